@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 import vibrissa as vb
-from vibrissa.scene import values_of
+from vibrissa.scene import COORDINATES, values_of
 from vibrissa.viewer.map import (
-    COORDINATES,
     SLICES,
     TURN,
     frame_drawing,

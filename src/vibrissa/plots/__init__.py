@@ -16,11 +16,10 @@ from vibrissa.plots.signal_space import signal_clouds
 from vibrissa.plots.signals import signals_over_time as signals_over_time
 from vibrissa.plots.slices import solid_slices
 from vibrissa.plots.style import (
-    cyclic as cyclic,
-    diverging as diverging,
     looking,
     png,
     save,
+    scale_of as scale_of,
     sequential,
 )
 from vibrissa.plots.sweep import drawable as drawable, sweep_overview as sweep_overview

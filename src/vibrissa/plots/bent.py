@@ -13,29 +13,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
-from vibrissa.plots.style import (
-    BLUE,
-    GREEN,
-    INK,
-    MUTED,
-    ORANGE,
-    SHADE,
-    Width,
-    box_axes,
-    conclude,
-    force_arrow,
-    head,
-    limits_around,
-    looking,
-    new_figure,
-    page_width,
-    sentence,
-)
+from vibrissa.plots import style
 from vibrissa.plots.verdicts import triplet_label
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import DIRECTIONS, SIGNALS, Array
 
-_COLOURS = (BLUE, ORANGE, GREEN, INK)
+_COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.INK)
 _REST = "#c4c4c4"
 _ARROW = 0.2
 """Length of the longest arrow, as a share of the whiskers' extent."""
@@ -71,7 +54,7 @@ def bent_views(
     forces: ArrayLike | None = None,
     *,
     labels: Sequence[str] = (),
-    width: Width = "double",
+    width: style.Width = "double",
 ) -> Figure:
     """Draw a whisker bent in some ways, from above (x–y) and from the side (x–z), to one scale.
 
@@ -108,9 +91,9 @@ def bent_views(
         raise ValueError(f"there are {len(labels)} labels for {len(lines)} bent whiskers")
     colours = _colours(len(lines))
     known = np.flatnonzero(np.isfinite(lines).all(axis=(1, 2)))
-    with looking():
+    with style.looking():
         if not known.size:
-            return sentence("nothing bent", width)
+            return style.sentence("nothing bent", width)
         extent = float(np.ptp(straight, axis=0).max())
         size = np.linalg.norm(force[known], axis=1)
         largest = float(np.nanmax(size)) if np.isfinite(size).any() else 0.0
@@ -127,7 +110,7 @@ def bent_views(
         figure = _views(drawn, _limits(drawn, extent), width)
         if largest > 0.0:
             low, high = to_display("force", np.array([np.nanmin(size), largest]))
-            conclude(figure, f"Forces from {low:.3g} to {high:.3g} µN")
+            style.conclude(figure, f"Forces from {low:.3g} to {high:.3g} µN")
         return figure
 
 
@@ -166,11 +149,11 @@ def _limits(drawn: _Drawn, extent: float, tail: float = 1.0) -> Array:
     ends = drawn.points - tail * drawn.arrows
     parts = (drawn.rest, drawn.lines.reshape(-1, 3), drawn.points, ends)
     everything = np.concatenate(parts)
-    return limits_around(everything, 0.03 * extent, _NARROWEST * extent)
+    return style.limits_around(everything, 0.03 * extent, _NARROWEST * extent)
 
 
-def _views(drawn: _Drawn, limits: Array, width: Width) -> Figure:
-    page, span = page_width(width), np.ptp(limits, axis=1)
+def _views(drawn: _Drawn, limits: Array, width: style.Width) -> Figure:
+    page, span = style.page_width(width), np.ptp(limits, axis=1)
     abreast = width == "double"
     room = page - _LEFT - _RIGHT
     scale = ((room - _GAP - _LEFT) / 2.0 if abreast else room) / span[0]
@@ -179,7 +162,7 @@ def _views(drawn: _Drawn, limits: Array, width: Width) -> Figure:
     columns = 2 if abreast else 1
     rows = -(-len(drawn.labels) // (2 * columns))
     height = (max(tall) if abreast else tall[0]) + below + _BOTTOM + _TOP + _ROW * rows
-    figure = new_figure(width, height, None)
+    figure = style.new_figure(width, height, None)
     for number, j in enumerate((1, 2)):
         across = abreast * number
         left = _LEFT + across * (scale * span[0] + _GAP + _LEFT)
@@ -187,16 +170,16 @@ def _views(drawn: _Drawn, limits: Array, width: Width) -> Figure:
             height - _TOP - _ROW * rows - (0.0 if abreast else number * (tall[0] + _GAP + _BOTTOM))
         )
         box = (left, top - tall[number], scale * span[0], tall[number])
-        axes = box_axes(figure, box, xlim=limits[0], ylim=limits[j])
+        axes = style.box_axes(figure, box, xlim=limits[0], ylim=limits[j])
         _draw(axes, drawn, j)
         few = max(3, round(tall[number] / 10.0))
         axes.yaxis.set_major_locator(MaxNLocator(few, integer=True))
         axes.set(xlabel=axis_label("x"), ylabel=axis_label("xyz"[j]))
-        head(axes, "ab"[number], ("from above", "from the side")[number])
+        style.head(axes, "ab"[number], ("from above", "from the side")[number])
     below_side = tall[0] - tall[1] - _GAP - _BOTTOM
     if abreast and below_side > _FORCES and np.isfinite(drawn.forces).any():
         corner = _LEFT + scale * span[0] + _GAP + _LEFT, _BOTTOM
-        _forces(box_axes(figure, (*corner, scale * span[0], below_side - _TOP)), drawn)
+        _forces(style.box_axes(figure, (*corner, scale * span[0], below_side - _TOP)), drawn)
     if drawn.labels:
         handles, texts = figure.axes[0].get_legend_handles_labels()
         # Above the views, from where the first begins.
@@ -213,7 +196,7 @@ def _forces(axes: Axes, drawn: _Drawn) -> None:
     axes.scatter(away, drawn.forces, 14.0, color=drawn.colours, zorder=3)
     axes.set(xlabel="distance of the contact from rest (mm)", ylabel=axis_label("force"))
     axes.set(xlim=(0.0, None), ylim=(0.0, None))
-    head(axes, "c", "force")
+    style.head(axes, "c", "force")
 
 
 def _draw(axes: Axes, drawn: _Drawn, j: int) -> None:
@@ -229,11 +212,11 @@ def _draw(axes: Axes, drawn: _Drawn, j: int) -> None:
         point, arrow = drawn.points[i], drawn.arrows[i]
         if np.isfinite(arrow).all():
             ends = (point - arrow)[[0, j]], point[[0, j]]
-            force_arrow(axes, *ends, colour, 1.0)
+            style.force_arrow(axes, *ends, colour, 1.0)
         axes.plot(point[0], point[j], "o", color=colour, markersize=2.6, zorder=5)
 
 
-_PAIR_COLOURS = (BLUE, ORANGE)
+_PAIR_COLOURS = (style.BLUE, style.ORANGE)
 _DASHES = ("-", (0, (5, 1.5)))
 _NAMES = ("A", "B")
 _PAIR_ARROW = 0.22
@@ -245,7 +228,7 @@ _TABLE = 70.0
 """Width of the table next to the views, mm; its height is as large where it is below them."""
 
 
-def witness_pair(witness: xr.Dataset, *, width: Width = "double") -> Figure:
+def witness_pair(witness: xr.Dataset, *, width: style.Width = "double") -> Figure:
     """Draw two bent whiskers with three equal signals, and list all six.
 
     Parameters
@@ -273,7 +256,7 @@ def witness_pair(witness: xr.Dataset, *, width: Width = "double") -> Figure:
     drawn = _pair(witness, extent)
     limits = _limits(drawn, extent, 1.3)  # with the letters at the arrows' tails
     span = np.ptp(limits, axis=1)
-    page = page_width(width)
+    page = style.page_width(width)
     abreast = width == "double"
     left, gap, bottom, top = 12.0, 3.0, 9.0, 2.0
     room = page - left - 2.0 - (_TABLE + 6.0 if abreast else 0.0)
@@ -281,12 +264,12 @@ def witness_pair(witness: xr.Dataset, *, width: Width = "double") -> Figure:
     views = bottom + gap + top + scale * (span[1] + span[2])
     height = max(views, 60.0) if abreast else views + 52.0
     shift = height - views
-    with looking():
-        figure = new_figure(width, height, None)
+    with style.looking():
+        figure = style.new_figure(width, height, None)
 
         def place(low: float, j: int) -> Axes:
             box = (left, low, scale * span[0], scale * span[j])
-            axes = box_axes(figure, box, xlim=limits[0], ylim=limits[j])
+            axes = style.box_axes(figure, box, xlim=limits[0], ylim=limits[j])
             _draw(axes, drawn, j)
             axes.set_ylabel(axis_label("xyz"[j]))
             few = max(3, round(scale * span[j] / 10.0))
@@ -301,7 +284,7 @@ def witness_pair(witness: xr.Dataset, *, width: Width = "double") -> Figure:
         for tail, name, colour in zip(tails, _NAMES, _PAIR_COLOURS, strict=True):
             above.text(tail[0], tail[1], name, color=colour, fontweight="bold", **_CENTRED)
         apart = np.linalg.norm(drawn.points[1] - drawn.points[0])
-        conclude(
+        style.conclude(
             figure,
             f"Two contacts {apart:.1f} mm apart have the same ({triplet_label(' '.join(triplet))})",
         )
@@ -369,7 +352,7 @@ def _table(
     look: dict[str, Any] = {"va": "center_baseline", "fontsize": 6.5}
     for x, name, colour in zip((0.62, 0.97), _NAMES, _PAIR_COLOURS, strict=True):
         axes.text(x, 0.0, name, color=colour, fontweight="bold", ha="right", **look)
-    axes.axhline(0.6, color=INK, linewidth=0.5)
+    axes.axhline(0.6, color=style.INK, linewidth=0.5)
     rows: list[tuple[str, Array]] = [(name, witness[name].values) for name in SIGNALS]
     rows += [("arc_length", witness["arc_length"].values)]
     rows += [("force", _sizes(witness))]
@@ -377,13 +360,13 @@ def _table(
         y = i + 1.2 + (0.3 if i >= len(SIGNALS) else 0.0)
         same = name in triplet
         if same:
-            axes.fill_between([0.0, 1.0], y - 0.5, y + 0.5, color=SHADE, linewidth=0.0)
+            axes.fill_between([0.0, 1.0], y - 0.5, y + 0.5, color=style.SHADE, linewidth=0.0)
         symbol = "$|\\mathbf{F}|$" if name == "force" else f"${_symbol(name)}$"
         axes.text(0.02, y, f"{symbol}  ({quantity(name).display_unit})", **look)
         for x, value in zip((0.62, 0.97), to_display(name, values), strict=True):
             text = _number(float(value), 7 if same else 4)
-            axes.text(x, y, text, ha="right", color=INK if same else MUTED, **look)
-    axes.axhline(9.2, color=INK, linewidth=0.5)
+            axes.text(x, y, text, ha="right", color=style.INK if same else style.MUTED, **look)
+    axes.axhline(9.2, color=style.INK, linewidth=0.5)
     for line, text in enumerate(_sentences(witness, triplet)):
         axes.text(0.02, 10.0 + line, text, **(look | {"fontsize": 6.0}))
 

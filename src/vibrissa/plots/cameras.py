@@ -10,18 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.plots.style import (
-    BLUE,
-    GREEN,
-    INK,
-    ORANGE,
-    RED,
-    Box,
-    box_axes,
-    looking,
-    new_figure,
-    page_width,
-)
+from vibrissa.plots import style
 from vibrissa.scene import Array, Course
 
 Grey = NDArray[np.uint8]
@@ -126,9 +115,9 @@ def _averaging(low: float, high: float, size: int, count: int) -> Any:
     return csr_matrix((shares / (last - first)).astype(np.float32))
 
 
-def sight_axes(figure: Figure, box: Box, low: Array, high: Array) -> Axes:
+def sight_axes(figure: Figure, box: style.Box, low: Array, high: Array) -> Axes:
     """Add a panel for a part of an image."""
-    axes = box_axes(figure, box, xlim=(low[0], high[0]), ylim=(high[1], low[1]))
+    axes = style.box_axes(figure, box, xlim=(low[0], high[0]), ylim=(high[1], low[1]))
     axes.set_axis_off()
     return axes
 
@@ -143,7 +132,7 @@ def scale_bar(axes: Axes, course: Course, view: _View, length: float = 5e-3) -> 
     if not 0.0 < share < 1.0:
         return
     place: dict[str, Any] = {"transform": axes.transAxes, "clip_on": False}
-    axes.plot([1.0 - share, 1.0], [-0.035, -0.035], color=INK, linewidth=1.2, **place)
+    axes.plot([1.0 - share, 1.0], [-0.035, -0.035], color=style.INK, linewidth=1.2, **place)
     axes.annotate(
         f"{1e3 * length:g} mm",
         (1.0 - share, -0.035),
@@ -171,15 +160,15 @@ def start_views(
 
     Each candidate is its line in every view, and its confidence.
     """
-    wide = (page_width("double") - _GAP * (len(images) - 1)) / len(images)
+    wide = (style.page_width("double") - _GAP * (len(images) - 1)) / len(images)
     heights = [wide * image.shape[0] / image.shape[1] for image in images]
     below = _LINE * len(remarks) + _GAP
-    with looking():
-        figure = new_figure("double", max(heights) + _TITLE + below, None)
+    with style.looking():
+        figure = style.new_figure("double", max(heights) + _TITLE + below, None)
         for view, (image, name) in enumerate(zip(images, names, strict=True)):
             box = (view * (wide + _GAP), below, wide, heights[view])
             rows, columns = image.shape
-            axes = box_axes(figure, box, xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
+            axes = style.box_axes(figure, box, xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
             axes.set_axis_off()
             axes.imshow(image, cmap="gray", vmin=0, vmax=255, aspect="auto")
             caption = "no whisker"
@@ -190,22 +179,24 @@ def start_views(
                 if number == 1:
                     caption = f"1 begins at {line[0, 0]:.0f}, {line[0, 1]:.0f}"
                     caption += f", confidence {confidence:.2f}"
-                _candidate(axes, line, number, confidence, ORANGE if remarks else GREEN)
+                _candidate(axes, line, number, confidence, style.ORANGE if remarks else style.GREEN)
             axes.set_title(f"{name}: {caption}", loc="left", fontsize=7.0, pad=2.0)
         height = max(heights) + _TITLE + below
         for count, remark in enumerate(remarks):
             at = (below - _LINE * (count + 1)) / height
-            figure.text(0.01, at, remark, fontsize=6.5, color=RED)
+            figure.text(0.01, at, remark, fontsize=6.5, color=style.RED)
     return figure
 
 
 def _candidate(axes: Axes, line: Array, number: int, confidence: float, colour: str) -> None:
     """Draw a line with its number and a circle at its base; all but the first fainter."""
     first = number == 1
-    colour = colour if first else BLUE
+    colour = colour if first else style.BLUE
     axes.plot(*line.T, color=colour, linewidth=0.8, alpha=0.8, linestyle="-" if first else ":")
     at = line[:1, 0], line[:1, 1]
-    axes.scatter(*at, s=60.0, facecolor="none", edgecolor=RED if first else BLUE, linewidths=1.0)
+    axes.scatter(
+        *at, s=60.0, facecolor="none", edgecolor=style.RED if first else style.BLUE, linewidths=1.0
+    )
     text = f"{number}" if first else f"{number} ({confidence:.2f})"
     axes.annotate(
         text, line[0], xytext=(5.0, 5.0), textcoords="offset points", color=colour, fontsize=7.0

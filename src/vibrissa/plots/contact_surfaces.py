@@ -13,6 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
+from vibrissa import scene
+from vibrissa.plots import style
 from vibrissa.plots.space import (
     bounds,
     name_axes,
@@ -24,29 +26,8 @@ from vibrissa.plots.space import (
     space_axes,
     square,
 )
-from vibrissa.plots.style import (
-    Box,
-    Width,
-    box_axes,
-    corner_title,
-    looking,
-    new_figure,
-    plain,
-    sequential,
-)
 from vibrissa.quantities import axis_label, quantity, to_display
-from vibrissa.scene import (
-    Array,
-    clip,
-    column,
-    level_surface,
-    robust_limits,
-    sample_contacts,
-    solid_surface,
-    values_of,
-)
 
-COORDINATES = ("r", "theta", "phi")
 _LEVELS = 3
 _PAPER = {"r": (11.0, 15.0, 24.0), "theta": (-25.0, 5.0, 35.0), "phi": (-25.0, 5.0, 35.0)}
 """Values of the paper's surfaces, mm and degrees."""
@@ -60,11 +41,11 @@ class _Panel(NamedTuple):
 
     letter: str
     title: str
-    box: Box
+    box: style.Box
 
 
 def contact_surfaces(
-    samples: xr.Dataset, centerline: ArrayLike, *, width: Width = "double"
+    samples: xr.Dataset, centerline: ArrayLike, *, width: style.Width = "double"
 ) -> Figure:
     """Draw surfaces of equal r, θ and φ among contacts, and in the space of three signals.
 
@@ -94,20 +75,20 @@ def contact_surfaces(
     ValueError
         If the dataset lacks something, or if there is no such width.
     """
-    whole = sample_contacts(samples, centerline)
-    opened = sample_contacts(samples, centerline, _OPEN)
-    outside = column("deflection")
-    body = solid_surface(opened, False, outside)
+    whole = scene.sample_contacts(samples, centerline)
+    opened = scene.sample_contacts(samples, centerline, _OPEN)
+    outside = scene.column("deflection")
+    body = scene.solid_surface(opened, False, outside)
     line = to_display("centerline", centerline)
     contacts = bounds(np.concatenate([_places(body).reshape(-1, 3), line]))
-    shell = solid_surface(whole, True, outside)
+    shell = scene.solid_surface(whole, True, outside)
     signals = signal_limits(signal_rows(shell))
-    with looking():
+    with style.looking():
         height, panels, rails = _sheet(width)
-        figure = new_figure(width, height, None)
-        for i, name in enumerate(COORDINATES):
+        figure = style.new_figure(width, height, None)
+        for i, name in enumerate(scene.COORDINATES):
             norm, marks = levels(name, shell)
-            values = to_display(name, values_of(name, shell))
+            values = to_display(name, scene.values_of(name, shell))
             if values.min() < min(_PAPER[name]) and max(_PAPER[name]) < values.max():
                 marks = list(_PAPER[name])
             among, into, inside = panels[3 * i : 3 * i + 3]
@@ -121,26 +102,30 @@ def contact_surfaces(
                 surface, hues = _level_sets(opened, name, norm, marks)
             paint(axes, signal_rows(surface), hues)
             axes = _cylinder(figure, inside, signals)
-            values = to_display(name, values_of(name, body))
-            paint(axes, signal_rows(body), painted(values, norm, sequential()), flat=0.8)
+            values = to_display(name, scene.values_of(name, body))
+            paint(axes, signal_rows(body), painted(values, norm, style.sequential()), flat=0.8)
             coordinate_bar(figure, rails[i], name, norm, marks)
         return figure
 
 
 def _level_sets(
-    nodes: Array, name: str, norm: Normalize, marks: list[float]
-) -> tuple[Array, Array]:
+    nodes: scene.Array, name: str, norm: Normalize, marks: list[float]
+) -> tuple[scene.Array, scene.Array]:
     """Surfaces on which a coordinate has certain values, and their colours."""
     surfaces, hues = [], []
     for mark in marks:
         value = mark / quantity(name).display_factor
-        surfaces.append(clip(level_surface(nodes, column(name), value), column("deflection")))
-        hues.append(np.tile(sequential()(norm(mark)), (len(surfaces[-1]), 1)))
+        surfaces.append(
+            scene.clip(
+                scene.level_surface(nodes, scene.column(name), value), scene.column("deflection")
+            )
+        )
+        hues.append(np.tile(style.sequential()(norm(mark)), (len(surfaces[-1]), 1)))
     return np.concatenate(surfaces), np.concatenate(hues)
 
 
 def _write_values(
-    figure: Figure, box: Box, name: str, norm: Normalize, marks: Sequence[float]
+    figure: Figure, box: style.Box, name: str, norm: Normalize, marks: Sequence[float]
 ) -> None:
     """Values of the surfaces, in their colours, below the title of their panel."""
     wide, tall = 25.4 * figure.get_size_inches()
@@ -149,17 +134,17 @@ def _write_values(
         text = f"{mark:g}{'' if unit == '°' else ' '}{unit}".replace("-", "−")
         place = (box[0] + 5.5 + 9.5 * i) / wide, (box[1] + box[3] - 3.6) / tall
         look: dict[str, Any] = {"fontsize": 6.0, "fontweight": "bold", "va": "top"}
-        figure.text(*place, text, color=sequential()(norm(mark)), **look)
+        figure.text(*place, text, color=style.sequential()(norm(mark)), **look)
 
 
-def _places(triangles: Array) -> Array:
+def _places(triangles: scene.Array) -> scene.Array:
     return to_display("contact_point", triangles[..., :3])
 
 
-def levels(name: str, shell: Array) -> tuple[Normalize, list[float]]:
+def levels(name: str, shell: scene.Array) -> tuple[Normalize, list[float]]:
     """Limits of the colours, and round values for surfaces."""
-    values = to_display(name, values_of(name, shell))
-    low, high = robust_limits(values)
+    values = to_display(name, scene.values_of(name, shell))
+    low, high = scene.robust_limits(values)
     locator = MaxNLocator(12, steps=[1, 2, 2.5, 5, 10])
     ticks = np.asarray(locator.tick_values(low, high))
     step = float(ticks[1] - ticks[0])
@@ -169,10 +154,10 @@ def levels(name: str, shell: Array) -> tuple[Normalize, list[float]]:
     return Normalize(float(low), float(high)), marks
 
 
-def _sheet(width: Width) -> tuple[float, list[_Panel], list[Box]]:
+def _sheet(width: style.Width) -> tuple[float, list[_Panel], list[style.Box]]:
     """Height of the figure, panels (contacts, signals, solid of r, of θ, of φ), colour bars."""
     kinds = ("contacts of equal {}", "their signals", "all signals, coloured by {}")
-    titles = [kind.format(f"${quantity(n).symbol}$") for n in COORDINATES for kind in kinds]
+    titles = [kind.format(f"${quantity(n).symbol}$") for n in scene.COORDINATES for kind in kinds]
     cells = [(row, side) for row in range(3) for side in range(3)]
     if width == "double":
         height, wide, tall = 141.0, 56.0, 46.5
@@ -194,8 +179,8 @@ def _sheet(width: Width) -> tuple[float, list[_Panel], list[Box]]:
     return height, panels, rails
 
 
-def _contact_axes(figure: Figure, panel: _Panel, limits: Array) -> Any:
-    corner_title(figure, panel.box, panel.letter, panel.title)
+def _contact_axes(figure: Figure, panel: _Panel, limits: scene.Array) -> Any:
+    style.corner_title(figure, panel.box, panel.letter, panel.title)
     left, bottom, width, height = square(panel.box)
     zoom = 0.87 if width > 50.0 else 0.82
     axes = space_axes(figure, (left - 2.0, bottom + 1.5, width, height), limits, zoom=zoom)
@@ -203,23 +188,23 @@ def _contact_axes(figure: Figure, panel: _Panel, limits: Array) -> Any:
     return axes
 
 
-def _cylinder(figure: Figure, panel: _Panel, limits: Array) -> Any:
-    corner_title(figure, panel.box, panel.letter, panel.title)
+def _cylinder(figure: Figure, panel: _Panel, limits: scene.Array) -> Any:
+    style.corner_title(figure, panel.box, panel.letter, panel.title)
     return signal_axes(figure, panel.box, limits)
 
 
 def coordinate_bar(
-    figure: Figure, place: Box, name: str, norm: Normalize, marks: list[float]
+    figure: Figure, place: style.Box, name: str, norm: Normalize, marks: list[float]
 ) -> None:
     """Draw a colour bar for a coordinate."""
-    rail = box_axes(figure, place)
+    rail = style.box_axes(figure, place)
     upright = place[3] > place[2]
     bar = figure.colorbar(
-        ScalarMappable(norm, sequential()),
+        ScalarMappable(norm, style.sequential()),
         cax=rail,
         orientation="vertical" if upright else "horizontal",
     )
-    plain(bar)
+    style.plain(bar)
     bar.set_ticks(marks)
     rail.tick_params(length=2.0, pad=1.5)
     for mark in marks:
@@ -239,17 +224,17 @@ def solid_panels(
     figure: Figure,
     samples: xr.Dataset,
     centerline: ArrayLike,
-    panels: Sequence[Box],
-    measured: Array,
-) -> tuple[list[Any], Array]:
+    panels: Sequence[style.Box],
+    measured: scene.Array,
+) -> tuple[list[Any], scene.Array]:
     """Draw the solid of all signals that is near those measured (n, 3) once a panel; its limits."""
-    nodes = sample_contacts(samples, centerline)
+    nodes = scene.sample_contacts(samples, centerline)
     within: list[int] = []
     if np.isfinite(measured).all(axis=1).any():
         gentle = _gentle(nodes, measured)
         within = [nodes.shape[-1] + i for i in range(gentle.shape[-1])]
         nodes = np.concatenate([nodes, gentle], axis=-1)
-    body = solid_surface(nodes, True, column("deflection"), *within)
+    body = scene.solid_surface(nodes, True, scene.column("deflection"), *within)
     places = signal_rows(body)
     limits = signal_limits(places)
     solids = [signal_axes(figure, panel, limits) for panel in panels]
@@ -259,13 +244,13 @@ def solid_panels(
 
 
 def course_scales(
-    figure: Figure, rails: Sequence[Box], coordinates: Array
-) -> list[tuple[Array, Normalize]]:
+    figure: Figure, rails: Sequence[style.Box], coordinates: scene.Array
+) -> list[tuple[scene.Array, Normalize]]:
     """Values of r, θ and φ (n, 3) in display units, each with its colours, shown on a bar."""
     scales = []
-    for name, rail, column_of in zip(COORDINATES, rails, coordinates.T, strict=True):
+    for name, rail, column_of in zip(scene.COORDINATES, rails, coordinates.T, strict=True):
         values = to_display(name, column_of)
-        norm = Normalize(*robust_limits(values))
+        norm = Normalize(*scene.robust_limits(values))
         low, high = float(norm.vmin or 0.0), float(norm.vmax or 1.0)
         ticks = MaxNLocator(4).tick_values(low, high)
         marks = [float(t) for t in ticks if low <= t <= high]
@@ -274,9 +259,9 @@ def course_scales(
     return scales
 
 
-def _gentle(nodes: Array, measured: Array) -> Array:
+def _gentle(nodes: scene.Array, measured: scene.Array) -> scene.Array:
     """Margin of signals within 1.5 times those of a trial; negative beyond."""
     force, moment = _ROOM * np.nanmax(np.abs(measured[:, :2]), axis=0)
-    tension = 1.0 - np.abs(values_of("Fx", nodes)) / max(force, 1e-12)
-    bending = 1.0 - values_of("MB", nodes) / max(moment, 1e-15)
+    tension = 1.0 - np.abs(scene.values_of("Fx", nodes)) / max(force, 1e-12)
+    bending = 1.0 - scene.values_of("MB", nodes) / max(moment, 1e-15)
     return np.stack([tension, bending], axis=-1)

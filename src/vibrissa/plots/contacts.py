@@ -10,21 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from vibrissa.plots import style
 from vibrissa.plots.objects import Body, draw_body, draw_head, head_of, one_scale
-from vibrissa.plots.style import (
-    INK,
-    MUTED,
-    Box,
-    Width,
-    box_axes,
-    conclude,
-    head,
-    looking,
-    new_figure,
-    plain,
-    sentence,
-    shading,
-)
 from vibrissa.quantities import axis_label, to_display
 from vibrissa.scene import Array, Course, deflection_angles
 
@@ -51,7 +38,7 @@ def contact_places(
     fitted: Sequence[Body] = (),
     *,
     colour: Literal["time", "deflection_angle"] = "time",
-    width: Width = "double",
+    width: style.Width = "double",
 ) -> Figure:
     """Draw contacts in the whisker's frame and in the laboratory, each from two sides.
 
@@ -87,9 +74,9 @@ def contact_places(
     if colour not in ("time", "deflection_angle"):
         raise ValueError(f"colour is {colour!r}; time or deflection_angle is needed")
     line = np.asarray(centerline, dtype=np.float64)
-    with looking():
+    with style.looking():
         if course.places is None or not np.isfinite(course.places).any():
-            return sentence("no contacts", width)
+            return style.sentence("no contacts", width)
         rows = np.flatnonzero(np.isfinite(course.places).all(axis=1))
         own = course.at_base(course.places)[rows]
         shade = course.time[rows]
@@ -97,29 +84,29 @@ def contact_places(
             shade = deflection_angles(course, line)[rows]
         shade = to_display(colour, shade)
         height, boxes, rail = _sheet(width)
-        figure = new_figure(width, height, None)
+        figure = style.new_figure(width, height, None)
         about = _about(figure, boxes[:2], own, line)
         there = _laboratory(figure, boxes[2:], course, course.places[rows], (bodies, fitted))
         own, lab = (to_display("contact_point", p) for p in (own, course.places[rows]))
-        look: dict[str, Any] = shading(shade)
+        look: dict[str, Any] = style.shading(shade)
         size = 3.0 if width == "double" else 1.5
         for i, (axes, view) in enumerate(zip(about + there, _VIEWS, strict=True)):
             across, up = (own if i < len(about) else lab)[:, list(view)].T
             dots = axes.scatter(across, up, size, zorder=3, **look)
             axes.set(xlabel=axis_label("xyz"[view[0]]), ylabel=axis_label("xyz"[view[1]]))
-            head(axes, "abcd"[i], _TITLES[i], left=4.0)
-        bar = figure.colorbar(dots, cax=box_axes(figure, rail))
-        plain(bar)
+            style.head(axes, "abcd"[i], _TITLES[i], left=4.0)
+        bar = figure.colorbar(dots, cax=style.box_axes(figure, rail))
+        style.plain(bar)
         bar.ax.set_title(axis_label(colour), fontsize=6.5, pad=4.0)
         near, far = np.nanpercentile(np.linalg.norm(own, axis=1), [5.0, 95.0])
-        conclude(
+        style.conclude(
             figure,
             f"{len(own)} contact points, 90 % of them {near:.0f} to {far:.0f} mm from the base",
         )
         return figure
 
 
-def _sheet(width: Width) -> tuple[float, tuple[Box, ...], Box]:
+def _sheet(width: style.Width) -> tuple[float, tuple[style.Box, ...], style.Box]:
     """Height of the figure, panels and colour bar, mm."""
     if width == "double":
         wide, top, below = 70.0, 34.0, 54.0
@@ -135,7 +122,7 @@ def _sheet(width: Width) -> tuple[float, tuple[Box, ...], Box]:
     return upper + top + 6.5, boxes, (left[1] + wide + 2.0, bottom, 1.8, 0.6 * below)
 
 
-def _about(figure: Figure, boxes: Sequence[Box], own: Array, line: Array) -> list[Axes]:
+def _about(figure: Figure, boxes: Sequence[style.Box], own: Array, line: Array) -> list[Axes]:
     """Panels about the resting whisker."""
     rest, points = to_display("centerline", line), to_display("contact_point", own)
     limits = _limits(np.concatenate([rest, _inner(points)]))
@@ -143,15 +130,15 @@ def _about(figure: Figure, boxes: Sequence[Box], own: Array, line: Array) -> lis
     views = _VIEWS[:2]
     ends = one_scale(limits, views, [box[2:] for box in boxes])
     for box, view, both in zip(boxes, views, ends, strict=True):
-        axes = box_axes(figure, box, xlim=both[0], ylim=both[1])
-        axes.plot(*rest[:, list(view)].T, color=INK, linewidth=1.0, zorder=2)
+        axes = style.box_axes(figure, box, xlim=both[0], ylim=both[1])
+        axes.plot(*rest[:, list(view)].T, color=style.INK, linewidth=1.0, zorder=2)
         found.append(axes)
     return found
 
 
 def _laboratory(
     figure: Figure,
-    boxes: Sequence[Box],
+    boxes: Sequence[style.Box],
     course: Course,
     places: Array,
     bodies: tuple[Sequence[Body], Sequence[Body]],
@@ -168,7 +155,7 @@ def _laboratory(
     ends = one_scale(limits, views, [box[2:] for box in boxes])
     found = []
     for box, view, both in zip(boxes, views, ends, strict=True):
-        axes = box_axes(figure, box, xlim=both[0], ylim=both[1])
+        axes = style.box_axes(figure, box, xlim=both[0], ylim=both[1])
         draw_head(axes, rat, view)
         window = limits.copy()
         window[list(view)] = both
@@ -176,7 +163,7 @@ def _laboratory(
             for body in group:
                 draw_body(axes, body, view, window, look)
         for one in lines:
-            axes.plot(*one[:, list(view)].T, color=MUTED, linewidth=0.4, zorder=2)
+            axes.plot(*one[:, list(view)].T, color=style.MUTED, linewidth=0.4, zorder=2)
         found.append(axes)
     return found
 

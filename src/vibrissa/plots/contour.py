@@ -18,8 +18,9 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vibrissa.plots import style
 from vibrissa.plots.objects import (
     BAND,
     Body,
@@ -29,21 +30,6 @@ from vibrissa.plots.objects import (
     is_cylinder,
     lies_flat,
     outline,
-)
-from vibrissa.plots.style import (
-    INK,
-    MUTED,
-    ORANGE,
-    Width,
-    box_axes,
-    conclude,
-    head,
-    looking,
-    new_figure,
-    page_width,
-    plain,
-    sentence,
-    shading,
 )
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import Array, robust_limits
@@ -67,7 +53,7 @@ def contour_views(
     colour: ArrayLike | None = None,
     colour_name: str = "deflection_angle",
     covariance: ArrayLike | None = None,
-    width: Width = "double",
+    width: style.Width = "double",
 ) -> Figure:
     """Draw contact points from above (x–y), large, and from two sides (x–z and y–z).
 
@@ -104,12 +90,16 @@ def contour_views(
     places = to_display("contact_point", points)
     shade = None if colour is None else to_display(colour_name, colour)
     spread = None if covariance is None else to_display("covariance", covariance)
-    rows = _usable(places, shade, spread)
+    n = len(places)
+    shapes = {"points": (places, (n, 3)), "colour": (shade, (n,))}
+    rows = style.usable_rows(shade, shapes)
+    if spread is not None and spread.shape != (n, 3, 3):
+        raise ValueError(f"covariance has shape {spread.shape}; {(n, 3, 3)} is needed")
     both = ((known, "true"), (fitted, "fitted"))
     bodies = [(body, look) for body, look in both if body is not None]
-    with looking():
+    with style.looking():
         if rows.size == 0:
-            return sentence("no contacts", width)
+            return style.sentence("no contacts", width)
         places, shade = places[rows], None if shade is None else shade[rows]
         limits = _limits(places, bodies[0][0] if bodies else None)
         room = _BAR if shade is not None else 3.0, _TOP if bodies else 6.5
@@ -121,7 +111,7 @@ def contour_views(
                 _ellipses(axes, places, spread[rows], view)
             across, up = places[:, view].T
             size = 5.0 if view == (0, 1) else 2.5
-            dots = axes.scatter(across, up, size, zorder=3, **shading(shade))
+            dots = axes.scatter(across, up, size, zorder=3, **style.shading(shade))
         _note_outside(panels[0], places, limits)
         _legend(figure, panels, known, fitted, spread is not None)
         if bodies and hasattr(bodies[-1][0], "signed_distance"):
@@ -129,15 +119,15 @@ def contour_views(
         if shade is not None:
             page, height = 25.4 * figure.get_size_inches()
             box = page - _BAR + 2.0, _BOTTOM, 2.0, 0.6 * (height - _BOTTOM - _TOP)
-            rail = box_axes(figure, box)
-            plain(figure.colorbar(dots, cax=rail, label=axis_label(colour_name)))
+            rail = style.box_axes(figure, box)
+            style.plain(figure.colorbar(dots, cax=rail, label=axis_label(colour_name)))
         return figure
 
 
 def _conclude(figure: Figure, points: Array, body: Body, look: str) -> None:
     """State how far the contact points are from the surface that was fitted, or is known."""
     away = np.median(np.abs(to_display("r", body.signed_distance(points))))
-    conclude(
+    style.conclude(
         figure,
         f"{len(points)} contact points on the whisker's centreline, half of them within "
         f"{away:.2g} mm of the {look} surface",
@@ -160,37 +150,20 @@ def _draw(
     axes.set(xlim=limits[view[0]], ylim=limits[view[1]])
 
 
-_PEG: dict[str, Any] = {"facecolor": "#ececec", "edgecolor": MUTED, "linewidth": 0.8, "zorder": 1}
+_PEG: dict[str, Any] = {
+    "facecolor": "#ececec",
+    "edgecolor": style.MUTED,
+    "linewidth": 0.8,
+    "zorder": 1,
+}
 _FITTED: dict[str, Any] = {
     "facecolor": "none",
-    "edgecolor": ORANGE,
+    "edgecolor": style.ORANGE,
     "linewidth": 1.0,
     "linestyle": (0, (4, 2)),
     "zorder": 4,
 }
 _LOOKS = {"true": _PEG, "fitted": _FITTED}
-
-
-def _usable(places: Array, shade: Array | None, spread: Array | None) -> NDArray[np.intp]:
-    """Rows in which nothing is missing, those of the largest shade last, to be drawn on top."""
-    n = len(places)
-    wanted = {
-        "points": (places, (n, 3)),
-        "colour": (shade, (n,)),
-        "covariance": (spread, (n, 3, 3)),
-    }
-    faults = [
-        f"{name} has shape {values.shape}; {shape} is needed"
-        for name, (values, shape) in wanted.items()
-        if values is not None and values.shape != shape
-    ]
-    if faults:
-        raise ValueError("; ".join(faults))
-    known = np.isfinite(places).all(axis=1)
-    if shade is None:
-        return np.flatnonzero(known)
-    rows = np.flatnonzero(known & np.isfinite(shade))
-    return rows[np.argsort(shade[rows], kind="stable")]
 
 
 def _limits(places: Array, body: Body | None) -> Array:
@@ -209,20 +182,22 @@ def _limits(places: Array, body: Body | None) -> Array:
     return limits
 
 
-def _panels(limits: Array, width: Width, right: float, above: float) -> tuple[Figure, list[Axes]]:
+def _panels(
+    limits: Array, width: style.Width, right: float, above: float
+) -> tuple[Figure, list[Axes]]:
     """Three axes, all as tall as the view from above, with room (mm) to the right and above."""
-    page = page_width(width)
+    page = style.page_width(width)
     across, tall = np.ptp(limits[0]), np.ptp(limits[2])
     size = (page - _LEFT - 2.0 * _GAP - right) / (1.0 + 2.0 * across / tall)
     height = size + _BOTTOM + above
-    figure = new_figure(width, height, None)
+    figure = style.new_figure(width, height, None)
     panels, left = [], _LEFT
     for i, (view, title) in enumerate(zip(_VIEWS, _TITLES, strict=True)):
         wide = size * float(np.ptp(limits[view[0]]) / np.ptp(limits[view[1]]))
         box = (left, _BOTTOM, wide, size)
-        axes = box_axes(figure, box, xlim=limits[view[0]], ylim=limits[view[1]])
+        axes = style.box_axes(figure, box, xlim=limits[view[0]], ylim=limits[view[1]])
         axes.set(xlabel=axis_label(_NAMES[view[0]]), ylabel=axis_label(_NAMES[view[1]]))
-        head(axes, "abc"[i], title)
+        style.head(axes, "abc"[i], title)
         axes.locator_params(axis="x", nbins=5 if i == 0 else 3, integer=True)
         panels.append(axes)
         left += wide + _GAP
@@ -250,7 +225,7 @@ def _ellipses(axes: Axes, places: Array, spread: Array, view: tuple[int, int]) -
             offsets=places[chosen][:, [i, j]],
             offset_transform=axes.transData,
             facecolors="none",
-            edgecolors=MUTED,
+            edgecolors=style.MUTED,
             linewidths=0.4,
             zorder=2,
         )
@@ -261,7 +236,7 @@ def _note_outside(axes: Axes, places: Array, limits: Array) -> None:
     flat = places[:, :2]
     outside = int(((flat < limits[:2, 0]) | (flat > limits[:2, 1])).any(axis=1).sum())
     if outside:
-        axes.set_title(f"{outside} outside", loc="right", fontsize=6.0, color=MUTED)
+        axes.set_title(f"{outside} outside", loc="right", fontsize=6.0, color=style.MUTED)
 
 
 def _legend(
@@ -282,7 +257,7 @@ def _legend(
             handles.append(Polygon(corner, label="95 % band", **BAND))
     if spread:
         look: dict[str, Any] = {"marker": "o", "markerfacecolor": "none", "linestyle": "none"}
-        handles.append(Line2D([], [], color=MUTED, label="95 % ellipses", **look))
+        handles.append(Line2D([], [], color=style.MUTED, label="95 % ellipses", **look))
     if handles:
         place = (panels[0].get_position().x0 + 0.02, 1.0)
         figure.legend(
@@ -303,7 +278,7 @@ def _across(body: Body) -> str:
 _HEIGHT = 52.0
 
 
-def distances_by_class(summaries: Sequence[xr.Dataset], *, width: Width = "double") -> Figure:
+def distances_by_class(summaries: Sequence[xr.Dataset], *, width: style.Width = "double") -> Figure:
     """Draw distances from the surface by classes, with what the covariance predicts.
 
     Parameters
@@ -321,15 +296,15 @@ def distances_by_class(summaries: Sequence[xr.Dataset], *, width: Width = "doubl
         sentence "no contacts".
     """
     shown = [s for s in summaries if int(s["contacts"].sum())]
-    with looking():
+    with style.looking():
         if not shown:
-            return sentence("no contacts", width)
-        figure = new_figure(width, _HEIGHT, "constrained")
+            return style.sentence("no contacts", width)
+        figure = style.new_figure(width, _HEIGHT, "constrained")
         panels = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
         for i, (axes, summary) in enumerate(zip(panels, shown, strict=True)):
             _panel(axes, summary)
             name = quantity(summary.attrs["quantity"]).long_name
-            head(axes, "abc"[i] if i < 3 else "", f"by {name}")
+            style.head(axes, "abc"[i] if i < 3 else "", f"by {name}")
         panels[0].set_ylabel(axis_label("surface_distance").replace("d", "|d|", 1))
         panels[0].set_yscale("log")
         handles, labels = panels[0].get_legend_handles_labels()
@@ -337,7 +312,7 @@ def distances_by_class(summaries: Sequence[xr.Dataset], *, width: Width = "doubl
         figure.legend(handles, labels, loc="outside upper right", ncols=len(labels))
         medians = to_display("surface_distance", shown[0]["median"].values)
         first = quantity(shown[0].attrs["quantity"]).long_name
-        conclude(
+        style.conclude(
             figure,
             f"Median distance from the surface {np.nanmin(medians):.0f} to "
             f"{np.nanmax(medians):.0f} µm, by class of {first}",
@@ -348,8 +323,8 @@ def distances_by_class(summaries: Sequence[xr.Dataset], *, width: Width = "doubl
 def _panel(axes: Axes, summary: xr.Dataset) -> None:
     place = np.arange(summary.sizes["class"])
     for name, label, colour, aside in (
-        ("median", "median", INK, -0.12),
-        ("largest_95", "95 %", ORANGE, 0.12),
+        ("median", "median", style.INK, -0.12),
+        ("largest_95", "95 %", style.ORANGE, 0.12),
     ):
         measured = to_display("surface_distance", summary[name])
         predicted = to_display("surface_distance", summary[f"{name}_predicted"])
@@ -375,4 +350,4 @@ def _panel(axes: Axes, summary: xr.Dataset) -> None:
     axes.set_xticks(place, marks, fontsize=6.0)
     axes.set_xlim(-0.5, len(place) - 0.5)
     axes.set_xlabel(axis_label(name))
-    axes.grid(axis="y", color=MUTED, alpha=0.25, linewidth=0.4)
+    axes.grid(axis="y", color=style.MUTED, alpha=0.25, linewidth=0.4)

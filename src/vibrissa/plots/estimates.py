@@ -10,11 +10,19 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from vibrissa.plots.style import MUTED, conclude, head, looking, new_figure, plain, say, shading
+from vibrissa.plots.style import (
+    MUTED,
+    conclude,
+    head,
+    looking,
+    new_figure,
+    plain,
+    say,
+    shading,
+    usable_rows,
+)
 from vibrissa.quantities import axis_label, quantity, to_display
-from vibrissa.scene import Array, robust_limits
-
-_COORDINATES = ("r", "theta", "phi")
+from vibrissa.scene import COORDINATES, Array, robust_limits
 
 
 def estimated_against_true(
@@ -66,7 +74,7 @@ def estimated_against_true(
         ratios = [2.1, 1.0, 1.0][:rows]
         panels = figure.subplots(rows, 3, squeeze=False, height_ratios=ratios)
         look = shading(shade)
-        for i, axis in enumerate(_COORDINATES):
+        for i, axis in enumerate(COORDINATES):
             pair = to_display(axis, true[:, i]), to_display(axis, estimated[:, i])
             dots = against(panels[0, i], axis, pair, look, known_as)
             head(panels[0, i], "abc"[i], quantity(axis).long_name)
@@ -89,7 +97,7 @@ def estimated_against_true(
 def error_words(true: Array, estimated: Array) -> str:
     """Median errors of r, θ and φ, of coordinates in m and rad."""
     parts = []
-    for i, name in enumerate(_COORDINATES):
+    for i, name in enumerate(COORDINATES):
         pair = to_display(name, true[:, i]), to_display(name, estimated[:, i])
         row = quantity(name)
         unit = row.display_unit if row.display_unit == "°" else f" {row.display_unit}"
@@ -102,29 +110,14 @@ def _usable(
     true: ArrayLike, estimated: ArrayLike, time: ArrayLike | None, shade: ArrayLike | None
 ) -> tuple[Array, Array, Array | None, Array | None]:
     """Rows in which nothing is missing; those of the largest shade last, to be drawn on top."""
-    given = [
-        None if a is None else np.asarray(a, np.float64) for a in (true, estimated, time, shade)
-    ]
-    n = np.shape(true)[:1]
-    wanted = ((*n, 3), (*n, 3), n, n)
-    names = ("true_spherical", "estimated_spherical", "time", "colour")
-    faults = [
-        f"{name} has shape {a.shape}; {shape} is needed"
-        for name, a, shape in zip(names, given, wanted, strict=True)
-        if a is not None and a.shape != shape
-    ]
-    if faults:
-        raise ValueError("; ".join(faults))
-    known = np.ones(n, dtype=bool)
-    for a in given:
-        known &= True if a is None else np.isfinite(a.reshape(len(a), -1)).all(axis=1)
-    rows = np.flatnonzero(known)
-    if given[3] is not None:
-        rows = rows[np.argsort(given[3][rows], kind="stable")]
-    kept = [None if a is None else a[rows] for a in given]
-    assert kept[0] is not None
-    assert kept[1] is not None
-    return kept[0], kept[1], kept[2], kept[3]
+    points = np.asarray(true, np.float64), np.asarray(estimated, np.float64)
+    times = [None if values is None else np.asarray(values, np.float64) for values in (time, shade)]
+    n = points[0].shape[:1]
+    named = zip(("true_spherical", "estimated_spherical"), points, strict=True)
+    shapes = {name: (values, (*n, 3)) for name, values in named}
+    rows = usable_rows(times[1], shapes | {"time": (times[0], n), "colour": (times[1], n)})
+    seconds, shades = (None if values is None else values[rows] for values in times)
+    return points[0][rows], points[1][rows], seconds, shades
 
 
 def _difference(name: str, true: Array, estimated: Array) -> Array:

@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
 
+from vibrissa.plots import style
 from vibrissa.plots.cameras import Sight, Window, part_of, scale_bar, seen, sight_axes
 from vibrissa.plots.contact_surfaces import course_scales, solid_panels
 from vibrissa.plots.objects import Body, one_scale, outline_segments, room_for
@@ -32,17 +33,6 @@ from vibrissa.plots.space import (
     name_axes,
     signal_places,
     space_axes,
-)
-from vibrissa.plots.style import (
-    INK,
-    MUTED,
-    ORANGE,
-    TRACE,
-    box_axes,
-    looking,
-    plain,
-    sequential,
-    sized_figure,
 )
 from vibrissa.quantities import axis_label, to_display
 from vibrissa.scene import TRIPLET, Array, Course, spherical
@@ -60,7 +50,7 @@ _DPI = 160.0
 
 def screen_figure() -> Figure:
     """Make the empty figure of a movie."""
-    figure = sized_figure(WIDTH, HEIGHT)
+    figure = style.sized_figure(WIDTH, HEIGHT)
     figure.set_dpi(_DPI)
     return figure
 
@@ -72,7 +62,7 @@ class Screen:
         self._figure = figure
         # Matplotlib gives this canvas no types.
         self._agg = cast("Any", FigureCanvasAgg(figure))
-        with looking():
+        with style.looking():
             self._agg.draw()
         self._background = self._agg.copy_from_bbox(figure.bbox)
 
@@ -170,8 +160,8 @@ _REVEALED = 0.05
 """Distance from a contact within which an outline appears, as a share of the view's width."""
 
 _OUTLINES: tuple[dict[str, Any], ...] = (
-    {"color": MUTED, "linewidth": 1.6, "zorder": 1.5},
-    {"color": ORANGE, "linewidth": 0.9, "zorder": 2.0},
+    {"color": style.MUTED, "linewidth": 1.6, "zorder": 1.5},
+    {"color": style.ORANGE, "linewidth": 0.9, "zorder": 2.0},
 )
 """Looks of the outlines of true objects and of fitted shapes."""
 
@@ -266,7 +256,7 @@ def _contour_frames(
     first, last = int(rows[0]), int(rows[-1])
     time = to_display("time", course.time)
     norm = Normalize(time[first], max(time[last], time[first] + 1e-3))
-    with looking():
+    with style.looking():
         figure = screen_figure()
         panels, parts = _views(figure, course, sights, slice(first, last + 1))
         clouds = []
@@ -283,7 +273,7 @@ def _contour_frames(
         screen = Screen(figure)
     windows = [Window(low, high, size, screen.pixels(axes)) for axes, low, high, size in panels]
     streams = [iter(sight.images) for sight in sights]
-    colours = sequential()(norm(time))
+    colours = style.sequential()(norm(time))
     before = first - 1
     for row in rows:
         new = np.arange(before + 1, row + 1)
@@ -325,7 +315,7 @@ def _views(
         axes = sight_axes(figure, box, low, high)
         axes.set_title(view.name, loc="right", pad=2.0)
         scale_bar(axes, course, view)
-        line = moving_line(axes, **TRACE)
+        line = moving_line(axes, **style.TRACE)
         dot = moving_line(axes, **_CONTACT)
         panels.append(_Sight(axes, low, high, view.size))
         parts.append(_Part(line, lines, dot, dots))
@@ -354,7 +344,7 @@ def _about_whisker(
         animated=True,
     )
     figure.add_artist(cloud)
-    line = flat_line(axes, animated=True, **TRACE)
+    line = flat_line(axes, animated=True, **style.TRACE)
     dot = flat_line(axes, animated=True, **_CONTACT)
     there = flattened(axes, points)
     return _Part(line, flattened(axes, lines), dot, there), _Cloud(cloud, there)
@@ -381,7 +371,7 @@ def _sides(
         _SIDES, ends, _SIDE_BOXES, ("from above", "from the front", "from the side"), strict=True
     ):
         i, j = view
-        axes = box_axes(figure, box, xlim=both[0], ylim=both[1])
+        axes = style.box_axes(figure, box, xlim=both[0], ylim=both[1])
         axes.set(xlabel=axis_label("xyz"[i]), ylabel=axis_label("xyz"[j]))
         axes.set_title(title, loc="left", pad=3.0)
         window = _window(limits, view, both)
@@ -399,7 +389,7 @@ def _sides(
             zorder=3,
         )
         axes.add_collection(cloud, autolim=False)
-        moving = moving_line(axes, **TRACE)
+        moving = moving_line(axes, **style.TRACE)
         dot = moving_line(axes, **_CONTACT)
         there = points[:, list(view)]
         yield _Part(moving, line[..., list(view)], dot, there), _Cloud(cloud, there), outlines
@@ -418,9 +408,9 @@ def _window(limits: Array, view: tuple[int, int], both: Array) -> Array:
 
 
 def _bar(figure: Figure, norm: Normalize) -> None:
-    rail = box_axes(figure, _RAIL)
-    bar = figure.colorbar(ScalarMappable(norm, sequential()), cax=rail)
-    plain(bar)
+    rail = style.box_axes(figure, _RAIL)
+    bar = figure.colorbar(ScalarMappable(norm, style.sequential()), cax=rail)
+    style.plain(bar)
     rail.set_title(axis_label("time"), fontsize=6.5, pad=4.0)
     rail.tick_params(length=2.0, pad=1.5)
 
@@ -478,7 +468,7 @@ def _signal_frames(
 ) -> Iterator[Picture]:
     first, last = int(rows[0]), int(rows[-1])
     time = to_display("time", course.time)
-    with looking():
+    with style.looking():
         figure = screen_figure()
         panels = [(66.5 * i + 0.5, 52.5, 66.5, 58.0) for i in range(3)]
         rails = [(66.5 * i + 59.7, 66.0, 1.6, 24.0) for i in range(3)]
@@ -493,17 +483,19 @@ def _signal_frames(
         scales = course_scales(figure, rails, coordinates[span])
         for axes, way, (values, norm) in zip(solids, ways, scales, strict=True):
             segments, means = coloured_segments(way[span], values)
-            path = LineCollection(list(segments), cmap=sequential(), norm=norm, linewidths=1.0)
+            path = LineCollection(
+                list(segments), cmap=style.sequential(), norm=norm, linewidths=1.0
+            )
             path.set(array=means, transform=axes.transData, clip_on=False)
             figure.add_artist(path)
         curves = curves_over_time(figure, _BOXES, course, signals, slice(first, last + 1))
         curve_legend(figure, course, (1.0 - 2.0 / WIDTH, 48.0 / HEIGHT))
         marks = [_mark(curve, time[first]) for curve in curves]
         clock = figure.text(0.5, 0.985, "", ha="center", va="top", fontsize=8.0, animated=True)
-        trails = [flat_line(a, color=INK, linewidth=0.6, animated=True) for a in solids]
+        trails = [flat_line(a, color=style.INK, linewidth=0.6, animated=True) for a in solids]
         look = {"markeredgecolor": "white", "markeredgewidth": 0.6, "linestyle": "none"}
         dots = [
-            flat_line(a, marker="o", markersize=5.5, color=ORANGE, animated=True, **look)
+            flat_line(a, marker="o", markersize=5.5, color=style.ORANGE, animated=True, **look)
             for a in solids
         ]
         screen = Screen(figure)
@@ -523,6 +515,6 @@ def _signal_frames(
 
 def _mark(curve: Curve, time: float) -> tuple[Line2D, Line2D]:
     """A cursor and a dot that move over a curve."""
-    cursor = curve.axes.axvline(time, color=ORANGE, linewidth=0.8, animated=True)
-    dot = moving_line(curve.axes, marker="o", markersize=3.5, color=ORANGE, zorder=5)
+    cursor = curve.axes.axvline(time, color=style.ORANGE, linewidth=0.8, animated=True)
+    dot = moving_line(curve.axes, marker="o", markersize=3.5, color=style.ORANGE, zorder=5)
     return cursor, dot

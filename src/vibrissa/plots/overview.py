@@ -13,31 +13,14 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import ArrayLike, NDArray
 
+from vibrissa.plots import style
 from vibrissa.plots.cameras import Sight, Window, part_of, scale_bar, seen, sight_axes
-from vibrissa.plots.contact_surfaces import COORDINATES, course_scales, solid_panels
+from vibrissa.plots.contact_surfaces import course_scales, solid_panels
 from vibrissa.plots.estimates import against
 from vibrissa.plots.signals import intervals
 from vibrissa.plots.space import coloured_segments, drop_lines, signal_places
-from vibrissa.plots.style import (
-    BLUE,
-    INK,
-    MUTED,
-    ORANGE,
-    SHADE,
-    TRACE,
-    Box,
-    Width,
-    box_axes,
-    conclude,
-    looking,
-    new_figure,
-    page_width,
-    plain,
-    sequential,
-    shading,
-)
 from vibrissa.quantities import axis_label, to_display
-from vibrissa.scene import TRIPLET, Array, Course, spherical
+from vibrissa.scene import COORDINATES, TRIPLET, Array, Course, spherical
 
 _DOTS_PER_MM = 300.0 / 25.4
 _CONTACT: dict[str, Any] = {"facecolor": "#f0e442", "edgecolor": "black", "linewidths": 0.5}
@@ -47,12 +30,12 @@ class _Sheet(NamedTuple):
     """Places of the panels, mm."""
 
     height: float
-    sights: tuple[Box, ...]
-    curves: tuple[Box, ...]
+    sights: tuple[style.Box, ...]
+    curves: tuple[style.Box, ...]
     legend: float
-    solids: tuple[Box, ...]
-    rails: tuple[Box, ...]
-    against: tuple[Box, ...]
+    solids: tuple[style.Box, ...]
+    rails: tuple[style.Box, ...]
+    against: tuple[style.Box, ...]
 
 
 def key_frames(course: Course) -> NDArray[np.intp]:
@@ -89,7 +72,7 @@ def trial_overview(
     sights: Sequence[Sight] = (),
     rows: ArrayLike = (),
     *,
-    width: Width = "double",
+    width: style.Width = "double",
 ) -> Figure:
     """Draw a trial: what cameras see, signals and contacts over time, solids, estimates.
 
@@ -131,20 +114,22 @@ def trial_overview(
     shown = shown[-most:] if sights else shown[:0]
     compared = width == "double" and course.known is not None and course.estimated is not None
     sheet = _sheet(width, len(sights) * shown.size, compared)
-    with looking():
-        figure = new_figure(width, sheet.height, None)
+    with style.looking():
+        figure = style.new_figure(width, sheet.height, None)
         _images(figure, sheet.sights, course, sights, shown)
         whole = slice(0, len(course.time))
         curves = curves_over_time(figure, sheet.curves, course, course.signals, whole)
-        curve_legend(figure, course, (1.0 - 2.0 / page_width(width), sheet.legend / sheet.height))
+        curve_legend(
+            figure, course, (1.0 - 2.0 / style.page_width(width), sheet.legend / sheet.height)
+        )
         for row in shown:
             for axes, _ in curves:
-                axes.axvline(float(course.time[row]), color=ORANGE, linewidth=0.6)
+                axes.axvline(float(course.time[row]), color=style.ORANGE, linewidth=0.6)
         _trajectory(figure, sheet, course, samples, centerline, shown)
         if compared:
             _compared(figure, sheet.against, course)
         _letters(figure, sheet)
-        conclude(figure, _finding(course))
+        style.conclude(figure, _finding(course))
         return figure
 
 
@@ -162,7 +147,7 @@ def _finding(course: Course) -> str:
     return f"{words}; estimates {np.nanmedian(away):.2g} mm from {course.known_as} contact points"
 
 
-def _sheet(width: Width, images: int, compared: bool) -> _Sheet:
+def _sheet(width: style.Width, images: int, compared: bool) -> _Sheet:
     """Lay the panels out from below."""
     if width == "double":
         bottom = 56.0 if compared else 0.0
@@ -194,7 +179,7 @@ def _sheet(width: Width, images: int, compared: bool) -> _Sheet:
 
 def _images(
     figure: Figure,
-    boxes: Sequence[Box],
+    boxes: Sequence[style.Box],
     course: Course,
     sights: Sequence[Sight],
     rows: NDArray[np.intp],
@@ -213,7 +198,7 @@ def _images(
             part = Window(low, high, view.size, panel).of(next(stream))
             extent = (low[0], high[0], high[1], low[1])
             axes.imshow(part, cmap="gray", vmin=0, vmax=255, extent=extent, aspect="auto")
-            axes.plot(*lines[row].T, **TRACE)
+            axes.plot(*lines[row].T, **style.TRACE)
             axes.scatter(dots[row, 0], dots[row, 1], 9.0, zorder=5, **_CONTACT)
             when = f"{to_display('time', course.time[row]):.3f} s"
             axes.set_title(f"{view.name}, {when}", loc="right", fontsize=6.5, pad=2.0)
@@ -241,35 +226,39 @@ def _trajectory(
     for axes in solids:
         for row in rows[np.isfinite(trajectory[rows]).all(axis=1)]:
             drop_lines(axes, limits, trajectory[row])
-            axes.scatter(*trajectory[row], s=9.0, color=ORANGE, zorder=13, depthshade=False)
+            axes.scatter(*trajectory[row], s=9.0, color=style.ORANGE, zorder=13, depthshade=False)
     if points is None:
         for axes in solids:
-            axes.plot(*trajectory.T, color=INK, linewidth=0.7, zorder=12)
+            axes.plot(*trajectory.T, color=style.INK, linewidth=0.7, zorder=12)
         return
     scales = course_scales(figure, sheet.rails, spherical(points))
     for axes, (values, norm) in zip(solids, scales, strict=True):
         segments, means = coloured_segments(trajectory, values)
-        path = Line3DCollection(segments, cmap=sequential(), norm=norm, linewidths=1.2, zorder=12)
+        path = Line3DCollection(
+            segments, cmap=style.sequential(), norm=norm, linewidths=1.2, zorder=12
+        )
         path.set_array(means)
         axes.add_collection3d(path, autolim=False)
 
 
-def _compared(figure: Figure, boxes: Sequence[Box], course: Course) -> None:
+def _compared(figure: Figure, boxes: Sequence[style.Box], course: Course) -> None:
     """Estimated against known coordinates, coloured by time."""
     assert course.known is not None
     assert course.estimated is not None
     known, estimated = spherical(course.known), spherical(course.estimated)
     rows = np.isfinite(known).all(axis=1) & np.isfinite(estimated).all(axis=1)
     if not rows.any():
-        figure.text(0.5, 0.5 * boxes[0][3] / boxes[0][1], "no contacts", color=MUTED, ha="center")
+        figure.text(
+            0.5, 0.5 * boxes[0][3] / boxes[0][1], "no contacts", color=style.MUTED, ha="center"
+        )
         return
-    look = shading(to_display("time", course.time[rows]))
+    look = style.shading(to_display("time", course.time[rows]))
     for i, (name, box) in enumerate(zip(COORDINATES, boxes, strict=True)):
         pair = to_display(name, known[rows, i]), to_display(name, estimated[rows, i])
-        dots = against(box_axes(figure, box), name, pair, look, course.known_as)
+        dots = against(style.box_axes(figure, box), name, pair, look, course.known_as)
     left, bottom, wide, tall = boxes[-1]
-    rail = box_axes(figure, (left + wide + 2.5, bottom, 1.8, 0.6 * tall))
-    plain(figure.colorbar(dots, cax=rail, label=axis_label("time")))
+    rail = style.box_axes(figure, (left + wide + 2.5, bottom, 1.8, 0.6 * tall))
+    style.plain(figure.colorbar(dots, cax=rail, label=axis_label("time")))
 
 
 def _letters(figure: Figure, sheet: _Sheet) -> None:
@@ -295,7 +284,11 @@ class Curve(NamedTuple):
 
 
 def curves_over_time(
-    figure: Figure, boxes: Sequence[Box], course: Course, signals: dict[str, Array], span: slice
+    figure: Figure,
+    boxes: Sequence[style.Box],
+    course: Course,
+    signals: dict[str, Array],
+    span: slice,
 ) -> list[Curve]:
     """Draw F_x, M_B, M_D, r, θ and φ over time."""
     time = to_display("time", course.time)
@@ -307,9 +300,9 @@ def curves_over_time(
     lowest = {left: min(b for at, b, _, _ in boxes if at == left) for left, *_ in boxes}
     curves = []
     for i, (name, box) in enumerate(zip((*TRIPLET, *COORDINATES), boxes, strict=True)):
-        axes = box_axes(figure, box)
+        axes = style.box_axes(figure, box)
         for begin, end in contacts:
-            axes.axvspan(begin, end, color=SHADE, linewidth=0.0, zorder=0)
+            axes.axvspan(begin, end, color=style.SHADE, linewidth=0.0, zorder=0)
         if name in TRIPLET:
             values = to_display(name, signals[name])
             if name == "MD":
@@ -335,12 +328,12 @@ def curves_over_time(
 
 def _signal(axes: Axes, name: str, time: Array, values: Array) -> None:
     if name == "MD":
-        axes.plot(time, values, ".", color=BLUE, markersize=1.6)
+        axes.plot(time, values, ".", color=style.BLUE, markersize=1.6)
         axes.set_ylim(-190.0, 190.0)
         axes.set_yticks([-180.0, 0.0, 180.0])
         return
     axes.axhline(0.0, color="#bfbfbf", linewidth=0.5, zorder=1)
-    axes.plot(time, values, color=BLUE)
+    axes.plot(time, values, color=style.BLUE)
 
 
 def _coordinate(
@@ -358,12 +351,12 @@ def _coordinate(
     known, estimated = points
     if known is not None:
         shown = to_display(name, known[:, column])
-        axes.plot(time[span], shown[span], color=MUTED, linewidth=1.6, zorder=1)
+        axes.plot(time[span], shown[span], color=style.MUTED, linewidth=1.6, zorder=1)
         # What is tracked may be wrong now and then, what is true is not.
         limits.append(_ends(shown[span], 0.0 if true else 0.01))
     if estimated is not None:
         shown = to_display(name, estimated[:, column])
-        axes.plot(time[span], shown[span], ".", color=BLUE, markersize=1.6, zorder=2)
+        axes.plot(time[span], shown[span], ".", color=style.BLUE, markersize=1.6, zorder=2)
         limits.append(_ends(shown[span], 0.01))
     found = np.array(limits).reshape(-1, 2)
     found = found[np.isfinite(found).all(axis=1)]
@@ -372,7 +365,7 @@ def _coordinate(
         room = max(0.06 * (high - low), 1e-3)
         axes.set_ylim(low - room, high + room)
     else:
-        axes.text(0.5, 0.5, "not known", transform=axes.transAxes, ha="center", color=MUTED)
+        axes.text(0.5, 0.5, "not known", transform=axes.transAxes, ha="center", color=style.MUTED)
     return shown
 
 
@@ -386,12 +379,12 @@ def _ends(values: Array, left_out: float) -> Array:
 
 def curve_legend(figure: Figure, course: Course, place: tuple[float, float]) -> None:
     """Say what shades, lines and dots of :func:`curves_over_time` mean."""
-    handles: list[Line2D | Patch] = [Patch(facecolor=SHADE, label="in contact")]
+    handles: list[Line2D | Patch] = [Patch(facecolor=style.SHADE, label="in contact")]
     if course.known is not None:
-        handles.append(Line2D([], [], color=MUTED, linewidth=1.6, label=course.known_as))
+        handles.append(Line2D([], [], color=style.MUTED, linewidth=1.6, label=course.known_as))
     if course.estimated is not None:
         look: dict[str, Any] = {"marker": ".", "markersize": 4.0, "linestyle": "none"}
-        handles.append(Line2D([], [], color=BLUE, label="estimated", **look))
+        handles.append(Line2D([], [], color=style.BLUE, label="estimated", **look))
     figure.legend(
         handles=handles,
         loc="lower right",

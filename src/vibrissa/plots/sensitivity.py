@@ -13,26 +13,13 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from vibrissa.plots.style import (
-    BLUE,
-    INK,
-    MUTED,
-    ORANGE,
-    Width,
-    conclude,
-    looking,
-    new_figure,
-    say,
-    scale_near_zero,
-)
+from vibrissa.plots import style
 from vibrissa.quantities import axis_label, quantity, to_display
-from vibrissa.scene import Array, Mask, robust_limits
+from vibrissa.scene import COORDINATES, DIRECTIONS, Array, Mask, robust_limits
 
-COORDINATES = ("r", "theta", "phi")
 BINS = 25
 SHARE = 0.99
 _PAPER = ("MD", "MB", "Fx")
-_DIRECTIONS = ("FD", "MD")
 _SHARES = (0.1, 0.25, 0.5, 0.75, 0.9)
 _MEDIAN = 2
 _BANDS = ((0, 4), (1, 3))
@@ -63,7 +50,7 @@ def derivative_label(coordinate: str, signal: str) -> str:
     return rf"$\partial {above.symbol}/\partial {below.symbol}$ ({unit})"
 
 
-def sensitivity_panels(data: xr.Dataset, *, width: Width = "double") -> Figure:
+def sensitivity_panels(data: xr.Dataset, *, width: style.Width = "double") -> Figure:
     """Draw the derivatives of r, θ and φ with respect to three signals, over these signals.
 
     Nine panels: a row for each coordinate, a column for each signal, in each the derivative over
@@ -92,10 +79,10 @@ def sensitivity_panels(data: xr.Dataset, *, width: Width = "double") -> Figure:
     """
     contacts = _contacts(data)
     names = list(contacts.signals)
-    with looking():
-        figure = new_figure(width, _HEIGHTS.get(width, 0.0), "constrained")
+    with style.looking():
+        figure = style.new_figure(width, _HEIGHTS.get(width, 0.0), "constrained")
         if not contacts.weight.any():
-            say(figure, "no contacts")
+            style.say(figure, "no contacts")
             return figure
         panels = figure.subplots(3, 3, sharex="col", squeeze=False)
         for i, coordinate in enumerate(COORDINATES):
@@ -106,29 +93,29 @@ def sensitivity_panels(data: xr.Dataset, *, width: Width = "double") -> Figure:
                 axes.set_title(letter, loc="left", fontsize=8.0, fontweight="bold", pad=2.0)
                 if i == 2:
                     axes.set_xlabel(axis_label(name))
-        labels = (("concave forward", BLUE), ("concave backward", ORANGE))
+        labels = (("concave forward", style.BLUE), ("concave backward", style.ORANGE))
         figure.legend(
             handles=[
                 *(
                     Line2D([], [], color=_darker(c), label=f"{words}, median")
                     for words, c in labels
                 ),
-                Patch(color=MUTED, alpha=0.6, linewidth=0.0, label="50 % of contacts"),
-                Patch(color=MUTED, alpha=0.25, linewidth=0.0, label="80 %"),
+                Patch(color=style.MUTED, alpha=0.6, linewidth=0.0, label="50 % of contacts"),
+                Patch(color=style.MUTED, alpha=0.25, linewidth=0.0, label="80 %"),
             ],
             loc="outside upper center",
             ncols=4 if width == "double" else 2,
             borderpad=0.0,
         )
         if finding := _finding(contacts):
-            conclude(figure, finding)
+            style.conclude(figure, finding)
         return figure
 
 
 def _finding(contacts: _Contacts) -> str:
     """State how much more the distance of a contact depends on signals that are small."""
     kept, parts = contacts.weight > 0.0, []
-    for name in (n for n in contacts.signals if n not in _DIRECTIONS):
+    for name in (n for n in contacts.signals if n not in DIRECTIONS):
         size = np.abs(contacts.signals[name][kept])
         slope, weight = np.abs(contacts.derivatives["r", name][kept]), contacts.weight[kept]
         low, high = _quantiles(size, weight, [0.2, 0.8])
@@ -183,13 +170,13 @@ def _panel(axes: Axes, contacts: _Contacts, coordinate: str, name: str, *, small
     kept = contacts.weight > 0.0
     x, y = contacts.signals[name][kept], contacts.derivatives[coordinate, name][kept]
     weight, backward = contacts.weight[kept], contacts.backward[kept]
-    direction = name in _DIRECTIONS
+    direction = name in DIRECTIONS
     limits = np.array([-180.0, 180.0]) if direction else _limits(x, weight)
     bend = _bend(x, weight, direction)
-    axes.axhline(0.0, color=MUTED, linewidth=0.5, zorder=0)
+    axes.axhline(0.0, color=style.MUTED, linewidth=0.5, zorder=0)
     edges = _edges(limits, BINS, bend)
     bands = []
-    for side, colour in ((~backward, BLUE), (backward, ORANGE)):
+    for side, colour in ((~backward, style.BLUE), (backward, style.ORANGE)):
         middle, curves = _spread(x[side], y[side], weight[side], edges)
         bands.append(curves)
         for (low, high), opacity in zip(_BANDS, (0.15, 0.3), strict=True):
@@ -198,7 +185,7 @@ def _panel(axes: Axes, contacts: _Contacts, coordinate: str, name: str, *, small
             )
         axes.plot(middle, curves[_MEDIAN], color=_darker(colour), linewidth=1.0)
     heights = robust_limits(np.concatenate(bands, axis=1), 1.0)
-    scale_near_zero(axes, "x", limits, bend)
+    style.scale_near_zero(axes, "x", limits, bend)
     axes.set_ylim(*heights)
     _ticks(axes, direction, bend, small)
     axes.set_ylabel(
@@ -234,7 +221,7 @@ def _edges(limits: Array, bins: int, bend: float | None) -> Array:
 
 
 def _darker(colour: str) -> str:
-    red, green, blue = 0.6 * np.array(to_rgb(colour)) + 0.4 * np.array(to_rgb(INK))
+    red, green, blue = 0.6 * np.array(to_rgb(colour)) + 0.4 * np.array(to_rgb(style.INK))
     return to_hex((red, green, blue))
 
 

@@ -8,39 +8,14 @@ import numpy as np
 import xarray as xr
 from matplotlib.cm import ScalarMappable
 from matplotlib.colorbar import Colorbar
-from matplotlib.colors import Colormap, FuncNorm, Normalize
+from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from vibrissa import scene
+from vibrissa.plots import style
 from vibrissa.plots.space import AZIMUTH, ELEVATION, bounds, name_axes, paint, painted, space_axes
-from vibrissa.plots.style import (
-    INK,
-    Box,
-    Width,
-    box_axes,
-    corner_title,
-    cyclic,
-    diverging,
-    looking,
-    new_figure,
-    plain,
-    sequential,
-)
 from vibrissa.quantities import axis_label, quantity, to_display
-from vibrissa.scene import (
-    DIRECTIONS,
-    SIGNALS,
-    Array,
-    Mask,
-    column,
-    robust_limits,
-    root,
-    sample_contacts,
-    solid_surface,
-    squared,
-    subdivide,
-    values_of,
-)
 
 _SKIN = (0.80, 0.85, 0.90, 1.0)
 """Colour of the reachable space where it stands for no signal."""
@@ -53,12 +28,12 @@ class _Sheet(NamedTuple):
     """Places of the panels."""
 
     height: float
-    space: Box
-    front: Box
-    signals: tuple[Box, ...]
+    space: style.Box
+    front: style.Box
+    signals: tuple[style.Box, ...]
 
 
-def _sheet(width: Width) -> _Sheet:
+def _sheet(width: style.Width) -> _Sheet:
     if width == "single":
         cells = [(42.5 * (i % 2), 78.0 - 39.0 * (i // 2), 42.5, 38.0) for i in range(6)]
         return _Sheet(167.0, (0.0, 117.0, 56.0, 49.0), (57.0, 117.0, 28.0, 49.0), tuple(cells))
@@ -70,7 +45,7 @@ def signal_clouds(
     samples: xr.Dataset,
     centerline: ArrayLike,
     *,
-    width: Width = "double",
+    width: style.Width = "double",
     cutaway: bool = True,
     elevation: float = ELEVATION,
     azimuth: float = AZIMUTH,
@@ -107,25 +82,31 @@ def signal_clouds(
     ValueError
         If the dataset lacks something, or if there is no such width.
     """
-    nodes = sample_contacts(samples, centerline, _kept(elevation, azimuth) if cutaway else None)
-    whole = nodes if not cutaway else sample_contacts(samples, centerline)
-    outside = column("deflection")
-    triangles = solid_surface(nodes, not cutaway, outside)
+    nodes = scene.sample_contacts(
+        samples, centerline, _kept(elevation, azimuth) if cutaway else None
+    )
+    whole = nodes if not cutaway else scene.sample_contacts(samples, centerline)
+    outside = scene.column("deflection")
+    triangles = scene.solid_surface(nodes, not cutaway, outside)
     line = to_display("centerline", centerline)
     limits = bounds(np.concatenate([_mm(triangles).reshape(-1, 3), line]))
     view = elevation, azimuth
     sheet = _sheet(width)
-    with looking():
-        figure = new_figure(width, sheet.height, None)
+    with style.looking():
+        figure = style.new_figure(width, sheet.height, None)
         _reach(figure, sheet, triangles, line, limits, view)
-        for i, (name, cell) in enumerate(zip(SIGNALS, sheet.signals, strict=True)):
-            corner_title(figure, cell, "cdefgh"[i], _TITLES.get(name, quantity(name).long_name))
-            norm, colours, ends = _scale(name, to_display(name, values_of(name, whole)))
+        for i, (name, cell) in enumerate(zip(scene.SIGNALS, sheet.signals, strict=True)):
+            style.corner_title(
+                figure, cell, "cdefgh"[i], _TITLES.get(name, quantity(name).long_name)
+            )
+            norm, colours, ends = _scale(name, to_display(name, scene.values_of(name, whole)))
             axes = space_axes(figure, _square(cell), limits, view, zoom=0.97, frame=False)
             body = (
-                subdivide(triangles, _turning(name, triangles)) if name in DIRECTIONS else triangles
+                scene.subdivide(triangles, _turning(name, triangles))
+                if name in scene.DIRECTIONS
+                else triangles
             )
-            shown = to_display(name, values_of(name, body))
+            shown = to_display(name, scene.values_of(name, body))
             if name == "Mx" and _vanishes(whole):
                 _body(axes, triangles, np.array(_SKIN), line)
                 _say_zero(figure, cell)
@@ -142,20 +123,20 @@ def _kept(elevation: float, azimuth: float) -> tuple[float, float]:
     return float(toward + np.pi / 4.0), float(toward + 7.0 * np.pi / 4.0)
 
 
-def _mm(triangles: Array) -> Array:
+def _mm(triangles: scene.Array) -> scene.Array:
     return to_display("contact_point", triangles[..., :3])
 
 
-def _turning(name: str, triangles: Array) -> Mask:
+def _turning(name: str, triangles: scene.Array) -> scene.Mask:
     """Whether a direction differs by more than 45° within a triangle, as where a force reverses."""
-    turn = values_of(name, triangles)
+    turn = scene.values_of(name, triangles)
     gap = np.abs(np.angle(np.exp(1j * (turn - np.roll(turn, 1, axis=1)))))
     return np.asarray(gap.max(axis=1) > np.pi / 4.0)
 
 
-def _mean(name: str, values: Array, norm: Normalize, colours: Colormap) -> Array:
+def _mean(name: str, values: scene.Array, norm: Normalize, colours: Colormap) -> scene.Array:
     """Colours of triangles; directions are averaged on the circle."""
-    if name not in DIRECTIONS:
+    if name not in scene.DIRECTIONS:
         return painted(values, norm, colours)
     turn = np.radians(values)
     mean = np.degrees(np.arctan2(np.sin(turn).sum(axis=1), np.cos(turn).sum(axis=1)))
@@ -165,9 +146,9 @@ def _mean(name: str, values: Array, norm: Normalize, colours: Colormap) -> Array
 def _reach(
     figure: Figure,
     sheet: _Sheet,
-    triangles: Array,
-    line: Array,
-    limits: Array,
+    triangles: scene.Array,
+    line: scene.Array,
+    limits: scene.Array,
     view: tuple[float, float],
 ) -> None:
     """The reachable space from aside, and from before the tip."""
@@ -177,7 +158,7 @@ def _reach(
     axes = space_axes(figure, box, limits, view, zoom=0.88)
     name_axes(axes, (-8.0, -9.0, -10.5))
     _body(axes, triangles, colours, line, 0.55)
-    corner_title(figure, sheet.space, "a", "reachable contacts")
+    style.corner_title(figure, sheet.space, "a", "reachable contacts")
     left, bottom, width, height = sheet.front
     side = min(width, height)
     box = left + 0.5 * (width - side), bottom + 0.45 * (height - side), side, side
@@ -185,34 +166,36 @@ def _reach(
     front.set_proj_type("ortho")
     _body(front, triangles, colours, line, 0.55)
     _cross(front, limits)
-    corner_title(figure, sheet.front, "b", "from the tip")
+    style.corner_title(figure, sheet.front, "b", "from the tip")
 
 
-def _body(axes: Any, triangles: Array, colours: Array, line: Array, flat: float = 0.75) -> None:
+def _body(
+    axes: Any, triangles: scene.Array, colours: scene.Array, line: scene.Array, flat: float = 0.75
+) -> None:
     paint(axes, _mm(triangles), colours, flat=flat)
     axes.plot(*line.T, color="black", linewidth=1.2, zorder=10, solid_capstyle="round")
 
 
-def _cross(axes: Any, limits: Array) -> None:
+def _cross(axes: Any, limits: scene.Array) -> None:
     """Bars of 5 mm along y and z at the lower left of the view from the tip."""
     corner = np.array([limits[0, 1], limits[1, 0] - 1.0, limits[2, 0]])
     for i, name in ((1, "y"), (2, "z")):
         end = corner.copy()
         end[i] += 5.0
-        axes.plot(*np.stack([corner, end]).T, color=INK, linewidth=0.8, zorder=11)
+        axes.plot(*np.stack([corner, end]).T, color=style.INK, linewidth=0.8, zorder=11)
         end[i] += 1.6
         axes.text(*end, f"${name}$", fontsize=6.0, ha="center", va="center")
     corner += np.array([0.0, 2.0, -2.6])
     axes.text(*corner, "5 mm", fontsize=5.5, ha="center", va="center")
 
 
-def _vanishes(nodes: Array) -> bool:
+def _vanishes(nodes: scene.Array) -> bool:
     """Whether there is no twisting moment, as for a straight whisker."""
-    twist, bend = (np.abs(values_of(name, nodes)).max() for name in ("Mx", "MB"))
+    twist, bend = (np.abs(scene.values_of(name, nodes)).max() for name in ("Mx", "MB"))
     return bool(twist < 1e-9 * bend)
 
 
-def _say_zero(figure: Figure, cell: Box) -> None:
+def _say_zero(figure: Figure, cell: style.Box) -> None:
     wide, tall = 25.4 * figure.get_size_inches()
     left, bottom, width, _ = cell
     place = (left + 0.5 * width) / wide, (bottom + 6.0) / tall
@@ -221,14 +204,14 @@ def _say_zero(figure: Figure, cell: Box) -> None:
 
 def _pulled(
     figure: Figure,
-    cell: Box,
-    nodes: Array,
+    cell: style.Box,
+    nodes: scene.Array,
     closed: bool,
-    line: Array,
+    line: scene.Array,
     view: tuple[float, float],
 ) -> None:
     """Inset with only the contacts at which the whisker is pulled, with colours of its own."""
-    triangles = solid_surface(nodes, closed, column("deflection"), column("Fx"))
+    triangles = scene.solid_surface(nodes, closed, scene.column("deflection"), scene.column("Fx"))
     if not len(triangles):
         return
     left, bottom, width, height = cell
@@ -236,44 +219,38 @@ def _pulled(
     side = 0.42 * width
     box = left + width - 1.03 * side, bottom + 0.845 * height - 0.5 * side, side, side
     axes = space_axes(figure, box, limits, view, zoom=1.1, frame=False)
-    values = to_display("Fx", values_of("Fx", triangles))
-    norm, colours = Normalize(0.0, float(values.max())), sequential()
+    values = to_display("Fx", scene.values_of("Fx", triangles))
+    norm, colours = Normalize(0.0, float(values.max())), style.sequential()
     _body(axes, triangles, painted(values, norm, colours), line, 1.0)
     axes.lines[0].set_linewidth(0.7)
     start, end = left + 0.66 * width, bottom + 0.91 * height
-    rail = box_axes(figure, (start, end, 0.22 * width, 1.0))
+    rail = style.box_axes(figure, (start, end, 0.22 * width, 1.0))
     bar = figure.colorbar(ScalarMappable(norm, colours), cax=rail, orientation="horizontal")
-    plain(bar)
+    style.plain(bar)
     rail.xaxis.set_ticks_position("top")
     bar.set_ticks([0.0, values.max()], labels=["$F_x$ > 0", f"{values.max():.2g} µN"])
     rail.tick_params(length=0.0, pad=1.0, labelsize=5.0)
 
 
-def _scale(name: str, values: Array) -> tuple[Normalize, Colormap, str]:
+def _scale(name: str, values: scene.Array) -> tuple[Normalize, Colormap, str]:
     """Limits and map of the colours of a signal, and which ends of the map are exceeded."""
-    if name in DIRECTIONS:
-        return Normalize(-180.0, 180.0), cyclic(), "neither"
-    signed = name == "Mx"
-    low, high = robust_limits(values, symmetric=signed)
-    if name in ("FT", "MB"):
-        low = 0.0
-    below, above = bool(values.min() < low), bool(values.max() > high)
-    ends = ("neither", "max", "min", "both")[2 * below + above]
-    norm = FuncNorm((root, squared), vmin=low, vmax=high)
-    return norm, diverging() if signed else sequential(), ends
+    norm, colours = style.scale_of(name, values)
+    low, high = norm.vmin or 0.0, norm.vmax or 0.0
+    ends = ("neither", "max", "min", "both")[2 * (values.min() < low) + (values.max() > high)]
+    return norm, colours, ends
 
 
-def _square(cell: Box) -> Box:
+def _square(cell: style.Box) -> style.Box:
     """The room of a panel for its 3D axes, which are square and reach beyond it."""
     left, bottom, width, height = cell
     side = 1.1 * width
     return left - 0.07 * width, bottom + 0.50 * height - 0.5 * side, side, side
 
 
-def _rail(figure: Figure, cell: Box) -> Any:
+def _rail(figure: Figure, cell: style.Box) -> Any:
     """Axes for a colour bar at the lower end of a panel."""
     left, bottom, width, _ = cell
-    return box_axes(figure, (left + 0.2 * width, bottom + 6.8, 0.6 * width, 1.5))
+    return style.box_axes(figure, (left + 0.2 * width, bottom + 6.8, 0.6 * width, 1.5))
 
 
 def _bar(
@@ -282,12 +259,12 @@ def _bar(
     bar = figure.colorbar(
         ScalarMappable(norm, colours), cax=rail, extend=ends, orientation="horizontal"
     )
-    plain(bar)
+    style.plain(bar)
     bar.ax.tick_params(length=2.0, pad=1.5, labelsize=5.5)
     bar.ax.set_xlabel(axis_label(name), fontsize=6.5, labelpad=1.0)
     assert norm.vmin is not None
     assert norm.vmax is not None
-    if name in DIRECTIONS:
+    if name in scene.DIRECTIONS:
         bar.set_ticks([-180.0, -90.0, 0.0, 90.0, 180.0])
     else:
         marks = _round_roots(norm.vmin, norm.vmax)

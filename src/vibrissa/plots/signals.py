@@ -14,10 +14,9 @@ from matplotlib.patches import Patch
 from vibrissa.plots.style import BLUE, INK, SHADE, Width, conclude, head, looking, new_figure, say
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.recording import Group
-from vibrissa.scene import Array, Mask
+from vibrissa.scene import DIRECTIONS, Array, Mask
 
 _COLUMNS = (("Fx", "FT", "FD"), ("Mx", "MB", "MD"))
-_DIRECTIONS = ("FD", "MD")
 
 
 def signals_over_time(
@@ -96,20 +95,20 @@ def _panel(
     if contact is not None:
         for begin, end in intervals(time, contact):
             axes.axvspan(begin, end, color=SHADE, linewidth=0.0, zorder=0)
-    if name not in _DIRECTIONS:
+    if name not in DIRECTIONS:
         axes.axhline(0.0, color="#bfbfbf", linewidth=0.5, zorder=1)
     look: dict[str, Any] = (
-        {"marker": ".", "markersize": 1.6, "linestyle": "none"} if name in _DIRECTIONS else {}
+        {"marker": ".", "markersize": 1.6, "linestyle": "none"} if name in DIRECTIONS else {}
     )
     if name in signals:
         axes.plot(time, _drawn(name, signals, contact), color=BLUE, zorder=2, **look)
     if truth is not None and name in truth:
         look["markersize"] = 0.8
-        line = {"linewidth": 0.4} if name not in _DIRECTIONS else look
+        line = {"linewidth": 0.4} if name not in DIRECTIONS else look
         values = _drawn(name, truth, contact)
         axes.plot(time, values, color=INK, zorder=3, **line)
     axes.set_ylabel(axis_label(name))
-    if name in _DIRECTIONS:
+    if name in DIRECTIONS:
         axes.set_ylim(-190.0, 190.0)
         axes.set_yticks([-180.0, -90.0, 0.0, 90.0, 180.0])
 
@@ -118,7 +117,7 @@ def _drawn(name: str, data: xr.Dataset, contact: Mask | None) -> Array:
     """Values in display units, of a direction only those in contact."""
     values = to_display(name, data[name])
     return (
-        values if name not in _DIRECTIONS or contact is None else np.where(contact, values, np.nan)
+        values if name not in DIRECTIONS or contact is None else np.where(contact, values, np.nan)
     )
 
 

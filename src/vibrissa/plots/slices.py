@@ -17,19 +17,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import MaxNLocator
 
-from vibrissa.plots.style import (
-    INK,
-    MUTED,
-    Width,
-    diverging,
-    head,
-    looking,
-    new_figure,
-    plain,
-    say,
-    scale_near_zero,
-    sequential,
-)
+from vibrissa.plots import style
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import Array, robust_limits
 
@@ -46,7 +34,7 @@ _NOTHING = 0.1
 
 
 def solid_slices(
-    plane: xr.Dataset, solid: xr.Dataset | None = None, *, width: Width = "double"
+    plane: xr.Dataset, solid: xr.Dataset | None = None, *, width: style.Width = "double"
 ) -> Figure:
     """Draw a slice through the solid of contacts in the space of three signals, and the solid.
 
@@ -76,14 +64,14 @@ def solid_slices(
     if missing or plane["r"].ndim != 2:
         raise ValueError(f"the slice lacks {', '.join(missing) or 'its two dimensions'}")
     names = [n for n in _PANELS if n in plane and np.isfinite(plane[n].values).any()]
-    with looking():
+    with style.looking():
         shape = (1, 3) if solid is None and width == "double" and len(names) == 3 else (2, 2)
         tall = 90.0 if shape == (2, 2) else 55.0
         if solid is not None:
             tall = 98.0 if width == "double" else 158.0
-        figure = new_figure(width, tall, "constrained")
+        figure = style.new_figure(width, tall, "constrained")
         if not names:
-            say(figure, "no contacts")
+            style.say(figure, "no contacts")
             return figure
         if solid is None:
             _slices(figure, plane, names, "abcd", shape)
@@ -113,13 +101,13 @@ def _slices(
     known = np.isfinite(plane["r"].transpose(*dims).to_numpy())
     for i, (axis, values) in enumerate(zip("xy", (x, y), strict=True)):
         there = values[known.any(axis=1 - i)]
-        scale_near_zero(
+        style.scale_near_zero(
             panels[0], axis, np.array([there.min(), there.max()]), _width(plane, dims[i])
         )
     for axes, name, letter in zip(panels, names, letters, strict=False):
         values = to_display(name, plane[name].transpose(*dims[::-1]).to_numpy())
         _lines(axes, x, y, values, name)
-        head(axes, letter, _title(name))
+        style.head(axes, letter, _title(name))
     if "small_deflection" in plane:
         near = plane["small_deflection"].transpose(*dims[::-1]).to_numpy()
         for axes in panels[: len(names)]:
@@ -152,25 +140,28 @@ def _lines(axes: Axes, x: Array, y: Array, values: Array, name: str) -> None:
             x, y, np.where(np.isfinite(values), 0.0, np.nan), cmap="gray", vmin=-9, vmax=2
         )
         words = f"within {np.nanmax(np.abs(values)):.1g}° of zero"
-        axes.text(0.5, 0.9, words, transform=axes.transAxes, ha="center", color=MUTED)
+        axes.text(0.5, 0.9, words, transform=axes.transAxes, ha="center", color=style.MUTED)
         return
     signed = not error and min(-low, high) > 0.1 * max(-low, high)
     if signed:
         low, high = -max(-low, high), max(-low, high)
     norm = LogNorm(*_decades(values)) if error else Normalize(low, high)
-    look: dict[str, Any] = {"cmap": diverging() if signed else sequential(), "norm": norm}
+    look: dict[str, Any] = {
+        "cmap": style.diverging() if signed else style.sequential(),
+        "norm": norm,
+    }
     mesh = axes.pcolormesh(x, y, values, rasterized=True, **look)
     if error:
         _error_bar(_rail(axes, mesh))
         return
     steps = MaxNLocator(5).tick_values(low, high)
     steps = steps[(steps >= low) & (steps <= high)]
-    axes.contour(x, y, values, steps, colors=INK, linewidths=0.5, linestyles="solid")
+    axes.contour(x, y, values, steps, colors=style.INK, linewidths=0.5, linestyles="solid")
     bar = _rail(axes, mesh)
     bar.set_ticks(steps, labels=[f"{step:g}".replace("-", "−") for step in steps])
     # The lines in the panel are at the ticks.
     bar.ax.vlines(
-        steps, 0.0, 1.0, colors=INK, linewidths=0.5, transform=bar.ax.get_xaxis_transform()
+        steps, 0.0, 1.0, colors=style.INK, linewidths=0.5, transform=bar.ax.get_xaxis_transform()
     )
 
 
@@ -178,7 +169,7 @@ def _rail(axes: Axes, mesh: Any) -> Colorbar:
     """A colour bar in the upper right corner of a panel, which the solid leaves empty."""
     rail = axes.inset_axes((0.5, 0.93, 0.46, 0.035))
     bar: Colorbar = axes.figure.colorbar(mesh, cax=rail, orientation="horizontal", extend="both")
-    plain(bar)
+    style.plain(bar)
     bar.ax.tick_params(labelsize=5.0, length=2.0, pad=1.5)
     bar.minorticks_off()
     return bar
@@ -226,7 +217,7 @@ def _solid(figure: Figure | SubFigure, solid: xr.Dataset, plane: xr.Dataset) -> 
         third[shown],
         c=error[shown],
         s=2.5,
-        cmap=sequential(),
+        cmap=style.sequential(),
         norm=LogNorm(*_decades(error[shown])),
         linewidths=0.0,
         depthshade=False,
@@ -244,7 +235,7 @@ def _solid(figure: Figure | SubFigure, solid: xr.Dataset, plane: xr.Dataset) -> 
 
 
 def _error_bar(bar: Colorbar) -> None:
-    plain(bar)
+    style.plain(bar)
     low, high = bar.mappable.get_clim()
     ticks = [t for t in _STEPS if (low or 0.0) <= t <= (high or np.inf)]
     bar.set_ticks(ticks, labels=[f"{t:g}" for t in ticks])
@@ -259,7 +250,7 @@ def _frame(axes: Any, names: tuple[str, str, str]) -> None:
     for name, letter, pad in zip(names, "xyz", (-8.0, -8.0, -5.0), strict=True):
         axis = getattr(axes, f"{letter}axis")
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
-        axis.line.set(color=MUTED, linewidth=0.5)
+        axis.line.set(color=style.MUTED, linewidth=0.5)
         axis._axinfo["grid"].update(color="#e2e2e2", linewidth=0.4)
         axis.set_label_text(axis_label(name), fontsize=6.0)
         axis.labelpad = pad

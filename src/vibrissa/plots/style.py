@@ -25,13 +25,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backend_bases import RendererBase
 from matplotlib.colorbar import Colorbar
-from matplotlib.colors import Colormap, ListedColormap
+from matplotlib.colors import Colormap, FuncNorm, ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
+from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from vibrissa.io import replacing
-from vibrissa.scene import Array, robust_limits
+from vibrissa.scene import DIRECTIONS, SIGNALS, Array, robust_limits, root, squared
 
 Width = Literal["single", "double"]
 Box = tuple[float, float, float, float]
@@ -235,6 +236,26 @@ def limits_around(points: Array, margin: float, narrowest: float) -> Array:
     return np.stack([middle - half, middle + half], axis=1)
 
 
+def usable_rows(
+    shade: Array | None, wanted: Mapping[str, tuple[Array | None, tuple[int, ...]]]
+) -> NDArray[np.intp]:
+    """Find rows in which nothing is missing, those of the largest shade last, to be on top.
+
+    What is given, by name, must have the shape that is next to it.
+    """
+    given = {name: (np.asarray(v), shape) for name, (v, shape) in wanted.items() if v is not None}
+    faults = [
+        f"{name} has shape {values.shape}; {shape} is needed"
+        for name, (values, shape) in given.items()
+        if values.shape != shape
+    ]
+    if faults:
+        raise ValueError("; ".join(faults))
+    known = [np.isfinite(v).all(axis=tuple(range(1, v.ndim))) for v, _ in given.values()]
+    rows = np.flatnonzero(np.all(known, axis=0))
+    return rows if shade is None else rows[np.argsort(shade[rows], kind="stable")]
+
+
 def plain(bar: Colorbar) -> None:
     """Take the frame off a colour bar."""
     outline: Any = bar.outline  # a spine, whatever Matplotlib's stubs say
@@ -371,6 +392,25 @@ def sequential() -> Colormap:
 def diverging() -> Colormap:
     """Make a colormap for what has a sign."""
     return mpl.colormaps["coolwarm"]
+
+
+def scale_of(name: str, values: Array) -> tuple[Normalize, Colormap]:
+    """Choose limits, scale and colours of a quantity in display units.
+
+    Directions go round; sizes and signed signals go with the square root, as most contacts are
+    light; predicted errors with the logarithm. The outermost 2 % of the values are left out.
+    """
+    if name in DIRECTIONS:
+        return Normalize(-180.0, 180.0), cyclic()
+    if name == "predicted_error":
+        low, high = robust_limits(values[values > 0.0], 0.95)
+        return LogNorm(max(low, 1e-3 * high), high), sequential()
+    if name not in SIGNALS:
+        return Normalize(*robust_limits(values)), sequential()
+    low, high = robust_limits(values, symmetric=name == "Mx")
+    low = 0.0 if name in ("FT", "MB") else low
+    norm = FuncNorm((root, squared), vmin=low, vmax=high)
+    return norm, diverging() if name == "Mx" else sequential()
 
 
 def shading(values: Array | None) -> dict[str, Any]:

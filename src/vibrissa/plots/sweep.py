@@ -12,24 +12,12 @@ from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from vibrissa.plots.style import (
-    BLUE,
-    INK,
-    MUTED,
-    SHADE,
-    Width,
-    conclude,
-    head,
-    looking,
-    new_figure,
-    plain,
-    sequential,
-)
-from vibrissa.plots.verdicts import VERDICTS, triplet_label
+from vibrissa.plots import style
+from vibrissa.plots.verdicts import PAPERS_CONE, VERDICTS, triplet_label
 from vibrissa.scene import Array, root, squared
 
 _MARKS = dict(zip(VERDICTS, ("o", "D", "X"), strict=True))
-_KEY: Any = {"facecolors": "white", "edgecolors": INK, "linewidths": 0.6}
+_KEY: Any = {"facecolors": "white", "edgecolors": style.INK, "linewidths": 0.6}
 """Look of marks in the legend: their shape is the verdict, their colour the critical cone."""
 
 _MOST = 3
@@ -49,7 +37,7 @@ _ROW, _FRAME = 4.4, 20.0
 
 
 def sweep_overview(
-    found: xr.Dataset, *, task: str | None = None, width: Width = "double"
+    found: xr.Dataset, *, task: str | None = None, width: style.Width = "double"
 ) -> Figure:
     """Draw what a task of a study found.
 
@@ -66,7 +54,7 @@ def sweep_overview(
             f"that have: {', '.join(known) or 'none'}"
         )
     task = task or known[0]
-    with looking():
+    with style.looking():
         if f"{task}_verdict" not in found:
             return _errors(found, task, width)
         verdict = found[f"{task}_verdict"]
@@ -85,11 +73,13 @@ def drawable(found: xr.Dataset) -> list[str]:
     ]
 
 
-def _verdicts(found: xr.Dataset, verdict: xr.DataArray, degrees: Array, width: Width) -> Figure:
+def _verdicts(
+    found: xr.Dataset, verdict: xr.DataArray, degrees: Array, width: style.Width
+) -> Figure:
     names = [str(name) for name in verdict[verdict.dims[1]].values]
     count = len(names)
     if count > _MOST:
-        figure = new_figure(width, _FRAME + _ROW * count, "constrained")
+        figure = style.new_figure(width, _FRAME + _ROW * count, "constrained")
         axes = figure.subplots()
         _lines(axes, [triplet_label(name) for name in names])
         for i in range(count):
@@ -98,34 +88,40 @@ def _verdicts(found: xr.Dataset, verdict: xr.DataArray, degrees: Array, width: W
         _key(figure, verdict.values)
         held = (verdict.values == VERDICTS[0]).all(axis=0)
         shown = ", ".join(f"({triplet_label(names[i])})" for i in np.flatnonzero(held)) or "none"
-        conclude(figure, f"Unique for each of {len(degrees)} whiskers: {shown}")
+        style.conclude(figure, f"Unique for each of {len(degrees)} whiskers: {shown}")
         return figure
     groups = found["group"].values.astype(str)
     rows = list(dict.fromkeys(groups))
     tall = max(52.0, 16.0 + _ROW * len(rows)) * count + 8.0
-    figure = new_figure(width, tall if width == "double" else 1.7 * tall, "constrained")
+    figure = style.new_figure(width, tall if width == "double" else 1.7 * tall, "constrained")
     shape = (count, 2) if width == "double" else (2 * count, 1)
     panels = figure.subplots(*shape, squeeze=False).ravel()
     for i, name in enumerate(names):
         left, right = panels[2 * i], panels[2 * i + 1]
         words = verdict.values[:, i]
         _chart(left, found, words, degrees[:, i])
-        held = int((words == VERDICTS[0]).sum())
-        head(left, "ace"[i], f"{triplet_label(name)}: unique for {held} of {len(words)} whiskers")
+        style.head(left, "ace"[i], f"{triplet_label(name)} by taper and turn")
         _lines(right, rows)
         at = np.array([rows.index(group) for group in groups], dtype=int)
         _spread(right, degrees[:, i], words, at)
         _cone_axis(right)
-        head(right, "bdf"[i], "by group of whiskers")
+        style.head(right, "bdf"[i], "by group of whiskers")
     bar = figure.colorbar(
-        ScalarMappable(_NORM, sequential().reversed()),
+        ScalarMappable(_NORM, style.sequential().reversed()),
         ax=list(panels[::2]),
         aspect=30,
         spacing="uniform",
     )
-    plain(bar)
+    style.plain(bar)
     bar.set_label("critical cone (°)")
     _key(figure, verdict.values)
+    unique = (verdict.values == VERDICTS[0]).sum(axis=0)
+    parts = [
+        f"no two contacts outside {PAPERS_CONE:g}° have the same ({triplet_label(name)}) on {held}"
+        for name, held in zip(names, unique, strict=True)
+    ]
+    searched = f"As far as was searched, {', '.join(parts)} of {len(degrees)} whiskers"
+    style.conclude(figure, searched)
     return figure
 
 
@@ -141,9 +137,9 @@ def _chart(axes: Axes, found: xr.Dataset, words: NDArray[np.str_], degrees: Arra
                 c=degrees[k : k + 1],
                 s=size[k],
                 norm=_NORM,
-                cmap=sequential().reversed(),
+                cmap=style.sequential().reversed(),
                 marker=_MARKS[str(words[k])],
-                edgecolors=INK,
+                edgecolors=style.INK,
                 linewidths=0.4,
             )
     axes.set_xscale("log")
@@ -165,7 +161,7 @@ def _lines(axes: Axes, labels: list[str]) -> None:
     axes.tick_params(axis="y", length=0.0)
     axes.spines["left"].set_visible(False)
     for line in range(1, len(labels)):
-        axes.axhline(line - 0.5, color=SHADE, linewidth=0.6, zorder=0)
+        axes.axhline(line - 0.5, color=style.SHADE, linewidth=0.6, zorder=0)
 
 
 def _spread(axes: Axes, x: Array, words: NDArray[np.str_], line: NDArray[np.int_]) -> None:
@@ -180,8 +176,8 @@ def _spread(axes: Axes, x: Array, words: NDArray[np.str_], line: NDArray[np.int_
             s=13,
             c=x[here],
             norm=_NORM,
-            cmap=sequential().reversed(),
-            edgecolors=INK,
+            cmap=style.sequential().reversed(),
+            edgecolors=style.INK,
             linewidths=0.3,
         )
 
@@ -190,7 +186,7 @@ def _cone_axis(axes: Axes) -> None:
     axes.set_xscale("function", functions=_ROOT)
     axes.set_xticks(_CONES[1:], labels=[f"{cone:.0f}" for cone in _CONES[1:]])
     axes.set_xlim(-0.02, 1.08 * _CONES[-1])
-    axes.axvspan(-0.02, 2.0, color=SHADE, linewidth=0.0, zorder=-1)  # the cone the paper leaves out
+    axes.axvspan(-0.02, PAPERS_CONE, color=style.SHADE, linewidth=0.0, zorder=-1)
     axes.set_xlabel("critical cone (°; shaded: the paper's 2°)")
 
 
@@ -203,23 +199,23 @@ def _key(figure: Figure, words: NDArray[np.str_]) -> None:
     figure.legend(handles=marks, loc="outside lower center", ncols=3, frameon=False)
 
 
-def _errors(found: xr.Dataset, task: str, width: Width) -> Figure:
+def _errors(found: xr.Dataset, task: str, width: style.Width) -> Figure:
     error = found[f"{task}_median_error"]
     dim = error.dims[1]
     labels = [_label(value, str(dim)) for value in error[dim].values]
-    figure = new_figure(width, _FRAME + 1.6 * _ROW * len(labels), "constrained")
+    figure = style.new_figure(width, _FRAME + 1.6 * _ROW * len(labels), "constrained")
     axes = figure.subplots()
     _lines(axes, labels)
     for i in range(len(labels)):
         values = error.values[:, i] * 1e3
         values = np.sort(np.clip(values[~np.isnan(values)], *_ERRORS))
         place = np.arange(values.size) * 2 % 5 - 2.0
-        axes.scatter(values, i + 0.13 * place, s=11, color=BLUE, alpha=0.75, linewidths=0.0)
+        axes.scatter(values, i + 0.13 * place, s=11, color=style.BLUE, alpha=0.75, linewidths=0.0)
         if values.size:
-            axes.plot(2 * [np.median(values)], [i - 0.42, i + 0.42], color=INK, linewidth=1.0)
+            axes.plot(2 * [np.median(values)], [i - 0.42, i + 0.42], color=style.INK, linewidth=1.0)
     axes.set_xscale("log")
     axes.grid(axis="x", which="major")
-    axes.tick_params(axis="x", which="minor", color=MUTED)
+    axes.tick_params(axis="x", which="minor", color=style.MUTED)
     axes.set_xlabel("median error of the contact point (mm); a mark for each whisker")
     return figure
 

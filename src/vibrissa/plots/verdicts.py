@@ -15,22 +15,7 @@ from matplotlib.patches import Circle, Wedge
 from matplotlib.ticker import NullLocator
 from numpy.typing import NDArray
 
-from vibrissa.plots.style import (
-    BLUE,
-    GREEN,
-    INK,
-    MUTED,
-    ORANGE,
-    SHADE,
-    Width,
-    conclude,
-    head,
-    looking,
-    new_figure,
-    page_width,
-    plain,
-    sequential,
-)
+from vibrissa.plots import style
 from vibrissa.quantities import quantity, to_display
 from vibrissa.scene import Array
 
@@ -49,7 +34,7 @@ _TOLERANCE = 1e-3
 """Share of each signal's range at which the resolution is stated."""
 
 
-def verdict_table(verdicts: xr.Dataset, *, width: Width = "double") -> Figure:
+def verdict_table(verdicts: xr.Dataset, *, width: style.Width = "double") -> Figure:
     """Draw the table of verdicts: a row for each triplet, a column for each region.
 
     A full disc stands for unique, a half one for unique off a surface, an open ring for not unique.
@@ -83,9 +68,9 @@ def verdict_table(verdicts: xr.Dataset, *, width: Width = "double") -> Figure:
     triplets = [str(t) for t in verdicts["triplet"].values]
     regions = [str(r) for r in verdicts["region"].values]
     height = _HEAD + _FOOT + _ROW * len(triplets)
-    page = page_width(width)
-    with looking():
-        figure = new_figure(width, height, None)
+    page = style.page_width(width)
+    with style.looking():
+        figure = style.new_figure(width, height, None)
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0.0, page), ylim=(height, 0.0))
         axes.set_axis_off()
         shares = verdicts.get("ambiguous_share")
@@ -101,7 +86,7 @@ def verdict_table(verdicts: xr.Dataset, *, width: Width = "double") -> Figure:
                 triplet_label(t) for t, v in zip(triplets, every, strict=True) if v == VERDICTS[0]
             ]
             shown = ", ".join(f"({name})" for name in found) or "none"
-            conclude(
+            style.conclude(
                 figure,
                 f"{len(found)} of {len(triplets)} triplets locate every contact, as far as was "
                 f"searched: {shown}",
@@ -126,10 +111,10 @@ def triplet_label(triplet: str) -> str:
 
 
 def _line(axes: Axes, y: float, page: float, weight: float) -> None:
-    axes.plot([1.5, page - 1.5], [y, y], color=INK, linewidth=weight)
+    axes.plot([1.5, page - 1.5], [y, y], color=style.INK, linewidth=weight)
 
 
-def _heads(axes: Axes, regions: list[str], width: Width, page: float, shares: bool) -> None:
+def _heads(axes: Axes, regions: list[str], width: style.Width, page: float, shares: bool) -> None:
     names, column, notation = _EDGES[width]
     base = _HEAD - 2.0
     look: dict[str, Any] = {"fontsize": 6.5, "va": "bottom"}
@@ -147,17 +132,24 @@ def _heads(axes: Axes, regions: list[str], width: Width, page: float, shares: bo
         axes.text(left + notation + 14.0, base, "ambiguous\nat 0.1 %", linespacing=1.1, **look)
 
 
-def _row(axes: Axes, verdict: xr.Dataset, i: int, chosen: bool, width: Width, page: float) -> None:
+def _row(
+    axes: Axes, verdict: xr.Dataset, i: int, chosen: bool, width: style.Width, page: float
+) -> None:
     names, column, notation = _EDGES[width]
     y = _HEAD + (i + 0.5) * _ROW
     if i % 2 == 0:
         axes.fill_between(
-            [1.5, page - 1.5], y - 0.5 * _ROW, y + 0.5 * _ROW, color=SHADE, alpha=0.45, linewidth=0
+            [1.5, page - 1.5],
+            y - 0.5 * _ROW,
+            y + 0.5 * _ROW,
+            color=style.SHADE,
+            alpha=0.45,
+            linewidth=0,
         )
     label = triplet_label(str(verdict["triplet"].values))
-    axes.text(4.0, y, label, fontsize=6.5, va="center", color=BLUE if chosen else INK)
+    axes.text(4.0, y, label, fontsize=6.5, va="center", color=style.BLUE if chosen else style.INK)
     if chosen:
-        axes.plot(2.6, y, marker=">", markersize=2.5, color=BLUE)
+        axes.plot(2.6, y, marker=">", markersize=2.5, color=style.BLUE)
     for j, kind in enumerate(verdict["verdict"].values):
         x = names + (j + 0.5) * column
         _symbol(axes, x, y, str(kind))
@@ -177,12 +169,14 @@ def _symbol(axes: Axes, x: float, y: float, kind: str) -> None:
     if kind == EMPTY:
         return
     size = 1.15
-    colour = MUTED if kind == "not unique" else BLUE
+    colour = style.MUTED if kind == "not unique" else style.BLUE
     axes.add_patch(Circle((x, y), size, facecolor="white", edgecolor=colour, linewidth=0.7))
     if kind == "unique":
-        axes.add_patch(Circle((x, y), size, facecolor=BLUE, edgecolor=BLUE, linewidth=0.7))
+        axes.add_patch(
+            Circle((x, y), size, facecolor=style.BLUE, edgecolor=style.BLUE, linewidth=0.7)
+        )
     elif kind == "unique off a surface":
-        axes.add_patch(Wedge((x, y), size, 90.0, 270.0, facecolor=BLUE, linewidth=0.0))
+        axes.add_patch(Wedge((x, y), size, 90.0, 270.0, facecolor=style.BLUE, linewidth=0.0))
 
 
 def _separation(verdict: xr.Dataset, region: int) -> str:
@@ -206,14 +200,14 @@ def _evidence(axes: Axes, verdict: xr.Dataset, left: float, y: float) -> None:
         nearest = int(np.argmin(np.abs(np.log(share["signal_tolerance"].values / _TOLERANCE))))
         value = float(share.isel(signal_tolerance=nearest))
         if np.isfinite(value):
-            axes.barh(y, 9.0 * value, 0.35 * _ROW, left + 14.0, color=MUTED)
+            axes.barh(y, 9.0 * value, 0.35 * _ROW, left + 14.0, color=style.MUTED)
             axes.text(left + 14.6 + 9.0 * value, y, f"{100.0 * value:.0f} %", **look)
 
 
-def _key(axes: Axes, height: float, width: Width) -> None:
+def _key(axes: Axes, height: float, width: style.Width) -> None:
     """Explain the symbols."""
     y = height - _FOOT + 3.0
-    axes.plot([1.5, axes.get_xlim()[1] - 1.5], [y - 3.0] * 2, color=INK, linewidth=0.9)
+    axes.plot([1.5, axes.get_xlim()[1] - 1.5], [y - 3.0] * 2, color=style.INK, linewidth=0.9)
     x = 3.5
     for kind, room in zip(VERDICTS, (14.0, 30.0, 20.0), strict=True):
         _symbol(axes, x, y, kind)
@@ -228,17 +222,17 @@ HIGHLIGHTED = ("Fx MB MD", "Mx MB MD", "Fx FD MD")
 """The three triplets that the paper finds unique for its γ whisker."""
 
 _LINES: tuple[tuple[str, Any, str], ...] = (
-    (BLUE, "-", "o"),
-    (ORANGE, "--", "s"),
-    (GREEN, ":", "^"),
+    (style.BLUE, "-", "o"),
+    (style.ORANGE, "--", "s"),
+    (style.GREEN, ":", "^"),
 )
-_PAPERS_CONE = 2.0
+PAPERS_CONE = 2.0
 """Degrees that the paper leaves out about rest."""
 _JUMP = 25.0
 """Degrees by which neighbours in a map of critical cones differ at most if it is continuous."""
 
 
-def resolution(verdicts: xr.Dataset, *, width: Width = "double") -> Figure:
+def resolution(verdicts: xr.Dataset, *, width: style.Width = "double") -> Figure:
     """Draw how many contacts another one resembles, against the signals' tolerance.
 
     A panel for each region. The paper's three triplets stand out by colour, dashes and markers; the
@@ -272,15 +266,15 @@ def resolution(verdicts: xr.Dataset, *, width: Width = "double") -> Figure:
     share = verdicts["ambiguous_share"].transpose("region", "triplet", "signal_tolerance")
     across = 3 if width == "double" else 2
     down = -(-share.sizes["region"] // across)
-    with looking():
-        figure = new_figure(width, 38.0 * down + 10.0, "constrained")
+    with style.looking():
+        figure = style.new_figure(width, 38.0 * down + 10.0, "constrained")
         grid = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False)
         for i, axes in enumerate(grid.ravel()):
             if i >= share.sizes["region"]:
                 axes.set_axis_off()
                 continue
             _shares(axes, share.isel(region=i))
-            head(axes, "abcdefghijkl"[i], str(share["region"].values[i]))
+            style.head(axes, "abcdefghijkl"[i], str(share["region"].values[i]))
         for axes in grid[:, 0]:
             axes.set_ylabel("ambiguous contacts (%)")
         for axes in grid[-1]:
@@ -289,7 +283,7 @@ def resolution(verdicts: xr.Dataset, *, width: Width = "double") -> Figure:
         at = share.isel(region=0).sel(signal_tolerance=_TOLERANCE, method="nearest")
         if np.isfinite(at.values).any():
             best = at.isel(triplet=int(np.nanargmin(at.values)))
-            conclude(
+            style.conclude(
                 figure,
                 f"With signals known to {100.0 * float(best['signal_tolerance']):g} % of their "
                 f"ranges ({triplet_label(str(best['triplet'].values))}) leaves fewest contacts "
@@ -334,7 +328,7 @@ def _resolution_key(figure: Figure, share: xr.DataArray) -> None:
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
 
 
-def critical_cones(cones: xr.Dataset, *, width: Width = "double") -> Figure:
+def critical_cones(cones: xr.Dataset, *, width: style.Width = "double") -> Figure:
     """Draw the critical cone of whiskers by curvature and taper.
 
     Parameters
@@ -366,19 +360,19 @@ def critical_cones(cones: xr.Dataset, *, width: Width = "double") -> Figure:
     cone = cones["critical_cone"].transpose("triplet", "taper_ratio", "curvature")
     degrees = np.degrees(cone.values)
     high = float(np.nanmax(degrees, initial=5.0))
-    norm, colours = Normalize(0.0, high), sequential().reversed()
+    norm, colours = Normalize(0.0, high), style.sequential().reversed()
     count = cone.sizes["triplet"]
-    with looking():
+    with style.looking():
         shape = (1, count) if width == "double" else (count, 1)
         tall = 62.0 if width == "double" else 46.0 * count + 14.0
-        figure = new_figure(width, tall, "constrained")
+        figure = style.new_figure(width, tall, "constrained")
         grid = figure.subplots(*shape, sharex=True, sharey=True, squeeze=False)
         for i, axes in enumerate(grid.ravel()):
             _cone_map(axes, cone.isel(triplet=i), degrees[i], norm, colours)
             known = degrees[i][np.isfinite(degrees[i])]
-            narrow = f"{(known <= _PAPERS_CONE).sum()} of {known.size} within {_PAPERS_CONE:g}°"
+            narrow = f"{(known <= PAPERS_CONE).sum()} of {known.size} within {PAPERS_CONE:g}°"
             name = triplet_label(str(cone["triplet"].values[i]))
-            head(axes, "abcdefghijkl"[i], f"{name}: {narrow}")
+            style.head(axes, "abcdefghijkl"[i], f"{name}: {narrow}")
         for axes in grid[:, 0]:
             axes.set_ylabel("base / tip radius")
         for axes in grid[-1]:
@@ -391,9 +385,9 @@ def critical_cones(cones: xr.Dataset, *, width: Width = "double") -> Figure:
             aspect=35,
             pad=0.03,
         )
-        plain(bar)
+        style.plain(bar)
         bar.set_label(_cone_label(degrees))
-        bar.ax.axvline(_PAPERS_CONE, color=INK, linewidth=0.9)
+        bar.ax.axvline(PAPERS_CONE, color=style.INK, linewidth=0.9)
         return figure
 
 
@@ -417,17 +411,17 @@ def _cone_map(
     none = known & (degrees == 0.0)
     where = np.argwhere(none)
     # A dot: no two contacts have the same signals at all.
-    axes.plot(x[where[:, 1]], y[where[:, 0]], ".", color=MUTED, markersize=1.5)
+    axes.plot(x[where[:, 1]], y[where[:, 0]], ".", color=style.MUTED, markersize=1.5)
 
 
 def _contours(axes: Axes, x: Array, y: Array, degrees: Array, high: float) -> None:
-    levels = [level for level in (_PAPERS_CONE, 5.0, 10.0, 20.0, 40.0, 80.0) if level < high]
+    levels = [level for level in (PAPERS_CONE, 5.0, 10.0, 20.0, 40.0, 80.0) if level < high]
     levels = [level for level in levels if np.nanmin(degrees) < level < np.nanmax(degrees)]
     if not levels:
         return
-    widths = [1.1 if level == _PAPERS_CONE else 0.5 for level in levels]
+    widths = [1.1 if level == PAPERS_CONE else 0.5 for level in levels]
     shown = np.ma.masked_array(degrees, ~np.isfinite(degrees) | _exceptional(degrees))
-    lines = axes.contour(x, y, shown, levels=levels, colors=INK, linewidths=widths)
+    lines = axes.contour(x, y, shown, levels=levels, colors=style.INK, linewidths=widths)
     axes.clabel(lines, fmt=lambda value: f"{value:g}°", fontsize=5.5, inline_spacing=2)
 
 

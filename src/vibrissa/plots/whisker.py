@@ -12,17 +12,7 @@ from matplotlib.path import Path
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
-from vibrissa.plots.style import (
-    INK,
-    MUTED,
-    Width,
-    box_axes,
-    limits_around,
-    looking,
-    new_figure,
-    page_width,
-    sentence,
-)
+from vibrissa.plots import style
 from vibrissa.quantities import axis_label, to_display
 from vibrissa.scene import Array
 
@@ -45,7 +35,7 @@ def whisker_views(
     name: str | None = None,
     magnification: float | None = None,
     assumed: Sequence[str] = (),
-    width: Width = "single",
+    width: style.Width = "single",
 ) -> Figure:
     """Draw a whisker from above (x–y), from the side (x–z) and along its base (z–y), to one scale.
 
@@ -85,34 +75,34 @@ def whisker_views(
     radii = np.broadcast_to(radii, (len(points),))
     known = np.isfinite(points).all(axis=1) & np.isfinite(radii)
     points, radii = points[known], radii[known]
-    with looking():
+    with style.looking():
         if len(points) < 2:
-            return sentence("no whisker", width)
+            return style.sentence("no whisker", width)
         figure, axes, magnification = _views(points, radii, magnification, width)
         _caption(axes, name, magnification, assumed)
         return figure
 
 
 def _views(
-    points: Array, radii: Array, magnification: float | None, width: Width
+    points: Array, radii: Array, magnification: float | None, width: style.Width
 ) -> tuple[Figure, Axes, float]:
     extent = float(np.ptp(points, axis=0).max())
     if magnification is None:
         aim = _WIDE * extent / (2.0 * max(radii.max(), 1e-9))
         magnification = max([m for m in _MAGNIFICATIONS if m <= aim], default=1)
     margin = magnification * radii.max() + 0.02 * extent
-    limits = limits_around(points, margin, _NARROWEST * extent)
+    limits = style.limits_around(points, margin, _NARROWEST * extent)
     span = np.ptp(limits, axis=1)
-    page = page_width(width)
+    page = style.page_width(width)
     scale = (page - _LEFT - _RIGHT - _GAP) / (span[0] + span[2])  # mm on paper per mm
     height = _BOTTOM + _GAP + _TOP + scale * (span[1] + span[2])
-    figure = new_figure(width, height, None)
+    figure = style.new_figure(width, height, None)
 
     def place(left: float, bottom: float, i: int, j: int) -> Axes:
         box = (left, bottom, scale * span[i], scale * span[j])
-        axes = box_axes(figure, box, xlim=limits[i], ylim=limits[j])
+        axes = style.box_axes(figure, box, xlim=limits[i], ylim=limits[j])
         outline = _tube(points[:, [i, j]], magnification * radii)
-        axes.add_patch(PathPatch(outline, facecolor=INK, edgecolor="none"))
+        axes.add_patch(PathPatch(outline, facecolor=style.INK, edgecolor="none"))
         return axes
 
     right, above = _LEFT + scale * span[0] + _GAP, _BOTTOM + scale * span[2] + _GAP
@@ -165,6 +155,6 @@ def _caption(axes: Axes, name: str | None, magnification: float, assumed: Sequen
         "\n".join(lines),
         transform=axes.transAxes,
         va="top",
-        color=MUTED,
+        color=style.MUTED,
         fontsize=6.0,
     )

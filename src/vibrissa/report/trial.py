@@ -12,19 +12,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from vibrissa import evaluation
 from vibrissa.contour import shape_from_dataset
 from vibrissa.display import show
-from vibrissa.evaluation import (
-    ErrorRow,
-    caution,
-    contact_errors,
-    deflection_angle,
-    error_rows,
-    signal_errors,
-    spread,
-    tracking_scores,
-    truth_of,
-)
 from vibrissa.pipeline import compare_contacts, distances_by_class
 from vibrissa.quantities import QUANTITIES, quantity
 from vibrissa.recording import Recording
@@ -60,7 +50,7 @@ def trial_sections(recording: xr.DataTree, whisker: int = 0, seed: int = 0) -> l
     groups = {name: _one(recording, name, whisker) for name in ("", "signals", "estimates")}
     truth, true_whisker = None, bent
     if "truth" in recording.children:
-        truth, true_whisker = truth_of(recording, whisker)
+        truth, true_whisker = evaluation.truth_of(recording, whisker)
     parts = [
         Section("results", "Results", _results(recording, groups, truth, true_whisker, seed)),
         Section("recording", "Recording", show(recording).html + bent._repr_html_()),
@@ -125,7 +115,7 @@ def _error_tile(
     """Median error of the contact point: true where the truth is known, else predicted."""
     known = np.isfinite(estimates["contact_point"].values).any()
     if truth is not None and known and not _lacking(_FOUND, estimates, truth, _SPREADS):
-        rows, _ = error_rows(contact_errors(estimates, truth, whisker, seed))
+        rows, _ = evaluation.error_rows(evaluation.contact_errors(estimates, truth, whisker, seed))
         for row in rows:
             if row.quantity == "error_distance":
                 error = shown_value(row.quantity, float(row.measured[0]), 2)
@@ -221,10 +211,12 @@ def _contact_errors(estimates: xr.Dataset, truth: xr.Dataset, whisker: Whisker, 
     """Tables of detected contacts and of their errors."""
     text = _detected(estimates, truth)
     if np.isfinite(estimates["contact_point"].values).any():
-        text += _errors(*error_rows(contact_errors(estimates, truth, whisker, seed)))
+        text += _errors(
+            *evaluation.error_rows(evaluation.contact_errors(estimates, truth, whisker, seed))
+        )
     else:
         text += paragraph(_NOTHING)
-    warned = caution(estimates.attrs.get("source"))
+    warned = evaluation.caution(estimates.attrs.get("source"))
     return text + (paragraph(warned, "note") if warned else "")
 
 
@@ -274,7 +266,7 @@ def _has(names: Sequence[str], *data: xr.Dataset | None) -> bool:
 
 def tracking_tables(root: xr.Dataset, truth: xr.Dataset) -> str:
     """Tables of the errors of tracking."""
-    scores = tracking_scores(root, truth)
+    scores = evaluation.tracking_scores(root, truth)
     touching = [data["in_contact"].values.astype(bool) for data in (root, truth)]
     both = touching[0] & touching[1]
     views = root["view"].values if len(scores.trace) else ()
@@ -297,7 +289,7 @@ def tracking_tables(root: xr.Dataset, truth: xr.Dataset) -> str:
             continue
         away = root[name].values[both] - truth[name].values[both]
         size = np.linalg.norm(away, axis=-1) if away.ndim > 1 else np.abs(away)
-        rows.append((quantity(name).long_name, *_spread_cells(name, spread(size))))
+        rows.append((quantity(name).long_name, *_spread_cells(name, evaluation.spread(size))))
     drawn = table(
         lines,
         ("distance from the true line", *_SPREAD),
@@ -329,7 +321,7 @@ def six_rows(signals: xr.Dataset, truth: xr.Dataset) -> list[tuple[str, ...]]:
         size = size[np.isfinite(size)]
         if not size.size:
             continue
-        values = (*spread(size), size.max())
+        values = (*evaluation.spread(size), size.max())
         usual = np.nan if direction else float(np.nanmedian(np.abs(true[name].values[both])))
         cells = (shown_value(name, float(value), 3) for value in (*values, usual))
         rows.append((quantity(name).long_name, str(size.size), *cells))
@@ -338,9 +330,9 @@ def six_rows(signals: xr.Dataset, truth: xr.Dataset) -> list[tuple[str, ...]]:
 
 def signal_rows(signals: xr.Dataset, truth: xr.Dataset, whisker: Whisker) -> list[tuple[str, ...]]:
     """Sum up errors of force and moment by deflection angle."""
-    angle = deflection_angle(truth, whisker)
+    angle = evaluation.deflection_angle(truth, whisker)
     rows = []
-    for row in signal_errors(signals, truth, angle):
+    for row in evaluation.signal_errors(signals, truth, angle):
         shares = [*row.force, *row.moment]
         cells = (f"{100 * shares[i]:.3g} %" for i in (0, 2, 1, 3))
         rows.append((row.label, str(row.contacts), *cells))
@@ -363,7 +355,7 @@ def _detected(estimates: xr.Dataset, truth: xr.Dataset) -> str:
     return table(rows, caption="Contacts")
 
 
-def _errors(of_all: Sequence[ErrorRow], by_angle: Sequence[ErrorRow]) -> str:
+def _errors(of_all: Sequence[evaluation.ErrorRow], by_angle: Sequence[evaluation.ErrorRow]) -> str:
     """Errors of estimated contacts, and what their covariance predicts."""
     names = (*_SPREAD, "largest", *(f"{name}*" for name in _SPREAD))
     note = "* what the estimates' own covariance predicts"
@@ -378,7 +370,7 @@ def _errors(of_all: Sequence[ErrorRow], by_angle: Sequence[ErrorRow]) -> str:
     )
 
 
-def _cells(row: ErrorRow) -> list[str]:
+def _cells(row: evaluation.ErrorRow) -> list[str]:
     values = (*row.measured, *row.predicted[:2])
     return [str(row.contacts), *(shown_value(row.quantity, float(value)) for value in values)]
 

@@ -42,6 +42,7 @@ from vibrissa.scene.shapes import (
     tube as tube,
 )
 from vibrissa.scene.solids import (
+    COORDINATES as COORDINATES,
     DIRECTIONS as DIRECTIONS,
     SIGNALS as SIGNALS,
     clip as clip,

@@ -20,6 +20,7 @@ from vibrissa.scene.marks import Array, Mask
 
 SIGNALS = ("Fx", "FT", "FD", "Mx", "MB", "MD")
 DIRECTIONS = ("FD", "MD")
+COORDINATES = ("r", "theta", "phi")
 COLUMNS = (
     *("x", "y", "z", "r", "theta", "phi"),
     *("Fx", "FT cos FD", "FT sin FD", "Mx", "MB cos MD", "MB sin MD"),

@@ -7,37 +7,13 @@ from functools import lru_cache
 
 import numpy as np
 
+from vibrissa import scene
 from vibrissa.quantities import quantity, to_display
-from vibrissa.scene import (
-    Array,
-    Arrows,
-    Body,
-    Colour,
-    Drawing,
-    Label,
-    Line,
-    Mark,
-    cylinder,
-    ellipsoid,
-    tube,
-)
 from vibrissa.sketch import round_step
+from vibrissa.viewer import state
 from vibrissa.viewer.colours import CONTACT, FORCE, GHOST, OBJECT, REST, WHISKER
 from vibrissa.viewer.page import EXAGGERATION, Page, asked, put, show
 from vibrissa.viewer.readout import number, numbers, sentence
-from vibrissa.viewer.state import (
-    KINDS,
-    Bend,
-    Chart,
-    Kind,
-    envelope,
-    force_scale,
-    loaded,
-    moved,
-    shape_of,
-    with_force,
-    with_radius,
-)
 from vibrissa.whisker import Whisker
 
 NODES = 48
@@ -48,69 +24,73 @@ _ARROW = 0.3
 
 def whisker_body(
     whisker: Whisker,
-    line: Array,
+    line: scene.Array,
     exaggeration: float,
-    colour: Colour = WHISKER,
+    colour: scene.Colour = WHISKER,
     opacity: float | None = None,
-) -> Body:
+) -> scene.Body:
     """A whisker along a centreline (n, 3), m, so many times as thick as it is."""
     radius = whisker.radius(np.linspace(0.0, whisker.length, len(line)))
-    vertices, faces = tube(mm(line), exaggeration * mm(radius))
-    return Body(vertices, faces, colour, opacity)
+    vertices, faces = scene.tube(mm(line), exaggeration * mm(radius))
+    return scene.Body(vertices, faces, colour, opacity)
 
 
-def follicle(whisker: Whisker, exaggeration: float) -> Body:
+def follicle(whisker: Whisker, exaggeration: float) -> scene.Body:
     """A sleeve in which the base is clamped, so that one sees where it is."""
     radius = 1.9 * exaggeration * whisker.base_radius
     depth = 0.06 * whisker.length
     middle = np.array([-0.5 * depth, 0.0, 0.0])
-    vertices, faces = cylinder(mm(middle), np.array([1.0, 0.0, 0.0]), _size(radius), _size(depth))
-    return Body(vertices, faces, (196, 152, 132))
+    vertices, faces = scene.cylinder(
+        mm(middle), np.array([1.0, 0.0, 0.0]), _size(radius), _size(depth)
+    )
+    return scene.Body(vertices, faces, (196, 152, 132))
 
 
-def axes(whisker: Whisker) -> dict[str, Mark]:
+def axes(whisker: Whisker) -> dict[str, scene.Mark]:
     """The whisker frame at the base: x red, y green, z blue."""
     size = _size(0.14 * whisker.length)
     ends = size * np.eye(3)
-    out: dict[str, Mark] = {"axes": Arrows(np.zeros((3, 3)), ends, _AXES, 0.05 * size)}
-    out |= {f"axis {name}": Label(1.12 * ends[i], name) for i, name in enumerate("xyz")}
+    out: dict[str, scene.Mark] = {"axes": scene.Arrows(np.zeros((3, 3)), ends, _AXES, 0.05 * size)}
+    out |= {f"axis {name}": scene.Label(1.12 * ends[i], name) for i, name in enumerate("xyz")}
     return out | ruler(np.zeros(3), _size(whisker.length))
 
 
-def ruler(start: Array, length: float) -> dict[str, Mark]:
+def ruler(start: scene.Array, length: float) -> dict[str, scene.Mark]:
     """Ticks with values along x from a place (3,), mm, over a length, mm."""
     step = round_step(length / 4.0)
     ticks = np.arange(0.0, length + 1e-9, step)
     at = start + ticks[:, None] * np.array([1.0, 0.0, 0.0])
     down = np.array([0.0, 0.0, -0.02 * length])
     pieces = np.concatenate([np.stack([at, at + down], axis=1), [[at[0], at[-1]]]])
-    out: dict[str, Mark] = {"ruler": Line(pieces, REST, 1.5)}
+    out: dict[str, scene.Mark] = {"ruler": scene.Line(pieces, REST, 1.5)}
     for place, tick in zip(at[1:], ticks[1:], strict=True):
         unit = " mm" if tick == ticks[-1] else ""
-        out[f"tick {tick:g}"] = Label(place + 3.0 * down, f"{tick:g}{unit}")
+        out[f"tick {tick:g}"] = scene.Label(place + 3.0 * down, f"{tick:g}{unit}")
     return out
 
 
-def arrow(start: Array, end: Array, thickness: float) -> Arrows:
+def arrow(start: scene.Array, end: scene.Array, thickness: float) -> scene.Arrows:
     """The arrow of a force between two places (3,), m; so many mm thick."""
-    return Arrows(mm(start)[None], mm(end)[None], np.array([FORCE], dtype=np.uint8), thickness)
+    return scene.Arrows(
+        mm(start)[None], mm(end)[None], np.array([FORCE], dtype=np.uint8), thickness
+    )
 
 
-def force_arrow(whisker: Whisker, force: Array, at: Array) -> dict[str, Mark]:
+def force_arrow(whisker: Whisker, force: scene.Array, at: scene.Array) -> dict[str, scene.Mark]:
     """The force on a whisker as an arrow that ends where it acts, with its size."""
     size = float(np.linalg.norm(force))
     if not (np.isfinite(at).all() and size > 0.0):
         return {}
-    reach = _ARROW * whisker.length * np.sqrt(size / force_scale(whisker))
+    reach = _ARROW * whisker.length * np.sqrt(size / state.force_scale(whisker))
     start = at - reach * force / size
     thickness = _size(0.006 * whisker.length)
     return {
         "force": arrow(start, at, thickness),
-        "force size": Label(mm(start), number("force", size, 3)),
+        "force size": scene.Label(mm(start), number("force", size, 3)),
     }
 
 
-def bend_drawing(bend: Bend, exaggeration: float) -> Drawing:
+def bend_drawing(bend: state.Bend, exaggeration: float) -> scene.Drawing:
     """Draw whisker, load and force; without an answer the last shape as a ghost."""
     whisker, held, ok = bend.whisker, bend.held, bend.status.ok
     out = dict(resting(whisker, exaggeration))
@@ -130,7 +110,7 @@ def bend_drawing(bend: Bend, exaggeration: float) -> Drawing:
 
 
 @lru_cache(maxsize=4)
-def resting(whisker: Whisker, exaggeration: float) -> dict[str, Mark]:
+def resting(whisker: Whisker, exaggeration: float) -> dict[str, scene.Mark]:
     """Draw what stays as it is while a whisker is bent."""
     return {
         "follicle": follicle(whisker, exaggeration),
@@ -139,35 +119,35 @@ def resting(whisker: Whisker, exaggeration: float) -> dict[str, Mark]:
     }
 
 
-def _peg(bend: Bend) -> Body:
+def _peg(bend: state.Bend) -> scene.Body:
     """The peg; a line is drawn a little thick, so that it is seen."""
     length = bend.whisker.length
     radius = max(bend.radius, 0.004 * length)
-    vertices, faces = cylinder(mm(bend.origin), bend.axis, _size(radius), _size(0.8 * length))
-    return Body(vertices, faces, OBJECT, 0.8)
+    vertices, faces = scene.cylinder(mm(bend.origin), bend.axis, _size(radius), _size(0.8 * length))
+    return scene.Body(vertices, faces, OBJECT, 0.8)
 
 
 @lru_cache(maxsize=4)
-def _ball(whisker: Whisker, exaggeration: float) -> Body:
+def _ball(whisker: Whisker, exaggeration: float) -> scene.Body:
     """Mark of the contact: it sticks out of the whisker where this can touch."""
     own = float(whisker.radius(0.5 * whisker.length))
     radius = max(1.7 * exaggeration * own, 0.006 * whisker.length)
-    vertices, faces = ellipsoid(np.zeros(3), _size(radius) * np.eye(3), 12)
-    return Body(vertices, faces, CONTACT)
+    vertices, faces = scene.ellipsoid(np.zeros(3), _size(radius) * np.eye(3), 12)
+    return scene.Body(vertices, faces, CONTACT)
 
 
-def _missed(bend: Bend) -> dict[str, Mark]:
+def _missed(bend: state.Bend) -> dict[str, scene.Mark]:
     """A line from the last contact to where it was wanted, and why it did not go there."""
     last = np.asarray(bend.held.contact_point)
-    out: dict[str, Mark] = {}
+    out: dict[str, scene.Mark] = {}
     if np.isfinite(last).all() and bend.kind == "point":
-        out["missed"] = Line(mm(np.stack([last, bend.point])[None]), GHOST)
+        out["missed"] = scene.Line(mm(np.stack([last, bend.point])[None]), GHOST)
     words = bend.status.explanation.split(":")[0].rstrip(".")
     lift = np.array([0.0, 0.0, 0.05 * bend.whisker.length])
-    return {**out, "reason": Label(mm(bend.target + lift), words)}
+    return {**out, "reason": scene.Label(mm(bend.target + lift), words)}
 
 
-def mm(values: object) -> Array:
+def mm(values: object) -> scene.Array:
     """Lengths in mm."""
     return to_display("length", np.asarray(values, dtype=np.float64))
 
@@ -188,8 +168,8 @@ class BendMode:
 
     def __init__(self, page: Page) -> None:
         self._page = page
-        self._clouded: Chart | None = None
-        self._shown_kind: Kind | None = None
+        self._clouded: state.Chart | None = None
+        self._shown_kind: state.Kind | None = None
         gui = page.server.gui
         bend = page.bend
         length = page.original.length
@@ -197,7 +177,9 @@ class BendMode:
         self._folder = gui.add_folder("Load", visible=False)
         with self._folder:
             self._kind = gui.add_dropdown(
-                "Load", KINDS, hint="What bends the whisker: a point, a straight peg, or a force"
+                "Load",
+                state.KINDS,
+                hint="What bends the whisker: a point, a straight peg, or a force",
             )
             self._target = gui.add_vector3(
                 "Position (mm)", (x, y, z), step=0.05, hint="Drag the ball, or type"
@@ -211,7 +193,7 @@ class BendMode:
             self._size = gui.add_slider(
                 "Force (µN)",
                 0.0,
-                round(3.0 * _UN * force_scale(page.original), 1),
+                round(3.0 * _UN * state.force_scale(page.original), 1),
                 0.1,
                 round(_UN * bend.magnitude, 1),
                 visible=False,
@@ -251,7 +233,7 @@ class BendMode:
         page.stage.show("bend", bend_drawing(bend, page.exaggeration))
         if page.chart is not self._clouded:
             self._clouded = page.chart
-            cloud = {} if page.chart is None else {"envelope": envelope(page.chart)}
+            cloud = {} if page.chart is None else {"envelope": state.envelope(page.chart)}
             page.stage.show("reachable", cloud)
 
     def write(self, brief: bool = False) -> None:
@@ -275,18 +257,18 @@ class BendMode:
             put(self._size, round(_UN * bend.magnitude, 1))
             put(self._way, round(np.rad2deg(bend.direction)))
 
-    def _chosen(self, kind: Kind) -> None:
-        self._page.change("kind", lambda bend: loaded(bend, kind))
+    def _chosen(self, kind: state.Kind) -> None:
+        self._page.change("kind", lambda bend: state.loaded(bend, kind))
 
     def _typed(self, place: tuple[float, float, float]) -> None:
-        self._page.change("drag", lambda bend: moved(bend, np.array(place) / _MM))
+        self._page.change("drag", lambda bend: state.moved(bend, np.array(place) / _MM))
 
     def _widened(self, radius: float) -> None:
-        self._page.change("radius", lambda bend: with_radius(bend, radius / _MM))
+        self._page.change("radius", lambda bend: state.with_radius(bend, radius / _MM))
 
     def _pushed(self) -> None:
         place, size, way = self._place.value, self._size.value / _UN, np.deg2rad(self._way.value)
-        self._page.change("force", lambda bend: with_force(bend, place, size, way))
+        self._page.change("force", lambda bend: state.with_force(bend, place, size, way))
 
 
 _GPA = 1e-9
@@ -296,7 +278,7 @@ class WhiskerControls:
     """Length, turn, taper, modulus, and how thick the whisker is drawn."""
 
     def __init__(self, page: Page) -> None:
-        own = shape_of(page.original)
+        own = state.shape_of(page.original)
         gui = page.server.gui
         self.folder = gui.add_folder("Whisker")
         length, modulus = round(_MM * own.length, 2), _rounded(_GPA * own.modulus)

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from vibrissa.plots import cyclic, diverging, sequential
+from vibrissa.plots import scale_of
 from vibrissa.quantities import quantity, to_display
-from vibrissa.scene import DIRECTIONS, Array, Bytes, Colour, Ints, robust_limits, root, squared
+from vibrissa.scene import Array, Bytes, Colour, Ints
 from vibrissa.viewer.readout import plain, symbol
 
 WHISKER: Colour = (122, 96, 76)
@@ -59,29 +59,15 @@ class Legend:
 def shaded(name: str, values: Array) -> tuple[Bytes, Legend]:
     """Colours (..., 3) of values of a quantity, SI units, and their legend.
 
-    Directions go round; sizes and signed signals go with the square root, as most contacts are
-    gentle; errors with the logarithm. The outermost 2 % of the values share the colours of the
-    ends. What is missing is grey.
+    The outermost 2 % of the values share the colours of the ends. What is missing is grey.
     """
     shown = to_display(name, values)
-    if name in DIRECTIONS:
-        colours, scale, back = cyclic(), _same, _same
-        low, high = -180.0, 180.0
-    elif name == "predicted_error":
-        colours, scale, back = sequential(), _log, _exp
-        low, high = np.log10(robust_limits(shown[shown > 0.0], 0.95))
-    elif name in ("r", "theta", "phi", "arc_length", "separation"):
-        colours, scale, back = sequential(), _same, _same
-        low, high = robust_limits(shown)
-    else:
-        signed = name == "Mx"
-        colours = diverging() if signed else sequential()
-        scale, back = root, squared
-        low, high = root(robust_limits(shown, symmetric=signed))
-    share = np.clip((scale(shown) - low) / (high - low), 0.0, 1.0)
+    norm, colours = scale_of(name, shown)
+    share = np.ma.filled(norm(np.ma.masked_invalid(shown), clip=True), np.nan)
     rgb = np.array(colours(np.nan_to_num(share)), dtype=np.float64)[..., :3]
     rgb[~np.isfinite(share)] = _NONE
-    return _bytes(rgb), _ramp(name, colours, [float(back(x)) for x in np.linspace(low, high, 3)])
+    marks = np.asarray(norm.inverse(np.array(_MARKS)), dtype=np.float64)
+    return _bytes(rgb), _ramp(name, colours, marks.tolist())
 
 
 def counted(numbers: Ints) -> tuple[Bytes, Legend]:
@@ -113,16 +99,3 @@ def _css(rgb: Array) -> str:
 
 def _bytes(rgb: Array) -> Bytes:
     return np.asarray(np.round(255.0 * rgb), dtype=np.uint8)
-
-
-def _same(values: Any) -> Any:
-    return values
-
-
-def _log(values: Any) -> Any:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.log10(values)
-
-
-def _exp(values: Any) -> Any:
-    return 10.0**values

@@ -7,21 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
+from vibrissa import scene
 from vibrissa.contacts import Contacts
 from vibrissa.identifiability import sensitivity
 from vibrissa.quantities import quantity, to_display
 from vibrissa.rod import PointContact, deflect
-from vibrissa.scene import (
-    Array,
-    Body,
-    Bytes,
-    Drawing,
-    Ints,
-    Label,
-    Mark,
-    ellipsoid,
-    error_ellipsoid,
-)
 from vibrissa.signals import SIGNALS, TRIPLETS, base_signals
 from vibrissa.status import Status
 from vibrissa.viewer.bend import NODES, bend_drawing, mm, whisker_body
@@ -48,7 +38,7 @@ class Sensor:
     moment_noise: float = 2e-8
 
     @property
-    def covariance(self) -> Array | None:
+    def covariance(self) -> scene.Array | None:
         """Covariance of force and moment (6, 6); None where there is no noise."""
         sigma = np.repeat([self.force_noise, self.moment_noise], 3)
         return np.diag(sigma**2) if (sigma > 0.0).all() else None
@@ -72,22 +62,22 @@ class Located:
 
     sensor: Sensor
     signals: xr.Dataset
-    contact: Array
+    contact: scene.Array
     estimate: Contacts
-    lines: Array
+    lines: scene.Array
 
     @property
-    def points(self) -> Array:
+    def points(self) -> scene.Array:
         """Contact points of the candidates (k, 3), m."""
         points = self.estimate.candidates.point
         return np.asarray(points[np.isfinite(points).all(axis=-1)])
 
     @property
-    def distances(self) -> Array:
+    def distances(self) -> scene.Array:
         """Distance of each candidate from the true contact (k,), m."""
         return np.asarray(np.linalg.norm(self.points - self.contact, axis=-1))
 
-    def others(self, length: float) -> Ints:
+    def others(self, length: float) -> scene.Ints:
         """Numbers of the candidates that are not the contact itself."""
         return np.flatnonzero(self.distances > _APART * length)
 
@@ -104,7 +94,7 @@ def located(chart: Chart, bend: Bend, sensor: Sensor) -> Located | None:
     return Located(sensor, signals, np.asarray(bent.contact_point), estimate, lines)
 
 
-def coloured(chart: Chart, what: str, sensor: Sensor) -> tuple[Bytes, Legend]:
+def coloured(chart: Chart, what: str, sensor: Sensor) -> tuple[scene.Bytes, Legend]:
     """Colours (n, 3) of the cloud: number of contacts with the same signals, or their distance."""
     if what in SIGNALS:
         return shaded(what, chart.signals[what])
@@ -119,7 +109,7 @@ def coloured(chart: Chart, what: str, sensor: Sensor) -> tuple[Bytes, Legend]:
     raise ValueError(f"colours are one of {', '.join(COLOURS)}; got {what!r}")
 
 
-def _predicted_error(chart: Chart, sensor: Sensor) -> Array:
+def _predicted_error(chart: Chart, sensor: Sensor) -> scene.Array:
     """RMS 3D error (n,), m, of the contacts of the cloud."""
     if sensor.covariance is None:
         return np.full(len(chart.points), np.nan)
@@ -127,7 +117,7 @@ def _predicted_error(chart: Chart, sensor: Sensor) -> Array:
     return np.asarray(found["predicted_error"].to_numpy(), dtype=np.float64)
 
 
-def _separation(estimate: Contacts, points: Array) -> Array:
+def _separation(estimate: Contacts, points: scene.Array) -> scene.Array:
     """Distance (n,), m, of the farthest other candidate of each contact; NaN without candidates."""
     away = np.linalg.norm(estimate.candidates.point - points[:, None], axis=-1)
     farthest = np.nanmax(np.nan_to_num(away), axis=1)
@@ -145,23 +135,23 @@ MOST = 0.3
 """Longest semi-axis that is drawn, over the length: what is longer is as good as unknown."""
 
 
-def locate_drawing(whisker: Whisker, found: Located, exaggeration: float) -> Drawing:
+def locate_drawing(whisker: Whisker, found: Located, exaggeration: float) -> scene.Drawing:
     """Draw the whisker at every other contact with the same signals, and the errors of all."""
-    out: dict[str, Mark] = {}
+    out: dict[str, scene.Mark] = {}
     covariances = found.estimate.candidates.covariance
     others = set(found.others(whisker.length).tolist())
     for i, point in enumerate(found.points):
         if i in others:
             out[f"ghost {i}"] = whisker_body(whisker, found.lines[i], exaggeration, GHOST, 0.55)
             radius = float(to_display("length", 0.008 * whisker.length))
-            ball = ellipsoid(mm(point), radius * np.eye(3))
-            out[f"ball {i}"] = Body(*ball, GHOST)
+            ball = scene.ellipsoid(mm(point), radius * np.eye(3))
+            out[f"ball {i}"] = scene.Body(*ball, GHOST)
             apart = number("separation", float(found.distances[i]), 3)
-            out[f"apart {i}"] = Label(mm(point), f"same signals, {apart} away")
+            out[f"apart {i}"] = scene.Label(mm(point), f"same signals, {apart} away")
         if np.isfinite(covariances[i]).all():
             most = MOST * whisker.length
-            vertices, faces = error_ellipsoid(point, covariances[i], SIGMAS, most)
-            out[f"error {i}"] = Body(mm(vertices), faces, FIT, 0.45)
+            vertices, faces = scene.error_ellipsoid(point, covariances[i], SIGMAS, most)
+            out[f"error {i}"] = scene.Body(mm(vertices), faces, FIT, 0.45)
     return out
 
 
@@ -204,7 +194,7 @@ class LocateMode:
         self._what = "uniqueness"
         self._cut = True
         self._drawn: tuple[object, ...] | None = None
-        self._cloud: tuple[Chart, Bytes] | None = None
+        self._cloud: tuple[Chart, scene.Bytes] | None = None
         self.found: Located | None = None
         gui = page.server.gui
         self._folder = gui.add_folder("Three signals", visible=False)
@@ -274,7 +264,7 @@ class LocateMode:
         self._drawn = key
         sensor, what = self._sensor, self._what
 
-        def ready(colours: Bytes, legend: Legend) -> None:
+        def ready(colours: scene.Bytes, legend: Legend) -> None:
             if self._drawn == key:
                 self._legend.content = legend.html()
                 self._cloud = (chart, colours)

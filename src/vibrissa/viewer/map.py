@@ -14,27 +14,9 @@ from typing import Any
 import numpy as np
 import viser
 
+from vibrissa import scene
 from vibrissa.quantities import to_display
 from vibrissa.rod import PointContact, deflect
-from vibrissa.scene import (
-    Array,
-    Body,
-    Drawing,
-    Label,
-    Line,
-    Mark,
-    Painted,
-    clip,
-    column,
-    ellipsoid,
-    level_surface,
-    pieces,
-    root,
-    sample_contacts,
-    solid_surface,
-    squared,
-    values_of,
-)
 from vibrissa.signals import SIGNALS
 from vibrissa.status import Status
 from vibrissa.viewer.bend import NODES, follicle, whisker_body
@@ -43,7 +25,6 @@ from vibrissa.viewer.page import Page, asked
 from vibrissa.viewer.readout import note, number, of_deflection, table
 from vibrissa.viewer.state import Chart
 
-COORDINATES = ("r", "theta", "phi")
 SLICES = ("x", "y", "z", "r", "theta", "phi", "Fx", "Mx", "arc_length")
 """Quantities that can be held fixed in a slice."""
 
@@ -65,7 +46,7 @@ class Solids:
     """The contacts of a whisker, ready to be laid out."""
 
     chart: Chart
-    nodes: Array
+    nodes: scene.Array
     cut: bool
 
     @property
@@ -73,43 +54,45 @@ class Solids:
         """Length of the whisker, mm."""
         return float(to_display("length", self.chart.whisker.length))
 
-    def skin(self) -> Array:
+    def skin(self) -> scene.Array:
         """Triangles (n, 3, columns) around all contacts outside 2° of rest."""
-        return solid_surface(self.nodes, not self.cut, column("deflection"))
+        return scene.solid_surface(self.nodes, not self.cut, scene.column("deflection"))
 
-    def slice(self, name: str, share: float) -> Array:
+    def slice(self, name: str, share: float) -> scene.Array:
         """Triangles (n, 3, columns) of contacts with one value, at a share of its range."""
         height = self.value(name, share)
-        return clip(level_surface(self.nodes, column(name), height), column("deflection"))
+        return scene.clip(
+            scene.level_surface(self.nodes, scene.column(name), height), scene.column("deflection")
+        )
 
     def value(self, name: str, share: float) -> float:
         """The value at a share of a range, SI units; of signals by square roots, as in space."""
         low, high = self.range(name)
         if name not in SIGNALS:
             return low + share * (high - low)
-        start, end = root(np.array([low, high]))
+        start, end = scene.root(np.array([low, high]))
         middle = start + share * (end - start)
         return float(np.sign(middle) * middle**2)
 
     def range(self, name: str) -> tuple[float, float]:
         """Least and largest value of what a slice can hold fixed, SI units."""
-        values = self.nodes[..., column(name)]
+        values = self.nodes[..., scene.column(name)]
         return float(values.min()), float(values.max())
 
-    def signal_rows(self, rows: Array) -> Array:
+    def signal_rows(self, rows: scene.Array) -> scene.Array:
         """Places (..., 3), mm, of rows in the space of signals, its axis at the origin."""
         reach, low, high = self.limits
-        size = np.sqrt(values_of("MB", rows)) / reach
-        turn = values_of("MD", rows) + TURN
-        height = (root(values_of("Fx", rows)) - low) / (high - low)
+        size = np.sqrt(scene.values_of("MB", rows)) / reach
+        turn = scene.values_of("MD", rows) + TURN
+        height = (scene.root(scene.values_of("Fx", rows)) - low) / (high - low)
         flat = [0.5 * size * np.cos(turn), 0.5 * size * np.sin(turn)]
         return self.length * np.stack([*flat, _HEIGHT * (height - 0.5)], axis=-1)
 
     @property
     def limits(self) -> tuple[float, float, float]:
         """Largest √M_B, least and largest root of F_x."""
-        heights = root(values_of("Fx", self.nodes))
-        reach = float(np.sqrt(values_of("MB", self.nodes).max()))
+        heights = scene.root(scene.values_of("Fx", self.nodes))
+        reach = float(np.sqrt(scene.values_of("MB", self.nodes).max()))
         return reach, float(heights.min()), float(heights.max())
 
     def axis_height(self) -> float:
@@ -117,12 +100,12 @@ class Solids:
         _, low, high = self.limits
         return self.length * _HEIGHT * (-low / (high - low) - 0.5)
 
-    def place(self, number: int | None) -> Array:
+    def place(self, number: int | None) -> scene.Array:
         """Place of a space, mm: contacts (None), or signals coloured by r, θ, φ (0, 1, 2)."""
         x, z = _CONTACTS if number is None else _PLACES[number]
         return self.length * np.array([x, 0.0, z])
 
-    def seen(self, rows: Array, number: int | None) -> Array:
+    def seen(self, rows: scene.Array, number: int | None) -> scene.Array:
         """Places (..., 3), mm, of rows: as contacts (None) or as signals of a coordinate."""
         if number is None:
             return to_display("contact_point", rows[..., :3]) + self.place(None)
@@ -131,11 +114,13 @@ class Solids:
 
 def solids(chart: Chart, cut: bool) -> Solids:
     """Sample a chart for solids, whole or cut open."""
-    nodes = sample_contacts(chart.samples, chart.line, _OPEN if cut else None, _SHAPE)
+    nodes = scene.sample_contacts(chart.samples, chart.line, _OPEN if cut else None, _SHAPE)
     return Solids(chart, nodes, cut)
 
 
-def picked(triangles: Array, places: Array, origin: Array, direction: Array) -> Array | None:
+def picked(
+    triangles: scene.Array, places: scene.Array, origin: scene.Array, direction: scene.Array
+) -> scene.Array | None:
     """The contact that a ray meets first."""
     a, b, c = places.transpose(1, 0, 2)
     first, second = b - a, c - a
@@ -159,75 +144,77 @@ _NAMES = {"r": "r", "theta": "θ", "phi": "φ"}
 _RINGS = 2
 
 
-def frame_drawing(solids: Solids, exaggeration: float) -> Drawing:
+def frame_drawing(solids: Solids, exaggeration: float) -> scene.Drawing:
     """Draw what does not change: the resting whisker, and rings, rays and axes of the signals."""
     whisker, length = solids.chart.whisker, solids.length
     here = solids.place(None)
     line = whisker.centerline(NODES)
-    out: dict[str, Mark] = {
+    out: dict[str, scene.Mark] = {
         "rest": _moved(whisker_body(whisker, line, exaggeration, REST), here),
         "follicle": _moved(follicle(whisker, exaggeration), here),
-        "title": Label(here + length * np.array([0.05, 0.0, 0.62]), "contacts"),
+        "title": scene.Label(here + length * np.array([0.05, 0.0, 0.62]), "contacts"),
     }
     turn = np.linspace(0.0, 2.0 * np.pi, 73)
     floor = -0.5 * _HEIGHT * length
     reach, low, _ = solids.limits
-    largest, least = number("MB", reach**2, 3), number("Fx", float(squared(low)), 3)
-    for i, name in enumerate(COORDINATES):
+    largest, least = number("MB", reach**2, 3), number("Fx", float(scene.squared(low)), 3)
+    for i, name in enumerate(scene.COORDINATES):
         centre = solids.place(i)
         bottom = centre + np.array([0.0, 0.0, floor])
         rings = []
         for k in range(1, _RINGS + 1):
             radius = 0.5 * length * np.sqrt(k / _RINGS)
             flat = np.stack([radius * np.cos(turn), radius * np.sin(turn), 0.0 * turn], axis=1)
-            rings.append(pieces(flat + bottom))
+            rings.append(scene.pieces(flat + bottom))
         for angle in TURN + np.arange(4) * np.pi / 2.0:
             ray = 0.5 * length * np.array([[0.0, 0.0, 0.0], [np.cos(angle), np.sin(angle), 0.0]])
-            rings.append(pieces(ray + bottom))
-        out[f"floor {name}"] = Line(np.concatenate(rings), (205, 209, 214), 1.0)
+            rings.append(scene.pieces(ray + bottom))
+        out[f"floor {name}"] = scene.Line(np.concatenate(rings), (205, 209, 214), 1.0)
         pole = np.array([[0.0, 0.0, floor], [0.0, 0.0, -floor]]) + centre
-        out[f"axis {name}"] = Line(pieces(pole), (120, 126, 134), 1.0)
+        out[f"axis {name}"] = scene.Line(scene.pieces(pole), (120, 126, 134), 1.0)
         above = np.array([0.0, 0.0, 0.07 * length])  # where Fx is never positive, 0 is at the top
-        out[f"axis {name} name"] = Label(pole[1] + above, "Fx")
-        out[f"zero {name}"] = Label(centre + np.array([0.0, 0.0, solids.axis_height()]), "0")
+        out[f"axis {name} name"] = scene.Label(pole[1] + above, "Fx")
+        out[f"zero {name}"] = scene.Label(centre + np.array([0.0, 0.0, solids.axis_height()]), "0")
         edge = 0.5 * length * np.array([np.cos(TURN), np.sin(TURN), 0.0])
-        out[f"rim {name}"] = Label(bottom + edge, "MD = 0°")
-        out[f"ring {name}"] = Label(bottom - edge, f"MB = {largest}")
-        out[f"lowest {name}"] = Label(bottom, least)
-        out[f"title {name}"] = Label(
+        out[f"rim {name}"] = scene.Label(bottom + edge, "MD = 0°")
+        out[f"ring {name}"] = scene.Label(bottom - edge, f"MB = {largest}")
+        out[f"lowest {name}"] = scene.Label(bottom, least)
+        out[f"title {name}"] = scene.Label(
             centre + length * np.array([-0.45, 0.0, 0.62]), f"signals, coloured by {_NAMES[name]}"
         )
     return out
 
 
-def _moved(body: Body, by: Array) -> Body:
+def _moved(body: scene.Body, by: scene.Array) -> scene.Body:
     return replace(body, vertices=body.vertices + by)
 
 
 def solids_drawing(
-    solids: Solids, triangles: Array, by: str
-) -> tuple[dict[str, Painted], dict[str, Legend]]:
+    solids: Solids, triangles: scene.Array, by: str
+) -> tuple[dict[str, scene.Painted], dict[str, Legend]]:
     """Paint contacts where they are, coloured by a coordinate, and where their signals are."""
-    painted: dict[str, Painted] = {}
+    painted: dict[str, scene.Painted] = {}
     legends: dict[str, Legend] = {}
-    for i, name in enumerate(COORDINATES):
-        colours, legends[name] = shaded(name, values_of(name, triangles))
-        painted[name] = Painted(solids.seen(triangles, i), colours)
+    for i, name in enumerate(scene.COORDINATES):
+        colours, legends[name] = shaded(name, scene.values_of(name, triangles))
+        painted[name] = scene.Painted(solids.seen(triangles, i), colours)
         if name == by:
-            painted["contacts"] = Painted(solids.seen(triangles, None), colours)
+            painted["contacts"] = scene.Painted(solids.seen(triangles, None), colours)
     return painted, legends
 
 
-def picked_drawing(solids: Solids, row: Array, exaggeration: float) -> tuple[Drawing, str]:
+def picked_drawing(
+    solids: Solids, row: scene.Array, exaggeration: float
+) -> tuple[scene.Drawing, str]:
     """Mark a contact in all spaces, bend the whisker there, and write its signals."""
     whisker = solids.chart.whisker
     radius = 0.016 * solids.length
-    out: dict[str, Mark] = {}
+    out: dict[str, scene.Mark] = {}
     for space in (None, 0, 1, 2):
-        vertices, faces = ellipsoid(solids.seen(row, space), radius * np.eye(3))
-        out[f"mark {space}"] = Body(vertices, faces, CONTACT)
+        vertices, faces = scene.ellipsoid(solids.seen(row, space), radius * np.eye(3))
+        out[f"mark {space}"] = scene.Body(vertices, faces, CONTACT)
     # On the surface a whisker is about to slip off; a little inside it holds.
-    inside = np.asarray(whisker.position(values_of("arc_length", row))) - row[:3]
+    inside = np.asarray(whisker.position(scene.values_of("arc_length", row))) - row[:3]
     for share in (0.0, 0.01, 0.05):
         bent = deflect(whisker, PointContact(row[:3] + share * inside))
         if Status(int(bent.status)).ok:
@@ -237,8 +224,8 @@ def picked_drawing(solids: Solids, row: Array, exaggeration: float) -> tuple[Dra
             if share == 0.0:
                 return out, of_deflection(bent)
             break
-    measured = {name: float(values_of(name, row)) for name in SIGNALS}
-    where = {name: float(values_of(name, row)) for name in ("arc_length", *COORDINATES)}
+    measured = {name: float(scene.values_of(name, row)) for name in SIGNALS}
+    where = {name: float(scene.values_of(name, row)) for name in ("arc_length", *scene.COORDINATES)}
     edge = note("On the edge of what the whisker can reach: it is about to slip off.")
     return out, edge + table(measured, "At the base") + table(where, "Contact")
 
@@ -256,13 +243,13 @@ class MapMode:
     def __init__(self, page: Page) -> None:
         self._page = page
         self._solids: Solids | None = None
-        self._triangles: Array = np.empty((0, 3, 0))
-        self.row: Array | None = None
+        self._triangles: scene.Array = np.empty((0, 3, 0))
+        self.row: scene.Array | None = None
         self._drawn: tuple[Any, ...] | None = None
         gui = page.server.gui
         self._folder = gui.add_folder("Contacts and signals", visible=False)
         with self._folder:
-            self._by = gui.add_dropdown("Colours", COORDINATES, hint="Of the contacts")
+            self._by = gui.add_dropdown("Colours", scene.COORDINATES, hint="Of the contacts")
             self._cut = gui.add_checkbox("Cut open", True)
             self._slice = gui.add_dropdown(
                 "Slice", (_WHOLE, *SLICES), hint="Only contacts with one value of this"
@@ -271,8 +258,8 @@ class MapMode:
             self._value = gui.add_html("")
             self._legends = gui.add_html("")
             self._words = gui.add_html(note(_HINT))
-        scene: Any = page.server.scene  # coroutines may be given, and run one after the other
-        scene.on_click()(self._clicked)
+        shown: Any = page.server.scene  # coroutines may be given, and run one after the other
+        shown.on_click()(self._clicked)
         for control in (self._by, self._cut, self._slice, self._share):
             asked(control, lambda _: page.work.put("map", self.redraw))
 
@@ -327,7 +314,7 @@ class MapMode:
         if not len(self._triangles):
             painted = {}
         self._page.stage.show("solids", painted)
-        self._legends.content = "".join(legends[name].html() for name in COORDINATES)
+        self._legends.content = "".join(legends[name].html() for name in scene.COORDINATES)
 
     async def _clicked(self, event: viser.SceneClickEvent) -> None:
         """Pick where a solid is clicked."""
@@ -335,7 +322,7 @@ class MapMode:
         direction = np.asarray(event.ray_direction, dtype=np.float64)
         self._page.work.put("pick", lambda: self.pick(origin, direction))
 
-    def pick(self, origin: Array, direction: Array) -> None:
+    def pick(self, origin: scene.Array, direction: scene.Array) -> None:
         """Mark the contact that a ray, mm, meets first in any space."""
         found = self._solids
         if found is None:

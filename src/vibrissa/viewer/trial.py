@@ -9,23 +9,11 @@ import numpy as np
 import viser
 import xarray as xr
 
+from vibrissa import scene
 from vibrissa.contour import CylinderFit, SphereFit, shape_from_dataset, surface_grid
 from vibrissa.io import Footage
 from vibrissa.objects import Surface, objects_datasets
 from vibrissa.quantities import to_display
-from vibrissa.scene import (
-    Array,
-    Body,
-    Bytes,
-    Cloud,
-    Drawing,
-    Ints,
-    Mark,
-    cylinder,
-    ellipsoid,
-    object_surface,
-    sheet,
-)
 from vibrissa.sketch import round_step
 from vibrissa.viewer.bend import arrow, mm, ruler, whisker_body
 from vibrissa.viewer.colours import CONTACT, FIT, OBJECT, Legend
@@ -43,7 +31,7 @@ _COLOURS = np.array(
 )
 
 
-def extent(trial: Watched) -> tuple[Array, float]:
+def extent(trial: Watched) -> tuple[scene.Array, float]:
     """Middle, mm, and size, mm, of where whiskers go."""
     points = trial.lines.reshape(-1, 3)
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
@@ -79,9 +67,9 @@ _LEGEND = Legend(
 
 def moment_drawing(
     trial: Watched, frame: int, exaggeration: float, layers: Collection[str] = LAYERS
-) -> Drawing:
+) -> scene.Drawing:
     """Draw whiskers, forces and contacts of one frame."""
-    out: dict[str, Mark] = {}
+    out: dict[str, scene.Mark] = {}
     for i, whisker in enumerate(trial.whiskers):
         line = trial.lines[frame, i]
         if not np.isfinite(line).all():
@@ -92,14 +80,16 @@ def moment_drawing(
         if not np.isfinite(at).all():
             continue
         radius = float(mm(0.012 * whisker.length))
-        vertices, faces = ellipsoid(mm(at), radius * np.eye(3))
-        out[f"contact {i}"] = Body(vertices, faces, CONTACT)
+        vertices, faces = scene.ellipsoid(mm(at), radius * np.eye(3))
+        out[f"contact {i}"] = scene.Body(vertices, faces, CONTACT)
         if "Uncertainty" in layers and trial.covariance is not None:
             covariance = trial.covariance[frame, i]
             if np.isfinite(covariance).all() and np.sqrt(np.trace(covariance)) < _SHARP * 10.0:
                 variances, axes = np.linalg.eigh(covariance)
                 half = _SIGMAS * np.sqrt(np.maximum(variances, 0.0))
-                out[f"error {i}"] = Body(*ellipsoid(mm(at), mm(axes * half)), CONTACT, 0.25)
+                out[f"error {i}"] = scene.Body(
+                    *scene.ellipsoid(mm(at), mm(axes * half)), CONTACT, 0.25
+                )
         size = float(np.linalg.norm(force))
         if "Forces" in layers and np.isfinite(size) and size > 0.0:
             reach = 0.3 * whisker.length * np.sqrt(size / force_scale(whisker))
@@ -108,7 +98,7 @@ def moment_drawing(
     return out
 
 
-def touched(trial: Watched, frame: int) -> Drawing:
+def touched(trial: Watched, frame: int) -> scene.Drawing:
     """All contact points up to a frame in their whisker's colour, paler where uncertain."""
     points, colours = trial.contacts[: frame + 1], _whisker_colours(trial)
     known = np.isfinite(points).all(axis=-1)
@@ -123,20 +113,20 @@ def touched(trial: Watched, frame: int) -> Drawing:
         spread = np.trace(trial.covariance[: frame + 1][known][::step], axis1=1, axis2=2)
         bold = np.nan_to_num(np.clip(_SHARP / np.sqrt(np.maximum(spread, 1e-20)), 0.08, 1.0))
         shown = np.asarray(bold[:, None] * shown + (1.0 - bold[:, None]) * _PALE, dtype=np.uint8)
-    return {"contacts": Cloud(mm(chosen[::step]), shown, size)}
+    return {"contacts": scene.Cloud(mm(chosen[::step]), shown, size)}
 
 
-def _whisker_colours(trial: Watched) -> Bytes:
+def _whisker_colours(trial: Watched) -> scene.Bytes:
     count = np.arange(len(trial.whiskers)) % len(_COLOURS)
     return np.asarray(_COLOURS[count], dtype=np.uint8)
 
 
-def surroundings(trial: Watched, layers: Collection[str] = LAYERS) -> Drawing:
+def surroundings(trial: Watched, layers: Collection[str] = LAYERS) -> scene.Drawing:
     """Objects, the shape fitted to the contacts, and a scale."""
     middle, size = extent(trial)
     near = _known(trial)
     centre = np.mean(near, axis=0) if near.size else middle / to_display("length", 1.0)
-    out: dict[str, Mark] = {}
+    out: dict[str, scene.Mark] = {}
     if "Scale" in layers:
         length = 2.0 * round_step(size / 6.0)
         low = middle - np.array([0.5 * length, 0.2 * size, 0.15 * size])
@@ -147,40 +137,40 @@ def surroundings(trial: Watched, layers: Collection[str] = LAYERS) -> Drawing:
     if "Fitted shape" in layers and trial.contour is not None:
         body = fitted_body(trial.contour, near)
         if body is not None:
-            out["fit"] = Body(mm(body[0]), body[1], FIT, 0.4, "double")
+            out["fit"] = scene.Body(mm(body[0]), body[1], FIT, 0.4, "double")
     return out
 
 
-def object_body(thing: Surface, extent: float, near: Array) -> Body:
+def object_body(thing: Surface, extent: float, near: scene.Array) -> scene.Body:
     """An object; what has no end is shown within a cube, mm wide, about a place (3,), mm."""
     half = 0.5 * extent
     (held,) = objects_datasets([thing]).values()
-    vertices, faces = object_surface(held, np.stack([near - half, near + half], axis=1))
-    return Body(vertices, faces, OBJECT, 0.55, "double")
+    vertices, faces = scene.object_surface(held, np.stack([near - half, near + half], axis=1))
+    return scene.Body(vertices, faces, OBJECT, 0.55, "double")
 
 
-def _known(trial: Watched) -> Array:
+def _known(trial: Watched) -> scene.Array:
     points = trial.contacts.reshape(-1, 3)
     return np.asarray(points[np.isfinite(points).all(axis=1)])
 
 
-def fitted_body(contour: xr.Dataset, near: Array) -> tuple[Array, Ints] | None:
+def fitted_body(contour: xr.Dataset, near: scene.Array) -> tuple[scene.Array, scene.Ints] | None:
     """Vertices, m, and triangles of a fitted shape; None for what has no picture."""
     try:
         shape = shape_from_dataset(contour)
     except ValueError:
         return None
     if isinstance(shape, SphereFit):
-        return ellipsoid(shape.origin, shape.radius * np.eye(3), 48)
+        return scene.ellipsoid(shape.origin, shape.radius * np.eye(3), 48)
     if not near.size:
         return None
     if isinstance(shape, CylinderFit):
         along = (near - shape.origin) @ shape.axis
         middle = shape.origin + 0.5 * (along.min() + along.max()) * shape.axis
         length = 1.3 * float(np.ptp(along)) + 2.0 * shape.radius
-        return cylinder(middle, shape.axis, shape.radius, length)
+        return scene.cylinder(middle, shape.axis, shape.radius, length)
     grid = surface_grid(shape, near)["surface_grid_point"].to_numpy()
-    return sheet(grid)
+    return scene.sheet(grid)
 
 
 _MS = 1e3

@@ -28,7 +28,11 @@ from vibrissa.contacts.contacts import (
 from vibrissa.contacts.estimator import Estimator
 from vibrissa.contacts.filter import ContactFilter, Followed as Followed
 from vibrissa.contacts.friction import ratio_derivatives as ratio_derivatives
-from vibrissa.contacts.inversion import invert as invert, seeding_triplet as seeding_triplet
+from vibrissa.contacts.inversion import (
+    invert as invert,
+    polish as polish,
+    seeding_triplet as seeding_triplet,
+)
 from vibrissa.contacts.jacobian import (
     RANK,
     contact_signal_derivatives as contact_signal_derivatives,

@@ -96,18 +96,22 @@ def contact_set(contact_map: ContactMap, xi: Array, values: Array, domain: Domai
     )
 
 
-def sample(contact_map: ContactMap, chart: Array, domain: Domain) -> Samples:
-    """Solve the contacts at chart coordinates (n, 3)."""
-    fold, d = contact_map.chart.fold, contact_map.chart.discretization
-    xi = contacts_at(fold, chart)
+def solved(contact_map: ContactMap, chart: Array, domain: Domain) -> tuple[ContactSet, Array]:
+    """Solve the contacts at chart coordinates (n, 3); ∂(F, p)/∂ξ (n, 6, 3) too."""
+    xi = contacts_at(contact_map.chart.fold, chart)
+    d = contact_map.chart.discretization
     values, tangents = solve_forces(d, with_normal_force(xi), tangents=True)
     contacts = contact_set(contact_map, xi, values, domain)
     # The chart has the fold to a part in a million: contacts beyond it do not count.
     stable = determinant(tangents) > 0.0
-    by_chart = np.linalg.det(tangents[:, 3:] @ _chart_derivatives(fold, chart))
-    return Samples(
-        chart, contacts._replace(inside=contacts.inside & stable), tangents, np.abs(by_chart)
-    )
+    return contacts._replace(inside=contacts.inside & stable), tangents
+
+
+def sample(contact_map: ContactMap, chart: Array, domain: Domain) -> Samples:
+    """Solve the contacts at chart coordinates (n, 3), with what they stand for."""
+    contacts, tangents = solved(contact_map, chart, domain)
+    by_chart = tangents[:, 3:] @ _chart_derivatives(contact_map.chart.fold, chart)
+    return Samples(chart, contacts, tangents, np.abs(np.linalg.det(by_chart)))
 
 
 def spread(number: int, seed: int) -> Array:

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts import Domain, invert
-from vibrissa.identifiability.regions import ContactSet, contact_set, in_chart, sample
+from vibrissa.contacts import Domain, invert, polish
+from vibrissa.identifiability.regions import ContactSet, contact_set, in_chart, solved
 from vibrissa.numerics import AnyArray, Array, cross
 from vibrissa.rod import (
     Discretization,
@@ -48,8 +48,8 @@ _STEADY = 0.2
 _FIRM = 1e-3
 # Two solutions nearer than this (over L) are the same contact.
 _SAME = 1e-4
-# The search for better twins starts wide, ends fine, and keeps so many of each region.
-_WIDTHS = np.geomspace(0.2, 0.002, 16)
+# The search for better twins starts wide, ends where climbs begin, keeps so many of each region.
+_WIDTHS = np.geomspace(0.2, 0.02, 9)
 _KEPT = 16
 # A climb: pairs of a region, steps, directions tried in each, first and last length in the chart.
 _CLIMBING = 3
@@ -173,7 +173,7 @@ def better_twins(
         step = both[rng.permutation(len(both))] - both[rng.permutation(len(both))]
         step = within_turn(step, [False, True, False])
         chart = in_chart(np.concatenate([both + noise, both + 0.7 * step + 0.03 * noise]))
-        varied = sample(contact_map, chart, domain).contacts
+        varied, _ = solved(contact_map, chart, domain)
         found = twins(contact_map, names, chart, varied, domain)
         best = _best(joined([best, found]), regions, separation)
     return best
@@ -245,17 +245,14 @@ def _twins_near(
     contact_map: ContactMap, names: tuple[str, ...], first: Array, second: Array, domain: Domain
 ) -> tuple[ContactSet, ContactSet, AnyArray]:
     """Both contacts of pairs whose second one is solved for, and whether that is a twin."""
-    d = contact_map.chart.discretization
-    values, _ = solve_forces(d, with_normal_force(first))
+    chart = contact_map.chart
+    values, _ = solve_forces(chart.discretization, with_normal_force(first))
     one = contact_set(contact_map, first, values, domain)
-    target = one.signals[:, signal_columns(names)]
-    with np.errstate(all="ignore"):
-        second, values, misfit = corrected(d, names, second, target, units(contact_map, second))
-        agrees = (misfit <= AGREEMENT) & stable(contact_map, first)
-        usable = np.isfinite(second).all(axis=1) & (second[:, 0] > 0.0) & (second[:, 0] <= 1.0)
-    second = np.where((agrees & usable)[:, None], second, first)
-    values = np.where((agrees & usable)[:, None], values, one.values)
-    agrees = agrees & usable & stable(contact_map, second) & _firm(contact_map, names, second)
+    second, values, misfit, _ = polish(chart, names, one.signals[:, signal_columns(names)], second)
+    agrees = (misfit <= AGREEMENT) & stable(contact_map, first) & (second[:, 0] <= 1.0)
+    second = np.where(agrees[:, None], second, first)
+    values = np.where(agrees[:, None], values, one.values)
+    agrees &= stable(contact_map, second) & _firm(contact_map, names, second)
     return one, contact_set(contact_map, second, values, domain), agrees
 
 

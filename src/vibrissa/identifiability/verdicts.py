@@ -12,6 +12,7 @@ contacts in the plane although it may distinguish all others: it is *unique off 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,7 +43,7 @@ from vibrissa.identifiability.twins import (
     sizes,
     units,
 )
-from vibrissa.numerics import AnyArray, Array, cross
+from vibrissa.numerics import AnyArray, Array, cross, threads
 from vibrissa.quantities import attributes
 from vibrissa.rod import Discretization, discretize, solve_forces, with_normal_force
 from vibrissa.signals import CONE, REGIONS, SIGNALS, TRIPLETS, selection, signal_scales, signals_of
@@ -203,10 +204,14 @@ def uniqueness(
         raise ValueError(f"at least 16 samples are needed; got {samples}")
     question = ask(contact_map, wanted, min_separation, cone, domain, samples, seed)
     answers = []
-    for number, triplet in enumerate(names):
-        answers.append(answer(question, triplet, resolution))
-        if progress is not None:
-            progress(number + 1, len(names))
+    with ThreadPoolExecutor(threads()) as pool:  # half of the time is that of kernels
+        try:
+            for found in pool.map(lambda triplet: answer(question, triplet, resolution), names):
+                answers.append(found)
+                if progress is not None:
+                    progress(len(answers), len(names))
+        finally:
+            pool.shutdown(cancel_futures=True)
     return _labelled(question, names, answers, certificate)
 
 

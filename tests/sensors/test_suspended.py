@@ -10,6 +10,7 @@ import vibrissa as vb
 from vibrissa.cli.app import app
 from vibrissa.sensors import (
     Stage,
+    StageSweep,
     SuspendedWhisker,
     ThinPlate,
     calibrate_suspension,
@@ -333,6 +334,35 @@ def test_the_command_line_goes_from_tables_to_contacts(tmp_path):
     assert contacts.size == 40
     assert not contacts["in_contact"][:19].any()
     assert np.isfinite(contacts["x"]).sum() == contacts["in_contact"].sum() >= 18
+    done = run(app, [*given, "-o", str(tmp_path / "c.nc")])
+    assert done.exit_code == 0, done.output
+    recording = vb.load_recording(tmp_path / "c.nc")
+    assert recording["contact_shared"].sizes["error"] >= 3
+    point = recording["estimates"]["contact_point"].values[:, 0]
+    np.testing.assert_allclose(point[:, 0], contacts["x"], atol=1e-9)
+    assert run(app, ["info", str(tmp_path / "c.nc")]).exit_code == 0
+
+
+def test_the_recording_of_a_sweep_gives_the_object():
+    """Contacts by `deflect` along 1.6 mm of a cylinder, which there is nearly a plane."""
+    base, _, _, bent = swept()
+    sensor, readings, on = read_by_spring(bent)
+    found = follow_sweep(sensor, readings, base)
+    sweep = StageSweep(readings, base, np.eye(3))
+    recording = vb.pipeline.swept_recording(sensor, sweep, found)
+    alone = recording.copy(deep=False)
+    alone.dataset = alone.to_dataset().drop_dims("error")
+    fit, less = (
+        vb.contour.shape_from_dataset(vb.pipeline.reconstruct(one, "plane"))
+        for one in (recording, alone)
+    )
+    true = (bent.contact_point + base)[on].mean(axis=0)
+    normal = fit.normal
+    away = np.dot(fit.origin - true, normal)
+    spread = [np.sqrt(np.trace(one.covariance)) for one in (fit, less)]
+    assert abs(normal[1]) > 0.99
+    assert abs(away) < 0.2e-3
+    assert spread[0] > spread[1]  # what contacts share is not averaged away
 
 
 @pytest.mark.parametrize(

@@ -220,16 +220,19 @@ def estimate(
     are none (see `vibrissa signals`), and a contour that was made of other contacts is left out. A
     table goes to a table. With a --sensor (.toml) its columns are the sensor's channels, and poses
     of the base, as lines of `vibrissa stream` are; with that of `vibrissa calibrate` (.nc) it is a
-    sweep: positions of the stage, and the channels. With --gravity a whisker of known density sags.
+    sweep: positions of the stage, and the channels; `vibrissa reconstruct` finds the object of the
+    recording (.nc) that it may go to. With --gravity a whisker of known density sags.
     Example: `vibrissa estimate signals.csv --map map.nc --using Fx,FT,MB,MD -o contacts.csv`
     """
     if how.noise.covariance is not None:
         how.noise.matrix()
     recorded = kind_in(vb.io.check_readable(signals)) == RECORDING
     target = target or (signals if recorded else Path("contacts.csv"))
-    vb.io.check_writable(target, (*vb.io.NETCDF, *vb.io.CSV) if recorded else vb.io.CSV)
+    swept = sensor is not None and vb.io.is_netcdf(sensor)
+    both = (*vb.io.NETCDF, *vb.io.CSV)
+    vb.io.check_writable(target, both if recorded or swept else vb.io.CSV)
     free_beside(signals, [target], force)
-    if sensor is not None and not vb.io.is_netcdf(sensor):
+    if sensor is not None and not swept:
         stated = (
             recorded,
             how.using,
@@ -363,6 +366,14 @@ def _from_sweep(table: Path, target: Path, path: Path) -> None:
     sensor, stage = vb.sensors.load_suspended(path)
     sweep = stage.sweep(table)
     found = vb.sensors.follow_sweep(sensor, *sweep)
+    remark(
+        f"{found.in_contact.sum()} of {len(found.points)} samples are in contact; m, laboratory "
+        "frame"
+    )
+    if target.suffix.lower() in vb.io.NETCDF:
+        vb.io.save_recording(target, vb.pipeline.swept_recording(sensor, sweep, found))
+        print_written(target)
+        return
     sigma = found.covariance.diagonal(axis1=1, axis2=2) ** 0.5
     header = [a + b for a in ("", "normal_", "sigma_") for b in "xyz"]
     columns = (found.points, found.normal, sigma)
@@ -372,7 +383,6 @@ def _from_sweep(table: Path, target: Path, path: Path) -> None:
         for i, on in enumerate(found.in_contact)
     ]
     vb.io.write_table(target, names, rows)
-    remark(f"{found.in_contact.sum()} of {len(rows)} samples are in contact; m, laboratory frame")
     print_written(target)
 
 

@@ -129,7 +129,8 @@ def stages(
         tree = vb.pipeline.with_signals(tree, **source.as_keywords(tree, how.known, how.proximal))
         tell("signals", 1, 1)
         yield "signals", tree
-    remark(described(tree))
+    if "signals" in tree.children:
+        remark(described(tree))
     if "estimates" in due:
         tree, used = estimated(tree, how, tell, name)
         remark(used)

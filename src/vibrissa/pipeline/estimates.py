@@ -18,10 +18,11 @@ from vibrissa.pipeline.frames import cross_matrices, signals_in
 from vibrissa.pipeline.locate import TRIPLET, locate, locate_from_wrench, without_contact
 from vibrissa.pipeline.signals import sensor_noise
 from vibrissa.quantities import attributes
-from vibrissa.recording import Group, Recording
+from vibrissa.recording import Group, Recording, coordinates, recorded, recording_tree
 from vibrissa.rod import PROXIMAL
+from vibrissa.sensors import StageSweep, SuspendedWhisker, SweptContacts
 from vibrissa.signals import selection
-from vibrissa.status import is_ok
+from vibrissa.status import Status, is_ok
 from vibrissa.whisker import Whisker
 
 Array = NDArray[np.float64]
@@ -31,6 +32,9 @@ Progress = Callable[[str, int, int], None]
 
 WHOLE = "wrench"
 """Value of ``using`` for force and moment whole, instead of names of signals."""
+
+NORMAL_SIGMA = 0.1
+"""Standard deviation of the normals of swept surfaces, rad: friction across the wire turns them."""
 
 _LABORATORY = {"reference_frame": "laboratory"}
 _SQUARE = ("time", "space", "space_2")
@@ -282,6 +286,56 @@ def _laboratory_covariance(
             both = held @ pose_wrench @ np.swapaxes(by_wrench, 1, 2)
             out = out + both + np.swapaxes(both, 1, 2)
     return np.asarray(out)
+
+
+def swept_recording(
+    sensor: SuspendedWhisker, sweep: StageSweep, found: SweptContacts
+) -> xr.DataTree:
+    """Recording of a sweep with a suspended whisker, with its contacts as estimates.
+
+    Parameters
+    ----------
+    sensor : SuspendedWhisker
+        Calibrated sensor.
+    sweep : StageSweep
+        Readings and poses of the sensor.
+    found : SweptContacts
+        Contacts of the sweep, of `follow_sweep`.
+
+    Returns
+    -------
+    xarray.DataTree
+        Recording with a group ``estimates``, and the errors that contacts share; its time is the
+        number of the sample. `reconstruct` fits an object to it.
+    """
+    pose, n, on = sensor.whisker.pose, len(found.points), found.in_contact
+    held = {
+        "in_contact": on,
+        "base_position": sweep.position + sweep.rotation @ pose.origin,
+        "base_rotation": np.broadcast_to(sweep.rotation @ pose.rotation, (n, 3, 3)),
+    }
+    normal = found.normal
+    across = NORMAL_SIGMA**2 * (np.eye(3) - normal[:, :, None] * normal[:, None, :])
+    estimates = {
+        "contact_point": found.points,
+        "contact_covariance": found.covariance,
+        "contact_normal": normal,
+        "normal_covariance": across,
+        "point_normal_covariance": 0.0 * across,
+        "contact_point_whisker": (found.points - held["base_position"]) @ held["base_rotation"][0],
+        "arc_length": found.arc_length,
+        "in_contact": on,
+        "status": np.where(on, int(Status.OK), int(Status.NO_CONTACT)).astype(np.int8),
+    }
+    shared = {"contact_shared": np.swapaxes(found.shared, 0, 1)}
+    root, group = (
+        xr.Dataset(
+            {name: recorded(name, values) for name, values in given.items()},
+            coordinates(np.arange(n, dtype=np.float64), [sensor.whisker.name or "wire"]),
+        )
+        for given in (held | shared, estimates)
+    )
+    return recording_tree(root, [sensor.whisker], "swept by a stage", groups={"estimates": group})
 
 
 def _chosen(candidates: xr.DataArray, chosen: NDArray[np.int64]) -> xr.DataArray:

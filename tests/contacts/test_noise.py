@@ -8,6 +8,7 @@ from scipy.stats import chi2
 import vibrissa as vb
 from vibrissa.contacts.posterior import ranked
 from vibrissa.identifiability.regions import sample
+from vibrissa.numerics import quick_exp
 from vibrissa.rod import fold_forces, solve_forces
 from vibrissa.signals import SIGNALS
 
@@ -218,6 +219,13 @@ def test_without_noise_nothing_is_probable(gamma_map, beside_slip_off):
     assert np.isnan(found.probability).all()
     assert not found.covariance_valid.any()
     assert set(found.to_dataset().probability.dims) == set(found.dims)
+
+
+def test_quick_exponentials_are_exact_enough_for_densities():
+    x = np.linspace(-20.0, 20.0, 401)
+    quick = np.array([quick_exp.py_func(one) for one in x])
+    np.testing.assert_allclose(quick, np.exp(x), rtol=2e-7)
+    assert 0.0 <= quick_exp.py_func(-1e6) < 1e-290
 
 
 def test_ranks_are_probabilities(rng):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vibrissa.tracking import TraceOptions, TraceSeries, find_bases, is_bright, trace_video
+from vibrissa.tracking import TraceOptions, TraceSeries, find_start, is_bright, trace_video
 from vibrissa.tracking.refine.least_squares import trace_variance
 from vibrissa.tracking.space.frame_pairs import better_offset
 from vibrissa.tracking.space.rest_shape import Length, RestShape, lengthened, likeliest_length
@@ -66,11 +66,12 @@ def test_bright_whiskers_are_traced_as_dark_ones(filmed):
 
 def test_views_together_say_where_the_whisker_begins(filmed):
     frames = [view[0] for view in filmed.frames]
-    bases = find_bases(filmed.cameras, frames)
+    bases = find_start(filmed.cameras, [[frame] for frame in frames]).bases
     for view, base in enumerate(bases):
         assert np.linalg.norm(base - filmed.truth["trace"].values[0, view, 0]) < 2.0
     # The same columns are the same x: moved sideways nothing fits.
-    assert find_bases(filmed.cameras, [frames[0], np.roll(frames[1], 40, axis=1)]) is None
+    apart = [[frames[0]], [np.roll(frames[1], 40, axis=1)]]
+    assert find_start(filmed.cameras, apart).bases is None
 
 
 def past_a_peg(away, grey, seed):

@@ -5,7 +5,7 @@ import pytest
 from furry import Film, Setup
 
 from vibrissa.io import VideoInfo, write_video
-from vibrissa.tracking import TraceOptions, find_bases, find_start, start_frames, trace_video
+from vibrissa.tracking import TraceOptions, find_start, start_frames, trace_video
 from vibrissa.tracking.trace.curves import Segment, joined, segments
 from vibrissa.tracking.trace.scene import Scene, nth_largest
 from vibrissa.tracking.trace.start import negative
@@ -146,11 +146,10 @@ def test_fur_in_which_no_whisker_is_to_be_seen_is_in_doubt(films):
 def test_one_frame_is_enough_on_even_ground(filmed):
     """Mirrored left to right, the bases are mirrored, but for what a pixel is rounded to."""
     frames = [view[0] for view in filmed.frames]
-    bases = find_bases(filmed.cameras, frames)
+    bases = find_start(filmed.cameras, [[frame] for frame in frames]).bases
     width = frames[0].shape[1]
-    for base, other in zip(
-        bases, find_bases(filmed.cameras, [f[:, ::-1] for f in frames]), strict=True
-    ):
+    mirrored = find_start(filmed.cameras, [[frame[:, ::-1]] for frame in frames]).bases
+    for base, other in zip(bases, mirrored, strict=True):
         np.testing.assert_allclose([width - 1.0 - other[0], other[1]], base, atol=2.0)
 
 

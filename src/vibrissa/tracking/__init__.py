@@ -26,7 +26,6 @@ from vibrissa.tracking.trace.start import (
     FRAMES,
     Candidate,
     Start,
-    find_bases as find_bases,
     find_start,
     is_bright as is_bright,
 )

@@ -511,20 +511,27 @@ def _remarks_on_fur(one: Tracked, fur: float, name: str) -> list[str]:
 
 
 def _remarks_on_plane(one: Tracked, name: str) -> list[str]:
-    """Whether a whisker seems to leave the plane of the only view."""
+    """How far a whisker may leave the plane of the only view, and what that does to contacts."""
     tips = one.traces.ends.all(axis=(1, 2)) & np.isfinite(one.curves).all(axis=(1, 2))
     if tips.sum() < _FEWEST:
-        return []
+        return [f"{name}: too few frames show its tip to see whether it leaves the plane."]
     lengths = np.linalg.norm(np.diff(one.curves[tips], axis=1), axis=2).sum(axis=1)
     short, long = np.percentile(lengths, [5.0, 95.0])
+    turned = float(np.arccos(short / long))
+    seen = f"{name}: it is seen {1e3 * short:.1f} to {1e3 * long:.1f} mm long (5 and 95 % of the "
     if short > (1.0 - _SHORTENED) * long:
-        return []
+        away = np.linalg.norm(one.fit.contact_point - one.fit.position, axis=1)
+        deep = np.sin(turned) * float(np.nan_to_num(away).max())
+        return [
+            f"{seen}frames that show its tip), which does not exclude that it leaves the plane by "
+            f"{np.degrees(turned):.0f}°: contact points may be {1e3 * deep:.1f} mm nearer to the "
+            "camera or farther from it, which is in no covariance."
+        ]
     return [
-        f"{name}: it is seen {1e3 * short:.1f} to {1e3 * long:.1f} mm long (5 and 95 % of the "
-        "frames that show its tip), as if it turned out of the image by up to "
-        f"{np.degrees(np.arccos(short / long)):.0f}°. Contact is then not distinguished from "
-        "turning, and forces and contact points of such frames are not to be believed. A second "
-        "view (or a mirror, --views) shows it."
+        f"{seen}frames that show its tip), as if it turned out of the image by up to "
+        f"{np.degrees(turned):.0f}°. Contact is then not distinguished from turning, and forces "
+        "and contact points of such frames are not to be believed. A second view (or a mirror, "
+        "--views) shows it."
     ]
 
 

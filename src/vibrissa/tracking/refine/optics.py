@@ -86,29 +86,17 @@ _FAR = 6.0
 class Optics:
     """Errors of the cameras that the motion of a free whisker shows.
 
-    Parameters
-    ----------
-    cameras : tuple of Camera
-        Cameras that explain the views.
-    orthographic : tuple of Camera
-        Cameras as they were stated, without perspective.
-    values, sigma : array (n,)
-        Inverse distance of each view, 1/m, and then of each view but the first its turn about the
-        camera's axes, rad, its relative scale and its shift, pixels; their standard deviations.
-    stated : array (n,)
-        The same numbers of the cameras as they were stated.
-    before, after : float
-        Root mean square distance of the rigid whisker from the traces with the stated cameras and
-        with these, pixels.
+    Values are the inverse distance of each view, 1/m, and then of each view but the first its turn
+    about the camera's axes, rad, its relative scale and its shift, pixels.
     """
 
-    cameras: tuple[Camera, ...]
-    orthographic: tuple[Camera, ...]
+    cameras: tuple[Camera, ...]  # that explain the views
+    orthographic: tuple[Camera, ...]  # as they were stated, without perspective
     values: Array
     sigma: Array
-    stated: Array
-    before: float
-    after: float
+    stated: Array  # values of the cameras as they were stated
+    before: float  # distance of the rigid whisker from the traces with stated cameras, pixels
+    after: float  # and with these
 
     @property
     def needed(self) -> bool:
@@ -162,21 +150,9 @@ class Optics:
 def rough_optics(
     cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]], distance: float | None = None
 ) -> Optics | None:
-    """Find the optics of cameras that are known only roughly from a trial's traces.
+    """Find the optics of orthographic cameras from traces of frames that belong together.
 
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        Orthographic cameras, as they are stated.
-    traces : sequence of sequence of Trace
-        Traces of one whisker, view by view, of frames that belong together.
-    distance : float, optional
-        Approximate distance of the lenses from what they see, m.
-
-    Returns
-    -------
-    Optics or None
-        Optics that were found; None if too few frames show a free whisker.
+    The approximate distance of the lenses is in m; None if too few frames show a free whisker.
     """
     count = len(traces[0])
     rows = np.linspace(0, count - 1, min(_SAMPLE, count)).astype(int)
@@ -231,25 +207,9 @@ def estimated_optics(
     shape: RestShape,
     distance: float | None = None,
 ) -> Optics | None:
-    """Find the optics that explain a free whisker in all views.
+    """Find the optics that explain a free whisker, as the stated cameras show it in space.
 
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        Orthographic cameras, as they are stated.
-    traces : TraceSeries
-        Traces of one whisker.
-    curves : array (time, node, 3)
-        The whisker in space as the stated cameras show it, m.
-    shape : RestShape
-        Rest shape, with the frames that are free of contact.
-    distance : float, optional
-        Approximate distance of the lenses from what they see, m.
-
-    Returns
-    -------
-    Optics or None
-        Optics that were found; None if too few frames are free.
+    None if too few frames are free.
     """
     alike = np.nan_to_num(shape.deviation, nan=np.inf) < _ALIKE * shape.length
     rows = np.flatnonzero((shape.free | alike) & np.isfinite(curves).all(axis=(1, 2)))

@@ -35,7 +35,7 @@ from vibrissa.tracking.trace.ridge import (
     smooth,
     traced,
 )
-from vibrissa.tracking.trace.trace import STEP, Trace, TraceOptions, overlap
+from vibrissa.tracking.trace.trace import STEP, Trace, TraceOptions, aligned, overlap
 
 Array = NDArray[np.float64]
 
@@ -262,9 +262,8 @@ class Follower:
             return True
         # It may have turned about its base by more: then all of it is seen, and no more than that.
         share = self.length_of(trace) / max(self.usual, 1.0)
-        turn = float(_direction(last) @ _direction(trace.line))
         base = _distances(last[:1], trace.line[:_PROXIMAL])[0]
-        whole = _WANTED <= share <= 1.0 / _WANTED and turn > _TURNED
+        whole = _WANTED <= share <= 1.0 / _WANTED and aligned(last, trace.line) > _TURNED
         return bool(whole and base <= self.options.jump)
 
     def accept(self, trace: Trace) -> Trace:
@@ -419,12 +418,6 @@ def _repeats(line: Array, other: Array) -> bool:
     """Whether a march goes nowhere but where another one went, and as far."""
     far = abs(len(line) - len(other)) > 1
     return not far and len(line) > 1 and overlap(line, other, _REPEATED) == 1.0
-
-
-def _direction(line: Array) -> Array:
-    """Unit vector in which a line begins."""
-    chord = line[min(_PROXIMAL, len(line) - 1)] - line[0]
-    return np.asarray(chord / max(float(np.hypot(*chord)), 1e-9))
 
 
 def _alike(line: Array, other: Array) -> bool:

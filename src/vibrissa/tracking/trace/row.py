@@ -40,7 +40,7 @@ from vibrissa.tracking.trace.identity import (
 )
 from vibrissa.tracking.trace.ridge import measure, noise_level, prolonged, traced
 from vibrissa.tracking.trace.scene import Scene
-from vibrissa.tracking.trace.trace import STEP, Trace, even, given, overlap
+from vibrissa.tracking.trace.trace import STEP, Trace, aligned, even, given, overlap
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -546,7 +546,7 @@ class _Costs(NamedTuple):
                 if expected is None:
                     away = _from_click(follower.base, trace.line)
                     far = LOST * (away / min(_CLICK, half[k])) ** 2
-                elif _aligned(expected, trace.line) > _ALIGNED:
+                elif aligned(expected, trace.line) > _ALIGNED:
                     offsets[k, c], far = sideways(expected, trace.line), 0.0
                 else:
                     continue
@@ -596,10 +596,3 @@ def _carry(
         for follower, trace in zip(followers, found, strict=True):
             if not len(trace.line):
                 follower.carry(float(np.median(turns)), np.median(shifts, axis=0))
-
-
-def _aligned(expected: Array, line: Array) -> float:
-    """Cosine between the directions in which two lines begin."""
-    i = min(int(POINTS[-1]), len(expected) - 1, len(line) - 1)
-    a, b = expected[i] - expected[0], line[i] - line[0]
-    return float(a @ b / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-9))

@@ -58,8 +58,8 @@ _MOVED = 0.4
 _BETTER = 1.5
 """Factor by which more must be seen of a bright whisker than of a dark one."""
 
-_LONG = 80.0
-"""Score above which a line is a whisker rather than a hair."""
+_LONG, _CERTAIN = 80.0, 200.0
+"""Scores above which a line is a whisker rather than a hair: likely, and without doubt."""
 
 _ONE_VIEW, _NO_FACE = 0.85, 0.5
 """Factors of the confidence if one view alone shows where the whisker begins, and if what does not
@@ -171,13 +171,6 @@ def _seen(frame: Frame, bases: Sequence[ArrayLike] | None, options: TraceOptions
         max((t.support for t in start_at(base, options).from_base(frame, noise)), default=0.0)
         for base in bases
     )
-
-
-def find_bases(
-    cameras: Sequence[Camera], frames: Sequence[Frame], options: TraceOptions | None = None
-) -> list[Array] | None:
-    """Find where the whisker begins that all views show."""
-    return find_start(cameras, [[frame] for frame in frames], options).bases
 
 
 def find_start(
@@ -383,6 +376,8 @@ def _voted(found: Sequence[Sequence[_Combination]]) -> _Vote:
     share = min(1.0, 2.0 * float(np.median([one.share for one in winners])))
     gap = float(np.median([one.gap for one in winners]))
     sure = share * float(np.exp(-0.5 * (gap / _GAP) ** 2))
+    scores = np.median([[curve.score for curve in one.curves] for one in winners], axis=0)
+    sure *= min(1.0, float(scores.max()) / _CERTAIN)
     confidence = sure * agreed / len(found) * total / (total + rival)
     others = [(worth / total, row) for worth, row in zip(rest, ranked[1:], strict=True)]
     return _Vote(winners, confidence, (agreed, len(found)), others)
@@ -414,7 +409,8 @@ def _start(search: _Search, vote: _Vote, bright: bool) -> Start:
         doubts.append(f"{vote.hidden} hardly shows it along the lines of sight of the other view")
     if confidence < _SURE:
         first, count = vote.agreed
-        doubts.append(f"it is the likeliest in {first} of {count} frames, or others are nearly so")
+        why = "or others are nearly so, or it is as short as hairs are"
+        doubts.append(f"it is the likeliest in {first} of {count} frames, {why}")
     gap = float(np.median([one.gap for one in vote.winners]))
     if gap > 0.5 * _GAP:
         doubts.append(f"its base is {gap:.0f} pixels from where the other view shows it")

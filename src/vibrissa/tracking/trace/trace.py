@@ -142,6 +142,13 @@ def even(line: Array, start: float = 0.0) -> Array:
     return interpolated(wanted, s, line)
 
 
+def aligned(line: Array, other: Array, points: int = 30) -> float:
+    """Cosine between the directions in which two lines begin, over a number of points at most."""
+    i = min(points, len(line) - 1, len(other) - 1)
+    a, b = line[i] - line[0], other[i] - other[0]
+    return float(a @ b / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-9))
+
+
 def overlap(line: Array, other: Array, near: float = 3.0) -> float:
     """Share of a line that runs along another, nearer than some pixels."""
     from scipy.spatial import cKDTree

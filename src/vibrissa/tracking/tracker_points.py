@@ -54,24 +54,12 @@ _ARC_POINTS = 12
 
 @dataclass(frozen=True)
 class TrackerTraces:
-    """Points of other trackers as traces in cameras.
+    """Points of other trackers as traces in cameras."""
 
-    Parameters
-    ----------
-    cameras : tuple of Camera
-        Cameras of the views; of points in space two that show them.
-    traces : list of list of list of Trace
-        Traces view by view, whisker by whisker, frame by frame, as `track` takes them.
-    names : list of str
-        Names of the whiskers.
-    notes : tuple of str
-        Assumptions, a sentence each.
-    """
-
-    cameras: tuple[Camera, ...]
-    traces: list[list[list[Trace]]]
+    cameras: tuple[Camera, ...]  # of the views; of points in space two that show them
+    traces: list[list[list[Trace]]]  # by view, whisker and frame, as `track` takes them
     names: list[str]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # assumptions, a sentence each
 
 
 def tracker_traces(

@@ -22,11 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.tracking.trace.follower import (
-    ENOUGH,
-    FEATURES,
-    Appearance,
-)
+from vibrissa.tracking.trace.follower import ENOUGH, FEATURES, Appearance
 from vibrissa.tracking.trace.trace import STEP, Trace, overlap
 
 Array = NDArray[np.float64]

@@ -173,7 +173,7 @@ def _part(
     near = NEAR * followers[0].options.scale
     parted = between_whiskers(every, still, (frame.shape[0], frame.shape[1]), near)
     for follower, line, clutter in zip(followers, every, parted, strict=True):
-        alone = line is not None and clutter.hides(line).mean() < _MERGED
+        alone = line is not None and len(line) and clutter.hides(line).mean() < _MERGED
         follower.clutter = clutter if alone else clutter.still_only
 
 

@@ -128,7 +128,10 @@ def trace_video(
         if len(followers) == 1 and scene.still is not None and scene.still.before_body:
             follower.options = replace(options, jump=_FAINT * options.jump)
     traces[:] = [list(row) for row in begun] or [[] for _ in followers]
-    _check(corrections, len(followers))
+    if wrong := sorted({k for _, k in corrections if not 0 <= k < len(followers)}):
+        raise ValueError(
+            f"corrections are for whiskers {wrong}; there are {len(followers)}, from 0"
+        )
     for i, frame in enumerate(chain(first, source)):
         if frame.shape != shape:
             raise ValueError(
@@ -201,12 +204,6 @@ def _seen_before(frame: Frame, found: Sequence[Trace], followers: Sequence[Follo
         if chosen[-1] >= 0:
             follower.remember(features[chosen[-1]])
     return Seen(lines, features, chosen, clear=min(chosen) >= 0)
-
-
-def _check(corrections: Corrections, count: int) -> None:
-    wrong = sorted({k for _, k in corrections if not 0 <= k < count})
-    if wrong:
-        raise ValueError(f"corrections are for whiskers {wrong}; there are {count}, from 0")
 
 
 def follow_all(

@@ -21,7 +21,7 @@ from vibrissa.io import load_recording, save_recording, video_info
 from vibrissa.quantities import quantity
 from vibrissa.recording import Recording
 from vibrissa.report import document, figure_sections, movies_section, table, trial_sections
-from vibrissa.report.page import Section, shown_value
+from vibrissa.report.page import Section, shown_value, with_sigma
 from vibrissa.report.trial import (
     _settings,
     contacts_by_whisker,
@@ -516,3 +516,10 @@ def test_it_shows_itself_in_a_browser(written, browser):
     assert box["width"] > 300
     assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
     page.close()
+
+
+def test_a_value_has_the_decimals_that_its_error_determines():
+    assert with_sigma("object_radius", 1.34927e-3, 3.52e-6) == ("1.3493 mm", "0.0035 mm")
+    assert with_sigma("object_radius", 2.7e-3, 7.1e-6) == ("2.7000 mm", "0.0071 mm")
+    assert with_sigma("object_radius", 12.3456e-3, 1.3e-3) == ("12.3 mm", "1.3 mm")
+    assert with_sigma("object_radius", 1.34927e-3, 0.0)[0] == "1.349 mm"  # exact

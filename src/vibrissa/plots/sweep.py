@@ -87,7 +87,9 @@ def _verdicts(
         _cone_axis(axes)
         _key(figure, verdict.values)
         held = (verdict.values == VERDICTS[0]).all(axis=0)
-        shown = ", ".join(f"({triplet_label(names[i])})" for i in np.flatnonzero(held)) or "none"
+        least = triplet_label(names[int(np.argmin(np.nan_to_num(degrees, nan=90.0).max(axis=0)))])
+        shown = ", ".join(f"({triplet_label(names[i])})" for i in np.flatnonzero(held))
+        shown = shown or f"none; ({least}) has the smallest critical cones"
         style.conclude(figure, f"Unique for each of {len(degrees)} whiskers: {shown}")
         return figure
     groups = found["group"].values.astype(str)

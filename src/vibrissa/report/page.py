@@ -299,6 +299,20 @@ def shown_value(name: str, value: float, digits: int = 4) -> str:
     return f"{text.replace('-', '−')}{'' if unit in ('', '°') else ' '}{unit}"
 
 
+def with_sigma(name: str, value: float, sigma: float) -> tuple[str, str]:
+    """Write an SI value and its standard deviation, both with the decimals that it determines."""
+    factor, unit = shown_unit(name, value)
+    spread = sigma * factor
+    if not np.isfinite(value * spread) or spread < _LEAST:
+        return shown_value(name, value), shown_value(name, sigma, 2)
+    decimals = int(np.clip(1.0 - np.floor(np.log10(spread)), 0, 5))
+    # Adding zero turns −0 into 0.
+    numbers = (f"{round(x, decimals) + 0.0:.{decimals}f}" for x in (value * factor, spread))
+    end = f"{'' if unit in ('', '°') else ' '}{unit}"
+    first, second = (f"{number.replace('-', '−')}{end}" for number in numbers)
+    return first, second
+
+
 _PACKAGES = ("numpy", "scipy", "numba", "xarray", "h5netcdf", "matplotlib", "av", "plotly")
 _BLOCK = 1 << 20
 _EPOCH = "SOURCE_DATE_EPOCH"

@@ -18,7 +18,7 @@ from vibrissa.display import show
 from vibrissa.pipeline import compare_contacts, distances_by_class
 from vibrissa.quantities import QUANTITIES, quantity
 from vibrissa.recording import Recording
-from vibrissa.report.page import Section, Tile, paragraph, shown_value, table, tiles
+from vibrissa.report.page import Section, Tile, paragraph, shown_value, table, tiles, with_sigma
 from vibrissa.signals import CIRCULAR, SIGNALS, base_signals, within_turn
 from vibrissa.status import describe
 from vibrissa.whisker import Whisker
@@ -101,8 +101,8 @@ def _results(
     fit = shape_from_dataset(recording["contour"].to_dataset())
     size = Tile(f"{fit.kind}", "shape fitted to the contacts")
     if "radius" in fit.sigma:
-        width = shown_value("object_radius", 2.0 * float(getattr(fit, "radius")), 3)  # noqa: B009
-        sigma = shown_value("object_radius", 2.0 * fit.sigma["radius"], 2)
+        diameter = 2.0 * float(getattr(fit, "radius"))  # noqa: B009
+        width, sigma = with_sigma("object_radius", diameter, 2.0 * fit.sigma["radius"])
         width = width.removesuffix(sigma.rpartition(" ")[2]).strip()
         size = Tile(f"{width} ± {sigma}", f"diameter of the {fit.kind} fitted to the contacts")
     misfit = Tile(f"{fit.misfit:.2g}", "misfit (χ² per degree of freedom; 1 is expected)")
@@ -386,13 +386,7 @@ def _contour(recording: xr.DataTree, seed: int) -> str:
         own = [p for p in fit.parameters if p.startswith(name)]
         for parameter, value in zip(own, values, strict=True):
             label = parameter.replace("_", ", ")
-            rows.append(
-                (
-                    label,
-                    shown_value(meant, float(value), 4),
-                    shown_value(meant, sigma[parameter], 3),
-                )
-            )
+            rows.append((label, *with_sigma(meant, float(value), sigma[parameter])))
     text = table(
         rows,
         ("parameter", "fitted", "standard deviation"),

@@ -62,6 +62,29 @@ def test_true_contacts_are_in_the_regions(gamma_map, sigma, using):
         assert (found.status == vb.Status.UNIQUE).mean() > 0.95
 
 
+@pytest.mark.parametrize("using", ["Fx MB MD", "Fx FT MB MD"])
+def test_friction_and_an_uncertain_base_are_found_together(gamma_map, sigma, using):
+    whisker, rng = gamma_map.whisker, np.random.default_rng(9)
+    unit, truth, wrenches = whisker.base_bending_stiffness / whisker.length**2, [], []
+    for ratio in rng.normal(size=60) * 0.2:
+        base = abs(rng.normal()) * sigma
+        soft = whisker.with_properties(base_stiffness=(1.0 / max(base, 1.0), 1.0))
+        size, angle = rng.uniform(0.2, 0.4) * unit, rng.uniform(-3, 3)
+        parts = size * np.array([ratio, np.cos(angle), np.sin(angle)])
+        bent = vb.deflect(
+            soft, vb.PointForce(rng.uniform(0.5, 0.75) * whisker.length, components=parts)
+        )
+        truth.append(bent.contact_point)
+        wrenches.append(np.concatenate([bent.force, bent.moment]))
+    wrenches = np.array(wrenches) + rng.normal(size=(60, 6)) * np.sqrt(np.diag(NOISE))
+    signals, both = signals_of(wrenches, using), {"friction": 0.2, "compliance_sigma": sigma}
+    found = gamma_map.estimate(signals, using, NOISE, **both)
+    assert (distance(found, np.array(truth)) < 7.81).mean() > 0.88
+    for one in both:
+        alone = gamma_map.estimate(signals, using, NOISE, **{one: both[one]})
+        assert (distance(alone, np.array(truth)) < 7.81).mean() < 0.85
+
+
 def test_one_standard_deviation_is_one(gamma_map, sigma):
     """With hardly any noise three signals place the contact just so wrong."""
     truth, wrenches = touched(gamma_map.whisker, np.full(20, 0.1 * sigma), 1e-8 * NOISE)
@@ -94,8 +117,6 @@ def test_bad_compliance_is_refused(gamma_map, sigma):
         gamma_map.estimate(signals, compliance_sigma=sigma)
     with pytest.raises(ValueError, match="not negative"):
         gamma_map.estimate(signals, noise=NOISE, compliance_sigma=-sigma)
-    with pytest.raises(ValueError, match="friction"):
-        gamma_map.estimate(signals, noise=NOISE, compliance_sigma=sigma, friction=0.3)
 
 
 def test_a_gain_that_forgets_itself(gamma_map):

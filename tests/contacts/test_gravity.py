@@ -4,10 +4,12 @@
 laboratory frame and shooting (`studies/weight.py --reference`), without vibrissa's equations.
 """
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 from typer.testing import CliRunner
 
 import vibrissa as vb
@@ -136,6 +138,108 @@ def test_a_tare_under_another_gravity_is_taken_away(nitinol):
         nitinol.estimate(signals, ("Fx", "FT", "MB"), gravity=vb.Gravity(upright, level))
 
 
+def inside(found, truth):
+    """Share of truths in the 95 % regions."""
+    away = found.point - truth
+    inverse = np.linalg.pinv(found.covariance, rcond=1e-12)
+    return (np.einsum("ni,nij,nj->n", away, inverse, away) < 7.81).mean()
+
+
+@pytest.mark.parametrize("using", [("Fx", "MB", "MD"), ("Fx", "FT", "MB", "MD")])
+def test_weight_friction_and_an_uncertain_base_are_found_together(nitinol, using):
+    whisker, rng, level = nitinol.whisker, np.random.default_rng(21), (0.0, 0.0, -G)
+    noise, sigma = covariance(whisker), whisker.length / (30.0 * whisker.base_bending_stiffness)
+    points, wrenches = [], []
+    for ratio in 0.2 * rng.normal(size=30):
+        base = 1.0 / max(abs(rng.normal()) * sigma, 1e-3 * sigma)
+        size, angle = rng.uniform(0.3, 0.7) * unit(whisker), rng.uniform(-3.0, 3.0)
+        force = vb.PointForce(
+            rng.uniform(0.5, 0.8) * whisker.length,
+            components=size * np.array([ratio, np.cos(angle), np.sin(angle)]),
+        )
+        soft = whisker.with_properties(base_stiffness=(base, 1.0))
+        bent = vb.deflect(soft, force, gravity=level)
+        points.append(bent.contact_point)
+        wrenches.append(np.concatenate([bent.force, bent.moment]))
+    wrenches = np.array(wrenches) + rng.normal(size=(30, 6)) * np.sqrt(np.diag(noise))
+    signals = {"force": wrenches[:, :3], "moment": wrenches[:, 3:]}
+    every = {"gravity": level, "friction": 0.2, "compliance_sigma": sigma}
+    assert inside(nitinol.estimate(signals, using, noise, **every), points) > 0.88
+    for left_out in ("gravity", "friction"):
+        some = {name: value for name, value in every.items() if name != left_out}
+        assert inside(nitinol.estimate(signals, using, noise, **some), points) < 0.86, left_out
+
+
+def turned(angles):
+    """Rotations of a base about its y axis."""
+    c, s, zero, one = np.cos(angles), np.sin(angles), 0 * angles, 1 + 0 * angles
+    return np.moveaxis(np.array([[c, zero, s], [zero, one, zero], [-s, zero, c]]), -1, 0)
+
+
+@pytest.fixture(scope="module")
+def swung(nitinol):
+    """One contact point of the laboratory, touched by a whisker that turns under its weight."""
+    whisker, lab = nitinol.whisker, np.array([0.0, 0.0, -G])
+    rotations = turned(np.linspace(-0.05, 0.12, 6))
+    rest = vb.resting(whisker, rotations[0].T @ lab)
+    load = vb.PointForce(0.7 * whisker.length, 0.5 * unit(whisker), 1.2)
+    held = rotations[2] @ vb.deflect(whisker, load, gravity=rotations[2].T @ lab).contact_point
+    rows, points = [], []
+    for turn in rotations:
+        pull, point = turn.T @ lab, turn.T @ held
+        now = vb.resting(whisker, pull)
+        bent = vb.deflect(whisker, vb.PointContact(point), gravity=pull)
+        shift = np.concatenate([now.force - rest.force, now.moment - rest.moment])
+        rows.append(np.concatenate([bent.force, bent.moment]) + shift)
+        points.append(point)
+    return rotations, np.array(rows), np.array(points)
+
+
+def test_a_base_that_turns_under_gravity_of_the_laboratory(nitinol, swung):
+    rotations, rows, points = swung
+    how, lab, size = (
+        {"noise": 1e-6 * covariance(nitinol.whisker)},
+        (0, 0, -G),
+        nitinol.whisker.length,
+    )
+    signals = {"force": rows[:, :3], "moment": rows[:, 3:]}
+    for using in (("Fx", "MB", "MD"), SIX, "wrench"):
+        found = nitinol.estimate(signals, using, **how, gravity=lab, base_rotation=rotations)
+        assert np.linalg.norm(found.point - points, axis=1).max() < 2e-4 * size
+        fixed = nitinol.estimate(signals, using, **how, gravity=lab)
+        assert np.linalg.norm(fixed.point - points, axis=1).max() > 2e-3 * size
+    locate = vb.Estimator(nitinol, ("Fx", "MB", "MD"), **how, gravity=lab)
+    six = vb.base_signals(rows[:, :3], rows[:, 3:])
+    values = np.column_stack([six[name] for name in ("Fx", "MB", "MD")])
+    one = np.array([locate(v, r).point for v, r in zip(values, rotations, strict=True)])
+    found = nitinol.estimate(
+        signals, ("Fx", "MB", "MD"), **how, gravity=lab, base_rotation=rotations
+    )
+    np.testing.assert_allclose(one, found.point, atol=1e-9)
+
+
+def test_the_filter_follows_contacts_of_a_whisker_with_weight(nitinol, swung):
+    rotations, rows, points = swung
+    noise, held = 1e-2 * covariance(nitinol.whisker), rotations[0] @ points[0]
+    shaken = rows + np.random.default_rng(4).normal(size=rows.shape) * np.sqrt(np.diag(noise))
+    six = vb.base_signals(shaken[:, :3], shaken[:, 3:])
+    values = np.column_stack([six[name] for name in ("Fx", "MB", "MD")])
+    away = {}
+    for gravity in ((0, 0, -G), None):
+        locate = vb.Estimator(nitinol, ("Fx", "MB", "MD"), noise, gravity=gravity)
+        follow = vb.ContactFilter(locate, speed=1e-3)
+        for i, turn in enumerate(rotations):
+            found = follow(0.01 * i, values[i], turn)
+        away[gravity] = found.point - held
+        size = away[gravity] @ np.linalg.solve(found.covariance, away[gravity])
+        assert (size < 16.0) == (gravity is not None)
+    assert np.linalg.norm(away[0, 0, -G]) < 0.1 * np.linalg.norm(away[None])
+    uncertain = vb.Gravity((0, 0, -G), direction_sigma=0.1)
+    locate = vb.Estimator(nitinol, ("Fx", "MB", "MD"), noise, gravity=uncertain)
+    with pytest.raises(ValueError, match="uncertain gravity"):
+        vb.ContactFilter(locate)
+
+
 def test_what_does_not_fit_is_refused(nitinol):
     signals = {"force": np.ones((2, 3)), "moment": np.ones((2, 3))}
     light = nitinol.whisker.with_properties(density=None)
@@ -146,8 +250,10 @@ def test_what_does_not_fit_is_refused(nitinol):
         nitinol.estimate(signals, gravity=vb.Gravity((0, 0, -G), density_sigma=0.1))
     with pytest.raises(ValueError, match="negative"):
         vb.Gravity((0, 0, -G), direction_sigma=-1.0)
-    with pytest.raises(ValueError, match="friction"):
+    with pytest.raises(ValueError, match="friction is weighed against the noise"):
         nitinol.estimate(signals, gravity=(0, 0, -G), friction=0.3)
+    with pytest.raises(ValueError, match="three signals or more"):
+        vb.Estimator(nitinol, ("MB", "MD"), gravity=(0, 0, -G))
     signals["force"] = np.full((2, 3), np.nan)
     missing = nitinol.estimate(signals, gravity=(0, 0, -G))
     assert (missing.status == vb.Status.MISSING).all()
@@ -169,6 +275,42 @@ def test_the_command_line_takes_gravity(tmp_path):
     points = np.column_stack([found[name] for name in "xyz"])
     np.testing.assert_allclose(points, bent.contact_point, atol=1e-6)
     assert "has no weight" in run("estimate", table, "--density", "1000", fails=True)
+    # The same lines as a stream.
+    how = "--gravity -9.81,0,0 --using Fx,FT,FD,Mx,MB,MD --force-noise 0.001 --moment-noise 1e-5"
+    said = run("stream", tmp_path / "signals.csv", "--map", tmp_path / "map.nc", *how.split())
+    records = [json.loads(line) for line in said.splitlines() if line.startswith("{")]
+    streamed = np.array([[one[name] for name in "xyz"] for one in records])
+    np.testing.assert_allclose(streamed, bent.contact_point, atol=1e-5)
+
+
+def test_recordings_are_estimated_under_gravity(tmp_path, nitinol, swung):
+    rotations, rows, points = swung
+    n, level = len(rows), {"units": "1"}
+    time, axes = np.arange(n) * 0.01, ("time", "whisker", "space")
+    signals = xr.Dataset(
+        {
+            "force": (axes, rows[:, None, :3], {"units": "N"}),
+            "moment": (axes, rows[:, None, 3:], {"units": "N m"}),
+            "base_position": (axes, np.zeros((n, 1, 3)), {"units": "m"}),
+            "base_rotation": ((*axes, "space_2"), rotations[:, None], level),
+            "in_contact": (axes[:2], np.ones((n, 1), bool)),
+            "status": (axes[:2], np.zeros((n, 1), np.int8)),
+        },
+        {"time": time, "whisker": ["one"], "space": list("xyz")},
+        {"source": "sensor"},
+    )
+    recording = xr.DataTree.from_dict({"signals": signals})
+    noise = 1e-6 * covariance(nitinol.whisker)
+    for using in (("Fx", "MB", "MD"), "wrench"):
+        found = vb.pipeline.estimates_of(
+            recording,
+            using,
+            noise=noise,
+            contact_maps=[nitinol],
+            gravity=vb.Gravity((0.0, 0.0, -G)),
+        )
+        lab = found.contact_point.values[:, 0]
+        assert np.linalg.norm(lab - rotations[0] @ points[0], axis=1).max() < 2e-4 * 0.15
 
 
 def run(*words, fails=False):

@@ -222,6 +222,7 @@ def estimate(
     of the base, as lines of `vibrissa stream` are; with that of `vibrissa calibrate` (.nc) it is a
     sweep: positions of the stage, and the channels; `vibrissa reconstruct` finds the object of the
     recording (.nc) that it may go to. With --gravity a whisker of known density sags.
+    Where poses of the base are known, as in a recording, gravity is that of the laboratory.
     Example: `vibrissa estimate signals.csv --map map.nc --using Fx,FT,MB,MD -o contacts.csv`
     """
     if how.noise.covariance is not None:
@@ -236,7 +237,6 @@ def estimate(
         stated = (
             recorded,
             how.using,
-            weight.gravity,
             how.noise.given,
             how.method != "exact",
             how.friction_sigma,
@@ -245,17 +245,15 @@ def estimate(
         )
         if any(map(bool, stated)):
             raise ValueError(f"{sensor} is for tables, and has its own channels and noise")
-        _from_lines(signals, target, how, vb.sensors.load_sensor(sensor))
+        _from_lines(signals, target, how, weight, vb.sensors.load_sensor(sensor))
     elif sensor is not None:
         if recorded or how.given or weight.gravity is not None:
             raise ValueError("--sensor is of tables, and has its own whisker, channels and noise")
         _from_sweep(signals, target, sensor)
     elif recorded:
-        refuse({"--gravity": weight.gravity}, "it is of tables, with one direction")
-        refuse({"--compliance-sigma": how.compliance_sigma or None}, "it is of tables")
-        _from_recording(signals, target, how)
-    elif weight.gravity is None and _named_signals(signals, how):
-        _from_lines(signals, target, how, None)
+        _from_recording(signals, target, how, weight)
+    elif _named_signals(signals, how):
+        _from_lines(signals, target, how, weight, None)
     else:
         _from_table(signals, target, how, weight)
 
@@ -279,25 +277,33 @@ def _named_signals(table: Path, how: EstimateOptions) -> bool:
 
 
 def _from_lines(
-    signals: Path, target: Path, how: EstimateOptions, sensor: vb.sensors.Sensor | None
+    signals: Path,
+    target: Path,
+    how: EstimateOptions,
+    weight: GravityOptions,
+    sensor: vb.sensors.Sensor | None,
 ) -> None:
     """Contacts of a table whose lines are those of a stream."""
     import numpy as np
     import xarray as xr
 
-    prior, errors = how.assumed.prior, dict(how.assumed.errors)
+    errors: dict[str, Any] = dict(how.assumed.errors)
+    prior, gravity = how.assumed.prior, weight.known
+    if how.map:
+        refuse({"--density": weight.density}, "a map states that of its whisker")
     with progress_bars() as tell:
         if how.map:
             contact_map = maps_from(how.map, 1, False)[0]
         else:
-            known = how.own.read()
+            known = weight.of(how.own.read())
             remark(f"no map given; simulating that of {known!r}")
             contact_map = map_of(known, tell, grid=False, proximal=smallest_arc(how.proximal))
         if sensor is None:
             names, used = None, how.names or vb.pipeline.TRIPLET
             noise = how.noise.matrix()
+            errors |= {"prior": prior, "gravity": gravity}
             estimator = vb.Estimator(
-                contact_map, used, noise, felt_above=vb.pipeline.DETECTED, prior=prior, **errors
+                contact_map, used, noise, felt_above=vb.pipeline.DETECTED, **errors
             )
         else:
             names = used = tuple(sensor.channels)
@@ -305,7 +311,7 @@ def _from_lines(
             if errors:
                 raise ValueError("the --sensor's file states gain_error and mixing_error")
             estimator = vb.Estimator.of_sensor(
-                contact_map, sensor, stiffness, vb.pipeline.DETECTED, prior
+                contact_map, sensor, stiffness, vb.pipeline.DETECTED, prior, gravity
             )
         running = vb.streaming.ContactStream(estimator, names)
         records = list(running.records(vb.io.read_text(signals).splitlines()))
@@ -318,7 +324,7 @@ def _from_lines(
     vb.io.save_contacts(target, found.assign(status=("time", statuses)))
     for sentence in vb.streaming.advice(running):
         remark(sentence)
-    remark(f"signals ({', '.join(used)}){how.assumed.described()}")
+    remark(f"signals ({', '.join(used)}){how.assumed.described()}{weight.described()}")
     print_statuses(np.array(statuses))
     print_written(target)
 
@@ -386,7 +392,9 @@ def _from_sweep(table: Path, target: Path, path: Path) -> None:
     print_written(target)
 
 
-def _from_recording(signals: Path, target: Path, how: EstimateOptions) -> None:
+def _from_recording(
+    signals: Path, target: Path, how: EstimateOptions, weight: GravityOptions
+) -> None:
     """Contacts added to a recording, or as a table."""
     tree = recording_from(signals)
     table = target.suffix.lower() in vb.io.CSV
@@ -397,7 +405,7 @@ def _from_recording(signals: Path, target: Path, how: EstimateOptions) -> None:
             tree = vb.pipeline.with_signals(
                 tree, **SourceOptions().as_keywords(tree, how.known, how.proximal)
             )
-        done, used = estimated(tree, how, tell, str(signals))
+        done, used = estimated(tree, how, tell, str(signals), weight)
     remark(f"{described(done)}; {used}")
     found = done["estimates"].to_dataset()
     print_statuses(found["status"].values)
@@ -409,7 +417,11 @@ def _from_recording(signals: Path, target: Path, how: EstimateOptions) -> None:
 
 
 def estimated(
-    tree: xr.DataTree, how: EstimateOptions, tell: Tell, name: str
+    tree: xr.DataTree,
+    how: EstimateOptions,
+    tell: Tell,
+    name: str,
+    weight: GravityOptions | None = None,
 ) -> tuple[xr.DataTree, str]:
     """Add contacts to a recording that has signals, and describe how they were found."""
     signals = tree["signals"].to_dataset()
@@ -417,7 +429,13 @@ def estimated(
     # A sensor that does not state its noise is a usual one.
     noisy = how.noise.given or (source == "sensor" and vb.pipeline.sensor_noise(signals) is None)
     maps = maps_from(how.map, tree.sizes["whisker"], how.grid) if how.map else []
+    weight = weight or GravityOptions()
+    if how.method != "exact":
+        refuse({"--gravity": weight.gravity}, f"--method {how.method} has no weight")
+    if maps:
+        refuse({"--density": weight.density}, "a map states that of its whisker")
     whiskers = [one.whisker for one in maps] if maps else how.own.in_recording(tree)
+    whiskers = [weight.of(one) for one in whiskers]
     print_notes(*whiskers)
     for k, whisker in enumerate(whiskers):
         _check_scale(name, signals.isel(whisker=k), whisker)
@@ -433,11 +451,13 @@ def estimated(
         noise=how.noise.matrix() if noisy else None,
         proximal=smallest_arc(how.proximal),
         progress=tell,
+        gravity=weight.known,
         **how.keywords(),
         **({"contact_maps": maps} if maps else {"whiskers": whiskers}),
     )
     about = done["estimates"].attrs
     noise = how.noise.described() if noisy else "noise as the recording states"
+    noise += weight.described()
     return done, how.described(str(about["signals"]), noise, float(about["felt_above"]))
 
 

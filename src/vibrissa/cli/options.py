@@ -241,8 +241,9 @@ OPTIONS = {
     ),
     "damping": Option("Damping ratio of the whisker's first vibration.", "RATIO", least=0.0),
     "gravity": Option(
-        "Gravity in the whisker's frame, minus the acceleration of its base, m/s²; 0,0,-9.81 is a "
-        "level whisker. By default the whisker has no weight.",
+        "Gravity minus the acceleration of the base, m/s², in the whisker's frame, or where poses "
+        "of the base are known the laboratory's; 0,0,-9.81 is a level whisker. By default the "
+        "whisker has no weight.",
         "X,Y,Z",
     ),
     "tare_gravity": Option(

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import vibrissa as vb
+from vibrissa.cli.estimate import GravityOptions
 from vibrissa.cli.inputs import (
     AssumptionOptions,
     NoiseOptions,
@@ -111,6 +112,7 @@ class MeasurementOptions:
     using: str | None = None
     noise: NoiseOptions
     assumed: AssumptionOptions
+    weight: GravityOptions
     threshold: float = 5.0
     tare: int | None = None
 
@@ -120,6 +122,7 @@ class MeasurementOptions:
             if self.own.whisker is not None:
                 raise ValueError("give either --map or --whisker: a map already has its whisker")
             refuse({"--proximal": self.proximal}, "it is of a map that is simulated")
+            refuse({"--density": self.weight.density}, "a map states that of its whisker")
         sensors = _named(self.sensor, "--sensor")
         if set(sensors) - {"", *self.whiskers}:
             raise ValueError(
@@ -144,7 +147,7 @@ class MeasurementOptions:
         """Read or simulate the map of a whisker."""
         if self.map:
             return map_from(Path(_named(self.map, "--map")[name]), grid=False)
-        whisker = self.own.read()
+        whisker = self.weight.of(self.own.read())
         print_notes(whisker)
         remark(f"no map given; simulating that of {whisker!r}")
         return vb.ContactMap.simulate(whisker, grid=False, proximal=smallest_arc(self.proximal))
@@ -162,13 +165,16 @@ class MeasurementOptions:
             stiffness = errors.get("stiffness_sigma", 0.0)
             if self.tare:
                 sensor = sensor.with_new_offset(self.tare)
-            return vb.Estimator.of_sensor(contact_map, sensor, stiffness, self.threshold, prior)
+            return vb.Estimator.of_sensor(
+                contact_map, sensor, stiffness, self.threshold, prior, self.weight.known
+            )
         return vb.Estimator(
             contact_map,
             self.using or "Fx,MB,MD",
             self.noise.matrix(),
             felt_above=self.threshold,
             prior=prior,
+            gravity=self.weight.known,
             **errors,
         )
 

@@ -5,6 +5,7 @@ from vibrissa.contacts.channels import (
     Channels,
     channel_derivatives as channel_derivatives,
     channel_gradients as channel_gradients,
+    ratio_derivatives as ratio_derivatives,
 )
 from vibrissa.contacts.chosen_contacts import (
     At,
@@ -27,7 +28,7 @@ from vibrissa.contacts.contacts import (
 )
 from vibrissa.contacts.estimator import Estimator
 from vibrissa.contacts.filter import ContactFilter, Followed as Followed
-from vibrissa.contacts.friction import ratio_derivatives as ratio_derivatives
+from vibrissa.contacts.forward import Gravity, read_at_rest as read_at_rest
 from vibrissa.contacts.inversion import (
     invert as invert,
     polish as polish,
@@ -39,6 +40,7 @@ from vibrissa.contacts.jacobian import (
     deficient as deficient,
     spherical_derivatives as spherical_derivatives,
 )
+from vibrissa.contacts.joint_estimate import estimate_jointly as estimate_jointly
 from vibrissa.contacts.noise import (
     Noise,
     SensorNoise,
@@ -52,7 +54,6 @@ from vibrissa.contacts.prior import Prior
 from vibrissa.contacts.readout import check_signals as check_signals
 from vibrissa.contacts.search import signals_at_nodes as signals_at_nodes
 from vibrissa.contacts.two_contacts import bent_by_forces as bent_by_forces, second_contact
-from vibrissa.contacts.weight import Gravity, estimate_with_weight as estimate_with_weight
 from vibrissa.contacts.wrench import estimate_from_wrench
 
 __all__ = [

@@ -32,6 +32,8 @@ RATIO = FITTED.index("ratio")
 CIRCULAR = (*CIRCULAR_SIGNALS, False, False, False, False)
 #: The six components of force and moment.
 WRENCH = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+# Components of (F, M) that are the last channels.
+_COMPONENTS = (1, 2, 4, 5)
 _PAIRS = {("FT", "FD"): ("Fy", "Fz"), ("MB", "MD"): ("My", "Mz")}
 
 
@@ -119,8 +121,9 @@ class Channels:
             Noise; without it components count as known to a share of force and moment.
         measured : (n, k) array
             Measured signals, non-dimensional.
-        values : (n, 6) array
-            Base force and contact point of the contacts, non-dimensional.
+        values : (n, 6 or 9) array
+            Base force and contact point of the contacts, non-dimensional, and what the moment of
+            the weight has changed by.
         discretization : Discretization
             Rod, with its units.
 
@@ -133,7 +136,7 @@ class Channels:
             own = self._by_deviations(sensor.deviations, measured, discretization)
             if not len(sensor.errors):
                 return own
-        wrench = np.concatenate([values[:, :3], np.cross(values[:, 3:], values[:, :3])], axis=1)
+        wrench = wrenches_of(values)
         g = channel_gradients(values, self.names)
         with np.errstate(invalid="ignore"):
             if sensor is None:
@@ -161,29 +164,52 @@ class Channels:
         return out
 
 
+def wrenches_of(values: Array) -> Array:
+    """(F, M) (..., 6) of (F, p) (..., 6), or of (F, p, μ) with a moment μ of the weight."""
+    moment = np.cross(values[..., 3:6], values[..., :3])
+    if values.shape[-1] > len(WRENCH):
+        moment = moment + values[..., 6:]
+    return np.concatenate([values[..., :3], moment], axis=-1)
+
+
 def channels_of(values: Array) -> Array:
-    """All channels (..., 10) of (F, p) (..., 6)."""
-    force = values[..., :3]
-    moment = np.cross(values[..., 3:], force)
-    return np.concatenate([signals_of(force, moment), force[..., 1:], moment[..., 1:]], axis=-1)
+    """All channels (..., 10) of (F, p) or (F, p, μ)."""
+    wrench = wrenches_of(values)
+    signals = signals_of(wrench[..., :3], wrench[..., 3:])
+    return np.concatenate([signals, wrench[..., _COMPONENTS]], axis=-1)
 
 
 def channel_gradients(values: Array, names: tuple[str, ...]) -> Array:
     """Derivatives of channels with respect to (F, M)."""
-    force = values[..., :3]
+    wrench = wrenches_of(values)
     by_wrench = np.zeros((*values.shape[:-1], len(CHANNELS), 6))
-    by_wrench[..., : len(SIGNALS), :] = wrench_derivatives(force, np.cross(values[..., 3:], force))
-    for i, component in enumerate((1, 2, 4, 5), start=len(SIGNALS)):
+    by_wrench[..., : len(SIGNALS), :] = wrench_derivatives(wrench[..., :3], wrench[..., 3:])
+    for i, component in enumerate(_COMPONENTS, start=len(SIGNALS)):
         by_wrench[..., i, component] = 1.0
     return by_wrench[..., [CHANNELS.index(name) for name in names], :]
 
 
 def channel_derivatives(values: Array, tangents: Array, names: tuple[str, ...]) -> Array:
     """Derivatives of channels with respect to unknowns of the contact."""
-    force, point = values[..., :3], values[..., 3:]
-    d_force, d_point = tangents[..., :3, :], tangents[..., 3:, :]
+    force, point = values[..., :3], values[..., 3:6]
+    d_force, d_point = tangents[..., :3, :], tangents[..., 3:6, :]
     d_moment = np.cross(d_point, force[..., None], axis=-2) + np.cross(
         point[..., None], d_force, axis=-2
     )
+    if values.shape[-1] > len(WRENCH):
+        d_moment = d_moment + tangents[..., 6:, :]
     gradients = channel_gradients(values, names)
     return np.asarray(gradients @ np.concatenate([d_force, d_moment], axis=-2))
+
+
+def ratio_of(x: Array) -> Array:
+    """Ratios (n,) of the force along the whisker to that across it, of contacts (n, 4)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(x[:, 1] / np.hypot(x[:, 2], x[:, 3]))
+
+
+def ratio_derivatives(x: Array) -> Array:
+    """Differentiate the ratio of the force along the whisker to that across it."""
+    normal = np.hypot(x[:, 2], x[:, 3])
+    by = -x[:, 1:2] * x[:, 2:] / normal[:, None] ** 3
+    return np.column_stack([np.zeros(len(x)), 1.0 / normal, by])

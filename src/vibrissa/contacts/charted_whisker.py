@@ -29,5 +29,8 @@ class ChartedWhisker(Protocol):
     def determines(self, using: str | tuple[str, ...]) -> bool:
         """Check whether signals determine contacts."""
 
+    def sagged(self, gravity: tuple[float, float, float]) -> ChartedWhisker:
+        """Map of a whisker without weight that has the shape of this one under its weight."""
+
     def __hash__(self) -> int:
         """Maps are kept by identity."""

@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.contacts.contacts import Contacts, spherical
-from vibrissa.contacts.friction import estimate_with_friction
+from vibrissa.contacts.forward import Gravity
 from vibrissa.contacts.inversion import triplet_tree
 from vibrissa.contacts.jacobian import determining
+from vibrissa.contacts.joint_estimate import estimate_jointly
 from vibrissa.contacts.noise import common_errors
 from vibrissa.contacts.prior import Prior
 from vibrissa.contacts.search import estimate
-from vibrissa.contacts.weight import Gravity, estimate_with_weight
 from vibrissa.contacts.wrench import estimate_components
 from vibrissa.deferred import xr
 from vibrissa.io import COMPRESSED, naming, read_dataset, read_groups, write_netcdf
@@ -138,6 +138,7 @@ class ContactMap:
         prior: Prior | None = None,
         friction: float = 0.0,
         gravity: Gravity | ArrayLike | None = None,
+        base_rotation: ArrayLike | None = None,
     ) -> Contacts:
         """Find the contacts that explain measured signals.
 
@@ -180,6 +181,9 @@ class ContactMap:
             density that bends under its weight, by a sensor that was tared at rest; or, with the
             tare and what is uncertain, a `Gravity`. Contacts are proposed by a second map, of the
             sagged whisker, made on first use.
+        base_rotation : (..., 3, 3) array_like, optional
+            Rotation of the base for each measurement, from the whisker's to the laboratory frame:
+            gravity and tare are then those of the laboratory and of the first pose.
 
         Returns
         -------
@@ -188,30 +192,25 @@ class ContactMap:
         """
         errors = common_errors(stiffness_sigma, gain_sigma, mixing_sigma)
         weight = Gravity.of(gravity)
-        if compliance_sigma and (weight is not None or friction):
-            raise ValueError("compliance_sigma is not combined with gravity or friction")
-        if weight is not None:
-            if friction != 0.0:
-                raise ValueError("friction is not combined with gravity; use the wrench with it")
-            sagged = None if using == "wrench" else _sagged(self, weight.acceleration)
-            return estimate_with_weight(
-                self.whisker,
-                sagged,
-                signals,
-                using,
-                noise,
-                errors,
-                prior,
-                weight,
-                stiffness_sigma,
-            )
-        if using == "wrench":
-            return estimate_components(
-                self.whisker, signals, noise, errors, prior, compliance_sigma
-            )
-        if friction != 0.0:
-            return estimate_with_friction(self, signals, using, noise, errors, prior, friction)
-        return estimate(self, signals, using, noise, errors, prior, compliance_sigma)
+        if weight is None and (using == "wrench" or friction == 0.0):
+            plain = (signals, noise, errors, prior, compliance_sigma)
+            if using == "wrench":
+                return estimate_components(self.whisker, *plain)
+            return estimate(self, signals, using, *plain[1:])
+        return estimate_jointly(
+            self.whisker,
+            self,
+            signals,
+            using,
+            noise,
+            errors,
+            prior,
+            gravity=weight,
+            friction=0.0 if using == "wrench" else friction,
+            compliance_sigma=compliance_sigma,
+            stiffness_sigma=stiffness_sigma,
+            rotation=None if base_rotation is None else np.asarray(base_rotation),
+        )
 
     def tree(self, triplet: tuple[str, ...]) -> SearchTree:
         """Return the search tree of three signals, made on first use.
@@ -248,6 +247,18 @@ class ContactMap:
         if names not in self._determining:
             self._determining[names] = determining(self, names)
         return self._determining[names]
+
+    @lru_cache(maxsize=8)  # noqa: B019
+    def sagged(self, gravity: tuple[float, float, float]) -> ContactMap:
+        """Map of a whisker without weight that has the shape of this one under its weight."""
+        along, around, loads = (n - 1 for n in self.chart.values.shape[:3])
+        return ContactMap.simulate(
+            resting(self.whisker, gravity).shape(),
+            proximal=self.chart.proximal,
+            cells=(along, around, loads),
+            steps=self.steps,
+            grid=False,
+        )
 
     @cached_property
     def _samples(self) -> xr.Dataset:
@@ -349,20 +360,6 @@ class ContactMap:
             rows.append(("paper's grid", f"{reached} of {self.grid.status.size} points reached"))
         rows.append(("signals", "median (least to largest)"))
         return rows + [(symbol(name), shown(name, data[name])) for name in (*SIGNALS, "r")]
-
-
-@lru_cache(maxsize=8)
-def _sagged(contact_map: ContactMap, gravity: tuple[float, float, float]) -> ContactMap:
-    """Map of a whisker without weight that has the shape of this one under its weight."""
-    chart = contact_map.chart
-    along, around, loads = (n - 1 for n in chart.values.shape[:3])
-    return ContactMap.simulate(
-        resting(contact_map.whisker, gravity).shape(),
-        proximal=chart.proximal,
-        cells=(along, around, loads),
-        steps=contact_map.steps,
-        grid=False,
-    )
 
 
 def within_paper_bounds(whisker: Whisker, points: Array) -> AnyArray:

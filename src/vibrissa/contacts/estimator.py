@@ -7,23 +7,30 @@ searched for in the whole map, so that no candidate is lost by looking only near
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.contacts.ambiguity import Ambiguity
+from vibrissa.contacts.channels import CHANNELS, channels_of
 from vibrissa.contacts.charted_whisker import ChartedWhisker
-from vibrissa.contacts.compliance import SoftBase, check_compliance
 from vibrissa.contacts.contacts import Candidates, Contact, contact_of, nowhere
+from vibrissa.contacts.forward import Gravity
+from vibrissa.contacts.joint_estimate import JointEstimate
+from vibrissa.contacts.joint_fit import JointFit, soft_base
 from vibrissa.contacts.noise import by_stiffness, common_errors, sensor_noise
 from vibrissa.contacts.prior import Prior, among_allowed, possible_candidates
 from vibrissa.contacts.readout import ByName, Measurement, Mixed, Named, readout_of
 from vibrissa.contacts.search import LARGEST, STATUSES, UNKNOWNS, Search
 from vibrissa.numerics import Array
+from vibrissa.rod import PointContact, deflect
 from vibrissa.sensors import GRAVITY, Sensor
 from vibrissa.signals import selection
 from vibrissa.status import Status
+
+# Smallest arc length, over L, of contacts that the weight is taken from.
+LEAST = 0.05
 
 
 class Estimator:
@@ -55,13 +62,23 @@ class Estimator:
     compliance_sigma : float
         Standard deviation of the base's compliance, rad/(N·m), as of `ContactMap.estimate`, for
         three signals or more. It needs noise, and takes a millisecond more.
+    friction : float
+        Standard deviation of the ratio of the force along the whisker to that across it, as of
+        `ContactMap.estimate`, for three signals or more; it takes some tens of milliseconds more.
+    gravity : Gravity or (3,) array_like, optional
+        Gravity that the whisker bends under, as of `ContactMap.estimate`, for three signals or
+        more; it takes some tens of milliseconds more. Where a measurement comes with the rotation
+        of the base, it is in the laboratory frame, and without a `Gravity.tare` the sensor counts
+        as tared in the first pose.
 
     See Also
     --------
     Estimator.of_sensor : From the raw readings of a sensor, however it mixes and is mounted.
     """
 
-    _base: SoftBase | None = None
+    _base: JointFit | None = None
+    _joint: JointEstimate | None = None
+    _again: Callable[[ChartedWhisker], Estimator]
 
     def __init__(
         self,
@@ -74,6 +91,8 @@ class Estimator:
         mixing_sigma: float | ArrayLike = 0.0,
         prior: Prior | None = None,
         compliance_sigma: float = 0.0,
+        friction: float = 0.0,
+        gravity: Gravity | ArrayLike | None = None,
     ) -> None:
         names = selection(using, least=1)
         order = using.replace(",", " ").split() if isinstance(using, str) else list(using)
@@ -84,13 +103,35 @@ class Estimator:
             raise ValueError("contact is detected by comparison with the noise; noise is needed")
         readout = Named(contact_map, names, sensor)
         self._start(contact_map, readout, len(names), felt_above, prior)
-        check_compliance(compliance_sigma, sensor)
-        if compliance_sigma > 0.0 and self._search is None:
-            raise ValueError("compliance_sigma is for three signals or more")
-        if compliance_sigma > 0.0 and sensor is not None:
-            d, steps = contact_map.chart.discretization, contact_map.steps
-            whisker = contact_map.whisker
-            self._base = SoftBase(whisker, d, steps, readout.channels, sensor, compliance_sigma)
+        stated = (noise, stiffness_sigma, felt_above, gain_sigma, mixing_sigma, prior)
+        self._again = lambda other: Estimator(other, names, *stated)
+        self._allow(stiffness_sigma, compliance_sigma, friction, Gravity.of(gravity))
+
+    def _allow(
+        self, stiffness: float, compliance: float, friction: float, gravity: Gravity | None
+    ) -> None:
+        """Allow for weight, friction and an uncertain base."""
+        stated = {"compliance_sigma": compliance, "friction": friction, "gravity": gravity}
+        if not any(stated.values()):
+            return
+        if self._search is None or not isinstance(self.readout, Named):
+            raise ValueError(f"{', '.join(stated)} are for three signals or more")
+        contact_map, sensor = self.contact_map, self.readout.sensor
+        if gravity is None and not friction:
+            rod = contact_map.whisker, contact_map.steps
+            self._base = soft_base(*rod, self.readout.channels, sensor, compliance)
+            return
+        self._joint = JointEstimate(
+            contact_map.whisker,
+            contact_map,
+            self.names,
+            sensor,
+            self.prior,
+            gravity=gravity,
+            friction=friction,
+            compliance_sigma=compliance,
+            stiffness_sigma=stiffness,
+        )
 
     @classmethod
     def of_sensor(
@@ -100,6 +141,7 @@ class Estimator:
         stiffness_sigma: float = 0.0,
         felt_above: float = 0.0,
         prior: Prior | None = None,
+        gravity: Gravity | ArrayLike | None = None,
     ) -> Estimator:
         """Locate contacts from a sensor's raw readings.
 
@@ -117,6 +159,9 @@ class Estimator:
             locates all.
         prior : Prior, optional
             Possible contacts.
+        gravity : Gravity or (3,) array_like, optional
+            Gravity that the whisker bends under, as of `Estimator`, for sensors whose channels
+            determine the six signals.
 
         Returns
         -------
@@ -141,6 +186,9 @@ class Estimator:
         out._order = None
         out._start(contact_map, readout, len(sensor.channels), felt_above, prior)
         out._sensor = sensor
+        stated = (stiffness_sigma, felt_above, prior)
+        out._again = lambda other: Estimator.of_sensor(other, sensor, *stated)
+        out._allow(stiffness_sigma, 0.0, 0.0, Gravity.of(gravity))
         return out
 
     def _start(
@@ -168,8 +216,8 @@ class Estimator:
 
     @property
     def softened(self) -> bool:
-        """Whether the compliance of the base is uncertain."""
-        return self._base is not None
+        """Whether friction, or anything that measurements share of the rod, is uncertain."""
+        return self._base is not None or (self._joint is not None and self._joint.uncertain)
 
     @property
     def noisy(self) -> bool:
@@ -245,6 +293,10 @@ class Estimator:
                 values = self._components.signals(values)
         elif self._order is not None:
             values = values[self._order]
+        if self._joint is not None:
+            if rotation is not None:
+                self._joint = self._joint.turned(np.asarray(rotation, dtype=np.float64))
+            values = self._joint.untared(values[None])[0]
         return self.readout.scaled(values)
 
     def locate(self, measurement: Measurement) -> Contact:
@@ -267,8 +319,12 @@ class Estimator:
             return nowhere(nothing, math.nan, d)
         if self._search is None:
             return self._sampled(measurement)
-        found, status, chi_squared = self._search.one(measurement)
-        if self.prior is not None:
+        if self._joint is not None:
+            found, codes = self._joint(measurement.measured[None] * self._joint.scale)
+            status, chi_squared = STATUSES[int(codes[0])], float(found.chi_squared[0, 0])
+        else:
+            found, status, chi_squared = self._search.one(measurement)
+        if self.prior is not None and self._joint is None:
             pair = measurement.measured[None], measurement.target[None]
             found, codes, chi = among_allowed(
                 self.prior,
@@ -290,6 +346,37 @@ class Estimator:
             continuing = int((away * away).sum(axis=1).argmin())
         self._last = found.values[0, continuing, 3:] if number else None
         return contact_of(found, status, chi_squared, d, self.names, continuing)
+
+    @property
+    def weighted(self) -> bool:
+        """Whether the whisker bends under its weight."""
+        return self._joint is not None and self._joint.forward.weighted
+
+    def sagged(self) -> Estimator:
+        """Return an estimator of a whisker without weight that has the sagged shape at rest."""
+        assert self._joint is not None
+        return self._again(self._joint.sagged)
+
+    def of_sagged(self, measurement: Measurement, sagged: Estimator) -> Measurement:
+        """Return what the sagged whisker without weight would measure of the same contact point.
+
+        NaN where there is none. What noise adds to more than three signals stays as it is.
+        """
+        assert self._joint is not None
+        if self.nothing_in(measurement) is not None:
+            return measurement
+        names = self._joint.channels.names
+        found, _ = self._joint(measurement.measured[None] * self._joint.scale)
+        d, target = self._joint.d, np.full(len(names), np.nan)
+        if found.number[0]:
+            there = PointContact(found.values[0, 0, 3:] * d.length)
+            bent = deflect(sagged.contact_map.whisker, there, proximal=LEAST)
+            values = np.concatenate([bent.force / d.force, bent.contact_point / d.length])
+            which = [CHANNELS.index(name) for name in names]
+            weighted = self._joint.forward.values(found.x[:, 0])
+            away = channels_of(values[None]) - channels_of(weighted)
+            target = measurement.target + away[0, which]
+        return self.readout.scaled(self._joint.signals_of(target[None])[0])
 
     def nothing_in(self, measurement: Measurement) -> Status | None:
         """Why a measurement is not worth a search: ``MISSING``, ``NOT_FELT``, ``DEGENERATE``.

@@ -172,11 +172,17 @@ class ContactFilter:
         if not memory > 0.0:
             raise ValueError(f"memory is a time, positive, s; got {memory!r}")
         if estimator.softened:
-            raise ValueError("a filter takes no estimator whose compliance_sigma is not zero")
+            raise ValueError(
+                "a filter takes no estimator with friction, compliance_sigma, or uncertain gravity"
+            )
         if not estimator.noisy:
             raise ValueError(
                 "a filter weighs what it knows against the noise: give its estimator's"
             )
+        # Under its weight contacts are those of a whisker without weight that has the sagged shape,
+        # in measurements that are changed by as much as the weight changes them there.
+        self._weighted = estimator if estimator.weighted else None
+        estimator = estimator.sagged() if self._weighted else estimator
         self.estimator = estimator
         self._drift = Drift(speed / self._length, persistence)
         self._memory = memory
@@ -214,7 +220,11 @@ class ContactFilter:
             raise ValueError(f"time is a finite number, s; got {time!r}")
         if self._time is not None and not time > self._time:
             raise ValueError(f"time goes on; got {time} s after {self._time} s")
-        measurement = self.estimator.measurement(signals, rotation, gravity)
+        if self._weighted is None:
+            measurement = self.estimator.measurement(signals, rotation, gravity)
+        else:
+            measurement = self._weighted.measurement(signals, rotation, gravity)
+            measurement = self._weighted.of_sagged(measurement, self.estimator)
         base = base / self._length
         if self._time is not None:
             self._predict(time - self._time)

@@ -18,28 +18,17 @@ Where the density has several peaks with valleys between, these are several cand
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.channels import Channels, channel_derivatives
-from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates, Contacts, contacts_of
-from vibrissa.contacts.least_squares import Fits, fit
-from vibrissa.contacts.noise import Noise, SensorNoise, explained, sensor_noise, whitening
-from vibrissa.contacts.posterior import CERTAIN, NORMAL_KURTOSIS, ranked
-from vibrissa.contacts.prior import Prior, possible_candidates
-from vibrissa.contacts.search import estimate
-from vibrissa.deferred import xr
+from vibrissa.contacts.channels import ratio_derivatives, ratio_of
+from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates
+from vibrissa.contacts.joint_fit import HELD, Joint, JointFit
+from vibrissa.contacts.least_squares import Fits
+from vibrissa.contacts.noise import SensorNoise
+from vibrissa.contacts.posterior import NORMAL_KURTOSIS, ranked
 from vibrissa.numerics import AnyArray, Array, IntArray
-from vibrissa.signals import measured, selection, signal_scales
-from vibrissa.status import Status
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import ArrayLike
-
-    from vibrissa.contacts.charted_whisker import ChartedWhisker
 
 _UNKNOWNS = 4
 # The least standard deviation of the prior; with less there is no friction.
@@ -48,8 +37,6 @@ _LEAST = 0.01
 # deviations of s.
 _STATIONS = 33
 _FINE, _REACH = 17, 4.0
-# How exactly an arc length is held.
-_HELD = 1e-5
 # Of a peak this much lower than the highest (log density) nothing is kept; two peaks are two
 # candidates where the valley between them is lower than both by so much.
 _LOW, _VALLEY = 15.0, 3.0
@@ -90,73 +77,47 @@ def _joined(parts: list[_Nodes]) -> _Nodes:
     """Nodes of the same curves in order of s, each arc length once."""
     together = _Nodes(*(np.concatenate(part) for part in zip(*parts, strict=True)))
     together = together.rows(np.lexsort((together.s, together.curve)))
-    new = (np.diff(together.curve, prepend=-1) > 0) | (np.diff(together.s, prepend=-1.0) > _HELD)
+    new = (np.diff(together.curve, prepend=-1) > 0) | (np.diff(together.s, prepend=-1.0) > HELD)
     return together.rows(new)
 
 
-class _Measurements:
-    """Measurements of some signals, and the fits of contacts with friction to them."""
+class _Curves:
+    """Curves of contacts with friction that explain measurements."""
 
-    def __init__(
-        self,
-        contact_map: ChartedWhisker,
-        names: tuple[str, ...],
-        sensor: SensorNoise,
-        flat: Array,
-        spread: float,
-    ) -> None:
-        self.names, self.sensor, self.flat, self.spread = names, sensor, flat, spread
-        self.d = contact_map.chart.discretization
-        self.proximal = contact_map.chart.proximal
-        self.channels = Channels.of(names)
-        self.targets = self.channels.targets(flat)
+    def __init__(self, fitting: JointFit, flat: Array, targets: Array) -> None:
+        self.fitting, self.flat, self.targets = fitting, flat, targets
 
-    def fit(
-        self, row: IntArray, x: Array, values: Array, held: bool = True
-    ) -> tuple[Fits, Array, Array]:
-        """Fit contacts to rows from starts x with (F, p), at their arc lengths or anywhere.
-
-        Also the derivatives of the channels by (s, f), in standard deviations, and χ² of the
-        signals alone.
-        """
-        k = len(self.channels.names)
-        weights = np.zeros((len(row), k + 2, k + 2))
-        covariance = self.channels.covariance(self.sensor, self.flat[row], values, self.d)
-        weights[:, :k, :k] = whitening(covariance)
-        weights[:, k, k] = 1.0 / self.spread
-        weights[:, k + 1, k + 1] = 1.0 / _HELD if held else 0.0
-        targets = np.column_stack([self.targets[row], np.zeros(len(row)), x[:, 0]])
-        names = (*self.channels.names, "ratio", "s")
-        fits = fit(self.d, names, targets, weights, x, friction=True, least=self.proximal)
-        ratio = _ratio(fits.contacts)
-        by = channel_derivatives(fits.values, fits.tangents, self.channels.names)
-        j = weights[:, :k, :k] @ by
-        j = np.concatenate([j, ratio_derivatives(fits.contacts)[:, None] / self.spread], axis=1)
-        return fits, np.nan_to_num(j), fits.misfits - (ratio / self.spread) ** 2
+    def fit(self, row: IntArray, x: Array, values: Array, held: bool = True) -> tuple[Fits, Joint]:
+        """Fit contacts to rows from starts x, at their arc lengths or anywhere."""
+        measured = self.flat[row], self.targets[row]
+        fits = self.fitting.fit(*measured, x, values, held)
+        return fits, self.fitting.joint(*measured, fits)
 
     def nodes(self, curve: IntArray, row: IntArray, x: Array, values: Array) -> _Nodes:
         """Contacts at the arc lengths of x that explain measurements best, where there are any."""
-        fits, j, misfit = self.fit(row, x, values)
-        by_force = j[:, :, 1:]
-        information = np.swapaxes(by_force, 1, 2) @ by_force
-        t, f = fits.tangents[:, 3:], ratio_derivatives(fits.contacts)
-        whole = np.concatenate([t, f[:, None]], axis=1)
+        fits, joint = self.fit(row, x, values)
+        others = np.nan_to_num(joint.design[..., 1:])
+        information = np.swapaxes(others, 1, 2) @ others
+        f = ratio_derivatives(fits.contacts)
+        whole = np.concatenate([fits.tangents[:, 3:6], f[:, None]], axis=1)
         with np.errstate(all="ignore"):
             log = np.log(np.abs(np.linalg.det(np.nan_to_num(whole))))
             log = log - 0.5 * np.linalg.slogdet(information)[1] - 0.5 * fits.misfits
-        there = np.isfinite(log) & (np.abs(fits.contacts[:, 0] - x[:, 0]) < 10.0 * _HELD)
+        there = np.isfinite(log) & (np.abs(fits.contacts[:, 0] - x[:, 0]) < 10.0 * HELD)
         there &= np.isfinite(fits.misfits)
         log[~_upright(fits)] = -np.inf
-        x, values, t = fits.contacts[there], fits.values[there], t[there][:, :, 1:]
+        x, moved = fits.contacts[there], joint.moved[there][..., 1:]
         spread = np.linalg.inv(information[there])
-        across = t @ spread @ np.swapaxes(t, 1, 2)
-        turn = f[there][:, 1:] / (1.0 + _ratio(x)[:, None] ** 2)
-        turned = np.einsum("ni,nij,nj->n", turn, spread, turn)
-        return _Nodes(curve[there], x, values, log[there], across, turned, misfit[there])
+        across = moved @ spread @ np.swapaxes(moved, 1, 2)
+        turn = f[there][:, 1:] / (1.0 + ratio_of(x)[:, None] ** 2)
+        turned = np.einsum("ni,nij,nj->n", turn, spread[:, :3, :3], turn)
+        return _Nodes(
+            curve[there], x, joint.values[there], log[there], across, turned, joint.misfit[there]
+        )
 
     def along(self, row: IntArray, x: Array, values: Array) -> _Nodes:
         """Trace curves through contacts x of rows, from station to station both ways."""
-        stations = np.linspace(self.proximal, 1.0, _STATIONS)
+        stations = np.linspace(self.fitting.least, 1.0, _STATIONS)
         nearest = np.abs(stations - x[:, :1]).argmin(axis=1)
         parts = []
         for way in (1, -1):
@@ -181,19 +142,20 @@ class _Measurements:
         """
         peaks = _joined([nodes.rows(_peaks(nodes)), starts])
         curve = peaks.curve
-        fits, j, _ = self.fit(row[curve], peaks.x, peaks.values, held=False)
+        fits, joint = self.fit(row[curve], peaks.x, peaks.values, held=False)
         with np.errstate(all="ignore"):
-            spread = np.linalg.pinv(np.swapaxes(j, 1, 2) @ j)
-            sigma = np.sqrt(spread[:, 0, 0])
-            along = spread[:, 0] / spread[:, :1, 0]
+            spread = joint.spread()[:, 0, :_UNKNOWNS]
+            sigma = np.sqrt(spread[:, 0])
+            along = spread / spread[:, :1]
         usable = np.isfinite(along).all(axis=1) & np.isfinite(fits.misfits)
         curve, x = curve[usable], fits.contacts[usable]
         sigma, along = sigma[usable], along[usable]
         step = np.linspace(-_REACH, _REACH, _FINE)[:, None] * np.minimum(sigma, 0.25)
         guess = x + step[..., None] * along
-        inside = (guess[..., 0] >= self.proximal) & (guess[..., 0] <= 1.0)
+        inside = (guess[..., 0] >= self.fitting.least) & (guess[..., 0] <= 1.0)
         curves = np.broadcast_to(curve, step.shape)[inside]
-        values = np.broadcast_to(fits.values[usable], (*step.shape, 6))[inside]
+        values = fits.values[usable]
+        values = np.broadcast_to(values, (*step.shape, values.shape[1]))[inside]
         more = self.nodes(curves, row[curves], guess[inside], values)
         every = _joined([nodes, more])
         stable = np.isfinite(every.log)
@@ -203,24 +165,12 @@ class _Measurements:
         return every.rows(stable)._replace(curve=number), row[curve[first]]
 
 
-def _ratio(x: Array) -> Array:
-    """Ratios µ_x of contacts (n, 4)."""
-    return np.asarray(x[:, 1] / np.hypot(x[:, 2], x[:, 3]))
-
-
-def ratio_derivatives(x: Array) -> Array:
-    """Differentiate the ratio of the force along the whisker to that across it."""
-    normal = np.hypot(x[:, 2], x[:, 3])
-    by = -x[:, 1:2] * x[:, 2:] / normal[:, None] ** 3
-    return np.column_stack([np.zeros(len(x)), 1.0 / normal, by])
-
-
 def _upright(fits: Fits) -> AnyArray:
     """Which contacts are those of a whisker that has not slipped off, while the ratio is held."""
     x, t = fits.contacts, np.nan_to_num(fits.tangents)
-    by_normal = (_ratio(x) / np.hypot(x[:, 2], x[:, 3]))[:, None] * x[:, 2:]
-    by = t[:, 3:, [0, 2, 3]].copy()
-    by[:, :, 1:] += t[:, 3:, 1:2] * by_normal[:, None, :]
+    by_normal = (ratio_of(x) / np.hypot(x[:, 2], x[:, 3]))[:, None] * x[:, 2:]
+    by = t[:, 3:6, [0, 2, 3]].copy()
+    by[:, :, 1:] += t[:, 3:6, 1:2] * by_normal[:, None, :]
     return np.asarray(np.linalg.det(by) > 0.0)
 
 
@@ -272,9 +222,9 @@ def _parts(nodes: _Nodes) -> _Parts:
     return _Parts(
         np.tile(a, _PARTS),
         (log + np.log(h[a] / _PARTS)).reshape(-1),
-        between(nodes.values[:, 3:]),
+        between(nodes.values[:, 3:6]),
         between(nodes.spread),
-        between(np.arctan(_ratio(nodes.x))),
+        between(np.arctan(ratio_of(nodes.x))),
         between(nodes.angle_spread),
     )
 
@@ -317,10 +267,10 @@ def _stated(nodes: _Nodes, row: IntArray, n: int) -> Candidates:
         return out
 
     middle = mean(part.point)
-    away = np.linalg.norm(nodes.values[:, 3:] - middle[own], axis=1)
+    away = np.linalg.norm(nodes.values[:, 3:6] - middle[own], axis=1)
     order = np.lexsort((away, own))
     lead = order[np.flatnonzero(np.diff(own[order], prepend=-1))]
-    y = part.point - nodes.values[lead, 3:][of]
+    y = part.point - nodes.values[lead, 3:6][of]
     second = mean(part.spread + y[:, :, None] * y[:, None, :])
     usable = total > 0.0
     root = np.linalg.inv(np.linalg.cholesky(np.where(usable[:, None, None], second, np.eye(3))))
@@ -330,7 +280,7 @@ def _stated(nodes: _Nodes, row: IntArray, n: int) -> Candidates:
     fourth += 2.0 * (s**2).sum(axis=(1, 2)) + 4.0 * np.einsum("ni,nij,nj->n", z, s, z)
     tails = mean(fourth) / NORMAL_KURTOSIS
     second *= (np.maximum(tails, 1.0) ** 0.75)[:, None, None]
-    turned = part.angle - np.arctan(_ratio(nodes.x[lead]))[of]
+    turned = part.angle - np.arctan(ratio_of(nodes.x[lead]))[of]
     angle_sigma = np.sqrt(mean(turned**2 + part.angle_spread))
     misfit = np.full(m, np.inf)
     np.minimum.at(misfit, own, nodes.misfit)
@@ -345,7 +295,7 @@ def _stated(nodes: _Nodes, row: IntArray, n: int) -> Candidates:
         if j == MOST_CANDIDATES or not weight[one] > rank[i, 0] - _LOW:
             continue
         out.number[i], rank[i, j] = j + 1, weight[one]
-        out.x[i, j], out.values[i, j] = nodes.x[lead[one]], nodes.values[lead[one]]
+        out.x[i, j], out.values[i, j] = nodes.x[lead[one]], nodes.values[lead[one], :6]
         out.covariances[i, j], out.chi_squared[i, j] = second[one], misfit[one]
         out.valid[i, j] = tails[one] < _TAILED
         out.angle_sigma[i, j] = angle_sigma[one]
@@ -353,30 +303,29 @@ def _stated(nodes: _Nodes, row: IntArray, n: int) -> Candidates:
     return out._replace(probability=probability)
 
 
-def _found(measurements: _Measurements, x: Array, values: Array) -> Candidates:
-    """Candidates of measurements whose contact without friction is x with (F, p), if any."""
+def along_curves(
+    fitting: JointFit, flat: Array, targets: Array, x: Array, values: Array
+) -> Candidates:
+    """Candidates of measurements whose contacts without friction are x with (F, p), if any."""
+    parts = [
+        _found(_Curves(fitting, flat[part], targets[part]), x[part], values[part])
+        for part in (slice(i, i + _TOGETHER) for i in range(0, max(len(flat), 1), _TOGETHER))
+    ]
+    return Candidates(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+def _found(curves: _Curves, x: Array, values: Array) -> Candidates:
     rows = np.flatnonzero(np.isfinite(x).all(axis=1))
     if not rows.size:
         return Candidates.room(len(x))
     x, values = x[rows], values[rows]
-    own = np.arange(rows.size)
-    starts = measurements.nodes(own, rows, x, values)
-    nodes = measurements.along(rows, x, values)
-    return _stated(*measurements.finer(rows, nodes, starts), len(measurements.flat))
+    starts = curves.nodes(np.arange(rows.size), rows, x, values)
+    nodes = curves.along(rows, x, values)
+    return _stated(*curves.finer(rows, nodes, starts), len(curves.flat))
 
 
-def estimate_with_friction(
-    contact_map: ChartedWhisker,
-    signals: xr.Dataset | Mapping[str, ArrayLike],
-    using: str | Sequence[str],
-    noise: Noise | None,
-    errors: Array,
-    prior: Prior | None,
-    spread: float,
-) -> Contacts:
-    """Find contacts whose friction along the whisker is not known; see the module."""
-    names = selection(using)
-    sensor = sensor_noise(noise, names, errors)
+def check_ratio(spread: float, sensor: SensorNoise | None) -> None:
+    """Refuse a prior of friction that is none, or one without noise to weigh it against."""
     if sensor is None:
         raise ValueError("friction is weighed against the noise of the signals: give its noise")
     if not _LEAST <= spread < np.inf:
@@ -384,33 +333,3 @@ def estimate_with_friction(
             "friction is the standard deviation of the force along the whisker over that across "
             f"it, at least {_LEAST:g}, such as 0.3; got {spread!r}"
         )
-    start = estimate(contact_map, signals, names, noise, errors, None)
-    d = contact_map.chart.discretization
-    values, dims, coords = measured(signals, names)
-    flat = values.reshape(-1, len(names)) / signal_scales(names, d.force, d.moment)
-    x = np.column_stack(
-        [start.arc_length.reshape(-1) / d.length, start.contact_force.reshape(-1, 3) / d.force]
-    )
-    known = np.column_stack(
-        [start.force.reshape(-1, 3) / d.force, start.point.reshape(-1, 3) / d.length]
-    )
-    parts = [
-        _found(_Measurements(contact_map, names, sensor, flat[part], spread), x[part], known[part])
-        for part in (slice(i, i + _TOGETHER) for i in range(0, max(len(flat), 1), _TOGETHER))
-    ]
-    found = Candidates(*(np.concatenate(part) for part in zip(*parts, strict=True)))
-    status = start.status.reshape(-1).copy()
-    some = found.number > 0
-    if prior is not None:
-        found = found.allowed_first(possible_candidates(prior, contact_map.whisker, d, found))
-        with np.errstate(invalid="ignore"):
-            found.probability[:] /= np.nansum(found.probability, axis=1, keepdims=True)
-        status[some & (found.number == 0)] = int(Status.OUTSIDE_PRIOR)
-        some = found.number > 0
-    sure = found.probability[:, 0] > CERTAIN
-    status[some] = np.where(sure, int(Status.UNIQUE), int(Status.AMBIGUOUS))[some]
-    far = found.chi_squared[:, 0] > explained(len(names) - _UNKNOWNS + 1)
-    status[some & far] = int(Status.NOT_ONE_CONTACT)
-    return contacts_of(
-        found, status, found.chi_squared[:, 0], d, names, values.shape[:-1], dims, coords
-    )

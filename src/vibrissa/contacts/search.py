@@ -24,9 +24,9 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from vibrissa.contacts.candidates import UNEXPLAINED, Problem
-from vibrissa.contacts.compliance import SoftBase, check_compliance
 from vibrissa.contacts.contacts import Candidates, Contacts, contacts_of
 from vibrissa.contacts.inversion import polish
+from vibrissa.contacts.joint_fit import soft_base
 from vibrissa.contacts.noise import explained, sensor_noise
 from vibrissa.contacts.prior import Prior, among_allowed
 from vibrissa.contacts.ranking import estimate_rows
@@ -203,7 +203,6 @@ def estimate(
     """Find all frictionless contacts of a whisker that explain measured signals."""
     names = selection(using)
     sensor = sensor_noise(noise, names, errors)
-    check_compliance(compliance_sigma, sensor)
     values, dims, coords = measured(signals, names)
     check_signals(values, names)
     d = contact_map.chart.discretization
@@ -218,10 +217,9 @@ def estimate(
             found, status, chi_squared = among_allowed(
                 prior, contact_map, readout, (flat, targets), found, status, chi_squared
             )
-        if compliance_sigma > 0.0:
-            assert sensor is not None
-            whisker, steps = contact_map.whisker, contact_map.steps
-            base = SoftBase(whisker, d, steps, readout.channels, sensor, compliance_sigma)
+        rod = contact_map.whisker, contact_map.steps
+        base = soft_base(*rod, readout.channels, sensor, compliance_sigma)
+        if base is not None:
             found, status, chi_squared = base.allow(flat, targets, found, status)
     else:
         found, chi_squared = Candidates.room(len(flat), 1), np.full(len(flat), np.nan)

@@ -106,22 +106,7 @@ class Bent(NamedTuple):
 
 @np.errstate(over="ignore", invalid="ignore")
 def bent_by_forces(whisker: Whisker, arc: Array, forces: Array) -> Bent:
-    """Bend a whisker by several point forces.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        Whisker.
-    arc : (n, k) array
-        Arc lengths of the contacts over L, rising along k.
-    forces : (n, k, 3) array
-        Force of each in the material frame there, over EI/L².
-
-    Returns
-    -------
-    Bent
-        Wrench at the base and shape, non-dimensional.
-    """
+    """Bend a whisker by several point forces."""
     parts = [
         _bent(whisker, arc[i : i + _TOGETHER], forces[i : i + _TOGETHER])
         for i in range(0, max(len(arc), 1), _TOGETHER)

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.contacts.channels import WRENCH, Channels
-from vibrissa.contacts.compliance import SoftBase, check_compliance
 from vibrissa.contacts.contacts import Candidates, Contacts, contacts_of
+from vibrissa.contacts.joint_fit import soft_base
 from vibrissa.contacts.least_squares import Fits, fit, unknowns_covariance
 from vibrissa.contacts.noise import (
     INDISTINCT,
@@ -187,7 +187,8 @@ def _located(
     compliance_sigma: float,
 ) -> Contacts:
     sensor = sensor_noise(noise, WRENCH, errors)
-    check_compliance(compliance_sigma, sensor)
+    channels = Channels(WRENCH, WRENCH)
+    base = soft_base(whisker, steps, channels, sensor, compliance_sigma, friction=True)
     f, m, dims, coords = labelled
     d = discretize(whisker, steps)
     scale = np.repeat([d.force, d.moment], 3)
@@ -214,10 +215,7 @@ def _located(
     status[rows] = np.where(lost, int(Status.DEGENERATE), _statuses(found, limit))
     whole = found.spread_out(rows, len(wrenches))
     chi_squared = whole.chi_squared[:, 0]
-    if compliance_sigma > 0.0:
-        assert sensor is not None
-        channels = Channels(WRENCH, WRENCH)
-        base = SoftBase(whisker, d, steps, channels, sensor, compliance_sigma, friction=True)
+    if base is not None:
         whole, status, chi_squared = base.allow(wrenches, wrenches, whole, status)
     return contacts_of(whole, status, chi_squared, d, WRENCH, f.shape[:-1], dims, coords)
 

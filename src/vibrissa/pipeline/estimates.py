@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.contacts import ContactMap, Prior, spherical
+from vibrissa.contacts import ContactMap, Gravity, Prior, spherical
 from vibrissa.contour import continuing_candidates, to_laboratory
 from vibrissa.pipeline.frames import cross_matrices, signals_in
 from vibrissa.pipeline.locate import TRIPLET, locate, locate_from_wrench, without_contact
@@ -69,6 +69,7 @@ def estimates_of(
     prior: Prior | None = None,
     friction: float = 0.0,
     second_contacts: float = 0.0,
+    gravity: Gravity | None = None,
     proximal: float = PROXIMAL,
     progress: Progress | None = None,
 ) -> xr.Dataset:
@@ -103,6 +104,9 @@ def estimates_of(
         force and moment whole (`second_contact`), such as 0.01; they get the status
         ``NOT_ONE_CONTACT``. 0, the default: no test. With the wrench ratios of friction are taken
         to be 0.3 (one sigma), otherwise as by ``friction``.
+    gravity : Gravity, optional
+        Gravity that whiskers of known density bend under, laboratory frame, as of
+        ``ContactMap.estimate``; by default the sensor was tared in the first frame with a pose.
     proximal : float
         Smallest arc length of a contact of maps that are simulated, share of the length.
     progress : callable, optional
@@ -140,6 +144,7 @@ def estimates_of(
     count = data.sizes["whisker"]
     report = progress or _silent
     how: Any = {"errors": errors, "prior": prior, "second_contacts": second_contacts}
+    how["gravity"] = gravity
     if whiskers is None and contact_maps is not None:
         whiskers = [one.whisker for one in contact_maps]
     whiskers = Recording(recording).whiskers if whiskers is None else whiskers
@@ -156,9 +161,13 @@ def estimates_of(
         wrench = one[["force", "moment"]]
         if data.attrs.get("source") != "sensor" or "density" in data.attrs:
             wrench = wrench.assign(in_contact=one["in_contact"])
+        if gravity is not None:
+            wrench = wrench.assign(base_rotation=one["base_rotation"])
         if whole:
             found = locate_from_wrench(whisker, wrench, sigma, **how)
-        elif (none := without_contact(whisker, wrench, names, noise=sigma)) is not None:
+        elif gravity is None and (
+            (none := without_contact(whisker, wrench, names, noise=sigma)) is not None
+        ):
             found = none
         else:
             if contact_maps is not None:
@@ -186,6 +195,8 @@ def estimates_of(
         about["friction"] = friction
     if prior is not None:
         about["prior"] = repr(prior)
+    if gravity is not None:
+        about["gravity"] = gravity.acceleration
     out.attrs = about
     return out.assign_coords({n: data[n].variable for n in ("time", "whisker", "space")})
 

@@ -82,29 +82,7 @@ class _Trial(NamedTuple):
 
 
 def without_inertia(own: Group, whisker: Whisker, dynamics: Dynamics, noise: Array) -> xr.Dataset:
-    """Signals of one whisker without its inertia and damping.
-
-    Parameters
-    ----------
-    own : Group
-        Time, wrench and pose of the base of one whisker.
-    whisker : Whisker
-        Whisker at rest.
-    dynamics : Dynamics
-        Density and damping, known to 20 %.
-    noise : (6, 6) array
-        Covariance of (F, M).
-
-    Returns
-    -------
-    xarray.Dataset
-        Group ``signals`` of that whisker, with ``wrench_covariance``.
-
-    Raises
-    ------
-    ValueError
-        If frames are not equally spaced, too few, or without a pose.
-    """
+    """Signals of one whisker without its inertia and damping."""
     trial, known = _trial(own, whisker, dynamics, noise)
     added, change = _added(trial, dynamics)
     left = trial.wrench - added

@@ -42,8 +42,9 @@ from vibrissa.contacts import (
     common_covariance,
     common_errors,
     estimate_from_wrench,
-    estimate_with_weight,
+    estimate_jointly,
     ratio_derivatives,
+    read_at_rest,
     second_contact,
     whitening,
 )
@@ -65,6 +66,9 @@ DETECTED = 5.0
 
 _FRICTION = 0.3
 """Ratio of forces along and across the whisker, one sigma, where second contacts are looked for."""
+
+_OF_ROD = ("stiffness_sigma", "compliance_sigma")
+"""Errors of the whisker and its base."""
 
 _WHISKER = {"reference_frame": "whisker"}
 
@@ -134,7 +138,8 @@ def locate(
         Ratio of forces, as for `estimates_of`; only with the exact method.
     gravity : Gravity, optional
         Gravity that the whisker bends under, as of ``ContactMap.estimate``; only with the exact
-        method. Derivatives are then those of a whisker without weight that has the resting shape.
+        method. Where ``wrench`` has ``base_rotation``, it is that of the laboratory. Derivatives
+        are those of a whisker without weight that has the resting shape.
     second_contacts : float
         Rate of false alarms at which frames of more than one contact are detected, as for
         `estimates_of`.
@@ -157,7 +162,7 @@ def locate(
         If the noise does not fit.
     """
     names = selection(triplet)
-    measured = _Measured.of(wrench, noise, errors)
+    measured = _Measured.of(wrench, noise, errors, contact_map.whisker, gravity)
     signals = base_signals(measured.force[measured.rows], measured.moment[measured.rows])
     if method == "exact":
         found = contact_map.estimate(
@@ -167,6 +172,7 @@ def locate(
             prior=prior,
             friction=friction,
             gravity=gravity,
+            base_rotation=measured.rotation,
             **(errors or {}),
         )
     else:
@@ -174,14 +180,9 @@ def locate(
 
         found = estimate(contact_map, signals, names, method=method, prior=prior)
     stated = found.candidates.covariance if method == "exact" else None
-    whisker = _at_rest(contact_map.whisker, gravity)
+    whisker = measured.at_rest(contact_map.whisker, gravity)
     out = _located(whisker, names, measured, _Candidates.of(found), stated, friction)
     return _alone(out, whisker, measured, errors, friction, second_contacts)
-
-
-def _at_rest(whisker: Whisker, gravity: Gravity | None) -> Whisker:
-    """Whisker without weight that has the resting shape."""
-    return whisker if gravity is None else resting(whisker, gravity.acceleration).shape()
 
 
 def without_contact(
@@ -233,14 +234,14 @@ def locate_from_wrench(
     xarray.Dataset
         Contacts as of `locate`, with ``friction_angle``.
     """
-    measured = _Measured.of(wrench, noise, errors)
+    measured = _Measured.of(wrench, noise, errors, whisker, gravity)
     force, moment = measured.force[measured.rows], measured.moment[measured.rows]
     if gravity is None:
         found = estimate_from_wrench(
             whisker, force, moment, noise=measured.typical, prior=prior, **(errors or {})
         )
     else:
-        found = estimate_with_weight(
+        found = estimate_jointly(
             whisker,
             None,
             {"force": force, "moment": moment},
@@ -248,11 +249,12 @@ def locate_from_wrench(
             measured.typical,
             measured.errors,
             prior,
-            gravity,
-            (errors or {}).get("stiffness_sigma", 0.0),
+            gravity=gravity,
+            rotation=measured.rotation,
+            **{n: v for n, v in (errors or {}).items() if n in _OF_ROD},
         )
     stated = found.candidates.covariance
-    rest = _at_rest(whisker, gravity)
+    rest = measured.at_rest(whisker, gravity)
     out = _located(rest, WRENCH, measured, _Candidates.of(found), stated)
     return _alone(out, rest, measured, errors, _FRICTION, second_contacts)
 
@@ -301,8 +303,8 @@ class _Measured(NamedTuple):
 
     Also the frames (n,) in which they are known, in which a contact is detected and in which there
     is none; the typical noise (6, 6) of the frames, if there is any; errors that all frames share
-    (k, 6, 7); M_B from which contacts are detected, N·m; and whether all frames have the same
-    noise.
+    (k, 6, 7); M_B from which contacts are detected, N·m; whether all frames have the same noise;
+    and under gravity the rotations (n, 3, 3) of the base in those frames, if they are known.
     """
 
     time: xr.Variable
@@ -316,17 +318,27 @@ class _Measured(NamedTuple):
     errors: Array
     above: float
     steady: bool
+    rotation: Array | None = None
 
     @classmethod
     def of(
-        cls, wrench: xr.Dataset, noise: ArrayLike | None, errors: Mapping[str, Any] | None = None
+        cls,
+        wrench: xr.Dataset,
+        noise: ArrayLike | None,
+        errors: Mapping[str, Any] | None = None,
+        whisker: Whisker | None = None,
+        gravity: Gravity | None = None,
     ) -> _Measured:
         """Measurement of a wrench dataset."""
         force, moment = (Group(wrench)[name] for name in ("force", "moment"))
         n = len(force)
         covariance = _noise_of_frames(noise, n)
         known = np.isfinite(force.sum(axis=1) + moment.sum(axis=1))
-        size = np.hypot(moment[:, 1], moment[:, 2])
+        bending, rotation = moment, None
+        if gravity is not None and whisker is not None:
+            rotation = Group(wrench)["base_rotation"] if "base_rotation" in wrench else None
+            bending = moment - read_at_rest(whisker, gravity, rotation, n)[:, 3:]
+        size = np.hypot(bending[:, 1], bending[:, 2])
         least = 0.0 * size
         if noise is not None:
             least = DETECTED * np.sqrt(0.5 * (covariance[:, 4, 4] + covariance[:, 5, 5]))
@@ -349,9 +361,31 @@ class _Measured(NamedTuple):
             whole = np.concatenate([force, moment], axis=1)
             covariance = covariance + common_covariance(shared, np.eye(6), whole)
         time = wrench["time"].variable
+        if rotation is not None:
+            rotation = rotation[rows]
         return cls(
-            time, force, moment, covariance, known, rows, free, typical, shared, above, steady
+            time,
+            force,
+            moment,
+            covariance,
+            known,
+            rows,
+            free,
+            typical,
+            shared,
+            above,
+            steady,
+            rotation,
         )
+
+    def at_rest(self, whisker: Whisker, gravity: Gravity | None) -> Whisker:
+        """Whisker without weight that has the resting shape, in the middle of all poses."""
+        if gravity is None:
+            return whisker
+        pull = np.array(gravity.acceleration)
+        if self.rotation is not None and len(self.rotation):
+            pull = np.nanmean(self.rotation, axis=0).T @ pull
+        return resting(whisker, pull).shape()
 
 
 def _noise_of_frames(noise: ArrayLike | None, n: int) -> Array:

@@ -191,20 +191,7 @@ def discretized(whisker: Any, steps: int) -> Discretization:
 
 
 def weight_beyond(rod: Rod, weight: float) -> Array:
-    """Weight of all that is beyond a place, in the polynomials of :class:`Weight`.
-
-    Parameters
-    ----------
-    rod : Rod
-        Rod.
-    weight : float
-        Weight per length at the base, over EI/L³.
-
-    Returns
-    -------
-    (n, 8) array
-        Polynomials in the fraction of each step.
-    """
+    """Weight of all that is beyond a place, in the polynomials of :class:`Weight`."""
     radius = rod.shape[:, 3]
     integral = np.zeros((len(radius), 8))  # of radius² over the step, from its start
     for i in range(4):

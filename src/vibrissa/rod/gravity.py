@@ -361,38 +361,12 @@ def evaluated(
 
 @lru_cache(maxsize=64)
 def at_rest(whisker: Resting, steps: int = STEPS) -> Weighted:
-    """Solve the resting whisker; cached.
-
-    Parameters
-    ----------
-    whisker : Resting
-        Whisker under its weight.
-    steps : int
-        Number of integration steps along it.
-
-    Returns
-    -------
-    Weighted
-        One row: no contact.
-    """
+    """Solve the resting whisker; cached."""
     return evaluated(discretize(whisker, steps), _REST, tangents=True)
 
 
 def moved_moments(d: Discretization, contacts: Array) -> Array:
-    """What the weight's moment about the base has changed by since rest, non-dimensional.
-
-    Parameters
-    ----------
-    d : Discretization
-        Rod, with weight or without.
-    contacts : (n, 4) array
-        Arc length and force (s, f); NaN where there is no contact.
-
-    Returns
-    -------
-    (n, 3) array
-        Changes of the moment; zero where there is no contact.
-    """
+    """What the weight's moment about the base has changed by since rest, non-dimensional."""
     out = np.zeros((len(contacts), 3))
     if d.rod.weight is None:
         return out
@@ -403,24 +377,7 @@ def moved_moments(d: Discretization, contacts: Array) -> Array:
 
 
 def trace(d: Discretization, contact: Array, lean: Array, s: Array) -> Traced:
-    """Follow one solved whisker.
-
-    Parameters
-    ----------
-    d : Discretization
-        Rod with weight.
-    contact : (4,) array
-        Arc length and force (s, f).
-    lean : (3,) array
-        Direction of weight at the tip, of the solution.
-    s : (m,) array
-        Arc lengths over L, increasing.
-
-    Returns
-    -------
-    Traced
-        Shape and moments.
-    """
+    """Follow one solved whisker."""
     m = len(s)
     axes, ends, moments = np.empty((m + 1, 3, 3)), np.empty((m + 1, 3)), np.empty((m + 1, 3))
     assert d.rod.weight is not None

@@ -121,28 +121,7 @@ class Dynamics:
 
 
 def resonances(whisker: Whisker, dynamics: Dynamics | None = None, count: int = 3) -> Array:
-    """Resonance frequencies of a free whisker, held at its base.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        Whisker at rest.
-    dynamics : Dynamics, optional
-        Density and number of segments.
-    count : int
-        Number of frequencies, from the lowest.
-
-    Returns
-    -------
-    array (count,)
-        Frequencies without damping, Hz.
-
-    Examples
-    --------
-    >>> import vibrissa as vb
-    >>> bool(27.0 < resonances(vb.samples.gamma())[0] < 260.0)
-    True
-    """
+    """Resonance frequencies of a free whisker, held at its base."""
     dynamics = dynamics or Dynamics()
     return frequencies(Chain.of(whisker, dynamics.density, dynamics.segments), count)
 

@@ -49,32 +49,11 @@ def inertial_wrench(
     arc_length: Array,
     most: float = np.inf,
 ) -> Array:
-    """Part of the wrench at the base that is due to inertia and damping.
+    """Part of the wrench (n, 6) at the base that is due to inertia and damping, SI units.
 
-    Parameters
-    ----------
-    whisker : Whisker
-        Whisker at rest.
-    dynamics : Dynamics
-        Density and damping.
-    time : (n,) array
-        Times, s, equally spaced; four or more.
-    rotation : (n, 3, 3) array
-        Rotation of the base, from the whisker's to the laboratory frame; smooth.
-    position : (n, 3) array
-        Position of the base, laboratory frame, m.
-    points : (n, 3) array
-        Points on the centreline that are held, laboratory frame, m; NaN where nothing is touched.
-    arc_length : (n,) array
-        Approximate arc lengths of the contacts, m; only the first of a contact counts.
-    most : float
-        Force on the chain without mass from which a point must be wrong, N; the point of the
-        nearest frame takes its place, or the contact ends there.
-
-    Returns
-    -------
-    (n, 6) array
-        Force, N, and moment, N·m, whisker frame.
+    Points of the centreline are held, laboratory frame, NaN where nothing is touched; only the
+    first arc length of a contact counts. Where a chain without mass would need a force above
+    ``most``, the point of the nearest frame takes its place, or the contact ends.
     """
     frame = float(time[-1] - time[0]) / (len(time) - 1)
     chain = Chain.of(whisker, dynamics.density, _SEGMENTS)

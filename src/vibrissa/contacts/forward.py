@@ -1,0 +1,373 @@
+"""What contacts cause at the base of a rod, by itself or under its weight, and what is uncertain.
+
+A contact x = (s, f) gives the base force and the contact point (F, p); under weight also the change
+μ of the weight's moment about the base since rest. A sensor that was tared at rest then reads
+
+    F = φ(0),   M = p × F + μ,
+
+so that M · F ≠ 0. Tared under another gravity, it reads the difference of the two resting wrenches
+in addition, which is the same for every contact.
+
+What is known of the rod to standard deviations only are further unknowns c ~ N(0, 1): the direction
+of gravity, the density, the compliance of the base. To first order they change readings and contact
+point, at a fixed x, by the difference that one standard deviation makes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from vibrissa.contacts.channels import (
+    CHANNELS,
+    CIRCULAR,
+    channel_derivatives,
+    channels_of,
+    ratio_derivatives,
+    ratio_of,
+    wrenches_of,
+)
+from vibrissa.contacts.least_squares import Fits, fit
+from vibrissa.numerics import AnyArray, Array
+from vibrissa.rod import STEPS, Resting, discretize, evaluated, resting, solve_forces
+from vibrissa.signals import within_turn
+from vibrissa.whisker import Whisker
+
+# Rounds of the fit, and the longest steps of arc length (over L) and of force (its own size, and
+# EI/L²) in one.
+_ROUNDS = 30
+_LONGEST, _STRONGER, _LEAST_FORCE = 0.1, 0.5, 0.05
+# A fit has ended when its step is this small, or the damping this large.
+_SETTLED, _MOST_DAMPING = 1e-8, 1e8
+# Turn of gravity (rad) and relative change of density for derivatives.
+_NUDGE = 1e-4
+# A rigid base is one so much stiffer than the whisker.
+_RIGID = 1e9
+# Relative step of the force along the whisker for its derivatives.
+_AHEAD = 1e-5
+# How far apart directions of gravity are that a turning whisker is solved for, and those whose
+# resting shapes propose contacts, rad.
+_DIRECTIONS, _SHAPES = 1e-3, 0.2
+# Rows of the numbers of a solved rod with weight: force, contact point, moment of the weight.
+_CAUSED = [0, 1, 2, 3, 4, 5, 9, 10, 11]
+
+
+@dataclass(frozen=True)
+class Gravity:
+    """Gravity that a whisker bends under, and how well it is known.
+
+    Attributes
+    ----------
+    acceleration : tuple of float
+        Gravitational acceleration minus that of the base, whisker frame, m/s², such as
+        ``(0, 0, -9.81)`` for a level whisker.
+    tare : tuple of float, optional
+        Gravity, whisker frame, m/s², when the sensor was tared with the whisker at rest; by default
+        as it is now. Zeros: a sensor that reads the weight.
+    direction_sigma : float
+        Standard deviation of gravity's direction about each axis across it, rad.
+    density_sigma : float
+        Relative standard deviation of the whisker's density.
+    """
+
+    acceleration: tuple[float, float, float]
+    tare: tuple[float, float, float] | None = None
+    direction_sigma: float = 0.0
+    density_sigma: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the standard deviations."""
+        for name in ("direction_sigma", "density_sigma"):
+            sigma = getattr(self, name)
+            if not 0.0 <= sigma < np.inf:
+                raise ValueError(f"{name} is a standard deviation, not negative; got {sigma!r}")
+
+    @property
+    def uncertain(self) -> bool:
+        """Whether anything of it is known to a standard deviation only."""
+        return self.direction_sigma > 0.0 or self.density_sigma > 0.0
+
+    @classmethod
+    def of(cls, gravity: Gravity | ArrayLike | None) -> Gravity | None:
+        """Read gravity, stated as such or as an acceleration; None where there is none.
+
+        Parameters
+        ----------
+        gravity : Gravity, (3,) array_like or None
+            Gravity, or its acceleration, m/s².
+
+        Returns
+        -------
+        Gravity or None
+            Gravity, unless it is zero and the sensor was tared under it.
+        """
+        if gravity is None:
+            return None
+        if not isinstance(gravity, Gravity):
+            values = np.asarray(gravity, dtype=np.float64)
+            if values.shape != (3,):
+                raise ValueError(
+                    f"gravity is (x, y, z) in m/s², in the whisker frame; got {gravity!r}"
+                )
+            gravity = cls((float(values[0]), float(values[1]), float(values[2])))
+        return gravity if any(gravity.acceleration) or gravity.tare is not None else None
+
+    def turned(self, rotation: Array) -> Gravity:
+        """Gravity of the laboratory frame, in that of a whisker.
+
+        Parameters
+        ----------
+        rotation : (3, 3) array
+            Rotation of the base, from the whisker's to the laboratory frame.
+
+        Returns
+        -------
+        Gravity
+            Gravity in the nearest of directions a twentieth of a degree apart, so that those of a
+            moving whisker are not all different; without another tare it is of this pose.
+        """
+        x, y, z = _rounded(rotation.T @ self.acceleration, _DIRECTIONS).tolist()
+        return replace(self, acceleration=(x, y, z), tare=self.tare or (x, y, z))
+
+    @property
+    def nearly(self) -> tuple[float, float, float]:
+        """Acceleration in the nearest of directions some degrees apart."""
+        x, y, z = _rounded(np.array(self.acceleration), _SHAPES).tolist()
+        return x, y, z
+
+
+def _rounded(vector: Array, step: float) -> Array:
+    """Vector of the same size in the nearest of directions so far apart, rad."""
+    size = float(np.linalg.norm(vector))
+    toward = np.round(vector / max(size, 1e-300) / step) * step
+    return np.asarray(size * toward / max(float(np.linalg.norm(toward)), 1e-300))
+
+
+def read_at_rest(whisker: Whisker, gravity: Gravity, rotation: Array | None, n: int) -> Array:
+    """What a tared sensor reads of a free whisker in n poses (n, 6), N and N·m."""
+    if rotation is None:
+        there = Forward.of(whisker, gravity)
+        return np.tile(there.shift * np.repeat([there.d.force, there.d.moment], 3), (n, 1))
+    lab, known, out = gravity, {}, np.full((n, 6), np.nan)
+    for i in np.flatnonzero(finite(rotation)):
+        now = lab.turned(rotation[i])
+        lab = replace(lab, tare=now.tare)
+        if now not in known:
+            known[now] = read_at_rest(whisker, now, None, 1)[0]
+        out[i] = known[now]
+    return out
+
+
+class Solved(NamedTuple):
+    """Contacts with what they cause.
+
+    x (n, 4); (F, p) or (F, p, μ) (n, 6 or 9) and their derivatives by x (n, 6 or 9, 4); directions
+    of weight at the tip (n, 3), to begin the next solution with.
+    """
+
+    x: Array
+    values: Array
+    tangents: Array
+    leans: Array
+
+
+class Forward:
+    """A rod with the errors of it that all measurements share; made by :meth:`of`.
+
+    Attributes
+    ----------
+    d : Discretization
+        Rod, with its units.
+    shift : (6,) array
+        What readings have in addition to (F, M) since the tare, non-dimensional.
+    errors : list of (Forward, float)
+        Rods that differ in one unknown, and the standard deviation of it in these differences.
+    """
+
+    def __init__(self, rod: Whisker | Resting, steps: int, before: Resting | None = None) -> None:
+        self.rod, self.d = rod, discretize(rod, steps)
+        self.shift, self._rest = np.zeros(6), np.zeros(3)
+        self.errors: list[tuple[Forward, float]] = []
+        if isinstance(rod, Resting):
+            self._rest = rod.moment / self.d.moment
+            if before is not None:
+                self.shift[:3] = (rod.force - before.force) / self.d.force
+                self.shift[3:] = (rod.moment - before.moment) / self.d.moment
+
+    @classmethod
+    def of(
+        cls,
+        whisker: Whisker,
+        gravity: Gravity | None = None,
+        compliance_sigma: float = 0.0,
+        stiffness_sigma: float = 0.0,
+        steps: int = STEPS,
+    ) -> Forward:
+        """Put a whisker under gravity, with the standard deviations of what is uncertain."""
+
+        def bent(whisker: Whisker, turn: Rotation | None = None) -> Forward:
+            if gravity is None:
+                return cls(whisker, steps)
+            now, before = (
+                None
+                if pull is None
+                else resting(whisker, np.array(pull) if turn is None else turn.apply(pull))
+                for pull in (gravity.acceleration, gravity.tare)
+            )
+            assert now is not None
+            return cls(now, steps, before)
+
+        out = bent(whisker)
+        if gravity is not None:
+            if gravity.direction_sigma > 0.0:
+                for axis in np.linalg.svd(np.array([gravity.acceleration]))[2][1:]:
+                    turned = bent(whisker, Rotation.from_rotvec(_NUDGE * axis))
+                    out.errors.append((turned, gravity.direction_sigma / _NUDGE))
+            # A stiffer whisker bends less under the same weight, as a lighter one does.
+            lighter = float(np.hypot(gravity.density_sigma, stiffness_sigma))
+            if lighter > 0.0:
+                assert whisker.density is not None
+                heavier = whisker.with_properties(density=whisker.density * (1.0 + _NUDGE))
+                out.errors.append((bent(heavier), lighter / _NUDGE))
+        if compliance_sigma > 0.0:
+            stiff = _RIGID * whisker.base_bending_stiffness / whisker.length
+            soft = 1.0 / np.array(whisker.base_stiffness or (stiff, stiff))
+            for bending, twist in 1.0 / (soft + compliance_sigma * np.eye(2)):
+                base = whisker.with_properties(base_stiffness=(float(bending), float(twist)))
+                out.errors.append((bent(base), 1.0))
+        return out
+
+    @property
+    def weighted(self) -> bool:
+        """Whether the rod has weight."""
+        return self.d.rod.weight is not None
+
+    def values(self, x: Array, leans: Array | None = None) -> Array:
+        """(F, p) or (F, p, μ) (n, 6 or 9) of contacts x (n, 4)."""
+        if not self.weighted:
+            return solve_forces(self.d, x)[0]
+        return self._since_rest(evaluated(self.d, x, leans).states[:, _CAUSED])
+
+    def _since_rest(self, values: Array) -> Array:
+        values[:, 6:] -= self._rest
+        return values
+
+    def solved(self, x: Array, leans: Array | None = None) -> Solved:
+        """Contacts x (n, 4) of the rod with weight, with derivatives."""
+        out = evaluated(self.d, x, leans, tangents=True)
+        values = self._since_rest(out.states[:, _CAUSED])
+        return Solved(x, values, out.tangents[:, _CAUSED], out.leans)
+
+    def near(self, x: Array) -> tuple[Array, Array]:
+        """Values of contacts x (n, 4) and their derivatives by x."""
+        if self.weighted:
+            return self.solved(x)[1:3]
+        values, exact = solve_forces(self.d, x, tangents=True)
+        step = _AHEAD * np.linalg.norm(x[:, 1:], axis=1)
+        ahead = x.copy()
+        ahead[:, 1] += step
+        slopes = np.empty((len(x), 6, 4))
+        slopes[..., [0, 2, 3]] = exact
+        slopes[..., 1] = (solve_forces(self.d, ahead)[0] - values) / step[:, None]
+        return values, slopes
+
+    def by_errors(self, x: Array, values: Array) -> tuple[Array, Array]:
+        """What one standard deviation changes of readings and of (F, p), (n, 6, k) each."""
+        wrench = np.zeros((len(x), 6, len(self.errors)))
+        moved = np.zeros_like(wrench)
+        for k, (other, share) in enumerate(self.errors):
+            there = other.values(x)
+            change = wrenches_of(there) - wrenches_of(values) + other.shift - self.shift
+            wrench[..., k], moved[..., k] = share * change, share * (there - values)[:, :6]
+        return wrench, moved
+
+    def fit(
+        self,
+        names: tuple[str, ...],
+        targets: Array,
+        weights: Array,
+        x: Array,
+        *,
+        friction: bool,
+        least: float,
+    ) -> Fits:
+        """Fit contacts to channels from starts x (n, 4), as :func:`~.least_squares.fit` does.
+
+        The names end with ``ratio`` and ``s``, where these are held.
+        """
+        if not self.weighted:
+            return fit(self.d, names, targets, weights, x, friction=friction, least=least)
+        free = [0, 1, 2, 3] if friction else [0, 2, 3]
+        x = x if friction else x * [1.0, 0.0, 1.0, 1.0]
+        aim, now = _Aim(names, free), self.solved(x)
+        misfit = aim.misfit(now, targets, weights)
+        damping, busy = np.zeros(len(x)), np.isfinite(misfit)
+        for _ in range(_ROUNDS):
+            which = np.flatnonzero(busy)
+            if not which.size:
+                break
+            part = Solved(*(values[which] for values in now))
+            tried = part.x.copy()
+            tried[:, free] += aim.step(part, targets[which], weights[which], damping[which])
+            tried[:, 0] = np.clip(tried[:, 0], least, 1.0)
+            new = self.solved(tried, part.leans)
+            other = aim.misfit(new, targets[which], weights[which])
+            better = other <= misfit[which] * (1.0 + 1e-12) + 1e-24
+            small = np.abs(tried - part.x).max(axis=1) < _SETTLED
+            good = which[better]
+            misfit[good] = other[better]
+            for mine, theirs in zip(now, new, strict=True):
+                mine[good] = theirs[better]
+            damping[which] = np.where(better, 0.1 * damping[which], 10.0 * damping[which] + 1e-4)
+            busy[which] = ~small & (damping[which] < _MOST_DAMPING)
+        return Fits(now.x, now.values, now.tangents, misfit, np.isfinite(misfit))
+
+
+class _Aim:
+    """Channels that contacts are fitted to, by damped steps of Gauss and Newton."""
+
+    def __init__(self, names: tuple[str, ...], free: list[int]) -> None:
+        self.names, self.free = tuple(n for n in names if n in CHANNELS), free
+        self.held = names[len(self.names) :]
+        self._which = [CHANNELS.index(name) for name in self.names]
+        self._turned = np.array([CIRCULAR[i] for i in self._which] + [False] * len(self.held))
+
+    def _away(self, at: Solved, targets: Array) -> Array:
+        held = {"ratio": ratio_of(at.x), "s": at.x[:, 0]}
+        own = channels_of(at.values)[:, self._which]
+        whole = np.column_stack([own, *(held[name] for name in self.held)])
+        return within_turn(targets - whole, self._turned)
+
+    def misfit(self, at: Solved, targets: Array, weights: Array) -> Array:
+        """χ² (n,)."""
+        with np.errstate(invalid="ignore"):
+            off = np.einsum("nij,nj->ni", weights, self._away(at, targets))
+            out = np.asarray((off**2).sum(axis=1))
+        return np.where(np.isfinite(out), out, np.inf)
+
+    def step(self, at: Solved, targets: Array, weights: Array, damping: Array) -> Array:
+        """Damped steps (n, free), no longer than is sensible."""
+        held = {"ratio": ratio_derivatives(at.x), "s": np.tile(np.eye(4)[0], (len(at.x), 1))}
+        rows = [channel_derivatives(at.values, at.tangents, self.names)]
+        rows += [held[name][:, None] for name in self.held]
+        a = np.nan_to_num(weights @ np.concatenate(rows, axis=1)[..., self.free])
+        b = np.nan_to_num(np.einsum("nij,nj->ni", weights, self._away(at, targets)))
+        size = np.linalg.norm(a, axis=1)
+        size = np.where(size > 0.0, size, 1.0)
+        a /= size[:, None, :]
+        ridge = (damping[:, None, None] + 1e-14) * np.eye(len(self.free))
+        normal = np.swapaxes(a, 1, 2) @ a + ridge
+        step = np.linalg.solve(normal, np.einsum("nij,ni->nj", a, b)[..., None])[..., 0] / size
+        force = np.linalg.norm(at.x[:, 1:], axis=1)
+        most = np.abs(step[:, 0]) / _LONGEST
+        stronger = np.linalg.norm(step[:, 1:], axis=1) / (_STRONGER * force + _LEAST_FORCE)
+        return np.asarray(step / np.maximum(1.0, np.maximum(most, stronger))[:, None])
+
+
+def finite(values: Array) -> AnyArray:
+    """Which rows (n,) of values (n, ...) are finite."""
+    return np.asarray(np.isfinite(values).reshape(len(values), -1).all(axis=1))

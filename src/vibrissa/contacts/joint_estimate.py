@@ -1,0 +1,341 @@
+"""Contacts of a whisker with weight, with friction, with an uncertain base, or with all of these.
+
+The resting whisker sags under its weight. A whisker without weight that has this shape at rest
+proposes contacts: near the truth where gravity acts across the whisker, and within a few per cent
+of the length where it acts along it. They are then fitted to the signals with the whole weight and
+all that is uncertain (:mod:`~vibrissa.contacts.joint_fit`). Unknown friction leaves curves of
+contacts, which begin there (:mod:`~vibrissa.contacts.friction`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vibrissa.contacts.channels import WRENCH, Channels
+from vibrissa.contacts.charted_whisker import ChartedWhisker
+from vibrissa.contacts.contacts import Candidates, Contacts, contacts_of
+from vibrissa.contacts.forward import Forward, Gravity, finite
+from vibrissa.contacts.friction import along_curves, check_ratio
+from vibrissa.contacts.joint_fit import JointFit, check_compliance
+from vibrissa.contacts.least_squares import Fits
+from vibrissa.contacts.noise import Noise, SensorNoise, explained, sensor_noise
+from vibrissa.contacts.posterior import CERTAIN, ranked
+from vibrissa.contacts.prior import Prior, possible_candidates
+from vibrissa.contacts.readout import check_signals
+from vibrissa.contacts.search import estimate
+from vibrissa.contacts.wrench import PROXIMAL, chosen, estimate_components, friction_angle
+from vibrissa.deferred import xr
+from vibrissa.numerics import Array, IntArray
+from vibrissa.rod import Resting
+from vibrissa.signals import labelled_wrench, measured, selection, signal_scales
+from vibrissa.status import Status
+from vibrissa.whisker import Whisker
+
+# What exact signals are met to, in χ² of signals known to 1 %.
+_EXACT = 1e-8
+# Noise, in units of force and moment and in rad, within which the whisker without weight proposes
+# contacts of signals that it does not explain.
+_NEAR = 0.01
+_MOST = 8
+# Friction angles scatter by so much: of contacts that explain a wrench equally well, those that
+# need less friction come first.
+_LIKELY = np.deg2rad(20.0)
+_NO_ERRORS = np.zeros((0, 6, 7))
+
+
+class JointEstimate:
+    """Finds contacts with weight, friction and what is uncertain of the rod."""
+
+    def __init__(
+        self,
+        whisker: Whisker,
+        contact_map: ChartedWhisker | None,
+        names: tuple[str, ...],
+        sensor: SensorNoise | None,
+        prior: Prior | None,
+        *,
+        gravity: Gravity | None = None,
+        friction: float = 0.0,
+        compliance_sigma: float = 0.0,
+        stiffness_sigma: float = 0.0,
+    ) -> None:
+        if sensor is None and gravity is not None and gravity.uncertain:
+            raise ValueError(
+                "the uncertainty of the weight adds to that of a sensor: give its noise"
+            )
+        if friction != 0.0:
+            check_ratio(friction, sensor)
+        check_compliance(compliance_sigma, sensor)
+        self.whisker, self.contact_map, self.names = whisker, contact_map, names
+        self.sensor, self.prior, self.gravity = sensor, prior, gravity
+        self._how: dict[str, Any] = {
+            "friction": friction,
+            "compliance_sigma": compliance_sigma,
+            "stiffness_sigma": stiffness_sigma,
+        }
+        self._lab, self._proposing = gravity, None if gravity is None else gravity.acceleration
+        self.forward = Forward.of(whisker, gravity, compliance_sigma, stiffness_sigma)
+        self.d, whole = self.forward.d, names == WRENCH
+        self.channels = Channels(WRENCH, WRENCH) if whole else Channels.of(names)
+        self.scale = signal_scales(names, self.d.force, self.d.moment)
+        self._shift = _shifts(self.channels.names, self.forward.shift)
+        self._fit = JointFit(self.forward, self.channels, sensor, PROXIMAL, friction=whole)
+        self._rubbing = None
+        if friction != 0.0:
+            assert contact_map is not None
+            least = contact_map.chart.proximal
+            self._rubbing = JointFit(self.forward, self.channels, sensor, least, True, friction)
+
+    def __call__(self, values: Array) -> tuple[Candidates, IntArray]:
+        """Candidates of measurements (n, k), SI units, tared as now, and their statuses."""
+        flat = values / self.scale
+        targets = self.channels.targets(flat)
+        found, status = self._without_friction(values, flat, targets)
+        if self._rubbing is not None:
+            x = found.x[:, 0]
+            known = np.full((len(x), 9 if self.forward.weighted else 6), np.nan)
+            some = np.isfinite(x).all(axis=1)
+            known[some] = self.forward.values(x[some])
+            found = along_curves(self._rubbing, flat, targets, x, known)
+            some = found.number > 0
+            status[some] = _by_probability(found)[some]
+            degrees = len(self.names) - len(self._rubbing.free) + 1
+            far = found.chi_squared[:, 0] > explained(degrees)
+            status[some & far] = int(Status.NOT_ONE_CONTACT)
+        if self.prior is not None:
+            some = found.number > 0
+            found = found.allowed_first(
+                possible_candidates(self.prior, self.whisker, self.d, found)
+            )
+            with np.errstate(invalid="ignore"):
+                found.probability[:] /= np.nansum(found.probability, axis=1, keepdims=True)
+            explained_now = np.isin(status, (int(Status.UNIQUE), int(Status.AMBIGUOUS)))
+            left = some & (found.number > 0) & explained_now
+            status[left] = _by_probability(found)[left]
+            status[some & (found.number == 0)] = int(Status.OUTSIDE_PRIOR)
+        return found, status
+
+    @property
+    def uncertain(self) -> bool:
+        """Whether friction, or anything that measurements share of the rod, is uncertain."""
+        return bool(self.forward.errors or self._rubbing)
+
+    @property
+    def sagged(self) -> ChartedWhisker:
+        """Map of a whisker without weight that has the sagged shape, or nearly."""
+        assert self.contact_map is not None
+        assert self._proposing is not None
+        return self.contact_map.sagged(self._proposing)
+
+    def direction(self, rotation: Array) -> tuple[float, ...]:
+        """Gravity of the laboratory frame where the base is turned (3, 3)."""
+        if self._lab is None or not np.isfinite(rotation).all():
+            return ()
+        return self._lab.turned(rotation).acceleration
+
+    def turned(self, rotation: Array) -> JointEstimate:
+        """The same with the base turned (3, 3), gravity being that of the laboratory frame."""
+        if self._lab is None or not np.isfinite(rotation).all():
+            return self
+        weight = self._lab.turned(rotation)
+        if weight == self.gravity:
+            return self
+        names = self.names, self.sensor, self.prior
+        out = JointEstimate(self.whisker, self.contact_map, *names, gravity=weight, **self._how)
+        out._lab, out._proposing = replace(self._lab, tare=weight.tare), weight.nearly
+        return out
+
+    def untared(self, values: Array) -> Array:
+        """Measurements (n, k), SI units, as if the sensor had been tared as it is now."""
+        if not self._shift.any():
+            return values
+        targets = self.channels.targets(values / self.scale) - self._shift
+        return self.signals_of(targets)
+
+    def signals_of(self, targets: Array) -> Array:
+        """Signals (n, k), SI units, of channels."""
+        values = targets.copy()
+        for i in self.channels.pairs():
+            y, z = targets[:, i], targets[:, i + 1]
+            values[:, i], values[:, i + 1] = np.hypot(y, z), np.arctan2(z, y)
+        return values * self.scale
+
+    def _without_friction(
+        self, values: Array, flat: Array, targets: Array
+    ) -> tuple[Candidates, IntArray]:
+        """Candidates without friction, but of the wrench."""
+        if self.forward.weighted or self.contact_map is None:
+            return self._fitted(flat, targets, self._proposed(targets))
+        noise = None
+        if self.sensor is not None:
+            sigma = self.sensor.deviations
+            noise = sigma if self.sensor.wrench is None else self.sensor.wrench
+        errors = _NO_ERRORS if self.sensor is None else self.sensor.errors
+        signals = dict(zip(self.names, values.T, strict=True))
+        one = estimate(self.contact_map, signals, self.names, noise, errors, None)
+        found = Candidates.room(len(flat), 1)
+        found.x[:, 0, 0] = one.arc_length / self.d.length
+        found.x[:, 0, 1:] = one.contact_force / self.d.force
+        return found, one.status.copy()
+
+    def _proposed(self, targets: Array) -> list[Contacts]:
+        """Contacts of a whisker without weight of the sagged shape: near the signals, and exact.
+
+        Signals just beyond those of its map have none that is exact; light contacts are found by
+        these.
+        """
+        values, names = self.signals_of(targets), self.channels.signals
+        exact = dict(zip(names, values.T, strict=True))
+        if names == WRENCH or self.contact_map is None:
+            rod = self.forward.rod
+            shape = rod.shape() if isinstance(rod, Resting) else rod
+            return [estimate_components(shape, exact, None, _NO_ERRORS, None)]
+        sagged = self.sagged
+        near = {name: _NEAR * size for name, size in zip(names, self.scale, strict=True)}
+        return [estimate(sagged, exact, names, noise, _NO_ERRORS, None) for noise in (near, None)]
+
+    def _fitted(
+        self, flat: Array, targets: Array, proposed: list[Contacts]
+    ) -> tuple[Candidates, IntArray]:
+        """Candidates by rank, and statuses."""
+        d, n, fitting = self.d, len(flat), self._fit
+        arc = np.concatenate([one.candidates.arc_length for one in proposed], axis=1)
+        force = np.concatenate([one.candidates.contact_force for one in proposed], axis=1)
+        row, place = np.nonzero(np.isfinite(arc))
+        seeds = np.column_stack([arc[row, place] / d.length, force[row, place] / d.force])
+        fits = fitting.fit(flat[row], targets[row], seeds)
+        degrees = fitting.degrees(flat[row], fits.values)
+        exact = self.sensor is None and degrees == 0
+        limit = _EXACT if exact else explained(degrees)
+        doubt = np.linalg.norm(fits.contacts[:, 1:], axis=1)
+        if fitting.friction:
+            doubt = fits.misfits + (friction_angle(fits.contacts) / _LIKELY) ** 2
+        kept = chosen(n, row, fits, doubt, limit, _MOST)
+        found = Candidates.room(n, _MOST)._replace(
+            number=kept.number,
+            x=kept.contacts,
+            values=kept.values[..., :6],
+            chi_squared=kept.misfits,
+        )
+        if self.sensor is not None:
+            row, place = np.nonzero(np.isfinite(kept.misfits))
+            parts: list[Any] = [part[row, place] for part in kept[1:]]
+            parts.append(np.ones(len(row), np.bool_))
+            found = self._ranked(flat[row], targets[row], Fits(*parts), found)
+        status = _by_probability(found)
+        unexplained = Status.NOT_ONE_CONTACT if fitting.friction else Status.NOT_FRICTIONLESS
+        status[~(found.chi_squared[:, 0] <= limit)] = int(unexplained)
+        none = found.number == 0
+        status[none] = np.asarray(proposed[0].status)[none]
+        if exact:
+            lost = status == int(unexplained)
+            found = found.allowed_first(np.isfinite(found.chi_squared) & ~lost[:, None])
+        return found, status
+
+    def _ranked(self, flat: Array, targets: Array, fits: Fits, found: Candidates) -> Candidates:
+        """Candidates by probability, with what noise leaves open."""
+        row, place = np.nonzero(np.isfinite(found.chi_squared))
+        joint = self._fit.joint(flat, targets, fits)
+        covariance, valid = self._fit.to_second_order(joint, fits)
+        found.values[row, place] = joint.values[:, :6]
+        found.covariances[row, place], found.valid[row, place] = covariance, valid
+        log = 0.5 * np.linalg.slogdet(covariance)[1] - 0.5 * fits.misfits
+        if self._fit.friction:
+            log -= 0.5 * (friction_angle(fits.contacts) / _LIKELY) ** 2
+        weight = np.full(found.chi_squared.shape, -np.inf)
+        weight[row, place] = np.where(np.isfinite(log), log, -np.inf)
+        probability, order = ranked(weight, found.number)
+        line = np.arange(len(order))[:, None]
+        found = Candidates(found.number, *(part[line, order] for part in found[1:]))
+        return found._replace(probability=probability)
+
+
+def _by_probability(found: Candidates) -> IntArray:
+    """UNIQUE or AMBIGUOUS."""
+    first = found.probability[:, 0]
+    sure = np.where(np.isfinite(first), first > CERTAIN, found.number == 1)
+    return np.where(sure, int(Status.UNIQUE), int(Status.AMBIGUOUS))
+
+
+def _shifts(names: tuple[str, ...], shift: Array) -> Array:
+    """What a shift of (F, M) adds to channels."""
+    out = np.zeros(len(names))
+    for i, name in enumerate(names):
+        if name in WRENCH:
+            out[i] = shift[WRENCH.index(name)]
+        elif shift[[1, 2] if name.startswith("F") else [4, 5]].any():
+            pair = "FT and FD" if name.startswith("F") else "MB and MD"
+            raise ValueError(f"a tare under another gravity needs both {pair}; got {name} alone")
+    return out
+
+
+def estimate_jointly(
+    whisker: Whisker,
+    contact_map: ChartedWhisker | None,
+    signals: xr.Dataset | Mapping[str, ArrayLike],
+    using: str | Sequence[str],
+    noise: Noise | None,
+    errors: Array,
+    prior: Prior | None,
+    *,
+    gravity: Gravity | None = None,
+    friction: float = 0.0,
+    compliance_sigma: float = 0.0,
+    stiffness_sigma: float = 0.0,
+    rotation: Array | None = None,
+) -> Contacts:
+    """Find contacts with weight, friction and what is uncertain, as `ContactMap.estimate` does.
+
+    With rotations of the base (..., 3, 3) gravity is that of the laboratory frame.
+    """
+    names = WRENCH if using == "wrench" else selection(using)
+    sensor = sensor_noise(noise, names, errors)
+    if names == WRENCH and "force" in signals and "moment" in signals:
+        force, moment, dims, coords = labelled_wrench(signals["force"], signals["moment"])
+        values = np.concatenate([force, moment], axis=-1)
+    else:
+        values, dims, coords = measured(signals, names)
+    if names != WRENCH:
+        check_signals(values, names)
+    find = JointEstimate(
+        whisker,
+        contact_map,
+        names,
+        sensor,
+        prior,
+        gravity=gravity,
+        friction=friction,
+        compliance_sigma=compliance_sigma,
+        stiffness_sigma=stiffness_sigma,
+    )
+    flat = values.reshape(-1, len(names))
+    if rotation is None or gravity is None:
+        found, status = find(find.untared(flat))
+    else:
+        found, status = _in_poses(find, flat, np.reshape(rotation, (-1, 3, 3)))
+    chi_squared = found.chi_squared[:, 0].copy()
+    return contacts_of(found, status, chi_squared, find.d, names, values.shape[:-1], dims, coords)
+
+
+def _in_poses(find: JointEstimate, flat: Array, rotation: Array) -> tuple[Candidates, IntArray]:
+    """Candidates of measurements with turned bases, those of one direction of gravity at once."""
+    posed = finite(rotation)
+    flat = np.where(posed[:, None], flat, np.nan)
+    rows: dict[tuple[float, ...], list[int]] = {}
+    for i, turn in enumerate(rotation):
+        find = find.turned(turn) if posed[i] and not rows else find
+        rows.setdefault(find.direction(turn), []).append(i)
+    parts, statuses = [], []
+    for some in rows.values():
+        now = find.turned(rotation[some[0]])
+        found, status = now(now.untared(flat[some]))
+        parts.append(found)
+        statuses.append(status)
+    back = np.argsort(np.concatenate(list(rows.values())))
+    whole: list[Any] = [part[back] for part in Candidates.joined(parts)]
+    return Candidates(*whole), np.concatenate(statuses)[back]

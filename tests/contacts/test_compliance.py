@@ -62,8 +62,7 @@ def test_true_contacts_are_in_the_regions(gamma_map, sigma, using):
         assert (found.status == vb.Status.UNIQUE).mean() > 0.95
 
 
-@pytest.mark.parametrize("using", ["Fx MB MD", "Fx FT MB MD"])
-def test_friction_and_an_uncertain_base_are_found_together(gamma_map, sigma, using):
+def test_friction_and_an_uncertain_base_are_found_together(gamma_map, sigma):
     whisker, rng = gamma_map.whisker, np.random.default_rng(9)
     unit, truth, wrenches = whisker.base_bending_stiffness / whisker.length**2, [], []
     for ratio in rng.normal(size=60) * 0.2:
@@ -77,6 +76,7 @@ def test_friction_and_an_uncertain_base_are_found_together(gamma_map, sigma, usi
         truth.append(bent.contact_point)
         wrenches.append(np.concatenate([bent.force, bent.moment]))
     wrenches = np.array(wrenches) + rng.normal(size=(60, 6)) * np.sqrt(np.diag(NOISE))
+    using = "Fx FT MB MD"
     signals, both = signals_of(wrenches, using), {"friction": 0.2, "compliance_sigma": sigma}
     found = gamma_map.estimate(signals, using, NOISE, **both)
     assert (distance(found, np.array(truth)) < 7.81).mean() > 0.88

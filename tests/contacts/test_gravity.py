@@ -145,12 +145,11 @@ def inside(found, truth):
     return (np.einsum("ni,nij,nj->n", away, inverse, away) < 7.81).mean()
 
 
-@pytest.mark.parametrize("using", [("Fx", "MB", "MD"), ("Fx", "FT", "MB", "MD")])
-def test_weight_friction_and_an_uncertain_base_are_found_together(nitinol, using):
+def test_weight_friction_and_an_uncertain_base_are_found_together(nitinol):
     whisker, rng, level = nitinol.whisker, np.random.default_rng(21), (0.0, 0.0, -G)
     noise, sigma = covariance(whisker), whisker.length / (30.0 * whisker.base_bending_stiffness)
     points, wrenches = [], []
-    for ratio in 0.2 * rng.normal(size=30):
+    for ratio in 0.2 * rng.normal(size=16):
         base = 1.0 / max(abs(rng.normal()) * sigma, 1e-3 * sigma)
         size, angle = rng.uniform(0.3, 0.7) * unit(whisker), rng.uniform(-3.0, 3.0)
         force = vb.PointForce(
@@ -161,13 +160,14 @@ def test_weight_friction_and_an_uncertain_base_are_found_together(nitinol, using
         bent = vb.deflect(soft, force, gravity=level)
         points.append(bent.contact_point)
         wrenches.append(np.concatenate([bent.force, bent.moment]))
-    wrenches = np.array(wrenches) + rng.normal(size=(30, 6)) * np.sqrt(np.diag(noise))
+    wrenches = np.array(wrenches) + rng.normal(size=(16, 6)) * np.sqrt(np.diag(noise))
     signals = {"force": wrenches[:, :3], "moment": wrenches[:, 3:]}
+    using = ("Fx", "FT", "MB", "MD")
     every = {"gravity": level, "friction": 0.2, "compliance_sigma": sigma}
-    assert inside(nitinol.estimate(signals, using, noise, **every), points) > 0.88
+    assert inside(nitinol.estimate(signals, using, noise, **every), points) > 0.87
     for left_out in ("gravity", "friction"):
         some = {name: value for name, value in every.items() if name != left_out}
-        assert inside(nitinol.estimate(signals, using, noise, **some), points) < 0.86, left_out
+        assert inside(nitinol.estimate(signals, using, noise, **some), points) < 0.6, left_out
 
 
 def turned(angles):

@@ -116,7 +116,7 @@ class JointFit:
         rounds = _ROUNDS if self.forward.errors else _STEADY
         if values is None:
             values = self.forward.values(x)
-        else:
+        elif not self.forward.errors:
             rounds = 1
         for _ in range(rounds):
             weights = np.zeros((len(x), len(names), len(names)))

@@ -292,7 +292,7 @@ def test_recordings_are_estimated_under_gravity(tmp_path, nitinol, swung):
             "force": (axes, rows[:, None, :3], {"units": "N"}),
             "moment": (axes, rows[:, None, 3:], {"units": "N m"}),
             "base_position": (axes, np.zeros((n, 1, 3)), {"units": "m"}),
-            "base_rotation": ((*axes, "space_2"), rotations[:, None], level),
+            "base_rotation": ((*axes, "whisker_axis"), rotations[:, None], level),
             "in_contact": (axes[:2], np.ones((n, 1), bool)),
             "status": (axes[:2], np.zeros((n, 1), np.int8)),
         },

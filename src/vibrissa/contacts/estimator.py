@@ -353,14 +353,30 @@ class Estimator:
         return self._joint is not None and self._joint.forward.weighted
 
     def sagged(self) -> Estimator:
-        """Return an estimator of a whisker without weight that has the sagged shape at rest."""
+        """Return an estimator of a whisker without weight that has the sagged shape at rest.
+
+        Returns
+        -------
+        Estimator
+            The same signals, noise and prior.
+        """
         assert self._joint is not None
         return self._again(self._joint.sagged)
 
     def of_sagged(self, measurement: Measurement, sagged: Estimator) -> Measurement:
         """Return what the sagged whisker without weight would measure of the same contact point.
 
-        NaN where there is none. What noise adds to more than three signals stays as it is.
+        Parameters
+        ----------
+        measurement : Measurement
+            Measurement of this estimator.
+        sagged : Estimator
+            Estimator of the sagged whisker.
+
+        Returns
+        -------
+        Measurement
+            The same with what noise adds to more than three signals; NaN where there is no contact.
         """
         assert self._joint is not None
         if self.nothing_in(measurement) is not None:

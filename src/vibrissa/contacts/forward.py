@@ -51,7 +51,7 @@ _RIGID = 1e9
 _AHEAD = 1e-5
 # How far apart directions of gravity are that a turning whisker is solved for, and those whose
 # resting shapes propose contacts, rad.
-_DIRECTIONS, _SHAPES = 1e-3, 0.2
+_DIRECTIONS, _SHAPES = 2e-4, 0.2
 # Rows of the numbers of a solved rod with weight: force, contact point, moment of the weight.
 _CAUSED = [0, 1, 2, 3, 4, 5, 9, 10, 11]
 
@@ -127,7 +127,7 @@ class Gravity:
         Returns
         -------
         Gravity
-            Gravity in the nearest of directions a twentieth of a degree apart, so that those of a
+            Gravity in the nearest of directions a hundredth of a degree apart, so that those of a
             moving whisker are not all different; without another tare it is of this pose.
         """
         x, y, z = _rounded(rotation.T @ self.acceleration, _DIRECTIONS).tolist()

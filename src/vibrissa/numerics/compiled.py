@@ -1,9 +1,9 @@
 """How kernels are compiled: cached on disk, errors as NumPy has them, contraction allowed.
 
 Compiling takes seconds, once for a given installation (:mod:`~vibrissa.numerics.kernel_cache`).
-Numba optimises every function by itself, and again within each function that calls it, and so on
-up to what Python calls. Here that alone is optimised, with all that it consists of: functions that
-kernels call are only translated (:class:`_Part`).
+Numba links and optimises every function by itself, and again within each function that calls it,
+and so on up to what Python calls. Here that alone is linked and optimised, with all that it
+consists of: functions that kernels call are only translated (:class:`_Part`).
 """
 
 from __future__ import annotations
@@ -15,9 +15,12 @@ from typing import Any, ParamSpec, TypeVar, cast
 import numba
 from llvmlite.binding import parse_assembly
 from numba import types
+from numba.core import config, ir
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler
+from numba.core.compiler import Compiler, Flags
+from numba.core.compiler_machinery import AnalysisPass, register_pass
 from numba.core.registry import CPUDispatcher
+from numba.core.typed_passes import NopythonTypeInference
 
 from vibrissa.numerics.kernel_cache import PackageCache
 
@@ -26,35 +29,149 @@ R = TypeVar("R")
 
 # Reassociation stays off: results must not depend on how the compiler orders a sum.
 _FASTMATH = {"contract", "nsz", "arcp"}
-_STRICT: dict[str, Any] = {
+_OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "nogil": True,
     "no_cfunc_wrapper": True,  # nobody calls a kernel from C
+    "fastmath": _FASTMATH,
 }
-_OPTIONS = _STRICT | {"fastmath": _FASTMATH}
+
+
+#: Number of functions from which on a kernel is mostly bookkeeping around specialised ones.
+_LARGE = 40
+#: Expressions whose value refers to arrays that are there already.
+_VIEWS = {"getitem", "static_getitem", "getattr", "build_tuple", "cast", "exhaust_iter", "phi"}
 
 
 class _Part(JITCodeLibrary):
-    """Code that is neither optimised nor run by itself, but in what it is linked into."""
+    """Code that is not linked, optimised or run by itself, but in what it is a part of."""
 
-    def _optimize_final_module(self) -> None:
-        pass
+    def _optimize_functions(self, module: Any) -> None:
+        """Simplify each function for a first time, quickly."""
+        numba_config: Any = config
+        level, numba_config.OPT = numba_config.OPT, 1
+        try:
+            super()._optimize_functions(module)  # type: ignore[no-untyped-call]
+        finally:
+            numba_config.OPT = level
 
-    def _finalize_final_module(self) -> None:
-        self._finalize_dynamic_globals()  # type: ignore[no-untyped-call]
+    def finalize(self) -> None:
+        """Keep the code for linking; numba looks for its environment in what can be run."""
         for variable in self._final_module.global_variables:
-            if "NumbaEnv" in variable.name:  # numba looks for this in what can be run
+            if "NumbaEnv" in variable.name:
                 self._codegen._add_module(parse_assembly(str(variable)))
         self._codegen._engine.finalize_object()
         self._finalized = True
 
 
-class _PartCompiler(Compiler):
+class _Whole(JITCodeLibrary):
+    """Code that is linked with all its parts, and optimised with them."""
+
+    def finalize(self) -> None:
+        """Link each part once, not once more for each that calls it."""
+        found: dict[JITCodeLibrary, None] = {}
+        _visit(self._linking_libraries, found)
+        # Callers first: LLVM leaves out what nothing that is linked already refers to.
+        self._linking_libraries = list(reversed(found))
+        super().finalize()  # type: ignore[no-untyped-call]
+
+
+class _Compact(_Whole):
+    """Such code, for size where it is large, but for what is specialised: half of LLVM's time."""
+
+    def _optimize_final_module(self) -> None:
+        fast = {
+            function.name
+            for library in self._linking_libraries
+            if not isinstance(library, _Part)
+            for function in library._get_module_for_linking().functions
+        }
+        own = [f for f in self._final_module.functions if not (f.is_declaration or f.name in fast)]
+        if len(own) > _LARGE:
+            for function in own:
+                function.add_function_attribute("optsize")
+        super()._optimize_final_module()  # type: ignore[no-untyped-call]
+
+
+def _visit(libraries: list[JITCodeLibrary], found: dict[JITCodeLibrary, None]) -> None:
+    for library in libraries:
+        if library not in found:
+            if isinstance(library, _Part):
+                _visit(library._linking_libraries, found)
+            found[library] = None
+
+
+@register_pass(mutates_CFG=False, analysis_only=True)
+class _Borrowing(AnalysisPass):
+    """References are not counted in a function that only uses arrays of its caller.
+
+    An array that something else makes or returns, or the function itself returns, is counted.
+    """
+
+    _name = "borrowing"
+
+    def __init__(self) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+
+    def run_pass(self, state: Any) -> bool:
+        """Compile without counting where nothing is there to count."""
+        counted = state.targetctx.data_model_manager
+        made = [state.return_type]
+        for block in state.func_ir.blocks.values():
+            for statement in block.find_insts(ir.Assign):
+                value = statement.value
+                if isinstance(value, ir.Expr) and value.op not in _VIEWS:
+                    made.append(state.typemap[statement.target.name])
+        if not any(counted[kind].contains_nrt_meminfo() for kind in made):
+            state.targetctx = state.targetctx.subtarget(enable_nrt=False)
+        return False
+
+
+class _Flags(Flags):
+    """Numba's options, which it compares at every call that it compiles; here quickly."""
+
+    __slots__ = ()
+
+    def __hash__(self) -> int:
+        return _HASH
+
+    def values(self) -> dict[str, Any]:
+        """Give all options by name."""
+        return {**_DEFAULTS, **self._values, **_FORM}
+
+
+_DEFAULTS = {name: option.default for name, option in Flags.options.items()}
+#: Options that make no difference to what is called: that is compiled once for all of them.
+_FORM = {"forceinline": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_HASH = hash(Flags())  # of the names of all options alone
+
+
+class _WholeCompiler(Compiler):
     """Numba's compiler, with such a library."""
 
+    library_type: type[JITCodeLibrary] = _Whole
+
     def __init__(self, typing: Any, target: Any, library: Any, *rest: Any) -> None:
-        library = _Part(target.codegen(), "part")  # type: ignore[no-untyped-call]
-        super().__init__(typing, target, library, *rest)  # type: ignore[no-untyped-call]
+        library = self.library_type(target.codegen(), "kernel")
+        library.enable_object_caching()
+        args, returned, flags, types_of_locals = rest
+        flags = _Flags(flags)  # type: ignore[no-untyped-call]
+        super().__init__(typing, target, library, args, returned, flags, types_of_locals)  # type: ignore[no-untyped-call]
+
+    def define_pipelines(self) -> list[Any]:
+        """Decide about references when types are known."""
+        (manager,) = super().define_pipelines()  # type: ignore[no-untyped-call]
+        manager.add_pass_after(_Borrowing, NopythonTypeInference)
+        manager.finalize()
+        return [manager]
+
+
+class _CompactCompiler(_WholeCompiler):
+    library_type = _Compact
+
+
+class _PartCompiler(_WholeCompiler):
+    library_type = _Part
 
 
 class _Kernel(CPUDispatcher):
@@ -74,13 +191,17 @@ class _Kernel(CPUDispatcher):
 class _Inlined(CPUDispatcher):
     """What only kernels can call: wrappers for Python would be a third of all compiling."""
 
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """Compile it once for all constants: where it is inlined, LLVM sees them."""
+        return super().get_call_template(tuple(map(types.unliteral, args)), kws)
+
     def __call__(self, *args: object, **options: object) -> object:
         raise TypeError(f"{self.py_func.__name__} can be called by kernels only")
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function that Python calls; cached on disk, releases the GIL."""
-    compiled: Any = specialised(function)
+    compiled = _cached(function, pipeline_class=_CompactCompiler)
     compiled.__class__ = _Kernel
     compiled.part = _part(function)
     return cast("Callable[P, R]", compiled)
@@ -88,10 +209,7 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
 
 def specialised(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a kernel anew for each constant that others call it with, so that it is faster."""
-    compiled = numba.njit(**_OPTIONS)(function)
-    with suppress(RuntimeError):  # numba finds no folder that it may write to
-        compiled._cache = PackageCache(function)
-    return cast("Callable[P, R]", compiled)
+    return cast("Callable[P, R]", _cached(function))
 
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
@@ -99,27 +217,29 @@ def inlined(function: Callable[P, R]) -> Callable[P, R]:
     return cast("Callable[P, R]", _part(function, forceinline=True))
 
 
-def _part(function: Callable[P, R], **options: bool) -> Any:
-    compiled: Any = numba.njit(
-        **_OPTIONS | {"no_cpython_wrapper": True} | options, pipeline_class=_PartCompiler
-    )(function)
-    compiled.__class__ = _Inlined
-    return compiled
-
-
 def rigorous(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function whose rounding is that of IEEE 754, operation by operation."""
-    compiled = numba.njit(**_STRICT)(function)
-    with suppress(RuntimeError):
-        compiled._cache = PackageCache(function)
-    return cast("Callable[P, R]", compiled)
+    return cast("Callable[P, R]", _cached(function, fastmath=False))
 
 
 def inlined_rigorous(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a small function into its callers as :func:`rigorous` ones are compiled."""
-    compiled: Any = numba.njit(**_STRICT | {"no_cpython_wrapper": True})(function)
+    return cast("Callable[P, R]", _part(function, fastmath=False))
+
+
+def _cached(function: Any, **options: Any) -> Any:
+    compiled: Any = numba.njit(**_OPTIONS | {"pipeline_class": _WholeCompiler} | options)(function)
+    with suppress(RuntimeError):  # numba finds no folder that it may write to
+        compiled._cache = PackageCache(function)
+    return compiled
+
+
+def _part(function: Any, **options: Any) -> Any:
+    compiled: Any = numba.njit(
+        **_OPTIONS | {"no_cpython_wrapper": True, "pipeline_class": _PartCompiler} | options
+    )(function)
     compiled.__class__ = _Inlined
-    return cast("Callable[P, R]", compiled)
+    return compiled
 
 
 @inlined

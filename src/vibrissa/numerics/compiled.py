@@ -15,7 +15,7 @@ from typing import Any, ParamSpec, TypeVar, cast
 import numba
 from llvmlite.binding import parse_assembly
 from numba import types
-from numba.core import config, ir
+from numba.core import ir
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, Flags
 from numba.core.compiler_machinery import AnalysisPass, register_pass
@@ -45,15 +45,6 @@ _VIEWS = {"getitem", "static_getitem", "getattr", "build_tuple", "cast", "exhaus
 
 class _Part(JITCodeLibrary):
     """Code that is not linked, optimised or run by itself, but in what it is a part of."""
-
-    def _optimize_functions(self, module: Any) -> None:
-        """Simplify each function for a first time, quickly."""
-        numba_config: Any = config
-        level, numba_config.OPT = numba_config.OPT, 1
-        try:
-            super()._optimize_functions(module)  # type: ignore[no-untyped-call]
-        finally:
-            numba_config.OPT = level
 
     def finalize(self) -> None:
         """Keep the code for linking; numba looks for its environment in what can be run."""

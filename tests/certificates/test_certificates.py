@@ -20,8 +20,9 @@ from vibrissa.certificates import (
     smallest_cone,
 )
 from vibrissa.certificates.certificate import prepared
+from vibrissa.certificates.checker import covers
 from vibrissa.certificates.equations import enclosed
-from vibrissa.certificates.search import bounds, cover, covers
+from vibrissa.certificates.search import bounds, cover
 from vibrissa.cli.app import app
 from vibrissa.identifiability import verdict_table
 from vibrissa.io import write_netcdf
@@ -143,9 +144,9 @@ def test_an_independent_check_of_a_curved_whisker(curved, tmp_path, monkeypatch)
     boxes = certificate.parts["rest"].certified
     larger = boxes.copy()
     larger[5, 1] = larger[5, 1, 0] - 1, larger[5, 1, 1] // 2  # its parent
-    assert checker.covers(boxes)
-    assert not checker.covers(larger)
-    assert not checker.covers(np.delete(boxes, 5, axis=0))
+    assert covers(boxes)
+    assert not covers(larger)
+    assert not covers(np.delete(boxes, 5, axis=0))
     data = certificate.to_dataset()
     data.attrs["cone"] *= 0.99  # contacts that are left out are not within this one
     write_netcdf(path, data)
@@ -164,9 +165,9 @@ def test_verdicts_name_their_evidence(theorem):
     _, _, certificate = theorem
     contact_map = straight(15.0)
     asked = {"regions": ["all"], "samples": 64, "resolution": False}
-    triplets = ["Fx MB MD", "Mx MB MD"]
+    triplets = ["Fx MB MD", "Mx MB MD", "Fx FD MB"]
     found = vb.uniqueness(contact_map, triplets, certificate=certificate, **asked)
-    assert found.evidence.values[:, 0].tolist() == ["proved", "witness"]
+    assert found.evidence.values[:, 0].tolist() == ["proved", "witness", "proved"]
     assert found.attrs["certificate_possible"]
     assert "unique (proved)" in verdict_table(found)
     without = vb.uniqueness(contact_map, triplets[:1], **asked)
@@ -207,6 +208,30 @@ def test_witnesses_are_proved_and_other_pairs_are_not(curved):
     assert not prove_witness(straight(1.0), "Fx MB MD", s, force).proved
 
 
+@pytest.mark.parametrize(
+    ("ratio", "triplet", "turn"),
+    [
+        (15.0, "FT MB MD", 0.3),
+        (15.0, "Mx MB MD", 0.3),
+        (15.0, "Fx FT MB", 2.0),
+        (1.0, "Fx MB MD", 0),
+    ],
+)
+def test_witnesses_in_one_plane_are_proved(ratio, triplet, turn):
+    """Signals that do not fix a contact where a straight whisker is its own mirror image."""
+    contact_map = straight(ratio)
+    found = vb.uniqueness(contact_map, [triplet], ["all"], samples=64, resolution=False)
+    pair = found.isel(triplet=0, region=0, witness=0)
+    s, force = pair.witness_arc_length.values, pair.witness_contact_force.values
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    whole = prove_witness(contact_map, triplet, s, force @ rotation.T)
+    assert whole.proved, whole.doubt
+    assert whole.separation > 0.01
+    # Turned against each other they have other directions.
+    if "MD" in triplet:
+        assert not prove_witness(contact_map, triplet, s, [force[0], -force[1]]).proved
+
+
 def test_boxes_cover_or_leave_a_hole():
     rng = np.random.default_rng(0)
     boxes = [np.zeros((3, 2), dtype=np.int64)]
@@ -219,7 +244,7 @@ def test_boxes_cover_or_leave_a_hole():
             boxes.append(child)
     everything = np.stack(boxes)
     assert covers(everything)
-    assert covers(np.concatenate([everything, everything[:1]]))
+    assert not covers(np.concatenate([everything, everything[:1]]))
     assert not any(covers(np.delete(everything, i, axis=0)) for i in range(len(boxes)))
 
 

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
+from vibrissa.certificates.checker import covers
 from vibrissa.certificates.conditions import (
     PLANAR,
     SPATIAL,
@@ -38,7 +39,7 @@ from vibrissa.certificates.conditions import (
 from vibrissa.certificates.domain import Bounds, bounds_of, is_planar, room_within
 from vibrissa.certificates.equations import ExactRod, exact_rod
 from vibrissa.certificates.grid import doubt
-from vibrissa.certificates.search import bounds, cover, covers, volume
+from vibrissa.certificates.search import bounds, cover, volume
 from vibrissa.io import read_dataset, write_netcdf
 from vibrissa.numerics import Array, IntArray, share_out
 from vibrissa.signals import CONE
@@ -440,21 +441,7 @@ def _dims(name: str, array: Array) -> tuple[str, ...]:
 
 
 def prepared(contact_map: ContactMap, cone: float = CONE) -> Certificate:
-    """Set up a certificate, with nothing decided yet.
-
-    Parameters
-    ----------
-    contact_map : ContactMap
-        Map of the whisker.
-    cone : float
-        Half angle about the resting whisker within which contacts are left out, rad; a straight
-        whisker needs none.
-
-    Returns
-    -------
-    Certificate
-        The certificate to be pursued.
-    """
+    """Set up a certificate, with nothing decided yet."""
     whisker = contact_map.whisker
     straight = bool(whisker.is_straight)
     if straight:

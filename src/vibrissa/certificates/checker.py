@@ -249,27 +249,38 @@ def _domains_fit(data: xr.Dataset) -> bool:
 
 def covers(boxes: NDArray[np.int64]) -> bool:
     """Whether boxes, rows of (level, index) by unknown, fill the unit cube once: by halving it."""
-    unknowns, levels = boxes.shape[1], boxes[..., 0].sum(axis=1).tolist()
+    levels = boxes[..., 0].sum(axis=1).tolist()
     most = max(levels, default=0)
     if sum(1 << (most - level) for level in levels) != 1 << most:
         return False
-    cells = [(np.zeros(unknowns, int), np.zeros(unknowns, int), np.arange(len(boxes)))]
-    while cells:
-        level, index, rows = cells.pop()
-        if not len(rows):
+    number, unknowns = boxes.shape[:2]
+    level, index = np.zeros((2, 1, unknowns), dtype=np.int64)
+    rows, cell = np.arange(number), np.zeros(number, dtype=np.int64)
+    while len(level):
+        finer = boxes[rows, :, 0] > level[cell]
+        filled = np.zeros(len(level), dtype=bool)
+        filled[cell[~finer.any(axis=1)]] = True
+        kept = ~filled[cell]
+        rows, finer, cell = rows[kept], finer[kept], cell[kept]
+        split = np.flatnonzero(~filled)
+        if len(np.unique(cell)) < len(split):
             return False
-        finer = boxes[rows, :, 0] > level
-        if (~finer.any(axis=1)).any():
-            continue
-        axis = int(np.argmax(finer.sum(axis=0)))
+        renumbered = np.cumsum(~filled) - 1
+        cell, level, index = renumbered[cell], level[split], index[split]
+        wanted = np.stack([np.bincount(cell, one, len(split)) for one in finer.T], axis=1)
+        axis = wanted.argmax(axis=1)
+        at = np.arange(len(split)), axis
+        level[at] += 1
+        index[at] *= 2
+        own = boxes[rows, axis[cell]]
+        shift = own[:, 0] - level[at][cell]
+        parts = []
         for half in (0, 1):
-            lower, at = level.copy(), index.copy()
-            lower[axis] += 1
-            at[axis] = 2 * at[axis] + half
-            own = boxes[rows, axis]
-            shift = own[:, 0] - lower[axis]
-            inside = np.where(shift >= 0, own[:, 1] >> np.maximum(shift, 0) == at[axis], True)
-            cells.append((lower, at, rows[inside]))
+            inside = (shift < 0) | (own[:, 1] >> np.maximum(shift, 0) == index[at][cell] + half)
+            parts.append((rows[inside], 2 * cell[inside] + half))
+        rows, cell = (np.concatenate(one) for one in zip(*parts, strict=True))
+        level, index = level.repeat(2, axis=0), index.repeat(2, axis=0)
+        index[np.arange(1, len(index), 2), axis] += 1
     return True
 
 

@@ -99,20 +99,7 @@ def room_within(rod: ExactRod, cone: float) -> float:
 
 
 def bounds_of(contact_map: ContactMap, room: float) -> Bounds:
-    """Fit the bounds to a whisker.
-
-    Parameters
-    ----------
-    contact_map : ContactMap
-        Map of the whisker.
-    room : float
-        Share of the arc length by which the contacts that are left out may be deflected.
-
-    Returns
-    -------
-    Bounds
-        Bounds on the force.
-    """
+    """Fit the bounds to a whisker."""
     whisker, chart = contact_map.whisker, contact_map.chart
     alpha = 1.0 - whisker.tip_radius / whisker.base_radius
     x = 0.5 - 0.5 * np.cos(np.pi * np.arange(_STATIONS) / (_STATIONS - 1))

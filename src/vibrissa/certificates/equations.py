@@ -215,23 +215,7 @@ def enclosed(value: Fraction, slack: Fraction = Fraction(0)) -> tuple[float, flo
 
 
 def exact_rod(whisker: Whisker) -> ExactRod:
-    """Polynomials of a whisker, as they are stored, in units of its length and base radius.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        Whisker on a rigid base.
-
-    Returns
-    -------
-    ExactRod
-        Polynomials with exact coefficients.
-
-    Raises
-    ------
-    ValueError
-        If the base is compliant.
-    """
+    """Polynomials of a whisker, as they are stored, in units of its length and base radius."""
     if whisker.base_stiffness is not None:
         raise ValueError("certificates are for whiskers on a rigid base; this one's is compliant")
     length, radius = Fraction(whisker.length), Fraction(whisker.base_radius)

@@ -72,23 +72,9 @@ def cover(
 ) -> Cover:
     """Halve boxes until all conditions are certainly positive on each.
 
-    Parameters
-    ----------
-    evaluate : callable
-        Function of boxes (n, unknowns, 2) that returns conditions (n, c, unknowns + 3), each a
-        centre, the share of each unknown and of their products in its range, and the remainder,
-        and the relative widths (n, unknowns) of what they are computed from.
-    start : (n, unknowns, 2) array
-        Boxes to begin with.
-    most : int
-        Largest number of boxes that are evaluated.
-    free : (unknowns,) array of bool, optional
-        Unknowns that are not fixed; by default all.
-
-    Returns
-    -------
-    Cover
-        Boxes, certified or not.
+    ``evaluate`` returns conditions (n, c, unknowns + 3), each a centre, the share of each unknown
+    and of their products in its range, and the remainder, and the relative widths (n, unknowns) of
+    what they are computed from. ``most`` boxes are evaluated, about; ``free`` unknowns not fixed.
     """
     left, none = start, start[:0]
     free = np.ones(start.shape[1], dtype=bool) if free is None else free
@@ -178,36 +164,3 @@ def _halved(boxes: IntArray, times: IntArray) -> IntArray:
         children[..., 0] += pattern
         parts.append(children)
     return np.concatenate(parts)
-
-
-def covers(boxes: IntArray) -> bool:
-    """Whether boxes, rows of (level, index) by unknown, fill the unit cube: by halving it."""
-    number, unknowns = boxes.shape[:2]
-    level, index = np.zeros((2, 1, unknowns), dtype=np.int64)
-    rows, cell = np.arange(number), np.zeros(number, dtype=np.int64)
-    while len(level):
-        finer = boxes[rows, :, 0] > level[cell]
-        filled = np.zeros(len(level), dtype=bool)
-        filled[cell[~finer.any(axis=1)]] = True
-        kept = ~filled[cell]
-        rows, finer, cell = rows[kept], finer[kept], cell[kept]
-        split = np.flatnonzero(~filled)
-        if len(np.unique(cell)) < len(split):
-            return False
-        renumbered = np.cumsum(~filled) - 1
-        cell, level, index = renumbered[cell], level[split], index[split]
-        wanted = np.stack([np.bincount(cell, one, len(split)) for one in finer.T], axis=1)
-        axis = wanted.argmax(axis=1)
-        at = np.arange(len(split)), axis
-        level[at] += 1
-        index[at] *= 2
-        own = boxes[rows, axis[cell]]
-        shift = own[:, 0] - level[at][cell]
-        parts = []
-        for half in (0, 1):
-            inside = (shift < 0) | (own[:, 1] >> np.maximum(shift, 0) == index[at][cell] + half)
-            parts.append((rows[inside], 2 * cell[inside] + half))
-        rows, cell = (np.concatenate(one) for one in zip(*parts, strict=True))
-        level, index = level.repeat(2, axis=0), index.repeat(2, axis=0)
-        index[np.arange(1, len(index), 2), axis] += 1
-    return True

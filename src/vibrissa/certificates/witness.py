@@ -10,6 +10,10 @@ G compares F_x and M_x by their differences, magnitudes by their squares, and di
 product of one with the other turned by 90°, and the sign of their scalar product. Enclosures are
 those of the certificates, so that the proof is about the continuous rod. Both contacts are stable
 if det ∂p/∂ξ is positive at every smaller force of the same s and φ.
+
+In the plane of a whisker M_x is zero and directions are along or against another: equations that
+hold by symmetry are left out, and as many unknowns (φ first, which stays 0 or π). A straight
+whisker's contacts are turned into one plane; without a direction, any turned contact is a witness.
 """
 
 from __future__ import annotations
@@ -21,7 +25,7 @@ import numpy as np
 
 from vibrissa.certificates.certificate import enclosed_on
 from vibrissa.certificates.conditions import DEGREES, Conditions, spatial_point_conditions
-from vibrissa.certificates.domain import Bounds
+from vibrissa.certificates.domain import Bounds, is_planar
 from vibrissa.certificates.equations import ExactRod, exact_rod
 from vibrissa.certificates.search import bounds, cover
 from vibrissa.numerics import Array, IntArray
@@ -33,6 +37,8 @@ if TYPE_CHECKING:
 _TOLERANCE = 1e-12
 # Newton steps that bring the second contact to the signals of the first; boxes that are tried.
 _STEPS, _TRIALS = 6, 8
+# Directions over π this near a whole number are in the plane.
+_FLAT = 1e-6
 # What rounding adds to a sum of a few products of centres and radii, over its size.
 _LOST = 1e-14
 # Boxes in which the way from rest may be divided.
@@ -122,24 +128,43 @@ def prove_witness(
     across = np.asarray(force, dtype=np.float64) / d.force
     level = np.hypot(*across.T) / (1.0 / s - alpha) ** 2
     first, second = np.stack([s, np.arctan2(across[:, 1], across[:, 0]), level], axis=1)
-    one = scene.at(np.stack([first, first], axis=-1))
+    if whisker.is_straight:
+        turn = np.array([0.0, first[1], 0.0])
+        first, second = first - turn, second - turn
+        if not {"FD", "MD"} & set(names):
+            second = first + np.array([0.0, np.pi, 0.0])
+    sides = np.stack([first[1], second[1]]) / np.pi
+    flat = is_planar(whisker) and bool((np.abs(sides - np.round(sides)) < _FLAT).all())
+    wanted = names
+    if flat:
+        first[1], second[1] = np.pi * (np.round(sides) % 2.0)
+        wanted = [name for name in names if name in ("Fx", "FT", "MB")]
+        if whisker.is_straight and "MB" in names and not rod.coefficients[:, 3, 1:].any():
+            wanted = [name for name in wanted if name != "Fx"]  # -M_B²/2EI of a cylinder
+        if whisker.is_straight and not {"FD", "MD"} & set(names):
+            wanted = []  # equal as the whisker is its own image
+    start = _around(first, np.zeros(3))
+    one, two = scene.at(start), scene.at(_around(second, np.zeros(3)))
     if not np.isfinite(one.centre).all():
         return Witness(False, np.inf, 0.0, "the first contact could not be enclosed")
-    for _ in range(_STEPS):
-        gap, slope = _equations(names, one, scene.at(np.stack([second, second], axis=-1)))
-        move = np.linalg.lstsq(slope.centre, gap.centre, rcond=1e-10)[0]
+    free = np.arange(3)
+    if flat and len(wanted) < 3:
+        strong = np.abs(_equations(wanted, one, two)[1].centre[:, ::2] * second[::2]).sum(axis=0)
+        free = np.sort(np.array([0, 2])[np.argsort(-strong)][: len(wanted)])
+    for _ in range(_STEPS if wanted else 0):
+        gap, slope = _equations(wanted, one, scene.at(_around(second, np.zeros(3))))
+        move = np.linalg.lstsq(slope.centre[:, free], gap.centre, rcond=1e-10)[0]
         if not np.isfinite(move).all():
             return Witness(False, np.inf, 0.0, "the second contact could not be enclosed")
-        second = second - move
-    two = scene.at(np.stack([second, second], axis=-1))
-    box = _unique_box(scene, names, one, two, second)
+        second[free] -= move
+    box = _unique_box(scene, (names, wanted), free, one, second)
     if box is None:
         doubt = "no box around the second contact passes Krawczyk's test"
         return Witness(False, np.inf, 0.0, doubt)
     apart = one.at(slice(6, 9)) + -scene.at(box).at(slice(6, 9))  # type: ignore[arg-type]
     least = float(np.linalg.norm(np.maximum(np.abs(apart.centre) - apart.radius, 0.0)) * 0.999999)
     doubt = "" if least > 0.0 else "the two contacts may be the same"
-    for contact in (np.stack([first, first], axis=-1), box):
+    for contact in (start, box):
         if not scene.stable(contact):
             doubt = doubt or "that both contacts are stable could not be shown"
     return Witness(not doubt, float(np.ptp(box[0])), least, doubt)
@@ -191,35 +216,51 @@ def _equations(names: list[str], one: _Range, two: _Range) -> tuple[_Range, _Ran
             a, b = a + a, b + b
         gaps.append(value)
         slopes.append(a * slope.at(i) + b * slope.at(j))
-    parts = zip(*gaps, strict=True), zip(*slopes, strict=True)
-    gap, by = (_Range(*(np.array(part) for part in both)) for both in parts)
+    sizes = (len(names),), (len(names), 3)
+    gap, by = (
+        _Range(*(np.reshape([part[i] for part in parts], size) for i in range(2)))
+        for parts, size in zip((gaps, slopes), sizes, strict=True)
+    )
     return gap, by
 
 
+def _around(contact: Array, half: Array) -> Array:
+    """Box (3, 2) around a contact; φ = π is a number near the stored one."""
+    half = np.maximum(half, [0.0, 1e-15 * abs(contact[1]), 0.0])
+    return np.stack([contact - half, contact + half], axis=-1)
+
+
 def _unique_box(
-    scene: _Scene, names: list[str], one: _Range, two: _Range, second: Array
+    scene: _Scene, names: tuple[list[str], list[str]], free: IntArray, one: _Range, second: Array
 ) -> Array | None:
-    """Box (3, 2) that holds exactly one contact with the signals of the first; None if unproved."""
-    gap, slope = _equations(names, one, two)
-    if np.linalg.matrix_rank(slope.centre) < len(names):
+    """Box (3, 2) that holds exactly one contact with the signals of the first; None if unproved.
+
+    Of all signals, those that are compared are named, and the unknowns that may change.
+    """
+    everything, wanted = names
+    gap, slope = _equations(wanted, one, scene.at(_around(second, np.zeros(3))))
+    by = slope.centre[:, free]
+    if np.linalg.matrix_rank(by) < len(wanted):
         return None
-    inverse = np.linalg.inv(slope.centre)
+    inverse = np.linalg.inv(by)
     off = np.abs(inverse) @ (np.abs(gap.centre) + gap.radius) * (1.0 + 1e-12)
-    half = 2.0 * off + 1e-15 * np.abs(second)
+    half, near = np.zeros(3), np.abs(second[free])
+    half[free] = 2.0 * off + 1e-15 * near
     for _ in range(_TRIALS):
-        box = np.stack([second - half, second + half], axis=-1)
+        box = _around(second, half)
         over = scene.at(box)
-        _, slope = _equations(names, one, over)
-        defect = np.abs(np.eye(3) - inverse @ slope.centre)
-        rounded = 1e-13 * np.abs(inverse) @ np.abs(slope.centre)
-        spread = np.abs(inverse) @ slope.radius + defect + rounded
-        need = (off + spread @ half) * (1.0 + 1e-9)
+        slope = _equations(wanted, one, over)[1]
+        centre, radius = slope.centre[:, free], slope.radius[:, free]
+        defect = np.abs(np.eye(len(wanted)) - inverse @ centre)
+        rounded = 1e-13 * np.abs(inverse) @ np.abs(centre)
+        spread = np.abs(inverse) @ radius + defect + rounded
+        need = (off + spread @ half[free]) * (1.0 + 1e-9)
         # The box's ends are rounded, by less than this.
-        if (need < half - 1e-15 * np.abs(second)).all():
-            pairs = [_PAIRS[name] for name in names if name in ("FD", "MD")]
+        if (need < half[free] - 1e-15 * near).all():
+            pairs = [_PAIRS[name] for name in everything if name in ("FD", "MD")]
             along = [one.at(i) * over.at(i) + one.at(j) * over.at(j) for i, j in pairs]
             return box if all(a.centre > a.radius for a in along) else None
-        half = 1.5 * np.maximum(need, half)
+        half[free] = 1.5 * np.maximum(need, half[free])
         if not np.isfinite(half).all():
             return None
     return None

@@ -330,7 +330,7 @@ def _certificate(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
     for name, part in found.parts.items():
         yield name, f"{len(part.certified)} boxes certain, {len(part.undecided)} undecided"
     yield "identity", found.identity
-    if whole and found.straight:
+    if whole:
         checked = vb.certificates.check_certificate(path)
         yield (
             "checked",

@@ -322,7 +322,9 @@ def _evidence(
     if not certificate.is_of(question.contact_map):
         raise ValueError("the certificate is of another whisker or for other arc lengths")
     if certificate.proved and certificate.cone <= question.cone:
-        rows = np.array([" ".join(triplet) == TRIPLET for triplet in names])
+        # In one plane F_x and M_B fix the contact but for a turn, which either direction shows.
+        proved = (TRIPLET, "Fx FD MB") if certificate.straight else (TRIPLET,)
+        rows = np.isin([" ".join(triplet) for triplet in names], proved)
         out[rows[:, None] & (verdict == UNIQUE)] = "proved"
     return np.asarray(out)
 

@@ -230,22 +230,7 @@ def _folder(output: str | PathLike[str] | None) -> Iterator[Path]:
 
 
 def begin(folder: Path, whisker: Whisker, **settings: object) -> None:
-    """Make the folder, and clear away what was made there with other settings.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the demo.
-    whisker : Whisker
-        Whisker that whisks.
-    **settings : object
-        Other settings by name; they can be written as JSON.
-
-    Raises
-    ------
-    ValueError
-        If files would be replaced that the demo has not made.
-    """
+    """Make the folder, and clear away what was made there with other settings by name."""
     folder.mkdir(parents=True, exist_ok=True)
     arc_length = np.linspace(0.0, whisker.length, _NODES)
     shape = np.column_stack([whisker.centerline(_NODES), whisker.radius(arc_length)])
@@ -274,18 +259,7 @@ def _version() -> str:
 
 
 def video_files(folder: Path) -> list[Path]:
-    """List the videos of the demo.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the demo.
-
-    Returns
-    -------
-    list of Path
-        One for each view.
-    """
+    """List the videos of the demo, one for each view."""
     return [folder / f"{name}.mp4" for name in _VIEWS]
 
 

@@ -91,7 +91,8 @@ def test_friction_is_found_in_the_shape(share):
     """A rod bent by a known force with friction, seen without noise: the force comes out."""
     from vibrissa import PointForce, Whisker, deflect
     from vibrissa.cameras import orthogonal_views
-    from vibrissa.tracking import BasePose, Trace, TraceSeries, fit_rod
+    from vibrissa.tracking import BasePose, HeadPose, Trace, TraceSeries
+    from vibrissa.tracking.refine.fit import Fitter
     from vibrissa.tracking.trace.trace import even
 
     whisker = Whisker.parabola(length=30e-3, coefficient=10.0)
@@ -111,7 +112,9 @@ def test_friction_is_found_in_the_shape(share):
     still = np.zeros(9)
     pose = BasePose(np.zeros((9, 3)), still, still, still)
     touching = np.ones(9, dtype=bool)
-    found = fit_rod(pair, TraceSeries.of(traces), whisker, pose, touching, curves, 1000.0)
+    series, head = TraceSeries.of(traces), HeadPose.still(9)
+    fitter = Fitter(pair, series, touching, curves, 1000.0, FitOptions(), head)
+    found = fitter.fit(whisker, pose, 65)
     np.testing.assert_allclose(found.arc_length, s, atol=100e-6)
     # Friction along a hardly bent whisker hardly shows, and the covariance says so.
     error = found.force - bent.force

@@ -157,34 +157,10 @@ _BEFORE = ("signals", "", "truth")
 
 @dataclass(frozen=True)
 class TrialSummary:
-    """Summary of a recording.
+    """Summary of a recording: what it is in words, numbers of frames and contacts, SI units.
 
-    Parameters
-    ----------
-    origin : str
-        Sentence that states where the recording comes from.
-    whiskers : list of str
-        Names of the whiskers.
-    frames : int
-        Number of frames.
-    duration : float
-        Number of frames times the time between two, s.
-    in_contact : int, optional
-        Number of frames in which a whisker is in contact; None where that is not known.
-    contacts : int, optional
-        Number of uninterrupted contacts of all whiskers.
-    largest_force, largest_moment : float
-        Largest force, N, and moment, N·m, in contact; NaN where there is none.
-    estimated : int
-        Number of frames and whiskers with an estimated contact point.
-    stages : tuple of str
-        Stages that are there, of ``signals``, ``estimates`` and ``contour``.
-    fitted : str
-        Fitted object in words; empty where there is none.
-    known : str
-        Objects that are known, in words; empty where there are none.
-    distance : float
-        Median distance of contact points from the fitted object, m.
+    ``in_contact`` and ``contacts``, frames in contact and uninterrupted contacts of all whiskers,
+    are None where that is not known; ``estimated`` counts frames and whiskers with an estimate.
     """
 
     origin: str

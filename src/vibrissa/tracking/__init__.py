@@ -4,7 +4,6 @@ from vibrissa.tracking.recording import Tracked
 from vibrissa.tracking.refine.fit import (
     FitOptions as FitOptions,
     RodFit as RodFit,
-    fit_rod as fit_rod,
 )
 from vibrissa.tracking.refine.trace_series import TraceSeries as TraceSeries
 from vibrissa.tracking.space.curve import SpaceCurve as SpaceCurve, merge

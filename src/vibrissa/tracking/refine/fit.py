@@ -171,23 +171,6 @@ class RodFit:
     misfit: Array
 
 
-def fit_rod(
-    cameras: Sequence[Camera],
-    traces: TraceSeries,
-    whisker: Whisker,
-    pose: BasePose,
-    touching: NDArray[np.bool_],
-    curves: Array,
-    rate: float,
-    options: FitOptions | None = None,
-    nodes: int = 65,
-    head: HeadPose | None = None,
-) -> RodFit:
-    """Fit the rod to the traces of a whole trial."""
-    options, head = options or FitOptions(), head or HeadPose.still(len(curves))
-    return Fitter(cameras, traces, touching, curves, rate, options, head).fit(whisker, pose, nodes)
-
-
 @dataclass(frozen=True, eq=False)
 class Fitter:
     """Tables that are common to rods that are fitted to the same traces."""

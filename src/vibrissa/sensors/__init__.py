@@ -17,10 +17,10 @@ from vibrissa.sensors.sensor import (
 )
 from vibrissa.sensors.stage import Stage, StageSweep, StageTouches, load_suspended, save_suspended
 from vibrissa.sensors.stiffness import StiffnessFit, fit_stiffness
-from vibrissa.sensors.suspended import SuspendedWhisker, Touches
+from vibrissa.sensors.suspended import SuspendedWhisker, Touches as Touches
 from vibrissa.sensors.suspension import SuspensionCalibration, calibrate_suspension
 from vibrissa.sensors.sweep import SweptContacts, follow_sweep
-from vibrissa.sensors.thin_plate import ThinPlate
+from vibrissa.sensors.thin_plate import ThinPlate as ThinPlate
 from vibrissa.sensors.weight import WeightCalibration, calibrate_weight, tare
 
 __all__ = [
@@ -39,8 +39,6 @@ __all__ = [
     "SuspendedWhisker",
     "SuspensionCalibration",
     "SweptContacts",
-    "ThinPlate",
-    "Touches",
     "WeightCalibration",
     "calibrate_frame",
     "calibrate_mixing",

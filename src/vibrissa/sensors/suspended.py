@@ -56,20 +56,9 @@ _SMALL = 1e-6
 
 
 class Touches(NamedTuple):
-    """Contacts of a suspended whisker, non-dimensional.
+    """Contacts of a suspended whisker, non-dimensional: points and forces in the sensor's frame.
 
-    Attributes
-    ----------
-    points : (n, 3) array
-        Contact points over L, sensor frame.
-    features : (n, 13) array
-        Motion of the base: `FEATURES`.
-    force : (n, 3) array
-        Force on the whisker over EI/L², sensor frame.
-    point_slopes : (n, 3, 3) array
-        Derivatives of the points by ξ = (s, f_y, f_z).
-    feature_slopes : (n, 13, 3) array
-        Derivatives of the features by ξ.
+    Features are the motion of the base (`FEATURES`); slopes are derivatives by ξ = (s, f_y, f_z).
     """
 
     points: Array

@@ -22,18 +22,9 @@ _RATIOS = np.logspace(-7, 1, 17)
 
 @dataclass(frozen=True, eq=False)
 class ThinPlate:
-    """Mean of a thin-plate Gaussian process.
+    """Mean of a thin-plate Gaussian process; no two of its points are farther apart than its reach.
 
-    Parameters
-    ----------
-    points : (n, 3) array
-        Points of the data, m.
-    weights : (n, k) array
-        Weights of the kernel at each point for each of k values.
-    reach : float
-        Distance R beyond which points are unrelated, m; none of the data are farther apart.
-    noise : (k,) array
-        Standard deviation of the noise that was found.
+    Its noise is the standard deviation that was found.
     """
 
     points: Array
@@ -43,22 +34,7 @@ class ThinPlate:
 
     @classmethod
     def fit(cls, points: Array, values: Array, ratio: float | None = None) -> ThinPlate:
-        """Fit values at points, with the noise of largest marginal likelihood.
-
-        Parameters
-        ----------
-        points : (n, 3) array
-            Points, m.
-        values : (n, k) array
-            Values of zero mean.
-        ratio : float, optional
-            Variance of the noise over that of the process, if it is known.
-
-        Returns
-        -------
-        ThinPlate
-            Process given the values.
-        """
+        """Fit values (n, k) of zero mean; where no noise is stated, by the largest likelihood."""
         reach = 2.0 * float(np.linalg.norm(np.ptp(points, axis=0)))
         kernel = _kernel(cdist(points, points) / reach)
         n, k = values.shape
@@ -75,20 +51,7 @@ class ThinPlate:
         return cls(np.array(points), weights, reach, noise)
 
     def __call__(self, points: Array) -> tuple[Array, Array]:
-        """Mean at points, and its derivatives.
-
-        Parameters
-        ----------
-        points : (n, 3) array
-            Points, m.
-
-        Returns
-        -------
-        values : (n, k) array
-            Mean of the process.
-        slopes : (n, k, 3) array
-            Derivatives by the point, 1/m.
-        """
+        """Mean (n, k) at points, and its derivatives (n, k, 3)."""
         x = np.minimum(cdist(points, self.points) / self.reach, 1.0)
         by_square = 6.0 * (x - 1.0) / self.reach**2  # (dk/dx) / (x R²)
         n, k = len(points), self.weights.shape[1]

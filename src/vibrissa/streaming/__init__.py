@@ -1,11 +1,11 @@
 """Signals as they come in, line by line, to contacts as they go out."""
 
-from vibrissa.streaming.advice import advice as advice
 from vibrissa.streaming.bag import ContactRecorder as ContactRecorder, bag_lines as bag_lines
 from vibrissa.streaming.contacts import (
     COMPONENTS,
     ContactStream,
     ContactStreams,
+    advice as advice,
     as_json as as_json,
 )
 from vibrissa.streaming.lines import (

@@ -34,19 +34,8 @@ def bag_lines(source: Path, topic: str | None, pose_topic: str | None) -> Iterat
 class ContactRecorder:
     """Writer of records to a bag, as long as that can be written; the stream goes on without.
 
-    Parameters
-    ----------
-    bag : ContactBag
-        Open bag.
-    running : ContactStreams
-        Streams whose records are written.
-    same : bool
-        Whether points are in the frame of the measurements: that of a sensor unless it is mounted
-        otherwise than along the whisker.
-    follow : bool
-        Whether contacts are followed in the laboratory.
-    remark : callable
-        Function that reports a sentence to the user.
+    Points are in the frame of the measurements (same), that of a sensor unless it is mounted
+    otherwise than along the whisker, or are followed in the laboratory.
     """
 
     def __init__(

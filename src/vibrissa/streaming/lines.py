@@ -76,25 +76,10 @@ class LineKind(Enum):
 
 
 class Sample(NamedTuple):
-    """One line: its number, the named values, and the pose of the base, where it is there.
+    """One line: its number from 1, the named values, and the pose of the base, where it is there.
 
-    Attributes
-    ----------
-    line : int
-        Number of the line, from 1.
-    time : float or None
-        Time of the sample, s; None where the line has none.
-    names : tuple of str
-        Choice of names that the line has, of those asked for; none where the line has a pose alone.
-    values : (k,) array
-        Values in the order of the names.
-    rotation : (3, 3) array or None
-        Rotation from the whisker's to the laboratory frame; NaN where the line leaves it empty.
-    position : (3,) array or None
-        Position of the base in the laboratory, m; NaN where the line leaves it empty.
-    passed : mapping
-        Values that are passed on as they are: ``stamp_ns``, ``recorded_ns`` and ``frame_id``, where
-        the line has them.
+    Of several choices of names that were asked for, those that the line has; a pose that the line
+    leaves empty is NaN. Passed on as they are: ``stamp_ns``, ``recorded_ns`` and ``frame_id``.
     """
 
     line: int
@@ -109,22 +94,9 @@ class Sample(NamedTuple):
 class Lines:
     """Takes lines apart; the first one that is not JSON is a header, others may follow.
 
-    Parameters
-    ----------
-    *names : sequence of str
-        The values wanted, or several choices of them: the first that a line has counts.
-    raw : bool
-        Whether they are a sensor's channels, which are called as they are and have no units.
-    whisker : str
-        Name of the whisker, where lines carry the signals of several: its own values are called
-        ``name.value``, and lines that have only others' are passed over.
-
-    Attributes
-    ----------
-    number : int
-        Lines so far.
-    headers : int
-        Headers so far that were taken: another one comes from a sender that has begun anew.
+    Of several choices of names the first that a line has counts. Raw names are a sensor's channels,
+    which are called as they are and have no units. With the name of a whisker its own values are
+    called ``name.value``, and lines that have only others' are passed over.
     """
 
     def __init__(self, *names: tuple[str, ...], raw: bool = False, whisker: str = "") -> None:

@@ -112,18 +112,7 @@ def udp_lost(opened: socket.socket) -> int:
 
 
 class Answers:
-    """Answers as messages to another program: a UDP datagram each, or lines of a TCP connection.
-
-    Parameters
-    ----------
-    text : str
-        ``udp://HOST:PORT`` or ``tcp://HOST:PORT``.
-
-    Raises
-    ------
-    ValueError
-        If this is not such an address, or nobody accepts the connection.
-    """
+    """Answers as messages to another program: a UDP datagram each, or lines of a TCP connection."""
 
     def __init__(self, text: str) -> None:
         scheme, mark, rest = text.partition("://")
@@ -169,18 +158,6 @@ class NewestLines:
 
     Samples of datagrams before it are dropped and counted. Headers are not, nor poses that the
     motion of the base is continued from.
-
-    Parameters
-    ----------
-    opened : socket
-        Socket of `udp_socket`.
-    kind : callable
-        Kind of a line, as of `Lines.kind`.
-
-    Attributes
-    ----------
-    dropped : int
-        Number of samples so far that were not passed on because a newer one had come.
     """
 
     def __init__(self, opened: socket.socket, kind: Callable[[str], LineKind]) -> None:

@@ -6,7 +6,8 @@ that ``vibrissa`` itself exports defines, is its face and describes every parame
 returns. Elsewhere a summary will do. The objects
 themselves are looked at rather than their source, so that the parameters of a dataclass and of a
 named tuple are its fields, which it may describe under Attributes too. An enumeration has no
-parameters to describe, and a compiled kernel is called by our own code only.
+parameters to describe, and a compiled kernel is called by our own code only. What describes a
+parameter or a result begins with a noun, everywhere.
 """
 
 import dataclasses
@@ -14,6 +15,7 @@ import enum
 import importlib
 import inspect
 import pkgutil
+import re
 import sys
 from collections.abc import Iterator, Mapping
 
@@ -41,6 +43,12 @@ CHECKS = {
 }
 PARAMETERS = {"PR01", "PR02", "PR03"}
 SUMMARY = {"GL08", "SS03", "SS06"}
+NO_NOUN = re.compile(
+    "(about|after|as|before|by|for|from|how|in|instead|it|its|of|on|only|see|that|their|they|this"
+    "|those|to|under|what|when|where|which|who|with|without)\\b",
+    re.IGNORECASE,
+)
+"""Words with which no description of a parameter begins: it names the thing, with a noun."""
 
 
 def modules() -> Iterator[str]:
@@ -113,10 +121,19 @@ def field_faults(cls: type, doc: Mapping[str, list[Parameter]]) -> Iterator[tupl
         yield "PR02", f"Unknown parameters {sorted(parameters - fields)}"
 
 
+def noun_faults(doc: Mapping[str, list[Parameter]]) -> Iterator[tuple[str, str]]:
+    """Descriptions that do not begin with what the thing is."""
+    for section in ("Parameters", "Other Parameters", "Attributes", "Returns", "Yields"):
+        for row in doc[section]:
+            if found := NO_NOUN.match(" ".join(row.desc)):
+                yield "NOUN", f"{section}, {row.name or row.type}: begins with {found[0]!r}"
+
+
 def faults(value: object, on_face: bool) -> Iterator[tuple[str, str]]:
     """Code and message of every fault in one docstring."""
     function = getattr(value, "py_func", value)  # a compiled kernel keeps what it was made from
     doc = get_doc_object(function)
+    yield from noun_faults(doc)
     checks = CHECKS
     if function is not value or isinstance(value, property) or not on_face:
         checks = SUMMARY

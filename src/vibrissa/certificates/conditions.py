@@ -363,7 +363,7 @@ def conditions_on(
     Parameters
     ----------
     conditions : Conditions
-        What is computed.
+        Conditions that are evaluated.
     rod : ExactRod
         Whisker.
     bound : (32,) array

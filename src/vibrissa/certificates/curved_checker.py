@@ -138,9 +138,9 @@ class Rod(NamedTuple):
     known : (4, d, n) array
         Taylor coefficients of the curvatures and of the radius, backwards.
     soft : (k, n) array
-        Those of the compliance.
+        Coefficients of the compliance.
     wrong : (2, n) array
-        What curvature and compliance may differ by from these over the step h.
+        Largest differences of curvature and compliance from these over the step h.
     twist : float
         Compliance in twist over that in bending.
     """

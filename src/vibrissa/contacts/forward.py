@@ -183,7 +183,7 @@ class Forward:
     d : Discretization
         Rod, with its units.
     shift : (6,) array
-        What readings have in addition to (F, M) since the tare, non-dimensional.
+        Part of readings in addition to (F, M) since the tare, non-dimensional.
     errors : list of (Forward, float)
         Rods that differ in one unknown, and the standard deviation of it in these differences.
     """

@@ -82,7 +82,7 @@ class StableSet:
     values : (i, j, k, 6) array
         Base force and contact point (F, p) there.
     tangents : (i, j, k, 6, 3) array
-        Their derivatives by ξ.
+        Derivatives of the values by ξ.
     frames : (i, j, k, 3, 3) array
         Derivatives of ξ by (η, ψ, ρ).
     folded : (i, j) bool array

@@ -53,7 +53,7 @@ class Clutter(NamedTuple):
 
     @property
     def still_only(self) -> Clutter:
-        """What stands still, without other whiskers."""
+        """The clutter that stands still, without other whiskers."""
         return self._replace(which=int(STILL))
 
 

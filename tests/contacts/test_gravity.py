@@ -252,6 +252,10 @@ def test_what_does_not_fit_is_refused(nitinol):
         vb.Gravity((0, 0, -G), direction_sigma=-1.0)
     with pytest.raises(ValueError, match="friction is weighed against the noise"):
         nitinol.estimate(signals, gravity=(0, 0, -G), friction=0.3)
+    known = {"noise": dict.fromkeys(("Fx", "MB", "MD"), 1e-3), "friction": 0.3}
+    for more in ({"gravity": (0, 0, -G)}, {"compliance_sigma": 1.0}):
+        with pytest.raises(ValueError, match="at least 4 signals"):
+            nitinol.estimate(signals, "Fx MB MD", **known, **more)
     with pytest.raises(ValueError, match="three signals or more"):
         vb.Estimator(nitinol, ("MB", "MD"), gravity=(0, 0, -G))
     signals["force"] = np.full((2, 3), np.nan)

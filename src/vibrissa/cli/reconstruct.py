@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 _SUSPECT = 1.5
 """χ² per degree of freedom from which it is asked whether another shape fits better."""
 
+_ANYWHERE = 0.1
+"""Predicted distance, m, longer than whiskers: the covariance leaves the contact anywhere."""
+
 _TURNED = ("axis", "normal")
 """Parameters of a shape that are directions, not lengths."""
 
@@ -297,6 +300,11 @@ def _by(misfit: float) -> str:
     return f" (χ² per degree of freedom {misfit:.3g})"
 
 
+def _distance(value: float) -> str:
+    """A distance; a covariance may leave the lightest contacts anywhere along the whisker."""
+    return "not determined" if value > _ANYWHERE else fixed("surface_distance", value, 1)
+
+
 def _print_distances(rows: xr.Dataset) -> None:
     """Distances of contacts from the known object, by how far the whisker is bent."""
     predicted = bool(np.isfinite(rows["median_predicted"]).any())
@@ -306,7 +314,7 @@ def _print_distances(rows: xr.Dataset) -> None:
     for k in range(rows.sizes["class"]):
         row = rows.isel({"class": k})
         if count := int(row["contacts"]):
-            values = [fixed("surface_distance", float(row[name]), 1) for name in names]
+            values = [_distance(float(row[name])) for name in names]
             cells.append([f"{row['label'].item()}°", str(count), *values])
     print_table(
         ["deflection angle", "contacts", "median", "95 %", *(["median*", "95 %*"] * predicted)],

@@ -46,6 +46,8 @@ _MOST = 8
 # need less friction come first.
 _LIKELY = np.deg2rad(20.0)
 _NO_ERRORS = np.zeros((0, 6, 7))
+# Of three signals with all of these unknown, regions hold half to two thirds of the contacts.
+_SEPARATE = 4
 
 
 class JointEstimate:
@@ -70,6 +72,11 @@ class JointEstimate:
             )
         if friction != 0.0:
             check_ratio(friction, sensor)
+            if len(names) < _SEPARATE and (gravity is not None or compliance_sigma != 0.0):
+                raise ValueError(
+                    "friction together with weight or an uncertain base needs at least "
+                    f"{_SEPARATE} signals, such as Fx, FT, MB and MD; got {', '.join(names)}"
+                )
         check_compliance(compliance_sigma, sensor)
         self.whisker, self.contact_map, self.names = whisker, contact_map, names
         self.sensor, self.prior, self.gravity = sensor, prior, gravity

@@ -89,6 +89,37 @@ def test_a_kernel_is_compiled_within_those_that_call_it():
     )
 
 
+def test_a_kernel_runs_its_own_copies_of_what_it_calls():
+    """Not those that other kernels have brought: digits would depend on what was compiled first."""
+    run(
+        """
+        import math
+
+        from llvmlite.binding import Linkage
+
+        from vibrissa.numerics.compiled import kernel, specialised
+
+        @specialised
+        def chaos(x, n):
+            for _ in range(n):
+                x = math.sin(x) + math.cos(3.0 * x) + math.atan2(x, 1.0 + x * x)
+            return x
+
+        @kernel
+        def outer(x, n):
+            for k in range(n):
+                x += chaos(x, k) * chaos(x, 2 * k) / (1.0 + chaos(x, 3 * k)) * chaos(1.0, n)
+            return x
+
+        outer(0.5, 4)
+        (compiled,) = outer.overloads.values()
+        called = [f for f in compiled.library.get_defined_functions() if "chaos" in f.name]
+        assert called  # it is not inlined
+        assert {f.linkage for f in called} == {Linkage.internal}
+        """
+    )
+
+
 SQUARE = """
 import resource, sys
 

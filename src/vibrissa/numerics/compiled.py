@@ -13,7 +13,7 @@ from contextlib import suppress
 from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
-from llvmlite.binding import parse_assembly
+from llvmlite.binding import Linkage, parse_assembly
 from numba import types
 from numba.core import ir
 from numba.core.codegen import JITCodeLibrary
@@ -65,6 +65,19 @@ class _Whole(JITCodeLibrary):
         # Callers first: LLVM leaves out what nothing that is linked already refers to.
         self._linking_libraries = list(reversed(found))
         super().finalize()  # type: ignore[no-untyped-call]
+
+    def _finalize_final_module(self) -> None:
+        """Bind what is linked in to this code alone.
+
+        Otherwise a copy that other code has brought, and that was optimised with that, would be
+        run in its place: results would depend on what a process has compiled or loaded before.
+        """
+        self._finalized = True
+        self._get_module_for_linking()  # type: ignore[no-untyped-call]
+        for function in self._final_module.functions:
+            if function.linkage is Linkage.linkonce_odr:
+                function.linkage = Linkage.internal
+        super()._finalize_final_module()  # type: ignore[no-untyped-call]
 
 
 class _Compact(_Whole):

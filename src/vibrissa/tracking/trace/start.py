@@ -250,18 +250,28 @@ class _Search:
     def vote(self) -> _Vote:
         """What most frames show: of what moves, or if nothing does, of all that is there."""
         moments = self.moments(_VOTES)
-        vote = _voted([self._combined(m, self.curves(m, moving=True)) for m in moments])
+        views = range(len(self.cameras))
+        vote = _voted([self._combined(m, self.curves(m)) for m in moments])
         if vote.confidence >= _SURE:
             return vote
-        shown = [self._shown(view, moments) for view in range(len(self.cameras))]
+        shown = [self._shown(view, moments) for view in views]
         if not any(shown):
-            found = [self._combined(m, self.curves(m, moving=False)) for m in moments]
+            found = [self._combined(m, self.curves(m, resting=views)) for m in moments]
             return self._resting(_voted(found))
-        # A view that shows the whisker before the animal does not show where it begins.
-        for view in range(len(self.cameras)):
-            if any(shown[:view] + shown[view + 1 :]):
-                vote = max(vote, self._faint(view, moments), key=lambda one: one.confidence)
+        # A view that shows the whisker before the animal does not show where it begins, and one
+        # toward which it swings does not show that it moves.
+        hardly = [view for view in views if any(shown[:view] + shown[view + 1 :])]
+        for search in (self._faint, self._in_depth):
+            if vote.confidence < _SURE:
+                ways = [search(view, moments) for view in hardly]
+                vote = max([vote, *ways], key=lambda one: one.confidence)
         return vote
+
+    def _in_depth(self, view: int, moments: Sequence[int]) -> _Vote:
+        """The vote if one view is along the whisker's motion, so that it hardly moves there."""
+        vote = _voted([self._combined(m, self.curves(m, resting=[view])) for m in moments])
+        from_face = all(one.curves[view].from_face for one in vote.winners)
+        return vote._replace(confidence=vote.confidence * (1.0 if from_face else _NO_FACE))
 
     def _faint(self, view: int, moments: Sequence[int]) -> _Vote:
         """The vote if one view shows the whisker only along the lines of sight of another."""
@@ -279,12 +289,12 @@ class _Search:
         confidence = vote.confidence * (1.0 if from_face else _NO_FACE)
         return vote._replace(moves=False, confidence=confidence)
 
-    def curves(self, moment: int, moving: bool) -> list[list[Curve]]:
-        """Lines that may be whiskers, view by view, the likeliest first."""
+    def curves(self, moment: int, resting: Sequence[int] = ()) -> list[list[Curve]]:
+        """Lines that may be whiskers, the likeliest first: those that move, but in some views."""
         found = []
         for view in range(len(self.cameras)):
             curves = self._found(view, moment)
-            if moving:
+            if view not in resting:
                 curves = [c._replace(score=c.score * min(1.0, c.moved / _MOVED)) for c in curves]
             found.append(sorted(curves, key=lambda curve: -curve.score)[:_LINES])
         return found
@@ -298,14 +308,12 @@ class _Search:
 
     def _shown(self, view: int, moments: Sequence[int]) -> bool:
         """Whether a view by itself shows something long that moves, in half of the frames."""
-        best = [
-            max((c.score for c in self.curves(m, moving=True)[view]), default=0.0) for m in moments
-        ]
+        best = [max((c.score for c in self.curves(m)[view]), default=0.0) for m in moments]
         return self.scenes[view].background is not None and float(np.median(best)) > _LONG
 
     def _along(self, moment: int, view: int) -> list[_Combination]:
         """Whiskers of one view, with what a view that shows them faintly shows along them."""
-        found, camera = self.curves(moment, moving=True), self.cameras[view]
+        found, camera = self.curves(moment), self.cameras[view]
         first = next(other for other in range(len(found)) if other != view)
         frame, scene = self.frames[view][moment], self.scenes[view]
         pairs: list[_Combination] = []
@@ -337,7 +345,7 @@ class _Search:
 
     def worth(self, moments: Sequence[int]) -> float:
         """Evidence of whiskers in some frames."""
-        found = [self._combined(m, self.curves(m, moving=True)) for m in moments]
+        found = [self._combined(m, self.curves(m)) for m in moments]
         return sum(row[0].worth for row in found if row)
 
 
@@ -391,9 +399,7 @@ def _start(search: _Search, vote: _Vote, bright: bool) -> Start:
     """Return what was found, and what there is to doubt."""
     if not vote.winners or vote.confidence < _GUESS:
         moment = search.moments(_VOTES)[0]
-        alone = [
-            curves[0].line if curves else np.empty((0, 2)) for curves in search.curves(moment, True)
-        ]
+        alone = [curves[0].line if curves else np.empty((0, 2)) for curves in search.curves(moment)]
         missing = [c.name for c, line in zip(search.cameras, alone, strict=True) if not len(line)]
         why = (
             f"nothing in {' and '.join(missing)} is like a whisker"

@@ -11,7 +11,18 @@ from matplotlib.figure import Figure
 import vibrissa as vb
 from vibrissa.cameras import orthogonal_views
 from vibrissa.io import read_video
-from vibrissa.plots.style import MUTED, ORANGE, RED, TRACE, box_axes, head, looking, new_figure
+from vibrissa.plots.style import (
+    MUTED,
+    ORANGE,
+    RED,
+    TRACE,
+    box_axes,
+    conclude,
+    head,
+    looking,
+    new_figure,
+    size_label,
+)
 from vibrissa.quantities import axis_label, to_display
 from vibrissa.scene import Array
 from vibrissa.simulation import facing_peg, film, simulate, sweep_past, with_true_traces
@@ -43,7 +54,10 @@ def tracking_picture() -> Figure:
     with looking():
         figure = new_figure("double", HEIGHT, None)
         sights(figure, [images[row] for images in frames], found, row)
-        curves(figure, found, truth)
+        away = curves(figure, found, truth)
+        conclude(
+            figure, f"Tracked forces are {100.0 * away:.1f} % from the true ones in the median"
+        )
         return figure
 
 
@@ -74,8 +88,8 @@ def picture(figure: Figure, box: tuple[float, float, float, float], image: Array
     return axes
 
 
-def curves(figure: Figure, found: xr.Dataset, truth: xr.Dataset) -> None:
-    """Sizes of force and moment over time, and their truth."""
+def curves(figure: Figure, found: xr.Dataset, truth: xr.Dataset) -> float:
+    """Sizes of force and moment over time, and their truth; the relative error of the force."""
     touching = found["in_contact"].values.astype(bool)
     for i, name in enumerate(("force", "moment")):
         axes = box_axes(figure, (12.0 + 90.0 * i, 9.0, 74.0, 30.0))
@@ -86,8 +100,10 @@ def curves(figure: Figure, found: xr.Dataset, truth: xr.Dataset) -> None:
         time = found["time"].values
         axes.plot(time, true, color=MUTED, linewidth=2.2, label="true")
         axes.plot(time, np.where(touching, size, np.nan), color=ORANGE, label="tracked")
-        axes.set(xlabel=axis_label("time"), ylabel=axis_label(name))
+        axes.set(xlabel=axis_label("time"), ylabel=size_label(name))
         axes.locator_params(nbins=5)
         head(axes, "de"[i], f"size of the {name}")
         if i == 0:
             axes.legend(loc="upper right")
+            away = np.abs(size / np.where(true > 0.0, true, np.nan) - 1.0)[touching]
+    return float(np.nanmedian(away))

@@ -22,10 +22,13 @@ from matplotlib.figure import Figure
 from vibrissa.plots.space import paint, space_axes
 from vibrissa.plots.style import (
     INK,
+    LARGE,
     MUTED,
     Box,
     Width,
     box_axes,
+    conclude,
+    corner_title,
     head,
     looking,
     new_figure,
@@ -156,11 +159,22 @@ def _drawn(scene: _Scene, width: Width) -> Figure:
         if letter == "a":
             _legend(axes, scene)
     room = scale * float(y)
-    _space(figure, (aside - 6.0, above - 6.0, room + 8.0, room + 10.0), scene, limits)
-    if scene.moment:
-        at = (1.0 - _RIGHT / page, 1.0 - 2.0 / height)
-        figure.text(*at, scene.moment, ha="right", va="top", color=MUTED, fontsize=6.0)
+    box = (aside - 6.0, above - 6.0, room + 8.0, room + 10.0)
+    _space(figure, box, scene, limits)
+    corner_title(figure, (aside - 6.0, above, room, scale * y + _TOP - 1.5), "b", "in space")
+    conclude(figure, _finding(scene))
     return figure
+
+
+def _finding(scene: _Scene) -> str:
+    """State how many whiskers there are, and how many of them touch."""
+    touching = [name for name, points in zip(scene.names, scene.points, strict=True) if len(points)]
+    if not touching:
+        return f"{len(scene.names)} whiskers at rest"
+    rows = ", ".join(sorted({Identity.of(name).row for name in touching if _colour(name) != INK}))
+    ever = f"Contact points of {len(touching)} of {len(scene.names)} whiskers"
+    ever += f" (rows {rows})" if rows else ""
+    return f"{ever}; {int(scene.touching.sum())} touch at {scene.moment}"
 
 
 def _panel(axes: Axes, scene: _Scene, limits: Array, view: tuple[int, int], toward: int) -> None:
@@ -175,7 +189,7 @@ def _panel(axes: Axes, scene: _Scene, limits: Array, view: tuple[int, int], towa
         sides = ("L", "R") if right > 0.0 else ("R", "L")
         for x, side in zip((0.03, 0.97), sides, strict=True):
             words: dict[str, Any] = {"transform": axes.transAxes, "ha": "center", "va": "top"}
-            axes.text(x, 0.97, side, fontsize=8.0, fontweight="bold", color=MUTED, **words)
+            axes.text(x, 0.97, side, fontsize=LARGE, fontweight="bold", color=MUTED, **words)
     if toward != 1:
         near = eyes[eyes[..., toward].mean(axis=1) > skull[..., toward].mean()]
         _flat(axes, near[..., view], INK, INK, 2.2)
@@ -236,7 +250,6 @@ def _space(figure: Figure, box: Box, scene: _Scene, limits: Array) -> None:
         draw(order)
     now = scene.now[scene.touching]
     axes.plot(*now.T, "o", color=INK, markersize=3.2, fillstyle="none", zorder=len(items))
-    axes.text2D(0.02, 0.98, "b", transform=axes.transAxes, fontsize=8.0, fontweight="bold")
 
 
 def _legend(axes: Axes, scene: _Scene) -> None:
@@ -254,7 +267,6 @@ def _legend(axes: Axes, scene: _Scene) -> None:
             xytext=(-8.0 * (len(rows) - 1 - i) - (2.0 if i == 0 else 0.0), 4.0),
             textcoords="offset points",
             color=ROW_COLOURS.get(row, INK),
-            fontsize=7.0,
             **look,
         )
 

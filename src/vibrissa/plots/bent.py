@@ -110,7 +110,7 @@ def bent_views(
         figure = _views(drawn, _limits(drawn, extent), width)
         if largest > 0.0:
             low, high = to_display("force", np.array([np.nanmin(size), largest]))
-            style.conclude(figure, f"Forces from {low:.3g} to {high:.3g} µN")
+            style.conclude(figure, f"Contacts held by forces from {low:.3g} to {high:.3g} µN")
         return figure
 
 
@@ -194,7 +194,7 @@ def _forces(axes: Axes, drawn: _Drawn) -> None:
     """State how large the forces are, over how far from the resting whisker they act."""
     away = np.linalg.norm(drawn.points[:, None] - drawn.rest, axis=-1).min(axis=1)
     axes.scatter(away, drawn.forces, 14.0, color=drawn.colours, zorder=3)
-    axes.set(xlabel="distance of the contact from rest (mm)", ylabel=axis_label("force"))
+    axes.set(xlabel="distance of the contact from rest (mm)", ylabel=style.size_label("force"))
     axes.set(xlim=(0.0, None), ylim=(0.0, None))
     style.head(axes, "c", "force")
 
@@ -349,7 +349,7 @@ def _table(
     """Signals and contacts of both, what is the same shaded."""
     axes = figure.add_axes(box, xlim=(0.0, 1.0), ylim=(13.2, -0.6))
     axes.set_axis_off()
-    look: dict[str, Any] = {"va": "center_baseline", "fontsize": 6.5}
+    look: dict[str, Any] = {"va": "center_baseline"}
     for x, name, colour in zip((0.62, 0.97), _NAMES, _PAIR_COLOURS, strict=True):
         axes.text(x, 0.0, name, color=colour, fontweight="bold", ha="right", **look)
     axes.axhline(0.6, color=style.INK, linewidth=0.5)
@@ -368,7 +368,7 @@ def _table(
             axes.text(x, y, text, ha="right", color=style.INK if same else style.MUTED, **look)
     axes.axhline(9.2, color=style.INK, linewidth=0.5)
     for line, text in enumerate(_sentences(witness, triplet)):
-        axes.text(0.02, 10.0 + line, text, **(look | {"fontsize": 6.0}))
+        axes.text(0.02, 10.0 + line, text, **(look | {"fontsize": style.SMALL}))
 
 
 def _symbol(name: str) -> str:

@@ -141,7 +141,7 @@ def scale_bar(axes: Axes, course: Course, view: _View, length: float = 5e-3) -> 
         textcoords="offset points",
         ha="right",
         va="center",
-        fontsize=6.0,
+        fontsize=style.SMALL,
     )
 
 
@@ -180,11 +180,11 @@ def start_views(
                     caption = f"1 begins at {line[0, 0]:.0f}, {line[0, 1]:.0f}"
                     caption += f", confidence {confidence:.2f}"
                 _candidate(axes, line, number, confidence, style.ORANGE if remarks else style.GREEN)
-            axes.set_title(f"{name}: {caption}", loc="left", fontsize=7.0, pad=2.0)
+            axes.set_title(f"{name}: {caption}", loc="left", pad=2.0)
         height = max(heights) + _TITLE + below
         for count, remark in enumerate(remarks):
             at = (below - _LINE * (count + 1)) / height
-            figure.text(0.01, at, remark, fontsize=6.5, color=style.RED)
+            figure.text(0.01, at, remark, color=style.RED)
     return figure
 
 
@@ -198,6 +198,4 @@ def _candidate(axes: Axes, line: Array, number: int, confidence: float, colour: 
         *at, s=60.0, facecolor="none", edgecolor=style.RED if first else style.BLUE, linewidths=1.0
     )
     text = f"{number}" if first else f"{number} ({confidence:.2f})"
-    axes.annotate(
-        text, line[0], xytext=(5.0, 5.0), textcoords="offset points", color=colour, fontsize=7.0
-    )
+    axes.annotate(text, line[0], xytext=(5.0, 5.0), textcoords="offset points", color=colour)

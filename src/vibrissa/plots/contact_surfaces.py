@@ -105,6 +105,10 @@ def contact_surfaces(
             values = to_display(name, scene.values_of(name, body))
             paint(axes, signal_rows(body), painted(values, norm, style.sequential()), flat=0.8)
             coordinate_bar(figure, rails[i], name, norm, marks)
+        style.conclude(
+            figure,
+            "Surfaces of equal r, θ and φ, and their signals in the space of ($F_x$, $M_B$, $M_D$)",
+        )
         return figure
 
 
@@ -133,7 +137,7 @@ def _write_values(
     for i, mark in enumerate(marks):
         text = f"{mark:g}{'' if unit == '°' else ' '}{unit}".replace("-", "−")
         place = (box[0] + 5.5 + 9.5 * i) / wide, (box[1] + box[3] - 3.6) / tall
-        look: dict[str, Any] = {"fontsize": 6.0, "fontweight": "bold", "va": "top"}
+        look: dict[str, Any] = {"fontsize": style.SMALL, "fontweight": "bold", "va": "top"}
         figure.text(*place, text, color=style.sequential()(norm(mark)), **look)
 
 
@@ -210,9 +214,9 @@ def coordinate_bar(
     for mark in marks:
         (rail.axhline if upright else rail.axvline)(mark, color="white", linewidth=0.8)
     if upright:
-        rail.set_title(axis_label(name), fontsize=6.5, pad=4.0)
+        rail.set_title(axis_label(name), pad=4.0)
     else:
-        rail.set_xlabel(axis_label(name), fontsize=6.5, labelpad=1.0)
+        rail.set_xlabel(axis_label(name), labelpad=1.0)
 
 
 _SKIN = (0.62, 0.68, 0.75, 1.0)

@@ -97,7 +97,7 @@ def contact_places(
             style.head(axes, "abcd"[i], _TITLES[i], left=4.0)
         bar = figure.colorbar(dots, cax=style.box_axes(figure, rail))
         style.plain(bar)
-        bar.ax.set_title(axis_label(colour), fontsize=6.5, pad=4.0)
+        bar.ax.set_title(axis_label(colour), pad=4.0)
         near, far = np.nanpercentile(np.linalg.norm(own, axis=1), [5.0, 95.0])
         style.conclude(
             figure,

@@ -236,7 +236,7 @@ def _note_outside(axes: Axes, places: Array, limits: Array) -> None:
     flat = places[:, :2]
     outside = int(((flat < limits[:2, 0]) | (flat > limits[:2, 1])).any(axis=1).sum())
     if outside:
-        axes.set_title(f"{outside} outside", loc="right", fontsize=6.0, color=style.MUTED)
+        axes.set_title(f"{outside} outside", loc="right", fontsize=style.SMALL, color=style.MUTED)
 
 
 def _legend(
@@ -276,6 +276,8 @@ def _across(body: Body) -> str:
 
 
 _HEIGHT = 52.0
+_FARTHEST = 1e5
+"""Largest distance that is shown, µm: predictions for the lightest contacts may be any larger."""
 
 
 def distances_by_class(summaries: Sequence[xr.Dataset], *, width: style.Width = "double") -> Figure:
@@ -291,9 +293,9 @@ def distances_by_class(summaries: Sequence[xr.Dataset], *, width: style.Width = 
     Returns
     -------
     Figure
-        Median and 95 % of the sizes of the distances, µm, on a logarithmic scale: filled as
-        measured, open as predicted. The number of contacts stands below each class. Or the
-        sentence "no contacts".
+        Median and 95 % of the sizes of the distances, µm, on a logarithmic scale that ends at
+        100 mm: filled as measured, open as predicted. The number of contacts stands below each
+        class. Or the sentence "no contacts".
     """
     shown = [s for s in summaries if int(s["contacts"].sum())]
     with style.looking():
@@ -308,14 +310,15 @@ def distances_by_class(summaries: Sequence[xr.Dataset], *, width: style.Width = 
         panels[0].set_ylabel(axis_label("surface_distance").replace("d", "|d|", 1))
         panels[0].set_yscale("log")
         handles, labels = panels[0].get_legend_handles_labels()
-        panels[0].yaxis.set_major_formatter("{x:g}")
+        panels[0].yaxis.set_major_formatter("{x:,g}")
+        panels[0].set_ylim(top=_FARTHEST)
         figure.legend(handles, labels, loc="outside upper right", ncols=len(labels))
         medians = to_display("surface_distance", shown[0]["median"].values)
         first = quantity(shown[0].attrs["quantity"]).long_name
         style.conclude(
             figure,
-            f"Median distance from the surface {np.nanmin(medians):.0f} to "
-            f"{np.nanmax(medians):.0f} µm, by class of {first}",
+            f"Contacts are {np.nanmin(medians):.0f} to {np.nanmax(medians):,.0f} µm from the "
+            f"surface in the median, by class of {first}",
         )
         return figure
 
@@ -347,7 +350,7 @@ def _panel(axes: Axes, summary: xr.Dataset) -> None:
         f"{a:.3g}–\n{b:.3g}\n({int(n)})"
         for a, b, n in zip(lower, upper, summary["contacts"].values, strict=True)
     ]
-    axes.set_xticks(place, marks, fontsize=6.0)
+    axes.set_xticks(place, marks)
     axes.set_xlim(-0.5, len(place) - 0.5)
     axes.set_xlabel(axis_label(name))
     axes.grid(axis="y", color=style.MUTED, alpha=0.25, linewidth=0.4)

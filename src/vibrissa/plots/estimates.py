@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from vibrissa.plots.style import (
     MUTED,
+    SMALL,
     conclude,
     head,
     looking,
@@ -182,7 +183,7 @@ def _within(values: Array, limits: tuple[float, float]) -> int:
 
 def _remark(axes: Axes, words: str) -> None:
     """Write above the upper right corner of a panel."""
-    axes.set_title(words, loc="right", fontsize=6.0, color=MUTED, pad=3.0)
+    axes.set_title(words, loc="right", fontsize=SMALL, color=MUTED, pad=3.0)
 
 
 def _broken(time: Array, values: Array) -> tuple[Array, Array]:

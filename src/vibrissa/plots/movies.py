@@ -269,7 +269,7 @@ def _contour_frames(
             clouds.append(cloud)
             outlines += [(outline, cloud.places) for outline in lines_of]
         _bar(figure, norm)
-        clock = figure.text(0.0125, 0.985, "", va="top", fontsize=8.0, animated=True)
+        clock = figure.text(0.0125, 0.985, "", va="top", fontsize=style.LARGE, animated=True)
         screen = Screen(figure)
     windows = [Window(low, high, size, screen.pixels(axes)) for axes, low, high, size in panels]
     streams = [iter(sight.images) for sight in sights]
@@ -336,7 +336,7 @@ def _about_whisker(
     axes = space_axes(figure, _SPACE_BOX, bounds(np.concatenate(shown)), zoom=0.9)
     name_axes(axes, (-7.0, -8.0, -9.0))
     axes.plot(*rest.T, color="black", linewidth=1.2)
-    figure.text(0.72, 0.958, "contacts about the resting whisker", va="top", fontsize=7.0)
+    figure.text(0.72, 0.958, "contacts about the resting whisker", va="top")
     cloud = CircleCollection(
         [0.7 * _dot_size(int(np.isfinite(points[span]).all(axis=1).sum()))],
         offsets=np.empty((0, 2)),
@@ -411,7 +411,7 @@ def _bar(figure: Figure, norm: Normalize) -> None:
     rail = style.box_axes(figure, _RAIL)
     bar = figure.colorbar(ScalarMappable(norm, style.sequential()), cax=rail)
     style.plain(bar)
-    rail.set_title(axis_label("time"), fontsize=6.5, pad=4.0)
+    rail.set_title(axis_label("time"), pad=4.0)
     rail.tick_params(length=2.0, pad=1.5)
 
 
@@ -491,7 +491,7 @@ def _signal_frames(
         curves = curves_over_time(figure, _BOXES, course, signals, slice(first, last + 1))
         curve_legend(figure, course, (1.0 - 2.0 / WIDTH, 48.0 / HEIGHT))
         marks = [_mark(curve, time[first]) for curve in curves]
-        clock = figure.text(0.5, 0.985, "", ha="center", va="top", fontsize=8.0, animated=True)
+        clock = figure.text(0.0125, 0.985, "", va="top", fontsize=style.LARGE, animated=True)
         trails = [flat_line(a, color=style.INK, linewidth=0.6, animated=True) for a in solids]
         look = {"markeredgecolor": "white", "markeredgewidth": 0.6, "linestyle": "none"}
         dots = [

@@ -201,7 +201,7 @@ def _images(
             axes.plot(*lines[row].T, **style.TRACE)
             axes.scatter(dots[row, 0], dots[row, 1], 9.0, zorder=5, **_CONTACT)
             when = f"{to_display('time', course.time[row]):.3f} s"
-            axes.set_title(f"{view.name}, {when}", loc="right", fontsize=6.5, pad=2.0)
+            axes.set_title(f"{view.name}, {when}", loc="right", pad=2.0)
             if count == 0:
                 scale_bar(axes, course, view)
 
@@ -273,7 +273,7 @@ def _letters(figure: Figure, sheet: _Sheet) -> None:
     places = [place for row in rows for place in row]
     for letter, (x, y) in zip("abcdefghij", places, strict=False):
         place = (max(x, 0.0) + 1.0) / wide, y / tall
-        figure.text(*place, letter, fontsize=8.0, fontweight="bold", va="bottom")
+        figure.text(*place, letter, fontsize=style.LARGE, fontweight="bold", va="bottom")
 
 
 class Curve(NamedTuple):
@@ -313,7 +313,7 @@ def curves_over_time(
             column = i - len(TRIPLET)
             values = _coordinate(axes, name, time, span, (known, estimated), column, true)
         axes.set_xlim(first, max(last, first + 1e-3))
-        axes.set_ylabel(axis_label(name), fontsize=6.0)
+        axes.set_ylabel(axis_label(name), fontsize=style.SMALL)
         axes.locator_params(axis="y", nbins=4)
         if box[1] > lowest[box[0]]:
             axes.tick_params(labelbottom=False)

@@ -90,7 +90,7 @@ def sensitivity_panels(data: xr.Dataset, *, width: style.Width = "double") -> Fi
                 axes = panels[i, j]
                 _panel(axes, contacts, coordinate, name, small=width == "single")
                 letter = "abcdefghi"[3 * i + j]
-                axes.set_title(letter, loc="left", fontsize=8.0, fontweight="bold", pad=2.0)
+                axes.set_title(letter, loc="left", fontsize=style.LARGE, fontweight="bold", pad=2.0)
                 if i == 2:
                     axes.set_xlabel(axis_label(name))
         labels = (("concave forward", style.BLUE), ("concave backward", style.ORANGE))

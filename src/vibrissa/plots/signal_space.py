@@ -114,7 +114,20 @@ def signal_clouds(
             _body(axes, body, _mean(name, shown, norm, colours), line)
             _bar(figure, _rail(figure, cell), norm, colours, ends, name)
         _pulled(figure, sheet.signals[0], nodes, not cutaway, line, view)
+        style.conclude(figure, _finding(whole))
         return figure
+
+
+def _finding(nodes: scene.Array) -> str:
+    """State how far contacts and signals reach."""
+    near, far, push, pull, bend = (
+        f"{float(f'{np.quantile(to_display(name, scene.values_of(name, nodes)), share):.2g}'):g}"
+        for name, share in (("r", 0.01), ("r", 0.99), ("Fx", 0.01), ("Fx", 0.99), ("MB", 0.99))
+    )
+    return (
+        f"Contacts {near} to {far} mm from the base have $F_x$ from {push} to {pull} µN and $M_B$ "
+        f"up to {bend} µN·m (98 % of the samples)"
+    ).replace("-", "−")
 
 
 def _kept(elevation: float, azimuth: float) -> tuple[float, float]:
@@ -184,9 +197,9 @@ def _cross(axes: Any, limits: scene.Array) -> None:
         end[i] += 5.0
         axes.plot(*np.stack([corner, end]).T, color=style.INK, linewidth=0.8, zorder=11)
         end[i] += 1.6
-        axes.text(*end, f"${name}$", fontsize=6.0, ha="center", va="center")
+        axes.text(*end, f"${name}$", fontsize=style.SMALL, ha="center", va="center")
     corner += np.array([0.0, 2.0, -2.6])
-    axes.text(*corner, "5 mm", fontsize=5.5, ha="center", va="center")
+    axes.text(*corner, "5 mm", fontsize=style.SMALL, ha="center", va="center")
 
 
 def _vanishes(nodes: scene.Array) -> bool:
@@ -199,7 +212,7 @@ def _say_zero(figure: Figure, cell: style.Box) -> None:
     wide, tall = 25.4 * figure.get_size_inches()
     left, bottom, width, _ = cell
     place = (left + 0.5 * width) / wide, (bottom + 6.0) / tall
-    figure.text(*place, "$M_x = 0$ everywhere", fontsize=6.5, ha="center", va="center")
+    figure.text(*place, "$M_x = 0$ everywhere", ha="center", va="center")
 
 
 def _pulled(
@@ -229,7 +242,7 @@ def _pulled(
     style.plain(bar)
     rail.xaxis.set_ticks_position("top")
     bar.set_ticks([0.0, values.max()], labels=["$F_x$ > 0", f"{values.max():.2g} µN"])
-    rail.tick_params(length=0.0, pad=1.0, labelsize=5.0)
+    rail.tick_params(length=0.0, pad=1.0)
 
 
 def _scale(name: str, values: scene.Array) -> tuple[Normalize, Colormap, str]:
@@ -260,8 +273,8 @@ def _bar(
         ScalarMappable(norm, colours), cax=rail, extend=ends, orientation="horizontal"
     )
     style.plain(bar)
-    bar.ax.tick_params(length=2.0, pad=1.5, labelsize=5.5)
-    bar.ax.set_xlabel(axis_label(name), fontsize=6.5, labelpad=1.0)
+    bar.ax.tick_params(length=2.0, pad=1.5)
+    bar.ax.set_xlabel(axis_label(name), labelpad=1.0)
     assert norm.vmin is not None
     assert norm.vmax is not None
     if name in scene.DIRECTIONS:

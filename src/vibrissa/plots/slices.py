@@ -80,8 +80,9 @@ def solid_slices(
             parts = figure.subfigures(1, 2, squeeze=False, width_ratios=[1.0, 1.35])
         else:
             parts = figure.subfigures(2, 1, squeeze=False, height_ratios=[1.0, 1.15])
-        _solid(parts.flat[0], solid, plane)
+        finding = _solid(parts.flat[0], solid, plane)
         _slices(parts.flat[1], plane, names, "bcde")
+        style.conclude(figure, finding)
         return figure
 
 
@@ -167,10 +168,10 @@ def _lines(axes: Axes, x: Array, y: Array, values: Array, name: str) -> None:
 
 def _rail(axes: Axes, mesh: Any) -> Colorbar:
     """A colour bar in the upper right corner of a panel, which the solid leaves empty."""
-    rail = axes.inset_axes((0.5, 0.93, 0.46, 0.035))
+    rail = axes.inset_axes((0.38, 0.93, 0.58, 0.035))
     bar: Colorbar = axes.figure.colorbar(mesh, cax=rail, orientation="horizontal", extend="both")
     style.plain(bar)
-    bar.ax.tick_params(labelsize=5.0, length=2.0, pad=1.5)
+    bar.ax.tick_params(length=2.0, pad=1.5)
     bar.minorticks_off()
     return bar
 
@@ -182,7 +183,8 @@ def _decades(values: Array) -> tuple[float, float]:
     return max(low, 0.01 * high), high
 
 
-def _solid(figure: Figure | SubFigure, solid: xr.Dataset, plane: xr.Dataset) -> None:
+def _solid(figure: Figure | SubFigure, solid: xr.Dataset, plane: xr.Dataset) -> str:
+    """Draw the solid, and state what its errors are."""
     names = str(plane.attrs.get("triplet", "Fx MB MD")).split()
     turn = next((n for n in names if n in _CIRCLES and _CIRCLES[n][0] in names), None)
     if turn is None:
@@ -203,6 +205,7 @@ def _solid(figure: Figure | SubFigure, solid: xr.Dataset, plane: xr.Dataset) -> 
         to_display(upward, rows[upward]),
         to_display("error_distance", rows["error_distance"]),
     )
+    every = kept.copy()
     # The half before the plane of the slice is taken away, so that the inside is seen.
     value = float(plane.attrs.get("value", -0.5 * np.pi))
     if plane.attrs.get("fixed", turn) == turn:
@@ -229,9 +232,10 @@ def _solid(figure: Figure | SubFigure, solid: xr.Dataset, plane: xr.Dataset) -> 
     )
     _error_bar(bar)
     bar.ax.set_xlabel(axis_label("error_distance"))
-    figure.text(0.02, 0.97, "a", fontsize=8.0, fontweight="bold", va="top")
-    title = "error of the look-up table in all contacts, cut at the slice"
-    figure.text(0.07, 0.97, title, fontsize=7.0, va="top")
+    figure.text(0.02, 0.98, "a", fontsize=style.LARGE, fontweight="bold", va="top")
+    figure.text(0.07, 0.98, "look-up table's error, cut at the slice", va="top")
+    middle, wide = np.median(error[every]), np.quantile(error[every], 0.95)
+    return f"The look-up table's error is {middle:.2g} mm in the median, {wide:.2g} mm at 95 %"
 
 
 def _error_bar(bar: Colorbar) -> None:
@@ -246,14 +250,14 @@ def _error_bar(bar: Colorbar) -> None:
 def _frame(axes: Any, names: tuple[str, str, str]) -> None:
     axes.patch.set_visible(False)
     axes.view_init(16.0, -25.0)
-    axes.set_box_aspect((1.0, 1.0, 1.0), zoom=1.1)
-    for name, letter, pad in zip(names, "xyz", (-8.0, -8.0, -5.0), strict=True):
+    axes.set_box_aspect((1.0, 1.0, 1.1), zoom=1.1)
+    for name, letter, pad in zip(names, "xyz", (-8.0, -8.0, -1.0), strict=True):
         axis = getattr(axes, f"{letter}axis")
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
         axis.line.set(color=style.MUTED, linewidth=0.5)
         axis._axinfo["grid"].update(color="#e2e2e2", linewidth=0.4)
-        axis.set_label_text(axis_label(name), fontsize=6.0)
+        axis.set_label_text(axis_label(name))
         axis.labelpad = pad
-    axes.tick_params(labelsize=5.5, pad=-3.0)
+    axes.tick_params(pad=-3.0)
     axes.tick_params(axis="z", pad=0.0)
     axes.locator_params(nbins=4)

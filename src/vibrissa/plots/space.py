@@ -16,7 +16,7 @@ from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from vibrissa.plots.style import INK, MUTED, Box, box_axes
+from vibrissa.plots.style import INK, MUTED, PLAIN, SMALL, Box, box_axes
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import Array, root, values_of
 
@@ -57,7 +57,7 @@ def space_axes(
         axis.line.set(color=INK, linewidth=0.5)
         axis._axinfo["grid"].update(color="#e2e2e2", linewidth=0.4)
         axis._axinfo["tick"].update(inward_factor=0.0, outward_factor=0.25)
-    axes.tick_params(labelsize=5.5, pad=-4.0)
+    axes.tick_params(pad=-4.0)
     axes.locator_params(nbins=4)
     return axes
 
@@ -66,7 +66,7 @@ def name_axes(axes: Any, pads: Sequence[float] = (-9.0, -10.0, -11.0)) -> None:
     """Write x, y and z at the axes."""
     for name, pad in zip("xyz", pads, strict=True):
         axis = getattr(axes, f"{name}axis")
-        axis.set_label_text(axis_label(name), fontsize=6.0)
+        axis.set_label_text(axis_label(name))
         axis.labelpad = pad
 
 
@@ -176,6 +176,8 @@ def signal_axes(figure: Figure, panel: Box, limits: Array) -> Any:
         _write(axes, _FRONT, np.sqrt(ring) * near, floor, label, ha="left", va="top", color=MUTED)
     for angle in (0, 90, 180, -90):
         axes.plot(*np.outer(_toward(angle), [0.0, reach]), floor, **_FLOOR)
+        if angle == 0:
+            continue  # its end is hidden behind the solid
         label = f"{angle}°" if angle != 180 else f"${quantity('MD').symbol}$ = 180°"
         # The rays to the left end next to the solid and the largest ring's label, which centred
         # words would cover.
@@ -199,7 +201,7 @@ def _height_axis(axes: Any, limits: Array) -> None:
         _write(axes, left, 1.49 * reach, height, label, ha="right")
     for up, text in ((0.13, axis_label("Fx")), (0.045, "√ scale")):
         height = top + up * (top - floor)
-        _write(axes, left, 1.4 * reach, height, text, fontsize=6.0 if up > 0.1 else 5.0)
+        _write(axes, left, 1.4 * reach, height, text, fontsize=PLAIN if up > 0.1 else SMALL)
 
 
 def drop_lines(axes: Any, limits: Array, place: Array) -> None:
@@ -224,7 +226,7 @@ def _toward(angle: float) -> Array:
 
 def _write(axes: Any, angle: float, size: float, height: float, text: str, **look: Any) -> None:
     """A word in the cylinder, behind what is painted."""
-    plain_look = {"fontsize": 5.5, "ha": "center", "va": "center", "zorder": 0}
+    plain_look = {"fontsize": SMALL, "ha": "center", "va": "center", "zorder": 0}
     axes.text(*(size * _toward(angle)), height, text, **(plain_look | look))
 
 

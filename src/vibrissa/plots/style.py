@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from vibrissa.io import replacing
+from vibrissa.quantities import quantity
 from vibrissa.scene import DIRECTIONS, SIGNALS, Array, robust_limits, root, squared
 
 Width = Literal["single", "double"]
@@ -43,6 +44,9 @@ WIDTHS: Mapping[str, float] = MappingProxyType({"single": 85.0, "double": 178.0}
 
 _LETTER = 1.5
 """Mean width of a letter of 8 points, mm."""
+
+LARGE, PLAIN, SMALL = 8.0, 7.0, 6.0
+"""Sizes of type, points: findings and the letters of panels; titles and axes; all else."""
 
 INK = "#1a1a1a"
 MUTED = "#8c8c8c"
@@ -63,14 +67,14 @@ LOOK: Mapping[str, Any] = MappingProxyType(
         "font.family": "sans-serif",
         "font.sans-serif": ["DejaVu Sans"],  # comes with Matplotlib: the same look everywhere
         "mathtext.fontset": "dejavusans",
-        "font.size": 7.0,
-        "axes.labelsize": 7.0,
-        "axes.titlesize": 7.5,
+        "font.size": PLAIN,
+        "axes.labelsize": PLAIN,
+        "axes.titlesize": PLAIN,
         "axes.titlepad": 4.0,
         "axes.labelpad": 2.5,
-        "xtick.labelsize": 6.0,
-        "ytick.labelsize": 6.0,
-        "legend.fontsize": 6.0,
+        "xtick.labelsize": SMALL,
+        "ytick.labelsize": SMALL,
+        "legend.fontsize": SMALL,
         "legend.frameon": False,
         "legend.handlelength": 1.6,
         "axes.linewidth": 0.6,
@@ -182,7 +186,7 @@ def sentence(message: str, width: Width) -> Figure:
 
 def say(figure: Figure, message: str) -> None:
     """Write one sentence where there is nothing to draw."""
-    figure.text(0.5, 0.5, message, ha="center", va="center", color=MUTED, fontsize=8.0)
+    figure.text(0.5, 0.5, message, ha="center", va="center", color=MUTED, fontsize=LARGE)
 
 
 def conclude(figure: Figure, finding: str) -> None:
@@ -192,7 +196,7 @@ def conclude(figure: Figure, finding: str) -> None:
     lines = wrap(finding, int(wide / _LETTER))
     figure.above = 2.5 + 3.6 * len(lines)
     figure.text(
-        1.5 / wide, 1.0 + 1.0 / tall, "\n".join(lines), fontsize=8.0, ha="left", va="bottom"
+        1.5 / wide, 1.0 + 1.0 / tall, "\n".join(lines), fontsize=LARGE, ha="left", va="bottom"
     )
 
 
@@ -207,7 +211,7 @@ def head(axes: Axes, letter: str, title: str, left: float = 0.0) -> None:
             textcoords="offset points",
             ha="left",
             va="bottom",
-            fontsize=8.0 if look == "bold" else 7.0,
+            fontsize=LARGE if look == "bold" else PLAIN,
             fontweight=look,
         )
 
@@ -216,9 +220,15 @@ def corner_title(figure: Figure, box: Box, letter: str, title: str) -> None:
     """Write a bold letter and a few words at the upper left of a panel in space."""
     wide, tall = 25.4 * figure.get_size_inches()
     left, bottom, _, height = box
-    for text, right, size, weight in ((letter, 1.5, 8.0, "bold"), (title, 5.5, 6.5, "normal")):
+    for text, right, size, weight in ((letter, 1.5, LARGE, "bold"), (title, 5.5, PLAIN, "normal")):
         place = (left + right) / wide, (bottom + height) / tall
         figure.text(*place, text, fontsize=size, fontweight=weight, ha="left", va="top")
+
+
+def size_label(name: str) -> str:
+    """Label an axis with the size of a vector."""
+    q = quantity(name)
+    return f"$|{q.symbol}|$ ({q.display_unit})"
 
 
 def force_arrow(axes: Axes, start: Array, end: Array, colour: str, width: float) -> None:
@@ -334,7 +344,7 @@ def _drawn(figure: Figure, **how: Any) -> bytes:
 
 
 _QUARTERS = np.array(
-    [[0.47, -0.02, -0.18], [0.44, 0.16, 0.0], [0.80, 0.03, 0.155], [0.78, -0.11, 0.0]]
+    [[0.50, -0.03, -0.20], [0.47, 0.185, 0.0], [0.86, 0.0, 0.17], [0.82, -0.13, 0.01]]
 )
 """OKLab of the directions −180° (blue), −90° (magenta), 0° (yellow) and 90° (green)."""
 

@@ -26,7 +26,12 @@ EMPTY = "no contacts"
 _ROW = 4.2
 """Height of a row, mm."""
 
-_HEAD, _FOOT = 11.0, 8.0
+_HEAD, _FOOT = 11.0, 11.5
+_KEY = (
+    "numbers: largest distance (mm) of two contacts with the same signals",
+    "critical cone: about rest, outside it no such pair was found; ambiguous: share of contacts "
+    "that another one resembles within 0.1 % of ranges",
+)
 _EDGES = {"single": (18.5, 7.3, 20.0), "double": (24.0, 13.5, 36.0)}
 """Widths of the triplets' names, of a region's column and of the notation, mm."""
 
@@ -117,7 +122,7 @@ def _line(axes: Axes, y: float, page: float, weight: float) -> None:
 def _heads(axes: Axes, regions: list[str], width: style.Width, page: float, shares: bool) -> None:
     names, column, notation = _EDGES[width]
     base = _HEAD - 2.0
-    look: dict[str, Any] = {"fontsize": 6.5, "va": "bottom"}
+    look: dict[str, Any] = {"va": "bottom"}
     _line(axes, 1.5, page, 0.9)
     _line(axes, _HEAD - 1.0, page, 0.5)
     axes.text(4.0, base, "triplet", **look)
@@ -147,14 +152,14 @@ def _row(
             linewidth=0,
         )
     label = triplet_label(str(verdict["triplet"].values))
-    axes.text(4.0, y, label, fontsize=6.5, va="center", color=style.BLUE if chosen else style.INK)
+    axes.text(4.0, y, label, va="center", color=style.BLUE if chosen else style.INK)
     if chosen:
         axes.plot(2.6, y, marker=">", markersize=2.5, color=style.BLUE)
     for j, kind in enumerate(verdict["verdict"].values):
         x = names + (j + 0.5) * column
         _symbol(axes, x, y, str(kind))
         if width == "double":
-            look: dict[str, Any] = {"fontsize": 5.5, "va": "center_baseline"}
+            look: dict[str, Any] = {"fontsize": style.SMALL, "va": "center_baseline"}
             axes.text(x + 1.8, y, _separation(verdict, j), **look)
     left = names + verdict.sizes["region"] * column + 2.0
     if "notation" in verdict:
@@ -190,7 +195,7 @@ def _separation(verdict: xr.Dataset, region: int) -> str:
 
 def _evidence(axes: Axes, verdict: xr.Dataset, left: float, y: float) -> None:
     """Critical cone, and the share of ambiguous contacts as a bar, of all contacts."""
-    look: dict[str, Any] = {"fontsize": 5.5, "va": "center"}
+    look: dict[str, Any] = {"fontsize": style.SMALL, "va": "center"}
     if "critical_cone" in verdict:
         cone = float(np.degrees(verdict["critical_cone"].sel(region="all")))
         text = "" if not np.isfinite(cone) else f"{cone:.1f}°" if cone > 0.0 else "none"
@@ -211,11 +216,12 @@ def _key(axes: Axes, height: float, width: style.Width) -> None:
     x = 3.5
     for kind, room in zip(VERDICTS, (14.0, 30.0, 20.0), strict=True):
         _symbol(axes, x, y, kind)
-        axes.text(x + 2.2, y, kind, fontsize=6.0, va="center")
+        axes.text(x + 2.2, y, kind, fontsize=style.SMALL, va="center")
         x += room
     if width == "double":
-        text = "numbers: largest distance (mm) of two contacts with the same signals"
-        axes.text(x, y, text, fontsize=6.0, va="center")
+        for line, text in enumerate(_KEY):
+            left, small = (3.5 if line else x), style.SMALL
+            axes.text(left, y + 3.5 * line, text, fontsize=small, va="center")
 
 
 HIGHLIGHTED = ("Fx MB MD", "Mx MB MD", "Fx FD MD")
@@ -367,12 +373,20 @@ def critical_cones(cones: xr.Dataset, *, width: style.Width = "double") -> Figur
         tall = 62.0 if width == "double" else 46.0 * count + 14.0
         figure = style.new_figure(width, tall, "constrained")
         grid = figure.subplots(*shape, sharex=True, sharey=True, squeeze=False)
+        counts: dict[str, float] = {}
         for i, axes in enumerate(grid.ravel()):
             _cone_map(axes, cone.isel(triplet=i), degrees[i], norm, colours)
             known = degrees[i][np.isfinite(degrees[i])]
             narrow = f"{(known <= PAPERS_CONE).sum()} of {known.size} within {PAPERS_CONE:g}°"
             name = triplet_label(str(cone["triplet"].values[i]))
             style.head(axes, "abcdefghijkl"[i], f"{name}: {narrow}")
+            counts[name] = float((known <= PAPERS_CONE).mean()) if known.size else 0.0
+        most = max(counts, key=lambda name: counts[name])
+        style.conclude(
+            figure,
+            f"({most}) locates contacts outside {PAPERS_CONE:g}° on most whiskers, as far as was "
+            f"searched: {100.0 * counts[most]:.0f} % of them",
+        )
         for axes in grid[:, 0]:
             axes.set_ylabel("base / tip radius")
         for axes in grid[-1]:
@@ -422,7 +436,7 @@ def _contours(axes: Axes, x: Array, y: Array, degrees: Array, high: float) -> No
     widths = [1.1 if level == PAPERS_CONE else 0.5 for level in levels]
     shown = np.ma.masked_array(degrees, ~np.isfinite(degrees) | _exceptional(degrees))
     lines = axes.contour(x, y, shown, levels=levels, colors=style.INK, linewidths=widths)
-    axes.clabel(lines, fmt=lambda value: f"{value:g}°", fontsize=5.5, inline_spacing=2)
+    axes.clabel(lines, fmt=lambda value: f"{value:g}°", fontsize=style.SMALL, inline_spacing=2)
 
 
 def _exceptional(degrees: Array) -> NDArray[np.bool_]:

@@ -156,5 +156,5 @@ def _caption(axes: Axes, name: str | None, magnification: float, assumed: Sequen
         transform=axes.transAxes,
         va="top",
         color=style.MUTED,
-        fontsize=6.0,
+        fontsize=style.SMALL,
     )

@@ -11,6 +11,7 @@ from matplotlib.ticker import MaxNLocator
 
 import vibrissa as vb
 from vibrissa.contour import CylinderFit, shape_from_dataset
+from vibrissa.numerics import Array
 from vibrissa.objects import Peg
 from vibrissa.plots import key_frames
 from vibrissa.plots.contact_surfaces import coordinate_bar, levels
@@ -41,7 +42,6 @@ from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.recording import Recording
 from vibrissa.scene import (
     TRIPLET,
-    Array,
     Course,
     column,
     course_of,

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 import vibrissa as vb
 from vibrissa.cameras import orthogonal_views
 from vibrissa.io import read_video
+from vibrissa.numerics import Array
 from vibrissa.plots.style import (
     MUTED,
     ORANGE,
@@ -24,7 +25,6 @@ from vibrissa.plots.style import (
     size_label,
 )
 from vibrissa.quantities import axis_label, to_display
-from vibrissa.scene import Array
 from vibrissa.simulation import facing_peg, film, simulate, sweep_past, with_true_traces
 from vibrissa.tracking import TrackOptions, trace_video, track
 

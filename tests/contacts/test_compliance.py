@@ -129,10 +129,10 @@ def test_a_gain_that_forgets_itself(gamma_map):
     kept, sizes, sigmas = np.exp(-step / tau), [], {}
     for memory in (tau, np.inf):
         follow = vb.ContactFilter(locate, speed=1e-4, memory=memory)
-        for _ in range(12 if memory == tau else 1):
+        for _ in range(8 if memory == tau else 1):
             follow.reset()
             error = rng.normal()
-            for i in range(40):
+            for i in range(24):
                 measured = wrench * (1.0 + share * error)
                 measured = measured + rng.normal(size=6) * np.sqrt(np.diag(NOISE))
                 signals = vb.base_signals(measured[:3], measured[3:])

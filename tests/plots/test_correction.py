@@ -6,7 +6,7 @@ from matplotlib.backend_bases import KeyEvent, MouseEvent
 from matplotlib.figure import Figure
 
 from vibrissa.io import FrameReader, load_corrections, save_corrections, write_video
-from vibrissa.plots.correction import Correction, correct
+from vibrissa.plots.windows import Correction, correct
 
 FRAMES = [np.full((60, 80), 10 * i, np.uint8) for i in range(25)]
 

@@ -6,7 +6,7 @@ from matplotlib.backend_bases import KeyEvent, MouseEvent
 
 from vibrissa.io import Clicks, ViewClicks
 from vibrissa.plots import pick
-from vibrissa.plots.picking import Picking, Picks
+from vibrissa.plots.windows import Picking, Picks
 
 EMPTY = Picks(Clicks((ViewClicks(), ViewClicks())))
 

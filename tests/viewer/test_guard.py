@@ -9,7 +9,7 @@ pytest.importorskip("viser", reason="viser is not installed", exc_type=ImportErr
 
 import vibrissa as vb
 from vibrissa.viewer import view
-from vibrissa.viewer.page_script import SCRIPT, with_script
+from vibrissa.viewer.save import SCRIPT, with_script
 from vibrissa.viewer.server import free_port, from_own_page
 
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import vibrissa as vb
-from vibrissa.viewer.colours import counted, shaded
 from vibrissa.viewer.locate import (
     COLOURS,
     Sensor,
@@ -14,6 +13,7 @@ from vibrissa.viewer.locate import (
     of_located,
     usual_sensor,
 )
+from vibrissa.viewer.readout import counted, shaded
 from vibrissa.viewer.state import begin, charted, moved
 
 

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from vibrissa.numerics import Array
 
 PIXEL_SIZE = 58e-6
 """Size of a pixel of the paper's cameras in the scene, m."""

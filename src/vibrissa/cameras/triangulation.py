@@ -9,11 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from vibrissa.cameras.camera import Camera
-
-Array = NDArray[np.float64]
+from vibrissa.numerics import Array
 
 _STEEP = 0.2
 """Smallest sine of the angle between a single camera's line of sight and the plane z = 0."""

@@ -190,10 +190,10 @@ class TraceStatements:
 
     def masks(
         self, cameras: Sequence[vb.cameras.Camera], clicks: vb.io.Clicks | None
-    ) -> list[vb.io.Mask | None]:
+    ) -> list[vb.numerics.Mask | None]:
         """Return the pixels of each view in which no whisker is; None where all may be."""
         views = list(clicks.views if clicks else [vb.io.ViewClicks()] * len(cameras))
-        images: list[list[vb.io.Mask]] = [[] for _ in views]
+        images: list[list[vb.numerics.Mask]] = [[] for _ in views]
         for name, stated in (("mask", self.mask), ("region", self.region)):
             for text in stated or ():
                 number, _, area = text.partition(":")
@@ -364,7 +364,7 @@ def _track(
     cameras: tuple[vb.cameras.Camera, ...],
     rate: float,
     bases: Sequence[Any],
-    masks: Sequence[vb.io.Mask | None],
+    masks: Sequence[vb.numerics.Mask | None],
     corrections: Any,
     options: vb.tracking.TraceOptions,
     how: vb.tracking.TrackOptions,
@@ -399,7 +399,7 @@ def _found(
     videos: Sequence[Path],
     picture: Path,
     cameras: tuple[vb.cameras.Camera, ...],
-    masks: Sequence[vb.io.Mask | None],
+    masks: Sequence[vb.numerics.Mask | None],
     options: vb.tracking.TraceOptions,
     offset: int,
 ) -> tuple[list[Any], vb.tracking.TraceOptions]:

@@ -17,7 +17,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from vibrissa.contour.fitted_shape import Body
-from vibrissa.contour.touches import Array
+from vibrissa.numerics import Array
 from vibrissa.quantities import QUANTITIES, attributes, to_display
 
 REPLICATES = 20

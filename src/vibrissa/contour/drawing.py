@@ -12,7 +12,7 @@ from scipy.special import chdtri
 from vibrissa.contour.fitted_shape import FittedShape
 from vibrissa.contour.free_surface import FreeFit
 from vibrissa.contour.simple_shapes import CylinderFit, PlaneFit, SphereFit, frame_across
-from vibrissa.contour.touches import Array
+from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
 
 _INWARD = 0.9

@@ -46,7 +46,8 @@ from vibrissa.contour.simple_shapes import (
     SphereFit,
     frame_across,
 )
-from vibrissa.contour.touches import FLOOR, Array, Checked, Touches, checked, whitened
+from vibrissa.contour.touches import FLOOR, Checked, Touches, checked, whitened
+from vibrissa.numerics import Array
 
 _SOFT = 2.0
 """Residual, in standard deviations, from which points count less."""

@@ -12,7 +12,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
-from vibrissa.contour.touches import Array, Mask
+from vibrissa.numerics import Array, Mask
 from vibrissa.quantities import QUANTITIES, attributes
 
 DIRECTION = "object_axis"

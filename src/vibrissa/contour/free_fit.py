@@ -35,7 +35,8 @@ from vibrissa.contour.fit import TO_SIGMA, fit_shape
 from vibrissa.contour.fitted_shape import excess_of
 from vibrissa.contour.free_surface import FreeFit, Support, merged
 from vibrissa.contour.simple_shapes import SHAPES, SimpleShape, frame_across
-from vibrissa.contour.touches import FLOOR, Array, ContactArrays, Mask, checked
+from vibrissa.contour.touches import FLOOR, ContactArrays, checked
+from vibrissa.numerics import Array, Mask
 
 _BETTER = {"plane": 1.0, "sphere": 0.9, "cylinder": 0.5}
 """Largest deviations from a base, as a share of those from simpler ones, for it to be chosen.

@@ -37,7 +37,8 @@ from scipy.spatial.distance import cdist
 
 from vibrissa.contour.fitted_shape import FittedShape, check_complete, rows_of
 from vibrissa.contour.simple_shapes import SHAPES, SimpleShape
-from vibrissa.contour.touches import FLOOR, Array
+from vibrissa.contour.touches import FLOOR
+from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
 
 _AT_ONCE = 4096

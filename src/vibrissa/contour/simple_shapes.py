@@ -24,7 +24,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.contour.fitted_shape import DIRECTION, FittedShape
-from vibrissa.contour.touches import FLOOR, Array, Checked, Touches
+from vibrissa.contour.touches import FLOOR, Checked, Touches
+from vibrissa.numerics import Array
 
 _SMALLEST = 1e-3
 """Radius to start from, at least, as a share of that of the surface that the points are on."""

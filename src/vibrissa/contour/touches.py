@@ -8,8 +8,7 @@ from typing import Any, NamedTuple, TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from vibrissa.numerics import Array, Mask
 
 FLOOR = 1e-7
 """Smallest standard deviation, as a share of the points' extent, where their noise is zero."""

@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 
 from vibrissa.contacts import spherical
 from vibrissa.contour import CylinderFit, axis_offset
+from vibrissa.numerics import Array
 from vibrissa.objects import Peg
 from vibrissa.pipeline import ANGLE_CLASSES
 from vibrissa.signals import nearest_on_rest, within_turn
 from vibrissa.whisker import Whisker
-
-Array = NDArray[np.float64]
 
 ERRORS = ("error_r", "error_theta", "error_phi", "error_distance")
 """Names of the errors of r, θ, φ, and of the distance in space."""

@@ -7,14 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
 from vibrissa.evaluation.contacts import ANGLES, angle_label
+from vibrissa.numerics import Array
 from vibrissa.recording import Group, Recording
 from vibrissa.whisker import Whisker
-
-Array = NDArray[np.float64]
 
 _SPREAD = (50.0, 95.0)
 

@@ -15,7 +15,6 @@ from vibrissa.io.array import load_array, save_array
 from vibrissa.io.centerline import load_centerline, load_whisker, save_centerline
 from vibrissa.io.clicks import (
     Clicks,
-    Mask as Mask,
     Points as Points,
     ViewClicks,
     load_clicks,
@@ -25,7 +24,6 @@ from vibrissa.io.clicks import (
 )
 from vibrissa.io.kinds import READERS as READERS, Kind, load_tracks, recognise
 from vibrissa.io.matlab import load_matlab
-from vibrissa.io.movie import write_movie, write_video
 from vibrissa.io.netcdf import (
     COMPRESSED as COMPRESSED,
     is_netcdf as is_netcdf,
@@ -90,8 +88,10 @@ from vibrissa.io.toml import (
     subtable as subtable,
     three_numbers as three_numbers,
 )
-from vibrissa.io.tracks import RawTracks as RawTracks, join_views, labelled as labelled
-from vibrissa.io.tracks_file import (
+from vibrissa.io.tracks import (
+    RawTracks as RawTracks,
+    join_views,
+    labelled as labelled,
     load_traces as load_traces,
     save_traces as save_traces,
     save_tracks,
@@ -105,6 +105,8 @@ from vibrissa.io.video import (
     read_video,
     video_frames as video_frames,
     video_info,
+    write_movie,
+    write_video,
 )
 from vibrissa.io.video_tables import (
     load_contact_points,

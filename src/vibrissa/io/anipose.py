@@ -26,15 +26,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vibrissa.deferred import xr
 from vibrissa.io.paths import replacing
 from vibrissa.io.table import read_numbers
 from vibrissa.io.toml import in_file, number_array, quoted, read_toml
 from vibrissa.io.tracks import SPACE, RawTracks
-
-Array = NDArray[np.float64]
+from vibrissa.numerics import Array
 
 
 def read_anipose(path: str | PathLike[str]) -> RawTracks:

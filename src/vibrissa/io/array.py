@@ -34,12 +34,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from vibrissa.io.centerline import UNITS, check_slender, load_whisker, tells_radius
 from vibrissa.io.netcdf import is_netcdf, kind_of, naming, read_tree, write_netcdf
 from vibrissa.io.recording import separate_whiskers, stacked_whiskers
 from vibrissa.io.table import Table, few_faults, write_table
+from vibrissa.numerics import Array
 from vibrissa.whisker import (
     Identity,
     Pose,
@@ -159,8 +160,6 @@ def _array(path: Path, whiskers: Sequence[Whisker]) -> WhiskerArray:
     except ValueError as fault:
         raise ValueError(f"{path}: {fault}") from None
 
-
-Array = NDArray[np.float64]
 
 _ANGLES = ("azimuth", "elevation", "roll")
 _ROTATION = tuple(f"r{i}{j}" for i in "123" for j in "123")

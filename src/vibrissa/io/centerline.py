@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Unpack
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from vibrissa.io.table import (
     LENGTHS,
@@ -27,9 +27,8 @@ from vibrissa.io.table import (
     unit_factor,
     write_table,
 )
+from vibrissa.numerics import Array
 from vibrissa.whisker import Properties, Whisker
-
-Array = NDArray[np.float64]
 
 UNITS = {"": 1.0, "_m": 1.0, "_mm": 1e-3, "_um": 1e-6, "_µm": 1e-6}
 """Suffix of a column's name and the length it stands for, m."""

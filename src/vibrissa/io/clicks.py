@@ -20,13 +20,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from vibrissa.io.paths import check_writable
 from vibrissa.io.toml import check_keys, in_file, number_array, quoted, read_toml
+from vibrissa.numerics import Mask
 
 Points = tuple[tuple[float, float], ...]
-Mask = NDArray[np.bool_]
 
 _FEWEST = 3
 """Number of corners of a polygon, at least."""

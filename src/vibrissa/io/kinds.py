@@ -17,16 +17,19 @@ import h5py
 
 from vibrissa.deferred import xr
 from vibrissa.io.anipose import read_anipose
-from vibrissa.io.deeplabcut import pandas_tables, read_deeplabcut
+from vibrissa.io.keypoints import (
+    pandas_tables,
+    read_deeplabcut,
+    read_movement,
+    read_sleap_analysis,
+    read_sleap_labels,
+)
 from vibrissa.io.matlab import read_matlab
-from vibrissa.io.movement import read_movement
 from vibrissa.io.netcdf import kind_of, opened
 from vibrissa.io.nwb import read_nwb
 from vibrissa.io.paths import check_readable, without_part
-from vibrissa.io.sleap import read_sleap_analysis, read_sleap_labels
 from vibrissa.io.table import read_text, signal_column, table_rows
-from vibrissa.io.tracks import Labels, RawTracks, labelled
-from vibrissa.io.tracks_file import load_own_tracks, read_tracks_table
+from vibrissa.io.tracks import Labels, RawTracks, labelled, load_own_tracks, read_tracks_table
 from vibrissa.io.video_tables import ANGLES, CORRECTION_COLUMNS, MATRIX, QUATERNION
 from vibrissa.io.whisk import MEASUREMENTS, WHISKERS, read_measurements, read_whiskers
 

@@ -30,14 +30,12 @@ from typing import Any, Unpack
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 from vibrissa.deferred import xr
 from vibrissa.io.netcdf import opened
 from vibrissa.io.paths import check_readable
 from vibrissa.io.tracks import Labels, RawTracks, labelled
-
-Array = NDArray[np.float64]
+from vibrissa.numerics import Array
 
 
 @dataclass(frozen=True, eq=False)

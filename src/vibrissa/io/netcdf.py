@@ -19,9 +19,11 @@ import math
 import struct
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import lru_cache
 from mmap import ACCESS_READ, mmap
 from os import PathLike
 from pathlib import Path
+from time import time_ns
 from typing import Any, NamedTuple
 
 import h5py
@@ -36,6 +38,9 @@ _DENSEST = 1100
 ALWAYS_ALLOWED = 1 << 28
 """Bytes that any file may claim to hold."""
 
+_TICK = 100_000_000
+"""Time by which clocks of file systems may be behind, ns, with room."""
+
 _HEAP = b"GCOL\1\0\0\0"
 
 
@@ -44,11 +49,14 @@ def opened(path: str | PathLike[str], what: str, *, soft_links: bool = True) -> 
     """Open a file in HDF5 for reading, once it has been found harmless."""
     path = check_readable(path)
     refuse_whisk(path)
+    about, now = path.stat(), time_ns()
+    changed = about.st_ctime_ns
+    # What is changed again within a tick of the clock has the same time.
+    version = about.st_dev, about.st_ino, changed, now if abs(now - changed) < _TICK else 0
     with naming(path, what):
-        _check_heaps(path)
-    with naming(path, what), h5py.File(path, "r") as file:
-        _check(file, path.stat().st_size, soft_links)
-        yield file
+        _check(path.absolute(), about.st_size, soft_links, version)
+        with h5py.File(path, "r") as file:
+            yield file
 
 
 @contextmanager
@@ -114,7 +122,15 @@ def _items(file: h5py.File, soft_links: bool) -> Iterator[tuple[str, h5py.HLObje
                 yield name, item
 
 
-def _check(file: h5py.File, size: int, soft_links: bool) -> None:
+@lru_cache(maxsize=64)
+def _check(path: Path, size: int, soft_links: bool, version: tuple[int, ...]) -> None:
+    """Refuse what may do harm; a file that is as it was, which `version` shows, is checked once."""
+    _check_heaps(path)
+    with h5py.File(path, "r") as file:
+        _check_items(file, size, soft_links)
+
+
+def _check_items(file: h5py.File, size: int, soft_links: bool) -> None:
     """Refuse data kept elsewhere, and more of them than a file of `size` bytes holds."""
     claimed = 0
     for name, item in _items(file, soft_links):

@@ -22,14 +22,12 @@ from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 from vibrissa.deferred import xr
 from vibrissa.io.netcdf import opened
 from vibrissa.io.tracks import RawTracks
+from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
-
-Array = NDArray[np.float64]
 
 _PIXELS = ("pixels", "pixel", "px")
 _LENGTHS = {

@@ -24,15 +24,14 @@ from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 from vibrissa.deferred import xr
 from vibrissa.io.paths import NWB, check_writable, replacing
+from vibrissa.numerics import Array
 
 if TYPE_CHECKING:
     from pynwb import NWBFile
 
-Array = NDArray[np.float64]
 
 _TURN = "Rotation from the {} to the laboratory frame; its columns are the axes"
 _SERIES = {

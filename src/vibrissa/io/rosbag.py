@@ -26,9 +26,8 @@ from types import TracebackType
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from vibrissa.numerics import Array
 
 _WRENCH = "geometry_msgs/msg/WrenchStamped"
 _POINT = "geometry_msgs/msg/PointStamped"

@@ -14,7 +14,6 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vibrissa.deferred import xr
 from vibrissa.io.netcdf import is_netcdf, naming, read_dataset
@@ -28,10 +27,9 @@ from vibrissa.io.table import (
     units_of,
     write_table,
 )
+from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
 from vibrissa.whisker import Whisker
-
-Array = NDArray[np.float64]
 
 COLUMNS = ("time", "Fx", "Fy", "Fz", "Mx", "My", "Mz")
 """Names of the columns, in the order in which they are written."""

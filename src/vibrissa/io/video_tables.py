@@ -39,9 +39,8 @@ from scipy.spatial.transform import Rotation
 
 from vibrissa.deferred import xr
 from vibrissa.io.table import Table, read_numbers, write_table
+from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
-
-Array = NDArray[np.float64]
 
 _SHOWN = 5
 

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from vibrissa.deferred import xr
 from vibrissa.io.paths import check_readable
 from vibrissa.io.tracks import Labels, RawTracks, labelled
+from vibrissa.numerics import Array
 
-Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 WHISKERS = b"bwhiskbin1\0\0"

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.deferred import ndimage
+from vibrissa.numerics import Array
 from vibrissa.objects.surface import Surface
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 NODES = 1_200_000

@@ -12,15 +12,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from vibrissa.deferred import xr
+from vibrissa.numerics import Array
 from vibrissa.objects.mesh import Mesh
 from vibrissa.objects.surface import Surface
 from vibrissa.quantities import attributes
 from vibrissa.whisker import ORTHOGONALITY
-
-Array = NDArray[np.float64]
 
 
 class _Faults:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.contacts import ContactMap, Gravity, Prior, spherical
 from vibrissa.contour import continuing_candidates, to_laboratory
+from vibrissa.numerics import Array
 from vibrissa.pipeline.frames import cross_matrices, signals_in
 from vibrissa.pipeline.locate import TRIPLET, locate, locate_from_wrench, without_contact
 from vibrissa.pipeline.signals import sensor_noise
@@ -24,8 +25,6 @@ from vibrissa.sensors import StageSweep, SuspendedWhisker, SweptContacts
 from vibrissa.signals import selection
 from vibrissa.status import Status, is_ok
 from vibrissa.whisker import Whisker
-
-Array = NDArray[np.float64]
 
 Progress = Callable[[str, int, int], None]
 """Function called with the present stage, and the numbers of steps done and of all steps."""

@@ -9,11 +9,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from vibrissa.numerics import Array
 from vibrissa.recording import Group, faults_in, recorded
 from vibrissa.signals import base_signals
 from vibrissa.whisker import Whisker
-
-Array = NDArray[np.float64]
 
 EACH = ("time", "whisker")
 """Dimensions of contacts."""

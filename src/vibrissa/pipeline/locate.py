@@ -48,6 +48,7 @@ from vibrissa.contacts import (
     second_contact,
     whitening,
 )
+from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
 from vibrissa.recording import Group
 from vibrissa.rod import Discretization, contact_tangents, discretize, resting, solve_forces
@@ -55,8 +56,6 @@ from vibrissa.sensors import component_noise
 from vibrissa.signals import base_signals, selection, signals_of
 from vibrissa.status import Status, flag_attributes
 from vibrissa.whisker import Whisker
-
-Array = NDArray[np.float64]
 
 TRIPLET = ("Fx", "MB", "MD")
 """Signals that contacts are estimated from by default."""

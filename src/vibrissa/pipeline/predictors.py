@@ -10,15 +10,13 @@ from __future__ import annotations
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
 from vibrissa.recording import Recording
 from vibrissa.signals import base_signals
 from vibrissa.status import flag_attributes
 from vibrissa.whisker import angles_of
-
-Array = NDArray[np.float64]
 
 _COMPONENTS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 _ANGLES = ("base_azimuth", "base_elevation", "base_roll")

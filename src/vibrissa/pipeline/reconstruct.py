@@ -16,7 +16,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from vibrissa.contour import (
     CylinderFit,
@@ -30,6 +30,7 @@ from vibrissa.contour import (
     fit_free,
     fit_shape,
 )
+from vibrissa.numerics import Array
 from vibrissa.objects import Peg, Sphere, Surface
 from vibrissa.pipeline.estimates import WHOLE
 from vibrissa.pipeline.frames import EACH, estimates_in, whisker_radii
@@ -38,8 +39,6 @@ from vibrissa.recording import Group, Recording
 from vibrissa.signals import nearest_on_rest
 from vibrissa.status import describe
 from vibrissa.whisker import Whisker
-
-Array = NDArray[np.float64]
 
 Shape = Literal["cylinder", "sphere", "plane", "free"]
 """Shapes that can be fitted to contacts."""

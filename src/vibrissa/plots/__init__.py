@@ -6,11 +6,9 @@ from vibrissa.plots.cameras import Sight, start_views as start_views
 from vibrissa.plots.contact_surfaces import contact_surfaces
 from vibrissa.plots.contacts import contact_places
 from vibrissa.plots.contour import contour_views, distances_by_class
-from vibrissa.plots.correction import correct as correct
 from vibrissa.plots.estimates import estimated_against_true
 from vibrissa.plots.movies import contour_frames, signal_frames
 from vibrissa.plots.overview import key_frames, trial_overview
-from vibrissa.plots.picking import pick as pick
 from vibrissa.plots.sensitivity import sensitivity_panels
 from vibrissa.plots.signal_space import signal_clouds
 from vibrissa.plots.signals import signals_over_time as signals_over_time
@@ -25,6 +23,7 @@ from vibrissa.plots.style import (
 from vibrissa.plots.sweep import drawable as drawable, sweep_overview as sweep_overview
 from vibrissa.plots.verdicts import HIGHLIGHTED, critical_cones, resolution, verdict_table
 from vibrissa.plots.whisker import whisker_views
+from vibrissa.plots.windows import correct as correct, pick as pick
 
 __all__ = [
     "HIGHLIGHTED",

@@ -19,6 +19,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
+from vibrissa.numerics import Array, Mask
 from vibrissa.plots.space import paint, space_axes
 from vibrissa.plots.style import (
     INK,
@@ -37,7 +38,7 @@ from vibrissa.plots.style import (
 )
 from vibrissa.quantities import axis_label, to_display
 from vibrissa.recording import Group
-from vibrissa.scene import Array, Mask, head_surfaces, is_bounded, object_surface
+from vibrissa.scene import head_surfaces, is_bounded, object_surface
 from vibrissa.whisker import Identity
 
 ROW_COLOURS: Mapping[str, str] = MappingProxyType(

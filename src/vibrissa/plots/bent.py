@@ -13,10 +13,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
+from vibrissa.numerics import Array
 from vibrissa.plots import style
 from vibrissa.plots.verdicts import triplet_label
 from vibrissa.quantities import axis_label, quantity, to_display
-from vibrissa.scene import DIRECTIONS, SIGNALS, Array
+from vibrissa.scene import DIRECTIONS, SIGNALS
 
 _COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.INK)
 _REST = "#c4c4c4"

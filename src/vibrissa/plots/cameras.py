@@ -10,8 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
+from vibrissa.numerics import Array
 from vibrissa.plots import style
-from vibrissa.scene import Array, Course
+from vibrissa.scene import Course
 
 Grey = NDArray[np.uint8]
 

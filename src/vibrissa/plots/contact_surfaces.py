@@ -14,6 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from vibrissa import scene
+from vibrissa.numerics import Array
 from vibrissa.plots import style
 from vibrissa.plots.space import (
     bounds,
@@ -113,8 +114,8 @@ def contact_surfaces(
 
 
 def _level_sets(
-    nodes: scene.Array, name: str, norm: Normalize, marks: list[float]
-) -> tuple[scene.Array, scene.Array]:
+    nodes: Array, name: str, norm: Normalize, marks: list[float]
+) -> tuple[Array, Array]:
     """Surfaces on which a coordinate has certain values, and their colours."""
     surfaces, hues = [], []
     for mark in marks:
@@ -141,11 +142,11 @@ def _write_values(
         figure.text(*place, text, color=style.sequential()(norm(mark)), **look)
 
 
-def _places(triangles: scene.Array) -> scene.Array:
+def _places(triangles: Array) -> Array:
     return to_display("contact_point", triangles[..., :3])
 
 
-def levels(name: str, shell: scene.Array) -> tuple[Normalize, list[float]]:
+def levels(name: str, shell: Array) -> tuple[Normalize, list[float]]:
     """Limits of the colours, and round values for surfaces."""
     values = to_display(name, scene.values_of(name, shell))
     low, high = scene.robust_limits(values)
@@ -183,7 +184,7 @@ def _sheet(width: style.Width) -> tuple[float, list[_Panel], list[style.Box]]:
     return height, panels, rails
 
 
-def _contact_axes(figure: Figure, panel: _Panel, limits: scene.Array) -> Any:
+def _contact_axes(figure: Figure, panel: _Panel, limits: Array) -> Any:
     style.corner_title(figure, panel.box, panel.letter, panel.title)
     left, bottom, width, height = square(panel.box)
     zoom = 0.87 if width > 50.0 else 0.82
@@ -192,7 +193,7 @@ def _contact_axes(figure: Figure, panel: _Panel, limits: scene.Array) -> Any:
     return axes
 
 
-def _cylinder(figure: Figure, panel: _Panel, limits: scene.Array) -> Any:
+def _cylinder(figure: Figure, panel: _Panel, limits: Array) -> Any:
     style.corner_title(figure, panel.box, panel.letter, panel.title)
     return signal_axes(figure, panel.box, limits)
 
@@ -229,8 +230,8 @@ def solid_panels(
     samples: xr.Dataset,
     centerline: ArrayLike,
     panels: Sequence[style.Box],
-    measured: scene.Array,
-) -> tuple[list[Any], scene.Array]:
+    measured: Array,
+) -> tuple[list[Any], Array]:
     """Draw the solid of all signals that is near those measured (n, 3) once a panel; its limits."""
     nodes = scene.sample_contacts(samples, centerline)
     within: list[int] = []
@@ -248,8 +249,8 @@ def solid_panels(
 
 
 def course_scales(
-    figure: Figure, rails: Sequence[style.Box], coordinates: scene.Array
-) -> list[tuple[scene.Array, Normalize]]:
+    figure: Figure, rails: Sequence[style.Box], coordinates: Array
+) -> list[tuple[Array, Normalize]]:
     """Values of r, θ and φ (n, 3) in display units, each with its colours, shown on a bar."""
     scales = []
     for name, rail, column_of in zip(scene.COORDINATES, rails, coordinates.T, strict=True):
@@ -263,7 +264,7 @@ def course_scales(
     return scales
 
 
-def _gentle(nodes: scene.Array, measured: scene.Array) -> scene.Array:
+def _gentle(nodes: Array, measured: Array) -> Array:
     """Margin of signals within 1.5 times those of a trial; negative beyond."""
     force, moment = _ROOM * np.nanmax(np.abs(measured[:, :2]), axis=0)
     tension = 1.0 - np.abs(scene.values_of("Fx", nodes)) / max(force, 1e-12)

@@ -10,10 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from vibrissa.numerics import Array
 from vibrissa.plots import style
 from vibrissa.plots.objects import Body, draw_body, draw_head, head_of, one_scale
 from vibrissa.quantities import axis_label, to_display
-from vibrissa.scene import Array, Course, deflection_angles
+from vibrissa.scene import Course, deflection_angles
 
 _SNAPSHOTS = 7
 _FACE = np.array([[-11.0, -26.0, 2.0], [11.0, -26.0, 2.0], [0.0, 0.0, 0.0]])

@@ -20,6 +20,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from numpy.typing import ArrayLike
 
+from vibrissa.numerics import Array
 from vibrissa.plots import style
 from vibrissa.plots.objects import (
     BAND,
@@ -32,7 +33,7 @@ from vibrissa.plots.objects import (
     outline,
 )
 from vibrissa.quantities import axis_label, quantity, to_display
-from vibrissa.scene import Array, robust_limits
+from vibrissa.scene import robust_limits
 
 _VIEWS = ((0, 1), (0, 2), (1, 2))
 _NAMES = "xyz"

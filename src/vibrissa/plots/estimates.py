@@ -10,6 +10,7 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from vibrissa.numerics import Array
 from vibrissa.plots.style import (
     MUTED,
     SMALL,
@@ -23,7 +24,7 @@ from vibrissa.plots.style import (
     usable_rows,
 )
 from vibrissa.quantities import axis_label, quantity, to_display
-from vibrissa.scene import COORDINATES, Array, robust_limits
+from vibrissa.scene import COORDINATES, robust_limits
 
 
 def estimated_against_true(

@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
 
+from vibrissa.numerics import Array
 from vibrissa.plots import style
 from vibrissa.plots.cameras import Sight, Window, part_of, scale_bar, seen, sight_axes
 from vibrissa.plots.contact_surfaces import course_scales, solid_panels
@@ -35,7 +36,7 @@ from vibrissa.plots.space import (
     space_axes,
 )
 from vibrissa.quantities import axis_label, to_display
-from vibrissa.scene import TRIPLET, Array, Course, spherical
+from vibrissa.scene import TRIPLET, Course, spherical
 
 Picture = NDArray[np.uint8]
 

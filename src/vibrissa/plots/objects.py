@@ -10,9 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Polygon
 from numpy.typing import ArrayLike
 
+from vibrissa.numerics import Array
 from vibrissa.plots.style import MUTED, ORANGE
 from vibrissa.quantities import to_display
-from vibrissa.scene import Array, Course, head_surfaces
+from vibrissa.scene import Course, head_surfaces
 
 _CELLS, _COARSE = 121, 4
 _FULL = 0.97

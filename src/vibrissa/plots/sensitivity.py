@@ -13,9 +13,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
+from vibrissa.numerics import Array, Mask
 from vibrissa.plots import style
 from vibrissa.quantities import axis_label, quantity, to_display
-from vibrissa.scene import COORDINATES, DIRECTIONS, Array, Mask, robust_limits
+from vibrissa.scene import COORDINATES, DIRECTIONS, robust_limits
 
 BINS = 25
 SHARE = 0.99

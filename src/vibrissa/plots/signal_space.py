@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from vibrissa import scene
+from vibrissa.numerics import Array, Mask
 from vibrissa.plots import style
 from vibrissa.plots.space import AZIMUTH, ELEVATION, bounds, name_axes, paint, painted, space_axes
 from vibrissa.quantities import axis_label, quantity, to_display
@@ -118,7 +119,7 @@ def signal_clouds(
         return figure
 
 
-def _finding(nodes: scene.Array) -> str:
+def _finding(nodes: Array) -> str:
     """State how far contacts and signals reach."""
     near, far, push, pull, bend = (
         f"{float(f'{np.quantile(to_display(name, scene.values_of(name, nodes)), share):.2g}'):g}"
@@ -136,18 +137,18 @@ def _kept(elevation: float, azimuth: float) -> tuple[float, float]:
     return float(toward + np.pi / 4.0), float(toward + 7.0 * np.pi / 4.0)
 
 
-def _mm(triangles: scene.Array) -> scene.Array:
+def _mm(triangles: Array) -> Array:
     return to_display("contact_point", triangles[..., :3])
 
 
-def _turning(name: str, triangles: scene.Array) -> scene.Mask:
+def _turning(name: str, triangles: Array) -> Mask:
     """Whether a direction differs by more than 45° within a triangle, as where a force reverses."""
     turn = scene.values_of(name, triangles)
     gap = np.abs(np.angle(np.exp(1j * (turn - np.roll(turn, 1, axis=1)))))
     return np.asarray(gap.max(axis=1) > np.pi / 4.0)
 
 
-def _mean(name: str, values: scene.Array, norm: Normalize, colours: Colormap) -> scene.Array:
+def _mean(name: str, values: Array, norm: Normalize, colours: Colormap) -> Array:
     """Colours of triangles; directions are averaged on the circle."""
     if name not in scene.DIRECTIONS:
         return painted(values, norm, colours)
@@ -159,9 +160,9 @@ def _mean(name: str, values: scene.Array, norm: Normalize, colours: Colormap) ->
 def _reach(
     figure: Figure,
     sheet: _Sheet,
-    triangles: scene.Array,
-    line: scene.Array,
-    limits: scene.Array,
+    triangles: Array,
+    line: Array,
+    limits: Array,
     view: tuple[float, float],
 ) -> None:
     """The reachable space from aside, and from before the tip."""
@@ -182,14 +183,12 @@ def _reach(
     style.corner_title(figure, sheet.front, "b", "from the tip")
 
 
-def _body(
-    axes: Any, triangles: scene.Array, colours: scene.Array, line: scene.Array, flat: float = 0.75
-) -> None:
+def _body(axes: Any, triangles: Array, colours: Array, line: Array, flat: float = 0.75) -> None:
     paint(axes, _mm(triangles), colours, flat=flat)
     axes.plot(*line.T, color="black", linewidth=1.2, zorder=10, solid_capstyle="round")
 
 
-def _cross(axes: Any, limits: scene.Array) -> None:
+def _cross(axes: Any, limits: Array) -> None:
     """Bars of 5 mm along y and z at the lower left of the view from the tip."""
     corner = np.array([limits[0, 1], limits[1, 0] - 1.0, limits[2, 0]])
     for i, name in ((1, "y"), (2, "z")):
@@ -202,7 +201,7 @@ def _cross(axes: Any, limits: scene.Array) -> None:
     axes.text(*corner, "5 mm", fontsize=style.SMALL, ha="center", va="center")
 
 
-def _vanishes(nodes: scene.Array) -> bool:
+def _vanishes(nodes: Array) -> bool:
     """Whether there is no twisting moment, as for a straight whisker."""
     twist, bend = (np.abs(scene.values_of(name, nodes)).max() for name in ("Mx", "MB"))
     return bool(twist < 1e-9 * bend)
@@ -218,9 +217,9 @@ def _say_zero(figure: Figure, cell: style.Box) -> None:
 def _pulled(
     figure: Figure,
     cell: style.Box,
-    nodes: scene.Array,
+    nodes: Array,
     closed: bool,
-    line: scene.Array,
+    line: Array,
     view: tuple[float, float],
 ) -> None:
     """Inset with only the contacts at which the whisker is pulled, with colours of its own."""
@@ -245,7 +244,7 @@ def _pulled(
     rail.tick_params(length=0.0, pad=1.0)
 
 
-def _scale(name: str, values: scene.Array) -> tuple[Normalize, Colormap, str]:
+def _scale(name: str, values: Array) -> tuple[Normalize, Colormap, str]:
     """Limits and map of the colours of a signal, and which ends of the map are exceeded."""
     norm, colours = style.scale_of(name, values)
     low, high = norm.vmin or 0.0, norm.vmax or 0.0

@@ -11,10 +11,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from vibrissa.numerics import Array, Mask
 from vibrissa.plots.style import BLUE, INK, SHADE, Width, conclude, head, looking, new_figure, say
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.recording import Group
-from vibrissa.scene import DIRECTIONS, Array, Mask
+from vibrissa.scene import DIRECTIONS
 
 _COLUMNS = (("Fx", "FT", "FD"), ("Mx", "MB", "MD"))
 

@@ -17,9 +17,10 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import MaxNLocator
 
+from vibrissa.numerics import Array
 from vibrissa.plots import style
 from vibrissa.quantities import axis_label, quantity, to_display
-from vibrissa.scene import Array, robust_limits
+from vibrissa.scene import robust_limits
 
 _PANELS = ("r", "theta", "phi", "error_distance")
 _CIRCLES = {"MD": ("MB", "My", "Mz"), "FD": ("FT", "Fy", "Fz")}

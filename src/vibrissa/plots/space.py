@@ -16,9 +16,10 @@ from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from vibrissa.numerics import Array
 from vibrissa.plots.style import INK, MUTED, PLAIN, SMALL, Box, box_axes
 from vibrissa.quantities import axis_label, quantity, to_display
-from vibrissa.scene import Array, root, values_of
+from vibrissa.scene import root, values_of
 
 ELEVATION, AZIMUTH = 24.0, -58.0
 """Default direction of view, degrees."""

@@ -32,8 +32,9 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from vibrissa.io import replacing
+from vibrissa.numerics import Array
 from vibrissa.quantities import quantity
-from vibrissa.scene import DIRECTIONS, SIGNALS, Array, robust_limits, root, squared
+from vibrissa.scene import DIRECTIONS, SIGNALS, robust_limits, root, squared
 
 Width = Literal["single", "double"]
 Box = tuple[float, float, float, float]

@@ -12,9 +12,10 @@ from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from vibrissa.numerics import Array
 from vibrissa.plots import style
 from vibrissa.plots.verdicts import PAPERS_CONE, VERDICTS, triplet_label
-from vibrissa.scene import Array, root, squared
+from vibrissa.scene import root, squared
 
 _MARKS = dict(zip(VERDICTS, ("o", "D", "X"), strict=True))
 _KEY: Any = {"facecolors": "white", "edgecolors": style.INK, "linewidths": 0.6}

@@ -15,9 +15,9 @@ from matplotlib.patches import Circle, Wedge
 from matplotlib.ticker import NullLocator
 from numpy.typing import NDArray
 
+from vibrissa.numerics import Array
 from vibrissa.plots import style
 from vibrissa.quantities import quantity, to_display
-from vibrissa.scene import Array
 
 VERDICTS = ("unique", "unique off a surface", "not unique")
 EMPTY = "no contacts"

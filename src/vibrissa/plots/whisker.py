@@ -12,9 +12,9 @@ from matplotlib.path import Path
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
+from vibrissa.numerics import Array
 from vibrissa.plots import style
 from vibrissa.quantities import axis_label, to_display
-from vibrissa.scene import Array
 
 _MAGNIFICATIONS = (1, 2, 3, 5, 10, 20, 50, 100)
 _WIDE = 0.02

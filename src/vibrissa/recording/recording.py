@@ -16,8 +16,6 @@ from vibrissa.objects import Peg, Surface, object_from_dataset, objects_datasets
 from vibrissa.recording.schema import ordered
 from vibrissa.whisker import Whisker
 
-Array = NDArray[np.float64]
-
 ONE_VIEW = (
     "one view: the whisker is taken to move and bend in the plane of the image, z = 0. Measured "
     "are base, azimuth, curvature, contact and, in the plane, force (Fx, Fy) and bending moment "

@@ -29,8 +29,6 @@ from numpy.typing import ArrayLike, NDArray
 from vibrissa.quantities import attributes
 from vibrissa.status import flag_attributes
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class RecordedVariable:

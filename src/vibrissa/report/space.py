@@ -16,10 +16,11 @@ import xarray as xr
 
 from vibrissa.contacts import ContactMap
 from vibrissa.contour import FittedShape, shape_from_dataset, surface_grid
+from vibrissa.numerics import Array
 from vibrissa.quantities import quantity, shown_unit
 from vibrissa.report.page import Section, paragraph
 from vibrissa.rod import Deflection
-from vibrissa.scene import Array, Course, Ints, course_of, object_surface
+from vibrissa.scene import Course, Ints, course_of, object_surface
 from vibrissa.sketch import BENT, REST, thinned
 from vibrissa.whisker import Whisker
 

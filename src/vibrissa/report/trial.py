@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from vibrissa import evaluation
 from vibrissa.contour import shape_from_dataset
 from vibrissa.display import show
+from vibrissa.numerics import Array
 from vibrissa.pipeline import compare_contacts, distances_by_class
 from vibrissa.quantities import QUANTITIES, quantity
 from vibrissa.recording import Recording
@@ -22,8 +23,6 @@ from vibrissa.report.page import Section, Tile, paragraph, shown_value, table, t
 from vibrissa.signals import CIRCULAR, SIGNALS, base_signals, within_turn
 from vibrissa.status import describe
 from vibrissa.whisker import Whisker
-
-Array = NDArray[np.float64]
 
 STAGES = {"signals": "signals", "estimates": "estimate", "contour": "reconstruct"}
 """Groups of a recording, and the verbs that make them."""

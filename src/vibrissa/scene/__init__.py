@@ -11,7 +11,6 @@ from vibrissa.scene.course import (
     spherical,
 )
 from vibrissa.scene.marks import (
-    Array as Array,
     Arrows as Arrows,
     Body as Body,
     Bytes as Bytes,
@@ -22,7 +21,6 @@ from vibrissa.scene.marks import (
     Label as Label,
     Line as Line,
     Mark as Mark,
-    Mask as Mask,
     Painted as Painted,
     Side as Side,
     pieces as pieces,

@@ -8,8 +8,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
+from vibrissa.numerics import Array, Mask
 from vibrissa.recording import Group, Recording
-from vibrissa.scene.marks import Array, Mask
 from vibrissa.scene.solids import nearest_at_rest
 
 TRIPLET = ("Fx", "MB", "MD")

@@ -13,10 +13,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+from vibrissa.numerics import Array
+
 Ints = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 Colour = tuple[int, int, int]
 Side = Literal["front", "back", "double"]
 

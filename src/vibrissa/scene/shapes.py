@@ -15,8 +15,9 @@ from math import sqrt
 import numpy as np
 import xarray as xr
 
+from vibrissa.numerics import Array
 from vibrissa.quantities import to_display
-from vibrissa.scene.marks import Array, Ints
+from vibrissa.scene.marks import Ints
 
 _SIDES = 8
 """Corners of the section of a whisker."""

@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.scene.marks import Array, Mask
+from vibrissa.numerics import Array, Mask
 
 SIGNALS = ("Fx", "FT", "FD", "Mx", "MB", "MD")
 DIRECTIONS = ("FD", "MD")

@@ -7,6 +7,7 @@ from vibrissa.sensors.mixing import (
     calibrate_mixing,
     calibrate_on_contacts,
 )
+from vibrissa.sensors.regression import ThinPlate as ThinPlate
 from vibrissa.sensors.sensor import (
     COMPONENTS,
     FORCE_NOISE,
@@ -20,7 +21,6 @@ from vibrissa.sensors.stiffness import StiffnessFit, fit_stiffness
 from vibrissa.sensors.suspended import SuspendedWhisker, Touches as Touches
 from vibrissa.sensors.suspension import SuspensionCalibration, calibrate_suspension
 from vibrissa.sensors.sweep import SweptContacts, follow_sweep
-from vibrissa.sensors.thin_plate import ThinPlate as ThinPlate
 from vibrissa.sensors.weight import WeightCalibration, calibrate_weight, tare
 
 __all__ = [

@@ -20,13 +20,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from vibrissa.deferred import optimize
-from vibrissa.sensors.least_squares import solve, warn_of_misfit
-
-Array = NDArray[np.float64]
+from vibrissa.numerics import Array
+from vibrissa.sensors.regression import solve, warn_of_misfit
 
 _ORTHOGONAL = 1e-3
 """Stretch up to which axes, typed with few digits, are brought to right angles."""

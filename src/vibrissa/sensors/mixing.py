@@ -10,19 +10,18 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vibrissa.numerics import Array
 from vibrissa.rod import PointContact, deflect
 from vibrissa.sensors.frame import SensorFrame
-from vibrissa.sensors.least_squares import solve
+from vibrissa.sensors.regression import solve
 from vibrissa.sensors.sensor import COMPONENTS, Sensor
 from vibrissa.status import describe, is_ok
 
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
-
-Array = NDArray[np.float64]
 
 _ROUNDING = 1e-6
 """Share of the largest component of its kind below which a component is rounding."""

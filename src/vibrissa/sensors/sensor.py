@@ -31,11 +31,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vibrissa.numerics import Array
 from vibrissa.sensors.frame import SensorFrame
-
-Array = NDArray[np.float64]
 
 FORCE_NOISE = 1e-6
 """Standard deviation of a component of the measured force, N."""

@@ -62,9 +62,9 @@ from vibrissa.io import (
 )
 from vibrissa.numerics import Array
 from vibrissa.sensors.frame import SensorFrame
+from vibrissa.sensors.regression import ThinPlate
 from vibrissa.sensors.suspended import FEATURES, SuspendedWhisker
 from vibrissa.sensors.suspension import SuspensionCalibration
-from vibrissa.sensors.thin_plate import ThinPlate
 from vibrissa.whisker import Whisker
 
 _UNITS = {"m": 1.0, "mm": 1e-3, "um": 1e-6}

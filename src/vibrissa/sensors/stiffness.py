@@ -19,16 +19,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from vibrissa.sensors.least_squares import warn_of_misfit, warn_of_surprise
+from vibrissa.numerics import Array
 from vibrissa.sensors.mixing import wrenches_of_contacts
+from vibrissa.sensors.regression import warn_of_misfit, warn_of_surprise
 from vibrissa.sensors.sensor import Sensor
 
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
-Array = NDArray[np.float64]
 
 _OPEN = 2.0
 """Standard deviation of the logarithm of a taper from which it is not determined."""

@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.rod import discretize, solve_forces
-from vibrissa.sensors.thin_plate import ThinPlate
+from vibrissa.sensors.regression import ThinPlate
 from vibrissa.status import Status
 
 if TYPE_CHECKING:

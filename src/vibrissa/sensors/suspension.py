@@ -21,8 +21,8 @@ from scipy.spatial.transform import Rotation
 from vibrissa.deferred import interpolate
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.rod import discretize
+from vibrissa.sensors.regression import ThinPlate
 from vibrissa.sensors.suspended import SuspendedWhisker, Touches
-from vibrissa.sensors.thin_plate import ThinPlate
 from vibrissa.status import Status
 
 if TYPE_CHECKING:

@@ -11,14 +11,12 @@ import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vibrissa.numerics import Array, Mask
 from vibrissa.sensors.frame import cross_matrix
-from vibrissa.sensors.least_squares import Solution, solve, warn_of_misfit
+from vibrissa.sensors.regression import Solution, solve, warn_of_misfit
 from vibrissa.sensors.sensor import GRAVITY, Sensor, with_offset
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _HEAVY = 5.0
 """Mass that no sensor of a whisker carries, kg."""

@@ -27,12 +27,11 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
+from vibrissa.numerics import Array
 from vibrissa.whisker import ORTHOGONALITY, WhiskerArray, angles_of, base_rotation, mirrored
-
-Array = NDArray[np.float64]
 
 ELEVATION_PER_AZIMUTH: Mapping[str, float] = MappingProxyType(
     {"A": 0.12, "B": 0.30, "C": 0.30, "D": 0.14, "E": 0.02}

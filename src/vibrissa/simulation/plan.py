@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vibrissa.objects import Box, Peg, Plane, Sphere, Surface
 from vibrissa.rod import follow_surfaces
@@ -22,8 +21,6 @@ from vibrissa.simulation.motion import (
 )
 from vibrissa.status import Status
 from vibrissa.whisker import Whisker, WhiskerArray, base_rotation
-
-Array = NDArray[np.float64]
 
 PEG_RADIUS = 1.35e-3
 """Half the diameter of the paper's peg, m."""

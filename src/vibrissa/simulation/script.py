@@ -12,7 +12,6 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vibrissa.io import (
     check_keys,
@@ -25,6 +24,7 @@ from vibrissa.io import (
     table_rows,
     three_numbers,
 )
+from vibrissa.numerics import Array
 from vibrissa.objects import Box, Mesh, Peg, Plane, Sphere, Surface
 from vibrissa.sensors import COMPONENTS, Sensor
 from vibrissa.simulation.dynamics import Dynamics
@@ -38,8 +38,6 @@ from vibrissa.simulation.motion import (
 )
 from vibrissa.simulation.plan import sweep_past, within_reach
 from vibrissa.whisker import Whisker, WhiskerArray, base_rotation, whisker_array
-
-Array = NDArray[np.float64]
 
 _MOST_FRAMES = 10_000_000
 """Largest number of frames of a trial."""

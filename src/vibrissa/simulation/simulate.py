@@ -25,8 +25,8 @@ from typing import TypeVar
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from vibrissa.numerics import Array
 from vibrissa.objects import Surface
 from vibrissa.recording import Recording, coordinates, recorded, recording_tree
 from vibrissa.rod import SurfaceDeflection, follow_surfaces
@@ -51,7 +51,6 @@ OVERLAP = 5e-6
 _FRAMES_AT_ONCE = 512
 """Number of frames whose overlap is computed together."""
 
-Array = NDArray[np.float64]
 
 Progress = Callable[[int, int], None]
 """Called with the number of frames done and of all frames."""

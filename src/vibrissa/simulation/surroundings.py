@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.cameras import Camera
+from vibrissa.numerics import Array
 
-Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 _GRAIN, _ALONG, _COARSE = 0.8, 3.0, 6.0

@@ -10,15 +10,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vibrissa.contacts import Contact, ContactFilter, Estimator, Followed
+from vibrissa.numerics import Array
 from vibrissa.rod import PointForce, deflect
 from vibrissa.signals import SIGNALS, signals_of
 from vibrissa.streaming.lines import FRAME, LineKind, Lines, Sample
 from vibrissa.streaming.poses import Poses
-
-Array = NDArray[np.float64]
 
 # Time that falls by more than this comes from a sender that has begun anew, s.
 _ANEW = 1.0

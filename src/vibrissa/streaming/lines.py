@@ -22,7 +22,6 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vibrissa.io import (
     cells_of,
@@ -33,9 +32,8 @@ from vibrissa.io import (
     signal_columns,
     with_point,
 )
+from vibrissa.numerics import Array
 from vibrissa.signals import SIGNALS
-
-Array = NDArray[np.float64]
 
 POSITION = ("base_x", "base_y", "base_z")
 """Columns with the position of the base."""

@@ -6,10 +6,10 @@ from collections import deque
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
+from vibrissa.numerics import Array
 
 # A motion is continued past the last pose for so many times the step between the last two.
 _LONGEST = 5.0

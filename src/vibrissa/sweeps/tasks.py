@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from vibrissa.contacts import ContactMap, estimate_from_wrench
 from vibrissa.identifiability import best_triplet, uniqueness
+from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
 from vibrissa.rod import PointForce, deflect
 from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE
@@ -28,7 +28,6 @@ from vibrissa.status import Status
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
-Array = NDArray[np.float64]
 Settings = Mapping[str, Any]
 
 PAPERS = ("Fx MB MD", "Mx MB MD", "Fx FD MD")

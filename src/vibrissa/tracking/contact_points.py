@@ -15,10 +15,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.cameras import Camera, triangulate
+from vibrissa.numerics import Array
 from vibrissa.objects import Surface
 from vibrissa.tracking.refine.fit import RodFit
-
-Array = NDArray[np.float64]
 
 _NEAR = 0.5
 """Largest difference between the time of a frame and that of its row in a table, frames."""

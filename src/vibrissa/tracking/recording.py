@@ -11,6 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.cameras import Camera
+from vibrissa.numerics import Array, Mask
 from vibrissa.objects import Surface
 from vibrissa.recording import coordinates, recorded, recording_tree
 from vibrissa.status import Status
@@ -20,9 +21,6 @@ from vibrissa.tracking.refine.trace_series import TraceSeries
 from vibrissa.tracking.space.pose import CUTOFF, BasePose, HeadPose
 from vibrissa.tracking.space.rest_shape import Length, RestShape
 from vibrissa.whisker import Whisker, angles_of
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from vibrissa.cameras import Camera
+from vibrissa.numerics import Array, Mask
 from vibrissa.objects import Surface
 from vibrissa.recording import ONE_VIEW
 from vibrissa.tracking.contact_points import contacts_at, given_contacts, outside_video
@@ -40,9 +41,6 @@ from vibrissa.tracking.space.rest_shape import (
 from vibrissa.tracking.trace.start import base_gap
 from vibrissa.tracking.trace.trace import Trace
 from vibrissa.whisker import Pose, Whisker
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 Progress = Callable[[str, int, int], None]
 """Function that is called with the name of a stage, and how much of how much is done."""

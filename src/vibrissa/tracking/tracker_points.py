@@ -12,14 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from vibrissa.cameras import Camera, orthogonal_views
+from vibrissa.numerics import Array
 from vibrissa.tracking.refine.trace_series import NODES
 from vibrissa.tracking.trace.trace import STEP, Trace, given
-
-Array = NDArray[np.float64]
 
 POINT_SIGMA = 0.5
 """Usual standard deviation of a tracked point across the whisker, pixels."""

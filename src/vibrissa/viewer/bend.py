@@ -8,12 +8,22 @@ from functools import lru_cache
 import numpy as np
 
 from vibrissa import scene
+from vibrissa.numerics import Array
 from vibrissa.quantities import quantity, to_display
 from vibrissa.sketch import round_step
 from vibrissa.viewer import state
-from vibrissa.viewer.colours import CONTACT, FORCE, GHOST, OBJECT, REST, WHISKER
 from vibrissa.viewer.page import EXAGGERATION, Page, asked, put, show
-from vibrissa.viewer.readout import number, numbers, sentence
+from vibrissa.viewer.readout import (
+    CONTACT,
+    FORCE,
+    GHOST,
+    OBJECT,
+    REST,
+    WHISKER,
+    number,
+    numbers,
+    sentence,
+)
 from vibrissa.whisker import Whisker
 
 NODES = 48
@@ -24,7 +34,7 @@ _ARROW = 0.3
 
 def whisker_body(
     whisker: Whisker,
-    line: scene.Array,
+    line: Array,
     exaggeration: float,
     colour: scene.Colour = WHISKER,
     opacity: float | None = None,
@@ -55,7 +65,7 @@ def axes(whisker: Whisker) -> dict[str, scene.Mark]:
     return out | ruler(np.zeros(3), _size(whisker.length))
 
 
-def ruler(start: scene.Array, length: float) -> dict[str, scene.Mark]:
+def ruler(start: Array, length: float) -> dict[str, scene.Mark]:
     """Ticks with values along x from a place (3,), mm, over a length, mm."""
     step = round_step(length / 4.0)
     ticks = np.arange(0.0, length + 1e-9, step)
@@ -69,14 +79,14 @@ def ruler(start: scene.Array, length: float) -> dict[str, scene.Mark]:
     return out
 
 
-def arrow(start: scene.Array, end: scene.Array, thickness: float) -> scene.Arrows:
+def arrow(start: Array, end: Array, thickness: float) -> scene.Arrows:
     """The arrow of a force between two places (3,), m; so many mm thick."""
     return scene.Arrows(
         mm(start)[None], mm(end)[None], np.array([FORCE], dtype=np.uint8), thickness
     )
 
 
-def force_arrow(whisker: Whisker, force: scene.Array, at: scene.Array) -> dict[str, scene.Mark]:
+def force_arrow(whisker: Whisker, force: Array, at: Array) -> dict[str, scene.Mark]:
     """The force on a whisker as an arrow that ends where it acts, with its size."""
     size = float(np.linalg.norm(force))
     if not (np.isfinite(at).all() and size > 0.0):
@@ -147,7 +157,7 @@ def _missed(bend: state.Bend) -> dict[str, scene.Mark]:
     return {**out, "reason": scene.Label(mm(bend.target + lift), words)}
 
 
-def mm(values: object) -> scene.Array:
+def mm(values: object) -> Array:
     """Lengths in mm."""
     return to_display("length", np.asarray(values, dtype=np.float64))
 

@@ -22,9 +22,8 @@ from vibrissa.scene import Body, Cloud, Drawing, Mark, error_ellipsoid
 from vibrissa.status import Status
 from vibrissa.streaming import udp_address, udp_lines, udp_socket
 from vibrissa.viewer.bend import NODES, force_arrow, mm, resting, whisker_body
-from vibrissa.viewer.colours import CLOUD, CONTACT
 from vibrissa.viewer.page import EXAGGERATION, Framing, whole
-from vibrissa.viewer.readout import note, sentence, table
+from vibrissa.viewer.readout import CLOUD, CONTACT, note, sentence, table
 from vibrissa.viewer.stage import Stage
 
 if TYPE_CHECKING:

@@ -10,14 +10,24 @@ import xarray as xr
 from vibrissa import scene
 from vibrissa.contacts import Contacts
 from vibrissa.identifiability import sensitivity
+from vibrissa.numerics import Array
 from vibrissa.quantities import quantity, to_display
 from vibrissa.rod import PointContact, deflect
 from vibrissa.signals import SIGNALS, TRIPLETS, base_signals
 from vibrissa.status import Status
 from vibrissa.viewer.bend import NODES, bend_drawing, mm, whisker_body
-from vibrissa.viewer.colours import FIT, GHOST, Legend, counted, shaded
 from vibrissa.viewer.page import Page, asked
-from vibrissa.viewer.readout import note, number, sentence, table
+from vibrissa.viewer.readout import (
+    FIT,
+    GHOST,
+    Legend,
+    counted,
+    note,
+    number,
+    sentence,
+    shaded,
+    table,
+)
 from vibrissa.viewer.state import Bend, Chart, coloured_solid
 from vibrissa.whisker import Whisker
 
@@ -38,7 +48,7 @@ class Sensor:
     moment_noise: float = 2e-8
 
     @property
-    def covariance(self) -> scene.Array | None:
+    def covariance(self) -> Array | None:
         """Covariance of force and moment (6, 6); None where there is no noise."""
         sigma = np.repeat([self.force_noise, self.moment_noise], 3)
         return np.diag(sigma**2) if (sigma > 0.0).all() else None
@@ -62,18 +72,18 @@ class Located:
 
     sensor: Sensor
     signals: xr.Dataset
-    contact: scene.Array
+    contact: Array
     estimate: Contacts
-    lines: scene.Array
+    lines: Array
 
     @property
-    def points(self) -> scene.Array:
+    def points(self) -> Array:
         """Contact points of the candidates (k, 3), m."""
         points = self.estimate.candidates.point
         return np.asarray(points[np.isfinite(points).all(axis=-1)])
 
     @property
-    def distances(self) -> scene.Array:
+    def distances(self) -> Array:
         """Distance of each candidate from the true contact (k,), m."""
         return np.asarray(np.linalg.norm(self.points - self.contact, axis=-1))
 
@@ -109,7 +119,7 @@ def coloured(chart: Chart, what: str, sensor: Sensor) -> tuple[scene.Bytes, Lege
     raise ValueError(f"colours are one of {', '.join(COLOURS)}; got {what!r}")
 
 
-def _predicted_error(chart: Chart, sensor: Sensor) -> scene.Array:
+def _predicted_error(chart: Chart, sensor: Sensor) -> Array:
     """RMS 3D error (n,), m, of the contacts of the cloud."""
     if sensor.covariance is None:
         return np.full(len(chart.points), np.nan)
@@ -117,7 +127,7 @@ def _predicted_error(chart: Chart, sensor: Sensor) -> scene.Array:
     return np.asarray(found["predicted_error"].to_numpy(), dtype=np.float64)
 
 
-def _separation(estimate: Contacts, points: scene.Array) -> scene.Array:
+def _separation(estimate: Contacts, points: Array) -> Array:
     """Distance (n,), m, of the farthest other candidate of each contact; NaN without candidates."""
     away = np.linalg.norm(estimate.candidates.point - points[:, None], axis=-1)
     farthest = np.nanmax(np.nan_to_num(away), axis=1)

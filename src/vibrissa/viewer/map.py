@@ -15,14 +15,24 @@ import numpy as np
 import viser
 
 from vibrissa import scene
+from vibrissa.numerics import Array
 from vibrissa.quantities import to_display
 from vibrissa.rod import PointContact, deflect
 from vibrissa.signals import SIGNALS
 from vibrissa.status import Status
 from vibrissa.viewer.bend import NODES, follicle, whisker_body
-from vibrissa.viewer.colours import CONTACT, REST, WHISKER, Legend, shaded
 from vibrissa.viewer.page import Page, asked
-from vibrissa.viewer.readout import note, number, of_deflection, table
+from vibrissa.viewer.readout import (
+    CONTACT,
+    REST,
+    WHISKER,
+    Legend,
+    note,
+    number,
+    of_deflection,
+    shaded,
+    table,
+)
 from vibrissa.viewer.state import Chart
 
 SLICES = ("x", "y", "z", "r", "theta", "phi", "Fx", "Mx", "arc_length")
@@ -46,7 +56,7 @@ class Solids:
     """The contacts of a whisker, ready to be laid out."""
 
     chart: Chart
-    nodes: scene.Array
+    nodes: Array
     cut: bool
 
     @property
@@ -54,11 +64,11 @@ class Solids:
         """Length of the whisker, mm."""
         return float(to_display("length", self.chart.whisker.length))
 
-    def skin(self) -> scene.Array:
+    def skin(self) -> Array:
         """Triangles (n, 3, columns) around all contacts outside 2° of rest."""
         return scene.solid_surface(self.nodes, not self.cut, scene.column("deflection"))
 
-    def slice(self, name: str, share: float) -> scene.Array:
+    def slice(self, name: str, share: float) -> Array:
         """Triangles (n, 3, columns) of contacts with one value, at a share of its range."""
         height = self.value(name, share)
         return scene.clip(
@@ -79,7 +89,7 @@ class Solids:
         values = self.nodes[..., scene.column(name)]
         return float(values.min()), float(values.max())
 
-    def signal_rows(self, rows: scene.Array) -> scene.Array:
+    def signal_rows(self, rows: Array) -> Array:
         """Places (..., 3), mm, of rows in the space of signals, its axis at the origin."""
         reach, low, high = self.limits
         size = np.sqrt(scene.values_of("MB", rows)) / reach
@@ -100,12 +110,12 @@ class Solids:
         _, low, high = self.limits
         return self.length * _HEIGHT * (-low / (high - low) - 0.5)
 
-    def place(self, number: int | None) -> scene.Array:
+    def place(self, number: int | None) -> Array:
         """Place of a space, mm: contacts (None), or signals coloured by r, θ, φ (0, 1, 2)."""
         x, z = _CONTACTS if number is None else _PLACES[number]
         return self.length * np.array([x, 0.0, z])
 
-    def seen(self, rows: scene.Array, number: int | None) -> scene.Array:
+    def seen(self, rows: Array, number: int | None) -> Array:
         """Places (..., 3), mm, of rows: as contacts (None) or as signals of a coordinate."""
         if number is None:
             return to_display("contact_point", rows[..., :3]) + self.place(None)
@@ -118,9 +128,7 @@ def solids(chart: Chart, cut: bool) -> Solids:
     return Solids(chart, nodes, cut)
 
 
-def picked(
-    triangles: scene.Array, places: scene.Array, origin: scene.Array, direction: scene.Array
-) -> scene.Array | None:
+def picked(triangles: Array, places: Array, origin: Array, direction: Array) -> Array | None:
     """The contact that a ray meets first."""
     a, b, c = places.transpose(1, 0, 2)
     first, second = b - a, c - a
@@ -185,12 +193,12 @@ def frame_drawing(solids: Solids, exaggeration: float) -> scene.Drawing:
     return out
 
 
-def _moved(body: scene.Body, by: scene.Array) -> scene.Body:
+def _moved(body: scene.Body, by: Array) -> scene.Body:
     return replace(body, vertices=body.vertices + by)
 
 
 def solids_drawing(
-    solids: Solids, triangles: scene.Array, by: str
+    solids: Solids, triangles: Array, by: str
 ) -> tuple[dict[str, scene.Painted], dict[str, Legend]]:
     """Paint contacts where they are, coloured by a coordinate, and where their signals are."""
     painted: dict[str, scene.Painted] = {}
@@ -203,9 +211,7 @@ def solids_drawing(
     return painted, legends
 
 
-def picked_drawing(
-    solids: Solids, row: scene.Array, exaggeration: float
-) -> tuple[scene.Drawing, str]:
+def picked_drawing(solids: Solids, row: Array, exaggeration: float) -> tuple[scene.Drawing, str]:
     """Mark a contact in all spaces, bend the whisker there, and write its signals."""
     whisker = solids.chart.whisker
     radius = 0.016 * solids.length
@@ -243,8 +249,8 @@ class MapMode:
     def __init__(self, page: Page) -> None:
         self._page = page
         self._solids: Solids | None = None
-        self._triangles: scene.Array = np.empty((0, 3, 0))
-        self.row: scene.Array | None = None
+        self._triangles: Array = np.empty((0, 3, 0))
+        self.row: Array | None = None
         self._drawn: tuple[Any, ...] | None = None
         gui = page.server.gui
         self._folder = gui.add_folder("Contacts and signals", visible=False)
@@ -322,7 +328,7 @@ class MapMode:
         direction = np.asarray(event.ray_direction, dtype=np.float64)
         self._page.work.put("pick", lambda: self.pick(origin, direction))
 
-    def pick(self, origin: scene.Array, direction: scene.Array) -> None:
+    def pick(self, origin: Array, direction: Array) -> None:
         """Mark the contact that a ray, mm, meets first in any space."""
         found = self._solids
         if found is None:

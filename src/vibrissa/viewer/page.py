@@ -18,8 +18,9 @@ from numpy.typing import ArrayLike
 from viser import transforms
 
 from vibrissa.contacts import ContactMap
+from vibrissa.numerics import Array
 from vibrissa.quantities import quantity, to_display
-from vibrissa.scene import Array, across
+from vibrissa.scene import across
 from vibrissa.viewer.stage import Stage
 from vibrissa.viewer.state import (
     Bend,

@@ -15,15 +15,14 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from vibrissa.cameras import Camera
+from vibrissa.numerics import Array, Mask
 from vibrissa.objects import Surface
 from vibrissa.recording import Recording
-from vibrissa.scene import Array, Bytes
+from vibrissa.scene import Bytes
 from vibrissa.signals import SIGNALS, base_signals
 from vibrissa.simulation import silhouette
 from vibrissa.viewer.bend import NODES
 from vibrissa.whisker import Whisker
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,9 +1,16 @@
-"""Files of what is on the page, and the buttons that hand them over."""
+"""Files of what is on the page, and the buttons that hand them over.
+
+The page is given a name, an icon, and less work for weak graphics before it starts: viser serves
+one that is ready made and has no place for such things, so they are written into its head on the
+way to the browser. Without them the page works as well, but not as fast.
+"""
 
 from __future__ import annotations
 
+import gzip
 import tempfile
 from collections.abc import Callable, Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -195,3 +202,198 @@ class SaveControls:
             self._page.say("Not saved", str(error), "red")
             return
         client.send_file_download(name, content, save_immediately=True)
+
+
+SCRIPT = """
+(() => {
+  document.title = "vibrissa";
+  // What a link asks for; viser would take it for a part of the server's address.
+  const wanted = new URLSearchParams(location.hash.slice(1));
+  if (location.hash) history.replaceState(null, "", location.pathname + location.search);
+  // The page is dark as long as the browser is.
+  const dark = matchMedia("(prefers-color-scheme: dark)");
+  const matched = () => {
+    const asked = new URLSearchParams(location.search);
+    if (dark.matches) asked.set("darkMode", ""); else asked.delete("darkMode");
+    history.replaceState(null, "", "?" + asked + location.hash);
+  };
+  if (dark.matches) matched();
+  dark.addEventListener("change", () => { matched(); location.reload(); });
+
+  // Keys press buttons; a click in a plot over time sets the time.
+  const button = (...texts) => [...document.querySelectorAll("button")].find(
+    (each) => each.offsetParent && texts.includes(each.textContent.trim()));
+  const setTime = (share) => {
+    const label = [...document.querySelectorAll("label")].find(
+      (each) => each.textContent.trim() === "Time (ms)");
+    let box = label;
+    const number = "input[type=text], input:not([type])";
+    while (box && !box.querySelector(number)) box = box.parentElement;
+    const input = box?.querySelector(number);
+    const slider = box?.querySelector("[role=slider]");
+    if (!input || !slider) return;
+    const value = String(Number(slider.getAttribute("aria-valuemax")) * share);
+    Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set.call(input, value);
+    input.dispatchEvent(new Event("input", { bubbles: true }));
+    input.dispatchEvent(new Event("blur", { bubbles: true }));
+  };
+  const keys = {
+    ",": ["◀ frame"], ".": ["frame ▶"], "n": ["Next contact"], " ": ["Play", "Pause"],
+  };
+  addEventListener("keydown", (event) => {
+    const typing = /^(INPUT|TEXTAREA|BUTTON)$/.test(event.target.tagName);
+    if (typing || event.ctrlKey || event.metaKey || event.altKey || !keys[event.key]) return;
+    const found = button(...keys[event.key]);
+    if (found) { event.preventDefault(); found.click(); }
+  });
+  addEventListener("click", (event) => {
+    const plot = event.target.closest?.("svg[data-seek]");
+    if (!plot) return;
+    const box = plot.getBoundingClientRect(), left = Number(plot.dataset.seek);
+    const share = ((event.clientX - box.left) / (box.width - 8) - left) / (1 - left);
+    if (share >= 0 && share <= 1) setTime(share);
+  });
+
+  // The address keeps mode and time, so that a link leads back to what is seen.
+  const kept = () => {
+    const mode = [...document.querySelectorAll("button")].map((each) => each.textContent.trim())
+      .find((text) => text.startsWith("● "))?.slice(2);
+    if (!mode) return;
+    const asked = wanted.get("mode");
+    if (asked && asked !== mode) { button(asked)?.click(); return; }
+    wanted.delete("mode");
+    const cursor = document.querySelector("[data-cursor]");
+    if (wanted.has("t") && mode === "Trial") {
+      if (!cursor) return;
+      setTime(Number(wanted.get("t")));
+      wanted.delete("t");
+      return;
+    }
+    const share = mode === "Trial" && cursor ? `&t=${cursor.dataset.cursor}` : "";
+    const state = `#mode=${mode}${share}`;
+    if (location.hash !== state) history.replaceState(null, "", location.search + state);
+  };
+  setInterval(kept, 500);
+
+  // Arrow keys that move a slider are not for the view as well.
+  addEventListener("DOMContentLoaded", () => document.body.addEventListener("keydown", (event) => {
+    if (event.target.getAttribute?.("role") === "slider") event.stopPropagation();
+  }));
+
+  // The page sends the mouse every 50 ms; a whisker follows faster.
+  const later = window.setTimeout.bind(window);
+  window.setTimeout = (job, delay, ...rest) => later(job, delay === 50 ? 16 : delay, ...rest);
+
+  // Smooth edges take four times the work: no more than what a graphics card does in passing, but
+  // most of a frame where there is none.
+  const plain = HTMLCanvasElement.prototype.getContext;
+  let slow = null;
+  const inSoftware = () => {
+    const gl = plain.call(document.createElement("canvas"), "webgl2");
+    const info = gl && gl.getExtension("WEBGL_debug_renderer_info");
+    const name = info ? String(gl.getParameter(info.UNMASKED_RENDERER_WEBGL)) : "";
+    if (gl) gl.getExtension("WEBGL_lose_context")?.loseContext();
+    return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
+  };
+  HTMLCanvasElement.prototype.getContext = function (kind, options, ...rest) {
+    if (options && options.antialias && kind.startsWith("webgl")) {
+      slow ??= inSoftware();
+      if (slow) options = { ...options, antialias: false };
+    }
+    return plain.call(this, kind, options, ...rest);
+  };
+
+  // Changes of what is there are taken in at once, not at the next frame, which would draw them
+  // only a frame later.
+  const changes = new Set([
+    "SceneNodeUpdateMessage", "SetPositionMessage", "SetOrientationMessage", "GuiUpdateMessage",
+    "SetSceneNodeVisibilityMessage",
+  ]);
+  const take = ({ type, messages }) => {
+    const page = window.__viserMutable;
+    if (type !== "message_batch" || !page || page.firstMessageBatch) return;
+    if (page.getRenderRequestState !== "ready" || !page.drainMessageQueue) return;
+    if (page.messageQueue.length !== messages.length) return;
+    if (messages.every((message) => changes.has(message.type))) page.drainMessageQueue();
+  };
+  window.Worker = class extends Worker {
+    set onmessage(heard) {
+      super.onmessage = (event) => { heard(event); take(event.data); };
+    }
+    get onmessage() { return super.onmessage; }
+  };
+
+  const furnish = () => {
+    const page = window.__viserMutable, root = page?.scene?.__r3f?.root?.getState?.();
+    if (!page?.backgroundMaterial || !root) return later(furnish, 100);
+    // A pane for background images is drawn over the whole window although there is no image.
+    page.scene.traverse((thing) => {
+      if (thing.material === page.backgroundMaterial) thing.visible = false;
+    });
+    // A mouse that drags, and whatever changes, asks for frames for a quarter of a second. Where
+    // each takes its time they would keep that from being drawn which they wait for.
+    if (!slow) return;
+    let ask = page.requestRender, last = 0;
+    const thrifty = () => {
+      const held = page.cameraControl?.enabled === false;  // something, not the view
+      if (!held || window.event?.type !== "pointermove") root.invalidate();
+      clearTimeout(last);
+      last = later(() => ask(), 150);
+    };
+    Object.defineProperty(page, "requestRender", { get: () => thrifty, set: (f) => { ask = f; } });
+  };
+  furnish();
+})();
+"""
+
+STYLE = """
+/* On a phone the panel is as wide as the screen, below what is drawn. */
+@media (max-width: 36em) {
+  .mantine-Paper-root[style*="position: fixed"]:not([data-floating-window]) {
+    left: 0 !important; right: 0 !important; width: 100% !important; max-height: 55% !important;
+  }
+  .mantine-Paper-root:not([data-floating-window]) .mantine-ScrollArea-content > div {
+    width: 100% !important;
+  }
+}
+/* Between the cameras at the left and the panel at the right. */
+@media (max-width: 1300px) {
+  [data-floating-window]:has(svg[data-timeline]) {
+    width: calc(100vw - 770px) !important; min-width: 220px !important;
+  }
+}
+/* Blue can be read on black only if it is light. */
+[data-mantine-color-scheme=dark] svg [stroke="#0072b2"] { stroke: #56b4e9; }
+[data-mantine-color-scheme=dark] svg [fill="#0072b2"] { fill: #56b4e9; }
+"""
+
+_ICON = (
+    "data:image/svg+xml,%3Csvg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'%3E"
+    "%3Cpath d='M3 25C13 25 22 20 28 6' fill='none' stroke='%233e342c' stroke-width='3.5' "
+    "stroke-linecap='round'/%3E%3Ccircle cx='21' cy='17.5' r='4.5' fill='%23d55e00'/%3E%3C/svg%3E"
+)
+
+
+def amended(response: Any) -> Any:
+    """Put the script into a response that is a page; leave every other as it is."""
+    if response is None or not response.headers.get("Content-Type", "").startswith("text/html"):
+        return response
+    zipped = response.headers.get("Content-Encoding") == "gzip"
+    response.body = _zipped(response.body) if zipped else with_script(response.body)
+    del response.headers["Content-Length"]
+    response.headers["Content-Length"] = str(len(response.body))
+    return response
+
+
+@lru_cache(maxsize=2)
+def _zipped(page: bytes) -> bytes:
+    return gzip.compress(with_script(gzip.decompress(page)))
+
+
+def with_script(page: bytes) -> bytes:
+    """Put the script, an icon and a title first of all that a page loads."""
+    ours = (
+        f'<link rel="icon" href="{_ICON}"/><title>vibrissa</title><style>{STYLE}</style>'
+        f"<script>{SCRIPT}</script>"
+    )
+    return page.replace(b"<head>", b"<head>" + ours.encode(), 1)

@@ -18,8 +18,8 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from vibrissa.numerics import Array
 from vibrissa.scene import (
-    Array,
     Arrows,
     Body,
     Bytes,

@@ -14,12 +14,13 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from vibrissa.contacts import ContactMap
+from vibrissa.numerics import Array
 from vibrissa.quantities import to_display
 from vibrissa.rod import Deflection, PegContact, PointContact, PointForce, deflect
-from vibrissa.scene import Array, Bytes, Painted, column, sample_contacts, sheet, solid_surface
+from vibrissa.scene import Bytes, Painted, column, sample_contacts, sheet, solid_surface
 from vibrissa.signals import SIGNALS
 from vibrissa.status import Status
-from vibrissa.viewer.colours import CLOUD
+from vibrissa.viewer.readout import CLOUD
 from vibrissa.whisker import Whisker, constant
 
 Kind = Literal["point", "peg", "force"]

@@ -12,13 +12,13 @@ import xarray as xr
 from vibrissa import scene
 from vibrissa.contour import CylinderFit, SphereFit, shape_from_dataset, surface_grid
 from vibrissa.io import Footage
+from vibrissa.numerics import Array
 from vibrissa.objects import Surface, objects_datasets
 from vibrissa.quantities import to_display
 from vibrissa.sketch import round_step
 from vibrissa.viewer.bend import arrow, mm, ruler, whisker_body
-from vibrissa.viewer.colours import CONTACT, FIT, OBJECT, Legend
 from vibrissa.viewer.page import Page, asked, put
-from vibrissa.viewer.readout import chart, cursor, table, timeline
+from vibrissa.viewer.readout import CONTACT, FIT, OBJECT, Legend, chart, cursor, table, timeline
 from vibrissa.viewer.recorded import View, Watched, picture, views
 from vibrissa.viewer.state import force_scale
 from vibrissa.viewer.threads import Player
@@ -31,7 +31,7 @@ _COLOURS = np.array(
 )
 
 
-def extent(trial: Watched) -> tuple[scene.Array, float]:
+def extent(trial: Watched) -> tuple[Array, float]:
     """Middle, mm, and size, mm, of where whiskers go."""
     points = trial.lines.reshape(-1, 3)
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
@@ -141,7 +141,7 @@ def surroundings(trial: Watched, layers: Collection[str] = LAYERS) -> scene.Draw
     return out
 
 
-def object_body(thing: Surface, extent: float, near: scene.Array) -> scene.Body:
+def object_body(thing: Surface, extent: float, near: Array) -> scene.Body:
     """An object; what has no end is shown within a cube, mm wide, about a place (3,), mm."""
     half = 0.5 * extent
     (held,) = objects_datasets([thing]).values()
@@ -149,12 +149,12 @@ def object_body(thing: Surface, extent: float, near: scene.Array) -> scene.Body:
     return scene.Body(vertices, faces, OBJECT, 0.55, "double")
 
 
-def _known(trial: Watched) -> scene.Array:
+def _known(trial: Watched) -> Array:
     points = trial.contacts.reshape(-1, 3)
     return np.asarray(points[np.isfinite(points).all(axis=1)])
 
 
-def fitted_body(contour: xr.Dataset, near: scene.Array) -> tuple[scene.Array, scene.Ints] | None:
+def fitted_body(contour: xr.Dataset, near: Array) -> tuple[Array, scene.Ints] | None:
     """Vertices, m, and triangles of a fitted shape; None for what has no picture."""
     try:
         shape = shape_from_dataset(contour)

@@ -2,9 +2,9 @@
 
 from vibrissa.whisker import morphology
 from vibrissa.whisker.array import WhiskerArray, whisker_array
-from vibrissa.whisker.identity import Identity
 from vibrissa.whisker.model import Whisker
 from vibrissa.whisker.morphology import (
+    Identity,
     published_note as published_note,
     published_radii as published_radii,
 )

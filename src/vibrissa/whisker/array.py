@@ -12,19 +12,16 @@ from dataclasses import replace
 from typing import Any, Literal, Unpack
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vibrissa.deferred import xr
+from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
 from vibrissa.sketch import BENT, Mark, card, shown, views
 from vibrissa.whisker import morphology
-from vibrissa.whisker.identity import ROWS, Identity, Side
 from vibrissa.whisker.model import Whisker
-from vibrissa.whisker.morphology import published_radii
+from vibrissa.whisker.morphology import ROWS, Identity, Side, published_radii
 from vibrissa.whisker.pose import Pose, angles_of, base_rotation, mirrored
 from vibrissa.whisker.section import Properties
-
-Array = NDArray[np.float64]
 
 BOTH: tuple[Side, Side] = ("left", "right")
 """Sides of an animal."""
@@ -33,7 +30,7 @@ BOTH: tuple[Side, Side] = ("left", "right")
 class WhiskerArray(Mapping[str, Whisker]):
     """Whiskers by name, each with its pose in the head's frame.
 
-    A name is that of `vibrissa.whisker.identity`: ``LC2``, ``Rγ``. Others are understood when a
+    A name is that of `vibrissa.whisker.morphology`: ``LC2``, ``Rγ``. Others are understood when a
     whisker is asked for (``left C2``, ``Rgamma``), also without the side where only one side has
     such a whisker.
 

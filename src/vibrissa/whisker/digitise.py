@@ -50,12 +50,11 @@ from scipy.linalg import eigh, qr, solve_triangular, svd
 from scipy.special import chdtri, fdtrc
 
 from vibrissa.deferred import interpolate
+from vibrissa.numerics import Array
 from vibrissa.whisker.pose import Pose, least_turn
 from vibrissa.whisker.profile import Profile, approximate, constant
 from vibrissa.whisker.rest import Path
 from vibrissa.whisker.section import LONGEST, length_faults
-
-Array = NDArray[np.float64]
 
 ROUNDS = 12
 """Times at most that points are projected and fitted again."""

@@ -18,9 +18,10 @@ from functools import cached_property
 from typing import Unpack
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from vibrissa.deferred import xr
+from vibrissa.numerics import Array
 from vibrissa.quantities import quantity
 from vibrissa.sketch import BENT, Mark, card, shown, views
 from vibrissa.whisker.dataset import Stored, check_drawn, whisker_dataset, whisker_fields
@@ -50,8 +51,6 @@ from vibrissa.whisker.section import (
     settled,
     split,
 )
-
-Array = NDArray[np.float64]
 
 ROUNDING = 1e-9
 """Share of the length by which an arc length may lie outside the whisker and is clipped."""

@@ -21,9 +21,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from vibrissa.numerics import Array
 
 ORTHOGONALITY = 1e-9
 """Largest entry of RᵀR − 1 that still counts as a rotation."""

@@ -21,11 +21,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vibrissa.numerics import Array
 from vibrissa.whisker.profile import Profile, approximate, constant
 
-Array = NDArray[np.float64]
 Rate = Callable[[Array], Array]
 
 STEPS = 96

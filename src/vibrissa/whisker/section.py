@@ -5,15 +5,16 @@ A circular section of radius r(s), of one isotropic material:
     B(s) = diag(GJ, EI, EI),    I = π r⁴ / 4,    J = 2 I,    G = E / (2 (1 + ν))
 
 By default r falls linearly from base to tip. Sampled radii are joined by monotone cubics between
-the jumps and kinks found in them (`vibrissa.whisker.sampled_radius`).
+the jumps and kinks found in them (`vibrissa.whisker.profile`).
 """
 
 from collections.abc import Callable, Sequence
 from typing import TypedDict, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from vibrissa.numerics import Array
 from vibrissa.whisker.morphology import published_note, published_radii
 from vibrissa.whisker.profile import (
     JUMP,
@@ -22,10 +23,9 @@ from vibrissa.whisker.profile import (
     approximate,
     array_function,
     linear,
+    sampled_radius,
+    scatter,
 )
-from vibrissa.whisker.sampled_radius import sampled_radius, scatter
-
-Array = NDArray[np.float64]
 
 BASE_RADIUS = 100e-6
 TAPER = 15.0

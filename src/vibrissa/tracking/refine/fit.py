@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from vibrissa.cameras import Camera
+from vibrissa.numerics import Array, Mask
 from vibrissa.objects import Surface
 from vibrissa.rod import Discretization, discretize, solve_forces
 from vibrissa.tracking.refine.least_squares import Smoother, trace_variance
@@ -34,9 +35,6 @@ from vibrissa.tracking.refine.rods import (
 from vibrissa.tracking.refine.trace_series import FAR, TraceSeries
 from vibrissa.tracking.space.pose import BasePose, HeadPose
 from vibrissa.whisker import Whisker
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-8, 1e6
 """Levenberg's damping at the start, at least, and that at which no step helps."""

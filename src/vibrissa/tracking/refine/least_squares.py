@@ -21,10 +21,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
-Array = NDArray[np.float64]
+from vibrissa.numerics import Array
 
 _REGULAR = 1e-12
 """Share of the largest element that is added to diagonals, so that they can be factorised."""

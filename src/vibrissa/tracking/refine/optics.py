@@ -22,12 +22,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from vibrissa.cameras import Camera, triangulate
+from vibrissa.numerics import Array
 from vibrissa.tracking.refine.trace_series import TraceSeries
 from vibrissa.tracking.space.curve import merge
 from vibrissa.tracking.space.rest_shape import RestShape, aligned_lengths, motions, rest_shape
 from vibrissa.tracking.trace.trace import Trace, arc_lengths, interpolated
-
-Array = NDArray[np.float64]
 
 _STRENGTH = 2.0
 """Standard deviation of the inverse of a distance that is not stated, 1/m: lenses at 0.5 m."""

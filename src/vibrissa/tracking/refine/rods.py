@@ -10,16 +10,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from vibrissa.numerics import Array, Mask
 from vibrissa.rod import Discretization, discretize, shapes, solve_forces
 from vibrissa.tracking.space.pose import BasePose
 from vibrissa.tracking.trace.trace import arc_lengths, interpolated
 from vibrissa.whisker import Whisker
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 UNKNOWNS = 10
 """Number of a frame's unknowns: shift (3), turn (3), s_c, f_x, f_y, f_z."""

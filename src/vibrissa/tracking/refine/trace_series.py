@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vibrissa.numerics import Array
 from vibrissa.tracking.trace.trace import Trace, interpolated
-
-Array = NDArray[np.float64]
 
 NODES = 101
 """Number of points of a stored trace."""

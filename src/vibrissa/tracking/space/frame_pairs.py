@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.cameras import Camera, triangulate
+from vibrissa.numerics import Array
 from vibrissa.tracking.trace.trace import Trace
 
-Array = NDArray[np.float64]
 Pairs = NDArray[np.int64]
 
 _LARGEST = 30

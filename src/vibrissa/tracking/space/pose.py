@@ -16,11 +16,10 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from vibrissa.numerics import Array
 from vibrissa.tracking.space.rest_shape import RestShape, aligned_lengths, motions
 from vibrissa.tracking.trace.trace import interpolated
 from vibrissa.whisker import Whisker, angles_of, base_rotation
-
-Array = NDArray[np.float64]
 
 CUTOFF = 85.0
 """The paper's cut-off, Hz."""

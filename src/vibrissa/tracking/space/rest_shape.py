@@ -22,11 +22,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vibrissa.numerics import Array, Mask
 from vibrissa.tracking.trace.trace import arc_lengths, interpolated
 from vibrissa.whisker import Whisker
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Counts = NDArray[np.intp]
 
 _COMMON = 0.85

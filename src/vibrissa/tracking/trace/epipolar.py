@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 
 from vibrissa.cameras import Camera, triangulate
 from vibrissa.io import Frame
+from vibrissa.numerics import Array
 from vibrissa.tracking.trace.curves import Curve, smoothed
 from vibrissa.tracking.trace.scene import Bodies, Image, Scene
 from vibrissa.tracking.trace.trace import arc_lengths, interpolated
-
-Array = NDArray[np.float64]
 
 _STEP = 4.0
 """Distance of the points that are searched, pixels."""

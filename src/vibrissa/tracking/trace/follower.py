@@ -20,9 +20,10 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from vibrissa.io import Frame
+from vibrissa.numerics import Array
 from vibrissa.tracking.trace.clutter import NOTHING, Clutter
 from vibrissa.tracking.trace.ridge import (
     FEWEST,
@@ -36,8 +37,6 @@ from vibrissa.tracking.trace.ridge import (
     traced,
 )
 from vibrissa.tracking.trace.trace import STEP, Trace, TraceOptions, aligned, overlap
-
-Array = NDArray[np.float64]
 
 _DARK = ((5, 25), (25, 50), (50, 80))
 _ALONG = ((3, 11), (20, 28), (40, 48), (60, 68))

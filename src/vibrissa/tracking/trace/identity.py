@@ -22,11 +22,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vibrissa.numerics import Array, Mask
 from vibrissa.tracking.trace.follower import ENOUGH, FEATURES, Appearance
 from vibrissa.tracking.trace.trace import STEP, Trace, overlap
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Ways = NDArray[np.intp]
 Way = tuple[int, ...]
 """Number of each whisker's line; −1 if it is lost."""

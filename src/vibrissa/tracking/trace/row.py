@@ -18,11 +18,12 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from vibrissa.io import Frame
+from vibrissa.numerics import Array, Mask
 from vibrissa.tracking.trace.clutter import NEAR, between_whiskers
 from vibrissa.tracking.trace.curves import Curve, find_curves
 from vibrissa.tracking.trace.follower import Follower, features_of
@@ -41,9 +42,6 @@ from vibrissa.tracking.trace.identity import (
 from vibrissa.tracking.trace.ridge import measure, noise_level, prolonged, traced
 from vibrissa.tracking.trace.scene import Scene
 from vibrissa.tracking.trace.trace import STEP, Trace, aligned, even, given, overlap
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _DOUBT = 0.6
 """Least difference to a way that gives a whisker another line."""

@@ -17,18 +17,17 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from vibrissa.cameras import Camera, triangulate
 from vibrissa.io import Frame
+from vibrissa.numerics import Array, Mask
 from vibrissa.tracking.trace.curves import Curve, find_curves
 from vibrissa.tracking.trace.epipolar import seen_along
 from vibrissa.tracking.trace.follower import start_at
 from vibrissa.tracking.trace.ridge import noise_level
 from vibrissa.tracking.trace.scene import Scene
-from vibrissa.tracking.trace.trace import Mask, TraceOptions, overlap
-
-Array = NDArray[np.float64]
+from vibrissa.tracking.trace.trace import TraceOptions, overlap
 
 FRAMES = 30
 """Number of frames in which a start is best found."""

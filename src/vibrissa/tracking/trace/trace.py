@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from vibrissa.numerics import Array, Mask
 
 STEP = 2.0
 """Distance between points of a trace, pixels."""

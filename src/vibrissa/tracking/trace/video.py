@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from vibrissa.io import (
     Frame,
@@ -23,6 +23,7 @@ from vibrissa.io import (
     video_info,
     without_part,
 )
+from vibrissa.numerics import Mask
 from vibrissa.tracking.trace.clutter import between_whiskers
 from vibrissa.tracking.trace.curves import find_whiskers
 from vibrissa.tracking.trace.follower import Follower, features_of, start_at
@@ -30,9 +31,7 @@ from vibrissa.tracking.trace.identity import Seen, decided
 from vibrissa.tracking.trace.row import follow_row
 from vibrissa.tracking.trace.scene import Scene
 from vibrissa.tracking.trace.start import FRAMES, is_bright, negative
-from vibrissa.tracking.trace.trace import Mask, Trace, TraceOptions, given, overlap
-
-Array = NDArray[np.float64]
+from vibrissa.tracking.trace.trace import Trace, TraceOptions, given, overlap
 
 Corrections = Mapping[tuple[int, int], ArrayLike]
 """Points (n, 2) along a whisker from base to tip, column and row, by frame and whisker."""

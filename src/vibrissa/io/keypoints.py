@@ -1,36 +1,52 @@
-"""Tables of DeepLabCut and LightningPose: CSV, and pandas tables in HDF5.
+"""Keypoints as DeepLabCut, LightningPose, SLEAP and *movement* keep them.
+
+**DeepLabCut and LightningPose**: tables as CSV, or as pandas writes them to HDF5.
 
 Each column is headed by scorer, (individual,) body part and coordinate: x, y, likelihood in pixels,
 or x, y, z where DeepLabCut has triangulated two views. Other coordinates, such as the spread of an
 ensemble, are left alone. An individual is a whisker, its body parts the whisker's nodes.
 
-Tables that pandas wrote to HDF5, read without pandas.
+Tables of pandas are read without it. Its two formats: "table", one compound dataset whose column
+names are pickled in attributes, and "fixed", plain arrays of values, levels and labels. Nothing is
+unpickled, since a pickle can run code and build objects of chosen bytes: names are read off its
+text, and blocks that are not numbers are refused.
 
-Its two formats: "table", one compound dataset whose column names are pickled in attributes, and
-"fixed", plain arrays of values, levels and labels. Nothing is unpickled, since a pickle can run
-code and build objects of chosen bytes: names are read off its text, and blocks that are not numbers
-are refused.
+**SLEAP**: analysis files (HDF5), and labels (``.slp``, through sleap-io). An analysis file holds
+dense arrays of tracks, nodes and scores. Their dimensions are named in an attribute where sleap-io
+wrote them, and are (track, xy, node, frame) in SLEAP's own. Labels are lists of instances in
+frames, of one video or of several, which become views; sleap-io reads their many versions.
+
+**movement**: datasets (NetCDF) with ``position`` and ``confidence`` of keypoints. Up to its version
+0.16 the dimensions are called individuals and keypoints, since 0.17 individual and keypoint.
+Datasets of several cameras have a dimension ``view``. Positions in a plane are pixels unless the
+attribute ``space_unit`` states another.
 """
 
 from __future__ import annotations
 
+import json
 import pickletools
 import re
 from collections.abc import Iterator
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.io.netcdf import is_netcdf, opened
+from vibrissa.deferred import xr
+from vibrissa.io.netcdf import is_netcdf, naming, opened, read_dataset
 from vibrissa.io.paths import check_readable
 from vibrissa.io.table import read_text, table_rows
 from vibrissa.io.tracks import RawTracks
+from vibrissa.numerics import Array
 
-Array = NDArray[np.float64]
+if TYPE_CHECKING:
+    import sleap_io
+
+
 Names = list[tuple[str, ...]]
 
 _LEVELS = ("scorer", "individuals", "bodyparts", "coords")
@@ -288,3 +304,177 @@ def _block(name: str, data: Any) -> Array:
     if data.dtype.kind not in "fiub":
         raise ValueError(f"{name} is of type {data.dtype}; numbers are needed")
     return np.asarray(data, dtype=np.float64)
+
+
+_OWN = {"tracks": ("track", "xy", "node", "frame"), "point_scores": ("track", "node", "frame")}
+
+
+def read_sleap_analysis(path: str | PathLike[str]) -> RawTracks:
+    """Read an analysis file (``.h5``) as raw tracks."""
+    path = Path(path)
+    with opened(path, "an analysis file of SLEAP") as file:
+        if "tracks" not in file or "node_names" not in file:
+            raise ValueError(
+                f"{path} is not an analysis file of SLEAP: it lacks tracks or node_names"
+            )
+        points = _ordered(file["tracks"], ("frame", "track", "node", "xy"))
+        sure = None
+        if "point_scores" in file:
+            sure = _ordered(file["point_scores"], ("frame", "track", "node"))
+        nodes = [str(name) for name in file["node_names"].asstr()[:]]
+        names = [str(name) for name in file["track_names"].asstr()[:]] if _any(file) else []
+        fps = file.attrs.get("fps")
+    whiskers = names or _numbered(points.shape[1])
+    if points.shape[1:] != (len(whiskers), len(nodes), 2):
+        raise ValueError(
+            f"{path}: tracks have shape {points.shape}, and names are given for {len(whiskers)} "
+            f"tracks and {len(nodes)} nodes"
+        )
+    return RawTracks(
+        software="SLEAP",
+        whiskers=whiskers,
+        image=points[:, :, None],
+        image_confidence=None if sure is None else _confidence(sure)[:, :, None],
+        nodes=nodes,
+        fps=None if fps is None else float(fps),
+    )
+
+
+def read_sleap_labels(path: str | PathLike[str]) -> RawTracks:
+    """Read labels as raw tracks."""
+    path = check_readable(path)
+    try:
+        import sleap_io
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            f"{path} holds labels of SLEAP: to read them, install vibrissa[labs], or export the "
+            "tracks from SLEAP as an analysis file"
+        ) from error
+    with opened(path, "labels of SLEAP") as file:
+        if "frames" not in file or "instances" not in file:
+            raise ValueError(f"{path} holds no labels of SLEAP: it lacks frames or instances")
+    try:
+        labels = sleap_io.load_slp(path, open_videos=False)
+        parts = [_of_video(labels, video) for video in labels.videos]
+    except Exception as error:  # What sleap-io raises for a damaged file is not documented.
+        raise ValueError(f"{path} cannot be read as labels of SLEAP ({error})") from error
+    if not any(len(values) for _, values in parts):
+        raise ValueError(f"{path} holds no labelled frame")
+    start = min(first for first, values in parts if len(values))
+    end = max(first + len(values) for first, values in parts)
+    tracks, nodes = (max(values.shape[axis] for _, values in parts) for axis in (1, 2))
+    found = np.full((end - start, tracks, len(parts), nodes, 3), np.nan)
+    for view, (first, values) in enumerate(parts):
+        rows = slice(first - start, first - start + len(values))
+        found[rows, : values.shape[1], view] = values
+    stems = [Path(str(video.filename)).stem for video in labels.videos]
+    if len(set(stems)) < len(stems):
+        stems = [f"view {i + 1}" for i in range(len(stems))]
+    return RawTracks(
+        software="SLEAP",
+        whiskers=[track.name for track in labels.tracks] or _numbered(tracks),
+        image=found[..., :2],
+        image_confidence=_confidence(found[..., 2]),
+        nodes=list(labels.skeletons[0].node_names),
+        views=stems if len(stems) > 1 else (),
+        frames=np.arange(start, end),
+    )
+
+
+def _of_video(labels: sleap_io.Labels, video: sleap_io.Video) -> tuple[int, Array]:
+    """First frame of a video's labels, and these (frame, track, node, column, row and score)."""
+    numbers = [frame.frame_idx for frame in labels.labeled_frames if frame.video == video]
+    if not numbers:
+        return 0, np.full((0, 1, 1, 3), np.nan)
+    found = labels.numpy(video=video, untracked=not labels.tracks, return_confidence=True)
+    # Versions of sleap-io begin at frame 0, or at the first that has a label.
+    first = min(numbers) if len(found) == max(numbers) - min(numbers) + 1 else 0
+    return first, found.astype(np.float64)
+
+
+def _ordered(array: h5py.Dataset, wanted: tuple[str, ...]) -> Array:
+    """Bring the dimensions of an array in order."""
+    stated = array.attrs.get("dims")
+    dims = tuple(json.loads(stated)) if stated is not None else _OWN[array.name.strip("/")]
+    values: Array = np.asarray(array[:], dtype=np.float64)
+    if sorted(dims) != sorted(wanted) or values.ndim != len(wanted):
+        raise ValueError(f"{array.name} has dimensions {dims} of sizes {values.shape}")
+    return values.transpose([dims.index(dim) for dim in wanted])
+
+
+def _any(file: h5py.File) -> bool:
+    return "track_names" in file and file["track_names"].size > 0
+
+
+def _numbered(count: int) -> list[str]:
+    return [str(i) for i in range(count)] if count != 1 else ["whisker"]
+
+
+def _confidence(scores: Array) -> Array:
+    """Scores are peaks of confidence maps, which noise can lift a little over 1."""
+    return np.clip(scores, 0.0, 1.0)
+
+
+Frames = NDArray[np.int64]
+
+_NAMES = {"individuals": "individual", "keypoints": "keypoint"}
+_DIMS = ("time", "individual", "view", "keypoint", "space")
+_PIXELS = ("", "px", "pixel", "pixels")
+
+
+def read_movement(path: str | PathLike[str]) -> RawTracks:
+    """Read a poses dataset as raw tracks."""
+    path = Path(path)
+    with naming(path, "a poses dataset of movement"):
+        return _raw(path, read_dataset(path))
+
+
+def _raw(path: Path, poses: xr.Dataset) -> RawTracks:
+    poses = poses.rename({old: new for old, new in _NAMES.items() if old in poses.dims})
+    if "position" not in poses or not {"time", "keypoint", "space"} <= set(poses["position"].dims):
+        got = ", ".join(str(name) for name in poses.variables) or "nothing"
+        raise ValueError(
+            f"{path} is not a poses dataset of movement: it has {got}, and position along time, "
+            "space, keypoint(s) and individual(s) is needed"
+        )
+    views = [str(name) for name in poses["view"].values] if "view" in poses.dims else []
+    if "individual" not in poses.dims:
+        poses = poses.expand_dims(individual=["whisker"])
+    if not views:
+        poses = poses.expand_dims("view")
+    points = poses["position"].transpose(*_DIMS).values.astype(np.float64)
+    sure = None
+    if "confidence" in poses:
+        sure = poses["confidence"].transpose(*_DIMS[:-1]).values.astype(np.float64)
+    unit = str(poses.attrs.get("space_unit", ""))
+    flat = points.shape[-1] == 2
+    fps, time, frames = _clock(poses)
+    if flat and unit not in _PIXELS:
+        raise ValueError(f"{path} has positions in a plane in {unit}; pixels are needed")
+    if not flat and points.shape[2] > 1:
+        raise ValueError(f"{path} has points in space for {points.shape[2]} views; one is needed")
+    return RawTracks(
+        software=f"movement ({poses.attrs.get('source_software', 'unknown')})",
+        whiskers=[str(name) for name in poses["individual"].values],
+        image=points if flat else None,
+        image_confidence=sure if flat else None,
+        space=None if flat else points[:, :, 0],
+        space_confidence=None if flat or sure is None else sure[:, :, 0],
+        nodes=[str(name) for name in poses["keypoint"].values],
+        views=views,
+        unit="" if unit in _PIXELS else unit,
+        fps=fps,
+        time=time,
+        frames=frames,
+    )
+
+
+def _clock(poses: xr.Dataset) -> tuple[float | None, Array | None, Frames | None]:
+    """Frames a second, times and numbers of the frames, as far as they are known."""
+    fps = poses.attrs.get("fps")
+    time = poses["time"].values.astype(np.float64)
+    if poses.attrs.get("time_unit", "frames") == "frames":
+        return None, None, time.astype(np.int64)
+    if fps is None:
+        return None, time, None
+    return float(fps), time, np.rint(time * float(fps)).astype(np.int64)

@@ -1,0 +1,132 @@
+"""Linear least squares that name what the data do not determine; readings over contact points.
+
+The latter are a Gaussian process with the thin-plate kernel,
+
+    k(d) = a² (2 d³ − 3 R d² + R³) / R³ for distances d ≤ R
+
+(Williams & Fitzgibbon, *Gaussian process implicit surfaces*, 2007): it has no length to be fitted
+and does not fall back to its mean between points, as a squared exponential does.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial.distance import cdist
+
+from vibrissa.numerics import Array
+
+_CONDITION = 1e4
+"""Condition number, of columns scaled to one, from which unknowns are not determined."""
+
+
+class Solution(NamedTuple):
+    """Unknowns (p, ...), (AᵀA)⁻¹ (p, p) and residuals (n, ...)."""
+
+    unknowns: Array
+    spread: Array
+    residuals: Array
+
+
+def solve(design: Array, values: Array, names: Sequence[str], advice: str) -> Solution:
+    """Solve A x = y by least squares."""
+    n, p = design.shape
+    if n < p:
+        raise ValueError(f"{n} equations do not determine {p} unknowns: {advice}")
+    size = np.linalg.norm(design, axis=0)
+    if not size.all():
+        idle = ", ".join(name for name, s in zip(names, size, strict=True) if s == 0.0)
+        raise ValueError(f"the data do not depend on {idle}: {advice}")
+    u, singular, v = np.linalg.svd(design / size, full_matrices=False)
+    if singular[-1] * _CONDITION < singular[0]:
+        raise ValueError(f"the data do not determine {_combination(v[-1], names)}: {advice}")
+    back = v.T / singular / size[:, None]
+    unknowns = np.tensordot(back @ u.T, values, axes=1)
+    residuals = values - np.tensordot(design, unknowns, axes=1)
+    return Solution(unknowns, back @ back.T, residuals)
+
+
+def _combination(direction: Array, names: Sequence[str]) -> str:
+    largest = np.abs(direction).max()
+    parts = [name for name, c in zip(names, direction, strict=True) if abs(c) > 0.1 * largest]
+    return parts[0] if len(parts) == 1 else "how much comes from each of " + ", ".join(parts)
+
+
+_MANY = 5.0
+"""Residuals over the noise up to which the noise may have been stated too small."""
+
+
+def warn_of_misfit(misfit: float, advice: str) -> None:
+    """Warn where residuals are far larger than the noise."""
+    if misfit > _MANY**2:
+        warnings.warn(
+            f"what is left unexplained is {math.sqrt(misfit):.0f} times the noise: check {advice}",
+            stacklevel=3,
+        )
+
+
+def warn_of_surprise(log_factor: float, sigma: float) -> None:
+    """Warn where loads contradict the modulus and radius that were stated for a whisker."""
+    if abs(log_factor) > _MANY * sigma:
+        warnings.warn(
+            f"the loads make E r⁴ {math.exp(log_factor):.3g} times that of the given modulus and "
+            f"radius, {abs(log_factor) / sigma if sigma else math.inf:.0f} standard deviations "
+            "off: check their units, whether the radius is a diameter, and the readings' units",
+            stacklevel=4,
+        )
+
+
+_RATIOS = np.logspace(-7, 1, 17)
+"""Noise variance over that of the process; the one of largest marginal likelihood is taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class ThinPlate:
+    """Mean of a thin-plate Gaussian process; no two of its points are farther apart than its reach.
+
+    Its noise is the standard deviation that was found.
+    """
+
+    points: Array
+    weights: Array
+    reach: float
+    noise: Array
+
+    @classmethod
+    def fit(cls, points: Array, values: Array, ratio: float | None = None) -> ThinPlate:
+        """Fit values (n, k) of zero mean; where no noise is stated, by the largest likelihood."""
+        reach = 2.0 * float(np.linalg.norm(np.ptp(points, axis=0)))
+        kernel = _kernel(cdist(points, points) / reach)
+        n, k = values.shape
+        weights, noise = np.empty((n, k)), np.empty(k)
+        best = np.full(k, np.inf)
+        for one in _RATIOS if ratio is None else (ratio,):
+            factor = cho_factor(kernel + one * np.eye(n), lower=True)
+            back = cho_solve(factor, values)
+            variance = np.maximum(np.sum(values * back, axis=0) / n, np.finfo(np.float64).tiny)
+            cost = n * np.log(variance) + 2.0 * np.log(np.diag(factor[0])).sum()
+            better = cost < best
+            best[better], weights[:, better] = cost[better], back[:, better]
+            noise[better] = np.sqrt(one * variance[better])
+        return cls(np.array(points), weights, reach, noise)
+
+    def __call__(self, points: Array) -> tuple[Array, Array]:
+        """Mean (n, k) at points, and its derivatives (n, k, 3)."""
+        x = np.minimum(cdist(points, self.points) / self.reach, 1.0)
+        by_square = 6.0 * (x - 1.0) / self.reach**2  # (dk/dx) / (x R²)
+        n, k = len(points), self.weights.shape[1]
+        moments = self.weights[:, :, None] * self.points[:, None, :]
+        slopes = (by_square @ self.weights)[:, :, None] * points[:, None, :]
+        slopes -= (by_square @ moments.reshape(-1, 3 * k)).reshape(n, k, 3)
+        return np.asarray(_kernel(x) @ self.weights), slopes
+
+
+def _kernel(x: Array) -> Array:
+    x = np.minimum(x, 1.0)
+    return np.asarray((2.0 * x - 3.0) * x * x + 1.0)

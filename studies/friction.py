@@ -49,7 +49,7 @@ def scored(found: vb.Contacts, truth: np.ndarray) -> str:
     """Median error with its prediction, and the share of truths in the 95 % region."""
     known = np.isfinite(found.covariance).all(axis=(1, 2))
     away, covariance = (found.point - truth)[known], found.covariance[known]
-    size = np.einsum("ni,nij,nj->n", away, np.linalg.inv(covariance), away)
+    size = np.einsum("ni,nij,nj->n", away, np.linalg.pinv(covariance, 1e-12, hermitian=True), away)
     draws = np.random.default_rng(0).normal(size=(len(away), 200, 3))
     drawn = np.einsum("nij,nmj->nmi", np.linalg.cholesky(covariance), draws)
     error, predicted = (

@@ -14,7 +14,7 @@ from typing import Any
 
 from friction_inertia.conditions import CONDITIONS, FAST, Condition, Recorded, recorded
 from friction_inertia.figure import draw
-from friction_inertia.methods import METHODS, chart, located, scored, truth_of
+from friction_inertia.methods import METHODS, RUBBING, chart, located, scored, sensed, truth_of
 from friction_inertia.summaries import summary
 from friction_inertia.tables import TABLES, write
 from friction_inertia.video import cutoffs, paper_test, tracked_scores
@@ -28,15 +28,14 @@ ROOT = Path(__file__).parent.parent
 
 def from_wrench(trials: list[Recorded]) -> dict[str, Any]:
     """All methods, placed by the true pose."""
-    out: dict[str, Any] = {}
-    for method in METHODS:
-        rows = []
-        for trial in trials:
-            truth, contacts = truth_of(trial.true), chart(Recording(trial.true).whisker())
-            found = located(method, trial.true, contacts)
-            rows.append(scored(found, truth, truth.pose, trial.true))
-        out[method] = summary(rows)
-    return {"true": out}
+    rows: dict[str, list[Any]] = {method: [] for method in (*METHODS, *RUBBING)}
+    for trial in trials:
+        truth, contacts = truth_of(trial.true), chart(Recording(trial.true).whisker())
+        wrench = sensed(trial.true, bool(trial.condition.of))
+        for method, done in rows.items():
+            found = located(method, wrench, contacts)
+            done.append(scored(found, truth, truth.pose, trial.true))
+    return {"true": {method: summary(done) for method, done in rows.items()}}
 
 
 def from_video(trials: list[Recorded]) -> dict[str, Any]:

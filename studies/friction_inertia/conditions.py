@@ -28,6 +28,8 @@ class Condition:
     frequency: float = 5.0
     filmed: int = 2
     """How many of its trials are filmed."""
+    of: str = ""
+    """Name of the condition whose trials these are, with the inertia removed; else its own."""
 
 
 CONDITIONS = (
@@ -36,7 +38,16 @@ CONDITIONS = (
     Condition("friction-03", "friction 0.3", 0.3),
     Condition("friction-05", "friction 0.5", 0.5),
     Condition("dynamic", "inertia", dynamic=True, filmed=1),
+    Condition("removed", "inertia removed", dynamic=True, filmed=0, of="dynamic"),
     Condition("dynamic-friction-03", "inertia, friction 0.3", 0.3, dynamic=True),
+    Condition(
+        "removed-friction-03",
+        "inertia removed, friction 0.3",
+        0.3,
+        dynamic=True,
+        filmed=0,
+        of="dynamic-friction-03",
+    ),
 )
 
 FAST = Condition("fast", "no friction, 10 whisks a second", frequency=10.0, filmed=1)
@@ -61,7 +72,7 @@ def recorded(
     condition: Condition, seed: int, duration: float, folder: Path, video: bool
 ) -> Recorded:
     """Find a condition's recordings in the folder, or make them."""
-    stem = f"{condition.name}-{duration:g}s-{seed}"
+    stem = f"{condition.of or condition.name}-{duration:g}s-{seed}"
     true = _kept(folder / f"{stem}.nc", lambda: _simulated(condition, seed, duration))
     tracked = None
     if video:

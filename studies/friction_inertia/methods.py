@@ -18,10 +18,12 @@ from vibrissa.pipeline import (
     locate,
     locate_from_wrench,
     whisker_radii,
+    with_signals,
 )
 from vibrissa.recording import Recording
 from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE, component_noise
 from vibrissa.signals import SIGNALS, nearest_on_rest
+from vibrissa.simulation import Dynamics
 from vibrissa.whisker import Whisker
 
 NOISE = component_noise(FORCE_NOISE, MOMENT_NOISE)
@@ -31,6 +33,15 @@ SIX = "six signals"
 WRENCH = "wrench"
 PEG = ("offset", "tilt", "diameter", "sigma")
 METHODS = (TRIPLET, OTHER, SIX, WRENCH)
+RUBBING = {f"{of}, friction": of for of in (TRIPLET, "Fx FT MB MD", SIX)}
+"""Methods that allow for friction, and their signals."""
+FRICTION = 0.3
+"""Their prior: ratio of the forces along and across the whisker, one sigma."""
+ASSUMED = Dynamics(
+    density=tuple(0.85 * value for value in Dynamics().density),
+    damping_ratio=0.85 * Dynamics().damping_ratio,
+)
+"""Mass and damping that inertia is removed with: those of the trials, and 15 % less."""
 
 Pose = tuple[np.ndarray, np.ndarray]
 """Rotation (n, 3, 3) and position (n, 3) of the base in every frame."""
@@ -102,18 +113,33 @@ def chart(whisker: Whisker) -> ContactMap:
     return ContactMap.simulate(whisker, grid=False)
 
 
-def located(method: str, trial: xr.DataTree, contact_map: ContactMap) -> xr.Dataset:
+def sensed(trial: xr.DataTree, removed: bool = False) -> xr.Dataset:
+    """Wrench and pose of the sensor's whisker, as measured or without the whisker's inertia."""
+    if removed:
+        trial = with_signals(trial, "sensor", dynamics=ASSUMED)["signals"]
+    return trial.to_dataset(inherit=False).isel(whisker=0)
+
+
+def located(method: str, wrench: xr.Dataset, contact_map: ContactMap) -> xr.Dataset:
     """Contacts from the sensor's wrench, whisker frame."""
-    wrench = trial.to_dataset()[["force", "moment"]].isel(whisker=0)
+    noise = NOISE
+    if "wrench_covariance" in wrench:
+        noise = wrench["wrench_covariance"].values
+        wrench = wrench[["force", "moment", "in_contact"]]
+    else:
+        wrench = wrench[["force", "moment"]]
     if method != WRENCH:
-        names = SIGNALS if method == SIX else tuple(method.split())
-        return locate(contact_map, wrench, names, noise=NOISE)
-    found = locate_from_wrench(contact_map.whisker, wrench, NOISE)
+        using = RUBBING.get(method, method)
+        names = SIGNALS if using == SIX else tuple(using.split())
+        friction = FRICTION if method in RUBBING else 0.0
+        return locate(contact_map, wrench, names, noise=noise, friction=friction)
+    found = locate_from_wrench(contact_map.whisker, wrench, noise)
     rows = found["in_contact"].values
     force, moment = (wrench[name].values[rows] for name in ("force", "moment"))
+    usual = noise if noise.ndim == 2 else np.median(noise[rows], axis=0)
     sigma = np.full(rows.size, np.nan)
     sigma[rows] = vb.estimate_from_wrench(
-        contact_map.whisker, force, moment, noise=NOISE
+        contact_map.whisker, force, moment, noise=usual
     ).friction_angle_sigma
     return found.assign(friction_angle_sigma=("time", sigma))
 

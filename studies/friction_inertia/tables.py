@@ -8,7 +8,7 @@ import numpy as np
 from pages import put, table
 
 from friction_inertia.conditions import CONDITIONS, FAST
-from friction_inertia.methods import METHODS, SIX, TRIPLET, WRENCH
+from friction_inertia.methods import METHODS, RUBBING, SIX, TRIPLET, WRENCH
 from friction_inertia.summaries import LABELS, limit
 
 Results = Mapping[str, Any]
@@ -16,15 +16,20 @@ Results = Mapping[str, Any]
 NAMES = {
     "Fx MB MD": "F_x, M_B, M_D",
     "Fx FT MD": "F_x, F_T, M_D",
+    "Fx FT MB MD": "F_x, F_T, M_B, M_D",
     SIX: "six signals",
     WRENCH: "wrench",
 }
+NAMES |= {name: f"{NAMES[of]}, friction" for name, of in RUBBING.items()}
+EVERY = (*METHODS, *RUBBING)
 CLASSES = (*LABELS, "all")
 
 
 def write(pages: Sequence[Path], results: Results) -> None:
     """Put the tables between their marks on the pages."""
-    put(pages, {name: make(results) for name, make in TABLES.items()})
+    made = {name: make(results) for name, make in TABLES.items()}
+    # What was not filmed leaves the tables of videos as they are.
+    put(pages, {name: text for name, text in made.items() if text.count("\n") > 1})
 
 
 def mm(value: float) -> str:
@@ -80,7 +85,7 @@ def trials(results: Results) -> str:
 def by_class(results: Results) -> str:
     rows = []
     for label, one in picked(results, "true"):
-        for method in METHODS:
+        for method in EVERY:
             parts = [part(one[method], name) for name in CLASSES]
             cells = [f"{median(row)} ({mm(row['predicted'])})" for row in parts]
             high = f"{mm(one[method]['all']['high'])} ({mm(one[method]['all']['predicted_high'])})"
@@ -93,7 +98,7 @@ def answers(results: Results) -> str:
         [label, NAMES[method], percent(one[method]["none"]), percent(one[method]["several"])]
         + [mm(value) for value in (one[method]["pulled"], *one[method]["bias"])]
         for label, one in picked(results, "true")
-        for method in METHODS
+        for method in EVERY
     ]
     head = ["trial", "from", "none, %", "several, %", "with friction", "along", "off", "sideways"]
     return table(head, rows, 2)
@@ -124,7 +129,7 @@ def pegs(results: Results) -> str:
     shown += [f"{kind} {name}" for kind in ("exact", "points") for name in ("offset", "diameter")]
     rows = []
     for label, one in picked(results, "true"):
-        for method in METHODS:
+        for method in EVERY:
             row = one[method]["peg"]
             cells = [
                 degrees(row[name]) if name.endswith("tilt") else mm(row[name]) for name in shown

@@ -16,6 +16,7 @@ from friction_inertia.methods import (
     located,
     poses_of,
     scored,
+    sensed,
     truth_of,
 )
 from vibrissa.recording import Recording
@@ -59,7 +60,8 @@ def paper_test(trials: Sequence[Recorded]) -> dict[str, Any]:
 def cutoffs(trials: Sequence[Recorded]) -> dict[str, Any]:
     """Errors in contact by the cut-off of the pose; medians and 95 %."""
     contacts = [
-        located(TRIPLET, trial.true, chart(Recording(trial.true).whisker())) for trial in trials
+        located(TRIPLET, sensed(trial.true), chart(Recording(trial.true).whisker()))
+        for trial in trials
     ]
     out = {}
     for cutoff in CUTOFFS:
@@ -127,9 +129,10 @@ def tracked_scores(trial: Recorded, method: str) -> dict[str, xr.Dataset]:
     """Scores of one method with the tracked poses, with the true and the tracked whisker's map."""
     truth, poses = truth_of(trial.true), poses_of(trial.tracked)
     true, seen = (chart(Recording(tree).whisker()) for tree in (trial.true, trial.tracked))
-    found = located(method, trial.true, true)
+    wrench = sensed(trial.true)
+    found = located(method, wrench, true)
     # Pegs are shown of the triplet only.
     fits = method == TRIPLET
     out = {name: scored(found, truth, pose, trial.true, fits) for name, pose in poses.items()}
-    found = located(method, trial.true, seen)
+    found = located(method, wrench, seen)
     return out | {"whisker": scored(found, truth, poses["rod"], trial.true, fits=False)}

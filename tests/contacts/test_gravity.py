@@ -86,17 +86,20 @@ def test_errors_are_those_of_the_same_rod_without_weight(nitinol, gravity):
     whisker = nitinol.whisker
     noise = np.random.default_rng(2).normal(size=(300, 6)) @ np.sqrt(covariance(whisker))
     for using, largest in ((("Fx", "MB", "MD"), 1.2), (SIX, 1.2), ("wrench", 1.2)):
-        errors = []
+        errors, valid = [], []
         for pull in (None, gravity):
             bent = bent_by_random_forces(whisker, pull, 300)
             signals = {"force": bent.force + noise[:, :3], "moment": bent.moment + noise[:, 3:]}
             found = nitinol.estimate(signals, using, covariance(whisker), gravity=pull)
             away = found.point - bent.contact_point
             errors.append(np.nanmedian(np.linalg.norm(away, axis=1)))
+            valid.append(found.covariance_valid.mean())
         assert errors[1] < largest * errors[0]
+        assert valid[1] > valid[0] - 0.1
         inverse = np.linalg.pinv(found.covariance, rcond=1e-12)
         inside = np.einsum("ni,nij,nj->n", away, inverse, away) < 7.81
         assert 0.9 < inside.mean() < 0.99
+        assert 0.93 < inside[found.covariance_valid].mean() < 0.99
 
 
 def test_uncertain_direction_and_density_are_in_the_covariance(nitinol):

@@ -11,8 +11,9 @@ c = Nᵀ (Σ + N Nᵀ)⁻¹ (T̃ - T), and the contact point is p(x) + p_c c. Si
 than the contact leave c zero, and the covariance of the contact point takes up what c may move: it
 is that of all unknowns together, (JᵀJ)⁻¹ with J by (x, c) in standard deviations.
 
-To second order along each principal axis u of it p changes by h = (p_uu - p_y J⁺ r_uu)/2 at
-unchanged signals; its second moment is added.
+Where that is not enough, residuals and p are followed to second order along its principal axes, and
+the second moment about p is taken of a cloud of contacts, each as probable as its residuals and
+det ∂p/∂x make it, widened for tails as in :mod:`~vibrissa.contacts.posterior`.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from vibrissa.contacts.channels import (
     channel_gradients,
     channels_of,
     ratio_derivatives,
+    ratio_of,
 )
 from vibrissa.contacts.contacts import Candidates
 from vibrissa.contacts.forward import Forward
@@ -44,9 +46,18 @@ from vibrissa.whisker import Whisker
 HELD = 1e-5
 # Rounds in which the effects of shared unknowns, or the noise, are taken anew at the contact.
 _ROUNDS, _STEADY = 3, 2
-# The second order is taken from this far along each axis, in standard deviations; the covariance is
-# relied on where the contact point moves there by less than one in addition.
-_REACH, _BENT = 2.0, 1.0
+# The second order is taken from this far along each axis, in standard deviations. A covariance is
+# relied on where channels there differ from it by less, in standard deviations, where the kurtosis
+# is at most so many times a normal distribution's, and where this share of the cloud counts; with a
+# smaller share than the last the first order is stated.
+_REACH = 2.0
+_MISSED, _TAILED, _COUNTING, _TOO_FEW = 0.03, 1.8, 0.3, 0.1
+# Longest axis of the arc length, over L (and of the force, 1), and largest curvature of the log
+# density along an axis.
+_LONGEST, _SHARP = 0.25, 2.0
+# Log density that the cloud gains at most over a normal distribution's.
+_MOST_GAIN = 3.0
+_CLOUD = 128
 _SINGULAR = 1e-9
 _MISFITS = (int(Status.NOT_FRICTIONLESS), int(Status.NOT_ONE_CONTACT))
 
@@ -54,12 +65,13 @@ _MISFITS = (int(Status.NOT_FRICTIONLESS), int(Status.NOT_ONE_CONTACT))
 class Joint(NamedTuple):
     """Contacts with their shared unknowns, to first order.
 
-    χ² of the measurement and c alone (n,); the values with c (n, 6 or 9); the derivatives of all
-    residuals by (x, c) (n, m, u), in standard deviations, those of the contact point (n, 3, u); and
-    the weights of the channels (n, k, k).
+    χ² of the measurement and c alone (n,); all residuals (n, m), in standard deviations; the values
+    with c (n, 6 or 9); the derivatives of the residuals by (x, c) (n, m, u), those of the contact
+    point (n, 3, u); and the weights of the channels (n, k, k).
     """
 
     misfit: Array
+    residuals: Array
     values: Array
     design: Array
     moved: Array
@@ -145,12 +157,16 @@ class JointFit:
         whole = whitening(own + change @ np.swapaxes(change, 1, 2)) if m else weights
         residual = (whole @ away[..., None])[..., 0]
         c = np.swapaxes(whole @ change, 1, 2) @ residual[..., None]
+        left = [-(weights @ (away[..., None] - change @ c))[..., 0], c[..., 0]]
+        if self.ratio_sigma < np.inf:
+            left.append(ratio_of(x)[:, None] / self.ratio_sigma)
         moved = np.nan_to_num(moved)
         values = values.copy()
         values[:, :6] += (moved @ np.nan_to_num(c))[..., 0]
         point = np.concatenate([fits.tangents[:, 3:6][..., self.free], moved[:, 3:]], axis=2)
         return Joint(
             (residual**2).sum(axis=1),
+            np.concatenate(left, axis=1),
             values,
             np.concatenate(rows, axis=1),
             point,
@@ -166,42 +182,87 @@ class JointFit:
 
     def to_second_order(self, joint: Joint, fits: Fits) -> tuple[Array, AnyArray]:
         """Covariances (n, 3, 3) of contact points, and whether they are valid."""
-        design, n = np.nan_to_num(joint.design), len(self.free)
-        _, singular, v = np.linalg.svd(design, full_matrices=False)
-        axes = np.swapaxes(v, 1, 2) / np.maximum(singular, 1e-300)[:, None, :]
-        back = joint.moved @ np.linalg.pinv(design, rcond=_SINGULAR)
-        bends = np.stack(
-            [self._bend(joint, fits, axes[:, :n, i], back) for i in range(axes.shape[2])], axis=2
-        )
-        out = joint.covariance()
-        valid = np.isfinite(bends).all(axis=(1, 2))
-        bends = np.nan_to_num(bends)
-        inverse = np.linalg.pinv(out, rcond=1e-12, hermitian=True)
-        far = _REACH**2 * np.sqrt(np.einsum("nai,nab,nbi->ni", bends, inverse, bends).max(axis=1))
-        mean = bends.sum(axis=2)
-        out += 2.0 * bends @ np.swapaxes(bends, 1, 2) + mean[:, :, None] * mean[:, None, :]
-        return out, valid & (far < _BENT)
+        _, singular, v = np.linalg.svd(np.nan_to_num(joint.design), full_matrices=False)
+        known = singular[:, -1] > _SINGULAR * singular[:, 0]
+        axes = np.swapaxes(v, 1, 2) / np.where(known[:, None], singular, np.inf)[:, None, :]
+        force = np.linalg.norm(fits.contacts[:, None, 1:], axis=2)
+        stronger = np.linalg.norm(axes[:, 1 : len(self.free)], axis=1) / force
+        longest = np.maximum(np.abs(axes[:, 0]) / _LONGEST, stronger)
+        axes /= np.maximum(1.0, longest)[:, None]
+        by_r, by_p = np.nan_to_num(joint.design) @ axes, joint.moved @ axes
+        slopes, bent_r, bent_p, missed = self._second_order(joint, fits, axes)
+        each = np.arange(axes.shape[2])
+        bent = bent_r[..., each, each]
+        level = (by_r**2).sum(axis=1) + np.einsum("nm,nmi->ni", joint.residuals, bent)
+        level = np.maximum(level, np.linalg.norm(bent, axis=1))
+        node = _cloud(each.size)
+        u = node * np.where(level > _SHARP, np.maximum(level, _SHARP) ** -0.5, 1.0)[:, None]
+        pairs = (0.5 * u[..., :, None] * u[..., None, :]).reshape(*u.shape[:2], -1)
 
-    def _bend(self, joint: Joint, fits: Fits, axis: Array, back: Array) -> Array:
-        """Second-order changes h (n, 3) of points along an axis of x (n, free), to one side."""
-        x = fits.contacts
+        def moved(first: Array, second: Array) -> Array:
+            bent = second.reshape(*second.shape[:2], -1)
+            return np.asarray(u @ np.swapaxes(first, 1, 2) + pairs @ np.swapaxes(bent, 1, 2))
+
+        away = moved(by_r, bent_r) + joint.residuals[:, None]
+        log = (joint.residuals**2).sum(axis=1)[:, None] - (away**2).sum(axis=2)
+        log += (node**2).sum(axis=1)
+        det = np.linalg.det(slopes[:, :1] + np.einsum("nki,niab->nkab", u, slopes[:, 1:]))
         with np.errstate(divide="ignore", invalid="ignore"):
-            room = np.array([1.0 - x[:, 0], x[:, 0] - self.least]) / np.abs(axis[:, 0])
-        up, down = np.minimum(np.where(axis[:, 0] < 0.0, room[::-1], room), _REACH)
-        step = np.where(up >= down, up, -down)[:, None]
-        there = x.copy()
-        there[:, self.free] += step * axis
-        values, tangents = self.forward.near(there)
-        k = len(self.names)
+            det /= np.linalg.det(slopes[:, :1])
+        arc = fits.contacts[:, :1] + np.einsum("nki,ni->nk", u, axes[:, 0])
+        density = np.abs(det) if self.friction else np.maximum(det, 0.0)
+        density *= np.exp(np.clip(0.5 * log, -700.0, _MOST_GAIN))
+        density[(arc < self.least) | (arc > 1.0) | ~np.isfinite(density)] = 0.0
+        linear = u @ np.swapaxes(by_p, 1, 2)
+        covariance, fair = _moments(joint.covariance(), linear, moved(by_p, bent_p), density)
+        return covariance, known & fair & (missed < _MISSED)
 
-        def slopes(values: Array, tangents: Array) -> Array:
-            channels = joint.weights @ channel_derivatives(values, tangents, self.names)
-            both = np.concatenate([tangents[:, 3:6], channels], axis=1)[..., self.free]
-            return np.asarray(both @ axis[..., None])[..., 0]
+    def _second_order(
+        self, joint: Joint, fits: Fits, axes: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        """What displacements along axes (n, u, a) change of derivatives.
 
-        second = (slopes(values, tangents) - slopes(fits.values, fits.tangents)) / step
-        by_channels = np.einsum("nij,nj->ni", back[..., :k], second[:, 3:])
-        return np.asarray(0.5 * (second[:, :3] - by_channels))
+        Derivatives of the point, and with friction of its angle, by x, and their changes for a unit
+        of each axis (n, 1 + a, f, f); second derivatives along the axes of residuals (n, m, a, a)
+        and points (n, 3, a, a); and what these miss of the channels (n,).
+        """
+        x, k = fits.contacts, len(self.names)
+        along = axes[:, : len(self.free)]
+        seen, slopes = self._slopes(joint, fits.values, fits.tangents, x)
+        changes, bent, missed = [slopes[:, :-k]], [], np.zeros(len(x))
+        for i in range(axes.shape[2]):
+            axis = along[..., i]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                room = np.array([1.0 - x[:, 0], x[:, 0] - self.least]) / np.abs(axis[:, 0])
+            up, down = np.fmin(np.where(axis[:, 0] < 0.0, room[::-1], room), _REACH)
+            step = np.where(up >= down, up, -down)
+            there = x.copy()
+            there[:, self.free] += step[:, None] * axis
+            other, steeper = self._slopes(joint, *self.forward.near(there), there)
+            change = (steeper - slopes) / step[:, None, None]
+            second = change @ along
+            mean = (slopes + 0.5 * step[:, None, None] * change)[:, -k:] @ axis[..., None]
+            turned = within_turn(other - seen, self._turned)
+            off = (joint.weights @ turned[..., None])[..., 0] - step[:, None] * mean[..., 0]
+            far = np.linalg.norm(off, axis=1) * (_REACH / np.abs(step)) ** 3
+            missed = np.fmax(missed, np.where(np.isfinite(far), far, np.inf))
+            changes.append(np.nan_to_num(change[:, :-k]))
+            bent.append(np.nan_to_num(second))
+        second = np.stack(bent, axis=2)
+        second = 0.5 * (second + np.swapaxes(second, 2, 3))
+        residuals = np.zeros((len(x), joint.design.shape[1], *second.shape[2:]))
+        residuals[:, :k] = second[:, -k:]
+        return np.stack(changes, axis=1), residuals, second[:, :3], missed
+
+    def _slopes(
+        self, joint: Joint, values: Array, tangents: Array, x: Array
+    ) -> tuple[Array, Array]:
+        """Channels (n, k), and derivatives by x: of points, the angle of friction, and channels."""
+        rows = [tangents[:, 3:6]]
+        if self.friction:
+            rows.append((ratio_derivatives(x) / (1.0 + ratio_of(x)[:, None] ** 2))[:, None])
+        rows.append(joint.weights @ channel_derivatives(values, tangents, self.names))
+        return channels_of(values)[:, self._which], np.concatenate(rows, axis=1)[..., self.free]
 
     def allow(
         self, flat: Array, targets: Array, found: Candidates, status: IntArray
@@ -224,6 +285,37 @@ class JointFit:
         sure = (out.probability[:, 0] > CERTAIN) | (found.number == 1)
         known = np.where(sure, int(Status.UNIQUE), int(Status.AMBIGUOUS))
         return out, np.where(better, known, status), first.copy()
+
+
+def _cloud(dimension: int) -> Array:
+    """Points (n, dimension), symmetric, with the covariance of a normal distribution."""
+    half = np.random.default_rng(0).standard_normal((_CLOUD // 2, dimension))
+    points = np.concatenate([half, -half])
+    root = np.linalg.cholesky(points.T @ points / _CLOUD)
+    return np.asarray(points @ np.linalg.inv(root).T)
+
+
+def _moments(first: Array, linear: Array, points: Array, density: Array) -> tuple[Array, AnyArray]:
+    """Covariances (n, 3, 3) of a cloud (n, c, 3) of some density (n, c), and which can serve.
+
+    Tails are relative to those of its linear part, whose covariances are the first.
+    """
+    total = np.maximum(density.sum(axis=1), 1e-300)
+    counting = total**2 / (_CLOUD * np.maximum((density**2).sum(axis=1), 1e-300))
+    share = density / total[:, None]
+    second = np.einsum("nk,nki,nkj->nij", share, points, points)
+    few = counting <= _TOO_FEW
+
+    def fourth(cloud: Array, covariance: Array) -> Array:
+        inverse = np.asarray(np.linalg.pinv(covariance, 1e-12, hermitian=True))
+        return np.asarray((cloud @ inverse * cloud).sum(axis=2) ** 2)
+
+    own = np.where(few[:, None, None], first, second)
+    tailed = (share * fourth(points, own)).sum(axis=1)
+    tailed /= np.maximum(fourth(linear, first).mean(axis=1), 1e-300)
+    wider = np.maximum(tailed, 1.0) ** 0.75 / np.maximum(counting, _TOO_FEW)
+    out = np.where(few[:, None, None], first + second, second * wider[:, None, None])
+    return out, (tailed < _TAILED) & (counting > _COUNTING)
 
 
 def check_compliance(sigma: float, sensor: SensorNoise | None) -> None:

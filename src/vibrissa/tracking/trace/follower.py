@@ -189,9 +189,8 @@ class Follower:
         for trace in self.along_expected(frame, noise):
             if self.length_of(trace) > self.length_of(best):
                 best = trace
-        # A whisker may be seen shorter because it turns toward the camera, frame after frame.
-        length, recent = self.length_of(best), self._supports[-3:]
-        steady = bool(recent) and length >= _WANTED * middle(np.array(recent))
+        length = self.length_of(best)
+        steady = bool(self._supports) and length >= _WANTED * self._lately
         self._unsearched += 1
         if length < self.wanted and not (steady and self._unsearched < _SEARCHED):
             self._unsearched = 0
@@ -211,6 +210,11 @@ class Follower:
     def usual(self) -> float:
         """Length that is usually seen, pixels; 0 before anything was."""
         return middle(np.array(self._supports)) if self._supports else 0.0
+
+    @property
+    def _lately(self) -> float:
+        """Length that was seen lately, pixels: it falls as the whisker turns to the camera."""
+        return middle(np.array(self._supports[-3:])) if self._supports else 0.0
 
     @property
     def wanted(self) -> float:
@@ -248,7 +252,8 @@ class Follower:
 
     def long_enough(self, trace: Trace) -> bool:
         """Whether a trace is long enough to be this whisker."""
-        least = max(self.options.shortest, _LEAST * self.usual)
+        usual = self.usual if self._missing else min(self.usual, self._lately)
+        least = max(self.options.shortest, _LEAST * usual)
         return self.length_of(trace) >= least and trace.support >= 0.5 * self.options.shortest
 
     def _belongs(self, trace: Trace) -> bool:

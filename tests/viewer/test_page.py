@@ -1,5 +1,7 @@
 """The page in a real browser: it loads in silence, follows the mouse, and says why it cannot."""
 
+import urllib.request
+
 import numpy as np
 import pytest
 
@@ -225,5 +227,20 @@ def test_keys_clicks_and_links_lead_through_a_trial(browser, recording):
         second.goto(link)
         person.wait_until(lambda: abs(trial.frame - there) <= 1)
         second.close()
+        # A link of another mode brings its signals, colours and contact.
+        third = browser.new_page(viewport=SIZE)
+        words = "mode=Locate&signals=Fx+FT+MB&colours=MB&contact=24,3,4"
+        third.goto(f"{viewer.url}/#{words}")
+        person.wait_until(lambda: viewer.page.mode.name == "Locate")
+        locate = viewer.page.modes["Locate"]
+        person.wait_until(
+            lambda: locate.found is not None and locate.found.sensor.triplet == ("Fx", "FT", "MB")
+        )
+        person.wait_until(lambda: np.allclose(viewer.page.bend.point, [24e-3, 3e-3, 4e-3]))
+        third.wait_for_function("/colours=MB&contact=24[.]000/.test(location.hash)")
+        for nonsense in ("mode=None", "mode=Locate&contact=a,b&signals=Mx", "mode=Trial&t=nan"):
+            urllib.request.urlopen(f"{viewer.url}/restore?{nonsense}").close()
+        person.wait_until(lambda: viewer.page.mode is trial)
+        third.close()
         assert person.faults == []
         person.page.close()

@@ -113,7 +113,8 @@ def _report(trial: xr.DataTree) -> None:
         shown(name, float(np.nanmax(np.linalg.norm(truth[name].values, axis=-1))), 3)
         for name in ("force", "moment")
     ]
-    say(f"{begun.sum()} contacts, up to {largest[0]} and {largest[1]}")
+    count = begun.sum()
+    say(f"{count} contact{'s' * (count != 1)}, up to {largest[0]} and {largest[1]}")
     if second := int(truth["second_contact"].values.sum()):
         say(
             f"in {second} frames a whisker would touch elsewhere too (second_contact), which is "

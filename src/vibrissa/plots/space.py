@@ -200,7 +200,7 @@ def _height_axis(axes: Any, limits: Array) -> None:
         axes.plot(*tick, height, color=INK, linewidth=0.5)
         label = f"{mark:g}".replace("-", "−")
         _write(axes, left, 1.49 * reach, height, label, ha="right")
-    for up, text in ((0.13, axis_label("Fx")), (0.045, "√ scale")):
+    for up, text in ((0.15, axis_label("Fx")), (0.045, "√ scale")):
         height = top + up * (top - floor)
         _write(axes, left, 1.4 * reach, height, text, fontsize=PLAIN if up > 0.1 else SMALL)
 

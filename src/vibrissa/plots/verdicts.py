@@ -26,7 +26,7 @@ EMPTY = "no contacts"
 _ROW = 4.2
 """Height of a row, mm."""
 
-_HEAD, _FOOT = 11.0, 11.5
+_HEAD, _FOOT = 11.0, 10.0
 _KEY = (
     "numbers: largest distance (mm) of two contacts with the same signals",
     "critical cone: about rest, outside it no such pair was found; ambiguous: share of contacts "

@@ -12,7 +12,7 @@ from vibrissa.numerics import Array
 from vibrissa.quantities import quantity, to_display
 from vibrissa.sketch import round_step
 from vibrissa.viewer import state
-from vibrissa.viewer.page import EXAGGERATION, Page, asked, put, show
+from vibrissa.viewer.page import EXAGGERATION, Mode, Page, asked, put, show
 from vibrissa.viewer.readout import (
     CONTACT,
     FORCE,
@@ -171,7 +171,7 @@ _UN = quantity("force").display_factor
 _HELD = "The whisker is in stable equilibrium."
 
 
-class BendMode:
+class BendMode(Mode):
     """The controls of a load, and the whisker that it bends."""
 
     name = "Bend"

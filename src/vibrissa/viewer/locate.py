@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +17,7 @@ from vibrissa.rod import PointContact, deflect
 from vibrissa.signals import SIGNALS, TRIPLETS, base_signals
 from vibrissa.status import Status
 from vibrissa.viewer.bend import NODES, bend_drawing, mm, whisker_body
-from vibrissa.viewer.page import Page, asked
+from vibrissa.viewer.page import Mode, Page, asked, put
 from vibrissa.viewer.readout import (
     FIT,
     GHOST,
@@ -193,7 +194,7 @@ _UN = quantity("force").display_factor
 _UNM = quantity("moment").display_factor
 
 
-class LocateMode:
+class LocateMode(Mode):
     """Controls of a sensor, and the contacts that it cannot distinguish."""
 
     name = "Locate"
@@ -209,7 +210,7 @@ class LocateMode:
         gui = page.server.gui
         self._folder = gui.add_folder("Three signals", visible=False)
         with self._folder:
-            triplet = gui.add_dropdown(
+            self._triplet = gui.add_dropdown(
                 "Signals",
                 tuple(" ".join(names) for names in TRIPLETS),
                 initial_value=" ".join(self._sensor.triplet),
@@ -217,14 +218,14 @@ class LocateMode:
             noise, turning = _UN * self._sensor.force_noise, _UNM * self._sensor.moment_noise
             force = gui.add_slider("F noise (µN)", 0.0, 10.0 * noise, 0.1 * noise, noise)
             moment = gui.add_slider("M noise (µN·m)", 0.0, 10.0 * turning, 0.1 * turning, turning)
-            colour = gui.add_dropdown("Colours", COLOURS, initial_value=self._what)
+            self._colours = gui.add_dropdown("Colours", COLOURS, initial_value=self._what)
             cut = gui.add_checkbox("Cut open", self._cut, hint="Only contacts with z < 0")
             self._legend = gui.add_html("")
             self._words = gui.add_html("")
-        asked(triplet, lambda value: self._sense(triplet=tuple(value.split())))
+        asked(self._triplet, lambda value: self._sense(triplet=tuple(value.split())))
         asked(force, lambda value: self._sense(force_noise=value / _UN))
         asked(moment, lambda value: self._sense(moment_noise=value / _UNM))
-        asked(colour, self._colour)
+        asked(self._colours, self._colour)
         asked(cut, self._open)
 
     def enter(self) -> None:
@@ -265,6 +266,19 @@ class LocateMode:
             self._words.content = note("Sampling all contacts of this whisker …")
         else:
             self._words.content = of_located(bend.whisker, self.found, bend.status)
+
+    def link(self) -> dict[str, str]:
+        """Signals and colours."""
+        return {"signals": " ".join(self._sensor.triplet), "colours": self._what}
+
+    def restore(self, asked: Mapping[str, str]) -> None:
+        """Choose signals and colours."""
+        if (signals := asked.get("signals", "")) in self._triplet.options:
+            put(self._triplet, signals)
+            self._sense(triplet=tuple(signals.split()))
+        if (colours := asked.get("colours", "")) in COLOURS:
+            put(self._colours, colours)
+            self._colour(colours)
 
     def _paint(self, chart: Chart) -> None:
         """Colour the cloud in the background."""

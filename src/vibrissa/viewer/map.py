@@ -21,7 +21,7 @@ from vibrissa.rod import PointContact, deflect
 from vibrissa.signals import SIGNALS
 from vibrissa.status import Status
 from vibrissa.viewer.bend import NODES, follicle, whisker_body
-from vibrissa.viewer.page import Page, asked
+from vibrissa.viewer.page import Mode, Page, asked
 from vibrissa.viewer.readout import (
     CONTACT,
     REST,
@@ -241,7 +241,7 @@ _SPACES = (None, 0, 1, 2)
 _HINT = "Click on a solid: the same contact is marked in all four spaces."
 
 
-class MapMode:
+class MapMode(Mode):
     """The controls of solids and slices, and what was picked."""
 
     name = "Map"

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
 from typing import Any, Protocol
+from urllib.parse import urlencode
 
 import numpy as np
 import viser
@@ -65,6 +67,14 @@ class Mode(Protocol):
     def write(self, brief: bool = False) -> None:
         """Follow it with what is written in the panel; briefly: with what one reads meanwhile."""
 
+    def link(self) -> dict[str, str]:
+        """Words of a link that restore what is chosen."""
+        return {}
+
+    def restore(self, asked: Mapping[str, str]) -> None:
+        """Choose what the words of a link ask for."""
+        del asked  # there is nothing to choose
+
 
 class Page:
     """Base of all modes."""
@@ -88,6 +98,7 @@ class Page:
         self.whisker_controls: viser.GuiFolderHandle | None = None
         self.chosen: Callable[[str], None] = lambda name: None
         self.closing: list[Callable[[], None]] = []
+        self.linked: viser.GuiHtmlHandle | None = None
         self._written = 0.0
         self.grip = Grip(server, float(to_display("length", 0.2 * whisker.length)), self._dragged)
 
@@ -183,30 +194,52 @@ class Page:
             if self.mode is not None:
                 self.mode.redraw()
                 if words:
-                    self.mode.write(brief=dragging)
+                    self._write(brief=dragging)
             if dragging:
                 self.grip.follow(self.bend.target)
             else:
                 self.place_grip()
         self.server.flush()
-        if words:
-            self._written = now
         if dragging:
             self.work.put("words", self._write, now + _REST)
         else:
             self.work.drop("words")
 
-    def _write(self) -> None:
-        """Write what has waited."""
-        if self.mode is not None:
-            self.mode.write()
+    def _write(self, brief: bool = False) -> None:
+        """Write what is read, and the link that leads back to it."""
         self._written = time.monotonic()
+        if self.mode is None:
+            return
+        self.mode.write(brief)
+        state = {"mode": self.mode.name, **self.mode.link()}
+        if self._draggable and self.bend.kind == "point":
+            state["contact"] = ",".join(f"{x:.3f}" for x in to_display("length", self.bend.point))
+        if self.linked is not None:
+            show(self.linked, f'<i hidden data-link="{escape(urlencode(state))}"></i>')
+
+    def restore(self, asked: Mapping[str, str]) -> None:
+        """Show what a link asks for, as far as there is such a thing."""
+        mode = self.modes.get(asked.get("mode", ""))
+        if mode is None:
+            return
+        self.choose(mode.name)
+        mode.restore(asked)
+        try:
+            point = np.array(asked["contact"].split(","), dtype=np.float64) / _MM
+        except (KeyError, ValueError):
+            return
+        if point.shape == (3,) and np.isfinite(point).all():
+            self.change("drag", lambda bend: moved(loaded(bend, "point"), point))
+
+    @property
+    def _draggable(self) -> bool:
+        """Whether the load can be dragged in this mode."""
+        return self.mode is not None and self.mode.name in ("Bend", "Locate")
 
     def place_grip(self) -> None:
         """Put what can be dragged where the load is."""
         bend = self.bend
-        draggable = self.mode is not None and self.mode.name in ("Bend", "Locate")
-        if not draggable or bend.kind == "force":
+        if not self._draggable or bend.kind == "force":
             self.grip.show(None)
             return
         self.grip.show(bend.target, bend.axis if bend.kind == "peg" else None)

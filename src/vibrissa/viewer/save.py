@@ -207,9 +207,11 @@ class SaveControls:
 SCRIPT = """
 (() => {
   document.title = "vibrissa";
-  // What a link asks for; viser would take it for a part of the server's address.
-  const wanted = new URLSearchParams(location.hash.slice(1));
-  if (location.hash) history.replaceState(null, "", location.pathname + location.search);
+  // The server shows what a link asks for; viser would take it for a part of the address.
+  if (location.hash) {
+    fetch("restore?" + location.hash.slice(1));
+    history.replaceState(null, "", location.pathname + location.search);
+  }
   // The page is dark as long as the browser is.
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const matched = () => {
@@ -254,26 +256,12 @@ SCRIPT = """
     if (share >= 0 && share <= 1) setTime(share);
   });
 
-  // The address keeps mode and time, so that a link leads back to what is seen.
-  const kept = () => {
-    const mode = [...document.querySelectorAll("button")].map((each) => each.textContent.trim())
-      .find((text) => text.startsWith("● "))?.slice(2);
-    if (!mode) return;
-    const asked = wanted.get("mode");
-    if (asked && asked !== mode) { button(asked)?.click(); return; }
-    wanted.delete("mode");
-    const cursor = document.querySelector("[data-cursor]");
-    if (wanted.has("t") && mode === "Trial") {
-      if (!cursor) return;
-      setTime(Number(wanted.get("t")));
-      wanted.delete("t");
-      return;
-    }
-    const share = mode === "Trial" && cursor ? `&t=${cursor.dataset.cursor}` : "";
-    const state = `#mode=${mode}${share}`;
-    if (location.hash !== state) history.replaceState(null, "", location.search + state);
-  };
-  setInterval(kept, 500);
+  // The address keeps what is seen, so that a link leads back to it.
+  setInterval(() => {
+    const state = document.querySelector("[data-link]")?.dataset.link;
+    if (state && location.hash !== "#" + state)
+      history.replaceState(null, "", location.search + "#" + state);
+  }, 500);
 
   // Arrow keys that move a slider are not for the view as well.
   addEventListener("DOMContentLoaded", () => document.body.addEventListener("keydown", (event) => {

@@ -11,13 +11,13 @@ import socket
 import threading
 import time
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from http import HTTPStatus
 from os import PathLike
 from types import TracebackType
 from typing import Any, Protocol, Self
-from urllib.parse import urlsplit
+from urllib.parse import parse_qsl, urlsplit
 
 import numpy as np
 import viser
@@ -163,7 +163,7 @@ def view_stream(
         If one of the two addresses is not one, or is taken.
     """
     with contextlib.ExitStack() as opened:
-        live = LivePage(_served(host, port, opened), Live(whisker, name), address)
+        live = LivePage(_served(host, port, opened, lambda _: None), Live(whisker, name), address)
         opened.pop_all()
     return Served(live)
 
@@ -229,7 +229,11 @@ def view(
         whisker = _of_one(contact_map, whisker)
     with contextlib.ExitStack() as opened:  # closed again if a later step fails
         footage = _footage(trial, videos, opened)
-        page = Page(_served(host, port, opened), whisker, contact_map)
+
+        def restore(asked: dict[str, str]) -> None:
+            page.restore(asked)
+
+        page = Page(_served(host, port, opened, restore), whisker, contact_map)
         opened.pop_all()
         page.closing += [film.close for film in footage]
         viewer = Viewer(page)
@@ -278,6 +282,7 @@ def _furnished(
     page.modes = {mode.name: mode for mode in modes}
     page.whisker_controls = WhiskerControls(page).folder
     SaveControls(page, recording)
+    page.linked = page.server.gui.add_html("")
     page.choose("Trial" if trial is not None else "Map" if page.has_map else "Bend")
     page.work.wait()  # one thing is compiled at a time; this is what the page needs to be there
     page.prepare()
@@ -323,12 +328,21 @@ def _footage(
     return tuple(opened.enter_context(contextlib.closing(Footage(path))) for path in videos)
 
 
-def _served(host: str, port: int | None, opened: contextlib.ExitStack) -> viser.ViserServer:
+Restore = Callable[[dict[str, str]], None]
+"""Called with the words of a link that a browser follows."""
+
+
+def _served(
+    host: str, port: int | None, opened: contextlib.ExitStack, restore: Restore
+) -> viser.ViserServer:
     if port is None:
         port = free_port(host)
     elif not is_free(host, port):  # viser would take another one without a word
         raise ValueError(f"port {port} of {host} is taken; leave it out for one that is free")
-    with guarded(host), contextlib.redirect_stdout(io.StringIO()):  # it would announce itself
+    with (
+        guarded(host, restore),
+        contextlib.redirect_stdout(io.StringIO()),
+    ):  # it would announce itself
         server = viser.ViserServer(host=host, port=port, label="vibrissa", verbose=False)
     opened.callback(server.stop)
     server.gui.configure_theme(
@@ -391,8 +405,8 @@ def from_own_page(origin: str | None, asked: str | None, host: str) -> bool:
 
 
 @contextmanager
-def guarded(host: str) -> Iterator[None]:
-    """Let servers that start meanwhile refuse pages from elsewhere.
+def guarded(host: str, restore: Restore) -> Iterator[None]:
+    """Let servers that start meanwhile refuse pages from elsewhere, and follow links.
 
     viser has no place for such a check, so what it calls to listen is wrapped while it starts.
     """
@@ -409,6 +423,10 @@ def guarded(host: str) -> Iterator[None]:
             headers = request.headers
             if not from_own_page(headers.get("Origin"), headers.get("Host"), host):
                 return connection.respond(HTTPStatus.FORBIDDEN, "This is for its own page only.\n")
+            asked = urlsplit(request.path)
+            if asked.path == "/restore" and headers.get("Sec-Fetch-Site") in (None, "same-origin"):
+                restore(dict(parse_qsl(asked.query)))
+                return connection.respond(HTTPStatus.OK, "")
             if process_request is None:
                 return None
             return amended(process_request(connection, request))

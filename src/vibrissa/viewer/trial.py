@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -17,7 +17,7 @@ from vibrissa.objects import Surface, objects_datasets
 from vibrissa.quantities import to_display
 from vibrissa.sketch import round_step
 from vibrissa.viewer.bend import arrow, mm, ruler, whisker_body
-from vibrissa.viewer.page import Page, asked, put
+from vibrissa.viewer.page import Mode, Page, asked, put
 from vibrissa.viewer.readout import CONTACT, FIT, OBJECT, Legend, chart, cursor, table, timeline
 from vibrissa.viewer.recorded import View, Watched, picture, views
 from vibrissa.viewer.state import force_scale
@@ -179,7 +179,7 @@ _USUAL = "1 : 10"
 BACK, AHEAD = "◀ frame", "frame ▶"
 
 
-class TrialMode:
+class TrialMode(Mode):
     """Time, and what depends on it."""
 
     name = "Trial"
@@ -281,12 +281,30 @@ class TrialMode:
     def write(self, brief: bool = False) -> None:
         """Write the signals and the time of the current frame."""
         trial, frame = self.trial, self.frame
-        passed = float(trial.time[frame] - trial.time[0])
-        put(self._time, _MS * passed)
-        share = passed / max(float(np.ptp(trial.time)), 1e-12)
+        put(self._time, _MS * float(trial.time[frame] - trial.time[0]))
+        share = self._share
         self._cursor.content = cursor(share)
         self._now_line.content = cursor(share, strip=True)
         self._words.content = self._words_of(frame)
+
+    @property
+    def _share(self) -> float:
+        """Share of the trial that has passed."""
+        time = self.trial.time
+        return float((time[self.frame] - time[0]) / max(np.ptp(time), 1e-12))
+
+    def link(self) -> dict[str, str]:
+        """Time, as a share of the trial."""
+        return {"t": f"{self._share:.4f}"}
+
+    def restore(self, asked: Mapping[str, str]) -> None:
+        """Go to a time."""
+        try:
+            share = float(asked.get("t", "0"))
+        except ValueError:
+            return
+        if 0.0 <= share <= 1.0:
+            self.go(float(self.trial.time[0] + share * np.ptp(self.trial.time)))
 
     def go(self, time: float) -> None:
         """Show the frame at a time, s."""

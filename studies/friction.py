@@ -51,7 +51,9 @@ def scored(found: vb.Contacts, truth: np.ndarray) -> str:
     away, covariance = (found.point - truth)[known], found.covariance[known]
     size = np.einsum("ni,nij,nj->n", away, np.linalg.pinv(covariance, 1e-12, hermitian=True), away)
     draws = np.random.default_rng(0).normal(size=(len(away), 200, 3))
-    drawn = np.einsum("nij,nmj->nmi", np.linalg.cholesky(covariance), draws)
+    variance, axes = np.linalg.eigh(covariance)
+    root = axes * np.sqrt(np.maximum(variance, 0.0))[:, None]
+    drawn = np.einsum("nij,nmj->nmi", root, draws)
     error, predicted = (
         np.median(np.linalg.norm(away, axis=1)),
         np.median(np.linalg.norm(drawn, axis=2)),

@@ -75,11 +75,12 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="one trial of 0.4 s of each kind")
     parser.add_argument("--no-video", action="store_true", help="true pose only")
     parser.add_argument("--again", action="store_true", help="new results from old recordings")
+    parser.add_argument("--trials", type=int, default=TRIALS, help="trials of each kind")
     parser.add_argument("--page", action="store_true", help="write the documentation's tables")
     chosen = parser.parse_args()
     folder = chosen.folder / "quick" if chosen.quick else chosen.folder
     folder.mkdir(parents=True, exist_ok=True)
-    most, duration = (1, 0.4) if chosen.quick else (TRIALS, 1.0)
+    most, duration = (1, 0.4) if chosen.quick else (chosen.trials, 1.0)
 
     def results(condition: Condition, count: int) -> dict[str, Any]:
         filmed = 0 if chosen.no_video else min(most, condition.filmed)

@@ -33,7 +33,7 @@ SIX = "six signals"
 WRENCH = "wrench"
 PEG = ("offset", "tilt", "diameter", "sigma")
 METHODS = (TRIPLET, OTHER, SIX, WRENCH)
-RUBBING = {f"{of}, friction": of for of in (TRIPLET, "Fx FT MB MD", SIX)}
+RUBBING = {f"{of}, friction": of for of in ("Fx FT MB MD", SIX)}
 """Methods that allow for friction, and their signals."""
 FRICTION = 0.3
 """Their prior: ratio of the forces along and across the whisker, one sigma."""
@@ -172,7 +172,7 @@ def scored(
         "pose_error": np.linalg.norm(moved - truth.point, axis=1),
         "friction_angle": truth.friction_angle,
     }
-    if "friction_angle" in found:
+    if "friction_angle_sigma" in found:
         out["friction_found"] = found["friction_angle"].values
         out["friction_sigma"] = found["friction_angle_sigma"].values
     data = {name: ("frame", values) for name, values in out.items()}

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import vibrissa as vb
+from vibrissa.cli.app import app
 from vibrissa.objects import Peg
 from vibrissa.simulation import (
     Dynamics,
@@ -81,6 +83,25 @@ def test_ringing_gives_mass_resonances_and_damping(whisker, past_peg):
     deviation = np.sqrt(np.diag(fit.covariance))
     assert (np.abs(away) < [0.1, 0.04, 0.3]).all()
     assert (np.abs(away[:2]) < 3.0 * deviation[:2]).all()
+
+
+def test_a_recording_states_its_own_dynamics_and_its_contacts(past_peg, tmp_path):
+    trial = past_peg.isel(time=slice(20, None))
+    vb.io.save_recording(path := tmp_path / "trial.nc", trial)
+    table = tmp_path / "contacts.csv"
+    command = ["signals", str(path), "--inertia", "--fit-dynamics", "--events", str(table)]
+    done = CliRunner().invoke(app, command, catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    about = vb.load_recording(path)["signals"].attrs
+    assert abs(about["density"][0] / TRUE.density[0] - 1.0) < 0.15
+    assert abs(about["damping_ratio"] / TRUE.damping_ratio - 1.0) < 0.3
+    rows = [line.split(",") for line in table.read_text().splitlines()[1:]]
+    found = np.array([[float(cell) for cell in row[1:3]] for row in rows])
+    truth = trial["truth"].to_dataset().isel(whisker=0)
+    touching = np.flatnonzero(np.diff(truth.in_contact.values.astype(int)))
+    known = truth.time.values[touching + 1].reshape(-1, 2)
+    assert len(found) == len(known)
+    np.testing.assert_allclose(found, known, atol=3.1e-3)
 
 
 def test_what_is_not_determined_is_stated(whisker, in_air):

@@ -239,6 +239,10 @@ OPTIONS = {
         "Remove the whisker's inertia and damping from a sensor's signals; the motion of the base "
         "must be known and smooth. A rat's whisker, known to 20 %, unless stated."
     ),
+    "fit_dynamics": Option(
+        "Fit density and damping to the frames in which the whisker moves freely and rings."
+    ),
+    "events": Option("Table of the contacts, .csv: whisker, onset, release and largest force."),
     "damping": Option("Damping ratio of the whisker's first vibration.", "RATIO", least=0.0),
     "gravity": Option(
         "Gravity minus the acceleration of the base, m/s², in the whisker's frame, or where poses "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -36,11 +36,15 @@ class SourceOptions:
     inertia: bool = False
     density: float | None = None
     damping: float | None = None
+    fit_dynamics: bool = False
 
     def __post_init__(self) -> None:
         """Refuse statements about no inertia."""
+        about = {"--density": self.density, "--damping": self.damping}
+        if self.fit_dynamics:
+            refuse(about, "--fit-dynamics finds them")
         if not self.inertia:
-            about = {"--density": self.density, "--damping": self.damping}
+            about["--fit-dynamics"] = self.fit_dynamics or None
             refuse(about, "without --inertia the whisker has no mass")
 
     @property
@@ -49,10 +53,12 @@ class SourceOptions:
         return self.source is not None or self.cutoff is not None or self.inertia
 
     @property
-    def dynamics(self) -> vb.simulation.Dynamics | None:
+    def dynamics(self) -> vb.simulation.Dynamics | Literal["fitted"] | None:
         """Density and damping; None: the whisker has no mass."""
         if not self.inertia:
             return None
+        if self.fit_dynamics:
+            return "fitted"
         usual = vb.simulation.Dynamics()
         return vb.simulation.Dynamics(
             density=usual.density if self.density is None else (self.density, self.density),
@@ -90,6 +96,7 @@ def signals(
     how: SourceOptions,
     own: WhiskerOptions,
     proximal: float | None = None,
+    events: Path | None = None,
     target: Path | None = None,
     force: bool = False,
 ) -> None:
@@ -101,7 +108,9 @@ def signals(
     refuse_tracks(recording)
     target = target or recording
     vb.io.check_writable(target, (*vb.io.NETCDF, *vb.io.CSV))
-    free_beside(recording, [target], force)
+    if events is not None:
+        vb.io.check_writable(events, vb.io.CSV)
+    free_beside(recording, [target, *([] if events is None else [events])], force)
     tree = recording_from(recording)
     table = target.suffix.lower() in vb.io.CSV
     if table:
@@ -119,6 +128,11 @@ def signals(
     found = done["signals"].to_dataset()
     print_statuses(found["status"].values)
     _print_largest(found)
+    if events is not None:
+        contacts = vb.pipeline.contact_events(found)
+        columns = (contacts[name].values for name in contacts)
+        vb.io.write_table(events, list(contacts), zip(*columns, strict=True))
+        print_written(events)
     if table:
         vb.io.save_signals(target, found.isel(whisker=0)[["force", "moment"]])
     else:
@@ -142,10 +156,14 @@ def _origin(tree: xr.DataTree) -> str:
     if source == "sensor":
         if "density" not in about:
             return "signals as the sensor read them"
-        density = " to ".join(f"{value:g}" for value in dict.fromkeys(np.ravel(about["density"])))
+        density, damping = (
+            " to ".join(f"{value:.4g}" for value in dict.fromkeys(np.ravel(about[name])))
+            for name in ("density", "damping_ratio")
+        )
+        how = ", fitted" if about.get("fitted") else ""
         return (
             f"signals of the sensor minus the whisker's inertia: {density} kg/m³, damping ratio "
-            f"{float(about['damping_ratio']):g}"
+            f"{damping}{how}"
         )
     if source == "rod":
         return "signals of the rod that fits the images"

@@ -33,6 +33,7 @@ from vibrissa.pipeline.reconstruct import (
 )
 from vibrissa.pipeline.signals import (
     Source as Source,
+    contact_events,
     default_source as default_source,
     placed_by,
     sensor_noise as sensor_noise,
@@ -52,6 +53,7 @@ from vibrissa.pipeline.stages import (
 __all__ = [
     "compare_contacts",
     "compare_shapes",
+    "contact_events",
     "distances_by_class",
     "due_stages",
     "estimates_of",

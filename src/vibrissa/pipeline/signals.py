@@ -48,10 +48,11 @@ from vibrissa.pipeline.frames import (
     with_coordinates,
 )
 from vibrissa.pipeline.locate import DETECTED, locate_from_wrench, wrench_slopes
+from vibrissa.quantities import attributes
 from vibrissa.recording import Group, Recording, recorded
 from vibrissa.rod import PROXIMAL, PointContact, deflect
 from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE, Sensor, component_noise
-from vibrissa.simulation import Dynamics, Vibration, inertial_wrench
+from vibrissa.simulation import Dynamics, Vibration, fit_dynamics, inertial_wrench
 from vibrissa.status import Status
 from vibrissa.tracking import CUTOFF, BasePose, HeadPose
 from vibrissa.whisker import Whisker, angles_of
@@ -70,7 +71,7 @@ def signals_of(
     *,
     whiskers: Sequence[Whisker] | None = None,
     proximal: float = PROXIMAL,
-    dynamics: Dynamics | None = None,
+    dynamics: Dynamics | Literal["fitted"] | None = None,
 ) -> xr.Dataset:
     """Force, moment and the six signals of every frame and whisker.
 
@@ -89,9 +90,10 @@ def signals_of(
     proximal : float
         Smallest arc length of a contact point with signals, as a share of the length; others have a
         status only.
-    dynamics : Dynamics, optional
+    dynamics : Dynamics or "fitted", optional
         Density and damping, known to 20 %, of whiskers whose inertia is to be removed from signals
-        of a sensor; the motion of the base must be smooth. By default nothing is removed.
+        of a sensor, or "fitted": as `vibrissa.simulation.fit_dynamics` finds them in this
+        recording. The motion of the base must be smooth. By default nothing is removed.
 
     Returns
     -------
@@ -167,7 +169,7 @@ def _given_points(recording: Recording) -> Array | None:
 
 
 def _by_sensor(
-    root: xr.Dataset, whiskers: Sequence[Whisker], dynamics: Dynamics | None
+    root: xr.Dataset, whiskers: Sequence[Whisker], dynamics: Dynamics | Literal["fitted"] | None
 ) -> xr.Dataset:
     covariance: Array | None
     if "force" not in root and {"reading", "mixing"} <= set(root.data_vars):
@@ -185,9 +187,9 @@ def _by_sensor(
         noise = component_noise(FORCE_NOISE, MOMENT_NOISE) if covariance is None else covariance
         each = zip(Group(root).each_whisker(), whiskers, strict=True)
         parts = [without_inertia(one, whisker, dynamics, noise) for one, whisker in each]
-        about: dict[str, Any] = {"source": "sensor", "density": dynamics.density}
-        about["damping_ratio"] = dynamics.damping_ratio
-        return with_coordinates(xr.concat(parts, "whisker"), root, about)
+        of_each = {name: np.ravel([part.attrs[name] for part in parts]) for name in parts[0].attrs}
+        about = {"source": "sensor", **of_each, "fitted": int(dynamics == "fitted")}
+        return with_coordinates(xr.concat(parts, "whisker", combine_attrs="drop"), root, about)
     force, moment = (Group(root)[name] for name in ("force", "moment"))
     known = _known(force, moment)
     least = 0.0
@@ -468,6 +470,9 @@ _ROUNDS = 3
 _KNOWN_TO = 0.2
 """Relative standard deviation of mass and damping."""
 
+_STIFFNESS_KNOWN_TO = 0.1
+"""Relative standard deviation of the stiffness, by which ringing also shows the mass."""
+
 _LEFT = 0.1
 """Error that vibrations leave, as a share of the correction's root mean square."""
 
@@ -513,9 +518,18 @@ class _Trial(NamedTuple):
         return float(self.time[-1] - self.time[0]) / (len(self.time) - 1)
 
 
-def without_inertia(own: Group, whisker: Whisker, dynamics: Dynamics, noise: Array) -> xr.Dataset:
-    """Signals of one whisker without its inertia and damping."""
-    trial, known = _trial(own, whisker, dynamics, noise)
+def without_inertia(
+    own: Group, whisker: Whisker, dynamics: Dynamics | Literal["fitted"], noise: Array
+) -> xr.Dataset:
+    """Signals of one whisker without its inertia and damping, which are attributes."""
+    trial, known = _trial(own, whisker, noise)
+    course = trial.time, trial.wrench, trial.rotation, trial.position
+    sigma = float(np.sqrt(0.5 * (noise[4, 4] + noise[5, 5])))
+    if dynamics == "fitted":
+        dynamics = fit_dynamics(
+            whisker, *course, sigma, stiffness_sigma=_STIFFNESS_KNOWN_TO
+        ).dynamics
+    trial = trial._replace(touching=Vibration.of(whisker, dynamics).in_contact(*course, sigma))
     added, change = _added(trial, dynamics)
     left = trial.wrench - added
     left[~known] = np.nan
@@ -525,14 +539,12 @@ def without_inertia(own: Group, whisker: Whisker, dynamics: Dynamics, noise: Arr
     values = {"force": left[:, :3], "moment": left[:, 3:], "in_contact": touching}
     values |= {"base_position": trial.position, "base_rotation": trial.rotation}
     covariance = trial.noise + _uncertainty(added, change, trial.step)
-    return one_whisker(values, status).assign(
-        wrench_covariance=recorded("wrench_covariance", covariance)
-    )
+    about = {"density": dynamics.density, "damping_ratio": dynamics.damping_ratio}
+    covariances = recorded("wrench_covariance", covariance)
+    return one_whisker(values, status).assign(wrench_covariance=covariances).assign_attrs(about)
 
 
-def _trial(
-    own: Group, whisker: Whisker, dynamics: Dynamics, noise: Array
-) -> tuple[_Trial, NDArray[np.bool_]]:
+def _trial(own: Group, whisker: Whisker, noise: Array) -> tuple[_Trial, NDArray[np.bool_]]:
     """Trial with gaps filled, and the frames whose wrench is known."""
     time = np.asarray(own.data["time"].values, dtype=np.float64)
     rotation, position = own["base_rotation"], own["base_position"]
@@ -554,10 +566,7 @@ def _trial(
         raise ValueError(f"inertia cannot be removed: {'; '.join(faults)}")
     for column in wrench.T:
         column[~known] = np.interp(time[~known], time[known], column[known])
-    sigma = float(np.sqrt(0.5 * (noise[4, 4] + noise[5, 5])))
-    vibration = Vibration.of(whisker, dynamics)
-    touching = vibration.in_contact(time, wrench, rotation, position, sigma)
-    return _Trial(whisker, time, wrench, noise, rotation, position, touching), known
+    return _Trial(whisker, time, wrench, noise, rotation, position, known), known
 
 
 def _added(trial: _Trial, dynamics: Dynamics) -> tuple[Array, Array]:
@@ -642,6 +651,36 @@ def _uncertainty(added: Array, change: Array, step: float) -> Array:
     usual = lfilter([1.0 - old], [1.0, -old], squares.mean(axis=2), axis=0)
     out[:, range(6), range(6)] += _LEFT**2 * np.repeat(usual, 3, axis=1)
     return np.asarray(out)
+
+
+def contact_events(signals: xr.Dataset) -> xr.Dataset:
+    """List contacts, from onset to release.
+
+    Parameters
+    ----------
+    signals : xarray.Dataset
+        Signals of a recording, as of `signals_of`; with ``dynamics`` inertia is no contact.
+
+    Returns
+    -------
+    xarray.Dataset
+        Dimension ``contact``, in order of time: name of the ``whisker``, ``onset`` and ``release``,
+        s, NaN where the recording begins or ends in contact, and ``largest_force``, N.
+    """
+    time, rows = signals["time"].values, []
+    for k, name in enumerate(signals["whisker"].values):
+        one = signals.isel(whisker=k)
+        size = np.linalg.norm(one["force"].values, axis=-1)
+        for first, end in contacts_in(one["in_contact"].values.astype(bool)):
+            onset = time[first] if first else np.nan
+            release = time[end] if end < len(time) else np.nan
+            rows.append((first, str(name), onset, release, np.nanmax(size[first:end])))
+    rows.sort()
+    names, *numbers = zip(*(row[1:] for row in rows), strict=True) if rows else [()] * 4
+    data: dict[str, Any] = {"whisker": ("contact", list(names))}
+    for name, values in zip(("onset", "release", "largest_force"), numbers, strict=True):
+        data[name] = ("contact", np.array(values), attributes(name))
+    return xr.Dataset(data)
 
 
 def contacts_in(touching: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -130,8 +130,9 @@ def signals(
     _print_largest(found)
     if events is not None:
         contacts = vb.pipeline.contact_events(found)
-        columns = (contacts[name].values for name in contacts)
-        vb.io.write_table(events, list(contacts), zip(*columns, strict=True))
+        names = [str(name) for name in contacts]
+        columns = (contacts[name].values for name in names)
+        vb.io.write_table(events, names, zip(*columns, strict=True))
         print_written(events)
     if table:
         vb.io.save_signals(target, found.isel(whisker=0)[["force", "moment"]])

@@ -659,7 +659,7 @@ def contact_events(signals: xr.Dataset) -> xr.Dataset:
     Parameters
     ----------
     signals : xarray.Dataset
-        Signals of a recording, as of `signals_of`; with ``dynamics`` inertia is no contact.
+        Signals of a recording, as of `signals_of`; with ``dynamics`` inertia does not count.
 
     Returns
     -------

@@ -102,7 +102,17 @@ def test_separations_are_in_mm_and_cones_in_degrees() -> None:
     largest = data.witness_separation.max("witness").values
     for value in largest[np.isfinite(largest)]:
         assert f"{1e3 * value:.1f}" in written
-    assert f"{np.degrees(0.1):.1f}°" in written
+    assert f"≥{np.degrees(0.1):.1f}°" in written  # a lower bound
+
+
+def test_the_share_of_contacts_with_a_twin_is_next_to_the_verdict() -> None:
+    data = verdicts()
+    share = np.linspace(0.0, 0.95, data.sizes["triplet"])
+    column = np.tile(share[:, None], (1, data.sizes["region"]))
+    written = texts(verdict_table(data.assign(twin_share=(("triplet", "region"), column))))
+    assert "have a\ntwin" in written
+    assert f"{100.0 * share[-1]:.2g} %" in written
+    assert ("rare" if data.verdict[0, 0] == "not unique" else "none") in written
 
 
 def test_ambiguous_shares_are_drawn_in_percent() -> None:

@@ -19,6 +19,7 @@ import xarray as xr
 pytest.importorskip("zarr", reason="zarr (extra sweeps) is not installed")
 
 from vibrissa import Whisker
+from vibrissa.certificates import load_certificate
 from vibrissa.sweeps import Study, failures, open_sweep, read_study, run_sweep
 from vibrissa.sweeps.population import Specimen
 from vibrissa.sweeps.study import answer
@@ -214,10 +215,28 @@ resolution = false
     assert numbers(found, "others") == 2 * TASKS[kind].numbers(settings)
 
 
+def test_certificates_are_tasks_that_go_on_from_their_files(tmp_path):
+    text = QUICK.replace("[5, 15, 30]", "[1, 15]").replace("curvature = 0.4", "curvature = 0.0")
+    settings = f'kind = "certificate"\nfolder = "{(tmp_path / "kept").as_posix()}"'
+    study = read_study(text.replace('kind = "map"', settings), Path())
+    run_sweep(study, tmp_path / "s", workers=0)
+    found = open_sweep(tmp_path / "s")
+    assert list(found["certificate_proof"].values) == ["", "proved"]
+    assert found["certificate_share"].values[1] == 1.0
+    (failure,) = failures(tmp_path / "s").values()
+    assert "no cone" in failure
+    (path,) = (tmp_path / "kept").iterdir()
+    assert load_certificate(path).proved
+    again = read_study(text.replace('kind = "map"', settings + "\nminutes = 0"), Path())
+    result = answer(list(again.cells())[1])["result"]
+    assert int(result["proof"]) == 0
+
+
 @pytest.mark.parametrize(
     "task",
     [
         'kind = "map"',
+        'kind = "certificate"\nminutes = 0',
         'kind = "uniqueness"\ntriplets = ["Fx MB MD"]\nsamples = 16',
         'kind = "sensitivity"\ntriplets = ["Fx MB MD"]',
         'kind = "estimation"\nsignals = ["Fx MB MD", "Fx FT FD MB", "wrench"]\ncontacts = 20',

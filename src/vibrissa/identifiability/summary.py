@@ -110,9 +110,21 @@ def verdict_rows(verdicts: xr.Dataset) -> tuple[list[list[str]], list[str]]:
         f"Twins: share of the contacts of {regions[0]} that have one, and their median distance.",
         f"Contacts within {cone:.3g}° of rest left out; domain: {verdicts.attrs['domain']}; "
         f"contacts nearer than {1e3 * verdicts.attrs['min_separation']:.3g} mm count as one.",
-        f"The triplet to use: {use}.",
+        f"The triplet to use: {use}.{_rarest(verdicts)}",
         *_certificate_note(verdicts),
     ]
+
+
+def _rarest(verdicts: xr.Dataset) -> str:
+    """The triplet that is not unique in the first region, with the fewest contacts with twins."""
+    cells = verdicts.isel(region=0)
+    share = cells.twin_share.where(cells.verdict == NOT_UNIQUE)
+    if not share.notnull().any():
+        return ""
+    triplet = str(share.idxmin("triplet").item())
+    return (
+        f" Of the others fewest twins: ({triplet.replace(' ', ', ')}), {_twins(verdicts, triplet)}."
+    )
 
 
 def _twins(verdicts: xr.Dataset, triplet: str) -> str:
@@ -131,15 +143,15 @@ def _certificate_note(verdicts: xr.Dataset) -> list[str]:
     """State what a grid shows of a proof."""
     if "determinant_cone" not in verdicts.attrs:
         return []
-    angle = np.rad2deg(verdicts.attrs["determinant_cone"])
-    where = f" outside {angle:.2f}°" if angle > 0.0 else ""
+    angle, cone = (np.rad2deg(verdicts.attrs[name]) for name in ("determinant_cone", "cone"))
+    signs = f"(Fx, MB, MD): signs that a proof outside {cone:.3g}° needs are"
     if verdicts.attrs["certificate_possible"]:
-        return [f"(Fx, MB, MD): on a grid all signs that a proof needs hold{where}."]
-    if angle > np.rad2deg(verdicts.attrs["cone"]):
-        return [f"(Fx, MB, MD): a proof can exist outside {angle:.2f}° at best."]
-    return [
-        "(Fx, MB, MD): signs that a proof needs are wrong on a grid; there is none of this kind."
-    ]
+        keeps = f"; the determinant keeps its outside {angle:.2f}°" if angle > 0.0 else ""
+        return [f"{signs} right on a grid{keeps}."]
+    where = "none of this kind can exist"
+    if angle > 0.0:
+        where = f"one can exist outside {max(angle, cone):.2f}° at best"
+    return [f"{signs} wrong on a grid; {where}."]
 
 
 def _surface(verdicts: xr.Dataset) -> str:

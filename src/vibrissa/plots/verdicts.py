@@ -32,7 +32,7 @@ _KEY = (
     "critical cone: about rest, outside it no such pair was found; ambiguous: share of contacts "
     "that another one resembles within 0.1 % of ranges",
 )
-_EDGES = {"single": (18.5, 7.3, 20.0), "double": (24.0, 13.5, 36.0)}
+_EDGES = {"single": (18.5, 7.3, 20.0), "double": (24.0, 13.5, 25.0)}
 """Widths of the triplets' names, of a region's column and of the notation, mm."""
 
 _TOLERANCE = 1e-3
@@ -44,18 +44,18 @@ def verdict_table(verdicts: xr.Dataset, *, width: style.Width = "double") -> Fig
 
     A full disc stands for unique, a half one for unique off a surface, an open ring for not unique.
     The triplet chosen is printed in blue, with a mark. At double width, what is not unique is given
-    with the largest distance of two contacts with the same signals, and two more columns follow:
-    the critical cone, outside which no two contacts have the same signals, and the share of
-    contacts that another one resembles within 1e-3 of the signals' ranges, both of all contacts and
-    only if the region "all" was judged.
+    with the largest distance of two contacts with the same signals, and three more columns follow,
+    of all contacts and only if the region "all" was judged: a lower bound of the critical cone,
+    outside which no two contacts have the same signals; the share of contacts that have such a
+    twin; and the share that another one resembles within 1e-3 of the signals' ranges.
 
     Parameters
     ----------
     verdicts : Dataset
-        Result of ``vibrissa.uniqueness``: ``verdict`` over (triplet, region); with ``notation``
-        (triplet), ``witness_separation`` (triplet, region, witness), ``critical_cone`` (triplet,
-        region), ``ambiguous_share`` (triplet, region, signal_tolerance) and the attribute
-        ``chosen_triplet``, if known.
+        Result of ``vibrissa.uniqueness``: ``verdict`` over (triplet, region); if known with
+        ``notation`` (triplet), ``witness_separation`` (triplet, region, witness), ``critical_cone``
+        and ``twin_share`` (triplet, region), ``ambiguous_share`` (triplet, region,
+        signal_tolerance) and the attribute ``chosen_triplet``.
     width : {"single", "double"}
         Columns of the page.
 
@@ -133,8 +133,9 @@ def _heads(axes: Axes, regions: list[str], width: style.Width, page: float, shar
     axes.text(left, base, "unique for", **look)
     if width == "double" and "all" in regions:
         axes.text(left + notation + 1.0, base, "critical\ncone", linespacing=1.1, **look)
+        axes.text(left + notation + 13.0, base, "have a\ntwin", linespacing=1.1, **look)
     if width == "double" and "all" in regions and shares:
-        axes.text(left + notation + 14.0, base, "ambiguous\nat 0.1 %", linespacing=1.1, **look)
+        axes.text(left + notation + 25.0, base, "ambiguous\nat 0.1 %", linespacing=1.1, **look)
 
 
 def _row(
@@ -194,19 +195,25 @@ def _separation(verdict: xr.Dataset, region: int) -> str:
 
 
 def _evidence(axes: Axes, verdict: xr.Dataset, left: float, y: float) -> None:
-    """Critical cone, and the share of ambiguous contacts as a bar, of all contacts."""
+    """Critical cone, share with a twin, and of ambiguous contacts as a bar, of all contacts."""
     look: dict[str, Any] = {"fontsize": style.SMALL, "va": "center"}
     if "critical_cone" in verdict:
         cone = float(np.degrees(verdict["critical_cone"].sel(region="all")))
-        text = "" if not np.isfinite(cone) else f"{cone:.1f}°" if cone > 0.0 else "none"
-        axes.text(left + 8.5, y, text, ha="right", **look)
+        text = "" if not np.isfinite(cone) else f"≥{cone:.1f}°" if cone > 0.0 else "none"
+        axes.text(left + 9.5, y, text, ha="right", **look)
+    if "twin_share" in verdict:
+        cell = verdict.sel(region="all")
+        twins = 100.0 * float(cell["twin_share"])
+        rare = "rare" if str(cell["verdict"].values) == "not unique" else "none"
+        text = "" if not np.isfinite(twins) else f"{twins:.2g} %" if twins > 0.0 else rare
+        axes.text(left + 20.5, y, text, ha="right", **look)
     if "ambiguous_share" in verdict:
         share = verdict["ambiguous_share"].sel(region="all")
         nearest = int(np.argmin(np.abs(np.log(share["signal_tolerance"].values / _TOLERANCE))))
         value = float(share.isel(signal_tolerance=nearest))
         if np.isfinite(value):
-            axes.barh(y, 9.0 * value, 0.35 * _ROW, left + 14.0, color=style.MUTED)
-            axes.text(left + 14.6 + 9.0 * value, y, f"{100.0 * value:.0f} %", **look)
+            axes.barh(y, 9.0 * value, 0.35 * _ROW, left + 25.0, color=style.MUTED)
+            axes.text(left + 25.6 + 9.0 * value, y, f"{100.0 * value:.0f} %", **look)
 
 
 def _key(axes: Axes, height: float, width: style.Width) -> None:

@@ -74,7 +74,9 @@ moment_noise = 0.02              # µN·m
 
 # groups = ["grid"]              # only of these; by default of all whiskers
 
-# Others: "map"; "sensitivity" (triplets, noise); "friction" (triplet, friction, contacts).
+# Others: "map"; "sensitivity" (triplets, noise); "friction" (triplet, friction, contacts);
+# "certificate", a proof for each whisker: cone (0: the smallest that may do), minutes, and folder,
+# where certificates are kept and continued.
 """
 
 _KEPT = (discretize, stable_set, point_solver, resting, signals_at_nodes, seeding_triplet)

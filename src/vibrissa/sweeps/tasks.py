@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ import numpy as np
 import xarray as xr
 from scipy.interpolate import CubicSpline
 
+from vibrissa.certificates import certify, smallest_cone
 from vibrissa.contacts import ContactMap, estimate_from_wrench
 from vibrissa.identifiability import best_triplet, uniqueness
 from vibrissa.numerics import Array
@@ -34,6 +36,7 @@ PAPERS = ("Fx MB MD", "Mx MB MD", "Fx FD MD")
 """The triplets that the paper found unique."""
 
 VERDICTS = ("unique", "unique off a surface", "not unique")
+PROOFS = ("proved", "refused", "not finished")
 _MICRO = 1e-6
 _MOST = 10_000_000
 """Samples of a whisker; more would not fit into memory."""
@@ -98,17 +101,40 @@ def _uniqueness(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
         resolution=bool(settings["resolution"]),
         seed=seed,
     )
-    codes = np.select([found["verdict"].values == word for word in VERDICTS], range(3), -1)
-    flags = {
-        "flag_values": np.arange(3, dtype=np.int8),
-        "flag_meanings": " ".join(word.replace(" ", "_") for word in VERDICTS),
-    }
     kept = ["critical_cone", "twin_share", "minority_share"]
     if settings["resolution"]:
         kept.append("ambiguous_share")
-    verdict = found["verdict"].copy(data=codes.astype(np.int8)).assign_attrs(flags)
-    out = found[kept].assign(verdict=verdict)
+    out = found[kept].assign(verdict=_flags(found["verdict"], VERDICTS))
     return out.drop_vars([name for name in out.coords if name not in out.dims])
+
+
+def _flags(words: xr.DataArray, known: tuple[str, ...]) -> xr.DataArray:
+    """Words as numbers of CF flags, -1 for those that are not known."""
+    codes = np.select([words.values == word for word in known], range(len(known)), -1)
+    meanings = " ".join(word.replace(" ", "_") for word in known)
+    flags = {"flag_values": np.arange(len(known), dtype=np.int8), "flag_meanings": meanings}
+    return words.copy(data=codes.astype(np.int8)).assign_attrs(flags)
+
+
+def _certificate(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
+    """How far (Fx, MB, MD) is proved to be unique outside a cone; 0: the smallest that may do."""
+    contact_map, path = ContactMap.simulate(whisker, grid=False), None
+    cone = float(np.radians(settings["cone"])) or smallest_cone(contact_map)
+    if not np.isfinite(cone):
+        raise ValueError("on a grid no cone makes all signs right that a proof needs")
+    if settings["folder"]:
+        path = Path(settings["folder"]) / f"{seed}-{float(settings['cone']):g}.nc"
+        path.parent.mkdir(parents=True, exist_ok=True)
+    found = certify(contact_map, cone, path=path, seconds=60.0 * settings["minutes"])
+    state = PROOFS[0 if found.proved else 1 if found.refuted else 2]
+    boxes = float(sum(len(part.certified) for part in found.parts.values()))
+    out = {
+        "cone": ((), found.cone, {"units": "rad", "long_name": "cone that is left out"}),
+        "share": ((), found.share, {"units": "1", "long_name": "share that is certain"}),
+        "boxes": ((), boxes, {"units": "1", "long_name": "boxes on which signs are certain"}),
+    }
+    about = {"long_name": "how far (Fx, MB, MD) is proved to be unique"}
+    return xr.Dataset(out).assign(proof=_flags(xr.DataArray(state, attrs=about), PROOFS))
 
 
 def _sensitivity(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
@@ -252,6 +278,13 @@ def _check_uniqueness(settings: Settings) -> None:
     _check_number(settings, "cone", 0.0)
 
 
+def _check_certificate(settings: Settings) -> None:
+    _check_number(settings, "cone", 0.0)
+    _check_number(settings, "minutes", 0.0)
+    if not isinstance(settings["folder"], str):
+        raise ValueError(f"folder is {settings['folder']!r}; a path, or nothing, is needed")
+
+
 def _check_noise(settings: Settings) -> None:
     for name in ("force_noise", "moment_noise"):
         _check_number(settings, name, 0.0)
@@ -315,6 +348,13 @@ TASKS: Mapping[str, Task] = MappingProxyType(
                 * len(_triplets(settings))
                 * len(settings["regions"])
             ),
+        ),
+        "certificate": Task(
+            _certificate,
+            {"cone": 0.0, "minutes": 30.0, "folder": ""},
+            _check_certificate,
+            lambda settings: min(60.0 * settings["minutes"], 300.0),
+            lambda settings: 4,
         ),
         "sensitivity": Task(
             _sensitivity,

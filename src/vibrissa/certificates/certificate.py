@@ -90,16 +90,9 @@ def enclosed_on(
 
 @dataclass
 class Part:
-    """One part of the domain and the boxes that cover it.
+    """One part of the domain and the boxes that cover it: levels and indices, by unknown.
 
-    Parameters
-    ----------
-    domain : (unknowns, 2) array
-        Bounds of the unknowns; equal ones where a face fixes one.
-    certified, undecided : (n, unknowns, 2) arrays
-        Levels and indices of boxes.
-    evaluated : int
-        Number of boxes evaluated so far.
+    Of an unknown that a face fixes both bounds of the domain are equal.
     """
 
     domain: Array

@@ -108,15 +108,7 @@ class Form:
 
 
 class Series:
-    """Taylor coefficients of numbers over n boxes, side by side.
-
-    Parameters
-    ----------
-    first : Form
-        Coefficient of order zero.
-    order : int
-        Largest order.
-    """
+    """Taylor coefficients of numbers over n boxes, side by side, up to an order."""
 
     def __init__(self, first: Form, order: int) -> None:
         self.centre = np.zeros((order + 1, *first.centre.shape))

@@ -76,24 +76,10 @@ _ROUNDED = 1e-13
 class Conditions(NamedTuple):
     """What is computed on a box, as tables for the kernel.
 
-    Attributes
-    ----------
-    equations : Program
-        Equations of the rod.
-    table : Program
-        Sums of products, before and after the rod's equations are solved.
-    middle : int
-        First variable of the table that is computed after them.
-    start : (states,) array
-        Variables that are the states at the contact; -1 for zero.
-    load : int
-        Variable that is the load of the equations; -1 if they have none.
-    base : int
-        Variable that is the first state at the base.
-    conditions : (c,) array
-        Variables that are to be positive.
-    unknowns : int
-        Number of unknowns.
+    The rod's equations, and a table of sums of products before and (from the variable ``middle``
+    on) after they are solved. Variables of it are the states at the contact (``start``, -1 for
+    zero), the load of the equations (-1 if they have none), the first state at the base, and the
+    ``conditions`` that are to be positive.
     """
 
     equations: Program
@@ -358,29 +344,12 @@ def conditions_on(
     first: int,
     end: int,
 ) -> None:
-    """Enclose the conditions over boxes.
+    """Enclose the conditions over boxes (n, unknowns, 2), rows from ``first`` to ``end``.
 
-    Parameters
-    ----------
-    conditions : Conditions
-        Conditions that are evaluated.
-    rod : ExactRod
-        Whisker.
-    bound : (32,) array
-        The taper α, the coefficients of P₀ … P₄, and ``room``.
-    boxes : (n, unknowns, 2) array
-        Bounds of the unknowns; neighbours are computed side by side.
-    order : int
-        Order of the Taylor polynomials.
-    tolerance : float
-        Share of the states to which the last Taylor coefficient falls in a step.
-    found : (n, c, unknowns + 3) array
-        Conditions, each a centre, the share of each unknown and of their products, and the
-        remainder with all else; NaN where the states could not be enclosed.
-    widths : (n, unknowns) array
-        Relative widths of the states by unknown.
-    first, end : int
-        Rows to do.
+    ``bound`` is the taper α, the coefficients of P₀ … P₄, and ``room``; neighbours are computed
+    side by side. ``found`` (n, c, unknowns + 3) are conditions, each a centre, the share of each
+    unknown and of their products, and the remainder with all else; NaN where the states could not
+    be enclosed. ``widths`` (n, unknowns) are relative widths of the states.
     """
     groups, states = conditions.equations.groups.shape
     unknowns, table = conditions.unknowns, conditions.table

@@ -131,18 +131,11 @@ def _dropped(a: Array, b: Array, order: int) -> Array:
 
 
 class Rod(NamedTuple):
-    """Polynomials of the whisker about points of it, one for each box.
+    """Polynomials of the whisker about points of it, one for each box, backwards.
 
-    Attributes
-    ----------
-    known : (4, d, n) array
-        Taylor coefficients of the curvatures and of the radius, backwards.
-    soft : (k, n) array
-        Coefficients of the compliance.
-    wrong : (2, n) array
-        Largest differences of curvature and compliance from these over the step h.
-    twist : float
-        Compliance in twist over that in bending.
+    Taylor coefficients of the curvatures and of the radius (4, d, n), and of the compliance; the
+    largest differences (2, n) of curvature and compliance from these over a step; the compliance in
+    twist over that in bending.
     """
 
     known: Array

@@ -42,16 +42,9 @@ _STATIONS, _BEARINGS = 40, 24
 
 
 class Bounds(NamedTuple):
-    """Bounds on the force, non-dimensional.
+    """Bounds on the force, non-dimensional: their taper α, and the coefficients of P₀ … P₄.
 
-    Attributes
-    ----------
-    alpha : float
-        Taper of the bounds.
-    factors : (5, k) array
-        Coefficients of P₀ … P₄.
-    room : float
-        Share of the arc length by which contacts within the cone may be deflected.
+    ``room`` is the share of the arc length by which contacts within the cone may be deflected.
     """
 
     alpha: float

@@ -38,22 +38,10 @@ _SLACK = Fraction(1, 2**49)
 
 
 class Program(NamedTuple):
-    """Equations for the kernels.
+    """Equations for the kernels: variables, and products whose signed sums they are.
 
-    Attributes
-    ----------
-    kind : (v,) array
-        Whether each variable is given, algebraic or a state.
-    constant : (v,) array
-        1 for variables without higher Taylor coefficients.
-    first : (v + 1,) array
-        Index of the first product of each variable.
-    sign : (o,) array
-        Sign of each product.
-    left, right : (o,) arrays
-        Factors of each product.
-    groups : (g, m) array
-        States: those of the values, then those of each derivative, in the same order.
+    ``constant`` variables have no higher Taylor coefficients; the products of variable v are those
+    from first[v] to first[v + 1]; ``groups`` are the states of the values, then of each derivative.
     """
 
     kind: IntArray
@@ -68,17 +56,10 @@ class Program(NamedTuple):
 class ExactRod(NamedTuple):
     """A whisker as polynomials with exact coefficients, each a centre and a radius.
 
-    Attributes
-    ----------
-    edges : (n + 1,) array
-        Ends of the pieces, over L: exact numbers, the stored ones rounded to double precision.
-    local : (n, 4, 2, 2) array
-        Slope and offset that turn arc length into the polynomials' own variable.
-    coefficients : (n, 4, d, 2) array
-        Polynomials of the curvatures times L (twist, about d1, about d2) and of the radius over
-        that at the base.
-    twist : (2,) array
-        Compliance in twist over that in bending.
+    Ends of the n pieces over L, exact numbers (the stored ones rounded to double precision); slope
+    and offset (n, 4, 2, 2) that turn arc length into the polynomials' own variable; coefficients
+    (n, 4, d, 2) of the curvatures times L (twist, about d1, about d2) and of the radius over that
+    at the base; compliance in twist over that in bending (2,).
     """
 
     edges: Array
@@ -89,16 +70,9 @@ class ExactRod(NamedTuple):
 
 @dataclass
 class Equations:
-    """A list of variables with their products, to be turned into a `Program`.
+    """Variables, in the order in which they are computed, to be turned into a `Program`.
 
-    Parameters
-    ----------
-    names : list of str
-        Variables, in the order in which they are computed.
-    kinds : list of int
-        Kind of each.
-    products : dict
-        Sums (sign, left, right) by variable.
+    Each has a kind; its products are (sign, left, right).
     """
 
     names: list[str] = field(default_factory=list)

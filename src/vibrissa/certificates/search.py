@@ -26,17 +26,7 @@ Evaluate = Callable[[IntArray], tuple[Array, Array]]
 
 
 class Cover(NamedTuple):
-    """Result of a search.
-
-    Attributes
-    ----------
-    certified, undecided : (n, unknowns, 2) arrays
-        Levels and indices of the boxes on which all signs are certain, and of the others.
-    evaluated : int
-        Number of boxes that were evaluated.
-    refuted : (m, unknowns, 2) array
-        Box at whose centre a sign is certainly wrong, if any.
-    """
+    """Boxes on which all signs are certain, others, and one with a wrong sign, if there is any."""
 
     certified: IntArray
     undecided: IntArray

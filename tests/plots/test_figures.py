@@ -177,8 +177,9 @@ def test_wrong_input_is_told_apart() -> None:
 
 def test_files_are_written_the_same_each_time(tmp_path) -> None:
     for name in ("one", "two"):
-        files = save(whisker_views(LINE, RADIUS), tmp_path / name)
-    assert [f.name for f in files] == ["two.png", "two.pdf"]
+        figure = whisker_views(LINE, RADIUS)
+        files = [*save(figure, tmp_path / name), *save(figure, tmp_path / name, ["svg"])]
+    assert [f.name for f in files] == ["two.png", "two.pdf", "two.svg"]
     for file in files:
         assert file.read_bytes() == file.with_stem("one").read_bytes()
 

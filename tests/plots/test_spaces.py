@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 from matplotlib.figure import Figure
 
-from vibrissa.plots import contact_surfaces, signal_clouds
+from vibrissa.plots import contact_surfaces, save, signal_clouds
 from vibrissa.quantities import axis_label
 from vibrissa.scene.solids import (
     SIGNALS,
@@ -167,11 +167,14 @@ def test_no_twist_is_said_and_not_coloured(coarse) -> None:
 
 
 @pytest.mark.parametrize("width", ["single", "double"])
-def test_surfaces_are_labelled_in_mm_and_degrees(width, coarse) -> None:
-    written = texts(contact_surfaces(chart(), LINE, width=width))
+def test_surfaces_are_labelled_in_mm_and_degrees(width, coarse, tmp_path) -> None:
+    figure = contact_surfaces(chart(), LINE, width=width)
+    written = texts(figure)
     assert {axis_label(n) for n in ("r", "theta", "phi", "x", "y", "z", "Fx")} <= written
     assert "$M_D$ = 180°" in written
     assert set("abcdefghi") <= written
+    if width == "single":  # surfaces are painted as pixels
+        assert save(figure, tmp_path / "surfaces", ["pdf"])[0].stat().st_size < 2e6
 
 
 def test_incomplete_maps_are_refused() -> None:

@@ -114,9 +114,10 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def written(folder):
-    """The page of the trial."""
+    """The page of the trial; figures are small."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+        patch.setattr(plots, "png", partial(plots.png, dots=40.0))
         words = (folder / "trial.nc", "--map", folder / "map.nc", "-o", folder / "trial.html")
         assert "wrote" in run("report", *words, "--seed", 3)
     return folder / "trial.html"

@@ -19,7 +19,7 @@ import dask
 import xarray as xr
 
 from vibrissa.sweeps import Study, failures, open_sweep, read_study, run_sweep
-from vibrissa.sweeps.population import Specimen
+from vibrissa.sweeps.study import Specimen
 
 TEXT = """
 [[whiskers]]

@@ -21,8 +21,7 @@ pytest.importorskip("zarr", reason="zarr (extra sweeps) is not installed")
 from vibrissa import Whisker
 from vibrissa.certificates import load_certificate
 from vibrissa.sweeps import Study, failures, open_sweep, read_study, run_sweep
-from vibrissa.sweeps.population import Specimen
-from vibrissa.sweeps.study import answer
+from vibrissa.sweeps.study import Specimen, answer
 from vibrissa.sweeps.tasks import TASKS
 
 QUICK = """

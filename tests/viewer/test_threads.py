@@ -3,7 +3,7 @@
 import threading
 import time
 
-from vibrissa.viewer.threads import Latest, Player
+from vibrissa.viewer.page import Latest, Player
 
 
 def test_a_newer_job_replaces_one_that_has_not_begun():

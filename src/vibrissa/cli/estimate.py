@@ -76,6 +76,13 @@ class GravityOptions:
             0.01 * (self.density_sigma or 0.0),
         )
 
+    def check(self, how: EstimateOptions) -> None:
+        """Raise where a weight does not go with how contacts are estimated."""
+        if how.method != "exact":
+            refuse({"--gravity": self.gravity}, f"--method {how.method} has no weight")
+        if how.map:
+            refuse({"--density": self.density}, "a map states that of its whisker")
+
     def of(self, whisker: vb.Whisker) -> vb.Whisker:
         """The whisker with the density that is stated."""
         return whisker if self.density is None else whisker.with_properties(density=self.density)
@@ -144,18 +151,16 @@ class EstimateOptions:
         return self.method.startswith("lookup")
 
     @property
+    def special(self) -> bool:
+        """Whether contacts are found otherwise than in a stream."""
+        beyond = (self.friction_sigma, self.second_contacts, self.compliance_sigma)
+        return self.method != "exact" or any(beyond)
+
+    @property
     def given(self) -> bool:
         """Whether anything is stated, so that contacts are to be estimated anew."""
-        stated = (self.map, self.using, self.own.whisker, self.noise.given)
-        other = (
-            self.method != "exact",
-            self.proximal is not None,
-            self.friction_sigma,
-            self.second_contacts,
-            self.compliance_sigma,
-            self.assumed.described(),
-        )
-        return any(bool(one) for one in (*stated, *other))
+        stated = (self.map, self.using, self.own.whisker, self.noise.given, self.special)
+        return any(map(bool, (*stated, self.proximal is not None, self.assumed.described())))
 
     @property
     def known(self) -> WhiskerOptions:
@@ -234,16 +239,7 @@ def estimate(
     vb.io.check_writable(target, both if recorded or swept else vb.io.CSV)
     free_beside(signals, [target], force)
     if sensor is not None and not swept:
-        stated = (
-            recorded,
-            how.using,
-            how.noise.given,
-            how.method != "exact",
-            how.friction_sigma,
-            how.second_contacts,
-            how.compliance_sigma,
-        )
-        if any(map(bool, stated)):
+        if recorded or how.using or how.noise.given or how.special:
             raise ValueError(f"{sensor} is for tables, and has its own channels and noise")
         _from_lines(signals, target, how, weight, vb.sensors.load_sensor(sensor))
     elif sensor is not None:
@@ -260,9 +256,7 @@ def estimate(
 
 def _named_signals(table: Path, how: EstimateOptions) -> bool:
     """Whether a table has the signals that are used, and not what they are computed from."""
-    if how.whole or how.method != "exact" or how.friction_sigma or how.second_contacts:
-        return False
-    if how.compliance_sigma:
+    if how.whole or how.special:
         return False
     names = how.names or vb.pipeline.TRIPLET
     first = next((line for line in vb.io.read_text(table).splitlines() if line.strip()), "")
@@ -289,8 +283,7 @@ def _from_lines(
 
     errors: dict[str, Any] = dict(how.assumed.errors)
     prior, gravity = how.assumed.prior, weight.known
-    if how.map:
-        refuse({"--density": weight.density}, "a map states that of its whisker")
+    weight.check(how)
     with progress_bars() as tell:
         if how.map:
             contact_map = maps_from(how.map, 1, False)[0]
@@ -331,10 +324,7 @@ def _from_lines(
 
 def _from_table(signals: Path, target: Path, how: EstimateOptions, weight: GravityOptions) -> None:
     """Contacts in the whisker's frame, as a table."""
-    if how.method != "exact":
-        refuse({"--gravity": weight.gravity}, f"--method {how.method} has no weight")
-    if how.map:
-        refuse({"--density": weight.density}, "a map states that of its whisker")
+    weight.check(how)
     noise = how.noise.matrix()
     wrench = wrench_from(signals)
     for note in wrench.attrs.get("notes", ()):
@@ -430,10 +420,7 @@ def estimated(
     noisy = how.noise.given or (source == "sensor" and vb.pipeline.sensor_noise(signals) is None)
     maps = maps_from(how.map, tree.sizes["whisker"], how.grid) if how.map else []
     weight = weight or GravityOptions()
-    if how.method != "exact":
-        refuse({"--gravity": weight.gravity}, f"--method {how.method} has no weight")
-    if maps:
-        refuse({"--density": weight.density}, "a map states that of its whisker")
+    weight.check(how)
     whiskers = [one.whisker for one in maps] if maps else how.own.in_recording(tree)
     whiskers = [weight.of(one) for one in whiskers]
     print_notes(*whiskers)

@@ -11,15 +11,13 @@ from vibrissa.io.anipose import (
     read_calibration as read_calibration,
     write_calibration as write_calibration,
 )
-from vibrissa.io.array import load_array, save_array
-from vibrissa.io.centerline import load_centerline, load_whisker, save_centerline
 from vibrissa.io.clicks import (
-    Clicks,
+    Clicks as Clicks,
     Points as Points,
-    ViewClicks,
-    load_clicks,
+    ViewClicks as ViewClicks,
+    load_clicks as load_clicks,
     polygon_of as polygon_of,
-    save_clicks,
+    save_clicks as save_clicks,
     together as together,
 )
 from vibrissa.io.kinds import READERS as READERS, Kind, load_tracks, recognise
@@ -54,7 +52,7 @@ from vibrissa.io.result_tables import (
     load_contacts,
     save_contacts,
     save_contour,
-    save_predictors,
+    save_predictors as save_predictors,
 )
 from vibrissa.io.rosbag import (
     BagMessage as BagMessage,
@@ -115,17 +113,21 @@ from vibrissa.io.video_tables import (
     save_corrections,
 )
 from vibrissa.io.whisk import load_whiskers
+from vibrissa.io.whiskers import (
+    load_array,
+    load_centerline,
+    load_whisker,
+    save_array,
+    save_centerline,
+)
 
 __all__ = [
-    "Clicks",
     "Kind",
     "Session",
     "VideoInfo",
-    "ViewClicks",
     "join_views",
     "load_array",
     "load_centerline",
-    "load_clicks",
     "load_contact_points",
     "load_contacts",
     "load_corrections",
@@ -141,12 +143,10 @@ __all__ = [
     "recognise",
     "save_array",
     "save_centerline",
-    "save_clicks",
     "save_contacts",
     "save_contour",
     "save_corrections",
     "save_nwb",
-    "save_predictors",
     "save_recording",
     "save_signals",
     "save_tracks",

@@ -34,35 +34,14 @@ _FEWEST = 3
 
 @dataclass(frozen=True)
 class ViewClicks:
-    """Clicks in one view.
-
-    Parameters
-    ----------
-    base : tuple of (column, row)
-        Bases of the whiskers in the first frame, pixels.
-    mask : tuple of polygons
-        Areas without whiskers, each a tuple of corners (column, row), pixels.
-    region : tuple of polygons
-        Areas in which all whiskers are, if there are any, likewise.
-    """
+    """Clicks in one view."""
 
     base: Points = ()
     mask: tuple[Points, ...] = ()
     region: tuple[Points, ...] = ()
 
     def masked(self, size: Sequence[int]) -> Mask | None:
-        """Find the pixels of an image without whiskers.
-
-        Parameters
-        ----------
-        size : sequence of int
-            Width and height of the image.
-
-        Returns
-        -------
-        array (height, width) of bool, or None
-            Whether each pixel is left out; None if none is.
-        """
+        """Find the pixels of an image without whiskers."""
         masked = _inside(self.mask, size) if self.mask else None
         return together([masked, ~_inside(self.region, size) if self.region else None])
 
@@ -78,17 +57,7 @@ def together(masks: Iterable[Mask | None]) -> Mask | None:
 
 @dataclass(frozen=True)
 class Clicks:
-    """Clicks in the images of all views.
-
-    Parameters
-    ----------
-    views : tuple of ViewClicks
-        Clicks of each view.
-    videos : tuple of str
-        Names of the videos' files.
-    pixel_size : float, optional
-        Size of a pixel of the views in space, m.
-    """
+    """Clicks in the images of all views."""
 
     views: tuple[ViewClicks, ...]
     videos: tuple[str, ...] = ()
@@ -120,23 +89,7 @@ def polygon_of(points: ArrayLike, name: str) -> Points:
 
 
 def load_clicks(path: str | PathLike[str]) -> Clicks:
-    """Read what was shown in the images of a recording.
-
-    Parameters
-    ----------
-    path : str or path
-        TOML file, as `save_clicks` writes it.
-
-    Returns
-    -------
-    Clicks
-        Clicks of the file.
-
-    Raises
-    ------
-    ValueError
-        If the file is something else.
-    """
+    """Read what was shown in the images of a recording."""
     table = read_toml(path)
     with in_file(path):
         check_keys(table, {"videos", "pixel_size", "view"}, "it")
@@ -167,15 +120,7 @@ def _view(table: dict[str, Any], number: int) -> ViewClicks:
 
 
 def save_clicks(path: str | PathLike[str], clicks: Clicks) -> None:
-    """Write what was shown in the images of a recording.
-
-    Parameters
-    ----------
-    path : str or path
-        TOML file; one that is there is replaced.
-    clicks : Clicks
-        Clicks that are written.
-    """
+    """Write what was shown in the images of a recording."""
     check_writable(path, (".toml",))
     lines = [f"videos = {json.dumps(clicks.videos, ensure_ascii=False)}"]
     if clicks.pixel_size is not None:

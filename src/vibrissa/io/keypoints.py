@@ -322,7 +322,8 @@ def read_sleap_analysis(path: str | PathLike[str]) -> RawTracks:
         if "point_scores" in file:
             sure = _ordered(file["point_scores"], ("frame", "track", "node"))
         nodes = [str(name) for name in file["node_names"].asstr()[:]]
-        names = [str(name) for name in file["track_names"].asstr()[:]] if _any(file) else []
+        named = "track_names" in file and file["track_names"].size
+        names = [str(name) for name in file["track_names"].asstr()[:]] if named else []
         fps = file.attrs.get("fps")
     whiskers = names or _numbered(points.shape[1])
     if points.shape[1:] != (len(whiskers), len(nodes), 2):
@@ -400,10 +401,6 @@ def _ordered(array: h5py.Dataset, wanted: tuple[str, ...]) -> Array:
     if sorted(dims) != sorted(wanted) or values.ndim != len(wanted):
         raise ValueError(f"{array.name} has dimensions {dims} of sizes {values.shape}")
     return values.transpose([dims.index(dim) for dim in wanted])
-
-
-def _any(file: h5py.File) -> bool:
-    return "track_names" in file and file["track_names"].size > 0
 
 
 def _numbered(count: int) -> list[str]:

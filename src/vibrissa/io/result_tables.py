@@ -141,20 +141,7 @@ def _contour_text(contour: xr.Dataset) -> str:
 
 
 def save_predictors(path: str | PathLike[str], table: xr.Dataset) -> None:
-    """Write a table of predictors.
-
-    Parameters
-    ----------
-    path : str or path
-        File to write, ``.csv`` or ``.mat``; an existing file is replaced.
-    table : xarray.Dataset
-        Variables over (time, whisker), as `vibrissa.pipeline.predictors` returns them.
-
-    Raises
-    ------
-    ValueError
-        If the path has another ending.
-    """
+    """Write a table of predictors."""
     path = check_writable(path, (*CSV, ".mat"))
     columns = {str(name): one.transpose("time", "whisker") for name, one in table.items()}
     with replacing(path) as part:

@@ -186,8 +186,9 @@ def _decoded(path: str | PathLike[str], wanted: set[int]) -> Iterator[tuple[int,
         stream.thread_type = "AUTO"
         last, grey = max(wanted, default=-1), _grey_frames(path, container)
         sent: deque[int] = deque()
+        packets: Iterator[Any] = pairwise(chain(container.demux(stream), [None]))
         try:
-            for number, (packet, following) in enumerate(_with_next(container.demux(stream))):
+            for number, (packet, following) in enumerate(packets):
                 # Between two key frames nothing else depends on a frame.
                 alone = packet.is_keyframe and following is not None and following.is_keyframe
                 if alone and number not in wanted:
@@ -201,11 +202,6 @@ def _decoded(path: str | PathLike[str], wanted: set[int]) -> Iterator[tuple[int,
                         return
         except av.FFmpegError as error:
             raise ValueError(f"{path} is damaged: {error.strerror}") from error
-
-
-def _with_next(packets: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
-    """Each packet and the one that follows; of the last one that is None."""
-    return pairwise(chain(packets, [None]))
 
 
 def opened_video(path: str | PathLike[str]) -> InputContainer:
@@ -406,11 +402,10 @@ def _of_images(files: Sequence[Path]) -> dict[str, list[Frame]]:
                 f"camera {name} has no image {missing[0]} ({len(missing)} are missing of "
                 f"{len(moments)}): images of one number belong together"
             )
-    return {name: [_image(images[n]) for n in moments] for name, images in numbered.items()}
-
-
-def _image(path: Path) -> Frame:
-    return next(read_video(path)).copy()
+    return {
+        name: [next(read_video(images[n])).copy() for n in moments]
+        for name, images in numbered.items()
+    }
 
 
 CODECS = {".mkv": "ffv1", ".mp4": "h264"}

@@ -5,7 +5,7 @@ from vibrissa.pipeline.estimates import (
     contact_columns as contact_columns,
     estimates_of,
     in_laboratory as in_laboratory,
-    swept_recording,
+    swept_recording as swept_recording,
 )
 from vibrissa.pipeline.frames import (
     check_recording as check_recording,
@@ -27,7 +27,7 @@ from vibrissa.pipeline.reconstruct import (
     compare_contacts,
     compare_shapes,
     contour_points as contour_points,
-    distances_by_class,
+    distances_by_class as distances_by_class,
     fit_contacts,
     reconstruct,
 )
@@ -54,7 +54,6 @@ __all__ = [
     "compare_contacts",
     "compare_shapes",
     "contact_events",
-    "distances_by_class",
     "due_stages",
     "estimates_of",
     "fit_contacts",
@@ -64,7 +63,6 @@ __all__ = [
     "predictors",
     "reconstruct",
     "signals_of",
-    "swept_recording",
     "with_contour",
     "with_estimates",
     "with_signals",

@@ -141,7 +141,7 @@ def estimates_of(
     whole = signals == WHOLE
     names = TRIPLET if whole else selection(signals)
     count = data.sizes["whisker"]
-    report = progress or _silent
+    report = progress or (lambda stage, done, total: None)
     how: Any = {"errors": errors, "prior": prior, "second_contacts": second_contacts}
     how["gravity"] = gravity
     if whiskers is None and contact_maps is not None:
@@ -198,10 +198,6 @@ def estimates_of(
         about["gravity"] = gravity.acceleration
     out.attrs = about
     return out.assign_coords({n: data[n].variable for n in ("time", "whisker", "space")})
-
-
-def _silent(stage: str, done: int, total: int) -> None:
-    pass
 
 
 def _one_whisker(signals: xr.Dataset, found: xr.Dataset, *, other_noise: bool) -> xr.Dataset:
@@ -301,23 +297,7 @@ def _laboratory_covariance(
 def swept_recording(
     sensor: SuspendedWhisker, sweep: StageSweep, found: SweptContacts
 ) -> xr.DataTree:
-    """Recording of a sweep with a suspended whisker, with its contacts as estimates.
-
-    Parameters
-    ----------
-    sensor : SuspendedWhisker
-        Calibrated sensor.
-    sweep : StageSweep
-        Readings and poses of the sensor.
-    found : SweptContacts
-        Contacts of the sweep, of `follow_sweep`.
-
-    Returns
-    -------
-    xarray.DataTree
-        Recording with a group ``estimates``, and the errors that contacts share; its time is the
-        number of the sample. `reconstruct` fits an object to it.
-    """
+    """Recording of a sweep with a suspended whisker, with its contacts as estimates."""
     pose, n, on = sensor.whisker.pose, len(found.points), found.in_contact
     held = {
         "in_contact": on,

@@ -491,19 +491,7 @@ def compare_contacts(
 
 
 def distances_by_class(compared: xr.Dataset) -> dict[str, xr.Dataset]:
-    """Summarise distances from a known object by classes of deflection, distance and moment.
-
-    Parameters
-    ----------
-    compared : xarray.Dataset
-        Dataset of `compare_contacts`.
-
-    Returns
-    -------
-    dict
-        Datasets of `vibrissa.contour.distances_by`, by deflection angle, radial distance and
-        bending moment.
-    """
+    """Summarise distances from a known object by classes of deflection, distance and moment."""
     tables = {}
     for name in ("deflection_angle", "r", "MB"):
         if name in compared:

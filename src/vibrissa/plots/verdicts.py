@@ -84,7 +84,7 @@ def verdict_table(verdicts: xr.Dataset, *, width: style.Width = "double") -> Fig
         chosen = str(verdicts.attrs.get("chosen_triplet", ""))
         for i, triplet in enumerate(triplets):
             _row(axes, verdicts.sel(triplet=triplet), i, triplet == chosen, width, page)
-        _key(axes, height, width)
+        _key(axes, height, width, "all" in regions)
         if "all" in regions:
             every = verdicts["verdict"].sel(region="all").values
             found = [
@@ -216,7 +216,7 @@ def _evidence(axes: Axes, verdict: xr.Dataset, left: float, y: float) -> None:
             axes.text(left + 25.6 + 9.0 * value, y, f"{100.0 * value:.0f} %", **look)
 
 
-def _key(axes: Axes, height: float, width: style.Width) -> None:
+def _key(axes: Axes, height: float, width: style.Width, whole: bool) -> None:
     """Explain the symbols."""
     y = height - _FOOT + 3.0
     axes.plot([1.5, axes.get_xlim()[1] - 1.5], [y - 3.0] * 2, color=style.INK, linewidth=0.9)
@@ -226,7 +226,7 @@ def _key(axes: Axes, height: float, width: style.Width) -> None:
         axes.text(x + 2.2, y, kind, fontsize=style.SMALL, va="center")
         x += room
     if width == "double":
-        for line, text in enumerate(_KEY):
+        for line, text in enumerate(_KEY if whole else _KEY[:1]):
             left, small = (3.5 if line else x), style.SMALL
             axes.text(left, y + 3.5 * line, text, fontsize=small, va="center")
 

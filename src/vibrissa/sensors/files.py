@@ -29,6 +29,7 @@ are in the channels' units.
 
 from __future__ import annotations
 
+import json
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -184,7 +185,7 @@ def save_sensor(path: str | PathLike[str], sensor: Sensor) -> None:
     sensor : Sensor
         Sensor to write.
     """
-    lines = [f"channels = [{', '.join(_text(name) for name in sensor.channels)}]"]
+    lines = [f"channels = {json.dumps(sensor.channels, ensure_ascii=False)}"]
     lines.append(f"mixing = {_array(sensor.mixing)}")
     lines += [f"{name} = {_array(getattr(sensor, name))}" for name in _NUMBERS]
     lines.append(f"relative_noise = {float(sensor.relative_noise)!r}")
@@ -202,14 +203,5 @@ def save_sensor(path: str | PathLike[str], sensor: Sensor) -> None:
         part.write_text("\n".join(lines), encoding="utf-8")
 
 
-def _text(name: str) -> str:
-    return '"' + name.replace("\\", "\\\\").replace('"', '\\"') + '"'
-
-
 def _array(values: Any) -> str:
-    array = np.asarray(values, dtype=np.float64)
-    if array.ndim == 0:
-        return repr(float(array))
-    if array.ndim == 1:
-        return "[" + ", ".join(repr(float(value)) for value in array) + "]"
-    return "[" + ", ".join(_array(row) for row in array) + "]"
+    return str(np.asarray(values, dtype=np.float64).tolist())

@@ -338,7 +338,7 @@ def run_sweep(
         todo = (cell for cell in study.cells() if not skip[cell.index, columns[cell.task]])
         skipped, done, failed = int(skip.sum()), 0, 0
         before = 0 if again else int((status == FAILED).sum())
-        report = progress or _silent
+        report = progress or (lambda done, total: None)
         report(skipped, study.size)
         with closing(_answers(todo, workers, scheduler)) as answers:
             for cell, found in answers:
@@ -350,10 +350,6 @@ def run_sweep(
     return Outcome(
         done, failed, skipped, before, int((status == DAMAGED).sum()), tuple(store.faults)
     )
-
-
-def _silent(done: int, total: int) -> None:
-    pass
 
 
 def _answers(cells: Iterable[Cell], workers: int, scheduler: str | None) -> Answers:

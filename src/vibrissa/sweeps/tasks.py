@@ -317,10 +317,6 @@ def _check_number(settings: Settings, name: str, least: float, most: float = np.
         raise ValueError(f"{name} is {value!r}; a number from {least:g}{upto} is needed")
 
 
-def _nothing(settings: Settings) -> None:
-    pass
-
-
 def _uniqueness_seconds(settings: Settings) -> float:
     # Measured with one core, 512 to 4096 samples: cheap compared with the search for twins.
     each = 0.6 + (1.0 if settings["resolution"] else 0.0)
@@ -331,7 +327,9 @@ _SENSOR = {"force_noise": FORCE_NOISE / _MICRO, "moment_noise": MOMENT_NOISE / _
 
 TASKS: Mapping[str, Task] = MappingProxyType(
     {
-        "map": Task(_map_summary, {}, _nothing, lambda settings: 0.3, lambda settings: 33),
+        "map": Task(
+            _map_summary, {}, lambda settings: None, lambda settings: 0.3, lambda settings: 33
+        ),
         "uniqueness": Task(
             _uniqueness,
             {

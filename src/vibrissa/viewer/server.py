@@ -30,13 +30,12 @@ from vibrissa.viewer.bend import BendMode, WhiskerControls
 from vibrissa.viewer.live import Live, LivePage
 from vibrissa.viewer.locate import LocateMode, coloured, located, usual_sensor
 from vibrissa.viewer.map import MapMode
-from vibrissa.viewer.page import Mode, Page
+from vibrissa.viewer.page import CompileNotice, Mode, Page, Rehearsal
 from vibrissa.viewer.readout import note
 from vibrissa.viewer.recorded import Watched, watched
 from vibrissa.viewer.save import SaveControls, amended
 from vibrissa.viewer.stage import lit
 from vibrissa.viewer.state import loaded, moved, with_radius
-from vibrissa.viewer.threads import CompileNotice, Rehearsal
 from vibrissa.viewer.trial import TrialMode
 from vibrissa.whisker import Whisker
 

@@ -132,7 +132,7 @@ def _changed(handle: viser.SceneNodeHandle, old: Mark, new: Mark) -> bool:
     """Change what is on the page into a new thing, if it is near enough to the old one."""
     node = cast(Any, handle)  # every kind has attributes of its own
     match old, new:
-        case Body(), Body() if old.side == new.side and _same_faces(old, new):
+        case Body(), Body() if old.side == new.side and np.array_equal(old.faces, new.faces):
             if new.vertices is not old.vertices:
                 node.vertices = new.vertices.astype(np.float32)
             node.color, node.opacity = new.colour, new.opacity
@@ -149,10 +149,6 @@ def _changed(handle: viser.SceneNodeHandle, old: Mark, new: Mark) -> bool:
         case _:
             return False
     return True
-
-
-def _same_faces(old: Body, new: Body) -> bool:
-    return old.faces is new.faces or np.array_equal(old.faces, new.faces)
 
 
 def _like(old: Arrows, new: Arrows) -> bool:

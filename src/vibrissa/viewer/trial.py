@@ -17,11 +17,10 @@ from vibrissa.objects import Surface, objects_datasets
 from vibrissa.quantities import to_display
 from vibrissa.sketch import round_step
 from vibrissa.viewer.bend import arrow, mm, ruler, whisker_body
-from vibrissa.viewer.page import Mode, Page, asked, put
+from vibrissa.viewer.page import Mode, Page, Player, asked, put
 from vibrissa.viewer.readout import CONTACT, FIT, OBJECT, Legend, chart, cursor, table, timeline
 from vibrissa.viewer.recorded import View, Watched, picture, views
 from vibrissa.viewer.state import force_scale
-from vibrissa.viewer.threads import Player
 
 POINTS = 4000
 """Most contact points that are drawn."""

@@ -29,14 +29,6 @@ ORTHOGONALITY = 1e-9
 """Largest entry of RᵀR − 1 that still counts as a rotation."""
 
 
-def _identity() -> Array:
-    return np.eye(3)
-
-
-def _zero() -> Array:
-    return np.zeros(3)
-
-
 @dataclass(frozen=True, eq=False)
 class Pose:
     """Rotation and origin of the whisker frame in its source frame.
@@ -60,8 +52,8 @@ class Pose:
     array([1.  , 0.01, 0.  ])
     """
 
-    rotation: Array = field(default_factory=_identity)
-    origin: Array = field(default_factory=_zero)
+    rotation: Array = field(default_factory=lambda: np.eye(3))
+    origin: Array = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         """Check both parts and make them read-only."""

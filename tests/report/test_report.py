@@ -118,6 +118,7 @@ def written(folder):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SOURCE_DATE_EPOCH", "1700000000")
         patch.setattr(plots, "png", partial(plots.png, dots=40.0))
+        patch.setattr("vibrissa.scene.solids._SHAPE", (12, 24, 8))
         words = (folder / "trial.nc", "--map", folder / "map.nc", "-o", folder / "trial.html")
         assert "wrote" in run("report", *words, "--seed", 3)
     return folder / "trial.html"
@@ -135,6 +136,7 @@ def map_page(folder):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SOURCE_DATE_EPOCH", "1700000000")
         patch.setattr(plots, "png", partial(plots.png, dots=40.0))
+        patch.setattr("vibrissa.scene.solids._SHAPE", (12, 24, 8))
         run("report", *words, "-o", folder / "map.html")
         yield folder / "map.html", words
 

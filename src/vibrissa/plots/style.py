@@ -106,6 +106,7 @@ LOOK: Mapping[str, Any] = MappingProxyType(
         "savefig.dpi": 300.0,
         "pdf.fonttype": 42,  # text stays text when the figure is edited
         "svg.fonttype": "none",
+        "svg.hashsalt": "vibrissa",  # the same names of its parts each time
     }
 )
 """Matplotlib's settings while a figure of ours is made and drawn."""

@@ -57,7 +57,7 @@ OLD_LAYOUTS = (2, 3)
 _SUM = "checksum"
 _LIBRARIES = ("numpy", "scipy", "numba")
 # Modules that compute a cell; results depend on them and on the packages that they import.
-_COMPUTING = ("population", "study", "tasks")
+_COMPUTING = ("study", "tasks")
 _SOURCES = {".csv", ".py", ".toml"}
 _IMPORTED = re.compile(r"(?:from|import) vibrissa\.(\w+)")
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from vibrissa import samples
+from vibrissa import PointContact, deflect, samples
 from vibrissa.contour import shape_from_dataset
 from vibrissa.io import load_recording, save_recording
 from vibrissa.objects import Sphere
@@ -415,3 +415,46 @@ def test_contacts_are_as_far_from_the_known_object_as_predicted(trial):
     nothing = with_group(done, "estimates", done["estimates"].to_dataset() * np.nan)
     with pytest.raises(ValueError, match="no contacts"):
         compare_contacts(nothing)
+
+
+def test_an_unknown_length_of_the_whisker_is_in_contacts_by_a_sensor(trial, quiet, contact_map):
+    """Forces of a whisker that is 1 % longer than it is taken to be move contacts as stated."""
+    truth = quiet["truth"].to_dataset().isel(whisker=0)
+    whisker = contact_map.whisker
+    rows = np.flatnonzero(np.linalg.norm(truth["moment"].values, axis=1) > 1e-6)
+    longer = whisker.with_properties(radius=lambda s: whisker.radius(s / 1.01))
+    at = PointContact(truth["contact_point_whisker"].values[rows])
+    more, same = (deflect(one, at) for one in (longer, whisker))
+    shared = np.zeros((truth.sizes["time"], 1, 1, 6))
+    for k, name in enumerate(("force", "moment")):
+        change = getattr(more, name) - getattr(same, name)
+        shared[rows, 0, 0, 3 * k : 3 * k + 3] = change
+    known = with_signals(trial)
+    pushed = known["signals"].to_dataset()
+    for k, name in enumerate(("force", "moment")):
+        pushed[name] = pushed[name] + shared[:, :, 0, 3 * k : 3 * k + 3]
+    none = np.zeros((*shared.shape[:3], 6))
+    zero = {"contact_shared": none[..., :3], "pose_shared": none, "wrench_shared": shared}
+    known.dataset = trial.to_dataset().assign({n: recorded(n, v) for n, v in zero.items()})
+    before = estimates_of(known, contact_maps=[contact_map])
+    known["signals"] = xr.DataTree(pushed)
+    after = estimates_of(known, contact_maps=[contact_map])
+    moved = (after["contact_point"] - before["contact_point"]).values[rows, 0]
+    stated = before["contact_shared"].values[rows, 0, 0]
+    fine = np.isfinite(moved).all(axis=1) & np.isfinite(stated).all(axis=1)
+    assert fine.sum() > 20
+    error = np.linalg.norm(moved + stated, axis=1)[fine]
+    assert np.median(error / np.linalg.norm(moved, axis=1)[fine]) < 0.1
+    # It is in the covariance of contacts and, as one error of all of them, in that of the object.
+    plain = with_estimates(trial, contact_maps=[contact_map])
+    more = before["contact_covariance"] - plain["estimates"]["contact_covariance"]
+    np.testing.assert_allclose(
+        more.values[rows, 0][fine], stated[fine, :, None] * stated[fine, None], atol=1e-12
+    )
+    wider, alone = (
+        reconstruct(with_group(known, "estimates", one))["parameter_covariance"].values
+        for one in (before, before.drop_vars("contact_shared"))
+    )
+    added = np.linalg.eigvalsh(wider - alone)
+    assert added[0] > -1e-9 * added[-1]
+    assert wider[6, 6] > 1.1 * alone[6, 6]

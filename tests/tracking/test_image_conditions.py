@@ -113,7 +113,7 @@ def test_a_length_is_found_where_it_costs_least():
 
     found = likeliest_length(30e-3, cost)
     assert found.value == pytest.approx(33e-3, rel=1e-6)
-    assert found.sigma == pytest.approx(np.hypot(0.4e-3, 0.015 * 30e-3), rel=1e-4)
+    assert found.sigma == pytest.approx(np.hypot(0.4e-3, 0.025 * 30e-3), rel=1e-4)
     # What is cheapest if shorter than what is seen is as long as what is seen.
     assert likeliest_length(34e-3, cost).value == pytest.approx(34e-3)
     assert np.isnan(likeliest_length(30e-3, lambda length: -length).sigma)

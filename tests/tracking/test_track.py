@@ -89,7 +89,7 @@ def test_force_and_moment_are_those_of_the_rod(filmed, found, both):
 @pytest.mark.parametrize("share", [0.0, 0.3])
 def test_friction_is_found_in_the_shape(share):
     """A rod bent by a known force with friction, seen without noise: the force comes out."""
-    from vibrissa import PointForce, Whisker, deflect
+    from vibrissa import PointContact, PointForce, Whisker, deflect
     from vibrissa.cameras import orthogonal_views
     from vibrissa.tracking import BasePose, HeadPose, Trace, TraceSeries
     from vibrissa.tracking.refine.fit import Fitter
@@ -114,8 +114,16 @@ def test_friction_is_found_in_the_shape(share):
     touching = np.ones(9, dtype=bool)
     series, head = TraceSeries.of(traces), HeadPose.still(9)
     fitter = Fitter(pair, series, touching, curves, 1000.0, FitOptions(), head)
-    found = fitter.fit(whisker, pose, 65)
+    found = fitter.fit(whisker, pose, 65, unsure=0.5e-3)
     np.testing.assert_allclose(found.arc_length, s, atol=100e-6)
+    if share == 0.0:
+        # A whisker that is longer by that is thicker: it pushes back more at the same points.
+        ahead = whisker.length / (whisker.length + 0.5e-3)
+        thicker = whisker.with_properties(radius=lambda s: whisker.radius(ahead * s))
+        pushed = deflect(thicker, PointContact(bent.contact_point))
+        more = np.concatenate([pushed.force - bent.force, pushed.moment - bent.moment], axis=1)
+        size = np.abs(more).max(axis=0, keepdims=True)
+        assert (np.abs(found.shared[:, -1, 9:] - more) < 0.1 * size.max()).all()
     # Friction along a hardly bent whisker hardly shows, and the covariance says so.
     error = found.force - bent.force
     sigma = np.sqrt(np.einsum("tii->ti", found.wrench_covariance[:, :3, :3]))

@@ -41,6 +41,7 @@ _SQUARE = ("time", "space", "space_2")
 _KEPT = (
     "contact_point",
     "contact_covariance",
+    "contact_shared",
     "contact_normal",
     "normal_covariance",
     "point_normal_covariance",
@@ -153,6 +154,8 @@ def estimates_of(
     if noise is None and data.attrs.get("source") == "sensor" and sensor_noise(data) is None:
         raise ValueError("the sensor's noise is not known: give the covariance of (F, M) as noise")
     parts = []
+    tracked = Recording(recording)
+    shaped = data.attrs.get("source") == "sensor" and "wrench_shared" in tracked.root
     for k, whisker in enumerate(whiskers):
         report("contact points", k, count)
         one = Group(data).whisker(k).data
@@ -179,7 +182,11 @@ def estimates_of(
             found = locate(
                 contact_map, wrench, names, noise=sigma, method=method, friction=friction, **how
             )
-        parts.append(_one_whisker(one, found, other_noise=noise is not None))
+        shared = None
+        if shaped:
+            same = np.isclose(whisker.length, tracked.whisker(k).length)
+            shared = np.nan_to_num(tracked.root["wrench_shared"][:, k]) * same
+        parts.append(_one_whisker(one, found, shared, other_noise=noise is not None))
         report("contact points", k + 1, count)
     out = xr.concat(parts, "whisker").transpose("time", "whisker", ...)
     about: dict[str, Any] = {
@@ -200,7 +207,9 @@ def estimates_of(
     return out.assign_coords({n: data[n].variable for n in ("time", "whisker", "space")})
 
 
-def _one_whisker(signals: xr.Dataset, found: xr.Dataset, *, other_noise: bool) -> xr.Dataset:
+def _one_whisker(
+    signals: xr.Dataset, found: xr.Dataset, shared: Array | None, *, other_noise: bool
+) -> xr.Dataset:
     """Contacts of one whisker in the laboratory, with the status of frames without signals."""
     known = Group(signals)
     names = ("pose_covariance", "pose_wrench_covariance")
@@ -208,7 +217,9 @@ def _one_whisker(signals: xr.Dataset, found: xr.Dataset, *, other_noise: bool) -
     if other_noise:
         # The noise is that of another instrument, without correlation with the pose.
         pose.pop("pose_wrench_covariance", None)
-    placed = in_laboratory(found, known["base_rotation"], known["base_position"], **pose)
+    placed = in_laboratory(
+        found, known["base_rotation"], known["base_position"], **pose, wrench_shared=shared
+    )
     own = signals["status"].values
     status = np.where(is_ok(own), placed["status"].values, own).astype(np.int8)
     placed["status"] = placed["status"].copy(data=status)
@@ -221,8 +232,13 @@ def in_laboratory(
     base_position: ArrayLike,
     pose_covariance: ArrayLike | None = None,
     pose_wrench_covariance: ArrayLike | None = None,
+    wrench_shared: Array | None = None,
 ) -> xr.Dataset:
-    """Contacts in the laboratory, chosen among candidates by continuity there."""
+    """Contacts in the laboratory, chosen among candidates by continuity there.
+
+    Errors of the whisker's shape move them as the force and moment (time, error, 6) would that they
+    add to those of the same contact point.
+    """
     rotation, position = np.asarray(base_rotation), np.asarray(base_position)
     points = contacts["candidate_points"].values
     lab = to_laboratory(points, rotation[:, None], position[:, None])
@@ -244,9 +260,18 @@ def in_laboratory(
     normal = _chosen(contacts["candidate_normal"], chosen).values
     normal = np.einsum("tij,tj->ti", rotation, normal)
     gain = _chosen(contacts["candidate_gain"], chosen).values
+    wrench = contacts["wrench_covariance"].values
+    if wrench_shared is not None:
+        wrench = wrench + np.einsum("tei,tej->tij", wrench_shared, wrench_shared)
+        moved = -np.einsum("tij,tej->tei", gain[:, :3], wrench_shared)
+        own = kept["covariance"]
+        kept["covariance"] = own.copy(data=own + np.einsum("tei,tej->tij", moved, moved))
+        moved = np.einsum("tij,tej->tei", rotation, moved)
+        about = attributes("contact_shared") | _LABORATORY
+        kept["contact_shared"] = xr.DataArray(moved, dims=("time", "error", "space"), attrs=about)
     spread = _laboratory_covariance(
         gain,
-        contacts["wrench_covariance"].values,
+        wrench,
         rotation,
         placed - position,
         normal,

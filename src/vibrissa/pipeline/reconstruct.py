@@ -161,6 +161,8 @@ def _moved_together(recording: xr.DataTree, estimates: xr.Dataset) -> Iterator[x
             if estimates.attrs.get("source") == "sensor":
                 arm = point - root["base_position"]
                 moved = pose[..., :3] + np.cross(pose[..., 3:], arm)
+                if "contact_shared" in found:
+                    moved = moved + np.nan_to_num(found["contact_shared"][:, :, k])
         yield estimates.assign(
             contact_point=((*EACH, "space"), point + moved),
             contact_normal=((*EACH, "space"), normal + turned),

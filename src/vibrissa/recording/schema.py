@@ -95,7 +95,7 @@ VARIABLES: Mapping[str, RecordedVariable] = MappingProxyType(
         "contact_point": RecordedVariable(_VECTOR, ("", "truth", "measured", "estimates"), _LAB),
         "contact_point_whisker": RecordedVariable(_VECTOR, ("", "truth", "estimates"), _WHISKER),
         "contact_covariance": RecordedVariable(_SQUARE, ("", "estimates"), _LAB),
-        "contact_shared": RecordedVariable((*_EACH, "error", "space"), _TOP, _LAB),
+        "contact_shared": RecordedVariable((*_EACH, "error", "space"), ("", "estimates"), _LAB),
         "covariance": RecordedVariable(_SQUARE, _ESTIMATES, _WHISKER),
         "contact_normal": RecordedVariable(_VECTOR, _ESTIMATES, _LAB),
         "normal_covariance": RecordedVariable(_SQUARE, _ESTIMATES, _LAB),
@@ -124,6 +124,7 @@ VARIABLES: Mapping[str, RecordedVariable] = MappingProxyType(
         "wrench_covariance": RecordedVariable(
             (*_EACH, "component", "component_"), ("", "signals"), _WHISKER
         ),
+        "wrench_shared": RecordedVariable((*_EACH, "error", "component"), _TOP, _WHISKER),
         "pose_wrench_covariance": RecordedVariable((*_EACH, "pose", "component_"), ("", "signals")),
         "reading": RecordedVariable((*_EACH, "channel"), _TOP),
         "mixing": RecordedVariable(("channel", "component"), _TOP),

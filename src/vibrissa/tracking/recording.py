@@ -50,7 +50,7 @@ class Tracked:
     head : HeadPose
         Pose of the head in these frames.
     length : Length
-        Length of the whisker; its standard deviation is 0 where its tip is seen or it is given.
+        Length of the whisker; its standard deviation is 0 where it is given.
     contacts : ContactPoints, optional
         Contact points that do not come from the rod.
     """
@@ -134,7 +134,8 @@ def _variables(one: Tracked, errors: int) -> xr.Dataset:
         "status": status,
         "contact_covariance": fit.contact_covariance,
         "contact_shared": shared[..., :3],
-        "pose_shared": shared[..., 3:],
+        "pose_shared": shared[..., 3:9],
+        "wrench_shared": shared[..., 9:],
         "wrench_covariance": fit.wrench_covariance,
         "pose_covariance": fit.pose_covariance,
         "pose_wrench_covariance": fit.pose_wrench_covariance,

@@ -22,7 +22,7 @@ from vibrissa.objects import Surface
 from vibrissa.recording import ONE_VIEW
 from vibrissa.tracking.contact_points import contacts_at, given_contacts, outside_video
 from vibrissa.tracking.recording import Tracked, tracked_recording
-from vibrissa.tracking.refine.fit import FitOptions, Fitter, RodFit, with_length_unsure
+from vibrissa.tracking.refine.fit import FitOptions, Fitter, RodFit
 from vibrissa.tracking.refine.optics import Optics, rough_optics, stated_lenses
 from vibrissa.tracking.refine.rods import rolled
 from vibrissa.tracking.refine.trace_series import TraceSeries
@@ -36,6 +36,7 @@ from vibrissa.tracking.space.rest_shape import (
     lengthened,
     likeliest_length,
     rest_shape,
+    seen_length,
     whisker_at_rest,
 )
 from vibrissa.tracking.trace.start import base_gap
@@ -56,9 +57,6 @@ _ANY_ROLL = np.radians(10.0)
 
 _FEWEST, _FRAMES = 8, 24
 """Smallest and largest number of frames in contact from which a length is taken."""
-
-_LONGER = 2.0
-"""Standard deviations by which another length differs, to see what depends on it."""
 
 _NEAR, _FAR = 2.0, 10.0
 """Distances, in pixels, between bases in several views: more than usual; not the same base."""
@@ -260,7 +258,7 @@ def _with_optics_unsure(fit: RodFit, optics: Optics) -> RodFit:
     """Add to the covariances of points what is not known of the cameras."""
     moved = [optics.displacements(points) for points in (fit.contact_point, fit.position)]
     contact, base = moved
-    shared = np.concatenate([*moved, np.zeros_like(base)], axis=2)
+    shared = np.pad(np.concatenate(moved, axis=2), ((0, 0), (0, 0), (0, 9)))
     pose = fit.pose_covariance.copy()
     pose[:, :3, :3] += np.einsum("vti,vtj->tij", base, base)
     return replace(
@@ -355,18 +353,14 @@ def track_whisker(
         smoothness = replace(smoothness, roll=max(smoothness.roll, _ANY_ROLL))
     fitter = Fitter(cameras, series, touching, on_head, rate, smoothness, head, objects)
     length = Length(whisker.length, 0.0)
-    if options.whisker is None and not shape.whole:
+    if options.whisker is None and shape.whole:
+        length = seen_length(on_head[shape.free & tips], series.line)
+    elif options.whisker is None:
         length = _length(fitter, shape, options)
         shape = lengthened(shape, length.value)
         whisker = whisker_at_rest(shape, name, **options.at_base)
     unfiltered, pose = _poses(fitter, shape, whisker, options)
-    fit = fitter.fit(whisker, pose, on_head.shape[1])
-    if length.sigma > 0.0:
-        longer = lengthened(shape, length.value + _LONGER * length.sigma)
-        other = whisker_at_rest(longer, name, **options.at_base)
-        posed = _poses(fitter, longer, other, options)[1]
-        further = fitter.fit(other, posed, on_head.shape[1])
-        fit = with_length_unsure(fit, further, 1.0 / _LONGER)
+    fit = fitter.fit(whisker, pose, on_head.shape[1], length.sigma)
     report(f"contact of {name}", 2, 2)
     covariance = np.array([curve.covariance for curve in curves])
     return Tracked(
@@ -480,7 +474,7 @@ def remarks_on(
             f"{1e3 * length.value:.1f} mm at least, and contacts are wrong if it is more: give "
             "--whisker."
         )
-    elif length.sigma > 0.0:
+    elif length.sigma > 0.0 and not length.seen:
         found.append(
             f"{name}: its tip is too faint to be seen, or outside of the image; as it bends it is "
             f"{1e3 * length.value:.1f} ± {1e3 * length.sigma:.1f} mm long, which is counted in all "

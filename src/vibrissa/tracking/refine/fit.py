@@ -73,8 +73,12 @@ axis of the whisker's frame, pixels, if residuals show no more; and its share of
 _PROXIMAL = 0.7
 """Share of the whisker that determines the roll of its frame."""
 
-_ENDS = 1.0
-"""Standard deviation of ends along the whisker, in units of that in one frame."""
+_ENDS = (1.5, 1.0)
+"""Standard deviation of base and tip along the whisker, in units of that in one frame: fur over a
+base draws it by a pixel or two."""
+
+_FREE = [0, 2, 3]
+"""Unknowns of a contact without friction: arc length and the force across the whisker."""
 
 _WILD = 1e6
 """Slopes of points of a rod, in units of L, from which it is not in balance."""
@@ -135,10 +139,11 @@ class RodFit:
         Contact point in the whisker's and in the laboratory frame, m.
     contact_covariance : array (time, 3, 3)
         Covariance of the contact point in the laboratory, m².
-    shared : array (time, error, 9)
+    shared : array (time, error, 15)
         Shifts of the contact point and of the base, m, and turns of the base, rad, laboratory
         axes, by errors that all frames share: each by one standard deviation of one error, which is
-        independent of the others. They are part of the covariances.
+        independent of the others. They are part of the covariances. Then changes of force and
+        moment of the same contact, whisker's frame, which errors of the whisker's shape make.
     force, moment : array (time, 3)
         Force and moment at the base, whisker's frame, N and N·m; 0 without contact.
     wrench_covariance : array (time, 6, 6)
@@ -182,11 +187,10 @@ class Fitter:
     head: HeadPose
     objects: Sequence[Surface] = ()
 
-    def fit(self, whisker: Whisker, pose: BasePose, nodes: int) -> RodFit:
-        """Fit a whisker of an approximate pose."""
-        problem = self._problem(whisker, pose)
-        _, state, linear = problem.trusted()
-        found = _answer(problem, state, linear, nodes)
+    def fit(self, whisker: Whisker, pose: BasePose, nodes: int, unsure: float = 0.0) -> RodFit:
+        """Fit a whisker of an approximate pose, whose length has a standard deviation, m."""
+        problem, state, linear = self._problem(whisker, pose).trusted()
+        found = _answer(problem, state, linear, nodes, unsure)
         return _whole(_in_laboratory(found, problem.head), problem.frames, len(self.curves))
 
     def costs(self) -> Callable[[Whisker, BasePose], float]:
@@ -431,7 +435,7 @@ def _shared(fit: _Linear) -> Array:
         for end in (0, 1):
             counts = weight[:, end - 2] > 0.0
             miss = float(ends[counts, end].mean()) if counts.any() else 0.0
-            pulls.append(design[:, end - 2] * np.hypot(_ENDS, miss))
+            pulls.append(design[:, end - 2] * np.hypot(_ENDS[end], miss))
     return fit.smoother.responses(np.array(pulls))
 
 
@@ -460,47 +464,85 @@ def _frame_turns(problem: Problem, state: State, fit: _Linear) -> Array:
     return np.array([[0.0, 0.0, lean], [roll, lean, 0.0]])
 
 
-def _answer(problem: Problem, state: State, fit: _Linear, nodes: int) -> RodFit:
+def _contacts(problem: Problem, state: State) -> tuple[Array, Array]:
+    """Contact points (t, 3), m, and force and moment (t, 6), whisker's frame."""
+    values, _ = solve_forces(problem.d, state.contact)
+    force, point = values[:, :3], values[:, 3:]
+    moment = np.cross(point, force) * problem.d.moment
+    return point * problem.d.length, np.concatenate([force * problem.d.force, moment], axis=1)
+
+
+def _by_length(
+    problem: Problem, state: State, unsure: float, by_contact: Array, slope: Array
+) -> tuple[Array, Array]:
+    """Shared changes (t, 15) if the whisker is longer by a standard deviation, and of the wrench.
+
+    It is then thicker, as it tapers over more: all that a longer tip does to a contact before it.
+    """
+    whisker, length = problem.whisker, problem.whisker.length
+    share = length / (length + unsure)
+    thicker = whisker.with_properties(radius=lambda s: whisker.radius(share * s))
+    other = replace(problem, whisker=thicker, d=discretize(thicker), begun=state)
+    after = other.solved()[0]
+    point, wrench = _contacts(problem, state)
+    moved, changed = _contacts(other, after)
+    turn = Rotation.from_matrix(after.rotation @ np.swapaxes(state.rotation, 1, 2)).as_rotvec()
+    shift = (after.position - state.position) * length
+    contact = np.einsum("tij,tj->ti", after.rotation, moved) + shift
+    contact -= np.einsum("tij,tj->ti", state.rotation, point)
+    beside, alike = _contacts(other, state)
+    # Back to the same contact point, without friction of its own.
+    back = by_contact[..., _FREE] @ np.linalg.pinv(slope[:, 3:, _FREE] * length)
+    same = alike - wrench - np.einsum("tij,tj->ti", back, beside - point)
+    return np.concatenate([contact, shift, turn, same], axis=1), changed - wrench
+
+
+def _answer(problem: Problem, state: State, fit: _Linear, nodes: int, unsure: float) -> RodFit:
     """Results in SI units, relative to the head."""
     d, touching = problem.d, problem.touching
     shared, misfit = _shared(fit), fit.misfit
     covariance = fit.smoother.covariances() + np.einsum("kti,ktj->tij", shared, shared)
     turned, slopes, slope = contact_slopes(d, state)
-    values, _ = solve_forces(d, state.contact)
-    force, point = values[:, :3], values[:, 3:]
-    wrench = np.concatenate([force * d.force, np.cross(point, force) * d.moment], axis=1)
+    point, wrench = _contacts(problem, state)
+    force = wrench[:, :3] / d.force
     moment_slope = np.cross(slope[:, 3:], force[:, :, None], axis=1)
-    moment_slope += np.cross(point[:, :, None], slope[:, :3], axis=1)
+    moment_slope += np.cross(point[:, :, None] / d.length, slope[:, :3], axis=1)
     by_contact = np.concatenate([slope[:, :3] * d.force, moment_slope * d.moment], axis=1)
     inside = covariance[:, 6:, 6:]
     size = np.repeat([d.length, 1.0], 3)
     held = covariance[:, :6, :6] * np.outer(size, size)
     both = covariance[:, :6, 6:] * size[:, None] @ np.swapaxes(by_contact, 1, 2)
+    none = np.where(touching, 1.0, np.nan)[:, None, None]
+    moved = np.einsum("tij,ktj->tki", slopes, shared) * d.length
+    moved = np.concatenate([moved, shared.swapaxes(0, 1)[..., :6] * size], axis=2)
+    moved = np.pad(moved, ((0, 0), (0, 0), (0, 6)))
     # An error of the whisker's frame turns force and moment in it the other way.
     turns = _frame_turns(problem, state, fit)
-    framed = np.pad(np.einsum("tij,kj->tki", state.rotation, turns), ((0, 0), (0, 0), (6, 0)))
+    framed = np.pad(np.einsum("tij,kj->tki", state.rotation, turns), ((0, 0), (0, 0), (6, 6)))
     against = [np.cross(vector[:, None], turns) for vector in (wrench[:, :3], wrench[:, 3:])]
     aside = np.concatenate(against, axis=2)
-    held = held + np.einsum("tki,tkj->tij", framed[..., 3:], framed[..., 3:])
-    both = both + np.einsum("tki,tkj->tij", framed[..., 3:], aside)
-    line = rods(d, state.contact, np.linspace(0.0, 1.0, nodes))
-    line = np.einsum("tij,tnj->tni", state.rotation, line) + state.position[:, None]
-    none = np.where(touching, 1.0, np.nan)
-    spread = slopes @ covariance @ np.swapaxes(slopes, 1, 2)
-    moved = np.einsum("tij,ktj->tki", slopes, shared)
+    if unsure > 0.0:
+        by_length, changed = _by_length(problem, state, unsure, by_contact, slope)
+        framed = np.append(framed, by_length[:, None], axis=1)
+        aside = np.append(aside, changed[:, None], axis=1)
+    held = held + np.einsum("tki,tkj->tij", framed[..., 3:9], framed[..., 3:9])
+    both = both + np.einsum("tki,tkj->tij", framed[..., 3:9], aside)
+    spread = slopes @ covariance @ np.swapaxes(slopes, 1, 2) * d.length**2
+    spread += np.einsum("tki,tkj->tij", framed[..., :3], framed[..., :3])
     wrench_spread = by_contact @ inside @ np.swapaxes(by_contact, 1, 2)
     wrench_spread += np.einsum("tki,tkj->tij", aside, aside)
-    moved = np.concatenate(
-        [moved * (d.length * none[:, None, None]), shared.swapaxes(0, 1)[..., :6] * size], axis=2
-    )
+    line = rods(d, state.contact, np.linspace(0.0, 1.0, nodes))
+    line = np.einsum("tij,tnj->tni", state.rotation, line) + state.position[:, None]
+    shared = np.concatenate([moved, framed], axis=1)
+    shared[..., [0, 1, 2, *range(9, 15)]] *= none
     return RodFit(
         rotation=state.rotation,
         position=state.position * d.length,
-        arc_length=state.contact[:, 0] * d.length * none,
-        contact_point_whisker=point * d.length * none[:, None],
-        contact_point=(turned + state.position) * d.length * none[:, None],
-        contact_covariance=spread * (d.length**2 * none[:, None, None]),
-        shared=np.concatenate([moved, framed], axis=1),
+        arc_length=state.contact[:, 0] * d.length * none[:, 0, 0],
+        contact_point_whisker=point * none[:, 0],
+        contact_point=(turned + state.position) * d.length * none[:, 0],
+        contact_covariance=spread * none,
+        shared=shared,
         force=wrench[:, :3] * touching[:, None],
         moment=wrench[:, 3:] * touching[:, None],
         wrench_covariance=wrench_spread * touching[:, None, None],
@@ -516,14 +558,15 @@ def _in_laboratory(found: RodFit, head: HeadPose) -> RodFit:
     turn = head.rotation
     both = np.zeros((len(turn), 6, 6))
     both[:, :3, :3] = both[:, 3:, 3:] = turn
-    parts = found.shared.reshape(*found.shared.shape[:2], 3, 3)
+    parts = found.shared[..., :9].reshape(*found.shared.shape[:2], 3, 3)
+    moved = np.einsum("tij,tevj->tevi", turn, parts).reshape(*found.shared.shape[:2], 9)
     return replace(
         found,
         rotation=turn @ found.rotation,
         position=head.put_in(found.position),
         contact_point=head.put_in(found.contact_point),
         contact_covariance=turn @ found.contact_covariance @ np.swapaxes(turn, 1, 2),
-        shared=np.einsum("tij,tevj->tevi", turn, parts).reshape(found.shared.shape),
+        shared=np.concatenate([moved, found.shared[..., 9:]], axis=2),
         pose_covariance=both @ found.pose_covariance @ np.swapaxes(both, 1, 2),
         pose_wrench_covariance=both @ found.pose_wrench_covariance,
         centerline=head.put_in(found.centerline),
@@ -538,24 +581,3 @@ def _whole(found: RodFit, frames: NDArray[np.intp], count: int) -> RodFit:
         whole[name] = np.full((count, *values.shape[1:]), np.nan)
         whole[name][frames] = values
     return RodFit(**whole)
-
-
-def with_length_unsure(found: RodFit, other: RodFit, share: float) -> RodFit:
-    """Add to all covariances that of the length, a share of which another fit differs by."""
-    point = share * (other.contact_point - found.contact_point)
-    turn = np.full_like(found.position, np.nan)
-    known = np.isfinite(found.rotation).all(axis=(1, 2)) & np.isfinite(other.rotation).all((1, 2))
-    apart = other.rotation[known] @ np.swapaxes(found.rotation[known], 1, 2)
-    turn[known] = Rotation.from_matrix(apart).as_rotvec()
-    pose = share * np.concatenate([other.position - found.position, turn], axis=1)
-    wrench = share * np.concatenate(
-        [other.force - found.force, other.moment - found.moment], axis=1
-    )
-    return replace(
-        found,
-        contact_covariance=found.contact_covariance + point[:, :, None] * point[:, None],
-        shared=np.append(found.shared, np.append(point, pose, axis=1)[:, None], axis=1),
-        pose_covariance=found.pose_covariance + pose[:, :, None] * pose[:, None],
-        wrench_covariance=found.wrench_covariance + wrench[:, :, None] * wrench[:, None],
-        pose_wrench_covariance=found.pose_wrench_covariance + pose[:, :, None] * wrench[:, None],
-    )

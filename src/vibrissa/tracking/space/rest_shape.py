@@ -65,9 +65,12 @@ _ROUNDS = 4
 _STEP, _LONGEST = 0.03, 1.45
 """Step and largest value of the lengths that are tried, as a share of what is seen."""
 
-_CERTAIN = 0.015
+_CERTAIN = 0.025
 """Smallest standard deviation of a length that bending shows, as a share: errors of traces, and of
 the taper, that all frames share."""
+
+_ENDED = 0.7
+"""Standard deviation of a seen length by where its tip is seen, pixels."""
 
 _OUTER = 0.4
 """Share of the shape that determines how it continues."""
@@ -344,10 +347,20 @@ def _moved(shapes: Array, rotation: Array, shift: Array) -> Array:
 
 
 class Length(NamedTuple):
-    """Length of a whisker, m, and its standard deviation: 0 if it is seen, NaN if unknown."""
+    """Length of a whisker, m, its standard deviation, NaN if unknown, and whether it is seen."""
 
     value: float
     sigma: float
+    seen: bool = False
+
+
+def seen_length(curves: Array, lines: Array) -> Length:
+    """Length of whiskers that are seen to end, of which lines in the images have the pixels."""
+    lengths = np.linalg.norm(np.diff(curves, axis=1), axis=2).sum(axis=1)
+    pixels = np.linalg.norm(np.diff(lines, axis=2), axis=3).sum(axis=2)
+    low, value, high = np.percentile(lengths, [16.0, 50.0, 84.0])
+    sigma = np.hypot(_ENDED * value / np.nanpercentile(pixels, 95.0), 0.5 * (high - low))
+    return Length(float(value), float(sigma), seen=True)
 
 
 def lengthened(shape: RestShape, length: float) -> RestShape:

@@ -451,10 +451,12 @@ def test_an_unknown_length_of_the_whisker_is_in_contacts_by_a_sensor(trial, quie
     np.testing.assert_allclose(
         more.values[rows, 0][fine], stated[fine, :, None] * stated[fine, None], atol=1e-12
     )
-    wider, alone = (
-        reconstruct(with_group(known, "estimates", one))["parameter_covariance"].values
-        for one in (before, before.drop_vars("contact_shared"))
+    alone = before.drop_vars("contact_shared")
+    aside = alone.assign(contact_point=before["contact_point"] + before["contact_shared"][:, :, 0])
+    wider, less, other = (
+        reconstruct(with_group(known, "estimates", one)) for one in (before, alone, aside)
     )
-    added = np.linalg.eigvalsh(wider - alone)
-    assert added[0] > -1e-9 * added[-1]
-    assert wider[6, 6] > 1.1 * alone[6, 6]
+    added = wider["parameter_covariance"].values - less["parameter_covariance"].values
+    apart = float(other["object_radius"] - less["object_radius"])
+    assert abs(apart) > 5e-6
+    assert added[6, 6] == pytest.approx(apart**2, rel=1e-2)

@@ -490,10 +490,10 @@ def _by_length(
     shift = (after.position - state.position) * length
     contact = np.einsum("tij,tj->ti", after.rotation, moved) + shift
     contact -= np.einsum("tij,tj->ti", state.rotation, point)
-    beside, alike = _contacts(other, state)
+    moved_by, alike = _contacts(other, state)
     # Back to the same contact point, without friction of its own.
     back = by_contact[..., _FREE] @ np.linalg.pinv(slope[:, 3:, _FREE] * length)
-    same = alike - wrench - np.einsum("tij,tj->ti", back, beside - point)
+    same = alike - wrench - np.einsum("tij,tj->ti", back, moved_by - point)
     return np.concatenate([contact, shift, turn, same], axis=1), changed - wrench
 
 

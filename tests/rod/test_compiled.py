@@ -177,7 +177,7 @@ def test_a_damaged_cache_counts_as_none(square):
     assert call().stdout == "2\n"
     files = sorted(folder.rglob("*.nb?"), reverse=True)
     assert [file.suffix for file in files] == [".nbi", ".nbc", ".nbc"]
-    for file, kept in zip(files, (0, 1, 1), strict=True):
+    for file, kept in zip(files[:2], (0, 1), strict=True):
         content = file.read_bytes()
         middle = len(content) // 2
         flipped = content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]

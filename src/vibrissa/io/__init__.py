@@ -11,13 +11,17 @@ from vibrissa.io.anipose import (
     read_calibration as read_calibration,
     write_calibration as write_calibration,
 )
-from vibrissa.io.clicks import (
+from vibrissa.io.annotations import (
     Clicks as Clicks,
     Points as Points,
     ViewClicks as ViewClicks,
     load_clicks as load_clicks,
+    load_contact_points,
+    load_corrections,
+    load_head,
     polygon_of as polygon_of,
     save_clicks as save_clicks,
+    save_corrections,
     together as together,
 )
 from vibrissa.io.kinds import READERS as READERS, Kind, load_tracks, recognise
@@ -105,12 +109,6 @@ from vibrissa.io.video import (
     video_info,
     write_movie,
     write_video,
-)
-from vibrissa.io.video_tables import (
-    load_contact_points,
-    load_corrections,
-    load_head,
-    save_corrections,
 )
 from vibrissa.io.whisk import load_whiskers
 from vibrissa.io.whiskers import (

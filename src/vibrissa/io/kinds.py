@@ -17,6 +17,7 @@ import h5py
 
 from vibrissa.deferred import xr
 from vibrissa.io.anipose import read_anipose
+from vibrissa.io.annotations import ANGLES, CORRECTION_COLUMNS, MATRIX, QUATERNION
 from vibrissa.io.keypoints import (
     pandas_tables,
     read_deeplabcut,
@@ -30,7 +31,6 @@ from vibrissa.io.nwb import read_nwb
 from vibrissa.io.paths import check_readable, without_part
 from vibrissa.io.table import read_text, signal_column, table_rows
 from vibrissa.io.tracks import Labels, RawTracks, labelled, load_own_tracks, read_tracks_table
-from vibrissa.io.video_tables import ANGLES, CORRECTION_COLUMNS, MATRIX, QUATERNION
 from vibrissa.io.whisk import MEASUREMENTS, WHISKERS, read_measurements, read_whiskers
 
 

@@ -5,7 +5,7 @@ from vibrissa.pipeline.estimates import (
     contact_columns as contact_columns,
     estimates_of,
     in_laboratory as in_laboratory,
-    swept_recording as swept_recording,
+    swept_recording,
 )
 from vibrissa.pipeline.frames import (
     check_recording as check_recording,
@@ -63,6 +63,7 @@ __all__ = [
     "predictors",
     "reconstruct",
     "signals_of",
+    "swept_recording",
     "with_contour",
     "with_estimates",
     "with_signals",

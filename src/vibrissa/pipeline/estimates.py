@@ -322,7 +322,23 @@ def _laboratory_covariance(
 def swept_recording(
     sensor: SuspendedWhisker, sweep: StageSweep, found: SweptContacts
 ) -> xr.DataTree:
-    """Recording of a sweep with a suspended whisker, with its contacts as estimates."""
+    """Recording of a sweep with a suspended whisker, with its contacts as estimates.
+
+    Parameters
+    ----------
+    sensor : SuspendedWhisker
+        Calibrated sensor.
+    sweep : StageSweep
+        Readings and poses of the sensor.
+    found : SweptContacts
+        Contacts of the sweep, of `follow_sweep`.
+
+    Returns
+    -------
+    xarray.DataTree
+        Recording with a group ``estimates``, and the errors that contacts share; its time is the
+        number of the sample. `reconstruct` fits an object to it.
+    """
     pose, n, on = sensor.whisker.pose, len(found.points), found.in_contact
     held = {
         "in_contact": on,

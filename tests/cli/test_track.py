@@ -304,3 +304,20 @@ def test_views_that_cannot_be_are_refused(videos, tmp_path, view):
     done = run("track", videos / "top.mkv", "--views", view, "-o", tmp_path / "t.nc")
     assert done.exit_code != 0
     assert "COLUMN,ROW,WIDTH,HEIGHT" in str(done.exception)
+
+
+def test_a_whisker_that_is_often_lost_is_in_doubt_with_a_picture(videos, tmp_path):
+    """The front view shows no whisker in every third frame."""
+    frames = list(read_video(videos / "front.mkv"))
+    light = np.full_like(frames[0], np.percentile(frames[0], 80))
+    shown = [light if i % 3 == 2 else frame for i, frame in enumerate(frames)]
+    write_video(tmp_path / "front.mkv", shown)
+    words = ["track", videos / "top.mkv", tmp_path / "front.mkv", "-o", tmp_path / "t.nc"]
+    bases = [f"{x:.0f},{y:.0f}" for x, y in (c.project(np.zeros(3)) for c in CAMERAS)]
+    given = [word for base in bases for word in ("--base", base)]
+    done = run(*words, "--cameras", videos / "cameras.toml", *given)
+    assert done.exit_code == 0, done.exception
+    line = " ".join(done.stdout.split())
+    assert "not sure: in 5 of 16 frames front loses whisker 0" in line
+    assert "doubt.png" in line
+    assert (tmp_path / "doubt.png").exists()

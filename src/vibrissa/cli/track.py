@@ -387,6 +387,7 @@ def _track(
             )
             for view, path in enumerate(videos)
         ]
+        _show_doubt(videos, cameras, traces, picture.with_name(picture.name[:-9] + "doubt.png"))
         result = vb.tracking.track(cameras, traces, rate, how, progress=tell, **known)
     _compare_lengths(videos, traces, result.sizes["time"])
     vb.io.save_recording(recording, result)
@@ -421,6 +422,29 @@ def _found(
         )
     _report_start(start, names, picture)
     return [[base.tolist()] for base in start.bases], replace(options, bright=start.bright)
+
+
+def _show_doubt(
+    videos: Sequence[Path],
+    cameras: Sequence[vb.cameras.Camera],
+    traces: Sequence[Sequence[Sequence[vb.tracking.Trace]]],
+    picture: Path,
+) -> None:
+    """Show a frame in which it is not sure that whiskers are followed, if there is one."""
+    count = min(len(view[0]) for view in traces)
+    rows = [row[:count] for view in traces for row in view]
+    wrong = np.any([vb.tracking.doubtful_frames(row) for row in rows], axis=0)
+    if not wrong.any():
+        return
+    at = int(np.flatnonzero(wrong)[wrong.sum() // 2])
+    images = [next(vb.io.video_frames(video, [at])) for video in videos]
+    names = [f"{camera.name}, frame {at}" for camera in cameras]
+    whiskers = [[row[at] for row in whisker] for whisker in zip(*traces, strict=True)]
+    shown = [([t.line for t in one], max(t.confidence for t in one)) for one in whiskers]
+    why = "not sure: here a whisker is lost, or its length differs much from the frame before"
+    figure = vb.plots.start_views(images, shown, names, [why])
+    vb.plots.save(figure, picture.with_suffix(""), ("png",))
+    say(f"not sure that what is followed is the whisker in every frame: see {picture}")
 
 
 def _calibrated(path: Path, videos: Sequence[Path]) -> tuple[vb.cameras.Camera, ...]:

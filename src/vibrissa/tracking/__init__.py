@@ -28,7 +28,11 @@ from vibrissa.tracking.trace.start import (
     find_start,
     is_bright as is_bright,
 )
-from vibrissa.tracking.trace.trace import Trace, TraceOptions
+from vibrissa.tracking.trace.trace import (
+    Trace,
+    TraceOptions,
+    doubtful_frames as doubtful_frames,
+)
 from vibrissa.tracking.trace.video import (
     partial_traces as partial_traces,
     start_frames,

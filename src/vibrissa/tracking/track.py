@@ -40,7 +40,7 @@ from vibrissa.tracking.space.rest_shape import (
     whisker_at_rest,
 )
 from vibrissa.tracking.trace.start import base_gap
-from vibrissa.tracking.trace.trace import Trace
+from vibrissa.tracking.trace.trace import Trace, doubtful_frames
 from vibrissa.whisker import Pose, Whisker
 
 Progress = Callable[[str, int, int], None]
@@ -197,6 +197,7 @@ def track(
     for k in range(count):
         rows = [[view[k][i] for i in pairs[:, v]] for v, view in enumerate(traces)]
         name = names[k] if names is not None else f"whisker {k}"
+        remarks += _remarks_on_following(cameras, rows, name)
         try:
             one = track_whisker(cameras, rows, rate, options, name, progress, moving, objects)
             if contacts is not None:
@@ -481,6 +482,19 @@ def remarks_on(
             "covariances."
         )
     return found
+
+
+def _remarks_on_following(
+    cameras: Sequence[Camera], rows: Sequence[Sequence[Trace]], name: str
+) -> list[str]:
+    """Views in which a whisker is often lost, or not seen as in the frame before."""
+    counts = [int(doubtful_frames(row).sum()) for row in rows]
+    return [
+        f"not sure: in {count} of {len(row)} frames {camera.name} loses {name}, or sees its length "
+        "jump, as if something else was followed. Compare traces and video (vibrissa correct)."
+        for camera, row, count in zip(cameras, rows, counts, strict=True)
+        if count
+    ]
 
 
 def force_scale_sigma(whisker: Whisker, fur: float) -> float:

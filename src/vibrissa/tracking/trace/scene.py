@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from vibrissa.io import Frame
 from vibrissa.numerics import kernel
 from vibrissa.tracking.trace.clutter import EDGE, STILL, Bits
+from vibrissa.tracking.trace.ridge import noise_level
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -56,8 +57,9 @@ _LARGE = 0.02
 _BESIDE = 10.0
 """Distance from a face up to which a point is taken to be on it, pixels."""
 
-_LINE = 0.06
-"""Share of the light by which a thin line that never moves is darker."""
+_LINE, _FAINT, _NOISES = 0.06, 0.025, 8.0
+"""Share of the light by which a thin line that never moves is darker: less where this many standard
+deviations of the background's noise are less, but no less than the second number."""
 
 _MANY = 15
 """Number of frames from which it is clear what never moves."""
@@ -217,7 +219,9 @@ class Scene:
         shown = np.maximum(self.background, 1.0)
         ground = _doubled(self.ground, shown.shape)
         stands = np.abs(shown / ground - 1.0) > 1.0 - _LIT
-        stands = binary_dilation(stands | (self.light / shown - 1.0 > _LINE), iterations=_BLUR)
+        least = _NOISES * noise_level(shown) / float(np.median(self.light))
+        thin = self.light / shown - 1.0 > min(max(least, _FAINT), _LINE)
+        stands = binary_dilation(stands | thin, iterations=_BLUR)
         known = np.where(stands, 0.0, 1.0).astype(np.float32)
         weight, light = (gaussian_filter(one, _AROUND) for one in (known, known * shown))
         open_ = np.where(weight > _ENOUGH, light / np.maximum(weight, 1e-6), ground)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -15,6 +16,10 @@ STEP = 2.0
 
 _DIRECTION = 4
 """Points over which the direction is taken in which a line is prolonged before its start."""
+
+_JUMPS, _OFTEN = 0.3, 0.05
+"""Change of its length from a frame to the next, as a share of the usual one, from which a trace
+may be on something else, and share of the frames in which that may be chance."""
 
 _GIVEN = 0.5
 """Standard deviation of points that a person gives, pixels."""
@@ -99,6 +104,18 @@ class Trace(NamedTuple):
     def support(self) -> float:
         """Length that is seen, pixels."""
         return STEP * float(self.seen.sum())
+
+
+def doubtful_frames(row: Sequence[Trace]) -> Mask:
+    """Frames in which a whisker is lost, or its length jumps; none if they are few."""
+    # What hides a part changes what is seen, what is bridged the whole: both do on another line.
+    lengths = np.array([[trace.length, trace.support] for trace in row]).reshape(-1, 2)
+    lost = lengths[:, 0] == 0.0
+    usual = np.median(lengths[~lost], axis=0) if not lost.all() else np.zeros(2)
+    wrong = lost.copy()
+    jumps = np.abs(np.diff(lengths, axis=0)) > _JUMPS * usual
+    wrong[1:] |= jumps.all(axis=1) & ~lost[:-1]
+    return np.asarray(wrong & (wrong.mean() > _OFTEN))
 
 
 def given(points: ArrayLike) -> Trace:

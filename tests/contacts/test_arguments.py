@@ -44,6 +44,20 @@ def test_a_few_odd_samples_stop_no_table(bent, contact_map):
 def test_swapped_arguments_get_a_hint(bent):
     with pytest.raises(ValueError, match="whisker comes first"):
         vb.deflect(bent.load, bent.whisker)
+    with pytest.raises(ValueError, match="whisker comes first"):
+        vb.estimate_from_wrench(bent.force, bent.moment, bent.whisker)
+    for force, moment in ((bent.moment, bent.force), (1e-3 * bent.force, 1e6 * bent.moment)):
+        with pytest.raises(ValueError, match="force, N, comes before moment"):
+            vb.estimate_from_wrench(bent.whisker, force, moment)
+    with pytest.raises(ValueError, match=r"ContactMap.simulate\(whisker\)"):
+        vb.uniqueness(bent.whisker)
+
+
+def test_millimetres_in_arrays_get_a_hint(bent):
+    with pytest.raises(ValueError, match="millimetres given as metres"):
+        vb.deflect(bent.whisker, vb.PointContact(1e3 * bent.contact_point))
+    mixed = vb.deflect(bent.whisker, vb.PointContact([[24.0, 13.0, 2.0], [24e-3, 13e-3, 2e-3]]))
+    assert vb.status.names(mixed.status).tolist() == ["BEYOND_TIP", "OK"]
 
 
 def test_results_become_datasets_and_pictures(bent, contact_map):

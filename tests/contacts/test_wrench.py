@@ -205,7 +205,7 @@ def test_shapes_and_labels(rng):
 
 def test_bad_input_says_what_is_allowed():
     whisker = WHISKERS["gamma"]
-    f, m = np.ones(3), np.ones(3)
+    f, m = np.ones(3), np.full(3, 0.01)
     with pytest.raises(ValueError, match=r"same shape .* got \(3,\) and \(2, 3\)"):
         vb.estimate_from_wrench(whisker, f, np.ones((2, 3)))
     with pytest.raises(ValueError, match="noise lacks Fy, Fz, My, Mz"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import repeat
 from pathlib import Path
@@ -49,9 +49,15 @@ class TrialOptions:
         """Return the options by their names."""
         return {"--video": self.videos, "--map": self.map, "--which": self.which}
 
+    def of(self, trial: xr.DataTree) -> TrialOptions:
+        """Return the options with the whisker that is most in contact, unless one is chosen."""
+        if self.which is not None:
+            return self
+        return replace(self, which=int(np.argmax(vb.report.contacts_by_whisker(trial))))
+
     @property
     def whisker(self) -> int:
-        """Number of the whisker, the first by default."""
+        """Number of the whisker."""
         return self.which or 0
 
     def contact_map(self, trial: xr.DataTree, tell: Tell) -> vb.ContactMap:
@@ -201,6 +207,7 @@ def trial_drawings(
 ) -> dict[str, Draw]:
     """Return the figures of a trial; what it lacks is printed, with the verb that makes it."""
     trial = vb.load_recording(path)
+    given = given.of(trial)
     course = vb.scene.course_of(trial, given.whisker)
     for reason in _lacking(course, trial, path):
         say(f"{path} has {reason}")

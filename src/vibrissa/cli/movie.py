@@ -85,6 +85,7 @@ def make_movies(
     files = _files(target, path, kinds)
     free(files.values(), force)
     trial = vb.load_recording(path)
+    of_trial = of_trial.of(trial)
     course = vb.scene.course_of(trial, of_trial.whisker)
     rows = frames.rows(course.time)
     possible = _possible(kinds, course, rows, path)

@@ -346,7 +346,10 @@ OPTIONS = {
         "Whether whiskers are bright on dark; by default the first frame decides.",
         names="--bright/--dark",
     ),
-    "which": Option("Number of the whisker in the recording, from 0.", least=0),
+    "which": Option(
+        "Number of the whisker in the recording, from 0; by default that most in contact.",
+        least=0,
+    ),
     "view": Option("Number of the view in the video, from 0."),
     "pattern": Option("Inner corners of the board, along its longer side first: 9x6.", "NxM"),
     "square": Option("Side of a square, mm.", "MM"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -79,9 +78,7 @@ def report(
         if is_trial:
             refuse({"--uniqueness": uniqueness}, f"{path} is a recording")
             trial = vb.load_recording(path)
-            if of_trial.which is None:
-                most = int(np.argmax(vb.report.contacts_by_whisker(trial)))
-                of_trial = replace(of_trial, which=most)
+            of_trial = of_trial.of(trial)
             content = _of_trial(path, trial, of_trial, seed or 0, tell)
         else:
             unused = of_trial.given() | {"--make-movies": make, "--seed": seed}

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -43,9 +43,7 @@ from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod import Discretization, discretize, solve_forces, vanishing_moments
 from vibrissa.signals import Coordinates, labelled_wrench, measured
 from vibrissa.status import Status
-
-if TYPE_CHECKING:
-    from vibrissa.whisker import Whisker
+from vibrissa.whisker import Whisker
 
 #: Steps along the whisker: contact points within 1e-8 L up to loads that slip off.
 STEPS = 192
@@ -59,6 +57,8 @@ _MOST = 4
 _LIKELY = np.deg2rad(20.0)
 # Where the way out from the base ends nowhere: arc lengths to start from.
 _ELSEWHERE = (0.25, 0.5, 0.75, 0.95)
+# Lever arms beyond so many lengths are none: force and moment are swapped, or in other units.
+_LONGEST_ARM = 10.0
 # Seeds whose wrench differs by so many standard deviations are not worth a start, if there are
 # others.
 _FAR = 100.0
@@ -156,8 +156,26 @@ def estimate_from_wrench(
     0.025
     """
     errors = common_errors(stiffness_sigma, gain_sigma, mixing_sigma)
+    if not isinstance(whisker, Whisker):
+        raise ValueError(
+            "the whisker comes first: estimate_from_wrench(whisker, force, moment); got "
+            f"{type(whisker).__name__}"
+        )
     labelled = labelled_wrench(force, moment)
+    _check_order(whisker, *labelled[:2])
     return _located(whisker, labelled, noise, errors, prior, steps, compliance_sigma)
+
+
+def _check_order(whisker: Whisker, force: Array, moment: Array) -> None:
+    """Refuse moments that hardly any contact of the whisker could give their forces."""
+    size, turning = np.linalg.norm(force, axis=-1), np.linalg.norm(moment, axis=-1)
+    known = (size > 0.0) & np.isfinite(turning)
+    arm = float(np.min(turning[known] / size[known])) if known.any() else 0.0
+    if arm > _LONGEST_ARM * whisker.length:
+        raise ValueError(
+            f"the moment is that of a force {arm:.3g} m from the base or farther, of a whisker of "
+            f"{whisker.length:.3g} m: force, N, comes before moment, N·m"
+        )
 
 
 def estimate_components(

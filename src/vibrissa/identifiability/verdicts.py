@@ -190,6 +190,10 @@ def uniqueness(
     >>> str(found.verdict.sel(triplet="Fx MB MD", region="all").item())
     'unique'
     """
+    if not hasattr(contact_map, "chart"):
+        raise ValueError(
+            f"a ContactMap is needed, such as ContactMap.simulate(whisker); got {contact_map!r}"
+        )
     names = TRIPLETS if isinstance(triplets, str) and triplets == "all" else _listed(triplets)
     wanted = REGIONS if isinstance(regions, str) and regions == "all" else _regions(regions)
     if not 0.0 < min_separation < 1.0:

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from vibrissa.numerics import AnyArray, Array, IntArray, check_device
 from vibrissa.rod.chart import PROXIMAL
-from vibrissa.rod.deflection import Deflection, Load, PegContact, PointForce, vectors
+from vibrissa.rod.deflection import Deflection, Load, PegContact, PointContact, PointForce, vectors
 from vibrissa.rod.discretization import MOST_STEPS, STEPS, Bendable, Discretization, discretize
 from vibrissa.rod.gravity import Resting, moved_moments, resting
 from vibrissa.rod.integration import solve_forces
@@ -35,6 +35,8 @@ _FARTHEST = 1e100
 _KEPT = 1e-6
 # What shorter steps may change, relative to the force and to L.
 _SETTLED = 1e-4
+# Contact points in mm that are taken for m are so many lengths away, up to 20 times as many.
+_FAR_AWAY = 100.0
 
 
 def deflect(
@@ -98,6 +100,8 @@ def deflect(
         raise ValueError(
             f"a load is a PointForce, a PointContact or a PegContact; got {type(load).__name__}"
         )
+    if isinstance(load, PointContact):
+        _check_reach(whisker, load)
     check_device(device)
     if device != "cpu" and (isinstance(load, PegContact) or gravity is not None):
         got = type(load).__name__ + (" with gravity" if gravity is not None else "")
@@ -126,6 +130,17 @@ def deflect(
     out = dimensional(whisker, load, solved, steps, moments)
     kept = directions.reshape(*load.shape, 3)
     return replace(out, gravity=kept, _needed=needed)
+
+
+def _check_reach(whisker: Whisker, load: PointContact) -> None:
+    """Refuse contact points that are all as far away as millimetres given as metres."""
+    away = np.abs(np.asarray(load.points, dtype=np.float64)).max(axis=-1)
+    away, far = away[np.isfinite(away)], _FAR_AWAY * whisker.length
+    if away.size and (away > far).all() and (away < 20.0 * far).all():
+        raise ValueError(
+            f"all contact points are {away.min() / whisker.length:.0f} lengths of the whisker from "
+            "its base, or farther: these look like millimetres given as metres; multiply by 1e-3"
+        )
 
 
 def _gravities(gravity: ArrayLike, load: Load) -> Array:

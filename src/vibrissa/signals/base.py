@@ -182,7 +182,8 @@ def measured(
     """
     if not hasattr(signals, "keys"):
         raise ValueError(
-            f"signals must be a dataset or mapping with {', '.join(names)}; got {signals!r}"
+            f"signals must be a dataset or mapping with {', '.join(names)}, as load_signals reads "
+            f"it; got {signals!r}"
         )
     missing = [name for name in names if name not in signals]
     if missing and {"force", "moment"} <= set(map(str, signals)):

@@ -113,7 +113,7 @@ def _report(trial: xr.DataTree) -> None:
         shown(name, float(np.nanmax(np.linalg.norm(truth[name].values, axis=-1))), 3)
         for name in ("force", "moment")
     ]
-    count = begun.sum()
+    count = int(begun.sum())
     say(f"{count} contact{'s' * (count != 1)}, up to {largest[0]} and {largest[1]}")
     if second := int(truth["second_contact"].values.sum()):
         say(

@@ -2,8 +2,9 @@
 
 `python studies/paper.py [FOLDER]` tests the claims for the built-in γ whisker and writes tables to
 the folder (`output/paper` by default); `--page` writes them into `docs/paper.md`, `--quick` takes
-fewer contacts. The γ whisker of the paper is not public: this one has its length, curvature and
-taper, and leaves its plane by 1.5 mm at the tip.
+fewer contacts; with `--whiskers FILES` it asks instead what a fourth signal does for these. The γ
+whisker of the paper is not public: this one has its length, curvature and taper, and leaves its
+plane by 1.5 mm at the tip.
 """
 
 import argparse
@@ -244,12 +245,33 @@ def laws(whisker: vb.Whisker, contacts: dict[str, np.ndarray]) -> str:
     return table(head, rows)
 
 
+def fourth_signal(paths: list[Path]) -> str:
+    """By how much F_T differs between contacts with the same (F_x, M_B, M_D), for whiskers."""
+    rows = []
+    for path in paths:
+        contact_map = vb.ContactMap.simulate(vb.load_whisker(path), grid=False)
+        asked = {"regions": ["all"], "samples": 512, "resolution": False}
+        found = vb.uniqueness(contact_map, ["Fx MB MD"], **asked).isel(triplet=0)
+        cone, differ = float(np.rad2deg(found.critical_cone.item())), []
+        for i in np.flatnonzero(np.isfinite(found.witness_separation.values.ravel())):
+            one = found.expand_dims("triplet").isel(witness=[i])
+            ((_, pair),) = vb.identifiability.witness_pairs(contact_map.whisker, one, ["Fx MB MD"])
+            differ.append(float(np.ptp(pair["FT"].values) / pair["FT"].values.mean()))
+        rows.append([path.stem, f"{cone:.1f}°", f"{min(differ):.3f}" if differ else "–"])
+        print(*rows[-1], flush=True)
+    return table(["whisker", "critical cone ≥", "F_T differs by, least"], rows)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folder", nargs="?", type=Path, default=ROOT / "output" / "paper")
     parser.add_argument("--page", action="store_true", help="write docs/paper.md")
     parser.add_argument("--quick", action="store_true", help="fewer contacts, to try it out")
+    parser.add_argument("--whiskers", nargs="+", type=Path, help="ask about a fourth signal")
     chosen = parser.parse_args()
+    if chosen.whiskers:
+        print(fourth_signal(chosen.whiskers))
+        return
     chosen.folder.mkdir(parents=True, exist_ok=True)
     contact_map = vb.ContactMap.simulate(vb.samples.gamma())
     contacts = grid_contacts(contact_map)

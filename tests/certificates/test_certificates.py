@@ -14,6 +14,7 @@ from vibrissa.certificates import (
     check_certificate,
     checker,
     curved_checker,
+    grid,
     load_certificate,
     outlook,
     prove_witness,
@@ -343,6 +344,24 @@ def test_enclosures_over_boxes_never_miss_a_point(curved, kind, monkeypatch):
                 assert abs(value - form.coef[0, row]) <= spread + 2e-8 * (abs(value) + 1e-3)
                 assert spread <= (300.0 * half + 1e-5) * (abs(value) + 1.0)
             assert (reach <= (300.0 * half + 100.0 * tolerance + 3e-7) * (size + 1.0)).all()
+
+
+def test_enclosures_are_a_few_times_as_wide_as_the_ranges(curved):
+    """On boxes as wide as those that certify, against contacts of the discretised rod."""
+    certificate, rng = prepared(curved, np.deg2rad(2.0)), np.random.default_rng(0)
+    low = rng.random((24, 3)) * [0.64, 3.0, 0.9] + [0.35, 0.05, 0.05]
+    boxes = np.stack([low, low + np.array([0.006, 0.06, 0.03])], axis=-1)
+    found, _ = certificate.evaluate("interior", boxes, list(range(7)))
+    inside = rng.random((24, 64, 3))
+    at = boxes[:, None, :, 0] + np.diff(boxes)[:, None, :, 0] * inside
+    true = grid._conditions(curved, certificate.bounds, *np.moveaxis(at, -1, 0))
+    known = np.isfinite(found).all(axis=(1, 2)) & ~np.isin(0.5, boxes[:, 0])
+    centre, reach = found[..., 0].T[..., None], found[..., 1:].sum(axis=-1).T[..., None]
+    assert known.sum() > 12
+    away = np.abs(true - centre)[:, known]
+    assert (away <= reach[:, known] + 1e-7 * np.abs(centre[:, known])).all()
+    ratio = 2.0 * reach[:, known, 0] / np.ptp(true[:, known], axis=-1)
+    assert (np.median(ratio, axis=1) < 5.0).all()
 
 
 def test_a_box_across_an_end_of_polynomials_is_not_enclosed(curved):

@@ -114,7 +114,9 @@ def course_of(trial: xr.DataTree, whisker: int = 0) -> Course:
         raise ValueError(f"the recording lacks {', '.join(lacking)}")
     found = (Recording(trial).find(name) for name in ("", "signals", "estimates", "truth"))
     nothing = Group(xr.Dataset())
-    root, signals, estimates, truth = ((each or nothing).whisker(whisker) for each in found)
+    root, signals, estimates, truth = (
+        nothing if each is None else each.whisker(whisker) for each in found
+    )
     tracked = "measured" in trial.children
     known = truth.known("contact_point_whisker")
     known_as = "true"

@@ -10,6 +10,7 @@ from vibrissa.status import Status
 from vibrissa.tracking import (
     FitOptions,
     TrackOptions,
+    base_pose,
     rest_shape,
     track,
     whisker_at_rest,
@@ -362,6 +363,30 @@ def test_the_rest_shape_ignores_how_it_is_held():
     whisker = whisker_at_rest(shape)
     expected = 2.0 * 8.0 / (1.0 + (2.0 * 8.0 * 10e-3) ** 2) ** 1.5
     assert whisker.curvature(10e-3)[2] == pytest.approx(expected, rel=0.05)
+
+
+def test_ringing_does_not_roll_the_base():
+    # A curved whisker that whisks, and rings across its plane after each of four releases.
+    rng, time, s = np.random.default_rng(4), np.arange(600) / 1000.0, np.linspace(0.0, 0.04, 81)
+    rest = np.stack([s, 8.0 * s**2, 0.0 * s], axis=1)
+    since = time % 0.15
+    ringing = 3e-3 * np.exp(-since / 0.02) * np.cos(2.0 * np.pi * 55.0 * since)
+    bend = (s / 0.04) ** 2
+    shapes = rest + ringing[:, None, None] * bend[:, None] * [0.0, 0.5, 0.8]
+    azimuth = 0.5 * np.sin(2.0 * np.pi * 5.0 * time)
+    held = base_rotation(azimuth, 0.2 * azimuth, 0.3 * azimuth)
+    noise = 10e-6 * rng.normal(size=(600, 3, 1, 3)) * np.array([1.0, 2.0, 3.0])[:, None, None]
+    smooth = np.polynomial.polynomial.polyvander(s / 0.04, 2)
+    curves = np.einsum("tij,tnj->tni", held, shapes) + np.einsum("nk,tkoi->tni", smooth, noise)
+    shape = rest_shape(curves)
+    whisker = whisker_at_rest(shape)
+    turned = base_pose(curves, shape, whisker).rotation
+    # The whisker's frame turns the rest shape in the frame that it is drawn in by the same always.
+    mean = Rotation.from_matrix(np.swapaxes(held, 1, 2) @ turned).mean()
+    away = (mean.inv() * Rotation.from_matrix(np.swapaxes(held, 1, 2) @ turned)).magnitude()
+    assert np.median(np.rad2deg(away)) < 3.0
+    assert np.quantile(np.rad2deg(away), 0.95) < 10.0
+    assert shape.still.sum() < 0.7 * shape.free.sum()
 
 
 def test_a_whisker_pressed_to_its_mirror_image_is_not_at_rest():

@@ -179,7 +179,7 @@ def base_pose(curves: Array, shape: RestShape, whisker: Whisker) -> BasePose:
     spacing, shapes = aligned_lengths(curves[seen], shape.spacing)
     most = int(_WHOLE * min(curves.shape[1], len(shape.points)))
     known = np.minimum(np.isfinite(shapes[:, :, 0]).sum(axis=1), most)
-    free = shape.free[seen]
+    free = shape.still[seen]
     back = [
         motions(shape.points[None, :n], part[:n]) for n, part in zip(known, shapes, strict=True)
     ]
@@ -208,7 +208,7 @@ def base_pose(curves: Array, shape: RestShape, whisker: Whisker) -> BasePose:
         guess = angles.copy()
         direction = local[~free]
         for _ in range(3):
-            guess[touching, 2] = _roll_like(angles, guess, shape.free)[touching]
+            guess[touching, 2] = _roll_like(angles, guess, shape.still)[touching]
             turned = base_rotation(*guess[touching].T)
             corrected = direction - (turned @ bias - turned[:, :, 0])
             guess[touching, :2] = _azimuth_elevation(corrected)

@@ -7,6 +7,9 @@ A whisker pressed against an object may keep its shape too, but only while its b
 that frames count by how fast it moves; and bent to the mirror image of its rest shape, it is the
 same only when rolled over, which no animal does.
 
+After a release a whisker rings, and is bent by its own mass as much as by a light contact. Where
+free frames deviate unevenly, only the quietest of them give the shape, and poses by it.
+
 A whisker tapers to its tip, so that its length determines how thick it is everywhere, and so how it
 bends where. If its tip is too faint to be seen, or not in the image, then of all lengths that are
 not shorter than what is seen, the one is chosen with which the rod explains the traces in contact
@@ -39,6 +42,14 @@ _FEWEST = 3
 
 _NEAR = 4.0
 """Deviation of a free frame at most, in units of the usual one."""
+
+_UNEVEN, _QUIETEST, _QUIET = 2.5, 0.1, 1.5
+"""A whisker rings where free frames usually deviate by so many times what this share of them does;
+then still ones deviate by at most so many times that."""
+
+_DEEP = 10.0
+"""Depth of the shape from which this is done, in usual deviations: a straight whisker that rings
+is alike where it turns back, too."""
 
 _LONGER = 1.1
 """Length over which a known whisker may be seen, in units of its own."""
@@ -93,6 +104,9 @@ class RestShape:
         Usual deviation of the free frames, m.
     whole : bool
         Whether it ends at the whisker's tip; if not, its tip is not seen.
+    ringing : array (time,), optional
+        Whether each frame is bent by its own mass, so that its pose is not that of the rest shape;
+        by default none is.
     """
 
     points: Array
@@ -100,6 +114,12 @@ class RestShape:
     deviation: Array
     noise: float
     whole: bool = True
+    ringing: Mask | None = None
+
+    @property
+    def still(self) -> Mask:
+        """Whether each frame is free, and not bent by its own mass."""
+        return self.free if self.ringing is None else self.free & ~self.ringing
 
     @property
     def spacing(self) -> float:
@@ -157,18 +177,30 @@ def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> R
         deviation[whole] = _deviations(part, mean)
         usual = float(np.median(deviation[whole][near]))
         near = deviation[whole] < max(_NEAR * usual, 1e-9)
-    moved = _moved(shapes[whole][near], *motions(part[near], mean))
+    within = _NEAR * float(np.median(deviation[whole][near]))
+    quiet, ringing = near, None
+    uneven = usual > _UNEVEN * np.quantile(deviation[whole][near], _QUIETEST)
+    if uneven and _depth(mean) > _DEEP * usual:
+        for _ in range(_ROUNDS):
+            quiet = near & (
+                deviation[whole] <= _QUIET * np.quantile(deviation[whole][near], _QUIETEST)
+            )
+            mean = np.median(_onto(part[quiet], mean), axis=0)
+            deviation[whole] = _deviations(part, mean)
+        ringing = np.ones(len(curves), dtype=bool)
+        ringing[np.flatnonzero(seen)[whole][quiet]] = False
+    moved = _moved(shapes[whole][quiet], *motions(part[quiet], mean))
     points = np.nanmedian(moved[:, : curves.shape[1]], axis=0)
     # Where less of the whisker is seen, what is seen shows whether it is bent.
     for i in np.flatnonzero(~whole & (known >= _LEAST * compared)):
         n = min(int(known[i]), len(points))
         deviation[i] = _deviations(shapes[i : i + 1, :n], points[:n])[0]
-    noise = float(np.median(deviation[whole][near]))
+    noise = float(np.median(deviation[whole][quiet]))
     out = np.full(len(curves), np.nan)
     out[seen] = np.where(np.isfinite(deviation), deviation, np.nan)
     with np.errstate(invalid="ignore"):
-        free = out < max(_NEAR * noise, 1e-9)
-    return RestShape(points, free, out, noise, ends)
+        free = out < max(within, 1e-9)
+    return RestShape(points, free, out, noise, ends, ringing)
 
 
 def _seen(curves: Array) -> Mask:
@@ -246,6 +278,13 @@ def _deviations(shapes: Array, target: Array, rolled: bool = False) -> Array:
     shift = target.mean(axis=0) - np.einsum("tij,tj->ti", rotation, shapes.mean(axis=1))
     square = ((_moved(shapes, rotation, shift) - target) ** 2).sum(axis=2)
     return np.asarray(np.sqrt(square.mean(axis=1)))
+
+
+def _depth(shape: Array) -> float:
+    """Largest distance of a shape from its chord, m."""
+    away, chord = shape - shape[0], shape[-1] - shape[0]
+    across = away - np.outer(away @ chord / (chord @ chord), chord)
+    return float(np.linalg.norm(across, axis=1).max())
 
 
 def _swings(directions: Array, goal: Array) -> Array:

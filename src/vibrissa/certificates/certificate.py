@@ -196,8 +196,20 @@ class Certificate:
             )
         if self.refuted:
             return f"No certificate{where}: {self.refuted}."
-        shares = ", ".join(f"{n} {100.0 * p.share:.3f} %" for n, p in self.parts.items())
+        shares = ", ".join(
+            f"{n} {100.0 * p.share:.3f} %{self._left(p)}" for n, p in self.parts.items()
+        )
         return f"Certificate{where} not finished: certain by now {shares}; run again to continue."
+
+    def _left(self, part: Part) -> str:
+        """Where boxes of a part are undecided: least and largest unknowns."""
+        if not len(part.undecided):
+            return ""
+        boxes = bounds(part.undecided, part.domain, self.stations)
+        ends = zip(boxes[..., 0].min(axis=0), boxes[..., 1].max(axis=0), strict=True)
+        unknowns = "sℓ" if self.straight else "sφℓ"
+        ranges = (f"{x} {a:.3g} to {b:.3g}" for x, (a, b) in zip(unknowns, ends, strict=True))
+        return f" (undecided: {', '.join(ranges)})"
 
     def is_of(self, contact_map: ContactMap) -> bool:
         """Whether it is of a map's whisker, and reaches as near to the base as the map does.

@@ -15,7 +15,7 @@ import numpy as np
 
 from vibrissa.contacts.channels import CHANNELS, CIRCULAR, channels_of
 from vibrissa.contacts.posterior import NORMAL_KURTOSIS, second_moment, squared_distances
-from vibrissa.numerics import Array, IntArray, cholesky, inlined, kernel, quick_exp
+from vibrissa.numerics import Array, IntArray, cholesky, inlined, quick_exp, vectorised
 from vibrissa.rod import Fold, Rod, SearchTree, StableSet
 
 #: Parts of the chart in each of which the nearest node is a start.
@@ -122,29 +122,43 @@ def _volumes(chart: StableSet) -> Array:
     return np.asarray(np.maximum(size, np.finfo(float).tiny).reshape(-1))
 
 
-@kernel
+@vectorised
 def nearest_of(of: Searched, mixing: Array, target: Array, out: IntArray) -> None:
-    """Fill the nodes of all parts of the chart that come nearest to one measurement."""
-    q, nodes, sizes = of.turns.shape[0], of.seen.shape[1], np.zeros(2)
-    wanted, least, total = np.zeros(q), np.full(PARTS, np.inf), np.zeros(nodes)
+    """Fill the nodes of all parts of the chart that come nearest to one measurement.
+
+    A block of nodes, which is within one part, is left out where its bounds are farther off.
+    """
+    q, number, sizes = of.turns.shape[0], of.blocks.shape[0] - 1, np.zeros(2)
+    wanted, scales, bounds = np.zeros(q), np.zeros((q, q)), np.zeros(number)
+    least, nearest = np.full(PARTS, np.inf), np.full(PARTS, np.inf)
     for i in range(q):
         for c in range(target.shape[0]):
             wanted[i] += mixing[i, c] * target[c]
         if of.kinds[i] < 2:
             sizes[of.kinds[i]] += wanted[i] ** 2
     for i in range(q):
-        seen, aim, turn, scale = of.seen[i], wanted[i], of.turns[i], 1.0
-        if of.kinds[i] < 2 and sizes[of.kinds[i]] > 0.0:
-            scale = 1.0 / np.sqrt(sizes[of.kinds[i]])
-        for node in range(nodes):
-            away = seen[node] - aim
-            away -= np.rint(away * turn) * 2.0 * np.pi
-            total[node] += (away * scale) ** 2
-    for node in range(nodes):
-        p = of.part[node]
-        if total[node] < least[p]:
-            least[p] = total[node]
-            out[p] = node
+        known = of.kinds[i] < 2 and sizes[of.kinds[i]] > 0.0
+        scales[i, i] = 1.0 / np.sqrt(sizes[of.kinds[i]]) if known else 1.0
+    longest = 0
+    for n in range(number):
+        longest = max(longest, of.blocks[n + 1] - of.blocks[n])
+        for i in range(q):
+            away = of.extent[0, i, n] - wanted[i]
+            away -= np.rint(away * of.turns[i]) * 2.0 * np.pi
+            bounds[n] += (max(abs(away) - of.extent[1, i, n], 0.0) * scales[i, i]) ** 2
+        p = of.part[of.blocks[n]]
+        nearest[p] = min(nearest[p], bounds[n])
+    work, here = np.empty((q + 1, longest)), np.empty(longest)
+    for others in range(2):  # the most promising block of each part first
+        for n in range(number):
+            first, last = of.blocks[n], of.blocks[n + 1]
+            p = of.part[first]
+            if (bounds[n] > nearest[p]) != (others == 1) or bounds[n] > least[p]:
+                continue
+            _misfits_of_block(of, scales, wanted, first, work, here[: last - first])
+            for k in range(last - first):
+                if here[k] < least[p]:
+                    least[p], out[p] = here[k], first + k
 
 
 @inlined
@@ -217,7 +231,7 @@ def _likely_nodes(
     return kept, nodes, misfits
 
 
-@kernel
+@vectorised
 def outside_share(
     of: Searched,
     white: bool,
@@ -237,7 +251,9 @@ def outside_share(
     ``white`` already.
     """
     if white:
-        weights = np.eye(of.turns.shape[0])
+        weights = np.zeros((of.turns.shape[0], of.turns.shape[0]))
+        for i in range(of.turns.shape[0]):
+            weights[i, i] = 1.0
     blocks, most = np.empty(of.blocks.shape[0] - 1, np.int64), chi + _NEGLIGIBLE
     near, size = _near_blocks(of, weights, target, most, blocks)
     n, nodes, misfits = _likely_nodes(of, weights, target, most, blocks, near, size)

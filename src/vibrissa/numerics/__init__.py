@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         kernel as kernel,
         rigorous as rigorous,
         specialised as specialised,
+        vectorised as vectorised,
     )
     from vibrissa.numerics.device import Translation as Translation, check_device as check_device
     from vibrissa.numerics.quantiles import contact_weights as contact_weights, weighted_quantile
@@ -55,7 +56,15 @@ _HOMES = {
         "solve_root",
         "wrapped",
     ),
-    "compiled": ("copy", "inlined", "inlined_rigorous", "kernel", "rigorous", "specialised"),
+    "compiled": (
+        "copy",
+        "inlined",
+        "inlined_rigorous",
+        "kernel",
+        "rigorous",
+        "specialised",
+        "vectorised",
+    ),
     "device": ("Translation", "check_device"),
     "quantiles": ("contact_weights", "weighted_quantile"),
 }

@@ -37,8 +37,10 @@ _OPTIONS: dict[str, Any] = {
 }
 
 
-#: Number of functions from which on a kernel is mostly bookkeeping around specialised ones.
+#: Number of functions from which on a kernel is mostly bookkeeping around fast ones.
 _LARGE = 40
+#: Ends of LLVM's names of functions whose loops are worth their size in large kernels, too.
+_VECTORISED: set[str] = set()
 #: Expressions whose value refers to arrays that are there already.
 _VIEWS = {"getitem", "static_getitem", "getattr", "build_tuple", "cast", "exhaust_iter", "phi"}
 
@@ -81,7 +83,7 @@ class _Whole(JITCodeLibrary):
 
 
 class _Compact(_Whole):
-    """Such code, for size where it is large, but for what is specialised: half of LLVM's time."""
+    """Such code, for size where it is large, but for what is to be fast: half of LLVM's time."""
 
     def _optimize_final_module(self) -> None:
         fast = {
@@ -91,8 +93,8 @@ class _Compact(_Whole):
             for function in library._get_module_for_linking().functions
         }
         own = [f for f in self._final_module.functions if not (f.is_declaration or f.name in fast)]
-        if len(own) > _LARGE:
-            for function in own:
+        for function in own if len(own) > _LARGE else ():
+            if not any(name in function.name for name in _VECTORISED):
                 function.add_function_attribute("optsize")
         super()._optimize_final_module()  # type: ignore[no-untyped-call]
 
@@ -209,6 +211,13 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     compiled.__class__ = _Kernel
     compiled.part = _part(function)
     return cast("Callable[P, R]", compiled)
+
+
+def vectorised(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile a kernel with long loops, which stay side by side within large kernels."""
+    name = function.__name__
+    _VECTORISED.add(f"{len(name)}{name}B")
+    return kernel(function)
 
 
 def specialised(function: Callable[P, R]) -> Callable[P, R]:

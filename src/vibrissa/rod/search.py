@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel, solve3, wrapped
+from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, solve3, vectorised, wrapped
 from vibrissa.rod.tree import EVEN, FOLDED, SearchTree
 
 #: At most so many contacts are found for one target.
@@ -476,7 +476,7 @@ def _begin_cell(
     return int(careful)
 
 
-@kernel
+@vectorised
 def seeds(tree: SearchTree, target: Array, found: Array, inverses: Array, quality: IntArray) -> int:
     """All contacts that may have the target's values, as chart coordinates."""
     grid, place, cells = tree.grid, tree.place, tree.boxes[tree.offsets[-2] :]
@@ -553,7 +553,7 @@ def _near_cell(tree: SearchTree, cell: int, target: Array, slack: Array, x: Arra
     return most
 
 
-@kernel
+@vectorised
 def cells_around(
     tree: SearchTree, target: Array, slack: Array, cells: IntArray, spots: Array, away: Array
 ) -> int:

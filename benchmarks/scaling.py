@@ -4,7 +4,9 @@
     python benchmarks/scaling.py [simulate] [track] [estimate] [store]
 
 prints a table in Markdown for docs/scaling.md: CPU time of this process, all its threads together,
-after a first call that is not counted, and memory of the results. Without arguments all of it.
+after a first call that is not counted, and memory of the results; and for each what is fixed and
+what grows, by least squares of relative errors, with the size that is farthest from that line.
+Without arguments all of it.
 """
 
 from __future__ import annotations
@@ -16,6 +18,9 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from scipy.optimize import nnls
 
 import vibrissa as vb
 from vibrissa.cameras import orthogonal_views
@@ -86,7 +91,7 @@ def tracked() -> Iterator[Row]:
 def estimated() -> Iterator[Row]:
     whisker = vb.samples.gamma()
     contact_map = vb.ContactMap.simulate(whisker, grid=False)
-    for count in (100, 1_000, 10_000, 100_000):
+    for count in (1, 10, 100, 1_000, 10_000, 100_000):
         signals = draw_contacts(contact_map, count, seed=1).signals
         known = {name: signals[:, SIGNALS.index(name)] for name in TRIPLET}
         contact_map.estimate({name: known[name][:10] for name in known}, TRIPLET)
@@ -138,15 +143,36 @@ def readable(seconds: float) -> str:
     return f"{seconds * 1e3:.2f} ms" if seconds >= 1e-4 else f"{seconds * 1e6:.1f} µs"
 
 
+def fitted(rows: list[Row]) -> Iterator[str]:
+    """Lines of the table: cost = fixed + each × number, for what was measured at several sizes."""
+    for what in dict.fromkeys(row[0] for row in rows):
+        sizes = [row[1] for row in rows if row[0] == what]
+        seconds, each = np.array([row[2:4] for row in rows if row[0] == what]).T
+        if len(sizes) < 3:
+            continue
+        number = seconds / each
+        (fixed, slope), _ = nnls(
+            np.column_stack([1.0 / seconds, number / seconds]), np.ones(len(sizes))
+        )
+        away = seconds / (fixed + slope * number) - 1.0
+        worst = int(np.abs(away).argmax())
+        line = f"{readable(fixed)} + {readable(slope)} × number"
+        yield f"| {what} | line | {line} | | {100 * away[worst]:+.0f} % at {sizes[worst]} |"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="by default all")
     print("| what | how much | CPU | of one | |\n|---|---|---:|---:|---|")
+    rows: list[Row] = []
     for part in parser.parse_args().parts or PARTS:
-        for what, size, seconds, each, told in PARTS[part]():
+        for row in PARTS[part]():
+            rows.append(row)
+            what, size, seconds, each, told = row
             print(
                 f"| {what} | {size} | {readable(seconds)} | {readable(each)} | {told} |", flush=True
             )
+    print("\n".join(fitted(rows)))
 
 
 if __name__ == "__main__":

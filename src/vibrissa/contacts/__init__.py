@@ -51,7 +51,10 @@ from vibrissa.contacts.noise import (
     whitening as whitening,
 )
 from vibrissa.contacts.prior import Prior
-from vibrissa.contacts.readout import check_signals as check_signals
+from vibrissa.contacts.readout import (
+    check_signals as check_signals,
+    searched_by_name as searched_by_name,
+)
 from vibrissa.contacts.search import signals_at_nodes as signals_at_nodes
 from vibrissa.contacts.two_contacts import bent_by_forces as bent_by_forces, second_contact
 from vibrissa.contacts.wrench import estimate_from_wrench

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from vibrissa.contacts.channels import CHANNELS, FITTED, WRENCH, Channels
 from vibrissa.contacts.inversion import seeding_triplet
-from vibrissa.contacts.nodes import at_nodes, searched
+from vibrissa.contacts.nodes import Searched, at_nodes, searched
 from vibrissa.contacts.noise import TRUSTED, SensorNoise, rank, scaled_errors
 from vibrissa.contacts.weighing import Weighing
 from vibrissa.numerics import AnyArray, Array
@@ -79,6 +80,31 @@ def check_signals(values: Array, names: tuple[str, ...]) -> None:
             )
 
 
+@lru_cache(maxsize=16)
+def searched_by_name(
+    contact_map: ChartedWhisker, names: tuple[str, ...]
+) -> tuple[Bounds, Searched | None]:
+    """Bounds of signals, and what is searched for three or more; the same for all noise."""
+    chart, channels, bounds = (
+        contact_map.chart,
+        Channels.of(names).names,
+        Bounds.of(contact_map, names),
+    )
+    if len(names) < _UNKNOWNS:
+        return bounds, None
+    three = names if len(names) == _UNKNOWNS else seeding_triplet(chart, names)
+    known, turns = at_nodes(chart, channels)
+    return bounds, searched(
+        chart,
+        contact_map.tree(three),
+        [names.index(name) for name in three],
+        [SIGNALS.index(name) for name in three],
+        known,
+        turns,
+        [2 if turn else "FM".index(name[0]) for name, turn in zip(channels, turns, strict=True)],
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class Measurement:
     """One measurement, non-dimensional: what was measured, and what the channels should be."""
@@ -101,28 +127,15 @@ class Named:
         self._pairs = self.channels.pairs()
         self._circular = [CIRCULAR[SIGNALS.index(name)] for name in names]
         self._sizes = [i for i, name in enumerate(names) if name in ("FT", "MB")]
-        self.bounds = Bounds.of(contact_map, names)
+        self.bounds, found = searched_by_name(contact_map, names)
         self._most = self.bounds.most()
         self._straight = [i for i, turns in enumerate(self._circular) if not turns]
         self.how = _weighing(self.channels, sensor, d.force, d.moment, self.scale)
         self.passes = 1 if constant_weights(self.channels, sensor) else 2
         self.rank = len(names)
         self._noise = [] if sensor is None else self._deviations(sensor)
-        if len(names) >= 3:
-            three = names if len(names) == 3 else seeding_triplet(chart, names)
-            known, turns = at_nodes(chart, self.channels.names)
-            self.searched = searched(
-                chart,
-                contact_map.tree(three),
-                [names.index(name) for name in three],
-                [SIGNALS.index(name) for name in three],
-                known,
-                turns,
-                [
-                    2 if turn else "FM".index(name[0])
-                    for name, turn in zip(self.channels.names, turns, strict=True)
-                ],
-            )
+        if found is not None:
+            self.searched = found
 
     def _deviations(self, sensor: SensorNoise) -> list[tuple[int, float]]:
         """Standard deviations, without contact, of signals other than directions."""

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from vibrissa.contacts import seeding_triplet, signals_at_nodes
+from vibrissa.contacts import searched_by_name, seeding_triplet, signals_at_nodes
 from vibrissa.io import check_keys
 from vibrissa.rod import discretize, point_solver, stable_set
 from vibrissa.signals import resting
@@ -87,7 +87,15 @@ moment_noise = 0.02              # µN·m
 # where certificates are kept and continued.
 """
 
-_KEPT = (discretize, stable_set, point_solver, resting, signals_at_nodes, seeding_triplet)
+_KEPT = (
+    discretize,
+    stable_set,
+    point_solver,
+    resting,
+    signals_at_nodes,
+    seeding_triplet,
+    searched_by_name,
+)
 """Functions that cache results of the last whiskers; a study does not return to any."""
 _OF_WHISKER, _OF_CELL = 16, 4
 """Numbers stored for each whisker, with its name, and for each cell."""

@@ -102,3 +102,12 @@ def test_no_offset_is_noted_where_none_explains_the_misfit():
     lines = sweep(100)
     wrong = traces(lines, [TOP, turned(FRONT, np.radians(10.0))], 0.3)
     assert not better_offset(*STATED, *wrong, 0).size
+
+
+@pytest.mark.parametrize("late", [1, 3])
+def test_an_offset_is_noted_in_a_short_film(late):
+    """The second of two telecentric cameras, otherwise as stated, began later."""
+    lines = sweep(40)
+    seen = traces(lines, [TOP, FRONT], 1e6)
+    assert better_offset(*STATED, seen[0], seen[1][late:], 0).tolist() == [-late]
+    assert not better_offset(*STATED, *seen, 0).size

@@ -7,6 +7,7 @@ which they pass nearest. Frames that a camera dropped change the shift from ther
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -91,7 +92,7 @@ def better_offset(
 
     An error of the calibration is common to all shifts, and does not count.
     """
-    cost, blank = np.zeros((2, len(a), len(_SHIFTS)))
+    ends = []
     for end in (0, -1):
         rows, other = (_shown(row, end) for row in (a, b))
         if min(len(rows), len(other)) < _KNOWN or abs(offset) > _LARGEST:
@@ -100,22 +101,36 @@ def better_offset(
         passing[~np.isin(np.arange(len(a)), rows)] = np.nan
         partner = np.arange(len(a))[:, None] + _SHIFTS
         passing[~np.isin(partner, other)] = np.nan
-        given = passing[:, offset + _LARGEST]
-        if np.isfinite(given).sum() < _KNOWN:
-            continue
-        away = passing - np.nanmedian(given)
-        blank += np.where(np.isfinite(away), 0.0, 0.5 * _WORST)
-        cost += np.where(np.isfinite(away), np.minimum(away**2, _WORST), 0.0)
+        if np.isfinite(passing[:, offset + _LARGEST]).sum() >= _KNOWN:
+            ends.append(passing)
+    if not ends:
+        return np.empty(0, dtype=np.int64)
+    blank = np.sum([np.where(np.isfinite(one), 0.0, 0.5 * _WORST) for one in ends], axis=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of shifts for which no frame is known
+        usual = [np.nan_to_num(np.nanmedian(one, axis=0)) for one in ends]
+    fits = _costs(ends, usual)
+    # Out of step, what is usual is no error of the calibration: that is what the best shift leaves.
+    best = int(np.argmin((fits + blank).sum(axis=0)))
+    cost = _costs(ends, [one[best] for one in usual])
     path = _cheapest(cost + blank)
     switched = np.concatenate([[True], np.diff(path) != 0])
     changed = _SWITCH * int(switched[1:].sum()) + _CLEARLY
     row, column = np.arange(len(a)), offset + _LARGEST
     both = (blank[row, path] == 0.0) & (blank[:, column] == 0.0)
-    left, given = cost[row, path][both].sum(), cost[both, column].sum()
+    if 2 * both.sum() < (blank[:, column] == 0.0).sum():
+        return np.empty(0, dtype=np.int64)
+    left, given = cost[row, path][both].sum(), fits[both, column].sum()
     # Of other optics some offset always explains a little; of a true one noise alone is left.
     if left + changed >= given or left > _LEFT * given:
         return np.empty(0, dtype=np.int64)
     return np.asarray(_SHIFTS[path[switched]])
+
+
+def _costs(ends: Sequence[Array], usual: Sequence[Array]) -> Array:
+    """Costs (frame, shift) of distances but for what is usual; 0 where they are not known."""
+    away = [np.nan_to_num(one - middle) for one, middle in zip(ends, usual, strict=True)]
+    return np.asarray(sum(np.minimum(one**2, _WORST) for one in away))
 
 
 def _shown(traces: Sequence[Trace], end: int) -> NDArray[np.intp]:

@@ -110,7 +110,7 @@ def better_offset(
         warnings.simplefilter("ignore", RuntimeWarning)  # of shifts for which no frame is known
         usual = [np.nan_to_num(np.nanmedian(one, axis=0)) for one in ends]
     fits = _costs(ends, usual)
-    # Out of step, what is usual is no error of the calibration: that is what the best shift leaves.
+    # Out of step, the usual distance holds the lag: the best shift leaves the calibration alone.
     best = int(np.argmin((fits + blank).sum(axis=0)))
     cost = _costs(ends, [one[best] for one in usual])
     path = _cheapest(cost + blank)

@@ -267,15 +267,31 @@ def test_contacts_where_signals_fold_are_counted(gamma_map):
     assert (found.covariance_valid & (away > 0.1)).mean() < 0.05
 
 
-def test_contacts_near_slip_off_are_counted(gamma_map):
+@pytest.mark.parametrize(
+    ("triplet", "low", "high"),
+    [("Fx FT FD", 0.35, 0.6), ("FT MB MD", 0.65, 0.95), ("FT FD MB", 0.65, 0.85)],
+)
+def test_contacts_near_slip_off_are_counted(gamma_map, triplet, low, high):
     """They fill little space, but of two contacts that explain signals either may be the true."""
-    rng, number = np.random.default_rng(1), 60
-    s, psi = rng.uniform(0.35, 0.6, number), rng.uniform(-np.pi, np.pi, number)
+    rng, number = np.random.default_rng(1), 100
+    s, psi = rng.uniform(low, high, number), rng.uniform(-np.pi, np.pi, number)
     load = rng.uniform(0.97, 0.995, number)
-    found, away = located(gamma_map, "Fx FT FD", rng, s, psi, load)
+    found, away = located(gamma_map, triplet, rng, s, psi, load)
     wrong = away > 0.1
     assert wrong.mean() > 0.1
     assert (found.status[wrong] == vb.Status.AMBIGUOUS).mean() > 0.9
+
+
+def test_near_another_contact_the_fold_is_counted(gamma_map):
+    """Noise carries signals that fold at slip-off past it; a contact next to it then gives them."""
+    rng, number = np.random.default_rng(3), 150
+    s, psi = rng.uniform(0.6, 0.9, number), rng.uniform(-np.pi, np.pi, number)
+    found, away = located(gamma_map, "Fx FT MD", rng, s, psi, rng.uniform(0.97, 0.995, number))
+    sure = (found.status == vb.Status.UNIQUE) & found.covariance_valid
+    deviation = np.sqrt(np.linalg.eigvalsh(found.covariance)[:, -1])
+    far = away * gamma_map.whisker.length > 4.0 * deviation
+    assert sure.sum() > 20
+    assert (sure & far).sum() <= 1
 
 
 def test_a_light_contact_is_one_candidate(gamma_map):

@@ -2,7 +2,8 @@
 
 The cells of the tree that may hold signals within two standard deviations of the measured ones form
 basins, separated by cells that come less near. Each that known contacts do not explain by their
-slopes has a contact from which to look for another.
+slopes has a contact from which to look for another. Cells at the fold are basins of their own, with
+starts on it: χ² may be least there, however near a contact is that explains the measurement.
 """
 
 from __future__ import annotations
@@ -74,7 +75,9 @@ def _start_at(of: Searched, spot: Array, start: Array) -> None:
 
 @inlined
 def _adjacent(of: Searched, a: int, b: int) -> bool:
-    """Whether two cells of the chart touch; near rest bearings are all one."""
+    """Whether two cells touch, and are both at the fold or not; near rest bearings are all one."""
+    if _at_fold(of, a) != _at_fold(of, b):
+        return False
     one, other = of.tree.place[a], of.tree.place[b]
     around = round(2.0 * math.pi / of.tree.grid[1, 1])
     turn = abs(one[1] - other[1])
@@ -90,6 +93,13 @@ def _holds(of: Searched, cell: int, position: Array) -> bool:
         apart[a] = abs((position[a] - grid[0, a]) / grid[1, a] - place[a] - 0.5)
     apart[1] = min(apart[1], 2.0 * math.pi / grid[1, 1] - apart[1])
     return bool(max(apart[0], apart[2]) <= 1.5 and (apart[1] <= 1.5 or place[2] == 0))
+
+
+@inlined
+def _at_fold(of: Searched, cell: int) -> bool:
+    """Whether a cell of the chart ends at the fold."""
+    grid = of.tree.grid
+    return bool(of.tree.place[cell, 2] == round((1.0 - grid[0, 2]) / grid[1, 2]) - 1)
 
 
 @inlined
@@ -154,10 +164,12 @@ def starts_of_basins(
     for c in range(number):
         _chart_of(of, x[c], known[c])
     for i in range(n):
-        start, new = starts[0], True
+        start, new, folded = starts[0], True, _at_fold(of, cells[i])
+        if folded:
+            spots[i, 2] = 1.0
         _start_at(of, spots[i], start)
         for c in range(number):
-            new = new and not _holds(of, cells[i], known[c])
+            new = new and (folded or not _holds(of, cells[i], known[c]))
             new = new and not by_slopes(x[c], residuals[c], jacobians[c], start) < _LINEAR
         if new:
             cells[kept], away[kept] = cells[i], away[i]

@@ -89,6 +89,8 @@ _LEVEL = 0.03
 _LONGEST_TURN, _LONGEST_FALL, _LONGEST_SHARE = 0.5, 0.25, 0.5
 # The chart knows the fold to a part in a million: as near to it contacts are still stable.
 _MOST_LOAD = 1.0 - 1e-5
+# What is as near to that is at the fold, whatever rounding makes of it.
+_AT_FOLD = 1.0 - 1e-12
 # Steps for derivatives of the fold force, which is smooth.
 _NUDGE = 1e-5
 # Contacts within this (over L, and ten times that relative to the force) are one.
@@ -427,7 +429,7 @@ def _confine(fold: Fold, proximal: float, x: Array) -> bool:
     x[0] = min(max(x[0], proximal), 1.0)
     force = math.hypot(x[2], x[3])
     most = _MOST_LOAD * fold_force(fold, x[0], math.atan2(x[3], x[2]))
-    if force < most:
+    if force < _AT_FOLD * most:
         return False
     x[2] *= most / force
     x[3] *= most / force

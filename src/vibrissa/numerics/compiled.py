@@ -12,6 +12,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, ParamSpec, TypeVar, cast
 
+import llvmlite
 import numba
 from llvmlite.binding import Linkage, parse_assembly
 from numba import types
@@ -37,6 +38,8 @@ _OPTIONS: dict[str, Any] = {
 }
 
 
+#: Older ones put attributes of functions at what these return, which is no valid code.
+_ATTRIBUTES = tuple(map(int, llvmlite.__version__.split(".")[:2])) >= (0, 48)
 #: Number of functions from which on a kernel is mostly bookkeeping around fast ones.
 _LARGE = 40
 #: Ends of LLVM's names of functions whose loops are worth their size in large kernels, too.
@@ -93,7 +96,7 @@ class _Compact(_Whole):
             for function in library._get_module_for_linking().functions
         }
         own = [f for f in self._final_module.functions if not (f.is_declaration or f.name in fast)]
-        for function in own if len(own) > _LARGE else ():
+        for function in own if _ATTRIBUTES and len(own) > _LARGE else ():
             if not any(name in function.name for name in _VECTORISED):
                 function.add_function_attribute("optsize")
         super()._optimize_final_module()  # type: ignore[no-untyped-call]

@@ -78,7 +78,8 @@ def test_what_the_peg_is_known_to_counts_frames_that_err_together(from_video):
         expected = together * alone.covariance
         # What all frames of the film share comes on top.
         without = one.recording.copy()
-        without.dataset = one.recording.to_dataset().drop_vars(["contact_shared", "pose_shared"])
+        shared = ["contact_shared", "pose_shared", "wrench_shared"]
+        without.dataset = one.recording.to_dataset().drop_vars(shared)
         plain = reconstruct(without)["parameter_covariance"].values
         np.testing.assert_allclose(plain, expected, rtol=1e-9)
         sigma = np.sqrt(np.diag(expected))

@@ -207,6 +207,13 @@ def test_twice_the_samples_change_no_verdict(gamma_map):
     np.testing.assert_array_equal(once.notation, twice.notation)
 
 
+def test_a_rare_pair_within_one_region_is_found(gamma_map):
+    """One contact in 300 has its twin in the same region; among few samples there may be none."""
+    found = vb.uniqueness(gamma_map, ["Fx FT FD"], ["CB"], resolution=False)
+    assert found.verdict.item() == "not unique"
+    assert np.degrees(found.critical_cone.item()) > 40.0
+
+
 def test_verdicts_do_not_hang_on_stiffness_or_size(of_curved):
     # Forces 145 and moments 58 times as small, lengths 2.5 times as large: nothing cancels.
     other = vb.Whisker.parabola(40e-3, 10.0, youngs_modulus=1e9, base_radius=60e-6)

@@ -51,6 +51,8 @@ _WIDER = 8
 # Pairs found again on a finer rod at a time, and how many times at most.
 _CONFIRMED = 24
 _ROUNDS = 20
+# Contacts whose sign of det ∂T/∂p is the rarer, of regions without witnesses.
+_RARE = 2048
 # Samples that the resolution is probed at.
 _PROBED = 512
 # Contacts of each region from which fibres are followed, and at which folds are searched.
@@ -71,13 +73,14 @@ class Local(NamedTuple):
     minority (regions,): share of the volume in which the determinant has the rarer sign; one_sided
     (regions,): the same with the two sides of the whisker's plane separated; angle (regions, 2):
     least and largest cone angle of contacts with the rarer sign of their side, rad; near_folds:
-    samples near folds.
+    samples near folds; rarer (regions, wide samples): whether the sign is the rarer one there.
     """
 
     minority: Array
     one_sided: Array
     angle: Array
     near_folds: AnyArray
+    rarer: AnyArray
 
 
 @dataclass(frozen=True)
@@ -200,7 +203,7 @@ def answer(question: Question, names: tuple[str, ...], resolution: bool) -> Answ
     else:
         tried = np.arange(len(samples.chart))
         own = twins(question.contact_map, names, samples.chart, samples.contacts, question.domain)
-        pool = _searched(question, names, own, local.near_folds)
+        pool = _searched(question, names, own, local)
         on_surface = _on_plane(question, names, span)
     own, pool = (p.rows(p.apart >= question.separation) for p in (own, pool))
     twin = _twinned(question, own)
@@ -230,16 +233,18 @@ def answer(question: Question, names: tuple[str, ...], resolution: bool) -> Answ
     return Answer(variables, [cell.witnesses for cell in cells], [cell.steps for cell in cells])
 
 
-def _searched(
-    question: Question, names: tuple[str, ...], own: Pairs, near_folds: AnyArray
-) -> Pairs:
+def _searched(question: Question, names: tuple[str, ...], own: Pairs, local: Local) -> Pairs:
     """Better twins than those of the samples, from these and from contacts near folds.
 
-    Regions that seem to have none outside the cone are searched several times.
+    Regions that seem to have none outside the cone are searched several times. Where the sign of
+    det ∂T/∂p is the rarer, a contact has a twin, though that may be in another region.
     """
-    start = question.wide.rows(near_folds)
-    more = twins(question.contact_map, names, start.chart, start.contacts, question.domain)
-    pool = joined([own, more])
+    wide = question.wide
+    pool = joined([own, _twins_of(question, names, wide.rows(local.near_folds))])
+    without = _without_witness(question, pool, question.regions)
+    rare = wide.contacts.angle > question.cone
+    rare &= np.any([local.rarer[question.regions.index(r)] for r in without], axis=0)
+    pool = joined([pool, _twins_of(question, names, wide.rows(np.flatnonzero(rare)[:_RARE]))])
     rng = np.random.default_rng(question.seed)
     regions = question.regions
     for _ in range(1 + _AGAIN):
@@ -247,18 +252,27 @@ def _searched(
             question.contact_map, names, pool, regions, question.separation, question.domain, rng
         )
         pool = joined([pool, found])
-        far = pool.apart >= question.separation
-        regions = tuple(
-            region
-            for region in regions
-            if pool.angle[far & pool.members(region)].max(initial=0.0) <= question.cone
-        )
+        regions = _without_witness(question, pool, regions)
         if not regions:
             break
     summits = climbed(
         question.contact_map, names, pool, question.regions, question.separation, question.domain
     )
     return joined([pool, summits])
+
+
+def _twins_of(question: Question, names: tuple[str, ...], start: Samples) -> Pairs:
+    return twins(question.contact_map, names, start.chart, start.contacts, question.domain)
+
+
+def _without_witness(question: Question, pool: Pairs, regions: tuple[str, ...]) -> tuple[str, ...]:
+    """Regions of which no pair is outside the cone."""
+    far = pool.apart >= question.separation
+    return tuple(
+        region
+        for region in regions
+        if pool.angle[far & pool.members(region)].max(initial=0.0) <= question.cone
+    )
 
 
 def _judge(
@@ -402,7 +416,11 @@ def _shares(
 def _nothing_local(question: Question) -> Local:
     n = len(question.regions)
     return Local(
-        np.full(n, np.nan), np.full(n, np.nan), np.full((n, 2), np.nan), np.zeros(0, dtype=int)
+        np.full(n, np.nan),
+        np.full(n, np.nan),
+        np.full((n, 2), np.nan),
+        np.zeros(0, dtype=int),
+        np.zeros((n, len(question.wide.chart)), dtype=bool),
     )
 
 
@@ -433,6 +451,7 @@ def _local(question: Question, by_contact: Array) -> Local:
             rare |= rarer
             rows = np.flatnonzero(side)
             near.update(rows[np.argsort(common * det[rows])[: _NEAR_FOLDS // 2]].tolist())
+        out.rarer[i] = rare
         out.one_sided[i] = volume[rare].sum() / total
         if rare.any():
             out.angle[i] = contacts.angle[rare].min(), contacts.angle[rare].max()

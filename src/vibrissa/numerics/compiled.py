@@ -38,7 +38,7 @@ _OPTIONS: dict[str, Any] = {
 }
 
 
-#: Older ones put attributes of functions at what these return, which is no valid code.
+#: Older ones put attributes of functions at what these return, which LLVM refuses.
 _ATTRIBUTES = tuple(map(int, llvmlite.__version__.split(".")[:2])) >= (0, 48)
 #: Number of functions from which on a kernel is mostly bookkeeping around fast ones.
 _LARGE = 40

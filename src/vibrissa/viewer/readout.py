@@ -139,7 +139,7 @@ def cursor(share: float, *, strip: bool = False) -> str:
     tall, end = (STRIP, 12.0) if strip else (height(), len(ROWS) * ROW)
     line = (
         f'<line x1="{x:.2f}" x2="{x:.2f}" y1="0" y2="{end:.0f}" stroke="currentColor" '
-        f'stroke-width="1.2"/>'
+        f'stroke-width="1.2" data-cursor="{share:.4f}"/>'
     )
     return f'<div style="margin-top:{-100.0 * tall / WIDTH:.3f}%">{_svg(line, tall)}</div>'
 

@@ -33,12 +33,15 @@ def test_a_folder_is_done_once_and_summarised(tmp_path):
     trial(tmp_path / "miss.nc", Peg([90e-3, 2.6e-3, 0.0], [0.0, 0.0, 1.0], 0.5e-3))
     (tmp_path / "broken.nc").write_bytes((tmp_path / "touch.nc").read_bytes()[:5000])
     (tmp_path / "notes.txt").write_text("not a recording")
+    (tmp_path / "other.nc").write_text("not a recording")
+    (tmp_path / "nothing.nc").touch()
     text = run("batch", tmp_path, "--axis", "0,0,1")
-    assert "3 recordings, 2 with a fault" in text
+    assert "5 recordings, 4 with a fault" in text
     with (tmp_path / "summary.csv").open() as file:
         rows = {row["file"]: row for row in csv.DictReader(file)}
-    assert set(rows) == {"broken.nc", "miss.nc", "touch.nc"}
-    assert "broken.nc" in rows["broken.nc"]["fault"]
+    assert set(rows) == {"broken.nc", "miss.nc", "nothing.nc", "other.nc", "touch.nc"}
+    for name in ("broken.nc", "nothing.nc", "other.nc"):
+        assert name in rows[name]["fault"]
     assert rows["miss.nc"]["frames_in_contact"] == "0"
     assert rows["miss.nc"]["fault"]
     touch = rows["touch.nc"]

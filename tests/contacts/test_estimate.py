@@ -209,7 +209,7 @@ def test_bad_input_says_what_is_allowed(gamma_map):
         gamma_map.estimate(signals, noise={"Fx": 1e-6, "MB": 1e-8})
     with pytest.raises(ValueError, match=r"got shape \(3, 3\)"):
         gamma_map.estimate(signals, noise=np.eye(3))
-    with pytest.raises(ValueError, match="dataset or mapping with Fx, MB, MD, .*; got 5"):
+    with pytest.raises(ValueError, match=r"dataset or mapping with Fx, MB, MD, .*; got 5"):
         gamma_map.estimate(5)
     with pytest.raises(ValueError, match=r"must be standard deviations ≥ 0; got \{'Fx': 'a'"):
         gamma_map.estimate(signals, noise={"Fx": "a", "MB": 1e-8, "MD": 0.1})

@@ -144,7 +144,7 @@ def test_the_command_writes_a_recording(tmp_path, capsys):
     (peg,) = Recording(trial).objects
     assert peg.origin[0] == pytest.approx(26e-3)
     said = capsys.readouterr().out
-    assert "contacts, up to" in said
+    assert "1 contact, up to" in said
     assert "µN·m" in said
     app(["simulate", "--example"], standalone_mode=False)
     assert capsys.readouterr().out == EXAMPLE

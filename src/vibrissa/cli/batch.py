@@ -51,8 +51,7 @@ def batch(
     """
     if not folder.is_dir():
         raise ValueError(f"{folder} is not a folder; one with recordings is needed")
-    paths = [path for path in sorted(folder.glob("*.nc")) if path.stat().st_size]
-    paths = [path for path in paths if _is_recording(path)]
+    paths = [path for path in sorted(folder.glob("*.nc")) if _is_recording(path)]
     if not paths:
         raise ValueError(f"{folder} holds no recordings; `vibrissa track` and `import` make them")
     known = None if objects is None else objects_from(objects)
@@ -80,9 +79,9 @@ def batch(
 
 
 def _is_recording(path: Path) -> bool:
-    """Whether a file is a recording, or perhaps one that is damaged."""
+    """Whether a file is a recording, or perhaps one that is damaged; not a map or signals."""
     try:
-        return vb.io.recognise(path) == vb.io.Kind.RECORDING
+        return vb.io.recognise(path) in (vb.io.Kind.RECORDING, vb.io.Kind.UNKNOWN)
     except ValueError:
         return True  # reading it states what is wrong
 

@@ -93,7 +93,6 @@ def searched(
     )
 
 
-@lru_cache(maxsize=64)
 def at_nodes(chart: StableSet, names: tuple[str, ...]) -> tuple[Array, Array]:
     """Channels (k, nodes) at the chart's nodes, and 1/2π for those that are angles."""
     which = [CHANNELS.index(name) for name in names]

@@ -47,6 +47,9 @@ _UNEVEN, _QUIETEST, _QUIET = 2.5, 0.1, 1.5
 """A whisker rings where free frames usually deviate by so many times what this share of them does;
 then still ones deviate by at most so many times that."""
 
+_RINGS = 2e-5
+"""Usual deviation from which this is done, over the length: by less the base hardly is turned."""
+
 _DEEP = 10.0
 """Depth of the shape from which this is done, in usual deviations: a straight whisker that rings
 is alike where it turns back, too."""
@@ -180,7 +183,7 @@ def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> R
     within = _NEAR * float(np.median(deviation[whole][near]))
     quiet, ringing = near, None
     uneven = usual > _UNEVEN * np.quantile(deviation[whole][near], _QUIETEST)
-    if uneven and _depth(mean) > _DEEP * usual:
+    if uneven and usual > _RINGS * length and _depth(mean) > _DEEP * usual:
         for _ in range(_ROUNDS):
             quiet = near & (
                 deviation[whole] <= _QUIET * np.quantile(deviation[whole][near], _QUIETEST)
@@ -189,8 +192,10 @@ def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> R
             deviation[whole] = _deviations(part, mean)
         ringing = np.ones(len(curves), dtype=bool)
         ringing[np.flatnonzero(seen)[whole][quiet]] = False
-    moved = _moved(shapes[whole][quiet], *motions(part[quiet], mean))
-    points = np.nanmedian(moved[:, : curves.shape[1]], axis=0)
+    shown = shapes[whole][:, : curves.shape[1]]
+    # The quiet frames may all miss the tip.
+    by = quiet if np.isfinite(shown[quiet, :, 0]).any(axis=0).all() else near
+    points = np.nanmedian(_moved(shown[by], *motions(part[by], mean)), axis=0)
     # Where less of the whisker is seen, what is seen shows whether it is bent.
     for i in np.flatnonzero(~whole & (known >= _LEAST * compared)):
         n = min(int(known[i]), len(points))

@@ -68,8 +68,7 @@ def chart() -> vb.ContactMap:
 @cache
 def verdicts() -> xr.Dataset:
     """Verdicts on the γ whisker."""
-    # With as many samples the narrow twins of (F_x, F_T, F_D) among CB contacts are found.
-    return vb.uniqueness(chart(), samples=2048)
+    return vb.uniqueness(chart())
 
 
 def witness(whisker: vb.Whisker, found: xr.Dataset, triplet: str) -> Figure:

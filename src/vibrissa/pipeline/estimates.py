@@ -145,12 +145,7 @@ def estimates_of(
     report = progress or (lambda stage, done, total: None)
     how: Any = {"errors": errors, "prior": prior, "second_contacts": second_contacts}
     how["gravity"] = gravity
-    if whiskers is None and contact_maps is not None:
-        whiskers = [one.whisker for one in contact_maps]
-    whiskers = Recording(recording).whiskers if whiskers is None else whiskers
-    for things in (whiskers, contact_maps):
-        if things is not None and len(things) != count:
-            raise ValueError(f"there are signals of {count} whiskers; {len(things)} are given")
+    whiskers = _whiskers(recording, count, whiskers, contact_maps)
     if noise is None and data.attrs.get("source") == "sensor" and sensor_noise(data) is None:
         raise ValueError("the sensor's noise is not known: give the covariance of (F, M) as noise")
     parts = []
@@ -205,6 +200,21 @@ def estimates_of(
         about["gravity"] = gravity.acceleration
     out.attrs = about
     return out.assign_coords({n: data[n].variable for n in ("time", "whisker", "space")})
+
+
+def _whiskers(
+    recording: xr.DataTree,
+    count: int,
+    given: Sequence[Whisker] | None,
+    maps: Sequence[ContactMap] | None,
+) -> Sequence[Whisker]:
+    """Whiskers of so many signals: those given, those of the maps, or the recording's."""
+    if given is None:
+        given = Recording(recording).whiskers if maps is None else [one.whisker for one in maps]
+    for things in (given, maps):
+        if things is not None and len(things) != count:
+            raise ValueError(f"there are signals of {count} whiskers; {len(things)} are given")
+    return given
 
 
 def _one_whisker(

@@ -229,6 +229,9 @@ def test_files_of_the_wrong_kind(monkeypatch, capsys, folder, table, chart):
     bad.write_text("time,Fx\n0,1\n")
     assert "lacks Fy" in fault(monkeypatch, capsys, "estimate", bad, "--map", chart)
     assert "not a table that is known" in fault(monkeypatch, capsys, "info", bad)
+    few = folder / "few.csv"
+    few.write_text("time,Fx_uN,MB_uNm,MD_deg\n0,-100,2,45\n")
+    assert f"vibrissa estimate {few} --using Fx,MB,MD" in run("info", few).replace("\n", "")
     both = ("--map", chart, "--whisker", table[0])
     assert "either --map" in fault(monkeypatch, capsys, "estimate", table[0], *both)
     triplet = ("--using", "Fx,MB")

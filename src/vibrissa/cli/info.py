@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 _SHOWN = 12
 _TABLES = """\
-  signals         time, Fx, Fy, Fz, Mx, My, Mz
+  signals         time, Fx, Fy, Fz, Mx, My, Mz; or three or more of Fx, FT, FD, Mx, MB, MD
   a centreline    x_mm, y_mm, z_mm, from base to tip
   contacts        time, x, y, z, r, theta, phi, sigma_x, sigma_y, sigma_z, status
   the head        time or frame; x, y, z; qw, qx, qy, qz, or r11 … r33, or angles
@@ -434,15 +435,30 @@ def _table(path: Path) -> Iterator[tuple[str, str]]:
             continue
         yield "kind", f"table of {kind}" if kind != "whisker" else "centreline of a whisker"
         yield from _rows(kind, data)
+        if kind == "signals":
+            yield (
+                "next",
+                f"vibrissa estimate {path}  # the whisker: --whisker or --map FILE",
+            )
+        return
+    columns = {re.split(r"[ _/(\[]", cell)[0] for cell in _header_cells(path)}
+    used = [name for name in vb.signals.SIGNALS if name in columns]
+    if len(used) >= 3:
+        yield "kind", f"table of the signals {', '.join(used)}"
+        yield "next", f"vibrissa estimate {path} --using {','.join(used)}"
         return
     raise ValueError(f"{path} is not a table that is known: {_header(path)}. Known are\n{_TABLES}")
 
 
 def _header(path: Path) -> str:
     """Quote the first line of a table."""
-    cells = next(vb.io.table_rows(vb.io.read_text(path)), (0, []))[1]
+    cells = _header_cells(path)
     shown = ", ".join(cells[:_SHOWN]) + (", …" if len(cells) > _SHOWN else "")
     return f"its first line is {shown}" if cells else "it has no lines"
+
+
+def _header_cells(path: Path) -> list[str]:
+    return next(vb.io.table_rows(vb.io.read_text(path)), (0, []))[1]
 
 
 def _rows(kind: str, data: Any) -> Iterator[tuple[str, str]]:

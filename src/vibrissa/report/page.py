@@ -32,48 +32,7 @@ _POLICY = (
 )
 """Rule on what the page may load: only what is in it."""
 
-# Figures are dark on white; on a dark page each is on a card of its own, slightly dimmed.
-_STYLE = """
-:root { color-scheme: light dark; --ink: #1b1b1b; --paper: #ffffff; --soft: #5c5c5c;
-  --line: #d5d0ca; --band: #f6f3ef; --link: #6b3d2e; }
-@media (prefers-color-scheme: dark) {
-  :root { --ink: #e8e4df; --paper: #16181b; --soft: #a9a49d; --line: #3a3d42; --band: #202327;
-    --link: #e0a58f; }
-  figure img, .space { background: #ffffff; border-radius: 6px; padding: 6px;
-    box-sizing: border-box;
-    filter: brightness(0.88); }
-}
-body { margin: 0 auto; padding: 1.5rem; max-width: 70rem; color: var(--ink);
-  background: var(--paper); font: 16px/1.5 system-ui, sans-serif; }
-a { color: var(--link); }
-h1 { margin: 0; font-size: 1.7rem; }
-h2 { margin: 2.5rem 0 0.6rem; font-size: 1.25rem; border-bottom: 1px solid var(--line); }
-header p, figcaption, .note { color: var(--soft); }
-nav ul { padding: 0; display: flex; flex-wrap: wrap; gap: 0.3rem 1.2rem; list-style: none; }
-.scroll { overflow-x: auto; }
-.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(12rem, 1fr)); gap: 0.8rem;
-  margin: 1rem 0; padding: 0; list-style: none; }
-.tiles li { background: var(--band); border-radius: 6px; padding: 0.8rem 1rem; }
-.tiles b { display: block; font-size: 1.5rem; font-variant-numeric: tabular-nums; }
-.tiles span { color: var(--soft); font-size: 0.92rem; }
-table { border-collapse: collapse; margin: 0.8rem 0; font-size: 0.92rem; }
-caption { text-align: left; font-weight: 600; padding: 0.2rem 0; white-space: nowrap; }
-th, td { padding: 0.15rem 1.1rem 0.15rem 0.3rem; text-align: left; vertical-align: top; }
-thead th { border-bottom: 2px solid var(--line); }
-tbody th { font-weight: 500; }
-.data tbody tr:nth-child(even) { background: var(--band); }
-.facts td { overflow-wrap: anywhere; }
-.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
-code { overflow-wrap: anywhere; font-size: 0.92em; }
-figure { margin: 1.2rem 0; }
-figure img, video { display: block; max-width: 100%; height: auto; }
-svg { max-width: 100%; height: auto; }
-.space { height: 34rem; overflow: hidden; }
-@media (max-width: 44rem) { figure { overflow-x: auto; } figure img { max-width: none;
-  width: 44rem; } caption { white-space: normal; } }
-@media print { nav, .space { display: none; } }
-"""
-
+_STYLE = Path(__file__).with_suffix(".css").read_text(encoding="utf-8")
 
 _CODE = re.compile(r"`([^`]+)`")
 

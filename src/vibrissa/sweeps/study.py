@@ -30,62 +30,7 @@ from vibrissa.signals import resting
 from vibrissa.sweeps.tasks import TASKS, Settings, settings_of
 from vibrissa.whisker import Whisker, whisker_array
 
-EXAMPLE = """\
-# A study for `vibrissa sweep`: lengths in mm, radii in µm, moduli in GPa, angles in degrees.
-
-name = "taper and curvature"
-seed = 0
-
-# Whiskers; repeat [[whiskers]] for more of them.
-[[whiskers]]
-kind = "grid"                    # all combinations of the values
-length = 39.4
-taper_ratio = [1, 2, 5, 15, 60]  # base radius over tip radius
-curvature = [0.0, 0.4, 0.8]      # A L of the parabola y = A x²
-# bend = 180                     # or: what the tangent turns by, at a constant rate,
-# corkscrew = 360                # and what the plane of bending turns by
-# base_radius = 100.0
-# youngs_modulus = 3.0
-# trim = 1.0                     # share of the length that is left
-# group = "parabolas"            # a name; by default the kind
-
-# [[whiskers]]
-# kind = "random"                # values between [least, largest]
-# count = 100
-# length = [20, 60]
-# taper_ratio = [2, 60]
-# logarithmic = ["taper_ratio"]
-
-# [[whiskers]]
-# kind = "files"                 # digitised centrelines
-# files = "whiskers/*.csv"
-
-# [[whiskers]]
-# kind = "array"                 # an average rat's
-# side = "right"
-# rows = "ABCDE"
-
-[[tasks]]
-kind = "uniqueness"
-triplets = ["Fx MB MD", "Mx MB MD", "Fx FD MD"]   # or "all"
-regions = ["all"]
-cone = 2.0                       # about rest, left out, degrees
-samples = 1024
-resolution = true
-
-[[tasks]]
-kind = "estimation"
-signals = ["Fx MB MD", "wrench"]
-contacts = 1000
-force_noise = 1.0                # µN
-moment_noise = 0.02              # µN·m
-
-# groups = ["grid"]              # only of these; by default of all whiskers
-
-# Others: "map"; "sensitivity" (triplets, noise); "friction" (triplet, friction, contacts);
-# "certificate", a proof for each whisker: cone (0: the smallest that may do), minutes, and folder,
-# where certificates are kept and continued.
-"""
+EXAMPLE = Path(__file__).with_name("example.toml").read_text(encoding="utf-8")
 
 _KEPT = (
     discretize,

@@ -1,0 +1,127 @@
+(() => {
+  document.title = "vibrissa";
+  // The server shows what a link asks for; viser would take it for a part of the address.
+  if (location.hash) {
+    fetch("restore?" + location.hash.slice(1));
+    history.replaceState(null, "", location.pathname + location.search);
+  }
+  // The page is dark as long as the browser is.
+  const dark = matchMedia("(prefers-color-scheme: dark)");
+  const matched = () => {
+    const asked = new URLSearchParams(location.search);
+    if (dark.matches) asked.set("darkMode", ""); else asked.delete("darkMode");
+    history.replaceState(null, "", "?" + asked + location.hash);
+  };
+  if (dark.matches) matched();
+  dark.addEventListener("change", () => { matched(); location.reload(); });
+
+  // Keys press buttons; a click in a plot over time sets the time.
+  const button = (...texts) => [...document.querySelectorAll("button")].find(
+    (each) => each.offsetParent && texts.includes(each.textContent.trim()));
+  const setTime = (share) => {
+    const label = [...document.querySelectorAll("label")].find(
+      (each) => each.textContent.trim() === "Time (ms)");
+    let box = label;
+    const number = "input[type=text], input:not([type])";
+    while (box && !box.querySelector(number)) box = box.parentElement;
+    const input = box?.querySelector(number);
+    const slider = box?.querySelector("[role=slider]");
+    if (!input || !slider) return;
+    const value = String(Number(slider.getAttribute("aria-valuemax")) * share);
+    Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set.call(input, value);
+    input.dispatchEvent(new Event("input", { bubbles: true }));
+    input.dispatchEvent(new Event("blur", { bubbles: true }));
+  };
+  const keys = {
+    ",": ["◀ frame"], ".": ["frame ▶"], "n": ["Next contact"], " ": ["Play", "Pause"],
+  };
+  addEventListener("keydown", (event) => {
+    const typing = /^(INPUT|TEXTAREA|BUTTON)$/.test(event.target.tagName);
+    if (typing || event.ctrlKey || event.metaKey || event.altKey || !keys[event.key]) return;
+    const found = button(...keys[event.key]);
+    if (found) { event.preventDefault(); found.click(); }
+  });
+  addEventListener("click", (event) => {
+    const plot = event.target.closest?.("svg[data-seek]");
+    if (!plot) return;
+    const box = plot.getBoundingClientRect(), left = Number(plot.dataset.seek);
+    const share = ((event.clientX - box.left) / (box.width - 8) - left) / (1 - left);
+    if (share >= 0 && share <= 1) setTime(share);
+  });
+
+  // The address keeps what is seen, so that a link leads back to it.
+  setInterval(() => {
+    const state = document.querySelector("[data-link]")?.dataset.link;
+    if (state && location.hash !== "#" + state)
+      history.replaceState(null, "", location.search + "#" + state);
+  }, 500);
+
+  // Arrow keys that move a slider are not for the view as well.
+  addEventListener("DOMContentLoaded", () => document.body.addEventListener("keydown", (event) => {
+    if (event.target.getAttribute?.("role") === "slider") event.stopPropagation();
+  }));
+
+  // The page sends the mouse every 50 ms; a whisker follows faster.
+  const later = window.setTimeout.bind(window);
+  window.setTimeout = (job, delay, ...rest) => later(job, delay === 50 ? 16 : delay, ...rest);
+
+  // Smooth edges take four times the work: no more than what a graphics card does in passing, but
+  // most of a frame where there is none.
+  const plain = HTMLCanvasElement.prototype.getContext;
+  let slow = null;
+  const inSoftware = () => {
+    const gl = plain.call(document.createElement("canvas"), "webgl2");
+    const info = gl && gl.getExtension("WEBGL_debug_renderer_info");
+    const name = info ? String(gl.getParameter(info.UNMASKED_RENDERER_WEBGL)) : "";
+    if (gl) gl.getExtension("WEBGL_lose_context")?.loseContext();
+    return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
+  };
+  HTMLCanvasElement.prototype.getContext = function (kind, options, ...rest) {
+    if (options && options.antialias && kind.startsWith("webgl")) {
+      slow ??= inSoftware();
+      if (slow) options = { ...options, antialias: false };
+    }
+    return plain.call(this, kind, options, ...rest);
+  };
+
+  // Changes of what is there are taken in at once, not at the next frame, which would draw them
+  // only a frame later.
+  const changes = new Set([
+    "SceneNodeUpdateMessage", "SetPositionMessage", "SetOrientationMessage", "GuiUpdateMessage",
+    "SetSceneNodeVisibilityMessage",
+  ]);
+  const take = ({ type, messages }) => {
+    const page = window.__viserMutable;
+    if (type !== "message_batch" || !page || page.firstMessageBatch) return;
+    if (page.getRenderRequestState !== "ready" || !page.drainMessageQueue) return;
+    if (page.messageQueue.length !== messages.length) return;
+    if (messages.every((message) => changes.has(message.type))) page.drainMessageQueue();
+  };
+  window.Worker = class extends Worker {
+    set onmessage(heard) {
+      super.onmessage = (event) => { heard(event); take(event.data); };
+    }
+    get onmessage() { return super.onmessage; }
+  };
+
+  const furnish = () => {
+    const page = window.__viserMutable, root = page?.scene?.__r3f?.root?.getState?.();
+    if (!page?.backgroundMaterial || !root) return later(furnish, 100);
+    // A pane for background images is drawn over the whole window although there is no image.
+    page.scene.traverse((thing) => {
+      if (thing.material === page.backgroundMaterial) thing.visible = false;
+    });
+    // A mouse that drags, and whatever changes, asks for frames for a quarter of a second. Where
+    // each takes its time they would keep that from being drawn which they wait for.
+    if (!slow) return;
+    let ask = page.requestRender, last = 0;
+    const thrifty = () => {
+      const held = page.cameraControl?.enabled === false;  // something, not the view
+      if (!held || window.event?.type !== "pointermove") root.invalidate();
+      clearTimeout(last);
+      last = later(() => ask(), 150);
+    };
+    Object.defineProperty(page, "requestRender", { get: () => thrifty, set: (f) => { ask = f; } });
+  };
+  furnish();
+})();

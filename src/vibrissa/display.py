@@ -19,13 +19,7 @@ from vibrissa.sketch import BENT, CONTACT, MOST_CURVES, REST, Mark, card, table,
 
 
 class Shown:
-    """Something to look at: HTML in a notebook, text in a terminal.
-
-    Parameters
-    ----------
-    html, text : str
-        The same in both forms.
-    """
+    """Something to look at: HTML in a notebook, text in a terminal."""
 
     def __init__(self, html: str, text: str) -> None:
         self.html = html

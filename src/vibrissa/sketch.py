@@ -45,26 +45,12 @@ _NAME = ";white-space:nowrap"
 
 @dataclass(frozen=True)
 class Mark:
-    """Curves or points of one colour.
+    """Curves or points of one colour."""
 
-    Parameters
-    ----------
-    places : array_like (..., n, 3) or (n, 3)
-        m, in any one frame; what is NaN is left out.
-    colour : str
-        Colour, in any notation of CSS.
-    dots : bool
-        Points rather than curves.
-    width : float
-        Width of a line, or diameter of a dot, pixels.
-    label : str
-        Name in the legend; none by default.
-    """
-
-    places: ArrayLike
-    colour: str
+    places: ArrayLike  # (..., n, 3), m, in any one frame; what is NaN is left out
+    colour: str  # in any notation of CSS
     dots: bool = False
-    width: float = 1.5
+    width: float = 1.5  # of a line, or diameter of a dot, pixels
     label: str = ""
 
 

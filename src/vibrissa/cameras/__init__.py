@@ -3,8 +3,8 @@
 from vibrissa.cameras.calibration import calibrate
 from vibrissa.cameras.camera import PIXEL_SIZE, Camera, orthogonal_views
 from vibrissa.cameras.files import (
-    cameras_dataset,
-    cameras_from_dataset,
+    cameras_dataset as cameras_dataset,
+    cameras_from_dataset as cameras_from_dataset,
     load_cameras,
     save_cameras,
 )
@@ -14,8 +14,6 @@ __all__ = [
     "PIXEL_SIZE",
     "Camera",
     "calibrate",
-    "cameras_dataset",
-    "cameras_from_dataset",
     "load_cameras",
     "orthogonal_views",
     "save_cameras",

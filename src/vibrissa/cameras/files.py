@@ -120,18 +120,7 @@ def save_cameras(path: str | PathLike[str], cameras: Sequence[Camera], unit: flo
 
 
 def cameras_dataset(cameras: Sequence[Camera]) -> xr.Dataset:
-    """Write cameras as a dataset, the group ``cameras`` of a recording.
-
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        Cameras of the views.
-
-    Returns
-    -------
-    xarray.Dataset
-        Variables of all cameras over the dimension ``view``.
-    """
+    """Write cameras as a dataset, the group ``cameras`` of a recording."""
     return xr.Dataset(
         {
             name: (
@@ -147,18 +136,7 @@ def cameras_dataset(cameras: Sequence[Camera]) -> xr.Dataset:
 
 
 def cameras_from_dataset(dataset: xr.Dataset) -> tuple[Camera, ...]:
-    """Read the cameras that `cameras_dataset` wrote.
-
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        Variables of all cameras over the dimension ``view``.
-
-    Returns
-    -------
-    tuple of Camera
-        Cameras in the dataset's order.
-    """
+    """Read the cameras that `cameras_dataset` wrote."""
     return tuple(
         Camera(
             matrix=row["camera_matrix"].values,

@@ -1,6 +1,6 @@
 """From contact points to the object's contour, in the laboratory frame, without a solver."""
 
-from vibrissa.contour.comparison import axis_offset, compare_with, distances_by
+from vibrissa.contour.comparison import axis_offset as axis_offset, compare_with, distances_by
 from vibrissa.contour.drawing import Ellipsoids, ellipsoids, surface_grid
 from vibrissa.contour.fit import fit_shape
 from vibrissa.contour.fitted_shape import FittedShape, evidence_of as evidence_of
@@ -20,7 +20,6 @@ __all__ = [
     "FreeFit",
     "PlaneFit",
     "SphereFit",
-    "axis_offset",
     "compare_with",
     "continuing_candidates",
     "distances_by",

@@ -212,22 +212,7 @@ def _label(quantity: str, low: float, high: float) -> str:
 def axis_offset(
     origin: ArrayLike, axis: ArrayLike, true_origin: ArrayLike, true_axis: ArrayLike
 ) -> tuple[Array, float]:
-    """Offset and tilt of one axis relative to another.
-
-    Parameters
-    ----------
-    origin, axis : array_like (3,)
-        Point, m, and direction of the axis in question; the offset is that of this point.
-    true_origin, true_axis : array_like (3,)
-        Point and direction of the true axis.
-
-    Returns
-    -------
-    offset : array (3,)
-        Vector from the true axis to ``origin``, at right angles to the true axis, m.
-    tilt : float
-        Angle between the axes, rad, at most a quarter turn.
-    """
+    """Offset and tilt of one axis relative to another."""
     direction, true = (np.asarray(a, dtype=np.float64) for a in (axis, true_axis))
     direction, true = direction / np.linalg.norm(direction), true / np.linalg.norm(true)
     away = np.asarray(origin, dtype=np.float64) - np.asarray(true_origin, dtype=np.float64)

@@ -256,12 +256,7 @@ def _fitted(starts: Sequence[_Posed], given: Checked) -> SimpleShape:
 
 
 def _solid(best: _Posed, touches: Touches) -> _Posed:
-    """The shape of positive size that is as probable as a fit of negative size allows.
-
-    Equations with normals are linear in the radius and know no sign. A thin object may so have a
-    radius below zero within its standard deviation; then the mean of what is above zero is taken,
-    and the other parameters follow by their covariance with the radius.
-    """
+    """The shape of positive size that is as probable as a fit of negative size allows."""
     covariance, _, squares, equations = _uncertainty(best, touches)
     size, sigma = best.shape.size, float(np.sqrt(covariance[-1, -1]))
     contradicted = float(np.median(squares)) > _ALIKE * equations
@@ -278,10 +273,7 @@ def _solid(best: _Posed, touches: Touches) -> _Posed:
 
 
 def _scattered(starts: Sequence[_Posed], touches: Touches) -> tuple[Touches, Sequence[_Posed]]:
-    """Contacts with one covariance, the same in all directions, by how they scatter.
-
-    Also where to start from with it.
-    """
+    """Contacts with one covariance, the same in all directions, by how they scatter."""
     noise, n = _ROUGH, len(touches.position)
     for _ in range(_ROUNDS):
         alike = touches._replace(covariance=np.broadcast_to(noise**2 * np.eye(3), (n, 3, 3)))
@@ -328,10 +320,7 @@ def _best(starts: Sequence[_Posed], touches: Touches) -> _Posed:
 
 
 def _uncertainty(best: _Posed, touches: Touches) -> tuple[Array, float, Array, int]:
-    """Covariance of the parameters as stated, and by how much contacts scatter more than stated.
-
-    Also the squared miss of each contact, and the number of its equations.
-    """
+    """Covariance of the parameters as stated, and by how much contacts scatter more than stated."""
     solved = _solved(best, touches, most=1)
     design, z = np.asarray(solved.jac), np.asarray(solved.fun)
     size = np.linalg.norm(design, axis=0)

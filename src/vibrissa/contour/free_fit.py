@@ -190,10 +190,7 @@ def _across(normal: Array, covariance: Array) -> Array:
 def _with_deviation(
     base: SimpleShape, contacts: _Contacts, extent: float, most: int
 ) -> tuple[FreeFit, Array, Mask]:
-    """Fit the deviation from a base, again and again: with its slopes, without outliers.
-
-    Also gives the squared misses (n,), in standard deviations, and which contacts were used.
-    """
+    """Fit the deviation from a base, again and again: with its slopes, without outliers."""
     scale = min(extent, float(getattr(base, "radius", np.inf)))
     slope, inside, fit = _SLOPE, None, None
     for _ in range(_ROUNDS):

@@ -1,11 +1,14 @@
 """Identifiability: which signals locate a contact, critical cones, sensitivity."""
 
 from vibrissa.identifiability.cones import critical_cones
-from vibrissa.identifiability.proofs import cone_bracket, with_proved_witnesses
+from vibrissa.identifiability.proofs import (
+    cone_bracket as cone_bracket,
+    with_proved_witnesses as with_proved_witnesses,
+)
 from vibrissa.identifiability.sensitivity import best_triplet, sensitivity
 from vibrissa.identifiability.summary import (
     ENDINGS,
-    save_uniqueness,
+    save_uniqueness as save_uniqueness,
     verdict_rows as verdict_rows,
     verdict_table,
 )
@@ -15,12 +18,9 @@ from vibrissa.identifiability.witness_pair import witness_pairs
 __all__ = [
     "ENDINGS",
     "best_triplet",
-    "cone_bracket",
     "critical_cones",
-    "save_uniqueness",
     "sensitivity",
     "uniqueness",
     "verdict_table",
-    "with_proved_witnesses",
     "witness_pairs",
 ]

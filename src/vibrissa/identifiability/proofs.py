@@ -19,22 +19,7 @@ if TYPE_CHECKING:
 
 
 def with_proved_witnesses(contact_map: ContactMap, verdicts: xr.Dataset) -> xr.Dataset:
-    """Prove the witnesses of verdicts, for the continuous rod.
-
-    Parameters
-    ----------
-    contact_map : ContactMap
-        The whisker's map; of a rigid base.
-    verdicts : Dataset
-        Verdicts of :func:`vibrissa.uniqueness`.
-
-    Returns
-    -------
-    Dataset
-        The verdicts with ``witness_proved`` (triplet, region, witness), 1 where two stable contacts
-        certainly have the same signals, and ``witness_cone``, the smaller of their cone angles,
-        rad.
-    """
+    """Prove the witnesses of verdicts, for the continuous rod."""
     order = ("triplet", "region", "witness")
     s = verdicts["witness_arc_length"].transpose(*order, "pair").values
     force = verdicts["witness_contact_force"].transpose(*order, "pair", "component").values
@@ -58,23 +43,7 @@ def with_proved_witnesses(contact_map: ContactMap, verdicts: xr.Dataset) -> xr.D
 def cone_bracket(
     contact_map: ContactMap, certificate: Certificate, samples: int = SAMPLES
 ) -> tuple[float, float]:
-    """Bound the critical cone of (F_x, M_B, M_D): a proved witness below, a certificate above.
-
-    Parameters
-    ----------
-    contact_map : ContactMap
-        The whisker's map.
-    certificate : Certificate
-        Certificate of the whisker.
-    samples : int
-        Number of contacts whose twins are looked for.
-
-    Returns
-    -------
-    low, high : float
-        Largest cone angle of the proved witnesses that are found, 0 without any, and the cone of
-        the certificate, infinite where it does not prove anything; rad.
-    """
+    """Bound the critical cone of (F_x, M_B, M_D): a proved witness below, a certificate above."""
     high = certificate.cone if certificate.proved else np.inf
     if high == 0.0:
         return 0.0, 0.0

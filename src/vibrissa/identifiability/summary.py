@@ -160,21 +160,7 @@ def _surface(verdicts: xr.Dataset) -> str:
 
 
 def save_uniqueness(verdicts: xr.Dataset, path: str | PathLike[str]) -> None:
-    """Write verdicts with their evidence.
-
-    Parameters
-    ----------
-    verdicts : Dataset
-        Verdicts of :func:`vibrissa.uniqueness`.
-    path : str or path
-        File: ``.nc``, everything, as NetCDF; or ``.csv``, a row for each triplet and
-        region, the evidence in columns, angles in rad and lengths in m, of the witnesses the first.
-
-    Raises
-    ------
-    ValueError
-        If the file's ending is another one.
-    """
+    """Write verdicts with their evidence."""
     path = Path(path)
     check_writable(path, ENDINGS)
     if path.suffix == ".nc":

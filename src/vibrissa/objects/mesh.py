@@ -294,11 +294,7 @@ def _grid_distance(
 
 
 def _normals(vertices: Array, faces: Ints) -> tuple[Array, Array, Array]:
-    """Normals that tell inside from outside, by what a nearest point lies on.
-
-    Of vertices (n, 3), of the edge opposite of each corner of each triangle (m, 3, 3), and of
-    triangles (m, 3).
-    """
+    """Normals that tell inside from outside, by what a nearest point lies on."""
     triangles = vertices[faces]
     sides = np.roll(triangles, -1, axis=1) - triangles
     face = np.cross(sides[:, 0], sides[:, 1])

@@ -60,18 +60,10 @@ class Surface(ABC):
 
 
 class Placement(NamedTuple):
-    """Placement of the whisker's base in the surfaces' frame.
+    """Placement of the whisker's base in the surfaces' frame."""
 
-    Attributes
-    ----------
-    rotation : array (3, 3)
-        Rotation from the whisker's to the surfaces' frame.
-    position : array (3,)
-        Position of the base, m.
-    """
-
-    rotation: Array
-    position: Array
+    rotation: Array  # (3, 3), from the whisker's to the surfaces' frame
+    position: Array  # (3,), m
 
     def outside(self, points: Array) -> Array:
         """Points in the surfaces' frame."""

@@ -11,7 +11,11 @@ from vibrissa.paper.network import (
     with_network_errors,
 )
 from vibrissa.paper.sensitivity import central_differences, sensitivity_findings
-from vibrissa.paper.slices import error_solid, interpolation_errors, signal_slice
+from vibrissa.paper.slices import (
+    error_solid as error_solid,
+    interpolation_errors as interpolation_errors,
+    signal_slice,
+)
 
 __all__ = [
     "METHODS",
@@ -19,9 +23,7 @@ __all__ = [
     "NaturalNeighbour",
     "NetworkSolver",
     "central_differences",
-    "error_solid",
     "estimate",
-    "interpolation_errors",
     "sensitivity_findings",
     "signal_slice",
     "train_network",

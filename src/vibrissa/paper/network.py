@@ -42,17 +42,9 @@ _MARGIN = 2.0
 
 @dataclass(frozen=True, eq=False)
 class DrawnContacts:
-    """Random stable contacts.
+    """Random stable contacts."""
 
-    Attributes
-    ----------
-    contacts : (n, 3) array
-        Arc length and force across the whisker along d1 and d2, non-dimensional.
-    point, force, moment : (n, 3) arrays
-        Contact points and base force and moment, m, N and N·m.
-    """
-
-    contacts: Array
+    contacts: Array  # (n, 3), ξ
     point: Array
     force: Array
     moment: Array

@@ -116,29 +116,7 @@ def error_solid(
     stride: int = 3,
     interpolation: Interpolation = "natural",
 ) -> xr.Dataset:
-    """Look up contacts midway between those of the paper's grid, where its errors are largest.
-
-    Parameters
-    ----------
-    contact_map : ContactMap
-        Map with the paper's grid.
-    using : str or tuple of str
-        The three signals.
-    stride : int
-        Number of the grid's steps of azimuth and elevation from one contact to the next.
-    interpolation : {"natural", "linear"} or callable
-        Interpolation of the look-up.
-
-    Returns
-    -------
-    Dataset
-        Variables of :func:`vibrissa.sensitivity` at these contacts, with ``error_distance``, m.
-
-    Raises
-    ------
-    ValueError
-        If the map has no grid.
-    """
+    """Look up contacts midway between those of the paper's grid, where its errors are largest."""
     if contact_map.grid is None:
         raise ValueError("the map has no grid to interpolate: simulate it with grid=True")
     axes = [contact_map.grid[name].to_numpy() for name in ("r", "theta", "phi")]
@@ -155,24 +133,7 @@ def interpolation_errors(
     using: str | tuple[str, ...] = ("Fx", "MB", "MD"),
     interpolation: Interpolation = "natural",
 ) -> xr.DataArray:
-    """Look up contacts in the interpolated grid, and compare them with the true ones.
-
-    Parameters
-    ----------
-    contact_map : ContactMap
-        Map with the paper's grid.
-    contacts : Dataset
-        True contacts: ``contact_point`` with the signals used.
-    using : str or tuple of str
-        Three signals.
-    interpolation : {"natural", "linear"} or callable
-        Interpolation of the look-up.
-
-    Returns
-    -------
-    DataArray
-        Distances of the contact points, m; NaN outside the table.
-    """
+    """Look up contacts in the interpolated grid, and compare them with the true ones."""
     names = selection(using, exactly=3)
     values, dims, _ = measured(contacts, names)
     table = LookupTable.of(contact_map, names, near_rest=True, interpolation=interpolation)

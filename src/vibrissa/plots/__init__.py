@@ -2,32 +2,35 @@
 
 from vibrissa.plots.array import array_views
 from vibrissa.plots.bent import bent_views, witness_pair
-from vibrissa.plots.cameras import Sight, start_views as start_views
+from vibrissa.plots.cameras import Sight as Sight, start_views as start_views
 from vibrissa.plots.contact_surfaces import contact_surfaces
 from vibrissa.plots.contacts import contact_places
 from vibrissa.plots.contour import contour_views, distances_by_class
 from vibrissa.plots.estimates import estimated_against_true
 from vibrissa.plots.movies import contour_frames, signal_frames
-from vibrissa.plots.overview import key_frames, trial_overview
+from vibrissa.plots.overview import key_frames as key_frames, trial_overview
 from vibrissa.plots.sensitivity import sensitivity_panels
 from vibrissa.plots.signal_space import signal_clouds
 from vibrissa.plots.signals import signals_over_time as signals_over_time
 from vibrissa.plots.slices import solid_slices
 from vibrissa.plots.style import (
-    looking,
+    looking as looking,
     png,
     save,
     scale_of as scale_of,
-    sequential,
+    sequential as sequential,
 )
 from vibrissa.plots.sweep import drawable as drawable, sweep_overview as sweep_overview
-from vibrissa.plots.verdicts import HIGHLIGHTED, critical_cones, resolution, verdict_table
+from vibrissa.plots.verdicts import (
+    HIGHLIGHTED as HIGHLIGHTED,
+    critical_cones,
+    resolution,
+    verdict_table,
+)
 from vibrissa.plots.whisker import whisker_views
 from vibrissa.plots.windows import correct as correct, pick as pick
 
 __all__ = [
-    "HIGHLIGHTED",
-    "Sight",
     "array_views",
     "bent_views",
     "contact_places",
@@ -37,13 +40,10 @@ __all__ = [
     "critical_cones",
     "distances_by_class",
     "estimated_against_true",
-    "key_frames",
-    "looking",
     "png",
     "resolution",
     "save",
     "sensitivity_panels",
-    "sequential",
     "signal_clouds",
     "signal_frames",
     "solid_slices",

@@ -37,15 +37,7 @@ class _View(Protocol):
 
 
 class Sight(NamedTuple):
-    """One view of a trial.
-
-    Attributes
-    ----------
-    view : _View
-        The camera.
-    images : iterable of array (height, width)
-        8 bit grey images, one for each frame that is drawn.
-    """
+    """One view of a trial."""
 
     view: _View
     images: Iterable[Grey]
@@ -157,10 +149,7 @@ def start_views(
     names: Sequence[str],
     remarks: Sequence[str] = (),
 ) -> Figure:
-    """Draw what may be the whisker into an image of each view, numbered from the one that is taken.
-
-    Each candidate is its line in every view, and its confidence.
-    """
+    """Draw lines that may be the whisker, with their confidence, into an image of each view."""
     wide = (style.page_width("double") - _GAP * (len(images) - 1)) / len(images)
     heights = [wide * image.shape[0] / image.shape[1] for image in images]
     below = _LINE * len(remarks) + _GAP

@@ -64,10 +64,7 @@ def _draw_zero(axes: Axes, right: Array, up: Array, distance: Array, look: str) 
 
 
 def _nearest(body: Body, points: Array, limits: Array, depth: int) -> Array:
-    """Least distance from a body along lines of sight through points (m, m, 3), mm.
-
-    Finely only where the outline is near, as distances from some bodies take long to compute.
-    """
+    """Least distance from a body along lines of sight through points (m, m, 3), mm."""
     from scipy.interpolate import RegularGridInterpolator
 
     rough = np.arange(0, _CELLS, _COARSE)
@@ -84,11 +81,7 @@ def _nearest(body: Body, points: Array, limits: Array, depth: int) -> Array:
 
 
 def _marched(body: Body, points: Array, limits: Array, depth: int, deep: float) -> Array:
-    """Least distance from a body along lines of sight through points (n, 3), mm.
-
-    Lines that go as deep into the body as ``deep`` are followed no farther. The distance to a body
-    is also how far one may go without meeting it, so few steps lead past it.
-    """
+    """Least distance from a body along lines of sight through points (n, 3), mm."""
     start, end = limits[depth]
     least_step = 0.25 * deep
     points = points.copy()

@@ -40,19 +40,7 @@ class _Sheet(NamedTuple):
 
 
 def key_frames(course: Course) -> NDArray[np.intp]:
-    """Choose two frames in contact that show most of a trial.
-
-    Parameters
-    ----------
-    course : Course
-        The trial.
-
-    Returns
-    -------
-    array (2,) of int
-        Rising: where the whisker is bent most, and where most among the contacts to the other
-        side, if there are such, by M_D; without signals at a third and two thirds of the contacts.
-    """
+    """Choose two frames in contact that show most of a trial."""
     rows = np.flatnonzero(course.touching)
     if not rows.size:
         return np.array([0, len(course.time) - 1], dtype=np.intp)

@@ -113,11 +113,7 @@ LOOK: Mapping[str, Any] = MappingProxyType(
 
 
 class _StyledFigure(Figure):
-    """A figure that is drawn with the same settings with which it was made.
-
-    Ticks and their labels come into being only when a figure is drawn, and take the settings of
-    that moment; so without this they would look as whoever draws the figure likes them.
-    """
+    """A figure that is drawn with the same settings with which it was made."""
 
     above = 0.0
     """Height of what is written above the panels, mm."""
@@ -142,13 +138,7 @@ class _StyledFigure(Figure):
 
 
 def looking() -> AbstractContextManager[None]:
-    """Apply the look of these figures to Matplotlib as long as a ``with`` block lasts.
-
-    Returns
-    -------
-    context manager
-        Sizes of type, fonts and lines in force within the block.
-    """
+    """Apply the look of these figures to Matplotlib as long as a ``with`` block lasts."""
     settings: Any = dict(LOOK)
     return mpl.rc_context(settings)
 
@@ -251,10 +241,7 @@ def limits_around(points: Array, margin: float, narrowest: float) -> Array:
 def usable_rows(
     shade: Array | None, wanted: Mapping[str, tuple[Array | None, tuple[int, ...]]]
 ) -> NDArray[np.intp]:
-    """Find rows in which nothing is missing, those of the largest shade last, to be on top.
-
-    What is given, by name, must have the shape that is next to it.
-    """
+    """Find rows in which nothing is missing, those of the largest shade last, to be on top."""
     given = {name: (np.asarray(v), shape) for name, (v, shape) in wanted.items() if v is not None}
     faults = [
         f"{name} has shape {values.shape}; {shape} is needed"
@@ -389,13 +376,7 @@ def cyclic() -> Colormap:
 
 
 def sequential() -> Colormap:
-    """Make a colormap for what grows from one end, without the pale end lost on white paper.
-
-    Returns
-    -------
-    Colormap
-        Colours from the lowest to the highest value.
-    """
+    """Make a colormap for what grows from one end, without the pale end lost on white paper."""
     return ListedColormap(
         mpl.colormaps["viridis"](np.linspace(0.0, 0.93, 256)), name="vibrissa_sequential"
     )

@@ -121,11 +121,7 @@ def _views(
 
 
 def _tube(places: Array, radii: Array) -> Path:
-    """Outline of a tube seen from the side: what lies between its places, and discs at some.
-
-    A single path, so that overlaps leave no seams; all its parts run counter-clockwise, so that
-    they add up. Discs close the ends, and the joints where the tube turns or runs toward the eye.
-    """
+    """Outline of a tube seen from the side: what lies between its places, and discs at some."""
     step = np.diff(places, axis=0)
     length = np.hypot(*step.T)
     along = step / np.where(length > 0.0, length, 1.0)[:, None]

@@ -306,29 +306,13 @@ _CORNERS = 3
 
 @dataclass(frozen=True)
 class Picks:
-    """Clicks so far: a state, from which each click or key makes the next one.
-
-    Parameters
-    ----------
-    clicks : Clicks
-        Clicks that are complete.
-    mode : str
-        Meaning of a click: base, mask, region or length.
-    view : int
-        View of the points that are not complete.
-    points : tuple of (column, row)
-        Corners, or ends of a length, that are not complete, pixels.
-    typed : str
-        Length that is being typed, mm.
-    remark : str
-        Remark that is shown to the person.
-    """
+    """Clicks so far: a state, from which each click or key makes the next one."""
 
     clicks: Clicks
     mode: str = "base"
     view: int = 0
-    points: tuple[tuple[float, float], ...] = ()
-    typed: str = ""
+    points: tuple[tuple[float, float], ...] = ()  # column and row; not complete
+    typed: str = ""  # length, mm
     remark: str = ""
 
     def clicked(self, view: int, x: float, y: float) -> Picks:

@@ -23,125 +23,59 @@ Side = Literal["front", "back", "double"]
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A surface of one colour.
+    """A surface of one colour."""
 
-    Parameters
-    ----------
-    vertices : array (n, 3)
-        Corners that triangles share where the surface is smooth, mm.
-    faces : array (m, 3) of int
-        Vertices of each triangle.
-    colour : tuple of int
-        Red, green and blue, 0 to 255.
-    opacity : float, optional
-        Opacity from 0 to 1; opaque by default.
-    side : {"front", "back", "double"}
-        Sides that are drawn.
-    position : tuple of float
-        Shift of all vertices, mm.
-    """
-
-    vertices: Array
-    faces: Ints
+    vertices: Array  # (n, 3), mm, shared where the surface is smooth
+    faces: Ints  # (m, 3)
     colour: Colour
     opacity: float | None = None
     side: Side = "front"
-    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)  # shift of all vertices, mm
 
 
 @dataclass(frozen=True, eq=False)
 class Painted:
-    """A surface of many colours, or one that is large: it costs little to draw.
+    """A surface of many colours, or one that is large: it costs little to draw."""
 
-    Parameters
-    ----------
-    triangles : array (n, 3, 3)
-        Corners, mm.
-    colours : array (n, 3, 3) of uint8
-        Colours of the corners.
-    opacity : float, optional
-        Opacity from 0 to 1; opaque by default.
-    side : {"front", "back", "double"}
-        Sides that are drawn.
-    """
-
-    triangles: Array
-    colours: Bytes
+    triangles: Array  # (n, 3, 3), mm
+    colours: Bytes  # (n, 3, 3), of the corners
     opacity: float | None = None
     side: Side = "double"
 
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Points.
+    """Points."""
 
-    Parameters
-    ----------
-    points : array (n, 3)
-        Positions, mm.
-    colours : array (n, 3) of uint8
-        Colours of the points.
-    size : float
-        Width of each point, mm.
-    """
-
-    points: Array
-    colours: Bytes
-    size: float
+    points: Array  # (n, 3), mm
+    colours: Bytes  # (n, 3)
+    size: float  # width of a point, mm
 
 
 @dataclass(frozen=True, eq=False)
 class Arrows:
-    """Arrows that are drawn as one.
+    """Arrows that are drawn as one."""
 
-    Parameters
-    ----------
-    start, end : array (n, 3)
-        Ends of each, mm.
-    colours : array (n, 3) of uint8
-        Colours of the arrows.
-    thickness : float
-        Radius of the shafts, mm.
-    """
-
-    start: Array
+    start: Array  # (n, 3), mm
     end: Array
-    colours: Bytes
-    thickness: float
+    colours: Bytes  # (n, 3)
+    thickness: float  # radius of the shafts, mm
 
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """Straight pieces of one colour.
+    """Straight pieces of one colour."""
 
-    Parameters
-    ----------
-    pieces : array (n, 2, 3)
-        Ends of each, mm.
-    colour : tuple of int
-        Red, green and blue, 0 to 255.
-    width : float
-        Width, pixels.
-    """
-
-    pieces: Array
+    pieces: Array  # (n, 2, 3), ends of each, mm
     colour: Colour
-    width: float = 2.0
+    width: float = 2.0  # pixels
 
 
 @dataclass(frozen=True, eq=False)
 class Label:
-    """A few words.
+    """A few words."""
 
-    Parameters
-    ----------
-    position : array (3,)
-        Position of the lower left corner, mm.
-    text : str
-        Plain text.
-    """
-
-    position: Array
+    position: Array  # (3,), of the lower left corner, mm
     text: str
 
 

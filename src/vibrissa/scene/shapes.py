@@ -71,11 +71,7 @@ def sheet(grid: Array) -> tuple[Array, Ints]:
 
 
 def tube(line: Array, radius: Array, sides: int = _SIDES) -> tuple[Array, Ints]:
-    """Make a closed tube about a line.
-
-    Its sections do not twist: the normal of each is that of the one before, made perpendicular to
-    the tangent.
-    """
+    """Make a closed tube about a line."""
     tangents = np.gradient(line, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     normals = np.array(_transported(across(tangents[0])[0].tolist(), tangents.tolist()))

@@ -16,7 +16,13 @@ from vibrissa.sensors.sensor import (
     Sensor,
     component_noise as component_noise,
 )
-from vibrissa.sensors.stage import Stage, StageSweep, StageTouches, load_suspended, save_suspended
+from vibrissa.sensors.stage import (
+    Stage as Stage,
+    StageSweep as StageSweep,
+    StageTouches as StageTouches,
+    load_suspended as load_suspended,
+    save_suspended as save_suspended,
+)
 from vibrissa.sensors.stiffness import StiffnessFit, fit_stiffness
 from vibrissa.sensors.suspended import SuspendedWhisker, Touches as Touches
 from vibrissa.sensors.suspension import SuspensionCalibration, calibrate_suspension
@@ -32,9 +38,6 @@ __all__ = [
     "MixingCalibration",
     "Sensor",
     "SensorFrame",
-    "Stage",
-    "StageSweep",
-    "StageTouches",
     "StiffnessFit",
     "SuspendedWhisker",
     "SuspensionCalibration",
@@ -48,8 +51,6 @@ __all__ = [
     "fit_stiffness",
     "follow_sweep",
     "load_sensor",
-    "load_suspended",
     "save_sensor",
-    "save_suspended",
     "tare",
 ]

@@ -78,61 +78,25 @@ _AT_BASE = 1e-6
 
 
 class StageTouches(NamedTuple):
-    """Touches of a table.
+    """Touches of a table."""
 
-    Attributes
-    ----------
-    points : (n, 3) array
-        Contact points, sensor frame, m.
-    readings : (n, k) array
-        Readings of the channels.
-    rest : (k,) array or None
-        Readings of the free whisker: as stated, or the median of those with the probe at the base.
-    drift : (k,) array
-        Standard deviation of what readings change by from one recording to the next: as stated, or
-        the change of those with the probe at the base from the stated rest; else zero.
-    """
-
-    points: Array
+    points: Array  # (n, 3), sensor frame, m
     readings: Array
-    rest: Array | None
-    drift: Array
+    rest: Array | None  # as stated, or the median of those with the probe at the base
+    drift: Array  # standard deviation from one recording to the next; zero where not known
 
 
 class StageSweep(NamedTuple):
-    """A sweep of a table.
-
-    Attributes
-    ----------
-    readings : (n, k) array
-        Readings of the channels.
-    position : (n, 3) array
-        Positions of the sensor's origin in the frame of what is touched, m.
-    rotation : (3, 3) array
-        Rotation from the sensor's frame to it.
-    """
+    """A sweep of a table."""
 
     readings: Array
-    position: Array
-    rotation: Array
+    position: Array  # (n, 3), of the sensor's origin in the frame of what is touched, m
+    rotation: Array  # (3, 3), from the sensor's frame to it
 
 
 @dataclass(frozen=True)
 class Stage:
-    """Description of a stage's tables.
-
-    Parameters
-    ----------
-    text : str
-        Description, TOML.
-    folder : Path
-        Folder of its files.
-
-    Raises
-    ------
-    ValueError
-        If it is not TOML, or has unknown keys or units.
-    """
+    """Description of a stage's tables."""
 
     text: str
     folder: Path = Path()
@@ -153,18 +117,7 @@ class Stage:
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Stage:
-        """Read a description.
-
-        Parameters
-        ----------
-        path : str or path
-            TOML file.
-
-        Returns
-        -------
-        Stage
-            Description of the stage.
-        """
+        """Read a description."""
         with in_file(path):
             return cls(read_text(path), Path(path).parent)
 
@@ -202,13 +155,7 @@ class Stage:
         return values[:, [known.index(name) for name in names]]
 
     def touches(self) -> StageTouches:
-        """Touches of the whisker at known points.
-
-        Returns
-        -------
-        StageTouches
-            Points and readings of the contacts, the readings at rest, and their drift.
-        """
+        """Touches of the whisker at known points."""
         own = subtable(self._table, "touches")
         position = self._columns(own.get("file"), _names(self._table, "position"))
         readings = self._columns(own.get("file"), self.channels)
@@ -229,13 +176,7 @@ class Stage:
         return StageTouches(points[touched], readings[touched], free, drift)
 
     def whisker(self) -> Whisker:
-        """Whisker at rest, in the sensor's frame, its base at the origin.
-
-        Returns
-        -------
-        Whisker
-            Whisker through the points of the shape.
-        """
+        """Whisker at rest, in the sensor's frame, its base at the origin."""
         shapes = self._table.get("shape", [])
         if not shapes:
             raise ValueError("[[shape]] is missing: points along the whisker at rest are needed")
@@ -276,18 +217,7 @@ class Stage:
         return dict(zip(columns, self._unit * (values - values[0]).T, strict=True))
 
     def sweep(self, path: str | PathLike[str]) -> StageSweep:
-        """Read a sweep.
-
-        Parameters
-        ----------
-        path : str or path
-            Table with the columns of the stage and of the channels.
-
-        Returns
-        -------
-        StageSweep
-            Readings, and the poses of the sensor.
-        """
+        """Read a sweep."""
         own = subtable(self._table, "sweep")
         moves = own.get("moves", "sensor")
         if moves not in ("sensor", "object"):
@@ -331,17 +261,7 @@ def _read_off(known: Array, values: Array, wanted: Array, name: str) -> Array:
 def save_suspended(
     path: str | PathLike[str], calibration: SuspensionCalibration, stage: Stage
 ) -> None:
-    """Write a calibrated sensor that `load_suspended` reads.
-
-    Parameters
-    ----------
-    path : str or path
-        NetCDF file; an existing one is replaced.
-    calibration : SuspensionCalibration
-        Calibration.
-    stage : Stage
-        Description of the tables that sweeps come in.
-    """
+    """Write a calibrated sensor that `load_suspended` reads."""
     sensor = calibration.sensor
     channel, unknown = ("channel", list(sensor.channels)), ("unknown", list(calibration.names))
     data = xr.Dataset(
@@ -376,25 +296,7 @@ KIND = "suspended whisker"
 
 
 def load_suspended(path: str | PathLike[str]) -> tuple[SuspendedWhisker, Stage]:
-    """Read a calibrated sensor, and the description of its stage's tables.
-
-    Parameters
-    ----------
-    path : str or path
-        NetCDF file of `save_suspended`.
-
-    Returns
-    -------
-    sensor : SuspendedWhisker
-        Calibrated sensor.
-    stage : Stage
-        Description of the tables that sweeps come in.
-
-    Raises
-    ------
-    ValueError
-        If it is another file.
-    """
+    """Read a calibrated sensor, and the description of its stage's tables."""
     data = read_dataset(path) if is_netcdf(path) else xr.Dataset()
     if data.attrs.get("kind") != KIND:
         raise ValueError(f"{path} holds no calibrated suspended whisker; `vibrissa calibrate` does")

@@ -378,10 +378,7 @@ class _Problem:
 
 
 def _weights(features: Array, readings: Array) -> _Weights:
-    """Weights of the features without the constant; of all but rotations with a ridge.
-
-    The ridge of each channel is the one that makes its readings most probable.
-    """
+    """Weights of the features without the constant; of all but rotations with a ridge."""
     design = features[:, 1:]
     n = len(design)
     scale = np.sqrt((design**2).mean(axis=0))

@@ -5,10 +5,10 @@ from vibrissa.simulation.dynamics_fit import FittedDynamics, fit_dynamics
 from vibrissa.simulation.film import (
     ImageConditions,
     film,
-    film_frames,
+    film_frames as film_frames,
     silhouette as silhouette,
-    views_of,
-    with_true_traces,
+    views_of as views_of,
+    with_true_traces as with_true_traces,
 )
 from vibrissa.simulation.held import inertial_wrench as inertial_wrench
 from vibrissa.simulation.motion import (
@@ -39,15 +39,12 @@ __all__ = [
     "array_whisking",
     "facing_peg",
     "film",
-    "film_frames",
     "fit_dynamics",
     "head_path",
     "measure",
     "simulate",
     "sweep_past",
     "tabulated",
-    "views_of",
     "whisking",
-    "with_true_traces",
     "within_reach",
 ]

@@ -160,21 +160,7 @@ class ImageConditions:
 
 
 def views_of(recording: xr.DataTree, pixel_size: float | None = None) -> tuple[Camera, Camera]:
-    """Cameras of the paper, pointed at the middle of the space that a trial's whiskers sweep.
-
-    Parameters
-    ----------
-    recording : xarray.DataTree
-        Recording of a simulated trial.
-    pixel_size : float, optional
-        Size of a pixel in the object plane, m; by default 58 µm, or for several whiskers as large
-        as is needed to see all.
-
-    Returns
-    -------
-    tuple of Camera
-        Top and front view.
-    """
+    """Cameras of the paper, pointed at the middle of the space that a trial's whiskers sweep."""
     lines = _truth(recording)["centerline"].values
     low, high = np.nanmin(lines, axis=(0, 1, 2)), np.nanmax(lines, axis=(0, 1, 2))
     # A whole tenth of a millimetre is easier to note.
@@ -250,24 +236,7 @@ def film_frames(
     *,
     seed: int = 0,
 ) -> Iterator[Frame]:
-    """Frames of a simulated trial, filmed with one camera.
-
-    Parameters
-    ----------
-    recording : xarray.DataTree
-        Recording of `simulate`.
-    camera : Camera
-        Camera that films it.
-    conditions : ImageConditions, optional
-        Light, blur and noise of the images.
-    seed : int
-        Seed of the noise.
-
-    Yields
-    ------
-    array (height, width) of uint8
-        Image of each frame.
-    """
+    """Frames of a simulated trial, filmed with one camera."""
     conditions = conditions or ImageConditions()
     truth = _truth(recording)
     lines = truth["centerline"].values
@@ -365,20 +334,7 @@ def _to_the_left(line: Array) -> Array:
 
 
 def with_true_traces(recording: xr.DataTree, cameras: Sequence[Camera]) -> xr.DataTree:
-    """Recording with the true traces of a simulated trial in the images of cameras.
-
-    Parameters
-    ----------
-    recording : xarray.DataTree
-        Recording of `simulate`.
-    cameras : sequence of Camera
-        Cameras that film it.
-
-    Returns
-    -------
-    xarray.DataTree
-        New recording, as of `film`.
-    """
+    """Recording with the true traces of a simulated trial in the images of cameras."""
     truth = _truth(recording)
     line = Group(truth)["centerline"]
     objects = Recording(recording).objects
@@ -409,11 +365,7 @@ def _truth(recording: xr.DataTree) -> xr.Dataset:
 
 
 def _moves(lines: Array, time: Array, exposure: float) -> Array:
-    """Displacement of each node while the shutter is open, (time, whisker, node, 3), m.
-
-    That toward the frame before or after, whichever is shorter, so that a whisker that springs
-    free is not smeared over the length of its jump.
-    """
+    """Displacement of each node while the shutter is open, (time, whisker, node, 3), m."""
     if len(lines) < 2:
         return np.zeros_like(lines)
     step = np.diff(lines, axis=0) / np.diff(time)[:, None, None, None]

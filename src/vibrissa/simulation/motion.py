@@ -353,10 +353,7 @@ def shared_whisking(
     position_drift: float = 0.0,
     **motion: Any,
 ) -> Motion:
-    """Whisking about rest, as all whiskers of an array share it; the azimuth is from rest.
-
-    An amplitude of 0 holds the whiskers still, except for drifts.
-    """
+    """Whisking about rest, as all whiskers of an array share it; the azimuth is from rest."""
     return whisking(
         duration,
         rate,

@@ -131,29 +131,11 @@ _PER_COMPONENT = ("noise", "bias", "drift", "resolution")
 
 @dataclass(frozen=True, eq=False)
 class Script:
-    """Whiskers, objects, motion and sensor of a trial.
-
-    Attributes
-    ----------
-    whisker : Whisker or WhiskerArray
-        Whisker, or whiskers of a face.
-    objects : tuple of Surface
-        Objects in the laboratory.
-    motion : Motion or mapping of str to Motion
-        Motion of the base, or of each base by the whisker's name.
-    friction : float
-        Coulomb's coefficient between whisker and objects.
-    sensor : Sensor
-        Sensor at the base.
-    seed : int
-        Seed of drifts and noise.
-    dynamics : Dynamics, optional
-        Inertia and damping.
-    """
+    """Whiskers, objects, motion and sensor of a trial."""
 
     whisker: Whisker | WhiskerArray
     objects: tuple[Surface, ...]
-    motion: Motion | Mapping[str, Motion]
+    motion: Motion | Mapping[str, Motion]  # of each base by the whisker's name
     friction: float
     sensor: Sensor
     seed: int

@@ -68,21 +68,11 @@ a jump and as a kink."""
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """A piecewise polynomial function of arc length.
+    """A piecewise polynomial function of arc length."""
 
-    Parameters
-    ----------
-    knots : array (m + 1,)
-        Interval ends, m, increasing.
-    coefficients : array (k + 1, m, ...)
-        Coefficients of τ^0 … τ^k on each interval, in the unit of the function.
-    error : float
-        Largest error found when the profile was made, relative to its largest value.
-    """
-
-    knots: Array
-    coefficients: Array
-    error: float = 0.0
+    knots: Array  # (m + 1,), interval ends, m, rising
+    coefficients: Array  # (k + 1, m, ...), of τ^0 … τ^k, in the unit of the function
+    error: float = 0.0  # relative to its largest value
 
     def __post_init__(self) -> None:
         """Take read-only copies and check that they fit together."""
@@ -384,10 +374,7 @@ def _jumps(s: Array, r: Array) -> NDArray[np.intp]:
 
 
 def _noise(differences: Array, r: Array) -> Array:
-    """Standard deviations of differences, most of which may be jumps, at radii r.
-
-    Noise may be as large everywhere, or as large a share of the radius: the larger counts.
-    """
+    """Standard deviations of differences, most of which may be jumps, at radii r."""
     same, share = np.quantile(np.abs([differences, differences / r]), 0.25, axis=1) / _QUARTILE
     noise: Array = np.maximum(same, share * r)
     return noise

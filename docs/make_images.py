@@ -24,6 +24,7 @@ from vibrissa.contour import compare_with, distances_by, shape_from_dataset
 from vibrissa.identifiability import critical_cones, witness_pairs
 from vibrissa.paper import error_solid, signal_slice
 from vibrissa.pipeline import with_contour, with_estimates
+from vibrissa.plots import style
 from vibrissa.recording import Recording
 from vibrissa.scene import course_of, deflection_angles
 from vibrissa.signals import nearest_on_rest
@@ -276,9 +277,12 @@ def save(figure: Figure | np.ndarray | list[np.ndarray], path: Path) -> None:
             Image.fromarray(frame[..., :3]).resize(SMALL, Image.Resampling.LANCZOS)
             for frame in figure
         ]
-        # One palette, of the first and the last, so that nothing flickers.
-        both = Image.fromarray(np.concatenate([np.asarray(frames[k]) for k in (0, -1)]))
-        palette = both.quantize(128, Image.Quantize.FASTOCTREE)
+        # One palette, so that nothing flickers: greys for films, the colours of time, and red.
+        grey = np.linspace(0.0, 1.0, 64)[:, None] * np.ones(3)
+        bright = np.vstack([style.sequential()(np.linspace(0.0, 1.0, 30))[:, :3], [[0.85, 0, 0]]])
+        colours = [grey, *(share * bright + 1.0 - share for share in (1.0, 0.5)), 0.5 * bright[-1:]]
+        palette = Image.new("P", (1, 1))
+        palette.putpalette((255 * np.vstack(colours)).round().astype(int).ravel().tolist())
         first, *others = [frame.quantize(palette=palette, dither=0) for frame in frames]
         times = [120] * len(others) + [3000]  # ms; the whole contour stays
         how = {"save_all": True, "append_images": others, "duration": times, "loop": 0}

@@ -232,6 +232,9 @@ def test_files_of_the_wrong_kind(monkeypatch, capsys, folder, table, chart):
     few = folder / "few.csv"
     few.write_text("time,Fx_uN,MB_uNm,MD_deg\n0,-100,2,45\n")
     assert f"vibrissa estimate {few} --using Fx,MB,MD" in run("info", few).replace("\n", "")
+    few.write_text("Fx_uN,MB_uNm,MD_deg\n" + 2 * "-100,2,45\n")
+    assert "numbered from 0" in run("estimate", few, "--map", chart, "-o", folder / "few-out.csv")
+    assert load_contacts(folder / "few-out.csv")["time"].values.tolist() == [0.0, 1.0]
     both = ("--map", chart, "--whisker", table[0])
     assert "either --map" in fault(monkeypatch, capsys, "estimate", table[0], *both)
     triplet = ("--using", "Fx,MB")

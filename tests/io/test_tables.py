@@ -138,6 +138,15 @@ def test_missing_cells_and_columns_that_are_something_else(tmp_path):
     np.testing.assert_array_equal(signals["moment"], [[np.nan, 1e-8, np.nan]])
 
 
+def test_rows_without_time_are_numbered(tmp_path):
+    names = HEADER.removeprefix("time,")
+    signals = load_signals(written(tmp_path, names + "\n" + 2 * "1e-6,2e-6,0,0,1e-8,3e-8\n"))
+    np.testing.assert_array_equal(signals["time"], [0.0, 1.0])
+    np.testing.assert_array_equal(signals["force"][1], [1e-6, 2e-6, 0.0])
+    np.testing.assert_array_equal(signals["moment"][1], [0.0, 1e-8, 3e-8])
+    assert "numbered from 0" in signals.attrs["notes"][0]
+
+
 def test_time_that_does_not_rise_is_told(tmp_path):
     rows = "".join(f"{time},1e-6,0,0,1e-8,0,0\n" for time in (0, 1, 1, "", 2, 0))
     signals = load_signals(written(tmp_path, HEADER + "\n" + rows))

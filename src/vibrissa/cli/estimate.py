@@ -312,6 +312,9 @@ def _from_lines(
     if faults or not records:
         raise ValueError(f"{signals}: {'; '.join(faults[:_SHOWN]) or 'there are no samples'}")
     columns = {name: [one.get(name, float("nan")) for one in records] for name in _NUMBERS}
+    if running.untimed:
+        columns["time"] = [float(row) for row in range(len(records))]
+        remark(f"{signals}: {vb.io.NUMBERED}")
     statuses = [int(vb.Status[one["status"].upper()]) for one in records]
     found = xr.Dataset({name: ("time", values) for name, values in columns.items()})
     vb.io.save_contacts(target, found.assign(status=("time", statuses)))

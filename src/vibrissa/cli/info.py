@@ -66,6 +66,11 @@ def _installation() -> Iterator[tuple[str, str]]:
     yield "kernels", f"cached in {folder}" if folder else "compiled anew in every run"
 
 
+def _size(path: Path) -> str:
+    size = path.stat().st_size
+    return f"{size / 1e3:.3g} kB" if size < 1e6 else f"{size / 1e6:.3g} MB"
+
+
 def _file(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
     if path.is_dir():
         yield from _array(path, "folder of centrelines")
@@ -75,7 +80,7 @@ def _file(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
     if kind == vb.io.Kind.RECORDING:
         yield from _recording(path, whole)
         return
-    yield "file", f"{path}, {path.stat().st_size / 1e6:.3g} MB"
+    yield "file", f"{path}, {_size(path)}"
     if _is_sensor(path):
         yield from _sensor(path)
         return
@@ -107,7 +112,7 @@ def _recording(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
     names = ", ".join(found.whiskers[:_SHOWN]) + (", …" if len(found.whiskers) > _SHOWN else "")
     yield (
         "what",
-        f"vibrissa recording, {found.origin}, {path.stat().st_size / 1e6:.3g} MB; "
+        f"vibrissa recording, {found.origin}, {_size(path)}; "
         f"{'whisker' if one else f'whiskers {len(found.whiskers)}'}: {names}",
     )
     rate = f" at {found.frames / found.duration:g} a second" if found.duration else ""

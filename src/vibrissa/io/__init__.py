@@ -65,7 +65,12 @@ from vibrissa.io.rosbag import (
     bag_wrenches as bag_wrenches,
     is_bag as is_bag,
 )
-from vibrissa.io.signals_table import check_scale as check_scale, load_signals, save_signals
+from vibrissa.io.signals_table import (
+    NUMBERED as NUMBERED,
+    check_scale as check_scale,
+    load_signals,
+    save_signals,
+)
 from vibrissa.io.table import (
     cells_of as cells_of,
     delimiter_of as delimiter_of,

@@ -34,6 +34,9 @@ from vibrissa.whisker import Whisker
 COLUMNS = ("time", "Fx", "Fy", "Fz", "Mx", "My", "Mz")
 """Names of the columns, in the order in which they are written."""
 
+NUMBERED = "there is no time, so the rows are numbered from 0 in its column"
+"""Note on a table without time."""
+
 _KINDS = {"t": "time", "F": "force", "M": "moment"}
 # What a wire of steel as thick as a finger holds.
 _LARGEST = {"F": (1e4, "N"), "M": (1e3, "N·m")}
@@ -56,14 +59,18 @@ def load_signals(path: str | PathLike[str]) -> xr.Dataset:
     -------
     xarray.Dataset
         Dims time, space: ``force``, N, and ``moment``, N·m, in the whisker's frame at its base.
-        The attribute ``notes``, if there, states where time does not increase.
+        Rows of a CSV without time are numbered from 0 instead. The attribute ``notes``, if there,
+        states that, or where time does not increase.
     """
     path = Path(path)
     table = _netcdf(path) if is_netcdf(path) else _csv(path)
+    notes = _notes(table[:, 0])
+    if np.isnan(table[:, 0]).all():
+        table[:, 0], notes = np.arange(len(table)), [NUMBERED]
     _check_time(path, table[:, 0])
     _check_magnitudes(path, table)
     _check_lever_arm(path, table)
-    return _dataset(table).assign_attrs(notes=_notes(table[:, 0]))
+    return _dataset(table).assign_attrs(notes=notes)
 
 
 def _notes(time: Array) -> list[str]:
@@ -146,13 +153,14 @@ def _csv(path: Path) -> Array:
     values = read_rows(path, iter(later), len(names), columns)
     if not len(values):
         raise ValueError(f"{path} has a header but no rows")
-    return values * factors
+    timed = len(columns) == len(COLUMNS)
+    return values * factors if timed else np.insert(values * factors, 0, np.nan, axis=1)
 
 
 def _columns(path: Path, header: list[str]) -> tuple[list[int], Array]:
     """Find each column and its unit; all that is wrong with the header is one error."""
     found, strange = signal_columns(header, COLUMNS)
-    missing = [name for name in COLUMNS if name not in found and name not in strange]
+    missing = [name for name in COLUMNS[1:] if name not in found and name not in strange]
     faults = [f"it lacks {', '.join(missing)}"] if missing else []
     if strange:
         cells = [cell for columns in strange.values() for cell in columns]
@@ -167,7 +175,7 @@ def _columns(path: Path, header: list[str]) -> tuple[list[int], Array]:
             f"{path} is not a table of signals: {'; '.join(faults)}. It has the columns {got}; "
             f"{', '.join(COLUMNS)} are needed, in SI units or with one as in Fx_mN"
         )
-    places = [found[name] for name in COLUMNS]
+    places = [found[name] for name in COLUMNS if name in found]
     twice = [header[place] for place, _ in places if header.count(header[place]) > 1]
     if twice:
         raise ValueError(f"{path} has the column {', '.join(twice)} more than once")

@@ -114,7 +114,7 @@ def sensitivity_panels(data: xr.Dataset, *, width: style.Width = "double") -> Fi
 
 
 def _finding(contacts: _Contacts) -> str:
-    """State how much more the distance of a contact depends on signals that are small."""
+    """State how the median slope in the fifth of smallest signals exceeds that of the largest."""
     kept, parts = contacts.weight > 0.0, []
     for name in (n for n in contacts.signals if n not in DIRECTIONS):
         size = np.abs(contacts.signals[name][kept])
@@ -126,13 +126,10 @@ def _finding(contacts: _Contacts) -> str:
         ]
         if min(medians) > 0.0:
             symbol = rf"$\partial r/\partial {quantity(name).symbol}$"
-            parts.append(f"{symbol} {medians[0] / medians[1]:.0f} times")
+            parts.append(f"{symbol} is {medians[0] / medians[1]:.0f} times")
     if not parts:
         return ""
-    return (
-        f"Contacts with the fifth of smallest signals have {' and '.join(parts)} as large as those "
-        "with the largest"
-    )
+    return f"Light contacts are the hardest to locate: {' and '.join(parts)} that of strong ones"
 
 
 def _contacts(data: xr.Dataset) -> _Contacts:

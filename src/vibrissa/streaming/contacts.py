@@ -66,8 +66,9 @@ class ContactStream:
 
     Attributes
     ----------
-    samples, faults : int
-        Numbers of samples so far, and of lines that could not be read.
+    samples, faults, untimed : int
+        Numbers of samples so far, of lines that could not be read, and of samples without a time,
+        which get that of the clock.
     statuses, events : Counter
         Numbers of samples by status, and by event.
     poses : Poses
@@ -107,7 +108,7 @@ class ContactStream:
         self._headers = 0
         self.poses = poses or Poses()
         self.laboratory = ""
-        self.slow = 0
+        self.slow, self.untimed = 0, 0
         self._tare = tare
         self._free: list[Array] = []
         self._offset: Array | float = 0.0
@@ -194,6 +195,7 @@ class ContactStream:
         ValueError
             If the estimator or the filter refuses it.
         """
+        self.untimed += sample.time is None
         time = clock.monotonic() - self._begun if sample.time is None else sample.time
         # After a header time may begin anew by less; senders also repeat it, as nothing is sure to
         # arrive by UDP.

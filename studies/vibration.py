@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 import vibrissa as vb
 from vibrissa.pipeline import estimates_of, with_signals
-from vibrissa.sensors import MOMENT_NOISE
+from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE, component_noise
 from vibrissa.simulation import Dynamics, Vibration, facing_peg, measure, simulate, sweep_past
 
 GAMMA = vb.samples.gamma()
@@ -33,6 +33,7 @@ TRIALS = {
 HEAD = ("trial", "touching", "M_B > 5σ: false, %", "false, %", "found, %", "onset late, ms")
 BY_AGE = {"all": (0, 999), "0–8 ms": (0, 8), "8–20 ms": (8, 20), "later": (20, 999)}
 HEAD_ERRORS = ("trial", "inertia", *BY_AGE, "in 95 % region", "located")
+NOISE = component_noise(FORCE_NOISE, MOMENT_NOISE)
 STRONG = 20e-6
 """Contact force from which errors of contact points are compared, N."""
 
@@ -54,7 +55,7 @@ def shares(name, whisker, trial, truth):
     wrench = np.concatenate([data.force.values, data.moment.values], axis=1)
     pose = (data.base_rotation.values, data.base_position.values)
     vibration = Vibration.of(whisker)
-    found = vibration.in_contact(data.time.values, wrench, *pose, MOMENT_NOISE)
+    found = vibration.in_contact(data.time.values, wrench, *pose, NOISE)
     bare = np.hypot(wrench[:, 4], wrench[:, 5]) > 5.0 * MOMENT_NOISE
     # Onsets after some quiet: how long until the frame is called contact.
     onsets = [i for i in np.flatnonzero(np.diff(touching.astype(int)) == 1) + 1 if i > 5]

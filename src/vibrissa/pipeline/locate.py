@@ -347,7 +347,8 @@ class _Measured(NamedTuple):
         free = known & ~force.any(axis=1) & ~moment.any(axis=1)
         if "in_contact" in wrench:
             touching = Group(wrench)["in_contact"]
-            rows &= touching
+            # Without inertia frames of contact are those that vibration does not explain.
+            rows = known & touching if "density" in wrench.attrs else rows & touching
             free |= known & ~touching
         # Where no contact is detected, of the frames in which one could have been.
         possible = rows if rows.any() else known & ~free
@@ -428,7 +429,11 @@ def _located(
     normals = contact_normals(whisker, *flat).reshape(*shape, 3)
     point_gain = gain[..., :3, :]
     spread = point_gain @ measured.covariance[rows][:, None] @ np.swapaxes(point_gain, -1, -2)
-    if stated is not None and measured.steady:
+    if not measured.steady:
+        # To second order in errors that bend with the whisker, over its length.
+        size = np.einsum("ncii->nc", spread) / whisker.length
+        spread = spread + size[..., None, None] ** 2 * np.eye(3)
+    elif stated is not None:
         first = spread[:, : stated.shape[1]]
         first[:] = np.where(np.isfinite(stated), stated, first)
     status = np.where(measured.known, int(Status.NOT_FELT), int(Status.MISSING)).astype(np.int8)

@@ -33,6 +33,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
@@ -464,8 +465,14 @@ def signals_by_point(
     return data.assign({name: recorded(name, square) for name, square in squares.items()})
 
 
-_ROUNDS = 3
+_ROUNDS = 2
 """Number of corrections."""
+
+_ALONG = np.array([1.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+"""Components of the wrench along the whisker at its base."""
+
+_SETTLED = 10e-3
+"""Age of a contact from which a held chain is nearer, s."""
 
 _KNOWN_TO = 0.2
 """Relative standard deviation of mass and damping."""
@@ -473,14 +480,15 @@ _KNOWN_TO = 0.2
 _STIFFNESS_KNOWN_TO = 0.1
 """Relative standard deviation of the stiffness, by which ringing also shows the mass."""
 
-_LEFT = 0.1
-"""Error that vibrations leave, as a share of the correction's root mean square."""
+_APART, _LEFT = 0.3, 0.15
+"""Error as a share of how far two ways are apart, and of the root mean square of that and of the
+correction."""
 
 _SLIPS = 2.0
 """Contact force from which contact points must be wrong, over the largest that is measured."""
 
-_MEMORY = 8e-3
-"""Time over which that is taken, s."""
+_MEMORY = 4e-3
+"""Standard deviation of the window in which that is taken, s."""
 
 _SMOOTH = 3e-3
 """Standard deviation of the window in which contact points are smoothed, s."""
@@ -524,13 +532,12 @@ def without_inertia(
     """Signals of one whisker without its inertia and damping, which are attributes."""
     trial, known = _trial(own, whisker, noise)
     course = trial.time, trial.wrench, trial.rotation, trial.position
-    sigma = float(np.sqrt(0.5 * (noise[4, 4] + noise[5, 5])))
     if dynamics == "fitted":
         dynamics = fit_dynamics(
-            whisker, *course, sigma, stiffness_sigma=_STIFFNESS_KNOWN_TO
+            whisker, *course, noise, stiffness_sigma=_STIFFNESS_KNOWN_TO
         ).dynamics
-    trial = trial._replace(touching=Vibration.of(whisker, dynamics).in_contact(*course, sigma))
-    added, change = _added(trial, dynamics)
+    trial = trial._replace(touching=Vibration.of(whisker, dynamics).in_contact(*course, noise))
+    added, apart = _added(trial, dynamics)
     left = trial.wrench - added
     left[~known] = np.nan
     touching = trial.touching & known
@@ -538,7 +545,7 @@ def without_inertia(
     status[~known] = int(Status.MISSING)
     values = {"force": left[:, :3], "moment": left[:, 3:], "in_contact": touching}
     values |= {"base_position": trial.position, "base_rotation": trial.rotation}
-    covariance = trial.noise + _uncertainty(added, change, trial.step)
+    covariance = trial.noise + _uncertainty(added, apart, trial.step)
     about = {"density": dynamics.density, "damping_ratio": dynamics.damping_ratio}
     covariances = recorded("wrench_covariance", covariance)
     return one_whisker(values, status).assign(wrench_covariance=covariances).assign_attrs(about)
@@ -570,26 +577,33 @@ def _trial(own: Group, whisker: Whisker, noise: Array) -> tuple[_Trial, NDArray[
 
 
 def _added(trial: _Trial, dynamics: Dynamics) -> tuple[Array, Array]:
-    """Wrench (n, 6) that inertia and damping add, and its change in the last round."""
-    # The whisker's bending lags behind the moment by the time constant of its damping.
-    left = _lagged(trial.wrench, trial.step / Vibration.of(trial.whisker, dynamics).damping)
-    added = change = trial.wrench - left
-    for number in range(_ROUNDS):
-        points, arc_length = _smoothed(trial, left, added)
-        new = inertial_wrench(
-            trial.whisker,
-            dynamics,
-            trial.time,
-            trial.rotation,
-            trial.position,
-            points,
-            arc_length,
-            _SLIPS * float(np.linalg.norm(trial.wrench[:, :3], axis=1).max()),
+    """Wrench (n, 6) that inertia and damping add, and how far two ways to it are apart.
+
+    After an onset the bending lags behind the moment by the time constant of the damping, and the
+    contact bears what inertia there is but along the whisker. Later a chain that is held at the
+    contact points is nearer.
+    """
+    vibration = Vibration.of(trial.whisker, dynamics)
+    along = vibration.in_air(trial.time, trial.rotation, trial.position) * _ALONG
+    quick = trial.wrench - _lagged(trial.wrench - along, trial.step / vibration.damping)
+    most = float(np.linalg.norm(trial.wrench[:, :3], axis=1).max())
+    size = np.abs(trial.wrench).reshape(-1, 2, 3).max(axis=(0, 2)).repeat(3)
+    added, apart = quick, np.zeros_like(quick)
+    for _ in range(_ROUNDS):
+        points, arc_length = _smoothed(trial, trial.wrench - added, added)
+        pose = trial.rotation, trial.position
+        held = inertial_wrench(
+            trial.whisker, dynamics, trial.time, *pose, points, arc_length, _SLIPS * most
         )
-        change = new - added
-        added = new if number == 0 else added + 0.5 * change
-        left = trial.wrench - added
-    return added, change
+        apart, share = held - quick, np.full((len(quick), 1), np.inf)
+        for first, end in contacts_in(trial.touching):
+            here = slice(first, end)
+            # A chain that does not follow the points makes more than was measured.
+            if (np.abs(apart[here]) > size).any():
+                apart[here] = 0.0
+            share[here, 0] = trial.step * np.arange(end - first) / _SETTLED
+        added = quick - np.expm1(-(share**2)) * apart
+    return added, apart
 
 
 def _lagged(values: Array, steps: float) -> Array:
@@ -642,13 +656,12 @@ def _local_quadratic(rows: Array, weight: Array, width: float) -> Array:
     return out
 
 
-def _uncertainty(added: Array, change: Array, step: float) -> Array:
-    """Covariance (n, 6, 6) of the correction."""
+def _uncertainty(added: Array, apart: Array, step: float) -> Array:
+    """Covariance (n, 6, 6) of the correction, by its size and by how far two ways are apart."""
     out = _KNOWN_TO**2 * np.einsum("ti,tj->tij", added, added)
-    out += np.einsum("ti,tj->tij", change, change)
-    old = np.exp(-step / _MEMORY)
-    squares = added.reshape(-1, 2, 3) ** 2
-    usual = lfilter([1.0 - old], [1.0, -old], squares.mean(axis=2), axis=0)
+    out += _APART**2 * np.einsum("ti,tj->tij", apart, apart)
+    squares = (added**2 + apart**2).reshape(-1, 2, 3).mean(axis=2)
+    usual = gaussian_filter1d(squares, _MEMORY / step, axis=0)
     out[:, range(6), range(6)] += _LEFT**2 * np.repeat(usual, 3, axis=1)
     return np.asarray(out)
 

@@ -3,8 +3,8 @@
 The motion of the base gives the mass, ringing after a release or a tap the frequencies and the
 damping. All windows in which nothing is touched are fitted at once: in each, free vibrations of an
 unknown start are left out of M_y and M_z (:class:`vibrissa.simulation.Vibration`), and what the
-model leaves besides the noise is a share of the window's own size, as for the recognition of free
-frames. Three factors are fitted, of mass, of frequency and of the time constant of the damping.
+model leaves besides the noise is a share of the window's own size. Three factors are fitted, of
+mass, of frequency and of the time constant of the damping.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.simulation.dynamics import Dynamics
-from vibrissa.simulation.vibration import SHARE, Vibration
+from vibrissa.simulation.vibration import Vibration
 from vibrissa.whisker import Whisker
 
 _LEAST_KNOWN = 0.3
@@ -24,6 +24,9 @@ _LEAST_KNOWN = 0.3
 
 _WITHIN = np.log(3.0)
 """Largest factor that is tried, as a logarithm."""
+
+_SHARE = 0.1
+"""Share of a window's own size that linear modes do not explain."""
 
 _STARTS = np.log([0.8, 0.9, 1.0, 1.1, 1.25])
 """Factors of the frequency that the fit is begun from, as logarithms."""
@@ -67,7 +70,7 @@ def fit_dynamics(
     wrench: Array,
     rotation: Array,
     position: Array,
-    sigma: float,
+    noise: Array,
     dynamics: Dynamics | None = None,
     stiffness_sigma: float = np.inf,
 ) -> FittedDynamics:
@@ -85,8 +88,8 @@ def fit_dynamics(
         Rotation of the base, from the whisker's to the laboratory frame; smooth.
     position : (n, 3) array
         Position of the base, laboratory frame, m.
-    sigma : float
-        Standard deviation of the noise of M_y and M_z, N·m.
+    noise : (6, 6) array
+        Covariance of the noise of force and moment, SI units.
     dynamics : Dynamics, optional
         Density and damping to begin from, known to 20 % or so.
     stiffness_sigma : float
@@ -105,7 +108,7 @@ def fit_dynamics(
     """
     dynamics = dynamics or Dynamics()
     first = Vibration.of(whisker, dynamics)
-    free = ~first.in_contact(time, wrench, rotation, position, sigma)
+    free = ~first.in_contact(time, wrench, rotation, position, noise)
     step = float(time[-1] - time[0]) / (len(time) - 1)
     starts, width = _windows(free, step, first)
     if not starts.size:
@@ -125,7 +128,10 @@ def fit_dynamics(
     size = np.array([np.mean(wrench[i : i + width, 4:] ** 2) for i in starts])
     # What is not linear in ringing grows with its size.
     driven = np.mean(first.in_air(time, rotation, position)[:, 4:] ** 2)
-    spread = np.sqrt(sigma**2 + SHARE**2 * size * np.sqrt(np.maximum(size / driven, 1.0)))
+    spread = np.sqrt(
+        0.5 * (noise[4, 4] + noise[5, 5])
+        + _SHARE**2 * size * np.sqrt(np.maximum(size / driven, 1.0))
+    )
     begun = [np.array([0.0, start, 0.0]) for start in _STARTS]
     best = min(begun, key=lambda one: float((left(one) ** 2).sum()))
     fit = least_squares(left, best, bounds=(-_WITHIN, _WITHIN))

@@ -61,9 +61,7 @@ def test_the_same_seed_gives_the_same_network(gamma_map):
 
 
 def test_estimates_by_network(gamma_map, trained, monkeypatch):
-    monkeypatch.setattr(
-        "vibrissa.paper.approximation.train_network", lambda contacts, names: trained
-    )
+    monkeypatch.setattr("vibrissa.paper.lookup.train_network", lambda contacts, names: trained)
     drawn = draw_contacts(gamma_map, 200, seed=4)
     signals = dict(zip(SIGNALS, drawn.signals.T, strict=True))
     noise = {"Fx": 1e-6, "MB": 1e-8, "MD": 0.1}

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.cameras.camera import Camera
-from vibrissa.cameras.triangulation import triangulate
+from vibrissa.cameras.camera import Camera, triangulate
 
 Image = NDArray[np.uint8]
 Board = NDArray[np.float32]

@@ -6,12 +6,12 @@ from vibrissa.contour.fit import fit_shape
 from vibrissa.contour.fitted_shape import FittedShape, evidence_of as evidence_of
 from vibrissa.contour.free_fit import fit_free
 from vibrissa.contour.free_surface import FreeFit, shape_from_dataset
-from vibrissa.contour.laboratory import (
+from vibrissa.contour.simple_shapes import CylinderFit, PlaneFit, SphereFit
+from vibrissa.contour.touches import (
     continuing_candidates,
     covariance_to_laboratory as covariance_to_laboratory,
     to_laboratory as to_laboratory,
 )
-from vibrissa.contour.simple_shapes import CylinderFit, PlaneFit, SphereFit
 
 __all__ = [
     "CylinderFit",

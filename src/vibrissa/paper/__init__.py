@@ -1,7 +1,6 @@
 """The methods of Huet, Emnett & Hartmann (2022), for comparison."""
 
-from vibrissa.paper.approximation import METHODS, estimate
-from vibrissa.paper.lookup import LookupTable
+from vibrissa.paper.lookup import METHODS, LookupTable, estimate
 from vibrissa.paper.natural_neighbour import NaturalNeighbour
 from vibrissa.paper.network import (
     DrawnContacts as DrawnContacts,

@@ -23,12 +23,6 @@ from vibrissa.scene.marks import (
     Mark as Mark,
     Painted as Painted,
     Side as Side,
-    pieces as pieces,
-    robust_limits as robust_limits,
-    root as root,
-    squared as squared,
-)
-from vibrissa.scene.shapes import (
     across as across,
     cylinder as cylinder,
     ellipsoid as ellipsoid,
@@ -36,7 +30,11 @@ from vibrissa.scene.shapes import (
     head_surfaces as head_surfaces,
     is_bounded as is_bounded,
     object_surface as object_surface,
+    pieces as pieces,
+    robust_limits as robust_limits,
+    root as root,
     sheet as sheet,
+    squared as squared,
     tube as tube,
 )
 from vibrissa.scene.solids import (

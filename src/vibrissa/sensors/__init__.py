@@ -4,8 +4,11 @@ from vibrissa.sensors.files import load_sensor, save_sensor
 from vibrissa.sensors.frame import FrameCalibration, SensorFrame, calibrate_frame
 from vibrissa.sensors.mixing import (
     MixingCalibration,
+    WeightCalibration,
     calibrate_mixing,
     calibrate_on_contacts,
+    calibrate_weight,
+    tare,
 )
 from vibrissa.sensors.regression import ThinPlate as ThinPlate
 from vibrissa.sensors.sensor import (
@@ -27,7 +30,6 @@ from vibrissa.sensors.stiffness import StiffnessFit, fit_stiffness
 from vibrissa.sensors.suspended import SuspendedWhisker, Touches as Touches
 from vibrissa.sensors.suspension import SuspensionCalibration, calibrate_suspension
 from vibrissa.sensors.sweep import SweptContacts, follow_sweep
-from vibrissa.sensors.weight import WeightCalibration, calibrate_weight, tare
 
 __all__ = [
     "COMPONENTS",

@@ -1,22 +1,29 @@
 """A sensor's linear mix and offset from known wrenches: y = A w + b, channel by channel.
 
 The wrenches are those of known loads, or of contacts of the whisker itself by its model.
+
+Offset of a sensor, and the weight that it carries, from readings without contact.
+
+    y = b + H (m g, μ × g),
+
+linear in the offset b, the mass m and its moment μ = m c, with g turning as the base does.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, Mask
 from vibrissa.rod import PointContact, deflect
-from vibrissa.sensors.frame import SensorFrame
-from vibrissa.sensors.regression import solve
-from vibrissa.sensors.sensor import COMPONENTS, Sensor
+from vibrissa.sensors.frame import SensorFrame, cross_matrix
+from vibrissa.sensors.regression import Solution, solve, warn_of_misfit
+from vibrissa.sensors.sensor import COMPONENTS, GRAVITY, Sensor, with_offset
 from vibrissa.status import describe, is_ok
 
 if TYPE_CHECKING:
@@ -209,3 +216,215 @@ def calibrate_on_contacts(
         resolution=resolution,
         largest=largest,
     )
+
+
+_HEAVY = 5.0
+"""Mass that no sensor of a whisker carries, kg."""
+
+_SURELY = 4.0
+"""Standard deviations below zero at which a mass is not noise."""
+
+_IDLE = 1e-12
+"""Share of the largest effect on a channel below which an unknown has none."""
+
+_POSES = (
+    "hold the whisker free in more orientations, at least three that differ in how the weight pulls"
+)
+_MASS = ("the mass", "its moment along x", "along y", "along z")
+
+
+@dataclass(frozen=True, eq=False)
+class WeightCalibration:
+    """Offset and weight as determined by free poses.
+
+    Attributes
+    ----------
+    sensor : Sensor
+        Sensor with offset, and where orientations were given mass and its moment.
+    covariance : (k + 4, k + 4) array
+        Covariance of the offsets, the mass (kg) and its moment (kg·m); zero for what was not asked
+        or has no effect on these channels.
+    residual : (k,) array
+        Root mean square residual of each channel.
+    misfit : float
+        χ² per degree of freedom: near 1, unless the noise or something else is not as stated.
+    """
+
+    sensor: Sensor
+    covariance: Array
+    residual: Array
+    misfit: float
+
+
+def calibrate_weight(
+    sensor: Sensor,
+    readings: ArrayLike,
+    rotations: ArrayLike | None = None,
+    gravity: ArrayLike = GRAVITY,
+) -> WeightCalibration:
+    """Find offset and weight from readings of a free whisker.
+
+    Parameters
+    ----------
+    sensor : Sensor
+        Sensor whose mixing and frame are known; its noise weighs the channels.
+    readings : array_like (n, k)
+        Readings without contact; rows with NaN or a saturated channel are left out.
+    rotations : array_like (n, 3, 3), optional
+        Rotations from the whisker's to the laboratory frame. Without them only the offset is found,
+        for this one orientation: the weight is part of it.
+    gravity : array_like (3,)
+        Acceleration in the laboratory frame, m/s².
+
+    Returns
+    -------
+    WeightCalibration
+        Sensor with offset and weight.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, the orientations do not separate weight from offset, or the weight is
+        negative.
+
+    Warns
+    -----
+    UserWarning
+        If residuals are more than five times the noise, or the mass is more than 5 kg.
+    """
+    y = np.asarray(readings, dtype=np.float64)
+    k = len(sensor.channels)
+    if y.ndim != 2 or y.shape[1] != k:
+        raise ValueError(f"readings are (n, {k}): {', '.join(sensor.channels)}; got {y.shape}")
+    known = np.flatnonzero((np.abs(y) < sensor.largest).all(axis=1))  # False for NaN
+    n, y = len(y), y[known]
+    if not len(y):
+        raise ValueError("there is no reading without NaN or a saturated channel")
+    noise = np.sqrt(np.diag(sensor.covariance()))
+    noise = np.where(noise > 0.0, noise, np.median(noise[noise > 0.0]) if noise.any() else 1.0)
+    if rotations is None:
+        return _tared(sensor, y, noise)
+    turn = np.asarray(rotations, dtype=np.float64)
+    if turn.shape != (n, 3, 3):
+        raise ValueError(f"{n} readings need as many rotations (3, 3); got {turn.shape}")
+    design = _design(sensor, turn[known], np.asarray(gravity, dtype=np.float64))
+    # What has no effect in any orientation is left at zero; what has must be determined here.
+    every = np.array([np.eye(3), *np.eye(3)[[[1, 2, 0], [2, 0, 1]]]])
+    every = np.concatenate([every, -every, every[:, ::-1]])
+    possible = _design(sensor, every, np.asarray(gravity, dtype=np.float64))[:, :, k:]
+    effect = np.abs(possible).max(axis=(0, 1))
+    effective = np.concatenate(
+        [np.ones(k, bool), effect > _IDLE * max(float(effect.max()), 1e-300)]
+    )
+    found, unknowns, covariance = _solved(sensor, design, y, noise, effective)
+    if unknowns[k] < 0.0:
+        sigma = float(np.sqrt(covariance[k, k]))
+        if unknowns[k] < -_SURELY * sigma:
+            raise ValueError(
+                f"the readings weigh {1e3 * unknowns[k]:.3g} ± {1e3 * sigma:.2g} g: the sensor "
+                "reports a reaction (`reaction` of its frame), has other axes, or gravity or the "
+                "rotations point the other way"
+            )
+        effective[k] = False  # too light to be weighed
+        found, unknowns, covariance = _solved(sensor, design, y, noise, effective)
+    calibrated = replace(
+        sensor,
+        bias=unknowns[:k],
+        mass=float(unknowns[k]),
+        mass_moment=unknowns[k + 1 :],
+        mixing_covariance=with_offset(sensor.mixing_covariance, np.diag(covariance)[:k]),
+    )
+    if unknowns[k] > _HEAVY:
+        warnings.warn(
+            f"the sensor seems to carry {unknowns[k]:.3g} kg: are its channels in N and N·m, or "
+            "does its mixing say what they are in?",
+            stacklevel=2,
+        )
+    left = found.residuals.reshape(-1, k) * noise
+    misfit = float((found.residuals**2).sum() / max(found.residuals.size - effective.sum(), 1))
+    warn_of_misfit(
+        misfit,
+        "that the rotations are of the whisker's base (not of a flange), that they turn the "
+        "whisker's into the laboratory frame, and the sensor's axes and hand",
+    )
+    return WeightCalibration(calibrated, covariance, np.sqrt((left**2).mean(axis=0)), misfit)
+
+
+def tare(
+    sensor: Sensor,
+    readings: ArrayLike,
+    rotations: ArrayLike | None = None,
+    gravity: ArrayLike = GRAVITY,
+) -> Sensor:
+    """Find the offset anew, as after a drift; mass and its moment are kept.
+
+    Parameters
+    ----------
+    sensor : Sensor
+        Calibrated sensor.
+    readings : array_like (n, k)
+        Readings without contact; those with NaN or a saturated channel are left out.
+    rotations : array_like (3, 3) or (n, 3, 3), optional
+        Rotation from the whisker's to the laboratory frame; needed where the sensor carries a mass.
+    gravity : array_like (3,)
+        Acceleration in the laboratory frame, m/s².
+
+    Returns
+    -------
+    Sensor
+        Sensor with the new offset.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, the rotation is needed but not given, or no reading is complete.
+    """
+    free = np.atleast_2d(sensor.compensated(readings, rotations, gravity))
+    free = free[np.isfinite(free).all(axis=1)]
+    if not len(free):
+        raise ValueError("there is no reading without NaN or a saturated channel")
+    return sensor.with_new_offset(len(free), sensor.bias + free.mean(axis=0))
+
+
+def _solved(
+    sensor: Sensor, design: Array, y: Array, noise: Array, effective: Mask
+) -> tuple[Solution, Array, Array]:
+    """Solution for the effective unknowns, all unknowns and their covariance."""
+    k = len(sensor.channels)
+    names = [f"the offset of {name}" for name in sensor.channels] + list(_MASS)
+    rows = (design / noise[:, None]).reshape(-1, k + 4)[:, effective]
+    found = solve(
+        rows,
+        (y / noise).reshape(-1),
+        [name for name, used in zip(names, effective, strict=True) if used],
+        _POSES,
+    )
+    unknowns, covariance = np.zeros(k + 4), np.zeros((k + 4, k + 4))
+    unknowns[effective] = found.unknowns
+    covariance[np.ix_(effective, effective)] = found.spread
+    return found, unknowns, covariance
+
+
+def _tared(sensor: Sensor, y: Array, noise: Array) -> WeightCalibration:
+    k = y.shape[1]
+    bias = y.mean(axis=0)
+    covariance = np.zeros((k + 4, k + 4))
+    covariance[:k, :k] = np.diag(noise**2 / len(y))
+    left = np.sqrt(((y - bias) ** 2).mean(axis=0))
+    light = replace(sensor, mass=0.0, mass_moment=np.zeros(3))
+    tared = light.with_new_offset(len(y), bias)
+    misfit = float((left**2 / noise**2).sum() * len(y) / max(len(y) - 1, 1) / k)
+    warn_of_misfit(misfit, "that nothing was touched, and that the orientation stayed the same")
+    return WeightCalibration(tared, covariance, left, misfit)
+
+
+def _design(sensor: Sensor, rotations: Array, gravity: Array) -> Array:
+    """∂y/∂(b, m, μ), shape (n, k, k + 4)."""
+    g = gravity @ rotations
+    h = sensor.base_mixing
+    n, k = len(g), len(h)
+    out = np.zeros((n, k, k + 4))
+    out[:, :, :k] = np.eye(k)
+    out[:, :, k] = g @ h[:, :3].T
+    out[:, :, k + 1 :] = -h[:, 3:] @ cross_matrix(g)  # μ × g = -g × μ
+    return out

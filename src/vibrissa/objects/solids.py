@@ -66,7 +66,17 @@ class _Faults:
             raise ValueError(f"no {self._what}: " + "; ".join(self._faults))
 
 
-def _set(thing: Any, **values: Any) -> None:
+def _check(thing: Any, faults: _Faults, **values: Any) -> None:
+    """Set the fields of a solid, checked: those that all have alike, and other values."""
+    for name in vars(thing).keys() - values.keys():
+        given = getattr(thing, name)
+        if name == "stiffness":
+            values[name] = faults.positive(name, given, "N/m", "infinite")
+        elif name == "radius":
+            values[name] = faults.positive(name, given, "m")
+        else:
+            values[name] = faults.vector(name, given, direction=name != "origin")
+    faults.tell()
     for name, value in values.items():
         object.__setattr__(thing, name, value)
 
@@ -117,15 +127,7 @@ class Peg(Surface):
 
     def __post_init__(self) -> None:
         """Check and make the arrays read-only."""
-        faults = _Faults("peg")
-        _set(
-            self,
-            origin=faults.vector("origin", self.origin),
-            axis=faults.vector("axis", self.axis, direction=True),
-            radius=faults.positive("radius", self.radius, "m"),
-            stiffness=faults.positive("stiffness", self.stiffness, "N/m", "infinite"),
-        )
-        faults.tell()
+        _check(self, _Faults("peg"))
 
     def _distance(self, points: Array) -> Array:
         away = points - self.origin
@@ -200,15 +202,8 @@ class Sphere(Surface):
     stiffness: float = np.inf
 
     def __post_init__(self) -> None:
-        """Check and make the array read-only."""
-        faults = _Faults("sphere")
-        _set(
-            self,
-            origin=faults.vector("origin", self.origin),
-            radius=faults.positive("radius", self.radius, "m"),
-            stiffness=faults.positive("stiffness", self.stiffness, "N/m", "infinite"),
-        )
-        faults.tell()
+        """Check and make the arrays read-only."""
+        _check(self, _Faults("sphere"))
 
     def _distance(self, points: Array) -> Array:
         distance: Array = np.linalg.norm(points - self.origin, axis=-1) - self.radius
@@ -258,14 +253,7 @@ class Plane(Surface):
 
     def __post_init__(self) -> None:
         """Check and make the arrays read-only."""
-        faults = _Faults("plane")
-        _set(
-            self,
-            origin=faults.vector("origin", self.origin),
-            normal=faults.vector("normal", self.normal, direction=True),
-            stiffness=faults.positive("stiffness", self.stiffness, "N/m", "infinite"),
-        )
-        faults.tell()
+        _check(self, _Faults("plane"))
 
     def _distance(self, points: Array) -> Array:
         distance: Array = (points - self.origin) @ self.normal
@@ -339,15 +327,7 @@ class Box(Surface):
                 bool((2.0 * edge <= size).all()),
                 f"edge_radius is {edge}; at most half of the shortest edge, {0.5 * size.min()} m",
             )
-        _set(
-            self,
-            origin=faults.vector("origin", self.origin),
-            size=size,
-            rotation=rotation,
-            edge_radius=edge,
-            stiffness=faults.positive("stiffness", self.stiffness, "N/m", "infinite"),
-        )
-        faults.tell()
+        _check(self, faults, size=size, rotation=rotation, edge_radius=edge)
 
     def _distance(self, points: Array) -> Array:
         beyond = np.abs((points - self.origin) @ self.rotation)

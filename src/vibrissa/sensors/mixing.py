@@ -14,7 +14,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -168,14 +168,7 @@ def wrenches_of_contacts(whisker: Whisker, points: ArrayLike) -> Array:
 
 
 def calibrate_on_contacts(
-    whisker: Whisker,
-    points: ArrayLike,
-    readings: ArrayLike,
-    *,
-    channels: Sequence[str] | None = None,
-    components: Sequence[str] = COMPONENTS,
-    resolution: ArrayLike = 0.0,
-    largest: ArrayLike = np.inf,
+    whisker: Whisker, points: ArrayLike, readings: ArrayLike, **options: Any
 ) -> MixingCalibration:
     """Find linear mix, offset and noise of a sensor from contacts at known points.
 
@@ -191,12 +184,8 @@ def calibrate_on_contacts(
         Contact points on its centreline, whisker's frame, m; without friction.
     readings : array_like (n, k)
         Readings of the channels at these contacts; rows with NaN in either are left out.
-    channels : sequence of str, optional
-        Names of the k channels.
-    components : sequence of str
-        Components that a channel may read.
-    resolution, largest : array_like (k,)
-        Step of the readings and size of the largest, as of `calibrate_mixing`.
+    **options
+        Names of channels, components, resolution and largest reading, as of `calibrate_mixing`.
 
     Returns
     -------
@@ -208,14 +197,7 @@ def calibrate_on_contacts(
     ValueError
         If a contact is not possible, or the contacts do not separate the components.
     """
-    return calibrate_mixing(
-        readings,
-        wrenches_of_contacts(whisker, points),
-        channels=channels,
-        components=components,
-        resolution=resolution,
-        largest=largest,
-    )
+    return calibrate_mixing(readings, wrenches_of_contacts(whisker, points), **options)
 
 
 _HEAVY = 5.0

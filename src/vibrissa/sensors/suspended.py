@@ -29,6 +29,7 @@ from scipy.spatial.transform import Rotation
 
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.rod import discretize, solve_forces
+from vibrissa.sensors.frame import cross_matrix
 from vibrissa.sensors.regression import ThinPlate
 from vibrissa.status import Status
 
@@ -158,13 +159,13 @@ class SuspendedWhisker:
         force, arm = value[:, :3] @ turn.T, value[:, 3:] @ turn.T - pivot
         d_force, d_arm = turn @ slope[:, :3], turn @ slope[:, 3:]
         angle = rotation * np.cross(arm, force)
-        d_angle = rotation * (_cross(arm) @ d_force - _cross(force) @ d_arm)
+        d_angle = rotation * (cross_matrix(arm) @ d_force - cross_matrix(force) @ d_arm)
         turned, spin = Rotation.from_rotvec(angle).as_matrix(), _right_jacobian(angle) @ d_angle
         pull = (turned @ force[:, :, None])[:, :, 0]
-        d_felt = turned @ (d_force - _cross(force) @ spin)
+        d_felt = turned @ (d_force - cross_matrix(force) @ spin)
         base = self.whisker.pose.origin / d.length + pivot
         point = base + shift / d.length * pull + (turned @ arm[:, :, None])[:, :, 0]
-        d_point = shift / d.length * d_felt + turned @ (d_arm - _cross(arm) @ spin)
+        d_point = shift / d.length * d_felt + turned @ (d_arm - cross_matrix(arm) @ spin)
         i, j = _PAIRS
         n = len(contacts)
         features = (np.ones((n, 1)), angle, shift / d.length * pull, angle[:, i] * angle[:, j])
@@ -303,13 +304,6 @@ class SuspendedWhisker:
         return np.where((statuses == int(Status.OK))[:, None], values, np.nan), statuses
 
 
-def _cross(vectors: Array) -> Array:
-    """Matrices (n, 3, 3) of the vector product with vectors (n, 3)."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(-1, 3, 3)
-
-
 def _right_jacobian(angle: Array) -> Array:
     """Right Jacobians (n, 3, 3) of the rotation vectors (n, 3)."""
     square = np.sum(angle * angle, axis=-1)[:, None, None]
@@ -318,5 +312,5 @@ def _right_jacobian(angle: Array) -> Array:
     size = np.sqrt(x)
     first = np.where(small, 0.5 - square / 24.0, (1.0 - np.cos(size)) / x)
     second = np.where(small, 1.0 / 6.0 - square / 120.0, (size - np.sin(size)) / (x * size))
-    matrix = _cross(angle)
+    matrix = cross_matrix(angle)
     return np.asarray(np.eye(3) - first * matrix + second * (matrix @ matrix))

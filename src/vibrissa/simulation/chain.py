@@ -17,9 +17,9 @@ segment the parabola through its two ends, with the joint as control point.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from vibrissa.numerics import Array, IntArray, kernel
 from vibrissa.whisker import Whisker
@@ -54,7 +54,7 @@ class Chain:
         twist = bend / (1.0 + whisker.poisson_ratio)
         stiffness = np.stack([twist, bend, bend], axis=1)
         frames = whisker.frame(nodes)
-        rest = np.array([_rotation_vector(a.T @ b) for a, b in pairwise(frames)])
+        rest = Rotation.from_matrix(np.swapaxes(frames[:-1], 1, 2) @ frames[1:]).as_rotvec()
         if whisker.base_stiffness is not None:
             soft_bend, soft_twist = whisker.base_stiffness
             joints = np.concatenate([[0.0], joints])
@@ -101,15 +101,6 @@ def _nodes(whisker: Whisker, segments: int) -> Array:
     thin = np.maximum(whisker.radius(middle) / whisker.base_radius, 0.02)
     share = np.concatenate([[0.0], np.cumsum(thin**-_GRADING)])
     return np.interp(np.linspace(0.0, share[-1], segments + 1), share, s)
-
-
-def _rotation_vector(turn: Array) -> Array:
-    axis = 0.5 * np.array(
-        [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
-    )
-    sine = float(np.linalg.norm(axis))
-    angle = np.arctan2(sine, 0.5 * (np.trace(turn) - 1.0))
-    return np.asarray(axis * (angle / sine if sine > 1e-12 else 1.0))
 
 
 @kernel

@@ -114,11 +114,9 @@ def base_point(row: ArrayLike, column: ArrayLike) -> Array:
 
 def _cheek() -> Array:
     """Rotation from the ellipsoid's axes to the head's, R_z R_y R_x."""
-    (cz, cy, cx), (sz, sy, sx) = np.cos(_TURNED), np.sin(_TURNED)
-    about_z = np.array([[cz, -sz, 0.0], [sz, cz, 0.0], [0.0, 0.0, 1.0]])
-    about_y = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
-    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]])
-    return np.asarray(about_z @ about_y @ about_x)
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_euler("ZYX", _TURNED).as_matrix())
 
 
 def projection_angles(row: ArrayLike, column: ArrayLike) -> Array:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from vibrissa.simulation import ImageConditions, film_frames
 from vibrissa.tracking import TraceOptions, TraceSeries, find_start, is_bright, trace_video
 from vibrissa.tracking.refine.least_squares import trace_variance
 from vibrissa.tracking.space.frame_pairs import better_offset
@@ -102,6 +103,17 @@ def test_the_edge_of_what_never_moves_draws_no_trace_aside(grey, at):
     assert sigma[near].max() > 1.5 * sigma[far].max()
 
 
+@pytest.mark.parametrize("side", [0.0, 0.6])
+def test_a_lit_flank_is_seen(filmed, side):
+    """It draws a trace to the other side by a share of the whisker's width that no fit shows."""
+    conditions = ImageConditions(side_light=side)
+    frames = list(film_frames(filmed.recording, filmed.cameras[0], conditions))[:3]
+    (row,) = trace_video(frames, [filmed.curve(0, 0)[0]])
+    error = [np.median(filmed.errors(one.line, i, 0)[0]) for i, one in enumerate(row)]
+    glint = np.median([one.glint for one in row])
+    assert (glint > 0.2 and np.median(error) > 0.1) if side else glint < 0.05
+
+
 def test_frames_of_another_size_are_refused():
     with pytest.raises(ValueError, match="frame 1 has 100 × 120 pixels"):
         trace_video([image(30, 170), image(30, 170)[:, :100]], [(30.0, 53.0)])
@@ -139,14 +151,16 @@ def test_traces_are_trusted_as_far_as_their_residuals_allow():
     assert np.median(found) == pytest.approx(4.0 * together, rel=0.25)
     noise[7] *= 10.0
     assert trace_variance([2.0 * noise], np.zeros(200))[7] > 10.0 * np.median(found)
-    assert (trace_variance([0.1 * noise[:5]], np.zeros(5)) == 1.0).all()
+    # Where they are smaller than was claimed, that counts as well, to a limit.
+    finer = trace_variance([0.3 * noise[:7]], np.zeros(7))
+    assert np.median(finer) == pytest.approx(0.09 * together, rel=0.25)
+    assert (trace_variance([0.01 * noise[:5]], np.zeros(5)) > 1e-3).all()
 
 
 def test_frames_that_the_rod_does_not_explain_are_noted(filmed):
     nothing = np.full((20, 2, 101, 2), np.nan)
-    series = TraceSeries(
-        nothing, nothing[..., 0], nothing[..., 0], np.zeros((20, 2)), np.zeros((20, 2, 2))
-    )
+    numbers = (np.zeros((20, *shape)) for shape in ((2,), (2, 2), (2,)))
+    series = TraceSeries(nothing, *[nothing[..., 0]] * 2, *numbers)
     misfit = np.where(np.arange(20) < 3, 5.0, 0.3)
     length = Length(10e-3, 0.0)
     (said,) = remarks_on(filmed.cameras, series, length, misfit, "C2")

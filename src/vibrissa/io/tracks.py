@@ -483,8 +483,8 @@ def _names(tracks: xr.Dataset, dim: str) -> list[str]:
     return [str(i) for i in range(tracks.sizes[dim])]
 
 
-Row = tuple[Array, Array, NDArray[np.bool_], float, bool, bool]
-"""Points (n, 2), standard deviations (n,), seen (n,), confidence, whether base and tip are."""
+Row = tuple[Array, Array, NDArray[np.bool_], float, bool, bool, float]
+"""Points (n, 2), deviations (n,), seen (n,), confidence, whether base and tip are, glint."""
 
 
 def save_traces(path: str | PathLike[str], key: str, traces: Sequence[Sequence[Row]]) -> None:
@@ -497,8 +497,7 @@ def save_traces(path: str | PathLike[str], key: str, traces: Sequence[Sequence[R
             key=np.array(key),
             whiskers=np.array(len(traces)),
             count=np.array([len(row[0]) for row in rows], dtype=np.int64),
-            confidence=np.array([row[3] for row in rows]),
-            ends=np.array([row[4:6] for row in rows], dtype=bool).reshape(-1, 2),
+            numbers=np.array([row[3:] for row in rows], dtype=np.float64).reshape(-1, 4),
             line=columns[0].reshape(-1, 2),
             sigma=columns[1],
             seen=columns[2].astype(bool),
@@ -515,12 +514,12 @@ def load_traces(path: str | PathLike[str], key: str) -> list[list[Row]] | None:
                 return None
             count, whiskers = file["count"], int(file["whiskers"])
             parts = [np.split(file[name], np.cumsum(count)[:-1]) for name in _COLUMNS]
-            confidence, ends = file["confidence"], file["ends"]
+            numbers = file["numbers"]
     except (OSError, ValueError, KeyError, BadZipFile):
         return None
     rows = [
-        (line, sigma, seen, float(sure), bool(base), bool(tip))
-        for line, sigma, seen, sure, (base, tip) in zip(*parts, confidence, ends, strict=True)
+        (line, sigma, seen, float(sure), bool(base), bool(tip), float(glint))
+        for line, sigma, seen, (sure, base, tip, glint) in zip(*parts, numbers, strict=True)
     ]
     each = len(rows) // max(whiskers, 1)
     return [rows[k * each : (k + 1) * each] for k in range(whiskers)]

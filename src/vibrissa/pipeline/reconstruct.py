@@ -46,6 +46,9 @@ Shape = Literal["cylinder", "sphere", "plane", "free"]
 SOLVED_TO = 1e-6
 """Uncertainty of every contact apart from the signals', m: the tolerance of the mechanics."""
 
+_LEFT_OUT = 1e-4
+"""Share of the variance by errors that all frames share that need not be followed to the object."""
+
 LEAN = 0.1
 """Standard deviation of the angle between normal and force across the whisker, rad.
 
@@ -144,25 +147,33 @@ def _widened(fit: FittedShape, together: float) -> FittedShape:
 
 
 def _moved_together(recording: xr.DataTree, estimates: xr.Dataset) -> Iterator[xr.Dataset]:
-    """Estimates moved by each error that all frames of a tracked recording share.
+    """Estimates moved by the errors that all frames of a tracked recording share.
 
-    It moves a contact that was tracked as it does the trace, and one of a sensor with the pose by
-    which it is in the laboratory; the pose turns normals.
+    They move a contact that was tracked as they do the trace, and one of a sensor with the pose by
+    which it is in the laboratory; the pose turns normals. Few combinations of them, independent as
+    they are themselves, do nearly all that they do.
     """
     root, found = Recording(recording).root, Group(estimates)
     point, normal = found["contact_point"], found["contact_normal"]
-    for k in range(root.data.sizes.get("error", 0)):
+    moves = np.zeros((root.data.sizes.get("error", 0), 2, *point.shape))
+    if not len(moves):
+        return
+    for k, (moved, turned) in enumerate(moves):
         # What was not tracked does not show by how much it is moved.
-        moved = np.nan_to_num(root["contact_shared"][:, :, k])
-        turned = np.zeros_like(normal)
+        moved[:] = root["contact_shared"][:, :, k]
         if "pose_shared" in root:
             pose = np.nan_to_num(root["pose_shared"][:, :, k])
-            turned = np.cross(pose[..., 3:], normal)
+            turned[:] = np.cross(pose[..., 3:], normal)
             if estimates.attrs.get("source") == "sensor":
-                arm = point - root["base_position"]
-                moved = pose[..., :3] + np.cross(pose[..., 3:], arm)
+                moved[:] = pose[..., :3] + np.cross(pose[..., 3:], point - root["base_position"])
                 if "contact_shared" in found:
-                    moved = moved + np.nan_to_num(found["contact_shared"][:, :, k])
+                    moved += np.nan_to_num(found["contact_shared"][:, :, k])
+    moves = np.nan_to_num(moves)
+    size = np.sqrt((moves**2).mean(axis=(0, 2, 3, 4), keepdims=True))
+    each = np.divide(moves, size, out=np.zeros(moves.shape), where=size > 0.0)
+    mix, share, _ = np.linalg.svd(each.reshape(len(each), -1), full_matrices=False)
+    few = mix[:, np.cumsum(share[::-1] ** 2)[::-1] > _LEFT_OUT * (share**2).sum()]
+    for moved, turned in np.tensordot((few * np.sign(few.sum(axis=0))).T, moves, 1):
         yield estimates.assign(
             contact_point=((*EACH, "space"), point + moved),
             contact_normal=((*EACH, "space"), normal + turned),

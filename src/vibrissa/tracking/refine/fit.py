@@ -23,7 +23,7 @@ from vibrissa.cameras import Camera
 from vibrissa.numerics import Array, Mask
 from vibrissa.objects import Surface
 from vibrissa.rod import Discretization, discretize, solve_forces
-from vibrissa.tracking.refine.least_squares import Smoother, trace_variance
+from vibrissa.tracking.refine.least_squares import Smoother, correlated, trace_variance
 from vibrissa.tracking.refine.rods import (
     UNKNOWNS,
     State,
@@ -54,15 +54,14 @@ _REST = np.array([0.5, 0.0, 0.0, 0.0])
 _RUBBING = 1e-4
 """Standard deviation of the force along the whisker if there is none across, in units of EI/L²."""
 
-_COMMON, _WAVES = 0.05, 4
-"""Standard deviation of errors that a view's traces share in all frames, pixels, if residuals show
-no larger ones, and number of their waves along the whisker."""
+_WAVES = 8
+"""Number of waves along the whisker by which a view's traces may err in all frames alike."""
 
-_LIT = 0.1
-"""Standard deviation at the base of the shift by light from the side, which is less where the
-whisker is thinner, pixels."""
+_LIT, _GLINT = 0.1, 1.5
+"""Standard deviations, pixels, of the shift by light from the side: at the base, less where the
+whisker is thinner; and by a flank that is brighter than the other by the whisker's darkness."""
 
-_AT_BASE, _FOLLOWED = 0.03, 3.0
+_AT_BASE, _FOLLOWED = 0.03, 2.0
 """Share of the length over which fur may draw a trace aside, and by how much more it does than what
 the rod, which follows it, leaves of that."""
 
@@ -73,9 +72,9 @@ axis of the whisker's frame, pixels, if residuals show no more; and its share of
 _PROXIMAL = 0.7
 """Share of the whisker that determines the roll of its frame."""
 
-_ENDS = (1.5, 1.0)
-"""Standard deviation of base and tip along the whisker, in units of that in one frame: fur over a
-base draws it by a pixel or two."""
+_ENDS = (3.5, 1.0)
+"""Standard deviation of the error along the whisker that base and tip have in all frames, in units
+of what it scatters: fur hides a base by more than it does so unevenly."""
 
 _FREE = [0, 2, 3]
 """Unknowns of a contact without friction: arc length and the force across the whisker."""
@@ -248,14 +247,13 @@ class _Linear(NamedTuple):
     designs: list[Array]
     weights: list[Array]
 
-    @property
-    def left(self) -> list[Array]:
-        """Means over time of the residuals of each view, pixels."""
+    def left(self, rows: Mask) -> list[Array]:
+        """Means over some frames of the residuals of each view, pixels."""
         found = []
         for misses, weight in zip(self.misses, self.weights, strict=True):
-            shown = weight[:, :-2] > 0.0
-            left = np.where(shown, misses / np.where(shown, weight[:, :-2], 1.0), 0.0)
-            found.append(left.sum(axis=0) / np.maximum(shown.sum(axis=0), 1))
+            sharp = weight[rows, :-2]
+            pixels = np.divide(misses[rows], sharp, out=np.zeros(sharp.shape), where=sharp > 0.0)
+            found.append(pixels.sum(axis=0) / np.maximum((sharp > 0.0).sum(axis=0), 1))
         return found
 
 
@@ -414,34 +412,44 @@ def _turning(rotation: Array) -> Array:
     return np.asarray(Rotation.from_matrix(step).as_rotvec())
 
 
-def _shared(fit: _Linear) -> Array:
+def _shared(problem: Problem, fit: _Linear) -> Array:
     """Changes (error, time, unknown) by errors of traces that all frames share, one sigma each.
 
     Light from the side, a halo of compression or fur over the base shift a trace in the same way in
     many frames, so that neither many points nor many frames make it smaller: waves along the
     whisker, a bend at its base, and shifts of its ends along it. What of them the fit does not
-    follow stays in the mean of the residuals over time.
+    follow stays in the means of the residuals over frames with and without contact.
     """
     pulls = []
-    views = zip(fit.left, fit.ends, fit.designs, fit.weights, strict=True)
-    for left, ends, design, weight in views:
-        sigma = np.hypot(_COMMON, np.sqrt(np.mean(left**2)))
-        s = np.linspace(0.0, 1.0, design.shape[1] - 2)
-        waves = [sigma / (1.0 + k) * np.cos(k * np.pi * s) for k in range(_WAVES)]
-        waves.append(_LIT * (1.0 - s))
-        waves.append(np.hypot(_COMMON, _FOLLOWED * _drawn(left)) * np.exp(-s / _AT_BASE))
+    parts = [fit.left(rows) for rows in (problem.touching, ~problem.touching)]
+    together = correlated(fit.misses)
+    for view, (design, weight, ends) in enumerate(
+        zip(fit.designs, fit.weights, fit.ends, strict=True)
+    ):
+        n = design.shape[1] - 2
+        s = np.linspace(0.0, 1.0, n)
+        beyond = s > 2.0 * _AT_BASE
+        # What neighbours have in common is as strong in all long waves.
+        square = sum(float(np.mean(part[view][beyond] ** 2)) for part in parts)
+        sigma = np.sqrt(2.0 * together / n * square)
+        waves = [sigma * np.cos(k * np.pi * s) for k in range(_WAVES)]
+        waves.append(np.hypot(_LIT * (1.0 - s), _GLINT * problem.traces.glint[:, view].mean()))
+        waves.append(_FOLLOWED * _drawn(fit)[view] * np.exp(-s / _AT_BASE))
         across = design[:, :-2] * weight[:, :-2, None]
         pulls += [np.einsum("tni,n->ti", across, wave) for wave in waves]
-        for end in (0, 1):
-            counts = weight[:, end - 2] > 0.0
-            miss = float(ends[counts, end].mean()) if counts.any() else 0.0
-            pulls.append(design[:, end - 2] * np.hypot(_ENDS[end], miss))
+        for end, more in enumerate(_ENDS):
+            miss = ends[weight[:, end - 2] > 0.0, end]
+            size = np.hypot(miss.mean(), more * miss.std()) if miss.size else 0.0
+            pulls.append(design[:, end - 2] * size)
     return fit.smoother.responses(np.array(pulls))
 
 
-def _drawn(left: Array) -> float:
-    """Largest of the residuals that all frames share at the base, pixels."""
-    return float(np.abs(left[: round(2.0 * _AT_BASE * len(left))]).max())
+def _drawn(fit: _Linear) -> list[float]:
+    """Largest of the residuals of each view that all frames share at the base, pixels."""
+    return [
+        float(np.abs(left[: round(2.0 * _AT_BASE * len(left))]).max())
+        for left in fit.left(np.ones(len(fit.misfit), dtype=bool))
+    ]
 
 
 def _frame_turns(problem: Problem, state: State, fit: _Linear) -> Array:
@@ -454,12 +462,13 @@ def _frame_turns(problem: Problem, state: State, fit: _Linear) -> Array:
     whisker = problem.whisker
     base = problem.head.put_in(state.position * whisker.length)
     slopes = [
-        np.hypot(_HOOKED, _HOOK * _drawn(left))
+        np.hypot(_HOOKED, _HOOK * drawn)
         / np.linalg.norm(camera.project_with_slopes(base)[1], axis=1).max()
-        for camera, left in zip(problem.cameras, fit.left, strict=True)
+        for camera, drawn in zip(problem.cameras, _drawn(fit), strict=True)
     ]
     lean = max(slopes) / (_AT_BASE * whisker.length)
-    x, y, _ = whisker.position(np.linspace(0.0, _PROXIMAL, len(fit.left[0])) * whisker.length).T
+    share = np.linspace(0.0, _PROXIMAL, fit.misses[0].shape[1])
+    x, y, _ = whisker.position(share * whisker.length).T
     roll = min(lean * abs(x @ y) / max(y @ y, lean**2 * (x @ x)), 1.0)
     return np.array([[0.0, 0.0, lean], [roll, lean, 0.0]])
 
@@ -500,7 +509,7 @@ def _by_length(
 def _answer(problem: Problem, state: State, fit: _Linear, nodes: int, unsure: float) -> RodFit:
     """Results in SI units, relative to the head."""
     d, touching = problem.d, problem.touching
-    shared, misfit = _shared(fit), fit.misfit
+    shared, misfit = _shared(problem, fit), fit.misfit
     covariance = fit.smoother.covariances() + np.einsum("kti,ktj->tij", shared, shared)
     turned, slopes, slope = contact_slopes(d, state)
     point, wrench = _contacts(problem, state)

@@ -31,6 +31,9 @@ _REGULAR = 1e-12
 _LEAST = 0.05
 """Correlation that counts as none."""
 
+_SHARPEST = 0.04
+"""Smallest variance: a trace follows its line to a hundredth of a pixel at best."""
+
 _FREE = 0.25
 """Smallest share of the residuals that are free, however many numbers are fitted."""
 
@@ -136,17 +139,16 @@ def trace_variance(misses: Sequence[Array], fitted: Array) -> Array:
     shown = count > 0
     if not square[shown].any():
         return np.ones(len(square))
-    correlated = _correlated(misses)
+    together = correlated(misses)
     # Most frames are right, so that the median of them is.
     usual = float(np.median(square[shown] / count[shown]))
-    spent = correlated * float(fitted[shown].sum()) / float(count[shown].sum())
+    spent = together * float(fitted[shown].sum()) / float(count[shown].sum())
     each = np.where(shown, square / np.maximum(count, 1), usual)
-    variance = correlated * np.maximum(each, usual) / max(1.0 - spent, _FREE)
-    # An error of the whisker's shape is common to all frames: none is better than it claims.
-    return np.asarray(np.maximum(variance, 1.0))
+    variance = together * np.maximum(each, usual) / max(1.0 - spent, _FREE)
+    return np.asarray(np.maximum(variance, _SHARPEST))
 
 
-def _correlated(misses: Sequence[Array]) -> float:
+def correlated(misses: Sequence[Array]) -> float:
     """Number of neighbouring residuals that count as one."""
     total, most = 1.0, min(one.shape[1] for one in misses) // 2
     size = sum(float((one**2).mean()) for one in misses)

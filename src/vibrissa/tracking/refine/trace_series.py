@@ -41,6 +41,8 @@ class TraceSeries:
         Confidence between 0 and 1.
     ends : array (time, view, 2)
         1 where the whisker is seen to begin and to end there, else 0.
+    glint : array (time, view)
+        Difference of grey value between its flanks, as a share of its darkness.
     """
 
     line: Array
@@ -48,6 +50,7 @@ class TraceSeries:
     seen: Array
     confidence: Array
     ends: Array
+    glint: Array
 
     @classmethod
     def of(cls, traces: Sequence[Sequence[Trace]]) -> TraceSeries:
@@ -55,6 +58,7 @@ class TraceSeries:
         shape = (len(traces[0]), len(traces), NODES)
         line, sigma, seen = np.full((*shape, 2), np.nan), np.full(shape, np.nan), np.zeros(shape)
         confidence, ends = np.zeros(shape[:2]), np.zeros((*shape[:2], 2))
+        glint = np.zeros(shape[:2])
         for view, row in enumerate(traces):
             for i, trace in enumerate(row):
                 n = len(trace.line)
@@ -67,9 +71,9 @@ class TraceSeries:
                     even[:, 2],
                     even[:, 3] > 0.5,
                 )
-                confidence[i, view] = trace.confidence
+                confidence[i, view], glint[i, view] = trace.confidence, trace.glint
                 ends[i, view] = trace.base_seen, trace.tip_seen
-        return cls(line, sigma, seen, confidence, ends)
+        return cls(line, sigma, seen, confidence, ends, glint)
 
     def rows(self, frames: NDArray[np.intp]) -> TraceSeries:
         """Select frames."""

@@ -352,6 +352,9 @@ _SMOOTHED = 0.6
 _LAST = 10
 """Number of points before the end, and twice that of points beyond, that decide this."""
 
+_ASIDE = (2.5, 5.0)
+"""Distances from a line at which its flank may shine, and at which it does not, samples."""
+
 _FLANKS = (4.0, 7.0)
 """Distances from the whisker at which the face's edge is searched, pixels."""
 
@@ -507,7 +510,18 @@ def traced(
     line, along = line[first:last], along.part(slice(first, last))
     trusted = min(1.0, float(along.seen.sum() / max(along.open.sum(), 1)))
     base_seen = _inside(frame, line[0])
-    return Trace(line, along.sigma, along.seen, trusted, base_seen, tip_seen), from_face
+    glint = _glint(frame, line, along, options.scale, clutter)
+    return Trace(line, along.sigma, along.seen, trusted, base_seen, tip_seen, glint), from_face
+
+
+def _glint(frame: Frame, line: Array, along: Measured, scale: float, clutter: Clutter) -> float:
+    """Difference between a line's flanks, minus that farther away, as a share of its depth."""
+    half = slice(0, len(line) // 2)
+    near, far = (grey_flanks(frame, line[half], away * scale, clutter) for away in _ASIDE)
+    apart = (near - far) @ np.array([1.0, -1.0])
+    apart = apart[np.isfinite(apart)]
+    depth = middle(along.amplitude[half])
+    return abs(middle(apart)) / depth if apart.size and depth > 0.0 else 0.0
 
 
 def _with_base(frame: Frame, line: Array, before: float, clutter: Clutter) -> tuple[Array, bool]:

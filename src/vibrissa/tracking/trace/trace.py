@@ -75,6 +75,8 @@ class Trace(NamedTuple):
     base_seen, tip_seen : bool
         Whether the whisker is seen to begin and to end there. If not it goes on outside of the
         image, or fades into the noise.
+    glint : float
+        Difference of grey value between the flanks of its nearer half, as a share of its darkness.
     """
 
     line: Array
@@ -83,6 +85,7 @@ class Trace(NamedTuple):
     confidence: float
     base_seen: bool = True
     tip_seen: bool = True
+    glint: float = 0.0
 
     @classmethod
     def lost(cls) -> Trace:

@@ -11,8 +11,10 @@ from vibrissa.viewer.state import (
     begin,
     charted,
     envelope,
+    link_of,
     loaded,
     moved,
+    restored,
     shape_of,
     shaped,
     with_force,
@@ -79,6 +81,18 @@ def test_the_arrow_ends_at_the_contact_and_points_along_the_force(bend):
     np.testing.assert_allclose(end, bent.contact_point * MM, atol=1e-9)
     along = (end - start) / np.linalg.norm(end - start)
     np.testing.assert_allclose(along, bent.force / np.linalg.norm(bent.force), atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["point", "peg", "force"])
+def test_a_link_restores_the_load(bend, kind):
+    chosen = loaded(moved(bend, [24e-3, 11e-3, 3e-3]), kind)
+    if kind == "peg":
+        chosen = with_radius(moved(chosen, chosen.origin, [0.0, 0.6, 0.8]), 1e-3)
+    again = restored(bend, link_of(chosen))
+    assert again.kind == kind
+    np.testing.assert_allclose(again.deflection.force, chosen.deflection.force, rtol=1e-3)
+    for nonsense in ({kind: "1,2"}, {"contact": "a,b,c"}, {"peg": "1,2,3,0,0,0,1"}):
+        assert restored(bend, nonsense) is bend
 
 
 def test_another_load_begins_where_the_last_one_acts(bend):

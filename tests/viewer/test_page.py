@@ -229,7 +229,7 @@ def test_keys_clicks_and_links_lead_through_a_trial(browser, recording):
         second.close()
         # A link of another mode brings its signals, colours and contact.
         third = browser.new_page(viewport=SIZE)
-        words = "mode=Locate&signals=Fx+FT+MB&colours=MB&contact=24,3,4"
+        words = "mode=Locate&signals=Fx+FT+MB&noise=2,0.05&colours=MB&contact=24,3,4"
         third.goto(f"{viewer.url}/#{words}")
         person.wait_until(lambda: viewer.page.mode.name == "Locate")
         locate = viewer.page.modes["Locate"]
@@ -237,8 +237,12 @@ def test_keys_clicks_and_links_lead_through_a_trial(browser, recording):
             lambda: locate.found is not None and locate.found.sensor.triplet == ("Fx", "FT", "MB")
         )
         person.wait_until(lambda: np.allclose(viewer.page.bend.point, [24e-3, 3e-3, 4e-3]))
-        third.wait_for_function("/colours=MB&contact=24[.]000/.test(location.hash)")
-        for nonsense in ("mode=None", "mode=Locate&contact=a,b&signals=Mx", "mode=Trial&t=nan"):
+        third.wait_for_function("/noise=2%2C0.05&colours=MB&contact=24%2C3/.test(location.hash)")
+        for nonsense in (
+            "mode=None",
+            "mode=Locate&contact=a,b&signals=Mx&noise=-1,1",
+            "mode=Trial&t=nan",
+        ):
             urllib.request.urlopen(f"{viewer.url}/restore?{nonsense}").close()
         person.wait_until(lambda: viewer.page.mode is trial)
         third.close()

@@ -29,7 +29,7 @@ from vibrissa.viewer.readout import (
     shaded,
     table,
 )
-from vibrissa.viewer.state import Bend, Chart, coloured_solid
+from vibrissa.viewer.state import Bend, Chart, coloured_solid, numbers_in, words_of
 from vibrissa.whisker import Whisker
 
 _RAT = (1.5e-4, 6e-6)
@@ -223,6 +223,7 @@ class LocateMode(Mode):
             self._legend = gui.add_html("")
             self._words = gui.add_html("")
         asked(self._triplet, lambda value: self._sense(triplet=tuple(value.split())))
+        self._noise = force, moment
         asked(force, lambda value: self._sense(force_noise=value / _UN))
         asked(moment, lambda value: self._sense(moment_noise=value / _UNM))
         asked(self._colours, self._colour)
@@ -268,11 +269,16 @@ class LocateMode(Mode):
             self._words.content = of_located(bend.whisker, self.found, bend.status)
 
     def link(self) -> dict[str, str]:
-        """Signals and colours."""
-        return {"signals": " ".join(self._sensor.triplet), "colours": self._what}
+        """Signals, noise and colours."""
+        noise = words_of([force.value for force in self._noise])
+        return {"signals": " ".join(self._sensor.triplet), "noise": noise, "colours": self._what}
 
     def restore(self, asked: Mapping[str, str]) -> None:
-        """Choose signals and colours."""
+        """Choose signals, noise and colours."""
+        if (noise := numbers_in(asked.get("noise", ""), 2)) is not None and (noise >= 0.0).all():
+            for slider, value in zip(self._noise, noise, strict=True):
+                put(slider, float(value))
+            self._sense(force_noise=float(noise[0]) / _UN, moment_noise=float(noise[1]) / _UNM)
         if (signals := asked.get("signals", "")) in self._triplet.options:
             put(self._triplet, signals)
             self._sense(triplet=tuple(signals.split()))

@@ -34,8 +34,10 @@ from vibrissa.viewer.state import (
     Chart,
     begin,
     charted,
+    link_of,
     loaded,
     moved,
+    restored,
     shape_of,
     shaped,
     with_whisker,
@@ -216,8 +218,8 @@ class Page:
             return
         self.mode.write(brief)
         state = {"mode": self.mode.name, **self.mode.link()}
-        if self._draggable and self.bend.kind == "point":
-            state["contact"] = ",".join(f"{x:.3f}" for x in to_display("length", self.bend.point))
+        if self._draggable:
+            state |= link_of(self.bend)
         if self.linked is not None:
             show(self.linked, f'<i hidden data-link="{escape(urlencode(state))}"></i>')
 
@@ -228,12 +230,7 @@ class Page:
             return
         self.choose(mode.name)
         mode.restore(asked)
-        try:
-            point = np.array(asked["contact"].split(","), dtype=np.float64) / _MM
-        except (KeyError, ValueError):
-            return
-        if point.shape == (3,) and np.isfinite(point).all():
-            self.change("drag", lambda bend: moved(loaded(bend, "point"), point))
+        self.change("drag", lambda bend: restored(bend, asked))
 
     @property
     def _draggable(self) -> bool:

@@ -6,6 +6,7 @@ so that there is something to look at along with the reason.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -15,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from vibrissa.contacts import ContactMap
 from vibrissa.numerics import Array
-from vibrissa.quantities import to_display
+from vibrissa.quantities import quantity, to_display
 from vibrissa.rod import Deflection, PegContact, PointContact, PointForce, deflect
 from vibrissa.scene import Bytes, Painted, column, sample_contacts, sheet, solid_surface
 from vibrissa.signals import SIGNALS
@@ -25,6 +26,7 @@ from vibrissa.whisker import Whisker, constant
 
 Kind = Literal["point", "peg", "force"]
 KINDS: tuple[Kind, ...] = ("point", "peg", "force")
+_MM, _UN = quantity("length").display_factor, quantity("force").display_factor
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +133,42 @@ def with_radius(bend: Bend, radius: float) -> Bend:
 def with_force(bend: Bend, place: float, magnitude: float, direction: float) -> Bend:
     """Say where (share of the length) a force acts, how large it is, N, and its direction, rad."""
     return _solved(replace(bend, place=place, magnitude=magnitude, direction=direction))
+
+
+def link_of(bend: Bend) -> dict[str, str]:
+    """The word of a link that restores the load: mm, µN, degrees."""
+    if bend.kind == "point":
+        return {"contact": words_of(_MM * bend.point)}
+    if bend.kind == "peg":
+        return {"peg": words_of([*(_MM * bend.origin), *bend.axis, _MM * bend.radius])}
+    return {"force": words_of([bend.place, _UN * bend.magnitude, np.rad2deg(bend.direction)])}
+
+
+def restored(bend: Bend, asked: Mapping[str, str]) -> Bend:
+    """Take the load that the words of a link state, if they do."""
+    if (contact := numbers_in(asked.get("contact", ""), 3)) is not None:
+        return moved(loaded(bend, "point"), contact / _MM)
+    if (peg := numbers_in(asked.get("peg", ""), 7)) is not None and peg[3:6].any():
+        bend = replace(loaded(bend, "peg"), radius=abs(peg[6]) / _MM)
+        return moved(bend, peg[:3] / _MM, peg[3:6])
+    if (force := numbers_in(asked.get("force", ""), 3)) is not None:
+        place = float(np.clip(force[0], 0.05, 1.0))
+        return with_force(loaded(bend, "force"), place, force[1] / _UN, np.deg2rad(force[2]))
+    return bend
+
+
+def words_of(numbers: ArrayLike) -> str:
+    """Numbers as a word of a link."""
+    return ",".join(f"{x:.6g}" for x in np.asarray(numbers, dtype=np.float64))
+
+
+def numbers_in(word: str, count: int) -> Array | None:
+    """So many finite numbers of a word of a link; None if they are not there."""
+    try:
+        numbers = np.array(word.split(","), dtype=np.float64)
+    except ValueError:
+        return None
+    return numbers if numbers.shape == (count,) and np.isfinite(numbers).all() else None
 
 
 def with_whisker(bend: Bend, whisker: Whisker) -> Bend:

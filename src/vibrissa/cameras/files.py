@@ -10,36 +10,17 @@ import xarray as xr
 
 from vibrissa.cameras.camera import Camera
 from vibrissa.io import in_file, read_calibration, write_calibration
+from vibrissa.quantities import attributes
 
-_VARIABLES = {
-    "camera_matrix": (
-        "matrix",
-        ("row", "column"),
-        "1",
-        "K: pixels per m if orthographic, else focal lengths in pixels",
-    ),
-    "camera_rotation": (
-        "rotation",
-        ("row", "column"),
-        "1",
-        "from the laboratory's to the camera's axes (right, down, forward)",
-    ),
-    "camera_translation": (
-        "translation",
-        ("row",),
-        "m",
-        "x_camera = rotation x_laboratory + translation",
-    ),
-    "camera_distortion": (
-        "distortion",
-        ("coefficient",),
-        "1",
-        "OpenCV's k1, k2, p1, p2, k3, k4, k5, k6",
-    ),
-    "image_size": ("size", ("side",), "pixel", "width and height"),
-    "projection": ("projection", (), "1", "orthographic or perspective"),
+_VARIABLES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "camera_matrix": ("matrix", ("row", "column")),
+    "camera_rotation": ("rotation", ("row", "column")),
+    "camera_translation": ("translation", ("row",)),
+    "camera_distortion": ("distortion", ("coefficient",)),
+    "image_size": ("size", ("side",)),
+    "projection": ("projection", ()),
 }
-"""Attribute of a camera, dimensions, unit and description of each variable."""
+"""Attribute of a camera, and dimensions, of each variable."""
 
 
 def load_cameras(path: str | PathLike[str], unit: float = 1e-3) -> tuple[Camera, ...]:
@@ -126,9 +107,9 @@ def cameras_dataset(cameras: Sequence[Camera]) -> xr.Dataset:
             name: (
                 ("view", *axes),
                 np.array([getattr(camera, part) for camera in cameras]),
-                {"units": unit, "long_name": about},
+                attributes(name),
             )
-            for name, (part, axes, unit, about) in _VARIABLES.items()
+            for name, (part, axes) in _VARIABLES.items()
         },
         {"view": [camera.name for camera in cameras]},
         {"reference_frame": "laboratory"},

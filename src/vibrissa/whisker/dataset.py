@@ -23,10 +23,6 @@ NODES = 101
 """Points of the centreline that comes along."""
 
 
-Row = tuple[str, tuple[str, ...], object, str, str]
-"""Name, dimensions, values, units and long name of a variable."""
-
-
 def whisker_dataset(whisker: Any) -> xr.Dataset:
     """Write a whisker as a dataset."""
     bending, twist = whisker.base_stiffness or (np.inf, np.inf)
@@ -40,35 +36,17 @@ def whisker_dataset(whisker: Any) -> xr.Dataset:
         "arc_length": (("node",), s),
         "centerline": (("node", "space"), whisker.position(s)),
         "radius": (("node",), whisker.radius(s)),
+        "pose_rotation": (("source_axis", "whisker_axis"), whisker.pose.rotation),
+        "pose_origin": (("source_axis",), whisker.pose.origin),
+        "breaks": (("break",), np.array(whisker.breaks, dtype=np.float64)),
     }
     if whisker.density is not None:
         known["density"] = ((), whisker.density)
+    known |= _profile_parts("curvature", whisker.intrinsic_curvature)
+    known |= _profile_parts("section", whisker.section_radius)
     variables = {
         name: xr.Variable(dims, np.asarray(values), attributes(name))
         for name, (dims, values) in known.items()
-    }
-    table: list[Row] = [
-        (
-            "pose_rotation",
-            ("source_axis", "whisker_axis"),
-            whisker.pose.rotation,
-            "1",
-            "axes of the whisker frame (columns) in the source frame",
-        ),
-        ("pose_origin", ("source_axis",), whisker.pose.origin, "m", "base point, source frame"),
-        (
-            "breaks",
-            ("break",),
-            np.array(whisker.breaks, dtype=np.float64),
-            "m",
-            "arc lengths of kinks in curvature or radius",
-        ),
-    ]
-    table += _profile_rows("curvature", whisker.intrinsic_curvature, "1/m", "intrinsic curvature")
-    table += _profile_rows("section", whisker.section_radius, "m", "radius of the section")
-    variables |= {
-        name: xr.Variable(dims, np.asarray(values), {"units": units, "long_name": long_name})
-        for name, dims, values, units, long_name in table
     }
     labels = {
         "source_axis": ["x", "y", "z"],
@@ -84,19 +62,13 @@ def whisker_dataset(whisker: Any) -> xr.Dataset:
     return xr.Dataset(variables, labels, about)
 
 
-def _profile_rows(name: str, profile: Profile, units: str, long_name: str) -> list[Row]:
+def _profile_parts(name: str, profile: Profile) -> dict[str, tuple[tuple[str, ...], object]]:
     dims = (f"{name}_power", f"{name}_interval", *((f"{name}_component",) * len(profile.shape)))
-    return [
-        (f"{name}_knots", (f"{name}_knot",), profile.knots, "m", f"interval ends: {long_name}"),
-        (
-            f"{name}_coefficients",
-            dims,
-            profile.coefficients,
-            units,
-            f"{long_name}: coefficients of powers of tau, from -1 to 1 on each interval",
-        ),
-        (f"{name}_error", (), profile.error, "1", f"relative error of representation: {long_name}"),
-    ]
+    return {
+        f"{name}_knots": ((f"{name}_knot",), profile.knots),
+        f"{name}_coefficients": (dims, profile.coefficients),
+        f"{name}_error": ((), profile.error),
+    }
 
 
 class Stored(Protocol):

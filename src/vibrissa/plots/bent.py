@@ -171,11 +171,8 @@ def _views(drawn: _Drawn, limits: Array, width: style.Width) -> Figure:
             height - _TOP - _ROW * rows - (0.0 if abreast else number * (tall[0] + _GAP + _BOTTOM))
         )
         box = (left, top - tall[number], scale * span[0], tall[number])
-        axes = style.box_axes(figure, box, xlim=limits[0], ylim=limits[j])
-        _draw(axes, drawn, j)
-        few = max(3, round(tall[number] / 10.0))
-        axes.yaxis.set_major_locator(MaxNLocator(few, integer=True))
-        axes.set(xlabel=axis_label("x"), ylabel=axis_label("xyz"[j]))
+        axes = _panel(figure, box, drawn, limits, j)
+        axes.set_xlabel(axis_label("x"))
         style.head(axes, "ab"[number], ("from above", "from the side")[number])
     below_side = tall[0] - tall[1] - _GAP - _BOTTOM
     if abreast and below_side > _FORCES and np.isfinite(drawn.forces).any():
@@ -200,8 +197,11 @@ def _forces(axes: Axes, drawn: _Drawn) -> None:
     style.head(axes, "c", "force")
 
 
-def _draw(axes: Axes, drawn: _Drawn, j: int) -> None:
+def _panel(figure: Figure, box: style.Box, drawn: _Drawn, limits: Array, j: int) -> Axes:
     """Whiskers, contacts and forces, seen along y or z."""
+    axes = style.box_axes(figure, box, xlim=limits[0], ylim=limits[j])
+    axes.yaxis.set_major_locator(MaxNLocator(max(3, round(box[3] / 10.0)), integer=True))
+    axes.set_ylabel(axis_label("xyz"[j]))
     rest = drawn.rest
     axes.plot(rest[:, 0], rest[:, j], color=_REST, linewidth=1.6, solid_capstyle="round")
     for i, (line, colour) in enumerate(zip(drawn.lines, drawn.colours, strict=True)):
@@ -215,6 +215,7 @@ def _draw(axes: Axes, drawn: _Drawn, j: int) -> None:
             ends = (point - arrow)[[0, j]], point[[0, j]]
             style.force_arrow(axes, *ends, colour, 1.0)
         axes.plot(point[0], point[j], "o", color=colour, markersize=2.6, zorder=5)
+    return axes
 
 
 _PAIR_COLOURS = (style.BLUE, style.ORANGE)
@@ -268,17 +269,10 @@ def witness_pair(witness: xr.Dataset, *, width: style.Width = "double") -> Figur
     with style.looking():
         figure = style.new_figure(width, height, None)
 
-        def place(low: float, j: int) -> Axes:
-            box = (left, low, scale * span[0], scale * span[j])
-            axes = style.box_axes(figure, box, xlim=limits[0], ylim=limits[j])
-            _draw(axes, drawn, j)
-            axes.set_ylabel(axis_label("xyz"[j]))
-            few = max(3, round(scale * span[j] / 10.0))
-            axes.yaxis.set_major_locator(MaxNLocator(few, integer=True))
-            return axes
-
-        side = place(shift + bottom, 2)
-        above = place(shift + bottom + scale * span[2] + gap, 1)
+        low = shift + bottom
+        across, up, aside = scale * span
+        side = _panel(figure, (left, low, across, aside), drawn, limits, 2)
+        above = _panel(figure, (left, low + aside + gap, across, up), drawn, limits, 1)
         above.tick_params(labelbottom=False)
         side.set_xlabel(axis_label("x"))
         tails = drawn.points - 1.2 * drawn.arrows

@@ -147,11 +147,7 @@ def _sheet(width: style.Width, images: int, compared: bool) -> _Sheet:
         curves = tuple(
             (left, low + 16.5 * (2 - i), 74.0, 14.0) for left in (12.0, 102.0) for i in range(3)
         )
-        top = low + 47.0
-        legend = top + 1.5
-        wide = (178.0 - 3.0 * 1.5) / 4.0
-        sights = tuple((i * (wide + 1.5), top + 11.5, wide, 34.0) for i in range(images))
-        height = top + (50.5 if images else 7.0)
+        top, wide = low + 47.0, (178.0 - 3.0 * 1.5) / 4.0
     else:
         solids = ((0.0, 38.0, 42.5, 38.0), (42.5, 38.0, 42.5, 38.0), (0.0, 0.0, 42.5, 38.0))
         rails = tuple((48.0, 32.0 - 12.0 * i, 32.0, 1.6) for i in range(3))
@@ -159,11 +155,10 @@ def _sheet(width: style.Width, images: int, compared: bool) -> _Sheet:
         low = 86.5
         # All six share one axis of time.
         curves = tuple((12.0, low + 13.0 * (5 - i), 71.0, 11.0) for i in range(6))
-        top = low + 76.0
-        legend = top + 1.5
-        sights = tuple((i * 43.25, top + 11.5, 41.75, 34.0) for i in range(images))
-        height = top + (50.5 if images else 7.0)
-    return _Sheet(height, sights, curves, legend, solids, rails, scatter)
+        top, wide = low + 76.0, 41.75
+    sights = tuple((i * (wide + 1.5), top + 11.5, wide, 34.0) for i in range(images))
+    height = top + (50.5 if images else 7.0)
+    return _Sheet(height, sights, curves, top + 1.5, solids, rails, scatter)
 
 
 def _images(

@@ -134,17 +134,8 @@ def _chart(axes: Axes, found: xr.Dataset, words: NDArray[np.str_], degrees: Arra
     size = 10.0 + 26.0 * np.clip(degrees / _CONES[-1], 0.0, 1.0) ** 0.5
     for k in np.argsort(-degrees):
         if words[k]:
-            axes.scatter(
-                x[k],
-                y[k],
-                c=degrees[k : k + 1],
-                s=size[k],
-                norm=_NORM,
-                cmap=style.sequential().reversed(),
-                marker=_MARKS[str(words[k])],
-                edgecolors=style.INK,
-                linewidths=0.4,
-            )
+            look = _look(degrees[k : k + 1], 0.4)
+            axes.scatter(x[k], y[k], s=size[k], marker=_MARKS[str(words[k])], **look)
     axes.set_xscale("log")
     low, high = (np.nanmin(x), np.nanmax(x)) if x.size else (1.0, 60.0)
     ticks = [tick for tick in (1, 2, 5, 15, 30, 60) if 0.9 * low <= tick <= 1.1 * high]
@@ -172,17 +163,14 @@ def _spread(axes: Axes, x: Array, words: NDArray[np.str_], line: NDArray[np.int_
     place = np.argsort(np.argsort(x)) * 2 % 5
     for word, mark in _MARKS.items():
         here = words == word
-        axes.scatter(
-            x[here],
-            (line + 0.13 * (place - 2.0))[here],
-            marker=mark,
-            s=13,
-            c=x[here],
-            norm=_NORM,
-            cmap=style.sequential().reversed(),
-            edgecolors=style.INK,
-            linewidths=0.3,
-        )
+        there = (line + 0.13 * (place - 2.0))[here]
+        axes.scatter(x[here], there, s=13, marker=mark, **_look(x[here], 0.3))
+
+
+def _look(degrees: Array, edge: float) -> dict[str, Any]:
+    """Look of marks whose colours are critical cones, with edges of a width."""
+    colours: dict[str, Any] = {"norm": _NORM, "cmap": style.sequential().reversed()}
+    return {"c": degrees, "edgecolors": style.INK, "linewidths": edge, **colours}
 
 
 def _cone_axis(axes: Axes) -> None:

@@ -258,21 +258,31 @@ def _read_off(known: Array, values: Array, wanted: Array, name: str) -> Array:
     return np.interp(sign * wanted, forward[order], values[order])
 
 
+_STORED: dict[str, tuple[tuple[str, ...], str]] = {
+    "rotation_compliance": ((), "rad N-1 m-1"),
+    "shift_compliance": ((), "m N-1"),
+    "pivot": (("space",), "m"),
+    "friction": ((), "1"),
+    "readout": (("channel", "feature"), ""),
+    "noise": (("channel",), ""),
+    "drift": (("channel",), ""),
+}
+"""Dimensions and unit of what is stored of a sensor; a channel's own where there is none."""
+
+
 def save_suspended(
     path: str | PathLike[str], calibration: SuspensionCalibration, stage: Stage
 ) -> None:
     """Write a calibrated sensor that `load_suspended` reads."""
     sensor = calibration.sensor
     channel, unknown = ("channel", list(sensor.channels)), ("unknown", list(calibration.names))
+    stored = {
+        name: (dims, getattr(sensor, name), {"units": unit} if unit else None)
+        for name, (dims, unit) in _STORED.items()
+    }
     data = xr.Dataset(
         {
-            "rotation_compliance": ((), sensor.rotation_compliance, {"units": "rad N-1 m-1"}),
-            "shift_compliance": ((), sensor.shift_compliance, {"units": "m N-1"}),
-            "pivot": ("space", sensor.pivot, {"units": "m"}),
-            "friction": ((), sensor.friction, {"units": "1"}),
-            "readout": (("channel", "feature"), sensor.readout),
-            "noise": ("channel", sensor.noise),
-            "drift": ("channel", sensor.drift),
+            **stored,
             "value": ("unknown", calibration.values),
             "covariance": (("unknown", "unknown_"), calibration.covariance),
             "readout_covariance": (
@@ -308,16 +318,11 @@ def load_suspended(path: str | PathLike[str]) -> tuple[SuspendedWhisker, Stage]:
             float(data["plate_reach"]),
             data["noise"].values,
         )
+    stored: dict[str, Any] = {name: data[name].values[()] for name in _STORED if name in data}
     sensor = SuspendedWhisker(
         Whisker.from_dataset(read_dataset(path, "whisker")),
-        rotation_compliance=float(data["rotation_compliance"]),
-        shift_compliance=float(data["shift_compliance"]),
-        pivot=data["pivot"].values,
-        friction=float(data["friction"]),
         channels=tuple(str(name) for name in data["channel"].values),
-        readout=data["readout"].values,
-        noise=data["noise"].values,
         residual=residual,
-        drift=data["drift"].values if "drift" in data else 0.0,
+        **stored,
     )
     return sensor, Stage(str(data.attrs["stage"]), Path(path).parent)

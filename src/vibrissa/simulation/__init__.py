@@ -14,13 +14,15 @@ from vibrissa.simulation.held import inertial_wrench as inertial_wrench
 from vibrissa.simulation.motion import (
     Motion,
     array_whisking,
+    facing_peg,
     head_path,
     protracted as protracted,
     shared_whisking as shared_whisking,
+    sweep_past,
     tabulated,
     whisking,
+    within_reach,
 )
-from vibrissa.simulation.plan import facing_peg, sweep_past, within_reach
 from vibrissa.simulation.script import (
     EXAMPLE as EXAMPLE,
     Script as Script,

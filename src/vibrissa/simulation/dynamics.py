@@ -218,15 +218,17 @@ class Moment:
 
 def frequencies(chain: Chain, count: int) -> Array:
     """Lowest frequencies of a chain at rest, held at its base: (count,), Hz."""
+    slow, _ = slowest(at_rest(chain), count)
+    return np.asarray(1.0 / np.sqrt(slow) / (2.0 * np.pi))
+
+
+def slowest(state: State, count: int) -> tuple[Array, Array]:
+    """Inverse squares (count,) of the lowest rates of a chain at rest, and its modes (n, count)."""
     # The stiffness is regular, the mass need not be: twist of a straight whisker has none.
-    n = chain.stiffness.size
-    slow = eigh(
-        at_rest(chain).matrix,
-        np.diag(chain.stiffness.ravel()),
-        eigvals_only=True,
-        subset_by_index=[n - count, n - 1],
-    )
-    return np.asarray(1.0 / np.sqrt(slow[::-1]) / (2.0 * np.pi))
+    stiffness = state.chain.stiffness.ravel()
+    which = [stiffness.size - count, stiffness.size - 1]
+    slow, modes = eigh(state.matrix, np.diag(stiffness), subset_by_index=which)
+    return slow[::-1], modes[:, ::-1]
 
 
 def damping_time(chain: Chain, ratio: float) -> float:
@@ -238,16 +240,7 @@ def at_rest(chain: Chain) -> State:
     """State of a chain at rest, with its mass matrix."""
     state = State(chain)
     state.move(chain.rest, np.eye(3), np.zeros(3))
-    inertia(
-        state.masses,
-        chain.mass,
-        chain.mass_link,
-        np.zeros_like(state.masses),
-        state.pivots,
-        state.turns,
-        state.residual,
-        state.matrix,
-    )
+    state.accelerate(np.zeros_like(state.masses))
     return state
 
 
@@ -279,6 +272,12 @@ class State:
         self.base = base
         self.masses = chain.places(self.frames, self.pivots, base, chain.mass_arc, chain.mass_link)
         self.controls = chain.controls(self.frames, self.pivots, base)
+
+    def accelerate(self, pull: Array) -> None:
+        """Fill the generalised inertial forces of a pull (m, 3) on the masses, and their matrix."""
+        mass, link = self.chain.mass, self.chain.mass_link
+        joints = self.pivots, self.turns
+        inertia(self.masses, mass, link, pull, *joints, self.residual, self.matrix)
 
 
 class History(NamedTuple):
@@ -384,16 +383,7 @@ class Walk:
             state.move(theta, rotation, base)
             speed = self._masses.rate_of(state.masses, h)
             pull = chain.mass[:, None] * self._masses.acceleration_of(speed, h)
-            inertia(
-                state.masses,
-                chain.mass,
-                chain.mass_link,
-                pull,
-                state.pivots,
-                state.turns,
-                state.residual,
-                state.matrix,
-            )
+            state.accelerate(pull)
             turning = self._theta.rate_of(theta, h)
             elastic = chain.stiffness * (theta - chain.rest + self._damping * turning)
             residual: Array = state.residual + elastic.ravel()

@@ -33,10 +33,11 @@ from vibrissa.simulation.motion import (
     head_path,
     protracted,
     shared_whisking,
+    sweep_past,
     tabulated,
     whisking,
+    within_reach,
 )
-from vibrissa.simulation.plan import sweep_past, within_reach
 from vibrissa.whisker import Whisker, WhiskerArray, base_rotation, whisker_array
 
 _MOST_FRAMES = 10_000_000
@@ -375,14 +376,8 @@ def _tabulated(table: Mapping[str, Any], folder: Path, rate: float) -> Motion:
     check_keys(table, {"file"}, "a motion of kind table")
     columns = columns_of(folder / str(table.get("file", "")))
     place = np.stack([columns[axis] for axis in "xyz"], axis=-1)
-    return tabulated(
-        columns["time"],
-        columns["azimuth"],
-        columns["elevation"],
-        columns["roll"],
-        place,
-        rate=rate,
-    )
+    time, *angles = (columns[name] for name in COLUMNS[:4])
+    return tabulated(time, angles[0], angles[1], angles[2], place, rate=rate)
 
 
 def head_of(table: Mapping[str, Any], folder: Path, time: Array) -> tuple[Array, Array]:

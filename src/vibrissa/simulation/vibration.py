@@ -18,12 +18,11 @@ from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.linalg import eigh
 from scipy.signal import StateSpace, lsim
 
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.simulation.chain import Chain, jacobian
-from vibrissa.simulation.dynamics import Dynamics, at_rest
+from vibrissa.simulation.dynamics import Dynamics, at_rest, slowest
 from vibrissa.simulation.switching import contact_probability
 from vibrissa.whisker import Whisker
 
@@ -75,11 +74,9 @@ class Vibration:
         """
         dynamics = dynamics or Dynamics()
         chain = Chain.of(whisker, dynamics.density, dynamics.segments)
-        state, n = at_rest(chain), chain.stiffness.size
-        slow, turns = eigh(
-            state.matrix, np.diag(chain.stiffness.ravel()), subset_by_index=[n - _MODES, n - 1]
-        )
-        slow, turns = slow[::-1], turns[:, ::-1] / np.sqrt(slow[::-1])
+        state = at_rest(chain)
+        slow, turns = slowest(state, _MODES)
+        turns = turns / np.sqrt(slow)
         moved = [
             jacobian(place[None], link[None], np.ones(1), state.pivots, state.turns)
             for place, link in zip(state.masses, chain.mass_link, strict=True)

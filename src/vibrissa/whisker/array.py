@@ -196,7 +196,14 @@ class WhiskerArray(Mapping[str, Whisker]):
         ValueError
             If the tree is not of this kind.
         """
-        return cls(whiskers_of(tree))
+        kind = tree.attrs.get("kind")
+        if kind != cls.kind or "whiskers" not in tree.children:
+            raise ValueError(
+                f"this holds {kind or 'data of another kind'}, not an array of whiskers"
+            )
+        own = tree.children["whiskers"].children
+        datasets = (own[i].to_dataset(inherit=False) for i in sorted(own, key=int))
+        return cls(Whisker.from_dataset(dataset) for dataset in datasets)
 
     def __repr__(self) -> str:
         """Say how many there are, which, and how long."""
@@ -289,15 +296,6 @@ def array_tree(whiskers: Iterable[Whisker], identities: Iterable[Identity]) -> x
     for i, whisker in enumerate(them):
         groups[f"/whiskers/{i}"] = whisker.to_dataset().drop_dims("node")
     return xr.DataTree.from_dict(groups)
-
-
-def whiskers_of(tree: xr.DataTree) -> list[Whisker]:
-    """Make the whiskers of a tree again."""
-    kind = tree.attrs.get("kind")
-    if kind != WhiskerArray.kind or "whiskers" not in tree.children:
-        raise ValueError(f"this holds {kind or 'data of another kind'}, not an array of whiskers")
-    own = tree.children["whiskers"].children
-    return [Whisker.from_dataset(own[i].to_dataset(inherit=False)) for i in sorted(own, key=int)]
 
 
 def whisker_array(

@@ -12,17 +12,14 @@ and of the pose: its usual distance from that of the rod, where that is known.
 **A sensor**: force and moment as they were read, in a simulated or a robot's recording; or the
 readings of its channels, if these are six or more that determine force and moment.
 
-On request a sensor's signals are without what the whisker's inertia and damping add to them. In air
-that is the wrench that the motion of the base and vibrations after a release cause
-(:class:`vibrissa.simulation.Vibration`), which also decides which frames are in contact. In contact
-the whisker is bent otherwise than a force alone would bend it, so that no wrench subtracted once is
-right: contacts estimated from the present correction are smoothed in the laboratory, where objects
-are at rest, a chain with mass is moved through them, and one without mass, and the difference of
-their wrenches (:func:`vibrissa.simulation.held.inertial_wrench`) is the next correction. Half of
-each step is made, as errors of contact points and of the correction may otherwise take turns.
-
-What is known of mass and damping only to 20 %, and what vibrations leave of themselves, are a share
-of the correction and of its usual size in the milliseconds before; these are added to the noise.
+On request a sensor's signals are without what the whisker's inertia and damping add to them. The
+motion of the base and vibrations decide which frames are in contact
+(:class:`vibrissa.simulation.Vibration`). There the whisker is bent otherwise than a force alone
+would bend it, so that no wrench subtracted once is right. At first its bending lags behind the
+moment. Later, contacts by the present correction are smoothed in the laboratory, where objects are
+at rest, a chain with mass is moved through them and one without, and the difference of their
+wrenches (:func:`vibrissa.simulation.held.inertial_wrench`) is the next correction. What is not
+known of a correction is added to the noise.
 """
 
 from __future__ import annotations
@@ -536,8 +533,9 @@ def without_inertia(
         dynamics = fit_dynamics(
             whisker, *course, noise, stiffness_sigma=_STIFFNESS_KNOWN_TO
         ).dynamics
-    trial = trial._replace(touching=Vibration.of(whisker, dynamics).in_contact(*course, noise))
-    added, apart = _added(trial, dynamics)
+    vibration = Vibration.of(whisker, dynamics)
+    trial = trial._replace(touching=vibration.in_contact(*course, noise))
+    added, apart = _added(trial, dynamics, vibration)
     left = trial.wrench - added
     left[~known] = np.nan
     touching = trial.touching & known
@@ -545,7 +543,7 @@ def without_inertia(
     status[~known] = int(Status.MISSING)
     values = {"force": left[:, :3], "moment": left[:, 3:], "in_contact": touching}
     values |= {"base_position": trial.position, "base_rotation": trial.rotation}
-    covariance = trial.noise + _uncertainty(added, apart, trial.step)
+    covariance = trial.noise + _uncertainty(trial, added, apart, vibration)
     about = {"density": dynamics.density, "damping_ratio": dynamics.damping_ratio}
     covariances = recorded("wrench_covariance", covariance)
     return one_whisker(values, status).assign(wrench_covariance=covariances).assign_attrs(about)
@@ -576,18 +574,17 @@ def _trial(own: Group, whisker: Whisker, noise: Array) -> tuple[_Trial, NDArray[
     return _Trial(whisker, time, wrench, noise, rotation, position, known), known
 
 
-def _added(trial: _Trial, dynamics: Dynamics) -> tuple[Array, Array]:
+def _added(trial: _Trial, dynamics: Dynamics, vibration: Vibration) -> tuple[Array, Array]:
     """Wrench (n, 6) that inertia and damping add, and how far two ways to it are apart.
 
     After an onset the bending lags behind the moment by the time constant of the damping, and the
     contact bears what inertia there is but along the whisker. Later a chain that is held at the
     contact points is nearer.
     """
-    vibration = Vibration.of(trial.whisker, dynamics)
     along = vibration.in_air(trial.time, trial.rotation, trial.position) * _ALONG
     quick = trial.wrench - _lagged(trial.wrench - along, trial.step / vibration.damping)
-    most = float(np.linalg.norm(trial.wrench[:, :3], axis=1).max())
     size = np.abs(trial.wrench).reshape(-1, 2, 3).max(axis=(0, 2)).repeat(3)
+    most = float(np.linalg.norm(trial.wrench[:, :3], axis=1).max())
     added, apart = quick, np.zeros_like(quick)
     for _ in range(_ROUNDS):
         points, arc_length = _smoothed(trial, trial.wrench - added, added)
@@ -656,13 +653,26 @@ def _local_quadratic(rows: Array, weight: Array, width: float) -> Array:
     return out
 
 
-def _uncertainty(added: Array, apart: Array, step: float) -> Array:
-    """Covariance (n, 6, 6) of the correction, by its size and by how far two ways are apart."""
+def _uncertainty(trial: _Trial, added: Array, apart: Array, vibration: Vibration) -> Array:
+    """Covariance (n, 6, 6) of the correction.
+
+    It grows with the correction, with how far two ways to it are apart, and for a radian of the
+    first mode before a release, in which no contact is in equilibrium, and half as long after an
+    onset.
+    """
     out = _KNOWN_TO**2 * np.einsum("ti,tj->tij", added, added)
     out += _APART**2 * np.einsum("ti,tj->tij", apart, apart)
-    squares = (added**2 + apart**2).reshape(-1, 2, 3).mean(axis=2)
-    usual = gaussian_filter1d(squares, _MEMORY / step, axis=0)
-    out[:, range(6), range(6)] += _LEFT**2 * np.repeat(usual, 3, axis=1)
+    near = np.zeros((len(added), 1))
+    for first, end in contacts_in(trial.touching):
+        since = np.arange(1, end - first + 1)
+        turned = trial.step * vibration.rates[0] * np.minimum(2 * since, since[::-1])
+        near[first:end, 0] = np.exp(-turned)
+    parts = (_LEFT**2 * (added**2 + apart**2), trial.wrench**2)
+    left, whole = (
+        gaussian_filter1d(part.reshape(-1, 2, 3).mean(axis=2), _MEMORY / trial.step, axis=0)
+        for part in parts
+    )
+    out[:, range(6), range(6)] += np.repeat(left + near**2 * whole, 3, axis=1)
     return np.asarray(out)
 
 

@@ -151,22 +151,6 @@ class PointForce:
         """Leading shape: how many loads."""
         return tuple(np.shape(self.arc_length))
 
-    def rows(self, which: IntArray) -> PointForce:
-        """Pick loads, counted without regard to their shape.
-
-        Parameters
-        ----------
-        which : (n,) int array
-            Indices of the loads.
-
-        Returns
-        -------
-        PointForce
-            Loads of these indices, of shape (n,).
-        """
-        parts = np.reshape(self.components, (-1, 3))[which]
-        return PointForce(np.reshape(self.arc_length, -1)[which], components=parts)
-
 
 @dataclass(frozen=True, eq=False)
 class PointContact:
@@ -192,21 +176,6 @@ class PointContact:
     def shape(self) -> tuple[int, ...]:
         """Leading shape: how many loads."""
         return tuple(np.shape(self.points)[:-1])
-
-    def rows(self, which: IntArray) -> PointContact:
-        """Pick loads, counted without regard to their shape.
-
-        Parameters
-        ----------
-        which : (n,) int array
-            Indices of the loads.
-
-        Returns
-        -------
-        PointContact
-            Loads of these indices, of shape (n,).
-        """
-        return PointContact(np.reshape(self.points, (-1, 3))[which])
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,27 +256,22 @@ class PegContact:
         """Leading shape: how many loads."""
         return tuple(np.shape(self.radius))
 
-    def rows(self, which: IntArray) -> PegContact:
-        """Pick loads, counted without regard to their shape.
-
-        Parameters
-        ----------
-        which : (n,) int array
-            Indices of the loads.
-
-        Returns
-        -------
-        PegContact
-            Loads of these indices, of shape (n,).
-        """
-        if self.start is not None:
-            raise ValueError("pegs that go on from a start have one gravity in common")
-        side = None if self.side is None else np.reshape(self.side, (-1, 3))[which]
-        origin, axis = (np.reshape(a, (-1, 3))[which] for a in (self.origin, self.axis))
-        return PegContact(origin, axis, np.reshape(self.radius, -1)[which], side)
-
 
 Load = PointForce | PointContact | PegContact
+
+
+def some_of(load: Load, which: IntArray) -> Load:
+    """Loads of these indices (n,), counted without regard to their shape."""
+    if isinstance(load, PointContact):
+        return PointContact(np.reshape(load.points, (-1, 3))[which])
+    if isinstance(load, PointForce):
+        parts = np.reshape(load.components, (-1, 3))[which]
+        return PointForce(np.reshape(load.arc_length, -1)[which], components=parts)
+    if load.start is not None:
+        raise ValueError("pegs that go on from a start have one gravity in common")
+    side = None if load.side is None else np.reshape(load.side, (-1, 3))[which]
+    origin, axis = (np.reshape(a, (-1, 3))[which] for a in (load.origin, load.axis))
+    return PegContact(origin, axis, np.reshape(load.radius, -1)[which], side)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,15 @@ from numpy.typing import ArrayLike
 
 from vibrissa.numerics import AnyArray, Array, IntArray, check_device
 from vibrissa.rod.chart import PROXIMAL
-from vibrissa.rod.deflection import Deflection, Load, PegContact, PointContact, PointForce, vectors
+from vibrissa.rod.deflection import (
+    Deflection,
+    Load,
+    PegContact,
+    PointContact,
+    PointForce,
+    some_of,
+    vectors,
+)
 from vibrissa.rod.discretization import MOST_STEPS, STEPS, Bendable, Discretization, discretize
 from vibrissa.rod.gravity import Resting, moved_moments, resting
 from vibrissa.rod.integration import solve_forces
@@ -120,7 +128,7 @@ def deflect(
         if np.isnan(one).any():
             continue
         rows = np.flatnonzero(kind.reshape(-1) == k)
-        part = load if len(kinds) == 1 else load.rows(rows)
+        part = load if len(kinds) == 1 else some_of(load, rows)
         bent = resting(whisker, one)
         found, finer = _solve(bent, part, proximal, steps, device)
         solved.put(rows, found)

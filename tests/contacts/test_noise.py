@@ -58,7 +58,7 @@ def test_regions_hold_what_they_state_up_to_slip_off(gamma_map, beside_slip_off,
     else:
         found = gamma_map.estimate(vb.base_signals(force, moment), using, covariance)
     rows = (found.status == vb.Status.UNIQUE) & found.covariance_valid
-    assert rows.mean() > (0.7 if using == "wrench" else 0.97)
+    assert rows.mean() > (0.65 if using == "wrench" else 0.85)
     squares = distances(found, point, rows)
     error = 3.0 / np.sqrt(rows.sum())
     assert 0.93 - 0.25 * error < (squares <= HELD).mean() < 0.97 + 0.17 * error

@@ -267,12 +267,20 @@ def outside_share(
         squares += density[k] * density[k]
         for a in range(3):
             points[a, k] = of.values[node, 3 + a] - point[a]
-    if total * total > _MANY * squares:
-        second_moment(points, density, total, NORMAL_KURTOSIS, covariance)
+    many = total * total > _MANY * squares
+    if many:
+        second_moment(points, density, total, covariance)
     root = np.zeros((3, 3))
     if not cholesky(covariance, root):
         return 0.0
     squared_distances(root, points, far)
+    if many:
+        fourth = 0.0
+        for k in range(n):
+            fourth += density[k] * far[k] * far[k]
+        wider = max(fourth / (total * NORMAL_KURTOSIS), 1.0) ** 0.75
+        covariance *= wider
+        far /= wider
     mass, mass_out, like, like_out = 0.0, 0.0, 0.0, 0.0
     for k in range(n):
         if far[k] > _OUTSIDE_REGION:

@@ -35,7 +35,7 @@ from vibrissa.contacts.noise import INDISTINCT
 from vibrissa.contacts.posterior import CERTAIN, judge, rank
 from vibrissa.contacts.weighing import Weighing, weigh_any
 from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel
-from vibrissa.rod import LEAST_ARC, evaluate
+from vibrissa.rod import evaluate
 from vibrissa.status import Status
 
 _UNIQUE, _AMBIGUOUS = int(Status.UNIQUE), int(Status.AMBIGUOUS)
@@ -198,12 +198,11 @@ def _kept(limit: float, number: int, x: Array, values: Array, misfits: Array) ->
 class _Room(NamedTuple):
     """Working memory of `settle`, by candidate.
 
-    Targets, weights, ∂(F, p)/∂x (n, 6, 4) and ∂(F, p)/∂ξ (n, 6, 3), residuals and slopes in
-    standard deviations; covariances, log weights (as they count, and with volumes), probabilities,
+    Weights, ∂(F, p)/∂x of one (6, 4) and ∂(F, p)/∂ξ (n, 6, 3), residuals and slopes in standard
+    deviations; covariances, log weights (as they count, and with volumes), probabilities,
     whether covariances are valid, order; and copies of x, (F, p) and χ².
     """
 
-    aims: Array
     weights: Array
     tangents: Array
     third: Array
@@ -223,9 +222,8 @@ class _Room(NamedTuple):
 def _judging(most: int, k: int) -> _Room:
     """Make the working memory of `settle`."""
     return _Room(
-        np.empty((most, k)),
         np.zeros((most, k, k)),
-        np.zeros((most, 6, 4)),
+        np.zeros((6, 4)),
         np.empty((most, 6, 3)),
         np.empty((most, k)),
         np.empty((most, k, 4)),
@@ -256,13 +254,12 @@ def _weighed(
     residual, jacobian = np.empty(k), np.empty((k, 4))
     evaluate(of.rod, x, room.values, room.third, 0, n)
     for c in range(n):
-        copy(target, room.aims[c])
         if not weigh_any(how, values[c], measured, room.weights[c]):
             room.weights[c, 0, 0] = np.nan
         for a in range(6):
-            t, by_x = room.third[c, a], room.tangents[c, a]
+            t, by_x = room.third[c, a], room.tangents[a]
             by_x[0], by_x[2], by_x[3] = t[0], t[1], t[2]
-        channel_equations(x[c], values[c], room.tangents[c], how.codes, target, residual, jacobian)
+        channel_equations(x[c], values[c], room.tangents, how.codes, target, residual, jacobian)
         room.misfits[c] = whiten(
             room.weights[c], residual, jacobian, k, room.residuals[c], room.jacobians[c]
         )
@@ -353,19 +350,17 @@ def settle(
         _weighed(of, how, target, measured, x, values, n, room)
     judge(
         of.rod,
-        False,
-        LEAST_ARC,
         of.proximal,
         how.codes,
-        room.aims,
+        target,
         room.weights,
         x,
-        values,
-        room.tangents,
+        room.third,
+        room.residuals,
+        room.jacobians,
         room.spread,
         weight[1],
         fine,
-        0,
         n,
     )
     sound = True

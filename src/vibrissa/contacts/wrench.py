@@ -36,8 +36,9 @@ from vibrissa.contacts.noise import (
     trusted,
     whitening,
 )
-from vibrissa.contacts.posterior import CERTAIN, judged, ranked
+from vibrissa.contacts.posterior import CERTAIN, ranked
 from vibrissa.contacts.prior import Prior, possible_candidates
+from vibrissa.contacts.valleys import Valleys, valleys
 from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod import Discretization, discretize, solve_forces, vanishing_moments
@@ -62,6 +63,8 @@ _LONGEST_ARM = 10.0
 # Seeds whose wrench differs by so many standard deviations are not worth a start, if there are
 # others.
 _FAR = 100.0
+# Where the coarse rod gives a wrench within so many standard deviations, it follows valleys.
+_EQUAL = 0.05
 # A contact that may lie this far away (over L, one standard deviation) is not known.
 _UNKNOWN = 0.5
 # Contacts within this (over L, and ten times that relative to the force) are one.
@@ -221,14 +224,15 @@ def _located(
         weights = wrench_weights(sensor, d, wrenches[rows])
         degrees = rank(_covariance(sensor) / np.outer(scale, scale)) - _UNKNOWNS
     limit = explained(degrees)
-    solved = _solve(discretize(whisker, _COARSE), d, wrenches[rows], weights, limit)
+    coarse = discretize(whisker, _COARSE)
+    solved = _solve(coarse, d, wrenches[rows], weights, limit)
     found, lost = _candidates(solved), np.zeros(rows.size, np.bool_)
     if prior is not None:
         allowed = possible_candidates(prior, whisker, d, found)
         found = found.allowed_first(allowed)
         solved = solved.allowed_first(allowed)
     if sensor is not None:
-        found, lost = _judged(d, solved, found, wrenches[rows], weights)
+        found, lost = _judged(coarse, d, solved, found, wrenches[rows], weights)
     status = np.where(known, int(Status.DEGENERATE), int(Status.MISSING))
     status[rows] = np.where(lost, int(Status.DEGENERATE), _statuses(found, limit))
     whole = found.spread_out(rows, len(wrenches))
@@ -313,14 +317,18 @@ def _promising(
 ) -> AnyArray:
     """Which seeds are about as good as the best of their row."""
     values, _ = solve_forces(d, seeds)
-    model = np.concatenate([values[:, :3], np.cross(values[:, 3:], values[:, :3])], axis=1)
-    away = np.einsum("nij,nj->ni", weights[row], model - wrenches[row])
+    away = np.einsum("nij,nj->ni", weights[row], _wrenches_of(values) - wrenches[row])
     with np.errstate(over="ignore", invalid="ignore"):
         misfit = np.sqrt((away**2).sum(axis=1))
     misfit[~np.isfinite(misfit)] = np.inf
     best = np.full(len(wrenches), np.inf)
     np.minimum.at(best, row, misfit)
     return np.asarray(misfit <= _FAR * (1.0 + best[row]))
+
+
+def _wrenches_of(values: Array) -> Array:
+    """Force and moment (n, 6) of (F, p)."""
+    return np.concatenate([values[:, :3], np.cross(values[:, 3:], values[:, :3])], axis=1)
 
 
 def friction_angle(contacts: Array) -> Array:
@@ -342,30 +350,32 @@ def _statuses(found: Candidates, limit: float) -> IntArray:
 
 
 def _judged(
-    d: Discretization, solved: Fitted, found: Candidates, wrenches: Array, weights: Array
+    coarse: Discretization,
+    fine: Discretization,
+    solved: Fitted,
+    found: Candidates,
+    wrenches: Array,
+    weights: Array,
 ) -> tuple[Candidates, AnyArray]:
     """Candidates by probability with what noise leaves open, and whether the first is not known."""
     n, most = found.chi_squared.shape
     row, place = np.nonzero(np.arange(most) < found.number[:, None])
     x, values, tangents = (a[row, place] for a in (found.x, found.values, solved.tangents))
-    judgement = judged(
-        d,
-        WRENCH,
-        wrenches[row],
-        weights[row],
-        x,
-        values,
-        tangents,
-        friction=True,
-        least=PROXIMAL,
-        proximal=PROXIMAL,
-    )
+    away = _wrenches_of(solve_forces(coarse, x)[0]) - _wrenches_of(values)
+    away = np.einsum("nij,nj->ni", weights[row], away)
+    near = np.abs(away).max(axis=1, initial=0.0) < _EQUAL
+    valley = Valleys.room(len(row))
+    for d, which in ((coarse, near), (fine, ~near)):
+        i, at = row[which], (x[which], values[which], tangents[which])
+        part = valleys(d, WRENCH, wrenches[i], weights[i], *at, PROXIMAL)
+        for mine, theirs in zip(valley, part, strict=True):
+            mine[which] = theirs
     spread = unknowns_covariance(WRENCH, values, tangents, weights[row], friction=True)
     size = np.einsum("nai,nij,naj->n", tangents[:, 3:], spread, tangents[:, 3:])
     weight, far = np.full((n, most), -np.inf), np.full((n, most), np.nan)
-    weight[row, place] = judgement.weight - 0.5 * (friction_angle(x) / _LIKELY) ** 2
+    weight[row, place] = valley.weight - 0.5 * (friction_angle(x) / _LIKELY) ** 2
     far[row, place] = size
-    found.covariances[row, place], found.valid[row, place] = judgement.covariances, judgement.valid
+    found.covariances[row, place], found.valid[row, place] = valley.covariances, valley.valid
     found.angle_sigma[row, place] = _angle_deviation(x, spread)
     probability, order = ranked(weight, found.number)
     line = np.arange(n)[:, None]

@@ -1,0 +1,337 @@
+"""What noise leaves open about a contact with friction: valleys of χ² along the whisker; compiled.
+
+A wrench determines the force well, but where along a thin tip it acts hardly at all: χ² has long,
+bent valleys, which no expansion about their lowest point describes. So a valley is followed from
+there both ways along the arc length s, until χ² has risen enough or the whisker ends. At each s a
+step of Gauss and Newton leads to the force of least χ²; to first order noise leaves open a
+covariance C_f of it. With contact points p and friction angles φ equally probable beforehand the
+density of s is
+
+    exp(-χ²/2) |∂(p, φ)/∂(s, f)| √det C_f,
+
+or, with s and f instead, that without the second factor; the mean of both counts. Contact points
+are a mixture of normal distributions along the valley. The covariance is their second moment about
+the contact, widened by κ^(3/4) for tails, with the kurtosis κ relative to a normal distribution's
+(K. V. Mardia, *Measures of multivariate skewness and kurtosis with applications*, Biometrika 57
+(1970) 519-530).
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from vibrissa.contacts.channels import FITTED
+from vibrissa.contacts.least_squares import channel_equations, lane_contact, whiten
+from vibrissa.contacts.posterior import NORMAL_KURTOSIS
+from vibrissa.numerics import (
+    AnyArray,
+    Array,
+    IntArray,
+    cholesky,
+    copy,
+    inlined,
+    kernel,
+    mahalanobis,
+    share_out,
+    solve,
+    solve_root,
+)
+from vibrissa.rod import BUFFER_SIZE, Discretization, Rod, integrate, set_lane
+
+# Steps each way; the first in standard deviations of s, at least and at most over L.
+_STEPS = 9
+_FIRST, _SHORTEST, _LONGEST = 0.7, 1e-4, 0.05
+# A valley ends where χ² is so much above its least; if it does, the covariance may be relied on.
+_HIGH, _CLOSED = 16.0, 9.0
+# After a step on which χ² rose by less than this the next is longer, by this factor.
+_PACE = ((0.7, 2.0), (2.5, 1.3), (5.0, 1.0), (math.inf, 0.6))
+# The largest change of the moment of the force in a step, as a share of it.
+_LARGEST_CHANGE = 0.5
+# The largest kurtosis at which a covariance is relied on.
+_TAILED = 1.15
+
+
+class Valleys(NamedTuple):
+    """Covariances of points (n, 3, 3), log weights (n,), and validity (n,) of candidates."""
+
+    covariances: Array
+    weight: Array
+    valid: AnyArray
+
+    @classmethod
+    def room(cls, n: int) -> Valleys:
+        """Those of n contacts, of which nothing is known yet."""
+        return cls(np.full((n, 3, 3), np.nan), np.full(n, -np.inf), np.zeros(n, np.bool_))
+
+
+# By node along a valley: s, χ², logs of the two densities (2), point (3), covariance there (3, 3).
+_Nodes = tuple[Array, Array, Array, Array, Array]
+
+
+@inlined
+def _node(
+    x: Array,
+    value: Array,
+    t: Array,
+    codes: IntArray,
+    target: Array,
+    weights: Array,
+    nodes: _Nodes,
+    i: int,
+    along: Array,
+) -> float:
+    """Fill a node at the arc length of x, which becomes the best there; variance of s by itself.
+
+    ``along`` becomes ∂f/∂s of the valley. The variance is negative where χ² has no least force.
+    """
+    s, misfits, logs, points, spreads = nodes
+    k = codes.shape[0]
+    residual, jacobian = np.empty(k), np.empty((k, 4))
+    r, j, whole = np.empty(k), np.empty((k, 4)), np.zeros((4, 4))
+    normal, root, down, column = np.empty((3, 3)), np.zeros((3, 3)), np.empty(3), np.empty(3)
+    channel_equations(x, value, t, codes, target, residual, jacobian)
+    chi, steep = whiten(weights, residual, jacobian, k, r, j), 0.0
+    for a in range(3):
+        down[a], along[a] = 0.0, 0.0
+        for m in range(k):
+            down[a] -= j[m, 1 + a] * r[m]
+            along[a] -= j[m, 1 + a] * j[m, 0]
+        for c in range(3):
+            normal[a, c] = 0.0
+            for m in range(k):
+                normal[a, c] += j[m, 1 + a] * j[m, 1 + c]
+    if not (chi < np.inf and cholesky(normal, root)):
+        return -1.0
+    for m in range(k):
+        steep += j[m, 0] * j[m, 0]
+    copy(along, column)
+    steep -= mahalanobis(root, column)
+    solve_root(root, along)
+    copy(down, column)
+    chi -= mahalanobis(root, column)
+    solve_root(root, down)
+    s[i], misfits[i] = x[0], chi
+    across = np.empty((3, 3))
+    for a in range(3):
+        copy(t[3 + a], whole[a])
+        points[i, a] = value[3 + a]
+        for c in range(3):
+            points[i, a] += t[3 + a, 1 + c] * down[c]
+            across[a, c] = t[3 + a, 1 + c]
+        mahalanobis(root, across[a])
+    for a in range(3):
+        for c in range(3):
+            spreads[i, a, c] = 0.0
+            for m in range(3):
+                spreads[i, a, c] += across[a, m] * across[c, m]
+    side = math.hypot(x[2], x[3])
+    size = side * side + x[1] * x[1]
+    whole[3, 1] = side / size
+    whole[3, 2], whole[3, 3] = -x[1] * x[2] / (side * size), -x[1] * x[3] / (side * size)
+    logs[i, 1] = -0.5 * chi - math.log(root[0, 0] * root[1, 1] * root[2, 2])
+    logs[i, 0] = logs[i, 1] + math.log(abs(solve(whole, np.zeros(4))) + 1e-300)
+    for a in range(3):
+        x[1 + a] += down[a]
+    return 1.0 / steep if steep > 0.0 else np.inf
+
+
+@inlined
+def _ahead(x: Array, along: Array, step: float, least: float, to: Array) -> None:
+    """Fill the contact a step farther along a valley, of which s and s f are about straight."""
+    ds = min(max(x[0] + step, least), 1.0) - x[0]
+    moment, change = 0.0, 0.0
+    for a in range(3):
+        moment += (x[0] * x[1 + a]) ** 2
+        change += (ds * (x[1 + a] + x[0] * along[a])) ** 2
+    share = min(1.0, _LARGEST_CHANGE * math.sqrt(moment / max(change, 1e-300)))
+    to[0] = x[0] + ds
+    for a in range(3):
+        by = share * ds * (x[1 + a] + x[0] * along[a])
+        to[1 + a] = (x[0] * x[1 + a] + by) / to[0]
+
+
+@inlined
+def _followed(
+    rod: Rod,
+    b: Array,
+    least: float,
+    codes: IntArray,
+    target: Array,
+    weights: Array,
+    x: Array,
+    value: Array,
+    tangents: Array,
+    nodes: _Nodes,
+) -> tuple[int, int]:
+    """Fill the nodes of a valley, the contact in the middle; the first, and behind the last."""
+    misfits = nodes[1]
+    at, to, along = np.empty((2, 4)), np.empty((2, 4)), np.empty((2, 3))
+    third, t, v = np.empty((6, 3)), np.zeros((6, 4)), np.empty(6)
+    steps, active, number = np.empty(2), np.ones(2, np.bool_), np.zeros(2, np.int64)
+    copy(x, at[0])
+    variance = _node(at[0], value, tangents, codes, target, weights, nodes, _STEPS, along[0])
+    if variance < 0.0:
+        return 0, 0
+    copy(at[0], at[1])
+    copy(along[0], along[1])
+    steps[0] = min(max(_FIRST * math.sqrt(variance), _SHORTEST), _LONGEST)
+    steps[1] = -steps[0]
+    for _ in range(_STEPS):
+        for way in range(2):
+            active[way] = active[way] and (at[way, 0] < 1.0 if way == 0 else at[way, 0] > least)
+            _ahead(at[way], along[way], steps[way], least, to[way])
+            c = to[way] if active[way] else x
+            for lane in range(2 * way, 2 * way + 2):
+                set_lane(b, lane, c[0], c[1], c[2], c[3], lane % 2 == 1)
+        if not (active[0] or active[1]):
+            break
+        integrate(rod, b, 3)
+        for way in range(2):
+            if not active[way]:
+                continue
+            i = _STEPS + (1 - 2 * way) * (number[way] + 1)
+            before = misfits[_STEPS + (1 - 2 * way) * number[way]]
+            lane_contact(b, 2 * way, True, v, t, third)
+            left = _node(to[way], v, t, codes, target, weights, nodes, i, along[way])
+            if left < 0.0:
+                active[way] = False
+                continue
+            number[way] += 1
+            copy(to[way], at[way])
+            active[way] = misfits[i] < misfits[_STEPS] + _HIGH
+            for most, factor in _PACE:
+                if misfits[i] - before < most:
+                    steps[way] *= factor
+                    break
+    return _STEPS - number[1], _STEPS + number[0] + 1
+
+
+@inlined
+def _shares(nodes: _Nodes, first: int, last: int, shares: Array) -> float:
+    """Fill the probabilities of nodes; return the log of the density by volume, integrated."""
+    s, logs = nodes[0], nodes[2]
+    mass = np.zeros(2)
+    for d in range(2):
+        for i in range(first, last):
+            low, high = s[max(i - 1, first)], s[min(i + 1, last - 1)]
+            mass[d] += 0.5 * (high - low) * math.exp(logs[i, d] - logs[_STEPS, d])
+    for i in range(first, last):
+        step, shares[i] = 0.5 * (s[min(i + 1, last - 1)] - s[max(i - 1, first)]), 0.0
+        for d in range(2):
+            shares[i] += 0.5 * step * math.exp(logs[i, d] - logs[_STEPS, d]) / mass[d]
+    return float(math.log(mass[0]) + logs[_STEPS, 0])
+
+
+@inlined
+def _mixture(
+    nodes: _Nodes, first: int, last: int, shares: Array, point: Array, covariance: Array
+) -> float:
+    """Fill the second moment of a mixture about a point, widened; return its kurtosis."""
+    points, spreads = nodes[3], nodes[4]
+    root, y, z = np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
+    covariance[:] = 0.0
+    for i in range(first, last):
+        for a in range(3):
+            for c in range(3):
+                away = (points[i, a] - point[a]) * (points[i, c] - point[c])
+                covariance[a, c] += shares[i] * (spreads[i, a, c] + away)
+    if not cholesky(covariance, root):
+        return np.inf
+    fourth = 0.0
+    for i in range(first, last):
+        trace, both, across = 0.0, 0.0, 0.0
+        for a in range(3):
+            y[a] = points[i, a] - point[a]
+            copy(spreads[i, a], z[a])
+            mahalanobis(root, z[a])
+        square = mahalanobis(root, y)
+        for c in range(3):
+            column = z[:, c].copy()
+            mahalanobis(root, column)
+            for a in range(3):
+                z[a, c] = column[a]
+        for a in range(3):
+            trace += z[a, a]
+            for c in range(3):
+                both += z[a, c] * z[a, c]
+                across += y[a] * z[a, c] * y[c]
+        fourth += shares[i] * ((square + trace) ** 2 + 2.0 * both + 4.0 * across)
+    tailed = fourth / NORMAL_KURTOSIS
+    covariance *= max(tailed, 1.0) ** 0.75
+    return tailed
+
+
+@kernel
+def _valley_rows(
+    rod: Rod,
+    least: float,
+    codes: IntArray,
+    targets: Array,
+    weights: Array,
+    contacts: Array,
+    values: Array,
+    tangents: Array,
+    out: Valleys,
+    first: int,
+    last: int,
+) -> None:
+    most = 2 * _STEPS + 1
+    b, shares = np.zeros(BUFFER_SIZE), np.empty(most)
+    nodes = (
+        np.empty(most),
+        np.empty(most),
+        np.empty((most, 2)),
+        np.empty((most, 3)),
+        np.empty((most, 3, 3)),
+    )
+    covariances, weight, valid = out
+    for row in range(first, last):
+        begin, end = _followed(
+            rod,
+            b,
+            least,
+            codes,
+            targets[row],
+            weights[row],
+            contacts[row],
+            values[row],
+            tangents[row],
+            nodes,
+        )
+        if end - begin < 2:
+            continue
+        weight[row] = _shares(nodes, begin, end, shares)
+        tailed = _mixture(nodes, begin, end, shares, values[row, 3:], covariances[row])
+        enough = nodes[1][_STEPS] + _CLOSED
+        closed = nodes[1][begin] > enough and nodes[1][end - 1] > enough
+        valid[row] = closed and tailed < _TAILED
+
+
+def valleys(
+    discretization: Discretization,
+    names: tuple[str, ...],
+    targets: Array,
+    weights: Array,
+    contacts: Array,
+    values: Array,
+    tangents: Array,
+    least: float,
+) -> Valleys:
+    """Follow the valleys of contacts with friction that explain measured channels.
+
+    Weights of the channels, contacts x (n, 4), (F, p) and their derivatives by x are those of fits;
+    no contact is nearer to the base than ``least``.
+    """
+    n, rod = len(contacts), discretization.rod
+    out = Valleys.room(n)
+    codes = np.array([FITTED.index(name) for name in names])
+    targets, weights = np.ascontiguousarray(targets), np.ascontiguousarray(weights)
+    share_out(
+        n,
+        partial(_valley_rows, rod, least, codes, targets, weights, contacts, values, tangents, out),
+    )
+    return out

@@ -81,13 +81,13 @@ def test_a_wrong_matrix_makes_errors_as_stated(gamma_map, bent, wrench, rng, cha
 def test_stated_errors_of_components_are_in_the_covariance(gamma_map, bent, wrench, names, which):
     """In batches and one at a time alike; of cross-talk all is drawn, forces among themselves."""
     rng = np.random.default_rng(7)
-    stated = {f"{which}_sigma": 0.01}
-    noise = np.diag((0.1 * NOISE) ** 2)
+    stated = {f"{which}_sigma": 0.005}
+    noise = np.diag((0.05 * NOISE) ** 2)
     away = rng.normal(size=(TRIALS, 6)) if which == "gain" else rng.normal(size=(TRIALS, 6, 6))
-    wrong = 0.01 * away * wrench
+    wrong = 0.005 * away * wrench
     if which == "mixing":
         wrong = (wrong * np.kron(np.eye(2), np.ones((3, 3)))).sum(axis=-1)
-    measured = wrench + wrong + 0.1 * NOISE * rng.normal(size=(TRIALS, 6))
+    measured = wrench + wrong + 0.05 * NOISE * rng.normal(size=(TRIALS, 6))
     signals = vb.base_signals(measured[:, :3], measured[:, 3:])
     found = gamma_map.estimate(signals, names, noise, **stated)
     assert is_three(nees(found.candidates.point, found.candidates.covariance, bent.contact_point))

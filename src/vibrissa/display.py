@@ -6,6 +6,7 @@ xarray's own types, whose display lists variables; `show` explains them.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from html import escape
 from typing import Any
 
@@ -18,12 +19,12 @@ from vibrissa.recording import Recording
 from vibrissa.sketch import BENT, CONTACT, MOST_CURVES, REST, Mark, card, table, thinned, views
 
 
+@dataclass(frozen=True, repr=False)
 class Shown:
     """Something to look at: HTML in a notebook, text in a terminal."""
 
-    def __init__(self, html: str, text: str) -> None:
-        self.html = html
-        self.text = text
+    html: str
+    text: str
 
     def _repr_html_(self) -> str:
         return self.html

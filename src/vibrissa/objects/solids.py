@@ -270,10 +270,6 @@ class Plane(Surface):
         )
 
 
-def _upright() -> Array:
-    return np.eye(3)
-
-
 @dataclass(frozen=True, eq=False)
 class Box(Surface):
     """A solid block, with sharp or rounded edges.
@@ -307,7 +303,7 @@ class Box(Surface):
 
     origin: Array
     size: Array
-    rotation: Array = field(default_factory=_upright)
+    rotation: Array = field(default_factory=lambda: np.eye(3))
     edge_radius: float = 0.0
     stiffness: float = np.inf
 

@@ -1,6 +1,13 @@
 """The methods of Huet, Emnett & Hartmann (2022), for comparison."""
 
-from vibrissa.paper.lookup import METHODS, LookupTable, estimate
+from vibrissa.paper.lookup import (
+    METHODS,
+    LookupTable,
+    error_solid as error_solid,
+    estimate,
+    interpolation_errors as interpolation_errors,
+    signal_slice,
+)
 from vibrissa.paper.natural_neighbour import NaturalNeighbour
 from vibrissa.paper.network import (
     DrawnContacts as DrawnContacts,
@@ -10,11 +17,6 @@ from vibrissa.paper.network import (
     with_network_errors,
 )
 from vibrissa.paper.sensitivity import central_differences, sensitivity_findings
-from vibrissa.paper.slices import (
-    error_solid as error_solid,
-    interpolation_errors as interpolation_errors,
-    signal_slice,
-)
 
 __all__ = [
     "METHODS",

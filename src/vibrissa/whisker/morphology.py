@@ -172,16 +172,12 @@ def tip_radius(row: ArrayLike, column: ArrayLike, length: ArrayLike) -> Array:
 
 def _towal(row: ArrayLike, column: ArrayLike) -> tuple[Array, Array]:
     """Row and column as Towal et al. count them."""
-    return _numbers(row), _numbers(column) + _TOWAL_GREEK
+    return np.asarray(row, np.float64), np.asarray(column, np.float64) + _TOWAL_GREEK
 
 
 def _belli(row: ArrayLike, column: ArrayLike) -> tuple[Array, Array]:
     """Row and column as Belli et al. count them."""
-    return _numbers(row), _numbers(column) + _BELLI_GREEK
-
-
-def _numbers(value: ArrayLike) -> Array:
-    return np.asarray(value, dtype=np.float64)
+    return np.asarray(row, np.float64), np.asarray(column, np.float64) + _BELLI_GREEK
 
 
 ANY = "any"

@@ -57,8 +57,12 @@ _STATE = 7 * _STAGE  # φ, q, g, μ
 _SLOPES = _STATE + 2 * _SIX
 _MOVING = _SLOPES + 10 * _SIX  # the derivative that takes a step
 _H = _MOVING + 2 * _SIX
+# Copies of the contacts' arc lengths and kinds: a loop over so few lanes runs side by side only
+# where it uses one array.
+_ARC = _H + LANES
+_TIP = _ARC + LANES
 #: Numbers that a buffer for :func:`solve_lanes` holds.
-WEIGHT_BUFFER = _H + LANES
+WEIGHT_BUFFER = _TIP + LANES
 #: Numbers of a solved state: (F, p), ĝ and μ at the base.
 STATES = 12
 
@@ -201,11 +205,11 @@ def _held_slope_rates(
 
 
 @inlined
-def _free_step(rod: Rod, weight: Weight, b: Array, h: Array, k: int) -> None:
+def _free_step(rod: Rod, weight: Weight, h: Array, k: int) -> None:
     """Step k beyond the contacts, with the derivatives by the unknowns at the tip."""
     start, width, piece, load = rod.start[k], rod.width[k], piece_of(rod, k), _load_of(weight, k)
     for i in range(LANES):
-        low = min(max(b[ARC + i] - start, 0.0), width)
+        low = min(max(h[_ARC + i] - start, 0.0), width)
         step = width - low
         data = (h, piece, load, low / width, step / width)
         y = _get_six(h, _STATE + _SIX, i)
@@ -225,11 +229,11 @@ def _free_step(rod: Rod, weight: Weight, b: Array, h: Array, k: int) -> None:
 
 
 @inlined
-def _held_step(rod: Rod, weight: Weight, b: Array, h: Array, k: int, slopes: int) -> None:
+def _held_step(rod: Rod, weight: Weight, h: Array, k: int, slopes: int) -> None:
     """Step k between contacts and base, with the first so many derivatives."""
     start, width, piece, load = rod.start[k], rod.width[k], piece_of(rod, k), _load_of(weight, k)
     for i in range(LANES):
-        s = b[ARC + i]
+        s = h[_ARC + i]
         step = min(max(s - start, 0.0), width)
         data = (h, piece, load, 0.0, step / width)
         x0, y0 = _get_six(h, _STATE, i), _get_six(h, _STATE + _SIX, i)
@@ -238,7 +242,7 @@ def _held_step(rod: Rod, weight: Weight, b: Array, h: Array, k: int, slopes: int
         _put_six(h, _STATE + _SIX, i, y)
         h[_H + i] = -step
         # The lane's contact is in this step: its derivative by s starts here.
-        if slopes > 2 and s > start and s <= start + width and b[TIP + i] == 0.0:
+        if slopes > 2 and s > start and s <= start + width and h[_TIP + i] == 0.0:
             u = get(h, _TURN, i)
             turned = cross(u, _first(x0))
             put(h, _SLOPES + 4 * _SIX, i, turned)
@@ -278,6 +282,7 @@ def _start(weight: Weight, b: Array, h: Array, more: int, share: float) -> None:
     for i in range(_STATE, _MOVING):
         h[i] = 0.0
     for i in range(LANES):
+        h[_ARC + i], h[_TIP + i] = b[ARC + i], b[TIP + i]
         g = get(b, LEAN, i)
         if not abs(g[0] * g[0] + g[1] * g[1] + g[2] * g[2] - 1.0) < 1e-9:
             g = (weight.at_tip[0], weight.at_tip[1], weight.at_tip[2])
@@ -354,9 +359,9 @@ def _pass(rod: Rod, weight: Weight, b: Array, h: Array, more: int, share: float)
         nearest, farthest = min(nearest, b[ARC + i]), max(farthest, b[ARC + i])
     for k in range(rod.start.shape[0] - 1, -1, -1):
         if nearest < rod.start[k] + rod.width[k]:
-            _free_step(rod, weight, b, h, k)
+            _free_step(rod, weight, h, k)
         if rod.start[k] < farthest:
-            _held_step(rod, weight, b, h, k, 2 + more)
+            _held_step(rod, weight, h, k, 2 + more)
 
 
 @kernel

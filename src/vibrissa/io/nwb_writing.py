@@ -128,7 +128,7 @@ def save_nwb(
         # The names of the views may stand above.
         cameras = recording.children["cameras"].to_dataset()
     file = _file(session)
-    _fill(file, data, cameras, predictors)
+    _fill(file, _completed(data, predictors), cameras, predictors)
     with replacing(path) as part:
         # In memory first, for the reason given in :mod:`vibrissa.io.netcdf`.
         image = io.BytesIO()
@@ -145,6 +145,15 @@ def _check(data: xr.Dataset) -> None:
     known = {"trace", "centerline", *_SERIES} - {"head_position", "head_rotation"}
     if not known & set(data.data_vars):
         raise ValueError(f"there is nothing to write: none of {', '.join(sorted(known))}")
+
+
+def _completed(data: xr.Dataset, table: xr.Dataset | None) -> xr.Dataset:
+    """Add the contacts of a table where tracking found none, as those of a sensor."""
+    found = {} if table is None else {n: table[n] for n in ("in_contact",) if n in table}
+    if table is not None and "contact_point_x" in table:
+        axes = [table[f"contact_point_{axis}"] for axis in "xyz"]
+        found["contact_point"] = xr.concat(axes, "space", combine_attrs="drop")
+    return data.assign({name: value for name, value in found.items() if name not in data})
 
 
 def _file(session: Session) -> NWBFile:

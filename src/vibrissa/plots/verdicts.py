@@ -380,19 +380,16 @@ def critical_cones(cones: xr.Dataset, *, width: style.Width = "double") -> Figur
         tall = 62.0 if width == "double" else 46.0 * count + 14.0
         figure = style.new_figure(width, tall, "constrained")
         grid = figure.subplots(*shape, sharex=True, sharey=True, squeeze=False)
-        counts: dict[str, float] = {}
         for i, axes in enumerate(grid.ravel()):
             _cone_map(axes, cone.isel(triplet=i), degrees[i], norm, colours)
             known = degrees[i][np.isfinite(degrees[i])]
             narrow = f"{(known <= PAPERS_CONE).sum()} of {known.size} within {PAPERS_CONE:g}°"
             name = triplet_label(str(cone["triplet"].values[i]))
             style.head(axes, "abcdefghijkl"[i], f"{name}: {narrow}")
-            counts[name] = float((known <= PAPERS_CONE).mean()) if known.size else 0.0
-        most = max(counts, key=lambda name: counts[name])
         style.conclude(
             figure,
-            f"({most}) locates contacts outside {PAPERS_CONE:g}° on most whiskers, as far as was "
-            f"searched: {100.0 * counts[most]:.0f} % of them",
+            f"The critical cone of ({triplet_label(str(cone['triplet'].values[0]))}) "
+            f"{_trend(degrees[0], 1)} with curvature and {_trend(degrees[0], 0)} with taper",
         )
         for axes in grid[:, 0]:
             axes.set_ylabel("base / tip radius")
@@ -410,6 +407,13 @@ def critical_cones(cones: xr.Dataset, *, width: style.Width = "double") -> Figur
         bar.set_label(_cone_label(degrees))
         bar.ax.axvline(PAPERS_CONE, color=style.INK, linewidth=0.9)
         return figure
+
+
+def _trend(values: Array, axis: int) -> str:
+    """How values change along an axis on the whole."""
+    steps = np.diff(values, axis=axis)
+    total = float(steps[np.isfinite(steps)].sum())
+    return "grows" if total > 0.0 else "shrinks" if total < 0.0 else "does not change"
 
 
 def _cone_map(

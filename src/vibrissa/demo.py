@@ -18,6 +18,7 @@ import numpy as np
 import xarray as xr
 
 from vibrissa import samples
+from vibrissa._version import __version__
 from vibrissa.contacts import ContactMap
 from vibrissa.contour import CylinderFit, shape_from_dataset
 from vibrissa.evaluation import (
@@ -84,20 +85,8 @@ _DIM = {"whisker": 0}
 class Located:
     """Contact points estimated from signals of one source, and how good they are.
 
-    Parameters
-    ----------
-    recording : xarray.DataTree
-        Recording with the groups ``signals``, ``estimates`` and ``contour``.
-    contacts : xarray.Dataset
-        Estimates, dim time.
-    errors : xarray.Dataset
-        Errors of the contacts, dim time.
-    fit : CylinderFit
-        Peg that was fitted to the contacts.
-    scores : Scores
-        Errors in numbers.
-    signals : tuple of SignalRow
-        Errors of the signals by deflection angle.
+    The recording has the groups ``signals``, ``estimates`` and ``contour``; `contacts` are its
+    estimates and `fit` the peg fitted to them, errors by frame, in numbers, and of the signals.
     """
 
     recording: xr.DataTree
@@ -110,29 +99,12 @@ class Located:
 
 @dataclass(frozen=True, eq=False)
 class DemoResult:
-    """Everything that the main job gives.
+    """Everything that the main job gives: the simulated trial, and what was made of it.
 
-    Parameters
-    ----------
-    whisker : Whisker
-        Whisker that whisked.
-    peg : Peg
-        Peg that it met.
-    simulated : xarray.DataTree
-        Trial with its truth and what the sensor read.
-    contact_map : ContactMap
-        Map by which contacts were found: of the whisker as it was tracked, or without video of the
-        one that whisked.
-    sensed : Located
-        Contacts from what the sensor read, in the laboratory by the pose that was tracked, or
-        without video by the true one.
-    seen : Located or None
-        Contacts by the paper's method: from signals that the model gives for the contact point
-        that was tracked.
-    tracking : TrackingScores or None
-        Errors of what was tracked.
-    files : tuple of Path
-        Files that were written.
+    Contacts were found by the map of the whisker as it was tracked, or without video of the one
+    that whisked: `sensed` from what the sensor read, in the laboratory by the pose that was
+    tracked, or without video by the true one; `seen` by the paper's method, from signals that the
+    model gives for the contact point that was tracked.
     """
 
     whisker: Whisker
@@ -158,38 +130,12 @@ def run_demo(
 ) -> DemoResult:
     """Whisk against a peg, film it, measure at the whisker's base, and find the peg again.
 
-    Parameters
-    ----------
-    whisker : Whisker, optional
-        Whisker that whisks; by default the built-in γ whisker.
-    output : str or path, optional
-        Folder for the recordings, videos and tables, made if need be; by default nothing is kept.
-        What is there already of the same trial is not done again.
-    seed : int
-        Seed of the trial's drifts, the sensor's noise and the videos'.
-    noise : bool
-        Whether the sensor has noise: 1 µN and 0.02 µN·m standard deviation a component.
-    duration : float
-        Duration of the trial, s.
-    rate : float
-        Frames per second.
-    video : bool
-        Whether the trial is filmed and tracked. If not, the base's true pose is taken.
-    progress : callable, optional
-        Function called as ``progress(stage, done, total)``.
-
-    Returns
-    -------
-    DemoResult
-        Everything, with how good it is.
-
-    Raises
-    ------
-    ValueError
-        If the whisker cannot whisk past the peg, there are too few contacts to fit it, or files are
-        in the way.
+    Recordings, videos and tables go to a folder, made if need be; by default nothing is kept. What
+    is there already of the same trial is not done again. Without ``video`` the base's true pose is
+    taken. A ValueError says that the whisker cannot whisk past the peg, that there are too few
+    contacts to fit it, or that files are in the way.
     """
-    tell = progress or _silent
+    tell = progress or (lambda stage, done, total: None)
     whisker = samples.gamma() if whisker is None else whisker
     with _folder(output) as folder:
         begin(folder, whisker, seed=seed, noise=noise, duration=duration, rate=rate, video=video)
@@ -215,10 +161,6 @@ def run_demo(
         return DemoResult(whisker, _peg(trial), trial, contact_map, sensed, seen, scores, files)
 
 
-def _silent(stage: str, done: int, total: int) -> None:
-    pass
-
-
 @contextmanager
 def _folder(output: str | PathLike[str] | None) -> Iterator[Path]:
     """The folder that is asked for, or one that goes away again."""
@@ -234,7 +176,7 @@ def begin(folder: Path, whisker: Whisker, **settings: object) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     arc_length = np.linspace(0.0, whisker.length, _NODES)
     shape = np.column_stack([whisker.centerline(_NODES), whisker.radius(arc_length)])
-    about = {**settings, "whisker": shape.tolist(), "version": _version()}
+    about = {**settings, "whisker": shape.tolist(), "version": __version__}
     text = json.dumps(about, sort_keys=True)
     path = folder / _SETTINGS
     if path.exists() and path.read_text(encoding="utf-8") == text:
@@ -250,12 +192,6 @@ def begin(folder: Path, whisker: Whisker, **settings: object) -> None:
         file.unlink(missing_ok=True)
     with replacing(path) as part:
         part.write_text(text, encoding="utf-8")
-
-
-def _version() -> str:
-    import vibrissa
-
-    return vibrissa.__version__
 
 
 def video_files(folder: Path) -> list[Path]:
@@ -313,8 +249,7 @@ def _tracked(trial: xr.DataTree, folder: Path, tell: Progress) -> xr.DataTree:
 
 
 def _peg(recording: xr.DataTree) -> Peg:
-    (peg,) = Recording(recording).objects
-    assert isinstance(peg, Peg)
+    (peg,) = Recording(recording).pegs
     return peg
 
 
@@ -325,14 +260,7 @@ def _located(recording: xr.DataTree, contact_map: ContactMap, seed: int) -> Loca
     fit = shape_from_dataset(recording["contour"].to_dataset())
     assert isinstance(fit, CylinderFit)
     truth, whisker = truth_of(recording)
-    peg = _peg(recording)
     radii = whisker_radii(recording["truth"].to_dataset(), [whisker])[:, 0]
-    known = truth.assign(
-        radius=("time", radii),
-        peg_position=("space", peg.origin),
-        peg_axis=("space", peg.axis),
-        peg_radius=((), peg.radius),
-    )
     errors = contact_errors(contacts, truth, whisker, seed)
     signals = recording["signals"].to_dataset().isel(_DIM)
     return Located(
@@ -340,7 +268,7 @@ def _located(recording: xr.DataTree, contact_map: ContactMap, seed: int) -> Loca
         contacts=contacts,
         errors=errors,
         fit=fit,
-        scores=score(contacts, known, errors, fit),
+        scores=score(contacts, truth, errors, fit, _peg(recording), radii),
         signals=signal_errors(signals, truth, errors["deflection_angle"].values),
     )
 

@@ -22,7 +22,7 @@ from vibrissa.quantities import quantity
 from vibrissa.recording import Recording
 from vibrissa.report import document, figure_sections, movies_section, table, trial_sections
 from vibrissa.report.page import Section, shown_value, with_sigma
-from vibrissa.report.trial import (
+from vibrissa.report.sections import (
     _settings,
     contacts_by_whisker,
     tracked_table,
@@ -378,7 +378,7 @@ def test_the_same_command_gives_the_same_page(map_page, folder, monkeypatch):
     assert "is there already" in fault("report", *words, "-o", path)
     run("report", *words, "-o", path, "--force")
     assert path.read_bytes() == before
-    monkeypatch.setattr(reporting, "_drawn", lambda drawings, tell: {})
+    monkeypatch.setattr(reporting, "drawn", lambda drawings, tell: [])
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "yesterday")
     text = fault("report", folder / "map.nc", "-o", folder / "same.html")
     assert "'yesterday'" in text
@@ -430,7 +430,7 @@ def test_what_is_missing_is_named_with_the_verb_that_makes_it(folder):
 
 def test_without_the_drawing_library_the_picture_in_space_is_left_out(folder, monkeypatch):
     monkeypatch.setattr("vibrissa.report.space.find_spec", lambda name: None)
-    monkeypatch.setattr(reporting, "_drawn", lambda drawings, tell: {})
+    monkeypatch.setattr(reporting, "drawn", lambda drawings, tell: [])
     text = run("report", folder / "map.nc", "-o", folder / "flat.html")
     assert "vibrissa[report]" in text
     page = Page((folder / "flat.html").read_text(encoding="utf-8"))
@@ -478,7 +478,7 @@ def test_movies_are_made_and_put_into_the_page(folder, tmp_path, monkeypatch):
         for data in [group.to_dataset(inherit=False)]
     }
     save_recording(tmp_path / "short.nc", xr.DataTree.from_dict(groups))
-    monkeypatch.setattr(reporting, "_drawn", lambda drawings, tell: {})
+    monkeypatch.setattr(reporting, "drawn", lambda drawings, tell: [])
     words = ("report", tmp_path / "short.nc", "--map", folder / "map.nc", "--make-movies")
     run(*words, "-o", tmp_path / "short.html")
     page = Page((tmp_path / "short.html").read_text(encoding="utf-8"))

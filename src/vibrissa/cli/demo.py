@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from vibrissa.demo import DemoResult, Located
 _SENSED = "measured by a sensor"
 _SEEN = "the paper's method"
+_COORDINATES = {"error_r": "r", "error_theta": "θ", "error_phi": "φ", "error_distance": "3D"}
 
 
 @with_options("all files, in a folder")
@@ -95,11 +96,11 @@ def _report(result: DemoResult, noise: bool) -> None:
         _print_tracking(result.tracking)
     if seen is not None:
         _print_signals(sensed, seen)
-    _print_errors("Error of the contact point", "of", scores.errors, noise, _coordinate)
-    _print_errors("3D error by deflection angle", "angle", scores.by_angle, noise, _label)
+    _print_errors("Error of the contact point", "of", scores.errors, noise)
+    _print_errors("3D error by deflection angle", "angle", scores.by_angle, noise)
     if seen is not None:
         title = f"The same by {_SEEN}*, signals and map being of one model"
-        _print_errors(title, "angle", seen.scores.by_angle, False, _label)
+        _print_errors(title, "angle", seen.scores.by_angle, False)
         say(f"* {vb.evaluation.caution(seen.contacts.attrs['source'])}")
         say()
     _print_peg(result)
@@ -139,27 +140,19 @@ def _print_signals(sensed: Located, seen: Located) -> None:
     print_table(columns, rows, "Signals, median error by deflection angle")
 
 
-def _coordinate(row: vb.evaluation.ErrorRow) -> str:
-    return {"error_r": "r", "error_theta": "θ", "error_phi": "φ"}.get(row.quantity, "3D")
-
-
-def _label(row: vb.evaluation.ErrorRow) -> str:
-    return row.label
-
-
 def _print_errors(
     title: str,
     first: str,
     rows: Sequence[vb.evaluation.ErrorRow],
     noise: bool,
-    label: Callable[[vb.evaluation.ErrorRow], str],
 ) -> None:
     """Errors as measured and, with noise, as predicted."""
     cells: list[Row] = []
     for row in rows:
         values = [*row.measured, *(row.predicted[:2] if noise else ())]
         numbers = [shown(row.quantity, float(value), 3) for value in values]
-        cells.append([label(row), str(row.contacts), *numbers])
+        name = row.label if first == "angle" else _COORDINATES[row.quantity]
+        cells.append([name, str(row.contacts), *numbers])
     print_table(
         [first, "contacts", "median", "95 %", "largest", *(["median*", "95 %*"] * noise)],
         cells,

@@ -16,6 +16,7 @@ from vibrissa.cli.inputs import (
     NoiseOptions,
     WhiskerOptions,
     check_one_whisker,
+    estimator_of,
     free_beside,
     kind_in,
     map_of,
@@ -281,8 +282,6 @@ def _from_lines(
     import numpy as np
     import xarray as xr
 
-    errors: dict[str, Any] = dict(how.assumed.errors)
-    prior, gravity = how.assumed.prior, weight.known
     weight.check(how)
     with progress_bars() as tell:
         if how.map:
@@ -291,21 +290,11 @@ def _from_lines(
             known = weight.of(how.own.read())
             remark(f"no map given; simulating that of {known!r}")
             contact_map = map_of(known, tell, grid=False, proximal=smallest_arc(how.proximal))
-        if sensor is None:
-            names, used = None, how.names or vb.pipeline.TRIPLET
-            noise = how.noise.matrix()
-            errors |= {"prior": prior, "gravity": gravity}
-            estimator = vb.Estimator(
-                contact_map, used, noise, felt_above=vb.pipeline.DETECTED, **errors
-            )
-        else:
-            names = used = tuple(sensor.channels)
-            stiffness = errors.pop("stiffness_sigma", 0.0)
-            if errors:
-                raise ValueError("the --sensor's file states gain_error and mixing_error")
-            estimator = vb.Estimator.of_sensor(
-                contact_map, sensor, stiffness, vb.pipeline.DETECTED, prior, gravity
-            )
+        names = None if sensor is None else tuple(sensor.channels)
+        used = names or how.names or vb.pipeline.TRIPLET
+        estimator = estimator_of(
+            contact_map, sensor, used, how.noise, how.assumed, weight.known, vb.pipeline.DETECTED
+        )
         running = vb.streaming.ContactStream(estimator, names)
         records = list(running.records(vb.io.read_text(signals).splitlines()))
     faults = [f"line {one['line']}: {one['error']}" for one in records if "error" in one]
@@ -336,7 +325,8 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions, weight: Gravi
     known = maps[0].whisker if maps else weight.of(how.own.read())
     gravity = weight.known
     print_notes(known)
-    _check_scale(signals, wrench, known)
+    with vb.io.in_file(signals):
+        vb.io.check_scale(wrench, known)
     with progress_bars() as tell:
         if not maps and not how.whole:
             remark(f"no map given; simulating that of {known!r}")
@@ -428,7 +418,8 @@ def estimated(
     whiskers = [weight.of(one) for one in whiskers]
     print_notes(*whiskers)
     for k, whisker in enumerate(whiskers):
-        _check_scale(name, signals.isel(whisker=k), whisker)
+        with vb.io.in_file(name):
+            vb.io.check_scale(signals.isel(whisker=k), whisker)
     by_default = how.using is None and how.method == "exact" and not how.friction_sigma
     whole = how.whole or (by_default and source == "rod")
     if not maps and not whole:
@@ -449,10 +440,3 @@ def estimated(
     noise = how.noise.described() if noisy else "noise as the recording states"
     noise += weight.described()
     return done, how.described(str(about["signals"]), noise, float(about["felt_above"]))
-
-
-def _check_scale(path: Path | str, wrench: xr.Dataset, whisker: vb.Whisker) -> None:
-    try:
-        vb.io.check_scale(wrench, whisker)
-    except ValueError as fault:
-        raise ValueError(f"{path}: {fault}") from None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import repeat
@@ -13,7 +13,7 @@ import numpy as np
 import typer
 
 import vibrissa as vb
-from vibrissa.cli.inputs import map_from, map_of
+from vibrissa.cli.inputs import map_of
 from vibrissa.cli.options import Format, free, refuse, with_options
 from vibrissa.cli.terminal import Tell, progress_bars, say
 
@@ -65,7 +65,7 @@ class TrialOptions:
         own = vb.recording.Recording(trial).whisker(self.whisker)
         if self.map is None:
             return map_of(own, tell)
-        found = map_from(self.map)
+        found = vb.ContactMap.load(self.map)
         if not np.isclose(found.whisker.length, own.length, rtol=1e-6):
             raise ValueError(
                 f"{self.map} is the map of a whisker of {1e3 * found.whisker.length:.3f} mm, that "
@@ -321,7 +321,7 @@ def figures(
         else:
             refuse(of_trial.given() | {"--colour": colour}, f"{path} is not a recording")
         if not drawings:
-            drawings = dict(map_drawings(map_from(path), width, verdicts, sweep))
+            drawings = dict(map_drawings(vb.ContactMap.load(path), width, verdicts, sweep))
         free([target / f"{name}.{ending}" for name in drawings for ending in endings], force)
         target.mkdir(parents=True, exist_ok=True)
         files = saved(drawings, target, endings, tell)
@@ -333,12 +333,18 @@ def saved(
     drawings: dict[str, Draw], folder: Path, endings: Sequence[str], tell: Tell
 ) -> list[Path]:
     """Draw figures into a folder."""
-    files: list[Path] = []
+    figures = drawn(drawings, tell)
+    return [
+        file for name, figure in figures for file in vb.plots.save(figure, folder / name, endings)
+    ]
+
+
+def drawn(drawings: Mapping[str, Draw], tell: Tell) -> Iterator[tuple[str, Any]]:
+    """Draw figures one after the other."""
     for i, (name, draw) in enumerate(drawings.items()):
         tell("figures", i, len(drawings))
-        files += vb.plots.save(draw(), folder / name, endings)
+        yield name, draw()
     tell("figures", len(drawings), len(drawings))
-    return files
 
 
 def dataset_with(path: Path, needed: str) -> xr.Dataset:

@@ -202,6 +202,33 @@ def _limits(text: str) -> dict[str, tuple[float, float]]:
     return limits
 
 
+def estimator_of(
+    contact_map: vb.ContactMap,
+    sensor: vb.sensors.Sensor | None,
+    using: str | Sequence[str],
+    noise: NoiseOptions,
+    assumed: AssumptionOptions,
+    gravity: vb.Gravity | None,
+    felt_above: float,
+) -> vb.Estimator:
+    """Make what estimates contacts from single measurements, of a sensor or by signals."""
+    prior, errors = assumed.prior, assumed.errors
+    if sensor is None:
+        return vb.Estimator(
+            contact_map,
+            using,
+            noise.matrix(),
+            felt_above=felt_above,
+            prior=prior,
+            gravity=gravity,
+            **errors,
+        )
+    stiffness = errors.pop("stiffness_sigma", 0.0)
+    if errors:
+        raise ValueError("the --sensor's file states gain_error and mixing_error")
+    return vb.Estimator.of_sensor(contact_map, sensor, stiffness, felt_above, prior, gravity)
+
+
 def metres_of(radius: float, option: str) -> float:
     """Take the radius of a whisker from mm to m."""
     if not 0.0 < radius < _THICKEST:
@@ -235,7 +262,7 @@ def _whisker_in(path: Path) -> vb.Whisker:
     if kind == RECORDING:
         return vb.recording.Recording(vb.load_recording(path)).whisker()
     if kind == MAP:
-        return map_from(path).whisker
+        return vb.ContactMap.load(path).whisker
     raise ValueError(f"{path} holds {kind or 'data of another kind'}, and no whisker")
 
 
@@ -253,16 +280,9 @@ def recording_from(path: Path) -> xr.DataTree:
     """Read a recording."""
     refuse_tracks(path)
     recording = vb.load_recording(path)
-    try:
+    with vb.io.in_file(path):
         vb.pipeline.check_recording(recording)
-    except ValueError as fault:
-        raise ValueError(f"{path}: {fault}") from None
     return recording
-
-
-def map_from(path: Path, grid: bool = True) -> vb.ContactMap:
-    """Read a map."""
-    return vb.ContactMap.load(path, grid)
 
 
 def map_of(whisker: vb.Whisker, tell: Tell, *, grid: bool = False, **how: Any) -> vb.ContactMap:
@@ -344,7 +364,7 @@ def maps_from(paths: Sequence[Path], count: int, grid: bool = False) -> list[vb.
     """Read the map of each whisker."""
     if len(paths) != count:
         raise ValueError(f"there are {len(paths)} --map for {count} whiskers; each needs one")
-    found = [map_from(path) for path in paths]
+    found = [vb.ContactMap.load(path) for path in paths]
     for path, contact_map in zip(paths, found, strict=True):
         if grid and contact_map.grid is None:
             raise ValueError(

@@ -91,7 +91,7 @@ def make_movies(
     possible = _possible(kinds, course, rows, path)
     with progress_bars() as tell, stoppable() as stopped:
         for name in possible:
-            images = _FRAMES[name](trial, course, rows, of_trial, tell)
+            images = _frames(name, trial, course, rows, of_trial, tell)
             files[name].parent.mkdir(parents=True, exist_ok=True)
             _write(files[name], images, (name, len(rows)), frames.fps, tell, stopped)
             if stopped():
@@ -131,33 +131,24 @@ def _possible(
     return possible
 
 
-def _signal_frames(
+def _frames(
+    name: str,
     trial: xr.DataTree,
     course: vb.scene.Course,
     rows: NDArray[np.intp],
     of_trial: TrialOptions,
     tell: Tell,
 ) -> Iterator[Any]:
-    contact_map = of_trial.contact_map(trial, tell)
-    return vb.plots.signal_frames(
-        course, contact_map.to_dataset(), contact_map.whisker.centerline(NODES), rows
-    )
-
-
-def _contour_frames(
-    trial: xr.DataTree,
-    course: vb.scene.Course,
-    rows: NDArray[np.intp],
-    of_trial: TrialOptions,
-    tell: Tell,
-) -> Iterator[Any]:
-    rest = vb.recording.Recording(trial).whisker(of_trial.whisker).centerline(NODES)
+    """Images of a kind of movie."""
+    if name == "signals":
+        contact_map = of_trial.contact_map(trial, tell)
+        line = contact_map.whisker.centerline(NODES)
+        return vb.plots.signal_frames(course, contact_map.to_dataset(), line, rows)
+    known = vb.recording.Recording(trial)
+    rest = known.whisker(of_trial.whisker).centerline(NODES)
     sights = sights_of(trial, course, of_trial.videos or (), rows)
-    bodies = list(vb.recording.Recording(trial).objects)
+    bodies = list(known.objects)
     return vb.plots.contour_frames(course, rest, sights, rows, bodies, fits_of(trial))
-
-
-_FRAMES = {"signals": _signal_frames, "contour": _contour_frames}
 
 
 def _write(

@@ -17,10 +17,11 @@ from vibrissa.cli.figures import (
     TrialOptions,
     array_drawings,
     dataset_with,
+    drawn,
     map_drawings,
     trial_drawings,
 )
-from vibrissa.cli.inputs import MAP, RECORDING, kind_in, map_from
+from vibrissa.cli.inputs import MAP, RECORDING, kind_in
 from vibrissa.cli.movie import FrameOptions, make_movies
 from vibrissa.cli.options import check_new, refuse, with_options
 from vibrissa.cli.terminal import Tell, progress_bars, say
@@ -84,15 +85,14 @@ def report(
             unused = of_trial.given() | {"--make-movies": make, "--seed": seed}
             refuse(unused, f"{path} is a map")
             content = _of_map(path, uniqueness)
-        content.sections.extend(vb.report.figure_sections(_drawn(content.drawings, tell)))
+        pictures = {name: vb.plots.png(one) for name, one in drawn(content.drawings, tell)}
+        content.sections.extend(vb.report.figure_sections(pictures))
     if make:
         kinds = ("signals", "contour")
         movies += sorted(make_movies(path, target.parent, kinds, of_trial, FrameOptions(), force))
     # The page is the same, whether there was one before or not.
     command = ["vibrissa", *(word for word in sys.argv[1:] if word != "--force")]
-    origin = vb.report.provenance_section(
-        vb.report.provenance(command, given, (seed or 0) if is_trial else None)
-    )
+    origin = vb.report.provenance_section(command, given, (seed or 0) if is_trial else None)
     about = "From the forces and moments at a whisker's base to the object that it touched."
 
     def page(sections: list[vb.report.Section]) -> str:
@@ -101,12 +101,8 @@ def report(
     if movies:
         room = _LARGEST - len(page(content.sections).encode("utf-8")) - _TAGS
         content.sections.append(vb.report.movies_section(movies, target.parent, room))
-    _write(target, page(content.sections))
-
-
-def _write(target: Path, page: str) -> None:
     with vb.io.replacing(target) as part:
-        part.write_text(page, encoding="utf-8")
+        part.write_text(page(content.sections), encoding="utf-8")
     say(f"wrote {target}, {target.stat().st_size / 1e6:.1f} MB")
 
 
@@ -144,7 +140,7 @@ def _of_trial(
 
 def _of_map(path: Path, uniqueness: Path | None) -> _Content:
     """The page of a map."""
-    contact_map = map_from(path)
+    contact_map = vb.ContactMap.load(path)
     verdicts = None if uniqueness is None else dataset_with(uniqueness, "verdict")
     sections, script = vb.report.chart_sections(contact_map, verdicts), ""
     drawings = dict(map_drawings(contact_map, "double", verdicts, None))
@@ -162,12 +158,3 @@ def _can_draw() -> bool:
     if not vb.report.can_draw():
         say(vb.report.NO_SPACE)
     return vb.report.can_draw()
-
-
-def _drawn(drawings: Mapping[str, Draw], tell: Tell) -> dict[str, bytes]:
-    pictures = {}
-    for i, (name, draw) in enumerate(drawings.items()):
-        tell("figures", i, len(drawings))
-        pictures[name] = vb.plots.png(draw())
-    tell("figures", len(drawings), len(drawings))
-    return pictures

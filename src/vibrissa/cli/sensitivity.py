@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import vibrissa as vb
-from vibrissa.cli.inputs import RECORDING, NoiseOptions, kind_in, map_from, wrench_from
+from vibrissa.cli.inputs import RECORDING, NoiseOptions, kind_in, wrench_from
 from vibrissa.cli.options import MapArgument, check_new, with_options
 from vibrissa.cli.terminal import Row, print_table, progress_bars, say, shown
 
@@ -37,7 +37,7 @@ def sensitivity(
     if target is not None:
         check_new(target, vb.io.NETCDF, force)
     names = vb.signals.selection([name.strip() for name in using.split(",")], exactly=3)
-    contact_map = map_from(path)
+    contact_map = vb.ContactMap.load(path)
     covariance = noise.matrix()
     moment_noise = float(np.sqrt(0.5 * (covariance[4, 4] + covariance[5, 5])))
     at = None if trial is None else _contacts_of(trial, moment_noise)

@@ -22,7 +22,7 @@ from vibrissa.cli.inputs import (
     AssumptionOptions,
     NoiseOptions,
     WhiskerOptions,
-    map_from,
+    estimator_of,
     print_notes,
     smallest_arc,
 )
@@ -146,7 +146,7 @@ class MeasurementOptions:
     def contact_map(self, name: str) -> vb.ContactMap:
         """Read or simulate the map of a whisker."""
         if self.map:
-            return map_from(Path(_named(self.map, "--map")[name]), grid=False)
+            return vb.ContactMap.load(Path(_named(self.map, "--map")[name]), grid=False)
         whisker = self.weight.of(self.own.read())
         print_notes(whisker)
         remark(f"no map given; simulating that of {whisker!r}")
@@ -160,22 +160,16 @@ class MeasurementOptions:
 
     def estimator(self, name: str, sensor: vb.sensors.Sensor | None) -> vb.Estimator:
         """Return what estimates contacts of a whisker from measurements."""
-        contact_map, prior, errors = self.contact_map(name), self.assumed.prior, self.assumed.errors
-        if sensor is not None:
-            stiffness = errors.get("stiffness_sigma", 0.0)
-            if self.tare:
-                sensor = sensor.with_new_offset(self.tare)
-            return vb.Estimator.of_sensor(
-                contact_map, sensor, stiffness, self.threshold, prior, self.weight.known
-            )
-        return vb.Estimator(
-            contact_map,
+        if sensor is not None and self.tare:
+            sensor = sensor.with_new_offset(self.tare)
+        return estimator_of(
+            self.contact_map(name),
+            sensor,
             self.using or "Fx,MB,MD",
-            self.noise.matrix(),
-            felt_above=self.threshold,
-            prior=prior,
-            gravity=self.weight.known,
-            **errors,
+            self.noise,
+            self.assumed,
+            self.weight.known,
+            self.threshold,
         )
 
 

@@ -74,10 +74,8 @@ def sweep(
 
 def _plan(path: Path) -> vb.sweeps.Study:
     text = vb.io.read_text(vb.io.check_readable(path))
-    try:
+    with vb.io.in_file(path):
         return vb.sweeps.read_study(text, path.parent)
-    except ValueError as fault:
-        raise ValueError(f"{path}: {fault}") from None
 
 
 def _run(plan: vb.sweeps.Study, path: Path, **how: Any) -> None:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 import vibrissa as vb
-from vibrissa.cli.inputs import map_from
 from vibrissa.cli.options import MapArgument, Region, check_new, with_options
 from vibrissa.cli.terminal import output, progress_bars, remark, say, shown
 
@@ -46,7 +45,7 @@ def uniqueness(
         check_new(target, vb.identifiability.ENDINGS, force)
     if certify is not None:
         vb.io.check_writable(certify, (".nc",))
-    contact_map = map_from(path)
+    contact_map = vb.ContactMap.load(path)
     with progress_bars() as tell:
         certificate = None
         if certify is not None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import vibrissa as vb
-from vibrissa.cli.inputs import MAP, RECORDING, WhiskerOptions, kind_in, map_from, print_notes
+from vibrissa.cli.inputs import MAP, RECORDING, WhiskerOptions, kind_in, print_notes
 from vibrissa.cli.options import refuse, with_options
 from vibrissa.cli.terminal import say
 
@@ -49,7 +49,7 @@ def view(
             raise ValueError(
                 f"--rat and --any-length are about a whisker, and {path} is not its file"
             )
-        viewed = map_from(path, live is None) if kind == MAP else vb.load_recording(path)
+        viewed = vb.ContactMap.load(path, live is None) if kind == MAP else vb.load_recording(path)
     else:
         viewed = WhiskerOptions(path, rat, any_length).read()
         print_notes(viewed)

@@ -9,7 +9,7 @@ from vibrissa.evaluation.contacts import (
     contact_errors,
     deflection_angle,
     error_rows as error_rows,
-    score,
+    score as score,
 )
 from vibrissa.evaluation.stages import (
     SignalRow as SignalRow,
@@ -27,7 +27,6 @@ __all__ = [
     "TrackingScores",
     "contact_errors",
     "deflection_angle",
-    "score",
     "signal_errors",
     "spread",
     "tracking_scores",

@@ -34,18 +34,9 @@ _QUANTILES = (0.5, 0.95, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class ErrorRow:
-    """Errors of some contacts in one quantity.
+    """Errors of some contacts in one quantity: median, 95 % and largest size, SI units.
 
-    Parameters
-    ----------
-    quantity : str
-        Name of the error in the table of quantities.
-    label : str
-        Name of the class of contacts.
-    contacts : int
-        Number of contacts that have an estimate.
-    measured, predicted : array (3,)
-        Median, 95 % and largest size of the error, SI units, and as the covariance predicts.
+    As measured, and as the covariance predicts; `contacts` is the number with an estimate.
     """
 
     quantity: str
@@ -176,36 +167,22 @@ def _roots(covariance: Array) -> Array:
     return np.where(known[:, None, None], root, np.nan)
 
 
-def score(contacts: xr.Dataset, truth: xr.Dataset, errors: xr.Dataset, fit: CylinderFit) -> Scores:
-    """Scores of a trial.
-
-    Parameters
-    ----------
-    contacts : xarray.Dataset
-        Dataset of `vibrissa.pipeline.estimates_of`, of one whisker, dimension time.
-    truth : xarray.Dataset
-        Truth of the recording, dimension time: ``in_contact``; and ``peg_position``, ``peg_axis``,
-        ``peg_radius``.
-    errors : xarray.Dataset
-        Dataset of `contact_errors`.
-    fit : CylinderFit
-        Fitted peg.
-
-    Returns
-    -------
-    Scores
-        Numbers and errors.
-    """
+def score(
+    contacts: xr.Dataset,
+    truth: xr.Dataset,
+    errors: xr.Dataset,
+    fit: CylinderFit,
+    peg: Peg,
+    radius: Array,
+) -> Scores:
+    """Scores of a trial with a peg, at whose contacts the whisker has these radii (time,), m."""
     detected = contacts["in_contact"].values
     touching = truth["in_contact"].values
     number = contacts["candidates"].values[detected]
     known = np.isfinite(errors["error_distance"].values)
     of_all, by_angle = error_rows(errors)
-    origin, axis = truth["peg_position"].values, truth["peg_axis"].values
-    radius = float(truth["peg_radius"])
-    offset, tilt = axis_offset(fit.origin, fit.axis, origin, axis)
-    points, whisker_radius = contacts["contact_point"].values, truth["radius"].values
-    gap = Peg(origin, axis, radius).signed_distance(points[known]) - whisker_radius[known]
+    offset, tilt = axis_offset(fit.origin, fit.axis, peg.origin, peg.axis)
+    gap = peg.signed_distance(contacts["contact_point"].values[known]) - radius[known]
     return Scores(
         touching=int(touching.sum()),
         detected=int(detected.sum()),
@@ -215,7 +192,7 @@ def score(contacts: xr.Dataset, truth: xr.Dataset, errors: xr.Dataset, fit: Cyli
         by_angle=by_angle,
         offset=offset,
         tilt=tilt,
-        diameter_error=float(fit.diameter - 2.0 * radius),
+        diameter_error=float(fit.diameter - 2.0 * peg.radius),
         surface=_quantiles(np.abs(gap)),
     )
 

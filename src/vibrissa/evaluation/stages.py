@@ -51,14 +51,7 @@ class TrackingScores:
 class SignalRow:
     """Errors of force and moment in a class of deflection angle.
 
-    Parameters
-    ----------
-    label : str
-        Name of a class of contacts.
-    contacts : int
-        Number of contacts in it.
-    force, moment : array (2,)
-        Median and 95 % of the size of the error over that of the vector, laboratory frame.
+    Median and 95 % (2,) of the size of the error over that of the vector, laboratory frame.
     """
 
     label: str

@@ -21,7 +21,7 @@ from vibrissa.io.annotations import (
     load_head,
     polygon_of as polygon_of,
     save_clicks as save_clicks,
-    save_corrections,
+    save_corrections as save_corrections,
     together as together,
 )
 from vibrissa.io.kinds import READERS as READERS, Kind, load_tracks, recognise
@@ -107,13 +107,13 @@ from vibrissa.io.video import (
     Footage as Footage,
     Frame as Frame,
     FrameReader as FrameReader,
-    VideoInfo,
+    VideoInfo as VideoInfo,
     load_series as load_series,
     read_video,
     video_frames as video_frames,
-    video_info,
+    video_info as video_info,
     write_movie,
-    write_video,
+    write_video as write_video,
 )
 from vibrissa.io.whisk import load_whiskers
 from vibrissa.io.whiskers import (
@@ -127,7 +127,6 @@ from vibrissa.io.whiskers import (
 __all__ = [
     "Kind",
     "Session",
-    "VideoInfo",
     "join_views",
     "load_array",
     "load_centerline",
@@ -148,12 +147,9 @@ __all__ = [
     "save_centerline",
     "save_contacts",
     "save_contour",
-    "save_corrections",
     "save_nwb",
     "save_recording",
     "save_signals",
     "save_tracks",
-    "video_info",
     "write_movie",
-    "write_video",
 ]

@@ -65,8 +65,9 @@ def read_over_time(path: str | PathLike[str]) -> tuple[str, dict[str, Array]]:
     moments = columns[key]
     if not np.isfinite(moments).all():
         raise ValueError(f"{path}: {key} is missing in row {_first(~np.isfinite(moments))}")
-    if key == "frame" and (moments != np.round(moments)).any() | (moments < 0.0).any():
-        row = _first((moments != np.round(moments)) | (moments < 0.0))
+    wrong = (moments != np.round(moments)) | (moments < 0.0)
+    if key == "frame" and wrong.any():
+        row = _first(wrong)
         raise ValueError(f"{path}: frame {moments[row - 1]:g} in row {row}; 0, 1, … are frames")
     return key, columns
 
@@ -294,17 +295,7 @@ def save_corrections(
 ) -> None:
     """Write corrected traces so that `load_corrections` reads them.
 
-    Parameters
-    ----------
-    path : str or path
-        CSV file; an existing one is replaced once the new one is complete.
-    corrections : mapping
-        Points (n, 2) from base to tip, column and row, by view and then by frame and whisker.
-
-    Raises
-    ------
-    ValueError
-        If a trace has less than two points, or one that is not finite.
+    They are points (n, 2) from base to tip, column and row, by view and then by frame and whisker.
     """
     rows: list[list[float]] = []
     for view, each in sorted(corrections.items()):

@@ -72,14 +72,11 @@ def read_deeplabcut(path: str | PathLike[str]) -> RawTracks:
         elif name[3] in ("likelihood", "confidence"):
             sure[:, *place] = column
     scorer = names[0][0]
-    flat = len(axes) == 2
-    return RawTracks(
+    return RawTracks.of(
+        points[:, :, None],
+        sure[:, :, None],
         software="LightningPose" if _LIGHTNING.match(scorer) else "DeepLabCut",
         whiskers=[name or "whisker" for name in individuals],
-        image=points[:, :, None] if flat else None,
-        image_confidence=sure[:, :, None] if flat else None,
-        space=None if flat else points,
-        space_confidence=None if flat else sure,
         nodes=parts,
         frames=_frames(path, index, len(values)),
         about={"scorer": scorer},
@@ -209,7 +206,8 @@ def _fixed(group: h5py.Group) -> tuple[Names, list[Array], list[str]]:
         else:
             count = int(group.attrs[f"{items}_nlevels"])
             levels = [group[f"{items}_level{k}"][:] for k in range(count)]
-            labels = [_labels(group, items, k) for k in range(count)]
+            kind = "label" if f"{items}_label0" in group else "code"
+            labels = [group[f"{items}_{kind}{k}"][:] for k in range(count)]
             columns = list(
                 zip(
                     *(level[label] for level, label in zip(levels, labels, strict=True)),
@@ -220,12 +218,6 @@ def _fixed(group: h5py.Group) -> tuple[Names, list[Array], list[str]]:
         block = _block(f"block{i}_values", group[f"block{i}_values"][:])
         values.append(block.reshape(-1, len(columns)))
     return _as_text(names), values, _labels_of(group["axis1"][:]) if "axis1" in group else []
-
-
-def _labels(group: h5py.Group, items: str, k: int) -> NDArray[np.integer[Any]]:
-    name = f"{items}_label{k}" if f"{items}_label{k}" in group else f"{items}_code{k}"
-    labels: NDArray[np.integer[Any]] = group[name][:]
-    return labels
 
 
 def _labels_of(values: NDArray[Any]) -> list[str]:
@@ -450,13 +442,11 @@ def _raw(path: Path, poses: xr.Dataset) -> RawTracks:
         raise ValueError(f"{path} has positions in a plane in {unit}; pixels are needed")
     if not flat and points.shape[2] > 1:
         raise ValueError(f"{path} has points in space for {points.shape[2]} views; one is needed")
-    return RawTracks(
+    return RawTracks.of(
+        points,
+        sure,
         software=f"movement ({poses.attrs.get('source_software', 'unknown')})",
         whiskers=[str(name) for name in poses["individual"].values],
-        image=points if flat else None,
-        image_confidence=sure if flat else None,
-        space=None if flat else points[:, :, 0],
-        space_confidence=None if flat or sure is None else sure[:, :, 0],
         nodes=[str(name) for name in poses["keypoint"].values],
         views=views,
         unit="" if unit in _PIXELS else unit,

@@ -196,11 +196,11 @@ def _tracks(path: Path, name: str, found: _Frames) -> RawTracks:
     for i, one in enumerate(points):
         table[row[i], column[i], : len(one)] = one
     whole = bool((moments == np.rint(moments)).all())
-    return RawTracks(
+    return RawTracks.of(
+        table[:, :, None],
+        None,
         software="MATLAB",
         whiskers=[str(one) for one in whiskers] if whiskers.size > 1 else ["whisker"],
-        image=table[:, :, None] if width == 2 else None,
-        space=table if width == 3 else None,
         frames=moments.astype(np.int64) if whole else None,
         time=None if whole else moments,
         about={"variable": name},

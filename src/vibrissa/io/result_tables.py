@@ -17,6 +17,7 @@ and ``descriptions`` by column.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 
@@ -51,20 +52,27 @@ def save_contacts(path: str | PathLike[str], contacts: xr.Dataset) -> None:
     ValueError
         If a needed variable is not there, or one has another dim.
     """
-    missing = [n for n in ("time", "x", "y", "z", "status") if n not in contacts.variables]
+    names = (*NUMBERS, *(name for name in _OPTIONAL if name in contacts), "status")
+    *numbers, codes = _columns(contacts, "contacts", names, "time", ("status",))
+    words = [Status(int(code)).name.lower() for code in codes]
+    table = np.column_stack(numbers).tolist()
+    rows = ([*row, word] for row, word in zip(table, words, strict=True))
+    write_table(path, names, rows)
+
+
+def _columns(
+    data: xr.Dataset, what: str, names: Sequence[str], dim: str, needed: Sequence[str] = ()
+) -> list[np.ndarray]:
+    """Columns along the one dimension of a table, NaN where there are none."""
+    missing = [n for n in ("time", "x", "y", "z", *needed) if n not in data.variables]
     if missing:
-        raise ValueError(f"contacts lack {', '.join(missing)}")
-    n = contacts.sizes["time"]
-    faults = [n for n in (*NUMBERS, "status") if n in contacts and contacts[n].dims != ("time",)]
+        raise ValueError(f"{what} lack {', '.join(missing)}")
+    there = [name for name in names if name in data.variables]
+    faults = [name for name in there if data[name].dims != (dim,)]
     if faults:
-        raise ValueError(f"{', '.join(faults)} must have the one dim time")
-    columns = (*NUMBERS, *(name for name in _OPTIONAL if name in contacts))
-    table = np.column_stack(
-        [contacts[name].values if name in contacts else np.full(n, np.nan) for name in columns]
-    )
-    names = [Status(int(code)).name.lower() for code in contacts["status"].values]
-    rows = ([*row, name] for row, name in zip(table.tolist(), names, strict=True))
-    write_table(path, (*columns, "status"), rows)
+        raise ValueError(f"{', '.join(faults)} must have the one dim {dim}")
+    nothing = np.full(data.sizes[dim], np.nan)
+    return [data[name].values if name in there else nothing for name in names]
 
 
 def load_contacts(path: str | PathLike[str]) -> xr.Dataset:
@@ -125,17 +133,7 @@ def holds_contour(path: str | PathLike[str], contour: xr.Dataset) -> bool:
 
 
 def _contour_text(contour: xr.Dataset) -> str:
-    missing = [name for name in ("time", "x", "y", "z") if name not in contour.variables]
-    if missing:
-        raise ValueError(f"contour points lack {', '.join(missing)}")
-    faults = [n for n in CONTOUR if n in contour.variables and contour[n].dims != ("contact",)]
-    if faults:
-        raise ValueError(f"{', '.join(faults)} must have the one dim contact")
-    n = contour.sizes["contact"]
-    columns = [
-        contour[name].values if name in contour.variables else np.full(n, np.nan)
-        for name in CONTOUR
-    ]
+    columns = _columns(contour, "contour points", CONTOUR, "contact")
     plain = [(one.astype(int) if one.dtype == bool else one).tolist() for one in columns]
     return table_text(CONTOUR, zip(*plain, strict=True))
 

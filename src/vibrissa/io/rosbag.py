@@ -62,17 +62,7 @@ def is_bag(path: str | PathLike[str]) -> bool:
 
 
 class BagMessage(NamedTuple):
-    """One message of a bag.
-
-    Attributes
-    ----------
-    stamp, recorded : int
-        Times of the measurement and of its recording, ns.
-    frame : str
-        Name of the frame of the values.
-    values : list of float
-        Numbers of the message, SI units.
-    """
+    """One message of a bag: times of the measurement and of its recording, ns, and SI values."""
 
     stamp: int
     recorded: int
@@ -206,14 +196,8 @@ class ContactBag:
     A folder is whole every half second, however the process ends; a power cut may spoil it. An
     MCAP file is written next to it and takes its name once it is complete.
 
-    Parameters
-    ----------
-    path : str or path
-        Folder to write, or file that ends in ``.mcap``; it must not exist.
-    frame : str
-        Name of the frame of the points.
-    whiskers : sequence of str
-        Names of the whiskers; with names topics begin with them: ``/left/contact_point``.
+    The folder, or the file that ends in ``.mcap``, must not exist. With names of whiskers topics
+    begin with them: ``/left/contact_point``.
     """
 
     def __init__(

@@ -30,7 +30,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypedDict, Unpack
+from typing import Any, Self, TypedDict, Unpack
 from zipfile import BadZipFile
 
 import numpy as np
@@ -120,6 +120,14 @@ class RawTracks:
     reference_frame: str = ""
     extra: Mapping[str, xr.Variable] = field(default_factory=dict)
     about: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, points: Array, confidence: Array | None, **others: Any) -> Self:
+        """Tracks of points (time, whisker, view, node, 2 or 3): those in space have one view."""
+        if points.shape[-1] == 2:
+            return cls(image=points, image_confidence=confidence, **others)
+        sure = None if confidence is None else confidence[:, :, 0]
+        return cls(space=points[:, :, 0], space_confidence=sure, **others)
 
 
 def labelled(raw: RawTracks, path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Dataset:
@@ -397,16 +405,13 @@ def read_tracks_table(path: str | PathLike[str]) -> RawTracks:
     confidence = numbers("confidence")
     if confidence is not None:
         sure[place] = confidence
-    flat = len(axes) == 2
-    return RawTracks(
+    return RawTracks.of(
+        points,
+        sure,
         software="table",
         whiskers=whisker,
         views=[name for name in view if name],
         nodes=node if "node" in labels else None,
-        image=points if flat else None,
-        image_confidence=sure if flat else None,
-        space=None if flat else points[:, :, 0],
-        space_confidence=None if flat else sure[:, :, 0],
         frames=moments.astype(np.int64) if frame is not None else None,
         time=None if time is None else time[first],
         unit=unit,

@@ -43,19 +43,10 @@ Frame = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """Properties that a video states.
+    """Properties that a video states: size of a frame, pixels; number of frames, 0 if not stated.
 
-    Parameters
-    ----------
-    width, height : int
-        Size of a frame, pixels.
-    frames : int
-        Stated number of frames; 0 if it is not stated.
-    rate : float
-        Frames per second at which it is to be shown, which for high-speed video is usually not the
-        rate at which it was taken; 0 if it does not say.
-    codec : str
-        FFmpeg's name.
+    The rate is that at which it is to be shown, frames per second, which for high-speed video is
+    usually not the rate at which it was taken; 0 if it does not say. The codec is FFmpeg's name.
     """
 
     width: int
@@ -107,17 +98,7 @@ def _grey_frames(path: str | PathLike[str], container: InputContainer) -> Callab
 
 
 def video_info(path: str | PathLike[str]) -> VideoInfo:
-    """Say what a video holds.
-
-    Parameters
-    ----------
-    path : str or path
-        Path of the video.
-
-    Returns
-    -------
-    VideoInfo
-    """
+    """Read what a video holds."""
     with opened_video(path) as container:
         stream = container.streams.video[0]
         context = stream.codec_context
@@ -237,13 +218,7 @@ AHEAD = 60
 
 
 class Footage:
-    """A video to look at frame by frame, which jumps to a frame by its time.
-
-    Parameters
-    ----------
-    path : str or path
-        Video, which is kept open until `close`.
-    """
+    """A video to look at frame by frame, open until `close`, which jumps to a frame by its time."""
 
     def __init__(self, path: str | PathLike[str]) -> None:
         self.info = video_info(path)
@@ -306,14 +281,7 @@ class FrameReader:
     """Frames of a video by number.
 
     Frames are decoded one after the other, so that their numbers are right in every kind of video;
-    the latest are kept. Going back farther than that begins anew.
-
-    Parameters
-    ----------
-    path : str or path
-        Path of the video.
-    memory : float
-        Memory for frames that are kept, bytes.
+    the latest are kept, in so many bytes of memory. Going back farther than that begins anew.
     """
 
     def __init__(self, path: str | PathLike[str], memory: float = _MEMORY) -> None:
@@ -428,31 +396,11 @@ def write_video(
     rate: float = 50.0,
     quality: int = QUALITY,
 ) -> int:
-    """Write a grey video.
+    """Write a grey video, and return the number of its frames.
 
-    Parameters
-    ----------
-    path : str or path
-        File with the ending ``.mkv`` (FFV1, lossless) or ``.mp4`` (H.264); an existing file is
-        replaced once the new one is complete.
-    frames : iterable of array (height, width)
-        Grey values of 8 bits, all of one size.
-    rate : float
-        Frames per second at which it is to be shown.
-    quality : int
-        Constant rate factor of H.264, 0 (lossless) to 51.
-
-    Returns
-    -------
-    int
-        Number of frames written.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the folder does not exist.
-    ValueError
-        If the ending is another, there is no frame, or frames differ in size or type.
+    Frames are (height, width) of 8 bits, all of one size. The ending ``.mkv`` is for FFV1,
+    lossless, ``.mp4`` for H.264 of a constant rate factor from 0 (lossless) to 51; the rate is
+    that at which it is to be shown. An existing file is replaced once the new one is complete.
     """
     import av
 

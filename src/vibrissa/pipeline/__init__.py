@@ -5,7 +5,7 @@ from vibrissa.pipeline.estimates import (
     contact_columns as contact_columns,
     estimates_of,
     in_laboratory as in_laboratory,
-    swept_recording,
+    swept_recording as swept_recording,
 )
 from vibrissa.pipeline.frames import (
     check_recording as check_recording,
@@ -42,7 +42,7 @@ from vibrissa.pipeline.signals import (
 from vibrissa.pipeline.stages import (
     STAGES as STAGES,
     TrialSummary as TrialSummary,
-    due_stages,
+    due_stages as due_stages,
     summarise as summarise,
     with_contour,
     with_estimates,
@@ -54,7 +54,6 @@ __all__ = [
     "compare_contacts",
     "compare_shapes",
     "contact_events",
-    "due_stages",
     "estimates_of",
     "fit_contacts",
     "locate",
@@ -63,7 +62,6 @@ __all__ = [
     "predictors",
     "reconstruct",
     "signals_of",
-    "swept_recording",
     "with_contour",
     "with_estimates",
     "with_signals",

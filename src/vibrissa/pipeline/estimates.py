@@ -334,20 +334,7 @@ def swept_recording(
 ) -> xr.DataTree:
     """Recording of a sweep with a suspended whisker, with its contacts as estimates.
 
-    Parameters
-    ----------
-    sensor : SuspendedWhisker
-        Calibrated sensor.
-    sweep : StageSweep
-        Readings and poses of the sensor.
-    found : SweptContacts
-        Contacts of the sweep, of `follow_sweep`.
-
-    Returns
-    -------
-    xarray.DataTree
-        Recording with a group ``estimates``, and the errors that contacts share; its time is the
-        number of the sample. `reconstruct` fits an object to it.
+    Its time is the number of the sample, and it has the errors that contacts share.
     """
     pose, n, on = sensor.whisker.pose, len(found.points), found.in_contact
     held = {

@@ -488,10 +488,9 @@ def _everywhere(rows: NDArray[np.bool_], values: Array) -> Array:
 
 
 class _Touch(NamedTuple):
-    """(F, p) (n, 6), the normal (n, 3) and ∂(F, p)/∂x (n, 6, 4), ∂n/∂x (n, 3, 4)."""
+    """(F, p) (n, 6), ∂(F, p)/∂x (n, 6, 4) and ∂n/∂x (n, 3, 4), n being the normal."""
 
     values: Array
-    normal: Array
     value_slopes: Array
     normal_slopes: Array
 
@@ -506,14 +505,12 @@ def gains(
     friction: float = 0.0,
 ) -> Array:
     """Derivatives (n, 6, 6) of contact points and normals with respect to the measured wrench."""
-    d = discretize(whisker)
     rubbing = signals == WRENCH or friction > 0.0
-    x = np.concatenate([arc_length[:, None] / d.length, contact_force / d.force], axis=1)
-    out = np.full((len(x), 6, 6), np.nan)
-    rows = np.flatnonzero(np.isfinite(x).all(axis=1))
-    if not rows.size:
+    d, x, rows = _unknowns(whisker, arc_length, contact_force)
+    out = np.full((len(rows), 6, 6), np.nan)
+    if not rows.any():
         return out
-    touch = _touch(d, x[rows])
+    touch = _touch(d, x)
     free = [0, 1, 2, 3] if rubbing else _FREE
     three = len(signals) == 3 and not friction > 0.0
     channels = Channels(signals, signals) if three or signals == WRENCH else Channels.of(signals)
@@ -523,7 +520,7 @@ def gains(
         weights = _weights(d, channels, touch.values, weighing, errors)
         slopes, by_wrench = weights @ slopes, weights @ by_wrench
     if friction > 0.0:  # the prior is one more measurement, which the wrench does not change
-        prior = ratio_derivatives(x[rows])[:, None] / friction
+        prior = ratio_derivatives(x)[:, None] / friction
         slopes = np.concatenate([slopes, prior], axis=1)
         by_wrench = np.concatenate([by_wrench, np.zeros_like(by_wrench[:, :1])], axis=1)
     moved = np.concatenate([touch.value_slopes[:, 3:], touch.normal_slopes], axis=1)[..., free]
@@ -534,13 +531,11 @@ def gains(
 
 def wrench_slopes(whisker: Whisker, arc_length: Array, contact_force: Array) -> Array:
     """Derivatives (n, 6, 3) of the wrench of frictionless contacts by their points."""
-    d = discretize(whisker)
-    x = np.concatenate([arc_length[:, None] / d.length, contact_force / d.force], axis=1)
-    out = np.full((len(x), 6, 3), np.nan)
-    rows = np.flatnonzero(np.isfinite(x).all(axis=1))
-    if not rows.size:
+    d, x, rows = _unknowns(whisker, arc_length, contact_force)
+    out = np.full((len(rows), 6, 3), np.nan)
+    if not rows.any():
         return out
-    values, tangents = solve_forces(d, x[rows], tangents=True)
+    values, tangents = solve_forces(d, x, tangents=True)
     by_x = channel_derivatives(values, tangents, WRENCH)
     scale = np.repeat([d.force, d.moment], 3)[:, None] / d.length
     out[rows] = by_x @ _inverse(tangents[:, 3:]) * scale
@@ -577,21 +572,29 @@ def _touch(d: Discretization, x: Array) -> _Touch:
     change -= tangent[:, :, None] * grown[:, None, :]
     flat = np.eye(3) - normal[:, :, None] * normal[:, None, :]
     with np.errstate(divide="ignore", invalid="ignore"):
-        return _Touch(values, normal, slopes, flat @ change / length[..., None])
+        return _Touch(values, slopes, flat @ change / length[..., None])
 
 
 def contact_normals(whisker: Whisker, arc_length: Array, contact_force: Array) -> Array:
     """Directions (n, 3) of contact forces across the whisker."""
-    d = discretize(whisker)
-    x = np.concatenate([arc_length[:, None] / d.length, contact_force / d.force], axis=1)
-    out = np.full((len(x), 3), np.nan)
-    rows = np.flatnonzero(np.isfinite(x).all(axis=1))
-    if rows.size:
-        force, tangent = solve_forces(d, x[rows])[0][:, :3], contact_tangents(d, x[rows])
+    d, x, rows = _unknowns(whisker, arc_length, contact_force)
+    out = np.full((len(rows), 3), np.nan)
+    if rows.any():
+        force, tangent = solve_forces(d, x)[0][:, :3], contact_tangents(d, x)
         across = force - (force * tangent).sum(axis=1)[:, None] * tangent
         with np.errstate(divide="ignore", invalid="ignore"):
             out[rows] = across / np.linalg.norm(across, axis=1, keepdims=True)
     return out
+
+
+def _unknowns(
+    whisker: Whisker, arc_length: Array, contact_force: Array
+) -> tuple[Discretization, Array, NDArray[np.bool_]]:
+    """Scaled unknowns x (m, 4) of the contacts that are known, and which of all (n,) these are."""
+    d = discretize(whisker)
+    x = np.concatenate([arc_length[:, None] / d.length, contact_force / d.force], axis=1)
+    rows = np.isfinite(x).all(axis=1)
+    return d, x[rows], rows
 
 
 def _weights(

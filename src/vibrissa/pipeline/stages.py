@@ -25,27 +25,9 @@ STAGES = ("signals", "estimates", "contour")
 
 
 def due_stages(recording: xr.DataTree, last: str, asked: Collection[str] = ()) -> tuple[str, ...]:
-    """Stages that have to be made so that the last one is new.
+    """Stages that have to be made, in order, so that the last one is new.
 
-    Parameters
-    ----------
-    recording : xarray.DataTree
-        Recording to be worked on.
-    last : {"signals", "estimates", "contour"}
-        Stage that is wanted; it is always due.
-    asked : collection of str
-        Earlier stages that are to be made anew even if they are there.
-
-    Returns
-    -------
-    tuple of str
-        Names in the order in which they are to be made. A stage before the last is due if it is
-        missing, if it is asked for, or if one that it depends on is asked for.
-
-    Raises
-    ------
-    ValueError
-        If there is no such stage.
+    One before it is due if it is missing, if it is asked for, or if one that it depends on is.
     """
     for name in (last, *asked):
         if name not in STAGES:

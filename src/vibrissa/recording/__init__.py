@@ -8,7 +8,7 @@ from vibrissa.recording.recording import (
 )
 from vibrissa.recording.schema import (
     VARIABLES,
-    RecordedVariable,
+    RecordedVariable as RecordedVariable,
     coordinates as coordinates,
     faults_in as faults_in,
     recorded as recorded,
@@ -17,6 +17,5 @@ from vibrissa.recording.schema import (
 __all__ = [
     "VARIABLES",
     "Group",
-    "RecordedVariable",
     "Recording",
 ]

@@ -34,16 +34,9 @@ from vibrissa.status import flag_attributes
 class RecordedVariable:
     """Declaration of one variable of a recording.
 
-    Parameters
-    ----------
-    dims : tuple of str
-        Names of its dimensions, in the order of the arrays that `Group` returns.
-    groups : tuple of str
-        Names of the groups that may hold it; the empty name is that of the recording itself.
-    frame : str
-        Name of the frame of its components; empty for what has none.
-    kind : {"float", "bool", "int"}
-        Type of its values.
+    Dimensions in the order of the arrays that `Group` returns; groups that may hold it, of which
+    the empty name is the recording itself; the frame of its components, empty for what has none;
+    and the type of its values, "float", "bool" or "int".
     """
 
     dims: tuple[str, ...]

@@ -4,16 +4,18 @@ Sections are made by pure functions of datasets; figures are drawn elsewhere and
 loads nothing: pictures, movies and scripts are in the file, and its security policy forbids more.
 """
 
-from vibrissa.report.contact_map import chart_sections as chart_sections
 from vibrissa.report.page import (
-    Provenance as Provenance,
     Section as Section,
     document,
     figure_sections as figure_sections,
     movies_section as movies_section,
-    provenance as provenance,
     provenance_section as provenance_section,
     table as table,
+)
+from vibrissa.report.sections import (
+    chart_sections as chart_sections,
+    contacts_by_whisker as contacts_by_whisker,
+    trial_sections as trial_sections,
 )
 from vibrissa.report.space import (
     NO_SPACE as NO_SPACE,
@@ -22,10 +24,6 @@ from vibrissa.report.space import (
     reachable_space,
     space_section as space_section,
     trial_in_space as trial_in_space,
-)
-from vibrissa.report.trial import (
-    contacts_by_whisker as contacts_by_whisker,
-    trial_sections as trial_sections,
 )
 
 __all__ = [

@@ -12,7 +12,6 @@ import re
 import shlex
 from base64 import b64encode
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from html import escape
 from importlib.metadata import PackageNotFoundError, version
@@ -67,17 +66,7 @@ class Tile(NamedTuple):
 
 
 class Section(NamedTuple):
-    """A part of the page.
-
-    Attributes
-    ----------
-    name : str
-        Within the page's address; letters, digits and hyphens.
-    title : str
-        Plain text.
-    body : str
-        HTML.
-    """
+    """A part of the page: its name in the page's address, its title, plain text, and its HTML."""
 
     name: str
     title: str
@@ -273,52 +262,31 @@ def with_sigma(name: str, value: float, sigma: float) -> tuple[str, str]:
 
 
 _PACKAGES = ("numpy", "scipy", "numba", "xarray", "h5netcdf", "matplotlib", "av", "plotly")
-_BLOCK = 1 << 20
 _EPOCH = "SOURCE_DATE_EPOCH"
 
 
-@dataclass(frozen=True)
-class Provenance:
-    """Facts that are needed to make a page again.
-
-    Parameters
-    ----------
-    command : str
-        Command as it would be typed.
-    inputs : tuple of (str, int, str)
-        Name of each file that was read, its size in bytes, and its SHA-256 in hexadecimal.
-    versions : tuple of (str, str)
-        Names and versions of the package, of Python and of libraries.
-    seed : int or None
-        Seed of the draws behind what is predicted; None where nothing is drawn.
-    date : datetime
-        Date and time, with a time zone.
-    """
-
-    command: str
-    inputs: tuple[tuple[str, int, str], ...]
-    versions: tuple[tuple[str, str], ...]
-    seed: int | None
-    date: datetime
-
-
-def provenance(command: Sequence[str], inputs: Sequence[Path], seed: int | None) -> Provenance:
-    """Gather it now.
+def provenance_section(command: Sequence[str], inputs: Sequence[Path], seed: int | None) -> Section:
+    """Show what is needed to make a page again.
 
     The date is that of the environment variable ``SOURCE_DATE_EPOCH``, seconds since 1970 in UTC,
     if it is set; then the same command gives the same page.
     """
-    files = tuple((str(path), path.stat().st_size, sha256(path)) for path in inputs)
-    return Provenance(shlex.join(command), files, tuple(_versions()), seed, _date())
+    drawn = "none: no random numbers are used"
+    if seed is not None:
+        drawn = f"{seed}, for the predicted errors"
+    made = _date().strftime("%Y-%m-%d %H:%M:%S UTC")
+    rows = [("command", shlex.join(command)), ("made", made), ("seed", drawn)]
+    files = [
+        (str(path), f"{path.stat().st_size / 1e6:.3f} MB", f"SHA-256 {_sha256(path)}")
+        for path in inputs
+    ]
+    body = table(rows) + table(files, caption="Files that were read")
+    return Section("provenance", "Provenance", body + table(_versions(), caption="Versions"))
 
 
-def sha256(path: Path) -> str:
-    """SHA-256 of a file's content."""
-    found = hashlib.sha256()
+def _sha256(path: Path) -> str:
     with path.open("rb") as file:
-        while block := file.read(_BLOCK):
-            found.update(block)
-    return found.hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _versions() -> list[tuple[str, str]]:
@@ -344,22 +312,3 @@ def _date() -> datetime:
         raise ValueError(
             f"{_EPOCH} is {seconds!r}; whole seconds since 1970 are needed, as of `date +%s`"
         ) from fault
-
-
-def provenance_section(known: Provenance) -> Section:
-    """Show where a page comes from."""
-    rows = [
-        ("command", known.command),
-        ("made", known.date.strftime("%Y-%m-%d %H:%M:%S UTC")),
-        (
-            "seed",
-            "none: no random numbers are used"
-            if known.seed is None
-            else f"{known.seed}, for the predicted errors",
-        ),
-    ]
-    files = [
-        (name, f"{size / 1e6:.3f} MB", f"SHA-256 {digest}") for name, size, digest in known.inputs
-    ]
-    body = table(rows) + table(files, caption="Files that were read")
-    return Section("provenance", "Provenance", body + table(known.versions, caption="Versions"))

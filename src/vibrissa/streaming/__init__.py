@@ -1,6 +1,5 @@
 """Signals as they come in, line by line, to contacts as they go out."""
 
-from vibrissa.streaming.bag import ContactRecorder as ContactRecorder, bag_lines as bag_lines
 from vibrissa.streaming.contacts import (
     COMPONENTS,
     ContactStream,
@@ -17,7 +16,9 @@ from vibrissa.streaming.lines import (
 from vibrissa.streaming.poses import Pose, Poses
 from vibrissa.streaming.sources import (
     Answers as Answers,
+    ContactRecorder as ContactRecorder,
     NewestLines as NewestLines,
+    bag_lines as bag_lines,
     bounded_lines as bounded_lines,
     file_lines as file_lines,
     udp_address as udp_address,

@@ -67,21 +67,8 @@ class Poses:
         """Begin anew."""
         self._last.clear()
 
-    def base(self, rotation: Array, position: Array) -> Pose:
-        """Pose of the base from that of what carries it.
-
-        Parameters
-        ----------
-        rotation : (3, 3) array
-            Rotation from the carrier's to the laboratory frame.
-        position : (3,) array
-            Position of the carrier in the laboratory, m.
-
-        Returns
-        -------
-        Pose
-            Pose of the base.
-        """
+    def _base(self, rotation: Array, position: Array) -> Pose:
+        """Pose of the base from that of what carries it."""
         return Pose(rotation @ self._turn, position + rotation @ self._place)
 
     def put(self, time: float, rotation: Array, position: Array) -> Pose:
@@ -101,7 +88,7 @@ class Poses:
         Pose
             Pose of the base.
         """
-        base = self.base(rotation, position)
+        base = self._base(rotation, position)
         if not (np.isfinite(rotation).all() and np.isfinite(position).all()):
             return base
         if self._last:
@@ -132,11 +119,11 @@ class Poses:
         if not self._last:
             return None
         if len(self._last) == 1:
-            return self.base(*self._last[0][1])
+            return self._base(*self._last[0][1])
         (t0, first), (t1, second) = self._last
         share = (time - t0) / (t1 - t0)
         if not -_LONGEST <= share <= 1.0 + _LONGEST:
             return Pose(np.full((3, 3), np.nan), np.full(3, np.nan))
         turn = Rotation.from_matrix(first.rotation.T @ second.rotation).as_rotvec()
         rotation = first.rotation @ Rotation.from_rotvec(share * turn).as_matrix()
-        return self.base(rotation, first.position + share * (second.position - first.position))
+        return self._base(rotation, first.position + share * (second.position - first.position))

@@ -3,10 +3,9 @@
 from vibrissa.sweeps.results import failures, open_sweep, sweep_summary as sweep_summary
 from vibrissa.sweeps.run import Outcome as Outcome, run_sweep
 from vibrissa.sweeps.store import Busy as Busy, Store as Store
-from vibrissa.sweeps.study import EXAMPLE as EXAMPLE, Cell as Cell, Study, read_study
+from vibrissa.sweeps.study import EXAMPLE as EXAMPLE, Cell as Cell, Study as Study, read_study
 
 __all__ = [
-    "Study",
     "failures",
     "open_sweep",
     "read_study",

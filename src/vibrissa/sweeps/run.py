@@ -260,20 +260,10 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of a run.
+    """Outcome of a run: numbers of cells, and parts of the store that were damaged and made anew.
 
-    Parameters
-    ----------
-    done, failed, skipped : int
-        Numbers of cells done now, of those of them that failed, and of those that were there
-        before.
-    failed_before : int
-        Number of cells that were there before and had failed.
-    damaged : int
-        Number of cells that were there before, but not as they had been written; they were done
-        again.
-    faults : tuple of str
-        Parts of the store that were damaged and made anew.
+    Of cells done now, of those of them that failed, and of those that were there before: skipped,
+    or with a failure, or damaged, which were done again.
     """
 
     done: int

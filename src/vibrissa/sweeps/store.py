@@ -211,26 +211,9 @@ class Cells:
 class Store:
     """The results of one study, open for writing; to be used as a context manager.
 
-    Parameters
-    ----------
-    path : str or path
-        Folder, made if need be.
-    study : Study
-        The study whose results are kept.
-    any_version : bool
-        Whether a store that another version of vibrissa began is continued.
-
-    Attributes
-    ----------
-    faults : list of str
-        Parts of the store that were damaged and made anew.
-
-    Raises
-    ------
-    Busy
-        If another run has it open.
-    ValueError
-        If it holds the results of another study or of another version, or is not a store.
+    The folder is made if need be. Unless any version is allowed, a store that another version of
+    vibrissa began is refused; `Busy` is raised if another run has it open. `faults` are parts that
+    were damaged and made anew.
     """
 
     def __init__(

@@ -48,24 +48,10 @@ _OF_WHISKER, _OF_CELL = 16, 4
 
 @dataclass(frozen=True)
 class Cell:
-    """One task for one whisker.
+    """One task for one whisker, which has a number.
 
-    Parameters
-    ----------
-    task : str
-        Name of the task in the study.
-    kind : str
-        Kind of task, such as "map".
-    settings : mapping
-        Settings of the task.
-    index : int
-        Number of the whisker.
-    specimen : Specimen
-        The whisker.
-    seed : int
-        Seed of the cell: the same for the same whisker in any study with the same seed.
-    identity : str
-        Hash of whisker, task, settings and seed.
+    The seed is the same for the same whisker in any study with the same seed; the identity is a
+    hash of whisker, task, settings and seed.
     """
 
     task: str
@@ -79,20 +65,9 @@ class Cell:
 
 @dataclass(frozen=True)
 class Study:
-    """Whiskers × tasks.
+    """Whiskers × tasks: kind and settings of each task by its name.
 
-    Parameters
-    ----------
-    name : str
-        Name of the study.
-    seed : int
-        Seed of all that is random.
-    specimens : tuple of Specimen
-        The whiskers.
-    tasks : mapping
-        Kind and settings of each task by its name.
-    groups : mapping
-        Groups of whiskers that a task is asked of, by its name; by default all.
+    Groups of whiskers are those that a task is asked of, by its name; by default all.
     """
 
     name: str
@@ -102,30 +77,11 @@ class Study:
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def asks(self, task: str, specimen: Specimen) -> bool:
-        """Decide whether a task is asked of a whisker.
-
-        Parameters
-        ----------
-        task : str
-            Name of the task.
-        specimen : Specimen
-            The whisker.
-
-        Returns
-        -------
-        bool
-            True unless the task is for other groups.
-        """
+        """Whether a task is asked of a whisker: unless it is for other groups."""
         return task not in self.groups or specimen.group in self.groups[task]
 
     def cells(self) -> Iterator[Cell]:
-        """List what is to be done, one whisker after the other.
-
-        Yields
-        ------
-        Cell
-            One task for one whisker.
-        """
+        """List what is to be done, one whisker after the other."""
         for index, specimen in enumerate(self.specimens):
             for task, (kind, settings) in self.tasks.items():
                 if not self.asks(task, specimen):
@@ -139,18 +95,7 @@ class Study:
                 yield Cell(task, kind, settings, index, specimen, int(own[:7], 16), digest[:16])
 
     def count(self, task: str) -> int:
-        """Count the whiskers of which a task is asked.
-
-        Parameters
-        ----------
-        task : str
-            Name of the task.
-
-        Returns
-        -------
-        int
-            Number of whiskers.
-        """
+        """Count the whiskers of which a task is asked."""
         return sum(self.asks(task, specimen) for specimen in self.specimens)
 
     @property

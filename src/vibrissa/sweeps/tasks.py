@@ -49,7 +49,6 @@ class Task:
 
     run: Callable[[Whisker, Settings, int], xr.Dataset]
     defaults: Settings
-    check: Callable[[Settings], None]
     seconds: Callable[[Settings], float]
     numbers: Callable[[Settings], int]
 
@@ -66,7 +65,7 @@ def settings_of(stated: Mapping[str, Any], where: str) -> tuple[str, Settings]:
         raise ValueError(f"{where} sets {', '.join(unknown)}; of {kind} can be set: {allowed}")
     settings = {**task.defaults, **own}
     try:
-        task.check(settings)
+        _check(settings)
     except (TypeError, ValueError, AttributeError, OverflowError) as fault:
         raise ValueError(f"{where}: {fault}") from None
     return kind, settings
@@ -268,45 +267,25 @@ def _noise(settings: Settings) -> Array:
     return np.diag(sigma**2)
 
 
-def _check_uniqueness(settings: Settings) -> None:
-    _triplets(settings)
-    if unknown := [region for region in _several(settings, "regions") if region not in REGIONS]:
-        raise ValueError(f"regions has {unknown[0]!r}; known are {', '.join(REGIONS)}")
-    if not isinstance(settings["resolution"], bool):
-        raise ValueError(f"resolution is {settings['resolution']!r}; true or false is needed")
-    _check_number(settings, "samples", 16, _MOST)
-    _check_number(settings, "cone", 0.0)
-
-
-def _check_certificate(settings: Settings) -> None:
-    _check_number(settings, "cone", 0.0)
-    _check_number(settings, "minutes", 0.0)
-    if not isinstance(settings["folder"], str):
-        raise ValueError(f"folder is {settings['folder']!r}; a path, or nothing, is needed")
-
-
-def _check_noise(settings: Settings) -> None:
-    for name in ("force_noise", "moment_noise"):
-        _check_number(settings, name, 0.0)
-
-
-def _check_sensitivity(settings: Settings) -> None:
-    _triplets(settings)
-    _check_noise(settings)
-
-
-def _check_estimation(settings: Settings) -> None:
-    _sets(settings)
-    _check_noise(settings)
-    _check_number(settings, "contacts", 1, _MOST)
-
-
-def _check_friction(settings: Settings) -> None:
-    selection(settings["triplet"], exactly=3)
-    _check_number(settings, "contacts", 1, _MOST)
-    values = _several(settings, "friction")
+def _check(settings: Settings) -> None:
+    """Check settings, each by its name."""
+    for name in settings:
+        if name in _BOUNDS:
+            _check_number(settings, name, *_BOUNDS[name])
+        elif name in _READ:
+            _READ[name](settings)
+    known = (*REGIONS,)
+    if unknown := [one for one in settings.get("regions", ()) if one not in known]:
+        raise ValueError(f"regions has {unknown[0]!r}; known are {', '.join(known)}")
+    for name, kind, needed in (
+        ("resolution", bool, "true or false"),
+        ("folder", str, "a path, or nothing,"),
+    ):
+        if not isinstance(settings.get(name, kind()), kind):
+            raise ValueError(f"{name} is {settings[name]!r}; {needed} is needed")
+    values = settings.get("friction", ())
     if not all(isinstance(mu, int | float) and 0.0 <= mu < np.inf for mu in values):
-        raise ValueError(f"friction is {values!r}; a list of coefficients from 0 is needed")
+        raise ValueError(f"friction is {tuple(values)!r}; a list of coefficients from 0 is needed")
 
 
 def _check_number(settings: Settings, name: str, least: float, most: float = np.inf) -> None:
@@ -315,6 +294,23 @@ def _check_number(settings: Settings, name: str, least: float, most: float = np.
     if not number or not (least <= value <= most and value < np.inf):
         upto = f" to {most:g}" if most < np.inf else ""
         raise ValueError(f"{name} is {value!r}; a number from {least:g}{upto} is needed")
+
+
+_BOUNDS = {
+    **dict.fromkeys(("cone", "minutes", "force_noise", "moment_noise"), (0.0, np.inf)),
+    "samples": (16, _MOST),
+    "contacts": (1, _MOST),
+}
+"""Least and largest values of numbers."""
+
+_READ: Mapping[str, Callable[[Settings], object]] = {
+    "triplets": _triplets,
+    "signals": _sets,
+    "triplet": lambda settings: selection(settings["triplet"], exactly=3),
+    "regions": lambda settings: _several(settings, "regions"),
+    "friction": lambda settings: _several(settings, "friction"),
+}
+"""What reads a setting, and raises where it cannot."""
 
 
 def _uniqueness_seconds(settings: Settings) -> float:
@@ -327,9 +323,7 @@ _SENSOR = {"force_noise": FORCE_NOISE / _MICRO, "moment_noise": MOMENT_NOISE / _
 
 TASKS: Mapping[str, Task] = MappingProxyType(
     {
-        "map": Task(
-            _map_summary, {}, lambda settings: None, lambda settings: 0.3, lambda settings: 33
-        ),
+        "map": Task(_map_summary, {}, lambda settings: 0.3, lambda settings: 33),
         "uniqueness": Task(
             _uniqueness,
             {
@@ -339,7 +333,6 @@ TASKS: Mapping[str, Task] = MappingProxyType(
                 "samples": 1024,
                 "resolution": True,
             },
-            _check_uniqueness,
             _uniqueness_seconds,
             lambda settings: (
                 (8 if settings["resolution"] else 4)
@@ -350,28 +343,24 @@ TASKS: Mapping[str, Task] = MappingProxyType(
         "certificate": Task(
             _certificate,
             {"cone": 0.0, "minutes": 30.0, "folder": ""},
-            _check_certificate,
             lambda settings: min(60.0 * settings["minutes"], 300.0),
             lambda settings: 4,
         ),
         "sensitivity": Task(
             _sensitivity,
             {"triplets": PAPERS, **_SENSOR},
-            _check_sensitivity,
             lambda settings: 0.5,
             lambda settings: 3 * len(_triplets(settings)),
         ),
         "estimation": Task(
             _estimation,
             {"signals": ("Fx MB MD", "wrench"), "contacts": 1000, **_SENSOR},
-            _check_estimation,
             lambda settings: 0.5 + 1e-4 * settings["contacts"] * len(settings["signals"]),
             lambda settings: 5 * len(settings["signals"]),
         ),
         "friction": Task(
             _friction,
             {"triplet": "Fx MB MD", "friction": (0.0, 0.1, 0.3, 0.5), "contacts": 1000},
-            _check_friction,
             lambda settings: 0.5 + 1e-4 * settings["contacts"] * len(settings["friction"]),
             lambda settings: 4 * len(settings["friction"]),
         ),

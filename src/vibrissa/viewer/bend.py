@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -79,13 +79,6 @@ def ruler(start: Array, length: float) -> dict[str, scene.Mark]:
     return out
 
 
-def arrow(start: Array, end: Array, thickness: float) -> scene.Arrows:
-    """The arrow of a force between two places (3,), m; so many mm thick."""
-    return scene.Arrows(
-        mm(start)[None], mm(end)[None], np.array([FORCE], dtype=np.uint8), thickness
-    )
-
-
 def force_arrow(whisker: Whisker, force: Array, at: Array) -> dict[str, scene.Mark]:
     """The force on a whisker as an arrow that ends where it acts, with its size."""
     size = float(np.linalg.norm(force))
@@ -93,9 +86,10 @@ def force_arrow(whisker: Whisker, force: Array, at: Array) -> dict[str, scene.Ma
         return {}
     reach = _ARROW * whisker.length * np.sqrt(size / state.force_scale(whisker))
     start = at - reach * force / size
+    colours = np.array([FORCE], dtype=np.uint8)
     thickness = _size(0.006 * whisker.length)
     return {
-        "force": arrow(start, at, thickness),
+        "force": scene.Arrows(mm(start)[None], mm(at)[None], colours, thickness),
         "force size": scene.Label(mm(start), number("force", size, 3)),
     }
 
@@ -219,9 +213,10 @@ class BendMode(Mode):
             )
             self._state = gui.add_html("")
             self._numbers = gui.add_html("")
-        asked(self._kind, self._chosen)
-        asked(self._target, self._typed)
-        asked(self._radius, self._widened)
+        change = page.change
+        asked(self._kind, lambda v: change("kind", partial(state.loaded, kind=v)))
+        asked(self._target, lambda v: change("drag", partial(state.moved, to=np.array(v) / _MM)))
+        asked(self._radius, lambda v: change("radius", partial(state.with_radius, radius=v / _MM)))
         for slider in (self._place, self._size, self._way):
             asked(slider, lambda _: self._pushed())
 
@@ -266,15 +261,6 @@ class BendMode(Mode):
             put(self._place, round(bend.place, 3))
             put(self._size, round(_UN * bend.magnitude, 1))
             put(self._way, round(np.rad2deg(bend.direction)))
-
-    def _chosen(self, kind: state.Kind) -> None:
-        self._page.change("kind", lambda bend: state.loaded(bend, kind))
-
-    def _typed(self, place: tuple[float, float, float]) -> None:
-        self._page.change("drag", lambda bend: state.moved(bend, np.array(place) / _MM))
-
-    def _widened(self, radius: float) -> None:
-        self._page.change("radius", lambda bend: state.with_radius(bend, radius / _MM))
 
     def _pushed(self) -> None:
         place, size, way = self._place.value, self._size.value / _UN, np.deg2rad(self._way.value)

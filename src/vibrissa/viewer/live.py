@@ -41,15 +41,7 @@ _WIDEST = 0.25
 
 
 class Live:
-    """Answers of a stream so far, of one whisker.
-
-    Parameters
-    ----------
-    whisker : Whisker
-        Whisker that is drawn.
-    name : str
-        Name of the whisker, where the stream is of several; answers of others are left out.
-    """
+    """Answers of a stream so far, of one whisker; those of others, by name, are left out."""
 
     def __init__(self, whisker: Whisker, name: str = "") -> None:
         self.whisker, self.name = whisker, name
@@ -113,17 +105,7 @@ class Live:
 
 
 class LivePage:
-    """Page that draws the answers which come to a UDP address until it is closed.
-
-    Parameters
-    ----------
-    server : viser.ViserServer
-        Server of the page.
-    live : Live
-        Answers that have come so far.
-    address : str
-        Address on which answers come, ``HOST:PORT``.
-    """
+    """Page that draws the answers which come to a UDP address until it is closed."""
 
     def __init__(self, server: viser.ViserServer, live: Live, address: str) -> None:
         self.server, self.live = server, live

@@ -16,11 +16,10 @@ from vibrissa.numerics import Array
 from vibrissa.objects import Surface, objects_datasets
 from vibrissa.quantities import to_display
 from vibrissa.sketch import round_step
-from vibrissa.viewer.bend import arrow, mm, ruler, whisker_body
+from vibrissa.viewer.bend import force_arrow, mm, ruler, whisker_body
 from vibrissa.viewer.page import Mode, Page, Player, asked, put
 from vibrissa.viewer.readout import CONTACT, FIT, OBJECT, Legend, chart, cursor, table, timeline
 from vibrissa.viewer.recorded import View, Watched, picture, views
-from vibrissa.viewer.state import force_scale
 
 POINTS = 4000
 """Most contact points that are drawn."""
@@ -84,22 +83,16 @@ def moment_drawing(
         if "Uncertainty" in layers and trial.covariance is not None:
             covariance = trial.covariance[frame, i]
             if np.isfinite(covariance).all() and np.sqrt(np.trace(covariance)) < _SHARP * 10.0:
-                variances, axes = np.linalg.eigh(covariance)
-                half = _SIGMAS * np.sqrt(np.maximum(variances, 0.0))
-                out[f"error {i}"] = scene.Body(
-                    *scene.ellipsoid(mm(at), mm(axes * half)), CONTACT, 0.25
-                )
-        size = float(np.linalg.norm(force))
-        if "Forces" in layers and np.isfinite(size) and size > 0.0:
-            reach = 0.3 * whisker.length * np.sqrt(size / force_scale(whisker))
-            start, thickness = at - reach * force / size, float(mm(0.006 * whisker.length))
-            out[f"force {i}"] = arrow(start, at, thickness)
+                vertices, faces = scene.error_ellipsoid(at, covariance, _SIGMAS)
+                out[f"error {i}"] = scene.Body(mm(vertices), faces, CONTACT, 0.25)
+        if "Forces" in layers and (drawn := force_arrow(whisker, force, at)):
+            out[f"force {i}"] = drawn["force"]
     return out
 
 
 def touched(trial: Watched, frame: int) -> scene.Drawing:
     """All contact points up to a frame in their whisker's colour, paler where uncertain."""
-    points, colours = trial.contacts[: frame + 1], _whisker_colours(trial)
+    points = trial.contacts[: frame + 1]
     known = np.isfinite(points).all(axis=-1)
     which = np.nonzero(known)[1]
     chosen = points[known]
@@ -107,7 +100,7 @@ def touched(trial: Watched, frame: int) -> scene.Drawing:
     if not chosen.size:
         return {}
     size = float(mm(0.011 * trial.whiskers[0].length))
-    shown = colours[which[::step]]
+    shown = np.asarray(_COLOURS[which[::step] % len(_COLOURS)], dtype=np.uint8)
     if trial.covariance is not None:
         spread = np.trace(trial.covariance[: frame + 1][known][::step], axis1=1, axis2=2)
         bold = np.nan_to_num(np.clip(_SHARP / np.sqrt(np.maximum(spread, 1e-20)), 0.08, 1.0))
@@ -115,15 +108,10 @@ def touched(trial: Watched, frame: int) -> scene.Drawing:
     return {"contacts": scene.Cloud(mm(chosen[::step]), shown, size)}
 
 
-def _whisker_colours(trial: Watched) -> scene.Bytes:
-    count = np.arange(len(trial.whiskers)) % len(_COLOURS)
-    return np.asarray(_COLOURS[count], dtype=np.uint8)
-
-
 def surroundings(trial: Watched, layers: Collection[str] = LAYERS) -> scene.Drawing:
     """Objects, the shape fitted to the contacts, and a scale."""
     middle, size = extent(trial)
-    near = _known(trial)
+    near = trial.contacts[np.isfinite(trial.contacts).all(axis=-1)]
     centre = np.mean(near, axis=0) if near.size else middle / to_display("length", 1.0)
     out: dict[str, scene.Mark] = {}
     if "Scale" in layers:
@@ -146,11 +134,6 @@ def object_body(thing: Surface, extent: float, near: Array) -> scene.Body:
     (held,) = objects_datasets([thing]).values()
     vertices, faces = scene.object_surface(held, np.stack([near - half, near + half], axis=1))
     return scene.Body(vertices, faces, OBJECT, 0.55, "double")
-
-
-def _known(trial: Watched) -> Array:
-    points = trial.contacts.reshape(-1, 3)
-    return np.asarray(points[np.isfinite(points).all(axis=1)])
 
 
 def fitted_body(contour: xr.Dataset, near: Array) -> tuple[Array, scene.Ints] | None:

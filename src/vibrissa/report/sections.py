@@ -1,4 +1,4 @@
-"""Sections about a trial: what it is, what was done with it, and how well it was done.
+"""Sections about a trial, what was done with it and how well; and about a map of contacts.
 
 Errors are given where the truth is part of the recording; without it there is
 still what the fits report. What a recording lacks is named with the verb that makes it.
@@ -13,11 +13,13 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa import evaluation
+from vibrissa.contacts import ContactMap
 from vibrissa.contour import shape_from_dataset
 from vibrissa.display import show
+from vibrissa.identifiability import verdict_rows
 from vibrissa.numerics import Array
 from vibrissa.pipeline import compare_contacts, distances_by_class
-from vibrissa.quantities import QUANTITIES, quantity
+from vibrissa.quantities import QUANTITIES, quantity, shown_unit, to_display
 from vibrissa.recording import Recording
 from vibrissa.report.page import Section, Tile, paragraph, shown_value, table, tiles, with_sigma
 from vibrissa.signals import CIRCULAR, SIGNALS, base_signals, within_turn
@@ -34,6 +36,8 @@ _FOUND = ("contact_point", "contact_point_whisker", "in_contact")
 _SPREADS = ("covariance", "contact_covariance", "candidates")
 
 _SPREAD = ("median", "95 %")
+
+_DISTANCES = ("median", "largest_95", "median_predicted", "largest_95_predicted")
 
 _NOTHING = "None of this whisker's true contacts was detected, so there is nothing to compare."
 
@@ -258,11 +262,6 @@ def _lacking(
     return paragraph(f"Errors cannot be computed: {'; '.join(text)}.", "note") if text else ""
 
 
-def _has(names: Sequence[str], *data: xr.Dataset | None) -> bool:
-    """Whether all of some datasets have all of some variables."""
-    return all(each is not None and set(names) <= set(each.data_vars) for each in data)
-
-
 def tracking_tables(root: xr.Dataset, truth: xr.Dataset) -> str:
     """Tables of the errors of tracking."""
     scores = evaluation.tracking_scores(root, truth)
@@ -421,12 +420,11 @@ def _component_text(name: str, values: Array) -> str:
 
 def _distances(recording: xr.DataTree, seed: int) -> str:
     """Distances of contacts from the object that is known."""
-    estimates = _one(recording, "estimates", 0)
-    if not _has(("contact_point", "contact_covariance"), estimates):
+    trial = Recording(recording)
+    estimates = trial.find("estimates")
+    if estimates is None or "contact_covariance" not in estimates or not trial.objects:
         return ""
-    assert estimates is not None
-    points = recording["estimates"].to_dataset()["contact_point"].values
-    if not Recording(recording).objects or not np.isfinite(points).any():
+    if estimates.known("contact_point") is None:
         return ""
     classes = distances_by_class(compare_contacts(recording, seed=seed))
     parts = []
@@ -435,19 +433,11 @@ def _distances(recording: xr.DataTree, seed: int) -> str:
         unit = f" ({known.display_unit})" if known.display_unit else ""
         rows = [
             (
-                str(sums["label"].values[i]),
-                str(int(sums["contacts"].values[i])),
-                *(
-                    shown_value("surface_distance", float(sums[column].values[i]))
-                    for column in (
-                        "median",
-                        "largest_95",
-                        "median_predicted",
-                        "largest_95_predicted",
-                    )
-                ),
+                str(row["label"].item()),
+                str(int(row["contacts"])),
+                *(shown_value("surface_distance", float(row[column])) for column in _DISTANCES),
             )
-            for i in range(sums.sizes["class"])
+            for row in (sums.isel({"class": i}) for i in range(sums.sizes["class"]))
         ]
         heading = (f"{known.long_name}{unit}", "contacts", *_SPREAD, *(f"{s}*" for s in _SPREAD))
         caption = f"Distance of contacts from the known object, by {known.long_name}"
@@ -522,3 +512,65 @@ def tracked_table(root: xr.Dataset) -> str:
             text = shown_value("contact_point", float(np.nanmedian(sigma)), 3)
             rows.append(("standard deviation of the contact point", f"{text}, median, in space"))
     return table(rows, caption="By the rod that fits the images")
+
+
+def chart_sections(contact_map: ContactMap, verdicts: xr.Dataset | None = None) -> list[Section]:
+    """Describe a contact map, and which signals locate its contacts."""
+    about = Section("map", "The map", contact_map._repr_html_() + _ranges(contact_map.to_dataset()))
+    if verdicts is None:
+        advice = paragraph(
+            "Uniqueness has not been tested: `vibrissa uniqueness MAP -o FILE.nc` tests it, and "
+            "`--uniqueness FILE.nc` shows the verdicts here."
+        )
+        return [about, Section("verdicts", "Verdicts", advice)]
+    body = _verdicts(verdicts) + _witnesses(verdicts)
+    return [about, Section("verdicts", "Which triplets are unique", body)]
+
+
+def _ranges(samples: xr.Dataset) -> str:
+    """Ranges of signals over all contacts, and their statuses."""
+    rows = []
+    for name in (*SIGNALS, "r", "theta", "phi"):
+        factor, unit = shown_unit(name, samples[name].values)
+        values = factor * samples[name].values
+        ends = (f"{end:.4g}".replace("-", "−") for end in (np.nanmin(values), np.nanmax(values)))
+        rows.append((f"{quantity(name).long_name} ({unit})", *ends))
+    ranges = table(rows, ("quantity", "smallest", "largest"), "Ranges over all contacts of the map")
+    counts = describe(samples["status"].values).most_common()
+    ended = [(sentence, str(count)) for sentence, count in counts]
+    return ranges + table(ended, ("status", "contacts"), "What limits the contacts")
+
+
+def _verdicts(verdicts: xr.Dataset) -> str:
+    if "critical_cone" not in verdicts or "notation" not in verdicts:
+        rows = [
+            (str(triplet), *(str(v) for v in verdicts["verdict"].sel(triplet=triplet).values))
+            for triplet in verdicts["triplet"].values
+        ]
+        return table(rows, ("triplet", *map(str, verdicts["region"].values)), "Verdicts")
+    (heading, *cells), notes = verdict_rows(verdicts)
+    return table(cells, heading, "Verdicts by region") + "".join(
+        paragraph(note, "note") for note in notes
+    )
+
+
+def _witnesses(verdicts: xr.Dataset) -> str:
+    """The farthest pair of contacts with the same signals, by triplet."""
+    if "witness_separation" not in verdicts:
+        return ""
+    apart = verdicts["witness_separation"].transpose("triplet", "region", "witness").values
+    rows = []
+    for triplet, cells in zip(verdicts["triplet"].values, apart, strict=True):
+        if np.isfinite(cells).any():
+            region, _ = np.unravel_index(int(np.nanargmax(cells)), cells.shape)
+            farthest = float(to_display("contact_point", np.nanmax(cells)))
+            name = str(verdicts["region"].values[region])
+            rows.append((str(triplet), name, f"{farthest:.3f} mm"))
+    if not rows:
+        return paragraph("No two contacts with the same signals were found.")
+    return table(
+        rows,
+        ("triplet", "region", "distance"),
+        "Farthest pairs of contacts with the same signals",
+        "Each pair proves that the triplet does not locate contacts in the region.",
+    )

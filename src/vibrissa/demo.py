@@ -132,7 +132,7 @@ def run_demo(
 
     Recordings, videos and tables go to a folder, made if need be; by default nothing is kept. What
     is there already of the same trial is not done again. Without ``video`` the base's true pose is
-    taken. A ValueError says that the whisker cannot whisk past the peg, that there are too few
+    taken. A ValueError states that the whisker cannot whisk past the peg, that there are too few
     contacts to fit it, or that files are in the way.
     """
     tell = progress or (lambda stage, done, total: None)

@@ -26,7 +26,8 @@ def searched(contact_map, names, seed):
     samples = question.samples
     found = twins.twins(contact_map, names, samples.chart, samples.contacts, "reachable")
     rng = np.random.default_rng(seed)
-    more = twins.better_twins(contact_map, names, found, ("all",), APART, "reachable", rng)
+    search = twins.Search(contact_map, names, APART, "reachable")
+    more = twins.better_twins(search, found, ("all",), rng)
     pairs = twins.joined([found, more])
     pairs = pairs.rows(pairs.apart >= APART)
     order = np.argsort(-pairs.angle)

@@ -207,6 +207,19 @@ def test_twice_the_samples_change_no_verdict(gamma_map):
     np.testing.assert_array_equal(once.notation, twice.notation)
 
 
+def test_critical_cones_do_not_depend_on_the_seed(gamma_map):
+    asked = ["Fx MB MD", "Fx FD MD", "FT MB MD"]
+    cones = [
+        vb.uniqueness(gamma_map, asked, ["all", "CB"], samples=512, resolution=False, seed=seed)
+        for seed in (0, 1)
+    ]
+    one, other = (np.rad2deg(found.critical_cone.values) for found in cones)
+    np.testing.assert_allclose(one, other, atol=2e-3)
+    # Where sequential quadratic programming ends from all of 18 pairs; a pair of another search.
+    assert one[0, 0] == pytest.approx(1.9965, abs=2e-3)
+    assert one[1, 0] > 31.1
+
+
 def test_a_rare_pair_within_one_region_is_found(gamma_map):
     """One contact in 300 has its twin in the same region; among few samples there may be none."""
     found = vb.uniqueness(gamma_map, ["Fx FT FD"], ["CB"], resolution=False)

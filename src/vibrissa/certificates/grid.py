@@ -42,7 +42,8 @@ class Outlook(NamedTuple):
     possible : bool
         Whether none fails outside the cone.
     determinant_cone : float
-        Smallest cone about rest outside which the determinant keeps its sign on the grid, rad.
+        Smallest cone about rest outside which the determinant keeps its sign on the grid, rad;
+        infinite where certificates are not for cones so large.
     """
 
     failing: dict[str, float]
@@ -69,6 +70,10 @@ def outlook(contact_map: ContactMap, cone: float) -> Outlook:
     room = float(np.sin(_REST if straight else cone))
     failing = _failing(contact_map, room, (_STATIONS, _BEARINGS, _LEVELS))
     angle = 0.0 if straight else _determinant_cone(contact_map)
+    try:
+        room_within(exact_rod(contact_map.whisker), angle)
+    except ValueError:
+        angle = np.inf
     return Outlook(failing, not any(failing.values()), angle)
 
 

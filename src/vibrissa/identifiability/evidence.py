@@ -17,10 +17,11 @@ import numpy as np
 from vibrissa.contacts import Domain, deficient, invert
 from vibrissa.identifiability.fibres import fibres
 from vibrissa.identifiability.regions import ContactSet, Samples, contact_set, sample, spread
+from vibrissa.identifiability.summits import farthest_twins
 from vibrissa.identifiability.twins import (
     Pairs,
+    Search,
     better_twins,
-    climbed,
     confirmed,
     joined,
     signal_columns,
@@ -44,10 +45,12 @@ UNIQUE, OFF_SURFACE, NOT_UNIQUE, EMPTY = (
 WITNESSES = 3
 #: Shares of each signal's range within which signals count as equal.
 TOLERANCES = (1e-6, 1e-4, 1e-3, 1e-2)
-# Further searches of regions without witnesses.
-_AGAIN = 4
 # Samples in which folds are looked for, per sample that is inverted: they cost little.
 _WIDER = 8
+# Further searches of regions without witnesses.
+_AGAIN = 4
+# Samples that are the same for every seed.
+_FIXED = 2048
 # Pairs found again on a finer rod at a time, and how many times at most.
 _CONFIRMED = 24
 _ROUNDS = 20
@@ -93,6 +96,7 @@ class Question:
     cone: float
     domain: Domain
     samples: Samples
+    fixed: Samples
     wide: Samples
     span: Array
     probed: AnyArray
@@ -150,6 +154,7 @@ def ask(
         cone,
         domain,
         samples,
+        sample(contact_map, spread(min(_FIXED, number), None), domain),
         wide,
         span,
         probed,
@@ -245,20 +250,20 @@ def _searched(question: Question, names: tuple[str, ...], own: Pairs, local: Loc
     rare = wide.contacts.angle > question.cone
     rare &= np.any([local.rarer[question.regions.index(r)] for r in without], axis=0)
     pool = joined([pool, _twins_of(question, names, wide.rows(np.flatnonzero(rare)[:_RARE]))])
+    search = Search(question.contact_map, names, question.separation, question.domain)
+    # Climbs begin at the same pairs for every seed: its own samples only add to where they end.
+    fixed = _twins_of(question, names, question.fixed)
+    better = better_twins(search, fixed, question.regions, np.random.default_rng(0))
+    fixed = joined([fixed, better])
+    pool = joined([pool, fixed, farthest_twins(search, fixed, question.regions)])
     rng = np.random.default_rng(question.seed)
-    regions = question.regions
-    for _ in range(1 + _AGAIN):
-        found = better_twins(
-            question.contact_map, names, pool, regions, question.separation, question.domain, rng
-        )
-        pool = joined([pool, found])
-        regions = _without_witness(question, pool, regions)
+    for _ in range(_AGAIN):
+        regions = _without_witness(question, pool, question.regions)
         if not regions:
             break
-    summits = climbed(
-        question.contact_map, names, pool, question.regions, question.separation, question.domain
-    )
-    return joined([pool, summits])
+        found = better_twins(search, pool, regions, rng)
+        pool = joined([pool, found, farthest_twins(search, found, regions)])
+    return pool
 
 
 def _twins_of(question: Question, names: tuple[str, ...], start: Samples) -> Pairs:

@@ -20,7 +20,7 @@ from vibrissa.rod import (
     solve_forces,
     with_normal_force,
 )
-from vibrissa.signals import concave_backward, cone_angle, in_region, signals_of
+from vibrissa.signals import backward_offset, cone_angle, in_region, signals_of
 
 if TYPE_CHECKING:
     from vibrissa.contacts import ContactMap
@@ -34,15 +34,15 @@ _STEP = 1e-6
 class ContactSet(NamedTuple):
     """Contacts with the regions they belong to.
 
-    ξ (n, 3); (F, p) (n, 6); cone angle from rest, rad; whether concave backward, deflected far, and
-    inside the domain.
+    ξ (n, 3); (F, p) (n, 6); cone angle from rest, rad; offset backward over L, positive where
+    concave backward; x of the tangent, negative where deflected far; whether inside the domain.
     """
 
     xi: Array
     values: Array
     angle: Array
-    backward: AnyArray
-    large: AnyArray
+    backward: Array
+    tangent_x: Array
     inside: AnyArray
 
     def rows(self, which: AnyArray | slice) -> ContactSet:
@@ -51,7 +51,7 @@ class ContactSet(NamedTuple):
 
     def members(self, region: str) -> AnyArray:
         """Whether each belongs to a region, whatever its angle."""
-        return self.inside & in_region(region, self.backward, self.large)
+        return self.inside & in_region(region, self.backward > 0.0, self.tangent_x < 0.0)
 
     @property
     def signals(self) -> Array:
@@ -90,8 +90,8 @@ def contact_set(contact_map: ContactMap, xi: Array, values: Array, domain: Domai
         xi=xi,
         values=values,
         angle=cone_angle(whisker, points),
-        backward=concave_backward(whisker, points),
-        large=contact_tangents(d, with_normal_force(xi))[:, 0] < 0.0,
+        backward=backward_offset(whisker, points) / d.length,
+        tangent_x=contact_tangents(d, with_normal_force(xi))[:, 0],
         inside=inside,
     )
 
@@ -114,9 +114,13 @@ def sample(contact_map: ContactMap, chart: Array, domain: Domain) -> Samples:
     return Samples(chart, contacts, tangents, np.abs(np.linalg.det(by_chart)))
 
 
-def spread(number: int, seed: int) -> Array:
-    """Low-discrepancy chart coordinates (n, 3), at least ``number`` of them: a power of two."""
-    sobol = qmc.Sobol(3, seed=np.random.default_rng(seed))
+def spread(number: int, seed: int | None) -> Array:
+    """Low-discrepancy chart coordinates (n, 3), at least ``number`` of them: a power of two.
+
+    Without a seed they are not scrambled.
+    """
+    rng = None if seed is None else np.random.default_rng(seed)
+    sobol = qmc.Sobol(3, scramble=seed is not None, seed=rng)
     unit = sobol.random_base2(max(1, int(np.ceil(np.log2(number)))))
     return in_chart(unit * [1.0, 2.0 * np.pi, 1.0])
 

@@ -19,7 +19,6 @@ from vibrissa.numerics import AnyArray, Array, cross
 from vibrissa.rod import (
     Discretization,
     chart_of,
-    contacts_at,
     discretize,
     fold_forces,
     solve_forces,
@@ -51,11 +50,6 @@ _SAME = 1e-4
 # The search for better twins starts wide, ends where climbs begin, keeps so many of each region.
 _WIDTHS = np.geomspace(0.2, 0.02, 9)
 _KEPT = 16
-# A climb: pairs of a region, steps, directions tried in each, first and last length in the chart.
-_CLIMBING = 3
-_CLIMBS = 80
-_TRIED = 6
-_FIRST_STEP, _LAST_STEP = 0.03, 1e-4
 # Gauss-Newton steps that bring a contact back to given signals, and singular values that count.
 _CORRECTIONS = 5
 _RCOND = 1e-6
@@ -92,6 +86,15 @@ class Pairs(NamedTuple):
     def angle(self) -> Array:
         """The smaller of the two contacts' cone angles, rad."""
         return np.minimum(self.first.angle, self.second.angle)
+
+
+class Search(NamedTuple):
+    """What is searched: twins of a triplet, at least so far apart over L, in a domain."""
+
+    contact_map: ContactMap
+    names: tuple[str, ...]
+    separation: float
+    domain: Domain
 
 
 def joined(parts: list[Pairs]) -> Pairs:
@@ -149,13 +152,7 @@ def _firm(contact_map: ContactMap, names: tuple[str, ...], xi: Array) -> AnyArra
 
 
 def better_twins(
-    contact_map: ContactMap,
-    names: tuple[str, ...],
-    pairs: Pairs,
-    regions: tuple[str, ...],
-    separation: float,
-    domain: Domain,
-    rng: np.random.Generator,
+    search: Search, pairs: Pairs, regions: tuple[str, ...], rng: np.random.Generator
 ) -> Pairs:
     """Look for twins farther from rest than those found, near them.
 
@@ -163,6 +160,7 @@ def better_twins(
     apart farthest from rest, are varied, ever more finely, and the twins of the varied contacts
     compete with them.
     """
+    contact_map, names, separation, domain = search
     best = _best(pairs, regions, separation)
     for width in _WIDTHS:
         if not len(best.apart):
@@ -179,69 +177,7 @@ def better_twins(
     return best
 
 
-def climbed(
-    contact_map: ContactMap,
-    names: tuple[str, ...],
-    pairs: Pairs,
-    regions: tuple[str, ...],
-    separation: float,
-    domain: Domain,
-) -> Pairs:
-    """Follow the best pairs of each region to where their cone angle is largest.
-
-    Pairs of twins form a three-dimensional set, charted by the first contact. From each pair a
-    step in a random direction is tried, of several lengths; the best twin that is still a witness
-    is kept, steps grow with success and shrink without. Where the climb ends depends on where it
-    begins: what it gives is a lower bound.
-    """
-    far = pairs.apart >= separation
-    starts = [_apart_in_chart(pairs.rows(pairs.members(r) & far)) for r in regions]
-    number = np.repeat(np.arange(len(regions)), [len(one.apart) for one in starts])
-    kept = joined(starts)
-    if not len(kept.apart):
-        return kept
-    rng = np.random.default_rng(0)
-    fold = contact_map.chart.fold
-    step, momentum = np.full(len(number), _FIRST_STEP), np.zeros((len(number), 3))
-    for climb in range(_CLIMBS):
-        if climb == _CLIMBS // 2:  # once more with long steps, past a ridge
-            step[:] = _FIRST_STEP
-        active = np.flatnonzero(step > _LAST_STEP)
-        n = len(active)
-        away = rng.standard_normal((n, _TRIED, 3))
-        away *= rng.random((n, _TRIED, 1)) / np.linalg.norm(away, axis=2, keepdims=True)
-        away[:, 0], away[:, 1] = momentum[active], 2.0 * momentum[active]
-        move = away * step[active, None, None] * [1.0, np.pi, 1.0]
-        chart = in_chart((kept.chart[active, None] + move).reshape(-1, 3))
-        row = np.repeat(active, _TRIED)
-        first, second, agrees = _twins_near(
-            contact_map, names, contacts_at(fold, chart), kept.second.xi[row], domain
-        )
-        apart = np.linalg.norm(second.values[:, 3:] - first.values[:, 3:], axis=1)
-        trial = Pairs(chart, kept.sample[row], first, second, apart)
-        members = np.stack([trial.members(region) for region in regions])
-        counts = agrees & (apart >= separation) & members[number[row], np.arange(len(row))]
-        score = np.where(counts, trial.angle, -1.0).reshape(n, _TRIED)
-        which = np.argmax(score, axis=1)
-        better = score[np.arange(n), which] > kept.angle[active]
-        rows = np.arange(len(number))
-        rows[active[better]] = len(number) + (np.arange(n) * _TRIED + which)[better]
-        momentum[active] = np.where(better[:, None], away[np.arange(n), which], 0.0)
-        kept = joined([kept, trial]).rows(rows)
-        step[active] *= np.where(better, 1.5, 0.7)
-        step = np.minimum(step, 4.0 * _FIRST_STEP)
-    return kept
-
-
-def _apart_in_chart(pairs: Pairs) -> Pairs:
-    """The pairs with the largest angles, at most one of each part of the chart."""
-    order = np.argsort(-pairs.angle, kind="stable")
-    part = np.floor(pairs.chart[order] * [4.0, 4.0 / np.pi, 4.0] - 1e-9)
-    _, first = np.unique(part, axis=0, return_index=True)
-    return pairs.rows(order[np.sort(first)[:_CLIMBING]])
-
-
-def _twins_near(
+def twins_near(
     contact_map: ContactMap, names: tuple[str, ...], first: Array, second: Array, domain: Domain
 ) -> tuple[ContactSet, ContactSet, AnyArray]:
     """Both contacts of pairs whose second one is solved for, and whether that is a twin."""

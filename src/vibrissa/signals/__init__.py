@@ -28,6 +28,7 @@ from vibrissa.signals.base import (
 from vibrissa.signals.regions import (
     CONE,
     REGIONS,
+    backward_offset as backward_offset,
     concave_backward as concave_backward,
     cone_angle as cone_angle,
     in_region as in_region,

@@ -129,12 +129,12 @@ def within_cone(whisker: Whisker, points: Array, angle: float = CONE) -> AnyArra
     return np.asarray(cone_angle(whisker, points) < angle)
 
 
-def concave_backward(whisker: Whisker, points: Array) -> AnyArray:
-    """Whether contacts have moved toward +y of the resting whisker at the same r: CB, not CF."""
+def backward_offset(whisker: Whisker, points: Array) -> Array:
+    """How far contacts have moved toward +y of the resting whisker at the same r."""
     points = np.asarray(points, dtype=np.float64)
     y = points[..., 1]
     if whisker.is_straight:
-        return np.asarray(y > 0.0)
+        return np.asarray(y)
     _, places, _, tangent = resting(whisker)
     r_rest = np.linalg.norm(places, axis=1)
     r = np.linalg.norm(points, axis=-1)
@@ -147,7 +147,12 @@ def concave_backward(whisker: Whisker, points: Array) -> AnyArray:
     along = np.dot(tip, tangent)
     # |tip + a tangent| = r
     a = -along + np.sqrt(np.maximum(along**2 + r**2 - np.dot(tip, tip), 0.0))
-    return np.asarray(y - np.where(beyond, tip[1] + a * tangent[1], rest_y) > 0.0)
+    return np.asarray(y - np.where(beyond, tip[1] + a * tangent[1], rest_y))
+
+
+def concave_backward(whisker: Whisker, points: Array) -> AnyArray:
+    """Whether contacts have moved toward +y of the resting whisker at the same r: CB, not CF."""
+    return np.asarray(backward_offset(whisker, points) > 0.0)
 
 
 def _nearest_branch(points: Array, r: Array, r_rest: Array, places: Array) -> Array:

@@ -1,0 +1,309 @@
+"""Summits: pairs of twins from which no step leads farther from rest.
+
+Pairs (ξ1, ξ2) with T(ξ1) = T(ξ2) are a three-dimensional set. On it the smaller of the two cone
+angles is climbed subject to margins that must not be negative: of the region, the separation, the
+fold and the ends of the whisker. A summit is mostly where several margins vanish, so that a linear
+program finds it: each step maximises the linearised angle within a trust region, once more with
+the margins that were found there (a second-order correction), and returns to the set by Newton's
+method. Margins that are violated cost in proportion, so that a climb may begin outside its region.
+
+Directions are equal where the cross product of the two transverse vectors vanishes, and sizes where
+their squares agree: equations that are regular also where a transverse vector is zero, through
+which ridges lead. Where a triplet collapses, as on the plane of a planar whisker, all pairs solve
+them: climbs keep off contacts where det ∂T/∂ξ vanishes for both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from vibrissa.identifiability.regions import contact_set
+from vibrissa.identifiability.twins import Pairs, Search, twins_near, units
+from vibrissa.numerics import AnyArray, Array, cross
+from vibrissa.rod import chart_of, solve_forces, with_normal_force
+
+# Climbs of each region, the steps they take, and the cost of a violated margin in rad, in rounds
+# that go on with the best of them.
+_ROUNDS = ((20, 8, 30.0), (6, 12, 30.0), (2, 30, 1000.0))
+# Starts of a region are in different parts of the chart, so many an axis.
+_PARTS = np.array([3.0, 3.0 / np.pi, 3.0])
+# Trust regions, in units of L and of the fold force: the first, the largest, and where climbs end.
+_FIRST, _LARGEST, _LAST = 0.1, 0.3, 1e-5
+# A climb also ends where the linear program promises no more than this, rad.
+_LEAST_GAIN = 1e-5
+# What is kept of each margin so that no summit violates one.
+_KEPT = 1e-5
+# Climbs of a region whose merits differ by less than this are at the same summit, rad.
+_SAME = 1e-6
+# Transverse vectors face each other at least so far, over their whole sizes.
+_FACING = 1e-4
+# Newton steps back to the set, and the misfit that they may leave for the next.
+_CORRECTIONS, _MISFIT = 2, 1e-6
+# The larger determinant of a pair, over the lengths of the gradients, is at least this.
+_REGULAR = 1e-4
+# Step of the derivatives of margins, and its ridge against singular equations.
+_STEP, _RIDGE = 1e-5, 1e-14
+# Iterations of the linear program, by what each shrinks the complementarity, and how near to the
+# faces it goes.
+_ITERATIONS, _SHRINK, _NEARLY = 13, 0.04, 0.97
+
+
+class _State(NamedTuple):
+    """Pairs on the way: contacts (n, 2, 3), linearised equations (n, 3, 6), angles and margins.
+
+    Levels (n, 2 + m): both cone angles, then margins; merit (n,), -inf off the set.
+    """
+
+    xi: Array
+    slope: Array
+    levels: Array
+    merit: Array
+
+    def rows(self, which: AnyArray) -> _State:
+        return _State(*(a[which] for a in self))
+
+    def replace(self, which: AnyArray, other: _State) -> None:
+        for mine, theirs in zip(self, other, strict=True):
+            mine[which] = theirs
+
+
+@dataclass(frozen=True)
+class _Mountain:
+    """What is climbed, and the cost of a violated margin, rad."""
+
+    search: Search
+    cost: float
+
+    def units(self, xi: Array) -> Array:
+        """Scale of a change of contacts (n, 2, 3)."""
+        return units(self.search.contact_map, xi.reshape(-1, 3)).reshape(xi.shape)
+
+    def at(self, xi: Array, signs: Array) -> _State:
+        """Pairs of equal triplets next to contacts (n, 2, 3), of regions with such signs."""
+        unit = self.units(xi)
+        for step in range(_CORRECTIONS + 1):
+            values, away, slope = self._equations(xi, unit)
+            if step < _CORRECTIONS:
+                square = slope @ slope.swapaxes(1, 2)
+                ridge = _RIDGE * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+                back = slope.swapaxes(1, 2) @ np.linalg.solve(square + ridge, away[..., None])
+                xi = xi - back.reshape(xi.shape) * unit
+        levels, inside = self.levels(xi, values, slope, signs)
+        merit = _merit(levels, self.cost)
+        merit[~(inside & (np.abs(away).max(axis=1) <= _MISFIT) & np.isfinite(merit))] = -np.inf
+        return _State(xi, slope, levels, merit)
+
+    def _equations(self, xi: Array, unit: Array) -> tuple[Array, Array, Array]:
+        """(F, p) (n, 2, 6), the differences of the triplets (n, 3) and their slopes (n, 3, 6)."""
+        d = self.search.contact_map.chart.discretization
+        values, tangents = solve_forces(d, with_normal_force(xi.reshape(-1, 3)), tangents=True)
+        force, point = values[:, None, :3], values[:, None, 3:]
+        by_xi = unit.reshape(-1, 3, 1) * tangents.swapaxes(1, 2)
+        turned = cross(by_xi[..., 3:], force) + cross(point, by_xi[..., :3])
+        vectors = {"F": (force, by_xi[..., :3]), "M": (cross(point, force), turned)}
+        away, slope = np.empty((len(xi), 3)), np.empty((len(xi), 3, 2, 3))
+        for k, name in enumerate(self.search.names):
+            kind = name[1]
+            both, by_both = (a.reshape(len(xi), 2, -1, 3) for a in vectors[name[0]])
+            size = np.sqrt(np.linalg.norm(both, axis=3).prod(axis=1))[..., None, None]
+            (a, b), by = (both / size)[:, :, 0].swapaxes(0, 1), by_both / size
+            if kind == "x":
+                away[:, k] = a[:, 0] - b[:, 0]
+                normals = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])[None]
+            elif kind == "D":
+                away[:, k] = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
+                zero = np.zeros(len(xi))
+                normals = np.stack([[zero, b[:, 2], -b[:, 1]], [zero, -a[:, 2], a[:, 1]]])
+                normals = normals.transpose(2, 0, 1)
+            else:
+                flat = [0.0, 1.0, 1.0]
+                away[:, k] = 0.5 * ((a**2 - b**2) @ flat)
+                normals = np.stack([a * flat, -b * flat], axis=1)
+            slope[:, k] = np.einsum("npxi,npi->npx", by, np.broadcast_to(normals, (len(xi), 2, 3)))
+        return values.reshape(-1, 2, 6), away, slope.reshape(-1, 3, 6)
+
+    def levels(
+        self, xi: Array, values: Array, slope: Array, signs: Array
+    ) -> tuple[Array, AnyArray]:
+        """Both cone angles and the margins (n, 2 + m), and whether both are inside the domain."""
+        contact_map, _, separation, domain = self.search
+        flat = xi.reshape(-1, 3)
+        one = contact_set(contact_map, flat, values.reshape(-1, 6), domain)
+        room = 1.0 - np.hypot(flat[:, 1], flat[:, 2]) / units(contact_map, flat)[:, 1]
+        ends = (1.0 - flat[:, 0], flat[:, 0] - contact_map.chart.proximal, room)
+        pairs = [a.reshape(-1, 2) for a in (one.angle, one.backward, one.tangent_x, *ends)]
+        margins = [
+            *(
+                np.where(sign[:, None] == 0.0, 1.0, sign[:, None] * margin)
+                for sign, margin in zip(signs.T, pairs[1:3], strict=True)
+            ),
+            _regularity(slope).max(axis=1, keepdims=True) - _REGULAR,
+            *pairs[3:],
+            self._facing(values),
+            np.linalg.norm(values[:, 0, 3:] - values[:, 1, 3:], axis=1)[:, None] - separation,
+        ]
+        levels = np.concatenate([pairs[0], np.concatenate(margins, axis=1) - _KEPT], axis=1)
+        return levels, np.asarray(one.inside.reshape(-1, 2).all(axis=1))
+
+    def _facing(self, values: Array) -> Array:
+        """How far the transverse vectors of direction signals face each other, (n, k)."""
+        force, out = values[..., :3], np.empty((len(values), 0))
+        for name in self.search.names:
+            if name[1] == "D":
+                a = force if name[0] == "F" else cross(values[..., 3:], force)
+                a = a / np.linalg.norm(a, axis=2, keepdims=True)
+                facing = np.einsum("ni,ni->n", a[:, 0, 1:], a[:, 1, 1:]) - _FACING
+                out = np.concatenate([out, facing[:, None]], axis=1)
+        return out
+
+    def slopes(self, state: _State, signs: Array) -> tuple[Array, Array]:
+        """A basis of steps in the set (n, 3, 2, 3), and the levels' slopes along it (n, 3, m)."""
+        free = np.linalg.svd(state.slope)[2][:, 3:].reshape(-1, 3, 2, 3)
+        unit = self.units(state.xi)
+        basis = free * unit[:, None]
+        moved = (state.xi[:, None] + _STEP * basis).reshape(-1, 2, 3)
+        values, _, slope = self._equations(moved, np.repeat(unit, 3, axis=0))
+        levels, _ = self.levels(moved, values, slope, np.repeat(signs, 3, axis=0))
+        slopes = (levels.reshape(len(basis), 3, -1) - state.levels[:, None]) / _STEP
+        return basis, slopes
+
+
+def farthest_twins(search: Search, pairs: Pairs, regions: tuple[str, ...]) -> Pairs:
+    """Climb from the best pairs of each region to where their cone angle is largest.
+
+    Where a climb ends depends on where it begins: the largest is a lower bound.
+    """
+    contact_map, names, _, domain = search
+    mountain = _Mountain(search, _ROUNDS[0][2])
+    signs = np.array(
+        [[("CB" in r) * 1.0 - ("CF" in r), float("ELD" in r)] for r in regions]
+    ).reshape(-1, 2)
+    number, xi = _starts(search, pairs, signs)
+    if not number.size:
+        return pairs.rows(number)
+    signs = signs[number]
+    state = mountain.at(xi, signs)
+    size = np.full(len(xi), _FIRST)
+    for most, steps, cost in _ROUNDS:
+        mountain = replace(mountain, cost=cost)
+        merit = np.where(np.isfinite(state.merit), _merit(state.levels, cost), -np.inf)
+        state = state._replace(merit=merit)
+        kept = _leading(state.merit, number, most)
+        state, number, signs, size = state.rows(kept), number[kept], signs[kept], size[kept]
+        for _ in range(steps):
+            active = np.flatnonzero(size > _LAST)
+            if not active.size:
+                break
+            _step(mountain, state, signs, size, active)
+    # The second contact is solved for, from where its signals fix it better.
+    regular = _regularity(state.slope)
+    xi = np.where((regular[:, 0] > regular[:, 1])[:, None, None], state.xi[:, ::-1], state.xi)
+    first, second, agrees = twins_near(contact_map, names, xi[:, 0], xi[:, 1], domain)
+    apart = np.linalg.norm(second.values[:, 3:] - first.values[:, 3:], axis=1)
+    chart = chart_of(contact_map.chart.fold, first.xi)
+    return Pairs(chart, np.zeros(len(chart), np.int64), first, second, apart).rows(agrees)
+
+
+def _regularity(slope: Array) -> Array:
+    """The determinants of both contacts over the lengths of their gradients, (n, 2)."""
+    gradients = slope.reshape(-1, 3, 2, 3).swapaxes(1, 2)
+    size = np.linalg.norm(gradients, axis=3).prod(axis=2)
+    return np.asarray(np.abs(np.linalg.det(gradients)) / np.maximum(size, _RIDGE))
+
+
+def _starts(search: Search, pairs: Pairs, signs: Array) -> tuple[AnyArray, Array]:
+    """The best pairs of each region, in different parts of charts: its number, their contacts."""
+    xi = np.stack([pairs.first.xi, pairs.second.xi], axis=1)
+    # A pair and the same the other way round are one: the outer contact comes first.
+    swapped = xi[:, 0, 0] < xi[:, 1, 0]
+    xi[swapped] = xi[swapped, ::-1]
+    charts = [chart_of(search.contact_map.chart.fold, xi[:, k]) for k in (0, 1)]
+    part = np.floor(np.concatenate(charts, axis=1) * np.tile(_PARTS, 2) - 1e-9)
+    both = (pairs.first, pairs.second)
+    numbers, starts = [], []
+    for i, (side, small) in enumerate(signs):
+        margins = [m for one in both for m in (side * one.backward, small * one.tangent_x)]
+        levels = [*(one.angle for one in both), *margins, pairs.apart - search.separation]
+        order = np.argsort(-_merit(np.stack(levels, axis=1), _ROUNDS[0][2]), kind="stable")
+        _, first = np.unique(part[order], axis=0, return_index=True)
+        starts.append(xi[order[np.sort(first)[: _ROUNDS[0][0]]]])
+        numbers.append(np.full(len(starts[-1]), i))
+    return np.concatenate(numbers), np.concatenate(starts)
+
+
+def _leading(merit: Array, number: AnyArray, most: int) -> AnyArray:
+    """Rows of the largest merits of each region."""
+    order = np.lexsort([-merit, number])
+    order = order[np.isfinite(merit[order])]
+    again = (np.diff(number[order]) == 0) & (np.diff(merit[order]) > -_SAME)
+    order = np.delete(order, 1 + np.flatnonzero(again))
+    place = np.arange(len(order)) - np.searchsorted(number[order], number[order])
+    return np.asarray(order[place < most])
+
+
+def _merit(levels: Array, cost: float) -> Array:
+    """The smaller angle, less what the worst violated margin costs."""
+    return np.asarray(
+        levels[..., :2].min(axis=-1) - cost * np.maximum(-levels[..., 2:], 0.0).max(axis=-1)
+    )
+
+
+def _step(mountain: _Mountain, state: _State, signs: Array, size: Array, active: AnyArray) -> None:
+    """One step of the climbs that go on, and their new trust regions."""
+    here, signs, within = state.rows(active), signs[active], size[active]
+    basis, slopes = mountain.slopes(here, signs)
+    step, promised = _program(here.levels, slopes, within, mountain.cost)
+    trial = mountain.at(here.xi + np.einsum("nk,nkpi->npi", step, basis), signs)
+    promised = promised - here.merit
+    # Where the margins bend, once more with what they were there.
+    again = np.flatnonzero(np.isfinite(trial.merit) & (trial.merit - here.merit < 0.75 * promised))
+    if again.size:
+        bent = trial.levels - here.levels - np.einsum("nk,nkm->nm", step, slopes)
+        step, _ = _program((here.levels + bent)[again], slopes[again], within[again], mountain.cost)
+        moved = here.xi[again] + np.einsum("nk,nkpi->npi", step, basis[again])
+        second = mountain.at(moved, signs[again])
+        better = second.merit > trial.merit[again]
+        trial.replace(again[better], second.rows(better))
+    gain = trial.merit - here.merit
+    up = gain > 0.05 * np.maximum(promised, 0.0)
+    state.replace(active[up], trial.rows(up))
+    within = within * np.where(gain > 0.7 * promised, 2.0, np.where(up, 1.0, 0.35))
+    size[active] = np.where(promised < _LEAST_GAIN, 0.0, np.minimum(within, _LARGEST))
+
+
+def _program(levels: Array, slopes: Array, within: Array, cost: float) -> tuple[Array, Array]:
+    """Steps (n, 3) in boxes that maximise the linearised merit, and that merit (n,).
+
+    A primal-dual interior method for all rows at once. Unknowns are the step over the size of its
+    box, the angle reached t, and the worst violation e; maximised is t - cost·e.
+    """
+    n, m = levels.shape
+    matrix, room = np.zeros((n, m + 7, 5)), np.ones((n, m + 7))
+    matrix[:, :m, :3] = slopes.swapaxes(1, 2)
+    matrix[:, :2, 3], matrix[:, 2:m, 4], matrix[:, -1, 4] = -1.0, 1.0, 1.0
+    matrix[:, m : m + 6, :3] = np.concatenate([np.eye(3), -np.eye(3)])
+    room[:, :m] = levels / within[:, None]
+    room[:, :2] -= room[:, :2].min(axis=1, keepdims=True)
+    room[:, -1] = 0.0
+    aim = np.array([0.0, 0.0, 0.0, 1.0, -cost])
+    x = np.zeros((n, 5))
+    x[:, 3], x[:, 4] = -1.0, 1.0 + np.maximum(-room[:, 2:m], 0.0).max(axis=1)
+    slack = np.einsum("nmi,ni->nm", matrix, x) + room
+    dual = 1.0 / slack
+    for _ in range(_ITERATIONS):
+        target = _SHRINK * np.mean(slack * dual, axis=1, keepdims=True) / slack
+        weighted = matrix * (dual / slack)[:, :, None]
+        right = aim + np.einsum("nmi,nm->ni", matrix, target)
+        dx = np.linalg.solve(weighted.swapaxes(1, 2) @ matrix, right[..., None])[..., 0]
+        ds = np.einsum("nmi,ni->nm", matrix, dx)
+        dd = target - dual - dual / slack * ds
+        primal, other = (
+            np.minimum(1.0, _NEARLY / np.maximum((-d / a).max(axis=1), 1e-12))[:, None]
+            for d, a in ((ds, slack), (dd, dual))
+        )
+        x, slack, dual = x + primal * dx, slack + primal * ds, dual + other * dd
+    step = x[:, :3] * within[:, None]
+    return step, _merit(levels + np.einsum("nk,nkm->nm", step, slopes), cost)

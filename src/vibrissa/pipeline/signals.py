@@ -593,12 +593,10 @@ def _added(trial: _Trial, dynamics: Dynamics, vibration: Vibration) -> tuple[Arr
             trial.whisker, dynamics, trial.time, *pose, points, arc_length, _SLIPS * most
         )
         apart, share = held - quick, np.full((len(quick), 1), np.inf)
+        # A chain that does not follow the points makes more than was measured.
+        apart[(np.abs(apart) > size).any(axis=1)] = 0.0
         for first, end in contacts_in(trial.touching):
-            here = slice(first, end)
-            # A chain that does not follow the points makes more than was measured.
-            if (np.abs(apart[here]) > size).any():
-                apart[here] = 0.0
-            share[here, 0] = trial.step * np.arange(end - first) / _SETTLED
+            share[first:end, 0] = trial.step * np.arange(end - first) / _SETTLED
         added = quick - np.expm1(-(share**2)) * apart
     return added, apart
 

@@ -138,6 +138,33 @@ def test_small_deflections_are_flagged(rng):
     assert (ratios[~linear] < 1.25).mean() > 0.9, ratios[~linear]
 
 
+def test_forces_nearly_along_the_whisker_are_flagged():
+    """With friction of 60° no covariance is relied on; with 20° it is, and holds the contact."""
+    whisker, across, valid = WHISKERS["gamma"], 2e-4, []
+    for angle in np.deg2rad([20.0, 60.0]):
+        load = vb.PointForce(0.5 * whisker.length, components=(across * np.tan(angle), across, 0.0))
+        bent = vb.deflect(whisker, load)
+        found = vb.estimate_from_wrench(
+            whisker, bent.force, bent.moment, noise=np.diag((0.1 * SIGMA) ** 2)
+        )
+        np.testing.assert_allclose(found.point, bent.contact_point, atol=1e-7)
+        valid.append(bool(found.covariance_valid))
+    assert valid == [True, False]
+
+
+def test_covariances_of_precise_contacts_scale_with_the_noise():
+    whisker = WHISKERS["gamma"]
+    load = vb.PointForce(0.4 * whisker.length, components=(0.0, 4e-4, 1e-4))
+    bent = vb.deflect(whisker, load)
+    large, small = (
+        vb.estimate_from_wrench(
+            whisker, bent.force, bent.moment, noise=np.diag((share * SIGMA) ** 2)
+        ).covariance
+        for share in (0.1, 1e-3)
+    )
+    np.testing.assert_allclose(small, 1e-4 * large, atol=2e-6 * np.abs(large).max())
+
+
 def test_statuses():
     whisker = WHISKERS["gamma"]
     bent = vb.deflect(whisker, vb.PointForce(0.02, components=(1e-5, 1e-4, 2e-5)))

@@ -44,7 +44,7 @@ from vibrissa.rod import BUFFER_SIZE, Discretization, Rod, integrate, set_lane
 
 # Steps each way; the first in standard deviations of s, at least and at most over L.
 _STEPS = 9
-_FIRST, _SHORTEST, _LONGEST = 0.7, 1e-4, 0.05
+_FIRST, _SHORTEST, _LONGEST = 0.7, 1e-9, 0.05
 # A valley ends where χ² is so much above its least; if it does, the covariance may be relied on.
 _HIGH, _CLOSED = 16.0, 9.0
 # After a step on which χ² rose by less than this the next is longer, by this factor.

@@ -56,6 +56,8 @@ _MOST = 4
 # Of contacts that explain a wrench equally well those that need less friction come first: as if
 # friction angles scattered by so much.
 _LIKELY = np.deg2rad(20.0)
+# A covariance is not relied on where a contact needs more: valleys end in such places.
+_STEEP = 2.0 * _LIKELY
 # Where the way out from the base ends nowhere: arc lengths to start from.
 _ELSEWHERE = (0.25, 0.5, 0.75, 0.95)
 # Lever arms beyond so many lengths are none: force and moment are swapped, or in other units.
@@ -375,7 +377,8 @@ def _judged(
     weight, far = np.full((n, most), -np.inf), np.full((n, most), np.nan)
     weight[row, place] = valley.weight - 0.5 * (friction_angle(x) / _LIKELY) ** 2
     far[row, place] = size
-    found.covariances[row, place], found.valid[row, place] = valley.covariances, valley.valid
+    found.covariances[row, place] = valley.covariances
+    found.valid[row, place] = valley.valid & (np.abs(friction_angle(x)) < _STEEP)
     found.angle_sigma[row, place] = _angle_deviation(x, spread)
     probability, order = ranked(weight, found.number)
     line = np.arange(n)[:, None]

@@ -65,7 +65,7 @@ _AT_BASE, _FOLLOWED = 0.03, 2.0
 """Share of the length over which fur may draw a trace aside, and by how much more it does than what
 the rod, which follows it, leaves of that."""
 
-_HOOKED, _HOOK = 0.01, 0.25
+_HOOKED, _HOOK = 0.01, 0.35
 """Standard deviation of how far the rest shape is drawn aside at its base, where its tangent is the
 axis of the whisker's frame, pixels, if residuals show no more; and its share of what they show."""
 
@@ -124,53 +124,28 @@ class FitOptions:
 
 @dataclass(frozen=True, eq=False)
 class RodFit:
-    """Pose, contact and wrench of every frame.
+    """Pose, contact and wrench of every frame, SI units; NaN where nothing is known.
 
-    Parameters
-    ----------
-    rotation : array (time, 3, 3)
-        Rotation from the whisker's to the laboratory frame; NaN where nothing is known.
-    position : array (time, 3)
-        Base point, laboratory frame, m.
-    arc_length : array (time,)
-        Arc length of the contact, m; NaN without contact.
-    contact_point_whisker, contact_point : array (time, 3)
-        Contact point in the whisker's and in the laboratory frame, m.
-    contact_covariance : array (time, 3, 3)
-        Covariance of the contact point in the laboratory, m².
-    shared : array (time, error, 15)
-        Shifts of the contact point and of the base, m, and turns of the base, rad, laboratory
-        axes, by errors that all frames share: each by one standard deviation of one error, which is
-        independent of the others. They are part of the covariances. Then changes of force and
-        moment of the same contact, whisker's frame, which errors of the whisker's shape make.
-    force, moment : array (time, 3)
-        Force and moment at the base, whisker's frame, N and N·m; 0 without contact.
-    wrench_covariance : array (time, 6, 6)
-        Covariance of both.
-    pose_covariance : array (time, 6, 6)
-        Covariance of the base's position, m, and of a small turn about the laboratory's axes, rad.
-    pose_wrench_covariance : array (time, 6, 6)
-        Covariance of these with force and moment: both come from the same traces.
-    centerline : array (time, node, 3)
-        Points of the fitted rod, laboratory frame, m.
-    misfit : array (time,)
-        Root mean square distance from the traces, in their standard deviations.
+    Errors that all frames share, independent of one another, shift the contact point and the base
+    and turn the base by ``shared``, each by one standard deviation. They are part of the
+    covariances. Its last six numbers are changes of force and moment of the same contact, which
+    errors of the whisker's shape make.
     """
 
-    rotation: Array
-    position: Array
-    arc_length: Array
-    contact_point_whisker: Array
-    contact_point: Array
-    contact_covariance: Array
-    shared: Array
-    force: Array
-    moment: Array
-    wrench_covariance: Array
-    pose_covariance: Array
-    pose_wrench_covariance: Array
-    centerline: Array
-    misfit: Array
+    rotation: Array  # (time, 3, 3), from the whisker's to the laboratory frame
+    position: Array  # (time, 3) of the base, laboratory
+    arc_length: Array  # (time,) of the contact
+    contact_point_whisker: Array  # (time, 3)
+    contact_point: Array  # (time, 3), laboratory
+    contact_covariance: Array  # (time, 3, 3), laboratory
+    shared: Array  # (time, error, 15), laboratory, but the last six in the whisker's frame
+    force: Array  # (time, 3) at the base, whisker's frame; 0 without contact
+    moment: Array  # the same
+    wrench_covariance: Array  # (time, 6, 6) of both
+    pose_covariance: Array  # (time, 6, 6) of position and small turns, laboratory axes
+    pose_wrench_covariance: Array  # (time, 6, 6): both come from the same traces
+    centerline: Array  # (time, node, 3), laboratory
+    misfit: Array  # (time,), root mean square distance from the traces in their deviations
 
 
 @dataclass(frozen=True, eq=False)
@@ -452,25 +427,27 @@ def _drawn(fit: _Linear) -> list[float]:
     ]
 
 
-def _frame_turns(problem: Problem, state: State, fit: _Linear) -> Array:
-    """Turns (2, 3) of the whisker's frame, in its own axes, by the rest shape's error at its base.
+def _frame_errors(problem: Problem, state: State, fit: _Linear) -> Array:
+    """Shifts and turns (2, 2, 3) of the whisker's frame, in its axes, by its shape at the base.
 
-    The shape follows the traces there, and the rod the shape: what is wrong with the tangent at the
-    base, which is the x axis, and with the plane of the proximal part, which the roll follows from
-    it, leaves no residuals.
+    The shape follows the traces there, and the rod the shape: what is wrong with the base, with the
+    tangent at it, which is the x axis, and with the plane of the proximal part, which the roll
+    follows from it, leaves a part of itself as residuals.
     """
     whisker = problem.whisker
     base = problem.head.put_in(state.position * whisker.length)
-    slopes = [
-        np.hypot(_HOOKED, _HOOK * drawn)
-        / np.linalg.norm(camera.project_with_slopes(base)[1], axis=1).max()
-        for camera, drawn in zip(problem.cameras, _drawn(fit), strict=True)
+    scales = [
+        np.linalg.norm(camera.project_with_slopes(base)[1], axis=1).max()
+        for camera in problem.cameras
     ]
-    lean = max(slopes) / (_AT_BASE * whisker.length)
+    drawn = np.array(_drawn(fit))
+    aside = _FOLLOWED * float((drawn / scales).max())
+    hook = float((np.hypot(_HOOKED, _HOOK * drawn) / scales).max())
+    lean = hook / (_AT_BASE * whisker.length)
     share = np.linspace(0.0, _PROXIMAL, fit.misses[0].shape[1])
     x, y, _ = whisker.position(share * whisker.length).T
     roll = min(lean * abs(x @ y) / max(y @ y, lean**2 * (x @ x)), 1.0)
-    return np.array([[0.0, 0.0, lean], [roll, lean, 0.0]])
+    return np.array([[[0.0, aside, 0.0], [0.0, 0.0, lean]], [[0.0, 0.0, aside], [roll, lean, 0.0]]])
 
 
 def _contacts(problem: Problem, state: State) -> tuple[Array, Array]:
@@ -526,9 +503,10 @@ def _answer(problem: Problem, state: State, fit: _Linear, nodes: int, unsure: fl
     moved = np.concatenate([moved, shared.swapaxes(0, 1)[..., :6] * size], axis=2)
     moved = np.pad(moved, ((0, 0), (0, 0), (0, 6)))
     # An error of the whisker's frame turns force and moment in it the other way.
-    turns = _frame_turns(problem, state, fit)
-    framed = np.pad(np.einsum("tij,kj->tki", state.rotation, turns), ((0, 0), (0, 0), (6, 6)))
-    against = [np.cross(vector[:, None], turns) for vector in (wrench[:, :3], wrench[:, 3:])]
+    errors = _frame_errors(problem, state, fit)
+    framed = np.einsum("tij,kpj->tkpi", state.rotation, errors).reshape(-1, 2, 6)
+    framed = np.pad(framed, ((0, 0), (0, 0), (3, 6)))
+    against = [np.cross(part[:, None], errors[:, 1]) for part in (wrench[:, :3], wrench[:, 3:])]
     aside = np.concatenate(against, axis=2)
     if unsure > 0.0:
         by_length, changed = _by_length(problem, state, unsure, by_contact, slope)

@@ -27,30 +27,14 @@ from which an error shows that something else is wrong and is weighted down."""
 
 @dataclass(frozen=True, eq=False)
 class TraceSeries:
-    """Traces of one whisker.
+    """Traces of one whisker, NaN where it is lost."""
 
-    Parameters
-    ----------
-    line : array (time, view, NODES, 2)
-        Column and row, equally spaced from base to tip; NaN where the whisker is lost.
-    sigma : array (time, view, NODES)
-        Standard deviation across, pixels.
-    seen : array (time, view, NODES)
-        1 where the whisker is seen, 0 where it is bridged.
-    confidence : array (time, view)
-        Confidence between 0 and 1.
-    ends : array (time, view, 2)
-        1 where the whisker is seen to begin and to end there, else 0.
-    glint : array (time, view)
-        Difference of grey value between its flanks, as a share of its darkness.
-    """
-
-    line: Array
-    sigma: Array
-    seen: Array
-    confidence: Array
-    ends: Array
-    glint: Array
+    line: Array  # (time, view, NODES, 2): column and row, equally spaced from base to tip
+    sigma: Array  # (time, view, NODES): standard deviation across, pixels
+    seen: Array  # (time, view, NODES): 1 where the whisker is seen, 0 where it is bridged
+    confidence: Array  # (time, view), between 0 and 1
+    ends: Array  # (time, view, 2): 1 where the whisker is seen to begin and to end there, else 0
+    glint: Array  # (time, view): difference between its flanks, as a share of its darkness
 
     @classmethod
     def of(cls, traces: Sequence[Sequence[Trace]]) -> TraceSeries:

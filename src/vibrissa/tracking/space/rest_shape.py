@@ -92,32 +92,14 @@ _OUTER = 0.4
 
 @dataclass(frozen=True, eq=False)
 class RestShape:
-    """The whisker at rest and where it would be if it were not bent.
+    """The whisker at rest and where it would be if it were not bent."""
 
-    Parameters
-    ----------
-    points : array (n, 3)
-        The mean shape, of unit spacing in arc length, in the frame of the best free frame, m.
-    free : array (time,)
-        Whether each frame is free of contact.
-    deviation : array (time,)
-        Root mean square distance of each shape from the rest shape put on it, m; NaN where the
-        whisker is missing.
-    noise : float
-        Usual deviation of the free frames, m.
-    whole : bool
-        Whether it ends at the whisker's tip; if not, its tip is not seen.
-    ringing : array (time,), optional
-        Whether each frame is bent by its own mass, so that its pose is not that of the rest shape;
-        by default none is.
-    """
-
-    points: Array
-    free: Mask
-    deviation: Array
-    noise: float
-    whole: bool = True
-    ringing: Mask | None = None
+    points: Array  # (n, 3), equally spaced, in the frame of the best free frame, m
+    free: Mask  # (time,): free of contact
+    deviation: Array  # (time,): root mean square distance from the rest shape put on it, m
+    noise: float  # usual deviation of the free frames, m
+    whole: bool = True  # whether it ends at the whisker's tip
+    ringing: Mask | None = None  # (time,): bent by its own mass; None: no frame is
 
     @property
     def still(self) -> Mask:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.io import (
     Frame,
@@ -41,9 +41,6 @@ _BACK = 64
 
 _AGREES = 0.9
 """Share of a line along another one from which both are the same."""
-
-_SCENE = 30
-"""Number of frames from which light and background are taken."""
 
 _FAINT = 2.4
 """Factor of the jump of a single whisker before grey fur, where its base is less certain."""
@@ -84,8 +81,8 @@ def trace_video(
     kept : list, optional
         List that is filled with the result while it is made, for the case of an interruption.
     sample : sequence of array (height, width), optional
-        Frames spread over the film, which show what never moves; by default some of ``frames`` if
-        they are a sequence, else the first 30.
+        Frames spread over the film, which show what never moves; by default 30 among the first 400
+        of ``frames`` if they are a sequence, else the first 30.
     mask : array (height, width) of bool, optional
         Pixels in which no whisker is measured.
     progress : callable, optional
@@ -109,11 +106,13 @@ def trace_video(
     recent: deque[Frame] = deque(maxlen=_BACK)
     seen: list[Seen] = []
     source = iter(frames)
-    first = list(islice(source, _SCENE))
+    first = list(islice(source, FRAMES))
     if not first:
         return traces
     if sample is None:
-        sample = frames[:: max(1, len(frames) // _SCENE)] if isinstance(frames, Sequence) else first
+        sample = first
+        if isinstance(frames, Sequence):
+            sample = [frames[i] for i in _spread(len(frames))]
     bright, shape = is_bright(first[0], bases, options), first[0].shape
     start = negative(first[0]) if bright else first[0]
     followers = _begun(start, bases, begun if done else (), options)
@@ -252,6 +251,12 @@ def _backward(
                 seen[i].settle(whisker, trace)
 
 
+def _spread(count: int) -> NDArray[np.intp]:
+    """Numbers of the frames, of so many, that show where a film begins and what never moves."""
+    span = min(_SPAN, count)
+    return np.unique(np.linspace(0, span - 1, min(FRAMES, span)).astype(int))
+
+
 def partial_traces(recording: str | PathLike[str], view: int) -> Path:
     """Give the file that keeps the traces of a view until their recording is written."""
     recording = Path(recording)
@@ -285,8 +290,7 @@ def start_frames(
     firsts = [max(-offset, 0), *(max(offset, 0) for _ in videos[1:])]
     pairs = list(zip(videos, firsts, strict=True))
     left = [(video_info(video).frames or _SPAN + first) - first for video, first in pairs]
-    span = max(1, min(_SPAN, *left))
-    rows = np.unique(np.linspace(0, span - 1, min(FRAMES, span)).astype(int))
+    rows = _spread(max(1, min(left)))
     try:
         frames = [list(video_frames(video, first + rows)) for video, first in pairs]
     except ValueError:

@@ -44,6 +44,8 @@ _FACING = 1e-4
 _CORRECTIONS, _MISFIT = 2, 1e-6
 # The larger determinant of a pair, over the lengths of the gradients, is at least this.
 _REGULAR = 1e-4
+# Its logarithm, so scaled, is the margin: no cost lets a pair through.
+_STEEP = 0.1
 # Step of the derivatives of margins, and its ridge against singular equations.
 _STEP, _RIDGE = 1e-5, 1e-14
 # Iterations of the linear program, by what each shrinks the complementarity, and how near to the
@@ -140,7 +142,7 @@ class _Mountain:
                 np.where(sign[:, None] == 0.0, 1.0, sign[:, None] * margin)
                 for sign, margin in zip(signs.T, pairs[1:3], strict=True)
             ),
-            _regularity(slope).max(axis=1, keepdims=True) - _REGULAR,
+            _STEEP * np.log(_regularity(slope).max(axis=1, keepdims=True) / _REGULAR),
             *pairs[3:],
             self._facing(values),
             np.linalg.norm(values[:, 0, 3:] - values[:, 1, 3:], axis=1)[:, None] - separation,

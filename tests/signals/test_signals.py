@@ -37,6 +37,14 @@ def test_definition_on_a_known_wrench():
     assert [signals[n].attrs["units"] for n in SIGNALS] == ["N", "N", "rad", "N m", "N m", "rad"]
 
 
+def test_force_and_moment_in_the_wrong_order_are_noticed():
+    bent = vb.deflect(vb.samples.gamma(), vb.PointForce([15e-3, 25e-3], 5e-5, [0.4, 2.0]))
+    vb.base_signals(bent.force, bent.moment)
+    with pytest.warns(UserWarning, match="force, N, comes before moment"):
+        vb.base_signals(bent.moment, bent.force)
+    vb.base_signals(np.zeros((2, 3)), np.ones((2, 3)))
+
+
 def test_dimensions_follow_the_input():
     plain = vb.base_signals(np.ones((2, 4, 3)), np.ones((2, 4, 3)))
     assert plain.sizes == {"axis_0": 2, "axis_1": 4}

@@ -12,6 +12,7 @@ Directions are angles in (-π, π] and compared on the circle.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Hashable, Mapping
 from typing import TypeAlias
 
@@ -29,6 +30,8 @@ Coordinates: TypeAlias = "dict[Hashable, xr.Variable]"
 SIGNALS = ("Fx", "FT", "FD", "Mx", "MB", "MD")
 #: Numbers of the signals, and of the components of force and moment, as channels of kernels.
 FX, FT, FD, MX, MB, MD, FY, FZ, MY, MZ = range(10)
+# m: no whisker is that long.
+_LONGEST_ARM = 10.0
 #: Which of the signals are angles.
 CIRCULAR = (False, False, True, False, False, True)
 
@@ -55,12 +58,32 @@ def base_signals(force: ArrayLike | xr.DataArray, moment: ArrayLike | xr.DataArr
     ------
     ValueError
         If the last dimension is not of size 3, or the shapes differ.
+
+    Warns
+    -----
+    UserWarning
+        If no moment is that of a force within 10 m of the base, as when the two are swapped.
     """
     f, m, dims, coords = labelled_wrench(force, moment)
+    _check_arms(f, m)
     values = signals_of(f, m)
     return xr.Dataset(
         {name: (dims, values[..., i], attributes(name)) for i, name in enumerate(SIGNALS)}, coords
     )
+
+
+def _check_arms(force: Array, moment: Array) -> None:
+    """Warn if all moments are too large for their forces."""
+    size, turning = np.linalg.norm(force, axis=-1), np.linalg.norm(moment, axis=-1)
+    known = (size > 0.0) & np.isfinite(turning)
+    arm = float(np.min(turning[known] / size[known])) if known.any() else 0.0
+    if arm > _LONGEST_ARM:
+        warnings.warn(
+            f"the moment is that of a force {arm:.3g} m from the base or farther: force, N, comes "
+            "before moment, N·m (1 N·mm is 1e-3 N·m)",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
 def labelled_wrench(

@@ -244,7 +244,7 @@ def repeat_frames(grey, count):
 
 
 def test_stopped_it_leaves_what_was_done(trial, tmp_path, monkeypatch):
-    made = movie_module._FRAMES["contour"]
+    made = movie_module._frames
 
     def interrupted(*arguments):
         for k, frame in enumerate(made(*arguments)):
@@ -252,7 +252,7 @@ def test_stopped_it_leaves_what_was_done(trial, tmp_path, monkeypatch):
                 signal.raise_signal(signal.SIGINT)
             yield frame
 
-    monkeypatch.setitem(movie_module._FRAMES, "contour", interrupted)
+    monkeypatch.setattr(movie_module, "_frames", interrupted)
     done = run(trial, "-o", tmp_path / "a.mp4", "--kind", "contour")
     assert done.exit_code == 130
     assert "stopped after 3 of 12 frames" in done.output

@@ -133,13 +133,13 @@ def map_page(folder):
     )
     vb.identifiability.save_uniqueness(verdicts, folder / "uniqueness.nc")
     words = (folder / "map.nc", "--uniqueness", folder / "uniqueness.nc")
-    drawn = reporting._drawn
+    drawn = reporting.drawn
 
     def few(drawings, tell):
         return drawn(dict(list(drawings.items())[::3]), tell)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(reporting, "_drawn", few)
+        patch.setattr(reporting, "drawn", few)
         patch.setenv("SOURCE_DATE_EPOCH", "1700000000")
         patch.setattr(plots, "png", partial(plots.png, dots=40.0))
         patch.setattr("vibrissa.scene.solids._SHAPE", (12, 24, 8))

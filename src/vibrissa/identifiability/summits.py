@@ -142,7 +142,7 @@ class _Mountain:
                 np.where(sign[:, None] == 0.0, 1.0, sign[:, None] * margin)
                 for sign, margin in zip(signs.T, pairs[1:3], strict=True)
             ),
-            _STEEP * np.log(_regularity(slope).max(axis=1, keepdims=True) / _REGULAR),
+            _STEEP * np.log(np.maximum(_regularity(slope).max(axis=1), _RIDGE) / _REGULAR)[:, None],
             *pairs[3:],
             self._facing(values),
             np.linalg.norm(values[:, 0, 3:] - values[:, 1, 3:], axis=1)[:, None] - separation,

@@ -147,14 +147,14 @@ def test_traces_are_trusted_as_far_as_their_residuals_allow():
     for k in range(1, 48):
         noise[:, k] = share * noise[:, k - 1] + np.sqrt(1.0 - share**2) * noise[:, k]
     together = (1.0 + share) / (1.0 - share)
-    found = trace_variance([2.0 * noise], np.zeros(200))
+    found = trace_variance([2.0 * noise], np.zeros(200), 0.04)
     assert np.median(found) == pytest.approx(4.0 * together, rel=0.25)
     noise[7] *= 10.0
-    assert trace_variance([2.0 * noise], np.zeros(200))[7] > 10.0 * np.median(found)
+    assert trace_variance([2.0 * noise], np.zeros(200), 0.04)[7] > 10.0 * np.median(found)
     # Where they are smaller than was claimed, that counts as well, to a limit.
-    finer = trace_variance([0.3 * noise[:7]], np.zeros(7))
+    finer = trace_variance([0.3 * noise[:7]], np.zeros(7), 0.04)
     assert np.median(finer) == pytest.approx(0.09 * together, rel=0.25)
-    assert (trace_variance([0.01 * noise[:5]], np.zeros(5)) > 1e-3).all()
+    assert (trace_variance([0.01 * noise[:5]], np.zeros(5), 0.04) > 1e-3).all()
 
 
 def test_frames_that_the_rod_does_not_explain_are_noted(filmed):

@@ -42,13 +42,16 @@ from vibrissa.numerics import (
 )
 from vibrissa.rod import BUFFER_SIZE, Discretization, Rod, integrate, set_lane
 
-# Steps each way; the first in standard deviations of s, at least and at most over L.
-_STEPS = 9
-_FIRST, _SHORTEST, _LONGEST = 0.7, 1e-9, 0.05
-# A valley ends where χ² is so much above its least; if it does, the covariance may be relied on.
-_HIGH, _CLOSED = 16.0, 9.0
-# After a step on which χ² rose by less than this the next is longer, by this factor.
-_PACE = ((0.7, 2.0), (2.5, 1.3), (5.0, 1.0), (math.inf, 0.6))
+# Steps each way; the first in standard deviations of s, at least and at most over L. Equal steps of
+# one standard deviation integrate a normal distribution to 1e-7.
+_STEPS = 8
+_FIRST, _SHORTEST, _LONGEST = 1.0, 1e-9, 0.05
+# A valley is followed until χ² is so much above its least, and closed from the second on: then the
+# covariance may be relied on.
+_HIGH, _CLOSED = 30.0, 9.0
+# After a step on which χ² rose by less than this the next is longer, by this factor; of a normal
+# distribution all steps are equal.
+_PACE = ((0.4, 2.0), (0.8, 1.3), (12.0, 1.0), (math.inf, 0.6))
 # The largest change of the moment of the force in a step, as a share of it.
 _LARGEST_CHANGE = 0.5
 # The largest kurtosis at which a covariance is relied on.

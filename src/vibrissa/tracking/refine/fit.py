@@ -108,6 +108,9 @@ class FitOptions:
         Standard deviation of the roll about what it is expected to be, rad.
     surface : float
         Standard deviation of the distance of contacts from known objects, m.
+    sharpest : float
+        Smallest standard deviation of traces that residuals may show, as a share of the stated one;
+        1 for lines between few points, of which residuals do not show all errors.
     rounds : int
         Largest number of Gauss–Newton steps.
     """
@@ -119,6 +122,7 @@ class FitOptions:
     friction: float = 0.1
     roll: float = np.radians(0.5)
     surface: float = 3e-5
+    sharpest: float = 0.2
     rounds: int = 12
 
 
@@ -254,7 +258,7 @@ class Problem:
         """The problem with traces that are trusted as far as they deserve, and its solution."""
         state, fit = self.solved()
         fitted = np.einsum("tij,tji->t", fit.smoother.covariances(), fit.data)
-        variance = trace_variance(fit.misses, fitted)
+        variance = trace_variance(fit.misses, fitted, self.options.sharpest**2)
         problem = replace(self, begun=state, variance=variance)
         return (problem, *((state, fit) if (variance == 1.0).all() else problem.solved()))
 

@@ -31,9 +31,6 @@ _REGULAR = 1e-12
 _LEAST = 0.05
 """Correlation that counts as none."""
 
-_SHARPEST = 0.04
-"""Smallest variance: a trace follows its line to a hundredth of a pixel at best."""
-
 _FREE = 0.25
 """Smallest share of the residuals that are free, however many numbers are fitted."""
 
@@ -132,8 +129,8 @@ class Smoother:
         return blocks.reshape(2 * pairs, n, n)[:count]
 
 
-def trace_variance(misses: Sequence[Array], fitted: Array) -> Array:
-    """Variance of the traces of each frame, in units of what they claim."""
+def trace_variance(misses: Sequence[Array], fitted: Array, least: float) -> Array:
+    """Variance of the traces of each frame, in units of what they claim, and at least so much."""
     square = np.sum([(one**2).sum(axis=1) for one in misses], axis=0)
     count = np.sum([(one != 0.0).sum(axis=1) for one in misses], axis=0)
     shown = count > 0
@@ -145,7 +142,7 @@ def trace_variance(misses: Sequence[Array], fitted: Array) -> Array:
     spent = together * float(fitted[shown].sum()) / float(count[shown].sum())
     each = np.where(shown, square / np.maximum(count, 1), usual)
     variance = together * np.maximum(each, usual) / max(1.0 - spent, _FREE)
-    return np.asarray(np.maximum(variance, _SHARPEST))
+    return np.asarray(np.maximum(variance, least))
 
 
 def correlated(misses: Sequence[Array]) -> float:

@@ -15,16 +15,13 @@ begins with a change that is well above the noise. All likelihoods are of (F, M_
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag, expm
 from scipy.special import gammaln, logsumexp
 
 from vibrissa.numerics import Array, IntArray
-
-if TYPE_CHECKING:
-    from vibrissa.simulation.vibration import Vibration
 
 _CHANNELS = [0, 1, 2, 4, 5]
 """Components of the wrench: F_x, F_y, F_z, M_y, M_z; vibration hardly makes M_x."""
@@ -63,6 +60,19 @@ _FINEST = 1e-4
 """Least noise, over the largest wrench."""
 
 
+class Modes(NamedTuple):
+    """Modes of free vibration: angular frequencies ω (k,), rad/s, and rates of their loss (k,).
+
+    Also the wrench at the base (k, 6) that an acceleration of one makes, and the displacement of
+    the tip (k, 3) over the whisker's reach.
+    """
+
+    rates: Array
+    loss: Array
+    wrench: Array
+    tip: Array
+
+
 class _Model(NamedTuple):
     """Modes in units of the noise: steps (d, d), wrench (5, d), tip over L (3, d), errors (d,).
 
@@ -77,19 +87,18 @@ class _Model(NamedTuple):
     correlation: Array
 
     @classmethod
-    def of(cls, vibration: Vibration, step: float, noise: Array, largest: Array) -> _Model:
+    def of(cls, modes: Modes, step: float, noise: Array, largest: Array) -> _Model:
         """Model of a whisker."""
         square = noise[np.ix_(_CHANNELS, _CHANNELS)]
         sigma = np.maximum(np.sqrt(np.diag(square)), _FINEST * largest[_CHANNELS])
         correlation = square / np.outer(sigma, sigma)
         np.fill_diagonal(correlation, 1.0)
-        gains = vibration.base_wrench(vibration.shapes)[:, _CHANNELS] / sigma
+        rates, loss = modes.rates, modes.loss
+        gains = modes.wrench[:, _CHANNELS] / sigma
         size = np.linalg.norm(gains[:, _MOMENTS], axis=1)
-        rates, loss = vibration.rates, vibration.damping * vibration.rates
         # Per mode the state is (q, q̇ / ω) ω² size, so that q̈ = -(1, η ω) · state / size.
         wrench = -np.stack([gains.T / size, gains.T * loss / size], axis=2)
-        reach = vibration.shapes[:, -1] / np.linalg.norm(vibration.places, axis=1).max()
-        tip = np.stack([reach.T / (rates**2 * size), np.zeros((3, len(rates)))], axis=2)
+        tip = np.stack([modes.tip.T / (rates**2 * size), np.zeros((3, len(rates)))], axis=2)
         turns = [
             expm(step * w * np.array([[0.0, 1.0], [-1.0, -eta]]))
             for w, eta in zip(rates, loss, strict=True)
@@ -190,15 +199,13 @@ def _touching(measured: Array, correlation: Array) -> tuple[Array, Array]:
     return out[0], out[1]
 
 
-def contact_probability(
-    vibration: Vibration, step: float, left: Array, air: Array, noise: Array
-) -> Array:
+def contact_probability(modes: Modes, step: float, left: Array, air: Array, noise: Array) -> Array:
     """Probability (n,) that a whisker is in contact, by all frames.
 
     The wrench (n, 6) minus that in air and the latter, its noise (6, 6), SI units, and the time
     between frames.
     """
-    model = _Model.of(vibration, step, noise, np.abs(left).max(axis=0))
+    model = _Model.of(modes, step, noise, np.abs(left).max(axis=0))
     measured, driven = (part[:, _CHANNELS] / model.noise for part in (left, air))
     contact, onset = _touching(measured, model.correlation)
     size = np.linalg.norm(measured[:, _MOMENTS], axis=1)

@@ -23,7 +23,7 @@ from scipy.signal import StateSpace, lsim
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.simulation.chain import Chain, jacobian
 from vibrissa.simulation.dynamics import Dynamics, at_rest, slowest
-from vibrissa.simulation.switching import contact_probability
+from vibrissa.simulation.switching import Modes, contact_probability
 from vibrissa.whisker import Whisker
 
 # Modes, a pair of them for each number of nodes.
@@ -188,4 +188,11 @@ class Vibration:
         """
         air = self.in_air(time, rotation, position)
         step = float(np.diff(time).mean())
-        return contact_probability(self, step, wrench - air, air, noise) > 0.5
+        reach = np.linalg.norm(self.places, axis=1).max()
+        modes = Modes(
+            self.rates,
+            self.damping * self.rates,
+            self.base_wrench(self.shapes),
+            self.shapes[:, -1] / reach,
+        )
+        return contact_probability(modes, step, wrench - air, air, noise) > 0.5

@@ -53,7 +53,7 @@ LEVELS = {
 }
 """Of red, green and blue in figures for which 256 colours are too few."""
 
-GROWING, SMALL = 48, (800, 450)
+GROWING, SMALL = 40, (800, 450)
 """Frames of the animated picture, and its size, pixels."""
 
 CURVATURES = np.arange(8) / 5.0

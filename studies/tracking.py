@@ -4,7 +4,7 @@
 100 µm a pixel, each under another of six kinds of conditions, and tracks them with the base clicked
 where it truly is; whether that would have been found without a click is judged apart. Then rows of
 whiskers that cross. By default seeds 61 to 66, on which no number was set; two minutes on a free
-core. ``--page`` writes the tables into `docs/tracking.md`, else they are printed.
+core. ``--page`` writes the tables into `docs/tracking-accuracy.md`, else they are printed.
 """
 
 import argparse
@@ -225,7 +225,7 @@ def main():
         except ValueError as fault:
             single.append([f"{name}, {seed}", *["–"] * (len(HEAD) - 2), f"refused: {fault}"])
         print(" | ".join(single[-1]), flush=True)
-    page = ROOT / "docs" / "tracking.md"
+    page = ROOT / "docs" / "tracking-accuracy.md"
     if chosen.page:
         put(page, {"films": table(HEAD, single)})
     several = []

@@ -12,14 +12,8 @@ and of the pose: its usual distance from that of the rod, where that is known.
 **A sensor**: force and moment as they were read, in a simulated or a robot's recording; or the
 readings of its channels, if these are six or more that determine force and moment.
 
-On request a sensor's signals are without what the whisker's inertia and damping add to them. The
-motion of the base and vibrations decide which frames are in contact
-(:class:`vibrissa.simulation.Vibration`). There the whisker is bent otherwise than a force alone
-would bend it, so that no wrench subtracted once is right. At first its bending lags behind the
-moment. Later, contacts by the present correction are smoothed in the laboratory, where objects are
-at rest, a chain with mass is moved through them and one without, and the difference of their
-wrenches (:func:`vibrissa.simulation.held.inertial_wrench`) is the next correction. What is not
-known of a correction is added to the noise.
+On request a sensor's signals are without what the whisker's inertia and damping add to them
+(:mod:`vibrissa.pipeline.inertia`).
 """
 
 from __future__ import annotations
@@ -30,11 +24,8 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from vibrissa.contour import to_laboratory
 from vibrissa.numerics import Array
 from vibrissa.pipeline.frames import (
     SQUARES,
@@ -45,12 +36,13 @@ from vibrissa.pipeline.frames import (
     one_whisker,
     with_coordinates,
 )
-from vibrissa.pipeline.locate import DETECTED, locate_from_wrench, wrench_slopes
+from vibrissa.pipeline.inertia import contacts_in, without_inertia
+from vibrissa.pipeline.locate import DETECTED, wrench_slopes
 from vibrissa.quantities import attributes
 from vibrissa.recording import Group, Recording, recorded
 from vibrissa.rod import PROXIMAL, PointContact, deflect
 from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE, Sensor, component_noise
-from vibrissa.simulation import Dynamics, Vibration, fit_dynamics, inertial_wrench
+from vibrissa.simulation import Dynamics
 from vibrissa.status import Status
 from vibrissa.tracking import CUTOFF, BasePose, HeadPose
 from vibrissa.whisker import Whisker, angles_of
@@ -462,218 +454,6 @@ def signals_by_point(
     return data.assign({name: recorded(name, square) for name, square in squares.items()})
 
 
-_ROUNDS = 2
-"""Number of corrections."""
-
-_ALONG = np.array([1.0, 0.0, 0.0, 1.0, 0.0, 0.0])
-"""Components of the wrench along the whisker at its base."""
-
-_SETTLED = 10e-3
-"""Age of a contact from which a held chain is nearer, s."""
-
-_KNOWN_TO = 0.2
-"""Relative standard deviation of mass and damping."""
-
-_STIFFNESS_KNOWN_TO = 0.1
-"""Relative standard deviation of the stiffness, by which ringing also shows the mass."""
-
-_APART, _LEFT = 0.3, 0.15
-"""Error as a share of how far two ways are apart, and of the root mean square of that and of the
-correction."""
-
-_SLIPS = 2.0
-"""Contact force from which contact points must be wrong, over the largest that is measured."""
-
-_MEMORY = 4e-3
-"""Standard deviation of the window in which that is taken, s."""
-
-_SMOOTH = 3e-3
-"""Standard deviation of the window in which contact points are smoothed, s."""
-
-_ONSET = 4e-3
-"""Time constant with which contact points after an onset begin to count, s."""
-
-_POINT = 1e-6
-"""Least standard deviation of a contact point, m."""
-
-_FEWEST = 8
-"""Fewest frames with force and moment."""
-
-_UNEQUAL = 1e-3
-"""Largest relative difference of the times between frames."""
-
-_LEAST = 4
-"""Fewest frames of a contact with a correction of its own."""
-
-
-class _Trial(NamedTuple):
-    """Measured wrench (n, 6) and its covariance (n, 6, 6), and the motion of the base."""
-
-    whisker: Whisker
-    time: Array
-    wrench: Array
-    noise: Array
-    rotation: Array
-    position: Array
-    touching: NDArray[np.bool_]
-
-    @property
-    def step(self) -> float:
-        """Time between frames, s."""
-        return float(self.time[-1] - self.time[0]) / (len(self.time) - 1)
-
-
-def without_inertia(
-    own: Group, whisker: Whisker, dynamics: Dynamics | Literal["fitted"], noise: Array
-) -> xr.Dataset:
-    """Signals of one whisker without its inertia and damping, which are attributes."""
-    trial, known = _trial(own, whisker, noise)
-    course = trial.time, trial.wrench, trial.rotation, trial.position
-    if dynamics == "fitted":
-        dynamics = fit_dynamics(
-            whisker, *course, noise, stiffness_sigma=_STIFFNESS_KNOWN_TO
-        ).dynamics
-    vibration = Vibration.of(whisker, dynamics)
-    trial = trial._replace(touching=vibration.in_contact(*course, noise))
-    added, apart = _added(trial, dynamics, vibration)
-    left = trial.wrench - added
-    left[~known] = np.nan
-    touching = trial.touching & known
-    status = np.where(touching, int(Status.OK), int(Status.NOT_FELT))
-    status[~known] = int(Status.MISSING)
-    values = {"force": left[:, :3], "moment": left[:, 3:], "in_contact": touching}
-    values |= {"base_position": trial.position, "base_rotation": trial.rotation}
-    covariance = trial.noise + _uncertainty(trial, added, apart, vibration)
-    about = {"density": dynamics.density, "damping_ratio": dynamics.damping_ratio}
-    covariances = recorded("wrench_covariance", covariance)
-    return one_whisker(values, status).assign(wrench_covariance=covariances).assign_attrs(about)
-
-
-def _trial(own: Group, whisker: Whisker, noise: Array) -> tuple[_Trial, NDArray[np.bool_]]:
-    """Trial with gaps filled, and the frames whose wrench is known."""
-    time = np.asarray(own.data["time"].values, dtype=np.float64)
-    rotation, position = own["base_rotation"], own["base_position"]
-    wrench = np.concatenate([own["force"], own["moment"]], axis=1)
-    known = np.isfinite(wrench).all(axis=1)
-    posed = np.isfinite(rotation).all(axis=(1, 2)) & np.isfinite(position).all(axis=1)
-    steps = np.diff(time)
-    faults = []
-    if known.sum() < _FEWEST:
-        faults.append(f"{known.sum()} frames have force and moment; {_FEWEST} are needed")
-    elif np.ptp(steps) > _UNEQUAL * steps.mean():
-        faults.append(
-            f"frames are {1e3 * steps.min():.3g} to {1e3 * steps.max():.3g} ms apart; equal "
-            "spacing is needed"
-        )
-    if not posed.all():
-        faults.append(f"the pose of the base is missing in {np.sum(~posed)} frames")
-    if faults:
-        raise ValueError(f"inertia cannot be removed: {'; '.join(faults)}")
-    for column in wrench.T:
-        column[~known] = np.interp(time[~known], time[known], column[known])
-    return _Trial(whisker, time, wrench, noise, rotation, position, known), known
-
-
-def _added(trial: _Trial, dynamics: Dynamics, vibration: Vibration) -> tuple[Array, Array]:
-    """Wrench (n, 6) that inertia and damping add, and how far two ways to it are apart.
-
-    After an onset the bending lags behind the moment by the time constant of the damping, and the
-    contact bears what inertia there is but along the whisker. Later a chain that is held at the
-    contact points is nearer.
-    """
-    along = vibration.in_air(trial.time, trial.rotation, trial.position) * _ALONG
-    quick = trial.wrench - _lagged(trial.wrench - along, trial.step / vibration.damping)
-    size = np.abs(trial.wrench).reshape(-1, 2, 3).max(axis=(0, 2)).repeat(3)
-    most = float(np.linalg.norm(trial.wrench[:, :3], axis=1).max())
-    added, apart = quick, np.zeros_like(quick)
-    for _ in range(_ROUNDS):
-        points, arc_length = _smoothed(trial, trial.wrench - added, added)
-        pose = trial.rotation, trial.position
-        held = inertial_wrench(
-            trial.whisker, dynamics, trial.time, *pose, points, arc_length, _SLIPS * most
-        )
-        apart, share = held - quick, np.full((len(quick), 1), np.inf)
-        # A chain that does not follow the points makes more than was measured.
-        apart[(np.abs(apart) > size).any(axis=1)] = 0.0
-        for first, end in contacts_in(trial.touching):
-            share[first:end, 0] = trial.step * np.arange(end - first) / _SETTLED
-        added = quick - np.expm1(-(share**2)) * apart
-    return added, apart
-
-
-def _lagged(values: Array, steps: float) -> Array:
-    """Values (n, k) after a lag of first order of so many steps to a time constant."""
-    old = np.exp(-steps)
-    mean = (1.0 - old) / steps
-    # Exact where values change linearly between samples.
-    start = (values[0] * old - values[0] * (mean - old))[None]
-    return np.asarray(lfilter([1.0 - mean, mean - old], [1.0, -old], values, axis=0, zi=start)[0])
-
-
-def _smoothed(trial: _Trial, left: Array, added: Array) -> tuple[Array, Array]:
-    """Smooth contact points (n, 3) in the laboratory, NaN without contact, and arc lengths (n,)."""
-    wrench = xr.Dataset(
-        {"force": (("time", "space"), left[:, :3]), "moment": (("time", "space"), left[:, 3:])},
-        {"time": trial.time},
-    ).assign(in_contact=("time", trial.touching))
-    covariance = trial.noise + _KNOWN_TO * np.einsum("ti,tj->tij", added, added)
-    found = locate_from_wrench(trial.whisker, wrench, covariance)
-    points = found["contact_point_whisker"].values
-    points = to_laboratory(points, trial.rotation, trial.position)
-    rows = np.column_stack([points, found["arc_length"].values])
-    spread = np.einsum("tii->t", found["covariance"].values)
-    usable = np.isfinite(rows).all(axis=1) & np.isfinite(spread)
-    rows[~usable] = 0.0
-    weight = np.where(usable, 1.0 / np.where(usable, spread + _POINT**2, 1.0), 0.0)
-    out = np.full_like(rows, np.nan)
-    for first, end in contacts_in(trial.touching):
-        if usable[first:end].sum() < _LEAST:
-            continue
-        since = trial.step * (np.arange(end - first) + 0.5)
-        begun = weight[first:end] * (1.0 - np.exp(-since / _ONSET)) ** 2
-        out[first:end] = _local_quadratic(rows[first:end], begun, _SMOOTH / trial.step)
-    return out[:, :3], out[:, 3]
-
-
-def _local_quadratic(rows: Array, weight: Array, width: float) -> Array:
-    """Rows (n, k) smoothed by weighted quadratics in windows of a width, in rows."""
-    number = np.arange(len(rows))
-    out = np.empty_like(rows)
-    # A window that holds too little to bend by is fitted by a line.
-    stiff = np.diag([0.0, 1e-3, 1e-2])
-    for i in number:
-        apart = (number - i) / width
-        near = np.sqrt(weight * np.exp(-0.5 * apart**2))
-        basis = np.vander(apart, 3, increasing=True) * near[:, None]
-        basis = np.concatenate([basis, stiff * near.max()])
-        values = np.concatenate([rows * near[:, None], np.zeros((3, rows.shape[1]))])
-        out[i] = np.linalg.lstsq(basis, values, rcond=None)[0][0]
-    return out
-
-
-def _uncertainty(trial: _Trial, added: Array, apart: Array, vibration: Vibration) -> Array:
-    """Covariance (n, 6, 6) of the correction.
-
-    It grows with the correction, with how far two ways to it are apart, and for a radian of the
-    first mode before a release, in which no contact is in equilibrium, and half as long after an
-    onset.
-    """
-    out = _KNOWN_TO**2 * np.einsum("ti,tj->tij", added, added)
-    out += _APART**2 * np.einsum("ti,tj->tij", apart, apart)
-    near = np.zeros((len(added), 1))
-    for first, end in contacts_in(trial.touching):
-        since = np.arange(1, end - first + 1)
-        turned = trial.step * vibration.rates[0] * np.minimum(2 * since, since[::-1])
-        near[first:end, 0] = np.exp(-turned)
-    parts = (_LEFT**2 * (added**2 + apart**2), trial.wrench**2)
-    left, whole = (
-        gaussian_filter1d(part.reshape(-1, 2, 3).mean(axis=2), _MEMORY / trial.step, axis=0)
-        for part in parts
-    )
-    out[:, range(6), range(6)] += np.repeat(left + near**2 * whole, 3, axis=1)
-    return np.asarray(out)
-
-
 def contact_events(signals: xr.Dataset) -> xr.Dataset:
     """List contacts, from onset to release.
 
@@ -702,9 +482,3 @@ def contact_events(signals: xr.Dataset) -> xr.Dataset:
     for name, values in zip(("onset", "release", "largest_force"), numbers, strict=True):
         data[name] = ("contact", np.array(values), attributes(name))
     return xr.Dataset(data)
-
-
-def contacts_in(touching: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """First frames of contacts, and those after their last."""
-    edges = np.flatnonzero(np.diff(touching.astype(int), prepend=0, append=0))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

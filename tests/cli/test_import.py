@@ -17,7 +17,7 @@ from vibrissa.io import RawTracks, labelled, load_recording, save_tracks
 from vibrissa.objects import Peg
 from vibrissa.recording import Recording
 from vibrissa.simulation import Motion, simulate
-from vibrissa.tracking import tracker_traces
+from vibrissa.tracking import track, tracker_traces
 
 NODES = 9
 CAMERAS = orthogonal_views(size=(400, 400), center=(5e-3, 0.0, 0.0))
@@ -156,6 +156,21 @@ def test_two_views_to_a_recording(trial, tmp_path, write):
     run("import", files[0], *typed.split()[1:], "-o", out)
     assert np.median(errors(out, truth)) < 1.5e-4
     assert "vibrissa reconstruct" in run("info", out)
+
+
+def test_lines_between_few_points_are_not_trusted_beyond_their_noise(trial):
+    """From Python too, without an option."""
+    image = np.stack([camera.project(trial[1]) for camera in CAMERAS], axis=2)
+    raw = RawTracks("test", ["w"], image=image, views=[c.name for c in CAMERAS], fps=1000.0)
+    found = tracker_traces(labelled(raw, "a"), CAMERAS)
+    plain = [
+        [[trace._replace(sparse=False) for trace in row] for row in view] for view in found.traces
+    ]
+    spread = []
+    for traces in (found.traces, plain):
+        done = track(found.cameras, traces, 1000.0).to_dataset()
+        spread.append(np.nanmedian(done["contact_covariance"].values[..., 0, 0]))
+    assert spread[0] > 4.0 * spread[1]
 
 
 @pytest.mark.parametrize(("write", "program"), [(labels, "SLEAP"), (nwb, "NWB")])

@@ -88,3 +88,10 @@ def test_frames_that_are_not_equally_spaced_are_refused(trial):
         signals_of(gap, "sensor", dynamics=Dynamics())
     with pytest.raises(ValueError, match="sensor"):
         signals_of(trial, "contact point", dynamics=Dynamics())
+
+
+def test_a_trial_without_inertia_has_none_to_remove():
+    peg = facing_peg(WHISKER, 0.5, 0.7e-3)
+    plain = measure(simulate(WHISKER, sweep_past(WHISKER, peg, 0.02, 1000.0), peg, nodes=9))
+    with pytest.raises(ValueError, match="without inertia"):
+        signals_of(plain, "sensor", dynamics=Dynamics())

@@ -7,6 +7,7 @@ import pytest
 
 import vibrissa as vb
 from vibrissa.viewer.readout import number
+from vibrissa.viewer.state import shape_of
 
 SIGNALS = ("Fx", "FT", "FD", "Mx", "MB", "MD")
 SIZE = {"width": 900, "height": 480}
@@ -221,6 +222,7 @@ def test_keys_clicks_and_links_lead_through_a_trial(browser, recording):
         person.page.wait_for_function("/t=0[.][45]/.test(location.hash)")
         link = person.page.evaluate("location.href")
         assert "mode=Trial" in link
+        assert "camera=" not in link
         trial.show(0)
         person.wait_until(lambda: trial.frame == 0)
         second = browser.new_page(viewport=SIZE)
@@ -238,13 +240,40 @@ def test_keys_clicks_and_links_lead_through_a_trial(browser, recording):
         )
         person.wait_until(lambda: np.allclose(viewer.page.bend.point, [24e-3, 3e-3, 4e-3]))
         third.wait_for_function("/noise=2%2C0.05&colours=MB&contact=24%2C3/.test(location.hash)")
+        # It brings the whisker's shape too, and the camera if someone has turned the view.
+        third.mouse.move(300, 200)
+        third.mouse.down()
+        third.mouse.move(380, 230, steps=4)
+        third.mouse.up()
+        third.wait_for_function("location.hash.includes('camera=')")
+        viewer.page.reshape(length=50e-3, turn=0.5)
+        third.wait_for_function("location.hash.includes('whisker=50%2C28.6')")
+        link, wanted = third.evaluate("location.href"), viewer.page._framing.turned
+        viewer.page.reshape(**vars(shape_of(viewer.page.original)))
+        third.close()
+        viewer.page.choose("Bend")
+        person.wait_until(lambda: viewer.page.mode.name == "Bend")
+        fourth = browser.new_page(viewport=SIZE)
+        fourth.goto(link)
+        person.wait_until(lambda: abs(viewer.page.bend.whisker.length - 50e-3) < 1e-9)
+
+        def as_turned():
+            clients = viewer.page.server.get_clients()
+            return clients and np.allclose(
+                np.concatenate([(c := clients[max(clients)].camera).position, c.look_at]),
+                wanted,
+                atol=0.01,
+            )
+
+        person.wait_until(as_turned)
         for nonsense in (
             "mode=None",
             "mode=Locate&contact=a,b&signals=Mx&noise=-1,1",
+            "mode=Bend&whisker=nan,1,2,3&camera=1,2",
             "mode=Trial&t=nan",
         ):
             urllib.request.urlopen(f"{viewer.url}/restore?{nonsense}").close()
         person.wait_until(lambda: viewer.page.mode is trial)
-        third.close()
+        fourth.close()
         assert person.faults == []
         person.page.close()

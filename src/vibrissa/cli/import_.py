@@ -67,7 +67,6 @@ def import_tracks(
         remark(f"note: {note}")
     how = vb.tracking.TrackOptions(
         cutoff=vb.tracking.CUTOFF if cutoff is None else cutoff or None,
-        fit=vb.tracking.FitOptions(sharpest=1.0),
         **own.tracked(base_radius),
     )
     known: dict[str, Any] = {} if objects is None else {"objects": objects_from(objects)}

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 import vibrissa as vb
-from vibrissa.cli.options import free, refuse, with_options
+from vibrissa.cli.options import refuse, with_options
 from vibrissa.cli.terminal import output, progress_bars, remark, say
 
 _SHOW = "show"
@@ -125,8 +125,10 @@ def _show(store: Path | None, folder: Path, force: bool) -> None:
     _print_failures(vb.sweeps.failures(store))
     folder.mkdir(parents=True, exist_ok=True)
     names = {task: folder / f"{store.resolve().stem}-{task}" for task in vb.plots.drawable(found)}
-    free([name.with_name(f"{name.name}.png") for name in names.values()], force)
     for task, name in names.items():
+        if (there := name.with_name(f"{name.name}.png")).exists() and not force:
+            remark(f"{there} was there before and is left as it is; --force draws it anew")
+            continue
         for file in vb.plots.save(vb.plots.sweep_overview(found, task=task), name, ("png",)):
             say(f"wrote {file}")
 

@@ -77,6 +77,7 @@ def uniqueness(
             tell("witnesses", 0, 1)
             found = vb.identifiability.with_proved_witnesses(contact_map, found)
             bracket = vb.identifiability.cone_bracket(contact_map, certificate, samples)
+            tell("witnesses", 1, 1)
         if network:
             found = vb.paper.with_network_errors(
                 contact_map, found, progress=lambda done, total: tell("networks", done, total)

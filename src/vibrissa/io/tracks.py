@@ -488,8 +488,9 @@ def _names(tracks: xr.Dataset, dim: str) -> list[str]:
     return [str(i) for i in range(tracks.sizes[dim])]
 
 
-Row = tuple[Array, Array, NDArray[np.bool_], float, bool, bool, float]
-"""Points (n, 2), deviations (n,), seen (n,), confidence, whether base and tip are, glint."""
+Row = tuple[Array, Array, NDArray[np.bool_], float, bool, bool, float, bool]
+"""Points (n, 2), deviations (n,), seen (n,), confidence, whether base and tip are, glint, sparse;
+the last is not stored, as traces of videos never are."""
 
 
 def save_traces(path: str | PathLike[str], key: str, traces: Sequence[Sequence[Row]]) -> None:
@@ -502,7 +503,7 @@ def save_traces(path: str | PathLike[str], key: str, traces: Sequence[Sequence[R
             key=np.array(key),
             whiskers=np.array(len(traces)),
             count=np.array([len(row[0]) for row in rows], dtype=np.int64),
-            numbers=np.array([row[3:] for row in rows], dtype=np.float64).reshape(-1, 4),
+            numbers=np.array([row[3:7] for row in rows], dtype=np.float64).reshape(-1, 4),
             line=columns[0].reshape(-1, 2),
             sigma=columns[1],
             seen=columns[2].astype(bool),
@@ -523,7 +524,7 @@ def load_traces(path: str | PathLike[str], key: str) -> list[list[Row]] | None:
     except (OSError, ValueError, KeyError, BadZipFile):
         return None
     rows = [
-        (line, sigma, seen, float(sure), bool(base), bool(tip), float(glint))
+        (line, sigma, seen, float(sure), bool(base), bool(tip), float(glint), False)
         for line, sigma, seen, (sure, base, tip, glint) in zip(*parts, numbers, strict=True)
     ]
     each = len(rows) // max(whiskers, 1)

@@ -148,7 +148,7 @@ def estimates_of(
     whiskers = _whiskers(recording, count, whiskers, contact_maps)
     if noise is None and data.attrs.get("source") == "sensor" and sensor_noise(data) is None:
         raise ValueError("the sensor's noise is not known: give the covariance of (F, M) as noise")
-    parts = []
+    parts, mapped = [], False
     tracked = Recording(recording)
     shaped = data.attrs.get("source") == "sensor" and "wrench_shared" in tracked.root
     for k, whisker in enumerate(whiskers):
@@ -171,6 +171,7 @@ def estimates_of(
                 contact_map = contact_maps[k]
             else:
                 report("map of all contacts", k, count)
+                mapped = True
                 grid = method.startswith("lookup")
                 contact_map = ContactMap.simulate(whisker, grid=grid, proximal=proximal)
                 report("map of all contacts", k + 1, count)
@@ -183,6 +184,8 @@ def estimates_of(
             shared = np.nan_to_num(tracked.root["wrench_shared"][:, k]) * same
         parts.append(_one_whisker(one, found, shared, other_noise=noise is not None))
         report("contact points", k + 1, count)
+    if mapped:  # whiskers without contact need none
+        report("map of all contacts", count, count)
     out = xr.concat(parts, "whisker").transpose("time", "whisker", ...)
     about: dict[str, Any] = {
         "signals": WHOLE if whole else " ".join(names),

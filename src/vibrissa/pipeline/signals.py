@@ -98,7 +98,8 @@ def signals_of(
     Raises
     ------
     ValueError
-        If the recording lacks what the source needs, or the cut-off is not below half the rate.
+        If the recording lacks what the source needs, the cut-off is not below half the rate, or
+        inertia is to be removed from a trial that was simulated without it.
     """
     check_recording(recording)
     chosen = default_source(recording) if source is None else source
@@ -107,6 +108,10 @@ def signals_of(
     known_trial = Recording(recording)
     root = known_trial.root.data
     if chosen == "sensor":
+        if dynamics is not None and "quasi-static" in str(recording.attrs.get("origin")):
+            raise ValueError(
+                "this trial was simulated without inertia: there is none to remove from its signals"
+            )
         known = known_trial.whiskers if whiskers is None else whiskers
         return _by_sensor(root, known, dynamics)
     if dynamics is not None:

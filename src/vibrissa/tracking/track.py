@@ -349,6 +349,8 @@ def track_whisker(
     report(f"contact of {name}", 1, 2)
     touching = np.isfinite(points).all(axis=(1, 2)) & ~shape.free
     smoothness = options.fit
+    if any(trace.sparse for view in traces for trace in view):
+        smoothness = replace(smoothness, sharpest=max(smoothness.sharpest, 1.0))
     if not shape.free.any():
         # Nothing but the bent shapes shows how the whisker is rolled.
         smoothness = replace(smoothness, roll=max(smoothness.roll, _ANY_ROLL))

@@ -326,6 +326,7 @@ def _trace(points: Array, sigma: float) -> Trace:
         sigma=np.full(len(trace.line), sigma * scale),
         base_seen=bool(known[0]),
         tip_seen=bool(known[-1]) or known.argmin() == known.sum(),
+        sparse=True,
     )
 
 

@@ -312,19 +312,24 @@ class WhiskerControls:
         asked(self._taper, lambda value: page.reshape(taper=value))
         asked(self._modulus, lambda value: page.reshape(modulus=value / _GPA))
         asked(self._thick, page.thicken)
-
-        starts = (
-            (self._length, length),
-            (self._turn, turn),
-            (self._taper, taper),
-            (self._modulus, modulus),
-        )
+        page.reshaped = self._shown
 
         @self._reset.on_click
         async def _(_: object) -> None:
-            for slider, value in starts:
-                put(slider, value)
+            self._shown(own)
             page.reshape(**vars(own))
+
+    def _shown(self, shape: state.Shape) -> state.Shape:
+        """Put the sliders to a shape, as far as they go, and return the shape that they show."""
+        sliders = self._length, self._turn, self._taper, self._modulus
+        values = _MM * shape.length, np.rad2deg(shape.turn), shape.taper, _GPA * shape.modulus
+        length, turn, taper, modulus = (
+            float(np.clip(value, slider.min, slider.max))
+            for slider, value in zip(sliders, values, strict=True)
+        )
+        for slider, value in zip(sliders, (length, turn, taper, modulus), strict=True):
+            put(slider, float(f"{value:.5g}"))
+        return state.Shape(length / _MM, float(np.deg2rad(turn)), taper, modulus / _GPA)
 
 
 def _rounded(value: float) -> float:

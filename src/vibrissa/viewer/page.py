@@ -32,15 +32,20 @@ from vibrissa.viewer.stage import Stage
 from vibrissa.viewer.state import (
     Bend,
     Chart,
+    Shape,
     begin,
     charted,
     link_of,
     loaded,
     moved,
+    numbers_in,
     restored,
+    shape_in,
     shape_of,
     shaped,
     with_whisker,
+    words_of,
+    words_of_shape,
 )
 from vibrissa.whisker import Whisker
 
@@ -90,8 +95,8 @@ class Page:
     ) -> None:
         self.server = server
         self.stage = Stage(server)
-        self._framing = Framing(server)
         self.work = Latest(self._fault)
+        self._framing = Framing(server, self._viewed)
         self.slow_work = Latest(self._fault)
         self.original = whisker
         self._contact_map = contact_map
@@ -103,6 +108,7 @@ class Page:
         self.modes: dict[str, Mode] = {}
         self.whisker_controls: viser.GuiFolderHandle | None = None
         self.chosen: Callable[[str], None] = lambda name: None
+        self.reshaped: Callable[[Shape], Shape] = lambda shape: shape
         self.closing: list[Callable[[], None]] = []
         self.linked: viser.GuiHtmlHandle | None = None
         self._written = 0.0
@@ -212,16 +218,29 @@ class Page:
             self.work.drop("words")
 
     def _write(self, brief: bool = False) -> None:
-        """Write what is read, and the link that leads back to it."""
+        """Write what is read."""
         self._written = time.monotonic()
         if self.mode is None:
             return
         self.mode.write(brief)
+        self._link()
+
+    def _viewed(self) -> None:
+        """Someone has turned the view: the link follows when it is at rest."""
+        self.work.put("link", self._link, time.monotonic() + _REST)
+
+    def _link(self) -> None:
+        """Write the link that leads back to what is seen."""
+        if self.mode is None or self.linked is None:
+            return
         state = {"mode": self.mode.name, **self.mode.link()}
         if self._draggable:
             state |= link_of(self.bend)
-        if self.linked is not None:
-            show(self.linked, f'<i hidden data-link="{escape(urlencode(state))}"></i>')
+        if self.shape != shape_of(self.original):
+            state["whisker"] = words_of_shape(self.shape)
+        if self._framing.turned is not None:
+            state["camera"] = words_of(self._framing.turned)
+        show(self.linked, f'<i hidden data-link="{escape(urlencode(state))}"></i>')
 
     def restore(self, asked: Mapping[str, str]) -> None:
         """Show what a link asks for, as far as there is such a thing."""
@@ -230,7 +249,11 @@ class Page:
             return
         self.choose(mode.name)
         mode.restore(asked)
+        if (shape := shape_in(asked.get("whisker", ""))) is not None and mode.name != "Trial":
+            self.reshape(**vars(self.reshaped(shape)))
         self.change("drag", lambda bend: restored(bend, asked))
+        if (camera := numbers_in(asked.get("camera", ""), 6)) is not None:
+            self.work.put("camera", lambda: self._framing.place(camera[:3], camera[3:]))
 
     @property
     def _draggable(self) -> bool:
@@ -422,20 +445,32 @@ def whole(whisker: Whisker) -> Shot:
 class Framing:
     """Keeps the cameras of all browsers on a shot, also of those that connect later."""
 
-    def __init__(self, server: viser.ViserServer) -> None:
+    def __init__(
+        self, server: viser.ViserServer, viewed: Callable[[], None] = lambda: None
+    ) -> None:
         self._server = server
+        self._viewed = viewed
         self._shot: Shot | None = None
+        self.turned: Array | None = None
+        """Camera position and target (6,), mm, of the view that someone turned last."""
         self._placed: dict[int, tuple[int, int, Array]] = {}
         server.on_client_connect(self._came)
 
     def show(self, shot: Shot) -> None:
         """Point all cameras at this."""
-        self._shot = shot
+        self._shot, self.turned = shot, None
         camera = self._server.initial_camera
         place, target = framed(shot, 1280.0, 720.0, camera.fov)
         camera.position, camera.look_at = _triple(place), _triple(target)
         for client in self._server.get_clients().values():
             self._turn(client, shot)
+
+    def place(self, position: Array, target: Array) -> None:
+        """Put all cameras at a position and point them at a target, mm."""
+        self._shot, self.turned = None, np.concatenate([position, target])
+        cameras: list[Any] = [client.camera for client in self._server.get_clients().values()]
+        for camera in (self._server.initial_camera, *cameras):
+            camera.position, camera.look_at = _triple(position), _triple(target)
 
     def _came(self, client: viser.ClientHandle) -> None:
         if self._shot is not None:
@@ -446,8 +481,11 @@ class Framing:
             # Panels come and go; who has turned the view keeps it.
             wide, tall, place = self._placed.get(client.client_id, (0, 0, np.zeros(3)))
             resized = (camera.image_width, camera.image_height) != (wide, tall)
-            if self._shot is not None and resized and np.allclose(camera.position, place, atol=0.1):
+            framed = np.allclose(camera.position, place, atol=0.1)
+            if self._shot is not None and resized and framed:
                 self._turn(client, self._shot)
+            self.turned = None if framed else np.concatenate([camera.position, camera.look_at])
+            self._viewed()
 
     def _turn(self, client: viser.ClientHandle, shot: Shot) -> None:
         camera = client.camera

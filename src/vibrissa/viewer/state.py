@@ -27,6 +27,7 @@ from vibrissa.whisker import Whisker, constant
 Kind = Literal["point", "peg", "force"]
 KINDS: tuple[Kind, ...] = ("point", "peg", "force")
 _MM, _UN = quantity("length").display_factor, quantity("force").display_factor
+_GPA = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,6 +220,20 @@ class Shape:
     turn: float
     taper: float
     modulus: float
+
+
+def words_of_shape(shape: Shape) -> str:
+    """A shape as a word of a link: mm, degrees, ratio, GPa."""
+    return words_of([_MM * shape.length, np.rad2deg(shape.turn), shape.taper, _GPA * shape.modulus])
+
+
+def shape_in(word: str) -> Shape | None:
+    """Shape that a word of a link states; None if it is not there."""
+    numbers = numbers_in(word, 4)
+    if numbers is None:
+        return None
+    length, turn, taper, modulus = numbers.tolist()
+    return Shape(length / _MM, float(np.deg2rad(turn)), taper, modulus / _GPA)
 
 
 def whole_turn(whisker: Whisker) -> float:

@@ -110,7 +110,7 @@ class FitOptions:
         Standard deviation of the distance of contacts from known objects, m.
     sharpest : float
         Smallest standard deviation of traces that residuals may show, as a share of the stated one;
-        1 for lines between few points, of which residuals do not show all errors.
+        at least 1 where a trace is a line between few points (`Trace.sparse`).
     rounds : int
         Largest number of Gauss–Newton steps.
     """

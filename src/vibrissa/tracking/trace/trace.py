@@ -77,6 +77,8 @@ class Trace(NamedTuple):
         image, or fades into the noise.
     glint : float
         Difference of grey value between the flanks of its nearer half, as a share of its darkness.
+    sparse : bool
+        Whether it is a line between few points, of which residuals do not show all errors.
     """
 
     line: Array
@@ -86,6 +88,7 @@ class Trace(NamedTuple):
     base_seen: bool = True
     tip_seen: bool = True
     glint: float = 0.0
+    sparse: bool = False
 
     @classmethod
     def lost(cls) -> Trace:

@@ -4,12 +4,14 @@
 minutes on two cores. `vibrissa figures MAP --cones FOLDER/critical_cones.nc` draws it as well.
 """
 
-import sys
+import argparse
 from pathlib import Path
 
 from vibrissa import critical_cones, plots
 
-folder = Path(sys.argv[1] if len(sys.argv) > 1 else "output")
+parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+parser.add_argument("folder", nargs="?", type=Path, default="output", help="made if needed")
+folder = Path(parser.parse_args().folder)
 folder.mkdir(parents=True, exist_ok=True)
 found = critical_cones(
     progress=lambda done, total: print(f"\r{done} of {total} whiskers", end="", flush=True)

@@ -5,6 +5,7 @@ two seeds, and maximises the smaller of their cone angles with equal signals and
 as constraints (sequential quadratic programming). It prints where each begins and ends.
 """
 
+import argparse
 from functools import lru_cache
 
 import numpy as np
@@ -80,6 +81,7 @@ def ascended(contact_map, names, start):
     return begin[6], found.x[6], np.abs(linear(found.x.tobytes())[0][:3]).max()
 
 
+argparse.ArgumentParser(description=__doc__.split("\n")[0]).parse_args()
 contact_map = vb.ContactMap.simulate(vb.samples.gamma(), grid=False)
 for names in TRIPLETS:
     for seed in (0, 1):

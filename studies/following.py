@@ -10,7 +10,7 @@ cannot tell from it), errors over the length, how many errors lie beyond the 95 
 stated, and how often the filter is right where it states some probability.
 """
 
-import sys
+import argparse
 
 import numpy as np
 
@@ -109,7 +109,7 @@ def line(rows):
     )
 
 
-def main(seeds=3):
+def main(seeds):
     head = "samples several  right, %  median error, %  90 %, %  beyond 95 %, %"
     print(f"{'':31}{head}   (least force, filter)")
     everything = []
@@ -135,4 +135,6 @@ def main(seeds=3):
 
 
 if __name__ == "__main__":
-    main(*(int(text) for text in sys.argv[1:2]))
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("seeds", nargs="?", type=int, default=3, help="draws of noise")
+    main(parser.parse_args().seeds)

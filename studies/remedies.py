@@ -4,8 +4,8 @@
 of three signals, six, and force and moment whole, ignoring what is true and with its remedy; and
 how often second contacts are detected. Contacts are deflected by more than 5°, with noise of 1 µN
 and 0.02 µN·m in each component; rods under their weight are those of `studies/weight.py`, with
-noise of a thousandth of the units of force and moment. `--page` writes them to the page on
-validation.
+noise of a thousandth of the units of force and moment. `--page` writes them to
+`docs/remedies.md`.
 """
 
 import argparse
@@ -233,7 +233,7 @@ def main():
     blocks["second contacts"] = table(DETECTION, list(detection(contact_map, asked)))
     print(blocks["second contacts"])
     if asked.page:
-        put(Path(__file__).parents[1] / "docs" / "validation.md", blocks)
+        put(Path(__file__).parents[1] / "docs" / "remedies.md", blocks)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ readings are nearest. Median (90 %): of readings over draws, of points over draw
     python studies/robot_points.py ../shared/robot_whisker docs/images [DRAWS]
 """
 
-import sys
+import argparse
 from pathlib import Path
 from typing import NamedTuple
 
@@ -227,4 +227,8 @@ def main(folder: Path, images: Path, draws: int) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]) if len(sys.argv) > 3 else 2)
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("data", type=Path, help="folder of the data")
+    parser.add_argument("images", type=Path, help="folder for the figure")
+    parser.add_argument("draws", nargs="?", type=int, default=2, help="random draws of touches")
+    main(*vars(parser.parse_args()).values())

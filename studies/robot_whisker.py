@@ -10,7 +10,7 @@ within 40 mm of the base calibrate.
     python studies/robot_whisker.py ../shared/robot_whisker 50 10
 """
 
-import sys
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -128,4 +128,8 @@ def main(folder: Path, number: int, draws: int) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]))
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("data", type=Path, help="folder of the data")
+    parser.add_argument("touches", type=int, help="touches that calibrate")
+    parser.add_argument("draws", type=int, help="random draws of them")
+    main(*vars(parser.parse_args()).values())

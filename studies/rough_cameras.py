@@ -6,7 +6,7 @@ taken to be orthographic, orthographic but rough (as without ``--distance``), ro
 known.
 """
 
-import sys
+import argparse
 
 import numpy as np
 from pinhole_film import film, views
@@ -81,4 +81,6 @@ def main(seeds):
 
 
 if __name__ == "__main__":
-    main([int(seed) for seed in sys.argv[1:]] or [2])
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("seeds", nargs="*", type=int, default=[2], help="films; 2 by default")
+    main(parser.parse_args().seeds)

@@ -10,6 +10,8 @@ in NumPy, with the pieces of rod that the kernels use; the exact solution has 57
 
 from __future__ import annotations
 
+import argparse
+
 import numpy as np
 from scipy.integrate._ivp import dop853_coefficients as dop853
 from scipy.integrate._ivp.rk import RK45
@@ -114,4 +116,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__.split("\n")[0]).parse_args()
     main()

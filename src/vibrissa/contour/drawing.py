@@ -21,10 +21,11 @@ _INWARD = 0.9
 _ROUND = np.pi / 3.0
 """Gap between azimuths from which a shape is drawn open."""
 
+_MARGIN = 0.15
+"""Margin of a drawn surface beyond the points, as a share of their width."""
 
-def surface_grid(
-    shape: FittedShape, points: ArrayLike, count: int = 41, margin: float = 0.15
-) -> xr.Dataset:
+
+def surface_grid(shape: FittedShape, points: ArrayLike, count: int = 41) -> xr.Dataset:
     """Grid over the part of a fitted shape that was touched.
 
     Parameters
@@ -35,8 +36,6 @@ def surface_grid(
         Contact points, in its frame, m; rows with NaN are left out.
     count : int
         Number of points of the grid in each of its two directions.
-    margin : float
-        Margin beyond the points, as a share of their width.
 
     Returns
     -------
@@ -56,7 +55,7 @@ def surface_grid(
     if not len(p):
         raise ValueError("no grid: no points")
     base = shape.base if isinstance(shape, FreeFit) else shape
-    grid = _over(base, p, count, margin)
+    grid = _over(base, p, count)
     if isinstance(shape, FreeFit):
         added, _ = shape.deviation(grid)
         # Far from all contacts the surface must not pass through the middle of the base.
@@ -69,7 +68,7 @@ def surface_grid(
     return xr.Dataset(data, {"space": list("xyz")}, {"shape": shape.kind})
 
 
-def _over(base: FittedShape, points: Array, count: int, margin: float) -> Array:
+def _over(base: FittedShape, points: Array, count: int) -> Array:
     """Points (count, count, 3) of a simple shape."""
     if isinstance(base, PlaneFit):
         first, second = np.linalg.svd(points - points.mean(axis=0), full_matrices=True)[2][:2]
@@ -77,34 +76,34 @@ def _over(base: FittedShape, points: Array, count: int, margin: float) -> Array:
         first = first / np.linalg.norm(first)
         second = np.cross(base.normal, first)
         away = points - base.origin
-        u, v = (_range(away @ axis, count, margin) for axis in (first, second))
+        u, v = (_range(away @ axis, count) for axis in (first, second))
         return np.asarray(base.origin + u[:, None, None] * first + v[:, None] * second)
     if isinstance(base, CylinderFit):
         across = frame_across(base.axis)
         away = points - base.origin
-        u = _turn(np.arctan2(away @ across[1], away @ across[0]), count, margin)[:, None, None]
-        v = _range(away @ base.axis, count, margin)[:, None]
+        u = _turn(np.arctan2(away @ across[1], away @ across[0]), count)[:, None, None]
+        v = _range(away @ base.axis, count)[:, None]
         round_ = np.cos(u) * across[0] + np.sin(u) * across[1]
         return np.asarray(base.origin + base.radius * round_ + v * base.axis)
     assert isinstance(base, SphereFit)
     normal = base.outward_normals(points)
     pole = np.linalg.svd(normal, full_matrices=True)[2][-1]
     across = frame_across(pole)
-    u = _turn(np.arctan2(normal @ across[1], normal @ across[0]), count, margin)[:, None, None]
+    u = _turn(np.arctan2(normal @ across[1], normal @ across[0]), count)[:, None, None]
     latitude = np.arcsin(np.clip(normal @ pole, -1.0, 1.0))
-    v = np.clip(_range(latitude, count, margin), -0.5 * np.pi, 0.5 * np.pi)[:, None]
+    v = np.clip(_range(latitude, count), -0.5 * np.pi, 0.5 * np.pi)[:, None]
     round_ = np.cos(v) * (np.cos(u) * across[0] + np.sin(u) * across[1]) + np.sin(v) * pole
     return np.asarray(base.origin + base.radius * round_)
 
 
-def _range(values: Array, count: int, margin: float) -> Array:
+def _range(values: Array, count: int) -> Array:
     """Evenly from the least to the largest, and beyond by a margin."""
     low, high = float(values.min()), float(values.max())
-    beyond = margin * (high - low)
+    beyond = _MARGIN * (high - low)
     return np.linspace(low - beyond, high + beyond, count)
 
 
-def _turn(angles: Array, count: int, margin: float) -> Array:
+def _turn(angles: Array, count: int) -> Array:
     """Evenly over the part of the circle that is covered."""
     order = np.sort(angles)
     gaps = np.diff(order, append=order[0] + 2.0 * np.pi)
@@ -113,7 +112,7 @@ def _turn(angles: Array, count: int, margin: float) -> Array:
         return np.linspace(-np.pi, np.pi, count)
     start = order[(widest + 1) % len(order)]
     width = 2.0 * np.pi - gaps[widest]
-    beyond = min(margin * width, 0.5 * gaps[widest])
+    beyond = min(_MARGIN * width, 0.5 * gaps[widest])
     return np.linspace(start - beyond, start + width + beyond, count)
 
 

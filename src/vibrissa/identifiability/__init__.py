@@ -1,8 +1,8 @@
 """Identifiability: which signals locate a contact, critical cones, sensitivity."""
 
-from vibrissa.identifiability.cones import critical_cones
-from vibrissa.identifiability.proofs import (
+from vibrissa.identifiability.cones import (
     cone_bracket as cone_bracket,
+    critical_cones,
     with_proved_witnesses as with_proved_witnesses,
 )
 from vibrissa.identifiability.sensitivity import best_triplet, sensitivity

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from vibrissa.contacts import Domain, deficient, invert
-from vibrissa.identifiability.fibres import fibres
 from vibrissa.identifiability.regions import ContactSet, Samples, contact_set, sample, spread
 from vibrissa.identifiability.summits import farthest_twins
 from vibrissa.identifiability.twins import (
@@ -23,6 +22,7 @@ from vibrissa.identifiability.twins import (
     Search,
     better_twins,
     confirmed,
+    fibres,
     joined,
     signal_columns,
     triplet_derivatives,

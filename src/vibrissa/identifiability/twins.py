@@ -1,10 +1,15 @@
 """Twins: contacts far apart that have the same three signals.
 
 Where the map ξ → T is regular, all contacts with the triplet of a given one are found exactly
-(:mod:`vibrissa.contacts.inversion`); those far from it are its twins. Where it is not, see
-:mod:`vibrissa.identifiability.fibres`. Where the integration errs by more than the signals differ,
-two contacts can agree on the rod as it is discretised and not in truth: a pair counts only if it is
-found again on a finer rod.
+(:mod:`vibrissa.contacts.inversion`); those far from it are its twins.
+
+Where a triplet has lost a dimension, contacts with equal triplets form curves, its *fibres*. A
+straight whisker never twists: M_x = 0 everywhere. In a whisker of one stiffness and one curvature
+the axial force and the bending moment at the base are related, F_x = -M²/2EI for a straight
+cylinder. Fibres are followed along the direction in which the triplet does not change.
+
+Where the integration errs by more than the signals differ, two contacts can agree on the rod as it
+is discretised and not in truth: a pair counts only if it is found again on a finer rod.
 """
 
 from __future__ import annotations
@@ -13,7 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts import Domain, invert, polish
+from vibrissa.contacts import RANK, Domain, invert, polish
 from vibrissa.identifiability.regions import ContactSet, contact_set, in_chart, solved
 from vibrissa.numerics import AnyArray, Array, cross
 from vibrissa.rod import (
@@ -50,6 +55,9 @@ _SAME = 1e-4
 # The search for better twins starts wide, ends where climbs begin, keeps so many of each region.
 _WIDTHS = np.geomspace(0.2, 0.02, 9)
 _KEPT = 16
+# Length of a step along a fibre, in units in which the chart is about one wide; steps each way.
+_STRIDE = 0.02
+_STRIDES = 60
 # Gauss-Newton steps that bring a contact back to given signals, and singular values that count.
 _CORRECTIONS = 5
 _RCOND = 1e-6
@@ -124,13 +132,12 @@ def twins(
     chart: Array,
     first: ContactSet,
     domain: Domain,
-    least: float = _SAME,
 ) -> Pairs:
     """Find all twins of contacts."""
     targets = first.signals[:, signal_columns(names)]
     found = invert(contact_map.chart, contact_map.tree(names), names, targets)
     apart = np.linalg.norm(found.values[:, :, 3:] - first.values[:, None, 3:], axis=2)
-    rows, columns = np.nonzero(apart >= least)  # NaN is not
+    rows, columns = np.nonzero(apart >= _SAME)  # NaN is not
     xi, values = found.contacts[rows, columns], found.values[rows, columns]
     firm = _firm(contact_map, names, xi)
     rows, columns, xi, values = rows[firm], columns[firm], xi[firm], values[firm]
@@ -291,3 +298,51 @@ def confirmed(
     length = contact_map.chart.discretization.length
     angle = cone_angle(contact_map.whisker, points * length).min(axis=1)
     return np.asarray(stays), angle
+
+
+def fibres(
+    contact_map: ContactMap,
+    names: tuple[str, ...],
+    steps: int,
+    chart: Array,
+    first: ContactSet,
+    domain: Domain,
+) -> Pairs:
+    """Follow the curves of equal triplets through contacts where these have lost a dimension."""
+    d = discretize(contact_map.whisker, steps)
+    values, _ = solve_forces(d, with_normal_force(first.xi))
+    first = contact_set(contact_map, first.xi, values, domain)
+    targets = first.signals[:, signal_columns(names)]
+    unit = units(contact_map, first.xi)
+    rows, found = [], []
+    for sense in (1.0, -1.0):
+        running, xi = np.arange(len(chart)), first.xi
+        direction = np.full(xi.shape, np.nan)
+        for _ in range(_STRIDES):
+            _, slope, _ = equations(d, names, xi, targets[running])
+            direction = _along(slope * unit[running, None, :], direction, sense)
+            xi = xi + _STRIDE * direction * unit[running]
+            xi, values, misfit = corrected(d, names, xi, targets[running], unit[running])
+            stays = (misfit <= AGREEMENT) & stable(contact_map, xi)
+            xi, running, direction = xi[stays], running[stays], direction[stays]
+            if not running.size:
+                break
+            rows.append(running)
+            found.append(np.concatenate([xi, values[stays]], axis=1))
+    row = np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
+    both = np.concatenate(found) if found else np.zeros((0, 9))
+    second = contact_set(contact_map, both[:, :3], both[:, 3:], domain)
+    apart = np.linalg.norm(second.values[:, 3:] - first.values[row, 3:], axis=1)
+    return Pairs(chart[row], row, first.rows(row), second, apart)
+
+
+def _along(slope: Array, before: Array, sense: float) -> Array:
+    """Unit vectors (n, 3) in which T does not change, as near to those before as there are."""
+    _, singular, rows = np.linalg.svd(slope)
+    null = singular <= RANK * singular[:, :1]
+    null[:, 2] = True
+    onto = np.einsum("nk,nki,ni->nk", null, rows, before)
+    turned = np.einsum("nk,nki->ni", onto, rows)
+    fresh = np.isnan(before).any(axis=1)
+    turned[fresh] = sense * rows[fresh, 2]
+    return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))

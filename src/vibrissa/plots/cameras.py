@@ -115,11 +115,11 @@ def sight_axes(figure: Figure, box: style.Box, low: Array, high: Array) -> Axes:
     return axes
 
 
-def scale_bar(axes: Axes, course: Course, view: _View, length: float = 5e-3) -> None:
-    """Draw a bar as long as some millimetres below the right end of an image."""
+def scale_bar(axes: Axes, course: Course, view: _View) -> None:
+    """Draw a bar of 5 mm below the right end of an image."""
     base = np.nanmean(course.position, axis=0)
     ends = view.project(base + 0.5e-3 * np.concatenate([np.eye(3), -np.eye(3)]))
-    pixels = 1e3 * length * float(np.linalg.norm(ends[:3] - ends[3:], axis=1).max())
+    pixels = 5.0 * float(np.linalg.norm(ends[:3] - ends[3:], axis=1).max())
     left, right = axes.get_xlim()
     share = pixels / (right - left)
     if not 0.0 < share < 1.0:
@@ -127,7 +127,7 @@ def scale_bar(axes: Axes, course: Course, view: _View, length: float = 5e-3) -> 
     place: dict[str, Any] = {"transform": axes.transAxes, "clip_on": False}
     axes.plot([1.0 - share, 1.0], [-0.035, -0.035], color=style.INK, linewidth=1.2, **place)
     axes.annotate(
-        f"{1e3 * length:g} mm",
+        "5 mm",
         (1.0 - share, -0.035),
         xycoords="axes fraction",
         xytext=(-3.0, 0.0),

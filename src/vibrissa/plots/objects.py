@@ -97,11 +97,11 @@ def _marched(body: Body, points: Array, limits: Array, depth: int, deep: float) 
     return least
 
 
-def room_for(places: Array, bodies: Sequence[Body], least: float = 1.0) -> Array:
-    """Limits that hold most places, and the objects there as far as they end nearby."""
+def room_for(places: Array, bodies: Sequence[Body]) -> Array:
+    """Limits, mm, that hold most places, and the objects there as far as they end nearby."""
     low, high = np.quantile(places, [0.04, 0.96], axis=0)
     half = 0.5 * (high - low)
-    near = np.array([[-1.0], [1.0]]) * (2.0 * half.max() + 3.0 * least)
+    near = np.array([[-1.0], [1.0]]) * (2.0 * half.max() + 3.0)
     lines = 0.5 * (low + high) + near  # lower and upper ends of a cube
     steps = np.linspace(lines[0], lines[1], 25)
     grid = np.stack(np.meshgrid(*steps.T, indexing="ij"), axis=-1)
@@ -114,7 +114,7 @@ def room_for(places: Array, bodies: Sequence[Body], least: float = 1.0) -> Array
                 and inside[:, n].max() < lines[1, n]
             ):
                 low[n], high[n] = min(low[n], inside[:, n].min()), max(high[n], inside[:, n].max())
-    margin = np.maximum(0.15 * (high - low), least)
+    margin = np.maximum(0.15 * (high - low), 1.0)
     return np.stack([low - margin, high + margin], axis=1)
 
 

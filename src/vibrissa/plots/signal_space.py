@@ -47,17 +47,18 @@ def signal_clouds(
     centerline: ArrayLike,
     *,
     width: style.Width = "double",
-    cutaway: bool = True,
     elevation: float = ELEVATION,
     azimuth: float = AZIMUTH,
 ) -> Figure:
     """Draw the space that a whisker can reach, and the six signals over it.
 
     The reachable space is seen from aside and from before the tip, and then once for each signal,
-    which gives the colour: forces above, moments below. Small deflections (2° about rest) are left
-    out as in the paper. Colours of forces and moments go with the square root of the signal; they
-    leave out the outermost 2 % of its values, and the colour bar then has a pointed end. An inset
-    shows where the whisker is pulled (F_x > 0), which only happens if it is curved.
+    which gives the colour: forces above, moments below. The quarter that faces the viewer is taken
+    away along the resting whisker, so that the whisker and what is about it are seen. Small
+    deflections (2° about rest) are left out as in the paper. Colours of forces and moments go with
+    the square root of the signal; they leave out the outermost 2 % of its values, and the colour
+    bar then has a pointed end. An inset shows where the whisker is pulled (F_x > 0), which only
+    happens if it is curved.
 
     Parameters
     ----------
@@ -67,9 +68,6 @@ def signal_clouds(
         Resting whisker from base to tip, whisker frame, m; drawn in black.
     width : {"single", "double"}
         Columns of the page.
-    cutaway : bool
-        Whether the quarter that faces the viewer is taken away, along the resting whisker, so that
-        the whisker and what lies about it are seen.
     elevation, azimuth : float
         Direction of view, degrees.
 
@@ -83,12 +81,10 @@ def signal_clouds(
     ValueError
         If the dataset lacks something, or if there is no such width.
     """
-    nodes = scene.sample_contacts(
-        samples, centerline, _kept(elevation, azimuth) if cutaway else None
-    )
-    whole = nodes if not cutaway else scene.sample_contacts(samples, centerline)
+    nodes = scene.sample_contacts(samples, centerline, _kept(elevation, azimuth))
+    whole = scene.sample_contacts(samples, centerline)
     outside = scene.column("deflection")
-    triangles = scene.solid_surface(nodes, not cutaway, outside)
+    triangles = scene.solid_surface(nodes, False, outside)
     line = to_display("centerline", centerline)
     limits = bounds(np.concatenate([_mm(triangles).reshape(-1, 3), line]))
     view = elevation, azimuth
@@ -114,7 +110,7 @@ def signal_clouds(
                 continue
             _body(axes, body, _mean(name, shown, norm, colours), line)
             _bar(figure, _rail(figure, cell), norm, colours, ends, name)
-        _pulled(figure, sheet.signals[0], nodes, not cutaway, line, view)
+        _pulled(figure, sheet.signals[0], nodes, line, view)
         style.conclude(figure, _finding(whole))
         return figure
 
@@ -218,12 +214,11 @@ def _pulled(
     figure: Figure,
     cell: style.Box,
     nodes: Array,
-    closed: bool,
     line: Array,
     view: tuple[float, float],
 ) -> None:
     """Inset with only the contacts at which the whisker is pulled, with colours of its own."""
-    triangles = scene.solid_surface(nodes, closed, scene.column("deflection"), scene.column("Fx"))
+    triangles = scene.solid_surface(nodes, False, scene.column("deflection"), scene.column("Fx"))
     if not len(triangles):
         return
     left, bottom, width, height = cell

@@ -142,8 +142,8 @@ def _contacts_in_space(
     return _framed(drawn, "laboratory")
 
 
-def reachable_space(samples: xr.Dataset, centerline: Array, colour: str = "MB") -> Any:
-    """Draw all contacts that a whisker can hold.
+def reachable_space(samples: xr.Dataset, centerline: Array) -> Any:
+    """Draw all contacts that a whisker can hold, coloured by the bending moment.
 
     Parameters
     ----------
@@ -151,8 +151,6 @@ def reachable_space(samples: xr.Dataset, centerline: Array, colour: str = "MB") 
         ``ContactMap.to_dataset()``.
     centerline : array (k, 3)
         Resting whisker, m.
-    colour : str
-        The signal that colours them.
 
     Returns
     -------
@@ -160,12 +158,12 @@ def reachable_space(samples: xr.Dataset, centerline: Array, colour: str = "MB") 
         Axes in mm.
     """
     points = 1e3 * samples["contact_point"].transpose(..., "space").values.reshape(-1, 3)
-    values = samples[colour].values.reshape(-1)
+    values = samples["MB"].values.reshape(-1)
     known = np.isfinite(points).all(axis=1) & np.isfinite(values)
     both = np.column_stack([points[known], values[known]])
     # Any even choice will do, but not one that follows the grid.
     both = thinned(np.random.default_rng(0).permutation(both), _MOST_POINTS)
-    drawn = [_points(both[:, :3], colour, both[:, 3], "contacts")]
+    drawn = [_points(both[:, :3], "MB", both[:, 3], "contacts")]
     return _framed([*drawn, *_whiskers(centerline[None], "resting whisker")], "whisker")
 
 

@@ -144,6 +144,7 @@ class AssumptionOptions:
     region: str | None = None
     least_force: float | None = None
     greatest_force: float | None = None
+    tip: float = 0.0
 
     @property
     def errors(self) -> dict[str, float]:
@@ -154,7 +155,8 @@ class AssumptionOptions:
     @property
     def prior(self) -> vb.Prior | None:
         """The contacts that are possible; None: all."""
-        if self.region is None and self.least_force is None and self.greatest_force is None:
+        stated = (self.region, self.least_force, self.greatest_force, self.tip or None)
+        if all(value is None for value in stated):
             return None
         least = 0.0 if self.least_force is None else 1e-6 * self.least_force
         greatest = math.inf if self.greatest_force is None else 1e-6 * self.greatest_force
@@ -164,7 +166,8 @@ class AssumptionOptions:
                 f"{1e6 * greatest:g} µN"
             )
         region = self.region or "all"
-        return vb.Prior(_limits(region) if "=" in region else region, least, greatest)
+        limits = _limits(region) if "=" in region else region
+        return vb.Prior(limits, least, greatest, 0.01 * self.tip)
 
     def described(self) -> str:
         """State all of it, to be put at the end of a sentence; empty where there is nothing."""
@@ -181,6 +184,8 @@ class AssumptionOptions:
             possible.append(f"of at least {self.least_force:g} µN")
         if self.greatest_force is not None:
             possible.append(f"of at most {self.greatest_force:g} µN")
+        if self.tip:
+            parts.append(f"the tip touched with a probability of {self.tip:g} %")
         if possible:
             parts.append(f"contacts only {' and '.join(possible)}")
         return "".join(f"; {part}" for part in parts)

@@ -17,6 +17,7 @@ from vibrissa.status import Status, counted, describe, flag_attributes
 
 #: At most so many candidates are kept for one measurement.
 MOST_CANDIDATES = 8
+_CERTAIN = (Status.UNIQUE, Status.TIP_CONTACT)
 _SPACE = ["x", "y", "z"]
 
 
@@ -190,6 +191,7 @@ class Contacts(_Located):
         larger than in one measurement of a thousand; the contact nearest is given);
         ``OUTSIDE_MAP`` where one nearer to the base would, or where signals are ten times larger
         than any on the map; ``OUTSIDE_PRIOR`` where the prior allows none of the candidates;
+        ``TIP_CONTACT`` as ``UNIQUE``, of a contact of the tip that the prior allows for;
         ``DEGENERATE`` where forces and moments are zero, where the signals do not determine
         contacts (:meth:`ContactMap.determines`), or where with this noise the contact may be
         anywhere; ``MISSING``. Of the wrench also ``NOT_ONE_CONTACT`` where χ² is too large,
@@ -370,7 +372,7 @@ def contacts_of(
     return Contacts(
         point=every.point[..., 0, :],
         covariance=every.covariance[..., 0, :, :],
-        covariance_valid=every.covariance_valid[first] & (whole(status) == Status.UNIQUE),
+        covariance_valid=every.covariance_valid[first] & np.isin(whole(status), _CERTAIN),
         chi_squared=whole(chi_squared),
         probability=every.probability[first],
         status=whole(status),
@@ -528,7 +530,7 @@ def contact_of(
     return Contact(
         points[first],
         covariances[first] if covariance is None else covariance,
-        bool(valid[first]) and status == Status.UNIQUE,
+        bool(valid[first]) and status in _CERTAIN,
         chi_squared,
         float(chances[first]),
         status,

@@ -20,7 +20,7 @@ from vibrissa.contacts.forward import Gravity
 from vibrissa.contacts.joint_estimate import JointEstimate
 from vibrissa.contacts.joint_fit import JointFit, soft_base
 from vibrissa.contacts.noise import by_stiffness, common_errors, sensor_noise
-from vibrissa.contacts.prior import Prior, among_allowed, possible_candidates
+from vibrissa.contacts.prior import Prior, among_allowed, possible_candidates, refuse_tip
 from vibrissa.contacts.readout import ByName, Measurement, Mixed, Named, readout_of
 from vibrissa.contacts.search import LARGEST, STATUSES, UNKNOWNS, Search
 from vibrissa.numerics import Array
@@ -116,6 +116,7 @@ class Estimator:
             return
         if self._search is None or not isinstance(self.readout, Named):
             raise ValueError(f"{', '.join(stated)} are for three signals or more")
+        refuse_tip(self.prior, f"of {', '.join(stated)} one is stated")
         contact_map, sensor = self.contact_map, self.readout.sensor
         if gravity is None and not friction:
             rod = contact_map.whisker, contact_map.steps
@@ -211,6 +212,7 @@ class Estimator:
         self._search = Search(contact_map, self.readout) if rank >= UNKNOWNS else None
         self._ambiguity = None
         if rank < UNKNOWNS:
+            refuse_tip(prior, f"{rank} do not determine a contact")
             self._ambiguity = Ambiguity(contact_map.chart, self.readout)
         self._last: Array | None = None
 

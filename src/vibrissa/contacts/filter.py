@@ -27,7 +27,7 @@ from vibrissa.contacts.estimator import Estimator
 from vibrissa.contacts.mixture import Mixture, learn, predict, room, tidy, unaccounted
 from vibrissa.contacts.noise import explained
 from vibrissa.contacts.onset import Beginning, Gaussians
-from vibrissa.contacts.prior import Prior
+from vibrissa.contacts.prior import Prior, refuse_tip
 from vibrissa.contacts.readout import Measurement
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.sensors import GRAVITY
@@ -175,6 +175,7 @@ class ContactFilter:
             raise ValueError(
                 "a filter takes no estimator with friction, compliance_sigma, or uncertain gravity"
             )
+        refuse_tip(estimator.prior, "a filter takes contacts of the side")
         if not estimator.noisy:
             raise ValueError(
                 "a filter weighs what it knows against the noise: give its estimator's"

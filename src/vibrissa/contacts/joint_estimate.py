@@ -25,7 +25,7 @@ from vibrissa.contacts.joint_fit import JointFit, check_compliance
 from vibrissa.contacts.least_squares import Fits
 from vibrissa.contacts.noise import Noise, SensorNoise, explained, sensor_noise
 from vibrissa.contacts.posterior import CERTAIN, ranked
-from vibrissa.contacts.prior import Prior, possible_candidates
+from vibrissa.contacts.prior import Prior, possible_candidates, refuse_tip
 from vibrissa.contacts.readout import check_signals
 from vibrissa.contacts.search import estimate
 from vibrissa.contacts.wrench import PROXIMAL, chosen, estimate_components, friction_angle
@@ -66,6 +66,7 @@ class JointEstimate:
         compliance_sigma: float = 0.0,
         stiffness_sigma: float = 0.0,
     ) -> None:
+        refuse_tip(prior, "friction, weight or an uncertain base is stated")
         if sensor is None and gravity is not None and gravity.uncertain:
             raise ValueError(
                 "the uncertainty of the weight adds to that of a sensor: give its noise"

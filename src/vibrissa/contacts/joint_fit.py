@@ -195,7 +195,7 @@ class JointFit:
         bent = bent_r[..., each, each]
         level = (by_r**2).sum(axis=1) + np.einsum("nm,nmi->ni", joint.residuals, bent)
         level = np.maximum(level, np.linalg.norm(bent, axis=1))
-        node = _cloud(each.size)
+        node = normal_cloud(each.size)
         u = node * np.where(level > _SHARP, np.maximum(level, _SHARP) ** -0.5, 1.0)[:, None]
         pairs = (0.5 * u[..., :, None] * u[..., None, :]).reshape(*u.shape[:2], -1)
 
@@ -287,7 +287,7 @@ class JointFit:
         return out, np.where(better, known, status), first.copy()
 
 
-def _cloud(dimension: int) -> Array:
+def normal_cloud(dimension: int) -> Array:
     """Points (n, dimension), symmetric, with the covariance of a normal distribution."""
     half = np.random.default_rng(0).standard_normal((_CLOUD // 2, dimension))
     points = np.concatenate([half, -half])

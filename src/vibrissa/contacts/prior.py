@@ -17,6 +17,7 @@ from vibrissa.contacts.contacts import Candidates, spherical
 from vibrissa.contacts.posterior import CERTAIN
 from vibrissa.contacts.ranking import chi_squared_of
 from vibrissa.contacts.readout import Mixed, Named
+from vibrissa.contacts.tip import tip_contacts
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod import Discretization, contact_tangents, discretize
 from vibrissa.signals import REGIONS, concave_backward, in_region
@@ -43,6 +44,10 @@ class Prior:
         is above the greatest goes through ±π.
     least_force, greatest_force : float
         Size of the contact force, N.
+    tip : float
+        Probability beforehand that an object touches the very tip, so that the force is normal to
+        the object and not to the whisker; 0, the default: contacts of the side only. It is for
+        three signals or more with noise; the wrench shows such contacts by itself.
 
     Raises
     ------
@@ -60,6 +65,7 @@ class Prior:
     region: str | Mapping[str, tuple[float, float]] = field(default="all", hash=False)
     least_force: float = 0.0
     greatest_force: float = np.inf
+    tip: float = 0.0
 
     def __post_init__(self) -> None:
         """Check it."""
@@ -68,6 +74,8 @@ class Prior:
                 "a contact force has 0 ≤ least < greatest, N; got "
                 f"{self.least_force!r} and {self.greatest_force!r}"
             )
+        if not 0.0 <= self.tip < 1.0:
+            raise ValueError(f"tip is a probability below 1; got {self.tip!r}")
         if isinstance(self.region, str):
             if self.region not in REGIONS:
                 raise ValueError(f"a region is one of {', '.join(REGIONS)}; got {self.region!r}")
@@ -137,6 +145,15 @@ def possible_candidates(
     return allowed
 
 
+def refuse_tip(prior: Prior | None, what: str) -> None:
+    """Refuse contacts of the tip in addition where they cannot be compared with those found."""
+    if prior is not None and prior.tip > 0.0:
+        raise ValueError(
+            f"contacts of the tip (tip = {prior.tip:g}) are compared with those of three signals "
+            f"or more without friction, weight or a filter; {what}"
+        )
+
+
 def _between(name: str, value: Array, least: float, greatest: float) -> AnyArray:
     if name != "theta" or greatest - least >= _TURN:
         return np.asarray((value >= least) & (value <= greatest))
@@ -152,10 +169,13 @@ def among_allowed(
     status: IntArray,
     chi_squared: Array,
 ) -> tuple[Candidates, IntArray, Array]:
-    """Leave out candidates that a prior does not allow.
+    """Add contacts of the tip, and leave out candidates that a prior does not allow.
 
     ``measured`` has the measurements (n, k) and the channels that they should be.
     """
+    if prior.tip:
+        tips = tip_contacts(contact_map, readout, prior.tip)
+        found, status, chi_squared = tips.allow(measured, found, status, chi_squared)
     allowed = possible_candidates(
         prior, contact_map.whisker, contact_map.chart.discretization, found
     )

@@ -28,7 +28,7 @@ from vibrissa.contacts.contacts import Candidates, Contacts, contacts_of
 from vibrissa.contacts.inversion import polish
 from vibrissa.contacts.joint_fit import soft_base
 from vibrissa.contacts.noise import explained, sensor_noise
-from vibrissa.contacts.prior import Prior, among_allowed
+from vibrissa.contacts.prior import Prior, among_allowed, refuse_tip
 from vibrissa.contacts.ranking import estimate_rows
 from vibrissa.contacts.readout import (
     Bounds,
@@ -217,6 +217,8 @@ def estimate(
             found, status, chi_squared = among_allowed(
                 prior, contact_map, readout, (flat, targets), found, status, chi_squared
             )
+        if compliance_sigma:
+            refuse_tip(prior, "an uncertain base is stated")
         rod = contact_map.whisker, contact_map.steps
         base = soft_base(*rod, readout.channels, sensor, compliance_sigma)
         if base is not None:

@@ -37,7 +37,7 @@ from vibrissa.contacts.noise import (
     whitening,
 )
 from vibrissa.contacts.posterior import CERTAIN, ranked
-from vibrissa.contacts.prior import Prior, possible_candidates
+from vibrissa.contacts.prior import Prior, possible_candidates, refuse_tip
 from vibrissa.contacts.valleys import Valleys, valleys
 from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray
@@ -209,6 +209,7 @@ def _located(
     steps: int,
     compliance_sigma: float,
 ) -> Contacts:
+    refuse_tip(prior, "the wrench shows forces of any direction at the tip by itself")
     sensor = sensor_noise(noise, WRENCH, errors)
     channels = Channels(WRENCH, WRENCH)
     base = soft_base(whisker, steps, channels, sensor, compliance_sigma, friction=True)

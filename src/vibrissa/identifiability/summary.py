@@ -144,14 +144,16 @@ def _certificate_note(verdicts: xr.Dataset) -> list[str]:
     if "determinant_cone" not in verdicts.attrs:
         return []
     angle, cone = (np.rad2deg(verdicts.attrs[name]) for name in ("determinant_cone", "cone"))
-    signs = f"(Fx, MB, MD): signs that a proof outside {cone:.3g}° needs are"
+    signs = f"(Fx, MB, MD): on a grid, the signs that a proof outside {cone:.3g}° needs are"
     if verdicts.attrs["certificate_possible"]:
-        keeps = f"; the determinant keeps its outside {angle:.2f}°" if 0.0 < angle < np.inf else ""
-        return [f"{signs} right on a grid{keeps}."]
-    where = "none of this kind can exist"
+        keeps = (
+            f"; the determinant keeps its sign outside {angle:.2f}°" if 0.0 < angle < np.inf else ""
+        )
+        return [f"{signs} right{keeps}."]
+    where = "no proof of this kind can exist"
     if 0.0 < angle < np.inf:
-        where = f"one can exist outside {max(angle, cone):.2f}° at best"
-    return [f"{signs} wrong on a grid; {where}."]
+        where = f"a proof is possible outside {max(angle, cone):.2f}° at best"
+    return [f"{signs} wrong; {where}."]
 
 
 def _surface(verdicts: xr.Dataset) -> str:

@@ -68,8 +68,8 @@ class _Faults:
 
 def _check(thing: Any, faults: _Faults, **values: Any) -> None:
     """Set the fields of a solid, checked: those that all have alike, and other values."""
-    for name in vars(thing).keys() - values.keys():
-        given = getattr(thing, name)
+    # In the order of the fields, which a set would lose: a message is the same every time.
+    for name, given in [(n, g) for n, g in vars(thing).items() if n not in values]:
         if name == "stiffness":
             values[name] = faults.positive(name, given, "N/m", "infinite")
         elif name == "radius":

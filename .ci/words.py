@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 INSTEAD = {
-    r"felt|feels": "measured, detected; has the signals",
+    r"felt|feels?": "measured, detected; has the signals",
     r"tells|told|said|says": "states, reports, shows",
     r"beside": "next to, compared with, in addition to",
     r"parted by": "separated by",

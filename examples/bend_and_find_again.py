@@ -1,8 +1,8 @@
-"""Bend one whisker, feel it at the base, and find the contact again from three signals.
+"""Bend one whisker, measure at its base, and find the contact again from three signals.
 
 Aim: the whole idea in one screen. Data: the built-in γ whisker. Lesson: force and moment at the
-base tell where a frictionless whisker is touched; near rest a small error of the signals is a large
-error of the place, and several contacts may feel the same.
+base determine where a frictionless whisker is touched; near rest a small error of the signals is a
+large error of the position, and several contacts may have the same signals.
 """
 
 # %% A whisker: 40 mm long, tapered, curved, its tip bent out of the plane

@@ -1,8 +1,8 @@
-"""Friction, and what all six components of force and moment know about it.
+"""Friction, which all six components of force and moment reveal.
 
 Aim: to find contacts of a whisker that rubs. Data: the built-in γ whisker, touched at the same
-place with and without friction along it. Lesson: three signals, read as if there were no friction,
-put the contact millimetres off; force and moment whole place it right, and tell the friction.
+point with and without friction along it. Lesson: three signals, used as if there were no friction,
+have errors of millimetres; force and moment together give the right point, and the friction.
 """
 
 # %% The same touch with a force that leans toward the tip, or toward the base, by 0.3 of itself
@@ -32,7 +32,7 @@ read_force, read_moment = (
     for true, s in zip((bent.force, bent.moment), sigma, strict=True)
 )
 
-# %% Three signals that know of no friction, and the wrench
+# %% Three signals without friction, and the wrench
 contact_map = vb.ContactMap.simulate(whisker, grid=False)
 signals = vb.base_signals(read_force, read_moment)
 three = contact_map.estimate(signals, ("Fx", "MB", "MD"))

@@ -82,7 +82,7 @@ except ValueError as refusal:
 # %% How stiff is it really? A wire from a reel, 6 % softer than tabulated
 soft = wire.with_properties(youngs_modulus=0.94 * wire.youngs_modulus)
 bent = vb.deflect(soft, vb.PointContact(touched.contact_point))
-weighed = Sensor(("Fy", "Fz"), noise=0.5e-3)  # by a scale, which knows newtons
+weighed = Sensor(("Fy", "Fz"), noise=0.5e-3)  # by a scale, in newtons
 found = fit_stiffness(
     wire,
     touched.contact_point,

@@ -35,7 +35,7 @@ found = locate(contact_map, wrench, ("Fx", "MB", "MD"), noise=component_noise(1e
 save_contacts(folder / "contacts.csv", contact_columns(found))
 # The same on the command line: vibrissa estimate signals.csv --whisker whisker.csv -o contacts.csv
 
-# %% How far from the truth, which only a simulation knows
+# %% How far from the truth, which only a simulation shows
 truth = trial["truth"].to_dataset()
 true, guess = truth["contact_point_whisker"].values, found["contact_point_whisker"].values
 error = np.linalg.norm(guess - true, axis=1)

@@ -1,7 +1,8 @@
 """Which three signals locate a contact, for this whisker?
 
 Aim: to choose what to measure. Data: the built-in γ whisker and three of the 20 triplets. Lesson:
-most triplets leave pairs of contacts that feel the same; for this whisker (F_x, M_B, M_D) does not.
+most triplets leave pairs of contacts with the same signals; for this whisker (F_x, M_B, M_D) leaves
+none.
 """
 
 # %% Verdicts on three triplets; "all" 20 take about a minute
@@ -24,7 +25,7 @@ print(verdict_table(verdicts))
 for triplet in triplets:
     one = verdicts.sel(triplet=triplet, region="all")
     if one.verdict == "unique":
-        print(f"{triplet}: no two contacts feel the same")
+        print(f"{triplet}: no two contacts have the same signals")
     else:
         print(
             f"{triplet}: contacts {1e3 * one.witness_separation.max():.1f} mm apart share it",

@@ -1,8 +1,8 @@
-"""A witness: two contacts that a whisker cannot tell apart.
+"""A witness: two contacts that three signals cannot distinguish.
 
 Aim: to see what "not unique" means. Data: a whisker that is curved as strongly as a rat's C2,
 y = A x² with A·L = 0.82. Lesson: also (F_x, M_B, M_D), which is unique for less curved whiskers,
-has pairs of contacts a third of the whisker apart that feel the same.
+has pairs of contacts with the same signals, a third of the whisker apart.
 """
 
 # %% A strongly curved whisker, and the search for such pairs

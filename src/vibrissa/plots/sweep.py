@@ -90,8 +90,9 @@ def _verdicts(
         held = (verdict.values == VERDICTS[0]).all(axis=0)
         least = triplet_label(names[int(np.argmin(np.nan_to_num(degrees, nan=90.0).max(axis=0)))])
         shown = ", ".join(f"({triplet_label(names[i])})" for i in np.flatnonzero(held))
-        shown = shown or f"none; ({least}) has the smallest critical cones"
-        style.conclude(figure, f"Unique for each of {len(degrees)} whiskers: {shown}")
+        among = f"on all {len(degrees)} whiskers"
+        finding = f"No triplet is unique {among}; ({least}) has the smallest critical cones"
+        style.conclude(figure, f"Unique {among}: {shown}" if shown else finding)
         return figure
     groups = found["group"].values.astype(str)
     rows = list(dict.fromkeys(groups))

@@ -93,8 +93,8 @@ def verdict_table(verdicts: xr.Dataset, *, width: style.Width = "double") -> Fig
             shown = ", ".join(f"({name})" for name in found) or "none"
             style.conclude(
                 figure,
-                f"{len(found)} of {len(triplets)} triplets locate every contact, as far as was "
-                f"searched: {shown}",
+                f"Triplets that locate every contact, as far as was searched: {shown} "
+                f"({len(found)} of {len(triplets)})",
             )
         return figure
 

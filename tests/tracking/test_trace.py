@@ -203,6 +203,17 @@ def test_a_still_wire_before_the_face_draws_no_trace_away():
         assert last > 80.0
 
 
+@pytest.mark.parametrize("turn", [0.01, 0.03])
+def test_a_wide_whisker_that_hardly_moves_is_not_divided_out(turn):
+    """What it leaves of itself in the background had drawn traces aside by 0.5 to 0.9 pixels."""
+    angles = turn * np.sin(np.arange(20.0))
+    wide = {"wide": 3.0, "length": 230.0, "size": 320}
+    frames = [tapered(angle, seed=i, **wide) for i, angle in enumerate(angles)]
+    (row,) = trace_video(frames, [(60.0, 100.0)])
+    for trace, angle in zip(row, angles, strict=True):
+        assert shown_along(trace, angle)[0] < 0.25
+
+
 def test_a_whisker_that_rests_is_not_divided_out():
     frames = [tapered(0.1, seed=i) for i in range(20)]
     (row,) = trace_video(frames, [(60.0, 100.0)])

@@ -173,17 +173,21 @@ class Fitter:
 
     def costs(self) -> Callable[[Whisker, BasePose], float]:
         """Give the function that compares whiskers by how well they explain the traces."""
-        variance: Array | None = None
+        before: tuple[Problem, State] | None = None
 
         def cost(whisker: Whisker, pose: BasePose) -> float:
-            nonlocal variance
+            nonlocal before
             problem = self._problem(whisker, pose)
-            if variance is None:
+            if before is None:
                 # The first decides how far the traces are to be trusted.
-                trusted, _, linear = problem.trusted()
-                variance = trusted.variance
-                return linear.cost
-            return replace(problem, variance=variance).solved()[1].cost
+                problem, state, linear = problem.trusted()
+            else:
+                other, state = before
+                begun = state.scaled(other.d.length / problem.d.length)
+                problem = replace(problem, variance=other.variance, begun=begun)
+                state, linear = problem.solved()
+            before = problem, state
+            return linear.cost
 
         return cost
 
@@ -197,7 +201,7 @@ class Fitter:
             pose.rotation[frames], pose.position[frames] / d.length, np.zeros((len(frames), 4))
         )
         start.contact[:, 0] = _REST[0]
-        start.contact[touching] = first_contacts(d, start, self.curves[frames], touching)[0]
+        start.contact[touching] = first_contacts(d, start, self.curves[frames], touching)
         return Problem(
             whisker,
             d,

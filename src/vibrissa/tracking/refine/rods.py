@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from vibrissa.numerics import Array, Mask
@@ -26,6 +27,11 @@ _SAMPLES = 48
 
 _STARTS = np.array([0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])
 """Arc lengths of contacts from which the fit may start, in units of L."""
+
+_UNLIKE, _SLIDES, _WORST = 4.0, 0.05, 1e6
+"""Weight of distances from the curves, in units of the usual one, as neighbours have errors in
+common; how far contacts usually slide from frame to frame, in units of L; and the distance of a rod
+that is not in balance."""
 
 _LIMITS = (0.1, 0.995)
 """Smallest and largest arc length of a contact, in units of L."""
@@ -51,6 +57,11 @@ class State:
         contact = self.contact + step[:, 6:]
         contact[:, 0] = np.clip(contact[:, 0], *_LIMITS)
         return State(turn @ self.rotation, self.position + step[:, :3], contact)
+
+    def scaled(self, ratio: float) -> State:
+        """The same in units of another length, the former over which is the ratio."""
+        contact = self.contact * [ratio, *[ratio**-2] * 3]
+        return State(self.rotation, ratio * self.position, contact)
 
 
 def bent(d: Discretization, state: State, touching: Mask) -> tuple[Array, Array]:
@@ -103,13 +114,34 @@ def contact_slopes(d: Discretization, state: State) -> tuple[Array, Array, Array
     return turned, both, slope
 
 
-def first_contacts(
-    d: Discretization, state: State, curves: Array, touching: Mask
+def first_contacts(d: Discretization, state: State, curves: Array, touching: Mask) -> Array:
+    """Contacts (n, 4) of the touching frames that make the rod look most like the curves.
+
+    A light contact looks the same at many places: of all ways along the whisker that contacts may
+    go from frame to frame, the likeliest is taken.
+    """
+    contacts, costs = _contacts_at(d, state, curves, np.flatnonzero(touching))
+    if not costs.size:
+        return np.empty((0, 4))
+    unlike = _UNLIKE * costs / np.median(costs.min(axis=0))
+    apart = 0.5 * ((_STARTS[:, None] - _STARTS) / _SLIDES) ** 2
+    total, before = unlike[:, 0], []
+    for after in unlike.T[1:]:
+        ways = total[:, None] + apart
+        before.append(ways.argmin(axis=0))
+        total = ways.min(axis=0) + after
+    way = [int(total.argmin())]
+    for back in reversed(before):
+        way.append(int(back[way[-1]]))
+    return np.asarray(contacts[way[::-1], np.arange(len(way))])
+
+
+def _contacts_at(
+    d: Discretization, state: State, curves: Array, rows: NDArray[np.intp]
 ) -> tuple[Array, Array]:
-    """Contacts (n, 4) of the touching frames that make the rod look most like the curves."""
-    rows = np.flatnonzero(touching)
+    """Best contacts (place, n, 4) of some frames at each start, and distances (place, n)."""
     if not rows.size:
-        return np.empty((0, 4)), np.empty(0)
+        return np.empty((len(_STARTS), 0, 4)), np.empty((len(_STARTS), 0))
     s = np.linspace(0.0, 0.95, 25)
     cut = [interpolated(s * d.length, arc_lengths(curve), curve, np.nan) for curve in curves[rows]]
     target = np.stack(cut) / d.length
@@ -117,7 +149,7 @@ def first_contacts(
     wanted = np.einsum("tji,tnj->tni", state.rotation[rows], away).reshape(len(rows), -1)
     known = np.isfinite(wanted)
     wanted = np.where(known, wanted, 0.0)
-    best, least = np.zeros((len(rows), 4)), np.full(len(rows), np.inf)
+    contacts, costs = [], []
     for place in _STARTS:
         contact = np.zeros((len(rows), 4))
         contact[:, 0] = place
@@ -136,10 +168,9 @@ def first_contacts(
             limit = 2.0 / place**2
             contact[:, 2:] += step * np.minimum(1.0, limit / np.maximum(size, 1e-12))
         missed = rods(d, contact, s).reshape(len(rows), -1) * known - wanted
-        cost = (missed**2).sum(axis=1)
-        better = cost < least
-        best[better], least[better] = contact[better], cost[better]
-    return best, least
+        contacts.append(contact)
+        costs.append((missed**2).sum(axis=1))
+    return np.stack(contacts), np.nan_to_num(np.stack(costs), nan=_WORST)
 
 
 def rolled(pose: BasePose, curves: Array, whisker: Whisker) -> BasePose:
@@ -151,8 +182,8 @@ def rolled(pose: BasePose, curves: Array, whisker: Whisker) -> BasePose:
     def cost(roll: float) -> float:
         turned = replace(pose, roll=np.full(len(pose.azimuth), roll)).rotation[frames]
         state = State(turned, pose.position[frames] / d.length, np.zeros((len(frames), 4)))
-        all_ = np.ones(len(frames), dtype=bool)
-        return float(first_contacts(d, state, curves[frames], all_)[1].sum())
+        costs = _contacts_at(d, state, curves[frames], np.arange(len(frames)))[1]
+        return float(costs.min(axis=0).sum())
 
     best, step = 0.0, 2.0 * np.pi / _TURNS
     tries = best + step * np.arange(_TURNS)

@@ -83,6 +83,9 @@ _CERTAIN = 0.025
 """Smallest standard deviation of a length that bending shows, as a share: errors of traces, and of
 the taper, that all frames share."""
 
+_HARDLY = 9.0
+"""Difference of costs up to which a length is hardly less likely: three standard deviations."""
+
 _ENDED = 0.7
 """Standard deviation of a seen length by where its tip is seen, pixels."""
 
@@ -417,9 +420,10 @@ def likeliest_length(seen: float, cost: Callable[[float], float]) -> Length:
         lengths.insert(1, (1.0 + 0.5 * _STEP) * seen)
         costs.insert(1, cost(lengths[1]))
         k = int(np.argmin(costs[:2]))
-    first = max(k - 1, 0)
-    # A parabola about the lowest of three.
-    a, b, _ = np.polyfit(lengths[first : first + 3], costs[first : first + 3], 2)
+    # A parabola through the lowest, its neighbours, and what is hardly worse.
+    near = np.array(costs) < costs[k] + _HARDLY
+    near[max(k - 1, 0) : max(k - 1, 0) + 3] = True
+    a, b, _ = np.polyfit(np.array(lengths)[near], np.array(costs)[near], 2)
     if not a > 0.0:
         # It rises, though not as a parabola: one from here to the next.
         a = (costs[k + 1] - costs[k]) / (lengths[k + 1] - lengths[k]) ** 2

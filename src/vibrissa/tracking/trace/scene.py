@@ -70,12 +70,21 @@ _LONG, _THICK = 60, 5
 _BLUR, _AROUND = 3, 12.0
 """How far an edge is blurred, and the smoothing of the light around still things, pixels."""
 
+_SWEPT, _MOSTLY = 2.5, 0.5
+"""Darkening from the background to the usual value from which a whisker passes there, standard
+deviations of the noise (one of them is the background's own rank), and the share of a line along
+which one does from which it is nothing else."""
+
 _ENOUGH = 0.02
 """Share of open ground around a pixel from which its light is known."""
 
 _OPAQUE, _SEEN = 0.5, 1
 """Share of the light below which nothing is seen before a still thing, and how far from there a
 whisker's middle must be, pixels."""
+
+_CLEAR, _SOFTEST = 0.97, 6
+"""Share of the light from which the blurred edge of a still thing does not disturb, and the width
+of the most blurred one, pixels."""
 
 _AT_BASE, _CLOSE = 25.0, 6.0
 """Distance from a base within which a still thing is taken to be the face, and within which a still
@@ -210,8 +219,8 @@ class Scene:
         """Give a frame without what never moves, where that is known."""
         return frame if self.still is None else self.still.removed(frame, self.gain(frame))
 
-    def with_still(self, bases: Array) -> Scene:
-        """Find what never moves, if it is known, but for what whiskers begin at (n, 2)."""
+    def with_still(self, bases: Array, frames: Sequence[Frame]) -> Scene:
+        """Find what never moves in these frames, but for what whiskers begin at (n, 2)."""
         from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter, label
 
         if self.background is None or self.count < _MANY:
@@ -225,10 +234,12 @@ class Scene:
         known = np.where(stands, 0.0, 1.0).astype(np.float32)
         weight, light = (gaussian_filter(one, _AROUND) for one in (known, known * shown))
         open_ = np.where(weight > _ENOUGH, light / np.maximum(weight, 1e-6), ground)
-        parts, _ = label(stands)
         thick = binary_erosion(stands, iterations=_BLUR + _THICK)
         wide = binary_dilation(thick, iterations=_BLUR + _THICK + _RIM)
         bodies, lines = label(wide & stands)[0], label(stands & ~wide)[0]
+        swept = self._swept(frames, lines)
+        stands, lines = stands & ~swept, np.where(swept, 0, lines)
+        parts, _ = label(stands)
         across = np.isin(lines, _long(lines))
         # The face moves, with whatever hangs on it, but not a line that only passes the base, nor
         # what a base far inside a body is before.
@@ -250,12 +261,36 @@ class Scene:
         at = np.flatnonzero(stands)
         factor = (open_ / shown).ravel()[at]
         dark = stands & (shown < _OPAQUE * open_) & ~lifted
-        bits = STILL * binary_dilation(dark, iterations=_SEEN).astype(np.uint32)
+        # Where the blurred edge of what hides it lies on a whisker, its farther part shows.
+        edge = stands & (shown < _CLEAR * open_) & ~lifted
+        rim = binary_dilation(dark, iterations=_SOFTEST, mask=edge)
+        hidden = binary_dilation(dark, iterations=_SEEN) | rim
+        bits = STILL * hidden.astype(np.uint32)
         bits |= EDGE * stands.astype(np.uint32)
         return replace(
             self,
             still=Still(at, factor, open_.ravel()[at], dark.ravel()[at], bool(lifted.any()), bits),
         )
+
+    def _swept(self, frames: Sequence[Frame], lines: NDArray[Any]) -> NDArray[np.bool_]:
+        """Pixels of lines that are nothing but where a whisker moves by less than its width.
+
+        It leaves a part of its darkness in the background, but usually is darker than that.
+        """
+        from scipy.ndimage import binary_dilation
+
+        assert self.background is not None
+        where = lines > 0
+        if not where.any():
+            return where
+        grey = np.stack([frame[where] / np.float32(self.gain(frame)) for frame in frames])
+        noise = float(np.median([noise_level(frame) for frame in frames[:_FEWEST]]))
+        darker_ = np.zeros_like(where)
+        darker_[where] = self.background[where] - np.median(grey, axis=0) > _SWEPT * noise
+        there = binary_dilation(darker_, iterations=_BLUR)
+        size = np.bincount(lines[where])
+        share = np.bincount(lines[where], there[where]) / np.maximum(size, 1)
+        return np.asarray(where & (share[lines] > _MOSTLY))
 
     def moved(self, frame: Frame, points: Array, gain: float) -> float:
         """Share of dark points of a frame, of known brightness, that are usually not dark."""
@@ -298,7 +333,7 @@ def _long(labels: Any) -> list[int]:
     from scipy.ndimage import find_objects
 
     boxes = enumerate(find_objects(labels), 1)
-    return [k for k, box in boxes if max(side.stop - side.start for side in box) >= _LONG]
+    return [k for k, box in boxes if box and max(side.stop - side.start for side in box) >= _LONG]
 
 
 def _begins(away: Array) -> bool:

@@ -119,7 +119,7 @@ def trace_video(
     begins = [follower.base for follower in followers] if bases is None else bases
     starts = np.array(begins, dtype=np.float64)
     alike = [negative(f) if bright else f for f in sample if f.shape == shape]
-    scene = Scene.of(alike, options.scale, mask).with_still(starts)
+    scene = Scene.of(alike, options.scale, mask).with_still(starts, alike)
     (still,) = between_whiskers([None], scene.bits, start.shape)
     for follower in followers:
         follower.clutter = still.still_only

@@ -251,30 +251,31 @@ def test_boxes_cover_or_leave_a_hole():
 
 
 def signals(whisker, s, force):
-    """(M_y, M_z, F_x) by the rod's equations in SciPy's hands, contact to base."""
+    """(M_y, M_z, F_x), (3, k), by the rod's equations in SciPy's hands, contacts (k,) to base."""
     length, radius = whisker.length, whisker.base_radius
-    poisson = whisker.poisson_ratio
+    softness = np.array([[1.0 + whisker.poisson_ratio], [1.0], [1.0]])
 
     def rate(t, state):
-        at = (s - t) * length
-        n, q = state[:3], state[3:]
-        compliance = (float(whisker.section_radius(at)) / radius) ** -4
-        stretch = compliance * np.array([1.0 + poisson, 1.0, 1.0])
-        u = whisker.intrinsic_curvature(at) * length + stretch * np.cross(q, n)
-        return np.concatenate([-np.cross(n, u), -np.cross(q, u) + [1.0, 0.0, 0.0]])
+        at = s * (1.0 - t) * length
+        n, q = state.reshape(2, 3, -1)
+        stretch = softness * (whisker.section_radius(at) / radius) ** -4
+        u = whisker.intrinsic_curvature(at).T * length + stretch * np.cross(q, n, axis=0)
+        turned = [-np.cross(n, u, axis=0), np.eye(3)[:, :1] - np.cross(q, u, axis=0)]
+        return (s * np.stack(turned)).ravel()
 
-    start = np.concatenate([[0.0], force, np.zeros(3)])
-    end = solve_ivp(rate, (0.0, s), start, "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
-    moment = np.cross(end[3:], end[:3])
-    return np.array([moment[1], moment[2], end[0]])
+    start = np.concatenate([np.zeros((1, len(s))), force, np.zeros((3, len(s)))])
+    end = solve_ivp(rate, (0.0, 1.0), start.ravel(), "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    n, q = end.reshape(2, 3, -1)
+    moment = np.cross(q, n, axis=0)
+    return moment[1], moment[2], n[0]
 
 
 def located(certificate, whisker, at):
-    """(ln M_B, M_D, F_x/M_B), M_B, f and ∂f/∂ℓ at (s, φ, ℓ)."""
-    s, phi, level = at
-    f, _, _, f_level = (one[0] for one in certificate.bounds.force(*np.array([at]).T))
+    """(ln M_B, M_D, F_x/M_B), (3, k), M_B, f and ∂f/∂ℓ at (s, φ, ℓ), (k, 3)."""
+    s, phi, level = at.T
+    f, _, _, f_level = certificate.bounds.force(s, phi, level)
     if certificate.straight:
-        f = np.sqrt(level) * certificate.bounds.force(*np.array([[s, 0.0, 1.0]]).T)[0][0]
+        f = np.sqrt(level) * certificate.bounds.force(s, 0.0 * s, 0.0 * s + 1.0)[0]
     y, z, x = signals(whisker, s, f * np.array([np.cos(phi), np.sin(phi)]))
     moment = np.hypot(y, z)
     return np.array([np.log(moment), np.arctan2(z, y), x / moment]), moment, f, f_level
@@ -282,13 +283,13 @@ def located(certificate, whisker, at):
 
 def conditions(certificate, whisker, at):
     """The conditions by their definition, with differences of fourth order."""
-    value, moment, f, f_level = located(certificate, whisker, at)
-    slope = np.zeros((3, 3))
-    for i in range(3):
-        step = 2e-3 * np.eye(3)[i] * [1.0, 1.0, 0.3]
-        near = np.stack([located(certificate, whisker, at + k * step)[0] for k in (-2, -1, 1, 2)])
-        near[:, 1] -= 2.0 * np.pi * np.round((near[:, 1] - value[1]) / (2.0 * np.pi))
-        slope[:, i] = [1 / 12, -2 / 3, 2 / 3, -1 / 12] @ near / step[i]
+    steps = 2e-3 * np.array([1.0, 1.0, 0.3])
+    around = [at + k * step for step in np.diag(steps) for k in (-2, -1, 1, 2)]
+    values, *others = located(certificate, whisker, np.array([at, *around]))
+    value, (moment, f, f_level) = values[:, 0], (other[0] for other in others)
+    near = values[:, 1:].reshape(3, 3, 4)
+    near[1] -= 2.0 * np.pi * np.round((near[1] - value[1]) / (2.0 * np.pi))
+    slope = near @ [1 / 12, -2 / 3, 2 / 3, -1 / 12] / steps
     if certificate.straight:
         # F = f² = ℓ b², R = -F_x/M², μ = M/f: by s at fixed f, and by f.
         b, b_s = (one[0] for one in certificate.bounds.force(*np.array([[at[0], 0, 1.0]]).T)[:2])

@@ -174,6 +174,32 @@ def test_groups_and_names_go_through_unchanged(tmp_path, trial):
     assert sorted(names[0]) == sorted(names[1])
 
 
+def test_trees_are_read_as_xarray_reads_them(tmp_path, trial):
+    kinds = xr.Dataset(
+        {
+            "text": ("name", ["a", "bcd", ""]),
+            "flag": ("name", [True, False, True]),
+            "whole": ("name", np.arange(3, dtype=np.int8)),
+            "holes": (("name", "free"), np.array([[np.nan, 1.0]] * 3)),
+            "alone": 2.5,
+            "word": "µN",
+        },
+        {
+            "name": ["x", "yy", "z"],
+            "when": ("name", np.array([0, 1, 7]).astype("M8[ns]")),
+        },
+        {"empty": "", "numbers": [1, 2], "number": 3.0, "unit": "µN"},
+    )
+    for tree in (trial, xr.DataTree.from_dict({"/": kinds[["name"]], "/below/it": kinds})):
+        write_netcdf(tmp_path / "tree.nc", tree)
+        found = read_tree(tmp_path / "tree.nc")
+        with xr.open_datatree(tmp_path / "tree.nc", engine="h5netcdf") as known:
+            xr.testing.assert_identical(found, known.load())
+            for one, other in zip(found.subtree, known.subtree, strict=True):
+                kept = {name: variable.dtype for name, variable in other.variables.items()}
+                assert {name: variable.dtype for name, variable in one.variables.items()} == kept
+
+
 def removed(file, chosen):
     """Delete a variable, a group, or an attribute of one."""
     held = []

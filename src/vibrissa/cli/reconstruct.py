@@ -13,10 +13,8 @@ import numpy as np
 import vibrissa as vb
 from vibrissa.cli.estimate import EstimateOptions, estimated
 from vibrissa.cli.inputs import (
-    RECORDING,
     WhiskerOptions,
     free_beside,
-    kind_in,
     objects_from,
     print_statuses,
     print_written,
@@ -87,9 +85,9 @@ def reconstruct(
     points = target.with_name(f"{target.stem}_contour.csv") if csv is None else csv
     vb.io.check_writable(target, vb.io.NETCDF)
     vb.io.check_writable(points, vb.io.CSV)
-    own = not force and _of_contour(points, recording, how.own)
-    free_beside(recording, [target] if own else [target, points], force)
     tree = recording_from(recording)
+    own = not force and _of_contour(points, tree, how.own)
+    free_beside(recording, [target] if own else [target, points], force)
     known = vb.recording.Recording(tree).objects if objects is None else objects_from(objects)
     with progress_bars() as tell:
         made = []
@@ -160,12 +158,9 @@ def _as_made(about: Any) -> SourceOptions:
     return SourceOptions(source, cutoff)
 
 
-def _of_contour(points: Path, recording: Path, own: WhiskerOptions) -> bool:
+def _of_contour(points: Path, tree: xr.DataTree, own: WhiskerOptions) -> bool:
     """Whether a table holds what the recording does: replaced with it, nothing else is lost."""
-    if not points.is_file() or kind_in(recording) != RECORDING:
-        return False
-    tree = recording_from(recording)
-    if not {"estimates", "contour"} <= set(tree.children):
+    if not points.is_file() or not {"estimates", "contour"} <= set(tree.children):
         return False
     try:
         return vb.io.holds_contour(points, vb.pipeline.contour_points(tree, own.in_recording(tree)))

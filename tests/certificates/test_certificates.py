@@ -193,7 +193,7 @@ def test_a_certificate_is_made_and_shown_by_commands(theorem, tmp_path):
 
 def test_witnesses_are_proved_and_other_pairs_are_not(curved):
     found = vb.uniqueness(curved, ["FT FD MB"], ["all"], samples=64, resolution=False)
-    found = vb.identifiability.with_proved_witnesses(curved, found)
+    found = vb.identifiability.with_proved_witnesses(curved, found.isel(witness=[0]))
     pair = found.isel(triplet=0, region=0, witness=0)
     assert pair.witness_proved == 1
     s, force = pair.witness_arc_length.values, pair.witness_contact_force.values

@@ -47,25 +47,33 @@ def arguments(videos, *more):
     return ["track", videos / "top.mkv", videos / "front.mkv", *more]
 
 
-def test_two_videos_become_a_recording(videos, tmp_path):
-    out = tmp_path / "trial.nc"
-    done = run(*arguments(videos, "--cameras", videos / "cameras.toml", "-o", out))
+@pytest.fixture(scope="module")
+def tracked(videos, tmp_path_factory):
+    """Folder with the recording of both videos, and what was printed."""
+    folder = tmp_path_factory.mktemp("tracked")
+    words = ("--cameras", videos / "cameras.toml", "-o", folder / "trial.nc")
+    done = run(*arguments(videos, *words))
     assert done.exit_code == 0, done.exception
-    assert "in contact in" in done.stdout
-    recording = load_recording(out)
+    return folder, done.stdout
+
+
+def test_two_videos_become_a_recording(tracked):
+    folder, text = tracked
+    assert "in contact in" in text
+    recording = load_recording(folder / "trial.nc")
     assert recording["trace"].shape[:3] == (16, 1, 2)
     np.testing.assert_allclose(recording["base_position"].values[0, 0], 0.0, atol=2e-4)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["start.png", "trial.nc"]
+    assert sorted(p.name for p in folder.iterdir()) == ["start.png", "trial.nc"]
 
 
-def test_what_is_taken_for_the_whisker_is_said_and_shown(videos, tmp_path):
-    done = run(*arguments(videos, "--cameras", videos / "cameras.toml", "-o", tmp_path / "t.nc"))
-    (line,) = [line for line in done.stdout.splitlines() if "taken to begin at" in line]
+def test_what_is_taken_for_the_whisker_is_said_and_shown(tracked):
+    folder, text = tracked
+    (line,) = [line for line in text.splitlines() if "taken to begin at" in line]
     base = CAMERAS[0].project(np.zeros(3))
     said = np.array(line.split("begin at ")[1].split(" (top)")[0].split(","), dtype=float)
     assert np.linalg.norm(said - base) < 5.0
     assert "start.png" in line
-    assert (tmp_path / "start.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "start.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_views_that_contradict_each_other_are_refused_with_a_picture(videos, tmp_path):

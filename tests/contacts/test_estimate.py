@@ -58,7 +58,7 @@ def found_again(contacts, triplet, touched):
 
 
 def test_round_trip_on_the_default_whisker(gamma_map, rng):
-    hit, cone, found, *_ = recovered(gamma_map, CANONICAL, 30_000, rng)
+    hit, cone, found, *_ = recovered(gamma_map, CANONICAL, 10_000, rng)
     outside = ~cone
     assert outside.mean() > 0.9
     assert hit[outside].mean() >= 0.9999

@@ -123,16 +123,16 @@ def test_small_deflections_are_flagged(rng):
     whisker = WHISKERS["gamma"]
     covariance = np.diag(SIGMA**2)
     ratios, linear = [], []
-    loads = frictional_load(whisker, 40, rng, most=0.3)
+    loads = frictional_load(whisker, 30, rng, most=0.3)
     bent = vb.deflect(whisker, loads)
     exact = vb.estimate_from_wrench(whisker, bent.force, bent.moment, noise=covariance)
     for force, moment, one in zip(bent.force, bent.moment, exact.covariance, strict=True):
-        noisy = np.concatenate([force, moment]) + SIGMA * rng.normal(size=(300, 6))
+        noisy = np.concatenate([force, moment]) + SIGMA * rng.normal(size=(200, 6))
         found = vb.estimate_from_wrench(whisker, noisy[:, :3], noisy[:, 3:], noise=covariance)
         scatter = np.sqrt(np.nansum(np.nanvar(found.point, axis=0)))
         ratios.append(scatter / np.sqrt(np.trace(one)))
     ratios, linear = np.array(ratios), exact.candidates.covariance_valid[..., 0]
-    assert 8 <= linear.sum() <= 32
+    assert 6 <= linear.sum() <= 24
     assert (ratios[linear] < 1.25).all(), ratios[linear]
     assert (np.abs(np.log(ratios[linear])) < np.log(1.25)).mean() > 0.9, ratios[linear]
     assert (ratios[~linear] < 1.25).mean() > 0.9, ratios[~linear]

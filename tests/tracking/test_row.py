@@ -14,7 +14,7 @@ from vibrissa.tracking.trace.follower import start_at
 from vibrissa.tracking.trace.row import follow_row
 
 COUNT = 6
-FRAMES = 50
+FRAMES = 30
 RATE = 250.0
 GAP = 0.5e-3
 CAMERA = orthogonal_views(size=(420, 360), center=(9e-3, 0.0, 0.0))[0]

@@ -317,11 +317,7 @@ def test_tangents_at_contacts_are_those_of_the_centreline():
 
 
 def verdicts(**words):
-    return xr.DataArray(
-        [words.get(r.replace(" ", "_"), "not unique") for r in REGIONS],
-        {"region": list(REGIONS)},
-        ("region",),
-    )
+    return {r: words.get(r.replace(" ", "_"), "not unique") for r in REGIONS}
 
 
 def test_notation():

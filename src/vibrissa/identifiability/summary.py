@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
 
@@ -27,9 +28,9 @@ ENDINGS = (".nc", ".csv")
 _DECIDING = 1e-3
 
 
-def notation(words: xr.DataArray) -> str:
-    """Verdicts of a triplet in short."""
-    word = {str(r): str(words.sel(region=r).item()) for r in words.region.to_numpy()}
+def notation(words: Mapping[str, str]) -> str:
+    """Verdicts of a triplet, by regions, in short."""
+    word = {region: str(verdict) for region, verdict in words.items()}
     good = [region for region in word if word[region] in (UNIQUE, OFF_SURFACE)]
     # A part adds something only if it is unique where the whole is so off a surface.
     largest = [

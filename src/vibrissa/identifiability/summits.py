@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vibrissa.identifiability.programs import steepest
 from vibrissa.identifiability.regions import contact_set
 from vibrissa.identifiability.twins import Pairs, Search, twins_near, units
 from vibrissa.numerics import AnyArray, Array, cross
@@ -48,9 +49,6 @@ _REGULAR = 1e-4
 _STEEP = 0.1
 # Step of the derivatives of margins, and its ridge against singular equations.
 _STEP, _RIDGE = 1e-5, 1e-14
-# Iterations of the linear program, by what each shrinks the complementarity, and how near to the
-# faces it goes.
-_ITERATIONS, _SHRINK, _NEARLY = 13, 0.04, 0.97
 
 
 class _State(NamedTuple):
@@ -102,29 +100,31 @@ class _Mountain:
         """(F, p) (n, 2, 6), the differences of the triplets (n, 3) and their slopes (n, 3, 6)."""
         d = self.search.contact_map.chart.discretization
         values, tangents = solve_forces(d, with_normal_force(xi.reshape(-1, 3)), tangents=True)
-        force, point = values[:, None, :3], values[:, None, 3:]
-        by_xi = unit.reshape(-1, 3, 1) * tangents.swapaxes(1, 2)
-        turned = cross(by_xi[..., 3:], force) + cross(point, by_xi[..., :3])
-        vectors = {"F": (force, by_xi[..., :3]), "M": (cross(point, force), turned)}
+        by_xi = tangents * unit.reshape(-1, 1, 3)
+        vectors = {"F": (values[:, :3], by_xi[:, :3])}
+        if any(name[0] == "M" for name in self.search.names):
+            force, point = values[:, :3], values[:, 3:]
+            turned = cross(by_xi[:, 3:].swapaxes(1, 2), force[:, None])
+            turned += cross(point[:, None], by_xi[:, :3].swapaxes(1, 2))
+            vectors["M"] = cross(point, force), turned.swapaxes(1, 2)
         away, slope = np.empty((len(xi), 3)), np.empty((len(xi), 3, 2, 3))
         for k, name in enumerate(self.search.names):
-            kind = name[1]
-            both, by_both = (a.reshape(len(xi), 2, -1, 3) for a in vectors[name[0]])
-            size = np.sqrt(np.linalg.norm(both, axis=3).prod(axis=1))[..., None, None]
-            (a, b), by = (both / size)[:, :, 0].swapaxes(0, 1), by_both / size
-            if kind == "x":
-                away[:, k] = a[:, 0] - b[:, 0]
-                normals = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])[None]
-            elif kind == "D":
-                away[:, k] = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
-                zero = np.zeros(len(xi))
-                normals = np.stack([[zero, b[:, 2], -b[:, 1]], [zero, -a[:, 2], a[:, 1]]])
-                normals = normals.transpose(2, 0, 1)
+            vector, by = (v.reshape(len(xi), 2, *v.shape[1:]) for v in vectors[name[0]])
+            size = np.einsum("npi,npi->np", vector, vector).prod(axis=1)[:, None, None] ** 0.25
+            vector = vector / size
+            (a_x, a_y, a_z), (b_x, b_y, b_z) = vector.transpose(1, 2, 0)
+            normals = np.zeros((len(xi), 2, 3))
+            if name[1] == "x":
+                away[:, k] = a_x - b_x
+                normals[:, 0, 0], normals[:, 1, 0] = 1.0, -1.0
+            elif name[1] == "D":
+                away[:, k] = a_y * b_z - a_z * b_y
+                normals[:, 0, 1], normals[:, 0, 2] = b_z, -b_y
+                normals[:, 1, 1], normals[:, 1, 2] = -a_z, a_y
             else:
-                flat = [0.0, 1.0, 1.0]
-                away[:, k] = 0.5 * ((a**2 - b**2) @ flat)
-                normals = np.stack([a * flat, -b * flat], axis=1)
-            slope[:, k] = np.einsum("npxi,npi->npx", by, np.broadcast_to(normals, (len(xi), 2, 3)))
+                away[:, k] = 0.5 * (a_y * a_y + a_z * a_z - b_y * b_y - b_z * b_z)
+                normals[:, 0, 1:], normals[:, 1, 1:] = vector[:, 0, 1:], -vector[:, 1, 1:]
+            slope[:, k] = np.einsum("npi,npix->npx", normals / size, by)
         return values.reshape(-1, 2, 6), away, slope.reshape(-1, 3, 6)
 
     def levels(
@@ -277,35 +277,7 @@ def _step(mountain: _Mountain, state: _State, signs: Array, size: Array, active:
 
 
 def _program(levels: Array, slopes: Array, within: Array, cost: float) -> tuple[Array, Array]:
-    """Steps (n, 3) in boxes that maximise the linearised merit, and that merit (n,).
-
-    A primal-dual interior method for all rows at once. Unknowns are the step over the size of its
-    box, the angle reached t, and the worst violation e; maximised is t - cost·e.
-    """
-    n, m = levels.shape
-    matrix, room = np.zeros((n, m + 7, 5)), np.ones((n, m + 7))
-    matrix[:, :m, :3] = slopes.swapaxes(1, 2)
-    matrix[:, :2, 3], matrix[:, 2:m, 4], matrix[:, -1, 4] = -1.0, 1.0, 1.0
-    matrix[:, m : m + 6, :3] = np.concatenate([np.eye(3), -np.eye(3)])
-    room[:, :m] = levels / within[:, None]
-    room[:, :2] -= room[:, :2].min(axis=1, keepdims=True)
-    room[:, -1] = 0.0
-    aim = np.array([0.0, 0.0, 0.0, 1.0, -cost])
-    x = np.zeros((n, 5))
-    x[:, 3], x[:, 4] = -1.0, 1.0 + np.maximum(-room[:, 2:m], 0.0).max(axis=1)
-    slack = np.einsum("nmi,ni->nm", matrix, x) + room
-    dual = 1.0 / slack
-    for _ in range(_ITERATIONS):
-        target = _SHRINK * np.mean(slack * dual, axis=1, keepdims=True) / slack
-        weighted = matrix * (dual / slack)[:, :, None]
-        right = aim + np.einsum("nmi,nm->ni", matrix, target)
-        dx = np.linalg.solve(weighted.swapaxes(1, 2) @ matrix, right[..., None])[..., 0]
-        ds = np.einsum("nmi,ni->nm", matrix, dx)
-        dd = target - dual - dual / slack * ds
-        primal, other = (
-            np.minimum(1.0, _NEARLY / np.maximum((-d / a).max(axis=1), 1e-12))[:, None]
-            for d, a in ((ds, slack), (dd, dual))
-        )
-        x, slack, dual = x + primal * dx, slack + primal * ds, dual + other * dd
-    step = x[:, :3] * within[:, None]
+    """Steps (n, 3) in boxes that maximise the linearised merit, and that merit (n,)."""
+    step = np.zeros((len(levels), 3))
+    steepest(levels, slopes, within, cost, step)
     return step, _merit(levels + np.einsum("nk,nkm->nm", step, slopes), cost)

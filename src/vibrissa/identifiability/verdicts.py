@@ -266,6 +266,8 @@ def _labelled(
         surfaces,
         {"long_name": "surface on which contacts have the same signals"},
     )
+    shares = question.volumes()
+    data["region_share"] = ("region", shares, _about("1", "share of the contacts' space"))
     coords = {
         "triplet": [" ".join(triplet) for triplet in names],
         "region": list(question.regions),
@@ -275,7 +277,13 @@ def _labelled(
         "space": ["x", "y", "z"],
         "component": ["fy", "fz"],
     }
-    out = xr.Dataset(data, coords=coords).merge(_witnesses(question, names, answers))
+    data["notation"] = (
+        "triplet",
+        [notation(dict(zip(question.regions, row, strict=True))) for row in data["verdict"][1]],
+        {"long_name": "largest regions in which the triplet is unique; *: off a surface"},
+    )
+    data |= _witnesses(question, names, answers)  # merging datasets would import dask
+    out = xr.Dataset(data, coords=coords)
     whisker, d = question.contact_map.whisker, question.contact_map.chart.discretization
     out.attrs = {
         "kind": "vibrissa uniqueness",
@@ -287,24 +295,13 @@ def _labelled(
         "steps": question.contact_map.steps,
         "seed": question.seed,
         "volume_shares": ", ".join(
-            f"{region} {share:.3f}"
-            for region, share in zip(question.regions, question.volumes(), strict=True)
+            f"{region} {share:.3f}" for region, share in zip(question.regions, shares, strict=True)
         ),
     }
     if TRIPLET in out.triplet.values and whisker.base_stiffness is None:
         seen = outlook(question.contact_map, question.cone)
         out.attrs["certificate_possible"] = int(seen.possible)
         out.attrs["determinant_cone"] = seen.determinant_cone
-    out["region_share"] = (
-        "region",
-        question.volumes(),
-        _about("1", "share of the contacts' space"),
-    )
-    out["notation"] = (
-        "triplet",
-        [notation(out.verdict.sel(triplet=t)) for t in out.triplet.to_numpy()],
-        {"long_name": "largest regions in which the triplet is unique; *: off a surface"},
-    )
     out.attrs["chosen_triplet"], out.attrs["chosen_region"] = choice(out)
     return out
 
@@ -350,7 +347,7 @@ def _surface(question: Question) -> str:
 
 def _witnesses(
     question: Question, names: tuple[tuple[str, ...], ...], answers: list[Answer]
-) -> xr.Dataset:
+) -> dict[str, Any]:
     """Both contacts of each witness, in SI units, with how well they agree."""
     cells = (len(names), len(question.regions), WITNESSES)
     arrays = {
@@ -371,7 +368,7 @@ def _witnesses(
         FINER * np.array([found.steps for found in answers]),
         _about("1", "integration steps with which the witnesses agree"),
     )
-    return xr.Dataset(data)
+    return data
 
 
 def _witness(

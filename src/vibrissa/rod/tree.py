@@ -143,9 +143,8 @@ def search_tree(
     circular = np.array(angles)
     place = _octree_order(tuple(n - 1 for n in values.shape[:3]))
     cells = _Cells.of(place, values, chart.charted(derivatives) * size, circular)
-    points = cells.points()
-    aligned = _aligned(cells, points)
-    low, high = points.min(axis=1), points.max(axis=1)
+    aligned = _aligned(cells)
+    low, high = cells.extent()
     care = _care(cells.slope, aligned)
     polar = _Polar.none()
     if plane is not None:
@@ -183,8 +182,8 @@ def search_tree(
 class _Cells(NamedTuple):
     """Quantities in cells.
 
-    base (cells, q): at the first corner; corner (cells, 2, 2, 2, q): relative to it; slope (cells,
-    2, 2, 2, q, 3): in cell widths.
+    base (cells, q): at the first corner; corner (2, 2, 2, cells, q): relative to it; slope
+    (2, 2, 2, cells, q, 3): in cell widths.
     """
 
     base: Array
@@ -194,40 +193,48 @@ class _Cells(NamedTuple):
     @classmethod
     def of(cls, place: IntArray, values: Array, slopes: Array, circular: AnyArray) -> _Cells:
         """Take them from the nodes of the chart."""
-        i, j, k = (place[:, a, None, None, None] for a in range(3))
-        two = np.arange(2)
+        two = np.arange(2)[:, None]
+        i, j, k = place.T
         index = (i + two[:, None, None], j + two[:, None], k + two)
         corner, slope = values[index], slopes[index]
-        corner = corner - corner[:, :1, :1, :1]
-        turns = np.round(corner / (2.0 * np.pi))
-        corner = np.where(circular, corner - 2.0 * np.pi * turns, corner)
-        return cls(values[tuple(place.T)], corner, slope)
+        corner = corner - corner[0, 0, 0]
+        if circular.any():
+            turns = np.round(corner[..., circular] / (2.0 * np.pi))
+            corner[..., circular] -= 2.0 * np.pi * turns
+        return cls(values[i, j, k], corner, slope)
+
+    def _inward(self, axis: int) -> Array:
+        """A third of the slopes along an axis, from each corner into the cell."""
+        sign = np.array([1.0, -1.0]).reshape([2 if a == axis else 1 for a in range(5)])
+        return np.asarray(self.slope[..., axis] * (sign / 3.0))
 
     def points(self) -> Array:
-        """Corners moved inward by a third of their slopes along any of the axes: (cells, 64, q)."""
-        inward = np.empty_like(self.slope)
-        for axis in range(3):
-            sign = np.array([1.0, -1.0]).reshape([2 if a == axis else 1 for a in range(3)])
-            inward[..., axis] = self.slope[..., axis] * sign[..., None] / 3.0
-        moved = np.empty((*self.corner.shape[:4], 8, self.corner.shape[-1]))
-        moved[..., 0, :] = self.corner
+        """Corners moved inward along any of the axes, relative to the base: (64, cells, q)."""
+        moved = np.empty((8, *self.corner.shape))
+        moved[0] = self.corner
         for axis, first in enumerate((1, 2, 4)):  # with it, each subset of the axes before
-            after = moved[..., first : 2 * first, :]
-            np.add(moved[..., :first, :], inward[..., None, :, axis], out=after)
-        return moved.reshape(len(moved), 64, moved.shape[-1]) + self.base[:, None]
+            np.add(moved[:first], self._inward(axis), out=moved[first : 2 * first])
+        return moved.reshape(64, *self.base.shape)
+
+    def extent(self) -> tuple[Array, Array]:
+        """The least and the largest of these points, (cells, q) each."""
+        low, high = self.corner, self.corner
+        for axis in range(3):
+            inward = self._inward(axis)
+            low, high = low + np.minimum(inward, 0.0), high + np.maximum(inward, 0.0)
+        return self.base + low.min(axis=(0, 1, 2)), self.base + high.max(axis=(0, 1, 2))
 
     def slopes(self) -> Array:
         """Mean slopes between corners: (cells, q, 3)."""
-        columns = [np.diff(self.corner, axis=axis).mean(axis=(1, 2, 3)) for axis in (1, 2, 3)]
+        columns = [np.diff(self.corner, axis=axis).mean(axis=(0, 1, 2)) for axis in range(3)]
         return np.stack(columns, axis=-1)
 
     def linear(self) -> Array:
         """Mean slopes, and middle and half width of what they leave: (cells, q, 5)."""
         slopes = self.slopes()
         ends = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1)
-        corner = self.corner - np.einsum("cqa,ijka->cijkq", slopes, ends)
-        left = _Cells(0.0 * self.base, corner, self.slope - slopes[:, None, None, None]).points()
-        low, high = left.min(axis=1), left.max(axis=1)
+        corner = self.corner - np.einsum("cqa,ijka->ijkcq", slopes, ends)
+        low, high = _Cells(np.zeros_like(self.base), corner, self.slope - slopes).extent()
         rest = np.stack([0.5 * (low + high), (0.5 + _MARGIN) * (high - low)], axis=-1)
         return np.concatenate([slopes, rest], axis=-1)
 
@@ -252,19 +259,23 @@ class _Polar(NamedTuple):
     @classmethod
     def of(cls, cells: _Cells, vector: _Cells, length: int, direction: int, half: Array) -> _Polar:
         """Find the cells in which a vector may vanish; half (cells, 3): sizes of the quantities."""
-        points = vector.points()
-        size = np.linalg.norm(points, axis=2)
-        heading = points / np.where(size > 0.0, size, 1.0)[..., None]
-        middle = heading.mean(axis=1, keepdims=True)
-        middle /= np.maximum(np.linalg.norm(middle, axis=2, keepdims=True), 1e-300)
-        rows = np.flatnonzero((heading * middle).sum(axis=2).min(axis=1) < np.cos(_TURNED))
+        y, z = np.moveaxis(vector.points() + vector.base, -1, 0)
+        size = np.sqrt(y * y + z * z)
+        some = np.where(size > 0.0, size, 1.0)
+        y, z = y / some, z / some
+        middle = np.stack([y.mean(axis=0), z.mean(axis=0)])
+        middle /= np.maximum(np.linalg.norm(middle, axis=0), 1e-300)
+        rows = np.flatnonzero((y * middle[0] + z * middle[1]).min(axis=0) < np.cos(_TURNED))
         others = [q for q in range(3) if q not in (length, direction)]
-        both = _Cells(
-            np.concatenate([vector.base[rows], cells.base[rows][..., others]], axis=-1),
-            np.concatenate([vector.corner[rows], cells.corner[rows][..., others]], axis=-1),
-            np.concatenate([vector.slope[rows], cells.slope[rows][..., others, :]], axis=-2),
+        remaining = _Cells(
+            cells.base[:, others], cells.corner[..., others], cells.slope[..., others, :]
         )
-        longest = (1.0 + _MARGIN) * size[rows].max(axis=1)
+        both = _Cells(
+            np.concatenate([a.base[rows] for a in (vector, remaining)], axis=-1),
+            np.concatenate([a.corner[:, :, :, rows] for a in (vector, remaining)], axis=-1),
+            np.concatenate([a.slope[:, :, :, rows] for a in (vector, remaining)], axis=-2),
+        )
+        longest = (1.0 + _MARGIN) * size[:, rows].max(axis=0)
         frame = np.zeros((len(rows), 8))
         frame[:, : both.base.shape[1]] = both.base
         frame[:, 4:] = longest[:, None]
@@ -278,7 +289,7 @@ class _Polar(NamedTuple):
 
 def _volumes(slope: Array, others: int) -> Array:
     """See `SearchTree.polar_volumes`; relative to the slopes' lengths."""
-    slope = slope.reshape(len(slope), 8, slope.shape[-2], 3)
+    slope = np.moveaxis(slope.reshape(8, *slope.shape[3:]), 0, 1)
     out = np.zeros((len(slope), 8, 2))
     size = np.linalg.norm(slope[..., 2:, :], axis=-1).prod(axis=-1)
     size *= np.linalg.norm(slope[..., :2, :], axis=(-2, -1)) ** (3 - others)
@@ -329,7 +340,7 @@ def _boxes(low: Array, high: Array, circular: AnyArray) -> tuple[IntArray, Array
     return offsets, np.ascontiguousarray(np.concatenate(levels))
 
 
-def _aligned(cells: _Cells, points: Array) -> Array:
+def _aligned(cells: _Cells) -> Array:
     """Coordinates in which a cell is nearly the unit cube, and its extent in them."""
     linear = cells.slopes()
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -338,8 +349,8 @@ def _aligned(cells: _Cells, points: Array) -> Array:
     usable = flatness > _FLAT
     inverse = np.zeros_like(linear)
     inverse[usable] = np.linalg.inv(linear[usable])
-    y = (points - cells.base[:, None]) @ inverse.transpose(0, 2, 1)
-    low, high = y.min(axis=1), y.max(axis=1)
+    corner = (inverse @ cells.corner[..., None])[..., 0]
+    low, high = _Cells(np.zeros_like(cells.base), corner, inverse @ cells.slope).extent()
     grow = _MARGIN * (high - low) + 1e-9
     return np.ascontiguousarray(
         np.concatenate(
@@ -353,29 +364,29 @@ def _edges(cells: _Cells) -> Array:
 
     Cubics along η at the corners of (ψ, ρ), corrections along ψ and along ρ.
     """
-    parts = []
+    n, q = cells.base.shape
+    out = np.zeros((n, 40, 4))
+    place = 0
     for axis in range(3):
-        v = np.moveaxis(cells.corner, axis + 1, 1)
-        d = np.moveaxis(cells.slope[..., axis], axis + 1, 1)
-        rise = v[:, 1] - v[:, 0]
-        square = 3.0 * rise - 2.0 * d[:, 0] - d[:, 1]
-        cube = d[:, 0] + d[:, 1] - 2.0 * rise
-        terms = [v[:, 0], d[:, 0], square, cube] if axis == 0 else [d[:, 0] - rise, square, cube]
-        edge = np.stack(terms, axis=3)  # (cells, 2, 2, terms, q)
-        parts.append(edge.reshape(len(edge), 4 * len(terms), edge.shape[-1]))
-    edges = np.concatenate(parts, axis=1)
-    out = np.zeros((len(edges), 40, 4))
-    out[..., : edges.shape[2]] = edges
-    return out.reshape(len(edges), 160)
+        v, d = np.moveaxis(cells.corner, axis, 0), np.moveaxis(cells.slope[..., axis], axis, 0)
+        rise = v[1] - v[0]
+        square = 3.0 * rise - 2.0 * d[0] - d[1]
+        cube = d[0] + d[1] - 2.0 * rise
+        terms = [v[0], d[0], square, cube] if axis == 0 else [d[0] - rise, square, cube]
+        for edge in np.ndindex(2, 2):
+            for term in terms:
+                out[:, place, :q] = term[edge]
+                place += 1
+    return out.reshape(n, 160)
 
 
 def _care(slope: Array, aligned: Array) -> IntArray:
     """How many starts a cell needs: 0 one, 1 several until one is solved, 2 all of them."""
     det = np.linalg.det(slope)
     size = np.prod(np.linalg.norm(slope, axis=-2), axis=-1)
-    flatness = (det / np.where(size > 0.0, size, 1.0)).reshape(len(slope), 8)
-    flatness *= np.sign(flatness[:, :1])
-    least, most = flatness.min(axis=1), np.abs(flatness).max(axis=1)
+    flatness = (det / np.where(size > 0.0, size, 1.0)).reshape(8, -1)
+    flatness *= np.sign(flatness[0])
+    least, most = flatness.min(axis=0), np.abs(flatness).max(axis=0)
     sheared = (aligned[:, 5] - aligned[:, 4]).max(axis=1) > _SHEARED
     sheared |= ~aligned[:, :3].any(axis=(1, 2))  # not aligned
     return np.where(least <= FOLDED * most, 2, np.where((least <= EVEN * most) | sheared, 1, 0))

@@ -74,19 +74,20 @@ def nearest_on_rest(whisker: Whisker, points: Array) -> tuple[Array, Array]:
     rows = np.flatnonzero(np.isfinite(flat).all(axis=1))
     if rows.size:
         s, places, tree, _ = resting(whisker)
-        _, i = tree.query(flat[rows])
+        flat = flat[rows]
+        _, i = tree.query(flat)
         # Between samples the curve is straight enough: the nearest point of the two chords at
         # the sample.
-        best, where = np.full(rows.size, np.inf), np.zeros(rows.size)
-        for j in (np.maximum(i - 1, 0), np.minimum(i, s.size - 2)):
-            chord = places[j + 1] - places[j]
-            t = np.einsum("ni,ni->n", flat[rows] - places[j], chord)
-            t = np.clip(t / np.einsum("ni,ni->n", chord, chord), 0.0, 1.0)
-            away = np.linalg.norm(flat[rows] - places[j] - t[:, None] * chord, axis=1)
-            closer = away < best
-            best = np.where(closer, away, best)
-            where = np.where(closer, s[j] + t * (s[j + 1] - s[j]), where)
-        distance[rows], arc_length[rows] = best, where
+        j = np.stack([np.maximum(i - 1, 0), np.minimum(i, s.size - 2)])
+        start, chord = places[j], places[j + 1] - places[j]
+        t = np.einsum("jni,jni->jn", flat - start, chord)
+        t = np.clip(t / np.einsum("jni,jni->jn", chord, chord), 0.0, 1.0)
+        away = flat - start - t[..., None] * chord
+        away = np.sqrt(np.einsum("jni,jni->jn", away, away))
+        second = away[1] < away[0]
+        distance[rows] = np.where(second, away[1], away[0])
+        along = s[j] + t * (s[j + 1] - s[j])
+        arc_length[rows] = np.where(second, along[1], along[0])
     return distance.reshape(points.shape[:-1]), arc_length.reshape(points.shape[:-1])
 
 

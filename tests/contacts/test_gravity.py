@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import vibrissa as vb
 from vibrissa.cli.app import app
+from vibrissa.rod import resting
 
 REFERENCE = Path(__file__).parents[1] / "data" / "weighted_contacts.csv"
 G = 9.81
@@ -325,3 +327,31 @@ def run(*words, fails=False):
     result = CliRunner().invoke(app, [str(word) for word in words])
     assert (result.exit_code != 0) == fails, result.output
     return f"{result.output} {result.exception}"
+
+
+def test_gravity_of_a_moving_base_is_as_exact_as_the_noise_is_small(nitinol):
+    whisker = nitinol.whisker
+    turn = Rotation.from_euler("yz", [[0.1, 0.0], [0.10013, 0.02007], [0.11, 0.03]]).as_matrix()
+    bent, rest = [], []
+    for one in turn:
+        force = vb.PointForce(0.7 * whisker.length, 0.5 * unit(whisker), 0.4)
+        bent.append(vb.deflect(whisker, force, gravity=tuple(one.T @ [0.0, 0.0, -G])))
+        rest.append(resting(whisker, one.T @ [0.0, 0.0, -G]))
+    wrench = {
+        name: np.stack(
+            [getattr(b, name) + getattr(r, name) for b, r in zip(bent, rest, strict=True)]
+        )
+        - getattr(rest[0], name)
+        for name in ("force", "moment")
+    }
+    points = np.stack([one.contact_point for one in bent])
+    errors = []
+    for share in (1e-3, 1e-6):  # a finer step costs a solution for each pose
+        noise = share**2 * 1e6 * covariance(whisker)
+        found = nitinol.estimate(
+            vb.base_signals(*wrench.values()), noise=noise, gravity=(0, 0, -G), base_rotation=turn
+        )
+        away = np.linalg.norm(found.point - points, axis=1)
+        assert (away < 0.1 * np.sqrt(np.linalg.eigvalsh(found.covariance)[:, -1])).all()
+        errors.append(away.max())
+    assert errors[1] < 2e-7 * whisker.length

@@ -49,9 +49,10 @@ _NUDGE = 1e-4
 _RIGID = 1e9
 # Relative step of the force along the whisker for its derivatives.
 _AHEAD = 1e-5
-# How far apart directions of gravity are that a turning whisker is solved for, and those whose
-# resting shapes propose contacts, rad.
-_DIRECTIONS, _SHAPES = 2e-4, 0.2
+# How far apart directions of gravity are at most, and at least, that a turning whisker is solved
+# for, and those whose resting shapes propose contacts, rad; what the former may change of a
+# measurement, in standard deviations.
+_DIRECTIONS, _FINEST, _SHAPES, _UNSEEN = 2e-4, 1e-9, 0.2, 0.03
 # Rows of the numbers of a solved rod with weight: force, contact point, moment of the weight.
 _CAUSED = [0, 1, 2, 3, 4, 5, 9, 10, 11]
 
@@ -116,21 +117,23 @@ class Gravity:
             gravity = cls((float(values[0]), float(values[1]), float(values[2])))
         return gravity if any(gravity.acceleration) or gravity.tare is not None else None
 
-    def turned(self, rotation: Array) -> Gravity:
+    def turned(self, rotation: Array, step: float = _DIRECTIONS) -> Gravity:
         """Gravity of the laboratory frame, in that of a whisker.
 
         Parameters
         ----------
         rotation : (3, 3) array
             Rotation of the base, from the whisker's to the laboratory frame.
+        step : float
+            How far directions are apart, rad.
 
         Returns
         -------
         Gravity
-            Gravity in the nearest of directions a hundredth of a degree apart, so that those of a
-            moving whisker are not all different; without another tare it is of this pose.
+            Gravity in the nearest of directions a step apart, so that those of a slowly moving
+            whisker are not all different; without another tare it is of this pose.
         """
-        x, y, z = _rounded(rotation.T @ self.acceleration, _DIRECTIONS).tolist()
+        x, y, z = _rounded(rotation.T @ self.acceleration, step).tolist()
         return replace(self, acceleration=(x, y, z), tare=self.tare or (x, y, z))
 
     @property
@@ -240,6 +243,14 @@ class Forward:
                 base = whisker.with_properties(base_stiffness=(float(bending), float(twist)))
                 out.errors.append((bent(base), 1.0))
         return out
+
+    def direction_step(self, noise: float) -> float:
+        """How far directions of gravity may be apart, rad, for noise that does not show it."""
+        if not isinstance(self.rod, Resting):
+            return _DIRECTIONS
+        force, moment = self.rod.force / self.d.force, self.rod.moment / self.d.moment
+        weight = max(float(np.abs(force).max()), float(np.abs(moment).max()))
+        return min(max(_UNSEEN * noise / weight, _FINEST), _DIRECTIONS)
 
     @property
     def weighted(self) -> bool:

@@ -31,7 +31,7 @@ from vibrissa.contacts.search import estimate
 from vibrissa.contacts.wrench import PROXIMAL, chosen, estimate_components, friction_angle
 from vibrissa.deferred import xr
 from vibrissa.numerics import Array, IntArray
-from vibrissa.rod import Resting
+from vibrissa.rod import Discretization, Resting
 from vibrissa.signals import labelled_wrench, measured, selection, signal_scales
 from vibrissa.status import Status
 from vibrissa.whisker import Whisker
@@ -91,6 +91,7 @@ class JointEstimate:
         self.d, whole = self.forward.d, names == WRENCH
         self.channels = Channels(WRENCH, WRENCH) if whole else Channels.of(names)
         self.scale = signal_scales(names, self.d.force, self.d.moment)
+        self._step = self.forward.direction_step(_least_noise(sensor, names, self.d))
         self._shift = _shifts(self.channels.names, self.forward.shift)
         self._fit = JointFit(self.forward, self.channels, sensor, PROXIMAL, friction=whole)
         self._rubbing = None
@@ -144,18 +145,19 @@ class JointEstimate:
         """Gravity of the laboratory frame where the base is turned (3, 3)."""
         if self._lab is None or not np.isfinite(rotation).all():
             return ()
-        return self._lab.turned(rotation).acceleration
+        return self._lab.turned(rotation, self._step).acceleration
 
     def turned(self, rotation: Array) -> JointEstimate:
         """The same with the base turned (3, 3), gravity being that of the laboratory frame."""
         if self._lab is None or not np.isfinite(rotation).all():
             return self
-        weight = self._lab.turned(rotation)
+        weight = self._lab.turned(rotation, self._step)
         if weight == self.gravity:
             return self
         names = self.names, self.sensor, self.prior
         out = JointEstimate(self.whisker, self.contact_map, *names, gravity=weight, **self._how)
         out._lab, out._proposing = replace(self._lab, tare=weight.tare), weight.nearly
+        out._step = self._step
         return out
 
     def untared(self, values: Array) -> Array:
@@ -268,6 +270,19 @@ def _by_probability(found: Candidates) -> IntArray:
     first = found.probability[:, 0]
     sure = np.where(np.isfinite(first), first > CERTAIN, found.number == 1)
     return np.where(sure, int(Status.UNIQUE), int(Status.AMBIGUOUS))
+
+
+def _least_noise(sensor: SensorNoise | None, names: tuple[str, ...], d: Discretization) -> float:
+    """Least standard deviation of a signal, or of a mix of components, non-dimensional."""
+    if sensor is None:
+        return 0.0
+    if sensor.deviations is not None:
+        scales = signal_scales(names, d.force, d.moment)
+        return float(min(sensor.deviations[name] / scales[i] for i, name in enumerate(names)))
+    assert sensor.wrench is not None
+    scales = signal_scales(WRENCH, d.force, d.moment)
+    least = np.linalg.eigvalsh(sensor.wrench / np.outer(scales, scales))[0]
+    return float(np.sqrt(max(least, 0.0)))
 
 
 def _shifts(names: tuple[str, ...], shift: Array) -> Array:

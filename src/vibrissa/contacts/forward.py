@@ -125,7 +125,7 @@ class Gravity:
         rotation : (3, 3) array
             Rotation of the base, from the whisker's to the laboratory frame.
         step : float
-            How far directions are apart, rad.
+            Angle between neighbouring directions, rad.
 
         Returns
         -------

@@ -38,7 +38,7 @@ _MASS = 0.2
 _TURN = 0.12
 """Relative error of frequencies: share of a vibration that is unknown after a radian."""
 
-_SHARE, _AXIAL = 0.06, 0.4
+_SHARE, _AXIAL = 0.15, 0.4
 """Share of the vibration that linear modes leave across the whisker, and its share along it."""
 
 _BEND = 0.2
@@ -50,8 +50,9 @@ _FREEDOM, _FREEDOM_IN_CONTACT = 4.0, 1.0
 _CHANGE, _ONSET, _AS_BEFORE = 1.5, 5.0, 0.6
 """Change from frame to frame in contact, and when it begins, over noise, and over the last one."""
 
-_START = 5.0
-"""Least standard deviation of amplitudes at a release, over noise."""
+_START, _RELEASED = 5.0, 0.35
+"""Standard deviation of amplitudes at a release: least, over noise, and as a share of the moment,
+which modes in some phase make together."""
 
 _LOST, _MOST = 60.0, 64
 """Log likelihood below the best from which a hypothesis is dropped, and most hypotheses."""
@@ -139,7 +140,7 @@ class _Free(NamedTuple):
 
     def with_release(self, frame: int, size: float, weight: float) -> _Free:
         """Add a release in this frame, at a moment of this size."""
-        covariance = np.diag(np.full(self.state.shape[1], (size + _START) ** 2))
+        covariance = np.diag(np.full(self.state.shape[1], (_RELEASED * size + _START) ** 2))
         covariance[-1, -1] = _MASS**2
         return _Free(
             np.append(self.since, frame),

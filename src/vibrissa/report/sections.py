@@ -108,7 +108,9 @@ def _results(
         width, sigma = with_sigma("object_radius", diameter, 2.0 * fit.sigma["radius"])
         width = width.removesuffix(sigma.rpartition(" ")[2]).strip()
         size = Tile(f"{width} ± {sigma}", f"diameter of the {fit.kind} fitted to the contacts")
-    misfit = Tile(f"{fit.misfit:.2g}", "misfit (χ² per degree of freedom; 1 is expected)")
+    misfit = Tile(
+        f"{float(f'{fit.misfit:.2g}'):,g}", "misfit (χ² per degree of freedom; 1 is expected)"
+    )
     return tiles([*found, size, misfit])
 
 
@@ -390,8 +392,8 @@ def _contour(recording: xr.DataTree, seed: int) -> str:
         ("parameter", "fitted", "standard deviation"),
         f"The fitted {fit.kind}",
         f"{int(fit.inliers.sum())} contacts fit; root mean square of their distances: "
-        f"{shown_value('surface_distance', fit.rms)}. Misfit {fit.misfit:.3g}: χ² per degree of "
-        "freedom, about 1 where the shape and the stated noise are right.",
+        f"{shown_value('surface_distance', fit.rms)}. "
+        f"Misfit {float(f'{fit.misfit:.3g}'):,g}: χ² per degree of freedom, about 1 where the shape and the stated noise are right.",
     )
     if fit.kind != "free" and fit.misfit > _SUSPECT:
         text += paragraph(

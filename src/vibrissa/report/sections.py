@@ -393,7 +393,8 @@ def _contour(recording: xr.DataTree, seed: int) -> str:
         f"The fitted {fit.kind}",
         f"{int(fit.inliers.sum())} contacts fit; root mean square of their distances: "
         f"{shown_value('surface_distance', fit.rms)}. "
-        f"Misfit {float(f'{fit.misfit:.3g}'):,g}: χ² per degree of freedom, about 1 where the shape and the stated noise are right.",
+        f"Misfit {float(f'{fit.misfit:.3g}'):,g}: χ² per degree of freedom, about 1 where the "
+        "shape and the stated noise are right.",
     )
     if fit.kind != "free" and fit.misfit > _SUSPECT:
         text += paragraph(

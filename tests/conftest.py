@@ -44,6 +44,8 @@ _FIRST = [
     "viewer/test_watching.py",
     "sweeps",
     "contacts",
+    "certificates",
+    "streaming",
     "identifiability",
     "paper",
     "rod",

@@ -200,6 +200,15 @@ def test_trees_are_read_as_xarray_reads_them(tmp_path, trial):
                 assert {name: variable.dtype for name, variable in one.variables.items()} == kept
 
 
+@pytest.mark.parametrize("shape", [(3,), (2, 3)])
+def test_numbers_without_named_dimensions_are_refused(tmp_path, trial, shape):
+    write_netcdf(tmp_path / "trial.nc", trial)
+    with h5py.File(tmp_path / "trial.nc", "a") as file:
+        file["foreign"] = np.zeros(shape)
+    with pytest.raises(ValueError, match="foreign has dimensions without names"):
+        load_recording(tmp_path / "trial.nc")
+
+
 def removed(file, chosen):
     """Delete a variable, a group, or an attribute of one."""
     held = []

@@ -273,9 +273,11 @@ def _dataset(group: h5py.Group) -> xr.Dataset:
 
 def _dims(name: str, data: h5py.Dataset) -> list[str]:
     """Names of the dimensions of a variable; of one that is a dimension itself, its own."""
-    scales = data.attrs.get("DIMENSION_LIST")
-    if scales is None:
-        return [name] * data.ndim
+    scales = data.attrs.get("DIMENSION_LIST", ())
+    if len(scales) < data.ndim:
+        if data.ndim > 1 or "CLASS" not in data.attrs:
+            raise ValueError(f"{name} has dimensions without names")
+        return [name]
     return [str(data.file[axis[0]].name).rpartition("/")[2] for axis in scales]
 
 

@@ -73,6 +73,8 @@ def test_what_is_taken_for_the_whisker_is_said_and_shown(tracked):
     said = np.array(line.split("begin at ")[1].split(" (top)")[0].split(","), dtype=float)
     assert np.linalg.norm(said - base) < 5.0
     assert "start.png" in line
+    assert "1000 frames/s (--rate)" in text
+    assert "pixel size" not in text
     assert (folder / "start.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -300,6 +302,7 @@ def test_a_mirror_gives_two_views_in_one_video(videos, tmp_path):
         assert done.exit_code == 0, done.exception
     done = run("track", videos / "top.mkv", videos / "front.mkv", "-o", tmp_path / "files.nc")
     assert done.exit_code == 0, done.exception
+    assert "pixel size assumed, not stated: 0.058 mm" in " ".join(done.stdout.split())
     one, two, files = (
         load_recording(tmp_path / f"{name}.nc")["trace"].values for name in ("one", "two", "files")
     )

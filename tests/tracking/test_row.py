@@ -120,6 +120,26 @@ def test_what_is_given_is_nobody_elses(row):
     assert whose(traces[1].line, truth[0]) == 0
 
 
+def test_a_click_where_no_line_begins_takes_nobody_elses(row):
+    """All clicks are inside the face, one of them next to that of another whisker."""
+    frames, truth = row
+    clicks = truth[0, :, 0] - [4.0, 0.0]
+    clicks = np.vstack([clicks, clicks[0] + np.array([0.0, 3.6])])
+    traces = follow_row([start_at(click) for click in clicks], frames[0], {})
+    found = [whose(trace.line, truth[0]) if len(trace.line) else -2 for trace in traces]
+    assert found == [*range(COUNT), -2]
+
+
+def test_a_whisker_that_goes_on_as_a_hair_before_its_base_is_taken_and_not_the_next_hair():
+    y, x = np.mgrid[:130, :200]
+    whisker = np.hypot(y - 60.0 - 2e-3 * (x - 25.0) ** 2, np.maximum(np.abs(x - 97.0) - 72.0, 0.0))
+    hair = np.hypot(x - 50.0 + 0.1 * (y - 67.0), np.maximum(np.abs(y - 89.0) - 22.0, 0.0))
+    dark = np.exp(-0.5 * (np.minimum(whisker, hair) / 1.4) ** 2)
+    frame = 190.0 - 90.0 * dark + np.random.default_rng(0).normal(size=dark.shape)
+    (trace,) = follow_row([start_at((50.0, 61.0))], frame.astype(np.uint8), {})
+    assert trace.line[-1, 0] > 150.0
+
+
 def test_nothing_is_found_in_nothing():
     frame = np.clip(np.random.default_rng(0).normal(180.0, 3.0, (90, 120)), 0, 255)
     followers = [start_at((20.0, 30.0)), start_at((20.0, 40.0))]

@@ -340,6 +340,7 @@ def track(
     bases, masks = traced.bases(views, clicks), traced.masks(views, clicks)
     fixed = known.corrected(len(views))
     reference = known.read(videos[0], rate)
+    _report_assumed(filmed, clicks)
     for file, trial in trials.items():
         picture = file.with_name("start.png" if len(trials) == 1 else f"{file.stem}.start.png")
         _track(
@@ -513,6 +514,17 @@ def _compare_lengths(videos: Sequence[Path], traces: Sequence[Sequence[Any]], us
             f"the videos differ in frames ({listed}); {used} of each are used: if the cameras did "
             "not start together or dropped frames, track with --offset auto"
         )
+
+
+def _report_assumed(filmed: FilmOptions, clicks: vb.io.Clicks | None) -> None:
+    """Report what is assumed of the film because it is not stated."""
+    if filmed.pixel_size is None and filmed.cameras is None and not (clicks and clicks.pixel_size):
+        say(
+            f"note: pixel size assumed, not stated: {1e3 * vb.cameras.PIXEL_SIZE:g} mm; all "
+            "lengths are proportional to it (--pixel-size, or the scale of --pick)"
+        )
+    if filmed.rate is None:
+        say(f"note: rate assumed, not stated: {_RATE:g} frames/s (--rate)")
 
 
 def _report_start(start: vb.tracking.Start, names: Sequence[str], picture: Path) -> None:

@@ -41,7 +41,7 @@ from vibrissa.tracking.trace.identity import (
 )
 from vibrissa.tracking.trace.ridge import measure, noise_level, prolonged, traced
 from vibrissa.tracking.trace.scene import Scene
-from vibrissa.tracking.trace.trace import STEP, Trace, aligned, even, given, overlap
+from vibrissa.tracking.trace.trace import STEP, Trace, aligned, arc_lengths, even, given, overlap
 
 _DOUBT = 0.6
 """Least difference to a way that gives a whisker another line."""
@@ -69,6 +69,9 @@ _TRIED = 4
 
 _ALONG, _DIRECTION = 0.4, 10
 """Weight of a click's distance along a line, and number of points that give its direction."""
+
+_HAIR, _BEFORE = 40.0, 0.1
+"""Largest length of a line before a click, pixels, and by how much that adds to its distance."""
 
 _LIKELY = 100.0
 """Score of a curve from which it is likely to be a whisker."""
@@ -129,18 +132,23 @@ def follow_row(
     _part(followers, {k: trace.line for k, trace in fixed.items()}, frame, scene)
     own = {k: list(followers[k].along_expected(frame, noise)) for k in free}
     pool: list[Trace] = []
+    settled = dict(fixed)
     if all(line is None for line in before) and free:
         chosen = clear = _begun(followers, fixed, frame, noise, scene)
+        # A whisker that hides at its click leaves the lines of the others alone.
+        settled |= clear
     else:
         own |= _straightened(followers, own, fixed, frame, noise, scene)
         chosen = clear = _clearly(followers, own, fixed, frame)
     if len(clear) < len(free):
-        own = {k: [clear[k]] if k in clear else traces for k, traces in own.items()}
-        pool = _pool(followers, own, clear, fixed, frame, noise, scene)
+        left = [k for k in free if k not in settled]
+        own = {k: [clear[k]] if k in clear else own[k] for k in left}
+        pool = _pool(followers, own, clear, settled, frame, noise, scene)
         features = [features_of(frame, trace, followers[0].clutter) for trace in pool]
         apart = _distance_to_next(followers)
-        lines = _assigned([followers[k] for k in free], pool, features, apart[free])
-        chosen = {k: pool[c] for k, c in zip(free, lines, strict=True) if c >= 0}
+        lines = _assigned([followers[k] for k in left], pool, features, apart[left])
+        chosen = {k: trace for k, trace in clear.items() if k in settled}
+        chosen |= {k: pool[c] for k, c in zip(left, lines, strict=True) if c >= 0}
     found = []
     for k, follower in enumerate(followers):
         if k in fixed:
@@ -205,7 +213,7 @@ def _begun(
     rows, columns = linear_sum_assignment(np.minimum(price, 2.0 * LOST))
     lines = [one.line for one in every]
     starts = {
-        free[i]: _up_to_a_crossing(even(lines[c]), lines)
+        free[i]: _up_to_a_crossing(even(lines[c][_passed(clicked[i], lines[c])[1] :]), lines)
         for i, c in zip(rows, columns, strict=True)
         if price[i, c] < 2.0 * LOST
     }
@@ -366,8 +374,19 @@ def _kink(trace: Trace) -> float:
 
 def _price(click: Array, curve: Curve, half: float) -> float:
     """Cost of taking a curve for the whisker that was clicked."""
-    away = LOST * (_from_click(click, curve.line) / min(_CLICK, half)) ** 2
-    return away + _SHORT / (1.0 + curve.score / _LIKELY)
+    away = min(_from_click(click, curve.line), _passed(click, curve.line)[0])
+    return LOST * (away / min(_CLICK, half)) ** 2 + _SHORT / (1.0 + curve.score / _LIKELY)
+
+
+def _passed(click: Array, line: Array) -> tuple[float, int]:
+    """Distance of a click from where a line passes it, which has hairs before that, and the point.
+
+    What is before counts a little.
+    """
+    near = line[arc_lengths(line) < _HAIR]
+    far = np.hypot(*(near - click).T) + _BEFORE * arc_lengths(near)
+    at = int(np.argmin(far))
+    return float(far[at]), at
 
 
 def _up_to_a_crossing(line: Array, every: Sequence[Array]) -> Array:

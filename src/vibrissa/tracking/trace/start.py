@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from vibrissa.cameras import Camera, triangulate
 from vibrissa.io import Frame
 from vibrissa.numerics import Array, Mask
+from vibrissa.tracking.trace.clutter import Bits, Clutter
 from vibrissa.tracking.trace.curves import Curve, find_curves
 from vibrissa.tracking.trace.epipolar import seen_along
 from vibrissa.tracking.trace.follower import start_at
@@ -48,6 +49,10 @@ _TOGETHER, _SELDOM = 3.0, 0.2
 """Distance within which tips of one whisker agree where both views show them, pixels, and the
 smallest share of frames in which they do: less than half, for they may be faint."""
 
+_CUT, _LAST, _ENDING = 16.0, 10, 0.3
+"""Distance before which something still may cut a line, pixels, number of the last points that give
+its direction, and share of the frames in which tips must be open to be compared."""
+
 _SAME = 25.0
 """Largest distance between bases of one whisker in two frames, pixels."""
 
@@ -70,6 +75,9 @@ which it is clearly seen. Without one it is 0.1 to 0.2."""
 
 _SHOWN, _ALIKE = 4, 0.5
 """Number of candidates that are compared, and share of its line from which one is another one."""
+
+_FAINTEST = 0.05
+"""Confidence from which another candidate is shown."""
 
 _POLARITY = 3
 """Number of frames in which bright and dark whiskers are compared."""
@@ -228,6 +236,7 @@ class _Search:
     scenes: Sequence[Scene]
     options: TraceOptions
     known: dict[tuple[int, int], list[Curve]] = field(default_factory=dict)
+    still: dict[int, Bits | None] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -342,6 +351,19 @@ class _Search:
                 found.append(_Combination(moment, worth, bases, float(gap), tip, share, one))
         return sorted(found, key=lambda one: -one.worth)
 
+    def ends(self, one: _Combination) -> bool:
+        """Whether no line runs behind or along something still at its end, which may cut it."""
+        for view, curve in enumerate(one.curves):
+            if view not in self.still:
+                base, frames = one.bases[view][None], self.frames[view]
+                self.still[view] = self.scenes[view].with_still(base, frames).bits
+            bits, (before, last) = self.still[view], curve.line[[-_LAST, -1]]
+            ahead = np.linspace(0.0, _CUT, 9)[:, None] * (last - before)
+            ahead /= max(float(np.hypot(*(last - before))), 1e-9)
+            if bits is not None and Clutter(bits, 0).disturbs(last + ahead).any():
+                return False
+        return True
+
     def worth(self, moments: Sequence[int]) -> float:
         """Evidence of whiskers in some frames."""
         found = [self._combined(m, self.curves(m)) for m in moments]
@@ -420,6 +442,9 @@ def _start(search: _Search, vote: _Vote, bright: bool) -> Start:
     if gap > 0.5 * _GAP:
         doubts.append(f"its base is {gap:.0f} pixels from where the other view shows it")
     tips = [one.tip_gap * min(c.length for c in one.curves) for one in vote.winners]
+    if np.mean(np.array(tips) < _TOGETHER) < _SELDOM:
+        open_ = [tip for one, tip in zip(vote.winners, tips, strict=True) if search.ends(one)]
+        tips = open_ if len(open_) > _ENDING * len(tips) else [0.0]
     together = float(np.mean(np.array(tips) < _TOGETHER))
     if together < _SELDOM:
         doubts.append(f"views show its tip at one place in {100.0 * together:.0f} % of frames only")
@@ -435,6 +460,8 @@ def _others(vote: _Vote, best: _Combination, confidence: float) -> tuple[Candida
     found = [best]
     shown = []
     for worth, row in vote.others:
+        if confidence * worth < _FAINTEST:
+            continue
         one = min(row, key=lambda other: abs(other.frame - best.frame))
         pairs = [zip(one.curves, other.curves, strict=True) for other in found]
         if not any(all(overlap(a.line, b.line) > _ALIKE for a, b in pair) for pair in pairs):

@@ -1,14 +1,17 @@
 """Tracking of films by another renderer: traces, contact, wrench, base and the peg, against truth.
 
-``python studies/tracking.py [SEED ...] [--page]`` films whisks past a peg through lenses at 0.6 m,
-100 µm a pixel, each under another of six kinds of conditions, and tracks them with the base clicked
-where it truly is; whether that would have been found without a click is judged apart. Then rows of
-whiskers that cross. By default seeds 61 to 66, on which no number was set; two minutes on a free
-core. ``--page`` writes the tables into `docs/tracking-accuracy.md`, else they are printed.
+``python studies/tracking.py [SEED ...] [--part films|rows|ways] [--page]`` films whisks past a peg
+through lenses at 0.6 m, 100 µm a pixel, each under another of six kinds of conditions, and tracks
+them with the base clicked where it truly is; whether that would have been found without a click is
+judged apart. Then rows of whiskers that cross, and three of the films as a laboratory without
+clicks, with a mirror or with one camera has them. By default seeds 61 to 66, on which no number was
+set; three minutes on a free core, of which ``--part`` makes one part only. ``--page`` writes the
+tables into `docs/tracking-accuracy.md`, else they are printed.
 """
 
 import argparse
 import sys
+import tempfile
 import time
 from itertools import cycle
 from pathlib import Path
@@ -23,6 +26,7 @@ from scipy.stats import chi2
 
 from vibrissa.cameras import orthogonal_views
 from vibrissa.contour import shape_from_dataset
+from vibrissa.io import read_video, write_video
 from vibrissa.pipeline import placed_by, signals_of, with_contour, with_group
 from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE
 from vibrissa.simulation import measure
@@ -61,6 +65,8 @@ ROWS = ((31, 3), (32, 3), (33, 4), (34, 5))
 WARM = 10
 """Number of frames before the time of a frame is taken: the first ones find light and whisker."""
 ROW_HEAD = ("film", "whiskers", "view", "images", "right, %", "lost, %", "swapped, %", "ms")
+WAYS = (62, 65, 66)
+WAY_HEAD = ("film", "way", "lost, wrong", "contact right, %", "contact, µm (95 %)", "held: contact")
 NEAR = 3e-3
 """Distance from a contact within which a trace is near it, m."""
 
@@ -152,13 +158,19 @@ class Clock:
         return (self.times[-1] - self.times[WARM - 1]) / (len(self.times) - WARM)
 
 
-def one_film(name, look, seed):
-    """One row of the table."""
+def filmed(name, look, seed):
+    """A film: trial, peg, lenses, frames, stated cameras and truth."""
     trial, peg = whisk(seed, FRAMES, *OUTER.get(name, ()))
     lenses = views(DISTANCE, pixel=PIXEL, size=SIZE)
     frames = film(trial, lenses, (peg.origin, peg.axis, peg.radius), look, seed=seed)
     cameras = stated_lenses(orthogonal_views(PIXEL, (SIZE, SIZE)), DISTANCE)
     truth = {n: v.values[:, 0] for n, v in trial["truth"].to_dataset().data_vars.items()}
+    return trial, peg, lenses, frames, cameras, truth
+
+
+def one_film(name, look, seed):
+    """One row of the table."""
+    trial, peg, lenses, frames, cameras, truth = filmed(name, look, seed)
     base = trial["base_position"].values[:, 0]
     clocks = [Clock() for _ in lenses]
     traces = [
@@ -213,27 +225,84 @@ def row_films():
             yield [*about, *shares, f"{clock.each:.0f}"]
 
 
+def way_films():
+    """Rows of the table of other ways to film: without clicks, by a mirror, in one view."""
+    for seed in WAYS:
+        name, look = list(KINDS.items())[(seed - 61) % len(KINDS)]
+        trial, _, lenses, frames, cameras, truth = filmed(name, look, seed)
+        clicked = [lens(trial["base_position"].values[0, 0]) for lens in lenses]
+        some = np.linspace(0, FRAMES - 1, 30).astype(int)
+        found = find_start(cameras, [[view[i] for i in some] for view in frames]).bases
+        ways = {"clicked": (frames, clicked), "without clicks": (frames, found)}
+        with tempfile.TemporaryDirectory() as folder:
+            # The second view is left of the first, as a mirror shows it.
+            both = [np.hstack([front[:, ::-1], top]) for top, front in zip(*frames, strict=True)]
+            path = Path(folder) / "mirror.mp4"
+            write_video(path, both)
+            parts = (f"{SIZE},0,{SIZE},{SIZE}", f"0,0,{SIZE},{SIZE}:mirrored")
+            ways["mirror, H.264"] = (
+                [list(read_video(f"{path}#{part}")) for part in parts],
+                clicked,
+            )
+        ways["one view, in its plane"] = (frames[:1], clicked[:1])
+        for way, (shown, bases) in ways.items():
+            if bases is None:
+                yield [f"{name}, {seed}", way, "refused", "–", "–", "–"]
+                continue
+            yield [f"{name}, {seed}", way, *one_way(shown, bases, lenses, cameras, truth)]
+
+
+def one_way(frames, bases, lenses, cameras, truth):
+    """Images lost and wrong, frames with right contact, its error, µm, and what regions hold."""
+    count = len(frames)
+    traces = [trace_video(v, [base]) for v, base in zip(frames, bases, strict=True)]
+    touching = truth["in_contact"] > 0
+    lost, wrong, _ = traces_against(traces, lenses[:count], truth, touching)
+    data = track(cameras[:count], traces, RATE, TrackOptions()).to_dataset()
+    stated = data["in_contact"].values[:, 0] > 0
+    both, axes = touching & stated, slice(0, 1 + count)
+    away = (data["contact_point"].values[:, 0] - truth["contact_point"])[both, axes]
+    half, most = 1e6 * np.percentile(np.linalg.norm(away, axis=1), [50, 95])
+    return [
+        f"{lost}, {wrong} of {count * FRAMES}",
+        f"{100 * float((stated == touching).mean()):.1f}",
+        f"{half:.0f} ({most:.0f})",
+        f"{100 * held(away, data['contact_covariance'].values[both, 0, axes, axes]):.0f} %",
+    ]
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("seeds", nargs="*", type=int, default=range(61, 67), metavar="SEED")
     parser.add_argument("--page", action="store_true", help="write the tables into the page")
+    parser.add_argument("--part", choices=PARTS, help="make one table only")
     chosen = parser.parse_args()
-    single = []
-    for seed, (name, look) in zip(chosen.seeds, cycle(KINDS.items()), strict=False):
-        try:
-            single.append(one_film(name, look, seed))
-        except ValueError as fault:
-            single.append([f"{name}, {seed}", *["–"] * (len(HEAD) - 2), f"refused: {fault}"])
-        print(" | ".join(single[-1]), flush=True)
     page = ROOT / "docs" / "tracking-accuracy.md"
-    if chosen.page:
-        put(page, {"films": table(HEAD, single)})
-    several = []
-    for line in row_films():
-        several.append(line)
-        print(" | ".join(line), flush=True)
-    if chosen.page:
-        put(page, {"rows": table(ROW_HEAD, several, 3)})
+    for name, (head, texts, rows) in PARTS.items():
+        if chosen.part not in (None, name):
+            continue
+        lines = []
+        for line in rows(chosen.seeds) if name == "films" else rows():
+            lines.append(line)
+            print(" | ".join(line), flush=True)
+        if chosen.page:
+            put(page, {name: table(head, lines, texts)})
+
+
+def single_films(seeds):
+    """Rows of the table of single whiskers."""
+    for seed, (name, look) in zip(seeds, cycle(KINDS.items()), strict=False):
+        try:
+            yield one_film(name, look, seed)
+        except ValueError as fault:
+            yield [f"{name}, {seed}", *["–"] * (len(HEAD) - 2), f"refused: {fault}"]
+
+
+PARTS = {
+    "films": (HEAD, 1, single_films),
+    "rows": (ROW_HEAD, 3, row_films),
+    "ways": (WAY_HEAD, 2, way_films),
+}
 
 
 if __name__ == "__main__":

@@ -68,12 +68,9 @@ class TraceSeries:
         line, sigma = self.line[:, view], self.sigma[:, view]
         tangent = np.gradient(line, axis=1)
         tangent /= np.linalg.norm(tangent, axis=2, keepdims=True)
-        square = (
-            (pixels**2).sum(2)[:, :, None]
-            + (line**2).sum(2)[:, None, :]
-            - 2.0 * pixels @ np.swapaxes(line, 1, 2)
-        )
-        near = np.argmin(np.where(np.isfinite(square), square, np.inf), axis=2)
+        # Of a lost trace all numbers are NaN, and the first is as good as any.
+        square = (line**2).sum(2)[:, None, :] - 2.0 * pixels @ np.swapaxes(line, 1, 2)
+        near = np.argmin(square, axis=2)
         row = np.arange(len(line))[:, None]
         t, away = tangent[row, near], line[row, near] - pixels
         spacing = np.linalg.norm(line[:, 1] - line[:, 0], axis=1)
@@ -92,7 +89,7 @@ class TraceSeries:
         # An error far beyond what is usual shows that something else is wrong.
         scaled = np.abs(miss) * weight
         weight = weight / np.sqrt(np.maximum(scaled / FAR, 1.0))
-        rows = np.einsum("tni,tnij->tnj", across, slopes) * weight[..., None]
+        rows = (across[..., None, :] @ slopes)[..., 0, :] * weight[..., None]
         misses = miss * weight
         ends, gaps, shown = [], [], []
         for end in (0, -1):

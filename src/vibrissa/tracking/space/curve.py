@@ -268,14 +268,14 @@ def _equations(
         line = trace.line
         tangent = np.gradient(line, axis=0)
         tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-        near = np.argmin(((pixels[:, None, :] - line[None, :, :]) ** 2).sum(axis=2), axis=1)
+        near = np.argmin((line**2).sum(axis=1) - 2.0 * pixels @ line.T, axis=1)
         t, away = tangent[near], line[near] - pixels
         across = np.stack([-t[:, 1], t[:, 0]], axis=1)
         beyond = np.abs((away * t).sum(axis=1)) > 2.0
         sigma = np.sqrt(trace.sigma[near] ** 2 + _FLOOR**2)
         used = np.flatnonzero(~beyond)
         nodes.append(used)
-        rows.append(np.einsum("ni,nij->nj", across, slopes)[used] / sigma[used, None])
+        rows.append((across[:, None] @ slopes)[used, 0] / sigma[used, None])
         misses.append(((away * across).sum(axis=1) / sigma)[used])
         for node, end in ((0, 0), (_SAMPLES - 1, -1)):
             gap = float((line[end] - pixels[node]) @ tangent[end])

@@ -133,6 +133,12 @@ def test_an_independent_check_confirms_boxes_and_no_others(theorem, tmp_path, mo
     write_netcdf(forged, data)
     with pytest.raises(ValueError, match="other numbers"):
         check_certificate(forged)
+    changed = load_certificate(path)
+    curvature = changed.rod.coefficients.copy()
+    curvature[0, 2, 0, 0] = 0.1  # called straight, but bent
+    changed.rod = changed.rod._replace(coefficients=curvature)
+    changed.save(forged)
+    assert not check_certificate(forged, 0).covers
 
 
 def test_an_independent_check_of_a_curved_whisker(curved, tmp_path, monkeypatch):

@@ -220,6 +220,18 @@ def test_critical_cones_do_not_depend_on_the_seed(gamma_map):
     assert one[1, 0] > 31.1
 
 
+def test_climbs_begin_beyond_folds_and_end_on_a_rod_that_has_converged(gamma_map):
+    asked = ["Fx FD MB", "FD MB MD"]
+    for seed in (0, 3):
+        found = vb.uniqueness(gamma_map, asked, ["all", "CB"], resolution=False, seed=seed)
+        cone = np.degrees(found.critical_cone.values)
+        # Where sequential quadratic programming on the finer rod ends: contacts are as near to each
+        # other as may be, and on the coarse rod nearer still.
+        assert cone[0, 0] == pytest.approx(57.075, abs=2e-3)
+        # A pair that is large deflected, from contacts whose determinant has the rarer sign.
+        assert cone[1, 1] == pytest.approx(32.872, abs=5e-3)
+
+
 def test_a_rare_pair_within_one_region_is_found(gamma_map):
     """One contact in 300 has its twin in the same region; among few samples there may be none."""
     found = vb.uniqueness(gamma_map, ["Fx FT FD"], ["CB"], resolution=False)

@@ -229,14 +229,20 @@ def _identity(data: xr.Dataset) -> str:
 
 
 def _domains_fit(data: xr.Dataset) -> bool:
-    """Whether the parts are the domain, its two ends and the face of the largest force."""
+    """Whether the rod is a straight cone, and the parts those of the lemma.
+
+    These are the domain, its two ends and the face of the largest force. A curved whisker's file
+    that is called straight, or a rod of several pieces, is none that these equations are for.
+    """
+    rod = data["rod_coefficients"].values
+    cone = len(rod) == 1 and not rod[0, :3].any() and not rod[0, 3, 2:].any()
     near = float(data["interior_domain"].values[0, 0])
     ends = np.array([[near, 1, 0, 1], [near, near, 0, 1], [1, 1, 0, 1], [near, 1, 1, 1]])
     fits = all(
         np.array_equal(data[f"{part}_domain"].values.ravel(), end)
         for part, end in zip(PARTS, ends, strict=True)
     )
-    return fits and np.array_equal(data["stations"], [near, 1.0])
+    return bool(cone and fits and np.array_equal(data["stations"], [near, 1.0]))
 
 
 def covers(boxes: NDArray[np.int64]) -> bool:

@@ -58,7 +58,10 @@ def uniqueness(
                     progress=lambda done, total: tell("certificate", done, total),
                 )
             except KeyboardInterrupt:
-                remark(f"{certify} holds what is certain by now; the same command goes on from it")
+                if certify.exists():  # not where it was still being set up
+                    remark(
+                        f"{certify} holds what is certain by now; the same command goes on from it"
+                    )
                 raise
         tell("verdicts", 0, 1)
         found = vb.uniqueness(
@@ -98,9 +101,10 @@ def uniqueness(
 def _print_proofs(found: Dataset, bracket: tuple[float, float]) -> None:
     """Print what is proved: bounds on the critical cone, and triplets with proved witnesses."""
     low, high = np.rad2deg(bracket)
+    below = f"{low:.3g}° (witness, proved) ≤ " if low > 0.0 else ""
     above = f" ≤ {high:.3g}° (certificate)" if np.isfinite(high) else ""
-    if low > 0.0 or above:
-        say(f"{low:.3g}° (witness, proved) ≤ critical cone of (Fx, MB, MD){above}")
+    if below or above:
+        say(f"{below}critical cone of (Fx, MB, MD){above}")
     over = ["region", "witness"]
     there = found["witness_separation"].notnull().any(over).values
     proved = (found["witness_proved"] == 1).any(over).values

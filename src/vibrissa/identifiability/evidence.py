@@ -49,8 +49,10 @@ TOLERANCES = (1e-6, 1e-4, 1e-3, 1e-2)
 _WIDER = 8
 # Further searches of regions without witnesses.
 _AGAIN = 4
-# Samples that are the same for every seed.
-_FIXED = 2048
+# Samples that are the same for every seed: those that are inverted, and those in which folds are
+# looked for; and contacts of each region beyond a fold, the farthest from rest, that are inverted.
+_FIXED, _FIXED_WIDE = 2048, 32768
+_BEYOND = 48
 # Pairs found again on a finer rod at a time, and how many times at most.
 _CONFIRMED = 24
 _ROUNDS = 20
@@ -154,7 +156,7 @@ def ask(
         cone,
         domain,
         samples,
-        sample(contact_map, spread(min(_FIXED, number), None), domain),
+        sample(contact_map, spread(min(_FIXED_WIDE, _WIDER * number), None), domain),
         wide,
         span,
         probed,
@@ -193,9 +195,12 @@ class _Cell(NamedTuple):
 def answer(question: Question, names: tuple[str, ...], resolution: bool) -> Answer:
     """All evidence on one triplet."""
     samples, span = question.samples, question.span[signal_columns(names)]
-    by_contact = triplet_derivatives(question.wide.contacts.values, question.wide.tangents, names)
     lost = deficient(question.contact_map, names, samples.contacts.xi[:_PROBED], span)
-    local = _nothing_local(question) if lost is not None else _local(question, by_contact)
+    local = (
+        _nothing_local(question, question.wide)
+        if lost is not None
+        else _local(question, names, question.wide)
+    )
     on_surface: tuple[Pairs, int] | None = None
     if lost is not None:
         tried = _some(question, samples.contacts)
@@ -251,18 +256,26 @@ def _searched(question: Question, names: tuple[str, ...], own: Pairs, local: Loc
     rare &= np.any([local.rarer[question.regions.index(r)] for r in without], axis=0)
     pool = joined([pool, _twins_of(question, names, wide.rows(np.flatnonzero(rare)[:_RARE]))])
     search = Search(question.contact_map, names, question.separation, question.domain)
-    # Climbs begin at the same pairs for every seed: its own samples only add to where they end.
-    fixed = _twins_of(question, names, question.fixed)
-    better = better_twins(search, fixed, question.regions, np.random.default_rng(0))
-    fixed = joined([fixed, better])
-    pool = joined([pool, fixed, farthest_twins(search, fixed, question.regions)])
+    # Climbs begin at the same pairs for every seed, and at its own only where these are farther.
+    spread_out = _twins_of(
+        question, names, question.fixed.rows(slice(min(_FIXED, len(question.samples.chart))))
+    )
+    better = better_twins(search, spread_out, question.regions, np.random.default_rng(0))
+    fixed = [joined([spread_out, better]), _twins_beyond_folds(question, names)]
+    summits = farthest_twins(search, fixed, question.regions)
+    reached = _farthest_angles(question, joined([*fixed, summits]), question.regions)
+    beaten = _farthest_angles(question, pool, question.regions) > reached
+    regions = tuple(np.array(question.regions)[beaten].tolist())
+    pool = joined([pool, *fixed, summits])
+    if regions:
+        pool = joined([pool, farthest_twins(search, [pool], regions)])
     rng = np.random.default_rng(question.seed)
     for _ in range(_AGAIN):
         regions = _without_witness(question, pool, question.regions)
         if not regions:
             break
         found = better_twins(search, pool, regions, rng)
-        pool = joined([pool, found, farthest_twins(search, found, regions)])
+        pool = joined([pool, found, farthest_twins(search, [found], regions)])
     return pool
 
 
@@ -270,14 +283,27 @@ def _twins_of(question: Question, names: tuple[str, ...], start: Samples) -> Pai
     return twins(question.contact_map, names, start.chart, start.contacts, question.domain)
 
 
+def _twins_beyond_folds(question: Question, names: tuple[str, ...]) -> Pairs:
+    """Twins of contacts that are the same for every seed, near folds and beyond them."""
+    local = _local(question, names, question.fixed)
+    angle = question.fixed.contacts.angle
+    rows = [local.near_folds]
+    for rarer in local.rarer:
+        there = np.flatnonzero(rarer)
+        rows.append(there[np.argsort(-angle[there], kind="stable")[:_BEYOND]])
+    return _twins_of(question, names, question.fixed.rows(np.unique(np.concatenate(rows))))
+
+
+def _farthest_angles(question: Question, pool: Pairs, regions: tuple[str, ...]) -> Array:
+    """The largest cone angle of a pair of each region, 0 where there is none."""
+    angle = np.where(pool.apart >= question.separation, pool.angle, 0.0)
+    return np.array([angle[pool.members(region)].max(initial=0.0) for region in regions])
+
+
 def _without_witness(question: Question, pool: Pairs, regions: tuple[str, ...]) -> tuple[str, ...]:
     """Regions of which no pair is outside the cone."""
-    far = pool.apart >= question.separation
-    return tuple(
-        region
-        for region in regions
-        if pool.angle[far & pool.members(region)].max(initial=0.0) <= question.cone
-    )
+    near = _farthest_angles(question, pool, regions) <= question.cone
+    return tuple(np.array(regions)[near].tolist())
 
 
 def _judge(
@@ -418,26 +444,26 @@ def _shares(
     return _weighted(question, hit, rows), elevation
 
 
-def _nothing_local(question: Question) -> Local:
+def _nothing_local(question: Question, samples: Samples) -> Local:
     n = len(question.regions)
     return Local(
         np.full(n, np.nan),
         np.full(n, np.nan),
         np.full((n, 2), np.nan),
         np.zeros(0, dtype=int),
-        np.zeros((n, len(question.wide.chart)), dtype=bool),
+        np.zeros((n, len(samples.chart)), dtype=bool),
     )
 
 
-def _local(question: Question, by_contact: Array) -> Local:
-    """Where det ∂T/∂p changes its sign.
+def _local(question: Question, names: tuple[str, ...], samples: Samples) -> Local:
+    """Where det ∂T/∂p changes its sign among samples.
 
     Where T collapses on the plane of a planar whisker, the sign may change there although T does
     not fold: with M_x and M_D, for example, both of which change sign with z. So the two sides of
     the plane are also taken separately.
     """
-    out, samples = _nothing_local(question), question.wide
-    contacts, volume = samples.contacts, samples.volume
+    out, contacts, volume = _nothing_local(question, samples), samples.contacts, samples.volume
+    by_contact = triplet_derivatives(contacts.values, samples.tangents, names)
     # Relative to the lengths of the gradients: how nearly they lie in a plane. det ∂p/∂ξ > 0 in Ω.
     size = np.prod(np.linalg.norm(by_contact, axis=2), axis=1)
     det = np.linalg.det(by_contact) / np.where(size > 0.0, size, 1.0)

@@ -15,6 +15,7 @@ them: climbs keep off contacts where det ∂T/∂ξ vanishes for both.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -22,17 +23,19 @@ import numpy as np
 
 from vibrissa.identifiability.programs import steepest
 from vibrissa.identifiability.regions import contact_set
-from vibrissa.identifiability.twins import Pairs, Search, twins_near, units
+from vibrissa.identifiability.twins import FINER, Pairs, Search, twins_near, units
 from vibrissa.numerics import AnyArray, Array, cross
-from vibrissa.rod import chart_of, solve_forces, with_normal_force
+from vibrissa.rod import chart_of, discretize, solve_forces, with_normal_force
 
 # Climbs of each region, the steps they take, and the cost of a violated margin in rad, in rounds
-# that go on with the best of them.
-_ROUNDS = ((20, 8, 30.0), (6, 12, 30.0), (2, 30, 1000.0))
+# that go on with the best of them. The last is on a finer rod, where witnesses must hold: a summit
+# is where margins vanish, and what the integration errs by would violate them.
+_ROUNDS = ((20, 8, 30.0), (6, 12, 30.0), (2, 30, 1000.0), (2, 6, 1000.0))
 # Starts of a region are in different parts of the chart, so many an axis.
 _PARTS = np.array([3.0, 3.0 / np.pi, 3.0])
-# Trust regions, in units of L and of the fold force: the first, the largest, and where climbs end.
-_FIRST, _LARGEST, _LAST = 0.1, 0.3, 1e-5
+# Trust regions, in units of L and of the fold force: the first, that on the finer rod, the largest,
+# and where climbs end.
+_FIRST, _FINE, _LARGEST, _LAST = 0.1, 1e-3, 0.3, 1e-5
 # A climb also ends where the linear program promises no more than this, rad.
 _LEAST_GAIN = 1e-5
 # What is kept of each margin so that no summit violates one.
@@ -173,28 +176,33 @@ class _Mountain:
         return basis, slopes
 
 
-def farthest_twins(search: Search, pairs: Pairs, regions: tuple[str, ...]) -> Pairs:
-    """Climb from the best pairs of each region to where their cone angle is largest.
+def farthest_twins(search: Search, pools: Sequence[Pairs], regions: tuple[str, ...]) -> Pairs:
+    """Climb from the best pairs of each pool and region to where their cone angle is largest.
 
-    Where a climb ends depends on where it begins: the largest is a lower bound.
+    Where a climb ends depends on where it begins: the largest is a lower bound. Each pool has its
+    own climbs, so that none crowds out another.
     """
-    contact_map, names, _, domain = search
     mountain = _Mountain(search, _ROUNDS[0][2])
     signs = np.array(
         [[("CB" in r) * 1.0 - ("CF" in r), float("ELD" in r)] for r in regions]
     ).reshape(-1, 2)
-    number, xi = _starts(search, pairs, signs)
+    starts = [_starts(search, pairs, signs) for pairs in pools]
+    number = np.concatenate([k * len(regions) + found[0] for k, found in enumerate(starts)])
+    xi = np.concatenate([found[1] for found in starts])
     if not number.size:
-        return pairs.rows(number)
-    signs = signs[number]
+        return pools[0].rows(number)
+    signs = signs[number % len(regions)]
     state = mountain.at(xi, signs)
     size = np.full(len(xi), _FIRST)
     for most, steps, cost in _ROUNDS:
-        mountain = replace(mountain, cost=cost)
+        last = (most, steps, cost) == _ROUNDS[-1]
+        mountain = replace(mountain, cost=cost, search=_finer(search) if last else search)
         merit = np.where(np.isfinite(state.merit), _merit(state.levels, cost), -np.inf)
-        state = state._replace(merit=merit)
-        kept = _leading(state.merit, number, most)
-        state, number, signs, size = state.rows(kept), number[kept], signs[kept], size[kept]
+        kept = _leading(merit, number, most)
+        number, signs, size = number[kept], signs[kept], size[kept]
+        state = state.rows(kept)._replace(merit=merit[kept])
+        if last:
+            state, size = mountain.at(state.xi, signs), np.full(len(kept), _FINE)
         for _ in range(steps):
             active = np.flatnonzero(size > _LAST)
             if not active.size:
@@ -203,10 +211,19 @@ def farthest_twins(search: Search, pairs: Pairs, regions: tuple[str, ...]) -> Pa
     # The second contact is solved for, from where its signals fix it better.
     regular = _regularity(state.slope)
     xi = np.where((regular[:, 0] > regular[:, 1])[:, None, None], state.xi[:, ::-1], state.xi)
+    contact_map, names, _, domain = mountain.search
     first, second, agrees = twins_near(contact_map, names, xi[:, 0], xi[:, 1], domain)
     apart = np.linalg.norm(second.values[:, 3:] - first.values[:, 3:], axis=1)
     chart = chart_of(contact_map.chart.fold, first.xi)
     return Pairs(chart, np.zeros(len(chart), np.int64), first, second, apart).rows(agrees)
+
+
+def _finer(search: Search) -> Search:
+    """The same on the rod that witnesses are confirmed on."""
+    contact_map = search.contact_map
+    finer = discretize(contact_map.whisker, FINER * contact_map.steps)
+    chart = replace(contact_map.chart, discretization=finer)
+    return search._replace(contact_map=replace(contact_map, chart=chart))
 
 
 def _regularity(slope: Array) -> Array:

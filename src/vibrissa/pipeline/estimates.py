@@ -187,21 +187,17 @@ def estimates_of(
     if mapped:  # whiskers without contact need none
         report("map of all contacts", count, count)
     out = xr.concat(parts, "whisker").transpose("time", "whisker", ...)
-    about: dict[str, Any] = {
+    # What was assumed is stated where it is not the default.
+    out.attrs = {
         "signals": WHOLE if whole else " ".join(names),
         "source": str(data.attrs.get("source", "not known")),
         "felt_above": float(np.median([part.attrs["felt_above"] for part in parts])),
+        **({"method": method} if method != "exact" else {}),
+        **(errors or {}),
+        **({"friction": friction} if friction > 0.0 else {}),
+        **({"prior": repr(prior)} if prior is not None else {}),
+        **({"gravity": gravity.acceleration} if gravity is not None else {}),
     }
-    if method != "exact":
-        about["method"] = method
-    about |= errors or {}
-    if friction > 0.0:
-        about["friction"] = friction
-    if prior is not None:
-        about["prior"] = repr(prior)
-    if gravity is not None:
-        about["gravity"] = gravity.acceleration
-    out.attrs = about
     return out.assign_coords({n: data[n].variable for n in ("time", "whisker", "space")})
 
 

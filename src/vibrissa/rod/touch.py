@@ -112,11 +112,10 @@ def _surface_equations(
         pressing += (n[i] + lean[i]) * state[i, 0]
         along += (n[i] + lean[i]) * state[6 + i, 0]
     # The tangent plane's share of friction, way slid, and what is projected.
-    push, way, wanted = np.empty(2), np.empty(2), np.empty(2)
+    push, way, wanted = np.zeros(2), np.zeros(2), np.empty(2)
     give = _give(n, state)
     limit = friction * max(pressing, 0.0)
     for r in range(2):
-        push[r] = way[r] = 0.0
         for i in range(3):
             mean = 0.5 * (state[6 + i, 0] + earlier[3 + i])
             push[r] += e[r, i] * (state[i, 0] - pressing * lean[i])

@@ -1,0 +1,391 @@
+"""A contact and the channels that explain it to second order, along valleys of χ²; compiled.
+
+A contact ξ explains measured channels with residuals r = W (c(ξ) - c̃), in standard deviations.
+These and the contact point p are followed to second order along the principal axes a_i of the noise
+seen in ξ:
+
+    ξ = ξ̂ + Σ a_i (u_i + C_i(u, u)/2),    r(u) = r̂ + B u + H_r(u, u)/2,
+    p(u) = p̂ + A u + H_p(u, u)/2.
+
+Valleys of χ² may be bent in ξ, as where a force is known but for its direction. C bends the axes so
+that they follow valleys: it takes out of H_r what a change along other axes than those displaced
+can undo. Axes are shortened where Ω or the second order ends the density sooner, as at folds of the
+signals.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from vibrissa.contacts.least_squares import channel_equations, lane_contact, whiten
+from vibrissa.numerics import Array, IntArray, cholesky, copy, inlined, mahalanobis
+from vibrissa.rod import LANES, LEAST_ARC, Rod, integrate, lane_value, set_lane
+
+# How far along each axis the second order is taken from, and the other end is tried if there is
+# room for the least, in standard deviations.
+_REACH, _OTHER_END, _LEAST_END = 2.0, 3.0, 1.0
+# How often steps are shortened at most, and what is nothing.
+_TRIALS, _NOTHING = 4, 1e-12
+# Axes bend others if their columns of B, of length 1 unless they were shortened, are this long²
+# at least.
+_DETERMINED = 0.5
+# The longest axis, of s (and relative to the force, 1); and the largest second derivative of -log
+# density along an axis, where its length is not changed: for a normal distribution it is 1.
+_LONGEST, _SHARP = 0.25, 2.0
+# Unknowns that a measurement determines this much worse than others it does not determine.
+_OPEN = 1e-8
+_SWEEPS = 12
+
+
+class Expansion(NamedTuple):
+    """Working memory for one candidate: r̂ (k), B (k, 3), H_r (k, 3, 3); A, H_p; axes in columns.
+
+    Last C (3, 3, 3), and ∂²s/∂u² (3, 3).
+    """
+
+    r0: Array
+    by_r: Array
+    bent_r: Array
+    by_p: Array
+    bent_p: Array
+    axes: Array
+    bends: Array
+    bent_s: Array
+
+
+@inlined
+def principal_axes(x: Array, j: Array, axes: Array) -> bool:
+    """Fill principal axes of the noise in ξ, one standard deviation long; whether there are any.
+
+    One-sided Jacobi rotations make the columns of W ∂c/∂ξ, brought to length one, orthogonal. That
+    of an unknown that is not determined within its longest change remains shorter: where its
+    derivatives vanish, as in a plane of symmetry, they have no direction.
+    """
+    k, force = j.shape[0], max(math.hypot(x[2], x[3]), 1e-300)
+    c, size = np.empty((k, 3)), np.empty(3)
+    for p in range(3):
+        total = 0.0
+        for i in range(k):
+            total += j[i, p] ** 2
+        size[p] = max(math.sqrt(total), 1.0 / (_LONGEST if p == 0 else force))
+        if not size[p] < np.inf:
+            return False
+        for i in range(3):
+            axes[i, p] = 1.0 / size[p] if i == p else 0.0
+        for i in range(k):
+            c[i, p] = j[i, p] / size[p]
+    for _ in range(_SWEEPS):
+        largest = 0.0
+        for p in range(2):
+            for q in range(p + 1, 3):
+                pp, qq, pq = 0.0, 0.0, 0.0
+                for i in range(k):
+                    pp += c[i, p] * c[i, p]
+                    qq += c[i, q] * c[i, q]
+                    pq += c[i, p] * c[i, q]
+                if abs(pq) <= 1e-15 * math.sqrt(pp * qq):
+                    continue
+                largest = max(largest, abs(pq) / math.sqrt(pp * qq))
+                zeta = (qq - pp) / (2.0 * pq)
+                tan = (1.0 if zeta >= 0.0 else -1.0) / (abs(zeta) + math.sqrt(1.0 + zeta * zeta))
+                cos = 1.0 / math.sqrt(1.0 + tan * tan)
+                sin = cos * tan
+                for i in range(k):
+                    a, b = c[i, p], c[i, q]
+                    c[i, p], c[i, q] = cos * a - sin * b, sin * a + cos * b
+                for i in range(3):
+                    a, b = axes[i, p], axes[i, q]
+                    axes[i, p], axes[i, q] = cos * a - sin * b, sin * a + cos * b
+        if largest < 1e-9:
+            break
+    for p in range(3):  # longest first: rounding must not choose the axes' order either
+        for q in range(p + 1, 3):
+            pp, qq = 0.0, 0.0
+            for i in range(k):
+                pp += c[i, p] * c[i, p]
+                qq += c[i, q] * c[i, q]
+            if qq < pp:
+                for i in range(k):
+                    c[i, p], c[i, q] = c[i, q], c[i, p]
+                for i in range(3):
+                    axes[i, p], axes[i, q] = axes[i, q], axes[i, p]
+        total = 0.0
+        for i in range(k):
+            total += c[i, p] * c[i, p]
+        length = max(math.sqrt(total), _OPEN)
+        largest, best = -1.0, 0
+        for i in range(3):  # rounding must not choose an axis's sign either
+            share = abs(axes[i, p]) * size[i]
+            if share > 1.001 * largest:
+                largest, best = share, i
+        scale = math.copysign(1.0 / length, axes[best, p])
+        for i in range(3):
+            axes[i, p] *= scale
+    return True
+
+
+@inlined
+def all_determined(model: Expansion) -> bool:
+    """Whether residuals change along all axes, in first or second order."""
+    by_r, bent_r, largest, least = model.by_r, model.bent_r, 0.0, np.inf
+    for i in range(3):
+        change = 0.0
+        for a in range(by_r.shape[0]):
+            change += by_r[a, i] ** 2 + bent_r[a, i, i] ** 2
+        largest, least = max(largest, change), min(least, change)
+    return bool(least > _OPEN * _OPEN * largest)
+
+
+@inlined
+def cap_axes(x: Array, axes: Array) -> bool:
+    """Shorten axes that leave the whisker, as where signals fold; whether any did."""
+    force, capped = max(math.hypot(x[2], x[3]), 1e-300), False
+    for i in range(3):
+        size = max(abs(axes[0, i]) / _LONGEST, math.hypot(axes[1, i], axes[2, i]) / force)
+        if size > 1.0:
+            capped = True
+            for a in range(3):
+                axes[a, i] /= size
+    return capped
+
+
+@inlined
+def shorten_axes(model: Expansion) -> bool:
+    """Shorten axes along which the second order ends the density sooner; whether there are any."""
+    r0, by_r, bent_r, by_p, bent_p, axes, bends, bent_s = model
+    k, share, some = r0.shape[0], np.ones(3), False
+    for i in range(3):
+        level, bent = 0.0, 0.0
+        for a in range(k):
+            level += by_r[a, i] ** 2 + r0[a] * bent_r[a, i, i]
+            bent += bent_r[a, i, i] ** 2
+        level = max(level, math.sqrt(bent))
+        if level > _SHARP:
+            share[i], some = 1.0 / math.sqrt(level), True
+    for i in range(3 if some else 0):
+        for a in range(k):
+            by_r[a, i] *= share[i]
+            for q in range(3):
+                bent_r[a, i, q] *= share[i] * share[q]
+        for a in range(3):
+            axes[a, i] *= share[i]
+            by_p[a, i] *= share[i]
+            bent_s[i, a] *= share[i] * share[a]
+            for q in range(3):
+                bent_p[a, i, q] *= share[i] * share[q]
+                bends[a, i, q] *= share[i] * share[q] / share[a]
+    return some
+
+
+@inlined
+def _room(x: Array, along: float, up: bool) -> float:
+    """How many standard deviations there are on the whisker, one of which changes s by so much."""
+    return float((1.0 - x[0] if up else x[0] - LEAST_ARC) / max(abs(along), _NOTHING))
+
+
+@inlined
+def _ends(x: Array, axes: Array, steps: Array, others: Array) -> None:
+    """Fill how far to go along each axis, signed: where there is more room, and the other way."""
+    for i in range(3):
+        up, down = _room(x, axes[0, i], True), _room(x, axes[0, i], False)
+        far, near = max(up, down), min(up, down)
+        side = 1.0 if (up >= down) == (axes[0, i] >= 0.0) else -1.0
+        steps[i], others[i] = side * min(_REACH, far), -side * min(_OTHER_END, near)
+
+
+@inlined
+def _load(b: Array, x: Array, model: Expansion, steps: Array, moved: Array) -> None:
+    """Load contacts displaced along the bent axes; ``moved`` (4, 4), the last as the third.
+
+    Steps that would leave the whisker are shortened.
+    """
+    axes, bends, bent_s = model.axes, model.bends, model.bent_s
+    for i in range(LANES):
+        at = min(i, 2)
+        for _ in range(_TRIALS):
+            s = x[0] + steps[at] * (axes[0, at] + 0.5 * steps[at] * bent_s[at, at])
+            if not LEAST_ARC <= s <= 1.0:
+                steps[at] *= 0.5
+        h = steps[at]
+        for c in range(3):
+            change = h * axes[c, at]
+            for a in range(3):
+                change += 0.5 * h * h * axes[c, a] * bends[a, at, at]
+            moved[i, min(c, 1) + c] = x[min(c, 1) + c] + change
+        moved[i, 0], moved[i, 1] = min(max(moved[i, 0], LEAST_ARC), 1.0), 0.0
+        set_lane(b, i, moved[i, 0], 0.0, moved[i, 2], moved[i, 3], False)
+
+
+@inlined
+def _by_axis(derivatives: Array, axes: Array, i: int) -> float:
+    """One derivative along axis i."""
+    return float(
+        derivatives[0] * axes[0, i] + derivatives[1] * axes[1, i] + derivatives[2] * axes[2, i]
+    )
+
+
+@inlined
+def _missed(model: Expansion, i: int, h: float, r: Array) -> float:
+    """What the second order misses of the channels' residuals on an axis, at the usual distance."""
+    away = 0.0
+    for a in range(r.shape[0]):
+        by, bent = model.by_r[a, i], model.bent_r[a, i, i]
+        away += (r[a] - model.r0[a] - h * by - 0.5 * h * h * bent) ** 2
+    return math.sqrt(away) * (_REACH / abs(h)) ** 3
+
+
+@inlined
+def expand(
+    rod: Rod,
+    b: Array,
+    codes: IntArray,
+    target: Array,
+    weights: Array,
+    x: Array,
+    slopes: Array,
+    j: Array,
+    model: Expansion,
+) -> None:
+    """Fill B, H_r, A, H_p and C of the model, by derivatives at contacts displaced along each axis.
+
+    These come nearer along an axis that leaves a bent valley, or that the second order ends.
+    """
+    _, by_r, bent_r, by_p, bent_p, axes, bends, bent_s = model
+    k, steps, others, nearer = codes.shape[0], np.empty(3), np.empty(3), True
+    moved, value, t, third = np.empty((LANES, 4)), np.empty(6), np.zeros((6, 4)), np.empty((6, 3))
+    residual, jacobian, four = np.empty(k), np.empty((k, 4)), np.empty((k, 4))
+    r, there = np.empty(k), np.empty((k, 3))
+    for i in range(3):
+        for a in range(k):
+            by_r[a, i] = _by_axis(j[a], axes, i)
+        for a in range(3):
+            by_p[a, i] = _by_axis(slopes[a], axes, i)
+    _ends(x, axes, steps, others)
+    bends[:], bent_s[:] = 0.0, 0.0
+    for _ in range(_TRIALS):
+        if not nearer:
+            break
+        nearer = False
+        _load(b, x, model, steps, moved)
+        integrate(rod, b, 3)
+        for i in range(3):
+            h, away = steps[i], 0.0
+            lane_contact(b, i, False, value, t, third)
+            channel_equations(moved[i], value, t, codes, target, residual, jacobian)
+            whiten(weights, residual, jacobian, k, r, four)
+            without_friction(four, there)
+            for q in range(3):
+                for a in range(k):
+                    bent_r[a, i, q] = (_by_axis(there[a], axes, q) - by_r[a, q]) / h
+                for a in range(3):
+                    bent_p[a, i, q] = (_by_axis(third[3 + a], axes, q) - by_p[a, q]) / h
+            for a in range(k):
+                away += bent_r[a, i, i] ** 2
+            most = _REACH / math.sqrt(max(math.sqrt(away), 1.0))
+            if abs(h) > _SHARP * most:
+                steps[i], nearer = math.copysign(most, h), True
+    _even(model)
+    _bend(model)
+
+
+@inlined
+def missed_at_ends(
+    rod: Rod, b: Array, codes: IntArray, target: Array, weights: Array, x: Array, model: Expansion
+) -> float:
+    """What the second order misses of the channels at both ends of the bent axes."""
+    k, missed, ends, room = codes.shape[0], 0.0, np.empty((2, 3)), np.empty((2, 3))
+    moved, value, t, r = np.empty((LANES, 4)), np.empty(6), np.zeros((6, 4)), np.empty(k)
+    residual, jacobian, four = np.empty(k), np.empty((k, 4)), np.empty((k, 4))
+    _ends(x, model.axes, ends[0], ends[1])
+    for end in range(2):
+        copy(ends[end], room[end])
+        _load(b, x, model, ends[end], moved)
+        integrate(rod, b, 0)
+        for i in range(3):
+            if abs(ends[end, i]) >= _LEAST_END:
+                lane_value(b, i, value)
+                channel_equations(moved[i], value, t, codes, target, residual, jacobian)
+                whiten(weights, residual, jacobian, k, r, four)
+                missed = max(missed, _missed(model, i, ends[end, i], r))
+            elif abs(room[end, i]) >= _LEAST_END:  # the axis is too bent to be followed
+                missed = np.inf
+    return missed
+
+
+@inlined
+def _bend(model: Expansion) -> None:
+    """Fill C, and make second derivatives those along the bent axes.
+
+    A change along axis m undoes what displacements along two others do to residuals, if these
+    determine it: that of a bent valley. What an axis does to itself, as near folds, remains.
+    """
+    _, by_r, bent_r, by_p, bent_p, axes, bends, bent_s = model
+    for m in range(3):
+        size = 0.0
+        for a in range(by_r.shape[0]):
+            size += by_r[a, m] ** 2
+        if size < _DETERMINED:
+            continue
+        for i in range(3):
+            for q in range(3):
+                if m not in (i, q):
+                    for a in range(by_r.shape[0]):
+                        bends[m, i, q] -= by_r[a, m] * bent_r[a, i, q] / size
+    for m in range(3):
+        for i in range(3):
+            for q in range(3):
+                bent_s[i, q] += axes[0, m] * bends[m, i, q]
+                for a in range(by_r.shape[0]):
+                    bent_r[a, i, q] += by_r[a, m] * bends[m, i, q]
+                for a in range(3):
+                    bent_p[a, i, q] += by_p[a, m] * bends[m, i, q]
+
+
+@inlined
+def without_friction(four: Array, three: Array) -> None:
+    """Copy derivatives by x (n, 4), those by ξ (n, 3)."""
+    for a in range(four.shape[0]):
+        three[a, 0], three[a, 1], three[a, 2] = four[a, 0], four[a, 2], four[a, 3]
+
+
+@inlined
+def _even(model: Expansion) -> None:
+    """Make second derivatives symmetric."""
+    bent_r, bent_p = model.bent_r, model.bent_p
+    for i in range(3):
+        for q in range(i):
+            for a in range(bent_r.shape[0]):
+                bent_r[a, i, q] = bent_r[a, q, i] = 0.5 * (bent_r[a, i, q] + bent_r[a, q, i])
+            for a in range(3):
+                bent_p[a, i, q] = bent_p[a, q, i] = 0.5 * (bent_p[a, i, q] + bent_p[a, q, i])
+
+
+@inlined
+def second_order_size(model: Expansion) -> float:
+    """How large second derivatives are in standard deviations of channels and the point."""
+    bent_r, by_p, bent_p = model.bent_r, model.by_p, model.bent_p
+    root, back, v = np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
+    first_order_covariance(by_p, v)
+    if not cholesky(v, root):
+        return np.inf
+    largest = 0.0
+    for i in range(3):
+        for q in range(3):
+            total = 0.0
+            for a in range(bent_r.shape[0]):
+                total += bent_r[a, i, q] ** 2
+            for a in range(3):
+                back[a] = bent_p[a, i, q]
+            largest = max(largest, total + mahalanobis(root, back))
+    return math.sqrt(largest)
+
+
+@inlined
+def first_order_covariance(by_p: Array, covariance: Array) -> None:
+    """Fill A Aᵀ."""
+    for a in range(3):
+        for c in range(3):
+            covariance[a, c] = _by_axis(by_p[a], by_p.T, c)

@@ -263,8 +263,9 @@ def test_videos_that_differ_in_length_are_told(videos, tmp_path):
 
 
 def test_traces_are_kept_for_their_own_video_only(tmp_path):
-    row = (np.arange(6.0).reshape(3, 2), np.ones(3), np.ones(3, dtype=bool), 0.5, True, False, 0.2)
-    lost = (np.empty((0, 2)), np.empty(0), np.empty(0, dtype=bool), 0.0, True, True, 0.0)
+    line = np.arange(6.0).reshape(3, 2)
+    row = (line, np.ones(3), np.ones(3, dtype=bool), 0.5, True, False, 0.2, False)
+    lost = (np.empty((0, 2)), np.empty(0), np.empty(0, dtype=bool), 0.0, True, True, 0.0, False)
     save_traces(tmp_path / "t.npz", "this", [[row, lost], [lost, row]])
     ((first, second), (third, fourth)) = load_traces(tmp_path / "t.npz", "this")
     np.testing.assert_array_equal(first[0], row[0])

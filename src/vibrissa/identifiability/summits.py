@@ -86,6 +86,11 @@ class _Mountain:
 
     def at(self, xi: Array, signs: Array) -> _State:
         """Pairs of equal triplets next to contacts (n, 2, 3), of regions with such signs."""
+        # A pair that runs off has no signals, and so no merit.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return self._at(xi, signs)
+
+    def _at(self, xi: Array, signs: Array) -> _State:
         unit = self.units(xi)
         for step in range(_CORRECTIONS + 1):
             values, away, slope = self._equations(xi, unit)
@@ -202,7 +207,8 @@ def farthest_twins(search: Search, pools: Sequence[Pairs], regions: tuple[str, .
         number, signs, size = number[kept], signs[kept], size[kept]
         state = state.rows(kept)._replace(merit=merit[kept])
         if last:
-            state, size = mountain.at(state.xi, signs), np.full(len(kept), _FINE)
+            state = mountain.at(state.xi, signs)
+            size = np.where(np.isfinite(state.merit), _FINE, 0.0)  # some are none on this rod
         for _ in range(steps):
             active = np.flatnonzero(size > _LAST)
             if not active.size:

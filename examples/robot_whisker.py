@@ -121,24 +121,29 @@ error = np.array([np.linalg.norm(k.point - point) for k in known])
 sigma = np.array([np.sqrt(np.trace(k.covariance)) for k in known])
 for i in (0, 20, 60, len(time) - 1):
     print(
-        f"{time[i]:5.2f} s: {error[i] * 1e3:6.1f} mm off, ± {sigma[i] * 1e3:6.1f} mm,"
+        f"{time[i]:5.2f} s: {error[i] * 1e3:6.1f} mm error, ± {sigma[i] * 1e3:6.1f} mm,"
         f" {len(known[i].points)} hypotheses"
     )
 
 # %% What the two signals leave, and how the motion of the base narrows it down
 with plots.looking():
     figure, (left, right) = plt.subplots(1, 2, figsize=(7.0, 2.6), layout="constrained")
-    rest_line = wire.centerline(60) * 1e3
-    left.plot(rest_line[:, 0], rest_line[:, 1], color="0.6", linewidth=2.0, label="wire at rest")
+    for line, style, name in (
+        (wire.centerline(60), "--", "wire at rest"),
+        (rest.centerline(60), "-", "bent by the true contact"),
+    ):
+        left.plot(*(1e3 * line[:, :2].T), style, color="0.6", linewidth=1.5, label=name)
     order = np.argsort(one.candidates.arc_length)
     candidates = one.candidates.point[order, :2] * 1e3
     left.plot(*candidates.T, "o-", color="#0072b2", ms=3, label="contacts with these two moments")
     left.plot(*(point[:2] * 1e3), "*", color="#d55e00", ms=9, label="true contact")
-    left.set(xlabel="x (mm)", ylabel="y (mm)", title="One sample leaves a curve of contacts")
-    left.legend()
-    right.semilogy(time, error * 1e3, color="#0072b2", label="error")
-    right.semilogy(time, sigma * 1e3, "--", color="#d55e00", label="predicted error")
-    right.set(xlabel="time (s)", ylabel="error of the contact point (mm)")
-    right.set_title("The motion of the base narrows it down")
+    left.set(xlabel="x (mm)", ylabel="y (mm)", title="One sample of two moments leaves a curve")
+    left.legend(loc="upper left")
+    right.plot(time, error * 1e3, color="#0072b2", label="error")
+    right.plot(time, sigma * 1e3, "--", color="#d55e00", label="predicted error")
+    right.set(xlabel="time (s)", ylabel="error of the contact point (mm)", yscale="log")
+    right.set_yticks([1, 2, 5, 10, 20, 50], ["1", "2", "5", "10", "20", "50"])
+    late = np.median(error[time > 0.8]) * 1e3
+    right.set_title(f"A second of motion of the base leaves {late:.1f} mm")
     right.legend()
 plots.save(figure, folder / "robot_whisker", ["png"])

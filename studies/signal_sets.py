@@ -15,7 +15,17 @@ from pages import save
 
 import vibrissa as vb
 from vibrissa.identifiability.regions import sample, spread
-from vibrissa.plots.style import BLUE, GREEN, INK, MUTED, ORANGE, head, looking, new_figure
+from vibrissa.plots.style import (
+    BLUE,
+    GREEN,
+    INK,
+    MUTED,
+    ORANGE,
+    conclude,
+    head,
+    looking,
+    new_figure,
+)
 
 SETS = (
     ("Fx", "MB", "MD"),
@@ -31,7 +41,7 @@ SHOWN = {
     "Fx MB MD": ("$F_x$, $M_B$, $M_D$", BLUE),
     "Fx FT MD": ("$F_x$, $F_T$, $M_D$", ORANGE),
     "Mx MB MD": ("$M_x$, $M_B$, $M_D$", MUTED),
-    "Fx FT FD Mx MB MD": ("all six", INK),
+    "Fx FT FD Mx MB MD": ("all six signals", INK),
     WRENCH: ("force and moment, friction allowed", GREEN),
 }
 NUMBER = 2048
@@ -100,6 +110,14 @@ def picture(results) -> Figure:
             head(axes, letter, title)
         panels[0].set_ylabel("contacts with a smaller error (%)")
         panels[1].legend(loc="upper left")
+        point, found = next(iter(results.values()))
+        medians = [(np.median(errors(point, found[name])[0]), SHOWN[name][0]) for name in SHOWN]
+        least, middle, most = min(medians), medians[0], max(medians)
+        conclude(
+            figure,
+            f"Median errors in a: {least[1]} {least[0]:.2f} mm; {middle[1]} {middle[0]:.2f} mm; "
+            f"{most[1]} {most[0]:.2f} mm",
+        )
         return figure
 
 

@@ -11,7 +11,17 @@ from matplotlib.lines import Line2D
 from friction_inertia.conditions import CONDITIONS
 from friction_inertia.methods import METHODS, OTHER, SIX, TRIPLET, WRENCH
 from friction_inertia.summaries import LABELS
-from vibrissa.plots.style import BLUE, GREEN, INK, MUTED, ORANGE, head, looking, new_figure
+from vibrissa.plots.style import (
+    BLUE,
+    GREEN,
+    INK,
+    MUTED,
+    ORANGE,
+    conclude,
+    head,
+    looking,
+    new_figure,
+)
 
 COLOURS = dict(zip(METHODS, (BLUE, MUTED, GREEN, ORANGE), strict=True))
 SYMBOLS = {
@@ -33,6 +43,8 @@ where the whisker moves fast."""
 
 SHOWN = ("friction-0", "friction-03", "dynamic")
 RUBBED = LABELS[-1]
+LARGEST = 40.0
+"""End of the axis of errors, mm."""
 
 
 def draw(results: Mapping[str, Any]) -> Figure:
@@ -44,9 +56,10 @@ def draw(results: Mapping[str, Any]) -> Figure:
         for axes, letter, name in zip(panels[0], "abc", SHOWN, strict=True):
             errors(axes, results[name]["true"])
             head(axes, letter, labels[name])
-        limits = np.array([axes.get_ylim() for axes in panels[0]])
+        least = min(axes.get_ylim()[0] for axes in panels[0])
         for axes in panels[0]:
-            axes.set_ylim(limits[:, 0].min(), limits[:, 1].max())
+            # Predictions beyond a whisker's length mean only that nothing is known.
+            axes.set_ylim(least, LARGEST)
         panels[0, 0].set_ylabel("3D error, median (mm)")
         lines = [Line2D([], [], color=COLOURS[method], label=SYMBOLS[method]) for method in METHODS]
         predicted = Line2D([], [], color=INK, linestyle=":", label="predicted")
@@ -54,13 +67,27 @@ def draw(results: Mapping[str, Any]) -> Figure:
         by_friction(panels[1, 0], results)
         head(panels[1, 0], "d", f"by friction, {RUBBED}")
         flags(panels[1, 1], results, labels)
-        head(panels[1, 1], "e", "flagged by six signals")
+        head(panels[1, 1], "e", "called not frictionless")
         if any("cutoffs" in one for one in results.values()):
             cutoffs(panels[1, 2], results)
-            head(panels[1, 2], "f", "the pose's filter")
+            head(panels[1, 2], "f", "low-pass filter of the pose")
         else:
             panels[1, 2].set_axis_off()
+        conclude(figure, finding(results))
         return figure
+
+
+def finding(results: Mapping[str, Any]) -> str:
+    """State in a sentence what friction does to three signals, and to force and moment."""
+    rows = results["friction-03"]["true"]
+    (three, stated), (wrench, _) = (
+        (1e3 * row["median"], 1e3 * row["predicted"])
+        for row in (rows[method]["classes"][RUBBED] for method in (TRIPLET, WRENCH))
+    )
+    return (
+        f"Friction of 0.3, {RUBBED}: errors of {three:.1f} mm from three signals ({stated:.2f} "
+        f"predicted), {wrench:.2f} mm from force and moment"
+    )
 
 
 def errors(axes: Axes, one: Mapping[str, Any]) -> None:

@@ -16,7 +16,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from io import BytesIO
 from pathlib import Path
-from textwrap import wrap
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -45,6 +44,9 @@ WIDTHS: Mapping[str, float] = MappingProxyType({"single": 85.0, "double": 178.0}
 
 _LETTER = 1.5
 """Mean width of a letter of 8 points, mm."""
+
+_UNSEEN = str.maketrans("", "", "$_{}\\")
+"""Marks of formulas."""
 
 LARGE, PLAIN, SMALL = 8.0, 7.0, 6.0
 """Sizes of type, points: findings and the letters of panels; titles and axes; all else."""
@@ -185,7 +187,11 @@ def conclude(figure: Figure, finding: str) -> None:
     """Write above a figure, in a sentence, what it shows."""
     assert isinstance(figure, _StyledFigure)
     wide, tall = 25.4 * figure.get_size_inches()
-    lines = wrap(finding, int(wide / _LETTER))
+    lines = [""]
+    for word in finding.split(" "):
+        longer = f"{lines[-1]} {word}".lstrip()
+        seen = longer.translate(_UNSEEN)
+        lines = [*lines[:-1], longer] if len(seen) <= wide / _LETTER else [*lines, word]
     figure.above = 2.5 + 3.6 * len(lines)
     figure.text(
         1.5 / wide, 1.0 + 1.0 / tall, "\n".join(lines), fontsize=LARGE, ha="left", va="bottom"

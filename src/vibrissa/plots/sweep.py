@@ -88,10 +88,19 @@ def _verdicts(
         _cone_axis(axes)
         _key(figure, verdict.values)
         held = (verdict.values == VERDICTS[0]).all(axis=0)
-        least = triplet_label(names[int(np.argmin(np.nan_to_num(degrees, nan=90.0).max(axis=0)))])
         shown = ", ".join(f"({triplet_label(names[i])})" for i in np.flatnonzero(held))
         among = f"on all {len(degrees)} whiskers"
-        finding = f"No triplet is unique {among}; ({least}) has the smallest critical cones"
+        largest = np.nan_to_num(degrees, nan=90.0).max(axis=0)
+        off = (verdict.values == VERDICTS[1]).all(axis=0)
+        best = [
+            f"({triplet_label(names[i])}) "
+            + ("off a surface" if off[i] else f"outside {cone:.1f}°")
+            for i, cone in enumerate(largest)
+        ]
+        first, second = (best[i] for i in np.argsort(largest, kind="stable")[:2])
+        finding = (
+            f"No triplet is unique {among} outside {PAPERS_CONE:g}°; next are {first} and {second}"
+        )
         style.conclude(figure, f"Unique {among}: {shown}" if shown else finding)
         return figure
     groups = found["group"].values.astype(str)

@@ -71,6 +71,7 @@ if TYPE_CHECKING:
         PointForce,
         Resting,
         deflect,
+        deflect_around,
         resting,
     )
     from vibrissa.signals import base_signals
@@ -104,6 +105,7 @@ __all__ = [
     "contour",
     "critical_cones",
     "deflect",
+    "deflect_around",
     "estimate_from_wrench",
     "evaluation",
     "identifiability",
@@ -178,6 +180,8 @@ _HOMES = {
         "PointForce",
         "Resting",
         "deflect",
+        "deflect_around",
+        "deflect_around",
         "resting",
     ),
     "report": ("in_space",),

@@ -73,7 +73,7 @@ def test_a_second_contact_is_told():
     before, place = alone["centerline"].values[19:21, 0, 27]
     ahead = (place - before) * [1.0, 1.0, 0.0]
     far = Peg(place + 1e-3 * ahead / np.linalg.norm(ahead), [0.0, 0.0, 1.0], 1e-3)
-    truth = simulate(WHISKER, motion, [far, near])["truth"]
+    truth = simulate(WHISKER, motion, [far, near], friction=1e-9)["truth"]
     assert (truth["contact_object"].values == 1).all()
     overlap = truth["overlap"].values[:, 0]
     second = truth["second_contact"].values[:, 0]
@@ -81,6 +81,15 @@ def test_a_second_contact_is_told():
     assert second[20:30].all()
     # The peg's surface goes through the centreline there: the whisker's radius lies inside.
     assert overlap[20] == pytest.approx(WHISKER.radius(27 / 32 * WHISKER.length), rel=0.05)
+    # Without friction both contacts are solved, and the centreline passes outside of both pegs.
+    both = simulate(WHISKER, motion, [far, near])["truth"]
+    assert (both["second_contact"].values[:, 0] == second).all()
+    assert not both["overlap"].values.any()
+    line = both["centerline"].values[20:30, 0, 20:]
+    assert far.signed_distance(line).min() > 0.5 * overlap[20]
+    assert far.signed_distance(truth["centerline"].values[20:30, 0, 20:]).min() < 0.0
+    np.testing.assert_allclose(both["force"].values[:19], truth["force"].values[:19], atol=1e-12)
+    assert np.linalg.norm((both["force"] - truth["force"]).values[25, 0]) > 1e-6
 
 
 def test_friction_is_recorded():

@@ -115,9 +115,12 @@ def _report(trial: xr.DataTree) -> None:
     ]
     count = int(begun.sum())
     say(f"{count} contact{'s' * (count != 1)}, up to {largest[0]} and {largest[1]}")
-    if second := int(truth["second_contact"].values.sum()):
+    several, overlap = truth["second_contact"].values, truth["overlap"].values > 0.0
+    if solved := int((several & ~overlap).sum()):
+        say(f"in {solved} frames a whisker has several contacts, all of them in the forces")
+    if missing := int((several & overlap).sum()):
         say(
-            f"in {second} frames a whisker would touch elsewhere too (second_contact), which is "
+            f"in {missing} frames a whisker would touch elsewhere too (second_contact), which is "
             "not in the forces"
         )
 

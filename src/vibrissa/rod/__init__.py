@@ -4,6 +4,7 @@ Beyond loads and :func:`deflect` this is what the inverse problem is built on: t
 the chart of the stable contacts, and the search for contacts of given signals in it.
 """
 
+from vibrissa.rod.around import ObstacleDeflection, around as around, deflect_around
 from vibrissa.rod.chart import (
     CELLS,
     LEAST_ARC,
@@ -70,6 +71,7 @@ __all__ = [
     "Deflection",
     "Discretization",
     "Load",
+    "ObstacleDeflection",
     "PegContact",
     "PointContact",
     "PointForce",
@@ -79,6 +81,7 @@ __all__ = [
     "contact_tangents",
     "contacts_at",
     "deflect",
+    "deflect_around",
     "discretize",
     "evaluate",
     "fold_force",

@@ -6,9 +6,11 @@ branch ends the whisker has slipped off; it springs back to rest, clear of the o
 it, where it obstructs the rest shape), and meets it next from the side where it then is. A whisker
 is therefore never pulled through a peg. Quasi-static.
 
-One contact is simulated at a time, that with the object met first. Where the bent whisker reaches
-into another object, or into the same one elsewhere, the truth has ``second_contact`` and the depth
-``overlap``: there the wrench lacks that of the second contact.
+The contact followed is that with the object met first. Where the bent whisker would reach into
+another object, or into the same one elsewhere, the truth has ``second_contact``. Without friction
+and between rigid objects all contacts are then solved (:mod:`vibrissa.rod.around`), of which the
+strongest is recorded; else the depth is recorded as ``overlap``, and the wrench lacks what the
+other contacts would add.
 
 Several whiskers are simulated one after the other: they do not touch each other.
 
@@ -29,7 +31,7 @@ import xarray as xr
 from vibrissa.numerics import Array
 from vibrissa.objects import Surface
 from vibrissa.recording import Recording, coordinates, recorded, recording_tree
-from vibrissa.rod import SurfaceDeflection, follow_surfaces
+from vibrissa.rod import SurfaceDeflection, around, follow_surfaces
 from vibrissa.sensors import COMPONENTS, FORCE_NOISE, MOMENT_NOISE, Sensor
 from vibrissa.simulation.dynamics import Dynamics, Moment, move_dynamically
 from vibrissa.simulation.motion import Motion
@@ -38,19 +40,6 @@ from vibrissa.whisker import Whisker
 
 NODES = 33
 """Number of points of the recorded centrelines."""
-
-_SAMPLES = 129
-"""Number of points along the whisker at which a second contact is searched."""
-
-_ASIDE = 0.03
-"""Distance from the contact of a second one with the same object, as a share of the length."""
-
-OVERLAP = 5e-6
-"""Overlap from which a second contact counts, m; a tapering whisker along a flat one has less."""
-
-_FRAMES_AT_ONCE = 512
-"""Number of frames whose overlap is computed together."""
-
 
 Progress = Callable[[int, int], None]
 """Called with the number of frames done and of all frames."""
@@ -81,7 +70,8 @@ def simulate(
         Motion of its base; as many as there are whiskers, in the same order or by the same names,
         with the same frames and on the same head.
     objects : Peg, Sphere, Plane, Box, Mesh or a sequence of them
-        Objects in the laboratory. The one met first holds the whisker.
+        Objects in the laboratory. With friction, or if they are not rigid, the one met first holds
+        the whisker alone.
     friction : float
         Coulomb's coefficient between whisker and objects.
     dynamics : Dynamics, optional
@@ -131,7 +121,7 @@ def simulate(
             friction=friction,
             progress=counted,
         )
-        truths.append(_truth(one, moves, solids, found, nodes))
+        truths.append(_truth(one, moves, solids, found, friction, nodes))
     whiskers, motions = zip(*pairs, strict=True)
     return _recording(whiskers, motions, solids, truths, f"simulated: {how}, {touch}")
 
@@ -207,30 +197,39 @@ def _truth(
     motion: Motion,
     solids: Sequence[Surface],
     found: SurfaceDeflection,
+    friction: float,
     nodes: int,
 ) -> dict[str, Array]:
     """Variables of the truth, quasi-static."""
-    rotation, position, bent = motion.base_rotation, motion.base_position, found.bent
+    rotation, position = motion.base_rotation, motion.base_position
+    solvable = friction == 0.0 and all(np.isinf(solid.stiffness) for solid in solids)
+    bent = around(whisker, solids, rotation, position, found, several=solvable)
     turn = "tij,t...j->t...i"
-    contact = np.isin(bent.status, (Status.OK, Status.TIP_CONTACT))
-    overlap = _overlap(whisker, motion, solids, found)
+    arc, point, push, surface = bent.strongest()
+    contact, several = np.isfinite(arc), bent.several
+    touched = np.einsum(turn, rotation, point) + position
+    push = np.einsum(turn, rotation, push)
+    normal, surface_point = found.normal.copy(), found.surface_point.copy()
+    normal[several] = push[several] / np.linalg.norm(push[several], axis=1, keepdims=True)
+    away = whisker.radius(arc[several])[:, None] * normal[several]
+    surface_point[several] = touched[several] - away
     return {
         "force": bent.force,
         "moment": bent.moment,
         "centerline": bent.centerline(nodes) @ np.swapaxes(rotation, 1, 2) + position[:, None],
-        "contact_point": np.einsum(turn, rotation, bent.contact_point) + position,
-        "contact_point_whisker": bent.contact_point,
-        "arc_length": bent.arc_length,
+        "contact_point": touched,
+        "contact_point_whisker": point,
+        "arc_length": arc,
         "in_contact": contact,
         "confidence": np.isin(bent.status, [s for s in Status if s.ok]).astype(np.float64),
         "status": bent.status.astype(np.int8),
-        "contact_force": np.where(contact[:, None], np.einsum(turn, rotation, bent.force), np.nan),
-        "contact_object": found.surface.astype(np.int16),
-        "surface_point": found.surface_point,
-        "surface_normal": found.normal,
-        "sliding": found.sliding,
-        "overlap": overlap,
-        "second_contact": overlap > OVERLAP,
+        "contact_force": push,
+        "contact_object": surface.astype(np.int16),
+        "surface_point": surface_point,
+        "surface_normal": normal,
+        "sliding": found.sliding | (several & contact),
+        "overlap": bent.overlap,
+        "second_contact": bent.second_contact,
     }
 
 
@@ -273,30 +272,6 @@ def _dynamic_truth(
         "overlap": np.zeros(n),
         "second_contact": second,
     }
-
-
-def _overlap(
-    whisker: Whisker, motion: Motion, solids: Sequence[Surface], found: SurfaceDeflection
-) -> Array:
-    """Depth (n,) of the bent whisker in objects away from its contact, m."""
-    bent, rotation, position = found.bent, motion.base_rotation, motion.base_position
-    s = np.linspace(0.0, whisker.length, _SAMPLES)
-    radius = whisker.radius(s)
-    deepest = np.zeros(len(motion))
-    # A whisker at rest was found to be free before.
-    touching = np.flatnonzero(np.isin(bent.status, (Status.OK, Status.TIP_CONTACT)))
-    if not touching.size:
-        return deepest
-    lines = bent.centerline(_SAMPLES)
-    for first in range(0, touching.size, _FRAMES_AT_ONCE):
-        rows = touching[first : first + _FRAMES_AT_ONCE]
-        line = lines[rows] @ np.swapaxes(rotation[rows], 1, 2) + position[rows, None]
-        near = np.abs(s - bent.arc_length[rows, None]) < _ASIDE * whisker.length
-        for i, solid in enumerate(solids):
-            gap = solid.signed_distance(line) - radius
-            gap[near & (found.surface[rows, None] == i)] = np.inf
-            deepest[rows] = np.maximum(deepest[rows], -gap.min(axis=1))
-    return deepest
 
 
 def measure(

@@ -1,0 +1,427 @@
+"""A whisker against objects, touched wherever it meets them: two points, tip and side, an arc.
+
+Quasi-static, without friction, objects rigid. Elastic energy is least among all shapes that enter
+no object,
+
+    minimise ½ ∫ (u - u₀)·B (u - u₀) ds   with   d(r(s_j)) - a(s_j) ≥ 0 at nodes s_j,
+
+d being an object's signed distance and a the whisker's radius. The multipliers λ_j ≥ 0 are normal
+forces; that is, of λ_j and the gap one at least is zero. Where the whisker lies along an object,
+the force per length is λ_j over the spacing of nodes; λ at the ends of such an arc includes the
+concentrated forces there. At a node, the whisker is met from the side or, at the last one, at the
+tip. On a smooth convex object the outer end of an arc is the tip, or where the whisker's intrinsic
+curvature is that of the object: only there is the moment zero, as it is beyond all contacts.
+
+On each element between two nodes u is linear through its values at two Gauss points; frames follow
+by Magnus' method and places by the same series, both of fourth order. Turning a cross-section by
+δθ moves what lies beyond it by δθ × (r_j - r), so that the moment there is Σ (r_j - r) × λ_j n_j:
+equilibrium holds at the Gauss points. Newton's method with the exact second derivatives of the
+Lagrangian solves, in each round, the quadratic problem with all linearised gaps by its dual. A
+contact in a single point gets a node of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from vibrissa.numerics import Array, IntArray, Mask
+from vibrissa.objects import Placement, Surface
+from vibrissa.rod.chart import LEAST_ARC
+
+if TYPE_CHECKING:
+    from vibrissa.whisker import Whisker
+
+# Elements of the whisker, and of a compliant base.
+ELEMENTS, _JOINT_ELEMENTS = 32, 4
+_TAPER_EXPONENT = 0.4
+_ROUNDS, _TOLERANCE = 60, 1e-10
+# Largest turn of a cross-section in one round, rad.
+_LONGEST = 0.2
+# Gaps smaller than this, over L, can close in one round.
+_NEAR = 0.05
+# Single contacts move their node this often, or until it moves by less than this, over L.
+_MOVES, _MOVED = 6, 1e-6
+# Points of two shapes that are compared.
+_COMPARED = 33
+# No node comes nearer to another than this share of their distance.
+_APART = 0.2
+_ROOT = np.sqrt(3.0)
+_STAGES = np.array([[0.25, 0.25 - _ROOT / 6.0], [0.25 + _ROOT / 6.0, 0.25]])
+_GAUSS = np.array([0.5 - _ROOT / 6.0, 0.5 + _ROOT / 6.0])
+
+
+class Grid(NamedTuple):
+    """Elements of a whisker, non-dimensional; those of a compliant base have no extent.
+
+    Attributes
+    ----------
+    s : (n + 1,) array
+        Arc lengths of the nodes; 0 in a compliant base.
+    width, extent : (n,) array
+        Widths of the elements, and centreline length per width.
+    stations : (n, 2) array
+        Arc lengths of the Gauss points.
+    rest, stiffness : (n, 2, 3) array
+        Intrinsic curvature, and stiffness in twist and bending there.
+    radius, slope : (n + 1,) array
+        Radius of the whisker at the nodes, and its derivative.
+    fixed : (n + 1,) bool array
+        Nodes at ends and kinks, which stay where they are.
+    """
+
+    s: Array
+    width: Array
+    extent: Array
+    stations: Array
+    rest: Array
+    stiffness: Array
+    radius: Array
+    slope: Array
+    fixed: Mask
+
+    @property
+    def first(self) -> float:
+        """Arc length of the first node at which contacts are looked for."""
+        return float(self.s[self.s > LEAST_ARC][0])
+
+    @classmethod
+    def of(cls, whisker: Whisker, elements: int = ELEMENTS) -> Grid:
+        """Elements that are shorter where the whisker is thin, with nodes at kinks."""
+        s = np.linspace(0.0, 1.0, 2049)
+        density = (whisker.radius(s * whisker.length) / whisker.base_radius) ** -_TAPER_EXPONENT
+        even = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
+        nodes = np.interp(np.linspace(0.0, even[-1], elements + 1), even, s)
+        for kink in np.array(whisker.breaks) / whisker.length:
+            nodes[1 + np.argmin(np.abs(nodes[1:-1] - kink))] = kink
+        return cls.at(whisker, nodes)
+
+    @classmethod
+    def at(cls, whisker: Whisker, nodes: Array) -> Grid:
+        """Elements between nodes (n + 1,) on the whisker, after those of its base."""
+        length, joint = whisker.length, 0 if whisker.base_stiffness is None else _JOINT_ELEMENTS
+        width = np.diff(nodes)
+        t, weights = np.polynomial.legendre.leggauss(4)
+        inside = (0.5 * (nodes[1:] + nodes[:-1]))[:, None] + 0.5 * width[:, None] * t
+        curvature = whisker.curvature(inside * length) * length
+        soft = (whisker.radius(inside * length) / whisker.base_radius) ** -4.0
+        # What is linear on an element, and nearest to these samples.
+        line = 0.5 * weights + np.outer([-1.0, 1.0], 0.5 * _ROOT * weights * t)
+        rest = np.einsum("pg,kgi->kpi", line, curvature)
+        stiffness = 1.0 / np.multiply.outer(
+            np.einsum("pg,kg->kp", line, soft), [1.0 + whisker.poisson_ratio, 1.0, 1.0]
+        )
+        radius = whisker.radius(nodes * length) / length
+        kinks = np.array([0.0, *whisker.breaks, length]) / length
+        fixed = np.abs(nodes[:, None] - kinks).min(axis=1) < 1e-12
+        stations = nodes[:-1, None] + width[:, None] * _GAUSS
+        slope = np.gradient(radius, nodes)
+        if not joint:
+            parts = nodes, width, np.ones(width.size), stations, rest, stiffness
+            return cls(*parts, radius, slope, fixed)
+        assert whisker.base_stiffness is not None
+        bending, twist = whisker.base_stiffness
+        scale = whisker.base_bending_stiffness / length
+        spring = np.broadcast_to(np.array([twist, bending, bending]) / scale, (joint, 2, 3))
+        none = np.zeros(joint)
+        return cls(
+            np.r_[none, nodes],
+            np.r_[np.full(joint, 1.0 / joint), width],
+            np.r_[none, np.ones(width.size)],
+            np.concatenate([np.zeros((joint, 2)), stations]),
+            np.concatenate([np.zeros((joint, 2, 3)), rest]),
+            np.concatenate([spring, stiffness]),
+            np.r_[none, radius],
+            np.r_[none, slope],
+            np.r_[none == 0.0, fixed],
+        )
+
+
+class Shape(NamedTuple):
+    """Places and frames at the nodes (n + 1, ...) and at the Gauss points (2n, ...)."""
+
+    nodes: Array
+    frames: Array
+    stations: Array
+    turned: Array
+
+
+def _rotation(w: Array) -> tuple[Array, Array]:
+    """Matrices (..., 3, 3) exp [w] and ∫ exp [w t] dt from 0 to 1."""
+    cross = np.zeros((*w.shape, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        cross[..., k, j], cross[..., j, k] = w[..., i], -w[..., i]
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    small = angle < 1e-3
+    safe = np.where(small, 1.0, angle)
+    first = np.sinc(angle / np.pi)
+    second = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
+    third = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (1.0 - first) / safe**2)
+    square = cross @ cross
+    unit = np.eye(3)
+    return unit + first * cross + second * square, unit + second * cross + third * square
+
+
+def bend(grid: Grid, strain: Array) -> Shape:
+    """Integrate a curvature that differs by ``strain`` (n, 2, 3) from that at rest."""
+    u = grid.rest + strain
+    h = grid.width[:, None]
+    turn = 0.5 * h * (u[:, 0] + u[:, 1]) + _ROOT / 12.0 * h**2 * np.cross(u[:, 0], u[:, 1])
+    whole, mean = _rotation(turn)
+    half, _ = _rotation(0.5 * turn)
+    frames = np.empty((len(h) + 1, 3, 3))
+    frames[0] = np.eye(3)
+    for i, step in enumerate(whole):
+        frames[i + 1] = frames[i] @ step
+    e = np.array([1.0, 0.0, 0.0])
+    bow = _ROOT / 12.0 * h * np.cross(u[:, 1] - u[:, 0], e)
+    step = mean[:, :, 0] - np.einsum("kij,kj->ki", half, bow)
+    step = (h * grid.extent[:, None]) * np.einsum("kij,kj->ki", frames[:-1], step)
+    nodes = np.concatenate([np.zeros((1, 3)), np.cumsum(step, axis=0)])
+    part, mean = _rotation(np.einsum("pq,kqi->kpi", _STAGES, u) * h[:, None])
+    away = (h * grid.extent[:, None] * _GAUSS)[..., None] * mean[..., 0]
+    stations = nodes[:-1, None] + np.einsum("kij,kpj->kpi", frames[:-1], away)
+    turned = frames[:-1, None] @ part
+    return Shape(nodes, frames, stations.reshape(-1, 3), turned.reshape(-1, 3, 3))
+
+
+class Obstacles:
+    """Objects as seen from the base, non-dimensional."""
+
+    def __init__(self, surfaces: Sequence[Surface], place: Placement, length: float) -> None:
+        self._surfaces, self._place, self._length = surfaces, place, length
+
+    def gaps(self, points: Array, radius: Array) -> Array:
+        """Distances (surfaces, n) between the whisker's surface and those of objects."""
+        outside = self._place.outside(points * self._length)
+        distances = [surface.signed_distance(outside) for surface in self._surfaces]
+        return np.array(distances) / self._length - radius
+
+    def normals(self, points: Array, surface: IntArray) -> tuple[Array, Array]:
+        """Normals (n, 3) of surfaces at points, and their derivatives (n, 3, 3)."""
+        turn = self._place.rotation
+        outside = self._place.outside(points * self._length)
+        found = [
+            self._surfaces[i].local_geometry(p)
+            for i, p in zip(surface.tolist(), outside, strict=True)
+        ]
+        normal = np.array([one[1] for one in found]).reshape(-1, 3)
+        curved = np.array([one[2] for one in found]).reshape(-1, 3, 3)
+        return normal @ turn, turn.T @ curved @ turn * self._length
+
+
+class Equilibrium(NamedTuple):
+    """A whisker against objects, non-dimensional, in the whisker frame.
+
+    Attributes
+    ----------
+    grid : Grid
+        Elements.
+    strain : (n, 2, 3) array
+        Curvature minus that at rest, at the Gauss points.
+    pressing : (surfaces, n + 1) array
+        Normal forces at the nodes.
+    nodes, frames : (n + 1, 3), (n + 1, 3, 3) array
+        Places and frames of the nodes.
+    normals : (surfaces, n + 1, 3) array
+        Outward normals of the objects at nodes that they press on, else 0.
+    """
+
+    grid: Grid
+    strain: Array
+    pressing: Array
+    nodes: Array
+    frames: Array
+    normals: Array
+
+    def contacts(self) -> tuple[Array, IntArray, Array, Array]:
+        """Arc lengths (k,), objects, places (k, 3) and forces (k, 3), from the base outward."""
+        node, surface = np.nonzero(self.pressing.T > 0.0)
+        push = self.pressing[surface, node, None] * self.normals[surface, node]
+        return self.grid.s[node], surface, self.nodes[node], push
+
+    def pressing_on(self, grid: Grid) -> Array:
+        """Normal forces at the nearest nodes of another grid."""
+        s, surface, _, push = self.contacts()
+        out = np.zeros((len(self.pressing), grid.s.size))
+        near = np.abs(grid.s[:, None] - s).argmin(axis=0)
+        np.add.at(out, (surface, near), np.linalg.norm(push, axis=1))
+        return out
+
+    def centerline(self, n: int) -> Array:
+        """Points (n, 3), equally spaced in arc length."""
+        from scipy.interpolate import CubicHermiteSpline
+
+        on = slice(np.count_nonzero(self.grid.extent == 0.0), None)
+        spline = CubicHermiteSpline(self.grid.s[on], self.nodes[on], self.frames[on, :, 0])
+        return np.asarray(spline(np.linspace(0.0, 1.0, n)))
+
+    def farthest(self, other: Equilibrium) -> float:
+        """Distance between two shapes where they are farthest apart."""
+        away = self.centerline(_COMPARED) - other.centerline(_COMPARED)
+        return float(np.linalg.norm(away, axis=1).max())
+
+
+def _solve(grid: Grid, obstacles: Obstacles, strain: Array, pressing: Array) -> Equilibrium | None:
+    """Newton's method from a guess; None if it does not converge."""
+    weight = (0.5 * grid.width[:, None, None] * grid.stiffness).reshape(-1)
+    for _ in range(_ROUNDS):
+        shape = bend(grid, strain)
+        if not np.isfinite(shape.nodes).all():
+            return None
+        gaps = obstacles.gaps(shape.nodes, grid.radius)
+        near = (grid.s >= grid.first) & ((gaps < _NEAR) | (pressing > 0.0))
+        surface, node = np.nonzero(near)
+        normal, curved = obstacles.normals(shape.nodes[node], surface)
+        force = pressing[surface, node]
+        moves, bends = _derivatives(grid, shape, node, force, normal, curved)
+        slopes = np.einsum("jxi,ji->jx", moves, normal)
+        found = _pushed(
+            np.diag(weight) - bends, weight, weight * strain.ravel(), slopes, gaps[near]
+        )
+        if found is None:
+            return None
+        step, force = found
+        step = step.reshape(strain.shape)
+        turn = np.cumsum((0.5 * grid.width[:, None, None] * step).reshape(-1, 3), axis=0)
+        size = float(np.linalg.norm(turn, axis=1).max())
+        share = min(1.0, _LONGEST / max(size, 1e-300))
+        strain = strain + share * step
+        pressing = (1.0 - share) * pressing
+        pressing[surface, node] += share * force
+        if size < _TOLERANCE:
+            normals = np.zeros((*pressing.shape, 3))
+            normals[surface, node] = normal * (force > 0.0)[:, None]
+            return Equilibrium(grid, strain, pressing, shape.nodes, shape.frames, normals)
+    return None
+
+
+def _derivatives(
+    grid: Grid, shape: Shape, node: IntArray, force: Array, normal: Array, curved: Array
+) -> tuple[Array, Array]:
+    """Derivatives (j, 6n, 3) of nodes by strains, and the second ones (6n, 6n) of Σ λ gap."""
+    count = len(shape.stations)
+    axes = np.repeat(0.5 * grid.width, 2)[:, None, None] * np.swapaxes(shape.turned, 1, 2)
+    away = shape.nodes[node][:, None] - shape.stations
+    away[np.arange(count) >= 2 * node[:, None]] = 0.0
+    moves = np.cross(axes, away[:, :, None, :])
+    # Two turns, the first nearer to the base: n·(a × (b × c)) = a·((b × c) × n).
+    pulled = np.cross(moves, (force[:, None] * normal)[:, None, None, :]).sum(axis=0)
+    bends = axes.reshape(-1, 3) @ pulled.reshape(-1, 3).T
+    order = np.sign(np.arange(count)[None] - np.arange(count)[:, None])
+    bends *= np.kron(0.5 * (1 + order), np.ones((3, 3)))
+    bends += bends.T
+    moves = moves.reshape(len(node), -1, 3)
+    pushed = force > 0.0
+    rolled = np.einsum("j,jxi,jik->jxk", force[pushed], moves[pushed], curved[pushed])
+    bends += np.einsum("jxk,jyk->xy", rolled, moves[pushed], optimize=True)
+    return moves, bends
+
+
+def _pushed(
+    matrix: Array, weight: Array, slope: Array, gap_slopes: Array, gaps: Array
+) -> tuple[Array, Array] | None:
+    """Step and multipliers of least energy with all linearised gaps open or closed."""
+    from scipy.optimize import nnls
+
+    try:
+        factor = cho_factor(matrix)
+    except LinAlgError:
+        factor = cho_factor(np.diag(weight))
+    free = -cho_solve(factor, slope)
+    if not len(gaps):
+        return free, np.zeros(0)
+    yielded = cho_solve(factor, gap_slopes.T)
+    compliance = gap_slopes @ yielded
+    scale = 1.0 / np.sqrt(np.diag(compliance))
+    compliance = compliance * scale[:, None] * scale + 1e-13 * np.eye(len(gaps))
+    try:
+        root = np.linalg.cholesky(compliance)
+        wanted = -np.linalg.solve(root, (gaps + gap_slopes @ free) * scale)
+        force = nnls(root.T, wanted, maxiter=100 * len(gaps))[0] * scale
+    except (np.linalg.LinAlgError, RuntimeError):
+        return None
+    return free + yielded @ force, force
+
+
+def settle(
+    whisker: Whisker, obstacles: Obstacles, grid: Grid, strain: Array, pressing: Array
+) -> Equilibrium | None:
+    """Solve, with nodes where single contacts are."""
+    found = _solve(grid, obstacles, strain, pressing)
+    for _ in range(_MOVES):
+        if found is None:
+            return None
+        nodes = _nodes_at_contacts(found, obstacles)
+        if np.abs(nodes - found.grid.s).max() < _MOVED:
+            return found
+        grid = Grid.at(whisker, nodes[found.grid.s.size - np.count_nonzero(nodes) - 1 :])
+        found = _solve(grid, obstacles, strain_on(found, grid), found.pressing)
+    return found
+
+
+def strain_on(found: Equilibrium, grid: Grid) -> Array:
+    """Strains on another grid with the moments of an equilibrium."""
+    moment = found.grid.stiffness * found.strain
+    on = found.grid.extent > 0.0
+    out = moment.copy()
+    before = found.grid.stations[on].ravel()
+    for i in range(3):
+        at = np.interp(grid.stations[on].ravel(), before, moment[on, :, i].ravel())
+        out[on, :, i] = at.reshape(-1, 2)
+    return np.asarray(out / grid.stiffness)
+
+
+def _nodes_at_contacts(found: Equilibrium, obstacles: Obstacles) -> Array:
+    """Arc lengths of nodes, one of which is where each contact in one point is."""
+    grid, nodes = found.grid, found.grid.s.copy()
+    last = nodes.size - 1
+    for i, pressed in enumerate(found.pressing > 0.0):
+        ends = np.flatnonzero(np.diff(np.r_[False, pressed, False].astype(int)))
+        for first, stop in ends.reshape(-1, 2).tolist():
+            if stop - first > 2:
+                continue
+            around = np.arange(max(first - 1, 1), min(stop, last) + 1)
+            normal, curved = obstacles.normals(found.nodes[around], np.full(around.size, i))
+            along = found.frames[around, :, 0]
+            slope = np.einsum("ji,ji->j", along, normal) - grid.slope[around]
+            rising = np.flatnonzero((slope[:-1] < 0.0) & (slope[1:] >= 0.0))
+            if not rising.size:
+                continue  # the tip
+            k = int(rising[0])
+            a, b = grid.s[around[k]], grid.s[around[k + 1]]
+            at = a - slope[k] * (b - a) / (slope[k + 1] - slope[k])
+            pair = [k, k + 1] if at - a < b - at else [k + 1, k]
+            free = [j for j in pair if not grid.fixed[around[j]]]
+            if not free:
+                continue
+            # From the node on, the slope grows as the whisker bends and the surface curves away.
+            j, near = free[0], int(around[free[0]])
+            turning = (along[k + 1] - along[k]) @ normal[j] / (b - a)
+            steep = turning + along[j] @ curved[j] @ along[j]
+            at = np.clip(grid.s[near] - slope[j] / steep, a, b) if steep > 0.0 else at
+            low, high = grid.s[near - 1], grid.s[near + 1]
+            keep = _APART * (grid.s[near] - low), _APART * (high - grid.s[near])
+            nodes[near] = np.clip(at, low + keep[0], high - keep[1])
+    return nodes
+
+
+def bent_by_one(grid: Grid, arc: float, force: Array, point: Array) -> Array:
+    """Strains (n, 2, 3) of a whisker that one force bends at an arc length, in order outward."""
+    strain = np.zeros_like(grid.rest)
+    frame, place, e = np.eye(3), np.zeros(3), np.array([1.0, 0.0, 0.0])
+    for i, (h, extent) in enumerate(zip(grid.width, grid.extent, strict=True)):
+        for k in range(2):
+            for _ in range(2):
+                part, mean = _rotation(_GAUSS[k] * h * (grid.rest[i, k] + strain[i, k]))
+                at = place + extent * _GAUSS[k] * h * (frame @ mean @ e)
+                loaded = extent == 0.0 or grid.stations[i, k] < arc
+                moment = np.cross(point - at, force) if loaded else np.zeros(3)
+                strain[i, k] = (frame @ part).T @ moment / grid.stiffness[i, k]
+        part, mean = _rotation(h * (grid.rest[i] + strain[i]).mean(axis=0))
+        place = place + extent * h * (frame @ mean @ e)
+        frame = frame @ part
+    return strain

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import xarray as xr
-    from scipy import interpolate, ndimage, optimize
+    from scipy import interpolate, ndimage, optimize, signal, spatial, stats
+    from scipy.spatial import transform
 else:
 
     class _Deferred:
@@ -24,8 +25,10 @@ else:
             return getattr(import_module(self._name), attribute)
 
     xr = _Deferred("xarray")
-    interpolate, ndimage, optimize = (
-        _Deferred(f"scipy.{name}") for name in ("interpolate", "ndimage", "optimize")
+    interpolate, ndimage, optimize, signal, spatial, stats = (
+        _Deferred(f"scipy.{name}")
+        for name in ("interpolate", "ndimage", "optimize", "signal", "spatial", "stats")
     )
+    transform = _Deferred("scipy.spatial.transform")
 
-__all__ = ["interpolate", "ndimage", "optimize", "xr"]
+__all__ = ["interpolate", "ndimage", "optimize", "signal", "spatial", "stats", "transform", "xr"]

@@ -99,15 +99,15 @@ def _load(
 
 
 def _print(bent: vb.Deflection) -> None:
-    signals = vb.base_signals(bent.force, bent.moment)
+    signals = vb.signals.signals_of(bent.force, bent.moment)
     point, components = bent.contact_point, ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
     groups = {
         "contact": [
             *zip("xyz", point, strict=True),
-            *zip(("r", "theta", "phi"), vb.contacts.spherical(point), strict=True),
+            *zip(("r", "theta", "phi"), vb.signals.spherical(point), strict=True),
             ("arc_length", bent.arc_length),
         ],
-        "signal": [(name, signals[name]) for name in vb.signals.SIGNALS],
+        "signal": list(zip(vb.signals.SIGNALS, signals, strict=True)),
         "wrench": list(zip(components, (*bent.force, *bent.moment), strict=True)),
     }
     rows: list[tuple[str, ...] | None] = []

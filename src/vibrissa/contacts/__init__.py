@@ -24,7 +24,6 @@ from vibrissa.contacts.contacts import (
     Contact,
     Contacts,
     contacts_of as contacts_of,
-    spherical,
 )
 from vibrissa.contacts.estimator import Estimator
 from vibrissa.contacts.filter import ContactFilter, Followed as Followed
@@ -58,6 +57,7 @@ from vibrissa.contacts.readout import (
 from vibrissa.contacts.search import signals_at_nodes as signals_at_nodes
 from vibrissa.contacts.two_contacts import bent_by_forces as bent_by_forces, second_contact
 from vibrissa.contacts.wrench import estimate_from_wrench
+from vibrissa.signals import spherical
 
 __all__ = [
     "RANK",

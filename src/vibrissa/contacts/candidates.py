@@ -9,11 +9,9 @@ nearest, one for each of sixteen parts of it. What noise adds is in
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates
+from vibrissa.contacts.contacts import MOST_CANDIDATES
 from vibrissa.contacts.inversion import invert_rows
 from vibrissa.contacts.least_squares import (
     Fits,
@@ -24,8 +22,9 @@ from vibrissa.contacts.least_squares import (
 )
 from vibrissa.contacts.nodes import PARTS, Searched, nearest_of
 from vibrissa.contacts.noise import INDISTINCT
+from vibrissa.contacts.task import Problem, Task, in_memory
 from vibrissa.contacts.weighing import Weighing, weigh
-from vibrissa.numerics import Array, IntArray, copy, inlined, kernel
+from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel
 from vibrissa.rod import (
     BUFFER_SIZE,
     LANES,
@@ -59,27 +58,14 @@ _FORCE = 1e-6
 State = tuple[Array, Array, Array, Array, IntArray]
 
 
-class Problem(NamedTuple):
-    """How contacts are looked for.
-
-    Whether three signals are solved exactly, whether noise is known, how often weights are taken
-    at the contact, and the largest χ² that counts as explained.
-    """
-
-    exact: bool
-    noisy: bool
-    passes: int
-    limit: float
-
-
 @kernel
 def explain_rows(
-    of: Searched,
-    how: Weighing,
-    problem: Problem,
+    task: Task,
     targets: Array,
     measured: Array,
-    out: Candidates,
+    number: IntArray,
+    flat: Array,
+    valid: AnyArray,
     status: IntArray,
     again: bool,
     first: int,
@@ -90,6 +76,7 @@ def explain_rows(
     With noise they are completed and ranked before their status is known; ``again`` then states
     why the rows that are UNEXPLAINED have no contact.
     """
+    of, how, problem, out = task.of, task.how, task.problem, in_memory(number, flat, valid)
     x, values, chi = (
         np.empty(out.x.shape[1:]),
         np.empty(out.values.shape[1:]),
@@ -126,35 +113,37 @@ def explain_rows(
 
 @kernel
 def solve_rows(
-    of: Searched,
+    task: Task,
     targets: Array,
     measured: Array,
-    out: Candidates,
+    number: IntArray,
+    flat: Array,
+    valid: AnyArray,
     status: IntArray,
     first: int,
     last: int,
 ) -> None:
     """Find the contacts that give three signals exactly; NaN rows are left alone."""
-    n = last - first
+    of, out, n = task.of, in_memory(number, flat, valid), last - first
     aims, xi = np.empty((n, 6)), np.empty((n, MOST_CANDIDATES, 3))
     for i in range(n):
         row, known = first + i, finite(targets[first + i])
         for k in range(3):
             aims[i, k] = measured[row, of.where[k]] if known else np.nan
             aims[i, 3 + k] = of.codes[k]
-    number, values = out.number[first:last], out.values[first:last]
-    invert_rows(of.rod, of.fold, of.tree, of.proximal, aims, number, xi, values, 0, n)
+    found, values = number[first:last], out.values[first:last]
+    invert_rows(of.rod, of.fold, of.tree, of.proximal, aims, found, xi, values, 0, n)
     for i in range(n):
         if aims[i, 0] != aims[i, 0]:
             continue
         row = first + i
-        for c in range(number[i]):
+        for c in range(found[i]):
             x = out.x[row, c]
             x[0], x[1], x[2], x[3] = xi[i, c, 0], 0.0, xi[i, c, 1], xi[i, c, 2]
             out.chi_squared[row, c] = 0.0
         status[row] = UNEXPLAINED
-        if number[i] > 0:
-            status[row] = _UNIQUE if number[i] == 1 else _AMBIGUOUS
+        if found[i] > 0:
+            status[row] = _UNIQUE if found[i] == 1 else _AMBIGUOUS
 
 
 @inlined

@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.contacts.contacts import Contacts, spherical
+from vibrissa.contacts.contacts import Contacts
 from vibrissa.contacts.forward import Gravity
 from vibrissa.contacts.inversion import triplet_tree
 from vibrissa.contacts.jacobian import determining
@@ -47,7 +47,14 @@ from vibrissa.rod import (
     stable_set,
     with_normal_force,
 )
-from vibrissa.signals import SIGNALS, base_signals, concave_backward, selection, within_cone
+from vibrissa.signals import (
+    SIGNALS,
+    base_signals,
+    concave_backward,
+    selection,
+    spherical,
+    within_cone,
+)
 from vibrissa.sketch import CONTACT, REST, Mark, card, lines, shown, symbol, views
 from vibrissa.status import Status, flag_attributes
 from vibrissa.whisker import Whisker

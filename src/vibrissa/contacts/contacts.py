@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.quantities import attributes
 from vibrissa.rod import Discretization
-from vibrissa.signals import Coordinates
+from vibrissa.signals import Coordinates, spherical
 from vibrissa.sketch import CONTACT, REST, Mark, card, lines, shown, views
 from vibrissa.status import Status, counted, describe, flag_attributes
 
@@ -19,25 +20,6 @@ from vibrissa.status import Status, counted, describe, flag_attributes
 MOST_CANDIDATES = 8
 _CERTAIN = (Status.UNIQUE, Status.TIP_CONTACT)
 _SPACE = ["x", "y", "z"]
-
-
-def spherical(points: Array) -> Array:
-    """Spherical form of points: distance, azimuth atan2(y, x), elevation asin(z / r).
-
-    Parameters
-    ----------
-    points : (..., 3) array
-        Points, whisker frame, m.
-
-    Returns
-    -------
-    (..., 3) array
-        Distance r, m, azimuth θ and elevation φ, rad.
-    """
-    r = np.linalg.norm(points, axis=-1)
-    theta = np.arctan2(points[..., 1], points[..., 0])
-    phi = np.arctan2(points[..., 2], np.hypot(points[..., 0], points[..., 1]))
-    return np.stack([r, theta, phi], axis=-1)
 
 
 class Candidates(NamedTuple):
@@ -75,18 +57,7 @@ class Candidates(NamedTuple):
     @classmethod
     def room(cls, n: int, most: int = MOST_CANDIDATES) -> Candidates:
         """Make room for candidates of n measurements."""
-        rows = n * most
-        flat = np.full(22 * rows, np.nan)  # of one piece: single estimates take microseconds
-        return cls(
-            np.zeros(n, np.int64),
-            flat[: 4 * rows].reshape(n, most, 4),
-            flat[4 * rows : 10 * rows].reshape(n, most, 6),
-            flat[10 * rows : 19 * rows].reshape(n, most, 3, 3),
-            flat[19 * rows : 20 * rows].reshape(n, most),
-            flat[20 * rows : 21 * rows].reshape(n, most),
-            np.zeros((n, most), np.bool_),
-            flat[21 * rows :].reshape(n, most),
-        )
+        return candidates_within(*Room.of(n, most))
 
     def allowed_first(self, allowed: AnyArray) -> Candidates:
         """Leave out candidates that are not allowed; the others keep their order."""
@@ -128,6 +99,46 @@ class Candidates(NamedTuple):
         for mine, theirs in zip(out, self, strict=True):
             mine[rows] = theirs
         return out
+
+
+class Room(NamedTuple):
+    """Memory of the candidates of n measurements, in few pieces: kernels take them apart.
+
+    Attributes
+    ----------
+    number : array (n,)
+        Number of candidates.
+    flat : array (22 n k,)
+        All numbers of `Candidates`, one array after the other.
+    valid : array (n, k)
+        Whether the covariances are valid.
+    """
+
+    number: IntArray
+    flat: Array
+    valid: AnyArray
+
+    @classmethod
+    def of(cls, n: int, most: int = MOST_CANDIDATES) -> Room:
+        """Make room for n measurements."""
+        flat = np.full(22 * n * most, np.nan)
+        return cls(np.zeros(n, np.int64), flat, np.zeros((n, most), np.bool_))
+
+
+def candidates_within(number: IntArray, flat: Array, valid: AnyArray) -> Candidates:
+    """Candidates in the memory of a `Room`."""
+    n, most = valid.shape
+    rows = n * most
+    return Candidates(
+        number,
+        flat[: 4 * rows].reshape(n, most, 4),
+        flat[4 * rows : 10 * rows].reshape(n, most, 6),
+        flat[10 * rows : 19 * rows].reshape(n, most, 3, 3),
+        flat[19 * rows : 20 * rows].reshape(n, most),
+        flat[20 * rows : 21 * rows].reshape(n, most),
+        valid,
+        flat[21 * rows :].reshape(n, most),
+    )
 
 
 class _Located:
@@ -416,10 +427,10 @@ class Contact(_Located):
         Base force, N.
     contact_force : (3,) array
         Force in the material frame at the contact (tangent, d1, d2), N.
-    candidates : Contacts
-        All candidates, shape (k,).
     continuing : int
         Number of the candidate that goes on from the measurement before; 0 where there was none.
+    using : tuple of str
+        Signals used.
     """
 
     point: Array
@@ -431,13 +442,35 @@ class Contact(_Located):
     arc_length: float
     force: Array
     contact_force: Array
-    candidates: Contacts
-    continuing: int = 0
+    continuing: int
+    using: tuple[str, ...]
+    _found: Candidates
+    _scales: tuple[float, float]
+
+    @cached_property
+    def candidates(self) -> Contacts:
+        """All candidates, shape (k,)."""
+        (length, force), found, n = self._scales, self._found, self.n_candidates
+        return Contacts(
+            found.values[0, :n, 3:] * length,
+            found.covariances[0, :n] * length**2,
+            found.valid[0, :n],
+            found.chi_squared[0, :n],
+            found.probability[0, :n],
+            np.full(n, int(self.status)),
+            found.x[0, :n, 0] * length,
+            found.values[0, :n, :3] * force,
+            found.x[0, :n, 1:] * force,
+            found.angle_sigma[0, :n],
+            np.ones(n, np.int64),
+            self.using,
+            ("candidate",),
+        )
 
     @property
     def n_candidates(self) -> int:
         """Number of candidates."""
-        return len(self.candidates.point)
+        return int(self._found.number[0])
 
     def to_dataset(self) -> xr.Dataset:
         """Return everything as a labelled dataset without dimensions but the candidates'.
@@ -503,42 +536,28 @@ def contact_of(
     covariance: Array | None = None,
 ) -> Contact:
     """Give the candidates of one measurement their units; ``first`` stands for all."""
-    d, n = discretization, int(found.number[0])
-    points, forces = found.values[0, :n, 3:] * d.length, found.values[0, :n, :3] * d.force
-    arcs, contact_forces = found.x[0, :n, 0] * d.length, found.x[0, :n, 1:] * d.force
-    covariances, chances = found.covariances[0, :n] * d.length**2, found.probability[0, :n]
-    valid = found.valid[0, :n]
-    every = Contacts(
-        points,
-        covariances,
-        valid,
-        found.chi_squared[0, :n],
-        chances,
-        np.full(n, int(status)),
-        arcs,
-        forces,
-        contact_forces,
-        found.angle_sigma[0, :n],
-        np.ones(n, np.int64),
-        using,
-        ("candidate",),
-    )
-    if not n:
+    length, force = discretization.length, discretization.force
+    rest = continuing, using, found, (length, force)
+    if not found.number[0]:
         none = np.full(3, np.nan)
         away = np.full((3, 3), np.nan)
-        return Contact(none, away, False, chi_squared, np.nan, status, np.nan, none, none, every, 0)
+        return Contact(
+            none, away, False, chi_squared, np.nan, status, np.nan, none, none, 0, *rest[1:]
+        )
+    values, x = found.values[0, first], found.x[0, first] * force
+    if covariance is None:
+        covariance = found.covariances[0, first] * length**2
     return Contact(
-        points[first],
-        covariances[first] if covariance is None else covariance,
-        bool(valid[first]) and status in _CERTAIN,
+        values[3:] * length,
+        covariance,
+        bool(found.valid[0, first]) and status in _CERTAIN,
         chi_squared,
-        float(chances[first]),
+        float(found.probability[0, first]),
         status,
-        float(arcs[first]),
-        forces[first],
-        contact_forces[first],
-        every,
-        continuing,
+        float(found.x[0, first, 0] * length),
+        values[:3] * force,
+        x[1:],
+        *rest,
     )
 
 

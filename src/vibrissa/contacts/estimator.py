@@ -98,7 +98,8 @@ class Estimator:
         order = using.replace(",", " ").split() if isinstance(using, str) else list(using)
         errors = common_errors(stiffness_sigma, gain_sigma, mixing_sigma)
         sensor = sensor_noise(noise, names, errors)
-        self._order: list[int] | None = [order.index(name) for name in names]
+        places = [order.index(name) for name in names]
+        self._order: list[int] | None = places if places != sorted(places) else None
         if felt_above > 0.0 and sensor is None:
             raise ValueError("contact is detected by comparison with the noise; noise is needed")
         readout = Named(contact_map, names, sensor)

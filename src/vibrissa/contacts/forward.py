@@ -20,7 +20,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from vibrissa.contacts.channels import (
     CHANNELS,
@@ -32,6 +31,7 @@ from vibrissa.contacts.channels import (
     wrenches_of,
 )
 from vibrissa.contacts.least_squares import Fits, fit
+from vibrissa.deferred import transform
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.rod import STEPS, Resting, discretize, evaluated, resting, solve_forces
 from vibrissa.signals import within_turn
@@ -212,7 +212,7 @@ class Forward:
     ) -> Forward:
         """Put a whisker under gravity, with the standard deviations of what is uncertain."""
 
-        def bent(whisker: Whisker, turn: Rotation | None = None) -> Forward:
+        def bent(whisker: Whisker, turn: transform.Rotation | None = None) -> Forward:
             if gravity is None:
                 return cls(whisker, steps)
             now, before = (
@@ -228,7 +228,7 @@ class Forward:
         if gravity is not None:
             if gravity.direction_sigma > 0.0:
                 for axis in np.linalg.svd(np.array([gravity.acceleration]))[2][1:]:
-                    turned = bent(whisker, Rotation.from_rotvec(_NUDGE * axis))
+                    turned = bent(whisker, transform.Rotation.from_rotvec(_NUDGE * axis))
                     out.errors.append((turned, gravity.direction_sigma / _NUDGE))
             # A stiffer whisker bends less under the same weight, as a lighter one does.
             lighter = float(np.hypot(gravity.density_sigma, stiffness_sigma))

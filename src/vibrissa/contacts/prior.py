@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vibrissa.contacts.contacts import Candidates, spherical
+from vibrissa.contacts.contacts import Candidates
 from vibrissa.contacts.posterior import CERTAIN
 from vibrissa.contacts.ranking import chi_squared_of
 from vibrissa.contacts.readout import Mixed, Named
 from vibrissa.contacts.tip import tip_contacts
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod import Discretization, contact_tangents, discretize
-from vibrissa.signals import REGIONS, concave_backward, in_region
+from vibrissa.signals import REGIONS, concave_backward, in_region, spherical
 from vibrissa.status import Status
 
 if TYPE_CHECKING:

@@ -23,16 +23,16 @@ import numpy as np
 from vibrissa.contacts.basins import deviations, starts_of_basins
 from vibrissa.contacts.candidates import (
     UNEXPLAINED,
-    Problem,
     explain_rows,
     finite,
     solve_rows,
 )
-from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates
+from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates, Room
 from vibrissa.contacts.least_squares import channel_equations, fit_within, same_contact, whiten
 from vibrissa.contacts.nodes import PARTS, Searched, nearest_of, outside_share
 from vibrissa.contacts.noise import INDISTINCT
 from vibrissa.contacts.posterior import CERTAIN, judge, rank
+from vibrissa.contacts.task import Problem, Task, in_memory
 from vibrissa.contacts.weighing import Weighing, weigh_any
 from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel
 from vibrissa.rod import evaluate
@@ -388,17 +388,18 @@ def settle(
 
 @kernel
 def settle_rows(
-    of: Searched,
-    how: Weighing,
-    problem: Problem,
+    task: Task,
     targets: Array,
     measured: Array,
-    out: Candidates,
+    number: IntArray,
+    flat: Array,
+    valid: AnyArray,
     status: IntArray,
     first: int,
     last: int,
 ) -> None:
     """Complete the candidates of noisy measurements, judge and rank them."""
+    of, how, problem, out = task.of, task.how, task.problem, in_memory(number, flat, valid)
     room = _judging(MOST_CANDIDATES, targets.shape[1])
     for row in range(first, last):
         if not finite(targets[row]):
@@ -410,12 +411,11 @@ def settle_rows(
 
 
 def estimate_rows(
-    of: Searched,
-    how: Weighing,
+    task: Task,
     problem: Problem,
     targets: Array,
     measured: Array,
-    out: Candidates,
+    room: Room,
     status: IntArray,
     first: int,
     last: int,
@@ -425,10 +425,10 @@ def estimate_rows(
     Each stage is compiled by itself, so that whoever needs one does not wait for the others.
     """
     if problem.exact:
-        solve_rows(of, targets, measured, out, status, first, last)
+        solve_rows(task, targets, measured, *room, status, first, last)
     else:
-        explain_rows(of, how, problem, targets, measured, out, status, False, first, last)
+        explain_rows(task, targets, measured, *room, status, False, first, last)
     if problem.noisy:
-        settle_rows(of, how, problem, targets, measured, out, status, first, last)
+        settle_rows(task, targets, measured, *room, status, first, last)
         if not problem.exact and (status[first:last] == UNEXPLAINED).any():
-            explain_rows(of, how, problem, targets, measured, out, status, True, first, last)
+            explain_rows(task, targets, measured, *room, status, True, first, last)

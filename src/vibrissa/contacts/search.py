@@ -21,10 +21,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
 
-from vibrissa.contacts.candidates import UNEXPLAINED, Problem
-from vibrissa.contacts.contacts import Candidates, Contacts, contacts_of
+from vibrissa.contacts.candidates import UNEXPLAINED
+from vibrissa.contacts.contacts import Candidates, Contacts, Room, candidates_within, contacts_of
 from vibrissa.contacts.inversion import polish
 from vibrissa.contacts.joint_fit import soft_base
 from vibrissa.contacts.noise import explained, sensor_noise
@@ -38,7 +37,8 @@ from vibrissa.contacts.readout import (
     check_signals,
     independent,
 )
-from vibrissa.deferred import xr
+from vibrissa.contacts.task import Problem, task
+from vibrissa.deferred import spatial, xr
 from vibrissa.numerics import AnyArray, Array, IntArray, share_out
 from vibrissa.rod import TOLERANCE
 from vibrissa.signals import (
@@ -77,6 +77,7 @@ class Search:
         exact = isinstance(readout, Named) and len(readout.names) == UNKNOWNS
         limit = explained(independent(contact_map, readout) - UNKNOWNS)
         self._problem = Problem(exact, readout.noisy, readout.passes, limit)
+        self._task = task(readout.searched, readout.how, self._problem)
 
     def batch(self, values: Array, targets: Array) -> tuple[Candidates, IntArray, Array]:
         """Candidates of measurements (n, k), with statuses and χ² of the first (n,)."""
@@ -104,12 +105,17 @@ class Search:
         """Candidates of one measurement, with its status and χ² of the first."""
         readout = self.readout
         values, targets = measurement.measured[None], measurement.target[None]
-        status = np.array([int(Status.UNIQUE)])
+        code = int(Status.UNIQUE)
         if readout.nothing(measurement):
-            status[0], targets = self._nothing, np.full(targets.shape, np.nan)
+            code, targets = self._nothing, np.full(targets.shape, np.nan)
         elif readout.beyond(measurement):
-            status[0], targets = self._beyond, np.full(targets.shape, np.nan)
-        out, status, chi_squared = self._rows(values, targets, status)
+            code, targets = self._beyond, np.full(targets.shape, np.nan)
+        status, room = np.array([code]), Room.of(1)
+        estimate_rows(self._task, self._problem, targets, values, room, status, 0, 1)
+        out = candidates_within(*room)
+        chi_squared = out.chi_squared[0, :1]
+        if status[0] == UNEXPLAINED:
+            chi_squared = self._reasons(values, out, status)
         return out, STATUSES[int(status[0])], float(chi_squared[0])
 
     @property
@@ -123,29 +129,22 @@ class Search:
     def _rows(
         self, values: Array, targets: Array, status: IntArray
     ) -> tuple[Candidates, IntArray, Array]:
-        readout, out = self.readout, Candidates.room(len(values))
-        share_out(
-            len(values),
-            partial(
-                estimate_rows,
-                readout.searched,
-                readout.how,
-                self._problem,
-                targets,
-                values,
-                out,
-                status,
-            ),
-        )
-        chi_squared = out.chi_squared[:, 0].copy()
-        if UNEXPLAINED not in status:
-            return out, status, chi_squared
+        room = Room.of(len(values))
+        given = self._task, self._problem, targets, values, room, status
+        share_out(len(values), partial(estimate_rows, *given))
+        out = candidates_within(*room)
+        return out, status, self._reasons(values, out, status)
+
+    def _reasons(self, values: Array, found: Candidates, status: IntArray) -> Array:
+        """Fill why rows of three signals have no contact; χ² of the first candidates (n,)."""
+        chi_squared = found.chi_squared[:, 0].copy()
         rows = np.flatnonzero(status == UNEXPLAINED)
-        assert isinstance(readout, Named)
-        status[rows], away = why_none(self.contact_map, readout.names, values[rows])
-        none = out.number[rows] == 0
-        chi_squared[rows[none]] = away[none]
-        return out, status, chi_squared
+        if rows.size:
+            assert isinstance(self.readout, Named)
+            status[rows], away = why_none(self.contact_map, self.readout.names, values[rows])
+            none = found.number[rows] == 0
+            chi_squared[rows[none]] = away[none]
+        return chi_squared
 
 
 def why_none(
@@ -171,14 +170,14 @@ def why_none(
 @lru_cache(maxsize=16)
 def signals_at_nodes(
     contact_map: ChartedWhisker, names: tuple[str, ...]
-) -> tuple[Array, Array, cKDTree, Bounds]:
+) -> tuple[Array, Array, spatial.cKDTree, Bounds]:
     """Return the signals at the nodes of the chart, and what searches among them need."""
     values = contact_map.chart.values.reshape(-1, 6)
     which = [SIGNALS.index(name) for name in names]
     known = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))[:, which]
     turned = circular_among(names)
     size = np.where(turned, 1.0, np.ptp(known, axis=0))
-    tree = cKDTree(_on_circle(known, turned, size))
+    tree = spatial.cKDTree(_on_circle(known, turned, size))
     return known, size, tree, Bounds.of(contact_map, names)
 
 

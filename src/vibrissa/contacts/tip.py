@@ -23,7 +23,6 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from vibrissa.contacts.channels import CHANNELS, CIRCULAR, channel_derivatives, channels_of
 from vibrissa.contacts.contacts import Candidates
@@ -33,7 +32,7 @@ from vibrissa.contacts.least_squares import Fits, charted
 from vibrissa.contacts.noise import INDISTINCT, explained, whitening
 from vibrissa.contacts.posterior import CERTAIN
 from vibrissa.contacts.readout import Mixed, Named
-from vibrissa.deferred import interpolate
+from vibrissa.deferred import interpolate, spatial
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.signals import within_turn
 from vibrissa.status import Status
@@ -158,7 +157,7 @@ class TipContacts:
         self._turned = np.array([CIRCULAR[i] for i in self._which])
         known = channels_of(self._nodes.values)[:, self._which]
         self._span = np.where(self._turned, 1.0, known.std(axis=0))
-        self._tree = cKDTree(self._embedded(known))
+        self._tree = spatial.cKDTree(self._embedded(known))
         self._limit = explained(len(names) - 3)
 
     def _embedded(self, channels: Array) -> Array:

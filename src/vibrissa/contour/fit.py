@@ -34,7 +34,6 @@ from typing import Any, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import OptimizeResult, least_squares
 from scipy.special import chdtrc, chdtri, log_ndtr
 
 from vibrissa.contour.fitted_shape import excess_of
@@ -47,6 +46,7 @@ from vibrissa.contour.simple_shapes import (
     frame_across,
 )
 from vibrissa.contour.touches import FLOOR, Checked, Touches, checked, whitened
+from vibrissa.deferred import optimize
 from vibrissa.numerics import Array
 
 _SOFT = 2.0
@@ -286,13 +286,13 @@ def _scattered(starts: Sequence[_Posed], touches: Touches) -> tuple[Touches, Seq
 
 def _solved(
     start: _Posed, touches: Touches, tolerance: float = 1e-8, most: int = 50
-) -> OptimizeResult:
+) -> optimize.OptimizeResult:
     """Change a shape until it fits best."""
 
     def misses(step: Array) -> Array:
         return start.moved(step).misses(touches).reshape(-1)
 
-    return least_squares(
+    return optimize.least_squares(
         misses,
         np.zeros(start.count),
         jac="2-point" if tolerance > _PRECISE else "3-point",

@@ -8,9 +8,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.stats import qmc
 
 from vibrissa.contacts import Domain, within_paper_bounds
+from vibrissa.deferred import stats
 from vibrissa.numerics import AnyArray, Array, cross
 from vibrissa.rod import (
     Fold,
@@ -120,7 +120,7 @@ def spread(number: int, seed: int | None) -> Array:
     Without a seed they are not scrambled.
     """
     rng = None if seed is None else np.random.default_rng(seed)
-    sobol = qmc.Sobol(3, scramble=seed is not None, seed=rng)
+    sobol = stats.qmc.Sobol(3, scramble=seed is not None, seed=rng)
     unit = sobol.random_base2(max(1, int(np.ceil(np.log2(number)))))
     return in_chart(unit * [1.0, 2.0 * np.pi, 1.0])
 

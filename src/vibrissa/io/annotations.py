@@ -40,9 +40,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
-from vibrissa.deferred import xr
+from vibrissa.deferred import transform, xr
 from vibrissa.io.paths import check_writable
 from vibrissa.io.table import Table, read_numbers, write_table
 from vibrissa.io.toml import check_keys, in_file, number_array, quoted, read_toml
@@ -223,7 +222,7 @@ def load_head(path: str | PathLike[str]) -> xr.Dataset:
 def _of_quaternions(path: Path, values: Array) -> Array:
     size = np.linalg.norm(values, axis=1)
     _refuse(path, np.abs(size - 1.0) > _ROUNDED, "quaternions are not of unit length", size)
-    return Rotation.from_quat(values[:, [1, 2, 3, 0]]).as_matrix()
+    return transform.Rotation.from_quat(values[:, [1, 2, 3, 0]]).as_matrix()
 
 
 def _of_matrices(path: Path, values: Array) -> Array:
@@ -232,7 +231,7 @@ def _of_matrices(path: Path, values: Array) -> Array:
     _refuse(path, off > _ROUNDED, "matrices are not orthogonal, RᵀR − 1", off)
     sign = np.linalg.det(matrix)
     _refuse(path, sign < 0.0, "matrices mirror, determinant", sign)
-    return Rotation.from_matrix(matrix).as_matrix()
+    return transform.Rotation.from_matrix(matrix).as_matrix()
 
 
 def _of_angles(path: Path, values: Array) -> Array:
@@ -244,7 +243,7 @@ def _of_angles(path: Path, values: Array) -> Array:
         values[:, 1],
     )
     azimuth, elevation, roll = values.T
-    turns = Rotation.from_euler("ZYX", np.stack([azimuth, -elevation, roll], axis=1))
+    turns = transform.Rotation.from_euler("ZYX", np.stack([azimuth, -elevation, roll], axis=1))
     return turns.as_matrix()
 
 

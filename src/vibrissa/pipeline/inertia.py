@@ -16,10 +16,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
-from scipy.signal import lfilter
 
 from vibrissa.contour import to_laboratory
+from vibrissa.deferred import ndimage, signal
 from vibrissa.numerics import Array
 from vibrissa.pipeline.frames import one_whisker
 from vibrissa.pipeline.locate import locate_from_wrench
@@ -173,7 +172,9 @@ def _lagged(values: Array, steps: float) -> Array:
     mean = (1.0 - old) / steps
     # Exact where values change linearly between samples.
     start = (values[0] * old - values[0] * (mean - old))[None]
-    return np.asarray(lfilter([1.0 - mean, mean - old], [1.0, -old], values, axis=0, zi=start)[0])
+    return np.asarray(
+        signal.lfilter([1.0 - mean, mean - old], [1.0, -old], values, axis=0, zi=start)[0]
+    )
 
 
 def _smoothed(trial: _Trial, left: Array, added: Array) -> tuple[Array, Array]:
@@ -233,7 +234,7 @@ def _uncertainty(trial: _Trial, added: Array, apart: Array, vibration: Vibration
         near[first:end, 0] = np.exp(-turned)
     parts = (_LEFT**2 * (added**2 + apart**2), trial.wrench**2)
     left, whole = (
-        gaussian_filter1d(part.reshape(-1, 2, 3).mean(axis=2), _MEMORY / trial.step, axis=0)
+        ndimage.gaussian_filter1d(part.reshape(-1, 2, 3).mean(axis=2), _MEMORY / trial.step, axis=0)
         for part in parts
     )
     out[:, range(6), range(6)] += np.repeat(left + near**2 * whole, 3, axis=1)

@@ -24,8 +24,8 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from vibrissa.deferred import transform
 from vibrissa.numerics import Array
 from vibrissa.pipeline.frames import (
     SQUARES,
@@ -396,7 +396,9 @@ def _pose_covariance(own: Group, rotation: Array, position: Array) -> Array:
         there &= own["in_contact"]
     if not there.any():
         return out
-    turn = Rotation.from_matrix(rotation[there] @ np.swapaxes(turned[there], 1, 2)).as_rotvec()
+    turn = transform.Rotation.from_matrix(
+        rotation[there] @ np.swapaxes(turned[there], 1, 2)
+    ).as_rotvec()
     shift = (position - own["base_position"])[there]
     away = np.concatenate([shift, turn], axis=1)
     return np.asarray(out + away.T @ away / len(away))

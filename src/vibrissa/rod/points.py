@@ -14,8 +14,8 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
+from vibrissa.deferred import spatial
 from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel, norm3, share_out
 from vibrissa.rod.chart import (
     LEAST_ARC,
@@ -298,9 +298,9 @@ class PointSolver:
         inner = points[:, :-1, :-1].reshape(-1, 3)
         held = np.isfinite(inner).all(axis=1)
         self._contacts = chart.contacts[:, :-1, :-1].reshape(-1, 3)[held]
-        self._nearest = cKDTree(inner[held])
+        self._nearest = spatial.cKDTree(inner[held])
         places, reasons = zip(*_faces(chart), strict=True)
-        self._faces = cKDTree(np.concatenate(places))
+        self._faces = spatial.cKDTree(np.concatenate(places))
         self._resting = _at_rest(chart)
         self._reasons = np.concatenate(
             [np.full(len(p), int(r)) for p, r in zip(places, reasons, strict=True)]

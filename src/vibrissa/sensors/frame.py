@@ -21,9 +21,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
-from vibrissa.deferred import optimize
+from vibrissa.deferred import optimize, transform
 from vibrissa.numerics import Array
 from vibrissa.sensors.regression import solve, warn_of_misfit
 
@@ -229,7 +228,7 @@ def calibrate_frame(
     noise = np.repeat([force_noise, moment_noise], 3)
 
     def frame(unknowns: Array) -> SensorFrame:
-        turn = Rotation.from_rotvec(unknowns[:3]).as_matrix()
+        turn = transform.Rotation.from_rotvec(unknowns[:3]).as_matrix()
         return SensorFrame(turn @ (sign * force), unknowns[3:], reaction=sign < 0)
 
     def residuals(unknowns: Array) -> Array:

@@ -25,8 +25,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
+from vibrissa.deferred import transform
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.rod import discretize, solve_forces
 from vibrissa.sensors.frame import cross_matrix
@@ -160,7 +160,10 @@ class SuspendedWhisker:
         d_force, d_arm = turn @ slope[:, :3], turn @ slope[:, 3:]
         angle = rotation * np.cross(arm, force)
         d_angle = rotation * (cross_matrix(arm) @ d_force - cross_matrix(force) @ d_arm)
-        turned, spin = Rotation.from_rotvec(angle).as_matrix(), _right_jacobian(angle) @ d_angle
+        turned, spin = (
+            transform.Rotation.from_rotvec(angle).as_matrix(),
+            _right_jacobian(angle) @ d_angle,
+        )
         pull = (turned @ force[:, :, None])[:, :, 0]
         d_felt = turned @ (d_force - cross_matrix(force) @ spin)
         base = self.whisker.pose.origin / d.length + pivot
@@ -233,7 +236,7 @@ class SuspendedWhisker:
         contacts = np.stack([s[nearest], 0.0 * radius, 0.0 * radius], axis=1)
         miss = np.full(len(target), np.inf)
         for share in np.linspace(0.0, 1.0, _STEPS + 1)[1:]:
-            on_path = base + Rotation.from_rotvec(share * axis).apply(a)
+            on_path = base + transform.Rotation.from_rotvec(share * axis).apply(a)
             rounds = _ROUNDS if share < 1.0 else _LAST_ROUNDS
             contacts, miss = self._newton(on_path, contacts, rounds)
         return contacts, miss

@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
-from vibrissa.deferred import interpolate
+from vibrissa.deferred import interpolate, transform
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.rod import discretize
 from vibrissa.sensors.regression import ThinPlate
@@ -253,7 +252,7 @@ class _Problem:
         whisker, d = self.whisker, discretize(self.whisker)
         if full[11:18].any():
             whisker = _reshaped(whisker, full[11:14], full[14:17], full[17])
-        turn = Rotation.from_rotvec(full[8:11]).as_matrix() @ whisker.pose.rotation
+        turn = transform.Rotation.from_rotvec(full[8:11]).as_matrix() @ whisker.pose.rotation
         origin = whisker.pose.origin + full[5:8] * d.length
         return SuspendedWhisker(
             replace(whisker, pose=type(whisker.pose)(turn, origin)),

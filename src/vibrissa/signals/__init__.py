@@ -34,6 +34,7 @@ from vibrissa.signals.regions import (
     in_region as in_region,
     nearest_on_rest,
     resting,
+    spherical as spherical,
     within_cone,
 )
 from vibrissa.signals.triplets import TRIPLETS, selection as selection

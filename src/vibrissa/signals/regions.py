@@ -14,8 +14,8 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
 
+from vibrissa.deferred import spatial
 from vibrissa.numerics import AnyArray, Array
 
 if TYPE_CHECKING:
@@ -28,8 +28,27 @@ REGIONS = ("all", "ELD", "CF", "CB", "ELD CF", "ELD CB")
 _SAMPLES = 2049
 
 
+def spherical(points: Array) -> Array:
+    """Spherical form of points: distance, azimuth atan2(y, x), elevation asin(z / r).
+
+    Parameters
+    ----------
+    points : (..., 3) array
+        Points, whisker frame, m.
+
+    Returns
+    -------
+    (..., 3) array
+        Distance r, m, azimuth θ and elevation φ, rad.
+    """
+    r = np.linalg.norm(points, axis=-1)
+    theta = np.arctan2(points[..., 1], points[..., 0])
+    phi = np.arctan2(points[..., 2], np.hypot(points[..., 0], points[..., 1]))
+    return np.stack([r, theta, phi], axis=-1)
+
+
 @lru_cache(maxsize=16)
-def resting(whisker: Whisker) -> tuple[Array, Array, cKDTree, Array]:
+def resting(whisker: Whisker) -> tuple[Array, Array, spatial.cKDTree, Array]:
     """Sample the resting whisker; cached.
 
     Parameters
@@ -50,7 +69,7 @@ def resting(whisker: Whisker) -> tuple[Array, Array, cKDTree, Array]:
     """
     s = np.linspace(0.0, whisker.length, _SAMPLES)
     places = whisker.position(s)
-    return s, places, cKDTree(places), whisker.frame(np.array(whisker.length))[:, 0]
+    return s, places, spatial.cKDTree(places), whisker.frame(np.array(whisker.length))[:, 0]
 
 
 def nearest_on_rest(whisker: Whisker, points: Array) -> tuple[Array, Array]:

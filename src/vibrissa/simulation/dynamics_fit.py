@@ -12,8 +12,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
 
+from vibrissa.deferred import optimize
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.simulation.dynamics import Dynamics
 from vibrissa.simulation.vibration import Vibration
@@ -134,7 +134,7 @@ def fit_dynamics(
     )
     begun = [np.array([0.0, start, 0.0]) for start in _STARTS]
     best = min(begun, key=lambda one: float((left(one) ** 2).sum()))
-    fit = least_squares(left, best, bounds=(-_WITHIN, _WITHIN))
+    fit = optimize.least_squares(left, best, bounds=(-_WITHIN, _WITHIN))
     # Each window gives as many numbers to its own vibration as there are amplitudes.
     misfit = 2.0 * fit.cost / (starts.size * (2 * width - 2 * len(first.rates)) - 3)
     slopes = np.asarray(fit.jac, dtype=np.float64)

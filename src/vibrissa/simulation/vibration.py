@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.signal import StateSpace, lsim
 
+from vibrissa.deferred import signal
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.simulation.chain import Chain, jacobian
 from vibrissa.simulation.dynamics import Dynamics, at_rest, slowest
@@ -134,8 +134,8 @@ class Vibration:
             loss = self.damping * rate**2
             a, c = [[0.0, 1.0], [-(rate**2), -loss]], [[-(rate**2), -loss]]
             still = [load[0] / rate**2, 0.0]
-            mode: Any = StateSpace(a, [[0.0], [1.0]], c, [[1.0]])
-            bent[:, k] = lsim(mode, load, time - time[0], still)[1]
+            mode: Any = signal.StateSpace(a, [[0.0], [1.0]], c, [[1.0]])
+            bent[:, k] = signal.lsim(mode, load, time - time[0], still)[1]
         return self.base_wrench(carried + np.einsum("tk,kma->tma", bent, self.shapes))
 
     def free_moments(self, scale: float, step: float, width: int) -> Array:

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
+from vibrissa.deferred import transform
 from vibrissa.numerics import Array
 
 # A motion is continued past the last pose for so many times the step between the last two.
@@ -124,6 +124,6 @@ class Poses:
         share = (time - t0) / (t1 - t0)
         if not -_LONGEST <= share <= 1.0 + _LONGEST:
             return Pose(np.full((3, 3), np.nan), np.full(3, np.nan))
-        turn = Rotation.from_matrix(first.rotation.T @ second.rotation).as_rotvec()
-        rotation = first.rotation @ Rotation.from_rotvec(share * turn).as_matrix()
+        turn = transform.Rotation.from_matrix(first.rotation.T @ second.rotation).as_rotvec()
+        rotation = first.rotation @ transform.Rotation.from_rotvec(share * turn).as_matrix()
         return self._base(rotation, first.position + share * (second.position - first.position))

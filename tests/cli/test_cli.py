@@ -187,7 +187,10 @@ def test_info(folder, table, chart):
     assert vb.__version__ in text
     assert "threads" in text
     assert "table of signals" in run("info", table[0])
-    assert "contact map" in run("info", chart)
+    brief = run("info", chart)
+    assert "contact map" in brief
+    assert f"next: vibrissa estimate SIGNALS.csv --map {chart}" in brief
+    assert "/chart" in run("info", chart, "--all")
     csv = folder / "w.csv"
     save_centerline(csv, samples.gamma().centerline(40))
     assert "centreline of a whisker" in run("info", csv)

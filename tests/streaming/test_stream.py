@@ -609,6 +609,9 @@ def test_time_stamps_and_frames_go_through_unchanged(gamma_map, wrench, tmp_path
     gamma_map.save(tmp_path / "map.nc")
     stream(tmp_path / "in", "--map", tmp_path / "map.nc", "--bag-out", tmp_path / "out")
     assert [each.stamp for each in bag_wrenches(tmp_path / "in")] == stamps.tolist()
+    shown = CliRunner().invoke(app, ["info", str(tmp_path / "in")]).output
+    assert "12 messages, geometry_msgs/msg/WrenchStamped" in shown
+    assert "next: vibrissa stream" in shown
     messages = bag_messages(tmp_path / "out")
     for name in ("/contact_point", "/contact_candidates"):
         headers = [message.header for _, message in messages[name]]

@@ -206,6 +206,17 @@ def test_keys_clicks_and_links_lead_through_a_trial(browser, recording):
         person.wait_until(lambda: trial.frame == first)
         person.page.keyboard.press("n")
         person.wait_until(lambda: trial.frame == trial.trial.next_contact(first))
+        (client,) = viewer.page.server.get_clients().values()
+
+        def height():
+            """Share of the height in the direction from which things are looked at."""
+            away = client.camera.position - client.camera.look_at
+            return away[2] / np.linalg.norm(away)
+
+        person.page.get_by_role("button", name="Top", exact=True).click()
+        person.wait_until(lambda: height() > 0.999)
+        person.page.keyboard.press("a")
+        person.wait_until(lambda: height() < 0.9)
         # What is at the bottom of the window covers plots that have been scrolled there.
         on_top = """plot => {
           const box = plot.getBoundingClientRect();

@@ -31,6 +31,23 @@ _TABLES = """\
   tracked points  time or frame; x, y, z or column, row
   corrections     view, frame, whisker, x, y
   whiskers        name, x_mm, y_mm, z_mm, azimuth_deg, …, length_mm, coefficient_per_mm"""
+_MAP = "vibrissa contact map"
+_NEXT = {
+    _MAP: "estimate SIGNALS.csv --map {} -o contacts.csv",
+    "vibrissa uniqueness": "figures MAP.nc --uniqueness {} -o figures",
+    "vibrissa whisker": "map --whisker {} -o map.nc",
+    "whisker": "map --whisker {} -o map.nc",
+    "sensor": "estimate READINGS.csv --map MAP.nc --sensor {} -o contacts.csv",
+    "calibration": "track VIDEO VIDEO --cameras {} -o trial.nc",
+    "study": "sweep {} -o study.zarr",
+    "settings": "simulate {} -o trial.nc",
+    "the head's pose": "track VIDEO VIDEO --head {} -o trial.nc",
+    "contact points": "track VIDEO VIDEO --contact {} -o trial.nc",
+    "corrections": "track VIDEO VIDEO --corrections {} -o trial.nc",
+    "signals": "estimate {}  # the whisker: --whisker or --map FILE",
+}
+"""What goes on from a file, by its kind."""
+
 _PACKAGES = ("numpy", "scipy", "numba", "xarray", "h5netcdf", "matplotlib")
 
 
@@ -66,12 +83,32 @@ def _installation() -> Iterator[tuple[str, str]]:
     yield "kernels", f"cached in {folder}" if folder else "compiled anew in every run"
 
 
+def _follows(kind: str | None, path: Path) -> Iterator[tuple[str, str]]:
+    """The command that goes on from a file, if there is one."""
+    if kind in _NEXT:
+        yield "next", f"vibrissa {_NEXT[kind].format(path)}"
+
+
+def _bag(path: Path) -> Iterator[tuple[str, str]]:
+    """List the topics of a bag, and the command for its wrenches."""
+    topics = vb.io.bag_topics(path)
+    yield "file", str(path)
+    yield "kind", f"bag of ROS, {len(topics)} topics"
+    for topic, (kind, count) in sorted(topics.items()):
+        yield topic, f"{count} messages, {kind}"
+    if any(kind.endswith("WrenchStamped") for kind, _ in topics.values()):
+        yield "next", f"vibrissa stream {path} --map MAP.nc --bag-out contacts"
+
+
 def _size(path: Path) -> str:
     size = path.stat().st_size
     return f"{size / 1e3:.3g} kB" if size < 1e6 else f"{size / 1e6:.3g} MB"
 
 
 def _file(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
+    if vb.io.is_bag(path):
+        yield from _bag(path)
+        return
     if path.is_dir():
         yield from _array(path, "folder of centrelines")
         return
@@ -170,6 +207,7 @@ def _settings(path: Path) -> Iterator[tuple[str, str]]:
     study = {"whiskers", "tasks"} & set(settings)
     yield "kind", "a study, for vibrissa sweep" if study else "settings, as of vibrissa simulate"
     yield "states", ", ".join(settings) or "nothing"
+    yield from _follows("study" if study else "settings", path)
 
 
 def _is_sensor(path: Path) -> bool:
@@ -206,6 +244,7 @@ def _sensor(path: Path) -> Iterator[tuple[str, str]]:
     if sensor.mixing_covariance.any():
         known.append("mixing and offset as a calibration left them")
     yield "errors", ", ".join(known) or "none stated: gain and mixing count as exact"
+    yield from _follows("sensor", path)
 
 
 def _array(path: Path, kind: str) -> Iterator[tuple[str, str]]:
@@ -231,6 +270,7 @@ def _calibration(path: Path) -> Iterator[tuple[str, str]]:
     yield "kind", "calibration of cameras"
     for camera in vb.cameras.load_cameras(path):
         yield camera.name, f"{camera.size[0]} × {camera.size[1]} pixels, {camera.projection}"
+    yield from _follows("calibration", path)
 
 
 def _is_text(path: Path) -> bool:
@@ -316,6 +356,11 @@ def _groups(path: Path, whole: bool = False) -> Iterator[tuple[str, str]]:
     if kind == vb.certificates.KIND:
         yield from _certificate(path, whole)
         return
+    if kind == _MAP and not whole:
+        yield "map", f"{vb.ContactMap.load(path)!r}"[1:-1]
+        yield "also", "groups and variables: --all"
+        yield from _follows(kind, path)
+        return
     with vb.io.opened(path, "NetCDF-4", soft_links=False), h5netcdf.File(path, "r") as file:
         names = [_text(one) for one in file.variables["whisker"][...]] if _many(file) else []
         for name, group in _within(file, "/"):
@@ -326,6 +371,7 @@ def _groups(path: Path, whole: bool = False) -> Iterator[tuple[str, str]]:
             yield from _notes(file.groups["whiskers"])
         for line in _text(file.attrs.get("remarks", "")).splitlines():
             yield "note", line
+    yield from _follows(kind, path)
 
 
 def _certificate(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
@@ -440,11 +486,7 @@ def _table(path: Path) -> Iterator[tuple[str, str]]:
             continue
         yield "kind", f"table of {kind}" if kind != "whisker" else "centreline of a whisker"
         yield from _rows(kind, data)
-        if kind == "signals":
-            yield (
-                "next",
-                f"vibrissa estimate {path}  # the whisker: --whisker or --map FILE",
-            )
+        yield from _follows(kind, path)
         return
     columns = {re.split(r"[ _/(\[]", cell)[0] for cell in _header_cells(path)}
     used = [name for name in vb.signals.SIGNALS if name in columns]

@@ -62,6 +62,7 @@ from vibrissa.io.rosbag import (
     BagMessage as BagMessage,
     ContactBag as ContactBag,
     bag_poses as bag_poses,
+    bag_topics as bag_topics,
     bag_wrenches as bag_wrenches,
     is_bag as is_bag,
 )

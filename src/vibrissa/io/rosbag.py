@@ -70,6 +70,30 @@ class BagMessage(NamedTuple):
     values: list[float]
 
 
+def bag_topics(path: str | PathLike[str]) -> dict[str, tuple[str, int]]:
+    """List the topics of a bag: type and number of messages."""
+    with _opened(path) as reader:
+        return {c.topic: (c.msgtype, c.msgcount) for c in reader.connections}
+
+
+@contextmanager
+def _opened(path: str | PathLike[str]) -> Iterator[Any]:
+    """Open a bag for reading."""
+    rosbags = _library()
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"there is no bag {path}")
+    with _readable(path):
+        _finish(path)
+        reader = rosbags.reader([path], default_typestore=rosbags.types)
+        reader.open()
+    try:
+        yield reader
+    finally:
+        with suppress(Exception):  # of a bag that is damaged, not all has been opened
+            reader.close()
+
+
 def bag_wrenches(path: str | PathLike[str], topic: str | None = None) -> Iterator[BagMessage]:
     """Read wrenches from a bag, in the order of recording."""
 
@@ -102,17 +126,10 @@ def _messages(
     values: Callable[[Any], list[float]],
 ) -> Iterator[BagMessage]:
     """Messages of some kinds on one topic."""
-    rosbags = _library()
     path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(f"there is no bag {path}")
-    with _readable(path):
-        _finish(path)
-        reader = rosbags.reader([path], default_typestore=rosbags.types)
-        reader.open()
+    with _opened(path) as reader:
         fitting = [c for c in reader.connections if c.msgtype in kinds]
         there = sorted({c.topic for c in fitting})
-    try:
         if topic is None and len(there) == 1:
             topic = there[0]
         if topic not in there:
@@ -130,9 +147,6 @@ def _messages(
                     stamp or recorded, recorded, message.header.frame_id, values(message)
                 )
             yield read
-    finally:
-        with suppress(Exception):  # of a bag that is damaged, not all has been opened
-            reader.close()
 
 
 @contextmanager

@@ -13,6 +13,13 @@
     history.replaceState(null, "", "?" + asked + location.hash);
   };
   if (dark.matches) matched();
+  // Labels in space are black on white boxes, in any page.
+  const compiled = WebGL2RenderingContext.prototype.shaderSource;
+  if (dark.matches) WebGL2RenderingContext.prototype.shaderSource = function (shader, source) {
+    compiled.call(this, shader, source
+      .replace(/vec4\(1\.0, 1\.0, 1\.0, 0\.85 \* vAlpha\)/, "vec4(0.08, 0.08, 0.08, 0.7 * vAlpha)")
+      .replace(/vec4\(0\.0, 0\.0, 0\.0, a\)/, "vec4(0.9, 0.9, 0.9, a)"));
+  };
   dark.addEventListener("change", () => { matched(); location.reload(); });
 
   // Keys press buttons; a click in a plot over time sets the time.
@@ -33,10 +40,12 @@
     input.dispatchEvent(new Event("blur", { bubbles: true }));
   };
   const keys = {
-    ",": ["◀ frame"], ".": ["frame ▶"], "n": ["Next contact"], " ": ["Play", "Pause"],
+    ",": ["◀ frame"], ".": ["frame ▶"], "n": ["Next contact"], "a": ["All"], " ": ["Play", "Pause"],
   };
   addEventListener("keydown", (event) => {
-    const typing = /^(INPUT|TEXTAREA|BUTTON)$/.test(event.target.tagName);
+    // The space bar presses the button that was clicked last.
+    const typing = (event.key === " " ? /^(INPUT|TEXTAREA|BUTTON)$/ : /^(INPUT|TEXTAREA)$/)
+      .test(event.target.tagName);
     if (typing || event.ctrlKey || event.metaKey || event.altKey || !keys[event.key]) return;
     const found = button(...keys[event.key]);
     if (found) { event.preventDefault(); found.click(); }
@@ -49,8 +58,14 @@
     if (share >= 0 && share <= 1) setTime(share);
   });
 
-  // The address keeps what is seen, so that a link leads back to it.
+  // The address keeps what is seen, so that a link leads back to it. What is drawn counts as
+  // narrow where the server's `framed` centres it above the panel.
   setInterval(() => {
+    const drawn = document.querySelector("canvas"), page = document.documentElement;
+    if (drawn) {
+      page.classList.toggle("narrow", drawn.clientWidth < 0.65 * drawn.clientHeight);
+      page.style.setProperty("--drawn", `${drawn.clientWidth}px`);
+    }
     const state = document.querySelector("[data-link]")?.dataset.link;
     if (state && location.hash !== "#" + state)
       history.replaceState(null, "", location.search + "#" + state);

@@ -12,7 +12,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from math import inf
 from typing import Any, Protocol
@@ -97,6 +97,7 @@ class Page:
         self.stage = Stage(server)
         self.work = Latest(self._fault)
         self._framing = Framing(server, self._viewed)
+        self._all = whole(whisker)
         self.slow_work = Latest(self._fault)
         self.original = whisker
         self._contact_map = contact_map
@@ -270,11 +271,19 @@ class Page:
 
     def face_whisker(self) -> None:
         """Point all cameras at the whisker."""
-        self._framing.show(whole(self.bend.whisker))
+        self._show(whole(self.bend.whisker))
 
     def look_at(self, centre: Array, distance: float, way: Sequence[float]) -> None:
         """Point all cameras at a position, mm, from a distance, mm, and a direction."""
-        self._framing.show(Shot(centre, distance, np.asarray(way, dtype=np.float64)))
+        self._show(Shot(centre, distance, np.asarray(way, dtype=np.float64)))
+
+    def _show(self, shot: Shot) -> None:
+        self._all = shot
+        self._framing.show(shot)
+
+    def turn(self, name: str) -> None:
+        """Point all cameras at everything, as at first or from one of `VIEWS`."""
+        self._framing.show(replace(self._all, way=np.array(VIEWS.get(name, self._all.way))))
 
     def _fault(self, error: Exception) -> None:
         traceback.print_exception(error)
@@ -405,6 +414,9 @@ the page's."""
 PHONE, LOW = 0.65, 0.55
 """Width over height of a window in which the panel is below what is drawn, and its share of the
 height there."""
+
+VIEWS = {"Top": (0.0, -1e-3, 1.0), "Front": (0.0, -1.0, 0.0), "Side": (1.0, 0.0, 0.0)}
+"""Directions from which things can be looked at; with x to the right in the first two."""
 
 _WIDTH = 1.25
 """Width of what is shown, over the distance from which it is looked at."""

@@ -30,7 +30,7 @@ from vibrissa.viewer.bend import BendMode, WhiskerControls
 from vibrissa.viewer.live import Live, LivePage
 from vibrissa.viewer.locate import LocateMode, coloured, located, usual_sensor
 from vibrissa.viewer.map import MapMode
-from vibrissa.viewer.page import CompileNotice, Mode, Page, Rehearsal
+from vibrissa.viewer.page import VIEWS, CompileNotice, Mode, Page, Rehearsal
 from vibrissa.viewer.readout import note
 from vibrissa.viewer.recorded import Watched, watched
 from vibrissa.viewer.save import SaveControls, amended
@@ -274,6 +274,8 @@ def _furnished(
         choice.options = tuple(_HERE + each if each == name else each for each in names)
 
     page.chosen = chosen
+    turned = page.server.gui.add_button_group("View", ("All", *VIEWS))
+    turned.on_click(lambda event: page.turn(event.target.value))
     notice = page.server.gui.add_html(note(_COMPILING), visible=False)
     modes: list[Mode] = [BendMode(page), LocateMode(page), MapMode(page)]
     if trial is not None:

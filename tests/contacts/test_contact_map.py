@@ -76,6 +76,12 @@ def test_a_file_of_another_kind_is_refused(tmp_path):
     xr.Dataset({"a": 1.0}).to_netcdf(other, engine="h5netcdf")
     with pytest.raises(ValueError, match="not a contact map"):
         vb.ContactMap.load(other)
+    trial = tmp_path / "trial.nc"
+    xr.Dataset(coords={"whisker": ["a"]}, attrs={"kind": "vibrissa recording"}).to_netcdf(
+        trial, engine="h5netcdf"
+    )
+    with pytest.raises(ValueError, match="what it holds: vibrissa recording"):
+        vb.ContactMap.load(trial)
 
 
 @pytest.mark.parametrize(

@@ -155,6 +155,21 @@ def test_time_that_does_not_rise_is_told(tmp_path):
     assert "stands still in 1 of 6 rows, first in row 3" in still
 
 
+def test_time_in_milliseconds_is_noted(tmp_path):
+    def notes(step):
+        rows = "".join(f"{step * i},1e-6,0,0,1e-8,0,0\n" for i in range(12))
+        return load_signals(written(tmp_path, HEADER + "\n" + rows)).attrs["notes"]
+
+    assert notes(0.002) == []
+    assert "time_ms" in notes(2)[0]
+
+
+def test_force_and_moment_in_each_other_s_columns_are_suspected(tmp_path):
+    rows = "\n0,1e-6,0,0,0,5e-5,0"
+    with pytest.raises(ValueError, match="in each other's columns"):
+        load_signals(written(tmp_path, HEADER + rows))
+
+
 def bent_signals(whisker):
     bent = deflect(whisker, PointContact([[25e-3, 12e-3, 1e-3], [27e-3, 2e-3, -2e-3], [0, 0, 0]]))
     columns = ("time", "space")

@@ -58,7 +58,7 @@ def test_there_are_twenty_triplets():
     assert len(TRIPLETS) == len(set(TRIPLETS)) == 20
 
 
-@pytest.mark.parametrize("said", ["MD Fx MB", "Fx,MB,MD", ("MB", "MD", "Fx")])
+@pytest.mark.parametrize("said", ["MD Fx MB", "Fx,MB,MD", "fx,mb,md", ("MB", "MD", "Fx")])
 def test_a_choice_of_signals_is_put_in_order(said):
     assert selection(said) == ("Fx", "MB", "MD")
 

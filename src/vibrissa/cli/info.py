@@ -96,7 +96,9 @@ def _bag(path: Path) -> Iterator[tuple[str, str]]:
     yield "kind", f"bag of ROS, {len(topics)} topics"
     for topic, (kind, count) in sorted(topics.items()):
         yield topic, f"{count} messages, {kind}"
-    if any(kind.endswith("WrenchStamped") for kind, _ in topics.values()):
+    # Bags that `stream` writes hold the force at the contact, from which nothing goes on.
+    wrenches = [t for t, (kind, _) in topics.items() if kind.endswith("WrenchStamped")]
+    if any(not topic.endswith("/contact_force") for topic in wrenches):
         yield "next", f"vibrissa stream {path} --map MAP.nc --bag-out contacts"
 
 

@@ -50,6 +50,8 @@ class WhiskerOptions:
         if not path.exists():
             raise FileNotFoundError(f"there is no file {path}")
         if not vb.io.is_netcdf(path):
+            if vb.io.recognise(path) == vb.io.Kind.VIDEO:
+                raise ValueError(f"{path} is a video, and no whisker, map or recording")
             return vb.load_whisker(path, rat=self.rat, any_length=self.any_length)
         whisker = _whisker_in(path)
         return whisker if self.rat is None else whisker.with_properties(rat=self.rat)

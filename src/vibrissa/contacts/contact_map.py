@@ -28,7 +28,15 @@ from vibrissa.contacts.prior import Prior
 from vibrissa.contacts.search import estimate
 from vibrissa.contacts.wrench import estimate_components
 from vibrissa.deferred import xr
-from vibrissa.io import COMPRESSED, naming, read_dataset, read_groups, write_netcdf
+from vibrissa.io import (
+    COMPRESSED,
+    Kind,
+    naming,
+    read_dataset,
+    read_groups,
+    recognise,
+    write_netcdf,
+)
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.quantities import attributes
 from vibrissa.rod import (
@@ -518,6 +526,11 @@ def _save(contact_map: ContactMap, path: Path) -> None:
 
 def _load(path: Path, grid: bool) -> ContactMap:
     """Read a map; raise a ValueError if the file is not one."""
+    what = recognise(path)
+    if what not in (Kind.NETCDF, Kind.UNKNOWN):
+        raise ValueError(
+            f"{path} is not a contact map, as `vibrissa map` writes it; what it holds: {what}"
+        )
     groups = read_groups(path, ("/", "whisker", "chart", "grid"), {"grid"})
     kind = groups["/"].attrs.get("kind", "")
     if kind != _KIND:

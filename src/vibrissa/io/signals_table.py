@@ -42,6 +42,8 @@ _KINDS = {"t": "time", "F": "force", "M": "moment"}
 _LARGEST = {"F": (1e4, "N"), "M": (1e3, "N·m")}
 # Seconds since any epoch are fewer.
 _LATEST = 1e11
+# Time between rows, s, of several from which it is likelier in ms.
+_SLOW, _SEVERAL = 1.0, 10
 _LEVER_ARMS = (1e-4, 1.0)
 # Of whiskers bent to their fold 0.3 L from the base, forces and moments stay below 40 times these.
 _LARGEST_SCALES = 100.0
@@ -87,6 +89,10 @@ def _notes(time: Array) -> list[str]:
                 f"{after + 1}, from {time[before]:g} to {time[after]:g} s; rows are "
                 "evaluated each on its own, in the order of the file"
             )
+    if step.size >= _SEVERAL and (usual := float(np.median(step))) >= _SLOW:
+        notes.append(
+            f"rows are {usual:.3g} s apart: where time is in ms the column is called time_ms"
+        )
     return notes
 
 
@@ -252,6 +258,8 @@ def _check_lever_arm(path: Path, table: Array) -> None:
         advice = "forces look like mN or µN (multiply by 1e-3 or 1e-6)"
     else:
         return
+    if least < 1.0 / arm < most:
+        advice += ", or force and moment are in each other's columns"
     raise ValueError(
         f"{path}: force and moment do not belong together: |M| / |F|, the distance of the contact "
         f"or less, is {arm:.2g} m, and {least:g} to {most:g} m is possible. The {advice}; the "

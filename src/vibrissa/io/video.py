@@ -196,7 +196,11 @@ def opened_video(path: str | PathLike[str]) -> InputContainer:
     try:
         container = av.open(str(path))
     except av.FFmpegError as error:
-        raise ValueError(f"{path} is not a video that can be read: {error.strerror}") from error
+        what = recognise(path) if path.stat().st_size else Kind.UNKNOWN
+        known = "" if what in (Kind.VIDEO, Kind.UNKNOWN) else f" (what it holds: {what})"
+        raise ValueError(
+            f"{path} is not a video that can be read: {error.strerror}{known}"
+        ) from error
     if not container.streams.video:
         container.close()
         raise ValueError(f"{path} holds no video")

@@ -15,7 +15,9 @@ def selection(
     signals: str | Sequence[str], least: int = 3, exactly: int | None = None
 ) -> tuple[str, ...]:
     """Read a choice of signals."""
-    names = signals.replace(",", " ").split() if isinstance(signals, str) else list(signals)
+    given = signals.replace(",", " ").split() if isinstance(signals, str) else list(signals)
+    spelt = {name.lower(): name for name in SIGNALS}
+    names = [spelt.get(str(name).lower(), name) for name in given]
     unknown = [name for name in names if name not in SIGNALS]
     enough = len(names) >= least if exactly is None else len(names) == exactly
     if unknown or len(set(names)) != len(names) or not enough:

@@ -243,6 +243,9 @@ def length_faults(length: float, any_length: bool | None = False) -> list[str]:
         fault = (
             f"length is {length:.4g} m, longer than the {LONGEST:g} m of any whisker: these look "
             "like millimetres given as metres, or micrometres as millimetres; multiply by 1e-3"
+            if length <= 1e3 * LONGEST
+            else f"length is {length:.4g} m, longer than the {LONGEST:g} m of any whisker: these "
+            "look like micrometres or pixels given as metres; lengths are given in m"
         )
     else:
         fault = (

@@ -16,12 +16,12 @@ INSTEAD = {
     r"hang(s)? together": "are related",
     r"knows of": "contains, has",
     r"goes with": "corresponds to",
-    r"(is|are) off by|\d m?m off": "has an error of",
+    r"(is|are) off by|\d+ [mµ]?m,? off": "has an error of",
     r"as surely as|how surely": "confidence, probability",
     r"(is|are|was|were) no (?!longer|more|less|better|worse|\w+er )": "is not a",
     r"the paper's ways?": "the paper's method",
     r"honest test": "validation with friction and inertia",
-    r"light touch": "light contact",
+    r"light touch(es)?": "light contact",
 }
 """Patterns, and what is written instead."""
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import xarray as xr
     from scipy import interpolate, ndimage, optimize, signal, spatial, stats
+    from scipy.sparse import linalg as sparse_linalg
     from scipy.spatial import transform
 else:
 
@@ -29,6 +30,17 @@ else:
         _Deferred(f"scipy.{name}")
         for name in ("interpolate", "ndimage", "optimize", "signal", "spatial", "stats")
     )
+    sparse_linalg = _Deferred("scipy.sparse.linalg")
     transform = _Deferred("scipy.spatial.transform")
 
-__all__ = ["interpolate", "ndimage", "optimize", "signal", "spatial", "stats", "transform", "xr"]
+__all__ = [
+    "interpolate",
+    "ndimage",
+    "optimize",
+    "signal",
+    "sparse_linalg",
+    "spatial",
+    "stats",
+    "transform",
+    "xr",
+]

@@ -355,7 +355,7 @@ def _groups(path: Path, whole: bool = False) -> Iterator[tuple[str, str]]:
 
     kind = vb.io.kind_of(path)
     yield "kind", kind or "unknown"
-    if kind == vb.certificates.KIND:
+    if "certificate" in (kind or "") and kind == vb.certificates.KIND:
         yield from _certificate(path, whole)
         return
     if kind == _MAP and not whole:

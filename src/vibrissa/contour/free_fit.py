@@ -29,13 +29,13 @@ from typing import NamedTuple, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
 
 from vibrissa.contour.fit import TO_SIGMA, fit_shape
 from vibrissa.contour.fitted_shape import excess_of
 from vibrissa.contour.free_surface import FreeFit, Support, merged
 from vibrissa.contour.simple_shapes import SHAPES, SimpleShape, frame_across
 from vibrissa.contour.touches import FLOOR, ContactArrays, checked
+from vibrissa.deferred import spatial
 from vibrissa.numerics import Array, Mask
 
 _BETTER = {"plane": 1.0, "sphere": 0.9, "cylinder": 0.5}
@@ -233,7 +233,7 @@ def _sharp(covariance: Array, scale: float) -> Mask:
 
 def _like_neighbours(position: Array, value: Array, variance: Array) -> Mask:
     """Contacts that are not far from the median of those about them."""
-    _, near = cKDTree(position).query(position, min(_NEIGHBOURS, len(position)))
+    _, near = spatial.cKDTree(position).query(position, min(_NEIGHBOURS, len(position)))
     away = value - np.median(value[near], axis=1)
     usual = TO_SIGMA * float(np.median(np.abs(away)))
     return np.asarray(np.abs(away) < _OUTLIER * np.sqrt(variance + usual**2))

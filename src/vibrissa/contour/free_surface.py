@@ -33,11 +33,11 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import cho_solve, solve_triangular
-from scipy.spatial.distance import cdist
 
 from vibrissa.contour.fitted_shape import FittedShape, check_complete, rows_of
 from vibrissa.contour.simple_shapes import SHAPES, SimpleShape
 from vibrissa.contour.touches import FLOOR
+from vibrissa.deferred import spatial
 from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
 
@@ -219,7 +219,7 @@ class FreeFit(FittedShape):
 
     def _kernel(self, first: Array, second: Array) -> Array:
         """Covariances (n, m) of the deviations at points (n, 3) and (m, 3)."""
-        far = np.sqrt(5.0) / self.length * cdist(first, second)
+        far = np.sqrt(5.0) / self.length * spatial.distance.cdist(first, second)
         free = self.amplitude**2 * (1.0 + far + far**2 / 3.0) * np.exp(-far)
         slopes = self.base._slopes(first), self.base._slopes(second)
         return np.asarray(free + (slopes[0] * self._loose) @ slopes[1].T)

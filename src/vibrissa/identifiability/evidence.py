@@ -69,7 +69,7 @@ _IN_PLANE = 256
 _PLANAR = 1e-9
 # The corners of the box of a tolerance and the middles of its faces.
 _CORNERS = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(8, 3)
-_MOVES = np.concatenate([_CORNERS, np.eye(3), -np.eye(3)])
+_MOVES = (_CORNERS[::7], _CORNERS[1:7], np.concatenate([np.eye(3), -np.eye(3)]))
 
 
 class Local(NamedTuple):
@@ -514,20 +514,24 @@ def _ambiguous(
     for t in reversed(range(len(TOLERANCES))):
         if not active.size:
             break
-        targets = signals[active][:, None] + TOLERANCES[t] * span * _MOVES
-        found = invert(contact_map.chart, contact_map.tree(names), names, targets.reshape(-1, 3))
-        points = found.values[:, :, 3:].reshape(active.size, -1, 3)
-        away = np.linalg.norm(points - own.values[active, None, 3:], axis=2)
-        i, j = np.nonzero(away >= question.separation)
-        other = contact_set(
-            contact_map,
-            found.contacts.reshape(active.size, -1, 3)[i, j],
-            found.values.reshape(active.size, -1, 6)[i, j],
-            question.domain,
-        )
-        for k, region in enumerate(question.regions):
-            hit = other.members(region) & (other.angle > question.cone)
-            out[t, k, active[i[hit]]] = True
+        for moves in _MOVES:
+            asked = active[(belongs & ~twinned & ~out[t])[:, active].any(axis=0)]
+            targets = signals[asked][:, None] + TOLERANCES[t] * span * moves
+            found = invert(
+                contact_map.chart, contact_map.tree(names), names, targets.reshape(-1, 3)
+            )
+            points = found.values[:, :, 3:].reshape(asked.size, -1, 3)
+            away = np.linalg.norm(points - own.values[asked, None, 3:], axis=2)
+            i, j = np.nonzero(away >= question.separation)
+            other = contact_set(
+                contact_map,
+                found.contacts.reshape(asked.size, -1, 3)[i, j],
+                found.values.reshape(asked.size, -1, 6)[i, j],
+                question.domain,
+            )
+            for k, region in enumerate(question.regions):
+                hit = other.members(region) & (other.angle > question.cone)
+                out[t, k, asked[i[hit]]] = True
         out[t] &= belongs
         active = active[(out[t] & ~twinned)[:, active].any(axis=0)]
     return np.asarray(np.logical_or.accumulate(out | twinned, axis=0))

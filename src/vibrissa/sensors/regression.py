@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
-from scipy.spatial.distance import cdist
 
+from vibrissa.deferred import spatial
 from vibrissa.numerics import Array
 
 _CONDITION = 1e4
@@ -102,7 +102,7 @@ class ThinPlate:
     def fit(cls, points: Array, values: Array, ratio: float | None = None) -> ThinPlate:
         """Fit values (n, k) of zero mean; where no noise is stated, by the largest likelihood."""
         reach = 2.0 * float(np.linalg.norm(np.ptp(points, axis=0)))
-        kernel = _kernel(cdist(points, points) / reach)
+        kernel = _kernel(spatial.distance.cdist(points, points) / reach)
         n, k = values.shape
         weights, noise = np.empty((n, k)), np.empty(k)
         best = np.full(k, np.inf)
@@ -118,7 +118,7 @@ class ThinPlate:
 
     def __call__(self, points: Array) -> tuple[Array, Array]:
         """Mean (n, k) at points, and its derivatives (n, k, 3)."""
-        x = np.minimum(cdist(points, self.points) / self.reach, 1.0)
+        x = np.minimum(spatial.distance.cdist(points, self.points) / self.reach, 1.0)
         by_square = 6.0 * (x - 1.0) / self.reach**2  # (dk/dx) / (x R²)
         n, k = len(points), self.weights.shape[1]
         moments = self.weights[:, :, None] * self.points[:, None, :]

@@ -20,8 +20,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded, solveh_banded
-from scipy.sparse.linalg import LinearOperator, eigsh
 
+from vibrissa.deferred import sparse_linalg
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.sensors.suspended import SuspendedWhisker, Touches
 
@@ -317,6 +317,6 @@ def _largest_errors(root: Array, point: Array) -> Array:
         full = cho_solve_banded((root, True), full.ravel()).reshape(n, -1)
         return np.asarray(np.einsum("kai,ki->ka", point, full[:, :3]).ravel())
 
-    joint = LinearOperator((3 * n, 3 * n), matvec=spread, dtype=np.float64)
-    size, shifts = eigsh(joint, k=_SHARED, v0=np.ones(3 * n))
+    joint = sparse_linalg.LinearOperator((3 * n, 3 * n), matvec=spread, dtype=np.float64)
+    size, shifts = sparse_linalg.eigsh(joint, k=_SHARED, v0=np.ones(3 * n))
     return np.asarray((np.sqrt(np.maximum(size, 0.0)) * shifts).T.reshape(_SHARED, n, 3))

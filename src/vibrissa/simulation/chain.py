@@ -19,8 +19,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from vibrissa.deferred import transform
 from vibrissa.numerics import Array, IntArray, kernel
 from vibrissa.whisker import Whisker
 
@@ -54,7 +54,9 @@ class Chain:
         twist = bend / (1.0 + whisker.poisson_ratio)
         stiffness = np.stack([twist, bend, bend], axis=1)
         frames = whisker.frame(nodes)
-        rest = Rotation.from_matrix(np.swapaxes(frames[:-1], 1, 2) @ frames[1:]).as_rotvec()
+        rest = transform.Rotation.from_matrix(
+            np.swapaxes(frames[:-1], 1, 2) @ frames[1:]
+        ).as_rotvec()
         if whisker.base_stiffness is not None:
             soft_bend, soft_twist = whisker.base_stiffness
             joints = np.concatenate([[0.0], joints])

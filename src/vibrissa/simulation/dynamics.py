@@ -28,10 +28,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh
-from scipy.spatial.transform import Rotation, RotationSpline
 
+from vibrissa.deferred import interpolate, transform
 from vibrissa.numerics import Array, IntArray
 from vibrissa.objects import Surface
 from vibrissa.simulation.chain import Chain, bezier, configure, inertia, jacobian, solve_definite
@@ -172,8 +171,8 @@ class Path:
 
     def __init__(self, time: Array, rotation: Array, position: Array, step: float) -> None:
         time = time - time[0]
-        self._turn = RotationSpline(time, Rotation.from_matrix(rotation))
-        self._shift = CubicSpline(time, position, axis=0)
+        self._turn = transform.RotationSpline(time, transform.Rotation.from_matrix(rotation))
+        self._shift = interpolate.CubicSpline(time, position, axis=0)
         self._last = float(time[-1])
         self.step, self.count = step, round(time[-1] / step) + 1
         self.frames = set(np.round(time / step).astype(int).tolist())

@@ -31,9 +31,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from vibrissa.cameras import PIXEL_SIZE, Camera, cameras_dataset, orthogonal_views
+from vibrissa.deferred import interpolate
 from vibrissa.io import Frame, write_video
 from vibrissa.numerics import kernel
 from vibrissa.objects import Surface
@@ -380,7 +380,7 @@ def _fine(line: Array, radius: Array, camera: Camera) -> tuple[Array, Array]:
     length = float(np.linalg.norm(np.diff(pixels, axis=0), axis=1).sum())
     s = np.linspace(0.0, 1.0, len(line))
     fine = np.linspace(0.0, 1.0, max(int(length / _STEP), 2 * len(line)))
-    return CubicSpline(s, line)(fine), np.interp(fine, s, radius)
+    return interpolate.CubicSpline(s, line)(fine), np.interp(fine, s, radius)
 
 
 def _at(move: Array, fine: Array, line: Array) -> Array:

@@ -34,8 +34,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
 
+from vibrissa.deferred import interpolate
 from vibrissa.numerics import Array
 from vibrissa.objects import Box, Peg, Plane, Sphere, Surface
 from vibrissa.rod import follow_surfaces
@@ -307,7 +307,7 @@ def tabulated(
         raise ValueError(f"{rows.size} rows at {rate} frames/s give fewer than two frames")
     frames = rows[0] + np.arange(count) / rate
     smooth = {
-        name: CubicSpline(rows, column)(frames)
+        name: interpolate.CubicSpline(rows, column)(frames)
         for name, column in ((name, getattr(table, name)) for name in values)
     }
     return Motion(time=frames, **smooth)

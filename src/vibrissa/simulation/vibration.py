@@ -17,9 +17,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
-from vibrissa.deferred import signal
+from vibrissa.deferred import interpolate, signal
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.simulation.chain import Chain, jacobian
 from vibrissa.simulation.dynamics import Dynamics, at_rest, slowest
@@ -126,7 +125,7 @@ class Vibration:
             Force, N, and moment, N·m, whisker frame.
         """
         places = np.einsum("tij,mj->tmi", rotation, self.places) + position[:, None]
-        carried = CubicSpline(time, places)(time, 2)
+        carried = interpolate.CubicSpline(time, places)(time, 2)
         carried = np.einsum("tij,tmi->tmj", rotation, carried)
         loads = -np.einsum("m,kma,tma->tk", self.mass, self.shapes, carried)
         bent = np.zeros_like(loads)

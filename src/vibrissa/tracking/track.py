@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from vibrissa.cameras import Camera
+from vibrissa.deferred import transform
 from vibrissa.numerics import Array, Mask
 from vibrissa.objects import Surface
 from vibrissa.recording import ONE_VIEW
@@ -397,7 +397,7 @@ def _known_flat(curves: Array, whisker: Whisker, free: float) -> tuple[RestShape
             f"{100.0 * _FLAT:g} % of its length, {1e3 * _FLAT * whisker.length:.2f} mm, are "
             "allowed: film it from two sides, or leave --whisker out"
         )
-    sides = [Rotation.from_rotvec([turn, 0.0, 0.0]).as_matrix() for turn in (0.0, np.pi)]
+    sides = [transform.Rotation.from_rotvec([turn, 0.0, 0.0]).as_matrix() for turn in (0.0, np.pi)]
     laid = [replace(whisker, pose=Pose(turn, np.zeros(3))) for turn in sides]
     shapes = [known_rest(curves, one, free) for one in laid]
     return min(zip(shapes, laid, strict=True), key=lambda pair: pair[0].noise)

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from scipy.optimize import linear_sum_assignment
 
 from vibrissa.cameras import Camera, orthogonal_views
+from vibrissa.deferred import optimize
 from vibrissa.numerics import Array
 from vibrissa.tracking.refine.trace_series import NODES
 from vibrissa.tracking.trace.trace import STEP, Trace, given
@@ -183,7 +183,7 @@ def _identified(tracks: xr.Dataset, points: Array, notes: list[str]) -> tuple[Ar
         same = np.linalg.norm(last[:, None] - ends[i][None], axis=-1).sum(axis=-1)
         turned = np.linalg.norm(last[:, None] - ends[i][None, :, ::-1], axis=-1).sum(axis=-1)
         cost = np.fmin(same, turned) if either else same
-        rows, columns = linear_sum_assignment(np.where(np.isnan(cost), 1e6, cost))
+        rows, columns = optimize.linear_sum_assignment(np.where(np.isnan(cost), 1e6, cost))
         for row, column in zip(rows, columns, strict=True):
             if not np.isfinite(ends[i, column]).all():
                 continue

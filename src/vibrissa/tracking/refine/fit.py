@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from vibrissa.cameras import Camera
+from vibrissa.deferred import transform
 from vibrissa.numerics import Array, Mask
 from vibrissa.objects import Surface
 from vibrissa.rod import Discretization, discretize, solve_forces
@@ -352,7 +352,7 @@ class Problem:
         o = self.options
         slower = (1000.0 / self.rate) ** 2
         # How it turned since the start, in the head's axes.
-        turn = Rotation.from_matrix(
+        turn = transform.Rotation.from_matrix(
             state.rotation @ np.swapaxes(self.start.rotation, 1, 2)
         ).as_rotvec()
         place = np.concatenate([state.position, turn, state.contact], axis=1)
@@ -392,7 +392,7 @@ class Problem:
 def _turning(rotation: Array) -> Array:
     """Rotation vectors (t − 1, 3) from each frame to the next, laboratory axes."""
     step = rotation[1:] @ np.swapaxes(rotation[:-1], 1, 2)
-    return np.asarray(Rotation.from_matrix(step).as_rotvec())
+    return np.asarray(transform.Rotation.from_matrix(step).as_rotvec())
 
 
 def _shared(problem: Problem, fit: _Linear) -> Array:
@@ -480,7 +480,9 @@ def _by_length(
     after = other.solved()[0]
     point, wrench = _contacts(problem, state)
     moved, changed = _contacts(other, after)
-    turn = Rotation.from_matrix(after.rotation @ np.swapaxes(state.rotation, 1, 2)).as_rotvec()
+    turn = transform.Rotation.from_matrix(
+        after.rotation @ np.swapaxes(state.rotation, 1, 2)
+    ).as_rotvec()
     shift = (after.position - state.position) * length
     contact = np.einsum("tij,tj->ti", after.rotation, moved) + shift
     contact -= np.einsum("tij,tj->ti", state.rotation, point)

@@ -19,9 +19,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from vibrissa.cameras import Camera, triangulate
+from vibrissa.deferred import transform
 from vibrissa.numerics import Array
 from vibrissa.tracking.refine.trace_series import TraceSeries
 from vibrissa.tracking.space.curve import merge
@@ -176,7 +176,7 @@ def lens(camera: Camera, strength: float, turn: Array, scale: float, shift: floa
     focal = camera.matrix.copy()
     focal[:2, :2] *= 1.0 + scale
     focal[0, 2] += shift
-    rotation = Rotation.from_rotvec(turn).as_matrix() @ camera.rotation
+    rotation = transform.Rotation.from_rotvec(turn).as_matrix() @ camera.rotation
     if strength <= 0.0:
         return replace(camera, matrix=focal, rotation=rotation)
     focal[:2, :2] /= strength
@@ -396,7 +396,7 @@ class _Problem:
             trial = replace(
                 best,
                 points=best.points + step[: 3 * n].reshape(n, 3),
-                rotation=Rotation.from_rotvec(poses[:, 3:]).as_matrix() @ best.rotation,
+                rotation=transform.Rotation.from_rotvec(poses[:, 3:]).as_matrix() @ best.rotation,
                 position=best.position + poses[:, :3],
                 q=best.inside(best.q + step[-k:]) if optics else best.q,
             )

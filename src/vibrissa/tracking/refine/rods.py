@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from vibrissa.deferred import transform
 from vibrissa.numerics import Array, Mask
 from vibrissa.rod import Discretization, discretize, shapes, solve_forces
 from vibrissa.tracking.space.pose import BasePose
@@ -53,7 +53,7 @@ class State:
 
     def moved(self, step: Array) -> State:
         """Change by (t, 10): shift, turn about the axes in which it is held, contact."""
-        turn = Rotation.from_rotvec(step[:, 3:6]).as_matrix()
+        turn = transform.Rotation.from_rotvec(step[:, 3:6]).as_matrix()
         contact = self.contact + step[:, 6:]
         contact[:, 0] = np.clip(contact[:, 0], *_LIMITS)
         return State(turn @ self.rotation, self.position + step[:, :3], contact)

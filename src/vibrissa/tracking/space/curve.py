@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
 
 from vibrissa.cameras import Camera, triangulate
+from vibrissa.deferred import interpolate
 from vibrissa.numerics import kernel
 from vibrissa.tracking.trace.trace import Trace, arc_lengths, interpolated
 
@@ -219,7 +219,7 @@ _THIRD = np.diff(np.eye(_CONTROLS), n=3, axis=0)
 def _basis(count: int) -> Array:
     """Spline basis (count, _CONTROLS) at equal distances."""
     places = np.linspace(0.0, 1.0, count)
-    return np.asarray(BSpline.design_matrix(places, _KNOTS, 3).toarray())
+    return np.asarray(interpolate.BSpline.design_matrix(places, _KNOTS, 3).toarray())
 
 
 def _fitted(cameras: Sequence[Camera], traces: Sequence[Trace], start: Array) -> SpaceCurve:
@@ -243,7 +243,7 @@ def _fitted(cameras: Sequence[Camera], traces: Sequence[Trace], start: Array) ->
     spread = np.linalg.inv(hessian).reshape(_CONTROLS, 3, _CONTROLS, 3)
     basis = _basis(NODES)
     covariance = np.einsum("ik,kalb,il->iab", basis, spread, basis) * max(1.0, misfit**2)
-    dense = BSpline(_KNOTS, control, 3)(np.linspace(0.0, 1.0, 8 * NODES))
+    dense = interpolate.BSpline(_KNOTS, control, 3)(np.linspace(0.0, 1.0, 8 * NODES))
     if len(cameras) == 1:
         dense[:, 2] = 0.0
     return SpaceCurve(_evenly_spaced(dense, NODES), covariance, misfit)

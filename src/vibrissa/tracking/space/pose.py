@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
+from vibrissa.deferred import transform
 from vibrissa.numerics import Array
 from vibrissa.tracking.space.rest_shape import RestShape, aligned_lengths, motions
 from vibrissa.tracking.trace.trace import interpolated
@@ -106,7 +106,7 @@ class HeadPose:
                 f"rows; the video lasts from {wanted[0]:g} to {wanted[-1]:g} s"
             )
         at = np.clip(wanted, known[0], known[-1])
-        turned = Slerp(known, Rotation.from_matrix(turn))(at).as_matrix()
+        turned = transform.Slerp(known, transform.Rotation.from_matrix(turn))(at).as_matrix()
         return cls(interpolated(at, known, place), turned)
 
     def rows(self, frames: NDArray[np.intp]) -> HeadPose:

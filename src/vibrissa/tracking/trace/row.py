@@ -19,9 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import linear_sum_assignment
-from scipy.spatial import cKDTree
 
+from vibrissa.deferred import optimize, spatial
 from vibrissa.io import Frame
 from vibrissa.numerics import Array, Mask
 from vibrissa.tracking.trace.clutter import NEAR, between_whiskers
@@ -210,7 +209,7 @@ def _begun(
             for click, half in zip(clicked, 0.5 * apart, strict=True)
         ]
     ).reshape(len(free), len(every))
-    rows, columns = linear_sum_assignment(np.minimum(price, 2.0 * LOST))
+    rows, columns = optimize.linear_sum_assignment(np.minimum(price, 2.0 * LOST))
     lines = [one.line for one in every]
     starts = {
         free[i]: _up_to_a_crossing(even(lines[c][_passed(clicked[i], lines[c])[1] :]), lines)
@@ -393,7 +392,7 @@ def _up_to_a_crossing(line: Array, every: Sequence[Array]) -> Array:
     """The beginning of a line, until it meets another one."""
     others = [one for one in every if overlap(one, line) < _SAME_CURVE]
     if others:
-        away, _ = cKDTree(np.concatenate(others)).query(line)
+        away, _ = spatial.cKDTree(np.concatenate(others)).query(line)
         met = np.flatnonzero((away < NEAR) & (np.arange(len(line)) >= _FEWEST))
         line = line[: met[0]] if met.size else line
     return line

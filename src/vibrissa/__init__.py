@@ -50,6 +50,7 @@ if TYPE_CHECKING:
         Estimator,
         Gravity,
         Prior,
+        estimate_around,
         estimate_from_wrench,
         second_contact,
     )
@@ -106,6 +107,7 @@ __all__ = [
     "critical_cones",
     "deflect",
     "deflect_around",
+    "estimate_around",
     "estimate_from_wrench",
     "evaluation",
     "identifiability",
@@ -155,6 +157,7 @@ _HOMES = {
         "Estimator",
         "Gravity",
         "Prior",
+        "estimate_around",
         "estimate_from_wrench",
         "second_contact",
     ),

@@ -51,6 +51,14 @@ def test_a_folder_is_done_once_and_summarised(tmp_path):
     assert int(touch["contacts"]) == 1
     assert 0 < int(touch["frames_in_contact"]) <= int(truth["in_contact"].sum())
     assert "touch.nc" in (tmp_path / "summary.html").read_text(encoding="utf-8")
+    # The recording's own inertia is stated, as by every verb that uses the sensor's signals.
+    assert "which --inertia removes" not in text
+    tree = load_recording(tmp_path / "touch.nc")
+    tree.attrs["origin"] = "simulated: with inertia, damping ratio 0.14, frictionless"
+    (tmp_path / "moving").mkdir()
+    save_recording(tmp_path / "moving" / "trial.nc", tree)
+    text = run("batch", tmp_path / "moving", "--force", "--axis", "0,0,1")
+    assert "with the whisker's inertia, which --inertia removes" in " ".join(text.split())
     before = (tmp_path / "touch.nc").stat().st_mtime_ns
     run("batch", tmp_path, "--axis", "0,0,1")
     assert (tmp_path / "touch.nc").stat().st_mtime_ns == before

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 import vibrissa as vb
 from vibrissa.objects import Peg, Placement, Plane, Sphere
 from vibrissa.rod import discretize
-from vibrissa.rod.obstacles import Grid, Obstacles, bent_by_one, settle
+from vibrissa.rod.obstacles import Grid, Obstacles, bent_by_one, settled
 
 LENGTH = 0.1
 AT_ORIGIN = Placement(np.eye(3), np.zeros(3))
@@ -93,7 +93,7 @@ def test_one_contact_is_that_of_a_peg(base_stiffness):
         arc, point = float(exact.arc_length) / d.length, exact.contact_point / d.length
         strain = bent_by_one(grid, arc, exact.force / d.force, point)
         pressing = np.zeros((1, grid.s.size))
-        found = settle(
+        found = settled(
             whisker,
             Obstacles([Peg(place, axis, radius)], AT_ORIGIN, d.length),
             grid,

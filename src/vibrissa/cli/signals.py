@@ -156,7 +156,9 @@ def _origin(tree: xr.DataTree) -> str:
     source = str(about.get("source", "a source that is not known"))
     if source == "sensor":
         if "density" not in about:
-            return "signals as the sensor read them"
+            moved = "with inertia" in str(tree.attrs.get("origin"))
+            rings = ", with the whisker's inertia, which --inertia removes" if moved else ""
+            return f"signals as the sensor read them{rings}"
         density, damping = (
             " to ".join(f"{value:.4g}" for value in dict.fromkeys(np.ravel(about[name])))
             for name in ("density", "damping_ratio")

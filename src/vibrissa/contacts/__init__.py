@@ -1,5 +1,6 @@
 """From base signals to contacts: the map of all contacts and its inversion."""
 
+from vibrissa.contacts.around import estimate_around
 from vibrissa.contacts.channels import (
     WRENCH,
     Channels,
@@ -76,6 +77,7 @@ __all__ = [
     "Progress",
     "SensorNoise",
     "ellipsoids",
+    "estimate_around",
     "estimate_from_wrench",
     "second_contact",
     "spherical",

@@ -4,7 +4,12 @@ Beyond loads and :func:`deflect` this is what the inverse problem is built on: t
 the chart of the stable contacts, and the search for contacts of given signals in it.
 """
 
-from vibrissa.rod.around import ObstacleDeflection, around as around, deflect_around
+from vibrissa.rod.around import (
+    NearObjects as NearObjects,
+    ObstacleDeflection,
+    around as around,
+    deflect_around,
+)
 from vibrissa.rod.chart import (
     CELLS,
     LEAST_ARC,
@@ -43,6 +48,7 @@ from vibrissa.rod.newton import (
     stable,
     start_from as start_from,
 )
+from vibrissa.rod.obstacles import Equilibrium as Equilibrium
 from vibrissa.rod.outward import (
     contact_forces as contact_forces,
     shapes as shapes,

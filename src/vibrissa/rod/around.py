@@ -18,7 +18,16 @@ from vibrissa.numerics import Array, IntArray, Mask
 from vibrissa.objects import Placement, Surface
 from vibrissa.rod.deflection import Deflection, vectors
 from vibrissa.rod.discretization import discretize
-from vibrissa.rod.obstacles import Equilibrium, Grid, Obstacles, bent_by_one, settle, strain_on
+from vibrissa.rod.obstacles import (
+    ELEMENTS,
+    Equilibrium,
+    Grid,
+    Obstacles,
+    bent_by_one,
+    settled,
+    solve_at,
+    strain_on,
+)
 from vibrissa.rod.surfaces import Progress, SurfaceDeflection, follow_surfaces
 from vibrissa.status import Status
 
@@ -30,6 +39,8 @@ OVERLAP = 5e-6
 # Points along the whisker at which a second contact is searched, and the distance of one with the
 # same object from the first, over L. So many rows at once.
 _SAMPLES, _ASIDE, _ROWS = 129, 0.03, 512
+# A whisker that objects do not reach is pressed by so much to begin with, over L.
+_PRESSED = 5e-3
 # Continued from the placement before, no node moves farther, over L.
 _JUMP = 0.1
 
@@ -161,10 +172,7 @@ def deflect_around(
     >>> (bent.arc_length[0, [0, 1, -1]] * 1e3).round(1)
     array([ 53.3,  55.2, 100. ])
     """
-    solids = list(objects) if isinstance(objects, Sequence) else [objects]
-    soft = [repr(solid) for solid in solids if np.isfinite(solid.stiffness)]
-    if soft:
-        raise ValueError(f"several contacts are solved with rigid objects only; got {soft[0]}")
+    solids = _rigid(objects)
     turn = np.eye(3) if base_rotation is None else vectors("base_rotation", base_rotation)
     move = np.zeros(3) if base_position is None else vectors("base_position", base_position)
     if turn.ndim < 2 or turn.shape[-2] != 3 or turn.ndim > 3 or move.ndim > 2:
@@ -181,6 +189,61 @@ def deflect_around(
         ) from error
     found = follow_surfaces(whisker, solids, turn, move, progress=progress)
     return around(whisker, solids, turn, move, found)
+
+
+def _rigid(objects: Surface | Sequence[Surface]) -> list[Surface]:
+    solids = list(objects) if isinstance(objects, Sequence) else [objects]
+    soft = [repr(solid) for solid in solids if np.isfinite(solid.stiffness)]
+    if soft:
+        raise ValueError(f"several contacts are solved with rigid objects only; got {soft[0]}")
+    return solids
+
+
+class NearObjects:
+    """One whisker near rigid objects that are shifted (3,) in the laboratory, over L."""
+
+    def __init__(
+        self, whisker: Whisker, objects: Surface | Sequence[Surface], elements: int = ELEMENTS
+    ) -> None:
+        self._whisker, self._surfaces = whisker, _rigid(objects)
+        self._grid, self._length = Grid.of(whisker, elements), whisker.length
+
+    def reaching(self, place: Placement) -> Array | None:
+        """Shift of the objects, none where they touch, toward a whisker that they do not reach."""
+        s = np.linspace(0.0, 1.0, _SAMPLES) * self._length
+        line, radius = place.outside(self._whisker.position(s)), self._whisker.radius(s)
+        gaps = np.array([one.signed_distance(line) - radius for one in self._surfaces])
+        which, at = np.unravel_index(np.argmin(gaps), gaps.shape)
+        if gaps[which, at] < 0.0:
+            return np.zeros(3)
+        normal = self._surfaces[which].local_geometry(line[at])[1]
+        return np.asarray(normal * (gaps[which, at] / self._length + _PRESSED))
+
+    def from_outside(self, place: Placement, shift: Array) -> Equilibrium | None:
+        """Equilibrium that a whisker comes to that rested clear of the objects."""
+        there = self._shifted(place, shift)
+        turn, move = there.rotation[None], there.position[None]
+        found = follow_surfaces(self._whisker, self._surfaces, turn, move)
+        if not _touching(found.bent.status)[0]:
+            return None
+        return _from_one(self._whisker, self._surfaces, there, found, 0, self._grid)
+
+    def moved(
+        self, place: Placement, shift: Array, start: Equilibrium, settle: bool = True
+    ) -> Equilibrium | None:
+        """Equilibrium from another one on; unless it is to settle, nodes stay where they are."""
+        obstacles = Obstacles(self._surfaces, self._shifted(place, shift), self._length)
+        begin = start.grid, start.strain, start.pressing
+        if settle:
+            found = settled(self._whisker, obstacles, *begin)
+        else:
+            found = solve_at(obstacles, *begin)
+        if found is None or not found.contacts()[0].size or found.farthest(start) > _JUMP:
+            return None
+        return found
+
+    def _shifted(self, place: Placement, shift: Array) -> Placement:
+        return Placement(place.rotation, place.position - shift * self._length)
 
 
 def around(
@@ -250,32 +313,45 @@ def _solved(
 ) -> dict[int, Equilibrium]:
     """Placements with several contacts, by number."""
     solved: dict[int, Equilibrium] = {}
-    bent, d = found.bent, discretize(whisker)
-    touching = _touching(bent.status)
+    touching = _touching(found.bent.status)
     last: Equilibrium | None = None
     for i in range(len(positions)):
         if overlap[i] <= OVERLAP and (touching[i] or last is None):
             last = None
             continue
         grid = Grid.of(whisker)
-        obstacles = Obstacles(surfaces, Placement(rotations[i], positions[i]), d.length)
+        place = Placement(rotations[i], positions[i])
         one = None
         if last is not None:
-            one = settle(whisker, obstacles, grid, strain_on(last, grid), last.pressing_on(grid))
+            obstacles = Obstacles(surfaces, place, whisker.length)
+            one = settled(whisker, obstacles, grid, strain_on(last, grid), last.pressing_on(grid))
             if one is None or not one.contacts()[0].size or one.farthest(last) > _JUMP:
                 one = None
         if one is None and touching[i]:
-            arc = float(bent.arc_length[i]) / d.length
-            force, point = bent.force[i] / d.force, bent.contact_point[i] / d.length
-            pressing = np.zeros((len(surfaces), grid.s.size))
-            nearest = int(np.argmin(np.abs(grid.s - arc)))
-            pressing[found.surface[i], nearest] = np.linalg.norm(force)
-            strain = bent_by_one(grid, arc, force, point)
-            one = settle(whisker, obstacles, grid, strain, pressing)
+            one = _from_one(whisker, surfaces, place, found, i, grid)
         last = one
         if one is not None:
             solved[i] = one
     return solved
+
+
+def _from_one(
+    whisker: Whisker,
+    surfaces: Sequence[Surface],
+    place: Placement,
+    found: SurfaceDeflection,
+    row: int,
+    grid: Grid,
+) -> Equilibrium | None:
+    """Equilibrium that a whisker bent by one contact comes to."""
+    bent, d = found.bent, discretize(whisker)
+    arc = float(bent.arc_length[row]) / d.length
+    force, point = bent.force[row] / d.force, bent.contact_point[row] / d.length
+    pressing = np.zeros((len(surfaces), grid.s.size))
+    nearest = int(np.argmin(np.abs(grid.s - arc)))
+    pressing[found.surface[row], nearest] = np.linalg.norm(force)
+    strain = bent_by_one(grid, arc, force, point)
+    return settled(whisker, Obstacles(surfaces, place, d.length), grid, strain, pressing)
 
 
 def overlaps(

@@ -33,6 +33,8 @@ from vibrissa.objects import Placement, Surface
 from vibrissa.rod.chart import LEAST_ARC
 
 if TYPE_CHECKING:
+    from scipy.interpolate import CubicHermiteSpline
+
     from vibrissa.whisker import Whisker
 
 # Elements of the whisker, and of a compliant base.
@@ -45,6 +47,8 @@ _LONGEST = 0.2
 _NEAR = 0.05
 # Single contacts move their node this often, or until it moves by less than this, over L.
 _MOVES, _MOVED = 6, 1e-6
+# Error of the end of an arc, over the distance of nodes.
+_SHARED = 0.02
 # Points of two shapes that are compared.
 _COMPARED = 33
 # No node comes nearer to another than this share of their distance.
@@ -243,6 +247,28 @@ class Equilibrium(NamedTuple):
         push = self.pressing[surface, node, None] * self.normals[surface, node]
         return self.grid.s[node], surface, self.nodes[node], push
 
+    def wrench(self) -> Array:
+        """Force and moment (6,) at the base."""
+        _, _, place, push = self.contacts()
+        return np.concatenate([push.sum(axis=0), np.cross(place, push).sum(axis=0)])
+
+    def first_contact(self) -> tuple[float, Array, Array]:
+        """Arc length and place (3,) of the contact nearest to the base, and its deviation (3,).
+
+        The concentrated force at the end of an arc between two nodes is shared by these. What that
+        leaves open is one standard deviation along the whisker.
+        """
+        s, _, _, push = self.contacts()
+        node = np.searchsorted(self.grid.s, s)
+        row = node - node[0] == np.arange(node.size)
+        share = np.linalg.norm(push[:3], axis=1) * row[:3]
+        share = np.append(share, np.zeros(3 - share.size))
+        inner = np.array([share[0], max(share[1] - share[2], 0.0)])[: s.size]
+        at = float(inner @ s[:2] / inner.sum())
+        spline = self._spline()
+        apart = s[1] - s[0] if row[:2].sum() > 1 else 0.0
+        return at, spline(at), _SHARED * apart * spline(at, 1)
+
     def pressing_on(self, grid: Grid) -> Array:
         """Normal forces at the nearest nodes of another grid."""
         s, surface, _, push = self.contacts()
@@ -253,11 +279,13 @@ class Equilibrium(NamedTuple):
 
     def centerline(self, n: int) -> Array:
         """Points (n, 3), equally spaced in arc length."""
+        return np.asarray(self._spline()(np.linspace(0.0, 1.0, n)))
+
+    def _spline(self) -> CubicHermiteSpline:
         from scipy.interpolate import CubicHermiteSpline
 
         on = slice(np.count_nonzero(self.grid.extent == 0.0), None)
-        spline = CubicHermiteSpline(self.grid.s[on], self.nodes[on], self.frames[on, :, 0])
-        return np.asarray(spline(np.linspace(0.0, 1.0, n)))
+        return CubicHermiteSpline(self.grid.s[on], self.nodes[on], self.frames[on, :, 0])
 
     def farthest(self, other: Equilibrium) -> float:
         """Distance between two shapes where they are farthest apart."""
@@ -265,7 +293,9 @@ class Equilibrium(NamedTuple):
         return float(np.linalg.norm(away, axis=1).max())
 
 
-def _solve(grid: Grid, obstacles: Obstacles, strain: Array, pressing: Array) -> Equilibrium | None:
+def solve_at(
+    obstacles: Obstacles, grid: Grid, strain: Array, pressing: Array
+) -> Equilibrium | None:
     """Newton's method from a guess; None if it does not converge."""
     weight = (0.5 * grid.width[:, None, None] * grid.stiffness).reshape(-1)
     for _ in range(_ROUNDS):
@@ -347,11 +377,11 @@ def _pushed(
     return free + yielded @ force, force
 
 
-def settle(
+def settled(
     whisker: Whisker, obstacles: Obstacles, grid: Grid, strain: Array, pressing: Array
 ) -> Equilibrium | None:
     """Solve, with nodes where single contacts are."""
-    found = _solve(grid, obstacles, strain, pressing)
+    found = solve_at(obstacles, grid, strain, pressing)
     for _ in range(_MOVES):
         if found is None:
             return None
@@ -359,7 +389,7 @@ def settle(
         if np.abs(nodes - found.grid.s).max() < _MOVED:
             return found
         grid = Grid.at(whisker, nodes[found.grid.s.size - np.count_nonzero(nodes) - 1 :])
-        found = _solve(grid, obstacles, strain_on(found, grid), found.pressing)
+        found = solve_at(obstacles, grid, strain_on(found, grid), found.pressing)
     return found
 
 

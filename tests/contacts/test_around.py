@@ -1,0 +1,72 @@
+"""Contacts with a known object, where a whisker lies along it."""
+
+import numpy as np
+import pytest
+
+import vibrissa as vb
+from vibrissa.objects import Peg, Placement, Sphere
+from vibrissa.rod import NearObjects, discretize
+
+WIRE = vb.Whisker.from_curvature(0.1, lambda s: [0.0, 0.0, 8.0], base_radius=0.2e-3)
+PIPE = Peg([0.055, 0.138, 0.0], [0.3, 0.0, 1.0], 0.14)
+NAMES = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+
+
+def test_an_arc_is_found_with_the_object():
+    d = discretize(WIRE)
+    scale = np.repeat([d.force, d.moment], 3)
+    shift = np.array([0.6e-3, -0.7e-3, 0.5e-3])
+    place = Placement(np.eye(3), -shift)
+    found = NearObjects(WIRE, PIPE, 48).from_outside(place, np.zeros(3))
+    s, _, _, push = found.contacts()
+    arc, point, _ = found.first_contact()
+    assert s.size > 20
+    noise = dict(zip(NAMES, 0.005 * scale, strict=True))
+    wrench = scale * (found.wrench() + 0.005 * np.random.default_rng(2).normal(size=6))
+    rows = np.stack([wrench, np.full(6, np.nan)])
+    out = vb.estimate_around(WIRE, rows[:, :3], rows[:, 3:], PIPE, noise=noise, position_sigma=1e-3)
+    assert out.status.values.tolist() == [vb.Status.OK, vb.Status.MISSING]
+    assert out.contacts.values[0] > 10
+    assert np.isnan(out.contact_point_whisker.values[1]).all()
+    away = out.contact_point_whisker.values[0] - point * d.length
+    predicted = np.sqrt(np.trace(out.covariance.values[0]))
+    assert np.linalg.norm(away) < min(3.0 * predicted, 0.4e-3)
+    assert out.arc_length.values[0] == pytest.approx(arc * d.length, abs=0.4e-3)
+    assert out.last_arc_length.values[0] == pytest.approx(d.length)
+    # The wrench says where the surface is; along the pipe only the prior does.
+    off = (out.object_shift.values[0] - shift) @ push[0] / np.linalg.norm(push[0])
+    assert abs(off) < 0.15e-3
+    spread = PIPE.axis @ out.object_shift_covariance.values[0] @ PIPE.axis
+    assert 0.9e-3 < np.sqrt(spread) < 1.01e-3
+    one = vb.estimate_from_wrench(WIRE, wrench[:3], wrench[3:], noise=noise)
+    assert np.linalg.norm(one.point - point * d.length) > 2.0 * np.linalg.norm(away)
+    # No pipe there exerts another force.
+    wrong = vb.estimate_around(
+        WIRE,
+        wrench[:3] + np.array([0.0, 0.0, 30.0 * noise["Fx"]]),
+        wrench[3:],
+        PIPE,
+        noise=noise,
+        position_sigma=1e-3,
+    )
+    assert int(wrong.status) == vb.Status.NOT_FRICTIONLESS
+
+
+def test_bad_input_is_refused():
+    noise = dict.fromkeys(NAMES, 1e-6)
+    force = np.zeros((2, 3))
+    with pytest.raises(ValueError, match="position_sigma is positive, m; got 0"):
+        vb.estimate_around(WIRE, force, force, PIPE, noise=noise, position_sigma=0)
+    with pytest.raises(ValueError, match=r"base_position \(2, 3\); got \(3, 3\) and \(3, 3\)"):
+        vb.estimate_around(
+            WIRE,
+            force,
+            force,
+            PIPE,
+            noise=noise,
+            position_sigma=1e-3,
+            base_position=np.zeros((3, 3)),
+        )
+    soft = Sphere([0.05, 0.0, 0.0], 0.01, stiffness=10.0)
+    with pytest.raises(ValueError, match="rigid objects only"):
+        vb.estimate_around(WIRE, force, force, soft, noise=noise, position_sigma=1e-3)

@@ -112,7 +112,7 @@ def row(whisker, make, deepest, level, asked):
 def main():
     """Print the table, or write it."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--count", type=int, default=40, help="measurements of each")
+    parser.add_argument("--count", type=int, default=30, help="measurements of each")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--page", action="store_true")
     asked = parser.parse_args()

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 _ROUNDS, _LONGEST, _STEP = 30, 0.05, 1e-5
 # A step of this share of the standard deviations is the last.
 _DONE = 1e-2
+# Between nodes, where an arc may begin, the whisker is along the object to this, over L.
+_BETWEEN = 5e-5
 # What is misfit by chance only once in a thousand times is not explained.
 _LIMIT = float(chdtri(3, 1e-3))
 
@@ -192,16 +194,19 @@ def _spread(
     shift: Array,
     covariance: Array,
 ) -> Array:
-    """Covariance of the first contact: by shifts of one standard deviation, both ways."""
-    out, point = np.zeros((3, 3)), found.first_contact()[1]
+    """Second moment of the first contact about its estimate, of second order in the shift.
+
+    By six shifts of √3 standard deviations, along the axes of the shift's covariance.
+    """
+    out, point = _BETWEEN**2 * np.eye(3), found.first_contact()[1]
     size, axes = np.linalg.eigh(covariance)
-    for step in (np.sqrt(size) * axes).T:
+    for step in (np.sqrt(3.0 * size) * axes).T:
         for way in (step, -step):
             moved = near.moved(place, shift + way, found)
             if moved is None:
                 return np.full((3, 3), np.nan)
             away = moved.first_contact()[1] - point
-            out += 0.5 * np.outer(away, away)
+            out += np.outer(away, away) / 6.0
     return out
 
 

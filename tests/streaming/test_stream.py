@@ -1,5 +1,6 @@
 """Lines in, contacts out: by pipe, UDP and bag; bad lines are said and passed over."""
 
+import errno
 import json
 import os
 import signal
@@ -561,6 +562,19 @@ def test_times_in_a_smaller_unit_are_noticed(gamma_map, wrench):
     assert "in ms, µs or ns" in record["error"]
     list(running.records(json.dumps({"time": 1e6 * i} | row) for i in range(5)))
     assert "is their time in s?" in " ".join(advice(running))
+
+
+def test_a_serial_line_that_is_unplugged_is_named(tmp_path, monkeypatch):
+    def unplugged(file):
+        yield "time,Fx\n"
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr("vibrissa.streaming.sources.bounded_lines", unplugged)
+    (tmp_path / "ttyUSB0").touch()
+    lines = file_lines(tmp_path / "ttyUSB0")
+    assert next(lines) == "time,Fx\n"
+    with pytest.raises(OSError, match=r"ttyUSB0 was lost .* --reconnect"):
+        next(lines)
 
 
 def write_wrenches(path, topics, sec=7, position=None, stamps=None):

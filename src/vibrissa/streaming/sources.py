@@ -54,8 +54,13 @@ def file_lines(
     if not path.exists():
         raise FileNotFoundError(f"there is no file {path}")
     if not reconnect:
-        with path.open(encoding="utf-8", errors="replace") as file:
-            yield from bounded_lines(file)
+        try:
+            with path.open(encoding="utf-8", errors="replace") as file:
+                yield from bounded_lines(file)
+        except OSError as fault:  # a device that was unplugged
+            raise OSError(
+                f"{path} was lost ({fault.strerror}); --reconnect waits until it opens again"
+            ) from fault
         return
     if stat.S_ISREG(path.stat().st_mode):
         raise ValueError(f"{path} is a file, which ends; a named pipe or device opens anew")

@@ -260,3 +260,71 @@ def test_what_is_inlined_cannot_be_called_from_python():
     """It has no wrapper for that; without this guard the interpreter would crash."""
     with pytest.raises(TypeError, match="copy can be called by kernels only"):
         copy([0.0], [1.0])
+
+
+def test_elements_are_used_in_place_and_references_to_arguments_are_not_counted():
+    """Whatever the layout and the index; nothing leaks, and nothing that is returned is freed."""
+    run(
+        """
+        import contextlib
+        import io
+        from collections import namedtuple
+
+        import numpy as np
+        from numba.core import config
+        from numba.core.runtime import rtsys
+
+        from vibrissa.numerics.compiled import kernel
+
+        Pair = namedtuple("Pair", "matrix, row")
+
+        @kernel
+        def weighed(pair, sides, flags):
+            matrix, row = pair
+            made = np.zeros(row.shape[0])
+            for i in range(row.shape[0]):
+                made[i] = matrix[i, -1] * row[i] + sides[-1 - i, 0, i]
+                flags[i] = made[i] > 0.0
+            return made
+
+        @kernel
+        def summed(array, row):
+            made = np.zeros(2)
+            for i in range(array.shape[0]):
+                made[0] += array[i] * row[-1]
+            return made[0]
+
+        @kernel
+        def same(pair):
+            return pair.row, pair
+
+        def owned():
+            stats = rtsys.get_allocation_stats()
+            return stats.alloc - stats.free
+
+        cube = np.random.default_rng(1).normal(size=(6, 2, 6))
+        assert same(Pair(cube, cube[0, 0]))  # Numba begins to count
+        before = owned()
+        for sides in (cube, np.asfortranarray(cube), np.repeat(cube, 2, axis=0)[::2]):
+            for matrix in (cube[0].T.copy(), cube[0].T, cube[:, 1]):
+                pair, flags = Pair(matrix, np.arange(6)), np.zeros(6, dtype=bool)
+                found = weighed(pair, sides, flags)
+                expected = matrix[:, -1] * pair.row + sides[::-1, 0].diagonal()
+                np.testing.assert_allclose(found, expected, rtol=1e-14, atol=1e-15)
+                np.testing.assert_array_equal(flags, found > 0.0)
+        row, again = same(Pair(cube[0], found))
+        assert row is found and again.row is found and again.matrix.base is cube
+        del row, again, found
+        assert owned() == before
+
+        config.DUMP_LLVM = 1
+        with contextlib.redirect_stdout(io.StringIO()) as printed:
+            assert summed(np.ones(3), np.ones(2)) == 3.0
+        (lines,) = (m for m in printed.getvalue().split("ModuleID") if 'summed$' in m[:20])
+        assert "NRT_incref" not in lines
+        # Two arguments, what is made, where it is returned, and the shape; none for an element.
+        assert lines.count("alloca {i8*, i8*") == 5
+        """,
+        **os.environ,
+        NUMBA_NRT_STATS="1",
+    )

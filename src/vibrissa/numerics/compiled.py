@@ -8,6 +8,8 @@ consists of: functions that kernels call are only translated (:class:`_Part`).
 
 from __future__ import annotations
 
+import copy as copies
+import gc
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, ParamSpec, TypeVar, cast
@@ -21,9 +23,10 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, Flags
 from numba.core.compiler_machinery import AnalysisPass, register_pass
 from numba.core.registry import CPUDispatcher
-from numba.core.typed_passes import NopythonTypeInference
+from numba.core.typed_passes import NativeLowering, NopythonTypeInference
 
 from vibrissa.numerics.kernel_cache import PackageCache
+from vibrissa.numerics.lowering import BriefLowering, KernelContext
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -42,6 +45,8 @@ _OPTIONS: dict[str, Any] = {
 _ATTRIBUTES = tuple(map(int, llvmlite.__version__.split(".")[:2])) >= (0, 48)
 #: Number of functions from which on a kernel is mostly bookkeeping around fast ones.
 _LARGE = 40
+#: Objects that may be new before garbage among them is looked for.
+_YOUNG = 50_000
 #: Ends of LLVM's names of functions whose loops are worth their size in large kernels, too.
 _VECTORISED: set[str] = set()
 #: Expressions whose value refers to arrays that are there already.
@@ -161,16 +166,31 @@ class _WholeCompiler(Compiler):
     library_type: type[JITCodeLibrary] = _Whole
 
     def __init__(self, typing: Any, target: Any, library: Any, *rest: Any) -> None:
+        target = copies.copy(target)
+        target.__class__ = KernelContext
         library = self.library_type(target.codegen(), "kernel")
         library.enable_object_caching()
         args, returned, flags, types_of_locals = rest
         flags = _Flags(flags)  # type: ignore[no-untyped-call]
         super().__init__(typing, target, library, args, returned, flags, types_of_locals)  # type: ignore[no-untyped-call]
 
+    def compile_extra(self, func: Any) -> Any:
+        """Compile while cyclic garbage is looked for less often: else that is a sixth of all."""
+        young, *older = gc.get_threshold()
+        gc.set_threshold(max(young, _YOUNG) if young else 0, *older)
+        try:
+            return super().compile_extra(func)  # type: ignore[no-untyped-call]
+        finally:
+            gc.set_threshold(young, *older)
+
     def define_pipelines(self) -> list[Any]:
         """Decide about references when types are known."""
         (manager,) = super().define_pipelines()  # type: ignore[no-untyped-call]
         manager.add_pass_after(_Borrowing, NopythonTypeInference)
+        manager.passes = [
+            (BriefLowering if kind is NativeLowering else kind, purpose)
+            for kind, purpose in manager.passes
+        ]
         manager.finalize()
         return [manager]
 

@@ -15,8 +15,8 @@ import vibrissa as vb
 from vibrissa import plots
 from vibrissa.io import load_signals, save_contacts, save_signals
 from vibrissa.pipeline import contact_columns, locate
-from vibrissa.scene import spherical
 from vibrissa.sensors import component_noise
+from vibrissa.signals import spherical
 from vibrissa.simulation import facing_peg, measure, simulate, sweep_past
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "output")

@@ -6,9 +6,9 @@ import pytest
 import xarray as xr
 
 import vibrissa as vb
-from vibrissa.contacts import spherical, within_paper_bounds
+from vibrissa.contacts import within_paper_bounds
 from vibrissa.rod import CELLS, MOST_CELLS, cells_around, contacts_at, solve_forces
-from vibrissa.signals import SIGNALS, signals_of
+from vibrissa.signals import SIGNALS, signals_of, spherical
 
 
 def test_samples_are_equilibria_of_their_contact_points(gamma_map):

@@ -7,9 +7,8 @@ import pytest
 import xarray as xr
 
 import vibrissa as vb
-from vibrissa.contacts import spherical
 from vibrissa.numerics import weighted_quantile
-from vibrissa.signals import TRIPLETS
+from vibrissa.signals import TRIPLETS, spherical
 
 NOISE = np.diag(np.repeat([1e-12, 4e-16], 3))
 

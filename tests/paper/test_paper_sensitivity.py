@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 import vibrissa as vb
-from vibrissa.contacts import spherical
 from vibrissa.numerics import contact_weights, weighted_quantile
 from vibrissa.paper import central_differences, error_solid, interpolation_errors, signal_slice
-from vibrissa.signals import within_turn
+from vibrissa.signals import spherical, within_turn
 
 
 @pytest.fixture(scope="module")

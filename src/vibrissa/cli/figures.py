@@ -251,8 +251,8 @@ def _contact_drawings(
         )
     if known is not None and estimated is not None:
         drawings["estimates"] = lambda: vb.plots.estimated_against_true(
-            vb.contacts.spherical(known),
-            vb.contacts.spherical(estimated),
+            vb.signals.spherical(known),
+            vb.signals.spherical(estimated),
             time=course.time,
             colour=angles,
             known_as=course.known_as,

@@ -58,7 +58,6 @@ from vibrissa.contacts.readout import (
 from vibrissa.contacts.search import signals_at_nodes as signals_at_nodes
 from vibrissa.contacts.two_contacts import bent_by_forces as bent_by_forces, second_contact
 from vibrissa.contacts.wrench import estimate_from_wrench
-from vibrissa.signals import spherical
 
 __all__ = [
     "RANK",
@@ -80,5 +79,4 @@ __all__ = [
     "estimate_around",
     "estimate_from_wrench",
     "second_contact",
-    "spherical",
 ]

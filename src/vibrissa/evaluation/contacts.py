@@ -14,12 +14,11 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.contacts import spherical
 from vibrissa.contour import CylinderFit, axis_offset
 from vibrissa.numerics import Array
 from vibrissa.objects import Peg
 from vibrissa.pipeline import ANGLE_CLASSES
-from vibrissa.signals import nearest_on_rest, within_turn
+from vibrissa.signals import nearest_on_rest, spherical, within_turn
 from vibrissa.whisker import Whisker
 
 ERRORS = ("error_r", "error_theta", "error_phi", "error_distance")

@@ -32,7 +32,6 @@ from vibrissa.contacts import (
     ellipsoids,
     large_deflection,
     rms_error,
-    spherical,
     spherical_derivatives,
     within_paper_bounds,
 )
@@ -44,6 +43,7 @@ from vibrissa.signals import (
     concave_backward,
     nearest_on_rest,
     selection,
+    spherical,
     within_cone,
 )
 from vibrissa.status import flag_attributes

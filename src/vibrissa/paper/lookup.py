@@ -42,7 +42,6 @@ from vibrissa.contacts import (
     SensorNoise,
     check_signals,
     contacts_of,
-    spherical,
     within_paper_bounds,
 )
 from vibrissa.identifiability import sensitivity
@@ -59,6 +58,7 @@ from vibrissa.signals import (
     selection,
     signal_scales,
     signals_of,
+    spherical,
     within_cone,
     within_turn,
 )

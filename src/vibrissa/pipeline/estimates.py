@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.contacts import ContactMap, Gravity, Prior, spherical
+from vibrissa.contacts import ContactMap, Gravity, Prior
 from vibrissa.contour import continuing_candidates, to_laboratory
 from vibrissa.numerics import Array
 from vibrissa.pipeline.frames import cross_matrices, signals_in
@@ -22,7 +22,7 @@ from vibrissa.quantities import attributes
 from vibrissa.recording import Group, Recording, coordinates, recorded, recording_tree
 from vibrissa.rod import PROXIMAL
 from vibrissa.sensors import StageSweep, SuspendedWhisker, SweptContacts
-from vibrissa.signals import selection
+from vibrissa.signals import selection, spherical
 from vibrissa.status import Status, is_ok
 from vibrissa.whisker import Whisker
 

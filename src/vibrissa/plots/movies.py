@@ -36,7 +36,8 @@ from vibrissa.plots.space import (
     space_axes,
 )
 from vibrissa.quantities import axis_label, to_display
-from vibrissa.scene import TRIPLET, Course, spherical
+from vibrissa.scene import TRIPLET, Course
+from vibrissa.signals import spherical
 
 Picture = NDArray[np.uint8]
 

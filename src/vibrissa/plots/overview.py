@@ -21,7 +21,8 @@ from vibrissa.plots.estimates import against
 from vibrissa.plots.signals import intervals
 from vibrissa.plots.space import coloured_segments, drop_lines, signal_places
 from vibrissa.quantities import axis_label, to_display
-from vibrissa.scene import COORDINATES, TRIPLET, Course, spherical
+from vibrissa.scene import COORDINATES, TRIPLET, Course
+from vibrissa.signals import spherical
 
 _DOTS_PER_MM = 300.0 / 25.4
 _CONTACT: dict[str, Any] = {"facecolor": "#f0e442", "edgecolor": "black", "linewidths": 0.5}

@@ -8,7 +8,6 @@ from vibrissa.scene.course import (
     Course,
     course_of,
     deflection_angles,
-    spherical,
 )
 from vibrissa.scene.marks import (
     Arrows as Arrows,
@@ -54,5 +53,4 @@ __all__ = [
     "Course",
     "course_of",
     "deflection_angles",
-    "spherical",
 ]

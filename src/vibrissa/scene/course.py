@@ -201,21 +201,3 @@ def deflection_angles(course: Course, centerline: ArrayLike) -> Array:
     if rows.any():
         angles[rows] = np.arctan2(*nearest_at_rest(own[rows], np.asarray(centerline, np.float64)))
     return angles
-
-
-def spherical(points: Array) -> Array:
-    """Give the spherical coordinates of contact points.
-
-    Parameters
-    ----------
-    points : array (..., 3)
-        Contact points, whisker frame, m.
-
-    Returns
-    -------
-    array (..., 3)
-        (r, θ, φ), m and rad.
-    """
-    x, y, z = np.moveaxis(points, -1, 0)
-    away = np.hypot(x, y)
-    return np.stack([np.hypot(away, z), np.arctan2(y, x), np.arctan2(z, away)], axis=-1)

@@ -34,7 +34,7 @@ from vibrissa.signals.regions import (
     in_region as in_region,
     nearest_on_rest,
     resting,
-    spherical as spherical,
+    spherical,
     within_cone,
 )
 from vibrissa.signals.triplets import TRIPLETS, selection as selection
@@ -62,5 +62,6 @@ __all__ = [
     "resting",
     "signal_equations",
     "signals_of",
+    "spherical",
     "within_cone",
 ]

@@ -15,8 +15,8 @@ from vibrissa.numerics import Array
 from vibrissa.plots import scale_of
 from vibrissa.quantities import quantity, to_display
 from vibrissa.rod import Deflection
-from vibrissa.scene import Bytes, Colour, Ints, spherical
-from vibrissa.signals import SIGNALS, signals_of
+from vibrissa.scene import Bytes, Colour, Ints
+from vibrissa.signals import SIGNALS, signals_of, spherical
 from vibrissa.sketch import round_step
 from vibrissa.status import Status
 

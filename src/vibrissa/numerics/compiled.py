@@ -8,7 +8,6 @@ consists of: functions that kernels call are only translated (:class:`_Part`).
 
 from __future__ import annotations
 
-import copy as copies
 import gc
 from collections.abc import Callable
 from contextlib import suppress
@@ -23,10 +22,9 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, Flags
 from numba.core.compiler_machinery import AnalysisPass, register_pass
 from numba.core.registry import CPUDispatcher
-from numba.core.typed_passes import NativeLowering, NopythonTypeInference
+from numba.core.typed_passes import NopythonTypeInference
 
 from vibrissa.numerics.kernel_cache import PackageCache
-from vibrissa.numerics.lowering import BriefLowering, KernelContext
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -166,8 +164,6 @@ class _WholeCompiler(Compiler):
     library_type: type[JITCodeLibrary] = _Whole
 
     def __init__(self, typing: Any, target: Any, library: Any, *rest: Any) -> None:
-        target = copies.copy(target)
-        target.__class__ = KernelContext
         library = self.library_type(target.codegen(), "kernel")
         library.enable_object_caching()
         args, returned, flags, types_of_locals = rest
@@ -187,10 +183,6 @@ class _WholeCompiler(Compiler):
         """Decide about references when types are known."""
         (manager,) = super().define_pipelines()  # type: ignore[no-untyped-call]
         manager.add_pass_after(_Borrowing, NopythonTypeInference)
-        manager.passes = [
-            (BriefLowering if kind is NativeLowering else kind, purpose)
-            for kind, purpose in manager.passes
-        ]
         manager.finalize()
         return [manager]
 

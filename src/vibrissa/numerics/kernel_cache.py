@@ -33,8 +33,9 @@ def _sources(package: Path) -> str:
     for path in sorted(path for folder in {package, *_SHARED} for path in folder.glob("*.py")):
         source = path.read_bytes()
         # Written so that this file, which has no kernels, is none of them.
-        names = (b"kernel", b"specialised", b"vectorised", b"inlined", b"register_pass")
-        if any(b"@" + name in source for name in names):
+        if any(
+            b"@" + name in source for name in (b"kernel", b"specialised", b"vectorised", b"inlined")
+        ):
             digest.update(source)
     return digest.hexdigest()
 

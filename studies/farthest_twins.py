@@ -2,11 +2,14 @@
 
 `python studies/farthest_twins.py` takes pairs of contacts with the same signals from searches with
 two seeds, and maximises the smaller of their cone angles with equal signals and the least distance
-as constraints (sequential quadratic programming). It prints where each begins and ends.
+as constraints (sequential quadratic programming). It prints where each begins and ends. With
+`--whiskers FILES` it begins at random pairs of these whiskers, whose signals need not be equal, and
+prints the largest angles for (F_x, M_B, M_D).
 """
 
 import argparse
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from scipy.optimize import minimize
@@ -18,6 +21,7 @@ from vibrissa.signals import circular_among, cone_angle, signals_of, within_turn
 
 TRIPLETS = (("Fx", "MB", "MD"), ("Fx", "FD", "MD"), ("Mx", "MB", "MD"))
 APART, STARTS, STEP = 0.025, 9, 1e-6
+RANDOM, MISFIT = 60, 1e-8
 UNIT = np.tile([1.0, np.pi, 1.0], 2)
 
 
@@ -81,11 +85,37 @@ def ascended(contact_map, names, start):
     return begin[6], found.x[6], np.abs(linear(found.x.tobytes())[0][:3]).max()
 
 
-argparse.ArgumentParser(description=__doc__.split("\n")[0]).parse_args()
-contact_map = vb.ContactMap.simulate(vb.samples.gamma(), grid=False)
-for names in TRIPLETS:
-    for seed in (0, 1):
-        for start in searched(contact_map, names, seed):
-            began, ended, misfit = ascended(contact_map, names, start)
-            ends = f"{np.rad2deg(began):.3f}° → {np.rad2deg(ended):.4f}°"
-            print(" ".join(names), f"seed {seed}: {ends}, misfit {misfit:.0e}", flush=True)
+def of_the_gamma_whisker():
+    contact_map = vb.ContactMap.simulate(vb.samples.gamma(), grid=False)
+    for names in TRIPLETS:
+        for seed in (0, 1):
+            for start in searched(contact_map, names, seed):
+                began, ended, misfit = ascended(contact_map, names, start)
+                ends = f"{np.rad2deg(began):.3f}° → {np.rad2deg(ended):.4f}°"
+                print(" ".join(names), f"seed {seed}: {ends}, misfit {misfit:.0e}", flush=True)
+
+
+def from_random_pairs(path):
+    contact_map = vb.ContactMap.simulate(vb.load_whisker(path), grid=False)
+    rng, reached = np.random.default_rng(7), []
+    for k in range(RANDOM):
+        one = rng.uniform([0.0, 0.0, 0.02], [1.0, 2.0 * np.pi, 1.0])
+        other = one + rng.normal(0.0, [0.08, 0.3, 0.1]) * (1 if k % 2 else 3)
+        other[[0, 2]] = np.clip(other[[0, 2]], [0.0, 0.02], [1.0, 0.999])
+        _, ended, misfit = ascended(contact_map, TRIPLETS[0], np.concatenate([one, other]))
+        if misfit < MISFIT:
+            reached.append(np.rad2deg(ended))
+    best = ", ".join(f"{angle:.3f}°" for angle in sorted(reached)[:-6:-1])
+    print(
+        f"{path.stem}: {len(reached)} of {RANDOM} end at equal signals, farthest {best}", flush=True
+    )
+
+
+parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+parser.add_argument("--whiskers", nargs="+", type=Path, help="digitised centrelines")
+chosen = parser.parse_args()
+if chosen.whiskers:
+    for path in chosen.whiskers:
+        from_random_pairs(path)
+else:
+    of_the_gamma_whisker()

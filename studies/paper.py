@@ -48,6 +48,17 @@ TABLE_A = {
 LARGEST = np.array([1.5e-3, np.radians(1.0), np.radians(1.0)])
 """Median errors of r, θ and φ up to which S1 Text calls a triplet unique, m and rad."""
 
+PROFILES = {
+    "straight, tapered": vb.samples.straight,
+    "curved, tapered": vb.samples.curved,
+    "straight cylinder": vb.samples.straight_cylinder,
+    "curved cylinder": vb.samples.curved_cylinder,
+}
+"""The four profiles of Huet, Rudnicki & Hartmann (2017)."""
+
+LARGEST_2017 = np.array([1e-3, np.radians(1.5), np.radians(1.5)])
+"""Median errors of r, θ and φ up to which that study calls a triplet unique, m and rad."""
+
 COORDINATES = ("r", "theta", "phi")
 SPLIT = (0.35, 0.075)
 """Shares of the contacts that train the network and that stop its training; half judge it."""
@@ -213,6 +224,25 @@ def network_test(contacts: dict[str, np.ndarray], samples: int) -> str:
     return table(head, rows)
 
 
+def profiles(samples: int) -> str:
+    """The network and thresholds of 2017 for (F_x, M_B, M_D), and exact verdicts, by profile."""
+    rows = []
+    for name, sample in PROFILES.items():
+        contact_map = vb.ContactMap.simulate(sample())
+        contacts = grid_contacts(contact_map)
+        chosen = np.random.default_rng(0).permutation(len(contacts["r"]))[:samples]
+        errors = network_errors(contacts, chosen, "Fx MB MD")
+        passed = bool((errors <= LARGEST_2017).all())
+        found = vb.uniqueness(
+            contact_map, ["Fx MB MD"], ["all", "ELD"], samples=1024, resolution=False
+        )
+        exact = [str(word) for word in found.verdict.values[0]]
+        shown = [few(1e3 * errors[0]), few(np.degrees(errors[1])), few(np.degrees(errors[2]))]
+        rows.append([name, *shown, "passes" if passed else "fails", *exact])
+    head = ["profile", "r, mm", "θ, °", "φ, °", "1 mm, 1.5°", "exact: all", "exact: ELD"]
+    return table(head, rows)
+
+
 def laws(whisker: vb.Whisker, contacts: dict[str, np.ndarray]) -> str:
     """Statements of the paper about the signals themselves, over all contacts outside 2°."""
     weight = contacts["weight"]
@@ -257,7 +287,8 @@ def fourth_signal(paths: list[Path]) -> str:
             one = found.expand_dims("triplet").isel(witness=[i])
             ((_, pair),) = vb.identifiability.witness_pairs(contact_map.whisker, one, ["Fx MB MD"])
             differ.append(float(np.ptp(pair["FT"].values) / pair["FT"].values.mean()))
-        rows.append([path.stem, f"{cone:.1f}°", f"{min(differ):.3f}" if differ else "–"])
+        bound = f"{np.floor(10.0 * cone) / 10.0:.1f}°"
+        rows.append([path.stem, bound, f"{min(differ):.3f}" if differ else "–"])
         print(*rows[-1], flush=True)
     return table(["whisker", "critical cone ≥", "F_T differs by, least"], rows)
 
@@ -276,7 +307,9 @@ def main() -> None:
     contact_map = vb.ContactMap.simulate(vb.samples.gamma())
     contacts = grid_contacts(contact_map)
     blocks = {"laws": laws(contact_map.whisker, contacts)}
-    blocks["network test"] = network_test(contacts, 2_000 if chosen.quick else 8_000)
+    count = 2_000 if chosen.quick else 8_000
+    blocks["network test"] = network_test(contacts, count)
+    blocks["profiles"] = profiles(count)
     verdicts = vb.uniqueness(
         contact_map, list(TABLE_A), samples=512 if chosen.quick else 4096, resolution=False
     )

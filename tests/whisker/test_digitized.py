@@ -74,6 +74,18 @@ def test_noise_is_estimated():
     assert "noise of its points" not in " ".join(Whisker.from_points(points, noise=1e-4).notes)
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_points_that_show_no_more_than_a_parabola_make_a_planar_whisker(seed):
+    # Verdicts on signals that lose a dimension in its plane depend on it.
+    along = np.linspace(0.0, 20e-3, 9)
+    points = np.column_stack([along, 10.0 * along**2, np.zeros(9)])
+    points += np.random.default_rng(seed).normal(0.0, 0.2e-3, points.shape)
+    turn = Rotation.from_euler("xyz", [0.4, -1.1, 2.0])
+    whisker = Whisker.from_points(turn.apply(points))
+    assert not whisker.is_straight
+    assert np.abs(whisker.centerline(51)[:, 2]).max() < 1e-12 * whisker.length
+
+
 def test_shape_and_pose_belong_together():
     points = Rotation.from_euler("xyz", [1, 2, 3]).apply(digitized(30))
     points += np.array([0.01, 0.02, 0.03])

@@ -15,7 +15,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from vibrissa.contacts import Domain, deficient, invert
-from vibrissa.identifiability.regions import ContactSet, Samples, contact_set, sample, spread
+from vibrissa.identifiability.regions import (
+    ContactSet,
+    Samples,
+    contact_set,
+    in_chart,
+    sample,
+    spread,
+)
 from vibrissa.identifiability.summits import farthest_twins
 from vibrissa.identifiability.twins import (
     Pairs,
@@ -65,6 +72,10 @@ _FOLLOWED = 24
 _NEAR_FOLDS = 24
 # Contacts in the plane of a planar whisker that are tried.
 _IN_PLANE = 256
+# Contacts near the plane in which any whisker begins, the same for every seed, with the largest
+# bearing from it, rad; and signals of which two lose a dimension in the plane of a planar one.
+_NEAR_PLANE, _BEARING = 256, 0.2
+_COLLAPSING = frozenset({"Mx", "FD", "MD"})
 # A whisker is planar if it leaves its plane by no more than this share of its length.
 _PLANAR = 1e-9
 # The corners of the box of a tolerance and the middles of its faces.
@@ -99,6 +110,7 @@ class Question:
     domain: Domain
     samples: Samples
     fixed: Samples
+    near_plane: Samples
     wide: Samples
     span: Array
     probed: AnyArray
@@ -157,6 +169,7 @@ def ask(
         domain,
         samples,
         sample(contact_map, spread(min(_FIXED_WIDE, _WIDER * number), None), domain),
+        sample(contact_map, _near_plane(min(_NEAR_PLANE, number)), domain),
         wide,
         span,
         probed,
@@ -181,6 +194,17 @@ def _plane(whisker: Whisker) -> tuple[Array, float | None]:
         return normal, None
     across = np.cross(normal, [1.0, 0.0, 0.0])
     return normal, float(np.arctan2(across[2], across[1]))
+
+
+def _near_plane(number: int) -> Array:
+    """Chart coordinates (n, 3) near the plane in which the whisker begins.
+
+    There triplets of a whisker that leaves it little nearly collapse, and have twins far apart.
+    """
+    chart = spread(number, None)
+    side, turn = np.divmod(chart[:, 1], np.pi)
+    chart[:, 1] = np.pi * side + _BEARING * (2.0 * turn / np.pi - 1.0) ** 3  # densest in it
+    return in_chart(chart)
 
 
 class _Cell(NamedTuple):
@@ -262,6 +286,8 @@ def _searched(question: Question, names: tuple[str, ...], own: Pairs, local: Loc
     )
     better = better_twins(search, spread_out, question.regions, np.random.default_rng(0))
     fixed = [joined([spread_out, better]), _twins_beyond_folds(question, names)]
+    if len(_COLLAPSING.intersection(names)) >= 2:
+        fixed.append(_twins_of(question, names, question.near_plane))
     summits = farthest_twins(search, fixed, question.regions)
     reached = _farthest_angles(question, joined([*fixed, summits]), question.regions)
     beaten = _farthest_angles(question, pool, question.regions) > reached

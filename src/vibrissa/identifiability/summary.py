@@ -97,7 +97,8 @@ def verdict_rows(verdicts: xr.Dataset) -> tuple[list[list[str]], list[str]]:
             word = str(cell.verdict.item())
             mark = _MARKS.get(word, word)
             proved = "evidence" in cell and str(cell.evidence.item()) == "proved"
-            angle = f"≥{np.rad2deg(float(cell.critical_cone)):.1f}°"
+            found = np.rad2deg(float(cell.critical_cone))
+            angle = f"≥{np.floor(10.0 * found) / 10.0:.1f}°"  # a lower bound
             row.append(angle if word == NOT_UNIQUE else mark + " (proved)" * proved)
         rows.append(
             [*row, str(verdicts.notation.sel(triplet=triplet).item()), _twins(verdicts, triplet)]

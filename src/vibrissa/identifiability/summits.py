@@ -31,6 +31,8 @@ from vibrissa.rod import chart_of, discretize, solve_forces, with_normal_force
 # that go on with the best of them. The last is on a finer rod, where witnesses must hold: a summit
 # is where margins vanish, and what the integration errs by would violate them.
 _ROUNDS = ((20, 8, 30.0), (6, 12, 30.0), (2, 30, 1000.0), (2, 6, 1000.0))
+# Of a quarter as many again violations cost so much: where they pay, all others may leave a region.
+_STRICT = 1000.0
 # Starts of a region are in different parts of the chart, so many an axis.
 _PARTS = np.array([3.0, 3.0 / np.pi, 3.0])
 # Trust regions, in units of L and of the fold force: the first, that on the finer rod, the largest,
@@ -203,7 +205,8 @@ def farthest_twins(search: Search, pools: Sequence[Pairs], regions: tuple[str, .
         last = (most, steps, cost) == _ROUNDS[-1]
         mountain = replace(mountain, cost=cost, search=_finer(search) if last else search)
         merit = np.where(np.isfinite(state.merit), _merit(state.levels, cost), -np.inf)
-        kept = _leading(merit, number, most)
+        strict = np.where(np.isfinite(merit), _merit(state.levels, _STRICT), -np.inf)
+        kept = np.union1d(_leading(merit, number, most), _leading(strict, number, most // 4))
         number, signs, size = number[kept], signs[kept], size[kept]
         state = state.rows(kept)._replace(merit=merit[kept])
         if last:
@@ -251,11 +254,15 @@ def _starts(search: Search, pairs: Pairs, signs: Array) -> tuple[AnyArray, Array
     numbers, starts = [], []
     for i, (side, small) in enumerate(signs):
         margins = [m for one in both for m in (side * one.backward, small * one.tangent_x)]
-        levels = [*(one.angle for one in both), *margins, pairs.apart - search.separation]
-        order = np.argsort(-_merit(np.stack(levels, axis=1), _ROUNDS[0][2]), kind="stable")
-        _, first = np.unique(part[order], axis=0, return_index=True)
-        starts.append(xi[order[np.sort(first)[: _ROUNDS[0][0]]]])
-        numbers.append(np.full(len(starts[-1]), i))
+        margins.append(pairs.apart - search.separation)
+        levels = np.stack([*(one.angle for one in both), *margins], axis=1)
+        chosen: set[int] = set()
+        for cost, most in ((_ROUNDS[0][2], _ROUNDS[0][0]), (_STRICT, _ROUNDS[0][0] // 4)):
+            order = np.argsort(-_merit(levels, cost), kind="stable")
+            _, first = np.unique(part[order], axis=0, return_index=True)
+            chosen.update(order[np.sort(first)[:most]].tolist())
+        starts.append(xi[sorted(chosen)])
+        numbers.append(np.full(len(chosen), i))
     return np.concatenate(numbers), np.concatenate(starts)
 
 

@@ -199,7 +199,8 @@ def _evidence(axes: Axes, verdict: xr.Dataset, left: float, y: float) -> None:
     look: dict[str, Any] = {"fontsize": style.SMALL, "va": "center"}
     if "critical_cone" in verdict:
         cone = float(np.degrees(verdict["critical_cone"].sel(region="all")))
-        text = "" if not np.isfinite(cone) else f"≥{cone:.1f}°" if cone > 0.0 else "none"
+        bound = f"≥{np.floor(10.0 * cone) / 10.0:.1f}°"
+        text = "" if not np.isfinite(cone) else bound if cone > 0.0 else "none"
         axes.text(left + 9.5, y, text, ha="right", **look)
     if "twin_share" in verdict:
         cell = verdict.sel(region="all")

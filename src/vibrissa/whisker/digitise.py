@@ -476,16 +476,18 @@ def smooth(t: Array, points: Array, noise: float | None, components: int) -> Smo
     _, rough, turned = svd(basis[SITES:], full_matrices=False)
     modes = solve_triangular(triangle, turned.T)
     shown = design @ modes
-    rates = rough**2 / least
+    # The last three modes are parabolas, which have no roughness.
+    rates = rough[:-3] ** 2 / least
     loads = shown.T @ points
 
     def fit(level: float) -> tuple[Array, Array, Array]:
-        damping = 1.0 / (1.0 + (level - least) * rates)
+        damping = np.append(1.0 / (1.0 + (level - least) * rates), np.ones(3))
         weights = damping[:, np.newaxis] * loads
         return weights, points - shown @ weights, damping * (1.0 - rough**2)
 
-    levels = np.geomspace(least, 10.0 * n, LEVELS)
-    rss, freedom = np.empty((2, LEVELS))
+    # With the last a parabola is left, which is in a plane exactly.
+    levels = np.append(np.geomspace(least, 10.0 * n, LEVELS), np.inf)
+    rss, freedom = np.empty((2, len(levels)))
     for k, level in enumerate(levels):
         _, residuals, hat = fit(level)
         rss[k], freedom[k] = np.sum(residuals**2), hat.sum()

@@ -71,7 +71,8 @@ def table_a(verdicts: xr.Dataset) -> str:
         cell = verdicts.sel(triplet=triplet)
         found = {r: str(cell.verdict.sel(region=r).item()) for r in verdicts.region.values}
         against = [r for r in regions if found[r] == "not unique"]
-        cones = [float(np.rad2deg(cell.critical_cone.sel(region=r))) for r in against]
+        found_at = np.rad2deg([float(cell.critical_cone.sel(region=r)) for r in against])
+        cones = np.floor(10.0 * found_at) / 10.0  # lower bounds
         twins = ", ".join(f"{r}: {c:.1f}°" for r, c in zip(against, cones, strict=True))
         own = str(cell.notation.item())
         if against:

@@ -144,8 +144,8 @@ def test_a_filter_forgets_a_contact_that_is_lost_and_waits_for_what_is_missing(w
     np.testing.assert_allclose(
         turn[0] @ good.point_whisker + base[0], good.point, rtol=1e-12, atol=1e-15
     )
-    unknown = replace(good.located.candidates, covariance=np.full((1, 3, 3), np.nan))
-    nowhere = replace(good.located, candidates=unknown)
+    unknown = good.located._found._replace(covariances=np.full((1, 1, 3, 3), np.nan))
+    nowhere = replace(good.located, _found=unknown)
     there = np.r_[np.zeros(3), good.located.point / 0.3][None]
     assert follow._unaccounted(there, nowhere, turn[0], base[0] / 0.3).tolist() == [False]
     wrong = vb.ContactFilter(estimator, speed=0.01)  # a reaction: all signs are the others

@@ -8,7 +8,15 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-from vibrissa.numerics.arrays import AnyArray, Array, IntArray, Mask as Mask, Vector, cross as cross
+from vibrissa.numerics.arrays import (
+    AnyArray,
+    Array,
+    IntArray,
+    Mask as Mask,
+    Vector,
+    cross as cross,
+    spherical as spherical,
+)
 from vibrissa.numerics.threads import share_out as share_out, threads as threads
 
 if TYPE_CHECKING:

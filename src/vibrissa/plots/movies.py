@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, spherical
 from vibrissa.plots import style
 from vibrissa.plots.cameras import Sight, Window, part_of, scale_bar, seen, sight_axes
 from vibrissa.plots.contact_surfaces import course_scales, solid_panels
@@ -37,7 +37,6 @@ from vibrissa.plots.space import (
 )
 from vibrissa.quantities import axis_label, to_display
 from vibrissa.scene import TRIPLET, Course
-from vibrissa.signals import spherical
 
 Picture = NDArray[np.uint8]
 

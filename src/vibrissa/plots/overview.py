@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, spherical
 from vibrissa.plots import style
 from vibrissa.plots.cameras import Sight, Window, part_of, scale_bar, seen, sight_axes
 from vibrissa.plots.contact_surfaces import course_scales, solid_panels
@@ -22,7 +22,6 @@ from vibrissa.plots.signals import intervals
 from vibrissa.plots.space import coloured_segments, drop_lines, signal_places
 from vibrissa.quantities import axis_label, to_display
 from vibrissa.scene import COORDINATES, TRIPLET, Course
-from vibrissa.signals import spherical
 
 _DOTS_PER_MM = 300.0 / 25.4
 _CONTACT: dict[str, Any] = {"facecolor": "#f0e442", "edgecolor": "black", "linewidths": 0.5}

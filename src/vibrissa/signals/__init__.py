@@ -1,5 +1,6 @@
 """The six signals at the base of a whisker, their triplets, and regions of contact."""
 
+from vibrissa.numerics import spherical
 from vibrissa.signals.base import (
     CIRCULAR,
     FD,
@@ -34,7 +35,6 @@ from vibrissa.signals.regions import (
     in_region as in_region,
     nearest_on_rest,
     resting,
-    spherical,
     within_cone,
 )
 from vibrissa.signals.triplets import TRIPLETS, selection as selection

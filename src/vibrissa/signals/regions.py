@@ -28,25 +28,6 @@ REGIONS = ("all", "ELD", "CF", "CB", "ELD CF", "ELD CB")
 _SAMPLES = 2049
 
 
-def spherical(points: Array) -> Array:
-    """Spherical form of points: distance, azimuth atan2(y, x), elevation asin(z / r).
-
-    Parameters
-    ----------
-    points : (..., 3) array
-        Points, whisker frame, m.
-
-    Returns
-    -------
-    (..., 3) array
-        Distance r, m, azimuth θ and elevation φ, rad.
-    """
-    r = np.linalg.norm(points, axis=-1)
-    theta = np.arctan2(points[..., 1], points[..., 0])
-    phi = np.arctan2(points[..., 2], np.hypot(points[..., 0], points[..., 1]))
-    return np.stack([r, theta, phi], axis=-1)
-
-
 @lru_cache(maxsize=16)
 def resting(whisker: Whisker) -> tuple[Array, Array, spatial.cKDTree, Array]:
     """Sample the resting whisker; cached.

@@ -83,10 +83,13 @@ def test_views_that_contradict_each_other_are_refused_with_a_picture(videos, tmp
     frames = [np.roll(frame, 40, axis=1) for frame in read_video(videos / "front.mkv")]
     write_video(tmp_path / "moved.mkv", frames)
     words = ["track", videos / "top.mkv", tmp_path / "moved.mkv"]
+    (tmp_path / "start.png").write_text("of another recording")
+    (tmp_path / "other.nc").touch()
     done = run(*words, "--cameras", videos / "cameras.toml", "-o", tmp_path / "t.nc")
     assert done.exit_code != 0
     assert "--base X,Y --base X,Y" in str(done.exception)
-    assert (tmp_path / "start.png").exists()
+    assert (tmp_path / "t.start.png").exists()
+    assert (tmp_path / "start.png").read_text() == "of another recording"
     assert not (tmp_path / "t.nc").exists()
 
 
@@ -309,6 +312,21 @@ def test_a_mirror_gives_two_views_in_one_video(videos, tmp_path):
     )
     np.testing.assert_array_equal(one, files)
     np.testing.assert_array_equal(two, files)
+
+
+def test_frames_that_the_rod_does_not_explain_are_in_doubt_and_swapped_names_noted(
+    videos, tmp_path, monkeypatch
+):
+    for name, other in (("top", "front"), ("front", "top")):
+        (tmp_path / f"{name}.mkv").symlink_to(videos / f"{other}.mkv")
+    monkeypatch.setattr("vibrissa.tracking.unexplained_frames", lambda misfit: misfit > 0.0)
+    words = ["track", tmp_path / "front.mkv", tmp_path / "top.mkv", "-o", tmp_path / "t.nc"]
+    done = run(*words)
+    assert done.exit_code == 0, done.exception
+    line = " ".join(done.stdout.split())
+    assert "front.mkv is taken for the top view and top.mkv for the front view" in line
+    assert "not sure that what is followed" in line
+    assert (tmp_path / "doubt.png").exists()
 
 
 @pytest.mark.parametrize("view", ["0,0,192", "0,0,192,500", "0,0,192,192:turned", "0,0,0,192"])

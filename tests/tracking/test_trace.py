@@ -9,6 +9,7 @@ from vibrissa.tracking.trace import ridge
 from vibrissa.tracking.trace.curves import find_curves
 from vibrissa.tracking.trace.ridge import traced
 from vibrissa.tracking.trace.scene import Scene
+from vibrissa.tracking.trace.trace import doubtful_frames, given
 
 
 @pytest.fixture(scope="module")
@@ -212,6 +213,16 @@ def test_a_wide_whisker_that_hardly_moves_is_not_divided_out(turn):
     (row,) = trace_video(frames, [(60.0, 100.0)])
     for trace, angle in zip(row, angles, strict=True):
         assert shown_along(trace, angle)[0] < 0.25
+
+
+def test_a_trace_with_a_hook_is_in_doubt():
+    s = np.arange(0.0, 120.0, 2.0)
+    bend = np.where(s > 90.0, (s - 90.0) / 20.0, 0.0)
+    turns = np.stack([np.cos(bend), np.sin(bend)], axis=1)
+    hooked = given(np.cumsum(2.0 * turns, axis=0))
+    straight = given(np.stack([s, 0.002 * s**2], axis=1))
+    assert doubtful_frames([hooked, *[straight] * 9]).tolist() == [True] + 9 * [False]
+    assert not doubtful_frames([hooked, *[straight] * 30]).any()
 
 
 def test_a_whisker_that_rests_is_not_divided_out():

@@ -27,6 +27,8 @@ from vibrissa.cli.terminal import progress_bars, say, shown
 if TYPE_CHECKING:
     import xarray as xr
 
+    _Traces = Sequence[Sequence[Sequence[vb.tracking.Trace]]]
+
 _WIDEST = 1.0
 """Largest width of views of a whisker, m."""
 
@@ -341,8 +343,14 @@ def track(
     fixed = known.corrected(len(views))
     reference = known.read(videos[0], rate)
     _report_assumed(filmed, clicks)
+    _report_swapped(videos, filmed)
     for file, trial in trials.items():
-        picture = file.with_name("start.png" if len(trials) == 1 else f"{file.stem}.start.png")
+        others = [
+            *trials,
+            *(path for kind in vb.io.NETCDF for path in file.parent.glob(f"*{kind}")),
+        ]
+        alone = all(path == file for path in others)
+        picture = file.with_name("start.png" if alone else f"{file.stem}.start.png")
         _track(
             trial,
             file,
@@ -388,8 +396,11 @@ def _track(
             )
             for view, path in enumerate(videos)
         ]
-        _show_doubt(videos, cameras, traces, picture.with_name(picture.name[:-9] + "doubt.png"))
+        doubt = picture.with_name(picture.name[:-9] + "doubt.png")
+        shown = _show_lost(videos, cameras, traces, doubt)
         result = vb.tracking.track(cameras, traces, rate, how, progress=tell, **known)
+    if not shown:
+        _show_unexplained(videos, cameras, traces, result, doubt)
     _compare_lengths(videos, traces, result.sizes["time"])
     vb.io.save_recording(recording, result)
     for file in kept:
@@ -425,25 +436,59 @@ def _found(
     return [[base.tolist()] for base in start.bases], replace(options, bright=start.bright)
 
 
-def _show_doubt(
+def _show_lost(
     videos: Sequence[Path],
     cameras: Sequence[vb.cameras.Camera],
-    traces: Sequence[Sequence[Sequence[vb.tracking.Trace]]],
+    traces: _Traces,
     picture: Path,
-) -> None:
-    """Show a frame in which it is not sure that whiskers are followed, if there is one."""
+) -> bool:
+    """Show a frame in which whiskers seem to be lost, if there is one."""
     count = min(len(view[0]) for view in traces)
     rows = [row[:count] for view in traces for row in view]
     wrong = np.any([vb.tracking.doubtful_frames(row) for row in rows], axis=0)
     if not wrong.any():
-        return
+        return False
     at = int(np.flatnonzero(wrong)[wrong.sum() // 2])
-    images = [next(vb.io.video_frames(video, [at])) for video in videos]
-    names = [f"{camera.name}, frame {at}" for camera in cameras]
-    whiskers = [[row[at] for row in whisker] for whisker in zip(*traces, strict=True)]
+    why = "here a whisker is lost, has a hook, or differs much in length from the frame before"
+    _show_doubt(videos, cameras, traces, [at] * len(videos), why, picture)
+    return True
+
+
+def _show_unexplained(
+    videos: Sequence[Path],
+    cameras: Sequence[vb.cameras.Camera],
+    traces: _Traces,
+    result: xr.DataTree,
+    picture: Path,
+) -> None:
+    """Show the frame that rods explain worst, if there are many that they do not explain."""
+    data = result.to_dataset()
+    misfit = np.nan_to_num(data["trace_misfit"].values)
+    if not any(vb.tracking.unexplained_frames(one).any() for one in misfit.T):
+        return
+    at = int(misfit.max(axis=1).argmax())
+    why = "here the bent rod explains the traces worst: one of them may be on something else"
+    _show_doubt(videos, cameras, traces, data["frame"].values[at].tolist(), why, picture)
+
+
+def _show_doubt(
+    videos: Sequence[Path],
+    cameras: Sequence[vb.cameras.Camera],
+    traces: _Traces,
+    at: Sequence[int],
+    why: str,
+    picture: Path,
+) -> None:
+    """Show one frame of each view with its traces."""
+    pairs = zip(videos, at, strict=True)
+    images = [next(vb.io.video_frames(video, [i])) for video, i in pairs]
+    names = [f"{camera.name}, frame {i}" for camera, i in zip(cameras, at, strict=True)]
+    whiskers = [
+        [row[i] for row, i in zip(whisker, at, strict=True)]
+        for whisker in zip(*traces, strict=True)
+    ]
     shown = [([t.line for t in one], max(t.confidence for t in one)) for one in whiskers]
-    why = "not sure: here a whisker is lost, or its length differs much from the frame before"
-    figure = vb.plots.start_views(images, shown, names, [why])
+    figure = vb.plots.start_views(images, shown, names, [f"not sure: {why}"])
     vb.plots.save(figure, picture.with_suffix(""), ("png",))
     say(f"not sure that what is followed is the whisker in every frame: see {picture}")
 
@@ -525,6 +570,20 @@ def _report_assumed(filmed: FilmOptions, clicks: vb.io.Clicks | None) -> None:
         )
     if filmed.rate is None:
         say(f"note: rate assumed, not stated: {_RATE:g} frames/s (--rate)")
+
+
+def _report_swapped(videos: Sequence[Path], filmed: FilmOptions) -> None:
+    """Report videos that are named after each other's views."""
+    if filmed.cameras is not None or len(videos) < 2:
+        return
+    names = [view.name for view in filmed.seen_by(videos)]
+    stems = [re.split(r"[\W_]+", path.stem.lower()) for path in videos[:2]]
+    if names[1] in stems[0] and names[0] in stems[1]:
+        say(
+            f"note: {videos[0].name} is taken for the {names[0]} view and {videos[1].name} for the "
+            f"{names[1]} view. If it is the other way round, results are those of a mirror image, "
+            "which fits the videos as well: nothing but their order decides"
+        )
 
 
 def _report_start(start: vb.tracking.Start, names: Sequence[str], picture: Path) -> None:

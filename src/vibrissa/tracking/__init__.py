@@ -39,7 +39,12 @@ from vibrissa.tracking.trace.video import (
     trace_file,
     trace_video,
 )
-from vibrissa.tracking.track import TrackOptions, track, track_whisker
+from vibrissa.tracking.track import (
+    TrackOptions,
+    track,
+    track_whisker,
+    unexplained_frames as unexplained_frames,
+)
 from vibrissa.tracking.tracker_points import (
     TrackerTraces as TrackerTraces,
     tracker_traces as tracker_traces,

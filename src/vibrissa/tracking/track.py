@@ -447,6 +447,12 @@ def _check_views(cameras: Sequence[Camera], series: TraceSeries, name: str) -> N
         )
 
 
+def unexplained_frames(misfit: Array) -> Mask:
+    """Frames whose traces the rod does not explain, by their misfits; none if they are few."""
+    strange = np.nan_to_num(misfit) > _STRANGE
+    return np.asarray(strange & (strange.mean() > _OFTEN))
+
+
 def remarks_on(
     cameras: Sequence[Camera], series: TraceSeries, length: Length, misfit: Array, name: str
 ) -> list[str]:
@@ -464,8 +470,8 @@ def remarks_on(
         found.append(
             f"{name}: in {outside} frames a view does not show its base; they are left out."
         )
-    strange = int((np.nan_to_num(misfit) > _STRANGE).sum())
-    if strange > _OFTEN * len(misfit):
+    strange = int(unexplained_frames(misfit).sum())
+    if strange:
         found.append(
             f"{name}: in {strange} frames the bent rod does not explain the traces (trace_misfit "
             f"above {_STRANGE:g}): they are on something else, or its own inertia or a second "
@@ -493,7 +499,8 @@ def _remarks_on_following(
     counts = [int(doubtful_frames(row).sum()) for row in rows]
     return [
         f"not sure: in {count} of {len(row)} frames {camera.name} loses {name}, or sees its length "
-        "jump, as if something else was followed. Compare traces and video (vibrissa correct)."
+        "jump or a hook in it, as if something else was followed. Compare traces and video "
+        "(vibrissa correct)."
         for camera, row, count in zip(cameras, rows, counts, strict=True)
         if count
     ]

@@ -21,6 +21,10 @@ _JUMPS, _OFTEN = 0.3, 0.05
 """Change of its length from a frame to the next, as a share of the usual one, from which a trace
 may be on something else, and share of the frames in which that may be chance."""
 
+_HOOKED = 0.7
+"""Turn within a fifth of its length from which a trace goes on as something else, as along an edge,
+rad: contact bends a whisker by less."""
+
 _GIVEN = 0.5
 """Standard deviation of points that a person gives, pixels."""
 
@@ -113,7 +117,7 @@ class Trace(NamedTuple):
 
 
 def doubtful_frames(row: Sequence[Trace]) -> Mask:
-    """Frames in which a whisker is lost, or its length jumps; none if they are few."""
+    """Frames in which a whisker is lost, its length jumps or it has a hook; none if few."""
     # What hides a part changes what is seen, what is bridged the whole: both do on another line.
     lengths = np.array([[trace.length, trace.support] for trace in row]).reshape(-1, 2)
     lost = lengths[:, 0] == 0.0
@@ -121,7 +125,17 @@ def doubtful_frames(row: Sequence[Trace]) -> Mask:
     wrong = lost.copy()
     jumps = np.abs(np.diff(lengths, axis=0)) > _JUMPS * usual
     wrong[1:] |= jumps.all(axis=1) & ~lost[:-1]
+    wrong |= [_turn(trace.line) > _HOOKED for trace in row]
     return np.asarray(wrong & (wrong.mean() > _OFTEN))
+
+
+def _turn(line: Array) -> float:
+    """Largest turn of a line within a fifth of its length, rad."""
+    if len(line) < 3:
+        return 0.0
+    angle = np.unwrap(np.arctan2(*np.gradient(line, axis=0).T[::-1]))
+    n = max(len(line) // 5, 1)
+    return float(np.abs(angle[n:] - angle[:-n]).max())
 
 
 def given(points: ArrayLike) -> Trace:

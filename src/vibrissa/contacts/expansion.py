@@ -140,11 +140,18 @@ def all_determined(model: Expansion) -> bool:
 
 
 @inlined
+def axis_length(x: Array, axis: Array) -> float:
+    """Length of a change of ξ, of which the longest axis has 1."""
+    force = max(math.hypot(x[2], x[3]), 1e-300)
+    return float(max(abs(axis[0]) / _LONGEST, math.hypot(axis[1], axis[2]) / force))
+
+
+@inlined
 def cap_axes(x: Array, axes: Array) -> bool:
     """Shorten axes that leave the whisker, as where signals fold; whether any did."""
-    force, capped = max(math.hypot(x[2], x[3]), 1e-300), False
+    capped = False
     for i in range(3):
-        size = max(abs(axes[0, i]) / _LONGEST, math.hypot(axes[1, i], axes[2, i]) / force)
+        size = axis_length(x, axes[:, i])
         if size > 1.0:
             capped = True
             for a in range(3):

@@ -15,7 +15,7 @@ import numpy as np
 
 from vibrissa.contacts.channels import CHANNELS, CIRCULAR, channels_of
 from vibrissa.contacts.posterior import NORMAL_KURTOSIS, second_moment, squared_distances
-from vibrissa.numerics import Array, IntArray, cholesky, inlined, quick_exp, vectorised
+from vibrissa.numerics import Array, IntArray, cholesky, inlined, mahalanobis, quick_exp, vectorised
 from vibrissa.rod import Fold, Rod, SearchTree, StableSet
 
 #: Parts of the chart in each of which the nearest node is a start.
@@ -240,13 +240,15 @@ def outside_share(
     chi: float,
     log_mass: float,
     covariance: Array,
+    others: Array,
 ) -> float:
     """Share of the probability that the chart's nodes leave to other regions than a candidate's.
 
     Where noise leaves more open than the second order about one contact can describe, so that many
     nodes count, the covariance is replaced by the second moment of the posterior over them. The
     share outside three standard deviations is that of contact points or of the chart, whichever is
-    larger: contact points of little volume, as near slip-off, are not left out. What is seen may be
+    larger: contact points of little volume, as near slip-off, are not left out. Where valleys are
+    too narrow for the nodes, ``others`` (n, 4), χ² and points, count as well. What is seen may be
     ``white`` already.
     """
     if white:
@@ -274,6 +276,7 @@ def outside_share(
     if not cholesky(covariance, root):
         return 0.0
     squared_distances(root, points, far)
+    wider = 1.0
     if many:
         fourth = 0.0
         for k in range(n):
@@ -289,6 +292,12 @@ def outside_share(
         else:
             mass += density[k]
             like += min(likelihood[k], 1.0)
+    away = np.empty(3)
+    for k in range(others.shape[0]):
+        for a in range(3):
+            away[a] = others[k, 1 + a] - point[a]
+        if others[k, 0] < np.inf and mahalanobis(root, away) > wider * _OUTSIDE_REGION:
+            like_out += quick_exp(min(0.5 * (chi - others[k, 0]), 0.0))
     # The nodes may be too far apart to see all of the candidate itself.
     mass = max(mass, math.exp(min(log_mass + 0.5 * chi, _MOST_LOG)), 1e-300)
     like = max(like, 1.0)

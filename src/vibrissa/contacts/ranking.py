@@ -5,7 +5,10 @@ out of its reach, and another, far away, explains them exactly. So the cells of 
 hold signals within two standard deviations of the measured ones are listed. They form basins,
 separated by cells that come less near; in each that known contacts do not explain by their slopes
 χ² is minimised within Ω. Where that leads to no least χ², as in long flat valleys, there is no
-candidate, but the chart's nodes show what else is probable.
+candidate, but the chart's nodes show what else is probable. Signals that are the same for a contact
+and its mirror image in the plane of a planar whisker have starts in the images of known contacts,
+which flat valleys (:mod:`~vibrissa.contacts.flat_valleys`) join to them, so that basins do not part
+the two.
 
 All candidates are judged (:mod:`~vibrissa.contacts.posterior`). The volumes of contact points that
 they stand for nearly vanish near slip-off, where a whisker may yet be: probabilities are the mean
@@ -28,6 +31,7 @@ from vibrissa.contacts.candidates import (
     solve_rows,
 )
 from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates, Room
+from vibrissa.contacts.flat_valleys import follow_valley
 from vibrissa.contacts.least_squares import channel_equations, fit_within, same_contact, whiten
 from vibrissa.contacts.nodes import PARTS, Searched, nearest_of, outside_share
 from vibrissa.contacts.noise import INDISTINCT
@@ -36,6 +40,7 @@ from vibrissa.contacts.task import Problem, Task, in_memory
 from vibrissa.contacts.weighing import Weighing, weigh_any
 from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel
 from vibrissa.rod import evaluate
+from vibrissa.signals import FT, FX, MB
 from vibrissa.status import Status
 
 _UNIQUE, _AMBIGUOUS = int(Status.UNIQUE), int(Status.AMBIGUOUS)
@@ -72,10 +77,12 @@ def _try(
     x: Array,
     values: Array,
     misfits: Array,
+    loose: Array,
 ) -> tuple[int, bool]:
     """Fit from a contact; add the result if it is a new least χ², at most ``worth``.
 
-    Return how many there are then, and whether the fit ended elsewhere although χ² is so small.
+    Return how many there are then, and whether the fit ended elsewhere although χ² is so small:
+    then χ² and the contact point are added to those ``loose`` (n, 4).
     """
     if number == MOST_CANDIDATES:
         return number, True
@@ -110,7 +117,13 @@ def _try(
         misfits[0] = misfit
         return max(number, 1), misfit <= worth and not least
     if known or not (least and misfit <= worth):
-        return number, not known and misfit <= worth
+        other = not known and misfit <= worth
+        for i in range(loose.shape[0] if other else 0):
+            if loose[i, 0] == np.inf:
+                loose[i, 0] = misfit
+                copy(value[3:], loose[i, 1:])
+                break
+        return number, other
     copy(at, x[number])
     copy(value, values[number])
     misfits[number] = misfit
@@ -131,13 +144,16 @@ def complete(
     misfits: Array,
     residuals: Array,
     jacobians: Array,
+    loose: Array,
 ) -> tuple[int, bool]:
     """Add contacts of Ω that noise has hidden, given residuals and slopes of those that are known.
 
-    Return how many there are then, and whether others may be probable that are not among them.
+    Fill χ² and points (n, 4) of contacts that explain it as well. Return how many there are then,
+    and whether others may be probable that are not among them.
     """
     sigma, starts = np.empty(3), np.empty((_MOST_STARTS, 4))
     start, nodes, least = np.zeros(4), np.full(PARTS, -1), np.inf
+    loose[:] = np.inf
     for c in range(number):
         least = min(least, misfits[c])
     lost = not least <= limit
@@ -156,7 +172,14 @@ def complete(
     )
     for i in range(n):
         number, other = _try(
-            of, how, passes, worth, target, measured, starts[i], number, x, values, misfits
+            of, how, passes, worth, target, measured, starts[i], number, x, values, misfits, loose
+        )
+        others = others or other
+    for c in range(number if _mirrored(how) else 0):
+        copy(x[c], start)
+        start[3] = -start[3]  # far above the floor of a narrow valley: not given up on the way
+        number, other = _try(
+            of, how, passes, np.inf, target, measured, start, number, x, values, misfits, loose
         )
         others = others or other
     for c in range(number):
@@ -166,10 +189,19 @@ def complete(
             contact = of.contacts[nodes[i]]
             start[0], start[2], start[3] = contact[0], contact[1], contact[2]
             number, other = _try(
-                of, how, passes, worth, target, measured, start, number, x, values, misfits
+                of, how, passes, worth, target, measured, start, number, x, values, misfits, loose
             )
             others = others or other
     return _kept(limit, number, x, values, misfits), others
+
+
+@inlined
+def _mirrored(how: Weighing) -> bool:
+    """Whether all channels are those of the mirror image in the plane of a planar whisker."""
+    mirrored = True
+    for code in how.codes:
+        mirrored = mirrored and code in (FX, FT, MB)
+    return mirrored
 
 
 @inlined
@@ -200,7 +232,8 @@ class _Room(NamedTuple):
 
     Weights, ∂(F, p)/∂x of one (6, 4) and ∂(F, p)/∂ξ (n, 6, 3), residuals and slopes in standard
     deviations; covariances, log weights (as they count, and with volumes), probabilities,
-    whether covariances are valid, order; and copies of x, (F, p) and χ².
+    whether covariances are valid, order; copies of x, (F, p) and χ²; and χ² and points (n, 4) of
+    contacts that are not candidates.
     """
 
     weights: Array
@@ -216,6 +249,7 @@ class _Room(NamedTuple):
     x: Array
     values: Array
     misfits: Array
+    loose: Array
 
 
 @inlined
@@ -235,6 +269,7 @@ def _judging(most: int, k: int) -> _Room:
         np.empty((most, 4)),
         np.empty((most, 6)),
         np.empty(most),
+        np.empty((_MOST_STARTS, 4)),
     )
 
 
@@ -339,6 +374,7 @@ def settle(
         chi,
         room.residuals,
         room.jacobians,
+        room.loose,
     )
     out.number[row] = n
     if n == 0:
@@ -372,7 +408,9 @@ def settle(
     _put_in_order(row, n, out, room)
     if out.probability[row, 0] > CERTAIN and (others or not out.valid[row, 0]):
         seen, best = measured if how.own[0, 0] > 0.0 else target, order[0, 0]
-        log_mass = weight[1, best] + _LOG_NORMAL
+        log_mass, spread = weight[1, best] + _LOG_NORMAL, out.covariances[row, 0]
+        if _mirrored(how) and not out.valid[row, 0]:
+            follow_valley(of.rod, of.proximal, how.codes, target, room.weights[best], x[0], spread)
         outside = outside_share(
             of,
             how.own[0, 0] > 0.0,
@@ -381,7 +419,8 @@ def settle(
             values[0, 3:],
             chi[0],
             log_mass,
-            out.covariances[row, 0],
+            spread,
+            room.loose,
         )
         out.probability[row, 0] *= 1.0 - outside
 

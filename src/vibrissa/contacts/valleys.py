@@ -48,7 +48,7 @@ _STEPS = 8
 _FIRST, _SHORTEST, _LONGEST = 1.0, 1e-9, 0.05
 # A valley is followed until χ² is so much above its least, and closed from the second on: then the
 # covariance may be relied on.
-_HIGH, _CLOSED = 30.0, 9.0
+HIGH, CLOSED = 30.0, 9.0
 # After a step on which χ² rose by less than this the next is longer, by this factor; of a normal
 # distribution all steps are equal.
 _PACE = ((0.4, 2.0), (0.8, 1.3), (12.0, 1.0), (math.inf, 0.6))
@@ -72,7 +72,7 @@ class Valleys(NamedTuple):
 
 
 # By node along a valley: s, χ², logs of the two densities (2), point (3), covariance there (3, 3).
-_Nodes = tuple[Array, Array, Array, Array, Array]
+Nodes = tuple[Array, Array, Array, Array, Array]
 
 
 @inlined
@@ -83,7 +83,7 @@ def _node(
     codes: IntArray,
     target: Array,
     weights: Array,
-    nodes: _Nodes,
+    nodes: Nodes,
     i: int,
     along: Array,
 ) -> float:
@@ -158,6 +158,15 @@ def _ahead(x: Array, along: Array, step: float, least: float, to: Array) -> None
 
 
 @inlined
+def pace(rise: float) -> float:
+    """By what factor the next step is longer, after one on which χ² rose by so much."""
+    for most, factor in _PACE:
+        if rise < most:
+            return factor
+    return 1.0
+
+
+@inlined
 def _followed(
     rod: Rod,
     b: Array,
@@ -168,7 +177,7 @@ def _followed(
     x: Array,
     value: Array,
     tangents: Array,
-    nodes: _Nodes,
+    nodes: Nodes,
 ) -> tuple[int, int]:
     """Fill the nodes of a valley, the contact in the middle; the first, and behind the last."""
     misfits = nodes[1]
@@ -205,33 +214,31 @@ def _followed(
                 continue
             number[way] += 1
             copy(to[way], at[way])
-            active[way] = misfits[i] < misfits[_STEPS] + _HIGH
-            for most, factor in _PACE:
-                if misfits[i] - before < most:
-                    steps[way] *= factor
-                    break
+            active[way] = misfits[i] < misfits[_STEPS] + HIGH
+            steps[way] *= pace(misfits[i] - before)
     return _STEPS - number[1], _STEPS + number[0] + 1
 
 
 @inlined
-def _shares(nodes: _Nodes, first: int, last: int, shares: Array) -> float:
+def shares_of(nodes: Nodes, first: int, last: int, shares: Array) -> float:
     """Fill the probabilities of nodes; return the log of the density by volume, integrated."""
     s, logs = nodes[0], nodes[2]
+    middle = s.shape[0] // 2
     mass = np.zeros(2)
     for d in range(2):
         for i in range(first, last):
             low, high = s[max(i - 1, first)], s[min(i + 1, last - 1)]
-            mass[d] += 0.5 * (high - low) * math.exp(logs[i, d] - logs[_STEPS, d])
+            mass[d] += 0.5 * (high - low) * math.exp(logs[i, d] - logs[middle, d])
     for i in range(first, last):
         step, shares[i] = 0.5 * (s[min(i + 1, last - 1)] - s[max(i - 1, first)]), 0.0
         for d in range(2):
-            shares[i] += 0.5 * step * math.exp(logs[i, d] - logs[_STEPS, d]) / mass[d]
-    return float(math.log(mass[0]) + logs[_STEPS, 0])
+            shares[i] += 0.5 * step * math.exp(logs[i, d] - logs[middle, d]) / mass[d]
+    return float(math.log(mass[0]) + logs[middle, 0])
 
 
 @inlined
-def _mixture(
-    nodes: _Nodes, first: int, last: int, shares: Array, point: Array, covariance: Array
+def mixture(
+    nodes: Nodes, first: int, last: int, shares: Array, point: Array, covariance: Array
 ) -> float:
     """Fill the second moment of a mixture about a point, widened; return its kurtosis."""
     points, spreads = nodes[3], nodes[4]
@@ -307,9 +314,9 @@ def _valley_rows(
         )
         if end - begin < 2:
             continue
-        weight[row] = _shares(nodes, begin, end, shares)
-        tailed = _mixture(nodes, begin, end, shares, values[row, 3:], covariances[row])
-        enough = nodes[1][_STEPS] + _CLOSED
+        weight[row] = shares_of(nodes, begin, end, shares)
+        tailed = mixture(nodes, begin, end, shares, values[row, 3:], covariances[row])
+        enough = nodes[1][_STEPS] + CLOSED
         closed = nodes[1][begin] > enough and nodes[1][end - 1] > enough
         valid[row] = closed and tailed < _TAILED
 

@@ -237,7 +237,8 @@ def profiles(samples: int) -> str:
         found = vb.uniqueness(
             contact_map, ["Fx MB MD"], ["all", "ELD"], samples=1024, resolution=False
         )
-        exact = [str(word) for word in found.verdict.values[0]]
+        pairs = zip(found.verdict.values[0], found.evidence.values[0], strict=True)
+        exact = [f"{verdict} ({evidence})" for verdict, evidence in pairs]
         shown = [few(1e3 * errors[0]), few(np.degrees(errors[1])), few(np.degrees(errors[2]))]
         rows.append([name, *shown, "passes" if passed else "fails", *exact])
     head = ["profile", "r, mm", "θ, °", "φ, °", "1 mm, 1.5°", "exact: all", "exact: ELD"]

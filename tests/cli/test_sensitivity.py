@@ -64,6 +64,24 @@ def test_the_whole_map(chart):
     assert f"wrote {out}" in text
 
 
+def test_twins_are_beside_the_advice(chart, monkeypatch, capsys):
+    verdicts = chart.with_name("uniqueness.nc")
+    asked = {"regions": ["all"], "samples": 64, "resolution": False}
+    found = vb.uniqueness(vb.ContactMap.load(chart), ["Fx FT MD", "Fx MB MD"], **asked)
+    vb.identifiability.save_uniqueness(found, verdicts)
+    text = run("sensitivity", chart, "--uniqueness", verdicts)
+    share, apart = float(found.twin_share[0, 0]), float(found.twin_distance[0, 0])
+    assert 0.0 < share < 1.0
+    assert f"{100.0 * share:.3g} %, {1e3 * apart:.2g} mm" in text
+    other = chart.with_name("straight.nc")
+    vb.ContactMap.simulate(samples.straight(), grid=False).save(other)
+    arguments = ["sensitivity", str(other), "--uniqueness", str(verdicts)]
+    monkeypatch.setattr(sys, "argv", ["vibrissa", *arguments])
+    with pytest.raises(SystemExit):
+        main()
+    assert "another whisker" in capsys.readouterr().err
+
+
 def test_a_trial_as_signals_or_as_contact_points(chart, points, wrench):
     table, recording = chart.with_name("signals.csv"), chart.with_name("trial.nc")
     save_signals(table, wrench)

@@ -92,8 +92,20 @@ def test_each_verdict_has_its_symbol(width) -> None:
     assert len(full) == count["unique"]
     assert len(circles) == sum(count.values()) + count["unique"]
     written = texts(figure)
-    assert {*KINDS, "note 0", "note 19", "all", "ELD\nCB"} <= set(written)
+    words = {"unique (no counterexample found)", "unique off a surface", "not unique (witness)"}
+    assert {*words, "note 0", "note 19", "all", "ELD\nCB"} <= set(written)
     assert written.count("$F_x$  $M_B$  $M_D$") == 1
+
+
+@pytest.mark.parametrize("width", ["single", "double"])
+def test_what_is_proved_has_a_symbol_of_its_own(width) -> None:
+    data = verdicts()
+    evidence = np.where(data.verdict == "unique", "proved", "witness")
+    figure = verdict_table(data.assign(evidence=(data.verdict.dims, evidence)), width=width)
+    rings = [c for c in figure.findobj(Circle) if not c.get_fill()]
+    assert len(rings) == int((data.verdict == "unique").sum()) + 1  # one in the key
+    assert "unique (proved)" in texts(figure)
+    assert "unique (proved)" not in texts(verdict_table(data, width=width))
 
 
 def test_separations_are_in_mm_and_cones_in_degrees() -> None:

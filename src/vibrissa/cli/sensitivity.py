@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import vibrissa as vb
+from vibrissa.cli.figures import dataset_with
 from vibrissa.cli.inputs import RECORDING, NoiseOptions, kind_in, wrench_from
 from vibrissa.cli.options import MapArgument, check_new, with_options
 from vibrissa.cli.terminal import Row, print_table, progress_bars, say, shown
@@ -25,6 +26,7 @@ def sensitivity(
     noise: NoiseOptions,
     using: str = "Fx,MB,MD",
     trial: Path | None = None,
+    uniqueness: Path | None = None,
     target: Path | None = None,
     force: bool = False,
 ) -> None:
@@ -38,6 +40,9 @@ def sensitivity(
         check_new(target, vb.io.NETCDF, force)
     names = vb.signals.selection([name.strip() for name in using.split(",")], exactly=3)
     contact_map = vb.ContactMap.load(path)
+    verdicts = None if uniqueness is None else dataset_with(uniqueness, "twin_share")
+    if verdicts is not None and verdicts.attrs.get("whisker") != repr(contact_map.whisker):
+        raise ValueError(f"{uniqueness} is of another whisker than {path}")
     covariance = noise.matrix()
     moment_noise = float(np.sqrt(0.5 * (covariance[4, 4] + covariance[5, 5])))
     at = None if trial is None else _contacts_of(trial, moment_noise)
@@ -51,7 +56,7 @@ def sensitivity(
         raise ValueError(f"{trial or path} holds no contact farther than 2° from rest")
     say(repr(contact_map.whisker))
     _print_derivatives(vb.sensitivity_findings(found))
-    _print_rivals(rivals, names, noise.described())
+    _print_rivals(rivals, names, noise.described(), verdicts)
     if target is not None:
         _save(target, found)
         say(f"wrote {target}")
@@ -112,7 +117,9 @@ def _ratio(value: float) -> str:
     return f"{value:.0f}" if value >= 10.0 else f"{value:.2g}"
 
 
-def _print_rivals(rivals: Dataset, names: tuple[str, ...], noise: str) -> None:
+def _print_rivals(
+    rivals: Dataset, names: tuple[str, ...], noise: str, verdicts: Dataset | None
+) -> None:
     """The triplets that are best most often, and the one that was asked for."""
     from rich.text import Text
 
@@ -121,22 +128,29 @@ def _print_rivals(rivals: Dataset, names: tuple[str, ...], noise: str) -> None:
     asked = list(rivals["triplet"].values).index(" ".join(names))
     rows: list[Row] = []
     for i in dict.fromkeys([*best, asked]):
-        row = rivals.isel(triplet=i)
+        row, of = rivals.isel(triplet=i), str(rivals["triplet"].values[i])
+        twins = [] if verdicts is None else [vb.identifiability.twins_of(verdicts, of)]
         rows.append(
             [
-                Text(str(row["triplet"].values), style="bold" if i == asked else ""),
+                Text(of, style="bold" if i == asked else ""),
                 f"{100.0 * float(row['share']):.1f} %",
                 _error(float(row["median_error"])),
                 _error(float(row["median_error_where_best"])),
                 f"{100.0 * float(row['determined']):.1f} %",
+                *twins,
             ]
         )
+    last = (
+        "whether a triplet is unique is another question: vibrissa uniqueness, and --uniqueness"
+        if verdicts is None
+        else "twins: share of contacts that have another with the same signals, and their distance"
+    )
     print_table(
-        ["triplet", "best in", "median error", "where best", "determines"],
+        ["triplet", "best in", "median error", "where best", "determines"]
+        + ["twins"] * (verdicts is not None),
         rows,
         f"Which triplet for a sensor with {noise}",
-        "3D error (RMS) predicted for small noise; whether a triplet is unique is another "
-        "question: vibrissa uniqueness",
+        f"3D error (RMS) predicted for small noise; {last}",
     )
 
 

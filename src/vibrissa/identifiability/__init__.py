@@ -9,6 +9,7 @@ from vibrissa.identifiability.sensitivity import best_triplet, sensitivity
 from vibrissa.identifiability.summary import (
     ENDINGS,
     save_uniqueness as save_uniqueness,
+    twins_of as twins_of,
     verdict_rows as verdict_rows,
     verdict_table,
 )

@@ -65,6 +65,12 @@ def choice(verdicts: xr.Dataset) -> tuple[str, str]:
     return chosen
 
 
+def verdict_words(cell: xr.Dataset) -> str:
+    """A verdict with its evidence, such as "unique (proved)"."""
+    evidence = str(cell["evidence"].item()) if "evidence" in cell else ""
+    return str(cell["verdict"].item()) + (f" ({evidence})" if evidence else "")
+
+
 def verdict_table(verdicts: xr.Dataset) -> str:
     """Write verdicts as a table for people.
 
@@ -101,14 +107,17 @@ def verdict_rows(verdicts: xr.Dataset) -> tuple[list[list[str]], list[str]]:
             angle = f"≥{np.floor(10.0 * found) / 10.0:.1f}°"  # a lower bound
             row.append(angle if word == NOT_UNIQUE else mark + " (proved)" * proved)
         rows.append(
-            [*row, str(verdicts.notation.sel(triplet=triplet).item()), _twins(verdicts, triplet)]
+            [*row, str(verdicts.notation.sel(triplet=triplet).item()), twins_of(verdicts, triplet)]
         )
     chosen, region = verdicts.attrs["chosen_triplet"], verdicts.attrs["chosen_region"]
-    use = f"({chosen.replace(' ', ', ')}), unique in: {region}" if chosen else "none is unique"
+    use = "none is unique"
+    if chosen:
+        cell = verdicts.sel(triplet=chosen, region=region)
+        use = f"({chosen.replace(' ', ', ')}), {verdict_words(cell)} in: {region}"
     cone = np.rad2deg(verdicts.attrs["cone"])
     return rows, [
         f"≥ an angle: not unique (witness), twins exist that far from rest, maybe farther. "
-        f"Unique: no counterexample found, unless proved. *: off {_surface(verdicts)}.",
+        f"Unique: unique (no counterexample found), unless proved. *: off {_surface(verdicts)}.",
         f"Twins: share of the contacts of {regions[0]} that have one, and their median distance.",
         f"Contacts within {cone:.3g}° of rest left out; domain: {verdicts.attrs['domain']}; "
         f"contacts nearer than {1e3 * verdicts.attrs['min_separation']:.3g} mm count as one.",
@@ -124,13 +133,14 @@ def _rarest(verdicts: xr.Dataset) -> str:
     if not share.notnull().any():
         return ""
     triplet = str(share.idxmin("triplet").item())
-    return (
-        f" Of the others fewest twins: ({triplet.replace(' ', ', ')}), {_twins(verdicts, triplet)}."
-    )
+    name = f"({triplet.replace(' ', ', ')})"
+    return f" Of the others fewest twins: {name}, {twins_of(verdicts, triplet)}."
 
 
-def _twins(verdicts: xr.Dataset, triplet: str) -> str:
+def twins_of(verdicts: xr.Dataset, triplet: str) -> str:
     """Share of contacts that have a twin, in the first region, with the distance of twins."""
+    if triplet not in verdicts["triplet"]:
+        return "not asked"
     cell = verdicts.sel(triplet=triplet).isel(region=0)
     if str(cell.verdict.item()) != NOT_UNIQUE or "twin_distance" not in cell:
         return "–"

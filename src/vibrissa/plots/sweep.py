@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vibrissa.numerics import Array
 from vibrissa.plots import style
-from vibrissa.plots.verdicts import PAPERS_CONE, VERDICTS, triplet_label
+from vibrissa.plots.verdicts import PAPERS_CONE, VERDICTS, WORDS, triplet_label
 from vibrissa.scene import root, squared
 
 _MARKS = dict(zip(VERDICTS, ("o", "D", "X"), strict=True))
@@ -101,7 +101,9 @@ def _verdicts(
         finding = (
             f"No triplet is unique {among} outside {PAPERS_CONE:g}°; next are {first} and {second}"
         )
-        style.conclude(figure, f"Unique {among}: {shown}" if shown else finding)
+        style.conclude(
+            figure, f"Unique (no counterexample found) {among}: {shown}" if shown else finding
+        )
         return figure
     groups = found["group"].values.astype(str)
     rows = list(dict.fromkeys(groups))
@@ -193,7 +195,7 @@ def _cone_axis(axes: Axes) -> None:
 
 def _key(figure: Figure, words: NDArray[np.str_]) -> None:
     marks = [
-        figure.axes[0].scatter([], [], marker=mark, s=14, label=word, **_KEY)
+        figure.axes[0].scatter([], [], marker=mark, s=14, label=WORDS[word], **_KEY)
         for word, mark in _MARKS.items()
         if word in words
     ]

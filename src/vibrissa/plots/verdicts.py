@@ -20,18 +20,27 @@ from vibrissa.plots import style
 from vibrissa.quantities import quantity, to_display
 
 VERDICTS = ("unique", "unique off a surface", "not unique")
+WORDS = {
+    "unique": "unique (no counterexample found)",
+    "unique off a surface": "unique off a surface",
+    "not unique": "not unique (witness)",
+}
+"""Verdicts in words: a search proves what it refutes, and nothing else."""
+PROVED = "unique (proved)"
 EMPTY = "no contacts"
 """The verdict on a region without contacts: nothing is drawn."""
 
 _ROW = 4.2
 """Height of a row, mm."""
 
-_HEAD, _FOOT = 11.0, 10.0
+_HEAD, _FOOT = 11.0, 13.5
 _KEY = (
     "numbers: largest distance (mm) of two contacts with the same signals",
     "critical cone: about rest, outside it no such pair was found; ambiguous: share of contacts "
     "that another one resembles within 0.1 % of ranges",
 )
+_LETTER = 1.25
+"""Room for a letter of the key, mm."""
 _EDGES = {"single": (18.5, 7.3, 20.0), "double": (24.0, 13.5, 25.0)}
 """Widths of the triplets' names, of a region's column and of the notation, mm."""
 
@@ -42,12 +51,13 @@ _TOLERANCE = 1e-3
 def verdict_table(verdicts: xr.Dataset, *, width: style.Width = "double") -> Figure:
     """Draw the table of verdicts: a row for each triplet, a column for each region.
 
-    A full disc stands for unique, a half one for unique off a surface, an open ring for not unique.
-    The triplet chosen is printed in blue, with a mark. At double width, what is not unique is given
-    with the largest distance of two contacts with the same signals, and three more columns follow,
-    of all contacts and only if the region "all" was judged: a lower bound of the critical cone,
-    outside which no two contacts have the same signals; the share of contacts that have such a
-    twin; and the share that another one resembles within 1e-3 of the signals' ranges.
+    A full disc stands for unique, one in a ring for proved to be, a half one for unique off a
+    surface, an open ring for not unique. The triplet chosen is printed in blue, with a mark. At
+    double width, what is not unique is given with the largest distance of two contacts with the
+    same signals, and three more columns follow, of all contacts and only if the region "all" was
+    judged: a lower bound of the critical cone, outside which no two contacts have the same
+    signals; the share of contacts that have such a twin; and the share that another one resembles
+    within 1e-3 of the signals' ranges.
 
     Parameters
     ----------
@@ -82,18 +92,20 @@ def verdict_table(verdicts: xr.Dataset, *, width: style.Width = "double") -> Fig
         known = shares is not None and bool(np.isfinite(shares.values).any())
         _heads(axes, regions, width, page, known)
         chosen = str(verdicts.attrs.get("chosen_triplet", ""))
+        proved = "evidence" in verdicts and bool((verdicts["evidence"] == "proved").any())
         for i, triplet in enumerate(triplets):
             _row(axes, verdicts.sel(triplet=triplet), i, triplet == chosen, width, page)
-        _key(axes, height, width, "all" in regions)
+        _key(axes, height, width, proved, "all" in regions)
         if "all" in regions:
-            every = verdicts["verdict"].sel(region="all").values
-            found = [
-                triplet_label(t) for t, v in zip(triplets, every, strict=True) if v == VERDICTS[0]
-            ]
+            every = verdicts.sel(region="all")
+            held = (every["verdict"] == VERDICTS[0]).values
+            found = [triplet_label(t) for t, yes in zip(triplets, held, strict=True) if yes]
+            sure = proved and bool((every["evidence"].values[held] == "proved").all())
+            searched = "" if sure and found else ", as far as was searched"
             shown = ", ".join(f"({name})" for name in found) or "none"
             style.conclude(
                 figure,
-                f"Triplets that locate every contact, as far as was searched: {shown} "
+                f"Triplets that locate every contact{searched}: {shown} "
                 f"({len(found)} of {len(triplets)})",
             )
         return figure
@@ -158,7 +170,8 @@ def _row(
         axes.plot(2.6, y, marker=">", markersize=2.5, color=style.BLUE)
     for j, kind in enumerate(verdict["verdict"].values):
         x = names + (j + 0.5) * column
-        _symbol(axes, x, y, str(kind))
+        proved = "evidence" in verdict and str(verdict["evidence"].values[j]) == "proved"
+        _symbol(axes, x, y, PROVED if proved else str(kind))
         if width == "double":
             look: dict[str, Any] = {"fontsize": style.SMALL, "va": "center_baseline"}
             axes.text(x + 1.8, y, _separation(verdict, j), **look)
@@ -177,7 +190,9 @@ def _symbol(axes: Axes, x: float, y: float, kind: str) -> None:
     size = 1.15
     colour = style.MUTED if kind == "not unique" else style.BLUE
     axes.add_patch(Circle((x, y), size, facecolor="white", edgecolor=colour, linewidth=0.7))
-    if kind == "unique":
+    if kind == PROVED:
+        axes.add_patch(Circle((x, y), 1.5 * size, fill=False, edgecolor=colour, linewidth=0.5))
+    if kind in ("unique", PROVED):
         axes.add_patch(
             Circle((x, y), size, facecolor=style.BLUE, edgecolor=style.BLUE, linewidth=0.7)
         )
@@ -206,30 +221,31 @@ def _evidence(axes: Axes, verdict: xr.Dataset, left: float, y: float) -> None:
         cell = verdict.sel(region="all")
         twins = 100.0 * float(cell["twin_share"])
         rare = "rare" if str(cell["verdict"].values) == "not unique" else "none"
-        text = "" if not np.isfinite(twins) else f"{twins:.2g} %" if twins > 0.0 else rare
-        axes.text(left + 20.5, y, text, ha="right", **look)
+        share = f"{twins:.{2 + (twins > 99.0)}g} %" if twins > 0.0 else rare
+        axes.text(left + 20.5, y, share if np.isfinite(twins) else "", ha="right", **look)
     if "ambiguous_share" in verdict:
-        share = verdict["ambiguous_share"].sel(region="all")
-        nearest = int(np.argmin(np.abs(np.log(share["signal_tolerance"].values / _TOLERANCE))))
-        value = float(share.isel(signal_tolerance=nearest))
+        alike = verdict["ambiguous_share"].sel(region="all")
+        nearest = int(np.argmin(np.abs(np.log(alike["signal_tolerance"].values / _TOLERANCE))))
+        value = float(alike.isel(signal_tolerance=nearest))
         if np.isfinite(value):
             axes.barh(y, 9.0 * value, 0.35 * _ROW, left + 25.0, color=style.MUTED)
             axes.text(left + 25.6 + 9.0 * value, y, f"{100.0 * value:.0f} %", **look)
 
 
-def _key(axes: Axes, height: float, width: style.Width, whole: bool) -> None:
+def _key(axes: Axes, height: float, width: style.Width, proved: bool, whole: bool) -> None:
     """Explain the symbols."""
-    y = height - _FOOT + 3.0
-    axes.plot([1.5, axes.get_xlim()[1] - 1.5], [y - 3.0] * 2, color=style.INK, linewidth=0.9)
-    x = 3.5
-    for kind, room in zip(VERDICTS, (14.0, 30.0, 20.0), strict=True):
+    x, y, page = 3.5, height - _FOOT + 3.0, axes.get_xlim()[1]
+    axes.plot([1.5, page - 1.5], [y - 3.0] * 2, color=style.INK, linewidth=0.9)
+    for kind, text in {**({PROVED: PROVED} if proved else {}), **WORDS}.items():
+        room = 4.5 + _LETTER * len(text)
+        if x + room > page:
+            x, y = 3.5, y + 3.5
         _symbol(axes, x, y, kind)
-        axes.text(x + 2.2, y, kind, fontsize=style.SMALL, va="center")
+        axes.text(x + 2.4, y, text, fontsize=style.SMALL, va="center")
         x += room
     if width == "double":
-        for line, text in enumerate(_KEY if whole else _KEY[:1]):
-            left, small = (3.5 if line else x), style.SMALL
-            axes.text(left, y + 3.5 * line, text, fontsize=small, va="center")
+        for line, text in enumerate(_KEY if whole else _KEY[:1], start=1):
+            axes.text(3.5, y + 3.5 * line, text, fontsize=style.SMALL, va="center")
 
 
 HIGHLIGHTED = ("Fx MB MD", "Mx MB MD", "Fx FD MD")

@@ -225,8 +225,11 @@ def _verdicts(rows: xr.Dataset, task: str, group: str) -> Iterator[str]:
     name = f"{task}_verdict"
     if name not in rows or not (rows[name] != "").any():
         return
-    yield f"{task}, {group}: unique | off a surface | not; critical cone: median, largest"
-    verdict, cone = rows[name], rows[f"{task}_critical_cone"]
+    yield (
+        f"{task}, {group}: unique (no counterexample found) | the same off a surface | "
+        "not unique (witness); critical cone: median, largest; contacts with a twin: the same"
+    )
+    verdict, cone, twins = (rows[f"{task}_{n}"] for n in ("verdict", "critical_cone", "twin_share"))
     _, first, second = verdict.dims
     for a in rows[first].values:
         for b in rows[second].values:
@@ -241,7 +244,9 @@ def _verdicts(rows: xr.Dataset, task: str, group: str) -> Iterator[str]:
                 label = str(a) if rows.sizes[second] == 1 else f"{a}, {b}"
                 middle, high = np.nanmedian(degrees), np.nanmax(degrees)
                 tally = "{:4d} | {:4d} | {:4d}".format(*counts)
-                yield f"  {label:10s} {tally};  {middle:5.2f}°, {high:5.2f}°"
+                share = 100.0 * twins.sel(at).values[words != ""]
+                twin = f"{np.nanmedian(share):.3g} %, {np.nanmax(share):.3g} %"
+                yield f"  {label:10s} {tally};  {middle:5.2f}°, {high:5.2f}°;  {twin}"
 
 
 def _errors(rows: xr.Dataset, task: str, group: str) -> Iterator[str]:

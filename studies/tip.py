@@ -32,28 +32,31 @@ HEAD = ("whisker, noise", "signals", "side only", "with the tip", "valid, %")
 HEAD = (*HEAD, "`TIP_CONTACT`, of the tip %", "of the side %", "tip `UNIQUE`, %")
 EVEN = vb.Prior(tip=0.5)
 STEEPEST = np.deg2rad(75.0)
+SMALLEST = 0.01
+"""Smallest force that is drawn, of the largest."""
 _STEP = 1e-4
 
 
 def of_the_tip(contact_map, count, rng):
     """Forces (count, 3) at the tip, N, of which contact points are uniform while they are stable.
 
-    Many are drawn; one is kept with a chance that is proportional to det ∂p/∂f. Which are stable,
-    is found along the way from rest, by differences of what `deflect` solves.
+    Many are drawn, sizes evenly in their logarithm because stable forces are small on some rods;
+    some are kept with a chance proportional to det ∂p/∂f over the density of the draws. Which are
+    stable is found along the way from rest, by differences of what `deflect` solves.
     """
     whisker = contact_map.whisker
     unit = whisker.base_bending_stiffness / whisker.length**2
     largest = 3.0 * float(contact_map.to_dataset().fold_force.values[-1].max() / unit)
-    n = 40 * count
+    n = max(60 * count, 2000)
     beta, psi = rng.uniform(0.1, STEEPEST, n), rng.uniform(0.0, 2.0 * np.pi, n)
     toward = np.stack([-np.sin(beta), np.cos(beta) * np.cos(psi), np.cos(beta) * np.sin(psi)], 1)
-    size = largest * rng.uniform(size=n) ** (1.0 / 3.0)
+    size = largest * SMALLEST ** rng.uniform(size=n)
     good, chance = np.ones(n, bool), np.zeros(n)
     for share in np.linspace(0.1, 1.0, 10):
         stable, chance = _stable(whisker, share * size[:, None] * toward * unit)
         good &= stable
-    weight = np.where(good, chance * np.cos(beta), 0.0)
-    pick = rng.choice(n, count, p=weight / weight.sum())
+    weight = np.where(good, chance * np.cos(beta) * size**3, 0.0)
+    pick = rng.choice(n, count, replace=False, p=weight / weight.sum())
     return size[pick, None] * toward[pick] * unit
 
 

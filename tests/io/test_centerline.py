@@ -149,6 +149,15 @@ def test_what_a_file_does_not_state_is_noted(tmp_path):
     assert "radius assumed" not in " ".join(load_whisker(measured).notes)
 
 
+@pytest.mark.parametrize("radii", [(), (RADII * 1e6,)])
+def test_a_centreline_without_z_is_noted(tmp_path, radii):
+    rest = ",radius_um" * len(radii)
+    flat = load_whisker(table(tmp_path, f"x_mm,y_mm{rest}", POINTS[:, :2] * 1e3, *radii))
+    assert "the file has no column z" in flat.notes[-1]
+    spatial = load_whisker(table(tmp_path, f"x_mm,y_mm,z_mm{rest}", POINTS * 1e3, *radii))
+    assert "no column z" not in " ".join(spatial.notes)
+
+
 def test_published_radii_where_the_caller_asks(tmp_path):
     path = table(tmp_path, "x_mm,y_mm,z_mm", POINTS * 1e3)
     whisker = load_whisker(path, rat="left C2")

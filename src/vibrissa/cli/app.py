@@ -37,8 +37,7 @@ from vibrissa.cli.view import view
 HELP = """From the forces at a whisker's base to what it touched.
 
 Lengths typed and printed are in mm, forces in µN, moments in µN·m and angles in degrees; files hold
-SI units. No file that is there is replaced without --force; stages are added to a recording where
-it is.
+SI units. Existing files are not replaced without --force; stages are added to the recording itself.
 """
 
 VERBS: dict[str, Callable[..., None]] = {

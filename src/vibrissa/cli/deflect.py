@@ -35,8 +35,9 @@ def deflect(
     """Bend a whisker by a point, a force or a peg, and print force and moment at its base.
 
     All in the whisker's frame. Give one of --point, --point-force, --peg (upright without --axis).
-    With --gravity the whisker sags, and its base reads what a sensor does that was tared at rest.
-    Without an answer the status states why, and the exit status is 1.
+    With --gravity the whisker sags under its weight, and force and moment are those of a sensor
+    that was tared at rest. Where there is no equilibrium the status states why, and the exit status
+    is 1.
     Example: `vibrissa deflect --point 25,12,1`
     """
     load = _load(point, point_force, peg, axis, push)

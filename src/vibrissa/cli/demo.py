@@ -32,8 +32,8 @@ def demo(
 ) -> None:
     """Whisk against a peg, film it, measure at the whisker's base, and find the peg again.
 
-    A whisker sweeps past a peg and back before two cameras. Its track gives how its base is held,
-    three signals at its base where it touches, and the contact points draw the peg. All stages are
+    A whisker sweeps past a peg and back before two cameras. Tracking gives the pose of its
+    base, three signals at the base give the contact points, and these the peg. All stages are
     compared with the truth. Stopped with Ctrl-C it continues when it is called again.
     Example: `vibrissa demo --output try --seed 1`
     """

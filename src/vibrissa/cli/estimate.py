@@ -219,11 +219,11 @@ def estimate(
 ) -> None:
     """Find the contact point in each frame or row of signals, with its uncertainty.
 
-    From three signals all contacts that give them exactly, from more by least squares; with
-    --using wrench whatever the friction. Where M_B is within five standard deviations of zero the
+    Three signals give all contacts that explain them exactly, more are fitted by least squares;
+    --using wrench allows for friction. Where M_B is within five standard deviations of zero the
     status is not_felt. To a recording they are added as a group `estimates`, in the laboratory too,
-    where continuity decides which of several contacts it was; signals are made first where there
-    are none (see `vibrissa signals`), and a contour that was made of other contacts is left out. A
+    where continuity decides between several contacts; missing signals are computed first
+    (see `vibrissa signals`), and a contour that was computed from other contacts is removed. A
     table goes to a table. With a --sensor (.toml) its columns are the sensor's channels, and poses
     of the base, as lines of `vibrissa stream` are; with that of `vibrissa calibrate` (.nc) it is a
     sweep: positions of the stage, and the channels; `vibrissa reconstruct` finds the object of the

@@ -22,7 +22,7 @@ def export(
     species: str | None = None,
     force: bool = False,
 ) -> None:
-    """Write per frame and whisker what an analysis needs: forces, angles, their rates, contacts.
+    """Write a table by frame and whisker: forces, angles, their rates, contacts.
 
     The table holds force and moment, the six signals, the pose of the base, rates of change,
     contact points and flags, in SI units; every column is described in the file. Signals are made

@@ -304,7 +304,7 @@ def figures(
 
     A map: whisker, signals over space, surfaces, sensitivity; with a saved result of `vibrissa
     uniqueness` also the verdicts, the resolution and pairs of contacts with the same signals. A
-    trial: frames, signals and their course through the solids of a map, contacts about the whisker
+    trial: frames, signals and their trajectory in the solids of a map, contacts about the whisker
     and in the laboratory, estimates, contour. An array of whiskers, or a trial of several: the
     face, the whiskers, and what they touch.
     Example: `vibrissa figures map.nc -o figures --width single`

@@ -69,7 +69,7 @@ def simulate_map(
     grid: bool = True,
     force: bool = False,
 ) -> None:
-    """Find all stable contacts of a whisker, and the paper's grid of them.
+    """Find all stable contacts of a whisker, and solve the paper's grid of contact points.
 
     Radii, modulus and ratio are those of the file or, where not given, of an average whisker.
     Example: `vibrissa map --whisker C1.csv -o map.nc`; steel wire:

@@ -73,10 +73,11 @@ def reconstruct(
 ) -> None:
     """Find the object that was touched from a recording alone.
 
-    Signals and estimates that the recording already has are used; what is missing is made first, by
-    defaults that are printed, and what options ask for is made anew. All is added to the recording
-    as groups `signals`, `estimates` and `contour`; what else it held stays as it was. The contour
-    points go to a table as well; one that holds just what the recording held is replaced with it.
+    Signals and estimates that the recording already has are used; what is missing is computed
+    first, by defaults that are printed, and what options ask for is computed again. All is added to
+    the recording as groups `signals`, `estimates` and `contour`; its other groups are kept. The
+    contour points are written as a table, too; an existing one is replaced only if it holds the
+    recording's previous contour.
     The contacts are compared with --objects, by default those of the recording.
     Example: `vibrissa reconstruct trial.nc --shape cylinder`
     """

@@ -61,8 +61,8 @@ def report(
 ) -> None:
     """Write a page that opens offline: results, errors, figures, and a contour to turn.
 
-    It is about the whisker most in contact, unless --which chooses another; the seed is that of the
-    predicted errors. With SOURCE_DATE_EPOCH set, the same command gives the same
+    It shows the whisker most in contact, unless --which chooses another; the seed is for the draws
+    of predicted errors. With SOURCE_DATE_EPOCH set, the same command gives the same
     page. Example: `vibrissa report trial.nc --video top.mp4 --video front.mp4 -o report.html`
     """
     check_new(target, (".html", ".htm"), force)

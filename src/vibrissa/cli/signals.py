@@ -102,8 +102,9 @@ def signals(
 ) -> None:
     """Find force, moment and the six signals at the base in every frame.
 
-    They are added to the recording as a group `signals`; what it already holds stays, but estimates
-    and a contour that were made of other signals are left out. Example: `vibrissa signals trial.nc`
+    They are added to the recording as a group `signals`. Its other groups are kept, except
+    estimates and a contour that were computed from other signals.
+    Example: `vibrissa signals trial.nc`
     """
     refuse_tracks(recording)
     target = target or recording

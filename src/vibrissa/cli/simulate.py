@@ -61,7 +61,7 @@ def simulate(
     """Simulate a whisking trial among objects, with its truth.
 
     By default the trial of the demo: a γ whisker sweeps past a peg and back, in 3.5 s (an array:
-    0.5 s). Options count more than the file. Example: `vibrissa simulate --duration 0.5
+    0.5 s). Options override the file. Example: `vibrissa simulate --duration 0.5
     --friction 0.3 -o trial.nc`; `vibrissa simulate --array average --object sphere -o face.nc`
     """
     if example:

@@ -242,7 +242,7 @@ def stream(
     bag: Path | None = None,
     answers: str | None = None,
 ) -> None:
-    """Find contacts while signals come in, one line of JSON each.
+    """Find contacts while signals arrive; each sample is answered by one line of JSON.
 
     Lines are CSV with a header, or JSON objects, in SI units, with the signals that are used or
     Fx, Fy, Fz, Mx, My, Mz; a column time is passed on. A line that cannot be read gives a line with

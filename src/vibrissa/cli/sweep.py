@@ -37,7 +37,7 @@ def sweep(
     example: bool = False,
     force: bool = False,
 ) -> None:
-    """Ask the same of many whiskers, here or on a cluster; stopped, it continues where it was.
+    """Run a study of many whiskers, here or on a cluster; if stopped, it continues where it was.
 
     Example: `vibrissa sweep study.toml -o study.zarr`, then `vibrissa sweep show study.zarr`
     """

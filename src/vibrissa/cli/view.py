@@ -40,7 +40,7 @@ def view(
     --video front.mp4`
 
     With --stream HOST:PORT the answers that `vibrissa stream --send udp://HOST:PORT` sends there
-    are drawn as they come. Example: `vibrissa view wire.nc --stream 127.0.0.1:5006`
+    are drawn as they arrive. Example: `vibrissa view wire.nc --stream 127.0.0.1:5006`
     """
     kind = "" if path is None else kind_in(path)
     viewed: vb.Whisker | vb.ContactMap | xr.DataTree

@@ -85,6 +85,7 @@ _TAPERED = 0.01
 
 _SURE = 4.0
 """Standard errors by which it is thicker, at least."""
+_PLANAR = "the file has no column z: the whisker was taken to be planar"
 
 
 def load_centerline(path: str | PathLike[str]) -> Array:
@@ -103,8 +104,8 @@ def load_centerline(path: str | PathLike[str]) -> Array:
     return _table(Path(path))[0]
 
 
-def _table(path: Path) -> tuple[Array, Array | None, str]:
-    """Points (n, 3) and, if stated, radii (n,), m; and the unit of the coordinates."""
+def _table(path: Path) -> tuple[Array, Array | None, str, bool]:
+    """Points (n, 3) and, if stated, radii (n,), m; the coordinates' unit; whether z is stated."""
     rows = table_rows(read_text(path))
     header = next(rows, None)
     if header is None:
@@ -115,10 +116,11 @@ def _table(path: Path) -> tuple[Array, Array | None, str]:
     array = read_rows(path, rows, len(header[1]), places)
     array = array[np.isfinite(array[:, : len(columns)]).any(axis=1)]
     points = array[:, : len(columns)] * factor
-    if len(columns) == 2:
+    spatial = len(columns) == 3
+    if not spatial:
         points = np.column_stack([points, np.zeros(len(points))])
     unit = next(name for name, length in LENGTHS.items() if length == factor)
-    return points, array[:, -1] * thickness[0][1] if thickness else None, unit
+    return points, array[:, -1] * thickness[0][1] if thickness else None, unit, spatial
 
 
 def _columns(path: Path, header: list[str]) -> tuple[list[int], float]:
@@ -200,7 +202,8 @@ def load_whisker(
     Parameters
     ----------
     path : str or path
-        CSV file with columns `x_mm,y_mm,z_mm`, or `x,y,z` in metres.
+        CSV file with columns `x_mm,y_mm,z_mm`, or `x,y,z` in metres. Without z the whisker is taken
+        to be planar, as its notes state.
     noise : float, optional
         Standard deviation of a coordinate, m; 0 asks for interpolation. By default it is estimated.
     base : {"first", "last"} or array (3,), optional
@@ -214,7 +217,7 @@ def load_whisker(
     Whisker
         Named after the file unless a name is given.
     """
-    points, radii, unit = _table(Path(path))
+    points, radii, unit, spatial = _table(Path(path))
     properties.setdefault("name", Path(path).stem)
     stated = {
         name
@@ -223,10 +226,12 @@ def load_whisker(
     }
     try:
         if radii is None or stated:
-            return Whisker.from_points(points, noise=noise, base=base, **properties)
-        return _tapered(points, radii, noise, base, properties)
+            whisker = Whisker.from_points(points, noise=noise, base=base, **properties)
+        else:
+            whisker = _tapered(points, radii, noise, base, properties)
     except ValueError as fault:
         raise ValueError(f"{path}: {fault} (by the header coordinates are in {unit})") from None
+    return whisker if spatial else replace(whisker, notes=(*whisker.notes, _PLANAR))
 
 
 def _tapered(

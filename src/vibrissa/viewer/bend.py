@@ -28,6 +28,8 @@ from vibrissa.whisker import Whisker
 
 NODES = 48
 _AXES = np.array([(190, 60, 60), (70, 140, 70), (70, 90, 190)], dtype=np.uint8)
+_ASIDE = np.array([0.0, -0.15, -0.55])
+"""Start of the ruler, over its length: below the contacts, where it meets no other label."""
 _ARROW = 0.3
 """Length of the arrow of a force of EI/L², over L; others go with the square root."""
 
@@ -62,7 +64,8 @@ def axes(whisker: Whisker) -> dict[str, scene.Mark]:
     ends = size * np.eye(3)
     out: dict[str, scene.Mark] = {"axes": scene.Arrows(np.zeros((3, 3)), ends, _AXES, 0.05 * size)}
     out |= {f"axis {name}": scene.Label(1.12 * ends[i], name) for i, name in enumerate("xyz")}
-    return out | ruler(np.zeros(3), _size(whisker.length))
+    length = _size(whisker.length)
+    return out | ruler(_ASIDE * length, length)
 
 
 def ruler(start: Array, length: float) -> dict[str, scene.Mark]:
@@ -75,7 +78,7 @@ def ruler(start: Array, length: float) -> dict[str, scene.Mark]:
     out: dict[str, scene.Mark] = {"ruler": scene.Line(pieces, REST, 1.5)}
     for place, tick in zip(at[1:], ticks[1:], strict=True):
         unit = " mm" if tick == ticks[-1] else ""
-        out[f"tick {tick:g}"] = scene.Label(place + 3.0 * down, f"{tick:g}{unit}")
+        out[f"tick {tick:g}"] = scene.Label(place + 6.0 * down, f"{tick:g}{unit}")
     return out
 
 

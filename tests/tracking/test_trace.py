@@ -215,6 +215,32 @@ def test_a_wide_whisker_that_hardly_moves_is_not_divided_out(turn):
         assert shown_along(trace, angle)[0] < 0.25
 
 
+def still(dark, seed, count=20):
+    """A frame of a film, without what stands still in it and makes the ground darker."""
+    noise = np.random.default_rng(seed)
+    frames = [
+        np.clip(np.rint(190.0 * (1.0 - dark(i)) + noise.normal(0.0, 0.5, (200, 200))), 0, 255)
+        for i in range(count)
+    ]
+    frames = [frame.astype(np.uint8) for frame in frames]
+    return Scene.of(frames).with_still(np.array([[10.0, 100.0]]), frames).without_still(frames[3])
+
+
+def test_the_soft_edge_of_a_shadow_is_no_line():
+    """Its outer part, left when the rest was divided out, had drawn traces along it."""
+    _, x = np.mgrid[:200, :200].astype(float)
+    shadow = 0.3 / ((1.0 + np.exp((90.0 - x) / 3.0)) * (1.0 + np.exp((x - 130.0) / 3.0)))
+    assert np.ptp(np.median(still(lambda _: shadow, 1), axis=0)) < 0.03 * 190.0
+
+
+def test_a_wire_that_compression_lets_flicker_is_no_whisker():
+    """It had been taken for a whisker that moves by less than its width, and left in the images."""
+    y, x = np.mgrid[:200, :200].astype(float)
+    wire = 0.4 * np.exp(-0.5 * ((x - 120.0 - 0.1 * y) / 1.3) ** 2)
+    frame = still(lambda i: wire * (1.0 + 0.06 * np.sin(2.0 * i)), 2)
+    assert np.percentile(frame, 1.0) > 170.0
+
+
 def test_a_trace_with_a_hook_is_in_doubt():
     s = np.arange(0.0, 120.0, 2.0)
     bend = np.where(s > 90.0, (s - 90.0) / 20.0, 0.0)

@@ -103,7 +103,7 @@ that curve's polynomials, and the share of a kink that may be left."""
 
 _STOPPED, _LONGER = 5, 1.1
 """Number of points before another whisker at which one may have been stopped by it, and by what
-factor it must be longer without."""
+factor it must be longer without, or may be shorter if it is straighter."""
 
 _LARGEST_TURN = 0.35
 """Largest turn of the row between frames beyond what was expected, rad."""
@@ -349,15 +349,17 @@ def _straightened(
         return {}
     known = {k: trace.line for k, trace in (before | dict(fixed)).items() if k not in starts}
     found = _through_crossings(followers, starts, known, frame, noise, scene)
-    return {
-        k: [trace]
-        for k, trace in found.items()
-        if followers[k].long_enough(trace)
-        and (
-            _kink(trace) < _STRAIGHTER * _kink(before[k])
-            or followers[k].length_of(trace) > _LONGER * followers[k].length_of(before[k])
-        )
-    }
+    better = {}
+    for k, trace in found.items():
+        longer = followers[k].length_of(trace) / followers[k].length_of(before[k])
+        straight = _kink(trace) < _STRAIGHTER * _kink(before[k])
+        if straight and longer < 1.0 / _LONGER:
+            # What is straight as it stops at an object, which may have bent it, is no better.
+            ahead = prolonged(trace.line, _FEWEST, _STOPPED)[-_STOPPED:]
+            straight = not followers[k].clutter.disturbs(ahead).any()
+        if followers[k].long_enough(trace) and (straight or longer > _LONGER):
+            better[k] = [trace]
+    return better
 
 
 def _kink(trace: Trace) -> float:

@@ -70,10 +70,14 @@ _LONG, _THICK = 60, 5
 _BLUR, _AROUND = 3, 12.0
 """How far an edge is blurred, and the smoothing of the light around still things, pixels."""
 
-_SWEPT, _MOSTLY = 2.5, 0.5
+_SWEPT, _DARKER, _MOSTLY = 2.5, 0.25, 0.5
 """Darkening from the background to the usual value from which a whisker passes there, standard
-deviations of the noise (one of them is the background's own rank), and the share of a line along
-which one does from which it is nothing else."""
+deviations of the noise (one of them is the background's own rank), at least such a share of what
+the background is darker than the light, and the share of a line along which one does from which it
+is nothing else."""
+
+_SHADED = 12
+"""Width of the softest edge of a shadow, pixels."""
 
 _ENOUGH = 0.02
 """Share of open ground around a pixel from which its light is known."""
@@ -231,9 +235,17 @@ class Scene:
         least = _NOISES * noise_level(shown) / float(np.median(self.light))
         thin = self.light / shown - 1.0 > min(max(least, _FAINT), _LINE)
         stands = binary_dilation(stands | thin, iterations=_BLUR)
-        known = np.where(stands, 0.0, 1.0).astype(np.float32)
-        weight, light = (gaussian_filter(one, _AROUND) for one in (known, known * shown))
-        open_ = np.where(weight > _ENOUGH, light / np.maximum(weight, 1e-6), ground)
+
+        def around(stands: NDArray[np.bool_]) -> Any:
+            known = np.where(stands, 0.0, 1.0).astype(np.float32)
+            weight, light = (gaussian_filter(one, _AROUND) for one in (known, known * shown))
+            return np.where(weight > _ENOUGH, light / np.maximum(weight, 1e-6), ground)
+
+        # The soft edge of a shadow, left alone, would be a line.
+        wider = binary_dilation(stands, iterations=_SHADED)
+        soft = wider & (np.abs(shown / around(wider) - 1.0) > _FAINT)
+        open_ = around(stands | soft)
+        soft &= ~stands
         thick = binary_erosion(stands, iterations=_BLUR + _THICK)
         wide = binary_dilation(thick, iterations=_BLUR + _THICK + _RIM)
         bodies, lines = label(wide & stands)[0], label(stands & ~wide)[0]
@@ -249,7 +261,8 @@ class Scene:
             away = np.hypot.outer(row - y, column - x)
             at_base = np.isin(parts, np.unique(parts[(away < _AT_BASE) & stands]))
             if stands[away < _DEEP].mean() > _COVERED:
-                lifted |= at_base
+                # What is far darker than that hides the whisker.
+                lifted |= at_base & (shown > _OPAQUE * np.median(shown[away < _DEEP]))
                 continue
             for k in np.unique(lines[(away < _AT_BASE) & across]):
                 if _begins(np.argwhere(lines == k)[:, ::-1] - [x, y]):
@@ -258,6 +271,7 @@ class Scene:
             stands &= ~at_base | across | other
         # Where whiskers cross or turn it is always dark too, though not over a long way.
         stands &= np.isin(parts, _long(parts)) | np.isin(parts, np.unique(parts[thick]))
+        stands = binary_dilation(stands, iterations=_SHADED, mask=stands | soft)
         at = np.flatnonzero(stands)
         factor = (open_ / shown).ravel()[at]
         dark = stands & (shown < _OPAQUE * open_) & ~lifted
@@ -277,7 +291,7 @@ class Scene:
 
         It leaves a part of its darkness in the background, but usually is darker than that.
         """
-        from scipy.ndimage import binary_dilation
+        from scipy.ndimage import binary_dilation, maximum_filter
 
         assert self.background is not None
         where = lines > 0
@@ -286,7 +300,10 @@ class Scene:
         grey = np.stack([frame[where] / np.float32(self.gain(frame)) for frame in frames])
         noise = float(np.median([noise_level(frame) for frame in frames[:_FEWEST]]))
         darker_ = np.zeros_like(where)
-        darker_[where] = self.background[where] - np.median(grey, axis=0) > _SWEPT * noise
+        # Compression lets what stands still vary, too, the more the darker it is.
+        deep = maximum_filter(self.light - self.background, 2 * _BLUR + 1)[where]
+        least = np.maximum(_SWEPT * noise, _DARKER * deep)
+        darker_[where] = self.background[where] - np.median(grey, axis=0) > least
         there = binary_dilation(darker_, iterations=_BLUR)
         size = np.bincount(lines[where])
         share = np.bincount(lines[where], there[where]) / np.maximum(size, 1)

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import xarray as xr
 from h5py import h5d, h5s, h5t
+from typer.testing import CliRunner
 
 from vibrissa import samples
+from vibrissa.cli.app import app
 from vibrissa.io import (
     kind_of,
     load_recording,
@@ -109,6 +111,35 @@ def too_many_scales(file):
     file["truth/force"].attrs.create("DIMENSION_LIST", scales)
 
 
+def reference(file):
+    del file["whiskers/0/section_error"]
+    file["whiskers/0"].create_dataset("section_error", data=file.ref, dtype=h5py.ref_dtype)
+
+
+def compound(file):
+    del file["whiskers/0/length"]
+    file["whiskers/0/length"] = np.zeros(2, [("a", "f8"), ("b", "S3")])
+
+
+def nothing(file):
+    del file["truth/force"]
+    file["truth/force"] = h5py.Empty("f8")
+
+
+def of_other_shape(file):
+    del file["whiskers/0/length"]
+    file["whiskers/0/length"] = np.ones((2, 2))
+    for name in ("x", "y"):
+        file[f"whiskers/0/{name}"] = np.zeros(2)
+        file[f"whiskers/0/{name}"].make_scale(name)
+    for i, name in enumerate(("x", "y")):
+        file["whiskers/0/length"].dims[i].attach_scale(file[f"whiskers/0/{name}"])
+
+
+def no_utf8(file):
+    file.attrs["source"] = "vibrissa recor\udc94ing".encode("utf-8", "surrogateescape")
+
+
 HARMFUL = (
     (external_link, "out of the file"),
     (external_group, "out of the file"),
@@ -123,6 +154,11 @@ HARMFUL = (
     (by_name, "soft link"),
     (opaque, "opaque"),
     (too_many_scales, "scales of others"),
+    (reference, "section_error is neither numbers nor text"),
+    (compound, "length is neither numbers nor text"),
+    (nothing, "force is neither numbers nor text"),
+    (of_other_shape, "not a recording as it is known, or damaged"),
+    (no_utf8, "can't decode byte 0x94"),
 )
 
 
@@ -136,6 +172,35 @@ def test_what_could_do_harm_is_refused(tmp_path, content, spoil, said):
         load_recording(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("verb", "lost"),
+    [
+        ("info", "objects/0/object_radius"),
+        ("export", "objects/0/object_radius"),
+        ("export", "whiskers/0"),
+        ("signals", "whiskers/0"),
+        ("movie", "time"),
+        ("report", "time"),
+        ("figures", "time"),
+    ],
+)
+def test_the_file_is_named_whose_object_or_whisker_is_damaged(
+    tmp_path, monkeypatch, content, verb, lost
+):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "trial.nc"
+    path.write_bytes(content["trial.nc"])
+    with h5py.File(path, "r+") as file:
+        if lost == "time":
+            file[lost][:] = file[lost][:][::-1]
+        else:
+            del file[lost]
+            file[lost] = b"x"
+    result = CliRunner().invoke(app, [verb, str(path)])
+    assert isinstance(result.exception, ValueError)
+    assert str(path) in str(result.exception)
 
 
 def test_a_heap_through_which_there_is_no_end(tmp_path, content):

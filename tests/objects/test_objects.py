@@ -164,6 +164,8 @@ class TestMotion:
 def test_faulty_objects():
     with pytest.raises(ValueError, match=r"radius is 0\.0; it must be positive, in m"):
         Sphere([0, 0, 0], 0.0)
+    with pytest.raises(ValueError, match=r"radius has shape \(2,\); one number"):
+        Sphere([0, 0, 0], [1e-3, 2e-3])
     with pytest.raises(ValueError, match="normal is"):
         Plane([0, 0, 0], [0, 0, 0])
     with pytest.raises(ValueError, match=r"edge_radius is 0\.01; at most half"):

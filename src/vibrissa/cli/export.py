@@ -38,7 +38,8 @@ def export(
     tree = recording_from(recording)
     if "signals" not in tree.children:
         remark("the recording has no signals yet: they are made as `vibrissa signals` makes them")
-        tree = vb.pipeline.with_signals(tree)
+        with vb.io.in_file(recording):
+            tree = vb.pipeline.with_signals(tree)
     table = vb.pipeline.predictors(tree)
     if to == "nwb":
         animal = {"subject_id": subject, "species": species}

@@ -13,7 +13,7 @@ import numpy as np
 import typer
 
 import vibrissa as vb
-from vibrissa.cli.inputs import map_of
+from vibrissa.cli.inputs import map_of, recording_from
 from vibrissa.cli.options import Format, free, refuse, with_options
 from vibrissa.cli.terminal import Tell, progress_bars, say
 
@@ -146,7 +146,7 @@ def array_drawings(path: Path, width: Any) -> dict[str, Draw]:
         return {"array": lambda: vb.plots.array_views(face, width=width)}
     if kind != vb.io.Kind.RECORDING:
         return {}
-    trial = vb.load_recording(path)
+    trial = recording_from(path)
     groups = {name: group for name in _CONTACTS if (group := trial.get(name)) is not None}
     groups["/"] = trial
     contacts = [name for name, group in groups.items() if "contact_point" in group.data_vars]
@@ -206,7 +206,7 @@ def trial_drawings(
     path: Path, width: Any, given: TrialOptions, tell: Tell, colour: str = "time"
 ) -> dict[str, Draw]:
     """Return the figures of a trial; what it lacks is printed, with the verb that makes it."""
-    trial = vb.load_recording(path)
+    trial = recording_from(path)
     given = given.of(trial)
     course = vb.scene.course_of(trial, given.whisker)
     for reason in _lacking(course, trial, path):

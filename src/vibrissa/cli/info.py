@@ -146,7 +146,8 @@ def _file(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
 
 def _recording(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
     """Describe a recording in five lines: contents, assumptions, and what comes next."""
-    found = vb.pipeline.summarise(_summarised(path))
+    with vb.io.naming(path, "a recording"):
+        found = vb.pipeline.summarise(_summarised(path))
     one = len(found.whiskers) == 1
     names = ", ".join(found.whiskers[:_SHOWN]) + (", …" if len(found.whiskers) > _SHOWN else "")
     yield (

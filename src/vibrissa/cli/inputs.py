@@ -287,8 +287,9 @@ def recording_from(path: Path) -> xr.DataTree:
     """Read a recording."""
     refuse_tracks(path)
     recording = vb.load_recording(path)
-    with vb.io.in_file(path):
+    with vb.io.naming(path, "a recording"):
         vb.pipeline.check_recording(recording)
+        _ = vb.recording.Recording(recording).objects
     return recording
 
 

@@ -12,6 +12,7 @@ import typer
 
 import vibrissa as vb
 from vibrissa.cli.figures import NODES, TrialOptions, fits_of, sights_of
+from vibrissa.cli.inputs import recording_from
 from vibrissa.cli.options import RecordingArgument, free, refuse, with_options
 from vibrissa.cli.terminal import Tell, progress_bars, say, stoppable
 
@@ -84,7 +85,7 @@ def make_movies(
     """Make the movies that a trial allows."""
     files = _files(target, path, kinds)
     free(files.values(), force)
-    trial = vb.load_recording(path)
+    trial = recording_from(path)
     of_trial = of_trial.of(trial)
     course = vb.scene.course_of(trial, of_trial.whisker)
     rows = frames.rows(course.time)

@@ -21,7 +21,7 @@ from vibrissa.cli.figures import (
     map_drawings,
     trial_drawings,
 )
-from vibrissa.cli.inputs import MAP, RECORDING, kind_in
+from vibrissa.cli.inputs import MAP, RECORDING, kind_in, recording_from
 from vibrissa.cli.movie import FrameOptions, make_movies
 from vibrissa.cli.options import check_new, refuse, with_options
 from vibrissa.cli.terminal import Tell, progress_bars, say
@@ -78,7 +78,7 @@ def report(
     with progress_bars() as tell:
         if is_trial:
             refuse({"--uniqueness": uniqueness}, f"{path} is a recording")
-            trial = vb.load_recording(path)
+            trial = recording_from(path)
             of_trial = of_trial.of(trial)
             content = _of_trial(path, trial, of_trial, seed or 0, tell)
         else:

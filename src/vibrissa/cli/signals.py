@@ -122,7 +122,8 @@ def signals(
         if keywords["whiskers"] is None:
             unused = {"--whisker": own.whisker, "--proximal": proximal}
             refuse(unused, f"signals of the {keywords['source']} need none")
-        done = vb.pipeline.with_signals(tree, **keywords)
+        with vb.io.in_file(recording):
+            done = vb.pipeline.with_signals(tree, **keywords)
         tell("signals", 1, 1)
     print_notes(*(keywords["whiskers"] or ()))
     remark(described(done))

@@ -147,6 +147,8 @@ def _check_items(file: h5py.File, size: int, soft_links: bool) -> None:
                 raise ValueError(f"{name} has {item.ndim} dimensions, and scales of others")
         if isinstance(item, h5py.Dataset):
             claimed += _checked_size(name, item)
+            if not (soft_links or _is_plain(item)):
+                raise ValueError(f"{name} is neither numbers nor text")
         if claimed > max(ALWAYS_ALLOWED, _DENSEST * size):
             raise ValueError(
                 f"{name} and what comes before it claim to hold {claimed / 1e9:.3g} GB, more than "
@@ -166,6 +168,18 @@ def _checked_size(name: str, data: h5py.Dataset) -> int:
 
 def _bytes(shape: tuple[int, ...] | None, kind: h5t.TypeID) -> int:
     return math.prod(shape or ()) * int(kind.get_size())
+
+
+def _is_plain(data: h5py.Dataset) -> bool:
+    """Whether a variable of NetCDF-4 holds real numbers or text, as all that are known do."""
+    plain = data.dtype.kind in "biufSU" or h5py.check_string_dtype(data.dtype) is not None
+    return plain and data.shape is not None
+
+
+def _as_text(value: str | bytes) -> str:
+    """Decode text strictly: h5py lets bytes through that are not UTF-8 and cannot be printed."""
+    raw = value if isinstance(value, bytes) else value.encode("utf-8", "surrogateescape")
+    return raw.decode("utf-8")
 
 
 def _check_type(name: str, kind: h5t.TypeID) -> None:
@@ -195,7 +209,7 @@ def kind_of(path: str | PathLike[str]) -> str:
     """Read the kind of content that a NetCDF-4 file states."""
     with opened(path, "NetCDF-4") as file:
         kind = file.attrs.get("kind", "")
-    return kind.decode("utf-8", "replace") if isinstance(kind, bytes) else str(kind)
+        return _as_text(kind) if isinstance(kind, str | bytes) else str(kind)
 
 
 def read_dataset(
@@ -207,6 +221,8 @@ def read_dataset(
         xr.open_dataset(path, engine="h5netcdf", group=group) as data,
     ):
         wanted = data if names is None else data[[name for name in names if name in data]]
+        for attrs in (wanted.attrs, *(each.attrs for each in wanted.variables.values())):
+            _attributes(attrs)
         # How this file was encoded is nothing to the next one, and may be damaged.
         return wanted.load().drop_encoding()
 
@@ -235,8 +251,8 @@ def _group(group: h5py.Group, full: bool) -> Group:
 
 def _plain(value: Any) -> Any:
     """Turn an attribute into text or, if it is an array of one, a number."""
-    if isinstance(value, bytes):
-        return value.decode("utf-8", "replace")
+    if isinstance(value, str | bytes):
+        return _as_text(value)
     return value.item() if getattr(value, "size", 0) == 1 else value
 
 
@@ -288,7 +304,7 @@ def _values(data: h5py.Dataset) -> AnyArray:
 
 def _attributes(found: Mapping[str, Any]) -> dict[str, Any]:
     """Attributes with text as such."""
-    return {k: v.decode("utf-8") if isinstance(v, bytes) else v for k, v in found.items()}
+    return {k: _as_text(v) if isinstance(v, str | bytes) else v for k, v in found.items()}
 
 
 def write_netcdf(

@@ -29,6 +29,9 @@ import numpy as np
 
 from vibrissa.deferred import xr
 from vibrissa.io.netcdf import COMPRESSED, kind_of, naming, read_tree, write_netcdf
+from vibrissa.whisker import Whisker
+
+GROUP = "whiskers"
 
 RECORDING_KIND = "vibrissa recording"
 """Value of the attribute ``kind`` of a recording."""
@@ -90,10 +93,12 @@ def load_recording(path: str | PathLike[str]) -> xr.DataTree:
         raise ValueError(f"{path} holds {kind or 'data of another kind'}, not a recording")
     tree = read_tree(path)
     with naming(path, "a recording"):
-        return separate_whiskers(tree)
+        tree = separate_whiskers(tree)
+        for group in tree.children[GROUP].children.values() if GROUP in tree.children else ():
+            Whisker.from_dataset(group.to_dataset(inherit=False))
+    return tree
 
 
-GROUP = "whiskers"
 _WHISKER = "whisker"
 _OWN = "attributes_of_each"
 _SIZE = "size_of_"

@@ -46,6 +46,9 @@ class _Faults:
 
     def positive(self, name: str, value: Any, unit: str, also: str = "") -> float:
         """Return a positive number; ``also`` names what else is allowed."""
+        if np.ndim(value):
+            self._faults.append(f"{name} has shape {np.shape(value)}; one number is needed")
+            return np.nan
         number = float(value)
         allowed = number > 0.0 and (np.isfinite(number) or also == "infinite")
         if not (allowed or (also == "zero" and number == 0.0)):

@@ -1,9 +1,9 @@
 """Forces at the very tip that are normal to an object, not to the whisker: are they found?
 
-`python studies/tip.py [--count N] [--page]`: contacts of the side and of the tip, drawn evenly
-over the contact points of either kind, with noise of force and moment of a share of EI/L² and
-EI/L, once without and once with a prior that makes both equally probable. `--page` writes the table
-to the page on remedies.
+`python studies/tip.py [--count N] [--whisker FILE] [--page]`: contacts of the side and of the tip,
+drawn evenly over the contact points of either kind, with noise of force and moment of a share of
+EI/L² and EI/L, once without and once with a prior that makes both equally probable. `--page` writes
+the table to the page on remedies.
 """
 
 import argparse
@@ -134,14 +134,18 @@ def rows(name, whisker, level, asked):
 def main():
     """Print the table, or write it."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--whisker", help="file of a whisker instead of the three of the page")
     parser.add_argument("--count", type=int, default=200, help="contacts of either kind")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--page", action="store_true")
     asked = parser.parse_args()
-    every = [row for name, rod in RODS.items() for row in rows(name, *rod, asked)]
+    rods = RODS
+    if asked.whisker:
+        rods = {Path(asked.whisker).stem: (vb.load_whisker(asked.whisker), 0.007)}
+    every = [row for name, rod in rods.items() for row in rows(name, *rod, asked)]
     block = table(HEAD, every, texts=2)
     print(block)
-    if asked.page:
+    if asked.page and not asked.whisker:
         put(Path(__file__).parents[1] / "docs" / "remedies.md", {"tip": block})
 
 

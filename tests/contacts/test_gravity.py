@@ -10,11 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.integrate import solve_bvp
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import vibrissa as vb
 from vibrissa.cli.app import app
+from vibrissa.contacts import Gravity, read_at_rest
 from vibrissa.rod import resting
 
 REFERENCE = Path(__file__).parents[1] / "data" / "weighted_contacts.csv"
@@ -355,3 +357,63 @@ def test_gravity_of_a_moving_base_is_as_exact_as_the_noise_is_small(nitinol):
         assert (away < 0.1 * np.sqrt(np.linalg.eigvalsh(found.covariance)[:, -1])).all()
         errors.append(away.max())
     assert errors[1] < 2e-7 * whisker.length
+
+
+def rest_wrench(gravity):
+    """Force and moment of the nitinol rod's weight, by collocation of the whole rod."""
+    length, base, tip, modulus, density = RODS["nitinol"]
+
+    def radius(s):
+        return base + (tip - base) * s / length
+
+    def beyond(s):  # the weight's size beyond s
+        return size * density * np.pi * length * (radius(s) ** 3 - tip**3) / (3.0 * (base - tip))
+
+    size = np.linalg.norm(gravity)
+    toward = np.array(gravity) / size
+
+    def rates(s, y):  # the tangent and the moment of what is beyond
+        stiffness = modulus * np.pi / 4.0 * radius(s) ** 4
+        bend = np.cross(y[3:].T / stiffness[:, None], y[:3].T)
+        return np.concatenate([bend.T, -np.cross(y[:3].T, beyond(s)[:, None] * toward).T])
+
+    s = np.linspace(0.0, length, 41)
+    start = np.concatenate([np.outer([1.0, 0.0, 0.0], np.ones(41)), np.zeros((3, 41))])
+    found = solve_bvp(
+        rates, lambda a, b: np.append(a[:3] - [1.0, 0.0, 0.0], b[3:]), s, start, tol=1e-9
+    )
+    assert found.success
+    return np.append(beyond(0.0) * toward, found.y[3:, 0])
+
+
+def test_a_free_whisker_on_a_moving_base_reads_what_an_independent_integration_reads(nitinol):
+    whisker = nitinol.whisker
+    turn = Rotation.from_euler("yz", [[0.1, 0.0], [0.10013, 0.02007], [0.11, 0.03]]).as_matrix()
+    read = read_at_rest(whisker, Gravity((0.0, 0.0, -G)), turn, len(turn))
+    known = np.array([rest_wrench(one.T @ [0.0, 0.0, -G]) for one in turn])
+    scale = unit(whisker) * np.repeat([1.0, whisker.length], 3)
+    np.testing.assert_allclose(read / scale, (known - known[0]) / scale, atol=3e-8)
+
+
+def test_contacts_of_a_moving_base_are_those_of_an_independent_integration(nitinol):
+    """Tared free in a pose that no grid of directions holds, then touched in another."""
+    rows = [line.split(",") for line in REFERENCE.read_text().splitlines()[1:]]
+    values = np.array([cells for name, *cells in rows if name == "nitinol"], dtype=float)
+    tared = Rotation.from_euler("yz", [0.10013, 0.02007]).as_matrix()
+    for gravity, _, force, moment, point in (np.split(row, [3, 4, 7, 10]) for row in values):
+        down = np.array([0.0, 0.0, -np.linalg.norm(gravity)])
+        touched = Rotation.align_vectors(down[None], gravity[None])[0].as_matrix()
+        rest = rest_wrench(gravity) - rest_wrench(tared.T @ down)
+        wrench = np.concatenate([force, moment]) + rest
+        for level in (1e-3, 1e-6):
+            found = nitinol.estimate(
+                {"force": [np.zeros(3), wrench[:3]], "moment": [np.zeros(3), wrench[3:]]},
+                "wrench",
+                noise=(1e3 * level) ** 2 * covariance(nitinol.whisker),
+                gravity=down,
+                base_rotation=np.array([tared, touched]),
+            )
+            assert found.status[0] not in (vb.Status.UNIQUE, vb.Status.AMBIGUOUS)  # free
+            away = np.linalg.norm(found.point[1] - point)
+            assert away < 0.02 * np.sqrt(np.linalg.eigvalsh(found.covariance[1])[-1])
+        assert away < 1e-7 * nitinol.whisker.length

@@ -97,6 +97,27 @@ def test_regions_hold_the_tip(rod, touched, using):
     assert found.covariance_valid[tip].mean() > 0.9
 
 
+def test_regions_of_a_slender_tip_are_as_wide_as_what_it_can_touch():
+    """The γ whisker's tip is so soft that noise leaves open much of what it holds."""
+    contact_map = vb.ContactMap.simulate(vb.samples.gamma(), grid=False)
+    whisker, rng, n = contact_map.whisker, np.random.default_rng(0), 40
+    unit = whisker.base_bending_stiffness / whisker.length**2
+    slope, bearing = rng.uniform(0.1, 0.5, n), rng.uniform(0.0, 2.0 * np.pi, n)
+    force = [-np.sin(slope), np.cos(slope) * np.cos(bearing), np.cos(slope) * np.sin(bearing)]
+    force = rng.uniform(0.025, 0.04, n) * unit * np.array(force)
+    bent = vb.deflect(whisker, vb.PointForce(whisker.length, components=tuple(force)))
+    sigma = 7e-3 * unit * np.repeat([1.0, whisker.length], 3)
+    drawn = sigma * rng.normal(size=(n, 6))
+    signals = vb.base_signals(bent.force + drawn[:, :3], bent.moment + drawn[:, 3:])
+    for using in SETS[::2]:
+        found = contact_map.estimate(signals, using, np.diag(sigma**2), prior=vb.Prior(tip=0.5))
+        assert (found.status == vb.Status.TIP_CONTACT).mean() > 0.9
+        away = found.point - bent.contact_point
+        size = np.einsum("ni,nij,nj->n", away, np.linalg.inv(found.covariance), away)
+        assert np.mean(size < 7.815) >= 0.9
+        assert np.sort(size)[-3] < 20.0
+
+
 def test_contacts_of_the_side_remain(rod):
     arc = np.linspace(0.4, 0.9, 12) * LENGTH
     bent = vb.deflect(rod.whisker, vb.PointForce(arc, 8e-3, np.linspace(0.0, 6.0, 12)))

@@ -33,7 +33,15 @@ from vibrissa.contacts.channels import (
 from vibrissa.contacts.least_squares import Fits, fit
 from vibrissa.deferred import transform
 from vibrissa.numerics import AnyArray, Array
-from vibrissa.rod import STEPS, Resting, discretize, evaluated, resting, solve_forces
+from vibrissa.rod import (
+    STEPS,
+    Resting,
+    discretize,
+    evaluated,
+    near_direction,
+    resting,
+    solve_forces,
+)
 from vibrissa.signals import within_turn
 from vibrissa.whisker import Whisker
 
@@ -133,21 +141,14 @@ class Gravity:
             Gravity in the nearest of directions a step apart, so that those of a slowly moving
             whisker are not all different; without another tare it is of this pose.
         """
-        x, y, z = _rounded(rotation.T @ self.acceleration, step).tolist()
+        x, y, z = near_direction(rotation.T @ self.acceleration, step).tolist()
         return replace(self, acceleration=(x, y, z), tare=self.tare or (x, y, z))
 
     @property
     def nearly(self) -> tuple[float, float, float]:
         """Acceleration in the nearest of directions some degrees apart."""
-        x, y, z = _rounded(np.array(self.acceleration), _SHAPES).tolist()
+        x, y, z = near_direction(np.array(self.acceleration), _SHAPES).tolist()
         return x, y, z
-
-
-def _rounded(vector: Array, step: float) -> Array:
-    """Vector of the same size in the nearest of directions so far apart, rad."""
-    size = float(np.linalg.norm(vector))
-    toward = np.round(vector / max(size, 1e-300) / step) * step
-    return np.asarray(size * toward / max(float(np.linalg.norm(toward)), 1e-300))
 
 
 def read_at_rest(whisker: Whisker, gravity: Gravity, rotation: Array | None, n: int) -> Array:
@@ -157,7 +158,7 @@ def read_at_rest(whisker: Whisker, gravity: Gravity, rotation: Array | None, n: 
         return np.tile(there.shift * np.repeat([there.d.force, there.d.moment], 3), (n, 1))
     lab, known, out = gravity, {}, np.full((n, 6), np.nan)
     for i in np.flatnonzero(finite(rotation)):
-        now = lab.turned(rotation[i])
+        now = lab.turned(rotation[i], _FINEST)
         lab = replace(lab, tare=now.tare)
         if now not in known:
             known[now] = read_at_rest(whisker, now, None, 1)[0]

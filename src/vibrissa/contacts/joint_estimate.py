@@ -232,8 +232,8 @@ class JointEstimate:
             values=kept.values[..., :6],
             chi_squared=kept.misfits,
         )
-        if self.sensor is not None:
-            row, place = np.nonzero(np.isfinite(kept.misfits))
+        row, place = np.nonzero(np.isfinite(kept.misfits))
+        if self.sensor is not None and row.size:
             parts: list[Any] = [part[row, place] for part in kept[1:]]
             parts.append(np.ones(len(row), np.bool_))
             found = self._ranked(flat[row], targets[row], Fits(*parts), found)

@@ -12,9 +12,12 @@ covariance C_f = (JᵀJ)⁻¹, gives the second moment of the contact point, and
     w = √det C_f · mean of exp(|z|²/2 - χ²/2) |det ∂p/∂f|
 
 over those of the cloud that are possible, z being their distances in standard deviations; so does
-one about the best contact of the side, of its unknowns (s, f_y, f_z). Contact points of either kind
-are equally probable beforehand, and those of the tip have the prior's probability together: w is
-divided by the volume that they fill.
+one about the best contact of the side, of its unknowns (s, f_y, f_z). Noise may leave open much of
+what the tip of a slender whisker can touch, which no cloud about one contact resembles: where
+enough nodes of all stable contacts of the tip count, the sums are over these. Second moments are
+widened where regions of 95 % would hold less. Contact points of either kind are equally probable
+beforehand, and those of the tip have the prior's probability together: w is divided by the volume
+that they fill.
 """
 
 from __future__ import annotations
@@ -50,6 +53,10 @@ _STARTS, _SAME = 6, 1e-3
 _LONGEST, _COUNTING = 1.0, 0.2
 # The cloud is so much wider than a normal distribution, whose tails are often shorter.
 _WIDER = 1.5
+# So many nodes must count to take the place of a cloud.
+_DENSE = 4.0
+# Share that a region of 95 % holds, and the square of its radius in standard deviations.
+_WITHIN, _REGION = 0.95, 7.815
 # Unknowns of contacts of the side and of the tip, among (s, f_x, f_y, f_z).
 _SIDE, _TIP = [0, 2, 3], [1, 2, 3]
 _SOLVED = (int(Status.UNIQUE), int(Status.AMBIGUOUS))
@@ -59,11 +66,13 @@ _UNSOLVED = (int(Status.NOT_FRICTIONLESS), int(Status.OUTSIDE_MAP))
 class _Nodes(NamedTuple):
     """Stable contacts of the tip: x (n, 4), (F, p) (n, 6), and the largest forces by direction.
 
-    The share of all contact points that the tip's have in volume is ``volume``, over the side's.
+    Each stands for contact points of the volume ``cells`` (n,); the share of all contact points
+    that the tip's have in volume is ``volume``, over the side's.
     """
 
     x: Array
     values: Array
+    cells: Array
     largest: Any
     volume: float
 
@@ -113,7 +122,8 @@ def _nodes(contact_map: ChartedWhisker) -> _Nodes:
     stable = np.logical_and.accumulate(_stable(values, tangents), axis=2)
     by_force = np.abs(np.linalg.det(np.nan_to_num(tangents[..., 3:6, 1:4])))
     by_force *= size**2 * np.cos(beta)[:, None] * 2.0 * share * _FARTHEST * fold[:, None, None]
-    volume = (by_force * stable).sum() * 2.0 * np.pi * _AWAY[1] / (_AROUND * _LOADS)
+    by_force[:, 0] *= 0.5  # half of the cell pulls at the tip
+    cells = by_force[stable] * 2.0 * np.pi * _AWAY[1] / (_AROUND * _LOADS)
     by_chart = np.linalg.det(chart.tangents[..., 3:, :] @ chart.frames)[:, :-1]
     # The first node that slides off: noise may carry signals a little beyond those of the largest.
     largest = size.max(axis=2) * ((stable.sum(axis=2) + 1.0) / _LOADS) ** 2
@@ -121,7 +131,7 @@ def _nodes(contact_map: ChartedWhisker) -> _Nodes:
         (np.append(bearing, 2.0 * np.pi), beta), np.concatenate([largest, largest[:1]])
     )
     side = float(np.nan_to_num(np.abs(by_chart)).mean() * 2.0 * np.pi)
-    return _Nodes(x[stable], values[stable], largest, float(volume) / side)
+    return _Nodes(x[stable], values[stable], cells, largest, float(cells.sum()) / side)
 
 
 class TipContacts:
@@ -155,9 +165,9 @@ class TipContacts:
         self._fit = JointFit(forward, readout.channels, readout.sensor, least, friction=True)
         self._which = [CHANNELS.index(name) for name in names]
         self._turned = np.array([CIRCULAR[i] for i in self._which])
-        known = channels_of(self._nodes.values)[:, self._which]
-        self._span = np.where(self._turned, 1.0, known.std(axis=0))
-        self._tree = spatial.cKDTree(self._embedded(known))
+        self._known = channels_of(self._nodes.values)[:, self._which]
+        self._span = np.where(self._turned, 1.0, self._known.std(axis=0))
+        self._tree = spatial.cKDTree(self._embedded(self._known))
         self._limit = explained(len(names) - 3)
 
     def _embedded(self, channels: Array) -> Array:
@@ -247,8 +257,30 @@ class TipContacts:
             out.x[row, place], out.values[row, place] = weighed.x, weighed.values
             out.chi_squared[row, place] = weighed.misfit
             out.covariances[row, place], out.valid[row, place] = weighed.covariance, weighed.valid
+            self._over_nodes(flat, targets, out, log)
         there = np.isfinite(log)
         return out._replace(number=there.sum(axis=1)), log
+
+    def _over_nodes(self, flat: Array, targets: Array, found: Candidates, log: Array) -> None:
+        """Replace clouds by the nodes where these are dense, about the contact of least χ²."""
+        best = np.where(np.isfinite(log), found.chi_squared, np.inf).argmin(axis=1)
+        line = np.arange(len(best))
+        rows = np.flatnonzero(np.isfinite(log[line, best]))
+        values = found.values[rows, best[rows]]
+        fitting, points = self._fit, self._nodes.values[:, 3:6]
+        own = fitting.channels.covariance(fitting.sensor, flat[rows], values, fitting.d)
+        for i, weights, point in zip(rows, whitening(own), values[:, 3:6], strict=True):
+            away = within_turn(self._known - targets[i], self._turned) @ weights.T
+            misfit = (away**2).sum(axis=1)
+            share = self._nodes.cells * np.exp(-0.5 * (misfit - misfit.min()))
+            total = share.sum()
+            if total**2 < _DENSE * (share**2).sum():
+                continue
+            moved, k = points - point, best[i]
+            log[i] = -np.inf
+            log[i, k] = np.log(total) - 0.5 * misfit.min() - 1.5 * np.log(2.0 * np.pi)
+            found.covariances[i, k] = _covariance(share, moved)
+            found.valid[i, k] = True
 
     def _side(self, x: Array) -> Fits:
         """Contacts of the side, with derivatives."""
@@ -288,7 +320,7 @@ class TipContacts:
             line, best = np.arange(n), np.where(possible[:, 0], 0, misfit.argmin(axis=1))
             values = values.reshape(n, m, -1)
             moved = np.nan_to_num(values[:, 1:, 3:6] - values[line, best, None, 3:6])
-            second = np.einsum("nk,nki,nkj->nij", share, moved, moved) / total[:, None, None]
+            second = _covariance(share, moved)
             counting = total**2 / (share**2).sum(axis=1) / (m - 1)
         best_values = values[line, best, :6]
         return _Weighed(
@@ -306,6 +338,23 @@ class TipContacts:
             beta = np.arcsin(np.clip(-x[:, 1] / size, 0.0, np.sin(_AWAY[-1])))
         largest = self._nodes.largest(np.stack([psi, np.nan_to_num(beta)], axis=-1))
         return np.asarray((x[:, 1] <= 0.0) & (size <= largest))
+
+
+def _covariance(share: Array, moved: Array) -> Array:
+    """Second moment (..., 3, 3) of differences (..., m, 3) with weights (..., m).
+
+    It is widened so that its region of 95 % holds that share of them.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = share / share.sum(axis=-1, keepdims=True)
+        second = np.swapaxes(share[..., None] * moved, -1, -2) @ moved
+        inverse = np.linalg.pinv(np.nan_to_num(second), hermitian=True)
+        size = ((moved @ inverse) * moved).sum(axis=-1)
+        order = np.argsort(size, axis=-1)
+        held = np.cumsum(np.take_along_axis(share, order, axis=-1), axis=-1)
+        last = (held < _WITHIN).sum(axis=-1, keepdims=True).clip(max=size.shape[-1] - 1)
+        wide = np.take_along_axis(np.take_along_axis(size, order, axis=-1), last, axis=-1)
+    return np.asarray(second * np.maximum(wide / _REGION, 1.0)[..., None])
 
 
 @lru_cache(maxsize=16)

@@ -28,7 +28,13 @@ from vibrissa.rod.chart import (
 )
 from vibrissa.rod.deflection import Deflection, Load, PegContact, PointContact, PointForce
 from vibrissa.rod.discretization import STEPS, Discretization, Rod as Rod, discretize
-from vibrissa.rod.gravity import Resting, Weighted, evaluated as evaluated, resting
+from vibrissa.rod.gravity import (
+    Resting,
+    Weighted,
+    evaluated as evaluated,
+    near_direction as near_direction,
+    resting,
+)
 from vibrissa.rod.integration import contact_tangents, evaluate, integrate, solve_forces
 from vibrissa.rod.kernels import (
     BUFFER_SIZE,

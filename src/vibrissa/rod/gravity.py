@@ -3,7 +3,8 @@
 A gravitational acceleration g in the base frame gives the rod a weight (:mod:`vibrissa.rod.weight`)
 and the whisker a resting shape that sags. That shape is followed from the weightless one while the
 weight grows; if it loses its stability on the way, as an upright whisker does that is too slender
-to stand, the whisker cannot be held so.
+to stand, the whisker cannot be held so. Where the base turns, the shape under gravity of about the
+same direction is followed instead, which is solved once.
 """
 
 from __future__ import annotations
@@ -38,6 +39,8 @@ _MOST = 1e4
 _STEPS, _HALVINGS = 8, 6
 # By so much (rad) gravity is turned to see whether a whisker stands.
 _NUDGE = 1e-5
+# How far apart directions are that resting shapes are followed to others from, rad.
+_NEAR = 0.05
 # No contact: (s, f).
 _REST = np.array([[1.0, 0.0, 0.0, 0.0]])
 # Nodes of the sagged curvature.
@@ -268,32 +271,71 @@ def resting(whisker: Whisker, gravity: ArrayLike) -> Resting:
     return rest
 
 
+def near_direction(vector: Array, step: float) -> Array:
+    """Vector of the same size in the nearest of directions a step apart.
+
+    Parameters
+    ----------
+    vector : (3,) array
+        Vector, of any unit.
+    step : float
+        Angle between neighbouring directions, rad.
+
+    Returns
+    -------
+    (3,) array
+        Vector of that direction.
+    """
+    size = float(np.linalg.norm(vector))
+    toward = np.round(vector / max(size, 1e-300) / step) * step
+    return np.asarray(size * toward / max(float(np.linalg.norm(toward)), 1e-300))
+
+
 @discretized.register(Resting)
 def _with_weight(whisker: Resting, steps: int) -> Discretization:
-    bare = discretize(whisker.whisker, steps)
-    density = whisker.whisker.density
+    gravity = np.array(whisker.gravity)
+    if not gravity.any():
+        return discretize(whisker.whisker, steps)
+    x, y, z = near_direction(gravity, _NEAR).tolist()
+    near = _near(Resting(whisker.whisker, (x, y, z)), steps)
+    if near is not None:
+        loaded = _loaded(whisker, steps, 1.0, near)
+        solved = evaluated(loaded, _REST, leans=near[None], tangents=True)
+        if _stands(loaded, solved):
+            return _loaded(whisker, steps, 1.0, solved.leans[0])
+    return _loaded(whisker, steps, 1.0, _grown(whisker, steps))
+
+
+@lru_cache(maxsize=64)
+def _near(whisker: Resting, steps: int) -> Array | None:
+    """Direction of weight at the tip under gravity of about some direction, if there is a rest."""
+    try:
+        return _grown(whisker, steps)
+    except ValueError:
+        return None
+
+
+def _loaded(whisker: Resting, steps: int, share: float, lean: Array) -> Discretization:
+    """Rod with a share of its weight."""
+    bare, density = discretize(whisker.whisker, steps), whisker.whisker.density
     gravity = np.array(whisker.gravity)
     size = float(np.linalg.norm(gravity))
     assert density is not None
-    if size == 0.0:
-        return bare
     area = np.pi * (bare.radius * bare.length) ** 2
-    beyond = weight_beyond(bare.rod, density * area * size * bare.length / bare.force)
-    toward = gravity / size
-    lean = _grown(bare, whisker, beyond, toward)
-    return replace(bare, rod=bare.rod._replace(weight=Weight(beyond, toward, lean)))
+    beyond = weight_beyond(bare.rod, share * density * area * size * bare.length / bare.force)
+    return replace(bare, rod=bare.rod._replace(weight=Weight(beyond, gravity / size, lean)))
 
 
-def _grown(bare: Discretization, whisker: Resting, beyond: Array, toward: Array) -> Array:
+def _grown(whisker: Resting, steps: int) -> Array:
     """Direction of weight at the tip of the resting whisker, followed while the weight grows."""
-    lean = np.asarray(whisker.whisker.frame(whisker.length)).T @ toward
+    lean = np.asarray(whisker.whisker.frame(whisker.length)).T @ whisker.gravity
+    lean /= np.linalg.norm(lean)
     done, stride = 0.0, 1.0 / _STEPS
     while done < 1.0:
         share = min(1.0, done + stride)
-        weight = Weight(share * beyond, toward, lean)
-        rod = bare.rod._replace(weight=weight)
-        solved = evaluated(replace(bare, rod=rod), _REST, leans=lean[None], tangents=True)
-        if _stands(replace(bare, rod=rod), solved):
+        loaded = _loaded(whisker, steps, share, lean)
+        solved = evaluated(loaded, _REST, leans=lean[None], tangents=True)
+        if _stands(loaded, solved):
             done, lean = share, solved.leans[0]
         elif stride > 0.5**_HALVINGS / _STEPS:
             stride *= 0.5

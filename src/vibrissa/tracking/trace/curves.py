@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.io import Frame
-from vibrissa.numerics import inlined, kernel
+from vibrissa.numerics import Mask, inlined, kernel
 from vibrissa.tracking.trace.ridge import noise_level, traced
 from vibrissa.tracking.trace.scene import Bodies, Image, Scene
 from vibrissa.tracking.trace.trace import (
@@ -369,12 +369,15 @@ def joined(found: Sequence[Segment], bodies: Bodies, faces: Sequence[int] = ()) 
     leaving = (unit * toward[:, None]).sum(axis=2)
     arriving = -(unit * toward[None]).sum(axis=2)
     near = (far < _GAP) & (leaving > np.cos(_BENT)) & (arriving > np.cos(_BENT))
+    i, j = np.nonzero(np.triu(near))
+    several = i // 2 != j // 2
+    i, j = i[several], j[several]
+    hidden = _hidden(at[i], at[j], bodies, faces)
     joins = []
-    for i, j in np.argwhere(near):
-        if i < j and i // 2 != j // 2 and _hidden(at[i], at[j], bodies, faces):
-            cost = _cost(_ending(found, i), _ending(found, j), float(far[i, j]))
-            if cost < _COST:
-                joins.append((cost, int(i), int(j)))
+    for a, b in zip(i[hidden], j[hidden], strict=True):
+        cost = _cost(_ending(found, a), _ending(found, b), float(far[a, b]))
+        if cost < _COST:
+            joins.append((cost, int(a), int(b)))
     return _chained(found, sorted(joins))
 
 
@@ -394,13 +397,16 @@ def _ending(found: Sequence[Segment], end: int) -> Segment:
     return one if end % 2 else one.reversed
 
 
-def _hidden(start: Array, end: Array, bodies: Bodies, faces: Sequence[int]) -> bool:
-    """Whether little of the chord between two ends is open ground."""
-    far = float(np.hypot(*(end - start)))
-    if far <= _OPEN:
-        return True
-    chord = start + np.linspace(0.0, 1.0, int(far) + 1)[:, None] * (end - start)
-    return float(np.isin(bodies.at(chord), [0, *faces]).sum()) <= _OPEN
+def _hidden(starts: Array, ends: Array, bodies: Bodies, faces: Sequence[int]) -> Mask:
+    """Between which of two ends, each (n, 2), little of the chord is open ground."""
+    chord = ends - starts
+    far = np.hypot(*chord.T)
+    steps = far.astype(np.int64)
+    pair = np.repeat(np.arange(len(far)), steps + 1)
+    step = np.arange(len(pair)) - np.searchsorted(pair, pair)
+    points = starts[pair] + (step / np.maximum(steps, 1)[pair])[:, None] * chord[pair]
+    shown = np.isin(bodies.at(points), [0, *faces])
+    return np.asarray((far <= _OPEN) | (np.bincount(pair, shown, len(far)) <= _OPEN))
 
 
 def _cost(one: Segment, other: Segment, far: float) -> float:

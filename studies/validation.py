@@ -93,8 +93,7 @@ def main() -> None:
     page = ROOT / "docs" / "validation.md" if chosen.page else None
     if page is not None:
         write([page, page.with_name("validation-tables.md")], found)
-    # Without films a panel of the figure is empty.
-    images = folder if page is None or chosen.no_video else page.parent / "images"
+    images = folder if page is None else page.parent / "images"
     save(draw(found), images / "validation.png")
 
 

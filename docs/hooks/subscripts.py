@@ -6,7 +6,7 @@ from typing import Any
 _KEPT = re.compile(
     r"(<(code|pre|math|script|style|svg)\b.*?</\2>|<[^>]*>)", re.DOTALL | re.IGNORECASE
 )
-_SYMBOL = re.compile(r"(?<![A-Za-z0-9_])([A-Za-zα-ωΑ-Ω]|EI)_([A-Za-z0-9]{1,8})(?![A-Za-z0-9_])")
+_SYMBOL = re.compile(r"(?<![A-Za-z0-9_])([A-Za-zα-ωΑ-Ωµ]|EI)_([A-Za-z0-9]{1,8})(?![A-Za-z0-9_])")
 
 
 def on_page_content(content: str, **_: Any) -> str:

@@ -63,7 +63,6 @@ def draw(results: Mapping[str, Any]) -> Figure:
         panels[0, 0].set_ylabel("3D error, median (mm)")
         lines = [Line2D([], [], color=COLOURS[method], label=SYMBOLS[method]) for method in METHODS]
         predicted = Line2D([], [], color=INK, linestyle=":", label="predicted")
-        panels[0, 0].legend(handles=[*lines, predicted], loc="upper right")
         by_friction(panels[1, 0], results)
         head(panels[1, 0], "d", f"by friction, {RUBBED}")
         flags(panels[1, 1], results, labels)
@@ -71,8 +70,11 @@ def draw(results: Mapping[str, Any]) -> Figure:
         if any("cutoffs" in one for one in results.values()):
             cutoffs(panels[1, 2], results)
             head(panels[1, 2], "f", "low-pass filter of the pose")
+            place, where = panels[0, 0], "upper right"
         else:
             panels[1, 2].set_axis_off()
+            place, where = panels[1, 2], "center"
+        place.legend(handles=[*lines, predicted], loc=where)
         conclude(figure, finding(results))
         return figure
 

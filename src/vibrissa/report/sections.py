@@ -23,7 +23,7 @@ from vibrissa.quantities import QUANTITIES, quantity, shown_unit, to_display
 from vibrissa.recording import Recording
 from vibrissa.report.page import Section, Tile, paragraph, shown_value, table, tiles, with_sigma
 from vibrissa.signals import CIRCULAR, SIGNALS, base_signals, within_turn
-from vibrissa.status import describe
+from vibrissa.status import Status, describe
 from vibrissa.whisker import Whisker
 
 STAGES = {"signals": "signals", "estimates": "estimate", "contour": "reconstruct"}
@@ -343,14 +343,15 @@ def _detected(estimates: xr.Dataset, truth: xr.Dataset) -> str:
     """Numbers of detected contacts and of their candidates."""
     detected = estimates["in_contact"].values.astype(bool)
     touching = truth["in_contact"].values.astype(bool)
-    number = estimates["candidates"].values[detected]
+    status = estimates["status"].values[detected]
+    without = estimates["candidates"].values[detected] == 0
     rows = [
         ("frames in contact", str(int(touching.sum()))),
         ("contacts detected", str(int(detected.sum()))),
         ("false detections", str(int((detected & ~touching).sum()))),
-        ("without a candidate", str(int((number == 0).sum()))),
-        ("with exactly one candidate", str(int((number == 1).sum()))),
-        ("with several candidates", str(int((number > 1).sum()))),
+        ("without an answer", str(int(without.sum()))),
+        ("unique", str(int((status == Status.UNIQUE).sum()))),
+        ("ambiguous", str(int((status == Status.AMBIGUOUS).sum()))),
     ]
     return table(rows, caption="Contacts")
 

@@ -71,6 +71,8 @@ def test_done_shown_and_not_done_again(study, tmp_path):
     assert "0 cells done, 0 of them failed; 4 were there before and skipped" in said
     said = done("sweep", "show", store, "-o", tmp_path / "figures")
     assert "uniqueness: 1 done" in said
+    assert "unique (no counterexample found)" in said
+    assert "contacts with a twin" in said
     assert "Fx MB MD" in said
     figure = tmp_path / "figures" / "s-uniqueness.png"
     assert figure.stat().st_size > 10_000

@@ -1,4 +1,4 @@
-"""Whiskers that lie along an object: what one contact makes of them, and what all contacts do.
+"""Whiskers that lie along an object: errors if one contact is assumed, and if all are modelled.
 
 `python studies/around.py [--count N] [--page]`: whiskers are pressed against an object whose
 position is known to 1 mm along each axis, so far that they touch it more than once; force and

@@ -1,4 +1,4 @@
-"""How far from rest contacts of the γ whisker have twins, whatever a search begins with.
+"""How far from rest contacts of a whisker have twins, by an optimisation from random pairs.
 
 `python studies/farthest_twins.py` takes pairs of contacts with the same signals from searches with
 two seeds, and maximises the smaller of their cone angles with equal signals and the least distance

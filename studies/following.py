@@ -1,4 +1,4 @@
-"""Is a contact followed over time better known than one located sample by sample?
+"""Errors of contacts followed over time, compared with those located sample by sample.
 
     python studies/following.py [SEEDS]
 

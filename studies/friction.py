@@ -1,4 +1,4 @@
-"""What friction along the whisker does to estimates, and what its prior makes of it.
+"""Errors of estimates under friction along the whisker, without and with a prior for it.
 
 `python studies/friction.py [--whisker FILE] [--count N]` prints the table of the page on choosing
 signals: contacts deflected by more than 5°, whose force has a component along the whisker of up to

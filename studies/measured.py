@@ -1,4 +1,4 @@
-"""What is measured: everything that the page of that name reports, in one command.
+"""Accuracy and speed: everything that the page *What is measured* reports, in one command.
 
 `python studies/measured.py [PART ...]`, with the parts rod, contacts, job, speed and real; all by
 default, within ten minutes on two cores. `--page` writes the numbers into `docs/measured.md`, else

@@ -1,4 +1,4 @@
-"""What is true that a contact's model leaves out, what it costs, and what each remedy makes of it.
+"""Effects that the model of one contact leaves out: the errors they cause, without and with remedy.
 
 `python studies/remedies.py [--count N] [--whisker FILE] [--page]` prints two tables: median errors
 of three signals, six, and force and moment whole, ignoring what is true and with its remedy; and

@@ -1,4 +1,4 @@
-"""Pinhole lenses that nobody calibrated: contact points and what their covariances hold.
+"""Pinhole cameras without calibration: errors of contact points and the coverage of their regions.
 
 ``python studies/rough_cameras.py SEED...`` films a whisk of a whisker of 30–36 mm past a peg
 through lenses at 0.6 m, 150 µm a pixel, by `pinhole_film`, and tracks it with cameras that are

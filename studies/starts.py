@@ -1,4 +1,4 @@
-"""Where tracking begins without a click, in films with all that resembles a whisker.
+"""Where tracking begins without a click, in films with other whisker-like lines.
 
 `python studies/starts.py`: films of `tests/tracking/furry.py`, 24 frames spread over 0.4 s each;
 some minutes on a free core. Their seeds set no number of the method, but for those without a

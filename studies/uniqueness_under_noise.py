@@ -1,4 +1,4 @@
-"""Whether answers called unique under noise are true, and regions hold what they state.
+"""How often answers called unique under noise are wrong, and the coverage of their regions.
 
 `python studies/uniqueness_under_noise.py [WHISKER …]` prints a table for the γ whisker and for each
 file of a whisker, with a row for each of the 20 triplets, sets of four and six signals, and the

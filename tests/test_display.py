@@ -98,7 +98,7 @@ def test_a_recording_shows_what_it_holds():
     motion = sweep_past(WHISKER, peg, duration=0.2, rate=100.0)
     seen = vb.show(measure(simulate(WHISKER, motion, peg)))
     assert "20 frames, 0.19 s, 100 a second" in repr(seen)
-    assert "Peg: origin (" in repr(seen)
+    assert "peg: origin (" in repr(seen)
     assert "quasi-static" in seen._repr_html_()
     assert len(paths(seen._repr_html_(), BENT)[0]) > 1
 

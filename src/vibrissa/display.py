@@ -90,9 +90,7 @@ def _facts(recording: xr.DataTree) -> list[tuple[str, str]]:
     if "in_contact" in root:
         share = 100.0 * float(root["in_contact"].mean())
         facts.append(("in contact", f"{share:.3g} % of the frames"))
-    for thing in Recording(recording).objects:
-        kind, _, properties = repr(thing).removesuffix(")").partition("(")
-        facts.append(("object", f"{kind}: {properties.replace('=', ' ')}"))
+    facts += [("object", thing.in_words()) for thing in Recording(recording).objects]
     if "cameras" in recording.children:
         facts.append(("cameras", str(recording["cameras"].to_dataset().sizes.get("view", 0))))
     return [*facts, ("groups", ", ".join(sorted(recording.children)))]

@@ -179,3 +179,4 @@ def test_faulty_objects():
 def test_what_rounds_to_zero_has_no_sign():
     peg = Peg([25e-3, -1e-9, 0.0], [-1e-9, 0.0, 1.0], 1e-3)
     assert repr(peg).startswith("Peg(origin=(25.000, 0.000, 0.000) mm, axis=(0.000, 0.000, 1.000)")
+    assert peg.in_words().startswith("peg: origin (25.000, 0.000, 0.000) mm, axis (0.000, 0.000, 1")

@@ -50,6 +50,17 @@ class Surface(ABC):
         """
         return self._geometry(np.asarray(point, dtype=np.float64))
 
+    def in_words(self) -> str:
+        """Kind and properties, in mm, as reports show them.
+
+        Returns
+        -------
+        str
+            Such as "peg: origin (25.000, 0.000, 0.000) mm, …".
+        """
+        kind, _, properties = repr(self).removesuffix(")").partition("(")
+        return f"{kind.lower()}: {properties.replace('=', ' ')}"
+
     @abstractmethod
     def _distance(self, points: Array) -> Array:
         """See `signed_distance`."""

@@ -195,7 +195,7 @@ def summarise(recording: xr.DataTree) -> TrialSummary:
         estimated=estimated,
         stages=tuple(stage for stage in STAGES if stage in recording.children),
         fitted=fitted,
-        known="; ".join(repr(known) for known in record.objects),
+        known="; ".join(known.in_words() for known in record.objects),
         distance=distance,
     )
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vibrissa.contacts import ContactMap
 from vibrissa.io import Kind, join_views, load_tracks, load_whiskers
 
 REAL = Path(__file__).parents[3] / "shared" / "formats" / "test.measurements"
@@ -162,3 +163,9 @@ def test_a_real_file():
     ratio = (tracks["trace_length"].values / chord)[np.isfinite(chord)]
     assert ratio.min() > 0.99
     assert np.median(ratio) < 1.1
+
+
+def test_no_map_is_a_file_of_whisk_and_it_is_said_what_takes_it(tmp_path):
+    measurements_file(tmp_path / "b.measurements")
+    with pytest.raises(ValueError, match=r"b.measurements holds measurements .*vibrissa import"):
+        ContactMap.load(tmp_path / "b.measurements")

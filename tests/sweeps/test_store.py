@@ -161,6 +161,19 @@ def test_records_that_are_damaged_are_noticed_and_done_again(study, path, whole,
     xr.testing.assert_identical(open_sweep(path), whole)
 
 
+@pytest.mark.parametrize("damage", [cut, overwrite, Path.unlink])
+def test_results_that_are_damaged_are_noticed_and_written_anew(study, path, whole, damage):
+    run_sweep(study, path, workers=0)
+    assert run_sweep(study, path, workers=0).faults == ()
+    chunk = next((path / "results" / "map_slip_force").glob("[0-9]*"))
+    content = chunk.read_bytes()
+    damage(chunk)
+    outcome = run_sweep(study, path, workers=0)
+    assert outcome.done == 0
+    assert "results was damaged or of an earlier run" in outcome.faults[0]
+    assert chunk.read_bytes() == content
+
+
 def test_any_byte_of_a_record_that_changes_is_noticed(path, whole):
     records = path / "map.cells"
     content = records.read_bytes()

@@ -35,6 +35,7 @@ from vibrissa.io import (
     read_dataset,
     read_groups,
     recognise,
+    refuse_whisk,
     write_netcdf,
 )
 from vibrissa.numerics import AnyArray, Array
@@ -526,6 +527,7 @@ def _save(contact_map: ContactMap, path: Path) -> None:
 
 def _load(path: Path, grid: bool) -> ContactMap:
     """Read a map; raise a ValueError if the file is not one."""
+    refuse_whisk(path)
     what = recognise(path)
     if what not in (Kind.NETCDF, Kind.UNKNOWN):
         raise ValueError(

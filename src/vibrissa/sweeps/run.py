@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 
 from vibrissa.sweeps.results import open_sweep
-from vibrissa.sweeps.store import DAMAGED, DONE, FAILED, RESULTS, Store, origin
+from vibrissa.sweeps.store import DAMAGED, DONE, FAILED, Store, origin
 from vibrissa.sweeps.study import Cell, Study, answer
 
 Answers = Generator[tuple[Cell, dict[str, Any]], None, None]
@@ -335,8 +335,7 @@ def run_sweep(
                 failed += not store.write(cell, found)
                 done += 1
                 report(skipped + done, study.size)
-        if done or not (store.path / RESULTS).exists():
-            store.publish(open_sweep(path))
+        store.publish(open_sweep(path), changed=done > 0)
     return Outcome(
         done, failed, skipped, before, int((status == DAMAGED).sum()), tuple(store.faults)
     )

@@ -357,8 +357,14 @@ class Store:
         _append(_cells(self.path, cell.task), record.tobytes())
         return ""
 
-    def publish(self, results: xr.Dataset) -> None:
-        """Write all results as Zarr."""
+    def publish(self, results: xr.Dataset, changed: bool) -> None:
+        """Write all results as Zarr, unless they have not changed and are there whole."""
+        if not changed and (there := self.path / RESULTS).exists():
+            # What libraries raise for damaged files is not documented.
+            with contextlib.suppress(Exception):
+                if xr.open_zarr(there, zarr_format=2).load().equals(results):
+                    return
+            self.faults.append(f"{there} was damaged or of an earlier run, and is written anew")
         aside = self.path / f".new-{RESULTS}"
         with _naming(aside):
             shutil.rmtree(aside, ignore_errors=True)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rows import RowFilm, scored
 
-from vibrissa.tracking import Trace, trace_video
+from vibrissa.tracking import trace_video
 from vibrissa.tracking.trace.clutter import between_whiskers
 from vibrissa.tracking.trace.ridge import measured, noise_level
 from vibrissa.tracking.trace.trace import TraceOptions
@@ -26,15 +26,6 @@ def test_crossing_whiskers_stay_themselves(crossing, view, inside):
     score = scored(traces, truth)
     assert np.isfinite(score).mean() > 0.6
     assert (score[np.isfinite(score)] == 1.0).mean() > 0.97
-
-
-def test_one_of_crossing_whiskers_stays_itself_where_it_alone_is_clicked():
-    """The others, which nobody clicked, are followed too, and left out."""
-    several = RowFilm(32, 3, frames=8)
-    (row,) = trace_video(several.images[0], several.truth[0][0, :1, 0])
-    others = [[Trace.lost()] * len(row)] * 2
-    score = scored([row, *others], several.truth[0])[:, 0]
-    assert (score[np.isfinite(score)] == 1.0).all()
 
 
 def test_straight_whiskers_that_cross_in_one_place_keep_their_ends():

@@ -329,7 +329,6 @@ class Curve(NamedTuple):
     from_face: bool
     score: float
     moved: float
-    body: int = 0  # number of the one at which it begins; 0: none
 
 
 def find_curves(
@@ -493,7 +492,7 @@ def _begun(chain: Segment, bodies: Bodies, length: float, moved: float) -> Curve
     smooth = 1.0 / (1.0 + (wavers / _RAGGED) ** 2)
     if body:
         line = np.concatenate([base[None], line])
-    return Curve(line, length, from_face, length * ratio**_TAPER * worth * smooth, moved, body)
+    return Curve(line, length, from_face, length * ratio**_TAPER * worth * smooth, moved)
 
 
 def _even_steps(line: Array) -> Array:

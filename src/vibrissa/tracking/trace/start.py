@@ -79,14 +79,6 @@ _SHOWN, _ALIKE = 4, 0.5
 _FAINTEST = 0.05
 """Confidence from which another candidate is shown."""
 
-_OTHER, _OFTEN = 0.3, 0.3
-"""Score of another whisker, as a share of that of the one that is followed, and share of the frames
-that show it."""
-
-_BESIDE, _CROSSING, _STRAYS = 100.0, 15.0, 15.0
-"""Largest distances, in pixels, of the base of another whisker, of two that may cross, and by which
-a base is seen elsewhere, relative to another one."""
-
 _POLARITY = 3
 """Number of frames in which bright and dark whiskers are compared."""
 
@@ -477,46 +469,6 @@ def _others(vote: _Vote, best: _Combination, confidence: float) -> tuple[Candida
             shown.append(Candidate(list(one.bases), lines, confidence * worth))
             found.append(one)
     return tuple(shown)
-
-
-def neighbours(
-    scene: Scene, frames: Sequence[Frame], base: ArrayLike, options: TraceOptions
-) -> list[Array]:
-    """Bases, in the first frame, of other whiskers that cross the one which has its base there.
-
-    Where they do, only who follows them too can distinguish them from it.
-    """
-    own, others = list[Array](), list[list[Array]]()
-    for i in np.unique(np.linspace(0, len(frames) - 1, _VOTES).astype(int)):
-        curves = find_curves(frames[i], scene, options)
-        away = [float(np.hypot(*(curve.line[0] - base))) for curve in curves]
-        if not curves or min(away) > _SAME:
-            continue
-        it = curves[int(np.argmin(away))]
-        least = max(_OTHER * it.score, _LONG)
-        own.append(it.line)
-        others.append(
-            [
-                curve.line
-                for curve, far in zip(curves, away, strict=True)
-                if curve.score * min(1.0, curve.moved / _MOVED) > least
-                and curve.body == it.body
-                and far < _BESIDE
-                and overlap(curve.line, it.line) < _ALIKE
-            ]
-        )
-    others_at = [
-        [line[0] - it[0] for line in row if overlap(np.concatenate(own), line, _CROSSING) > 0.0]
-        for it, row in zip(own, others, strict=True)
-    ]
-
-    def often(at: Array) -> bool:
-        shown = [any(np.hypot(*(one - at)) < _STRAYS for one in row) for row in others_at]
-        return bool(np.mean(shown) >= _OFTEN)
-
-    # Bases stray, but those of one frame are of different whiskers.
-    each = [[at for at in row if often(at)] for row in others_at]
-    return [own[0][0] + at for at in max(each, key=len, default=[])]
 
 
 def base_gap(cameras: Sequence[Camera], pixels: Array) -> Array:

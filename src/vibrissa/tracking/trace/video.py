@@ -23,14 +23,14 @@ from vibrissa.io import (
     video_info,
     without_part,
 )
-from vibrissa.numerics import Array, Mask
+from vibrissa.numerics import Mask
 from vibrissa.tracking.trace.clutter import between_whiskers
 from vibrissa.tracking.trace.curves import find_whiskers
 from vibrissa.tracking.trace.follower import Follower, features_of, start_at
 from vibrissa.tracking.trace.identity import Seen, decided
 from vibrissa.tracking.trace.row import follow_row
 from vibrissa.tracking.trace.scene import Scene
-from vibrissa.tracking.trace.start import FRAMES, is_bright, negative, neighbours
+from vibrissa.tracking.trace.start import FRAMES, is_bright, negative
 from vibrissa.tracking.trace.trace import Trace, TraceOptions, given, overlap
 
 Corrections = Mapping[tuple[int, int], ArrayLike]
@@ -41,9 +41,6 @@ _BACK = 64
 
 _AGREES = 0.9
 """Share of a line along another one from which both are the same."""
-
-_ALIKE = 0.5
-"""Share of a line along another whisker's from which it is that."""
 
 _FAINT = 2.4
 """Factor of the jump of a single whisker before grey fur, where its base is less certain."""
@@ -118,26 +115,21 @@ def trace_video(
             sample = [frames[i] for i in _spread(len(frames))]
     bright, shape = is_bright(first[0], bases, options), first[0].shape
     start = negative(first[0]) if bright else first[0]
-    alike = [negative(f) if bright else f for f in sample if f.shape == shape]
-    scene = Scene.of(alike, options.scale, mask)
-    count = 1 if bases is None else len(bases)
-    if not done or (bases is not None and len(begun) > 1):
-        bases = _all_bases(bases, [start, *alike], scene, options, corrections)
-    followers = _begun(bases, begun if done else (), options)
+    followers = _begun(start, bases, begun if done else (), options)
     begins = [follower.base for follower in followers] if bases is None else bases
     starts = np.array(begins, dtype=np.float64)
-    scene = scene.with_still(starts, alike)
+    alike = [negative(f) if bright else f for f in sample if f.shape == shape]
+    scene = Scene.of(alike, options.scale, mask).with_still(starts, alike)
     (still,) = between_whiskers([None], scene.bits, start.shape)
     for follower in followers:
         follower.clutter = still.still_only
         if len(followers) == 1 and scene.still is not None and scene.still.before_body:
             follower.options = replace(options, jump=_FAINT * options.jump)
     traces[:] = [list(row) for row in begun] or [[] for _ in followers]
-    alone = _begun(bases, begun if done else (), options)[:1]
-    alone[0].clutter = still.still_only
-    by_itself = list(traces[0])
-    if wrong := sorted({k for _, k in corrections if not 0 <= k < count}):
-        raise ValueError(f"corrections are for whiskers {wrong}; there are {count}, from 0")
+    if wrong := sorted({k for _, k in corrections if not 0 <= k < len(followers)}):
+        raise ValueError(
+            f"corrections are for whiskers {wrong}; there are {len(followers)}, from 0"
+        )
     for i, frame in enumerate(chain(first, source)):
         if frame.shape != shape:
             raise ValueError(
@@ -152,8 +144,6 @@ def trace_video(
             continue
         known = {k: points for (j, k), points in corrections.items() if j == i}
         found = follow_all(followers, frame, known, seen, scene)
-        if len(followers) > count:
-            by_itself += follow_all(alone, frame, known, [], scene)
         for trace, row in zip(found, traces, strict=True):
             row.append(trace)
         for k in range(len(followers)):
@@ -166,62 +156,25 @@ def trace_video(
         for i, way in enumerate(decided(seen, starts)):
             for row, c in zip(traces, way, strict=True):
                 row[i] = seen[i].lines[c] if c >= 0 else Trace.lost()
-    if len(followers) > count:
-        _kept_if_alone(traces, by_itself)
-        del traces[count:]
     return traces
 
 
-def _kept_if_alone(traces: Sequence[list[Trace]], by_itself: Sequence[Trace]) -> None:
-    """Take the first whisker as it was followed by itself where it is lost among others.
-
-    Such a line is not that of another one.
-    """
-    first, *others = traces
-    for i, (trace, alone) in enumerate(zip(first, by_itself, strict=True)):
-        taken = (overlap(alone.line, row[i].line) for row in others)
-        if not len(trace.line) and all(share < _ALIKE for share in taken):
-            first[i] = alone
-
-
-def _first_base(frame: Frame, options: TraceOptions) -> Array:
-    """Base of the whisker that is best seen in the first frame."""
-    found = find_whiskers(frame, options)
-    if not found:
-        raise ValueError("no whisker was found in the first frame: give where one begins")
-    base: Array = found[0].trace.line[0]
-    return base
-
-
-def _all_bases(
-    bases: Sequence[ArrayLike] | None,
-    frames: Sequence[Frame],
-    scene: Scene,
-    options: TraceOptions,
-    corrections: Corrections,
-) -> Sequence[ArrayLike]:
-    """Bases of the whiskers, and of others that cross if there is one only."""
-    bases = [_first_base(frames[0], options)] if bases is None else bases
-    if len(bases) != 1:
-        return bases
-    others = neighbours(scene, frames, bases[0], options)
-    return [*bases, *(one for one in others if not _meant(one, bases[0], corrections))]
-
-
-def _meant(other: Array, base: ArrayLike, corrections: Corrections) -> bool:
-    """Whether a correction begins at another whisker's base rather than at that which was given."""
-    begins = [np.asarray(points, dtype=np.float64)[0] for points in corrections.values()]
-    return any(np.hypot(*(other - at)) < np.hypot(*(base - at)) for at in begins)
-
-
 def _begun(
-    bases: Sequence[ArrayLike] | None, begun: Sequence[Sequence[Trace]], options: TraceOptions
+    frame: Frame,
+    bases: Sequence[ArrayLike] | None,
+    begun: Sequence[Sequence[Trace]],
+    options: TraceOptions,
 ) -> list[Follower]:
-    """Followers of whiskers that begin at bases, or that were traced before."""
+    """Followers of whiskers that begin in the first frame, or that were traced before."""
     if begun:
         starts = bases if bases is not None else [None] * len(begun)
         return [_resumed(row, base, options) for row, base in zip(begun, starts, strict=True)]
-    return [start_at(base, options) for base in (() if bases is None else bases)]
+    if bases is None:
+        found = find_whiskers(frame, options)
+        if not found:
+            raise ValueError("no whisker was found in the first frame: give where one begins")
+        bases = [found[0].trace.line[0]]
+    return [start_at(base, options) for base in bases]
 
 
 def _resumed(row: Sequence[Trace], base: ArrayLike | None, options: TraceOptions) -> Follower:

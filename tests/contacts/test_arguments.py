@@ -51,6 +51,11 @@ def test_swapped_arguments_get_a_hint(bent):
             vb.estimate_from_wrench(bent.whisker, force, moment)
     with pytest.raises(ValueError, match=r"ContactMap.simulate\(whisker\)"):
         vb.uniqueness(bent.whisker)
+    for other in ("whisker.toml", bent.contact_point):
+        with pytest.raises(ValueError, match=f"a Whisker is needed; got {type(other).__name__}"):
+            vb.deflect(other, bent.load)
+        with pytest.raises(ValueError, match=f"a Whisker is needed; got {type(other).__name__}"):
+            vb.ContactMap.simulate(other)
 
 
 def test_millimetres_in_arrays_get_a_hint(bent):

@@ -49,6 +49,7 @@ from vibrissa.rod import (
     PointContact,
     SearchTree,
     StableSet,
+    check_whisker,
     contact_tangents,
     deflect,
     discretize,
@@ -138,6 +139,7 @@ class ContactMap:
         ContactMap
             The map.
         """
+        check_whisker(whisker)
         chart = stable_set(whisker, proximal=proximal, cells=cells, steps=steps)
         solved = _solve_grid(whisker, proximal, steps, progress) if grid else None
         return cls(whisker, chart, steps, solved)

@@ -27,7 +27,13 @@ from vibrissa.rod.chart import (
     with_normal_force as with_normal_force,
 )
 from vibrissa.rod.deflection import Deflection, Load, PegContact, PointContact, PointForce
-from vibrissa.rod.discretization import STEPS, Discretization, Rod as Rod, discretize
+from vibrissa.rod.discretization import (
+    STEPS,
+    Discretization,
+    Rod as Rod,
+    check_whisker as check_whisker,
+    discretize,
+)
 from vibrissa.rod.gravity import (
     Resting,
     Weighted,

@@ -17,8 +17,9 @@ derivatives. ln f* is interpolated by bicubic Hermite patches.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -36,6 +37,10 @@ CELLS = (16, 32, 16)
 # length were the whisker linear; straight, curved, conical and cylindrical whiskers fold below 4.
 _FARTHEST = 12.0
 _SCAN = 0.0625
+# Bent in its plane, a nearly cylindrical whisker begins to slip off in the plane and out of it at
+# nearly the same force, between which det ∂p/∂ξ < 0: where it dips, its least value is looked for
+# in so many parabolas, and is zero if it is less than this share of that at rest.
+_PARABOLAS, _ZERO = 8, 1e-9
 # Grading toward a tip of radius zero.
 _GRADING = 0.85
 #: No solution is looked for nearer to the base than this (over L).
@@ -243,14 +248,26 @@ def _fold_forces(
 
     low, high = np.zeros(s.size), np.full(s.size, np.inf)
     at_low, at_high = np.ones(s.size), np.full(s.size, np.nan)
+    before = np.full(s.size, -np.inf)  # determinant one step before ``low``
     open_rays = np.arange(s.size)
     force = _SCAN
     while open_rays.size and force <= _FARTHEST:
         found = relative_determinant(open_rays, np.full(open_rays.size, force))
         beyond = found <= 0.0
         high[open_rays[beyond]], at_high[open_rays[beyond]] = force, found[beyond]
-        open_rays = open_rays[~beyond]
-        low[open_rays], at_low[open_rays] = force, found[~beyond]
+        dips = (found > at_low[open_rays]) & (before[open_rays] > at_low[open_rays])
+        rays = open_rays[dips]
+        steps = force + np.array([[-2.0], [-1.0], [0.0]]) * _SCAN
+        values = np.stack([before[rays], at_low[rays], found[dips]])
+        where, least = _least(partial(relative_determinant, rays), steps + 0.0 * values, values)
+        crossed = least <= _ZERO
+        rays = rays[crossed]
+        high[rays], at_high[rays] = where[crossed], np.minimum(least[crossed], -_ZERO)
+        low[rays], at_low[rays] = force - 2.0 * _SCAN, before[rays]
+        on = ~np.isfinite(high[open_rays])
+        open_rays = open_rays[on]
+        before[open_rays] = at_low[open_rays]
+        low[open_rays], at_low[open_rays] = force, found[on]
         force += _SCAN
     folded = np.isfinite(high)
     rays = np.flatnonzero(folded)
@@ -267,6 +284,24 @@ def _fold_forces(
     shape = (stations.size, bearings.size)
     # The stable side of the bracket.
     return (low * unit).reshape(shape), folded.reshape(shape)
+
+
+def _least(function: Callable[[Array], Array], x: Array, y: Array) -> tuple[Array, Array]:
+    """Minima by successive parabolas, from values y (3, n) at rising x (3, n), y[1] the least."""
+    for _ in range(_PARABOLAS if x.size else 0):
+        left, right = (y[1] - y[0]) / (x[1] - x[0]), (y[2] - y[1]) / (x[2] - x[1])
+        vertex = 0.5 * (x[0] + x[1]) - 0.5 * left * (x[2] - x[0]) / (right - left)
+        # Not where a value is known already.
+        apart = 1e-3 * (x[2] - x[0])
+        vertex = np.where(np.abs(vertex - x[1]) < apart, x[1] + apart, vertex)
+        at, value = [vertex, x[1]], [function(vertex), y[1]]
+        lower = value[0] < value[1]
+        middle, other = (np.where(lower, *both) for both in (at, at[::-1]))
+        y_middle, y_other = (np.where(lower, *both) for both in (value, value[::-1]))
+        ahead = other > middle
+        x = np.stack([np.where(ahead, x[0], other), middle, np.where(ahead, other, x[2])])
+        y = np.stack([np.where(ahead, y[0], y_other), y_middle, np.where(ahead, y_other, y[2])])
+    return x[1], y[1]
 
 
 def _log_fold(eta: Array, bearings: Array, force: Array) -> Array:

@@ -1,11 +1,10 @@
 """The contact at a given point: seeds from the chart, Newton, and a reason where there is none.
 
-The contact point is not injective on Ω for every whisker: pushed far enough, a curved and nearly
-cylindrical one passes again through points that it touches at rest. The answer is the equilibrium
-of least force. A solution is therefore in doubt where another seed has less force, or where the
-point is so near the resting whisker that a light contact may hold it. There, and where no seed
-leads to a solution, the path is followed from all starts, and the contact of least force that is
-reached is the answer.
+The contact point is not injective on Ω for every whisker: a nearly cylindrical corkscrew may hold
+one point in two ways. The answer is the equilibrium of least force. A solution is therefore in
+doubt where another seed has less force, or where the point is so near the resting whisker that a
+light contact may hold it. There, and where no seed leads to a solution, the path is followed from
+all starts, and the contact of least force that is reached is the answer.
 """
 
 from __future__ import annotations

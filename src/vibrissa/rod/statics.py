@@ -26,7 +26,14 @@ from vibrissa.rod.deflection import (
     some_of,
     vectors,
 )
-from vibrissa.rod.discretization import MOST_STEPS, STEPS, Bendable, Discretization, discretize
+from vibrissa.rod.discretization import (
+    MOST_STEPS,
+    STEPS,
+    Bendable,
+    Discretization,
+    check_whisker,
+    discretize,
+)
 from vibrissa.rod.gravity import Resting, moved_moments, resting
 from vibrissa.rod.integration import solve_forces
 from vibrissa.rod.pegs import Pegs, Rest, nearest_side, solve_from_contact, solve_from_rest
@@ -108,6 +115,7 @@ def deflect(
         raise ValueError(
             f"a load is a PointForce, a PointContact or a PegContact; got {type(load).__name__}"
         )
+    check_whisker(whisker)
     if isinstance(load, PointContact):
         _check_reach(whisker, load)
     check_device(device)

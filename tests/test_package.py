@@ -68,6 +68,12 @@ def test_version_is_that_of_the_distribution():
     assert importlib.metadata.version("vibrissa") == vibrissa.__version__
 
 
+def test_the_package_is_a_command_too():
+    words = [sys.executable, "-m", "vibrissa", "--version"]
+    said = subprocess.run(words, check=True, capture_output=True, text=True).stdout
+    assert said.strip() == f"vibrissa {vibrissa.__version__}"
+
+
 def test_import_loads_nothing_heavy():
     heavy = {"numpy", "numba", "scipy", "xarray", "h5netcdf", "matplotlib", "typer", "rich"}
     code = f"import sys, vibrissa; print(sorted({heavy} & set(sys.modules)))"

@@ -2,8 +2,8 @@
 
 `python studies/around.py [--count N] [--page]`: whiskers are pressed against an object whose
 position is known to 1 mm along each axis, so far that they touch it more than once; force and
-moment have noise of a share of EI/L² and EI/L. The truth is solved with three times the nodes.
-`--page` writes the table to the page on remedies.
+moment have noise of a share of EI/L² and EI/L. The truth is solved with 160 elements, estimates
+with 32, then 96. `--page` writes the table to the page on remedies.
 """
 
 import argparse
@@ -17,7 +17,7 @@ import vibrissa as vb
 from vibrissa.objects import Peg, Placement, Plane, Sphere
 from vibrissa.rod import NearObjects
 
-SIGMA, FINE, WITHIN_95 = 1e-3, 96, 7.815
+SIGMA, FINE, WITHIN_95 = 1e-3, 160, 7.815
 WIRE = vb.Whisker.from_curvature(0.1, lambda s: [0.0, 0.0, 8.0], base_radius=0.2e-3)
 HEAD = ("whisker, noise", "object", "one contact", "all contacts", "in the 95 % region")
 HEAD = (*HEAD, "not explained, %", "shift off the surface, mm", "s each")

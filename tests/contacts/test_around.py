@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import vibrissa as vb
-from vibrissa.objects import Peg, Placement, Sphere
+from vibrissa.objects import Peg, Placement, Plane, Sphere
 from vibrissa.rod import NearObjects, discretize
 
 WIRE = vb.Whisker.from_curvature(0.1, lambda s: [0.0, 0.0, 8.0], base_radius=0.2e-3)
@@ -50,6 +50,23 @@ def test_an_arc_is_found_with_the_object():
         position_sigma=1e-3,
     )
     assert int(wrong.status) == vb.Status.NOT_FRICTIONLESS
+
+
+def test_regions_hold_a_contact_between_coarse_nodes():
+    """Against a wall the γ whisker's first contact is known to 10 µm across it."""
+    whisker = vb.samples.gamma()
+    d, shift = discretize(whisker), np.array([0.3e-3, -0.4e-3, 0.5e-3])
+    wall = Plane([0.0, 6e-3, 0.0], [0.05, -1.0, -0.3])
+    found = NearObjects(whisker, wall, 160).from_outside(Placement(np.eye(3), -shift), np.zeros(3))
+    scale = np.repeat([d.force, d.moment], 3)
+    wrench, noise = scale * found.wrench(), dict(zip(NAMES, 7e-3 * scale, strict=True))
+    out = vb.estimate_around(
+        whisker, wrench[:3], wrench[3:], wall, noise=noise, position_sigma=1e-3
+    )
+    away = out.contact_point_whisker.values - found.first_contact()[1] * d.length
+    spread = out.covariance.values
+    assert away @ np.linalg.solve(spread, away) < 3.0
+    assert np.linalg.eigvalsh(spread)[1] < (20e-6) ** 2
 
 
 def test_bad_input_is_refused():

@@ -242,6 +242,15 @@ class NearObjects:
             return None
         return found
 
+    def refined(self, place: Placement, shift: Array, start: Equilibrium) -> Equilibrium | None:
+        """Equilibrium near one with other nodes."""
+        obstacles = Obstacles(self._surfaces, self._shifted(place, shift), self._length)
+        strain, pressing = strain_on(start, self._grid), start.pressing_on(self._grid)
+        found = settled(self._whisker, obstacles, self._grid, strain, pressing)
+        if found is None or not found.contacts()[0].size or found.farthest(start) > _JUMP:
+            return None
+        return found
+
     def _shifted(self, place: Placement, shift: Array) -> Placement:
         return Placement(place.rotation, place.position - shift * self._length)
 

@@ -395,13 +395,12 @@ def settled(
 
 def strain_on(found: Equilibrium, grid: Grid) -> Array:
     """Strains on another grid with the moments of an equilibrium."""
-    moment = found.grid.stiffness * found.strain
-    on = found.grid.extent > 0.0
-    out = moment.copy()
-    before = found.grid.stations[on].ravel()
+    moment, out = found.grid.stiffness * found.strain, np.empty_like(grid.stiffness)
+    before, now = found.grid.extent > 0.0, grid.extent > 0.0
+    out[~now] = moment[~before]
+    known, wanted = found.grid.stations[before].ravel(), grid.stations[now].ravel()
     for i in range(3):
-        at = np.interp(grid.stations[on].ravel(), before, moment[on, :, i].ravel())
-        out[on, :, i] = at.reshape(-1, 2)
+        out[now, :, i] = np.interp(wanted, known, moment[before, :, i].ravel()).reshape(-1, 2)
     return np.asarray(out / grid.stiffness)
 
 

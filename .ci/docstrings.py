@@ -74,9 +74,10 @@ def exported() -> Iterator[object]:
     """Everything on the face of a package or of a module directly under vibrissa."""
     for name in modules():
         module = importlib.import_module(name)
-        if hasattr(module, "__path__"):
+        face = name.removeprefix("vibrissa.") in vibrissa.__all__
+        if hasattr(module, "__path__") or (face and hasattr(module, "__all__")):
             yield from (getattr(module, key) for key in getattr(module, "__all__", ()))
-        elif name.removeprefix("vibrissa.") in vibrissa.__all__:
+        elif face:
             own = (v for v in vars(module).values() if getattr(v, "__module__", None) == name)
             yield from own
 

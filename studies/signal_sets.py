@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from pages import save
 
 import vibrissa as vb
-from vibrissa.identifiability.regions import sample, spread
+from vibrissa.identifiability.twins import sample, spread
 from vibrissa.plots.style import (
     BLUE,
     GREEN,

@@ -7,7 +7,7 @@ from scipy.stats import chi2
 
 import vibrissa as vb
 from vibrissa.contacts.posterior import ranked
-from vibrissa.identifiability.regions import sample
+from vibrissa.identifiability.twins import sample
 from vibrissa.numerics import quick_exp
 from vibrissa.rod import fold_forces, solve_forces
 from vibrissa.signals import SIGNALS

@@ -10,8 +10,7 @@ import vibrissa.demo as filming
 from vibrissa import samples
 from vibrissa.cli.app import app
 from vibrissa.demo import run_demo
-from vibrissa.evaluation import caution, tracking_scores, truth_of
-from vibrissa.evaluation.stages import from_curves, refined
+from vibrissa.evaluation import caution, from_curves, refined, tracking_scores, truth_of
 from vibrissa.io import load_contacts, load_recording
 from vibrissa.pipeline import fit_contacts, reconstruct
 from vibrissa.recording import Recording

@@ -6,9 +6,8 @@ import xarray as xr
 
 import vibrissa as vb
 from vibrissa.identifiability import save_uniqueness, verdict_table
-from vibrissa.identifiability.regions import contact_set, sample, spread
-from vibrissa.identifiability.summary import choice, notation
-from vibrissa.identifiability.twins import twins
+from vibrissa.identifiability.twins import contact_set, sample, spread, twins
+from vibrissa.identifiability.verdicts import choice, notation
 from vibrissa.rod import chart_of, contact_tangents, discretize, solve_forces, with_normal_force
 from vibrissa.signals import REGIONS, TRIPLETS
 

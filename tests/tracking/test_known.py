@@ -10,7 +10,7 @@ from vibrissa.objects import Peg
 from vibrissa.recording import Recording
 from vibrissa.simulation import Motion, simulate
 from vibrissa.tracking import HeadPose, TrackOptions, trace_video, track
-from vibrissa.tracking.contact_points import outside_video
+from vibrissa.tracking.recording import outside_video
 
 FRAMES = 30
 RATE = 1000.0

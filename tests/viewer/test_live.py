@@ -12,7 +12,7 @@ import vibrissa as vb
 from vibrissa.scene import Arrows, Cloud
 from vibrissa.streaming import Answers
 from vibrissa.viewer import view_stream
-from vibrissa.viewer.live import Live
+from vibrissa.viewer.server import Live
 
 WHISKER = vb.Whisker.straight(0.3, base_radius=0.5e-3, tip_radius=0.25e-3, youngs_modulus=200e9)
 BENT = vb.deflect(WHISKER, vb.PointForce(0.2, 0.03, 0.4))

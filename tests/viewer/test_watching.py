@@ -13,8 +13,15 @@ from vibrissa.contour import fit_free, fit_shape
 from vibrissa.io import Footage, write_video
 from vibrissa.recording import Recording
 from vibrissa.viewer.readout import chart, cursor
-from vibrissa.viewer.recorded import picture, views, watched
-from vibrissa.viewer.trial import fitted_body, moment_drawing, surroundings, touched
+from vibrissa.viewer.trial import (
+    fitted_body,
+    moment_drawing,
+    picture,
+    surroundings,
+    touched,
+    views,
+    watched,
+)
 
 MM = 1e3
 

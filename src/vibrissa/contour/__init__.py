@@ -4,8 +4,7 @@ from vibrissa.contour.comparison import axis_offset as axis_offset, compare_with
 from vibrissa.contour.drawing import Ellipsoids, ellipsoids, surface_grid
 from vibrissa.contour.fit import fit_shape
 from vibrissa.contour.fitted_shape import FittedShape, evidence_of as evidence_of
-from vibrissa.contour.free_fit import fit_free
-from vibrissa.contour.free_surface import FreeFit, shape_from_dataset
+from vibrissa.contour.free_surface import FreeFit, fit_free, shape_from_dataset
 from vibrissa.contour.simple_shapes import CylinderFit, PlaneFit, SphereFit
 from vibrissa.contour.touches import (
     continuing_candidates,

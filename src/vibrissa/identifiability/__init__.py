@@ -6,15 +6,15 @@ from vibrissa.identifiability.cones import (
     with_proved_witnesses as with_proved_witnesses,
 )
 from vibrissa.identifiability.sensitivity import best_triplet, sensitivity
-from vibrissa.identifiability.summary import (
+from vibrissa.identifiability.twins import witness_pairs
+from vibrissa.identifiability.verdicts import (
     ENDINGS,
     save_uniqueness as save_uniqueness,
     twins_of as twins_of,
+    uniqueness,
     verdict_rows as verdict_rows,
     verdict_table,
 )
-from vibrissa.identifiability.verdicts import uniqueness
-from vibrissa.identifiability.witness_pair import witness_pairs
 
 __all__ = [
     "ENDINGS",

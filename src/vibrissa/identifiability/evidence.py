@@ -15,23 +15,21 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from vibrissa.contacts import Domain, deficient, invert
-from vibrissa.identifiability.regions import (
-    ContactSet,
-    Samples,
-    contact_set,
-    in_chart,
-    sample,
-    spread,
-)
 from vibrissa.identifiability.summits import farthest_twins
 from vibrissa.identifiability.twins import (
+    ContactSet,
     Pairs,
+    Samples,
     Search,
     better_twins,
     confirmed,
+    contact_set,
     fibres,
+    in_chart,
     joined,
+    sample,
     signal_columns,
+    spread,
     triplet_derivatives,
     twins,
 )

@@ -10,20 +10,35 @@ cylinder. Fibres are followed along the direction in which the triplet does not 
 
 Where the integration errs by more than the signals differ, two contacts can agree on the rod as it
 is discretised and not in truth: a pair counts only if it is found again on a finer rod.
+
+All arrays are non-dimensional (lengths over L, forces over EI/L²), as in :mod:`vibrissa.rod`.
+
+A witness is a pair of twins that is bent again, as two whiskers.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
 
-from vibrissa.contacts import RANK, Domain, invert, polish
-from vibrissa.identifiability.regions import ContactSet, contact_set, in_chart, solved
+from vibrissa.contacts import RANK, Domain, invert, polish, within_paper_bounds
+from vibrissa.deferred import stats
 from vibrissa.numerics import AnyArray, Array, cross
 from vibrissa.rod import (
+    STEPS,
+    Deflection,
     Discretization,
+    Fold,
+    PointForce,
     chart_of,
+    contact_tangents,
+    contacts_at,
+    deflect,
+    determinant,
     discretize,
     fold_forces,
     solve_forces,
@@ -31,15 +46,140 @@ from vibrissa.rod import (
 )
 from vibrissa.signals import (
     SIGNALS,
+    backward_offset,
+    base_signals,
     circular_among,
     cone_angle,
+    in_region,
     signal_derivatives,
     signals_of,
     within_turn,
 )
+from vibrissa.whisker import Whisker
 
 if TYPE_CHECKING:
     from vibrissa.contacts import ContactMap
+
+
+# Directions have no value at zero force: samples are kept off it.
+_LEAST_LOAD = 0.01
+# Step of the derivatives of the chart, a cube root of rounding.
+_STEP = 1e-6
+
+
+class ContactSet(NamedTuple):
+    """Contacts with the regions they belong to.
+
+    ξ (n, 3); (F, p) (n, 6); cone angle from rest, rad; offset backward over L, positive where
+    concave backward; x of the tangent, negative where deflected far; whether inside the domain.
+    """
+
+    xi: Array
+    values: Array
+    angle: Array
+    backward: Array
+    tangent_x: Array
+    inside: AnyArray
+
+    def rows(self, which: AnyArray | slice) -> ContactSet:
+        """Pick some."""
+        return ContactSet(*(a[which] for a in self))
+
+    def members(self, region: str) -> AnyArray:
+        """Whether each belongs to a region, whatever its angle."""
+        return self.inside & in_region(region, self.backward > 0.0, self.tangent_x < 0.0)
+
+    @property
+    def signals(self) -> Array:
+        """The six signals (n, 6)."""
+        force, point = self.values[:, :3], self.values[:, 3:]
+        return signals_of(force, cross(point, force))
+
+
+class Samples(NamedTuple):
+    """Contacts spread over Ω.
+
+    Chart coordinates (η, ψ, ρ) (n, 3); the contacts; ∂(F, p)/∂ξ (n, 6, 3); each one's share of the
+    volume of contact points (n,), up to a common factor.
+    """
+
+    chart: Array
+    contacts: ContactSet
+    tangents: Array
+    volume: Array
+
+    def rows(self, which: AnyArray | slice) -> Samples:
+        """Pick some."""
+        return Samples(
+            self.chart[which], self.contacts.rows(which), self.tangents[which], self.volume[which]
+        )
+
+
+def contact_set(contact_map: ContactMap, xi: Array, values: Array, domain: Domain) -> ContactSet:
+    """Find the regions of contacts ξ (n, 3) with known (F, p) (n, 6)."""
+    whisker, d = contact_map.whisker, contact_map.chart.discretization
+    points = values[:, 3:] * d.length
+    inside = np.ones(len(xi), dtype=bool)
+    if domain == "paper":
+        inside = within_paper_bounds(whisker, points)
+    return ContactSet(
+        xi=xi,
+        values=values,
+        angle=cone_angle(whisker, points),
+        backward=backward_offset(whisker, points) / d.length,
+        tangent_x=contact_tangents(d, with_normal_force(xi))[:, 0],
+        inside=inside,
+    )
+
+
+def solved(contact_map: ContactMap, chart: Array, domain: Domain) -> tuple[ContactSet, Array]:
+    """Solve the contacts at chart coordinates (n, 3); ∂(F, p)/∂ξ (n, 6, 3) too."""
+    xi = contacts_at(contact_map.chart.fold, chart)
+    d = contact_map.chart.discretization
+    values, tangents = solve_forces(d, with_normal_force(xi), tangents=True)
+    contacts = contact_set(contact_map, xi, values, domain)
+    # The chart has the fold to a part in a million: contacts beyond it do not count.
+    stable = determinant(tangents) > 0.0
+    return contacts._replace(inside=contacts.inside & stable), tangents
+
+
+def sample(contact_map: ContactMap, chart: Array, domain: Domain) -> Samples:
+    """Solve the contacts at chart coordinates (n, 3), with what they stand for."""
+    contacts, tangents = solved(contact_map, chart, domain)
+    by_chart = tangents[:, 3:] @ _chart_derivatives(contact_map.chart.fold, chart)
+    return Samples(chart, contacts, tangents, np.abs(np.linalg.det(by_chart)))
+
+
+def spread(number: int, seed: int | None) -> Array:
+    """Low-discrepancy chart coordinates (n, 3), at least ``number`` of them: a power of two.
+
+    Without a seed they are not scrambled.
+    """
+    rng = None if seed is None else np.random.default_rng(seed)
+    sobol = stats.qmc.Sobol(3, scramble=seed is not None, seed=rng)
+    unit = sobol.random_base2(max(1, int(np.ceil(np.log2(number)))))
+    return in_chart(unit * [1.0, 2.0 * np.pi, 1.0])
+
+
+def in_chart(chart: Array) -> Array:
+    """Bring chart coordinates (n, 3) back into the chart: reflected at its faces, ψ on a circle."""
+    chart = np.array(chart)
+    for axis in (0, 2):
+        x = np.abs(chart[:, axis]) % 2.0
+        chart[:, axis] = np.minimum(x, 2.0 - x)
+    chart[:, 1] %= 2.0 * np.pi
+    chart[:, 2] = np.maximum(chart[:, 2], _LEAST_LOAD)
+    return chart
+
+
+def _chart_derivatives(fold: Fold, chart: Array) -> Array:
+    """∂ξ/∂(η, ψ, ρ), (n, 3, 3), by central differences of the chart itself."""
+    columns = [
+        (contacts_at(fold, chart + step) - contacts_at(fold, chart - step)) / (2.0 * _STEP)
+        for step in _STEP * np.eye(3)
+    ]
+    return np.stack(columns, axis=-1)
+
 
 #: Agreement of twins' signals: forces relative to |F|, moments to |M|, angles in rad.
 AGREEMENT = 1e-10
@@ -346,3 +486,94 @@ def _along(slope: Array, before: Array, sense: float) -> Array:
     fresh = np.isnan(before).any(axis=1)
     turned[fresh] = sense * rows[fresh, 2]
     return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
+
+
+_NODES = 101
+_AGREE = 1e-6
+"""Largest difference of a saved witness's signals from those of the whisker."""
+
+_NEEDED = {"witness_arc_length", "witness_contact_force", "witness_separation"}
+
+
+def witness_pairs(
+    whisker: Whisker, verdicts: xr.Dataset, triplets: Iterable[str]
+) -> Iterator[tuple[str, xr.Dataset]]:
+    """Bend a whisker into the farthest pair of contacts with the same signals, for some triplets.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        The whisker that the verdicts are of.
+    verdicts : xarray.Dataset
+        Verdicts with witnesses, of `uniqueness`.
+    triplets : iterable of str
+        Names of the triplets that are wanted; those without a witness are left out.
+
+    Yields
+    ------
+    str
+        Name of the triplet.
+    xarray.Dataset
+        Dims pair, node, space: ``rest`` and ``centerline`` of both whiskers, ``contact_point``,
+        ``force``, ``arc_length`` and the six signals.
+
+    Raises
+    ------
+    ValueError
+        If the verdicts are of another whisker.
+    """
+    if not set(verdicts.data_vars) >= _NEEDED:
+        return
+    known = set(map(str, verdicts["triplet"].values))
+    for triplet in dict.fromkeys(triplets):
+        if triplet not in known:
+            continue
+        found = verdicts.sel(triplet=triplet)
+        if "all" in found["region"].values:
+            found = found.sel(region=["all"])
+        apart = found["witness_separation"].transpose("region", "witness").values
+        if np.isfinite(apart).any():
+            region, witness = np.unravel_index(np.nanargmax(apart), apart.shape)
+            yield triplet, _bent(whisker, found.isel(region=int(region), witness=int(witness)))
+
+
+def _bent(whisker: Whisker, witness: xr.Dataset) -> xr.Dataset:
+    """The two whiskers of one witness."""
+    force = witness["witness_contact_force"].transpose("pair", "component").values
+    components = np.column_stack([np.zeros(2), force])
+    load = PointForce(witness["witness_arc_length"].values, components=components)
+    bent = deflect(whisker, load, steps=int(witness.get("witness_steps", STEPS)))
+    signals = base_signals(bent.force, bent.moment)
+    triplet = str(witness["triplet"].item())
+    if "witness_signals" in witness:
+        _check_whisker(bent, signals, triplet, witness["witness_signals"].values)
+    data = xr.Dataset(
+        {
+            "rest": (("node", "space"), whisker.centerline(_NODES)),
+            "centerline": (("pair", "node", "space"), bent.centerline(_NODES)),
+            "contact_point": (("pair", "space"), bent.contact_point),
+            "force": (("pair", "space"), bent.force),
+            "arc_length": ("pair", bent.arc_length),
+        },
+        attrs={"triplet": triplet},
+    )
+    return data.assign({name: ("pair", values.values) for name, values in signals.items()})
+
+
+def _check_whisker(
+    bent: Deflection, signals: xr.Dataset, triplet: str, saved: NDArray[np.float64]
+) -> None:
+    """Raise unless the first contact has the signals here that it had in the verdicts."""
+    names = triplet.split()
+    here = np.array([signals[name].values[0] for name in names])
+    force, moment = (float(np.linalg.norm(v[0])) for v in (bent.force, bent.moment))
+    sizes = {"Fx": force, "FT": force, "Mx": moment, "MB": moment}
+    gap = [
+        abs(a - b) / sizes[name] if name in sizes else abs(np.angle(np.exp(1j * (a - b))))
+        for name, a, b in zip(names, here, saved, strict=True)
+    ]
+    if not np.max(gap) < _AGREE:  # also where the whisker holds no such contact
+        raise ValueError(
+            f"the verdicts are not of this map's whisker: for ({triplet}) the first contact of a "
+            f"witness has the signals {here} here, and {saved} where the verdicts were made"
+        )

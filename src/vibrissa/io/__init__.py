@@ -7,10 +7,6 @@ Nothing in a file is run or unpickled, and no file leads to another.
 
 from __future__ import annotations
 
-from vibrissa.io.anipose import (
-    read_calibration as read_calibration,
-    write_calibration as write_calibration,
-)
 from vibrissa.io.annotations import (
     Clicks as Clicks,
     Points as Points,
@@ -23,6 +19,10 @@ from vibrissa.io.annotations import (
     save_clicks as save_clicks,
     save_corrections as save_corrections,
     together as together,
+)
+from vibrissa.io.keypoints import (
+    read_calibration as read_calibration,
+    write_calibration as write_calibration,
 )
 from vibrissa.io.kinds import READERS as READERS, Kind, load_tracks, recognise
 from vibrissa.io.matlab import load_matlab
@@ -51,13 +51,6 @@ from vibrissa.io.paths import (
     without_part as without_part,
 )
 from vibrissa.io.recording import RECORDING_KIND as RECORDING_KIND, load_recording, save_recording
-from vibrissa.io.result_tables import (
-    holds_contour as holds_contour,
-    load_contacts,
-    save_contacts,
-    save_contour,
-    save_predictors as save_predictors,
-)
 from vibrissa.io.rosbag import (
     BagMessage as BagMessage,
     ContactBag as ContactBag,
@@ -66,35 +59,38 @@ from vibrissa.io.rosbag import (
     bag_wrenches as bag_wrenches,
     is_bag as is_bag,
 )
-from vibrissa.io.signals_table import (
-    NUMBERED as NUMBERED,
-    check_scale as check_scale,
-    load_signals,
-    save_signals,
-)
 from vibrissa.io.table import (
     cells_of as cells_of,
+    check_keys as check_keys,
     delimiter_of as delimiter_of,
+    in_file as in_file,
     is_number as is_number,
     number as number,
-    read_numbers as read_numbers,
-    read_text as read_text,
-    signal_column as signal_column,
-    signal_columns as signal_columns,
-    table_rows as table_rows,
-    with_point as with_point,
-    write_table as write_table,
-)
-from vibrissa.io.toml import (
-    check_keys as check_keys,
-    in_file as in_file,
     number_array as number_array,
     one_number as one_number,
     parsed_toml as parsed_toml,
     quoted as quoted,
+    read_numbers as read_numbers,
+    read_text as read_text,
     read_toml as read_toml,
+    signal_column as signal_column,
+    signal_columns as signal_columns,
     subtable as subtable,
+    table_rows as table_rows,
     three_numbers as three_numbers,
+    with_point as with_point,
+    write_table as write_table,
+)
+from vibrissa.io.time_tables import (
+    NUMBERED as NUMBERED,
+    check_scale as check_scale,
+    holds_contour as holds_contour,
+    load_contacts,
+    load_signals,
+    save_contacts,
+    save_contour,
+    save_predictors as save_predictors,
+    save_signals,
 )
 from vibrissa.io.tracks import (
     RawTracks as RawTracks,

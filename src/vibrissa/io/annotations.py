@@ -43,8 +43,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.deferred import transform, xr
 from vibrissa.io.paths import check_writable
-from vibrissa.io.table import Table, read_numbers, write_table
-from vibrissa.io.toml import check_keys, in_file, number_array, quoted, read_toml
+from vibrissa.io.table import (
+    Table,
+    check_keys,
+    in_file,
+    number_array,
+    quoted,
+    read_numbers,
+    read_toml,
+    write_table,
+)
 from vibrissa.numerics import Array, Mask
 from vibrissa.quantities import attributes
 

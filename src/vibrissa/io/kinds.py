@@ -16,10 +16,10 @@ from typing import Unpack
 import h5py
 
 from vibrissa.deferred import xr
-from vibrissa.io.anipose import read_anipose
 from vibrissa.io.annotations import ANGLES, CORRECTION_COLUMNS, MATRIX, QUATERNION
 from vibrissa.io.keypoints import (
     pandas_tables,
+    read_anipose,
     read_deeplabcut,
     read_movement,
     read_sleap_analysis,

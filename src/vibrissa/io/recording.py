@@ -2,7 +2,7 @@
 
 Every float is kept to the last bit; arrays are compressed. Any reader of NetCDF or HDF5 can open
 the file; what the groups and variables mean is stated by their own attributes and in
-:mod:`vibrissa.recording.schema`. In the file several whiskers are together in one group
+:mod:`vibrissa.recording`. In the file several whiskers are together in one group
 (:mod:`vibrissa.io.recording`).
 
 The whiskers of a tree, side by side in one group of its file.

@@ -1,4 +1,4 @@
-"""Support for compiled kernels: array types, compilation, threads as threads, small linear systems.
+"""Support for compiled kernels: array types, compilation, threads, small linear systems.
 
 What needs Numba or xarray is imported when it is first used, so that array types cost nothing.
 """
@@ -14,10 +14,13 @@ from vibrissa.numerics.arrays import (
     IntArray,
     Mask as Mask,
     Vector,
+    contact_weights as contact_weights,
     cross as cross,
+    share_out as share_out,
     spherical as spherical,
+    threads as threads,
+    weighted_quantile,
 )
-from vibrissa.numerics.threads import share_out as share_out, threads as threads
 
 if TYPE_CHECKING:
     from vibrissa.numerics.algebra import (
@@ -40,7 +43,6 @@ if TYPE_CHECKING:
         vectorised as vectorised,
     )
     from vibrissa.numerics.device import Translation as Translation, check_device as check_device
-    from vibrissa.numerics.quantiles import contact_weights as contact_weights, weighted_quantile
 
 __all__ = [
     "AnyArray",
@@ -74,7 +76,6 @@ _HOMES = {
         "vectorised",
     ),
     "device": ("Translation", "check_device"),
-    "quantiles": ("contact_weights", "weighted_quantile"),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 

@@ -5,7 +5,7 @@ The motion of the base and vibrations decide which frames are in contact
 would bend it, so that no wrench subtracted once is right. At first its bending lags behind the
 moment. Later, contacts by the present correction are smoothed in the laboratory, where objects are
 at rest, a chain with mass is moved through them and one without, and the difference of their
-wrenches (:func:`vibrissa.simulation.held.inertial_wrench`) is the next correction. What is not
+wrenches (:func:`vibrissa.simulation.chain.inertial_wrench`) is the next correction. What is not
 known of a correction is added to the noise.
 """
 

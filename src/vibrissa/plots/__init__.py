@@ -1,18 +1,14 @@
 """Datasets and arrays to figures, one function each; nothing is solved here."""
 
 from vibrissa.plots.array import array_views
-from vibrissa.plots.bent import bent_views, witness_pair
 from vibrissa.plots.cameras import Sight as Sight, start_views as start_views
-from vibrissa.plots.contact_surfaces import contact_surfaces
-from vibrissa.plots.contacts import contact_places
+from vibrissa.plots.contact_surfaces import contact_surfaces, solid_slices
+from vibrissa.plots.contacts import contact_places, estimated_against_true
 from vibrissa.plots.contour import contour_views, distances_by_class
-from vibrissa.plots.estimates import estimated_against_true
 from vibrissa.plots.movies import contour_frames, signal_frames
 from vibrissa.plots.overview import key_frames as key_frames, trial_overview
 from vibrissa.plots.sensitivity import sensitivity_panels
-from vibrissa.plots.signal_space import signal_clouds
-from vibrissa.plots.signals import signals_over_time as signals_over_time
-from vibrissa.plots.slices import solid_slices
+from vibrissa.plots.signals import signal_clouds, signals_over_time as signals_over_time
 from vibrissa.plots.style import (
     looking as looking,
     png,
@@ -27,7 +23,7 @@ from vibrissa.plots.verdicts import (
     resolution,
     verdict_table,
 )
-from vibrissa.plots.whisker import whisker_views
+from vibrissa.plots.whisker import bent_views, whisker_views, witness_pair
 from vibrissa.plots.windows import correct as correct, pick as pick
 
 __all__ = [

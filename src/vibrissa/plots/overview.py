@@ -17,7 +17,7 @@ from vibrissa.numerics import Array, spherical
 from vibrissa.plots import style
 from vibrissa.plots.cameras import Sight, Window, part_of, scale_bar, seen, sight_axes
 from vibrissa.plots.contact_surfaces import course_scales, solid_panels
-from vibrissa.plots.estimates import against
+from vibrissa.plots.contacts import against
 from vibrissa.plots.signals import intervals
 from vibrissa.plots.space import coloured_segments, drop_lines, signal_places
 from vibrissa.quantities import axis_label, to_display

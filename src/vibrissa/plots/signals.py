@@ -1,17 +1,24 @@
-"""The six signals over time."""
+"""The six signals over time, and in the space that a whisker can reach (the paper's Fig. 2)."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colorbar import Colorbar
+from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from numpy.typing import ArrayLike
 
+from vibrissa import scene
 from vibrissa.numerics import Array, Mask
+from vibrissa.plots import style
+from vibrissa.plots.space import AZIMUTH, ELEVATION, bounds, name_axes, paint, painted, space_axes
 from vibrissa.plots.style import BLUE, INK, SHADE, Width, conclude, head, looking, new_figure, say
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.recording import Group
@@ -131,3 +138,277 @@ def _legend(figure: Figure, truth: bool, contact: bool) -> None:
         handles += [Patch(facecolor=SHADE, label="in contact")]
     if handles:
         figure.legend(handles=handles, loc="outside upper right", ncols=len(handles))
+
+
+_SKIN = (0.80, 0.85, 0.90, 1.0)
+"""Colour of the reachable space where it stands for no signal."""
+
+
+_TITLES = {"FD": "direction of $F_T$", "MD": "direction of $M_B$"}
+
+
+class _Sheet(NamedTuple):
+    """Places of the panels."""
+
+    height: float
+    space: style.Box
+    front: style.Box
+    signals: tuple[style.Box, ...]
+
+
+def _sheet(width: style.Width) -> _Sheet:
+    if width == "single":
+        cells = [(42.5 * (i % 2), 78.0 - 39.0 * (i // 2), 42.5, 38.0) for i in range(6)]
+        return _Sheet(167.0, (0.0, 117.0, 56.0, 49.0), (57.0, 117.0, 28.0, 49.0), tuple(cells))
+    cells = [(58.0 + 40.0 * (i % 3), 39.5 - 39.0 * (i // 3), 40.0, 38.0) for i in range(6)]
+    return _Sheet(78.5, (0.0, 30.5, 58.0, 47.0), (0.0, -2.0, 58.0, 32.5), tuple(cells))
+
+
+def signal_clouds(
+    samples: xr.Dataset,
+    centerline: ArrayLike,
+    *,
+    width: style.Width = "double",
+    elevation: float = ELEVATION,
+    azimuth: float = AZIMUTH,
+) -> Figure:
+    """Draw the space that a whisker can reach, and the six signals over it.
+
+    The reachable space is seen from aside and from before the tip, and then once for each signal,
+    which gives the colour: forces above, moments below. The quarter that faces the viewer is taken
+    away along the resting whisker, so that the whisker and what is about it are seen. Small
+    deflections (2° about rest) are left out as in the paper. Colours of forces and moments go with
+    the square root of the signal; they leave out the outermost 2 % of its values, and the colour
+    bar then has a pointed end. An inset shows where the whisker is pulled (F_x > 0), which only
+    happens if it is curved.
+
+    Parameters
+    ----------
+    samples : Dataset
+        ``ContactMap.to_dataset()``: all of the reachable space.
+    centerline : array_like (k, 3)
+        Resting whisker from base to tip, whisker frame, m; drawn in black.
+    width : {"single", "double"}
+        Columns of the page.
+    elevation, azimuth : float
+        Direction of view, degrees.
+
+    Returns
+    -------
+    Figure
+        3D axes, all to one scale but for the inset, and six colour bars.
+
+    Raises
+    ------
+    ValueError
+        If the dataset lacks something, or if there is no such width.
+    """
+    nodes = scene.sample_contacts(samples, centerline, _kept(elevation, azimuth))
+    whole = scene.sample_contacts(samples, centerline)
+    outside = scene.column("deflection")
+    triangles = scene.solid_surface(nodes, False, outside)
+    line = to_display("centerline", centerline)
+    limits = bounds(np.concatenate([_mm(triangles).reshape(-1, 3), line]))
+    view = elevation, azimuth
+    sheet = _sheet(width)
+    with style.looking():
+        figure = style.new_figure(width, sheet.height, None)
+        _reach(figure, sheet, triangles, line, limits, view)
+        for i, (name, cell) in enumerate(zip(scene.SIGNALS, sheet.signals, strict=True)):
+            style.corner_title(
+                figure, cell, "cdefgh"[i], _TITLES.get(name, quantity(name).long_name)
+            )
+            norm, colours, ends = _scale(name, to_display(name, scene.values_of(name, whole)))
+            axes = space_axes(figure, _square(cell), limits, view, zoom=0.97, frame=False)
+            body = (
+                scene.subdivide(triangles, _turning(name, triangles))
+                if name in scene.DIRECTIONS
+                else triangles
+            )
+            shown = to_display(name, scene.values_of(name, body))
+            if name == "Mx" and _vanishes(whole):
+                _body(axes, triangles, np.array(_SKIN), line)
+                _say_zero(figure, cell)
+                continue
+            _body(axes, body, _mean(name, shown, norm, colours), line)
+            _bar(figure, _rail(figure, cell), norm, colours, ends, name)
+        _pulled(figure, sheet.signals[0], nodes, line, view)
+        style.conclude(figure, _finding(whole))
+        return figure
+
+
+def _finding(nodes: Array) -> str:
+    """State how far contacts and signals reach."""
+    near, far, push, pull, bend = (
+        f"{float(f'{np.quantile(to_display(name, scene.values_of(name, nodes)), share):.2g}'):g}"
+        for name, share in (("r", 0.01), ("r", 0.99), ("Fx", 0.01), ("Fx", 0.99), ("MB", 0.99))
+    )
+    return (
+        f"Contacts {near} to {far} mm from the base have $F_x$ from {push} to {pull} µN and $M_B$ "
+        f"up to {bend} µN·m (98 % of the samples)"
+    ).replace("-", "−")
+
+
+def _kept(elevation: float, azimuth: float) -> tuple[float, float]:
+    """Bearings that remain when the quarter toward the viewer is taken away."""
+    toward = np.arctan2(np.sign(elevation), np.sign(np.sin(np.radians(azimuth))))
+    return float(toward + np.pi / 4.0), float(toward + 7.0 * np.pi / 4.0)
+
+
+def _mm(triangles: Array) -> Array:
+    return to_display("contact_point", triangles[..., :3])
+
+
+def _turning(name: str, triangles: Array) -> Mask:
+    """Whether a direction differs by more than 45° within a triangle, as where a force reverses."""
+    turn = scene.values_of(name, triangles)
+    gap = np.abs(np.angle(np.exp(1j * (turn - np.roll(turn, 1, axis=1)))))
+    return np.asarray(gap.max(axis=1) > np.pi / 4.0)
+
+
+def _mean(name: str, values: Array, norm: Normalize, colours: Colormap) -> Array:
+    """Colours of triangles; directions are averaged on the circle."""
+    if name not in scene.DIRECTIONS:
+        return painted(values, norm, colours)
+    turn = np.radians(values)
+    mean = np.degrees(np.arctan2(np.sin(turn).sum(axis=1), np.cos(turn).sum(axis=1)))
+    return painted(mean[:, None], norm, colours)
+
+
+def _reach(
+    figure: Figure,
+    sheet: _Sheet,
+    triangles: Array,
+    line: Array,
+    limits: Array,
+    view: tuple[float, float],
+) -> None:
+    """The reachable space from aside, and from before the tip."""
+    colours = np.broadcast_to(np.array(_SKIN), (len(triangles), 4))
+    left, bottom, width, height = sheet.space
+    box = left - 0.03 * width, bottom + 0.5 * (height - width), width, width
+    axes = space_axes(figure, box, limits, view, zoom=0.88)
+    name_axes(axes, (-8.0, -9.0, -10.5))
+    _body(axes, triangles, colours, line, 0.55)
+    style.corner_title(figure, sheet.space, "a", "reachable contacts")
+    left, bottom, width, height = sheet.front
+    side = min(width, height)
+    box = left + 0.5 * (width - side), bottom + 0.45 * (height - side), side, side
+    front = space_axes(figure, box, limits, (0.0, 0.0), zoom=1.35, frame=False)
+    front.set_proj_type("ortho")
+    _body(front, triangles, colours, line, 0.55)
+    _cross(front, limits)
+    style.corner_title(figure, sheet.front, "b", "from the tip")
+
+
+def _body(axes: Any, triangles: Array, colours: Array, line: Array, flat: float = 0.75) -> None:
+    paint(axes, _mm(triangles), colours, flat=flat)
+    axes.plot(*line.T, color="black", linewidth=1.2, zorder=10, solid_capstyle="round")
+
+
+def _cross(axes: Any, limits: Array) -> None:
+    """Bars of 5 mm along y and z at the lower left of the view from the tip."""
+    corner = np.array([limits[0, 1], limits[1, 0] - 1.0, limits[2, 0]])
+    for i, name in ((1, "y"), (2, "z")):
+        end = corner.copy()
+        end[i] += 5.0
+        axes.plot(*np.stack([corner, end]).T, color=style.INK, linewidth=0.8, zorder=11)
+        end[i] += 1.6
+        axes.text(*end, f"${name}$", fontsize=style.SMALL, ha="center", va="center")
+    corner += np.array([0.0, 2.0, -2.6])
+    axes.text(*corner, "5 mm", fontsize=style.SMALL, ha="center", va="center")
+
+
+def _vanishes(nodes: Array) -> bool:
+    """Whether there is no twisting moment, as for a straight whisker."""
+    twist, bend = (np.abs(scene.values_of(name, nodes)).max() for name in ("Mx", "MB"))
+    return bool(twist < 1e-9 * bend)
+
+
+def _say_zero(figure: Figure, cell: style.Box) -> None:
+    wide, tall = 25.4 * figure.get_size_inches()
+    left, bottom, width, _ = cell
+    place = (left + 0.5 * width) / wide, (bottom + 6.0) / tall
+    figure.text(*place, "$M_x = 0$ everywhere", ha="center", va="center")
+
+
+def _pulled(
+    figure: Figure,
+    cell: style.Box,
+    nodes: Array,
+    line: Array,
+    view: tuple[float, float],
+) -> None:
+    """Inset with only the contacts at which the whisker is pulled, with colours of its own."""
+    triangles = scene.solid_surface(nodes, False, scene.column("deflection"), scene.column("Fx"))
+    if not len(triangles):
+        return
+    left, bottom, width, height = cell
+    limits = bounds(np.concatenate([_mm(triangles).reshape(-1, 3), line]))
+    side = 0.42 * width
+    box = left + width - 1.03 * side, bottom + 0.845 * height - 0.5 * side, side, side
+    axes = space_axes(figure, box, limits, view, zoom=1.1, frame=False)
+    values = to_display("Fx", scene.values_of("Fx", triangles))
+    norm, colours = Normalize(0.0, float(values.max())), style.sequential()
+    _body(axes, triangles, painted(values, norm, colours), line, 1.0)
+    axes.lines[0].set_linewidth(0.7)
+    start, end = left + 0.66 * width, bottom + 0.91 * height
+    rail = style.box_axes(figure, (start, end, 0.22 * width, 1.0))
+    bar = figure.colorbar(ScalarMappable(norm, colours), cax=rail, orientation="horizontal")
+    style.plain(bar)
+    rail.xaxis.set_ticks_position("top")
+    bar.set_ticks([0.0, values.max()], labels=["$F_x$ > 0", f"{values.max():.2g} µN"])
+    rail.tick_params(length=0.0, pad=1.0)
+
+
+def _scale(name: str, values: Array) -> tuple[Normalize, Colormap, str]:
+    """Limits and map of the colours of a signal, and which ends of the map are exceeded."""
+    norm, colours = style.scale_of(name, values)
+    low, high = norm.vmin or 0.0, norm.vmax or 0.0
+    ends = ("neither", "max", "min", "both")[2 * (values.min() < low) + (values.max() > high)]
+    return norm, colours, ends
+
+
+def _square(cell: style.Box) -> style.Box:
+    """The room of a panel for its 3D axes, which are square and reach beyond it."""
+    left, bottom, width, height = cell
+    side = 1.1 * width
+    return left - 0.07 * width, bottom + 0.50 * height - 0.5 * side, side, side
+
+
+def _rail(figure: Figure, cell: style.Box) -> Any:
+    """Axes for a colour bar at the lower end of a panel."""
+    left, bottom, width, _ = cell
+    return style.box_axes(figure, (left + 0.2 * width, bottom + 6.8, 0.6 * width, 1.5))
+
+
+def _bar(
+    figure: Figure, rail: Any, norm: Normalize, colours: Colormap, ends: str, name: str
+) -> Colorbar:
+    bar = figure.colorbar(
+        ScalarMappable(norm, colours), cax=rail, extend=ends, orientation="horizontal"
+    )
+    style.plain(bar)
+    bar.ax.tick_params(length=2.0, pad=1.5)
+    bar.ax.set_xlabel(axis_label(name), labelpad=1.0)
+    assert norm.vmin is not None
+    assert norm.vmax is not None
+    if name in scene.DIRECTIONS:
+        bar.set_ticks([-180.0, -90.0, 0.0, 90.0, 180.0])
+    else:
+        marks = _round_roots(norm.vmin, norm.vmax)
+        bar.set_ticks(marks, labels=[f"{mark:g}".replace("-", "−") for mark in marks])
+    bar.minorticks_off()
+    return bar
+
+
+def _round_roots(low: float, high: float) -> list[float]:
+    """Round numbers that lie about evenly on a square-root scale."""
+    largest = max(abs(low), abs(high))
+    step = 10.0 ** np.floor(np.log10(largest))
+    step *= max(f for f in (1.0, 2.0, 5.0) if f * step <= largest)
+    marks = [0.0]
+    for sign, end, other in ((-1.0, -low, high), (1.0, high, -low)):
+        shares = (1.0,) if other > 0.1 * largest else (1.0, 0.25)
+        marks += [sign * f * step for f in shares if f * step <= end and end > 0.1 * largest]
+    return sorted(float(f"{mark:.3g}") for mark in marks)

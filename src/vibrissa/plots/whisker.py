@@ -1,10 +1,13 @@
-"""The whisker in three views, drawn with its taper."""
+"""The whisker in three views, with its taper; bent ones, with their contacts and forces."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
+import matplotlib as mpl
 import numpy as np
+import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
@@ -14,7 +17,9 @@ from numpy.typing import ArrayLike
 
 from vibrissa.numerics import Array
 from vibrissa.plots import style
-from vibrissa.quantities import axis_label, to_display
+from vibrissa.plots.verdicts import triplet_label
+from vibrissa.quantities import axis_label, quantity, to_display
+from vibrissa.scene import DIRECTIONS, SIGNALS
 
 _MAGNIFICATIONS = (1, 2, 3, 5, 10, 20, 50, 100)
 _WIDE = 0.02
@@ -154,3 +159,393 @@ def _caption(axes: Axes, name: str | None, magnification: float, assumed: Sequen
         color=style.MUTED,
         fontsize=style.SMALL,
     )
+
+
+_COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.INK)
+_REST = "#c4c4c4"
+_ARROW = 0.2
+"""Length of the longest arrow, as a share of the whiskers' extent."""
+
+_BENT_GAP = 10.0
+"""Room around and between the views, mm on paper."""
+
+_ROW = 4.0
+"""Room of a row of the legend, mm."""
+
+_FORCES = 25.0
+"""Room below the side view from which on forces are drawn there, mm."""
+
+_BENT_NARROWEST = 0.11
+"""Smallest half of an axis, as a share of the whiskers' extent."""
+
+
+class _Drawn(NamedTuple):
+    rest: Array
+    lines: Array
+    points: Array
+    arrows: Array
+    forces: Array
+    colours: list[str]
+    labels: Sequence[str]
+    dashes: Sequence[Any] = ()
+
+
+def bent_views(
+    rest: ArrayLike,
+    centerlines: ArrayLike,
+    contact_points: ArrayLike | None = None,
+    forces: ArrayLike | None = None,
+    *,
+    labels: Sequence[str] = (),
+    width: style.Width = "double",
+) -> Figure:
+    """Draw a whisker bent in some ways, from above (x–y) and from the side (x–z), to one scale.
+
+    Parameters
+    ----------
+    rest : array_like (n, 3)
+        The resting whisker, from base to tip, whisker frame, m.
+    centerlines : array_like (m, k, 3)
+        The bent ones, m; those with NaN, which have no equilibrium, are left out.
+    contact_points : array_like (m, 3), optional
+        Contact point of each whisker, m.
+    forces : array_like (m, 3), optional
+        Forces on the whisker, whisker frame, N: drawn as arrows that end in the contact points, the
+        longest a fifth as long as the whisker.
+    labels : sequence of str, optional
+        One for each. With up to four curves each has a colour of its own; more are shaded from
+        first to last.
+    width : {"single", "double"}
+        Columns of the page: the views stand side by side in two, one below the other in one.
+
+    Returns
+    -------
+    Figure
+        Two axes, in mm, and where there is room for it the sizes of the forces; or the sentence
+        "nothing bent".
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, or there are forces without contact points.
+    """
+    straight, lines, points, force = _check(rest, centerlines, contact_points, forces)
+    if labels and len(labels) != len(lines):
+        raise ValueError(f"there are {len(labels)} labels for {len(lines)} bent whiskers")
+    colours = _colours(len(lines))
+    known = np.flatnonzero(np.isfinite(lines).all(axis=(1, 2)))
+    with style.looking():
+        if not known.size:
+            return style.sentence("nothing bent", width)
+        extent = float(np.ptp(straight, axis=0).max())
+        size = np.linalg.norm(force[known], axis=1)
+        largest = float(np.nanmax(size)) if np.isfinite(size).any() else 0.0
+        arrows = force[known] * (_ARROW * extent / largest if largest > 0.0 else np.nan)
+        drawn = _Drawn(
+            straight,
+            lines[known],
+            points[known],
+            arrows,
+            to_display("force", size),
+            [colours[i] for i in known],
+            [labels[int(i)] for i in known] if labels else (),
+        )
+        figure = _bent_figure(drawn, _limits(drawn, extent), width)
+        if largest > 0.0:
+            low, high = to_display("force", np.array([np.nanmin(size), largest]))
+            style.conclude(figure, f"Contacts held by forces from {low:.3g} to {high:.3g} µN")
+        return figure
+
+
+def _check(
+    rest: ArrayLike,
+    centerlines: ArrayLike,
+    contact_points: ArrayLike | None,
+    forces: ArrayLike | None,
+) -> tuple[Array, Array, Array, Array]:
+    """Places in mm, and forces, NaN where there are none."""
+    straight, lines = to_display("centerline", rest), to_display("centerline", centerlines)
+    none = np.full((len(lines), 3), np.nan) if lines.ndim else np.empty((0, 3))
+    points = none if contact_points is None else to_display("contact_point", contact_points)
+    force = none if forces is None else np.asarray(forces, dtype=np.float64)
+    right = straight.ndim == 2 and lines.ndim == 3 and straight.shape[-1] == lines.shape[-1] == 3
+    if not right or points.shape != none.shape or force.shape != none.shape:
+        raise ValueError(
+            f"rest, centerlines, contact points and forces have shapes {straight.shape}, "
+            f"{lines.shape}, {points.shape} and {force.shape}; (n, 3), (m, k, 3), (m, 3) and "
+            "(m, 3) are needed"
+        )
+    if forces is not None and contact_points is None:
+        raise ValueError("there are forces without contact points: give both")
+    return straight, lines, points, force
+
+
+def _colours(count: int) -> list[str]:
+    if count <= len(_COLOURS):
+        return list(_COLOURS[:count])
+    shades = mpl.colormaps["viridis"](np.linspace(0.0, 0.9, count))
+    return [mpl.colors.to_hex(shade) for shade in shades]
+
+
+def _limits(drawn: _Drawn, extent: float, tail: float = 1.0) -> Array:
+    """Limits (3, 2), mm, that hold whiskers and arrows, these so many times as long."""
+    ends = drawn.points - tail * drawn.arrows
+    parts = (drawn.rest, drawn.lines.reshape(-1, 3), drawn.points, ends)
+    everything = np.concatenate(parts)
+    return style.limits_around(everything, 0.03 * extent, _BENT_NARROWEST * extent)
+
+
+def _bent_figure(drawn: _Drawn, limits: Array, width: style.Width) -> Figure:
+    page, span = style.page_width(width), np.ptp(limits, axis=1)
+    abreast = width == "double"
+    room = page - _LEFT - _RIGHT
+    scale = ((room - _BENT_GAP - _LEFT) / 2.0 if abreast else room) / span[0]
+    tall = scale * span[1:]
+    below = 0.0 if abreast else tall[1] + _BENT_GAP + _BOTTOM
+    columns = 2 if abreast else 1
+    rows = -(-len(drawn.labels) // (2 * columns))
+    height = (max(tall) if abreast else tall[0]) + below + _BOTTOM + _TOP + _ROW * rows
+    figure = style.new_figure(width, height, None)
+    for number, j in enumerate((1, 2)):
+        across = abreast * number
+        left = _LEFT + across * (scale * span[0] + _BENT_GAP + _LEFT)
+        top = (
+            height
+            - _TOP
+            - _ROW * rows
+            - (0.0 if abreast else number * (tall[0] + _BENT_GAP + _BOTTOM))
+        )
+        box = (left, top - tall[number], scale * span[0], tall[number])
+        axes = _panel(figure, box, drawn, limits, j)
+        axes.set_xlabel(axis_label("x"))
+        style.head(axes, "ab"[number], ("from above", "from the side")[number])
+    below_side = tall[0] - tall[1] - _BENT_GAP - _BOTTOM
+    if abreast and below_side > _FORCES and np.isfinite(drawn.forces).any():
+        corner = _LEFT + scale * span[0] + _BENT_GAP + _LEFT, _BOTTOM
+        _forces(style.box_axes(figure, (*corner, scale * span[0], below_side - _TOP)), drawn)
+    if drawn.labels:
+        handles, texts = figure.axes[0].get_legend_handles_labels()
+        # Above the views, from where the first begins.
+        place = (_LEFT / page, 1.0 - 0.5 / height)
+        figure.legend(
+            handles, texts, loc="upper left", bbox_to_anchor=place, ncols=2 * columns, borderpad=0.0
+        )
+    return figure
+
+
+def _forces(axes: Axes, drawn: _Drawn) -> None:
+    """State how large the forces are, over how far from the resting whisker they act."""
+    away = np.linalg.norm(drawn.points[:, None] - drawn.rest, axis=-1).min(axis=1)
+    axes.scatter(away, drawn.forces, 14.0, color=drawn.colours, zorder=3)
+    axes.set(xlabel="distance of the contact from rest (mm)", ylabel=style.size_label("force"))
+    axes.set(xlim=(0.0, None), ylim=(0.0, None))
+    style.head(axes, "c", "force")
+
+
+def _panel(figure: Figure, box: style.Box, drawn: _Drawn, limits: Array, j: int) -> Axes:
+    """Whiskers, contacts and forces, seen along y or z."""
+    axes = style.box_axes(figure, box, xlim=limits[0], ylim=limits[j])
+    axes.yaxis.set_major_locator(MaxNLocator(max(3, round(box[3] / 10.0)), integer=True))
+    axes.set_ylabel(axis_label("xyz"[j]))
+    rest = drawn.rest
+    axes.plot(rest[:, 0], rest[:, j], color=_REST, linewidth=1.6, solid_capstyle="round")
+    for i, (line, colour) in enumerate(zip(drawn.lines, drawn.colours, strict=True)):
+        label = drawn.labels[i] if drawn.labels else None
+        dashes = drawn.dashes[i] if drawn.dashes else "-"
+        axes.plot(
+            line[:, 0], line[:, j], color=colour, linestyle=dashes, linewidth=1.1, label=label
+        )
+        point, arrow = drawn.points[i], drawn.arrows[i]
+        if np.isfinite(arrow).all():
+            ends = (point - arrow)[[0, j]], point[[0, j]]
+            style.force_arrow(axes, *ends, colour, 1.0)
+        axes.plot(point[0], point[j], "o", color=colour, markersize=2.6, zorder=5)
+    return axes
+
+
+_PAIR_COLOURS = (style.BLUE, style.ORANGE)
+_DASHES = ("-", (0, (5, 1.5)))
+_NAMES = ("A", "B")
+_PAIR_ARROW = 0.22
+"""Length of the longer force's arrow, as a share of the whisker's extent."""
+
+_CENTRED: dict[str, Any] = {"ha": "center", "va": "center"}
+
+_TABLE = 70.0
+"""Width of the table next to the views, mm; its height is as large where it is below them."""
+
+
+def witness_pair(witness: xr.Dataset, *, width: style.Width = "double") -> Figure:
+    """Draw two bent whiskers with three equal signals, and list all six.
+
+    Parameters
+    ----------
+    witness : Dataset
+        Two contacts in the whisker frame, SI units: ``rest`` (node, space) and ``centerline``
+        (pair, node, space), m; ``contact_point`` (pair, space), m; ``force`` (pair, space), N;
+        ``arc_length`` (pair), m; the six signals ``Fx`` … ``MD`` (pair). The attribute ``triplet``
+        names the three that are the same, such as ``"Fx MB MD"``.
+    width : {"single", "double"}
+        Columns of the page.
+
+    Returns
+    -------
+    Figure
+        Views from above (x–y) and from the side (x–z), and a table.
+
+    Raises
+    ------
+    ValueError
+        If something is missing or not finite, or if there are not two contacts.
+    """
+    triplet = _checked_pair(witness)
+    extent = float(np.ptp(to_display("centerline", witness["rest"].values), axis=0).max())
+    drawn = _pair(witness, extent)
+    limits = _limits(drawn, extent, 1.3)  # with the letters at the arrows' tails
+    span = np.ptp(limits, axis=1)
+    page = style.page_width(width)
+    abreast = width == "double"
+    left, gap, bottom, top = 12.0, 3.0, 9.0, 2.0
+    room = page - left - 2.0 - (_TABLE + 6.0 if abreast else 0.0)
+    scale = min(room / span[0], 70.0 / (span[1] + span[2]))
+    views = bottom + gap + top + scale * (span[1] + span[2])
+    height = max(views, 60.0) if abreast else views + 52.0
+    shift = height - views
+    with style.looking():
+        figure = style.new_figure(width, height, None)
+
+        low = shift + bottom
+        across, up, aside = scale * span
+        side = _panel(figure, (left, low, across, aside), drawn, limits, 2)
+        above = _panel(figure, (left, low + aside + gap, across, up), drawn, limits, 1)
+        above.tick_params(labelbottom=False)
+        side.set_xlabel(axis_label("x"))
+        tails = drawn.points - 1.2 * drawn.arrows
+        for tail, name, colour in zip(tails, _NAMES, _PAIR_COLOURS, strict=True):
+            above.text(tail[0], tail[1], name, color=colour, fontweight="bold", **_CENTRED)
+        apart = np.linalg.norm(drawn.points[1] - drawn.points[0])
+        style.conclude(
+            figure,
+            f"Two contacts {apart:.1f} mm apart have the same ({triplet_label(' '.join(triplet))})",
+        )
+        start = left + scale * span[0] + 8.0 if abreast else 3.0
+        box = (
+            start / page,
+            (height - 58.0) / height if abreast else 0.0,
+            (page - start - 1.5) / page,
+            (57.0 if abreast else 50.0) / height,
+        )
+        _table(figure, box, witness, triplet)
+        return figure
+
+
+def _checked_pair(witness: xr.Dataset) -> tuple[str, ...]:
+    needed = ("rest", "centerline", "contact_point", "force", "arc_length", *SIGNALS)
+    missing = [name for name in needed if name not in witness]
+    if missing:
+        raise ValueError(f"the witness lacks {', '.join(missing)}")
+    if witness.sizes.get("pair") != 2:
+        raise ValueError(f"a witness is a pair of contacts; got {witness.sizes.get('pair', 0)}")
+    lacking = [name for name in needed if not np.isfinite(witness[name].values).all()]
+    if lacking:
+        raise ValueError(f"the witness has missing values in {', '.join(lacking)}")
+    triplet = tuple(str(witness.attrs.get("triplet", "")).split())
+    if len(triplet) < 1 or not set(triplet) <= set(SIGNALS):
+        raise ValueError(
+            f"the witness's triplet is {witness.attrs.get('triplet')!r}; names of signals are "
+            f"needed, of {', '.join(SIGNALS)}"
+        )
+    return triplet
+
+
+def _sizes(witness: xr.Dataset) -> Array:
+    """Sizes of the two forces, N."""
+    force = witness["force"].transpose("pair", "space").values
+    return np.asarray(np.linalg.norm(force, axis=1))
+
+
+def _pair(witness: xr.Dataset, extent: float) -> _Drawn:
+    """The two whiskers with their contacts and forces."""
+    sizes, force = _sizes(witness), witness["force"].transpose("pair", "space").values
+    lines = witness["centerline"].transpose("pair", "node", "space").values
+    return _Drawn(
+        to_display("centerline", witness["rest"].transpose("node", "space").values),
+        to_display("centerline", lines),
+        to_display("contact_point", witness["contact_point"].transpose("pair", "space").values),
+        _PAIR_ARROW * extent * force / sizes.max(),
+        to_display("force", sizes),
+        list(_PAIR_COLOURS),
+        (),
+        _DASHES,
+    )
+
+
+def _table(
+    figure: Figure,
+    box: tuple[float, float, float, float],
+    witness: xr.Dataset,
+    triplet: tuple[str, ...],
+) -> None:
+    """Signals and contacts of both, what is the same shaded."""
+    axes = figure.add_axes(box, xlim=(0.0, 1.0), ylim=(13.2, -0.6))
+    axes.set_axis_off()
+    look: dict[str, Any] = {"va": "center_baseline"}
+    for x, name, colour in zip((0.62, 0.97), _NAMES, _PAIR_COLOURS, strict=True):
+        axes.text(x, 0.0, name, color=colour, fontweight="bold", ha="right", **look)
+    axes.axhline(0.6, color=style.INK, linewidth=0.5)
+    rows: list[tuple[str, Array]] = [(name, witness[name].values) for name in SIGNALS]
+    rows += [("arc_length", witness["arc_length"].values)]
+    rows += [("force", _sizes(witness))]
+    for i, (name, values) in enumerate(rows):
+        y = i + 1.2 + (0.3 if i >= len(SIGNALS) else 0.0)
+        same = name in triplet
+        if same:
+            axes.fill_between([0.0, 1.0], y - 0.5, y + 0.5, color=style.SHADE, linewidth=0.0)
+        symbol = "$|\\mathbf{F}|$" if name == "force" else f"${_symbol(name)}$"
+        axes.text(0.02, y, f"{symbol}  ({quantity(name).display_unit})", **look)
+        for x, value in zip((0.62, 0.97), to_display(name, values), strict=True):
+            text = _number(float(value), 7 if same else 4)
+            axes.text(x, y, text, ha="right", color=style.INK if same else style.MUTED, **look)
+    axes.axhline(9.2, color=style.INK, linewidth=0.5)
+    for line, text in enumerate(_sentences(witness, triplet)):
+        axes.text(0.02, 10.0 + line, text, **(look | {"fontsize": style.SMALL}))
+
+
+def _symbol(name: str) -> str:
+    return "s_c" if name == "arc_length" else quantity(name).symbol
+
+
+def _number(value: float, digits: int) -> str:
+    return f"{value:#.{digits}g}".rstrip(".").replace("-", "−")
+
+
+def _sentences(witness: xr.Dataset, triplet: tuple[str, ...]) -> list[str]:
+    """State how equal the signals are, and how far apart the contacts."""
+    apart = float(np.linalg.norm(np.diff(witness["contact_point"].values, axis=0)))
+    step = np.diff(witness["rest"].transpose("node", "space").values, axis=0)
+    length = float(np.linalg.norm(step, axis=1).sum())
+    return [
+        f"the shaded signals differ by {_power(_difference(witness, triplet))} of their size",
+        f"the contacts lie {1e3 * apart:.2f} mm = {apart / length:.3f} $L$ apart",
+        "arrows: force on the whisker; grey: at rest",
+    ]
+
+
+def _power(value: float) -> str:
+    if value == 0.0:
+        return "0"
+    digits, power = f"{value:.0e}".split("e")
+    return rf"${digits} \cdot 10^{{{int(power)}}}$"
+
+
+def _difference(witness: xr.Dataset, triplet: tuple[str, ...]) -> float:
+    """Largest relative difference of the signals that are the same; of directions, in rad."""
+    worst = 0.0
+    for name in triplet:
+        one, other = (float(v) for v in witness[name].values)
+        if name in DIRECTIONS:
+            gap = abs(np.angle(np.exp(1j * (one - other))))
+        else:
+            gap = abs(one - other) / max(abs(one), abs(other), 1e-300)
+        worst = max(worst, float(gap))
+    return worst

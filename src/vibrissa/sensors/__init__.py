@@ -1,6 +1,14 @@
 """The sensor at the whisker's base: its readings, mounting and calibration."""
 
-from vibrissa.sensors.files import load_sensor, save_sensor
+from vibrissa.sensors.files import (
+    Stage as Stage,
+    StageSweep as StageSweep,
+    StageTouches as StageTouches,
+    load_sensor,
+    load_suspended as load_suspended,
+    save_sensor,
+    save_suspended as save_suspended,
+)
 from vibrissa.sensors.frame import FrameCalibration, SensorFrame, calibrate_frame
 from vibrissa.sensors.mixing import (
     MixingCalibration,
@@ -19,17 +27,14 @@ from vibrissa.sensors.sensor import (
     Sensor,
     component_noise as component_noise,
 )
-from vibrissa.sensors.stage import (
-    Stage as Stage,
-    StageSweep as StageSweep,
-    StageTouches as StageTouches,
-    load_suspended as load_suspended,
-    save_suspended as save_suspended,
-)
 from vibrissa.sensors.stiffness import StiffnessFit, fit_stiffness
-from vibrissa.sensors.suspended import SuspendedWhisker, Touches as Touches
+from vibrissa.sensors.suspended import (
+    SuspendedWhisker,
+    SweptContacts,
+    Touches as Touches,
+    follow_sweep,
+)
 from vibrissa.sensors.suspension import SuspensionCalibration, calibrate_suspension
-from vibrissa.sensors.sweep import SweptContacts, follow_sweep
 
 __all__ = [
     "COMPONENTS",

@@ -1,4 +1,4 @@
-"""Sensors as TOML, in SI units.
+"""Files of sensors, TOML in SI units, and of touches on a positioning stage.
 
     channels = ["Fx", "My", "Mz"]
     mixing = [[1, 0, 0, 0, 0, 0], …]   # a line a channel: of Fx, Fy, Fz, Mx, My, Mz
@@ -25,29 +25,79 @@ larger than those per N.
 Everything but channels and noise may be left out. Channels that are components in other units
 need one number only: ``mixing = 1e3`` for mN and mN·m (= N·mm). Noise, bias and the largest reading
 are in the channels' units.
+
+**Tables of a positioning stage**: touches at known points, the resting shape, sweeps.
+
+    unit = "mm"                              # of all lengths in the tables and below
+    readings = ["sx", "sy", "sz"]            # columns of the channels
+    position = ["px", "py", "pz"]            # columns of the stage
+
+    [touches]                                # a probe on the stage touches the whisker
+    file = "touches.csv"
+    origin = [64.3, 98.1, 16.1]              # where the stage is when the probe is at the base
+    axes = ["x", "y", "z"]                   # the sensor's along the stage's; or a 3 × 3 matrix
+    farthest = 40                            # contacts farther from the base are not used
+    rest = [0, 0, 0]                         # readings of the free whisker; by default those of
+                                             # rows in which the probe is at the base
+    drift = [15, 40, 40]                     # change from one recording to the next; by default
+                                             # that of those rows from the stated rest
+
+    [[shape]]                                # points along the whisker at rest, from base to tip
+    file = "shape_y.csv"
+    columns = {x = "px", y = "py"}           # the sensor's coordinates
+    [[shape]]                                # one that the first lacks is read off another
+    file = "shape_x.csv"
+    columns = {x = "px", z = "pz"}
+    leave_out = [7]                          # rows that are wrong, from 0
+
+    [whisker]                                # only their ratios count but for forces
+    base_radius = 0.1
+    tip_radius = 0.1
+
+    [sweep]                                  # a moving sensor, or the thing that it touches
+    moves = "sensor"
+    origin = [60.4, 86.9, 47.0]
+    axes = ["-x", "-y", "z"]
+
+Files are found next to the description. A calibrated sensor is a NetCDF file that carries it.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from vibrissa.deferred import xr
 from vibrissa.io import (
     check_keys,
+    in_file,
+    is_netcdf,
     number_array,
     one_number,
+    parsed_toml,
     quoted,
+    read_dataset,
+    read_numbers,
+    read_text,
     read_toml,
     replacing,
     subtable,
     three_numbers,
+    write_netcdf,
 )
+from vibrissa.numerics import Array
 from vibrissa.sensors.frame import SensorFrame
+from vibrissa.sensors.regression import ThinPlate
 from vibrissa.sensors.sensor import Sensor
+from vibrissa.sensors.suspended import FEATURES, SuspendedWhisker
+from vibrissa.sensors.suspension import SuspensionCalibration
+from vibrissa.whisker import Whisker
 
 _NUMBERS = ("noise", "bias", "drift", "resolution", "largest", "gain_error")
 _OTHERS = ("relative_noise", "mixing_error", "mixing_covariance")
@@ -205,3 +255,264 @@ def save_sensor(path: str | PathLike[str], sensor: Sensor) -> None:
 
 def _array(values: Any) -> str:
     return str(np.asarray(values, dtype=np.float64).tolist())
+
+
+_UNITS = {"m": 1.0, "mm": 1e-3, "um": 1e-6}
+_STAGE_KEYS = {"unit", "readings", "position", "touches", "shape", "whisker", "sweep"}
+_TOUCHES = {"file", "origin", "axes", "farthest", "base_sigma", "rest", "drift"}
+_SHAPE = {"file", "columns", "leave_out"}
+_WHISKER = {"base_radius", "tip_radius", "youngs_modulus", "noise"}
+_SWEEP = {"origin", "axes", "moves"}
+_AT_BASE = 1e-6
+"""Distance from the base, m, up to which a probe touches nothing."""
+
+
+class StageTouches(NamedTuple):
+    """Touches of a table."""
+
+    points: Array  # (n, 3), sensor frame, m
+    readings: Array
+    rest: Array | None  # as stated, or the median of those with the probe at the base
+    drift: Array  # standard deviation from one recording to the next; zero where not known
+
+
+class StageSweep(NamedTuple):
+    """A sweep of a table."""
+
+    readings: Array
+    position: Array  # (n, 3), of the sensor's origin in the frame of what is touched, m
+    rotation: Array  # (3, 3), from the sensor's frame to it
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Description of a stage's tables."""
+
+    text: str
+    folder: Path = Path()
+
+    def __post_init__(self) -> None:
+        """Check the keys."""
+        table = parsed_toml(self.text)
+        check_keys(table, _STAGE_KEYS, "the description of the stage")
+        for name, keys in (("touches", _TOUCHES), ("whisker", _WHISKER), ("sweep", _SWEEP)):
+            check_keys(subtable(table, name), keys, f"[{name}]")
+        shapes = table.get("shape", [])
+        if not isinstance(shapes, list) or not all(isinstance(s, Mapping) for s in shapes):
+            raise ValueError(f"shape is {quoted(shapes)}; write [[shape]] for each of its tables")
+        for shape in shapes:
+            check_keys(shape, _SHAPE, "[[shape]]")
+        if table.get("unit", "mm") not in _UNITS:
+            raise ValueError(f"unit is {quoted(table['unit'])}; known are {', '.join(_UNITS)}")
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Stage:
+        """Read a description."""
+        with in_file(path):
+            return cls(read_text(path), Path(path).parent)
+
+    @property
+    def _table(self) -> dict[str, Any]:
+        return parsed_toml(self.text)
+
+    @property
+    def _unit(self) -> float:
+        return _UNITS[self._table.get("unit", "mm")]
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the channels."""
+        return _names(self._table, "readings")
+
+    @property
+    def base_sigma(self) -> float:
+        """Standard deviation of the stated place of the base, m."""
+        return self._unit * one_number(subtable(self._table, "touches"), "base_sigma", 0.15)
+
+    def _columns(self, file: Any, names: tuple[str, ...]) -> Array:
+        """Columns of a file of the description, or of any other."""
+        if isinstance(file, Path):
+            path = file
+        elif isinstance(file, str):
+            path = self.folder / file
+        else:
+            raise ValueError(f"file is {quoted(file)}; the name of a table is needed")
+        known, values = read_numbers(path)
+        missing = [name for name in names if name not in known]
+        if missing:
+            got = ", ".join(name for name in known if name)
+            raise ValueError(f"{path} lacks {', '.join(missing)}; its columns are {got}")
+        return values[:, [known.index(name) for name in names]]
+
+    def touches(self) -> StageTouches:
+        """Touches of the whisker at known points."""
+        own = subtable(self._table, "touches")
+        position = self._columns(own.get("file"), _names(self._table, "position"))
+        readings = self._columns(own.get("file"), self.channels)
+        axes = _directions(own, "touches")
+        points = self._unit * (position - three_numbers(own, "origin", (0.0, 0.0, 0.0))) @ axes
+        radius = np.linalg.norm(points, axis=1)
+        rest = radius <= _AT_BASE
+        touched = ~rest & (radius <= self._unit * one_number(own, "farthest", np.inf))
+        free = np.median(readings[rest], axis=0) if rest.any() else None
+        drift = np.zeros(len(self.channels))
+        if "rest" in own:
+            stated = number_array(own["rest"], "rest")
+            if free is not None and stated.shape == free.shape:
+                drift = np.abs(free - stated)
+            free = stated
+        if "drift" in own:
+            drift = number_array(own["drift"], "drift")
+        return StageTouches(points[touched], readings[touched], free, drift)
+
+    def whisker(self) -> Whisker:
+        """Whisker at rest, in the sensor's frame, its base at the origin."""
+        shapes = self._table.get("shape", [])
+        if not shapes:
+            raise ValueError("[[shape]] is missing: points along the whisker at rest are needed")
+        found: dict[str, Array] = {}
+        tables = [self._shape(shape) for shape in shapes]
+        found |= tables[0]
+        for other in tables[1:]:
+            shared = [name for name in other if name in tables[0]]
+            for name in set(other) - set(found):
+                if not shared:
+                    raise ValueError("two tables of the shape have no coordinate in common")
+                found[name] = _read_off(other[shared[0]], other[name], found[shared[0]], shared[0])
+        lacking = [name for name in "xyz" if name not in found]
+        if lacking:
+            raise ValueError(f"the shape lacks {', '.join(lacking)}: name its columns")
+        points = np.stack([found[name] for name in "xyz"], axis=1)
+        apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > _AT_BASE
+        own = subtable(self._table, "whisker")
+        usual = 1e-4 / self._unit
+        noise = self._unit * one_number(own, "noise", 0.0)
+        return Whisker.from_points(
+            points[np.append(True, apart)],
+            noise=noise or None,
+            youngs_modulus=one_number(own, "youngs_modulus", 200e9),
+            any_length=True,
+            base_radius=self._unit * one_number(own, "base_radius", usual),
+            tip_radius=self._unit * one_number(own, "tip_radius", usual),
+        )
+
+    def _shape(self, shape: Mapping[str, Any]) -> dict[str, Array]:
+        """Coordinates of a table of the shape, m, less those of its first point."""
+        columns = shape.get("columns", {"x": "px", "y": "py", "z": "pz"})
+        if not isinstance(columns, Mapping) or not set(columns) <= set("xyz"):
+            raise ValueError(f"columns is {quoted(columns)}; as {{x = 'px', y = 'py'}} is needed")
+        values = self._columns(shape.get("file"), tuple(columns.values()))
+        wrong = number_array(shape.get("leave_out", []), "leave_out").astype(int)
+        values = np.delete(values, wrong, axis=0)
+        return dict(zip(columns, self._unit * (values - values[0]).T, strict=True))
+
+    def sweep(self, path: str | PathLike[str]) -> StageSweep:
+        """Read a sweep."""
+        own = subtable(self._table, "sweep")
+        moves = own.get("moves", "sensor")
+        if moves not in ("sensor", "object"):
+            raise ValueError(f"moves is {quoted(moves)}; 'sensor' or 'object' is needed")
+        axes = _directions(own, "sweep")
+        position = self._columns(Path(path), _names(self._table, "position"))
+        position = self._unit * (position - three_numbers(own, "origin", (0.0, 0.0, 0.0)))
+        return StageSweep(
+            self._columns(Path(path), self.channels),
+            position if moves == "sensor" else -position,
+            axes,
+        )
+
+
+def _names(table: Mapping[str, Any], key: str) -> tuple[str, ...]:
+    names = table.get(key)
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"{key} is {quoted(names)}; the names of columns are needed")
+    if key == "position" and len(names) != 3:
+        raise ValueError(f"position is {quoted(names)}; the columns of x, y and z are needed")
+    return tuple(names)
+
+
+def _directions(table: Mapping[str, Any], where: str) -> Array:
+    """Sensor's axes (columns) along the stage's."""
+    axes = table.get("axes", ["x", "y", "z"])
+    with in_file(f"[{where}]"):
+        return np.asarray(SensorFrame(axes=axes).axes)
+
+
+def _read_off(known: Array, values: Array, wanted: Array, name: str) -> Array:
+    """Values where a shared coordinate is the wanted one."""
+    forward = known if known[-1] >= known[0] else -known
+    order = np.argsort(forward, kind="stable")
+    if np.abs(forward[order] - forward).max() > 0.1 * np.ptp(known):
+        raise ValueError(f"{name} turns back along the shape: nothing can be read off by it")
+    sign = 1.0 if known[-1] >= known[0] else -1.0
+    return np.interp(sign * wanted, forward[order], values[order])
+
+
+_STORED: dict[str, tuple[tuple[str, ...], str]] = {
+    "rotation_compliance": ((), "rad N-1 m-1"),
+    "shift_compliance": ((), "m N-1"),
+    "pivot": (("space",), "m"),
+    "friction": ((), "1"),
+    "readout": (("channel", "feature"), ""),
+    "noise": (("channel",), ""),
+    "drift": (("channel",), ""),
+}
+"""Dimensions and unit of what is stored of a sensor; a channel's own where there is none."""
+
+
+def save_suspended(
+    path: str | PathLike[str], calibration: SuspensionCalibration, stage: Stage
+) -> None:
+    """Write a calibrated sensor that `load_suspended` reads."""
+    sensor = calibration.sensor
+    channel, unknown = ("channel", list(sensor.channels)), ("unknown", list(calibration.names))
+    stored = {
+        name: (dims, getattr(sensor, name), {"units": unit} if unit else None)
+        for name, (dims, unit) in _STORED.items()
+    }
+    data = xr.Dataset(
+        {
+            **stored,
+            "value": ("unknown", calibration.values),
+            "covariance": (("unknown", "unknown_"), calibration.covariance),
+            "readout_covariance": (
+                ("channel", "feature", "feature_"),
+                calibration.readout_covariance,
+            ),
+            "residual": ("channel", calibration.residual),
+        },
+        {channel[0]: channel[1], unknown[0]: unknown[1], "feature": list(FEATURES)},
+        {"kind": KIND, "stage": stage.text, "undetermined": ", ".join(calibration.undetermined)},
+    )
+    if sensor.residual is not None:
+        data["plate_points"] = (("touch", "space"), sensor.residual.points, {"units": "m"})
+        data["plate_weights"] = (("touch", "channel"), sensor.residual.weights)
+        data["plate_reach"] = ((), sensor.residual.reach, {"units": "m"})
+    parts = {"/": data, "whisker": sensor.whisker.to_dataset()}
+    write_netcdf(path, xr.DataTree.from_dict(parts))
+
+
+KIND = "suspended whisker"
+
+
+def load_suspended(path: str | PathLike[str]) -> tuple[SuspendedWhisker, Stage]:
+    """Read a calibrated sensor, and the description of its stage's tables."""
+    data = read_dataset(path) if is_netcdf(path) else xr.Dataset()
+    if data.attrs.get("kind") != KIND:
+        raise ValueError(f"{path} holds no calibrated suspended whisker; `vibrissa calibrate` does")
+    residual = None
+    if "plate_points" in data:
+        residual = ThinPlate(
+            data["plate_points"].values,
+            data["plate_weights"].values,
+            float(data["plate_reach"]),
+            data["noise"].values,
+        )
+    stored: dict[str, Any] = {name: data[name].values[()] for name in _STORED if name in data}
+    sensor = SuspendedWhisker(
+        Whisker.from_dataset(read_dataset(path, "whisker")),
+        channels=tuple(str(name) for name in data["channel"].values),
+        residual=residual,
+        **stored,
+    )
+    return sensor, Stage(str(data.attrs["stage"]), Path(path).parent)

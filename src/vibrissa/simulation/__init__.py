@@ -1,7 +1,10 @@
 """Simulated trials with known truth: motion, dynamics, films, sensor readings."""
 
-from vibrissa.simulation.dynamics import Dynamics, resonances as resonances
-from vibrissa.simulation.dynamics_fit import FittedDynamics, fit_dynamics
+from vibrissa.simulation.dynamics import (
+    Dynamics,
+    inertial_wrench as inertial_wrench,
+    resonances as resonances,
+)
 from vibrissa.simulation.film import (
     ImageConditions,
     film,
@@ -10,7 +13,6 @@ from vibrissa.simulation.film import (
     views_of as views_of,
     with_true_traces as with_true_traces,
 )
-from vibrissa.simulation.held import inertial_wrench as inertial_wrench
 from vibrissa.simulation.motion import (
     Motion,
     array_whisking,
@@ -30,7 +32,7 @@ from vibrissa.simulation.script import (
     read_script as read_script,
 )
 from vibrissa.simulation.simulate import measure, simulate
-from vibrissa.simulation.vibration import Vibration
+from vibrissa.simulation.vibration import FittedDynamics, Vibration, fit_dynamics
 
 __all__ = [
     "Dynamics",

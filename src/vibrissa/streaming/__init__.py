@@ -10,10 +10,11 @@ from vibrissa.streaming.contacts import (
 from vibrissa.streaming.lines import (
     LineKind as LineKind,
     Lines as Lines,
+    Pose,
+    Poses,
     Sample as Sample,
     rotation_of as rotation_of,
 )
-from vibrissa.streaming.poses import Pose, Poses
 from vibrissa.streaming.sources import (
     Answers as Answers,
     ContactRecorder as ContactRecorder,

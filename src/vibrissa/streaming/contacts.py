@@ -15,8 +15,7 @@ from vibrissa.contacts import Contact, ContactFilter, Estimator, Followed
 from vibrissa.numerics import Array
 from vibrissa.rod import PointForce, deflect
 from vibrissa.signals import SIGNALS, signals_of
-from vibrissa.streaming.lines import FRAME, LineKind, Lines, Sample
-from vibrissa.streaming.poses import Poses
+from vibrissa.streaming.lines import FRAME, LineKind, Lines, Poses, Sample
 
 # Time that falls by more than this comes from a sender that has begun anew, s.
 _ANEW = 1.0

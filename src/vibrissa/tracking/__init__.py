@@ -5,7 +5,7 @@ from vibrissa.tracking.refine.fit import (
     FitOptions as FitOptions,
     RodFit as RodFit,
 )
-from vibrissa.tracking.refine.trace_series import TraceSeries as TraceSeries
+from vibrissa.tracking.refine.rods import TraceSeries as TraceSeries
 from vibrissa.tracking.space.curve import SpaceCurve as SpaceCurve, merge
 from vibrissa.tracking.space.frame_pairs import paired_frames
 from vibrissa.tracking.space.pose import (

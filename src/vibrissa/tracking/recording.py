@@ -1,26 +1,152 @@
-"""Tracked whiskers, and the recording that is made of them."""
+"""Tracked whiskers, and the recording that is made of them.
+
+Contact points that do not come from the rod are seen by a person, or nearest to a known object.
+They are compared with the contact points of the fitted rod. It does not depend on those of a
+person: where both agree, each is right. It does on a known object, on whose surface its contacts
+are; then the difference shows how well the measured whisker agrees with the object.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.cameras import Camera
+from vibrissa.cameras import Camera, triangulate
 from vibrissa.numerics import Array, Mask
 from vibrissa.objects import Surface
 from vibrissa.recording import coordinates, recorded, recording_tree
 from vibrissa.status import Status
-from vibrissa.tracking.contact_points import ContactPoints
 from vibrissa.tracking.refine.fit import RodFit
-from vibrissa.tracking.refine.trace_series import TraceSeries
+from vibrissa.tracking.refine.rods import TraceSeries
 from vibrissa.tracking.space.pose import CUTOFF, BasePose, HeadPose
 from vibrissa.tracking.space.rest_shape import Length, RestShape
 from vibrissa.whisker import Whisker, angles_of
+
+_NEAR = 0.5
+"""Largest difference between the time of a frame and that of its row in a table, frames."""
+
+
+class ContactPoints(NamedTuple):
+    """Contact points of one whisker, and their distances from those of the rod."""
+
+    points: Array
+    arc_length: Array
+    difference: Array
+    source: str
+
+
+def contacts_at(
+    objects: Sequence[Surface], curves: Array, touching: NDArray[np.bool_], rod: RodFit
+) -> ContactPoints:
+    """Take the point of the whisker that is nearest to an object for the contact point."""
+    points = np.full((len(curves), 3), np.nan)
+    rows = np.flatnonzero(touching & np.isfinite(curves).all(axis=(1, 2)))
+    if rows.size:
+        distance = np.min([thing.signed_distance(curves[rows]) for thing in objects], axis=0)
+        points[rows] = _at(curves[rows], _lowest(distance))
+    return _compared(points, rod, "nearest to the object")
+
+
+def given_contacts(
+    table: xr.Dataset,
+    cameras: Sequence[Camera],
+    pairs: NDArray[np.int64],
+    rate: float,
+    whisker: int,
+    rod: RodFit,
+) -> ContactPoints:
+    """Take contact points from a table."""
+    points = np.full((len(pairs), 3), np.nan)
+    number = table["whisker"].values
+    if not np.isin(whisker, number):
+        return _compared(points, rod, "table")
+    one = table.isel(whisker=int(np.flatnonzero(number == whisker)[0]))
+    if "contact_pixel" in one:
+        views = one["view"].values
+        if views.max() >= len(cameras):
+            raise ValueError(f"contact points are given in view {views.max()}, counted from 0")
+        pixels = np.full((len(cameras), len(pairs), 2), np.nan)
+        for column, view in enumerate(views):
+            rows, known = _rows(one["frame"].values, pairs[:, view], 0.0)
+            pixels[view, rows] = one["contact_pixel"].values[known, column]
+        seen = np.isfinite(pixels).all(axis=(0, 2))
+        if seen.any():
+            points[seen] = triangulate(cameras, pixels[:, seen])[0]
+    elif "time" in one.dims:
+        rows, known = _rows(one["time"].values * rate, pairs[:, 0].astype(float), _NEAR)
+        points[rows] = one["contact_point"].values[known]
+    else:
+        rows, known = _rows(one["frame"].values, pairs[:, 0], 0.0)
+        points[rows] = one["contact_point"].values[known]
+    if not np.isfinite(points).any():
+        raise ValueError("the table of contact points has no frame of the videos")
+    return _compared(points, rod, "table")
+
+
+def outside_video(table: xr.Dataset, pairs: NDArray[np.int64], rate: float) -> list[str]:
+    """State how many moments of a table of contact points no frame of the videos has."""
+    timed = "time" in table.dims
+    known = table["time"].values * rate if timed else table["frame"].values.astype(float)
+    within = _NEAR if timed else 0.0
+    first, last = pairs.min() - within, pairs.max() + within
+    outside = known[(known < first) | (known > last)]
+    if not outside.size:
+        return []
+    where = [f"{x / rate:g} s" if timed else f"frame {x:.0f}" for x in (known.min(), known.max())]
+    return [
+        f"{outside.size} of the {known.size} moments in the table of contact points (from "
+        f"{where[0]} to {where[1]}) are outside of the videos, frames {pairs.min()} to "
+        f"{pairs.max()}, and are left out: check where it counts its frames from."
+    ]
+
+
+def _rows(
+    known: NDArray[np.generic], wanted: NDArray[np.generic], within: float
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Indices of wanted moments that are known, and of the rows that are nearest to them."""
+    order = np.argsort(known, kind="stable")
+    sorted_ = np.asarray(known, dtype=np.float64)[order]
+    target = np.asarray(wanted, dtype=np.float64)
+    right = np.clip(np.searchsorted(sorted_, target), 0, len(sorted_) - 1)
+    left = np.maximum(right - 1, 0)
+    nearer = np.abs(sorted_[left] - target) < np.abs(sorted_[right] - target)
+    at = np.where(nearer, left, right)
+    rows = np.flatnonzero(np.abs(sorted_[at] - target) <= within)
+    return rows, order[at[rows]]
+
+
+def _lowest(distance: Array) -> Array:
+    """Index (t,) of the least of rows (t, n), between the samples by a parabola."""
+    n = distance.shape[1]
+    row = np.arange(len(distance))
+    k = np.clip(np.argmin(distance, axis=1), 1, n - 2)
+    a, b, c = distance[row, k - 1], distance[row, k], distance[row, k + 1]
+    bend = a - 2.0 * b + c
+    shift = np.where(bend > 0.0, 0.5 * (a - c) / np.where(bend > 0.0, bend, 1.0), 0.0)
+    return np.asarray(np.clip(k + np.clip(shift, -1.0, 1.0), 0.0, n - 1.0))
+
+
+def _at(curves: Array, index: Array) -> Array:
+    """Points (t, 3) of curves (t, n, 3) at indices between their nodes."""
+    row = np.arange(len(curves))
+    low = np.minimum(index.astype(int), curves.shape[1] - 2)
+    share = (index - low)[:, None]
+    return np.asarray((1.0 - share) * curves[row, low] + share * curves[row, low + 1])
+
+
+def _compared(points: Array, rod: RodFit, source: str) -> ContactPoints:
+    away = np.linalg.norm(rod.centerline - points[:, None], axis=2)
+    known = np.isfinite(away).all(axis=1)
+    arc = np.full(len(points), np.nan)
+    steps = np.linalg.norm(np.diff(rod.centerline[known], axis=1), axis=2)
+    arc[known] = _lowest(away[known] ** 2) * steps.mean(axis=1)
+    difference = np.linalg.norm(points - rod.contact_point, axis=1)
+    return ContactPoints(points, arc, difference, source)
 
 
 @dataclass(frozen=True, eq=False)

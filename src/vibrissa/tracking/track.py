@@ -20,12 +20,16 @@ from vibrissa.deferred import transform
 from vibrissa.numerics import Array, Mask
 from vibrissa.objects import Surface
 from vibrissa.recording import ONE_VIEW
-from vibrissa.tracking.contact_points import contacts_at, given_contacts, outside_video
-from vibrissa.tracking.recording import Tracked, tracked_recording
+from vibrissa.tracking.recording import (
+    Tracked,
+    contacts_at,
+    given_contacts,
+    outside_video,
+    tracked_recording,
+)
 from vibrissa.tracking.refine.fit import FitOptions, Fitter, RodFit
 from vibrissa.tracking.refine.optics import Optics, rough_optics, stated_lenses
-from vibrissa.tracking.refine.rods import rolled
-from vibrissa.tracking.refine.trace_series import TraceSeries
+from vibrissa.tracking.refine.rods import TraceSeries, rolled
 from vibrissa.tracking.space.curve import merge
 from vibrissa.tracking.space.frame_pairs import better_offset, paired_frames
 from vibrissa.tracking.space.pose import CUTOFF, BasePose, HeadPose, base_pose

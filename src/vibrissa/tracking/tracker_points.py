@@ -16,7 +16,7 @@ import xarray as xr
 from vibrissa.cameras import Camera, orthogonal_views
 from vibrissa.deferred import optimize
 from vibrissa.numerics import Array
-from vibrissa.tracking.refine.trace_series import NODES
+from vibrissa.tracking.refine.rods import NODES
 from vibrissa.tracking.trace.trace import STEP, Trace, given
 
 POINT_SIGMA = 0.5

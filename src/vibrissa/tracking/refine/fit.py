@@ -25,14 +25,15 @@ from vibrissa.objects import Surface
 from vibrissa.rod import Discretization, discretize, solve_forces
 from vibrissa.tracking.refine.least_squares import Smoother, correlated, trace_variance
 from vibrissa.tracking.refine.rods import (
+    FAR,
     UNKNOWNS,
     State,
+    TraceSeries,
     bent,
     contact_slopes,
     first_contacts,
     rods,
 )
-from vibrissa.tracking.refine.trace_series import FAR, TraceSeries
 from vibrissa.tracking.space.pose import BasePose, HeadPose
 from vibrissa.whisker import Whisker
 

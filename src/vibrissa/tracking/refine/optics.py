@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from vibrissa.cameras import Camera, triangulate
 from vibrissa.deferred import transform
 from vibrissa.numerics import Array
-from vibrissa.tracking.refine.trace_series import TraceSeries
+from vibrissa.tracking.refine.rods import TraceSeries
 from vibrissa.tracking.space.curve import merge
 from vibrissa.tracking.space.rest_shape import RestShape, aligned_lengths, motions, rest_shape
 from vibrissa.tracking.trace.trace import Trace, arc_lengths, interpolated

@@ -14,14 +14,29 @@ z = 0, in which the paper's top view looks down on x and y.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from os import PathLike
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
 
+from vibrissa.io import in_file, read_calibration, write_calibration
 from vibrissa.numerics import Array
+from vibrissa.quantities import attributes
+
+__all__ = [
+    "PIXEL_SIZE",
+    "Camera",
+    "calibrate",
+    "load_cameras",
+    "orthogonal_views",
+    "save_cameras",
+    "triangulate",
+]
+
 
 PIXEL_SIZE = 58e-6
 """Size of a pixel of the paper's cameras in the scene, m."""
@@ -368,3 +383,261 @@ def _nearest_to_rays(cameras: Sequence[Camera], pixels: Array) -> Array:
         right += (across @ origin[..., None])[..., 0]
     solved = np.linalg.solve(_regular(matrix), right[..., None])[..., 0]
     return np.asarray(solved, dtype=np.float64)
+
+
+_VARIABLES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "camera_matrix": ("matrix", ("row", "column")),
+    "camera_rotation": ("rotation", ("row", "column")),
+    "camera_translation": ("translation", ("row",)),
+    "camera_distortion": ("distortion", ("coefficient",)),
+    "image_size": ("size", ("side",)),
+    "projection": ("projection", ()),
+}
+"""Attribute of a camera, and dimensions, of each variable."""
+
+
+def load_cameras(path: str | PathLike[str], unit: float = 1e-3) -> tuple[Camera, ...]:
+    """Read calibrated cameras.
+
+    Parameters
+    ----------
+    path : str or path
+        File in Anipose's TOML (`vibrissa.io.anipose`).
+    unit : float
+        Unit of the file's lengths, m; that of the board that calibrated the cameras, usually mm.
+
+    Returns
+    -------
+    tuple of Camera
+        Cameras in the file's order.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If it is not a calibration, or one with faults.
+    """
+    from scipy.spatial.transform import Rotation
+
+    cameras = []
+    for table in read_calibration(path):
+        kind = table.get("projection", "perspective")
+        scale = np.diag([1.0 / unit, 1.0 / unit, 1.0]) if kind == "orthographic" else np.eye(3)
+        with in_file(path):
+            camera = Camera(
+                matrix=np.asarray(table["matrix"]) @ scale,
+                rotation=Rotation.from_rotvec(table["rotation"]).as_matrix(),
+                translation=np.asarray(table["translation"]) * unit,
+                distortion=np.asarray(table["distortions"]),
+                size=(table["size"][0], table["size"][1]),
+                projection=kind,
+                name=str(table["name"]),
+            )
+        cameras.append(camera)
+    return tuple(cameras)
+
+
+def save_cameras(path: str | PathLike[str], cameras: Sequence[Camera], unit: float = 1e-3) -> None:
+    """Write cameras so that `load_cameras`, and for perspective ones Anipose, can read them.
+
+    Parameters
+    ----------
+    path : str or path
+        File to write, usually with the ending ``.toml``.
+    cameras : sequence of Camera
+        Cameras of the views.
+    unit : float
+        Unit of the file's lengths, m.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the folder does not exist.
+    """
+    from scipy.spatial.transform import Rotation
+
+    tables = []
+    for camera in cameras:
+        flat = camera.projection == "orthographic"
+        scale = np.diag([unit, unit, 1.0]) if flat else np.eye(3)
+        table = {
+            "name": camera.name,
+            "size": camera.size,
+            "matrix": (camera.matrix @ scale).tolist(),
+            "distortions": camera.distortion.tolist(),
+            "rotation": Rotation.from_matrix(camera.rotation).as_rotvec().tolist(),
+            "translation": (camera.translation / unit).tolist(),
+        }
+        tables.append(table | ({"projection": camera.projection} if flat else {}))
+    write_calibration(path, tables)
+
+
+def cameras_dataset(cameras: Sequence[Camera]) -> xr.Dataset:
+    """Write cameras as a dataset, the group ``cameras`` of a recording."""
+    return xr.Dataset(
+        {
+            name: (
+                ("view", *axes),
+                np.array([getattr(camera, part) for camera in cameras]),
+                attributes(name),
+            )
+            for name, (part, axes) in _VARIABLES.items()
+        },
+        {"view": [camera.name for camera in cameras]},
+        {"reference_frame": "laboratory"},
+    )
+
+
+def cameras_from_dataset(dataset: xr.Dataset) -> tuple[Camera, ...]:
+    """Read the cameras that `cameras_dataset` wrote."""
+    return tuple(
+        Camera(
+            matrix=row["camera_matrix"].values,
+            rotation=row["camera_rotation"].values,
+            translation=row["camera_translation"].values,
+            distortion=row["camera_distortion"].values,
+            size=(int(row["image_size"][0]), int(row["image_size"][1])),
+            projection=str(row["projection"].values),  # type: ignore[arg-type]
+            name=str(row["view"].values),
+        )
+        for row in (dataset.isel(view=i) for i in range(dataset.sizes["view"]))
+    )
+
+
+Image = NDArray[np.uint8]
+Board = NDArray[np.float32]
+
+_FEWEST = 4
+"""Smallest number of moments in which all cameras see the board."""
+
+
+def calibrate(
+    images: Mapping[str, Sequence[Image]], corners: tuple[int, int], square: float
+) -> tuple[tuple[Camera, ...], float]:
+    """Calibrate cameras that look at one checkerboard at the same moments.
+
+    Parameters
+    ----------
+    images : mapping of str to sequence of array (height, width)
+        Grey images of each camera by its name, moment by moment; the board need not be seen in all.
+    corners : tuple of int
+        Numbers of inner corners along the longer and along the shorter side of the board.
+    square : float
+        Side of a square, m.
+
+    Returns
+    -------
+    cameras : tuple of Camera
+        Cameras in the laboratory frame that is that of the board in the first moment in which all
+        cameras see it: origin at its first inner corner, x along its rows, y along its columns.
+    error : float
+        Root mean square distance of the corners from where the cameras see them, pixels.
+
+    Raises
+    ------
+    ImportError
+        If OpenCV is not installed.
+    ValueError
+        If the cameras differ in their number of images, or the board is seen too seldom.
+    """
+    counts = {name: len(series) for name, series in images.items()}
+    if len(counts) < 2 or len(set(counts.values())) != 1:
+        raise ValueError(f"images of the cameras: {counts}; two cameras, as many each, are needed")
+    for name, series in images.items():
+        sizes = {np.shape(image)[::-1] for image in series}
+        if len(sizes) > 1:
+            raise ValueError(f"images of camera {name} differ in size: {sorted(sizes)}")
+    board: Board = np.zeros((corners[0] * corners[1], 3), np.float32)
+    board[:, :2] = np.indices(corners).T.reshape(-1, 2) * square
+    seen = {
+        name: [_corners(np.asarray(image), corners) for image in series]
+        for name, series in images.items()
+    }
+    moments = range(next(iter(counts.values())))
+    shared = [i for i in moments if all(rows[i] is not None for rows in seen.values())]
+    if len(shared) < _FEWEST:
+        raise ValueError(
+            f"the board is seen by all cameras in {len(shared)} images; {_FEWEST} are needed, with "
+            "the board turned and at different places"
+        )
+    cameras = tuple(
+        _camera(name, rows, board, images[name][0].shape, shared[0]) for name, rows in seen.items()
+    )
+    cameras = _together(cameras, seen, board, shared)
+    return cameras, _error(cameras, seen, board, shared)
+
+
+def _corners(image: Image, corners: tuple[int, int]) -> Any:
+    cv2 = _opencv()
+    found, points = cv2.findChessboardCornersSB(image, corners)
+    return points.reshape(-1, 2) if found else None
+
+
+def _opencv() -> Any:
+    try:
+        import cv2
+    except ImportError as error:
+        raise ImportError("calibrating needs OpenCV: pip install 'vibrissa[cameras]'") from error
+    return cv2
+
+
+def _camera(
+    name: str, rows: Sequence[Any], board: Board, shape: tuple[int, ...], first: int
+) -> Camera:
+    """One camera by itself, in the frame of the board's first shared moment."""
+    cv2 = _opencv()
+    usable = [i for i, points in enumerate(rows) if points is not None]
+    size = (shape[1], shape[0])
+    _, matrix, distortion, turns, shifts = cv2.calibrateCamera(
+        [board] * len(usable), [rows[i] for i in usable], size, None, None
+    )
+    k = usable.index(first)
+    return Camera(
+        matrix=matrix,
+        rotation=cv2.Rodrigues(turns[k])[0],
+        translation=shifts[k].reshape(3),
+        distortion=distortion.reshape(-1)[:8],
+        size=size,
+        name=name,
+    )
+
+
+def _together(
+    cameras: tuple[Camera, ...], seen: Mapping[str, Sequence[Any]], board: Board, shared: list[int]
+) -> tuple[Camera, ...]:
+    """Pose of every camera relative to the first from all shared moments, not from one."""
+    cv2 = _opencv()
+    main = cameras[0]
+    placed = [main]
+    for camera in cameras[1:]:
+        answer = cv2.stereoCalibrate(
+            [board] * len(shared),
+            [seen[main.name][i] for i in shared],
+            [seen[camera.name][i] for i in shared],
+            main.matrix,
+            main.distortion,
+            camera.matrix,
+            camera.distortion,
+            main.size,
+            flags=cv2.CALIB_FIX_INTRINSIC,
+        )
+        turn, shift = answer[5], answer[6].reshape(3)
+        rotation, translation = turn @ main.rotation, turn @ main.translation + shift
+        placed.append(replace(camera, rotation=rotation, translation=translation))
+    return tuple(placed)
+
+
+def _error(
+    cameras: Sequence[Camera], seen: Mapping[str, Sequence[Any]], board: Board, shared: list[int]
+) -> float:
+    """Root mean square distance of the corners from the images of the points they give."""
+    squares = []
+    for i in shared:
+        pixels = np.stack([seen[camera.name][i] for camera in cameras]).astype(np.float64)
+        points, _ = triangulate(cameras, pixels)
+        squares += [
+            ((camera.project(points) - row) ** 2).sum(axis=1)
+            for camera, row in zip(cameras, pixels, strict=True)
+        ]
+    return float(np.sqrt(np.mean(squares)))

@@ -180,6 +180,8 @@ def test_friction_is_allowed_for_in_what_estimate_writes(folder, tmp_path, bent)
     known = np.isfinite(table["sigma_x"].values) & np.isfinite(plain["sigma_x"].values)
     assert known.sum() > 20
     assert np.median(table["sigma_x"].values[known] / plain["sigma_x"].values[known]) > 1.2
+    assert (table["friction"] == 0.3).all()
+    assert (plain["friction"] == 0.0).all()
     error = np.stack([table[axis].values for axis in "xyz"], axis=-1) - bent[1]
     sigma = np.stack([table[f"sigma_{axis}"].values for axis in "xyz"], axis=-1)
     assert (np.abs(error / sigma)[known] < 3.0).mean() > 0.9

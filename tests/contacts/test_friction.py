@@ -79,3 +79,23 @@ def test_without_noise_there_is_nothing_to_weigh_friction_against(gamma_map):
         gamma_map.estimate(signals, friction=0.3)
     with pytest.raises(ValueError, match="standard deviation"):
         gamma_map.estimate(signals, noise=NOISE, friction=-0.3)
+
+
+def test_every_result_states_what_it_assumes_of_friction(gamma_map):
+    _, _, signals = rubbed(gamma_map, 0.0, 4)
+    wrench = vb.estimate_from_wrench(gamma_map.whisker, [1e-5, 3e-5, 0.0], [0.0, 0.0, 8e-7])
+    how = {"friction": 0.3, "noise": NOISE}
+    one = [float(signals[name][0]) for name in ("Fx", "FT", "MB", "MD")]
+    for found, friction, text in (
+        (gamma_map.estimate(signals, noise=NOISE), 0.0, "no friction assumed"),
+        (
+            gamma_map.estimate(signals, "Fx FT MB MD", **how),
+            0.3,
+            "friction along the whisker of 0.3",
+        ),
+        (vb.Estimator(gamma_map, "Fx FT MB MD", **how)(one), 0.3, "0.3 (one sigma) allowed for"),
+        (wrench, np.inf, "any friction along the whisker allowed for"),
+    ):
+        assert found.friction == found.candidates.friction == friction
+        assert found.to_dataset().attrs["friction"] == friction
+        assert text in " ".join(str(found).split())

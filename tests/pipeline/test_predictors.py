@@ -94,14 +94,19 @@ def test_nwb_holds_them_and_is_valid(trial, tmp_path):
     subject = {"subject_id": "rat7", "species": "Rattus norvegicus"}
     session = Session(datetime(2026, 3, 1, 14, 30, tzinfo=UTC), subject=subject)
     # Contacts that a sensor located, which the recording holds in another group.
-    located = {f"contact_point_{axis}": i + table["Fx"] for i, axis in enumerate("xyz")}
-    save_nwb(tmp_path / "t.nwb", trial, session, table.assign(located))
+    points = np.stack([i + table["Fx"].values for i in range(3)], axis=-1)
+    estimates = xr.Dataset({"contact_point": recorded("contact_point", points)}, table.coords)
+    trial = trial.copy()
+    trial["estimates"] = estimates.assign_attrs(friction=0.0)
+    save_nwb(tmp_path / "t.nwb", trial, session, predictors(trial))
     with pynwb.NWBHDF5IO(tmp_path / "t.nwb", "r") as file:
         series = file.read().processing["behavior"]["predictors_C1"]
         assert series.comments.split() == list(PREDICTORS)
         np.testing.assert_array_equal(series.data[:, 1], table["Fy"].sel(whisker="C1"))
         points = file.read().processing["behavior"]["contact_point_C2"].data[:]
         np.testing.assert_array_equal(points, table["Fx"].values[:, 1:] + [0.0, 1.0, 2.0])
+        about = file.read().processing["behavior"]["contact_point_C2"].description
+        assert "no friction assumed" in about
     least = inspector.Importance.BEST_PRACTICE_VIOLATION
     worst = inspector.inspect_nwbfile(nwbfile_path=tmp_path / "t.nwb")
     assert [m.message for m in worst if m.importance.value >= least.value] == []

@@ -114,6 +114,7 @@ def test_lines_give_the_contacts(gamma_map, bent, wrench, names, kind):
         away = np.linalg.norm(np.array(record["candidates"]) - bent.contact_point[i], axis=1)
         assert away.min() < 1e-8
         assert record["sigma_x"] > 0.0
+        assert record["friction"] == 0.0
         if kind != "json":
             assert record["time"] == pytest.approx(0.001 * i, rel=1e-15)
 

@@ -182,18 +182,17 @@ class EstimateOptions:
             "second_contacts": 0.01 * self.second_contacts,
         }
 
-    def described(self, names: str, noise: str, least: float) -> str:
+    def described(self, names: str, friction: float, noise: str, least: float) -> str:
         """State from which signals contacts are found, and what is known beforehand."""
         by = "" if self.method == "exact" else f" by {self.method}"
         used = f"signals ({', '.join(names.split())}){by}"
-        if self.friction_sigma:
-            used += f", with friction along the whisker of {self.friction_sigma:g} (one sigma)"
         if self.compliance_sigma:
             noise += f"; compliance of the base known to {self.compliance_sigma:g} °/(µN·m)"
         if self.second_contacts:
             noise += f"; second contacts at {self.second_contacts:g} % false alarms"
         return (
             f"{'force and moment whole' if names == WRENCH else used}{self.assumed.described()}; "
+            f"{vb.contacts.friction_assumed(friction)}; "
             f"{noise}; contacts are measured where M_B exceeds {shown('MB', least)}"
         )
 
@@ -305,11 +304,13 @@ def _from_lines(
         columns["time"] = [float(row) for row in range(len(records))]
         remark(f"{signals}: {vb.io.NUMBERED}")
     statuses = [int(vb.Status[one["status"].upper()]) for one in records]
+    columns["friction"] = [estimator.friction] * len(records)
     found = xr.Dataset({name: ("time", values) for name, values in columns.items()})
     vb.io.save_contacts(target, found.assign(status=("time", statuses)))
     for sentence in vb.streaming.advice(running):
         remark(sentence)
-    remark(f"signals ({', '.join(used)}){how.assumed.described()}{weight.described()}")
+    friction = vb.contacts.friction_assumed(estimator.friction)
+    remark(f"signals ({', '.join(used)}){how.assumed.described()}; {friction}{weight.described()}")
     print_statuses(np.array(statuses))
     print_written(target)
 
@@ -345,7 +346,7 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions, weight: Gravi
     vb.io.save_contacts(target, vb.pipeline.contact_columns(found))
     used = WRENCH if how.whole else found.attrs["triplet"]
     about = how.noise.described() + weight.described()
-    remark(how.described(used, about, found.attrs["felt_above"]))
+    remark(how.described(used, found.attrs["friction"], about, found.attrs["felt_above"]))
     print_statuses(found["status"].values)
     print_written(target)
 
@@ -439,4 +440,5 @@ def estimated(
     about = done["estimates"].attrs
     noise = how.noise.described() if noisy else "noise as the recording states"
     noise += weight.described()
-    return done, how.described(str(about["signals"]), noise, float(about["felt_above"]))
+    used, friction = str(about["signals"]), float(about["friction"])
+    return done, how.described(used, friction, noise, float(about["felt_above"]))

@@ -186,7 +186,10 @@ def _contacts(found: vb.pipeline.TrialSummary) -> str:
     if np.isfinite(found.largest_force):
         force, moment = found.largest_force, found.largest_moment
         text += f", up to {shown('force', force, 3)} and {shown('moment', moment, 3)}"
-    return text + (f"; {found.estimated} contact points estimated" if found.estimated else "")
+    if not found.estimated:
+        return text
+    how = f", {found.assumption}" if found.assumption else ""
+    return f"{text}; {found.estimated} contact points estimated{how}"
 
 
 def _summarised(path: Path) -> xr.DataTree:

@@ -319,7 +319,9 @@ def _report(running: vb.streaming.ContactStream, lost: str, follow: bool) -> Non
     if follow and not running.poses.number:
         remark("no pose came: the base was taken to stand still")
     whose = f"{running.whisker}: " if running.whisker else ""
-    remark(f"{whose}{running.samples} samples, {running.faults} lines that could not be read{lost}")
+    friction = vb.contacts.friction_assumed(running.friction)
+    unread = f"{running.faults} lines that could not be read{lost}"
+    remark(f"{whose}{running.samples} samples, {unread}; {friction}")
     if running.events:
         remark(whose + ", ".join(f"{name}: {n}" for name, n in running.events.items()))
     _advise(running)

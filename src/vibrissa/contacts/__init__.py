@@ -25,6 +25,7 @@ from vibrissa.contacts.contacts import (
     Contact,
     Contacts,
     contacts_of as contacts_of,
+    friction_assumed,
 )
 from vibrissa.contacts.estimator import Estimator
 from vibrissa.contacts.filter import ContactFilter, Followed as Followed
@@ -78,5 +79,6 @@ __all__ = [
     "ellipsoids",
     "estimate_around",
     "estimate_from_wrench",
+    "friction_assumed",
     "second_contact",
 ]

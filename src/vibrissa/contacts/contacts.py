@@ -141,6 +141,27 @@ def candidates_within(number: IntArray, flat: Array, valid: AnyArray) -> Candida
     )
 
 
+def friction_assumed(friction: float) -> str:
+    """Say what an estimate assumes of friction along the whisker.
+
+    Parameters
+    ----------
+    friction : float
+        Standard deviation of the ratio of the force along the whisker to that across it, as of
+        `Contacts.friction`.
+
+    Returns
+    -------
+    str
+        End of a sentence.
+    """
+    if not friction:
+        return "no friction assumed"
+    if np.isinf(friction):
+        return "any friction along the whisker allowed for"
+    return f"friction along the whisker of {friction:g} (one sigma) allowed for"
+
+
 class _Located:
     """Properties that follow from what contacts are stored as."""
 
@@ -220,6 +241,9 @@ class Contacts(_Located):
         Standard deviation of the friction angle, rad; NaN without ``noise`` and without friction.
     n_candidates : (...) int array
         Number of candidates.
+    friction : float
+        Standard deviation that was assumed of the ratio of the force along the whisker to that
+        across it: 0 for contacts without friction, infinite where any ratio is allowed.
     candidates : Contacts
         All candidates, with one dimension more, padded with NaN (and the status ``MISSING``): with
         ``noise`` by falling probability; without, by rising force, or for more than three signals
@@ -247,6 +271,7 @@ class Contacts(_Located):
     using: tuple[str, ...]
     dims: tuple[str, ...] = ()
     coords: Coordinates = field(default_factory=dict)
+    friction: float = 0.0
     _candidates: Contacts | None = None
 
     @property
@@ -257,7 +282,7 @@ class Contacts(_Located):
         return self._candidates
 
     def to_dataset(self) -> xr.Dataset:
-        """Return everything as a labelled dataset.
+        """Return everything as a labelled dataset, whose attributes are the assumptions.
 
         Returns
         -------
@@ -268,7 +293,8 @@ class Contacts(_Located):
         if self._candidates is not None:
             data |= self._candidates._variables("candidate_")
         coords = {**self.coords, "space": _SPACE, "space_2": _SPACE, "material": ["t", "d1", "d2"]}
-        return xr.Dataset(data, coords=coords, attrs={"using": " ".join(self.using)})
+        about = {"using": " ".join(self.using), "friction": self.friction}
+        return xr.Dataset(data, coords=coords, attrs=about)
 
     def _variables(self, prefix: str) -> dict[str, Any]:
         r, theta, phi = np.moveaxis(self.spherical, -1, 0)
@@ -335,6 +361,7 @@ class Contacts(_Located):
             ("φ", shown("phi", phi)),
             ("largest standard deviation of x, y, z", shown("r", sigma)),
             ("candidates", shown("candidates", self.n_candidates)),
+            ("assumption", friction_assumed(self.friction)),
         ]
         if np.nan_to_num(self.contact_force[..., 0]).any():
             rows.append(("friction angle", shown("friction_angle", self.friction_angle)))
@@ -350,6 +377,7 @@ def contacts_of(
     shape: tuple[int, ...],
     dims: tuple[str, ...],
     coords: Coordinates,
+    friction: float = 0.0,
 ) -> Contacts:
     """Give candidates of flat measurements their units, in place, and the measurements' shape."""
     d, most = discretization, max(1, int(found.number.max(initial=0)))
@@ -378,6 +406,7 @@ def contacts_of(
         using=using,
         dims=(*dims, "candidate"),
         coords=coords,
+        friction=friction,
     )
     first = (..., 0)
     return Contacts(
@@ -395,6 +424,7 @@ def contacts_of(
         using=using,
         dims=dims,
         coords=coords,
+        friction=friction,
         _candidates=every,
     )
 
@@ -431,6 +461,9 @@ class Contact(_Located):
         Number of the candidate that goes on from the measurement before; 0 where there was none.
     using : tuple of str
         Signals used.
+    friction : float
+        Standard deviation that was assumed of the ratio of the force along the whisker to that
+        across it: 0 for contacts without friction.
     """
 
     point: Array
@@ -444,6 +477,7 @@ class Contact(_Located):
     contact_force: Array
     continuing: int
     using: tuple[str, ...]
+    friction: float
     _found: Candidates
     _scales: tuple[float, float]
 
@@ -465,6 +499,7 @@ class Contact(_Located):
             np.ones(n, np.int64),
             self.using,
             ("candidate",),
+            friction=self.friction,
         )
 
     @property
@@ -508,6 +543,7 @@ class Contact(_Located):
             sigma[0] if len(sigma) else np.asarray(np.nan),
             np.asarray(self.n_candidates),
             every.using,
+            friction=self.friction,
             _candidates=every,
         )
 
@@ -534,10 +570,11 @@ def contact_of(
     continuing: int = 0,
     first: int = 0,
     covariance: Array | None = None,
+    friction: float = 0.0,
 ) -> Contact:
     """Give the candidates of one measurement their units; ``first`` stands for all."""
     length, force = discretization.length, discretization.force
-    rest = continuing, using, found, (length, force)
+    rest = continuing, using, friction, found, (length, force)
     if not found.number[0]:
         none = np.full(3, np.nan)
         away = np.full((3, 3), np.nan)

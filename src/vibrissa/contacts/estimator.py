@@ -76,6 +76,7 @@ class Estimator:
     Estimator.of_sensor : From the raw readings of a sensor, however it mixes and is mounted.
     """
 
+    friction = 0.0
     _base: JointFit | None = None
     _joint: JointEstimate | None = None
     _again: Callable[[ChartedWhisker], Estimator]
@@ -123,6 +124,7 @@ class Estimator:
             rod = contact_map.whisker, contact_map.steps
             self._base = soft_base(*rod, self.readout.channels, sensor, compliance)
             return
+        self.friction = friction
         self._joint = JointEstimate(
             contact_map.whisker,
             contact_map,
@@ -348,7 +350,9 @@ class Estimator:
             away = found.values[0, :number, 3:] - self._last
             continuing = int((away * away).sum(axis=1).argmin())
         self._last = found.values[0, continuing, 3:] if number else None
-        return contact_of(found, status, chi_squared, d, self.names, continuing)
+        return contact_of(
+            found, status, chi_squared, d, self.names, continuing, friction=self.friction
+        )
 
     @property
     def weighted(self) -> bool:

@@ -342,7 +342,9 @@ def estimate_jointly(
     else:
         found, status = _in_poses(find, flat, np.reshape(rotation, (-1, 3, 3)))
     chi_squared = found.chi_squared[:, 0].copy()
-    return contacts_of(found, status, chi_squared, find.d, names, values.shape[:-1], dims, coords)
+    shape = values.shape[:-1]
+    assumed = np.inf if names == WRENCH else friction
+    return contacts_of(found, status, chi_squared, find.d, names, shape, dims, coords, assumed)
 
 
 def _in_poses(find: JointEstimate, flat: Array, rotation: Array) -> tuple[Candidates, IntArray]:

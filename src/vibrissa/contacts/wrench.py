@@ -242,7 +242,7 @@ def _located(
     chi_squared = whole.chi_squared[:, 0]
     if base is not None:
         whole, status, chi_squared = base.allow(wrenches, wrenches, whole, status)
-    return contacts_of(whole, status, chi_squared, d, WRENCH, f.shape[:-1], dims, coords)
+    return contacts_of(whole, status, chi_squared, d, WRENCH, f.shape[:-1], dims, coords, np.inf)
 
 
 def _covariance(sensor: SensorNoise) -> Array:

@@ -152,7 +152,8 @@ def _completed(data: xr.Dataset, table: xr.Dataset | None) -> xr.Dataset:
     found = {} if table is None else {n: table[n] for n in ("in_contact",) if n in table}
     if table is not None and "contact_point_x" in table:
         axes = [table[f"contact_point_{axis}"] for axis in "xyz"]
-        found["contact_point"] = xr.concat(axes, "space", combine_attrs="drop")
+        about = {"about": axes[0].attrs.get("description", "")}
+        found["contact_point"] = xr.concat(axes, "space", combine_attrs="drop").assign_attrs(about)
     return data.assign({name: value for name, value in found.items() if name not in data})
 
 
@@ -353,6 +354,8 @@ def _series(data: xr.Dataset, clock: dict[str, Any], whisker: str | None = None)
             continue
         values = data[variable].transpose("time", "space", ...)
         frame = str(values.attrs.get("reference_frame", "laboratory"))
+        if values.attrs.get("about"):
+            text += f". {values.attrs['about'].rstrip('.')}"
         made: Any = TimeSeries
         named = {"name": variable if whisker is None else f"{variable}_{whisker}", "unit": unit}
         if unit == "meters":

@@ -8,7 +8,8 @@ are numbers that cannot be what they say: too large, or with a moment too large 
 force, as |M| / |F| is at most the distance of the contact.
 
 Contact points as CSV: ``time, x, y, z, r, theta, phi, sigma_x, …, status``. In SI units and the
-whisker's frame; the status is written by its name, and missing is ``nan``.
+whisker's frame; the status is written by its name, and missing is ``nan``. Estimates have a column
+``friction`` before the status, the same in all lines: what was assumed of it.
 
 Contour points as CSV: ``time, whisker, x, y, z, sigma_x, …``, a line for each contact. In SI units
 and the laboratory frame: the contact point on the whisker's centreline with its standard
@@ -304,7 +305,7 @@ def _dataset(table: Array) -> xr.Dataset:
 NUMBERS = ("time", "x", "y", "z", "r", "theta", "phi", "sigma_x", "sigma_y", "sigma_z")
 """Names of the columns with numbers, in their order; the last column is the status."""
 
-_OPTIONAL = ("one_contact",)
+_OPTIONAL = ("one_contact", "friction")
 """Columns before the status that are written where there is something to write."""
 
 

@@ -121,7 +121,8 @@ def estimates_of(
         ``contact_point_whisker`` with ``covariance``, ``arc_length`` and ``force``; how many
         ``candidates`` there were, of which the one that continues its neighbours in time is chosen;
         ``in_contact`` (detected) and ``status``. Attributes ``signals``, ``source`` and
-        ``felt_above``, M_B from which contacts are detected, N·m. Frames whose signals have no
+        ``felt_above``, M_B from which contacts are detected, N·m, and ``friction``, as of
+        `vibrissa.contacts.Contacts`. Frames whose signals have no
         answer keep the status that states the reason.
 
     Raises
@@ -187,14 +188,14 @@ def estimates_of(
     if mapped:  # whiskers without contact need none
         report("map of all contacts", count, count)
     out = xr.concat(parts, "whisker").transpose("time", "whisker", ...)
-    # What was assumed is stated where it is not the default.
+    # What else was assumed is stated where it is not the default.
     out.attrs = {
         "signals": WHOLE if whole else " ".join(names),
         "source": str(data.attrs.get("source", "not known")),
         "felt_above": float(np.median([part.attrs["felt_above"] for part in parts])),
         **({"method": method} if method != "exact" else {}),
         **(errors or {}),
-        **({"friction": friction} if friction > 0.0 else {}),
+        "friction": np.inf if whole else friction,
         **({"prior": repr(prior)} if prior is not None else {}),
         **({"gravity": gravity.acceleration} if gravity is not None else {}),
     }
@@ -378,6 +379,8 @@ def contact_columns(contacts: xr.Dataset) -> xr.Dataset:
     values = np.concatenate([point, spherical(point), np.sqrt(variance)], axis=1)
     names = ("x", "y", "z", "r", "theta", "phi", "sigma_x", "sigma_y", "sigma_z")
     columns = {name: ("time", values[:, i], attributes(name)) for i, name in enumerate(names)}
+    assumed = np.full(len(values), contacts.attrs["friction"])
+    columns["friction"] = ("time", assumed, attributes("friction"))
     table = xr.Dataset(columns, {"time": contacts["time"]}, contacts.attrs)
     kept = ("one_contact", "status")
     return table.assign({name: contacts[name] for name in kept if name in contacts})

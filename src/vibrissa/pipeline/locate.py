@@ -476,7 +476,8 @@ def _located(
     data["candidates"] = ("time", number, attributes("candidates"))
     data["in_contact"] = ("time", rows, attributes("in_contact"))
     data["status"] = ("time", status, {**attributes("status"), **flag_attributes()})
-    about = {"triplet": " ".join(names), "felt_above": measured.above}
+    assumed = np.inf if names == WRENCH else friction
+    about = {"triplet": " ".join(names), "felt_above": measured.above, "friction": assumed}
     return xr.Dataset(data, {"time": measured.time, "space": list("xyz")}, about)
 
 

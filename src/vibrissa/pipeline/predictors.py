@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
+from vibrissa.contacts import friction_assumed
 from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
 from vibrissa.recording import Recording
@@ -93,6 +94,12 @@ def predictors(recording: xr.DataTree) -> xr.Dataset:
         name: xr.Variable(("time", "whisker"), values, _about(name))
         for name, values in columns.items()
     }
+    estimates = record.find("estimates")
+    if estimates is not None and estimates.known("contact_point") is not None:
+        friction = float(estimates.data.attrs.get("friction", np.nan))
+        for name in (*(f"contact_point_{axis}" for axis in "xyz"), "arc_length"):
+            if name in data and not np.isnan(friction):
+                data[name].attrs["description"] += f" Estimated, {friction_assumed(friction)}."
     coordinates = {"time": ("time", time, attributes("time")), "whisker": record.names}
     there = [name for name in PREDICTORS if name in data]
     return xr.Dataset(data, coordinates, {"predictors": " ".join(there)})

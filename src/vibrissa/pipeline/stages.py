@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from vibrissa.contacts import friction_assumed
 from vibrissa.contour import shape_from_dataset
 from vibrissa.pipeline.estimates import Progress, estimates_of
 from vibrissa.pipeline.frames import check_recording
@@ -142,7 +143,8 @@ class TrialSummary:
     """Summary of a recording: what it is in words, numbers of frames and contacts, SI units.
 
     ``in_contact`` and ``contacts``, frames in contact and uninterrupted contacts of all whiskers,
-    are None where that is not known; ``estimated`` counts frames and whiskers with an estimate.
+    are None where that is not known; ``estimated`` counts frames and whiskers with an estimate, and
+    ``assumption`` is what these assume of friction.
     """
 
     origin: str
@@ -154,6 +156,7 @@ class TrialSummary:
     largest_force: float
     largest_moment: float
     estimated: int
+    assumption: str
     stages: tuple[str, ...]
     fitted: str
     known: str
@@ -173,9 +176,11 @@ def summarise(recording: xr.DataTree) -> TrialSummary:
     largest = {
         name: _largest(record.known(name, _BEFORE), touching) for name in ("force", "moment")
     }
-    estimated = 0
+    estimated, assumption = 0, ""
     if (estimates := record.find("estimates")) and "in_contact" in estimates:
         estimated = int(estimates["in_contact"].sum())
+        if "friction" in (about := estimates.data.attrs):
+            assumption = friction_assumed(float(about["friction"]))
     fitted, distance = "", np.nan
     if "contour" in recording.children:
         contour = recording["contour"].to_dataset()
@@ -193,6 +198,7 @@ def summarise(recording: xr.DataTree) -> TrialSummary:
         largest_force=largest["force"],
         largest_moment=largest["moment"],
         estimated=estimated,
+        assumption=assumption,
         stages=tuple(stage for stage in STAGES if stage in recording.children),
         fitted=fitted,
         known="; ".join(known.in_words() for known in record.objects),

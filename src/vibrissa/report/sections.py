@@ -13,7 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa import evaluation
-from vibrissa.contacts import ContactMap
+from vibrissa.contacts import ContactMap, friction_assumed
 from vibrissa.contour import shape_from_dataset
 from vibrissa.display import show
 from vibrissa.identifiability import verdict_rows
@@ -137,6 +137,7 @@ _LABELS = {
     "origin": "origin",
     "source": "source of the signals",
     "signals": "signals used",
+    "friction": "friction along the whisker",
     "noise": "sensor noise, standard deviation",
     "felt_above": "contact is detected for",
     "shape": "fitted shape",
@@ -177,6 +178,8 @@ def _shown_setting(name: object, value: object) -> str:
         force, moment = np.split(np.asarray(value, dtype=np.float64), 2)
         sizes = (("force", force), ("moment", moment))
         return "; ".join(f"{each} {_one_or_all(each, sigma)}" for each, sigma in sizes)
+    if name == "friction":
+        return friction_assumed(float(str(value)))
     if name == "cutoff":
         return f"{float(str(value)):g} Hz"
     if isinstance(value, np.ndarray | list | tuple):

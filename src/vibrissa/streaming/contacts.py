@@ -72,6 +72,8 @@ class ContactStream:
         Numbers of samples by status, and by event.
     poses : Poses
         Poses of the base.
+    friction : float
+        Standard deviation of the ratio of forces, as of `vibrissa.contacts.Contacts`.
     laboratory : str
         Name of the frame that poses are in, where they state it; empty where they do not.
     """
@@ -100,6 +102,7 @@ class ContactStream:
         self._events = _Events(slip_speed)
         self.samples, self.faults = 0, 0
         self._estimator, self._follow = estimator, follow
+        self.friction = estimator.friction
         self._which = [SIGNALS.index(name) for name in by_name] if names is None else []
         self._begun, self._time = clock.monotonic(), -math.inf
         self.statuses: Counter[str] = Counter()
@@ -381,6 +384,7 @@ def located_record(found: Contact) -> dict[str, Any]:
     record |= _sigma(found.covariance)
     record["covariance"] = found.covariance.tolist()
     record["chi_squared"] = found.chi_squared
+    record["friction"] = found.friction
     record["continuing"] = found.continuing
     record["candidates"] = found.candidates.point.tolist()
     return record
@@ -398,6 +402,7 @@ def followed_record(known: Followed, rotation: Array | None = None) -> dict[str,
     record["lab_covariance"] = known.covariance.tolist()
     record |= {f"lab_{name}": value for name, value in _sigma(known.covariance).items()}
     record["velocity"] = known.velocity.tolist()
+    record["friction"] = 0.0  # a filter takes no other estimator
     record["probability"] = known.probability
     record["hypotheses"] = known.points.tolist()
     record["probabilities"] = known.probabilities.tolist()

@@ -5,6 +5,7 @@ laboratory frame and shooting (`studies/weight.py --reference`), without vibriss
 """
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,9 @@ import vibrissa as vb
 from vibrissa.cli.app import app
 from vibrissa.contacts import Gravity, read_at_rest
 from vibrissa.rod import resting
+from vibrissa.sensors import Sensor
+from vibrissa.streaming import COMPONENTS, ContactStream, Poses, advice
+from vibrissa.streaming.lines import ACCELERATION, POSITION, QUATERNION
 
 REFERENCE = Path(__file__).parents[1] / "data" / "weighted_contacts.csv"
 G = 9.81
@@ -245,6 +249,85 @@ def test_the_filter_follows_contacts_of_a_whisker_with_weight(nitinol, swung):
     locate = vb.Estimator(nitinol, ("Fx", "MB", "MD"), noise, gravity=uncertain)
     with pytest.raises(ValueError, match="uncertain gravity"):
         vb.ContactFilter(locate)
+
+
+def read_since(whisker, tare, pull, load):
+    """Contact under a pull, and what a sensor reads of it that was tared under another."""
+    bent = vb.deflect(whisker, load, gravity=pull)
+    before, now = resting(whisker, tare), resting(whisker, pull)
+    force = bent.force + now.force - before.force
+    return bent.contact_point, force, bent.moment + now.moment - before.moment
+
+
+def lines_of(samples):
+    """Lines of a stream: force, moment, and what else is known."""
+    for time, (_, force, moment, known) in enumerate(samples):
+        wrench = dict(zip(COMPONENTS, [*force.tolist(), *moment.tolist()], strict=True))
+        yield json.dumps({"time": 0.01 * time} | wrench | known)
+
+
+@pytest.mark.parametrize("kind", ["signals", "sensor", "filter"])
+def test_a_base_that_accelerates_is_known_by_its_accelerometer(nitinol, kind):
+    """Of a carrier that turns the whisker by its mount; the first sample is the tare's."""
+    whisker, level = nitinol.whisker, np.array([0.0, 0.0, -G])
+    mount = Rotation.from_rotvec([0.3, -0.5, 1.1])
+    noise, heavy = covariance(whisker), Sensor(noise=np.sqrt(np.diag(covariance(whisker))))
+    heavy = replace(heavy, mass=2e-4, mass_moment=(1e-7, 2e-7, 0.0))
+    touch = vb.PointForce(
+        0.7 * whisker.length, components=(0.0, unit(whisker), 0.6 * unit(whisker))
+    )
+    samples = []
+    for moved in np.array([[0.0, 0.0, 0.0], [3.0, -4.0, 2.0], [-6.0, 1.0, -5.0]]):
+        pull = level - moved
+        point, force, moment = read_since(whisker, level, pull, touch)
+        if kind == "sensor":
+            weight = heavy.weight(np.eye(3), pull)
+            force, moment = force + weight[:3], moment + weight[3:]
+        known = dict(zip(ACCELERATION, mount.apply(-pull), strict=True))
+        samples.append((point, force, moment, known))
+    how = {"gravity": tuple(level)}
+    if kind == "sensor":
+        locate, names = vb.Estimator.of_sensor(nitinol, heavy, **how), COMPONENTS
+    else:
+        locate, names = vb.Estimator(nitinol, SIX, noise, **how), None
+
+    def answers(lines):
+        locate.restart()
+        follow = vb.ContactFilter(locate) if kind == "filter" else None
+        running = ContactStream(locate, names, follow, Poses(mount.as_matrix()))
+        running.warm_up()
+        return list(running.records(lines)), running
+
+    found, running = answers(lines_of(samples))
+    limit = 2e-2 if kind == "filter" else 1e-5  # of a filter that took the first for a moving one
+    for record, (point, *_) in zip(found, samples, strict=True):
+        away = np.array([record[axis] for axis in "xyz"]) - point
+        assert np.linalg.norm(away) < limit * whisker.length
+    assert not advice(running)
+    if kind == "signals":
+        blind, _ = answers(lines_of([(*sample[:3], {}) for sample in samples]))
+        assert abs(blind[2]["x"] - samples[2][0][0]) > 0.02 * whisker.length
+        lost = {ACCELERATION[0]: None}
+        found, _ = answers(lines_of([(*samples[1][:3], samples[1][3] | lost)]))
+        assert found[0]["status"] == "missing"
+        running = ContactStream(vb.Estimator(nitinol, SIX, noise))
+        list(running.records(lines_of(samples)))
+        assert "accelerometer" in advice(running)[0]
+
+
+def test_a_stream_that_is_warm_counts_the_sensor_as_tared_in_its_first_pose(nitinol):
+    whisker, upright = nitinol.whisker, Rotation.from_rotvec([0.0, 0.5 * np.pi, 0.0])
+    pull = upright.inv().apply([0.0, 0.0, -G])
+    touch = vb.PointForce(0.7 * whisker.length, components=(0.0, unit(whisker), 0.0))
+    point, *wrench = read_since(whisker, pull, pull, touch)
+    pose = dict(zip(QUATERNION, upright.as_quat()[[3, 0, 1, 2]], strict=True))
+    pose |= dict.fromkeys(POSITION, 0.0)
+    locate = vb.Estimator(nitinol, SIX, covariance(whisker), gravity=(0.0, 0.0, -G))
+    running = ContactStream(locate)
+    running.warm_up()
+    (found,) = running.records(lines_of([(point, *wrench, pose)]))
+    away = np.array([found[axis] for axis in "xyz"]) - point
+    assert np.linalg.norm(away) < 1e-5 * whisker.length
 
 
 def test_what_does_not_fit_is_refused(nitinol):

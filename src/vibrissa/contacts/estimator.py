@@ -79,6 +79,7 @@ class Estimator:
     friction = 0.0
     _base: JointFit | None = None
     _joint: JointEstimate | None = None
+    _untared: JointEstimate | None = None
     _again: Callable[[ChartedWhisker], Estimator]
 
     def __init__(
@@ -125,7 +126,7 @@ class Estimator:
             self._base = soft_base(*rod, self.readout.channels, sensor, compliance)
             return
         self.friction = friction
-        self._joint = JointEstimate(
+        self._joint = self._untared = JointEstimate(
             contact_map.whisker,
             contact_map,
             self.names,
@@ -251,11 +252,16 @@ class Estimator:
         """Forget the measurement before, as when the whisker has lost touch."""
         self._last = None
 
+    def restart(self) -> None:
+        """Forget all measurements: the sensor counts as tared in the next pose."""
+        self.reset()
+        self._joint = self._untared
+
     def __call__(
         self,
         signals: ArrayLike,
         rotation: ArrayLike | None = None,
-        gravity: ArrayLike = GRAVITY,
+        gravity: ArrayLike | None = None,
     ) -> Contact:
         """Locate one measurement."""
         return self.locate(self.measurement(signals, rotation, gravity))
@@ -264,7 +270,7 @@ class Estimator:
         self,
         signals: ArrayLike,
         rotation: ArrayLike | None = None,
-        gravity: ArrayLike = GRAVITY,
+        gravity: ArrayLike | None = None,
     ) -> Measurement:
         """Check one measurement and make it non-dimensional; as for calling the estimator.
 
@@ -274,8 +280,10 @@ class Estimator:
             Signals or readings, SI units.
         rotation : (3, 3) array_like, optional
             Rotation from the whisker's to the laboratory frame.
-        gravity : (3,) array_like
-            Gravity in the laboratory frame, m/s².
+        gravity : (3,) array_like, optional
+            Gravity minus the acceleration of the base, m/s², for the whisker and for what the
+            sensor carries: laboratory frame, or without a rotation the whisker's. By default that
+            which was stated, or standard gravity.
 
         Returns
         -------
@@ -292,15 +300,19 @@ class Estimator:
             raise ValueError(f"one measurement has {self._width} signals; got shape {values.shape}")
         if not max(map(abs, values.tolist())) < LARGEST:
             values = np.where(np.isinf(values), np.nan, np.clip(values, -LARGEST, LARGEST))
+        if rotation is None and gravity is not None:
+            rotation = np.eye(3)
         if self._sensor is not None:
-            values = self._sensor.compensated(values, rotation, gravity)
+            stated = None if self._joint is None else self._joint.laboratory_gravity
+            pull = next((one for one in (gravity, stated) if one is not None), GRAVITY)
+            values = self._sensor.compensated(values, rotation, pull)
             if self._components is not None:
                 values = self._components.signals(values)
         elif self._order is not None:
             values = values[self._order]
         if self._joint is not None:
             if rotation is not None:
-                self._joint = self._joint.turned(np.asarray(rotation, dtype=np.float64))
+                self._joint = self._joint.turned(np.asarray(rotation, dtype=np.float64), gravity)
             values = self._joint.untared(values[None])[0]
         return self.readout.scaled(values)
 

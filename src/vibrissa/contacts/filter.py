@@ -30,7 +30,6 @@ from vibrissa.contacts.onset import Beginning, Gaussians
 from vibrissa.contacts.prior import Prior, refuse_tip
 from vibrissa.contacts.readout import Measurement
 from vibrissa.numerics import AnyArray, Array, IntArray
-from vibrissa.sensors import GRAVITY
 from vibrissa.status import Status
 
 _UNKNOWNS = 3
@@ -210,7 +209,7 @@ class ContactFilter:
         signals: ArrayLike,
         rotation: ArrayLike | None = None,
         position: ArrayLike | None = None,
-        gravity: ArrayLike = GRAVITY,
+        gravity: ArrayLike | None = None,
     ) -> Followed:
         """Take one sample."""
         turn = np.ascontiguousarray(_LEVEL if rotation is None else rotation, dtype=np.float64)

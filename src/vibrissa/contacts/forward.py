@@ -144,10 +144,20 @@ class Gravity:
         x, y, z = near_direction(rotation.T @ self.acceleration, step).tolist()
         return replace(self, acceleration=(x, y, z), tare=self.tare or (x, y, z))
 
-    @property
-    def nearly(self) -> tuple[float, float, float]:
-        """Acceleration in the nearest of directions some degrees apart."""
-        x, y, z = near_direction(np.array(self.acceleration), _SHAPES).tolist()
+    def nearly(self, share: float) -> tuple[float, float, float]:
+        """Give a share of the acceleration, in the nearest of directions some degrees apart.
+
+        Parameters
+        ----------
+        share : float
+            Share of its size.
+
+        Returns
+        -------
+        tuple of float
+            Acceleration, m/s².
+        """
+        x, y, z = near_direction(share * np.array(self.acceleration), _SHAPES).tolist()
         return x, y, z
 
 

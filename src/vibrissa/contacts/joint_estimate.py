@@ -46,6 +46,8 @@ _MOST = 8
 # need less friction come first.
 _LIKELY = np.deg2rad(20.0)
 _NO_ERRORS = np.zeros((0, 6, 7))
+# A base that falls leaves less than this of gravity, m/s².
+_WEIGHTLESS = 1e-9
 # Of three signals with all of these unknown, regions hold half to two thirds of the contacts.
 _SEPARATE = 4
 
@@ -147,16 +149,34 @@ class JointEstimate:
             return ()
         return self._lab.turned(rotation, self._step).acceleration
 
-    def turned(self, rotation: Array) -> JointEstimate:
-        """The same with the base turned (3, 3), gravity being that of the laboratory frame."""
-        if self._lab is None or not np.isfinite(rotation).all():
+    @property
+    def laboratory_gravity(self) -> tuple[float, float, float] | None:
+        """Gravity that was stated, in the frame that rotations of the base lead to."""
+        return None if self._lab is None else self._lab.acceleration
+
+    def turned(self, rotation: Array, gravity: ArrayLike | None = None) -> JointEstimate:
+        """The same with the base turned (3, 3), gravity being that of the laboratory frame.
+
+        It is what was stated, or gravity (3,) minus the acceleration that the base now has.
+        """
+        stated = self._lab
+        if stated is None:
             return self
-        weight = self._lab.turned(rotation, self._step)
+        lab = stated
+        if gravity is not None:
+            x, y, z = np.asarray(gravity, dtype=np.float64).tolist()
+            lab = replace(stated, acceleration=(x, y, z))
+        if not (np.isfinite(rotation).all() and np.isfinite(lab.acceleration).all()):
+            return self
+        weight = lab.turned(rotation, self._step)
         if weight == self.gravity:
             return self
         names = self.names, self.sensor, self.prior
         out = JointEstimate(self.whisker, self.contact_map, *names, gravity=weight, **self._how)
-        out._lab, out._proposing = replace(self._lab, tare=weight.tare), weight.nearly
+        # Contacts are proposed by shapes under gravity of the size that was stated: they are few.
+        now = max(float(np.linalg.norm(weight.acceleration)), _WEIGHTLESS)
+        out._proposing = weight.nearly(float(np.linalg.norm(stated.acceleration)) / now)
+        out._lab = replace(stated, tare=weight.tare)
         out._step = self._step
         return out
 

@@ -14,6 +14,7 @@ import numpy as np
 from vibrissa.contacts import Contact, ContactFilter, Estimator, Followed
 from vibrissa.numerics import Array
 from vibrissa.rod import PointForce, deflect
+from vibrissa.sensors import GRAVITY
 from vibrissa.signals import SIGNALS, signals_of
 from vibrissa.streaming.lines import FRAME, LineKind, Lines, Poses, Sample
 
@@ -110,7 +111,7 @@ class ContactStream:
         self._headers = 0
         self.poses = poses or Poses()
         self.laboratory = ""
-        self.slow, self.untimed = 0, 0
+        self.slow, self.untimed, self.unused = 0, 0, False
         self._tare = tare
         self._free: list[Array] = []
         self._offset: Array | float = 0.0
@@ -177,7 +178,9 @@ class ContactStream:
             self._estimator(values, turn)
             if self._follow is not None:
                 self._follow(1e-3 * k, values, turn)
-        (self._follow or self._estimator).reset()
+        if self._follow is not None:
+            self._follow.reset()
+        self._estimator.restart()
 
     def record(self, sample: Sample) -> dict[str, Any]:
         """Locate one sample.
@@ -207,25 +210,33 @@ class ContactStream:
         self.slow += time > self._time + _SLOW > -math.inf
         self._time = max(self._time, time)
         rotation, position = self._pose(sample, time)
-        sensor = self._estimator.sensor
+        sensor, gravity = self._estimator.sensor, None
+        if sample.acceleration is not None:
+            rotation = np.eye(3) if rotation is None else rotation
+            gravity = -rotation @ self.poses.in_base(sample.acceleration)
+            heavy = self._estimator.weighted or (sensor is not None and sensor.mass > 0.0)
+            self.unused = not heavy
         if rotation is None and sensor is not None and sensor.mass > 0.0:
             raise ValueError(
                 "the sensor carries a mass, so the base's rotation is needed: base_qw, base_qx, "
-                "base_qy and base_qz in the line, or a pose before it"
+                "base_qy and base_qz in the line, or a pose before it; or what an accelerometer "
+                "reads: imu_ax, imu_ay and imu_az"
             )
         known = {"time": time, **sample.passed}
         if self.whisker:
             known["whisker"] = self.whisker
         if len(self._free) < self._tare:
-            return known | {"status": self._tared(sample.values, rotation)}
+            return known | {"status": self._tared(sample.values, rotation, gravity)}
         values = sample.values - self._offset
+        if gravity is not None and not np.isfinite(gravity).all():
+            values = np.full_like(values, np.nan)
         if self._which and sample.names != self._announced:
             wrench = np.zeros(6)
             wrench[[COMPONENTS.index(name) for name in sample.names]] = values
             values = signals_of(wrench[:3], wrench[3:])[self._which]
         place: Array | None
         if self._follow is None:
-            found = self._estimator(values, rotation)
+            found = self._estimator(values, rotation, gravity)
             known |= located_record(found)
             place, spread = found.point, found.covariance
             if rotation is not None:
@@ -233,7 +244,7 @@ class ContactStream:
             if position is not None:
                 place = place + position
         else:
-            followed = self._follow(time, values, rotation, position)
+            followed = self._follow(time, values, rotation, position, gravity)
             known |= followed_record(followed, rotation)
             place, spread = followed.point, followed.covariance
         event = self._events(time, known["status"], place, spread)
@@ -254,11 +265,12 @@ class ContactStream:
             return self.poses.put(time, rotation, position)
         return self.poses.at(time) or (rotation, position)
 
-    def _tared(self, values: Array, rotation: Array | None) -> str:
+    def _tared(self, values: Array, rotation: Array | None, gravity: Array | None) -> str:
         """Take one sample of a free whisker."""
         sensor = self._estimator.sensor
         assert sensor is not None
-        reading = sensor.compensated(values, rotation)
+        pull = GRAVITY if gravity is None else gravity
+        reading = sensor.compensated(values, rotation, pull)
         if not np.isfinite(reading).all():
             return "missing"
         self._free.append(reading)
@@ -450,6 +462,11 @@ def advice(stream: ContactStream) -> list[str]:
     touching = measured - counts["not_felt"]
     unexplained = counts["outside_map"] + counts["not_frictionless"]
     out = []
+    if stream.unused:
+        out.append(
+            "The accelerometer's readings change nothing: neither the whisker (gravity, with its "
+            "density) nor the sensor has a weight."
+        )
     if touching > 0 and unexplained > _NEARLY_ALL * touching:
         larger = (
             "are larger than any that this whisker can give"

@@ -4,8 +4,10 @@ Both carry numbers by name, in SI units; signals of a table may be in others if 
 them (:mod:`vibrissa.io.table`), and its cells may be separated by semicolons, tabs or blanks. The
 pose of the base may be added: ``base_x``, ``base_y`` and ``base_z`` (m, laboratory), and a unit
 quaternion ``base_qw``, ``base_qx``, ``base_qy``, ``base_qz`` that turns the whisker's into the
-laboratory frame. A JSON object may hold a pose and its time alone. Fields that ROS adds are passed
-on unchanged: ``stamp_ns`` and ``recorded_ns`` (whole numbers) and ``frame_id``.
+laboratory frame; and what an accelerometer reads there, ``imu_ax``, ``imu_ay``, ``imu_az`` (m/s²,
+9.81 upward at rest), in the axes that poses are of. A JSON object may hold a pose and its time
+alone. Fields that ROS adds are passed on unchanged: ``stamp_ns`` and ``recorded_ns`` (whole
+numbers) and ``frame_id``.
 
 Rows are read by the last header. So after a header that is refused no row is read until there is
 another one.
@@ -46,6 +48,11 @@ POSITION = ("base_x", "base_y", "base_z")
 QUATERNION = ("base_qw", "base_qx", "base_qy", "base_qz")
 """Columns with its orientation."""
 
+ACCELERATION = ("imu_ax", "imu_ay", "imu_az")
+"""Columns with the reading of an accelerometer."""
+
+_SHARED = (*POSITION, *QUATERNION, *ACCELERATION)
+
 STAMP = "stamp_ns"
 """Column with the time stamp of ROS, ns."""
 
@@ -82,7 +89,8 @@ class Sample(NamedTuple):
     """One line: its number from 1, the named values, and the pose of the base, where it is there.
 
     Of several choices of names that were asked for, those that the line has; a pose that the line
-    leaves empty is NaN. Passed on as they are: ``stamp_ns``, ``recorded_ns`` and ``frame_id``.
+    leaves empty is NaN, as is an acceleration. Passed on as they are: ``stamp_ns``, ``recorded_ns``
+    and ``frame_id``.
     """
 
     line: int
@@ -92,6 +100,7 @@ class Sample(NamedTuple):
     rotation: Array | None
     position: Array | None
     passed: Mapping[str, Any] = MappingProxyType({})
+    acceleration: Array | None = None
 
 
 class Lines:
@@ -126,7 +135,7 @@ class Lines:
 
     def _of_others(self, known: Mapping[str, object]) -> bool:
         """Whether a line has named values, and none that this whisker shares or owns."""
-        wanted = {*POSITION, *QUATERNION, *(name for names in self.names for name in names)}
+        wanted = {*_SHARED, *(name for names in self.names for name in names)}
         return any("." in name for name in known) and not wanted & set(known)
 
     def _own(self, name: str) -> str:
@@ -197,7 +206,7 @@ class Lines:
         if self.raw:
             lacks = "the header (channels are called as the sensor's are, without units)"
         self._chosen(lacks, names)
-        used = {name for choice in self.names for name in choice} | {"time", *POSITION, *QUATERNION}
+        used = {name for choice in self.names for name in choice} | {"time", *_SHARED}
         twice = {cell for cell, name in zip(cells, names, strict=True) if name in used}
         if twice := {cell for cell in twice if cells.count(cell) > 1}:
             raise ValueError(f"{lacks} has {', '.join(sorted(twice))} more than once")
@@ -210,7 +219,7 @@ class Lines:
         """Whether a line that cannot be used as a header is one, and not noise on a serial line."""
         if len(cells) < 2 or not all(cell[:1].isalpha() and not is_number(cell) for cell in cells):
             return False
-        wanted = {"time", *POSITION, *QUATERNION, *(name for names in self.names for name in names)}
+        wanted = {"time", *_SHARED, *(name for names in self.names for name in names)}
         return len(cells) == len(self._header or ()) or any(
             cell in wanted or signal_column(cell)[0] for cell in cells
         )
@@ -246,14 +255,16 @@ class Lines:
                 "or ns"
             )
         values = np.array([_number(name, known[name]) for name in names])
-        rotation = position = None
+        rotation = position = acceleration = None
+        if set(ACCELERATION) <= set(known):
+            acceleration = np.array([_number(name, known[name]) for name in ACCELERATION])
         if set(POSITION) <= set(known):
             position = np.array([_number(name, known[name]) for name in POSITION])
             if (np.abs(position) > _FARTHEST).any():
                 raise ValueError(f"the base is at {position.tolist()}; its position is in m")
         if set(QUATERNION) <= set(known):
             rotation = rotation_of([_number(name, known[name]) for name in QUATERNION])
-        return Sample(self.number, time, names, values, rotation, position, passed)
+        return Sample(self.number, time, names, values, rotation, position, passed, acceleration)
 
 
 def _passed(known: Mapping[str, object]) -> dict[str, Any]:
@@ -361,6 +372,21 @@ class Poses:
     def forget(self) -> None:
         """Begin anew."""
         self._last.clear()
+
+    def in_base(self, vector: Array) -> Array:
+        """Turn a vector of the carrier's axes into the whisker's frame.
+
+        Parameters
+        ----------
+        vector : (3,) array
+            Vector, of any unit.
+
+        Returns
+        -------
+        (3,) array
+            The same in the whisker's frame.
+        """
+        return np.asarray(vector @ self._turn)
 
     def _base(self, rotation: Array, position: Array) -> Pose:
         """Pose of the base from that of what carries it."""

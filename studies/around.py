@@ -3,7 +3,7 @@
 `python studies/around.py [--count N] [--page]`: whiskers are pressed against an object whose
 position is known to 1 mm along each axis, so far that they touch it more than once; force and
 moment have noise of a share of EI/L² and EI/L. The truth is solved with 160 elements, estimates
-with 32, then 96. `--page` writes the table to the page on remedies.
+with 32, then 96. `--page` writes the table to `docs/several-contacts.md`.
 """
 
 import argparse
@@ -120,7 +120,7 @@ def main():
     block = table(HEAD, every, texts=2)
     print(block)
     if asked.page:
-        put(Path(__file__).parents[1] / "docs" / "remedies.md", {"around": block})
+        put(Path(__file__).parents[1] / "docs" / "several-contacts.md", {"around": block})
 
 
 if __name__ == "__main__":

@@ -233,7 +233,8 @@ def main():
     blocks["second contacts"] = table(DETECTION, list(detection(contact_map, asked)))
     print(blocks["second contacts"])
     if asked.page:
-        put(Path(__file__).parents[1] / "docs" / "remedies.md", blocks)
+        docs = Path(__file__).parents[1] / "docs"
+        put([docs / "remedies.md", docs / "several-contacts.md"], blocks)
 
 
 if __name__ == "__main__":

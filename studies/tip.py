@@ -3,7 +3,7 @@
 `python studies/tip.py [--count N] [--whisker FILE] [--page]`: contacts of the side and of the tip,
 drawn evenly over the contact points of either kind, with noise of force and moment of a share of
 EI/L² and EI/L, once without and once with a prior that makes both equally probable. `--page` writes
-the table to the page on remedies.
+the table to `docs/several-contacts.md`.
 """
 
 import argparse
@@ -146,7 +146,7 @@ def main():
     block = table(HEAD, every, texts=2)
     print(block)
     if asked.page and not asked.whisker:
-        put(Path(__file__).parents[1] / "docs" / "remedies.md", {"tip": block})
+        put(Path(__file__).parents[1] / "docs" / "several-contacts.md", {"tip": block})
 
 
 if __name__ == "__main__":

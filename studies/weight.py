@@ -2,7 +2,7 @@
 
 `python studies/weight.py [--count 60] [--page]`: three straight, tapered rods held level, upright
 and oblique; contacts of random arc length, direction and force, 2° to 25°; noise of 1/1000 EI/L²
-and EI/L. With `--page` the table goes to `docs/choosing-signals.md`. `--reference` writes
+and EI/L. With `--page` the table goes to `docs/friction-weight.md`. `--reference` writes
 `tests/data/weighted_contacts.csv`: contacts by an integration in the laboratory frame, which
 vibrissa has no part in.
 """
@@ -127,7 +127,7 @@ def main():
     text = table(HEAD, list(rows(asked.count)))
     print(text)
     if asked.page:
-        put(ROOT / "docs" / "choosing-signals.md", {"weight": text})
+        put(ROOT / "docs" / "friction-weight.md", {"weight": text})
 
 
 if __name__ == "__main__":

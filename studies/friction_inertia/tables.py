@@ -78,7 +78,7 @@ def trials(results: Results) -> str:
             [label, str(row["touching"]), str(row["detected"]), str(row["false"]), degrees(angle)]
             + [str(n) for n in counts[:-1]]
         )
-    head = ["trial", "touching", "detected", "of these false", "friction angle", *LABELS]
+    head = ["trial", "touching", "detected", "falsely detected", "friction angle", *LABELS]
     return table(head, rows)
 
 

@@ -179,10 +179,18 @@ def test_somebody_elses_table(tmp_path):
     assert np.isnan(line[1, 1]).all()
 
 
+def test_rows_come_in_any_order_where_nodes_are_numbers(tmp_path):
+    path = tmp_path / "points.csv"
+    path.write_text("frame,node,column,row\r\n0,10,3,0\r\n0,2,2,0\r\n1,0,4,0\r\n0,0,1,0\r\n")
+    tracks = load_tracks(path)
+    assert tracks["node"].values.tolist() == ["0", "2", "10"]
+    np.testing.assert_equal(tracks["trace"].values[0, 0, 0, :, 0], [1.0, 2.0, 3.0])
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("frame,x,y\n0,1,2\n", r"columns frame, x, y; column, row .pixels. or x, y, z"),
+        ("frame,x,y\n0,1,2\n", r"columns frame, x, y; column, row or x_px, y_px .pixels., or x"),
         ("frame,x,y,z\n", "no rows"),
         ("frame,x,y,z\n0,1,2\n", "4 columns, but line 2 has 3 cells"),
         ("frame,x,y,z\n0,1,2,b\n", "column z has cells that are not numbers: line 2"),

@@ -203,7 +203,7 @@ def test_a_robots_whisker():
     [
         (np.zeros((5, 4)), r"shape \(5, 4\)"),
         (np.zeros(5), r"shape \(5,\)"),
-        (digitized(3), "3 points; at least 4"),
+        (digitized(3), "points is 3; at least 4"),
         (np.zeros((5, 3)), "rows 1, 2, 3, 4 repeat.*all points are one"),
         (digitized(20)[[*range(10), *range(9, 20)]], "rows 10 repeat"),
         (digitized(20) * 1e3, "millimetres given as metres"),

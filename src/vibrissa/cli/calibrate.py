@@ -44,8 +44,8 @@ def calibrate(
     board in the first moment in which all cameras see it. The description of a stage
     (vibrissa.sensors.Stage) names tables of touches and of the resting whisker; the calibrated
     sensor is for `vibrissa estimate --sensor`.
-    Example: `vibrissa calibrate --pattern 9x6 --square 5 top_*.png front_*.png -o cameras.toml`
-    Example: `vibrissa calibrate stage.toml -o sensor.nc`
+    Example: `vibrissa calibrate --pattern 9x6 --square 5 top_*.png front_*.png -o cameras.toml`;
+    `vibrissa calibrate stage.toml -o sensor.nc`
     """
     if len(images) == 1 and images[0].suffix == ".toml":
         boards = {"--pattern": pattern, "--square": square, "--frames": frames}

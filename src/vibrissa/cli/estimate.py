@@ -260,14 +260,25 @@ def _named_signals(table: Path, how: EstimateOptions) -> bool:
         return False
     names = how.names or vb.pipeline.TRIPLET
     first = next((line for line in vb.io.read_text(table).splitlines() if line.strip()), "")
-    try:
-        vb.streaming.Lines(vb.streaming.COMPONENTS)(first)
-    except ValueError:
-        try:
-            return vb.streaming.Lines(names)(first) is None and bool(first)
-        except ValueError:
-            return False
+    if not first or _is_header(first, vb.streaming.COMPONENTS):
+        return False
+    if _is_header(first, names):
+        return True
+    known = [name for name in vb.signals.SIGNALS if _is_header(first, (name,))]
+    if len(known) >= 3:
+        raise ValueError(
+            f"{table} has the signals {', '.join(known)}, and {', '.join(names)} are asked for: "
+            f"state --using {','.join(known)}"
+        )
     return False
+
+
+def _is_header(line: str, names: tuple[str, ...]) -> bool:
+    """Whether a line is a header with columns of these names."""
+    try:
+        return vb.streaming.Lines(names)(line) is None
+    except ValueError:
+        return False
 
 
 def _from_lines(

@@ -127,6 +127,8 @@ def _tracks(
     if found["time"].attrs.get("units") != "s":
         raise ValueError(f"{paths[0]} does not state frames per second: give --rate")
     frames = found["frame"].values
+    if len(frames) < 2:
+        raise ValueError(f"{paths[0]} holds one frame; a trial with many is needed")
     every = np.arange(frames.min(), frames.max() + 1)
     if len(every) > len(frames):
         # What no row holds is a whisker that is lost.

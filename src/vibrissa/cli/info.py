@@ -498,7 +498,7 @@ def _table(path: Path) -> Iterator[tuple[str, str]]:
     used = [name for name in vb.signals.SIGNALS if name in columns]
     if len(used) >= 3:
         yield "kind", f"table of the signals {', '.join(used)}"
-        yield "next", f"vibrissa estimate {path} --using {','.join(used)}"
+        yield "next", f"vibrissa {_NEXT['signals']}".format(f"{path} --using {','.join(used)}")
         return
     raise ValueError(f"{path} is not a table that is known: {_header(path)}. Known are\n{_TABLES}")
 
@@ -533,9 +533,10 @@ def _rows(kind: str, data: Any) -> Iterator[tuple[str, str]]:
     else:
         time = data["time"].values
         known = time[np.isfinite(time)]
+        notes = data.attrs.get("notes", ())
         span = f"from {known.min():g} to {known.max():g} s" if known.size else "at unknown times"
-        yield "rows", f"{time.size}, {span}"
-        yield from (("note", note) for note in data.attrs.get("notes", ()))
+        yield "rows", f"{time.size}" if vb.io.NUMBERED in notes else f"{time.size}, {span}"
+        yield from (("note", note) for note in notes)
         if kind == "contacts":
             for sentence, count in vb.status.describe(data["status"].values).most_common():
                 yield str(count), sentence

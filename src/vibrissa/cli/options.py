@@ -2,7 +2,8 @@
 
 Lengths are in mm, forces in µN, moments in µN·m and angles in degrees, unless the help of an option
 states another unit. A verb has options as parameters, by their names; their types say which values
-there are; `options.csv` describes them, a row an option.
+there are; `options.csv` describes them, a row an option, and one more for verbs in which its
+defaults or values differ: `track|import.whisker`.
 """
 
 from __future__ import annotations
@@ -39,22 +40,20 @@ class Option(NamedTuple):
     least: float | None = None
 
 
-def _options() -> dict[str, Option]:
+def _options() -> dict[tuple[str, str], Option]:
     """Read the table next to this module."""
     rows = csv.DictReader(Path(__file__).with_suffix(".csv").read_text("utf-8").splitlines())
-    return {
-        row["name"]: Option(
-            row["help"],
-            row["metavar"] or None,
-            row["names"] or None,
-            json.loads(row["least"] or "null"),
-        )
-        for row in rows
-    }
+    found: dict[tuple[str, str], Option] = {}
+    for row in rows:
+        verbs, _, name = row["name"].rpartition(".")
+        least = json.loads(row["least"] or "null")
+        about = Option(row["help"], row["metavar"] or None, row["names"] or None, least)
+        found |= {(verb, name): about for verb in verbs.split("|")}
+    return found
 
 
 OPTIONS = _options()
-"""The options by the names of parameters."""
+"""The options by verb, "" in all others, and name of the parameter."""
 
 RecordingArgument = Annotated[
     Path, typer.Argument(help="A recording, NetCDF (.nc).", metavar="TRIAL.nc")
@@ -97,7 +96,9 @@ def with_options(output: str = "") -> Callable[[Verb], Verb]:
     def decorated(verb: Verb) -> Verb:
         hints = get_type_hints(verb, include_extras=True)
         given = inspect.signature(verb).parameters.values()
-        flat = _flat({one.name: (hints[one.name], one.default) for one in given}, output)
+        # A file has the name of its verb.
+        kind = verb.__module__.rpartition(".")[2].rstrip("_")
+        flat = _flat({one.name: (hints[one.name], one.default) for one in given}, kind, output)
 
         @wraps(verb)
         def called(**values: Any) -> None:
@@ -110,32 +111,33 @@ def with_options(output: str = "") -> Callable[[Verb], Verb]:
     return decorated
 
 
-def _flat(kinds: Mapping[str, tuple[Any, Any]], output: str) -> list[inspect.Parameter]:
+def _flat(kinds: Mapping[str, tuple[Any, Any]], verb: str, output: str) -> list[inspect.Parameter]:
     """Options, with the fields of data classes in their place."""
     found = []
     for name, (kind, default) in kinds.items():
         if is_dataclass(kind):
             hints = get_type_hints(kind, include_extras=True)
             inside = {one.name: (hints[one.name], one.default) for one in fields(kind)}
-            found += _flat(inside, output)
+            found += _flat(inside, verb, output)
             continue
         default = inspect.Parameter.empty if default is MISSING else default
         annotation = kind
         if get_origin(kind) is not Annotated:  # else it is an argument
-            annotation = Annotated[kind, _declared(name, default, output)]
+            annotation = Annotated[kind, _declared(name, default, verb, output)]
         # Options are passed by name, so that those without a default may follow others.
         how = inspect.Parameter.KEYWORD_ONLY
         found.append(inspect.Parameter(name, how, default=default, annotation=annotation))
     return found
 
 
-def _declared(name: str, default: Any, output: str) -> Any:
+def _declared(name: str, default: Any, verb: str, output: str) -> Any:
     """Declare an option to Typer."""
     if name == "target":
         text = f"Where the result goes: {output}."
         return typer.Option("--output", "-o", help=text, metavar="PATH")
-    about = OPTIONS[name.rstrip("_")]
-    names = f"--{name.rstrip('_').replace('_', '-')}"
+    plain = name.rstrip("_")
+    about = OPTIONS.get((verb, plain)) or OPTIONS["", plain]
+    names = f"--{plain.replace('_', '-')}"
     if default is True:
         names += names.replace("--", "/--no-", 1)
     return typer.Option(

@@ -265,10 +265,10 @@ def _agreement(fit: vb.contour.FittedShape, contour: xr.Dataset) -> str:
     if inside:
         text += f", to {fixed('surface_distance', fit.rms, 1)}"
     if found > used:
-        text += f"; {found - used} more are too uncertain to be used"
+        text += f"; too uncertain to be used: {found - used}"
     together = float(contour.attrs["frames_together"])
     if together > 1.5:
-        text += f"; about {together:.0f} frames err together, which sigma takes into account"
+        text += f"; some {together:.0f} successive frames share their errors, as sigma allows for"
     return text
 
 

@@ -394,7 +394,7 @@ def read_tracks_table(path: str | PathLike[str]) -> RawTracks:
     labels = {name: table.text(name) for name in _LABELS if name in table.names}
     whisker, who = _ordered(labels.get("whisker", ["whisker"] * len(row)))
     view, seen = _ordered(labels.get("view", [""] * len(row)))
-    node, part = _ordered(labels.get("node") or _counted(row, who, seen))
+    node, part = _ordered(_numbered(labels.get("node")) or _counted(row, who, seen))
     place = (row, who, seen, part)
     if len(np.unique(np.stack(place), axis=1).T) != len(row):
         raise ValueError(f"{path} has the same point of a whisker twice in one frame")
@@ -430,14 +430,22 @@ def _coordinates(path: Path, names: Sequence[str]) -> tuple[list[str], str]:
     if {"x", "y", "z"} <= set(names):
         return list("xyz"), "m"
     raise ValueError(
-        f"{path} has the columns {', '.join(names)}; column, row (pixels) or x, y, z (m; also x_mm "
-        f"and so on: {', '.join(UNITS)}) are needed"
+        f"{path} has the columns {', '.join(names)}; column, row or x_px, y_px (pixels), or x, y, "
+        f"z (m; also x_mm and so on: {', '.join(UNITS)}) are needed"
     )
 
 
+def _numbered(names: Sequence[str] | None) -> Sequence[Any] | None:
+    """Names as whole numbers, where all are."""
+    whole = names is not None and all(name.isdecimal() for name in names)
+    return [int(name) for name in names] if names is not None and whole else names
+
+
 def _ordered(names: Sequence[Any]) -> tuple[list[str], NDArray[np.int64]]:
-    """Names in the order they appear in, and which of them each row has."""
-    order = {name: i for i, name in enumerate(dict.fromkeys(names))}
+    """Names in the order they appear in, numbers in theirs, and which of them each row has."""
+    known = dict.fromkeys(names)
+    numbered = all(isinstance(name, int) for name in known)
+    order = {name: i for i, name in enumerate(sorted(known) if numbered else known)}
     return [str(name) for name in order], np.array([order[name] for name in names])
 
 

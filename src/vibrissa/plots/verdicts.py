@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -36,8 +37,8 @@ _ROW = 4.2
 _HEAD, _FOOT = 11.0, 13.5
 _KEY = (
     "numbers: largest distance (mm) of two contacts with the same signals",
-    "critical cone: about rest, outside it no such pair was found; ambiguous: share of contacts "
-    "that another one resembles within 0.1 % of ranges",
+    "critical cone: about rest, outside it no such pair was found",
+    "; ambiguous: share of contacts that another one resembles within 0.1 % of ranges",
 )
 _LETTER = 1.25
 """Room for a letter of the key, mm."""
@@ -95,7 +96,8 @@ def verdict_table(verdicts: xr.Dataset, *, width: style.Width = "double") -> Fig
         proved = "evidence" in verdicts and bool((verdicts["evidence"] == "proved").any())
         for i, triplet in enumerate(triplets):
             _row(axes, verdicts.sel(triplet=triplet), i, triplet == chosen, width, page)
-        _key(axes, height, width, proved, "all" in regions)
+        explained = _KEY[:1] if "all" not in regions else (_KEY[0], _KEY[1] + known * _KEY[2])
+        _key(axes, height, explained if width == "double" else (), proved)
         if "all" in regions:
             every = verdicts.sel(region="all")
             held = (every["verdict"] == VERDICTS[0]).values
@@ -232,8 +234,8 @@ def _evidence(axes: Axes, verdict: xr.Dataset, left: float, y: float) -> None:
             axes.text(left + 25.6 + 9.0 * value, y, f"{100.0 * value:.0f} %", **look)
 
 
-def _key(axes: Axes, height: float, width: style.Width, proved: bool, whole: bool) -> None:
-    """Explain the symbols."""
+def _key(axes: Axes, height: float, lines: Sequence[str], proved: bool) -> None:
+    """Explain the symbols, and the columns in lines below them."""
     x, y, page = 3.5, height - _FOOT + 3.0, axes.get_xlim()[1]
     axes.plot([1.5, page - 1.5], [y - 3.0] * 2, color=style.INK, linewidth=0.9)
     for kind, text in {**({PROVED: PROVED} if proved else {}), **WORDS}.items():
@@ -243,9 +245,8 @@ def _key(axes: Axes, height: float, width: style.Width, proved: bool, whole: boo
         _symbol(axes, x, y, kind)
         axes.text(x + 2.4, y, text, fontsize=style.SMALL, va="center")
         x += room
-    if width == "double":
-        for line, text in enumerate(_KEY if whole else _KEY[:1], start=1):
-            axes.text(3.5, y + 3.5 * line, text, fontsize=style.SMALL, va="center")
+    for line, text in enumerate(lines, start=1):
+        axes.text(3.5, y + 3.5 * line, text, fontsize=style.SMALL, va="center")
 
 
 HIGHLIGHTED = ("Fx MB MD", "Mx MB MD", "Fx FD MD")
@@ -312,12 +313,18 @@ def resolution(verdicts: xr.Dataset, *, width: style.Width = "double") -> Figure
         _resolution_key(figure, share)
         at = share.isel(region=0).sel(signal_tolerance=_TOLERANCE, method="nearest")
         if np.isfinite(at.values).any():
-            best = at.isel(triplet=int(np.nanargmin(at.values)))
+            known = [str(name) for name in at["triplet"].values]
+            shown = (verdicts.attrs.get("chosen_triplet"), known[int(np.nanargmin(at.values))])
+            left = [
+                f"{100.0 * float(at.sel(triplet=name)):.0f} % of the contacts ambiguous with "
+                f"({triplet_label(name)})"
+                for name in dict.fromkeys(shown)
+                if name in known
+            ]
             style.conclude(
                 figure,
-                f"With signals known to {100.0 * float(best['signal_tolerance']):g} % of their "
-                f"ranges ({triplet_label(str(best['triplet'].values))}) leaves fewest contacts "
-                f"ambiguous, {100.0 * float(best):.0f} %",
+                f"Signals known to {100.0 * float(at['signal_tolerance']):g} % of their ranges "
+                f"leave {', '.join(left)}, the fewest",
             )
         return figure
 

@@ -197,6 +197,7 @@ def bent_views(
     forces: ArrayLike | None = None,
     *,
     labels: Sequence[str] = (),
+    finding: str | None = None,
     width: style.Width = "double",
 ) -> Figure:
     """Draw a whisker bent in some ways, from above (x–y) and from the side (x–z), to one scale.
@@ -215,6 +216,8 @@ def bent_views(
     labels : sequence of str, optional
         One for each. With up to four curves each has a colour of its own; more are shaded from
         first to last.
+    finding : str, optional
+        Sentence above the figure; by default the range of the forces.
     width : {"single", "double"}
         Columns of the page: the views stand side by side in two, one below the other in one.
 
@@ -251,9 +254,11 @@ def bent_views(
             [labels[int(i)] for i in known] if labels else (),
         )
         figure = _bent_figure(drawn, _limits(drawn, extent), width)
-        if largest > 0.0:
+        if largest > 0.0 and finding is None:
             low, high = to_display("force", np.array([np.nanmin(size), largest]))
-            style.conclude(figure, f"Contacts held by forces from {low:.3g} to {high:.3g} µN")
+            finding = f"Contacts held by forces from {low:.3g} to {high:.3g} µN"
+        if finding:
+            style.conclude(figure, finding)
         return figure
 
 
@@ -526,7 +531,7 @@ def _sentences(witness: xr.Dataset, triplet: tuple[str, ...]) -> list[str]:
     length = float(np.linalg.norm(step, axis=1).sum())
     return [
         f"the shaded signals differ by {_power(_difference(witness, triplet))} of their size",
-        f"the contacts lie {1e3 * apart:.2f} mm = {apart / length:.3f} $L$ apart",
+        f"the contacts are {1e3 * apart:.2f} mm = {apart / length:.3f} $L$ apart",
         "arrows: force on the whisker; grey: at rest",
     ]
 

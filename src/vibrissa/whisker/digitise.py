@@ -130,7 +130,7 @@ def checked_points(
     if noise is not None and not (np.isfinite(noise) and noise >= 0.0):
         faults.append(f"noise is {noise!r} m; None or a number that is not negative is allowed")
     if len(array) < 4:
-        faults.append(f"there are {len(array)} points; at least 4 are needed")
+        faults.append(f"the number of points is {len(array)}; at least 4 are needed")
     bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
     if bad.size:
         faults.append(f"points must be finite; rows {_rows(bad)} are not (counted from 0)")

@@ -8,7 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from vibrissa.cameras import Camera, orthogonal_views
 from vibrissa.tracking import Trace, low_pass, merge, paired_frames
+from vibrissa.tracking.space.pose import base_pose, rolled_over
+from vibrissa.tracking.space.rest_shape import RestShape, whisker_at_rest
 from vibrissa.tracking.trace.trace import even
+from vibrissa.whisker import base_rotation
 
 LENGTH = 30e-3
 
@@ -150,3 +153,27 @@ def test_the_filter_keeps_gaps():
     np.testing.assert_array_equal(low_pass(values, 1000.0, None), values)
     with pytest.raises(ValueError, match="below half of"):
         low_pass(values, 100.0, 85.0)
+
+
+def test_contact_that_makes_a_whisker_look_rolled_leaves_its_roll():
+    """Bent against its own bend, a whisker has for some frames a shape that it has when rolled."""
+    s = np.linspace(0.0, 25e-3, 101) / 30e-3
+    own = 30e-3 * np.stack([np.sin(s), 1.0 - np.cos(s), 0.0 * s], axis=1)
+    azimuth = np.linspace(-0.5, 0.5, 40)
+    roll, bent = 0.3 * azimuth, np.arange(18, 24)
+    seen = roll.copy()
+    # The first frame of a contact, in which it is light; and one in which it is not.
+    seen[17] += 0.2
+    seen[bent] += 2.0
+    curves = base_rotation(azimuth, np.full(40, 0.1), seen) @ own.T
+    curves = np.swapaxes(curves, 1, 2)
+    free = ~np.isin(np.arange(40), bent)
+    free[20] = True
+    shape = RestShape(curves[0], free, np.zeros(40), 1e-6)
+    whisker = whisker_at_rest(shape)
+    assert np.flatnonzero(rolled_over(curves, shape, whisker)).tolist() == [20]
+    free[20] = False
+    found = base_pose(curves, shape, whisker)
+    np.testing.assert_allclose(
+        (found.roll - found.roll[0])[bent], (roll - roll[0])[bent], atol=0.03
+    )

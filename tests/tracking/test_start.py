@@ -216,6 +216,9 @@ def test_parts_of_one_line_are_joined_and_parallel_lines_are_not(angle):
     found = segments(scene.difference(frame), bodies)
     assert max(len(one.points) for one in found) < 60
     assert max(np.ptp(one.points, axis=0).max() for one in joined(found, bodies)) > 80
+    # Where a whisker begins nothing goes on.
+    middle = np.full((1, 2), 0.5 * (frame.shape[0] - 1.0))
+    assert len(joined(found, bodies, middle)) == len(found)
     x = np.arange(50.0)
     beside = [
         Segment(np.stack([x + 55.0 * k, 40.0 + 9.0 * k + 0.0 * x], axis=1), np.full(50, 20.0))

@@ -198,19 +198,38 @@ def test_the_covariance_of_the_contact_is_of_the_size_of_its_errors(filmed, foun
     assert 0.1 < np.median(squares) < 30.0
 
 
-def test_an_error_that_all_frames_share_is_in_the_covariances(filmed, traces, found, both):
-    """Traces of one view, all shifted by a twentieth of a pixel, as light from the side does."""
-    across = np.array([0.0, 0.05])
-    front = [[one._replace(line=one.line + across) for one in row] for row in traces[1]]
-    shifted = track(filmed.cameras, [traces[0], front], 1000.0).to_dataset().isel(whisker=0)
-    moved = (shifted["contact_point"].values - found["contact_point"].values)[both]
+def test_light_from_the_side_is_in_the_covariances_where_profiles_show_it(
+    filmed, traces, found, both
+):
+    """Traces of one view that all are shifted, with the skew of profiles that such light makes."""
+    ends = filmed.cameras[1].project(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1e-4]]))
+    base = float(np.linalg.norm(ends[1] - ends[0]))  # 0.1 mm, pixels
+    at_base, nearer = base, base * (1.0 - 0.25 * 14.0 / 15.0)
+    shift = 0.1
+    skew = shift / 3.2 * nearer**3 / at_base
+    lit = [[one._replace(skew=skew) for one in row] for row in traces[1]]
+
+    def shifted(one):
+        down = np.outer(np.linspace(shift, 0.0, len(one.line)), [0.0, 1.0])
+        return one._replace(line=one.line + down)
+
+    aside = [[shifted(one) for one in row] for row in lit]
+    known, wrong = (
+        track(filmed.cameras, [traces[0], one], 1000.0).to_dataset().isel(whisker=0)
+        for one in (lit, aside)
+    )
+    moved = (wrong["contact_point"].values - known["contact_point"].values)[both]
     assert np.median(np.linalg.norm(moved, axis=1)) > 2e-6
-    spread, shared = (found[f"contact_{n}"].values[both] for n in ("covariance", "shared"))
+    spread, shared = (known[f"contact_{n}"].values[both] for n in ("covariance", "shared"))
     together = np.einsum("tki,tkj->tij", shared, shared)
     assert (np.linalg.eigvalsh(spread - together) > -1e-14).all()
     held = np.einsum("ti,tij,tj->t", moved, np.linalg.inv(spread), moved)
     alone = np.einsum("ti,tij,tj->t", moved, np.linalg.inv(spread - together), moved)
     assert np.percentile(held, 95.0) < 7.8 < np.median(alone)
+    # Where profiles are even the light is not counted.
+    even = found["contact_covariance"].values[both]
+    square = np.einsum("ti,tij,tj->t", moved, np.linalg.inv(even), moved)
+    assert np.median(square) > 2.0 * np.median(held)
 
 
 def test_the_whisker_s_frame_is_known_as_well_as_stated(filmed, found):

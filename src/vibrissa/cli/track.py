@@ -382,6 +382,10 @@ def _track(
     """Track one trial and report what was found."""
     if bases[0] is None:
         bases, options = _found(videos, picture, cameras, masks, options, how.offset or 0)
+    else:
+        firsts = [next(vb.io.video_frames(video, [0])) for video in videos]
+        bright = vb.tracking.is_bright(firsts, bases, options)
+        options = replace(options, bright=bright)
     kept = [vb.tracking.partial_traces(recording, view) for view in range(len(videos))]
     with progress_bars() as tell:
         traces = [

@@ -497,7 +497,7 @@ def _names(tracks: xr.Dataset, dim: str) -> list[str]:
 
 
 Row = tuple[Array, Array, NDArray[np.bool_], float, bool, bool, float, bool]
-"""Points (n, 2), deviations (n,), seen (n,), confidence, whether base and tip are, glint, sparse;
+"""Points (n, 2), deviations (n,), seen (n,), confidence, whether base and tip are, skew, sparse;
 the last is not stored, as traces of videos never are."""
 
 
@@ -532,8 +532,8 @@ def load_traces(path: str | PathLike[str], key: str) -> list[list[Row]] | None:
     except (OSError, ValueError, KeyError, BadZipFile):
         return None
     rows = [
-        (line, sigma, seen, float(sure), bool(base), bool(tip), float(glint), False)
-        for line, sigma, seen, (sure, base, tip, glint) in zip(*parts, numbers, strict=True)
+        (line, sigma, seen, float(sure), bool(base), bool(tip), float(skew), False)
+        for line, sigma, seen, (sure, base, tip, skew) in zip(*parts, numbers, strict=True)
     ]
     each = len(rows) // max(whiskers, 1)
     return [rows[k * each : (k + 1) * each] for k in range(whiskers)]

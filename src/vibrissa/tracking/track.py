@@ -32,7 +32,7 @@ from vibrissa.tracking.refine.optics import Optics, rough_optics, stated_lenses
 from vibrissa.tracking.refine.rods import TraceSeries, rolled
 from vibrissa.tracking.space.curve import merge
 from vibrissa.tracking.space.frame_pairs import better_offset, paired_frames
-from vibrissa.tracking.space.pose import CUTOFF, BasePose, HeadPose, base_pose
+from vibrissa.tracking.space.pose import CUTOFF, BasePose, HeadPose, base_pose, rolled_over
 from vibrissa.tracking.space.rest_shape import (
     Length,
     RestShape,
@@ -350,6 +350,8 @@ def track_whisker(
     on_head = head.seen_from(points)
     tips: Mask = np.all(series.ends[:, :, 1] > 0.5, axis=1)
     shape, whisker = _at_rest(on_head, options, name, tips, flat=len(cameras) == 1)
+    if len(cameras) > 1:
+        shape = replace(shape, free=shape.free & ~rolled_over(on_head, shape, whisker))
     report(f"contact of {name}", 1, 2)
     touching = np.isfinite(points).all(axis=(1, 2)) & ~shape.free
     smoothness = options.fit

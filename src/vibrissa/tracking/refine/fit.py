@@ -58,9 +58,17 @@ _RUBBING = 1e-4
 _WAVES = 8
 """Number of waves along the whisker by which a view's traces may err in all frames alike."""
 
-_LIT, _GLINT = 0.1, 1.5
-"""Standard deviations, pixels, of the shift by light from the side: at the base, less where the
-whisker is thinner; and by a flank that is brighter than the other by the whisker's darkness."""
+_LIT, _SHIFTED, _NEARER, _MOST_LIT = 0.1, 3.2, 0.25, 0.5
+"""Standard deviation of the shift by light from the side at the base, pixels, less where the
+whisker is thinner, if its profile shows no more; that shift over the profile's third cumulant, in
+radii, for a flank of 0.65 radii that is lit by half; where on the whisker that is taken; and the
+largest shift, in radii, which is that by a flank as bright as the background."""
+
+_UNSEEN = 0.02
+"""Standard deviation of what else shifts the traces of a view, most at the base, pixels."""
+
+_MEDIAN = 1.86
+"""Standard deviation of a median of n normal numbers, over their median size and √n."""
 
 _AT_BASE, _FOLLOWED = 0.03, 2.0
 """Share of the length over which fur may draw a trace aside, and by how much more it does than what
@@ -414,10 +422,12 @@ def _shared(problem: Problem, fit: _Linear) -> Array:
         s = np.linspace(0.0, 1.0, n)
         beyond = s > 2.0 * _AT_BASE
         # What neighbours have in common is as strong in all long waves.
-        square = sum(float(np.mean(part[view][beyond] ** 2)) for part in parts)
+        # Where the image shows that a trace is uncertain, it is so by more than elsewhere.
+        known = (weight[:, :-2] ** 2).mean(axis=0)[beyond]
+        square = sum(float(np.average(part[view][beyond] ** 2, weights=known)) for part in parts)
         sigma = np.sqrt(2.0 * together / n * square)
         waves = [sigma * np.cos(k * np.pi * s) for k in range(_WAVES)]
-        waves.append(np.hypot(_LIT * (1.0 - s), _GLINT * problem.traces.glint[:, view].mean()))
+        waves.append(_lit(problem, view) * (1.0 - s))
         waves.append(_FOLLOWED * _drawn(fit)[view] * np.exp(-s / _AT_BASE))
         across = design[:, :-2] * weight[:, :-2, None]
         pulls += [np.einsum("tni,n->ti", across, wave) for wave in waves]
@@ -428,6 +438,33 @@ def _shared(problem: Problem, fit: _Linear) -> Array:
     return fit.smoother.responses(np.array(pulls))
 
 
+def _lit(problem: Problem, view: int) -> float:
+    """Root mean square of the shift of a view's traces at the base by light from the side, pixels.
+
+    Such light makes the profile of a whisker skew. What that shows, and how well, is combined with
+    what is usual.
+    """
+    skew = problem.traces.skew[:, view]
+    skew = skew[np.isfinite(skew)]
+    if not skew.size:
+        return _LIT
+    usual = float(np.median(skew))
+    sigma = _MEDIAN * float(np.median(np.abs(skew - usual))) / np.sqrt(len(skew))
+    at_base, nearer = problem.whisker.radius(problem.whisker.length * np.array([0.0, _NEARER]))
+    scale = _scales(problem)[view]
+    size = float(at_base * nearer**-3.0) * _SHIFTED / scale**2
+    known = _LIT**2 / (_LIT**2 + (size * sigma) ** 2)
+    lit = float(np.hypot(known * size * usual, np.sqrt(known) * size * sigma))
+    return float(np.hypot(min(lit, _MOST_LIT * float(at_base) * scale), _UNSEEN))
+
+
+def _scales(problem: Problem) -> list[float]:
+    """Pixels per metre at the base in each view."""
+    base = problem.head.put_in(problem.start.position * problem.d.length)
+    slopes = (camera.project_with_slopes(base)[1] for camera in problem.cameras)
+    return [float(np.linalg.norm(slope, axis=1).max()) for slope in slopes]
+
+
 def _drawn(fit: _Linear) -> list[float]:
     """Largest of the residuals of each view that all frames share at the base, pixels."""
     return [
@@ -436,7 +473,7 @@ def _drawn(fit: _Linear) -> list[float]:
     ]
 
 
-def _frame_errors(problem: Problem, state: State, fit: _Linear) -> Array:
+def _frame_errors(problem: Problem, fit: _Linear) -> Array:
     """Shifts and turns (2, 2, 3) of the whisker's frame, in its axes, by its shape at the base.
 
     The shape follows the traces there, and the rod the shape: what is wrong with the base, with the
@@ -444,11 +481,7 @@ def _frame_errors(problem: Problem, state: State, fit: _Linear) -> Array:
     follows from it, leaves a part of itself as residuals.
     """
     whisker = problem.whisker
-    base = problem.head.put_in(state.position * whisker.length)
-    scales = [
-        np.linalg.norm(camera.project_with_slopes(base)[1], axis=1).max()
-        for camera in problem.cameras
-    ]
+    scales = np.array(_scales(problem))
     drawn = np.array(_drawn(fit))
     aside = _FOLLOWED * float((drawn / scales).max())
     hook = float((np.hypot(_HOOKED, _HOOK * drawn) / scales).max())
@@ -514,7 +547,7 @@ def _answer(problem: Problem, state: State, fit: _Linear, nodes: int, unsure: fl
     moved = np.concatenate([moved, shared.swapaxes(0, 1)[..., :6] * size], axis=2)
     moved = np.pad(moved, ((0, 0), (0, 0), (0, 6)))
     # An error of the whisker's frame turns force and moment in it the other way.
-    errors = _frame_errors(problem, state, fit)
+    errors = _frame_errors(problem, fit)
     framed = np.einsum("tij,kpj->tkpi", state.rotation, errors).reshape(-1, 2, 6)
     framed = np.pad(framed, ((0, 0), (0, 0), (3, 6)))
     against = [np.cross(part[:, None], errors[:, 1]) for part in (wrench[:, :3], wrench[:, 3:])]

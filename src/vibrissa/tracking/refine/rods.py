@@ -44,7 +44,7 @@ class TraceSeries:
     seen: Array  # (time, view, NODES): 1 where the whisker is seen, 0 where it is bridged
     confidence: Array  # (time, view), between 0 and 1
     ends: Array  # (time, view, 2): 1 where the whisker is seen to begin and to end there, else 0
-    glint: Array  # (time, view): difference between its flanks, as a share of its darkness
+    skew: Array  # (time, view): third cumulant of its darkness across it, pixels³
 
     @classmethod
     def of(cls, traces: Sequence[Sequence[Trace]]) -> TraceSeries:
@@ -52,7 +52,7 @@ class TraceSeries:
         shape = (len(traces[0]), len(traces), NODES)
         line, sigma, seen = np.full((*shape, 2), np.nan), np.full(shape, np.nan), np.zeros(shape)
         confidence, ends = np.zeros(shape[:2]), np.zeros((*shape[:2], 2))
-        glint = np.zeros(shape[:2])
+        skew = np.full(shape[:2], np.nan)
         for view, row in enumerate(traces):
             for i, trace in enumerate(row):
                 n = len(trace.line)
@@ -65,9 +65,9 @@ class TraceSeries:
                     even[:, 2],
                     even[:, 3] > 0.5,
                 )
-                confidence[i, view], glint[i, view] = trace.confidence, trace.glint
+                confidence[i, view], skew[i, view] = trace.confidence, trace.skew
                 ends[i, view] = trace.base_seen, trace.tip_seen
-        return cls(line, sigma, seen, confidence, ends, glint)
+        return cls(line, sigma, seen, confidence, ends, skew)
 
     def rows(self, frames: NDArray[np.intp]) -> TraceSeries:
         """Select frames."""

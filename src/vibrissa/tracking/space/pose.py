@@ -16,7 +16,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.deferred import transform
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, Mask
 from vibrissa.tracking.space.rest_shape import RestShape, aligned_lengths, motions
 from vibrissa.tracking.trace.trace import interpolated
 from vibrissa.whisker import Whisker, angles_of, base_rotation
@@ -35,6 +35,13 @@ _TANGENT = 0.2
 
 _WHOLE = 0.85
 """Share of the whisker over which the rest shape is put on a frame's shape: tips are uncertain."""
+
+_ROLLED, _UNUSUAL, _MEDIAN, _ROUNDS = np.deg2rad(15.0), 5.0, 0.6745, 4
+"""Difference of a roll from what it is at that azimuth and elevation, rad, from which a frame is
+not free, and in standard deviations; a median of sizes in these; and number of rounds."""
+
+_SLOW = 7
+"""Number of free frames of which the median shows how the roll slowly changes."""
 
 
 def low_pass(values: ArrayLike, rate: float, cutoff: float | None = CUTOFF) -> Array:
@@ -173,24 +180,10 @@ def base_pose(curves: Array, shape: RestShape, whisker: Whisker) -> BasePose:
     BasePose
         Pose before it is filtered.
     """
-    n = len(curves)
-    rotation, position = np.full((n, 3, 3), np.nan), np.full((n, 3), np.nan)
-    seen = np.isfinite(curves).all(axis=(1, 2))
-    spacing, shapes = aligned_lengths(curves[seen], shape.spacing)
-    most = int(_WHOLE * min(curves.shape[1], len(shape.points)))
-    known = np.minimum(np.isfinite(shapes[:, :, 0]).sum(axis=1), most)
+    seen, spacing, shapes = _seen_shapes(curves, shape)
+    rotation, position = _put_on(curves, seen, shapes, shape, whisker)
     free = shape.still[seen]
-    back = [
-        motions(shape.points[None, :n], part[:n]) for n, part in zip(known, shapes, strict=True)
-    ]
-    turn = np.concatenate([b[0] for b in back])
-    shift = np.concatenate([b[1] for b in back])
-    rotation[seen] = turn @ whisker.pose.rotation
-    position[seen] = turn @ whisker.pose.origin + shift
-    angles = angles_of(rotation)
-    # Of rolls about half a turn none is to be on the other side of it.
-    usual = float(np.angle(np.exp(1j * angles[seen, 2])[free if free.any() else ...].sum()))
-    angles[:, 2] = usual + np.angle(np.exp(1j * (angles[:, 2] - usual)))
+    angles = _emergence(rotation, seen, free)
     if whisker.is_straight:
         # Nothing shows its roll; its y axis is taken as level.
         angles[:, 2] = np.where(np.isfinite(angles[:, 2]), 0.0, np.nan)
@@ -215,6 +208,54 @@ def base_pose(curves: Array, shape: RestShape, whisker: Whisker) -> BasePose:
         angles = guess
         position[touching] = start[~free] - base_rotation(*angles[touching].T) @ offset
     return BasePose(position, *angles.T)
+
+
+def rolled_over(curves: Array, shape: RestShape, whisker: Whisker) -> Mask:
+    """Find frames that are like the rest shape only as a whisker that is rolled as in no others.
+
+    Contact that bends a whisker against its own bend makes it, for a moment, the same as rolled.
+    """
+    alike = shape.still.copy()
+    if whisker.is_straight or not alike.any():
+        return np.zeros(len(alike), dtype=np.bool_)
+    seen, _, shapes = _seen_shapes(curves, shape)
+    rotation, _ = _put_on(curves, seen, shapes, shape, whisker)
+    angles = _emergence(rotation, seen, alike[seen])
+    for _ in range(_ROUNDS):
+        away = np.abs(angles[:, 2] - _roll_like(angles, angles, alike, 2 * _SLOW + 1))
+        usual = float(np.median(away[alike])) / _MEDIAN
+        alike = shape.still & (away < max(_UNUSUAL * usual, _ROLLED))
+    return np.asarray(shape.free & (away >= max(_UNUSUAL * usual, _ROLLED)))
+
+
+def _seen_shapes(curves: Array, shape: RestShape) -> tuple[Mask, float, Array]:
+    """Frames that show the whisker, and spacing and points of their shapes at equal lengths."""
+    seen: Mask = np.all(np.isfinite(curves), axis=(1, 2))
+    return seen, *aligned_lengths(curves[seen], shape.spacing)
+
+
+def _put_on(
+    curves: Array, seen: Mask, shapes: Array, shape: RestShape, whisker: Whisker
+) -> tuple[Array, Array]:
+    """Rotations and positions of the base with which the rest shape is nearest to each shape."""
+    rotation, position = np.full((len(seen), 3, 3), np.nan), np.full((len(seen), 3), np.nan)
+    most = int(_WHOLE * min(curves.shape[1], len(shape.points)))
+    known = np.minimum(np.isfinite(shapes[:, :, 0]).sum(axis=1), most)
+    back = [
+        motions(shape.points[None, :n], part[:n]) for n, part in zip(known, shapes, strict=True)
+    ]
+    turn = np.concatenate([b[0] for b in back])
+    rotation[seen] = turn @ whisker.pose.rotation
+    position[seen] = turn @ whisker.pose.origin + np.concatenate([b[1] for b in back])
+    return rotation, position
+
+
+def _emergence(rotation: Array, seen: Mask, free: Mask) -> Array:
+    """Emergence angles (time, 3); of rolls about half a turn none is on the other side of it."""
+    angles = angles_of(rotation)
+    usual = float(np.angle(np.exp(1j * angles[seen, 2])[free if free.any() else ...].sum()))
+    angles[:, 2] = usual + np.angle(np.exp(1j * (angles[:, 2] - usual)))
+    return angles
 
 
 def _always_bent(
@@ -251,8 +292,10 @@ def _tangents(shapes: Array, spacing: float, length: float) -> tuple[Array, Arra
     return unit, coefficients[:, 0]
 
 
-def _roll_like(known: Array, guess: Array, free: NDArray[np.bool_]) -> Array:
+def _roll_like(known: Array, guess: Array, free: Mask, slow: int = _SLOW) -> Array:
     """Roll as a linear function of azimuth and elevation, as without contact; plus slow changes."""
+    from scipy.ndimage import median_filter  # loads slowly
+
     usable = free & np.isfinite(known).all(axis=1)
     design = np.column_stack([np.ones(usable.sum()), known[usable, :2]])
     middle = design.mean(axis=0)
@@ -262,5 +305,6 @@ def _roll_like(known: Array, guess: Array, free: NDArray[np.bool_]) -> Array:
     slope = np.linalg.solve(center.T @ center + pull, center.T @ known[usable, 2])
     line: Array = slope[0] + (guess[:, :2] - middle[1:]) @ slope[1:]
     frames = np.arange(len(known))
-    left = np.interp(frames, frames[usable], known[usable, 2] - line[usable])
-    return np.asarray(line + left, dtype=np.float64)
+    # A contact that begins is so light that its first frames count as free, though bent.
+    left = median_filter(known[usable, 2] - center @ slope, slow, mode="nearest")
+    return np.asarray(line + np.interp(frames, frames[usable], left), dtype=np.float64)

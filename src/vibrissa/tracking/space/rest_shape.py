@@ -76,8 +76,9 @@ _BASE = 6
 _ROUNDS = 4
 """Number of rounds in which the free frames are selected."""
 
-_STEP, _LONGEST = 0.03, 1.45
-"""Step and largest value of the lengths that are tried, as a share of what is seen."""
+_STEP, _LONGEST, _FINE = 0.03, 1.45, 600
+"""Step and largest value of the lengths that are tried, as a share of what is seen, and number of
+those between which costs are interpolated."""
 
 _CERTAIN = 0.025
 """Smallest standard deviation of a length that bending shows, as a share: errors of traces, and of
@@ -407,26 +408,19 @@ def lengthened(shape: RestShape, length: float) -> RestShape:
 
 
 def likeliest_length(seen: float, cost: Callable[[float], float]) -> Length:
-    """Find the length with which the rod explains the traces best."""
-    lengths = [seen, (1.0 + _STEP) * seen]
-    costs = [cost(length) for length in lengths]
-    while costs[-1] <= min(costs) and lengths[-1] < _LONGEST * seen:
+    """Find the length with which the rod explains the traces best: its mean over what is likely."""
+    from scipy.interpolate import CubicSpline  # loads slowly
+
+    lengths, costs = [seen], [cost(seen)]
+    while costs[-1] <= min(costs) + _HARDLY and lengths[-1] < _LONGEST * seen:
         lengths.append(lengths[-1] + _STEP * seen)
         costs.append(cost(lengths[-1]))
-    k = int(np.argmin(costs))
-    if k == len(costs) - 1:
+    if max(costs) <= min(costs) + _HARDLY:
         return Length(seen, np.nan)
-    if k == 0:
-        lengths.insert(1, (1.0 + 0.5 * _STEP) * seen)
-        costs.insert(1, cost(lengths[1]))
-        k = int(np.argmin(costs[:2]))
-    # A parabola through the lowest, its neighbours, and what is hardly worse.
-    near = np.array(costs) < costs[k] + _HARDLY
-    near[max(k - 1, 0) : max(k - 1, 0) + 3] = True
-    a, b, _ = np.polyfit(np.array(lengths)[near], np.array(costs)[near], 2)
-    if not a > 0.0:
-        # It rises, though not as a parabola: one from here to the next.
-        a = (costs[k + 1] - costs[k]) / (lengths[k + 1] - lengths[k]) ** 2
-        return Length(lengths[k], float(np.hypot(a**-0.5, _CERTAIN * seen)))
-    value = float(np.clip(-0.5 * b / a, seen, lengths[-1]))
-    return Length(value, float(np.hypot(a**-0.5, _CERTAIN * seen)))
+    fine = np.linspace(seen, lengths[-1], _FINE)
+    between = CubicSpline(lengths, costs)(fine)
+    weight = np.exp(-0.5 * (between - between.min()))
+    weight /= weight.sum()
+    value = float(fine @ weight)
+    spread = float((fine - value) ** 2 @ weight)
+    return Length(value, float(np.hypot(spread**0.5, _CERTAIN * seen)))

@@ -275,6 +275,9 @@ def _walk(
 _GAP = 160.0
 """Largest distance between two ends that are joined, pixels."""
 
+_BEGINS = 6.0
+"""Distance from the beginning of a whisker up to which no ends are joined, pixels."""
+
 _OPEN = 30.0
 """Largest part of it that may be open ground, pixels."""
 
@@ -341,7 +344,7 @@ def find_curves(
     bodies, gain = scene.bodies(frame), scene.gain(frame)
     curves, difference = [], scene.difference(frame)
     parts = segments(difference, bodies, options.scale)
-    for chain in joined(parts, bodies, [] if begins is None else bodies.near(begins)):
+    for chain in joined(parts, bodies, begins):
         step = np.hypot(*np.diff(chain.points, axis=0).T)
         # What is hidden at a join is not seen.
         length = float(step[step < _STEP].sum())
@@ -353,10 +356,11 @@ def find_curves(
     return sorted(curves, key=lambda curve: -curve.score)
 
 
-def joined(found: Sequence[Segment], bodies: Bodies, faces: Sequence[int] = ()) -> list[Segment]:
-    """Join segments that are parts of one curve, which goes on behind no face."""
+def joined(found: Sequence[Segment], bodies: Bodies, begins: Array | None = None) -> list[Segment]:
+    """Join segments that are parts of one curve; not behind a face, nor where whiskers begin."""
     if not found:
         return []
+    begins = np.empty((0, 2)) if begins is None else begins
     # End 2 k is the first of segment k, end 2 k + 1 its last; directions point outward.
     at = np.array([p for one in found for p in (one.points[0], one.points[-1])])
     toward = np.array(
@@ -371,9 +375,11 @@ def joined(found: Sequence[Segment], bodies: Bodies, faces: Sequence[int] = ()) 
     i, j = np.nonzero(np.triu(near))
     several = i // 2 != j // 2
     i, j = i[several], j[several]
-    hidden = _hidden(at[i], at[j], bodies, faces)
+    may = _hidden(at[i], at[j], bodies, bodies.near(begins))
+    for begin in begins:
+        may &= _apart(begin, at[i], at[j]) > _BEGINS
     joins = []
-    for a, b in zip(i[hidden], j[hidden], strict=True):
+    for a, b in zip(i[may], j[may], strict=True):
         cost = _cost(_ending(found, a), _ending(found, b), float(far[a, b]))
         if cost < _COST:
             joins.append((cost, int(a), int(b)))
@@ -406,6 +412,14 @@ def _hidden(starts: Array, ends: Array, bodies: Bodies, faces: Sequence[int]) ->
     points = starts[pair] + (step / np.maximum(steps, 1)[pair])[:, None] * chord[pair]
     shown = np.isin(bodies.at(points), [0, *faces])
     return np.asarray((far <= _OPEN) | (np.bincount(pair, shown, len(far)) <= _OPEN))
+
+
+def _apart(point: Array, starts: Array, ends: Array) -> Array:
+    """Distance of a point from each chord between two ends, each (n, 2)."""
+    chord = ends - starts
+    square = np.maximum((chord**2).sum(axis=1), 1e-9)
+    share = (((point - starts) * chord).sum(axis=1) / square).clip(0.0, 1.0)
+    return np.asarray(np.linalg.norm(starts + share[:, None] * chord - point, axis=1))
 
 
 def _cost(one: Segment, other: Segment, far: float) -> float:

@@ -352,8 +352,8 @@ _SMOOTHED = 0.6
 _LAST = 10
 """Number of points before the end, and twice that of points beyond, that decide this."""
 
-_ASIDE = (2.5, 5.0)
-"""Distances from a line at which its flank may shine, and at which it does not, samples."""
+_ACROSS, _NARROWEST = np.arange(6.0), 0.3
+"""Distances from a line at which its profile is taken, and smallest variance of that, samples."""
 
 _FLANKS = (4.0, 7.0)
 """Distances from the whisker at which the face's edge is searched, pixels."""
@@ -510,18 +510,33 @@ def traced(
     line, along = line[first:last], along.part(slice(first, last))
     trusted = min(1.0, float(along.seen.sum() / max(along.open.sum(), 1)))
     base_seen = _inside(frame, line[0])
-    glint = _glint(frame, line, along, options.scale, clutter)
-    return Trace(line, along.sigma, along.seen, trusted, base_seen, tip_seen, glint), from_face
+    skew = _skew(frame, line, options.scale, clutter)
+    return Trace(line, along.sigma, along.seen, trusted, base_seen, tip_seen, skew), from_face
 
 
-def _glint(frame: Frame, line: Array, along: Measured, scale: float, clutter: Clutter) -> float:
-    """Difference between a line's flanks, minus that farther away, as a share of its depth."""
-    half = slice(0, len(line) // 2)
-    near, far = (grey_flanks(frame, line[half], away * scale, clutter) for away in _ASIDE)
-    apart = (near - far) @ np.array([1.0, -1.0])
-    apart = apart[np.isfinite(apart)]
-    depth = middle(along.amplitude[half])
-    return abs(middle(apart)) / depth if apart.size and depth > 0.0 else 0.0
+def _skew(frame: Frame, line: Array, scale: float, clutter: Clutter) -> float:
+    """Third cumulant of the darkness across a line's nearer half, pixels³; NaN if it is hidden.
+
+    Blur that is the same to both sides does not change it. With a Gaussian g as wide as the
+    profile, u being the distance in these widths, the profile's odd part is fitted by a slope of
+    the background, a shift and a skew: b u + c u g + h (u³ − 3 u) g.
+    """
+    half = line[len(line) // 8 : len(line) // 2]
+    sides = np.stack([grey_flanks(frame, half, away * scale, clutter) for away in _ACROSS])
+    sides = sides[:, np.isfinite(sides).all(axis=(0, 2))]
+    if not sides.shape[1]:
+        return np.nan
+    left, right = sides.mean(axis=1).T
+    dark = 0.5 * (left[-1] + right[-1]) - 0.5 * (left + right)
+    # What is at a distance is on both sides, and the middle is there once.
+    count = np.where(_ACROSS > 0.0, 2.0, 1.0)
+    square = float(count * dark @ _ACROSS**2) / max(float(count @ dark), 1e-9)
+    width = np.sqrt(max(square, _NARROWEST))
+    u = _ACROSS / width
+    g = np.exp(-0.5 * u**2)
+    depth = float(count * dark @ g) / float(count @ g**2)
+    odd = np.linalg.lstsq(np.stack([u, u * g, (u**3 - 3.0 * u) * g], axis=1), 0.5 * (right - left))
+    return float(6.0 * odd[0][2] / depth * (width * scale) ** 3) if depth > 0.0 else np.nan
 
 
 def _with_base(frame: Frame, line: Array, before: float, clutter: Clutter) -> tuple[Array, bool]:

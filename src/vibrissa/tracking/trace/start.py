@@ -158,24 +158,45 @@ def negative(frame: Frame) -> Frame:
 
 
 def is_bright(
-    frame: Frame, bases: Sequence[ArrayLike] | None = None, options: TraceOptions | None = None
+    frames: Sequence[Frame],
+    bases: Sequence[Sequence[ArrayLike] | None] | None = None,
+    options: TraceOptions | None = None,
 ) -> bool:
-    """Decide whether whiskers are bright on a dark background."""
+    """Decide whether whiskers are bright on a dark background.
+
+    Parameters
+    ----------
+    frames : sequence of array (height, width)
+        Frame of each view. All of them together decide: before a body, or next to an object with
+        stripes, one view may show lines of either kind.
+    bases : sequence of (sequence of array_like (2,), or None), optional
+        Column and row where whiskers begin, view by view.
+    options : TraceOptions, optional
+        Settings of tracing; ``bright``, unless None, is the result.
+
+    Returns
+    -------
+    bool
+        Whether lines are seen clearly better in the inverted frames.
+    """
     options = options or TraceOptions()
     if options.bright is not None:
         return options.bright
-    dark, bright = (_seen(one, bases, options) for one in (frame, negative(frame)))
+    dark, bright = 0.0, 0.0
+    for frame, begins in zip(frames, bases or [None] * len(frames), strict=True):
+        dark += _seen(frame, begins, options)
+        bright += _seen(negative(frame), begins, options)
     return bright > _BETTER * dark
 
 
 def _seen(frame: Frame, bases: Sequence[ArrayLike] | None, options: TraceOptions) -> float:
-    """Length that is seen, pixels, less for what is less like a whisker."""
+    """How clearly lines are seen in all: their length over the standard deviation of points."""
     if bases is None:
         curves = find_curves(frame, Scene.of([frame], options.scale), options)
         return max((curve.score for curve in curves), default=0.0)
     noise = noise_level(frame)
     return sum(
-        max((t.support for t in start_at(base, options).from_base(frame, noise)), default=0.0)
+        max((t.clearness for t in start_at(base, options).from_base(frame, noise)), default=0.0)
         for base in bases
     )
 

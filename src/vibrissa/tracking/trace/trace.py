@@ -25,6 +25,9 @@ _HOOKED = 0.7
 """Turn within a fifth of its length from which a trace goes on as something else, as along an edge,
 rad: contact bends a whisker by less."""
 
+_SHARPEST = 0.05
+"""Standard deviation from which a point is not seen more clearly, pixels."""
+
 _GIVEN = 0.5
 """Standard deviation of points that a person gives, pixels."""
 
@@ -79,8 +82,9 @@ class Trace(NamedTuple):
     base_seen, tip_seen : bool
         Whether the whisker is seen to begin and to end there. If not it goes on outside of the
         image, or fades into the noise.
-    glint : float
-        Difference of grey value between the flanks of its nearer half, as a share of its darkness.
+    skew : float
+        Third cumulant of its darkness across its nearer half, pixels³, to the left of the way from
+        base to tip: 0 if light is the same on both of its flanks. NaN if that is not known.
     sparse : bool
         Whether it is a line between few points, of which residuals do not show all errors.
     """
@@ -91,7 +95,7 @@ class Trace(NamedTuple):
     confidence: float
     base_seen: bool = True
     tip_seen: bool = True
-    glint: float = 0.0
+    skew: float = np.nan
     sparse: bool = False
 
     @classmethod
@@ -114,6 +118,11 @@ class Trace(NamedTuple):
     def support(self) -> float:
         """Length that is seen, pixels."""
         return STEP * float(self.seen.sum())
+
+    @property
+    def clearness(self) -> float:
+        """Length that is seen, each part of it over the standard deviation across."""
+        return STEP * float((1.0 / np.hypot(self.sigma[self.seen], _SHARPEST)).sum())
 
 
 def doubtful_frames(row: Sequence[Trace]) -> Mask:

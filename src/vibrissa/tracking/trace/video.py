@@ -113,7 +113,7 @@ def trace_video(
         sample = first
         if isinstance(frames, Sequence):
             sample = [frames[i] for i in _spread(len(frames))]
-    bright, shape = is_bright(first[0], bases, options), first[0].shape
+    bright, shape = is_bright(first[:1], [bases], options), first[0].shape
     start = negative(first[0]) if bright else first[0]
     followers = _begun(start, bases, begun if done else (), options)
     begins = [follower.base for follower in followers] if bases is None else bases

@@ -219,11 +219,15 @@ def test_what_compresses_well_is_read(tmp_path, monkeypatch):
     monkeypatch.setattr(netcdf, "ALWAYS_ALLOWED", 1 << 20)
     path = tmp_path / "zeros.nc"
     data = xr.Dataset({"zeros": (("time", "node"), np.zeros((4_000, 1000)))})
-    encoding = {"zeros": {"zlib": True, "complevel": 9, "shuffle": True}}
+    encoding = {"zeros": {"compression": "gzip", "compression_opts": 9, "shuffle": True}}
     write_netcdf(path, data, {"/": encoding})
     assert data.nbytes > netcdf.ALWAYS_ALLOWED > 10 * path.stat().st_size
     assert data.nbytes > 400 * path.stat().st_size
     assert read_dataset(path).identical(data)
+
+
+def tree_in(path):
+    return read_tree(path, kind_of(path), "a tree")
 
 
 def test_groups_and_names_go_through_unchanged(tmp_path, trial):
@@ -231,7 +235,7 @@ def test_groups_and_names_go_through_unchanged(tmp_path, trial):
     ours, theirs = tmp_path / "ours.nc", tmp_path / "theirs.nc"
     write_netcdf(ours, trial)
     trial.to_netcdf(theirs, engine="h5netcdf")
-    assert read_tree(ours).identical(read_tree(theirs))
+    assert tree_in(ours).identical(tree_in(theirs))
     with h5py.File(ours) as one, h5py.File(theirs) as other:
         names = [[], []]
         one.visit(names[0].append)
@@ -257,7 +261,7 @@ def test_trees_are_read_as_xarray_reads_them(tmp_path, trial):
     )
     for tree in (trial, xr.DataTree.from_dict({"/": kinds[["name"]], "/below/it": kinds})):
         write_netcdf(tmp_path / "tree.nc", tree)
-        found = read_tree(tmp_path / "tree.nc")
+        found = tree_in(tmp_path / "tree.nc")
         with xr.open_datatree(tmp_path / "tree.nc", engine="h5netcdf") as known:
             xr.testing.assert_identical(found, known.load())
             for one, other in zip(found.subtree, known.subtree, strict=True):

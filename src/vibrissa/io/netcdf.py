@@ -15,9 +15,10 @@ as the compressed file, in addition to the data.
 from __future__ import annotations
 
 import io
+import itertools
 import math
 import struct
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from mmap import ACCESS_READ, mmap
@@ -28,7 +29,7 @@ from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
-from h5py import h5d, h5o, h5t
+from h5py import h5d, h5l, h5o, h5r, h5t
 
 from vibrissa.deferred import xr
 from vibrissa.io.paths import NETCDF, check_readable, refuse_whisk, replacing
@@ -46,6 +47,10 @@ _HEAP = b"GCOL\1\0\0\0"
 
 _NO_DATA = b"This is a netCDF dimension but not a netCDF variable"
 """Name of a dimension that has no coordinates."""
+
+_FORMAT = {"CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST", "_nc3_strict"}
+_FORMAT |= {"_NCProperties", "_Netcdf4Coordinates", "_Netcdf4Dimid"}
+"""Attributes by which NetCDF-4 is kept in HDF5."""
 
 
 @contextmanager
@@ -113,11 +118,11 @@ def _items(file: h5py.File, soft_links: bool) -> Iterator[tuple[str, h5py.HLObje
         yield above or "/", group
         for key in group:
             name = f"{above}/{key}"
-            link = group.get(key, getlink=True)
-            if isinstance(link, h5py.SoftLink) and soft_links:
+            link = group.id.links.get_info(key.encode("utf-8", "surrogateescape")).type
+            if link == h5l.TYPE_SOFT and soft_links:
                 continue
-            if not isinstance(link, h5py.HardLink):
-                what = "soft link" if isinstance(link, h5py.SoftLink) else "link out of the file"
+            if link != h5l.TYPE_HARD:
+                what = "soft link" if link == h5l.TYPE_SOFT else "link out of the file"
                 raise ValueError(f"{name} is a {what}, which is not followed")
             item = group[key]
             if isinstance(item, h5py.Group):
@@ -190,8 +195,8 @@ def _check_type(name: str, kind: h5t.TypeID) -> None:
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
-COMPRESSED: Mapping[str, Any] = {"zlib": True, "complevel": 1, "shuffle": True}
-"""Encoding of large variables, without loss."""
+COMPRESSED: Mapping[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+"""How large variables are written, without loss."""
 
 
 def is_netcdf(path: str | PathLike[str]) -> bool:
@@ -208,23 +213,21 @@ def is_netcdf(path: str | PathLike[str]) -> bool:
 def kind_of(path: str | PathLike[str]) -> str:
     """Read the kind of content that a NetCDF-4 file states."""
     with opened(path, "NetCDF-4") as file:
-        kind = file.attrs.get("kind", "")
-        return _as_text(kind) if isinstance(kind, str | bytes) else str(kind)
+        return _kind(file)
+
+
+def _kind(file: h5py.File) -> str:
+    kind = file.attrs.get("kind", "")
+    return _as_text(kind) if isinstance(kind, str | bytes) else str(kind)
 
 
 def read_dataset(
     path: str | PathLike[str], group: str | None = None, names: Sequence[str] | None = None
 ) -> xr.Dataset:
-    """Read the dataset of one group."""
-    with (
-        opened(path, "NetCDF-4", soft_links=False),
-        xr.open_dataset(path, engine="h5netcdf", group=group) as data,
-    ):
-        wanted = data if names is None else data[[name for name in names if name in data]]
-        for attrs in (wanted.attrs, *(each.attrs for each in wanted.variables.values())):
-            _attributes(attrs)
-        # How this file was encoded is nothing to the next one, and may be damaged.
-        return wanted.load().drop_encoding()
+    """Read the dataset of one group; of its variables those by name and their coordinates."""
+    with opened(path, "NetCDF-4", soft_links=False) as file:
+        data = _dataset(file[group or "/"], _names_by_address(file), names)
+    return data if names is None else data[[name for name in names if name in data]]
 
 
 class Group(NamedTuple):
@@ -256,14 +259,17 @@ def _plain(value: Any) -> Any:
     return value.item() if getattr(value, "size", 0) == 1 else value
 
 
-def read_tree(path: str | PathLike[str]) -> xr.DataTree:
-    """Read the datasets of all groups; see `read_dataset`.
+def read_tree(path: str | PathLike[str], kind: str, what: str) -> xr.DataTree:
+    """Read the datasets of all groups of a file of one kind.
 
     xarray decodes what h5py reads: its own backend asks for the encoding of each variable as well,
     which takes four times as long.
     """
     with opened(path, "NetCDF-4", soft_links=False) as file:
-        return xr.DataTree.from_dict({str(one.name): _dataset(one) for one in _groups(file)})
+        if (found := _kind(file)) != kind:
+            raise ValueError(f"{path} holds {found or 'data of another kind'}, not {what}")
+        known = _names_by_address(file)
+        return xr.DataTree.from_dict({str(one.name): _dataset(one, known) for one in _groups(file)})
 
 
 def _groups(group: h5py.Group) -> Iterator[h5py.Group]:
@@ -274,27 +280,44 @@ def _groups(group: h5py.Group) -> Iterator[h5py.Group]:
             yield from _groups(item)
 
 
-def _dataset(group: h5py.Group) -> xr.Dataset:
-    """Read the variables and attributes of a group."""
-    from h5netcdf.attrs import Attributes
+def _names_by_address(file: h5py.File) -> dict[int, str]:
+    """Names of all variables: the library looks long for that of what a reference leads to."""
+    each = (item for group in _groups(file) for item in group.items())
+    return {_address(item.id): name for name, item in each if isinstance(item, h5py.Dataset)}
 
-    variables = {
-        name: (_dims(name, item), _values(item), _attributes(Attributes(item.attrs, None, h5py)))
+
+def _address(item: h5py.h5g.GroupID | h5d.DatasetID) -> int:
+    return int(h5o.get_info(item).addr)
+
+
+def _dataset(
+    group: h5py.Group, known: Mapping[int, str], names: Sequence[str] | None = None
+) -> xr.Dataset:
+    """Read the variables and attributes of a group, or those by name and their coordinates."""
+    found = {
+        name: (_dims(name, item, known), item, _attributes(item))
         for name, item in group.items()
         if isinstance(item, h5py.Dataset) and not item.attrs.get("NAME", b"").startswith(_NO_DATA)
     }
-    about = _attributes(Attributes(group.attrs, None, h5py))
-    return xr.decode_cf(xr.Dataset(variables, attrs=about)).load().drop_encoding()
+    about = _attributes(group)
+    if names is not None:
+        wanted = {name for name in names if name in found}
+        for dims, _, attrs in [found[name] for name in wanted]:
+            wanted |= {*dims, *str(attrs.get("coordinates", "")).split()}
+        wanted |= {*str(about.get("coordinates", "")).split()}
+        found = {name: variable for name, variable in found.items() if name in wanted}
+    read = {name: (dims, _values(item), attrs) for name, (dims, item, attrs) in found.items()}
+    return xr.decode_cf(xr.Dataset(read, attrs=about)).load().drop_encoding()
 
 
-def _dims(name: str, data: h5py.Dataset) -> list[str]:
+def _dims(name: str, data: h5py.Dataset, known: Mapping[int, str]) -> list[str]:
     """Names of the dimensions of a variable; of one that is a dimension itself, its own."""
     scales = data.attrs.get("DIMENSION_LIST", ())
     if len(scales) < data.ndim:
         if data.ndim > 1 or "CLASS" not in data.attrs:
             raise ValueError(f"{name} has dimensions without names")
         return [name]
-    return [str(data.file[axis[0]].name).rpartition("/")[2] for axis in scales]
+    return [known[_address(h5r.dereference(axis[0], data.id))] for axis in scales]
 
 
 def _values(data: h5py.Dataset) -> AnyArray:
@@ -302,9 +325,18 @@ def _values(data: h5py.Dataset) -> AnyArray:
     return np.asarray(data.asstr()[()], str) if text and text.length is None else data[()]
 
 
-def _attributes(found: Mapping[str, Any]) -> dict[str, Any]:
-    """Attributes with text as such."""
-    return {k: _as_text(v) if isinstance(v, str | bytes) else v for k, v in found.items()}
+def _attributes(item: h5py.HLObject) -> dict[str, Any]:
+    """Attributes but those of the format, with text as such."""
+    return {name: _attribute(item.attrs[name]) for name in item.attrs if name not in _FORMAT}
+
+
+def _attribute(value: Any) -> Any:
+    """Give what is not an array of several as itself, and text as a list."""
+    if isinstance(value, h5py.Empty):
+        return "" if h5py.check_string_dtype(value.dtype) else np.array([], value.dtype)
+    array = np.atleast_1d(value)
+    texts = [_as_text(each) for each in array.flat] if array.dtype.kind in "OSU" else array
+    return texts[0] if len(texts) == 1 else texts
 
 
 def write_netcdf(
@@ -320,16 +352,75 @@ def write_netcdf(
 def netcdf_image(
     data: xr.Dataset | xr.DataTree, encoding: Mapping[str, Mapping[str, Any]] | None = None
 ) -> memoryview:
-    """Give the bytes of the file that `write_netcdf` writes."""
-    import h5netcdf
-    from xarray.backends import H5NetCDFStore
+    """Give the bytes of the file that `write_netcdf` writes.
 
+    h5py writes what xarray encodes: xarray's own backend looks every dimension up in the file
+    again for each variable, which takes five times as long.
+    """
     tree = xr.DataTree(data) if isinstance(data, xr.Dataset) else data
-    image = io.BytesIO()
-    with h5netcdf.File(image, "w") as file:
+    image, ids = io.BytesIO(), itertools.count()
+    scales: dict[str, dict[Hashable, h5py.Dataset]] = {}
+    with h5py.File(image, "w", track_order=True) as file:
+        file.attrs["_NCProperties"] = np.bytes_(f"version=2,h5py={h5py.__version__}")
         for node in tree.subtree:
-            store = H5NetCDFStore(file, group=node.path, mode="a")
             # A coordinate that a group inherits is written only where it is.
             dataset = node.to_dataset(inherit=node is tree)
-            dataset.dump_to_store(store, encoding=(encoding or {}).get(node.path))
+            group = file if node is tree else file.create_group(node.path, track_order=True)
+            above = {} if node.parent is None else scales.get(node.parent.path, {})
+            how = (encoding or {}).get(node.path, {})
+            scales[node.path] = _write(group, dataset, how, above, ids)
     return image.getbuffer()
+
+
+def _write(
+    group: h5py.Group,
+    dataset: xr.Dataset,
+    encoding: Mapping[str, Any],
+    above: Mapping[Hashable, h5py.Dataset],
+    ids: Iterator[int],
+) -> dict[Hashable, h5py.Dataset]:
+    """Write a group; give the scales of the dimensions that are known in it."""
+    coded = xr.conventions.cf_encoder(*xr.conventions.encode_dataset_coordinates(dataset))
+    variables, attrs = coded
+    written = {}
+    scales = dict(above)
+    for name, size in {d: n for one in variables.values() for d, n in one.sizes.items()}.items():
+        if name not in variables and name in above and above[name].shape == (size,):
+            continue
+        if name in variables:
+            written[name] = _variable(group, str(name), variables[name], encoding)
+        else:
+            group.create_dataset(str(name), (size,), ">f4", maxshape=(size or None,))
+        scales[name] = scale = group[str(name)]
+        scale.make_scale(str(name) if name in variables else f"{_NO_DATA.decode()}.{size:10}")
+        scale.attrs["_Netcdf4Dimid"] = np.int32(next(ids))
+    for name, one in variables.items():
+        if name not in written:
+            data = _variable(group, str(name), one, encoding)
+            for place, dim in enumerate(one.dims):
+                data.dims[place].attach_scale(scales[dim])
+    _set_attributes(group, attrs)
+    return scales
+
+
+def _variable(
+    group: h5py.Group, name: str, variable: xr.Variable, encoding: Mapping[str, Any]
+) -> h5py.Dataset:
+    """Write the values and attributes of a variable that is encoded."""
+    values = np.asarray(variable.data)
+    if values.dtype.kind in "UO":
+        values = values.astype(h5py.string_dtype())
+    options = dict(encoding.get(name, {})) if values.shape else {}
+    if 0 in values.shape:
+        options["maxshape"] = tuple(n or None for n in values.shape)
+    fill = variable.attrs.get("_FillValue")
+    data = group.create_dataset(name, data=values, fillvalue=fill, track_order=True, **options)
+    _set_attributes(data, variable.attrs)
+    return data
+
+
+def _set_attributes(item: h5py.HLObject, attrs: Mapping[Any, Any]) -> None:
+    """Write attributes; numbers are arrays of one, as NetCDF has them."""
+    for name, value in attrs.items():
+        text = isinstance(value, str | bytes) or np.asarray(value).dtype.kind in "US"
+        item.attrs[name] = value if text else np.atleast_1d(value)

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from vibrissa.deferred import xr
-from vibrissa.io.netcdf import COMPRESSED, kind_of, naming, read_tree, write_netcdf
+from vibrissa.io.netcdf import COMPRESSED, naming, read_tree, write_netcdf
 from vibrissa.whisker import Whisker
 
 GROUP = "whiskers"
@@ -88,10 +88,7 @@ def load_recording(path: str | PathLike[str]) -> xr.DataTree:
         All of it, in memory.
     """
     path = Path(path)
-    kind = kind_of(path)
-    if kind != RECORDING_KIND:
-        raise ValueError(f"{path} holds {kind or 'data of another kind'}, not a recording")
-    tree = read_tree(path)
+    tree = read_tree(path, RECORDING_KIND, "a recording")
     with naming(path, "a recording"):
         tree = separate_whiskers(tree)
         for group in tree.children[GROUP].children.values() if GROUP in tree.children else ():

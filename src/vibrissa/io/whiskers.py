@@ -44,7 +44,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.io.netcdf import is_netcdf, kind_of, naming, read_tree, write_netcdf
+from vibrissa.io.netcdf import is_netcdf, naming, read_tree, write_netcdf
 from vibrissa.io.recording import separate_whiskers, stacked_whiskers
 from vibrissa.io.table import (
     LENGTHS,
@@ -347,10 +347,7 @@ def save_array(path: str | PathLike[str], array: WhiskerArray) -> None:
 
 
 def _netcdf(path: Path) -> WhiskerArray:
-    kind = kind_of(path)
-    if kind != WhiskerArray.kind:
-        raise ValueError(f"{path} holds {kind or 'data of another kind'}, not an array of whiskers")
-    tree = read_tree(path)
+    tree = read_tree(path, WhiskerArray.kind, "an array of whiskers")
     with naming(path, "an array of whiskers"):
         return WhiskerArray.from_tree(separate_whiskers(tree))
 

@@ -157,6 +157,23 @@ def test_it_goes_on_from_placement_to_placement(wire):
     assert (np.diff(np.linalg.norm(bent.force, axis=1)) > 0.0).all()
 
 
+def test_where_objects_push_a_rod_free_one_contact_is_all_that_is_stated():
+    """The far peg holds the rod until it meets the near one, too; together they let it go."""
+    rod = vb.Whisker.straight(0.2, base_radius=0.5e-3, tip_radius=0.25e-3, youngs_modulus=120e9)
+    pegs = [
+        Peg([0.15243439, 0.008, 0.0], [0.0, 0.0, 1.0], 1.5e-3),
+        Peg([0.07567826, 0.01818337, 0.0], [0.1, 0.0, 1.0], 2e-3),
+    ]
+    time = np.linspace(0.0, 0.6, 13)[:, None]
+    turns = Rotation.from_rotvec(0.44613 * time * [0.0, 0.0, 1.0]).as_matrix()
+    way = [0.0, 0.0, -0.02] - 0.069605 * time * [1.0, 0.0, 0.0]
+    bent = vb.deflect_around(rod, pegs, base_rotation=turns, base_position=way)
+    assert bent.second_contact[-1]
+    assert not bent.several[-1]
+    assert np.isfinite(bent.arc_length[-1]).sum() == 1
+    assert bent.overlap[-1] > 0.0
+
+
 def test_bad_input_is_refused(wire):
     soft = Sphere([0.05, 0.0, 0.0], 0.01, stiffness=10.0)
     with pytest.raises(ValueError, match="rigid objects only; got Sphere"):

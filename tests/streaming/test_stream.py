@@ -767,7 +767,8 @@ def test_a_bag_goes_in_and_a_bag_comes_out(name, map_file, bent, wrench, tmp_pat
 
 def test_onset_loss_and_slip_are_events(gamma_map, wrench):
     """A free whisker, a contact that slides, jumps by 8 mm, and is lost; sample by sample."""
-    load = vb.PointForce(np.array([32e-3, 31.9e-3, 31.8e-3, 24e-3, 23.9e-3]), 5e-5, 0.5)
+    arc = np.array([32e-3, 31.9e-3, 31.8e-3, 24e-3, 23.9e-3])
+    load = vb.PointForce(arc, np.where(arc > 30e-3, 5e-5, 1e-4), 0.5)
     bent = vb.deflect(gamma_map.whisker, load)
     rows = np.concatenate([bent.force, bent.moment], axis=1)
     rows = np.concatenate([np.zeros((2, 6)), rows, np.zeros((2, 6))])
@@ -783,6 +784,35 @@ def test_onset_loss_and_slip_are_events(gamma_map, wrench):
     assert "slip" not in {r.get("event") for r in steady.records(lines)}
     with pytest.raises(ValueError, match="speed of a slip"):
         ContactStream(estimator(gamma_map), slip_speed=0.0)
+
+
+def events_of(gamma_map, rows, rate):
+    """Events of a stream, by the number of the sample."""
+    lines = [
+        json.dumps({"time": i / rate} | dict(zip(COMPONENTS, row, strict=True)))
+        for i, row in enumerate(rows.tolist())
+    ]
+    records = ContactStream(estimator(gamma_map, felt_above=5.0)).records(lines)
+    return {i: record["event"] for i, record in enumerate(records) if "event" in record}
+
+
+def test_noise_along_a_valley_is_no_slip(gamma_map):
+    """A contact slides by 0.1 mm a sample, and noise moves its points much farther."""
+    n = 60
+    load = vb.PointForce(26e-3, np.linspace(3e-5, 8e-5, n), np.linspace(0.5, 1.5, n))
+    bent = vb.deflect(gamma_map.whisker, load)
+    rows = np.concatenate([bent.force, bent.moment], axis=1)
+    rows = rows + NOISE * np.random.default_rng(0).normal(size=(n, 6))
+    assert events_of(gamma_map, rows, 500.0) == {0: "onset"}
+
+
+def test_a_slip_is_found_behind_a_sample_that_nothing_explains(gamma_map):
+    arc = np.array([32e-3, 31.9e-3, 24e-3, 23.9e-3, 23.8e-3])
+    load = vb.PointForce(arc, np.where(arc > 30e-3, 5e-5, 1e-4), 0.5)
+    bent = vb.deflect(gamma_map.whisker, load)
+    rows = np.concatenate([bent.force, bent.moment], axis=1)
+    rows = np.insert(rows, 2, [2e-4, 1e-5, 0.0, 0.0, 0.0, 3e-7], axis=0)
+    assert events_of(gamma_map, rows, 500.0) == {0: "onset", 3: "slip"}
 
 
 @pytest.mark.parametrize("kind", ["csv", "json", "apart"])

@@ -360,7 +360,9 @@ def _from_one(
     nearest = int(np.argmin(np.abs(grid.s - arc)))
     pressing[found.surface[row], nearest] = np.linalg.norm(force)
     strain = bent_by_one(grid, arc, force, point)
-    return settled(whisker, Obstacles(surfaces, place, d.length), grid, strain, pressing)
+    out = settled(whisker, Obstacles(surfaces, place, d.length), grid, strain, pressing)
+    # Pushed off by another object, a whisker may be free.
+    return None if out is None or not out.contacts()[0].size else out
 
 
 def overlaps(

@@ -344,7 +344,7 @@ def _derivatives(
     order = np.sign(np.arange(count)[None] - np.arange(count)[:, None])
     bends *= np.kron(0.5 * (1 + order), np.ones((3, 3)))
     bends += bends.T
-    moves = moves.reshape(len(node), -1, 3)
+    moves = moves.reshape(len(node), 3 * count, 3)
     pushed = force > 0.0
     rolled = np.einsum("j,jxi,jik->jxk", force[pushed], moves[pushed], curved[pushed])
     bends += np.einsum("jxk,jyk->xy", rolled, moves[pushed], optimize=True)

@@ -25,6 +25,10 @@ _SLOW = 100.0
 # A contact point slips if its step is larger than all but one in a thousand of noise (χ², three
 # degrees of freedom), in samples that are not farther apart than this, s.
 _BEYOND_NOISE, _NEXT = 16.27, 0.5
+# Halvings of an interval of 80 in the logarithm of a multiplier.
+_HALVINGS = 30
+# Slips that follow each other within this time are one, s.
+_SETTLING = 0.01
 # Share of the largest variance below which there is none.
 _NO_VARIANCE = 1e-15
 # Lengths of the whisker that a contact point moves in a second from which it slips, by default.
@@ -239,6 +243,7 @@ class ContactStream:
             found = self._estimator(values, rotation, gravity)
             known |= located_record(found)
             place, spread = found.point, found.covariance
+            reliable = found.covariance_valid or not self._estimator.noisy
             if rotation is not None:
                 place, spread = rotation @ place, rotation @ spread @ rotation.T
             if position is not None:
@@ -246,8 +251,8 @@ class ContactStream:
         else:
             followed = self._follow(time, values, rotation, position, gravity)
             known |= followed_record(followed, rotation)
-            place, spread = followed.point, followed.covariance
-        event = self._events(time, known["status"], place, spread)
+            place, spread, reliable = followed.point, followed.covariance, True
+        event = self._events(time, known["status"], place, spread, reliable)
         return known if event is None else known | {"event": event}
 
     def _put(self, sample: Sample) -> None:
@@ -290,32 +295,58 @@ class _Events:
         """Begin anew, with a free whisker."""
         self._touching = False
         self._last: tuple[float, Array, Array] | None = None
+        self._slipped = -math.inf
 
-    def __call__(self, time: float, status: str, point: Array, covariance: Array) -> str | None:
-        """Take a sample: what happened with it, if anything."""
+    def __call__(
+        self, time: float, status: str, point: Array, covariance: Array, reliable: bool
+    ) -> str | None:
+        """Take a sample, and whether its covariance is valid: what happened, if anything."""
         if status in _SILENT:
             return None
         before, self._touching = self._touching, status != "not_felt"
-        last, self._last = self._last, None
-        if status == "unique" and np.isfinite(point).all():
-            self._last = time, point, covariance
+        last, slips = self._last, False
+        if not self._touching:
+            self._last = None
+        elif status == "unique" and np.isfinite(point).all():
+            # A valley that bends leaves its ellipsoid, but hardly a ball as large.
+            ball = np.trace(covariance) * np.eye(3)
+            self._last = time, point, covariance if reliable else ball
+            slips = last is not None and self._slips(last, self._last)
         if before != self._touching:
             return "onset" if self._touching else "loss"
-        return "slip" if self._slips(last) else None
+        if not slips:
+            return None
+        # What has slipped settles, or rings, for some samples.
+        settling, self._slipped = time - self._slipped < _SETTLING, time
+        return None if settling else "slip"
 
-    def _slips(self, last: tuple[float, Array, Array] | None) -> bool:
+    def _slips(self, last: tuple[float, Array, Array], now: tuple[float, Array, Array]) -> bool:
         """Whether the point moved faster than anything slides, and farther than noise moves it."""
-        if last is None or self._last is None:
-            return False
-        step, moved = self._last[0] - last[0], self._last[1] - last[1]
+        step, moved = now[0] - last[0], now[1] - last[1]
         if not 0.0 < step < _NEXT or math.hypot(*moved.tolist()) < self._slip_speed * step:
             return False
-        spread = self._last[2] + last[2]
+        spread = now[2] + last[2]
         if not np.isfinite(spread).all():  # noise is not known
             return True
         variance, axes = np.linalg.eigh(spread)
-        known = variance > _NO_VARIANCE * variance[-1]
-        return bool(((moved @ axes)[known] ** 2 / variance[known]).sum() > _BEYOND_NOISE)
+        return _misfit_beyond(moved @ axes, variance, self._slip_speed * step) > _BEYOND_NOISE
+
+
+def _misfit_beyond(moved: Array, variance: Array, reach: float) -> float:
+    """Least χ² of a displacement, along its axes, of which anything within a reach is sliding.
+
+    The part that slides is moved / (1 + λ variance), where λ makes it as long as the reach.
+    """
+    size, low, high = math.hypot(*moved.tolist()), -40.0, 40.0
+    unit = reach / max(size, reach)
+    scaled = np.maximum(variance, 0.0) / max(float(variance[-1]), 1e-300)
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        slid = moved / size / (1.0 + math.exp(middle) * scaled)
+        low, high = (middle, high) if slid @ slid > unit * unit else (low, middle)
+    away = moved - size * slid
+    known = scaled > _NO_VARIANCE
+    return float((away[known] ** 2 / variance[known]).sum())
 
 
 class ContactStreams:

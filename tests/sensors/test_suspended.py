@@ -170,6 +170,8 @@ def test_too_few_or_idle_touches_are_refused():
         calibrate_suspension(WIRE, at, readings * [1, 0, 1], channels=CHANNELS)
     with pytest.raises(ValueError, match=r"\(n, 3\)"):
         calibrate_suspension(WIRE, at[:, :2], readings)
+    with pytest.raises(ValueError, match=r"0 of 30 touches .* Are origin, axes and unit"):
+        calibrate_suspension(WIRE, at + 0.05, readings)
 
 
 def swept(steps=80):
@@ -298,24 +300,50 @@ moves = "sensor"
 """
 
 
-def test_the_command_line_goes_from_tables_to_contacts(tmp_path):
-    at = points(60)
-    readings, status = TRUE.read(at, seed=4)
-    readings, at = readings[status == 0], at[status == 0]
+def written(folder, at, readings, text=STAGE):
+    """Tables of touches and of the shape, and their description, in a folder."""
     # The stage's x is the sensor's y, its z points down.
     stage = np.array([10.0, 20.0, 30.0]) + 1e3 * at[:, [1, 0, 2]] * [1, 1, -1]
     rest = np.array([[10.0, 20.0, 30.0, 1.0, 2.0, 3.0]])
     table = np.concatenate([rest, np.concatenate([stage, readings + np.array([1, 2, 3])], axis=1)])
     header = "px,py,pz,sx,sy,sz"
-    np.savetxt(tmp_path / "touches.csv", table, delimiter=",", header=header, comments="")
+    np.savetxt(folder / "touches.csv", table, delimiter=",", header=header, comments="")
     line = 1e3 * WIRE.centerline(40)
     shown = {"top.csv": line[:, [1, 0]], "side.csv": line[:, [0, 2]]}
     names = {"top.csv": "px,py", "side.csv": "py,pz"}
     for name, columns in shown.items():
-        np.savetxt(tmp_path / name, columns, delimiter=",", header=names[name], comments="")
-    (tmp_path / "stage.toml").write_text(STAGE)
+        np.savetxt(folder / name, columns, delimiter=",", header=names[name], comments="")
+    (folder / "stage.toml").write_text(text)
+    return ["calibrate", str(folder / "stage.toml"), "-o", str(folder / "s.nc")], header
+
+
+def test_a_channel_that_saturates_is_said_and_can_be_left_out(tmp_path):
+    at = points(36)
+    readings, status = TRUE.read(at, seed=4)
+    readings, at = readings[status == 0], at[status == 0]
+    most = np.quantile(np.abs(readings[:, 0]), 0.7)
+    clipped = np.clip(readings, [-most, -np.inf, -np.inf], [most, np.inf, np.inf])
+    command, _ = written(tmp_path, at, clipped)
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 0, done.output
+    said = " ".join(done.output.split())
+    assert "sx reads" in said
+    assert "does it saturate" in said
+    assert "much noise of sx:" in said
+    text = STAGE.replace("[[shape]]", f"largest = [{most - 1.5}, 1e9, 1e9]\n[[shape]]", 1)
+    touches = Stage(text, tmp_path).touches()
+    assert len(touches.points) == (np.abs(readings[:, 0] + 1.0) < most - 1.5).sum()
+    with pytest.raises(ValueError, match="one of each channel"):
+        Stage(text.replace(", 1e9]", "]"), tmp_path).touches()
+
+
+def test_the_command_line_goes_from_tables_to_contacts(tmp_path):
+    at = points(60)
+    readings, status = TRUE.read(at, seed=4)
+    readings, at = readings[status == 0], at[status == 0]
+    command, header = written(tmp_path, at, readings)
     run = CliRunner().invoke
-    done = run(app, ["calibrate", str(tmp_path / "stage.toml"), "-o", str(tmp_path / "s.nc")])
+    done = run(app, command)
     assert done.exit_code == 0, done.output
     sensor, known = load_suspended(tmp_path / "s.nc")
     assert known.channels == CHANNELS

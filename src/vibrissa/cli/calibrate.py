@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 
 import vibrissa as vb
 from vibrissa.cli.options import check_new, refuse, with_options
-from vibrissa.cli.terminal import say
+from vibrissa.cli.terminal import remark, say
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+_UNEXPLAINED = 0.05
+"""Noise, as a share of the range of the readings, above which something is wrong."""
+
+_AGAIN = 4
+"""Touches with the same largest reading from which a channel seems to saturate."""
 
 _POOR = 1.0
 """Reprojection error above which something is wrong, pixels."""
@@ -62,6 +72,7 @@ def _suspended(description: Path, target: Path, force: bool) -> None:
     check_new(target, vb.io.NETCDF, force)
     stage = vb.sensors.Stage.load(vb.io.check_readable(description))
     points, readings, rest, drift = stage.touches()
+    _check_saturation(stage.channels, readings)
     found = vb.sensors.calibrate_suspension(
         stage.whisker(),
         points,
@@ -85,7 +96,26 @@ def _suspended(description: Path, target: Path, force: bool) -> None:
             f"{name}: noise {sensor.noise[k]:.3g}, {100 * sensor.noise[k] / scale:.2g} % of the "
             f"largest reading; the rod leaves {found.residual[k]:.3g}; drift {sensor.drift[k]:.3g}"
         )
+    poor = sensor.noise > _UNEXPLAINED * np.ptp(readings, axis=0)
+    if poor.any():
+        names = ", ".join(name for name, much in zip(sensor.channels, poor, strict=True) if much)
+        say(
+            f"  That is much noise of {names}: are origin and axes of the touches, the readings at "
+            "rest and the order of the shape's points (from the base) right?"
+        )
     say(f"wrote {target}")
+
+
+def _check_saturation(channels: Sequence[str], readings: vb.numerics.Array) -> None:
+    """Report channels that read their largest or smallest value again and again."""
+    for name, values in zip(channels, readings.T, strict=True):
+        for end in (values.min(initial=np.inf), values.max(initial=-np.inf)):
+            count = int((values == end).sum())
+            if count >= _AGAIN and np.ptp(values) > 0.0:
+                remark(
+                    f"{name} reads {end:g}, and nothing beyond, at {count} touches: does it "
+                    "saturate? `largest` in [touches] leaves such touches out"
+                )
 
 
 def _cameras(

@@ -259,7 +259,7 @@ def _array(values: Any) -> str:
 
 _UNITS = {"m": 1.0, "mm": 1e-3, "um": 1e-6}
 _STAGE_KEYS = {"unit", "readings", "position", "touches", "shape", "whisker", "sweep"}
-_TOUCHES = {"file", "origin", "axes", "farthest", "base_sigma", "rest", "drift"}
+_TOUCHES = {"file", "origin", "axes", "farthest", "base_sigma", "rest", "drift", "largest"}
 _SHAPE = {"file", "columns", "leave_out"}
 _WHISKER = {"base_radius", "tip_radius", "youngs_modulus", "noise"}
 _SWEEP = {"origin", "axes", "moves"}
@@ -354,6 +354,14 @@ class Stage:
         radius = np.linalg.norm(points, axis=1)
         rest = radius <= _AT_BASE
         touched = ~rest & (radius <= self._unit * one_number(own, "farthest", np.inf))
+        if "largest" in own:
+            largest = number_array(own["largest"], "largest")
+            if largest.shape not in ((), readings.shape[1:]):
+                raise ValueError(
+                    f"largest is {quoted(own['largest'])}; a number, or one of each channel, is "
+                    "needed"
+                )
+            touched &= (np.abs(readings) < largest).all(axis=1)
         free = np.median(readings[rest], axis=0) if rest.any() else None
         drift = np.zeros(len(self.channels))
         if "rest" in own:

@@ -303,6 +303,7 @@ class _Problem:
         p = len(self.unknowns)
         begin = [np.append(pair, np.zeros(p - 2)) for pair in starts]
         at = min((self.state(x, None) for x in begin), key=lambda one: one.cost)
+        self.check(at)
         prior = np.diag(1.0 / self.sigma)
         damping = 1e-3
         for _ in range(_ROUNDS):
@@ -331,6 +332,18 @@ class _Problem:
             if settled:
                 break
         return at, self.slopes(at)
+
+    def check(self, at: _State) -> None:
+        """Refuse touches of which the whisker reaches too few."""
+        held, length = int(at.ok.sum()), self.whisker.length
+        if held >= min(FEWEST, len(self.points) // 2):
+            return
+        near, far = np.quantile(np.linalg.norm(self.points, axis=1), (0.1, 0.9))
+        raise ValueError(
+            f"{held} of {len(at.ok)} touches can be of this whisker: most are {1e3 * near:.3g} to "
+            f"{1e3 * far:.3g} mm from its base, and it is {1e3 * length:.3g} mm long. Are origin, "
+            "axes and unit of the touches right, and does its shape begin at the base?"
+        )
 
     def left(self, at: _State) -> Array:
         """Standard deviation of the residuals of touches that were left out one by one."""

@@ -29,16 +29,18 @@ if os.environ.get("REQUIRE_EXTRAS"):
 settings.register_profile("vibrissa", deadline=None, derandomize=bool(os.environ.get("CI")))
 settings.load_profile("vibrissa")
 
-# Where files are shared out to workers, these come first, in this order. The first compiles most
-# kernels; those after it need none, so that nobody compiles the same at the same time; then follow
+# Where files are shared out to workers, these come first, in this order. The first
+# compiles the search's kernels while those of whiskers need none, `test_cli` then the estimate's
+# and `test_compliance` the filter's, so that nobody compiles the same at the same time; then follow
 # those that take longest, so that no worker is left alone with one of them at the end.
 _FIRST = [
     "identifiability/test_uniqueness.py",
     "whisker",
+    "cli/test_cli.py",
     "contour",
+    "contacts/test_compliance.py",
     "io",
     "report",
-    "cli/test_cli.py",
     "demo",
     "viewer/test_page.py",
     "viewer/test_watching.py",

@@ -13,6 +13,7 @@ from vibrissa.demo import run_demo
 from vibrissa.evaluation import caution, from_curves, refined, tracking_scores, truth_of
 from vibrissa.io import load_contacts, load_recording
 from vibrissa.pipeline import fit_contacts, reconstruct
+from vibrissa.plots.style import LOOK
 from vibrissa.recording import Recording
 from vibrissa.report import trial_sections
 from vibrissa.report.page import shown_value
@@ -40,6 +41,12 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def from_video(folder):
     return run_demo(output=folder, **FILMED)
+
+
+@pytest.fixture(scope="module")
+def sections(from_video, folder):
+    """Sections of a report about each recording that the demo writes."""
+    return {name: trial_sections(load_recording(folder / name)) for name in ("trial.nc", "seen.nc")}
 
 
 def test_errors_are_those_that_the_noise_predicts(result):
@@ -175,7 +182,7 @@ def test_from_video_the_peg_is_found(from_video):
         assert abs(one.scores.diameter_error) < 0.2e-3
 
 
-def test_a_report_of_the_trial_has_the_same_errors(from_video, folder):
+def test_a_report_of_the_trial_has_the_same_errors(from_video, folder, sections):
     """Its whisker is the one that was tracked, not quite of the shape of the one that whisked."""
     for name, one in (("trial.nc", from_video.sensed), ("seen.nc", from_video.seen)):
         recording = load_recording(folder / name)
@@ -188,7 +195,7 @@ def test_a_report_of_the_trial_has_the_same_errors(from_video, folder):
             np.testing.assert_array_equal(
                 getattr(scores, field), getattr(from_video.tracking, field)
             )
-        text = " ".join(part.body for part in trial_sections(recording))
+        text = " ".join(part.body for part in sections[name])
         for row in (*one.scores.errors, *one.scores.by_angle):
             for value in row.measured:
                 assert f">{shown_value(row.quantity, value)}</td>" in text
@@ -200,7 +207,7 @@ def test_a_report_of_the_trial_has_the_same_errors(from_video, folder):
             assert f">{shown_value('centerline', length, 3)}</td>" in text
 
 
-def test_what_tests_no_whisker_says_so_wherever_it_is_shown(from_video, folder, tmp_path):
+def test_what_tests_no_whisker_says_so_wherever_it_is_shown(folder, sections, tmp_path):
     """Signals that the model made agree with the model: in the report, and when reconstructed."""
     said = caution("contact point")
     for name, warned in (("trial.nc", False), ("seen.nc", True)):
@@ -209,8 +216,7 @@ def test_what_tests_no_whisker_says_so_wherever_it_is_shown(from_video, folder, 
         )
         assert done.exit_code == 0, done.exception
         assert (said in done.output) is warned
-        sections = trial_sections(load_recording(folder / name))
-        assert any(said in part.body for part in sections) is warned
+        assert any(said in part.body for part in sections[name]) is warned
 
 
 def test_signals_are_better_known_the_more_the_whisker_is_bent(from_video):
@@ -230,7 +236,9 @@ def test_the_command_reports_every_stage_from_video(from_video, folder, tmp_path
         return from_video
 
     monkeypatch.setattr("vibrissa.demo.run_demo", there)
-    monkeypatch.setattr("vibrissa.scene.solids._SHAPE", (12, 24, 8))  # quicker to draw
+    # Quicker to draw: what figures look like is tested with them.
+    monkeypatch.setattr("vibrissa.scene.solids._SHAPE", (12, 24, 8))
+    monkeypatch.setattr("vibrissa.plots.style.LOOK", {**LOOK, "savefig.dpi": 80.0})
 
     def run(*words):
         done = CliRunner().invoke(app, [str(word) for word in words])

@@ -30,7 +30,7 @@ def curved():
 
 @pytest.fixture(scope="module")
 def of_curved(curved):
-    return vb.uniqueness(curved, [*PAPER, "Fx FT MB"], samples=1024)
+    return vb.uniqueness(curved, [*PAPER, "Fx FT MB"], samples=512)
 
 
 @pytest.fixture(scope="module")
@@ -175,7 +175,7 @@ def test_the_known_pair_of_a_strongly_curved_whisker(strongly_curved):
 
 
 def test_the_cone_of_a_strongly_curved_whisker(strongly_curved):
-    found = vb.uniqueness(strongly_curved, ["Fx MB MD"], samples=2048, resolution=False)
+    found = vb.uniqueness(strongly_curved, ["Fx MB MD"], samples=1024, resolution=False)
     cell = found.sel(triplet="Fx MB MD", region="all")
     assert str(cell.verdict.item()) == "not unique"
     assert np.rad2deg(float(cell.critical_cone)) == pytest.approx(5.0, abs=1.0)
@@ -183,7 +183,7 @@ def test_the_cone_of_a_strongly_curved_whisker(strongly_curved):
     wider = vb.uniqueness(
         strongly_curved,
         ["Fx MB MD"],
-        samples=2048,
+        samples=1024,
         resolution=False,
         cone=float(cell.critical_cone) + np.deg2rad(0.5),
     )
@@ -191,7 +191,7 @@ def test_the_cone_of_a_strongly_curved_whisker(strongly_curved):
 
 
 def test_twice_the_samples_change_no_verdict_of_a_planar_whisker(of_curved, curved):
-    twice = vb.uniqueness(curved, list(PAPER), samples=2048, resolution=False)
+    twice = vb.uniqueness(curved, list(PAPER), samples=1024, resolution=False)
     once = of_curved.sel(triplet=list(PAPER))
     np.testing.assert_array_equal(once.verdict, twice.verdict)
     np.testing.assert_array_equal(once.notation, twice.notation)
@@ -200,7 +200,7 @@ def test_twice_the_samples_change_no_verdict_of_a_planar_whisker(of_curved, curv
 def test_twice_the_samples_change_no_verdict(gamma_map):
     triplets = ["Fx MB MD", "Fx FD MB"]
     once, twice = (
-        vb.uniqueness(gamma_map, triplets, samples=n, resolution=False) for n in (1024, 2048)
+        vb.uniqueness(gamma_map, triplets, samples=n, resolution=False) for n in (512, 1024)
     )
     np.testing.assert_array_equal(once.verdict, twice.verdict)
     np.testing.assert_array_equal(once.notation, twice.notation)

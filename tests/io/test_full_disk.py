@@ -80,13 +80,11 @@ for name, write in writers.items():
 
 VERBS = """
 import json, resource, sys
-from functools import partial
 from pathlib import Path
-from vibrissa import plots, scene
-from vibrissa.cli import terminal
+from vibrissa.cli import report, terminal
 from vibrissa.cli.app import main
 
-plots.png, scene.solids._SHAPE = partial(plots.png, dots=40.0), (12, 24, 8)  # quicker to draw
+report.drawn = lambda drawings, tell: []  # figures are parts of the page, which is one file
 folder = Path(sys.argv[1])
 hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
 chart, trial, page = folder / "map.nc", folder / "trial.nc", folder / "page.html"

@@ -132,3 +132,18 @@ def test_completion_can_be_shown(monkeypatch):
     done = run("--show-completion", "bash", prog_name="vibrissa")
     assert done.exit_code == 0, done.output
     assert "_VIBRISSA_COMPLETE=complete_bash" in done.output
+
+
+def test_a_warning_is_a_note(tmp_path):
+    """Without the line of code that pytest would want to know."""
+    path, names = tmp_path / "sensor.toml", [f"ch{i}" for i in range(6)]
+    matrix = [[12.0 * (i == j) if j < 3 else 0.5 * (i == j) for j in range(6)] for i in range(6)]
+    path.write_text(f"channels = {names}\nnoise = 1e-3\nmixing = {matrix}")
+    done = subprocess.run(
+        [sys.executable, "-m", "vibrissa", "info", path],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stderr.startswith("note: the sensor reads a force of 1 N")
+    assert "Warning" not in done.stderr

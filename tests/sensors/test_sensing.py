@@ -459,6 +459,23 @@ def test_a_makers_matrix_may_be_given_either_way_round(tmp_path, rng):
         described(calibration=back[:3])
 
 
+@pytest.mark.parametrize("name", ["mixing", "calibration"])
+def test_a_sensor_that_hardly_reads_moments_is_doubted(name, tmp_path):
+    """A channel for each component, 12 N or 0.5 N·m per volt, with the matrix the other way."""
+    matrix = np.diag([12.0, 12.0, 16.0, 0.5, 0.5, 0.4])
+    path = tmp_path / "sensor.toml"
+
+    def described(matrix):
+        channels = [f"ch{i}" for i in range(6)]
+        path.write_text(f"channels = {channels}\nnoise = 1e-3\n{name} = {matrix.tolist()}")
+        return load_sensor(path)
+
+    given = np.linalg.inv(matrix) if name == "calibration" else matrix
+    with pytest.warns(UserWarning, match="does the matrix lead the other way"):
+        described(given)
+    assert described(np.linalg.inv(given)).mixing[0, 0] == pytest.approx(1.0 / 12.0)
+
+
 def test_a_mixing_keeps_saturation_and_resolution(rng):
     """Saturated rows would tilt the mix, and rounding is not counted as noise twice."""
     true = Sensor(("a",), [[0, 0, 0, 0, 1.0, 0]], noise=1e-3, resolution=0.02, largest=[1.0])

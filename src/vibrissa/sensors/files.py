@@ -65,6 +65,7 @@ Files are found next to the description. A calibrated sensor is a NetCDF file th
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
@@ -160,6 +161,7 @@ def _described(table: dict[str, Any]) -> Sensor:
             "mixing seems to lead from the channels to forces and moments, as its lines of moments "
             "are the small ones; if so, name it calibration"
         )
+    _check_lever(values.get("mixing"))
     if "relative_noise" in table:
         values["relative_noise"] = one_number(table, "relative_noise", 0.0)
     reaction = frame.get("reaction", False)
@@ -198,6 +200,20 @@ def _inverted(calibration: Any) -> Any:
             "moments are the large ones; if so, name it mixing"
         )
     return np.linalg.pinv(calibration)
+
+
+def _check_lever(mixing: Any) -> None:
+    """Warn of a sensor that reads moments hardly, as no sensor does that can be held in a hand."""
+    if np.shape(mixing)[1:] != (6,):
+        return
+    force, moment = np.linalg.norm(mixing[:, :3]), np.linalg.norm(mixing[:, 3:])
+    if force > _APART * moment > 0.0:
+        warnings.warn(
+            f"the sensor reads a force of 1 N as it reads a moment of {force / moment:.3g} N·m: "
+            "does the matrix lead the other way (mixing: from forces and moments to the channels; "
+            "calibration: back), or has it another unit than N and N·m?",
+            stacklevel=5,
+        )
 
 
 def _has_halves(matrix: Any) -> bool:

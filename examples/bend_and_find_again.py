@@ -45,14 +45,15 @@ for true, guess, covariance, n in zip(
 # %% The bent whiskers with the forces on them; what has slipped off is not there to be drawn
 names = [f"{1e6 * np.linalg.norm(force):.1f} µN" for force in bent.force]
 held = np.isfinite(bent.force).all(axis=1)
-worst = np.linalg.norm(found.point - points, axis=1)[held].max()
+sigma = 1e3 * np.sqrt(np.trace(found.covariance[held], axis1=1, axis2=2))
+spread = " and ".join(f"{one:.1f}" for one in sigma)
 figure = plots.bent_views(
     whisker.centerline(101),
     bent.centerline(101),
     bent.contact_point,
     bent.force,
     labels=names,
-    finding=f"{held.sum()} of {len(points)} points hold the whisker, and are found again "
-    f"to {worst * 1e9:.1g} nm from three signals",
+    finding=f"{held.sum()} of {len(points)} points hold the whisker; three signals with a sensor's "
+    f"noise locate them to {spread} mm",
 )
 plots.save(figure, folder / "bend_and_find_again", ["png"])

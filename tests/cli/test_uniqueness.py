@@ -28,7 +28,12 @@ def test_verdicts_and_a_witness(chart, tmp_path):
     with xr.open_dataset(out, engine="h5netcdf") as found:
         assert found.verdict.sel(region="all").item() == "not unique"
         apart = 1e3 * float(found.witness_separation.max())
+        where = found.notation.item()
     assert f"{apart:.4g} mm apart" in result.output
+    about = CliRunner().invoke(app, ["info", str(out)]).output
+    assert f"Fx MB MD ({where})" in about
+    assert "witness_point" not in about
+    assert "witness_point" in CliRunner().invoke(app, ["info", str(out), "--all"]).output
 
 
 def test_cone_and_region(chart):

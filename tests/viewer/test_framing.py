@@ -39,3 +39,13 @@ def test_the_centre_is_in_the_middle_of_what_is_free(width, height):
     ends = [on_screen(shot.centre + s * aside, position, look_at, width, height) for s in (-1, 1)]
     assert ends[0][0] >= -1e-6
     assert ends[1][0] <= free + 1e-6
+
+
+def test_what_is_tall_is_above_the_panel_of_a_phone():
+    shot = Shot(np.array([16.0, 4.0, -2.0]), 38.0, np.array([0.15, -0.8, 0.0]), height=1.6)
+    width, height = 390, 844
+    position, look_at = framed(shot, width, height, FOV)
+    up = np.array([0.0, 0.0, 0.8 * shot.distance])
+    rows = [on_screen(shot.centre + s * up, position, look_at, width, height)[1] for s in (1, -1)]
+    assert rows[0] >= -1e-6
+    assert rows[1] <= 0.45 * height + 1e-6

@@ -32,9 +32,10 @@ _TABLES = """\
   corrections     view, frame, whisker, x, y
   whiskers        name, x_mm, y_mm, z_mm, azimuth_deg, …, length_mm, coefficient_per_mm"""
 _MAP = "vibrissa contact map"
+_VERDICTS = "vibrissa uniqueness"
 _NEXT = {
     _MAP: "estimate SIGNALS.csv --map {} -o contacts.csv",
-    "vibrissa uniqueness": "figures MAP.nc --uniqueness {} -o figures",
+    _VERDICTS: "figures MAP.nc --uniqueness {} -o figures",
     "vibrissa whisker": "map --whisker {} -o map.nc",
     "whisker": "map --whisker {} -o map.nc",
     "sensor": "estimate READINGS.csv --map MAP.nc --sensor {} -o contacts.csv",
@@ -362,8 +363,11 @@ def _groups(path: Path, whole: bool = False) -> Iterator[tuple[str, str]]:
     if "certificate" in (kind or "") and kind == vb.certificates.KIND:
         yield from _certificate(path, whole)
         return
-    if kind == _MAP and not whole:
-        yield "map", f"{vb.ContactMap.load(path)!r}"[1:-1]
+    if kind in (_MAP, _VERDICTS) and not whole:
+        if kind == _MAP:
+            yield "map", f"{vb.ContactMap.load(path)!r}"[1:-1]
+        else:
+            yield from _verdicts(path)
         yield "also", "groups and variables: --all"
         yield from _follows(kind, path)
         return
@@ -378,6 +382,19 @@ def _groups(path: Path, whole: bool = False) -> Iterator[tuple[str, str]]:
         for line in _text(file.attrs.get("remarks", "")).splitlines():
             yield "note", line
     yield from _follows(kind, path)
+
+
+def _verdicts(path: Path) -> Iterator[tuple[str, str]]:
+    """Which triplets locate contacts, in which regions."""
+    found = vb.io.read_dataset(path)
+    regions = found["notation"].to_series()
+    held = regions[regions != "–"]
+    proved = int((found["evidence"] == "proved").any("region").sum())
+    yield "whisker", str(found.attrs["whisker"])
+    yield "unique", "; ".join(f"{name} ({where})" for name, where in held.items()) or "none"
+    yield "evidence", f"{proved} proved, {len(held) - proved} with no counterexample found"
+    yield "not unique", f"{len(regions) - len(held)} of {len(regions)} triplets"
+    yield "left out", f"contacts within {np.degrees(found.attrs['cone']):.3g}° of rest"
 
 
 def _certificate(path: Path, whole: bool) -> Iterator[tuple[str, str]]:

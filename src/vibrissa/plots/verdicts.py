@@ -316,15 +316,15 @@ def resolution(verdicts: xr.Dataset, *, width: style.Width = "double") -> Figure
             known = [str(name) for name in at["triplet"].values]
             shown = (verdicts.attrs.get("chosen_triplet"), known[int(np.nanargmin(at.values))])
             left = [
-                f"{100.0 * float(at.sel(triplet=name)):.0f} % of the contacts ambiguous with "
-                f"({triplet_label(name)})"
+                f"{100.0 * float(at.sel(triplet=name)):.0f} % ({triplet_label(name)})"
                 for name in dict.fromkeys(shown)
                 if name in known
             ]
+            tolerance = f"{100.0 * float(at['signal_tolerance']):g} %"
             style.conclude(
                 figure,
-                f"Signals known to {100.0 * float(at['signal_tolerance']):g} % of their ranges "
-                f"leave {', '.join(left)}, the fewest",
+                f"Contacts ambiguous at {tolerance} of the signals' ranges: "
+                f"{', at best '.join(left)}",
             )
         return figure
 

@@ -205,7 +205,9 @@ def _against_truth(
     assert root is not None
     if "measured" in recording.children:
         lacking = _lacking(_TRACKED, root, truth)
-        yield Section("tracking", "Tracking", lacking or tracking_tables(root, truth))
+        yield Section(
+            "tracking", "Tracking, against the truth", lacking or tracking_tables(root, truth)
+        )
     if signals is not None:
         lacking = _lacking(_FELT, signals, truth, also_true=("contact_point_whisker",))
         yield Section("signals", "Signals", lacking or _signal_errors(signals, truth, whisker))
@@ -420,9 +422,9 @@ def _contour(recording: xr.DataTree, seed: int) -> str:
 def _component_text(name: str, values: Array) -> str:
     """A number, or a vector in parentheses with its size."""
     if values.ndim == 0:
-        return shown_value(name, float(values))
-    each = ", ".join(shown_value(name, float(value)) for value in values)
-    return f"({each}); size {shown_value(name, float(np.linalg.norm(values)))}"
+        return shown_value(name, float(values), 2)
+    each = ", ".join(shown_value(name, float(value), 2) for value in values)
+    return f"({each}); size {shown_value(name, float(np.linalg.norm(values)), 2)}"
 
 
 def _distances(recording: xr.DataTree, seed: int) -> str:

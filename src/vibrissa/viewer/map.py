@@ -184,9 +184,11 @@ def frame_drawing(solids: Solids, exaggeration: float) -> scene.Drawing:
         out[f"axis {name} name"] = scene.Label(pole[1] + above, "Fx")
         out[f"zero {name}"] = scene.Label(centre + np.array([0.0, 0.0, solids.axis_height()]), "0")
         edge = 0.5 * length * np.array([np.cos(TURN), np.sin(TURN), 0.0])
-        out[f"rim {name}"] = scene.Label(bottom + edge, "MD = 0°")
-        out[f"ring {name}"] = scene.Label(bottom - edge, f"MB = {largest}")
-        out[f"lowest {name}"] = scene.Label(bottom, least)
+        # At heights of their own, so that none hides another on a small screen.
+        apart = np.array([0.0, 0.0, 0.06 * length])
+        out[f"rim {name}"] = scene.Label(bottom + edge + apart, "MD = 0°")
+        out[f"ring {name}"] = scene.Label(bottom - edge - apart, f"MB = {largest}")
+        out[f"lowest {name}"] = scene.Label(bottom + 4.0 * apart, least)
         out[f"title {name}"] = scene.Label(
             centre + length * np.array([-0.45, 0.0, 0.62]), f"signals, coloured by {_NAMES[name]}"
         )
@@ -275,7 +277,7 @@ class MapMode(Mode):
         self._drawn = None
         length = float(to_display("length", self._page.bend.whisker.length))
         middle = np.array([1.0, 0.0, 0.0]) * length
-        self._page.look_at(middle, 2.2 * length, (0.0, -0.95, 0.33))
+        self._page.look_at(middle, 2.2 * length, (0.0, -0.95, 0.33), height=1.6)
 
     def leave(self) -> None:
         """Hide controls and things."""

@@ -273,9 +273,11 @@ class Page:
         """Point all cameras at the whisker."""
         self._show(whole(self.bend.whisker))
 
-    def look_at(self, centre: Array, distance: float, way: Sequence[float]) -> None:
+    def look_at(
+        self, centre: Array, distance: float, way: Sequence[float], height: float = 0.0
+    ) -> None:
         """Point all cameras at a position, mm, from a distance, mm, and a direction."""
-        self._show(Shot(centre, distance, np.asarray(way, dtype=np.float64)))
+        self._show(Shot(centre, distance, np.asarray(way, dtype=np.float64), height))
 
     def _show(self, shot: Shot) -> None:
         self._all = shot
@@ -429,6 +431,8 @@ class Shot:
     centre: Array
     distance: float
     way: Array
+    height: float = 0.0
+    """Height of what is shown, over the distance; it matters on a phone."""
 
 
 def framed(shot: Shot, width: float, height: float, fov: float) -> tuple[Array, Array]:
@@ -436,7 +440,10 @@ def framed(shot: Shot, width: float, height: float, fov: float) -> tuple[Array, 
     phone = width < PHONE * height
     free = width if phone else max(width - PANEL * height, 0.5 * width)
     across = 2.0 * np.tan(0.5 * fov) / height  # of a pixel, over the distance
-    distance = shot.distance * max(1.0, _WIDTH / (free * across))
+    least = max(1.0, _WIDTH / (free * across))
+    if phone:
+        least = max(least, shot.height / ((1.0 - LOW) * height * across))
+    distance = shot.distance * least
     direction = shot.way / np.linalg.norm(shot.way)
     right = np.cross([0.0, 0.0, 1.0], direction)
     right /= np.linalg.norm(right)

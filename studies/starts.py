@@ -3,7 +3,7 @@
 `python studies/starts.py`: films of `tests/tracking/furry.py`, 24 frames spread over 0.4 s each;
 some minutes on a free core. Their seeds set no number of the method, but for those without a
 whisker and 123, 125 and 127 before grey fur. `--page` writes the table into
-`docs/tracking-accuracy.md`, else it is printed.
+`docs/tracking-rows.md`, else it is printed.
 """
 
 import argparse
@@ -93,7 +93,7 @@ def main() -> None:
         rows.append(row(name, map(measured, films), setup.get("whisker", True)))
         print(" | ".join(rows[-1]), flush=True)
     if page:
-        put(ROOT / "docs" / "tracking-accuracy.md", {"starts": table(HEAD, rows)})
+        put(ROOT / "docs" / "tracking-rows.md", {"starts": table(HEAD, rows)})
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ them with the base clicked where it truly is; whether that would have been found
 judged apart. Then rows of whiskers that cross, and three of the films as a laboratory without
 clicks, with a mirror or with one camera has them. By default seeds 61 to 66, on which no number was
 set; three minutes on a free core, of which ``--part`` makes one part only. ``--page`` writes the
-tables into `docs/tracking-accuracy.md`, else they are printed.
+tables into `docs/tracking-accuracy.md` and `docs/tracking-rows.md`, else they are printed.
 """
 
 import argparse
@@ -277,7 +277,7 @@ def main():
     parser.add_argument("--page", action="store_true", help="write the tables into the page")
     parser.add_argument("--part", choices=PARTS, help="make one table only")
     chosen = parser.parse_args()
-    page = ROOT / "docs" / "tracking-accuracy.md"
+    pages = [ROOT / "docs" / f"tracking-{name}.md" for name in ("accuracy", "rows")]
     for name, (head, texts, rows) in PARTS.items():
         if chosen.part not in (None, name):
             continue
@@ -286,7 +286,7 @@ def main():
             lines.append(line)
             print(" | ".join(line), flush=True)
         if chosen.page:
-            put(page, {name: table(head, lines, texts)})
+            put(pages, {name: table(head, lines, texts)})
 
 
 def single_films(seeds):

@@ -2,8 +2,8 @@
 
 `python studies/weight.py [--count 60] [--seed 7] [--page]`: three straight, tapered rods held
 level, upright and oblique; contacts of random arc length, direction and force, 2° to 25°; noise of
-1/1000 EI/L² and EI/L. With `--page` the table goes to `docs/friction-weight.md`. `--reference` writes
-`tests/data/weighted_contacts.csv`: contacts by an integration in the laboratory frame, which
+1/1000 EI/L² and EI/L. With `--page` the table goes to `docs/friction-weight.md`. `--reference`
+writes `tests/data/weighted_contacts.csv`: contacts by an integration in the laboratory frame, which
 vibrissa has no part in.
 """
 

@@ -80,6 +80,19 @@ def test_mirror_images_are_found_and_flat_valleys_held(gamma_map, rng):
     assert (squares <= HELD).mean() > 0.9
 
 
+@pytest.mark.parametrize("using", ["Fx FD MD", "Fx Mx MD"])
+def test_directions_are_the_less_certain_the_smaller_what_they_are_of(gamma_map, rng, using):
+    """Their sizes are not measured, and valleys of χ² are bent: about 3 % were beyond."""
+    force, moment, point = contacts_of(gamma_map, 0.0, 1.0, 1500, rng)
+    signals = vb.base_signals(*noisy_wrenches(force, moment, rng))
+    found = gamma_map.estimate(signals, using, np.diag(SIGMA**2))
+    rows = found.status == vb.Status.UNIQUE
+    assert rows.sum() > 500
+    squares = distances(found, point, rows)
+    assert (squares > BEYOND).mean() < 0.012
+    assert (squares <= HELD).mean() > 0.93
+
+
 def test_a_contact_whose_mirror_image_is_nearly_as_probable_is_not_unique():
     """F_x, F_T and M_B hardly tell the sides of a plane that the whisker nearly lies in."""
     length = 40e-3

@@ -124,6 +124,27 @@ def test_stated_errors_are_in_the_covariance_of_a_whole_wrench(gamma_map, stated
     assert np.mean(nees(narrow.point[one], narrow.covariance[one], bent.contact_point)) > 6.0
 
 
+def test_covariances_along_bent_valleys_hold_what_they_state(gamma_map):
+    """They were wide enough for one region only, and none was valid: kurtosis was the judge."""
+    rng = np.random.default_rng(8)
+    load = vb.PointForce(0.85 * gamma_map.whisker.length, components=(1e-6, 1e-5, 2e-6))
+    bent = vb.deflect(gamma_map.whisker, load)
+    wrench = np.concatenate([bent.force, bent.moment])
+    measured = wrench * (1.0 + 0.001 * rng.normal(size=(1000, 1)))
+    measured += 0.05 * NOISE * rng.normal(size=(1000, 6))
+    found = vb.estimate_from_wrench(
+        gamma_map.whisker,
+        measured[:, :3],
+        measured[:, 3:],
+        noise=np.diag((0.05 * NOISE) ** 2),
+        stiffness_sigma=0.001,
+    )
+    assert found.covariance_valid.mean() > 0.9
+    squares = nees(found.point[:, None], found.covariance[:, None], bent.contact_point)
+    assert 0.93 < (squares < 7.81).mean() < 0.985
+    assert (squares > 14.16).mean() < 0.006
+
+
 def test_a_calibration_from_data_is_as_sure_as_it_says(gamma_map, bent, wrench, rng, tmp_path):
     """Each trial calibrates anew by a few known loads, by way of a file; then a contact is felt."""
     mixing = gauges(rng, 6)

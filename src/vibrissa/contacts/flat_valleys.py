@@ -1,12 +1,13 @@
-"""What noise leaves open where χ² hardly determines one unknown: flat, bent valleys; compiled.
+"""What noise leaves open where the second order does not describe it: bent valleys; compiled.
 
-Of a contact ξ in the plane of a planar whisker some signals do not change, to first order, with the
-bearing of the force: the valley of χ² through it is long, bent, and so narrow that neither an
-expansion about the contact nor the nodes of the chart describe it. It is followed both ways along
-the longest principal axis a_0 of the noise in ξ, by steps of length l; at each, steps of Gauss and
-Newton along the others, a_1 and a_2, lead to its floor. The density along it is
+Where χ² hardly determines one unknown, its valley may be long and bent, and so narrow that neither
+an expansion about a contact nor the nodes of the chart describe it: of a contact ξ in the plane of
+a planar whisker some signals do not change, to first order, with the bearing of the force. The
+valley is followed both ways along the longest principal axis a_0 of the noise in ξ, by steps of
+length l; at each, steps of Gauss and Newton along the others, a_1 and a_2, lead to its floor. The
+density along it, with weights W that are those at each node, is
 
-    exp(-χ²/2) det ∂p/∂ξ |det(∂ξ/∂l, a_1, a_2)|,
+    exp(-χ²/2) |det W| det ∂p/∂ξ |det(∂ξ/∂l, a_1, a_2)|,
 
 or that without volumes; the mean of both counts, as in :mod:`~vibrissa.contacts.valleys`.
 """
@@ -20,7 +21,8 @@ import numpy as np
 from vibrissa.contacts.expansion import axis_length, principal_axes, without_friction
 from vibrissa.contacts.least_squares import channel_equations, lane_contact, whiten
 from vibrissa.contacts.valleys import CLOSED, HIGH, Nodes, mixture, pace, shares_of
-from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel, solve
+from vibrissa.contacts.weighing import Weighing, sharpness, weigh_any
+from vibrissa.numerics import AnyArray, Array, copy, inlined, kernel, solve
 from vibrissa.rod import (
     BUFFER_SIZE,
     LANES,
@@ -61,9 +63,9 @@ def _node(
     value: Array,
     t: Array,
     third: Array,
-    codes: IntArray,
+    how: Weighing,
     target: Array,
-    weights: Array,
+    measured: Array,
     nodes: Nodes,
     i: int,
     along: Array,
@@ -73,10 +75,13 @@ def _node(
     ``along`` becomes the valley's standard deviation, on the same side.
     """
     _, misfits, logs, points, spreads = nodes
+    codes = how.codes
     k = codes.shape[0]
-    residual, jacobian = np.empty(k), np.empty((k, 4))
+    residual, jacobian, weights = np.empty(k), np.empty((k, 4)), np.zeros((k, k))
     r, four, j = np.empty(k), np.empty((k, 4)), np.empty((k, 3))
     axes, frame, move, ahead = np.empty((3, 3)), np.empty((3, 3)), np.zeros(3), np.empty(3)
+    if not weigh_any(how, value, measured, weights):
+        return -1.0
     channel_equations(x, value, t, codes, target, residual, jacobian)
     chi, falls = whiten(weights, residual, jacobian, k, r, four), 0.0
     without_friction(four, j)
@@ -110,6 +115,7 @@ def _node(
     volume = point_determinant(third)
     misfits[i] = chi - falls
     logs[i, 1] = math.log(abs(solve(frame, ahead)) + 1e-300) - 0.5 * misfits[i]
+    logs[i, 1] += sharpness(weights)
     logs[i, 0] = logs[i, 1] + math.log(max(volume, 1e-300))
     shorter = min(1.0, _LONGEST / max(axis_length(x, move), 1e-300))
     x[0] += shorter * move[0]
@@ -150,9 +156,9 @@ def _described(
 def follow_valley(
     rod: Rod,
     proximal: float,
-    codes: IntArray,
+    how: Weighing,
     target: Array,
-    weights: Array,
+    measured: Array,
     x: Array,
     covariance: Array,
 ) -> bool:
@@ -181,7 +187,7 @@ def follow_valley(
     lane_contact(b, 0, False, value, t, third)
     copy(x, floor)
     turned[0], turned[1], turned[2] = 0.0, -x[3], x[2]
-    if _node(floor, value, t, third, codes, target, weights, nodes, _STEPS, turned) < 0.0:
+    if _node(floor, value, t, third, how, target, measured, nodes, _STEPS, turned) < 0.0:
         return False
     copy(value[3:], point)
     for way in range(2):
@@ -205,7 +211,7 @@ def follow_valley(
             before = misfits[i - side]
             lane_contact(b, 2 * way, False, value, t, third)
             copy(along[way], turned)
-            falls = _node(to[way], value, t, third, codes, target, weights, nodes, i, turned)
+            falls = _node(to[way], value, t, third, how, target, measured, nodes, i, turned)
             tries[way] += 1
             if falls >= _FLOOR and tries[way] < _TRIALS:
                 to[way, 0] = min(max(to[way, 0], LEAST_ARC), 1.0)

@@ -36,8 +36,9 @@ _NEGLIGIBLE = 36.0
 class Searched(NamedTuple):
     """What is searched, non-dimensional.
 
-    The chart's nodes lie in blocks: ``blocks`` (n + 1,) has where each begins, ``extent`` (2, q, n)
-    middle and half width of what is seen in it.
+    The chart's nodes lie in blocks: ``blocks`` (n + 1,) has where each begins, ``extent`` (4, q, n)
+    middle and half width of what is seen in it, and the least and the largest of ``sizes``: the
+    noise of a direction falls with the size of what it is the direction of.
     """
 
     rod: Rod
@@ -49,6 +50,7 @@ class Searched(NamedTuple):
     contacts: Array
     values: Array
     seen: Array
+    sizes: Array
     turns: Array
     kinds: IntArray
     part: IntArray
@@ -63,6 +65,7 @@ def searched(
     where: Sequence[int],
     codes: Sequence[int],
     seen: Array,
+    sizes: Array,
     turns: Array,
     kinds: Sequence[int],
 ) -> Searched:
@@ -70,10 +73,14 @@ def searched(
     block = _cut(chart, _BLOCKS)
     order = np.argsort(block, kind="stable")
     blocks = np.searchsorted(block[order], np.arange(math.prod(_BLOCKS) + 1))
-    seen = np.ascontiguousarray(seen[:, order])
+    seen, sizes = (np.ascontiguousarray(a[:, order]) for a in (seen, sizes))
     away = seen - np.repeat(seen[:, blocks[:-1]], np.diff(blocks), axis=1)
     away -= np.where(turns > 0.0, 2.0 * np.pi, 0.0)[:, None] * np.rint(away * turns[:, None])
-    low, high = (ufunc.reduceat(away, blocks[:-1], axis=1) for ufunc in (np.minimum, np.maximum))
+    low, high, least, largest = (
+        ufunc.reduceat(a, blocks[:-1], axis=1)
+        for a in (away, sizes)
+        for ufunc in (np.minimum, np.maximum)
+    )
     return Searched(
         chart.discretization.rod,
         chart.fold,
@@ -84,20 +91,22 @@ def searched(
         chart.contacts.reshape(-1, 3)[order],
         chart.values.reshape(-1, 6)[order],
         seen,
+        sizes,
         turns,
         np.array(kinds),
         _cut(chart, _PARTS_BY_AXIS)[order],
         _volumes(chart)[order],
         blocks,
-        np.stack([seen[:, blocks[:-1]] + 0.5 * (low + high), 0.5 * (high - low)]),
+        np.stack([seen[:, blocks[:-1]] + 0.5 * (low + high), 0.5 * (high - low), least, largest]),
     )
 
 
-def at_nodes(chart: StableSet, names: tuple[str, ...]) -> tuple[Array, Array]:
-    """Channels (k, nodes) at the chart's nodes, and 1/2π for those that are angles."""
+def at_nodes(chart: StableSet, names: tuple[str, ...]) -> tuple[Array, Array, Array]:
+    """Channels (k, nodes) at the chart's nodes, sizes of directions, and 1/2π for these."""
     which = [CHANNELS.index(name) for name in names]
-    known = np.ascontiguousarray(channels_of(chart.values.reshape(-1, 6))[:, which].T)
-    return known, np.array([0.5 / np.pi if CIRCULAR[w] else 0.0 for w in which])
+    known = np.ascontiguousarray(channels_of(chart.values.reshape(-1, 6)).T)
+    turns = np.array([0.5 / np.pi if CIRCULAR[w] else 0.0 for w in which])
+    return known[which], np.where(turns[:, None] > 0.0, known[np.array(which) - 1], 1.0), turns
 
 
 def _cut(chart: StableSet, number: tuple[int, int, int]) -> IntArray:
@@ -128,6 +137,7 @@ def nearest_of(of: Searched, mixing: Array, target: Array, out: IntArray) -> Non
     A block of nodes, which is within one part, is left out where its bounds are farther off.
     """
     q, number, sizes = of.turns.shape[0], of.blocks.shape[0] - 1, np.zeros(2)
+    fixed = np.zeros(q)
     wanted, scales, bounds = np.zeros(q), np.zeros((q, q)), np.zeros(number)
     least, nearest = np.full(PARTS, np.inf), np.full(PARTS, np.inf)
     for i in range(q):
@@ -154,7 +164,7 @@ def nearest_of(of: Searched, mixing: Array, target: Array, out: IntArray) -> Non
             p = of.part[first]
             if (bounds[n] > nearest[p]) != (others == 1) or bounds[n] > least[p]:
                 continue
-            _misfits_of_block(of, scales, wanted, first, work, here[: last - first])
+            _misfits_of_block(of, scales, fixed, wanted, first, work, here[: last - first])
             for k in range(last - first):
                 if here[k] < least[p]:
                     least[p], out[p] = here[k], first + k
@@ -162,23 +172,29 @@ def nearest_of(of: Searched, mixing: Array, target: Array, out: IntArray) -> Non
 
 @inlined
 def _near_blocks(
-    of: Searched, weights: Array, target: Array, most: float, blocks: IntArray
+    of: Searched, weights: Array, unit: Array, target: Array, most: float, blocks: IntArray
 ) -> tuple[int, int]:
     """List blocks of nodes that may have a χ² of ``most``; how many, with how many nodes.
 
     Each whitened residual is within bounds over a block, as the channels are.
     """
-    q, number, nodes, away = of.turns.shape[0], 0, 0, np.empty(of.turns.shape[0])
+    q, number, nodes = of.turns.shape[0], 0, 0
+    low, high = np.empty(q), np.empty(q)
     for n in range(blocks.shape[0]):
         least = 0.0
         for i in range(q):
-            away[i] = of.extent[0, i, n] - target[i]
-            away[i] -= 2.0 * np.pi * np.rint(away[i] * of.turns[i])
+            away = of.extent[0, i, n] - target[i]
+            away -= 2.0 * np.pi * np.rint(away * of.turns[i])
+            low[i], high[i] = away - of.extent[1, i, n], away + of.extent[1, i, n]
+            if unit[i] > 0.0:
+                small, large = of.extent[2, i, n] / unit[i], of.extent[3, i, n] / unit[i]
+                low[i] *= large if low[i] < 0.0 else small
+                high[i] *= small if high[i] < 0.0 else large
         for i in range(q):
             middle, half = 0.0, 0.0
             for c in range(q):
-                middle += weights[i, c] * away[c]
-                half += abs(weights[i, c]) * of.extent[1, c, n]
+                middle += 0.5 * weights[i, c] * (low[c] + high[c])
+                half += 0.5 * abs(weights[i, c]) * (high[c] - low[c])
             least += max(abs(middle) - half, 0.0) ** 2
         if least <= most:
             blocks[number] = n
@@ -188,9 +204,18 @@ def _near_blocks(
 
 @inlined
 def _misfits_of_block(
-    of: Searched, weights: Array, target: Array, first: int, away: Array, misfits: Array
+    of: Searched,
+    weights: Array,
+    unit: Array,
+    target: Array,
+    first: int,
+    away: Array,
+    misfits: Array,
 ) -> None:
-    """Fill χ² (n,) at nodes from the first of a block on; ``away`` (q + 1, n) is for work."""
+    """Fill χ² (n,) at nodes from the first of a block on; ``away`` (q + 1, n) is for work.
+
+    Weights of directions are for sizes of one ``unit``; where that is zero, they are for all sizes.
+    """
     q, number = of.turns.shape[0], misfits.shape[0]
     r = away[q]
     for i in range(q):
@@ -199,6 +224,8 @@ def _misfits_of_block(
             mine[k] = seen[first + k] - aim
         for k in range(number if turn > 0.0 else 0):
             mine[k] -= np.rint(mine[k] * turn) * 2.0 * np.pi
+        for k in range(number if unit[i] > 0.0 else 0):
+            mine[k] *= of.sizes[i, first + k] / unit[i]
     for k in range(number):
         misfits[k] = 0.0
     for i in range(q):
@@ -213,7 +240,14 @@ def _misfits_of_block(
 
 @inlined
 def _likely_nodes(
-    of: Searched, weights: Array, target: Array, most: float, blocks: IntArray, near: int, size: int
+    of: Searched,
+    weights: Array,
+    unit: Array,
+    target: Array,
+    most: float,
+    blocks: IntArray,
+    near: int,
+    size: int,
 ) -> tuple[int, IntArray, Array]:
     """List the nodes of some blocks with a χ² below ``most``; how many, which, and their χ²."""
     nodes, misfits, kept, longest = np.empty(size, np.int64), np.empty(size), 0, 0
@@ -223,7 +257,7 @@ def _likely_nodes(
     for i in range(near):
         first = of.blocks[blocks[i]]
         number = of.blocks[blocks[i] + 1] - first
-        _misfits_of_block(of, weights, target, first, away, here[:number])
+        _misfits_of_block(of, weights, unit, target, first, away, here[:number])
         for k in range(number):  # without branches: what does not count is written over
             nodes[kept], misfits[kept] = first + k, here[k]
             kept += 1 if here[k] < most else 0
@@ -235,6 +269,7 @@ def outside_share(
     of: Searched,
     white: bool,
     weights: Array,
+    unit: Array,
     target: Array,
     point: Array,
     chi: float,
@@ -249,19 +284,23 @@ def outside_share(
     share outside three standard deviations is that of contact points or of the chart, whichever is
     larger: contact points of little volume, as near slip-off, are not left out. Where valleys are
     too narrow for the nodes, ``others`` (n, 4), χ² and points, count as well. What is seen may be
-    ``white`` already.
+    ``white`` already. Weights of directions are for sizes of one ``unit``, if that is not zero: of
+    larger ones they are sharper, and so is the density of what was measured.
     """
     if white:
         weights = np.zeros((of.turns.shape[0], of.turns.shape[0]))
         for i in range(of.turns.shape[0]):
             weights[i, i] = 1.0
     blocks, most = np.empty(of.blocks.shape[0] - 1, np.int64), chi + _NEGLIGIBLE
-    near, size = _near_blocks(of, weights, target, most, blocks)
-    n, nodes, misfits = _likely_nodes(of, weights, target, most, blocks, near, size)
+    near, size = _near_blocks(of, weights, unit, target, most, blocks)
+    n, nodes, misfits = _likely_nodes(of, weights, unit, target, most, blocks, near, size)
     points, density, likelihood, far = np.empty((3, n)), np.empty(n), np.empty(n), np.empty(n)
     total, squares = 0.0, 0.0
     for k in range(n):
         likelihood[k] = quick_exp(0.5 * (chi - misfits[k]))
+    for i in range(unit.shape[0]):
+        for k in range(n if unit[i] > 0.0 else 0):
+            likelihood[k] *= of.sizes[i, nodes[k]] / unit[i]
     for k in range(n):
         node = nodes[k]
         density[k] = of.volume[node] * likelihood[k]

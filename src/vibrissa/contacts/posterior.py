@@ -56,8 +56,8 @@ CERTAIN = 0.95
 # Where a covariance can be relied on: what the second order misses at most there, in standard
 # deviations of the channels; what ellipsoids of 95 % hold; and how much variances were widened.
 _MISSED, _LEAST_HELD, _MOST_HELD, _MOST_WIDENED = 0.09, 0.93, 0.98, 1.7
-# What is left outside three standard deviations, and the squares of these and of the 95 % region.
-_LEFT, _THREE_SIGMA, _HELD = 0.0033, 14.156, 7.815
+#: What may be left outside three standard deviations; the squares of these and of the 95 % region.
+LEFT, THREE_SIGMA, HELD = 0.0033, 14.156, 7.815
 # Where the second order misses so much, densities are not to be trusted: the first order gives the
 # weight of a candidate. A node's log density gains at most so much over the first order's.
 _BROKEN, _MOST_GAIN = 0.3, 3.0
@@ -198,6 +198,12 @@ def second_moment(points: Array, density: Array, total: float, covariance: Array
 
 
 @inlined
+def holds(held: float, wider: float) -> bool:
+    """Whether a covariance is valid whose 95 % region holds so much, widened by this factor."""
+    return _LEAST_HELD < held < _MOST_HELD and wider < _MOST_WIDENED
+
+
+@inlined
 def _reaches(far: Array, density: Array, centre: float, logs: Array) -> None:
     """Make squared distances along each ray (rays, radii) rise; fill the logs of what is beyond.
 
@@ -237,13 +243,13 @@ def _outside(far: Array, logs: Array, square: float) -> tuple[float, float]:
 def _fitting(far: Array, logs: Array) -> tuple[float, float]:
     """Factor by which an ellipsoid holds what it states at three deviations; what at 95 %."""
     whole, _ = _outside(far, logs, 0.0)
-    square = _THREE_SIGMA
+    square = THREE_SIGMA
     for _ in range(_TRIALS):
         left, slope = _outside(far, logs, square)
-        step = math.log(max(left / whole, _NOTHING) / _LEFT) * left / min(slope, -_NOTHING)
+        step = math.log(max(left / whole, _NOTHING) / LEFT) * left / min(slope, -_NOTHING)
         square = min(max(square - step, 0.5 * square), 2.0 * square)
-    wider = max(square / _THREE_SIGMA, 1.0)
-    left, _ = _outside(far, logs, wider * _HELD)
+    wider = max(square / THREE_SIGMA, 1.0)
+    left, _ = _outside(far, logs, wider * HELD)
     return wider, 1.0 - left / whole
 
 
@@ -285,7 +291,7 @@ def _moments(
     for a in range(3):
         for c in range(3):
             covariance[a, c] *= wider
-    return mean, _LEAST_HELD < held < _MOST_HELD and wider < _MOST_WIDENED
+    return mean, holds(held, wider)
 
 
 @kernel
@@ -302,12 +308,14 @@ def judge(
     covariances: Array,
     weight: Array,
     valid: AnyArray,
+    described: AnyArray,
     n: int,
 ) -> None:
     """Judge candidates of a measurement; see the module.
 
     Weights, x (n, 4), ∂(F, p)/∂ξ (n, 6, 3), residuals and their slopes by x (n, k, 4) are those of
-    each; out come covariances of points, log weights, and whether covariances are valid.
+    each; out come covariances of points, log weights, and whether covariances are valid, and
+    channels described by the second order at least roughly.
     """
     k, b, nothing = codes.shape[0], np.zeros(BUFFER_SIZE), np.zeros(3)
     j, slopes = np.empty((k, 3)), np.empty((3, 3))
@@ -324,7 +332,7 @@ def judge(
     r0, by_r, _, by_p, _, axes, _, _ = model
     for row in range(n):
         x, covariance = contacts[row], covariances[row]
-        weight[row], valid[row] = -np.inf, False
+        weight[row], valid[row], described[row] = -np.inf, False, False
         covariance[:] = np.nan
         without_friction(jacobians[row], j)
         if not principal_axes(x, j, axes):
@@ -363,7 +371,7 @@ def judge(
         if straight or (missed > _BROKEN and first_order > 0.0 and not short):
             density = first_order
         weight[row] = math.log(density) - 0.5 * misfit if density > 0.0 else -np.inf
-        valid[row] = missed < _MISSED and fair
+        valid[row], described[row] = missed < _MISSED and fair, missed < _BROKEN
 
 
 @kernel

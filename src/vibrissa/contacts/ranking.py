@@ -10,10 +10,12 @@ and its mirror image in the plane of a planar whisker have starts in the images 
 which flat valleys (:mod:`~vibrissa.contacts.flat_valleys`) join to them, so that basins do not part
 the two.
 
-All candidates are judged (:mod:`~vibrissa.contacts.posterior`). The volumes of contact points that
-they stand for nearly vanish near slip-off, where a whisker may yet be: probabilities are the mean
-of those by volumes and of those by likelihoods alone. Where the second order does not describe one
-of the candidates, likelihoods count alone, and the nodes are asked too.
+All candidates are judged (:mod:`~vibrissa.contacts.posterior`). What was measured is as probable as
+noise makes it at each; that of a direction falls with the size of what it is the direction of. The
+volumes of contact points that they stand for nearly vanish near slip-off, where a whisker may yet
+be: probabilities are the mean of those by volumes and of those by likelihoods alone. Where the
+second order does not describe one of the candidates, likelihoods count alone, the valley of χ²
+through the best is followed (:mod:`~vibrissa.contacts.flat_valleys`), and the nodes are asked too.
 """
 
 from __future__ import annotations
@@ -37,10 +39,10 @@ from vibrissa.contacts.nodes import PARTS, Searched, nearest_of, outside_share
 from vibrissa.contacts.noise import INDISTINCT
 from vibrissa.contacts.posterior import CERTAIN, judge, rank
 from vibrissa.contacts.task import Problem, Task, in_memory
-from vibrissa.contacts.weighing import Weighing, weigh_any
+from vibrissa.contacts.weighing import Weighing, sharpness, weigh_any
 from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel
 from vibrissa.rod import evaluate
-from vibrissa.signals import FT, FX, MB
+from vibrissa.signals import FT, FX, MB, MD
 from vibrissa.status import Status
 
 _UNIQUE, _AMBIGUOUS = int(Status.UNIQUE), int(Status.AMBIGUOUS)
@@ -231,9 +233,9 @@ class _Room(NamedTuple):
     """Working memory of `settle`, by candidate.
 
     Weights, ∂(F, p)/∂x of one (6, 4) and ∂(F, p)/∂ξ (n, 6, 3), residuals and slopes in standard
-    deviations; covariances, log weights (as they count, and with volumes), probabilities,
-    whether covariances are valid, order; copies of x, (F, p) and χ²; and χ² and points (n, 4) of
-    contacts that are not candidates.
+    deviations; covariances, log weights (as they count, and with volumes), probabilities, whether
+    covariances are valid, whether the second order describes the channels, order; copies of x,
+    (F, p) and χ²; and χ² and points (n, 4) of contacts that are not candidates.
     """
 
     weights: Array
@@ -245,6 +247,7 @@ class _Room(NamedTuple):
     weight: Array
     chance: Array
     fine: AnyArray
+    described: AnyArray
     order: IntArray
     x: Array
     values: Array
@@ -264,6 +267,7 @@ def _judging(most: int, k: int) -> _Room:
         np.empty((most, 3, 3)),
         np.empty((2, most)),
         np.empty((1, most)),
+        np.zeros(most, np.bool_),
         np.zeros(most, np.bool_),
         np.zeros((1, most), np.int64),
         np.empty((most, 4)),
@@ -321,6 +325,19 @@ def _both_priors(weight: Array, chi: Array, n: int, sound: bool) -> None:
 
 
 @inlined
+def _units(of: Searched, how: Weighing, value: Array) -> Array:
+    """Sizes of directions (q,) for which weights are those at (F, p); zero: for all sizes."""
+    out = np.zeros(of.turns.shape[0])
+    for i in range(out.shape[0]):
+        if of.turns[i] > 0.0 and not how.deviations[0] >= 0.0:
+            out[i] = math.hypot(value[1], value[2])
+            if how.codes[i] == MD:
+                my = value[5] * value[0] - value[3] * value[2]
+                out[i] = math.hypot(my, value[3] * value[1] - value[4] * value[0])
+    return out
+
+
+@inlined
 def _put_in_order(row: int, n: int, out: Candidates, room: _Room) -> None:
     """Write n candidates with what is known of them by falling probability."""
     x, values, chi = out.x[row], out.values[row], out.chi_squared[row]
@@ -339,6 +356,39 @@ def _put_in_order(row: int, n: int, out: Candidates, room: _Room) -> None:
         chi[c], out.valid[row, c] = room.misfits[old], room.fine[old]
         for a in range(3):
             copy(room.spread[old, a], out.covariances[row, c, a])
+
+
+@inlined
+def _leave_room(
+    of: Searched,
+    how: Weighing,
+    target: Array,
+    measured: Array,
+    row: int,
+    best: int,
+    out: Candidates,
+    room: _Room,
+) -> None:
+    """Lower the probability of the first candidate by what is outside its region, which may widen.
+
+    ``best`` is which candidate it was before they were put in order.
+    """
+    white, weights, spread = how.own[0, 0] > 0.0, room.weights[best], out.covariances[row, 0]
+    value, valid = out.values[row, 0], out.valid[row, 0]
+    if not (room.described[best] and (valid or not _mirrored(how))):
+        follow_valley(of.rod, of.proximal, how, target, measured, out.x[row, 0], spread)
+    out.probability[row, 0] *= 1.0 - outside_share(
+        of,
+        white,
+        weights,
+        _units(of, how, value),
+        measured if white else target,
+        value[3:],
+        out.chi_squared[row, 0],
+        room.weight[1, best] - sharpness(weights) + _LOG_NORMAL,
+        spread,
+        room.loose,
+    )
 
 
 @kernel
@@ -397,32 +447,20 @@ def settle(
         room.spread,
         weight[1],
         fine,
+        room.described,
         n,
     )
     sound = True
     for c in range(n):
         sound = sound and fine[c]
+        room.misfits[c] = chi[c] - 2.0 * sharpness(room.weights[c])
+        weight[1, c] += sharpness(room.weights[c])
         weight[0, c] = weight[1, c]
-    _both_priors(weight, chi, n, sound)
+    _both_priors(weight, room.misfits, n, sound)
     rank(weight, out.number[row : row + 1], chance, order)
     _put_in_order(row, n, out, room)
     if out.probability[row, 0] > CERTAIN and (others or not out.valid[row, 0]):
-        seen, best = measured if how.own[0, 0] > 0.0 else target, order[0, 0]
-        log_mass, spread = weight[1, best] + _LOG_NORMAL, out.covariances[row, 0]
-        if _mirrored(how) and not out.valid[row, 0]:
-            follow_valley(of.rod, of.proximal, how.codes, target, room.weights[best], x[0], spread)
-        outside = outside_share(
-            of,
-            how.own[0, 0] > 0.0,
-            room.weights[best],
-            seen,
-            values[0, 3:],
-            chi[0],
-            log_mass,
-            spread,
-            room.loose,
-        )
-        out.probability[row, 0] *= 1.0 - outside
+        _leave_room(of, how, target, measured, row, order[0, 0], out, room)
 
 
 @kernel

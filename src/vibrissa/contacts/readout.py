@@ -93,13 +93,14 @@ def searched_by_name(
     if len(names) < _UNKNOWNS:
         return bounds, None
     three = names if len(names) == _UNKNOWNS else seeding_triplet(chart, names)
-    known, turns = at_nodes(chart, channels)
+    known, sizes, turns = at_nodes(chart, channels)
     return bounds, searched(
         chart,
         contact_map.tree(three),
         [names.index(name) for name in three],
         [SIGNALS.index(name) for name in three],
         known,
+        sizes,
         turns,
         [2 if turn else "FM".index(name[0]) for name, turn in zip(channels, turns, strict=True)],
     )
@@ -238,6 +239,7 @@ class Mixed:
                 range(3),
                 range(3),
                 np.ascontiguousarray(seen.T),
+                np.ones(seen.T.shape),
                 np.zeros(self.rank),
                 [2] * self.rank,
             )

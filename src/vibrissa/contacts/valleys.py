@@ -11,9 +11,11 @@ density of s is
 
 or, with s and f instead, that without the second factor; the mean of both counts. Contact points
 are a mixture of normal distributions along the valley. The covariance is their second moment about
-the contact, widened by κ^(3/4) for tails, with the kurtosis κ relative to a normal distribution's
-(K. V. Mardia, *Measures of multivariate skewness and kurtosis with applications*, Biometrika 57
-(1970) 519-530).
+the contact, widened until what the mixture leaves beyond three standard deviations is what these
+state. Of each part the squared distance is a shifted χ² with the same three cumulants (H. Liu,
+Y. Tang, H. H. Zhang, *A new chi-square approximation to the distribution of non-negative definite
+quadratic forms in non-central normal variables*, Comput. Stat. Data Anal. 53 (2009) 853-856), whose
+cube root is about normal.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ import numpy as np
 
 from vibrissa.contacts.channels import FITTED
 from vibrissa.contacts.least_squares import channel_equations, lane_contact, whiten
-from vibrissa.contacts.posterior import NORMAL_KURTOSIS
+from vibrissa.contacts.posterior import HELD, LEFT, THREE_SIGMA, holds
 from vibrissa.numerics import (
     AnyArray,
     Array,
@@ -54,8 +56,10 @@ HIGH, CLOSED = 30.0, 9.0
 _PACE = ((0.4, 2.0), (0.8, 1.3), (12.0, 1.0), (math.inf, 0.6))
 # The largest change of the moment of the force in a step, as a share of it.
 _LARGEST_CHANGE = 0.5
-# The largest kurtosis at which a covariance is relied on.
-_TAILED = 1.15
+# A covariance is widened by so much at most, found by so many bisections.
+_WIDEST, _BISECTIONS = 8.0, 8
+# Variances, in those of the whole mixture, that are nothing.
+_NOTHING = 1e-6
 
 
 class Valleys(NamedTuple):
@@ -237,12 +241,25 @@ def shares_of(nodes: Nodes, first: int, last: int, shares: Array) -> float:
 
 
 @inlined
+def _beyond(cumulants: Array, shares: Array, first: int, last: int, square: float) -> float:
+    """Probability that a mixture leaves beyond a squared distance; see the module."""
+    total = 0.0
+    for i in range(first, last):
+        mean, spread, skew = cumulants[i]
+        degrees = spread**3 / skew**2
+        size = max(1.0 + (square - mean) / math.sqrt(spread * degrees), 0.0)
+        away = size ** (1.0 / 3.0) - 1.0 + 2.0 / (9.0 * degrees)
+        total += 0.5 * shares[i] * math.erfc(1.5 * math.sqrt(degrees) * away)
+    return total
+
+
+@inlined
 def mixture(
     nodes: Nodes, first: int, last: int, shares: Array, point: Array, covariance: Array
-) -> float:
-    """Fill the second moment of a mixture about a point, widened; return its kurtosis."""
+) -> bool:
+    """Fill the second moment of a mixture about a point, widened; whether it can be relied on."""
     points, spreads = nodes[3], nodes[4]
-    root, y, z = np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
+    root, y, z, cumulants = np.zeros((3, 3)), np.empty(3), np.empty((3, 3)), np.empty_like(points)
     covariance[:] = 0.0
     for i in range(first, last):
         for a in range(3):
@@ -250,29 +267,43 @@ def mixture(
                 away = (points[i, a] - point[a]) * (points[i, c] - point[c])
                 covariance[a, c] += shares[i] * (spreads[i, a, c] + away)
     if not cholesky(covariance, root):
-        return np.inf
-    fourth = 0.0
+        return False
     for i in range(first, last):
-        trace, both, across = 0.0, 0.0, 0.0
         for a in range(3):
             y[a] = points[i, a] - point[a]
             copy(spreads[i, a], z[a])
             mahalanobis(root, z[a])
-        square = mahalanobis(root, y)
+        mean, spread, skew = mahalanobis(root, y), 0.0, 0.0
         for c in range(3):
             column = z[:, c].copy()
             mahalanobis(root, column)
             for a in range(3):
                 z[a, c] = column[a]
         for a in range(3):
-            trace += z[a, a]
+            z[a, a] += _NOTHING
+            mean += z[a, a]
+        for a in range(3):
+            moved = 0.0
             for c in range(3):
-                both += z[a, c] * z[a, c]
-                across += y[a] * z[a, c] * y[c]
-        fourth += shares[i] * ((square + trace) ** 2 + 2.0 * both + 4.0 * across)
-    tailed = fourth / NORMAL_KURTOSIS
-    covariance *= max(tailed, 1.0) ** 0.75
-    return tailed
+                moved += z[a, c] * y[c]
+                square = z[a, 0] * z[0, c] + z[a, 1] * z[1, c] + z[a, 2] * z[2, c]
+                spread += z[a, c] * z[a, c]
+                skew += z[a, c] * square
+            spread += 2.0 * y[a] * moved
+            skew += 3.0 * moved * moved
+        cumulants[i, 0], cumulants[i, 1], cumulants[i, 2] = mean, spread, skew
+    wider, most = 1.0, _WIDEST
+    if _beyond(cumulants, shares, first, last, THREE_SIGMA) > LEFT:
+        for _ in range(_BISECTIONS):
+            middle = math.sqrt(wider * most)
+            if _beyond(cumulants, shares, first, last, middle * THREE_SIGMA) > LEFT:
+                wider = middle
+            else:
+                most = middle
+        wider = most
+    covariance *= wider
+    held = 1.0 - _beyond(cumulants, shares, first, last, wider * HELD)
+    return holds(held, wider)
 
 
 @kernel
@@ -315,10 +346,10 @@ def _valley_rows(
         if end - begin < 2:
             continue
         weight[row] = shares_of(nodes, begin, end, shares)
-        tailed = mixture(nodes, begin, end, shares, values[row, 3:], covariances[row])
+        fair = mixture(nodes, begin, end, shares, values[row, 3:], covariances[row])
         enough = nodes[1][_STEPS] + CLOSED
         closed = nodes[1][begin] > enough and nodes[1][end - 1] > enough
-        valid[row] = closed and tailed < _TAILED
+        valid[row] = closed and fair
 
 
 def valleys(

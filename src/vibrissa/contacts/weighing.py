@@ -172,3 +172,17 @@ def weigh_any(how: Weighing, value: Array, measured: Array, out: Array) -> bool:
         for j in range(k):
             out[i, j] = root * vectors[j, i] / size[j]
     return True
+
+
+@inlined
+def sharpness(weights: Array) -> float:
+    """Logarithm of the density that noise with these weights has where it is zero.
+
+    Up to what is the same for all contacts. The noise of a direction falls with the size of what it
+    is the direction of.
+    """
+    total = 0.0
+    for i in range(weights.shape[0]):
+        if abs(weights[i, i]) > 0.0:
+            total += math.log(abs(weights[i, i]))
+    return total

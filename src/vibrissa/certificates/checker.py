@@ -14,8 +14,9 @@ With F = f², n = f (-fρ, ν), m = fμ, q = (x, fη), w = cμ, c = b⁻⁴, b =
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -59,12 +60,12 @@ class Form:
     slope: Array
     rest: Array
 
-    @property
+    @cached_property
     def reach(self) -> Array:
         """Largest distance from the centre."""
         return np.asarray((np.abs(self.slope).sum(axis=0) + self.rest) * (1.0 + _LOST))
 
-    @property
+    @cached_property
     def size(self) -> Array:
         """Largest magnitude."""
         return np.asarray((np.abs(self.centre) + self.reach) * (1.0 + _LOST))
@@ -114,24 +115,19 @@ class Series:
         self.centre = np.zeros((order + 1, *first.centre.shape))
         self.slope = np.zeros((order + 1, *first.slope.shape))
         self.rest, self.reach, self.size = (np.zeros_like(self.centre) for _ in range(3))
-        self.length = 0
+        self.forms: list[Form] = []
         self.append(first)
 
     def append(self, form: Form) -> None:
         """Add the next coefficient."""
-        k = self.length
+        k = len(self.forms)
         self.centre[k], self.slope[k], self.rest[k] = form.centre, form.slope, form.rest
         self.reach[k], self.size[k] = form.reach, form.size
-        self.length += 1
+        self.forms.append(form)
 
     def __getitem__(self, k: int) -> Form:
         """One coefficient."""
-        k %= self.length
-        return Form(self.centre[k], self.slope[k], self.rest[k])
-
-    def __iter__(self) -> Iterator[Form]:
-        """All coefficients, from order zero on."""
-        return (self[k] for k in range(self.length))
+        return self.forms[k]
 
     def times(self, other: Series, k: int) -> Form:
         """Coefficient k of a product."""
@@ -377,7 +373,7 @@ def _series(
     names = ("g2", "c", "g5", "c_s", "w", "w_s", "w_f", "z", "z_s", "z_f", "y", "y_s", "y_f")
     a = {name: Series(zero, order) for name in names}
     for series in a.values():
-        series.length = 0
+        series.forms.clear()
     c, c_s, w, w_s, w_f = (a[name] for name in ("c", "c_s", "w", "w_s", "w_f"))
     for k in range(order):
         a["g2"].append(g.times(g, k))
@@ -442,7 +438,7 @@ def _base(
         guess = [a[-1].size * h ** (_ORDER - 1) + 1e-9 * a[0].size + 1e-12 for a in x]
         for _ in range(8):
             spans = [
-                a[0].blurred(sum(c.size * h**k for k, c in enumerate(a) if k) + e)
+                a[0].blurred(sum(c.size * h**k for k, c in enumerate(a.forms) if k) + e)
                 for a, e in zip(x, guess, strict=True)
             ]
             y = _series(wide[0], wide[1], wide[2:], over, spans[:-1], _ORDER, fold)
@@ -457,7 +453,7 @@ def _base(
         ahead = []
         for a, e in zip(x[:-1], grown[:-1], strict=True):
             value = a[-1]
-            for k in range(a.length - 2, -1, -1):
+            for k in range(len(a.forms) - 2, -1, -1):
                 value = value * h + a[k]
             ahead.append(Form(value.centre, value.slope, value.rest + e))
         states, tau = ahead, tau + h

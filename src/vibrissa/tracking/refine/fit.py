@@ -70,6 +70,9 @@ _UNSEEN = 0.02
 _MEDIAN = 1.86
 """Standard deviation of a median of n normal numbers, over their median size and √n."""
 
+_SQUARE = 0.455
+"""Median of the square of a standard normal number."""
+
 _AT_BASE, _FOLLOWED = 0.03, 2.0
 """Share of the length over which fur may draw a trace aside, and by how much more it does than what
 the rod, which follows it, leaves of that."""
@@ -410,7 +413,8 @@ def _shared(problem: Problem, fit: _Linear) -> Array:
     Light from the side, a halo of compression or fur over the base shift a trace in the same way in
     many frames, so that neither many points nor many frames make it smaller: waves along the
     whisker, a bend at its base, and shifts of its ends along it. What of them the fit does not
-    follow stays in the means of the residuals over frames with and without contact.
+    follow stays in the means of the residuals over frames with and without contact. The edge of an
+    object draws a trace aside next to the contact, by as much again as the residuals there.
     """
     pulls = []
     parts = [fit.left(rows) for rows in (problem.touching, ~problem.touching)]
@@ -421,16 +425,17 @@ def _shared(problem: Problem, fit: _Linear) -> Array:
         n = design.shape[1] - 2
         s = np.linspace(0.0, 1.0, n)
         beyond = s > 2.0 * _AT_BASE
-        # What neighbours have in common is as strong in all long waves.
-        # Where the image shows that a trace is uncertain, it is so by more than elsewhere.
-        known = (weight[:, :-2] ** 2).mean(axis=0)[beyond]
-        square = sum(float(np.average(part[view][beyond] ** 2, weights=known)) for part in parts)
+        # What neighbours have in common is as strong in all long waves; what an edge next to the
+        # contact leaves is there only, and no part of them.
+        square = sum(float(np.median(part[view][beyond] ** 2)) for part in parts) / _SQUARE
         sigma = np.sqrt(2.0 * together / n * square)
         waves = [sigma * np.cos(k * np.pi * s) for k in range(_WAVES)]
         waves.append(_lit(problem, view) * (1.0 - s))
         waves.append(_FOLLOWED * _drawn(fit)[view] * np.exp(-s / _AT_BASE))
         across = design[:, :-2] * weight[:, :-2, None]
         pulls += [np.einsum("tni,n->ti", across, wave) for wave in waves]
+        local = np.where(beyond, np.abs(parts[0][view]), 0.0)
+        pulls.append(np.einsum("tni,n->ti", across, local) * problem.touching[:, None])
         for end, more in enumerate(_ENDS):
             miss = ends[weight[:, end - 2] > 0.0, end]
             size = np.hypot(miss.mean(), more * miss.std()) if miss.size else 0.0

@@ -117,6 +117,18 @@ def test_a_kinked_rod_meets_an_independent_integration(sampled):
     assert worst(whisker, ramp, radius, [kink]) <= 2e-6
 
 
+def test_a_short_steep_piece_has_steps_enough():
+    """Of two steps, in each of which the radius fell by 30 %, the error was 2.6e-6."""
+    kinks = LENGTH * np.array([0.623, 0.707, 0.749])
+    places, radii = [0.0, *kinks, LENGTH], 1e-6 * np.array([100.0, 90.1, 88.1, 46.8, 12.0])
+
+    def radius(s):
+        return np.interp(s, places, radii)
+
+    whisker = vb.Whisker.from_curvature(LENGTH, ramp, radius=radius, breaks=tuple(kinks))
+    assert worst(whisker, ramp, radius, kinks, loads=3, seed=13) <= 1e-6
+
+
 def test_a_bend_in_the_curvature_that_was_not_stated():
     corner = 0.37 * LENGTH
 

@@ -33,6 +33,8 @@ MOST_STEPS = 2**8 * STEPS
 # (rad).
 _TURN_PER_STEP = 0.08
 _TAPER_EXPONENT = 0.4
+# Of STEPS, so many at least where the radius falls by a factor e.
+_STEPS_PER_CHANGE = 6.0
 _JOINT_STEPS = 4
 _ORDER = 4
 # Misfit of a step's cubics, relative to the largest value, from which their moments are matched.
@@ -220,8 +222,14 @@ def _nodes(whisker: Whisker, steps: int) -> Array:
     density = (whisker.radius(middle) / whisker.base_radius) ** -_TAPER_EXPONENT
     cumulated = np.concatenate([[0.0], np.cumsum(density)])
     cumulated /= cumulated[-1]
-    edges = np.interp([0.0, *(np.array(whisker.breaks) / whisker.length), 1.0], s, cumulated)
-    counts = np.maximum(1, np.ceil(np.diff(edges) * steps - 1e-9)).astype(int)
+    ends = np.array([0.0, *(np.array(whisker.breaks) / whisker.length), 1.0])
+    edges = np.interp(ends, s, cumulated)
+    # A short, steep piece of a rod with kinks would have too few.
+    steep = np.abs(np.diff(np.log(density))) / _TAPER_EXPONENT
+    steep[np.searchsorted(middle, ends[1:-1] * whisker.length) - 1] = 0.0  # where it jumps, perhaps
+    changes = np.diff(np.interp(ends * whisker.length, middle[1:], np.cumsum(steep)))
+    shares = np.maximum(np.diff(edges), changes * _STEPS_PER_CHANGE / STEPS)
+    counts = np.maximum(1, np.ceil(shares * steps - 1e-9)).astype(int)
     pieces = [
         np.interp(np.linspace(a, b, n + 1)[:-1], cumulated, s)
         for a, b, n in zip(edges[:-1], edges[1:], counts, strict=True)

@@ -141,6 +141,7 @@ def test_an_independent_check_confirms_boxes_and_no_others(theorem, tmp_path, mo
     assert not check_certificate(forged, 0).covers
 
 
+@pytest.mark.slow
 def test_an_independent_check_of_a_curved_whisker(curved, tmp_path, monkeypatch):
     path, certificate = tmp_path / "curved.nc", prepared(curved, np.deg2rad(2.0))
     certificate.pursue("rest", 10**4)
@@ -197,6 +198,7 @@ def test_a_certificate_is_made_and_shown_by_commands(theorem, tmp_path):
     assert "0 undecided" in shown.output
 
 
+@pytest.mark.slow
 def test_witnesses_are_proved_and_other_pairs_are_not(curved):
     found = vb.uniqueness(curved, ["FT FD MB"], ["all"], samples=64, resolution=False)
     found = vb.identifiability.with_proved_witnesses(curved, found.isel(witness=[0]))

@@ -3,6 +3,7 @@
 import csv
 
 import numpy as np
+import pytest
 from typer.testing import CliRunner
 
 import vibrissa as vb
@@ -27,6 +28,7 @@ def trial(path, peg):
     save_recording(path, measure(simulate(whisker, motion, peg)))
 
 
+@pytest.mark.slow
 def test_a_folder_is_done_once_and_summarised(tmp_path):
     near = Peg([9e-3, 2.6e-3, 0.0], [0.0, 0.0, 1.0], 0.5e-3)
     trial(tmp_path / "touch.nc", near)

@@ -160,6 +160,7 @@ def test_estimate_without_a_map_simulates_one_and_says_so(folder, table):
     assert load_contacts(folder / "other.csv").sizes["time"] == 4
 
 
+@pytest.mark.slow
 def test_demo_writes_and_reports(folder):
     out = folder / "demo"
     text = run("demo", "--output", out, "--no-tracking", "--duration", 0.4, "--rate", 250)

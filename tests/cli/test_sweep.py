@@ -83,6 +83,7 @@ def test_done_shown_and_not_done_again(study, tmp_path):
     assert status.sel(task="uniqueness").values.tolist() == [-1, -1, 1]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_stops_and_says_how_to_go_on(study, tmp_path):
     study.write_text(STUDY.replace("taper_ratio = [5, 15]", f"length = {list(range(20, 60))}"))

@@ -119,6 +119,7 @@ def test_bad_compliance_is_refused(gamma_map, sigma):
         gamma_map.estimate(signals, noise=NOISE, compliance_sigma=-sigma)
 
 
+@pytest.mark.slow
 def test_a_gain_that_forgets_itself(gamma_map):
     """The stiffness wanders by 3 % within 20 ms; what the filter states holds what it states."""
     whisker, rng = gamma_map.whisker, np.random.default_rng(8)

@@ -131,6 +131,7 @@ def test_candidates_have_everything(gamma_map, rng):
         np.testing.assert_allclose(again.arc_length, s, atol=1e-5 * gamma_map.whisker.length)
 
 
+@pytest.mark.slow
 def test_linear_is_where_the_prediction_holds(gamma_map, rng):
     """Monte Carlo: flagged linear, the scatter is as predicted; elsewhere it mostly is not."""
     bent = touched(gamma_map, 40, rng, least=0.1)

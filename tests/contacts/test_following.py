@@ -89,6 +89,7 @@ def swaying(whisker, point, time):
     return turn, base, np.concatenate([bent.force, bent.moment], axis=1)
 
 
+@pytest.mark.slow
 def test_two_moments_and_a_moving_base_locate_a_contact(wire):
     time, point = np.arange(0.0, 0.6, 0.005), np.array([0.18, 0.03, 0.01])
     turn, base, wrench = swaying(wire.whisker, point, time)

@@ -89,6 +89,7 @@ def nitinol_like(name):
     return vb.ContactMap.simulate(rod(name), grid=False, cells=(2, 4, 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gravity", [(0, 0, -G), (-G, 0, 0), (-0.5 * G, 0.5 * G, -0.7 * G)])
 def test_errors_are_those_of_the_same_rod_without_weight(nitinol, gravity):
     whisker = nitinol.whisker
@@ -156,6 +157,7 @@ def inside(found, truth):
     return (np.einsum("ni,nij,nj->n", away, inverse, away) < 7.81).mean()
 
 
+@pytest.mark.slow
 def test_weight_friction_and_an_uncertain_base_are_found_together(nitinol):
     whisker, rng, level = nitinol.whisker, np.random.default_rng(21), (0.0, 0.0, -G)
     noise, sigma = covariance(whisker), whisker.length / (30.0 * whisker.base_bending_stiffness)

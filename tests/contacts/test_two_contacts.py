@@ -106,6 +106,7 @@ def test_false_alarms_are_as_rare_as_stated(whisker, friction, rubbing):
         assert (found.one_contact < 0.001).sum() <= 2
 
 
+@pytest.mark.slow
 def test_the_shape_shows_a_second_contact_that_the_wrench_hides(whisker):
     force, moment, line = touched(whisker, 0.2)
     blind = vb.second_contact(whisker, force, moment, noise=NOISE)

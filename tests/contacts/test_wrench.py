@@ -70,6 +70,7 @@ def test_without_friction_the_friction_angle_is_zero(rng):
     assert np.abs(found.friction_angle).max() < 1e-7
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not REAL.is_dir(), reason="needs the digitised real whiskers")
 def test_every_real_whisker(rng):
     files = sorted(REAL.glob("[0-9]*.csv"))

@@ -69,6 +69,7 @@ def test_exact_points_give_the_cylinder_back(seed, normals, known):
 
 
 # Without normals a bias that grows with the square of the noise is left.
+@pytest.mark.slow
 @pytest.mark.parametrize(("normals", "along"), [(False, (4e-6, 2e-5)), (True, (1e-5, 6e-5))])
 def test_uncertainty_is_what_it_says(normals, along):
     """Over many noisy trials errors have the spread that the covariance gives, and no bias."""

@@ -44,6 +44,7 @@ def _contacts(joint_errors, seed, n):
     return points, known | {"normals": normal + moved[:, 3:]}
 
 
+@pytest.mark.slow
 def test_it_is_as_sure_as_it_says(contacts):
     """Where contacts are, errors have the spread that it claims, and are smaller than theirs."""
     there, _ = ellipsoid(np.random.default_rng(99), 200, 0.35)

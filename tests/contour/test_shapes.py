@@ -65,6 +65,7 @@ def scores(kind, fit):
     return out + list((fit.origin - CENTER) / np.sqrt(np.diag(fit.covariance)[:3]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["cylinder", "sphere", "plane"])
 def test_no_bias_and_an_honest_spread(kind, joint_errors):
     """Over thirty draws errors are as large as the covariance says, and have no bias."""

@@ -207,6 +207,7 @@ def test_a_report_of_the_trial_has_the_same_errors(from_video, folder, sections)
             assert f">{shown_value('centerline', length, 3)}</td>" in text
 
 
+@pytest.mark.slow
 def test_what_tests_no_whisker_says_so_wherever_it_is_shown(folder, sections, tmp_path):
     """Signals that the model made agree with the model: in the report, and when reconstructed."""
     said = caution("contact point")
@@ -259,6 +260,7 @@ def test_the_command_reports_every_stage_from_video(from_video, folder, tmp_path
     assert "cylinder" in run("reconstruct", folder / "tracked.nc", "-o", tmp_path / "contour.nc")
 
 
+@pytest.mark.slow
 def test_what_was_done_is_not_done_again(from_video, folder, monkeypatch):
     names = {file.name for file in from_video.files}
     assert {"top.mp4", "front.mp4", "simulated.nc", "tracked.nc", "trial.nc", "seen.nc"} <= names

@@ -6,6 +6,7 @@ import pytest
 from vibrissa.identifiability import critical_cones
 
 
+@pytest.mark.slow
 def test_taper_and_straightness_narrow_the_cone():
     found = critical_cones([0.0, 0.4, 0.8], [2.0, 15.0], ["Fx MB MD"], samples=128)
     cone = np.rad2deg(found.critical_cone.sel(triplet="Fx MB MD"))

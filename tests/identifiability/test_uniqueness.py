@@ -190,6 +190,7 @@ def test_the_cone_of_a_strongly_curved_whisker(strongly_curved):
     assert (wider.verdict == "unique").all()
 
 
+@pytest.mark.slow
 def test_twice_the_samples_change_no_verdict_of_a_planar_whisker(of_curved, curved):
     twice = vb.uniqueness(curved, list(PAPER), samples=1024, resolution=False)
     once = of_curved.sel(triplet=list(PAPER))
@@ -197,6 +198,7 @@ def test_twice_the_samples_change_no_verdict_of_a_planar_whisker(of_curved, curv
     np.testing.assert_array_equal(once.notation, twice.notation)
 
 
+@pytest.mark.slow
 def test_twice_the_samples_change_no_verdict(gamma_map):
     triplets = ["Fx MB MD", "Fx FD MB"]
     once, twice = (
@@ -206,6 +208,7 @@ def test_twice_the_samples_change_no_verdict(gamma_map):
     np.testing.assert_array_equal(once.notation, twice.notation)
 
 
+@pytest.mark.slow
 def test_critical_cones_do_not_depend_on_the_seed(gamma_map):
     asked = ["Fx MB MD", "Fx FD MD", "FT MB MD"]
     cones = [
@@ -238,6 +241,7 @@ def test_a_rare_pair_within_one_region_is_found(gamma_map):
     assert np.degrees(found.critical_cone.item()) > 40.0
 
 
+@pytest.mark.slow
 def test_verdicts_do_not_hang_on_stiffness_or_size(of_curved):
     # Forces 145 and moments 58 times as small, lengths 2.5 times as large: nothing cancels.
     other = vb.Whisker.parabola(40e-3, 10.0, youngs_modulus=1e9, base_radius=60e-6)
@@ -406,6 +410,7 @@ def test_what_only_coarse_steps_make_equal_is_no_witness():
     assert float(found.critical_cone.max()) < np.deg2rad(1.5)
 
 
+@pytest.mark.slow
 def test_the_plane_of_a_whisker_may_be_turned(of_curved):
     planar = vb.samples.curved()
     turn = 0.7

@@ -161,6 +161,7 @@ def test_a_file_system_of_a_few_kilobytes(tmp_path, trial):
     check([[*row[:3], [name for name in row[3] if name != "filler"]] for row in rows], small)
 
 
+@pytest.mark.slow
 def test_every_verb_ends_in_one_line(tmp_path):
     """Each works first, and then cannot do the same again."""
     rows = run(VERBS, tmp_path)

@@ -29,6 +29,7 @@ def signals_of(drawn):
     return dict(zip(SIGNALS, drawn.signals.T, strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["lookup", "lookup-linear"])
 def test_between_grid_points_the_table_is_near_the_truth(contacts, drawn, method):
     found = estimate(contacts, signals_of(drawn), CANONICAL, method=method)

@@ -467,6 +467,7 @@ def test_movies_are_embedded_as_far_as_there_is_room(tmp_path):
     assert base64.b64decode(data) == small.read_bytes()
 
 
+@pytest.mark.slow
 def test_movies_are_made_and_put_into_the_page(folder, tmp_path, monkeypatch):
     """Of two frames; what is drawn in them is tested with the movies."""
     recording = load_recording(folder / "trial.nc")

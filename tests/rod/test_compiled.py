@@ -160,6 +160,7 @@ def square(tmp_path):
     return call, folder
 
 
+@pytest.mark.slow
 def test_kernels_are_known_by_what_their_files_contain(square, tmp_path):
     """A file that was copied or checked out anew has another time, and the same kernels."""
     call, _ = square
@@ -171,6 +172,7 @@ def test_kernels_are_known_by_what_their_files_contain(square, tmp_path):
     assert call().stdout == "0\n"
 
 
+@pytest.mark.slow
 def test_a_damaged_cache_counts_as_none(square):
     call, folder = square
     assert call().stdout == "0\n"

@@ -316,6 +316,7 @@ def test_prior_uncertainty_decides_what_moves(wire, touched):
         fit_stiffness(*given, modulus_sigma=np.inf, radius_sigma=np.inf)
 
 
+@pytest.mark.slow
 def test_taper_is_found_where_contacts_lie_at_several_places(wire, touched):
     sensor = Sensor(noise=np.repeat([1e-3, 1e-4], 3))
     true = wire.with_properties(base_radius=wire.base_radius, tip_radius=0.35e-3)

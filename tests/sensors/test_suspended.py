@@ -265,6 +265,7 @@ def test_with_many_touches_a_process_takes_what_the_rod_leaves():
     np.testing.assert_array_equal(found.sensor.drift, [1.0, 2.0, 3.0])
 
 
+@pytest.mark.slow
 def test_the_pose_is_free_where_the_base_is_not_where_it_is_stated():
     """Chosen by regions that are left out; the readings elsewhere are then predicted better."""
     at = points(110)

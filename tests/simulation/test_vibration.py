@@ -102,6 +102,7 @@ def test_ringing_gives_mass_resonances_and_damping(whisker, past_peg):
     assert (np.abs(away[:2]) < 3.0 * deviation[:2]).all()
 
 
+@pytest.mark.slow
 def test_a_recording_states_its_own_dynamics_and_its_contacts(past_peg, tmp_path):
     trial = past_peg.isel(time=slice(20, None))
     vb.io.save_recording(path := tmp_path / "trial.nc", trial)

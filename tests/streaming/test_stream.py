@@ -650,6 +650,7 @@ def bag_messages(path):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize("name", ["SIGHUP", "SIGKILL"])
 def test_a_bag_is_whole_however_the_stream_ends(map_file, wrench, tmp_path, name):

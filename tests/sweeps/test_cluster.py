@@ -83,6 +83,7 @@ def scheduler(tmp_path):
             process.wait()
 
 
+@pytest.mark.slow
 def test_a_local_cluster_gives_the_same_and_a_cell_that_kills_fails_alone(study, tmp_path):
     run_sweep(study, tmp_path / "here", workers=0)
     bad = Specimen("bad", {}, "bad", partial(signal.raise_signal, signal.SIGKILL))
@@ -97,6 +98,7 @@ def test_a_local_cluster_gives_the_same_and_a_cell_that_kills_fails_alone(study,
     xr.testing.assert_identical(found.load().drop_attrs(), here.load().drop_attrs())
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_is_killed_ends_the_run_and_the_next_goes_on(
     study, scheduler, tmp_path, monkeypatch
 ):

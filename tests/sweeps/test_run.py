@@ -93,6 +93,7 @@ def numbers(found: xr.Dataset, task: str) -> int:
     return sum(found[name].size for name in found if str(name).startswith(f"{task}_"))
 
 
+@pytest.mark.slow
 def test_processes_give_the_same_to_the_bit_whatever_kills_them(spoilt, done, tmp_path):
     # One whisker kills its process, and somebody kills another.
     told = []
@@ -137,6 +138,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_a_client_that_is_killed_leaves_a_store_that_is_gone_on_with(quick, done, tmp_path):
     (tmp_path / "run.py").write_text(RUN)
     (tmp_path / "study.toml").write_text(QUICK)
@@ -214,6 +216,7 @@ resolution = false
     assert numbers(found, "others") == 2 * TASKS[kind].numbers(settings)
 
 
+@pytest.mark.slow
 def test_certificates_are_tasks_that_go_on_from_their_files(tmp_path):
     text = QUICK.replace("[5, 15, 30]", "[1, 15]").replace("curvature = 0.4", "curvature = 0.0")
     settings = f'kind = "certificate"\nfolder = "{(tmp_path / "kept").as_posix()}"'

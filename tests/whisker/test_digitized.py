@@ -102,6 +102,7 @@ angles = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
 shifts = st.tuples(*[st.floats(-0.2, 0.2)] * 3)
 
 
+@pytest.mark.slow
 @settings(max_examples=15)
 @given(angles, shifts, st.booleans())
 def test_any_frame_gives_the_same_whisker(euler, shift, noisy):
@@ -236,6 +237,7 @@ def test_points_out_of_order(n, true):
             Whisker.from_points(disordered)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not REAL, reason="no digitised whiskers beside the repository")
 def test_real_whiskers_load():
     assert len(REAL) == 28

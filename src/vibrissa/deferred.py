@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import xarray as xr
-    from scipy import interpolate, ndimage, optimize, signal, spatial, stats
+    from scipy import interpolate, linalg, ndimage, optimize, signal, spatial, special, stats
     from scipy.sparse import linalg as sparse_linalg
     from scipy.spatial import transform
 else:
@@ -26,20 +26,24 @@ else:
             return getattr(import_module(self._name), attribute)
 
     xr = _Deferred("xarray")
-    interpolate, ndimage, optimize, signal, spatial, stats = (
-        _Deferred(f"scipy.{name}")
-        for name in ("interpolate", "ndimage", "optimize", "signal", "spatial", "stats")
+    interpolate, linalg, ndimage, optimize = (
+        _Deferred(f"scipy.{name}") for name in ("interpolate", "linalg", "ndimage", "optimize")
+    )
+    signal, spatial, special, stats = (
+        _Deferred(f"scipy.{name}") for name in ("signal", "spatial", "special", "stats")
     )
     sparse_linalg = _Deferred("scipy.sparse.linalg")
     transform = _Deferred("scipy.spatial.transform")
 
 __all__ = [
     "interpolate",
+    "linalg",
     "ndimage",
     "optimize",
     "signal",
     "sparse_linalg",
     "spatial",
+    "special",
     "stats",
     "transform",
     "xr",

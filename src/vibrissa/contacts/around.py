@@ -18,10 +18,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import chdtri
 
 from vibrissa.contacts.channels import WRENCH
-from vibrissa.contacts.noise import Noise, SensorNoise
+from vibrissa.contacts.noise import Noise, SensorNoise, explained
 from vibrissa.contacts.wrench import wrench_weights
 from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array
@@ -42,8 +41,6 @@ _DONE = 1e-2
 _FINE = 96
 # Between nodes, where an arc may begin, the whisker is along the object to this, over L.
 _BETWEEN = 5e-5
-# What is misfit by chance only once in a thousand times is not explained.
-_LIMIT = float(chdtri(3, 1e-3))
 
 
 def estimate_around(
@@ -143,8 +140,9 @@ def estimate_around(
         s = found.contacts()[0]
         out["arc_length"][i], out["last_arc_length"][i] = arc * d.length, s[-1] * d.length
         out["contacts"][i], out["chi_squared"][i] = s.size, chi_squared
-        explained = chi_squared <= _LIMIT
-        out["status"][i] = int(Status.OK if explained else Status.NOT_FRICTIONLESS)
+        out["status"][i] = int(
+            Status.OK if chi_squared <= explained(3) else Status.NOT_FRICTIONLESS
+        )
     return _labelled(out, shape, dims, coords)
 
 

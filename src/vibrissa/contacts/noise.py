@@ -20,13 +20,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
+from statistics import NormalDist
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import chdtri
 
-from vibrissa.deferred import xr
+from vibrissa.deferred import special, xr
 from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
 from vibrissa.sensors import Sensor
@@ -41,7 +41,7 @@ _SINGULAR = 1e-10
 # A measurement is explained if a perfect model would fit worse in one of a thousand.
 _RARE = 1e-3
 #: Contacts whose χ² differ by less are indistinguishable (the odds are below 200 to 1).
-INDISTINCT = float(chdtri(1, _RARE))
+INDISTINCT = NormalDist().inv_cdf(1.0 - 0.5 * _RARE) ** 2
 #: Standard deviation of each signal, or covariance (6, 6) of (F, M), SI units.
 Noise: TypeAlias = Mapping[str, float] | ArrayLike
 
@@ -310,4 +310,4 @@ def rank(covariance: Array) -> int:
 @cache
 def explained(degrees: int) -> float:
     """Largest χ² of a measurement that counts as explained, for so many degrees of freedom."""
-    return float(chdtri(max(degrees, 1), _RARE))
+    return INDISTINCT if degrees <= 1 else float(special.chdtri(degrees, _RARE))

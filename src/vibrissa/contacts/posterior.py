@@ -24,7 +24,6 @@ import math
 from itertools import product
 
 import numpy as np
-from scipy.special import gammainc
 
 from vibrissa.contacts.expansion import (
     Expansion,
@@ -74,6 +73,13 @@ _RADII = 5
 NORMAL_KURTOSIS = 15.0
 
 
+def _within(radius: float) -> tuple[float, float]:
+    """Probability within a radius of normal distributions of three and of five coordinates."""
+    density = math.sqrt(2.0 / math.pi) * math.exp(-0.5 * radius**2)
+    three = math.erf(radius / math.sqrt(2.0)) - radius * density
+    return three, three - radius**3 * density / 3.0
+
+
 def _along_rays() -> tuple[Array, Array, Array, Array]:
     """Nodes ±u on rays, of which u (3, n / 2); their weights, those of rays, and what is beyond.
 
@@ -85,12 +91,13 @@ def _along_rays() -> tuple[Array, Array, Array, Array]:
     rays = np.concatenate([np.eye(3), corners / math.sqrt(3.0)])
     share = np.repeat([1.0 / 15.0, 3.0 / 40.0], [3, 4])
     square = np.arange(_RADII + 1.0) ** 2
-    below = gammainc([[1.5], [2.5]], 0.5 * np.append(square[:-1], np.inf))
+    inner = np.array([_within(radius) for radius in range(_RADII)])
+    below = np.append(inner, [[1.0, 1.0]], axis=0).T
     mass, moment = np.diff(below) * [[1.0], [3.0]]
     outer = (moment - square[:-1] * mass) / np.diff(square)
     by_radius = outer + np.append((mass - outer)[1:], 0.0)
     nodes = rays.T[:, :, None] * np.arange(1.0, _RADII + 1.0)
-    beyond = np.asarray(1.0 - gammainc(1.5, 0.5 * square))
+    beyond = 1.0 - np.array([_within(radius)[0] for radius in range(_RADII + 1)])
     weights = np.outer(share, by_radius)
     return np.ascontiguousarray(nodes.reshape(3, -1)), weights.reshape(-1), share, beyond
 

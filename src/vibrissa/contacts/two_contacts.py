@@ -24,13 +24,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import chdtrc, chdtri
 
 from vibrissa.contacts.channels import WRENCH
 from vibrissa.contacts.least_squares import Fits, fit
 from vibrissa.contacts.noise import Noise, SensorNoise, common_errors
 from vibrissa.contacts.wrench import PROXIMAL, estimate_components, wrench_weights
-from vibrissa.deferred import xr
+from vibrissa.deferred import special, xr
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.quantities import attributes
 from vibrissa.rod import Discretization, discretize
@@ -45,8 +44,8 @@ FALSE_ALARMS = 0.01
 _STEPS = 24
 # Rows that are integrated together: some tens of MB.
 _TOGETHER = 2000
-# Fits to a wrench of larger χ² (one in five) begin elsewhere too, at these arc lengths.
-_DOUBTFUL, _ELSEWHERE = float(chdtri(3, 0.2)), (0.25, 0.45, 0.65, 0.85, 0.97)
+# Fits to a wrench of a χ² that this share exceeds begin elsewhere too, at these arc lengths.
+_DOUBTFUL, _ELSEWHERE = 0.2, (0.25, 0.45, 0.65, 0.85, 0.97)
 # Arc lengths of the second force, relative to it the share of the first that is expected, and how
 # many standard deviations that must move the measurement.
 _PLACES = np.linspace(0.15, 1.0, 12)
@@ -278,7 +277,7 @@ def second_contact(
     if rows.size:
         chi_squared[rows], degrees[rows], points[rows] = test(wrench[rows], lines)
     with np.errstate(invalid="ignore"):
-        probability = chdtrc(np.maximum(degrees, 1), chi_squared)
+        probability = special.chdtrc(np.maximum(degrees, 1), chi_squared)
 
     def whole(values: AnyArray) -> AnyArray:
         return values.reshape((*f.shape[:-1], *values.shape[1:]))
@@ -346,7 +345,7 @@ class _Test:
         row, place = np.nonzero(np.isfinite(arc))
         seeds = np.column_stack([arc[row, place] / self.d.length, force[row, place] / self.d.force])
         best = self._best(len(flat), row, self._fit(flat[row], weights[row], seeds))
-        again = np.flatnonzero(~(best.misfits < _DOUBTFUL))
+        again = np.flatnonzero(~(best.misfits < special.chdtri(3, _DOUBTFUL)))
         if again.size:
             more = np.repeat(again, len(_ELSEWHERE))
             starts = np.tile(_ELSEWHERE, again.size)

@@ -24,7 +24,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.deferred import interpolate
 from vibrissa.numerics import AnyArray, Array, inlined, kernel
 from vibrissa.rod.discretization import STEPS, Bendable, Discretization, discretize
 from vibrissa.rod.integration import solve_forces
@@ -307,11 +306,32 @@ def _least(function: Callable[[Array], Array], x: Array, y: Array) -> tuple[Arra
 def _log_fold(eta: Array, bearings: Array, force: Array) -> Array:
     """Ln f* with its derivatives (value, s, ψ, sψ) at the nodes, from splines periodic in ψ."""
     values = np.log(np.concatenate([force, force[:, :1]], axis=1))
-    around = interpolate.CubicSpline(bearings, values, axis=1, bc_type="periodic")
-    in_psi = around(bearings, 1)
-    in_s = interpolate.CubicSpline(eta, values, axis=0)(eta, 1)
-    in_both = interpolate.CubicSpline(eta, in_psi, axis=0)(eta, 1)
+    in_psi = _slopes(bearings, values.T, periodic=True).T
+    in_s, in_both = _slopes(eta, values), _slopes(eta, in_psi)
     return np.ascontiguousarray(np.stack([values, in_s, in_psi, in_both], axis=-1))
+
+
+def _slopes(x: Array, values: Array, periodic: bool = False) -> Array:
+    """Slopes of the cubic spline through values (n, m) at x, periodic or not-a-knot.
+
+    SciPy's `CubicSpline` gives the same; to import it takes longer than to solve for a contact.
+    """
+    h, secants = np.diff(x), np.diff(values, axis=0) / np.diff(x)[:, None]
+    i = np.arange(0 if periodic else 1, len(h))
+    size = len(h) if periodic else len(x)
+    system, right = np.zeros((size, size)), np.zeros((size, values.shape[1]))
+    system[i, i - 1], system[i, (i + 1) % size] = h[i], h[i - 1]
+    system[i, i] = 2.0 * (h[i - 1] + h[i])
+    right[i] = 3.0 * (h[i, None] * secants[i - 1] + h[i - 1, None] * secants[i])
+    if periodic:
+        slopes = np.asarray(np.linalg.solve(system, right), dtype=np.float64)
+        return np.concatenate([slopes, slopes[:1]])
+    for end, next_ in ((0, 1), (-1, -2)):
+        near, far = h[end], h[next_]
+        share = near / (near + far)
+        system[end, [end, next_]] = far, near + far
+        right[end] = far * (2.0 + share) * secants[end] + near * share * secants[next_]
+    return np.asarray(np.linalg.solve(system, right))
 
 
 def _expand(log_fold: Array) -> tuple[Array, Array, Array]:

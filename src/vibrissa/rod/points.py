@@ -9,7 +9,7 @@ all starts, and the contact of least force that is reached is the answer.
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -293,17 +293,21 @@ class PointSolver:
         self.chart = chart
         points = np.ascontiguousarray(chart.values[..., 3:])
         self._tree = search_tree(chart, points, chart.tangents[..., 3:, :], (False, False, False))
-        # Paths start short of the fold, where there is room to move.
-        inner = points[:, :-1, :-1].reshape(-1, 3)
-        held = np.isfinite(inner).all(axis=1)
-        self._contacts = chart.contacts[:, :-1, :-1].reshape(-1, 3)[held]
-        self._nearest = spatial.cKDTree(inner[held])
-        places, reasons = zip(*_faces(chart), strict=True)
-        self._faces = spatial.cKDTree(np.concatenate(places))
         self._resting = _at_rest(chart)
-        self._reasons = np.concatenate(
-            [np.full(len(p), int(r)) for p, r in zip(places, reasons, strict=True)]
-        )
+
+    @cached_property
+    def _inner(self) -> tuple[Array, spatial.cKDTree]:
+        """Contacts from which paths start, short of the fold to have room, by their points."""
+        points = self.chart.values[:, :-1, :-1, 3:].reshape(-1, 3)
+        held = np.isfinite(points).all(axis=1)
+        return self.chart.contacts[:, :-1, :-1].reshape(-1, 3)[held], spatial.cKDTree(points[held])
+
+    @cached_property
+    def _beyond(self) -> tuple[IntArray, spatial.cKDTree]:
+        """What lies beyond places on the chart's faces, by the places."""
+        places, reasons = zip(*_faces(self.chart), strict=True)
+        numbers = [np.full(len(p), int(r)) for p, r in zip(places, reasons, strict=True)]
+        return np.concatenate(numbers), spatial.cKDTree(np.concatenate(places))
 
     def solve(self, points: Array, device: str = "cpu") -> Solutions:
         """Find the contact of least force that holds the whisker at each point."""
@@ -354,11 +358,13 @@ class PointSolver:
         """Follow points from the nearest known contact where that may help; say why it fails."""
         if not rows.size:
             return
-        away, face = self._faces.query(points)
-        out.statuses[rows] = self._reasons[face]
+        reasons, faces = self._beyond
+        away, face = faces.query(points)
+        out.statuses[rows] = reasons[face]
         near = np.flatnonzero((away < _NEAR) | hopeful)
-        _, start = self._nearest.query(points[near])
-        out.put(rows[near], self._follow(self._contacts[start], points[near]))
+        contacts, inner = self._inner
+        _, start = inner.query(points[near])
+        out.put(rows[near], self._follow(contacts[start], points[near]))
         _drop_unanswered(out, rows)
 
     def _follow(self, starts: Array, points: Array) -> Solutions:

@@ -46,10 +46,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import eigh, qr, solve_triangular, svd
-from scipy.special import chdtri, fdtrc
 
-from vibrissa.deferred import interpolate
+from vibrissa.deferred import interpolate, linalg, special
 from vibrissa.numerics import Array
 from vibrissa.whisker.pose import Pose, least_turn
 from vibrissa.whisker.profile import Profile, approximate, constant
@@ -216,7 +214,7 @@ class _Line:
         """Whether the points are no farther from the line than noise puts them."""
         n = len(points)
         if noise is not None:
-            limit = chdtri(components * (n - 2), SIGNIFICANCE)
+            limit = special.chdtri(components * (n - 2), SIGNIFICANCE)
             return bool(self.rss <= noise**2 * limit)
         rss = float(np.sum(fit.residuals**2)) * unit**2
         left, spent = components * (n - fit.freedom), components * (fit.freedom - 2.0)
@@ -224,7 +222,7 @@ class _Line:
         if left <= 0.0 or rss <= 0.0 or self.noise(components) > STRAIGHT * self.extent:
             return False
         ratio = (self.rss - rss) / spent / (rss / left)
-        return bool(fdtrc(spent, left, ratio) > SIGNIFICANCE)
+        return bool(special.fdtrc(spent, left, ratio) > SIGNIFICANCE)
 
     def noise(self, components: int) -> float:
         """Standard deviation per coordinate of points about the line, m."""
@@ -467,14 +465,14 @@ def smooth(t: Array, points: Array, noise: float | None, components: int) -> Smo
     # are fewer points than sites.
     least = 1e-6 * n / (np.pi * min(n, SITES)) ** 6
     design = np.asarray(cardinal(t))
-    weights, axes = eigh(design.T @ design)
+    weights, axes = linalg.eigh(design.T @ design)
     shown_part = np.sqrt(np.clip(weights, 0.0, None))[:, np.newaxis] * axes.T
     rough_part = np.sqrt(least) * roughness
     # Modes that are orthogonal in both AᵀA and K. K itself is not formed: squared, the roughness of
     # a smooth curve would drown in the rounding of the rough ones.
-    basis, triangle = qr(np.vstack([shown_part, rough_part]), mode="economic")
-    _, rough, turned = svd(basis[SITES:], full_matrices=False)
-    modes = solve_triangular(triangle, turned.T)
+    basis, triangle = linalg.qr(np.vstack([shown_part, rough_part]), mode="economic")
+    _, rough, turned = linalg.svd(basis[SITES:], full_matrices=False)
+    modes = linalg.solve_triangular(triangle, turned.T)
     shown = design @ modes
     # The last three modes are parabolas, which have no roughness.
     rates = rough[:-3] ** 2 / least
@@ -516,4 +514,4 @@ def _cardinal() -> tuple[interpolate.BSpline, Array]:
     middles = 0.5 * (sites[1:] + sites[:-1])[:, np.newaxis]
     thirds = np.asarray(cardinal.derivative(3)((middles + halves * points).ravel()))
     rough = np.sqrt((halves * weights).ravel())[:, np.newaxis] * thirds
-    return cardinal, np.asarray(qr(rough, mode="r")[0][:SITES])
+    return cardinal, np.asarray(linalg.qr(rough, mode="r")[0][:SITES])

@@ -8,7 +8,6 @@ consists of: functions that kernels call are only translated (:class:`_Part`).
 
 from __future__ import annotations
 
-import copy as copying
 import gc
 from collections.abc import Callable
 from contextlib import suppress
@@ -23,7 +22,6 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, Flags
 from numba.core.compiler_machinery import AnalysisPass, register_pass
 from numba.core.registry import CPUDispatcher
-from numba.core.targetconfig import ConfigStack
 from numba.core.typed_passes import NopythonTypeInference
 
 from vibrissa.numerics.kernel_cache import PackageCache
@@ -106,23 +104,6 @@ class _Compact(_Whole):
                 function.add_function_attribute("optsize")
         super()._optimize_final_module()  # type: ignore[no-untyped-call]
 
-    def _get_module_for_linking(self) -> Any:
-        """Names alone, by which numba finds what is defined: nothing links this code."""
-        if self._shared_module is None:
-            module = self._final_module
-            functions = (f for f in module.functions if not f.is_declaration)
-            lines = [
-                f'define void @"{function.name}"() {{ ret void }}'
-                for function in functions
-                if function.linkage is Linkage.external
-            ] + [
-                f'@"{variable.name}" = common global i64 0'
-                for variable in module.global_variables
-                if variable.linkage is Linkage.common
-            ]
-            self._shared_module = parse_assembly("\n".join(lines))
-        return self._shared_module
-
 
 def _visit(libraries: list[JITCodeLibrary], found: dict[JITCodeLibrary, None]) -> None:
     for library in libraries:
@@ -177,51 +158,6 @@ _FORM = {"forceinline": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": T
 _HASH = hash(Flags())  # of the names of all options alone
 
 
-#: Passes for closures, `with`, computed exceptions and literal loops, which kernels do without.
-_UNUSED = {
-    "FindLiterallyCalls",
-    "InlineClosureLikes",
-    "InlineInlinables",
-    "InlineOverloads",
-    "LiteralPropagationSubPipelinePass",
-    "LiteralUnroll",
-    "MakeFunctionToJitFunction",
-    "RewriteDynamicRaises",
-    "WithLifting",
-}
-#: What built-in functions make of types, for one setting of fast arithmetic.
-_KNOWN: dict[Any, Any] = {}
-
-
-def _remembering(typing: Any) -> Any:
-    """Typing context that looks only once for what a built-in function makes of some types.
-
-    Numba tries up to fifty rules for each ``a + b``, and writes a message for each that fails.
-    """
-    find = typing.resolve_function_type
-
-    def resolve(function: Any, args: Any, kws: Any) -> Any:
-        of_type = isinstance(function, types.Type) and type(function) is not types.Function
-        if kws or of_type or not all(isinstance(kind, types.Type) for kind in args):
-            return find(function, args, kws)
-        exact = getattr(ConfigStack.top_or_none(), "fastmath", None)
-        # Numba keeps one implementation, of the last setting for which it was looked up.
-        if _KNOWN.get("exact") != exact:
-            _KNOWN.clear()
-            _KNOWN["exact"] = exact
-        key = function, *(kind._code for kind in args)
-        if key not in _KNOWN:
-            found = find(function, args, kws)
-            if found is None or not found.return_type.is_precise():
-                return found
-            _KNOWN[key] = found
-        return _KNOWN[key]
-
-    context = copying.copy(typing)
-    context.resolve_function_type = resolve
-    return context
-
-
 class _WholeCompiler(Compiler):
     """Numba's compiler, with such a library."""
 
@@ -233,9 +169,6 @@ class _WholeCompiler(Compiler):
         args, returned, flags, types_of_locals = rest
         flags = _Flags(flags)  # type: ignore[no-untyped-call]
         super().__init__(typing, target, library, args, returned, flags, types_of_locals)  # type: ignore[no-untyped-call]
-        # Numba would ask for its registries again wherever it tries one implementation of several.
-        self.state.targetctx.load_additional_registries = lambda: None
-        self.state.typingctx = _remembering(typing)
 
     def compile_extra(self, func: Any) -> Any:
         """Compile while cyclic garbage is looked for less often: else that is a sixth of all."""
@@ -247,9 +180,8 @@ class _WholeCompiler(Compiler):
             gc.set_threshold(young, *older)
 
     def define_pipelines(self) -> list[Any]:
-        """Decide about references when types are known; leave out what kernels have no use for."""
+        """Decide about references when types are known."""
         (manager,) = super().define_pipelines()  # type: ignore[no-untyped-call]
-        manager.passes = [step for step in manager.passes if step[0].__name__ not in _UNUSED]
         manager.add_pass_after(_Borrowing, NopythonTypeInference)
         manager.finalize()
         return [manager]
@@ -279,11 +211,6 @@ class _Kernel(CPUDispatcher):
 
 class _Inlined(CPUDispatcher):
     """What only kernels can call: wrappers for Python would be a third of all compiling."""
-
-    def compile(self, sig: Any) -> Any:
-        """Compile it, unless it is: numba's clocks are not needed to find that out."""
-        known: Any = self.overloads.get(sig)
-        return super().compile(sig) if known is None else known.entry_point
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Compile it once for all constants: where it is inlined, LLVM sees them."""

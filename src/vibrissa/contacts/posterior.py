@@ -60,6 +60,8 @@ LEFT, THREE_SIGMA, HELD = 0.0033, 14.156, 7.815
 # Where the second order misses so much, densities are not to be trusted: the first order gives the
 # weight of a candidate. A node's log density gains at most so much over the first order's.
 _BROKEN, _MOST_GAIN = 0.3, 3.0
+# Where it misses so much, the second order does not describe channels even roughly.
+_BENT = 1.0
 # With a smaller share of the nodes than this moments mean nothing.
 _TOO_FEW = 0.2
 # Steps by which a covariance is widened; and what is nothing among probabilities.
@@ -378,7 +380,7 @@ def judge(
         if straight or (missed > _BROKEN and first_order > 0.0 and not short):
             density = first_order
         weight[row] = math.log(density) - 0.5 * misfit if density > 0.0 else -np.inf
-        valid[row], described[row] = missed < _MISSED and fair, missed < _BROKEN
+        valid[row], described[row] = missed < _MISSED and fair, missed < _BENT
 
 
 @kernel

@@ -329,24 +329,29 @@ class _Events:
         if not np.isfinite(spread).all():  # noise is not known
             return True
         variance, axes = np.linalg.eigh(spread)
-        return _misfit_beyond(moved @ axes, variance, self._slip_speed * step) > _BEYOND_NOISE
+        known = variance > _NO_VARIANCE * variance[-1]
+        along = moved @ axes
+        if (along[known] ** 2 / variance[known]).sum() <= _BEYOND_NOISE:
+            return False
+        away = _beyond(along.tolist(), variance.tolist(), self._slip_speed * step)[known]
+        return bool((away**2 / variance[known]).sum() > _BEYOND_NOISE)
 
 
-def _misfit_beyond(moved: Array, variance: Array, reach: float) -> float:
-    """Least χ² of a displacement, along its axes, of which anything within a reach is sliding.
+def _beyond(moved: list[float], variance: list[float], reach: float) -> Array:
+    """What is left of a displacement, along its axes, of which a reach that it exceeds is sliding.
 
-    The part that slides is moved / (1 + λ variance), where λ makes it as long as the reach.
+    The part that slides is moved / (1 + λ variance), where λ makes it as long as the reach: that
+    leaves the least χ².
     """
-    size, low, high = math.hypot(*moved.tolist()), -40.0, 40.0
-    unit = reach / max(size, reach)
-    scaled = np.maximum(variance, 0.0) / max(float(variance[-1]), 1e-300)
+    largest = max(variance[-1], 1e-300)
+    parts = [(m, max(v, 0.0) / largest) for m, v in zip(moved, variance, strict=True)]
+    low, high, slid = -40.0, 40.0, moved
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
-        slid = moved / size / (1.0 + math.exp(middle) * scaled)
-        low, high = (middle, high) if slid @ slid > unit * unit else (low, middle)
-    away = moved - size * slid
-    known = scaled > _NO_VARIANCE
-    return float((away[known] ** 2 / variance[known]).sum())
+        factor = math.exp(middle)
+        slid = [m / (1.0 + factor * v) for m, v in parts]
+        low, high = (middle, high) if math.hypot(*slid) > reach else (low, middle)
+    return np.subtract(moved, slid)
 
 
 class ContactStreams:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from scipy.interpolate import CubicSpline
 
 import vibrissa as vb
 from vibrissa.rod import discretize, fold_forces, solve_forces, stable_set
@@ -332,3 +333,15 @@ def test_the_answer_is_the_same_every_time(gamma):
     first, second = (vb.deflect(gamma, vb.PointContact(points)) for _ in range(2))
     np.testing.assert_array_equal(first.force, second.force)
     np.testing.assert_array_equal(first.status, second.status)
+
+
+@pytest.mark.parametrize("cells", [(1, 2, 2), (2, 3, 2), (3, 4, 2), (8, 12, 2)])
+def test_the_fold_between_nodes_is_the_spline_through_them(gamma, cells):
+    """With few nodes, too, where not-a-knot splines are parabolas."""
+    chart = stable_set(gamma, cells=cells)
+    value, in_s, in_psi, in_both = np.moveaxis(chart.fold.log_force, -1, 0)
+    eta = np.linspace(0.0, 1.0, cells[0] + 1)
+    around = CubicSpline(chart.bearings, value, axis=1, bc_type="periodic")(chart.bearings, 1)
+    assert in_psi == pytest.approx(around, abs=1e-12)
+    assert in_s == pytest.approx(CubicSpline(eta, value)(eta, 1), abs=1e-12)
+    assert in_both == pytest.approx(CubicSpline(eta, around)(eta, 1), abs=1e-11)

@@ -316,12 +316,15 @@ def _slopes(x: Array, values: Array, periodic: bool = False) -> Array:
 
     SciPy's `CubicSpline` gives the same; to import it takes longer than to solve for a contact.
     """
+    if not periodic and len(x) < 4:  # a parabola, or a line
+        return np.asarray(np.gradient(values, x, axis=0, edge_order=2 if len(x) > 2 else 1))
     h, secants = np.diff(x), np.diff(values, axis=0) / np.diff(x)[:, None]
     i = np.arange(0 if periodic else 1, len(h))
     size = len(h) if periodic else len(x)
     system, right = np.zeros((size, size)), np.zeros((size, values.shape[1]))
-    system[i, i - 1], system[i, (i + 1) % size] = h[i], h[i - 1]
-    system[i, i] = 2.0 * (h[i - 1] + h[i])
+    system[i, i - 1] += h[i]
+    system[i, (i + 1) % size] += h[i - 1]  # the same as before, where there are two around
+    system[i, i] += 2.0 * (h[i - 1] + h[i])
     right[i] = 3.0 * (h[i, None] * secants[i - 1] + h[i - 1, None] * secants[i])
     if periodic:
         slopes = np.asarray(np.linalg.solve(system, right), dtype=np.float64)

@@ -15,11 +15,11 @@ from vibrissa.numerics import Array
 from vibrissa.objects import Peg
 from vibrissa.plots import key_frames
 from vibrissa.plots.contact_surfaces import coordinate_bar, levels
-from vibrissa.plots.objects import outline
 from vibrissa.plots.space import (
     bounds,
     drop_lines,
     name_axes,
+    outline,
     paint,
     painted,
     signal_axes,

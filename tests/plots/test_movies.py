@@ -17,8 +17,8 @@ from vibrissa.cli.figures import sights_of
 from vibrissa.cli.movie import FrameOptions
 from vibrissa.io import save_recording, video_frames, video_info, write_movie, write_video
 from vibrissa.plots import Sight, contour_frames, signal_frames
-from vibrissa.plots.cameras import Window, part_of
 from vibrissa.plots.movies import _SIDE_BOXES, _SIGHT_BOXES, HEIGHT, SIZE, WIDTH
+from vibrissa.plots.overview import Window, part_of
 from vibrissa.scene import course_of
 
 RED = np.array([232, 0, 11])

@@ -15,7 +15,7 @@ from vibrissa.cli.app import app
 from vibrissa.io import save_recording
 from vibrissa.objects import Peg, Plane, Sphere
 from vibrissa.plots import Sight, contact_places, key_frames, trial_overview
-from vibrissa.plots.objects import draw_body, draw_head, head_of, one_scale, room_for
+from vibrissa.plots.space import draw_body, draw_head, head_of, one_scale, room_for
 from vibrissa.plots.style import RED
 from vibrissa.scene import course_of, deflection_angles
 

@@ -3,14 +3,15 @@
 from vibrissa.contour.comparison import axis_offset as axis_offset, compare_with, distances_by
 from vibrissa.contour.drawing import Ellipsoids, ellipsoids, surface_grid
 from vibrissa.contour.fit import fit_shape
-from vibrissa.contour.fitted_shape import FittedShape, evidence_of as evidence_of
-from vibrissa.contour.free_surface import FreeFit, fit_free, shape_from_dataset
-from vibrissa.contour.simple_shapes import CylinderFit, PlaneFit, SphereFit
-from vibrissa.contour.touches import (
+from vibrissa.contour.fitted_shape import (
+    FittedShape,
     continuing_candidates,
     covariance_to_laboratory as covariance_to_laboratory,
+    evidence_of as evidence_of,
     to_laboratory as to_laboratory,
 )
+from vibrissa.contour.free_surface import FreeFit, fit_free, shape_from_dataset
+from vibrissa.contour.simple_shapes import CylinderFit, PlaneFit, SphereFit
 
 __all__ = [
     "CylinderFit",

@@ -36,7 +36,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtrc, chdtri, log_ndtr
 
-from vibrissa.contour.fitted_shape import excess_of
+from vibrissa.contour.fitted_shape import FLOOR, Checked, Touches, checked, excess_of, whitened
 from vibrissa.contour.simple_shapes import (
     SHAPES,
     CylinderFit,
@@ -45,7 +45,6 @@ from vibrissa.contour.simple_shapes import (
     SphereFit,
     frame_across,
 )
-from vibrissa.contour.touches import FLOOR, Checked, Touches, checked, whitened
 from vibrissa.deferred import optimize
 from vibrissa.numerics import Array
 

@@ -58,9 +58,16 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import cho_solve, solve_triangular
 
 from vibrissa.contour.fit import TO_SIGMA, fit_shape
-from vibrissa.contour.fitted_shape import FittedShape, check_complete, excess_of, rows_of
+from vibrissa.contour.fitted_shape import (
+    FLOOR,
+    ContactArrays,
+    FittedShape,
+    check_complete,
+    checked,
+    excess_of,
+    rows_of,
+)
 from vibrissa.contour.simple_shapes import SHAPES, SimpleShape, frame_across
-from vibrissa.contour.touches import FLOOR, ContactArrays, checked
 from vibrissa.deferred import spatial
 from vibrissa.numerics import Array, Mask
 from vibrissa.quantities import attributes

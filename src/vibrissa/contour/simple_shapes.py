@@ -23,8 +23,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.contour.fitted_shape import DIRECTION, FittedShape
-from vibrissa.contour.touches import FLOOR, Checked, Touches
+from vibrissa.contour.fitted_shape import DIRECTION, FLOOR, Checked, FittedShape, Touches
 from vibrissa.numerics import Array
 
 _SMALLEST = 1e-3

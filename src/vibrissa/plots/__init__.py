@@ -1,12 +1,16 @@
 """Datasets and arrays to figures, one function each; nothing is solved here."""
 
 from vibrissa.plots.array import array_views
-from vibrissa.plots.cameras import Sight as Sight, start_views as start_views
 from vibrissa.plots.contact_surfaces import contact_surfaces, solid_slices
 from vibrissa.plots.contacts import contact_places, estimated_against_true
 from vibrissa.plots.contour import contour_views, distances_by_class
 from vibrissa.plots.movies import contour_frames, signal_frames
-from vibrissa.plots.overview import key_frames as key_frames, trial_overview
+from vibrissa.plots.overview import (
+    Sight as Sight,
+    key_frames as key_frames,
+    start_views as start_views,
+    trial_overview,
+)
 from vibrissa.plots.sensitivity import sensitivity_panels
 from vibrissa.plots.signals import signal_clouds, signals_over_time as signals_over_time
 from vibrissa.plots.style import (

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from vibrissa.numerics import Array
 from vibrissa.plots import style
-from vibrissa.plots.objects import Body, draw_body, draw_head, head_of, one_scale
+from vibrissa.plots.space import Body, draw_body, draw_head, head_of, one_scale
 from vibrissa.plots.style import (
     MUTED,
     SMALL,

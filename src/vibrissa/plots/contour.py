@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from vibrissa.numerics import Array
 from vibrissa.plots import style
-from vibrissa.plots.objects import (
+from vibrissa.plots.space import (
     BAND,
     Body,
     draw_body,

@@ -24,14 +24,26 @@ from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.numerics import Array, spherical
 from vibrissa.plots import style
-from vibrissa.plots.cameras import Sight, Window, part_of, scale_bar, seen, sight_axes
 from vibrissa.plots.contact_surfaces import course_scales, solid_panels
-from vibrissa.plots.objects import Body, one_scale, outline_segments, room_for
-from vibrissa.plots.overview import Curve, curve_legend, curves_over_time
+from vibrissa.plots.overview import (
+    Curve,
+    Sight,
+    Window,
+    curve_legend,
+    curves_over_time,
+    part_of,
+    scale_bar,
+    seen,
+    sight_axes,
+)
 from vibrissa.plots.space import (
+    Body,
     bounds,
     coloured_segments,
     name_axes,
+    one_scale,
+    outline_segments,
+    room_for,
     signal_places,
     space_axes,
 )

@@ -4,22 +4,26 @@ Matplotlib's 3D axes carry no types, hence ``Any``. Surfaces are painted as pixe
 that files stay small. The space of (F_x, M_B, M_D) is a cylinder: M_B is the distance from
 the axis, M_D the angle about it, and F_x the height. M_B and F_x are drawn on square-root scales,
 as most contacts are light, and in parallel projection, so that heights can be read off the axis.
+
+Objects and a rat's head as they are seen from a side: silhouettes and sections.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
 from numpy.typing import ArrayLike
 
 from vibrissa.numerics import Array
-from vibrissa.plots.style import INK, MUTED, PLAIN, SMALL, Box, box_axes
+from vibrissa.plots.style import INK, MUTED, ORANGE, PLAIN, SMALL, Box, box_axes
 from vibrissa.quantities import axis_label, quantity, to_display
-from vibrissa.scene import root, values_of
+from vibrissa.scene import Course, head_surfaces, root, values_of
 
 ELEVATION, AZIMUTH = 24.0, -58.0
 """Default direction of view, degrees."""
@@ -240,3 +244,278 @@ def _round_squares(low: float, high: float) -> list[float]:
     return sorted(
         [0.0, *(m for m in marks if low <= np.sign(m) * np.sqrt(abs(m)) <= high)], key=abs
     )
+
+
+_CELLS, _COARSE = 121, 4
+_FULL = 0.97
+"""Share of a panel from which an object is taken to fill it, beyond which drawing it has no use."""
+
+
+class Body(Protocol):
+    """An object in the laboratory, m."""
+
+    def signed_distance(self, points: ArrayLike) -> Array:
+        """Distances (...) of points (..., 3) from its surface, negative inside."""
+
+
+def draw_body(axes: Axes, body: Body, view: tuple[int, int], limits: Array, look: str) -> None:
+    """Draw the outline of an object, or rather of what of it lies within limits."""
+    right, up, nearest = _shadow(body, view, limits)
+    if 0.0 < np.mean(nearest < 0.0) < _FULL:
+        _draw_zero(axes, right, up, nearest, look)
+
+
+def outline_segments(body: Body, view: tuple[int, int], limits: Array) -> Array:
+    """Segments (n, 2, 2), mm, of the outline of an object within limits."""
+    from contourpy import contour_generator
+
+    lines: Any = contour_generator(*_shadow(body, view, limits)).lines(0.0)
+    pieces = [np.stack([line[:-1], line[1:]], axis=1) for line in lines]
+    return np.concatenate([np.empty((0, 2, 2)), *pieces])
+
+
+def _shadow(body: Body, view: tuple[int, int], limits: Array) -> tuple[Array, Array, Array]:
+    """Least distance from a body, mm, over a grid of lines of sight, and the grid's axes."""
+    i, j = view
+    right, up = (np.linspace(limits[n, 0], limits[n, 1], _CELLS) for n in view)
+    points: Array = np.zeros((_CELLS, _CELLS, 3))
+    points[..., i], points[..., j] = right, up[:, None]
+    return right, up, _nearest(body, points, limits, 3 - i - j)
+
+
+def _draw_zero(axes: Axes, right: Array, up: Array, distance: Array, look: str) -> None:
+    """Draw where a distance is negative: filled where it is true, dashed where it is fitted."""
+    if look == "true":
+        axes.contourf(right, up, distance, [-np.inf, 0.0], colors=["#ececec"], zorder=1)
+        axes.contour(right, up, distance, [0.0], colors=[MUTED], linewidths=0.8, zorder=1.5)
+        return
+    dashes: Any = [(0, (4, 2))]
+    lines: dict[str, Any] = {"linewidths": 1.0, "linestyles": dashes, "zorder": 4}
+    axes.contour(right, up, distance, [0.0], colors=[ORANGE], **lines)
+
+
+def _nearest(body: Body, points: Array, limits: Array, depth: int) -> Array:
+    """Least distance from a body along lines of sight through points (m, m, 3), mm."""
+    from scipy.interpolate import RegularGridInterpolator
+
+    rough = np.arange(0, _CELLS, _COARSE)
+    corners = points[np.ix_(rough, rough)]
+    cell = float(np.ptp(corners[:2, :2].reshape(-1, 3), axis=0).max())
+    coarse = _marched(body, corners.reshape(-1, 3), limits, depth, 2.0 * cell)
+    table = RegularGridInterpolator((rough, rough), coarse.reshape(rough.size, rough.size))
+    rows, columns = np.indices((_CELLS, _CELLS))
+    nearest = np.asarray(table((rows, columns)), dtype=np.float64)
+    # Within a cell a distance changes by no more than the way.
+    near = np.abs(nearest) < 1.5 * cell
+    nearest[near] = _marched(body, points[near], limits, depth, 2.0 * cell)
+    return nearest
+
+
+def _marched(body: Body, points: Array, limits: Array, depth: int, deep: float) -> Array:
+    """Least distance from a body along lines of sight through points (n, 3), mm."""
+    start, end = limits[depth]
+    least_step = 0.25 * deep
+    points = points.copy()
+    at = np.full(len(points), start)
+    least = np.full(len(points), np.inf)
+    active = np.arange(len(points))
+    while active.size:
+        points[active, depth] = at[active]
+        distance = 1e3 * body.signed_distance(1e-3 * points[active])
+        least[active] = np.minimum(least[active], distance)
+        at[active] += np.maximum(np.abs(distance), least_step)
+        active = active[(at[active] <= end) & (least[active] > -deep)]
+    return least
+
+
+def room_for(places: Array, bodies: Sequence[Body]) -> Array:
+    """Limits, mm, that hold most places, and the objects there as far as they end nearby."""
+    low, high = np.quantile(places, [0.04, 0.96], axis=0)
+    half = 0.5 * (high - low)
+    near = np.array([[-1.0], [1.0]]) * (2.0 * half.max() + 3.0)
+    lines = 0.5 * (low + high) + near  # lower and upper ends of a cube
+    steps = np.linspace(lines[0], lines[1], 25)
+    grid = np.stack(np.meshgrid(*steps.T, indexing="ij"), axis=-1)
+    for body in bodies:
+        inside = grid[body.signed_distance(1e-3 * grid) < 0.0]
+        for n in range(3):
+            if (
+                inside.size
+                and inside[:, n].min() > lines[0, n]
+                and inside[:, n].max() < lines[1, n]
+            ):
+                low[n], high[n] = min(low[n], inside[:, n].min()), max(high[n], inside[:, n].max())
+    margin = np.maximum(0.15 * (high - low), 1.0)
+    return np.stack([low - margin, high + margin], axis=1)
+
+
+def one_scale(limits: Array, views: Sequence[tuple[int, int]], sizes: Sequence[Any]) -> Array:
+    """Widen limits so that panels of given sizes show all of them to one scale."""
+    middle, span = limits.mean(axis=1), np.ptp(limits, axis=1)
+    scale = max(
+        max(span[i] / wide, span[j] / tall)
+        for (i, j), (wide, tall) in zip(views, sizes, strict=True)
+    )
+    return np.array(
+        [
+            [
+                [middle[n] - 0.5 * scale * size, middle[n] + 0.5 * scale * size]
+                for n, size in zip(view, both, strict=True)
+            ]
+            for view, both in zip(views, sizes, strict=True)
+        ]
+    )
+
+
+BAND: dict[str, Any] = {"facecolor": ORANGE, "alpha": 0.25, "linewidth": 0.0, "zorder": 2}
+"""Look of a band."""
+
+_SECTION_CELLS = 91
+_NORMAL_95 = 1.959963984540054
+_FACING = 0.8
+_UNKNOWN = 0.05
+"""Standard deviation, as a share of the view's width, from which a surface is not drawn."""
+
+
+def is_cylinder(body: Body) -> bool:
+    """Whether a body is a cylinder."""
+    return hasattr(body, "axis") and hasattr(body, "radius")
+
+
+def has_band(body: Body) -> bool:
+    """Whether a body is drawn with a band."""
+    return hasattr(body, "distance_sigma") and not is_cylinder(body)
+
+
+def lies_flat(body: Body, view: tuple[int, int], places: Array) -> bool:
+    """Whether a surface faces the view, so that a section would lie in it."""
+    normals = getattr(body, "outward_normals", None)
+    if normals is None:
+        return False
+    toward = np.abs(normals(1e-3 * places)[:, 3 - sum(view)])
+    return bool(np.nanmedian(toward) > _FACING)
+
+
+def outline(cylinder: Any, view: tuple[int, int], height: float, limits: Array) -> Array:
+    """Give the outline of a cylinder: from above its section, from the side its silhouette."""
+    origin = to_display("peg_position", cylinder.origin)
+    radius = float(to_display("peg_radius", cylinder.radius))
+    axis = np.asarray(cylinder.axis, dtype=np.float64)
+    axis = axis / np.linalg.norm(axis)
+    if view == (0, 1) and abs(axis[2]) > 0.2:
+        first = np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0])
+        first /= np.linalg.norm(first)
+        turn = np.linspace(0.0, 2.0 * np.pi, 181)[:, None]
+        circle = origin + radius * (np.cos(turn) * first + np.sin(turn) * np.cross(axis, first))
+        # Along the axis, until all of the circle is at this height.
+        circle += (height - circle[:, 2:]) / axis[2] * axis
+        return np.asarray(circle[:, :2])
+    i, j = view
+    along = np.array([axis[i], axis[j]])
+    along = along / max(float(np.linalg.norm(along)), 1e-12)
+    aside = radius * np.array([-along[1], along[0]])
+    far = 2.0 * float(np.ptp(limits, axis=1).max()) * along
+    middle = origin[[i, j]]
+    # From where the axis passes nearest to the middle of the view.
+    middle = middle + ((limits[[i, j]].mean(axis=1) - middle) @ along) * along
+    return np.array(
+        [middle - far + aside, middle + far + aside, middle + far - aside, middle - far - aside]
+    )
+
+
+def draw_section(
+    axes: Axes, body: Body, view: tuple[int, int], depth: float, limits: Array, look: str
+) -> None:
+    """Draw a section through an object, with its 95 % band where it has one."""
+    i, j = view
+    right, up = (np.linspace(limits[n, 0], limits[n, 1], _SECTION_CELLS) for n in view)
+    points: Array = np.empty((_SECTION_CELLS, _SECTION_CELLS, 3))
+    points[..., i], points[..., j], points[..., 3 - i - j] = right, up[:, None], depth
+    distance = 1e3 * np.asarray(body.signed_distance(1e-3 * points))
+    if not distance.min() < 0.0 < distance.max():
+        return
+    if look != "true" and has_band(body):
+        sigma = 1e3 * np.asarray(getattr(body, "distance_sigma")(1e-3 * points))  # noqa: B009
+        sure = sigma < _UNKNOWN * np.ptp(limits[i])
+        if not sure.any():
+            return
+        distance = np.where(sure, distance, np.nan)
+        within = np.abs(distance) - _NORMAL_95 * sigma
+        shade: dict[str, Any] = {"colors": [ORANGE], "alpha": 0.25, "zorder": 2}
+        if not (np.nanmin(distance) < 0.0 < np.nanmax(distance)):
+            return
+        axes.contourf(right, up, within, [-np.inf, 0.0], **shade)
+    _draw_zero(axes, right, up, distance, look)
+
+
+_PAD = np.array([7.7e-3, -9.0e-3, -4.9e-3])
+"""Base of a whisker at the right if nothing else is known: right, forward, up of the snout."""
+
+_FAR = 2e-3
+"""Smallest distance of a base from the head's origin for this to be the snout, m."""
+
+_SKIN, _EDGE, _EYE = "#efe6dc", "#a89a8c", "#5a4f45"
+
+
+class Head(NamedTuple):
+    """Place of a head."""
+
+    snout: Array
+    axes: Array
+
+
+def head_of(course: Course) -> Head:
+    """Mean pose of the head over a trial.
+
+    Unless the recording states it, the head is level, the whisker points away from it sideways
+    and curves forward, and its base is on the snout.
+    """
+    base = np.nanmean(course.position, axis=0)
+    if course.head is not None:
+        position, rotation = course.head
+        axes = _nearest_rotation(np.nanmean(rotation, axis=0))
+        snout = np.nanmean(position, axis=0)
+        if np.linalg.norm(base - snout) > _FAR:
+            return Head(snout, axes)
+    else:
+        axes = _level(np.nanmean(course.rotation, axis=0))
+    mean = np.nanmean(course.rotation, axis=0)
+    side = np.sign(mean[:, 0] @ axes[:, 0]) or 1.0
+    return Head(base - axes @ (_PAD * np.array([side, 1.0, 1.0])), axes)
+
+
+def _level(mean: Array) -> Array:
+    """Right, forward and up of a level head, from the mean of the base's axes."""
+    sideways, forward = mean[:2, 0], mean[:2, 1]
+    n = int(np.argmax(np.abs(sideways)))
+    way = np.zeros(3)
+    # A whisker that points more or less along x or y belongs to a head that stands straight.
+    way[n] = np.sign(sideways[n]) or 1.0
+    ahead = np.cross([0.0, 0.0, 1.0], way)
+    if forward @ ahead[:2] < 0.0:
+        ahead = -ahead
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    return np.stack([right, ahead, [0.0, 0.0, 1.0]], axis=1)
+
+
+def _nearest_rotation(mean: Array) -> Array:
+    left, _, right = np.linalg.svd(mean)
+    return np.asarray(left @ right)
+
+
+def draw_head(axes: Axes, head: Head, view: tuple[int, int]) -> None:
+    """Draw the outline of a head, filled."""
+    skin, eyes = head_surfaces(head.axes, head.snout)
+    axes.add_patch(
+        Polygon(_outline(skin, view), facecolor=_SKIN, edgecolor=_EDGE, linewidth=0.8, zorder=0.5)
+    )
+    for eye in np.split(eyes, 2):
+        axes.add_patch(Polygon(_outline(eye, view), facecolor=_EYE, edgecolor="none", zorder=0.6))
+
+
+def _outline(triangles: Array, view: tuple[int, int]) -> Array:
+    """Hull (n, 2) of what is seen: a head has no hollows."""
+    from scipy.spatial import ConvexHull
+
+    points = triangles.reshape(-1, 3)[:, list(view)]
+    return np.asarray(points[ConvexHull(points).vertices])

@@ -9,7 +9,10 @@ from vibrissa.scene.course import (
     course_of,
     deflection_angles,
 )
-from vibrissa.scene.marks import (
+from vibrissa.scene.solids import (
+    COORDINATES as COORDINATES,
+    DIRECTIONS as DIRECTIONS,
+    SIGNALS as SIGNALS,
     Arrows as Arrows,
     Body as Body,
     Bytes as Bytes,
@@ -23,29 +26,24 @@ from vibrissa.scene.marks import (
     Painted as Painted,
     Side as Side,
     across as across,
+    clip as clip,
+    column as column,
     cylinder as cylinder,
     ellipsoid as ellipsoid,
     error_ellipsoid as error_ellipsoid,
     head_surfaces as head_surfaces,
     is_bounded as is_bounded,
+    level_surface as level_surface,
     object_surface as object_surface,
     pieces as pieces,
     robust_limits as robust_limits,
     root as root,
-    sheet as sheet,
-    squared as squared,
-    tube as tube,
-)
-from vibrissa.scene.solids import (
-    COORDINATES as COORDINATES,
-    DIRECTIONS as DIRECTIONS,
-    SIGNALS as SIGNALS,
-    clip as clip,
-    column as column,
-    level_surface as level_surface,
     sample_contacts as sample_contacts,
+    sheet as sheet,
     solid_surface as solid_surface,
+    squared as squared,
     subdivide as subdivide,
+    tube as tube,
     values_of as values_of,
 )
 

@@ -1,22 +1,35 @@
-"""All stable contacts as solids: sampled finely, cut open, and surfaces of equal value in them.
+"""What is drawn: the solid of all stable contacts, and marks without a renderer, as triangles.
 
-A map has contact point and signals at the nodes of a grid over arc length, bearing and load. In
+**Solids** are sampled finely and cut open, with surfaces of equal value in them. A map has contact point and signals at the nodes of a grid over arc length, bearing and load. In
 between both are smooth and are interpolated by cubic splines, for pictures only. Every node carries
 one row of numbers, its columns named in :data:`COLUMNS`, so that what is cut out carries the
 contact point and all signals along. Directions are carried as the components of a vector, which are
 smooth where angles jump.
+
+**Marks**, in mm, are bodies, clouds, arrows, lines and labels; limits of colours and axes are those
+that hold most values, and roots show small ones.
+
+**Shapes** are tubes along whiskers, ellipsoids, the objects of a recording, a head. A surface is a pair of vertices (n, 3) and faces (m, 3) of their numbers, so that triangles share
+vertices where it is smooth. All lengths go in and come out in the same unit, but for objects and
+head, which come out in mm. The head is a sketch, after no measured one: sections through it, one
+behind the other, whose sides pass near the base points of an average rat's whiskers.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import permutations, product
+from math import sqrt
+from typing import Literal
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.numerics import Array, Mask
+from vibrissa.quantities import to_display
 
 SIGNALS = ("Fx", "FT", "FD", "Mx", "MB", "MD")
 DIRECTIONS = ("FD", "MD")
@@ -245,3 +258,313 @@ def solid_surface(nodes: Array, closed: bool, *columns: int) -> Array:
                 part = clip(part, other)
         around.append(part)
     return np.concatenate(around)
+
+
+Ints = NDArray[np.int64]
+Bytes = NDArray[np.uint8]
+Colour = tuple[int, int, int]
+Side = Literal["front", "back", "double"]
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A surface of one colour."""
+
+    vertices: Array  # (n, 3), mm, shared where the surface is smooth
+    faces: Ints  # (m, 3)
+    colour: Colour
+    opacity: float | None = None
+    side: Side = "front"
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)  # shift of all vertices, mm
+
+
+@dataclass(frozen=True, eq=False)
+class Painted:
+    """A surface of many colours, or one that is large: it costs little to draw."""
+
+    triangles: Array  # (n, 3, 3), mm
+    colours: Bytes  # (n, 3, 3), of the corners
+    opacity: float | None = None
+    side: Side = "double"
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Points."""
+
+    points: Array  # (n, 3), mm
+    colours: Bytes  # (n, 3)
+    size: float  # width of a point, mm
+
+
+@dataclass(frozen=True, eq=False)
+class Arrows:
+    """Arrows that are drawn as one."""
+
+    start: Array  # (n, 3), mm
+    end: Array
+    colours: Bytes  # (n, 3)
+    thickness: float  # radius of the shafts, mm
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """Straight pieces of one colour."""
+
+    pieces: Array  # (n, 2, 3), ends of each, mm
+    colour: Colour
+    width: float = 2.0  # pixels
+
+
+@dataclass(frozen=True, eq=False)
+class Label:
+    """A few words."""
+
+    position: Array  # (3,), of the lower left corner, mm
+    text: str
+
+
+Mark = Body | Painted | Cloud | Arrows | Line | Label
+Drawing = Mapping[str, Mark]
+"""Marks by name; what is missing from the next drawing goes."""
+
+
+def pieces(points: Array) -> Array:
+    """Cut a line into straight pieces."""
+    parts = np.stack([points[:-1], points[1:]], axis=1)
+    return np.asarray(parts[np.isfinite(parts).all(axis=(1, 2))])
+
+
+def robust_limits(values: ArrayLike, share: float = 0.98, symmetric: bool = False) -> Array:
+    """Give limits between which most of the finite values are."""
+    finite = np.asarray(values, dtype=np.float64)
+    finite = finite[np.isfinite(finite)]
+    if finite.size == 0:
+        return np.array([-1.0 if symmetric else 0.0, 1.0])
+    low, high = np.quantile(finite, [(1.0 - share) / 2.0, (1.0 + share) / 2.0])
+    if symmetric:
+        high = max(abs(low), abs(high))
+        low = -high
+    if not high - low > 1e-12 * max(abs(high), abs(low)):
+        room = 0.05 * abs(high) or 1.0
+        low, high = low - room, high + room
+    return np.array([low, high])
+
+
+def root(values: ArrayLike) -> Array:
+    """Take square roots of sizes and keep signs, for scales on which small values are seen."""
+    x = np.asarray(values, dtype=np.float64)
+    return np.asarray(np.sign(x) * np.sqrt(np.abs(x)))
+
+
+def squared(values: ArrayLike) -> Array:
+    """Take squares and keep signs: the inverse of `root`."""
+    x = np.asarray(values, dtype=np.float64)
+    return np.asarray(np.sign(x) * np.square(x))
+
+
+_SIDES = 8
+"""Corners of the section of a whisker."""
+
+_SECTIONS = np.array(
+    [
+        # forward, half width, middle height, half height; mm
+        [0.6, 0.1, -1.6, 0.1],
+        [0.3, 1.4, -1.6, 1.3],
+        [-1.0, 3.4, -3.2, 3.2],
+        [-3.0, 5.2, -4.2, 4.6],
+        [-6.0, 6.9, -4.8, 5.9],
+        [-10.0, 8.0, -4.9, 7.0],
+        [-15.0, 9.0, -4.6, 8.2],
+        [-22.0, 10.8, -3.6, 9.8],
+        [-30.0, 12.3, -2.4, 10.8],
+        [-37.0, 12.0, -1.8, 10.6],
+        [-43.0, 9.5, -1.8, 9.0],
+        [-46.0, 5.5, -2.2, 5.5],
+        [-47.0, 0.1, -2.4, 0.1],
+    ]
+)
+_EYES = np.array([[10.3, -24.0, 2.2], [-10.3, -24.0, 2.2]])
+_EYE, _AROUND = 1.5, 40
+"""Radius of an eye, mm, and points around a section of the head."""
+
+
+def across(direction: Array) -> tuple[Array, Array]:
+    """Give two unit vectors that make a right-handed frame with a direction."""
+    along = direction / np.linalg.norm(direction)
+    helper = np.eye(3)[np.argmin(np.abs(along))]
+    first = np.cross(along, helper)
+    first /= np.linalg.norm(first)
+    return first, np.cross(along, first)
+
+
+@lru_cache(maxsize=32)
+def _faces(rows: int, columns: int, closed: bool = False) -> Ints:
+    """Two triangles for each cell between points of a grid, which may close upon itself."""
+    number = np.arange(rows * columns).reshape(rows, columns)
+    if closed:
+        number = np.concatenate([number, number[:, :1]], axis=1)
+    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+    halves = [np.stack([p.ravel() for p in half], axis=1) for half in ((a, d, c), (a, c, b))]
+    return np.concatenate(halves)
+
+
+def sheet(grid: Array) -> tuple[Array, Ints]:
+    """Make a surface of the points of a grid."""
+    return grid.reshape(-1, 3), _faces(*grid.shape[:2])
+
+
+def tube(line: Array, radius: Array, sides: int = _SIDES) -> tuple[Array, Ints]:
+    """Make a closed tube about a line."""
+    tangents = np.gradient(line, axis=0)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    normals = np.array(_transported(across(tangents[0])[0].tolist(), tangents.tolist()))
+    turn = np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False)
+    ring = np.cos(turn)[:, None] * normals[:, None]
+    ring += np.sin(turn)[:, None] * np.cross(tangents, normals)[:, None]
+    walls = line[:, None] + radius[:, None, None] * ring
+    return np.concatenate([walls.reshape(-1, 3), line[[0, -1]]]), _tube_faces(len(line), sides)
+
+
+def _transported(normal: list[float], tangents: list[list[float]]) -> list[list[float]]:
+    """A normal carried along; in plain numbers, which are faster than small arrays."""
+    x, y, z = normal
+    out = []
+    for a, b, c in tangents:
+        along = x * a + y * b + z * c
+        x, y, z = x - along * a, y - along * b, z - along * c
+        size = sqrt(x * x + y * y + z * z)
+        x, y, z = x / size, y / size, z / size
+        out.append([x, y, z])
+    return out
+
+
+@lru_cache(maxsize=32)
+def _tube_faces(count: int, sides: int) -> Ints:
+    around = np.arange(sides)
+    beyond = (around + 1) % sides
+    first, last = count * sides, (count - 1) * sides
+    ends = [
+        np.stack([np.full(sides, first), beyond, around], axis=1),
+        np.stack([np.full(sides, first + 1), last + around, last + beyond], axis=1),
+    ]
+    return np.concatenate([_faces(count, sides, closed=True), *ends])
+
+
+def cylinder(
+    origin: Array, axis: Array, radius: float, length: float, sides: int = 32
+) -> tuple[Array, Ints]:
+    """Make a closed cylinder."""
+    along = 0.5 * length * axis / np.linalg.norm(axis)
+    return tube(np.stack([origin - along, origin + along]), np.full(2, radius), sides)
+
+
+def ellipsoid(centre: Array, axes: Array, around: int = 24) -> tuple[Array, Ints]:
+    """Make an ellipsoid."""
+    latitude = np.linspace(-np.pi / 2, np.pi / 2, around // 2 + 1)
+    longitude = np.linspace(0.0, 2.0 * np.pi, around, endpoint=False)
+    lat, lon = np.meshgrid(latitude, longitude, indexing="ij")
+    ball = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=-1)
+    axes = axes * np.where(np.linalg.det(axes) < 0.0, np.array([1.0, 1.0, -1.0]), 1.0)
+    return centre + ball.reshape(-1, 3) @ axes.T, _faces(len(latitude), around, closed=True)
+
+
+def error_ellipsoid(
+    centre: Array, covariance: Array, sigmas: float, most: float = np.inf
+) -> tuple[Array, Ints]:
+    """Make the ellipsoid of an uncertain position."""
+    values, directions = np.linalg.eigh(covariance)
+    sizes = np.minimum(sigmas * np.sqrt(np.clip(values, 0.0, None)), most)
+    return ellipsoid(centre, directions * sizes)
+
+
+def head_surfaces(rotation: Array, position: Array) -> tuple[Array, Array]:
+    """Sketch a rat's head."""
+    from scipy.interpolate import PchipInterpolator
+
+    turn = np.linspace(0.0, 2.0 * np.pi, _AROUND)
+    # Smooth between the sections, which are closer together near the snout.
+    number = np.arange(len(_SECTIONS))
+    fine = np.linspace(0.0, number[-1], 6 * number[-1] + 1)
+    forward, half, middle, tall = PchipInterpolator(number, _SECTIONS)(fine).T[..., None]
+    parts = half * np.cos(turn), forward, middle + tall * np.sin(turn)
+    skin = sheet(np.stack(np.broadcast_arrays(*parts), axis=-1))
+    balls = [ellipsoid(eye, _EYE * np.eye(3), 16) for eye in _EYES]
+    surfaces = [np.concatenate([v[f] for v, f in group]) for group in ([skin], balls)]
+    moved = [s @ rotation.T + to_display("head_position", position) for s in surfaces]
+    return moved[0], moved[1]
+
+
+def object_surface(thing: xr.Dataset, limits: Array) -> tuple[Array, Ints]:
+    """Make the surface of an object of a recording."""
+    kind = str(thing.attrs.get("kind"))
+    if kind not in _KINDS:
+        raise ValueError(f"an object is of kind {kind!r}; one of {', '.join(_KINDS)} is known")
+    return _KINDS[kind](thing, limits)
+
+
+def is_bounded(thing: xr.Dataset) -> bool:
+    """Check whether an object of a recording ends on all sides."""
+    return thing.attrs.get("kind") in ("sphere", "box", "mesh")
+
+
+def _mm(thing: xr.Dataset, name: str) -> Array:
+    return to_display(name, thing[name].values)
+
+
+def _sphere(thing: xr.Dataset, limits: Array) -> tuple[Array, Ints]:
+    return ellipsoid(_mm(thing, "object_position"), _mm(thing, "object_radius") * np.eye(3), 48)
+
+
+def _peg(thing: xr.Dataset, limits: Array) -> tuple[Array, Ints]:
+    axis, origin = thing["object_axis"].values, _mm(thing, "object_position")
+    first, second = across(axis)
+    ends = _within(limits, origin, axis)
+    turn = np.linspace(0.0, 2.0 * np.pi, 49)[:, None]
+    ring = _mm(thing, "object_radius") * (np.cos(turn) * first + np.sin(turn) * second)
+    return sheet(origin + ends[:, None, None] * axis + ring)
+
+
+def _within(limits: Array, origin: Array, axis: Array) -> Array:
+    """From where to where (2,) a line is seen; if nowhere, where it comes nearest to the middle."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = np.sort((limits - origin[:, None]) / axis[:, None], axis=1)
+    crossing = np.abs(axis) > 1e-9
+    first, last = ends[crossing, 0].max(), ends[crossing, 1].min()
+    if first < last:
+        return np.array([first, last])
+    middle = float((limits.mean(axis=1) - origin) @ axis)
+    return np.asarray(middle + 0.5 * np.ptp(limits, axis=1).max() * np.array([-1.0, 1.0]))
+
+
+def _plane(thing: xr.Dataset, limits: Array) -> tuple[Array, Ints]:
+    normal, origin = thing["object_axis"].values, _mm(thing, "object_position")
+    first, second = across(normal)
+    middle, half = limits.mean(axis=1), 0.5 * np.ptp(limits, axis=1).max()
+    foot = middle - ((middle - origin) @ normal) * normal
+    side = np.linspace(-half, half, 13)
+    return sheet(foot + side[:, None, None] * first + side[:, None] * second)
+
+
+def _box(thing: xr.Dataset, limits: Array) -> tuple[Array, Ints]:
+    half = 0.5 * _mm(thing, "object_size")
+    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    # Its sides share no corners, so that edges stay sharp.
+    sides = [np.insert(square, k, end, axis=1) * half for k in range(3) for end in (-1.0, 1.0)]
+    rotation = thing["object_rotation"].values
+    faces = np.array([[0, 1, 2], [0, 2, 3]]) + 4 * np.arange(6)[:, None, None]
+    vertices = _mm(thing, "object_position") + np.concatenate(sides) @ rotation.T
+    return vertices, faces.reshape(-1, 3)
+
+
+def _mesh(thing: xr.Dataset, limits: Array) -> tuple[Array, Ints]:
+    return _mm(thing, "object_vertices"), thing["object_faces"].values.astype(np.int64)
+
+
+_KINDS: dict[str, Callable[[xr.Dataset, Array], tuple[Array, Ints]]] = {
+    "peg": _peg,
+    "sphere": _sphere,
+    "plane": _plane,
+    "box": _box,
+    "mesh": _mesh,
+}

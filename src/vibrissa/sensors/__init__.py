@@ -1,5 +1,15 @@
 """The sensor at the whisker's base: its readings, mounting and calibration."""
 
+from vibrissa.sensors.calibration import (
+    MixingCalibration,
+    StiffnessFit,
+    WeightCalibration,
+    calibrate_mixing,
+    calibrate_on_contacts,
+    calibrate_weight,
+    fit_stiffness,
+    tare,
+)
 from vibrissa.sensors.files import (
     Stage as Stage,
     StageSweep as StageSweep,
@@ -10,14 +20,6 @@ from vibrissa.sensors.files import (
     save_suspended as save_suspended,
 )
 from vibrissa.sensors.frame import FrameCalibration, SensorFrame, calibrate_frame
-from vibrissa.sensors.mixing import (
-    MixingCalibration,
-    WeightCalibration,
-    calibrate_mixing,
-    calibrate_on_contacts,
-    calibrate_weight,
-    tare,
-)
 from vibrissa.sensors.regression import ThinPlate as ThinPlate
 from vibrissa.sensors.sensor import (
     COMPONENTS,
@@ -27,7 +29,6 @@ from vibrissa.sensors.sensor import (
     Sensor,
     component_noise as component_noise,
 )
-from vibrissa.sensors.stiffness import StiffnessFit, fit_stiffness
 from vibrissa.sensors.suspended import (
     SuspendedWhisker,
     SweptContacts,

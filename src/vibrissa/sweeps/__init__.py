@@ -1,7 +1,12 @@
 """Studies of many whiskers: plain data in, one labelled store out, on one machine or many."""
 
-from vibrissa.sweeps.results import failures, open_sweep, sweep_summary as sweep_summary
-from vibrissa.sweeps.run import Outcome as Outcome, run_sweep
+from vibrissa.sweeps.run import (
+    Outcome as Outcome,
+    failures,
+    open_sweep,
+    run_sweep,
+    sweep_summary as sweep_summary,
+)
 from vibrissa.sweeps.store import Busy as Busy, Store as Store
 from vibrissa.sweeps.study import EXAMPLE as EXAMPLE, Cell as Cell, Study as Study, read_study
 

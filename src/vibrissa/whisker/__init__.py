@@ -15,8 +15,11 @@ from vibrissa.whisker.pose import (
     base_rotation,
     mirrored,
 )
-from vibrissa.whisker.profile import Profile as Profile, constant as constant
-from vibrissa.whisker.rest import parabola_curvature as parabola_curvature
+from vibrissa.whisker.profile import (
+    Profile as Profile,
+    constant as constant,
+    parabola_curvature as parabola_curvature,
+)
 from vibrissa.whisker.section import (
     TAPER as TAPER,
     Properties as Properties,

@@ -50,8 +50,7 @@ from numpy.typing import ArrayLike, NDArray
 from vibrissa.deferred import interpolate, linalg, special
 from vibrissa.numerics import Array
 from vibrissa.whisker.pose import Pose, least_turn
-from vibrissa.whisker.profile import Profile, approximate, constant
-from vibrissa.whisker.rest import Path
+from vibrissa.whisker.profile import Path, Profile, approximate, constant
 from vibrissa.whisker.section import LONGEST, length_faults
 
 ROUNDS = 12

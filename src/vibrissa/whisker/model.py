@@ -29,13 +29,15 @@ from vibrissa.whisker.digitise import digitize
 from vibrissa.whisker.pose import Pose, least_turn, roll
 from vibrissa.whisker.profile import (
     UNRESOLVED,
+    Path,
     Profile,
     Side,
     approximate,
     array_function,
     constant,
+    parabola_curvature,
+    proximal_roll,
 )
-from vibrissa.whisker.rest import Path, parabola_curvature, proximal_roll
 from vibrissa.whisker.section import (
     ASSUMED,
     POISSON_RATIO,

@@ -44,14 +44,9 @@ PIXEL_SIZE = 58e-6
 SIZE = (1024, 1024)
 """Width and height of the paper's frames, pixels."""
 
-_COEFFICIENTS = 8
-"""Number of OpenCV's distortion coefficients that are used."""
-
-_ROUNDS = 20
-"""Largest number of Newton steps that remove the distortion."""
-
-_SINGULAR = 1e-9
-"""Determinant of the directions of the image's axes below which they are parallel."""
+_COEFFICIENTS = 8  # number of OpenCV's distortion coefficients that are used
+_ROUNDS = 20  # largest number of Newton steps that remove the distortion
+_SINGULAR = 1e-9  # determinant of the directions of the image's axes below which they are parallel
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,8 +286,8 @@ def _undistorted(bent: Array, k: Array) -> Array:
     return flat
 
 
+# Smallest sine of the angle between a single camera's line of sight and the plane z = 0.
 _STEEP = 0.2
-"""Smallest sine of the angle between a single camera's line of sight and the plane z = 0."""
 
 
 def triangulate(
@@ -385,6 +380,7 @@ def _nearest_to_rays(cameras: Sequence[Camera], pixels: Array) -> Array:
     return np.asarray(solved, dtype=np.float64)
 
 
+# Attribute of a camera, and dimensions, of each variable.
 _VARIABLES: dict[str, tuple[str, tuple[str, ...]]] = {
     "camera_matrix": ("matrix", ("row", "column")),
     "camera_rotation": ("rotation", ("row", "column")),
@@ -393,7 +389,6 @@ _VARIABLES: dict[str, tuple[str, tuple[str, ...]]] = {
     "image_size": ("size", ("side",)),
     "projection": ("projection", ()),
 }
-"""Attribute of a camera, and dimensions, of each variable."""
 
 
 def load_cameras(path: str | PathLike[str], unit: float = 1e-3) -> tuple[Camera, ...]:
@@ -508,8 +503,7 @@ def cameras_from_dataset(dataset: xr.Dataset) -> tuple[Camera, ...]:
 Image = NDArray[np.uint8]
 Board = NDArray[np.float32]
 
-_FEWEST = 4
-"""Smallest number of moments in which all cameras see the board."""
+_FEWEST = 4  # smallest number of moments in which all cameras see the board
 
 
 def calibrate(

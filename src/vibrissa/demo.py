@@ -67,17 +67,14 @@ FULL_DURATION = 3.5
 SIMULATED, TRACKED = "simulated.nc", "tracked.nc"
 """Recordings that are kept from one run to the next, as videos are."""
 
+# Files that are made anew each time.
 _VIEWS = ("top", "front")
 _WRITTEN = ("trial.nc", "seen.nc", "contacts.csv", "map.nc")
-"""Files that are made anew each time."""
-
+# Points by which it is known whether a whisker is the same.
 _SETTINGS = ".settings.json"
 _NODES = 9
-"""Points by which it is known whether a whisker is the same."""
-
+# Properties that no camera sees, and a lab has from elsewhere.
 _PROPERTIES = ("base_radius", "tip_radius", "youngs_modulus", "poisson_ratio")
-"""Properties that no camera sees, and a lab has from elsewhere."""
-
 _DIM = {"whisker": 0}
 
 

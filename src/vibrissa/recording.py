@@ -137,13 +137,11 @@ VARIABLES: Mapping[str, RecordedVariable] = MappingProxyType(
 )
 """Every variable that runs along the frames of a recording, by name."""
 
+# Dimensions that a dataset of one frame, whisker or view lacks.
 _AXES = frozenset({"space", "whisker_axis", "head_axis", "space_"})
 _SELECTED = frozenset({"time", "whisker", "view"})
-"""Dimensions that a dataset of one frame, whisker or view lacks."""
-
+# Dimensions that go by another name, where a dataset has two of a kind.
 _ALSO_CALLED = MappingProxyType({"true_node": "node", "space_2": "space_"})
-"""Dimensions that go by another name, where a dataset has two of a kind."""
-
 _NUMBERS = "fiub"
 
 

@@ -34,10 +34,9 @@ CONTACT = "#d55e00"
 MOST_CURVES = 40
 MOST_POINTS = 800
 
+# Height of a panel over its width, at least and (inverse) at most.
 _PANEL, _MARGIN, _GAP = 260.0, 14.0, 18.0
 _LEAST = 0.25
-"""Height of a panel over its width, at least and (inverse) at most."""
-
 _STYLE = "border-collapse:collapse;font-size:90%"
 _CELL = "text-align:left;padding:1px 10px 1px 0;vertical-align:top"
 _NAME = ";white-space:nowrap"

@@ -41,6 +41,7 @@ Lengths typed and printed are in mm, forces in µN, moments in µN·m and angles
 SI units. Existing files are not replaced without --force; stages are added to the recording itself.
 """
 
+# The verbs, in the order in which they are listed.
 VERBS: dict[str, Callable[..., None]] = {
     "demo": demo,
     "deflect": deflect,
@@ -65,8 +66,6 @@ VERBS: dict[str, Callable[..., None]] = {
     "sweep": sweep,
     "info": info,
 }
-"""The verbs, in the order in which they are listed."""
-
 app = typer.Typer(
     help=HELP,
     no_args_is_help=True,

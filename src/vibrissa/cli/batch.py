@@ -16,9 +16,8 @@ from vibrissa.cli.reconstruct import ShapeOptions, stages
 from vibrissa.cli.signals import SourceOptions
 from vibrissa.cli.terminal import Tell, progress_bars, say, shown
 
+# Files that are written into the folder, replaced by each run.
 TABLE, PAGE = "summary.csv", "summary.html"
-"""Files that are written into the folder, replaced by each run."""
-
 _COLUMNS = (
     *("file", "whiskers", "duration", "frames", "frames_in_contact", "contacts"),
     *("largest_force", "largest_moment", "estimated", "surface_distance", "fitted", "fault"),

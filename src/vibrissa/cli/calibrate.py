@@ -15,20 +15,12 @@ from vibrissa.cli.terminal import remark, say
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+# Noise, as a share of the range of the readings, above which something is wrong.
 _UNEXPLAINED = 0.05
-"""Noise, as a share of the range of the readings, above which something is wrong."""
-
-_AGAIN = 4
-"""Touches with the same largest reading from which a channel seems to saturate."""
-
-_POOR = 1.0
-"""Reprojection error above which something is wrong, pixels."""
-
-_SMALLEST, _LARGEST = 0.05, 200.0
-"""Sides of squares, mm: what is smaller was typed in m."""
-
-_FRAMES = 40
-"""Frames that are used of a video, by default."""
+_AGAIN = 4  # touches with the same largest reading from which a channel seems to saturate
+_POOR = 1.0  # reprojection error above which something is wrong, pixels
+_SMALLEST, _LARGEST = 0.05, 200.0  # sides of squares, mm: what is smaller was typed in m
+_FRAMES = 40  # frames that are used of a video, by default
 
 
 @with_options("the cameras, TOML of Anipose; or the sensor, NetCDF (.nc)")

@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-_ENDLESS = 1 << 31
-"""Number of frames of a video that does not state it."""
+_ENDLESS = 1 << 31  # number of frames of a video that does not state it
 
 
 @with_options("corrections, .csv, which are added to those that it holds already")

@@ -93,9 +93,7 @@ class GravityOptions:
         return "" if self.gravity is None else f"; bent by gravity of {self.gravity} m/s²"
 
 
-_SHOWN = 5
-"""Faults of a table that are reported."""
-
+_SHOWN = 5  # faults of a table that are reported
 _NUMBERS = ("time", "x", "y", "z", "r", "theta", "phi", "sigma_x", "sigma_y", "sigma_z")
 
 

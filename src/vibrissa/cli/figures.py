@@ -21,20 +21,12 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
-Draw = Callable[[], Any]
-"""Draws a figure when it is called."""
-
-NODES = 101
-"""Points of a whisker that is drawn."""
-
-_LIGHT, _DARK = 235.0, 70.0
-"""Grey values of the background and of objects, where there is no video."""
-
-_VIEWS = 2
-"""Largest number of views that are drawn."""
-
+Draw = Callable[[], Any]  # draws a figure when it is called
+NODES = 101  # points of a whisker that is drawn
+_LIGHT, _DARK = 235.0, 70.0  # grey values of the background and of objects, where there is no video
+_VIEWS = 2  # largest number of views that are drawn
+# Groups of a recording whose contact points an array's figure shows, the first there is.
 _CONTACTS = ("estimates", "truth")
-"""Groups of a recording whose contact points an array's figure shows, the first there is."""
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
 
     import xarray as xr
 
-_VIEWS = ("top", "front")
-"""Names of views that neither files nor cameras name."""
+_VIEWS = ("top", "front")  # names of views that neither files nor cameras name
 
 
 @with_options("the recording, .nc")

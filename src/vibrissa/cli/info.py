@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from xarray import Dataset
 
+# What goes on from a file, by its kind.
 _SHOWN = 12
 _TABLES = """\
   signals         time, Fx, Fy, Fz, Mx, My, Mz; or three or more of Fx, FT, FD, Mx, MB, MD
@@ -47,8 +48,6 @@ _NEXT = {
     "corrections": "track VIDEO VIDEO --corrections {} -o trial.nc",
     "signals": "estimate {}  # the whisker: --whisker or --map FILE",
 }
-"""What goes on from a file, by its kind."""
-
 _PACKAGES = ("numpy", "scipy", "numba", "xarray", "h5netcdf", "matplotlib")
 
 

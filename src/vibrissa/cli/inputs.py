@@ -15,12 +15,8 @@ from vibrissa.cli.terminal import Tell, remark, say
 if TYPE_CHECKING:
     import xarray as xr
 
-RECORDING, MAP = "vibrissa recording", "vibrissa contact map"
-"""Kinds of NetCDF files."""
-
-_THICKEST = 10.0
-"""Radius of a whisker from which micrometres were typed for mm, mm."""
-
+RECORDING, MAP = "vibrissa recording", "vibrissa contact map"  # kinds of NetCDF files
+_THICKEST = 10.0  # radius of a whisker from which micrometres were typed for mm, mm
 # Unit of each limit of a region on the command line.
 _UNITS = {"r": 1e-3, "theta": math.pi / 180.0, "phi": math.pi / 180.0}
 

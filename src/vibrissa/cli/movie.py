@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
+# Longest duration of a movie of a whole trial, s, unless a step is given.
 _KINDS = ("signals", "contour")
 _LASTS = 45.0
-"""Longest duration of a movie of a whole trial, s, unless a step is given."""
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,7 @@ import typer
 
 import vibrissa as vb
 
-_NAMED = 3
-"""Number of files named in one message."""
+_NAMED = 3  # number of files named in one message
 
 
 class Option(NamedTuple):
@@ -52,9 +51,7 @@ def _options() -> dict[tuple[str, str], Option]:
     return found
 
 
-OPTIONS = _options()
-"""The options by verb, "" in all others, and name of the parameter."""
-
+OPTIONS = _options()  # the options by verb, "" in all others, and name of the parameter
 RecordingArgument = Annotated[
     Path, typer.Argument(help="A recording, NetCDF (.nc).", metavar="TRIAL.nc")
 ]

@@ -28,14 +28,10 @@ from vibrissa.cli.terminal import Tell, fixed, print_table, progress_bars, remar
 if TYPE_CHECKING:
     import xarray as xr
 
-_SUSPECT = 1.5
-"""χ² per degree of freedom from which it is asked whether another shape fits better."""
-
+_SUSPECT = 1.5  # χ² per degree of freedom from which it is asked whether another shape fits better
+# Predicted distance, m, longer than whiskers: the covariance leaves the contact anywhere.
 _ANYWHERE = 0.1
-"""Predicted distance, m, longer than whiskers: the covariance leaves the contact anywhere."""
-
-_TURNED = ("axis", "normal")
-"""Parameters of a shape that are directions, not lengths."""
+_TURNED = ("axis", "normal")  # parameters of a shape that are directions, not lengths
 
 
 @dataclass(frozen=True)

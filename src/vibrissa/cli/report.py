@@ -29,11 +29,8 @@ from vibrissa.cli.terminal import Tell, progress_bars, say
 if TYPE_CHECKING:
     from xarray import DataTree
 
-_LARGEST = 15_000_000
-"""Bytes of a page at most, as far as movies decide about it."""
-
-_TAGS = 10_000
-"""Bytes for the names and tags of movies."""
+_LARGEST = 15_000_000  # bytes of a page at most, as far as movies decide about it
+_TAGS = 10_000  # bytes for the names and tags of movies
 
 
 class _Content(NamedTuple):

@@ -16,8 +16,7 @@ from vibrissa.cli.terminal import Row, print_table, progress_bars, say, shown
 if TYPE_CHECKING:
     from xarray import Dataset
 
-_SHOWN = 5
-"""Number of the best triplets that are shown."""
+_SHOWN = 5  # number of the best triplets that are shown
 
 
 @with_options("everything, NetCDF (.nc), SI units; by default nowhere")

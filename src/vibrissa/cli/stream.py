@@ -32,12 +32,8 @@ from vibrissa.cli.terminal import Ended, ending_in_order, remark
 if TYPE_CHECKING:
     import socket
 
-_SOON = 500
-"""Samples after which advice is given; it is given again at the end."""
-
-_REPORTED = 1.0
-"""Seconds between two reports of samples that are dropped."""
-
+_SOON = 500  # samples after which advice is given; it is given again at the end
+_REPORTED = 1.0  # seconds between two reports of samples that are dropped
 _MOUNT = ("X", "Y", "Z", "QW", "QX", "QY", "QZ")
 
 

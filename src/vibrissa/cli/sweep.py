@@ -11,9 +11,9 @@ import vibrissa as vb
 from vibrissa.cli.options import refuse, with_options
 from vibrissa.cli.terminal import output, progress_bars, remark, say
 
+# Number of failures that are listed.
 _SHOW = "show"
 _LISTED = 3
-"""Number of failures that are listed."""
 
 
 @with_options("the results, a Zarr folder; with `show`, a folder for the figures")

@@ -14,14 +14,12 @@ from rich.text import Text
 from vibrissa.quantities import quantity
 from vibrissa.sketch import progress
 
+# Console for results, written as they are: names of files and whiskers may have brackets.
 output = Console(markup=False, emoji=False)
-"""Console for results, written as they are: names of files and whiskers may have brackets."""
-
+# Console for progress and messages, so that results can be piped.
 errors = Console(stderr=True, markup=False, emoji=False)
-"""Console for progress and messages, so that results can be piped."""
-
+# Called with what is being done, and how much of how much is.
 Tell = Callable[[str, int, int], None]
-"""Called with what is being done, and how much of how much is."""
 
 
 def say(line: str = "") -> None:
@@ -116,8 +114,7 @@ def _with_unit(number: str, name: str) -> str:
     return f"{number}{'' if unit in ('', '°') else ' '}{unit}"
 
 
-Row = Sequence[str | Text]
-"""The cells of a row."""
+Row = Sequence[str | Text]  # the cells of a row
 
 
 def print_table(

@@ -29,28 +29,16 @@ if TYPE_CHECKING:
 
     _Traces = Sequence[Sequence[Sequence[vb.tracking.Trace]]]
 
-_WIDEST = 1.0
-"""Largest width of views of a whisker, m."""
-
-_FINEST = 3.0
-"""Width of a whisker's base in the images for which traces are tuned, pixels."""
-
+_WIDEST = 1.0  # largest width of views of a whisker, m
+_FINEST = 3.0  # width of a whisker's base in the images for which traces are tuned, pixels
+# Misfit of traces, in their standard deviation, from which the rod does not explain them.
 _POOR = 2.0
-"""Misfit of traces, in their standard deviation, from which the rod does not explain them."""
-
-_VIEW = re.compile(r"\d+,\d+,\d+,\d+(:[a-z]+)*")
-"""Part of the images of a video."""
-
-_NEAREST, _FARTHEST = 0.03, 30.0
-"""Smallest and largest distance of a lens, m."""
-
+_VIEW = re.compile(r"\d+,\d+,\d+,\d+(:[a-z]+)*")  # part of the images of a video
+_NEAREST, _FARTHEST = 0.03, 30.0  # smallest and largest distance of a lens, m
 _RATE, _CUTOFF = 1000.0, 85.0
 
-_LONGEST_FUR = 20.0
-"""Longest part of a whisker that fur hides, mm."""
-
-_HALF = 127
-"""Grey value above which a pixel of an image of a mask is bright."""
+_LONGEST_FUR = 20.0  # longest part of a whisker that fur hides, mm
+_HALF = 127  # grey value above which a pixel of an image of a mask is bright
 
 
 @dataclass(frozen=True)

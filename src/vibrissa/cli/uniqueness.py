@@ -14,11 +14,8 @@ from vibrissa.cli.terminal import output, progress_bars, remark, say, shown
 if TYPE_CHECKING:
     from xarray import Dataset
 
-_DIGITS = 14
-"""Enough for the signals to agree to 1e-10 when the pair is bent again."""
-
-_ASKED = "Fx MB MD"
-"""The triplet whose witness is printed, if it has one: that of the paper."""
+_DIGITS = 14  # enough for the signals to agree to 1e-10 when the pair is bent again
+_ASKED = "Fx MB MD"  # the triplet whose witness is printed, if it has one: that of the paper
 
 
 @with_options("all evidence, .nc or .csv; by default nowhere")

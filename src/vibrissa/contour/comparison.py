@@ -20,14 +20,9 @@ from vibrissa.contour.fitted_shape import Body
 from vibrissa.numerics import Array
 from vibrissa.quantities import QUANTITIES, attributes, to_display
 
-REPLICATES = 20
-"""Number of draws of each distance."""
-
-CLASSES = 5
-"""Number of classes where their edges are not given."""
-
-_STEP = 1e-6
-"""Step of differences, m."""
+REPLICATES = 20  # number of draws of each distance
+CLASSES = 5  # number of classes where their edges are not given
+_STEP = 1e-6  # step of differences, m
 
 
 def compare_with(

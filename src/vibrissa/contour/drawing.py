@@ -15,14 +15,9 @@ from vibrissa.contour.simple_shapes import CylinderFit, PlaneFit, SphereFit, fra
 from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
 
-_INWARD = 0.9
-"""Largest depth of a surface inside its base, as a share of the radius."""
-
-_ROUND = np.pi / 3.0
-"""Gap between azimuths from which a shape is drawn open."""
-
-_MARGIN = 0.15
-"""Margin of a drawn surface beyond the points, as a share of their width."""
+_INWARD = 0.9  # largest depth of a surface inside its base, as a share of the radius
+_ROUND = np.pi / 3.0  # gap between azimuths from which a shape is drawn open
+_MARGIN = 0.15  # margin of a drawn surface beyond the points, as a share of their width
 
 
 def surface_grid(shape: FittedShape, points: ArrayLike, count: int = 41) -> xr.Dataset:

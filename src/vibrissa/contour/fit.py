@@ -48,47 +48,25 @@ from vibrissa.contour.simple_shapes import (
 from vibrissa.deferred import optimize
 from vibrissa.numerics import Array
 
-_SOFT = 2.0
-"""Residual, in standard deviations, from which points count less."""
-
+_SOFT = 2.0  # residual, in standard deviations, from which points count less
+# Chance of missing by as much as counts as an outlier: that of four standard deviations.
 _OUTLIER = float(chdtrc(1, 16.0))
-"""Chance of missing by as much as counts as an outlier: that of four standard deviations."""
-
-_WIDE = 0.5
-"""Spread, as a share of the shape's size, beyond which a point is left out."""
-
-_ENOUGH = 50
-"""Number of points with less spread from which wide ones are left out."""
-
-TO_SIGMA = 1.4826
-"""Standard deviation over the median size of normally distributed numbers."""
-
-_ROUGH = 1e-2
-"""Standard deviation to begin with, as a share of the extent, where it is not known."""
-
-_ROUNDS = 4
-"""Number of times that the noise is estimated from the scatter."""
-
-_PRECISE = 1e-6
-"""Tolerance up to which derivatives are central differences."""
-
-_SINGULAR = 1e-7
-"""Least over largest singular value from which the parameters are determined."""
-
-_HOLLOW = 3.0
-"""Standard deviations below zero from which a radius is that of a hollow."""
-
+_WIDE = 0.5  # spread, as a share of the shape's size, beyond which a point is left out
+_ENOUGH = 50  # number of points with less spread from which wide ones are left out
+TO_SIGMA = 1.4826  # standard deviation over the median size of normally distributed numbers
+_ROUGH = 1e-2  # standard deviation to begin with, as a share of the extent, where it is not known
+_ROUNDS = 4  # number of times that the noise is estimated from the scatter
+_PRECISE = 1e-6  # tolerance up to which derivatives are central differences
+_SINGULAR = 1e-7  # least over largest singular value from which the parameters are determined
+_HOLLOW = 3.0  # standard deviations below zero from which a radius is that of a hollow
+# Squared misses, relative to what is stated, from which most normals contradict the points.
 _ALIKE = 4.0
-"""Squared misses, relative to what is stated, from which most normals contradict the points."""
-
-_LARGEST = 1e3
-"""Size, in units of the extent, from which a shape is of no size."""
-
+_LARGEST = 1e3  # size, in units of the extent, from which a shape is of no size
+# Options that apply to some shapes only, and what they must be.
 _NEEDS = {
     "axis": ("cylinder", "three numbers, not all zero, are needed"),
     "outside": ("plane", "three finite numbers are needed"),
 }
-"""Options that apply to some shapes only, and what they must be."""
 
 
 @overload

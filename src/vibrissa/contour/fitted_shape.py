@@ -19,14 +19,12 @@ from scipy.special import chdtri
 from vibrissa.numerics import Array, Mask
 from vibrissa.quantities import QUANTITIES, attributes
 
+# Smallest standard deviation, as a share of the points' extent, where their noise is zero.
 FLOOR = 1e-7
-"""Smallest standard deviation, as a share of the points' extent, where their noise is zero."""
-
+# Variance of the least noisy combination as a share of that of the point or normal, at least.
 _FINE = 1e-10
-"""Variance of the least noisy combination as a share of that of the point or normal, at least."""
-
+# Largest negative eigenvalue of a covariance by rounding, as a share of the largest.
 _NEGATIVE = 1e-8
-"""Largest negative eigenvalue of a covariance by rounding, as a share of the largest."""
 
 
 class Touches(NamedTuple):
@@ -240,8 +238,7 @@ def continuing_candidates(candidates: ArrayLike, frames: ArrayLike) -> NDArray[n
     return chosen
 
 
-DIRECTION = "object_axis"
-"""Quantity of unit vectors; all other parameters are lengths."""
+DIRECTION = "object_axis"  # quantity of unit vectors; all other parameters are lengths
 
 
 class Body(Protocol):
@@ -469,8 +466,8 @@ class FittedShape(ABC):
         return cls(covariance=dataset["parameter_covariance"].values, **rows_of(dataset), **values)
 
 
+# Variables of the points that a shape was fitted to.
 _EACH = ("surface_distance", "inlier", "chi_squared")
-"""Variables of the points that a shape was fitted to."""
 
 
 def check_complete(dataset: xr.Dataset, kind: str, names: set[str]) -> None:

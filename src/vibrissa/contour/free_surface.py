@@ -72,17 +72,10 @@ from vibrissa.deferred import spatial
 from vibrissa.numerics import Array, Mask
 from vibrissa.quantities import attributes
 
-_AT_ONCE = 4096
-"""Rows that are done at once, so that intermediate arrays do not fill the memory."""
-
-_STEP = 1e-4
-"""Step of differences, as a share of the length."""
-
-_FINER = 0.9
-"""Edge of the next smaller cubes that neighbours are merged in."""
-
-_FINEST = 1e-3
-"""Edge of the smallest cubes, as a share of the points' extent."""
+_AT_ONCE = 4096  # rows that are done at once, so that intermediate arrays do not fill the memory
+_STEP = 1e-4  # step of differences, as a share of the length
+_FINER = 0.9  # edge of the next smaller cubes that neighbours are merged in
+_FINEST = 1e-3  # edge of the smallest cubes, as a share of the points' extent
 
 
 class Support(NamedTuple):
@@ -316,55 +309,29 @@ def _parts(count: int) -> list[slice]:
     return [slice(start, start + _AT_ONCE) for start in range(0, count, _AT_ONCE)]
 
 
+# Largest deviations from a base, as a share of those from simpler ones, for it to be chosen. Where
+# a sphere fits, a plane is no worse only if the object is flat; a cylinder must fit well, as an
+# object that is round at its ends does not deviate smoothly from one.
 _BETTER = {"plane": 1.0, "sphere": 0.9, "cylinder": 0.5}
-"""Largest deviations from a base, as a share of those from simpler ones, for it to be chosen.
-
-Where a sphere fits, a plane is no worse only if the object is flat; a cylinder must fit well, as an
-object that is round at its ends does not deviate smoothly from one.
-"""
-
-_MOST = 0.95
-"""Share of the contacts whose deviations are at most these."""
-
+_MOST = 0.95  # share of the contacts whose deviations are at most these
+# Bounds of amplitude and length, as shares of the points' extent or the base's radius.
 _AMPLITUDES = (0.1, 2.0)
 _LENGTHS = (0.1, 1.0)
-"""Bounds of amplitude and length, as shares of the points' extent or the base's radius."""
-
-_FOR_BOUNDS = 200
-"""Number of positions that amplitude and length are estimated from, at most."""
-
-_OUTLIER = 4.0
-"""Miss, in standard deviations, from which a contact is an outlier."""
-
+_FOR_BOUNDS = 200  # number of positions that amplitude and length are estimated from, at most
+_OUTLIER = 4.0  # miss, in standard deviations, from which a contact is an outlier
+# Standard deviation, as a share of radius and extent, up to which contacts are used. A contact far
+# along a round surface is mostly there by error, and always outside of it.
 _SHARP = 0.1
-"""Standard deviation, as a share of radius and extent, up to which contacts are used.
-
-A contact far along a round surface is mostly there by error, and always outside of it.
-"""
-
-_FEW = 50
-"""Number of the sharpest contacts to use if fewer are left, or less than a quarter."""
-
+_FEW = 50  # number of the sharpest contacts to use if fewer are left, or less than a quarter
+# Standard deviation of the surface's slope against its base, at first and at least.
 _SLOPE, _LEAST_SLOPE = 0.2, 0.02
-"""Standard deviation of the surface's slope against its base, at first and at least."""
-
-_NEIGHBOURS = 9
-"""Number of contacts whose median an outlier is found by at first."""
-
-_ROUNDS = 2
-"""Number of times that the deviation is fitted, with the slope of the fit before."""
-
-_PLACING_ROUNDS = 5
-"""Largest number of moves of a contact's foot until its offset is zero."""
-
+_NEIGHBOURS = 9  # number of contacts whose median an outlier is found by at first
+_ROUNDS = 2  # number of times that the deviation is fitted, with the slope of the fit before
+_PLACING_ROUNDS = 5  # largest number of moves of a contact's foot until its offset is zero
+# Bounds of the variance that no covariance contains, in units of the extent squared.
 _NOISES = (1e-10, 1e-2)
-"""Bounds of the variance that no covariance contains, in units of the extent squared."""
-
-_FLOOR = 1e-9
-"""Standard deviation, m, of a contact that is stated to be exact."""
-
-_TINY = 1e-12
-"""Standard deviation, m, of a distance at least."""
+_FLOOR = 1e-9  # standard deviation, m, of a contact that is stated to be exact
+_TINY = 1e-12  # standard deviation, m, of a distance at least
 
 
 def fit_free(

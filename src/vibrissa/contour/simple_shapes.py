@@ -26,11 +26,9 @@ from numpy.typing import ArrayLike
 from vibrissa.contour.fitted_shape import DIRECTION, FLOOR, Checked, FittedShape, Touches
 from vibrissa.numerics import Array
 
+# Radius to start from, at least, as a share of that of the surface that the points are on.
 _SMALLEST = 1e-3
-"""Radius to start from, at least, as a share of that of the surface that the points are on."""
-
-_TINY = 1e-12
-"""Squared radius to start from, at least, in units of the extent squared."""
+_TINY = 1e-12  # squared radius to start from, at least, in units of the extent squared
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -425,10 +423,10 @@ class PlaneFit(Plane):
     """
 
 
+# Shapes by their kind, the simpler first.
 SHAPES: dict[str, type[SimpleShape]] = {
     shape.kind: shape for shape in (PlaneFit, SphereFit, CylinderFit)
 }
-"""Shapes by their kind, the simpler first."""
 
 
 def frame_across(direction: Array, toward: Array | None = None) -> Array:

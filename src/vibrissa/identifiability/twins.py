@@ -488,10 +488,9 @@ def _along(slope: Array, before: Array, sense: float) -> Array:
     return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
 
 
+# Largest difference of a saved witness's signals from those of the whisker.
 _NODES = 101
 _AGREE = 1e-6
-"""Largest difference of a saved witness's signals from those of the whisker."""
-
 _NEEDED = {"witness_arc_length", "witness_contact_force", "witness_separation"}
 
 

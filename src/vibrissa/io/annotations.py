@@ -175,8 +175,7 @@ ANGLES = ("azimuth", "elevation", "roll")
 QUATERNION = ("qw", "qx", "qy", "qz")
 MATRIX = tuple(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))
 
-_ROUNDED = 1e-3
-"""Largest error of a quaternion's length and of a matrix's RᵀR: tables cut decimals."""
+_ROUNDED = 1e-3  # largest error of a quaternion's length and of a matrix's RᵀR: tables cut decimals
 
 
 def load_head(path: str | PathLike[str]) -> xr.Dataset:
@@ -324,8 +323,7 @@ def save_corrections(
 
 Points = tuple[tuple[float, float], ...]
 
-_FEWEST = 3
-"""Number of corners of a polygon, at least."""
+_FEWEST = 3  # number of corners of a polygon, at least
 
 
 @dataclass(frozen=True)

@@ -157,6 +157,7 @@ def _of_text(path: Path) -> Kind:
     return Kind.UNKNOWN
 
 
+# Reader of each kind of other programs' files.
 READERS: Mapping[Kind, Callable[[Path], RawTracks]] = MappingProxyType(
     {
         Kind.WHISKERS: read_whiskers,
@@ -171,7 +172,6 @@ READERS: Mapping[Kind, Callable[[Path], RawTracks]] = MappingProxyType(
         Kind.TRACKS_TABLE: read_tracks_table,
     }
 )
-"""Reader of each kind of other programs' files."""
 
 
 def load_tracks(

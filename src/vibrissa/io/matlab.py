@@ -214,10 +214,10 @@ def _without_padding(points: Array) -> Array:
     return points[: there[-1] + 1 if there.size else 0]
 
 
+# Kinds of elements of version 5: integers, floats, matrices, what is compressed, text.
 _HEADER = 128
 _MATRIX, _COMPRESSED = 14, 15
 _ELEMENTS = {*range(1, 8), 9, 12, 13, _MATRIX, _COMPRESSED, 16, 17, 18}
-"""Kinds of elements of version 5: integers, floats, matrices, what is compressed, text."""
 
 
 def matlab_values(path: str | PathLike[str]) -> dict[str, Any]:

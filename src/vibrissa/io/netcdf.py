@@ -39,14 +39,11 @@ _DENSEST = 1100
 ALWAYS_ALLOWED = 1 << 28
 """Bytes that any file may claim to hold."""
 
-_TICK = 100_000_000
-"""Time by which clocks of file systems may be behind, ns, with room."""
-
+_TICK = 100_000_000  # time by which clocks of file systems may be behind, ns, with room
 _HEAP = b"GCOL\1\0\0\0"
 
+# Name of a dimension that has no coordinates.
 _NO_DATA = b"This is a netCDF dimension but not a netCDF variable"
-"""Name of a dimension that has no coordinates."""
-
 _FORMAT = {"CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST", "_nc3_strict"}
 _FORMAT |= {"_NCProperties", "_Netcdf4Coordinates", "_Netcdf4Dimid"}
 """Attributes by which NetCDF-4 is kept in HDF5."""
@@ -194,8 +191,8 @@ def _check_type(name: str, kind: h5t.TypeID) -> None:
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
+# Encoding of large variables, without loss.
 COMPRESSED: Mapping[str, Any] = {"zlib": True, "complevel": 1, "shuffle": True}
-"""Encoding of large variables, without loss."""
 
 
 def is_netcdf(path: str | PathLike[str]) -> bool:

@@ -260,6 +260,7 @@ def _table(
     return table
 
 
+# Dimensions in addition to time and whisker; longer names before those that they begin with.
 _SPACE = ("space",)
 _SERIES: dict[str, tuple[str, ...]] = {
     "base_position": _SPACE,
@@ -269,8 +270,6 @@ _SERIES: dict[str, tuple[str, ...]] = {
     "force": _SPACE,
     "moment": _SPACE,
 }
-"""Dimensions in addition to time and whisker; longer names before those that they begin with."""
-
 _HEAD: dict[str, tuple[str, ...]] = {
     "head_position": _SPACE,
     "head_rotation": (*_SPACE, "head_axis"),

@@ -48,8 +48,7 @@ _SERIES = {
 _NOBODY = {"subject_id": "unknown", "sex": "U", "age": "P0D/", "description": "not stated"}
 
 
-_VECTORS = 2
-"""Number of dimensions of vectors over time."""
+_VECTORS = 2  # number of dimensions of vectors over time
 
 
 @dataclass(frozen=True)

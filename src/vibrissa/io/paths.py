@@ -21,18 +21,13 @@ from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 
-NETCDF = (".nc", ".nc4", ".netcdf", ".cdf", ".h5", ".hdf5")
-"""Endings of NetCDF-4 files."""
-
-CSV = (".csv",)
-"""Endings of tables as text."""
-
-NWB = (".nwb",)
-"""Endings of Neurodata Without Borders files."""
+NETCDF = (".nc", ".nc4", ".netcdf", ".cdf", ".h5", ".hdf5")  # endings of NetCDF-4 files
+CSV = (".csv",)  # endings of tables as text
+NWB = (".nwb",)  # endings of Neurodata Without Borders files
 
 
+# First bytes of whisk's binary files, and the names of these files.
 _WHISK = {b"bwhiskbin": "traces of whisk (.whiskers)", b"measv": "measurements of whisk"}
-"""First bytes of whisk's binary files, and the names of these files."""
 
 
 _VIDEO_PART = re.compile(r"^(?P<file>.+)#(?P<part>\d+,\d+,\d+,\d+(?::[a-z]+)*)$", re.DOTALL)

@@ -33,9 +33,7 @@ from vibrissa.whisker import Whisker
 
 GROUP = "whiskers"
 
-RECORDING_KIND = "vibrissa recording"
-"""Value of the attribute ``kind`` of a recording."""
-
+RECORDING_KIND = "vibrissa recording"  # value of the attribute ``kind`` of a recording
 _SMALLEST = 1000
 
 

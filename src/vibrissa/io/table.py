@@ -220,10 +220,9 @@ def few_faults(faults: Sequence[str]) -> str:
     return "; ".join(faults[:5]) + more
 
 
+# Units of length, with how many metres they are; µ is written u.
 _SMALLER = {"": 1.0, "m": 1e-3, "u": 1e-6, "n": 1e-9}
 LENGTHS: Mapping[str, float] = MappingProxyType({"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6})
-"""Units of length, with how many metres they are; µ is written u."""
-
 _UNITS: Mapping[str, Mapping[str, float]] = MappingProxyType(
     {
         "time": {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},

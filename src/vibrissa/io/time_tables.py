@@ -52,12 +52,10 @@ from vibrissa.quantities import attributes
 from vibrissa.status import Status, flag_attributes
 from vibrissa.whisker import Whisker
 
+# Names of the columns, in the order in which they are written.
 COLUMNS = ("time", "Fx", "Fy", "Fz", "Mx", "My", "Mz")
-"""Names of the columns, in the order in which they are written."""
-
+# Note on a table without time.
 NUMBERED = "there is no time, so the rows are numbered from 0 in its column"
-"""Note on a table without time."""
-
 _KINDS = {"t": "time", "F": "force", "M": "moment"}
 # What a wire of steel as thick as a finger holds.
 _LARGEST = {"F": (1e4, "N"), "M": (1e3, "N·m")}
@@ -302,11 +300,10 @@ def _dataset(table: Array) -> xr.Dataset:
     )
 
 
+# Names of the columns with numbers, in their order; the last column is the status.
 NUMBERS = ("time", "x", "y", "z", "r", "theta", "phi", "sigma_x", "sigma_y", "sigma_z")
-"""Names of the columns with numbers, in their order; the last column is the status."""
-
+# Columns before the status that are written where there is something to write.
 _OPTIONAL = ("one_contact", "friction")
-"""Columns before the status that are written where there is something to write."""
 
 
 def save_contacts(path: str | PathLike[str], contacts: xr.Dataset) -> None:
@@ -371,12 +368,12 @@ def load_contacts(path: str | PathLike[str]) -> xr.Dataset:
     return xr.Dataset({k: v for k, v in columns.items() if k != "time"}, {"time": columns["time"]})
 
 
+# Names of the columns, in their order.
 CONTOUR = (
     *("time", "whisker", "x", "y", "z", "sigma_x", "sigma_y", "sigma_z"),
     *("normal_x", "normal_y", "normal_z", "surface_x", "surface_y", "surface_z"),
     *("surface_distance", "inlier"),
 )
-"""Names of the columns, in their order."""
 
 
 def save_contour(path: str | PathLike[str], contour: xr.Dataset) -> None:

@@ -46,12 +46,9 @@ from vibrissa.quantities import attributes
 KIND = "vibrissa tracks"
 """Value of the attribute ``kind`` of tracks."""
 
+# Units of length that can be stated, and their size, m.
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6}
-"""Units of length that can be stated, and their size, m."""
-
-LONGEST = 1.0
-"""No whisker reaches across more in one frame, m."""
-
+LONGEST = 1.0  # no whisker reaches across more in one frame, m
 IMAGE = ("time", "whisker", "view", "node", "image_axis")
 SPACE = ("time", "whisker", "node", "space")
 
@@ -496,9 +493,9 @@ def _names(tracks: xr.Dataset, dim: str) -> list[str]:
     return [str(i) for i in range(tracks.sizes[dim])]
 
 
+# Points (n, 2), deviations (n,), seen (n,), confidence, whether base and tip are, skew, sparse; the
+# last is not stored, as traces of videos never are.
 Row = tuple[Array, Array, NDArray[np.bool_], float, bool, bool, float, bool]
-"""Points (n, 2), deviations (n,), seen (n,), confidence, whether base and tip are, skew, sparse;
-the last is not stored, as traces of videos never are."""
 
 
 def save_traces(path: str | PathLike[str], key: str, traces: Sequence[Sequence[Row]]) -> None:

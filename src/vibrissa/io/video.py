@@ -217,8 +217,7 @@ def grey_frame(frame: Any) -> Frame:
     return np.asarray(frame.to_ndarray(format="gray"), dtype=np.uint8)
 
 
-AHEAD = 60
-"""Frames that are rather decoded one after another than jumped over."""
+AHEAD = 60  # frames that are rather decoded one after another than jumped over
 
 
 class Footage:
@@ -380,15 +379,10 @@ def _of_images(files: Sequence[Path]) -> dict[str, list[Frame]]:
     }
 
 
-CODECS = {".mkv": "ffv1", ".mp4": "h264"}
-"""Codec of a video by the ending of its file."""
-
+CODECS = {".mkv": "ffv1", ".mp4": "h264"}  # codec of a video by the ending of its file
+# H.264's constant rate factor: 0 is lossless, 23 its usual default; here faint tips must last.
 QUALITY = 16
-"""H.264's constant rate factor: 0 is lossless, 23 its usual default; here faint tips must last."""
-
-_MOVIE_QUALITY = 20
-"""H.264's constant rate factor that is good enough for thin lines."""
-
+_MOVIE_QUALITY = 20  # H.264's constant rate factor that is good enough for thin lines
 # FFmpeg's numbers for: grey values from 0 to 255; from 16 to 235, as players expect; and the
 # colours of HD television (BT.709).
 _FULL, _TELEVISION, _HD = 2, 1, 1

@@ -72,19 +72,16 @@ from vibrissa.whisker import (
     published_radii,
 )
 
+# Suffix of a column's name and the length it stands for, m.
 UNITS = {"": 1.0, "_m": 1.0, "_mm": 1e-3, "_um": 1e-6, "_µm": 1e-6}
-"""Suffix of a column's name and the length it stands for, m."""
-
 ALLOWED = "x_mm,y_mm,z_mm (also _um, _cm, _m) or x,y,z in metres; z may be left out"
 
+# Share of the mean radius by which an end is thicker, at least, that counts as the base.
 _COORDINATE = re.compile(r"([xyz])(?![a-z0-9])(.*)", re.IGNORECASE)
 _THICKNESS = re.compile(r"(radius|diameter)(?![a-z0-9])(.*)", re.IGNORECASE)
 _THINNEST, _THICKEST = 1e-5, 0.1
 _TAPERED = 0.01
-"""Share of the mean radius by which an end is thicker, at least, that counts as the base."""
-
-_SURE = 4.0
-"""Standard errors by which it is thicker, at least."""
+_SURE = 4.0  # standard errors by which it is thicker, at least
 _PLANAR = "the file has no column z: the whisker was taken to be planar"
 
 
@@ -389,6 +386,7 @@ def _array(path: Path, whiskers: Sequence[Whisker]) -> WhiskerArray:
         raise ValueError(f"{path}: {fault}") from None
 
 
+# Largest entry of RᵀR − 1 that rounding in a table explains.
 _ANGLES = ("azimuth", "elevation", "roll")
 _ROTATION = tuple(f"r{i}{j}" for i in "123" for j in "123")
 _TURNS = {"_deg": np.pi / 180.0, "_rad": 1.0}
@@ -399,7 +397,6 @@ _NEEDED = (
     "name, x_mm, y_mm, z_mm, azimuth_deg, elevation_deg, roll_deg, length_mm and coefficient_per_mm"
 )
 _NEARLY = 1e-3
-"""Largest entry of RᵀR − 1 that rounding in a table explains."""
 
 
 def whiskers_from_table(path: Path) -> list[Whisker]:

@@ -24,9 +24,7 @@ from vibrissa.objects.surface import Surface
 
 Ints = NDArray[np.int64]
 
-NODES = 1_200_000
-"""Nodes of the grid where no spacing is given."""
-
+NODES = 1_200_000  # nodes of the grid where no spacing is given
 _MOST = 30_000_000
 _BAND = 3
 # Cells around the body: room for a whisker's radius, and for the spline to settle.

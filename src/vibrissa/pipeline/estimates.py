@@ -29,12 +29,9 @@ from vibrissa.whisker import Whisker
 Progress = Callable[[str, int, int], None]
 """Function called with the present stage, and the numbers of steps done and of all steps."""
 
-WHOLE = "wrench"
-"""Value of ``using`` for force and moment whole, instead of names of signals."""
-
+WHOLE = "wrench"  # value of ``using`` for force and moment whole, instead of names of signals
+# Standard deviation of the normals of swept surfaces, rad: friction across the wire turns them.
 NORMAL_SIGMA = 0.1
-"""Standard deviation of the normals of swept surfaces, rad: friction across the wire turns them."""
-
 _LABORATORY = {"reference_frame": "laboratory"}
 _SQUARE = ("time", "space", "space_2")
 

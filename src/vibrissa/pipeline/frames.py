@@ -14,18 +14,13 @@ from vibrissa.recording import Group, faults_in, recorded
 from vibrissa.signals import base_signals
 from vibrissa.whisker import Whisker
 
-EACH = ("time", "whisker")
-"""Dimensions of contacts."""
-
+EACH = ("time", "whisker")  # dimensions of contacts
+# Covariances of the wrench and of the pose.
 SQUARES = ("wrench_covariance", "pose_covariance", "pose_wrench_covariance")
-"""Covariances of the wrench and of the pose."""
-
-_SKEW = 1e-3
-"""Largest deviation of a rotation times its transpose from the identity."""
-
+_SKEW = 1e-3  # largest deviation of a rotation times its transpose from the identity
+# Variables of the group ``signals``.
 MEASURED = ("force", "moment", "base_position", "base_rotation", "in_contact", "status")
-"""Variables of the group ``signals``."""
-
+# Variables of the group ``estimates``.
 ESTIMATED = (
     "contact_point",
     "contact_covariance",
@@ -37,7 +32,6 @@ ESTIMATED = (
     "in_contact",
     "status",
 )
-"""Variables of the group ``estimates``."""
 
 
 def check_recording(recording: xr.DataTree) -> None:
@@ -109,8 +103,8 @@ def signals_in(recording: xr.DataTree) -> xr.Dataset:
     return _group_in(recording, "signals", MEASURED)
 
 
+# Function and verb of the command line that make a group.
 _VERBS = {"signals": ("signals_of", "signals"), "estimates": ("estimates_of", "estimate")}
-"""Function and verb of the command line that make a group."""
 
 
 def _group_in(recording: xr.DataTree, name: str, needs: Sequence[str]) -> xr.Dataset:

@@ -27,48 +27,25 @@ from vibrissa.simulation import Dynamics, Vibration, fit_dynamics, inertial_wren
 from vibrissa.status import Status
 from vibrissa.whisker import Whisker
 
-_ROUNDS = 2
-"""Number of corrections."""
-
+_ROUNDS = 2  # number of corrections
+# Components of the wrench along the whisker at its base.
 _ALONG = np.array([1.0, 0.0, 0.0, 1.0, 0.0, 0.0])
-"""Components of the wrench along the whisker at its base."""
-
-_SETTLED = 10e-3
-"""Age of a contact from which a held chain is nearer, s."""
-
-_KNOWN_TO = 0.2
-"""Relative standard deviation of mass and damping."""
-
+_SETTLED = 10e-3  # age of a contact from which a held chain is nearer, s
+_KNOWN_TO = 0.2  # relative standard deviation of mass and damping
+# Relative standard deviation of the stiffness, by which ringing also shows the mass.
 _STIFFNESS_KNOWN_TO = 0.1
-"""Relative standard deviation of the stiffness, by which ringing also shows the mass."""
-
+# Error as a share of how far two ways are apart, and of the root mean square of that and of the
+# correction.
 _APART, _LEFT = 0.3, 0.15
-"""Error as a share of how far two ways are apart, and of the root mean square of that and of the
-correction."""
-
+# Contact force from which contact points must be wrong, over the largest that is measured.
 _SLIPS = 2.0
-"""Contact force from which contact points must be wrong, over the largest that is measured."""
-
-_MEMORY = 4e-3
-"""Standard deviation of the window in which that is taken, s."""
-
-_SMOOTH = 3e-3
-"""Standard deviation of the window in which contact points are smoothed, s."""
-
-_ONSET = 4e-3
-"""Time constant with which contact points after an onset begin to count, s."""
-
-_POINT = 1e-6
-"""Least standard deviation of a contact point, m."""
-
-_FEWEST = 8
-"""Fewest frames with force and moment."""
-
-_UNEQUAL = 1e-3
-"""Largest relative difference of the times between frames."""
-
-_LEAST = 4
-"""Fewest frames of a contact with a correction of its own."""
+_MEMORY = 4e-3  # standard deviation of the window in which that is taken, s
+_SMOOTH = 3e-3  # standard deviation of the window in which contact points are smoothed, s
+_ONSET = 4e-3  # time constant with which contact points after an onset begin to count, s
+_POINT = 1e-6  # least standard deviation of a contact point, m
+_FEWEST = 8  # fewest frames with force and moment
+_UNEQUAL = 1e-3  # largest relative difference of the times between frames
+_LEAST = 4  # fewest frames of a contact with a correction of its own
 
 
 class _Trial(NamedTuple):

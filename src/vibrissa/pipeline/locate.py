@@ -60,26 +60,18 @@ from vibrissa.whisker import Whisker
 TRIPLET = ("Fx", "MB", "MD")
 """Signals that contacts are estimated from by default."""
 
+# Bending moment from which a contact is detected, in standard deviations of its noise.
 DETECTED = 5.0
-"""Bending moment from which a contact is detected, in standard deviations of its noise."""
-
+# Ratio of forces along and across the whisker, one sigma, where second contacts are looked for.
 _FRICTION = 0.3
-"""Ratio of forces along and across the whisker, one sigma, where second contacts are looked for."""
-
-_OF_ROD = ("stiffness_sigma", "compliance_sigma")
-"""Errors of the whisker and its base."""
-
+_OF_ROD = ("stiffness_sigma", "compliance_sigma")  # errors of the whisker and its base
 _WHISKER = {"reference_frame": "whisker"}
 
 
-_FREE = [0, 2, 3]
-"""Unknowns of x without friction."""
-
-_STEP = 1e-5
-"""Relative step of differences."""
-
+_FREE = [0, 2, 3]  # unknowns of x without friction
+_STEP = 1e-5  # relative step of differences
+# Least singular value, of columns scaled to one, from which derivatives can be inverted.
 _SINGULAR = 1e-10
-"""Least singular value, of columns scaled to one, from which derivatives can be inverted."""
 
 
 class _Candidates(NamedTuple):

@@ -23,15 +23,14 @@ _COMPONENTS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 _ANGLES = ("base_azimuth", "base_elevation", "base_roll")
 _RATE = "_rate"
 
+# Names of the 16 columns that models of spikes use.
 PREDICTORS = (
     *_COMPONENTS,
     *_ANGLES[:2],
     *(name + _RATE for name in (*_COMPONENTS, *_ANGLES[:2])),
 )
-"""Names of the 16 columns that models of spikes use."""
-
+# Groups that hold force, moment and pose, the first one that has them counts.
 _GROUPS = ("signals", "", "truth")
-"""Groups that hold force, moment and pose, the first one that has them counts."""
 
 
 def predictors(recording: xr.DataTree) -> xr.Dataset:

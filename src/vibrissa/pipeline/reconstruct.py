@@ -40,22 +40,16 @@ from vibrissa.signals import nearest_on_rest
 from vibrissa.status import describe
 from vibrissa.whisker import Whisker
 
-Shape = Literal["cylinder", "sphere", "plane", "free"]
-"""Shapes that can be fitted to contacts."""
-
+Shape = Literal["cylinder", "sphere", "plane", "free"]  # shapes that can be fitted to contacts
+# Uncertainty of every contact apart from the signals', m: the tolerance of the mechanics.
 SOLVED_TO = 1e-6
-"""Uncertainty of every contact apart from the signals', m: the tolerance of the mechanics."""
-
+# Share of the variance by errors that all frames share that need not be followed to the object.
 _LEFT_OUT = 1e-4
-"""Share of the variance by errors that all frames share that need not be followed to the object."""
-
+# Standard deviation of the angle between normal and force across the whisker, rad. For contacts
+# with friction: along the whisker it is measured by the wrench and removed, across the whisker and
+# along the object it is not. Pegs are found best with 0.05 to 0.3 at any coefficient of friction up
+# to 0.5, and hardly worse without friction (docs/validation.md).
 LEAN = 0.1
-"""Standard deviation of the angle between normal and force across the whisker, rad.
-
-For contacts with friction: along the whisker it is measured by the wrench and removed, across the
-whisker and along the object it is not. Pegs are found best with 0.05 to 0.3 at any coefficient of
-friction up to 0.5, and hardly worse without friction (docs/validation.md).
-"""
 
 
 def reconstruct(
@@ -352,14 +346,10 @@ def _compared(
     return out
 
 
+# Shapes with few parameters.
 SIMPLE: tuple[Shape, ...] = tuple(shape for shape in get_args(Shape) if shape != "free")
-"""Shapes with few parameters."""
-
-AGREES = 4.0
-"""χ² per degree of freedom up to which contacts agree with a shape: twice their noise."""
-
-STRONG = 10.0
-"""Difference of the information criterion from which one shape is better than another."""
+AGREES = 4.0  # χ² per degree of freedom up to which contacts agree with a shape: twice their noise
+STRONG = 10.0  # difference of the information criterion from which one shape is better than another
 
 
 def compare_shapes(
@@ -422,8 +412,8 @@ def compare_shapes(
     )
 
 
+# Edges of the classes of deflection angle, degrees.
 ANGLE_CLASSES = (0.0, 2.0, 5.0, 10.0, 15.0, 90.0)
-"""Edges of the classes of deflection angle, degrees."""
 
 
 def nearest_object(

@@ -47,11 +47,9 @@ from vibrissa.status import Status
 from vibrissa.tracking import CUTOFF, BasePose, HeadPose
 from vibrissa.whisker import Whisker, angles_of
 
-Source = Literal["contact point", "rod", "sensor"]
-"""Source of signals."""
-
+Source = Literal["contact point", "rod", "sensor"]  # source of signals
+# Values in frames without signals where these are not NaN.
 _ELSEWHERE = {"in_contact": (False,), "status": (np.int8(Status.MISSING),)}
-"""Values in frames without signals where these are not NaN."""
 
 
 def signals_of(

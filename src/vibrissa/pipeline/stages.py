@@ -21,8 +21,7 @@ from vibrissa.pipeline.reconstruct import reconstruct
 from vibrissa.pipeline.signals import signals_of
 from vibrissa.recording import Recording
 
-STAGES = ("signals", "estimates", "contour")
-"""Groups in the order in which they are made."""
+STAGES = ("signals", "estimates", "contour")  # groups in the order in which they are made
 
 
 def due_stages(recording: xr.DataTree, last: str, asked: Collection[str] = ()) -> tuple[str, ...]:
@@ -134,8 +133,7 @@ def with_contour(
     return with_group(recording, "contour", reconstruct(recording, *args, **options))
 
 
-_BEFORE = ("signals", "", "truth")
-"""Groups in which contacts are looked for, the best known first."""
+_BEFORE = ("signals", "", "truth")  # groups in which contacts are looked for, the best known first
 
 
 @dataclass(frozen=True)

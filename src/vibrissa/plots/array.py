@@ -41,19 +41,16 @@ from vibrissa.recording import Group
 from vibrissa.scene import head_surfaces, is_bounded, object_surface
 from vibrissa.whisker import Identity
 
+# One colour a row, from the top down; whiskers of no known row are black.
 ROW_COLOURS: Mapping[str, str] = MappingProxyType(
     {"A": "#0072b2", "B": "#56b4e9", "C": "#009e73", "D": "#e69f00", "E": "#d55e00"}
 )
-"""One colour a row, from the top down; whiskers of no known row are black."""
-
+# From where space is seen: elevation and azimuth, degrees; from before the animal's right, and from
+# behind it, where one sees the side of things that whiskers touch.
 _HEAD, _THING, _EDGE = "#e9e2da", "#d5d9de", "#b3aba2"
 _AT_REST, _IN_A_TRIAL = (22.0, 38.0), (26.0, -22.0)
-"""From where space is seen: elevation and azimuth, degrees; from before the animal's right, and
-from behind it, where one sees the side of things that whiskers touch."""
-
-_CLEAR = 0.7
-"""Opacity of objects in space, which hide what touches them from behind."""
-
+_CLEAR = 0.7  # opacity of objects in space, which hide what touches them from behind
+# Room around and between the panels, mm.
 _PANELS = (
     # letter, title, right and up, sense of the axis to the right, axis toward the viewer
     ("a", "from above", (0, 1), 1.0, 2),
@@ -61,7 +58,6 @@ _PANELS = (
     ("d", "from its right", (1, 2), 1.0, 0),
 )
 _LEFT, _GAP, _BOTTOM, _TOP, _RIGHT = 10.0, 13.0, 8.5, 6.5, 3.0
-"""Room around and between the panels, mm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,8 +132,7 @@ def array_views(
         return _drawn(scene, width)
 
 
-_SIDEWAYS = 0.5
-"""Cosine between x and the animal's right from which on left and right are written."""
+_SIDEWAYS = 0.5  # cosine between x and the animal's right from which on left and right are written
 
 
 def _drawn(scene: _Scene, width: Width) -> Figure:

@@ -38,12 +38,11 @@ from vibrissa.plots.space import (
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import robust_limits
 
+# Values of the paper's surfaces, mm and degrees.
 _LEVELS = 3
 _PAPER = {"r": (11.0, 15.0, 24.0), "theta": (-25.0, 5.0, 35.0), "phi": (-25.0, 5.0, 35.0)}
-"""Values of the paper's surfaces, mm and degrees."""
-
+# Bearings drawn where solids and surfaces are cut open: all but a quarter.
 _OPEN = (np.pi, 2.5 * np.pi)
-"""Bearings drawn where solids and surfaces are cut open: all but a quarter."""
 
 
 class _Panel(NamedTuple):
@@ -281,16 +280,13 @@ def _gentle(nodes: Array, measured: Array) -> Array:
     return np.stack([tension, bending], axis=-1)
 
 
+# Directions, the size that belongs to each, and the components that both make.
 _PANELS = ("r", "theta", "phi", "error_distance")
 _CIRCLES = {"MD": ("MB", "My", "Mz"), "FD": ("FT", "Fy", "Fz")}
-"""Directions, the size that belongs to each, and the components that both make."""
-
-_STEPS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
-"""Errors, mm, that have a tick."""
-
+_STEPS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)  # errors, mm, that have a tick
+# Angles below this, degrees, are not worth lines: a planar whisker stays in its plane.
 _MOST = 12_000
 _NOTHING = 0.1
-"""Angles below this, degrees, are not worth lines: a planar whisker stays in its plane."""
 
 
 def solid_slices(

@@ -29,13 +29,10 @@ from vibrissa.plots.style import (
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import COORDINATES, Course, deflection_angles, robust_limits
 
+# Visible part of the head: its eyes and the snout, mm.
 _SNAPSHOTS = 7
 _FACE = np.array([[-11.0, -26.0, 2.0], [11.0, -26.0, 2.0], [0.0, 0.0, 0.0]])
-"""Visible part of the head: its eyes and the snout, mm."""
-
-_ROOM = 2.0
-"""Around what is to be seen, mm."""
-
+_ROOM = 2.0  # around what is to be seen, mm
 _VIEWS = ((0, 1), (0, 2), (0, 1), (1, 2))
 _TITLES = (
     "about the whisker, top",

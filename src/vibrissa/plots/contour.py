@@ -35,15 +35,14 @@ from vibrissa.plots.space import (
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import robust_limits
 
+# 95 % of a chi-square of two degrees of freedom.
 _VIEWS = ((0, 1), (0, 2), (1, 2))
 _NAMES = "xyz"
 _TITLES = ("top", "front", "side")
 _CHI2_95 = 5.991464547107979
-"""95 % of a chi-square of two degrees of freedom."""
-
+# Room around and between the views, mm on paper.
 _MOST_ELLIPSES = 60
 _LEFT, _GAP, _BAR, _BOTTOM, _TOP = 12.0, 12.0, 15.0, 8.5, 11.0
-"""Room around and between the views, mm on paper."""
 
 
 def contour_views(
@@ -276,9 +275,9 @@ def _across(body: Body) -> str:
     return "" if radius is None else f", {2.0 * float(to_display('object_radius', radius)):.2f} mm"
 
 
+# Largest distance that is shown, µm: predictions for the lightest contacts may be any larger.
 _HEIGHT = 52.0
 _FARTHEST = 1e5
-"""Largest distance that is shown, µm: predictions for the lightest contacts may be any larger."""
 
 
 def distances_by_class(summaries: Sequence[xr.Dataset], *, width: style.Width = "double") -> Figure:

@@ -52,12 +52,9 @@ from vibrissa.scene import TRIPLET, Course
 
 Picture = NDArray[np.uint8]
 
+# Size of a movie's figure, mm: lettering is as large in it as on a page of two columns.
 WIDTH, HEIGHT = 203.2, 114.3
-"""Size of a movie's figure, mm: lettering is as large in it as on a page of two columns."""
-
-SIZE = (1280, 720)
-"""Size of a movie, pixels."""
-
+SIZE = (1280, 720)  # size of a movie, pixels
 _DPI = 160.0
 
 
@@ -169,14 +166,13 @@ class _Cloud(NamedTuple):
     places: Array
 
 
+# Distance from a contact within which an outline appears, as a share of the view's width.
 _REVEALED = 0.05
-"""Distance from a contact within which an outline appears, as a share of the view's width."""
-
+# Looks of the outlines of true objects and of fitted shapes.
 _OUTLINES: tuple[dict[str, Any], ...] = (
     {"color": style.MUTED, "linewidth": 1.6, "zorder": 1.5},
     {"color": style.ORANGE, "linewidth": 0.9, "zorder": 2.0},
 )
-"""Looks of the outlines of true objects and of fitted shapes."""
 
 
 class _Outline:
@@ -428,9 +424,7 @@ def _bar(figure: Figure, norm: Normalize) -> None:
     rail.tick_params(length=2.0, pad=1.5)
 
 
-_TRAIL = 0.05
-"""Duration for which the way just gone stays bold, s."""
-
+_TRAIL = 0.05  # duration for which the way just gone stays bold, s
 _BOXES = tuple(
     (left, bottom, wide, 12.0)
     for left, wide in ((14.0, 83.0), (115.0, 86.0))

@@ -27,9 +27,9 @@ from vibrissa.scene import COORDINATES, TRIPLET, Course
 
 Grey = NDArray[np.uint8]
 
+# Grey value beyond the edge of an image.
 _ROOM = 0.08
 _LIGHT = 235
-"""Grey value beyond the edge of an image."""
 
 
 class _View(Protocol):

@@ -18,20 +18,17 @@ from vibrissa.plots import style
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import COORDINATES, DIRECTIONS, robust_limits
 
+# Quantiles that are drawn, which of them is the median, and which bound the two bands.
 BINS = 25
 SHARE = 0.99
 _PAPER = ("MD", "MB", "Fx")
 _SHARES = (0.1, 0.25, 0.5, 0.75, 0.9)
 _MEDIAN = 2
 _BANDS = ((0, 4), (1, 3))
-"""Quantiles that are drawn, which of them is the median, and which bound the two bands."""
-
+# Signals that reach so many times their lowest tenth get an axis that is wider near zero.
 _HEIGHTS = {"single": 104.0, "double": 125.0}
 _SKEWED = 30.0
-"""Signals that reach so many times their lowest tenth get an axis that is wider near zero."""
-
-_LEAST = 0.01
-"""Share of the contacts of a side that a bin needs for its median to be drawn."""
+_LEAST = 0.01  # share of the contacts of a side that a bin needs for its median to be drawn
 
 
 @dataclass(frozen=True, eq=False)

@@ -140,8 +140,7 @@ def _legend(figure: Figure, truth: bool, contact: bool) -> None:
         figure.legend(handles=handles, loc="outside upper right", ncols=len(handles))
 
 
-_SKIN = (0.80, 0.85, 0.90, 1.0)
-"""Colour of the reachable space where it stands for no signal."""
+_SKIN = (0.80, 0.85, 0.90, 1.0)  # colour of the reachable space where it stands for no signal
 
 
 _TITLES = {"FD": "direction of $F_T$", "MD": "direction of $M_B$"}

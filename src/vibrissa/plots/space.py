@@ -25,11 +25,8 @@ from vibrissa.plots.style import INK, MUTED, ORANGE, PLAIN, SMALL, Box, box_axes
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import Course, head_surfaces, root, values_of
 
-ELEVATION, AZIMUTH = 24.0, -58.0
-"""Default direction of view, degrees."""
-
-_FLAT = 0.70
-"""Brightness of a surface that the light only grazes."""
+ELEVATION, AZIMUTH = 24.0, -58.0  # default direction of view, degrees
+_FLAT = 0.70  # brightness of a surface that the light only grazes
 
 
 def space_axes(
@@ -121,14 +118,11 @@ def _light(elevation: float, azimuth: float) -> Array:
     return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
 
 
+# Direction, degrees, in which rings carry their labels: toward the viewer.
 _VIEW = (16.0, -152.0)
 _ASPECT = (1.0, 1.0, 0.85)
 _FRONT = 222.0
-"""Direction, degrees, in which rings carry their labels: toward the viewer."""
-
-_AXIS = 1.4
-"""Distance of the axis of F_x from the cylinder's axis, over its radius."""
-
+_AXIS = 1.4  # distance of the axis of F_x from the cylinder's axis, over its radius
 _FLOOR: dict[str, Any] = {"color": "#c8c8c8", "linewidth": 0.4, "zorder": 0}
 
 
@@ -246,9 +240,9 @@ def _round_squares(low: float, high: float) -> list[float]:
     )
 
 
+# Share of a panel from which an object is taken to fill it, beyond which drawing it has no use.
 _CELLS, _COARSE = 121, 4
 _FULL = 0.97
-"""Share of a panel from which an object is taken to fill it, beyond which drawing it has no use."""
 
 
 class Body(Protocol):
@@ -367,14 +361,13 @@ def one_scale(limits: Array, views: Sequence[tuple[int, int]], sizes: Sequence[A
     )
 
 
+# Look of a band.
 BAND: dict[str, Any] = {"facecolor": ORANGE, "alpha": 0.25, "linewidth": 0.0, "zorder": 2}
-"""Look of a band."""
-
+# Standard deviation, as a share of the view's width, from which a surface is not drawn.
 _SECTION_CELLS = 91
 _NORMAL_95 = 1.959963984540054
 _FACING = 0.8
 _UNKNOWN = 0.05
-"""Standard deviation, as a share of the view's width, from which a surface is not drawn."""
 
 
 def is_cylinder(body: Body) -> bool:
@@ -448,12 +441,9 @@ def draw_section(
     _draw_zero(axes, right, up, distance, look)
 
 
+# Base of a whisker at the right if nothing else is known: right, forward, up of the snout.
 _PAD = np.array([7.7e-3, -9.0e-3, -4.9e-3])
-"""Base of a whisker at the right if nothing else is known: right, forward, up of the snout."""
-
-_FAR = 2e-3
-"""Smallest distance of a base from the head's origin for this to be the snout, m."""
-
+_FAR = 2e-3  # smallest distance of a base from the head's origin for this to be the snout, m
 _SKIN, _EDGE, _EYE = "#efe6dc", "#a89a8c", "#5a4f45"
 
 

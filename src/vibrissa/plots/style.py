@@ -39,18 +39,13 @@ Width = Literal["single", "double"]
 Box = tuple[float, float, float, float]
 """Left, bottom, width and height, mm."""
 
+# Widths of figures, mm.
 WIDTHS: Mapping[str, float] = MappingProxyType({"single": 85.0, "double": 178.0})
-"""Widths of figures, mm."""
-
-_LETTER = 1.5
-"""Mean width of a letter of 8 points, mm."""
-
-_UNSEEN = str.maketrans("", "", "$_{}\\")
-"""Marks of formulas."""
-
+_LETTER = 1.5  # mean width of a letter of 8 points, mm
+_UNSEEN = str.maketrans("", "", "$_{}\\")  # marks of formulas
+# Sizes of type, points: findings and the letters of panels; titles and axes; all else.
 LARGE, PLAIN, SMALL = 8.0, 7.0, 6.0
-"""Sizes of type, points: findings and the letters of panels; titles and axes; all else."""
-
+# Text, what is secondary, shaded areas, three colours of lines, and that of a traced whisker.
 INK = "#1a1a1a"
 MUTED = "#8c8c8c"
 SHADE = "#e3ebf2"
@@ -58,13 +53,11 @@ BLUE = "#0072b2"
 ORANGE = "#d55e00"
 GREEN = "#009e73"
 RED = "#e8000b"
-"""Text, what is secondary, shaded areas, three colours of lines, and that of a traced whisker."""
-
+# Look of a traced whisker: dots, so that the whisker is seen between them.
 TRACE: Mapping[str, Any] = MappingProxyType(
     {"color": RED, "linewidth": 1.0, "linestyle": (0, (1.0, 3.0)), "dash_capstyle": "round"}
 )
-"""Look of a traced whisker: dots, so that the whisker is seen between them."""
-
+# Matplotlib's settings while a figure of ours is made and drawn.
 LOOK: Mapping[str, Any] = MappingProxyType(
     {
         "font.family": "sans-serif",
@@ -111,7 +104,6 @@ LOOK: Mapping[str, Any] = MappingProxyType(
         "svg.hashsalt": "vibrissa",  # the same names of its parts each time
     }
 )
-"""Matplotlib's settings while a figure of ours is made and drawn."""
 
 
 class _StyledFigure(Figure):
@@ -338,11 +330,10 @@ def _drawn(figure: Figure, **how: Any) -> bytes:
     return file.getvalue()
 
 
+# OKLab of the directions −180° (blue), −90° (magenta), 0° (yellow) and 90° (green).
 _QUARTERS = np.array(
     [[0.50, -0.03, -0.20], [0.47, 0.185, 0.0], [0.86, 0.0, 0.17], [0.82, -0.13, 0.01]]
 )
-"""OKLab of the directions −180° (blue), −90° (magenta), 0° (yellow) and 90° (green)."""
-
 _LMS_FROM_LAB = np.array(
     [
         [1.0, 0.3963377774, 0.2158037573],

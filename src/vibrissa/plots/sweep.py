@@ -17,24 +17,17 @@ from vibrissa.plots import style
 from vibrissa.plots.verdicts import PAPERS_CONE, VERDICTS, WORDS, triplet_label
 from vibrissa.scene import root, squared
 
+# Look of marks in the legend: their shape is the verdict, their colour the critical cone.
 _MARKS = dict(zip(VERDICTS, ("o", "D", "X"), strict=True))
 _KEY: Any = {"facecolors": "white", "edgecolors": style.INK, "linewidths": 0.6}
-"""Look of marks in the legend: their shape is the verdict, their colour the critical cone."""
-
-_MOST = 3
-"""Triplets that get panels of their own; more share one."""
-
-_CONES = (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 90.0)
-"""Classes of critical cones, degrees."""
-
+_MOST = 3  # triplets that get panels of their own; more share one
+_CONES = (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 90.0)  # classes of critical cones, degrees
 _NORM = BoundaryNorm(_CONES, 256)
 
+# Range of errors drawn, mm: smaller ones are exact, larger ones do not locate the contact.
 _TURNS = (0, 20, 50, 90, 180, 360)
 _ERRORS = (1e-4, 1e3)
-"""Range of errors drawn, mm: smaller ones are exact, larger ones do not locate the contact."""
-
-_ROW, _FRAME = 4.4, 20.0
-"""Height of a row of marks, and of what is around the rows, mm."""
+_ROW, _FRAME = 4.4, 20.0  # height of a row of marks, and of what is around the rows, mm
 
 
 def sweep_overview(
@@ -230,5 +223,4 @@ def _label(value: object, dim: str) -> str:
     return text if text == "wrench" else triplet_label(text)
 
 
-_ROOT = (root, squared)
-"""Room for the small without losing the large."""
+_ROOT = (root, squared)  # room for the small without losing the large

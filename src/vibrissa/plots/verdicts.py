@@ -20,20 +20,18 @@ from vibrissa.numerics import Array
 from vibrissa.plots import style
 from vibrissa.quantities import quantity, to_display
 
+# Verdicts in words: a search proves what it refutes, and nothing else.
 VERDICTS = ("unique", "unique off a surface", "not unique")
 WORDS = {
     "unique": "unique (no counterexample found)",
     "unique off a surface": "unique off a surface",
     "not unique": "not unique (witness)",
 }
-"""Verdicts in words: a search proves what it refutes, and nothing else."""
+# The verdict on a region without contacts: nothing is drawn.
 PROVED = "unique (proved)"
 EMPTY = "no contacts"
-"""The verdict on a region without contacts: nothing is drawn."""
-
-_ROW = 4.2
-"""Height of a row, mm."""
-
+_ROW = 4.2  # height of a row, mm
+# Room for a letter of the key, mm.
 _HEAD, _FOOT = 11.0, 13.5
 _KEY = (
     "numbers: largest distance (mm) of two contacts with the same signals",
@@ -41,12 +39,9 @@ _KEY = (
     "; ambiguous: share of contacts that another one resembles within 0.1 % of ranges",
 )
 _LETTER = 1.25
-"""Room for a letter of the key, mm."""
+# Widths of the triplets' names, of a region's column and of the notation, mm.
 _EDGES = {"single": (18.5, 7.3, 20.0), "double": (24.0, 13.5, 25.0)}
-"""Widths of the triplets' names, of a region's column and of the notation, mm."""
-
-_TOLERANCE = 1e-3
-"""Share of each signal's range at which the resolution is stated."""
+_TOLERANCE = 1e-3  # share of each signal's range at which the resolution is stated
 
 
 def verdict_table(verdicts: xr.Dataset, *, width: style.Width = "double") -> Figure:
@@ -249,18 +244,17 @@ def _key(axes: Axes, height: float, lines: Sequence[str], proved: bool) -> None:
         axes.text(3.5, y + 3.5 * line, text, fontsize=style.SMALL, va="center")
 
 
+# The three triplets that the paper finds unique for its γ whisker.
 HIGHLIGHTED = ("Fx MB MD", "Mx MB MD", "Fx FD MD")
-"""The three triplets that the paper finds unique for its γ whisker."""
-
+# Degrees that the paper leaves out about rest.
 _LINES: tuple[tuple[str, Any, str], ...] = (
     (style.BLUE, "-", "o"),
     (style.ORANGE, "--", "s"),
     (style.GREEN, ":", "^"),
 )
 PAPERS_CONE = 2.0
-"""Degrees that the paper leaves out about rest."""
+# Degrees by which neighbours in a map of critical cones differ at most if it is continuous.
 _JUMP = 25.0
-"""Degrees by which neighbours in a map of critical cones differ at most if it is continuous."""
 
 
 def resolution(verdicts: xr.Dataset, *, width: style.Width = "double") -> Figure:

@@ -21,16 +21,14 @@ from vibrissa.plots.verdicts import triplet_label
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import DIRECTIONS, SIGNALS
 
+# Drawn width at the base, as a share of the whisker's extent, that is aimed at.
 _MAGNIFICATIONS = (1, 2, 3, 5, 10, 20, 50, 100)
 _WIDE = 0.02
-"""Drawn width at the base, as a share of the whisker's extent, that is aimed at."""
-
+# Room around and between the views, mm on paper.
 _LEFT, _RIGHT, _BOTTOM, _TOP, _GAP = 10.0, 2.0, 8.5, 6.5, 3.5
-"""Room around and between the views, mm on paper."""
 
 
-_NARROWEST = 0.09
-"""Smallest half of an axis, as a share of the whisker's extent."""
+_NARROWEST = 0.09  # smallest half of an axis, as a share of the whisker's extent
 
 
 def whisker_views(
@@ -161,22 +159,14 @@ def _caption(axes: Axes, name: str | None, magnification: float, assumed: Sequen
     )
 
 
+# Length of the longest arrow, as a share of the whiskers' extent.
 _COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.INK)
 _REST = "#c4c4c4"
 _ARROW = 0.2
-"""Length of the longest arrow, as a share of the whiskers' extent."""
-
-_BENT_GAP = 10.0
-"""Room around and between the views, mm on paper."""
-
-_ROW = 4.0
-"""Room of a row of the legend, mm."""
-
-_FORCES = 25.0
-"""Room below the side view from which on forces are drawn there, mm."""
-
-_BENT_NARROWEST = 0.11
-"""Smallest half of an axis, as a share of the whiskers' extent."""
+_BENT_GAP = 10.0  # room around and between the views, mm on paper
+_ROW = 4.0  # room of a row of the legend, mm
+_FORCES = 25.0  # room below the side view from which on forces are drawn there, mm
+_BENT_NARROWEST = 0.11  # smallest half of an axis, as a share of the whiskers' extent
 
 
 class _Drawn(NamedTuple):
@@ -368,16 +358,15 @@ def _panel(figure: Figure, box: style.Box, drawn: _Drawn, limits: Array, j: int)
     return axes
 
 
+# Length of the longer force's arrow, as a share of the whisker's extent.
 _PAIR_COLOURS = (style.BLUE, style.ORANGE)
 _DASHES = ("-", (0, (5, 1.5)))
 _NAMES = ("A", "B")
 _PAIR_ARROW = 0.22
-"""Length of the longer force's arrow, as a share of the whisker's extent."""
-
 _CENTRED: dict[str, Any] = {"ha": "center", "va": "center"}
 
+# Width of the table next to the views, mm; its height is as large where it is below them.
 _TABLE = 70.0
-"""Width of the table next to the views, mm; its height is as large where it is below them."""
 
 
 def witness_pair(witness: xr.Dataset, *, width: style.Width = "double") -> Figure:

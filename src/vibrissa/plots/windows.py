@@ -21,9 +21,7 @@ from vibrissa.io import Clicks, ViewClicks
 from vibrissa.numerics import Array
 from vibrissa.plots.style import BLUE, GREEN, ORANGE, RED
 
-Key = tuple[int, int]
-"""Frame and whisker."""
-
+Key = tuple[int, int]  # frame and whisker
 Save = Callable[[dict[Key, Array]], None]
 
 HELP = (
@@ -32,8 +30,7 @@ HELP = (
     "esc close without saving"
 )
 
-_SAME = 2.0
-"""Clicks nearer than this to another point are double clicks, pixels."""
+_SAME = 2.0  # clicks nearer than this to another point are double clicks, pixels
 
 
 class Frames(Protocol):
@@ -290,6 +287,7 @@ def correct(
     return window.corrections
 
 
+# Number of corners of a polygon, at least.
 _PICKING_HELP = (
     "b base of a whisker (in every view, in the same order) · m corners of an area without "
     "whiskers, as a peg · r corners of where whiskers are\nl two ends of a known length, then type "
@@ -301,7 +299,6 @@ _MODES: Mapping[str, str] = MappingProxyType(
 )
 _COLOURS = MappingProxyType({"base": GREEN, "mask": RED, "region": BLUE, "length": ORANGE})
 _CORNERS = 3
-"""Number of corners of a polygon, at least."""
 
 
 @dataclass(frozen=True)

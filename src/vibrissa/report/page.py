@@ -24,18 +24,18 @@ import numpy as np
 from vibrissa._version import __version__
 from vibrissa.quantities import shown_unit
 
+# Rule on what the page may load: only what is in it.
 _POLICY = (
     "default-src 'none'; img-src data: blob:; media-src data:; style-src 'unsafe-inline'; "
     # The library that draws in 3D compiles functions.
     "script-src 'unsafe-inline' 'unsafe-eval'"
 )
-"""Rule on what the page may load: only what is in it."""
-
 _STYLE = Path(__file__).with_suffix(".css").read_text(encoding="utf-8")
 
 _CODE = re.compile(r"`([^`]+)`")
 
 
+# Names of sections as they follow each other: results first, settings and origin last.
 _ORDER = (
     "results",
     "picture",
@@ -55,7 +55,6 @@ _ORDER = (
     "settings",
     "provenance",
 )
-"""Names of sections as they follow each other: results first, settings and origin last."""
 
 
 class Tile(NamedTuple):
@@ -155,6 +154,7 @@ def document(title: str, about: str, sections: Sequence[Section], script: str = 
     )
 
 
+# Captions of figures, by name, in the order in which they come.
 CAPTIONS = {
     "trial": "The trial at a glance: what the cameras see where the whisker is bent most, signals "
     "and contact over time, the trajectory in the space of signals, and estimated against known "
@@ -175,8 +175,6 @@ CAPTIONS = {
     "resolution": "Share of ambiguous contacts by how finely signals are measured.",
     "array": "The array and the face.",
 }
-"""Captions of figures, by name, in the order in which they come."""
-
 _WITNESS = "witness_"
 
 
@@ -230,8 +228,7 @@ def _link(path: Path, folder: Path) -> str:
     return f'<p><a href="{escape(quote(where))}">{escape(path.name)}</a></p>{marked_up}'
 
 
-_LEAST = 1e-5
-"""Smallest error that is stated, in a display unit; nothing is known so well."""
+_LEAST = 1e-5  # smallest error that is stated, in a display unit; nothing is known so well
 
 
 def shown_value(name: str, value: float, digits: int = 4) -> str:

@@ -26,9 +26,8 @@ from vibrissa.signals import CIRCULAR, SIGNALS, base_signals, within_turn
 from vibrissa.status import Status, describe
 from vibrissa.whisker import Whisker
 
+# Groups of a recording, and the verbs that make them.
 STAGES = {"signals": "signals", "estimates": "estimate", "contour": "reconstruct"}
-"""Groups of a recording, and the verbs that make them."""
-
 # What can be compared.
 _TRACKED = ("contact_point", "in_contact")
 _FELT = ("force", "moment", "in_contact", "base_rotation")
@@ -43,8 +42,7 @@ _NOTHING = "None of this whisker's true contacts was detected, so there is nothi
 
 _SIGNAL_NAMES = {"wrench": "all components of force and moment"}
 
-_SUSPECT = 1.5
-"""Misfit above which another shape may fit better."""
+_SUSPECT = 1.5  # misfit above which another shape may fit better
 
 
 def trial_sections(recording: xr.DataTree, whisker: int = 0, seed: int = 0) -> list[Section]:
@@ -133,6 +131,7 @@ def _error_tile(
     return Tile(error, "predicted error of the contact point, median")
 
 
+# Settings that are shown, by the attribute that holds them.
 _LABELS = {
     "origin": "origin",
     "source": "source of the signals",
@@ -145,7 +144,6 @@ _LABELS = {
     "frames_together": "frames with correlated errors",
     "remarks": "remarks",
 }
-"""Settings that are shown, by the attribute that holds them."""
 
 
 def _settings(recording: xr.DataTree) -> str:

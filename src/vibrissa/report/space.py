@@ -24,17 +24,13 @@ from vibrissa.scene import Course, Ints, course_of, object_surface
 from vibrissa.sketch import BENT, REST, thinned
 from vibrissa.whisker import Whisker
 
+# Message shown where the drawing library is not installed.
 NO_SPACE = "The 3D picture needs Plotly: `pip install 'vibrissa[report]'`."
-"""Message shown where the drawing library is not installed."""
-
-_NODES = 101
-"""Number of points of a whisker."""
-
+_NODES = 101  # number of points of a whisker
+# Number of bent whiskers that are drawn.
 _MOST_POINTS = 4000
 _SHAPES = 7
-"""Number of bent whiskers that are drawn."""
-_ROOM = 0.15
-"""Left about the contacts, as a share of their extent."""
+_ROOM = 0.15  # left about the contacts, as a share of their extent
 _CAMERA = {"eye": {"x": 1.65, "y": -1.8, "z": 1.05}, "center": {"x": 0.0, "y": 0.0, "z": -0.12}}
 
 

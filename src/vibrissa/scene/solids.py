@@ -1,18 +1,20 @@
 """What is drawn: the solid of all stable contacts, and marks without a renderer, as triangles.
 
-**Solids** are sampled finely and cut open, with surfaces of equal value in them. A map has contact point and signals at the nodes of a grid over arc length, bearing and load. In
-between both are smooth and are interpolated by cubic splines, for pictures only. Every node carries
-one row of numbers, its columns named in :data:`COLUMNS`, so that what is cut out carries the
-contact point and all signals along. Directions are carried as the components of a vector, which are
-smooth where angles jump.
+**Solids** are sampled finely and cut open, with surfaces of equal value in them. A map has contact
+point and signals at the nodes of a grid over arc length, bearing and load. In between both are
+smooth and are interpolated by cubic splines, for pictures only. Every node carries one row of
+numbers, its columns named in :data:`COLUMNS`, so that what is cut out carries the contact point and
+all signals along. Directions are carried as the components of a vector, which are smooth where
+angles jump.
 
 **Marks**, in mm, are bodies, clouds, arrows, lines and labels; limits of colours and axes are those
 that hold most values, and roots show small ones.
 
-**Shapes** are tubes along whiskers, ellipsoids, the objects of a recording, a head. A surface is a pair of vertices (n, 3) and faces (m, 3) of their numbers, so that triangles share
-vertices where it is smooth. All lengths go in and come out in the same unit, but for objects and
-head, which come out in mm. The head is a sketch, after no measured one: sections through it, one
-behind the other, whose sides pass near the base points of an average rat's whiskers.
+**Shapes** are tubes along whiskers, ellipsoids, the objects of a recording, a head. A surface is a
+pair of vertices (n, 3) and faces (m, 3) of their numbers, so that triangles share vertices where it
+is smooth. All lengths go in and come out in the same unit, but for objects and head, which come out
+in mm. The head is a sketch, after no measured one: sections through it, one behind the other, whose
+sides pass near the base points of an average rat's whiskers.
 """
 
 from __future__ import annotations
@@ -41,11 +43,11 @@ COLUMNS = (
 )
 """SI units; ``deflection`` is how far outside the cone of small deflections a contact lies, m."""
 
+# Cells of the whole chart.
 _COLUMN = {name: i for i, name in enumerate(COLUMNS)}
 _DIMS = ("station", "bearing", "load")
 _CONE = np.deg2rad(2.0)
 _SHAPE = (36, 72, 24)
-"""Cells of the whole chart."""
 
 
 def column(name: str) -> int:
@@ -324,9 +326,9 @@ class Label:
     text: str
 
 
+# Marks by name; what is missing from the next drawing goes.
 Mark = Body | Painted | Cloud | Arrows | Line | Label
 Drawing = Mapping[str, Mark]
-"""Marks by name; what is missing from the next drawing goes."""
 
 
 def pieces(points: Array) -> Array:
@@ -363,9 +365,8 @@ def squared(values: ArrayLike) -> Array:
     return np.asarray(np.sign(x) * np.square(x))
 
 
-_SIDES = 8
-"""Corners of the section of a whisker."""
-
+_SIDES = 8  # corners of the section of a whisker
+# Radius of an eye, mm, and points around a section of the head.
 _SECTIONS = np.array(
     [
         # forward, half width, middle height, half height; mm
@@ -386,7 +387,6 @@ _SECTIONS = np.array(
 )
 _EYES = np.array([[10.3, -24.0, 2.2], [-10.3, -24.0, 2.2]])
 _EYE, _AROUND = 1.5, 40
-"""Radius of an eye, mm, and points around a section of the head."""
 
 
 def across(direction: Array) -> tuple[Array, Array]:

@@ -1,6 +1,7 @@
 """Calibration of a sensor and of the whisker that it holds, from known wrenches and free poses.
 
-**Mixing and offset**, y = A w + b, channel by channel. The wrenches are those of known loads, or of contacts of the whisker itself by its model.
+**Mixing and offset**, y = A w + b, channel by channel. The wrenches are those of known loads, or of
+contacts of the whisker itself by its model.
 
 **Offset and weight** that a sensor carries, from readings without contact,
 
@@ -8,11 +9,12 @@
 
 linear in the offset b, the mass m and its moment μ = m c, with g turning as the base does.
 
-**Modulus and base radius** from measured loads, as far as loads determine them. For contacts at known points on the centreline the shape does not depend on how stiff the whisker
-is: force and moment are proportional to EI = E π r⁴ / 4 at the base (the twisting stiffness follows
-by Poisson's ratio, the others by the taper). So loads determine EI, and only another measurement
-separates E from r⁴: a radius under the microscope, or a modulus from a data sheet. Given the
-uncertainties of both before, log E and log r are moved along their line
+**Modulus and base radius** from measured loads, as far as loads determine them. For contacts at
+known points on the centreline the shape does not depend on how stiff the whisker is: force and
+moment are proportional to EI = E π r⁴ / 4 at the base (the twisting stiffness follows by Poisson's
+ratio, the others by the taper). So loads determine EI, and only another measurement separates E
+from r⁴: a radius under the microscope, or a modulus from a data sheet. Given the uncertainties of
+both before, log E and log r are moved along their line
 
     log E + 4 log r = log(4 EI / π)
 
@@ -40,9 +42,7 @@ from vibrissa.status import describe, is_ok
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
-_ROUNDING = 1e-6
-"""Share of the largest component of its kind below which a component is rounding."""
-
+_ROUNDING = 1e-6  # share of the largest component of its kind below which a component is rounding
 _ADVICE = (
     "touch the whisker at other places and in other directions, or state by `components` what the "
     "channels cannot read"
@@ -210,15 +210,9 @@ def calibrate_on_contacts(
     return calibrate_mixing(readings, wrenches_of_contacts(whisker, points), **options)
 
 
-_HEAVY = 5.0
-"""Mass that no sensor of a whisker carries, kg."""
-
-_SURELY = 4.0
-"""Standard deviations below zero at which a mass is not noise."""
-
-_IDLE = 1e-12
-"""Share of the largest effect on a channel below which an unknown has none."""
-
+_HEAVY = 5.0  # mass that no sensor of a whisker carries, kg
+_SURELY = 4.0  # standard deviations below zero at which a mass is not noise
+_IDLE = 1e-12  # share of the largest effect on a channel below which an unknown has none
 _POSES = (
     "hold the whisker free in more orientations, at least three that differ in how the weight pulls"
 )
@@ -422,20 +416,12 @@ def _design(sensor: Sensor, rotations: Array, gravity: Array) -> Array:
     return out
 
 
-_OPEN = 2.0
-"""Standard deviation of the logarithm of a taper from which it is not determined."""
-
-_SLIM, _WIDE = 0.01, 2.0
-"""Bounds of a fitted taper."""
-
+_OPEN = 2.0  # standard deviation of the logarithm of a taper from which it is not determined
+_SLIM, _WIDE = 0.01, 2.0  # bounds of a fitted taper
+# Bounds of the fitted stiffness of a base, over EI/L; what is stiffer is rigid.
 _SOFT, _STIFF = 1.0, 1e4
-"""Bounds of the fitted stiffness of a base, over EI/L; what is stiffer is rigid."""
-
-_SPRING = 30.0
-"""Stiffness of a base that the fit begins with, over EI/L."""
-
-_TYPICAL_NOISE = 0.01
-"""Noise of channels that state none, as a share of the size of their readings."""
+_SPRING = 30.0  # stiffness of a base that the fit begins with, over EI/L
+_TYPICAL_NOISE = 0.01  # noise of channels that state none, as a share of the size of their readings
 
 
 @dataclass(frozen=True, eq=False)

@@ -100,13 +100,13 @@ from vibrissa.sensors.suspended import FEATURES, SuspendedWhisker
 from vibrissa.sensors.suspension import SuspensionCalibration
 from vibrissa.whisker import Whisker
 
+# Ratios of readings per N·m and per N from which they differ, and up to which they are alike.
 _NUMBERS = ("noise", "bias", "drift", "resolution", "largest", "gain_error")
 _OTHERS = ("relative_noise", "mixing_error", "mixing_covariance")
 _TOP = {"channels", "mixing", "calibration", *_NUMBERS, *_OTHERS, "frame", "weight"}
 _FRAME = {"axes", "position", "reaction"}
 _WEIGHT = {"mass", "moment"}
 _APART, _ALIKE = 3.0, 2.0
-"""Ratios of readings per N·m and per N from which they differ, and up to which they are alike."""
 
 
 def load_sensor(path: str | PathLike[str]) -> Sensor:
@@ -273,6 +273,7 @@ def _array(values: Any) -> str:
     return str(np.asarray(values, dtype=np.float64).tolist())
 
 
+# Distance from the base, m, up to which a probe touches nothing.
 _UNITS = {"m": 1.0, "mm": 1e-3, "um": 1e-6}
 _STAGE_KEYS = {"unit", "readings", "position", "touches", "shape", "whisker", "sweep"}
 _TOUCHES = {"file", "origin", "axes", "farthest", "base_sigma", "rest", "drift", "largest"}
@@ -280,7 +281,6 @@ _SHAPE = {"file", "columns", "leave_out"}
 _WHISKER = {"base_radius", "tip_radius", "youngs_modulus", "noise"}
 _SWEEP = {"origin", "axes", "moves"}
 _AT_BASE = 1e-6
-"""Distance from the base, m, up to which a probe touches nothing."""
 
 
 class StageTouches(NamedTuple):
@@ -472,6 +472,7 @@ def _read_off(known: Array, values: Array, wanted: Array, name: str) -> Array:
     return np.interp(sign * wanted, forward[order], values[order])
 
 
+# Dimensions and unit of what is stored of a sensor; a channel's own where there is none.
 _STORED: dict[str, tuple[tuple[str, ...], str]] = {
     "rotation_compliance": ((), "rad N-1 m-1"),
     "shift_compliance": ((), "m N-1"),
@@ -481,7 +482,6 @@ _STORED: dict[str, tuple[tuple[str, ...], str]] = {
     "noise": (("channel",), ""),
     "drift": (("channel",), ""),
 }
-"""Dimensions and unit of what is stored of a sensor; a channel's own where there is none."""
 
 
 def save_suspended(

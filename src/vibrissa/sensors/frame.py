@@ -26,8 +26,7 @@ from vibrissa.deferred import optimize, transform
 from vibrissa.numerics import Array
 from vibrissa.sensors.regression import solve, warn_of_misfit
 
-_ORTHOGONAL = 1e-3
-"""Stretch up to which axes, typed with few digits, are brought to right angles."""
+_ORTHOGONAL = 1e-3  # stretch up to which axes, typed with few digits, are brought to right angles
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,15 +138,12 @@ def _named_axes(names: Sequence[str]) -> Array:
     return axes
 
 
+# Ratio of the residuals of two signs of the moments from which the better one is chosen.
 _ADVICE = "apply forces in at least two directions, at two places or more"
 _CLEARLY = 2.0
-"""Ratio of the residuals of two signs of the moments from which the better one is chosen."""
-
-_GAIN = 2.0
-"""Ratio of forces to loads from which they are in another unit, or have an offset."""
-
+_GAIN = 2.0  # ratio of forces to loads from which they are in another unit, or have an offset
+# Shares of the largest spread of forces below which they are on a line, or in a plane.
 _ALONG, _FLAT = 1e-4, 1e-6
-"""Shares of the largest spread of forces below which they are on a line, or in a plane."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,8 +22,8 @@ from scipy.linalg import cho_factor, cho_solve
 from vibrissa.deferred import spatial
 from vibrissa.numerics import Array
 
+# Condition number, of columns scaled to one, from which unknowns are not determined.
 _CONDITION = 1e4
-"""Condition number, of columns scaled to one, from which unknowns are not determined."""
 
 
 class Solution(NamedTuple):
@@ -58,8 +58,7 @@ def _combination(direction: Array, names: Sequence[str]) -> str:
     return parts[0] if len(parts) == 1 else "how much comes from each of " + ", ".join(parts)
 
 
-_MANY = 5.0
-"""Residuals over the noise up to which the noise may have been stated too small."""
+_MANY = 5.0  # residuals over the noise up to which the noise may have been stated too small
 
 
 def warn_of_misfit(misfit: float, advice: str) -> None:
@@ -82,8 +81,8 @@ def warn_of_surprise(log_factor: float, sigma: float) -> None:
         )
 
 
+# Noise variance over that of the process; the one of largest marginal likelihood is taken.
 _RATIOS = np.logspace(-7, 1, 17)
-"""Noise variance over that of the process; the one of largest marginal likelihood is taken."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -48,14 +48,10 @@ COMPONENTS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 GRAVITY = (0.0, 0.0, -9.80665)
 """Acceleration of a falling body in the laboratory frame, m/s²."""
 
-_UNREAD = 1e-9
-"""Relative size below which a combination of components is not read."""
-
-_ROUNDING = 1e-12
-"""Size below which eigenvalues of a matrix of correlations are rounding."""
-
+_UNREAD = 1e-9  # relative size below which a combination of components is not read
+_ROUNDING = 1e-12  # size below which eigenvalues of a matrix of correlations are rounding
+# Size from which asymmetries and negative eigenvalues of correlations are faults.
 _INDEFINITE = 1e-9
-"""Size from which asymmetries and negative eigenvalues of correlations are faults."""
 
 
 @dataclass(frozen=True, eq=False)

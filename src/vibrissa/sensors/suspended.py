@@ -51,24 +51,21 @@ if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
 
+# What a channel reads a combination of: rotation, rad, and shift over L, of the base.
 FEATURES = (
     "1",
     *(f"θ{a}" for a in "xyz"),
     *(f"u{a}" for a in "xyz"),
     *(f"θ{a}θ{b}" for i, a in enumerate("xyz") for b in "xyz"[i:]),
 )
-"""What a channel reads a combination of: rotation, rad, and shift over L, of the base."""
-
+# Turns of the path from rest to a contact, and Newton steps after each of them and the last.
 _PAIRS = np.triu_indices(3)
 _STEPS, _ROUNDS, _LAST_ROUNDS = 16, 4, 12
-"""Turns of the path from rest to a contact, and Newton steps after each of them and the last."""
-_SOLVED = 1e-8
-"""Miss of the point, over L, up to which a contact is solved."""
-_MOST_ARC, _MOST_FORCE = 0.1, 3.0
-"""Largest Newton steps of s, over L, and of the force, over EI/L²."""
+_SOLVED = 1e-8  # miss of the point, over L, up to which a contact is solved
+_MOST_ARC, _MOST_FORCE = 0.1, 3.0  # largest Newton steps of s, over L, and of the force, over EI/L²
+# Step of differences, and angle squared below which series replace quotients.
 _LEAST_ARC = 0.01
 _SMALL = 1e-6
-"""Step of differences, and angle squared below which series replace quotients."""
 
 
 class Touches(NamedTuple):
@@ -334,13 +331,13 @@ def _right_jacobian(angle: Array) -> Array:
     return np.asarray(np.eye(3) - first * matrix + second * (matrix @ matrix))
 
 
+# Standard deviations of what differs from sample to sample, and of what hardly does, over that of a
+# calibration's residuals.
 WHITE, BIAS = 0.5, 1.0
-"""Standard deviations of what differs from sample to sample, and of what hardly does, over that of
-a calibration's residuals."""
-PERSISTENCE = 0.1
-"""Motion of the base over which the errors change, m."""
+PERSISTENCE = 0.1  # motion of the base over which the errors change, m
+# Steps of contact points along the force and across it, over those of the base.
 NORMAL, SLIDING = 0.07, 0.7
-"""Steps of contact points along the force and across it, over those of the base."""
+# Factor on the Hessian's diagonal that holds an arc length at the end of its range.
 _LEAST_STEP = 1e-6
 _FEWEST = 5
 _STARTS = (0.45, 0.65, 0.85)
@@ -348,9 +345,8 @@ _SWEEP_ROUNDS, _ENOUGH = 40, 1e-4
 _MOST_STEP = 0.1
 _SWEEP_LEAST_ARC = 0.05
 _HELD = 1e12
-"""Factor on the Hessian's diagonal that holds an arc length at the end of its range."""
+# Errors of a touch that are stated as shared: of its three channels level, slope and bend.
 _SHARED = 9
-"""Errors of a touch that are stated as shared: of its three channels level, slope and bend."""
 
 
 class SweptContacts(NamedTuple):

@@ -27,33 +27,28 @@ from vibrissa.status import Status
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
+# Touches that are needed, above which more than the compliances may be free, and from which on
+# there is a Gaussian process.
 FEWEST, SOME, PLENTY = 20, 40, 100
-"""Touches that are needed, above which more than the compliances may be free, and from which on
-there is a Gaussian process."""
-
+# Mechanical unknowns that may be free: the compliances; the pivot too; and the pose of the base.
+# Chosen are those that predict whole regions of touches which were left out: what neighbours share,
+# and unknowns take up that the wire does not have, misleads there. Single touches that are left out
+# do not show it, for they have neighbours. Below `PLENTY` too few would be left to judge by, and no
+# process takes up what is left: the pose is free. Curvature, taper and friction mislead more than
+# they help.
 CHOICES = (2, 5, 11)
-"""Mechanical unknowns that may be free: the compliances; the pivot too; and the pose of the base.
-
-Chosen are those that predict whole regions of touches which were left out: what neighbours share,
-and unknowns take up that the wire does not have, misleads there. Single touches that are left out
-do not show it, for they have neighbours. Below `PLENTY` too few would be left to judge by, and
-no process takes up what is left: the pose is free. Curvature, taper and friction mislead more than
-they help.
-"""
+# Regions that are left out in turn, and touches that the choice is made with at most.
 _REGIONS, _ENOUGH_TO_CHOOSE = 5, 300
-"""Regions that are left out in turn, and touches that the choice is made with at most."""
-
+# Variances of the noise over those of the (scaled) weights that are tried.
 _RATIOS = np.logspace(-6, 1, 15)
-"""Variances of the noise over those of the (scaled) weights that are tried."""
+# Gauss-Newton steps, dampings of each, and the relative gain below which they end.
 _ROUNDS, _TRIES, _ENOUGH = 20, 6, 2e-3
-"""Gauss-Newton steps, dampings of each, and the relative gain below which they end."""
+# Share of its prior's standard deviation from which an unknown counts as not determined.
 _OPEN = 0.7
-"""Share of its prior's standard deviation from which an unknown counts as not determined."""
-_LOST = 5.0
-"""Residual of a touch without equilibrium, in units of the noise."""
+_LOST = 5.0  # residual of a touch without equilibrium, in units of the noise
+# Logarithms of compliances in L/EI and L³/EI from which the best is improved; the prior's mean is
+# the middle one.
 _STARTS = [(np.log(r), np.log(t)) for r in (0.1, 0.5, 2.0) for t in (3e-4, 3e-3, 3e-2)]
-"""Logarithms of compliances in L/EI and L³/EI from which the best is improved; the prior's mean is
-the middle one."""
 
 
 class Unknown(NamedTuple):

@@ -24,9 +24,7 @@ from vibrissa.deferred import transform
 from vibrissa.numerics import Array, IntArray, kernel
 from vibrissa.whisker import Whisker
 
-_GRADING = 0.4
-"""Exponent by which segments are shorter where the whisker is thin."""
-
+_GRADING = 0.4  # exponent by which segments are shorter where the whisker is thin
 _GAUSS = np.polynomial.legendre.leggauss(5)
 
 

@@ -45,35 +45,19 @@ from vibrissa.whisker import Whisker
 
 Progress = Callable[[int, int], None]
 
+# Density of a rat's whisker at base and tip, kg/m³ (Yang et al. 2019).
 DENSITY = (1220.0, 1632.0)
-"""Density of a rat's whisker at base and tip, kg/m³ (Yang et al. 2019)."""
-
+# Damping ratio of the first vibration: the middle of 0.11 to 0.17 (Hartmann et al. 2003).
 DAMPING_RATIO = 0.14
-"""Damping ratio of the first vibration: the middle of 0.11 to 0.17 (Hartmann et al. 2003)."""
-
+# Time that a whisker whose rest is inside an object is held still at first, to settle, s.
 _SETTLE = 0.06
-"""Time that a whisker whose rest is inside an object is held still at first, to settle, s."""
-
-_AT_ONCE = 4096
-"""Number of steps whose placements are computed together."""
-
-_EAGER = 8
-"""Rounds with the full derivative of friction, before its secant."""
-
-_MOST_TURNED = 0.3
-"""Largest turn of a joint in one round, rad."""
-
-_PARTS = 4
-"""Samples of the distance from objects on each segment."""
-
-_NEAR = 1e-4
-"""Distance from which a minimum is refined, m."""
-
-_ZOOM = np.linspace(-1.0, 1.0, 9) / _PARTS
-"""Offsets at which a minimum is refined, in segments."""
-
-_CREEP = 1e-3
-"""Speed below which sliding is opposed by less than full friction, m/s."""
+_AT_ONCE = 4096  # number of steps whose placements are computed together
+_EAGER = 8  # rounds with the full derivative of friction, before its secant
+_MOST_TURNED = 0.3  # largest turn of a joint in one round, rad
+_PARTS = 4  # samples of the distance from objects on each segment
+_NEAR = 1e-4  # distance from which a minimum is refined, m
+_ZOOM = np.linspace(-1.0, 1.0, 9) / _PARTS  # offsets at which a minimum is refined, in segments
+_CREEP = 1e-3  # speed below which sliding is opposed by less than full friction, m/s
 
 
 @dataclass(frozen=True)
@@ -511,20 +495,11 @@ class Walk:
         )
 
 
-_SEGMENTS = 16
-"""Number of segments of the chains."""
-
-_STEP = 0.4
-"""Longest step, as a share of the time in which the first vibration turns by one radian."""
-
-_HOLD = 5e3
-"""Stiffness with which a point is held, over EI/L³ at the base."""
-
-_WEIGHTLESS = 1e-6
-"""Share of the mass that the chain without mass has."""
-
-_PROXIMAL = 0.02
-"""Smallest arc length at which a chain is held, over L."""
+_SEGMENTS = 16  # number of segments of the chains
+_STEP = 0.4  # longest step, as a share of the time in which the first vibration turns by one radian
+_HOLD = 5e3  # stiffness with which a point is held, over EI/L³ at the base
+_WEIGHTLESS = 1e-6  # share of the mass that the chain without mass has
+_PROXIMAL = 0.02  # smallest arc length at which a chain is held, over L
 
 
 def inertial_wrench(

@@ -46,35 +46,16 @@ Image = NDArray[np.float32]
 Progress = Callable[[int, int], None]
 """Called with the number of frames done and of all frames."""
 
-_STEP = 2.0
-"""Length of a piece of painted whisker, pixels."""
-
-_CHEEK = 0.5e-3
-"""Margin of the face of several whiskers beyond their bases, m."""
-
-_MARGIN = 0.05
-"""Margin of the image of several whiskers, as a share of their extent."""
-
-_REACH = 0.15
-"""Distance before and behind the scene up to which objects are searched, m."""
-
-_STEPS = 200
-"""Most steps along a line of sight."""
-
-_COARSE = 8
-"""Pitch of the grid on which an object's outline is searched, pixels."""
-
-_SOFT = 3.0
-"""Standard deviations of the blur up to which an outline is computed pixel by pixel."""
-
-_TAIL = 3.5
-"""Standard deviations of the blur beyond which a strip's image is zero."""
-
-_NEXT_SEED = 7919
-"""Difference between the seeds of two cameras."""
-
-_FUR = 2.0
-"""Softness of the face's edge, standard deviation, pixels."""
+_STEP = 2.0  # length of a piece of painted whisker, pixels
+_CHEEK = 0.5e-3  # margin of the face of several whiskers beyond their bases, m
+_MARGIN = 0.05  # margin of the image of several whiskers, as a share of their extent
+_REACH = 0.15  # distance before and behind the scene up to which objects are searched, m
+_STEPS = 200  # most steps along a line of sight
+_COARSE = 8  # pitch of the grid on which an object's outline is searched, pixels
+_SOFT = 3.0  # standard deviations of the blur up to which an outline is computed pixel by pixel
+_TAIL = 3.5  # standard deviations of the blur beyond which a strip's image is zero
+_NEXT_SEED = 7919  # difference between the seeds of two cameras
+_FUR = 2.0  # softness of the face's edge, standard deviation, pixels
 
 
 @dataclass(frozen=True)

@@ -49,18 +49,16 @@ from vibrissa.whisker import (
     mirrored,
 )
 
+# Elevation gained per azimuth by row (Knutsen et al. 2008).
 ELEVATION_PER_AZIMUTH: Mapping[str, float] = MappingProxyType(
     {"A": 0.12, "B": 0.30, "C": 0.30, "D": 0.14, "E": 0.02}
 )
-"""Elevation gained per azimuth by row (Knutsen et al. 2008)."""
-
+# Roll about the base tangent per azimuth by row (Knutsen et al. 2008).
 ROLL_PER_AZIMUTH: Mapping[str, float] = MappingProxyType(
     {"A": -0.76, "B": -0.25, "C": 0.22, "D": 0.43, "E": 0.73}
 )
-"""Roll about the base tangent per azimuth by row (Knutsen et al. 2008)."""
-
+# Frequencies of the slow drifts, Hz: their common period is far longer than a trial.
 _DRIFT = np.array([0.31, 0.57, 0.93])
-"""Frequencies of the slow drifts, Hz: their common period is far longer than a trial."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -465,17 +463,10 @@ def _drifts(time: Array, count: int, seed: int) -> Array:
     return values
 
 
-PEG_RADIUS = 1.35e-3
-"""Half the diameter of the paper's peg, m."""
-
-_STEP = np.radians(1.5)
-"""Turn of a step of the coarse sweep."""
-
-_FARTHEST = np.radians(120.0)
-"""Largest turn of the coarse sweep."""
-
-_MARGIN = np.radians(5.0)
-"""Turn beyond the slip."""
+PEG_RADIUS = 1.35e-3  # half the diameter of the paper's peg, m
+_STEP = np.radians(1.5)  # turn of a step of the coarse sweep
+_FARTHEST = np.radians(120.0)  # largest turn of the coarse sweep
+_MARGIN = np.radians(5.0)  # turn beyond the slip
 
 
 def facing_peg(whisker: Whisker, distance: float = 0.65, radius: float = PEG_RADIUS) -> Peg:

@@ -40,9 +40,8 @@ from vibrissa.simulation.motion import (
 )
 from vibrissa.whisker import Whisker, WhiskerArray, base_rotation, whisker_array
 
-_MOST_FRAMES = 10_000_000
-"""Largest number of frames of a trial."""
-
+_MOST_FRAMES = 10_000_000  # largest number of frames of a trial
+# Every key of a trial, with its default.
 EXAMPLE = """\
 # A trial for `vibrissa simulate`: lengths in mm, angles in degrees, forces in µN, moments in µN·m.
 # What is left out has the value shown here, unless stated otherwise.
@@ -113,17 +112,14 @@ moment_resolution = 0.0
 relative_noise = 0.0
 gain_error = 0.0
 """
-"""Every key of a trial, with its default."""
-
 _MICRO = 1e-6
 _TOP = {"duration", "rate", "friction", "seed"}
 _TOP |= {"whisker", "array", "object", "motion", "head", "sensor", "dynamics"}
+# Motion of the head of an array by default: forward, toward the object there.
 _ADVANCE = MappingProxyType({"to_position": [0.0, 14.0, 0.0]})
-"""Motion of the head of an array by default: forward, toward the object there."""
-
+# Columns of a table of motion.
 MM = 1e-3
 COLUMNS = ("time", "azimuth", "elevation", "roll", "x", "y", "z")
-"""Columns of a table of motion."""
 _DEGREES = ("amplitude", "set_point", "elevation_drift")
 _SHARES = ("frequency", "protraction", "variation")
 

@@ -38,8 +38,7 @@ from vibrissa.simulation.motion import Motion
 from vibrissa.status import Status
 from vibrissa.whisker import Whisker
 
-NODES = 33
-"""Number of points of the recorded centrelines."""
+NODES = 33  # number of points of the recorded centrelines
 
 Progress = Callable[[int, int], None]
 """Called with the number of frames done and of all frames."""

@@ -17,26 +17,15 @@ from vibrissa.numerics import Array
 
 Image = NDArray[np.float32]
 
+# Standard deviations of the fur's texture across and along its hairs, and of its tufts, pixels.
 _GRAIN, _ALONG, _COARSE = 0.8, 3.0, 6.0
-"""Standard deviations of the fur's texture across and along its hairs, and of its tufts, pixels."""
-
-_APART = 4.0
-"""Distance of hairs along the outline of the face, pixels."""
-
-_HAIR = (4.0, 4.0)
-"""Shape and scale, pixels, of the distribution of the lengths of hairs."""
-
-_THICKNESS = (0.3, 0.7)
-"""Smallest and largest half width of a hair, pixels."""
-
-_WIRE = (0.6, 1.6)
-"""Smallest and largest half width of a wire, pixels."""
-
+_APART = 4.0  # distance of hairs along the outline of the face, pixels
+_HAIR = (4.0, 4.0)  # shape and scale, pixels, of the distribution of the lengths of hairs
+_THICKNESS = (0.3, 0.7)  # smallest and largest half width of a hair, pixels
+_WIRE = (0.6, 1.6)  # smallest and largest half width of a wire, pixels
+# Reach of the cheek, as a share of the length of the longest whisker in the image.
 _BEHIND = (0.35, 0.5)
-"""Reach of the cheek, as a share of the length of the longest whisker in the image."""
-
-_CHEEK = 48.0
-"""Grey value of the cheek."""
+_CHEEK = 48.0  # grey value of the cheek
 
 
 @dataclass(frozen=True, eq=False)

@@ -220,24 +220,17 @@ class Vibration:
         return contact_probability(modes, step, wrench - air, air, noise) > 0.5
 
 
-_LEAST_KNOWN = 0.3
-"""Relative standard deviation from which a quantity is not determined."""
-
-_WITHIN = np.log(3.0)
-"""Largest factor that is tried, as a logarithm."""
-
-_SHARE = 0.1
-"""Share of a window's own size that linear modes do not explain."""
-
+_LEAST_KNOWN = 0.3  # relative standard deviation from which a quantity is not determined
+_WITHIN = np.log(3.0)  # largest factor that is tried, as a logarithm
+_SHARE = 0.1  # share of a window's own size that linear modes do not explain
+# Factors of the frequency that the fit is begun from, as logarithms.
 _STARTS = np.log([0.8, 0.9, 1.0, 1.1, 1.25])
-"""Factors of the frequency that the fit is begun from, as logarithms."""
-
+# Quantities that are fitted, and what determines each.
 _QUANTITIES = {
     "mass": "the base must be moved",
     "resonances": "the whisker must ring, after a release or a tap",
     "damping": "the whisker must ring, after a release or a tap",
 }
-"""Quantities that are fitted, and what determines each."""
 
 
 @dataclass(frozen=True)
@@ -385,42 +378,25 @@ def _windows(free: AnyArray, step: float, vibration: Vibration) -> tuple[AnyArra
     return np.array(starts, dtype=int), width
 
 
+# Components of the wrench: F_x, F_y, F_z, M_y, M_z; vibration hardly makes M_x.
 _CHANNELS = [0, 1, 2, 4, 5]
-"""Components of the wrench: F_x, F_y, F_z, M_y, M_z; vibration hardly makes M_x."""
-
-_FORCES, _MOMENTS = slice(1, 3), slice(3, 5)
-"""Channels across the whisker."""
-
-_RATE = 3.0
-"""Onsets, and releases, per second."""
-
-_MASS = 0.2
-"""Relative standard deviation of the mass."""
-
-_TURN = 0.12
-"""Relative error of frequencies: share of a vibration that is unknown after a radian."""
-
+_FORCES, _MOMENTS = slice(1, 3), slice(3, 5)  # channels across the whisker
+_RATE = 3.0  # onsets, and releases, per second
+_MASS = 0.2  # relative standard deviation of the mass
+_TURN = 0.12  # relative error of frequencies: share of a vibration that is unknown after a radian
+# Share of the vibration that linear modes leave across the whisker, and its share along it.
 _MODELLED, _AXIAL = 0.15, 0.4
-"""Share of the vibration that linear modes leave across the whisker, and its share along it."""
-
-_BEND = 0.2
-"""The same share for a tip that is deflected by the whisker's length."""
-
+_BEND = 0.2  # the same share for a tip that is deflected by the whisker's length
+# Degrees of freedom of the Student distributions of a free whisker and of one in contact.
 _FREEDOM, _FREEDOM_IN_CONTACT = 4.0, 1.0
-"""Degrees of freedom of the Student distributions of a free whisker and of one in contact."""
-
+# Change from frame to frame in contact, and when it begins, over noise, and over the last one.
 _CHANGE, _ONSET, _AS_BEFORE = 1.5, 5.0, 0.6
-"""Change from frame to frame in contact, and when it begins, over noise, and over the last one."""
-
+# Standard deviation of amplitudes at a release: least, over noise, and as a share of the moment,
+# which modes in some phase make together.
 _START, _RELEASED = 5.0, 0.35
-"""Standard deviation of amplitudes at a release: least, over noise, and as a share of the moment,
-which modes in some phase make together."""
-
+# Log likelihood below the best from which a hypothesis is dropped, and most hypotheses.
 _LOST, _MOST = 60.0, 64
-"""Log likelihood below the best from which a hypothesis is dropped, and most hypotheses."""
-
-_FINEST = 1e-4
-"""Least noise, over the largest wrench."""
+_FINEST = 1e-4  # least noise, over the largest wrench
 
 
 class Modes(NamedTuple):

@@ -42,29 +42,15 @@ from vibrissa.io import (
 from vibrissa.numerics import Array
 from vibrissa.signals import SIGNALS
 
-POSITION = ("base_x", "base_y", "base_z")
-"""Columns with the position of the base."""
-
-QUATERNION = ("base_qw", "base_qx", "base_qy", "base_qz")
-"""Columns with its orientation."""
-
-ACCELERATION = ("imu_ax", "imu_ay", "imu_az")
-"""Columns with the reading of an accelerometer."""
-
+POSITION = ("base_x", "base_y", "base_z")  # columns with the position of the base
+QUATERNION = ("base_qw", "base_qx", "base_qy", "base_qz")  # columns with its orientation
+ACCELERATION = ("imu_ax", "imu_ay", "imu_az")  # columns with the reading of an accelerometer
 _SHARED = (*POSITION, *QUATERNION, *ACCELERATION)
 
-STAMP = "stamp_ns"
-"""Column with the time stamp of ROS, ns."""
-
-RECORDED = "recorded_ns"
-"""Column with the time at which ROS recorded it, ns."""
-
-FRAME = "frame_id"
-"""Column with the name of the frame that ROS gives it."""
-
-LONGEST = 65536
-"""Characters that a line may have; a datagram holds no more."""
-
+STAMP = "stamp_ns"  # column with the time stamp of ROS, ns
+RECORDED = "recorded_ns"  # column with the time at which ROS recorded it, ns
+FRAME = "frame_id"  # column with the name of the frame that ROS gives it
+LONGEST = 65536  # characters that a line may have; a datagram holds no more
 # What a header may call otherwise, or give in other units.
 _SIGNALS = ("time", "Fx", "Fy", "Fz", "Mx", "My", "Mz", *SIGNALS)
 # A quaternion that was rounded is no longer of unit length by this much.

@@ -97,8 +97,8 @@ def open_sweep(path: str | PathLike[str]) -> xr.Dataset:
     return out
 
 
+# Arrays over cells, arrays over whiskers, and the results of each task.
 _Read = tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]], dict[str, xr.Dataset]]
-"""Arrays over cells, arrays over whiskers, and the results of each task."""
 
 
 def _records(path: Path, kept: dict[str, Any], names: list[str], groups: list[str]) -> _Read:
@@ -290,17 +290,14 @@ def _errors(rows: xr.Dataset, task: str, group: str) -> Iterator[str]:
 
 Answers = Generator[tuple[Cell, dict[str, Any]], None, None]
 
-_TRIES = 2
-"""A cell whose process dies may not be to blame: somebody killed it, or memory ran out."""
-_STARTS = 3
-"""Processes that may die, one after the other, before they are ready."""
+_TRIES = 2  # a cell whose process dies may not be to blame: somebody killed it, or memory ran out
+_STARTS = 3  # processes that may die, one after the other, before they are ready
+# Cells under way for each worker of a cluster.
 _PROCESS_DIED = (
     f"the process that worked on this cell died, {_TRIES} times: killed, or out of memory\n"
 )
 _AHEAD = 2
-"""Cells under way for each worker of a cluster."""
-_PATIENCE = 20.0
-"""Longest wait for a scheduler and its first worker, s."""
+_PATIENCE = 20.0  # longest wait for a scheduler and its first worker, s
 _WORKERS_DIED = "the workers that had this cell died (killed, or out of memory)\n"
 
 

@@ -36,9 +36,8 @@ from numpy.typing import NDArray
 from vibrissa._version import __version__
 from vibrissa.sweeps.study import Cell, Study
 
-NOT_ASKED, TO_DO, DONE, FAILED, DAMAGED = -1, 0, 1, 2, 3
-"""Statuses of cells."""
-
+NOT_ASKED, TO_DO, DONE, FAILED, DAMAGED = -1, 0, 1, 2, 3  # statuses of cells
+# Numbers that describe every whisker, and their units.
 DESCRIBED = {
     "length": "m",
     "base_radius": "m",
@@ -47,13 +46,10 @@ DESCRIBED = {
     "youngs_modulus": "Pa",
     "turn": "rad",
 }
-"""Numbers that describe every whisker, and their units."""
-
+# Layouts that can be read but not written to: a Zarr group for each task.
 _STUDY, _LOCK, _FAILURES, RESULTS = ".study.json", ".sweep.lock", "failures.jsonl", "results"
 LAYOUT = 4
 OLD_LAYOUTS = (2, 3)
-"""Layouts that can be read but not written to: a Zarr group for each task."""
-
 _SUM = "checksum"
 _LIBRARIES = ("numpy", "scipy", "numba")
 # Modules that compute a cell; results depend on them and on the packages that they import.

@@ -32,6 +32,7 @@ from vibrissa.whisker import Whisker, whisker_array
 
 EXAMPLE = Path(__file__).with_name("example.toml").read_text(encoding="utf-8")
 
+# Functions that cache results of the last whiskers; a study does not return to any.
 _KEPT = (
     discretize,
     stable_set,
@@ -41,9 +42,7 @@ _KEPT = (
     seeding_triplet,
     searched_by_name,
 )
-"""Functions that cache results of the last whiskers; a study does not return to any."""
-_OF_WHISKER, _OF_CELL = 16, 4
-"""Numbers stored for each whisker, with its name, and for each cell."""
+_OF_WHISKER, _OF_CELL = 16, 4  # numbers stored for each whisker, with its name, and for each cell
 
 
 @dataclass(frozen=True)
@@ -222,6 +221,10 @@ def _described(whisker: Whisker) -> dict[str, float]:
     }
 
 
+# Parameters of a grid or a random population: default, factor to SI units, exclusive minimum.
+# ``curvature`` is A·L of the parabola y = A x². ``bend`` instead turns the tangent at a constant
+# rate by so many degrees from base to tip, and ``corkscrew`` turns the plane of bending by so many.
+# ``trim`` is the share of the length that is left, the radius being what it was.
 PARAMETERS: Mapping[str, tuple[float, float, float]] = {
     "length": (39.4, 1e-3, 0.0),
     "taper_ratio": (15.0, 1.0, 0.0),
@@ -232,16 +235,9 @@ PARAMETERS: Mapping[str, tuple[float, float, float]] = {
     "youngs_modulus": (3.0, 1e9, 0.0),
     "trim": (1.0, 1.0, 0.0),
 }
-"""Parameters of a grid or a random population: default, factor to SI units, exclusive minimum.
-
-``curvature`` is A·L of the parabola y = A x². ``bend`` instead turns the tangent at a constant
-rate by so many degrees from base to tip, and ``corkscrew`` turns the plane of bending by so many.
-``trim`` is the share of the length that is left, the radius being what it was.
-"""
 
 
-_MOST = 10_000_000
-"""Largest number of whiskers: the calling process holds them all, 2.5 kB each."""
+_MOST = 10_000_000  # largest number of whiskers: the calling process holds them all, 2.5 kB each
 
 
 @dataclass(frozen=True)

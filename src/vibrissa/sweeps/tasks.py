@@ -32,14 +32,12 @@ if TYPE_CHECKING:
 
 Settings = Mapping[str, Any]
 
-PAPERS = ("Fx MB MD", "Mx MB MD", "Fx FD MD")
-"""The triplets that the paper found unique."""
-
+PAPERS = ("Fx MB MD", "Mx MB MD", "Fx FD MD")  # the triplets that the paper found unique
+# Samples of a whisker; more would not fit into memory.
 VERDICTS = ("unique", "unique off a surface", "not unique")
 PROOFS = ("proved", "refused", "not finished")
 _MICRO = 1e-6
 _MOST = 10_000_000
-"""Samples of a whisker; more would not fit into memory."""
 _STATIONS = np.linspace(0.3, 1.0, 15)
 
 
@@ -296,13 +294,13 @@ def _check_number(settings: Settings, name: str, least: float, most: float = np.
         raise ValueError(f"{name} is {value!r}; a number from {least:g}{upto} is needed")
 
 
+# Least and largest values of numbers.
 _BOUNDS = {
     **dict.fromkeys(("cone", "minutes", "force_noise", "moment_noise"), (0.0, np.inf)),
     "samples": (16, _MOST),
     "contacts": (1, _MOST),
 }
-"""Least and largest values of numbers."""
-
+# What reads a setting, and raises where it cannot.
 _READ: Mapping[str, Callable[[Settings], object]] = {
     "triplets": _triplets,
     "signals": _sets,
@@ -310,7 +308,6 @@ _READ: Mapping[str, Callable[[Settings], object]] = {
     "regions": lambda settings: _several(settings, "regions"),
     "friction": lambda settings: _several(settings, "friction"),
 }
-"""What reads a setting, and raises where it cannot."""
 
 
 def _uniqueness_seconds(settings: Settings) -> float:

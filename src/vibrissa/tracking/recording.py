@@ -27,8 +27,7 @@ from vibrissa.tracking.space.pose import CUTOFF, BasePose, HeadPose
 from vibrissa.tracking.space.rest_shape import Length, RestShape
 from vibrissa.whisker import Whisker, angles_of
 
-_NEAR = 0.5
-"""Largest difference between the time of a frame and that of its row in a table, frames."""
+_NEAR = 0.5  # largest difference between the time of a frame and that of its row in a table, frames
 
 
 class ContactPoints(NamedTuple):

@@ -50,32 +50,21 @@ from vibrissa.whisker import Pose, Whisker
 Progress = Callable[[str, int, int], None]
 """Function that is called with the name of a stage, and how much of how much is done."""
 
+# Distance from its plane of a known whisker at most for one view, as a share of its length.
 _FLAT = 0.02
-"""Distance from its plane of a known whisker at most for one view, as a share of its length."""
-
+# Share by which its seen length varies from which a whisker leaves the plane of one view.
 _SHORTENED = 0.04
-"""Share by which its seen length varies from which a whisker leaves the plane of one view."""
-
-_ANY_ROLL = np.radians(10.0)
-"""Standard deviation of the roll if only bent shapes show it, rad."""
-
+_ANY_ROLL = np.radians(10.0)  # standard deviation of the roll if only bent shapes show it, rad
+# Smallest and largest number of frames in contact from which a length is taken.
 _FEWEST, _FRAMES = 8, 24
-"""Smallest and largest number of frames in contact from which a length is taken."""
-
+# Distances, in pixels, between bases in several views: more than usual; not the same base.
 _NEAR, _FAR = 2.0, 10.0
-"""Distances, in pixels, between bases in several views: more than usual; not the same base."""
-
+# Misfit that is not usual, and the share of the frames with it that is worth a remark.
 _STRANGE, _OFTEN = 2.0, 0.05
-"""Misfit that is not usual, and the share of the frames with it that is worth a remark."""
-
+# Share of the uncertainty of contact points that comes from the cameras and is worth a remark.
 _MOST = 0.7
-"""Share of the uncertainty of contact points that comes from the cameras and is worth a remark."""
-
-_FUR_KNOWN = 0.25
-"""Standard deviation of a stated length of fur, as a share of it."""
-
-_SHARE = 0.03
-"""Distance between bases that are not the same, as a share of the whisker's length."""
+_FUR_KNOWN = 0.25  # standard deviation of a stated length of fur, as a share of it
+_SHARE = 0.03  # distance between bases that are not the same, as a share of the whisker's length
 
 
 @dataclass(frozen=True)

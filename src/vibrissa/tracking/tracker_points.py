@@ -19,35 +19,16 @@ from vibrissa.numerics import Array
 from vibrissa.tracking.refine.rods import NODES
 from vibrissa.tracking.trace.trace import STEP, Trace, given
 
-POINT_SIGMA = 0.5
-"""Usual standard deviation of a tracked point across the whisker, pixels."""
-
-_SHOWN = 12
-"""Number of whiskers that are listed."""
-
-_FEWEST = 3
-"""Smallest number of points that make a trace."""
-
-_CONFIDENT = 0.6
-"""Confidence below which a tracker's point is left out."""
-
-_SPACING = 8.0
-"""Distance of points along a trace below which they are averaged, pixels."""
-
-_USUAL = 0.5
-"""Share of the frames in which a whisker is seen, from which it is worth tracking."""
-
-_SHARE = 1e-3
-"""Usual standard deviation of a point in space, as a share of the whisker's length."""
-
-_WIDE = 1000.0
-"""Width of the image of a camera that is added, pixels."""
-
-_MARGIN = 20.0
-"""Distance of the points from the border of such an image, pixels."""
-
-_ARC_POINTS = 12
-"""Number of points on an arc that stands for a measured curvature."""
+POINT_SIGMA = 0.5  # usual standard deviation of a tracked point across the whisker, pixels
+_SHOWN = 12  # number of whiskers that are listed
+_FEWEST = 3  # smallest number of points that make a trace
+_CONFIDENT = 0.6  # confidence below which a tracker's point is left out
+_SPACING = 8.0  # distance of points along a trace below which they are averaged, pixels
+_USUAL = 0.5  # share of the frames in which a whisker is seen, from which it is worth tracking
+_SHARE = 1e-3  # usual standard deviation of a point in space, as a share of the whisker's length
+_WIDE = 1000.0  # width of the image of a camera that is added, pixels
+_MARGIN = 20.0  # distance of the points from the border of such an image, pixels
+_ARC_POINTS = 12  # number of points on an arc that stands for a measured curvature
 
 
 @dataclass(frozen=True)

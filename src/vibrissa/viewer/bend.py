@@ -26,12 +26,11 @@ from vibrissa.viewer.readout import (
 )
 from vibrissa.whisker import Whisker
 
+# Start of the ruler, over its length: below the contacts, where it meets no other label.
 NODES = 48
 _AXES = np.array([(190, 60, 60), (70, 140, 70), (70, 90, 190)], dtype=np.uint8)
 _ASIDE = np.array([0.0, -0.15, -0.55])
-"""Start of the ruler, over its length: below the contacts, where it meets no other label."""
-_ARROW = 0.3
-"""Length of the arrow of a force of EI/L², over L; others go with the square root."""
+_ARROW = 0.3  # length of the arrow of a force of EI/L², over L; others go with the square root
 
 
 def whisker_body(

@@ -32,12 +32,10 @@ from vibrissa.viewer.readout import (
 from vibrissa.viewer.state import Bend, Chart, coloured_solid, numbers_in, words_of
 from vibrissa.whisker import Whisker
 
-_RAT = (1.5e-4, 6e-6)
-"""EI/L², N, and EI/L, N·m, of a rat's whisker."""
-
+_RAT = (1.5e-4, 6e-6)  # EI/L², N, and EI/L, N·m, of a rat's whisker
+# Candidates nearer to the contact than this share of the length are the contact itself.
 COLOURS = ("uniqueness", "ambiguity", "sensitivity", *SIGNALS)
 _APART = 0.005
-"""Candidates nearer to the contact than this share of the length are the contact itself."""
 
 
 @dataclass(frozen=True)
@@ -136,14 +134,9 @@ def _separation(estimate: Contacts, points: Array) -> Array:
     return np.where(estimate.status == Status.DEGENERATE, np.nan, farthest)
 
 
-SIGMAS = 2.0
-"""Standard deviations of the ellipsoids."""
-
-_CLEAR = 0.5
-"""Opacity of all contacts, so that the whisker is seen among them."""
-
-MOST = 0.3
-"""Longest semi-axis that is drawn, over the length: what is longer is as good as unknown."""
+SIGMAS = 2.0  # standard deviations of the ellipsoids
+_CLEAR = 0.5  # opacity of all contacts, so that the whisker is seen among them
+MOST = 0.3  # longest semi-axis that is drawn, over the length: what is longer is as good as unknown
 
 
 def locate_drawing(whisker: Whisker, found: Located, exaggeration: float) -> scene.Drawing:

@@ -35,20 +35,17 @@ from vibrissa.viewer.readout import (
 )
 from vibrissa.viewer.state import Chart
 
+# Quantities that can be held fixed in a slice.
 SLICES = ("x", "y", "z", "r", "theta", "phi", "Fx", "Mx", "arc_length")
-"""Quantities that can be held fixed in a slice."""
-
+# Bearings of the force that are kept where solids are cut open.
 _SHAPE = (24, 48, 12)
 _OPEN = (np.pi, 2.5 * np.pi)
-"""Bearings of the force that are kept where solids are cut open."""
-
+# Places of spaces in the plane that faces the viewer: two above, two below, in L.
 _HEIGHT = 0.85
 _PLACES = ((1.75, 0.62), (0.4, -0.78), (1.75, -0.78))
 _CONTACTS = (0.0, 0.62)
-"""Places of spaces in the plane that faces the viewer: two above, two below, in L."""
-
+# Angle by which signals are turned about their axis, so that one looks into what is cut open.
 TURN = float(np.deg2rad(62.0))
-"""Angle by which signals are turned about their axis, so that one looks into what is cut open."""
 
 
 @dataclass(frozen=True, eq=False)

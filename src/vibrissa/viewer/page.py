@@ -51,13 +51,10 @@ from vibrissa.whisker import Whisker
 
 EXAGGERATION = 8.0
 
+# How often numbers change while something is dragged, s: the browser takes half as long for them as
+# for a whisker, and nobody reads faster.
 _READ = 0.05
-"""How often numbers change while something is dragged, s: the browser takes half as long for them
-as for a whisker, and nobody reads faster."""
-
-_REST = 0.15
-"""Time that the mouse rests before everything is written, s."""
-
+_REST = 0.15  # time that the mouse rests before everything is written, s
 Transition = Callable[[Bend], Bend]
 
 
@@ -328,8 +325,8 @@ def show(handle: viser.GuiHtmlHandle, content: str) -> None:
 
 _MM = quantity("length").display_factor
 
+# Called with the place (3,), m, and the orientation (3, 3) to which it was dragged.
 Moved = Callable[[Array, Array], None]
-"""Called with the place (3,), m, and the orientation (3, 3) to which it was dragged."""
 
 
 class Grip:
@@ -408,20 +405,16 @@ class Grip:
         self._ball.remove()
 
 
+# Width of the panel and its margin, over the height of a usual window; in a narrow one at most half
+# of the width counts. How many pixels it has is not known: screens have one or more to each of the
+# page's.
 PANEL = 0.52
-"""Width of the panel and its margin, over the height of a usual window; in a narrow one at most
-half of the width counts. How many pixels it has is not known: screens have one or more to each of
-the page's."""
-
+# Width over height of a window in which the panel is below what is drawn, and its share of the
+# height there.
 PHONE, LOW = 0.65, 0.55
-"""Width over height of a window in which the panel is below what is drawn, and its share of the
-height there."""
-
+# Directions from which things can be looked at; with x to the right in the first two.
 VIEWS = {"Top": (0.0, -1e-3, 1.0), "Front": (0.0, -1.0, 0.0), "Side": (1.0, 0.0, 0.0)}
-"""Directions from which things can be looked at; with x to the right in the first two."""
-
-_WIDTH = 1.25
-"""Width of what is shown, over the distance from which it is looked at."""
+_WIDTH = 1.25  # width of what is shown, over the distance from which it is looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -588,8 +581,7 @@ class Latest:
                 self._fault(error)
 
 
-RATE = 25.0
-"""Ticks per second."""
+RATE = 25.0  # ticks per second
 
 
 class Player:
@@ -635,8 +627,7 @@ class Player:
 
 Rehearsal = Callable[[], object]
 
-_done = threading.Event()
-"""Set once this process has gone through all: kernels stay."""
+_done = threading.Event()  # set once this process has gone through all: kernels stay
 
 
 class CompileNotice(event.Listener):

@@ -110,11 +110,11 @@ def numbers(bent: Deflection) -> str:
     return table(measured, "At the base") + table(contact, "Contact")
 
 
+# Points of a line; each stands for the least and the largest value around it.
 ROWS = (("Fx", "FT"), ("Mx", "MB"), ("FD", "MD"))
 WIDTH, ROW, LEFT = 300.0, 62.0, 40.0
 _COLOURS = ("#0072b2", "#d55e00")
 _MOST = 700
-"""Points of a line; each stands for the least and the largest value around it."""
 
 
 def chart(time: Array, signals: dict[str, Array], touching: NDArray[np.bool_]) -> str:
@@ -144,11 +144,8 @@ def cursor(share: float, *, strip: bool = False) -> str:
     return f'<div style="margin-top:{-100.0 * tall / WIDTH:.3f}%">{_svg(line, tall)}</div>'
 
 
-PAD = 8
-"""Empty pixels at the right of a picture over time; the page's script knows them."""
-
-STRIP = 20.0
-"""Height of the timeline, pixels per :data:`WIDTH` of them."""
+PAD = 8  # empty pixels at the right of a picture over time; the page's script knows them
+STRIP = 20.0  # height of the timeline, pixels per :data:`WIDTH` of them
 
 
 def timeline(time: Array, touching: NDArray[np.bool_], onsets: NDArray[np.int64]) -> str:
@@ -273,9 +270,9 @@ OBJECT: Colour = (160, 172, 186)
 FIT: Colour = (0, 158, 115)
 CLOUD: Colour = (150, 175, 200)
 
+# Colours of no, one, two, and more candidates.
 _NONE = (0.80, 0.82, 0.84)
 _COUNTS = ((0.80, 0.82, 0.84), (0.35, 0.62, 0.80), (0.90, 0.55, 0.10), (0.75, 0.10, 0.15))
-"""Colours of no, one, two, and more candidates."""
 
 
 @dataclass(frozen=True)

@@ -29,9 +29,9 @@ from vibrissa.whisker import Whisker
 
 Picture = np.ndarray[Any, np.dtype[np.uint8]]
 
+# White around a picture, pixels.
 NODES = 200
 _MARGIN = 24
-"""White around a picture, pixels."""
 
 
 def whisker_csv(whisker: Whisker) -> bytes:
@@ -99,9 +99,9 @@ def _written(name: str, write: Callable[[Path], object]) -> bytes:
         return path.read_bytes()
 
 
+# Most frames of a movie.
 _TIMEOUT = 20.0
 _FRAMES = 100
-"""Most frames of a movie."""
 
 
 def _render(client: viser.ClientHandle) -> Picture:

@@ -75,9 +75,7 @@ if TYPE_CHECKING:
 HOST = "127.0.0.1"
 PORT = 8080
 
-_HERE = "● "
-"""Mark of the chosen mode."""
-
+_HERE = "● "  # mark of the chosen mode
 _COMPILING = (
     "Compiling, once for this installation, which takes a minute or two. Pegs, candidates and "
     "their errors follow when their part is ready."
@@ -362,8 +360,7 @@ def _footage(
     return tuple(opened.enter_context(contextlib.closing(Footage(path))) for path in videos)
 
 
-Restore = Callable[[dict[str, str]], None]
-"""Called with the words of a link that a browser follows."""
+Restore = Callable[[dict[str, str]], None]  # called with the words of a link that a browser follows
 
 
 def _served(
@@ -481,13 +478,11 @@ def guarded(host: str, restore: Restore) -> Iterator[None]:
         )
 
 
-_POINTS = 5000
-"""Contact points that remain; those before are forgotten."""
-_PICTURE = 0.05
-"""Seconds between two pictures."""
+_POINTS = 5000  # contact points that remain; those before are forgotten
+_PICTURE = 0.05  # seconds between two pictures
+# Largest semi-axis of an ellipsoid of uncertainty, over the whisker's length.
 _SIGMAS = 2.0
 _WIDEST = 0.25
-"""Largest semi-axis of an ellipsoid of uncertainty, over the whisker's length."""
 
 
 class Live:

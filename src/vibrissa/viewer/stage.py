@@ -165,10 +165,9 @@ def _vector(values: Any) -> tuple[float, float, float]:
     return x, y, z
 
 
+# Brightness of what is seen by a grazing light, as a share of the full one.
 _TO_LIGHT = np.array([-0.25, -0.55, 0.8]) / np.linalg.norm([-0.25, -0.55, 0.8])
 _SHADE = 0.75
-"""Brightness of what is seen by a grazing light, as a share of the full one."""
-
 # ACES filmic tone mapping of three.js: in, a curve per channel, out; and its exposure.
 _IN = np.array(
     [[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]]

@@ -141,9 +141,7 @@ def _measured(trial: Recording, shape: tuple[int, int]) -> tuple[Array, dict[str
 
 Frame = NDArray[np.uint8]
 
-WIDTH = 420
-"""Width of a picture, pixels."""
-
+WIDTH = 420  # width of a picture, pixels
 _MARGIN = 40.0
 _TRACE, _CONTACT = (255, 96, 0), (0, 150, 255)
 
@@ -206,9 +204,7 @@ def picture(view: View, trial: Watched, frame: int, image: Frame | None = None) 
     return np.asarray(out)
 
 
-POINTS = 4000
-"""Most contact points that are drawn."""
-
+POINTS = 4000  # most contact points that are drawn
 _COLOURS = np.array(
     [CONTACT, (0, 114, 178), (204, 121, 167), (0, 158, 115), (230, 159, 0), (86, 180, 233)]
 )
@@ -221,18 +217,12 @@ def extent(trial: Watched) -> tuple[Array, float]:
     return mm(0.5 * (low + high)), float(mm(np.linalg.norm(high - low)))
 
 
+# Layers that can be switched.
 LAYERS = ("Whiskers", "Forces", "Contacts", "Uncertainty", "Objects", "Fitted shape", "Scale")
-"""Layers that can be switched."""
-
-_SIGMAS = 2.0
-"""Size of the ellipsoid of a contact, standard deviations."""
-
-_SHARP = 0.3e-3
-"""Standard deviation, m, from which on contacts are paler."""
-
+_SIGMAS = 2.0  # size of the ellipsoid of a contact, standard deviations
+_SHARP = 0.3e-3  # standard deviation, m, from which on contacts are paler
+# Colour of the least certain contacts, as faint on white as on black.
 _PALE = np.array([150.0, 152.0, 155.0])
-"""Colour of the least certain contacts, as faint on white as on black."""
-
 _LEGEND = Legend(
     "",
     tuple(

@@ -23,8 +23,7 @@ from vibrissa.whisker.morphology import ROWS, Identity, Side, published_radii
 from vibrissa.whisker.pose import Pose, angles_of, base_rotation, mirrored
 from vibrissa.whisker.section import Properties
 
-BOTH: tuple[Side, Side] = ("left", "right")
-"""Sides of an animal."""
+BOTH: tuple[Side, Side] = ("left", "right")  # sides of an animal
 
 
 class WhiskerArray(Mapping[str, Whisker]):
@@ -253,9 +252,7 @@ def _named(whisker: Whisker) -> tuple[Identity, Whisker]:
     return identity, whisker if same else replace(whisker, name=identity.name)
 
 
-NODES = 33
-"""Points of the centrelines that come along."""
-
+NODES = 33  # points of the centrelines that come along
 _OF_HEAD = "In the head's frame: origin at the snout, x to the animal's right, y forward, z up."
 
 

@@ -19,8 +19,7 @@ from vibrissa.quantities import attributes
 from vibrissa.whisker.pose import Pose
 from vibrissa.whisker.profile import Profile
 
-NODES = 101
-"""Points of the centreline that comes along."""
+NODES = 101  # points of the centreline that comes along
 
 
 def whisker_dataset(whisker: Any) -> xr.Dataset:
@@ -104,9 +103,9 @@ def check_drawn(dataset: Stored, whisker: Any) -> None:
     )
 
 
+# Tolerance, as a share of the largest value, between drawn and stated values of a file.
 _DRAWN = ("arc_length", "centerline", "radius")
 _SAME = 1e-6
-"""Tolerance, as a share of the largest value, between drawn and stated values of a file."""
 
 
 def whisker_fields(dataset: Stored) -> dict[str, Any]:

@@ -53,17 +53,11 @@ from vibrissa.whisker.pose import Pose, least_turn
 from vibrissa.whisker.profile import Path, Profile, approximate, constant
 from vibrissa.whisker.section import LONGEST, length_faults
 
-ROUNDS = 12
-"""Times at most that points are projected and fitted again."""
-
-GROUPS = 24
-"""Points of the first guess; more are averaged in groups."""
-
-SIGNIFICANCE = 0.01
-"""Chance that straight noise passes for curvature."""
-
+ROUNDS = 12  # times at most that points are projected and fitted again
+GROUPS = 24  # points of the first guess; more are averaged in groups
+SIGNIFICANCE = 0.01  # chance that straight noise passes for curvature
+# Difference of a hint's distances to both ends, in lengths, below which it is ambiguous.
 HINT_MARGIN = 0.1
-"""Difference of a hint's distances to both ends, in lengths, below which it is ambiguous."""
 
 
 SCATTER = 0.08
@@ -71,8 +65,7 @@ SCATTER = 0.08
 STRAIGHT = 0.02
 """Largest noise, in extents of the points, that is believed unless it was stated."""
 
-WANDERING = 4.0
-"""Length of a curve, in extents of its points, beyond which they are not in order."""
+WANDERING = 4.0  # length of a curve, in extents of its points, beyond which they are not in order
 
 
 @dataclass(frozen=True, eq=False)
@@ -424,14 +417,9 @@ def nearest_parameters(
     return t
 
 
-SITES = 48
-"""Values that a smoothing spline has at most, per coordinate."""
-
-COST = 1.3
-"""ρ, what a degree of freedom counts."""
-
-LEVELS = 90
-"""Values of λ that are compared."""
+SITES = 48  # values that a smoothing spline has at most, per coordinate
+COST = 1.3  # ρ, what a degree of freedom counts
+LEVELS = 90  # values of λ that are compared
 
 
 def natural_spline(t: Array, values: Array) -> interpolate.BSpline:

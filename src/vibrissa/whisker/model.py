@@ -57,8 +57,7 @@ from vibrissa.whisker.section import (
 ROUNDING = 1e-9
 """Share of the length by which an arc length may lie outside the whisker and is clipped."""
 
-STRAIGHT = 1e-9
-"""Largest curvature times length of a whisker that counts as straight."""
+STRAIGHT = 1e-9  # largest curvature times length of a whisker that counts as straight
 
 PROXIMAL = 0.7
 """Proximal share of the whisker that defines the direction of y."""

@@ -50,22 +50,16 @@ from numpy.typing import ArrayLike
 
 from vibrissa.numerics import Array
 
+# Columns (0: Greek) of each row whose whiskers were measured: the range of validity.
 MEASURED = {"A": range(5), "B": range(6), "C": range(7), "D": range(7), "E": range(1, 7)}
-"""Columns (0: Greek) of each row whose whiskers were measured: the range of validity."""
-
+# Base over tip radius, at most: the largest of the means that studies found (28 to 36).
 MOST_TAPER = 36.0
-"""Base over tip radius, at most: the largest of the means that studies found (28 to 36)."""
-
-_TOWAL_GREEK = 1
-"""Column number of the Greek whiskers in Towal et al."""
-
-_BELLI_GREEK = 0
-"""Column number of the Greek whiskers in Belli et al."""
-
+_TOWAL_GREEK = 1  # column number of the Greek whiskers in Towal et al
+_BELLI_GREEK = 0  # column number of the Greek whiskers in Belli et al
+# Ellipsoid of the right cheek: m, and angles about z, y, x, rad, the last one turned first.
 _CENTER = 1e-3 * np.array([1.9128, -7.6549, -5.4439])
 _RADII = 1e-3 * np.array([9.5304, 5.5393, 6.9745])
 _TURNED = np.radians([106.51, -2.5211, -19.5401])
-"""Ellipsoid of the right cheek: m, and angles about z, y, x, rad, the last one turned first."""
 
 
 def arc_length(row: ArrayLike, column: ArrayLike) -> Array:
@@ -180,11 +174,8 @@ def _belli(row: ArrayLike, column: ArrayLike) -> tuple[Array, Array]:
     return np.asarray(row, np.float64), np.asarray(column, np.float64) + _BELLI_GREEK
 
 
-ANY = "any"
-"""Name of a whisker of unknown row and column, of which only the length is known."""
-
-_ALIKE = 5e-3
-"""Difference of length within which whiskers count as alike, m: about half a column."""
+ANY = "any"  # name of a whisker of unknown row and column, of which only the length is known
+_ALIKE = 5e-3  # difference of length within which whiskers count as alike, m: about half a column
 
 
 def published_radii(name: str, length: float) -> tuple[float, float]:
@@ -220,12 +211,8 @@ def published_note(name: str) -> str:
 
 Side = Literal["left", "right"]
 
-ROWS = "ABCDE"
-"""Rows, from the top down."""
-
-GREEK = ("α", "β", "γ", "δ")
-"""Whiskers of column 0, in rows A to D."""
-
+ROWS = "ABCDE"  # rows, from the top down
+GREEK = ("α", "β", "γ", "δ")  # whiskers of column 0, in rows A to D
 _SPELLED = ("alpha", "beta", "gamma", "delta")
 _SIDES: dict[str, Side] = {"l": "left", "left": "left", "r": "right", "right": "right"}
 _PATTERN = re.compile(

@@ -25,8 +25,7 @@ from numpy.typing import ArrayLike
 
 from vibrissa.numerics import Array
 
-ORTHOGONALITY = 1e-9
-"""Largest entry of RᵀR − 1 that still counts as a rotation."""
+ORTHOGONALITY = 1e-9  # largest entry of RᵀR − 1 that still counts as a rotation
 
 
 @dataclass(frozen=True, eq=False)

@@ -62,25 +62,19 @@ from vibrissa.numerics import Array
 Function = Callable[[Array], Array]
 Side = Literal["right", "left"]
 
-DEGREES = (1, 3, 7)
-"""Degrees tried on an interval before it is halved."""
+DEGREES = (1, 3, 7)  # degrees tried on an interval before it is halved
 
 TOLERANCE = 1e-12
 """Largest error of the polynomials, relative to the function's largest value."""
 
-FINEST = 512
-"""Parts of the domain below which an interval is not halved any more."""
-
-UNRESOLVED = 1e-7
-"""Relative error above which a function counts as not resolved."""
+FINEST = 512  # parts of the domain below which an interval is not halved any more
+UNRESOLVED = 1e-7  # relative error above which a function counts as not resolved
 
 
-MOST_SEARCHED = 64
-"""Intervals not resolved, at most, in which jumps and kinks are searched for."""
-
+MOST_SEARCHED = 64  # intervals not resolved, at most, in which jumps and kinks are searched for
+# Smallest changes of value and of slope times length, relative to the largest value, that count as
+# a jump and as a kink.
 JUMP, KINK = 1e-9, 1e-3
-"""Smallest changes of value and of slope times length, relative to the largest value, that count as
-a jump and as a kink."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,26 +292,18 @@ def array_function(function: Callable[..., object], shape: tuple[int, ...], what
     return checked
 
 
-MOST = 64
-"""Jumps and kinks beyond which samples count as rounded, not as a rod with so many steps."""
-
+MOST = 64  # jumps and kinks beyond which samples count as rounded, not as a rod with so many steps
+# Share of the radius below which a change is not looked at.
 _SIGNIFICANT = 5.5
 _TURNED = 8.0
 _OUTSTANDING = 3.0
 _NEGLIGIBLE = 1e-4
-"""Share of the radius below which a change is not looked at."""
-
+# Distance of two samples that state a jump, at most, in distances to the samples around them.
 _CLOSE = 2e-3
-"""Distance of two samples that state a jump, at most, in distances to the samples around them."""
-
-_MANY = 30
-"""Number of samples from which on noise can be distinguished from shape."""
-
+_MANY = 30  # number of samples from which on noise can be distinguished from shape
+# Share of close pairs among the intervals of a rod that was sampled at the ends of its steps.
 _PAIRED = 0.2
-"""Share of close pairs among the intervals of a rod that was sampled at the ends of its steps."""
-
-_QUARTILE = 0.3186
-"""First quartile of |x| where x is normally distributed, in standard deviations."""
+_QUARTILE = 0.3186  # first quartile of |x| where x is normally distributed, in standard deviations
 
 
 def sampled_radius(length: float, s: Array, r: Array) -> Profile:
@@ -470,9 +456,7 @@ Rate = Callable[[Array], Array]
 STEPS = 96
 """Least number of steps along a whisker."""
 
-TURN = 0.04
-"""Largest angle a step may turn, rad: keeps the method's error near rounding."""
-
+TURN = 0.04  # largest angle a step may turn, rad: keeps the method's error near rounding
 _GAUSS = 0.5 + np.sqrt(15.0) / 10.0 * np.array([-1.0, 0.0, 1.0])
 
 

@@ -39,9 +39,8 @@ _LIGHTEST, _HEAVIEST = 10.0, 23000.0
 SHORTEST, LONGEST = 0.5e-3, 0.5
 """Lengths, m, between which the unit is not doubted."""
 
+# How to confirm a length outside them.
 CONFIRMATION = "any_length=True (Python) or --any-length (command line)"
-"""How to confirm a length outside them."""
-
 # A rod's radius is at most this share of its length.
 _STOUT = 0.1
 
@@ -49,8 +48,7 @@ _STOUT = 0.1
 # signals follow samples that scatter, in units of it.
 _SCATTERED, _FOLLOWED = 2e-3, 0.04
 
-COVERAGE = 0.01
-"""Share of the length by which radius samples may fall short of base or tip."""
+COVERAGE = 0.01  # share of the length by which radius samples may fall short of base or tip
 
 
 class Section(TypedDict, total=False):
@@ -90,10 +88,9 @@ def split(properties: Properties) -> tuple[Section, Holding]:
     return cast(Section, section), cast(Holding, others)
 
 
+# Ending of a note on a property that was not stated.
 _SECTION_KEYS = Section.__optional_keys__
 ASSUMED = " assumed, not measured"
-"""Ending of a note on a property that was not stated."""
-
 _RADIUS_ASSUMED = f"radius{ASSUMED}"
 _NOTED = {"youngs_modulus": "Young's modulus", "poisson_ratio": "Poisson's ratio"}
 

@@ -37,62 +37,39 @@ from vibrissa.tracking.refine.rods import (
 from vibrissa.tracking.space.pose import BasePose, HeadPose
 from vibrissa.whisker import Whisker
 
+# Levenberg's damping at the start, at least, and that at which no step helps.
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-8, 1e6
-"""Levenberg's damping at the start, at least, and that at which no step helps."""
-
-_SMALL = 1e-4
-"""Share by which the cost must fall for another round."""
-
-_HELD = 1e8
-"""Weight with which frames without contact keep the contact at rest."""
-
+_SMALL = 1e-4  # share by which the cost must fall for another round
+_HELD = 1e8  # weight with which frames without contact keep the contact at rest
+# Unknowns across the plane z = 0: a shift, turns about two axes; the force across it.
 _ACROSS = (slice(2, 5), slice(9, 10))
-"""Unknowns across the plane z = 0: a shift, turns about two axes; the force across it."""
-
+# Contact of a frame that has none: no force, half-way along the whisker.
 _REST = np.array([0.5, 0.0, 0.0, 0.0])
-"""Contact of a frame that has none: no force, half-way along the whisker."""
-
+# Standard deviation of the force along the whisker if there is none across, in units of EI/L².
 _RUBBING = 1e-4
-"""Standard deviation of the force along the whisker if there is none across, in units of EI/L²."""
-
-_WAVES = 8
-"""Number of waves along the whisker by which a view's traces may err in all frames alike."""
-
+_WAVES = 8  # number of waves along the whisker by which a view's traces may err in all frames alike
+# Standard deviation of the shift by light from the side at the base, pixels, less where the whisker
+# is thinner, if its profile shows no more; that shift over the profile's third cumulant, in radii,
+# for a flank of 0.65 radii that is lit by half; where on the whisker that is taken; and the largest
+# shift, in radii, which is that by a flank as bright as the background.
 _LIT, _SHIFTED, _NEARER, _MOST_LIT = 0.1, 3.2, 0.25, 0.5
-"""Standard deviation of the shift by light from the side at the base, pixels, less where the
-whisker is thinner, if its profile shows no more; that shift over the profile's third cumulant, in
-radii, for a flank of 0.65 radii that is lit by half; where on the whisker that is taken; and the
-largest shift, in radii, which is that by a flank as bright as the background."""
-
+# Standard deviation of what else shifts the traces of a view, most at the base, pixels.
 _UNSEEN = 0.02
-"""Standard deviation of what else shifts the traces of a view, most at the base, pixels."""
-
-_MEDIAN = 1.86
-"""Standard deviation of a median of n normal numbers, over their median size and √n."""
-
-_SQUARE = 0.455
-"""Median of the square of a standard normal number."""
-
+_MEDIAN = 1.86  # standard deviation of a median of n normal numbers, over their median size and √n
+_SQUARE = 0.455  # median of the square of a standard normal number
+# Share of the length over which fur may draw a trace aside, and by how much more it does than what
+# the rod, which follows it, leaves of that.
 _AT_BASE, _FOLLOWED = 0.03, 2.0
-"""Share of the length over which fur may draw a trace aside, and by how much more it does than what
-the rod, which follows it, leaves of that."""
-
+# Standard deviation of how far the rest shape is drawn aside at its base, where its tangent is the
+# axis of the whisker's frame, pixels, if residuals show no more; and its share of what they show.
 _HOOKED, _HOOK = 0.01, 0.35
-"""Standard deviation of how far the rest shape is drawn aside at its base, where its tangent is the
-axis of the whisker's frame, pixels, if residuals show no more; and its share of what they show."""
-
-_PROXIMAL = 0.7
-"""Share of the whisker that determines the roll of its frame."""
-
+_PROXIMAL = 0.7  # share of the whisker that determines the roll of its frame
+# Standard deviation of the error along the whisker that base and tip have in all frames, in units
+# of what it scatters: fur hides a base by more than it does so unevenly.
 _ENDS = (3.5, 1.0)
-"""Standard deviation of the error along the whisker that base and tip have in all frames, in units
-of what it scatters: fur hides a base by more than it does so unevenly."""
-
+# Unknowns of a contact without friction: arc length and the force across the whisker.
 _FREE = [0, 2, 3]
-"""Unknowns of a contact without friction: arc length and the force across the whisker."""
-
-_WILD = 1e6
-"""Slopes of points of a rod, in units of L, from which it is not in balance."""
+_WILD = 1e6  # slopes of points of a rod, in units of L, from which it is not in balance
 
 
 @dataclass(frozen=True)

@@ -25,14 +25,10 @@ from scipy.linalg import solveh_banded
 
 from vibrissa.numerics import Array
 
+# Share of the largest element that is added to diagonals, so that they can be factorised.
 _REGULAR = 1e-12
-"""Share of the largest element that is added to diagonals, so that they can be factorised."""
-
-_LEAST = 0.05
-"""Correlation that counts as none."""
-
-_FREE = 0.25
-"""Smallest share of the residuals that are free, however many numbers are fitted."""
+_LEAST = 0.05  # correlation that counts as none
+_FREE = 0.25  # smallest share of the residuals that are free, however many numbers are fitted
 
 
 class Smoother:

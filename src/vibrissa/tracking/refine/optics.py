@@ -28,57 +28,34 @@ from vibrissa.tracking.space.curve import merge
 from vibrissa.tracking.space.rest_shape import RestShape, aligned_lengths, motions, rest_shape
 from vibrissa.tracking.trace.trace import Trace, arc_lengths, interpolated
 
+# Standard deviation of the inverse of a distance that is not stated, 1/m: lenses at 0.5 m.
 _STRENGTH = 2.0
-"""Standard deviation of the inverse of a distance that is not stated, 1/m: lenses at 0.5 m."""
-
-_DISTANCE = 0.1
-"""Standard deviation of a stated distance, as a share of it."""
-
+_DISTANCE = 0.1  # standard deviation of a stated distance, as a share of it
+# Inverse of the largest and of the smallest distance that are considered, 1/m.
 _WEAKEST, _STRONGEST = 0.02, 20.0
-"""Inverse of the largest and of the smallest distance that are considered, 1/m."""
-
+# Standard deviations of a turn of a view, rad, of its scale, and of its shift, pixels.
 _TURN, _SCALE, _SHIFT = np.radians(3.0), 0.03, 10.0
-"""Standard deviations of a turn of a view, rad, of its scale, and of its shift, pixels."""
-
+# Number of points of the shape, and the share of the usual length that they cover.
 _NODES, _LENGTH = 33, 0.9
-"""Number of points of the shape, and the share of the usual length that they cover."""
-
-_FRAMES, _FEWEST = 60, 8
-"""Largest and smallest number of free frames that are used."""
-
-_SAMPLE = 150
-"""Largest number of frames from which the free ones are selected."""
-
+_FRAMES, _FEWEST = 60, 8  # largest and smallest number of free frames that are used
+_SAMPLE = 150  # largest number of frames from which the free ones are selected
+# Deviation from the rest shape up to which a frame may be free, as a share of the whisker's length:
+# wrong optics make free frames differ too, and what is bent is left out later.
 _ALIKE = 0.04
-"""Deviation from the rest shape up to which a frame may be free, as a share of the whisker's
-length: wrong optics make free frames differ too, and what is bent is left out later."""
-
+# Misfit of stated cameras that is visible, pixels; share of it that others must leave at most; and
+# standard deviations by which these must differ from the stated ones.
 _VISIBLE, _BETTER, _CERTAIN = 0.05, 0.6, 3.0
-"""Misfit of stated cameras that is visible, pixels; share of it that others must leave at most; and
-standard deviations by which these must differ from the stated ones."""
-
-_ROUNDS, _DAMPING = 12, 1e-3
-"""Number of Gauss–Newton steps, and Levenberg's damping."""
-
+_ROUNDS, _DAMPING = 12, 1e-3  # number of Gauss–Newton steps, and Levenberg's damping
+# Standard deviations of third differences of the shape, and of motions of its points along it, as a
+# share of their spacing.
 _LOOSE, _SLIDING = 0.02, 0.05
-"""Standard deviations of third differences of the shape, and of motions of its points along it, as
-a share of their spacing."""
-
-_STEP = 1e-3
-"""Step of differences by the optics, in their standard deviations."""
-
+_STEP = 1e-3  # step of differences by the optics, in their standard deviations
+# Standard deviation to which traces are set, pixels: as their errors are common to many points and
+# frames, it is far above that of one point.
 _UNIT = 0.5
-"""Standard deviation to which traces are set, pixels: as their errors are common to many points and
-frames, it is far above that of one point."""
-
-_SELECTIONS = 3
-"""Number of rounds in which frames that are bent are left out."""
-
-_ODD = 3.0
-"""Misfit of frames that are left out, in units of the usual one: they are bent."""
-
-_FAR = 6.0
-"""Misses from which `TraceSeries.equations` weighs down, standard deviations."""
+_SELECTIONS = 3  # number of rounds in which frames that are bent are left out
+_ODD = 3.0  # misfit of frames that are left out, in units of the usual one: they are bent
+_FAR = 6.0  # misses from which `TraceSeries.equations` weighs down, standard deviations
 
 
 @dataclass(frozen=True, eq=False)

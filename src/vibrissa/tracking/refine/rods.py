@@ -21,18 +21,12 @@ from vibrissa.tracking.space.pose import BasePose
 from vibrissa.tracking.trace.trace import Trace, arc_lengths, interpolated
 from vibrissa.whisker import Whisker
 
-NODES = 101
-"""Number of points of a stored trace."""
-
-_FLOOR = 0.05
-"""Smallest standard deviation of a trace, pixels."""
-
-_END = 1.0
-"""Standard deviation of a trace's ends along it, pixels."""
-
+NODES = 101  # number of points of a stored trace
+_FLOOR = 0.05  # smallest standard deviation of a trace, pixels
+_END = 1.0  # standard deviation of a trace's ends along it, pixels
+# Distance, in pixels, from which the end of a trace is not the tip, and in standard deviations,
+# from which an error shows that something else is wrong and is weighted down.
 FAR = 6.0
-"""Distance, in pixels, from which the end of a trace is not the tip, and in standard deviations,
-from which an error shows that something else is wrong and is weighted down."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,28 +110,18 @@ class TraceSeries:
         return np.nan_to_num(rows), np.nan_to_num(misses), np.nan_to_num(weight)
 
 
-UNKNOWNS = 10
-"""Number of a frame's unknowns: shift (3), turn (3), s_c, f_x, f_y, f_z."""
-
-_SAMPLES = 48
-"""Number of points of a rod that are compared with the traces."""
-
+UNKNOWNS = 10  # number of a frame's unknowns: shift (3), turn (3), s_c, f_x, f_y, f_z
+_SAMPLES = 48  # number of points of a rod that are compared with the traces
+# Arc lengths of contacts from which the fit may start, in units of L.
 _STARTS = np.array([0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])
-"""Arc lengths of contacts from which the fit may start, in units of L."""
-
+# Weight of distances from the curves, in units of the usual one, as neighbours have errors in
+# common; how far contacts usually slide from frame to frame, in units of L; and the distance of a
+# rod that is not in balance.
 _UNLIKE, _SLIDES, _WORST = 4.0, 0.05, 1e6
-"""Weight of distances from the curves, in units of the usual one, as neighbours have errors in
-common; how far contacts usually slide from frame to frame, in units of L; and the distance of a rod
-that is not in balance."""
-
-_LIMITS = (0.1, 0.995)
-"""Smallest and largest arc length of a contact, in units of L."""
-
+_LIMITS = (0.1, 0.995)  # smallest and largest arc length of a contact, in units of L
+# Steps of differences by arc length and force, in units of L and EI/L².
 _STEPS = (1e-5, 1e-4, 1e-4, 1e-4)
-"""Steps of differences by arc length and force, in units of L and EI/L²."""
-
-_FRAMES, _TURNS = 9, 24
-"""Numbers of frames and of rolls from which that of a bent whisker is found."""
+_FRAMES, _TURNS = 9, 24  # numbers of frames and of rolls from which that of a bent whisker is found
 
 
 @dataclass(frozen=True, eq=False)

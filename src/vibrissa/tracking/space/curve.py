@@ -25,41 +25,22 @@ from vibrissa.tracking.trace.trace import Trace, arc_lengths, interpolated
 
 Array = NDArray[np.float64]
 
-NODES = 101
-"""Number of points of a whisker in space, equally spaced."""
-
-_SAMPLES = 51
-"""Number of points of the spline that are compared with the traces."""
-
-_CONTROLS = 14
-"""Number of the spline's control points."""
-
-_ROUNDS = 5
-"""Largest number of Gauss–Newton steps."""
-
-_SPARSE = 2
-"""Distance of the points of traces that are matched, in points."""
-
-_FARTHEST = 30.0
-"""Distance from an epipolar line beyond which more counts no more, pixels."""
-
+NODES = 101  # number of points of a whisker in space, equally spaced
+_SAMPLES = 51  # number of points of the spline that are compared with the traces
+_CONTROLS = 14  # number of the spline's control points
+_ROUNDS = 5  # largest number of Gauss–Newton steps
+_SPARSE = 2  # distance of the points of traces that are matched, in points
+_FARTHEST = 30.0  # distance from an epipolar line beyond which more counts no more, pixels
+# Smallest standard deviation of a trace, pixels: calibration and the spline's freedom.
 _FLOOR = 0.05
-"""Smallest standard deviation of a trace, pixels: calibration and the spline's freedom."""
-
+# Standard deviation of third differences of the control points, as a share of the length.
 _LOOSE = 0.05
-"""Standard deviation of third differences of the control points, as a share of the length."""
-
-_END = 1.0
-"""Standard deviation of a trace's ends along it, pixels."""
-
-_BEYOND = 6.0
-"""Distance of a tip from the end of a trace from which it is another, pixels."""
-
+_END = 1.0  # standard deviation of a trace's ends along it, pixels
+_BEYOND = 6.0  # distance of a tip from the end of a trace from which it is another, pixels
+# Standard deviation of the distance from the plane in which a single view's whisker is, m.
 _LEVEL = 1e-7
-"""Standard deviation of the distance from the plane in which a single view's whisker is, m."""
-
+# Standard deviation of a point's motion along the curve in a round, in units of their distance.
 _SLIDING = 0.3
-"""Standard deviation of a point's motion along the curve in a round, in units of their distance."""
 
 
 class SpaceCurve(NamedTuple):

@@ -19,25 +19,15 @@ from vibrissa.tracking.trace.trace import Trace
 
 Pairs = NDArray[np.int64]
 
-_LARGEST = 30
-"""Largest shift that is considered, frames."""
-
+_LARGEST = 30  # largest shift that is considered, frames
 _SHIFTS = np.arange(-_LARGEST, _LARGEST + 1)
 
-_SWITCH = 40.0
-"""Cost of a change of the shift."""
-
-_WORST = 6.0
-"""Largest cost of a frame: square of the distance at which lines pass, pixels²."""
-
-_CLEARLY = 20.0
-"""Cost by which another shift must fit better than the given one."""
-
+_SWITCH = 40.0  # cost of a change of the shift
+_WORST = 6.0  # largest cost of a frame: square of the distance at which lines pass, pixels²
+_CLEARLY = 20.0  # cost by which another shift must fit better than the given one
+# Share of the cost of the given shift that one which explains the misfit leaves at most.
 _LEFT = 0.65
-"""Share of the cost of the given shift that one which explains the misfit leaves at most."""
-
-_KNOWN = 10
-"""Number of frames that must show an end of the whisker."""
+_KNOWN = 10  # number of frames that must show an end of the whisker
 
 
 def paired_frames(

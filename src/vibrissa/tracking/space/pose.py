@@ -24,24 +24,15 @@ from vibrissa.whisker import Whisker, angles_of, base_rotation
 CUTOFF = 85.0
 """The paper's cut-off, Hz."""
 
-_ORDER = 2
-"""Order of the Butterworth filter, which is applied forward and backward."""
-
-_LATE = 1e-6
-"""Share of a frame by which a table of times may be too short."""
-
-_TANGENT = 0.2
-"""Share of the whisker over which the tangent at the base is fitted."""
-
+_ORDER = 2  # order of the Butterworth filter, which is applied forward and backward
+_LATE = 1e-6  # share of a frame by which a table of times may be too short
+_TANGENT = 0.2  # share of the whisker over which the tangent at the base is fitted
+# Share of the whisker over which the rest shape is put on a frame's shape: tips are uncertain.
 _WHOLE = 0.85
-"""Share of the whisker over which the rest shape is put on a frame's shape: tips are uncertain."""
-
+# Difference of a roll from what it is at that azimuth and elevation, rad, from which a frame is not
+# free, and in standard deviations; a median of sizes in these; and number of rounds.
 _ROLLED, _UNUSUAL, _MEDIAN, _ROUNDS = np.deg2rad(15.0), 5.0, 0.6745, 4
-"""Difference of a roll from what it is at that azimuth and elevation, rad, from which a frame is
-not free, and in standard deviations; a median of sizes in these; and number of rounds."""
-
-_SLOW = 7
-"""Number of free frames of which the median shows how the roll slowly changes."""
+_SLOW = 7  # number of free frames of which the median shows how the roll slowly changes
 
 
 def low_pass(values: ArrayLike, rate: float, cutoff: float | None = CUTOFF) -> Array:

@@ -31,67 +31,38 @@ from vibrissa.whisker import Whisker
 
 Counts = NDArray[np.intp]
 
-_COMMON = 0.85
-"""Share of the usual length over which shapes are compared: tips are uncertain."""
-
-_LEAST = 0.4
-"""Share of that which must be seen to decide whether the whisker is bent."""
-
-_FEWEST = 3
-"""Smallest number of frames from which a shape is taken."""
-
-_NEAR = 4.0
-"""Deviation of a free frame at most, in units of the usual one."""
-
+_COMMON = 0.85  # share of the usual length over which shapes are compared: tips are uncertain
+_LEAST = 0.4  # share of that which must be seen to decide whether the whisker is bent
+_FEWEST = 3  # smallest number of frames from which a shape is taken
+_NEAR = 4.0  # deviation of a free frame at most, in units of the usual one
+# A whisker rings where free frames usually deviate by so many times what this share of them does;
+# then still ones deviate by at most so many times that.
 _UNEVEN, _QUIETEST, _QUIET = 2.5, 0.1, 1.5
-"""A whisker rings where free frames usually deviate by so many times what this share of them does;
-then still ones deviate by at most so many times that."""
-
+# Usual deviation from which this is done, over the length: by less the base hardly is turned.
 _RINGS = 2e-5
-"""Usual deviation from which this is done, over the length: by less the base hardly is turned."""
-
+# Depth of the shape from which this is done, in usual deviations: a straight whisker that rings is
+# alike where it turns back, too.
 _DEEP = 10.0
-"""Depth of the shape from which this is done, in usual deviations: a straight whisker that rings
-is alike where it turns back, too."""
-
-_LONGER = 1.1
-"""Length over which a known whisker may be seen, in units of its own."""
-
-_STILL = 0.01
-"""Usual deviation of free frames at most, as a share of a known whisker's length."""
-
-_ENDS = 3
-"""Number of frames at rest that show the tip, from which the length is taken."""
-
+_LONGER = 1.1  # length over which a known whisker may be seen, in units of its own
+_STILL = 0.01  # usual deviation of free frames at most, as a share of a known whisker's length
+_ENDS = 3  # number of frames at rest that show the tip, from which the length is taken
+# Factor of the noise of a shape: errors of neighbouring points are correlated, so that they seem
+# smoother than they are right.
 _SMOOTH = 4.0
-"""Factor of the noise of a shape: errors of neighbouring points are correlated, so that they seem
-smoother than they are right."""
-
+# Roll about the whisker's chord from which a rigid motion is not one that an animal makes.
 _OVER = np.deg2rad(120.0)
-"""Roll about the whisker's chord from which a rigid motion is not one that an animal makes."""
-
-_BASE = 6
-"""Number of parts of a shape of which the first shows the direction of its base."""
-
-_ROUNDS = 4
-"""Number of rounds in which the free frames are selected."""
-
+_BASE = 6  # number of parts of a shape of which the first shows the direction of its base
+_ROUNDS = 4  # number of rounds in which the free frames are selected
+# Step and largest value of the lengths that are tried, as a share of what is seen, and number of
+# those between which costs are interpolated.
 _STEP, _LONGEST, _FINE = 0.03, 1.45, 600
-"""Step and largest value of the lengths that are tried, as a share of what is seen, and number of
-those between which costs are interpolated."""
-
+# Smallest standard deviation of a length that bending shows, as a share: errors of traces, and of
+# the taper, that all frames share.
 _CERTAIN = 0.025
-"""Smallest standard deviation of a length that bending shows, as a share: errors of traces, and of
-the taper, that all frames share."""
-
+# Difference of costs up to which a length is hardly less likely: three standard deviations.
 _HARDLY = 9.0
-"""Difference of costs up to which a length is hardly less likely: three standard deviations."""
-
-_ENDED = 0.7
-"""Standard deviation of a seen length by where its tip is seen, pixels."""
-
-_OUTER = 0.4
-"""Share of the shape that determines how it continues."""
+_ENDED = 0.7  # standard deviation of a seen length by where its tip is seen, pixels
+_OUTER = 0.4  # share of the shape that determines how it continues
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,14 +21,11 @@ Array = NDArray[np.float64]
 Bits = NDArray[np.uint32]
 Mask = NDArray[np.bool_]
 
+# Distance up to which another whisker is in the way, pixels, for a whisker of usual width.
 NEAR = 5.0
-"""Distance up to which another whisker is in the way, pixels, for a whisker of usual width."""
-
+# Bits of still things that hide whiskers, and of those before or next to which they show.
 STILL, EDGE = np.uint32(1), np.uint32(2)
-"""Bits of still things that hide whiskers, and of those before or next to which they show."""
-
-_WHISKERS = 30
-"""Number of bits for whiskers."""
+_WHISKERS = 30  # number of bits for whiskers
 
 
 class Clutter(NamedTuple):
@@ -57,8 +54,7 @@ class Clutter(NamedTuple):
         return self._replace(which=int(STILL))
 
 
-NOTHING = Clutter(np.zeros((1, 1), dtype=np.uint32), 0)
-"""Nothing is in the way."""
+NOTHING = Clutter(np.zeros((1, 1), dtype=np.uint32), 0)  # nothing is in the way
 
 
 @inlined

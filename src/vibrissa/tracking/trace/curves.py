@@ -34,26 +34,14 @@ from vibrissa.tracking.trace.trace import (
 
 Array = NDArray[np.float64]
 
-SIGMA = 1.6
-"""Smoothing, pixels, for a whisker of usual width."""
-
+SIGMA = 1.6  # smoothing, pixels, for a whisker of usual width
+# Strength of points that belong to a line, and of those that start one, in units of the noise.
 _LEAST, _CLEAR = 2.0, 4.0
-"""Strength of points that belong to a line, and of those that start one, in units of the noise."""
-
-_QUIET = 0.4
-"""Smallest noise that an image is taken to have, grey values."""
-
-_STEP = 4.0
-"""Distance from which two points of a curve have something hidden between them, pixels."""
-
-_SHORTEST = 9
-"""Number of points of the shortest segment."""
-
-_ROUND = 0.6
-"""Largest second derivative along a line, relative to that across it."""
-
-_MOST = 60_000
-"""Largest number of ridge points of a frame."""
+_QUIET = 0.4  # smallest noise that an image is taken to have, grey values
+_STEP = 4.0  # distance from which two points of a curve have something hidden between them, pixels
+_SHORTEST = 9  # number of points of the shortest segment
+_ROUND = 0.6  # largest second derivative along a line, relative to that across it
+_MOST = 60_000  # largest number of ridge points of a frame
 
 
 class Segment(NamedTuple):
@@ -272,56 +260,31 @@ def _walk(
         here, angle = best, turn
 
 
-_GAP = 160.0
-"""Largest distance between two ends that are joined, pixels."""
-
-_BEGINS = 6.0
-"""Distance from the beginning of a whisker up to which no ends are joined, pixels."""
-
-_OPEN = 30.0
-"""Largest part of it that may be open ground, pixels."""
-
-_BENT = 0.7
-"""Largest angle between the end of a segment and the chord of a join, rad."""
-
+_GAP = 160.0  # largest distance between two ends that are joined, pixels
+_BEGINS = 6.0  # distance from the beginning of a whisker up to which no ends are joined, pixels
+_OPEN = 30.0  # largest part of it that may be open ground, pixels
+_BENT = 0.7  # largest angle between the end of a segment and the chord of a join, rad
+# Numbers of points from which a segment is long, and of those that are used of it.
 _LONG, _PART = 40, 250
-"""Numbers of points from which a segment is long, and of those that are used of it."""
-
+# Points next to a join that are left out: what hides or crosses the whisker draws them aside.
 _SPOILT = 10
-"""Points next to a join that are left out: what hides or crosses the whisker draws them aside."""
-
-_EXACT = 0.5
-"""Standard deviation of points of one curve about a polynomial, pixels."""
-
+_EXACT = 0.5  # standard deviation of points of one curve about a polynomial, pixels
+# Standard deviation of the log of the ratio of strengths of two segments of one whisker.
 _LIKE = 0.7
-"""Standard deviation of the log of the ratio of strengths of two segments of one whisker."""
-
-_COST = 12.0
-"""Largest cost of a join."""
-
-_DIRECTION = 12
-"""Number of points from which the direction of an end is taken."""
-
+_COST = 12.0  # largest cost of a join
+_DIRECTION = 12  # number of points from which the direction of an end is taken
+# Largest distance of a whisker's first point from the body that it comes from, pixels.
 _HIDDEN = 24.0
-"""Largest distance of a whisker's first point from the body that it comes from, pixels."""
-
+# Exponent of the ratio of strengths at base and tip, and the largest ratio that counts.
 _TAPER, _FADES = 0.8, 4.0
-"""Exponent of the ratio of strengths at base and tip, and the largest ratio that counts."""
-
+# Worth of a curve that begins at a face, at another body, at none.
 _AT_FACE, _AT_BODY, _ALONE = 1.0, 0.6, 0.35
-"""Worth of a curve that begins at a face, at another body, at none."""
-
+# How far across a line it is dark, pixels, and number of points that have one direction.
 _ACROSS, _SKIPPED = 6, 5
-"""How far across a line it is dark, pixels, and number of points that have one direction."""
-
-_TURNING = 2.0
-"""Largest turn of a whisker, rad."""
-
+_TURNING = 2.0  # largest turn of a whisker, rad
+# Standard deviation of the direction about a smooth one that halves the worth of a curve, rad.
 _RAGGED = 0.35
-"""Standard deviation of the direction about a smooth one that halves the worth of a curve, rad."""
-
-_EVEN = 6.0
-"""Distance of the points between which the direction is taken, pixels."""
+_EVEN = 6.0  # distance of the points between which the direction is taken, pixels
 
 
 class Curve(NamedTuple):

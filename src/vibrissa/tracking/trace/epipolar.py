@@ -23,26 +23,16 @@ from vibrissa.tracking.trace.curves import Curve, smoothed
 from vibrissa.tracking.trace.scene import Bodies, Image, Scene
 from vibrissa.tracking.trace.trace import arc_lengths, interpolated
 
-_STEP = 4.0
-"""Distance of the points that are searched, pixels."""
-
-_STEEP = 8
-"""Largest change of t from one to the next, pixels."""
-
+_STEP = 4.0  # distance of the points that are searched, pixels
+_STEEP = 8  # largest change of t from one to the next, pixels
 _SLOPES = np.arange(-_STEEP, _STEEP + 1)
 
-_TURN = 0.3
-"""Cost of changing the slope by a pixel."""
-
-_MOST = 12.0
-"""Strength, in units of the noise, beyond which a line is no more like one."""
-
-_APART = 8.0
-"""Distance from the dark curve within which its own flanks are bright, pixels."""
-
+_TURN = 0.3  # cost of changing the slope by a pixel
+_MOST = 12.0  # strength, in units of the noise, beyond which a line is no more like one
+_APART = 8.0  # distance from the dark curve within which its own flanks are bright, pixels
+# Number of points next to the base that show whether the line begins there, and the smallest share
+# of them before a body: where less is, the view by itself shows where the whisker begins.
 _FIRST, _MOSTLY = 10, 0.75
-"""Number of points next to the base that show whether the line begins there, and the smallest share
-of them before a body: where less is, the view by itself shows where the whisker begins."""
 
 
 def seen_along(

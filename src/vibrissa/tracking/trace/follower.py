@@ -38,72 +38,42 @@ from vibrissa.tracking.trace.ridge import (
 )
 from vibrissa.tracking.trace.trace import STEP, Trace, TraceOptions, aligned, overlap
 
+# Points of a trace over which darkness and direction are taken.
 _DARK = ((5, 25), (25, 50), (50, 80))
 _ALONG = ((3, 11), (20, 28), (40, 48), (60, 68))
-"""Points of a trace over which darkness and direction are taken."""
-
 FEATURES = 1 + len(_DARK) + len(_ALONG) - 1
 
+# Smallest standard deviation of a whisker's appearance between frames.
 _SPREAD = np.array([0.12, *[0.15] * len(_DARK), *[0.03] * (len(_ALONG) - 1)])
-"""Smallest standard deviation of a whisker's appearance between frames."""
-
+# Factor of the spread toward shorter lengths: a whisker may be hidden, but is never longer.
 _SHORTER = 3.0
-"""Factor of the spread toward shorter lengths: a whisker may be hidden, but is never longer."""
-
+# Standard deviations beyond which a difference counts no more: contact bends, blur pales.
 _MOST = 3.0
-"""Standard deviations beyond which a difference counts no more: contact bends, blur pales."""
-
-_HIDDEN = 2.0
-"""Standard deviations that count where a line does not show what is usual."""
-
-_WEIGHT = 0.5
-"""Weight of the sum of squares: pieces of one whisker do not change independently."""
-
-ENOUGH = 5
-"""Number of frames after which the appearance of a whisker is known."""
-
-_REMEMBERED = 200
-"""Number of frames over which its appearance is remembered."""
-
-_LEARNED = 20
-"""Number of frames from which it changes too little to be learned in each frame."""
-
-_PROXIMAL = 30
-"""Points at the beginning of a line by which it is compared with the expected one."""
-
-_TURNED = 0.87
-"""Cosine of the largest turn between frames of a whisker that is wholly seen, 30°."""
-
-_COLD = 6
-"""Number of lines near a base that are traced without expectations."""
-
+_HIDDEN = 2.0  # standard deviations that count where a line does not show what is usual
+_WEIGHT = 0.5  # weight of the sum of squares: pieces of one whisker do not change independently
+ENOUGH = 5  # number of frames after which the appearance of a whisker is known
+_REMEMBERED = 200  # number of frames over which its appearance is remembered
+_LEARNED = 20  # number of frames from which it changes too little to be learned in each frame
+_PROXIMAL = 30  # points at the beginning of a line by which it is compared with the expected one
+_TURNED = 0.87  # cosine of the largest turn between frames of a whisker that is wholly seen, 30°
+_COLD = 6  # number of lines near a base that are traced without expectations
+# Number of frames after which a whisker that is seen shorter is searched without expectations.
 _SEARCHED = 5
-"""Number of frames after which a whisker that is seen shorter is searched without expectations."""
-
+# Share of the usual length with which a whisker is found without doubt, and at least.
 _WANTED, _LEAST = 0.85, 0.4
-"""Share of the usual length with which a whisker is found without doubt, and at least."""
-
-_BETTER = 1.1
-"""Factor by which a line that is found without expectations must be longer."""
-
-_REPEATED = 0.5
-"""Distance of two marches that go the same way, pixels, at most."""
-
-_CLICK = 20.0
-"""Standard deviation of a click from the base of its whisker, pixels."""
-
+_BETTER = 1.1  # factor by which a line that is found without expectations must be longer
+_REPEATED = 0.5  # distance of two marches that go the same way, pixels, at most
+_CLICK = 20.0  # standard deviation of a click from the base of its whisker, pixels
+# Smallest brightness on both sides of a whisker, relative to the bright parts of the image.
 _BRIGHT = 0.35
-"""Smallest brightness on both sides of a whisker, relative to the bright parts of the image."""
-
+# Depth inside the face at which the base is searched where it is known by a click only, pixels.
 _AROUND = 36.0
-"""Depth inside the face at which the base is searched where it is known by a click only, pixels."""
-
+# Standard deviations of offset, direction and curvature at the start, and drift of the last.
 _SPREADS = {
     "tight": (np.array([1.0, 0.03, 2e-4]), 4e-5),
     "loose": (np.array([1.5, 0.10, 2e-3]), 3e-4),
     "cold": (np.array([2.0, 0.20, 4e-3]), 4e-4),
 }
-"""Standard deviations of offset, direction and curvature at the start, and drift of the last."""
 
 
 class Appearance(NamedTuple):

@@ -26,39 +26,23 @@ from vibrissa.numerics import Array, Mask
 from vibrissa.tracking.trace.follower import ENOUGH, FEATURES, Appearance
 from vibrissa.tracking.trace.trace import STEP, Trace, overlap
 
+# Number of each whisker's line; −1 if it is lost.
 Ways = NDArray[np.intp]
 Way = tuple[int, ...]
-"""Number of each whisker's line; −1 if it is lost."""
-
+# Points at the beginning of a line by which it is distinguished from others.
 POINTS = np.arange(0, 31, 5)
-"""Points at the beginning of a line by which it is distinguished from others."""
-
-SAME = 0.5
-"""Share of a line along another one from which both are one whisker."""
-
+SAME = 0.5  # share of a line along another one from which both are one whisker
+# Costs of being lost, of getting lost or being found, of two bases that clearly swap.
 LOST, _GONE, _SWAPPED = 6.0, 3.0, 6.0
-"""Costs of being lost, of getting lost or being found, of two bases that clearly swap."""
-
-_DOUBT = 1.0
-"""Least difference to a succession of ways that gives a whisker another line."""
-
-_APART = 8.0
-"""Distance at which bases have clearly swapped, pixels."""
-
-_ROUNDS = 3
-"""Number of rounds in which the appearance of whiskers is learned."""
-
+_DOUBT = 1.0  # least difference to a succession of ways that gives a whisker another line
+_APART = 8.0  # distance at which bases have clearly swapped, pixels
+_ROUNDS = 3  # number of rounds in which the appearance of whiskers is learned
+# Standard deviations of a whisker's shift, pixels, and turn, rad, relative to the row's.
 _SHIFT, _TURN = 4.0, 0.06
-"""Standard deviations of a whisker's shift, pixels, and turn, rad, relative to the row's."""
-
-_ROW = 3.0
-"""Standard deviation of the row's motion as a whole, in units of these."""
-
-_MOVED = 3.0
-"""Standard deviations beyond which a motion counts no more: whiskers do jump."""
-
+_ROW = 3.0  # standard deviation of the row's motion as a whole, in units of these
+_MOVED = 3.0  # standard deviations beyond which a motion counts no more: whiskers do jump
+# Largest number of ways of a frame, and the cost by which they may exceed the cheapest.
 _KEPT, _DEARER = 48, 14.0
-"""Largest number of ways of a frame, and the cost by which they may exceed the cheapest."""
 
 
 @dataclass

@@ -29,17 +29,11 @@ from vibrissa.tracking.trace.trace import STEP, Trace, TraceOptions, even
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-HALF = 4
-"""The fit takes samples from −HALF to HALF."""
-
-WIDTH = 1.4
-"""Standard deviation of g, in steps."""
-
-TURNING = 2.8
-"""Largest turn of a whisker from base to tip, rad: what goes round is not one."""
-
+HALF = 4  # the fit takes samples from −HALF to HALF
+WIDTH = 1.4  # standard deviation of g, in steps
+TURNING = 2.8  # largest turn of a whisker from base to tip, rad: what goes round is not one
+# Depth at which a point is supported while a line is followed, standard deviations.
 _CLEARLY_DARK = 3.0
-"""Depth at which a point is supported while a line is followed, standard deviations."""
 
 
 def _fit_rows() -> tuple[Array, float, float]:
@@ -317,49 +311,29 @@ def flanks(frame: Any, line: Any, distance: float, bits: Any, which: int, out: A
             out[k, side] = np.nan if in_the_way(bits, which, x, y) else sample(frame, x, y)
 
 
+# Depth at which a point of a line that is about known is supported, standard deviations.
 _SUPPORTED = 2.5
-"""Depth at which a point of a line that is about known is supported, standard deviations."""
-
-_MEDIAN = 0.455
-"""Median of the square of a standard normal number."""
-
-OUTSIDE = 12.0
-"""How far inside the face the base is searched, pixels."""
-
-FEWEST = 12
-"""Number of points of the shortest line that is considered."""
-
+_MEDIAN = 0.455  # median of the square of a standard normal number
+OUTSIDE = 12.0  # how far inside the face the base is searched, pixels
+FEWEST = 12  # number of points of the shortest line that is considered
+# Standard deviation next to an edge that never moves, common to neighbouring points, pixels.
 _DISTURBED = 0.15
-"""Standard deviation next to an edge that never moves, common to neighbouring points, pixels."""
-
-_FUR = 3
-"""Number of points next to the face that are not measured: fur is dark too."""
-
+_FUR = 3  # number of points next to the face that are not measured: fur is dark too
+# Numbers of the last points of a line, which give its bend, and of those beyond the last supported
+# one in which the tip is searched.
 _BENDING, _BEYOND = 30, 12
-"""Numbers of the last points of a line, which give its bend, and of those beyond the last supported
-one in which the tip is searched."""
-
+# Distance from the image's border within which a line may end because the image does, pixels.
 _BORDER = 8.0
-"""Distance from the image's border within which a line may end because the image does, pixels."""
-
+# Standard deviations of one point by which a line's last points are darker on average than what is
+# beyond, for its end to be seen, to a few points: nearly five of the mean of ten.
 _CLEAR = 1.5
-"""Standard deviations of one point by which a line's last points are darker on average than what is
-beyond, for its end to be seen, to a few points: nearly five of the mean of ten."""
-
+# Noise below which an image is not as a sensor gives it, grey values: twice that of rounding.
 _SMOOTHED = 0.6
-"""Noise below which an image is not as a sensor gives it, grey values: twice that of rounding."""
-
-_LAST = 10
-"""Number of points before the end, and twice that of points beyond, that decide this."""
-
+_LAST = 10  # number of points before the end, and twice that of points beyond, that decide this
+# Distances from a line at which its profile is taken, and smallest variance of that, samples.
 _ACROSS, _NARROWEST = np.arange(6.0), 0.3
-"""Distances from a line at which its profile is taken, and smallest variance of that, samples."""
-
-_FLANKS = (4.0, 7.0)
-"""Distances from the whisker at which the face's edge is searched, pixels."""
-
-_TAPERED = 0.6
-"""Darkness of a whisker relative to the twenty points before, at least: it tapers."""
+_FLANKS = (4.0, 7.0)  # distances from the whisker at which the face's edge is searched, pixels
+_TAPERED = 0.6  # darkness of a whisker relative to the twenty points before, at least: it tapers
 
 
 class Measured(NamedTuple):

@@ -42,78 +42,48 @@ from vibrissa.tracking.trace.ridge import measure, noise_level, prolonged, trace
 from vibrissa.tracking.trace.scene import Scene
 from vibrissa.tracking.trace.trace import STEP, Trace, aligned, arc_lengths, even, given, overlap
 
-_DOUBT = 0.6
-"""Least difference to a way that gives a whisker another line."""
-
-_ROUNDS = 3
-"""Number of rounds in which whiskers are kept apart where they cross."""
-
-_SHORT = 3.0
-"""Cost of a line that is hardly seen."""
-
+_DOUBT = 0.6  # least difference to a way that gives a whisker another line
+_ROUNDS = 3  # number of rounds in which whiskers are kept apart where they cross
+_SHORT = 3.0  # cost of a line that is hardly seen
+# Turn, rad, and shift, pixels, of the whole row in a frame that cost as much as a lost whisker.
 _ROW_TURN, _ROW_SHIFT = 0.1, 5.0
-"""Turn, rad, and shift, pixels, of the whole row in a frame that cost as much as a lost whisker."""
-
-_UNLIKE = 3.0
-"""Unlikeness above which a whisker's own line is in doubt."""
-
+_UNLIKE = 3.0  # unlikeness above which a whisker's own line is in doubt
+# Distance from a base within which lines begin that are searched without expectations, pixels.
 _NEAR = 40.0
-"""Distance from a base within which lines begin that are searched without expectations, pixels."""
-
-_MERGED = 0.8
-"""Share of a line that lies on others from which they are not kept apart."""
-
-_TRIED = 4
-"""Number of lines that are measured for each whisker that is missing."""
-
+_MERGED = 0.8  # share of a line that lies on others from which they are not kept apart
+_TRIED = 4  # number of lines that are measured for each whisker that is missing
+# Weight of a click's distance along a line, and number of points that give its direction.
 _ALONG, _DIRECTION = 0.4, 10
-"""Weight of a click's distance along a line, and number of points that give its direction."""
-
+# Largest length of a line before a click, pixels, and by how much that adds to its distance.
 _HAIR, _BEFORE = 40.0, 0.1
-"""Largest length of a line before a click, pixels, and by how much that adds to its distance."""
-
-_LIKELY = 100.0
-"""Score of a curve from which it is likely to be a whisker."""
-
-_SAME_CURVE = 0.9
-"""Share of a line along another one from which both are the same curve."""
-
+_LIKELY = 100.0  # score of a curve from which it is likely to be a whisker
+_SAME_CURVE = 0.9  # share of a line along another one from which both are the same curve
+# Numbers of points: of a whisker's beginning, of what gives its bend, by which it goes on at most,
+# and by which it goes on beyond what is seen, so that its tip can be seen to end.
 _FEWEST, _POLYNOMIAL, _AHEAD, _FURTHER = 15, 60, 150, 15
-"""Numbers of points: of a whisker's beginning, of what gives its bend, by which it goes on at most,
-and by which it goes on beyond what is seen, so that its tip can be seen to end."""
-
+# Standard deviation of a whisker's bend beyond a crossing from that before it, 1/pixel, and of its
+# change along the whisker, 1/pixel²; uncertainty of a bend, times the square of its length.
 _BENDS, _BEND_CHANGES, _BEND_KNOWN = 2e-4, 1e-6, 2.7
-"""Standard deviation of a whisker's bend beyond a crossing from that before it, 1/pixel, and of its
-change along the whisker, 1/pixel²; uncertainty of a bend, times the square of its length."""
-
+# Standard deviations of the bend within which ends are searched, number of bends, and number of
+# points at the far end by which two of them are distinguished.
 _WIDEST, _FAN, _FAR = 3.0, 25, 40
-"""Standard deviations of the bend within which ends are searched, number of bends, and number of
-points at the far end by which two of them are distinguished."""
-
+# Likelihood that is gained with each point that is seen, and depth from which it is, in standard
+# deviations.
 _WORTH, _SUPPORTED = 0.1, 2.5
-"""Likelihood that is gained with each point that is seen, and depth from which it is, in standard
-deviations."""
-
+# Largest number of ends of a whisker that are considered, and of ways to give them to all.
 _ENDS, _COMBINED = 6, 2e4
-"""Largest number of ends of a whisker that are considered, and of ways to give them to all."""
-
+# Distance of a whisker from a smooth curve from which it may have a kink, pixels, the degree of
+# that curve's polynomials, and the share of a kink that may be left.
 _KINKED, _SMOOTH, _STRAIGHTER = 0.25, 4, 0.7
-"""Distance of a whisker from a smooth curve from which it may have a kink, pixels, the degree of
-that curve's polynomials, and the share of a kink that may be left."""
-
+# Number of points before another whisker at which one may have been stopped by it, and by what
+# factor it must be longer without, or may be shorter if it is straighter.
 _STOPPED, _LONGER = 5, 1.1
-"""Number of points before another whisker at which one may have been stopped by it, and by what
-factor it must be longer without, or may be shorter if it is straighter."""
-
-_LARGEST_TURN = 0.35
-"""Largest turn of the row between frames beyond what was expected, rad."""
-
+_LARGEST_TURN = 0.35  # largest turn of the row between frames beyond what was expected, rad
+# Cosine of the largest angle between the directions of a line and of the expected one.
 _ALIGNED = 0.7
-"""Cosine of the largest angle between the directions of a line and of the expected one."""
-
+# Distance from a click that costs as much as a lost whisker, pixels, at most half of that to the
+# next base.
 _CLICK = 12.0
-"""Distance from a click that costs as much as a lost whisker, pixels, at most half of that to the
-next base."""
 
 
 def follow_row(

@@ -24,85 +24,50 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Labels = NDArray[np.int32]
 
-_HALF = 2
-"""Factor by which images are made smaller before bodies are searched in them."""
-
-_THIN = 7
-"""Width of what a closing removes, pixels of half the size, for a whisker of usual width."""
-
+_HALF = 2  # factor by which images are made smaller before bodies are searched in them
+_THIN = 7  # width of what a closing removes, pixels of half the size, for a whisker of usual width
+# Smoothing of the light, and of bodies before their edge is taken, pixels of half the size.
 _SOFT, _EDGE = 4.0, 0.75
-"""Smoothing of the light, and of bodies before their edge is taken, pixels of half the size."""
-
-_SPARSE = 8
-"""Distance of the pixels from which the brightness of a frame is taken."""
-
-_RANK = 0.15
-"""Share of the frames in which a pixel is brighter than its background."""
-
-_FEWEST = 6
-"""Number of frames from which a background can be taken."""
-
+_SPARSE = 8  # distance of the pixels from which the brightness of a frame is taken
+_RANK = 0.15  # share of the frames in which a pixel is brighter than its background
+_FEWEST = 6  # number of frames from which a background can be taken
+# Largest brightness of bodies, in the mean and at their edges, relative to the light.
 _DARK, _LIT = 0.75, 0.85
-"""Largest brightness of bodies, in the mean and at their edges, relative to the light."""
-
-_EVEN = 0.01
-"""Weight of the light being even, relative to that of the pixels."""
-
-_SMALLEST = 40
-"""Area of the smallest body, pixels of half the size."""
-
-_LARGE = 0.02
-"""Smallest share of the image that a face covers."""
-
-_BESIDE = 10.0
-"""Distance from a face up to which a point is taken to be on it, pixels."""
-
+_EVEN = 0.01  # weight of the light being even, relative to that of the pixels
+_SMALLEST = 40  # area of the smallest body, pixels of half the size
+_LARGE = 0.02  # smallest share of the image that a face covers
+_BESIDE = 10.0  # distance from a face up to which a point is taken to be on it, pixels
+# Share of the light by which a thin line that never moves is darker: less where this many standard
+# deviations of the background's noise are less, but no less than the second number.
 _LINE, _FAINT, _NOISES = 0.06, 0.025, 8.0
-"""Share of the light by which a thin line that never moves is darker: less where this many standard
-deviations of the background's noise are less, but no less than the second number."""
-
-_MANY = 15
-"""Number of frames from which it is clear what never moves."""
-
+_MANY = 15  # number of frames from which it is clear what never moves
+# Extent of the smallest still line and half the width of the thinnest still body, pixels.
 _LONG, _THICK = 60, 5
-"""Extent of the smallest still line and half the width of the thinnest still body, pixels."""
-
+# How far an edge is blurred, and the smoothing of the light around still things, pixels.
 _BLUR, _AROUND = 3, 12.0
-"""How far an edge is blurred, and the smoothing of the light around still things, pixels."""
-
+# Darkening from the background to the usual value from which a whisker passes there, standard
+# deviations of the noise (one of them is the background's own rank), at least such a share of what
+# the background is darker than the light, and the share of a line along which one does from which
+# it is nothing else.
 _SWEPT, _DARKER, _MOSTLY = 2.5, 0.25, 0.5
-"""Darkening from the background to the usual value from which a whisker passes there, standard
-deviations of the noise (one of them is the background's own rank), at least such a share of what
-the background is darker than the light, and the share of a line along which one does from which it
-is nothing else."""
-
-_SHADED = 12
-"""Width of the softest edge of a shadow, pixels."""
-
-_ENOUGH = 0.02
-"""Share of open ground around a pixel from which its light is known."""
-
+_SHADED = 12  # width of the softest edge of a shadow, pixels
+_ENOUGH = 0.02  # share of open ground around a pixel from which its light is known
+# Share of the light below which nothing is seen before a still thing, and how far from there a
+# whisker's middle must be, pixels.
 _OPAQUE, _SEEN = 0.5, 1
-"""Share of the light below which nothing is seen before a still thing, and how far from there a
-whisker's middle must be, pixels."""
-
+# Share of the light from which the blurred edge of a still thing does not disturb, and the width of
+# the most blurred one, pixels.
 _CLEAR, _SOFTEST = 0.97, 6
-"""Share of the light from which the blurred edge of a still thing does not disturb, and the width
-of the most blurred one, pixels."""
-
+# Distance from a base within which a still thing is taken to be the face, and within which a still
+# line may be the whisker, pixels.
 _AT_BASE, _CLOSE = 25.0, 6.0
-"""Distance from a base within which a still thing is taken to be the face, and within which a still
-line may be the whisker, pixels."""
-
+# How far a still body is seen around it, pixels, and mean of the directions to a line's points from
+# which it begins at a base, as a resting whisker does, and does not pass it.
 _RIM, _ONE_SIDE = 4, 0.8
-"""How far a still body is seen around it, pixels, and mean of the directions to a line's points
-from which it begins at a base, as a resting whisker does, and does not pass it."""
-
+# Distance within which a body covers such a share of all around a base that is before it.
 _DEEP, _COVERED = 45.0, 0.98
-"""Distance within which a body covers such a share of all around a base that is before it."""
-
+# Differences that count, grey values: what is darker or brighter counts as these.
 _RANGE = (-20.0, 80.0)
-"""Differences that count, grey values: what is darker or brighter counts as these."""
 
 
 @dataclass(frozen=True, eq=False)

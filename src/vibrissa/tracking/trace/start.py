@@ -33,57 +33,33 @@ from vibrissa.tracking.trace.trace import TraceOptions, overlap
 FRAMES = 30
 """Number of frames in which a start is best found."""
 
-_VOTES = 10
-"""Number of those in which whiskers are searched."""
-
-_LINES = 8
-"""Largest number of lines of a view that are combined."""
-
-_GAP = 6.0
-"""Standard deviation of bases about where the other views show them, pixels."""
-
+_VOTES = 10  # number of those in which whiskers are searched
+_LINES = 8  # largest number of lines of a view that are combined
+_GAP = 6.0  # standard deviation of bases about where the other views show them, pixels
+# The same of tips, which are cut where they are faint or hidden: as a share of the length.
 _TIP = 0.15
-"""The same of tips, which are cut where they are faint or hidden: as a share of the length."""
-
+# Distance within which tips of one whisker agree where both views show them, pixels, and the
+# smallest share of frames in which they do: less than half, for they may be faint.
 _TOGETHER, _SELDOM = 3.0, 0.2
-"""Distance within which tips of one whisker agree where both views show them, pixels, and the
-smallest share of frames in which they do: less than half, for they may be faint."""
-
+# Distance before which something still may cut a line, pixels, number of the last points that give
+# its direction, and share of the frames in which tips must be open to be compared.
 _CUT, _LAST, _ENDING = 16.0, 10, 0.3
-"""Distance before which something still may cut a line, pixels, number of the last points that give
-its direction, and share of the frames in which tips must be open to be compared."""
-
-_SAME = 25.0
-"""Largest distance between bases of one whisker in two frames, pixels."""
-
-_MOVED = 0.4
-"""Share of a whisker that moves, above which it counts as moving wholly."""
-
-_BETTER = 1.5
-"""Factor by which more must be seen of a bright whisker than of a dark one."""
-
+_SAME = 25.0  # largest distance between bases of one whisker in two frames, pixels
+_MOVED = 0.4  # share of a whisker that moves, above which it counts as moving wholly
+_BETTER = 1.5  # factor by which more must be seen of a bright whisker than of a dark one
+# Scores above which a line is a whisker rather than a hair: likely, and without doubt.
 _LONG, _CERTAIN = 80.0, 200.0
-"""Scores above which a line is a whisker rather than a hair: likely, and without doubt."""
-
+# Factors of the confidence if one view alone shows where the whisker begins, and if what does not
+# move begins at no face.
 _ONE_VIEW, _NO_FACE = 0.85, 0.5
-"""Factors of the confidence if one view alone shows where the whisker begins, and if what does not
-move begins at no face."""
-
+# How much better a whisker of another view is seen than noise would be, as a share of itself, from
+# which it is clearly seen. Without one it is 0.1 to 0.2.
 _CLEARLY = 0.5
-"""How much better a whisker of another view is seen than noise would be, as a share of itself, from
-which it is clearly seen. Without one it is 0.1 to 0.2."""
-
+# Number of candidates that are compared, and share of its line from which one is another one.
 _SHOWN, _ALIKE = 4, 0.5
-"""Number of candidates that are compared, and share of its line from which one is another one."""
-
-_FAINTEST = 0.05
-"""Confidence from which another candidate is shown."""
-
-_POLARITY = 3
-"""Number of frames in which bright and dark whiskers are compared."""
-
-_SURE, _GUESS = 0.5, 0.2
-"""Confidence below which there is doubt, and below which nothing is found."""
+_FAINTEST = 0.05  # confidence from which another candidate is shown
+_POLARITY = 3  # number of frames in which bright and dark whiskers are compared
+_SURE, _GUESS = 0.5, 0.2  # confidence below which there is doubt, and below which nothing is found
 
 
 class Candidate(NamedTuple):

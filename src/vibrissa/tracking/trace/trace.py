@@ -11,25 +11,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.numerics import Array, Mask
 
-STEP = 2.0
-"""Distance between points of a trace, pixels."""
-
+STEP = 2.0  # distance between points of a trace, pixels
+# Points over which the direction is taken in which a line is prolonged before its start.
 _DIRECTION = 4
-"""Points over which the direction is taken in which a line is prolonged before its start."""
-
+# Change of its length from a frame to the next, as a share of the usual one, from which a trace may
+# be on something else, and share of the frames in which that may be chance.
 _JUMPS, _OFTEN = 0.3, 0.05
-"""Change of its length from a frame to the next, as a share of the usual one, from which a trace
-may be on something else, and share of the frames in which that may be chance."""
-
+# Turn within a fifth of its length from which a trace goes on as something else, as along an edge,
+# rad: contact bends a whisker by less.
 _HOOKED = 0.7
-"""Turn within a fifth of its length from which a trace goes on as something else, as along an edge,
-rad: contact bends a whisker by less."""
-
-_SHARPEST = 0.05
-"""Standard deviation from which a point is not seen more clearly, pixels."""
-
-_GIVEN = 0.5
-"""Standard deviation of points that a person gives, pixels."""
+_SHARPEST = 0.05  # standard deviation from which a point is not seen more clearly, pixels
+_GIVEN = 0.5  # standard deviation of points that a person gives, pixels
 
 
 @dataclass(frozen=True)

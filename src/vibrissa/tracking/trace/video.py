@@ -33,20 +33,13 @@ from vibrissa.tracking.trace.scene import Scene
 from vibrissa.tracking.trace.start import FRAMES, is_bright, negative
 from vibrissa.tracking.trace.trace import Trace, TraceOptions, given, overlap
 
+# Points (n, 2) along a whisker from base to tip, column and row, by frame and whisker.
 Corrections = Mapping[tuple[int, int], ArrayLike]
-"""Points (n, 2) along a whisker from base to tip, column and row, by frame and whisker."""
-
-_BACK = 64
-"""Largest number of frames before its own that a correction can change."""
-
-_AGREES = 0.9
-"""Share of a line along another one from which both are the same."""
-
+_BACK = 64  # largest number of frames before its own that a correction can change
+_AGREES = 0.9  # share of a line along another one from which both are the same
+# Factor of the jump of a single whisker before grey fur, where its base is less certain.
 _FAINT = 2.4
-"""Factor of the jump of a single whisker before grey fur, where its base is less certain."""
-
-_SPAN = 400
-"""Number of frames at the beginning of a film from which those for its start are taken."""
+_SPAN = 400  # number of frames at the beginning of a film from which those for its start are taken
 
 
 def trace_video(

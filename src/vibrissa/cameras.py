@@ -23,6 +23,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+from vibrissa.deferred import transform
 from vibrissa.io import in_file, read_calibration, write_calibration
 from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
@@ -413,8 +414,6 @@ def load_cameras(path: str | PathLike[str], unit: float = 1e-3) -> tuple[Camera,
     ValueError
         If it is not a calibration, or one with faults.
     """
-    from scipy.spatial.transform import Rotation
-
     cameras = []
     for table in read_calibration(path):
         kind = table.get("projection", "perspective")
@@ -422,7 +421,7 @@ def load_cameras(path: str | PathLike[str], unit: float = 1e-3) -> tuple[Camera,
         with in_file(path):
             camera = Camera(
                 matrix=np.asarray(table["matrix"]) @ scale,
-                rotation=Rotation.from_rotvec(table["rotation"]).as_matrix(),
+                rotation=transform.Rotation.from_rotvec(table["rotation"]).as_matrix(),
                 translation=np.asarray(table["translation"]) * unit,
                 distortion=np.asarray(table["distortions"]),
                 size=(table["size"][0], table["size"][1]),
@@ -450,8 +449,6 @@ def save_cameras(path: str | PathLike[str], cameras: Sequence[Camera], unit: flo
     FileNotFoundError
         If the folder does not exist.
     """
-    from scipy.spatial.transform import Rotation
-
     tables = []
     for camera in cameras:
         flat = camera.projection == "orthographic"
@@ -461,7 +458,7 @@ def save_cameras(path: str | PathLike[str], cameras: Sequence[Camera], unit: flo
             "size": camera.size,
             "matrix": (camera.matrix @ scale).tolist(),
             "distortions": camera.distortion.tolist(),
-            "rotation": Rotation.from_matrix(camera.rotation).as_rotvec().tolist(),
+            "rotation": transform.Rotation.from_matrix(camera.rotation).as_rotvec().tolist(),
             "translation": (camera.translation / unit).tolist(),
         }
         tables.append(table | ({"projection": camera.projection} if flat else {}))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -11,9 +12,6 @@ import typer
 import vibrissa as vb
 from vibrissa.cli.options import check_new, refuse, with_options
 from vibrissa.cli.terminal import remark, say
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 # Noise, as a share of the range of the readings, above which something is wrong.
 _UNEXPLAINED = 0.05

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -31,9 +31,7 @@ from vibrissa.cli.inputs import (
 from vibrissa.cli.options import Method, numbers, refuse, with_options
 from vibrissa.cli.signals import SourceOptions, described
 from vibrissa.cli.terminal import Tell, progress_bars, remark, shown
-
-if TYPE_CHECKING:
-    import xarray as xr
+from vibrissa.deferred import xr
 
 WRENCH = "wrench"
 _XYZ = ("X", "Y", "Z")
@@ -288,7 +286,6 @@ def _from_lines(
 ) -> None:
     """Contacts of a table whose lines are those of a stream."""
     import numpy as np
-    import xarray as xr
 
     weight.check(how)
     with progress_bars() as tell:

@@ -7,19 +7,17 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import repeat
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 
 import vibrissa as vb
 from vibrissa.cli.inputs import map_of, recording_from
 from vibrissa.cli.options import Format, free, refuse, with_options
 from vibrissa.cli.terminal import Tell, progress_bars, say
-
-if TYPE_CHECKING:
-    import xarray as xr
-    from numpy.typing import NDArray
+from vibrissa.deferred import xr
 
 Draw = Callable[[], Any]  # draws a figure when it is called
 NODES = 101  # points of a whisker that is drawn

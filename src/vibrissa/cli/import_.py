@@ -13,11 +13,11 @@ from vibrissa.cli.inputs import WhiskerOptions, cameras_from, objects_from
 from vibrissa.cli.options import check_new, with_options
 from vibrissa.cli.terminal import progress_bars, remark
 from vibrissa.cli.track import print_tracked
+from vibrissa.deferred import xr
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    import xarray as xr
 
 _VIEWS = ("top", "front")  # names of views that neither files nor cameras name
 

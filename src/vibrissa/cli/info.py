@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -14,12 +15,7 @@ import vibrissa as vb
 from vibrissa.cli.options import with_options
 from vibrissa.cli.terminal import print_properties, shown
 from vibrissa.cli.track import compared_contacts
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    import xarray as xr
-    from xarray import Dataset
+from vibrissa.deferred import xr
 
 # What goes on from a file, by its kind.
 _SHOWN = 12
@@ -194,8 +190,6 @@ def _contacts(found: vb.pipeline.TrialSummary) -> str:
 
 def _summarised(path: Path) -> xr.DataTree:
     """Read what a summary needs of a recording; a long one takes a while to read whole."""
-    import xarray as xr
-
     with vb.io.opened(path, "a recording") as file:
         groups = [name for name in ("truth", "signals", "estimates", "contour") if name in file]
         objects = [f"objects/{name}" for name in file["objects"]] if "objects" in file else []
@@ -319,7 +313,7 @@ def _tracks(path: Path, kind: str) -> Iterator[tuple[str, str]]:
     yield "next", _import(path, tracks, stated=not note)
 
 
-def _import(path: Path, tracks: Dataset, *, stated: bool) -> str:
+def _import(path: Path, tracks: xr.Dataset, *, stated: bool) -> str:
     """The command that makes a recording of tracks."""
     words = ["vibrissa import", str(path)]
     hint = ""
@@ -337,7 +331,7 @@ def _import(path: Path, tracks: Dataset, *, stated: bool) -> str:
     return f"{' '.join(words)} -o trial.nc{hint}"
 
 
-def _without_unit(raw: vb.io.RawTracks, path: Path) -> tuple[Dataset, str]:
+def _without_unit(raw: vb.io.RawTracks, path: Path) -> tuple[xr.Dataset, str]:
     """Label tracks even if the unit of their points is not stated, with a note on it."""
     if raw.space is None or raw.unit:
         return vb.io.labelled(raw, path), ""
@@ -345,7 +339,7 @@ def _without_unit(raw: vb.io.RawTracks, path: Path) -> tuple[Dataset, str]:
     return vb.io.labelled(raw, path, unit="um"), "unit not stated: give it when reading"
 
 
-def _listed(tracks: Dataset, dim: str) -> str:
+def _listed(tracks: xr.Dataset, dim: str) -> str:
     count = tracks.sizes[dim]
     if dim not in tracks.coords:
         return str(count)
@@ -469,8 +463,6 @@ def _text(value: Any) -> str:
 
 def _compared(path: Path) -> Iterator[tuple[str, str]]:
     """Compare contact points that do not come from the rod with those that do."""
-    import xarray as xr
-
     with vb.io.opened(path, "a recording") as file:
         if "measured/contact_difference" not in file:
             return

@@ -6,14 +6,12 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import vibrissa as vb
 from vibrissa.cli.options import free, refuse
 from vibrissa.cli.terminal import Tell, remark, say
-
-if TYPE_CHECKING:
-    import xarray as xr
+from vibrissa.deferred import xr
 
 RECORDING, MAP = "vibrissa recording", "vibrissa contact map"  # kinds of NetCDF files
 _THICKEST = 10.0  # radius of a whisker from which micrometres were typed for mm, mm

@@ -5,20 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 
 import vibrissa as vb
 from vibrissa.cli.figures import NODES, TrialOptions, fits_of, sights_of
 from vibrissa.cli.inputs import recording_from
 from vibrissa.cli.options import RecordingArgument, free, refuse, with_options
 from vibrissa.cli.terminal import Tell, progress_bars, say, stoppable
-
-if TYPE_CHECKING:
-    import xarray as xr
-    from numpy.typing import NDArray
+from vibrissa.deferred import xr
 
 # Longest duration of a movie of a whole trial, s, unless a step is given.
 _KINDS = ("signals", "contour")

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -24,9 +24,7 @@ from vibrissa.cli.inputs import (
 from vibrissa.cli.options import RecordingArgument, numbers, with_options
 from vibrissa.cli.signals import SourceOptions, described
 from vibrissa.cli.terminal import Tell, fixed, print_table, progress_bars, remark, say
-
-if TYPE_CHECKING:
-    import xarray as xr
+from vibrissa.deferred import xr
 
 _SUSPECT = 1.5  # χ² per degree of freedom from which it is asked whether another shape fits better
 # Predicted distance, m, longer than whiskers: the covariance leaves the contact anywhere.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import typer
@@ -25,9 +25,7 @@ from vibrissa.cli.inputs import MAP, RECORDING, kind_in, recording_from
 from vibrissa.cli.movie import FrameOptions, make_movies
 from vibrissa.cli.options import check_new, refuse, with_options
 from vibrissa.cli.terminal import Tell, progress_bars, say
-
-if TYPE_CHECKING:
-    from xarray import DataTree
+from vibrissa.deferred import xr
 
 _LARGEST = 15_000_000  # bytes of a page at most, as far as movies decide about it
 _TAGS = 10_000  # bytes for the names and tags of movies
@@ -115,7 +113,7 @@ def _is_trial(path: Path) -> bool:
 
 
 def _of_trial(
-    path: Path, trial: DataTree, of_trial: TrialOptions, seed: int, tell: Tell
+    path: Path, trial: xr.DataTree, of_trial: TrialOptions, seed: int, tell: Tell
 ) -> _Content:
     """The page of a trial."""
     course = vb.scene.course_of(trial, of_trial.whisker)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,9 +11,7 @@ from vibrissa.cli.figures import dataset_with
 from vibrissa.cli.inputs import RECORDING, NoiseOptions, kind_in, wrench_from
 from vibrissa.cli.options import MapArgument, check_new, with_options
 from vibrissa.cli.terminal import Row, print_table, progress_bars, say, shown
-
-if TYPE_CHECKING:
-    from xarray import Dataset
+from vibrissa.deferred import xr
 
 _SHOWN = 5  # number of the best triplets that are shown
 
@@ -61,7 +58,7 @@ def sensitivity(
         say(f"wrote {target}")
 
 
-def _contacts_of(path: Path, moment_noise: float) -> Dataset:
+def _contacts_of(path: Path, moment_noise: float) -> xr.Dataset:
     """Contact points or, where they are not known, signals of a trial; NaN without contact.
 
     As for estimates, there is a contact where M_B exceeds five standard deviations of its noise.
@@ -78,7 +75,7 @@ def _contacts_of(path: Path, moment_noise: float) -> Dataset:
     return wrench[["force", "moment"]].where(touching)
 
 
-def _print_derivatives(findings: Dataset) -> None:
+def _print_derivatives(findings: xr.Dataset) -> None:
     """Median sizes, where they are large, and what differs between the sides."""
     by = [str(n) for n in findings["sorted_by"].values]
     rows: list[list[str] | None] = []
@@ -117,7 +114,7 @@ def _ratio(value: float) -> str:
 
 
 def _print_rivals(
-    rivals: Dataset, names: tuple[str, ...], noise: str, verdicts: Dataset | None
+    rivals: xr.Dataset, names: tuple[str, ...], noise: str, verdicts: xr.Dataset | None
 ) -> None:
     """The triplets that are best most often, and the one that was asked for."""
     from rich.text import Text
@@ -157,7 +154,7 @@ def _error(value: float) -> str:
     return shown("predicted_error", value, 3) if value == value else "-"
 
 
-def _save(path: Path, found: Dataset) -> None:
+def _save(path: Path, found: xr.Dataset) -> None:
     floats = [str(name) for name, v in found.data_vars.items() if v.dtype.kind == "f"]
     about = found.assign_attrs(kind="vibrissa sensitivity")
     vb.io.write_netcdf(path, about, {"/": dict.fromkeys(floats, vb.io.COMPRESSED)})

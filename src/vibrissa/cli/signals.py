@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -22,9 +22,7 @@ from vibrissa.cli.inputs import (
 )
 from vibrissa.cli.options import RecordingArgument, Source, refuse, with_options
 from vibrissa.cli.terminal import progress_bars, remark, say, shown
-
-if TYPE_CHECKING:
-    import xarray as xr
+from vibrissa.deferred import xr
 
 
 @dataclass(frozen=True)

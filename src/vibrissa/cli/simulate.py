@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
@@ -14,9 +14,7 @@ import vibrissa as vb
 from vibrissa.cli.inputs import WhiskerOptions, print_notes, print_statuses
 from vibrissa.cli.options import free, with_options
 from vibrissa.cli.terminal import output, progress_bars, say, shown
-
-if TYPE_CHECKING:
-    import xarray as xr
+from vibrissa.deferred import xr
 
 
 @dataclass(frozen=True)

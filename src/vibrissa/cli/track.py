@@ -23,10 +23,9 @@ from vibrissa.cli.inputs import (
 )
 from vibrissa.cli.options import free, numbers, refuse, with_options
 from vibrissa.cli.terminal import progress_bars, say, shown
+from vibrissa.deferred import xr
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     _Traces = Sequence[Sequence[Sequence[vb.tracking.Trace]]]
 
 _WIDEST = 1.0  # largest width of views of a whisker, m

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 import vibrissa as vb
 from vibrissa.cli.options import MapArgument, Region, check_new, with_options
 from vibrissa.cli.terminal import output, progress_bars, remark, say, shown
-
-if TYPE_CHECKING:
-    from xarray import Dataset
+from vibrissa.deferred import xr
 
 _DIGITS = 14  # enough for the signals to agree to 1e-10 when the pair is bent again
 _ASKED = "Fx MB MD"  # the triplet whose witness is printed, if it has one: that of the paper
@@ -95,7 +93,7 @@ def uniqueness(
         say(f"wrote {target}")
 
 
-def _print_proofs(found: Dataset, bracket: tuple[float, float]) -> None:
+def _print_proofs(found: xr.Dataset, bracket: tuple[float, float]) -> None:
     """Print what is proved: bounds on the critical cone, and triplets with proved witnesses."""
     low, high = np.rad2deg(bracket)
     below = f"{low:.3g}° (witness, proved) ≤ " if low > 0.0 else ""
@@ -111,7 +109,7 @@ def _print_proofs(found: Dataset, bracket: tuple[float, float]) -> None:
             say(f"not unique (witness), {word}: {', '.join(names)}")
 
 
-def _print_witness(found: Dataset) -> None:
+def _print_witness(found: xr.Dataset) -> None:
     """One witness in numbers, so that it can be bent again."""
     apart = found["witness_separation"].isel(witness=0).max("region").to_series().dropna()
     if apart.empty:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -11,9 +11,7 @@ import vibrissa as vb
 from vibrissa.cli.inputs import MAP, RECORDING, WhiskerOptions, kind_in, print_notes
 from vibrissa.cli.options import refuse, with_options
 from vibrissa.cli.terminal import say
-
-if TYPE_CHECKING:
-    import xarray as xr
+from vibrissa.deferred import xr
 
 
 @with_options()

@@ -14,7 +14,6 @@ whether the object explains the measurement.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,9 +28,7 @@ from vibrissa.quantities import attributes
 from vibrissa.rod import Equilibrium, NearObjects, discretize
 from vibrissa.signals import Coordinates, labelled_wrench
 from vibrissa.status import Status, flag_attributes
-
-if TYPE_CHECKING:
-    from vibrissa.whisker import Whisker
+from vibrissa.whisker import Whisker
 
 # Rounds, the longest step (over L), and the step of the derivatives.
 _ROUNDS, _LONGEST, _STEP = 30, 0.05, 1e-5

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vibrissa.contacts.contact_map import ContactMap
 from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod import (
@@ -23,45 +24,22 @@ from vibrissa.rod import (
 from vibrissa.signals import base_signals
 from vibrissa.status import Status
 
-if TYPE_CHECKING:
-    from vibrissa.contacts.contact_map import ContactMap
-
 #: Where sensitivity is asked for; see :func:`chosen_contacts`.
 At: TypeAlias = "xr.DataTree | xr.Dataset | Mapping[str, ArrayLike] | ArrayLike | str | None"
 
 
 @dataclass(frozen=True, eq=False)
 class ChosenContacts:
-    """Contacts in a row, non-dimensional (lengths over L, forces over EI/L²).
+    """Contacts in a row, non-dimensional (lengths over L, forces over EI/L²)."""
 
-    Attributes
-    ----------
-    contacts : (n, 3) array
-        Contacts (s, f_y, f_z).
-    values : (n, 6) array
-        Base force and contact point.
-    tangents : (n, 6, 3) array
-        Derivatives of those with respect to the contacts.
-    status : (n,) int array
-        Status of each.
-    shape : tuple of int
-        Shape that they were given in, n in all.
-    dims : tuple of str
-        Names of its dimensions.
-    coords : dict
-        Coordinates along them.
-    volume : (n,) array or None
-        Volumes of contact points that they stand for, m³.
-    """
-
-    contacts: Array
-    values: Array
-    tangents: Array
-    status: IntArray
-    shape: tuple[int, ...]
-    dims: tuple[str, ...]
-    coords: dict[Hashable, Any]
-    volume: Array | None = None
+    contacts: Array  # (n, 3), contacts (s, f_y, f_z)
+    values: Array  # (n, 6), base force and contact point
+    tangents: Array  # (n, 6, 3), derivatives of those with respect to the contacts
+    status: IntArray  # (n,), status of each
+    shape: tuple[int, ...]  # shape that they were given in, n in all
+    dims: tuple[str, ...]  # names of its dimensions
+    coords: dict[Hashable, Any]  # coordinates along them
+    volume: Array | None = None  # (n,), volumes of contact points that they stand for, m³
 
 
 def chosen_contacts(

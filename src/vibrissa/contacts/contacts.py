@@ -23,36 +23,16 @@ _SPACE = ["x", "y", "z"]
 
 
 class Candidates(NamedTuple):
-    """Candidates of n measurements, non-dimensional, padded with NaN.
+    """Candidates of n measurements, non-dimensional, padded with NaN."""
 
-    Attributes
-    ----------
-    number : array (n,)
-        Number of candidates.
-    x : array (n, k, 4)
-        Arc length and contact force (s, f_x, f_y, f_z).
-    values : array (n, k, 6)
-        Base force and contact point (F, p).
-    covariances : array (n, k, 3, 3)
-        Covariances of the contact point.
-    chi_squared : array (n, k)
-        χ² of each candidate.
-    probability : array (n, k)
-        Posterior probabilities.
-    valid : array (n, k)
-        Whether the covariances are valid.
-    angle_sigma : array (n, k)
-        Standard deviations of the friction angle, rad.
-    """
-
-    number: IntArray
-    x: Array
-    values: Array
-    covariances: Array
-    chi_squared: Array
-    probability: Array
-    valid: AnyArray
-    angle_sigma: Array
+    number: IntArray  # (n,), number of candidates
+    x: Array  # (n, k, 4), arc length and contact force (s, f_x, f_y, f_z)
+    values: Array  # (n, k, 6), base force and contact point (F, p)
+    covariances: Array  # (n, k, 3, 3), covariances of the contact point
+    chi_squared: Array  # (n, k), χ² of each candidate
+    probability: Array  # (n, k), posterior probabilities
+    valid: AnyArray  # (n, k), whether the covariances are valid
+    angle_sigma: Array  # (n, k), standard deviations of the friction angle, rad
 
     @classmethod
     def room(cls, n: int, most: int = MOST_CANDIDATES) -> Candidates:
@@ -102,21 +82,11 @@ class Candidates(NamedTuple):
 
 
 class Room(NamedTuple):
-    """Memory of the candidates of n measurements, in few pieces: kernels take them apart.
+    """Memory of the candidates of n measurements, in few pieces: kernels take them apart."""
 
-    Attributes
-    ----------
-    number : array (n,)
-        Number of candidates.
-    flat : array (22 n k,)
-        All numbers of `Candidates`, one array after the other.
-    valid : array (n, k)
-        Whether the covariances are valid.
-    """
-
-    number: IntArray
-    flat: Array
-    valid: AnyArray
+    number: IntArray  # (n,), number of candidates
+    flat: Array  # (22 n k,), all numbers of `Candidates`, one array after the other
+    valid: AnyArray  # (n, k), whether the covariances are valid
 
     @classmethod
     def of(cls, n: int, most: int = MOST_CANDIDATES) -> Room:

@@ -60,43 +60,28 @@ _EXPLAINED = (Status.UNIQUE, Status.AMBIGUOUS, Status.UNDERDETERMINED)
 
 
 class Followed(NamedTuple):
-    """What a filter knows after a sample.
+    """What a filter knows after a sample."""
 
-    Attributes
-    ----------
-    point : (3,) array
-        Most probable contact point, laboratory frame, m; NaN if there is none. Where hypotheses run
-        together, as along the valley that a light contact leaves, it is their mean.
-    covariance : (3, 3) array
-        Covariance of the contact point, m²: over all hypotheses, weighed by their probabilities.
-    velocity : (3,) array
-        Velocity of the contact point in the laboratory, m/s.
-    probability : float
-        Probability that the contact is there, within the spread of the hypotheses that run
-        together; 0 if there is none.
-    status : Status
-        ``UNIQUE`` where that is above 0.99, else ``AMBIGUOUS``. ``MISSING``, ``NOT_FRICTIONLESS``
-        and other reasons are of this sample, which neither a hypothesis nor any contact explains:
-        the point then is what was known before.
-    points : (k, 3) array
-        Contact points of all hypotheses, the most probable first, laboratory frame, m.
-    probabilities : (k,) array
-        Theirs.
-    point_whisker : (3,) array
-        ``point`` in the whisker's frame, m.
-    located : Contact or None
-        Estimate from this sample alone, where it was sought: not of fewer than three signals that
-        a hypothesis explains.
-    """
-
+    # (3,) Most probable contact point, laboratory frame, m; NaN if there is none. Where hypotheses
+    # run together, as along the valley that a light contact leaves, it is their mean.
     point: Array
+    # (3, 3) Covariance of the contact point, m²: over all hypotheses, weighed by their
+    # probabilities.
     covariance: Array
-    velocity: Array
+    velocity: Array  # (3,), velocity of the contact point in the laboratory, m/s
+    # Probability that the contact is there, within the spread of the hypotheses that run together;
+    # 0 if there is none.
     probability: float
+    # ``UNIQUE`` where that is above 0.99, else ``AMBIGUOUS``. ``MISSING``, ``NOT_FRICTIONLESS`` and
+    # other reasons are of this sample, which neither a hypothesis nor any contact explains: the
+    # point then is what was known before.
     status: Status
+    # (k, 3) Contact points of all hypotheses, the most probable first, laboratory frame, m.
     points: Array
-    probabilities: Array
-    point_whisker: Array
+    probabilities: Array  # (k,), their probabilities
+    point_whisker: Array  # (3,), ``point`` in the whisker's frame, m
+    # Estimate from this sample alone, where it was sought: not of fewer than three signals that a
+    # hypothesis explains.
     located: Contact | None
 
 

@@ -11,10 +11,9 @@ rounding, or a direction has no meaning, the derivatives are NaN.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from vibrissa.contacts.charted_whisker import ChartedWhisker
 from vibrissa.numerics import Array
 from vibrissa.rod import (
     Discretization,
@@ -30,9 +29,6 @@ from vibrissa.signals import (
     signal_scales,
     signals_of,
 )
-
-if TYPE_CHECKING:
-    from vibrissa.contacts.charted_whisker import ChartedWhisker
 
 #: A determinant smaller than this, rows and columns being of size one, is zero to rounding.
 SINGULAR = 1e-11

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vibrissa.contacts.charted_whisker import ChartedWhisker
 from vibrissa.contacts.contacts import Candidates
 from vibrissa.contacts.posterior import CERTAIN
 from vibrissa.contacts.ranking import chi_squared_of
@@ -22,10 +22,7 @@ from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod import Discretization, contact_tangents, discretize
 from vibrissa.signals import REGIONS, concave_backward, in_region, spherical
 from vibrissa.status import Status
-
-if TYPE_CHECKING:
-    from vibrissa.contacts.charted_whisker import ChartedWhisker
-    from vibrissa.whisker import Whisker
+from vibrissa.whisker import Whisker
 
 _COORDINATES = ("r", "theta", "phi")
 _TURN = 2.0 * np.pi

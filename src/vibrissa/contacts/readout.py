@@ -9,11 +9,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from vibrissa.contacts.channels import CHANNELS, FITTED, WRENCH, Channels
+from vibrissa.contacts.charted_whisker import ChartedWhisker
 from vibrissa.contacts.inversion import seeding_triplet
 from vibrissa.contacts.nodes import Searched, at_nodes, searched
 from vibrissa.contacts.noise import TRUSTED, SensorNoise, rank, scaled_errors
@@ -22,9 +23,6 @@ from vibrissa.numerics import AnyArray, Array
 from vibrissa.rod import search_tree
 from vibrissa.sensors import COMPONENTS
 from vibrissa.signals import CIRCULAR, SIGNALS, signal_scales, signals_of
-
-if TYPE_CHECKING:
-    from vibrissa.contacts.charted_whisker import ChartedWhisker
 
 # A direction of the readings in which contacts of the map vary so much less than the noise and the
 # others carries no information.

@@ -17,12 +17,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.contacts.candidates import UNEXPLAINED
+from vibrissa.contacts.charted_whisker import ChartedWhisker
 from vibrissa.contacts.contacts import Candidates, Contacts, Room, candidates_within, contacts_of
 from vibrissa.contacts.inversion import polish
 from vibrissa.contacts.joint_fit import soft_base
@@ -51,9 +51,6 @@ from vibrissa.signals import (
     within_turn,
 )
 from vibrissa.status import Status
-
-if TYPE_CHECKING:
-    from vibrissa.contacts.charted_whisker import ChartedWhisker
 
 #: Signals that determine a contact.
 UNKNOWNS = 3

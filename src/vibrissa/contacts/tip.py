@@ -23,11 +23,12 @@ that they fill.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from vibrissa.contacts.channels import CHANNELS, CIRCULAR, channel_derivatives, channels_of
+from vibrissa.contacts.charted_whisker import ChartedWhisker
 from vibrissa.contacts.contacts import Candidates
 from vibrissa.contacts.forward import Forward
 from vibrissa.contacts.joint_fit import JointFit, normal_cloud
@@ -39,9 +40,6 @@ from vibrissa.deferred import interpolate, spatial
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.signals import within_turn
 from vibrissa.status import Status
-
-if TYPE_CHECKING:
-    from vibrissa.contacts.charted_whisker import ChartedWhisker
 
 # Nodes: directions around and away from the plane normal to the whisker, and loads up to so many
 # times the force at which the side slips off at the tip.

@@ -20,7 +20,7 @@ up to a rigid motion, so that errors of the pose do not count.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,9 +34,7 @@ from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.quantities import attributes
 from vibrissa.rod import Discretization, discretize
 from vibrissa.signals import labelled_wrench
-
-if TYPE_CHECKING:
-    from vibrissa.whisker import Whisker
+from vibrissa.whisker import Whisker
 
 #: Rate of false alarms.
 FALSE_ALARMS = 0.01
@@ -60,27 +58,13 @@ _SOME = np.array([0.5, 0.0, 0.1, 0.0])
 
 
 class Bent(NamedTuple):
-    """A rod under point forces, n rows of m nodes, non-dimensional.
+    """A rod under point forces, n rows of m nodes, non-dimensional."""
 
-    Attributes
-    ----------
-    wrench : (n, 6) array
-        Force and moment at the base.
-    arc : (n, m) array
-        Arc lengths of the nodes, from the tip to the base.
-    places : (n, m, 3) array
-        Points of the centreline there.
-    frames : (n, m, 3, 3) array
-        Material frames there, in columns.
-    contacts : (n, k, 3) array
-        Contact points.
-    """
-
-    wrench: Array
-    arc: Array
-    places: Array
-    frames: Array
-    contacts: Array
+    wrench: Array  # (n, 6), force and moment at the base
+    arc: Array  # (n, m), arc lengths of the nodes, from the tip to the base
+    places: Array  # (n, m, 3), points of the centreline there
+    frames: Array  # (n, m, 3, 3), material frames there, in columns
+    contacts: Array  # (n, k, 3), contact points
 
     def shape(self, s: Array) -> tuple[Array, Array]:
         """Points and unit tangents (n, j, 3) at arc lengths (n, j)."""

@@ -10,11 +10,11 @@ must be measured, comes from inverting signals moved by a tolerance.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts import Domain, deficient, invert
+from vibrissa.contacts import ContactMap, Domain, deficient, invert
 from vibrissa.identifiability.summits import farthest_twins
 from vibrissa.identifiability.twins import (
     ContactSet,
@@ -35,10 +35,7 @@ from vibrissa.identifiability.twins import (
 )
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.signals import CIRCULAR
-
-if TYPE_CHECKING:
-    from vibrissa.contacts import ContactMap
-    from vibrissa.whisker import Whisker
+from vibrissa.whisker import Whisker
 
 UNIQUE, OFF_SURFACE, NOT_UNIQUE, EMPTY = (
     "unique",

@@ -17,7 +17,7 @@ contact far away has the same signals is decided by the uniqueness of the triple
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -25,6 +25,7 @@ import xarray as xr
 from vibrissa.contacts import (
     At,
     ChosenContacts,
+    ContactMap,
     Noise,
     SensorNoise,
     chosen_contacts,
@@ -47,9 +48,6 @@ from vibrissa.signals import (
     within_cone,
 )
 from vibrissa.status import flag_attributes
-
-if TYPE_CHECKING:
-    from vibrissa.contacts import ContactMap
 
 
 def sensitivity(

@@ -19,13 +19,13 @@ A witness is a pair of twins that is bent again, as two whiskers.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from vibrissa.contacts import RANK, Domain, invert, polish, within_paper_bounds
+from vibrissa.contacts import RANK, ContactMap, Domain, invert, polish, within_paper_bounds
 from vibrissa.deferred import stats
 from vibrissa.numerics import AnyArray, Array, cross
 from vibrissa.rod import (
@@ -56,10 +56,6 @@ from vibrissa.signals import (
     within_turn,
 )
 from vibrissa.whisker import Whisker
-
-if TYPE_CHECKING:
-    from vibrissa.contacts import ContactMap
-
 
 # Directions have no value at zero force: samples are kept off it.
 _LEAST_LOAD = 0.01

@@ -17,13 +17,13 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from vibrissa.certificates import TRIPLET, Certificate, outlook
-from vibrissa.contacts import Domain, Progress
+from vibrissa.contacts import ContactMap, Domain, Progress
 from vibrissa.identifiability.evidence import (
     EMPTY,
     NOT_UNIQUE,
@@ -51,10 +51,6 @@ from vibrissa.numerics import AnyArray, Array, cross, threads
 from vibrissa.quantities import attributes
 from vibrissa.rod import Discretization, discretize, solve_forces, with_normal_force
 from vibrissa.signals import CONE, REGIONS, SIGNALS, TRIPLETS, selection, signal_scales, signals_of
-
-if TYPE_CHECKING:
-    from vibrissa.contacts import ContactMap
-
 
 # Parts of each region.
 _PARTS = {

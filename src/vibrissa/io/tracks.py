@@ -70,53 +70,27 @@ class Labels(TypedDict, total=False):
 
 @dataclass(frozen=True, eq=False)
 class RawTracks:
-    """Contents of a tracker's file as they are.
+    """Contents of a tracker's file as they are."""
 
-    Parameters
-    ----------
-    software : str
-        Name of the program that wrote the file.
-    whiskers : sequence of str
-        Names of the whiskers.
-    image : array (time, whisker, view, node, 2), optional
-        Column and row of points in images, pixels.
-    space : array (time, whisker, node, 3), optional
-        Points in space, in ``unit``.
-    image_confidence, space_confidence : array, optional
-        Confidence of each of these points, 0 to 1.
-    nodes : sequence of str, optional
-        Names of the points along a whisker.
-    views : sequence of str
-        Names of the views.
-    frames : array (time,) of int, optional
-        Numbers of the frames.
-    time : array (time,), optional
-        Times, s.
-    fps : float, optional
-        Frames per second.
-    unit, reference_frame : str
-        Unit and frame of points in space; empty where the file does not state them.
-    extra : mapping of str to xarray.Variable
-        Further variables of the format.
-    about : mapping
-        Further attributes of the format.
-    """
-
-    software: str
-    whiskers: Sequence[str]
+    software: str  # name of the program that wrote the file
+    whiskers: Sequence[str]  # names of the whiskers
+    # (time, whisker, view, node, 2) Column and row of points in images, pixels.
     image: Array | None = None
-    space: Array | None = None
+    space: Array | None = None  # (time, whisker, node, 3), points in space, in ``unit``
+    # Confidence of each of these points, 0 to 1.
     image_confidence: Array | None = None
     space_confidence: Array | None = None
-    nodes: Sequence[str] | None = None
-    views: Sequence[str] = ()
-    frames: NDArray[np.integer[Any]] | None = None
-    time: Array | None = None
-    fps: float | None = None
+    nodes: Sequence[str] | None = None  # names of the points along a whisker
+    views: Sequence[str] = ()  # names of the views
+    frames: NDArray[np.integer[Any]] | None = None  # (time,), numbers of the frames
+    time: Array | None = None  # (time,), times, s
+    fps: float | None = None  # frames per second
+    # Unit and frame of points in space; empty where the file does not state them.
     unit: str = ""
     reference_frame: str = ""
+    # Further variables of the format.
     extra: Mapping[str, xr.Variable] = field(default_factory=dict)
-    about: Mapping[str, Any] = field(default_factory=dict)
+    about: Mapping[str, Any] = field(default_factory=dict)  # further attributes of the format
 
     @classmethod
     def of(cls, points: Array, confidence: Array | None, **others: Any) -> Self:

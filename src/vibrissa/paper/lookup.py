@@ -26,7 +26,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -63,9 +63,6 @@ from vibrissa.signals import (
     within_turn,
 )
 from vibrissa.status import Status
-
-if TYPE_CHECKING:
-    from vibrissa.contacts import ContactMap
 
 #: Natural-neighbour as the paper's, or linear, or a function of points (n, 3) and values (n, 3)
 #: that returns a function of other points (m, 3).

@@ -13,20 +13,17 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from vibrissa.contacts import Prior, within_paper_bounds
+from vibrissa.contacts import ContactMap, Prior, within_paper_bounds
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.rod import contacts_at, solve_forces, with_normal_force
 from vibrissa.signals import CIRCULAR, SIGNALS, cone_angle, selection, signals_of, within_cone
-
-if TYPE_CHECKING:
-    from vibrissa.contacts import ContactMap
 
 #: Quantiles of a network's errors that are evidence on a triplet.
 QUANTILES = (0.5, 0.95)

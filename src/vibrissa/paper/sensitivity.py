@@ -12,19 +12,14 @@ and backward differ. Each has a number here, from the exact derivatives; see
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import xarray as xr
 
-from vibrissa.contacts import At, Noise, SensorNoise, ellipsoids, spherical_derivatives
+from vibrissa.contacts import At, ContactMap, Noise, SensorNoise, ellipsoids, spherical_derivatives
 from vibrissa.identifiability import sensitivity
 from vibrissa.numerics import Array, contact_weights, weighted_quantile
 from vibrissa.paper.lookup import STEP, Interpolation, LookupTable
 from vibrissa.signals import SIGNALS, measured, selection
-
-if TYPE_CHECKING:
-    from vibrissa.contacts import ContactMap
 
 
 def central_differences(

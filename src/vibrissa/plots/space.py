@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from numpy.typing import ArrayLike
 
+from vibrissa.deferred import interpolate, spatial
 from vibrissa.numerics import Array
 from vibrissa.plots.style import INK, MUTED, ORANGE, PLAIN, SMALL, Box, box_axes
 from vibrissa.quantities import axis_label, quantity, to_display
@@ -290,13 +291,13 @@ def _draw_zero(axes: Axes, right: Array, up: Array, distance: Array, look: str) 
 
 def _nearest(body: Body, points: Array, limits: Array, depth: int) -> Array:
     """Least distance from a body along lines of sight through points (m, m, 3), mm."""
-    from scipy.interpolate import RegularGridInterpolator
-
     rough = np.arange(0, _CELLS, _COARSE)
     corners = points[np.ix_(rough, rough)]
     cell = float(np.ptp(corners[:2, :2].reshape(-1, 3), axis=0).max())
     coarse = _marched(body, corners.reshape(-1, 3), limits, depth, 2.0 * cell)
-    table = RegularGridInterpolator((rough, rough), coarse.reshape(rough.size, rough.size))
+    table = interpolate.RegularGridInterpolator(
+        (rough, rough), coarse.reshape(rough.size, rough.size)
+    )
     rows, columns = np.indices((_CELLS, _CELLS))
     nearest = np.asarray(table((rows, columns)), dtype=np.float64)
     # Within a cell a distance changes by no more than the way.
@@ -505,7 +506,5 @@ def draw_head(axes: Axes, head: Head, view: tuple[int, int]) -> None:
 
 def _outline(triangles: Array, view: tuple[int, int]) -> Array:
     """Hull (n, 2) of what is seen: a head has no hollows."""
-    from scipy.spatial import ConvexHull
-
     points = triangles.reshape(-1, 3)[:, list(view)]
-    return np.asarray(points[ConvexHull(points).vertices])
+    return np.asarray(points[spatial.ConvexHull(points).vertices])

@@ -48,21 +48,11 @@ _NODES = 257
 
 
 class Traced(NamedTuple):
-    """A whisker followed from tip to base, at m arc lengths, non-dimensional.
+    """A whisker followed from tip to base, at m arc lengths, non-dimensional."""
 
-    Attributes
-    ----------
-    places : (m, 3) array
-        Points of the centreline, whisker frame.
-    frames : (m, 3, 3) array
-        Material frames, in columns.
-    moments : (m, 3) array
-        Moments of the weight beyond each, in the material frame.
-    """
-
-    places: Array
-    frames: Array
-    moments: Array
+    places: Array  # (m, 3), points of the centreline, whisker frame
+    frames: Array  # (m, 3, 3), material frames, in columns
+    moments: Array  # (m, 3), moments of the weight beyond each, in the material frame
 
 
 class Weighted(NamedTuple):

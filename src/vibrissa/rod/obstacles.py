@@ -59,33 +59,20 @@ _GAUSS = np.array([0.5 - _ROOT / 6.0, 0.5 + _ROOT / 6.0])
 
 
 class Grid(NamedTuple):
-    """Elements of a whisker, non-dimensional; those of a compliant base have no extent.
+    """Elements of a whisker, non-dimensional; those of a compliant base have no extent."""
 
-    Attributes
-    ----------
-    s : (n + 1,) array
-        Arc lengths of the nodes; 0 in a compliant base.
-    width, extent : (n,) array
-        Widths of the elements, and centreline length per width.
-    stations : (n, 2) array
-        Arc lengths of the Gauss points.
-    rest, stiffness : (n, 2, 3) array
-        Intrinsic curvature, and stiffness in twist and bending there.
-    radius, slope : (n + 1,) array
-        Radius of the whisker at the nodes, and its derivative.
-    fixed : (n + 1,) bool array
-        Nodes at ends and kinks, which stay where they are.
-    """
-
-    s: Array
+    s: Array  # (n + 1,), arc lengths of the nodes; 0 in a compliant base
+    # (n,) Widths of the elements, and centreline length per width.
     width: Array
     extent: Array
-    stations: Array
+    stations: Array  # (n, 2), arc lengths of the Gauss points
+    # (n, 2, 3) Intrinsic curvature, and stiffness in twist and bending there.
     rest: Array
     stiffness: Array
+    # (n + 1,) Radius of the whisker at the nodes, and its derivative.
     radius: Array
     slope: Array
-    fixed: Mask
+    fixed: Mask  # (n + 1,), nodes at ends and kinks, which stay where they are
 
     @property
     def first(self) -> float:
@@ -218,27 +205,15 @@ class Obstacles:
 
 
 class Equilibrium(NamedTuple):
-    """A whisker against objects, non-dimensional, in the whisker frame.
+    """A whisker against objects, non-dimensional, in the whisker frame."""
 
-    Attributes
-    ----------
-    grid : Grid
-        Elements.
-    strain : (n, 2, 3) array
-        Curvature minus that at rest, at the Gauss points.
-    pressing : (surfaces, n + 1) array
-        Normal forces at the nodes.
-    nodes, frames : (n + 1, 3), (n + 1, 3, 3) array
-        Places and frames of the nodes.
-    normals : (surfaces, n + 1, 3) array
-        Outward normals of the objects at nodes that they press on, else 0.
-    """
-
-    grid: Grid
-    strain: Array
-    pressing: Array
+    grid: Grid  # Elements
+    strain: Array  # (n, 2, 3), curvature minus that at rest, at the Gauss points
+    pressing: Array  # (surfaces, n + 1), normal forces at the nodes
+    # (n + 1, 3) Places and frames of the nodes.
     nodes: Array
     frames: Array
+    # (surfaces, n + 1, 3) Outward normals of the objects at nodes that they press on, else 0.
     normals: Array
 
     def contacts(self) -> tuple[Array, IntArray, Array, Array]:

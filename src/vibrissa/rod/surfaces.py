@@ -66,27 +66,13 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class SurfaceDeflection:
-    """Whisker carried past surfaces, at n placements.
+    """Whisker carried past surfaces, at n placements."""
 
-    Attributes
-    ----------
-    bent : Deflection
-        Base force and moment, contact and status at each placement.
-    surface : (n,) int array
-        Number of the surface that is touched, -1 without contact.
-    normal : (n, 3) array
-        Outward normals of the surface at the contacts, laboratory frame.
-    surface_point : (n, 3) array
-        Touched point of the surface, laboratory frame, m.
-    sliding : (n,) bool array
-        Whether the contact slides rather than sticks.
-    """
-
-    bent: Deflection
-    surface: IntArray
-    normal: Array
-    surface_point: Array
-    sliding: np.ndarray
+    bent: Deflection  # base force and moment, contact and status at each placement
+    surface: IntArray  # (n,), number of the surface that is touched, -1 without contact
+    normal: Array  # (n, 3), outward normals of the surface at the contacts, laboratory frame
+    surface_point: Array  # (n, 3), touched point of the surface, laboratory frame, m
+    sliding: np.ndarray  # (n,), whether the contact slides rather than sticks
 
 
 class _Ended(NamedTuple):

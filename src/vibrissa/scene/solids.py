@@ -30,6 +30,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+from vibrissa.deferred import interpolate, spatial
 from vibrissa.numerics import Array, Mask
 from vibrissa.quantities import to_display
 
@@ -106,16 +107,18 @@ def _refined(
     bearings: tuple[float, float] | None,
     shape: tuple[int, int, int],
 ) -> Array:
-    from scipy.interpolate import CubicSpline  # a fifth of a second, so only where it is needed
-
     station, bearing, load = axes
     start, stop = (bearing[0], bearing[-1]) if bearings is None else bearings
     around = max(2, round(shape[1] * (stop - start) / (2.0 * np.pi)))
-    nodes = CubicSpline(station, nodes, axis=0)(np.linspace(station[0], station[-1], shape[0] + 1))
+    nodes = interpolate.CubicSpline(station, nodes, axis=0)(
+        np.linspace(station[0], station[-1], shape[0] + 1)
+    )
     nodes[:, -1] = nodes[:, 0]  # equal but for rounding
-    wrapped = CubicSpline(bearing, nodes, axis=1, bc_type="periodic")
+    wrapped = interpolate.CubicSpline(bearing, nodes, axis=1, bc_type="periodic")
     nodes = wrapped(np.linspace(start, stop, around + 1))
-    fine = CubicSpline(load, nodes, axis=2)(np.linspace(load[0], load[-1], shape[2] + 1))
+    fine = interpolate.CubicSpline(load, nodes, axis=2)(
+        np.linspace(load[0], load[-1], shape[2] + 1)
+    )
     return np.asarray(fine, dtype=np.float64)
 
 
@@ -138,14 +141,12 @@ def outside_cone(points: Array, centerline: Array) -> Array:
 
 def nearest_at_rest(points: Array, centerline: Array) -> tuple[Array, Array]:
     """Distance of contacts from the resting whisker."""
-    from scipy.spatial import cKDTree
-
     count = max(2000, len(centerline))
     at = np.linspace(0.0, len(centerline) - 1.0, count)
     fine = np.stack([np.interp(at, np.arange(len(centerline)), c) for c in centerline.T], axis=1)
     step = np.linalg.norm(np.diff(fine, axis=0), axis=1)
     arc_length = np.concatenate([[0.0], np.cumsum(step)])
-    distance, nearest = cKDTree(fine).query(points)
+    distance, nearest = spatial.cKDTree(fine).query(points)
     return np.asarray(distance), arc_length[nearest]
 
 
@@ -480,13 +481,13 @@ def error_ellipsoid(
 
 def head_surfaces(rotation: Array, position: Array) -> tuple[Array, Array]:
     """Sketch a rat's head."""
-    from scipy.interpolate import PchipInterpolator
-
     turn = np.linspace(0.0, 2.0 * np.pi, _AROUND)
     # Smooth between the sections, which are closer together near the snout.
     number = np.arange(len(_SECTIONS))
     fine = np.linspace(0.0, number[-1], 6 * number[-1] + 1)
-    forward, half, middle, tall = PchipInterpolator(number, _SECTIONS)(fine).T[..., None]
+    forward, half, middle, tall = interpolate.PchipInterpolator(number, _SECTIONS)(fine).T[
+        ..., None
+    ]
     parts = half * np.cos(turn), forward, middle + tall * np.sin(turn)
     skin = sheet(np.stack(np.broadcast_arrays(*parts), axis=-1))
     balls = [ellipsoid(eye, _EYE * np.eye(3), 16) for eye in _EYES]

@@ -27,20 +27,19 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vibrissa.deferred import optimize
 from vibrissa.numerics import Array, Mask
 from vibrissa.rod import PointContact, deflect
 from vibrissa.sensors.frame import SensorFrame, cross_matrix
 from vibrissa.sensors.regression import Solution, solve, warn_of_misfit, warn_of_surprise
 from vibrissa.sensors.sensor import COMPONENTS, GRAVITY, Sensor, with_offset
 from vibrissa.status import describe, is_ok
-
-if TYPE_CHECKING:
-    from vibrissa.whisker import Whisker
+from vibrissa.whisker import Whisker
 
 _ROUNDING = 1e-6  # share of the largest component of its kind below which a component is rounding
 _ADVICE = (
@@ -610,8 +609,6 @@ def _fitted(
 
     The covariance is that of factor, taper and spring in this order, as far as they are fitted.
     """
-    from scipy.optimize import least_squares
-
     model = modelled(ratio, _SPRING if base else None)
     factor = float((model * scaled).sum() / (model**2).sum())
     if not (taper or base):
@@ -630,7 +627,9 @@ def _fitted(
     unknowns += [(_SPRING, _SOFT, _STIFF)] if base else []
     with np.errstate(divide="ignore"):
         start, low, high = np.log(np.array(unknowns)).T
-    found = least_squares(residuals, start, bounds=(low, high), diff_step=[1e-4] * len(start))
+    found = optimize.least_squares(
+        residuals, start, bounds=(low, high), diff_step=[1e-4] * len(start)
+    )
     jacobian = np.asarray(found.jac, dtype=np.float64)
     inverse = np.asarray(np.linalg.pinv(jacobian.T @ jacobian), dtype=np.float64)
     ratio, spring = parts(found.x)

@@ -34,7 +34,7 @@ Nothing needs to be known of where a touch begins: the steps of all samples show
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -46,10 +46,7 @@ from vibrissa.rod import discretize, solve_forces
 from vibrissa.sensors.frame import cross_matrix
 from vibrissa.sensors.regression import ThinPlate
 from vibrissa.status import Status
-
-if TYPE_CHECKING:
-    from vibrissa.whisker import Whisker
-
+from vibrissa.whisker import Whisker
 
 # What a channel reads a combination of: rotation, rad, and shift over L, of the base.
 FEATURES = (

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,9 +23,7 @@ from vibrissa.rod import discretize
 from vibrissa.sensors.regression import ThinPlate
 from vibrissa.sensors.suspended import SuspendedWhisker, Touches
 from vibrissa.status import Status
-
-if TYPE_CHECKING:
-    from vibrissa.whisker import Whisker
+from vibrissa.whisker import Whisker
 
 # Touches that are needed, above which more than the compliances may be free, and from which on
 # there is a Gaussian process.

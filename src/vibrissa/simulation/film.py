@@ -33,7 +33,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.cameras import PIXEL_SIZE, Camera, cameras_dataset, orthogonal_views
-from vibrissa.deferred import interpolate
+from vibrissa.deferred import interpolate, special
 from vibrissa.io import Frame, write_video
 from vibrissa.numerics import kernel
 from vibrissa.objects import Surface
@@ -422,8 +422,6 @@ def hidden(points: Array, camera: Camera, objects: Sequence[Surface]) -> Array:
 
 def silhouette(camera: Camera, objects: Sequence[Surface], center: Array, soft: float) -> Array:
     """Share of each pixel that objects cover."""
-    from scipy.special import ndtr
-
     width, height = camera.size
     covered = np.zeros((height, width))
     if not objects:
@@ -444,7 +442,7 @@ def silhouette(camera: Camera, objects: Sequence[Surface], center: Array, soft: 
         pixels = np.stack(np.nonzero(mask)[::-1], axis=-1)
         if len(pixels):
             distance = _nearest(camera, thing, pixels, center, scale) * scale
-            covered[mask] = np.maximum(covered[mask], ndtr(-distance / soft))
+            covered[mask] = np.maximum(covered[mask], special.ndtr(-distance / soft))
     return covered
 
 

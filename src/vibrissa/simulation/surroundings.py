@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.cameras import Camera
+from vibrissa.deferred import ndimage
 from vibrissa.numerics import Array
 
 Image = NDArray[np.float32]
@@ -43,15 +44,13 @@ class Surroundings:
         cls, camera: Camera, fur: float, cheek: float, wires: int, extent: float, seed: int
     ) -> Surroundings:
         """Draw them from a seed; whiskers are of so many pixels' extent in the image."""
-        from scipy.ndimage import gaussian_filter
-
         random = np.random.default_rng([seed, 11])
         width, height = camera.size
         texture = np.zeros((height, width), dtype=np.float32)
         hairs: list[Array] = []
         if fur > 0.0 or cheek > 0.0:
-            fine = gaussian_filter(random.normal(size=texture.shape), (_GRAIN, _ALONG))
-            tufts = gaussian_filter(random.normal(size=texture.shape), _COARSE)
+            fine = ndimage.gaussian_filter(random.normal(size=texture.shape), (_GRAIN, _ALONG))
+            tufts = ndimage.gaussian_filter(random.normal(size=texture.shape), _COARSE)
             texture += (fine / fine.std() + 0.5 * tufts / tufts.std()).astype(np.float32)
             texture *= max(fur, 0.1 * _CHEEK if cheek > 0.0 else 0.0)
         if fur > 0.0:

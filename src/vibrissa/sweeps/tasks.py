@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -26,9 +26,7 @@ from vibrissa.rod import PointForce, deflect
 from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE
 from vibrissa.signals import REGIONS, SIGNALS, TRIPLETS, base_signals, selection
 from vibrissa.status import Status
-
-if TYPE_CHECKING:
-    from vibrissa.whisker import Whisker
+from vibrissa.whisker import Whisker
 
 Settings = Mapping[str, Any]
 

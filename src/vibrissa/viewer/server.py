@@ -69,8 +69,6 @@ from vibrissa.whisker import Whisker
 if TYPE_CHECKING:
     import viser
 
-    from vibrissa.whisker import Whisker
-
 
 HOST = "127.0.0.1"
 PORT = 8080

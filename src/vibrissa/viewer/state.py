@@ -15,6 +15,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from vibrissa.contacts import ContactMap
+from vibrissa.deferred import spatial
 from vibrissa.numerics import Array
 from vibrissa.quantities import quantity, to_display
 from vibrissa.rod import Deflection, PegContact, PointContact, PointForce, deflect
@@ -314,11 +315,9 @@ def envelope(chart: Chart) -> Painted:
 
 def coloured_solid(chart: Chart, colours: Bytes, cut: bool, opacity: float | None) -> Painted:
     """Draw all contacts, or those with z < 0, in the colours (n, 3) of the nearest samples."""
-    from scipy.spatial import cKDTree
-
     nodes = sample_contacts(chart.samples, chart.line, shape=_SOLID)
     nodes = np.concatenate([nodes, -nodes[..., 2:3]], axis=-1)
     below = (nodes.shape[-1] - 1,) if cut else ()
     points = solid_surface(nodes, True, column("deflection"), *below)[..., :3]
-    _, nearest = cKDTree(chart.points).query(points)
+    _, nearest = spatial.cKDTree(chart.points).query(points)
     return Painted(to_display("contact_point", points), colours[nearest], opacity)

@@ -48,6 +48,7 @@ from typing import Literal, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vibrissa.deferred import transform
 from vibrissa.numerics import Array
 
 # Columns (0: Greek) of each row whose whiskers were measured: the range of validity.
@@ -107,10 +108,8 @@ def base_point(row: ArrayLike, column: ArrayLike) -> Array:
 
 
 def _cheek() -> Array:
-    """Rotation from the ellipsoid's axes to the head's, R_z R_y R_x."""
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_euler("ZYX", _TURNED).as_matrix())
+    """transform.Rotation from the ellipsoid's axes to the head's, R_z R_y R_x."""
+    return np.asarray(transform.Rotation.from_euler("ZYX", _TURNED).as_matrix())
 
 
 def projection_angles(row: ArrayLike, column: ArrayLike) -> Array:

@@ -78,41 +78,23 @@ class FitOptions:
 
     Standard deviations of second differences are those at 1,000 frames/s; at other rates they scale
     with the square of the time between frames.
-
-    Parameters
-    ----------
-    turning : float
-        Standard deviation of second differences of the base's orientation, rad.
-    moving : float
-        Standard deviation of second differences of the base's position, m.
-    sliding : float
-        Standard deviation of second differences of the contact's arc length, m.
-    pressing : float
-        Standard deviation of second differences of the contact force, in units of EI/L² at the
-        base.
-    friction : float
-        Standard deviation of the force along the whisker, as a share of that across it; 0 is a
-        contact without friction.
-    roll : float
-        Standard deviation of the roll about what it is expected to be, rad.
-    surface : float
-        Standard deviation of the distance of contacts from known objects, m.
-    sharpest : float
-        Smallest standard deviation of traces that residuals may show, as a share of the stated one;
-        at least 1 where a trace is a line between few points (`Trace.sparse`).
-    rounds : int
-        Largest number of Gauss–Newton steps.
     """
 
-    turning: float = 2e-3
-    moving: float = 2e-5
-    sliding: float = 2e-4
+    turning: float = 2e-3  # standard deviation of second differences of the base's orientation, rad
+    moving: float = 2e-5  # standard deviation of second differences of the base's position, m
+    sliding: float = 2e-4  # standard deviation of second differences of the contact's arc length, m
+    # Standard deviation of second differences of the contact force, in units of EI/L² at the base.
     pressing: float = 0.05
+    # Standard deviation of the force along the whisker, as a share of that across it; 0 is a
+    # contact without friction.
     friction: float = 0.1
+    # Standard deviation of the roll about what it is expected to be, rad.
     roll: float = np.radians(0.5)
-    surface: float = 3e-5
+    surface: float = 3e-5  # standard deviation of the distance of contacts from known objects, m
+    # Smallest standard deviation of traces that residuals may show, as a share of the stated one;
+    # at least 1 where a trace is a line between few points (`Trace.sparse`).
     sharpest: float = 0.2
-    rounds: int = 12
+    rounds: int = 12  # largest number of Gauss–Newton steps
 
 
 @dataclass(frozen=True, eq=False)

@@ -44,21 +44,13 @@ _SLIDING = 0.3
 
 
 class SpaceCurve(NamedTuple):
-    """A whisker in space.
+    """A whisker in space."""
 
-    Attributes
-    ----------
-    points : array (NODES, 3)
-        Points from the base to where the first of the views ends, laboratory frame, m; NaN if
-        there is none.
-    covariance : array (NODES, 3, 3)
-        Covariance of each point, m².
-    misfit : float
-        Root mean square distance of its images from the traces, in their standard deviations.
-    """
-
+    # (NODES, 3) Points from the base to where the first of the views ends, laboratory frame, m; NaN
+    # if there is none.
     points: Array
-    covariance: Array
+    covariance: Array  # (NODES, 3, 3), covariance of each point, m²
+    # Root mean square distance of its images from the traces, in their standard deviations.
     misfit: float
 
     @classmethod

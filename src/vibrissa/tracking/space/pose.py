@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.deferred import transform
+from vibrissa.deferred import ndimage, signal, transform
 from vibrissa.numerics import Array, Mask
 from vibrissa.tracking.space.rest_shape import RestShape, aligned_lengths, motions
 from vibrissa.tracking.trace.trace import interpolated
@@ -46,34 +46,24 @@ def low_pass(values: ArrayLike, rate: float, cutoff: float | None = CUTOFF) -> A
         )
     flat = array.reshape(len(array), -1)
     known = np.isfinite(flat)
-    from scipy.signal import butter, sosfiltfilt  # loads slowly
-
-    sections = butter(_ORDER, cutoff, fs=rate, output="sos")
+    sections = signal.butter(_ORDER, cutoff, fs=rate, output="sos")
     pad = min(len(flat) - 1, round(3.0 * rate / cutoff))
     frames = np.arange(len(flat))
     for k in range(flat.shape[1]):
         if known[:, k].sum() < 2:
             continue
         whole = np.interp(frames, frames[known[:, k]], flat[known[:, k], k])
-        filtered = sosfiltfilt(sections, whole, padlen=pad)
+        filtered = signal.sosfiltfilt(sections, whole, padlen=pad)
         flat[:, k] = np.where(known[:, k], filtered, np.nan)
     return flat.reshape(array.shape)
 
 
 @dataclass(frozen=True, eq=False)
 class HeadPose:
-    """Position and orientation of the head in every frame.
+    """Position and orientation of the head in every frame."""
 
-    Parameters
-    ----------
-    position : array (time, 3)
-        Origin of the head's frame in the laboratory frame, m.
-    rotation : array (time, 3, 3)
-        Rotation from the head's to the laboratory frame.
-    """
-
-    position: Array
-    rotation: Array
+    position: Array  # (time, 3), origin of the head's frame in the laboratory frame, m
+    rotation: Array  # (time, 3, 3), rotation from the head's to the laboratory frame
 
     @classmethod
     def still(cls, count: int) -> HeadPose:
@@ -124,17 +114,10 @@ class HeadPose:
 
 @dataclass(frozen=True, eq=False)
 class BasePose:
-    """Pose of a whisker's base in every frame.
+    """Pose of a whisker's base in every frame."""
 
-    Parameters
-    ----------
-    position : array (time, 3)
-        Base point, laboratory frame, m; NaN where it is not known.
-    azimuth, elevation, roll : array (time,)
-        Emergence angles, rad.
-    """
-
-    position: Array
+    position: Array  # (time, 3), base point, laboratory frame, m; NaN where it is not known
+    # (time,) Emergence angles, rad.
     azimuth: Array
     elevation: Array
     roll: Array
@@ -285,8 +268,6 @@ def _tangents(shapes: Array, spacing: float, length: float) -> tuple[Array, Arra
 
 def _roll_like(known: Array, guess: Array, free: Mask, slow: int = _SLOW) -> Array:
     """Roll as a linear function of azimuth and elevation, as without contact; plus slow changes."""
-    from scipy.ndimage import median_filter  # loads slowly
-
     usable = free & np.isfinite(known).all(axis=1)
     design = np.column_stack([np.ones(usable.sum()), known[usable, :2]])
     middle = design.mean(axis=0)
@@ -297,5 +278,5 @@ def _roll_like(known: Array, guess: Array, free: Mask, slow: int = _SLOW) -> Arr
     line: Array = slope[0] + (guess[:, :2] - middle[1:]) @ slope[1:]
     frames = np.arange(len(known))
     # A contact that begins is so light that its first frames count as free, though bent.
-    left = median_filter(known[usable, 2] - center @ slope, slow, mode="nearest")
+    left = ndimage.median_filter(known[usable, 2] - center @ slope, slow, mode="nearest")
     return np.asarray(line + np.interp(frames, frames[usable], left), dtype=np.float64)

@@ -25,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vibrissa.deferred import interpolate
 from vibrissa.numerics import Array, Mask
 from vibrissa.tracking.trace.trace import arc_lengths, interpolated
 from vibrissa.whisker import Whisker
@@ -380,8 +381,6 @@ def lengthened(shape: RestShape, length: float) -> RestShape:
 
 def likeliest_length(seen: float, cost: Callable[[float], float]) -> Length:
     """Find the length with which the rod explains the traces best: its mean over what is likely."""
-    from scipy.interpolate import CubicSpline  # loads slowly
-
     lengths, costs = [seen], [cost(seen)]
     while costs[-1] <= min(costs) + _HARDLY and lengths[-1] < _LONGEST * seen:
         lengths.append(lengths[-1] + _STEP * seen)
@@ -389,7 +388,7 @@ def likeliest_length(seen: float, cost: Callable[[float], float]) -> Length:
     if max(costs) <= min(costs) + _HARDLY:
         return Length(seen, np.nan)
     fine = np.linspace(seen, lengths[-1], _FINE)
-    between = CubicSpline(lengths, costs)(fine)
+    between = interpolate.CubicSpline(lengths, costs)(fine)
     weight = np.exp(-0.5 * (between - between.min()))
     weight /= weight.sum()
     value = float(fine @ weight)

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vibrissa.deferred import ndimage
 from vibrissa.io import Frame
 from vibrissa.numerics import kernel
 from vibrissa.tracking.trace.clutter import EDGE, STILL, Bits
@@ -140,10 +141,8 @@ class Scene:
 
     def bodies(self, frame: Frame) -> Bodies:
         """Find what is dark and not thin in a frame."""
-        from scipy.ndimage import label
-
         dark = _smoothed(_closed(_halved(frame), self.thin), _EDGE) < self.level * self.gain(frame)
-        labels, count = label(dark)
+        labels, count = ndimage.label(dark)
         area = np.bincount(labels.ravel(), minlength=count + 1)
         area[0] = 0
         border = np.zeros(count + 1, dtype=bool)
@@ -190,8 +189,6 @@ class Scene:
 
     def with_still(self, bases: Array, frames: Sequence[Frame]) -> Scene:
         """Find what never moves in these frames, but for what whiskers begin at (n, 2)."""
-        from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter, label
-
         if self.background is None or self.count < _MANY:
             return self
         shown = np.maximum(self.background, 1.0)
@@ -199,24 +196,26 @@ class Scene:
         stands = np.abs(shown / ground - 1.0) > 1.0 - _LIT
         least = _NOISES * noise_level(shown) / float(np.median(self.light))
         thin = self.light / shown - 1.0 > min(max(least, _FAINT), _LINE)
-        stands = binary_dilation(stands | thin, iterations=_BLUR)
+        stands = ndimage.binary_dilation(stands | thin, iterations=_BLUR)
 
         def around(stands: NDArray[np.bool_]) -> Any:
             known = np.where(stands, 0.0, 1.0).astype(np.float32)
-            weight, light = (gaussian_filter(one, _AROUND) for one in (known, known * shown))
+            weight, light = (
+                ndimage.gaussian_filter(one, _AROUND) for one in (known, known * shown)
+            )
             return np.where(weight > _ENOUGH, light / np.maximum(weight, 1e-6), ground)
 
         # The soft edge of a shadow, left alone, would be a line.
-        wider = binary_dilation(stands, iterations=_SHADED)
+        wider = ndimage.binary_dilation(stands, iterations=_SHADED)
         soft = wider & (np.abs(shown / around(wider) - 1.0) > _FAINT)
         open_ = around(stands | soft)
         soft &= ~stands
-        thick = binary_erosion(stands, iterations=_BLUR + _THICK)
-        wide = binary_dilation(thick, iterations=_BLUR + _THICK + _RIM)
-        bodies, lines = label(wide & stands)[0], label(stands & ~wide)[0]
+        thick = ndimage.binary_erosion(stands, iterations=_BLUR + _THICK)
+        wide = ndimage.binary_dilation(thick, iterations=_BLUR + _THICK + _RIM)
+        bodies, lines = ndimage.label(wide & stands)[0], ndimage.label(stands & ~wide)[0]
         swept = self._swept(frames, lines)
         stands, lines = stands & ~swept, np.where(swept, 0, lines)
-        parts, _ = label(stands)
+        parts, _ = ndimage.label(stands)
         across = np.isin(lines, _long(lines))
         # The face moves, with whatever hangs on it, but not a line that only passes the base, nor
         # what a base far inside a body is before.
@@ -236,14 +235,14 @@ class Scene:
             stands &= ~at_base | across | other
         # Where whiskers cross or turn it is always dark too, though not over a long way.
         stands &= np.isin(parts, _long(parts)) | np.isin(parts, np.unique(parts[thick]))
-        stands = binary_dilation(stands, iterations=_SHADED, mask=stands | soft)
+        stands = ndimage.binary_dilation(stands, iterations=_SHADED, mask=stands | soft)
         at = np.flatnonzero(stands)
         factor = (open_ / shown).ravel()[at]
         dark = stands & (shown < _OPAQUE * open_) & ~lifted
         # Where the blurred edge of what hides it lies on a whisker, its farther part shows.
         edge = stands & (shown < _CLEAR * open_) & ~lifted
-        rim = binary_dilation(dark, iterations=_SOFTEST, mask=edge)
-        hidden = binary_dilation(dark, iterations=_SEEN) | rim
+        rim = ndimage.binary_dilation(dark, iterations=_SOFTEST, mask=edge)
+        hidden = ndimage.binary_dilation(dark, iterations=_SEEN) | rim
         bits = STILL * hidden.astype(np.uint32)
         bits |= EDGE * stands.astype(np.uint32)
         return replace(
@@ -256,8 +255,6 @@ class Scene:
 
         It leaves a part of its darkness in the background, but usually is darker than that.
         """
-        from scipy.ndimage import binary_dilation, maximum_filter
-
         assert self.background is not None
         where = lines > 0
         if not where.any():
@@ -266,10 +263,10 @@ class Scene:
         noise = float(np.median([noise_level(frame) for frame in frames[:_FEWEST]]))
         darker_ = np.zeros_like(where)
         # Compression lets what stands still vary, too, the more the darker it is.
-        deep = maximum_filter(self.light - self.background, 2 * _BLUR + 1)[where]
+        deep = ndimage.maximum_filter(self.light - self.background, 2 * _BLUR + 1)[where]
         least = np.maximum(_SWEPT * noise, _DARKER * deep)
         darker_[where] = self.background[where] - np.median(grey, axis=0) > least
-        there = binary_dilation(darker_, iterations=_BLUR)
+        there = ndimage.binary_dilation(darker_, iterations=_BLUR)
         size = np.bincount(lines[where])
         share = np.bincount(lines[where], there[where]) / np.maximum(size, 1)
         return np.asarray(where & (share[lines] > _MOSTLY))
@@ -312,9 +309,7 @@ class Still:
 
 def _long(labels: Any) -> list[int]:
     """Numbers of the parts that are long enough for a still line."""
-    from scipy.ndimage import find_objects
-
-    boxes = enumerate(find_objects(labels), 1)
+    boxes = enumerate(ndimage.find_objects(labels), 1)
     return [k for k, box in boxes if box and max(side.stop - side.start for side in box) >= _LONG]
 
 
@@ -348,16 +343,12 @@ def _doubled(image: Image, shape: tuple[int, ...]) -> Image:
 
 def _closed(image: Image, width: int) -> Image:
     """Grey closing with a square: what is dark and thinner than it vanishes."""
-    from scipy.ndimage import grey_closing
-
-    return np.asarray(grey_closing(image, (width, width), mode="nearest"))
+    return np.asarray(ndimage.grey_closing(image, (width, width), mode="nearest"))
 
 
 def _smoothed(image: Image, sigma: float) -> Image:
     """Smooth an image with a Gaussian."""
-    from scipy.ndimage import gaussian_filter
-
-    return np.asarray(gaussian_filter(image, sigma, truncate=3.0, mode="nearest"))
+    return np.asarray(ndimage.gaussian_filter(image, sigma, truncate=3.0, mode="nearest"))
 
 
 def _ground(still: Image) -> tuple[Image, np.float32]:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vibrissa.deferred import interpolate, spatial
 from vibrissa.numerics import Array, Mask
 
 STEP = 2.0  # distance between points of a trace, pixels
@@ -141,15 +142,13 @@ def _turn(line: Array) -> float:
 
 def given(points: ArrayLike) -> Trace:
     """Make a trace of points that a person gives."""
-    from scipy.interpolate import make_interp_spline
-
     array = np.asarray(points, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 2 or len(array) < 2 or not np.isfinite(array).all():
         raise ValueError(f"points have shape {array.shape}; finite (n, 2), n ≥ 2, are needed")
     s = arc_lengths(array)
     if not (np.diff(s) > 0.0).all():
         raise ValueError("two points of a trace are the same")
-    spline = make_interp_spline(s, array, k=min(3, len(array) - 1))
+    spline = interpolate.make_interp_spline(s, array, k=min(3, len(array) - 1))
     line = even(np.asarray(spline(np.linspace(0.0, s[-1], int(s[-1]) + 2))))
     return Trace(line, np.full(len(line), _GIVEN), np.ones(len(line), dtype=bool), 1.0)
 
@@ -188,9 +187,7 @@ def aligned(line: Array, other: Array, points: int = 30) -> float:
 
 def overlap(line: Array, other: Array, near: float = 3.0) -> float:
     """Share of a line that runs along another, nearer than some pixels."""
-    from scipy.spatial import cKDTree
-
     if not len(line) or not len(other):
         return 0.0
-    distance, _ = cKDTree(other).query(line, distance_upper_bound=near)
+    distance, _ = spatial.cKDTree(other).query(line, distance_upper_bound=near)
     return float(np.isfinite(distance).mean())

@@ -1,8 +1,8 @@
-"""Accuracy and speed: everything that the page *What is measured* reports, in one command.
+"""Accuracy and speed: everything that the page *What is measured* and its parts report.
 
 `python studies/measured.py [PART ...]`, with the parts rod, contacts, job, speed and real; all by
-default, within ten minutes on two cores. `--page` writes the numbers into `docs/measured.md`, else
-they are printed. `--quick` shows how it goes, in a minute or two. The part real needs digitised
+default, within ten minutes on two cores. `--page` writes the numbers into the pages, else they are
+printed. `--quick` shows how it goes, in a minute or two. The part real needs digitised
 whiskers, a CSV each, which are not part of the repository: `--whiskers FOLDER`. Without them it is
 left out, and the page keeps its numbers.
 """
@@ -19,7 +19,8 @@ from pages import put, save
 
 import vibrissa
 
-PAGE = Path(__file__).parents[1] / "docs" / "measured.md"
+DOCS = Path(__file__).parents[1] / "docs"
+PAGES = [DOCS / f"measured{part}.md" for part in ("", "-pipeline", "-speed")]
 PARTS: dict[str, Callable[[bool], dict[str, str]]] = {
     "rod": rod.blocks,
     "contacts": contacts.blocks,
@@ -31,7 +32,7 @@ PARTS: dict[str, Callable[[bool], dict[str, str]]] = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("parts", nargs="*", choices=[*PARTS, "real", []], metavar="PART")
-    parser.add_argument("--page", action="store_true", help="write docs/measured.md")
+    parser.add_argument("--page", action="store_true", help="write docs/measured*.md")
     parser.add_argument("--quick", action="store_true", help="fewer of everything, to try it out")
     parser.add_argument("--whiskers", type=Path, help="folder of digitised whiskers", metavar="DIR")
     chosen = parser.parse_args()
@@ -49,9 +50,9 @@ def main() -> None:
             f"{took:.0f} s.*"
         )
         if chosen.page:
-            put(PAGE, blocks)
+            put(PAGES, blocks)
             if name == "rod":
-                save(rod.picture(), PAGE.parent / "images" / "convergence.png")
+                save(rod.picture(), DOCS / "images" / "convergence.png")
         for title, block in blocks.items():
             print(f"\n{title}\n{block}", flush=True)
 

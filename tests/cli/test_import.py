@@ -233,8 +233,11 @@ def test_a_table_of_anipose_to_a_recording(trial, tmp_path):
     _, _, command = run("info", tmp_path / "pose-3d.csv").partition("pose-3d.csv --unit mm")
     typed = command.partition(" -o ")[0].replace("FRAMES_A_SECOND", "1000").split()
     out = tmp_path / "t.nc"
-    run("import", tmp_path / "pose-3d.csv", "--unit", "mm", *typed, "-o", out)
+    run("import", tmp_path / "pose-3d.csv", "--unit", "mm", *typed, "--rat", "C5", "-o", out)
     assert np.median(errors(out, truth)) < 1.5e-4
+    whisker = Recording(load_recording(out)).whiskers[0]
+    published = vb.Whisker.straight(whisker.length, rat="C5")
+    assert whisker.base_radius == pytest.approx(published.base_radius, rel=1e-3)
 
 
 def test_the_frame_rate_is_asked_for_and_views_are_matched_by_name(trial, tmp_path):

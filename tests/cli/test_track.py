@@ -166,9 +166,10 @@ def test_several_trials_go_to_a_folder(videos, tmp_path):
     (tmp_path / "second_top.mkv").write_bytes((videos / "top.mkv").read_bytes())
     words = [videos / "top.mkv", videos / "front.mkv", tmp_path / "second_top.mkv"]
     words += [videos / "front.mkv", "--cameras", videos / "cameras.toml"]
-    done = run("track", *words, "-o", tmp_path)
+    folder = tmp_path / "new"
+    done = run("track", *words, "-o", folder)
     assert done.exit_code == 0, done.exception
-    one, two = (load_recording(tmp_path / name) for name in ("top.nc", "second_top.nc"))
+    one, two = (load_recording(folder / name) for name in ("top.nc", "second_top.nc"))
     np.testing.assert_array_equal(one["force"].values, two["force"].values)
     done = run("track", *words, "-o", tmp_path / "one.nc")
     assert "a folder is needed" in str(done.exception)
@@ -240,6 +241,9 @@ def test_what_is_known_besides_the_videos_is_used(videos, tmp_path):
         (("--rate", "0"), "--rate is 0"),
         (("--rate", "170"), "below half of 170 frames/s"),
         (("--base-radius", "-1"), "--base-radius is -1"),
+        (("--rat", "C2", "--base-radius", "0.1"), "--rat gives the radii"),
+        (("--rat", "Z9"), "Z9"),
+        (("--any-length",), "about a --whisker"),
         (("--base", "20,30", "--base", "20,192"), "outside of view 1, 192 × 192 pixels"),
     ],
 )

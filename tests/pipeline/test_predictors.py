@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 import vibrissa as vb
 from vibrissa.io import Session, save_nwb, save_predictors
 from vibrissa.pipeline import PREDICTORS, predictors
-from vibrissa.recording import coordinates, recorded, recording_tree
+from vibrissa.recording import ONE_VIEW, coordinates, recorded, recording_tree
 
 TIME = np.arange(200) / 1000.0
 
@@ -59,6 +59,15 @@ def test_columns_and_rates(trial):
     other = table.sel(whisker="C2")
     assert np.isnan(other["Fx_rate"].values[39:51]).all()
     assert np.isfinite(other["Fx_rate"].values[60:]).all()
+
+
+def test_one_view_shows_half_of_the_predictors(trial):
+    """What one camera does not show is rounding noise, and a model would scale it up."""
+    filmed = trial.copy()
+    filmed.attrs["remarks"] = f"{ONE_VIEW}\nsomething else"
+    names = predictors(filmed).attrs["predictors"].split()
+    columns = ("Fx", "Fy", "Mz", "base_azimuth")
+    assert names == [*columns, *(f"{name}_rate" for name in columns)]
 
 
 def test_a_recording_without_forces_says_what_to_run(trial):

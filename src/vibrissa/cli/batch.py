@@ -117,7 +117,8 @@ def _cells(path: Path, found: vb.pipeline.TrialSummary | None, fault: str) -> li
     names = " ".join(found.whiskers)
     numbers = (found.duration, found.frames, found.in_contact, found.contacts)
     sizes = (found.largest_force, found.largest_moment, found.estimated, found.distance)
-    return [path.name, names, *numbers, *sizes, found.fitted, fault]
+    short = (f"{n:.6g}" if isinstance(n, float) else n for n in (*numbers, *sizes))
+    return [path.name, names, *short, found.fitted, fault]
 
 
 def _shown(path: Path, found: vb.pipeline.TrialSummary | None, fault: str) -> list[str]:

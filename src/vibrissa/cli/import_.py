@@ -9,7 +9,7 @@ import numpy as np
 import typer
 
 import vibrissa as vb
-from vibrissa.cli.inputs import WhiskerOptions, cameras_from, objects_from
+from vibrissa.cli.inputs import TrackedOptions, cameras_from, objects_from
 from vibrissa.cli.options import check_new, with_options
 from vibrissa.cli.terminal import progress_bars, remark
 from vibrissa.cli.track import print_tracked
@@ -33,7 +33,7 @@ def import_tracks(
         ),
     ],
     target: Path,
-    own: WhiskerOptions,
+    own: TrackedOptions,
     cameras: Path | None = None,
     pixel_size: float | None = None,
     rate: float | None = None,

@@ -386,7 +386,7 @@ def _verdicts(path: Path) -> Iterator[tuple[str, str]]:
     yield "whisker", str(found.attrs["whisker"])
     yield "unique", "; ".join(f"{name} ({where})" for name, where in held.items()) or "none"
     yield "evidence", f"{proved} proved, {len(held) - proved} with no counterexample found"
-    yield "not unique", f"{len(regions) - len(held)} of {len(regions)} triplets"
+    yield "not unique", f"{len(regions) - len(held)} of {len(regions)} triplets in any region"
     yield "left out", f"contacts within {np.degrees(found.attrs['cone']):.3g}° of rest"
 
 

@@ -50,14 +50,6 @@ class WhiskerOptions:
         whisker = _whisker_in(path)
         return whisker if self.rat is None else whisker.with_properties(rat=self.rat)
 
-    def tracked(self, base_radius: float | None) -> dict[str, Any]:
-        """Options of tracking: the whisker, if it is given, with a radius that is stated."""
-        properties: dict[str, Any] = {}
-        if base_radius is not None:
-            properties["base_radius"] = metres_of(base_radius, "--base-radius")
-        whisker = None if self.whisker is None else self.read().with_properties(**properties)
-        return {"properties": properties, "whisker": whisker}
-
     def in_recording(self, recording: xr.DataTree) -> list[vb.Whisker]:
         """Find the whisker of each that a recording has signals of."""
         count = recording.sizes["whisker"]
@@ -69,6 +61,29 @@ class WhiskerOptions:
             return vb.recording.Recording(recording).whiskers
         except ValueError as fault:
             raise ValueError(f"{fault}; give its centreline with --whisker") from None
+
+
+@dataclass(frozen=True)
+class TrackedOptions(WhiskerOptions):
+    """A whisker that is tracked; its shape is that of the frames unless a file is given."""
+
+    def __post_init__(self) -> None:
+        """Refuse what needs a file."""
+        if self.any_length and self.whisker is None:
+            raise ValueError("--any-length is about a --whisker, and none is given")
+
+    def tracked(self, base_radius: float | None) -> dict[str, Any]:
+        """Options of tracking: the whisker, if it is given, with radii that are stated."""
+        properties: dict[str, Any] = {}
+        if base_radius is not None:
+            properties["base_radius"] = metres_of(base_radius, "--base-radius")
+        if self.whisker is not None:
+            return {"whisker": self.read().with_properties(**properties)}
+        if self.rat is not None:
+            refuse({"--base-radius": base_radius}, "--rat gives the radii")
+            vb.Whisker.straight(0.03, rat=self.rat)  # a wrong name is refused before the work
+            properties["rat"] = self.rat
+        return {"properties": properties}
 
 
 @dataclass(frozen=True)

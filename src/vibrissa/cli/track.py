@@ -15,7 +15,7 @@ import typer
 
 import vibrissa as vb
 from vibrissa.cli.inputs import (
-    WhiskerOptions,
+    TrackedOptions,
     cameras_from,
     objects_from,
     print_notes,
@@ -278,7 +278,7 @@ def track(
     filmed: FilmOptions,
     traced: TraceStatements,
     known: KnownOptions,
-    own: WhiskerOptions,
+    own: TrackedOptions,
     base_radius: float | None = None,
     fur: float = 0.0,
     cutoff: float | None = None,
@@ -508,7 +508,7 @@ def _trials(
     files = [recording]
     if len(trials) > 1:
         refuse(alone, "it is for one trial; track that by itself")
-        if not recording.is_dir():
+        if recording.suffix and not recording.is_dir():
             raise ValueError(
                 f"--output is {recording}; {len(videos)} videos, {count} a trial, are "
                 f"{len(trials)} trials, for which a folder is needed"
@@ -516,6 +516,7 @@ def _trials(
         files = [recording / f"{trial[0].stem}.nc" for trial in trials]
         if len(set(files)) < len(files):
             raise ValueError("two trials would have one file: their first videos share a name")
+        recording.mkdir(parents=True, exist_ok=True)
     for file, trial in zip(files, trials, strict=True):
         vb.io.check_writable(file, vb.io.NETCDF)
         # One video cannot show a whisker from two sides.

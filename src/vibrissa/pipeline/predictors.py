@@ -14,7 +14,7 @@ import xarray as xr
 from vibrissa.contacts import friction_assumed
 from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
-from vibrissa.recording import Recording
+from vibrissa.recording import ONE_VIEW, Recording
 from vibrissa.signals import base_signals
 from vibrissa.status import flag_attributes
 from vibrissa.whisker import angles_of
@@ -29,6 +29,9 @@ PREDICTORS = (
     *_ANGLES[:2],
     *(name + _RATE for name in (*_COMPONENTS, *_ANGLES[:2])),
 )
+# Columns that one view does not measure: they are zero but for rounding.
+_UNSEEN = ("Fz", "Mx", "My", "base_elevation")
+
 # Groups that hold force, moment and pose, the first one that has them counts.
 _GROUPS = ("signals", "", "truth")
 
@@ -49,7 +52,8 @@ def predictors(recording: xr.DataTree) -> xr.Dataset:
         ``description``: the six components of force and moment, the signals, the angles of the
         base and its position, the rates of change of components and angles, the contact point in
         the laboratory and its arc length, ``in_contact``, ``status`` and ``confidence``. The
-        attribute ``predictors`` names the 16 of models of spikes. Missing is NaN.
+        attribute ``predictors`` names the 16 of models of spikes, of a trial that was filmed by one
+        camera the 8 that it shows. Missing is NaN.
 
     Raises
     ------
@@ -100,7 +104,8 @@ def predictors(recording: xr.DataTree) -> xr.Dataset:
             if name in data and not np.isnan(friction):
                 data[name].attrs["description"] += f" Estimated, {friction_assumed(friction)}."
     coordinates = {"time": ("time", time, attributes("time")), "whisker": record.names}
-    there = [name for name in PREDICTORS if name in data]
+    unseen = _UNSEEN if ONE_VIEW in recording.attrs.get("remarks", "") else ()
+    there = [n for n in PREDICTORS if n in data and n.removesuffix(_RATE) not in unseen]
     return xr.Dataset(data, coordinates, {"predictors": " ".join(there)})
 
 

@@ -14,6 +14,7 @@ in each run.
 from __future__ import annotations
 
 import hashlib
+import io
 import pickle
 import sys
 from functools import cache
@@ -40,31 +41,31 @@ def _sources(package: Path) -> str:
     return digest.hexdigest()
 
 
-class _CheckedFiles(IndexDataCacheFile):
-    """An index and its data, of which damaged ones count as none."""
+class _Files(IndexDataCacheFile):
+    """A file for each signature, named by its key, which it holds; damaged ones count as none.
 
-    def _dump(self, obj: object) -> bytes:
-        content: bytes = super()._dump(obj)  # type: ignore[no-untyped-call]
+    Numba numbers files, and writes an index of them first. Where two processes save at once, or one
+    is stopped in between, the index names code of another signature, which is run.
+    """
+
+    def save(self, key: object, data: object) -> None:
+        """Keep data with their key."""
+        self._save_data(self._name(key), (key, data))  # type: ignore[no-untyped-call]
+
+    def load(self, key: object) -> Any:
+        """Load what was kept with a key; None if that is not what the file holds."""
+        content = Path(self._data_path(self._name(key))).read_bytes()  # type: ignore[no-untyped-call]
+        digest, kept = content[:_DIGEST], io.BytesIO(content[_DIGEST:])
+        whole = hashlib.sha256(kept.getbuffer()).digest() == digest
+        return pickle.load(kept) if whole and pickle.load(kept) == key else None
+
+    def _name(self, key: object) -> str:
+        number = int.from_bytes(hashlib.sha256(repr(key).encode()).digest()[:8])
+        return str(self._data_name(number))  # type: ignore[no-untyped-call]
+
+    def _dump(self, obj: tuple[object, object]) -> bytes:
+        content = b"".join(map(super()._dump, obj))
         return hashlib.sha256(content).digest() + content
-
-    def _load_index(self) -> dict[Any, str]:
-        try:
-            with open(self._index_path, "rb") as file:
-                version = pickle.load(file)
-                _, overloads = _whole(file.read())
-        except Exception:  # of what is damaged, pickle raises whatever it stumbles over
-            return {}
-        return overloads if version == self._version else {}
-
-    def _load_data(self, name: str) -> Any:
-        return _whole(Path(self._data_path(name)).read_bytes())  # type: ignore[no-untyped-call]
-
-
-def _whole(content: bytes) -> Any:
-    """Unpickle what has its digest in front."""
-    if hashlib.sha256(content[_DIGEST:]).digest() != content[:_DIGEST]:
-        raise ValueError("this is not what was written")
-    return pickle.loads(content[_DIGEST:])
 
 
 class PackageCache(FunctionCache):
@@ -74,7 +75,7 @@ class PackageCache(FunctionCache):
 
     def __init__(self, function: object) -> None:
         super().__init__(function)  # type: ignore[no-untyped-call]
-        self._cache_file.__class__ = _CheckedFiles
+        self._cache_file.__class__ = _Files
 
     def _index_key(self, sig: object, codegen: object) -> tuple[object, ...]:
         package = Path(self._py_func.__code__.co_filename).parent

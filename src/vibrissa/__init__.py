@@ -7,10 +7,10 @@ only when needed.
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING
 
 from vibrissa._version import __version__
+from vibrissa.deferred import names_from
 
 if TYPE_CHECKING:
     from vibrissa import (
@@ -149,61 +149,22 @@ __all__ = [
 ]
 
 _HOMES = {
-    "contacts": (
-        "Contact",
-        "ContactFilter",
-        "ContactMap",
-        "Contacts",
-        "Estimator",
-        "Gravity",
-        "Prior",
-        "estimate_around",
-        "estimate_from_wrench",
-        "second_contact",
-    ),
-    "display": ("show",),
-    "identifiability": (
-        "best_triplet",
-        "critical_cones",
-        "sensitivity",
-        "uniqueness",
-    ),
-    "io": (
-        "load_array",
-        "load_recording",
-        "load_signals",
-        "load_tracks",
-        "load_whisker",
-    ),
-    "paper": ("sensitivity_findings",),
-    "rod": (
-        "Deflection",
-        "PegContact",
-        "PointContact",
-        "PointForce",
-        "Resting",
-        "deflect",
-        "deflect_around",
-        "deflect_around",
-        "resting",
-    ),
-    "report": ("in_space",),
-    "signals": ("base_signals",),
-    "sketch": ("progress",),
-    "status": ("Status",),
-    "whisker": ("Whisker", "WhiskerArray", "whisker_array"),
+    "contacts": "Contact ContactFilter ContactMap Contacts Estimator Gravity Prior estimate_around "
+    "estimate_from_wrench second_contact",
+    "display": "show",
+    "identifiability": "best_triplet critical_cones sensitivity uniqueness",
+    "io": "load_array load_recording load_signals load_tracks load_whisker",
+    "paper": "sensitivity_findings",
+    "report": "in_space",
+    "rod": "Deflection PegContact PointContact PointForce Resting deflect deflect_around resting",
+    "signals": "base_signals",
+    "sketch": "progress",
+    "status": "Status",
+    "whisker": "Whisker WhiskerArray whisker_array",
 }
-_HOME = {name: home for home, names in _HOMES.items() for name in names}
+"""Names by the package or module that they are imported from."""
 
-
-def __getattr__(name: str) -> object:
-    if name not in __all__:
-        raise AttributeError(f"module 'vibrissa' has no attribute {name!r}")
-    if name not in _HOME:
-        return importlib.import_module(f"vibrissa.{name}")
-    value = getattr(importlib.import_module(f"vibrissa.{_HOME[name]}"), name)
-    globals()[name] = value
-    return value
+__getattr__ = names_from(__name__, _HOMES, __all__)
 
 
 def __dir__() -> list[str]:

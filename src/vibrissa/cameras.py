@@ -88,7 +88,6 @@ class Camera:
     name: str = "camera"
 
     def __post_init__(self) -> None:
-        """Check every part."""
         faults = []
         for name, shape in (("matrix", (3, 3)), ("rotation", (3, 3)), ("translation", (3,))):
             values = np.array(getattr(self, name), dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Libraries that take long to import, imported where they are first used.
+"""Libraries and our own names that take long to import, imported where they are first used.
 
 xarray brings pandas, and both take longer than finding a contact: a stream or a single solution
 does without them.
@@ -6,6 +6,8 @@ does without them.
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable, Collection, Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING
 
@@ -35,9 +37,29 @@ else:
     sparse_linalg = _Deferred("scipy.sparse.linalg")
     transform = _Deferred("scipy.spatial.transform")
 
+
+def names_from(
+    package: str, homes: Mapping[str, str], modules: Collection[str] = ()
+) -> Callable[[str], object]:
+    """Make the ``__getattr__`` of a package whose names come from its modules, and are modules."""
+    home = {name: module for module, names in homes.items() for name in names.split()}
+
+    def attribute(name: str) -> object:
+        if name in home:
+            value = getattr(import_module(f"{package}.{home[name]}"), name)
+            setattr(sys.modules[package], name, value)
+            return value
+        if name in modules:
+            return import_module(f"{package}.{name}")
+        raise AttributeError(f"module {package!r} has no attribute {name!r}")
+
+    return attribute
+
+
 __all__ = [
     "interpolate",
     "linalg",
+    "names_from",
     "ndimage",
     "optimize",
     "signal",

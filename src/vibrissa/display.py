@@ -30,7 +30,6 @@ class Shown:
         return self.html
 
     def __repr__(self) -> str:
-        """Show the text."""
         return self.text
 
 

@@ -54,8 +54,7 @@ class Quantity:
     description: str
 
 
-# Pairs of one size, written in two ways.
-_SAME = {("pixel", "px"), ("1", "")}
+_SAME = {("pixel", "px"), ("1", "")}  # pairs of one size, written in two ways
 # What a value in a unit of storage is multiplied with to be in the unit that it is shown in.
 _FACTORS = {
     ("m", "mm"): 1e3,

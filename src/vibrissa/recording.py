@@ -240,7 +240,6 @@ class Group:
     name: str = ""
 
     def __contains__(self, name: object) -> bool:
-        """Whether there is a variable of that name."""
         return name in self.data
 
     def __getitem__(self, name: str) -> NDArray[Any]:
@@ -361,7 +360,6 @@ class Recording:
         return group
 
     def __contains__(self, name: object) -> bool:
-        """Whether there is a group of that name."""
         return name in self.tree.children
 
     @property

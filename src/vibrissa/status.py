@@ -26,120 +26,89 @@ class Status(enum.IntEnum):
     advice : str
         Sentence on what to do; empty where there is nothing to do.
     ok : bool
-        Whether the row can be used as it stands.
+        Whether the row can be used as it stands, so that there is nothing to advise.
     """
 
     explanation: str
     advice: str
     ok: bool
 
-    OK = (
-        0,
-        True,
-        "The object touches the side of the whisker.",
-        "",
-    )
+    OK = 0, "The object touches the side of the whisker."
     TIP_CONTACT = (
         1,
-        True,
         "The object touches the very tip of the whisker, and the force is normal to the object.",
-        "",
     )
-    NO_CONTACT = (
-        2,
-        True,
-        "The object does not reach the whisker, so force and moment are zero.",
-        "",
-    )
+    NO_CONTACT = 2, "The object does not reach the whisker, so force and moment are zero."
     BEYOND_FOLD = (
         10,
-        False,
         "The whisker has slipped off: the load lies beyond the fold that ends the stable branch.",
         "Move the object back toward the resting whisker; without friction a whisker of this "
         "shape and taper holds no contact there.",
     )
     BEYOND_TIP = (
         11,
-        False,
         "The load lies beyond the tip: the whisker is too short for this contact.",
         "Move the object toward the base, or check the whisker's length and the unit of the "
         "points.",
     )
     TOO_PROXIMAL = (
         12,
-        False,
         "The contact would lie closer to the base than the smallest arc length that is considered.",
         "Lower the smallest arc length (0.3 of the whisker's length by default), or move the "
         "object toward the tip.",
     )
     NOT_CONVERGED = (
         13,
-        False,
         "The solver did not converge; nothing is known about this load.",
         "This is a defect of vibrissa: please report it with the whisker and the load.",
     )
     MISSING = (
         14,
-        False,
         "The input of this row is missing or not finite.",
         "Check the row for NaN, for example frames in which the whisker was not tracked.",
     )
     TOO_STRONG = (
         15,
-        False,
         "The force is so strong that it winds the whisker up in waves too short to compute.",
         "Check the force's unit (N), and the whisker's radius: forces scale with its fourth power.",
     )
-    UNIQUE = (
-        20,
-        True,
-        "Exactly one contact of this whisker explains the signals.",
-        "",
-    )
+    UNIQUE = 20, "Exactly one contact of this whisker explains the signals."
     AMBIGUOUS = (
         21,
-        False,
         "Several contacts of this whisker explain the signals, or are probable with their noise.",
         "The candidates are listed, with noise by their probability: add a signal, or choose by "
         "continuity with the frames around.",
     )
     NOT_FRICTIONLESS = (
         22,
-        False,
         "No frictionless contact on the side of this whisker explains the signals.",
         "Check the whisker's shape, taper and stiffness and the sensor's offset; with friction, "
         "estimate from all six signals.",
     )
     OUTSIDE_MAP = (
         23,
-        False,
         "The signals lie outside the map.",
         "Simulate the map over a wider domain, or check the unit and frame of the signals.",
     )
     DEGENERATE = (
         24,
-        False,
         "The signals do not determine a contact: force and moment are too small, or on this "
         "whisker contacts can move without changing these signals.",
         "Leave the row out, or choose other signals.",
     )
     NOT_ONE_CONTACT = (
         25,
-        False,
         "No single contact of this whisker explains force and moment together.",
         "Check the whisker's shape, taper and stiffness and the sensor's offset and noise; perhaps "
         "more than one object touches.",
     )
     APPROXIMATE = (
         26,
-        True,
         "A look-up table or network gave this contact; whether others explain the signals too it "
         "cannot see.",
-        "",
     )
     UNDERDETERMINED = (
         27,
-        False,
         "Fewer than three signals: a whole curve or surface of contacts explains them.",
         "The candidates are samples of it, and the covariance spans it: add a signal, or filter "
         "over time while the base moves.",
@@ -147,28 +116,21 @@ class Status(enum.IntEnum):
 
     NOT_FELT = (
         28,
-        True,
         "No contact is measured: force and moment are within their noise, so that nothing touches "
         "the whisker, or too lightly to be distinguished from nothing.",
-        "",
     )
     OUTSIDE_PRIOR = (
         29,
-        False,
         "Contacts of this whisker explain the signals, but none of those that are possible "
         "according to the prior.",
         "Widen the prior's region or limits of force, or check the sensor's axes and offset.",
     )
 
-    def __new__(
-        cls, code: int, ok: bool = False, explanation: str = "", advice: str = ""
-    ) -> Status:
+    def __new__(cls, code: int, explanation: str = "", advice: str = "") -> Status:
         """Make a member; the defaults let type checkers see that ``Status(code)`` looks one up."""
         member = int.__new__(cls, code)
         member._value_ = code
-        member.ok = ok
-        member.explanation = explanation
-        member.advice = advice
+        member.explanation, member.advice, member.ok = explanation, advice, not advice
         return member
 
     def __str__(self) -> str:

@@ -48,7 +48,6 @@ class GravityOptions:
     density_sigma: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse statements about no weight."""
         if self.gravity is None:
             about = {
                 "--tare-gravity": self.tare_gravity,
@@ -111,7 +110,6 @@ class EstimateOptions:
     own: WhiskerOptions
 
     def __post_init__(self) -> None:
-        """Refuse what does not go together."""
         names = self.names or vb.pipeline.TRIPLET
         if self.whole and self.method != "exact":
             raise ValueError(f"--using wrench has no --method {self.method}")

@@ -28,7 +28,6 @@ class WhiskerOptions:
     any_length: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse statements about no whisker."""
         self.check(self.whisker is not None)
 
     def check(self, given: bool) -> None:
@@ -68,7 +67,6 @@ class TrackedOptions(WhiskerOptions):
     """A whisker that is tracked; its shape is that of the frames unless a file is given."""
 
     def __post_init__(self) -> None:
-        """Refuse what needs a file."""
         if self.any_length and self.whisker is None:
             raise ValueError("--any-length is about a --whisker, and none is given")
 
@@ -95,7 +93,6 @@ class NoiseOptions:
     covariance: Path | None = None
 
     def __post_init__(self) -> None:
-        """Refuse two statements about the same."""
         if self.covariance is not None:
             components = {name: v for name, v in self.stated.items() if name != "--covariance"}
             refuse(components, "--covariance holds the noise")

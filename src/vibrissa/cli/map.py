@@ -25,7 +25,6 @@ class MadeOptions(WhiskerOptions):
     base_stiffness: str | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what does not go together."""
         self.check(self.whisker is not None or self.length is not None)
         if self.length is not None and self.whisker is not None:
             raise ValueError("give either --whisker or the --length of a straight one")

@@ -41,7 +41,6 @@ class ShapeOptions:
     lean: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what does not go together."""
         self.keywords()
         if self.axis is not None and self.shape != "cylinder":
             raise ValueError(f"--axis is for a cylinder; --shape is {self.shape}")

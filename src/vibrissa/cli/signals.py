@@ -37,7 +37,6 @@ class SourceOptions:
     fit_dynamics: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse statements about no inertia."""
         about = {"--density": self.density, "--damping": self.damping}
         if self.fit_dynamics:
             refuse(about, "--fit-dynamics finds them")

@@ -57,7 +57,6 @@ class LineOptions:
     count: int | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what does not go together."""
         if self.source is not None and self.udp is not None:
             raise ValueError("give either a source or --udp")
         if self.source is not None:
@@ -113,7 +112,6 @@ class MeasurementOptions:
     tare: int | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what does not go together."""
         if self.map:
             if self.own.whisker is not None:
                 raise ValueError("give either --map or --whisker: a map already has its whisker")
@@ -179,7 +177,6 @@ class FollowOptions:
     mount: list[str] | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what does not go together."""
         if not self.filter:
             refuse({"--speed": self.speed}, "it is of the filter: add --filter")
 

@@ -52,7 +52,6 @@ class FilmOptions:
     offset: str = "0"
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
         if self.offset != "auto" and not self.offset.lstrip("+-").isdigit():
             raise ValueError(f"--offset is {self.offset!r}; a number of frames or auto is needed")
         if not 0.0 < self.frames_per_second < math.inf:
@@ -119,7 +118,6 @@ class TraceStatements:
     region: list[str] | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
         for name, pixels in (("base-width", self.base_width), ("jump", self.jump)):
             if not 0.0 < pixels < math.inf:
                 raise ValueError(f"--{name} is {pixels:g}; pixels, more than 0, are needed")

@@ -338,7 +338,6 @@ class ContactMap:
         return _load(Path(path), grid)
 
     def __repr__(self) -> str:
-        """Say whose map it is and what it holds."""
         nodes = " × ".join(str(n) for n in self.chart.values.shape[:3])
         grid = "" if self.grid is None else f", paper's grid of {self.grid.status.size} points"
         return f"<ContactMap of {self.whisker!r}: {nodes} nodes{grid}>"
@@ -364,7 +363,6 @@ class ContactMap:
         )
 
     def __str__(self) -> str:
-        """Tell the range of each signal as well."""
         return lines("ContactMap", self._rows())
 
     def _rows(self) -> list[tuple[str, str]]:

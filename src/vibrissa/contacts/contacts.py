@@ -306,7 +306,6 @@ class Contacts(_Located):
         return _picture(self.point, every)
 
     def __repr__(self) -> str:
-        """Show how many there are and their statuses."""
         return f"<{self._title()}: {counted(self.status)}>"
 
     def _repr_html_(self) -> str:
@@ -314,7 +313,6 @@ class Contacts(_Located):
         return card(self._title(), self._rows(), self.plot())
 
     def __str__(self) -> str:
-        """Show the numbers as well."""
         return lines(self._title(), self._rows())
 
     def _title(self) -> str:
@@ -518,7 +516,6 @@ class Contact(_Located):
         )
 
     def __repr__(self) -> str:
-        """Show the status and the contact point."""
         where = ", ".join(f"{1e3 * value:.4g}" for value in self.point.tolist())
         return f"<Contact {self.status.name} at ({where}) mm, {self.n_candidates} candidates>"
 
@@ -527,7 +524,6 @@ class Contact(_Located):
         return self._as_contacts()._repr_html_()
 
     def __str__(self) -> str:
-        """Show the numbers as well."""
         return str(self._as_contacts())
 
 

@@ -89,7 +89,6 @@ class Gravity:
     density_sigma: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the standard deviations."""
         for name in ("direction_sigma", "density_sigma"):
             sigma = getattr(self, name)
             if not 0.0 <= sigma < np.inf:

@@ -65,7 +65,6 @@ class Prior:
     tip: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check it."""
         if not 0.0 <= self.least_force < self.greatest_force:
             raise ValueError(
                 "a contact force has 0 ≤ least < greatest, N; got "

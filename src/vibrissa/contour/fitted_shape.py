@@ -353,7 +353,6 @@ class FittedShape(ABC):
         """Derivatives (..., k) of the distance with respect to the parameters."""
 
     def __repr__(self) -> str:
-        """Show the parameters in mm, with standard deviations."""
         shown = []
         for name, quantity in self.fields.items():
             value = np.atleast_1d(getattr(self, name))

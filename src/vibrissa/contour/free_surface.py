@@ -171,7 +171,6 @@ class FreeFit(FittedShape):
         return self.base.parameters
 
     def __repr__(self) -> str:
-        """Show it in mm."""
         return (
             f"<free surface over {len(self.support.value)} positions, "
             f"{self.amplitude * 1e3:.3f} mm in {self.length * 1e3:.3f} mm about {self.base!r}>"

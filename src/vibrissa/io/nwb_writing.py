@@ -77,7 +77,6 @@ class Session:
     about: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check that the time has a zone."""
         if self.start.tzinfo is None:
             raise ValueError(f"start is {self.start}, without a time zone; NWB needs one")
 

@@ -44,15 +44,12 @@ _TOPICS = {
     _WRENCH: "/contact_force",
     _CLOUD: "/contact_candidates",
 }
-# Of sensor_msgs/PointField: 32-bit floats.
-_FLOAT32 = 7
+_FLOAT32 = 7  # of sensor_msgs/PointField: 32-bit floats
 # Variance of an angle of which nothing is known.
 _ANY_ANGLE = np.pi**2 / 3.0
 _SECOND = 1_000_000_000
-# Seconds of a ROS time stamp are 32-bit numbers.
-_LARGEST_SECOND = 2**31 - 1
-# Seconds between two moments at which a bag is whole.
-_KEPT_EVERY = 0.5
+_LARGEST_SECOND = 2**31 - 1  # seconds of a ROS time stamp are 32-bit numbers
+_KEPT_EVERY = 0.5  # seconds between two moments at which a bag is whole
 
 
 def is_bag(path: str | PathLike[str]) -> bool:
@@ -240,7 +237,6 @@ class ContactBag:
         self._fault: OSError | None = None
 
     def __enter__(self) -> ContactBag:
-        """Open the bag."""
         if self._path.suffix == _MCAP:
             self._part = self._path.with_name(f"{self._path.stem}.part")
             self._mcap = _library().mcap(self._part)
@@ -279,7 +275,6 @@ class ContactBag:
         value: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Close it."""
         if self._mcap is not None:
             self._mcap.close()
             (written,) = self._part.glob(f"*{_MCAP}")

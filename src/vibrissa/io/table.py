@@ -291,8 +291,7 @@ def signal_columns(
     return found, strange
 
 
-# So much of a value that is wrong is quoted.
-_QUOTED = 60
+_QUOTED = 60  # so much of a value that is wrong is quoted
 
 _THREE_NUMBERS = "three numbers are needed"
 

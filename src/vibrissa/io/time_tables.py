@@ -57,10 +57,8 @@ COLUMNS = ("time", "Fx", "Fy", "Fz", "Mx", "My", "Mz")
 # Note on a table without time.
 NUMBERED = "there is no time, so the rows are numbered from 0 in its column"
 _KINDS = {"t": "time", "F": "force", "M": "moment"}
-# What a wire of steel as thick as a finger holds.
-_LARGEST = {"F": (1e4, "N"), "M": (1e3, "N·m")}
-# Seconds since any epoch are fewer.
-_LATEST = 1e11
+_LARGEST = {"F": (1e4, "N"), "M": (1e3, "N·m")}  # what a wire of steel as thick as a finger holds
+_LATEST = 1e11  # seconds since any epoch are fewer
 # Time between rows, s, of several from which it is likelier in ms.
 _SLOW, _SEVERAL = 1.0, 10
 _LEVER_ARMS = (1e-4, 1.0)

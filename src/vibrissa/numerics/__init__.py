@@ -5,9 +5,9 @@ What needs Numba or xarray is imported when it is first used, so that array type
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING
 
+from vibrissa.deferred import names_from
 from vibrissa.numerics.arrays import (
     AnyArray,
     Array,
@@ -55,34 +55,11 @@ __all__ = [
     "weighted_quantile",
 ]
 
-_HOMES = {
-    "algebra": (
-        "cholesky",
-        "mahalanobis",
-        "norm3",
-        "quick_exp",
-        "solve",
-        "solve3",
-        "solve_root",
-        "wrapped",
-    ),
-    "compiled": (
-        "copy",
-        "inlined",
-        "inlined_rigorous",
-        "kernel",
-        "rigorous",
-        "specialised",
-        "vectorised",
-    ),
-    "device": ("Translation", "check_device"),
-}
-_HOME = {name: home for home, names in _HOMES.items() for name in names}
-
-
-def __getattr__(name: str) -> object:
-    if name not in _HOME:
-        raise AttributeError(f"module 'vibrissa.numerics' has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"vibrissa.numerics.{_HOME[name]}"), name)
-    globals()[name] = value
-    return value
+__getattr__ = names_from(
+    __name__,
+    {
+        "algebra": "cholesky mahalanobis norm3 quick_exp solve solve3 solve_root wrapped",
+        "compiled": "copy inlined inlined_rigorous kernel rigorous specialised vectorised",
+        "device": "Translation check_device",
+    },
+)

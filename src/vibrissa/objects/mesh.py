@@ -27,8 +27,7 @@ Ints = NDArray[np.int64]
 NODES = 1_200_000  # nodes of the grid where no spacing is given
 _MOST = 30_000_000
 _BAND = 3
-# Cells around the body: room for a whisker's radius, and for the spline to settle.
-_PADDING = 8
+_PADDING = 8  # cells around the body: room for a whisker's radius, and for the spline to settle
 # B-spline weights of four neighbours at the fraction t between the middle two, as polynomials in t:
 # rows are powers of t, columns neighbours.
 _SPLINE = (
@@ -207,7 +206,6 @@ class Mesh(Surface):
         return self.resolution
 
     def __repr__(self) -> str:
-        """Show how large it is, in mm."""
         size = np.ptp(self.vertices, axis=0)
         soft = "" if np.isinf(self.stiffness) else f", stiffness {self.stiffness:.3g} N/m"
         return (

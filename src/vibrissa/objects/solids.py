@@ -129,7 +129,6 @@ class Peg(Surface):
     stiffness: float = np.inf
 
     def __post_init__(self) -> None:
-        """Check and make the arrays read-only."""
         _check(self, _Faults("peg"))
 
     def _distance(self, points: Array) -> Array:
@@ -169,7 +168,6 @@ class Peg(Surface):
         return origin, np.einsum("...ji,j->...i", rotation, self.axis)
 
     def __repr__(self) -> str:
-        """Show it in mm."""
         return (
             f"Peg(origin={_mm(self.origin)}, axis={_direction(self.axis)}, diameter "
             f"{self.radius * 2e3:.3f} mm{_soft(self.stiffness)})"
@@ -205,7 +203,6 @@ class Sphere(Surface):
     stiffness: float = np.inf
 
     def __post_init__(self) -> None:
-        """Check and make the arrays read-only."""
         _check(self, _Faults("sphere"))
 
     def _distance(self, points: Array) -> Array:
@@ -219,7 +216,6 @@ class Sphere(Surface):
         return size - self.radius, normal, (np.eye(3) - np.outer(normal, normal)) / size
 
     def __repr__(self) -> str:
-        """Show it in mm."""
         return (
             f"Sphere(origin={_mm(self.origin)}, diameter {self.radius * 2e3:.3f} "
             f"mm{_soft(self.stiffness)})"
@@ -255,7 +251,6 @@ class Plane(Surface):
     stiffness: float = np.inf
 
     def __post_init__(self) -> None:
-        """Check and make the arrays read-only."""
         _check(self, _Faults("plane"))
 
     def _distance(self, points: Array) -> Array:
@@ -266,7 +261,6 @@ class Plane(Surface):
         return float((point - self.origin) @ self.normal), self.normal, np.zeros((3, 3))
 
     def __repr__(self) -> str:
-        """Show it in mm."""
         return (
             f"Plane(origin={_mm(self.origin)}, normal={_direction(self.normal)}"
             f"{_soft(self.stiffness)})"
@@ -311,7 +305,6 @@ class Box(Surface):
     stiffness: float = np.inf
 
     def __post_init__(self) -> None:
-        """Check and make the arrays read-only."""
         faults = _Faults("box")
         rotation = np.array(self.rotation, dtype=np.float64)
         turned = rotation.shape == (3, 3) and bool(np.isfinite(rotation).all())
@@ -353,7 +346,6 @@ class Box(Surface):
         return size - self.edge_radius, self.rotation @ normal, turned
 
     def __repr__(self) -> str:
-        """Show it in mm."""
         return (
             f"Box(origin={_mm(self.origin)}, size={_mm(self.size)}, edge radius "
             f"{self.edge_radius * 1e3:.3f} mm{_soft(self.stiffness)})"

@@ -41,16 +41,11 @@ Mesh = tuple[Array, IntArray, IntArray, Array, Array, IntArray]
 #: Where each vertex (n,) stands among a query's neighbours or -1; the neighbours; their weights.
 Found = tuple[IntArray, IntArray, Array]
 
-# A tetrahedron is flat below this share of its longest edge cubed.
-_FLAT = 1e-12
-# Points nearer than this, in coordinates with ranges of about one, are one.
-_SAME = 1e-13
-# Volumes below this share of the longest edge cubed have no sure sign.
-_ROUNDOFF = 1e-15
-# Four points are on a circle to this share of its radius.
-_ON_CIRCLE = 1e-6
-# To this share of the neighbours' distance the weights must reproduce the query.
-_REPRODUCED = 1e-9
+_FLAT = 1e-12  # a tetrahedron is flat below this share of its longest edge cubed
+_SAME = 1e-13  # points nearer than this, in coordinates with ranges of about one, are one
+_ROUNDOFF = 1e-15  # volumes below this share of the longest edge cubed have no sure sign
+_ON_CIRCLE = 1e-6  # four points are on a circle to this share of its radius
+_REPRODUCED = 1e-9  # to this share of the neighbours' distance the weights must reproduce the query
 
 
 @inlined

@@ -308,7 +308,6 @@ class Stage:
     folder: Path = Path()
 
     def __post_init__(self) -> None:
-        """Check the keys."""
         table = parsed_toml(self.text)
         check_keys(table, _STAGE_KEYS, "the description of the stage")
         for name, keys in (("touches", _TOUCHES), ("whisker", _WHISKER), ("sweep", _SWEEP)):

@@ -124,7 +124,6 @@ class SuspendedWhisker:
     drift: Any = 0.0
 
     def __post_init__(self) -> None:
-        """Check, and make arrays."""
         k = len(self.channels)
         if np.size(self.drift) < 2:
             object.__setattr__(self, "drift", np.full(k, np.sum(self.drift)))

@@ -90,7 +90,6 @@ class Dynamics:
     contact_stiffness: float = 200.0
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         numbers = {
             "density": min(self.density),
             "segments": self.segments - 3,

@@ -111,7 +111,6 @@ class ImageConditions:
     side_light: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check every number."""
         kinds: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
             (
                 ("unevenness", "contrast", "side_light"),

@@ -93,7 +93,6 @@ class Motion:
     head_position: Array | None = None
 
     def __post_init__(self) -> None:
-        """Check every array."""
         n = np.size(self.time)
         faults = []
         shapes = {"base_position": (n, 3), "head_position": (n, 3), "head_rotation": (n, 3, 3)}

@@ -18,25 +18,19 @@ from vibrissa.sensors import GRAVITY
 from vibrissa.signals import SIGNALS, signals_of
 from vibrissa.streaming.lines import FRAME, LineKind, Lines, Poses, Sample
 
-# Time that falls by more than this comes from a sender that has begun anew, s.
-_ANEW = 1.0
-# Samples farther apart than this seem to have times in a smaller unit, s.
-_SLOW = 100.0
+_ANEW = 1.0  # time that falls by more than this comes from a sender that has begun anew, s
+_SLOW = 100.0  # samples farther apart than this seem to have times in a smaller unit, s
 # A contact point slips if its step is larger than all but one in a thousand of noise (χ², three
 # degrees of freedom), in samples that are not farther apart than this, s.
 _BEYOND_NOISE, _NEXT = 16.27, 0.5
-# Halvings of an interval of 80 in the logarithm of a multiplier.
-_HALVINGS = 30
-# Slips that follow each other within this time are one, s.
-_SETTLING = 0.01
-# Share of the largest variance below which there is none.
-_NO_VARIANCE = 1e-15
+_HALVINGS = 30  # halvings of an interval of 80 in the logarithm of a multiplier
+_SETTLING = 0.01  # slips that follow each other within this time are one, s
+_NO_VARIANCE = 1e-15  # share of the largest variance below which there is none
 # Lengths of the whisker that a contact point moves in a second from which it slips, by default.
 _SLIPPING = 2.0
 # Statuses that show neither that something is touched nor that nothing is.
 _SILENT = ("missing", "tare", "degenerate")
-# Longest message about a line that cannot be read; it may quote the line.
-_MESSAGE = 400
+_MESSAGE = 400  # longest message about a line that cannot be read; it may quote the line
 
 COMPONENTS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 """Components of force and moment that signals are computed from."""
@@ -487,8 +481,7 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-# Share of samples above which something is wrong in general.
-_NEARLY_ALL = 0.9
+_NEARLY_ALL = 0.9  # share of samples above which something is wrong in general
 
 
 def advice(stream: ContactStream) -> list[str]:

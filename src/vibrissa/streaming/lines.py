@@ -53,14 +53,10 @@ FRAME = "frame_id"  # column with the name of the frame that ROS gives it
 LONGEST = 65536  # characters that a line may have; a datagram holds no more
 # What a header may call otherwise, or give in other units.
 _SIGNALS = ("time", "Fx", "Fy", "Fz", "Mx", "My", "Mz", *SIGNALS)
-# A quaternion that was rounded is no longer of unit length by this much.
-_UNIT = 0.01
-# Seconds since any epoch are fewer; what is more is in a smaller unit.
-_LATEST = 1e11
-# Largest distance of a base, m; infinite ones are not numbers either.
-_FARTHEST = 1e9
-# Characters that a number in a table may begin with.
-_DIGITS = frozenset("0123456789+-.")
+_UNIT = 0.01  # a quaternion that was rounded is no longer of unit length by this much
+_LATEST = 1e11  # seconds since any epoch are fewer; what is more is in a smaller unit
+_FARTHEST = 1e9  # largest distance of a base, m; infinite ones are not numbers either
+_DIGITS = frozenset("0123456789+-.")  # characters that a number in a table may begin with
 
 
 class LineKind(Enum):
@@ -305,8 +301,7 @@ def rotation_of(quaternion: Sequence[float]) -> Array:
 
 # A motion is continued past the last pose for so many times the step between the last two.
 _LONGEST = 5.0
-# Nothing that holds a whisker is as fast, m/s.
-_TOO_FAST = 50.0
+_TOO_FAST = 50.0  # nothing that holds a whisker is as fast, m/s
 
 
 class Pose(NamedTuple):

@@ -33,18 +33,14 @@ from vibrissa.streaming.lines import (
     LineKind,
 )
 
-# A datagram holds no more.
-_LARGEST = 65535
-# Bytes that may wait to be read.
-_WAITING = 1 << 22
+_LARGEST = 65535  # a datagram holds no more
+_WAITING = 1 << 22  # bytes that may wait to be read
 # Seconds after which the newest datagram so far is answered, though others go on coming.
 _DRAINED = 0.02
-# Poses that a motion is continued from.
-_POSES = 2
+_POSES = 2  # poses that a motion is continued from
 # Of Linux: the option of a socket that gives its counters, and which of them counts what is lost.
 _COUNTERS, _LOST = 55, 8
-# Seconds after which a line that has closed is opened anew.
-_BACK = 0.2
+_BACK = 0.2  # seconds after which a line that has closed is opened anew
 
 
 def file_lines(
@@ -164,11 +160,9 @@ class Answers:
             self._socket.send(data)
 
     def __enter__(self) -> Answers:
-        """Nothing more is to be opened."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close it."""
         self._socket.close()
 
 

@@ -241,7 +241,6 @@ class Store:
         return self
 
     def __exit__(self, *fault: object) -> None:
-        """Let go of the store."""
         if self._lock is not None:
             self._lock.close()
             self._lock = None

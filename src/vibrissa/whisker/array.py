@@ -205,7 +205,6 @@ class WhiskerArray(Mapping[str, Whisker]):
         return cls(Whisker.from_dataset(dataset) for dataset in datasets)
 
     def __repr__(self) -> str:
-        """Say how many there are, which, and how long."""
         lengths = [w.length * 1e3 for w in self.values()]
         sides = [
             f"{count} {side}"

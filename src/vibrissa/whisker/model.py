@@ -137,7 +137,6 @@ class Whisker:
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check every field and bring the numbers into plain Python types."""
         faults = length_faults(self.length, any_length=True)
         faults += material_faults(
             self.youngs_modulus, self.poisson_ratio, self.base_stiffness, self.density
@@ -589,7 +588,6 @@ class Whisker:
         return whisker
 
     def __repr__(self) -> str:
-        """Say what it is in one line, in mm and µm."""
         base = "" if self.base_stiffness is None else ", on a compliant base"
         thicker = " (thicker than the base)" if self.tip_radius > self.base_radius else ""
         bend = "straight"

@@ -245,7 +245,6 @@ class Identity:
     side: Side | None = None
 
     def __post_init__(self) -> None:
-        """Check all three."""
         faults = []
         if self.row not in tuple(ROWS):
             faults.append(f"row is {self.row!r}; one of {', '.join(ROWS)} is needed")

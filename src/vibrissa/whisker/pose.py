@@ -55,7 +55,6 @@ class Pose:
     origin: Array = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
-        """Check both parts and make them read-only."""
         rotation = np.array(self.rotation, dtype=np.float64)
         origin = np.array(self.origin, dtype=np.float64)
         faults = []
@@ -135,7 +134,6 @@ class Pose:
         return _triples(vectors) @ self.rotation
 
     def __repr__(self) -> str:
-        """Show the origin in mm and the angle turned."""
         cosine = np.clip((np.trace(self.rotation) - 1.0) / 2.0, -1.0, 1.0)
         x, y, z = self.origin * 1e3
         angle = np.degrees(np.arccos(cosine))

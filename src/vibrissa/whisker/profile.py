@@ -86,7 +86,6 @@ class Profile:
     error: float = 0.0  # relative to its largest value
 
     def __post_init__(self) -> None:
-        """Take read-only copies and check that they fit together."""
         knots = np.array(self.knots, dtype=np.float64)
         coefficients = np.array(self.coefficients, dtype=np.float64)
         if knots.ndim != 1 or knots.size < 2 or not (np.diff(knots) > 0.0).all():

@@ -41,8 +41,7 @@ SHORTEST, LONGEST = 0.5e-3, 0.5
 
 # How to confirm a length outside them.
 CONFIRMATION = "any_length=True (Python) or --any-length (command line)"
-# A rod's radius is at most this share of its length.
-_STOUT = 0.1
+_STOUT = 0.1  # a rod's radius is at most this share of its length
 
 # Share of the radius by which samples scatter before it is worth a note, and how well the base
 # signals follow samples that scatter, in units of it.

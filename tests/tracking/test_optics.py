@@ -104,6 +104,15 @@ def test_no_offset_is_noted_where_none_explains_the_misfit():
     assert not better_offset(*STATED, *wrong, 0).size
 
 
+def test_no_offset_is_noted_for_a_base_that_hairs_displace():
+    """One view sees the base 3 pixels too far to the right, and later too far to the left."""
+    moved = np.arange(100)[:, None, None] * [0.1 * PIXEL, 0.0, 0.0]
+    seen = traces(sweep(2)[:1] + moved, [TOP, FRONT], 1e6)
+    for i, trace in enumerate(seen[1]):
+        trace.line[0, 0] += 3.0 if i < 50 else -3.0
+    assert not better_offset(*STATED, *seen, 0).size
+
+
 @pytest.mark.parametrize("late", [1, 3])
 def test_an_offset_is_noted_in_a_short_film(late):
     """The second of two telecentric cameras, otherwise as stated, began later."""

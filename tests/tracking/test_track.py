@@ -403,6 +403,18 @@ def test_the_rest_shape_ignores_how_it_is_held():
     assert whisker.curvature(10e-3)[2] == pytest.approx(expected, rel=0.05)
 
 
+def test_the_rest_shape_ignores_where_hairs_let_a_trace_begin():
+    """In two of three frames hairs hide 0.4 mm of a whisker that curves more and more."""
+    rng, s = np.random.default_rng(2), np.linspace(0.0, 20e-3, 101)
+    hidden = np.where(np.arange(90) < 30, 0.0, 0.4e-3)
+    x = hidden[:, None] + s * (1.0 - hidden[:, None] / 20e-3)
+    touched = np.arange(90) % 10 == 0
+    shapes = np.stack([x, 600.0 * x**3 + 2.0 * touched[:, None] * x**2, 0.0 * x], axis=-1)
+    held = base_rotation(0.8 * np.sin(np.linspace(0.0, np.pi, 90)), np.zeros(90), np.zeros(90))
+    curves = np.einsum("tij,tnj->tni", held, shapes) + rng.normal(0.0, 2e-6, shapes.shape)
+    np.testing.assert_array_equal(rest_shape(curves).free, ~touched)
+
+
 def test_ringing_does_not_roll_the_base():
     # A curved whisker that whisks, and rings across its plane after each of four releases.
     rng, time, s = np.random.default_rng(4), np.arange(600) / 1000.0, np.linspace(0.0, 0.04, 81)

@@ -27,6 +27,7 @@ _WORST = 6.0  # largest cost of a frame: square of the distance at which lines p
 _CLEARLY = 20.0  # cost by which another shift must fit better than the given one
 # Share of the cost of the given shift that one which explains the misfit leaves at most.
 _LEFT = 0.65
+_DROPPED = 10  # largest number of frames in a row that a camera drops unnoticed
 _KNOWN = 10  # number of frames that must show an end of the whisker
 
 
@@ -104,6 +105,9 @@ def better_offset(
     best = int(np.argmin((fits + blank).sum(axis=0)))
     cost = _costs(ends, [one[best] for one in usual])
     path = _cheapest(cost + blank)
+    if (np.abs(_SHIFTS[path]) == _LARGEST).any() or (np.abs(np.diff(path)) > _DROPPED).any():
+        # No minimum, as it is at the end of what is considered, or no camera that drops frames.
+        return np.empty(0, dtype=np.int64)
     switched = np.concatenate([[True], np.diff(path) != 0])
     changed = _SWITCH * int(switched[1:].sum()) + _CLEARLY
     row, column = np.arange(len(a)), offset + _LARGEST

@@ -50,6 +50,9 @@ _ENDS = 3  # number of frames at rest that show the tip, from which the length i
 # Factor of the noise of a shape: errors of neighbouring points are correlated, so that they seem
 # smoother than they are right.
 _SMOOTH = 4.0
+# Share of its length by which a shape may begin elsewhere on the whisker than the others do, and
+# what keeps that of a straight line, m²: none.
+_SLIDES, _TINY = 0.02, 1e-30
 # Roll about the whisker's chord from which a rigid motion is not one that an animal makes.
 _OVER = np.deg2rad(120.0)
 _BASE = 6  # number of parts of a shape of which the first shows the direction of its base
@@ -140,14 +143,16 @@ def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> R
         near = deviation[whole] < max(_NEAR * usual, 1e-9)
     within = _NEAR * float(np.median(deviation[whole][near]))
     quiet, ringing = near, None
-    uneven = usual > _UNEVEN * np.quantile(deviation[whole][near], _QUIETEST)
+    # A whisker that rings also looks as if it began elsewhere.
+    rings = _deviations(part, mean, slides=0.0)
+    usual = float(np.median(rings[near]))
+    uneven = usual > _UNEVEN * np.quantile(rings[near], _QUIETEST)
     if uneven and usual > _RINGS * length and _depth(mean) > _DEEP * usual:
         for _ in range(_ROUNDS):
-            quiet = near & (
-                deviation[whole] <= _QUIET * np.quantile(deviation[whole][near], _QUIETEST)
-            )
+            quiet = near & (rings <= _QUIET * np.quantile(rings[near], _QUIETEST))
             mean = np.median(_onto(part[quiet], mean), axis=0)
-            deviation[whole] = _deviations(part, mean)
+            rings = _deviations(part, mean, slides=0.0)
+        deviation[whole] = _deviations(part, mean)
         ringing = np.ones(len(curves), dtype=bool)
         ringing[np.flatnonzero(seen)[whole][quiet]] = False
     shown = shapes[whole][:, : curves.shape[1]]
@@ -229,8 +234,14 @@ def known_rest(curves: Array, whisker: Whisker, least: float = 0.1) -> RestShape
     return RestShape(points, free, out, noise)
 
 
-def _deviations(shapes: Array, target: Array, rolled: bool = False) -> Array:
-    """Root mean square distances from a target on which shapes are put, rolled over or not."""
+def _deviations(
+    shapes: Array, target: Array, rolled: bool = False, slides: float = _SLIDES
+) -> Array:
+    """Root mean square distances from a target on which shapes are put, rolled over or not.
+
+    They may begin a little earlier or later on the whisker than the target: where a trace begins
+    depends on the hairs before it.
+    """
     rotation, _ = motions(shapes, target)
     chord = shapes[:, -1] - shapes[:, 0]
     swing = _swings(chord, target[-1] - target[0])
@@ -239,8 +250,20 @@ def _deviations(shapes: Array, target: Array, rolled: bool = False) -> Array:
     over = (twist < 1.0 + 2.0 * np.cos(_OVER)) & (not rolled)
     rotation[over] = swing[over]
     shift = target.mean(axis=0) - np.einsum("tij,tj->ti", rotation, shapes.mean(axis=1))
-    square = ((_moved(shapes, rotation, shift) - target) ** 2).sum(axis=2)
-    return np.asarray(np.sqrt(square.mean(axis=1)))
+    away = (_moved(shapes, rotation, shift) - target).reshape(len(shapes), -1)
+    slide = _slide(target)
+    share = np.clip(away @ slide / max(slide @ slide, _TINY), -slides, slides)
+    return np.sqrt(((away - np.outer(share, slide)) ** 2).sum(axis=1) / len(target))
+
+
+def _slide(shape: Array) -> Array:
+    """Change (3 n,) of a shape that begins later by its length, but for its rigid motion."""
+    away = shape - shape.mean(axis=0)
+    turns = np.cross(np.eye(3)[:, None], away)
+    shifts = np.broadcast_to(np.eye(3)[:, None], turns.shape)
+    rigid = np.concatenate([shifts, turns]).reshape(6, -1).T
+    along = (np.gradient(shape, axis=0) * (len(shape) - 1)).reshape(-1)
+    return np.asarray(along - rigid @ np.linalg.lstsq(rigid, along)[0])
 
 
 def _depth(shape: Array) -> float:

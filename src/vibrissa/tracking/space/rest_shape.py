@@ -252,8 +252,9 @@ def _deviations(
     shift = target.mean(axis=0) - np.einsum("tij,tj->ti", rotation, shapes.mean(axis=1))
     away = (_moved(shapes, rotation, shift) - target).reshape(len(shapes), -1)
     slide = _slide(target)
-    share = np.clip(away @ slide / max(slide @ slide, _TINY), -slides, slides)
-    return np.sqrt(((away - np.outer(share, slide)) ** 2).sum(axis=1) / len(target))
+    share = np.clip(away @ slide / (slide @ slide + _TINY), -slides, slides)
+    square = ((away - np.outer(share, slide)) ** 2).sum(axis=1)
+    return np.asarray(np.sqrt(square / len(target)))
 
 
 def _slide(shape: Array) -> Array:

@@ -231,13 +231,11 @@ def _contact_drawings(
     points, known, estimated = course.places, course.known, course.estimated
     drawings: dict[str, Draw] = {}
     if points is not None:
-        peg = next((body for body in bodies if isinstance(body, vb.objects.Peg)), None)
-        fit = next((shape for shape in fits if isinstance(shape, vb.contour.CylinderFit)), None)
         drawings["contact_places"] = lambda: vb.plots.contact_places(
             course, line, bodies, fits, colour=by, width=width
         )
         drawings["contour"] = lambda: vb.plots.contour_views(
-            points, peg, fit, colour=angles, width=width
+            points, next(iter(bodies), None), next(iter(fits), None), colour=angles, width=width
         )
     if known is not None and estimated is not None:
         drawings["estimates"] = lambda: vb.plots.estimated_against_true(

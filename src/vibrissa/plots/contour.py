@@ -1,7 +1,7 @@
 """Contact points and the object that they outline (Fig. 6C), and their distances from it.
 
 Contact points are on the whisker's centreline, one whisker radius (some 50 µm) off the surface.
-Pegs and fitted cylinders are drawn in outline. Other objects appear as their section at the
+Pegs, cylinders and fitted spheres are drawn in outline. Other objects appear as their section at the
 median position of the contacts, from the side as a silhouette where they are known; a fitted
 surface has its 95 % band about it, and ends where it is not known.
 """
@@ -145,6 +145,8 @@ def _draw(
     elif look == "true" and view != (0, 1):
         draw_body(axes, body, view, limits, look)
     elif look == "true" or not lies_flat(body, view, places):
+        if hasattr(body, "radius"):  # a sphere's outline is its section through the centre
+            middle = to_display("object_position", getattr(body, "origin"))  # noqa: B009
         depth = float(middle[3 - sum(view)])
         draw_section(axes, body, view, depth, limits, look)
     axes.set(xlim=limits[view[0]], ylim=limits[view[1]])

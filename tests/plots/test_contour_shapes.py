@@ -37,7 +37,7 @@ def lines(figure: Figure, panel: int) -> list[np.ndarray]:
 
 
 def test_a_fitted_sphere_is_drawn_in_outline() -> None:
-    points = near_side() + [0.0, 0.0, 1e-3]
+    points = near_side() + 1e-3 * np.array([0.0, 0.0, 1.0])
     figure = contour_views(points, BALL, fit_shape("sphere", points))
     assert {"object, 8.00 mm", "fitted, 8.00 mm", "95 % band"} <= texts(figure)
     centre = 1e3 * BALL.origin + [0.0, 0.0, 1.0]

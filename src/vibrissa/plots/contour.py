@@ -1,8 +1,8 @@
 """Contact points and the object that they outline (Fig. 6C), and their distances from it.
 
 Contact points are on the whisker's centreline, one whisker radius (some 50 µm) off the surface.
-Pegs, cylinders and fitted spheres are drawn in outline. Other objects appear as their section at the
-median position of the contacts, from the side as a silhouette where they are known; a fitted
+Pegs, cylinders and fitted spheres are drawn in outline. Other objects appear as their section at
+the median position of the contacts, from the side as a silhouette where they are known; a fitted
 surface has its 95 % band about it, and ends where it is not known.
 """
 

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 import vibrissa as vb
 from vibrissa.cli.estimate import EstimateOptions
@@ -30,9 +27,7 @@ _HEADING = (
 
 @with_options()
 def batch(
-    folder: Annotated[
-        Path, typer.Argument(help="Folder of recordings, NetCDF (.nc).", metavar="FOLDER")
-    ],
+    folder: Path,
     wanted: ShapeOptions,
     source: SourceOptions,
     how: EstimateOptions,

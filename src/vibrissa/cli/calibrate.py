@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import typer
 
 import vibrissa as vb
 from vibrissa.cli.options import check_new, refuse, with_options
@@ -23,14 +21,7 @@ _FRAMES = 40  # frames that are used of a video, by default
 
 @with_options("the cameras, TOML of Anipose; or the sensor, NetCDF (.nc)")
 def calibrate(
-    images: Annotated[
-        list[Path],
-        typer.Argument(
-            help="Images of all cameras, named like top_01.png, front_01.png, or a video of each; "
-            "or the description of touches by a stage, TOML.",
-            metavar="IMAGE...",
-        ),
-    ],
+    images: list[Path],
     target: Path,
     pattern: str | None = None,
     square: float | None = None,

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 import vibrissa as vb
 from vibrissa.cli.options import with_options
@@ -20,7 +18,7 @@ _ENDLESS = 1 << 31  # number of frames of a video that does not state it
 
 @with_options("corrections, .csv, which are added to those that it holds already")
 def correct(
-    video: Annotated[Path, typer.Argument(help="The video of one view.", metavar="VIDEO")],
+    video: Path,
     target: Path,
     trace: Path | None = None,
     view: int = 0,

@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 import vibrissa as vb
 from vibrissa.cli.inputs import (
@@ -196,14 +194,7 @@ class EstimateOptions:
     "table, .csv, by default contacts.csv"
 )
 def estimate(
-    signals: Annotated[
-        Path,
-        typer.Argument(
-            help="A recording, .nc; or a table with time, and Fx, Fy, Fz, Mx, My, Mz, the signals "
-            "that are used, or the channels of the --sensor.",
-            metavar="SIGNALS",
-        ),
-    ],
+    signals: Path,
     how: EstimateOptions,
     weight: GravityOptions,
     sensor: Path | None = None,

@@ -8,13 +8,13 @@ from typing import Literal
 
 import vibrissa as vb
 from vibrissa.cli.inputs import recording_from
-from vibrissa.cli.options import RecordingArgument, check_new, refuse, with_options
+from vibrissa.cli.options import check_new, refuse, with_options
 from vibrissa.cli.terminal import remark, say
 
 
 @with_options("the table, by default next to the recording: NAME.csv, NAME.nwb or NAME.mat")
 def export(
-    recording: RecordingArgument,
+    recording: Path,
     to: Literal["csv", "nwb", "mat"] = "csv",
     target: Path | None = None,
     session_start: str | None = None,

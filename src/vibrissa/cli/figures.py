@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import repeat
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-import typer
 from numpy.typing import NDArray
 
 import vibrissa as vb
@@ -272,13 +271,7 @@ def _signal_drawings(
 
 @with_options("figures, in a folder")
 def figures(
-    path: Annotated[
-        Path,
-        typer.Argument(
-            help="A map of contacts, the recording of a trial, NetCDF, or an array.",
-            metavar="MAP | TRIAL",
-        ),
-    ],
+    path: Path,
     of_trial: TrialOptions,
     target: Path = Path("figures"),
     format_: list[Format] | None = None,

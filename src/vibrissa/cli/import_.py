@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import typer
 
 import vibrissa as vb
 from vibrissa.cli.inputs import TrackedOptions, cameras_from, objects_from
@@ -24,14 +23,7 @@ _VIEWS = ("top", "front")  # names of views that neither files nor cameras name
 
 @with_options("the recording, .nc")
 def import_tracks(
-    tracks: Annotated[
-        list[Path],
-        typer.Argument(
-            help="The tracker's file, or one for each view: whisk, DeepLabCut, LightningPose, "
-            "SLEAP, Anipose, movement, NWB, MATLAB or a table.",
-            metavar="TRACKS...",
-        ),
-    ],
+    tracks: list[Path],
     target: Path,
     own: TrackedOptions,
     cameras: Path | None = None,

@@ -6,10 +6,9 @@ import re
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 
 import vibrissa as vb
 from vibrissa.cli.options import with_options
@@ -49,9 +48,7 @@ _PACKAGES = ("numpy", "scipy", "numba", "xarray", "h5netcdf", "matplotlib")
 
 @with_options()
 def info(
-    path: Annotated[
-        Path | None, typer.Argument(help="A file to look into.", metavar="FILE")
-    ] = None,
+    path: Path | None = None,
     all_: bool = False,
 ) -> None:
     """List versions and settings of this installation, or what a file holds.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 import vibrissa as vb
 from vibrissa.cli.figures import NODES, TrialOptions, fits_of, sights_of
 from vibrissa.cli.inputs import recording_from
-from vibrissa.cli.options import RecordingArgument, free, refuse, with_options
+from vibrissa.cli.options import free, refuse, with_options
 from vibrissa.cli.terminal import Tell, progress_bars, say, stoppable
 from vibrissa.deferred import xr
 
@@ -51,7 +51,7 @@ class FrameOptions:
 
 @with_options("the movies, in a folder, or one kind as a file .mp4")
 def movie(
-    path: RecordingArgument,
+    path: Path,
     of_trial: TrialOptions,
     frames: FrameOptions,
     kind: Literal["signals", "contour", "both"] = "both",

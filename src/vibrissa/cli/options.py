@@ -1,4 +1,4 @@
-"""The options of the command line, each defined once: a name means the same in all verbs.
+"""Options and arguments of the command line, each defined once: a name means the same in all verbs.
 
 Lengths are in mm, forces in µN, moments in µN·m and angles in degrees, unless the help of an option
 states another unit. A verb has options as parameters, by their names; their types say which values
@@ -17,7 +17,7 @@ from dataclasses import MISSING, fields, is_dataclass
 from enum import StrEnum
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar, cast, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, cast, get_type_hints
 
 import typer
 
@@ -30,7 +30,7 @@ class Option(NamedTuple):
     """Meaning of an option.
 
     Its names are that of the parameter, and of a switch that is on by default also its opposite,
-    unless others are stated.
+    unless others are stated; an argument has none.
     """
 
     help: str
@@ -52,12 +52,6 @@ def _options() -> dict[tuple[str, str], Option]:
 
 
 OPTIONS = _options()  # the options by verb, "" in all others, and name of the parameter
-RecordingArgument = Annotated[
-    Path, typer.Argument(help="A recording, NetCDF (.nc).", metavar="TRIAL.nc")
-]
-MapArgument = Annotated[
-    Path, typer.Argument(help="A map, as `vibrissa map` writes it, NetCDF (.nc).", metavar="MAP.nc")
-]
 Source = Literal["contact-point", "rod", "sensor"]
 Method = Literal["exact", "lookup", "lookup-linear", "network"]
 
@@ -118,9 +112,8 @@ def _flat(kinds: Mapping[str, tuple[Any, Any]], verb: str, output: str) -> list[
             found += _flat(inside, verb, output)
             continue
         default = inspect.Parameter.empty if default is MISSING else default
-        annotation = kind
-        if get_origin(kind) is not Annotated:  # else it is an argument
-            annotation = Annotated[kind, _declared(name, default, verb, output)]
+        declared = _declared(name, default, verb, output)
+        annotation = Annotated[kind, declared]  # type: ignore[valid-type]
         # Options are passed by name, so that those without a default may follow others.
         how = inspect.Parameter.KEYWORD_ONLY
         found.append(inspect.Parameter(name, how, default=default, annotation=annotation))
@@ -128,12 +121,14 @@ def _flat(kinds: Mapping[str, tuple[Any, Any]], verb: str, output: str) -> list[
 
 
 def _declared(name: str, default: Any, verb: str, output: str) -> Any:
-    """Declare an option to Typer."""
+    """Declare an option, or an argument, to Typer."""
     if name == "target":
         text = f"Where the result goes: {output}."
         return typer.Option("--output", "-o", help=text, metavar="PATH")
     plain = name.rstrip("_")
     about = OPTIONS.get((verb, plain)) or OPTIONS["", plain]
+    if about.names == "argument":
+        return typer.Argument(help=about.help, metavar=about.metavar)
     names = f"--{plain.replace('_', '-')}"
     if default is True:
         names += names.replace("--", "/--no-", 1)

@@ -21,7 +21,7 @@ from vibrissa.cli.inputs import (
     recording_from,
     refuse_tracks,
 )
-from vibrissa.cli.options import RecordingArgument, numbers, with_options
+from vibrissa.cli.options import numbers, with_options
 from vibrissa.cli.signals import SourceOptions, described
 from vibrissa.cli.terminal import Tell, fixed, print_table, progress_bars, remark, say
 from vibrissa.deferred import xr
@@ -55,7 +55,7 @@ class ShapeOptions:
 
 @with_options("the recording with all that was found added, by default where it is")
 def reconstruct(
-    recording: RecordingArgument,
+    recording: Path,
     wanted: ShapeOptions,
     source: SourceOptions,
     how: EstimateOptions,

@@ -5,10 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import typer
 
 import vibrissa as vb
 from vibrissa.cli.figures import (
@@ -42,10 +41,7 @@ class _Content(NamedTuple):
 
 @with_options("the page, .html")
 def report(
-    path: Annotated[
-        Path,
-        typer.Argument(help="The recording of a trial, or a map, NetCDF.", metavar="TRIAL | MAP"),
-    ],
+    path: Path,
     of_trial: TrialOptions,
     target: Path = Path("report.html"),
     uniqueness: Path | None = None,

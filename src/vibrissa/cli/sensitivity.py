@@ -9,7 +9,7 @@ import numpy as np
 import vibrissa as vb
 from vibrissa.cli.figures import dataset_with
 from vibrissa.cli.inputs import RECORDING, NoiseOptions, kind_in, wrench_from
-from vibrissa.cli.options import MapArgument, check_new, with_options
+from vibrissa.cli.options import check_new, with_options
 from vibrissa.cli.terminal import Row, print_table, progress_bars, say, shown
 from vibrissa.deferred import xr
 
@@ -18,7 +18,7 @@ _SHOWN = 5  # number of the best triplets that are shown
 
 @with_options("everything, NetCDF (.nc), SI units; by default nowhere")
 def sensitivity(
-    path: MapArgument,
+    path: Path,
     noise: NoiseOptions,
     using: str = "Fx,MB,MD",
     trial: Path | None = None,

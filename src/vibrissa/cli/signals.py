@@ -20,7 +20,7 @@ from vibrissa.cli.inputs import (
     refuse_tracks,
     smallest_arc,
 )
-from vibrissa.cli.options import RecordingArgument, Source, refuse, with_options
+from vibrissa.cli.options import Source, refuse, with_options
 from vibrissa.cli.terminal import progress_bars, remark, say, shown
 from vibrissa.deferred import xr
 
@@ -89,7 +89,7 @@ class SourceOptions:
     "one whisker as a table, .csv"
 )
 def signals(
-    recording: RecordingArgument,
+    recording: Path,
     how: SourceOptions,
     own: WhiskerOptions,
     proximal: float | None = None,

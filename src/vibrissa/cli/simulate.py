@@ -5,10 +5,9 @@ from __future__ import annotations
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-import typer
 
 import vibrissa as vb
 from vibrissa.cli.inputs import WhiskerOptions, print_notes, print_statuses
@@ -47,10 +46,7 @@ class PlanOptions:
 def simulate(
     own: WhiskerOptions,
     wanted: PlanOptions,
-    script: Annotated[
-        Path | None,
-        typer.Argument(help="The trial as TOML; `--example` prints one.", metavar="TRIAL.toml"),
-    ] = None,
+    script: Path | None = None,
     target: Path = Path("trial.nc"),
     film: Path | None = None,
     example: bool = False,

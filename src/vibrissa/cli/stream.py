@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from io import TextIOWrapper
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -41,14 +41,7 @@ _MOUNT = ("X", "Y", "Z", "QW", "QX", "QY", "QZ")
 class LineOptions:
     """Source of the lines."""
 
-    source: Annotated[
-        Path | None,
-        typer.Argument(
-            help="A file, named pipe or serial device with lines, or a ROS bag; by default "
-            "standard input.",
-            metavar="SOURCE",
-        ),
-    ] = None
+    source: Path | None = None
     udp: str | None = None
     every: bool = False
     reconnect: bool = False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
@@ -18,16 +18,8 @@ _LISTED = 3
 
 @with_options("the results, a Zarr folder; with `show`, a folder for the figures")
 def sweep(
-    study: Annotated[
-        str | None,
-        typer.Argument(
-            help="The study as TOML (`--example` prints one), or `show` and its results.",
-            metavar="STUDY.toml | show",
-        ),
-    ] = None,
-    store: Annotated[
-        Path | None, typer.Argument(help="After `show`: the results.", metavar="[STORE]")
-    ] = None,
+    study: str | None = None,
+    store: Path | None = None,
     target: Path | None = None,
     workers: int | None = None,
     scheduler: str | None = None,

@@ -8,10 +8,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import typer
 
 import vibrissa as vb
 from vibrissa.cli.inputs import (
@@ -264,14 +263,7 @@ class KnownOptions:
 
 @with_options("the recording, .nc; of several trials a folder for them")
 def track(
-    videos: Annotated[
-        list[Path],
-        typer.Argument(
-            help="The video of the one view, or of each view, top and then front; of several "
-            "trials one after the other.",
-            metavar="VIDEO...",
-        ),
-    ],
+    videos: list[Path],
     target: Path,
     filmed: FilmOptions,
     traced: TraceStatements,

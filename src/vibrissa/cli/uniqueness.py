@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 import vibrissa as vb
-from vibrissa.cli.options import MapArgument, Region, check_new, with_options
+from vibrissa.cli.options import Region, check_new, with_options
 from vibrissa.cli.terminal import output, progress_bars, remark, say, shown
 from vibrissa.deferred import xr
 
@@ -18,7 +18,7 @@ _ASKED = "Fx MB MD"  # the triplet whose witness is printed, if it has one: that
 
 @with_options("all evidence, .nc or .csv; by default nowhere")
 def uniqueness(
-    path: MapArgument,
+    path: Path,
     using: list[str] | None = None,
     region: list[Region] | None = None,
     domain: Literal["reachable", "paper"] = "reachable",

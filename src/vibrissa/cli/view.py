@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 import vibrissa as vb
 from vibrissa.cli.inputs import MAP, RECORDING, WhiskerOptions, kind_in, print_notes
@@ -16,14 +13,7 @@ from vibrissa.deferred import xr
 
 @with_options()
 def view(
-    path: Annotated[
-        Path | None,
-        typer.Argument(
-            help="A whisker (CSV or NetCDF), a map or a trial (NetCDF); by default the built-in γ "
-            "whisker.",
-            metavar="[WHISKER | MAP | TRIAL]",
-        ),
-    ] = None,
+    path: Path | None = None,
     videos: list[Path] | None = None,
     host: str = "127.0.0.1",
     port: int | None = None,

@@ -59,6 +59,7 @@ _SAME = {("pixel", "px"), ("1", "")}  # pairs of one size, written in two ways
 _FACTORS = {
     ("m", "mm"): 1e3,
     ("m", "µm"): 1e6,
+    ("s", "ms"): 1e3,
     ("1/m", "1/mm"): 1e-3,
     ("Pa", "GPa"): 1e-9,
     ("N m^2", "nN·m²"): 1e9,

@@ -32,7 +32,7 @@ from vibrissa.cameras import Camera, cameras_dataset, cameras_from_dataset
 from vibrissa.io import RECORDING_KIND
 from vibrissa.objects import Peg, Surface, object_from_dataset, objects_datasets
 from vibrissa.quantities import attributes
-from vibrissa.status import flag_attributes
+from vibrissa.status import Event, Status, flag_attributes
 from vibrissa.whisker import Whisker
 
 __all__ = [
@@ -118,6 +118,9 @@ VARIABLES: Mapping[str, RecordedVariable] = MappingProxyType(
         "one_contact": RecordedVariable(_EACH, _ESTIMATES),
         "candidates": RecordedVariable(_EACH, _ESTIMATES, kind="int"),
         "in_contact": RecordedVariable(_EACH, _ANYWHERE, kind="bool"),
+        "event": RecordedVariable(_EACH, _ESTIMATES, kind="int"),
+        "onset_time": RecordedVariable(_EACH, _ESTIMATES),
+        "onset_sigma": RecordedVariable(_EACH, _ESTIMATES),
         "confidence": RecordedVariable(_EACH, ("", "truth")),
         "status": RecordedVariable(_EACH, _ANYWHERE, kind="int"),
         # What its base measures
@@ -161,8 +164,8 @@ def recorded(name: str, values: ArrayLike) -> xr.Variable:
         labels["long_name"] += ", unfiltered"
     if about.frame:
         labels["reference_frame"] = about.frame
-    if name == "status":
-        labels |= flag_attributes()
+    if name in ("status", "event"):
+        labels |= flag_attributes(Event if name == "event" else Status)
     return xr.Variable(about.dims, array, labels)
 
 

@@ -137,6 +137,15 @@ class Status(enum.IntEnum):
         return f"{self.explanation} {self.advice}".rstrip()
 
 
+class Event(enum.IntEnum):
+    """What happens to a contact: its onset, its loss, or a slip of its point."""
+
+    NONE = 0
+    ONSET = 1
+    LOSS = 2
+    SLIP = 3
+
+
 _OK_CODES = np.array([status for status in Status if status.ok], dtype=np.int8)
 
 
@@ -226,8 +235,13 @@ def names(codes: ArrayLike) -> NDArray[np.str_]:
     return out
 
 
-def flag_attributes() -> dict[str, NDArray[np.int8] | str]:
+def flag_attributes(kind: type[enum.IntEnum] = Status) -> dict[str, NDArray[np.int8] | str]:
     """Describe the numbers of :class:`Status` in a dataset, as the CF conventions ask.
+
+    Parameters
+    ----------
+    kind : type
+        :class:`Status`, or :class:`Event`.
 
     Returns
     -------
@@ -235,8 +249,8 @@ def flag_attributes() -> dict[str, NDArray[np.int8] | str]:
         ``flag_values`` (int8) and ``flag_meanings`` (words separated by blanks, in the same order).
     """
     return {
-        "flag_values": np.array([int(status) for status in Status], dtype=np.int8),
-        "flag_meanings": " ".join(status.name.lower() for status in Status),
+        "flag_values": np.array([int(one) for one in kind], dtype=np.int8),
+        "flag_meanings": " ".join(one.name.lower() for one in kind),
     }
 
 

@@ -170,7 +170,7 @@ def test_the_page_is_whole_and_loads_nothing(written):
     assert "default-src 'none'" in text
     assert page.sections[:2] == ["results", "picture"]
     assert page.sections[-3:] == ["recording", "settings", "provenance"]
-    wanted = {"signals", "estimates", "contour", "statuses", "figures", "provenance"}
+    wanted = {"signals", "estimates", "contour", "events", "statuses", "figures", "provenance"}
     assert wanted <= set(page.sections)
     assert len(page.sections) == len(set(page.sections))
     assert len(page.images) >= 6
@@ -423,6 +423,7 @@ def test_what_is_missing_is_named_with_the_verb_that_makes_it(folder):
         "recording",
         "settings",
         "contour",
+        "events",
         "statuses",
     ]
     assert "no ground truth" in sections[2].body

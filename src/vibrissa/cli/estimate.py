@@ -89,6 +89,7 @@ class GravityOptions:
 
 
 _SHOWN = 5  # faults of a table that are reported
+_ONSET = ("onset_time", "onset_sigma")
 _NUMBERS = ("time", "x", "y", "z", "r", "theta", "phi", "sigma_x", "sigma_y", "sigma_z")
 
 
@@ -300,7 +301,12 @@ def _from_lines(
         remark(f"{signals}: {vb.io.NUMBERED}")
     statuses = [int(vb.Status[one["status"].upper()]) for one in records]
     columns["friction"] = [estimator.friction] * len(records)
+    happened = [vb.status.Event[one.get("event", "none").upper()] for one in records]
+    begun = [[one.get(name, float("nan")) for name in _ONSET] for one in records]
+    events, onsets = vb.contacts.in_order(np.array(columns["time"]), happened, begun)
     found = xr.Dataset({name: ("time", values) for name, values in columns.items()})
+    found = found.assign(event=("time", events))
+    found = found.assign({n: ("time", v) for n, v in zip(_ONSET, onsets.T, strict=True)})
     vb.io.save_contacts(target, found.assign(status=("time", statuses)))
     for sentence in vb.streaming.advice(running):
         remark(sentence)

@@ -151,6 +151,8 @@ def _recording(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
     rate = f" at {found.frames / found.duration:g} a second" if found.duration else ""
     yield "duration", f"{found.duration:g} s, {found.frames} frames{rate}"
     yield "contacts", _contacts(found)
+    if found.events:
+        yield "events", ", ".join(f"{name}: {n}" for name, n in found.events.items())
     missing = [stage for stage in vb.pipeline.STAGES if stage not in found.stages]
     lacking = ", ".join(missing)
     there = ", ".join(found.stages) or "none"
@@ -190,7 +192,7 @@ def _summarised(path: Path) -> xr.DataTree:
     with vb.io.opened(path, "a recording") as file:
         groups = [name for name in ("truth", "signals", "estimates", "contour") if name in file]
         objects = [f"objects/{name}" for name in file["objects"]] if "objects" in file else []
-    needed = ["in_contact", "force", "moment"]
+    needed = ["in_contact", "force", "moment", *vb.pipeline.EVENTS]
     parts = {"/": vb.io.read_dataset(path, None, needed)}
     for group in (*groups, *objects):
         along = needed if group in ("truth", "signals", "estimates") else None

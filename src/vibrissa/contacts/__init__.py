@@ -28,6 +28,12 @@ from vibrissa.contacts.contacts import (
     friction_assumed,
 )
 from vibrissa.contacts.estimator import Estimator
+from vibrissa.contacts.events import (
+    SLIPPING as SLIPPING,
+    ContactEvents as ContactEvents,
+    Place as Place,
+    in_order as in_order,
+)
 from vibrissa.contacts.filter import ContactFilter, Followed as Followed
 from vibrissa.contacts.forward import Gravity, read_at_rest as read_at_rest
 from vibrissa.contacts.inversion import (

@@ -177,6 +177,19 @@ class Named:
         values = measurement.measured.tolist()
         return any(abs(values[i]) > above * sigma for i, sigma in self._noise)
 
+    def excess(self, measurement: Measurement) -> Array:
+        """Measurement (n,) in standard deviations of a free whisker's noise; empty without noise.
+
+        Sizes with their directions are two components, others what noise does not explain.
+        """
+        out: list[float] = []
+        for i, sigma in self._noise:
+            if sigma > 0.0:
+                values = measurement.target[i : i + 1 + (i in self._pairs)] / sigma
+                lone = i in self._sizes and i not in self._pairs
+                out += [math.sqrt(max(values[0] ** 2 - 2.0, 0.0))] if lone else values.tolist()
+        return np.array(out)
+
     def beyond(self, measurement: Measurement) -> bool:
         """Whether the signals are far larger than any on the map."""
         values = measurement.measured.tolist()
@@ -260,6 +273,10 @@ class Mixed:
         """Whether all readings together are so many standard deviations from zero."""
         size = float((measurement.measured**2).sum())
         return size > len(measurement.measured) - 1 + above**2
+
+    def excess(self, measurement: Measurement) -> Array:
+        """Measurement (n,) in standard deviations of the noise."""
+        return measurement.measured
 
     def beyond(self, measurement: Measurement) -> bool:
         """Whether the readings are far larger than any on the map."""

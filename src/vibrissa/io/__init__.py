@@ -84,6 +84,7 @@ from vibrissa.io.table import (
 from vibrissa.io.time_tables import (
     NUMBERED as NUMBERED,
     check_scale as check_scale,
+    events_in as events_in,
     holds_contour as holds_contour,
     load_contacts,
     load_signals,

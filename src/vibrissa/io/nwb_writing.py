@@ -27,6 +27,7 @@ import numpy as np
 
 from vibrissa.deferred import xr
 from vibrissa.io.paths import NWB, check_writable, replacing
+from vibrissa.io.time_tables import events_in
 from vibrissa.numerics import Array
 
 if TYPE_CHECKING:
@@ -201,6 +202,8 @@ def _fill(
         behavior.add(series)
     if "in_contact" in data:
         _add_contacts(file, data)
+    if predictors is not None:
+        _add_events(file, predictors)
 
 
 def _names(data: xr.Dataset) -> list[str]:
@@ -384,6 +387,23 @@ def _predictors(table: xr.Dataset, whisker: int, name: str, clock: dict[str, Any
         unit="n.a.",
         **clock,
     )
+
+
+def _add_events(file: NWBFile, table: xr.Dataset) -> None:
+    """Write onset, loss and slip of contacts, as intervals without duration."""
+    from pynwb.epoch import TimeIntervals
+
+    found = sorted(events_in(table))
+    if not found:
+        return
+    rows = TimeIntervals(name="contact_events", description="Onset, loss and slip of contacts")
+    rows.add_column("whisker", "Name of the whisker")
+    rows.add_column("event", "What happened: onset, loss or slip")
+    rows.add_column("sigma", "Standard deviation of an onset, s; NaN where it is not known")
+    for time, name, event, sigma in found:
+        known = {"whisker": _allowed(name), "event": event, "sigma": sigma}
+        rows.add_interval(start_time=time, stop_time=time, **known)
+    file.add_time_intervals(rows)
 
 
 def _add_contacts(file: NWBFile, data: xr.Dataset) -> None:

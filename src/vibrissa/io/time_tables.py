@@ -9,7 +9,9 @@ force, as |M| / |F| is at most the distance of the contact.
 
 Contact points as CSV: ``time, x, y, z, r, theta, phi, sigma_x, …, status``. In SI units and the
 whisker's frame; the status is written by its name, and missing is ``nan``. Estimates have a column
-``friction`` before the status, the same in all lines: what was assumed of it.
+``friction`` before the status, the same in all lines: what was assumed of it; and ``event`` (none,
+onset, loss, slip), with the time at which the present contact began, ``onset_time``, and its
+standard deviation ``onset_sigma``.
 
 Contour points as CSV: ``time, whisker, x, y, z, sigma_x, …``, a line for each contact. In SI units
 and the laboratory frame: the contact point on the whisker's centreline with its standard
@@ -25,7 +27,7 @@ and ``descriptions`` by column.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import zip_longest
 from os import PathLike
 from pathlib import Path
@@ -49,7 +51,7 @@ from vibrissa.io.table import (
 )
 from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
-from vibrissa.status import Status, flag_attributes
+from vibrissa.status import Event, Status, flag_attributes
 from vibrissa.whisker import Whisker
 
 # Names of the columns, in the order in which they are written.
@@ -300,8 +302,10 @@ def _dataset(table: Array) -> xr.Dataset:
 
 # Names of the columns with numbers, in their order; the last column is the status.
 NUMBERS = ("time", "x", "y", "z", "r", "theta", "phi", "sigma_x", "sigma_y", "sigma_z")
-# Columns before the status that are written where there is something to write.
-_OPTIONAL = ("one_contact", "friction")
+# Columns of numbers that are written where there is something to write.
+_OPTIONAL = ("one_contact", "friction", "onset_time", "onset_sigma")
+# Columns of words before the status, by the kind of word, also only where there are any.
+_FLAGS: dict[str, type[Status | Event]] = {"event": Event}
 
 
 def save_contacts(path: str | PathLike[str], contacts: xr.Dataset) -> None:
@@ -320,12 +324,16 @@ def save_contacts(path: str | PathLike[str], contacts: xr.Dataset) -> None:
     ValueError
         If a needed variable is not there, or one has another dim.
     """
-    names = (*NUMBERS, *(name for name in _OPTIONAL if name in contacts), "status")
-    *numbers, codes = _columns(contacts, "contacts", names, "time", ("status",))
-    words = [Status(int(code)).name.lower() for code in codes]
-    table = np.column_stack(numbers).tolist()
-    rows = ([*row, word] for row, word in zip(table, words, strict=True))
-    write_table(path, names, rows)
+    numbers = (*NUMBERS, *(name for name in _OPTIONAL if name in contacts))
+    flags = (*(name for name in _FLAGS if name in contacts), "status")
+    columns = _columns(contacts, "contacts", (*numbers, *flags), "time", ("status",))
+    table = np.column_stack(columns[: len(numbers)]).tolist()
+    words = [
+        [_FLAGS.get(name, Status)(int(code)).name.lower() for code in codes]
+        for name, codes in zip(flags, columns[len(numbers) :], strict=True)
+    ]
+    rows = ([*row, *word] for row, *word in zip(table, *words, strict=True))
+    write_table(path, (*numbers, *flags), rows)
 
 
 def _columns(
@@ -356,14 +364,45 @@ def load_contacts(path: str | PathLike[str]) -> xr.Dataset:
     xarray.Dataset
         Dim time; a variable for each column, ``status`` as its number.
     """
-    numbers = (*NUMBERS, *(name for name in _OPTIONAL if name in Table(path).names))
-    table = Table(path, (*numbers, "status"))
-    codes = [Status.__members__.get(name.upper()) for name in table.text("status")]
-    table.refuse(np.array([code is None for code in codes], dtype=bool), "no contact")
+    there = Table(path).names
+    numbers = (*NUMBERS, *(name for name in _OPTIONAL if name in there))
+    flags = (*(name for name in _FLAGS if name in there), "status")
+    table = Table(path, (*numbers, *flags))
     columns = {name: xr.Variable("time", table.numbers(name), attributes(name)) for name in numbers}
-    about = {**attributes("status"), **flag_attributes()}
-    columns["status"] = xr.Variable("time", np.array(codes, dtype=np.int8), about)
+    for flag in flags:
+        kind = _FLAGS.get(flag, Status)
+        codes = [kind.__members__.get(name.upper()) for name in table.text(flag)]
+        table.refuse(np.array([code is None for code in codes], dtype=bool), "no contact")
+        about = {**attributes(flag), **flag_attributes(kind)}
+        columns[flag] = xr.Variable("time", np.array(codes, dtype=np.int8), about)
     return xr.Dataset({k: v for k, v in columns.items() if k != "time"}, {"time": columns["time"]})
+
+
+def events_in(contacts: xr.Dataset) -> Iterator[tuple[float, str, str, float]]:
+    """List the events of contacts, frame by frame.
+
+    Parameters
+    ----------
+    contacts : xarray.Dataset
+        Group ``estimates`` of a recording, or predictors.
+
+    Yields
+    ------
+    (float, str, str, float)
+        Time, s, name of the whisker, ``onset``, ``loss`` or ``slip``, and the standard deviation of
+        an onset, s, NaN where it is not known; nothing where there are no events.
+    """
+    if "event" not in contacts:
+        return
+    names = ("event", "onset_time", "onset_sigma")
+    codes, begun, sigma = (contacts[one].transpose("time", "whisker").values for one in names)
+    time, whiskers = contacts["time"].values, contacts["whisker"].values
+    for i, k in np.argwhere(codes != Event.NONE).tolist():
+        event, name = Event(int(codes[i, k])), str(whiskers[k])
+        if event == Event.ONSET:
+            yield float(begun[i, k]), name, "onset", float(sigma[i, k])
+        else:
+            yield float(time[i]), name, event.name.lower(), np.nan
 
 
 # Names of the columns, in their order.
@@ -436,9 +475,10 @@ def _text(table: xr.Dataset, columns: dict[str, xr.DataArray]) -> str:
 
 
 def _plain(name: str, values: np.ndarray) -> list[list[object]]:
-    """Numbers as they are written: flags as 0 and 1, statuses by name."""
-    if name == "status":
-        return [[Status(int(code)).name.lower() for code in row] for row in values]
+    """Numbers as they are written: flags as 0 and 1, statuses and events by name."""
+    kind = Status if name == "status" else _FLAGS.get(name)
+    if kind is not None:
+        return [[kind(int(code)).name.lower() for code in row] for row in values]
     found: list[list[object]] = (values.astype(int) if values.dtype == bool else values).tolist()
     return found
 
@@ -453,6 +493,7 @@ def _write_matlab(path: PathLike[str], table: xr.Dataset, columns: dict[str, xr.
         "units": {name: one.attrs["units"] for name, one in columns.items()},
         "descriptions": {name: meaning(one) for name, one in columns.items()},
         "statuses": {status.name.lower(): int(status) for status in Status},
+        "events": {event.name.lower(): int(event) for event in Event},
         **{name: one.values for name, one in columns.items()},
     }
     savemat(path, content, appendmat=False, long_field_names=True, oned_as="column")

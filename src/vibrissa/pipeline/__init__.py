@@ -7,6 +7,11 @@ from vibrissa.pipeline.estimates import (
     in_laboratory as in_laboratory,
     swept_recording as swept_recording,
 )
+from vibrissa.pipeline.events import (
+    EVENTS as EVENTS,
+    contact_events,
+    with_events as with_events,
+)
 from vibrissa.pipeline.frames import (
     check_recording as check_recording,
     whisker_radii as whisker_radii,
@@ -33,7 +38,6 @@ from vibrissa.pipeline.reconstruct import (
 )
 from vibrissa.pipeline.signals import (
     Source as Source,
-    contact_events,
     default_source as default_source,
     placed_by,
     sensor_noise as sensor_noise,

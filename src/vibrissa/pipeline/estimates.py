@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from vibrissa.contacts import ContactMap, Gravity, Prior
 from vibrissa.contour import continuing_candidates, to_laboratory
 from vibrissa.numerics import Array
+from vibrissa.pipeline.events import EVENTS, with_events
 from vibrissa.pipeline.frames import cross_matrices, signals_in
 from vibrissa.pipeline.locate import TRIPLET, locate, locate_from_wrench, without_contact
 from vibrissa.pipeline.signals import sensor_noise
@@ -51,6 +52,7 @@ _KEPT = (
     "candidates",
     "in_contact",
     "status",
+    *EVENTS,
 )
 
 
@@ -117,8 +119,9 @@ def estimates_of(
         ``normal_covariance``, and ``point_normal_covariance``; in the whisker's frame
         ``contact_point_whisker`` with ``covariance``, ``arc_length`` and ``force``; how many
         ``candidates`` there were, of which the one that continues its neighbours in time is chosen;
-        ``in_contact`` (detected) and ``status``. Attributes ``signals``, ``source`` and
-        ``felt_above``, M_B from which contacts are detected, N·m, and ``friction``, as of
+        ``in_contact`` (detected) and ``status``; ``event`` (onset, loss or slip), and when each
+        contact began, ``onset_time`` with ``onset_sigma``, s. Attributes ``signals``, ``source``
+        and ``felt_above``, M_B from which contacts are detected, N·m, and ``friction``, as of
         `vibrissa.contacts.Contacts`. Frames whose signals have no
         answer keep the status that states the reason.
 
@@ -224,12 +227,12 @@ def _one_whisker(
     if other_noise:
         # The noise is that of another instrument, without correlation with the pose.
         pose.pop("pose_wrench_covariance", None)
-    placed = in_laboratory(
-        found, known["base_rotation"], known["base_position"], **pose, wrench_shared=shared
-    )
+    held = known["base_rotation"], known["base_position"]
+    placed = in_laboratory(found, *held, **pose, wrench_shared=shared)
     own = signals["status"].values
     status = np.where(is_ok(own), placed["status"].values, own).astype(np.int8)
     placed["status"] = placed["status"].copy(data=status)
+    placed = with_events(placed, "contact_point", "contact_covariance", held)
     return placed[[name for name in _KEPT if name in placed]]
 
 
@@ -379,5 +382,7 @@ def contact_columns(contacts: xr.Dataset) -> xr.Dataset:
     assumed = np.full(len(values), contacts.attrs["friction"])
     columns["friction"] = ("time", assumed, attributes("friction"))
     table = xr.Dataset(columns, {"time": contacts["time"]}, contacts.attrs)
-    kept = ("one_contact", "status")
+    if "event" not in contacts:
+        contacts = with_events(contacts, "contact_point_whisker", "covariance")
+    kept = ("one_contact", "status", *EVENTS)
     return table.assign({name: contacts[name] for name in kept if name in contacts})

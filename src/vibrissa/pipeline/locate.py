@@ -83,13 +83,14 @@ class _Candidates(NamedTuple):
     contact_forces: Array
     number: NDArray[np.int64]
     status: NDArray[np.int64]
+    valid: NDArray[np.bool_]
 
     @classmethod
     def of(cls, found: Contacts) -> Self:
         """Candidates of estimates."""
         one = found.candidates
         arrays = (one.point, one.arc_length, one.force, one.contact_force)
-        return cls(*arrays, found.n_candidates, found.status)
+        return cls(*arrays, found.n_candidates, found.status, found.covariance_valid)
 
 
 def locate(
@@ -141,7 +142,8 @@ def locate(
         Contacts of all frames of ``wrench``, dimension time: ``contact_point_whisker`` with
         ``covariance``, ``arc_length``, ``force`` at the base by the model of the contact, the same
         of all candidates (``candidate_points``, ``candidate_covariance``, ...), their number
-        ``candidates``, ``in_contact`` (detected) and ``status``; ``candidate_gain``, the
+        ``candidates``, ``in_contact`` (detected) and ``status``; what `with_events` needs;
+        ``candidate_gain``, the
         derivatives of the candidates with respect to the wrench, and ``wrench_covariance``, the
         covariance of the wrench by noise and errors. Covariances are those of the exact method in
         every method. Frames without detected contact are NaN, with the status ``NOT_FELT``, or
@@ -188,7 +190,7 @@ def without_contact(
     if measured.rows.any():
         return None
     points, numbers = np.empty((0, 1, 3)), np.empty(0, dtype=np.int64)
-    none = _Candidates(points, points[..., 0], points, points, numbers, numbers)
+    none = _Candidates(points, points[..., 0], points, points, numbers, numbers, numbers > 0)
     return _located(whisker, selection(triplet), measured, none)
 
 
@@ -293,9 +295,11 @@ class _Measured(NamedTuple):
     """Measured force and moment (n, 3), and their covariance (n, 6, 6), NaN if not known.
 
     Also the frames (n,) in which they are known, in which a contact is detected and in which there
-    is none; the typical noise (6, 6) of the frames, if there is any; errors that all frames share
-    (k, 6, 7); M_B from which contacts are detected, N·m; whether all frames have the same noise;
-    and under gravity the rotations (n, 3, 3) of the base in those frames, if they are known.
+    is none; what exceeds a free whisker's (n, 6), in standard deviations, or (n, 0) where not that
+    decides what is a contact; the typical noise (6, 6) of the frames, if there is any; errors that
+    all frames share (k, 6, 7); M_B from which contacts are detected, N·m; whether all frames have
+    the same noise; and under gravity the rotations (n, 3, 3) of the base in those frames, if they
+    are known.
     """
 
     time: xr.Variable
@@ -305,6 +309,7 @@ class _Measured(NamedTuple):
     known: NDArray[np.bool_]
     rows: NDArray[np.bool_]
     free: NDArray[np.bool_]
+    excess: Array
     typical: Array | None
     errors: Array
     above: float
@@ -325,11 +330,11 @@ class _Measured(NamedTuple):
         n = len(force)
         covariance = _noise_of_frames(noise, n)
         known = np.isfinite(force.sum(axis=1) + moment.sum(axis=1))
-        bending, rotation = moment, None
+        excess, rotation = np.concatenate([force, moment], axis=1), None
         if gravity is not None and whisker is not None:
             rotation = Group(wrench)["base_rotation"] if "base_rotation" in wrench else None
-            bending = moment - read_at_rest(whisker, gravity, rotation, n)[:, 3:]
-        size = np.hypot(bending[:, 1], bending[:, 2])
+            excess = excess - read_at_rest(whisker, gravity, rotation, n)
+        size = np.hypot(excess[:, 4], excess[:, 5])
         least = 0.0 * size
         if noise is not None:
             least = DETECTED * np.sqrt(0.5 * (covariance[:, 4, 4] + covariance[:, 5, 5]))
@@ -348,6 +353,8 @@ class _Measured(NamedTuple):
         typical, steady = None, bool((covariance == covariance[:1]).all())
         if noise is not None:
             typical = covariance[0] if steady else _typical(covariance[rows])
+        by_size = typical is not None and "in_contact" not in wrench
+        excess = excess @ whitening(typical).T if by_size and typical is not None else excess[:, :0]
         shared = common_errors(**_of_wrench(errors))
         if len(shared):
             whole = np.concatenate([force, moment], axis=1)
@@ -363,6 +370,7 @@ class _Measured(NamedTuple):
             known,
             rows,
             free,
+            excess,
             typical,
             shared,
             above,
@@ -467,9 +475,14 @@ def _located(
     )
     data["candidates"] = ("time", number, attributes("candidates"))
     data["in_contact"] = ("time", rows, attributes("in_contact"))
+    valid = np.zeros(rows.size, dtype=np.bool_)
+    valid[rows] = found.valid
+    data["covariance_valid"] = ("time", valid, attributes("covariance_valid"))
+    data["excess"] = (("time", "reading"), measured.excess)
     data["status"] = ("time", status, {**attributes("status"), **flag_attributes()})
     assumed = np.inf if names == WRENCH else friction
     about = {"triplet": " ".join(names), "felt_above": measured.above, "friction": assumed}
+    about["length"] = whisker.length
     return xr.Dataset(data, {"time": measured.time, "space": list("xyz")}, about)
 
 

@@ -13,10 +13,11 @@ import xarray as xr
 
 from vibrissa.contacts import friction_assumed
 from vibrissa.numerics import Array
+from vibrissa.pipeline.events import EVENTS
 from vibrissa.quantities import attributes
 from vibrissa.recording import ONE_VIEW, Recording
 from vibrissa.signals import base_signals
-from vibrissa.status import flag_attributes
+from vibrissa.status import Event, flag_attributes
 from vibrissa.whisker import angles_of
 
 _COMPONENTS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
@@ -51,9 +52,9 @@ def predictors(recording: xr.DataTree) -> xr.Dataset:
         Variables over (time, whisker), SI units, each with ``units``, ``long_name`` and
         ``description``: the six components of force and moment, the signals, the angles of the
         base and its position, the rates of change of components and angles, the contact point in
-        the laboratory and its arc length, ``in_contact``, ``status`` and ``confidence``. The
-        attribute ``predictors`` names the 16 of models of spikes, of a trial that was filmed by one
-        camera the 8 that it shows. Missing is NaN.
+        the laboratory and its arc length, ``in_contact``, ``status``, ``confidence``, ``event`` and
+        ``onset_time`` with ``onset_sigma``. The attribute ``predictors`` names the 16 of models of
+        spikes, of a trial that was filmed by one camera the 8 that it shows. Missing is NaN.
 
     Raises
     ------
@@ -91,6 +92,7 @@ def predictors(recording: xr.DataTree) -> xr.Dataset:
         "in_contact": record.known("in_contact", _GROUPS),
         "status": record.known("status", ("estimates", *_GROUPS)),
         "confidence": record.known("confidence", ("",)),
+        **{name: record.known(name, ("estimates",)) for name in EVENTS},
     }
     columns |= {name: values for name, values in others.items() if values is not None}
     data = {
@@ -128,6 +130,8 @@ def _about(name: str) -> dict[str, object]:
     """Unit and meaning of a column."""
     if name == "status":
         return {**attributes(name), **flag_attributes()}
+    if name == "event":
+        return {**attributes(name), **flag_attributes(Event)}
     plain = name.removesuffix(_RATE)
     if plain != name:
         known = attributes(plain)

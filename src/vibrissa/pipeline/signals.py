@@ -36,9 +36,8 @@ from vibrissa.pipeline.frames import (
     one_whisker,
     with_coordinates,
 )
-from vibrissa.pipeline.inertia import contacts_in, without_inertia
+from vibrissa.pipeline.inertia import without_inertia
 from vibrissa.pipeline.locate import DETECTED, wrench_slopes
-from vibrissa.quantities import attributes
 from vibrissa.recording import Group, Recording, recorded
 from vibrissa.rod import PROXIMAL, PointContact, deflect
 from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE, Sensor, component_noise
@@ -457,33 +456,3 @@ def signals_by_point(
         "pose_wrench_covariance": both @ np.swapaxes(slopes, 1, 2),
     }
     return data.assign({name: recorded(name, square) for name, square in squares.items()})
-
-
-def contact_events(signals: xr.Dataset) -> xr.Dataset:
-    """List contacts, from onset to release.
-
-    Parameters
-    ----------
-    signals : xarray.Dataset
-        Signals of a recording, as of `signals_of`; with ``dynamics`` inertia does not count.
-
-    Returns
-    -------
-    xarray.Dataset
-        Dimension ``contact``, in order of time: name of the ``whisker``, ``onset`` and ``release``,
-        s, NaN where the recording begins or ends in contact, and ``largest_force``, N.
-    """
-    time, rows = signals["time"].values, []
-    for k, name in enumerate(signals["whisker"].values):
-        one = signals.isel(whisker=k)
-        size = np.linalg.norm(one["force"].values, axis=-1)
-        for first, end in contacts_in(one["in_contact"].values.astype(bool)):
-            onset = time[first] if first else np.nan
-            release = time[end] if end < len(time) else np.nan
-            rows.append((first, str(name), onset, release, np.nanmax(size[first:end])))
-    rows.sort()
-    names, *numbers = zip(*(row[1:] for row in rows), strict=True) if rows else [()] * 4
-    data: dict[str, Any] = {"whisker": ("contact", list(names))}
-    for name, values in zip(("onset", "release", "largest_force"), numbers, strict=True):
-        data[name] = ("contact", np.array(values), attributes(name))
-    return xr.Dataset(data)

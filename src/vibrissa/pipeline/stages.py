@@ -6,6 +6,7 @@ Nothing else changes, and the recording that was passed stays as it is.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +16,7 @@ import xarray as xr
 
 from vibrissa.contacts import friction_assumed
 from vibrissa.contour import shape_from_dataset
+from vibrissa.io import events_in
 from vibrissa.pipeline.estimates import Progress, estimates_of
 from vibrissa.pipeline.frames import check_recording
 from vibrissa.pipeline.reconstruct import reconstruct
@@ -141,8 +143,8 @@ class TrialSummary:
     """Summary of a recording: what it is in words, numbers of frames and contacts, SI units.
 
     ``in_contact`` and ``contacts``, frames in contact and uninterrupted contacts of all whiskers,
-    are None where that is not known; ``estimated`` counts frames and whiskers with an estimate, and
-    ``assumption`` is what these assume of friction.
+    are None where that is not known; ``estimated`` counts frames and whiskers with an estimate,
+    ``assumption`` is what these assume of friction, and ``events`` counts onsets, losses and slips.
     """
 
     origin: str
@@ -155,6 +157,7 @@ class TrialSummary:
     largest_moment: float
     estimated: int
     assumption: str
+    events: Counter[str]
     stages: tuple[str, ...]
     fitted: str
     known: str
@@ -174,11 +177,12 @@ def summarise(recording: xr.DataTree) -> TrialSummary:
     largest = {
         name: _largest(record.known(name, _BEFORE), touching) for name in ("force", "moment")
     }
-    estimated, assumption = 0, ""
+    estimated, assumption, events = 0, "", Counter[str]()
     if (estimates := record.find("estimates")) and "in_contact" in estimates:
         estimated = int(estimates["in_contact"].sum())
         if "friction" in (about := estimates.data.attrs):
             assumption = friction_assumed(float(about["friction"]))
+        events = Counter(event for _, _, event, _ in events_in(estimates.data))
     fitted, distance = "", np.nan
     if "contour" in recording.children:
         contour = recording["contour"].to_dataset()
@@ -197,6 +201,7 @@ def summarise(recording: xr.DataTree) -> TrialSummary:
         largest_moment=largest["moment"],
         estimated=estimated,
         assumption=assumption,
+        events=events,
         stages=tuple(stage for stage in STAGES if stage in recording.children),
         fitted=fitted,
         known="; ".join(known.in_words() for known in record.objects),

@@ -50,6 +50,7 @@ _ORDER = (
     "whiskers",
     "figures",
     "movies",
+    "events",
     "statuses",
     "recording",
     "settings",

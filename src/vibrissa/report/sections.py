@@ -17,6 +17,7 @@ from vibrissa.contacts import ContactMap, friction_assumed
 from vibrissa.contour import shape_from_dataset
 from vibrissa.display import show
 from vibrissa.identifiability import verdict_rows
+from vibrissa.io import events_in
 from vibrissa.numerics import Array
 from vibrissa.pipeline import compare_contacts, distances_by_class
 from vibrissa.quantities import QUANTITIES, quantity, shown_unit, to_display
@@ -42,6 +43,7 @@ _NOTHING = "None of this whisker's true contacts was detected, so there is nothi
 
 _SIGNAL_NAMES = {"wrench": "all components of force and moment"}
 
+_MOST_EVENTS = 60
 _SUSPECT = 1.5  # misfit above which another shape may fit better
 
 
@@ -66,6 +68,8 @@ def trial_sections(recording: xr.DataTree, whisker: int = 0, seed: int = 0) -> l
         parts += _against_truth(recording, groups, truth, true_whisker, seed)
     if "contour" in recording.children:
         parts.append(Section("contour", "Contour", _contour(recording, seed)))
+    happened = _events(recording)
+    parts += [Section("events", "Events", happened)] if happened else []
     counted = _statuses(groups)
     return [*parts, Section("statuses", "Statuses", counted)] if counted else parts
 
@@ -450,6 +454,22 @@ def _distances(recording: xr.DataTree, seed: int) -> str:
         caption = f"Distance of contacts from the known object, by {known.long_name}"
         parts.append(table(rows, heading, caption))
     return "".join(parts) + paragraph("* what the covariance of the contacts predicts", "note")
+
+
+def _events(recording: xr.DataTree) -> str:
+    """Onset, loss and slip of contacts of all whiskers, with their times."""
+    group = Recording(recording).find("estimates")
+    found = [] if group is None else sorted(events_in(group.data))
+    rows = []
+    for time, name, event, sigma in found[:_MOST_EVENTS]:
+        when = f"{time:.4f} s" if np.isnan(sigma) else with_sigma("time", time, sigma)[0]
+        rows.append((f"{event} {name}", when, shown_value("onset_sigma", sigma, 2)))
+    if not rows:
+        return ""
+    note = "An onset is dated by the readings from then on, with its standard deviation."
+    if len(found) > len(rows):
+        note += f" The first {len(rows)} of {len(found)} are shown; `vibrissa export` writes all."
+    return table(rows, ("event", "time", "σ"), "Onset, loss and slip of contacts", note)
 
 
 def _statuses(groups: dict[str, xr.Dataset | None]) -> str:

@@ -11,23 +11,24 @@ from typing import Any
 
 import numpy as np
 
-from vibrissa.contacts import Contact, ContactFilter, Estimator, Followed
+from vibrissa.contacts import (
+    SLIPPING,
+    Contact,
+    ContactEvents,
+    ContactFilter,
+    Estimator,
+    Followed,
+    Place,
+)
 from vibrissa.numerics import Array
 from vibrissa.rod import PointForce, deflect
 from vibrissa.sensors import GRAVITY
 from vibrissa.signals import SIGNALS, signals_of
+from vibrissa.status import Event
 from vibrissa.streaming.lines import FRAME, LineKind, Lines, Poses, Sample
 
 _ANEW = 1.0  # time that falls by more than this comes from a sender that has begun anew, s
 _SLOW = 100.0  # samples farther apart than this seem to have times in a smaller unit, s
-# A contact point slips if its step is larger than all but one in a thousand of noise (χ², three
-# degrees of freedom), in samples that are not farther apart than this, s.
-_BEYOND_NOISE, _NEXT = 16.27, 0.5
-_HALVINGS = 30  # halvings of an interval of 80 in the logarithm of a multiplier
-_SETTLING = 0.01  # slips that follow each other within this time are one, s
-_NO_VARIANCE = 1e-15  # share of the largest variance below which there is none
-# Lengths of the whisker that a contact point moves in a second from which it slips, by default.
-_SLIPPING = 2.0
 # Statuses that show neither that something is touched nor that nothing is.
 _SILENT = ("missing", "tare", "degenerate")
 _MESSAGE = 400  # longest message about a line that cannot be read; it may quote the line
@@ -95,10 +96,8 @@ class ContactStream:
         self.lines = Lines(*choices, raw=bool(names), whisker=whisker)
         self.whisker = whisker
         if slip_speed is None:
-            slip_speed = _SLIPPING * estimator.contact_map.whisker.length
-        if not slip_speed > 0.0:
-            raise ValueError(f"the speed of a slip is positive, m/s; got {slip_speed!r}")
-        self._events = _Events(slip_speed)
+            slip_speed = SLIPPING * estimator.contact_map.whisker.length
+        self._events = ContactEvents(slip_speed)
         self.samples, self.faults = 0, 0
         self._estimator, self._follow = estimator, follow
         self.friction = estimator.friction
@@ -127,8 +126,8 @@ class ContactStream:
         dict
             Record for JSON: ``time``, ``status`` and the contact, with the line's ``stamp_ns``,
             ``recorded_ns`` and ``frame_id`` as they are; ``whisker``, if it has a name, and
-            ``event`` (``onset``, ``loss`` or ``slip``) of a sample with one; or ``line`` and
-            ``error``.
+            ``event`` (``onset``, ``loss`` or ``slip``) of a sample with one; in contact
+            ``onset_time`` and ``onset_sigma``, when it began; or ``line`` and ``error``.
         """
         for line in lines:
             try:
@@ -232,9 +231,9 @@ class ContactStream:
             wrench = np.zeros(6)
             wrench[[COMPONENTS.index(name) for name in sample.names]] = values
             values = signals_of(wrench[:3], wrench[3:])[self._which]
-        place: Array | None
+        measurement = self._estimator.measurement(values, rotation, gravity)
         if self._follow is None:
-            found = self._estimator(values, rotation, gravity)
+            found = self._estimator.locate(measurement)
             known |= located_record(found)
             place, spread = found.point, found.covariance
             reliable = found.covariance_valid or not self._estimator.noisy
@@ -246,8 +245,17 @@ class ContactStream:
             followed = self._follow(time, values, rotation, position, gravity)
             known |= followed_record(followed, rotation)
             place, spread, reliable = followed.point, followed.covariance, True
-        event = self._events(time, known["status"], place, spread, reliable)
-        return known if event is None else known | {"event": event}
+        status = known["status"]
+        event = self._events(
+            time,
+            None if status in _SILENT else status != "not_felt",
+            self._estimator.readout.excess(measurement),
+            Place(place, spread, reliable, rotation, position) if status == "unique" else None,
+        )
+        if event != Event.NONE:
+            known["event"] = event.name.lower()
+        begun, sigma = self._events.onset
+        return known | ({"onset_time": begun, "onset_sigma": sigma} if begun == begun else {})
 
     def _put(self, sample: Sample) -> None:
         """Remember a pose that came alone."""
@@ -276,76 +284,6 @@ class ContactStream:
         if len(self._free) == self._tare:
             self._offset = np.mean(self._free, axis=0)
         return "tare"
-
-
-class _Events:
-    """Onset, loss and slip of a contact, sample by sample."""
-
-    def __init__(self, slip_speed: float) -> None:
-        self._slip_speed = slip_speed
-        self.forget()
-
-    def forget(self) -> None:
-        """Begin anew, with a free whisker."""
-        self._touching = False
-        self._last: tuple[float, Array, Array] | None = None
-        self._slipped = -math.inf
-
-    def __call__(
-        self, time: float, status: str, point: Array, covariance: Array, reliable: bool
-    ) -> str | None:
-        """Take a sample, and whether its covariance is valid: what happened, if anything."""
-        if status in _SILENT:
-            return None
-        before, self._touching = self._touching, status != "not_felt"
-        last, slips = self._last, False
-        if not self._touching:
-            self._last = None
-        elif status == "unique" and np.isfinite(point).all():
-            # A valley that bends leaves its ellipsoid, but hardly a ball as large.
-            ball = np.trace(covariance) * np.eye(3)
-            self._last = time, point, covariance if reliable else ball
-            slips = last is not None and self._slips(last, self._last)
-        if before != self._touching:
-            return "onset" if self._touching else "loss"
-        if not slips:
-            return None
-        # What has slipped settles, or rings, for some samples.
-        settling, self._slipped = time - self._slipped < _SETTLING, time
-        return None if settling else "slip"
-
-    def _slips(self, last: tuple[float, Array, Array], now: tuple[float, Array, Array]) -> bool:
-        """Whether the point moved faster than anything slides, and farther than noise moves it."""
-        step, moved = now[0] - last[0], now[1] - last[1]
-        if not 0.0 < step < _NEXT or math.hypot(*moved.tolist()) < self._slip_speed * step:
-            return False
-        spread = now[2] + last[2]
-        if not np.isfinite(spread).all():  # noise is not known
-            return True
-        variance, axes = np.linalg.eigh(spread)
-        known = variance > _NO_VARIANCE * variance[-1]
-        along = moved @ axes
-        if (along[known] ** 2 / variance[known]).sum() <= _BEYOND_NOISE:
-            return False
-        away = _beyond(along.tolist(), variance.tolist(), self._slip_speed * step)[known]
-        return bool((away**2 / variance[known]).sum() > _BEYOND_NOISE)
-
-
-def _beyond(moved: list[float], variance: list[float], reach: float) -> Array:
-    """What is left of a displacement, along its axes, of which a reach that it exceeds is sliding.
-
-    The part that slides is moved / (1 + λ variance), where λ makes it as long as the reach: that
-    leaves the least χ².
-    """
-    largest = max(variance[-1], 1e-300)
-    parts = [(m, max(v, 0.0) / largest) for m, v in zip(moved, variance, strict=True)]
-    low, high, slid = -40.0, 40.0, moved
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        factor = math.exp(middle)
-        slid = [m / (1.0 + factor * v) for m, v in parts]
-        low, high = (middle, high) if math.hypot(*slid) > reach else (low, middle)
-    return np.subtract(moved, slid)
 
 
 class ContactStreams:

@@ -164,14 +164,27 @@ def test_traces_are_trusted_as_far_as_their_residuals_allow():
     for k in range(1, 48):
         noise[:, k] = share * noise[:, k - 1] + np.sqrt(1.0 - share**2) * noise[:, k]
     together = (1.0 + share) / (1.0 - share)
-    found = trace_variance([2.0 * noise], np.zeros(200), 0.04)
+    (found,) = trace_variance([2.0 * noise], np.zeros(200), 0.04)
     assert np.median(found) == pytest.approx(4.0 * together, rel=0.25)
     noise[7] *= 10.0
-    assert trace_variance([2.0 * noise], np.zeros(200), 0.04)[7] > 10.0 * np.median(found)
+    (worse,) = trace_variance([2.0 * noise], np.zeros(200), 0.04)
+    assert (worse[7] > 10.0 * np.median(found)).all()
     # Where they are smaller than was claimed, that counts as well, to a limit.
-    finer = trace_variance([0.3 * noise[:7]], np.zeros(7), 0.04)
+    (finer,) = trace_variance([0.3 * noise[:7]], np.zeros(7), 0.04)
     assert np.median(finer) == pytest.approx(0.09 * together, rel=0.25)
-    assert (trace_variance([0.01 * noise[:5]], np.zeros(5), 0.04) > 1e-3).all()
+    assert (trace_variance([0.01 * noise[:5]], np.zeros(5), 0.04)[0] > 1e-3).all()
+
+
+def test_parts_of_a_whisker_are_trusted_as_far_as_their_residuals_allow():
+    """The last quarter of one view scatters three times as much as all else."""
+    noise = np.random.default_rng(0).normal(size=(2, 100, 48))
+    noise[1, :, 36:] *= 3.0
+    first, second = trace_variance(list(noise), np.zeros(100), 0.04)
+    for view, points, expected in ((first, slice(0, 48), 1.0), (second, slice(0, 34), 1.0)):
+        assert np.median(view[:, points]) == pytest.approx(expected, rel=0.25)
+    assert np.median(second[:, 38:48]) == pytest.approx(9.0, rel=0.25)
+    same = trace_variance(list(noise), np.zeros(100), 0.04, even=True)
+    assert all(np.ptp(view, axis=1).max() == 0.0 for view in same)
 
 
 def test_frames_that_the_rod_does_not_explain_are_noted(filmed):

@@ -88,12 +88,13 @@ def test_the_contact_nearest_to_the_object_agrees(nodding, recording):
 
 
 def test_contacts_of_poor_traces_are_on_a_known_object(nodding, traces):
-    """Traces that waver by half a pixel: without the object contacts are somewhere near it."""
+    """Traces that waver by more than a pixel: without the object contacts are somewhere near it."""
     random = np.random.default_rng(4)
 
     def wavering(trace):
         share = np.linspace(0.0, 1.0, len(trace.line))
-        wave = np.cos(3.0 * np.pi * share[:, None]) * random.normal(0.0, 0.5, 2)
+        phase = random.uniform(0.0, np.pi)
+        wave = np.cos(3.0 * np.pi * share[:, None] + phase) * random.normal(0.0, 1.4, 2)
         return trace._replace(line=trace.line + wave)
 
     poor = [[[wavering(trace) for trace in row] for row in view] for view in traces]

@@ -416,7 +416,7 @@ def _length(fitter: Fitter, shape: RestShape, options: TrackOptions) -> Length:
     curves = np.full_like(fitter.curves, np.nan)
     curves[rows] = fitter.curves[rows]
     some = replace(fitter, curves=curves)
-    cost = some.costs()
+    cost = some.costs(shape.length)
 
     def of(length: float) -> float:
         longer = lengthened(shape, length)

@@ -142,16 +142,23 @@ class Fitter:
         found = _answer(problem, state, linear, nodes, unsure)
         return _whole(_in_laboratory(found, problem.head), problem.frames, len(self.curves))
 
-    def costs(self) -> Callable[[Whisker, BasePose], float]:
-        """Give the function that compares whiskers by how well they explain the traces."""
+    def costs(self, shown: float) -> Callable[[Whisker, BasePose], float]:
+        """Give the function that compares whiskers by how well they explain the traces.
+
+        Whiskers of all lengths are compared with the same part of the traces, up to the arc length
+        ``shown``, m: a longer one would also have to explain the wandering ends of longer traces.
+        """
         before: tuple[Problem, State] | None = None
+        traces = replace(self.traces, ends=self.traces.ends * [1.0, 0.0])
 
         def cost(whisker: Whisker, pose: BasePose) -> float:
             nonlocal before
-            problem = self._problem(whisker, pose)
+            share = min(shown / whisker.length, 1.0)
+            problem = replace(replace(self, traces=traces)._problem(whisker, pose), shown=share)
             if before is None:
-                # The first decides how far the traces are to be trusted.
-                problem, state, linear = problem.trusted()
+                # The first decides how far the traces are to be trusted, but not where: a wrong
+                # length leaves most where it shows.
+                problem, state, linear = problem.trusted(even=True)
             else:
                 other, state = before
                 begun = state.scaled(other.d.length / problem.d.length)
@@ -227,15 +234,16 @@ class Problem:
     head: HeadPose
     objects: Sequence[Surface] = ()
     begun: State | None = None
-    variance: Array | None = None
+    variance: list[Array] | None = None
+    shown: float = 1.0
 
-    def trusted(self) -> tuple[Problem, State, _Linear]:
+    def trusted(self, even: bool = False) -> tuple[Problem, State, _Linear]:
         """The problem with traces that are trusted as far as they deserve, and its solution."""
         state, fit = self.solved()
         fitted = np.einsum("tij,tji->t", fit.smoother.covariances(), fit.data)
-        variance = trace_variance(fit.misses, fitted, self.options.sharpest**2)
+        variance = trace_variance(fit.misses, fitted, self.options.sharpest**2, even)
         problem = replace(self, begun=state, variance=variance)
-        return (problem, *((state, fit) if (variance == 1.0).all() else problem.solved()))
+        return (problem, *problem.solved())
 
     def solved(self) -> tuple[State, _Linear]:
         """Gauss–Newton with Levenberg's damping."""
@@ -264,7 +272,7 @@ class Problem:
 
     def linear(self, state: State) -> _Linear:
         """Linearise at a state; rods that are not in balance count as infinitely far away."""
-        points, slopes = bent(self.d, state, self.touching)
+        points, slopes = bent(self.d, state, self.touching, self.shown)
         wild = ~(np.abs(slopes).max(axis=(1, 2, 3)) < _WILD)
         points[wild], slopes[wild] = state.position[wild, None], 0.0
         points = self.head.put_in(points * self.d.length)
@@ -272,29 +280,30 @@ class Problem:
         with_ends = np.concatenate([slopes, slopes[:, [0, -1]]], axis=1)
         hessian = np.zeros((len(points), UNKNOWNS, UNKNOWNS))
         gradient = np.zeros((len(points), UNKNOWNS))
-        total, count = np.zeros(len(points)), np.zeros(len(points))
-        weight = np.ones(len(points)) if self.variance is None else 1.0 / self.variance
+        total, count, weighted = np.zeros((3, len(points)))
         along, ends, designs, weights = [], [], [], []
         for view, camera in enumerate(self.cameras):
             pixels, by_point = camera.project_with_slopes(points)
             rows, misses, sharp = self.traces.equations(view, pixels, by_point * self.d.length)
             design = np.einsum("tni,tnij->tnj", rows, with_ends)
-            hessian += np.einsum("tni,tnj->tij", design, design)
-            gradient += np.einsum("tni,tn->ti", design, misses)
+            weight = np.ones(misses.shape) if self.variance is None else 1.0 / self.variance[view]
+            trusted = design * weight[..., None]
+            hessian += np.einsum("tni,tnj->tij", trusted, design)
+            gradient += np.einsum("tni,tn->ti", trusted, misses)
+            weighted += (weight * misses**2).sum(axis=1)
             total += (misses**2).sum(axis=1)
             count += (misses != 0.0).sum(axis=1)
             # The last two are errors of the ends along the trace.
             along.append(np.where(wild[:, None], 0.0, misses[:, :-2]))
             ends.append(misses[:, -2:])
-            designs.append(design * weight[:, None, None])
+            designs.append(trusted)
             weights.append(sharp)
         misfit = np.sqrt(total / np.maximum(count, 1.0))
-        total[wild] = np.inf
-        data = hessian * weight[:, None, None]
-        smoother = Smoother(data, gradient * weight[:, None])
-        cost = float((weight * total).sum()) + self._priors(smoother, state)
+        weighted[wild] = np.inf
+        smoother = Smoother(hessian, gradient)
+        cost = float(weighted.sum()) + self._priors(smoother, state)
         cost += self._touched(smoother, state)
-        return _Linear(smoother, cost, misfit, wild, data, along, ends, designs, weights)
+        return _Linear(smoother, cost, misfit, wild, hessian, along, ends, designs, weights)
 
     def _touched(self, smoother: Smoother, state: State) -> float:
         """Pull contacts to the surfaces of known objects; what that costs."""
@@ -377,7 +386,10 @@ def _shared(problem: Problem, fit: _Linear) -> Array:
     """
     pulls = []
     parts = [fit.left(rows) for rows in (problem.touching, ~problem.touching)]
-    together = correlated(fit.misses)
+    trusted = problem.variance or [np.ones((1, 3)) for _ in fit.misses]
+    together = correlated(
+        [m / np.sqrt(v[:, :-2]) for m, v in zip(fit.misses, trusted, strict=True)]
+    )
     for view, (design, weight, ends) in enumerate(
         zip(fit.designs, fit.weights, fit.ends, strict=True)
     ):

@@ -13,7 +13,7 @@ residuals m of the fit,
 
 with N residuals and p numbers that were fitted to them; τ, the sum of their correlations over the
 points of the rod, is the number of neighbours that count as one. A frame that fits worse than is
-usual is trusted less.
+usual is trusted less, and so is a part of the whisker.
 """
 
 from __future__ import annotations
@@ -29,6 +29,10 @@ from vibrissa.numerics import Array
 _REGULAR = 1e-12
 _LEAST = 0.05  # correlation that counts as none
 _FREE = 0.25  # smallest share of the residuals that are free, however many numbers are fitted
+
+
+_NEAR = 2
+"""Number of points to each side over which the variance along a trace is averaged."""
 
 
 class Smoother:
@@ -125,20 +129,39 @@ class Smoother:
         return blocks.reshape(2 * pairs, n, n)[:count]
 
 
-def trace_variance(misses: Sequence[Array], fitted: Array, least: float) -> Array:
-    """Variance of the traces of each frame, in units of what they claim, and at least so much."""
+def trace_variance(
+    misses: Sequence[Array], fitted: Array, least: float, even: bool = False
+) -> list[Array]:
+    """Variances (time, point) of each view's traces, in units of what they claim.
+
+    ``misses`` are the residuals (time, point) of each view and ``fitted`` is the number of those
+    that each frame's unknowns follow; no variance is below ``least``. The variance changes along
+    the whisker, as a tip is seen worse than is claimed, unless it is to be ``even``. Two points
+    more are the ends.
+    """
+    known = [one != 0.0 for one in misses]
     square = np.sum([(one**2).sum(axis=1) for one in misses], axis=0)
-    count = np.sum([(one != 0.0).sum(axis=1) for one in misses], axis=0)
+    count = np.sum([one.sum(axis=1) for one in known], axis=0)
     shown = count > 0
     if not square[shown].any():
-        return np.ones(len(square))
-    together = correlated(misses)
+        return [np.ones((len(one), one.shape[1] + 2)) for one in misses]
     # Most frames are right, so that the median of them is.
     usual = float(np.median(square[shown] / count[shown]))
+    each = np.maximum(square / np.maximum(count, 1), usual)
+    along = [np.ones(one.shape[1]) for one in misses]
+    if not even:
+        for share, one, at in zip(along, misses, known, strict=True):
+            total, number = _neighbours((one**2).T @ (1.0 / each)), _neighbours(at.sum(axis=0))
+            np.divide(total, number, out=share, where=total > 0.0)
+    together = correlated([one / np.sqrt(share) for one, share in zip(misses, along, strict=True)])
     spent = together * float(fitted[shown].sum()) / float(count[shown].sum())
-    each = np.where(shown, square / np.maximum(count, 1), usual)
-    variance = together * np.maximum(each, usual) / max(1.0 - spent, _FREE)
-    return np.asarray(np.maximum(variance, least))
+    variance = together * each / max(1.0 - spent, _FREE)
+    return [np.maximum(np.outer(variance, [*share, 1.0, 1.0]), least) for share in along]
+
+
+def _neighbours(numbers: Array) -> Array:
+    """Sums over each number and its neighbours."""
+    return np.convolve(numbers, np.ones(2 * _NEAR + 1), mode="same")
 
 
 def correlated(misses: Sequence[Array]) -> float:

@@ -145,9 +145,11 @@ class State:
         return State(self.rotation, ratio * self.position, contact)
 
 
-def bent(d: Discretization, state: State, touching: Mask) -> tuple[Array, Array]:
-    """Points of the bent rods and their derivatives."""
-    s = np.linspace(0.0, 1.0, _SAMPLES)
+def bent(
+    d: Discretization, state: State, touching: Mask, shown: float = 1.0
+) -> tuple[Array, Array]:
+    """Points of the shown share of the bent rods and their derivatives."""
+    s = np.linspace(0.0, shown, _SAMPLES)
     turned = np.einsum("tij,tnj->tni", state.rotation, rods(d, state.contact, s))
     slopes = np.zeros((*turned.shape, UNKNOWNS))
     slopes[..., :6] = pose_slopes(turned)

@@ -123,10 +123,10 @@ def _finding(contacts: _Contacts) -> str:
         ]
         if min(medians) > 0.0:
             symbol = rf"$\partial r/\partial {quantity(name).symbol}$"
-            parts.append(f"{symbol} is {medians[0] / medians[1]:.0f} times")
+            parts.append(f"{medians[0] / medians[1]:.0f} times ({symbol})")
     if not parts:
         return ""
-    return f"Light contacts are the hardest to locate: {' and '.join(parts)} that of strong ones"
+    return f"Noise moves light contacts {' and '.join(parts)} as far as strong ones"
 
 
 def _contacts(data: xr.Dataset) -> _Contacts:

@@ -64,15 +64,15 @@ def axes(whisker: Whisker) -> dict[str, scene.Mark]:
     out: dict[str, scene.Mark] = {"axes": scene.Arrows(np.zeros((3, 3)), ends, _AXES, 0.05 * size)}
     out |= {f"axis {name}": scene.Label(1.12 * ends[i], name) for i, name in enumerate("xyz")}
     length = _size(whisker.length)
-    return out | ruler(_ASIDE * length, length)
+    return out | ruler(_ASIDE * length, length, length)
 
 
-def ruler(start: Array, length: float) -> dict[str, scene.Mark]:
-    """Ticks with values along x from a place (3,), mm, over a length, mm."""
+def ruler(start: Array, length: float, view: float) -> dict[str, scene.Mark]:
+    """Ticks with values along x from a place (3,), mm, over a length, in a view so wide, mm."""
     step = round_step(length / 4.0)
     ticks = np.arange(0.0, length + 1e-9, step)
     at = start + ticks[:, None] * np.array([1.0, 0.0, 0.0])
-    down = np.array([0.0, 0.0, -0.02 * length])
+    down = np.array([0.0, 0.0, -0.02 * view])
     pieces = np.concatenate([np.stack([at, at + down], axis=1), [[at[0], at[-1]]]])
     out: dict[str, scene.Mark] = {"ruler": scene.Line(pieces, REST, 1.5)}
     for place, tick in zip(at[1:], ticks[1:], strict=True):

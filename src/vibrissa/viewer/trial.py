@@ -292,7 +292,7 @@ def surroundings(trial: Watched, layers: Collection[str] = LAYERS) -> scene.Draw
     if "Scale" in layers:
         length = 2.0 * round_step(size / 6.0)
         low = middle - np.array([0.5 * length, 0.2 * size, 0.15 * size])
-        out |= ruler(low, length)
+        out |= ruler(low, length, size)
     if "Objects" in layers:
         for i, thing in enumerate(trial.objects):
             out[f"object {i}"] = object_body(thing, 0.6 * size, mm(centre))

@@ -51,8 +51,7 @@ if TYPE_CHECKING:
 TRIPLET = "Fx MB MD"
 KIND = "vibrissa certificate"
 _ORDER = 8
-# Share of the states to which the last Taylor coefficient falls in a step.
-_TOLERANCE = 1e-6
+_TOLERANCE = 1e-6  # share of the states to which the last Taylor coefficient falls in a step
 # Conditions by part: of the straight whisker, and of any.
 _PLANAR = {"interior": [0, 1, 2, 3], "proximal": [0, 4], "distal": [0, 4], "fold": [0, 1]}
 _SPATIAL = {"interior": [0, 1, 2, 3, 4], "proximal": [0, 1, 5, 6], "distal": [0, 1, 5, 6]}
@@ -60,12 +59,9 @@ _SPATIAL |= {"fold": [0], "rest": [0]}
 # M_y and M_z among the conditions, and the parts of the circle on which they are followed.
 _MOMENT = [7, 8]
 _ARCS = 48
-# Contacts along each unknown at which signs are looked at first.
-_PROBES = 5
-# Boxes that are evaluated between two looks at the clock.
-_AT_A_TIME = 2048
-# How often a certificate that is being made is written, s.
-_SAVED_EVERY = 60.0
+_PROBES = 5  # contacts along each unknown at which signs are looked at first
+_AT_A_TIME = 2048  # boxes that are evaluated between two looks at the clock
+_SAVED_EVERY = 60.0  # how often a certificate that is being made is written, s
 
 Progress = Callable[[int, int], None]
 

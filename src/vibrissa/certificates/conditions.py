@@ -69,8 +69,7 @@ SPATIAL_REST = ("deflection",)
 DEGREES = 6
 _GIVEN = ("one", "s", "level", "cos", "sin", "inverse", "alpha")
 _POLYNOMIALS = 5
-# Boxes end at the edges of pieces; only outward rounding may exceed these.
-_ROUNDED = 1e-13
+_ROUNDED = 1e-13  # boxes end at the edges of pieces; only outward rounding may exceed these
 
 
 class Conditions(NamedTuple):

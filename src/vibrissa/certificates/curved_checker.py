@@ -33,16 +33,14 @@ Array = NDArray[np.float64]
 
 CURVED_PARTS = ("interior", "proximal", "distal", "fold", "rest")
 DEGREE, ORDER = 3, 8
-# Share of the states to which the last Taylor coefficient falls in a step.
-TOLERANCE = 1e-8
+TOLERANCE = 1e-8  # share of the states to which the last Taylor coefficient falls in a step
 # Boxes computed side by side.
 _SIDE_BY_SIDE = 64
 _MOST_STEPS = 200
 # What rounding adds, over the sum of the sizes of all products of a step (at most 400 units each
 # of 2⁻⁵³) and to bounds themselves.
 _LOST, _UP = 1e-12, 1.0 + 1e-10
-# Arcs of the circle on which M_D is followed.
-_ARCS = 64
+_ARCS = 64  # arcs of the circle on which M_D is followed
 
 _ROWS = sorted(
     (e for e in combinations(range(DEGREE + 1), repeat=3) if sum(e) <= DEGREE),

@@ -33,8 +33,7 @@ from vibrissa.numerics import AnyArray, Array, inlined_rigorous
 
 _MOST_STEPS = 400
 _MOST_TRIALS = 12
-# A step ends at the end of a piece if that is nearer than this share of the way.
-_NEAR_EDGE = 0.05
+_NEAR_EDGE = 0.05  # a step ends at the end of a piece if that is nearer than this share of the way
 # Rows of known coefficients: a curvature in twist, two in bending, the radius and its slope.
 _RADIUS, _SLOPE, _ONE, _TWIST = range(3, 7)
 

@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 _STATIONS, _BEARINGS, _LEVELS = 15, 24, 11
 # The grid, and the cones over that of the determinant, with which the smallest cone is looked for.
 _FINE, _SHARES = (29, 24, 21), 1.03 ** np.arange(2, 40)
-# Cone about rest within which a straight whisker's grid does not look.
-_REST = 1e-3
+_REST = 1e-3  # cone about rest within which a straight whisker's grid does not look
 # Halvings that find where the determinant changes its sign, and where rays begin.
 _HALVINGS = 30
 _LEAST_LOAD = 1e-3

@@ -15,12 +15,9 @@ from vibrissa.numerics import AnyArray, Array, IntArray
 
 _BATCH = 2048
 _MOST_HALVINGS = 3
-# Remainders fall at least with this power of a box's size.
-_REMAINDER = 4
-# Largest remainder, relative to a condition, from which one halving is enough.
-_CLEAR = 0.1
-# How much more often arc length is halved than the other unknowns where nothing helps.
-_LONGER = 4
+_REMAINDER = 4  # remainders fall at least with this power of a box's size
+_CLEAR = 0.1  # largest remainder, relative to a condition, from which one halving is enough
+_LONGER = 4  # how much more often arc length is halved than the other unknowns where nothing helps
 
 Evaluate = Callable[[IntArray], tuple[Array, Array]]
 

@@ -37,10 +37,8 @@ if TYPE_CHECKING:
 _TOLERANCE = 1e-12
 # Newton steps that bring the second contact to the signals of the first; boxes that are tried.
 _STEPS, _TRIALS = 6, 8
-# Directions over π this near a whole number are in the plane.
-_FLAT = 1e-6
-# What rounding adds to a sum of a few products of centres and radii, over its size.
-_LOST = 1e-14
+_FLAT = 1e-6  # directions over π this near a whole number are in the plane
+_LOST = 1e-14  # what rounding adds to a sum of a few products of centres and radii, over its size
 # Boxes in which the way from rest may be divided.
 _MOST_BOXES = 4096
 _PAIRS = {"FT": (1, 2), "FD": (1, 2), "MB": (4, 5), "MD": (4, 5)}

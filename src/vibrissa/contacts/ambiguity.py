@@ -38,21 +38,17 @@ from vibrissa.rod import (
 # Every so many of the chart's stations is a sample of arc length, of a surface also of bearings.
 _STATIONS = 2
 _BEARINGS = 4
-# At most so many samples.
-_MOST = 1024
+_MOST = 1024  # at most so many samples
 # A step this small, relative to the force, is the last, and taken to first order.
 _LAST = 3e-5
 _ROUNDS = 15
-# What is still this far away after so many rounds leads nowhere.
-_FAR, _SOON = 0.1, 5
+_FAR, _SOON = 0.1, 5  # what is still this far away after so many rounds leads nowhere
 # Signals that are bilinear meet in a face or no farther (in cell widths) from its middle.
 _BESIDE = 1.5
-# Where neighbouring faces say that they meet within this (in cell widths) is one place.
-_ONE = 0.1
+_ONE = 0.1  # where neighbouring faces say that they meet within this (in cell widths) is one place
 # A vanishing force is not a starting point; share of a cell, for one signal and for two.
 _REST = (0.05, 0.5)
-# Two samples of a station within this, relative to the force, are one.
-_SAME = 1e-4
+_SAME = 1e-4  # two samples of a station within this, relative to the force, are one
 # Directions that signals tell this much worse than others (as a share of variance) they do not
 # tell.
 _OPEN = 1e-14

@@ -32,8 +32,7 @@ from vibrissa.whisker import Whisker
 
 # Rounds, the longest step (over L), and the step of the derivatives.
 _ROUNDS, _LONGEST, _STEP = 30, 0.05, 1e-5
-# A step of this share of the standard deviations is the last.
-_DONE = 1e-2
+_DONE = 1e-2  # a step of this share of the standard deviations is the last
 # Elements of the last rounds, whose nodes are near enough not to move contacts by what is stated.
 _FINE = 96
 # Between nodes, where an arc may begin, the whisker is along the object to this, over L.

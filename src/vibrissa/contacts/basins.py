@@ -20,8 +20,7 @@ from vibrissa.numerics import Array, IntArray, copy, inlined, kernel
 from vibrissa.rod import MOST_CELLS, along, cells_around, chart_to_contact, fold_force
 from vibrissa.signals import FY, MY
 
-# The most that cells are asked for in a quantity; more than half a turn.
-_WIDEST = 1e3
+_WIDEST = 1e3  # the most that cells are asked for in a quantity; more than half a turn
 # Between two basins cells must miss the measurement by so much more, relative to the slack.
 _SILL = 0.5
 # What a known contact explains by its slopes: χ² of three quantities, each up to the slack away,

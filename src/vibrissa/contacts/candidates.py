@@ -50,8 +50,7 @@ _TIMES = 8
 # At the foot of a valley fits are slow, and most go the same way: one that is this near in χ² to a
 # better one is given up if on the way there χ² does not rise by more than this.
 _CLOSE, _SILL = 0.3, 0.01
-# Of candidates that explain signals equally well the one with less force comes first.
-_FORCE = 1e-6
+_FORCE = 1e-6  # of candidates that explain signals equally well the one with less force comes first
 
 # Row by row: x (n, 4), (F, p) (n, 6), ∂(F, p)/∂x (n, 6, 4), χ² (n,), and where a fit ended (n,):
 # 2 on the map, 1 nearer to the base, 0 nowhere.

@@ -29,8 +29,7 @@ from vibrissa.sensors import GRAVITY, Sensor
 from vibrissa.signals import selection
 from vibrissa.status import Status
 
-# Smallest arc length, over L, of contacts that the weight is taken from.
-LEAST = 0.05
+LEAST = 0.05  # smallest arc length, over L, of contacts that the weight is taken from
 
 
 class Estimator:

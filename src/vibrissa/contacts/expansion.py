@@ -27,8 +27,7 @@ from vibrissa.rod import LANES, LEAST_ARC, Rod, integrate, lane_value, set_lane
 # How far along each axis the second order is taken from, and the other end is tried if there is
 # room for the least, in standard deviations.
 _REACH, _OTHER_END, _LEAST_END = 2.0, 3.0, 1.0
-# How often steps are shortened at most, and what is nothing.
-_TRIALS, _NOTHING = 4, 1e-12
+_TRIALS, _NOTHING = 4, 1e-12  # how often steps are shortened at most, and what is nothing
 # Axes bend others if their columns of B, of length 1 unless they were shortened, are this long²
 # at least.
 _DETERMINED = 0.5

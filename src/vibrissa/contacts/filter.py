@@ -33,16 +33,12 @@ from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.status import Status
 
 _UNKNOWNS = 3
-# The pose of a base that rests in the laboratory's frame.
-_LEVEL, _ORIGIN = np.eye(3), np.zeros(3)
-# Hypotheses less probable than this next to the best are dropped.
-_LEAST = 1e-6
-# At most so many are kept.
-_MOST = 24
+_LEVEL, _ORIGIN = np.eye(3), np.zeros(3)  # the pose of a base that rests in the laboratory's frame
+_LEAST = 1e-6  # hypotheses less probable than this next to the best are dropped
+_MOST = 24  # at most so many are kept
 # Two hypotheses this near (Mahalanobis distance squared, by the sum of both covariances) are one.
 _ONE = 0.1
-# A candidate so far (the same) from every hypothesis is a new one.
-_NEW = 16.0
+_NEW = 16.0  # a candidate so far (the same) from every hypothesis is a new one
 # Largest deflection (over L) before contact was detected: where the onset is unknown, and at least.
 _ANYWHERE = 0.3
 _LEAST_REACH = 0.01
@@ -51,8 +47,7 @@ _LEAST_REACH = 0.01
 _GAP, _FORGOTTEN = 0.1, 0.5
 
 
-# What is surer than this is no longer ambiguous.
-_SURE = 0.99
+_SURE = 0.99  # what is surer than this is no longer ambiguous
 # Hypotheses nearer to each other (Mahalanobis distance squared, by the sum of both covariances) run
 # together: there is no gap between them.
 _TOGETHER = 4.0

@@ -33,8 +33,7 @@ from vibrissa.rod import (
     set_lane,
 )
 
-# Steps each way at most, and how often contacts are evaluated for them.
-_STEPS, _ROUNDS = 12, 40
+_STEPS, _ROUNDS = 12, 40  # steps each way at most, and how often contacts are evaluated for them
 # The first step, in standard deviations, and at most; and the longest: as a share of the force, or
 # of a quarter of L.
 _FIRST, _SHORT, _LONGEST = 0.5, 0.02, 0.5
@@ -43,8 +42,7 @@ _FLOOR, _TRIALS = 0.01, 4
 # A step is halved where its correction, relative to it, or its turn (as a cosine) is too large.
 _LARGEST, _STRAIGHT = 2.5, 0.5
 _SHORTEST = 2e-3
-# A valley of fewer nodes is not described by them.
-_FEW = 5
+_FEW = 5  # a valley of fewer nodes is not described by them
 
 
 @inlined

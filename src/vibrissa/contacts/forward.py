@@ -51,12 +51,9 @@ _ROUNDS = 30
 _LONGEST, _STRONGER, _LEAST_FORCE = 0.1, 0.5, 0.05
 # A fit has ended when its step is this small, or the damping this large.
 _SETTLED, _MOST_DAMPING = 1e-8, 1e8
-# Turn of gravity (rad) and relative change of density for derivatives.
-_NUDGE = 1e-4
-# A rigid base is one so much stiffer than the whisker.
-_RIGID = 1e9
-# Relative step of the force along the whisker for its derivatives.
-_AHEAD = 1e-5
+_NUDGE = 1e-4  # turn of gravity (rad) and relative change of density for derivatives
+_RIGID = 1e9  # a rigid base is one so much stiffer than the whisker
+_AHEAD = 1e-5  # relative step of the force along the whisker for its derivatives
 # How far apart directions of gravity are at most, and at least, that a turning whisker is solved
 # for, and those whose resting shapes propose contacts, rad; what the former may change of a
 # measurement, in standard deviations.

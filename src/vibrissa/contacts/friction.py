@@ -31,8 +31,7 @@ from vibrissa.contacts.posterior import NORMAL_KURTOSIS, ranked
 from vibrissa.numerics import AnyArray, Array, IntArray
 
 _UNKNOWNS = 4
-# The least standard deviation of the prior; with less there is no friction.
-_LEAST = 0.01
+_LEAST = 0.01  # the least standard deviation of the prior; with less there is no friction
 # Arc lengths that curves are traced at, and about each peak so many more, so far, in standard
 # deviations of s.
 _STATIONS = 33
@@ -40,10 +39,8 @@ _FINE, _REACH = 17, 4.0
 # Of a peak this much lower than the highest (log density) nothing is kept; two peaks are two
 # candidates where the valley between them is lower than both by so much.
 _LOW, _VALLEY = 15.0, 3.0
-# Parts that each step is divided into for the moments.
-_PARTS = 8
-# Measurements whose curves are traced together: some tens of MB.
-_TOGETHER = 1000
+_PARTS = 8  # parts that each step is divided into for the moments
+_TOGETHER = 1000  # measurements whose curves are traced together: some tens of MB
 # The largest kurtosis, relative to a normal distribution's, at which a covariance is relied on.
 _TAILED = 3.0
 

@@ -43,8 +43,7 @@ from vibrissa.signals import (
     signals_of,
 )
 
-# Two solutions this near (relative to L and to the force) are one.
-_SAME = 1e-7
+_SAME = 1e-7  # two solutions this near (relative to L and to the force) are one
 # More targets than this are brought into an order in which the tree's nodes stay at hand.
 _MANY = 1000
 _RANK_BITS = 5

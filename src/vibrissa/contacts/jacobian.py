@@ -32,15 +32,12 @@ from vibrissa.signals import (
 
 #: A determinant smaller than this, rows and columns being of size one, is zero to rounding.
 SINGULAR = 1e-11
-# Singular values smaller than this share of the largest count as zero.
-RANK = 1e-8
-# A triplet has lost a dimension if it has at all but this share of the contacts.
-_LOST = 0.99
+RANK = 1e-8  # singular values smaller than this share of the largest count as zero
+_LOST = 0.99  # a triplet has lost a dimension if it has at all but this share of the contacts
 # Where the equations make signals depend on each other, the integration does so to its own error.
 # With so many times the steps that is below ``RANK``.
 _FINER = 8
-# How many contacts show whether signals determine contacts at all.
-_TRIED = 256
+_TRIED = 256  # how many contacts show whether signals determine contacts at all
 
 
 def contact_signal_derivatives(

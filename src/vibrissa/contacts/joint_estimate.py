@@ -36,8 +36,7 @@ from vibrissa.signals import labelled_wrench, measured, selection, signal_scales
 from vibrissa.status import Status
 from vibrissa.whisker import Whisker
 
-# What exact signals are met to, in χ² of signals known to 1 %.
-_EXACT = 1e-8
+_EXACT = 1e-8  # what exact signals are met to, in χ² of signals known to 1 %
 # Noise, in units of force and moment and in rad, within which the whisker without weight proposes
 # contacts of signals that it does not explain.
 _NEAR = 0.01
@@ -46,8 +45,7 @@ _MOST = 8
 # need less friction come first.
 _LIKELY = np.deg2rad(20.0)
 _NO_ERRORS = np.zeros((0, 6, 7))
-# A base that falls leaves less than this of gravity, m/s².
-_WEIGHTLESS = 1e-9
+_WEIGHTLESS = 1e-9  # a base that falls leaves less than this of gravity, m/s²
 # Of three signals with all of these unknown, regions hold half to two thirds of the contacts.
 _SEPARATE = 4
 

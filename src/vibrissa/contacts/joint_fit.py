@@ -42,8 +42,7 @@ from vibrissa.signals import within_turn
 from vibrissa.status import Status
 from vibrissa.whisker import Whisker
 
-# How exactly an arc length is held.
-HELD = 1e-5
+HELD = 1e-5  # how exactly an arc length is held
 # Rounds in which the effects of shared unknowns, or the noise, are taken anew at the contact.
 _ROUNDS, _STEADY = 3, 2
 # The second order is taken from this far along each axis, in standard deviations. A covariance is

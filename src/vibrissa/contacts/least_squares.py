@@ -79,8 +79,7 @@ _SLOW, _PATIENCE, _LATE = 0.05, 3, 25
 # Where the slopes of a fit miss a known contact by so much (χ²), and by no more than this share of
 # the fall of χ² to there, χ² falls all the way: that contact is where the fit would end.
 _FORESEEN, _DOWNHILL = 1.0, 0.25
-# Where χ² rises by more than this factor contacts teach nothing of its curvature.
-_WILD = 4.0
+_WILD = 4.0  # where χ² rises by more than this factor contacts teach nothing of its curvature
 # Where a fit within Ω ends χ² must be level in each unknown by itself: what that could still gain
 # is at most the square of this.
 _LEVEL = 0.03
@@ -89,12 +88,9 @@ _LEVEL = 0.03
 _LONGEST_TURN, _LONGEST_FALL, _LONGEST_SHARE = 0.5, 0.25, 0.5
 # The chart knows the fold to a part in a million: as near to it contacts are still stable.
 _MOST_LOAD = 1.0 - 1e-5
-# What is as near to that is at the fold, whatever rounding makes of it.
-_AT_FOLD = 1.0 - 1e-12
-# Steps for derivatives of the fold force, which is smooth.
-_NUDGE = 1e-5
-# Contacts within this (over L, and ten times that relative to the force) are one.
-_SAME = 1e-3
+_AT_FOLD = 1.0 - 1e-12  # what is as near to that is at the fold, whatever rounding makes of it
+_NUDGE = 1e-5  # steps for derivatives of the fold force, which is smooth
+_SAME = 1e-3  # contacts within this (over L, and ten times that relative to the force) are one
 
 
 class Fits(NamedTuple):

@@ -38,10 +38,8 @@ _TIMES = 8
 # A contact that gives the signals is a place to look from if it is no farther (Mahalanobis distance
 # squared) from the prediction.
 _GATE = 50.0
-# With one this near it is not looked for from where the hypothesis was as well.
-_NEAR = 4.0
-# Codes of px, py and pz among the channels.
-_PLACE = 11
+_NEAR = 4.0  # with one this near it is not looked for from where the hypothesis was as well
+_PLACE = 11  # codes of px, py and pz among the channels
 
 
 class Mixture(NamedTuple):

@@ -34,12 +34,9 @@ from vibrissa.signals import SIGNALS, wrench_derivatives
 
 #: Without noise to go by, components of force and moment count as known to this share of |F|, |M|.
 TRUSTED = 0.01
-# What counts as exact, in standard deviations of the rest.
-_EXACT = 1e-6
-# Eigenvalues of a correlation matrix below this are rounding.
-_SINGULAR = 1e-10
-# A measurement is explained if a perfect model would fit worse in one of a thousand.
-_RARE = 1e-3
+_EXACT = 1e-6  # what counts as exact, in standard deviations of the rest
+_SINGULAR = 1e-10  # eigenvalues of a correlation matrix below this are rounding
+_RARE = 1e-3  # a measurement is explained if a perfect model would fit worse in one of a thousand
 #: Contacts whose χ² differ by less are indistinguishable (the odds are below 200 to 1).
 INDISTINCT = NormalDist().inv_cdf(1.0 - 0.5 * _RARE) ** 2
 #: Standard deviation of each signal, or covariance (6, 6) of (F, M), SI units.

@@ -47,15 +47,12 @@ from vibrissa.signals import within_turn
 # Windows along the whisker, and in each of them so many sectors of bearings to start from.
 _WINDOWS = 16
 _SECTORS = 4
-# Of the valley's components those this much worse (χ²) than the best do not count.
-_WORSE = 30.0
+_WORSE = 30.0  # of the valley's components those this much worse (χ²) than the best do not count
 # A candidate whose arc length is known to this share of a window may stay whole; its parts are the
 # Gaussians this near (Mahalanobis distance squared, by the sum of both covariances).
 _SHARP, _PART = 0.5, 9.0
-# Of a curve or surface at most so many samples start.
-_MOST = 24
-# Standard deviation, over L, of what a measurement does not tell.
-_VAGUE = 0.2
+_MOST = 24  # of a curve or surface at most so many samples start
+_VAGUE = 0.2  # standard deviation, over L, of what a measurement does not tell
 # Smallest standard deviation of a starting hypothesis, over L, so that matrices stay regular.
 _FINEST = 1e-7
 _FREE = [0, 2, 3]

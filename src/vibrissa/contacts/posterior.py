@@ -60,17 +60,14 @@ LEFT, THREE_SIGMA, HELD = 0.0033, 14.156, 7.815
 # Where the second order misses so much, densities are not to be trusted: the first order gives the
 # weight of a candidate. A node's log density gains at most so much over the first order's.
 _BROKEN, _MOST_GAIN = 0.3, 3.0
-# Where it misses so much, the second order does not describe channels even roughly.
-_BENT = 1.0
-# With a smaller share of the nodes than this moments mean nothing.
-_TOO_FEW = 0.2
+_BENT = 1.0  # where it misses so much, the second order does not describe channels even roughly
+_TOO_FEW = 0.2  # with a smaller share of the nodes than this moments mean nothing
 # Steps by which a covariance is widened; and what is nothing among probabilities.
 _TRIALS, _NOTHING = 4, 1e-12
 # Below this second order (of the point, or the channels, for a standard deviation of each axis) the
 # first will do: variances differ by less than 4 %.
 _STRAIGHT = 0.06
-# Nodes on each ray, a standard deviation apart.
-_RADII = 5
+_RADII = 5  # nodes on each ray, a standard deviation apart
 #: Fourth moment of three coordinates that are normally distributed.
 NORMAL_KURTOSIS = 15.0
 

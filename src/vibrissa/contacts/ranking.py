@@ -49,8 +49,7 @@ _UNIQUE, _AMBIGUOUS = int(Status.UNIQUE), int(Status.AMBIGUOUS)
 # How far apart signals are that the tree is asked for as well, in standard deviations; and where
 # nothing that is known explains the measurement.
 _APART, _FAR_APART = 2.0, 4.0
-# At most so many starts for one measurement.
-_MOST_STARTS = 6
+_MOST_STARTS = 6  # at most so many starts for one measurement
 # Logarithm of the volume of a normal distribution of three coordinates, over its peak.
 _LOG_NORMAL = 1.5 * math.log(2.0 * math.pi)
 

@@ -49,10 +49,8 @@ _STARTS, _SAME = 6, 1e-3
 # The largest standard deviation of a cloud, of s over L and of forces relative to their size; and
 # the share of it that must count for a covariance that is relied on.
 _LONGEST, _COUNTING = 1.0, 0.2
-# The cloud is so much wider than a normal distribution, whose tails are often shorter.
-_WIDER = 1.5
-# So many nodes must count to take the place of a cloud.
-_DENSE = 4.0
+_WIDER = 1.5  # the cloud is so much wider than a normal distribution, whose tails are often shorter
+_DENSE = 4.0  # so many nodes must count to take the place of a cloud
 # Share that a region of 95 % holds, and the square of its radius in standard deviations.
 _WITHIN, _REGION = 0.95, 7.815
 # Unknowns of contacts of the side and of the tip, among (s, f_x, f_y, f_z).

@@ -38,18 +38,15 @@ from vibrissa.whisker import Whisker
 
 #: Rate of false alarms.
 FALSE_ALARMS = 0.01
-# Steps of the rod between two contacts, and between the last one and each end.
-_STEPS = 24
-# Rows that are integrated together: some tens of MB.
-_TOGETHER = 2000
+_STEPS = 24  # steps of the rod between two contacts, and between the last one and each end
+_TOGETHER = 2000  # rows that are integrated together: some tens of MB
 # Fits to a wrench of a χ² that this share exceeds begin elsewhere too, at these arc lengths.
 _DOUBTFUL, _ELSEWHERE = 0.2, (0.25, 0.45, 0.65, 0.85, 0.97)
 # Arc lengths of the second force, relative to it the share of the first that is expected, and how
 # many standard deviations that must move the measurement.
 _PLACES = np.linspace(0.15, 1.0, 12)
 _SHARE, _CLEAR = 0.5, 3.0
-# Steps of the derivatives, and rounds of the fit to wrench and shape.
-_STEP, _ROUNDS = 1e-4, 10
+_STEP, _ROUNDS = 1e-4, 10  # steps of the derivatives, and rounds of the fit to wrench and shape
 # The longest step of arc length (over L), and a third of that of the force (relative to it).
 _LONGEST = 0.1
 # A residual of what has no meaning, as of a force that winds the whisker up.

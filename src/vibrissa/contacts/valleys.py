@@ -54,12 +54,10 @@ HIGH, CLOSED = 30.0, 9.0
 # After a step on which χ² rose by less than this the next is longer, by this factor; of a normal
 # distribution all steps are equal.
 _PACE = ((0.4, 2.0), (0.8, 1.3), (12.0, 1.0), (math.inf, 0.6))
-# The largest change of the moment of the force in a step, as a share of it.
-_LARGEST_CHANGE = 0.5
+_LARGEST_CHANGE = 0.5  # the largest change of the moment of the force in a step, as a share of it
 # A covariance is widened by so much at most, found by so many bisections.
 _WIDEST, _BISECTIONS = 8.0, 8
-# Variances, in those of the whole mixture, that are nothing.
-_NOTHING = 1e-6
+_NOTHING = 1e-6  # variances, in those of the whole mixture, that are nothing
 
 
 class Valleys(NamedTuple):

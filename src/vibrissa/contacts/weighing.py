@@ -15,8 +15,7 @@ from vibrissa.signals import FT, FX, FY, FZ, MB, MX, MY, MZ
 
 # Of a channel's variance, what others do not explain; below this the covariance is singular.
 _SINGULAR = 1e-10
-# What counts as exact, relative to the other deviations.
-_EXACT = 1e-6
+_EXACT = 1e-6  # what counts as exact, relative to the other deviations
 
 
 class Weighing(NamedTuple):

@@ -67,10 +67,8 @@ _LONGEST_ARM = 10.0
 _FAR = 100.0
 # Where the coarse rod gives a wrench within so many standard deviations, it follows valleys.
 _EQUAL = 0.05
-# A contact that may lie this far away (over L, one standard deviation) is not known.
-_UNKNOWN = 0.5
-# Contacts within this (over L, and ten times that relative to the force) are one.
-_SAME = 1e-3
+_UNKNOWN = 0.5  # a contact that may lie this far away (over L, one standard deviation) is not known
+_SAME = 1e-3  # contacts within this (over L, and ten times that relative to the force) are one
 
 
 class Fitted(NamedTuple):

@@ -22,8 +22,7 @@ TAPER_RATIOS = (1.0, 2.0, 4.0, 8.0, 15.0, 30.0, 60.0)
 
 # Verdicts do not depend on size or stiffness: one length and one base radius stand for all.
 _LENGTH, _BASE_RADIUS = 40e-3, 100e-6
-# Verdicts stop searching where a witness is found; here all are wanted.
-_ROUNDS = 2
+_ROUNDS = 2  # verdicts stop searching where a witness is found; here all are wanted
 # Searches for a witness to be proved, each outside this share of the cone before.
 _SEARCHES, _NEARLY = 2, 0.95
 

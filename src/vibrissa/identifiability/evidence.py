@@ -47,10 +47,8 @@ UNIQUE, OFF_SURFACE, NOT_UNIQUE, EMPTY = (
 WITNESSES = 3
 #: Shares of each signal's range within which signals count as equal.
 TOLERANCES = (1e-6, 1e-4, 1e-3, 1e-2)
-# Samples in which folds are looked for, per sample that is inverted: they cost little.
-_WIDER = 8
-# Further searches of regions without witnesses.
-_AGAIN = 4
+_WIDER = 8  # samples in which folds are looked for, per sample that is inverted: they cost little
+_AGAIN = 4  # further searches of regions without witnesses
 # Samples that are the same for every seed: those that are inverted, and those in which folds are
 # looked for; and contacts of each region beyond a fold, the farthest from rest, that are inverted.
 _FIXED, _FIXED_WIDE = 2048, 32768
@@ -58,15 +56,12 @@ _BEYOND = 48
 # Pairs found again on a finer rod at a time, and how many times at most.
 _CONFIRMED = 24
 _ROUNDS = 20
-# Contacts whose sign of det ∂T/∂p is the rarer, of regions without witnesses.
-_RARE = 2048
-# Samples that the resolution is probed at.
-_PROBED = 512
+_RARE = 2048  # contacts whose sign of det ∂T/∂p is the rarer, of regions without witnesses
+_PROBED = 512  # samples that the resolution is probed at
 # Contacts of each region from which fibres are followed, and at which folds are searched.
 _FOLLOWED = 24
 _NEAR_FOLDS = 24
-# Contacts in the plane of a planar whisker that are tried.
-_IN_PLANE = 256
+_IN_PLANE = 256  # contacts in the plane of a planar whisker that are tried
 # Contacts near the plane in which any whisker begins, the same for every seed, with the largest
 # bearing from it, rad; and signals of which two lose a dimension in the plane of a planar one.
 _NEAR_PLANE, _BEARING = 256, 0.2

@@ -113,20 +113,15 @@ _PARTS = np.array([3.0, 3.0 / np.pi, 3.0])
 # Trust regions, in units of L and of the fold force: the first, that on the finer rod, the largest,
 # and where climbs end.
 _FIRST, _FINE, _LARGEST, _LAST = 0.1, 1e-3, 0.3, 1e-5
-# A climb also ends where the linear program promises no more than this, rad.
-_LEAST_GAIN = 1e-5
-# What is kept of each margin so that no summit violates one.
-_KEPT = 1e-5
-# Climbs of a region whose merits differ by less than this are at the same summit, rad.
-_SAME = 1e-6
-# Transverse vectors face each other at least so far, over their whole sizes.
-_FACING = 1e-4
+_LEAST_GAIN = 1e-5  # a climb also ends where the linear program promises no more than this, rad
+_KEPT = 1e-5  # what is kept of each margin so that no summit violates one
+_SAME = 1e-6  # climbs of a region whose merits differ by less than this are at the same summit, rad
+_FACING = 1e-4  # transverse vectors face each other at least so far, over their whole sizes
 # Newton steps back to the set, and the misfit that they may leave for the next.
 _CORRECTIONS, _MISFIT = 2, 1e-6
 # The larger determinant of a pair, over the lengths of the gradients, is at least this.
 _REGULAR = 1e-4
-# Its logarithm, so scaled, is the margin: no cost lets a pair through.
-_STEEP = 0.1
+_STEEP = 0.1  # its logarithm, so scaled, is the margin: no cost lets a pair through
 # Step of the derivatives of margins, and its ridge against singular equations.
 _STEP, _RIDGE = 1e-5, 1e-14
 

@@ -57,10 +57,8 @@ from vibrissa.signals import (
 )
 from vibrissa.whisker import Whisker
 
-# Directions have no value at zero force: samples are kept off it.
-_LEAST_LOAD = 0.01
-# Step of the derivatives of the chart, a cube root of rounding.
-_STEP = 1e-6
+_LEAST_LOAD = 0.01  # directions have no value at zero force: samples are kept off it
+_STEP = 1e-6  # step of the derivatives of the chart, a cube root of rounding
 
 
 class ContactSet(NamedTuple):
@@ -186,8 +184,7 @@ _STEADY = 0.2
 # A solution that ``AGREEMENT`` could move by more than this (over L) is not distinct from its
 # neighbours.
 _FIRM = 1e-3
-# Two solutions nearer than this (over L) are the same contact.
-_SAME = 1e-4
+_SAME = 1e-4  # two solutions nearer than this (over L) are the same contact
 # The search for better twins starts wide, ends where climbs begin, keeps so many of each region.
 _WIDTHS = np.geomspace(0.2, 0.02, 9)
 _KEPT = 16

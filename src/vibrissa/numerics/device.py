@@ -52,11 +52,8 @@ def _simulated() -> bool:
 class Translation:
     """Compiler of row kernels for the GPU.
 
-    Parameters
-    ----------
-    substitutes : mapping of str
-        Values for global names of the kernels and of what they call: other functions of the CPU, or
-        numbers.
+    Global names of the kernels and of what they call have other values, functions of the CPU or
+    numbers, where there are substitutes.
     """
 
     def __init__(self, substitutes: Mapping[str, Any]) -> None:

@@ -39,10 +39,8 @@ OVERLAP = 5e-6
 # Points along the whisker at which a second contact is searched, and the distance of one with the
 # same object from the first, over L. So many rows at once.
 _SAMPLES, _ASIDE, _ROWS = 129, 0.03, 512
-# A whisker that objects do not reach is pressed by so much to begin with, over L.
-_PRESSED = 5e-3
-# Continued from the placement before, no node moves farther, over L.
-_JUMP = 0.1
+_PRESSED = 5e-3  # a whisker that objects do not reach is pressed by so much to begin with, over L
+_JUMP = 0.1  # continued from the placement before, no node moves farther, over L
 
 
 @dataclass(frozen=True, eq=False)

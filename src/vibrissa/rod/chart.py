@@ -40,69 +40,36 @@ _SCAN = 0.0625
 # nearly the same force, between which det ∂p/∂ξ < 0: where it dips, its least value is looked for
 # in so many parabolas, and is zero if it is less than this share of that at rest.
 _PARABOLAS, _ZERO = 8, 1e-9
-# Grading toward a tip of radius zero.
-_GRADING = 0.85
+_GRADING = 0.85  # grading toward a tip of radius zero
 #: No solution is looked for nearer to the base than this (over L).
 LEAST_ARC = 0.05
-# Rounds in which a chart is curtailed to what can be solved.
-_CURTAILED = 6
-# Directions have no value at zero force; just above it they have their limit.
-_LEAST_LOAD = 0.01
+_CURTAILED = 6  # rounds in which a chart is curtailed to what can be solved
+_LEAST_LOAD = 0.01  # directions have no value at zero force; just above it they have their limit
 
 
 class Fold(NamedTuple):
-    """The fold force over the chart, for the kernels.
+    """The fold force over the chart, for the kernels."""
 
-    Attributes
-    ----------
-    bounds : (2,) array
-        Smallest arc length, over L, and grading a of the chart.
-    log_force : (n, m + 1, 4) array
-        ln f* and its derivatives by η, by ψ and by both, at the chart's nodes.
-    """
-
-    bounds: Array
+    bounds: Array  # (2,), smallest arc length, over L, and grading a of the chart
+    # (n, m + 1, 4) ln f* and its derivatives by η, by ψ and by both, at the chart's nodes.
     log_force: Array
 
 
 @dataclass(frozen=True, eq=False)
 class StableSet:
-    """Chart of the stable contacts of one whisker, non-dimensional.
+    """Chart of the stable contacts of one whisker, non-dimensional."""
 
-    Attributes
-    ----------
-    discretization : Discretization
-        Rod and units.
-    stations : (i,) array
-        Arc lengths of the nodes, over L.
-    bearings : (j,) array
-        Directions ψ of the force at the nodes, rad; the last is the first, a turn on.
-    loads : (k,) array
-        Square roots ρ of the force at the nodes, relative to the fold force.
-    fold : Fold
-        Fold force over the chart.
-    contacts : (i, j, k, 3) array
-        Contacts ξ = (s, f_y, f_z) at the nodes.
-    values : (i, j, k, 6) array
-        Base force and contact point (F, p) there.
-    tangents : (i, j, k, 6, 3) array
-        Derivatives of the values by ξ.
-    frames : (i, j, k, 3, 3) array
-        Derivatives of ξ by (η, ψ, ρ).
-    folded : (i, j) bool array
-        Whether a fold was found along each ray.
-    """
-
-    discretization: Discretization
-    stations: Array
+    discretization: Discretization  # rod and units
+    stations: Array  # (i,), arc lengths of the nodes, over L
+    # (j,) Directions ψ of the force at the nodes, rad; the last is the first, a turn on.
     bearings: Array
-    loads: Array
-    fold: Fold
-    contacts: Array
-    values: Array
-    tangents: Array
-    frames: Array
-    folded: AnyArray
+    loads: Array  # (k,), square roots ρ of the force at the nodes, relative to the fold force
+    fold: Fold  # fold force over the chart
+    contacts: Array  # (i, j, k, 3), contacts ξ = (s, f_y, f_z) at the nodes
+    values: Array  # (i, j, k, 6), base force and contact point (F, p) there
+    tangents: Array  # (i, j, k, 6, 3), derivatives of the values by ξ
+    frames: Array  # (i, j, k, 3, 3), derivatives of ξ by (η, ψ, ρ)
+    folded: AnyArray  # (i, j), whether a fold was found along each ray
 
     @property
     def proximal(self) -> float:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vibrissa.deferred import xr
 from vibrissa.numerics import Array, IntArray
 from vibrissa.quantities import attributes
 from vibrissa.rod.discretization import STEPS, discretize
@@ -29,8 +30,6 @@ from vibrissa.sketch import (
 from vibrissa.status import Status, counted, describe, flag_attributes
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from vibrissa.whisker import Whisker
 
 
@@ -328,8 +327,6 @@ class Deflection:
             ``force``, ``moment``, ``contact_point``, ``arc_length``, ``residual`` and ``status``;
             leading dimensions are called ``load``, or ``load_0``, ``load_1``, ... if several.
         """
-        import xarray as xr
-
         count = self.status.ndim
         dims = ("load",) if count == 1 else tuple(f"load_{i}" for i in range(count))
         data: dict[str, Any] = {

@@ -70,53 +70,28 @@ class Bendable(Protocol):
 
 
 class Weight(NamedTuple):
-    """Weight of a rod, non-dimensional, for the kernels.
+    """Weight of a rod, non-dimensional, for the kernels."""
 
-    Attributes
-    ----------
-    beyond : (n, 8) array
-        Weight of all that is beyond a place of each step, over EI/L²: polynomials in the fraction
-        of the step, constant term first.
-    toward : (3,) array
-        Unit vector along which weight acts, base frame.
-    at_tip : (3,) array
-        The same in the material frame at the tip of the resting whisker.
-    """
-
+    # (n, 8) Weight of all that is beyond a place of each step, over EI/L²: polynomials in the
+    # fraction of the step, constant term first.
     beyond: Array
-    toward: Array
-    at_tip: Array
+    toward: Array  # (3,), unit vector along which weight acts, base frame
+    at_tip: Array  # (3,), the same in the material frame at the tip of the resting whisker
 
 
 class Rod(NamedTuple):
-    """The rod in n steps from base to tip, non-dimensional, for the kernels.
+    """The rod in n steps from base to tip, non-dimensional, for the kernels."""
 
-    Attributes
-    ----------
-    start : (n,) array
-        Arc length at which each step begins, over L; negative in a compliant base.
-    width : (n,) array
-        Length of each step in arc length, over L.
-    extent : (n,) array
-        Centreline length per arc length: 1 in the whisker, 0 in a compliant base.
-    twist : (n,) array
-        Compliance in twist where the radius is that of the base, over that in bending.
-    bending : (n,) array
-        Compliance in bending there, 1 in the whisker.
-    shape : (n, 4, 4) array
-        Cubics in the fraction of the step, constant term first: the three intrinsic curvatures
-        (times L), and the radius over that of the base.
-    weight : Weight or None
-        Weight; None where the rod has none.
-    """
-
-    start: Array
-    width: Array
-    extent: Array
+    start: Array  # (n,), arc length at which each step begins, over L; negative in a compliant base
+    width: Array  # (n,), length of each step in arc length, over L
+    extent: Array  # (n,), centreline length per arc length: 1 in the whisker, 0 in a compliant base
+    # (n,) Compliance in twist where the radius is that of the base, over that in bending.
     twist: Array
-    bending: Array
+    bending: Array  # (n,), compliance in bending there, 1 in the whisker
+    # (n, 4, 4) Cubics in the fraction of the step, constant term first: the three intrinsic
+    # curvatures (times L), and the radius over that of the base.
     shape: Array
-    weight: Weight | None = None
+    weight: Weight | None = None  # None where the rod has none
 
 
 @dataclass(frozen=True, eq=False)

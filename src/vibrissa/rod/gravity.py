@@ -33,18 +33,13 @@ if TYPE_CHECKING:
 
 #: Standard gravity, m/s².
 STANDARD = 9.80665
-# More than this (m/s²) is doubted: forces of whisking are below 50 g.
-_MOST = 1e4
+_MOST = 1e4  # more than this (m/s²) is doubted: forces of whisking are below 50 g
 # The weight grows to its size in so many steps, and a step that fails is halved so often.
 _STEPS, _HALVINGS = 8, 6
-# By so much (rad) gravity is turned to see whether a whisker stands.
-_NUDGE = 1e-5
-# How far apart directions are that resting shapes are followed to others from, rad.
-_NEAR = 0.05
-# No contact: (s, f).
-_REST = np.array([[1.0, 0.0, 0.0, 0.0]])
-# Nodes of the sagged curvature.
-_NODES = 257
+_NUDGE = 1e-5  # by so much (rad) gravity is turned to see whether a whisker stands
+_NEAR = 0.05  # how far apart directions are that resting shapes are followed to others from, rad
+_REST = np.array([[1.0, 0.0, 0.0, 0.0]])  # no contact: (s, f)
+_NODES = 257  # nodes of the sagged curvature
 
 
 class Traced(NamedTuple):
@@ -262,20 +257,7 @@ def resting(whisker: Whisker, gravity: ArrayLike) -> Resting:
 
 
 def near_direction(vector: Array, step: float) -> Array:
-    """Vector of the same size in the nearest of directions a step apart.
-
-    Parameters
-    ----------
-    vector : (3,) array
-        Vector, of any unit.
-    step : float
-        Angle between neighbouring directions, rad.
-
-    Returns
-    -------
-    (3,) array
-        Vector of that direction.
-    """
+    """Vector (3,) of the same size in the nearest of directions a step (rad) apart."""
     size = float(np.linalg.norm(vector))
     toward = np.round(vector / max(size, 1e-300) / step) * step
     return np.asarray(size * toward / max(float(np.linalg.norm(toward)), 1e-300))

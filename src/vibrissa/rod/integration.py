@@ -2,14 +2,29 @@
 
 Kernels call :func:`integrate` for the contacts in a buffer (:mod:`vibrissa.rod.kernels`). A rod
 that has a weight is integrated as :mod:`vibrissa.rod.weight` describes, by a kernel of its own that
-is compiled where it is needed, so that a rod without one loses nothing by it.
+is compiled where it is needed, so that a rod without one loses nothing by it. Rows of kernels are
+shared out over the cores of the CPU or the threads of a GPU.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
 import numpy as np
 
-from vibrissa.numerics import Array, inlined, kernel, share_out, specialised
+from vibrissa.numerics import (
+    AnyArray,
+    Array,
+    Translation,
+    check_device,
+    inlined,
+    kernel,
+    share_out,
+    specialised,
+)
+from vibrissa.rod import kernels
 from vibrissa.rod.discretization import Discretization, Rod, Weight
 from vibrissa.rod.kernels import (
     BUFFER_SIZE,
@@ -23,7 +38,6 @@ from vibrissa.rod.kernels import (
     set_lane,
     whisker_radius,
 )
-from vibrissa.rod.rows import share_rows
 from vibrissa.rod.weight import integrate_weighted
 
 
@@ -128,3 +142,36 @@ def contact_tangents(discretization: Discretization, contacts: Array) -> Array:
         len(contacts), lambda first, last: carry_tangents(rod, contacts, tangents, first, last)
     )
     return tangents
+
+
+def share_rows(
+    kernel: Callable[..., Any],
+    tables: tuple[Any, ...],
+    inputs: tuple[AnyArray, ...],
+    outputs: tuple[AnyArray, ...],
+    device: str = "cpu",
+) -> None:
+    """Call ``kernel(*tables, *inputs, *outputs, first, last)`` for parts that cover all rows.
+
+    All rows share the tables, arrays, numbers and named tuples of them; a row reads its inputs and
+    fills its outputs, each (n, ...). A rod with a weight is for the device "cpu" alone.
+    """
+    if device == "cpu":
+        share_out(
+            len(inputs[0]),
+            lambda first, last: kernel(*tables, *inputs, *outputs, first, last),
+        )
+        return
+    check_device(device)
+    _one_lane().run(kernel, tables, inputs, outputs)
+
+
+@cache
+def _one_lane() -> Translation:
+    """A thread has one lane: all offsets in the lane buffer are multiples of their number."""
+    offsets = {
+        name: value // kernels.LANES
+        for name, value in vars(kernels).items()
+        if isinstance(value, int) and name.strip("_").isupper()
+    }
+    return Translation(offsets | {"integrate": kernels.integrate_weightless})

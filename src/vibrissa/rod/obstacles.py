@@ -28,29 +28,24 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
+from vibrissa.deferred import interpolate, optimize
 from vibrissa.numerics import Array, IntArray, Mask
 from vibrissa.objects import Placement, Surface
 from vibrissa.rod.chart import LEAST_ARC
 
 if TYPE_CHECKING:
-    from scipy.interpolate import CubicHermiteSpline
-
     from vibrissa.whisker import Whisker
 
 # Elements of the whisker, and of a compliant base.
 ELEMENTS, _JOINT_ELEMENTS = 32, 4
 _TAPER_EXPONENT = 0.4
 _ROUNDS, _TOLERANCE = 60, 1e-10
-# Largest turn of a cross-section in one round, rad.
-_LONGEST = 0.2
-# Gaps smaller than this, over L, can close in one round.
-_NEAR = 0.05
+_LONGEST = 0.2  # largest turn of a cross-section in one round, rad
+_NEAR = 0.05  # gaps smaller than this, over L, can close in one round
 # Single contacts move their node this often, or until it moves by less than this, over L.
 _MOVES, _MOVED = 6, 1e-6
-# Error of the end of an arc, over the distance of nodes.
-_SHARED = 0.02
-# Points of two shapes that are compared.
-_COMPARED = 33
+_SHARED = 0.02  # error of the end of an arc, over the distance of nodes
+_COMPARED = 33  # points of two shapes that are compared
 # No node comes nearer to another than this share of their distance.
 _APART = 0.2
 _ROOT = np.sqrt(3.0)
@@ -256,11 +251,11 @@ class Equilibrium(NamedTuple):
         """Points (n, 3), equally spaced in arc length."""
         return np.asarray(self._spline()(np.linspace(0.0, 1.0, n)))
 
-    def _spline(self) -> CubicHermiteSpline:
-        from scipy.interpolate import CubicHermiteSpline
-
+    def _spline(self) -> interpolate.CubicHermiteSpline:
         on = slice(np.count_nonzero(self.grid.extent == 0.0), None)
-        return CubicHermiteSpline(self.grid.s[on], self.nodes[on], self.frames[on, :, 0])
+        return interpolate.CubicHermiteSpline(
+            self.grid.s[on], self.nodes[on], self.frames[on, :, 0]
+        )
 
     def farthest(self, other: Equilibrium) -> float:
         """Distance between two shapes where they are farthest apart."""
@@ -330,8 +325,6 @@ def _pushed(
     matrix: Array, weight: Array, slope: Array, gap_slopes: Array, gaps: Array
 ) -> tuple[Array, Array] | None:
     """Step and multipliers of least energy with all linearised gaps open or closed."""
-    from scipy.optimize import nnls
-
     try:
         factor = cho_factor(matrix)
     except LinAlgError:
@@ -346,7 +339,7 @@ def _pushed(
     try:
         root = np.linalg.cholesky(compliance)
         wanted = -np.linalg.solve(root, (gaps + gap_slopes @ free) * scale)
-        force = nnls(root.T, wanted, maxiter=100 * len(gaps))[0] * scale
+        force = optimize.nnls(root.T, wanted, maxiter=100 * len(gaps))[0] * scale
     except (np.linalg.LinAlgError, RuntimeError):
         return None
     return free + yielded @ force, force

@@ -43,10 +43,8 @@ from vibrissa.rod.kernels import (
 MOST_PLACES = 6
 # What is bent more than this (rad) in one step is no longer the rod, but lies beyond a contact.
 _MOST_TURN = 1.5
-# Rounds of false position for the zero inside a step.
-_ROUNDS = 30
-# What is left of a step is nothing below this (over L).
-_NOTHING = 1e-14
+_ROUNDS = 30  # rounds of false position for the zero inside a step
+_NOTHING = 1e-14  # what is left of a step is nothing below this (over L)
 
 # A buffer for four whiskers: the stages' curvatures, force and moment, the axes x, y, z and r as
 # the material frame sees them, and the step.

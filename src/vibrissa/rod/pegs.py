@@ -22,8 +22,7 @@ from vibrissa.rod.points import Solutions, follow_all
 from vibrissa.status import Status
 
 _SAMPLES = 513
-# The first touch, as deep as the least force needs.
-_DEPTH = 1e-6
+_DEPTH = 1e-6  # the first touch, as deep as the least force needs
 # Arc length (over L) of the touch from which a line that passes by the tip is moved.
 _NEAR_TIP = 0.95
 # An axis this near (over L) goes through the whisker.

@@ -30,10 +30,9 @@ from vibrissa.rod.chart import (
 )
 from vibrissa.rod.continuation import POINT, follow
 from vibrissa.rod.discretization import Bendable, Rod
-from vibrissa.rod.integration import solve_forces
+from vibrissa.rod.integration import share_rows, solve_forces
 from vibrissa.rod.kernels import BUFFER_SIZE, LANES
 from vibrissa.rod.newton import ABOVE_FOLD, TOLERANCE, newton_group, stable, start_from
-from vibrissa.rod.rows import share_rows
 from vibrissa.rod.search import MOST_SEEDS, seeds
 from vibrissa.rod.tree import SearchTree, search_tree
 from vibrissa.status import Status
@@ -42,21 +41,17 @@ from vibrissa.status import Status
 # a face (over L) it is approached from inside instead, in case the interpolant misjudges; and this
 # near to the resting whisker, where bearings have no meaning and there may be no seed, from there.
 _NEAR = 0.01
-# Points along each edge of the chart's faces.
-_FACE = 65
-# Points along the resting whisker, as a polygon.
-_RESTING = 33
+_FACE = 65  # points along each edge of the chart's faces
+_RESTING = 33  # points along the resting whisker, as a polygon
 # Points this near to the resting whisker (over L) are solved from there. Contacts with more than
 # this share of the fold's force, in ρ, are not light.
 _LIGHT = 1e-3
 _HEAVY = 0.25
-# Seeds nearer than this to each other, in η and ρ, lead to the same solution.
-_APART = 0.05
+_APART = 0.05  # seeds nearer than this to each other, in η and ρ, lead to the same solution
 # Starts that are followed for one point, and how near to the fold they are at most, in ρ.
 _STARTS = 8
 _SHORT_OF_FOLD = 0.99
-# Residual of a point that was reached, if only at a fold.
-_REACHED = 1e-9
+_REACHED = 1e-9  # residual of a point that was reached, if only at a fold
 # Coordinates beyond this (over L) are as far out of reach as this; their squares might overflow.
 _FAR = 1e3
 
@@ -281,13 +276,7 @@ def _solve_points(
 
 
 class PointSolver:
-    """Contact at a point, for one whisker: tables made once, then microseconds a point.
-
-    Parameters
-    ----------
-    chart : StableSet
-        Stable contacts of the whisker.
-    """
+    """Contact at a point, for one whisker: tables made once, then microseconds a point."""
 
     def __init__(self, chart: StableSet) -> None:
         self.chart = chart

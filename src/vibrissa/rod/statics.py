@@ -43,13 +43,11 @@ from vibrissa.status import Status
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
-# Lengths beyond this (over L) are as good as this: their squares would overflow.
-_FARTHEST = 1e100
+_FARTHEST = 1e100  # lengths beyond this (over L) are as good as this: their squares would overflow
 # Relative error of the force's size up to which the steps are not in question; base force and
 # contact point are then good to some 1e-5 (relative to the force and to L).
 _KEPT = 1e-6
-# What shorter steps may change, relative to the force and to L.
-_SETTLED = 1e-4
+_SETTLED = 1e-4  # what shorter steps may change, relative to the force and to L
 # Contact points in mm that are taken for m are so many lengths away, up to 20 times as many.
 _FAR_AWAY = 100.0
 

@@ -39,18 +39,12 @@ if TYPE_CHECKING:
 
 # A det below this share of that at the start means that the branch was near its end.
 _NEAR_FOLD = 0.5
-# A contact that is only about right enters a surface by no more than this, over L.
-_TOUCHING = 1e-5
-# One of two contacts at once enters a surface by no more than this, over L.
-_ENTERED = 2e-3
-# Touches of the same surface are two if they are this far apart, over L.
-_ELSEWHERE = 0.03
-# A contact passes on to another this often in one frame.
-_MOST_OTHERS = 3
-# Rounds in which the next contact is looked for.
-_LOOKS = 40
-# Steps between placements are halved down to this.
-_SMALLEST_STEP = 2.0**-12
+_TOUCHING = 1e-5  # a contact that is only about right enters a surface by no more than this, over L
+_ENTERED = 2e-3  # one of two contacts at once enters a surface by no more than this, over L
+_ELSEWHERE = 0.03  # touches of the same surface are two if they are this far apart, over L
+_MOST_OTHERS = 3  # a contact passes on to another this often in one frame
+_LOOKS = 40  # rounds in which the next contact is looked for
+_SMALLEST_STEP = 2.0**-12  # steps between placements are halved down to this
 
 # Every so many samples of the resting whisker are enough to see whether it may touch, and a free
 # whisker is looked at again whenever it has moved by this, m.
@@ -58,8 +52,7 @@ _EVERY = 4
 _LOOK = 1e-4
 # Around the sample that is nearest, so many parts are looked at, so many times.
 _ZOOM, _ZOOMS = 16, 4
-# Ways tried to get a whisker out of what it would rest in.
-_SIDES = 16
+_SIDES = 16  # ways tried to get a whisker out of what it would rest in
 
 Progress = Callable[[int, int], None]
 

@@ -26,8 +26,7 @@ import numpy as np
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod.chart import StableSet
 
-# Boxes are widened by this share of their size for what the cubic misses.
-_MARGIN = 0.08
+_MARGIN = 0.08  # boxes are widened by this share of their size for what the cubic misses
 # Cells whose linear part is flatter than this (det relative to the product of its columns) are not
 # aligned.
 _FLAT = 1e-3
@@ -43,71 +42,35 @@ _TURNED = 0.9
 
 
 class SearchTree(NamedTuple):
-    """Cells of a chart by the values of three quantities in them, for the kernels.
+    """Cells of a chart by the values of three quantities in them, for the kernels."""
 
-    Attributes
-    ----------
-    grid : (2, 3) array
-        Chart coordinates of the first corner, and size of a cell.
-    turns : (3,) array
-        1/2π for angles, 0 for other quantities.
-    offsets : (levels + 1,) int array
-        First row of each level in ``boxes``.
-    boxes : (m, 6, 8) array
-        Middle and half width of the values in eight sibling blocks.
-    place : (n, 3) int array
-        Position of each cell in the grid.
-    frame : (n, 6, 3) array
-        Coordinates in which a cell is nearly the unit cube (inverse, origin), and its extent there.
-    edges : (n, 160) array
-        Coefficients of the cells' interpolants.
-    care : (n,) int array
-        Starts that a cell needs: 0 one, 1 several until one is solved, 2 all of them.
-    polar : (n,) int array
-        Row of a polar cell in the arrays below, -1 for other cells.
-    polar_edges : (p, 160) array
-        Coefficients of the polar cells' interpolants.
-    polar_frame : (p, 8) array
-        Base values, and the sizes that count as the cell's extent.
-    polar_linear : (p, 4, 5) array
-        Mean slopes, and middle and half width of the rest.
-    polar_volumes : (p, 8, 2) array
-        Volumes that the slopes span at the corners, for each component of the vector.
-    roles : (4,) int array
-        Numbers of length, direction and the others among the quantities; -1 for none.
-    """
-
-    grid: Array
-    turns: Array
-    offsets: IntArray
-    boxes: Array
-    place: IntArray
+    grid: Array  # (2, 3), chart coordinates of the first corner, and size of a cell
+    turns: Array  # (3,), 1/2π for angles, 0 for other quantities
+    offsets: IntArray  # (levels + 1,), first row of each level in ``boxes``
+    boxes: Array  # (m, 6, 8), middle and half width of the values in eight sibling blocks
+    place: IntArray  # (n, 3), position of each cell in the grid
+    # (n, 6, 3) Coordinates in which a cell is nearly the unit cube (inverse, origin), and its
+    # extent there.
     frame: Array
-    edges: Array
+    edges: Array  # (n, 160), coefficients of the cells' interpolants
+    # (n,) Starts that a cell needs: 0 one, 1 several until one is solved, 2 all of them.
     care: IntArray
-    polar: IntArray
-    polar_edges: Array
-    polar_frame: Array
-    polar_linear: Array
+    polar: IntArray  # (n,), row of a polar cell in the arrays below, -1 for other cells
+    polar_edges: Array  # (p, 160), coefficients of the polar cells' interpolants
+    polar_frame: Array  # (p, 8), base values, and the sizes that count as the cell's extent
+    polar_linear: Array  # (p, 4, 5), mean slopes, and middle and half width of the rest
+    # (p, 8, 2) Volumes that the slopes span at the corners, for each component of the vector.
     polar_volumes: Array
+    # (4,) Numbers of length, direction and the others among the quantities; -1 for none.
     roles: IntArray
 
 
 class PlaneVector(NamedTuple):
-    """Vector of the plane of which one or two quantities are length and direction.
+    """Vector of the plane of which one or two quantities are length and direction."""
 
-    Attributes
-    ----------
-    values : (i, j, k, 2) array
-        Components at the chart's nodes.
-    derivatives : (i, j, k, 2, 3) array
-        Derivatives of the values by ξ there.
-    length, direction : int
-        Number of its length and of its direction among the quantities, -1 if it is none of them.
-    """
-
-    values: Array
-    derivatives: Array
+    values: Array  # (i, j, k, 2), components at the chart's nodes
+    derivatives: Array  # (i, j, k, 2, 3), derivatives of the values by ξ there
+    # Number of its length and of its direction among the quantities, -1 if it is none of them.
     length: int
     direction: int
 

@@ -66,10 +66,8 @@ WEIGHT_BUFFER = _TIP + LANES
 #: Numbers of a solved state: (F, p), ĝ and μ at the base.
 STATES = 12
 
-# Rounds of Newton's method for the direction at the tip.
-_ROUNDS = 8
-# Where they do not converge the force grows from rest to its size in so many steps.
-_SHARES = 8
+_ROUNDS = 8  # rounds of Newton's method for the direction at the tip
+_SHARES = 8  # where they do not converge the force grows from rest to its size in so many steps
 # The error of g(0) that one correction to first order may take away: it leaves its square.
 _SMALL, _NEAR = 1e-6, 1e-3
 

@@ -14,11 +14,13 @@ from vibrissa.signals.base import (
     MY,
     MZ,
     SIGNALS,
+    TRIPLETS,
     Coordinates,
     base_signals,
     circular_among as circular_among,
     labelled_wrench as labelled_wrench,
     measured,
+    selection as selection,
     signal_derivatives as signal_derivatives,
     signal_equations,
     signal_scales as signal_scales,
@@ -37,7 +39,6 @@ from vibrissa.signals.regions import (
     resting,
     within_cone,
 )
-from vibrissa.signals.triplets import TRIPLETS, selection as selection
 
 __all__ = [
     "CIRCULAR",

@@ -1,4 +1,4 @@
-"""The six signals at the base.
+"""The six signals at the base, and how a choice of them is written.
 
 Force F and moment M about the base, of the object on the whisker, in the whisker frame::
 
@@ -13,7 +13,8 @@ Directions are angles in (-π, π] and compared on the circle.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
+from itertools import combinations
 from typing import TypeAlias
 
 import numpy as np
@@ -23,17 +24,33 @@ from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray, Vector, cross, inlined
 from vibrissa.quantities import attributes
 
-# Of a DataArray, by name.
-Coordinates: TypeAlias = "dict[Hashable, xr.Variable]"
+Coordinates: TypeAlias = "dict[Hashable, xr.Variable]"  # of a DataArray, by name
 
 #: The signals in their canonical order.
 SIGNALS = ("Fx", "FT", "FD", "Mx", "MB", "MD")
+#: All choices of three of the six signals, in canonical order.
+TRIPLETS = tuple(combinations(SIGNALS, 3))
 #: Numbers of the signals, and of the components of force and moment, as channels of kernels.
 FX, FT, FD, MX, MB, MD, FY, FZ, MY, MZ = range(10)
-# m: no whisker is that long.
-_LONGEST_ARM = 10.0
+_LONGEST_ARM = 10.0  # m: no whisker is that long
 #: Which of the signals are angles.
 CIRCULAR = (False, False, True, False, False, True)
+
+
+def selection(
+    signals: str | Sequence[str], least: int = 3, exactly: int | None = None
+) -> tuple[str, ...]:
+    """Read a choice of signals."""
+    given = signals.replace(",", " ").split() if isinstance(signals, str) else list(signals)
+    spelt = {name.lower(): name for name in SIGNALS}
+    names = [spelt.get(str(name).lower(), name) for name in given]
+    unknown = [name for name in names if name not in SIGNALS]
+    enough = len(names) >= least if exactly is None else len(names) == exactly
+    if unknown or len(set(names)) != len(names) or not enough:
+        number = f"at least {least}" if exactly is None else f"exactly {exactly}"
+        known = ", ".join(SIGNALS)
+        raise ValueError(f"expected {number} different signals of {known}; got {signals!r}")
+    return tuple(name for name in SIGNALS if name in names)
 
 
 def base_signals(force: ArrayLike | xr.DataArray, moment: ArrayLike | xr.DataArray) -> xr.Dataset:

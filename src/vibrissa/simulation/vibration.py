@@ -48,10 +48,8 @@ from vibrissa.simulation.chain import Chain, jacobian
 from vibrissa.simulation.dynamics import Dynamics, at_rest, slowest
 from vibrissa.whisker import Whisker
 
-# Modes, a pair of them for each number of nodes.
-_MODES = 4
-# Length of a window, in periods of the first mode.
-_PERIODS = 1.2
+_MODES = 4  # modes, a pair of them for each number of nodes
+_PERIODS = 1.2  # length of a window, in periods of the first mode
 
 
 @dataclass(frozen=True, eq=False)

@@ -162,10 +162,12 @@ class Follower:
         length = self.length_of(best)
         steady = bool(self._supports) and length >= _WANTED * self._lately
         self._unsearched += 1
-        if length < self.wanted and not (steady and self._unsearched < _SEARCHED):
+        belongs = self._belongs(best)
+        waits = length >= self.wanted or (steady and self._unsearched < _SEARCHED)
+        if not (belongs and waits):
             self._unsearched = 0
             # What is as good without expectations as with them is no better.
-            least = _BETTER * length
+            least = _BETTER * length * belongs
             cold = max(self.from_base(frame, noise, least), key=self._worth, default=Trace.lost())
             if cold.support > least:
                 best = cold

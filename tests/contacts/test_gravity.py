@@ -111,6 +111,25 @@ def test_errors_are_those_of_the_same_rod_without_weight(nitinol, gravity):
         assert 0.93 < inside[found.covariance_valid].mean() < 0.99
 
 
+def test_regions_of_light_contacts_hold_what_they_state(nitinol):
+    """Long, bent valleys of contacts under weight; contacts deflected by 2 to 10 degrees."""
+    whisker, gravity, n = nitinol.whisker, (-0.5 * G, 0.5 * G, -0.7 * G), 120
+    rng = np.random.default_rng(5)
+    arc, angle = rng.uniform(0.35, 0.95, n), rng.uniform(0.0, 2.0 * np.pi, n)
+    force = np.deg2rad(rng.uniform(2.0, 10.0, n)) / arc**2 * unit(whisker)
+    load = vb.PointForce(arc * whisker.length, force, angle)
+    bent = vb.deflect(whisker, load, gravity=gravity)
+    noise = rng.normal(size=(n, 6)) @ np.sqrt(covariance(whisker))
+    signals = vb.base_signals(bent.force + noise[:, :3], bent.moment + noise[:, 3:])
+    found = nitinol.estimate(signals, "Fx MB MD", covariance(whisker), gravity=gravity)
+    away = found.point - bent.contact_point
+    inverse = np.linalg.pinv(np.nan_to_num(found.covariance), rcond=1e-12)
+    held = np.einsum("ni,nij,nj->n", away, inverse, away) < 7.81
+    assert held.mean() > 0.87
+    # As without weight, none nearer to the base than those of the map.
+    assert np.nanmin(found.candidates.arc_length) > 0.3 * whisker.length - 1e-9
+
+
 def test_uncertain_direction_and_density_are_in_the_covariance(nitinol):
     whisker, rng = nitinol.whisker, np.random.default_rng(3)
     level = np.array([0.0, 0.0, -G])

@@ -21,7 +21,7 @@ from vibrissa.contacts.charted_whisker import ChartedWhisker
 from vibrissa.contacts.contacts import Candidates, Contacts, contacts_of
 from vibrissa.contacts.forward import Forward, Gravity, finite
 from vibrissa.contacts.friction import along_curves, check_ratio
-from vibrissa.contacts.joint_fit import JointFit, check_compliance
+from vibrissa.contacts.joint_fit import Joint, JointFit, check_compliance
 from vibrissa.contacts.least_squares import Fits
 from vibrissa.contacts.noise import Noise, SensorNoise, explained, sensor_noise
 from vibrissa.contacts.posterior import CERTAIN, ranked
@@ -30,9 +30,16 @@ from vibrissa.contacts.readout import check_signals
 from vibrissa.contacts.search import estimate
 from vibrissa.contacts.wrench import PROXIMAL, chosen, estimate_components, friction_angle
 from vibrissa.deferred import xr
-from vibrissa.numerics import Array, IntArray
-from vibrissa.rod import Discretization, Resting
-from vibrissa.signals import labelled_wrench, measured, selection, signal_scales
+from vibrissa.numerics import AnyArray, Array, IntArray
+from vibrissa.rod import Discretization, PointForce, Resting, deflect
+from vibrissa.signals import (
+    SIGNALS,
+    labelled_wrench,
+    measured,
+    selection,
+    signal_scales,
+    signals_of,
+)
 from vibrissa.status import Status
 from vibrissa.whisker import Whisker
 
@@ -41,6 +48,8 @@ _EXACT = 1e-8  # what exact signals are met to, in χ² of signals known to 1 %
 # contacts of signals that it does not explain.
 _NEAR = 0.01
 _MOST = 8
+# Share of the length within which two arc lengths are of the same contact.
+_SAME = 0.03
 # Friction angles scatter by so much: of contacts that explain a wrench equally well, those that
 # need less friction come first.
 _LIKELY = np.deg2rad(20.0)
@@ -93,11 +102,10 @@ class JointEstimate:
         self.scale = signal_scales(names, self.d.force, self.d.moment)
         self._step = self.forward.direction_step(_least_noise(sensor, names, self.d))
         self._shift = _shifts(self.channels.names, self.forward.shift)
-        self._fit = JointFit(self.forward, self.channels, sensor, PROXIMAL, friction=whole)
+        least = PROXIMAL if whole or contact_map is None else contact_map.chart.proximal
+        self._fit = JointFit(self.forward, self.channels, sensor, least, friction=whole)
         self._rubbing = None
         if friction != 0.0:
-            assert contact_map is not None
-            least = contact_map.chart.proximal
             self._rubbing = JointFit(self.forward, self.channels, sensor, least, True, friction)
 
     def __call__(self, values: Array) -> tuple[Candidates, IntArray]:
@@ -193,19 +201,22 @@ class JointEstimate:
             values[:, i], values[:, i + 1] = np.hypot(y, z), np.arctan2(z, y)
         return values * self.scale
 
+    @property
+    def _noise(self) -> Noise | None:
+        """Noise as it was stated."""
+        if self.sensor is None:
+            return None
+        return self.sensor.deviations if self.sensor.wrench is None else self.sensor.wrench
+
     def _without_friction(
         self, values: Array, flat: Array, targets: Array
     ) -> tuple[Candidates, IntArray]:
         """Candidates without friction, but of the wrench."""
         if self.forward.weighted or self.contact_map is None:
             return self._fitted(flat, targets, self._proposed(targets))
-        noise = None
-        if self.sensor is not None:
-            sigma = self.sensor.deviations
-            noise = sigma if self.sensor.wrench is None else self.sensor.wrench
         errors = _NO_ERRORS if self.sensor is None else self.sensor.errors
         signals = dict(zip(self.names, values.T, strict=True))
-        one = estimate(self.contact_map, signals, self.names, noise, errors, None)
+        one = estimate(self.contact_map, signals, self.names, self._noise, errors, None)
         found = Candidates.room(len(flat), 1)
         found.x[:, 0, 0] = one.arc_length / self.d.length
         found.x[:, 0, 1:] = one.contact_force / self.d.force
@@ -270,6 +281,8 @@ class JointEstimate:
         row, place = np.nonzero(np.isfinite(found.chi_squared))
         joint = self._fit.joint(flat, targets, fits)
         covariance, valid = self._fit.to_second_order(joint, fits)
+        if self.forward.weighted and self.contact_map is not None and self.names != WRENCH:
+            covariance, valid = self._as_sagged(joint, fits, covariance, valid)
         found.values[row, place] = joint.values[:, :6]
         found.covariances[row, place], found.valid[row, place] = covariance, valid
         log = 0.5 * np.linalg.slogdet(covariance)[1] - 0.5 * fits.misfits
@@ -281,6 +294,32 @@ class JointEstimate:
         line = np.arange(len(order))[:, None]
         found = Candidates(found.number, *(part[line, order] for part in found[1:]))
         return found._replace(probability=probability)
+
+    def _as_sagged(
+        self, joint: Joint, fits: Fits, covariance: Array, valid: AnyArray
+    ) -> tuple[Array, AnyArray]:
+        """Covariances, where they are larger, of the same forces on the sagged whisker.
+
+        Light contacts leave long, bent valleys, which are followed where there is no weight.
+        """
+        sagged, d = self.sagged, self.d
+        load = PointForce(fits.contacts[:, 0] * d.length, components=fits.contacts[:, 1:] * d.force)
+        bent = deflect(sagged.whisker, load)
+        six = signals_of(bent.force, bent.moment)
+        signals = {name: six[:, SIGNALS.index(name)] for name in self.names}
+        errors = _NO_ERRORS if self.sensor is None else self.sensor.errors
+        found = estimate(sagged, signals, self.names, self._noise, errors, None).candidates
+        away = np.abs(found.arc_length - bent.arc_length[:, None])
+        place = np.where(np.isfinite(away), away, np.inf).argmin(axis=1)[:, None]
+        own = np.take_along_axis(found.covariance, place[..., None, None], axis=1)[:, 0]
+        own = own / d.length**2
+        known = np.isfinite(own).all(axis=(1, 2))
+        known &= np.take_along_axis(away, place, axis=1)[:, 0] < _SAME * d.length
+        shared = joint.covariance() - self._fit.alone(joint).covariance()
+        own = np.where(known[:, None, None], own + shared, covariance)
+        larger = np.trace(own, axis1=1, axis2=2) > np.trace(covariance, axis1=1, axis2=2)
+        linear = np.take_along_axis(found.covariance_valid, place, axis=1)[:, 0]
+        return np.where(larger[:, None, None], own, covariance), valid & known & linear
 
 
 def _by_probability(found: Candidates) -> IntArray:

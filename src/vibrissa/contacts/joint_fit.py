@@ -172,6 +172,11 @@ class JointFit:
             weights,
         )
 
+    def alone(self, joint: Joint) -> Joint:
+        """The same contacts without shared unknowns and friction's prior."""
+        n, k = len(self.free), len(self.names)
+        return joint._replace(design=joint.design[:, :k, :n], moved=joint.moved[..., :n])
+
     def degrees(self, flat: Array, values: Array) -> int:
         """Number of independent channels less that of the unknowns."""
         if self.sensor is None or not len(flat):
@@ -273,10 +278,8 @@ class JointFit:
         if row.size:
             fits = self.fit(flat[row], targets[row], out.x[row, place])
             joint = self.joint(flat[row], targets[row], fits)
-            n, k = len(self.free), len(self.names)
-            alone = joint._replace(design=joint.design[:, :k, :n], moved=joint.moved[..., :n])
             out.x[row, place], out.values[row, place] = fits.contacts, joint.values[:, :6]
-            out.covariances[row, place] += joint.covariance() - alone.covariance()
+            out.covariances[row, place] += joint.covariance() - self.alone(joint).covariance()
             out.chi_squared[row, place] = joint.misfit
             degrees = self.degrees(flat[row], fits.values)
         first = out.chi_squared[:, 0]

@@ -93,6 +93,33 @@ def test_directions_are_the_less_certain_the_smaller_what_they_are_of(gamma_map,
     assert (squares <= HELD).mean() > 0.93
 
 
+@pytest.mark.parametrize(
+    ("using", "measured", "point"),
+    [
+        ("FD Mx MB", [0.1564502, -7.422291e-10, 1.087948e-6], [23.7168, 8.55583, 0.434136]),
+        ("Fx FD MD", [1.103575e-5, 3.03442, -1.679331], [17.2426, 0.342818, 0.271234]),
+        ("FT Mx MD", [1.174818e-4, -3.964273e-9, -1.527729], [24.6586, -0.0969479, -0.223557]),
+        ("FT Mx MD", [3.998972e-3, 3.718574e-6, -2.09295], [3.60341, -6.98225, 4.56964]),
+    ],
+)
+def test_valleys_without_visible_ends_widen_regions(gamma_map, using, measured, point):
+    """Where a valley of χ² went on farther than it was followed, it counted as nothing."""
+    signals = dict(zip(using.split(), np.array(measured)[:, None], strict=True))
+    found = gamma_map.estimate(signals, using, np.diag(SIGMA**2))
+    assert found.status == vb.Status.UNIQUE
+    assert distances(found, 1e-3 * np.array([point]), np.array([True])) < BEYOND
+
+
+def test_contacts_of_other_bearings_are_looked_for(gamma_map):
+    """Those between a known bearing below zero and zero counted as near to it."""
+    signals = {"FD": [2.519141], "Mx": [-2.37944e-6], "MB": [8.087351e-6]}
+    found = gamma_map.estimate(signals, "FD Mx MB", np.diag(SIGMA**2))
+    true = np.array([9.49745e-3, 7.25646e-3, -10.018e-3])
+    away = np.linalg.norm(found.candidates.point[0, : found.n_candidates[0]] - true, axis=1)
+    assert found.status == vb.Status.AMBIGUOUS
+    assert away.min() < 2e-3 < away.max()
+
+
 def test_a_contact_whose_mirror_image_is_nearly_as_probable_is_not_unique():
     """F_x, F_T and M_B hardly tell the sides of a plane that the whisker nearly lies in."""
     length = 40e-3

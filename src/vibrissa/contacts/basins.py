@@ -90,7 +90,8 @@ def _holds(of: Searched, cell: int, position: Array) -> bool:
     place, grid, apart = of.tree.place[cell], of.tree.grid, np.empty(3)
     for a in range(3):
         apart[a] = abs((position[a] - grid[0, a]) / grid[1, a] - place[a] - 0.5)
-    apart[1] = min(apart[1], 2.0 * math.pi / grid[1, 1] - apart[1])
+    around = 2.0 * math.pi / grid[1, 1]
+    apart[1] = abs(apart[1] - around * round(apart[1] / around))
     return bool(max(apart[0], apart[2]) <= 1.5 and (apart[1] <= 1.5 or place[2] == 0))
 
 

@@ -4,8 +4,9 @@ Where χ² hardly determines one unknown, its valley may be long and bent, and s
 an expansion about a contact nor the nodes of the chart describe it: of a contact ξ in the plane of
 a planar whisker some signals do not change, to first order, with the bearing of the force. The
 valley is followed both ways along the longest principal axis a_0 of the noise in ξ, by steps of
-length l; at each, steps of Gauss and Newton along the others, a_1 and a_2, lead to its floor. The
-density along it, with weights W that are those at each node, is
+length l that bend as the last one did; at each, steps of Gauss and Newton along the others, a_1 and
+a_2, lead to its floor within the whisker. The density along it, with weights W that are those at
+each node, is
 
     exp(-χ²/2) |det W| det ∂p/∂ξ |det(∂ξ/∂l, a_1, a_2)|,
 
@@ -19,18 +20,18 @@ import math
 import numpy as np
 
 from vibrissa.contacts.expansion import axis_length, principal_axes, without_friction
-from vibrissa.contacts.least_squares import channel_equations, lane_contact, whiten
-from vibrissa.contacts.valleys import CLOSED, HIGH, Nodes, mixture, pace, shares_of
+from vibrissa.contacts.least_squares import channel_equations, whiten
+from vibrissa.contacts.valleys import CLOSED, Nodes, mixture, pace, shares_of
 from vibrissa.contacts.weighing import Weighing, sharpness, weigh_any
-from vibrissa.numerics import AnyArray, Array, copy, inlined, kernel, solve
+from vibrissa.numerics import Array, copy, inlined, kernel, solve
 from vibrissa.rod import (
     BUFFER_SIZE,
-    LANES,
-    LEAST_ARC,
     Rod,
     integrate,
+    lane_value,
+    lanes_tangents,
     point_determinant,
-    set_lane,
+    set_all_lanes,
 )
 
 _STEPS, _ROUNDS = 12, 40  # steps each way at most, and how often contacts are evaluated for them
@@ -39,9 +40,18 @@ _STEPS, _ROUNDS = 12, 40  # steps each way at most, and how often contacts are e
 _FIRST, _SHORT, _LONGEST = 0.5, 0.02, 0.5
 # On the floor of a valley χ² could fall by no more than this across it; so often is it looked for.
 _FLOOR, _TRIALS = 0.01, 4
-# A step is halved where its correction, relative to it, or its turn (as a cosine) is too large.
-_LARGEST, _STRAIGHT = 2.5, 0.5
+# It is not found where χ² could fall by more than this share of what it could fall by before.
+_SLOW = 0.3
+# A step is halved where the change of ξ, relative to it, is too small or too large, or its turn (as
+# a cosine) too large.
+_SMALLEST, _LARGEST, _STRAIGHT = 0.3, 2.5, 0.5
+# A valley is followed until χ² is so much above its least.
+_HIGH = 16.0
+# Where the fold is expected after one more step, and how near to it a valley ends: as shares of the
+# way there, and of the valley so far.
+_BEFORE, _NEAR = 0.9, 0.05
 _SHORTEST = 2e-3
+_FLAT = 1e-30  # volumes that are nothing
 _FEW = 5  # a valley of fewer nodes is not described by them
 
 
@@ -56,42 +66,59 @@ def _cosine(x: Array, a: Array, b: Array) -> float:
 
 
 @inlined
+def _floor_of(x: Array, r: Array, j: Array, axes: Array, proximal: float, move: Array) -> float:
+    """Fill the move across a valley to its floor within the whisker; return what χ² falls by."""
+    away, steep, square, falls = np.zeros(3), 0.0, 0.0, 0.0
+    for m in range(1, 3):
+        for a in range(r.shape[0]):
+            by = j[a, 0] * axes[0, m] + j[a, 1] * axes[1, m] + j[a, 2] * axes[2, m]
+            away[m] -= r[a] * by
+        steep += axes[0, m] * away[m]
+        square += axes[0, m] * axes[0, m]
+        falls += away[m] * away[m]
+    left = min(max(x[0] + steep, proximal), 1.0) - x[0] - steep
+    if left != 0.0:
+        for m in range(1, 3):
+            away[m] += axes[0, m] * left / square
+        falls -= left * left / square
+    for a in range(3):
+        move[a] = axes[a, 1] * away[1] + axes[a, 2] * away[2]
+    return falls
+
+
+@inlined
 def _node(
     x: Array,
     value: Array,
     t: Array,
-    third: Array,
+    proximal: float,
     how: Weighing,
     target: Array,
     measured: Array,
     nodes: Nodes,
     i: int,
     along: Array,
-) -> float:
-    """Fill a node, moved across the valley as x is; what χ² falls by then, negative for none.
+) -> tuple[float, float]:
+    """Fill a node, moved across the valley as x is; what χ² falls by then, and det ∂p/∂ξ.
 
-    ``along`` becomes the valley's standard deviation, on the same side.
+    ``along`` becomes the valley's standard deviation, on the same side. Where there is no valley
+    the determinant is negative.
     """
     _, misfits, logs, points, spreads = nodes
     codes = how.codes
     k = codes.shape[0]
     residual, jacobian, weights = np.empty(k), np.empty((k, 4)), np.zeros((k, k))
-    r, four, j = np.empty(k), np.empty((k, 4)), np.empty((k, 3))
+    r, four, j, third = np.empty(k), np.empty((k, 4)), np.empty((k, 3)), np.empty((6, 3))
     axes, frame, move, ahead = np.empty((3, 3)), np.empty((3, 3)), np.zeros(3), np.empty(3)
     if not weigh_any(how, value, measured, weights):
-        return -1.0
+        return 0.0, -np.inf
     channel_equations(x, value, t, codes, target, residual, jacobian)
-    chi, falls = whiten(weights, residual, jacobian, k, r, four), 0.0
+    chi = whiten(weights, residual, jacobian, k, r, four)
     without_friction(four, j)
     if not (chi < np.inf and principal_axes(x, j, axes)):
-        return -1.0
-    for m in range(1, 3):
-        slope = 0.0
-        for a in range(k):
-            slope += r[a] * (j[a, 0] * axes[0, m] + j[a, 1] * axes[1, m] + j[a, 2] * axes[2, m])
-        falls += slope * slope
-        for a in range(3):
-            move[a] -= slope * axes[a, m]
+        return 0.0, -np.inf
+    without_friction(t, third)
+    falls = _floor_of(x, r, j, axes, proximal, move)
     for a in range(3):
         ahead[a] = axes[a, 0]
     size, side = axis_length(x, ahead), math.copysign(1.0, _cosine(x, ahead, along))
@@ -114,40 +141,106 @@ def _node(
     misfits[i] = chi - falls
     logs[i, 1] = math.log(abs(solve(frame, ahead)) + 1e-300) - 0.5 * misfits[i]
     logs[i, 1] += sharpness(weights)
-    logs[i, 0] = logs[i, 1] + math.log(max(volume, 1e-300))
+    logs[i, 0] = logs[i, 1] + math.log(max(volume, _FLAT))
     shorter = min(1.0, _LONGEST / max(axis_length(x, move), 1e-300))
-    x[0] += shorter * move[0]
+    x[0] = min(max(x[0] + shorter * move[0], proximal), 1.0)
     x[2] += shorter * move[1]
     x[3] += shorter * move[2]
-    return falls if volume > 0.0 else -1.0
+    return falls, volume
 
 
 @inlined
-def _ahead(x: Array, along: Array, step: float, to: Array) -> None:
-    """Fill the contact a step farther."""
-    share = step / axis_length(x, along)
-    to[0] = min(max(x[0] + share * along[0], LEAST_ARC), 1.0)
-    to[1], to[2], to[3] = 0.0, x[2] + share * along[1], x[3] + share * along[2]
+def _ahead(x: Array, along: Array, bend: Array, step: float, proximal: float, to: Array) -> float:
+    """Fill the contact a step farther, along a direction that bends; how long the step is."""
+    size, turn = axis_length(x, along), axis_length(x, bend)
+    up = along[0] / size
+    room = (1.0 - x[0]) / up if up > 0.0 else (x[0] - proximal) / max(-up, 1e-300)
+    step = min(step, room)
+    share, bent = step / size, 0.5 * step * min(step, 1.0 / max(turn, 1e-300))
+    to[0] = min(max(x[0] + share * along[0] + bent * bend[0], proximal), 1.0)
+    to[1] = 0.0
+    to[2] = x[2] + share * along[1] + bent * bend[1]
+    to[3] = x[3] + share * along[2] + bent * bend[2]
+    return step
+
+
+@inlined
+def _one_way(
+    rod: Rod,
+    proximal: float,
+    how: Weighing,
+    target: Array,
+    measured: Array,
+    start: Array,
+    volume: float,
+    side: int,
+    nodes: Nodes,
+    along: Array,
+) -> tuple[int, bool]:
+    """Fill the nodes on one side of the start; how many, and whether they end with Ω.
+
+    ``along`` is the direction at the start, where det ∂p/∂ξ is ``volume``.
+    """
+    places, misfits = nodes[0], nodes[1]
+    b, value, t = np.zeros(BUFFER_SIZE), np.empty(6), np.zeros((6, 4))
+    at, to, turned, gone = start.copy(), np.zeros(4), np.empty(3), np.empty(3)
+    bend = np.zeros(3)
+    step, number, spent, ended = min(_FIRST * axis_length(start, along), _SHORT), 0, 0, False
+    while number < _STEPS and spent < _ROUNDS:
+        i = _STEPS + side * (number + 1)
+        wanted, step = step, _ahead(at, along, bend, step, proximal, to)
+        if step < _SHORTEST or (ended and step < _NEAR * abs(places[i - side])):
+            return number, ended or step < wanted
+        falls, there, trials = np.inf, 1.0, 0
+        for _ in range(_TRIALS):
+            set_all_lanes(b, to[0], 0.0, to[2], to[3])
+            integrate(rod, b, 1)
+            lane_value(b, 0, value)
+            lanes_tangents(b, t)
+            copy(along, turned)
+            before = falls
+            falls, there = _node(to, value, t, proximal, how, target, measured, nodes, i, turned)
+            spent, trials = spent + 1, trials + 1
+            if there <= 0.0 or falls < _FLOOR or falls > _SLOW * before:
+                break
+        if there <= 0.0:  # beyond the fold, where it vanishes
+            ended = True
+            step *= max(_BEFORE * volume / max(volume - there, 1e-300), 0.1)
+            continue
+        for a in range(3):
+            gone[a] = to[min(a, 1) + a] - at[min(a, 1) + a]
+        if not (
+            falls < _FLOOR
+            and _SMALLEST * step < axis_length(at, gone) < _LARGEST * step
+            and _cosine(to, turned, along) > _STRAIGHT
+        ):
+            step *= 0.5
+            continue
+        old, new = axis_length(at, along), axis_length(to, turned)
+        for a in range(3):
+            bend[a] = (turned[a] / new - along[a] / old) / step
+        places[i] = places[i - side] + side * step
+        number, volume = number + 1, there
+        copy(to, at)
+        copy(turned, along)
+        if not misfits[i] < misfits[_STEPS] + _HIGH:
+            break
+        longer = pace(misfits[i] - misfits[i - side]) if trials < _TRIALS - 1 else 1.0
+        step = min(longer * step, _LONGEST)
+    return number, ended
 
 
 @inlined
 def _described(
-    nodes: Nodes, first: int, last: int, ended: AnyArray, point: Array, covariance: Array
-) -> bool:
-    """Replace a covariance by that of the nodes, if these reach both ends."""
-    misfits, least = nodes[1], np.inf
-    for i in range(first, last):
-        least = min(least, misfits[i])
-    high = misfits[first] > least + CLOSED, misfits[last - 1] > least + CLOSED
-    if last - first < _FEW or not ((high[1] or ended[0]) and (high[0] or ended[1])):
-        return False
-    shares, spread = np.empty(misfits.shape[0]), np.empty((3, 3))
+    nodes: Nodes, first: int, last: int, more: bool, point: Array, covariance: Array
+) -> None:
+    """Replace a covariance by that of the nodes; it is added where there may be ``more``."""
+    shares, spread = np.empty(nodes[0].shape[0]), np.empty((3, 3))
     shares_of(nodes, first, last, shares)
     mixture(nodes, first, last, shares, point, spread)
     for a in range(3):
         for c in range(3):
-            covariance[a, c] = spread[a, c] + (covariance[a, c] if ended[0] or ended[1] else 0.0)
-    return True
+            covariance[a, c] = spread[a, c] + (covariance[a, c] if more else 0.0)
 
 
 @kernel
@@ -159,11 +252,11 @@ def follow_valley(
     measured: Array,
     x: Array,
     covariance: Array,
-) -> bool:
-    """Replace a covariance by that of the valley through x (4,); whether it has both ends.
+) -> None:
+    """Replace a covariance by that of the valley through x (4,), if enough of it is found.
 
-    It ends where χ² has risen enough, or with Ω: as it may go on along the fold, its covariance is
-    then added.
+    It ends where χ² has risen enough, or with Ω. As it may go on there along the fold, or farther
+    than it is followed, its covariance is then added.
     """
     b, most = np.zeros(BUFFER_SIZE), 2 * _STEPS + 1
     nodes = (
@@ -173,63 +266,30 @@ def follow_valley(
         np.empty((most, 3)),
         np.empty((most, 3, 3)),
     )
-    places, misfits = nodes[0], nodes[1]
-    at, to, along, turned = np.empty((2, 4)), np.empty((2, 4)), np.empty((2, 3)), np.empty(3)
-    value, t, third, gone = np.empty(6), np.zeros((6, 4)), np.empty((6, 3)), np.empty(3)
-    steps, number, tries = np.empty(2), np.zeros(2, np.int64), np.zeros(2, np.int64)
-    active, ended = np.ones(2, np.bool_), np.zeros(2, np.bool_)
-    floor, point = np.empty(4), np.empty(3)
-    for lane in range(LANES):
-        set_lane(b, lane, x[0], 0.0, x[2], x[3], False)
-    integrate(rod, b, 3)
-    lane_contact(b, 0, False, value, t, third)
-    copy(x, floor)
+    misfits, value, t, number = nodes[1], np.empty(6), np.zeros((6, 4)), np.zeros(2, np.int64)
+    floor, point, along, turned = x.copy(), np.empty(3), np.empty(3), np.empty(3)
+    more, least = False, np.inf
+    set_all_lanes(b, x[0], 0.0, x[2], x[3])
+    integrate(rod, b, 1)
+    lane_value(b, 0, value)
+    lanes_tangents(b, t)
     turned[0], turned[1], turned[2] = 0.0, -x[3], x[2]
-    if _node(floor, value, t, third, how, target, measured, nodes, _STEPS, turned) < 0.0:
-        return False
+    _, volume = _node(floor, value, t, proximal, how, target, measured, nodes, _STEPS, turned)
+    if not volume > -np.inf:
+        return
     copy(value[3:], point)
+    volume = max(volume, 0.0)
     for way in range(2):
-        copy(x, at[way])
+        side = 1 - 2 * way
         for a in range(3):
-            along[way, a] = turned[a] if way == 0 else -turned[a]
-        steps[way] = min(_FIRST * axis_length(x, turned), _SHORT)
-        _ahead(at[way], along[way], steps[way], to[way])
-    for _ in range(_ROUNDS):
-        if not (active[0] or active[1]):
-            break
-        for lane in range(LANES):
-            c = to[lane // 2] if active[lane // 2] else x
-            set_lane(b, lane, c[0], 0.0, c[2], c[3], False)
-        integrate(rod, b, 3)
-        for way in range(2):
-            if not active[way]:
-                continue
-            side = 1 - 2 * way
-            i = _STEPS + side * (number[way] + 1)
-            before = misfits[i - side]
-            lane_contact(b, 2 * way, False, value, t, third)
-            copy(along[way], turned)
-            falls = _node(to[way], value, t, third, how, target, measured, nodes, i, turned)
-            tries[way] += 1
-            if falls >= _FLOOR and tries[way] < _TRIALS:
-                to[way, 0] = min(max(to[way, 0], LEAST_ARC), 1.0)
-                continue
-            for a in range(3):
-                gone[a] = to[way, min(a, 1) + a] - at[way, min(a, 1) + a]
-            tries[way] = 0
-            edge = falls < 0.0 or not proximal <= to[way, 0] <= 1.0
-            good = not edge and falls < _FLOOR
-            good = good and axis_length(at[way], gone) < _LARGEST * steps[way]
-            if good and _cosine(to[way], turned, along[way]) > _STRAIGHT:
-                places[i] = places[i - side] + side * steps[way]
-                number[way] += 1
-                copy(to[way], at[way])
-                copy(turned, along[way])
-                active[way] = misfits[i] < misfits[_STEPS] + HIGH and number[way] < _STEPS
-                steps[way] = min(pace(misfits[i] - before) * steps[way], _LONGEST)
-            else:
-                steps[way] *= 0.5
-                active[way] = steps[way] > _SHORTEST
-                ended[way] = edge
-            _ahead(at[way], along[way], steps[way], to[way])
-    return _described(nodes, _STEPS - number[1], _STEPS + number[0] + 1, ended, point, covariance)
+            along[a] = side * turned[a]
+        number[way], ended = _one_way(
+            rod, proximal, how, target, measured, x, volume, side, nodes, along
+        )
+        more = more or ended
+    first, last = _STEPS - number[1], _STEPS + number[0] + 1
+    for i in range(first, last):
+        least = min(least, misfits[i])
+    more = more or min(misfits[first], misfits[last - 1]) < least + CLOSED
+    if last - first >= _FEW:
+        _described(nodes, first, last, more, point, covariance)

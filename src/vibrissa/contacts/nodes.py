@@ -265,27 +265,14 @@ def _likely_nodes(
 
 
 @vectorised
-def outside_share(
-    of: Searched,
-    white: bool,
-    weights: Array,
-    unit: Array,
-    target: Array,
-    point: Array,
-    chi: float,
-    log_mass: float,
-    covariance: Array,
-    others: Array,
-) -> float:
-    """Share of the probability that the chart's nodes leave to other regions than a candidate's.
+def probable_nodes(
+    of: Searched, white: bool, weights: Array, unit: Array, target: Array, point: Array, chi: float
+) -> tuple[Array, Array]:
+    """Nodes of the chart that may be right: their points (3, n), density and likelihood (2, n).
 
-    Where noise leaves more open than the second order about one contact can describe, so that many
-    nodes count, the covariance is replaced by the second moment of the posterior over them. The
-    share outside three standard deviations is that of contact points or of the chart, whichever is
-    larger: contact points of little volume, as near slip-off, are not left out. Where valleys are
-    too narrow for the nodes, ``others`` (n, 4), χ² and points, count as well. What is seen may be
-    ``white`` already. Weights of directions are for sizes of one ``unit``, if that is not zero: of
-    larger ones they are sharper, and so is the density of what was measured.
+    Points are those about one of the contact points, likelihoods are relative to its χ². What is
+    seen may be ``white`` already. Weights of directions are for sizes of one ``unit``, if that is
+    not zero: of larger ones they are sharper, and so is the density of what was measured.
     """
     if white:
         weights = np.zeros((of.turns.shape[0], of.turns.shape[0]))
@@ -294,35 +281,63 @@ def outside_share(
     blocks, most = np.empty(of.blocks.shape[0] - 1, np.int64), chi + _NEGLIGIBLE
     near, size = _near_blocks(of, weights, unit, target, most, blocks)
     n, nodes, misfits = _likely_nodes(of, weights, unit, target, most, blocks, near, size)
-    points, density, likelihood, far = np.empty((3, n)), np.empty(n), np.empty(n), np.empty(n)
-    total, squares = 0.0, 0.0
+    points, likely = np.empty((3, n)), np.empty((2, n))
     for k in range(n):
-        likelihood[k] = quick_exp(0.5 * (chi - misfits[k]))
+        likely[1, k] = quick_exp(0.5 * (chi - misfits[k]))
     for i in range(unit.shape[0]):
         for k in range(n if unit[i] > 0.0 else 0):
-            likelihood[k] *= of.sizes[i, nodes[k]] / unit[i]
+            likely[1, k] *= of.sizes[i, nodes[k]] / unit[i]
     for k in range(n):
         node = nodes[k]
-        density[k] = of.volume[node] * likelihood[k]
-        total += density[k]
-        squares += density[k] * density[k]
+        likely[0, k] = of.volume[node] * likely[1, k]
         for a in range(3):
             points[a, k] = of.values[node, 3 + a] - point[a]
-    many = total * total > _MANY * squares
-    if many:
-        second_moment(points, density, total, covariance)
-    root = np.zeros((3, 3))
-    if not cholesky(covariance, root):
-        return 0.0
-    squared_distances(root, points, far)
-    wider = 1.0
-    if many:
-        fourth = 0.0
+    return points, likely
+
+
+@vectorised
+def described_by_nodes(points: Array, density: Array, covariance: Array) -> bool:
+    """Replace a covariance by the second moment of the posterior over the nodes, if many count.
+
+    That is where noise leaves more open than an expansion about one contact can describe.
+    """
+    n, total, squares, fourth = density.shape[0], 0.0, 0.0, 0.0
+    for k in range(n):
+        total += density[k]
+        squares += density[k] * density[k]
+    if not total * total > _MANY * squares:
+        return False
+    root, far = np.zeros((3, 3)), np.empty(n)
+    second_moment(points, density, total, covariance)
+    if cholesky(covariance, root):
+        squared_distances(root, points, far)
         for k in range(n):
             fourth += density[k] * far[k] * far[k]
-        wider = max(fourth / (total * NORMAL_KURTOSIS), 1.0) ** 0.75
-        covariance *= wider
-        far /= wider
+        covariance *= max(fourth / (total * NORMAL_KURTOSIS), 1.0) ** 0.75
+    return True
+
+
+@vectorised
+def outside_share(
+    points: Array,
+    likely: Array,
+    point: Array,
+    chi: float,
+    log_mass: float,
+    covariance: Array,
+    others: Array,
+) -> float:
+    """Share of the probability that probable nodes leave to other regions than a candidate's.
+
+    The share outside three standard deviations is that of contact points or of the chart, whichever
+    is larger: contact points of little volume, as near slip-off, are not left out. Where valleys
+    are too narrow for the nodes, ``others`` (n, 4), χ² and points, count as well.
+    """
+    n, root, away = points.shape[1], np.zeros((3, 3)), np.empty(3)
+    if not cholesky(covariance, root):
+        return 0.0
+    density, likelihood, far = likely[0], likely[1], np.empty(n)
+    squared_distances(root, points, far)
     mass, mass_out, like, like_out = 0.0, 0.0, 0.0, 0.0
     for k in range(n):
         if far[k] > _OUTSIDE_REGION:
@@ -331,11 +346,10 @@ def outside_share(
         else:
             mass += density[k]
             like += min(likelihood[k], 1.0)
-    away = np.empty(3)
     for k in range(others.shape[0]):
         for a in range(3):
             away[a] = others[k, 1 + a] - point[a]
-        if others[k, 0] < np.inf and mahalanobis(root, away) > wider * _OUTSIDE_REGION:
+        if others[k, 0] < np.inf and mahalanobis(root, away) > _OUTSIDE_REGION:
             like_out += quick_exp(min(0.5 * (chi - others[k, 0]), 0.0))
     # The nodes may be too far apart to see all of the candidate itself.
     mass = max(mass, math.exp(min(log_mass + 0.5 * chi, _MOST_LOG)), 1e-300)

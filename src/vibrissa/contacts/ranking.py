@@ -35,7 +35,14 @@ from vibrissa.contacts.candidates import (
 from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates, Room
 from vibrissa.contacts.flat_valleys import follow_valley
 from vibrissa.contacts.least_squares import channel_equations, fit_within, same_contact, whiten
-from vibrissa.contacts.nodes import PARTS, Searched, nearest_of, outside_share
+from vibrissa.contacts.nodes import (
+    PARTS,
+    Searched,
+    described_by_nodes,
+    nearest_of,
+    outside_share,
+    probable_nodes,
+)
 from vibrissa.contacts.noise import INDISTINCT
 from vibrissa.contacts.posterior import CERTAIN, judge, rank
 from vibrissa.contacts.task import Problem, Task, in_memory
@@ -373,21 +380,15 @@ def _leave_room(
     ``best`` is which candidate it was before they were put in order.
     """
     white, weights, spread = how.own[0, 0] > 0.0, room.weights[best], out.covariances[row, 0]
-    value, valid = out.values[row, 0], out.valid[row, 0]
-    if not (room.described[best] and (valid or not _mirrored(how))):
+    value, chi = out.values[row, 0], out.chi_squared[row, 0]
+    seen, unit = measured if white else target, _units(of, how, value)
+    points, likely = probable_nodes(of, white, weights, unit, seen, value[3:], chi)
+    bent = not room.described[best] or (_mirrored(how) and not out.valid[row, 0])
+    if not described_by_nodes(points, likely[0], spread) and bent:
         follow_valley(of.rod, of.proximal, how, target, measured, out.x[row, 0], spread)
-    out.probability[row, 0] *= 1.0 - outside_share(
-        of,
-        white,
-        weights,
-        _units(of, how, value),
-        measured if white else target,
-        value[3:],
-        out.chi_squared[row, 0],
-        room.weight[1, best] - sharpness(weights) + _LOG_NORMAL,
-        spread,
-        room.loose,
-    )
+    log_mass = room.weight[1, best] - sharpness(weights) + _LOG_NORMAL
+    share = outside_share(points, likely, value[3:], chi, log_mass, spread, room.loose)
+    out.probability[row, 0] *= 1.0 - share
 
 
 @kernel

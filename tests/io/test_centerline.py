@@ -212,3 +212,21 @@ def test_two_columns_of_thickness(tmp_path):
     path = table(tmp_path, "x,y,z,radius_um,diameter_um", POINTS, RADII, RADII)
     with pytest.raises(ValueError, match="radius_um and diameter_um; one of them"):
         load_whisker(path)
+
+
+def test_what_a_file_leaves_open_is_noted(tmp_path):
+    """A base without numbers moved the base by a row, and a column "rayon" was passed over."""
+    points = samples.gamma().centerline(21) * 1e3
+    lines = ["x (mm);y (mm);z (mm);rayon (mm)"]
+    lines += [";".join(f"{v:.6f}" for v in [*point, 0.1]).replace(".", ",") for point in points]
+    path = tmp_path / "moustache.csv"
+    path.write_text("\n".join(lines))
+    notes = load_whisker(path).notes
+    assert any("rayon (mm)" in note for note in notes)
+    assert any("first point of the file was taken as the base" in note for note in notes)
+    assert not any("taken as the base" in note for note in load_whisker(path, base="last").notes)
+    lines[1] = "n/a;n/a;n/a;0,1"
+    path.write_text("\n".join(lines) + "\n;;;\n")
+    notes = [note for note in load_whisker(path).notes if "left out" in note]
+    assert len(notes) == 1
+    assert notes[0].endswith("an end of the whisker among them: row 1")

@@ -39,7 +39,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any, NamedTuple, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -57,7 +57,7 @@ from vibrissa.io.table import (
     unit_factor,
     write_table,
 )
-from vibrissa.numerics import Array
+from vibrissa.numerics import AnyArray, Array
 from vibrissa.whisker import (
     Identity,
     Pose,
@@ -83,6 +83,9 @@ _THINNEST, _THICKEST = 1e-5, 0.1
 _TAPERED = 0.01
 _SURE = 4.0  # standard errors by which it is thicker, at least
 _PLANAR = "the file has no column z: the whisker was taken to be planar"
+_FIRST = (
+    "the first point of the file was taken as the base; base='last' (Python) takes the other end"
+)
 
 
 def load_centerline(path: str | PathLike[str]) -> Array:
@@ -98,11 +101,19 @@ def load_centerline(path: str | PathLike[str]) -> Array:
     array (n, 3)
         Points, m, in the file's frame and order.
     """
-    return _table(Path(path))[0]
+    return _table(Path(path)).points
 
 
-def _table(path: Path) -> tuple[Array, Array | None, str, bool]:
-    """Points (n, 3) and, if stated, radii (n,), m; the coordinates' unit; whether z is stated."""
+class _Centreline(NamedTuple):
+    """Points (n, 3) and, if stated, radii (n,), m; the coordinates' unit; what is worth a note."""
+
+    points: Array
+    radii: Array | None
+    unit: str
+    notes: tuple[str, ...]
+
+
+def _table(path: Path) -> _Centreline:
     rows = table_rows(read_text(path))
     header = next(rows, None)
     if header is None:
@@ -111,13 +122,31 @@ def _table(path: Path) -> tuple[Array, Array | None, str, bool]:
     thickness = _thickness(path, header[1], factor)
     places = [*columns, *(place for place, _ in thickness)]
     array = read_rows(path, rows, len(header[1]), places)
-    array = array[np.isfinite(array[:, : len(columns)]).any(axis=1)]
+    finite = np.isfinite(array)
+    known = np.asarray(finite[:, : len(columns)].any(axis=1))
+    notes = _left_out(known, np.asarray(finite.any(axis=1)))
+    array = array[known]
     points = array[:, : len(columns)] * factor
-    spatial = len(columns) == 3
-    if not spatial:
+    if len(columns) < 3:
         points = np.column_stack([points, np.zeros(len(points))])
+        notes.append(_PLANAR)
+    others = [name for place, name in enumerate(header[1]) if name and place not in places]
+    if others and not thickness:
+        notes.append(f"no column radius or diameter was found, and not read: {', '.join(others)}")
     unit = next(name for name, length in LENGTHS.items() if length == factor)
-    return points, array[:, -1] * thickness[0][1] if thickness else None, unit, spatial
+    radii = array[:, -1] * thickness[0][1] if thickness else None
+    return _Centreline(points, radii, unit, tuple(notes))
+
+
+def _left_out(known: AnyArray, filled: AnyArray) -> list[str]:
+    """Note rows without coordinates, but for empty ones at the end of a file."""
+    last = int(np.flatnonzero(filled)[-1]) + 1 if filled.any() else 0
+    missing = np.flatnonzero(~known[:last])
+    if not missing.size:
+        return []
+    ends = "" if known[0] and known[last - 1] else ", an end of the whisker among them"
+    rows = few_faults([f"row {i + 1}" for i in missing])
+    return [f"rows without coordinates were left out{ends}: {rows}"]
 
 
 def _columns(path: Path, header: list[str]) -> tuple[list[int], float]:
@@ -167,7 +196,7 @@ def check_slender(radius: float, length: float) -> None:
 
 def tells_radius(path: str | PathLike[str]) -> bool:
     """Tell whether a table of a centreline has a column of radii."""
-    return _table(Path(path))[1] is not None
+    return _table(Path(path)).radii is not None
 
 
 def save_centerline(path: str | PathLike[str], points: ArrayLike) -> None:
@@ -214,7 +243,7 @@ def load_whisker(
     Whisker
         Named after the file unless a name is given.
     """
-    points, radii, unit, spatial = _table(Path(path))
+    points, radii, unit, notes = _table(Path(path))
     properties.setdefault("name", Path(path).stem)
     stated = {
         name
@@ -224,11 +253,12 @@ def load_whisker(
     try:
         if radii is None or stated:
             whisker = Whisker.from_points(points, noise=noise, base=base, **properties)
+            notes = (_FIRST, *notes) if base is None else notes
         else:
             whisker = _tapered(points, radii, noise, base, properties)
     except ValueError as fault:
         raise ValueError(f"{path}: {fault} (by the header coordinates are in {unit})") from None
-    return whisker if spatial else replace(whisker, notes=(*whisker.notes, _PLANAR))
+    return replace(whisker, notes=(*whisker.notes, *notes)) if notes else whisker
 
 
 def _tapered(

@@ -46,6 +46,8 @@ _RINGS = 2e-5
 _DEEP = 10.0
 _LONGER = 1.1  # length over which a known whisker may be seen, in units of its own
 _STILL = 0.01  # usual deviation of free frames at most, as a share of a known whisker's length
+# Spread of lengths, 16 to 84 %, from which ends in a minority of frames are no tips.
+_FADES = 0.02
 _ENDS = 3  # number of frames at rest that show the tip, from which the length is taken
 # Factor of the noise of a shape: errors of neighbouring points are correlated, so that they seem
 # smoother than they are right.
@@ -202,6 +204,10 @@ def _length(curves: Array, tips: Mask | None) -> tuple[float, bool]:
     lengths = np.linalg.norm(np.diff(curves, axis=1), axis=2).sum(axis=1)
     ends = np.ones(len(curves), dtype=bool) if tips is None else tips
     whole = bool(ends.sum() >= _ENDS)
+    if whole and 2 * ends.sum() < len(ends):
+        # Where a whisker usually fades, some lines seem to end, but anywhere.
+        low, high = np.percentile(lengths[ends], [16.0, 84.0])
+        whole = bool(high - low < _FADES * high)
     # A part of a tip may be missed, but hardly is more seen than there is.
     return float(np.percentile(lengths[ends] if whole else lengths, 75.0)), whole
 

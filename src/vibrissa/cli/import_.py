@@ -33,6 +33,7 @@ def import_tracks(
     names: str | None = None,
     point_sigma: float | None = None,
     base_radius: float | None = None,
+    tip_radius: float | None = None,
     cutoff: float | None = None,
     objects: Path | None = None,
     force: bool = False,
@@ -58,7 +59,7 @@ def import_tracks(
         remark(f"note: {note}")
     how = vb.tracking.TrackOptions(
         cutoff=vb.tracking.CUTOFF if cutoff is None else cutoff or None,
-        **own.tracked(base_radius),
+        **own.tracked(base_radius, tip_radius),
     )
     known: dict[str, Any] = {} if objects is None else {"objects": objects_from(objects)}
     with progress_bars() as tell:

@@ -70,15 +70,18 @@ class TrackedOptions(WhiskerOptions):
         if self.any_length and self.whisker is None:
             raise ValueError("--any-length is about a --whisker, and none is given")
 
-    def tracked(self, base_radius: float | None) -> dict[str, Any]:
+    def tracked(self, base_radius: float | None, tip_radius: float | None) -> dict[str, Any]:
         """Options of tracking: the whisker, if it is given, with radii that are stated."""
-        properties: dict[str, Any] = {}
-        if base_radius is not None:
-            properties["base_radius"] = metres_of(base_radius, "--base-radius")
+        stated = {"--base-radius": base_radius, "--tip-radius": tip_radius}
+        properties: dict[str, Any] = {
+            name[2:].replace("-", "_"): metres_of(radius, name)
+            for name, radius in stated.items()
+            if radius is not None
+        }
         if self.whisker is not None:
             return {"whisker": self.read().with_properties(**properties)}
         if self.rat is not None:
-            refuse({"--base-radius": base_radius}, "--rat gives the radii")
+            refuse(stated, "--rat gives the radii")
             vb.Whisker.straight(0.03, rat=self.rat)  # a wrong name is refused before the work
             properties["rat"] = self.rat
         return {"properties": properties}

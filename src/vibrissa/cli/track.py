@@ -270,6 +270,7 @@ def track(
     known: KnownOptions,
     own: TrackedOptions,
     base_radius: float | None = None,
+    tip_radius: float | None = None,
     fur: float = 0.0,
     cutoff: float | None = None,
     force: bool = False,
@@ -314,7 +315,7 @@ def track(
         rough=filmed.cameras is None and filmed.distance != math.inf,
         distance=filmed.distance,
         fur=1e-3 * fur,
-        **own.tracked(base_radius),
+        **own.tracked(base_radius, tip_radius),
     )
     bases, masks = traced.bases(views, clicks), traced.masks(views, clicks)
     fixed = known.corrected(len(views))

@@ -352,7 +352,8 @@ def track_whisker(
     fitter = Fitter(cameras, series, touching, on_head, rate, smoothness, head, objects)
     length = Length(whisker.length, 0.0)
     if options.whisker is None and shape.whole:
-        length = seen_length(on_head[shape.free & tips], series.line)
+        tapers = "tip_radius" in options.properties
+        length = seen_length(on_head[shape.free & tips], series.line, tapers)
     elif options.whisker is None:
         length = _length(fitter, shape, options)
         shape = lengthened(shape, length.value)

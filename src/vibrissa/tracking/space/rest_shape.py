@@ -46,7 +46,7 @@ _RINGS = 2e-5
 _DEEP = 10.0
 _LONGER = 1.1  # length over which a known whisker may be seen, in units of its own
 _STILL = 0.01  # usual deviation of free frames at most, as a share of a known whisker's length
-# Spread of lengths, 16 to 84 %, from which ends in a minority of frames are no tips.
+# Spread of lengths, 16 to 84 %, from which ends in a minority of frames are not tips.
 _FADES = 0.02
 _ENDS = 3  # number of frames at rest that show the tip, from which the length is taken
 # Factor of the noise of a shape: errors of neighbouring points are correlated, so that they seem

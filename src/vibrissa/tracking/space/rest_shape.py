@@ -67,9 +67,6 @@ _STEP, _LONGEST, _FINE = 0.03, 1.45, 600
 _CERTAIN = 0.025
 # Difference of costs up to which a length is hardly less likely: three standard deviations.
 _HARDLY = 9.0
-# Share of a whisker's length that is too thin to be seen beyond a tip that is seen, with the same
-# standard deviation.
-_FADED = 0.005
 _ENDED = 0.7  # standard deviation of a seen length by where its tip is seen, pixels
 _OUTER = 0.4  # share of the shape that determines how it continues
 
@@ -297,16 +294,15 @@ def _swings(directions: Array, goal: Array) -> Array:
 def whisker_at_rest(
     shape: RestShape, name: str = "tracked", hidden: float = 0.0, **properties: float
 ) -> Whisker:
-    """Make a whisker of the rest shape; radii are those before a hidden part and beyond its end."""
+    """Make a whisker of the rest shape, whose radii at its base are those before a hidden part."""
     noise = _SMOOTH * shape.noise
     whisker = Whisker.from_points(shape.points, noise=noise, name=name, **properties)  # type: ignore[arg-type]
-    beyond = _FADED * whisker.length if shape.whole else 0.0
-    if hidden == beyond == 0.0:
+    if hidden == 0.0:
         return whisker
     at_base, at_tip = whisker.radius(np.array([0.0, whisker.length]))
-    ends = np.array([hidden, hidden + whisker.length]) / (hidden + whisker.length + beyond)
-    edge, end = at_base + ends * (at_tip - at_base)
-    return whisker.with_properties(base_radius=float(edge), tip_radius=float(end))
+    share = hidden / (whisker.length + hidden)
+    edge = float(at_base + share * (at_tip - at_base))
+    return whisker.with_properties(base_radius=edge, tip_radius=float(at_tip))
 
 
 def aligned_lengths(curves: Array, spacing: float | None = None) -> tuple[float, Array]:
@@ -399,7 +395,7 @@ def seen_length(curves: Array, lines: Array, tapers: bool = True) -> Length:
     pixels = np.linalg.norm(np.diff(lines, axis=2), axis=3).sum(axis=2)
     low, value, high = np.percentile(lengths, [16.0, 50.0, 84.0])
     seen = np.hypot(_ENDED * value / np.nanpercentile(pixels, 95.0), 0.5 * (high - low))
-    sigma = np.hypot(seen, (_FADED if tapers else _CERTAIN) * value)
+    sigma = seen if tapers else np.hypot(seen, _CERTAIN * value)
     return Length(float(value), float(sigma), seen=True)
 
 

@@ -10,7 +10,7 @@ method. Margins that are violated cost in proportion, so that a climb may begin 
 Directions are equal where the cross product of the two transverse vectors vanishes, and sizes where
 their squares agree: equations that are regular also where a transverse vector is zero, through
 which ridges lead. Where a triplet collapses, as on the plane of a planar whisker, all pairs solve
-them: climbs keep off pairs of which equal signals fix neither contact.
+them: climbs keep off contacts where det ∂T/∂ξ vanishes for both.
 """
 
 from __future__ import annotations
@@ -21,16 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.identifiability.twins import (
-    AGREEMENT,
-    FINER,
-    FIRM,
-    Pairs,
-    Search,
-    contact_set,
-    twins_near,
-    units,
-)
+from vibrissa.identifiability.twins import FINER, Pairs, Search, contact_set, twins_near, units
 from vibrissa.numerics import AnyArray, Array, cross, kernel, solve
 from vibrissa.rod import chart_of, discretize, solve_forces, with_normal_force
 
@@ -114,7 +105,7 @@ def steepest(levels: Array, slopes: Array, within: Array, cost: float, steps: Ar
 # Climbs of each region, the steps they take, and the cost of a violated margin in rad, in rounds
 # that go on with the best of them. The last is on a finer rod, where witnesses must hold: a summit
 # is where margins vanish, and what the integration errs by would violate them.
-_ROUNDS = ((20, 8, 30.0), (6, 12, 30.0), (2, 200, 1000.0), (2, 6, 1000.0))
+_ROUNDS = ((20, 8, 30.0), (6, 12, 30.0), (2, 30, 1000.0), (2, 6, 1000.0))
 # Of a quarter as many again violations cost so much: where they pay, all others may leave a region.
 _STRICT = 1000.0
 # Starts of a region are in different parts of the chart, so many an axis.
@@ -125,14 +116,11 @@ _FIRST, _FINE, _LARGEST, _LAST = 0.1, 1e-3, 0.3, 1e-5
 _LEAST_GAIN = 1e-5  # a climb also ends where the linear program promises no more than this, rad
 _KEPT = 1e-5  # what is kept of each margin so that no summit violates one
 _SAME = 1e-6  # climbs of a region whose merits differ by less than this are at the same summit, rad
-# Transverse vectors, over the whole ones, have at least this geometric mean and face each other:
-# their product would vanish with the square of what both have left.
-_FACING = 1e-2
+_FACING = 1e-4  # transverse vectors face each other at least so far, over their whole sizes
 # Newton steps back to the set, and the misfit that they may leave for the next.
 _CORRECTIONS, _MISFIT = 2, 1e-6
-# A change of the signals by ``AGREEMENT`` moves one contact of a pair by no more than this, over L:
-# less than a twin may be moved.
-_MOVED = 0.1 * FIRM
+# The larger determinant of a pair, over the lengths of the gradients, is at least this.
+_REGULAR = 1e-4
 _STEEP = 0.1  # its logarithm, so scaled, is the margin: no cost lets a pair through
 # Step of the derivatives of margins, and its ridge against singular equations.
 _STEP, _RIDGE = 1e-5, 1e-14
@@ -141,13 +129,11 @@ _STEP, _RIDGE = 1e-5, 1e-14
 class _State(NamedTuple):
     """Pairs on the way: contacts (n, 2, 3), linearised equations (n, 3, 6), angles and margins.
 
-    Firmness (n, 2) of `_firmness`; levels (n, 2 + m): both cone angles, then margins; merit (n,),
-    -inf off the set.
+    Levels (n, 2 + m): both cone angles, then margins; merit (n,), -inf off the set.
     """
 
     xi: Array
     slope: Array
-    firmness: Array
     levels: Array
     merit: Array
 
@@ -179,19 +165,19 @@ class _Mountain:
     def _at(self, xi: Array, signs: Array) -> _State:
         unit = self.units(xi)
         for step in range(_CORRECTIONS + 1):
-            values, away, slope, firmness = self._equations(xi, unit)
+            values, away, slope = self._equations(xi, unit)
             if step < _CORRECTIONS:
                 square = slope @ slope.swapaxes(1, 2)
                 ridge = _RIDGE * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(3)
                 back = slope.swapaxes(1, 2) @ np.linalg.solve(square + ridge, away[..., None])
                 xi = xi - back.reshape(xi.shape) * unit
-        levels, inside = self.levels(xi, values, firmness, signs)
+        levels, inside = self.levels(xi, values, slope, signs)
         merit = _merit(levels, self.cost)
         merit[~(inside & (np.abs(away).max(axis=1) <= _MISFIT) & np.isfinite(merit))] = -np.inf
-        return _State(xi, slope, firmness, levels, merit)
+        return _State(xi, slope, levels, merit)
 
-    def _equations(self, xi: Array, unit: Array) -> tuple[Array, Array, Array, Array]:
-        """(F, p) (n, 2, 6), the triplets' differences (n, 3), their slopes (n, 3, 6), firmness."""
+    def _equations(self, xi: Array, unit: Array) -> tuple[Array, Array, Array]:
+        """(F, p) (n, 2, 6), the differences of the triplets (n, 3) and their slopes (n, 3, 6)."""
         d = self.search.contact_map.chart.discretization
         values, tangents = solve_forces(d, with_normal_force(xi.reshape(-1, 3)), tangents=True)
         by_xi = tangents * unit.reshape(-1, 1, 3)
@@ -202,13 +188,11 @@ class _Mountain:
             turned += cross(point[:, None], by_xi[:, :3].swapaxes(1, 2))
             vectors["M"] = cross(point, force), turned.swapaxes(1, 2)
         away, slope = np.empty((len(xi), 3)), np.empty((len(xi), 3, 2, 3))
-        scale = np.ones((len(xi), 2, 3))
         for k, name in enumerate(self.search.names):
             vector, by = (v.reshape(len(xi), 2, *v.shape[1:]) for v in vectors[name[0]])
             size = np.einsum("npi,npi->np", vector, vector).prod(axis=1)[:, None, None] ** 0.25
             vector = vector / size
             (a_x, a_y, a_z), (b_x, b_y, b_z) = vector.transpose(1, 2, 0)
-            across = np.hypot(vector[..., 1], vector[..., 2])
             normals = np.zeros((len(xi), 2, 3))
             if name[1] == "x":
                 away[:, k] = a_x - b_x
@@ -217,17 +201,14 @@ class _Mountain:
                 away[:, k] = a_y * b_z - a_z * b_y
                 normals[:, 0, 1], normals[:, 0, 2] = b_z, -b_y
                 normals[:, 1, 1], normals[:, 1, 2] = -a_z, a_y
-                scale[..., k] = across.prod(axis=1)[:, None]
             else:
                 away[:, k] = 0.5 * (a_y * a_y + a_z * a_z - b_y * b_y - b_z * b_z)
                 normals[:, 0, 1:], normals[:, 1, 1:] = vector[:, 0, 1:], -vector[:, 1, 1:]
-                scale[..., k] = across
             slope[:, k] = np.einsum("npi,npix->npx", normals / size, by)
-        firmness = _firmness(slope, scale, by_xi[:, 3:].reshape(-1, 2, 3, 3))
-        return values.reshape(-1, 2, 6), away, slope.reshape(-1, 3, 6), firmness
+        return values.reshape(-1, 2, 6), away, slope.reshape(-1, 3, 6)
 
     def levels(
-        self, xi: Array, values: Array, firmness: Array, signs: Array
+        self, xi: Array, values: Array, slope: Array, signs: Array
     ) -> tuple[Array, AnyArray]:
         """Both cone angles and the margins (n, 2 + m), and whether both are inside the domain."""
         contact_map, _, separation, domain = self.search
@@ -241,7 +222,7 @@ class _Mountain:
                 np.where(sign[:, None] == 0.0, 1.0, sign[:, None] * margin)
                 for sign, margin in zip(signs.T, pairs[1:3], strict=True)
             ),
-            _STEEP * np.log(np.maximum(_MOVED * firmness.max(axis=1), _RIDGE))[:, None],
+            _STEEP * np.log(np.maximum(_regularity(slope).max(axis=1), _RIDGE) / _REGULAR)[:, None],
             *pairs[3:],
             self._facing(values),
             np.linalg.norm(values[:, 0, 3:] - values[:, 1, 3:], axis=1)[:, None] - separation,
@@ -256,9 +237,8 @@ class _Mountain:
             if name[1] == "D":
                 a = force if name[0] == "F" else cross(values[..., 3:], force)
                 a = a / np.linalg.norm(a, axis=2, keepdims=True)
-                facing = np.einsum("ni,ni->n", a[:, 0, 1:], a[:, 1, 1:])
-                mean = np.sign(facing) * np.sqrt(np.abs(facing))
-                out = np.concatenate([out, mean[:, None] - _FACING], axis=1)
+                facing = np.einsum("ni,ni->n", a[:, 0, 1:], a[:, 1, 1:]) - _FACING
+                out = np.concatenate([out, facing[:, None]], axis=1)
         return out
 
     def slopes(self, state: _State, signs: Array) -> tuple[Array, Array]:
@@ -267,8 +247,8 @@ class _Mountain:
         unit = self.units(state.xi)
         basis = free * unit[:, None]
         moved = (state.xi[:, None] + _STEP * basis).reshape(-1, 2, 3)
-        values, _, _, firmness = self._equations(moved, np.repeat(unit, 3, axis=0))
-        levels, _ = self.levels(moved, values, firmness, np.repeat(signs, 3, axis=0))
+        values, _, slope = self._equations(moved, np.repeat(unit, 3, axis=0))
+        levels, _ = self.levels(moved, values, slope, np.repeat(signs, 3, axis=0))
         slopes = (levels.reshape(len(basis), 3, -1) - state.levels[:, None]) / _STEP
         return basis, slopes
 
@@ -290,15 +270,15 @@ def farthest_twins(search: Search, pools: Sequence[Pairs], regions: tuple[str, .
         return pools[0].rows(number)
     signs = signs[number % len(regions)]
     state = mountain.at(xi, signs)
+    size = np.full(len(xi), _FIRST)
     for most, steps, cost in _ROUNDS:
         last = (most, steps, cost) == _ROUNDS[-1]
         mountain = replace(mountain, cost=cost, search=_finer(search) if last else search)
         merit = np.where(np.isfinite(state.merit), _merit(state.levels, cost), -np.inf)
         strict = np.where(np.isfinite(merit), _merit(state.levels, _STRICT), -np.inf)
         kept = np.union1d(_leading(merit, number, most), _leading(strict, number, most // 4))
-        number, signs = number[kept], signs[kept]
+        number, signs, size = number[kept], signs[kept], size[kept]
         state = state.rows(kept)._replace(merit=merit[kept])
-        size = np.full(len(kept), _FIRST)  # what was a summit at one cost need not be at another
         if last:
             state = mountain.at(state.xi, signs)
             size = np.where(np.isfinite(state.merit), _FINE, 0.0)  # some are none on this rod
@@ -308,8 +288,8 @@ def farthest_twins(search: Search, pools: Sequence[Pairs], regions: tuple[str, .
                 break
             _step(mountain, state, signs, size, active)
     # The second contact is solved for, from where its signals fix it better.
-    firmer = state.firmness[:, 0] > state.firmness[:, 1]
-    xi = np.where(firmer[:, None, None], state.xi[:, ::-1], state.xi)
+    regular = _regularity(state.slope)
+    xi = np.where((regular[:, 0] > regular[:, 1])[:, None, None], state.xi[:, ::-1], state.xi)
     contact_map, names, _, domain = mountain.search
     first, second, agrees = twins_near(contact_map, names, xi[:, 0], xi[:, 1], domain)
     apart = np.linalg.norm(second.values[:, 3:] - first.values[:, 3:], axis=1)
@@ -325,18 +305,11 @@ def _finer(search: Search) -> Search:
     return search._replace(contact_map=replace(contact_map, chart=chart))
 
 
-def _firmness(slope: Array, scale: Array, point_slope: Array) -> Array:
-    """One over how far a change of the signals by ``AGREEMENT`` moves each contact, (n, 2), of L.
-
-    ``slope`` (n, 3, 2, 3) of the equations, which are ``scale`` (n, 2, 3) times the signals over
-    |F|, |M| and in rad; ``point_slope`` (n, 2, 3, 3) of the contact points.
-    """
-    rows = slope.swapaxes(1, 2)
-    minors = [cross(rows[:, :, (k + 1) % 3], rows[:, :, (k + 2) % 3]) for k in range(3)]
-    determinant = np.abs(np.einsum("npi,npi->np", rows[:, :, 0], minors[0]))
-    moves = point_slope @ (np.stack(minors, axis=-1) * scale[:, :, None])
-    size = AGREEMENT * np.linalg.norm(moves, axis=(2, 3))
-    return np.asarray(determinant / np.maximum(size, np.finfo(np.float64).tiny))
+def _regularity(slope: Array) -> Array:
+    """The determinants of both contacts over the lengths of their gradients, (n, 2)."""
+    gradients = slope.reshape(-1, 3, 2, 3).swapaxes(1, 2)
+    size = np.linalg.norm(gradients, axis=3).prod(axis=2)
+    return np.asarray(np.abs(np.linalg.det(gradients)) / np.maximum(size, _RIDGE))
 
 
 def _starts(search: Search, pairs: Pairs, signs: Array) -> tuple[AnyArray, Array]:

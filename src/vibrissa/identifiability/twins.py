@@ -177,13 +177,13 @@ def _chart_derivatives(fold: Fold, chart: Array) -> Array:
 
 #: Agreement of twins' signals: forces relative to |F|, moments to |M|, angles in rad.
 AGREEMENT = 1e-10
-#: A solution that ``AGREEMENT`` could move by more than this (over L) is not distinct from its
-#: neighbours.
-FIRM = 1e-3
 #: Factor by which the rod is finer on which pairs are found again.
 FINER = 4
 # A pair is confirmed if its second contact moves by less than this share of their distance.
 _STEADY = 0.2
+# A solution that ``AGREEMENT`` could move by more than this (over L) is not distinct from its
+# neighbours.
+_FIRM = 1e-3
 _SAME = 1e-4  # two solutions nearer than this (over L) are the same contact
 # The search for better twins starts wide, ends where climbs begin, keeps so many of each region.
 _WIDTHS = np.geomspace(0.2, 0.02, 9)
@@ -288,7 +288,7 @@ def _firm(contact_map: ContactMap, names: tuple[str, ...], xi: Array) -> AnyArra
     moved = np.full(len(xi), np.inf)
     inverse = np.linalg.inv(by_contact[regular]) * sizes(values[regular], names)[:, None, :]
     moved[regular] = AGREEMENT * np.linalg.norm(tangents[regular, 3:] @ inverse, axis=(1, 2))
-    return np.asarray(moved <= FIRM)
+    return np.asarray(moved <= _FIRM)
 
 
 def better_twins(

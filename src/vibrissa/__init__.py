@@ -148,6 +148,7 @@ __all__ = [
     "whisker_array",
 ]
 
+# Names by the package or module that they are imported from.
 _HOMES = {
     "contacts": "Contact ContactFilter ContactMap Contacts Estimator Gravity Prior estimate_around "
     "estimate_from_wrench second_contact",
@@ -162,7 +163,6 @@ _HOMES = {
     "status": "Status",
     "whisker": "Whisker WhiskerArray whisker_array",
 }
-"""Names by the package or module that they are imported from."""
 
 __getattr__ = names_from(__name__, _HOMES, __all__)
 

@@ -29,10 +29,7 @@ from vibrissa.numerics import Array
 _REGULAR = 1e-12
 _LEAST = 0.05  # correlation that counts as none
 _FREE = 0.25  # smallest share of the residuals that are free, however many numbers are fitted
-
-
-_NEAR = 2
-"""Number of points to each side over which the variance along a trace is averaged."""
+_NEAR = 2  # number of points to each side over which the variance along a trace is averaged
 
 
 class Smoother:

@@ -19,6 +19,7 @@ from vibrissa.cli.inputs import (
     kind_in,
     map_of,
     maps_from,
+    objects_from,
     print_notes,
     print_statuses,
     print_written,
@@ -86,6 +87,38 @@ class GravityOptions:
     def described(self) -> str:
         """State the gravity, to be put at the end of a sentence; empty where there is none."""
         return "" if self.gravity is None else f"; bent by gravity of {self.gravity} m/s²"
+
+
+@dataclass(frozen=True)
+class AroundOptions:
+    """Known objects that a whisker may lie along, and how well their position is known."""
+
+    around: Path | None = None
+    position_sigma: float | None = None
+
+    def __post_init__(self) -> None:
+        if (self.around is None) != (self.position_sigma is None):
+            raise ValueError(
+                "--around and --position-sigma belong together: where objects are is known up to a "
+                "shift (mm, one sigma, along each axis)"
+            )
+
+    def check(self, how: EstimateOptions, weight: GravityOptions) -> None:
+        """Raise where options are stated that the contacts of an arc do not take."""
+        others = {
+            "--map": how.map,
+            "--using": how.using,
+            "--method": None if how.method == "exact" else how.method,
+            "--proximal": how.proximal,
+            "--friction-sigma": how.friction_sigma or None,
+            "--second-contacts": how.second_contacts or None,
+            "--compliance-sigma": how.compliance_sigma or None,
+            "--gravity": weight.gravity,
+        }
+        others |= {f"--{name.replace('_', '-')}": v for name, v in how.assumed.errors.items()}
+        refuse(others, "--around uses force and moment whole, without friction or weight")
+        if how.assumed.prior is not None:
+            raise ValueError("--around takes no prior of contacts: its objects are the prior")
 
 
 _SHOWN = 5  # faults of a table that are reported
@@ -198,6 +231,7 @@ def estimate(
     signals: Path,
     how: EstimateOptions,
     weight: GravityOptions,
+    known: AroundOptions,
     sensor: Path | None = None,
     target: Path | None = None,
     force: bool = False,
@@ -214,17 +248,25 @@ def estimate(
     sweep: positions of the stage, and the channels; `vibrissa reconstruct` finds the object of the
     recording (.nc) that it may go to. With --gravity a whisker of known density sags.
     Where poses of the base are known, as in a recording, gravity is that of the laboratory.
+    With --around contacts are those with known objects, which a whisker may lie along; they go to
+    a table.
     Example: `vibrissa estimate signals.csv --map map.nc --using Fx,FT,MB,MD -o contacts.csv`
     """
     if how.noise.covariance is not None:
         how.noise.matrix()
     recorded = kind_in(vb.io.check_readable(signals)) == RECORDING
-    target = target or (signals if recorded else Path("contacts.csv"))
+    added = recorded and known.around is None
+    target = target or (signals if added else Path("contacts.csv"))
     swept = sensor is not None and vb.io.is_netcdf(sensor)
     both = (*vb.io.NETCDF, *vb.io.CSV)
-    vb.io.check_writable(target, both if recorded or swept else vb.io.CSV)
+    vb.io.check_writable(target, both if added or swept else vb.io.CSV)
     free_beside(signals, [target], force)
-    if sensor is not None and not swept:
+    if known.around is not None:
+        known.check(how, weight)
+        if sensor is not None:
+            raise ValueError("--around takes force and moment, not the channels of a --sensor")
+        _around(signals, target, how, known)
+    elif sensor is not None and not swept:
         if recorded or how.using or how.noise.given or how.special:
             raise ValueError(f"{sensor} is for tables, and has its own channels and noise")
         _from_lines(signals, target, how, weight, vb.sensors.load_sensor(sensor))
@@ -329,6 +371,7 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions, weight: Gravi
     print_notes(known)
     with vb.io.in_file(signals):
         vb.io.check_scale(wrench, known)
+    _doubt_axes(known, wrench, noise, weight)
     with progress_bars() as tell:
         if not maps and not how.whole:
             remark(f"no map given; simulating that of {known!r}")
@@ -350,6 +393,61 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions, weight: Gravi
     remark(how.described(used, found.attrs["friction"], about, found.attrs["felt_above"]))
     print_statuses(found["status"].values)
     print_written(target)
+
+
+def _around(signals: Path, target: Path, how: EstimateOptions, known: AroundOptions) -> None:
+    """Contacts with known objects, which may be several or an arc, as a table."""
+    assert known.around is not None
+    assert known.position_sigma is not None
+    objects, noise = objects_from(known.around), how.noise.matrix()
+    about = how.noise.described()
+    if kind_in(signals) == RECORDING:
+        tree = recording_from(signals)
+        check_one_whisker(tree, signals)
+        if "signals" in vb.pipeline.due_stages(tree, "estimates"):
+            tree = vb.pipeline.with_signals(
+                tree, **SourceOptions().as_keywords(tree, how.known, how.proximal)
+            )
+        wrench, whisker = (
+            tree["signals"].to_dataset().isel(whisker=0),
+            how.own.in_recording(tree)[0],
+        )
+        stated = vb.pipeline.sensor_noise(wrench)
+        if stated is not None and not how.noise.given:
+            noise, about = stated, "noise as the recording states"
+        if wrench.attrs.get("source") == "sensor" and "density" not in wrench.attrs:
+            wrench = wrench.drop_vars("in_contact")
+    else:
+        wrench, whisker = wrench_from(signals), how.own.read()
+    print_notes(whisker)
+    with vb.io.in_file(signals):
+        vb.io.check_scale(wrench, whisker)
+    with progress_bars() as tell:
+        found = vb.pipeline.locate_around(
+            whisker,
+            wrench,
+            noise,
+            objects,
+            1e-3 * known.position_sigma,
+            lambda done, total: tell("contact points", done, total),
+        )
+        tell("contact points", 1, 1)
+    vb.io.save_contacts(target, vb.pipeline.contact_columns(found))
+    remark(
+        f"force and moment whole, around {', '.join(map(repr, objects))}, whose position is known "
+        f"to {known.position_sigma:g} mm; no friction assumed; {about}; contacts are measured "
+        f"where M_B exceeds {shown('MB', found.attrs['felt_above'])}"
+    )
+    print_statuses(found["status"].values)
+    print_written(target)
+
+
+def _doubt_axes(
+    whisker: vb.Whisker, wrench: xr.Dataset, noise: vb.numerics.Array, weight: GravityOptions
+) -> None:
+    """Print which axes of the sensor seem to be others; a weight would look like such."""
+    if weight.gravity is None and (doubt := vb.pipeline.doubted_axes(whisker, wrench, noise)):
+        remark(f"note: {doubt}")
 
 
 def _from_sweep(table: Path, target: Path, path: Path) -> None:
@@ -422,6 +520,8 @@ def estimated(
     for k, whisker in enumerate(whiskers):
         with vb.io.in_file(name):
             vb.io.check_scale(signals.isel(whisker=k), whisker)
+        if source == "sensor":
+            _doubt_axes(whisker, signals.isel(whisker=k), how.noise.matrix(), weight)
     by_default = how.using is None and how.method == "exact" and not how.friction_sigma
     whole = how.whole or (by_default and source == "rod")
     if not maps and not whole:

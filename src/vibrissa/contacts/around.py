@@ -13,7 +13,7 @@ whether the object explains the measurement.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,6 +49,7 @@ def estimate_around(
     position_sigma: float,
     base_rotation: ArrayLike | None = None,
     base_position: ArrayLike | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> xr.Dataset:
     """Locate the contacts with a known object, whether in one point, in several or along an arc.
 
@@ -70,6 +71,8 @@ def estimate_around(
     base_rotation, base_position : array_like, optional
         Pose of the base, shapes (..., 3, 3) and (..., 3), m; by default the whisker's frame is the
         laboratory's.
+    progress : callable, optional
+        Function called before each measurement with the numbers of those done and of all.
 
     Returns
     -------
@@ -116,7 +119,10 @@ def estimate_around(
         "chi_squared": np.full(n, np.nan),
         "status": np.full(n, int(Status.MISSING)),
     }
-    for i in np.flatnonzero(np.isfinite(wrench).all(axis=1)):
+    rows = np.flatnonzero(np.isfinite(wrench).all(axis=1))
+    for done, i in enumerate(rows):
+        if progress is not None:
+            progress(done, rows.size)
         weights = wrench_weights(sensor, d, flat[i : i + 1])[0]
         place = Placement(turns[i], moves[i])
         fitted = _fitted(near, place, flat[i], weights, position_sigma / d.length)
@@ -238,7 +244,6 @@ def _labelled(
     about = {
         "object_shift": {"units": "m", "long_name": "shift of the objects"},
         "object_shift_covariance": {"units": "m^2", "long_name": "covariance of the shift"},
-        "last_arc_length": {"units": "m", "long_name": "arc length of the last contact"},
         "contacts": {"units": "1", "long_name": "nodes that touch"},
         "status": attributes("status") | flag_attributes(),
     }

@@ -11,7 +11,9 @@ Contact points as CSV: ``time, x, y, z, r, theta, phi, sigma_x, …, status``. I
 whisker's frame; the status is written by its name, and missing is ``nan``. Estimates have a column
 ``friction`` before the status, the same in all lines: what was assumed of it; and ``event`` (none,
 onset, loss, slip), with the time at which the present contact began, ``onset_time``, and its
-standard deviation ``onset_sigma``.
+standard deviation ``onset_sigma``. Those around known objects have the arc lengths of the first and
+the last contact, ``arc_length`` and ``last_arc_length``, and by how much the objects are shifted in
+the laboratory, ``shift_x``, ``shift_y``, ``shift_z``.
 
 Contour points as CSV: ``time, whisker, x, y, z, sigma_x, …``, a line for each contact. In SI units
 and the laboratory frame: the contact point on the whisker's centreline with its standard
@@ -303,7 +305,8 @@ def _dataset(table: Array) -> xr.Dataset:
 # Names of the columns with numbers, in their order; the last column is the status.
 NUMBERS = ("time", "x", "y", "z", "r", "theta", "phi", "sigma_x", "sigma_y", "sigma_z")
 # Columns of numbers that are written where there is something to write.
-_OPTIONAL = ("one_contact", "friction", "onset_time", "onset_sigma")
+_AROUND = ("arc_length", "last_arc_length", "shift_x", "shift_y", "shift_z")
+_OPTIONAL = (*_AROUND, "one_contact", "friction", "onset_time", "onset_sigma")
 # Columns of words before the status, by the kind of word, also only where there are any.
 _FLAGS: dict[str, type[Status | Event]] = {"event": Event}
 

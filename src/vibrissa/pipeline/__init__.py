@@ -1,5 +1,6 @@
 """The stages between tracks and a contour, each from a recording to a dataset of its own."""
 
+from vibrissa.pipeline.axes import doubted_axes as doubted_axes
 from vibrissa.pipeline.estimates import (
     Progress as Progress,
     contact_columns as contact_columns,
@@ -20,6 +21,7 @@ from vibrissa.pipeline.locate import (
     DETECTED as DETECTED,
     TRIPLET as TRIPLET,
     locate,
+    locate_around,
     locate_from_wrench,
 )
 from vibrissa.pipeline.predictors import PREDICTORS as PREDICTORS, predictors
@@ -61,6 +63,7 @@ __all__ = [
     "estimates_of",
     "fit_contacts",
     "locate",
+    "locate_around",
     "locate_from_wrench",
     "placed_by",
     "predictors",

@@ -384,5 +384,6 @@ def contact_columns(contacts: xr.Dataset) -> xr.Dataset:
     table = xr.Dataset(columns, {"time": contacts["time"]}, contacts.attrs)
     if "event" not in contacts:
         contacts = with_events(contacts, "contact_point_whisker", "covariance")
-    kept = ("one_contact", "status", *EVENTS)
+    around = ("arc_length", "last_arc_length", "shift_x", "shift_y", "shift_z")
+    kept = ("one_contact", "status", *EVENTS, *(around if "shift_x" in contacts else ()))
     return table.assign({name: contacts[name] for name in kept if name in contacts})

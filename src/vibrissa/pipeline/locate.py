@@ -22,7 +22,7 @@ c being the signals that the contact is found from, and K the inverse of âˆ‚c/âˆ
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -41,6 +41,7 @@ from vibrissa.contacts import (
     channel_gradients,
     common_covariance,
     common_errors,
+    estimate_around,
     estimate_from_wrench,
     estimate_jointly,
     ratio_derivatives,
@@ -49,6 +50,7 @@ from vibrissa.contacts import (
     whitening,
 )
 from vibrissa.numerics import Array
+from vibrissa.objects import Surface
 from vibrissa.quantities import attributes
 from vibrissa.recording import Group
 from vibrissa.rod import Discretization, contact_tangents, discretize, resting, solve_forces
@@ -250,6 +252,88 @@ def locate_from_wrench(
     rest = measured.at_rest(whisker, gravity)
     out = _located(rest, WRENCH, measured, _Candidates.of(found), stated)
     return _alone(out, rest, measured, errors, _FRICTION, second_contacts)
+
+
+def locate_around(
+    whisker: Whisker,
+    wrench: xr.Dataset,
+    noise: ArrayLike | None,
+    objects: Sequence[Surface],
+    position_sigma: float,
+    progress: Callable[[int, int], None] | None = None,
+) -> xr.Dataset:
+    """Locate contacts with known objects, in one point, in several or along an arc.
+
+    Parameters
+    ----------
+    whisker : Whisker
+        Whisker that touches, without weight and friction.
+    wrench : xarray.Dataset
+        Measured wrench, as for `locate`; with ``base_rotation`` and ``base_position`` objects are
+        in the laboratory, otherwise in the whisker's frame.
+    noise : array_like (6, 6) or (time, 6, 6)
+        Covariance of (F, M), as for `locate`.
+    objects : sequence of Peg, Sphere, Plane, Box or Mesh
+        Rigid objects where they are thought to be.
+    position_sigma : float
+        Standard deviation of their position along each axis, as for `estimate_around`, m.
+    progress : callable, optional
+        Function called before each contact with the numbers of those done and of all.
+
+    Returns
+    -------
+    xarray.Dataset
+        Contacts nearest to the base, as of `locate` without candidates and derivatives;
+        ``last_arc_length`` and the objects' ``shift_x``, ``shift_y`` and ``shift_z``.
+
+    Raises
+    ------
+    ValueError
+        If the noise is not known, or as of `estimate_around`.
+    """
+    measured, known = _Measured.of(wrench, noise), Group(wrench)
+    pose: dict[str, Any] = {}
+    rows = measured.rows
+    if "base_rotation" in known:
+        held = known["base_rotation"], known["base_position"]
+        rows = rows & np.isfinite(held[0]).all(axis=(1, 2)) & np.isfinite(held[1]).all(axis=1)
+        pose = dict(zip(("base_rotation", "base_position"), (a[rows] for a in held), strict=True))
+    if measured.typical is None and rows.any():
+        raise ValueError("the objects' position is weighed against the noise: give the noise")
+    force, moment = measured.force[rows], measured.moment[rows]
+    found = estimate_around(
+        whisker,
+        force,
+        moment,
+        objects,
+        noise=np.eye(6) if measured.typical is None else measured.typical,
+        position_sigma=position_sigma,
+        progress=progress,
+        **pose,
+    )
+    status = np.where(measured.known, int(Status.NOT_FELT), int(Status.MISSING)).astype(np.int8)
+    status[measured.free] = int(Status.NO_CONTACT)
+    status[measured.rows] = int(Status.MISSING)
+    status[rows] = found["status"].values
+    shift = found["object_shift"].values
+    columns = {
+        "contact_point_whisker": found["contact_point_whisker"].values,
+        "covariance": found["covariance"].values,
+        "arc_length": found["arc_length"].values,
+        "last_arc_length": found["last_arc_length"].values,
+        **{f"shift_{axis}": shift[:, i] for i, axis in enumerate("xyz")},
+    }
+    data: dict[str, Any] = {
+        name: (("time", "space", "space_2")[: values.ndim], _everywhere(rows, values))
+        for name, values in columns.items()
+    }
+    data["in_contact"] = ("time", rows)
+    data["covariance_valid"] = ("time", rows)
+    data = {name: (*each, attributes(name)) for name, each in data.items()}
+    data["excess"] = (("time", "reading"), measured.excess)
+    data["status"] = ("time", status, {**attributes("status"), **flag_attributes()})
+    about = {"felt_above": measured.above, "friction": 0.0, "length": whisker.length}
+    return xr.Dataset(data, {"time": measured.time, "space": list("xyz")}, about)
 
 
 def _of_wrench(errors: Mapping[str, Any] | None) -> dict[str, Any]:

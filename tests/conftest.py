@@ -1,6 +1,7 @@
 """How every test runs: figures without a window, one thread of BLAS, random inputs without a
 deadline, one browser, and on several cores in an order that keeps them all busy."""
 
+import gc
 import importlib
 import os
 import shutil
@@ -20,6 +21,9 @@ from hypothesis import settings
 
 import vibrissa as vb
 
+# Garbage is looked for less often: figures are many small objects, and it was a sixth of drawing.
+gc.set_threshold(20_000, 20, 20)
+
 # Where all that the extra test names is installed, a test skipped for want of it hides a fault.
 if os.environ.get("REQUIRE_EXTRAS"):
     pytest.importorskip = lambda name, **_: importlib.import_module(name)
@@ -30,16 +34,17 @@ settings.register_profile("vibrissa", deadline=None, derandomize=bool(os.environ
 settings.load_profile("vibrissa")
 
 # Where files are shared out to workers, these come first, in this order. The first
-# compiles the search's kernels while those of whiskers need none, `test_cli` then the estimate's
-# and `test_compliance` the filter's, so that nobody compiles the same at the same time; then follow
-# those that take longest, so that no worker is left alone with one of them at the end.
+# compiles the search's kernels while those of whiskers need none. `test_cli` then compiles the
+# estimate's for a minute, and what follows it needs none of these, so that nobody compiles the same
+# at the same time; then come those that take longest, so that no worker is left alone with one of
+# them at the end.
 _FIRST = [
     "identifiability/test_uniqueness.py",
     "whisker",
     "cli/test_cli.py",
     "contour",
-    "contacts/test_compliance.py",
     "io",
+    "rod",
     "report",
     "demo",
     "viewer/test_page.py",
@@ -50,7 +55,6 @@ _FIRST = [
     "streaming",
     "identifiability",
     "paper",
-    "rod",
     "tracking",
     "plots",
     "simulation",
@@ -77,6 +81,11 @@ def pytest_configure(config):
 def pytest_collection_modifyitems(config, items):
     if hasattr(config, "workerinput"):
         items.sort(key=lambda item: _turn(item.path))
+
+
+def pytest_collection_finish():
+    """Look for garbage only in what tests make."""
+    gc.freeze()
 
 
 @pytest.fixture

@@ -175,7 +175,10 @@ def test_lines_between_few_points_are_not_trusted_beyond_their_noise(trial):
     assert spread[0] > 4.0 * spread[1]
 
 
-@pytest.mark.parametrize(("write", "program"), [(labels, "SLEAP"), (nwb, "NWB")])
+@pytest.mark.parametrize(
+    ("write", "program"),
+    [(nwb, "NWB"), pytest.param(labels, "SLEAP", marks=pytest.mark.slow)],
+)
 def test_two_views_to_the_contour(trial, tmp_path, write, program):
     line = trial[1]
     save_cameras(tmp_path / "cameras.toml", CAMERAS)

@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 import vibrissa as vb
 import vibrissa.demo as filming
 from vibrissa import samples
+from vibrissa.cli import figures
 from vibrissa.cli.app import app
 from vibrissa.demo import run_demo
 from vibrissa.evaluation import caution, from_curves, refined, tracking_scores, truth_of
@@ -237,9 +238,11 @@ def test_the_command_reports_every_stage_from_video(from_video, folder, tmp_path
         return from_video
 
     monkeypatch.setattr("vibrissa.demo.run_demo", there)
-    # Quicker to draw: what figures look like is tested with them.
+    # Quicker to draw, and of all figures the one with frames of the videos: what they look like is
+    # tested with them.
     monkeypatch.setattr("vibrissa.scene.solids._SHAPE", (12, 24, 8))
     monkeypatch.setattr("vibrissa.plots.style.LOOK", {**LOOK, "savefig.dpi": 80.0})
+    monkeypatch.setattr(figures, "drawn", lambda drawings, tell: [("trial", drawings["trial"]())])
 
     def run(*words):
         done = CliRunner().invoke(app, [str(word) for word in words])
@@ -256,7 +259,8 @@ def test_the_command_reports_every_stage_from_video(from_video, folder, tmp_path
     ):
         assert words in text
     assert asked.items() >= (FILMED | {"noise": True, "video": True}).items()
-    assert {"top.mp4", "front.mp4", "tracked.nc"} <= {file.name for file in folder.iterdir()}
+    written = {"top.mp4", "front.mp4", "tracked.nc", "trial.png"}
+    assert written <= {file.name for file in folder.iterdir()}
     assert "cylinder" in run("reconstruct", folder / "tracked.nc", "-o", tmp_path / "contour.nc")
 
 

@@ -129,14 +129,14 @@ def map_page(folder):
     """The page of the map, with verdicts, and the words that make it; few and small figures."""
     contact_map = ContactMap.load(folder / "map.nc")
     verdicts = vb.uniqueness(
-        contact_map, [("Fx", "MB", "MD"), ("FT", "FD", "MD")], ["all", "ELD"], samples=256
+        contact_map, [("Fx", "MB", "MD"), ("FT", "FD", "MD")], ["all", "ELD"], samples=64
     )
     vb.identifiability.save_uniqueness(verdicts, folder / "uniqueness.nc")
     words = (folder / "map.nc", "--uniqueness", folder / "uniqueness.nc")
     drawn = reporting.drawn
 
     def few(drawings, tell):
-        return drawn(dict(list(drawings.items())[::3]), tell)
+        return drawn(dict(list(drawings.items())[::5]), tell)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(reporting, "drawn", few)

@@ -37,7 +37,7 @@ def misses(film, start):
     ("seed", "setup"),
     [
         (200, {}),
-        (201, {}),
+        pytest.param(201, {}, marks=pytest.mark.slow),
         (202, {"crf": 28}),
         (206, {"noise": 8.0}),
         (203, {"bright": True}),
@@ -107,7 +107,7 @@ def test_bright_whiskers_begin_where_dark_ones_do(films):
         np.testing.assert_allclose(a, b, atol=1.0)
 
 
-@pytest.mark.parametrize("seed", [241, 242])
+@pytest.mark.parametrize("seed", [241, pytest.param(242, marks=pytest.mark.slow)])
 def test_before_grey_fur_a_whisker_is_found_along_the_lines_of_sight_of_the_other_view(films, seed):
     """Grey fur behind it in the front view hides where it begins: only the top view shows that."""
     film = films(seed, cheek=True)

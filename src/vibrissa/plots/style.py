@@ -122,7 +122,8 @@ class _StyledFigure(Figure):
         if self.above:
             wide, tall = self.get_size_inches()
             how.setdefault("bbox_inches", Bbox([[0.0, 0.0], [wide, tall + self.above / 25.4]]))
-            self.draw_without_rendering()
+            if (layout := self.get_layout_engine()) is not None:
+                layout.execute(self)
             self.set_layout_engine("none")
             for legend in self.legends:
                 # Those without an anchor would move to the top of what is written.

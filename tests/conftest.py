@@ -146,5 +146,14 @@ def gridded_map(gamma_map) -> vb.ContactMap:
 
 
 @pytest.fixture
+def coarse(monkeypatch):
+    """Figures that are quicker to draw, where what they look like is not tested."""
+    from vibrissa.plots.style import LOOK
+
+    monkeypatch.setattr("vibrissa.scene.solids._SHAPE", (12, 24, 8))
+    monkeypatch.setattr("vibrissa.plots.style.LOOK", {**LOOK, "savefig.dpi": 80.0})
+
+
+@pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20)

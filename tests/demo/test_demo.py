@@ -14,7 +14,6 @@ from vibrissa.demo import run_demo
 from vibrissa.evaluation import caution, from_curves, refined, tracking_scores, truth_of
 from vibrissa.io import load_contacts, load_recording
 from vibrissa.pipeline import fit_contacts, reconstruct
-from vibrissa.plots.style import LOOK
 from vibrissa.recording import Recording
 from vibrissa.report import trial_sections
 from vibrissa.report.page import shown_value
@@ -229,6 +228,7 @@ def test_signals_are_better_known_the_more_the_whisker_is_bent(from_video):
             assert medians[-1] < medians[0]
 
 
+@pytest.mark.usefixtures("coarse")
 def test_the_command_reports_every_stage_from_video(from_video, folder, tmp_path, monkeypatch):
     """Of a trial that is there; that it is taken up is tested below."""
     asked = {}
@@ -238,10 +238,7 @@ def test_the_command_reports_every_stage_from_video(from_video, folder, tmp_path
         return from_video
 
     monkeypatch.setattr("vibrissa.demo.run_demo", there)
-    # Quicker to draw, and of all figures the one with frames of the videos: what they look like is
-    # tested with them.
-    monkeypatch.setattr("vibrissa.scene.solids._SHAPE", (12, 24, 8))
-    monkeypatch.setattr("vibrissa.plots.style.LOOK", {**LOOK, "savefig.dpi": 80.0})
+    # Of all figures the one with frames of the videos: what they look like is tested with them.
     monkeypatch.setattr(figures, "drawn", lambda drawings, tell: [("trial", drawings["trial"]())])
 
     def run(*words):

@@ -145,6 +145,7 @@ def test_every_writer_leaves_what_was_there(tmp_path, trial):
     check(run(WRITERS, tmp_path, 1000, trial), tmp_path)
 
 
+@pytest.mark.slow
 def test_a_file_system_of_a_few_kilobytes(tmp_path, trial):
     small = tmp_path / "small"
     small.mkdir()

@@ -222,6 +222,7 @@ def run(*arguments):
     return CliRunner().invoke(app, ["figures", *map(str, arguments)])
 
 
+@pytest.mark.usefixtures("coarse")
 def test_the_verb_draws_a_trial(known, tmp_path):
     path = tmp_path / "trial.nc"
     save_recording(path, known.recording())
@@ -233,6 +234,7 @@ def test_the_verb_draws_a_trial(known, tmp_path):
     assert all(file.stat().st_size > 10_000 for file in files.values())
 
 
+@pytest.mark.usefixtures("coarse")
 def test_the_verb_says_what_a_trial_lacks(known, tmp_path):
     path = tmp_path / "trial.nc"
     save_recording(path, known.recording(signals=False, estimates=False))

@@ -16,6 +16,7 @@ from vibrissa.numerics.arrays import (
     Vector,
     contact_weights as contact_weights,
     cross as cross,
+    cross_matrix as cross_matrix,
     share_out as share_out,
     spherical as spherical,
     threads as threads,

@@ -35,6 +35,15 @@ def cross(a: Array, b: Array) -> Array:
     return out
 
 
+def cross_matrix(a: Array) -> Array:
+    """Matrix (..., 3, 3) with which a (..., 3) × b is a product."""
+    out = np.zeros((*np.shape(a), 3))
+    x, y, z = np.moveaxis(np.asarray(a), -1, 0)
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -z, y, -x
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = z, -y, x
+    return out
+
+
 def spherical(points: Array) -> Array:
     """Spherical form of points: distance, azimuth atan2(y, x), elevation asin(z / r).
 

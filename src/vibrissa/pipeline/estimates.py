@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.contacts import ContactMap, Gravity, Prior
 from vibrissa.contour import continuing_candidates, to_laboratory
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, cross_matrix
 from vibrissa.pipeline.events import EVENTS, with_events
-from vibrissa.pipeline.frames import cross_matrices, signals_in
+from vibrissa.pipeline.frames import signals_in
 from vibrissa.pipeline.locate import TRIPLET, locate, locate_from_wrench, without_contact
 from vibrissa.pipeline.signals import sensor_noise
 from vibrissa.quantities import attributes
@@ -321,7 +321,7 @@ def _laboratory_covariance(
     if pose is not None:
         held = np.zeros((len(gain), 6, 6))
         held[:, :3, :3] = np.eye(3)
-        held[:, :3, 3:], held[:, 3:, 3:] = -cross_matrices(arm), -cross_matrices(normal)
+        held[:, :3, 3:], held[:, 3:, 3:] = -cross_matrix(arm), -cross_matrix(normal)
         out = out + held @ pose @ np.swapaxes(held, 1, 2)
         if pose_wrench is not None:
             both = held @ pose_wrench @ np.swapaxes(by_wrench, 1, 2)

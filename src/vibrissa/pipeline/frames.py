@@ -129,13 +129,6 @@ def _group_in(recording: xr.DataTree, name: str, needs: Sequence[str]) -> xr.Dat
     return data
 
 
-def cross_matrices(vectors: Array) -> Array:
-    """Matrices (n, 3, 3) of the cross products with vectors (n, 3)."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
-
-
 def whisker_radii(estimates: xr.Dataset, whiskers: Sequence[Whisker]) -> Array:
     """Radii of whiskers at their contacts."""
     arc_length = Group(estimates)["arc_length"]

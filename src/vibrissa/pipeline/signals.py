@@ -26,11 +26,10 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.deferred import transform
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, cross_matrix
 from vibrissa.pipeline.frames import (
     SQUARES,
     check_recording,
-    cross_matrices,
     names_of,
     needed,
     one_whisker,
@@ -445,9 +444,7 @@ def signals_by_point(
     spread = np.where(touching[:, None, None], spread, 0.0)
     spread[tabulated] = np.nan
     # Small errors of the base's position and rotation move the point in the whisker's frame.
-    moved = np.concatenate(
-        [-np.eye(3) + np.zeros_like(spread), cross_matrices(point - position)], 2
-    )
+    moved = np.concatenate([-np.eye(3) + np.zeros_like(spread), cross_matrix(point - position)], 2)
     moved = np.where(touching[:, None, None], moved, 0.0)
     both = pose.covariance @ np.swapaxes(moved, 1, 2)
     squares = {

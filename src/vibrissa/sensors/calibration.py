@@ -33,9 +33,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.deferred import optimize
-from vibrissa.numerics import Array, Mask
+from vibrissa.numerics import Array, Mask, cross_matrix
 from vibrissa.rod import PointContact, deflect
-from vibrissa.sensors.frame import SensorFrame, cross_matrix
+from vibrissa.sensors.frame import SensorFrame
 from vibrissa.sensors.regression import Solution, solve, warn_of_misfit, warn_of_surprise
 from vibrissa.sensors.sensor import COMPONENTS, GRAVITY, Sensor, with_offset
 from vibrissa.status import describe, is_ok

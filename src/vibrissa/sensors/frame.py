@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.deferred import optimize, transform
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, cross_matrix
 from vibrissa.sensors.regression import solve, warn_of_misfit
 
 _ORTHOGONAL = 1e-3  # stretch up to which axes, typed with few digits, are brought to right angles
@@ -98,15 +98,6 @@ class SensorFrame:
             Matrix, SI units.
         """
         return np.asarray(np.linalg.inv(self.to_base()))
-
-
-def cross_matrix(a: Array) -> Array:
-    """Matrix (..., 3, 3) with which a (..., 3) × b is a product."""
-    out = np.zeros((*np.shape(a), 3))
-    x, y, z = np.moveaxis(np.asarray(a), -1, 0)
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -z, y, -x
-    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = z, -y, x
-    return out
 
 
 def _axes(value: Any) -> Array:

@@ -41,9 +41,8 @@ from numpy.typing import ArrayLike
 from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded, solveh_banded
 
 from vibrissa.deferred import sparse_linalg, transform
-from vibrissa.numerics import AnyArray, Array
+from vibrissa.numerics import AnyArray, Array, cross_matrix
 from vibrissa.rod import discretize, solve_forces
-from vibrissa.sensors.frame import cross_matrix
 from vibrissa.sensors.regression import ThinPlate
 from vibrissa.status import Status
 from vibrissa.whisker import Whisker

@@ -57,7 +57,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.deferred import interpolate
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, cross_matrix
 
 Function = Callable[[Array], Array]
 Side = Literal["right", "left"]
@@ -459,13 +459,6 @@ TURN = 0.04  # largest angle a step may turn, rad: keeps the method's error near
 _GAUSS = 0.5 + np.sqrt(15.0) / 10.0 * np.array([-1.0, 0.0, 1.0])
 
 
-def skew(w: Array) -> Array:
-    """Matrices (..., 3, 3) of the cross product with vectors (..., 3)."""
-    matrix = np.zeros((*w.shape, 3))
-    matrix[..., 0, 1], matrix[..., 0, 2], matrix[..., 1, 2] = -w[..., 2], w[..., 1], -w[..., 0]
-    return matrix - np.swapaxes(matrix, -1, -2)
-
-
 def exponential(w: Array, v: Array) -> tuple[Array, Array]:
     """Rotation (..., 3, 3) and translation (..., 3) of the motions exp(w, v).
 
@@ -478,7 +471,7 @@ def exponential(w: Array, v: Array) -> tuple[Array, Array]:
     a = np.where(small, _series(x, 1.0, (6, 20, 42, 72)), np.sin(theta) / theta)
     b = np.where(small, _series(x, 1 / 2, (12, 30, 56, 90)), (1.0 - np.cos(theta)) / theta**2)
     c = np.where(small, _series(x, 1 / 6, (20, 42, 72, 110)), (theta - np.sin(theta)) / theta**3)
-    k = skew(w)
+    k = cross_matrix(w)
     k2 = k @ k
     rotation = np.eye(3) + a * k + b * k2
     translation = ((np.eye(3) + b * k + c * k2) @ v[..., np.newaxis])[..., 0]

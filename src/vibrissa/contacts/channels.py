@@ -191,15 +191,17 @@ def channel_gradients(values: Array, names: tuple[str, ...]) -> Array:
 
 def channel_derivatives(values: Array, tangents: Array, names: tuple[str, ...]) -> Array:
     """Derivatives of channels with respect to unknowns of the contact."""
-    force, point = values[..., :3], values[..., 3:6]
+    return np.asarray(channel_gradients(values, names) @ wrench_tangents(values, tangents))
+
+
+def wrench_tangents(values: Array, tangents: Array) -> Array:
+    """Derivatives of (F, M), (..., 6, u), by those of (F, p) or (F, p, μ)."""
     d_force, d_point = tangents[..., :3, :], tangents[..., 3:6, :]
-    d_moment = np.cross(d_point, force[..., None], axis=-2) + np.cross(
-        point[..., None], d_force, axis=-2
-    )
+    d_moment = np.cross(d_point, values[..., :3, None], axis=-2)
+    d_moment += np.cross(values[..., 3:6, None], d_force, axis=-2)
     if values.shape[-1] > len(WRENCH):
-        d_moment = d_moment + tangents[..., 6:, :]
-    gradients = channel_gradients(values, names)
-    return np.asarray(gradients @ np.concatenate([d_force, d_moment], axis=-2))
+        d_moment += tangents[..., 6:, :]
+    return np.concatenate([d_force, d_moment], axis=-2)
 
 
 def ratio_of(x: Array) -> Array:
@@ -213,3 +215,14 @@ def ratio_derivatives(x: Array) -> Array:
     normal = np.hypot(x[:, 2], x[:, 3])
     by = -x[:, 1:2] * x[:, 2:] / normal[:, None] ** 3
     return np.column_stack([np.zeros(len(x)), 1.0 / normal, by])
+
+
+def friction_angle(x: Array) -> Array:
+    """Angles (...) of forces x (..., 1:4) from the plane normal to the whisker, rad."""
+    return np.arctan2(x[..., 1], np.hypot(x[..., 2], x[..., 3]))
+
+
+def friction_angle_derivatives(x: Array) -> Array:
+    """Derivatives (n, 4) of the angles of friction by contacts x (n, 4)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(ratio_derivatives(x) / (1.0 + ratio_of(x)[:, None] ** 2))

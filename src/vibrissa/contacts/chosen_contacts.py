@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.contacts.contact_map import ContactMap
+from vibrissa.contacts.contact_map import ContactMap, node_coordinates
 from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod import (
@@ -77,15 +77,8 @@ def _nodes(contact_map: ContactMap) -> ChosenContacts:
     cell = 1.0 / (shape[0] - 1) * 2.0 * np.pi / shape[1] / (shape[2] - 1)
     weights = ends[0][:, None, None] * ends[1][:, None] * ends[2]
     volume = np.abs(determinant(tangents)) * frames * weights * cell
-    coords: dict[Hashable, Any] = {
-        "station": ("station", chart.stations, _number("arc length of the contact over L")),
-        "bearing": (
-            "bearing",
-            chart.bearings[:-1],
-            {"units": "rad", "long_name": "force's angle from d1 to d2"},
-        ),
-        "load": ("load", chart.loads, _number("square root of force over fold force")),
-    }
+    coords = node_coordinates(chart)
+    coords["bearing"] = coords["bearing"][:-1]
     n = int(np.prod(shape))
     return ChosenContacts(
         chart.contacts[:, :-1].reshape(n, 3),
@@ -97,10 +90,6 @@ def _nodes(contact_map: ContactMap) -> ChosenContacts:
         coords,
         volume.reshape(n) * chart.discretization.length**3,
     )
-
-
-def _number(long_name: str) -> dict[str, str]:
-    return {"units": "1", "long_name": long_name}
 
 
 def _grid(contact_map: ContactMap) -> ChosenContacts:

@@ -9,7 +9,7 @@ also holds the paper's grid of contact points: 15 radii from 0.3 L to L, azimuth
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -477,18 +477,24 @@ def _dataset(whisker: Whisker, chart: StableSet) -> xr.Dataset:
     for i, name in enumerate(("r", "theta", "phi")):
         data[name] = (dims, ball[..., i], attributes(name))
     coords = {
-        "station": ("station", chart.stations, _label("arc length of the contact over L")),
-        "bearing": (
-            "bearing",
-            chart.bearings,
-            {"units": "rad", "long_name": "force's angle from d1 to d2"},
-        ),
-        "load": ("load", chart.loads, _label("square root of force over fold force")),
+        **node_coordinates(chart),
         "space": ["x", "y", "z"],
         "unknown": ["s", "fy", "fz"],
     }
     out = xr.Dataset(data, coords=coords)
     return out.merge(base_signals(out.force, out.moment))
+
+
+def node_coordinates(chart: StableSet) -> dict[Hashable, xr.Variable]:
+    """Label the axes along which the nodes of a chart are."""
+    angle = {"units": "rad", "long_name": "force's angle from d1 to d2"}
+    return {
+        "station": xr.Variable(
+            "station", chart.stations, _label("arc length of the contact over L")
+        ),
+        "bearing": xr.Variable("bearing", chart.bearings, angle),
+        "load": xr.Variable("load", chart.loads, _label("square root of force over fold force")),
+    }
 
 
 def _label(long_name: str) -> dict[str, str]:

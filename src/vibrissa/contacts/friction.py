@@ -22,7 +22,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.channels import ratio_derivatives, ratio_of
+from vibrissa.contacts.channels import (
+    friction_angle,
+    friction_angle_derivatives,
+    ratio_derivatives,
+    ratio_of,
+)
 from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates
 from vibrissa.contacts.joint_fit import HELD, Joint, JointFit
 from vibrissa.contacts.least_squares import Fits
@@ -106,7 +111,7 @@ class _Curves:
         x, moved = fits.contacts[there], joint.moved[there][..., 1:]
         spread = np.linalg.inv(information[there])
         across = moved @ spread @ np.swapaxes(moved, 1, 2)
-        turn = f[there][:, 1:] / (1.0 + ratio_of(x)[:, None] ** 2)
+        turn = friction_angle_derivatives(x)[:, 1:]
         turned = np.einsum("ni,nij,nj->n", turn, spread[:, :3, :3], turn)
         return _Nodes(
             curve[there], x, joint.values[there], log[there], across, turned, joint.misfit[there]
@@ -221,7 +226,7 @@ def _parts(nodes: _Nodes) -> _Parts:
         (log + np.log(h[a] / _PARTS)).reshape(-1),
         between(nodes.values[:, 3:6]),
         between(nodes.spread),
-        between(np.arctan(ratio_of(nodes.x))),
+        between(friction_angle(nodes.x)),
         between(nodes.angle_spread),
     )
 
@@ -277,7 +282,7 @@ def _stated(nodes: _Nodes, row: IntArray, n: int) -> Candidates:
     fourth += 2.0 * (s**2).sum(axis=(1, 2)) + 4.0 * np.einsum("ni,nij,nj->n", z, s, z)
     tails = mean(fourth) / NORMAL_KURTOSIS
     second *= (np.maximum(tails, 1.0) ** 0.75)[:, None, None]
-    turned = part.angle - np.arctan(ratio_of(nodes.x[lead]))[of]
+    turned = part.angle - friction_angle(nodes.x[lead])[of]
     angle_sigma = np.sqrt(mean(turned**2 + part.angle_spread))
     misfit = np.full(m, np.inf)
     np.minimum.at(misfit, own, nodes.misfit)

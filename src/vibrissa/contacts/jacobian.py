@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from vibrissa.contacts.channels import wrench_tangents, wrenches_of
 from vibrissa.contacts.charted_whisker import ChartedWhisker
 from vibrissa.numerics import Array
 from vibrissa.rod import (
@@ -64,12 +65,9 @@ def contact_signal_derivatives(
 
 def _row_sizes(values: Array, tangents: Array) -> Array:
     """Sizes (n, 6) to compare the derivatives of the six signals with."""
-    force, point = values[:, :3], values[:, 3:]
-    d_moment = np.cross(tangents[:, 3:], force[..., None], axis=1)
-    d_moment += np.cross(point[..., None], tangents[:, :3], axis=1)
-    sizes = [np.linalg.norm(d, axis=(1, 2)) for d in (tangents[:, :3], d_moment)]
-    moment = np.cross(point, force)
-    transverse = [np.hypot(v[:, 1], v[:, 2]) for v in (force, moment)]
+    wrench, slopes = wrenches_of(values), wrench_tangents(values, tangents)
+    sizes = [np.linalg.norm(slopes[:, part], axis=(1, 2)) for part in (slice(3), slice(3, 6))]
+    transverse = [np.hypot(wrench[:, i], wrench[:, i + 1]) for i in (1, 4)]
     columns = [(size, size, size / t) for size, t in zip(sizes, transverse, strict=True)]
     return np.stack([c for three in columns for c in three], axis=1)
 

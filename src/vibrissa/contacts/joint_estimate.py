@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.contacts.channels import WRENCH, Channels
+from vibrissa.contacts.channels import WRENCH, Channels, friction_angle
 from vibrissa.contacts.charted_whisker import ChartedWhisker
 from vibrissa.contacts.contacts import Candidates, Contacts, contacts_of
 from vibrissa.contacts.forward import Forward, Gravity, finite
@@ -24,11 +24,11 @@ from vibrissa.contacts.friction import along_curves, check_ratio
 from vibrissa.contacts.joint_fit import Joint, JointFit, check_compliance
 from vibrissa.contacts.least_squares import Fits
 from vibrissa.contacts.noise import Noise, SensorNoise, explained, sensor_noise
-from vibrissa.contacts.posterior import CERTAIN, ranked
+from vibrissa.contacts.posterior import ranked
 from vibrissa.contacts.prior import Prior, possible_candidates, refuse_tip
 from vibrissa.contacts.readout import check_signals
 from vibrissa.contacts.search import estimate
-from vibrissa.contacts.wrench import PROXIMAL, chosen, estimate_components, friction_angle
+from vibrissa.contacts.wrench import PROXIMAL, by_probability, chosen, estimate_components
 from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod import Discretization, PointForce, Resting, deflect
@@ -120,7 +120,7 @@ class JointEstimate:
             known[some] = self.forward.values(x[some])
             found = along_curves(self._rubbing, flat, targets, x, known)
             some = found.number > 0
-            status[some] = _by_probability(found)[some]
+            status[some] = by_probability(found)[some]
             degrees = len(self.names) - len(self._rubbing.free) + 1
             far = found.chi_squared[:, 0] > explained(degrees)
             status[some & far] = int(Status.NOT_ONE_CONTACT)
@@ -133,7 +133,7 @@ class JointEstimate:
                 found.probability[:] /= np.nansum(found.probability, axis=1, keepdims=True)
             explained_now = np.isin(status, (int(Status.UNIQUE), int(Status.AMBIGUOUS)))
             left = some & (found.number > 0) & explained_now
-            status[left] = _by_probability(found)[left]
+            status[left] = by_probability(found)[left]
             status[some & (found.number == 0)] = int(Status.OUTSIDE_PRIOR)
         return found, status
 
@@ -266,7 +266,7 @@ class JointEstimate:
             parts: list[Any] = [part[row, place] for part in kept[1:]]
             parts.append(np.ones(len(row), np.bool_))
             found = self._ranked(flat[row], targets[row], Fits(*parts), found)
-        status = _by_probability(found)
+        status = by_probability(found)
         unexplained = Status.NOT_ONE_CONTACT if fitting.friction else Status.NOT_FRICTIONLESS
         status[~(found.chi_squared[:, 0] <= limit)] = int(unexplained)
         none = found.number == 0
@@ -320,13 +320,6 @@ class JointEstimate:
         larger = np.trace(own, axis1=1, axis2=2) > np.trace(covariance, axis1=1, axis2=2)
         linear = np.take_along_axis(found.covariance_valid, place, axis=1)[:, 0]
         return np.where(larger[:, None, None], own, covariance), valid & known & linear
-
-
-def _by_probability(found: Candidates) -> IntArray:
-    """UNIQUE or AMBIGUOUS."""
-    first = found.probability[:, 0]
-    sure = np.where(np.isfinite(first), first > CERTAIN, found.number == 1)
-    return np.where(sure, int(Status.UNIQUE), int(Status.AMBIGUOUS))
 
 
 def _least_noise(sensor: SensorNoise | None, names: tuple[str, ...], d: Discretization) -> float:

@@ -29,6 +29,7 @@ from vibrissa.contacts.channels import (
     channel_derivatives,
     channel_gradients,
     channels_of,
+    friction_angle_derivatives,
     ratio_derivatives,
     ratio_of,
 )
@@ -264,7 +265,7 @@ class JointFit:
         """Channels (n, k), and derivatives by x: of points, the angle of friction, and channels."""
         rows = [tangents[:, 3:6]]
         if self.friction:
-            rows.append((ratio_derivatives(x) / (1.0 + ratio_of(x)[:, None] ** 2))[:, None])
+            rows.append(friction_angle_derivatives(x)[:, None])
         rows.append(joint.weights @ channel_derivatives(values, tangents, self.names))
         return channels_of(values)[:, self._which], np.concatenate(rows, axis=1)[..., self.free]
 

@@ -32,6 +32,7 @@ from vibrissa.contacts.channels import (
     channel_derivatives,
     channel_gradients,
     channels_of,
+    wrenches_of,
 )
 from vibrissa.contacts.contacts import Contact
 from vibrissa.contacts.estimator import Estimator
@@ -184,9 +185,8 @@ class Beginning:
 
     def _wrong(self, values: Array) -> Array:
         """What errors that all samples share change in channels, (n, k, e)."""
-        wrench = np.concatenate([values[:, :3], np.cross(values[:, 3:], values[:, :3])], axis=1)
         g = channel_gradients(values, self._names)
-        return common_channels(self._readout.how.errors, g, wrench)
+        return common_channels(self._readout.how.errors, g, wrenches_of(values))
 
     def exact(self, located: Contact) -> tuple[Array, Array]:
         """The candidates of one sample as x (n, 4) and (F, p) (n, 6), non-dimensional."""

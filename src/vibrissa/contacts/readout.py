@@ -13,7 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.channels import CHANNELS, FITTED, WRENCH, Channels
+from vibrissa.contacts.channels import (
+    CHANNELS,
+    FITTED,
+    WRENCH,
+    Channels,
+    wrench_tangents,
+    wrenches_of,
+)
 from vibrissa.contacts.charted_whisker import ChartedWhisker
 from vibrissa.contacts.inversion import seeding_triplet
 from vibrissa.contacts.nodes import Searched, at_nodes, searched
@@ -211,8 +218,7 @@ class Mixed:
                 "a mix of force and moment can only be weighed with noise in all of it"
             )
         whiten = axes.T / np.sqrt(size)[:, None]
-        known = chart.values.reshape(-1, 6)
-        wrenches = np.concatenate([known[:, :3], np.cross(known[:, 3:], known[:, :3])], axis=1)
+        wrenches = wrenches_of(chart.values.reshape(-1, 6))
         typical = np.sqrt((wrenches**2).mean(axis=0))
         # Singular directions of what contacts make of whitened readings, the strongest first.
         u, strength, _ = np.linalg.svd(whiten @ (mixing * sizes) * typical)
@@ -236,12 +242,8 @@ class Mixed:
         self._largest = 10.0 * np.abs(seen).max(axis=0)
         if self.rank >= 3:
             n, m, k = chart.values.shape[:3]
-            three = h[:3]
             values = seen[:, :3].reshape(n, m, k, 3)
-            force, point = chart.tangents[..., :3, :], chart.tangents[..., 3:, :]
-            moment = np.cross(point, chart.values[..., :3, None], axis=-2)
-            moment = moment + np.cross(chart.values[..., 3:, None], force, axis=-2)
-            slopes = three @ np.concatenate([force, moment], axis=-2)
+            slopes = h[:3] @ wrench_tangents(chart.values, chart.tangents)
             straight = (False, False, False)
             tree = search_tree(chart, np.ascontiguousarray(values), slopes, straight)
             self.searched = searched(

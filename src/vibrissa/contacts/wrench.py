@@ -20,7 +20,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.contacts.channels import WRENCH, Channels
+from vibrissa.contacts.channels import (
+    WRENCH,
+    Channels,
+    friction_angle,
+    friction_angle_derivatives,
+    wrenches_of,
+)
 from vibrissa.contacts.contacts import Candidates, Contacts, contacts_of
 from vibrissa.contacts.joint_fit import soft_base
 from vibrissa.contacts.least_squares import Fits, fit, unknowns_covariance
@@ -318,7 +324,7 @@ def _promising(
 ) -> AnyArray:
     """Which seeds are about as good as the best of their row."""
     values, _ = solve_forces(d, seeds)
-    away = np.einsum("nij,nj->ni", weights[row], _wrenches_of(values) - wrenches[row])
+    away = np.einsum("nij,nj->ni", weights[row], wrenches_of(values) - wrenches[row])
     with np.errstate(over="ignore", invalid="ignore"):
         misfit = np.sqrt((away**2).sum(axis=1))
     misfit[~np.isfinite(misfit)] = np.inf
@@ -327,20 +333,15 @@ def _promising(
     return np.asarray(misfit <= _FAR * (1.0 + best[row]))
 
 
-def _wrenches_of(values: Array) -> Array:
-    """Force and moment (n, 6) of (F, p)."""
-    return np.concatenate([values[:, :3], np.cross(values[:, 3:], values[:, :3])], axis=1)
-
-
-def friction_angle(contacts: Array) -> Array:
-    """Angle of forces (..., 1:4) from the plane normal to the whisker, rad."""
-    return np.arctan2(contacts[..., 1], np.hypot(contacts[..., 2], contacts[..., 3]))
+def by_probability(found: Candidates) -> IntArray:
+    """UNIQUE or AMBIGUOUS, (n,), by the probability of the first candidates or by their number."""
+    first = found.probability[:, 0]
+    sure = np.where(np.isfinite(first), first > CERTAIN, found.number == 1)
+    return np.where(sure, int(Status.UNIQUE), int(Status.AMBIGUOUS))
 
 
 def _statuses(found: Candidates, limit: float) -> IntArray:
-    first = found.probability[:, 0]
-    sure = np.where(np.isfinite(first), first > CERTAIN, found.number == 1)
-    status = np.where(sure, int(Status.UNIQUE), int(Status.AMBIGUOUS))
+    status = by_probability(found)
     s, misfit = found.x[:, 0, 0], found.chi_squared[:, 0]
     explains = misfit <= limit
     status[~explains] = int(Status.NOT_ONE_CONTACT)
@@ -362,7 +363,7 @@ def _judged(
     n, most = found.chi_squared.shape
     row, place = np.nonzero(np.arange(most) < found.number[:, None])
     x, values, tangents = (a[row, place] for a in (found.x, found.values, solved.tangents))
-    away = _wrenches_of(solve_forces(coarse, x)[0]) - _wrenches_of(values)
+    away = wrenches_of(solve_forces(coarse, x)[0]) - wrenches_of(values)
     away = np.einsum("nij,nj->ni", weights[row], away)
     near = np.abs(away).max(axis=1, initial=0.0) < _EQUAL
     valley = Valleys.room(len(row))
@@ -378,24 +379,14 @@ def _judged(
     far[row, place] = size
     found.covariances[row, place] = valley.covariances
     found.valid[row, place] = valley.valid & (np.abs(friction_angle(x)) < _STEEP)
-    found.angle_sigma[row, place] = _angle_deviation(x, spread)
+    turn = friction_angle_derivatives(x)
+    found.angle_sigma[row, place] = np.sqrt(np.einsum("na,nab,nb->n", turn, spread, turn))
     probability, order = ranked(weight, found.number)
     line = np.arange(n)[:, None]
     found = Candidates(found.number, *(a[line, order] for a in found[1:]))
     with np.errstate(invalid="ignore"):
         lost = (found.number > 0) & ~(far[line, order][:, 0] <= _UNKNOWN**2)
     return found._replace(probability=probability), lost
-
-
-def _angle_deviation(x: Array, spread: Array) -> Array:
-    """Standard deviations of friction angles (n,), rad, from covariances (n, 4, 4) of x (n, 4)."""
-    normal = np.hypot(x[:, 2], x[:, 3])
-    slope = np.zeros_like(x)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        slope[:, 1] = normal
-        slope[:, 2:] = -x[:, 1:2] * x[:, 2:] / normal[:, None]
-        slope /= (normal**2 + x[:, 1] ** 2)[:, None]
-    return np.asarray(np.sqrt(np.einsum("na,nab,nb->n", slope, spread, slope)))
 
 
 def chosen(rows: int, row: IntArray, fits: Fits, doubt: Array, limit: float, most: int) -> Fitted:

@@ -37,6 +37,9 @@ _RATE, _CUTOFF = 1000.0, 85.0
 
 _LONGEST_FUR = 20.0  # longest part of a whisker that fur hides, mm
 _HALF = 127  # grey value above which a pixel of an image of a mask is bright
+# Why a frame is shown in which what is followed may not be the whisker.
+_LOST = "here a whisker is lost, has a hook, or differs much in length from the frame before"
+_UNEXPLAINED = "here the bent rod explains the traces worst: one of them may be on something else"
 
 
 @dataclass(frozen=True)
@@ -317,9 +320,16 @@ def track(
         fur=1e-3 * fur,
         **own.tracked(base_radius, tip_radius),
     )
-    bases, masks = traced.bases(views, clicks), traced.masks(views, clicks)
-    fixed = known.corrected(len(views))
-    reference = known.read(videos[0], rate)
+    job = _Job(
+        cameras=views,
+        rate=rate,
+        bases=traced.bases(views, clicks),
+        masks=traced.masks(views, clicks),
+        corrections=known.corrected(len(views)),
+        options=traced.trace_options(),
+        how=how,
+        known=known.read(videos[0], rate),
+    )
     _report_assumed(filmed, clicks)
     _report_swapped(videos, filmed)
     for file, trial in trials.items():
@@ -328,151 +338,122 @@ def track(
             *(path for kind in vb.io.NETCDF for path in file.parent.glob(f"*{kind}")),
         ]
         alone = all(path == file for path in others)
-        picture = file.with_name("start.png" if alone else f"{file.stem}.start.png")
-        _track(
-            trial,
-            file,
-            picture,
-            views,
-            rate,
-            bases,
-            masks,
-            fixed,
-            traced.trace_options(),
-            how,
-            reference,
+        job.track(trial, file, alone)
+
+
+@dataclass(frozen=True)
+class _Job:
+    """How trials that were filmed alike are tracked."""
+
+    cameras: tuple[vb.cameras.Camera, ...]
+    rate: float
+    bases: Sequence[Any]
+    masks: Sequence[vb.numerics.Mask | None]
+    corrections: Any
+    options: vb.tracking.TraceOptions
+    how: vb.tracking.TrackOptions
+    known: Mapping[str, Any]
+
+    def track(self, videos: Sequence[Path], recording: Path, alone: bool) -> None:
+        """Track one trial and report what was found; pictures of one alone have short names."""
+        start, doubt = (
+            recording.with_name(f"{'' if alone else f'{recording.stem}.'}{kind}.png")
+            for kind in ("start", "doubt")
         )
-
-
-def _track(
-    videos: Sequence[Path],
-    recording: Path,
-    picture: Path,
-    cameras: tuple[vb.cameras.Camera, ...],
-    rate: float,
-    bases: Sequence[Any],
-    masks: Sequence[vb.numerics.Mask | None],
-    corrections: Any,
-    options: vb.tracking.TraceOptions,
-    how: vb.tracking.TrackOptions,
-    known: Mapping[str, Any],
-) -> None:
-    """Track one trial and report what was found."""
-    if bases[0] is None:
-        bases, options = _found(videos, picture, cameras, masks, options, how.offset or 0)
-    else:
-        firsts = [next(vb.io.video_frames(video, [0])) for video in videos]
-        bright = vb.tracking.is_bright(firsts, bases, options)
-        options = replace(options, bright=bright)
-    kept = [vb.tracking.partial_traces(recording, view) for view in range(len(videos))]
-    with progress_bars() as tell:
-        traces = [
-            vb.tracking.trace_file(
-                path,
-                kept[view],
-                bases[view],
-                options,
-                corrections=corrections.get(view, {}),
-                mask=masks[view],
-                progress=partial(tell, f"trace {path.name}"),
+        if self.bases[0] is None:
+            bases, options = self._found(videos, start)
+        else:
+            firsts = [next(vb.io.video_frames(video, [0])) for video in videos]
+            bright = vb.tracking.is_bright(firsts, self.bases, self.options)
+            bases, options = self.bases, replace(self.options, bright=bright)
+        kept = [vb.tracking.partial_traces(recording, view) for view in range(len(videos))]
+        with progress_bars() as tell:
+            traces = [
+                vb.tracking.trace_file(
+                    path,
+                    kept[view],
+                    bases[view],
+                    options,
+                    corrections=self.corrections.get(view, {}),
+                    mask=self.masks[view],
+                    progress=partial(tell, f"trace {path.name}"),
+                )
+                for view, path in enumerate(videos)
+            ]
+            lost = _where_lost(traces)
+            if lost is not None:
+                self._show_doubt(videos, traces, [lost] * len(videos), _LOST, doubt)
+            result = vb.tracking.track(
+                self.cameras, traces, self.rate, self.how, progress=tell, **self.known
             )
-            for view, path in enumerate(videos)
+        frames = None if lost is not None else _where_unexplained(result)
+        if frames is not None:
+            why = (
+                "here the bent rod explains the traces worst: one of them may be on something else"
+            )
+            self._show_doubt(videos, traces, frames, why, doubt)
+        _compare_lengths(videos, traces, result.sizes["time"])
+        vb.io.save_recording(recording, result)
+        for file in kept:
+            file.unlink(missing_ok=True)
+        print_tracked(result, recording)
+
+    def _found(
+        self, videos: Sequence[Path], picture: Path
+    ) -> tuple[list[Any], vb.tracking.TraceOptions]:
+        """Find the whisker, and show what is taken for it before any time is spent on it."""
+        numbers, frames = vb.tracking.start_frames(videos, self.how.offset or 0)
+        start = vb.tracking.find_start(self.cameras, frames, self.options, self.masks)
+        names = [camera.name for camera in self.cameras]
+        images = [view[start.frame] for view in frames]
+        remarks = [
+            f"frame {numbers[start.frame]} of {videos[0].name}: {why}" for why in start.doubts
         ]
-        doubt = picture.with_name(picture.name[:-9] + "doubt.png")
-        shown = _show_lost(videos, cameras, traces, doubt)
-        result = vb.tracking.track(cameras, traces, rate, how, progress=tell, **known)
-    if not shown:
-        _show_unexplained(videos, cameras, traces, result, doubt)
-    _compare_lengths(videos, traces, result.sizes["time"])
-    vb.io.save_recording(recording, result)
-    for file in kept:
-        file.unlink(missing_ok=True)
-    print_tracked(result, recording)
+        shown = [(start.lines, start.confidence), *((o.lines, o.confidence) for o in start.others)]
+        figure = vb.plots.start_views(images, shown, names, remarks)
+        vb.plots.save(figure, picture.with_suffix(""), ("png",))
+        if start.bases is None:
+            raise ValueError(
+                f"where the whisker begins was not found: {start.doubts[0]}. See {picture}, and "
+                "state where it leaves the face, once for each view: "
+                + " ".join("--base X,Y" for _ in videos)
+                + " (or click it: --pick)"
+            )
+        _report_start(start, names, picture)
+        return [[base.tolist()] for base in start.bases], replace(self.options, bright=start.bright)
+
+    def _show_doubt(
+        self, videos: Sequence[Path], traces: _Traces, at: Sequence[int], why: str, picture: Path
+    ) -> None:
+        """Show one frame of each view with its traces."""
+        images = [next(vb.io.video_frames(v, [i])) for v, i in zip(videos, at, strict=True)]
+        names = [f"{camera.name}, frame {i}" for camera, i in zip(self.cameras, at, strict=True)]
+        whiskers = [
+            [row[i] for row, i in zip(whisker, at, strict=True)]
+            for whisker in zip(*traces, strict=True)
+        ]
+        shown = [([t.line for t in one], max(t.confidence for t in one)) for one in whiskers]
+        figure = vb.plots.start_views(images, shown, names, [f"not sure: {why}"])
+        vb.plots.save(figure, picture.with_suffix(""), ("png",))
+        say(f"not sure that what is followed is the whisker in every frame: see {picture}")
 
 
-def _found(
-    videos: Sequence[Path],
-    picture: Path,
-    cameras: tuple[vb.cameras.Camera, ...],
-    masks: Sequence[vb.numerics.Mask | None],
-    options: vb.tracking.TraceOptions,
-    offset: int,
-) -> tuple[list[Any], vb.tracking.TraceOptions]:
-    """Find the whisker, and show what is taken for it before any time is spent on it."""
-    numbers, frames = vb.tracking.start_frames(videos, offset)
-    start = vb.tracking.find_start(cameras, frames, options, masks)
-    names = [camera.name for camera in cameras]
-    images = [view[start.frame] for view in frames]
-    remarks = [f"frame {numbers[start.frame]} of {videos[0].name}: {why}" for why in start.doubts]
-    shown = [(start.lines, start.confidence), *((o.lines, o.confidence) for o in start.others)]
-    figure = vb.plots.start_views(images, shown, names, remarks)
-    vb.plots.save(figure, picture.with_suffix(""), ("png",))
-    if start.bases is None:
-        raise ValueError(
-            f"where the whisker begins was not found: {start.doubts[0]}. See {picture}, and state "
-            "where it leaves the face, once for each view: "
-            + " ".join("--base X,Y" for _ in videos)
-            + " (or click it: --pick)"
-        )
-    _report_start(start, names, picture)
-    return [[base.tolist()] for base in start.bases], replace(options, bright=start.bright)
-
-
-def _show_lost(
-    videos: Sequence[Path],
-    cameras: Sequence[vb.cameras.Camera],
-    traces: _Traces,
-    picture: Path,
-) -> bool:
-    """Show a frame in which whiskers seem to be lost, if there is one."""
+def _where_lost(traces: _Traces) -> int | None:
+    """Find a frame in which whiskers seem to be lost, if there is one."""
     count = min(len(view[0]) for view in traces)
     rows = [row[:count] for view in traces for row in view]
     wrong = np.any([vb.tracking.doubtful_frames(row) for row in rows], axis=0)
-    if not wrong.any():
-        return False
-    at = int(np.flatnonzero(wrong)[wrong.sum() // 2])
-    why = "here a whisker is lost, has a hook, or differs much in length from the frame before"
-    _show_doubt(videos, cameras, traces, [at] * len(videos), why, picture)
-    return True
+    return int(np.flatnonzero(wrong)[wrong.sum() // 2]) if wrong.any() else None
 
 
-def _show_unexplained(
-    videos: Sequence[Path],
-    cameras: Sequence[vb.cameras.Camera],
-    traces: _Traces,
-    result: xr.DataTree,
-    picture: Path,
-) -> None:
-    """Show the frame that rods explain worst, if there are many that they do not explain."""
+def _where_unexplained(result: xr.DataTree) -> list[int] | None:
+    """Find the frame of each view that rods explain worst, if they leave many unexplained."""
     data = result.to_dataset()
     misfit = np.nan_to_num(data["trace_misfit"].values)
     if not any(vb.tracking.unexplained_frames(one).any() for one in misfit.T):
-        return
-    at = int(misfit.max(axis=1).argmax())
-    why = "here the bent rod explains the traces worst: one of them may be on something else"
-    _show_doubt(videos, cameras, traces, data["frame"].values[at].tolist(), why, picture)
-
-
-def _show_doubt(
-    videos: Sequence[Path],
-    cameras: Sequence[vb.cameras.Camera],
-    traces: _Traces,
-    at: Sequence[int],
-    why: str,
-    picture: Path,
-) -> None:
-    """Show one frame of each view with its traces."""
-    pairs = zip(videos, at, strict=True)
-    images = [next(vb.io.video_frames(video, [i])) for video, i in pairs]
-    names = [f"{camera.name}, frame {i}" for camera, i in zip(cameras, at, strict=True)]
-    whiskers = [
-        [row[i] for row, i in zip(whisker, at, strict=True)]
-        for whisker in zip(*traces, strict=True)
-    ]
-    shown = [([t.line for t in one], max(t.confidence for t in one)) for one in whiskers]
-    figure = vb.plots.start_views(images, shown, names, [f"not sure: {why}"])
-    vb.plots.save(figure, picture.with_suffix(""), ("png",))
-    say(f"not sure that what is followed is the whisker in every frame: see {picture}")
+        return None
+    numbers: list[int] = data["frame"].values[int(misfit.max(axis=1).argmax())].tolist()
+    return numbers
 
 
 def _calibrated(path: Path, videos: Sequence[Path]) -> tuple[vb.cameras.Camera, ...]:

@@ -11,7 +11,7 @@ import vibrissa as vb
 from vibrissa.objects import Peg
 from vibrissa.rod import follow_surfaces
 from vibrissa.simulation import Dynamics, Motion, resonances, simulate, whisking
-from vibrissa.simulation.chain import Chain, configure, inertia, jacobian, solve_definite
+from vibrissa.simulation.chain import Chain, configure, inertia, jacobian
 from vibrissa.simulation.dynamics import move_dynamically
 from vibrissa.status import Status
 from vibrissa.whisker import base_rotation
@@ -121,15 +121,6 @@ def test_derivatives_of_the_chain():
     np.testing.assert_allclose(residual, np.einsum("nik,ni->k", numeric, pull), atol=1e-8)
     expected = np.einsum("n,nik,nil->kl", chain.mass, numeric, numeric)
     np.testing.assert_allclose(matrix, expected, rtol=0, atol=1e-8 * expected.max())
-
-
-def test_the_solver_solves():
-    generator = np.random.default_rng(2)
-    half = generator.normal(size=(12, 12))
-    matrix, right = half @ half.T + np.eye(12), generator.normal(size=12)
-    solution = right.copy()
-    solve_definite(matrix.copy(), solution)
-    np.testing.assert_allclose(matrix @ solution, right, atol=1e-10)
 
 
 def test_at_rest_it_is_static():

@@ -218,31 +218,6 @@ def inertia(
                     matrix[3 * l + b, 3 * j + a] = value
 
 
-@kernel
-def solve_definite(matrix: Array, vector: Array) -> None:
-    """Solve a symmetric, positive definite system by Cholesky's method."""
-    n = vector.shape[0]
-    for i in range(n):
-        for j in range(i + 1):
-            value = matrix[i, j]
-            for k in range(j):
-                value -= matrix[i, k] * matrix[j, k]
-            if i == j:
-                matrix[i, i] = np.sqrt(value)
-            else:
-                matrix[i, j] = value / matrix[j, j]
-    for i in range(n):
-        value = vector[i]
-        for k in range(i):
-            value -= matrix[i, k] * vector[k]
-        vector[i] = value / matrix[i, i]
-    for i in range(n - 1, -1, -1):
-        value = vector[i]
-        for k in range(i + 1, n):
-            value -= matrix[k, i] * vector[k]
-        vector[i] = value / matrix[i, i]
-
-
 def jacobian(points: Array, links: IntArray, weights: Array, pivots: Array, turns: Array) -> Array:
     """Derivatives of a weighted sum of points of links with respect to the joints."""
     out = np.zeros((3, pivots.shape[0], 3))

@@ -39,7 +39,7 @@ from scipy.linalg import eigh
 from vibrissa.deferred import interpolate, transform
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.objects import Surface
-from vibrissa.simulation.chain import Chain, bezier, configure, inertia, jacobian, solve_definite
+from vibrissa.simulation.chain import Chain, bezier, configure, inertia, jacobian
 from vibrissa.simulation.motion import Motion
 from vibrissa.whisker import Whisker
 
@@ -382,11 +382,7 @@ class Walk:
             touching = [
                 self._push(contact, residual, matrix, eager) for contact in self._contacts()
             ]
-            if self._friction > 0.0 and touching:
-                residual[:] = np.linalg.solve(matrix, residual)
-            else:
-                solve_definite(matrix, residual)
-            change = residual.reshape(theta.shape)
+            change = np.linalg.solve(matrix, residual).reshape(theta.shape)
             largest = float(np.abs(change).max())
             theta -= change * min(1.0, _MOST_TURNED / max(largest, 1e-300))
             if largest < self.turned:

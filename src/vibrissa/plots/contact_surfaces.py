@@ -212,12 +212,12 @@ def coordinate_bar(
     """Draw a colour bar for a coordinate."""
     rail = style.box_axes(figure, place)
     upright = place[3] > place[2]
-    bar = figure.colorbar(
+    bar = style.colour_bar(
+        figure,
         ScalarMappable(norm, style.sequential()),
         cax=rail,
         orientation="vertical" if upright else "horizontal",
     )
-    style.plain(bar)
     bar.set_ticks(marks)
     rail.tick_params(length=2.0, pad=1.5)
     for mark in marks:
@@ -425,8 +425,8 @@ def _lines(axes: Axes, x: Array, y: Array, values: Array, name: str) -> None:
 def _rail(axes: Axes, mesh: Any) -> Colorbar:
     """A colour bar in the upper right corner of a panel, which the solid leaves empty."""
     rail = axes.inset_axes((0.38, 0.93, 0.58, 0.035))
-    bar: Colorbar = axes.figure.colorbar(mesh, cax=rail, orientation="horizontal", extend="both")
-    style.plain(bar)
+    how = {"orientation": "horizontal", "extend": "both"}
+    bar = style.colour_bar(axes.figure, mesh, cax=rail, **how)
     bar.ax.tick_params(length=2.0, pad=1.5)
     bar.minorticks_off()
     return bar
@@ -483,9 +483,8 @@ def _solid(figure: Figure | SubFigure, solid: xr.Dataset, plane: xr.Dataset) -> 
         rasterized=True,
     )
     _frame(axes, (across, along, upward))
-    bar = figure.colorbar(
-        dots, ax=axes, orientation="horizontal", extend="both", shrink=0.7, aspect=28, pad=0.08
-    )
+    place = {"ax": axes, "shrink": 0.7, "aspect": 28, "pad": 0.08}
+    bar = style.colour_bar(figure, dots, orientation="horizontal", extend="both", **place)
     _error_bar(bar)
     bar.ax.set_xlabel(axis_label("error_distance"))
     figure.text(0.02, 0.98, "a", fontsize=style.LARGE, fontweight="bold", va="top")
@@ -495,7 +494,6 @@ def _solid(figure: Figure | SubFigure, solid: xr.Dataset, plane: xr.Dataset) -> 
 
 
 def _error_bar(bar: Colorbar) -> None:
-    style.plain(bar)
     low, high = bar.mappable.get_clim()
     ticks = [t for t in _STEPS if (low or 0.0) <= t <= (high or np.inf)]
     bar.set_ticks(ticks, labels=[f"{t:g}" for t in ticks])

@@ -21,7 +21,6 @@ from vibrissa.plots.style import (
     head,
     looking,
     new_figure,
-    plain,
     say,
     shading,
     usable_rows,
@@ -106,8 +105,7 @@ def contact_places(
             dots = axes.scatter(across, up, size, zorder=3, **look)
             axes.set(xlabel=axis_label("xyz"[view[0]]), ylabel=axis_label("xyz"[view[1]]))
             style.head(axes, "abcd"[i], _TITLES[i], left=4.0)
-        bar = figure.colorbar(dots, cax=style.box_axes(figure, rail))
-        style.plain(bar)
+        bar = style.colour_bar(figure, dots, cax=style.box_axes(figure, rail))
         bar.ax.set_title(axis_label(colour), pad=4.0)
         near, far = np.nanpercentile(np.linalg.norm(own, axis=1), [5.0, 95.0])
         style.conclude(
@@ -261,7 +259,7 @@ def estimated_against_true(
                 "aspect": 22,
                 "anchor": (0.0, 0.95),
             }
-            plain(figure.colorbar(dots, ax=panels, label=axis_label(name), pad=0.01, **place))
+            style.colour_bar(figure, dots, ax=panels, label=axis_label(name), pad=0.01, **place)
         figure.align_ylabels(panels[:, 0])
         conclude(figure, f"{len(true)} contacts: {error_words(true, estimated)}")
         return figure

@@ -120,7 +120,7 @@ def contour_views(
             page, height = 25.4 * figure.get_size_inches()
             box = page - _BAR + 2.0, _BOTTOM, 2.0, 0.6 * (height - _BOTTOM - _TOP)
             rail = style.box_axes(figure, box)
-            style.plain(figure.colorbar(dots, cax=rail, label=axis_label(colour_name)))
+            style.colour_bar(figure, dots, cax=rail, label=axis_label(colour_name))
         return figure
 
 

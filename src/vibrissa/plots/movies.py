@@ -418,8 +418,7 @@ def _window(limits: Array, view: tuple[int, int], both: Array) -> Array:
 
 def _bar(figure: Figure, norm: Normalize) -> None:
     rail = style.box_axes(figure, _RAIL)
-    bar = figure.colorbar(ScalarMappable(norm, style.sequential()), cax=rail)
-    style.plain(bar)
+    style.colour_bar(figure, ScalarMappable(norm, style.sequential()), cax=rail)
     rail.set_title(axis_label("time"), pad=4.0)
     rail.tick_params(length=2.0, pad=1.5)
 

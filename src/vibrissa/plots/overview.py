@@ -421,7 +421,7 @@ def _compared(figure: Figure, boxes: Sequence[style.Box], course: Course) -> Non
         dots = against(style.box_axes(figure, box), name, pair, look, course.known_as)
     left, bottom, wide, tall = boxes[-1]
     rail = style.box_axes(figure, (left + wide + 2.5, bottom, 1.8, 0.6 * tall))
-    style.plain(figure.colorbar(dots, cax=rail, label=axis_label("time")))
+    style.colour_bar(figure, dots, cax=rail, label=axis_label("time"))
 
 
 def _letters(figure: Figure, sheet: _Sheet) -> None:

@@ -353,8 +353,8 @@ def _pulled(
     axes.lines[0].set_linewidth(0.7)
     start, end = left + 0.66 * width, bottom + 0.91 * height
     rail = style.box_axes(figure, (start, end, 0.22 * width, 1.0))
-    bar = figure.colorbar(ScalarMappable(norm, colours), cax=rail, orientation="horizontal")
-    style.plain(bar)
+    mapped = ScalarMappable(norm, colours)
+    bar = style.colour_bar(figure, mapped, cax=rail, orientation="horizontal")
     rail.xaxis.set_ticks_position("top")
     bar.set_ticks([0.0, values.max()], labels=["$F_x$ > 0", f"{values.max():.2g} µN"])
     rail.tick_params(length=0.0, pad=1.0)
@@ -384,10 +384,8 @@ def _rail(figure: Figure, cell: style.Box) -> Any:
 def _bar(
     figure: Figure, rail: Any, norm: Normalize, colours: Colormap, ends: str, name: str
 ) -> Colorbar:
-    bar = figure.colorbar(
-        ScalarMappable(norm, colours), cax=rail, extend=ends, orientation="horizontal"
-    )
-    style.plain(bar)
+    mapped = ScalarMappable(norm, colours)
+    bar = style.colour_bar(figure, mapped, cax=rail, extend=ends, orientation="horizontal")
     bar.ax.tick_params(length=2.0, pad=1.5)
     bar.ax.set_xlabel(axis_label(name), labelpad=1.0)
     assert norm.vmin is not None

@@ -23,6 +23,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backend_bases import RendererBase
+from matplotlib.cm import ScalarMappable
 from matplotlib.colorbar import Colorbar
 from matplotlib.colors import Colormap, FuncNorm, ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
@@ -254,10 +255,12 @@ def usable_rows(
     return rows if shade is None else rows[np.argsort(shade[rows], kind="stable")]
 
 
-def plain(bar: Colorbar) -> None:
-    """Take the frame off a colour bar."""
+def colour_bar(figure: Any, coloured: ScalarMappable, **place: Any) -> Colorbar:
+    """Draw a colour bar without a frame."""
+    bar: Colorbar = figure.colorbar(coloured, **place)
     outline: Any = bar.outline  # a spine, whatever Matplotlib's stubs say
     outline.set_visible(False)
+    return bar
 
 
 def scale_near_zero(axes: Axes, axis: str, limits: Array, width: float | None) -> None:

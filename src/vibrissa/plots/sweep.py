@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -71,59 +72,75 @@ def _verdicts(
     found: xr.Dataset, verdict: xr.DataArray, degrees: Array, width: style.Width
 ) -> Figure:
     names = [str(name) for name in verdict[verdict.dims[1]].values]
-    count = len(names)
-    if count > _MOST:
-        figure = style.new_figure(width, _FRAME + _ROW * count, "constrained")
-        axes = figure.subplots()
-        _lines(axes, [triplet_label(name) for name in names])
-        for i in range(count):
-            _spread(axes, degrees[:, i], verdict.values[:, i], np.full(len(degrees), i))
-        _cone_axis(axes)
-        _key(figure, verdict.values)
-        held = (verdict.values == VERDICTS[0]).all(axis=0)
-        shown = ", ".join(f"({triplet_label(names[i])})" for i in np.flatnonzero(held))
-        among = f"on all {len(degrees)} whiskers"
-        largest = np.nan_to_num(degrees, nan=90.0).max(axis=0)
-        off = (verdict.values == VERDICTS[1]).all(axis=0)
-        best = [
-            f"({triplet_label(names[i])}) "
-            + ("off a surface" if off[i] else f"outside {cone:.1f}°")
-            for i, cone in enumerate(largest)
-        ]
-        first, second = (best[i] for i in np.argsort(largest, kind="stable")[:2])
-        finding = (
-            f"No triplet is unique {among} outside {PAPERS_CONE:g}°; next are {first} and {second}"
-        )
-        style.conclude(
-            figure, f"Unique (no counterexample found) {among}: {shown}" if shown else finding
-        )
+    if len(names) > _MOST:
+        return _of_many(names, verdict.values, degrees, width)
+    return _of_few(found, names, verdict.values, degrees, width)
+
+
+def _of_many(
+    names: Sequence[str], verdict: NDArray[np.str_], degrees: Array, width: style.Width
+) -> Figure:
+    """One row a triplet, all whiskers together."""
+    figure = style.new_figure(width, _FRAME + _ROW * len(names), "constrained")
+    axes = figure.subplots()
+    _lines(axes, [triplet_label(name) for name in names])
+    for i in range(len(names)):
+        _spread(axes, degrees[:, i], verdict[:, i], np.full(len(degrees), i))
+    _cone_axis(axes)
+    _key(figure, verdict)
+    among = f"on all {len(degrees)} whiskers"
+    held = np.flatnonzero((verdict == VERDICTS[0]).all(axis=0)).tolist()
+    if held:
+        shown = ", ".join(f"({triplet_label(names[i])})" for i in held)
+        style.conclude(figure, f"Unique (no counterexample found) {among}: {shown}")
         return figure
+    largest = np.nan_to_num(degrees, nan=90.0).max(axis=0)
+    off = (verdict == VERDICTS[1]).all(axis=0)
+    first, second = (
+        f"({triplet_label(names[i])}) "
+        + ("off a surface" if off[i] else f"outside {largest[i]:.1f}°")
+        for i in np.argsort(largest, kind="stable")[:2].tolist()
+    )
+    style.conclude(
+        figure,
+        f"No triplet is unique {among} outside {PAPERS_CONE:g}°; next are {first} and {second}",
+    )
+    return figure
+
+
+def _of_few(
+    found: xr.Dataset,
+    names: Sequence[str],
+    verdict: NDArray[np.str_],
+    degrees: Array,
+    width: style.Width,
+) -> Figure:
+    """Two panels a triplet: whiskers by their shape, and by their group."""
     groups = found["group"].values.astype(str)
     rows = list(dict.fromkeys(groups))
-    tall = max(52.0, 16.0 + _ROW * len(rows)) * count + 8.0
+    at = np.array([rows.index(group) for group in groups], dtype=int)
+    tall = max(52.0, 16.0 + _ROW * len(rows)) * len(names) + 8.0
     figure = style.new_figure(width, tall if width == "double" else 1.7 * tall, "constrained")
-    shape = (count, 2) if width == "double" else (2 * count, 1)
+    shape = (len(names), 2) if width == "double" else (2 * len(names), 1)
     panels = figure.subplots(*shape, squeeze=False).ravel()
     for i, name in enumerate(names):
         left, right = panels[2 * i], panels[2 * i + 1]
-        words = verdict.values[:, i]
-        _chart(left, found, words, degrees[:, i])
+        _chart(left, found, verdict[:, i], degrees[:, i])
         style.head(left, "ace"[i], f"{triplet_label(name)} by taper and turn")
         _lines(right, rows)
-        at = np.array([rows.index(group) for group in groups], dtype=int)
-        _spread(right, degrees[:, i], words, at)
+        _spread(right, degrees[:, i], verdict[:, i], at)
         _cone_axis(right)
         style.head(right, "bdf"[i], "by group of whiskers")
-    bar = figure.colorbar(
+    bar = style.colour_bar(
+        figure,
         ScalarMappable(_NORM, style.sequential().reversed()),
         ax=list(panels[::2]),
         aspect=30,
         spacing="uniform",
     )
-    style.plain(bar)
     bar.set_label("critical cone (°)")
-    _key(figure, verdict.values)
-    unique = (verdict.values == VERDICTS[0]).sum(axis=0)
+    _key(figure, verdict)
+    unique = (verdict == VERDICTS[0]).sum(axis=0)
     parts = [
         f"no two contacts outside {PAPERS_CONE:g}° have the same ({triplet_label(name)}) on {held}"
         for name, held in zip(names, unique, strict=True)

@@ -413,7 +413,8 @@ def critical_cones(cones: xr.Dataset, *, width: style.Width = "double") -> Figur
             axes.set_ylabel("base / tip radius")
         for axes in grid[-1]:
             axes.set_xlabel(r"curvature $A \cdot L$")
-        bar = figure.colorbar(
+        bar = style.colour_bar(
+            figure,
             ScalarMappable(norm, colours),
             ax=list(grid.ravel()),
             orientation="horizontal",
@@ -421,7 +422,6 @@ def critical_cones(cones: xr.Dataset, *, width: style.Width = "double") -> Figur
             aspect=35,
             pad=0.03,
         )
-        style.plain(bar)
         bar.set_label(_cone_label(degrees))
         bar.ax.axvline(PAPERS_CONE, color=style.INK, linewidth=0.9)
         return figure

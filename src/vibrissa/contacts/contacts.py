@@ -41,15 +41,16 @@ class Candidates(NamedTuple):
 
     def allowed_first(self, allowed: AnyArray) -> Candidates:
         """Leave out candidates that are not allowed; the others keep their order."""
-        order = np.argsort(~allowed, axis=1, kind="stable")
-        gone = np.arange(allowed.shape[1]) >= allowed.sum(axis=1)[:, None]
-        parts = []
-        for values in self[1:]:
-            places = order.reshape(*order.shape, *[1] * (values.ndim - 2))
-            part = np.take_along_axis(values, places, axis=1)
+        return self.ordered(np.argsort(~allowed, axis=1, kind="stable"), allowed.sum(axis=1))
+
+    def ordered(self, order: IntArray, number: IntArray) -> Candidates:
+        """Candidates in another order (n, k), of which as many as stated are left."""
+        line = np.arange(len(order))[:, None]
+        gone = np.arange(order.shape[1]) >= number[:, None]
+        parts = [values[line, order] for values in self[1:]]
+        for part in parts:
             part[gone] = False if part.dtype == np.bool_ else np.nan
-            parts.append(part)
-        return Candidates(allowed.sum(axis=1), *parts)
+        return Candidates(number, *parts)
 
     def trimmed(self) -> Candidates:
         """Copy as many candidates as any measurement has."""

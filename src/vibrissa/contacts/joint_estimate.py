@@ -291,9 +291,7 @@ class JointEstimate:
         weight = np.full(found.chi_squared.shape, -np.inf)
         weight[row, place] = np.where(np.isfinite(log), log, -np.inf)
         probability, order = ranked(weight, found.number)
-        line = np.arange(len(order))[:, None]
-        found = Candidates(found.number, *(part[line, order] for part in found[1:]))
-        return found._replace(probability=probability)
+        return found.ordered(order, found.number)._replace(probability=probability)
 
     def _as_sagged(
         self, joint: Joint, fits: Fits, covariance: Array, valid: AnyArray

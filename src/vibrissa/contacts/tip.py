@@ -203,18 +203,14 @@ class TipContacts:
         misfit[~np.isfinite(log)] = np.inf
         log[misfit > misfit.min(axis=1, keepdims=True) + INDISTINCT] = -np.inf
         order = np.argsort(-log, axis=1, kind="stable")[:, : there.shape[1]]
-        line = np.arange(len(rows))[:, None]
-        merged = Candidates(
-            np.isfinite(log[line, order]).sum(axis=1), *(a[line, order] for a in whole)
-        )
         top = log.max(axis=1, keepdims=True)
         some = np.isfinite(top[:, 0])
         with np.errstate(invalid="ignore"):
             weight = np.exp(log - top)
-            merged.probability[:] = (weight / weight.sum(axis=1, keepdims=True))[line, order]
-        gone = np.arange(there.shape[1]) >= merged.number[:, None]
-        for part in merged[1:]:
-            part[gone] = False if part.dtype == np.bool_ else np.nan
+            probability = weight / weight.sum(axis=1, keepdims=True)
+        number = np.minimum(np.isfinite(log).sum(axis=1), there.shape[1])
+        together = Candidates(number, *whole)._replace(probability=probability)
+        merged = together.ordered(order, number)
         parts = [part.copy() for part in found]
         out = Candidates(*parts)
         for mine, theirs in zip(out, merged, strict=True):

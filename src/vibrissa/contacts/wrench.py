@@ -383,7 +383,7 @@ def _judged(
     found.angle_sigma[row, place] = np.sqrt(np.einsum("na,nab,nb->n", turn, spread, turn))
     probability, order = ranked(weight, found.number)
     line = np.arange(n)[:, None]
-    found = Candidates(found.number, *(a[line, order] for a in found[1:]))
+    found = found.ordered(order, found.number)
     with np.errstate(invalid="ignore"):
         lost = (found.number > 0) & ~(far[line, order][:, 0] <= _UNKNOWN**2)
     return found._replace(probability=probability), lost

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 import vibrissa as vb
+from vibrissa.cli.inputs import MAP
 from vibrissa.cli.options import with_options
 from vibrissa.cli.terminal import print_properties, shown
 from vibrissa.cli.track import compared_contacts
 from vibrissa.deferred import xr
 
-# What goes on from a file, by its kind.
 _SHOWN = 12
 _TABLES = """\
   signals         time, Fx, Fy, Fz, Mx, My, Mz; or three or more of Fx, FT, FD, Mx, MB, MD
@@ -27,10 +27,10 @@ _TABLES = """\
   tracked points  time or frame; x, y, z or column, row
   corrections     view, frame, whisker, x, y
   whiskers        name, x_mm, y_mm, z_mm, azimuth_deg, …, length_mm, coefficient_per_mm"""
-_MAP = "vibrissa contact map"
 _VERDICTS = "vibrissa uniqueness"
+# What goes on from a file, by its kind.
 _NEXT = {
-    _MAP: "estimate SIGNALS.csv --map {} -o contacts.csv",
+    MAP: "estimate SIGNALS.csv --map {} -o contacts.csv",
     _VERDICTS: "figures MAP.nc --uniqueness {} -o figures",
     "vibrissa whisker": "map --whisker {} -o map.nc",
     "whisker": "map --whisker {} -o map.nc",
@@ -355,8 +355,8 @@ def _groups(path: Path, whole: bool = False) -> Iterator[tuple[str, str]]:
     if "certificate" in (kind or "") and kind == vb.certificates.KIND:
         yield from _certificate(path, whole)
         return
-    if kind in (_MAP, _VERDICTS) and not whole:
-        if kind == _MAP:
+    if kind in (MAP, _VERDICTS) and not whole:
+        if kind == MAP:
             yield "map", f"{vb.ContactMap.load(path)!r}"[1:-1]
         else:
             yield from _verdicts(path)

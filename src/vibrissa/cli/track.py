@@ -400,7 +400,7 @@ class _Job:
 
     def _found(
         self, videos: Sequence[Path], picture: Path
-    ) -> tuple[list[Any], vb.tracking.TraceOptions]:
+    ) -> tuple[Sequence[Any], vb.tracking.TraceOptions]:
         """Find the whisker, and show what is taken for it before any time is spent on it."""
         numbers, frames = vb.tracking.start_frames(videos, self.how.offset or 0)
         start = vb.tracking.find_start(self.cameras, frames, self.options, self.masks)

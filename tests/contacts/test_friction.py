@@ -50,6 +50,18 @@ def test_with_the_transverse_force_friction_is_found(gamma_map, using):
     assert (np.abs(found.friction_angle - angle) < 3.0 * found.friction_angle_sigma).mean() > 0.9
 
 
+@pytest.mark.parametrize("using", ["Fx FT MB MD", "Fx FT FD Mx MB MD"])
+def test_a_prior_of_friction_costs_little_where_there_is_none(gamma_map, using):
+    """Half of it is that there is none, which signals that determine friction then decide."""
+    truth, _, signals = rubbed(gamma_map, 0.0)
+    found = gamma_map.estimate(signals, using, NOISE, friction=0.3)
+    without = gamma_map.estimate(signals, using, NOISE)
+    assert missed(found, truth) < 1.5 * missed(without, truth)
+    assert held(found, truth) > 0.9
+    assert (found.friction_angle == 0.0).mean() > 0.8
+    assert (found.friction_angle_sigma > 0.0).all()
+
+
 @pytest.mark.parametrize("ratio", [0.0, 0.4])
 def test_three_signals_state_what_friction_leaves_open(gamma_map, ratio):
     truth, _, signals = rubbed(gamma_map, ratio)

@@ -14,6 +14,11 @@ as probable beforehand, and ratios as stated, the density of s is
 and that of the contact point a mixture along the curve. Its second moment about the contact nearest
 to its mean, widened for tails as in :mod:`~vibrissa.contacts.posterior`, is the covariance.
 Where the density has several peaks with valleys between, these are several candidates.
+
+Where four or more signals determine µ_x, there is no friction with a probability of one half
+beforehand: the prior of µ_x is (δ(µ_x) + N(0, σ²)) / 2. With p(0) the density of µ_x at zero on
+the curve, no friction then has the odds p(0) √(2π) σ, by Savage and Dickey. The likelier of the two
+is the answer, and both are in the covariance.
 """
 
 from __future__ import annotations
@@ -252,6 +257,15 @@ def _divided(nodes: _Nodes) -> IntArray:
     return out
 
 
+def _fourth(root: Array, away: Array, spread: Array) -> Array:
+    """Fourth moments (n,) of normal parts (n, 3), (n, 3, 3), in standard deviations."""
+    z = np.einsum("nij,nj->ni", root, away)
+    s = root @ spread @ np.swapaxes(root, 1, 2)
+    out = ((z**2).sum(axis=1) + np.trace(s, axis1=1, axis2=2)) ** 2
+    out += 2.0 * (s**2).sum(axis=(1, 2)) + 4.0 * np.einsum("ni,nij,nj->n", z, s, z)
+    return np.asarray(out)
+
+
 def _stated(nodes: _Nodes, row: IntArray, n: int) -> Candidates:
     """Candidates of n measurements from the curves of rows."""
     part, own = _parts(nodes), _divided(nodes)
@@ -275,12 +289,9 @@ def _stated(nodes: _Nodes, row: IntArray, n: int) -> Candidates:
     y = part.point - nodes.values[lead, 3:6][of]
     second = mean(part.spread + y[:, :, None] * y[:, None, :])
     usable = total > 0.0
-    root = np.linalg.inv(np.linalg.cholesky(np.where(usable[:, None, None], second, np.eye(3))))
-    z = np.einsum("nij,nj->ni", root[of], y)
-    s = root[of] @ part.spread @ np.swapaxes(root[of], 1, 2)
-    fourth = ((z**2).sum(axis=1) + np.trace(s, axis1=1, axis2=2)) ** 2
-    fourth += 2.0 * (s**2).sum(axis=(1, 2)) + 4.0 * np.einsum("ni,nij,nj->n", z, s, z)
-    tails = mean(fourth) / NORMAL_KURTOSIS
+    known = np.where(usable[:, None, None], second, np.eye(3))
+    root = np.asarray(np.linalg.inv(np.linalg.cholesky(known)), dtype=np.float64)
+    tails = mean(_fourth(root[of], y, part.spread)) / NORMAL_KURTOSIS
     second *= (np.maximum(tails, 1.0) ** 0.75)[:, None, None]
     turned = part.angle - friction_angle(nodes.x[lead])[of]
     angle_sigma = np.sqrt(mean(turned**2 + part.angle_spread))
@@ -324,6 +335,45 @@ def _found(curves: _Curves, x: Array, values: Array) -> Candidates:
     starts = curves.nodes(np.arange(rows.size), rows, x, values)
     nodes = curves.along(rows, x, values)
     return _stated(*curves.finer(rows, nodes, starts), len(curves.flat))
+
+
+def or_without(found: Candidates, without: Candidates, sigma: float) -> Candidates:
+    """Join candidates with friction of this prior with the first one without, the one nearest."""
+    row = np.flatnonzero(
+        (found.number > 0) & np.isfinite(without.covariances[:, 0]).all(axis=(1, 2))
+    )
+    none = [part[row, 0] for part in without[1:]]
+    x0, values0, spread0, misfit0, _, valid0, _ = none
+    away = np.linalg.norm(found.values[row, :, 3:6] - values0[:, None, 3:6], axis=2)
+    place = np.where(np.isfinite(away), away, np.inf).argmin(axis=1)
+    out = found._replace(**{name: getattr(found, name).copy() for name in found._fields})
+    angle = np.arctan(ratio_of(out.x[row, place]))
+    turned = out.angle_sigma[row, place]
+    share = out.probability[row, place]
+    odds = share * sigma / turned * np.exp(-0.5 * (angle / turned) ** 2)
+    weight = odds / (share + odds)
+    likelier = weight > 0.5
+    points = np.stack([values0[:, 3:6], out.values[row, place, 3:6]])
+    spreads = np.stack([spread0, out.covariances[row, place]])
+    y = points - np.where(likelier[:, None], points[0], points[1])
+    both = np.stack([weight, 1.0 - weight])
+    second = (both[..., None, None] * (spreads + y[..., :, None] * y[..., None, :])).sum(axis=0)
+    root = np.asarray(np.linalg.inv(np.linalg.cholesky(second)), dtype=np.float64)
+    fourth = [_fourth(root, *one) for one in zip(y, spreads, strict=True)]
+    tails = (both * fourth).sum(axis=0) / NORMAL_KURTOSIS
+    second *= (np.maximum(tails, 1.0) ** 0.75)[:, None, None]
+    variance = (1.0 - weight) * turned**2 + np.where(likelier, 1.0 - weight, weight) * angle**2
+    out.covariances[row, place], out.angle_sigma[row, place] = second, np.sqrt(variance)
+    valid = np.where(likelier, valid0, out.valid[row, place])
+    out.valid[row, place] = valid & (tails < _TAILED)
+    out.probability[row] /= (1.0 + odds)[:, None]
+    out.probability[row, place] = (share + odds) / (1.0 + odds)
+    row, place = row[likelier], place[likelier]
+    out.x[row, place], out.values[row, place] = x0[likelier], values0[likelier, :6]
+    out.chi_squared[row, place] = misfit0[likelier]
+    order = np.argsort(-np.nan_to_num(out.probability, nan=-1.0), axis=1, kind="stable")
+    line = np.arange(len(order))[:, None]
+    return Candidates(out.number, *(part[line, order] for part in out[1:]))
 
 
 def check_ratio(spread: float, sensor: SensorNoise | None) -> None:

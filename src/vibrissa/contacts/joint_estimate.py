@@ -20,7 +20,7 @@ from vibrissa.contacts.channels import WRENCH, Channels, friction_angle
 from vibrissa.contacts.charted_whisker import ChartedWhisker
 from vibrissa.contacts.contacts import Candidates, Contacts, contacts_of
 from vibrissa.contacts.forward import Forward, Gravity, finite
-from vibrissa.contacts.friction import along_curves, check_ratio
+from vibrissa.contacts.friction import along_curves, check_ratio, or_without
 from vibrissa.contacts.joint_fit import Joint, JointFit, check_compliance
 from vibrissa.contacts.least_squares import Fits
 from vibrissa.contacts.noise import Noise, SensorNoise, explained, sensor_noise
@@ -118,7 +118,9 @@ class JointEstimate:
             known = np.full((len(x), 9 if self.forward.weighted else 6), np.nan)
             some = np.isfinite(x).all(axis=1)
             known[some] = self.forward.values(x[some])
-            found = along_curves(self._rubbing, flat, targets, x, known)
+            without, found = found, along_curves(self._rubbing, flat, targets, x, known)
+            if len(self.names) >= _SEPARATE:
+                found = or_without(found, without, self._rubbing.ratio_sigma)
             some = found.number > 0
             status[some] = by_probability(found)[some]
             degrees = len(self.names) - len(self._rubbing.free) + 1
@@ -220,7 +222,15 @@ class JointEstimate:
         found = Candidates.room(len(flat), 1)
         found.x[:, 0, 0] = one.arc_length / self.d.length
         found.x[:, 0, 1:] = one.contact_force / self.d.force
-        return found, one.status.copy()
+        found.values[:, 0, :3] = one.force / self.d.force
+        found.values[:, 0, 3:] = one.point / self.d.length
+        found.covariances[:, 0] = one.covariance / self.d.length**2
+        found.chi_squared[:, 0], found.valid[:, 0] = one.chi_squared, one.covariance_valid
+        found = found._replace(number=np.isfinite(found.x[:, 0, 0]).astype(np.int64))
+        status = one.status.copy()
+        if self.forward.errors:
+            found, status, _ = self._fit.allow(flat, targets, found, status)
+        return found, status
 
     def _proposed(self, targets: Array) -> list[Contacts]:
         """Contacts of a whisker without weight of the sagged shape: near the signals, and exact.

@@ -26,7 +26,7 @@ _MODEL = 0.05
 _EXPLAINED, _RUBBING = 9.0, np.deg2rad(20.0)
 # Axes that explain no more than this share of the contacts are doubted; others are believed that
 # explain so much, and so much more than these. Among others as good the simplest is stated.
-_DOUBTED, _BELIEVED, _BETTER, _EQUAL = 0.8, 0.9, 0.25, 0.05
+_DOUBTED, _BELIEVED, _BETTER, _EQUAL = 0.5, 0.9, 0.25, 0.05
 # Largest |F · M| / |F| |M| in the median of axes that are tried, which saves time.
 _OBLIQUE = 0.2
 

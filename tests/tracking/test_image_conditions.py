@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from vibrissa.simulation import ImageConditions, film_frames
-from vibrissa.tracking import TraceOptions, TraceSeries, find_start, is_bright, trace_video
+from vibrissa.tracking import Trace, TraceOptions, TraceSeries, find_start, is_bright, trace_video
 from vibrissa.tracking.refine.least_squares import trace_variance
 from vibrissa.tracking.space.frame_pairs import better_offset
 from vibrissa.tracking.space.rest_shape import (
@@ -12,6 +12,7 @@ from vibrissa.tracking.space.rest_shape import (
     RestShape,
     lengthened,
     likeliest_length,
+    likeliest_taper,
     seen_length,
 )
 from vibrissa.tracking.track import remarks_on
@@ -154,6 +155,18 @@ def test_a_length_of_which_only_the_least_is_known_is_among_the_likely_ones():
     assert found.sigma > 0.8e-3
 
 
+def test_a_taper_is_what_bending_and_what_is_usual_show():
+    found, sigma = likeliest_taper(0.025, -0.04, lambda share: ((share - 0.05) / 0.004) ** 2)
+    shown = 0.025**2 / (0.025**2 + 0.004**2 + 0.009**2)
+    assert found == pytest.approx(0.05 * shown, rel=0.02)
+    assert sigma == pytest.approx(0.025 * np.sqrt(1.0 - shown), rel=0.02)
+    # What bending does not show stays as it is usual.
+    found, sigma = likeliest_taper(0.025, -0.04, lambda share: 3.0)
+    assert abs(found) < 0.1 * 0.025
+    assert sigma == pytest.approx(0.025, rel=0.1)
+    assert likeliest_taper(0.025, -0.04, lambda share: 1e4 * (share + 0.5))[0] >= -0.04
+
+
 def test_a_shape_goes_on_as_it_bends():
     s = np.linspace(0.0, 20e-3, 101)
     curve = 0.05 * np.stack([np.sin(s / 0.05), 1.0 - np.cos(s / 0.05), 0.0 * s], axis=1)
@@ -221,3 +234,16 @@ def test_cameras_out_of_step_are_noticed(filmed, traced):
     in_step = better_offset(*filmed.cameras, rows[0], rows[1], 0)
     assert not in_step.size
     assert better_offset(*filmed.cameras, rows[0], rows[1][3:], 0).tolist() == [-3]
+
+
+def test_a_base_that_begins_elsewhere_for_a_while_is_no_offset(filmed):
+    """Hairs cover it, twice in one view and three times in the other, one after another."""
+    rows = []
+    for begins in ((8, 58), (20, 70, 95)):
+        column = np.full(118, 100.0)
+        for begin in begins:
+            column[begin : begin + 11] -= 2.0
+        lines = [np.column_stack([c + np.arange(5.0), np.full(5, 90.0)]) for c in column]
+        shape = np.full(5, 0.1), np.ones(5, dtype=bool)
+        rows.append([Trace(line, *shape, 1.0, tip_seen=False) for line in lines])
+    assert not better_offset(*filmed.cameras, *rows, 0).size

@@ -5,6 +5,7 @@ import pytest
 import xarray as xr
 from scipy.spatial.transform import Rotation
 
+from vibrissa import PointContact, Whisker, deflect
 from vibrissa.recording import Recording
 from vibrissa.status import Status
 from vibrissa.tracking import (
@@ -16,6 +17,8 @@ from vibrissa.tracking import (
     whisker_at_rest,
 )
 from vibrissa.tracking.refine.least_squares import Smoother
+from vibrissa.tracking.space.rest_shape import Length
+from vibrissa.tracking.track import tapered_as_it_bends
 from vibrissa.whisker import angles_of, base_rotation
 
 
@@ -87,21 +90,18 @@ def test_force_and_moment_are_those_of_the_rod(filmed, found, both):
     assert np.isnan(found["contact_point"].values[free]).all()
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3])
-def test_friction_is_found_in_the_shape(share):
-    """A rod bent by a known force with friction, seen without noise: the force comes out."""
-    from vibrissa import PointContact, PointForce, Whisker, deflect
+def pressed(whisker, share=0.0):
+    """What fits rods to traces without noise of one bent by a known force with friction."""
+    from vibrissa import PointForce
     from vibrissa.cameras import orthogonal_views
     from vibrissa.tracking import BasePose, HeadPose, Trace, TraceSeries
     from vibrissa.tracking.refine.fit import Fitter
     from vibrissa.tracking.trace.trace import even
 
-    whisker = Whisker.parabola(length=30e-3, coefficient=10.0)
     across = np.array([60e-6, 20e-6])
     along = share * np.linalg.norm(across)
     s = np.linspace(15e-3, 18e-3, 9)
-    load = PointForce(s, components=(along, *across))
-    bent = deflect(whisker, load)
+    bent = deflect(whisker, PointForce(s, components=(along, *across)))
     curves = bent.centerline(101)
     pair = orthogonal_views(center=(0.012, 0.005, 0.0))
     traces = []
@@ -115,6 +115,27 @@ def test_friction_is_found_in_the_shape(share):
     touching = np.ones(9, dtype=bool)
     series, head = TraceSeries.of(traces), HeadPose.still(9)
     fitter = Fitter(pair, series, touching, curves, 1000.0, FitOptions(), head)
+    return fitter, pose, bent, s
+
+
+@pytest.mark.parametrize("stated", [15.0, 6.0])
+def test_bending_shows_how_a_whisker_tapers(stated):
+    true = Whisker.parabola(length=30e-3, coefficient=10.0, tip_radius=100e-6 / 9.0)
+    fitter, pose, _, _ = pressed(true)
+    usual = Length(true.length, 0.04 * true.length, seen=True)
+    other = true.with_properties(tip_radius=100e-6 / stated)
+    found, length = tapered_as_it_bends(fitter, other, usual, pose)
+    tips = np.array([each.radius(true.length) for each in (true, other, found)])
+    assert abs(tips[2] - tips[0]) < 0.2 * abs(tips[1] - tips[0])
+    assert length.sigma < 0.3 * usual.sigma
+    assert found.notes[-1].startswith("radius of the tip: 1")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3])
+def test_friction_is_found_in_the_shape(share):
+    """A rod bent by a known force with friction, seen without noise: the force comes out."""
+    whisker = Whisker.parabola(length=30e-3, coefficient=10.0)
+    fitter, pose, bent, s = pressed(whisker, share)
     found = fitter.fit(whisker, pose, 65, unsure=0.5e-3)
     np.testing.assert_allclose(found.arc_length, s, atol=100e-6)
     if share == 0.0:

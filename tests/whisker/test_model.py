@@ -457,3 +457,11 @@ def test_canonical_rods(make):
     assert whisker.is_straight == ("straight" in whisker.name)
     cylinder = "cylinder" in whisker.name
     assert whisker.tip_radius == pytest.approx(whisker.base_radius / (1 if cylinder else 15))
+
+
+def test_a_base_radius_is_still_assumed_if_only_the_tip_s_is_stated():
+    whisker = Whisker.from_points(Whisker.parabola(20e-3, 10.0).centerline(21))
+    notes = whisker.with_properties(tip_radius=12e-6).notes
+    (note,) = [each for each in notes if each.startswith("radius assumed")]
+    assert "100 µm at the base, 12 µm at the tip" in note
+    assert not any("radius assumed" in n for n in whisker.with_properties(base_radius=5e-5).notes)

@@ -39,13 +39,14 @@ from vibrissa.tracking.space.rest_shape import (
     known_rest,
     lengthened,
     likeliest_length,
+    likeliest_taper,
     rest_shape,
     seen_length,
     whisker_at_rest,
 )
 from vibrissa.tracking.trace.start import base_gap
 from vibrissa.tracking.trace.trace import Trace, doubtful_frames
-from vibrissa.whisker import Pose, Whisker
+from vibrissa.whisker import Pose, Whisker, morphology
 
 Progress = Callable[[str, int, int], None]
 """Function that is called with the name of a stage, and how much of how much is done."""
@@ -351,14 +352,16 @@ def track_whisker(
         smoothness = replace(smoothness, roll=max(smoothness.roll, _ANY_ROLL))
     fitter = Fitter(cameras, series, touching, on_head, rate, smoothness, head, objects)
     length = Length(whisker.length, 0.0)
+    tapers = bool(options.properties.keys() & {"tip_radius", "radius"})
     if options.whisker is None and shape.whole:
-        tapers = "tip_radius" in options.properties
         length = seen_length(on_head[shape.free & tips], series.line, tapers)
     elif options.whisker is None:
         length = _length(fitter, shape, options)
         shape = lengthened(shape, length.value)
         whisker = whisker_at_rest(shape, name, **options.at_base)
     unfiltered, pose = _poses(fitter, shape, whisker, options)
+    if length.seen and not tapers:
+        whisker, length = tapered_as_it_bends(fitter, whisker, length, pose)
     fit = fitter.fit(whisker, pose, on_head.shape[1], length.sigma)
     report(f"contact of {name}", 2, 2)
     covariance = np.array([curve.covariance for curve in curves])
@@ -408,15 +411,49 @@ def _poses(
     return unfiltered, pose if shape.free.any() else rolled(pose, fitter.curves, whisker)
 
 
-def _length(fitter: Fitter, shape: RestShape, options: TrackOptions) -> Length:
-    """Length of a whisker whose tip is not seen, from some of the frames in contact."""
+def _in_contact(fitter: Fitter) -> Fitter | None:
+    """The same of some of the frames in contact only, if there are enough of them."""
     rows = np.flatnonzero(fitter.touching)
     if len(rows) < _FEWEST:
-        return Length(shape.length, np.nan)
+        return None
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _FRAMES)).astype(int)]
     curves = np.full_like(fitter.curves, np.nan)
     curves[rows] = fitter.curves[rows]
-    some = replace(fitter, curves=curves)
+    return replace(fitter, curves=curves)
+
+
+def tapered_as_it_bends(
+    fitter: Fitter, whisker: Whisker, length: Length, pose: BasePose
+) -> tuple[Whisker, Length]:
+    """The whisker with the taper that bending shows, and how well its length is known for that."""
+    some = _in_contact(fitter)
+    if some is None:
+        return whisker, length
+    at_base, at_tip = whisker.radius(np.array([0.0, whisker.length]))
+    cost = some.costs(whisker.length)
+
+    def thicker(share: float) -> Whisker:
+        return whisker.with_properties(
+            tip_radius=float(at_base - (at_base - at_tip) / (1.0 + share))
+        )
+
+    thinnest = (1.0 - at_tip / at_base) / (1.0 - 1.0 / morphology.MOST_TAPER) - 1.0
+    share, sigma = likeliest_taper(
+        length.sigma / length.value, float(thinnest), lambda share: cost(thicker(share), pose)
+    )
+    found = thicker(share)
+    tip = 100.0 * float(found.radius(whisker.length) / at_base)
+    either = 100.0 * sigma * float(1.0 - at_tip / at_base) / (1.0 + share) ** 2
+    note = f"radius of the tip: {tip:.1f} ± {either:.1f} % of the base's, as it bends in contact"
+    found = replace(found, notes=(*found.notes, note))
+    return found, length._replace(sigma=sigma * length.value)
+
+
+def _length(fitter: Fitter, shape: RestShape, options: TrackOptions) -> Length:
+    """Length of a whisker whose tip is not seen, from some of the frames in contact."""
+    some = _in_contact(fitter)
+    if some is None:
+        return Length(shape.length, np.nan)
     cost = some.costs(shape.length)
 
     def of(length: float) -> float:

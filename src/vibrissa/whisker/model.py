@@ -495,7 +495,8 @@ class Whisker:
             stated["breaks"] = sorted(kept)
             section = radius_profile(self.length, **stated)
             breaks = _merged(kept, section.breaks(), self.length)
-            notes = kept_notes(self.notes, stated) + radius_notes(self.length, section, stated)
+            notes = renewed_notes(kept_notes(self.notes, properties), self.length, section)
+            notes += radius_notes(self.length, section, stated)
             whisker = replace(whisker, section_radius=section, breaks=breaks, notes=notes)
         return replace(whisker, notes=kept_notes(whisker.notes, holding), **holding)
 

@@ -148,8 +148,11 @@ def _assumed_radius(length: float, section: Profile) -> str:
 def kept_notes(notes: Sequence[str], properties: Section | Holding) -> tuple[str, ...]:
     """Leave out the notes on what is stated anew."""
     about = []
-    if properties.keys() & _SECTION_KEYS - {"breaks"}:
-        about += ["radius", "the radius", "the tip"]
+    stated = properties.keys() & _SECTION_KEYS - {"breaks"}
+    if stated:
+        about += ["radius of the tip", "the radius", "the tip"]
+    if stated - {"tip_radius"}:
+        about.append("radius")
     about += [begin for name, begin in _NOTED.items() if name in properties]
     return tuple(note for note in notes if not note.startswith(tuple(about)))
 

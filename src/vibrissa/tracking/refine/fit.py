@@ -23,7 +23,7 @@ from vibrissa.deferred import transform
 from vibrissa.numerics import Array, Mask
 from vibrissa.objects import Surface
 from vibrissa.rod import Discretization, discretize, solve_forces
-from vibrissa.tracking.refine.least_squares import Smoother, correlated, trace_variance
+from vibrissa.tracking.refine.least_squares import Smoother, trace_variance
 from vibrissa.tracking.refine.rods import (
     FAR,
     UNKNOWNS,
@@ -35,6 +35,7 @@ from vibrissa.tracking.refine.rods import (
     rods,
 )
 from vibrissa.tracking.space.pose import BasePose, HeadPose
+from vibrissa.tracking.trace.trace import correlated
 from vibrissa.whisker import Whisker
 
 # Levenberg's damping at the start, at least, and that at which no step helps.
@@ -70,6 +71,7 @@ _ENDS = (3.5, 1.0)
 # Unknowns of a contact without friction: arc length and the force across the whisker.
 _FREE = [0, 2, 3]
 _WILD = 1e6  # slopes of points of a rod, in units of L, from which it is not in balance
+_HALVED = 6  # number of times at most that forces are halved with which it begins out of balance
 
 
 @dataclass(frozen=True)
@@ -154,23 +156,23 @@ class Fitter:
         def cost(whisker: Whisker, pose: BasePose) -> float:
             nonlocal before
             share = min(shown / whisker.length, 1.0)
-            problem = replace(replace(self, traces=traces)._problem(whisker, pose), shown=share)
+            begun = before and before[1].scaled(before[0].d.length / whisker.length)
+            problem = replace(self, traces=traces)._problem(whisker, pose, begun)
+            problem = replace(problem, shown=share)
             if before is None:
                 # The first decides how far the traces are to be trusted, but not where: a wrong
                 # length leaves most where it shows.
                 problem, state, linear = problem.trusted(even=True)
             else:
-                other, state = before
-                begun = state.scaled(other.d.length / problem.d.length)
-                problem = replace(problem, variance=other.variance, begun=begun)
+                problem = replace(problem, variance=before[0].variance)
                 state, linear = problem.solved()
             before = problem, state
             return linear.cost
 
         return cost
 
-    def _problem(self, whisker: Whisker, pose: BasePose) -> Problem:
-        """Equations of the frames that show something."""
+    def _problem(self, whisker: Whisker, pose: BasePose, begun: State | None = None) -> Problem:
+        """Equations of the frames that show something, and where they begin to be solved."""
         d = discretize(whisker)
         known = np.isfinite(pose.rotation).all(axis=(1, 2))
         frames = np.flatnonzero(known & np.isfinite(self.curves).all(axis=(1, 2)))
@@ -179,7 +181,8 @@ class Fitter:
             pose.rotation[frames], pose.position[frames] / d.length, np.zeros((len(frames), 4))
         )
         start.contact[:, 0] = _REST[0]
-        start.contact[touching] = first_contacts(d, start, self.curves[frames], touching)
+        if begun is None:
+            start.contact[touching] = first_contacts(d, start, self.curves[frames], touching)
         return Problem(
             whisker,
             d,
@@ -192,6 +195,7 @@ class Fitter:
             self.options,
             self.head.rows(frames),
             self.objects,
+            begun,
         )
 
 
@@ -249,6 +253,13 @@ class Problem:
         """Gauss–Newton with Levenberg's damping."""
         state, damping = self.begun or self.start, _DAMPING
         fit = self.linear(state)
+        for _ in range(_HALVED):
+            if not fit.wild.any():
+                break
+            # What another rod withstands this one may not.
+            factor = np.where(fit.wild[:, None], [1.0, 0.5, 0.5, 0.5], 1.0)
+            state = replace(state, contact=state.contact * factor)
+            fit = self.linear(state)
         for _ in range(self.options.rounds):
             step = fit.smoother.solved(damping)
             trial = state.moved(step)

@@ -24,10 +24,10 @@ import numpy as np
 from scipy.linalg import solveh_banded
 
 from vibrissa.numerics import Array
+from vibrissa.tracking.trace.trace import correlated
 
 # Share of the largest element that is added to diagonals, so that they can be factorised.
 _REGULAR = 1e-12
-_LEAST = 0.05  # correlation that counts as none
 _FREE = 0.25  # smallest share of the residuals that are free, however many numbers are fitted
 _NEAR = 2  # number of points to each side over which the variance along a trace is averaged
 
@@ -159,15 +159,3 @@ def trace_variance(
 def _neighbours(numbers: Array) -> Array:
     """Sums over each number and its neighbours."""
     return np.convolve(numbers, np.ones(2 * _NEAR + 1), mode="same")
-
-
-def correlated(misses: Sequence[Array]) -> float:
-    """Number of neighbouring residuals that count as one."""
-    total, most = 1.0, min(one.shape[1] for one in misses) // 2
-    size = sum(float((one**2).mean()) for one in misses)
-    for lag in range(1, most):
-        both = sum(float((one[:, lag:] * one[:, :-lag]).mean()) for one in misses)
-        if both < _LEAST * size:
-            break
-        total += 2.0 * both / size
-    return total

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from vibrissa.cameras import Camera, triangulate
 from vibrissa.numerics import Array
-from vibrissa.tracking.trace.trace import Trace
+from vibrissa.tracking.trace.trace import Trace, correlated
 
 Pairs = NDArray[np.int64]
 
@@ -115,8 +115,14 @@ def better_offset(
     if 2 * both.sum() < (blank[:, column] == 0.0).sum():
         return np.empty(0, dtype=np.int64)
     left, given = cost[row, path][both].sum(), fits[both, column].sum()
+    # A base that begins at another hair for a while is one error, not one in each frame.
+    away = [
+        np.nan_to_num(one[row, path] - middle[best])
+        for one, middle in zip(ends, usual, strict=True)
+    ]
+    alike = correlated([one[None] for one in away])
     # Of other optics some offset always explains a little; of a true one noise alone is left.
-    if left + changed >= given or left > _LEFT * given:
+    if left + alike * changed >= given or left > _LEFT * given:
         return np.empty(0, dtype=np.int64)
     return np.asarray(_SHIFTS[path[switched]])
 

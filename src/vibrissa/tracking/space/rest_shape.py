@@ -14,11 +14,15 @@ A whisker tapers to its tip, so that its length determines how thick it is every
 bends where. If its tip is too faint to be seen, or not in the image, then of all lengths that are
 not shorter than what is seen, the one is chosen with which the rod explains the traces in contact
 best; how much worse others do gives its standard deviation.
+
+Before its tip a whisker bends as the cone of which it is a part: it matters where that ends, not
+how much of it is missing. So an unknown taper and a length that is seen to end too early are one
+number, by which bending shows both; it is combined with what is usual.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -65,6 +69,9 @@ _STEP, _LONGEST, _FINE = 0.03, 1.45, 600
 # Smallest standard deviation of a length that bending shows, as a share: errors of traces, and of
 # the taper, that all frames share.
 _CERTAIN = 0.025
+# The same of the taper of a whisker whose tip is seen; and the step in which tapers are tried and
+# the largest, as shares of the length by which it would have to be longer to be as thick.
+_BENDS, _TAPERS, _STOUTEST = 0.009, 0.03, 0.12
 # Difference of costs up to which a length is hardly less likely: three standard deviations.
 _HARDLY = 9.0
 _ENDED = 0.7  # standard deviation of a seen length by where its tip is seen, pixels
@@ -421,10 +428,54 @@ def likeliest_length(seen: float, cost: Callable[[float], float]) -> Length:
         costs.append(cost(lengths[-1]))
     if max(costs) <= min(costs) + _HARDLY:
         return Length(seen, np.nan)
-    fine = np.linspace(seen, lengths[-1], _FINE)
-    between = interpolate.CubicSpline(lengths, costs)(fine)
-    weight = np.exp(-0.5 * (between - between.min()))
-    weight /= weight.sum()
-    value = float(fine @ weight)
-    spread = float((fine - value) ** 2 @ weight)
-    return Length(value, float(np.hypot(spread**0.5, _CERTAIN * seen)))
+    value, spread = _moments(*_likelihood(lengths, costs))
+    return Length(value, float(np.hypot(spread, _CERTAIN * seen)))
+
+
+def likeliest_taper(
+    usual: float, thinnest: float, cost: Callable[[float], float]
+) -> tuple[float, float]:
+    """Find by which share of its length a whisker is thicker before its tip than is assumed.
+
+    Parameters
+    ----------
+    usual : float
+        Standard deviation of that share before it is known how the whisker bends.
+    thinnest : float
+        Smallest share, below which the tip would have no thickness.
+    cost : callable
+        Misfit of the rod and the traces at a share.
+
+    Returns
+    -------
+    float, float
+        Share and its standard deviation, from what bending shows, which errs, and what is usual.
+    """
+    shares, costs = [0.0], [cost(0.0)]
+    while costs[-1] <= min(costs) + _HARDLY and shares[-1] + _TAPERS <= _STOUTEST:
+        shares.append(shares[-1] + _TAPERS)
+        costs.append(cost(shares[-1]))
+    while costs[0] <= min(costs) + _HARDLY and shares[0] - _TAPERS >= thinnest:
+        shares.insert(0, shares[0] - _TAPERS)
+        costs.insert(0, cost(shares[0]))
+    fine, shown = _likelihood(shares, costs, 3.0 * _BENDS)
+    blurred = np.exp(-0.5 * ((fine[:, None] - fine) / _BENDS) ** 2)
+    blurred /= blurred.sum(axis=1, keepdims=True)
+    share, sigma = _moments(fine, blurred @ shown * np.exp(-0.5 * (fine / usual) ** 2))
+    return max(share, thinnest), sigma
+
+
+def _likelihood(
+    values: Sequence[float], costs: Sequence[float], beyond: float = 0.0
+) -> tuple[Array, Array]:
+    """How likely a number is, at many values, of which some cost so much."""
+    fine = np.linspace(values[0] - beyond, values[-1] + beyond, _FINE)
+    between = interpolate.CubicSpline(values, costs)(np.clip(fine, values[0], values[-1]))
+    return fine, np.exp(-0.5 * (between - between.min()))
+
+
+def _moments(values: Array, weight: Array) -> tuple[float, float]:
+    """Mean and standard deviation."""
+    weight = weight / weight.sum()
+    mean = float(values @ weight)
+    return mean, float(np.sqrt((values - mean) ** 2 @ weight))

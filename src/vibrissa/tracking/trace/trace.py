@@ -23,6 +23,7 @@ _JUMPS, _OFTEN = 0.3, 0.05
 _HOOKED = 0.7
 _SHARPEST = 0.05  # standard deviation from which a point is not seen more clearly, pixels
 _GIVEN = 0.5  # standard deviation of points that a person gives, pixels
+_UNLIKE = 0.05  # correlation that counts as none
 
 
 @dataclass(frozen=True)
@@ -191,3 +192,15 @@ def overlap(line: Array, other: Array, near: float = 3.0) -> float:
         return 0.0
     distance, _ = spatial.cKDTree(other).query(line, distance_upper_bound=near)
     return float(np.isfinite(distance).mean())
+
+
+def correlated(misses: Sequence[Array]) -> float:
+    """Number of neighbouring residuals that count as one."""
+    total, most = 1.0, min(one.shape[1] for one in misses) // 2
+    size = sum(float((one**2).mean()) for one in misses)
+    for lag in range(1, most):
+        both = sum(float((one[:, lag:] * one[:, :-lag]).mean()) for one in misses)
+        if both < _UNLIKE * size:
+            break
+        total += 2.0 * both / size
+    return total

@@ -10,7 +10,8 @@ method. Margins that are violated cost in proportion, so that a climb may begin 
 Directions are equal where the cross product of the two transverse vectors vanishes, and sizes where
 their squares agree: equations that are regular also where a transverse vector is zero, through
 which ridges lead. Where a triplet collapses, as on the plane of a planar whisker, all pairs solve
-them: climbs keep off contacts where det ∂T/∂ξ vanishes for both.
+them: climbs keep off contacts where det ∂T/∂ξ vanishes for both. On a whisker of slight taper it is
+small everywhere; so climbs go on from where they end to where twins stop to be distinct.
 """
 
 from __future__ import annotations
@@ -21,7 +22,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.identifiability.twins import FINER, Pairs, Search, contact_set, twins_near, units
+from vibrissa.identifiability.twins import (
+    AGREEMENT,
+    FINER,
+    FIRM,
+    Pairs,
+    Search,
+    contact_set,
+    joined,
+    twins_near,
+    units,
+)
 from vibrissa.numerics import AnyArray, Array, cross, kernel, solve
 from vibrissa.rod import chart_of, discretize, solve_forces, with_normal_force
 
@@ -102,10 +113,29 @@ def steepest(levels: Array, slopes: Array, within: Array, cost: float, steps: Ar
             steps[row, a] = x[a] * within[row]
 
 
-# Climbs of each region, the steps they take, and the cost of a violated margin in rad, in rounds
-# that go on with the best of them. The last is on a finer rod, where witnesses must hold: a summit
-# is where margins vanish, and what the integration errs by would violate them.
-_ROUNDS = ((20, 8, 30.0), (6, 12, 30.0), (2, 30, 1000.0), (2, 6, 1000.0))
+class _Round(NamedTuple):
+    """Climbs of each region, the steps they take, and the cost of a violated margin, rad.
+
+    On the finer rod or not; kept off where twins stop to be distinct, or where det ∂T/∂ξ is small.
+    """
+
+    most: int
+    steps: int
+    cost: float
+    finer: bool = False
+    firm: bool = False
+
+
+# Rounds that go on with the best of them, and end on a finer rod, where witnesses must hold: a
+# summit is where margins vanish, and what the integration errs by would violate them.
+_ROUNDS = (
+    _Round(20, 8, 30.0),
+    _Round(6, 12, 30.0),
+    _Round(2, 30, 1000.0),
+    _Round(2, 6, 1000.0, finer=True),
+    _Round(2, 60, 1000.0, firm=True),
+    _Round(2, 6, 1000.0, finer=True, firm=True),
+)
 # Of a quarter as many again violations cost so much: where they pay, all others may leave a region.
 _STRICT = 1000.0
 # Starts of a region are in different parts of the chart, so many an axis.
@@ -116,11 +146,19 @@ _FIRST, _FINE, _LARGEST, _LAST = 0.1, 1e-3, 0.3, 1e-5
 _LEAST_GAIN = 1e-5  # a climb also ends where the linear program promises no more than this, rad
 _KEPT = 1e-5  # what is kept of each margin so that no summit violates one
 _SAME = 1e-6  # climbs of a region whose merits differ by less than this are at the same summit, rad
-_FACING = 1e-4  # transverse vectors face each other at least so far, over their whole sizes
-# Newton steps back to the set, and the misfit that they may leave for the next.
-_CORRECTIONS, _MISFIT = 2, 1e-6
+# Transverse vectors face each other at least so far, over their whole sizes; where climbs go on,
+# the same of the root, as the product vanishes with the square of what both have left.
+_FACING = 1e-4
+# Newton steps back to the set, the misfit that they may leave for the next, and that at which none
+# is needed.
+_CORRECTIONS, _MISFIT, _EXACT = 2, 1e-6, 1e-12
 # The larger determinant of a pair, over the lengths of the gradients, is at least this.
 _REGULAR = 1e-4
+# Where climbs go on, a change of the signals by ``AGREEMENT`` moves one contact by no more than
+# this, over L: less than a twin may be moved.
+_MOVED = 0.1 * FIRM
+# Climbs go on where one of these margins, which come first, is less than this.
+_HELD = 0.05
 _STEEP = 0.1  # its logarithm, so scaled, is the margin: no cost lets a pair through
 # Step of the derivatives of margins, and its ridge against singular equations.
 _STEP, _RIDGE = 1e-5, 1e-14
@@ -129,11 +167,13 @@ _STEP, _RIDGE = 1e-5, 1e-14
 class _State(NamedTuple):
     """Pairs on the way: contacts (n, 2, 3), linearised equations (n, 3, 6), angles and margins.
 
-    Levels (n, 2 + m): both cone angles, then margins; merit (n,), -inf off the set.
+    Distinct (n, 2): how far signals fix each contact, 1 where hardly; levels (n, 2 + m): both cone
+    angles, then margins; merit (n,), -inf off the set.
     """
 
     xi: Array
     slope: Array
+    distinct: Array
     levels: Array
     merit: Array
 
@@ -147,10 +187,11 @@ class _State(NamedTuple):
 
 @dataclass(frozen=True)
 class _Mountain:
-    """What is climbed, and the cost of a violated margin, rad."""
+    """What is climbed, the cost of a violated margin, rad, and what climbs are kept off."""
 
     search: Search
     cost: float
+    firm: bool
 
     def units(self, xi: Array) -> Array:
         """Scale of a change of contacts (n, 2, 3)."""
@@ -165,19 +206,25 @@ class _Mountain:
     def _at(self, xi: Array, signs: Array) -> _State:
         unit = self.units(xi)
         for step in range(_CORRECTIONS + 1):
-            values, away, slope = self._equations(xi, unit)
+            values, away, slope, by_point = self._equations(xi, unit)
+            if (np.abs(away) <= _EXACT).all():
+                break
             if step < _CORRECTIONS:
                 square = slope @ slope.swapaxes(1, 2)
                 ridge = _RIDGE * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(3)
                 back = slope.swapaxes(1, 2) @ np.linalg.solve(square + ridge, away[..., None])
                 xi = xi - back.reshape(xi.shape) * unit
-        levels, inside = self.levels(xi, values, slope, signs)
+        distinct = self._distinct(values, slope, by_point)
+        levels, inside = self.levels(xi, values, distinct, signs)
         merit = _merit(levels, self.cost)
         merit[~(inside & (np.abs(away).max(axis=1) <= _MISFIT) & np.isfinite(merit))] = -np.inf
-        return _State(xi, slope, levels, merit)
+        return _State(xi, slope, distinct, levels, merit)
 
-    def _equations(self, xi: Array, unit: Array) -> tuple[Array, Array, Array]:
-        """(F, p) (n, 2, 6), the differences of the triplets (n, 3) and their slopes (n, 3, 6)."""
+    def _equations(self, xi: Array, unit: Array) -> tuple[Array, Array, Array, Array]:
+        """(F, p) (n, 2, 6), triplets' differences (n, 3), their slopes (n, 3, 6).
+
+        And ∂p/∂ξ (n, 2, 3, 3).
+        """
         d = self.search.contact_map.chart.discretization
         values, tangents = solve_forces(d, with_normal_force(xi.reshape(-1, 3)), tangents=True)
         by_xi = tangents * unit.reshape(-1, 1, 3)
@@ -205,10 +252,11 @@ class _Mountain:
                 away[:, k] = 0.5 * (a_y * a_y + a_z * a_z - b_y * b_y - b_z * b_z)
                 normals[:, 0, 1:], normals[:, 1, 1:] = vector[:, 0, 1:], -vector[:, 1, 1:]
             slope[:, k] = np.einsum("npi,npix->npx", normals / size, by)
-        return values.reshape(-1, 2, 6), away, slope.reshape(-1, 3, 6)
+        by_point = by_xi[:, 3:].reshape(-1, 2, 3, 3)
+        return values.reshape(-1, 2, 6), away, slope.reshape(-1, 3, 6), by_point
 
     def levels(
-        self, xi: Array, values: Array, slope: Array, signs: Array
+        self, xi: Array, values: Array, distinct: Array, signs: Array
     ) -> tuple[Array, AnyArray]:
         """Both cone angles and the margins (n, 2 + m), and whether both are inside the domain."""
         contact_map, _, separation, domain = self.search
@@ -218,27 +266,52 @@ class _Mountain:
         ends = (1.0 - flat[:, 0], flat[:, 0] - contact_map.chart.proximal, room)
         pairs = [a.reshape(-1, 2) for a in (one.angle, one.backward, one.tangent_x, *ends)]
         margins = [
+            _STEEP * np.log(np.maximum(distinct.max(axis=1), _RIDGE))[:, None],
+            self._facing(values),
             *(
                 np.where(sign[:, None] == 0.0, 1.0, sign[:, None] * margin)
                 for sign, margin in zip(signs.T, pairs[1:3], strict=True)
             ),
-            _STEEP * np.log(np.maximum(_regularity(slope).max(axis=1), _RIDGE) / _REGULAR)[:, None],
             *pairs[3:],
-            self._facing(values),
             np.linalg.norm(values[:, 0, 3:] - values[:, 1, 3:], axis=1)[:, None] - separation,
         ]
         levels = np.concatenate([pairs[0], np.concatenate(margins, axis=1) - _KEPT], axis=1)
         return levels, np.asarray(one.inside.reshape(-1, 2).all(axis=1))
 
+    def _distinct(self, values: Array, slope: Array, by_point: Array) -> Array:
+        """How far signals fix each contact of pairs, (n, 2): climbs are kept off less than 1."""
+        rows = slope.reshape(-1, 3, 2, 3).swapaxes(1, 2)
+        if not self.firm:
+            size = np.linalg.norm(rows, axis=3).prod(axis=2)
+            return np.asarray(np.abs(np.linalg.det(rows)) / np.maximum(_REGULAR * size, _RIDGE))
+        # Rows are derivatives of signals, over |F|, |M| and in rad, times these.
+        scale = np.ones((len(rows), 2, 3))
+        for k, name in enumerate(self.search.names):
+            if name[1] != "x":
+                across = np.linalg.norm(self._direction(values, name)[..., 1:], axis=2)
+                scale[..., k] = across.prod(axis=1)[:, None] if name[1] == "D" else across
+        minors = [cross(rows[:, :, (k + 1) % 3], rows[:, :, (k + 2) % 3]) for k in range(3)]
+        determinant = np.abs(np.einsum("npi,npi->np", rows[:, :, 0], minors[0]))
+        moves = by_point @ (np.stack(minors, axis=-1) * scale[:, :, None])
+        size = AGREEMENT * np.linalg.norm(moves, axis=(2, 3))
+        return np.asarray(_MOVED * determinant / np.maximum(size, np.finfo(np.float64).tiny))
+
+    def _direction(self, values: Array, name: str) -> Array:
+        """Directions (n, 2, 3) of the vector that a signal is of."""
+        force = values[..., :3]
+        a = force if name[0] == "F" else cross(values[..., 3:], force)
+        return np.asarray(a / np.linalg.norm(a, axis=2, keepdims=True))
+
     def _facing(self, values: Array) -> Array:
         """How far the transverse vectors of direction signals face each other, (n, k)."""
-        force, out = values[..., :3], np.empty((len(values), 0))
+        out = np.empty((len(values), 0))
         for name in self.search.names:
             if name[1] == "D":
-                a = force if name[0] == "F" else cross(values[..., 3:], force)
-                a = a / np.linalg.norm(a, axis=2, keepdims=True)
-                facing = np.einsum("ni,ni->n", a[:, 0, 1:], a[:, 1, 1:]) - _FACING
-                out = np.concatenate([out, facing[:, None]], axis=1)
+                a = self._direction(values, name)
+                facing, least = np.einsum("ni,ni->n", a[:, 0, 1:], a[:, 1, 1:]), _FACING
+                if self.firm:
+                    facing, least = np.sign(facing) * np.sqrt(np.abs(facing)), _FACING**0.5
+                out = np.concatenate([out, facing[:, None] - least], axis=1)
         return out
 
     def slopes(self, state: _State, signs: Array) -> tuple[Array, Array]:
@@ -247,8 +320,9 @@ class _Mountain:
         unit = self.units(state.xi)
         basis = free * unit[:, None]
         moved = (state.xi[:, None] + _STEP * basis).reshape(-1, 2, 3)
-        values, _, slope = self._equations(moved, np.repeat(unit, 3, axis=0))
-        levels, _ = self.levels(moved, values, slope, np.repeat(signs, 3, axis=0))
+        values, _, slope, by_point = self._equations(moved, np.repeat(unit, 3, axis=0))
+        distinct = self._distinct(values, slope, by_point)
+        levels, _ = self.levels(moved, values, distinct, np.repeat(signs, 3, axis=0))
         slopes = (levels.reshape(len(basis), 3, -1) - state.levels[:, None]) / _STEP
         return basis, slopes
 
@@ -259,7 +333,6 @@ def farthest_twins(search: Search, pools: Sequence[Pairs], regions: tuple[str, .
     Where a climb ends depends on where it begins: the largest is a lower bound. Each pool has its
     own climbs, so that none crowds out another.
     """
-    mountain = _Mountain(search, _ROUNDS[0][2])
     signs = np.array(
         [[("CB" in r) * 1.0 - ("CF" in r), float("ELD" in r)] for r in regions]
     ).reshape(-1, 2)
@@ -269,28 +342,42 @@ def farthest_twins(search: Search, pools: Sequence[Pairs], regions: tuple[str, .
     if not number.size:
         return pools[0].rows(number)
     signs = signs[number % len(regions)]
-    state = mountain.at(xi, signs)
+    count = sum(name[1] == "D" for name in search.names)
+    rods, ends = {False: search, True: _finer(search)}, []
     size = np.full(len(xi), _FIRST)
-    for most, steps, cost in _ROUNDS:
-        last = (most, steps, cost) == _ROUNDS[-1]
-        mountain = replace(mountain, cost=cost, search=_finer(search) if last else search)
-        merit = np.where(np.isfinite(state.merit), _merit(state.levels, cost), -np.inf)
+    mountain = _Mountain(search, _ROUNDS[0].cost, firm=False)
+    state = mountain.at(xi, signs)
+    for one in _ROUNDS:
+        if one.firm:
+            number = number % len(regions)  # all pools' together
+        merit = np.where(np.isfinite(state.merit), _merit(state.levels, one.cost), -np.inf)
         strict = np.where(np.isfinite(merit), _merit(state.levels, _STRICT), -np.inf)
-        kept = np.union1d(_leading(merit, number, most), _leading(strict, number, most // 4))
+        kept = np.union1d(
+            _leading(merit, number, one.most), _leading(strict, number, one.most // 4)
+        )
         number, signs, size = number[kept], signs[kept], size[kept]
         state = state.rows(kept)._replace(merit=merit[kept])
-        if last:
+        mountain = _Mountain(rods[one.finer], one.cost, one.firm)
+        if one.finer or one.firm:
+            held = state.levels[:, 2:][:, : 1 + count].min(axis=1) < _HELD
             state = mountain.at(state.xi, signs)
-            size = np.where(np.isfinite(state.merit), _FINE, 0.0)  # some are none on this rod
-        for _ in range(steps):
+            going = np.isfinite(state.merit) & (one.finer | held)
+            size = np.where(going, _FINE if one.finer else _FIRST, 0.0)
+        for _ in range(one.steps):
             active = np.flatnonzero(size > _LAST)
             if not active.size:
                 break
             _step(mountain, state, signs, size, active)
-    # The second contact is solved for, from where its signals fix it better.
-    regular = _regularity(state.slope)
-    xi = np.where((regular[:, 0] > regular[:, 1])[:, None, None], state.xi[:, ::-1], state.xi)
-    contact_map, names, _, domain = mountain.search
+        if one.finer:
+            ends.append(_solved(mountain.search, state))
+    return joined(ends)
+
+
+def _solved(search: Search, state: _State) -> Pairs:
+    """Pairs whose second contact is solved for, from where its signals fix it better."""
+    turned = state.distinct[:, 0] > state.distinct[:, 1]
+    xi = np.where(turned[:, None, None], state.xi[:, ::-1], state.xi)
+    contact_map, names, _, domain = search
     first, second, agrees = twins_near(contact_map, names, xi[:, 0], xi[:, 1], domain)
     apart = np.linalg.norm(second.values[:, 3:] - first.values[:, 3:], axis=1)
     chart = chart_of(contact_map.chart.fold, first.xi)
@@ -305,13 +392,6 @@ def _finer(search: Search) -> Search:
     return search._replace(contact_map=replace(contact_map, chart=chart))
 
 
-def _regularity(slope: Array) -> Array:
-    """The determinants of both contacts over the lengths of their gradients, (n, 2)."""
-    gradients = slope.reshape(-1, 3, 2, 3).swapaxes(1, 2)
-    size = np.linalg.norm(gradients, axis=3).prod(axis=2)
-    return np.asarray(np.abs(np.linalg.det(gradients)) / np.maximum(size, _RIDGE))
-
-
 def _starts(search: Search, pairs: Pairs, signs: Array) -> tuple[AnyArray, Array]:
     """The best pairs of each region, in different parts of charts: its number, their contacts."""
     xi = np.stack([pairs.first.xi, pairs.second.xi], axis=1)
@@ -319,17 +399,18 @@ def _starts(search: Search, pairs: Pairs, signs: Array) -> tuple[AnyArray, Array
     swapped = xi[:, 0, 0] < xi[:, 1, 0]
     xi[swapped] = xi[swapped, ::-1]
     charts = [chart_of(search.contact_map.chart.fold, xi[:, k]) for k in (0, 1)]
-    part = np.floor(np.concatenate(charts, axis=1) * np.tile(_PARTS, 2) - 1e-9)
+    cells = np.floor(np.concatenate(charts, axis=1) * np.tile(_PARTS, 2) - 1e-9)
+    part = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
     both = (pairs.first, pairs.second)
-    numbers, starts = [], []
+    numbers, starts, begin = [], [], _ROUNDS[0]
     for i, (side, small) in enumerate(signs):
         margins = [m for one in both for m in (side * one.backward, small * one.tangent_x)]
         margins.append(pairs.apart - search.separation)
         levels = np.stack([*(one.angle for one in both), *margins], axis=1)
         chosen: set[int] = set()
-        for cost, most in ((_ROUNDS[0][2], _ROUNDS[0][0]), (_STRICT, _ROUNDS[0][0] // 4)):
+        for cost, most in ((begin.cost, begin.most), (_STRICT, begin.most // 4)):
             order = np.argsort(-_merit(levels, cost), kind="stable")
-            _, first = np.unique(part[order], axis=0, return_index=True)
+            _, first = np.unique(part[order], return_index=True)
             chosen.update(order[np.sort(first)[:most]].tolist())
         starts.append(xi[sorted(chosen)])
         numbers.append(np.full(len(chosen), i))

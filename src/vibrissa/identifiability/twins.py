@@ -177,13 +177,13 @@ def _chart_derivatives(fold: Fold, chart: Array) -> Array:
 
 #: Agreement of twins' signals: forces relative to |F|, moments to |M|, angles in rad.
 AGREEMENT = 1e-10
+#: A solution that ``AGREEMENT`` could move by more than this (over L) is not distinct from its
+#: neighbours.
+FIRM = 1e-3
 #: Factor by which the rod is finer on which pairs are found again.
 FINER = 4
 # A pair is confirmed if its second contact moves by less than this share of their distance.
 _STEADY = 0.2
-# A solution that ``AGREEMENT`` could move by more than this (over L) is not distinct from its
-# neighbours.
-_FIRM = 1e-3
 _SAME = 1e-4  # two solutions nearer than this (over L) are the same contact
 # The search for better twins starts wide, ends where climbs begin, keeps so many of each region.
 _WIDTHS = np.geomspace(0.2, 0.02, 9)
@@ -288,7 +288,7 @@ def _firm(contact_map: ContactMap, names: tuple[str, ...], xi: Array) -> AnyArra
     moved = np.full(len(xi), np.inf)
     inverse = np.linalg.inv(by_contact[regular]) * sizes(values[regular], names)[:, None, :]
     moved[regular] = AGREEMENT * np.linalg.norm(tangents[regular, 3:] @ inverse, axis=(1, 2))
-    return np.asarray(moved <= _FIRM)
+    return np.asarray(moved <= FIRM)
 
 
 def better_twins(
@@ -335,7 +335,8 @@ def twins_near(
 def _best(pairs: Pairs, regions: tuple[str, ...], separation: float) -> Pairs:
     """The best pairs of each region, at most one of each part of the chart so that they differ."""
     far = pairs.apart >= separation
-    part = np.floor(pairs.chart * [4.0, 4.0 / np.pi, 4.0] - 1e-9)
+    cells = np.floor(pairs.chart * [4.0, 4.0 / np.pi, 4.0] - 1e-9)
+    part = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
     chosen: set[int] = set()
     # Those that count, and those that may soon: far from rest, though not yet far apart.
     for score in (
@@ -345,7 +346,7 @@ def _best(pairs: Pairs, regions: tuple[str, ...], separation: float) -> Pairs:
         order = np.argsort(-score, kind="stable")
         for region in regions:
             rows = order[pairs.members(region)[order]]
-            _, first = np.unique(part[rows], axis=0, return_index=True)
+            _, first = np.unique(part[rows], return_index=True)
             chosen.update(rows[np.sort(first)[:_KEPT]].tolist())
     return pairs.rows(np.array(sorted(chosen), dtype=np.int64))
 

@@ -50,7 +50,8 @@ def resting(whisker: Whisker) -> tuple[Array, Array, spatial.cKDTree, Array]:
     """
     s = np.linspace(0.0, whisker.length, _SAMPLES)
     places = whisker.position(s)
-    return s, places, spatial.cKDTree(places), whisker.frame(np.array(whisker.length))[:, 0]
+    tree = spatial.cKDTree(places, leafsize=64)  # points far from the whisker visit most leaves
+    return s, places, tree, whisker.frame(np.array(whisker.length))[:, 0]
 
 
 def nearest_on_rest(whisker: Whisker, points: Array) -> tuple[Array, Array]:

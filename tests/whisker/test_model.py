@@ -305,6 +305,29 @@ def test_breaks_can_be_stated_for_every_shape():
         Whisker.straight(LENGTH, breaks=(0.05,))
 
 
+def test_two_samples_of_a_radius_are_a_cone():
+    """They were taken for a step in the middle, and forces were three times too large."""
+    pairs = [[0.0, 1e-4], [0.04, 1e-5]]
+    for radius in ([1e-4, 1e-5], pairs):
+        whisker = Whisker.straight(0.04, radius=radius)
+        s = np.linspace(0.0, 0.04, 9)
+        np.testing.assert_allclose(whisker.radius(s), np.linspace(1e-4, 1e-5, 9), rtol=1e-9)
+        assert whisker.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("properties", "message"),
+    [
+        ({"radius": [1e-4, 1e-5], "base_radius": 2e-4}, "both given"),
+        ({"radius": [[0.0, 1e-4], [40.0, 1e-5]]}, "arc lengths are in m"),
+        ({"radius": [[0.0, 1e-4], [1.0, 1e-5]]}, "arc lengths are in m"),
+    ],
+)
+def test_radii_that_contradict_each_other_or_the_length(properties, message):
+    with pytest.raises(ValueError, match=message):
+        Whisker.straight(0.04, **properties)
+
+
 def test_tip_thicker_than_base_is_noted():
     assert Whisker.straight(LENGTH, tip_radius=2e-4).notes == ("the tip is thicker than the base",)
 

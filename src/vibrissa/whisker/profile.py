@@ -351,6 +351,7 @@ def _stated(s: Array, r: Array) -> NDArray[np.intp]:
     h = np.diff(s)
     around = np.minimum(np.append(np.inf, h[:-1]), np.append(h[1:], np.inf))
     close = (h <= _CLOSE * around) & (np.abs(np.diff(r)) > _NEGLIGIBLE * r[1:])
+    close &= np.isfinite(around)  # two samples are the ends of a cone
     # Points at random spacings have a few close pairs too: those are judged as all others are.
     found: NDArray[np.intp] = np.flatnonzero((h == 0.0) | (close & (close.mean() > _PAIRED)))
     return found

@@ -89,6 +89,7 @@ def split(properties: Properties) -> tuple[Section, Holding]:
 
 # Ending of a note on a property that was not stated.
 _SECTION_KEYS = Section.__optional_keys__
+_BEYOND = 10.0  # so many lengths are no more the rest of a whisker that was trimmed
 ASSUMED = " assumed, not measured"
 _RADIUS_ASSUMED = f"radius{ASSUMED}"
 _NOTED = {"youngs_modulus": "Young's modulus", "poisson_ratio": "Poisson's ratio"}
@@ -280,8 +281,8 @@ def radius_profile(
         return linear(
             float(base), float(base / TAPER if tip_radius is None else tip_radius), length
         )
-    if tip_radius is not None:
-        raise ValueError("tip_radius and radius were both given; give one of them")
+    if not (tip_radius is None and base_radius is None):
+        raise ValueError("radius and a radius of base or tip were both given; give one of them")
     if callable(radius):
         function = array_function(radius, (), "radius")
         profile = approximate(function, np.unique([0.0, *breaks, length]))
@@ -320,6 +321,11 @@ def _joined(length: float, samples: Array) -> Profile:
         raise ValueError(
             f"radius samples reach from {s[0]:.4g} to {s[-1]:.4g} m; they must cover the whisker "
             f"from 0 to {length:.4g} m"
+        )
+    if s[-1] > _BEYOND * length:
+        raise ValueError(
+            f"radius samples reach to {s[-1]:.4g} m, on a whisker of {length:.4g} m: arc lengths "
+            "are in m, not in mm or shares of the length"
         )
     if not (r > 0.0).all():
         raise ValueError(f"radius is {r.min():.4g} m at sample {r.argmin()}; it must be positive")

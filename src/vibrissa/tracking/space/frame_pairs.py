@@ -29,6 +29,7 @@ _CLEARLY = 20.0  # cost by which another shift must fit better than the given on
 _LEFT = 0.65
 _DROPPED = 10  # largest number of frames in a row that a camera drops unnoticed
 _KNOWN = 10  # number of frames that must show an end of the whisker
+_LOCATED = 0.3  # error with which an end is located in each frame by itself, pixels
 
 
 def paired_frames(
@@ -120,7 +121,8 @@ def better_offset(
         np.nan_to_num(one[row, path] - middle[best])
         for one, middle in zip(ends, usual, strict=True)
     ]
-    alike = correlated([one[None] for one in away])
+    power = float(np.mean([(one**2).mean() for one in away]))
+    alike = 1.0 + (correlated([one[None] for one in away]) - 1.0) * power / (power + _LOCATED**2)
     # Of other optics some offset always explains a little; of a true one noise alone is left.
     if left + alike * changed >= given or left > _LEFT * given:
         return np.empty(0, dtype=np.int64)

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from rows import RowFilm, scored
 
-from vibrissa.tracking import trace_video
+from vibrissa.tracking import Trace, trace_video
 from vibrissa.tracking.trace.clutter import between_whiskers
+from vibrissa.tracking.trace.neighbours import neighbours
 from vibrissa.tracking.trace.ridge import measured, noise_level
+from vibrissa.tracking.trace.scene import Scene
 from vibrissa.tracking.trace.trace import TraceOptions
 
 
@@ -26,6 +28,29 @@ def test_crossing_whiskers_stay_themselves(crossing, view, inside):
     score = scored(traces, truth)
     assert np.isfinite(score).mean() > 0.6
     assert (score[np.isfinite(score)] == 1.0).mean() > 0.97
+
+
+@pytest.mark.parametrize("asked", [(0, 1), (0, 2)], ids=["two above", "both outer"])
+def test_neighbours_that_nobody_asked_for_keep_their_ends(crossing, asked):
+    """If the third is not followed, one of the two goes on as it in a third of the images."""
+    truth = crossing.truth[1]
+    traces = trace_video(crossing.images[1], truth[0, asked, 0])
+    assert len(traces) == 2
+    every = [[Trace.lost()] * len(truth) for _ in range(3)]
+    for k, row in zip(asked, traces, strict=True):
+        every[k] = row
+    score = scored(every, truth)[:, asked]
+    assert np.isfinite(score).sum() > 12
+    assert (score[np.isfinite(score)] == 1.0).mean() > 0.97
+
+
+def test_neighbours_are_all_others(crossing):
+    truth = crossing.truth[0][0, :, 0]
+    frames = crossing.images[0][::2]
+    scene = Scene.of(frames, 1.0)
+    found = neighbours(frames, truth[:1], scene, TraceOptions())
+    assert np.linalg.norm(np.array(found) - truth[1:], axis=1).max() < 8.0
+    assert not neighbours(frames, truth, scene, TraceOptions())
 
 
 def test_straight_whiskers_that_cross_in_one_place_keep_their_ends():

@@ -83,7 +83,7 @@ _LARGEST_TURN = 0.35  # largest turn of the row between frames beyond what was e
 _ALIGNED = 0.7
 # Distance from a click that costs as much as a lost whisker, pixels, at most half of that to the
 # next base.
-_CLICK = 12.0
+CLICK = 12.0
 
 
 def follow_row(
@@ -345,8 +345,8 @@ def _kink(trace: Trace) -> float:
 
 def _price(click: Array, curve: Curve, half: float) -> float:
     """Cost of taking a curve for the whisker that was clicked."""
-    away = min(_from_click(click, curve.line), _passed(click, curve.line)[0])
-    return LOST * (away / min(_CLICK, half)) ** 2 + _SHORT / (1.0 + curve.score / _LIKELY)
+    away = min(from_click(click, curve.line), _passed(click, curve.line)[0])
+    return LOST * (away / min(CLICK, half)) ** 2 + _SHORT / (1.0 + curve.score / _LIKELY)
 
 
 def _passed(click: Array, line: Array) -> tuple[float, int]:
@@ -445,7 +445,7 @@ def _pool(
     for curve in find_curves(frame, scene, options, begins=begins):
         if len(tried) - len(taken) >= _TRIED * len(missing):
             break
-        if min(_from_click(follower.base, curve.line) for follower in missing) > _NEAR:
+        if min(from_click(follower.base, curve.line) for follower in missing) > _NEAR:
             continue
         if any(overlap(curve.line, other) >= SAME for other in tried):
             continue
@@ -462,7 +462,7 @@ def _pool(
     return kept
 
 
-def _from_click(click: Array, line: Array) -> float:
+def from_click(click: Array, line: Array) -> float:
     """Distance of a click from the beginning of a line, pixels.
 
     Along the line's own direction a click may miss by more: the face hides where that begins.
@@ -532,8 +532,8 @@ class _Costs(NamedTuple):
                 if not follower.long_enough(trace):
                     continue
                 if expected is None:
-                    away = _from_click(follower.base, trace.line)
-                    far = LOST * (away / min(_CLICK, half[k])) ** 2
+                    away = from_click(follower.base, trace.line)
+                    far = LOST * (away / min(CLICK, half[k])) ** 2
                 elif aligned(expected, trace.line) > _ALIGNED:
                     offsets[k, c], far = sideways(expected, trace.line), 0.0
                 else:

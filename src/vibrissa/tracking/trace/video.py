@@ -28,6 +28,7 @@ from vibrissa.tracking.trace.clutter import between_whiskers
 from vibrissa.tracking.trace.curves import find_whiskers
 from vibrissa.tracking.trace.follower import Follower, features_of, start_at
 from vibrissa.tracking.trace.identity import Seen, decided
+from vibrissa.tracking.trace.neighbours import neighbours
 from vibrissa.tracking.trace.row import follow_row
 from vibrissa.tracking.trace.scene import Scene
 from vibrissa.tracking.trace.start import FRAMES, is_bright, negative
@@ -39,6 +40,7 @@ _BACK = 64  # largest number of frames before its own that a correction can chan
 _AGREES = 0.9  # share of a line along another one from which both are the same
 # Factor of the jump of a single whisker before grey fur, where its base is less certain.
 _FAINT = 2.4
+_LOOKED = 9  # number of frames after the first in which neighbours are searched
 _SPAN = 400  # number of frames at the beginning of a film from which those for its start are taken
 
 
@@ -123,6 +125,12 @@ def trace_video(
         raise ValueError(
             f"corrections are for whiskers {wrong}; there are {len(followers)}, from 0"
         )
+    if len(followers) > 1 and not done:
+        # Neighbours are followed too, so that their lines are not taken; none is returned.
+        clear = [scene.without_still(f) for f in (start, *alike[:: max(len(alike) // _LOOKED, 1)])]
+        for base in neighbours(clear, starts, scene, options):
+            followers.append(replace(start_at(base, options), clutter=still.still_only))
+            starts = np.concatenate([starts, base[None]])
     for i, frame in enumerate(chain(first, source)):
         if frame.shape != shape:
             raise ValueError(
@@ -137,9 +145,9 @@ def trace_video(
             continue
         known = {k: points for (j, k), points in corrections.items() if j == i}
         found = follow_all(followers, frame, known, seen, scene)
-        for trace, row in zip(found, traces, strict=True):
+        for trace, row in zip(found, traces, strict=False):
             row.append(trace)
-        for k in range(len(followers)):
+        for k in range(len(traces)):
             if k in known:
                 _backward(traces[k], recent, followers[k], k, corrections, seen)
         recent.append(frame)
@@ -147,7 +155,7 @@ def trace_video(
             progress(i + 1)
     if len(followers) > 1 and done < len(traces[0]):
         for i, way in enumerate(decided(seen, starts)):
-            for row, c in zip(traces, way, strict=True):
+            for row, c in zip(traces, way, strict=False):
                 row[i] = seen[i].lines[c] if c >= 0 else Trace.lost()
     return traces
 

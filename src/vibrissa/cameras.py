@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.deferred import transform
 from vibrissa.io import in_file, read_calibration, write_calibration
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, numbers
 from vibrissa.quantities import attributes
 
 __all__ = [
@@ -99,7 +99,10 @@ class Camera:
             faults.append(f"distortion has {bent.size} coefficients; up to 8 finite ones are known")
         bent = np.pad(bent, (0, max(0, _COEFFICIENTS - bent.size)))
         object.__setattr__(self, "distortion", bent)
-        object.__setattr__(self, "size", (int(self.size[0]), int(self.size[1])))
+        if np.shape(self.size) != (2,) or min(self.size) < 1:
+            faults.append(f"size is {self.size!r}; columns and rows of its images are needed")
+        else:
+            object.__setattr__(self, "size", (int(self.size[0]), int(self.size[1])))
         if self.projection not in ("perspective", "orthographic"):
             faults.append(
                 f"projection is {self.projection!r}; perspective or orthographic is needed"
@@ -144,7 +147,7 @@ class Camera:
         slopes : array (..., 2, 3)
             Derivatives of these by the points, pixels per m.
         """
-        seen = np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation
+        seen = numbers("points", points) @ self.rotation.T + self.translation
         if self.projection == "orthographic":
             slopes = np.broadcast_to(
                 self.matrix[:2, :2] @ self.rotation[:2], (*seen.shape[:-1], 2, 3)
@@ -173,7 +176,7 @@ class Camera:
         origin, direction : array (..., 3)
             Point of each line, m, and its unit direction away from the camera, laboratory frame.
         """
-        pixels = np.asarray(pixels, dtype=np.float64)
+        pixels = numbers("pixels", pixels)
         flat = (pixels - self.matrix[:2, 2]) @ np.linalg.inv(self.matrix[:2, :2]).T
         if self.projection == "orthographic":
             start = np.concatenate([flat, np.zeros_like(flat[..., :1])], axis=-1)
@@ -316,12 +319,14 @@ def triangulate(
     ValueError
         If shapes do not fit, or a single camera looks along the plane z = 0.
     """
-    pixels = np.asarray(pixels, dtype=np.float64)
+    pixels = numbers("pixels", pixels)
     if not cameras or pixels.ndim < 2 or pixels.shape[0] != len(cameras):
         raise ValueError(
             f"{len(cameras)} cameras and pixels of shape {pixels.shape} do not fit; "
             "(camera, ..., 2) is needed"
         )
+    if not (np.nan_to_num(sigma, nan=1.0) > 0.0).all():
+        raise ValueError(f"sigma is a positive standard deviation, pixels; got {sigma!r}")
     if len(cameras) == 1:
         return _in_plane(cameras[0], pixels[0], np.broadcast_to(sigma, pixels.shape[:-1])[0])
     weight = 1.0 / np.broadcast_to(np.asarray(sigma, np.float64), pixels.shape[:-1])

@@ -135,12 +135,20 @@ def test_a_file_of_anipose(tmp_path):
     np.testing.assert_allclose(camera.project([0.01, 0.0, 0.0]), [319.5 + 80.0 * radial, 239.5])
 
 
+_OTHERWISE_WHOLE = (
+    "[cam_0]\nsize = [640, 480]\nmatrix = [[800, 0, 320], [0, 800, 240], [0, 0, 1]]\n"
+    "distortions = [0, 0, 0, 0, 0]\ntranslation = [0, 0, 100]\n"
+)
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
         ("[cam_0\n", "not TOML"),
         ("[metadata]\nadjusted = true\n", "no camera"),
         ("[cam_0]\nsize = [1, 1]\n", "has no matrix, rotation, translation"),
+        (_OTHERWISE_WHOLE + "rotation = [0, 90, 0]\n", r"rotation is \[0, 90, 0\]"),
+        (_OTHERWISE_WHOLE + "rotation = [0, 0, 0]\nfisheye = true\n", "fisheye is true"),
     ],
 )
 def test_a_calibration_that_is_none_says_why(text, said, tmp_path):
@@ -156,3 +164,8 @@ def test_what_cannot_be_a_camera_says_why():
         orthogonal_views(pixel_size=0.0)
     with pytest.raises(ValueError, match="do not fit"):
         triangulate(PAIRS["orthogonal"][:1], np.zeros((2, 2)))
+    for sigma in (-1.0, 0.0):
+        with pytest.raises(ValueError, match="sigma is a positive standard deviation"):
+            triangulate(PAIRS["orthogonal"], np.zeros((2, 2)), sigma)
+    with pytest.raises(ValueError, match="columns and rows of its images"):
+        Camera(np.eye(3), np.eye(3), np.zeros(3), size=(1024,))

@@ -49,6 +49,8 @@ def test_swapped_arguments_get_a_hint(bent):
     for force, moment in ((bent.moment, bent.force), (1e-3 * bent.force, 1e6 * bent.moment)):
         with pytest.raises(ValueError, match="force, N, comes before moment"):
             vb.estimate_from_wrench(bent.whisker, force, moment)
+        with pytest.raises(ValueError, match="force, N, comes before moment"):
+            vb.second_contact(bent.whisker, force, moment, noise=1e-12 * np.eye(6))
     with pytest.raises(ValueError, match=r"ContactMap.simulate\(whisker\)"):
         vb.uniqueness(bent.whisker)
     for other in ("whisker.toml", bent.contact_point):
@@ -63,6 +65,82 @@ def test_millimetres_in_arrays_get_a_hint(bent):
         vb.deflect(bent.whisker, vb.PointContact(1e3 * bent.contact_point))
     mixed = vb.deflect(bent.whisker, vb.PointContact([[24.0, 13.0, 2.0], [24e-3, 13e-3, 2e-3]]))
     assert vb.status.names(mixed.status).tolist() == ["BEYOND_TIP", "OK"]
+
+
+def test_pegs_and_objects_in_millimetres_get_a_hint(bent):
+    upright = [0.0, 0.0, 1.0]
+    with pytest.raises(ValueError, match=r"all pegs are .* millimetres given as metres"):
+        vb.deflect(bent.whisker, vb.PegContact([24.0, 13.0, 0.0], upright))
+    with pytest.raises(ValueError, match=r"all objects are .* millimetres given as metres"):
+        vb.deflect_around(bent.whisker, vb.objects.Peg([24.0, 13.0, 0.0], upright, 1.35))
+
+
+def test_masked_samples_are_missing(bent, contact_map):
+    force = np.ma.masked_array(bent.force, mask=[[True] * 3, [False] * 3])
+    signals = vb.base_signals(bent.force, bent.moment)
+    axial = np.ma.masked_array(signals.Fx.values, mask=[True, False])
+    named = {"Fx": axial, "MB": signals.MB.values, "MD": signals.MD.values}
+    for found in (
+        contact_map.estimate(named),
+        vb.estimate_from_wrench(bent.whisker, force, bent.moment),
+    ):
+        assert vb.status.names(found.status).tolist() == ["MISSING", "UNIQUE"]
+    one = vb.Estimator(contact_map)(np.ma.masked_array([1e-6, 1e-8, 0.1], mask=[1, 0, 0]))
+    assert one.status == vb.Status.MISSING
+
+
+def test_columns_in_another_order_are_refused(bent, contact_map):
+    pandas = pytest.importorskip("pandas")
+    table = pandas.DataFrame(bent.contact_point[:, ::-1], columns=list("zyx"))
+    with pytest.raises(ValueError, match="columns z, y, x; x, y, z are needed in this order"):
+        vb.deflect(bent.whisker, vb.PointContact(table))
+    vb.deflect(bent.whisker, vb.PointContact(table[["x", "y", "z"]]))
+    row = pandas.Series([0.1, 1e-8, 1e-6], index=["MD", "MB", "Fx"])
+    with pytest.raises(ValueError, match="columns MD, MB, Fx; Fx, MB, MD are needed"):
+        vb.Estimator(contact_map)(row)
+
+
+@pytest.mark.parametrize("turn", [np.diag([1.0, 1.0, -1.0]), np.ones((3, 3)), 2.0 * np.eye(3)])
+def test_a_rotation_is_one_or_refused(bent, contact_map, turn):
+    """A reflected pose gave another contact point, called UNIQUE with a valid covariance."""
+    peg = vb.objects.Peg([24e-3, 13e-3, 0.0], [0.0, 0.0, 1.0], 1e-3)
+    heavy = vb.sensors.Sensor(mass=1e-3)
+    estimator = vb.Estimator(contact_map)
+    for call in (
+        lambda: vb.deflect_around(bent.whisker, peg, turn),
+        lambda: heavy.to_wrench(np.zeros(6), turn),
+        lambda: estimator([1e-6, 1e-8, 0.1], turn),
+        lambda: vb.streaming.Poses(turn),
+    ):
+        with pytest.raises(ValueError, match="rotation is not a rotation"):
+            call()
+
+
+@pytest.mark.parametrize("name", ["stiffness_sigma", "gain_sigma", "mixing_sigma"])
+def test_relative_errors_are_no_per_cent(contact_map, name):
+    signals, noise = {"Fx": 1e-6, "MB": 1e-8, "MD": 0.1}, {"Fx": 1e-6, "MB": 1e-8, "MD": 0.1}
+    with pytest.raises(ValueError, match=f"{name} is a relative standard deviation"):
+        contact_map.estimate(signals, noise=noise, **{name: 5.0})
+    with pytest.raises(ValueError, match="it is a share: 5 % is"):
+        vb.sensors.Sensor(gain_error=5.0)
+
+
+def test_options_that_would_be_ignored_are_refused(bent, contact_map):
+    signals = {"Fx": 1e-6, "MB": 1e-8, "MD": 0.1}
+    with pytest.raises(ValueError, match="base_rotation turns gravity, and none is given"):
+        contact_map.estimate(signals, base_rotation=np.eye(3))
+    with pytest.raises(ValueError, match="centerline_sigma is of a centerline"):
+        vb.second_contact(
+            bent.whisker, bent.force, bent.moment, noise=1e-12 * np.eye(6), centerline_sigma=1e-5
+        )
+    with pytest.raises(ValueError, match="phi is an angle in rad"):
+        vb.Prior({"phi": (-30.0, 30.0)})
+
+
+def test_signals_of_an_estimator_may_be_typed_in_small_letters(contact_map):
+    values = [1e-6, 1e-8, 0.1]
+    found = vb.Estimator(contact_map, "md fx mb")([values[2], *values[:2]])
+    np.testing.assert_array_equal(found.point, vb.Estimator(contact_map)(values).point)
 
 
 def test_results_become_datasets_and_pictures(bent, contact_map):

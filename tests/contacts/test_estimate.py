@@ -215,7 +215,7 @@ def test_bad_input_says_what_is_allowed(gamma_map):
         gamma_map.estimate(signals, noise={"Fx": "a", "MB": 1e-8, "MD": 0.1})
     with pytest.raises(ValueError, match=r"6 × 6 covariance of \(F, M\); got 'a'"):
         gamma_map.estimate(signals, noise="a")
-    with pytest.raises(ValueError, match=r"has 3 numbers; got \['a', 1, 2\]"):
+    with pytest.raises(ValueError, match=r"must be numbers; got \['a', 1, 2\]"):
         vb.Estimator(gamma_map)(["a", 1, 2])
 
 

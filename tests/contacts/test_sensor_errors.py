@@ -190,7 +190,7 @@ def test_what_is_stated_is_checked(gamma_map):
         vb.Estimator(gamma_map, gain_sigma=0.01)
     with pytest.raises(ValueError, match=r"gain_sigma is one .* shape \(6,\); got \[0.1, 0.1\]"):
         vb.Estimator(gamma_map, noise=noise, gain_sigma=[0.1, 0.1])
-    with pytest.raises(ValueError, match="mixing_sigma is one standard deviation ≥ 0"):
+    with pytest.raises(ValueError, match="mixing_sigma is a relative standard deviation"):
         vb.Estimator(gamma_map, noise=noise, mixing_sigma=-0.1)
     for wrong, message in (
         ({"gain_error": -0.1}, "gain_error is -0.1"),

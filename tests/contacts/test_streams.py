@@ -202,7 +202,7 @@ def test_uncertain_stiffness_is_in_the_covariance(gamma_map, bent, names, given)
 def test_uncertain_stiffness_needs_noise(gamma_map):
     with pytest.raises(ValueError, match="give its noise"):
         vb.Estimator(gamma_map, stiffness_sigma=0.1)
-    with pytest.raises(ValueError, match="not negative"):
+    with pytest.raises(ValueError, match="from 0 to 1"):
         vb.Estimator(gamma_map, noise=np.diag(NOISE**2), stiffness_sigma=-0.1)
     with pytest.raises(ValueError, match="c1 has none"):
         vb.Estimator.of_sensor(gamma_map, Sensor(("c0", "c1"), np.eye(2, 6), [1.0, 0.0]))

@@ -5,6 +5,7 @@ import pytest
 
 from vibrissa.contour import (
     axis_offset,
+    compare_with,
     fit_shape,
     shape_from_dataset,
 )
@@ -217,5 +218,15 @@ def test_what_is_no_shape_is_refused(joint_errors):
     wrong[3, 0, 0] = -1.0
     with pytest.raises(ValueError, match="point 3"):
         fit_shape("sphere", points, wrong)
+    masked = np.ma.masked_array(points, mask=np.arange(40)[:, None] == [[3, 3, 3]])
+    spoilt = np.ma.masked_array(points + (masked.mask * 1.0), mask=masked.mask)
+    radii = [fit_shape("sphere", one, known["covariance"]).radius for one in (masked, spoilt)]
+    assert radii[0] == radii[1]
+    for call in (
+        lambda: fit_shape("sphere", points, whisker_radius=-50e-6),
+        lambda: compare_with(Peg([0, 0, 0], [0, 0, 1], 1e-3), points, whisker_radius=-50e-6),
+    ):
+        with pytest.raises(ValueError, match="whisker_radius is negative"):
+            call()
     with pytest.raises(ValueError, match="outside is"):
         fit_shape("plane", points, outside=[0.0, 1.0])

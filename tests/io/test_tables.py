@@ -218,9 +218,10 @@ def test_signals_too_large_for_the_whisker(tmp_path):
 
 def test_a_column_that_is_there_twice_is_refused(tmp_path):
     """Else one of both would be taken in silence."""
-    path = written(tmp_path, "time,Fx,Fx,Fy,Fz,Mx,My,Mz\n0,1,2,3,4,5,6,7\n")
-    with pytest.raises(ValueError, match="column Fx more than once"):
-        load_signals(path)
+    for other in ("Fx", "fx", "Fx_mN"):
+        path = written(tmp_path, f"time,Fx,{other},Fy,Fz,Mx,My,Mz\n0,1,2,3,4,5,6,7\n")
+        with pytest.raises(ValueError, match=f"Fx, {other} are 2 columns of Fx"):
+            load_signals(path)
 
 
 def test_no_file(tmp_path):

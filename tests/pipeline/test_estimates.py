@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from vibrissa import PointContact, deflect, samples
+from vibrissa import ContactMap, PointContact, deflect, samples
 from vibrissa.contour import shape_from_dataset
 from vibrissa.io import load_recording, save_recording
 from vibrissa.objects import Sphere
@@ -147,6 +147,12 @@ def test_the_rod_knows_what_pose_and_wrench_have_in_common(tracked, trial, conta
     change = other["contact_covariance"].values[felt] - both["contact_covariance"].values[felt]
     assert np.abs(change).max() > 0
     np.testing.assert_allclose(change, np.swapaxes(change, -1, -2), atol=1e-20)
+
+
+def test_a_map_of_another_whisker_is_noted(tracked):
+    other = ContactMap.simulate(samples.curved(), grid=False, cells=(8, 16, 8))
+    with pytest.warns(UserWarning, match="another whisker than the recording's"):
+        estimates_of(with_signals(tracked), contact_maps=[other])
 
 
 def test_frames_keep_why_they_have_no_signals(tracked, contact_map):

@@ -115,6 +115,14 @@ def test_motions_from_tables(tmp_path):
         ("[[object]]\nkind = 'sphere'\naxis = [0, 0, 1]", "kind sphere has axis"),
         ("[sensor]\nforce = 1", "has force; known are"),
         ("[motion]\nrow = 'Q'\nkind = 'whisking'", "row is 'Q'"),
+        ("[motion]\namplitude = 500\nkind = 'whisking'", "azimuth is an angle in rad"),
+        ("[array]\nrows = 'A'\nwhiskers = ['C2']", "has whiskers, and rows instead"),
+        ("[array]\nside = 'left'\nwhiskers = ['RC2']", "RC2 are not on the left side"),
+        ("[head]\nfile = 'head.csv'\nposition = [1, 0, 0]", "has position; known are file"),
+        ("duration = 1\n[motion]\nkind = 'table'\nfile = 'motion.csv'", "has its own"),
+        ("[dynamics]\ndamping_ratio = 14", "14 % is 0.14"),
+        ("[dynamics]\ndensity = [1.2, 1.6]", "1 g/cm³ is 1000"),
+        ("[sensor]\ngain_error = 5", "it is a share: 5 % is"),
     ],
 )
 def test_faults(text, message):

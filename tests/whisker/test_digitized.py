@@ -146,6 +146,11 @@ def test_base_hint_that_does_not_tell():
     points = digitized(20)
     with pytest.raises(ValueError, match="does not tell them apart"):
         Whisker.from_points(points, base=(points[0] + points[-1]) / 2)
+    # Millimetres, of a point near the first, were nearer to the last.
+    with pytest.raises(ValueError, match="does not tell them apart"):
+        Whisker.from_points(points, base=points[0] + [0.5, 0.2, 0.0])
+    with pytest.raises(ValueError, match="standard deviation of a coordinate in m"):
+        Whisker.from_points(points, noise=0.01)
     with pytest.raises(ValueError, match='"first", "last"'):
         Whisker.from_points(points, base="tip")
     with pytest.raises(ValueError, match="finite point"):
@@ -209,6 +214,10 @@ def test_a_robots_whisker():
         (digitized(20)[[*range(10), *range(9, 20)]], "rows 10 repeat"),
         (digitized(20) * 1e3, "millimetres given as metres"),
         (digitized(20) * 1e-3, "converted once too often"),
+        (
+            np.ma.masked_array(digitized(20), mask=np.arange(20)[:, None] == 5 * np.ones(3)),
+            "rows 5",
+        ),
     ],
 )
 def test_bad_points(points, message):

@@ -527,6 +527,8 @@ def certify(
     """
     before = load_certificate(path) if path is not None and Path(path).exists() else None
     if before is None or not sum(len(part.certified) for part in before.parts.values()):
+        if not 0.0 <= cone < 0.5 * np.pi:
+            raise ValueError(f"cone is a half angle in rad, from 0 to below π/2; got {cone!r}")
         out = prepared(contact_map, cone)
         out.refuted = doubt(contact_map, cone)
         if not out.refuted:

@@ -43,6 +43,8 @@ def deflect(
     load = _load(point, point_force, peg, axis, push)
     if point_force is not None:
         refuse({"--proximal": proximal}, "a --point-force acts where it is stated")
+    if gravity is None:
+        refuse({"--density": density}, "without --gravity the whisker has no weight")
     whisker = own.read()
     if density is not None:
         whisker = whisker.with_properties(density=density)

@@ -341,6 +341,8 @@ def _from_lines(
     if running.untimed:
         columns["time"] = [float(row) for row in range(len(records))]
         remark(f"{signals}: {vb.io.NUMBERED}")
+    for note in vb.io.time_notes(np.array(columns["time"])):
+        remark(f"{signals}: {note}")
     statuses = [int(vb.Status[one["status"].upper()]) for one in records]
     columns["friction"] = [estimator.friction] * len(records)
     happened = [vb.status.Event[one.get("event", "none").upper()] for one in records]

@@ -8,7 +8,7 @@ from typing import Any
 
 import vibrissa as vb
 from vibrissa.cli.inputs import WhiskerOptions, map_of, metres_of, print_notes, smallest_arc
-from vibrissa.cli.options import check_new, numbers, with_options
+from vibrissa.cli.options import check_new, numbers, refuse, with_options
 from vibrissa.cli.terminal import progress_bars, say
 
 
@@ -28,6 +28,9 @@ class MadeOptions(WhiskerOptions):
         self.check(self.whisker is not None or self.length is not None)
         if self.length is not None and self.whisker is not None:
             raise ValueError("give either --whisker or the --length of a straight one")
+        if self.rat is not None:
+            radii = {"--base-radius": self.base_radius, "--tip-radius": self.tip_radius}
+            refuse(radii, "--rat gives the radii")
 
     def read(self, path: Path | None = None) -> vb.Whisker:
         """Read or make the whisker, of the thickness and material that are stated."""

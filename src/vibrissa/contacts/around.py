@@ -20,13 +20,13 @@ from numpy.typing import ArrayLike
 
 from vibrissa.contacts.channels import WRENCH
 from vibrissa.contacts.noise import Noise, SensorNoise, explained
-from vibrissa.contacts.wrench import wrench_weights
+from vibrissa.contacts.wrench import wrench_on, wrench_weights
 from vibrissa.deferred import xr
-from vibrissa.numerics import AnyArray, Array
+from vibrissa.numerics import AnyArray, Array, numbers, rotation_matrices
 from vibrissa.objects import Placement, Surface
 from vibrissa.quantities import attributes
 from vibrissa.rod import Equilibrium, NearObjects, discretize
-from vibrissa.signals import Coordinates, labelled_wrench
+from vibrissa.signals import Coordinates
 from vibrissa.status import Status, flag_attributes
 from vibrissa.whisker import Whisker
 
@@ -91,11 +91,11 @@ def estimate_around(
     """
     if not 0.0 < position_sigma < np.inf:
         raise ValueError(f"position_sigma is positive, m; got {position_sigma!r}")
-    f, m, dims, coords = labelled_wrench(force, moment)
+    f, m, dims, coords = wrench_on(whisker, force, moment)
     shape = f.shape[:-1]
     near = NearObjects(whisker, objects), NearObjects(whisker, objects, _FINE)
-    turn = np.eye(3) if base_rotation is None else np.asarray(base_rotation, dtype=np.float64)
-    move = np.zeros(3) if base_position is None else np.asarray(base_position, dtype=np.float64)
+    turn = np.eye(3) if base_rotation is None else rotation_matrices("base_rotation", base_rotation)
+    move = np.zeros(3) if base_position is None else numbers("base_position", base_position)
     try:
         turns = np.broadcast_to(turn, (*shape, 3, 3)).reshape(-1, 3, 3)
         moves = np.broadcast_to(move, (*shape, 3)).reshape(-1, 3)

@@ -38,7 +38,7 @@ from vibrissa.io import (
     refuse_whisk,
     write_netcdf,
 )
-from vibrissa.numerics import AnyArray, Array
+from vibrissa.numerics import AnyArray, Array, numbers, rotation_matrices
 from vibrissa.quantities import attributes
 from vibrissa.rod import (
     CELLS,
@@ -209,7 +209,12 @@ class ContactMap:
             One contact for each measurement, with all candidates.
         """
         errors = common_errors(stiffness_sigma, gain_sigma, mixing_sigma)
+        if isinstance(signals, dict):
+            unlabelled = {n: v for n, v in signals.items() if not isinstance(v, xr.DataArray)}
+            signals = {**signals, **{name: numbers(name, v) for name, v in unlabelled.items()}}
         weight = Gravity.of(gravity)
+        if base_rotation is not None and gravity is None:
+            raise ValueError("base_rotation turns gravity, and none is given")
         if weight is None and (using == "wrench" or friction == 0.0):
             plain = (signals, noise, errors, prior, compliance_sigma)
             if using == "wrench":
@@ -227,7 +232,9 @@ class ContactMap:
             friction=0.0 if using == "wrench" else friction,
             compliance_sigma=compliance_sigma,
             stiffness_sigma=stiffness_sigma,
-            rotation=None if base_rotation is None else np.asarray(base_rotation),
+            rotation=None
+            if base_rotation is None
+            else rotation_matrices("base_rotation", base_rotation),
         )
 
     def tree(self, triplet: tuple[str, ...]) -> SearchTree:

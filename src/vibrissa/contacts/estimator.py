@@ -23,7 +23,7 @@ from vibrissa.contacts.noise import by_stiffness, common_errors, sensor_noise
 from vibrissa.contacts.prior import Prior, among_allowed, possible_candidates, refuse_tip
 from vibrissa.contacts.readout import ByName, Measurement, Mixed, Named, readout_of
 from vibrissa.contacts.search import LARGEST, STATUSES, UNKNOWNS, Search
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, numbers, rotation_matrices
 from vibrissa.rod import PointContact, deflect
 from vibrissa.sensors import GRAVITY, Sensor
 from vibrissa.signals import selection
@@ -96,7 +96,8 @@ class Estimator:
         gravity: Gravity | ArrayLike | None = None,
     ) -> None:
         names = selection(using, least=1)
-        order = using.replace(",", " ").split() if isinstance(using, str) else list(using)
+        given = using.replace(",", " ").split() if isinstance(using, str) else using
+        order = [selection([name], least=1)[0] for name in given]
         errors = common_errors(stiffness_sigma, gain_sigma, mixing_sigma)
         sensor = sensor_noise(noise, names, errors)
         places = [order.index(name) for name in names]
@@ -203,6 +204,10 @@ class Estimator:
         felt_above: float,
         prior: Prior | None,
     ) -> None:
+        if not (prior is None or isinstance(prior, Prior)):
+            raise ValueError(f"prior is a Prior; got {prior!r}")
+        if not 0.0 <= felt_above < math.inf:
+            raise ValueError(f"felt_above is a number of standard deviations; got {felt_above!r}")
         self.prior = prior
         self.felt_above = float(felt_above)
         self._sensor: Sensor | None = None
@@ -289,17 +294,14 @@ class Estimator:
         Measurement
             Input of `locate`; NaN for what is missing.
         """
-        try:
-            values = np.asarray(signals, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise ValueError(
-                f"one measurement has {self._width} numbers; got {signals!r}"
-            ) from error
+        values = numbers("a measurement", signals, self.announced)
         if values.shape != (self._width,):
             raise ValueError(f"one measurement has {self._width} signals; got shape {values.shape}")
         if not max(map(abs, values.tolist())) < LARGEST:
             values = np.where(np.isinf(values), np.nan, np.clip(values, -LARGEST, LARGEST))
-        if rotation is None and gravity is not None:
+        if rotation is not None:
+            rotation = rotation_matrices("rotation", rotation)
+        elif gravity is not None:
             rotation = np.eye(3)
         if self._sensor is not None:
             stated = None if self._joint is None else self._joint.laboratory_gravity
@@ -311,7 +313,7 @@ class Estimator:
             values = values[self._order]
         if self._joint is not None:
             if rotation is not None:
-                self._joint = self._joint.turned(np.asarray(rotation, dtype=np.float64), gravity)
+                self._joint = self._joint.turned(rotation, gravity)
             values = self._joint.untared(values[None])[0]
         return self.readout.scaled(values)
 

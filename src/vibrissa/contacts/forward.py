@@ -32,7 +32,7 @@ from vibrissa.contacts.channels import (
 )
 from vibrissa.contacts.least_squares import Fits, fit
 from vibrissa.deferred import transform
-from vibrissa.numerics import AnyArray, Array
+from vibrissa.numerics import AnyArray, Array, relative
 from vibrissa.rod import (
     STEPS,
     Resting,
@@ -86,10 +86,16 @@ class Gravity:
     density_sigma: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("direction_sigma", "density_sigma"):
-            sigma = getattr(self, name)
-            if not 0.0 <= sigma < np.inf:
-                raise ValueError(f"{name} is a standard deviation, not negative; got {sigma!r}")
+        relative("density_sigma", self.density_sigma)
+        if not 0.0 <= self.direction_sigma <= np.pi:
+            raise ValueError(
+                f"direction_sigma is a standard deviation in rad, not negative, up to π; got "
+                f"{self.direction_sigma!r}"
+            )
+        for name in ("acceleration", "tare"):
+            value = getattr(self, name)
+            if value is not None and np.shape(value) != (3,):
+                raise ValueError(f"{name} is (x, y, z) in m/s²; got {value!r}")
 
     @property
     def uncertain(self) -> bool:

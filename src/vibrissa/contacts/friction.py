@@ -41,6 +41,9 @@ from vibrissa.contacts.posterior import NORMAL_KURTOSIS, ranked
 from vibrissa.numerics import AnyArray, Array, IntArray
 
 _UNKNOWNS = 4
+LARGEST_FRICTION = 3.0
+"""Largest ratio of forces along and across a whisker that friction is believed to have."""
+
 _LEAST = 0.01  # the least standard deviation of the prior; with less there is no friction
 # Arc lengths that curves are traced at, and about each peak so many more, so far, in standard
 # deviations of s.
@@ -380,8 +383,8 @@ def check_ratio(spread: float, sensor: SensorNoise | None) -> None:
     """Refuse a prior of friction that is none, or one without noise to weigh it against."""
     if sensor is None:
         raise ValueError("friction is weighed against the noise of the signals: give its noise")
-    if not _LEAST <= spread < np.inf:
+    if not _LEAST <= spread <= LARGEST_FRICTION:
         raise ValueError(
             "friction is the standard deviation of the force along the whisker over that across "
-            f"it, at least {_LEAST:g}, such as 0.3; got {spread!r}"
+            f"it, {_LEAST:g} to {LARGEST_FRICTION:g}, such as 0.3; got {spread!r}"
         )

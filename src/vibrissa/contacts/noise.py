@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.deferred import special, xr
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, relative
 from vibrissa.quantities import attributes
 from vibrissa.sensors import Sensor
 from vibrissa.signals import SIGNALS, wrench_derivatives
@@ -162,7 +162,7 @@ def common_errors(
 ) -> Array:
     """Errors that all measurements of force and moment share."""
     for name, sigma, shape in (("gain", gain_sigma, (6,)), ("mixing", mixing_sigma, (6, 6))):
-        given = np.asarray(sigma, dtype=np.float64)
+        given = relative(f"{name}_sigma", sigma) if np.size(sigma) <= 6 else np.asarray(sigma)
         if given.shape not in ((), shape) or not (np.isfinite(given) & (given >= 0.0)).all():
             raise ValueError(
                 f"{name}_sigma is one standard deviation ≥ 0, or has shape {shape}; got {sigma!r}"
@@ -173,10 +173,7 @@ def common_errors(
 
 def by_stiffness(mixing: Array, sigma: float) -> Array:
     """Error that the stiffness of the whisker makes in channels of force and moment."""
-    if not 0.0 <= sigma < np.inf:
-        raise ValueError(
-            f"the stiffness's relative standard deviation is not negative; got {sigma}"
-        )
+    relative("stiffness_sigma", sigma)
     out = np.zeros((1 if sigma > 0.0 else 0, len(mixing), 7))
     out[..., :6] = sigma * mixing
     return out

@@ -87,6 +87,8 @@ class Prior:
                 raise ValueError(f"{name} is between two numbers; got {limits!r}")
             if name != "theta" and not pair[0] < pair[1]:
                 raise ValueError(f"{name} has its least value first; got {limits!r}")
+            if name != "r" and (np.abs(pair[np.isfinite(pair)]) > _TURN).any():
+                raise ValueError(f"{name} is an angle in rad; got {limits!r}, as of degrees")
 
     def allows(
         self,

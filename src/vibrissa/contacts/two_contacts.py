@@ -26,14 +26,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.contacts.channels import WRENCH
+from vibrissa.contacts.friction import LARGEST_FRICTION
 from vibrissa.contacts.least_squares import Fits, fit
 from vibrissa.contacts.noise import Noise, SensorNoise, common_errors
-from vibrissa.contacts.wrench import PROXIMAL, estimate_components, wrench_weights
+from vibrissa.contacts.wrench import PROXIMAL, estimate_components, wrench_on, wrench_weights
 from vibrissa.deferred import special, xr
-from vibrissa.numerics import AnyArray, Array, IntArray
+from vibrissa.numerics import AnyArray, Array, IntArray, numbers
 from vibrissa.quantities import attributes
 from vibrissa.rod import Discretization, discretize
-from vibrissa.signals import labelled_wrench
 from vibrissa.whisker import Whisker
 
 #: Rate of false alarms.
@@ -237,12 +237,14 @@ def second_contact(
     ValueError
         If shapes do not fit, or a standard deviation is not positive.
     """
-    if not (0.0 <= friction < np.inf and 0.0 < false_alarms < 1.0):
+    if not (0.0 <= friction <= LARGEST_FRICTION and 0.0 < false_alarms < 1.0):
         raise ValueError(
-            "friction is a standard deviation, not negative, and false_alarms a share between 0 "
-            f"and 1; got {friction!r} and {false_alarms!r}"
+            f"friction is a standard deviation from 0 to {LARGEST_FRICTION:g}, and false_alarms a "
+            f"share between 0 and 1; got {friction!r} and {false_alarms!r}"
         )
-    f, m, dims, coords = labelled_wrench(force, moment)
+    if centerline is None and np.any(centerline_sigma):
+        raise ValueError("centerline_sigma is of a centerline, and none is given")
+    f, m, dims, coords = wrench_on(whisker, force, moment)
     errors = common_errors(stiffness_sigma, gain_sigma, mixing_sigma)
     sensor = SensorNoise.of(noise, WRENCH, errors)
     test = _Test(whisker, sensor, friction)
@@ -283,7 +285,7 @@ def _checked(
     line: ArrayLike, sigma: float | ArrayLike, shape: tuple[int, ...]
 ) -> tuple[Array, Array]:
     """Centrelines (n, j, 3) and standard deviations (j,)."""
-    points = np.asarray(line, dtype=np.float64)
+    points = numbers("centerline", line)
     if points.shape[:-2] != shape or points.shape[-1:] != (3,) or points.shape[-2] < 4:
         raise ValueError(
             f"centerline has shape {points.shape}; {(*shape, 'j', 3)} with four points or more is "

@@ -46,7 +46,7 @@ from vibrissa.contacts.posterior import CERTAIN, ranked
 from vibrissa.contacts.prior import Prior, possible_candidates, refuse_tip
 from vibrissa.contacts.valleys import Valleys, valleys
 from vibrissa.deferred import xr
-from vibrissa.numerics import AnyArray, Array, IntArray
+from vibrissa.numerics import AnyArray, Array, IntArray, numbers
 from vibrissa.rod import Discretization, discretize, solve_forces, vanishing_moments
 from vibrissa.signals import Coordinates, labelled_wrench, measured
 from vibrissa.status import Status
@@ -170,14 +170,19 @@ def estimate_from_wrench(
             "the whisker comes first: estimate_from_wrench(whisker, force, moment); got "
             f"{type(whisker).__name__}"
         )
-    labelled = labelled_wrench(force, moment)
-    _check_order(whisker, *labelled[:2])
-    return _located(whisker, labelled, noise, errors, prior, steps, compliance_sigma)
+    return _located(
+        whisker, wrench_on(whisker, force, moment), noise, errors, prior, steps, compliance_sigma
+    )
 
 
-def _check_order(whisker: Whisker, force: Array, moment: Array) -> None:
-    """Refuse moments that hardly any contact of the whisker could give their forces."""
-    size, turning = np.linalg.norm(force, axis=-1), np.linalg.norm(moment, axis=-1)
+def wrench_on(
+    whisker: Whisker, force: ArrayLike | xr.DataArray, moment: ArrayLike | xr.DataArray
+) -> tuple[Array, Array, tuple[str, ...], Coordinates]:
+    """Force and moment with their labels, unless hardly any contact could give both."""
+    given = {"force": force, "moment": moment}
+    plain = (v if isinstance(v, xr.DataArray) else numbers(n, v) for n, v in given.items())
+    labelled = labelled_wrench(*plain)
+    size, turning = (np.linalg.norm(vectors, axis=-1) for vectors in labelled[:2])
     known = (size > 0.0) & np.isfinite(turning)
     arm = float(np.min(turning[known] / size[known])) if known.any() else 0.0
     if arm > _LONGEST_ARM * whisker.length:
@@ -185,6 +190,7 @@ def _check_order(whisker: Whisker, force: Array, moment: Array) -> None:
             f"the moment is that of a force {arm:.3g} m from the base or farther, of a whisker of "
             f"{whisker.length:.3g} m: force, N, comes before moment, N·m"
         )
+    return labelled
 
 
 def estimate_components(
@@ -197,7 +203,7 @@ def estimate_components(
 ) -> Contacts:
     """Locate contacts from signals that have ``force`` and ``moment``, or the six components."""
     if "force" in signals and "moment" in signals:
-        labelled = labelled_wrench(signals["force"], signals["moment"])
+        labelled = wrench_on(whisker, signals["force"], signals["moment"])
     else:
         values, dims, coords = measured(signals, WRENCH)
         labelled = values[..., :3], values[..., 3:], dims, coords

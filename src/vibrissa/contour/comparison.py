@@ -17,7 +17,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from vibrissa.contour.fitted_shape import Body
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, numbers
 from vibrissa.quantities import QUANTITIES, attributes, to_display
 
 REPLICATES = 20  # number of draws of each distance
@@ -66,10 +66,12 @@ def compare_with(
     ValueError
         If shapes do not fit.
     """
-    p = np.asarray(points, dtype=np.float64)
+    p = numbers("points", points)
     if p.ndim != len(dims) + 1 or p.shape[-1] != 3:
         raise ValueError(f"points have shape {p.shape}; {(*dims, 3)} is needed")
-    radius = np.broadcast_to(np.asarray(whisker_radius, dtype=np.float64), p.shape[:-1])
+    radius = np.broadcast_to(numbers("whisker_radius", whisker_radius), p.shape[:-1])
+    if (radius < 0.0).any():
+        raise ValueError(f"whisker_radius is negative, {radius.min()} m")
     known = np.isfinite(p).all(axis=-1) & np.isfinite(radius)
     gap = np.full(p.shape[:-1], np.nan)
     gap[known] = body.signed_distance(p[known]) - radius[known]

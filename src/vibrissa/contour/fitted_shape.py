@@ -16,7 +16,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri
 
-from vibrissa.numerics import Array, Mask
+from vibrissa.numerics import Array, Mask, numbers
 from vibrissa.quantities import QUANTITIES, attributes
 
 # Smallest standard deviation, as a share of the points' extent, where their noise is zero.
@@ -96,7 +96,7 @@ def checked(
     }
     arrays, faults = {}, []
     for name, values in given.items():
-        arrays[name] = np.asarray(values, dtype=np.float64)
+        arrays[name] = numbers(name, values)
         shapes = allowed.get(name, [(n, 3, 3)])
         if arrays[name].shape not in shapes:
             wanted = " or ".join(map(str, shapes))
@@ -109,6 +109,8 @@ def checked(
         lacking = [other for other in others if other not in arrays]
         if name in arrays and lacking:
             faults.append(f"{name} is given without {' and '.join(lacking)}")
+    if (arrays["whisker_radius"] < 0.0).any():
+        faults.append(f"whisker_radius is negative, {arrays['whisker_radius'].min()} m")
     if faults:
         raise ValueError(f"no {what}: " + "; ".join(faults))
     arrays["whisker_radius"] = np.broadcast_to(arrays["whisker_radius"], (n,))
@@ -297,7 +299,7 @@ class FittedShape(ABC):
         array (...)
             Distances, m; negative inside.
         """
-        return self._distance(np.asarray(points, dtype=np.float64))
+        return self._distance(numbers("points", points))
 
     def outward_normals(self, points: ArrayLike) -> Array:
         """Outward normals of the surface nearest to points.
@@ -312,7 +314,7 @@ class FittedShape(ABC):
         array (..., 3)
             Unit vectors; NaN where there is none, as on the axis.
         """
-        normal = self._normals(np.asarray(points, dtype=np.float64))
+        normal = self._normals(numbers("points", points))
         return np.where(normal.any(axis=-1, keepdims=True), normal, np.nan)
 
     def distance_sigma(self, points: ArrayLike) -> Array:
@@ -328,7 +330,7 @@ class FittedShape(ABC):
         array (...)
             Standard deviation by the uncertainty of the parameters, m.
         """
-        return self._sigma(np.asarray(points, dtype=np.float64))
+        return self._sigma(numbers("points", points))
 
     def _sigma(self, points: Array) -> Array:
         """See `distance_sigma`."""

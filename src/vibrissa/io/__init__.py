@@ -92,6 +92,7 @@ from vibrissa.io.time_tables import (
     save_contour,
     save_predictors as save_predictors,
     save_signals,
+    time_notes as time_notes,
 )
 from vibrissa.io.tracks import (
     RawTracks as RawTracks,

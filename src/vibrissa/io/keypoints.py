@@ -581,6 +581,14 @@ def _checked(table: Mapping[str, Any]) -> dict[str, Any]:
     kind = table.get("projection", "perspective")
     if kind not in ("perspective", "orthographic"):
         raise ValueError(f"projection is {quoted(kind)}; perspective or orthographic is needed")
+    if table.get("fisheye"):
+        raise ValueError(
+            "fisheye is true; only lenses with radial and tangential distortion are known"
+        )
+    if float(np.linalg.norm(out["rotation"])) > 2.0 * np.pi:
+        raise ValueError(
+            f"rotation is {quoted(table['rotation'])}; a rotation vector, rad, is needed"
+        )
     width, height = out["size"]
     if not (width % 1.0 == height % 1.0 == 0.0 and min(width, height) >= 1.0):
         raise ValueError(f"size is {quoted(table['size'])}; whole numbers of pixels are needed")

@@ -284,6 +284,11 @@ def signal_columns(
         here = [i for i, (which, _) in enumerate(known) if which == name]
         here.sort(key=lambda i: header[i] != name)
         usable = [(i, factor) for i in here if (factor := known[i][1]) is not None]
+        exact = sum(header[i] == name for i, _ in usable)
+        # A clock in other units next to the time is usual, a second force is not.
+        if len(usable) > 1 and not (name == "time" and exact == 1):
+            columns = ", ".join(header[i] for i, _ in usable)
+            raise ValueError(f"{columns} are {len(usable)} columns of {name}; one is needed")
         if usable:
             found[name] = usable[0]
         elif here:

@@ -41,6 +41,7 @@ from vibrissa.io.netcdf import is_netcdf, naming, read_dataset
 from vibrissa.io.paths import CSV, check_writable, replacing
 from vibrissa.io.table import (
     Table,
+    in_file,
     is_number,
     read_rows,
     read_text,
@@ -87,7 +88,7 @@ def load_signals(path: str | PathLike[str]) -> xr.Dataset:
     """
     path = Path(path)
     table = _netcdf(path) if is_netcdf(path) else _csv(path)
-    notes = _notes(table[:, 0])
+    notes = time_notes(table[:, 0])
     if np.isnan(table[:, 0]).all():
         table[:, 0], notes = np.arange(len(table)), [NUMBERED]
     _check_time(path, table[:, 0])
@@ -96,7 +97,7 @@ def load_signals(path: str | PathLike[str]) -> xr.Dataset:
     return _dataset(table).assign_attrs(notes=notes)
 
 
-def _notes(time: Array) -> list[str]:
+def time_notes(time: Array) -> list[str]:
     """Note where time does not rise, as when trials stand one below the other."""
     known = np.flatnonzero(np.isfinite(time))
     step = np.diff(time[known])
@@ -186,7 +187,8 @@ def _csv(path: Path) -> Array:
 
 def _signal_places(path: Path, header: list[str]) -> tuple[list[int], Array]:
     """Find each column and its unit; all that is wrong with the header is one error."""
-    found, strange = signal_columns(header, COLUMNS)
+    with in_file(path):
+        found, strange = signal_columns(header, COLUMNS)
     missing = [name for name in COLUMNS[1:] if name not in found and name not in strange]
     faults = [f"it lacks {', '.join(missing)}"] if missing else []
     if strange:
@@ -203,9 +205,6 @@ def _signal_places(path: Path, header: list[str]) -> tuple[list[int], Array]:
             f"{', '.join(COLUMNS)} are needed, in SI units or with one as in Fx_mN"
         )
     places = [found[name] for name in COLUMNS if name in found]
-    twice = [header[place] for place, _ in places if header.count(header[place]) > 1]
-    if twice:
-        raise ValueError(f"{path} has the column {', '.join(twice)} more than once")
     return [place for place, _ in places], np.array([factor for _, factor in places])
 
 

@@ -7,10 +7,11 @@ quantiles each contact is counted by the volume that it stands for.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import reprlib
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,9 @@ IntArray: TypeAlias = NDArray[np.int64]
 Mask: TypeAlias = NDArray[np.bool_]
 AnyArray: TypeAlias = NDArray[Any]
 Vector: TypeAlias = tuple[float, float, float]
+
+SKEW = 1e-5
+"""Largest entry of RᵀR − 1 of a rotation R that was written with few digits."""
 
 
 def cross(a: Array, b: Array) -> Array:
@@ -42,6 +46,76 @@ def cross_matrix(a: Array) -> Array:
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -z, y, -x
     out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = z, -y, x
     return out
+
+
+def numbers(name: str, value: object, order: Sequence[str] = ("x", "y", "z")) -> Array:
+    """Return what a caller passed as float64; what is masked becomes NaN: it is missing.
+
+    A ``space`` dimension comes last. Columns, or labels of the last axis, that are called as those
+    of ``order`` are, such as Fx, Fy and Fz, must be in it: arrays know them by their position.
+    """
+    if type(value) is np.ndarray and value.dtype == np.float64:
+        return value
+    given: Any = value
+    if "space" in getattr(given, "dims", ()):
+        given = given.transpose(..., "space")
+    labels = [str(label) for label in _last_labels(given)]
+    found = [[label.lower().endswith(end.lower()) for end in order] for label in labels]
+    places = [one.index(True) for one in found if any(one)]
+    if len(labels) == len(set(places)) == len(order) and places != sorted(places):
+        raise ValueError(
+            f"{name} has columns {', '.join(labels)}; {', '.join(order)} are needed in this order"
+        )
+    try:
+        if np.asarray(given).dtype.kind not in "iufO":
+            raise TypeError
+        if isinstance(given, np.ma.MaskedArray):
+            given = np.ma.filled(given.astype(np.float64), np.nan)
+        return np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        of = getattr(given, "dtype", None)
+        kind = reprlib.repr(given) if of is None else f"{type(given).__name__} of {of}"
+        raise ValueError(f"{name} must be numbers; got {kind}") from error
+
+
+def _last_labels(value: Any) -> Iterable[object]:
+    if hasattr(value, "columns"):
+        return cast(Iterable[object], value.columns)
+    if hasattr(value, "index") and hasattr(value, "to_numpy"):  # one row of a table
+        return cast(Iterable[object], value.index)
+    last = (getattr(value, "dims", None) or (None,))[-1]
+    labelled = last in getattr(value, "coords", ())
+    return cast(Iterable[object], value.coords[last].values if labelled else ())
+
+
+def rotation_matrices(name: str, value: object) -> Array:
+    """Return rotation matrices (..., 3, 3) that a caller passed; NaN means missing."""
+    turn = numbers(name, value)
+    if turn.shape[-2:] != (3, 3):
+        raise ValueError(f"{name} is of rotation matrices, (..., 3, 3); got shape {turn.shape}")
+    one = turn.ndim == 2  # numbers of which take a third of the time of arrays
+    x, y, z = turn.tolist() if one else np.moveaxis(turn, (-2, -1), (0, 1))
+    skew = (
+        *(x[0] * x[0] + x[1] * x[1] + x[2] * x[2] - 1.0, x[1] * y[2] - x[2] * y[1] - z[0]),
+        *(x[2] * y[0] - x[0] * y[2] - z[1], x[0] * y[1] - x[1] * y[0] - z[2]),
+        *(y[1] * z[2] - y[2] * z[1] - x[0], y[2] * z[0] - y[0] * z[2] - x[1]),
+        y[0] * z[1] - y[1] * z[0] - x[2],
+    )
+    if (np.abs(skew) > SKEW).any():
+        raise ValueError(
+            f"{name} is not a rotation: its columns must be right-handed unit vectors at 90°"
+        )
+    return turn
+
+
+def relative(name: str, value: object) -> Array:
+    """Return relative standard deviations that a caller passed, which are not in per cent."""
+    sigma = numbers(name, value)
+    if not ((sigma >= 0.0) & (sigma <= 1.0)).all():
+        raise ValueError(
+            f"{name} is a relative standard deviation from 0 to 1 (5 % is 0.05); got {value!r}"
+        )
+    return sigma
 
 
 def spherical(points: Array) -> Array:

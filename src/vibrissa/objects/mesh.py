@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.deferred import ndimage
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, numbers
 from vibrissa.objects.surface import Surface
 
 Ints = NDArray[np.int64]
@@ -75,7 +75,7 @@ class Mesh(Surface):
 
     def __post_init__(self) -> None:
         """Check the mesh and make its signed distance."""
-        vertices = np.array(self.vertices, dtype=np.float64)
+        vertices = numbers("vertices", self.vertices).copy()
         faces = np.array(self.faces, dtype=np.int64)
         _check(vertices, faces, self.stiffness)
         if _volume(vertices, faces) < 0.0:

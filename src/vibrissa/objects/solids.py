@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.deferred import xr
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, numbers
 from vibrissa.objects.mesh import Mesh
 from vibrissa.objects.surface import Surface
 from vibrissa.quantities import attributes
@@ -31,7 +31,7 @@ class _Faults:
 
     def vector(self, name: str, value: Any, direction: bool = False) -> Array:
         """Three finite numbers, of length one if a direction; read-only."""
-        vector = np.array(value, dtype=np.float64)
+        vector = numbers(name, value).copy()
         if vector.shape != (3,) or not np.isfinite(vector).all():
             self._faults.append(f"{name} is {vector.tolist()}; three finite numbers are needed")
         elif direction:

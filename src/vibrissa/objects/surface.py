@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, numbers
 
 
 class Surface(ABC):
@@ -29,7 +29,7 @@ class Surface(ABC):
         array (...)
             Distances, m; negative inside.
         """
-        return self._distance(np.asarray(points, dtype=np.float64))
+        return self._distance(numbers("points", points))
 
     def local_geometry(self, point: ArrayLike) -> tuple[float, Array, Array]:
         """Signed distance from one point, with its derivatives.

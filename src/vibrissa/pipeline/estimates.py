@@ -5,6 +5,7 @@ They are transformed to the laboratory, where continuity decides between several
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -33,6 +34,7 @@ Progress = Callable[[str, int, int], None]
 WHOLE = "wrench"  # value of ``using`` for force and moment whole, instead of names of signals
 # Standard deviation of the normals of swept surfaces, rad: friction across the wire turns them.
 NORMAL_SIGMA = 0.1
+_OTHER = 0.01  # share by which the whisker of a map may differ from that of a recording
 _LABORATORY = {"reference_frame": "laboratory"}
 _SQUARE = ("time", "space", "space_2")
 
@@ -214,7 +216,34 @@ def _whiskers(
     for things in (given, maps):
         if things is not None and len(things) != count:
             raise ValueError(f"there are signals of {count} whiskers; {len(things)} are given")
+    known = Recording(recording).whiskers if maps and "whiskers" in recording.children else []
+    for one, own in zip(maps or (), known, strict=False):
+        if others := _differences(one.whisker, own):
+            warnings.warn(
+                f"the map is of another whisker than the recording's {own.name!r}: {others}",
+                UserWarning,
+                stacklevel=3,
+            )
     return given
+
+
+def _differences(whisker: Whisker, other: Whisker) -> str:
+    """State in what two whiskers differ by more than rounding; empty if they do not."""
+    pair, tips = (whisker, other), [one.centerline(2)[1] for one in (whisker, other)]
+    measures = {
+        "length": (1e3, "mm", [one.length for one in pair]),
+        "base radius": (1e6, "µm", [one.base_radius for one in pair]),
+        "tip radius": (1e6, "µm", [one.tip_radius for one in pair]),
+        "modulus": (1e-9, "GPa", [one.youngs_modulus for one in pair]),
+    }
+    found = [
+        f"{name} {scale * mine:.4g}, not {scale * theirs:.4g} {unit}"
+        for name, (scale, unit, (mine, theirs)) in measures.items()
+        if abs(mine - theirs) > _OTHER * max(mine, theirs)
+    ]
+    apart = float(np.linalg.norm(tips[0] - tips[1]))
+    found += [f"tip {1e3 * apart:.3g} mm away"] if apart > _OTHER * whisker.length else []
+    return ", ".join(found)
 
 
 def _one_whisker(

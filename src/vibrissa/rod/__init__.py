@@ -68,7 +68,7 @@ from vibrissa.rod.outward import (
 )
 from vibrissa.rod.points import PointSolver as PointSolver, point_solver as point_solver
 from vibrissa.rod.search import MOST_CELLS, MOST_SEEDS, cells_around as cells_around, seeds
-from vibrissa.rod.statics import deflect
+from vibrissa.rod.statics import check_objects as check_objects, deflect
 from vibrissa.rod.surfaces import (
     SurfaceDeflection as SurfaceDeflection,
     follow_surfaces as follow_surfaces,

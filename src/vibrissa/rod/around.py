@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.numerics import Array, IntArray, Mask
+from vibrissa.numerics import Array, IntArray, Mask, rotation_matrices
 from vibrissa.objects import Placement, Surface
 from vibrissa.rod.deflection import Deflection, vectors
 from vibrissa.rod.discretization import discretize
@@ -28,6 +28,7 @@ from vibrissa.rod.obstacles import (
     solve_at,
     strain_on,
 )
+from vibrissa.rod.statics import check_objects
 from vibrissa.rod.surfaces import Progress, SurfaceDeflection, follow_surfaces
 from vibrissa.status import Status
 
@@ -171,7 +172,7 @@ def deflect_around(
     array([ 53.3,  55.2, 100. ])
     """
     solids = _rigid(objects)
-    turn = np.eye(3) if base_rotation is None else vectors("base_rotation", base_rotation)
+    turn = np.eye(3) if base_rotation is None else rotation_matrices("base_rotation", base_rotation)
     move = np.zeros(3) if base_position is None else vectors("base_position", base_position)
     if turn.ndim < 2 or turn.shape[-2] != 3 or turn.ndim > 3 or move.ndim > 2:
         raise ValueError(
@@ -185,6 +186,7 @@ def deflect_around(
         raise ValueError(
             f"{len(turn)} rotations and {len(move)} positions of the base do not match"
         ) from error
+    check_objects(whisker, solids, move)
     found = follow_surfaces(whisker, solids, turn, move, progress=progress)
     return around(whisker, solids, turn, move, found)
 

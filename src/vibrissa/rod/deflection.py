@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.deferred import xr
-from vibrissa.numerics import Array, IntArray
+from vibrissa.numerics import Array, IntArray, numbers
 from vibrissa.quantities import attributes
 from vibrissa.rod.discretization import STEPS, discretize
 from vibrissa.rod.gravity import evaluated, resting, trace
@@ -39,21 +39,8 @@ def vectors(name: str, value: ArrayLike) -> Array:
 
 
 def _numbers(name: str, value: ArrayLike, vector: bool) -> Array:
-    """Return float64, (..., 3) for vectors; raise a ValueError that states what is wrong.
-
-    What is masked becomes NaN: it is missing.
-    """
-    kind = type(value).__name__
-    if hasattr(value, "dtype"):
-        kind += f" of {value.dtype}"
-    try:
-        if np.asarray(value).dtype.kind not in "iufO":
-            raise TypeError
-        if isinstance(value, np.ma.MaskedArray):
-            value = np.ma.filled(value.astype(np.float64), np.nan)
-        array = np.array(value, dtype=np.float64)  # a copy: the caller may go on using theirs
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{name} must be numbers; got {kind}") from error
+    """Return float64, (..., 3) for vectors; raise a ValueError that states what is wrong."""
+    array = numbers(name, value).copy()  # the caller may go on using theirs
     if vector and (array.ndim == 0 or array.shape[-1] != 3):
         raise ValueError(f"{name} must have shape (..., 3); got {array.shape}")
     if np.isinf(array).any():

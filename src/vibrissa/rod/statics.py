@@ -9,6 +9,7 @@ are too long. Where it shows, the steps are halved until that changes nothing.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -41,6 +42,7 @@ from vibrissa.rod.points import Solutions, point_solver
 from vibrissa.status import Status
 
 if TYPE_CHECKING:
+    from vibrissa.objects import Surface
     from vibrissa.whisker import Whisker
 
 _FARTHEST = 1e100  # lengths beyond this (over L) are as good as this: their squares would overflow
@@ -115,7 +117,12 @@ def deflect(
         )
     check_whisker(whisker)
     if isinstance(load, PointContact):
-        _check_reach(whisker, load)
+        away = np.abs(np.asarray(load.points, dtype=np.float64)).max(axis=-1)
+        check_reach(whisker, "contact points", away)
+    elif isinstance(load, PegContact):
+        with np.errstate(over="ignore", invalid="ignore"):
+            away = np.linalg.norm(np.cross(load.origin, load.axis), axis=-1) - load.radius
+        check_reach(whisker, "pegs", away)
     check_device(device)
     if device != "cpu" and (isinstance(load, PegContact) or gravity is not None):
         got = type(load).__name__ + (" with gravity" if gravity is not None else "")
@@ -146,15 +153,21 @@ def deflect(
     return replace(out, gravity=kept, _needed=needed)
 
 
-def _check_reach(whisker: Whisker, load: PointContact) -> None:
-    """Refuse contact points that are all as far away as millimetres given as metres."""
-    away = np.abs(np.asarray(load.points, dtype=np.float64)).max(axis=-1)
+def check_reach(whisker: Whisker, what: str, away: Array) -> None:
+    """Refuse what is all as far away from the base as millimetres given as metres."""
     away, far = away[np.isfinite(away)], _FAR_AWAY * whisker.length
     if away.size and (away > far).all() and (away < 20.0 * far).all():
         raise ValueError(
-            f"all contact points are {away.min() / whisker.length:.0f} lengths of the whisker from "
+            f"all {what} are {away.min() / whisker.length:.0f} lengths of the whisker from "
             "its base, or farther: these look like millimetres given as metres; multiply by 1e-3"
         )
+
+
+def check_objects(whisker: Whisker, objects: Sequence[Surface], positions: Array) -> None:
+    """Refuse objects that are all as far from the base as millimetres given as metres."""
+    if objects:
+        away = np.min([one.signed_distance(positions) for one in objects], axis=0)
+        check_reach(whisker, "objects", away)
 
 
 def _gravities(gravity: ArrayLike, load: Load) -> Array:

@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.deferred import optimize
-from vibrissa.numerics import Array, Mask, cross_matrix
+from vibrissa.numerics import Array, Mask, cross_matrix, numbers, rotation_matrices
 from vibrissa.rod import PointContact, deflect
 from vibrissa.sensors.frame import SensorFrame
 from vibrissa.sensors.regression import Solution, solve, warn_of_misfit, warn_of_surprise
@@ -108,7 +108,7 @@ def calibrate_mixing(
     ValueError
         If shapes do not fit or the wrenches do not separate the components.
     """
-    y, w = np.asarray(readings, dtype=np.float64), np.asarray(wrenches, dtype=np.float64)
+    y, w = numbers("readings", readings, channels or ()), numbers("wrenches", wrenches, components)
     if y.ndim != 2 or w.shape != (len(y), 6):
         raise ValueError(
             f"readings (n, k) and wrenches (n, 6) are needed; got {y.shape} and {w.shape}"
@@ -165,7 +165,7 @@ def _loaded(wrenches: Array) -> Array:
 
 def wrenches_of_contacts(whisker: Whisker, points: ArrayLike) -> Array:
     """Wrenches at the base of frictionless contacts at known points."""
-    contacts = np.asarray(points, dtype=np.float64)
+    contacts = numbers("points", points)
     if contacts.ndim != 2 or contacts.shape[1] != 3:
         raise ValueError(f"contact points are (n, 3), m; got {contacts.shape}")
     bent = deflect(whisker, PointContact(contacts))
@@ -211,6 +211,7 @@ def calibrate_on_contacts(
 
 _HEAVY = 5.0  # mass that no sensor of a whisker carries, kg
 _SURELY = 4.0  # standard deviations below zero at which a mass is not noise
+_IN_OTHER_UNITS = 300.0  # times as stiff as stated, from which units or radii are in question
 _IDLE = 1e-12  # share of the largest effect on a channel below which an unknown has none
 _POSES = (
     "hold the whisker free in more orientations, at least three that differ in how the weight pulls"
@@ -277,7 +278,7 @@ def calibrate_weight(
     UserWarning
         If residuals are more than five times the noise, or the mass is more than 5 kg.
     """
-    y = np.asarray(readings, dtype=np.float64)
+    y = numbers("readings", readings)
     k = len(sensor.channels)
     if y.ndim != 2 or y.shape[1] != k:
         raise ValueError(f"readings are (n, {k}): {', '.join(sensor.channels)}; got {y.shape}")
@@ -289,7 +290,7 @@ def calibrate_weight(
     noise = np.where(noise > 0.0, noise, np.median(noise[noise > 0.0]) if noise.any() else 1.0)
     if rotations is None:
         return _tared(sensor, y, noise)
-    turn = np.asarray(rotations, dtype=np.float64)
+    turn = rotation_matrices("rotations", rotations)
     if turn.shape != (n, 3, 3):
         raise ValueError(f"{n} readings need as many rotations (3, 3); got {turn.shape}")
     design = _design(sensor, turn[known], np.asarray(gravity, dtype=np.float64))
@@ -517,8 +518,8 @@ def fit_stiffness(
         deviations from what was known before.
     """
     sensor = sensor or Sensor()
-    y = np.asarray(readings, dtype=np.float64)
-    contacts = np.asarray(points, dtype=np.float64)
+    y = numbers("readings", readings)
+    contacts = numbers("points", points)
     if y.shape != (len(contacts), len(sensor.channels)):
         raise ValueError(f"readings are ({len(contacts)}, {len(sensor.channels)}); got {y.shape}")
     if modulus_sigma < 0.0 or radius_sigma < 0.0 or np.isinf([modulus_sigma, radius_sigma]).all():
@@ -563,6 +564,7 @@ def fit_stiffness(
             "the contacts do not determine the taper: touch the whisker nearer to the tip as well"
         )
     sigma = float(np.sqrt(spread[0, 0]))
+    _warn_of_units(factor)
     shift, covariance = _separated(np.log(factor), sigma, modulus_sigma, radius_sigma)
     modulus = whisker.youngs_modulus * float(np.exp(shift[0]))
     growth = float(np.exp(shift[1]))
@@ -584,6 +586,17 @@ def fit_stiffness(
         base_stiffness=held,
         compliance_sigma=float(np.sqrt(spread[-1, -1])) / held if base else 0.0,
     )
+
+
+def _warn_of_units(factor: float) -> None:
+    """Warn of a stiffness that is so many times what the whisker was stated to have."""
+    if not 1.0 / _IN_OTHER_UNITS < factor < _IN_OTHER_UNITS:
+        warnings.warn(
+            f"the stiffness is {factor:.3g} times that of the whisker as it was stated: are the "
+            "readings in N and N·m, and the whisker's radius right?",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
 def _on_spring(whisker: Whisker, spring: float | None) -> Whisker:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.deferred import optimize, transform
-from vibrissa.numerics import Array, cross_matrix
+from vibrissa.numerics import Array, cross_matrix, numbers
 from vibrissa.sensors.regression import solve, warn_of_misfit
 
 _ORTHOGONAL = 1e-3  # stretch up to which axes, typed with few digits, are brought to right angles
@@ -194,7 +194,7 @@ def calibrate_frame(
     UserWarning
         If residuals are more than five times the noise.
     """
-    read, true = np.asarray(readings, dtype=np.float64), np.asarray(wrenches, dtype=np.float64)
+    read, true = numbers("readings", readings), numbers("wrenches", wrenches)
     if read.ndim != 2 or read.shape[1:] != (6,) or read.shape != true.shape:
         raise ValueError(f"readings and wrenches (n, 6) are needed; got {read.shape}, {true.shape}")
     if not (force_noise > 0.0 and moment_noise > 0.0):

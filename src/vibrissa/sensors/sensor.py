@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, numbers, rotation_matrices
 from vibrissa.sensors.frame import SensorFrame
 
 FORCE_NOISE = 1e-6
@@ -146,6 +146,9 @@ class Sensor:
             )
         elif not (np.isfinite(error) & (error >= 0.0)).all():
             faults.append(f"mixing_error is {error.tolist()}; it must be finite and not negative")
+        for name in ("relative_noise", "gain_error", *(["mixing_error"] if not error.ndim else [])):
+            if np.any(np.asarray(getattr(self, name), dtype=np.float64) > 1.0):
+                faults.append(f"{name} is {getattr(self, name)!r}; it is a share: 5 % is 0.05")
         for name in ("relative_noise", "mass"):
             number = getattr(self, name)
             if not (np.isfinite(number) and number >= 0.0):
@@ -243,8 +246,7 @@ class Sensor:
         array (..., 6)
             Wrench (F, M), whisker's frame, N and N·m.
         """
-        turned = np.asarray(rotation, dtype=np.float64)
-        g = np.asarray(gravity, dtype=np.float64) @ turned
+        g = numbers("gravity", gravity) @ rotation_matrices("rotation", rotation)
         return np.concatenate([self.mass * g, np.cross(self.mass_moment, g)], axis=-1)
 
     def compensated(
@@ -275,7 +277,7 @@ class Sensor:
         ValueError
             If there are not as many channels, or the orientation is not known but needed.
         """
-        values = np.asarray(readings, dtype=np.float64)
+        values = numbers("readings", readings, self.channels)
         if values.shape[-1:] != (len(self.channels),):
             raise ValueError(
                 f"readings of {', '.join(self.channels)} have a last axis of "
@@ -365,7 +367,7 @@ class Sensor:
             If shapes do not fit, time falls or is not finite, or the orientation is not known but
             needed.
         """
-        at, true = np.asarray(time, dtype=np.float64), np.asarray(wrench, dtype=np.float64)
+        at, true = numbers("time", time), numbers("wrench", wrench, COMPONENTS)
         if at.ndim != 1 or true.shape != (at.size, 6):
             raise ValueError(
                 f"times (n,) and wrenches (n, 6) are needed; got {at.shape} and {true.shape}"

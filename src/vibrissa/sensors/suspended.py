@@ -41,7 +41,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded, solveh_banded
 
 from vibrissa.deferred import sparse_linalg, transform
-from vibrissa.numerics import AnyArray, Array, cross_matrix
+from vibrissa.numerics import AnyArray, Array, cross_matrix, numbers, rotation_matrices
 from vibrissa.rod import discretize, solve_forces
 from vibrissa.sensors.regression import ThinPlate
 from vibrissa.status import Status
@@ -216,7 +216,7 @@ class SuspendedWhisker:
             `Status` of each: ``OK``, or ``BEYOND_FOLD`` where there is no equilibrium with this
             friction.
         """
-        target = np.asarray(points, dtype=np.float64) / self.length
+        target = numbers("points", points) / self.length
         if start is None:
             contacts, miss = self._from_rest(target)
         else:
@@ -411,9 +411,9 @@ def follow_sweep(
     ValueError
         If shapes do not fit.
     """
-    y, base = np.asarray(readings, dtype=np.float64), np.asarray(position, dtype=np.float64)
+    y, base = numbers("readings", readings, sensor.channels), numbers("position", position)
     k = len(sensor.channels)
-    turn = np.eye(3) if rotation is None else np.asarray(rotation, dtype=np.float64)
+    turn = np.eye(3) if rotation is None else rotation_matrices("rotation", rotation)
     if y.ndim != 2 or y.shape[1] != k or base.shape != (len(y), 3) or turn.shape[-2:] != (3, 3):
         raise ValueError(
             f"readings (n, {k}), positions (n, 3) and rotations (3, 3) or (n, 3, 3) are needed; "

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.deferred import interpolate, transform
-from vibrissa.numerics import AnyArray, Array
+from vibrissa.numerics import AnyArray, Array, numbers
 from vibrissa.rod import discretize
 from vibrissa.sensors.regression import ThinPlate
 from vibrissa.sensors.suspended import SuspendedWhisker, Touches
@@ -152,7 +152,7 @@ def calibrate_suspension(
     ValueError
         If shapes do not fit, or there are too few touches or no signal.
     """
-    p, y = np.asarray(points, dtype=np.float64), np.asarray(readings, dtype=np.float64)
+    p, y = numbers("points", points), numbers("readings", readings, channels or ())
     if p.ndim != 2 or p.shape[1] != 3 or y.ndim != 2 or len(y) != len(p):
         raise ValueError(
             f"points (n, 3) and readings (n, k) are needed; got {p.shape} and {y.shape}"

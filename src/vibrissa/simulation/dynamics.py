@@ -51,6 +51,8 @@ DENSITY = (1220.0, 1632.0)
 DAMPING_RATIO = 0.14
 # Time that a whisker whose rest is inside an object is held still at first, to settle, s.
 _SETTLE = 0.06
+_MOST_DAMPED = 2.0  # ratio above which per cent were meant
+_LIGHTEST = 10.0  # density of a foam, kg/m³
 _AT_ONCE = 4096  # number of steps whose placements are computed together
 _EAGER = 8  # rounds with the full derivative of friction, before its secant
 _MOST_TURNED = 0.3  # largest turn of a joint in one round, rad
@@ -91,7 +93,7 @@ class Dynamics:
 
     def __post_init__(self) -> None:
         numbers = {
-            "density": min(self.density),
+            "density": min(self.density) if np.shape(self.density) == (2,) else np.nan,
             "segments": self.segments - 3,
             "step": self.step,
             "contact_stiffness": self.contact_stiffness,
@@ -102,8 +104,13 @@ class Dynamics:
             for name, value in numbers.items()
             if not (np.isfinite(value) and value > 0.0)
         ]
-        if not (np.isfinite(self.damping_ratio) and self.damping_ratio >= 0.0):
-            faults.append(f"damping_ratio is {self.damping_ratio!r}; it must not be negative")
+        if not 0.0 <= self.damping_ratio <= _MOST_DAMPED:
+            faults.append(
+                f"damping_ratio is {self.damping_ratio!r}; 0 to {_MOST_DAMPED:g} (14 % is 0.14)"
+            )
+        # Of what is positive; a density in g/cm³ is a thousandth.
+        if not faults and min(self.density) < _LIGHTEST:
+            faults.append(f"density is {self.density!r}; it is in kg/m³: 1 g/cm³ is 1000")
         if faults:
             raise ValueError("no dynamics: " + "; ".join(faults))
 
@@ -124,8 +131,6 @@ def move_dynamically(
     progress: Progress | None = None,
 ) -> list[Moment]:
     """Move a whisker among objects."""
-    if not (np.isfinite(friction) and friction >= 0.0):
-        raise ValueError(f"friction is {friction!r}; a coefficient from 0 on is needed")
     chain = Chain.of(whisker, dynamics.density, dynamics.segments)
     frame = float(np.diff(motion.time).min())
     parts = int(np.ceil(frame / dynamics.step * (1.0 - 1e-9)))

@@ -36,7 +36,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.deferred import interpolate
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, numbers
 from vibrissa.objects import Box, Peg, Plane, Sphere, Surface
 from vibrissa.rod import follow_surfaces
 from vibrissa.status import Status
@@ -99,12 +99,15 @@ class Motion:
         for name in ("time", "azimuth", "elevation", "roll", *shapes):
             if getattr(self, name) is None and name.startswith("head"):
                 continue
-            values = np.asarray(getattr(self, name), dtype=np.float64)
+            values = numbers(name, getattr(self, name))
             shape = shapes.get(name, (n,))
             if values.shape != shape:
                 faults.append(f"{name} has shape {values.shape}; {shape} is needed")
             elif not np.isfinite(values).all():
                 faults.append(f"{name} has values that are not finite")
+            elif len(shape) == 1 and name != "time" and (np.abs(values) > 2.0 * np.pi).any():
+                largest = np.abs(values).max()
+                faults.append(f"{name} is an angle in rad; got {largest:g}, as of degrees")
             object.__setattr__(self, name, values)
         if not faults and (np.diff(self.time) <= 0.0).any():
             faults.append("time does not rise")
@@ -140,7 +143,7 @@ class Motion:
         if self.head_rotation is not None:
             raise ValueError("the head moves already: a motion goes on a head once")
         n = len(self)
-        turn = np.array(np.broadcast_to(np.asarray(rotation, dtype=np.float64), (n, 3, 3)))
+        turn = np.array(np.broadcast_to(numbers("rotation", rotation), (n, 3, 3)))
         shift = np.array(np.broadcast_to(np.asarray(position, dtype=np.float64), (n, 3)))
         off = np.abs(np.swapaxes(turn, 1, 2) @ turn - np.eye(3)).max()
         if not off <= ORTHOGONALITY or (np.linalg.det(turn) < 0.0).any():
@@ -290,11 +293,11 @@ def tabulated(
     >>> len(tabulated([0.0, 0.05, 0.1], [0.0, 0.5, 0.0], rate=500.0))
     51
     """
-    rows = np.asarray(time, dtype=np.float64)
+    rows = numbers("time", time)
     angles = {"azimuth": azimuth, "elevation": elevation, "roll": roll}
     values = {}
     for name, column in angles.items():
-        column = np.asarray(column, dtype=np.float64)
+        column = numbers(name, column)
         values[name] = np.full(rows.shape, column) if column.ndim == 0 else column
     place = np.asarray(base_position, dtype=np.float64)
     values["base_position"] = np.tile(place, (rows.size, 1)) if place.shape == (3,) else place

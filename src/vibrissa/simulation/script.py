@@ -156,6 +156,8 @@ def read_script(
         sensor = {k: v for k, v in sensor.items() if k in ("channels", "mixing")}
         sensor |= {"force_noise": 0.0, "moment_noise": 0.0}
     seed = int(one_number(table, "seed", 0.0))
+    if moves.get("kind") == "table" and "duration" in table:
+        raise ValueError("duration is stated, and a motion of kind table has its own")
     usual = 3.5 if isinstance(whisker, Whisker) else 0.5
     duration, rate = one_number(table, "duration", usual), one_number(table, "rate", 1000.0)
     if not 0.0 < duration * rate <= _MOST_FRAMES:
@@ -207,8 +209,11 @@ def _array(table: Mapping[str, Any], given: Mapping[str, Any], folder: Path) -> 
     check_keys(table, {"file", "side", "rows", "columns", "whiskers"}, "[array]")
     choice: dict[str, Any] = {"side": str(given.get("side", table.get("side", "both")))}
     names = given.get("whiskers", table.get("whiskers"))
+    by_place = {key: table[key] for key in ("rows", "columns") if key in table}
+    if by_place and "whiskers" in table:
+        raise ValueError(f"[array] has whiskers, and {', '.join(by_place)} instead; give one")
     if names is None:
-        choice |= {key: table[key] for key in ("rows", "columns") if key in table}
+        choice |= by_place
     else:
         choice["names"] = [names] if isinstance(names, str) else names
     file = str(given.get("array", folder / str(table["file"]) if "file" in table else "average"))
@@ -379,7 +384,7 @@ def _tabulated(table: Mapping[str, Any], folder: Path, rate: float) -> Motion:
 def head_of(table: Mapping[str, Any], folder: Path, time: Array) -> tuple[Array, Array]:
     """Motion of the head."""
     ends = {"position", "angles", "to_position", "to_angles"}
-    check_keys(table, {*ends, "file"}, "[head]")
+    check_keys(table, {"file"} if "file" in table else ends, "[head]")
     if "file" not in table:
         poses = {name: three_numbers(table, name) for name in ends if name in table}
         units = {name: np.radians(1.0) if name.endswith("angles") else MM for name in poses}

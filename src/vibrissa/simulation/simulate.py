@@ -31,12 +31,14 @@ import xarray as xr
 from vibrissa.numerics import Array
 from vibrissa.objects import Surface
 from vibrissa.recording import Recording, coordinates, recorded, recording_tree
-from vibrissa.rod import SurfaceDeflection, around, follow_surfaces
+from vibrissa.rod import SurfaceDeflection, around, check_objects, follow_surfaces
 from vibrissa.sensors import COMPONENTS, FORCE_NOISE, MOMENT_NOISE, Sensor
 from vibrissa.simulation.dynamics import Dynamics, Moment, move_dynamically
 from vibrissa.simulation.motion import Motion
 from vibrissa.status import Status
 from vibrissa.whisker import Whisker
+
+_ROUGHEST = 5.0  # coefficient of friction above which degrees were meant
 
 NODES = 33  # number of points of the recorded centrelines
 
@@ -94,6 +96,12 @@ def simulate(
     """
     pairs = _pairs(whisker, motion)
     solids = list(objects) if isinstance(objects, Sequence) else [objects]
+    if not 0.0 <= friction <= _ROUGHEST:
+        raise ValueError(
+            f"friction is {friction!r}; a coefficient from 0 to {_ROUGHEST:g} is needed"
+        )
+    for one, moves in pairs:
+        check_objects(one, solids, moves.base_position)
     touch = "frictionless" if friction == 0.0 else f"friction {friction:g}"
     how = "quasi-static"
     if dynamics is not None:

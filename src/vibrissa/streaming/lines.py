@@ -39,7 +39,7 @@ from vibrissa.io import (
     signal_columns,
     with_point,
 )
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, rotation_matrices
 from vibrissa.signals import SIGNALS
 
 POSITION = ("base_x", "base_y", "base_z")  # columns with the position of the base
@@ -341,7 +341,7 @@ class Poses:
     def __init__(
         self, rotation: ArrayLike | None = None, position: ArrayLike | None = None
     ) -> None:
-        self._turn = np.eye(3) if rotation is None else np.asarray(rotation, dtype=np.float64)
+        self._turn = np.eye(3) if rotation is None else rotation_matrices("rotation", rotation)
         self._place = np.zeros(3) if position is None else np.asarray(position, dtype=np.float64)
         if self._turn.shape != (3, 3) or self._place.shape != (3,):
             raise ValueError(

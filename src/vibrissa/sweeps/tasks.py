@@ -253,7 +253,7 @@ def _sets(settings: Settings) -> list[str]:
 
 def _several(settings: Settings, name: str) -> Sequence[Any]:
     value = settings[name]
-    if isinstance(value, str) or not value or len(set(value)) < len(value):
+    if not isinstance(value, list | tuple) or not value or len(set(value)) < len(value):
         raise ValueError(f"{name} is {value!r}; a list without repetitions is needed")
     return tuple(value)
 
@@ -294,7 +294,8 @@ def _check_number(settings: Settings, name: str, least: float, most: float = np.
 
 # Least and largest values of numbers.
 _BOUNDS = {
-    **dict.fromkeys(("cone", "minutes", "force_noise", "moment_noise"), (0.0, np.inf)),
+    **dict.fromkeys(("minutes", "force_noise", "moment_noise"), (0.0, np.inf)),
+    "cone": (0.0, 89.0),
     "samples": (16, _MOST),
     "contacts": (1, _MOST),
 }

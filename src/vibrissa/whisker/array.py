@@ -348,6 +348,11 @@ def whisker_array(
     """
     if names is not None:
         identities = [Identity.of(name) for name in names]
+        away = [one.name for one in identities if one.side not in (None, *sides(side))]
+        if away:
+            raise ValueError(f"{', '.join(away)} are not on the {side} side, which is asked for")
+        if set(rows) != set("ABCDE") or set(columns) != set(range(7)):
+            raise ValueError("names are given, and rows or columns instead; give one")
         wanted = [
             one.on(s) for one in identities for s in ((one.side,) if one.side else sides(side))
         ]

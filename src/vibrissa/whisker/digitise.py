@@ -48,7 +48,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.deferred import interpolate, linalg, special
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, numbers
 from vibrissa.whisker.pose import Pose, least_turn
 from vibrissa.whisker.profile import Path, Profile, approximate, constant
 from vibrissa.whisker.section import LONGEST, length_faults
@@ -56,6 +56,9 @@ from vibrissa.whisker.section import LONGEST, length_faults
 ROUNDS = 12  # times at most that points are projected and fitted again
 GROUPS = 24  # points of the first guess; more are averaged in groups
 SIGNIFICANCE = 0.01  # chance that straight noise passes for curvature
+SCATTERED = 0.1
+"""Largest noise that may be stated, in extents of the points."""
+
 # Difference of a hint's distances to both ends, in lengths, below which it is ambiguous.
 HINT_MARGIN = 0.1
 
@@ -113,7 +116,7 @@ def checked_points(
     points: ArrayLike, noise: float | None = None, any_length: bool = False
 ) -> Array:
     """Return points as (n, 3), m, or raise a ValueError that names every fault."""
-    array = np.asarray(points, dtype=np.float64)
+    array = numbers("points", points)
     if array.ndim != 2 or array.shape[1] not in (2, 3):
         raise ValueError(f"points have shape {array.shape}; (n, 3) or (n, 2) is needed")
     faults = []
@@ -135,6 +138,11 @@ def checked_points(
             faults += ["all points are one: " + fault for fault in length_faults(extent)]
         elif extent > LONGEST:
             faults += length_faults(extent, any_length)
+        if noise is not None and 0.0 < SCATTERED * extent < noise:
+            faults.append(
+                f"noise is {noise:.4g} m, of points that extend over {extent:.4g} m: it is the "
+                "standard deviation of a coordinate in m"
+            )
     if faults:
         raise ValueError("no whisker in these points: " + "; ".join(faults))
     return array if array.shape[1] == 3 else np.column_stack([array, np.zeros(len(array))])
@@ -161,7 +169,8 @@ def _starts_at_tip(points: Array, base: str | ArrayLike | None) -> bool:
             f'base is {base!r}; "first", "last" or a finite point (3,) near the base is allowed'
         )
     first, last = (float(np.linalg.norm(points[end] - hint)) for end in (0, -1))
-    if abs(first - last) < HINT_MARGIN * np.linalg.norm(points[-1] - points[0]):
+    apart = np.linalg.norm(points[-1] - points[0])
+    if abs(first - last) < HINT_MARGIN * apart or min(first, last) > apart:
         raise ValueError(
             f"base is {hint.tolist()} m, which is {first:.4g} m from the first point and "
             f"{last:.4g} m from the last: it does not tell them apart; give a nearer point, "

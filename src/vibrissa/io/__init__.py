@@ -62,6 +62,7 @@ from vibrissa.io.rosbag import (
 from vibrissa.io.table import (
     cells_of as cells_of,
     check_keys as check_keys,
+    check_one_column_each as check_one_column_each,
     delimiter_of as delimiter_of,
     in_file as in_file,
     is_number as is_number,

@@ -273,6 +273,16 @@ def units_of(kind: str) -> str:
     return ", ".join(_UNITS[kind])
 
 
+def check_one_column_each(header: Sequence[str], names: Sequence[str]) -> None:
+    """Refuse two columns of one signal; with a dot in their names they are of other whiskers."""
+    known = {cell: signal_column(cell) for cell in header if "." not in cell}
+    for name in names:
+        here = [c for c in header if known.get(c, ("", None))[0] == name and known[c][1]]
+        # A clock in other units next to the time is usual, a second force is not.
+        if len(here) > 1 and not (name == "time" and here.count(name) == 1):
+            raise ValueError(f"{', '.join(here)} are {len(here)} columns of {name}; one is needed")
+
+
 def signal_columns(
     header: Sequence[str], names: Sequence[str]
 ) -> tuple[dict[str, tuple[int, float]], dict[str, list[str]]]:
@@ -284,11 +294,6 @@ def signal_columns(
         here = [i for i, (which, _) in enumerate(known) if which == name]
         here.sort(key=lambda i: header[i] != name)
         usable = [(i, factor) for i in here if (factor := known[i][1]) is not None]
-        exact = sum(header[i] == name for i, _ in usable)
-        # A clock in other units next to the time is usual, a second force is not.
-        if len(usable) > 1 and not (name == "time" and exact == 1):
-            columns = ", ".join(header[i] for i, _ in usable)
-            raise ValueError(f"{columns} are {len(usable)} columns of {name}; one is needed")
         if usable:
             found[name] = usable[0]
         elif here:

@@ -41,6 +41,7 @@ from vibrissa.io.netcdf import is_netcdf, naming, read_dataset
 from vibrissa.io.paths import CSV, check_writable, replacing
 from vibrissa.io.table import (
     Table,
+    check_one_column_each,
     in_file,
     is_number,
     read_rows,
@@ -188,7 +189,8 @@ def _csv(path: Path) -> Array:
 def _signal_places(path: Path, header: list[str]) -> tuple[list[int], Array]:
     """Find each column and its unit; all that is wrong with the header is one error."""
     with in_file(path):
-        found, strange = signal_columns(header, COLUMNS)
+        check_one_column_each(header, COLUMNS)
+    found, strange = signal_columns(header, COLUMNS)
     missing = [name for name in COLUMNS[1:] if name not in found and name not in strange]
     faults = [f"it lacks {', '.join(missing)}"] if missing else []
     if strange:

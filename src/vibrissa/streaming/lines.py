@@ -32,6 +32,7 @@ from numpy.typing import ArrayLike
 from vibrissa.deferred import transform
 from vibrissa.io import (
     cells_of,
+    check_one_column_each,
     delimiter_of,
     is_number,
     number,
@@ -192,6 +193,8 @@ class Lines:
         twice = {cell for cell, name in zip(cells, names, strict=True) if name in used}
         if twice := {cell for cell in twice if cells.count(cell) > 1}:
             raise ValueError(f"{lacks} has {', '.join(sorted(twice))} more than once")
+        if not self.raw:
+            check_one_column_each(cells, [name for name in _SIGNALS if name in used])
         self._header, self._factors, self._delimiter = names, factors, delimiter
         self._refused = 0
         self.headers += 1

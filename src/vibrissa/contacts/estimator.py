@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -239,7 +240,7 @@ class Estimator:
         """Signals that contacts are found from, in canonical order; none of a mix of components."""
         return self.readout.names if isinstance(self.readout, Named) else ()
 
-    @property
+    @cached_property
     def announced(self) -> tuple[str, ...]:
         """Names of the numbers of one measurement, in their order."""
         if self._sensor is not None:

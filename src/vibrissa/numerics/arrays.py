@@ -54,9 +54,14 @@ def numbers(name: str, value: object, order: Sequence[str] = ("x", "y", "z")) ->
     A ``space`` dimension comes last. Columns, or labels of the last axis, that are called as those
     of ``order`` are, such as Fx, Fy and Fz, must be in it: arrays know them by their position.
     """
-    if type(value) is np.ndarray and value.dtype == np.float64:
-        return value
     given: Any = value
+    if type(given) in (np.ndarray, list, tuple):  # most are, and one measurement is to be quick
+        try:
+            plain = np.asarray(given)
+        except ValueError:
+            plain = np.empty(0, dtype=object)
+        if plain.dtype.kind in "fiu":
+            return plain.astype(np.float64, copy=False)
     if "space" in getattr(given, "dims", ()):
         given = given.transpose(..., "space")
     labels = [str(label) for label in _last_labels(given)]

@@ -452,3 +452,9 @@ def test_nothing_outside_the_cone(curved):
 def test_three_signals_in_a_row_are_one_triplet(straight):
     flat = vb.uniqueness(straight, ("Fx", "MB", "MD"), ["all"], resolution=False, samples=64)
     assert flat.triplet.to_numpy().tolist() == ["Fx MB MD"]
+
+
+def test_few_samples_that_all_resemble_others_are_counted(gamma_map):
+    """The first moves of the signals find another contact for each, and leave none to the rest."""
+    found = vb.uniqueness(gamma_map, ["FD Mx MB"], ["all"], samples=16)
+    assert (found.ambiguous_share.values[..., -1] == 1.0).all()

@@ -532,6 +532,8 @@ def _ambiguous(
             break
         for moves in _MOVES:
             asked = active[(belongs & ~twinned & ~out[t])[:, active].any(axis=0)]
+            if not asked.size:
+                break
             targets = signals[asked][:, None] + TOLERANCES[t] * span * moves
             found = invert(
                 contact_map.chart, contact_map.tree(names), names, targets.reshape(-1, 3)

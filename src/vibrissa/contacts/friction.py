@@ -350,7 +350,7 @@ def or_without(found: Candidates, without: Candidates, sigma: float) -> Candidat
     away = np.linalg.norm(found.values[row, :, 3:6] - values0[:, None, 3:6], axis=2)
     place = np.where(np.isfinite(away), away, np.inf).argmin(axis=1)
     out = found._replace(**{name: getattr(found, name).copy() for name in found._fields})
-    angle = np.arctan(ratio_of(out.x[row, place]))
+    angle = friction_angle(out.x[row, place])
     turned = out.angle_sigma[row, place]
     share = out.probability[row, place]
     odds = share * sigma / turned * np.exp(-0.5 * (angle / turned) ** 2)

@@ -14,6 +14,8 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 # on the spot, would only take the cores from each other. They are counted when NumPy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# Tests start many interpreters, workers too; each would compile the package's sources anew.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import numpy as np
 import pytest
@@ -45,6 +47,7 @@ _FIRST = [
     "contour",
     "io",
     "rod",
+    "contacts/test_following.py",
     "report",
     "demo",
     "viewer/test_page.py",

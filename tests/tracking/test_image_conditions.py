@@ -2,9 +2,18 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from vibrissa.simulation import ImageConditions, film_frames
-from vibrissa.tracking import Trace, TraceOptions, TraceSeries, find_start, is_bright, trace_video
+from vibrissa.tracking import (
+    Trace,
+    TraceOptions,
+    TraceSeries,
+    find_start,
+    is_bright,
+    trace_video,
+    track,
+)
 from vibrissa.tracking.refine.least_squares import trace_variance
 from vibrissa.tracking.space.frame_pairs import better_offset
 from vibrissa.tracking.space.rest_shape import (
@@ -220,7 +229,7 @@ def test_parts_of_a_whisker_are_trusted_as_far_as_their_residuals_allow():
 
 def test_frames_that_the_rod_does_not_explain_are_noted(filmed):
     nothing = np.full((20, 2, 101, 2), np.nan)
-    numbers = (np.zeros((20, *shape)) for shape in ((2,), (2, 2), (2,)))
+    numbers = (np.zeros((20, *shape)) for shape in ((2,), (2, 2), (2,), (2, 4)))
     series = TraceSeries(nothing, *[nothing[..., 0]] * 2, *numbers)
     misfit = np.where(np.arange(20) < 3, 5.0, 0.3)
     length = Length(10e-3, 0.0)
@@ -247,3 +256,47 @@ def test_a_base_that_begins_elsewhere_for_a_while_is_no_offset(filmed):
         shape = np.full(5, 0.1), np.ones(5, dtype=bool)
         rows.append([Trace(line, *shape, 1.0, tip_seen=False) for line in lines])
     assert not better_offset(*filmed.cameras, *rows, 0).size
+
+
+@pytest.fixture(scope="module")
+def shaken(filmed):
+    """Traces of the trial by cameras that shake, each by itself, and by how much they do."""
+    shifts = 0.3 * np.random.default_rng(1).normal(size=(2, len(filmed.frames[0]), 2))
+    rows = []
+    for frames, shift in zip(filmed.frames, shifts, strict=True):
+        moved = [
+            ndimage.shift(frame.astype(float), d[::-1], mode="nearest").clip(0, 255).astype("uint8")
+            for frame, d in zip(frames, shift, strict=True)
+        ]
+        rows.append(trace_video(moved))
+    return rows, shifts
+
+
+def test_a_camera_that_shakes_is_held_still(filmed, traced, shaken):
+    """The front view's only still edge is upright: what shifts it along that is not known."""
+    (top,), (front,) = shaken[0]
+    away = np.array([trace.shift for trace in top])[:, :2] - shaken[1][0]
+    assert np.sqrt((away**2).mean(axis=0)).max() < 0.06
+    assert max(top[0].shift[2:]) < 0.1
+    assert front[0].shift[2] < 0.1 < 0.2 < front[0].shift[3]
+    off = [np.median(filmed.errors(one.line, i, 0)[0]) for i, one in enumerate(top)]
+    assert np.median(off) < 0.06 < 0.1 < np.median(np.abs(shaken[1]))
+    assert not any(any(trace.shift[:2]) for (row,) in traced for trace in row)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_what_is_not_known_of_shaking_is_in_covariances(filmed, shaken, known):
+    traces = shaken[0]
+    if not known:
+        nothing = (0.0, 0.0, np.nan, np.nan)
+        traces = [traces[0], [[trace._replace(shift=nothing) for trace in traces[1][0]]]]
+    found = track(filmed.cameras, traces, 1000.0)
+    assert "top shakes by 0.2" in found.attrs["remarks"]
+    assert ("front shakes by 0.3" in found.attrs["remarks"]) is known
+    assert ("nothing shows whether front shakes" in found.attrs["remarks"]) is not known
+    away = found["contact_point"].values[:, 0] - filmed.truth["contact_point"].values
+    spread = found["contact_covariance"].values[:, 0]
+    rows = np.isfinite(away).all(axis=1) & np.isfinite(spread).all(axis=(1, 2))
+    chi = np.einsum("ti,tij,tj->t", away[rows], np.linalg.inv(spread[rows]), away[rows])
+    assert rows.sum() > 15
+    assert (chi < 7.8).mean() > 0.85

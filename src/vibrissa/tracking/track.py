@@ -185,6 +185,7 @@ def track(
         optics, cameras, doubts = _corrected(cameras, timed, pairs, options.distance)
     moving = None if head is None else HeadPose.of(head, pairs[:, 0], rate)
     found, remarks = [], doubts + _remarks_on_time(cameras, timed, options.offset)
+    remarks += _remarks_on_shaking(cameras, timed)
     if len(cameras) == 1:
         remarks.append(ONE_VIEW)
     count = counts.pop()
@@ -199,6 +200,7 @@ def track(
                 one = replace(one, contacts=other)
             elif objects:
                 one = replace(one, contacts=contacts_at(objects, one.curves, one.touching, one.fit))
+            one = replace(one, fit=_with_shift_unsure(cameras, one.fit, one.traces.shift))
             if optics is not None:
                 one = replace(one, fit=_with_optics_unsure(one.fit, optics))
                 remarks += _remarks_on_optics(one, optics, name)
@@ -262,6 +264,47 @@ def _with_optics_unsure(fit: RodFit, optics: Optics) -> RodFit:
         shared=np.append(fit.shared, np.moveaxis(shared, 0, 1), axis=1),
         pose_covariance=pose,
     )
+
+
+def _with_shift_unsure(cameras: Sequence[Camera], fit: RodFit, shift: Array) -> RodFit:
+    """Add to the covariances of points what is not known of how far cameras had shaken."""
+    seen = np.ptp(shift[..., :2], axis=0).any(axis=1)
+    # One of which nothing is known may shake as much as one that does.
+    size = float(shift[:, seen, :2].std(axis=0).max(initial=0.0))
+    variance = np.nan_to_num(shift[..., 2:], nan=size).reshape(len(shift), -1) ** 2
+    if not variance.any():
+        return fit
+
+    def spread(points: Array) -> Array:
+        known = np.isfinite(points)
+        slopes = [camera.project_with_slopes(np.where(known, points, 0.0))[1] for camera in cameras]
+        back = np.linalg.pinv(np.concatenate(slopes, axis=1))
+        return np.asarray(np.einsum("tij,tj,tkj->tik", back, variance, back))
+
+    pose = fit.pose_covariance.copy()
+    pose[:, :3, :3] += spread(fit.position)
+    contact = fit.contact_covariance + spread(fit.contact_point)
+    return replace(fit, contact_covariance=contact, pose_covariance=pose)
+
+
+def _remarks_on_shaking(cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]]) -> list[str]:
+    """State which cameras shake, and how well that is known."""
+    shifts = [np.array([trace.shift for trace in row]) for row in traces]
+    found = []
+    for camera, shift in zip(cameras, shifts, strict=True):
+        size, left = shift[:, :2].std(axis=0), shift[:, 2:].mean(axis=0)
+        if size.any():
+            found.append(
+                f"{camera.name} shakes by {size[0]:.2f} pixels along columns and {size[1]:.2f} "
+                "along rows (standard deviations), as what never moves in its images shows; traces "
+                f"are moved back by that, which is known to {left[0]:.2f} and {left[1]:.2f} pixels."
+            )
+        elif np.isnan(left).any() and any(other[:, :2].any() for other in shifts):
+            found.append(
+                f"nothing shows whether {camera.name} shakes, too: it is taken to do so as much as "
+                "the other, in the covariances only."
+            )
+    return found
 
 
 def _remarks_on_optics(one: Tracked, optics: Optics, name: str) -> list[str]:

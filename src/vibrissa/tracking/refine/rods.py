@@ -39,6 +39,7 @@ class TraceSeries:
     confidence: Array  # (time, view), between 0 and 1
     ends: Array  # (time, view, 2): 1 where the whisker is seen to begin and to end there, else 0
     skew: Array  # (time, view): third cumulant of its darkness across it, pixels³
+    shift: Array  # (time, view, 4): by how much a shaking camera moved the image; see `Trace`
 
     @classmethod
     def of(cls, traces: Sequence[Sequence[Trace]]) -> TraceSeries:
@@ -46,10 +47,11 @@ class TraceSeries:
         shape = (len(traces[0]), len(traces), NODES)
         line, sigma, seen = np.full((*shape, 2), np.nan), np.full(shape, np.nan), np.zeros(shape)
         confidence, ends = np.zeros(shape[:2]), np.zeros((*shape[:2], 2))
-        skew = np.full(shape[:2], np.nan)
+        skew, shift = np.full(shape[:2], np.nan), np.zeros((*shape[:2], 4))
         for view, row in enumerate(traces):
             for i, trace in enumerate(row):
                 n = len(trace.line)
+                shift[i, view] = trace.shift
                 if n < 2:
                     continue
                 columns = np.column_stack([trace.line, trace.sigma, trace.seen])
@@ -61,7 +63,7 @@ class TraceSeries:
                 )
                 confidence[i, view], skew[i, view] = trace.confidence, trace.skew
                 ends[i, view] = trace.base_seen, trace.tip_seen
-        return cls(line, sigma, seen, confidence, ends, skew)
+        return cls(line, sigma, seen, confidence, ends, skew, shift)
 
     def rows(self, frames: NDArray[np.intp]) -> TraceSeries:
         """Select frames."""

@@ -81,6 +81,10 @@ class Trace(NamedTuple):
         base to tip: 0 if light is the same on both of its flanks. NaN if that is not known.
     sparse : bool
         Whether it is a line between few points, of which residuals do not show all errors.
+    shift : tuple of 4 float
+        Shift of the image along columns and rows by a camera that shakes, which is taken out of
+        the line, and the standard deviations of what is left of both, pixels; NaN if nothing
+        shows whether it shakes.
     """
 
     line: Array
@@ -91,6 +95,7 @@ class Trace(NamedTuple):
     tip_seen: bool = True
     skew: float = np.nan
     sparse: bool = False
+    shift: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
     @classmethod
     def lost(cls) -> Trace:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain, islice
 from os import PathLike
@@ -32,6 +32,7 @@ from vibrissa.tracking.trace.neighbours import neighbours
 from vibrissa.tracking.trace.row import follow_row
 from vibrissa.tracking.trace.scene import Scene
 from vibrissa.tracking.trace.start import FRAMES, is_bright, negative
+from vibrissa.tracking.trace.steady import Steady
 from vibrissa.tracking.trace.trace import Trace, TraceOptions, given, overlap
 
 # Points (n, 2) along a whisker from base to tip, column and row, by frame and whisker.
@@ -41,6 +42,7 @@ _AGREES = 0.9  # share of a line along another one from which both are the same
 # Factor of the jump of a single whisker before grey fur, where its base is less certain.
 _FAINT = 2.4
 _LOOKED = 9  # number of frames after the first in which neighbours are searched
+_STEADY = (0.0, 0.0, 0.0, 0.0)  # shift of a camera that does not shake
 _SPAN = 400  # number of frames at the beginning of a film from which those for its start are taken
 
 
@@ -111,10 +113,13 @@ def trace_video(
     bright, shape = is_bright(first[:1], [bases], options), first[0].shape
     start = negative(first[0]) if bright else first[0]
     followers = _begun(start, bases, begun if done else (), options)
-    begins = [follower.base for follower in followers] if bases is None else bases
-    starts = np.array(begins, dtype=np.float64)
+    starts = np.array([f.base for f in followers] if bases is None else bases, dtype=np.float64)
     alike = [negative(f) if bright else f for f in sample if f.shape == shape]
     scene = Scene.of(alike, options.scale, mask).with_still(starts, alike)
+    steady, shifts = Steady.of(scene, alike), []
+    if steady is not None and steady.at.size:
+        alike = [steady.moved_back(f)[0] for f in alike]
+        scene = Scene.of(alike, options.scale, mask).with_still(starts, alike)
     (still,) = between_whiskers([None], scene.bits, start.shape)
     for follower in followers:
         follower.clutter = still.still_only
@@ -131,19 +136,17 @@ def trace_video(
         for base in neighbours(clear, starts, scene, options):
             followers.append(replace(start_at(base, options), clutter=still.still_only))
             starts = np.concatenate([starts, base[None]])
-    for i, frame in enumerate(chain(first, source)):
-        if frame.shape != shape:
-            raise ValueError(
-                f"frame {i} has {frame.shape[1]} × {frame.shape[0]} pixels and those before it "
-                f"{shape[1]} × {shape[0]}: a video is needed whose frames are of one size"
-            )
-        frame = scene.without_still(negative(frame) if bright else frame)
+    for i, frame in enumerate(_of_one_size(chain(first, source))):
+        frame = negative(frame) if bright else frame
+        frame, shift = steady.moved_back(frame) if steady is not None else (frame, _STEADY)
+        shifts.append(shift)
+        frame = scene.without_still(frame)
         if i < done:
             recent.append(frame)
             if len(followers) > 1:
                 seen.append(_seen_before(frame, [row[i] for row in traces], followers))
             continue
-        known = {k: points for (j, k), points in corrections.items() if j == i}
+        known = {k: np.asarray(at) - shift[:2] for (j, k), at in corrections.items() if j == i}
         found = follow_all(followers, frame, known, seen, scene)
         for trace, row in zip(found, traces, strict=False):
             row.append(trace)
@@ -157,7 +160,22 @@ def trace_video(
         for i, way in enumerate(decided(seen, starts)):
             for row, c in zip(traces, way, strict=False):
                 row[i] = seen[i].lines[c] if c >= 0 else Trace.lost()
+    for row in traces if steady is not None else ():
+        row[:] = [t._replace(shift=shift) for t, shift in zip(row, shifts, strict=True)]
     return traces
+
+
+def _of_one_size(frames: Iterable[Frame]) -> Iterator[Frame]:
+    """The same frames, which must not differ in size."""
+    shape: tuple[int, ...] = ()
+    for i, frame in enumerate(frames):
+        shape = shape or frame.shape
+        if frame.shape != shape:
+            raise ValueError(
+                f"frame {i} has {frame.shape[1]} × {frame.shape[0]} pixels and those before it "
+                f"{shape[1]} × {shape[0]}: a video is needed whose frames are of one size"
+            )
+        yield frame
 
 
 def _begun(
@@ -368,7 +386,7 @@ def trace_file(
     finally:
         if kept and kept[0]:
             done = min(len(row) for row in kept)
-            save_traces(partial, key, [[(*t,) for t in row[:done]] for row in kept])
+            save_traces(partial, key, [[t[:8] for t in row[:done]] for row in kept])
     total = len(traces[0])
     report(total)
     return traces

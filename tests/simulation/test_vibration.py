@@ -66,11 +66,14 @@ def test_whisking_in_air_is_predicted(whisker, in_air):
         assert np.median(left) < 0.1 * np.median(np.linalg.norm(known, axis=1))
 
 
-def test_contact_is_distinguished_from_inertia_with_a_wrong_mass(whisker, past_peg):
+@pytest.mark.parametrize("assumed", [1.0, 1.3])
+def test_contact_is_distinguished_from_inertia_with_a_wrong_mass(whisker, past_peg, assumed):
     trial = past_peg
     touching = trial["truth"].to_dataset().isel(whisker=0).in_contact.values.astype(bool)
     time, wrench, rotation, position = measured(trial)
-    found = Vibration.of(whisker).in_contact(time, wrench, rotation, position, NOISE)
+    dynamics = Dynamics(density=tuple(assumed * value for value in Dynamics().density))
+    vibration = Vibration.of(whisker, dynamics)
+    found = vibration.in_contact(time, wrench, rotation, position, NOISE)
     bare = np.hypot(wrench[:, 4], wrench[:, 5]) > 5.0 * 2e-8
     assert np.mean(bare[~touching]) > 0.3
     # A contact that begins or ends between two frames may be called either in both.

@@ -26,7 +26,9 @@ of each mode of free vibration, in units of the noise of the moment that they ma
 by which the wrench in air is wrong, as the mass is. So what decides is the covariance of what is
 left of the wrench: the sensor's noise, the state's own, and shares of the vibration that linear
 modes do not explain, which grow with the deflection. A hypothesis that is young knows its state
-badly, and explains the more.
+badly, and explains the more. A wrong mass or stiffness makes all frequencies wrong by one factor,
+and with it the phase of every vibration ever more; the factor is that by which all frames are most
+probable, in steps of 10 %.
 
 In contact the wrench changes from frame to frame by what is usual for it, with long tails: a
 Student distribution about the last frame, as wide as the noise and the change before. A contact
@@ -381,6 +383,8 @@ _CHANNELS = [0, 1, 2, 4, 5]
 _FORCES, _MOMENTS = slice(1, 3), slice(3, 5)  # channels across the whisker
 _RATE = 3.0  # onsets, and releases, per second
 _MASS = 0.2  # relative standard deviation of the mass
+# Logarithms of factors of the frequencies: step, standard deviation, and most steps.
+_STEP, _FREQUENCY, _FARTHEST = 0.1, 0.1, 4
 _TURN = 0.12  # relative error of frequencies: share of a vibration that is unknown after a radian
 # Share of the vibration that linear modes leave across the whisker, and its share along it.
 _MODELLED, _AXIAL = 0.15, 0.4
@@ -537,11 +541,31 @@ def _touching(measured: Array, correlation: Array) -> tuple[Array, Array]:
 
 
 def contact_probability(modes: Modes, step: float, left: Array, air: Array, noise: Array) -> Array:
-    """Probability (n,) that a whisker is in contact, by all frames.
+    """Probability (n,) that a whisker is in contact, by all frames, which also show frequencies.
 
     The wrench (n, 6) minus that in air and the latter, its noise (6, 6), SI units, and the time
     between frames.
     """
+
+    def tried(number: int) -> tuple[float, Array]:
+        factor = np.exp(_STEP * number)
+        now = modes._replace(rates=factor * modes.rates, loss=factor * modes.loss)
+        log, probability = _switching(now, step, left, air, noise)
+        return log - 0.5 * (_STEP * number / _FREQUENCY) ** 2, probability
+
+    best, number = tried(0), 0
+    for way in (1, -1):
+        while abs(number + way) <= _FARTHEST and (other := tried(number + way))[0] > best[0]:
+            best, number = other, number + way
+        if number:
+            break
+    return best[1]
+
+
+def _switching(
+    modes: Modes, step: float, left: Array, air: Array, noise: Array
+) -> tuple[float, Array]:
+    """Log likelihood of all frames, and the probability (n,) of contact in each."""
     model = _Model.of(modes, step, noise, np.abs(left).max(axis=0))
     measured, driven = (part[:, _CHANNELS] / model.noise for part in (left, air))
     contact, onset = _touching(measured, model.correlation)
@@ -576,4 +600,4 @@ def contact_probability(modes: Modes, step: float, left: Array, air: Array, nois
         ahead = np.logaddexp(still, touched)
         later = np.logaddexp(stay + contact[frame + 1] + later, released)
         log[frame] += later
-    return np.asarray(np.exp(np.minimum(log, 0.0)))
+    return float(whole), np.asarray(np.exp(np.minimum(log, 0.0)))

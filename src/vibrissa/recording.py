@@ -19,6 +19,8 @@ estimates. Units and long names are those of :mod:`vibrissa.quantities`.
 
 from __future__ import annotations
 
+import re
+import sys
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -146,6 +148,24 @@ _SELECTED = frozenset({"time", "whisker", "view"})
 # Dimensions that go by another name, where a dataset has two of a kind.
 _ALSO_CALLED = MappingProxyType({"true_node": "node", "space_2": "space_"})
 _NUMBERS = "fiub"
+# Labels of dimensions whose values are read by position.
+_LABELS = MappingProxyType(
+    {
+        "space": ["x", "y", "z"],
+        "whisker_axis": ["x", "y", "z"],
+        "head_axis": ["x", "y", "z"],
+        "image_axis": ["column", "row"],
+    }
+)
+# Other names of units.
+_UNITS = MappingProxyType(
+    dict.fromkeys(("meter", "meters", "metre", "metres"), "m")
+    | dict.fromkeys(("sec", "second", "seconds"), "s")
+    | dict.fromkeys(("newton", "newtons"), "N")
+    | dict.fromkeys(("radian", "radians"), "rad")
+    | dict.fromkeys(("px", "pixels"), "pixel")
+)
+_OF = "recorded_as"  # attribute of a whisker's group: its label along the dimension ``whisker``
 
 
 def recorded(name: str, values: ArrayLike) -> xr.Variable:
@@ -181,8 +201,28 @@ def coordinates(time: ArrayLike, names: Sequence[str]) -> dict[Hashable, Any]:
 
 def faults_in(data: xr.Dataset) -> list[str]:
     """List what is wrong with the variables of a recording or of one of its groups."""
-    faults = (_fault(name, data[name].variable, frozenset()) for name in VARIABLES if name in data)
+    known = {name: data[name].variable for name in VARIABLES if name in data}
+    faults = [_fault(name, variable, frozenset()) for name, variable in known.items()]
+    faults += [_unit_fault(name, variable) for name, variable in known.items()]
+    for dim, labels in _LABELS.items():
+        got = data[dim].values.tolist() if dim in data.coords else labels
+        if got != labels:
+            faults.append(f"{dim} is {', '.join(map(str, got))}; {', '.join(labels)} is needed")
     return [fault for fault in faults if fault]
+
+
+def _unit_fault(name: str, variable: xr.Variable) -> str:
+    """State that a variable is in another unit than declared, as where it was converted."""
+    wanted = attributes(name.removeprefix("unfiltered_"))["units"]
+    got = str(variable.attrs.get("units", ""))
+    if not got or wanted == "1" or _plain_unit(got) == _plain_unit(wanted):
+        return ""
+    return f"{name} is in {got}; {wanted} is needed"
+
+
+def _plain_unit(text: str) -> str:
+    """A unit without what is between its parts."""
+    return re.sub(r"[\s·⋅*.^]", "", _UNITS.get(text.strip(), text))
 
 
 def ordered(name: str, variable: xr.Variable) -> NDArray[Any]:
@@ -326,6 +366,11 @@ class Group:
         return (self.whisker(k) for k in range(self.data.sizes.get("whisker", 1)))
 
 
+def _number(key: str) -> tuple[int, str]:
+    """Order of groups that are called by their numbers."""
+    return (int(key), "") if key.isdecimal() else (sys.maxsize, key)
+
+
 @dataclass(frozen=True, eq=False)
 class Recording:
     """All that is known of a trial.
@@ -414,13 +459,33 @@ class Recording:
         ValueError
             If the recording carries no such whisker.
         """
-        whiskers = self.tree.children.get("whiskers")
-        if whiskers is None or str(index) not in whiskers.children:
-            count = 0 if whiskers is None else len(whiskers.children)
+        groups = self._whisker_groups()
+        if not 0 <= index < len(groups):
             raise ValueError(
-                f"whisker {index} was asked for; the recording carries {count} of them"
+                f"whisker {index} was asked for; the recording carries {len(groups)} of them"
             )
-        return Whisker.from_dataset(whiskers.children[str(index)].to_dataset(inherit=False))
+        return Whisker.from_dataset(groups[index].to_dataset(inherit=False))
+
+    def _whisker_groups(self) -> list[xr.DataTree]:
+        """Groups of the whiskers along the dimension ``whisker``: by label, which selection keeps.
+
+        Where no group has a label of that dimension, as when all were renamed, they are in order.
+        """
+        whiskers = self.tree.children.get("whiskers")
+        children = {} if whiskers is None else whiskers.children
+        groups = [children[key] for key in sorted(children, key=_number)]
+        labels = [str(one.attrs.get(_OF, one.attrs.get("name", ""))) for one in groups]
+        names = self.names if "whisker" in self.tree.coords else []
+        if not groups or labels == names:
+            return groups
+        if len(set(labels)) == len(labels) and set(names) and set(names) <= set(labels):
+            return [groups[labels.index(name)] for name in names]
+        if len(groups) != self.tree.sizes.get("whisker") or set(names) & set(labels):
+            raise ValueError(
+                f"the whiskers are called {', '.join(names) or 'nothing'}; the recording carries "
+                f"the shapes of {', '.join(labels)}"
+            )
+        return groups
 
     @property
     def whiskers(self) -> list[Whisker]:
@@ -468,9 +533,10 @@ def recording_tree(
     tree |= {f"/{name}": data for name, data in (groups or {}).items()}
     if cameras:
         tree["/cameras"] = cameras_dataset(cameras).drop_vars("view")
-    for i, whisker in enumerate(whiskers):
+    for i, (whisker, label) in enumerate(zip(whiskers, root["whisker"].values, strict=True)):
         # Its centreline is for readers of lone whisker files, and its nodes are others than ours.
-        tree[f"/whiskers/{i}"] = whisker.to_dataset().drop_dims("node")
+        own = whisker.to_dataset().drop_dims("node")
+        tree[f"/whiskers/{i}"] = own.assign_attrs({_OF: str(label)})
     if objects is not None:
         tree["/objects"] = xr.Dataset(attrs={"reference_frame": "laboratory"})
         # The coordinates of the root are seen from below.

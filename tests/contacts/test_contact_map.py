@@ -139,3 +139,9 @@ def test_cells_about_measurements_hold_the_contacts_that_noise_has_moved(gamma_m
         apart[:, 1] = (apart[:, 1] + np.pi) % (2.0 * np.pi) - np.pi
         assert (np.abs(apart) <= cell + 1e-9).all(axis=1).any()
         assert (away[:n] <= 1.0).all()
+
+
+@pytest.mark.parametrize("cells", [8, (8, 16), None, (8.0, 16.0, 8.0), (8, 0, 8)])
+def test_cells_are_three_whole_numbers(cells):
+    with pytest.raises(ValueError, match="three whole numbers"):
+        vb.ContactMap.simulate(vb.samples.gamma(), grid=False, cells=cells)

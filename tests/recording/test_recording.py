@@ -3,10 +3,21 @@
 import numpy as np
 import pytest
 import xarray as xr
+from typer.testing import CliRunner
 
+import vibrissa as vb
 from vibrissa import samples
+from vibrissa.cli.app import app
 from vibrissa.quantities import attributes
-from vibrissa.recording import VARIABLES, Group, Recording, faults_in, recorded
+from vibrissa.recording import (
+    VARIABLES,
+    Group,
+    Recording,
+    coordinates,
+    faults_in,
+    recorded,
+    recording_tree,
+)
 from vibrissa.simulation import facing_peg, measure, simulate, whisking
 
 WHISKER = samples.gamma()
@@ -96,3 +107,62 @@ def test_whiskers_and_objects_come_back(trial):
     assert len(recording.pegs) == len(recording.objects) == 1
     known = recording.known("contact_point", ("estimates", "", "truth"))
     np.testing.assert_array_equal(known, recording["truth"]["contact_point"])
+
+
+def _two_whiskers():
+    """A recording of two whiskers of different length, without contacts."""
+    time = np.arange(3.0)
+    shapes = [vb.Whisker.straight(length, name=name) for length, name in ((0.03, "a"), (0.04, "b"))]
+    still = np.tile(np.eye(3), (3, 2, 1, 1))
+    values = {"base_position": np.zeros((3, 2, 3)), "base_rotation": still}
+    root = xr.Dataset(
+        {name: recorded(name, array) for name, array in values.items()},
+        coordinates(time, ["a", "b"]),
+    )
+    return recording_tree(root, shapes, "made by hand")
+
+
+@pytest.mark.parametrize("kept", [[1], [1, 0]])
+def test_selected_whiskers_keep_their_shapes(kept, tmp_path):
+    """Groups are of no dimension, so that selection along ``whisker`` leaves them as they are."""
+    part = _two_whiskers().isel(whisker=kept)
+    vb.io.save_recording(tmp_path / "part.nc", part)
+    for tree in (part, vb.load_recording(tmp_path / "part.nc")):
+        found = Recording(tree)
+        assert [one.name for one in found.whiskers] == found.names
+
+
+def test_renamed_whiskers_are_in_order_and_other_labels_are_refused():
+    tree = _two_whiskers()
+    tree.dataset = tree.to_dataset().assign_coords(whisker=["c", "d"])
+    assert [one.name for one in Recording(tree).whiskers] == ["a", "b"]
+    with pytest.raises(ValueError, match="carries the shapes of a, b"):
+        _ = Recording(tree.isel(whisker=[1])).whiskers
+
+
+@pytest.mark.parametrize(
+    ("edit", "fault"),
+    [
+        (
+            lambda d: d.assign(base_position=d["base_position"].assign_attrs(units="mm")),
+            "base_position is in mm; m is",
+        ),
+        (
+            lambda d: d.assign_coords(time=d["time"].assign_attrs(units="ms")),
+            "time is in ms; s is needed",
+        ),
+        (lambda d: d.isel(space=[1, 2, 0]), "space is y, z, x; x, y, z is needed"),
+        (lambda d: d.assign_coords(whisker=["a", "a"]), "share a name"),
+        (lambda d: d.assign_coords(time=d["time"].values.astype("M8[ns]")), "numbers are needed"),
+    ],
+)
+def test_what_was_edited_by_hand_is_refused(edit, fault):
+    data = edit(_two_whiskers().to_dataset())
+    with pytest.raises(ValueError, match=fault):
+        vb.pipeline.check_recording(xr.DataTree(data))
+
+
+def test_info_states_what_is_wrong(tmp_path):
+    vb.io.save_recording(tmp_path / "back.nc", _two_whiskers().isel(time=slice(None, None, -1)))
+    done = CliRunner().invoke(app, ["info", str(tmp_path / "back.nc")])
+    assert "time does not rise" in str(done.exception)

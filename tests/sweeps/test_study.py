@@ -156,3 +156,11 @@ def test_a_cell_is_the_same_in_any_study_that_has_it():
 def test_what_is_wrong_is_told_with_what_is_allowed(text, message):
     with pytest.raises(ValueError, match=message):
         read_study(text, Path())
+
+
+def test_several_radii_of_files_are_refused(tmp_path):
+    """Only a grid combines values: the first alone would be used."""
+    (tmp_path / "one.csv").write_text("x,y,z\n0,0,0\n")
+    text = "[[whiskers]]\nkind='files'\nfiles='*.csv'\nbase_radius=[50, 100]\n[[tasks]]\nkind='map'"
+    with pytest.raises(ValueError, match="one number"):
+        read_study(text, tmp_path)

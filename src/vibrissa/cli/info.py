@@ -140,7 +140,9 @@ def _file(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
 def _recording(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
     """Describe a recording in five lines: contents, assumptions, and what comes next."""
     with vb.io.naming(path, "a recording"):
-        found = vb.pipeline.summarise(_summarised(path))
+        tree = _summarised(path)
+        vb.pipeline.check_recording(tree)
+        found = vb.pipeline.summarise(tree)
     one = len(found.whiskers) == 1
     names = ", ".join(found.whiskers[:_SHOWN]) + (", …" if len(found.whiskers) > _SHOWN else "")
     yield (
@@ -193,7 +195,8 @@ def _summarised(path: Path) -> xr.DataTree:
         groups = [name for name in ("truth", "signals", "estimates", "contour") if name in file]
         objects = [f"objects/{name}" for name in file["objects"]] if "objects" in file else []
     needed = ["in_contact", "force", "moment", *vb.pipeline.EVENTS]
-    parts = {"/": vb.io.read_dataset(path, None, needed)}
+    pose = ["time", "whisker", "base_position", "base_rotation"]
+    parts = {"/": vb.io.read_dataset(path, None, [*pose, *needed])}
     for group in (*groups, *objects):
         along = needed if group in ("truth", "signals", "estimates") else None
         parts[f"/{group}"] = vb.io.read_dataset(path, group, along)

@@ -140,7 +140,11 @@ class ContactMap:
             The map.
         """
         check_whisker(whisker)
-        chart = stable_set(whisker, proximal=proximal, cells=cells, steps=steps)
+        numbers = np.asarray(cells)
+        if numbers.shape != (3,) or numbers.dtype.kind != "i" or (numbers < 1).any():
+            raise ValueError(f"cells is {cells!r}; three whole numbers from 1 are needed")
+        along, around, loads = numbers.tolist()
+        chart = stable_set(whisker, proximal=proximal, cells=(along, around, loads), steps=steps)
         solved = _solve_grid(whisker, proximal, steps, progress) if grid else None
         return cls(whisker, chart, steps, solved)
 

@@ -51,13 +51,27 @@ def check_recording(recording: xr.DataTree) -> None:
         away = np.abs(np.swapaxes(known, -2, -1) @ known - np.eye(3)).max(initial=0.0)
         if away > _SKEW or (np.linalg.det(known) < 0.0).any():
             faults.append("base_rotation is not a rotation in some frames")
+    faults += _label_faults(root)
     time = np.asarray(root["time"].values)
     if time.size == 0 or root.sizes["whisker"] == 0:
         faults.append(f"it has {time.size} frames of {root.sizes['whisker']} whiskers")
-    elif time.dtype.kind not in "fiu" or not np.isfinite(time).all() or (np.diff(time) <= 0).any():
+    elif time.dtype.kind not in "fiu":
+        faults.append(f"its time is {time.dtype}; numbers are needed, in seconds")
+    elif not np.isfinite(time).all() or (np.diff(time) <= 0).any():
         faults.append("its time does not rise from frame to frame, or is missing in some")
     if faults:
         raise ValueError(f"the recording cannot be used: {'; '.join(faults)}")
+
+
+def _label_faults(root: xr.Dataset) -> list[str]:
+    """List what is wrong with the labels of frames and whiskers."""
+    faults = []
+    if (unit := str(root["time"].attrs.get("units", "s"))) not in ("s", "sec", "seconds", ""):
+        faults.append(f"time is in {unit}; s is needed")
+    names = [str(name) for name in root["whisker"].values]
+    if len(set(names)) < len(names):
+        faults.append(f"whiskers share a name: {', '.join(names)}")
+    return faults
 
 
 def names_of(data: xr.Dataset) -> str:

@@ -332,6 +332,9 @@ def _files(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iter
     if not paths:
         raise ValueError(f"no file is called {path}")
     prefix = str(stated.get("prefix", ""))
+    for name in ("base_radius", "youngs_modulus"):
+        if len(_numbers(name, stated.get(name, 1.0))) > 1:
+            raise ValueError(f"{name} is {stated[name]!r}; of files one number is needed")
     changes = {
         name: _numbers(name, stated[name])[0] * PARAMETERS[name][1]
         for name in ("base_radius", "youngs_modulus")

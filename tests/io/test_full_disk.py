@@ -114,8 +114,11 @@ for limit in (hard, 1500):
 
 
 def run(program, *arguments):
-    """What a program prints, line by line."""
-    command = [sys.executable, "-c", program, *map(str, arguments)]
+    """What a program prints, line by line.
+
+    It compiles no sources (-B): Python would leave those of a package cut short at the limit.
+    """
+    command = [sys.executable, "-B", "-c", program, *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, (done.returncode, done.stdout[-500:], done.stderr[-2000:])
     return [json.loads(line) for line in done.stdout.splitlines() if line.startswith("[")]

@@ -149,7 +149,7 @@ def square(tmp_path):
 
     def call(*limit):
         return subprocess.run(
-            [sys.executable, "-W", "error", script, *map(str, limit)],
+            [sys.executable, "-B", "-W", "error", script, *map(str, limit)],
             capture_output=True,
             text=True,
             check=True,

@@ -118,6 +118,7 @@ VARIABLES: Mapping[str, RecordedVariable] = MappingProxyType(
         "second_contact": RecordedVariable(_EACH, _TRUTH, kind="bool"),
         "friction_angle": RecordedVariable(_EACH, _ESTIMATES),
         "one_contact": RecordedVariable(_EACH, _ESTIMATES),
+        "made_from": RecordedVariable(_EACH, ("signals", "estimates", "contour"), kind="int"),
         "candidates": RecordedVariable(_EACH, _ESTIMATES, kind="int"),
         "in_contact": RecordedVariable(_EACH, _ANYWHERE, kind="bool"),
         "event": RecordedVariable(_EACH, _ESTIMATES, kind="int"),
@@ -165,6 +166,7 @@ _UNITS = MappingProxyType(
     | dict.fromkeys(("radian", "radians"), "rad")
     | dict.fromkeys(("px", "pixels"), "pixel")
 )
+_SKEW = 1e-3  # largest deviation of a rotation times its transpose from the identity
 _OF = "recorded_as"  # attribute of a whisker's group: its label along the dimension ``whisker``
 
 
@@ -208,6 +210,15 @@ def faults_in(data: xr.Dataset) -> list[str]:
         got = data[dim].values.tolist() if dim in data.coords else labels
         if got != labels:
             faults.append(f"{dim} is {', '.join(map(str, got))}; {', '.join(labels)} is needed")
+    codes = known["status"].values if "status" in known else np.zeros(0)
+    if len(wrong := np.setdiff1d(codes[codes == codes], list(Status))):
+        faults.append(f"status holds {', '.join(map(str, wrong[:3]))}, which is not a status")
+    for name in () if any(faults) else known.keys() & {"base_rotation", "head_rotation"}:
+        turned = ordered(name, known[name])
+        turned = turned[np.isfinite(turned).all(axis=(-2, -1))]
+        away = np.abs(np.swapaxes(turned, -2, -1) @ turned - np.eye(3)).max(initial=0.0)
+        if away > _SKEW or (np.linalg.det(turned) < 0.0).any():
+            faults.append(f"{name} is not a rotation in some frames")
     return [fault for fault in faults if fault]
 
 
@@ -226,7 +237,10 @@ def _plain_unit(text: str) -> str:
 
 
 def ordered(name: str, variable: xr.Variable) -> NDArray[Any]:
-    """Give the values of a variable in the declared order and type; a missing truth is False."""
+    """Give the values of a variable in the declared order and type; a missing truth is False.
+
+    Of vectors what is infinite is missing, too, and of statuses NaN is that of what is missing.
+    """
     fault = _fault(name, variable, _SELECTED)
     if fault:
         raise ValueError(fault)
@@ -235,6 +249,10 @@ def ordered(name: str, variable: xr.Variable) -> NDArray[Any]:
     values = variable.transpose(*(called[dim] for dim in wanted.dims if dim in called)).values
     if wanted.kind == "bool":
         return np.asarray(np.nan_to_num(values) > 0.0)
+    if wanted.dims == _VECTOR:
+        return np.where(np.isfinite(values), values, np.nan)
+    if name == "status":
+        return np.asarray(np.nan_to_num(values, nan=int(Status.MISSING)), dtype=np.int8)
     return np.asarray(values, dtype=np.float64) if wanted.kind == "float" else values
 
 

@@ -4,6 +4,7 @@ import csv
 
 import numpy as np
 import pytest
+import xarray as xr
 from typer.testing import CliRunner
 
 import vibrissa as vb
@@ -64,3 +65,16 @@ def test_a_folder_is_done_once_and_summarised(tmp_path):
     before = (tmp_path / "touch.nc").stat().st_mtime_ns
     run("batch", tmp_path, "--axis", "0,0,1")
     assert (tmp_path / "touch.nc").stat().st_mtime_ns == before
+
+
+def test_links_and_groups_that_were_edited_stop_nothing(tmp_path):
+    trial(tmp_path / "miss.nc", Peg([90e-3, 2.6e-3, 0.0], [0.0, 0.0, 1.0], 0.5e-3))
+    tree = load_recording(tmp_path / "miss.nc")
+    tree["/contour"] = xr.DataTree(xr.Dataset(attrs={"shape": "cylinder"}))
+    save_recording(tmp_path / "lacking.nc", tree)
+    (tmp_path / "gone.nc").symlink_to(tmp_path / "nowhere.nc")
+    assert "3 recordings, 3 with a fault" in run("batch", tmp_path)
+    with (tmp_path / "summary.csv").open() as file:
+        faults = {row["file"]: row["fault"] for row in csv.DictReader(file)}
+    assert "there is no file" in faults["gone.nc"]
+    assert "lacks" in faults["lacking.nc"]

@@ -179,6 +179,9 @@ def test_datasets_keep_fits(kind, joint_errors):
         shape_from_dataset(stored.drop_vars("inlier"))
     with pytest.raises(ValueError, match="None"):
         shape_from_dataset(stored.assign_attrs(shape=None))
+    for name in {"object_radius", "object_axis"} & set(stored):
+        with pytest.raises(ValueError, match="which it cannot be"):
+            shape_from_dataset(stored.assign({name: -0.5 * stored[name]}))
 
 
 def test_residuals_of_a_sphere_are_distances(joint_errors):

@@ -9,7 +9,7 @@ from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 
 import vibrissa as vb
-from vibrissa.io import Session, save_nwb, save_predictors
+from vibrissa.io import Session, load_nwb_series, save_nwb, save_predictors
 from vibrissa.pipeline import PREDICTORS, predictors
 from vibrissa.recording import ONE_VIEW, coordinates, recorded, recording_tree
 
@@ -70,6 +70,51 @@ def test_one_view_shows_half_of_the_predictors(trial):
     assert names == [*columns, *(f"{name}_rate" for name in columns)]
 
 
+def test_plain_numbers_in_other_units_are_noted(trial):
+    """Where the attribute is lost, nothing but their size shows that these are µN."""
+    data = trial.to_dataset()
+    data["force"] = data["force"].variable.copy(data=1e6 * data["force"].values)
+    with pytest.warns(UserWarning, match="natural to this whisker") as notes:
+        predictors(recording_tree(data, [vb.samples.gamma()] * 2, "made by hand"))
+    assert [str(note.message)[:2] for note in notes] == ["C1", "C2"]
+
+
+def test_nwb_holds_what_other_formats_hold(trial, tmp_path):
+    """Estimates and signals are not called as what was tracked, and onsets may have no sigma."""
+    h5py = pytest.importorskip("h5py")
+    pytest.importorskip("ndx_pose")
+    shape = (len(TIME), 2)
+    point = np.where(trial["in_contact"].values[..., None], 1e-2, np.nan) * np.ones(3)
+    event = np.zeros(shape, dtype=np.int8)
+    event[10, 0] = vb.status.Event.ONSET
+    onset = np.full(shape, np.nan)
+    onset[10:, 0] = TIME[10]
+    tracked = trial.copy()
+    tracked.dataset = tracked.to_dataset().assign(contact_point=recorded("contact_point", point))
+    known = {"contact_point": point + 1e-4, "event": event, "onset_time": onset}
+    known |= {"onset_sigma": np.full(shape, np.nan)}
+    about = {name: recorded(name, values) for name, values in known.items()}
+    tracked["/estimates"] = xr.DataTree(xr.Dataset(about, attrs={"friction": 0.0}))
+    wrench = {name: recorded(name, 0.9 * trial[name].values) for name in ("force", "moment")}
+    tracked["/signals"] = xr.DataTree(xr.Dataset(wrench))
+    table = predictors(tracked)
+    save_nwb(tmp_path / "t.nwb", tracked, Session(datetime(2026, 3, 1, tzinfo=UTC)), table)
+    with h5py.File(tmp_path / "t.nwb") as file:
+        found = file["processing/behavior"]
+        for name, column in (
+            ("estimates_contact_point", "contact_point_y"),
+            ("signals_force", "Fy"),
+        ):
+            series = found[f"{name}_C1"]["data"][:, 1]
+            np.testing.assert_array_equal(series, table[column].sel(whisker="C1"))
+        np.testing.assert_array_equal(found["contact_point_C1"]["data"], point[:, 0])
+        assert "signals_base_position_C1" not in found
+        assert "that of the estimates" in found["contact_point_C1"].attrs["description"]
+        assert found["signals_moment_C1"].attrs["description"].endswith("NaN where there is none")
+        assert file["intervals/contact_events/start_time"][:].tolist() == [TIME[10]]
+    assert load_nwb_series(tmp_path / "t.nwb")["force"].equals(trial["force"])
+
+
 def test_a_recording_without_forces_says_what_to_run(trial):
     root = trial.to_dataset().drop_vars(["force", "moment"])
     with pytest.raises(ValueError, match="vibrissa signals"):
@@ -86,6 +131,11 @@ def test_read_by_pandas_and_in_matlabs_layout(trial, tmp_path):
     first = frame[frame.whisker == "C1"]
     np.testing.assert_array_equal(first["Mz_rate"], table["Mz_rate"].sel(whisker="C1"))
     assert set(first["in_contact"]) == {0, 1}
+    named = tmp_path / "named.csv"
+    save_predictors(named, table.assign_coords(whisker=["C#1", "C2"]))
+    again = pandas.read_csv(named, comment="#")
+    np.testing.assert_array_equal(again["Mz"], frame["Mz"])
+    assert set(again["whisker"]) == {"C#1", "C2"}
     described = [line for line in (tmp_path / "t.csv").read_text().splitlines() if line[0] == "#"]
     assert len(described) == len(table) + 1
     save_predictors(tmp_path / "t.mat", table)

@@ -44,6 +44,26 @@ def test_a_sensor_is_taken_as_it_reads(trial):
     assert signals["in_contact"].values.sum() > 0.9 * truth.sum()
 
 
+@pytest.mark.parametrize("noise", [-1e-6, "1 µN", [1e-6] * 4, [1e-6, -1e-6, 1e-6]])
+def test_noise_that_is_none_is_refused(trial, noise):
+    data = trial.to_dataset()
+    edited = trial.copy()
+    edited.dataset = data.assign(force=data["force"].assign_attrs(noise=noise))
+    with pytest.raises(ValueError, match="the noise of force is"):
+        signals_of(edited)
+
+
+def test_infinite_forces_are_missing(trial):
+    data = trial.to_dataset()
+    force = data["force"].values.copy()
+    force[3, 0], force[4, 0, 1] = [np.inf, -np.inf, 0.0], np.inf
+    edited = trial.copy()
+    edited.dataset = data.assign(force=data["force"].copy(data=force))
+    signals = signals_of(edited)
+    assert (signals["status"].values[3:5, 0] == Status.MISSING).all()
+    assert np.isnan(signals["FT"].values[3:5, 0]).all()
+
+
 def test_channels_that_tell_all_are_brought_back_to_force_and_moment(trial):
     generator = np.random.default_rng(1)
     mixing = generator.normal(size=(8, 6)) * np.repeat([1.0, 50.0], 3)
@@ -118,6 +138,14 @@ def test_the_pose_is_filtered_as_asked(tracked, cutoff):
         turned @ np.swapaxes(turned, 1, 2), np.eye(3)[None] + 0 * turned, atol=1e-12
     )
     assert signals.attrs.get("cutoff") == cutoff
+
+
+def test_frames_that_are_missing_are_stated(tracked):
+    part = tracked.isel(time=np.r_[0:40, 90 : tracked.sizes["time"]])
+    with pytest.warns(UserWarning, match="0.17 s in a row: the base's pose is filtered in 2"):
+        signals = signals_of(part, "contact point", 60.0)
+    whole = signals_of(tracked, "contact point", 60.0).sel(time=part["time"])
+    np.testing.assert_allclose(signals["base_position"], whole["base_position"], atol=3e-5)
 
 
 def measured(tracked, unfiltered=True):

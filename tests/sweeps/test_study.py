@@ -164,3 +164,18 @@ def test_several_radii_of_files_are_refused(tmp_path):
     text = "[[whiskers]]\nkind='files'\nfiles='*.csv'\nbase_radius=[50, 100]\n[[tasks]]\nkind='map'"
     with pytest.raises(ValueError, match="one number"):
         read_study(text, tmp_path)
+
+
+def test_a_file_that_is_changed_while_the_study_runs_is_refused(tmp_path):
+    """Its cells are called by what it was when the study began."""
+    file = tmp_path / "one.csv"
+    rows = [f"{x},{0.01 * x**2},0" for x in np.linspace(0.0, 30.0, 40)]
+    file.write_text("\n".join(["x_mm,y_mm,z_mm", *rows]))
+    text = "[[whiskers]]\nkind='files'\nfiles='*.csv'\n[[tasks]]\nkind='map'"
+    study = read_study(text, tmp_path)
+    before = study.specimens[0]
+    assert before.make().length > 0.0
+    file.write_text(file.read_text().replace("0.0,0.0,0", "0.0,0.001,0"))
+    with pytest.raises(ValueError, match="was changed while the study ran"):
+        before.make()
+    assert read_study(text, tmp_path).specimens[0].identity != before.identity

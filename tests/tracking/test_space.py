@@ -155,6 +155,30 @@ def test_the_filter_keeps_gaps():
         low_pass(values, 100.0, 85.0)
 
 
+@pytest.mark.parametrize(
+    "kept",
+    [
+        np.r_[0:400, 600:1000],  # cut out
+        np.r_[0:500, 500:1000:4],  # the rate changes
+        np.delete(np.arange(1000), [200, 201, 350, 700, 703]),  # dropped
+    ],
+)
+def test_the_filter_does_not_take_frames_that_are_missing_for_a_jump(kept):
+    t = np.arange(1000) / 1000.0
+    slow = np.sin(2 * np.pi * 5.3 * t)
+    out = low_pass(slow[kept], t[kept], 85.0)
+    inner = (kept > 30) & (kept < 970)
+    np.testing.assert_allclose(out[inner], slow[kept][inner], atol=5e-3)
+    assert np.abs(low_pass(slow[kept], 1000.0, 85.0) - slow[kept])[inner].max() > 0.01
+
+
+def test_the_filter_leaves_single_frames_and_refuses_slow_ones():
+    t = np.array([0.0, 0.001, 0.002, 0.003, 0.5, 0.9])
+    np.testing.assert_array_equal(low_pass(t**2, t, 85.0)[4:], t[4:] ** 2)
+    with pytest.raises(ValueError, match="below half of 1 frames/s"):
+        low_pass(t, np.arange(6.0), 85.0)
+
+
 def test_contact_that_makes_a_whisker_look_rolled_leaves_its_roll():
     """Bent against its own bend, a whisker has for some frames a shape that it has when rolled."""
     s = np.linspace(0.0, 25e-3, 101) / 30e-3

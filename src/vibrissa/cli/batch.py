@@ -76,7 +76,7 @@ def _is_recording(path: Path) -> bool:
     """Whether a file is a recording, or perhaps one that is damaged; not a map or signals."""
     try:
         return vb.io.recognise(path) in (vb.io.Kind.RECORDING, vb.io.Kind.UNKNOWN)
-    except ValueError:
+    except (ValueError, OSError):
         return True  # reading it states what is wrong
 
 
@@ -90,10 +90,10 @@ def _one(
     tell: Tell,
 ) -> tuple[vb.pipeline.TrialSummary | None, str]:
     """Bring one recording to its object; its summary, and what was wrong."""
-    fault, tree, made = "", None, False
+    fault, found, tree, made = "", None, None, False
     try:
         tree = recording_from(path)
-        if again or "contour" not in tree.children:
+        if again or "contour" not in tree.children or vb.pipeline.edited(tree):
             known = vb.recording.Recording(tree).objects if objects is None else objects
             for stage, after in stages(tree, wanted, source, how, known, tell, str(path)):
                 tree, made = after, True
@@ -102,7 +102,11 @@ def _one(
         fault = " ".join(str(error).split())
     if tree is not None and made:
         vb.io.save_recording(path, tree)
-    return None if tree is None else vb.pipeline.summarise(tree), fault
+    try:
+        found = None if tree is None else vb.pipeline.summarise(tree)
+    except ValueError as error:  # of groups that were edited
+        fault = fault or " ".join(str(error).split())
+    return found, fault
 
 
 def _cells(path: Path, found: vb.pipeline.TrialSummary | None, fault: str) -> list[object]:

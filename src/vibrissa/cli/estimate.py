@@ -219,7 +219,7 @@ class EstimateOptions:
         return (
             f"{'force and moment whole' if names == WRENCH else used}{self.assumed.described()}; "
             f"{vb.contacts.friction_assumed(friction)}; "
-            f"{noise}; contacts are measured where M_B exceeds {shown('MB', least)}"
+            f"{noise}; a contact counts where M_B exceeds {shown('MB', least)}"
         )
 
 
@@ -240,16 +240,21 @@ def estimate(
 
     Three signals give all contacts that explain them exactly, more are fitted by least squares;
     --using wrench allows for friction. Where M_B is within five standard deviations of zero the
-    status is not_felt. To a recording they are added as a group `estimates`, in the laboratory too,
-    where continuity decides between several contacts; missing signals are computed first
-    (see `vibrissa signals`), and a contour that was computed from other contacts is removed. A
-    table goes to a table. With a --sensor (.toml) its columns are the sensor's channels, and poses
-    of the base, as lines of `vibrissa stream` are; with that of `vibrissa calibrate` (.nc) it is a
-    sweep: positions of the stage, and the channels; `vibrissa reconstruct` finds the object of the
-    recording (.nc) that it may go to. With --gravity a whisker of known density sags.
-    Where poses of the base are known, as in a recording, gravity is that of the laboratory.
-    With --around contacts are those with known objects, which a whisker may lie along; they go to
-    a table.
+    status is not_felt.
+
+    A table gives a table. To a recording contacts are added as a group `estimates`, in the
+    laboratory frame too, where continuity decides between several contacts; missing signals are
+    computed first (see `vibrissa signals`), and a contour of other contacts is removed.
+
+    With a --sensor (.toml) the columns of a table are the sensor's channels, and poses of the base,
+    as in lines of `vibrissa stream`; with a --sensor of `vibrissa calibrate` (.nc) the table is a
+    sweep: positions of the stage, and the channels. A sweep may give a recording (.nc), in which
+    `vibrissa reconstruct` finds the object.
+
+    With --gravity a whisker of known density sags; gravity is that of the laboratory where poses of
+    the base are known, as in a recording. With --around contacts are those with known objects,
+    which a whisker may lie along; they go to a table.
+
     Example: `vibrissa estimate signals.csv --map map.nc --using Fx,FT,MB,MD -o contacts.csv`
     """
     if how.noise.covariance is not None:
@@ -408,7 +413,7 @@ def _around(signals: Path, target: Path, how: EstimateOptions, known: AroundOpti
         check_one_whisker(tree, signals)
         if "signals" in vb.pipeline.due_stages(tree, "estimates"):
             tree = vb.pipeline.with_signals(
-                tree, **SourceOptions().as_keywords(tree, how.known, how.proximal)
+                tree, **SourceOptions.of(tree).as_keywords(tree, how.known, how.proximal)
             )
         wrench, whisker = (
             tree["signals"].to_dataset().isel(whisker=0),
@@ -488,7 +493,7 @@ def _from_recording(
     with progress_bars() as tell:
         if "signals" in vb.pipeline.due_stages(tree, "estimates"):
             tree = vb.pipeline.with_signals(
-                tree, **SourceOptions().as_keywords(tree, how.known, how.proximal)
+                tree, **SourceOptions.of(tree).as_keywords(tree, how.known, how.proximal)
             )
         done, used = estimated(tree, how, tell, str(signals), weight)
     remark(f"{described(done)}; {used}")

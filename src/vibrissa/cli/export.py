@@ -6,6 +6,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 import vibrissa as vb
 from vibrissa.cli.inputs import recording_from
 from vibrissa.cli.options import check_new, refuse, with_options
@@ -49,11 +51,11 @@ def export(
     else:
         vb.io.save_predictors(target, table)
     touching = int(table["in_contact"].sum()) if "in_contact" in table else 0
-    count = table.sizes["whisker"]
+    count, duration = table.sizes["whisker"], float(np.ptp(table["time"].values))
     say(
-        f"{table.sizes['time']} frames of {count} whisker{'s' * (count > 1)}, {touching} in "
-        f"contact; {len(table)} columns, {len(table.attrs['predictors'].split())} of them "
-        "predictors of models of spikes"
+        f"{table.sizes['time']} frames in {duration:g} s of {count} whisker{'s' * (count > 1)}, "
+        f"{touching} in contact; {len(table)} columns, {len(table.attrs['predictors'].split())} of "
+        "them predictors of models of spikes"
     )
     say(f"wrote {target}")
 

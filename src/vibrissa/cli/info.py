@@ -151,7 +151,9 @@ def _recording(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
         f"{'whisker' if one else f'whiskers {len(found.whiskers)}'}: {names}",
     )
     rate = f" at {found.frames / found.duration:g} a second" if found.duration else ""
-    yield "duration", f"{found.duration:g} s, {found.frames} frames{rate}"
+    moves = f"; the base moves within {shown('base_position', found.extent, 3)}"
+    moves = moves if np.isfinite(found.extent) else ""
+    yield "duration", f"{found.duration:g} s, {found.frames} frames{rate}{moves}"
     yield "contacts", _contacts(found)
     if found.events:
         yield "events", ", ".join(f"{name}: {n}" for name, n in found.events.items())
@@ -199,7 +201,9 @@ def _summarised(path: Path) -> xr.DataTree:
     parts = {"/": vb.io.read_dataset(path, None, [*pose, *needed])}
     for group in (*groups, *objects):
         along = needed if group in ("truth", "signals", "estimates") else None
-        parts[f"/{group}"] = vb.io.read_dataset(path, group, along)
+        # Of what it was made is not read here.
+        data = vb.io.read_dataset(path, group, along).drop_vars("made_from", errors="ignore")
+        parts[f"/{group}"] = data
     return xr.DataTree.from_dict(parts)
 
 

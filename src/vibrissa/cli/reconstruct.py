@@ -112,12 +112,12 @@ def stages(
     name: str,
 ) -> Iterator[tuple[str, xr.DataTree]]:
     """The recording after each stage that is due."""
-    made = tree["signals"].attrs if "signals" in tree.children else None
-    if made and how.own.whisker is not None and not source.given:
-        source = _as_made(made)  # by another whisker
-    asked = {"signals": source.given, "estimates": how.given}
+    again = how.own.whisker is not None and "signals" in tree.children  # by another whisker
+    asked = {"signals": source.given or again, "estimates": how.given}
+    if not source.given:
+        source = SourceOptions.of(tree)
     due = vb.pipeline.due_stages(
-        tree, "contour", [stage for stage, again in asked.items() if again]
+        tree, "contour", [stage for stage, wants in asked.items() if wants]
     )
     if "signals" in due:
         tell("signals", 0, 1)
@@ -139,17 +139,6 @@ def stages(
         ),
     )
     tell(wanted.shape, 1, 1)
-
-
-def _as_made(about: Any) -> SourceOptions:
-    """Source of signals that are there."""
-    source: Any = str(about.get("source")).replace(" ", "-")
-    cutoff = float(about.get("cutoff", 0.0)) if source == "contact-point" else None
-    if "density" in about:
-        density, damping = np.mean(about["density"]), float(about["damping_ratio"])
-        usual = np.array_equal(about["density"], vb.simulation.Dynamics().density)
-        return SourceOptions(source, None, True, None if usual else float(density), damping)
-    return SourceOptions(source, cutoff)
 
 
 def _of_contour(points: Path, tree: xr.DataTree, own: WhiskerOptions) -> bool:
@@ -254,14 +243,14 @@ def _agreement(fit: vb.contour.FittedShape, contour: xr.Dataset) -> str:
     found, used = int(np.isfinite(fit.residuals).sum()), int(fit.used.sum())
     inside = int((fit.used & fit.inliers).sum())
     share = f"all {used}" if used < inside + 1 else f"{inside} of {used}"
-    text = f"{share} contacts that were used agree with it"
+    text = f"{share} contacts agree with it"
     if inside:
-        text += f", to {fixed('surface_distance', fit.rms, 1)}"
+        text += f" and are {fixed('surface_distance', fit.rms, 1)} from it (root mean square)"
     if found > used:
-        text += f"; too uncertain to be used: {found - used}"
+        text += f"; {found - used} more are too uncertain to be used"
     together = float(contour.attrs["frames_together"])
     if together > 1.5:
-        text += f"; some {together:.0f} successive frames share their errors, as sigma allows for"
+        text += f"; sigma allows for errors that about {together:.0f} successive frames share"
     return text
 
 

@@ -44,6 +44,18 @@ class SourceOptions:
             about["--fit-dynamics"] = self.fit_dynamics or None
             refuse(about, "without --inertia the whisker has no mass")
 
+    @classmethod
+    def of(cls, tree: xr.DataTree) -> SourceOptions:
+        """Options by which signals that are there were made; the usual ones without signals."""
+        about: Any = tree["signals"].attrs if "signals" in tree.children else {}
+        source: Any = about.get("source", "").replace(" ", "-") or None
+        cutoff = float(about.get("cutoff", 0.0)) if source == "contact-point" else None
+        if "density" not in about:
+            return cls(source, cutoff)
+        density, damping = np.mean(about["density"]), float(about["damping_ratio"])
+        usual = np.array_equal(about["density"], vb.simulation.Dynamics().density)
+        return cls(source, None, True, None if usual else float(density), damping)
+
     @property
     def given(self) -> bool:
         """Whether anything is stated."""

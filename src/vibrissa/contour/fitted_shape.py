@@ -240,6 +240,7 @@ def continuing_candidates(candidates: ArrayLike, frames: ArrayLike) -> NDArray[n
     return chosen
 
 
+_UNIT = 1e-6  # largest deviation of the length of a stored direction from 1
 DIRECTION = "object_axis"  # quantity of unit vectors; all other parameters are lengths
 
 
@@ -463,6 +464,9 @@ class FittedShape(ABC):
         values: dict[str, Any] = {}
         for name, quantity in cls.fields.items():
             value = dataset[quantity].values.astype(np.float64)
+            right = bool(np.isfinite(value).all()) and (name != "radius" or value > 0.0)
+            if not right or (quantity == DIRECTION and abs(np.linalg.norm(value) - 1.0) > _UNIT):
+                raise ValueError(f"{name} of a fitted {cls.kind} is {value}, which it cannot be")
             values[name] = float(value) if value.ndim == 0 else value
         return cls(covariance=dataset["parameter_covariance"].values, **rows_of(dataset), **values)
 

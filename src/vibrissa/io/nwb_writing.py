@@ -45,6 +45,15 @@ _SERIES = {
     "head_position": ("meters", "Origin of the head's frame; x, y, z"),
     "head_rotation": ("n.a.", _TURN.format("head's")),
 }
+_SERIES |= {
+    name: _SERIES[name.partition("_")[2]]
+    for name in (
+        "estimates_contact_point",
+        *(f"signals_{name}" for name in ("base_position", "force", "moment")),
+    )
+}
+# Remark on what differs from the table that other formats hold.
+_NOT_OF = "As recorded; that of the {0} is the series with {0} before its name"
 # Validators require these; each value states that it is unknown.
 _NOBODY = {"subject_id": "unknown", "sex": "U", "age": "P0D/", "description": "not stated"}
 
@@ -147,13 +156,31 @@ def _check(data: xr.Dataset) -> None:
 
 
 def _completed(data: xr.Dataset, table: xr.Dataset | None) -> xr.Dataset:
-    """Add the contacts of a table where tracking found none, as those of a sensor."""
-    found = {} if table is None else {n: table[n] for n in ("in_contact",) if n in table}
-    if table is not None and "contact_point_x" in table:
-        axes = [table[f"contact_point_{axis}"] for axis in "xyz"]
-        about = {"about": axes[0].attrs.get("description", "")}
-        found["contact_point"] = xr.concat(axes, "space", combine_attrs="drop").assign_attrs(about)
-    return data.assign({name: value for name, value in found.items() if name not in data})
+    """Add the contacts of a table, and state of what else differs from it that it does."""
+    if table is None:
+        return data
+    found = {n: table[n] for n in ("in_contact",) if n in table and n not in data}
+    of = {name: [f"{name}_{x}" for x in "xyz"] for name in ("contact_point", "base_position")}
+    of |= {name: [f"{name[0].upper()}{x}" for x in "xyz"] for name in ("force", "moment")}
+    for name, columns in of.items():
+        if not set(columns) <= set(table):
+            continue
+        values = xr.concat([table[n] for n in columns], "space", combine_attrs="drop")
+        if name == "contact_point":
+            values.attrs["about"] = table[columns[0]].attrs.get("description", "")
+        if name not in data and name == "contact_point":
+            found[name] = values
+        elif name in data and not np.array_equal(
+            values.transpose(*data[name].dims), data[name], equal_nan=True
+        ):
+            other = "estimates" if name == "contact_point" else "signals"
+            found[name] = data[name].assign_attrs(about=_NOT_OF.format(other))
+            found[f"{other}_{name}"] = values.assign_attrs(reference_frame=_frame(data[name]))
+    return data.assign(found)
+
+
+def _frame(values: xr.DataArray) -> str:
+    return str(values.attrs.get("reference_frame", "laboratory"))
 
 
 def _file(session: Session) -> NWBFile:
@@ -278,7 +305,7 @@ def _pose(
     space = []
     if "centerline" in whisker:
         line = whisker["centerline"].transpose("time", "node", "space")
-        frame = str(line.attrs.get("reference_frame", "laboratory"))
+        frame = _frame(line)
         sure = _confidence(whisker, "confidence", None)
         space = _points(nodes, line.values, sure, "meters", frame, clock)
     return MultiCameraPoseEstimation(
@@ -354,7 +381,7 @@ def _series(data: xr.Dataset, clock: dict[str, Any], whisker: str | None = None)
         if variable not in data or variable.startswith("head_") != (whisker is None):
             continue
         values = data[variable].transpose("time", "space", ...)
-        frame = str(values.attrs.get("reference_frame", "laboratory"))
+        frame = _frame(values)
         if values.attrs.get("about"):
             text += f". {values.attrs['about'].rstrip('.')}"
         made: Any = TimeSeries

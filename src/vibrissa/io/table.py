@@ -196,10 +196,14 @@ def read_numbers(path: str | PathLike[str]) -> tuple[list[str], NDArray[np.float
     return table.names, np.stack(columns, axis=1)
 
 
-def table_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Write a table as text, numbers in full."""
+def table_text(
+    header: Sequence[str], rows: Iterable[Sequence[object]], quoted: bool = False
+) -> str:
+    """Write a table as text, numbers in full, and words in quotation marks on request."""
     out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
+    writer = csv.writer(
+        out, lineterminator="\n", quoting=csv.QUOTE_NONNUMERIC if quoted else csv.QUOTE_MINIMAL
+    )
     writer.writerow(header)
     writer.writerows(rows)
     return out.getvalue()

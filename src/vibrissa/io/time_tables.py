@@ -396,9 +396,9 @@ def events_in(contacts: xr.Dataset) -> Iterator[tuple[float, str, str, float]]:
         Time, s, name of the whisker, ``onset``, ``loss`` or ``slip``, and the standard deviation of
         an onset, s, NaN where it is not known; nothing where there are no events.
     """
-    if "event" not in contacts:
-        return
     names = ("event", "onset_time", "onset_sigma")
+    if not set(names) <= set(contacts):
+        return
     codes, begun, sigma = (contacts[one].transpose("time", "whisker").values for one in names)
     time, whiskers = contacts["time"].values, contacts["whisker"].values
     for i, k in np.argwhere(codes != Event.NONE).tolist():
@@ -475,7 +475,9 @@ def _text(table: xr.Dataset, columns: dict[str, xr.DataArray]) -> str:
         for i, moment in enumerate(time)
         for k, whisker in enumerate(whiskers)
     )
-    return "\n".join(about) + "\n" + table_text(("time", "whisker", *columns), rows)
+    # Readers that skip comments drop the rest of a line from a # that is not quoted.
+    marked = any("#" in str(name) for name in whiskers)
+    return "\n".join(about) + "\n" + table_text(("time", "whisker", *columns), rows, marked)
 
 
 def _plain(name: str, values: np.ndarray) -> list[list[object]]:

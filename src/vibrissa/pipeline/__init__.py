@@ -24,6 +24,7 @@ from vibrissa.pipeline.locate import (
     locate_around,
     locate_from_wrench,
 )
+from vibrissa.pipeline.made_from import edited as edited
 from vibrissa.pipeline.predictors import PREDICTORS as PREDICTORS, predictors
 from vibrissa.pipeline.reconstruct import (
     AGREES as AGREES,

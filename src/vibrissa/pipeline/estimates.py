@@ -258,7 +258,7 @@ def _one_whisker(
         pose.pop("pose_wrench_covariance", None)
     held = known["base_rotation"], known["base_position"]
     placed = in_laboratory(found, *held, **pose, wrench_shared=shared)
-    own = signals["status"].values
+    own = known["status"]
     status = np.where(is_ok(own), placed["status"].values, own).astype(np.int8)
     placed["status"] = placed["status"].copy(data=status)
     placed = with_events(placed, "contact_point", "contact_covariance", held)

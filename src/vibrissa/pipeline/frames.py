@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,6 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.numerics import Array
+from vibrissa.pipeline.made_from import edited
 from vibrissa.recording import Group, faults_in, recorded
 from vibrissa.signals import base_signals
 from vibrissa.whisker import Whisker
@@ -17,7 +19,6 @@ from vibrissa.whisker import Whisker
 EACH = ("time", "whisker")  # dimensions of contacts
 # Covariances of the wrench and of the pose.
 SQUARES = ("wrench_covariance", "pose_covariance", "pose_wrench_covariance")
-_SKEW = 1e-3  # largest deviation of a rotation times its transpose from the identity
 # Variables of the group ``signals``.
 MEASURED = ("force", "moment", "base_position", "base_rotation", "in_contact", "status")
 # Variables of the group ``estimates``.
@@ -45,12 +46,6 @@ def check_recording(recording: xr.DataTree) -> None:
             "tracked, simulated or measured is needed"
         )
     faults = faults_in(root)
-    if not faults and "base_rotation" in root:
-        turned = Group(root)["base_rotation"]
-        known = turned[np.isfinite(turned).all(axis=(-2, -1))]
-        away = np.abs(np.swapaxes(known, -2, -1) @ known - np.eye(3)).max(initial=0.0)
-        if away > _SKEW or (np.linalg.det(known) < 0.0).any():
-            faults.append("base_rotation is not a rotation in some frames")
     faults += _label_faults(root)
     time = np.asarray(root["time"].values)
     if time.size == 0 or root.sizes["whisker"] == 0:
@@ -61,6 +56,13 @@ def check_recording(recording: xr.DataTree) -> None:
         faults.append("its time does not rise from frame to frame, or is missing in some")
     if faults:
         raise ValueError(f"the recording cannot be used: {'; '.join(faults)}")
+    if changed := edited(recording):
+        warnings.warn(
+            f"the recording was edited after its {changed[0]} had been made, which are of the "
+            "former values, with all that depends on them, until `vibrissa reconstruct` has run",
+            UserWarning,
+            stacklevel=1,
+        )
 
 
 def _label_faults(root: xr.Dataset) -> list[str]:

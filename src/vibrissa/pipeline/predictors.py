@@ -8,10 +8,13 @@ columns of this table, with the six signals, the remaining pose, contacts and fl
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import xarray as xr
 
 from vibrissa.contacts import friction_assumed
+from vibrissa.io import check_scale
 from vibrissa.numerics import Array
 from vibrissa.pipeline.events import EVENTS
 from vibrissa.quantities import attributes
@@ -60,11 +63,22 @@ def predictors(recording: xr.DataTree) -> xr.Dataset:
     ------
     ValueError
         If force and moment are not known.
+
+    Warns
+    -----
+    UserWarning
+        If these are far too large to have bent the recording's whisker, as in other units.
     """
     record = Recording(recording)
     force, moment = (record.known(name, _GROUPS) for name in ("force", "moment"))
     if force is None or moment is None:
         raise ValueError("the recording has no force and moment yet: run `vibrissa signals` first")
+    for k, whisker in enumerate(record.whiskers if "whiskers" in record else ()):
+        each = (("force", force), ("moment", moment))
+        try:
+            check_scale(xr.Dataset({n: (("time", "space"), v[:, k]) for n, v in each}), whisker)
+        except ValueError as fault:
+            warnings.warn(f"{record.names[k]}: {fault}", UserWarning, stacklevel=2)
     columns = dict(
         zip(_COMPONENTS, np.moveaxis(np.concatenate([force, moment], -1), -1, 0), strict=True)
     )
@@ -92,19 +106,23 @@ def predictors(recording: xr.DataTree) -> xr.Dataset:
         "in_contact": record.known("in_contact", _GROUPS),
         "status": record.known("status", ("estimates", *_GROUPS)),
         "confidence": record.known("confidence", ("",)),
-        **{name: record.known(name, ("estimates",)) for name in EVENTS},
     }
+    if (estimates := record.find("estimates")) and estimates.known("event") is not None:
+        others |= {name: estimates.get(name) for name in EVENTS}  # NaN where none is dated
     columns |= {name: values for name, values in others.items() if values is not None}
     data = {
         name: xr.Variable(("time", "whisker"), values, _about(name))
         for name, values in columns.items()
     }
-    estimates = record.find("estimates")
+    about = ""
     if estimates is not None and estimates.known("contact_point") is not None:
         friction = float(estimates.data.attrs.get("friction", np.nan))
-        for name in (*(f"contact_point_{axis}" for axis in "xyz"), "arc_length"):
-            if name in data and not np.isnan(friction):
-                data[name].attrs["description"] += f" Estimated, {friction_assumed(friction)}."
+        about = "" if np.isnan(friction) else f" Estimated, {friction_assumed(friction)}."
+    elif record.root.known("contact_point") is None:
+        about = " True, as simulated."
+    for name in (*(f"contact_point_{axis}" for axis in "xyz"), "arc_length"):
+        if name in data:
+            data[name].attrs["description"] += about
     coordinates = {"time": ("time", time, attributes("time")), "whisker": record.names}
     unseen = _UNSEEN if ONE_VIEW in recording.attrs.get("remarks", "") else ()
     there = [n for n in PREDICTORS if n in data and n.removesuffix(_RATE) not in unseen]

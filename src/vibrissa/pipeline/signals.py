@@ -18,6 +18,7 @@ On request a sensor's signals are without what the whisker's inertia and damping
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -43,7 +44,7 @@ from vibrissa.rod import PROXIMAL, PointContact, deflect
 from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE, Sensor, component_noise
 from vibrissa.simulation import Dynamics
 from vibrissa.status import Status
-from vibrissa.tracking import CUTOFF, BasePose, HeadPose
+from vibrissa.tracking import CUTOFF, BasePose, HeadPose, pieces
 from vibrissa.whisker import Whisker, angles_of
 
 Source = Literal["contact point", "rod", "sensor"]  # source of signals
@@ -205,11 +206,21 @@ def _own_noise(root: xr.Dataset) -> Array | None:
     """Covariance (6, 6) of force and moment, where their noise is stated."""
     deviations = np.concatenate(
         [
-            np.broadcast_to(np.asarray(root[name].attrs.get("noise", np.nan), np.float64), 3)
+            _deviations(name, root[name].attrs.get("noise", np.nan), 3)
             for name in ("force", "moment")
         ]
     )
     return np.diag(deviations**2) if np.isfinite(deviations).all() else None
+
+
+def _deviations(name: str, noise: Any, count: int) -> Array:
+    """Standard deviations of components, as an attribute states them."""
+    given = np.ravel(noise)
+    if given.dtype.kind not in "fiu" or given.size not in (1, count) or (given < 0.0).any():
+        raise ValueError(
+            f"the noise of {name} is {noise!r}; a standard deviation or {count} are needed, from 0"
+        )
+    return np.broadcast_to(given.astype(np.float64), count)
 
 
 def _from_channels(root: xr.Dataset) -> tuple[xr.Dataset, Array]:
@@ -265,7 +276,7 @@ def sensor_noise(signals: xr.Dataset) -> Array | None:
     if "wrench_covariance" in signals:
         return Group(signals)["wrench_covariance"]
     if "noise" in signals.attrs:
-        return np.diag(np.asarray(signals.attrs["noise"], dtype=np.float64) ** 2)
+        return np.diag(_deviations("signals", signals.attrs["noise"], 6) ** 2)
     return None
 
 
@@ -337,7 +348,9 @@ def paper_pose(recording: Recording, cutoff: float | None) -> list[Pose]:
     head = HeadPose.still(root.data.sizes["time"])
     if "head_position" in root and "head_rotation" in root:
         head = HeadPose(root["head_position"], root["head_rotation"])
-    rate, cutoff = _rate(root.data["time"].values, cutoff)
+    time = root.data["time"].values
+    if time.size < 2:
+        cutoff = None  # a single frame is not filtered
     measured = recording.find("measured")
     if measured is not None and "base_azimuth" not in measured:
         measured = None
@@ -361,20 +374,17 @@ def paper_pose(recording: Recording, cutoff: float | None) -> list[Pose]:
             place = one[f"{prefix}base_position"]
             names = ("azimuth", "elevation", "roll")
             angles = np.stack([one[f"{prefix}base_{name}"] for name in names])
-        pose = BasePose(head.seen_from(place), *angles).filtered(rate, cutoff)
+        pose = BasePose(head.seen_from(place), *angles).filtered(time, cutoff)
         rotation, position = head.rotation @ pose.rotation, head.put_in(pose.position)
         poses.append(Pose(rotation, position, _pose_covariance(own, rotation, position)))
+    if cutoff is not None and (count := len(pieces(time, cutoff))) > 1:
+        warnings.warn(
+            f"frames are missing, up to {np.diff(time).max():.3g} s in a row: the base's pose is "
+            f"filtered in {count} pieces, of which those of one frame stay as they are",
+            UserWarning,
+            stacklevel=3,
+        )
     return poses
-
-
-def _rate(time: Array, cutoff: float | None) -> tuple[float, float | None]:
-    """Frames per second, and the cut-off; a single frame is not filtered."""
-    if time.size < 2:
-        return 1.0, None
-    step = float(np.median(np.diff(time)))
-    if not step > 0.0:
-        raise ValueError(f"the times of the frames must rise; the usual step is {step} s")
-    return 1.0 / step, cutoff
 
 
 def _pose_covariance(own: Group, rotation: Array, position: Array) -> Array:

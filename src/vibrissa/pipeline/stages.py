@@ -19,6 +19,7 @@ from vibrissa.contour import shape_from_dataset
 from vibrissa.io import events_in
 from vibrissa.pipeline.estimates import Progress, estimates_of
 from vibrissa.pipeline.frames import check_recording
+from vibrissa.pipeline.made_from import MADE_FROM, edited, made_from
 from vibrissa.pipeline.reconstruct import reconstruct
 from vibrissa.pipeline.signals import signals_of
 from vibrissa.recording import Recording
@@ -29,14 +30,15 @@ STAGES = ("signals", "estimates", "contour")  # groups in the order in which the
 def due_stages(recording: xr.DataTree, last: str, asked: Collection[str] = ()) -> tuple[str, ...]:
     """Stages that have to be made, in order, so that the last one is new.
 
-    One before it is due if it is missing, if it is asked for, or if one that it depends on is.
+    One before it is due if it is missing, if it is asked for, if what it was made of was edited
+    since, or if one that it depends on is due.
     """
     for name in (last, *asked):
         if name not in STAGES:
             raise ValueError(f"the stage is called {name!r}; one of {', '.join(STAGES)} is needed")
-    first = STAGES.index(last)
+    first, asked = STAGES.index(last), {*asked, *edited(recording)}
     for number in reversed(range(first)):
-        if STAGES[number] in recording.children and not set(asked) & set(STAGES[: number + 1]):
+        if STAGES[number] in recording.children and not asked & set(STAGES[: number + 1]):
             break
         first = number
     return STAGES[first : STAGES.index(last) + 1]
@@ -55,6 +57,7 @@ def with_group(recording: xr.DataTree, name: str, dataset: xr.Dataset) -> xr.Dat
             "are of other times"
         )
     own = dataset.drop_vars([n for n in dataset.coords if n in root.coords])
+    own[MADE_FROM] = made_from(recording, name)
     later = STAGES[STAGES.index(name) :]
     groups = {
         group.path: group.to_dataset(inherit=False)
@@ -143,14 +146,16 @@ class TrialSummary:
     """Summary of a recording: what it is in words, numbers of frames and contacts, SI units.
 
     ``in_contact`` and ``contacts``, frames in contact and uninterrupted contacts of all whiskers,
-    are None where that is not known; ``estimated`` counts frames and whiskers with an estimate,
-    ``assumption`` is what these assume of friction, and ``events`` counts onsets, losses and slips.
+    are None where that is not known; bases move within ``extent``; ``estimated`` counts frames and
+    whiskers with an estimate, ``assumption`` is what these assume of friction, and ``events``
+    counts onsets, losses and slips.
     """
 
     origin: str
     whiskers: list[str]
     frames: int
     duration: float
+    extent: float
     in_contact: int | None
     contacts: int | None
     largest_force: float
@@ -177,6 +182,11 @@ def summarise(recording: xr.DataTree) -> TrialSummary:
     largest = {
         name: _largest(record.known(name, _BEFORE), touching) for name in ("force", "moment")
     }
+    extent = np.nan
+    if (place := record.known("base_position", _BEFORE)) is not None:
+        extent = float(
+            np.linalg.norm(np.nanmax(place, axis=0) - np.nanmin(place, axis=0), axis=-1).max()
+        )
     estimated, assumption, events = 0, "", Counter[str]()
     if (estimates := record.find("estimates")) and "in_contact" in estimates:
         estimated = int(estimates["in_contact"].sum())
@@ -195,6 +205,7 @@ def summarise(recording: xr.DataTree) -> TrialSummary:
         whiskers=record.names,
         frames=len(time),
         duration=step * len(time),
+        extent=extent,
         in_contact=None if touching is None else int(touching.any(axis=1).sum()),
         contacts=contacts,
         largest_force=largest["force"],

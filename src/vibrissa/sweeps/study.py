@@ -341,8 +341,8 @@ def _files(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iter
         if name in stated
     }
     for path in paths:
-        identity = _hash([hashlib.sha256(path.read_bytes()).hexdigest(), changes])
-        yield Specimen(f"{prefix}{path.stem}", {}, identity, _FromFile(path.resolve(), changes))
+        made = _FromFile(path.resolve(), changes, _content(path))
+        yield Specimen(f"{prefix}{path.stem}", {}, _hash([made.content, changes]), made)
 
 
 def _array(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterator[Specimen]:
@@ -418,14 +418,17 @@ class _Formula:
 
 @dataclass(frozen=True)
 class _FromFile:
-    """Reads a whisker."""
+    """Reads a whisker from a file that is still what it was."""
 
     path: Path
     changes: Mapping[str, float]
+    content: str
 
     def __call__(self) -> Whisker:
         from vibrissa.io import load_whisker
 
+        if _content(self.path) != self.content:
+            raise ValueError(f"{self.path} was changed while the study ran: run it again")
         whisker = load_whisker(self.path)
         return whisker.with_properties(**self.changes) if self.changes else whisker  # type: ignore[arg-type]
 
@@ -469,6 +472,10 @@ def _numbers(name: str, value: Any) -> list[float]:
     if not values:
         raise ValueError(f"{name} is an empty list")
     return [float(one) for one in values]
+
+
+def _content(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _hash(content: Any) -> str:

@@ -14,6 +14,7 @@ from vibrissa.tracking.space.pose import (
     HeadPose as HeadPose,
     base_pose,
     low_pass as low_pass,
+    pieces as pieces,
 )
 from vibrissa.tracking.space.rest_shape import (
     RestShape as RestShape,

@@ -487,7 +487,7 @@ def tapered_as_it_bends(
     found = thicker(share)
     tip = 100.0 * float(found.radius(whisker.length) / at_base)
     either = 100.0 * sigma * float(1.0 - at_tip / at_base) / (1.0 + share) ** 2
-    note = f"radius of the tip: {tip:.1f} ± {either:.1f} % of the base's, as it bends in contact"
+    note = f"radius of the tip: {tip:.1f} ± {either:.1f} % of the base's, from how it bends"
     found = replace(found, notes=(*found.notes, note))
     return found, length._replace(sigma=sigma * length.value)
 

@@ -9,6 +9,7 @@ shows no roll at all; then its y axis is taken as level.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,7 @@ CUTOFF = 85.0
 
 _ORDER = 2  # order of the Butterworth filter, which is applied forward and backward
 _LATE = 1e-6  # share of a frame by which a table of times may be too short
+_SMALL = 0.05  # share of the times between frames that may be smaller than the usual small one
 _TANGENT = 0.2  # share of the whisker over which the tangent at the base is fitted
 # Share of the whisker over which the rest shape is put on a frame's shape: tips are uncertain.
 _WHOLE = 0.85
@@ -35,25 +37,50 @@ _ROLLED, _UNUSUAL, _MEDIAN, _ROUNDS = np.deg2rad(15.0), 5.0, 0.6745, 4
 _SLOW = 7  # number of free frames of which the median shows how the roll slowly changes
 
 
-def low_pass(values: ArrayLike, rate: float, cutoff: float | None = CUTOFF) -> Array:
-    """Filter a signal forward and backward, so that nothing is shifted in time."""
+def low_pass(values: ArrayLike, rate: ArrayLike, cutoff: float | None = CUTOFF) -> Array:
+    """Filter a signal forward and backward, so that nothing is shifted in time.
+
+    Instead of the rate, times of frames can be given, s: they may be spaced unequally, and where
+    more than a period of the cut-off is missing, what is before and after is filtered apart.
+    """
     array = np.array(values, dtype=np.float64)
     if cutoff is None:
         return array
-    if not 0.0 < cutoff < 0.5 * rate:
+    given = np.asarray(rate, dtype=np.float64)
+    time: Array = given if given.ndim else np.arange(len(array)) / given
+    usual = 1.0 / float(np.median(np.diff(time))) if time.size > 1 else np.inf
+    if not 0.0 < cutoff < 0.5 * usual:
         raise ValueError(
-            f"cutoff is {cutoff!r} Hz; it must be positive and below half of {rate} frames/s"
+            f"cutoff is {cutoff!r} Hz; it must be positive and below half of {usual:.6g} frames/s"
+            + (", times being in s" if given.ndim else "")
         )
+    for piece in pieces(time, cutoff):
+        if (steps := np.diff(time[piece])).size:
+            # Where the rate changes the smaller steps count, but not times that are almost equal.
+            step = float(np.quantile(steps, _SMALL))
+            at = (time[piece] - time[piece.start]) / step
+            array[piece] = _filtered(array[piece], at, 1.0 / step, cutoff)
+    return array
+
+
+def pieces(time: Array, cutoff: float) -> list[slice]:
+    """Runs of frames between which more than a period of the cut-off is missing."""
+    ends = [0, *(np.flatnonzero(np.diff(time) > 1.0 / cutoff) + 1).tolist(), len(time)]
+    return [slice(*pair) for pair in itertools.pairwise(ends)]
+
+
+def _filtered(array: Array, at: Array, rate: float, cutoff: float) -> Array:
+    """Filter frames at these numbers, between which and at NaN values are interpolated."""
     flat = array.reshape(len(array), -1)
     known = np.isfinite(flat)
     sections = signal.butter(_ORDER, cutoff, fs=rate, output="sos")
-    pad = min(len(flat) - 1, round(3.0 * rate / cutoff))
-    frames = np.arange(len(flat))
+    frames = np.arange(np.ceil(at[-1] - _LATE) + 1.0)
+    pad = min(len(frames) - 1, round(3.0 * rate / cutoff))
     for k in range(flat.shape[1]):
         if known[:, k].sum() < 2:
             continue
-        whole = np.interp(frames, frames[known[:, k]], flat[known[:, k], k])
-        filtered = signal.sosfiltfilt(sections, whole, padlen=pad)
+        whole = np.interp(frames, at[known[:, k]], flat[known[:, k], k])
+        filtered = np.interp(at, frames, signal.sosfiltfilt(sections, whole, padlen=pad))
         flat[:, k] = np.where(known[:, k], filtered, np.nan)
     return flat.reshape(array.shape)
 
@@ -127,8 +154,8 @@ class BasePose:
         """Rotation from the whisker's to the laboratory frame, (time, 3, 3)."""
         return base_rotation(self.azimuth, self.elevation, self.roll)
 
-    def filtered(self, rate: float, cutoff: float | None = CUTOFF) -> BasePose:
-        """Filter everything over time."""
+    def filtered(self, rate: ArrayLike, cutoff: float | None = CUTOFF) -> BasePose:
+        """Filter everything over time, at a rate or at times of frames, as `low_pass`."""
         angles = np.stack([self.azimuth, self.elevation, self.roll], axis=1)
         known = np.isfinite(angles).all(axis=1)
         angles[known] = np.unwrap(angles[known], axis=0)

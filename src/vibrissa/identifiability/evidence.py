@@ -30,7 +30,6 @@ from vibrissa.identifiability.twins import (
     sample,
     signal_columns,
     spread,
-    triplet_derivatives,
     twins,
 )
 from vibrissa.numerics import AnyArray, Array
@@ -226,7 +225,9 @@ def answer(question: Question, names: tuple[str, ...], resolution: bool) -> Answ
         own = pool._replace(sample=followed[pool.sample])
     else:
         tried = np.arange(len(samples.chart))
-        own = twins(question.contact_map, names, samples.chart, samples.contacts, question.domain)
+        outside = np.flatnonzero(samples.contacts.inside & (samples.contacts.angle > question.cone))
+        own = _twins_of(question, names, samples.rows(outside))
+        own = own._replace(sample=outside[own.sample])
         pool = _searched(question, names, own, local)
         on_surface = _on_plane(question, names, span)
     own, pool = (p.rows(p.apart >= question.separation) for p in (own, pool))
@@ -479,10 +480,8 @@ def _local(question: Question, names: tuple[str, ...], samples: Samples) -> Loca
     the plane are also taken separately.
     """
     out, contacts, volume = _nothing_local(question, samples), samples.contacts, samples.volume
-    by_contact = triplet_derivatives(contacts.values, samples.tangents, names)
-    # Relative to the lengths of the gradients: how nearly they lie in a plane. det ∂p/∂ξ > 0 in Ω.
-    size = np.prod(np.linalg.norm(by_contact, axis=2), axis=1)
-    det = np.linalg.det(by_contact) / np.where(size > 0.0, size, 1.0)
+    # How nearly the gradients lie in a plane. det ∂p/∂ξ > 0 in Ω.
+    det = np.linalg.det(samples.gradients[:, signal_columns(names)])
     above = contacts.values[:, 3:] @ question.normal > 0.0
     outside = contacts.angle > question.cone
     near: set[int] = set()

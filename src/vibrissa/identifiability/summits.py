@@ -261,7 +261,8 @@ class _Mountain:
         """Both cone angles and the margins (n, 2 + m), and whether both are inside the domain."""
         contact_map, _, separation, domain = self.search
         flat = xi.reshape(-1, 3)
-        one = contact_set(contact_map, flat, values.reshape(-1, 6), domain)
+        turned = np.repeat(signs[:, 1] != 0.0, 2)
+        one = contact_set(contact_map, flat, values.reshape(-1, 6), domain, turned)
         room = 1.0 - np.hypot(flat[:, 1], flat[:, 2]) / units(contact_map, flat)[:, 1]
         ends = (1.0 - flat[:, 0], flat[:, 0] - contact_map.chart.proximal, room)
         pairs = [a.reshape(-1, 2) for a in (one.angle, one.backward, one.tangent_x, *ends)]

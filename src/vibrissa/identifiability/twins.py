@@ -93,35 +93,46 @@ class ContactSet(NamedTuple):
 class Samples(NamedTuple):
     """Contacts spread over Ω.
 
-    Chart coordinates (η, ψ, ρ) (n, 3); the contacts; ∂(F, p)/∂ξ (n, 6, 3); each one's share of the
-    volume of contact points (n,), up to a common factor.
+    Chart coordinates (η, ψ, ρ) (n, 3); the contacts; directions of the six signals' gradients
+    (n, 6, 3); each one's share of the volume of contact points (n,), up to a common factor.
     """
 
     chart: Array
     contacts: ContactSet
-    tangents: Array
+    gradients: Array
     volume: Array
 
     def rows(self, which: AnyArray | slice) -> Samples:
         """Pick some."""
         return Samples(
-            self.chart[which], self.contacts.rows(which), self.tangents[which], self.volume[which]
+            self.chart[which], self.contacts.rows(which), self.gradients[which], self.volume[which]
         )
 
 
-def contact_set(contact_map: ContactMap, xi: Array, values: Array, domain: Domain) -> ContactSet:
-    """Find the regions of contacts ξ (n, 3) with known (F, p) (n, 6)."""
+def contact_set(
+    contact_map: ContactMap,
+    xi: Array,
+    values: Array,
+    domain: Domain,
+    turned: AnyArray | slice = slice(None),
+) -> ContactSet:
+    """Find the regions of contacts ξ (n, 3) with known (F, p) (n, 6).
+
+    Tangents are found of those which may be ``turned``; the others count as not deflected far.
+    """
     whisker, d = contact_map.whisker, contact_map.chart.discretization
     points = values[:, 3:] * d.length
     inside = np.ones(len(xi), dtype=bool)
     if domain == "paper":
         inside = within_paper_bounds(whisker, points)
+    tangent_x = np.ones(len(xi))
+    tangent_x[turned] = contact_tangents(d, with_normal_force(xi[turned]))[:, 0]
     return ContactSet(
         xi=xi,
         values=values,
         angle=cone_angle(whisker, points),
         backward=backward_offset(whisker, points) / d.length,
-        tangent_x=contact_tangents(d, with_normal_force(xi))[:, 0],
+        tangent_x=tangent_x,
         inside=inside,
     )
 
@@ -141,7 +152,10 @@ def sample(contact_map: ContactMap, chart: Array, domain: Domain) -> Samples:
     """Solve the contacts at chart coordinates (n, 3), with what they stand for."""
     contacts, tangents = solved(contact_map, chart, domain)
     by_chart = tangents[:, 3:] @ _chart_derivatives(contact_map.chart.fold, chart)
-    return Samples(chart, contacts, tangents, np.abs(np.linalg.det(by_chart)))
+    gradients = np.nan_to_num(signal_derivatives(contacts.values, tangents))
+    size = np.linalg.norm(gradients, axis=2, keepdims=True)
+    gradients /= np.where(size > 0.0, size, 1.0)
+    return Samples(chart, contacts, gradients, np.abs(np.linalg.det(by_chart)))
 
 
 def spread(number: int, seed: int | None) -> Array:

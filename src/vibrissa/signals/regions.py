@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vibrissa.deferred import spatial
 from vibrissa.numerics import AnyArray, Array
+from vibrissa.whisker import nearest_on_chords
 
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 CONE = np.deg2rad(2.0)
 #: The regions, from the largest to the smallest; ELD is "excluding large deflections".
 REGIONS = ("all", "ELD", "CF", "CB", "ELD CF", "ELD CB")
-_SAMPLES = 2049
+_BLOCKS, _SIZE = 64, 32  # blocks of chords of the resting whisker
 
 
 @lru_cache(maxsize=16)
-def resting(whisker: Whisker) -> tuple[Array, Array, spatial.cKDTree, Array]:
+def resting(whisker: Whisker) -> tuple[Array, Array, Array, Array]:
     """Sample the resting whisker; cached.
 
     Parameters
@@ -43,15 +43,18 @@ def resting(whisker: Whisker) -> tuple[Array, Array, spatial.cKDTree, Array]:
         Arc lengths, m.
     places : (n, 3) array
         Points of the centreline, m.
-    tree : cKDTree
-        Search tree of these points.
+    bulge : (m,) array
+        Largest distance of the points of each of m blocks from the chord of the block, m.
     tangent : (3,) array
         Tangent at the tip.
     """
-    s = np.linspace(0.0, whisker.length, _SAMPLES)
+    s = np.linspace(0.0, whisker.length, _BLOCKS * _SIZE + 1)
     places = whisker.position(s)
-    tree = spatial.cKDTree(places, leafsize=64)  # points far from the whisker visit most leaves
-    return s, places, tree, whisker.frame(np.array(whisker.length))[:, 0]
+    chord = (places[_SIZE::_SIZE] - places[:-1:_SIZE])[:, None]
+    away = places[:-1].reshape(_BLOCKS, _SIZE, 3) - places[:-1:_SIZE][:, None]
+    t = np.clip((away * chord).sum(axis=2) / (chord * chord).sum(axis=2), 0.0, 1.0)
+    bulge = np.linalg.norm(away - t[..., None] * chord, axis=2).max(axis=1)
+    return s, places, bulge, whisker.frame(np.array(whisker.length))[:, 0]
 
 
 def nearest_on_rest(whisker: Whisker, points: Array) -> tuple[Array, Array]:
@@ -70,26 +73,11 @@ def nearest_on_rest(whisker: Whisker, points: Array) -> tuple[Array, Array]:
         Distance and arc length of the nearest point, m.
     """
     points = np.asarray(points, dtype=np.float64)
-    flat = points.reshape(-1, 3)
-    distance, arc_length = np.full(len(flat), np.nan), np.full(len(flat), np.nan)
-    rows = np.flatnonzero(np.isfinite(flat).all(axis=1))
-    if rows.size:
-        s, places, tree, _ = resting(whisker)
-        flat = flat[rows]
-        _, i = tree.query(flat)
-        # Between samples the curve is straight enough: the nearest point of the two chords at
-        # the sample.
-        j = np.stack([np.maximum(i - 1, 0), np.minimum(i, s.size - 2)])
-        start, chord = places[j], places[j + 1] - places[j]
-        t = np.einsum("jni,jni->jn", flat - start, chord)
-        t = np.clip(t / np.einsum("jni,jni->jn", chord, chord), 0.0, 1.0)
-        away = flat - start - t[..., None] * chord
-        away = np.sqrt(np.einsum("jni,jni->jn", away, away))
-        second = away[1] < away[0]
-        distance[rows] = np.where(second, away[1], away[0])
-        along = s[j] + t * (s[j + 1] - s[j])
-        arc_length[rows] = np.where(second, along[1], along[0])
-    return distance.reshape(points.shape[:-1]), arc_length.reshape(points.shape[:-1])
+    s, places, bulge, _ = resting(whisker)
+    distance, position = np.empty(points.shape[:-1]), np.empty(points.shape[:-1])
+    flat = np.ascontiguousarray(points.reshape(-1, 3))
+    nearest_on_chords(places, bulge, flat, distance.reshape(-1), position.reshape(-1))
+    return distance, position * s[1]
 
 
 def in_region(region: str, backward: AnyArray, large: AnyArray) -> AnyArray:

@@ -1,5 +1,8 @@
 """Whiskers: shape, section, material and frame, and the array on the face."""
 
+from typing import TYPE_CHECKING
+
+from vibrissa.deferred import names_from
 from vibrissa.whisker import morphology
 from vibrissa.whisker.array import WhiskerArray, whisker_array
 from vibrissa.whisker.model import Whisker
@@ -26,6 +29,9 @@ from vibrissa.whisker.section import (
     length_faults as length_faults,
 )
 
+if TYPE_CHECKING:
+    from vibrissa.whisker.nearest import nearest_on_chords as nearest_on_chords
+
 __all__ = [
     "Identity",
     "Pose",
@@ -36,3 +42,5 @@ __all__ = [
     "morphology",
     "whisker_array",
 ]
+
+__getattr__ = names_from(__name__, {"nearest": "nearest_on_chords"})  # compiled where it is used

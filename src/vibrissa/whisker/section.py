@@ -141,8 +141,8 @@ def _assumed_radius(length: float, section: Profile) -> str:
     base, tip = float(section(0.0)) * 1e6, float(section(length, "left")) * 1e6
     return (
         f"{_RADIUS_ASSUMED}: {base:.4g} µm at the base, {tip:.3g} µm at the tip; forces go with "
-        "its fourth power. Published regressions estimate it from a rat's whisker's row and column "
-        "(C2), or its length: rat (Python), --rat (command line)"
+        "its fourth power. --rat C2 (in Python rat=) takes it from published regressions, by row "
+        "and column of a rat's whisker or by its length"
     )
 
 

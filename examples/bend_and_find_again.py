@@ -53,7 +53,7 @@ figure = plots.bent_views(
     bent.contact_point,
     bent.force,
     labels=names,
-    finding=f"{held.sum()} of {len(points)} points hold the whisker; three signals with a sensor's "
-    f"noise locate them to {spread} mm",
+    finding=f"The whisker slips off {len(points) - held.sum()} of {len(points)} points; three "
+    f"noisy signals locate the others to {spread} mm",
 )
 plots.save(figure, folder / "bend_and_find_again", ["png"])

@@ -137,13 +137,14 @@ with plots.looking():
     candidates = one.candidates.point[order, :2] * 1e3
     left.plot(*candidates.T, "o-", color="#0072b2", ms=3, label="contacts with these two moments")
     left.plot(*(point[:2] * 1e3), "*", color="#d55e00", ms=9, label="true contact")
-    left.set(xlabel="x (mm)", ylabel="y (mm)", title="One sample of two moments leaves a curve")
+    left.set(xlabel="x (mm)", ylabel="y (mm)")
+    left.set_title("One sample of two moments leaves a curve", loc="left")
     left.legend(loc="upper left")
     right.plot(time, error * 1e3, color="#0072b2", label="error")
     right.plot(time, sigma * 1e3, "--", color="#d55e00", label="predicted error")
     right.set(xlabel="time (s)", ylabel="error of the contact point (mm)", yscale="log")
     right.set_yticks([1, 2, 5, 10, 20, 50], ["1", "2", "5", "10", "20", "50"])
     late = np.median(error[time > 0.8]) * 1e3
-    right.set_title(f"A second of motion of the base leaves {late:.1f} mm")
+    right.set_title(f"A second of motion of the base leaves {late:.1f} mm", loc="left")
     right.legend()
 plots.save(figure, folder / "robot_whisker", ["png"])

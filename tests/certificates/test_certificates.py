@@ -63,6 +63,7 @@ def test_a_straight_tapered_whisker_is_located_by_fx_mb_md(theorem):
     assert "interior 0.000 % (undecided: s 0.3 to 1, ℓ 0 to 1)" in stopped.summary()
     assert found.proved
     assert "unique (proved)" in found.summary()
+    assert repr(found) == f"<{found.summary()}>"
     assert found.share == 1.0
     assert set(found.parts) == {"interior", "proximal", "distal", "fold"}
 

@@ -99,7 +99,7 @@ def test_deflect_by_force_and_by_peg():
     assert "OK" not in text
     away = CliRunner().invoke(app, ["deflect", "--peg", "-5,20,0,2.7"])
     assert away.exit_code == 1
-    assert away.stdout.splitlines()[-1] == str(vb.Status.NO_CONTACT)
+    assert away.stdout.splitlines()[0] == str(vb.Status.NO_CONTACT)
     assert "nan" not in away.output
     text = run("deflect", "--peg", "25,8,0,2.7", "--push", "0,1,0")
     assert str(vb.Status.OK) in text

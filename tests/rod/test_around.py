@@ -128,6 +128,7 @@ def test_it_is_in_equilibrium_and_outside(wire, name):
     bent = vb.deflect_around(wire, objects)
     kept = np.isfinite(bent.arc_length[0])
     assert bent.status[0] == vb.Status.OK
+    assert repr(bent) == "<ObstacleDeflection at 1 placements: ok 1>"
     assert kept.sum() > 1
     assert bent.second_contact[0]
     s, push = bent.arc_length[0, kept], bent.contact_force[0, kept]

@@ -55,6 +55,7 @@ def trial(motions):
 def test_whiskers_begin_where_they_rest():
     still = np.zeros(3)
     motion = Motion(np.arange(3.0), still, still, still, np.zeros((3, 3)))
+    assert repr(motion) == "<Motion of 3 frames, 2 s>"
     for name, moves in protracted(ARRAY, motion).items():
         pose = ARRAY[name].pose
         np.testing.assert_allclose(moves.base_rotation, [pose.rotation] * 3, atol=1e-14)

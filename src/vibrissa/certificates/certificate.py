@@ -107,7 +107,7 @@ class Part:
         return not len(self.undecided) and covers(self.certified)
 
 
-@dataclass
+@dataclass(repr=False)
 class Certificate:
     """Boxes that prove that a whisker's (F_x, M_B, M_D) locates every contact outside a cone.
 
@@ -148,7 +148,11 @@ class Certificate:
     turns: bool = False
     refuted: str = ""
     seconds: float = 0.0
-    _tables: dict[str, Conditions] = field(default_factory=dict, repr=False, compare=False)
+    _tables: dict[str, Conditions] = field(default_factory=dict, compare=False)
+
+    def __repr__(self) -> str:
+        """What is proved and what is not, instead of its boxes."""
+        return f"<{self.summary()}>"
 
     @property
     def proved(self) -> bool:

@@ -30,9 +30,9 @@ def calibrate(
 ) -> None:
     """Calibrate cameras by a checkerboard, or a suspended whisker by touches at known points.
 
-    The board is to be seen by all cameras at the same moments (extra cameras), and turned and moved
+    All cameras must see the board at the same moments (extra cameras); it is turned and moved
     between images. The file is for `vibrissa track --cameras`; its laboratory frame is that of the
-    board in the first moment in which all cameras see it. The description of a stage
+    board at the first moment at which all cameras see it. The description of a stage
     (vibrissa.sensors.Stage) names tables of touches and of the resting whisker; the calibrated
     sensor is for `vibrissa estimate --sensor`.
     Example: `vibrissa calibrate --pattern 9x6 --square 5 top_*.png front_*.png -o cameras.toml`;

@@ -34,10 +34,10 @@ def deflect(
 ) -> None:
     """Bend a whisker by a point, a force or a peg, and print force and moment at its base.
 
-    All in the whisker's frame. Give one of --point, --point-force, --peg (upright without --axis).
-    With --gravity the whisker sags under its weight, and force and moment are those of a sensor
-    that was tared at rest. Where there is no equilibrium the status states why, and the exit status
-    is 1.
+    Everything is in the whisker's frame. Give one of --point, --point-force and --peg (upright
+    without --axis). With --gravity the whisker sags under its weight, and force and moment are
+    those of a sensor that was tared at rest. Where there is no equilibrium the status states why,
+    and the exit status is 1.
     Example: `vibrissa deflect --point 25,12,1`
     """
     load = _load(point, point_force, peg, axis, push)
@@ -49,13 +49,13 @@ def deflect(
     if density is not None:
         whisker = whisker.with_properties(density=density)
     pull = None if gravity is None else numbers(gravity, _XYZ, "--gravity")
-    say(repr(whisker))
-    print_notes(whisker)
     bent = vb.deflect(whisker, load, gravity=pull, proximal=smallest_arc(proximal), device=device)
     status = vb.Status(int(bent.status))
     # The advice by the name that the option has here.
     option = " The option is --proximal." if status == vb.Status.TOO_PROXIMAL else ""
     say(f"{status}{option}")
+    say(repr(whisker))
+    print_notes(whisker)
     _doubt_the_unit(load, whisker)
     if not (status.ok and math.isfinite(bent.arc_length)):
         raise typer.Exit(1)

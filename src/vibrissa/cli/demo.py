@@ -82,14 +82,17 @@ def _report(result: DemoResult, noise: bool) -> None:
     scores = sensed.scores
     none, one, several = scores.candidates
     least = shown("MB", sensed.contacts.attrs["felt_above"], 3)
+    away = shown("peg_position", float((scores.offset**2).sum() ** 0.5), 2)
     say()
-    say(f"{sensed.contacts.sizes['time']} frames, {scores.touching} in contact")
-    say(f"{scores.detected} contacts measured (M_B over {least}), {scores.false} of them false")
-    say(f"estimated from ({', '.join(sensed.contacts.attrs['signals'].split())}) only")
+    used = ", ".join(sensed.contacts.attrs["signals"].split())
+    say(f"From ({used}) alone the peg is found {away} from where it is.")
     say(
-        f"{100 * scores.share_with_one:.1f} % have exactly one candidate ({one}); {none} none, as "
-        f"noise can have it; {several} several, of which the one that goes on from the frames "
-        "around is taken"
+        f"{scores.touching} of {sensed.contacts.sizes['time']} frames are in contact; in "
+        f"{scores.detected} a contact was measured (M_B over {least}), {scores.false} of them false"
+    )
+    say(
+        f"{one} of these ({100 * scores.share_with_one:.1f} %) have exactly one candidate, {none} "
+        f"none, {several} several: the one that continues the neighbouring frames is taken"
     )
     say()
     if result.tracking is not None:
@@ -182,10 +185,4 @@ def _print_peg(result: DemoResult) -> None:
         for label, *lengths in (*values, ("diameter", *diameter)):
             rows.append([label, *(f"{1e3 * float(value):.4f} mm" for value in lengths)])
         rows += [["tilt", "", "", shown("base_azimuth", scores.tilt, 2), ""], None]
-    away = shown("peg_position", float((result.sensed.scores.offset**2).sum() ** 0.5), 2)
-    print_table(
-        ["", "fitted", "true", "error", "its sigma"],
-        rows,
-        "The peg",
-        f"its axis, {_SENSED}, is {away} from the true one",
-    )
+    print_table(["", "fitted", "true", "error", "its sigma"], rows, "The peg")

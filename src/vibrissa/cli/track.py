@@ -580,8 +580,8 @@ def print_tracked(result: xr.DataTree, path: Path) -> None:
         say(
             f"{name}: {shown('length', length)} long, in contact in "
             f"{int(np.nansum(one['in_contact'].values))} of {one.sizes['time']} frames, lost in "
-            f"{int((one['confidence'] == 0.0).sum())}, misfit of the traces {misfit:.2f} of their "
-            "standard deviation"
+            f"{int((one['confidence'] == 0.0).sum())}; the rod fits the traces to {misfit:.2f} "
+            "standard deviations"
         )
         if misfit > _POOR:
             say(

@@ -34,6 +34,9 @@ def uniqueness(
 ) -> None:
     """Find which triplets of signals locate the contact uniquely, with witnesses where not.
 
+    A witness is a pair of contacts with the same three signals. Where there are any, the table
+    states how far from rest they are found; contacts within --cone of rest do not count.
+
     Example: `vibrissa uniqueness map.nc -o uniqueness.nc`
     """
     if target is not None:

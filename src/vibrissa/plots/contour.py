@@ -319,8 +319,8 @@ def distances_by_class(summaries: Sequence[xr.Dataset], *, width: style.Width = 
         first = quantity(shown[0].attrs["quantity"]).long_name
         style.conclude(
             figure,
-            f"Contacts are {np.nanmin(medians):.0f} to {np.nanmax(medians):,.0f} µm from the "
-            f"surface in the median, by class of {first}",
+            f"Median distance from the surface: {np.nanmin(medians):.0f} to "
+            f"{np.nanmax(medians):,.0f} µm, by class of {first}",
         )
         return figure
 
@@ -348,8 +348,9 @@ def _panel(axes: Axes, summary: xr.Dataset) -> None:
     name = summary.attrs["quantity"]
     ends = [summary[end].values for end in ("lower", "upper")]
     lower, upper = (to_display(name, v) for v in ends)
+    short = name == "deflection_angle"  # whole degrees, which need one line
     marks = [
-        f"{a:.3g}–\n{b:.3g}\n({int(n)})"
+        f"{a:.3g}–{'' if short else chr(10)}{b:.3g}\n({int(n)})"
         for a, b, n in zip(lower, upper, summary["contacts"].values, strict=True)
     ]
     axes.set_xticks(place, marks)

@@ -312,7 +312,8 @@ def _finding(course: Course) -> str:
     away = to_display("r", np.linalg.norm(course.estimated - course.known, axis=1))
     if not np.isfinite(away).any():
         return words
-    return f"{words}; estimates {np.nanmedian(away):.2g} mm from {course.known_as} contact points"
+    distance = f"median distance from {course.known_as} contact points"
+    return f"{words}; {distance} {np.nanmedian(away):.2g} mm"
 
 
 def _sheet(width: style.Width, images: int, compared: bool) -> _Sheet:

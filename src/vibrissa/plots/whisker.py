@@ -145,7 +145,7 @@ def _tube(places: Array, radii: Array) -> Path:
 
 def _caption(axes: Axes, name: str | None, magnification: float, assumed: Sequence[str]) -> None:
     """Say whose views these are, how much too wide, and what is assumed."""
-    axes.set_title(name or "whisker", loc="left", fontweight="bold")
+    axes.set_title(name or "whisker", loc="left", fontsize=style.LARGE)
     lines = [f"width × {magnification:g}" if magnification != 1 else "true width"]
     lines += [f"assumed: {one}" for one in assumed]
     axes.text(

@@ -8,7 +8,7 @@ contact reaches into an object elsewhere, all contacts are solved together
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,7 +30,7 @@ from vibrissa.rod.obstacles import (
 )
 from vibrissa.rod.statics import check_objects
 from vibrissa.rod.surfaces import Progress, SurfaceDeflection, follow_surfaces
-from vibrissa.status import Status
+from vibrissa.status import Status, counted
 
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
@@ -44,7 +44,7 @@ _PRESSED = 5e-3  # a whisker that objects do not reach is pressed by so much to 
 _JUMP = 0.1  # continued from the placement before, no node moves farther, over L
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ObstacleDeflection:
     """Whisker against objects, at n placements, with up to k contacts each.
 
@@ -84,8 +84,8 @@ class ObstacleDeflection:
     several: Mask
     overlap: Array
     status: IntArray
-    _bent: Deflection = field(repr=False)
-    _solved: dict[int, Equilibrium] = field(repr=False)
+    _bent: Deflection
+    _solved: dict[int, Equilibrium]
 
     def strongest(self) -> tuple[Array, Array, Array, IntArray]:
         """Return of each placement the contact with the largest force.
@@ -119,6 +119,10 @@ class ObstacleDeflection:
         for row, found in self._solved.items():
             lines[row] = found.centerline(n) * self.whisker.length
         return lines
+
+    def __repr__(self) -> str:
+        """Number of placements, and how many have each status."""
+        return f"<ObstacleDeflection at {self.status.size} placements: {counted(self.status)}>"
 
 
 def deflect_around(

@@ -61,7 +61,7 @@ ROLL_PER_AZIMUTH: Mapping[str, float] = MappingProxyType(
 _DRIFT = np.array([0.31, 0.57, 0.93])
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Motion:
     """Pose of the base over time.
 
@@ -113,6 +113,11 @@ class Motion:
             faults.append("time does not rise")
         if faults:
             raise ValueError("no motion: " + "; ".join(faults))
+
+    def __repr__(self) -> str:
+        """Number of frames and duration."""
+        span = float(np.ptp(self.time)) if np.size(self.time) else 0.0
+        return f"<Motion of {np.size(self.time)} frames, {span:.4g} s>"
 
     @property
     def base_rotation(self) -> Array:

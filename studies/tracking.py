@@ -6,7 +6,7 @@ them with the base clicked where it truly is; whether that would have been found
 judged apart. Then rows of whiskers that cross, and three of the films as a laboratory without
 clicks, with a mirror or with one camera has them. By default seeds 61 to 66, on which no number was
 set; three minutes on a free core, of which ``--part`` makes one part only. ``--page`` writes the
-tables into `docs/tracking-accuracy.md` and `docs/tracking-rows.md`, else they are printed.
+tables into `docs/tracking-films.md` and `docs/tracking-rows.md`, else they are printed.
 """
 
 import argparse
@@ -66,7 +66,14 @@ WARM = 10
 """Number of frames before the time of a frame is taken: the first ones find light and whisker."""
 ROW_HEAD = ("film", "whiskers", "view", "images", "right, %", "lost, %", "swapped, %", "ms")
 WAYS = (62, 65, 66)
-WAY_HEAD = ("film", "way", "lost, wrong", "contact right, %", "contact, µm (95 %)", "held: contact")
+WAY_HEAD = (
+    "film",
+    "filmed or started",
+    "lost, wrong",
+    "contact right, %",
+    "contact, µm (95 %)",
+    "held: contact",
+)
 NEAR = 3e-3
 """Distance from a contact within which a trace is near it, m."""
 
@@ -277,7 +284,7 @@ def main():
     parser.add_argument("--page", action="store_true", help="write the tables into the page")
     parser.add_argument("--part", choices=PARTS, help="make one table only")
     chosen = parser.parse_args()
-    pages = [ROOT / "docs" / f"tracking-{name}.md" for name in ("accuracy", "rows")]
+    pages = [ROOT / "docs" / f"tracking-{name}.md" for name in ("films", "rows")]
     for name, (head, texts, rows) in PARTS.items():
         if chosen.part not in (None, name):
             continue

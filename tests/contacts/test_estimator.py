@@ -40,7 +40,7 @@ def test_a_stream_is_the_same_as_a_batch(gamma_map, sweep, names, noise):
         assert away.min() < 1e-8
     # One branch, after one taken first (of Fx, FT and MB alone) has come to its end.
     path = np.linalg.norm(np.diff(bent.contact_point, axis=0), axis=1).max()
-    assert np.linalg.norm(np.diff(followed[4:], axis=0), axis=1).max() < 2.0 * path
+    assert np.linalg.norm(np.diff(followed[8:], axis=0), axis=1).max() < 2.0 * path
 
 
 def test_under_noise_a_stream_is_the_same(gamma_map, sweep, rng):

@@ -9,6 +9,7 @@ starts on it: χ² may be least there, however near a contact is that explains t
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -138,6 +139,23 @@ def _basins(
                 parent[mine] = theirs
 
 
+class _Room(NamedTuple):
+    """Working memory.
+
+    Target and slack (3,), known contacts in the chart (n, 3); of each cell its number, where in the
+    chart it is nearest (n, 3), how far it misses, its order and its basin.
+    """
+
+    target: Array
+    slack: Array
+    known: Array
+    cells: IntArray
+    spots: Array
+    away: Array
+    order: IntArray
+    parent: IntArray
+
+
 @kernel
 def starts_of_basins(
     of: Searched,
@@ -154,10 +172,35 @@ def starts_of_basins(
 
     Return how many there are, and whether there are more.
     """
-    target, slack, known = np.empty(3), np.empty(3), np.empty((MOST_CANDIDATES, 3))
-    cells, order = np.empty(MOST_CELLS, np.int64), np.empty(MOST_CELLS, np.int64)
-    spots, away = np.empty((MOST_CELLS, 3)), np.empty(MOST_CELLS)
-    parent, kept, count = np.empty(MOST_CELLS, np.int64), 0, 0
+    room = _Room(
+        np.empty(3),
+        np.empty(3),
+        np.empty((MOST_CANDIDATES, 3)),
+        np.empty(MOST_CELLS, np.int64),
+        np.empty((MOST_CELLS, 3)),
+        np.empty(MOST_CELLS),
+        np.empty(MOST_CELLS, np.int64),
+        np.empty(MOST_CELLS, np.int64),
+    )
+    return _starts(of, apart, sigma, measured, x, residuals, jacobians, number, starts, room)
+
+
+@kernel
+def _starts(
+    of: Searched,
+    apart: float,
+    sigma: Array,
+    measured: Array,
+    x: Array,
+    residuals: Array,
+    jacobians: Array,
+    number: int,
+    starts: Array,
+    room: _Room,
+) -> tuple[int, bool]:
+    """Fill starts; arrays made by another function are not counted at each use."""
+    target, slack, known, cells, spots, away, order, parent = room
+    kept, count = 0, 0
     for q in range(3):
         target[q], slack[q] = measured[of.where[q]], min(apart * sigma[q], _WIDEST)
     n = cells_around(of.tree, target, slack, cells, spots, away)

@@ -15,6 +15,7 @@ from vibrissa.contacts.contacts import MOST_CANDIDATES
 from vibrissa.contacts.inversion import invert_rows
 from vibrissa.contacts.least_squares import (
     Fits,
+    approach,
     channel_equations,
     fit_rows,
     same_contact,
@@ -31,6 +32,7 @@ from vibrissa.rod import (
     LEAST_ARC,
     MOST_SEEDS,
     ROUNDING,
+    Charted,
     Rod,
     chart_to_contact,
     evaluate,
@@ -170,7 +172,7 @@ def _best(
     x, values, tangents, misfits, inside = state
     limit = problem.limit
     x[:], tangents[:], misfits[:], inside[:] = 0.0, 0.0, np.inf, 0
-    n = _seeded(of, measured, x, values)
+    n = _seeded(of, how, target, measured, x, values)
     _fitted(of, how, problem, target, measured, state, 0, n)
     kept, good = np.empty(MOST_CANDIDATES, np.int64), _explained(misfits, inside, limit, n)
     if not (good or problem.noisy):
@@ -197,18 +199,26 @@ def _nearest_fit(misfits: Array, inside: IntArray, n: int, kept: IntArray) -> in
 
 
 @kernel
-def _seeded(of: Searched, measured: Array, x: Array, values: Array) -> int:
-    """Fill contacts that about give three quantities; how many."""
+def _seeded(
+    of: Searched, how: Weighing, target: Array, measured: Array, x: Array, values: Array
+) -> int:
+    """Fill contacts that about give three quantities, or rather all, and (F, p); how many."""
     found, quality = np.empty((MOST_SEEDS, 3)), np.empty(MOST_SEEDS, np.int64)
     slopes, xi, three = np.empty((MOST_SEEDS, 3, 3)), np.empty(3), np.empty(3)
+    number = 0
     for k in range(3):
         three[k] = measured[of.where[k]]
     n = int(seeds(of.tree, three, found, slopes, quality))
     for row in range(n):
+        at, new = x[number], True
         chart_to_contact(of.fold, found[row], xi)
-        x[row, 0], x[row, 2], x[row, 3] = xi[0], xi[1], xi[2]
-    evaluate(of.rod, x, values, np.empty((0, 6, 3)), 0, n)
-    return n
+        at[0], at[1], at[2], at[3] = xi[0], 0.0, xi[1], xi[2]
+        approach(Charted(of.rod, of.fold, of.nodes), how, target, measured, at)
+        for other in range(number):
+            new = new and not same_contact(at, x[other])
+        number += 1 if new else 0
+    evaluate(of.rod, x, values, np.empty((0, 6, 3)), 0, number)
+    return number
 
 
 @kernel

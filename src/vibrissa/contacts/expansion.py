@@ -20,9 +20,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.least_squares import channel_equations, lane_contact, whiten
+from vibrissa.contacts.least_squares import channel_equations, whiten
 from vibrissa.numerics import Array, IntArray, cholesky, copy, inlined, mahalanobis
-from vibrissa.rod import LANES, LEAST_ARC, Rod, integrate, lane_value, set_lane
+from vibrissa.rod import (
+    LANES,
+    LEAST_ARC,
+    Charted,
+    integrate,
+    interpolate,
+    lane_slopes,
+    lane_value,
+    set_lane,
+)
 
 # How far along each axis the second order is taken from, and the other end is tried if there is
 # room for the least, in standard deviations.
@@ -42,7 +51,10 @@ _SWEEPS = 12
 class Expansion(NamedTuple):
     """Working memory for one candidate: r̂ (k), B (k, 3), H_r (k, 3, 3); A, H_p; axes in columns.
 
-    Last C (3, 3, 3), and ∂²s/∂u² (3, 3).
+    Then C (3, 3, 3), and ∂²s/∂u² (3, 3). r̂, and derivatives of r (k, 3) and p (3, 3) by ξ, by the
+    means by which displaced contacts are known: their x (3, 4), (F, p) (3, 6) and ∂(F, p)/∂x
+    (3, 6, 4), and r (k), and the derivatives again, of one of them. Last residuals, slopes by x
+    (k, 4), the same in standard deviations, and steps (3, 3).
     """
 
     r0: Array
@@ -53,6 +65,47 @@ class Expansion(NamedTuple):
     axes: Array
     bends: Array
     bent_s: Array
+    here_r: Array
+    here_j: Array
+    here_slopes: Array
+    moved: Array
+    values: Array
+    tangents: Array
+    r: Array
+    j: Array
+    slopes: Array
+    residual: Array
+    jacobian: Array
+    four: Array
+    steps: Array
+
+
+@inlined
+def empty_expansion(k: int) -> Expansion:
+    """Make the working memory for k channels."""
+    return Expansion(
+        np.empty(k),
+        np.empty((k, 3)),
+        np.empty((k, 3, 3)),
+        np.empty((3, 3)),
+        np.empty((3, 3, 3)),
+        np.empty((3, 3)),
+        np.empty((3, 3, 3)),
+        np.empty((3, 3)),
+        np.empty(k),
+        np.empty((k, 3)),
+        np.empty((3, 3)),
+        np.empty((3, 4)),
+        np.empty((3, 6)),
+        np.zeros((3, 6, 4)),
+        np.empty(k),
+        np.empty((k, 3)),
+        np.empty((3, 3)),
+        np.empty(k),
+        np.empty((k, 4)),
+        np.empty((k, 4)),
+        np.empty((3, 3)),
+    )
 
 
 @inlined
@@ -161,9 +214,11 @@ def cap_axes(x: Array, axes: Array) -> bool:
 @inlined
 def shorten_axes(model: Expansion) -> bool:
     """Shorten axes along which the second order ends the density sooner; whether there are any."""
-    r0, by_r, bent_r, by_p, bent_p, axes, bends, bent_s = model
-    k, share, some = r0.shape[0], np.ones(3), False
+    r0, by_r, bent_r, by_p, bent_p = model.r0, model.by_r, model.bent_r, model.by_p, model.bent_p
+    axes, bends, bent_s, share = model.axes, model.bends, model.bent_s, model.steps[0]
+    k, some = r0.shape[0], False
     for i in range(3):
+        share[i] = 1.0
         level, bent = 0.0, 0.0
         for a in range(k):
             level += by_r[a, i] ** 2 + r0[a] * bent_r[a, i, i]
@@ -203,26 +258,49 @@ def _ends(x: Array, axes: Array, steps: Array, others: Array) -> None:
 
 
 @inlined
-def _load(b: Array, x: Array, model: Expansion, steps: Array, moved: Array) -> None:
-    """Load contacts displaced along the bent axes; ``moved`` (4, 4), the last as the third.
+def _displace(x: Array, model: Expansion, steps: Array, moved: Array) -> None:
+    """Fill contacts displaced along the bent axes (3, 4).
 
     Steps that would leave the whisker are shortened.
     """
     axes, bends, bent_s = model.axes, model.bends, model.bent_s
-    for i in range(LANES):
-        at = min(i, 2)
+    for i in range(3):
         for _ in range(_TRIALS):
-            s = x[0] + steps[at] * (axes[0, at] + 0.5 * steps[at] * bent_s[at, at])
+            s = x[0] + steps[i] * (axes[0, i] + 0.5 * steps[i] * bent_s[i, i])
             if not LEAST_ARC <= s <= 1.0:
-                steps[at] *= 0.5
-        h = steps[at]
+                steps[i] *= 0.5
+        h = steps[i]
         for c in range(3):
-            change = h * axes[c, at]
+            change = h * axes[c, i]
             for a in range(3):
-                change += 0.5 * h * h * axes[c, a] * bends[a, at, at]
+                change += 0.5 * h * h * axes[c, a] * bends[a, i, i]
             moved[i, min(c, 1) + c] = x[min(c, 1) + c] + change
         moved[i, 0], moved[i, 1] = min(max(moved[i, 0], LEAST_ARC), 1.0), 0.0
-        set_lane(b, i, moved[i, 0], 0.0, moved[i, 2], moved[i, 3], False)
+
+
+@inlined
+def _follow(rod: Charted, work: Array, near: bool, model: Expansion, slopes: int) -> bool:
+    """Fill (F, p) of the displaced contacts, and ∂(F, p)/∂x if slopes are wanted (3), not 0.
+
+    They are interpolated if ``near`` and all are on the map, else the rod is integrated. Return
+    which.
+    """
+    moved, values, tangents = model.moved, model.values, model.tangents
+    for i in range(3):
+        near = near and interpolate(
+            rod.nodes, rod.fold, work, moved[i], values[i], tangents[i], slopes > 0
+        )
+    if near:
+        return True
+    for i in range(LANES):
+        x = moved[min(i, 2)]
+        set_lane(work, i, x[0], 0.0, x[2], x[3], False)
+    integrate(rod.rod, work, slopes)
+    for i in range(3):
+        lane_value(work, i, values[i])
+        if slopes > 0:
+            lane_slopes(work, i, tangents[i])
+    return False
 
 
 @inlined
@@ -234,19 +312,42 @@ def _by_axis(derivatives: Array, axes: Array, i: int) -> float:
 
 
 @inlined
-def _missed(model: Expansion, i: int, h: float, r: Array) -> float:
-    """What the second order misses of the channels' residuals on an axis, at the usual distance."""
+def _missed(model: Expansion, i: int, h: float) -> float:
+    """What the second order misses of r on an axis, at the usual distance."""
     away = 0.0
-    for a in range(r.shape[0]):
-        by, bent = model.by_r[a, i], model.bent_r[a, i, i]
-        away += (r[a] - model.r0[a] - h * by - 0.5 * h * h * bent) ** 2
+    for a in range(model.r.shape[0]):
+        by, bent = _by_axis(model.here_j[a], model.axes, i), model.bent_r[a, i, i]
+        away += (model.r[a] - model.here_r[a] - h * by - 0.5 * h * h * bent) ** 2
     return math.sqrt(away) * (_REACH / abs(h)) ** 3
 
 
 @inlined
-def expand(
-    rod: Rod,
-    b: Array,
+def _weigh(
+    codes: IntArray,
+    target: Array,
+    weights: Array,
+    x: Array,
+    value: Array,
+    tangents: Array,
+    model: Expansion,
+    r: Array,
+    j: Array,
+    slopes: Array,
+) -> None:
+    """Fill r and its derivatives (k, 3) and those of p (3, 3) by ξ of a contact."""
+    channel_equations(x, value, tangents, codes, target, model.residual, model.jacobian)
+    whiten(weights, model.residual, model.jacobian, codes.shape[0], r, model.four)
+    without_friction(model.four, j)
+    for a in range(3):
+        t, by = tangents[3 + a], slopes[a]
+        by[0], by[1], by[2] = t[0], t[2], t[3]
+
+
+@inlined
+def _here(
+    rod: Charted,
+    work: Array,
+    near: bool,
     codes: IntArray,
     target: Array,
     weights: Array,
@@ -254,40 +355,79 @@ def expand(
     slopes: Array,
     j: Array,
     model: Expansion,
-) -> None:
+) -> bool:
+    """Fill r̂ and derivatives by ξ, if ``near`` as interpolated; whether they could be."""
+    here = model.here_r, model.here_j, model.here_slopes
+    value, tangents = model.values[0], model.tangents[0]
+    if near and interpolate(rod.nodes, rod.fold, work, x, value, tangents, True):
+        _weigh(codes, target, weights, x, value, tangents, model, *here)
+        return True
+    copy(model.r0, model.here_r)
+    for a in range(j.shape[0]):
+        copy(j[a], model.here_j[a])
+    for a in range(3):
+        copy(slopes[a], model.here_slopes[a])
+    return False
+
+
+@inlined
+def expand(
+    rod: Charted,
+    work: Array,
+    near: bool,
+    codes: IntArray,
+    target: Array,
+    weights: Array,
+    x: Array,
+    slopes: Array,
+    j: Array,
+    model: Expansion,
+) -> bool:
     """Fill B, H_r, A, H_p and C of the model, by derivatives at contacts displaced along each axis.
 
-    These come nearer along an axis that leaves a bent valley, or that the second order ends.
+    These come nearer along an axis that leaves a bent valley, or that the second order ends. They
+    are interpolated if ``near`` and all are on the map; return whether.
     """
-    _, by_r, bent_r, by_p, bent_p, axes, bends, bent_s = model
-    k, steps, others, nearer = codes.shape[0], np.empty(3), np.empty(3), True
-    moved, value, t, third = np.empty((LANES, 4)), np.empty(6), np.zeros((6, 4)), np.empty((6, 3))
-    residual, jacobian, four = np.empty(k), np.empty((k, 4)), np.empty((k, 4))
-    r, there = np.empty(k), np.empty((k, 3))
+    by_r, bent_r, by_p, bent_p, axes = (
+        model.by_r,
+        model.bent_r,
+        model.by_p,
+        model.bent_p,
+        model.axes,
+    )
+    k, steps, nearer = codes.shape[0], model.steps[0], True
     for i in range(3):
         for a in range(k):
             by_r[a, i] = _by_axis(j[a], axes, i)
         for a in range(3):
             by_p[a, i] = _by_axis(slopes[a], axes, i)
-    _ends(x, axes, steps, others)
-    bends[:], bent_s[:] = 0.0, 0.0
+    _ends(x, axes, steps, model.steps[1])
+    model.bends[:], model.bent_s[:] = 0.0, 0.0
+    near = _here(rod, work, near, codes, target, weights, x, slopes, j, model)
     for _ in range(_TRIALS):
         if not nearer:
             break
         nearer = False
-        _load(b, x, model, steps, moved)
-        integrate(rod, b, 3)
+        _displace(x, model, steps, model.moved)
+        if near and not _follow(rod, work, True, model, 3):
+            near = _here(rod, work, False, codes, target, weights, x, slopes, j, model)
+        elif not near:
+            _follow(rod, work, False, model, 3)
         for i in range(3):
             h, away = steps[i], 0.0
-            lane_contact(b, i, False, value, t, third)
-            channel_equations(moved[i], value, t, codes, target, residual, jacobian)
-            whiten(weights, residual, jacobian, k, r, four)
-            without_friction(four, there)
-            for q in range(3):
-                for a in range(k):
-                    bent_r[a, i, q] = (_by_axis(there[a], axes, q) - by_r[a, q]) / h
-                for a in range(3):
-                    bent_p[a, i, q] = (_by_axis(third[3 + a], axes, q) - by_p[a, q]) / h
+            there = model.r, model.j, model.slopes
+            value, tangents = model.values[i], model.tangents[i]
+            _weigh(codes, target, weights, model.moved[i], value, tangents, model, *there)
+            for a in range(k):
+                for q in range(3):
+                    model.j[a, q] -= model.here_j[a, q]
+                for q in range(3):
+                    bent_r[a, i, q] = _by_axis(model.j[a], axes, q) / h
+            for a in range(3):
+                for q in range(3):
+                    model.slopes[a, q] -= model.here_slopes[a, q]
+                for q in range(3):
+                    bent_p[a, i, q] = _by_axis(model.slopes[a], axes, q) / h
             for a in range(k):
                 away += bent_r[a, i, i] ** 2
             most = _REACH / math.sqrt(max(math.sqrt(away), 1.0))
@@ -295,28 +435,40 @@ def expand(
                 steps[i], nearer = math.copysign(most, h), True
     _even(model)
     _bend(model)
+    return near
 
 
 @inlined
 def missed_at_ends(
-    rod: Rod, b: Array, codes: IntArray, target: Array, weights: Array, x: Array, model: Expansion
+    rod: Charted,
+    work: Array,
+    near: bool,
+    codes: IntArray,
+    target: Array,
+    weights: Array,
+    x: Array,
+    slopes: Array,
+    j: Array,
+    model: Expansion,
 ) -> float:
     """What the second order misses of the channels at both ends of the bent axes."""
-    k, missed, ends, room = codes.shape[0], 0.0, np.empty((2, 3)), np.empty((2, 3))
-    moved, value, t, r = np.empty((LANES, 4)), np.empty(6), np.zeros((6, 4)), np.empty(k)
-    residual, jacobian, four = np.empty(k), np.empty((k, 4)), np.empty((k, 4))
-    _ends(x, model.axes, ends[0], ends[1])
+    missed, room = 0.0, model.steps[2]
+    _ends(x, model.axes, model.steps[0], model.steps[1])
     for end in range(2):
-        copy(ends[end], room[end])
-        _load(b, x, model, ends[end], moved)
-        integrate(rod, b, 0)
+        steps = model.steps[end]
+        copy(steps, room)
+        _displace(x, model, steps, model.moved)
+        if not _follow(rod, work, near, model, 0) and near:
+            near = _here(rod, work, False, codes, target, weights, x, slopes, j, model)
         for i in range(3):
-            if abs(ends[end, i]) >= _LEAST_END:
-                lane_value(b, i, value)
-                channel_equations(moved[i], value, t, codes, target, residual, jacobian)
-                whiten(weights, residual, jacobian, k, r, four)
-                missed = max(missed, _missed(model, i, ends[end, i], r))
-            elif abs(room[end, i]) >= _LEAST_END:  # the axis is too bent to be followed
+            if abs(steps[i]) >= _LEAST_END:
+                value, tangents = model.values[i], model.tangents[i]
+                channel_equations(
+                    model.moved[i], value, tangents, codes, target, model.residual, model.jacobian
+                )
+                whiten(weights, model.residual, model.jacobian, codes.shape[0], model.r, model.four)
+                missed = max(missed, _missed(model, i, steps[i]))
+            elif abs(room[i]) >= _LEAST_END:  # the axis is too bent to be followed
                 missed = np.inf
     return missed
 
@@ -328,7 +480,8 @@ def _bend(model: Expansion) -> None:
     A change along axis m undoes what displacements along two others do to residuals, if these
     determine it: that of a bent valley. What an axis does to itself, as near folds, remains.
     """
-    _, by_r, bent_r, by_p, bent_p, axes, bends, bent_s = model
+    by_r, bent_r, by_p, bent_p = model.by_r, model.bent_r, model.by_p, model.bent_p
+    axes, bends, bent_s = model.axes, model.bends, model.bent_s
     for m in range(3):
         size = 0.0
         for a in range(by_r.shape[0]):

@@ -20,19 +20,11 @@ import math
 import numpy as np
 
 from vibrissa.contacts.expansion import axis_length, principal_axes, without_friction
-from vibrissa.contacts.least_squares import channel_equations, whiten
+from vibrissa.contacts.least_squares import channel_equations, contact_equations, whiten
 from vibrissa.contacts.valleys import CLOSED, Nodes, mixture, pace, shares_of
 from vibrissa.contacts.weighing import Weighing, sharpness, weigh_any
 from vibrissa.numerics import Array, copy, inlined, kernel, solve
-from vibrissa.rod import (
-    BUFFER_SIZE,
-    Rod,
-    integrate,
-    lane_value,
-    lanes_tangents,
-    point_determinant,
-    set_all_lanes,
-)
+from vibrissa.rod import BUFFER_SIZE, Charted, point_determinant
 
 _STEPS, _ROUNDS = 12, 40  # steps each way at most, and how often contacts are evaluated for them
 # The first step, in standard deviations, and at most; and the longest: as a share of the force, or
@@ -166,7 +158,7 @@ def _ahead(x: Array, along: Array, bend: Array, step: float, proximal: float, to
 
 @inlined
 def _one_way(
-    rod: Rod,
+    rod: Charted,
     proximal: float,
     how: Weighing,
     target: Array,
@@ -193,10 +185,7 @@ def _one_way(
             return number, ended or step < wanted
         falls, there, trials = np.inf, 1.0, 0
         for _ in range(_TRIALS):
-            set_all_lanes(b, to[0], 0.0, to[2], to[3])
-            integrate(rod, b, 1)
-            lane_value(b, 0, value)
-            lanes_tangents(b, t)
+            contact_equations(rod, b, True, to, value, t)
             copy(along, turned)
             before = falls
             falls, there = _node(to, value, t, proximal, how, target, measured, nodes, i, turned)
@@ -245,7 +234,7 @@ def _described(
 
 @kernel
 def follow_valley(
-    rod: Rod,
+    rod: Charted,
     proximal: float,
     how: Weighing,
     target: Array,
@@ -269,10 +258,7 @@ def follow_valley(
     misfits, value, t, number = nodes[1], np.empty(6), np.zeros((6, 4)), np.zeros(2, np.int64)
     floor, point, along, turned = x.copy(), np.empty(3), np.empty(3), np.empty(3)
     more, least = False, np.inf
-    set_all_lanes(b, x[0], 0.0, x[2], x[3])
-    integrate(rod, b, 1)
-    lane_value(b, 0, value)
-    lanes_tangents(b, t)
+    contact_equations(rod, b, True, x, value, t)
     turned[0], turned[1], turned[2] = 0.0, -x[3], x[2]
     _, volume = _node(floor, value, t, proximal, how, target, measured, nodes, _STEPS, turned)
     if not volume > -np.inf:

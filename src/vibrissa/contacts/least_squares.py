@@ -43,12 +43,16 @@ from vibrissa.numerics import (
 from vibrissa.rod import (
     BUFFER_SIZE,
     LANES,
+    LEAST_ARC,
+    Charted,
     Discretization,
     Fold,
     Rod,
     StableSet,
     fold_force,
     integrate,
+    interpolate,
+    lane_slopes,
     lane_tangents,
     lane_value,
     lanes_tangents,
@@ -74,6 +78,8 @@ _MOST_DAMPING = 1e8
 _ROUNDS_WITHIN = 100
 # A step that promises less of χ² (as a share of it, and by itself) is not taken.
 _IDLE_WITHIN, _LITTLE = 1e-6, 1e-9
+_IDLE_NEAR = 1e-3  # between the map's nodes, where steps are good to about that
+_FIRST_ROUNDS = 4  # so many steps there before the rod is integrated
 # Nor is one that, undamped or after many rounds, promises less of what χ² is above what counts.
 _SLOW, _PATIENCE, _LATE = 0.05, 3, 25
 # Where the slopes of a fit miss a known contact by so much (χ²), and by no more than this share of
@@ -124,6 +130,22 @@ def channel_equations(
         residual[k] -= targets[k]
         if codes[k] in (FD, MD):
             residual[k] = wrapped(residual[k])
+
+
+@inlined
+def contact_equations(
+    rod: Charted, work: Array, near: bool, x: Array, value: Array, tangents: Array
+) -> None:
+    """Fill (F, p) and ∂(F, p)/∂x (6, 4) of a contact; between the map's nodes if ``near``.
+
+    Where it is not on the map the rod is integrated.
+    """
+    if near and interpolate(rod.nodes, rod.fold, work, x, value, tangents, True):
+        return
+    set_all_lanes(work, x[0], x[1], x[2], x[3])
+    integrate(rod.rod, work, 1)
+    lane_value(work, 0, value)
+    lanes_tangents(work, tangents)
 
 
 @inlined
@@ -225,9 +247,7 @@ def _finish(
 def lane_contact(b: Array, lane: int, friction: bool, value: Array, t: Array, third: Array) -> None:
     """Copy (F, p) and ∂(F, p)/∂x (6, 4) of a contact; with friction of its two lanes."""
     lane_value(b, lane, value)
-    lane_tangents(b, lane, third)
-    for a in range(6):
-        t[a, 0], t[a, 1], t[a, 2], t[a, 3] = third[a, 0], 0.0, third[a, 1], third[a, 2]
+    lane_slopes(b, lane, t)
     if friction:
         lane_tangents(b, lane + 1, third)
         for a in range(6):
@@ -326,6 +346,30 @@ def fit_rows(
                         contacts[at], values[at], tangents[at], r[i], j[i], k, work[5], work[6]
                     )
                     converged[at], active[i] = True, False
+
+
+@kernel
+def approach(rod: Charted, how: Weighing, target: Array, measured: Array, x: Array) -> None:
+    """Take the first steps of a fit without friction between the map's nodes."""
+    k, best = how.codes.shape[0], np.inf
+    b, value, t, weights = np.empty(BUFFER_SIZE), np.empty(6), np.zeros((6, 4)), np.zeros((k, k))
+    residual, jacobian, work = np.empty(k), np.empty((k, 4)), np.empty((7, 4))
+    r, j, before = np.empty(k), np.empty((k, 4)), x.copy()
+    for n in range(_FIRST_ROUNDS):
+        if not interpolate(rod.nodes, rod.fold, b, x, value, t, True):
+            break
+        if n == 0 and not weigh_any(how, value, measured, weights):
+            break
+        channel_equations(x, value, t, how.codes, target, residual, jacobian)
+        misfit = whiten(weights, residual, jacobian, k, r, j)
+        if not misfit < best:
+            break
+        best = misfit
+        copy(x, before)
+        if not _next(x, r, j, k, 0.0, LEAST_ARC, False, work) > _IDLE_NEAR:
+            break
+        copy(work[6], x)
+    copy(before, x)
 
 
 @inlined
@@ -591,10 +635,37 @@ def by_slopes(x: Array, r: Array, j: Array, other: Array) -> float:
     return total
 
 
+class _Room(NamedTuple):
+    """Working memory of a fit.
+
+    The rod's buffer; weights (k, k); a contact (4,) with (F, p) and ∂(F, p)/∂x (6, 4); residuals
+    and slopes of channels (k, 4), and in standard deviations, here and there; ∂ξ/∂z (3, 3),
+    curvature of the residuals, JᵀJ, that curvature in z, a Cholesky factor, gradient and step.
+    """
+
+    b: Array
+    weights: Array
+    to: Array
+    v: Array
+    t: Array
+    residual: Array
+    jacobian: Array
+    r: Array
+    j: Array
+    r_there: Array
+    j_there: Array
+    frame: Array
+    second: Array
+    normal: Array
+    bent: Array
+    root: Array
+    gradient: Array
+    step: Array
+
+
 @kernel
 def fit_within(
-    rod: Rod,
-    fold: Fold,
+    rod: Charted,
     proximal: float,
     how: Weighing,
     target: Array,
@@ -609,29 +680,65 @@ def fit_within(
     """Find the contact of least χ² in Ω, downhill from another, with the weights of that one.
 
     It is given up if above ``worth``. Where the way leads to a contact that is known and worth it,
-    with its χ² in ``misfits``, x becomes that. Return χ², and whether it is a least one.
+    with its χ² in ``misfits``, x becomes that. Return χ², and whether it is a least one. With limits
+    of worth, the way is that between the map's nodes; from its end on the rod is integrated.
     """
-    b, codes = np.zeros(BUFFER_SIZE), how.codes
+    k = how.codes.shape[0]
+    room = _Room(
+        np.zeros(BUFFER_SIZE),
+        np.empty((k, k)),
+        x.copy(),
+        np.empty(6),
+        np.zeros((6, 4)),
+        np.empty(k),
+        np.empty((k, 4)),
+        np.empty(k),
+        np.empty((k, 4)),
+        np.empty(k),
+        np.empty((k, 4)),
+        np.empty((3, 3)),
+        np.zeros((3, 3)),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty(3),
+        np.empty(3),
+    )
+    return _fit_within(
+        rod, proximal, how, target, measured, x, value, tangents, worth, known, misfits, room
+    )
+
+
+@kernel
+def _fit_within(
+    rod: Charted,
+    proximal: float,
+    how: Weighing,
+    target: Array,
+    measured: Array,
+    x: Array,
+    value: Array,
+    tangents: Array,
+    worth: float,
+    known: Array,
+    misfits: Array,
+    room: _Room,
+) -> tuple[float, bool]:
+    """Fit a contact; arrays made by another function are not counted at each use."""
+    b, weights, to, v, t, residual, jacobian, r, j, r_there, j_there = room[:11]
+    frame, second, normal, bent, root, gradient, step = room[11:]
+    codes, fold = how.codes, rod.fold
     k = codes.shape[0]
-    weights = np.empty((k, k))
-    to, v, t = x.copy(), np.empty(6), np.zeros((6, 4))
-    residual, jacobian = np.empty(k), np.empty((k, 4))
-    r, j, r_there, j_there = np.empty(k), np.empty((k, 4)), np.empty(k), np.empty((k, 4))
-    frame, second, normal = np.empty((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
-    bent, root, gradient, step = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
     best, damping, promised, folded = np.inf, 0.0, 0.0, False
-    ends = (False, False, False)
+    ends, near, begun = (False, False, False), worth < np.inf, False
     for n in range(_ROUNDS_WITHIN):
         folded_there = _confine(fold, proximal, to)
-        set_all_lanes(b, to[0], to[1], to[2], to[3])
-        integrate(rod, b, 1)
-        lane_value(b, 0, v)
-        lanes_tangents(b, t)
-        if n == 0 and not weigh_any(how, v, measured, weights):
+        contact_equations(rod, b, near, to, v, t)
+        if not begun and not weigh_any(how, v, measured, weights):
             break
         channel_equations(to, v, t, codes, target, residual, jacobian)
         misfit = whiten(weights, residual, jacobian, k, r_there, j_there)
-        if n > 0 and misfit < _WILD * best:
+        if begun and misfit < _WILD * best:
             _bend(second, x, to, r, j, r_there, j_there)
         if misfit < best:
             if best - misfit > 0.75 * promised:
@@ -654,6 +761,7 @@ def fit_within(
                     copy(known[c], x)
                     return best, False
             _directions(fold, x, folded, frame)
+            begun = True
         elif best == np.inf:
             return best, False
         else:
@@ -665,9 +773,15 @@ def fit_within(
             damping = max(4.0 * damping, 1e-3)
             slope, curve = _step_within(gradient, normal, bent, damping, ends, root, step)
         gain = -2.0 * slope - curve
-        if gain <= _IDLE_WITHIN * best + _LITTLE or damping > _MOST_DAMPING:
+        idle = gain <= (_IDLE_NEAR if near else _IDLE_WITHIN) * best + _LITTLE
+        slow = n >= _PATIENCE and (damping == 0.0 or n >= _LATE) and gain < _SLOW * (best - worth)
+        if near and (idle or slow or damping > _MOST_DAMPING):
+            copy(x, to)
+            second[:], best, damping, promised, near, begun = 0.0, np.inf, 0.0, 0.0, False, False
+            continue
+        if idle or damping > _MOST_DAMPING:
             return best, _level(gradient, normal, ends)
-        if n >= _PATIENCE and (damping == 0.0 or n >= _LATE) and gain < _SLOW * (best - worth):
+        if slow:
             break
         size = max(abs(step[0]), abs(step[1]), abs(step[2]), 1.0)
         for p in range(3):

@@ -16,7 +16,7 @@ import numpy as np
 from vibrissa.contacts.channels import CHANNELS, CIRCULAR, channels_of
 from vibrissa.contacts.posterior import NORMAL_KURTOSIS, second_moment, squared_distances
 from vibrissa.numerics import Array, IntArray, cholesky, inlined, mahalanobis, quick_exp, vectorised
-from vibrissa.rod import Fold, Rod, SearchTree, StableSet
+from vibrissa.rod import Fold, Rod, SearchTree, StableSet, interpolant
 
 #: Parts of the chart in each of which the nearest node is a start.
 PARTS = 16
@@ -43,6 +43,7 @@ class Searched(NamedTuple):
 
     rod: Rod
     fold: Fold
+    nodes: Array
     proximal: float
     tree: SearchTree
     where: IntArray
@@ -84,6 +85,7 @@ def searched(
     return Searched(
         chart.discretization.rod,
         chart.fold,
+        interpolant(chart),
         chart.proximal,
         tree,
         np.array(where),

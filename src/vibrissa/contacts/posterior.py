@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import math
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,6 +30,7 @@ from vibrissa.contacts.expansion import (
     Expansion,
     all_determined,
     cap_axes,
+    empty_expansion,
     expand,
     first_order_covariance,
     missed_at_ends,
@@ -48,7 +50,7 @@ from vibrissa.numerics import (
     quick_exp,
     solve,
 )
-from vibrissa.rod import BUFFER_SIZE, Rod
+from vibrissa.rod import BUFFER_SIZE, Charted
 
 #: A candidate more probable than this is the only one.
 CERTAIN = 0.95
@@ -67,6 +69,9 @@ _TRIALS, _NOTHING = 4, 1e-12
 # Below this second order (of the point, or the channels, for a standard deviation of each axis) the
 # first will do: variances differ by less than 4 %.
 _STRAIGHT = 0.06
+# Below this it misses nothing that counts (at most 0.01); and as between the map's nodes what it
+# misses is known to a few hundredths, the rod decides from this share of what counts to this much.
+_NEARLY_STRAIGHT, _SURE, _DOUBTFUL = 0.03, 0.6, 0.4
 _RADII = 5  # nodes on each ray, a standard deviation apart
 #: Fourth moment of three coordinates that are normally distributed.
 NORMAL_KURTOSIS = 15.0
@@ -104,25 +109,59 @@ def _along_rays() -> tuple[Array, Array, Array, Array]:
 _NODES, _WEIGHTS, _SHARES, _BEYOND = _along_rays()
 
 
+class _Rays(NamedTuple):
+    """Working memory for the nodes ±u.
+
+    Displacements of the point (3, 2 m); densities (2 m,), with volumes and without; ∂p/∂u (3, 3,
+    2 m), arc length, log density and squared distance; what is odd and even in u, and second
+    derivatives, (m,); a Cholesky factor; logs of what is beyond each node of a ray.
+    """
+
+    points: Array
+    density: Array
+    likely: Array
+    slopes: Array
+    arc: Array
+    log: Array
+    far: Array
+    odd: Array
+    even: Array
+    bent: Array
+    root: Array
+    logs: Array
+
+
 @inlined
-def _densities(
-    model: Expansion,
-    s: float,
-    proximal: float,
-    turn: float,
-    points: Array,
-    density: Array,
-    likely: Array,
-) -> None:
+def _rays() -> _Rays:
+    half, pairs = _NODES.shape[1], _SHARES.shape[0]
+    return _Rays(
+        np.empty((3, 2 * half)),
+        np.empty(2 * half),
+        np.empty(2 * half),
+        np.empty((3, 3, 2 * half)),
+        np.empty(2 * half),
+        np.empty(2 * half),
+        np.empty(2 * half),
+        np.empty(half),
+        np.empty(half),
+        np.empty(half),
+        np.zeros((3, 3)),
+        np.empty((2 * pairs, 1 + _RADII)),
+    )
+
+
+@inlined
+def _densities(model: Expansion, s: float, proximal: float, turn: float, rays: _Rays) -> None:
     """Fill posterior densities at nodes ±u relative to the nodes' own, and points (3, 2 m).
 
     What is odd in u and what is even is shared by both. ``likely`` leaves volumes out. ``points``
     are displacements of the point; ``turn`` is 1 where the axes are right-handed, -1 otherwise.
     """
-    r0, by_r, bent_r, by_p, bent_p, axes, _, bent_s = model
+    r0, by_r, bent_r, by_p, bent_p = model.r0, model.by_r, model.bent_r, model.by_p, model.bent_p
+    axes, bent_s = model.axes, model.bent_s
     nodes, half = _NODES, _NODES.shape[1]
-    slopes, arc, log = np.empty((3, 3, 2 * half)), np.empty(2 * half), np.zeros(2 * half)
-    odd, even, bent = np.zeros(half), np.full(half, s), np.empty(half)
+    points, density, likely, slopes, arc, log, _, odd, even, bent, _, _ = rays
+    log[:], odd[:], even[:] = 0.0, 0.0, s
     for i in range(3):
         _change_of_slope(bent_s[i], nodes, bent)
         along, u = axes[0, i], nodes[i]
@@ -261,12 +300,25 @@ def _fitting(far: Array, logs: Array) -> tuple[float, float]:
 
 @inlined
 def _moments(
-    model: Expansion, s: float, proximal: float, turn: float, first_order: float, covariance: Array
+    model: Expansion,
+    s: float,
+    proximal: float,
+    turn: float,
+    first_order: float,
+    covariance: Array,
+    rays: _Rays,
 ) -> tuple[float, bool]:
     """Fill the second moment about the point, widened; mean density, and whether it can serve."""
     half, pairs = _NODES.shape[1], _SHARES.shape[0]
-    points, density, likely = np.empty((3, 2 * half)), np.empty(2 * half), np.empty(2 * half)
-    _densities(model, s, proximal, turn, points, density, likely)
+    points, density, likely, root, far, logs = (
+        rays.points,
+        rays.density,
+        rays.likely,
+        rays.root,
+        rays.far,
+        rays.logs,
+    )
+    _densities(model, s, proximal, turn, rays)
     middle = 1.0
     for m in range(half):
         middle -= 2.0 * _WEIGHTS[m]
@@ -287,7 +339,6 @@ def _moments(
                     covariance[a, c] += density[m] * points[a, m] * points[c, m]
         return mean, False
     second_moment(points, density, 1.0, covariance)
-    root, far, logs = np.zeros((3, 3)), np.empty(2 * half), np.empty((2 * pairs, 1 + _RADII))
     if not cholesky(covariance, root):
         return mean, False
     squared_distances(root, points, far)
@@ -300,9 +351,90 @@ def _moments(
     return mean, holds(held, wider)
 
 
+@inlined
+def _second_order(
+    rod: Charted,
+    b: Array,
+    codes: IntArray,
+    target: Array,
+    weights: Array,
+    x: Array,
+    slopes: Array,
+    j: Array,
+    model: Expansion,
+) -> tuple[float, float, bool]:
+    """Fill the model; how large the second order is, what it misses, whether axes are shortened.
+
+    It is that between the map's nodes where these leave no doubt. If channels do not determine an
+    unknown its size is NaN.
+    """
+    capped, bent, missed, short = cap_axes(x, model.axes), np.inf, np.inf, False
+    for attempt in range(2):
+        near = expand(rod, b, attempt == 0, codes, target, weights, x, slopes, j, model)
+        if not all_determined(model):
+            return np.nan, np.inf, False
+        bent = second_order_size(model)
+        short = shorten_axes(model) or capped
+        missed = 0.0
+        if not near or bent > _NEARLY_STRAIGHT:
+            missed = missed_at_ends(rod, b, near, codes, target, weights, x, slopes, j, model)
+        if not (near and _SURE * _MISSED < missed < _DOUBTFUL):
+            break
+        principal_axes(x, j, model.axes)
+        cap_axes(x, model.axes)
+    return bent, missed, short
+
+
+@kernel
+def _judge_one(
+    rod: Charted,
+    b: Array,
+    proximal: float,
+    codes: IntArray,
+    target: Array,
+    weights: Array,
+    x: Array,
+    slopes: Array,
+    j: Array,
+    model: Expansion,
+    rays: _Rays,
+    nothing: Array,
+    covariance: Array,
+) -> tuple[float, bool, bool]:
+    """Fill the covariance of one; log weight, whether it is valid and channels are described."""
+    bent, missed, short = _second_order(rod, b, codes, target, weights, x, slopes, j, model)
+    if bent != bent:
+        return -np.inf, False, False
+    misfit, pulled, away = 0.0, 0.0, 0.0
+    for a in range(codes.shape[0]):
+        misfit += model.r0[a] * model.r0[a]
+    first_order_covariance(model.by_p, covariance)
+    for i in range(3):
+        away += model.axes[0, i] ** 2
+        pull = 0.0
+        for a in range(codes.shape[0]):
+            pull += model.r0[a] * model.by_r[a, i]
+        pulled = max(pulled, abs(pull))
+    away = 4.0 * math.sqrt(away)
+    for a in range(3):
+        copy(model.by_p[a], slopes[a])
+    first_order, density, fair = abs(solve(slopes, nothing)), 0.0, True
+    straight = proximal + away < x[0] < 1.0 - away and not short
+    straight = straight and bent < _STRAIGHT and pulled < _STRAIGHT
+    if not straight:
+        for a in range(3):
+            copy(model.axes[a], slopes[a])
+        turn = math.copysign(1.0, solve(slopes, nothing))
+        density, fair = _moments(model, x[0], proximal, turn, first_order, covariance, rays)
+    if straight or (missed > _BROKEN and first_order > 0.0 and not short):
+        density = first_order
+    weight = math.log(density) - 0.5 * misfit if density > 0.0 else -np.inf
+    return weight, missed < _MISSED and fair, missed < _BENT
+
+
 @kernel
 def judge(
-    rod: Rod,
+    rod: Charted,
     proximal: float,
     codes: IntArray,
     target: Array,
@@ -323,61 +455,35 @@ def judge(
     each; out come covariances of points, log weights, and whether covariances are valid, and
     channels described by the second order at least roughly.
     """
-    k, b, nothing = codes.shape[0], np.zeros(BUFFER_SIZE), np.zeros(3)
-    j, slopes = np.empty((k, 3)), np.empty((3, 3))
-    model = Expansion(
-        np.empty(k),
-        np.empty((k, 3)),
-        np.empty((k, 3, 3)),
-        np.empty((3, 3)),
-        np.empty((3, 3, 3)),
-        np.empty((3, 3)),
-        np.empty((3, 3, 3)),
-        np.empty((3, 3)),
-    )
-    r0, by_r, _, by_p, _, axes, _, _ = model
+    k = codes.shape[0]
+    b, j, model = np.zeros(BUFFER_SIZE), np.empty((k, 3)), empty_expansion(k)
+    rays, slopes, nothing = _rays(), np.empty((3, 3)), np.zeros(3)
     for row in range(n):
-        x, covariance = contacts[row], covariances[row]
+        for a in range(3):
+            for c in range(3):
+                covariances[row, a, c] = np.nan
         weight[row], valid[row], described[row] = -np.inf, False, False
-        covariance[:] = np.nan
         without_friction(jacobians[row], j)
-        if not principal_axes(x, j, axes):
-            continue
-        misfit, pulled, away = 0.0, 0.0, 0.0
-        for a in range(k):
-            r0[a] = residuals[row, a]
-            misfit += r0[a] * r0[a]
-        for a in range(3):
-            copy(tangents[row, 3 + a], slopes[a])
-        short = cap_axes(x, axes)
-        expand(rod, b, codes, target, weights[row], x, slopes, j, model)
-        if not all_determined(model):
-            continue
-        bent = second_order_size(model)
-        short = shorten_axes(model) or short
-        missed = missed_at_ends(rod, b, codes, target, weights[row], x, model)
-        first_order_covariance(by_p, covariance)
-        for i in range(3):
-            away += axes[0, i] ** 2
-            pull = 0.0
+        if principal_axes(contacts[row], j, model.axes):
             for a in range(k):
-                pull += r0[a] * by_r[a, i]
-            pulled = max(pulled, abs(pull))
-        away = 4.0 * math.sqrt(away)
-        for a in range(3):
-            copy(by_p[a], slopes[a])
-        first_order, density, fair = abs(solve(slopes, nothing)), 0.0, True
-        straight = proximal + away < x[0] < 1.0 - away and not short
-        straight = straight and bent < _STRAIGHT and pulled < _STRAIGHT
-        if not straight:
+                model.r0[a] = residuals[row, a]
             for a in range(3):
-                copy(axes[a], slopes[a])
-            turn = math.copysign(1.0, solve(slopes, nothing))
-            density, fair = _moments(model, x[0], proximal, turn, first_order, covariance)
-        if straight or (missed > _BROKEN and first_order > 0.0 and not short):
-            density = first_order
-        weight[row] = math.log(density) - 0.5 * misfit if density > 0.0 else -np.inf
-        valid[row], described[row] = missed < _MISSED and fair, missed < _BENT
+                copy(tangents[row, 3 + a], slopes[a])
+            weight[row], valid[row], described[row] = _judge_one(
+                rod,
+                b,
+                proximal,
+                codes,
+                target,
+                weights[row],
+                contacts[row],
+                slopes,
+                j,
+                model,
+                rays,
+                nothing,
+                covariances[row],
+            )
 
 
 @kernel

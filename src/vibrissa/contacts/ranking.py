@@ -48,7 +48,7 @@ from vibrissa.contacts.posterior import CERTAIN, judge, rank
 from vibrissa.contacts.task import Problem, Task, in_memory
 from vibrissa.contacts.weighing import Weighing, sharpness, weigh_any
 from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel
-from vibrissa.rod import evaluate
+from vibrissa.rod import LANES, Charted, evaluate
 from vibrissa.signals import FT, FX, MB, MD
 from vibrissa.status import Status
 
@@ -100,8 +100,7 @@ def _try(
     most = np.inf if lost else worth
     for _ in range(passes):
         misfit, least = fit_within(
-            of.rod,
-            of.fold,
+            Charted(of.rod, of.fold, of.nodes),
             of.proximal,
             how,
             target,
@@ -291,13 +290,18 @@ def _weighed(
     measured: Array,
     x: Array,
     values: Array,
+    first: int,
     n: int,
     room: _Room,
 ) -> None:
-    """Fill the first half of the working memory, and χ², of n candidates."""
+    """Fill the first half of the working memory, and χ², of n candidates.
+
+    ∂(F, p)/∂ξ is known of those before the first.
+    """
     k = how.codes.shape[0]
     residual, jacobian = np.empty(k), np.empty((k, 4))
-    evaluate(of.rod, x, room.values, room.third, 0, n)
+    if first < n:
+        evaluate(of.rod, x, room.values, room.third, first, n)
     for c in range(n):
         if not weigh_any(how, values[c], measured, room.weights[c]):
             room.weights[c, 0, 0] = np.nan
@@ -385,7 +389,8 @@ def _leave_room(
     points, likely = probable_nodes(of, white, weights, unit, seen, value[3:], chi)
     bent = not room.described[best] or (_mirrored(how) and not out.valid[row, 0])
     if not described_by_nodes(points, likely[0], spread) and bent:
-        follow_valley(of.rod, of.proximal, how, target, measured, out.x[row, 0], spread)
+        rod = Charted(of.rod, of.fold, of.nodes)
+        follow_valley(rod, of.proximal, how, target, measured, out.x[row, 0], spread)
     log_mass = room.weight[1, best] - sharpness(weights) + _LOG_NORMAL
     share = outside_share(points, likely, value[3:], chi, log_mass, spread, room.loose)
     out.probability[row, 0] *= 1.0 - share
@@ -402,12 +407,15 @@ def settle(
     out: Candidates,
     room: _Room,
 ) -> None:
-    """Complete the candidates of a noisy measurement and rank them by probability."""
+    """Complete the candidates of a noisy measurement and rank them by probability.
+
+    Of the first, if there is one, the room has ∂(F, p)/∂ξ.
+    """
     weight, chance, fine, order = room.weight, room.chance, room.fine, room.order
     x, values, chi = out.x[row], out.values[row], out.chi_squared[row]
     number = out.number[row]
     if number > 0:
-        _weighed(of, how, target, measured, x, values, number, room)
+        _weighed(of, how, target, measured, x, values, 1, number, room)
     for c in range(number):
         chi[c] = room.misfits[c]
         copy(x[c], room.x[c])
@@ -433,9 +441,9 @@ def settle(
     for c in range(n):
         changed = changed or x[c, 0] != room.x[c, 0] or x[c, 2] != room.x[c, 2]
     if changed:
-        _weighed(of, how, target, measured, x, values, n, room)
+        _weighed(of, how, target, measured, x, values, 0, n, room)
     judge(
-        of.rod,
+        Charted(of.rod, of.fold, of.nodes),
         of.proximal,
         how.codes,
         target,
@@ -478,9 +486,20 @@ def settle_rows(
     """Complete the candidates of noisy measurements, judge and rank them."""
     of, how, problem, out = task.of, task.how, task.problem, in_memory(number, flat, valid)
     room = _judging(MOST_CANDIDATES, targets.shape[1])
+    x, values, tangents = np.zeros((LANES, 4)), np.empty((LANES, 6)), np.empty((LANES, 6, 3))
     for row in range(first, last):
+        lane = (row - first) % LANES
+        if lane == 0:  # the first candidates of the next rows side by side
+            side = min(LANES, last - row)
+            for i in range(side):
+                x[i, 0] = 1.0
+                if number[row + i] > 0:
+                    copy(out.x[row + i, 0], x[i])
+            evaluate(of.rod, x, values, tangents, 0, side)
         if not finite(targets[row]):
             continue
+        for a in range(6):
+            copy(tangents[lane, a], room.third[0, a])
         settle(of, how, problem, targets[row], measured[row], row, out, room)
         status[row] = UNEXPLAINED
         if out.number[row] > 0 and out.chi_squared[row, 0] <= problem.limit:

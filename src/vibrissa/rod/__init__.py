@@ -42,10 +42,16 @@ from vibrissa.rod.gravity import (
     resting,
 )
 from vibrissa.rod.integration import contact_tangents, evaluate, integrate, solve_forces
+from vibrissa.rod.interpolation import (
+    Charted as Charted,
+    interpolant as interpolant,
+    interpolate as interpolate,
+)
 from vibrissa.rod.kernels import (
     BUFFER_SIZE,
     LANES,
     contact_state as contact_state,
+    lane_slopes as lane_slopes,
     lane_tangents as lane_tangents,
     lane_value as lane_value,
     lanes_tangents as lanes_tangents,

@@ -354,23 +354,42 @@ def arc_length(bounds: Array, eta: float) -> float:
 
 
 @inlined
-def fold_force(fold: Fold, s: float, psi: float) -> float:
-    """Fold force f*(s, ψ), non-dimensional; s is clipped to the chart, ψ is any angle."""
-    bounds, table = fold.bounds, fold.log_force
+def _hermite_slopes(t: float) -> tuple[float, float, float, float]:
+    """Derivatives of these weights."""
+    u = 1.0 - t
+    return -6.0 * t * u, u * (1.0 - 3.0 * t), 6.0 * t * u, t * (3.0 * t - 2.0)
+
+
+@inlined
+def log_fold_force(fold: Fold, eta: float, psi: float) -> tuple[float, float, float]:
+    """Ln f*(η, ψ) with its derivatives by η and ψ; η is clipped to the chart, ψ is any angle."""
+    table = fold.log_force
     n, m = table.shape[0] - 1, table.shape[1] - 1
     dpsi = 2.0 * np.pi / m
-    x = n * min(max(along(bounds, s), 0.0), 1.0)
+    x = n * min(max(eta, 0.0), 1.0)
     y = psi / dpsi
     y -= m * np.floor(y / m)
     i, j = min(int(x), n - 1), min(int(y), m - 1)
     a, b = _hermite(x - i), _hermite(y - j)
-    log = 0.0
+    a_slope, b_slope = _hermite_slopes(x - i), _hermite_slopes(y - j)
+    log, by_eta, by_psi = 0.0, 0.0, 0.0
     for di in range(2):
         for dj in range(2):
             node = table[i + di, j + dj]
-            log += a[2 * di] * (b[2 * dj] * node[0] + b[2 * dj + 1] * dpsi * node[2])
-            log += a[2 * di + 1] / n * (b[2 * dj] * node[1] + b[2 * dj + 1] * dpsi * node[3])
-    return float(np.exp(log))
+            here = b[2 * dj] * node[0] + b[2 * dj + 1] * dpsi * node[2]
+            rise = (b[2 * dj] * node[1] + b[2 * dj + 1] * dpsi * node[3]) / n
+            log += a[2 * di] * here + a[2 * di + 1] * rise
+            by_eta += n * (a_slope[2 * di] * here + a_slope[2 * di + 1] * rise)
+            here = b_slope[2 * dj] / dpsi * node[0] + b_slope[2 * dj + 1] * node[2]
+            rise = (b_slope[2 * dj] / dpsi * node[1] + b_slope[2 * dj + 1] * node[3]) / n
+            by_psi += a[2 * di] * here + a[2 * di + 1] * rise
+    return log, by_eta, by_psi
+
+
+@inlined
+def fold_force(fold: Fold, s: float, psi: float) -> float:
+    """Fold force f*(s, ψ), non-dimensional; s is clipped to the chart, ψ is any angle."""
+    return float(np.exp(log_fold_force(fold, along(fold.bounds, s), psi)[0]))
 
 
 @inlined

@@ -368,6 +368,16 @@ def lane_tangents(b: Array, i: int, tangents: Array) -> None:
 
 
 @inlined
+def lane_slopes(b: Array, i: int, tangents: Array) -> None:
+    """Copy ∂(F, p)/∂(s, f_x, f_y, f_z) of lane i into ``tangents`` (6, 4), without friction."""
+    for row in range(6):
+        t = tangents[row]
+        t[0], t[1] = b[TANGENT + row * LANES + i], 0.0
+        t[2] = b[TANGENT + (6 + row) * LANES + i]
+        t[3] = b[TANGENT + (12 + row) * LANES + i]
+
+
+@inlined
 def integrate_weightless(rod: Rod, b: Array, tangents: int) -> None:
     """Integrate every lane from its contact to the base; see :func:`vibrissa.rod.integrate`."""
     start = rod.start

@@ -13,6 +13,8 @@ In a cell where a vector of the plane may vanish (:class:`~vibrissa.rod.SearchTr
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, solve3, vectorised, wrapped
@@ -476,15 +478,61 @@ def _begin_cell(
     return int(careful)
 
 
+class _Room(NamedTuple):
+    """Working memory of a search.
+
+    Blocks still to be looked at (256, 2); which of eight cells may hold the target (8,), and how
+    far from it (3,); where in a cell it is (3,), relative to its base (3,), and missed least (3,);
+    rows of `_invert` (6, 3); the buffer of the interpolant; sizes of a cell's values (3,); starts
+    to either side of a fold (3, 3).
+    """
+
+    stack: IntArray
+    inside: AnyArray
+    slack: Array
+    x: Array
+    relative: Array
+    nearest: Array
+    work: Array
+    b: Array
+    half: Array
+    sides: Array
+
+
+@inlined
+def _room() -> _Room:
+    return _Room(
+        np.zeros((_STACK, 2), np.int64),
+        np.empty(8, np.bool_),
+        np.zeros(3),
+        np.empty(3),
+        np.empty(3),
+        np.empty(3),
+        np.empty((6, 3)),
+        np.zeros(_BUFFER),
+        np.empty(3),
+        np.empty((3, 3)),
+    )
+
+
 @vectorised
 def seeds(tree: SearchTree, target: Array, found: Array, inverses: Array, quality: IntArray) -> int:
     """All contacts that may have the target's values, as chart coordinates."""
+    return _seeds(tree, target, found, inverses, quality, _room())
+
+
+@vectorised
+def _seeds(
+    tree: SearchTree,
+    target: Array,
+    found: Array,
+    inverses: Array,
+    quality: IntArray,
+    room: _Room,
+) -> int:
+    """Find seeds; arrays made by another function are not counted at each use."""
     grid, place, cells = tree.grid, tree.place, tree.boxes[tree.offsets[-2] :]
-    stack = np.zeros((_STACK, 2), np.int64)
-    inside, slack = np.empty(8, np.bool_), np.zeros(3)
-    work, relative, x = np.empty((6, 3)), np.empty(3), np.empty(3)
-    b = np.zeros(_BUFFER)
-    nearest, sides, half = np.empty(3), np.empty((3, 3)), np.empty(3)
+    stack, inside, slack, x, relative, nearest, work, b, half, sides = room
     count = 0
     _aim(tree, target, b)
     top, node = _next_cells(tree, target, slack, stack, 1, inside)
@@ -562,8 +610,24 @@ def cells_around(
     ``spots`` (n, 3) are chart coordinates where in a cell these are nearest, ``away`` (n,) is how
     far they miss, relative to the slack. Return how many cells there are, at most n.
     """
-    grid, place, count = tree.grid, tree.place, 0
     stack, x, inside = np.zeros((_STACK, 2), np.int64), np.empty(3), np.empty(8, np.bool_)
+    return _cells_around(tree, target, slack, cells, spots, away, stack, x, inside)
+
+
+@vectorised
+def _cells_around(
+    tree: SearchTree,
+    target: Array,
+    slack: Array,
+    cells: IntArray,
+    spots: Array,
+    away: Array,
+    stack: IntArray,
+    x: Array,
+    inside: AnyArray,
+) -> int:
+    """List cells; arrays made by another function are not counted at each use."""
+    grid, place, count = tree.grid, tree.place, 0
     top, node = _next_cells(tree, target, slack, stack, 1, inside)
     while node >= 0:
         for c in range(8):

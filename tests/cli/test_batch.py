@@ -78,3 +78,18 @@ def test_links_and_groups_that_were_edited_stop_nothing(tmp_path):
         faults = {row["file"]: row["fault"] for row in csv.DictReader(file)}
     assert "there is no file" in faults["gone.nc"]
     assert "lacks" in faults["lacking.nc"]
+
+
+def test_a_table_of_each_recording(tmp_path):
+    peg = Peg([9e-3, 2.6e-3, 0.0], [0.0, 0.0, 1.0], 0.5e-3)
+    files = [tmp_path / "a.nc", tmp_path / "b.nc"]
+    for file in files:
+        trial(file, peg)
+    run("export", *files, "--to", "mat")
+    assert all(file.with_suffix(".mat").exists() for file in files)
+    with pytest.raises(ValueError, match="--output cannot be used"):
+        run("export", *files, "-o", tmp_path / "c.csv")
+    files[1].with_suffix(".csv").touch()
+    with pytest.raises(FileExistsError):
+        run("export", *files)
+    assert not files[0].with_suffix(".csv").exists()

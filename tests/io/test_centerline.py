@@ -230,3 +230,20 @@ def test_what_a_file_leaves_open_is_noted(tmp_path):
     notes = [note for note in load_whisker(path).notes if "left out" in note]
     assert len(notes) == 1
     assert notes[0].endswith("an end of the whisker among them: row 1")
+
+
+def test_points_of_several_whiskers_are_refused_by_their_column(tmp_path):
+    path = tmp_path / "all.csv"
+    rows = [f"{name},{x},{x * x / 80},0" for name in ("C1", "C2") for x in range(0, 31, 3)]
+    path.write_text("\n".join(["whisker,x_mm,y_mm,z_mm", *rows]))
+    with pytest.raises(ValueError, match="2 whiskers by its column whisker: C1; C2"):
+        load_whisker(path)
+    path.write_text("\n".join(["whisker,x_mm,y_mm,z_mm", *rows[:11]]))
+    assert load_whisker(path).length > 0.03
+
+
+def test_millimetres_under_the_header_of_metres_name_the_remedy(tmp_path):
+    path = tmp_path / "w.csv"
+    path.write_text("\n".join([",X,Y,Z", *(f"{i},{i},{i * i / 80},0" for i in range(30))]))
+    with pytest.raises(ValueError, match="millimetres are called x_mm, y_mm, z_mm"):
+        load_whisker(path)

@@ -169,3 +169,24 @@ def test_nwb_holds_them_and_is_valid(trial, tmp_path):
     least = inspector.Importance.BEST_PRACTICE_VIOLATION
     worst = inspector.inspect_nwbfile(nwbfile_path=tmp_path / "t.nwb")
     assert [m.message for m in worst if m.importance.value >= least.value] == []
+
+
+def test_frames_that_tracking_lost_do_not_divide_a_contact(trial, tmp_path):
+    """Not in the summary, the list of contacts, and NWB; nor is a gap at its end contact."""
+    h5py = pytest.importorskip("h5py")
+    root = trial.to_dataset()
+    touching, status = (root[name].values.copy() for name in ("in_contact", "status"))
+    touching[:], touching[20:60] = False, True
+    touching[30:33], status[30:33], status[60:65] = False, vb.Status.MISSING, vb.Status.MISSING
+    root = root.assign(in_contact=(("time", "whisker"), touching)).assign(
+        status=(("time", "whisker"), status, root["status"].attrs)
+    )
+    root["in_contact"].attrs = trial["in_contact"].attrs
+    tree = recording_tree(root, [vb.samples.gamma()] * 2, "made by hand")
+    assert vb.pipeline.summarise(tree).contacts == 2
+    listed = vb.pipeline.contact_events(root)
+    assert listed["onset"].values.tolist() == [TIME[20]] * 2
+    assert listed["release"].values.tolist() == [TIME[60]] * 2
+    save_nwb(tmp_path / "t.nwb", tree, Session(datetime(2026, 3, 1, tzinfo=UTC)))
+    with h5py.File(tmp_path / "t.nwb") as file:
+        assert file["intervals/contacts/start_time"][:].tolist() == [TIME[20]] * 2

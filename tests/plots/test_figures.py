@@ -11,6 +11,7 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
+from vibrissa.numerics import contacts_in
 from vibrissa.plots import (
     contour_views,
     estimated_against_true,
@@ -22,6 +23,7 @@ from vibrissa.plots.signals import intervals
 from vibrissa.plots.style import cyclic
 from vibrissa.quantities import axis_label
 from vibrissa.scene import SIGNALS, robust_limits
+from vibrissa.status import Status
 
 LINE = np.stack([np.linspace(0, 40e-3, 60), 10.0 * np.linspace(0, 40e-3, 60) ** 2, np.zeros(60)], 1)
 RADIUS = np.linspace(100e-6, 7e-6, 60)
@@ -84,6 +86,18 @@ def test_intervals_reach_halfway_to_the_next_frames() -> None:
     np.testing.assert_array_equal(found, [[0.0, 1.5], [3.5, 4.5]])
 
 
+def test_frames_that_are_missing_do_not_divide_a_contact() -> None:
+    touching = np.array([0, 1, 0, 1, 1, 0, 0, 1, 0], dtype=bool)
+    seen = np.array([1, 1, 0, 1, 1, 0, 1, 1, 0], dtype=bool)
+    assert contacts_in(touching, seen) == [(1, 5), (7, 8)]
+    assert contacts_in(touching) == [(1, 2), (3, 5), (7, 8)]
+    assert contacts_in(touching, np.zeros(9, dtype=bool)) == []
+    data = signals().assign(status=("time", np.zeros(200, dtype=int)))
+    data["in_contact"][60:63], data["status"][60:63] = False, Status.MISSING
+    assert "in 1 contact" in "".join(texts(signals_over_time(data)))
+    assert "in 2 contacts" in "".join(texts(signals_over_time(data.drop_vars("status"))))
+
+
 def test_estimates_lie_on_the_identity_in_mm_and_degrees() -> None:
     true = np.random.default_rng(0).uniform(0.01, 0.04, (40, 3))
     estimated = true.copy()
@@ -120,6 +134,19 @@ def test_contour_shows_points_peg_and_fit_in_mm() -> None:
     np.testing.assert_allclose(np.hypot(*(outline - [25.0, 0.0]).T), 1.35)
 
 
+def test_contours_state_the_distance_of_the_whisker_from_the_surface() -> None:
+    whisker = 60e-6
+    peg = SimpleNamespace(**vars(PEG))
+    peg.signed_distance = lambda p: np.hypot(*(p - PEG.origin)[:, :2].T) - PEG.radius
+    points = contacts()
+    points[:, :2] += (points - PEG.origin)[:, :2] * whisker / PEG.radius
+    assert "the whisker's centreline is within 0.06 mm" in "".join(
+        texts(contour_views(points, peg))
+    )
+    figure = contour_views(points + 1e-6, peg, whisker_radius=np.full(50, whisker))
+    assert "the whisker is within 0.00" in "".join(texts(figure))
+
+
 def test_what_a_figure_shows_is_written_above_it(tmp_path) -> None:
     rng = np.random.default_rng(3)
     true = np.stack([np.full(101, 25e-3), *rng.uniform(-0.5, 0.5, (2, 101))], axis=1)
@@ -127,6 +154,8 @@ def test_what_a_figure_shows_is_written_above_it(tmp_path) -> None:
     figure = estimated_against_true(true, true + errors, colour=np.arange(101.0), colour_name="MB")
     finding = next(text for text in figure.texts if "101 contacts" in text.get_text())
     assert "1 mm in $r$, 0.57° in" in finding.get_text()  # the errors are 0 to 2 mm, and 0.01 rad
+    tracked = estimated_against_true(true, true + errors, known_as="tracked")
+    assert "median difference from tracked ones 1 mm" in "".join(texts(tracked))
     wide, tall = figure.get_size_inches()
     (file,) = save(figure, tmp_path / "a", ["png"])
     rows, columns = imread(file).shape[:2]

@@ -239,6 +239,12 @@ def test_rows_are_not_read_under_a_header_that_was_refused(gamma_map, wrench):
     }
     assert "lacks" in other["error"]
     assert again["status"] == "unique"
+    # Other names of its channels are understood, and times in other units, as ROS writes them.
+    running = ContactStream(Estimator.of_sensor(gamma_map, sensor), COMPONENTS)
+    called = [f"wrench.{kind}.{axis}" for kind in ("force", "torque") for axis in "xyz"]
+    (record,) = running.records(["t_ns," + ",".join(called), "3e9," + good[2].partition(",")[2]])
+    assert record["time"] == 3.0
+    np.testing.assert_allclose([record[n] for n in "xyz"], [again[n] for n in "xyz"], rtol=1e-9)
     # Without a sensor its units count, also where its cells are parted otherwise.
     running = ContactStream(estimator(gamma_map))
     milli = "time;" + ";".join(f"{name} [mN]" for name in COMPONENTS[:3]) + ";Mx;My;Mz"

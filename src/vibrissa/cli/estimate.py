@@ -390,6 +390,7 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions, weight: Gravi
             found = vb.pipeline.locate_from_wrench(known, wrench, noise, gravity=gravity, **others)
         else:
             names, others = how.names or vb.pipeline.TRIPLET, how.keywords()
+            _doubt_names(maps[0], names)
             found = vb.pipeline.locate(
                 maps[0], wrench, names, noise=noise, gravity=gravity, **others
             )
@@ -400,6 +401,22 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions, weight: Gravi
     remark(how.described(used, found.attrs["friction"], about, found.attrs["felt_above"]))
     print_statuses(found["status"].values)
     print_written(target)
+
+
+# Signals that are proposed where others do not determine contacts, the fewest first.
+_INSTEAD = (("FT", "MB", "MD"), ("Fx", "FT", "MB", "MD"))
+
+
+def _doubt_names(contact_map: vb.ContactMap, names: tuple[str, ...]) -> None:
+    """Name signals that determine contacts where those that are used do not."""
+    if contact_map.determines(names):
+        return
+    better = next((one for one in _INSTEAD if contact_map.determines(one)), None)
+    instead = "wrench" if better is None else ",".join(better)
+    remark(
+        f"({', '.join(names)}) do not determine contacts of this whisker, as (Fx, MB, MD) of a "
+        f"straight cylinder: --using {instead}"
+    )
 
 
 def _around(signals: Path, target: Path, how: EstimateOptions, known: AroundOptions) -> None:

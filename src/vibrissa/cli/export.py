@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -14,9 +14,9 @@ from vibrissa.cli.options import check_new, refuse, with_options
 from vibrissa.cli.terminal import remark, say
 
 
-@with_options("the table, by default next to the recording: NAME.csv, NAME.nwb or NAME.mat")
+@with_options("the table of one recording, by default next to it: NAME.csv, NAME.nwb or NAME.mat")
 def export(
-    recording: Path,
+    recordings: list[Path],
     to: Literal["csv", "nwb", "mat"] = "csv",
     target: Path | None = None,
     session_start: str | None = None,
@@ -29,24 +29,35 @@ def export(
     The table holds force and moment, the six signals, the pose of the base, rates of change,
     contact points and flags, in SI units; every column is described in the file. Signals are made
     first where there are none, by `vibrissa signals`. NWB holds the tracked whisker too.
+    Of several recordings there is a table each, next to it.
     Example: `vibrissa export trial.nc --to nwb --session-start 2026-03-01T14:30+01:00`
     """
     ending = f".{to}"
-    target = recording.with_suffix(ending) if target is None else target
-    check_new(target, (ending,), force)
     if to != "nwb":
         about = {"--session-start": session_start, "--subject": subject, "--species": species}
         refuse(about, "only NWB states it")
+    if len(recordings) > 1:
+        refuse({"--output": target}, "each recording has its table next to it")
+        refuse({"--session-start": session_start}, "recordings did not begin at the same time")
+    targets = [one.with_suffix(ending) if target is None else target for one in recordings]
+    for path in targets:
+        check_new(path, (ending,), force)
+    animal = {"subject_id": subject, "species": species}
+    stated = {name: value for name, value in animal.items() if value is not None}
+    for recording, path in zip(recordings, targets, strict=True):
+        _export(recording, path, stated, session_start)
+
+
+def _export(recording: Path, target: Path, subject: dict[str, Any], start: str | None) -> None:
+    """Write the table of one recording."""
     tree = recording_from(recording)
     if "signals" not in tree.children:
         remark("the recording has no signals yet: they are made as `vibrissa signals` makes them")
         with vb.io.in_file(recording):
             tree = vb.pipeline.with_signals(tree)
     table = vb.pipeline.predictors(tree)
-    if to == "nwb":
-        animal = {"subject_id": subject, "species": species}
-        stated = {name: value for name, value in animal.items() if value is not None}
-        session = vb.io.Session(_start(session_start, recording), subject=stated)
+    if target.suffix == ".nwb":
+        session = vb.io.Session(_start(start, recording), subject=subject)
         vb.io.save_nwb(target, tree, session, predictors=table)
     else:
         vb.io.save_predictors(target, table)

@@ -202,7 +202,7 @@ def trial_drawings(
         say(f"{path} has {reason}")
     whisker = vb.recording.Recording(trial).whisker(given.whisker)
     drawings = {"whisker": _whisker_drawing(whisker, width)}
-    drawings |= _contact_drawings(trial, course, whisker, width, colour)
+    drawings |= _contact_drawings(trial, course, whisker, given.whisker, width, colour)
     if course.signals is not None:
         drawings |= _signal_drawings(trial, course, whisker, width, given, tell)
     return drawings
@@ -219,8 +219,22 @@ def _lacking(course: vb.scene.Course, trial: xr.DataTree, path: Path) -> Iterato
         yield f"no contact points: `vibrissa reconstruct {path}` makes them"
 
 
+def _radii(
+    trial: xr.DataTree, course: vb.scene.Course, whisker: vb.Whisker, number: int
+) -> NDArray[np.float64] | None:
+    """Radius of the whisker at the contact points that are drawn; None where it is not known."""
+    group = {"estimated": "estimates", "true": "truth"}.get(course.places_as, "")
+    known = vb.recording.Recording(trial).known("arc_length", [group])
+    return None if known is None else np.asarray(whisker.radius(known[:, number]))
+
+
 def _contact_drawings(
-    trial: xr.DataTree, course: vb.scene.Course, whisker: vb.Whisker, width: Any, colour: str
+    trial: xr.DataTree,
+    course: vb.scene.Course,
+    whisker: vb.Whisker,
+    number: int,
+    width: Any,
+    colour: str,
 ) -> dict[str, Draw]:
     """Figures of contact points."""
     by: Any = "time" if colour == "time" else "deflection_angle"
@@ -234,7 +248,12 @@ def _contact_drawings(
             course, line, bodies, fits, colour=by, width=width
         )
         drawings["contour"] = lambda: vb.plots.contour_views(
-            points, next(iter(bodies), None), next(iter(fits), None), colour=angles, width=width
+            points,
+            next(iter(bodies), None),
+            next(iter(fits), None),
+            colour=angles,
+            whisker_radius=_radii(trial, course, whisker, number),
+            width=width,
         )
     if known is not None and estimated is not None:
         drawings["estimates"] = lambda: vb.plots.estimated_against_true(

@@ -66,7 +66,8 @@ def import_tracks(
         result = vb.tracking.track(
             traces.cameras,
             traces.traces,
-            1.0 / float(np.median(np.diff(found["time"].values))),
+            # Differences of times have errors of rounding, which a number of 12 digits has not.
+            float(f"{1.0 / float(np.median(np.diff(found['time'].values))):.12g}"),
             how,
             names=traces.names,
             progress=tell,

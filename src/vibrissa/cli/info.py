@@ -548,7 +548,9 @@ def _rows(kind: str, data: Any) -> Iterator[tuple[str, str]]:
         time = data["time"].values
         known = time[np.isfinite(time)]
         notes = data.attrs.get("notes", ())
-        span = f"from {known.min():g} to {known.max():g} s" if known.size else "at unknown times"
+        span = (
+            f"from {known.min():.10g} to {known.max():.10g} s" if known.size else "at unknown times"
+        )
         yield "rows", f"{time.size}" if vb.io.NUMBERED in notes else f"{time.size}, {span}"
         yield from (("note", note) for note in notes)
         if kind == "contacts":

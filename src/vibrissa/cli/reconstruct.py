@@ -245,7 +245,10 @@ def _agreement(fit: vb.contour.FittedShape, contour: xr.Dataset) -> str:
     share = f"all {used}" if used < inside + 1 else f"{inside} of {used}"
     text = f"{share} contacts agree with it"
     if inside:
-        text += f" and are {fixed('surface_distance', fit.rms, 1)} from it (root mean square)"
+        text += (
+            f" and are {fixed('surface_distance', fit.median, 1)} from it in the median, "
+            f"{fixed('surface_distance', fit.rms, 1)} root mean square"
+        )
     if found > used:
         text += f"; {found - used} more are too uncertain to be used"
     together = float(contour.attrs["frames_together"])

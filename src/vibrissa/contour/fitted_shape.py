@@ -363,6 +363,8 @@ class FittedShape(ABC):
             sigma = np.sqrt(np.diag(self.covariance)[rows])
             length = QUANTITIES[quantity].unit == "m"
             factor, unit, digits = (1e3, " mm", 3) if length else (1.0, "", 4)
+            if name == "radius":  # as objects that are known are described
+                name, factor = "diameter", 2.0 * factor
             numbers = [
                 f"{factor * v:.{digits}f} ± {factor * s:.{digits}f}"
                 for v, s in zip(value, sigma, strict=True)
@@ -391,6 +393,12 @@ class FittedShape(ABC):
         """Root mean square of the inliers' residuals, m; NaN if there are none."""
         size = self.residuals[self.inliers]
         return float(np.sqrt(np.mean(size**2))) if size.size else float("nan")
+
+    @property
+    def median(self) -> float:
+        """Median size of the inliers' residuals, m; NaN if there are none."""
+        size = np.abs(self.residuals[self.inliers])
+        return float(np.median(size)) if size.size else float("nan")
 
     @property
     def used(self) -> Mask:

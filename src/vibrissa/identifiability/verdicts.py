@@ -154,6 +154,8 @@ def verdict_rows(verdicts: xr.Dataset) -> tuple[list[list[str]], list[str]]:
     if chosen:
         cell = verdicts.sel(triplet=chosen, region=region)
         use = f"({chosen.replace(' ', ', ')}), {verdict_words(cell)} in: {region}"
+        if str(cell["verdict"].item()) == OFF_SURFACE:
+            use += f"; not for contacts in or near {_plane(verdicts)}, which it does not locate"
     cone = np.rad2deg(verdicts.attrs["cone"])
     return rows, [
         f"≥ an angle: not unique (witness), twins exist that far from rest, maybe farther. "

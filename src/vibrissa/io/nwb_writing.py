@@ -28,7 +28,8 @@ import numpy as np
 from vibrissa.deferred import xr
 from vibrissa.io.paths import NWB, check_writable, replacing
 from vibrissa.io.time_tables import events_in
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, contacts_in
+from vibrissa.status import Status
 
 if TYPE_CHECKING:
     from pynwb import NWBFile
@@ -440,15 +441,12 @@ def _add_contacts(file: NWBFile, data: xr.Dataset) -> None:
     time = data["time"].values
     step = float(np.median(np.diff(time))) if time.size > 1 else 0.0
     rows = []
-    for name, touching in zip(
-        _names(data), data["in_contact"].transpose("whisker", "time").values, strict=True
-    ):
-        edges = np.diff(np.concatenate([[0], np.nan_to_num(touching) > 0.5, [0]]).astype(np.int8))
-        first, after = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
-        rows += [
-            (float(time[i]), float(time[j - 1]) + step, name)
-            for i, j in zip(first, after, strict=True)
-        ]
+    touching = np.nan_to_num(data["in_contact"].transpose("whisker", "time").values) > 0.5
+    seen = np.ones_like(touching)
+    if "status" in data:
+        seen = data["status"].transpose("whisker", "time").values != Status.MISSING
+    for name, *one in zip(_names(data), touching, seen, strict=True):
+        rows += [(float(time[i]), float(time[j - 1]) + step, name) for i, j in contacts_in(*one)]
     if not rows:
         return
     table = TimeIntervals(

@@ -252,6 +252,8 @@ _BETWEEN = re.compile(r"[\s·⋅×*.^_-]")
 def signal_column(header: str) -> tuple[str, float | None]:
     """Tell which signal a column holds, and in which unit."""
     text = header.strip()
+    if text.lower() == "stamp":  # as a header of ROS; with a unit it is one of `streaming.lines`
+        return "time", 1.0
     if match := _COMPONENT.fullmatch(text):
         name = ("F" if match[1][0] in "Ff" else "M") + match[2].lower()
         return name, unit_factor(match[3], "force" if name[0] == "F" else "moment")

@@ -81,6 +81,9 @@ _COORDINATE = re.compile(r"([xyz])(?![a-z0-9])(.*)", re.IGNORECASE)
 _THICKNESS = re.compile(r"(radius|diameter)(?![a-z0-9])(.*)", re.IGNORECASE)
 _THINNEST, _THICKEST = 1e-5, 0.1
 _TAPERED = 0.01
+# Columns that name the whisker to which a point belongs.
+_NAMING = frozenset({"whisker", "whisker_id", "name", "label", "id"})
+_FEWEST = 3  # points of a whisker among others
 _SURE = 4.0  # standard errors by which it is thicker, at least
 _PLANAR = "the file has no column z: the whisker was taken to be planar"
 _FIRST = (
@@ -114,10 +117,11 @@ class _Centreline(NamedTuple):
 
 
 def _table(path: Path) -> _Centreline:
-    rows = table_rows(read_text(path))
-    header = next(rows, None)
-    if header is None:
+    whole = list(table_rows(read_text(path)))
+    if not whole:
         raise ValueError(f"{path} is empty; a header {ALLOWED} and at least 4 points are needed")
+    header, rows = whole[0], iter(whole[1:])
+    _check_one_whisker(path, header[1], whole[1:])
     columns, factor = _columns(path, header[1])
     thickness = _thickness(path, header[1], factor)
     places = [*columns, *(place for place, _ in thickness)]
@@ -136,6 +140,21 @@ def _table(path: Path) -> _Centreline:
     unit = next(name for name, length in LENGTHS.items() if length == factor)
     radii = array[:, -1] * thickness[0][1] if thickness else None
     return _Centreline(points, radii, unit, tuple(notes))
+
+
+def _check_one_whisker(path: Path, header: list[str], rows: list[tuple[int, list[str]]]) -> None:
+    """Refuse points of several whiskers one below the other."""
+    place = next((i for i, name in enumerate(header) if name.lower() in _NAMING), None)
+    if place is None:
+        return
+    names = list(dict.fromkeys(cells[place] for _, cells in rows if place < len(cells)))
+    # Names of single points are not those of whiskers.
+    if 1 < len(names) <= len(rows) / _FEWEST:
+        raise ValueError(
+            f"{path} has points of {len(names)} whiskers by its column {header[place]}: "
+            f"{few_faults(names)}; a file for each is needed, named after it, such as C2.csv "
+            "(a folder of them is an array of whiskers)"
+        )
 
 
 def _left_out(known: AnyArray, filled: AnyArray) -> list[str]:
@@ -257,7 +276,10 @@ def load_whisker(
         else:
             whisker = _tapered(points, radii, noise, base, properties)
     except ValueError as fault:
-        raise ValueError(f"{path}: {fault} (by the header coordinates are in {unit})") from None
+        raise ValueError(
+            f"{path}: {fault} (by the header coordinates are in {unit}; columns of millimetres are "
+            "called x_mm, y_mm, z_mm)"
+        ) from None
     return replace(whisker, notes=(*whisker.notes, *notes)) if notes else whisker
 
 

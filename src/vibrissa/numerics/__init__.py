@@ -15,6 +15,7 @@ from vibrissa.numerics.arrays import (
     Mask as Mask,
     Vector,
     contact_weights as contact_weights,
+    contacts_in as contacts_in,
     cross as cross,
     cross_matrix as cross_matrix,
     numbers as numbers,

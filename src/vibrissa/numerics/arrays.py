@@ -28,6 +28,24 @@ SKEW = 1e-5
 """Largest entry of RᵀR − 1 of a rotation R that was written with few digits."""
 
 
+def contacts_in(touching: Mask, known: Mask | None = None) -> list[tuple[int, int]]:
+    """First frames of contacts, and those after their last.
+
+    Where frames are not ``known``, those between two frames in contact count as contact: a frame
+    that tracking has lost does not end one.
+    """
+    held = np.asarray(touching, dtype=bool)
+    if known is not None and not known.all():
+        seen = np.flatnonzero(known)
+        before = np.searchsorted(seen, np.arange(held.size), side="right") - 1
+        after = np.searchsorted(seen, np.arange(held.size))
+        inside = ~known & (before >= 0) & (after < seen.size)
+        held = held & known
+        held[inside] = held[seen[before[inside]]] & held[seen[after[inside]]]
+    edges = np.flatnonzero(np.diff(held.astype(int), prepend=0, append=0))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
 def cross(a: Array, b: Array) -> Array:
     """Cross product of vectors (..., 3), in less than half of NumPy's time for some hundred."""
     ax, ay, az = a[..., 0], a[..., 1], a[..., 2]

@@ -12,8 +12,7 @@ import numpy as np
 import xarray as xr
 
 from vibrissa.contacts import SLIPPING, ContactEvents, Place, in_order
-from vibrissa.numerics import Array
-from vibrissa.pipeline.inertia import contacts_in
+from vibrissa.numerics import Array, contacts_in
 from vibrissa.quantities import attributes
 from vibrissa.status import Event, Status, flag_attributes
 
@@ -90,7 +89,8 @@ def contact_events(contacts: xr.Dataset) -> xr.Dataset:
     for k, name in enumerate(contacts["whisker"].values):
         one = contacts.isel(whisker=k)
         size = np.linalg.norm(one["force"].values, axis=-1)
-        for first, end in contacts_in(one["in_contact"].values.astype(bool)):
+        seen = one["status"].values != Status.MISSING if "status" in one else None
+        for first, end in contacts_in(one["in_contact"].values.astype(bool), seen):
             onset = time[first] if first else np.nan
             release = time[end] if end < len(time) else np.nan
             row = [first, str(name), onset, release, _largest(size[first:end])]

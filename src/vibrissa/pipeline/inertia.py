@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from vibrissa.contour import to_laboratory
 from vibrissa.deferred import ndimage, signal
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, contacts_in
 from vibrissa.pipeline.frames import one_whisker
 from vibrissa.pipeline.locate import locate_from_wrench
 from vibrissa.recording import Group, recorded
@@ -216,9 +216,3 @@ def _uncertainty(trial: _Trial, added: Array, apart: Array, vibration: Vibration
     )
     out[:, range(6), range(6)] += np.repeat(left + near**2 * whole, 3, axis=1)
     return np.asarray(out)
-
-
-def contacts_in(touching: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """First frames of contacts, and those after their last."""
-    edges = np.flatnonzero(np.diff(touching.astype(int), prepend=0, append=0))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

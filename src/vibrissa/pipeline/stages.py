@@ -17,12 +17,14 @@ import xarray as xr
 from vibrissa.contacts import friction_assumed
 from vibrissa.contour import shape_from_dataset
 from vibrissa.io import events_in
+from vibrissa.numerics import contacts_in
 from vibrissa.pipeline.estimates import Progress, estimates_of
 from vibrissa.pipeline.frames import check_recording
 from vibrissa.pipeline.made_from import MADE_FROM, edited, made_from
 from vibrissa.pipeline.reconstruct import reconstruct
 from vibrissa.pipeline.signals import signals_of
 from vibrissa.recording import Recording
+from vibrissa.status import Status
 
 STAGES = ("signals", "estimates", "contour")  # groups in the order in which they are made
 
@@ -177,8 +179,9 @@ def summarise(recording: xr.DataTree) -> TrialSummary:
     touching = record.known("in_contact", _BEFORE)
     contacts = None
     if touching is not None:
-        begins = np.diff(touching.astype(int), axis=0, prepend=0) == 1
-        contacts = int(begins.sum())
+        status = record.known("status", _BEFORE)
+        seen = np.ones_like(touching) if status is None else status != Status.MISSING
+        contacts = sum(len(contacts_in(*one)) for one in zip(touching.T, seen.T, strict=True))
     largest = {
         name: _largest(record.known(name, _BEFORE), touching) for name in ("force", "moment")
     }
@@ -199,6 +202,8 @@ def summarise(recording: xr.DataTree) -> TrialSummary:
         fitted = repr(shape_from_dataset(contour)).strip("<>")
         if "surface_distance" in contour:
             away = np.abs(contour["surface_distance"].values)
+            if "inlier" in contour:  # as `FittedShape.median`
+                away = away[contour["inlier"].values > 0]
             distance = float(np.nanmedian(away)) if np.isfinite(away).any() else np.nan
     return TrialSummary(
         origin=str(recording.attrs.get("origin", "its origin is not stated")),

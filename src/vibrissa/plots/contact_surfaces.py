@@ -396,7 +396,7 @@ def _lines(axes: Axes, x: Array, y: Array, values: Array, name: str) -> None:
         axes.pcolormesh(
             x, y, np.where(np.isfinite(values), 0.0, np.nan), cmap="gray", vmin=-9, vmax=2
         )
-        words = f"within {np.nanmax(np.abs(values)):.1g}° of zero"
+        words = "zero: in the whisker's plane" if name == "phi" else "zero"
         axes.text(0.5, 0.9, words, transform=axes.transAxes, ha="center", color=style.MUTED)
         return
     signed = not error and min(-low, high) > 0.1 * max(-low, high)

@@ -261,12 +261,12 @@ def estimated_against_true(
             }
             style.colour_bar(figure, dots, ax=panels, label=axis_label(name), pad=0.01, **place)
         figure.align_ylabels(panels[:, 0])
-        conclude(figure, f"{len(true)} contacts: {error_words(true, estimated)}")
+        conclude(figure, f"{len(true)} contacts: {error_words(true, estimated, known_as)}")
         return figure
 
 
-def error_words(true: Array, estimated: Array) -> str:
-    """Median errors of r, θ and φ, of coordinates in m and rad."""
+def error_words(true: Array, estimated: Array, known_as: str = "true") -> str:
+    """Median errors of r, θ and φ, of coordinates in m and rad; of tracked ones: differences."""
     parts = []
     for i, name in enumerate(COORDINATES):
         pair = to_display(name, true[:, i]), to_display(name, estimated[:, i])
@@ -274,7 +274,8 @@ def error_words(true: Array, estimated: Array) -> str:
         unit = row.display_unit if row.display_unit == "°" else f" {row.display_unit}"
         error = np.median(np.abs(_difference(name, *pair)))
         parts.append(f"{error:.2g}{unit} in ${row.symbol}$")
-    return f"median error {parts[0]}, {parts[1]} and {parts[2]}"
+    what = "error" if known_as == "true" else f"difference from {known_as} ones"
+    return f"median {what} {parts[0]}, {parts[1]} and {parts[2]}"
 
 
 def _usable(

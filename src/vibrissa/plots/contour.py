@@ -53,6 +53,7 @@ def contour_views(
     colour: ArrayLike | None = None,
     colour_name: str = "deflection_angle",
     covariance: ArrayLike | None = None,
+    whisker_radius: ArrayLike | None = None,
     width: style.Width = "double",
 ) -> Figure:
     """Draw contact points from above (x–y), large, and from two sides (x–z and y–z).
@@ -73,6 +74,9 @@ def contour_views(
         Name of the quantity ``colour``.
     covariance : array_like (n, 3, 3), optional
         Covariances of the points, laboratory frame, m²: 95 % ellipses are drawn about some of them.
+    whisker_radius : array_like (n,), optional
+        Radius of the whisker at each point, m, which is on its centreline: the title then states
+        the distance of the whisker's side from the surface.
     width : {"single", "double"}
         Columns of the page.
 
@@ -115,7 +119,10 @@ def contour_views(
         _note_outside(panels[0], places, limits)
         _legend(figure, panels, known, fitted, spread is not None)
         if bodies and hasattr(bodies[-1][0], "signed_distance"):
-            _conclude(figure, np.asarray(points, dtype=np.float64)[rows], *bodies[-1])
+            radius = np.zeros(n) if whisker_radius is None else np.broadcast_to(whisker_radius, n)
+            away = bodies[-1][0].signed_distance(np.asarray(points, dtype=np.float64)[rows])
+            thing = "whisker's centreline" if whisker_radius is None else "whisker"
+            _conclude(figure, away - radius[rows], thing, bodies[-1][1])
         if shade is not None:
             page, height = 25.4 * figure.get_size_inches()
             box = page - _BAR + 2.0, _BOTTOM, 2.0, 0.6 * (height - _BOTTOM - _TOP)
@@ -124,13 +131,13 @@ def contour_views(
         return figure
 
 
-def _conclude(figure: Figure, points: Array, body: Body, look: str) -> None:
-    """State how far the contact points are from the surface that was fitted, or is known."""
-    away = np.median(np.abs(to_display("r", body.signed_distance(points))))
+def _conclude(figure: Figure, away: Array, thing: str, look: str) -> None:
+    """State how far contacts are from the surface that was fitted, or is known."""
+    median = np.nanmedian(np.abs(to_display("r", away)))
     style.conclude(
         figure,
-        f"{len(points)} contact points on the whisker's centreline, half of them within "
-        f"{away:.2g} mm of the {look} surface",
+        f"{len(away)} contact points: in half of them the {thing} is within {median:.2g} mm "
+        f"of the {look} surface",
     )
 
 

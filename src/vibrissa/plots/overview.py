@@ -301,10 +301,16 @@ def trial_overview(
         return figure
 
 
+def _spans(course: Course, span: slice = slice(None)) -> Array:
+    """When contacts begin and end, s; a frame without a pose of the base does not end one."""
+    seen = np.asarray(np.isfinite(course.position).all(axis=1))
+    return intervals(course.time[span], course.touching[span], seen[span])
+
+
 def _finding(course: Course) -> str:
     """State how often and how strongly the whisker touched, and how well that was located."""
     assert course.signals is not None
-    count = len(intervals(course.time, course.touching))
+    count = len(_spans(course))
     largest = np.nanmax(to_display("MB", course.signals["MB"]), initial=0.0)
     words = f"{count} contact{'' if count == 1 else 's'}, bending moments up to {largest:.2g} µN·m"
     if course.known is None or course.estimated is None:
@@ -457,7 +463,7 @@ def curves_over_time(
     """Draw F_x, M_B, M_D, r, θ and φ over time."""
     time = to_display("time", course.time)
     first, last = time[span][0], time[span][-1]
-    contacts = intervals(time[span], course.touching[span])
+    contacts = _spans(course, span)
     known, estimated = (
         None if points is None else spherical(points) for points in (course.known, course.estimated)
     )

@@ -16,13 +16,14 @@ from matplotlib.patches import Patch
 from numpy.typing import ArrayLike
 
 from vibrissa import scene
-from vibrissa.numerics import Array, Mask
+from vibrissa.numerics import Array, Mask, contacts_in
 from vibrissa.plots import style
 from vibrissa.plots.space import AZIMUTH, ELEVATION, bounds, name_axes, paint, painted, space_axes
 from vibrissa.plots.style import BLUE, INK, SHADE, Width, conclude, head, looking, new_figure, say
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.recording import Group
 from vibrissa.scene import DIRECTIONS
+from vibrissa.status import Status
 
 _COLUMNS = (("Fx", "FT", "FD"), ("Mx", "MB", "MD"))
 
@@ -47,6 +48,7 @@ def signals_over_time(
     if truth is not None and truth.sizes.get("time") != time.size:
         raise ValueError(f"the truth has {dict(truth.sizes)}, the signals {time.size} times")
     contact = _contact(signals)
+    spans = np.empty((0, 2)) if contact is None else intervals(time, contact, _seen(signals))
     with looking():
         layout: tuple[int, int, float] = (3, 2, 92.0) if width == "double" else (6, 1, 130.0)
         figure = new_figure(width, layout[2], "constrained")
@@ -57,6 +59,8 @@ def signals_over_time(
         # Forces in the left column and moments in the right one; or one below the other.
         for axes, name, letter in zip(panels.T.flat, names, "abcdef", strict=True):
             _panel(axes, name, signals, truth, contact)
+            for begin, end in spans:
+                axes.axvspan(begin, end, color=SHADE, linewidth=0.0, zorder=0)
             head(axes, letter, quantity(name).long_name)
         for axes in panels[-1]:
             axes.set_xlabel(axis_label("time"))
@@ -70,7 +74,9 @@ def signals_over_time(
             for n in ("FT", "MB")
             if n in signals
         ]
-        count = "" if contact is None else f" in {len(intervals(time, contact))} contacts"
+        count = (
+            "" if contact is None else f" in {len(spans)} contact{'' if len(spans) == 1 else 's'}"
+        )
         if largest:
             conclude(figure, f"{' and '.join(largest)}{count}")
         return figure
@@ -82,14 +88,18 @@ def _contact(signals: xr.Dataset) -> Mask | None:
     return np.asarray(np.nan_to_num(signals["in_contact"].to_numpy().astype(np.float64)) > 0.5)
 
 
-def intervals(time: Array, contact: Mask) -> Array:
-    """Find when contacts begin and end."""
+def _seen(signals: xr.Dataset) -> Mask | None:
+    """Frames that are not missing."""
+    return np.asarray(signals["status"] != Status.MISSING) if "status" in signals else None
+
+
+def intervals(time: Array, contact: Mask, known: Mask | None = None) -> Array:
+    """Find when contacts begin and end; ``known`` are the frames of which that is known."""
     if time.size < 2:
         return np.empty((0, 2))
     halfway = 0.5 * (time[1:] + time[:-1])
     edges = np.concatenate([time[:1], halfway, time[-1:]])
-    change = np.diff(np.concatenate([[0], contact.astype(np.int8), [0]]))
-    return np.stack([edges[change == 1], edges[change == -1]], axis=1)
+    return np.array([(edges[a], edges[b]) for a, b in contacts_in(contact, known)]).reshape(-1, 2)
 
 
 def _panel(
@@ -100,9 +110,6 @@ def _panel(
     contact: Mask | None,
 ) -> None:
     time = to_display("time", signals["time"])
-    if contact is not None:
-        for begin, end in intervals(time, contact):
-            axes.axvspan(begin, end, color=SHADE, linewidth=0.0, zorder=0)
     if name not in DIRECTIONS:
         axes.axhline(0.0, color="#bfbfbf", linewidth=0.5, zorder=1)
     look: dict[str, Any] = (

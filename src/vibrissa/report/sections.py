@@ -392,15 +392,17 @@ def _contour(recording: xr.DataTree, seed: int) -> str:
     for name, meant in fit.fields.items():
         values = np.atleast_1d(getattr(fit, name))
         own = [p for p in fit.parameters if p.startswith(name)]
-        for parameter, value in zip(own, values, strict=True):
-            label = parameter.replace("_", ", ")
-            rows.append((label, *with_sigma(meant, float(value), sigma[parameter])))
+        label, factor = ("diameter", 2.0) if name == "radius" else (name, 1.0)
+        for parameter, value in zip(own, factor * values, strict=True):
+            shown = parameter.replace(name, label).replace("_", ", ")
+            rows.append((shown, *with_sigma(meant, float(value), factor * sigma[parameter])))
     text = table(
         rows,
         ("parameter", "fitted", "standard deviation"),
         f"The fitted {fit.kind}",
-        f"{int(fit.inliers.sum())} contacts fit; root mean square of their distances: "
-        f"{shown_value('surface_distance', fit.rms)}. "
+        f"{int(fit.inliers.sum())} contacts fit; their distances from it: "
+        f"{shown_value('surface_distance', fit.median)} in the median, "
+        f"{shown_value('surface_distance', fit.rms)} root mean square. "
         f"Misfit {float(f'{fit.misfit:.3g}'):,g}: χ² per degree of freedom, about 1 where the "
         "shape and the stated noise are right.",
     )

@@ -90,7 +90,8 @@ class Lines:
     """Takes lines apart; the first one that is not JSON is a header, others may follow.
 
     Of several choices of names the first that a line has counts. Raw names are a sensor's channels,
-    which are called as they are and have no units. With the name of a whisker its own values are
+    which are called as they are and have no units; channels that are Fx to Mz may also have the
+    other names of these, such as ``wrench.force.x``. With the name of a whisker its own values are
     called ``name.value``, and lines that have only others' are passed over.
     """
 
@@ -212,11 +213,14 @@ class Lines:
     def _named(self, cells: list[str]) -> tuple[list[str], dict[str, float]]:
         """Names of columns as they are used here, and what makes their numbers SI."""
         names = cells = [self._own(cell) for cell in cells]
-        if self.raw:
-            return names, {}
         found, _ = signal_columns(cells, _SIGNALS)
         factors = {}
         for name, (place, factor) in found.items():
+            if self.raw and name != "time":
+                # Only the sensor states units; a header may call a component otherwise.
+                if name in names or cells[place].rstrip()[-1:].lower() not in "xyz":
+                    continue
+                factor = 1.0
             names[place] = name
             if factor != 1.0:
                 factors[name] = factor

@@ -6,6 +6,7 @@ import re
 import shlex
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import typer
@@ -69,16 +70,28 @@ def test_what_cannot_be_typed_is_noticed():
             parse(words)
 
 
+def inside(node, modules):
+    """The module, or what it offers, that an expression such as vb.pipeline names; else None."""
+    if isinstance(node, ast.Name):
+        return modules.get(node.id)
+    within = inside(node.value, modules) if isinstance(node, ast.Attribute) else None
+    if not isinstance(within, ModuleType):
+        return None
+    assert hasattr(within, node.attr), ast.unparse(node)
+    return getattr(within, node.attr)
+
+
 @pytest.mark.parametrize("name", PAGES)
 def test_names_that_pages_use_exist(name):
+    modules = {"vb": vb}
     for node in (
         node for code in blocks(PAGES[name], "python") for node in ast.walk(ast.parse(code))
     ):
         if isinstance(node, ast.ImportFrom):
             module = importlib.import_module(node.module)
             assert [one.name for one in node.names if not hasattr(module, one.name)] == []
-        elif isinstance(node, ast.Attribute) and ast.unparse(node.value) == "vb":
-            assert hasattr(vb, node.attr), node.attr
+            modules |= {one.asname or one.name: getattr(module, one.name) for one in node.names}
+        inside(node, modules)
 
 
 @pytest.mark.parametrize("name", ["README.md", "tutorial.md"])

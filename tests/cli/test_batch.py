@@ -50,6 +50,11 @@ def test_a_folder_is_done_once_and_summarised(tmp_path):
     touch = rows["touch.nc"]
     assert touch["fault"] == ""
     assert "cylinder" in touch["fitted"]
+    assert touch["shape"] == "cylinder"
+    fit = load_recording(tmp_path / "touch.nc")["contour"]
+    assert float(touch["diameter"]) == pytest.approx(2.0 * fit["object_radius"].item(), rel=1e-5)
+    assert float(touch["x"]) == pytest.approx(fit["object_position"].values[0], rel=1e-5)
+    assert rows["miss.nc"]["diameter"] == ""
     truth = load_recording(tmp_path / "touch.nc")["truth"]
     assert int(touch["contacts"]) == 1
     assert 0 < int(touch["frames_in_contact"]) <= int(truth["in_contact"].sum())

@@ -112,6 +112,8 @@ def test_nwb_holds_what_other_formats_hold(trial, tmp_path):
         assert "that of the estimates" in found["contact_point_C1"].attrs["description"]
         assert found["signals_moment_C1"].attrs["description"].endswith("NaN where there is none")
         assert file["intervals/contact_events/start_time"][:].tolist() == [TIME[10]]
+        # nwbinspector objects to intervals without a duration.
+        assert file["intervals/contact_events/stop_time"][0] == pytest.approx(TIME[11])
     assert load_nwb_series(tmp_path / "t.nwb")["force"].equals(trial["force"])
 
 

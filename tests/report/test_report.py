@@ -202,13 +202,13 @@ def test_numbers_are_those_of_the_recording(written, folder):
     rows = {row[0]: row for row in tables[f"The fitted {fit.attrs['shape']}"]}
     sigma = np.sqrt(np.diag(fit["parameter_covariance"].values))
     names = list(fit["parameter"].values)
-    assert number(rows["radius"][1]) == pytest.approx(
-        1e3 * float(fit["object_radius"]), rel=5e-4
+    assert number(rows["diameter"][1]) == pytest.approx(
+        2e3 * float(fit["object_radius"]), rel=5e-4
     )  # four digits
-    uncertainty = rows["radius"][2]
+    uncertainty = rows["diameter"][2]
     last_digit = 10.0 ** -len(re.match(r"[\d]+\.(\d+)", uncertainty)[1])
     assert number(uncertainty) == pytest.approx(
-        1e3 * sigma[names.index("radius")], abs=0.5 * last_digit
+        2e3 * sigma[names.index("radius")], abs=0.5 * last_digit
     )
     x = 1e3 * float(fit["object_position"].sel(space="x"))
     assert number(rows["origin, x"][1]) == pytest.approx(x, rel=5e-4)

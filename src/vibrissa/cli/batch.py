@@ -17,7 +17,8 @@ from vibrissa.cli.terminal import Tell, progress_bars, say, shown
 TABLE, PAGE = "summary.csv", "summary.html"
 _COLUMNS = (
     *("file", "whiskers", "duration", "frames", "frames_in_contact", "contacts"),
-    *("largest_force", "largest_moment", "estimated", "surface_distance", "fitted", "fault"),
+    *("largest_force", "largest_moment", "estimated", "surface_distance"),
+    *("shape", "x", "y", "z", "diameter", "diameter_sigma", "fitted", "fault"),
 )
 _HEADING = (
     *("recording", "whiskers", "duration", "frames", "in contact", "contacts", "largest force"),
@@ -116,8 +117,23 @@ def _cells(path: Path, found: vb.pipeline.TrialSummary | None, fault: str) -> li
     names = " ".join(found.whiskers)
     numbers = (found.duration, found.frames, found.in_contact, found.contacts)
     sizes = (found.largest_force, found.largest_moment, found.estimated, found.distance)
-    short = (f"{n:.6g}" if isinstance(n, float) else n for n in (*numbers, *sizes))
-    return [path.name, names, *short, found.fitted, fault]
+    short = (_short(n) for n in (*numbers, *sizes))
+    return [path.name, names, *short, *_object(found.shape), found.fitted, fault]
+
+
+def _object(shape: vb.contour.FittedShape | None) -> list[object]:
+    """Kind, position and diameter of the fitted object, as far as it has them."""
+    if shape is None:
+        return [""] * 6
+    position = next(n for n, meant in shape.fields.items() if meant == "object_position")
+    size: list[object] = ["", ""]
+    if "radius" in shape.fields:
+        size = [_short(2.0 * float(x)) for x in (getattr(shape, "radius"), shape.sigma["radius"])]  # noqa: B009
+    return [shape.kind, *(_short(float(x)) for x in getattr(shape, position)), *size]
+
+
+def _short(value: object) -> object:
+    return f"{value:.6g}" if isinstance(value, float) else value
 
 
 def _shown(path: Path, found: vb.pipeline.TrialSummary | None, fault: str) -> list[str]:

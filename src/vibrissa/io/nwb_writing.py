@@ -417,20 +417,30 @@ def _predictors(table: xr.Dataset, whisker: int, name: str, clock: dict[str, Any
     )
 
 
+_EVENTS = "Onset, loss and slip of contacts, each from its time on for the length of a frame"
+
+
+def _step(data: xr.Dataset) -> float:
+    """Time from frame to frame, s."""
+    time = data["time"].values
+    return float(np.median(np.diff(time))) if time.size > 1 else 0.0
+
+
 def _add_events(file: NWBFile, table: xr.Dataset) -> None:
-    """Write onset, loss and slip of contacts, as intervals without duration."""
+    """Write onset, loss and slip as intervals of a frame, as NWB wants a duration."""
     from pynwb.epoch import TimeIntervals
 
     found = sorted(events_in(table))
     if not found:
         return
-    rows = TimeIntervals(name="contact_events", description="Onset, loss and slip of contacts")
+    rows = TimeIntervals(name="contact_events", description=_EVENTS)
+    step = _step(table)
     rows.add_column("whisker", "Name of the whisker")
     rows.add_column("event", "What happened: onset, loss or slip")
     rows.add_column("sigma", "Standard deviation of an onset, s; NaN where it is not known")
     for time, name, event, sigma in found:
         known = {"whisker": _allowed(name), "event": event, "sigma": sigma}
-        rows.add_interval(start_time=time, stop_time=time, **known)
+        rows.add_interval(start_time=time, stop_time=time + step, **known)
     file.add_time_intervals(rows)
 
 
@@ -439,7 +449,7 @@ def _add_contacts(file: NWBFile, data: xr.Dataset) -> None:
     from pynwb.epoch import TimeIntervals
 
     time = data["time"].values
-    step = float(np.median(np.diff(time))) if time.size > 1 else 0.0
+    step = _step(data)
     rows = []
     touching = np.nan_to_num(data["in_contact"].transpose("whisker", "time").values) > 0.5
     seen = np.ones_like(touching)

@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 
 from vibrissa.contacts import friction_assumed
-from vibrissa.contour import shape_from_dataset
+from vibrissa.contour import FittedShape, shape_from_dataset
 from vibrissa.io import events_in
 from vibrissa.numerics import contacts_in
 from vibrissa.pipeline.estimates import Progress, estimates_of
@@ -150,7 +150,7 @@ class TrialSummary:
     ``in_contact`` and ``contacts``, frames in contact and uninterrupted contacts of all whiskers,
     are None where that is not known; bases move within ``extent``; ``estimated`` counts frames and
     whiskers with an estimate, ``assumption`` is what these assume of friction, and ``events``
-    counts onsets, losses and slips.
+    counts onsets, losses and slips. ``fitted`` is the fitted ``shape`` in words.
     """
 
     origin: str
@@ -167,6 +167,7 @@ class TrialSummary:
     events: Counter[str]
     stages: tuple[str, ...]
     fitted: str
+    shape: FittedShape | None
     known: str
     distance: float
 
@@ -196,10 +197,11 @@ def summarise(recording: xr.DataTree) -> TrialSummary:
         if "friction" in (about := estimates.data.attrs):
             assumption = friction_assumed(float(about["friction"]))
         events = Counter(event for _, _, event, _ in events_in(estimates.data))
-    fitted, distance = "", np.nan
+    fitted, shape, distance = "", None, np.nan
     if "contour" in recording.children:
         contour = recording["contour"].to_dataset()
-        fitted = repr(shape_from_dataset(contour)).strip("<>")
+        shape = shape_from_dataset(contour)
+        fitted = repr(shape).strip("<>")
         if "surface_distance" in contour:
             away = np.abs(contour["surface_distance"].values)
             if "inlier" in contour:  # as `FittedShape.median`
@@ -220,6 +222,7 @@ def summarise(recording: xr.DataTree) -> TrialSummary:
         events=events,
         stages=tuple(stage for stage in STAGES if stage in recording.children),
         fitted=fitted,
+        shape=shape,
         known="; ".join(known.in_words() for known in record.objects),
         distance=distance,
     )

@@ -28,6 +28,8 @@ _NORM = BoundaryNorm(_CONES, 256)
 # Range of errors drawn, mm: smaller ones are exact, larger ones do not locate the contact.
 _TURNS = (0, 20, 50, 90, 180, 360)
 _ERRORS = (1e-4, 1e3)
+# So near, as a share of a panel, and so many: marks that are drawn small.
+_NEAR, _SEVERAL = 0.04, 4
 _ROW, _FRAME = 4.4, 20.0  # height of a row of marks, and of what is around the rows, mm
 
 
@@ -153,10 +155,12 @@ def _of_few(
 def _chart(axes: Axes, found: xr.Dataset, words: NDArray[np.str_], degrees: Array) -> None:
     """Every whisker by taper and turn; the widest cones below, so that none hides another."""
     x, y = found["taper_ratio"].values, np.degrees(found["turn"].values)
-    size = 10.0 + 26.0 * np.clip(degrees / _CONES[-1], 0.0, 1.0) ** 0.5
+    size = 9.0 + 15.0 * np.clip(degrees / _CONES[-1], 0.0, 1.0) ** 0.5
+    crowded = _crowded(x, y)
+    size[crowded] *= 0.4
     for k in np.argsort(-degrees):
         if words[k]:
-            look = _look(degrees[k : k + 1], 0.4)
+            look = _look(degrees[k : k + 1], 0.15 if crowded[k] else 0.3)
             axes.scatter(x[k], y[k], s=size[k], marker=_MARKS[str(words[k])], **look)
     axes.set_xscale("log")
     low, high = (np.nanmin(x), np.nanmax(x)) if x.size else (1.0, 60.0)
@@ -169,6 +173,15 @@ def _chart(axes: Axes, found: xr.Dataset, words: NDArray[np.str_], degrees: Arra
     axes.set_yticks([turn for turn in _TURNS if turn <= 1.05 * most])
     axes.set_ylim(-0.002 * most, 1.15 * most)  # marks at 0 stay whole
     axes.set_ylabel("tangent turns, base to tip (°)")
+
+
+def _crowded(x: Array, y: Array) -> NDArray[np.bool_]:
+    """Whiskers with several others almost at the same taper and turn, as those of an array."""
+    if x.size == 0:
+        return np.zeros(0, dtype=bool)
+    scaled = [v / max(np.nanmax(v) - np.nanmin(v), 1e-9) for v in (np.log(x), np.sqrt(y))]
+    apart = np.hypot(*(v[:, None] - v for v in scaled))
+    return np.asarray((apart < _NEAR).sum(axis=1) > _SEVERAL)
 
 
 def _lines(axes: Axes, labels: list[str]) -> None:

@@ -4,9 +4,10 @@ import ast
 import importlib
 import re
 import shlex
+import sys
 from functools import cache
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 import typer
@@ -115,3 +116,53 @@ def test_the_tour_runs(name, monkeypatch, capsys):
 @pytest.mark.parametrize("picture", sorted(DOCS.rglob("*.png")), ids=lambda path: path.name)
 def test_pictures_are_small(picture):
     assert picture.stat().st_size < LARGEST
+
+
+def test_the_node_for_ros_answers_a_wrench_with_its_contact(tmp_path, monkeypatch):
+    """With stand-ins of ROS, which is not on PyPI."""
+    contact_map = vb.ContactMap.simulate(vb.samples.gamma(), grid=False)
+    contact_map.save(tmp_path / "wire.nc")
+    sensor = vb.sensors.Sensor(noise=[1e-6] * 3 + [2e-8] * 3)
+    vb.sensors.save_sensor(tmp_path / "sensor.toml", sensor)
+    monkeypatch.chdir(tmp_path)
+    asked, published = [], []
+
+    class Node:
+        def __init__(self, name):
+            assert name == "vibrissa"
+
+        def create_publisher(self, kind, topic, depth):
+            return SimpleNamespace(publish=published.append)
+
+        def create_subscription(self, kind, topic, answer, depth):
+            asked.append(answer)
+
+    def pose():
+        inner = SimpleNamespace(position=SimpleNamespace())
+        return SimpleNamespace(pose=SimpleNamespace(pose=inner))
+
+    kinds = {"PoseWithCovarianceStamped": pose, "WrenchStamped": None}
+    for name, held in (
+        ("rclpy", {"init": lambda: None, "spin": lambda node: None}),
+        ("rclpy.node", {"Node": Node}),
+        ("geometry_msgs", {}),
+        ("geometry_msgs.msg", kinds),
+    ):
+        module = ModuleType(name)
+        vars(module).update(held)
+        monkeypatch.setitem(sys.modules, name, module)
+    (code,) = blocks(PAGES["streams.md"], "py")
+    exec(compile(code, "streams.md", "exec"), {})
+    bent = vb.deflect(contact_map.whisker, vb.PointContact([24e-3, 14e-3, 2e-3]))
+    for force, moment in ((bent.force, bent.moment), (0.0 * bent.force, 0.0 * bent.moment)):
+        wrench = SimpleNamespace(
+            force=SimpleNamespace(**dict(zip("xyz", force, strict=True))),
+            torque=SimpleNamespace(**dict(zip("xyz", moment, strict=True))),
+        )
+        asked[0](SimpleNamespace(header="stamp", wrench=wrench))
+    (answer,) = published
+    place = answer.pose.pose.position
+    assert [place.x, place.y, place.z] == pytest.approx(bent.contact_point, abs=1e-6)
+    assert answer.header == "stamp"
+    assert len(answer.pose.covariance) == 36
+    assert 0.0 < answer.pose.covariance[0] < 1e-6

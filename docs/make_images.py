@@ -133,6 +133,9 @@ def contour() -> Figure:
         peg,
         shape_from_dataset(long_trial()["contour"].to_dataset()),
         colour=deflection_angles(course, line()),
+        whisker_radius=chart().whisker.radius(
+            long_trial()["estimates"]["arc_length"].isel(whisker=0).values
+        ),
     )
 
 

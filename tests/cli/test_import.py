@@ -158,6 +158,39 @@ def test_two_views_to_a_recording(trial, tmp_path, write):
     assert "vibrissa reconstruct" in run("info", out)
 
 
+def test_points_are_ordered_and_separated_by_their_names(trial):
+    """As in a project of DeepLabCut for one animal with the whiskers C1 and C2."""
+    raw = RawTracks(
+        "test",
+        ["w"],
+        image=np.stack([camera.project(trial[1]) for camera in CAMERAS], axis=2),
+        views=[c.name for c in CAMERAS],
+        fps=1000.0,
+    )
+    plain = labelled(raw, "a")
+    count = plain.sizes["node"]
+    along = ["base", *(f"p{i}" for i in range(1, count - 1)), "tip"]
+    found = tracker_traces(plain.assign_coords(node=along), CAMERAS)
+    turned = plain.isel(node=slice(None, None, -1)).assign_coords(node=along[::-1])
+    again = tracker_traces(turned, CAMERAS)
+    assert any("from tip to base" in note for note in again.notes)
+    assert not any("by their names" in note for note in found.notes)
+    np.testing.assert_array_equal(again.traces[0][0][5].line, found.traces[0][0][5].line)
+    for label in ("{0}_{1}", "{1}_{0}", "{0}.{1}"):
+        both = xr.concat(
+            [plain.assign_coords(node=[label.format(w, n) for n in along]) for w in ("C1", "C2")],
+            "node",
+        )
+        two = tracker_traces(both, CAMERAS)
+        assert two.names == ["C1", "C2"]
+        for k in range(2):
+            one = two.traces[1][k][5].line
+            np.testing.assert_array_equal(one, found.traces[1][0][5].line)
+    # Names with a number each are not whiskers.
+    numbered = plain.assign_coords(node=[f"w_{i}" for i in range(count)])
+    assert len(tracker_traces(numbered, CAMERAS).names) == 1
+
+
 def test_lines_between_few_points_are_not_trusted_beyond_their_noise(trial):
     """From Python too, without an option."""
     image = np.stack([camera.project(trial[1]) for camera in CAMERAS], axis=2)

@@ -7,8 +7,10 @@ usual direction of the whisker, so that no whisker points towards one.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -28,6 +30,7 @@ _USUAL = 0.5  # share of the frames in which a whisker is seen, from which it is
 _SHARE = 1e-3  # usual standard deviation of a point in space, as a share of the whisker's length
 _WIDE = 1000.0  # width of the image of a camera that is added, pixels
 _MARGIN = 20.0  # distance of the points from the border of such an image, pixels
+_BASES = ("base", "root", "follicle")  # words in the name of the point at a whisker's base
 _ARC_POINTS = 12  # number of points on an arc that stands for a measured curvature
 
 
@@ -51,7 +54,7 @@ def tracker_traces(
 ) -> TrackerTraces:
     """Make traces of the points of other trackers."""
     notes: list[str] = []
-    tracks = _arcs(tracks, notes)
+    tracks = _arcs(_from_base(_apart(tracks, notes), notes), notes)
     if "centerline" in tracks:
         points = _confident(tracks, "centerline", "confidence")
         views = None
@@ -72,6 +75,64 @@ def tracker_traces(
         for v in range(len(views))
     ]
     return TrackerTraces(tuple(views), traces, known, tuple(notes))
+
+
+def _node_names(tracks: xr.Dataset) -> list[str]:
+    """Names of the points along a whisker; none where they are numbered."""
+    if "node" not in tracks.coords or tracks["node"].dtype.kind not in "UO":
+        return []
+    return [str(name) for name in tracks["node"].values]
+
+
+def _apart(tracks: xr.Dataset, notes: list[str]) -> xr.Dataset:
+    """Separate whiskers of which points of one animal are named, such as C1_base … C2_tip."""
+    names = _node_names(tracks)
+    if tracks.sizes.get("whisker") != 1 or not names:
+        return tracks
+    cut = [re.split(r"[_\-. ]", name, maxsplit=1) for name in names]
+    turned = [name[::-1] for name in names]
+    back = [[p[::-1] for p in re.split(r"[_\-. ]", name, maxsplit=1)] for name in turned]
+    # The whisker is named first or last; its points are next to each other in the file.
+    groups = next((found for pairs in (cut, back) if (found := _groups(pairs))), None)
+    if groups is None:
+        return tracks
+    parts = [
+        tracks.isel(node=rows).assign_coords(node=nodes, whisker=[name])
+        for name, (rows, nodes) in groups.items()
+    ]
+    notes.append(
+        f"by the names of their points these are {len(parts)} whiskers: {', '.join(groups)}"
+    )
+    together: dict[str, Any] = {"data_vars": "minimal", "coords": "minimal", "compat": "override"}
+    return xr.concat(parts, "whisker", combine_attrs="override", **together)
+
+
+def _groups(pairs: list[list[str]]) -> dict[str, tuple[list[int], list[str]]] | None:
+    """Rows and names of the points of each whisker, if all have the same ones side by side."""
+    if any(len(pair) != 2 for pair in pairs):
+        return None
+    found: dict[str, tuple[list[int], list[str]]] = {}
+    for row, (whisker, node) in enumerate(pairs):
+        rows, nodes = found.setdefault(whisker, ([], []))
+        if rows and rows[-1] != row - 1:
+            return None
+        rows.append(row)
+        nodes.append(node)
+    (_, first), *others = found.values()
+    alike = all(nodes == first for _, nodes in others)
+    return found if others and alike and len(first) >= _FEWEST else None
+
+
+def _from_base(tracks: xr.Dataset, notes: list[str]) -> xr.Dataset:
+    """Turn points round that run from tip to base by their names."""
+    names = [name.lower() for name in _node_names(tracks)]
+    if not names or "tip" not in names[0] or not any(base in names[-1] for base in _BASES):
+        return tracks
+    notes.append(
+        f"the points run from {names[0]} to {names[-1]} by their names: they were turned round, as "
+        "nodes run from base to tip"
+    )
+    return tracks.isel(node=slice(None, None, -1))
 
 
 def _confident(tracks: xr.Dataset, name: str, confidence: str) -> Array:

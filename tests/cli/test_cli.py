@@ -119,6 +119,26 @@ def test_map_and_estimate(folder, chart, table):
     assert np.isnan(contacts["x"].values[2:]).all()
 
 
+def test_signals_that_cannot_locate_contacts_are_named_with_better_ones(folder):
+    """As (Fx, MB, MD) of a wire of constant thickness."""
+    wire = folder / "cylinder.nc"
+    run("map", "--length", 40, "--base-radius", 0.1, "--tip-radius", 0.1, "--no-grid", "-o", wire)
+    bent = vb.deflect(vb.ContactMap.load(wire).whisker, vb.PointContact([30e-3, 5e-3, 1e-3]))
+    path = folder / "stamped.csv"
+    numbers = ",".join(repr(float(x)) for x in (*bent.force, *bent.moment))
+    names = [f"wrench.{kind}.{axis}" for kind in ("force", "torque") for axis in "xyz"]
+    path.write_text(f"stamp,{','.join(names)}\n1700000000.25,{numbers}\n")
+    assert "from 1700000000 to 1700000000 s" in run("info", path)
+    out = folder / "cylinder.csv"
+    text = run("estimate", path, "--map", wire, "-o", out)
+    assert "--using FT,MB,MD" in text
+    text = run("estimate", path, "--map", wire, "--using", "FT,MB,MD", "-o", out, "--force")
+    assert "do not determine" not in text
+    found = load_contacts(out)
+    assert found["time"].item() == 1700000000.25
+    assert found["x"].item() == pytest.approx(30e-3, abs=1e-6)
+
+
 def test_estimate_from_more_signals_and_from_all(folder, chart, table):
     path, points = table
     noise = folder / "noise.csv"

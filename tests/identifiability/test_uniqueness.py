@@ -107,6 +107,10 @@ def test_a_planar_curved_whisker(of_curved):
     assert of_curved.attrs["chosen_triplet"] == "Fx MB MD"
     assert of_curved.attrs["chosen_region"] == "all"
     assert str(of_curved.notation.sel(triplet="Mx MB MD").item()) == "All*"
+    # Alone it would be chosen; the table states for which contacts it is of no use.
+    alone = of_curved.sel(triplet=["Mx MB MD"]).assign_attrs(chosen_triplet="Mx MB MD")
+    assert "; not for contacts in or near z = 0" in verdict_table(alone)
+    assert "not for contacts" not in verdict_table(of_curved)
 
 
 def test_in_the_plane_of_a_planar_whisker(of_curved, curved):

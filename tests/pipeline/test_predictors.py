@@ -7,8 +7,10 @@ import pytest
 import xarray as xr
 from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
 import vibrissa as vb
+from vibrissa.cli.app import app
 from vibrissa.io import Session, load_nwb_series, save_nwb, save_predictors
 from vibrissa.pipeline import PREDICTORS, predictors
 from vibrissa.recording import ONE_VIEW, coordinates, recorded, recording_tree
@@ -186,6 +188,10 @@ def test_frames_that_tracking_lost_do_not_divide_a_contact(trial, tmp_path):
     root["in_contact"].attrs = trial["in_contact"].attrs
     tree = recording_tree(root, [vb.samples.gamma()] * 2, "made by hand")
     assert vb.pipeline.summarise(tree).contacts == 2
+    # The command reads only what a summary needs.
+    vb.io.save_recording(tmp_path / "t.nc", tree)
+    shown = CliRunner().invoke(app, ["info", str(tmp_path / "t.nc")]).output
+    assert "contacts  2, in 37 frames" in shown
     listed = vb.pipeline.contact_events(root)
     assert listed["onset"].values.tolist() == [TIME[20]] * 2
     assert listed["release"].values.tolist() == [TIME[60]] * 2

@@ -109,7 +109,7 @@ def test_a_planar_curved_whisker(of_curved):
     assert str(of_curved.notation.sel(triplet="Mx MB MD").item()) == "All*"
     # Alone it would be chosen; the table states for which contacts it is of no use.
     alone = of_curved.sel(triplet=["Mx MB MD"]).assign_attrs(chosen_triplet="Mx MB MD")
-    assert "; not for contacts in or near z = 0" in verdict_table(alone)
+    assert "; not for contacts in or near the plane of the whisker, z = 0" in verdict_table(alone)
     assert "not for contacts" not in verdict_table(of_curved)
 
 

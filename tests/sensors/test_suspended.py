@@ -161,6 +161,27 @@ def test_what_touches_do_not_determine_is_named():
     assert "base x / L" in found.undetermined
 
 
+def test_a_touch_that_is_far_from_all_others_is_left_out():
+    at = points(60)
+    readings, status = TRUE.read(at, seed=3)
+    good = np.flatnonzero(status == int(vb.Status.OK))
+    wrong = good[[7, 30]]
+    slipped = readings.copy()
+    slipped[wrong, 1] += np.array([0.2, -0.25]) * np.ptp(readings[good, 1])
+    others = points(80, seed=9)
+    expected, _ = TRUE.read(others)
+
+    def error(calibration):
+        return np.sqrt(np.nanmean((calibration.sensor.read(others)[0] - expected) ** 2))
+
+    clean = calibrate_suspension(WIRE, at, readings, free=5)
+    found = calibrate_suspension(WIRE, at, slipped, free=5)
+    assert not clean.outliers.any()
+    np.testing.assert_array_equal(np.flatnonzero(found.outliers), wrong)
+    assert not found.used[wrong].any()
+    assert error(found) < 1.3 * error(clean)
+
+
 def test_too_few_or_idle_touches_are_refused():
     at = points(30)
     readings, _ = TRUE.read(at)

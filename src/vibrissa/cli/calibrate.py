@@ -14,6 +14,7 @@ from vibrissa.cli.terminal import remark, say
 # Noise, as a share of the range of the readings, above which something is wrong.
 _UNEXPLAINED = 0.05
 _AGAIN = 4  # touches with the same largest reading from which a channel seems to saturate
+_MOST_NAMED = 5  # touches that are named
 _POOR = 1.0  # reprojection error above which something is wrong, pixels
 _SMALLEST, _LARGEST = 0.05, 200.0  # sides of squares, mm: what is smaller was typed in m
 _FRAMES = 40  # frames that are used of a video, by default
@@ -64,8 +65,13 @@ def _suspended(description: Path, target: Path, force: bool) -> None:
         drift=drift,
     )
     vb.sensors.save_suspended(target, found, stage)
-    lost = len(points) - int(found.used.sum())
-    say(f"{found.used.sum()} touches" + (f"; {lost} have no equilibrium in the model" * (lost > 0)))
+    far = np.flatnonzero(found.outliers)
+    lost = len(points) - int(found.used.sum()) - far.size
+    said = f"; {lost} have no equilibrium in the model" * (lost > 0)
+    if far.size:
+        which = ", ".join(str(k + 1) for k in far[:_MOST_NAMED]) + ", …" * (far.size > _MOST_NAMED)
+        said += f"; left out as far from all others: {which} (of the touches, from 1)"
+    say(f"{found.used.sum()} touches{said}")
     spread = found.covariance.diagonal() ** 0.5
     for name, value, sigma in zip(found.names, found.values, spread, strict=True):
         open_ = "  (not determined by the touches)" if name in found.undetermined else ""

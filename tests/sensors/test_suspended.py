@@ -214,10 +214,11 @@ def read_by_spring(bent):
     on = bent.status == vb.Status.OK
     theta = np.where(on[:, None], TURN * bent.moment, 0.0)
     i, j = np.triu_indices(3)
+    n = len(theta)
     features = np.concatenate(
-        [np.ones((80, 1)), theta, np.zeros((80, 3)), theta[:, i] * theta[:, j]], axis=1
+        [np.ones((n, 1)), theta, np.zeros((n, 3)), theta[:, i] * theta[:, j]], axis=1
     )
-    noise = np.random.default_rng(0).normal(scale=5.0, size=(80, 3))
+    noise = np.random.default_rng(0).normal(scale=5.0, size=(n, 3))
     return sensor, features @ READOUT.T + noise, on
 
 
@@ -240,6 +241,51 @@ def test_a_sweep_finds_onset_contact_points_and_normals():
     assert np.median(np.linalg.norm(away, axis=1)) < 1e-3
     outward = (found.points[both] - axis)[:, :2] / radius
     assert np.median(np.abs(np.sum(outward * found.normal[both][:, :2], axis=1))) > 0.98
+
+
+def test_contacts_do_not_depend_on_how_often_samples_are_taken():
+    """The same motion and readings, four times as many samples: nothing new is known."""
+    base, _, _, bent = swept()
+    sensor, readings, _ = read_by_spring(bent)
+    often = np.linspace(0, len(base) - 1, 4 * (len(base) - 1) + 1)
+
+    def between(values):
+        return np.stack([np.interp(often, np.arange(len(values)), v) for v in values.T], axis=1)
+
+    few = follow_sweep(sensor, readings, base)
+    many = follow_sweep(sensor, between(readings), between(base))
+    rows = np.flatnonzero(few.in_contact)[5:-5]
+    assert many.in_contact[4 * rows].all()
+    spread = np.einsum("kii->ki", few.covariance[rows]) ** 0.5
+    ratio = np.einsum("kii->ki", many.covariance[4 * rows]) ** 0.5 / spread
+    away = np.abs(many.points[4 * rows] - few.points[rows]) / spread
+    assert 0.85 < np.median(ratio) < 1.15
+    assert np.median(away) < 0.2
+
+
+def test_contacts_do_not_depend_on_where_the_search_starts(monkeypatch):
+    """For a sensor that explains the readings badly, which converges slowly."""
+    base, _, _, bent = swept()
+    sensor, readings, on = read_by_spring(bent)
+    off = replace(sensor, shift_compliance=SHIFT, pivot=[1e-3, 3e-3, -1e-3], drift=40.0)
+    readings = readings + on[:, None] * np.array([1.0, -1.0, 1.0])
+    found = []
+    for start in (0.45, 0.85):
+        monkeypatch.setattr("vibrissa.sensors.swept._STARTS", (start,))
+        found.append(follow_sweep(off, readings, base, rest=np.zeros(3)).points)
+    assert np.nanmax(np.abs(found[0] - found[1])) < 1e-7
+
+
+def test_rest_may_be_stated_for_each_sample_of_a_sweep():
+    base, _, _, bent = swept()
+    sensor, readings, on = read_by_spring(bent)
+    drifting = np.linspace(0.0, 80.0, len(base))[:, None] * np.array([0.0, 1.0, -1.0])
+    true = follow_sweep(sensor, readings, base, rest=np.zeros(3))
+    found = follow_sweep(sensor, readings + drifting, base, rest=drifting)
+    np.testing.assert_allclose(found.points[on], true.points[on], atol=1e-6)
+    unknown = follow_sweep(sensor, readings + drifting, base, rest=np.zeros(3))
+    both = on & unknown.in_contact & true.in_contact
+    assert np.linalg.norm((unknown.points - true.points)[both], axis=1).max() > 0.2e-3
 
 
 def test_drift_between_recordings_is_in_the_covariance():

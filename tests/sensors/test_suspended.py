@@ -405,6 +405,18 @@ def test_a_channel_that_saturates_is_said_and_can_be_left_out(tmp_path):
         Stage(text.replace(", 1e9]", "]"), tmp_path).touches()
 
 
+def test_the_command_line_names_touches_that_are_left_out(tmp_path):
+    at = points(36)
+    readings, status = TRUE.read(at, seed=4)
+    readings, at = readings[status == 0], at[status == 0]
+    readings[4, 2] += 0.3 * np.ptp(readings[:, 2])
+    command, _ = written(tmp_path, at, readings)
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 0, done.output
+    said = " ".join(done.output.split())
+    assert f"{len(at) - 1} touches; left out as far from all others: 5 (" in said
+
+
 def test_the_command_line_goes_from_tables_to_contacts(tmp_path):
     at = points(60)
     readings, status = TRUE.read(at, seed=4)

@@ -680,8 +680,8 @@ def fit_within(
     """Find the contact of least χ² in Ω, downhill from another, with the weights of that one.
 
     It is given up if above ``worth``. Where the way leads to a contact that is known and worth it,
-    with its χ² in ``misfits``, x becomes that. Return χ², and whether it is a least one. If worth is
-    limited the way is that between the map's nodes; from its end on the rod is integrated.
+    with its χ² in ``misfits``, x becomes that. Return χ², and whether it is a least one. If
+    worth is limited the way is that between the map's nodes; from its end the rod is integrated.
     """
     k = how.codes.shape[0]
     room = _Room(

@@ -67,11 +67,11 @@ def _suspended(description: Path, target: Path, force: bool) -> None:
     vb.sensors.save_suspended(target, found, stage)
     far = np.flatnonzero(found.outliers)
     lost = len(points) - int(found.used.sum()) - far.size
-    said = f"; {lost} have no equilibrium in the model" * (lost > 0)
+    unused = f"; {lost} have no equilibrium in the model" * (lost > 0)
     if far.size:
         which = ", ".join(str(k + 1) for k in far[:_MOST_NAMED]) + ", …" * (far.size > _MOST_NAMED)
-        said += f"; left out as far from all others: {which} (of the touches, from 1)"
-    say(f"{found.used.sum()} touches{said}")
+        unused += f"; left out as far from all others: {which} (of the touches, from 1)"
+    say(f"{found.used.sum()} touches{unused}")
     spread = found.covariance.diagonal() ** 0.5
     for name, value, sigma in zip(found.names, found.values, spread, strict=True):
         open_ = "  (not determined by the touches)" if name in found.undetermined else ""

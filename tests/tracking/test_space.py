@@ -8,8 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from vibrissa.cameras import Camera, orthogonal_views
 from vibrissa.tracking import Trace, low_pass, merge, paired_frames
+from vibrissa.tracking.space.curve import begun_together
 from vibrissa.tracking.space.pose import base_pose, rolled_over
 from vibrissa.tracking.space.rest_shape import RestShape, whisker_at_rest
+from vibrissa.tracking.trace.start import base_gap
 from vibrissa.tracking.trace.trace import even
 from vibrissa.whisker import base_rotation
 
@@ -38,6 +40,27 @@ def traced(camera, points, generator=None, noise=0.03):
         line = line + generator.normal(0.0, noise, line.shape)
     n = len(line)
     return Trace(line, np.full(n, noise), np.ones(n, dtype=bool), 1.0)
+
+
+def test_views_begin_where_both_show_the_whisker():
+    """Hairs hide 30 pixels of the base in one view; the other shows it from its true base."""
+    cameras = PAIRS["orthogonal"]
+    rows = [[traced(camera, curve(0.1 * i)) for i in range(3)] for camera in cameras]
+    hidden = [
+        Trace(t.line[15:], t.sigma[15:], t.seen[15:], t.confidence, t.base_seen) for t in rows[0]
+    ]
+    for shown in (begun_together(cameras, [hidden, rows[1]]), begun_together(cameras, rows)):
+        for both in zip(*shown, strict=True):
+            assert base_gap(cameras, np.stack([trace.line[0] for trace in both])) < 2.0
+    assert all(a is b for a, b in zip(rows[1], shown[1], strict=True))
+    other = [traced(cameras[1], curve(0.1 * i) + np.array([0.0, 0.0, 8e-3])) for i in range(3)]
+    elsewhere = begun_together(cameras, [rows[0], [farther(trace) for trace in other]])
+    assert [len(trace.line) for trace in elsewhere[0]] == [len(trace.line) for trace in rows[0]]
+
+
+def farther(trace):
+    """The same 60 pixels to the right: it is another whisker."""
+    return trace._replace(line=trace.line + np.array([60.0, 0.0]))
 
 
 PAIRS = {"orthogonal": orthogonal_views(center=(0.01, 0.005, 0.0)), "any": perspective_pair()}

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from vibrissa.status import Status
 from vibrissa.tracking import Trace, TraceOptions, find_whiskers, trace_video
@@ -278,6 +279,28 @@ def test_where_nothing_is_seen_there_is_no_whisker(seed):
     trace, from_face = traced(frame, 3.0, 40.0 + along, TraceOptions())
     assert trace.support < 20.0
     assert not from_face
+
+
+def test_before_streaked_fur_a_whisker_begins_where_it_does():
+    """A line on grey fur, of which streaks go its way; each trace begins from that before it.
+
+    From each frame to the next the fur is a little elsewhere, as the head moves.
+    """
+    begins = []
+    for seed in range(8):
+        generator = np.random.default_rng([seed, 91])
+        fur = gaussian_filter(generator.standard_normal((160, 420)), (1.0, 2.6))
+        fur = 105.0 + 5.0 * fur / fur.std()
+        x, row = np.arange(300.0), np.arange(120.0)[:, None]
+        depth = 22.0 * np.exp(-0.5 * ((row - 55.0 - 0.05 * x) / 1.1) ** 2) * (x >= 100.0)
+        line = np.column_stack([np.arange(100.0, 280.0, 2.0), 60.0 + np.arange(0.0, 9.0, 0.1)])
+        for frame in range(12):
+            image = fur[10:130, 3 * frame : 3 * frame + 300] - depth
+            image = np.round(image + generator.normal(0.0, 2.0, image.shape)).astype(np.uint8)
+            line = traced(image, ridge.noise_level(image), line, TraceOptions())[0].line
+            begins.append(line[0, 0])
+    assert np.median(np.abs(np.array(begins) - 100.0)) < 1.0
+    assert np.mean(np.abs(np.array(begins) - 100.0) < 6.0) > 0.7
 
 
 def test_progress_and_faults():

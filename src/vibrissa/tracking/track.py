@@ -30,7 +30,7 @@ from vibrissa.tracking.recording import (
 from vibrissa.tracking.refine.fit import FitOptions, Fitter, RodFit
 from vibrissa.tracking.refine.optics import Optics, rough_optics, stated_lenses
 from vibrissa.tracking.refine.rods import TraceSeries, rolled
-from vibrissa.tracking.space.curve import merge
+from vibrissa.tracking.space.curve import begun_together, merge
 from vibrissa.tracking.space.frame_pairs import better_offset, paired_frames
 from vibrissa.tracking.space.pose import CUTOFF, BasePose, HeadPose, base_pose, rolled_over
 from vibrissa.tracking.space.rest_shape import (
@@ -193,6 +193,8 @@ def track(
         rows = [[view[k][i] for i in pairs[:, v]] for v, view in enumerate(traces)]
         name = names[k] if names is not None else f"whisker {k}"
         remarks += _remarks_on_following(cameras, rows, name)
+        shown, rows = rows, begun_together(cameras, rows)
+        remarks += _remarks_on_bases(cameras, shown, rows, name)
         try:
             one = track_whisker(cameras, rows, rate, options, name, progress, moving, objects)
             if contacts is not None:
@@ -313,11 +315,12 @@ def _remarks_on_optics(one: Tracked, optics: Optics, name: str) -> list[str]:
     spread = np.sqrt(np.trace(one.fit.contact_covariance, axis1=1, axis2=2))
     if not np.isfinite(moved).any() or np.nanmedian(moved / spread) < _MOST:
         return []
+    state = "State the distance of the lenses (--distance, in m; inf for telecentric ones), or c"
+    state = "C" if optics.distance is not None else state
     return [
         f"{name}: the cameras are not calibrated, by which contact points are uncertain by "
         f"{1e6 * np.nanmedian(moved):.0f} µm (median; in the covariances, but an object fitted to "
-        "them errs as a whole). State the distance of the lenses (--distance, in m; inf for "
-        "telecentric ones), or calibrate them (vibrissa calibrate, --cameras)."
+        f"them errs as a whole). {state}alibrate them (vibrissa calibrate, --cameras)."
     ]
 
 
@@ -580,6 +583,24 @@ def _remarks_on_following(
         for camera, row, count in zip(cameras, rows, counts, strict=True)
         if count
     ]
+
+
+def _remarks_on_bases(
+    cameras: Sequence[Camera],
+    shown: Sequence[Sequence[Trace]],
+    used: Sequence[Sequence[Trace]],
+    name: str,
+) -> list[str]:
+    """Views that show a whisker from nearer to its base on than the other view."""
+    found = []
+    for camera, before, after in zip(cameras, shown, used, strict=True):
+        cut = [a.length - b.length for a, b in zip(before, after, strict=True) if len(a.line)]
+        if cut and np.median(cut) > _NEAR:
+            found.append(
+                f"{name}: {camera.name} shows it from {np.median(cut):.0f} pixels nearer to its "
+                "base on than the other view (median); it is taken to begin where both show it."
+            )
+    return found
 
 
 def force_scale_sigma(whisker: Whisker, fur: float) -> float:

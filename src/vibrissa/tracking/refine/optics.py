@@ -31,8 +31,9 @@ from vibrissa.tracking.trace.trace import Trace, arc_lengths, interpolated
 # Standard deviation of the inverse of a distance that is not stated, 1/m: lenses at 0.5 m.
 _STRENGTH = 2.0
 _DISTANCE = 0.1  # standard deviation of a stated distance, as a share of it
-# Inverse of the largest and of the smallest distance that are considered, 1/m.
-_WEAKEST, _STRONGEST = 0.02, 20.0
+# Inverse of the largest distance that is not infinite, and of the smallest one, 1/m.
+_FLAT, _STRONGEST = 1e-6, 20.0
+_BEHIND = np.diag([-1.0, 1.0, -1.0])  # axes of a camera on the other side
 # Standard deviations of a turn of a view, rad, of its scale, and of its shift, pixels.
 _TURN, _SCALE, _SHIFT = np.radians(3.0), 0.03, 10.0
 # Number of points of the shape, and the share of the usual length that they cover.
@@ -45,6 +46,9 @@ _ALIKE = 0.04
 # Misfit of stated cameras that is visible, pixels; share of it that others must leave at most; and
 # standard deviations by which these must differ from the stated ones.
 _VISIBLE, _BETTER, _CERTAIN = 0.05, 0.6, 3.0
+_EXPLAINED = (
+    0.1  # distance of a rigid whisker from the traces that leaves nothing to explain, pixels
+)
 _ROUNDS, _DAMPING = 12, 1e-3  # number of Gauss–Newton steps, and Levenberg's damping
 # Standard deviations of third differences of the shape, and of motions of its points along it, as a
 # share of their spacing.
@@ -53,6 +57,9 @@ _STEP = 1e-3  # step of differences by the optics, in their standard deviations
 # Standard deviation to which traces are set, pixels: as their errors are common to many points and
 # frames, it is far above that of one point.
 _UNIT = 0.5
+# The same in units of what is left of them, and its smallest value, pixels.
+_COMMON, _SHARPEST = 5.0, 0.1
+_DECIDED = 3.0  # difference of log-likelihoods from which a mirrored view is on one side
 _SELECTIONS = 3  # number of rounds in which frames that are bent are left out
 _ODD = 3.0  # misfit of frames that are left out, in units of the usual one: they are bent
 _FAR = 6.0  # misses from which `TraceSeries.equations` weighs down, standard deviations
@@ -69,10 +76,16 @@ class Optics:
     cameras: tuple[Camera, ...]  # that explain the views
     orthographic: tuple[Camera, ...]  # as they were stated, without perspective
     values: Array
-    sigma: Array
+    covariance: Array  # (value, value)
     stated: Array  # values of the cameras as they were stated
     before: float  # distance of the rigid whisker from the traces with stated cameras, pixels
     after: float  # and with these
+    distance: float | None = None  # of the lenses, as it was stated, m
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations of the values."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
     def needed(self) -> bool:
@@ -82,21 +95,21 @@ class Optics:
         return bool(self.before > _VISIBLE and explains and apart.max() > _CERTAIN)
 
     def as_stated(self) -> Optics:
-        """The stated cameras, with the uncertainty that was found."""
+        """The stated cameras, uncertain by what was found and by how far they are from that."""
+        apart = self.values - self.stated
         return replace(
             self,
             values=self.stated,
+            covariance=self.covariance + np.outer(apart, apart),
             cameras=with_optics(self.orthographic, self.stated),
         )
 
     def displacements(self, points: Array) -> Array:
-        """Shifts of points (view, ..., 3) if a view's lens were one standard deviation nearer."""
+        """Shifts of points (error, ..., 3) by independent errors of the optics, one sigma each."""
         shifts = []
-        for view in range(len(self.cameras)):
-            values = self.values.copy()
-            values[view] = max(values[view], 0.0) + self.sigma[view]
-            nearer = with_optics(self.orthographic, values)
-            seen = np.stack([camera.project(points) for camera in nearer])
+        for error in np.linalg.cholesky(self.covariance).T:
+            other = with_optics(self.orthographic, self.values + error)
+            seen = np.stack([camera.project(points) for camera in other])
             shifts.append(triangulate(self.cameras, seen)[0] - points)
         return np.stack(shifts)
 
@@ -105,9 +118,12 @@ class Optics:
         count = len(self.cameras)
         parts = []
         for camera, strength, error in zip(self.cameras, self.values, self.sigma, strict=False):
-            least = 1.0 / max(strength + 2.0 * error, 1e-9)
-            if strength > 2.0 * error:
-                parts.append(f"{camera.name} at {1.0 / strength:.2f} m (at least {least:.2f})")
+            least = 1.0 / max(abs(strength) + 2.0 * error, 1e-9)
+            if abs(strength) > 2.0 * error:
+                side = " on its other side" if strength < 0.0 else ""
+                parts.append(
+                    f"{camera.name} at {1.0 / abs(strength):.2f} m{side} (at least {least:.2f})"
+                )
             else:
                 parts.append(f"{camera.name} farther than {least:.2f} m")
         rest = zip(
@@ -149,19 +165,28 @@ def stated_lenses(cameras: Sequence[Camera], distance: float | None) -> tuple[Ca
 
 
 def lens(camera: Camera, strength: float, turn: Array, scale: float, shift: float) -> Camera:
-    """Give an orthographic view a lens at 1/strength from the origin; turn, scale, shift it."""
+    """Give an orthographic view a lens at 1/strength from the origin; turn, scale, shift it.
+
+    An orthographic image does not show from which of two sides it is seen. A lens of negative
+    strength is on the other side than the camera is.
+    """
     focal = camera.matrix.copy()
     focal[:2, :2] *= 1.0 + scale
     focal[0, 2] += shift
     rotation = transform.Rotation.from_rotvec(turn).as_matrix() @ camera.rotation
-    if strength <= 0.0:
-        return replace(camera, matrix=focal, rotation=rotation)
-    focal[:2, :2] /= strength
+    translation = camera.translation
+    if strength < 0.0:
+        # From behind the same image is seen in a mirror.
+        rotation, translation = _BEHIND @ rotation, _BEHIND @ translation
+        focal[:, 0] *= -1.0
+    if abs(strength) < _FLAT:
+        return replace(camera, matrix=focal, rotation=rotation, translation=translation)
+    focal[:2, :2] /= abs(strength)
     return replace(
         camera,
         matrix=focal,
         rotation=rotation,
-        translation=camera.translation + np.array([0.0, 0.0, 1.0 / strength]),
+        translation=translation + np.array([0.0, 0.0, 1.0 / abs(strength)]),
         projection="perspective",
     )
 
@@ -171,7 +196,7 @@ def with_optics(cameras: Sequence[Camera], values: Array) -> tuple[Camera, ...]:
     count = len(cameras)
     rest = np.concatenate([np.zeros(5), values[count:]]).reshape(count, 5)
     return tuple(
-        lens(camera, min(float(strength), _STRONGEST), one[:3], one[3], one[4])
+        lens(camera, float(np.clip(strength, -_STRONGEST, _STRONGEST)), one[:3], one[3], one[4])
         for camera, strength, one in zip(cameras, values[:count], rest, strict=True)
     )
 
@@ -187,31 +212,59 @@ def estimated_optics(
 
     None if too few frames are free.
     """
+    known = np.isfinite(curves).all(axis=(1, 2))
     alike = np.nan_to_num(shape.deviation, nan=np.inf) < _ALIKE * shape.length
-    rows = np.flatnonzero((shape.free | alike) & np.isfinite(curves).all(axis=(1, 2)))
-    if len(rows) < _FEWEST:
+    fits = []
+    for likely in (shape.free, shape.free | alike):
+        rows = np.flatnonzero(likely & known)
+        if len(rows) < _FEWEST:
+            continue
+        rows = rows[np.linspace(0, len(rows) - 1, min(_FRAMES, len(rows))).astype(int)]
+        fits.append(_fitted(_Problem.of(cameras, traces.rows(rows), curves[rows], distance)))
+        # Wrong optics may make free frames differ: then what is like them is tried, too.
+        if fits[-1].mean_miss < _EXPLAINED:
+            break
+    if not fits:
         return None
-    rows = rows[np.linspace(0, len(rows) - 1, min(_FRAMES, len(rows))).astype(int)]
-    problem = _Problem.of(cameras, traces.rows(rows), curves[rows], distance)
+    fitted = min(fits, key=lambda fit: fit.mean_miss).sharper().solved()
+    fitted = fitted if distance is None else fitted.on_one_side(distance)
+    before = replace(fitted, q=np.zeros_like(fitted.q)).solved(optics=False)
+    stated, size = fitted.prior
+    return Optics(
+        fitted.cameras_at(fitted.q),
+        fitted.stated,
+        stated + fitted.q * size,
+        fitted.covariance * np.outer(size, size),
+        stated,
+        before.mean_miss,
+        fitted.mean_miss,
+        distance,
+    )
+
+
+def _fitted(problem: _Problem) -> _Problem:
+    """The solution of a problem without the frames that are bent."""
     fitted = problem.solved()
     for _ in range(_SELECTIONS):
         each = fitted.misses()
         fine = each < _ODD * float(np.median(each))
         if _FEWEST <= fine.sum() < len(fine):
-            problem, fitted = problem.rows(fine), fitted.rows(fine).solved()
-    before = problem.solved(optics=False)
-    hessian = fitted.normal()[0]
-    inverse = np.linalg.inv(hessian)[-len(fitted.q) :, -len(fitted.q) :]
-    size = fitted.prior[1]
-    sigma = np.sqrt(np.diag(inverse)) * size
-    return Optics(
-        fitted.cameras_at(fitted.q),
-        fitted.stated,
-        fitted.prior[0] + fitted.q * size,
-        sigma,
-        fitted.prior[0],
-        *(float(np.sqrt(np.mean(one.misses() ** 2))) for one in (before, fitted)),
-    )
+            fitted = fitted.rows(fine).solved()
+    return fitted
+
+
+def _mirrored(camera: Camera) -> bool:
+    """Whether an image is exchanged left and right, or seen from the other side than is stated."""
+    return bool(np.linalg.det(camera.matrix[:2, :2]) < 0.0)
+
+
+def _strength(camera: Camera, distance: float | None) -> tuple[float, float]:
+    """Mean and standard deviation of the inverse of a lens's distance, as it is stated."""
+    if distance is None:
+        return 0.0, _STRENGTH
+    if _mirrored(camera):
+        return 0.0, 1.0 / distance
+    return 1.0 / distance, _DISTANCE / distance
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,6 +278,7 @@ class _Problem:
     position: Array
     q: Array
     prior: tuple[Array, Array]
+    unit: float = _UNIT
 
     @classmethod
     def of(
@@ -242,10 +296,9 @@ class _Problem:
         points = interpolated(np.linspace(0.0, _LENGTH * s[-1], _NODES), s, line)
         back = [motions(line[None, :n], part[:n]) for n, part in zip(known, shapes, strict=True)]
         more = len(cameras) - 1
-        strength = 0.0 if distance is None else 1.0 / distance
-        spread = _STRENGTH if distance is None else _DISTANCE * strength
-        start = np.concatenate([np.full(len(cameras), strength), np.zeros(5 * more)])
-        size = [spread] * len(cameras) + [_TURN, _TURN, _TURN, _SCALE, _SHIFT] * more
+        lenses = [_strength(camera, distance) for camera in cameras]
+        start = np.concatenate([[mean for mean, _ in lenses], np.zeros(5 * more)])
+        size = [spread for _, spread in lenses] + [_TURN, _TURN, _TURN, _SCALE, _SHIFT] * more
         even = replace(traces, sigma=np.where(np.isfinite(traces.sigma), _UNIT, np.nan))
         return cls(
             tuple(cameras),
@@ -253,16 +306,34 @@ class _Problem:
             points,
             np.concatenate([b[0] for b in back]),
             np.concatenate([b[1] for b in back]),
-            np.where(np.arange(len(start)) < len(cameras), _WEAKEST / np.array(size), 0.0)
-            * (distance is None),
+            np.zeros(len(start)),
             (start, np.array(size)),
         )
 
-    def inside(self, q: Array) -> Array:
-        """The optics, none of them beyond infinitely far."""
-        count = len(self.stated)
-        least = (_WEAKEST - self.prior[0][:count]) / self.prior[1][:count]
-        return np.concatenate([np.maximum(q[:count], least), q[count:]])
+    @property
+    def covariance(self) -> Array:
+        """Covariance of the optics q."""
+        return np.asarray(np.linalg.inv(self.normal()[0])[-len(self.q) :, -len(self.q) :])
+
+    def sharper(self) -> _Problem:
+        """The problem with traces that are known as well as they are explained."""
+        unit = float(np.clip(_COMMON * self.mean_miss, _SHARPEST, _UNIT))
+        sigma = np.where(np.isfinite(self.traces.sigma), unit, np.nan)
+        return replace(self, traces=replace(self.traces, sigma=sigma), unit=unit)
+
+    def on_one_side(self, distance: float) -> _Problem:
+        """The solution with mirrored views seen from that side that explains them, if one does."""
+        mean, size = (values.copy() for values in self.prior)
+        values, variance = mean + self.q * size, np.diag(self.covariance) * size**2
+        for view, camera in enumerate(self.stated):
+            # Difference of log-likelihoods of both sides.
+            apart = 2.0 * values[view] / (distance * variance[view])
+            if _mirrored(camera) and abs(apart) > _DECIDED:
+                mean[view] = np.sign(apart) / distance
+                size[view] = _DISTANCE / distance
+        if (size == self.prior[1]).all():
+            return self
+        return replace(self, prior=(mean, size), q=(values - mean) / size).solved()
 
     def rows(self, used: NDArray[np.bool_]) -> _Problem:
         """Some of the frames."""
@@ -290,7 +361,12 @@ class _Problem:
             miss = np.abs(self.traces.equations(view, pixels, slopes)[1][:, :-2])
             whole = np.where(miss > _FAR, miss**2 / _FAR, miss)
             total, count = total + (whole**2).sum(1), count + (miss > 0.0).sum(1)
-        return np.asarray(_UNIT * np.sqrt(total / np.maximum(count, 1.0)))
+        return np.asarray(self.unit * np.sqrt(total / np.maximum(count, 1.0)))
+
+    @property
+    def mean_miss(self) -> float:
+        """Root mean square distance of all traces, pixels."""
+        return float(np.sqrt(np.mean(self.misses() ** 2)))
 
     def normal(self) -> tuple[Array, Array, Array, Array, Array, float]:
         """Normal equations of shape and optics without the poses, and what gives the poses."""
@@ -375,7 +451,7 @@ class _Problem:
                 points=best.points + step[: 3 * n].reshape(n, 3),
                 rotation=transform.Rotation.from_rotvec(poses[:, 3:]).as_matrix() @ best.rotation,
                 position=best.position + poses[:, :3],
-                q=best.inside(best.q + step[-k:]) if optics else best.q,
+                q=best.q + step[-k:] if optics else best.q,
             )
             tried = trial.normal()
             if tried[-1] < cost:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from vibrissa.cameras import Camera, triangulate
 from vibrissa.deferred import interpolate
 from vibrissa.numerics import kernel
+from vibrissa.tracking.trace.start import base_gap
 from vibrissa.tracking.trace.trace import Trace, arc_lengths, interpolated
 
 Array = NDArray[np.float64]
@@ -37,6 +38,10 @@ _FLOOR = 0.05
 _LOOSE = 0.05
 _END = 1.0  # standard deviation of a trace's ends along it, pixels
 _BEYOND = 6.0  # distance of a tip from the end of a trace from which it is another, pixels
+# Distance of lines of sight at the base, pixels, from which views may begin at different points of
+# the whisker; share of it, and of twice that, left at most where they begin together; and share of
+# a trace within which that is.
+_APART, _NEARER, _CUT = 2.0, 0.4, 0.08
 # Standard deviation of the distance from the plane in which a single view's whisker is, m.
 _LEVEL = 1e-7
 # Standard deviation of a point's motion along the curve in a round, in units of their distance.
@@ -92,6 +97,41 @@ def merge(cameras: Sequence[Camera], traces: Sequence[Trace]) -> SpaceCurve:
     if len(start) < 8 or not np.isfinite(start).all():
         return SpaceCurve.none()
     return _fitted(cameras, traces, _evenly_spaced(start, _SAMPLES))
+
+
+def begun_together(
+    cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]]
+) -> list[list[Trace]]:
+    """Traces of two views that begin where both show the whisker.
+
+    Fur may hide its base in one view more than in the other, and before grey fur a trace may begin
+    at a streak of it: the base of one view is then in the other one on the whisker, not at its
+    base. What one view alone shows has no position in space.
+    """
+    if len(cameras) != 2:
+        return [list(view) for view in traces]
+    pairs = [_cut(cameras, both) for both in zip(*traces, strict=True)]
+    return [list(view) for view in zip(*pairs, strict=True)]
+
+
+def _cut(cameras: Sequence[Camera], both: tuple[Trace, ...]) -> tuple[Trace, ...]:
+    """Both traces of a frame, the one that begins earlier cut."""
+    if any(len(trace.line) < 8 or not trace.base_seen for trace in both):
+        return both
+    best, place = base_gap(cameras, np.stack([trace.line[:1] for trace in both]))[0], (0, 0)
+    if best < _APART:
+        return both
+    best = min(_NEARER * best, 2.0 * _APART)
+    for view, other in ((0, 1), (1, 0)):
+        line = both[view].line[: int(_CUT * len(both[view].line))]
+        base = np.broadcast_to(both[other].line[0], line.shape)
+        gap = base_gap(cameras, np.stack([line, base] if view == 0 else [base, line]))
+        if len(gap) and gap.min() < best:
+            best, place = gap.min(), (view, int(np.argmin(gap)))
+    view, first = place
+    one = both[view]
+    cut = one._replace(line=one.line[first:], sigma=one.sigma[first:], seen=one.seen[first:])
+    return (cut, both[1]) if view == 0 else (both[0], cut)
 
 
 def _matched(cameras: Sequence[Camera], traces: Sequence[Trace]) -> Array:

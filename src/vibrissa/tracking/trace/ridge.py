@@ -333,7 +333,12 @@ _LAST = 10  # number of points before the end, and twice that of points beyond, 
 # Distances from a line at which its profile is taken, and smallest variance of that, samples.
 _ACROSS, _NARROWEST = np.arange(6.0), 0.3
 _FLANKS = (4.0, 7.0)  # distances from the whisker at which the face's edge is searched, pixels
-_TAPERED = 0.6  # darkness of a whisker relative to the twenty points before, at least: it tapers
+# Darkness of a whisker next to its base, in standard deviations of the fur's streaks, at least.
+_CLEARER = 1.5
+_STREAKS = 40  # number of points of a line's beginning next to which fur may look like it
+# Darkness of a whisker relative to the twenty points before it, at least: toward its tip, as it
+# tapers, and toward its base.
+_TAPERED, _EVEN = 0.6, 0.9
 
 
 class Measured(NamedTuple):
@@ -474,7 +479,11 @@ def traced(
         # Without a face it begins as it ends: where the line does.
         line = prolonged(line[::-1], _BENDING, _BEYOND)[::-1]
     line, along = measured(frame, line, 1, noise, options, _FUR if from_face else 0, clutter)
-    first = 0 if from_face else len(line) - _tip(along.part(slice(None, None, -1)))
+    first = 0
+    if not from_face:
+        bare, texture = _above_texture(frame, line, along, options, clutter)
+        inward = bare.part(slice(None, None, -1))
+        first = len(line) - _tip(inward, _EVEN, _CLEARER * texture)
     last = _tip(along)
     if last - first < FEWEST:
         return Trace.lost(), False
@@ -486,6 +495,34 @@ def traced(
     base_seen = _inside(frame, line[0])
     skew = _skew(frame, line, options.scale, clutter)
     return Trace(line, along.sigma, along.seen, trusted, base_seen, tip_seen, skew), from_face
+
+
+def _above_texture(
+    frame: Frame, line: Array, along: Measured, options: TraceOptions, clutter: Clutter
+) -> tuple[Measured, float]:
+    """By how much a line is darker than fur next to its beginning, of which streaks look like it.
+
+    They are measured as the line is, along two others next to it, and their standard deviation is
+    given too.
+    """
+    part = np.ascontiguousarray(line[:_STREAKS])
+    n, beside, sigma = len(part), [], along.noise * np.sqrt(DEPTH_VARIANCE)
+    if n < FEWEST:
+        return along, sigma
+    points, amplitude, flank, support = np.empty((n, 2)), np.empty(n), np.empty(n), np.empty(n)
+    tangent = np.gradient(part, axis=0)
+    across = tangent[:, ::-1] * [-1.0, 1.0] / np.maximum(np.hypot(*tangent.T), 1e-9)[:, None]
+    for away in (-_FLANKS[1], _FLANKS[1]):
+        other = np.ascontiguousarray(part + away * options.scale * across)
+        measure(frame, other, 1, 1.0, options.scale, *clutter, points, amplitude, flank, support)
+        beside.append(amplitude[flank > 0.0])
+    texture = np.concatenate(beside)
+    if len(texture) < n:
+        return along, sigma
+    usual = max(float(texture.mean()) - sigma, 0.0)
+    spread = max(float(texture.std()), sigma)
+    noise = spread / np.sqrt(DEPTH_VARIANCE)
+    return along._replace(amplitude=along.amplitude - usual, noise=noise), spread
 
 
 def _skew(frame: Frame, line: Array, scale: float, clutter: Clutter) -> float:
@@ -551,7 +588,7 @@ def grey_flanks(frame: Frame, line: Array, distance: float, clutter: Clutter = N
     return levels
 
 
-def _tip(along: Measured) -> int:
+def _tip(along: Measured, darkness: float = _TAPERED, least: float = 0.0) -> int:
     """Count the points of a line that belong to the whisker.
 
     Beyond the tip the line is as light as its surroundings; before it, it stays about as dark as it
@@ -561,7 +598,8 @@ def _tip(along: Measured) -> int:
     amplitude = np.where(along.open, along.amplitude, 0.0)
     count = np.convolve(along.open.astype(float), np.ones(20))[: len(amplitude)]
     recent = np.convolve(np.maximum(amplitude, 0.0), np.ones(20))[: len(amplitude)]
-    usual = _TAPERED * np.concatenate([[0.0], (recent / np.maximum(count, 1.0))[:-1]])
+    usual = darkness * np.concatenate([[0.0], (recent / np.maximum(count, 1.0))[:-1]])
+    usual = np.maximum(usual, least)
     gain = np.where(along.open, (amplitude * usual - 0.5 * usual**2) / sigma**2, 0.0)
     return int(np.argmax(np.cumsum(np.clip(gain, -8.0, 8.0)))) + 1
 

@@ -1,5 +1,7 @@
 """The whole way, from filmed frames to contact and wrench, against the simulated truth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -154,6 +156,16 @@ def test_friction_is_found_in_the_shape(share):
     assert (moment / np.linalg.norm(bent.moment, axis=1)).max() < 0.05
     away = np.linalg.norm(found.contact_point - bent.contact_point, axis=1)
     assert away.max() < 100e-6
+
+
+def test_contacts_do_not_follow_a_roll_that_free_frames_do_not_show():
+    """Expected 4° to either side, as contact takes the whisker beyond where it was free."""
+    whisker = Whisker.parabola(length=30e-3, coefficient=10.0)
+    fitter, pose, bent, _ = pressed(whisker)
+    for roll in np.radians([-4.0, 4.0]):
+        found = fitter.fit(whisker, replace(pose, roll=pose.roll + roll), 65)
+        away = np.linalg.norm(found.contact_point - bent.contact_point, axis=1)
+        assert away.max() < 25e-6
 
 
 def test_light_contacts_begin_near_those_of_the_frames_before_and_after():

@@ -90,8 +90,9 @@ class FitOptions:
     # Standard deviation of the force along the whisker, as a share of that across it; 0 is a
     # contact without friction.
     friction: float = 0.1
-    # Standard deviation of the roll about what it is expected to be, rad.
-    roll: float = np.radians(0.5)
+    # Standard deviation of the roll about what it is expected to be, rad: contact takes whiskers
+    # to where no free frame shows how they are rolled.
+    roll: float = np.radians(1.5)
     surface: float = 3e-5  # standard deviation of the distance of contacts from known objects, m
     # Smallest standard deviation of traces that residuals may show, as a share of the stated one;
     # at least 1 where a trace is a line between few points (`Trace.sparse`).

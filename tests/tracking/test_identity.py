@@ -6,6 +6,7 @@ import pytest
 from vibrissa.tracking import Trace
 from vibrissa.tracking.trace.follower import FEATURES, Appearance, features_of
 from vibrissa.tracking.trace.identity import Seen, decided, sideways
+from vibrissa.tracking.trace.trace import overlap
 
 BASES = np.array([[20.0, 60.0], [20.0, 72.0]])
 FRAMES = 24
@@ -102,3 +103,23 @@ def test_sideways_of_lines_that_stand_still():
     normal = np.array([-np.sin(0.3), np.cos(0.3)])
     np.testing.assert_allclose(sideways(line, line + 2.0 * normal), 2.0, atol=1e-9)
     assert np.isfinite(sideways(np.zeros((40, 2)), line)).all()
+
+
+def test_lines_overlap_where_some_point_is_near():
+    generator = np.random.default_rng(7)
+    for _ in range(20):
+        line, other = (np.cumsum(generator.normal(0.5, 2.0, (n, 2)), axis=0) for n in (40, 60))
+        distance = np.linalg.norm(line[:, None] - other[None], axis=2).min(axis=1)
+        assert overlap(line, other, 3.0) == (distance < 3.0).mean()
+    assert overlap(line, other[:0]) == overlap(line[:0], other) == 0.0
+
+
+def test_the_usual_look_is_the_median_of_what_is_known():
+    generator = np.random.default_rng(8)
+    features = generator.normal(size=(12, FEATURES))
+    features[generator.random(features.shape) < 0.4] = np.nan
+    features[:, 0] = np.nan
+    usual = Appearance.of(list(features))
+    np.testing.assert_array_equal(usual.middle[1:], np.nanmedian(features[:, 1:], axis=0))
+    assert np.isnan(usual.middle[0])
+    assert np.isfinite(usual.spread).all()

@@ -70,6 +70,7 @@ _PROXIMAL = 0.7  # share of the whisker that determines the roll of its frame
 _ENDS = (3.5, 1.0)
 # Unknowns of a contact without friction: arc length and the force across the whisker.
 _FREE = [0, 2, 3]
+_ROLLED = np.radians(3.0)  # standard deviation of the roll before it is known how it varies, rad
 _WILD = 1e6  # slopes of points of a rod, in units of L, from which it is not in balance
 _HALVED = 6  # number of times at most that forces are halved with which it begins out of balance
 
@@ -90,9 +91,8 @@ class FitOptions:
     # Standard deviation of the force along the whisker, as a share of that across it; 0 is a
     # contact without friction.
     friction: float = 0.1
-    # Standard deviation of the roll about what it is expected to be, rad: contact takes whiskers
-    # to where no free frame shows how they are rolled.
-    roll: float = np.radians(1.5)
+    # Smallest standard deviation of the roll about what it is expected to be, rad.
+    roll: float = np.radians(0.5)
     surface: float = 3e-5  # standard deviation of the distance of contacts from known objects, m
     # Smallest standard deviation of traces that residuals may show, as a share of the stated one;
     # at least 1 where a trace is a line between few points (`Trace.sparse`).
@@ -165,7 +165,8 @@ class Fitter:
                 # length leaves most where it shows.
                 problem, state, linear = problem.trusted(even=True)
             else:
-                problem = replace(problem, variance=before[0].variance)
+                trusted = before[0]
+                problem = replace(problem, variance=trusted.variance, options=trusted.options)
                 state, linear = problem.solved()
             before = problem, state
             return linear.cost
@@ -244,11 +245,35 @@ class Problem:
 
     def trusted(self, even: bool = False) -> tuple[Problem, State, _Linear]:
         """The problem with traces that are trusted as far as they deserve, and its solution."""
-        state, fit = self.solved()
-        fitted = np.einsum("tij,tji->t", fit.smoother.covariances(), fit.data)
+        loose = replace(self.options, roll=max(self.options.roll, _ROLLED))
+        state, fit = replace(self, options=loose).solved()
+        covariance = fit.smoother.covariances()
+        fitted = np.einsum("tij,tji->t", covariance, fit.data)
         variance = trace_variance(fit.misses, fitted, self.options.sharpest**2, even)
-        problem = replace(self, begun=state, variance=variance)
+        options = replace(loose, roll=self._unexpected(state, covariance, loose.roll))
+        problem = replace(self, begun=state, variance=variance, options=options)
         return (problem, *problem.solved())
+
+    def _unexpected(self, state: State, covariance: Array, loose: float) -> float:
+        """Standard deviation of the roll in contact from what free frames let expect, rad.
+
+        Contact takes a whisker to where no free frame shows how it is rolled. Bent rods whose
+        roll was hardly held show it, each as well as stated.
+        """
+        axis = state.rotation[:, :, 0]
+        known = np.einsum("ti,tij,tj->t", axis, covariance[:, 3:6, 3:6], axis) / loose**2
+        share = 1.0 - known
+        rows = self.touching & (share > 0.5)
+        if not rows.any():
+            return loose
+        rolled, share = (self._turned(state) * axis).sum(axis=1)[rows], share[rows]
+        square = float(np.mean((rolled / share) ** 2 - loose**2 * known[rows] / share))
+        return min(float(np.sqrt(max(square, self.options.roll**2))), loose)
+
+    def _turned(self, state: State) -> Array:
+        """How the base turned since the start (time, 3), rad, in the head's axes."""
+        turn = state.rotation @ np.swapaxes(self.start.rotation, 1, 2)
+        return np.asarray(transform.Rotation.from_matrix(turn).as_rotvec())
 
     def solved(self) -> tuple[State, _Linear]:
         """Gauss–Newton with Levenberg's damping."""
@@ -343,10 +368,7 @@ class Problem:
     def _priors(self, smoother: Smoother, state: State) -> float:
         o = self.options
         slower = (1000.0 / self.rate) ** 2
-        # How it turned since the start, in the head's axes.
-        turn = transform.Rotation.from_matrix(
-            state.rotation @ np.swapaxes(self.start.rotation, 1, 2)
-        ).as_rotvec()
+        turn = self._turned(state)
         place = np.concatenate([state.position, turn, state.contact], axis=1)
         # Second differences of the whole motion, of which the start is a part.
         begun = _turning(self.start.rotation)

@@ -14,7 +14,6 @@ differences are relative. What it does not show, because the whisker is too shor
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -89,11 +88,9 @@ class Appearance(NamedTuple):
             return cls(np.full(FEATURES, np.nan), _SPREAD)
         known = np.array(features)
         known[np.isinf(known)] = np.nan
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # of what no frame shows
-            middle = np.nanmedian(known, axis=0)
-            spread = 1.4826 * np.nanmedian(np.abs(known - middle), axis=0)
-        return cls(middle, np.hypot(_SPREAD, np.nan_to_num(spread)))
+        usual = _medians(known)
+        spread = 1.4826 * _medians(np.abs(known - usual))
+        return cls(usual, np.hypot(_SPREAD, np.nan_to_num(spread)))
 
     def unlikeness(self, features: Array) -> float:
         """Negative log-likelihood that a line of these features is this whisker."""
@@ -104,6 +101,15 @@ class Appearance(NamedTuple):
             away[np.isnan(features) & np.isfinite(self.middle)] = _HIDDEN
         away[np.isinf(features)] = 0.0
         return float(0.5 * _WEIGHT * np.minimum(np.nan_to_num(away) ** 2, _MOST**2).sum())
+
+
+def _medians(values: Array) -> Array:
+    """Median of each column without what is NaN, without the checks that take longer than it."""
+    count = np.isfinite(values).sum(axis=0)
+    ordered, columns = np.sort(values, axis=0), np.arange(values.shape[1])
+    low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, len(values) - 1)
+    both = 0.5 * (ordered[low, columns] + ordered[high, columns])
+    return np.asarray(np.where(count > 0, both, np.nan))
 
 
 def features_of(frame: Frame, trace: Trace, clutter: Clutter = NOTHING) -> Array:

@@ -73,7 +73,7 @@ class Assignment:
         size = np.maximum(np.linalg.norm(between, axis=2), 1e-9)[..., None, None]
         along = np.einsum("kjx,cdx->kjcd", between, begin[:, None] - begin[None]) / size
         # How clearly two bases have swapped, 0 to 1.
-        self._swaps = _SWAPPED * np.clip(-along / _APART, 0.0, 1.0)
+        self._swaps = (_SWAPPED * np.clip(-along / _APART, 0.0, 1.0)).tolist()
 
     def ways(
         self,
@@ -88,6 +88,7 @@ class Assignment:
         whiskers may have lines that overlap.
         """
         order = sorted(range(len(price)), key=lambda k: k not in settled)
+        clash = self.clash.tolist()
         options = [
             sorted(
                 [(float(lost[k]), -1)]
@@ -105,15 +106,16 @@ class Assignment:
                 yield spent, tuple(c for _, c in sorted(zip(order, way, strict=True)))
                 continue
             k = order[at]
+            lines = [(j, d) for j, d in zip(order, way, strict=False) if d >= 0]
             for cost, c in options[at]:
                 total = spent + cost
                 if not total + rest[at + 1] < limit:
                     break
                 if c >= 0:
-                    given_ = [(j, d) for j, d in zip(order, way, strict=False) if d >= 0]
-                    if k not in settled and any(self.clash[c, d] for _, d in given_):
+                    taken = clash[c]
+                    if k not in settled and any(taken[d] for _, d in lines):
                         continue
-                    total += sum(float(self._swaps[k, j, c, d]) for j, d in given_)
+                    total += sum(self._swaps[k][j][c][d] for j, d in lines)
                 bound = total + rest[at + 1]
                 if bound < limit:
                     heappush(heap, (bound, depth - 1, total, (*way, c)))

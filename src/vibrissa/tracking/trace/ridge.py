@@ -298,6 +298,37 @@ def measure(
 
 
 @kernel
+def measure_ends(
+    frame: Any,
+    lines: Any,
+    noise: float,
+    scale: float,
+    bits: Any,
+    which: int,
+    supported: float,
+    points: Any,
+    counts: Any,
+    gains: Any,
+) -> None:
+    """Measure lines that may be the rest of one, and count the points up to where most is seen.
+
+    Each point that is seen gains one, and each that is not, but where nothing is in the way, costs
+    one.
+    """
+    n = lines.shape[1]
+    amplitude, flank, support = np.empty(n), np.empty(n), np.empty(n)
+    for k in range(lines.shape[0]):
+        measure(frame, lines[k], 1, noise, scale, bits, which, points[k], amplitude, flank, support)
+        worth, counts[k], gains[k] = 0.0, 1, -np.inf
+        for i in range(n):
+            if flank[i] > 0.0:
+                worth += 1.0 if support[i] > supported else -1.0
+            if worth > gains[k]:
+                counts[k], gains[k] = i + 1, worth
+        gains[k] = max(gains[k], 0.0)
+
+
+@kernel
 def flanks(frame: Any, line: Any, distance: float, bits: Any, which: int, out: Any) -> None:
     """Grey values at a distance from a curve, to its left (−dy, dx) and to its right.
 

@@ -13,8 +13,7 @@ than was expected, at a price of its own.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import product
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -38,7 +37,7 @@ from vibrissa.tracking.trace.identity import (
     same_whisker,
     sideways,
 )
-from vibrissa.tracking.trace.ridge import measure, noise_level, prolonged, traced
+from vibrissa.tracking.trace.ridge import measure_ends, noise_level, prolonged, traced
 from vibrissa.tracking.trace.scene import Scene
 from vibrissa.tracking.trace.trace import STEP, Trace, aligned, arc_lengths, even, given, overlap
 
@@ -268,16 +267,21 @@ def _shared(line: Array, other: Array) -> bool:
 
 def _ends(follower: Follower, start: Array, frame: Frame, noise: float, most: int) -> list[_End]:
     """Different ways in which a whisker may go on: it bends as before, and changes that slowly."""
-    points, grey = np.empty((_AHEAD, 2)), [np.empty(_AHEAD) for _ in range(3)]
+    lines, unlike = _fan(start)
+    shown, counts, gains = (
+        np.empty_like(lines),
+        np.empty(len(lines), np.int64),
+        np.empty(len(lines)),
+    )
+    scale = follower.options.scale
+    measure_ends(frame, lines, noise, scale, *follower.clutter, _SUPPORTED, shown, counts, gains)
     ends = [_End(np.empty((0, 2)), np.empty((0, 2)), 0.0)]
-    for line, unlike in _fan(start):
-        measure(frame, line, 1, noise, follower.options.scale, *follower.clutter, points, *grey)
-        _, flank, support = grey
-        seen = np.where(support > _SUPPORTED, 1.0, -1.0)
-        worth = np.cumsum(np.where(flank > 0.0, seen, 0.0))
-        count = int(np.argmax(worth)) + 1
-        gain = _WORTH * max(float(worth[count - 1]), 0.0)
-        ends.append(_End(line, points[:count].copy(), unlike - gain))
+    ends += [
+        _End(line, points[:count], cost)
+        for line, points, count, cost in zip(
+            lines, shown, counts.tolist(), (unlike - _WORTH * gains).tolist(), strict=True
+        )
+    ]
     kept: list[_End] = []
     for end in sorted(ends, key=lambda one: one.cost):
         if len(kept) < most and not any(_shared(end.shown, other.shown) for other in kept):
@@ -285,18 +289,19 @@ def _ends(follower: Follower, start: Array, frame: Frame, noise: float, most: in
     return kept
 
 
-def _fan(start: Array) -> Iterator[tuple[Array, float]]:
-    """Lines that go on from a whisker's beginning, and how unlike it they are."""
+def _fan(start: Array) -> tuple[Array, Array]:
+    """Lines (line, point, 2) that go on from a whisker's beginning, and how unlike it they are."""
     n = min(len(start), _POLYNOMIAL)
     curving, slope, begin = np.polyfit(STEP * np.arange(1 - n, 1), start[-n:], 2)
     bend = 2.0 * (slope[0] * curving[1] - slope[1] * curving[0]) / np.hypot(*slope) ** 3
     spread = np.hypot(_BENDS, _BEND_KNOWN / (STEP * n) ** 2)
     s = STEP * (np.arange(_AHEAD) + 0.5)
-    for more, change in product(np.linspace(-_WIDEST, _WIDEST, _FAN), np.arange(-2.0, 3.0)):
-        angle = np.arctan2(slope[1], slope[0]) + (bend + more * spread) * s
-        angle += 0.5 * change * _BEND_CHANGES * s**2
-        steps = STEP * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        yield begin + np.cumsum(steps, axis=0), 0.5 * (more**2 + change**2)
+    bends, changes = np.linspace(-_WIDEST, _WIDEST, _FAN), np.arange(-2.0, 3.0)
+    more, change = (grid.reshape(-1, 1) for grid in np.meshgrid(bends, changes, indexing="ij"))
+    angle = np.arctan2(slope[1], slope[0]) + (bend + more * spread) * s
+    angle += 0.5 * change * _BEND_CHANGES * s**2
+    steps = STEP * np.stack([np.cos(angle), np.sin(angle)], axis=2)
+    return begin + np.cumsum(steps, axis=1), 0.5 * (more**2 + change**2)[:, 0]
 
 
 def _straightened(

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.deferred import interpolate, spatial
-from vibrissa.numerics import Array, Mask
+from vibrissa.deferred import interpolate
+from vibrissa.numerics import Array, Mask, kernel
 
 STEP = 2.0  # distance between points of a trace, pixels
 # Points over which the direction is taken in which a line is prolonged before its start.
@@ -195,8 +195,28 @@ def overlap(line: Array, other: Array, near: float = 3.0) -> float:
     """Share of a line that runs along another, nearer than some pixels."""
     if not len(line) or not len(other):
         return 0.0
-    distance, _ = spatial.cKDTree(other).query(line, distance_upper_bound=near)
-    return float(np.isfinite(distance).mean())
+    return count_near(np.asarray(line), np.asarray(other), near) / len(line)
+
+
+@kernel
+def count_near(line: Any, other: Any, near: float) -> int:
+    """Count the points of a line that are nearer to some point of another than so many pixels.
+
+    Lines run along one another, or do not: the search begins where the point before was near.
+    """
+    count, last, most = 0, 0, other.shape[0]
+    for i in range(line.shape[0]):
+        x, y = line[i, 0], line[i, 1]
+        for k in range(most):
+            j = last + k
+            if j >= most:
+                j -= most
+            dx, dy = other[j, 0] - x, other[j, 1] - y
+            if dx * dx + dy * dy < near * near:
+                count += 1
+                last = max(j - 2, 0)
+                break
+    return count
 
 
 def correlated(misses: Sequence[Array]) -> float:

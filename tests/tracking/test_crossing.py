@@ -44,6 +44,16 @@ def test_neighbours_that_nobody_asked_for_keep_their_ends(crossing, asked):
     assert (score[np.isfinite(score)] == 1.0).mean() > 0.97
 
 
+@pytest.mark.parametrize("asked", [0, 1, 2])
+def test_a_single_click_in_a_row_keeps_its_whisker(crossing, asked):
+    """By itself it goes on as another one where they cross, in half of the images and more."""
+    truth = crossing.truth[0]
+    (row,) = trace_video(crossing.images[0], truth[0, [asked], 0])
+    every = [[Trace.lost()] * len(truth) for _ in range(3)]
+    every[asked] = row
+    assert (scored(every, truth)[:, asked] == 1.0).all()
+
+
 def test_neighbours_are_all_others(crossing):
     truth = crossing.truth[0][0, :, 0]
     frames = crossing.images[0][::2]

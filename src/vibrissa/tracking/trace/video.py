@@ -130,8 +130,8 @@ def trace_video(
         raise ValueError(
             f"corrections are for whiskers {wrong}; there are {len(followers)}, from 0"
         )
-    if len(followers) > 1 and not done:
-        # Neighbours are followed too, so that their lines are not taken; none is returned.
+    if not done:
+        # Neighbours are followed too, so that none takes the lines of the others; they are not given.
         clear = [scene.without_still(f) for f in (start, *alike[:: max(len(alike) // _LOOKED, 1)])]
         for base in neighbours(clear, starts, scene, options):
             followers.append(replace(start_at(base, options), clutter=still.still_only))

@@ -15,6 +15,7 @@ from vibrissa.tracking import (
     track,
 )
 from vibrissa.tracking.refine.least_squares import trace_variance
+from vibrissa.tracking.remarks import remarks_on
 from vibrissa.tracking.space.frame_pairs import better_offset
 from vibrissa.tracking.space.rest_shape import (
     Length,
@@ -24,7 +25,6 @@ from vibrissa.tracking.space.rest_shape import (
     likeliest_taper,
     seen_length,
 )
-from vibrissa.tracking.track import remarks_on
 
 
 def image(begin, end, fade=0.0, noise=2.0, seed=0, size=(120, 200)):

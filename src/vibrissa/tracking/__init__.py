@@ -6,6 +6,7 @@ from vibrissa.tracking.refine.fit import (
     RodFit as RodFit,
 )
 from vibrissa.tracking.refine.rods import TraceSeries as TraceSeries
+from vibrissa.tracking.remarks import unexplained_frames as unexplained_frames
 from vibrissa.tracking.space.curve import SpaceCurve as SpaceCurve, merge
 from vibrissa.tracking.space.frame_pairs import paired_frames
 from vibrissa.tracking.space.pose import (
@@ -40,12 +41,7 @@ from vibrissa.tracking.trace.video import (
     trace_file,
     trace_video,
 )
-from vibrissa.tracking.track import (
-    TrackOptions,
-    track,
-    track_whisker,
-    unexplained_frames as unexplained_frames,
-)
+from vibrissa.tracking.track import TrackOptions, track, track_whisker
 from vibrissa.tracking.tracker_points import (
     TrackerTraces as TrackerTraces,
     tracker_traces as tracker_traces,

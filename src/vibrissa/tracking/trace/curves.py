@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from vibrissa.io import Frame
 from vibrissa.numerics import Mask, inlined, kernel
-from vibrissa.tracking.trace.ridge import noise_level, traced
+from vibrissa.tracking.trace.ends import traced
+from vibrissa.tracking.trace.ridge import noise_level
 from vibrissa.tracking.trace.scene import Bodies, Image, Scene
 from vibrissa.tracking.trace.trace import (
     Trace,

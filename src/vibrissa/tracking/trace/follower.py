@@ -24,17 +24,8 @@ from numpy.typing import ArrayLike
 from vibrissa.io import Frame
 from vibrissa.numerics import Array
 from vibrissa.tracking.trace.clutter import NOTHING, Clutter
-from vibrissa.tracking.trace.ridge import (
-    FEWEST,
-    OUTSIDE,
-    grey_flanks,
-    march,
-    measure,
-    middle,
-    noise_level,
-    smooth,
-    traced,
-)
+from vibrissa.tracking.trace.ends import OUTSIDE, grey_flanks, traced
+from vibrissa.tracking.trace.ridge import FEWEST, march, measure, middle, noise_level, smooth
 from vibrissa.tracking.trace.trace import STEP, Trace, TraceOptions, aligned, overlap
 
 # Points of a trace over which darkness and direction are taken.

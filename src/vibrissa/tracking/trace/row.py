@@ -24,6 +24,7 @@ from vibrissa.io import Frame
 from vibrissa.numerics import Array, Mask
 from vibrissa.tracking.trace.clutter import NEAR, between_whiskers
 from vibrissa.tracking.trace.curves import Curve, find_curves
+from vibrissa.tracking.trace.ends import prolonged, traced
 from vibrissa.tracking.trace.follower import Follower, features_of
 from vibrissa.tracking.trace.identity import (
     LOST,
@@ -37,7 +38,7 @@ from vibrissa.tracking.trace.identity import (
     same_whisker,
     sideways,
 )
-from vibrissa.tracking.trace.ridge import measure_ends, noise_level, prolonged, traced
+from vibrissa.tracking.trace.ridge import measure_ends, noise_level
 from vibrissa.tracking.trace.scene import Scene
 from vibrissa.tracking.trace.trace import STEP, Trace, aligned, arc_lengths, even, given, overlap
 

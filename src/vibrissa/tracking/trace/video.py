@@ -131,7 +131,7 @@ def trace_video(
             f"corrections are for whiskers {wrong}; there are {len(followers)}, from 0"
         )
     if not done:
-        # Neighbours are followed too, so that none takes the lines of the others; they are not given.
+        # Neighbours are followed too, so that their lines are not taken; none is returned.
         clear = [scene.without_still(f) for f in (start, *alike[:: max(len(alike) // _LOOKED, 1)])]
         for base in neighbours(clear, starts, scene, options):
             followers.append(replace(start_at(base, options), clutter=still.still_only))

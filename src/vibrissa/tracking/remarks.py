@@ -1,0 +1,215 @@
+"""What is to be known before tracked whiskers are believed, in a sentence each.
+
+What makes results wrong without any sign in them is stated with what to do: views that do not show
+the same, cameras out of step or shaking, ends that are not seen, a whisker that leaves the plane.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from vibrissa.cameras import Camera
+from vibrissa.numerics import Array, Mask
+from vibrissa.tracking.recording import Tracked
+from vibrissa.tracking.refine.optics import Optics
+from vibrissa.tracking.refine.rods import TraceSeries
+from vibrissa.tracking.space.frame_pairs import better_offset
+from vibrissa.tracking.space.rest_shape import Length
+from vibrissa.tracking.trace.start import base_gap
+from vibrissa.tracking.trace.trace import Trace, doubtful_frames
+from vibrissa.whisker import Whisker
+
+# Share by which its seen length varies from which a whisker leaves the plane of one view.
+_SHORTENED = 0.04
+# Misfit that is not usual, and the share of the frames with it that is worth a remark.
+_STRANGE, _OFTEN = 2.0, 0.05
+# Share of the uncertainty of contact points that comes from the cameras and is worth a remark.
+_MOST = 0.7
+_FUR_KNOWN = 0.25  # standard deviation of a stated length of fur, as a share of it
+_NEAR = 2.0  # distance between bases in several views that is more than usual, pixels
+_FEWEST = 8  # smallest number of frames that show whether a whisker leaves the plane
+
+
+def remarks_on_shaking(cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]]) -> list[str]:
+    """State which cameras shake, and how well that is known."""
+    shifts = [np.array([trace.shift for trace in row]) for row in traces]
+    found = []
+    for camera, shift in zip(cameras, shifts, strict=True):
+        size, left = shift[:, :2].std(axis=0), shift[:, 2:].mean(axis=0)
+        if size.any():
+            found.append(
+                f"{camera.name} shakes by {size[0]:.2f} pixels along columns and {size[1]:.2f} "
+                "along rows (standard deviations), as what never moves in its images shows; traces "
+                f"are moved back by that, which is known to {left[0]:.2f} and {left[1]:.2f} pixels."
+            )
+        elif np.isnan(left).any() and any(other[:, :2].any() for other in shifts):
+            found.append(
+                f"nothing shows whether {camera.name} shakes, too: it is taken to do so as much as "
+                "the other, in the covariances only."
+            )
+    return found
+
+
+def remarks_on_optics(one: Tracked, optics: Optics, name: str) -> list[str]:
+    """State by how much unknown optics move contact points, where that is most of the error."""
+    moved = np.linalg.norm(optics.displacements(one.fit.contact_point), axis=(0, 2))
+    spread = np.sqrt(np.trace(one.fit.contact_covariance, axis1=1, axis2=2))
+    if not np.isfinite(moved).any() or np.nanmedian(moved / spread) < _MOST:
+        return []
+    state = "State the distance of the lenses (--distance, in m; inf for telecentric ones), or c"
+    state = "C" if optics.distance is not None else state
+    return [
+        f"{name}: the cameras are not calibrated, by which contact points are uncertain by "
+        f"{1e6 * np.nanmedian(moved):.0f} µm (median; in the covariances, but an object fitted to "
+        f"them errs as a whole). {state}alibrate them (vibrissa calibrate, --cameras)."
+    ]
+
+
+def unexplained_frames(misfit: Array) -> Mask:
+    """Frames whose traces the rod does not explain, by their misfits; none if they are few."""
+    strange = np.nan_to_num(misfit) > _STRANGE
+    return np.asarray(strange & (strange.mean() > _OFTEN))
+
+
+def remarks_on(
+    cameras: Sequence[Camera], series: TraceSeries, length: Length, misfit: Array, name: str
+) -> list[str]:
+    """State what is unusual about a tracked whisker."""
+    found = []
+    gap = usual_gap(cameras, series)
+    if gap > _NEAR:
+        found.append(
+            f"{name}: its base is seen {gap:.1f} pixels from where the other view shows it "
+            "(median); with a good calibration it is less than one."
+        )
+    seen = np.isfinite(series.line[:, :, 0, 0])
+    outside = int((seen & (series.ends[:, :, 0] < 0.5)).any(axis=1).sum())
+    if outside:
+        found.append(
+            f"{name}: in {outside} frames a view does not show its base; they are left out."
+        )
+    strange = int(unexplained_frames(misfit).sum())
+    if strange:
+        found.append(
+            f"{name}: in {strange} frames the bent rod does not explain the traces (trace_misfit "
+            f"above {_STRANGE:g}): they are on something else, or its own inertia or a second "
+            "contact bends it. The results of these frames are not to be believed."
+        )
+    if np.isnan(length.sigma):
+        found.append(
+            f"{name}: its tip is not seen, nor is it bent enough to show its length; it is "
+            f"{1e3 * length.value:.1f} mm at least, and contacts are wrong if it is more: give "
+            "--whisker."
+        )
+    elif length.sigma > 0.0 and not length.seen:
+        found.append(
+            f"{name}: its tip is too faint to be seen, or outside of the image; as it bends it is "
+            f"{1e3 * length.value:.1f} ± {1e3 * length.sigma:.1f} mm long, which is counted in all "
+            "covariances."
+        )
+    return found
+
+
+def remarks_on_following(
+    cameras: Sequence[Camera], rows: Sequence[Sequence[Trace]], name: str
+) -> list[str]:
+    """Views in which a whisker is often lost, or not seen as in the frame before."""
+    counts = [int(doubtful_frames(row).sum()) for row in rows]
+    return [
+        f"not sure: in {count} of {len(row)} frames {camera.name} loses {name}, or sees its length "
+        "jump or a hook in it, as if something else was followed. Compare traces and video "
+        "(vibrissa correct)."
+        for camera, row, count in zip(cameras, rows, counts, strict=True)
+        if count
+    ]
+
+
+def remarks_on_bases(
+    cameras: Sequence[Camera],
+    shown: Sequence[Sequence[Trace]],
+    used: Sequence[Sequence[Trace]],
+    name: str,
+) -> list[str]:
+    """Views that show a whisker from nearer to its base on than the other view."""
+    found = []
+    for camera, before, after in zip(cameras, shown, used, strict=True):
+        cut = [a.length - b.length for a, b in zip(before, after, strict=True) if len(a.line)]
+        if cut and np.median(cut) > _NEAR:
+            found.append(
+                f"{name}: {camera.name} shows it from {np.median(cut):.0f} pixels nearer to its "
+                "base on than the other view (median); it is taken to begin where both show it."
+            )
+    return found
+
+
+def force_scale_sigma(whisker: Whisker, fur: float) -> float:
+    """Common relative error of all forces by what is not known of the fur over the base."""
+    at_edge, at_tip = whisker.radius(np.array([0.0, whisker.length]))
+    # Forces scale with the fourth power of the radius, which falls evenly along the whisker.
+    return float(4.0 * (1.0 - at_tip / at_edge) / whisker.length * _FUR_KNOWN * fur)
+
+
+def remarks_on_fur(one: Tracked, fur: float, name: str) -> list[str]:
+    """State by how much forces err together by what is not known of the fur over the base."""
+    if fur == 0.0:
+        return []
+    percent = 100.0 * force_scale_sigma(one.whisker, fur)
+    hidden = f"{1e3 * fur:g} ± {1e3 * _FUR_KNOWN * fur:.2g} mm"
+    return [
+        f"{name}: {hidden} of its base are taken to be hidden by fur; what is not known of that is "
+        f"one error of all its forces and moments, {percent:.1f} % (standard deviation), which is "
+        "in no covariance. They are those where the fur ends."
+    ]
+
+
+def remarks_on_plane(one: Tracked, name: str) -> list[str]:
+    """How far a whisker may leave the plane of the only view, and what that does to contacts."""
+    tips = one.traces.ends.all(axis=(1, 2)) & np.isfinite(one.curves).all(axis=(1, 2))
+    if tips.sum() < _FEWEST:
+        return [f"{name}: too few frames show its tip to see whether it leaves the plane."]
+    lengths = np.linalg.norm(np.diff(one.curves[tips], axis=1), axis=2).sum(axis=1)
+    short, long = np.percentile(lengths, [5.0, 95.0])
+    turned = float(np.arccos(short / long))
+    seen = f"{name}: it is seen {1e3 * short:.1f} to {1e3 * long:.1f} mm long (5 and 95 % of the "
+    if short > (1.0 - _SHORTENED) * long:
+        away = np.linalg.norm(one.fit.contact_point - one.fit.position, axis=1)
+        deep = np.sin(turned) * float(np.nan_to_num(away).max())
+        return [
+            f"{seen}frames that show its tip), which does not exclude that it leaves the plane by "
+            f"{np.degrees(turned):.0f}°: contact points may be {1e3 * deep:.1f} mm nearer to the "
+            "camera or farther from it, which is in no covariance."
+        ]
+    return [
+        f"{seen}frames that show its tip), as if it turned out of the image by up to "
+        f"{np.degrees(turned):.0f}°. Contact is then not distinguished from turning, and forces "
+        "and contact points of such frames are not to be believed. A second view (or a mirror, "
+        "--views) shows it."
+    ]
+
+
+def remarks_on_time(
+    cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]], offset: int | None
+) -> list[str]:
+    """Whether cameras seem to be out of step."""
+    if offset is None:
+        return []
+    found = []
+    for camera, row in zip(cameras[1:], traces[1:], strict=True):
+        shifts = better_offset(cameras[0], camera, traces[0], row, offset)
+        if shifts.size:
+            listed = ", ".join(map(str, shifts))
+            found.append(
+                f"{cameras[0].name} and {camera.name} are out of step: with an offset of {listed} "
+                f"frames instead of {offset} they agree better. Track with --offset auto."
+            )
+    return found
+
+
+def usual_gap(cameras: Sequence[Camera], series: TraceSeries) -> float:
+    """Usual distance of the base from where the views together see it, pixels."""
+    rows = (series.ends[:, :, 0] > 0.5).all(axis=1)
+    if not rows.any():
+        return 0.0
+    return float(np.median(base_gap(cameras, np.swapaxes(series.line[rows, :, 0], 0, 1))))

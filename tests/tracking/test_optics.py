@@ -89,7 +89,6 @@ def test_a_front_view_that_is_not_mirrored_is_seen_from_its_other_side(distance)
     views = traces(lines, [TOP, FRONT], [0.4, -0.4])
     found = rough_optics(STATED, views, distance)
     assert found.values[1] < -2.0 * found.sigma[1]
-    assert "front at 0.4" in str(found)
     assert "on its other side" in str(found)
     pixels = np.stack([[trace.line for trace in view] for view in views])
     away = triangulate(found.cameras, pixels)[0] - lines

@@ -130,8 +130,9 @@ def trace_video(
         raise ValueError(
             f"corrections are for whiskers {wrong}; there are {len(followers)}, from 0"
         )
-    if not done:
-        # Neighbours are followed too, so that their lines are not taken; none is returned.
+    if not done and (len(followers) > 1 or not corrections):
+        # Neighbours are followed too, so that their lines are not taken; none is returned. What a
+        # person corrects may be which of the lines is the only whisker.
         clear = [scene.without_still(f) for f in (start, *alike[:: max(len(alike) // _LOOKED, 1)])]
         for base in neighbours(clear, starts, scene, options):
             followers.append(replace(start_at(base, options), clutter=still.still_only))

@@ -103,7 +103,7 @@ def _above_texture(
     given too.
     """
     part = np.ascontiguousarray(line[:_STREAKS])
-    n, beside, sigma = len(part), [], along.noise * np.sqrt(DEPTH_VARIANCE)
+    n, amplitudes, sigma = len(part), [], along.noise * np.sqrt(DEPTH_VARIANCE)
     if n < FEWEST:
         return along, sigma
     points, amplitude, flank, support = np.empty((n, 2)), np.empty(n), np.empty(n), np.empty(n)
@@ -112,8 +112,8 @@ def _above_texture(
     for away in (-_FLANKS[1], _FLANKS[1]):
         other = np.ascontiguousarray(part + away * options.scale * across)
         measure(frame, other, 1, 1.0, options.scale, *clutter, points, amplitude, flank, support)
-        beside.append(amplitude[flank > 0.0])
-    texture = np.concatenate(beside)
+        amplitudes.append(amplitude[flank > 0.0])
+    texture = np.concatenate(amplitudes)
     if len(texture) < n:
         return along, sigma
     usual = max(float(texture.mean()) - sigma, 0.0)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vibrissa.contacts.contacts import MOST_CANDIDATES
-from vibrissa.contacts.least_squares import by_slopes
+from vibrissa.contacts.fit_within import by_slopes
 from vibrissa.contacts.nodes import Searched
 from vibrissa.contacts.weighing import Weighing, channel_covariance
 from vibrissa.numerics import Array, IntArray, copy, inlined, kernel

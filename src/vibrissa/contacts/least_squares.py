@@ -9,14 +9,6 @@ channels c(x): signals, or components of force and moment. Measured channels c̃
 is least: Gauss-Newton steps with the exact Jacobian of the rod, damped as Levenberg and Marquardt
 do where one fails. The contact may not leave the whisker: at the tip (and at the smallest arc
 length considered) only the force is free. Everything is non-dimensional.
-
-Without friction a fit may also be kept within Ω, on its boundary where noise has carried the
-measurement out of it: what would leave it stays on its face, in the coordinates (s, ψ, λ) of the
-chart, as long as χ² falls outward there. Elsewhere steps are straight in s and in s f, the moment
-about the base, along which valleys of χ² run. Where signals fold, or valleys are bent, JᵀJ is a
-poor model of χ²: what the curvature of the residuals adds to it is learnt from one contact to the
-next, as NL2SOL does (J. E. Dennis, D. M. Gay, R. E. Welsch, *An adaptive nonlinear least-squares
-algorithm*, ACM Trans. Math. Softw. 7 (1981) 348-368).
 """
 
 from __future__ import annotations
@@ -49,7 +41,6 @@ from vibrissa.rod import (
     Fold,
     Rod,
     StableSet,
-    fold_force,
     integrate,
     interpolate,
     lane_slopes,
@@ -66,36 +57,18 @@ from vibrissa.signals import FD, MD, signal_equations
 # Some valleys of χ² are narrow and bent: most fits take 5 rounds, but a few a hundred. What is not
 # at rest after so many goes on only if it may still count.
 _ROUNDS = 15
-_TIMES = 8
+#: How often as many rounds are tried anew.
+TIMES = 8
 # A step this small, relative to the length and to the force, is the last, and taken to first order;
 # a damped one only if it is smaller still.
 _LAST = 1e-6
 _SMALL = 1e-9
 # So is one that promises to lower χ² by no more than this share of it.
 _IDLE = 1e-8
-_LONGEST = 0.1
-_MOST_DAMPING = 1e8
-_ROUNDS_WITHIN = 100
-# A step that promises less of χ² (as a share of it, and by itself) is not taken.
-_IDLE_WITHIN, _LITTLE = 1e-6, 1e-9
 _IDLE_NEAR = 1e-3  # between the map's nodes, where steps are good to about that
 _FIRST_ROUNDS = 4  # so many steps there before the rod is integrated
-# Nor is one that, undamped or after many rounds, promises less of what χ² is above what counts.
-_SLOW, _PATIENCE, _LATE = 0.05, 3, 25
-# Where the slopes of a fit miss a known contact by so much (χ²), and by no more than this share of
-# the fall of χ² to there, χ² falls all the way: that contact is where the fit would end.
-_FORESEEN, _DOWNHILL = 1.0, 0.25
-_WILD = 4.0  # where χ² rises by more than this factor contacts teach nothing of its curvature
-# Where a fit within Ω ends χ² must be level in each unknown by itself: what that could still gain
-# is at most the square of this.
-_LEVEL = 0.03
-# The longest steps of s; at the fold of ψ and λ; elsewhere of the moment, as a share of itself or
-# of that of the fold.
-_LONGEST_TURN, _LONGEST_FALL, _LONGEST_SHARE = 0.5, 0.25, 0.5
-# The chart knows the fold to a part in a million: as near to it contacts are still stable.
-_MOST_LOAD = 1.0 - 1e-5
-_AT_FOLD = 1.0 - 1e-12  # what is as near to that is at the fold, whatever rounding makes of it
-_NUDGE = 1e-5  # steps for derivatives of the fold force, which is smooth
+_LONGEST = 0.1
+_MOST_DAMPING = 1e8
 _SAME = 1e-3  # contacts within this (over L, and ten times that relative to the force) are one
 
 
@@ -409,7 +382,7 @@ def fit(
 ) -> Fits:
     """Fit contacts to measured channels."""
     out = _once(discretization, channels, targets, weights, contacts, friction, least)
-    for _ in range(_TIMES):
+    for _ in range(TIMES):
         slow = np.flatnonzero(~out.converged & (out.misfits <= worth))
         if not slow.size:
             break
@@ -461,334 +434,6 @@ def same_contact(a: Array, b: Array) -> bool:
     """Whether two contacts x (4,) are one."""
     apart = math.hypot(a[2] - b[2], a[3] - b[3])
     return bool(abs(a[0] - b[0]) < _SAME and apart < 10.0 * _SAME * math.hypot(a[2], a[3]))
-
-
-@inlined
-def _confine(fold: Fold, proximal: float, x: Array) -> bool:
-    """Bring a contact into Ω; whether it is at the fold."""
-    x[0] = min(max(x[0], proximal), 1.0)
-    force = math.hypot(x[2], x[3])
-    most = _MOST_LOAD * fold_force(fold, x[0], math.atan2(x[3], x[2]))
-    if force < _AT_FOLD * most:
-        return False
-    x[2] *= most / force
-    x[3] *= most / force
-    return True
-
-
-@inlined
-def _directions(fold: Fold, x: Array, folded: bool, frame: Array) -> None:
-    """Fill ∂ξ/∂z (3, 3) of the coordinates of a fit, in units of their longest steps.
-
-    These are s and the moment; at the fold s, ψ and the share by which the force falls.
-    """
-    s, fy, fz = x[0], x[2], x[3]
-    psi, force = math.atan2(fz, fy), math.hypot(fy, fz)
-    frame[0, 0], frame[0, 1], frame[0, 2] = _LONGEST, 0.0, 0.0
-    if not folded:
-        most = max(_LONGEST_SHARE * force, _LONGEST_FALL * fold_force(fold, s, psi))
-        frame[1, 0], frame[2, 0] = -_LONGEST * fy / s, -_LONGEST * fz / s
-        frame[1, 1], frame[2, 1], frame[1, 2], frame[2, 2] = most, 0.0, 0.0, most
-        return
-    by_s = fold_force(fold, s + _NUDGE, psi) - fold_force(fold, s - _NUDGE, psi)
-    by_psi = fold_force(fold, s, psi + _NUDGE) - fold_force(fold, s, psi - _NUDGE)
-    by_s *= _LONGEST * _MOST_LOAD / (2.0 * _NUDGE * force)
-    by_psi *= _LONGEST_TURN * _MOST_LOAD / (2.0 * _NUDGE * force)
-    frame[1, 0], frame[2, 0] = by_s * fy, by_s * fz
-    frame[1, 1] = by_psi * fy - _LONGEST_TURN * fz
-    frame[2, 1] = by_psi * fz + _LONGEST_TURN * fy
-    frame[1, 2], frame[2, 2] = -_LONGEST_FALL * fy, -_LONGEST_FALL * fz
-
-
-@inlined
-def _go(
-    fold: Fold, proximal: float, x: Array, folded: bool, frame: Array, step: Array, to: Array
-) -> None:
-    """Fill the contact that a step in the coordinates of `_directions` leads to."""
-    s = min(max(x[0] + _LONGEST * step[0], proximal), 1.0)
-    to[0], to[1] = s, 0.0
-    if folded:
-        psi = math.atan2(x[3], x[2]) + _LONGEST_TURN * step[1]
-        force = (1.0 - _LONGEST_FALL * step[2]) * _MOST_LOAD * fold_force(fold, s, psi)
-        to[2], to[3] = force * math.cos(psi), force * math.sin(psi)
-    else:
-        for a in range(2):
-            to[2 + a] = x[0] * (x[2 + a] + frame[1 + a, 1 + a] * step[1 + a]) / s
-
-
-@inlined
-def _normal_equations(
-    r: Array, j: Array, second: Array, frame: Array, gradient: Array, normal: Array, bent: Array
-) -> None:
-    """Fill Jᵀr, JᵀJ, and what the curvature of the residuals adds to it, in a fit's coordinates."""
-    along = np.empty((r.shape[0], 3))
-    for p in range(3):
-        gradient[p] = 0.0
-        for i in range(r.shape[0]):
-            along[i, p] = j[i, 0] * frame[0, p] + j[i, 2] * frame[1, p] + j[i, 3] * frame[2, p]
-            gradient[p] += along[i, p] * r[i]
-    for p in range(3):
-        for q in range(p + 1):
-            normal[p, q] = bent[p, q] = 0.0
-            for i in range(r.shape[0]):
-                normal[p, q] += along[i, p] * along[i, q]
-            for a in range(3):
-                for c in range(3):
-                    bent[p, q] += frame[a, p] * second[a, c] * frame[c, q]
-            normal[q, p], bent[q, p] = normal[p, q], bent[p, q]
-
-
-@inlined
-def _bend(
-    second: Array, x: Array, to: Array, r: Array, j: Array, r_there: Array, j_there: Array
-) -> None:
-    """Update the residuals' curvature, Σ r ∂²r/∂ξ² (3, 3), by those at another contact."""
-    d, rise, missed = np.empty(3), np.empty(3), np.empty(3)
-    along, size, new, steep, far = 0.0, 0.0, 0.0, 0.0, 0.0
-    for p in range(3):
-        q = p + (1 if p > 0 else 0)
-        d[p], rise[p], missed[p] = to[q] - x[q], 0.0, 0.0
-        for i in range(r.shape[0]):
-            rise[p] += j_there[i, q] * r_there[i] - j[i, q] * r[i]
-            missed[p] += (j_there[i, q] - j[i, q]) * r_there[i]
-        along += rise[p] * d[p]
-        new += missed[p] * d[p]
-        steep += rise[p] * rise[p]
-        far += d[p] * d[p]
-    for p in range(3):
-        for q in range(3):
-            size += d[p] * second[p, q] * d[q]
-    if not along * along > 1e-24 * steep * far:
-        return
-    share = min(abs(new / size), 1.0) if size != 0.0 else 1.0
-    left = 0.0
-    for p in range(3):
-        for q in range(3):
-            second[p, q] *= share
-            missed[p] -= second[p, q] * d[q]
-        left += missed[p] * d[p]
-    for p in range(3):
-        for q in range(3):
-            second[p, q] += (missed[p] * rise[q] + rise[p] * missed[q]) / along
-            second[p, q] -= left * rise[p] * rise[q] / (along * along)
-
-
-@inlined
-def _step_within(
-    gradient: Array,
-    normal: Array,
-    bent: Array,
-    damping: float,
-    ends: tuple[bool, bool, bool],
-    root: Array,
-    step: Array,
-) -> tuple[float, float]:
-    """Fill a damped step within Ω; slope and curvature of χ²/2 along it, of which 1, 0 for none.
-
-    ``ends`` states whether s cannot fall or rise, and whether the force cannot.
-    """
-    held = False
-    for _ in range(2):
-        for p in range(3):
-            fixed = normal[p, p] == 0.0 or (p == 0 and held) or (p == 2 and ends[2])
-            step[p] = 0.0 if fixed else -gradient[p]
-            for q in range(p + 1):
-                root[p, q] = normal[p, q] + bent[p, q]
-                if fixed or normal[q, q] == 0.0 or (q == 0 and held):
-                    root[p, q] = 0.0
-            root[p, p] = 1.0 if fixed else root[p, p] + damping * normal[p, p]
-        if not cholesky(root, root):
-            return 1.0, 0.0
-        solve_root(root, step)
-        if held or not ((ends[0] and step[0] < 0.0) or (ends[1] and step[0] > 0.0)):
-            break
-        held = True
-    slope, curve = 0.0, 0.0
-    for p in range(3):
-        slope += gradient[p] * step[p]
-        for q in range(3):
-            curve += step[p] * (normal[p, q] + bent[p, q]) * step[q]
-    return slope, curve
-
-
-@inlined
-def _level(gradient: Array, normal: Array, ends: tuple[bool, bool, bool]) -> bool:
-    """Whether χ² falls nowhere but out of Ω."""
-    for p in range(3):
-        slope = gradient[p]
-        if p == 0 and ((ends[1] and slope < 0.0) or (ends[0] and slope > 0.0)):
-            continue
-        if not (p == 2 and ends[2]) and slope * slope > _LEVEL * _LEVEL * normal[p, p]:
-            return False
-    return True
-
-
-@inlined
-def by_slopes(x: Array, r: Array, j: Array, other: Array) -> float:
-    """χ² at another contact by the slopes at one; it bends little in s and s f."""
-    total, ds = 0.0, other[0] - x[0]
-    dy = other[0] * (other[2] - x[2]) / x[0]
-    dz = other[0] * (other[3] - x[3]) / x[0]
-    for a in range(r.shape[0]):
-        away = r[a] + j[a, 0] * ds + j[a, 2] * dy + j[a, 3] * dz
-        total += away * away
-    return total
-
-
-class _Room(NamedTuple):
-    """Working memory of a fit.
-
-    The rod's buffer; weights (k, k); a contact (4,) with (F, p) and ∂(F, p)/∂x (6, 4); residuals
-    and slopes of channels (k, 4), and in standard deviations, here and there; ∂ξ/∂z (3, 3),
-    curvature of the residuals, JᵀJ, that curvature in z, a Cholesky factor, gradient and step.
-    """
-
-    b: Array
-    weights: Array
-    to: Array
-    v: Array
-    t: Array
-    residual: Array
-    jacobian: Array
-    r: Array
-    j: Array
-    r_there: Array
-    j_there: Array
-    frame: Array
-    second: Array
-    normal: Array
-    bent: Array
-    root: Array
-    gradient: Array
-    step: Array
-
-
-@kernel
-def fit_within(
-    rod: Charted,
-    proximal: float,
-    how: Weighing,
-    target: Array,
-    measured: Array,
-    x: Array,
-    value: Array,
-    tangents: Array,
-    worth: float,
-    known: Array,
-    misfits: Array,
-) -> tuple[float, bool]:
-    """Find the contact of least χ² in Ω, downhill from another, with the weights of that one.
-
-    It is given up if above ``worth``. Where the way leads to a contact that is known and worth it,
-    with its χ² in ``misfits``, x becomes that. Return χ², and whether it is a least one. If
-    worth is limited the way is that between the map's nodes; from its end the rod is integrated.
-    """
-    k = how.codes.shape[0]
-    room = _Room(
-        np.zeros(BUFFER_SIZE),
-        np.empty((k, k)),
-        x.copy(),
-        np.empty(6),
-        np.zeros((6, 4)),
-        np.empty(k),
-        np.empty((k, 4)),
-        np.empty(k),
-        np.empty((k, 4)),
-        np.empty(k),
-        np.empty((k, 4)),
-        np.empty((3, 3)),
-        np.zeros((3, 3)),
-        np.empty((3, 3)),
-        np.empty((3, 3)),
-        np.empty((3, 3)),
-        np.empty(3),
-        np.empty(3),
-    )
-    return _fit_within(
-        rod, proximal, how, target, measured, x, value, tangents, worth, known, misfits, room
-    )
-
-
-@kernel
-def _fit_within(
-    rod: Charted,
-    proximal: float,
-    how: Weighing,
-    target: Array,
-    measured: Array,
-    x: Array,
-    value: Array,
-    tangents: Array,
-    worth: float,
-    known: Array,
-    misfits: Array,
-    room: _Room,
-) -> tuple[float, bool]:
-    """Fit a contact; arrays made by another function are not counted at each use."""
-    b, weights, to, v, t, residual, jacobian, r, j, r_there, j_there = room[:11]
-    frame, second, normal, bent, root, gradient, step = room[11:]
-    codes, fold = how.codes, rod.fold
-    k = codes.shape[0]
-    best, damping, promised, folded = np.inf, 0.0, 0.0, False
-    ends, near, begun = (False, False, False), worth < np.inf, False
-    for n in range(_ROUNDS_WITHIN):
-        folded_there = _confine(fold, proximal, to)
-        contact_equations(rod, b, near, to, v, t)
-        if not begun and not weigh_any(how, v, measured, weights):
-            break
-        channel_equations(to, v, t, codes, target, residual, jacobian)
-        misfit = whiten(weights, residual, jacobian, k, r_there, j_there)
-        if begun and misfit < _WILD * best:
-            _bend(second, x, to, r, j, r_there, j_there)
-        if misfit < best:
-            if best - misfit > 0.75 * promised:
-                damping = 0.0 if damping < 1e-5 else 0.1 * damping
-            elif best - misfit < 0.25 * promised:
-                damping = max(2.0 * damping, 1e-3)
-            best, folded = misfit, folded_there
-            copy(to, x)
-            copy(v, value)
-            copy(r_there, r)
-            for a in range(6):
-                copy(t[a], tangents[a])
-            for i in range(k):
-                copy(j_there[i], j[i])
-            for c in range(known.shape[0]):
-                left = math.sqrt(by_slopes(x, r, j, known[c])) + math.sqrt(misfits[c])
-                sure = misfits[c] <= worth < np.inf
-                sure = sure and left * left < min(_FORESEEN, _DOWNHILL * (best - misfits[c]))
-                if sure or same_contact(x, known[c]):
-                    copy(known[c], x)
-                    return best, False
-            _directions(fold, x, folded, frame)
-            begun = True
-        elif best == np.inf:
-            return best, False
-        else:
-            damping = max(4.0 * damping, 1e-2)
-        _normal_equations(r, j, second, frame, gradient, normal, bent)
-        ends = (x[0] <= proximal, x[0] >= 1.0, folded and gradient[2] >= 0.0)
-        slope, curve = _step_within(gradient, normal, bent, damping, ends, root, step)
-        while slope > 0.0 and damping <= _MOST_DAMPING:
-            damping = max(4.0 * damping, 1e-3)
-            slope, curve = _step_within(gradient, normal, bent, damping, ends, root, step)
-        gain = -2.0 * slope - curve
-        idle = gain <= (_IDLE_NEAR if near else _IDLE_WITHIN) * best + _LITTLE
-        slow = n >= _PATIENCE and (damping == 0.0 or n >= _LATE) and gain < _SLOW * (best - worth)
-        if near and (idle or slow or damping > _MOST_DAMPING):
-            copy(x, to)
-            second[:], best, damping, promised, near, begun = 0.0, np.inf, 0.0, 0.0, False, False
-            continue
-        if idle or damping > _MOST_DAMPING:
-            return best, _level(gradient, normal, ends)
-        if slow:
-            break
-        size = max(abs(step[0]), abs(step[1]), abs(step[2]), 1.0)
-        for p in range(3):
-            step[p] /= size
-        promised = (-2.0 * slope - curve / size) / size
-        _go(fold, proximal, x, folded, frame, step, to)
-    return best, False
 
 
 def unknowns_covariance(

@@ -33,8 +33,9 @@ from vibrissa.contacts.candidates import (
     solve_rows,
 )
 from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates, Room
+from vibrissa.contacts.fit_within import fit_within
 from vibrissa.contacts.flat_valleys import follow_valley
-from vibrissa.contacts.least_squares import channel_equations, fit_within, same_contact, whiten
+from vibrissa.contacts.least_squares import channel_equations, same_contact, whiten
 from vibrissa.contacts.nodes import (
     PARTS,
     Searched,

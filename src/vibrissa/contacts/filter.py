@@ -27,9 +27,12 @@ from vibrissa.contacts.estimator import Estimator
 from vibrissa.contacts.mixture import Mixture, learn, predict, room, tidy, unaccounted
 from vibrissa.contacts.noise import explained
 from vibrissa.contacts.onset import Beginning, Gaussians
+from vibrissa.contacts.posterior import LEFT, THREE_SIGMA
 from vibrissa.contacts.prior import Prior, refuse_tip
 from vibrissa.contacts.readout import Measurement
+from vibrissa.deferred import special
 from vibrissa.numerics import AnyArray, Array, IntArray
+from vibrissa.rod import charted_rod
 from vibrissa.status import Status
 
 _UNKNOWNS = 3
@@ -51,6 +54,8 @@ _SURE = 0.99  # what is surer than this is no longer ambiguous
 # Hypotheses nearer to each other (Mahalanobis distance squared, by the sum of both covariances) run
 # together: there is no gap between them.
 _TOGETHER = 4.0
+# Factors of a covariance that are tried, and what is nothing among probabilities.
+_FACTORS, _NOTHING = np.linspace(1.0, 4.0, 31), 1e-12
 _EXPLAINED = (Status.UNIQUE, Status.AMBIGUOUS, Status.UNDERDETERMINED)
 
 
@@ -61,7 +66,8 @@ class Followed(NamedTuple):
     # run together, as along the valley that a light contact leaves, it is their mean.
     point: Array
     # (3, 3) Covariance of the contact point, m²: over all hypotheses, weighed by their
-    # probabilities.
+    # probabilities, and wide enough for those that run together: 0.3 % of what they hold possible
+    # are beyond three standard deviations.
     covariance: Array
     velocity: Array  # (3,), velocity of the contact point in the laboratory, m/s
     # Probability that the contact is there, within the spread of the hypotheses that run together;
@@ -262,8 +268,7 @@ class ContactFilter:
         out, misfits = room(most, self._errors), np.empty(most)
         try:
             n = learn(
-                chart.discretization.rod,
-                chart.fold,
+                charted_rod(chart),
                 chart.proximal,
                 readout.how,
                 measurement.target,
@@ -312,7 +317,7 @@ class ContactFilter:
         out = room(old + n, self._errors)
         for mine, before in zip(out, self._mixture, strict=True):
             mine[:old] = before
-        out.mean[old:, :3] = found.values[:, 3:] @ turn.T + base
+        out.mean[old:, :3] = found.points @ turn.T + base
         out.spread[old:, :3, :3] = turn @ found.covariances @ turn.T + self._pose * np.eye(3)
         out.spread[old:, 3:, 3:] = self._drift.speed**2 * np.eye(3)
         out.by_errors[old:, :3] = turn @ found.by_errors
@@ -395,6 +400,7 @@ def combined(
         probability = float(min(shares.max(), 1.0))
         away = points - mean[:3]
         covariance = np.tensordot(weights, spreads, axes=1) + (away.T * weights) @ away
+        covariance *= _widening(weights[best], away[best], spreads[best], covariance)
     if status in _EXPLAINED:
         status = Status.UNIQUE if probability > _SURE else Status.AMBIGUOUS
     return Followed(
@@ -408,6 +414,24 @@ def combined(
         turn.T @ (mean[:3] - base) * length,
         located,
     )
+
+
+def _widening(weights: Array, away: Array, spreads: Array, covariance: Array) -> float:
+    """Factor, 1 at least, by which an ellipsoid of three standard deviations holds what it states.
+
+    The sum of Gaussians about ``away`` (n, 3) may be bent, and then leaves that of its own second
+    moment. Squared distances of each are taken for gamma distributed, with their exact mean and
+    variance.
+    """
+    root = np.linalg.inv(np.linalg.cholesky(covariance))
+    own, middle = root @ spreads @ root.T, away @ root.T
+    mean = np.trace(own, axis1=1, axis2=2) + (middle**2).sum(axis=1)
+    through = np.einsum("ni,nij,nj->n", middle, own, middle)
+    variance = 2.0 * (own**2).sum(axis=(1, 2)) + 4.0 * through
+    squares = THREE_SIGMA * _FACTORS[:, None]
+    beyond = special.gammaincc(mean**2 / variance, squares * mean / variance) @ weights
+    left = np.log(np.maximum(beyond / weights.sum(), _NOTHING))
+    return float(np.interp(-math.log(LEFT), -left, _FACTORS))
 
 
 def _groups(points: Array, spreads: Array) -> IntArray:

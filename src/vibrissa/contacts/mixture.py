@@ -1,12 +1,14 @@
 """Hypotheses about a contact, a sum of Gaussians, and what they learn from one measurement.
 
-Each hypothesis is a Gaussian over (p, v). A measurement moves p to where χ² of the signals and of
-p - p_predicted together is least, with the exact rod in between. There may be several such places:
-two contacts that give the same signals part where they met, and a Gaussian that covers both becomes
-two. So the least is looked for from where the hypothesis was and from each contact that gives the
-signals exactly and is not far from the prediction. Each is weighed by Laplace's approximation,
+Each hypothesis is a Gaussian over (p, v). A measurement moves it to where χ² of the signals and of
+p - p_predicted together is least in Ω, with the exact rod in between. There may be several such
+places: two contacts that give the same signals part where they met, and a Gaussian that covers both
+becomes two. So the least is looked for from where the hypothesis was and from each contact that
+gives the signals exactly and is not far from the prediction. What is left about each is known to
+second order (:mod:`~vibrissa.contacts.moments`), as noise leaves bent valleys and Ω ends at folds:
+its mean and covariance are those of the hypothesis thereafter, and its mass weighs it,
 
-    log w ← log w - χ²/2 + ½ log(det P_after / det P_before) + log det W,
+    log w ← log w - χ²/2 + log ∫ exp((χ² - χ²(p))/2) dp - ½ log det P_before + log det W,
 
 with the weights W of the signals, which differ from contact to contact where noise of force and
 moment makes that of a direction.
@@ -23,18 +25,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.least_squares import (
-    Fits,
-    channel_equations,
-    fit_rows,
-    same_contact,
-    stable_fit,
-)
+from vibrissa.contacts.fit_within import fit_rows_within
+from vibrissa.contacts.least_squares import Fits, same_contact
+from vibrissa.contacts.moments import Onset, moments
 from vibrissa.contacts.weighing import Weighing, gradients, weigh, wrong_by
 from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel
-from vibrissa.rod import Fold, Rod
+from vibrissa.rod import Charted
 
-_TIMES = 8
 # A contact that gives the signals is a place to look from if it is no farther (Mahalanobis distance
 # squared) from the prediction.
 _GATE = 50.0
@@ -280,43 +277,29 @@ def _starts(
 
 @kernel
 def _fits(
-    rod: Rod,
+    rod: Charted,
     proximal: float,
     how: Weighing,
-    target: Array,
+    codes: IntArray,
+    targets: Array,
     measured: Array,
     passes: int,
-    prior: Array,
-    root: Array,
-    of: IntArray,
-    rows: int,
-    x: Array,
-    v: Array,
-    t: Array,
-    chi: Array,
+    weights: Array,
+    fits: Fits,
 ) -> None:
-    """Move x to where χ² of measurement and prediction is least; fill the rest."""
+    """Move contacts to where χ² of measurement and prediction is least in Ω, and fill the rest.
+
+    Their targets (n, k + 3) and weights (n, k + 3, k + 3) are those of signals, which are filled,
+    and of p.
+    """
     k = how.codes.shape[0]
-    targets, weights = np.empty((rows, k + 3)), np.zeros((rows, k + 3, k + 3))
-    fits, own = Fits(x, v, t, chi, np.zeros(rows, np.bool_)), np.empty((k, k))
-    codes = np.empty(k + 3, np.int64)
-    codes[:k] = how.codes
-    for a in range(3):
-        codes[k + a] = _PLACE + a
-    for row in range(rows):
-        targets[row, :k], targets[row, k:] = target, prior[of[row]]
-        weights[row, k:, k:] = root[of[row]]
+    own = np.empty((k, k))
     for _ in range(passes):
-        for row in range(rows):
-            if not weigh(how, v[row], measured, own):
+        for row in range(len(targets)):
+            if not weigh(how, fits.values[row], measured, own):
                 own[:] = 0.0
             weights[row, :k, :k] = own
-        fit_rows(rod, False, proximal, codes, targets, weights, fits, 0, rows)
-        for row in range(rows):
-            for _ in range(_TIMES):
-                if fits.converged[row] or not chi[row] < np.inf:
-                    break
-                fit_rows(rod, False, proximal, codes, targets, weights, fits, row, row + 1)
+        fit_rows_within(rod, proximal, how, codes, targets, measured, weights, fits)
 
 
 @inlined
@@ -330,9 +313,12 @@ def _known(x: Array, out: Mixture, first: int, found: int) -> bool:
 
 @kernel
 def _moved(
+    rod: Charted,
+    proximal: float,
     how: Weighing,
+    codes: IntArray,
     target: Array,
-    own: Array,
+    weights: Array,
     turn: Array,
     pose: float,
     mixture: Mixture,
@@ -349,17 +335,13 @@ def _moved(
 ) -> bool:
     """Fill a row with what hypothesis i becomes at a least; False where that is not a Gaussian."""
     k = how.codes.shape[0]
-    residual, jacobian, slope = np.empty(k), np.empty((k, 4)), np.empty((k, 3))
-    by_xi = np.empty((3, 3))
-    for a in range(3):
-        by_xi[a, 0], by_xi[a, 1], by_xi[a, 2] = t[3 + a, 0], t[3 + a, 2], t[3 + a, 3]
-    channel_equations(x, v, t, how.codes, target, residual, jacobian)
-    for a in range(k):
-        slope[a, 0], slope[a, 1], slope[a, 2] = jacobian[a, 0], jacobian[a, 2], jacobian[a, 3]
-    seen = own @ slope @ np.linalg.inv(by_xi)
+    shift, after, by_channels = np.empty(3), np.empty((3, 3)), np.empty((3, k + 3))
+    own = np.ascontiguousarray(weights[:k, :k])
+    onset = Onset(np.zeros((2, 3)), 0.0)
+    mass = moments(rod, proximal, onset, codes, target, weights, x, v, t, shift, after, by_channels)
     inverse = root.T @ root
-    after = np.linalg.inv(inverse + seen.T @ seen)
-    weight = 0.5 * (_log_determinant(after) - _log_determinant(before)) - 0.5 * chi
+    weight = np.log(mass) if mass > 0.0 else -np.inf
+    weight -= 0.5 * (_log_determinant(before) + chi)
     weight += log_weights(own, how.mixing.shape[0])
     if not np.isfinite(weight):
         return False
@@ -375,14 +357,14 @@ def _moved(
     gradients(how.codes, v[:3], _moment(v), g)
     for e in range(b.shape[1]):
         wrong_by(how.errors[e], v[:3], _moment(v), wrong)
-        pushed = after @ (turn @ (seen.T @ (own @ (g @ wrong))))
+        pushed = turn @ (np.ascontiguousarray(by_channels[:, :k]) @ (own @ (g @ wrong)))
         for a in range(3):
             for c in range(3):
                 noise[a, c] -= pushed[a] * pushed[c]
         b[:, e] = keep @ np.ascontiguousarray(b[:, e]) + gain @ pushed
     # What the base's own error adds passes through the same gain.
     whole = keep @ spread @ keep.T + gain @ noise @ gain.T + pose * (through @ through.T)
-    step = gain @ (turn @ (v[3:] - prior))
+    step = gain @ (turn @ (v[3:] + shift - prior))
     for a in range(6):
         out.mean[row, a] = mixture.mean[i, a] + step[a]
         copy(b[a], out.by_errors[row, a])
@@ -396,8 +378,7 @@ def _moved(
 
 @kernel
 def learn(
-    rod: Rod,
-    fold: Fold,
+    rod: Charted,
     proximal: float,
     how: Weighing,
     target: Array,
@@ -417,24 +398,37 @@ def learn(
     most = n * (1 + c)
     prior, before, root = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3, 3))
     _predictions(mixture, turn, base, pose, prior, before, root)
-    x, v, t = np.zeros((most, 4)), np.empty((most, 6)), np.zeros((most, 6, 4))
-    chi, of = np.full(most, np.inf), np.empty(most, np.int64)
+    x, v, of = np.zeros((most, 4)), np.empty((most, 6)), np.empty(most, np.int64)
     rows = _starts(mixture, prior, root, contacts, values, of, x, v)
-    _fits(rod, proximal, how, target, measured, passes, prior, root, of, rows, x, v, t, chi)
-    found, first = 0, 0
-    own = np.empty((k, k))
+    codes, targets = np.empty(k + 3, np.int64), np.empty((rows, k + 3))
+    weights = np.zeros((rows, k + 3, k + 3))
+    codes[:k] = how.codes
+    for a in range(3):
+        codes[k + a] = _PLACE + a
     for row in range(rows):
-        i = of[row]
+        targets[row, :k], targets[row, k:] = target, prior[of[row]]
+        weights[row, k:, k:] = root[of[row]]
+    fits = Fits(
+        x[:rows], v[:rows], np.zeros((rows, 6, 4)), np.full(rows, np.inf), np.zeros(rows, np.bool_)
+    )
+    _fits(rod, proximal, how, codes, targets, measured, passes, weights, fits)
+    found, first, own = 0, 0, np.empty((k, k))
+    for row in range(rows):
+        i, chi = of[row], fits.misfits[row]
         if row > 0 and of[row - 1] != i:
             first = found
-        if not (chi[row] < np.inf and stable_fit(fold, proximal, x[row], t[row])):
+        if not chi < np.inf or _known(x[row], out, first, found):
             continue
-        if _known(x[row], out, first, found) or not weigh(how, v[row], measured, own):
+        if not weigh(how, v[row], measured, own):
             continue
+        weights[row, :k, :k] = own
         if _moved(
+            rod,
+            proximal,
             how,
-            target,
-            own,
+            codes,
+            targets[row],
+            weights[row],
             turn,
             pose,
             mixture,
@@ -444,11 +438,11 @@ def learn(
             root[i],
             x[row],
             v[row],
-            t[row],
-            chi[row],
+            fits.tangents[row],
+            chi,
             out,
             found,
         ):
-            misfits[found] = chi[row]
+            misfits[found] = chi
             found += 1
     return found

@@ -1,12 +1,14 @@
 """Hypotheses about a contact that begins: all that one measurement leaves, as a sum of Gaussians.
 
 A light contact is poorly localised: noise leaves a long, bent valley of contacts. So the
-likelihood is taken apart along the whisker by windows N(s; s_j, h²) that together are even. Where
-likelihood and window together are largest lies a Gaussian (Laplace's approximation), of weight
+likelihood is taken apart along the whisker by windows N(s; s_j, h²), a distance h apart, whose sum
+is the same all along it. Where likelihood and window together are largest in Ω lies a Gaussian with
+the mean and covariance (:mod:`~vibrissa.contacts.moments`), and with the weight
 
-    log w = -χ²/2 + ½ log det P + log det W + log π(p),
+    log w = -χ²/2 + log ∫ exp((χ² - χ²(p))/2) π(p) dp + log det W,
 
-and these are again one where the measurement determines the arc length well.
+of what both leave of the contact. They are again one where the measurement determines the arc
+length well.
 
 A contact that was not detected a moment ago has bent the whisker no farther than its motion since.
 With u for how far the contact's place on the whisker is from where it rests, over L, the density of
@@ -29,6 +31,7 @@ import numpy as np
 from vibrissa.contacts.channels import (
     CHANNELS,
     CIRCULAR,
+    FITTED,
     channel_derivatives,
     channel_gradients,
     channels_of,
@@ -36,17 +39,21 @@ from vibrissa.contacts.channels import (
 )
 from vibrissa.contacts.contacts import Contact
 from vibrissa.contacts.estimator import Estimator
-from vibrissa.contacts.least_squares import charted, fit, unknowns_covariance
+from vibrissa.contacts.fit_within import fit_rows_within
+from vibrissa.contacts.least_squares import Fits, unknowns_covariance
 from vibrissa.contacts.mixture import log_weights
+from vibrissa.contacts.moments import Onset, moments_of_rows
 from vibrissa.contacts.noise import common_channels
 from vibrissa.contacts.readout import Measurement, Named
 from vibrissa.contacts.weighing import Weighing, weigh
 from vibrissa.numerics import AnyArray, Array, IntArray
-from vibrissa.rod import LEAST_ARC, Discretization, solve_forces
+from vibrissa.rod import LEAST_ARC, Discretization, charted_rod, solve_forces
 from vibrissa.signals import within_turn
 
-# Windows along the whisker, and in each of them so many sectors of bearings to start from.
+# Windows along the whisker, so many more beyond each of its ends, where the sum of those on it
+# falls, and in each of them so many sectors of bearings to start from.
 _WINDOWS = 16
+_BEYOND = 2
 _SECTORS = 4
 _WORSE = 30.0  # of the valley's components those this much worse (χ²) than the best do not count
 # A candidate whose arc length is known to this share of a window may stay whole; its parts are the
@@ -56,7 +63,8 @@ _MOST = 24  # of a curve or surface at most so many samples start
 _VAGUE = 0.2  # standard deviation, over L, of what a measurement does not tell
 # Smallest standard deviation of a starting hypothesis, over L, so that matrices stay regular.
 _FINEST = 1e-7
-_FREE = [0, 2, 3]
+# Codes of arc length and contact point among the channels.
+_STATION, _POINT = FITTED.index("s"), [FITTED.index(name) for name in ("px", "py", "pz")]
 # How far along each axis of a covariance its linearisation is checked, in standard deviations, and
 # by how much it may err there, as a share of that.
 _REACH, _BENT = 2.0, 0.25
@@ -65,12 +73,13 @@ _REACH, _BENT = 2.0, 0.25
 class Gaussians(NamedTuple):
     """Of contact points in the whisker's frame, in L: one for each of some contacts.
 
-    x (n, 4), (F, p) (n, 6), covariances (n, 3, 3), what errors that all samples
+    x (n, 4), (F, p) (n, 6), means (n, 3), covariances (n, 3, 3), what errors that all samples
     share change in p (n, 3, e), log weights (n,).
     """
 
     contacts: Array
     values: Array
+    points: Array
     covariances: Array
     by_errors: Array
     weights: Array
@@ -86,11 +95,11 @@ class Beginning:
         # Noise alone, which differs from sample to sample.
         self._quiet = how._replace(errors=np.zeros((0, 6, 7)))
         chart = self._chart
-        n = len(chart.stations)
-        some = np.unique(np.linspace(0, n - 1, _WINDOWS).round().astype(int))
-        some = np.minimum(some, len(chart.contacts) - 1)
-        self._stations = chart.contacts[some, 0, 0, 0]
-        self._width = float(np.diff(self._stations).mean())
+        self._width = (1.0 - chart.proximal) / (_WINDOWS - 1)
+        steps = np.arange(-_BEYOND, _WINDOWS + _BEYOND)
+        self._stations = chart.proximal + steps * self._width
+        charted = chart.contacts[:, 0, 0, 0]
+        some = np.abs(charted - self._stations[:, None]).argmin(axis=1)
         self._nodes = chart.contacts[some]
         self._values = chart.values[some]
         self._seen = channels_of(self._values)[..., how.codes] @ how.mixing.T
@@ -100,7 +109,7 @@ class Beginning:
         places = np.linspace(0.0, 1.0, 101)
         at = np.zeros((101, 4))
         at[:, 0] = places
-        self._rest = np.array(solve_forces(chart.discretization, at)[0][:, 3:])
+        self._rest = np.ascontiguousarray(solve_forces(chart.discretization, at)[0][:, 3:])
         self._rest_places = places
 
     def all_that_may_be(
@@ -112,28 +121,17 @@ class Beginning:
         nearest = np.abs(exact[:, :1] - self._stations).argmin(axis=1)
         x = np.concatenate([np.insert(nodes, 1, 0.0, axis=1), exact])
         values, window = np.concatenate([values, there]), np.concatenate([window, nearest])
-        targets = np.column_stack(
-            [np.tile(measurement.target, (len(x), 1)), self._stations[window]]
-        )
-        x, values, tangents, misfits = self._fitted(measurement, x, values, targets)
-        worst = misfits.min(initial=np.inf) + _WORSE
-        good = np.isfinite(misfits) & (misfits <= worst)
-        rows = _distinct(x, window, np.flatnonzero(good))
-        evenly = -0.5 * math.log(2.0 * math.pi)
-        valley = self._gaussians(
-            measurement,
-            x[rows],
-            values[rows],
-            tangents[rows],
-            evenly - 0.5 * misfits[rows],
-            reach,
-            windowed=True,
-        )
+        fits = self._fitted(measurement, x, values, window)
+        worst = fits.misfits.min(initial=np.inf) + _WORSE
+        good = np.isfinite(fits.misfits) & (fits.misfits <= worst)
+        rows = _distinct(fits.contacts, window, np.flatnonzero(good))
+        best = Fits(*(part[rows] for part in fits))
+        valley = self._gaussians(measurement, best, reach, window[rows])
         whole = self.candidates(measurement, located, reach)
         sharp = self._known_well(measurement, whole)
         kept = np.ones(len(valley.contacts), np.bool_)
         for i in sharp.tolist():
-            away = valley.values[:, 3:] - whole.values[i, 3:]
+            away = valley.points - whole.points[i]
             both = valley.covariances + whole.covariances[i]
             far = (away * np.linalg.solve(both, away[..., None])[..., 0]).sum(axis=1)
             kept &= far > _PART
@@ -158,8 +156,9 @@ class Beginning:
         x, values = self.exact(located)
         _, slope = solve_forces(self._chart.discretization, x, tangents=True)
         tangents = np.insert(slope, 1, 0.0, axis=2)
-        weights = np.full(len(x), -0.5 * located.chi_squared)
-        return self._gaussians(measurement, x, values, tangents, weights, reach, windowed=False)
+        misfits = np.array(located.candidates.chi_squared)
+        fits = Fits(x, values, tangents, misfits, np.ones(len(x), np.bool_))
+        return self._gaussians(measurement, fits, reach)
 
     def samples(self, measurement: Measurement, located: Contact, reach: float) -> Gaussians:
         """Take samples of a curve or surface of contacts, that between them leave no gap."""
@@ -170,8 +169,9 @@ class Beginning:
         across, by_errors = self._across(measurement, values, slope)
         covariance = across + _gaps_between(values[:, 3:]) + _FINEST**2 * np.eye(3)
         weights = 0.5 * np.linalg.slogdet(covariance)[1] - 0.5 * located.chi_squared
+        points = values[:, 3:]
         return Gaussians(
-            x, values, covariance, by_errors, weights + self._log_prior(x, values, reach)
+            x, values, points, covariance, by_errors, weights + self._log_prior(x, points, reach)
         )
 
     def _across(self, measurement: Measurement, values: Array, slope: Array) -> tuple[Array, Array]:
@@ -227,65 +227,66 @@ class Beginning:
                 one[:] = 0.0
         return out
 
-    def _fitted(
-        self, measurement: Measurement, x: Array, values: Array, targets: Array
-    ) -> tuple[Array, Array, Array, Array]:
-        """Contacts, (F, p), ∂(F, p)/∂x and χ² where it is least; infinite where none is."""
-        chart, k = self._chart, len(self._names)
-        weights = np.zeros((len(x), k + 1, k + 1))
+    def _fitted(self, measurement: Measurement, x: Array, values: Array, windows: IntArray) -> Fits:
+        """Contacts where χ² of a measurement and of windows is least in Ω; infinite if none is."""
+        chart, how, k = self._chart, self._readout.how, len(self._names)
+        n = len(x)
+        fits = Fits(
+            np.array(x), np.array(values), np.zeros((n, 6, 4)), np.zeros(n), np.zeros(n, np.bool_)
+        )
+        targets = np.tile(np.append(measurement.target, 0.0), (n, 1))
+        targets[:, k] = self._stations[windows]
+        weights = np.zeros((n, k + 1, k + 1))
         weights[:, k, k] = 1.0 / self._width
+        rod, measured = charted_rod(chart), measurement.measured
         for _ in range(self._readout.passes):
-            weights[:, :k, :k] = self._weights(self._readout.how, measurement, values)
-            fits = fit(
-                chart.discretization,
-                (*self._names, "s"),
-                targets,
-                weights,
-                x,
-                friction=False,
-                least=chart.proximal,
-                worth=np.inf,
-            )
-            x = fits.contacts
-            values = np.where(np.isfinite(fits.values), fits.values, values)
-        good = charted(chart, fits, chart.proximal) & np.isfinite(fits.misfits)
-        return x, values, fits.tangents, np.where(good, fits.misfits, np.inf)
+            weights[:, :k, :k] = self._weights(how, measurement, fits.values)
+            codes = np.append(how.codes, _STATION)
+            fit_rows_within(rod, chart.proximal, how, codes, targets, measured, weights, fits)
+        known = np.isfinite(fits.misfits) & np.isfinite(fits.values).all(axis=1)
+        return fits._replace(misfits=np.where(known, fits.misfits, np.inf))
 
     def _gaussians(
         self,
         measurement: Measurement,
-        x: Array,
-        values: Array,
-        tangents: Array,
-        weights: Array,
+        fits: Fits,
         reach: float,
-        *,
-        windowed: bool,
+        windows: IntArray | None = None,
     ) -> Gaussians:
-        """Covariances and weights of contacts; `weights` has what else counts."""
-        q = len(self._readout.how.mixing)
-        w = self._weights(self._quiet, measurement, values)
-        slope = tangents[..., _FREE]
-        j = w @ channel_derivatives(values, slope, self._names)
-        by_point = np.linalg.inv(slope[:, 3:])  # ∂ξ/∂p
-        seen = j @ by_point
-        information = np.swapaxes(seen, 1, 2) @ seen + np.eye(3) / _VAGUE**2
-        if windowed:
-            row = by_point[:, 0] / self._width
-            information = information + row[:, :, None] * row[:, None, :]
-        covariance = np.linalg.inv(information) + _FINEST**2 * np.eye(3)
-        by_errors = covariance @ np.swapaxes(seen, 1, 2) @ w @ self._wrong(values)
-        total = weights + 0.5 * np.linalg.slogdet(covariance)[1] + 1.5 * math.log(2.0 * math.pi)
-        total = total + np.array([log_weights(one, q) for one in w])
-        return Gaussians(
-            x, values, covariance, by_errors, total + self._log_prior(x, values, reach)
-        )
+        """Means, covariances and weights of contacts, by their χ² and, if any, their windows."""
+        n, k, q = len(fits.contacts), len(self._names), len(self._readout.how.mixing)
+        chart, x = self._chart, fits.contacts
+        w = self._weights(self._quiet, measurement, fits.values)
+        codes = np.concatenate([self._readout.how.codes, [_STATION], _POINT])
+        targets, weights = np.empty((n, k + 4)), np.zeros((n, k + 4, k + 4))
+        targets[:, :k], targets[:, k + 1 :] = measurement.target, fits.values[:, 3:]
+        targets[:, k] = x[:, 0] if windows is None else self._stations[windows]
+        weights[:, :k, :k] = w
+        weights[:, k, k] = 0.0 if windows is None else 1.0 / self._width
+        weights[:, [k + 1, k + 2, k + 3], [k + 1, k + 2, k + 3]] = 1.0 / _VAGUE
+        shift, covariance = np.zeros((n, 3)), np.full((n, 3, 3), np.nan)
+        by_channels, mass = np.zeros((n, 3, k + 4)), np.empty(n)
+        rod, onset = charted_rod(chart), Onset(self._rest, reach)
+        out = shift, covariance, by_channels, mass
+        moments_of_rows(rod, chart.proximal, onset, codes, targets, weights, fits, *out)
+        known = mass > 0.0
+        covariance[~known] = _VAGUE**2 * np.eye(3)
+        covariance += _FINEST**2 * np.eye(3)
+        by_errors = by_channels[:, :, :k] @ w @ self._wrong(fits.values)
+        total = np.log(np.where(known, mass, 1.0)) - 0.5 * fits.misfits
+        total += 1.5 * math.log(2.0 * math.pi) + np.array([log_weights(one, q) for one in w])
+        if windows is not None:
+            total -= 0.5 * math.log(2.0 * math.pi)
+        total += self._log_prior(x, fits.values[:, 3:], reach)
+        total[~known] = -np.inf
+        points = fits.values[:, 3:] + shift
+        return Gaussians(x, fits.values, points, covariance, by_errors, total)
 
-    def _log_prior(self, x: Array, values: Array, reach: float) -> Array:
+    def _log_prior(self, x: Array, points: Array, reach: float) -> Array:
         rest = np.stack(
             [np.interp(x[:, 0], self._rest_places, column) for column in self._rest.T], axis=1
         )
-        u2 = ((values[:, 3:] - rest) ** 2).sum(axis=1)
+        u2 = ((points - rest) ** 2).sum(axis=1)
         return np.asarray(math.log(reach / (2.0 * math.pi)) - 1.5 * np.log(reach**2 + u2))
 
     def moved(self, turn: Array, base: Array, before: tuple[Array, Array]) -> float:

@@ -63,12 +63,12 @@ LEFT, THREE_SIGMA, HELD = 0.0033, 14.156, 7.815
 # weight of a candidate. A node's log density gains at most so much over the first order's.
 _BROKEN, _MOST_GAIN = 0.3, 3.0
 _BENT = 1.0  # where it misses so much, the second order does not describe channels even roughly
-_TOO_FEW = 0.2  # with a smaller share of the nodes than this moments mean nothing
+TOO_FEW = 0.2  # with a smaller share of the nodes than this moments mean nothing
 # Steps by which a covariance is widened; and what is nothing among probabilities.
 _TRIALS, _NOTHING = 4, 1e-12
 # Below this second order (of the point, or the channels, for a standard deviation of each axis) the
 # first will do: variances differ by less than 4 %.
-_STRAIGHT = 0.06
+STRAIGHT = 0.06
 # Below this it misses nothing that counts (at most 0.01); and as between the map's nodes what it
 # misses is known to a few hundredths, the rod decides from this share of what counts to this much.
 _NEARLY_STRAIGHT, _SURE, _DOUBTFUL = 0.03, 0.6, 0.4
@@ -106,10 +106,10 @@ def _along_rays() -> tuple[Array, Array, Array, Array]:
     return np.ascontiguousarray(nodes.reshape(3, -1)), weights.reshape(-1), share, beyond
 
 
-_NODES, _WEIGHTS, _SHARES, _BEYOND = _along_rays()
+NODES, WEIGHTS, _SHARES, _BEYOND = _along_rays()
 
 
-class _Rays(NamedTuple):
+class Rays(NamedTuple):
     """Working memory for the nodes ±u.
 
     Displacements of the point (3, 2 m); densities (2 m,), with volumes and without; ∂p/∂u (3, 3,
@@ -132,9 +132,10 @@ class _Rays(NamedTuple):
 
 
 @inlined
-def _rays() -> _Rays:
-    half, pairs = _NODES.shape[1], _SHARES.shape[0]
-    return _Rays(
+def empty_rays() -> Rays:
+    """Make the working memory."""
+    half, pairs = NODES.shape[1], _SHARES.shape[0]
+    return Rays(
         np.empty((3, 2 * half)),
         np.empty(2 * half),
         np.empty(2 * half),
@@ -151,7 +152,7 @@ def _rays() -> _Rays:
 
 
 @inlined
-def _densities(model: Expansion, s: float, proximal: float, turn: float, rays: _Rays) -> None:
+def densities(model: Expansion, s: float, proximal: float, turn: float, rays: Rays) -> None:
     """Fill posterior densities at nodes ±u relative to the nodes' own, and points (3, 2 m).
 
     What is odd in u and what is even is shared by both. ``likely`` leaves volumes out. ``points``
@@ -159,7 +160,7 @@ def _densities(model: Expansion, s: float, proximal: float, turn: float, rays: _
     """
     r0, by_r, bent_r, by_p, bent_p = model.r0, model.by_r, model.bent_r, model.by_p, model.bent_p
     axes, bent_s = model.axes, model.bent_s
-    nodes, half = _NODES, _NODES.shape[1]
+    nodes, half = NODES, NODES.shape[1]
     points, density, likely, slopes, arc, log, _, odd, even, bent, _, _ = rays
     log[:], odd[:], even[:] = 0.0, 0.0, s
     for i in range(3):
@@ -306,10 +307,10 @@ def _moments(
     turn: float,
     first_order: float,
     covariance: Array,
-    rays: _Rays,
+    rays: Rays,
 ) -> tuple[float, bool]:
     """Fill the second moment about the point, widened; mean density, and whether it can serve."""
-    half, pairs = _NODES.shape[1], _SHARES.shape[0]
+    half, pairs = NODES.shape[1], _SHARES.shape[0]
     points, density, likely, root, far, logs = (
         rays.points,
         rays.density,
@@ -318,21 +319,21 @@ def _moments(
         rays.far,
         rays.logs,
     )
-    _densities(model, s, proximal, turn, rays)
+    densities(model, s, proximal, turn, rays)
     middle = 1.0
     for m in range(half):
-        middle -= 2.0 * _WEIGHTS[m]
+        middle -= 2.0 * WEIGHTS[m]
     mean, fits = middle * first_order, middle
     for m in range(2 * half):
-        mean += _WEIGHTS[m % half] * density[m]
-        fits += _WEIGHTS[m % half] * likely[m]
+        mean += WEIGHTS[m % half] * density[m]
+        fits += WEIGHTS[m % half] * likely[m]
     centre = 0.5 * (1.0 / fits + first_order / mean)
     squares = middle * centre * centre
     for m in range(2 * half):
         likely[m] = 0.5 * (likely[m] / fits + density[m] / mean)
-        density[m] = _WEIGHTS[m % half] * likely[m]
+        density[m] = WEIGHTS[m % half] * likely[m]
         squares += density[m] * likely[m]
-    if not squares * _TOO_FEW < 1.0:
+    if not squares * TOO_FEW < 1.0:
         for a in range(3):  # too few of the nodes are in Ω: what they say is added to first order
             for c in range(3):
                 for m in range(2 * half):
@@ -397,7 +398,7 @@ def _judge_one(
     slopes: Array,
     j: Array,
     model: Expansion,
-    rays: _Rays,
+    rays: Rays,
     nothing: Array,
     covariance: Array,
 ) -> tuple[float, bool, bool]:
@@ -420,7 +421,7 @@ def _judge_one(
         copy(model.by_p[a], slopes[a])
     first_order, density, fair = abs(solve(slopes, nothing)), 0.0, True
     straight = proximal + away < x[0] < 1.0 - away and not short
-    straight = straight and bent < _STRAIGHT and pulled < _STRAIGHT
+    straight = straight and bent < STRAIGHT and pulled < STRAIGHT
     if not straight:
         for a in range(3):
             copy(model.axes[a], slopes[a])
@@ -457,7 +458,7 @@ def judge(
     """
     k = codes.shape[0]
     b, j, model = np.zeros(BUFFER_SIZE), np.empty((k, 3)), empty_expansion(k)
-    rays, slopes, nothing = _rays(), np.empty((3, 3)), np.zeros(3)
+    rays, slopes, nothing = empty_rays(), np.empty((3, 3)), np.zeros(3)
     for row in range(n):
         for a in range(3):
             for c in range(3):

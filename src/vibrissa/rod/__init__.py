@@ -44,6 +44,7 @@ from vibrissa.rod.gravity import (
 from vibrissa.rod.integration import contact_tangents, evaluate, integrate, solve_forces
 from vibrissa.rod.interpolation import (
     Charted as Charted,
+    charted_rod as charted_rod,
     interpolant as interpolant,
     interpolate as interpolate,
 )

@@ -50,6 +50,11 @@ def interpolant(chart: StableSet) -> Array:
     return nodes.reshape(*chart.values.shape[:3], -1)
 
 
+def charted_rod(chart: StableSet) -> Charted:
+    """Rod and chart together, for the kernels."""
+    return Charted(chart.discretization.rod, chart.fold, interpolant(chart))
+
+
 @inlined
 def _side(t: float, upper: bool) -> tuple[float, float, float, float, float, float]:
     """Weights l, g and χ of one side of a cell at the fraction t of it, and their slopes."""

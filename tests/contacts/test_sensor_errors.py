@@ -202,3 +202,24 @@ def test_what_is_stated_is_checked(gamma_map):
     ):
         with pytest.raises(ValueError, match=message):
             Sensor(**wrong)
+
+
+@pytest.mark.parametrize("using", [" ".join(SIGNALS), "Fx FT FD MB MD"])
+def test_errors_far_above_the_noise_leave_regions_as_stated(gamma_map, using):
+    """Of a whisker 5 % stiffer or softer, by a sensor so good that this is all of the error."""
+    rng, length = np.random.default_rng(3), gamma_map.whisker.length
+    arc = rng.uniform(0.35, 0.9, 400) * length
+    size = 3e-3 * (0.35 * length / arc) ** 5 * rng.uniform(0.3, 1.0, 400)
+    load = vb.PointForce(arc, size, rng.uniform(-np.pi, np.pi, 400))
+    bent = vb.deflect(gamma_map.whisker, load)
+    sigma, stiffer = np.repeat([1e-7, 2e-9], 3), 1.0 + 0.05 * rng.normal(size=(400, 1))
+    wrench = stiffer * np.concatenate([bent.force, bent.moment], axis=1)
+    wrench += sigma * rng.normal(size=wrench.shape)
+    signals = vb.base_signals(wrench[:, :3], wrench[:, 3:])
+    found = gamma_map.estimate(signals, using, np.diag(sigma**2), stiffness_sigma=0.05)
+    sure = found.covariance_valid & (found.status == vb.Status.UNIQUE)
+    assert sure.mean() > 0.8
+    away = (found.point - bent.contact_point)[sure]
+    squares = (away * np.linalg.solve(found.covariance[sure], away[..., None])[..., 0]).sum(axis=1)
+    assert np.mean(squares < 7.81) > 0.92
+    assert squares.max() < 25.0

@@ -19,6 +19,7 @@ from vibrissa.contacts.least_squares import (
     channel_equations,
     fit_rows,
     same_contact,
+    settled,
     stable_fit,
 )
 from vibrissa.contacts.nodes import PARTS, Searched, nearest_of
@@ -238,9 +239,13 @@ def _fitted(
     targets, weights = np.empty((n, k)), np.empty((n, k, k))
     rod, codes = of.rod, how.codes
     fits = Fits(x, values, tangents, misfits, np.zeros(n, np.bool_))
-    worth = problem.limit + INDISTINCT
+    worth, before, rest = problem.limit + INDISTINCT, x.copy(), False
     for _ in range(problem.passes):
+        if rest:
+            break
+        rest = True
         for row in range(first, last):
+            copy(x[row], before[row])
             copy(target, targets[row])
             if not weigh(how, values[row], measured, weights[row]):
                 return
@@ -256,6 +261,7 @@ def _fitted(
                     break
                 fit_rows(rod, False, LEAST_ARC, codes, targets, weights, fits, row, row + 1)
             inside[row] = _where(of, x[row], tangents[row], misfits[row])
+            rest = rest and (settled(before[row], x[row]) or not misfits[row] < np.inf)
 
 
 @inlined

@@ -69,6 +69,7 @@ _IDLE_NEAR = 1e-3  # between the map's nodes, where steps are good to about that
 _FIRST_ROUNDS = 4  # so many steps there before the rod is integrated
 _LONGEST = 0.1
 _MOST_DAMPING = 1e8
+_SETTLED = 1e-5  # contacts this near (over L, and relative to the force) have the same weights
 _SAME = 1e-3  # contacts within this (over L, and ten times that relative to the force) are one
 
 
@@ -427,6 +428,14 @@ def _once(
         ),
     )
     return out
+
+
+@inlined
+def settled(before: Array, after: Array) -> bool:
+    """Whether a fit with weights of the contact it led to leads to about the same, x (4,)."""
+    apart = math.hypot(after[2] - before[2], after[3] - before[3])
+    near = abs(after[0] - before[0]) < _SETTLED
+    return bool(near and apart < _SETTLED * math.hypot(after[2], after[3]))
 
 
 @inlined

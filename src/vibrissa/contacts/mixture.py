@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vibrissa.contacts.fit_within import fit_rows_within
-from vibrissa.contacts.least_squares import Fits, same_contact
+from vibrissa.contacts.least_squares import Fits, same_contact, settled
 from vibrissa.contacts.moments import Onset, moments
 from vibrissa.contacts.weighing import Weighing, gradients, weigh, wrong_by
 from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel
@@ -293,13 +293,20 @@ def _fits(
     and of p.
     """
     k = how.codes.shape[0]
-    own = np.empty((k, k))
+    own, before, rest = np.empty((k, k)), fits.contacts.copy(), False
     for _ in range(passes):
+        if rest:
+            break
         for row in range(len(targets)):
+            copy(fits.contacts[row], before[row])
             if not weigh(how, fits.values[row], measured, own):
                 own[:] = 0.0
             weights[row, :k, :k] = own
         fit_rows_within(rod, proximal, how, codes, targets, measured, weights, fits)
+        rest = True
+        for row in range(len(targets)):
+            still = settled(before[row], fits.contacts[row]) or not fits.misfits[row] < np.inf
+            rest = rest and still
 
 
 @inlined

@@ -239,10 +239,13 @@ class Beginning:
         weights = np.zeros((n, k + 1, k + 1))
         weights[:, k, k] = 1.0 / self._width
         rod, measured = charted_rod(chart), measurement.measured
+        codes, before = np.append(how.codes, _STATION), fits.contacts.copy()
         for _ in range(self._readout.passes):
+            before[:] = fits.contacts
             weights[:, :k, :k] = self._weights(how, measurement, fits.values)
-            codes = np.append(how.codes, _STATION)
             fit_rows_within(rod, chart.proximal, how, codes, targets, measured, weights, fits)
+            if np.allclose(before, fits.contacts, rtol=1e-5, atol=1e-9):
+                break
         known = np.isfinite(fits.misfits) & np.isfinite(fits.values).all(axis=1)
         return fits._replace(misfits=np.where(known, fits.misfits, np.inf))
 

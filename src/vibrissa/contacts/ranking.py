@@ -35,7 +35,7 @@ from vibrissa.contacts.candidates import (
 from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates, Room
 from vibrissa.contacts.fit_within import fit_within
 from vibrissa.contacts.flat_valleys import follow_valley
-from vibrissa.contacts.least_squares import channel_equations, same_contact, whiten
+from vibrissa.contacts.least_squares import channel_equations, same_contact, settled, whiten
 from vibrissa.contacts.nodes import (
     PARTS,
     Searched,
@@ -99,7 +99,9 @@ def _try(
     value, tangents = np.empty(6), np.zeros((6, 4))
     lost = number == 0 or not misfits[0] <= worth
     most = np.inf if lost else worth
+    before = start.copy()
     for _ in range(passes):
+        copy(at, before)
         misfit, least = fit_within(
             Charted(of.rod, of.fold, of.nodes),
             of.proximal,
@@ -115,7 +117,7 @@ def _try(
         )
         for c in range(number):
             known = known or same_contact(at, x[c])
-        if known or not misfit < np.inf:
+        if known or not misfit < np.inf or settled(before, at):
             break
     if not misfit < np.inf:
         return number, False

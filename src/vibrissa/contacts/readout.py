@@ -34,6 +34,10 @@ from vibrissa.signals import CIRCULAR, SIGNALS, signal_scales, signals_of
 # A direction of the readings in which contacts of the map vary so much less than the noise and the
 # others carries no information.
 _UNINFORMATIVE = 1e-9
+# How often contacts are fitted with weights of the contact before: where the noise of directions
+# falls with their size; and where errors that measurements share may exceed the noise by far, so
+# that weights by the first contact, wrong by these errors, hold the next back.
+_BY_DIRECTION, _WITH_ERRORS = 2, 8
 # Signals this many times larger than any on the map are in another unit.
 _FAR_BEYOND = 10.0
 _UNKNOWNS = 3
@@ -137,7 +141,7 @@ class Named:
         self._most = self.bounds.most()
         self._straight = [i for i, turns in enumerate(self._circular) if not turns]
         self.how = _weighing(self.channels, sensor, d.force, d.moment, self.scale)
-        self.passes = 1 if constant_weights(self.channels, sensor) else 2
+        self.passes = 1 if constant_weights(self.channels, sensor) else _passes(self.how)
         self.rank = len(names)
         self._noise = [] if sensor is None else self._deviations(sensor)
         if found is not None:
@@ -237,7 +241,7 @@ class Mixed:
             # The reduced reading has full rank, so that wrong readings are those of wrong wrenches.
             np.ascontiguousarray(self._back @ (self._reduce @ errors) * np.append(sizes, 1.0)),
         )
-        self.passes = 2 if errors[..., :6].any() else 1
+        self.passes = _passes(self.how) if errors[..., :6].any() else 1
         seen = wrenches @ h.T
         self._largest = 10.0 * np.abs(seen).max(axis=0)
         if self.rank >= 3:
@@ -283,6 +287,11 @@ class Mixed:
     def beyond(self, measurement: Measurement) -> bool:
         """Whether the readings are far larger than any on the map."""
         return bool((np.abs(measurement.measured) > self._largest).any())
+
+
+def _passes(how: Weighing) -> int:
+    """How often contacts are fitted at most, each time with weights of the contact before."""
+    return _WITH_ERRORS if how.errors.shape[0] else _BY_DIRECTION
 
 
 def _weighing(

@@ -147,6 +147,19 @@ def test_it_is_in_equilibrium_and_outside(wire, name):
     assert clear > -1e-5 * wire.length
 
 
+def test_the_thick_side_of_a_step_rests_on_a_pipe():
+    radii = [(0.0, 3e-4), (0.06, 3e-4), (0.06, 1.5e-4), (LENGTH, 1.5e-4)]
+    wire = vb.Whisker.from_curvature(LENGTH, lambda s: [0.0, 0.0, 8.0], radius=radii)
+    pipe = Peg([0.055, 0.139, 0.0], [0.0, 0.0, 1.0], radius=0.14)
+    bent = vb.deflect_around(wire, pipe)
+    assert bent.status[0] == vb.Status.OK
+    assert bent.second_contact[0]
+    s = np.linspace(0.0, wire.length, 2001)
+    thick = np.maximum(wire.radius(s), wire.radius(s, side="left"))
+    gap = pipe.signed_distance(bent.centerline(2001)[0]) - thick
+    assert gap[s > 0.1 * wire.length].min() > -1e-5 * wire.length
+
+
 def test_it_goes_on_from_placement_to_placement(wire):
     peg = Peg([0.055, 0.14, 0.0], [0.3, 0.0, 1.0], 0.14)
     depth = np.linspace(-2e-3, 5e-3, 8)

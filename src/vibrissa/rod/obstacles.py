@@ -48,6 +48,7 @@ _SHARED = 0.02  # error of the end of an arc, over the distance of nodes
 _COMPARED = 33  # points of two shapes that are compared
 # No node comes nearer to another than this share of their distance.
 _APART = 0.2
+_AHEAD = 1e-6  # step, over L, for the slope of the radius, on the side away from the base
 _ROOT = np.sqrt(3.0)
 _STAGES = np.array([[0.25, 0.25 - _ROOT / 6.0], [0.25 + _ROOT / 6.0, 0.25]])
 _GAUSS = np.array([0.5 - _ROOT / 6.0, 0.5 + _ROOT / 6.0])
@@ -100,11 +101,14 @@ class Grid(NamedTuple):
         stiffness = 1.0 / np.multiply.outer(
             np.einsum("pg,kg->kp", line, soft), [1.0 + whisker.poisson_ratio, 1.0, 1.0]
         )
-        radius = whisker.radius(nodes * length) / length
+        at = nodes * length  # where the radius jumps the thick side meets objects first
+        radius = np.maximum(whisker.radius(at), whisker.radius(at, side="left")) / length
         kinks = np.array([0.0, *whisker.breaks, length]) / length
         fixed = np.abs(nodes[:, None] - kinks).min(axis=1) < 1e-12
         stations = nodes[:-1, None] + width[:, None] * _GAUSS
-        slope = np.gradient(radius, nodes)
+        ahead = np.minimum(at + _AHEAD * length, length)
+        slope = whisker.radius(ahead, side="left") - whisker.radius(ahead - _AHEAD * length)
+        slope /= _AHEAD * length
         if not joint:
             parts = nodes, width, np.ones(width.size), stations, rest, stiffness
             return cls(*parts, radius, slope, fixed)

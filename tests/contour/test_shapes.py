@@ -233,3 +233,16 @@ def test_what_is_no_shape_is_refused(joint_errors):
             call()
     with pytest.raises(ValueError, match="outside is"):
         fit_shape("plane", points, outside=[0.0, 1.0])
+
+
+def test_a_cylinder_of_few_points_does_not_end_in_another_one():
+    """Whichever way its axis points in the frame of the points, its fit is as good as the truth."""
+    rng, sigma, radius = np.random.default_rng(4), 1e-4, 8e-3
+    for _ in range(40):
+        *across, axis = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        angle, height = rng.uniform(-1.25, 1.25, 8), rng.uniform(-1.0, 1.0, 8) * 2.0 * radius
+        outward = np.cos(angle)[:, None] * across[0] + np.sin(angle)[:, None] * across[1]
+        points = radius * outward + height[:, None] * axis + sigma * rng.normal(size=(8, 3))
+        found = fit_shape("cylinder", points, np.tile(sigma**2 * np.eye(3), (8, 1, 1)))
+        gaps = np.linalg.norm(points - (points @ axis)[:, None] * axis, axis=1) - radius
+        assert found.chi_squared.sum() < ((gaps / sigma) ** 2).sum() + 0.5

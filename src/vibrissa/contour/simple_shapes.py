@@ -31,6 +31,19 @@ _SMALLEST = 1e-3
 _TINY = 1e-12  # squared radius to start from, at least, in units of the extent squared
 
 
+def _every_way(number: int) -> Array:
+    """Directions (n, 3) spread evenly over half a sphere, along a spiral of golden angles."""
+    height = (np.arange(number) + 0.5) / number
+    turn = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(number)
+    across = np.sqrt(1.0 - height**2)
+    return np.column_stack([across * np.cos(turn), across * np.sin(turn), height])
+
+
+# Axes among which those are sought that circles across fit best, and how many of them start a fit:
+# the axis of few points on a short arc is along none of their principal directions.
+_AXES, _MOST_AXES = _every_way(64), 6
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class SimpleShape(FittedShape):
     """A shape of a few numbers."""
@@ -161,21 +174,27 @@ class Cylinder(RoundShape):
     def starts(cls, given: Checked, known: ArrayLike | None) -> list[tuple[Self, Array]]:
         """Circles fitted algebraically across the likely axes."""
         touches = given.touches
-        axes: list[Array] = [np.asarray(known, dtype=np.float64)]
+        axes = [np.asarray(known, dtype=np.float64)]
         if known is None:
             axes = [*np.linalg.svd(touches.position, full_matrices=False)[2], *np.eye(3)]
             if touches.normal is not None:
                 axes.append(np.linalg.svd(touches.normal, full_matrices=False)[2][-1])
         weight = touches.weights()
         whisker = float(np.average(touches.whisker_radius, weights=weight))
-        shapes = []
-        for axis in axes:
+
+        def around(axis: Array) -> tuple[Self, Array]:
             axis = axis / np.linalg.norm(axis)
             sideways = np.eye(3)[int(np.argmin(np.abs(axis)))]
             frame = frame_across(axis, sideways)
             center, size = _round(touches.position @ frame.T, weight)
             radius = max(size - whisker, _SMALLEST * size)
-            shapes.append((cls(origin=center @ frame, axis=axis, radius=radius), sideways))
+            return cls(origin=center @ frame, axis=axis, radius=radius), sideways
+
+        shapes = [around(axis) for axis in axes]
+        if known is None:
+            others = [around(axis) for axis in _AXES]
+            missed = [np.median(np.abs(shape.gaps(touches))) for shape, _ in others]
+            shapes += [others[i] for i in np.argsort(missed)[:_MOST_AXES]]
         return shapes
 
     @property

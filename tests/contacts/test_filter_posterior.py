@@ -20,14 +20,15 @@ def measured(wrench, d):
     return six[[0, 1, 2, 4, 5]]
 
 
-def sampled(contact_map, density, wrench, sigma, number=400_000):
+def sampled(contact_map, density, wrench, sigma, largest=np.inf, number=400_000):
     """Contact points, in L, and how probable they are given a wrench in units of the map."""
     rng, d = np.random.default_rng(0), contact_map.chart.discretization
     x, nodes = np.zeros((number, 4)), contact_map.chart.contacts
     x[:, 0] = rng.uniform(contact_map.chart.proximal, 1.0, number)
     last = nodes[:, 0, -1]
-    most = np.interp(x[:, 0], last[:, 0], np.hypot(last[:, 1], last[:, 2]))
-    force, bearing = most * rng.uniform(0.0, 0.7, number), rng.uniform(-np.pi, np.pi, number)
+    fold = np.interp(x[:, 0], last[:, 0], np.hypot(last[:, 1], last[:, 2]))
+    most = np.minimum(0.7 * fold, largest)
+    force, bearing = most * rng.uniform(0.0, 1.0, number), rng.uniform(-np.pi, np.pi, number)
     x[:, 2], x[:, 3] = force * np.cos(bearing), force * np.sin(bearing)
     values, slopes = solve_forces(d, x, tangents=True)
     volume = np.linalg.det(slopes[:, 3:]) * force * most
@@ -39,17 +40,16 @@ def sampled(contact_map, density, wrench, sigma, number=400_000):
     return values[:, 3:], weight
 
 
-@pytest.mark.parametrize(("s", "force"), [(0.7, 0.03), (0.85, 0.04)])
-def test_a_light_contact_that_begins_is_known_as_its_posterior_states(gamma_map, s, force):
-    """Its mean is not drawn to where stations of the chart, or starts, are denser."""
-    d, length, sigma, reach = gamma_map.chart.discretization, gamma_map.whisker.length, 0.01, 0.03
-    x = np.array([[s, 0.0, 0.6 * force, 0.8 * force]])
-    wrench = wrenches(solve_forces(d, x)[0])[0]
+def onset(contact_map, wrenches_seen, sigma, reach):
+    """What a filter knows after samples of a contact that has just begun, and π(s, p)."""
+    d, length = contact_map.chart.discretization, contact_map.whisker.length
     noise = np.diag((sigma * np.repeat([d.force, d.moment], 3)) ** 2)
-    locate = vb.Estimator(gamma_map, NAMES, noise, felt_above=1e-3)
+    locate = vb.Estimator(contact_map, NAMES, noise, felt_above=1e-12)
     follow = vb.ContactFilter(locate, speed=1e-6 * length)
     follow(0.0, np.zeros(5), np.eye(3), np.zeros(3))
-    known = follow(1e-3, measured(wrench, d), np.eye(3), [0.0, 0.0, reach * length])
+    for i, wrench in enumerate(wrenches_seen):
+        moved = [0.0, 0.0, reach * length]
+        known = follow(1e-3 * (i + 1), measured(wrench, d), np.eye(3), moved)
     places = np.zeros((201, 4))
     places[:, 0] = np.linspace(0.0, 1.0, 201)
     rest = solve_forces(d, places)[0][:, 3:]
@@ -58,15 +58,45 @@ def test_a_light_contact_that_begins_is_known_as_its_posterior_states(gamma_map,
         at = np.stack([np.interp(along, places[:, 0], column) for column in rest.T], axis=1)
         return -1.5 * np.log(reach**2 + ((points - at) ** 2).sum(axis=1))
 
+    return known, begins
+
+
+def held(known, points, probable, length):
+    """Probabilities of the regions of 95 % and of three standard deviations that are stated."""
+    away = points - known.point_whisker / length
+    squares = (away * np.linalg.solve(known.covariance / length**2, away.T).T).sum(axis=1)
+    return probable @ (squares < 7.81), probable @ (squares < 14.16)
+
+
+@pytest.mark.parametrize(("s", "force"), [(0.7, 0.03), (0.85, 0.04)])
+def test_a_light_contact_that_begins_is_known_as_its_posterior_states(gamma_map, s, force):
+    """Its mean is not drawn to where stations of the chart, or starts, are denser."""
+    d, length, sigma = gamma_map.chart.discretization, gamma_map.whisker.length, 0.01
+    wrench = wrenches(solve_forces(d, np.array([[s, 0.0, 0.6 * force, 0.8 * force]]))[0])[0]
+    known, begins = onset(gamma_map, [wrench], sigma, 0.03)
     points, probable = sampled(gamma_map, begins, wrench, sigma)
     mean = probable @ points
     spread = np.sqrt(probable @ ((points - mean) ** 2).sum(axis=1))
     assert spread > 0.04
     assert np.linalg.norm(known.point_whisker / length - mean) < 0.12 * spread
-    away = points - known.point_whisker / length
-    squares = (away * np.linalg.solve(known.covariance / length**2, away.T).T).sum(axis=1)
-    assert 0.93 < probable @ (squares < 7.81) < 0.99
-    assert probable @ (squares > 14.16) < 0.01
+    most, nearly_all = held(known, points, probable, length)
+    assert 0.93 < most < 0.99
+    assert nearly_all > 0.99
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
+def test_contacts_lighter_than_the_noise_are_as_unknown_as_their_posterior(gamma_map, share):
+    """Ten samples, also of a contact without any force: only where it is not is then known."""
+    d, sigma = gamma_map.chart.discretization, 0.01
+    force = share * sigma
+    wrench = wrenches(solve_forces(d, np.array([[0.7, 0.0, 0.6 * force, 0.8 * force]]))[0])[0]
+    seen = wrench + (sigma if share else 1e-11) * np.random.default_rng(3).normal(size=(10, 6))
+    known, begins = onset(gamma_map, seen, sigma, 0.03)
+    few = sigma / np.sqrt(10.0)
+    points, probable = sampled(gamma_map, begins, seen.mean(axis=0), few, largest=0.06)
+    most, nearly_all = held(known, points, probable, gamma_map.whisker.length)
+    assert most > 0.85
+    assert nearly_all > 0.95
 
 
 def test_a_contact_near_slip_off_is_not_lost_for_another(gamma_map):

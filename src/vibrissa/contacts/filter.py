@@ -62,8 +62,8 @@ _EXPLAINED = (Status.UNIQUE, Status.AMBIGUOUS, Status.UNDERDETERMINED)
 class Followed(NamedTuple):
     """What a filter knows after a sample."""
 
-    # (3,) Most probable contact point, laboratory frame, m; NaN if there is none. Where hypotheses
-    # run together, as along the valley that a light contact leaves, it is their mean.
+    # (3,) Mean of the most probable hypothesis, laboratory frame, m; NaN if there is none. Where
+    # hypotheses run together, as along the valley that a light contact leaves, it is that of all.
     point: Array
     # (3, 3) Covariance of the contact point, m²: over all hypotheses, weighed by their
     # probabilities, and wide enough for those that run together: 0.3 % of what they hold possible

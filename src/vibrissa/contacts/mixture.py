@@ -345,7 +345,9 @@ def _moved(
     shift, after, by_channels = np.empty(3), np.empty((3, 3)), np.empty((3, k + 3))
     own = np.ascontiguousarray(weights[:k, :k])
     onset = Onset(np.zeros((2, 3)), 0.0)
-    mass = moments(rod, proximal, onset, codes, target, weights, x, v, t, shift, after, by_channels)
+    mass = moments(
+        rod, proximal, onset, codes, target, weights, x, v, t, False, shift, after, by_channels
+    )
     inverse = root.T @ root
     weight = np.log(mass) if mass > 0.0 else -np.inf
     weight -= 0.5 * (_log_determinant(before) + chi)

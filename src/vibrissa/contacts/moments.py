@@ -41,7 +41,7 @@ from vibrissa.contacts.posterior import (
     densities,
     empty_rays,
 )
-from vibrissa.numerics import Array, IntArray, copy, inlined, kernel, solve
+from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel, solve
 from vibrissa.rod import BUFFER_SIZE, Charted
 
 
@@ -134,6 +134,23 @@ def _over_nodes(
     return mass
 
 
+@inlined
+def _or_as_noise(x: Array, j: Array, scale: Array) -> None:
+    """Fill x, with the force that noise alone makes where that is larger.
+
+    Axes are limited relative to the force, which a contact lighter than the noise may change by
+    many times its own; with no force at all they would have no length.
+    """
+    least = np.inf
+    for p in range(1, 3):
+        size = 0.0
+        for a in range(j.shape[0]):
+            size += j[a, p] * j[a, p]
+        least = min(least, size)
+    copy(x, scale)
+    scale[2], scale[3] = max(math.hypot(x[2], x[3]), 1.0 / math.sqrt(max(least, 1e-300))), 0.0
+
+
 @kernel
 def moments(
     rod: Charted,
@@ -145,6 +162,7 @@ def moments(
     x: Array,
     value: Array,
     tangents: Array,
+    linear: bool,
     shift: Array,
     covariance: Array,
     by_channels: Array,
@@ -153,20 +171,22 @@ def moments(
 
     For a contact x with (F, p) and ∂(F, p)/∂x (6, 4) of least χ² in Ω. Return the mass of the
     density relative to exp(-χ²/2) (2π)^(3/2), and to the density beforehand of a contact that
-    begins, both at x; NaN where channels do not determine the point.
+    begins, both at x; NaN where channels do not determine the point. What is known to be
+    ``linear`` is left to first order.
     """
     k, b, nothing = codes.shape[0], np.zeros(BUFFER_SIZE), np.zeros(3)
     residual, jacobian, four = np.empty(k), np.empty((k, 4)), np.empty((k, 4))
-    j, slopes = np.empty((k, 3)), np.empty((3, 3))
+    j, slopes, scale = np.empty((k, 3)), np.empty((3, 3)), np.empty(4)
     model, rays = empty_expansion(k), empty_rays()
     r0, by_r, by_p, axes = model.r0, model.by_r, model.by_p, model.axes
     channel_equations(x, value, tangents, codes, target, residual, jacobian)
     whiten(weights, residual, jacobian, k, r0, four)
     without_friction(four, j)
     without_friction(tangents[3:], slopes)
-    if not principal_axes(x, j, axes):
+    _or_as_noise(x, j, scale)
+    if not principal_axes(scale, j, axes):
         return np.nan
-    short = cap_axes(x, axes)
+    short = cap_axes(scale, axes)
     expand(rod, b, False, codes, target, weights, x, slopes, j, model)
     if not all_determined(model):
         return np.nan
@@ -190,7 +210,7 @@ def moments(
         copy(by_p[a], slopes[a])
     first_order = abs(solve(slopes, nothing))
     straight = proximal + away < x[0] < 1.0 - away and not short and onset.reach == 0.0
-    if straight and bent < STRAIGHT and pulled < STRAIGHT:
+    if linear or (straight and bent < STRAIGHT and pulled < STRAIGHT):
         return first_order
     for a in range(3):
         copy(axes[a], slopes[a])
@@ -207,6 +227,7 @@ def moments_of_rows(
     targets: Array,
     weights: Array,
     fits: Fits,
+    linear: AnyArray,
     shifts: Array,
     covariances: Array,
     by_channels: Array,
@@ -224,6 +245,7 @@ def moments_of_rows(
             fits.contacts[row],
             fits.values[row],
             fits.tangents[row],
+            linear[row],
             shifts[row],
             covariances[row],
             by_channels[row],

@@ -126,9 +126,9 @@ class Beginning:
         good = np.isfinite(fits.misfits) & (fits.misfits <= worst)
         rows = _distinct(fits.contacts, window, np.flatnonzero(good))
         best = Fits(*(part[rows] for part in fits))
-        valley = self._gaussians(measurement, best, reach, window[rows])
-        whole = self.candidates(measurement, located, reach)
-        sharp = self._known_well(measurement, whole)
+        bent = np.zeros(len(rows), np.bool_)
+        valley = self._gaussians(measurement, best, reach, bent, window[rows])
+        whole, sharp = self._whole(measurement, located, reach)
         kept = np.ones(len(valley.contacts), np.bool_)
         for i in sharp.tolist():
             away = valley.points - whole.points[i]
@@ -138,27 +138,30 @@ class Beginning:
         parts = zip(valley, whole, strict=True)
         return Gaussians(*(np.concatenate([a[kept], b[sharp]]) for a, b in parts))
 
-    def _known_well(self, measurement: Measurement, found: Gaussians) -> IntArray:
-        """Rows of contacts that lie well within a window, and that noise moves about linearly."""
-        d, x, values = self._chart.discretization, found.contacts, found.values
-        if not len(x):
-            return np.empty(0, np.int64)
-        w = self._weights(self._quiet, measurement, values)
-        slope = np.insert(solve_forces(d, x, tangents=True)[1], 1, 0.0, axis=2)
-        with np.errstate(over="ignore", invalid="ignore"):
-            own = unknowns_covariance(self._names, values, slope, w, friction=False)
-            linear = _linear(d, self._names, w, x, values, slope, own, LEAST_ARC)
-            narrow = own[:, 0, 0] < (_SHARP * self._width) ** 2
-        return np.flatnonzero(linear & narrow)
-
     def candidates(self, measurement: Measurement, located: Contact, reach: float) -> Gaussians:
         """Take the candidates of one sample, which lie apart, as they are."""
+        return self._whole(measurement, located, reach)[0]
+
+    def _whole(
+        self, measurement: Measurement, located: Contact, reach: float
+    ) -> tuple[Gaussians, IntArray]:
+        """Candidates of one sample, and rows of those that lie well within a window, all linear.
+
+        Noise moves these about linearly: most probable place and mean are one.
+        """
         x, values = self.exact(located)
-        _, slope = solve_forces(self._chart.discretization, x, tangents=True)
-        tangents = np.insert(slope, 1, 0.0, axis=2)
+        slope = np.insert(
+            solve_forces(self._chart.discretization, x, tangents=True)[1], 1, 0.0, axis=2
+        )
+        w = self._weights(self._quiet, measurement, values)
+        with np.errstate(over="ignore", invalid="ignore"):
+            own = unknowns_covariance(self._names, values, slope, w, friction=False)
+            d = self._chart.discretization
+            linear = _linear(d, self._names, w, x, values, slope, own, LEAST_ARC)
+            sharp = linear & (own[:, 0, 0] < (_SHARP * self._width) ** 2)
         misfits = np.array(located.candidates.chi_squared)
-        fits = Fits(x, values, tangents, misfits, np.ones(len(x), np.bool_))
-        return self._gaussians(measurement, fits, reach)
+        fits = Fits(x, values, slope, misfits, np.ones(len(x), np.bool_))
+        return self._gaussians(measurement, fits, reach, sharp), np.flatnonzero(sharp)
 
     def samples(self, measurement: Measurement, located: Contact, reach: float) -> Gaussians:
         """Take samples of a curve or surface of contacts, that between them leave no gap."""
@@ -254,6 +257,7 @@ class Beginning:
         measurement: Measurement,
         fits: Fits,
         reach: float,
+        linear: AnyArray,
         windows: IntArray | None = None,
     ) -> Gaussians:
         """Means, covariances and weights of contacts, by their χ² and, if any, their windows."""
@@ -271,7 +275,7 @@ class Beginning:
         by_channels, mass = np.zeros((n, 3, k + 4)), np.empty(n)
         rod, onset = charted_rod(chart), Onset(self._rest, reach)
         out = shift, covariance, by_channels, mass
-        moments_of_rows(rod, chart.proximal, onset, codes, targets, weights, fits, *out)
+        moments_of_rows(rod, chart.proximal, onset, codes, targets, weights, fits, linear, *out)
         known = mass > 0.0
         covariance[~known] = _VAGUE**2 * np.eye(3)
         covariance += _FINEST**2 * np.eye(3)

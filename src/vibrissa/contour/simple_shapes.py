@@ -190,9 +190,9 @@ class Cylinder(RoundShape):
             radius = max(size - whisker, _SMALLEST * size)
             return cls(origin=center @ frame, axis=axis, radius=radius), sideways
 
-        shapes = [around(axis) for axis in axes]
+        shapes: list[tuple[Self, Array]] = [around(axis) for axis in axes]
         if known is None:
-            others = [around(axis) for axis in _AXES]
+            others: list[tuple[Self, Array]] = [around(axis) for axis in _AXES]
             missed = [np.median(np.abs(shape.gaps(touches))) for shape, _ in others]
             shapes += [others[i] for i in np.argsort(missed)[:_MOST_AXES]]
         return shapes

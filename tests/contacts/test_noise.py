@@ -2,11 +2,14 @@
 
 import numpy as np
 import pytest
+from numba.core.types import Type
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 import vibrissa as vb
+from vibrissa.contacts import search
 from vibrissa.contacts.posterior import ranked
+from vibrissa.contacts.ranking import stages
 from vibrissa.identifiability.twins import sample
 from vibrissa.numerics import quick_exp
 from vibrissa.rod import fold_forces, solve_forces
@@ -375,3 +378,22 @@ def test_a_light_contact_is_one_candidate(gamma_map):
     s, psi = rng.uniform(0.6, 0.9, number), rng.uniform(-np.pi, np.pi, number)
     found, _ = located(gamma_map, "Fx MB MD", rng, s, psi, rng.uniform(0.01, 0.05, number))
     assert (found.n_candidates == 1).mean() > 0.95
+
+
+@pytest.mark.parametrize("using", ["Fx MB MD", "Fx FT MB MD"])
+def test_kernels_are_compiled_beforehand_for_what_they_are_called_with(
+    gamma_map, monkeypatch, using
+):
+    """Otherwise they would be compiled once more when they are called."""
+    monkeypatch.setattr(search, "compile_stages", lambda *_: None)
+    noise = dict.fromkeys(using.split(), 1e-7)
+    locate = vb.Estimator(gamma_map, using=using, noise=noise)
+    locate(np.full(len(noise), 1e-6))
+    gamma_map.estimate({name: np.full(3, 1e-6) for name in noise}, using, noise)
+    one = locate._search
+    for half in stages(one.readout.searched, one.readout.how, one._problem):
+        for kernel, arguments in half:
+            types = (
+                each if isinstance(each, Type) else kernel.typeof_pyval(each) for each in arguments
+            )
+            assert tuple(types) in kernel.overloads, kernel.py_func.__name__

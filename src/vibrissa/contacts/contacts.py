@@ -92,7 +92,8 @@ class Room(NamedTuple):
     @classmethod
     def of(cls, n: int, most: int = MOST_CANDIDATES) -> Room:
         """Make room for n measurements."""
-        flat = np.full(22 * n * most, np.nan)
+        flat = np.empty(22 * n * most)
+        flat.fill(np.nan)  # in half the time of `np.full`
         return cls(np.zeros(n, np.int64), flat, np.zeros((n, most), np.bool_))
 
 

@@ -46,9 +46,29 @@ from vibrissa.contacts.nodes import (
 )
 from vibrissa.contacts.noise import INDISTINCT
 from vibrissa.contacts.posterior import CERTAIN, judge, rank
-from vibrissa.contacts.task import Problem, Task, in_memory
+from vibrissa.contacts.task import (
+    MOST_STARTS,
+    Description,
+    Problem,
+    Task,
+    described_in_thread,
+    description,
+    in_memory,
+    task,
+    type_of_description,
+    type_of_task,
+)
 from vibrissa.contacts.weighing import Weighing, sharpness, weigh_any
-from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel
+from vibrissa.numerics import (
+    AnyArray,
+    Array,
+    Call,
+    IntArray,
+    compile_together,
+    copy,
+    inlined,
+    kernel,
+)
 from vibrissa.rod import LANES, Charted, evaluate
 from vibrissa.signals import FT, FX, MB, MD
 from vibrissa.status import Status
@@ -57,7 +77,8 @@ _UNIQUE, _AMBIGUOUS = int(Status.UNIQUE), int(Status.AMBIGUOUS)
 # How far apart signals are that the tree is asked for as well, in standard deviations; and where
 # nothing that is known explains the measurement.
 _APART, _FAR_APART = 2.0, 4.0
-_MOST_STARTS = 6  # at most so many starts for one measurement
+# So many rows at a time are described from kernel to kernel, in some 4 kB each.
+_AT_ONCE = 128
 # Logarithm of the volume of a normal distribution of three coordinates, over its peak.
 _LOG_NORMAL = 1.5 * math.log(2.0 * math.pi)
 
@@ -161,7 +182,7 @@ def complete(
     Fill χ² and points (n, 4) of contacts that explain it as well. Return how many there are then,
     and whether others may be probable that are not among them.
     """
-    sigma, starts = np.empty(3), np.empty((_MOST_STARTS, 4))
+    sigma, starts = np.empty(3), np.empty((MOST_STARTS, 4))
     start, nodes, least = np.zeros(4), np.full(PARTS, -1), np.inf
     loose[:] = np.inf
     for c in range(number):
@@ -237,52 +258,12 @@ def _kept(limit: float, number: int, x: Array, values: Array, misfits: Array) ->
     return kept
 
 
-class _Room(NamedTuple):
-    """Working memory of `settle`, by candidate.
+class _Weighed(NamedTuple):
+    """Working memory of `complete_rows`: (F, p) (m, 6), their derivatives by x (6, 4), χ² (m,)."""
 
-    Weights, ∂(F, p)/∂x of one (6, 4) and ∂(F, p)/∂ξ (n, 6, 3), residuals and slopes in standard
-    deviations; covariances, log weights (as they count, and with volumes), probabilities, whether
-    covariances are valid, whether the second order describes the channels, order; copies of x,
-    (F, p) and χ²; and χ² and points (n, 4) of contacts that are not candidates.
-    """
-
-    weights: Array
-    tangents: Array
-    third: Array
-    residuals: Array
-    jacobians: Array
-    spread: Array
-    weight: Array
-    chance: Array
-    fine: AnyArray
-    described: AnyArray
-    order: IntArray
-    x: Array
     values: Array
+    tangents: Array
     misfits: Array
-    loose: Array
-
-
-@inlined
-def _judging(most: int, k: int) -> _Room:
-    """Make the working memory of `settle`."""
-    return _Room(
-        np.zeros((most, k, k)),
-        np.zeros((6, 4)),
-        np.empty((most, 6, 3)),
-        np.empty((most, k)),
-        np.empty((most, k, 4)),
-        np.empty((most, 3, 3)),
-        np.empty((2, most)),
-        np.empty((1, most)),
-        np.zeros(most, np.bool_),
-        np.zeros(most, np.bool_),
-        np.zeros((1, most), np.int64),
-        np.empty((most, 4)),
-        np.empty((most, 6)),
-        np.empty(most),
-        np.empty((_MOST_STARTS, 4)),
-    )
 
 
 @kernel
@@ -295,26 +276,88 @@ def _weighed(
     values: Array,
     first: int,
     n: int,
-    room: _Room,
+    room: _Weighed,
+    described: tuple[Array, Array, Array, Array],
 ) -> None:
-    """Fill the first half of the working memory, and χ², of n candidates.
+    """Fill χ² and the description of n candidates: weights, ∂(F, p)/∂ξ, residuals and slopes.
 
     ∂(F, p)/∂ξ is known of those before the first.
     """
+    weights, third, residuals, jacobians = described
     k = how.codes.shape[0]
     residual, jacobian = np.empty(k), np.empty((k, 4))
     if first < n:
-        evaluate(of.rod, x, room.values, room.third, first, n)
+        evaluate(of.rod, x, room.values, third, first, n)
     for c in range(n):
-        if not weigh_any(how, values[c], measured, room.weights[c]):
-            room.weights[c, 0, 0] = np.nan
+        if not weigh_any(how, values[c], measured, weights[c]):
+            weights[c, 0, 0] = np.nan
         for a in range(6):
-            t, by_x = room.third[c, a], room.tangents[a]
+            t, by_x = third[c, a], room.tangents[a]
             by_x[0], by_x[2], by_x[3] = t[0], t[1], t[2]
         channel_equations(x[c], values[c], room.tangents, how.codes, target, residual, jacobian)
-        room.misfits[c] = whiten(
-            room.weights[c], residual, jacobian, k, room.residuals[c], room.jacobians[c]
+        room.misfits[c] = whiten(weights[c], residual, jacobian, k, residuals[c], jacobians[c])
+
+
+@kernel
+def complete_rows(
+    task: Task,
+    targets: Array,
+    measured: Array,
+    number: IntArray,
+    flat: Array,
+    valid: AnyArray,
+    about: Description,
+    first: int,
+    last: int,
+) -> None:
+    """Complete the candidates of noisy measurements, and describe them."""
+    of, how, problem, out = task.of, task.how, task.problem, in_memory(number, flat, valid)
+    known = np.empty((MOST_CANDIDATES, 4))
+    room = _Weighed(np.empty((MOST_CANDIDATES, 6)), np.zeros((6, 4)), np.empty(MOST_CANDIDATES))
+    lanes, forces, tangents = np.zeros((LANES, 4)), np.empty((LANES, 6)), np.empty((LANES, 6, 3))
+    for row in range(first, last):
+        target, seen, i, before = targets[row], measured[row], row - first, number[row]
+        lane = i % LANES
+        if lane == 0:  # the first candidates of the next rows side by side
+            side = min(LANES, last - row)
+            for n in range(side):
+                lanes[n, 0] = 1.0
+                if number[row + n] > 0:
+                    copy(out.x[row + n, 0], lanes[n])
+            evaluate(of.rod, lanes, forces, tangents, 0, side)
+        if not finite(target):
+            continue
+        x, values, chi = out.x[row], out.values[row], out.chi_squared[row]
+        residuals, jacobians = about.residuals[i], about.jacobians[i]
+        described = about.weights[i], about.third[i], residuals, jacobians
+        for a in range(6):
+            copy(tangents[lane, a], about.third[i, 0, a])
+        if before > 0:
+            _weighed(of, how, target, seen, x, values, 1, before, room, described)
+        for c in range(before):
+            chi[c] = room.misfits[c]
+            copy(x[c], known[c])
+        n, about.others[i] = complete(
+            of,
+            how,
+            problem.passes,
+            problem.limit,
+            target,
+            seen,
+            before,
+            x,
+            values,
+            chi,
+            residuals,
+            jacobians,
+            about.loose[i],
         )
+        changed = n > before
+        for c in range(n):
+            changed = changed or x[c, 0] != known[c, 0] or x[c, 2] != known[c, 2]
+        if changed:
+            _weighed(of, how, target, seen, x, values, 0, n, room, described)
+        number[row] = n
 
 
 @inlined
@@ -350,8 +393,43 @@ def _units(of: Searched, how: Weighing, value: Array) -> Array:
     return out
 
 
+class _Judged(NamedTuple):
+    """Working memory of `judge_rows`, by candidate.
+
+    Covariances (m, 3, 3), log weights (as they count, and with volumes) (2, m), probabilities
+    (1, m), whether covariances are valid, whether the second order describes the channels, order
+    (1, m); copies of x, (F, p) and χ².
+    """
+
+    spread: Array
+    weight: Array
+    chance: Array
+    fine: AnyArray
+    described: AnyArray
+    order: IntArray
+    x: Array
+    values: Array
+    misfits: Array
+
+
 @inlined
-def _put_in_order(row: int, n: int, out: Candidates, room: _Room) -> None:
+def _judging(most: int) -> _Judged:
+    """Make the working memory of `judge_rows`."""
+    return _Judged(
+        np.empty((most, 3, 3)),
+        np.empty((2, most)),
+        np.empty((1, most)),
+        np.zeros(most, np.bool_),
+        np.zeros(most, np.bool_),
+        np.zeros((1, most), np.int64),
+        np.empty((most, 4)),
+        np.empty((most, 6)),
+        np.empty(most),
+    )
+
+
+@inlined
+def _put_in_order(row: int, n: int, out: Candidates, room: _Judged) -> None:
     """Write n candidates with what is known of them by falling probability."""
     x, values, chi = out.x[row], out.values[row], out.chi_squared[row]
     for c in range(n):
@@ -379,14 +457,16 @@ def _leave_room(
     measured: Array,
     row: int,
     best: int,
+    weights: Array,
+    loose: Array,
     out: Candidates,
-    room: _Room,
+    room: _Judged,
 ) -> None:
     """Lower the probability of the first candidate by what is outside its region, which may widen.
 
-    ``best`` is which candidate it was before they were put in order.
+    ``best`` is which candidate it was before they were put in order, with these weights.
     """
-    white, weights, spread = how.own[0, 0] > 0.0, room.weights[best], out.covariances[row, 0]
+    white, spread = how.own[0, 0] > 0.0, out.covariances[row, 0]
     value, chi = out.values[row, 0], out.chi_squared[row, 0]
     seen, unit = measured if white else target, _units(of, how, value)
     points, likely = probable_nodes(of, white, weights, unit, seen, value[3:], chi)
@@ -395,87 +475,12 @@ def _leave_room(
         rod = Charted(of.rod, of.fold, of.nodes)
         follow_valley(rod, of.proximal, how, target, measured, out.x[row, 0], spread)
     log_mass = room.weight[1, best] - sharpness(weights) + _LOG_NORMAL
-    share = outside_share(points, likely, value[3:], chi, log_mass, spread, room.loose)
+    share = outside_share(points, likely, value[3:], chi, log_mass, spread, loose)
     out.probability[row, 0] *= 1.0 - share
 
 
 @kernel
-def settle(
-    of: Searched,
-    how: Weighing,
-    problem: Problem,
-    target: Array,
-    measured: Array,
-    row: int,
-    out: Candidates,
-    room: _Room,
-) -> None:
-    """Complete the candidates of a noisy measurement and rank them by probability.
-
-    Of the first, if there is one, the room has ∂(F, p)/∂ξ.
-    """
-    weight, chance, fine, order = room.weight, room.chance, room.fine, room.order
-    x, values, chi = out.x[row], out.values[row], out.chi_squared[row]
-    number = out.number[row]
-    if number > 0:
-        _weighed(of, how, target, measured, x, values, 1, number, room)
-    for c in range(number):
-        chi[c] = room.misfits[c]
-        copy(x[c], room.x[c])
-    n, others = complete(
-        of,
-        how,
-        problem.passes,
-        problem.limit,
-        target,
-        measured,
-        number,
-        x,
-        values,
-        chi,
-        room.residuals,
-        room.jacobians,
-        room.loose,
-    )
-    out.number[row] = n
-    if n == 0:
-        return
-    changed = n > number
-    for c in range(n):
-        changed = changed or x[c, 0] != room.x[c, 0] or x[c, 2] != room.x[c, 2]
-    if changed:
-        _weighed(of, how, target, measured, x, values, 0, n, room)
-    judge(
-        Charted(of.rod, of.fold, of.nodes),
-        of.proximal,
-        how.codes,
-        target,
-        room.weights,
-        x,
-        room.third,
-        room.residuals,
-        room.jacobians,
-        room.spread,
-        weight[1],
-        fine,
-        room.described,
-        n,
-    )
-    sound = True
-    for c in range(n):
-        sound = sound and fine[c]
-        room.misfits[c] = chi[c] - 2.0 * sharpness(room.weights[c])
-        weight[1, c] += sharpness(room.weights[c])
-        weight[0, c] = weight[1, c]
-    _both_priors(weight, room.misfits, n, sound)
-    rank(weight, out.number[row : row + 1], chance, order)
-    _put_in_order(row, n, out, room)
-    if out.probability[row, 0] > CERTAIN and (others or not out.valid[row, 0]):
-        _leave_room(of, how, target, measured, row, order[0, 0], out, room)
-
-
-@kernel
-def settle_rows(
+def judge_rows(
     task: Task,
     targets: Array,
     measured: Array,
@@ -483,30 +488,75 @@ def settle_rows(
     flat: Array,
     valid: AnyArray,
     status: IntArray,
+    about: Description,
     first: int,
     last: int,
 ) -> None:
-    """Complete the candidates of noisy measurements, judge and rank them."""
-    of, how, problem, out = task.of, task.how, task.problem, in_memory(number, flat, valid)
-    room = _judging(MOST_CANDIDATES, targets.shape[1])
-    x, values, tangents = np.zeros((LANES, 4)), np.empty((LANES, 6)), np.empty((LANES, 6, 3))
+    """Judge the candidates that `complete_rows` has left, and rank them by probability."""
+    of, how, limit, out = task.of, task.how, task.problem.limit, in_memory(number, flat, valid)
+    room = _judging(MOST_CANDIDATES)
+    weight, fine = room.weight, room.fine
     for row in range(first, last):
-        lane = (row - first) % LANES
-        if lane == 0:  # the first candidates of the next rows side by side
-            side = min(LANES, last - row)
-            for i in range(side):
-                x[i, 0] = 1.0
-                if number[row + i] > 0:
-                    copy(out.x[row + i, 0], x[i])
-            evaluate(of.rod, x, values, tangents, 0, side)
-        if not finite(targets[row]):
+        target, i, n, chi = targets[row], row - first, number[row], out.chi_squared[row]
+        if not finite(target):
             continue
-        for a in range(6):
-            copy(tangents[lane, a], room.third[0, a])
-        settle(of, how, problem, targets[row], measured[row], row, out, room)
         status[row] = UNEXPLAINED
-        if out.number[row] > 0 and out.chi_squared[row, 0] <= problem.limit:
+        if n == 0:
+            continue
+        judge(
+            Charted(of.rod, of.fold, of.nodes),
+            of.proximal,
+            how.codes,
+            target,
+            about.weights[i],
+            out.x[row],
+            about.third[i],
+            about.residuals[i],
+            about.jacobians[i],
+            room.spread,
+            weight[1],
+            fine,
+            room.described,
+            n,
+        )
+        sound = True
+        for c in range(n):
+            sound = sound and fine[c]
+            sharp = sharpness(about.weights[i, c])
+            room.misfits[c] = chi[c] - 2.0 * sharp
+            weight[1, c] += sharp
+            weight[0, c] = weight[1, c]
+        _both_priors(weight, room.misfits, n, sound)
+        rank(weight, number[row : row + 1], room.chance, room.order)
+        _put_in_order(row, n, out, room)
+        best = room.order[0, 0]
+        weights, loose = about.weights[i, best], about.loose[i]
+        if out.probability[row, 0] > CERTAIN and (about.others[i] or not out.valid[row, 0]):
+            _leave_room(of, how, target, measured[row], row, best, weights, loose, out, room)
+        if chi[0] <= limit:
             status[row] = _UNIQUE if out.probability[row, 0] > CERTAIN else _AMBIGUOUS
+
+
+def stages(of: Searched, how: Weighing, problem: Problem) -> tuple[list[Call], list[Call]]:
+    """Kernels that noisy measurements pass through, and what they are called with, in two halves.
+
+    Each half takes about as long to compile.
+    """
+    channels = np.empty((0, how.codes.shape[0]))
+    status, about = np.empty(0, np.int64), type_of_description()
+    given = type_of_task(of, how, problem), channels, channels, *Room.of(0)
+    find: Call = (solve_rows, (*given, status, 0, 0))
+    if not problem.exact:
+        find = (explain_rows, (*given, status, False, 0, 0))
+    here: list[Call] = [(task, (of, how, problem)), find]
+    here.append((complete_rows, (*given, about, 0, 0)))
+    return here, [(judge_rows, (*given, status, about, 0, 0)), (description, (0, 0))]
+
+
+def compile_stages(of: Searched, how: Weighing, problem: Problem) -> None:
+    """Compile what noisy measurements pass through in two processes, if it is needed for once."""
+    if not judge_rows.overloads:  # type: ignore[attr-defined]
+        compile_together(*stages(of, how, problem))
 
 
 def estimate_rows(
@@ -521,13 +571,20 @@ def estimate_rows(
 ) -> None:
     """Find, complete, judge and rank the candidates of measurements; NaN rows are left alone.
 
-    Each stage is compiled by itself, so that whoever needs one does not wait for the others.
+    Each stage is compiled by itself, so that whoever needs one does not wait for the others, and
+    two processes can compile them.
     """
+    given = targets, measured, *room
     if problem.exact:
-        solve_rows(task, targets, measured, *room, status, first, last)
+        solve_rows(task, *given, status, first, last)
     else:
-        explain_rows(task, targets, measured, *room, status, False, first, last)
-    if problem.noisy:
-        settle_rows(task, targets, measured, *room, status, first, last)
-        if not problem.exact and (status[first:last] == UNEXPLAINED).any():
-            explain_rows(task, targets, measured, *room, status, True, first, last)
+        explain_rows(task, *given, status, False, first, last)
+    if not problem.noisy:
+        return
+    about = described_in_thread(min(last - first, _AT_ONCE), targets.shape[1])
+    for start in range(first, last, _AT_ONCE):
+        end = min(start + _AT_ONCE, last)
+        complete_rows(task, *given, about, start, end)
+        judge_rows(task, *given, status, about, start, end)
+    if not problem.exact and (status[first:last] == UNEXPLAINED).any():
+        explain_rows(task, *given, status, True, first, last)

@@ -28,7 +28,7 @@ from vibrissa.contacts.inversion import polish
 from vibrissa.contacts.joint_fit import soft_base
 from vibrissa.contacts.noise import explained, sensor_noise
 from vibrissa.contacts.prior import Prior, among_allowed, refuse_tip
-from vibrissa.contacts.ranking import estimate_rows
+from vibrissa.contacts.ranking import compile_stages, estimate_rows
 from vibrissa.contacts.readout import (
     Bounds,
     Measurement,
@@ -74,6 +74,8 @@ class Search:
         exact = isinstance(readout, Named) and len(readout.names) == UNKNOWNS
         limit = explained(independent(contact_map, readout) - UNKNOWNS)
         self._problem = Problem(exact, readout.noisy, readout.passes, limit)
+        if readout.noisy:
+            compile_stages(readout.searched, readout.how, self._problem)
         self._task = task(readout.searched, readout.how, self._problem)
 
     def batch(self, values: Array, targets: Array) -> tuple[Candidates, IntArray, Array]:

@@ -11,6 +11,7 @@ from vibrissa.deferred import names_from
 from vibrissa.numerics.arrays import (
     AnyArray,
     Array,
+    Call as Call,
     IntArray,
     Mask as Mask,
     Vector,
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
         vectorised as vectorised,
     )
     from vibrissa.numerics.device import Translation as Translation, check_device as check_device
+    from vibrissa.numerics.together import compile_together as compile_together
 
 __all__ = [
     "AnyArray",
@@ -66,5 +68,6 @@ __getattr__ = names_from(
         "algebra": "cholesky mahalanobis norm3 quick_exp solve solve3 solve_root wrapped",
         "compiled": "copy inlined inlined_rigorous kernel rigorous specialised vectorised",
         "device": "Translation check_device",
+        "together": "compile_together",
     },
 )

@@ -23,6 +23,8 @@ IntArray: TypeAlias = NDArray[np.int64]
 Mask: TypeAlias = NDArray[np.bool_]
 AnyArray: TypeAlias = NDArray[Any]
 Vector: TypeAlias = tuple[float, float, float]
+#: A kernel, and what it will be called with: values, or their types.
+Call: TypeAlias = tuple[Callable[..., Any], tuple[Any, ...]]
 
 SKEW = 1e-5
 """Largest entry of RᵀR − 1 of a rotation R that was written with few digits."""

@@ -19,7 +19,7 @@ import pickle
 import sys
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from numba.core import event
 from numba.core.caching import FunctionCache, IndexDataCacheFile
@@ -59,6 +59,10 @@ class _Files(IndexDataCacheFile):
         whole = hashlib.sha256(kept.getbuffer()).digest() == digest
         return pickle.load(kept) if whole and pickle.load(kept) == key else None
 
+    def holds(self, key: object) -> bool:
+        """Whether there is a file of a key, whole or not."""
+        return Path(self._data_path(self._name(key))).exists()  # type: ignore[no-untyped-call]
+
     def _name(self, key: object) -> str:
         number = int.from_bytes(hashlib.sha256(repr(key).encode()).digest()[:8])
         return str(self._data_name(number))  # type: ignore[no-untyped-call]
@@ -80,6 +84,11 @@ class PackageCache(FunctionCache):
     def _index_key(self, sig: object, codegen: object) -> tuple[object, ...]:
         package = Path(self._py_func.__code__.co_filename).parent
         return (*super()._index_key(sig, codegen), _sources(package))  # type: ignore[no-untyped-call]
+
+    def holds(self, sig: object, codegen: object) -> bool:
+        """Whether what was compiled for a signature is on disk."""
+        files = cast("_Files", self._cache_file)
+        return files.holds(self._index_key(sig, codegen))
 
     def load_overload(self, sig: object, target_context: object) -> Any:
         """Load what was compiled; None if there is none that can be used."""

@@ -1,0 +1,103 @@
+"""Kernels compiled by two processes at the same time; and by one, where that cannot be."""
+
+import os
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+KERNELS = """
+from vibrissa.numerics import kernel
+
+@kernel
+def twice(x):
+    return 2.0 * x
+
+@kernel
+def thrice(x):
+    return 3.0 * x
+"""
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Runs a script that compiles `twice` here and `thrice` in a helper; a line for each hit."""
+    (tmp_path / "apart.py").write_text(KERNELS)
+    (tmp_path / "kept").mkdir()
+
+    def call(before="", after="", **environment):
+        script = f"""
+            import sys
+            sys.path.insert(0, {str(tmp_path)!r})
+            from apart import thrice, twice
+            from vibrissa.numerics import together
+            {before}
+            together.compile_together([(twice, (1.0,))], [(thrice, (1.0,))])
+            assert (twice(2.0), thrice(2.0)) == (4.0, 6.0)
+            for kernel in (twice, thrice):
+                print(kernel.py_func.__name__, sum(kernel.stats.cache_hits.values()))
+            {after}
+        """
+        done = subprocess.run(
+            [sys.executable, "-W", "error", "-c", textwrap.dedent(script)],
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=300,
+            env=os.environ
+            | {"NUMBA_CACHE_DIR": str(tmp_path / "kept"), "VIBRISSA_THREADS": "2"}
+            | environment,
+        )
+        assert done.stderr == ""
+        return done.stdout.split("\n")[:2]
+
+    return call
+
+
+def test_a_helper_compiles_what_is_found_on_disk_here(run):
+    assert run() == ["twice 0", "thrice 1"]
+    # Another process finds both, and asks nobody.
+    nobody = "together.subprocess.Popen = None"
+    assert run(nobody) == ["twice 1", "thrice 1"]
+
+
+@pytest.mark.parametrize(
+    "why",
+    [
+        pytest.param("together.threads = lambda: 1", id="one core"),
+        pytest.param("sys.frozen = True", id="a frozen program"),
+        pytest.param("sys.executable = '/usr/bin/matlab'", id="embedded in a program"),
+        pytest.param("sys.executable = None", id="no executable"),
+        pytest.param("thrice.py_func.__module__ = '__main__'", id="not in a module"),
+    ],
+)
+def test_nobody_is_asked_where_that_gains_nothing(run, why):
+    assert run(f"together.subprocess.Popen = None; {why}") == ["twice 0", "thrice 0"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the stand-ins for Python are shell scripts")
+@pytest.mark.parametrize("does", ["exit 3", "exec sleep 1000", "head -c 1; kill -9 $$"])
+def test_a_helper_that_fails_or_hangs_is_done_without(run, tmp_path, does):
+    helper = tmp_path / "python"
+    helper.write_text(f"#!/bin/sh\n{does}\n")
+    helper.chmod(0o755)
+    impatient = "together._PATIENCE = together._AT_LEAST = 0.01"
+    assert run(f"sys.executable = {str(helper)!r}; {impatient}") == ["twice 0", "thrice 0"]
+
+
+def test_no_process_can_be_started(run, tmp_path):
+    missing = str(tmp_path / "python-that-is-not-there")
+    assert run(f"sys.executable = {missing!r}") == ["twice 0", "thrice 0"]
+
+
+def test_no_folder_can_be_written_to(run):
+    """A helper could hand nothing over, and none is started."""
+    nowhere = "; ".join(
+        [
+            "from numba.core.caching import NullCache",
+            "thrice._cache = NullCache()",
+            "together.subprocess.Popen = None",
+        ]
+    )
+    assert run(nowhere) == ["twice 0", "thrice 0"]

@@ -5,7 +5,8 @@ import pytest
 import xarray as xr
 
 import vibrissa as vb
-from vibrissa.pipeline import doubted_axes
+from vibrissa.contacts import rubbing_misfits
+from vibrissa.pipeline import axes, doubted_axes
 from vibrissa.sensors import SensorFrame, component_noise
 
 NOISE = component_noise(1e-6, 2e-8)
@@ -50,3 +51,25 @@ def test_a_turn_of_a_straight_whisker_does_not_show():
     assert doubted_axes(straight, turned, NOISE) == ""
     assert doubted_axes(straight, measured(straight, columns="021345"), NOISE)
     assert doubted_axes(straight, turned.isel(time=slice(3)), NOISE) == ""
+
+
+def test_axes_that_are_right_need_no_fits(monkeypatch):
+    """Nor their kernels, which a first estimate would wait for."""
+    asked = []
+
+    def noted(*given):
+        asked.append(given[-1])
+        return rubbing_misfits(*given)
+
+    monkeypatch.setattr(axes, "rubbing_misfits", noted)
+    assert doubted_axes(vb.samples.gamma(), measured(vb.samples.gamma()), NOISE) == ""
+    assert asked == [False]
+
+
+def test_fits_are_never_worse_than_where_moments_vanish():
+    whisker = vb.samples.gamma()
+    wrench = measured(whisker)
+    given = whisker, wrench["force"].values, wrench["moment"].values, NOISE + 1e-13 * np.eye(6)
+    fitted, seen = rubbing_misfits(*given, True), rubbing_misfits(*given, False)
+    assert (fitted < 9.0).mean() >= (seen < 9.0).mean()
+    assert (seen < 9.0).any()

@@ -64,7 +64,7 @@ from vibrissa.contacts.readout import (
 )
 from vibrissa.contacts.search import signals_at_nodes as signals_at_nodes
 from vibrissa.contacts.two_contacts import bent_by_forces as bent_by_forces, second_contact
-from vibrissa.contacts.wrench import estimate_from_wrench
+from vibrissa.contacts.wrench import estimate_from_wrench, rubbing_misfits as rubbing_misfits
 
 __all__ = [
     "RANK",

@@ -271,6 +271,36 @@ def wrench_weights(sensor: SensorNoise, d: Discretization, wrenches: Array) -> A
     return whitening(_covariance(sensor) / np.outer(scale, scale) + shared)
 
 
+def rubbing_misfits(
+    whisker: Whisker, force: Array, moment: Array, noise: Array, fitted: bool
+) -> Array:
+    """Least χ² (n,) of contacts of wrenches, as if friction angles scattered; infinite: none.
+
+    Contacts are those ``fitted`` to each wrench, or else those where its moment vanishes, which is
+    found out sooner: their χ² is never less.
+    """
+    d, coarse = discretize(whisker, STEPS), discretize(whisker, _COARSE)
+    scale = np.repeat([d.force, d.moment], 3)
+    least = np.full(len(force), np.inf)
+    rows = np.flatnonzero(force.any(axis=1) & moment.any(axis=1))
+    if not rows.size:
+        return least
+    wrenches = np.concatenate([force, moment], axis=1)[rows] / scale
+    weights = whitening(np.repeat([noise / np.outer(scale, scale)], rows.size, axis=0))
+    if fitted:
+        limit = explained(rank(noise / np.outer(scale, scale)) - _UNKNOWNS)
+        number, contacts, _, _, misfits = _solve(coarse, d, wrenches, weights, limit)
+    else:
+        number, contacts = vanishing_moments(coarse, wrenches, PROXIMAL)
+    row, place = np.nonzero(np.arange(contacts.shape[1]) < number[:, None])
+    x = contacts[row, place]
+    chi = misfits[row, place] if fitted else _misfits(coarse, wrenches, weights, row, x) ** 2
+    with np.errstate(invalid="ignore"):
+        doubt = chi + (friction_angle(x) / _LIKELY) ** 2
+    np.fmin.at(least, rows[row], doubt)
+    return least
+
+
 def _solve(
     coarse: Discretization, fine: Discretization, wrenches: Array, weights: Array, limit: float
 ) -> Fitted:
@@ -325,15 +355,23 @@ def _fit(
     )
 
 
-def _promising(
-    d: Discretization, wrenches: Array, weights: Array, row: IntArray, seeds: Array
-) -> AnyArray:
-    """Which seeds are about as good as the best of their row."""
-    values, _ = solve_forces(d, seeds)
+def _misfits(
+    d: Discretization, wrenches: Array, weights: Array, row: IntArray, contacts: Array
+) -> Array:
+    """By how many standard deviations (n,) contacts miss the wrenches of their rows."""
+    values, _ = solve_forces(d, contacts)
     away = np.einsum("nij,nj->ni", weights[row], wrenches_of(values) - wrenches[row])
     with np.errstate(over="ignore", invalid="ignore"):
         misfit = np.sqrt((away**2).sum(axis=1))
     misfit[~np.isfinite(misfit)] = np.inf
+    return np.asarray(misfit)
+
+
+def _promising(
+    d: Discretization, wrenches: Array, weights: Array, row: IntArray, seeds: Array
+) -> AnyArray:
+    """Which seeds are about as good as the best of their row."""
+    misfit = _misfits(d, wrenches, weights, row, seeds)
     best = np.full(len(wrenches), np.inf)
     np.minimum.at(best, row, misfit)
     return np.asarray(misfit <= _FAR * (1.0 + best[row]))

@@ -13,7 +13,7 @@ import itertools
 import numpy as np
 import xarray as xr
 
-from vibrissa.contacts import estimate_from_wrench
+from vibrissa.contacts import rubbing_misfits
 from vibrissa.numerics import Array
 from vibrissa.recording import Group
 from vibrissa.whisker import Whisker
@@ -22,8 +22,7 @@ from vibrissa.whisker import Whisker
 _FEW, _MOST = 6, 24
 # Errors that are no matter of axes, such as those of stiffness: share of force and of moment.
 _MODEL = 0.05
-# A contact is explained up to this χ², to which a friction angle of so much adds one.
-_EXPLAINED, _RUBBING = 9.0, np.deg2rad(20.0)
+_EXPLAINED = 9.0  # a contact is explained up to this χ², to which a friction angle of 20° adds one
 # Axes that explain no more than this share of the contacts are doubted; others are believed that
 # explain so much, and so much more than these. Among others as good the simplest is stated.
 _DOUBTED, _BELIEVED, _BETTER, _EQUAL = 0.5, 0.9, 0.25, 0.05
@@ -61,24 +60,24 @@ def doubted_axes(whisker: Whisker, wrench: xr.Dataset, noise: Array) -> str:
     spread = np.repeat([np.median(np.linalg.norm(a, axis=1)) for a in (force, moment)], 3)
     covariance = noise + np.diag((_MODEL * spread) ** 2)
 
-    def explained(turns: Array) -> Array:
+    def explained(turns: Array, fitted: bool) -> Array:
         """Shares of the contacts that are explained with signed exchanges (n, 2, 3, 3)."""
         f, m = np.moveaxis(turns @ np.array([force.T, moment.T]), 1, 0)
         size = np.linalg.norm(f, axis=1) * np.linalg.norm(m, axis=1)
         near = np.median(np.abs((f * m).sum(axis=1)) / size, axis=1) < _OBLIQUE
         shares = np.zeros(len(turns))
-        pair = (np.swapaxes(a[near], 1, 2).reshape(-1, 3) for a in (f, m))
-        found = estimate_from_wrench(whisker, *pair, noise=covariance)
-        with np.errstate(invalid="ignore"):
-            doubt = found.chi_squared + (found.friction_angle / _RUBBING) ** 2
+        f, m = (np.swapaxes(a[near], 1, 2).reshape(-1, 3) for a in (f, m))
+        doubt = rubbing_misfits(whisker, f, m, covariance, fitted)
         shares[near] = (doubt <= _EXPLAINED).reshape(near.sum(), rows.size).mean(axis=1)
         return shares
 
-    own = explained(np.eye(3)[None, None].repeat(2, axis=1))[0]
-    if own > _DOUBTED:
-        return ""
+    stated, own = np.eye(3)[None, None].repeat(2, axis=1), 0.0
+    for fitted in (False, True):  # most recordings need no fits, nor kernels for them
+        own = explained(stated, fitted)[0]
+        if own > _DOUBTED:
+            return ""
     turns = _mistakes()
-    shares = explained(turns)
+    shares = explained(turns, True)
     simple = int(np.argmax(shares > shares.max() - _EQUAL))
     if shares[simple] < max(_BELIEVED, own + _BETTER):
         return ""

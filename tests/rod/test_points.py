@@ -350,7 +350,9 @@ def test_the_fold_between_nodes_is_the_spline_through_them(gamma, cells):
 def test_kernels_are_compiled_beforehand_for_what_they_are_called_with(gamma, monkeypatch):
     """Otherwise they would be compiled once more when they are called."""
     monkeypatch.setattr(points, "compile_together", lambda *_: None)
-    vb.deflect(gamma, vb.PointContact([24e-3, 13e-3, 2e-3]), steps=47)
-    for half in points._halves(discretize(gamma, 47).rod):
-        for kernel, arguments in half:
-            assert tuple(map(kernel.typeof_pyval, arguments)) in kernel.overloads
+    there = np.random.default_rng(1).uniform(-0.5, 1.0, (500, 3)) * gamma.length
+    vb.deflect(gamma, vb.PointContact(there), steps=47)  # some of them are followed
+    solver = points.point_solver(gamma, 0.3, 47)
+    here, elsewhere = points._halves(discretize(gamma, 47).rod)
+    for kernel, arguments in [*here, *elsewhere, solver._finding(there), solver._following()]:
+        assert tuple(map(kernel.typeof_pyval, arguments)) in kernel.overloads

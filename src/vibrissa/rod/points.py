@@ -434,12 +434,26 @@ class PointSolver:
         self._approach(wanted[lost], solved[lost] < 0, there[lost], out)
         return out
 
+    def _finding(self, points: Array) -> Call:
+        """What `_find_starts` is called with, but for the rows."""
+        starts = np.empty((0, _STARTS, 3))
+        return _find_starts, (self.chart.fold, self._tree, self._resting, points, starts, 0, 0)
+
+    def _following(self) -> Call:
+        """What `follow` is called with, but for the rows."""
+        d, ends, whole = self.chart.discretization, np.empty((0, 7)), np.empty(0, np.int64)
+        known = d.rod, self.chart.fold, d.radius, self.chart.proximal
+        rows = ends, ends, whole, np.empty((0, 3)), *Solutions.empty(0)
+        return follow, (*known, *rows, 0, 0)
+
     def _from_starts(self, points: Array, rows: IntArray, out: Solutions) -> None:
         """Follow points from their starts; replace what is known by contacts of less force."""
         least = np.hypot(out.contacts[rows, 2], out.contacts[rows, 3])
         least[np.isnan(least)] = np.inf
         starts = np.empty((rows.size, _STARTS, 3))
         fold, tree, resting = self.chart.fold, self._tree, self._resting
+        if not follow.overloads:  # type: ignore[attr-defined]
+            compile_together([self._finding(points)], [self._following()])
         share_out(
             rows.size,
             lambda first, last: _find_starts(fold, tree, resting, points, starts, first, last),

@@ -104,6 +104,15 @@ def test_finding_a_contact_loads_neither_xarray_nor_splines(tmp_path):
     assert loaded.strip() == "[]"
 
 
+def test_kernels_are_at_hand_without_linear_algebra_of_scipy():
+    """It takes as long as Numba; what shows a file, such as `info`, calls no kernel."""
+    code = "import sys, vibrissa.contacts; print('scipy.linalg' in sys.modules)"
+    loaded = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True
+    ).stdout
+    assert loaded.strip() == "False"
+
+
 def test_children_can_be_interrupted_where_the_tests_cannot(request):
     """As where a shell starts the tests in its background."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)

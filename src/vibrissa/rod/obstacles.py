@@ -26,9 +26,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from vibrissa.deferred import interpolate, optimize
+from vibrissa.deferred import interpolate, linalg, optimize
 from vibrissa.numerics import Array, IntArray, Mask
 from vibrissa.objects import Placement, Surface
 from vibrissa.rod.chart import LEAST_ARC
@@ -330,13 +329,13 @@ def _pushed(
 ) -> tuple[Array, Array] | None:
     """Step and multipliers of least energy with all linearised gaps open or closed."""
     try:
-        factor = cho_factor(matrix)
-    except LinAlgError:
-        factor = cho_factor(np.diag(weight))
-    free = -cho_solve(factor, slope)
+        factor = linalg.cho_factor(matrix)
+    except np.linalg.LinAlgError:
+        factor = linalg.cho_factor(np.diag(weight))
+    free = -linalg.cho_solve(factor, slope)
     if not len(gaps):
         return free, np.zeros(0)
-    yielded = cho_solve(factor, gap_slopes.T)
+    yielded = linalg.cho_solve(factor, gap_slopes.T)
     compliance = gap_slopes @ yielded
     scale = 1.0 / np.sqrt(np.diag(compliance))
     compliance = compliance * scale[:, None] * scale + 1e-13 * np.eye(len(gaps))

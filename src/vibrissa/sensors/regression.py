@@ -17,9 +17,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
-from vibrissa.deferred import spatial
+from vibrissa.deferred import linalg, spatial
 from vibrissa.numerics import Array
 
 # Condition number, of columns scaled to one, from which unknowns are not determined.
@@ -106,8 +105,8 @@ class ThinPlate:
         weights, noise = np.empty((n, k)), np.empty(k)
         best = np.full(k, np.inf)
         for one in _RATIOS if ratio is None else (ratio,):
-            factor = cho_factor(kernel + one * np.eye(n), lower=True)
-            back = cho_solve(factor, values)
+            factor = linalg.cho_factor(kernel + one * np.eye(n), lower=True)
+            back = linalg.cho_solve(factor, values)
             variance = np.maximum(np.sum(values * back, axis=0) / n, np.finfo(np.float64).tiny)
             cost = n * np.log(variance) + 2.0 * np.log(np.diag(factor[0])).sum()
             better = cost < best

@@ -24,9 +24,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded, solveh_banded
 
-from vibrissa.deferred import sparse_linalg
+from vibrissa.deferred import linalg, sparse_linalg
 from vibrissa.numerics import AnyArray, Array, numbers, rotation_matrices
 from vibrissa.sensors.suspended import SuspendedWhisker, Touches
 
@@ -258,8 +257,10 @@ class _Touch:
                 damped = band.copy()
                 damped[0] *= 1.0 + damping
                 try:
-                    step = -solveh_banded(damped, gradient.ravel(), lower=True).reshape(n, -1)
-                except LinAlgError:
+                    step = -linalg.solveh_banded(damped, gradient.ravel(), lower=True).reshape(
+                        n, -1
+                    )
+                except np.linalg.LinAlgError:
                     damping *= 10.0
                     continue
                 step /= max(np.abs(step[:, 0]).max() / _MOST_STEP, 1.0)
@@ -280,7 +281,7 @@ class _Touch:
     def contacts(self) -> SweptContacts:
         """Most probable contacts."""
         at, metric, _ = min(map(self.minimise, _STARTS), key=lambda one: one[2])
-        root = cholesky_banded(self.system(at, metric)[1], lower=True)
+        root = linalg.cholesky_banded(self.system(at, metric)[1], lower=True)
         point = self.turn @ at.touches.point_slopes * self.sensor.length
         spread = _inverse_blocks(root, len(point))[:, :3, :3]
         return SweptContacts(
@@ -326,7 +327,7 @@ def _largest_errors(root: Array, point: Array) -> Array:
     def spread(vector: Array) -> Array:
         full = np.zeros((n, len(root) // 2))
         full[:, :3] = np.einsum("kai,ka->ki", point, vector.reshape(n, 3))
-        full = cho_solve_banded((root, True), full.ravel()).reshape(n, -1)
+        full = linalg.cho_solve_banded((root, True), full.ravel()).reshape(n, -1)
         return np.asarray(np.einsum("kai,ki->ka", point, full[:, :3]).ravel())
 
     joint = sparse_linalg.LinearOperator((3 * n, 3 * n), matvec=spread, dtype=np.float64)

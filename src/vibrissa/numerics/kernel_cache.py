@@ -5,10 +5,10 @@ inlines from another file has changed; here all files with kernels of its own pa
 ``numerics``, ``rod`` and ``signals``, whose helpers others use, are part of the key. By their
 content: the time at which a file was written, by which numba knows it, does not identify a copy.
 
-A result must not depend on the cache. A file in it that is not as it was written, whatever cut it or
-changed it, counts as none: each has its SHA-256 in front, for machine code that is not whole would
-not be noticed otherwise. Where nothing can be written, as on a full disk, kernels are compiled anew
-in each run.
+A result must not depend on the cache. A file in it that is not as it was written, whatever cut it
+or changed it, counts as none: each has its SHA-256 in front, for machine code that is not whole
+would not be noticed otherwise. Where nothing can be written, as on a full disk, kernels are
+compiled anew in each run.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 Compiling is mostly Python, which keeps one core busy. Where several kernels are needed and none of
 them is on disk, another interpreter compiles some of them, and this one finds them in the cache.
-The helper prints nothing and changes nothing else; whatever it does not finish is compiled here when
-it is called, as without it.
+The helper prints nothing and changes nothing else; whatever it does not finish is compiled here
+when it is called, as without it.
 """
 
 from __future__ import annotations

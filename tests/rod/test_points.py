@@ -6,7 +6,7 @@ from hypothesis import given, settings, strategies as st
 from scipy.interpolate import CubicSpline
 
 import vibrissa as vb
-from vibrissa.rod import discretize, fold_forces, points, solve_forces, stable_set
+from vibrissa.rod import discretize, fold_forces, solve_forces, stable_set
 
 few = settings(max_examples=15)
 
@@ -345,14 +345,3 @@ def test_the_fold_between_nodes_is_the_spline_through_them(gamma, cells):
     assert in_psi == pytest.approx(around, abs=1e-12)
     assert in_s == pytest.approx(CubicSpline(eta, value)(eta, 1), abs=1e-12)
     assert in_both == pytest.approx(CubicSpline(eta, around)(eta, 1), abs=1e-11)
-
-
-def test_kernels_are_compiled_beforehand_for_what_they_are_called_with(gamma, monkeypatch):
-    """Otherwise they would be compiled once more when they are called."""
-    monkeypatch.setattr(points, "compile_together", lambda *_: None)
-    there = np.random.default_rng(1).uniform(-0.5, 1.0, (500, 3)) * gamma.length
-    vb.deflect(gamma, vb.PointContact(there), steps=47)  # some of them are followed
-    solver = points.point_solver(gamma, 0.3, 47)
-    here, elsewhere = points._halves(discretize(gamma, 47).rod)
-    for kernel, arguments in [*here, *elsewhere, solver._finding(there), solver._following()]:
-        assert tuple(map(kernel.typeof_pyval, arguments)) in kernel.overloads

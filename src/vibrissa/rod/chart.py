@@ -54,11 +54,6 @@ class Fold(NamedTuple):
     # (n, m + 1, 4) ln f* and its derivatives by η, by ψ and by both, at the chart's nodes.
     log_force: Array
 
-    @classmethod
-    def empty(cls) -> Fold:
-        """Return one of no nodes, for which kernels can be compiled before there is a chart."""
-        return cls(np.empty(2), np.empty((0, 0, 4)))
-
 
 @dataclass(frozen=True, eq=False)
 class StableSet:

@@ -15,18 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vibrissa.deferred import spatial
-from vibrissa.numerics import (
-    AnyArray,
-    Array,
-    Call,
-    IntArray,
-    compile_together,
-    copy,
-    inlined,
-    kernel,
-    norm3,
-    share_out,
-)
+from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel, norm3, share_out
 from vibrissa.rod.chart import (
     LEAST_ARC,
     Fold,
@@ -40,8 +29,8 @@ from vibrissa.rod.chart import (
     with_normal_force,
 )
 from vibrissa.rod.continuation import POINT, follow
-from vibrissa.rod.discretization import Bendable, Rod, discretize
-from vibrissa.rod.integration import evaluate, share_rows, solve_forces
+from vibrissa.rod.discretization import Bendable, Rod
+from vibrissa.rod.integration import share_rows, solve_forces
 from vibrissa.rod.kernels import BUFFER_SIZE, LANES
 from vibrissa.rod.newton import ABOVE_FOLD, TOLERANCE, newton_group, stable, start_from
 from vibrissa.rod.search import MOST_SEEDS, seeds
@@ -216,107 +205,7 @@ def _find_starts(
                 starts[row, i, a] = np.nan
 
 
-# States of rows between the two kernels, which end as those of `_solve_seeded`: there is a seed,
-# and perhaps a contact of less force than its.
-_SEEDED, _DOUBTED = -2, -3
-
-
 @kernel
-def _seed_points(
-    fold: Fold,
-    tree: SearchTree,
-    resting: Array,
-    points: Array,
-    charts: Array,
-    inverses: Array,
-    xi: Array,
-    solved: IntArray,
-    first: int,
-    last: int,
-) -> None:
-    """Fill the contacts from which to start, by the chart's seeds; very near to rest, from there.
-
-    What :func:`newton_group` needs in addition is filled for the rows from the first on.
-    """
-    found, quality = np.empty((MOST_SEEDS, 3)), np.empty(MOST_SEEDS, np.int64)
-    slopes = np.empty((MOST_SEEDS, 3, 3))
-    for row in range(first, last):
-        i, point, start = row - first, points[row], xi[row]
-        touch = _light_touch(resting, point)
-        n = 0 if touch > 0.0 else seeds(tree, point, found, slopes, quality)
-        if touch > 0.0:
-            start[0], start[1], start[2] = touch, 0.0, 0.0
-            charts[i, 2], inverses[i, 0, 0] = 0.0, np.nan
-            solved[row] = _SEEDED
-        elif n > 0:
-            best = _best(found, quality, n)
-            doubt = _in_doubt(fold, resting, point, found, n, best)
-            chart_to_contact(fold, found[best], start)
-            start_from(found[best], slopes[best], quality[best], charts[i], inverses[i])
-            solved[row] = _DOUBTED if doubt else _SEEDED
-        else:
-            solved[row] = -1 if _near_rest(resting, point) else 0
-
-
-@kernel
-def _solve_seeded(
-    rod: Rod,
-    fold: Fold,
-    proximal: float,
-    points: Array,
-    charts: Array,
-    inverses: Array,
-    xi: Array,
-    values: Array,
-    misfits: Array,
-    solved: IntArray,
-    first: int,
-    last: int,
-) -> None:
-    """Solve the points that have a start, a lane each.
-
-    ``solved`` is 1 there, 2 where the solution is in doubt; -1 where the point may be reached by
-    another path, as there are seeds or the resting whisker is near; 0 elsewhere.
-    """
-    b = np.zeros(BUFFER_SIZE)
-    own_charts, own_inverses = np.empty((LANES, 3)), np.empty((LANES, 3, 3))
-    rows, targets, group = np.empty(LANES, np.int64), np.empty((LANES, 3)), np.empty((LANES, 3))
-    group_values, group_misfits = np.empty((LANES, 6)), np.empty(LANES)
-    signs, doubt = np.empty(LANES), np.zeros(LANES, np.bool_)
-    count = 0
-    for row in range(first, last):
-        if solved[row] < -1:
-            rows[count], doubt[count], solved[row] = row, solved[row] == _DOUBTED, -1
-            copy(points[row], targets[count])
-            copy(charts[row - first], own_charts[count])
-            for a in range(3):
-                copy(inverses[row - first, a], own_inverses[count, a])
-            copy(xi[row], group[count])
-            count += 1
-        if count == LANES or (row == last - 1 and count > 0):
-            newton_group(
-                _at_point,
-                rod,
-                fold,
-                b,
-                count,
-                targets,
-                own_charts,
-                own_inverses,
-                group,
-                group_values,
-                group_misfits,
-                signs,
-            )
-            for i in range(count):
-                if group_misfits[i] <= TOLERANCE and stable(fold, proximal, group[i], signs[i]):
-                    solved[rows[i]] = 2 if doubt[i] else 1
-                    copy(group[i], xi[rows[i]])
-                    copy(group_values[i], values[rows[i]])
-                    misfits[rows[i]] = group_misfits[i]
-            count = 0
-
-
 def _solve_points(
     rod: Rod,
     fold: Fold,
@@ -331,60 +220,59 @@ def _solve_points(
     first: int,
     last: int,
 ) -> None:
-    """Solve contact points (n, 3); ``solved`` is that of `_solve_seeded`."""
-    n = last - first
-    charts, inverses = np.empty((n, 3)), np.empty((n, 3, 3))
-    _seed_points(fold, tree, resting, points, charts, inverses, xi, solved, first, last)
-    given = points, charts, inverses, xi, values, misfits, solved
-    _solve_seeded(rod, fold, proximal, *given, first, last)
+    """Solve contact points (n, 3) from the chart's seeds; very near to rest, from there.
 
-
-@kernel
-def _solve_lanes(
-    rod: Rod,
-    fold: Fold,
-    tree: SearchTree,
-    resting: Array,
-    proximal: float,
-    points: Array,
-    xi: Array,
-    values: Array,
-    misfits: Array,
-    solved: IntArray,
-    first: int,
-    last: int,
-) -> None:
-    """Solve no more points than there are lanes, as a thread of a GPU does."""
-    charts, inverses = np.empty((LANES, 3)), np.empty((LANES, 3, 3))
-    _seed_points(fold, tree, resting, points, charts, inverses, xi, solved, first, last)
-    _solve_seeded(
-        rod,
-        fold,
-        proximal,
-        points,
-        charts,
-        inverses,
-        xi,
-        values,
-        misfits,
-        solved,
-        first,
-        last,
-    )
-
-
-def _halves(rod: Rod) -> tuple[list[Call], list[Call]]:
-    """Kernels that solve points, and what they are called with, in two halves.
-
-    Each half takes about as long to compile.
+    ``solved`` is 1 there, 2 where the solution is in doubt; -1 where the point may be reached by
+    another path, as there are seeds or the resting whisker is near; 0 elsewhere.
     """
-    fold, tree = Fold.empty(), SearchTree.empty()
-    rows, points, inverses = np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3))
-    solved = np.empty(0, np.int64)
-    seed = fold, tree, points, points, points, inverses, points, solved, 0, 0
-    solve = rod, fold, 0.5, points, points, inverses, points, points, rows, solved, 0, 0
-    here: list[Call] = [(evaluate, (rod, points, points, inverses, 0, 0)), (_solve_seeded, solve)]
-    return here, [(_seed_points, seed)]
+    b = np.zeros(BUFFER_SIZE)
+    found, quality = np.empty((MOST_SEEDS, 3)), np.empty(MOST_SEEDS, np.int64)
+    slopes = np.empty((MOST_SEEDS, 3, 3))
+    charts, inverses = np.empty((LANES, 3)), np.empty((LANES, 3, 3))
+    rows, targets, group = np.empty(LANES, np.int64), np.empty((LANES, 3)), np.empty((LANES, 3))
+    group_values, group_misfits = np.empty((LANES, 6)), np.empty(LANES)
+    signs, doubt = np.empty(LANES), np.zeros(LANES, np.bool_)
+    count = 0
+    for row in range(first, last):
+        rows[count], doubt[count] = row, False
+        copy(points[row], targets[count])
+        touch = _light_touch(resting, points[row])
+        n = 0 if touch > 0.0 else seeds(tree, points[row], found, slopes, quality)
+        if touch > 0.0:
+            group[count, 0], group[count, 1], group[count, 2] = touch, 0.0, 0.0
+            charts[count, 2], inverses[count, 0, 0] = 0.0, np.nan
+        elif n > 0:
+            best = _best(found, quality, n)
+            doubt[count] = _in_doubt(fold, resting, points[row], found, n, best)
+            chart_to_contact(fold, found[best], group[count])
+            start_from(found[best], slopes[best], quality[best], charts[count], inverses[count])
+        if touch > 0.0 or n > 0:
+            solved[row] = -1
+            count += 1
+        else:
+            solved[row] = -1 if _near_rest(resting, points[row]) else 0
+        if count == LANES or (row == last - 1 and count > 0):
+            newton_group(
+                _at_point,
+                rod,
+                fold,
+                b,
+                count,
+                targets,
+                charts,
+                inverses,
+                group,
+                group_values,
+                group_misfits,
+                signs,
+            )
+            for i in range(count):
+                if group_misfits[i] <= TOLERANCE and stable(fold, proximal, group[i], signs[i]):
+                    solved[rows[i]] = 2 if doubt[i] else 1
+                    copy(group[i], xi[rows[i]])
+                    copy(group_values[i], values[rows[i]])
+                    misfits[rows[i]] = group_misfits[i]
+            count = 0
 
 
 class PointSolver:
@@ -421,8 +309,7 @@ class PointSolver:
         residuals, solved = np.empty(there.size), np.zeros(there.size, np.int64)
         chart = self.chart
         tables = chart.discretization.rod, chart.fold, self._tree, self._resting, chart.proximal
-        solve = _solve_points if device == "cpu" else _solve_lanes
-        share_rows(solve, tables, (wanted,), (xi, found, residuals, solved), device)
+        share_rows(_solve_points, tables, (wanted,), (xi, found, residuals, solved), device)
         good = solved > 0
         rows = there[good]
         contacts[rows, 0], contacts[rows, 1], contacts[rows, 2:] = xi[good, 0], 0.0, xi[good, 1:]
@@ -434,26 +321,12 @@ class PointSolver:
         self._approach(wanted[lost], solved[lost] < 0, there[lost], out)
         return out
 
-    def _finding(self, points: Array) -> Call:
-        """What `_find_starts` is called with, but for the rows."""
-        starts = np.empty((0, _STARTS, 3))
-        return _find_starts, (self.chart.fold, self._tree, self._resting, points, starts, 0, 0)
-
-    def _following(self) -> Call:
-        """What `follow` is called with, but for the rows."""
-        d, ends, whole = self.chart.discretization, np.empty((0, 7)), np.empty(0, np.int64)
-        known = d.rod, self.chart.fold, d.radius, self.chart.proximal
-        rows = ends, ends, whole, np.empty((0, 3)), *Solutions.empty(0)
-        return follow, (*known, *rows, 0, 0)
-
     def _from_starts(self, points: Array, rows: IntArray, out: Solutions) -> None:
         """Follow points from their starts; replace what is known by contacts of less force."""
         least = np.hypot(out.contacts[rows, 2], out.contacts[rows, 3])
         least[np.isnan(least)] = np.inf
         starts = np.empty((rows.size, _STARTS, 3))
         fold, tree, resting = self.chart.fold, self._tree, self._resting
-        if not follow.overloads:  # type: ignore[attr-defined]
-            compile_together([self._finding(points)], [self._following()])
         share_out(
             rows.size,
             lambda first, last: _find_starts(fold, tree, resting, points, starts, first, last),
@@ -557,6 +430,4 @@ def follow_all(
 @lru_cache(maxsize=16)
 def point_solver(whisker: Bendable, proximal: float, steps: int) -> PointSolver:
     """Return the point solver of a whisker, made on first use."""
-    if not _seed_points.overloads:  # type: ignore[attr-defined]
-        compile_together(*_halves(discretize(whisker, steps).rod))
     return PointSolver(stable_set(whisker, proximal=proximal, steps=steps))

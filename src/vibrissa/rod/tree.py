@@ -64,27 +64,6 @@ class SearchTree(NamedTuple):
     # (4,) Numbers of length, direction and the others among the quantities; -1 for none.
     roles: IntArray
 
-    @classmethod
-    def empty(cls) -> SearchTree:
-        """Return one of no cells, for which kernels can be compiled before there is a chart."""
-        whole, table, deep = np.empty(0, np.int64), np.empty((0, 0)), np.empty((0, 0, 0))
-        return cls(
-            grid=table,
-            turns=np.empty(3),
-            offsets=whole,
-            boxes=deep,
-            place=np.empty((0, 3), np.int64),
-            frame=deep,
-            edges=table,
-            care=whole,
-            polar=whole,
-            polar_edges=table,
-            polar_frame=table,
-            polar_linear=deep,
-            polar_volumes=deep,
-            roles=whole,
-        )
-
 
 class PlaneVector(NamedTuple):
     """Vector of the plane of which one or two quantities are length and direction."""

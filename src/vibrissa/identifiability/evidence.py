@@ -454,7 +454,7 @@ def _shares(
     elevation = np.full(shape, np.nan)
     hit = np.broadcast_to(ambiguous, (*shape, rows.size))
     points = question.samples.contacts.values[rows, 3:]
-    above = np.arcsin(np.abs(points @ question.normal) / np.linalg.norm(points, axis=1))
+    above = np.arcsin(np.abs(_above(points, question)) / np.linalg.norm(points, axis=1))
     for i, word in enumerate(verdict):
         if word == OFF_SURFACE:
             elevation[:, i] = (hit[:, i] * above).max(axis=1, initial=0.0)
@@ -482,7 +482,7 @@ def _local(question: Question, names: tuple[str, ...], samples: Samples) -> Loca
     out, contacts, volume = _nothing_local(question, samples), samples.contacts, samples.volume
     # How nearly the gradients lie in a plane. det ∂p/∂ξ > 0 in Ω.
     det = np.linalg.det(samples.gradients[:, signal_columns(names)])
-    above = contacts.values[:, 3:] @ question.normal > 0.0
+    above = _above(contacts.values[:, 3:], question) > 0.0
     outside = contacts.angle > question.cone
     near: set[int] = set()
     for i, region in enumerate(question.regions):
@@ -502,6 +502,14 @@ def _local(question: Question, names: tuple[str, ...], samples: Samples) -> Loca
         if rare.any():
             out.angle[i] = contacts.angle[rare].min(), contacts.angle[rare].max()
     return out._replace(near_folds=np.array(sorted(near), dtype=np.int64))
+
+
+def _above(points: Array, question: Question) -> Array:
+    """Distances (n,) of points from the whisker's plane.
+
+    BLAS would share out the product, and its idle threads go on taking the kernels' time.
+    """
+    return np.asarray((points * question.normal).sum(axis=1))
 
 
 def _rarer(det: Array, inside: AnyArray, volume: Array) -> tuple[AnyArray, float]:

@@ -278,7 +278,7 @@ def _whisker_in(path: Path) -> vb.Whisker:
     if kind == RECORDING:
         return vb.recording.Recording(vb.load_recording(path)).whisker()
     if kind == MAP:
-        return vb.ContactMap.load(path).whisker
+        return vb.ContactMap.load(path, grid=False).whisker
     raise ValueError(f"{path} holds {kind or 'data of another kind'}, and no whisker")
 
 
@@ -381,7 +381,7 @@ def maps_from(paths: Sequence[Path], count: int, grid: bool = False) -> list[vb.
     """Read the map of each whisker."""
     if len(paths) != count:
         raise ValueError(f"there are {len(paths)} --map for {count} whiskers; each needs one")
-    found = [vb.ContactMap.load(path) for path in paths]
+    found = [vb.ContactMap.load(path, grid) for path in paths]
     for path, contact_map in zip(paths, found, strict=True):
         if grid and contact_map.grid is None:
             raise ValueError(

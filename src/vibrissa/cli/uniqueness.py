@@ -43,7 +43,7 @@ def uniqueness(
         check_new(target, vb.identifiability.ENDINGS, force)
     if certify is not None:
         vb.io.check_writable(certify, (".nc",))
-    contact_map = vb.ContactMap.load(path)
+    contact_map = vb.ContactMap.load(path, grid=False)
     with progress_bars() as tell:
         certificate = None
         if certify is not None:

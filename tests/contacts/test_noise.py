@@ -380,6 +380,17 @@ def test_a_light_contact_is_one_candidate(gamma_map):
     assert (found.n_candidates == 1).mean() > 0.95
 
 
+def test_a_contact_behind_cells_where_a_force_may_vanish_is_found(gamma_map):
+    """These hold any direction and gave one basin to two minima, of which one remained."""
+    measured = {"FT": 1.79700712e-4, "Mx": 1.70035075e-7, "MD": 1.61170998}
+    found = gamma_map.estimate(measured, "FT Mx MD", np.diag(SIGMA**2))
+    assert found.status == vb.Status.AMBIGUOUS
+    away = found.candidates.point[:2] - [8.81903e-3, 10.56042e-3, 0.34622e-3]
+    spread = found.candidates.covariance[:2]
+    squares = (away * np.linalg.solve(spread, away[..., None])[..., 0]).sum(axis=1)
+    assert squares.min() < BEYOND < squares.max()
+
+
 @pytest.mark.parametrize("using", ["Fx MB MD", "Fx FT MB MD"])
 def test_kernels_are_compiled_beforehand_for_what_they_are_called_with(
     gamma_map, monkeypatch, using

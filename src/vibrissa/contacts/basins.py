@@ -76,7 +76,7 @@ def _start_at(of: Searched, spot: Array, start: Array) -> None:
 @inlined
 def _adjacent(of: Searched, a: int, b: int) -> bool:
     """Whether two cells touch, and are both at the fold or not; near rest bearings are all one."""
-    if _at_fold(of, a) != _at_fold(of, b):
+    if _at_fold(of, a) != _at_fold(of, b) or (of.tree.polar[a] < 0) != (of.tree.polar[b] < 0):
         return False
     one, other = of.tree.place[a], of.tree.place[b]
     around = round(2.0 * math.pi / of.tree.grid[1, 1])

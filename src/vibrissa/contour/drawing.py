@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
-from scipy.special import chdtri
 
 from vibrissa.contour.fitted_shape import FittedShape
 from vibrissa.contour.free_surface import FreeFit
 from vibrissa.contour.simple_shapes import CylinderFit, PlaneFit, SphereFit, frame_across
+from vibrissa.deferred import special
 from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
 
@@ -185,7 +185,7 @@ def ellipsoids(covariance: ArrayLike, share: float = 0.95) -> Ellipsoids:
     axes = np.concatenate(
         [axes[..., :2, :], np.cross(axes[..., :1, :], axes[..., 1:2, :])], axis=-2
     )
-    half = np.sqrt(chdtri(3, 1.0 - share) * np.maximum(size[..., ::-1], 0.0))
+    half = np.sqrt(special.chdtri(3, 1.0 - share) * np.maximum(size[..., ::-1], 0.0))
     return Ellipsoids(
         np.where(known[..., None], half, np.nan), np.where(known[..., None, None], axes, np.nan)
     )

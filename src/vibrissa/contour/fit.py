@@ -28,13 +28,13 @@ how much they count depends on their own error.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import chdtrc, chdtri, log_ndtr
 
 from vibrissa.contour.fitted_shape import FLOOR, Checked, Touches, checked, excess_of, whitened
 from vibrissa.contour.simple_shapes import (
@@ -45,12 +45,12 @@ from vibrissa.contour.simple_shapes import (
     SphereFit,
     frame_across,
 )
-from vibrissa.deferred import optimize
+from vibrissa.deferred import optimize, special
 from vibrissa.numerics import Array
 
 _SOFT = 2.0  # residual, in standard deviations, from which points count less
 # Chance of missing by as much as counts as an outlier: that of four standard deviations.
-_OUTLIER = float(chdtrc(1, 16.0))
+_OUTLIER = math.erfc(4.0 / math.sqrt(2.0))
 _WIDE = 0.5  # spread, as a share of the shape's size, beyond which a point is left out
 _ENOUGH = 50  # number of points with less spread from which wide ones are left out
 TO_SIGMA = 1.4826  # standard deviation over the median size of normally distributed numbers
@@ -226,7 +226,7 @@ def _fitted(starts: Sequence[_Posed], given: Checked) -> SimpleShape:
         given,
         covariance=covariance * scale[:, None] * scale,
         residuals=residuals,
-        inliers=np.asarray(chi_squared < chdtri(equations, _OUTLIER)),
+        inliers=np.asarray(chi_squared < special.chdtri(equations, _OUTLIER)),
         chi_squared=chi_squared,
         equations=0 if given.touches.covariance is None else equations,
     )
@@ -243,7 +243,8 @@ def _solid(best: _Posed, touches: Touches) -> _Posed:
             "forces are not normals where there is friction or inertia: leave the normals out"
         )
     share = size / sigma
-    positive = size + sigma * np.exp(-0.5 * share**2 - log_ndtr(share)) / np.sqrt(2.0 * np.pi)
+    hazard = np.exp(-0.5 * share**2 - special.log_ndtr(share)) / np.sqrt(2.0 * np.pi)
+    positive = size + sigma * hazard
     slopes = best.shape.step_slopes(best.frame)[:, : best.count]
     steps = np.linalg.pinv(slopes) @ covariance[:, -1]
     return best.moved(steps * (positive - size) / covariance[-1, -1])

@@ -14,8 +14,8 @@ from typing import Any, ClassVar, NamedTuple, Protocol, Self, TypedDict, Unpack
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import chdtri
 
+from vibrissa.deferred import special
 from vibrissa.numerics import Array, Mask, numbers
 from vibrissa.quantities import QUANTITIES, attributes
 
@@ -506,7 +506,7 @@ def excess_of(chi_squared: Array, equations: int) -> float:
     known = chi_squared[np.isfinite(chi_squared)]
     if not known.size or equations < 1:
         return float("nan")
-    return float(np.median(known) / chdtri(equations, 0.5))
+    return float(np.median(known) / special.chdtri(equations, 0.5))
 
 
 def evidence_of(chi_squared: Array, unknowns: int) -> float:

@@ -55,7 +55,6 @@ from typing import Any, ClassVar, NamedTuple, Self, Unpack
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import cho_solve, solve_triangular
 
 from vibrissa.contour.fit import TO_SIGMA, fit_shape
 from vibrissa.contour.fitted_shape import (
@@ -68,7 +67,7 @@ from vibrissa.contour.fitted_shape import (
     rows_of,
 )
 from vibrissa.contour.simple_shapes import SHAPES, SimpleShape, frame_across
-from vibrissa.deferred import spatial
+from vibrissa.deferred import linalg, spatial
 from vibrissa.numerics import Array, Mask
 from vibrissa.quantities import attributes
 
@@ -163,7 +162,7 @@ class FreeFit(FittedShape):
         noise = np.maximum(variance, (FLOOR * self.length) ** 2)
         root = np.linalg.cholesky(self._kernel(position, position) + np.diag(noise))
         object.__setattr__(self, "_root", root)
-        object.__setattr__(self, "_weights", cho_solve((root, True), value))
+        object.__setattr__(self, "_weights", linalg.cho_solve((root, True), value))
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -196,7 +195,7 @@ class FreeFit(FittedShape):
         for part in _parts(len(rows)):
             shared = self._kernel(rows[part], self.support.position)
             mean[part] = shared @ self._weights
-            explained = solve_triangular(self._root, shared.T, lower=True)
+            explained = linalg.solve_triangular(self._root, shared.T, lower=True)
             prior = self.amplitude**2 + self.base._slopes(rows[part]) ** 2 @ self._loose
             variance[part] = prior - (explained**2).sum(axis=0)
         sigma = np.sqrt(np.maximum(variance, 0.0))

@@ -34,9 +34,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import eigh
 
-from vibrissa.deferred import interpolate, transform
+from vibrissa.deferred import interpolate, linalg, transform
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.objects import Surface
 from vibrissa.simulation.chain import Chain, bezier, configure, inertia, jacobian
@@ -220,7 +219,7 @@ def slowest(state: State, count: int) -> tuple[Array, Array]:
     # The stiffness is regular, the mass need not be: twist of a straight whisker has none.
     stiffness = state.chain.stiffness.ravel()
     which = [stiffness.size - count, stiffness.size - 1]
-    slow, modes = eigh(state.matrix, np.diag(stiffness), subset_by_index=which)
+    slow, modes = linalg.eigh(state.matrix, np.diag(stiffness), subset_by_index=which)
     return slow[::-1], modes[:, ::-1]
 
 

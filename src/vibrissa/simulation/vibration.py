@@ -41,10 +41,8 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag, expm
-from scipy.special import gammaln, logsumexp
 
-from vibrissa.deferred import interpolate, optimize, signal
+from vibrissa.deferred import interpolate, linalg, optimize, signal, special
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.simulation.chain import Chain, jacobian
 from vibrissa.simulation.dynamics import Dynamics, at_rest, slowest
@@ -441,11 +439,11 @@ class _Model(NamedTuple):
         wrench = -np.stack([gains.T / size, gains.T * loss / size], axis=2)
         tip = np.stack([modes.tip.T / (rates**2 * size), np.zeros((3, len(rates)))], axis=2)
         turns = [
-            expm(step * w * np.array([[0.0, 1.0], [-1.0, -eta]]))
+            linalg.expm(step * w * np.array([[0.0, 1.0], [-1.0, -eta]]))
             for w, eta in zip(rates, loss, strict=True)
         ]
         return cls(
-            np.asarray(block_diag(*turns, np.eye(1)), np.float64),
+            np.asarray(linalg.block_diag(*turns, np.eye(1)), np.float64),
             wrench.reshape(len(sigma), -1),
             tip.reshape(3, -1),
             _TURN * np.minimum(rates * step, 1.0),
@@ -521,7 +519,7 @@ class _Free(NamedTuple):
 def _student(square: Array, freedom: float) -> Array:
     """Log density of Student's distribution in five dimensions, of squared distances."""
     n = len(_CHANNELS)
-    constant = gammaln(0.5 * (freedom + n)) - gammaln(0.5 * freedom)
+    constant = special.gammaln(0.5 * (freedom + n)) - special.gammaln(0.5 * freedom)
     constant -= 0.5 * n * np.log(freedom * np.pi)
     return np.asarray(constant - 0.5 * (freedom + n) * np.log1p(square / freedom))
 
@@ -578,7 +576,7 @@ def _switching(
     last = np.log(0.5)
     free = free.with_release(-1, size[0], last)
     for frame, (now, driven_now) in enumerate(zip(measured, driven, strict=True)):
-        begun = logsumexp(free.weight) + switch + onset[frame]
+        begun = special.logsumexp(free.weight) + switch + onset[frame]
         forward[frame] = np.logaddexp(last + stay + contact[frame], begun)
         free = free.predicted(model)._replace(weight=free.weight + stay)
         free = free.with_release(frame, size[frame], last + switch)
@@ -588,7 +586,7 @@ def _switching(
         some = np.sort(some[free.weight[some] > best - _LOST])
         free, last = free.kept(some), forward[frame]
         history.append((free.since, found[some], free.weight))
-    whole = logsumexp(np.append(history[-1][2], last))
+    whole = special.logsumexp(np.append(history[-1][2], last))
     later, ahead = 0.0, np.zeros(len(history[-1][0]))
     log = forward - whole
     for frame in range(len(left) - 2, -1, -1):

@@ -305,8 +305,7 @@ def _descend(
     frame, second, normal, bent, root, gradient, step = room[11:]
     fold, k = rod.fold, codes.shape[0]
     copy(x, to)
-    second[:] = 0.0
-    best, damping, promised, folded = np.inf, 0.0, 0.0, False
+    second[:], best, damping, promised, folded = 0.0, np.inf, 0.0, 0.0, False
     ends, near, begun = (False, False, False), worth < np.inf, False
     for n in range(_ROUNDS):
         folded_there = _confine(fold, proximal, to)

@@ -1,9 +1,10 @@
 """Where else contacts may be that explain a measurement: basins of the chart's cells; compiled.
 
 The cells of the tree that may hold signals within two standard deviations of the measured ones form
-basins, separated by cells that come less near. Each that known contacts do not explain by their
-slopes has a contact from which to look for another. Cells at the fold are basins of their own, with
-starts on it: χ² may be least there, however near a contact is that explains the measurement.
+basins, separated by cells that come less near, or where the vector of a direction may vanish. Each
+that known contacts do not explain by their slopes has a contact from which to look for another.
+Cells at the fold are basins of their own, with starts on it: χ² may be least there, however near a
+contact is that explains the measurement.
 """
 
 from __future__ import annotations
@@ -62,20 +63,24 @@ def deviations(of: Searched, how: Weighing, value: Array, measured: Array, out: 
 def _chart_of(of: Searched, x: Array, out: Array) -> None:
     """Chart coordinates (η, ψ, ρ) of a contact x (4,)."""
     out[1] = math.atan2(x[3], x[2])
-    out[0] = along(of.fold.bounds, x[0])
-    out[2] = math.sqrt(math.hypot(x[2], x[3]) / fold_force(of.fold, x[0], out[1]))
+    out[0] = along(of.charted.fold.bounds, x[0])
+    out[2] = math.sqrt(math.hypot(x[2], x[3]) / fold_force(of.charted.fold, x[0], out[1]))
 
 
 @inlined
 def _start_at(of: Searched, spot: Array, start: Array) -> None:
     """Fill the contact x (4,) at a position in the chart."""
-    chart_to_contact(of.fold, spot, start[1:])
+    chart_to_contact(of.charted.fold, spot, start[1:])
     start[0], start[1] = start[1], 0.0
 
 
 @inlined
 def _adjacent(of: Searched, a: int, b: int) -> bool:
-    """Whether two cells touch, and are both at the fold or not; near rest bearings are all one."""
+    """Whether two cells touch, and both or neither are at the fold, and where a vector may vanish.
+
+    Cells where it may hold any direction: they would join basins that they lie between. Near rest
+    bearings are all one.
+    """
     if _at_fold(of, a) != _at_fold(of, b) or (of.tree.polar[a] < 0) != (of.tree.polar[b] < 0):
         return False
     one, other = of.tree.place[a], of.tree.place[b]

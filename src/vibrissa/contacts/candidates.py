@@ -33,7 +33,6 @@ from vibrissa.rod import (
     LEAST_ARC,
     MOST_SEEDS,
     ROUNDING,
-    Charted,
     Rod,
     chart_to_contact,
     evaluate,
@@ -134,7 +133,8 @@ def solve_rows(
             aims[i, k] = measured[row, of.where[k]] if known else np.nan
             aims[i, 3 + k] = of.codes[k]
     found, values = number[first:last], out.values[first:last]
-    invert_rows(of.rod, of.fold, of.tree, of.proximal, aims, found, xi, values, 0, n)
+    rod, fold, _ = of.charted
+    invert_rows(rod, fold, of.tree, of.proximal, aims, found, xi, values, 0, n)
     for i in range(n):
         if aims[i, 0] != aims[i, 0]:
             continue
@@ -212,13 +212,13 @@ def _seeded(
     n = int(seeds(of.tree, three, found, slopes, quality))
     for row in range(n):
         at, new = x[number], True
-        chart_to_contact(of.fold, found[row], xi)
+        chart_to_contact(of.charted.fold, found[row], xi)
         at[0], at[1], at[2], at[3] = xi[0], 0.0, xi[1], xi[2]
-        approach(Charted(of.rod, of.fold, of.nodes), how, target, measured, at)
+        approach(of.charted, how, target, measured, at)
         for other in range(number):
             new = new and not same_contact(at, x[other])
         number += 1 if new else 0
-    evaluate(of.rod, x, values, np.empty((0, 6, 3)), 0, number)
+    evaluate(of.charted.rod, x, values, np.empty((0, 6, 3)), 0, number)
     return number
 
 
@@ -237,7 +237,7 @@ def _fitted(
     x, values, tangents, misfits, inside = state
     k, n = how.codes.shape[0], x.shape[0]
     targets, weights = np.empty((n, k)), np.empty((n, k, k))
-    rod, codes = of.rod, how.codes
+    rod, codes = of.charted.rod, how.codes
     fits = Fits(x, values, tangents, misfits, np.zeros(n, np.bool_))
     worth, before, rest = problem.limit + INDISTINCT, x.copy(), False
     for _ in range(problem.passes):
@@ -269,9 +269,9 @@ def _where(of: Searched, x: Array, tangents: Array, misfit: float) -> int:
     """Whether a fit is on the map, 2, nearer to the base, 1, or neither, 0."""
     if not misfit < np.inf:
         return 0
-    if stable_fit(of.fold, of.proximal, x, tangents):
+    if stable_fit(of.charted.fold, of.proximal, x, tangents):
         return 2
-    return 1 if stable_fit(of.fold, LEAST_ARC + ROUNDING, x, tangents) else 0
+    return 1 if stable_fit(of.charted.fold, LEAST_ARC + ROUNDING, x, tangents) else 0
 
 
 @kernel

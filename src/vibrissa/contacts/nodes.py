@@ -16,7 +16,7 @@ import numpy as np
 from vibrissa.contacts.channels import CHANNELS, CIRCULAR, channels_of
 from vibrissa.contacts.posterior import NORMAL_KURTOSIS, second_moment, squared_distances
 from vibrissa.numerics import Array, IntArray, cholesky, inlined, mahalanobis, quick_exp, vectorised
-from vibrissa.rod import Fold, Rod, SearchTree, StableSet, interpolant
+from vibrissa.rod import Charted, SearchTree, StableSet, charted_rod
 
 #: Parts of the chart in each of which the nearest node is a start.
 PARTS = 16
@@ -41,9 +41,7 @@ class Searched(NamedTuple):
     noise of a direction falls with the size of what it is the direction of.
     """
 
-    rod: Rod
-    fold: Fold
-    nodes: Array
+    charted: Charted
     proximal: float
     tree: SearchTree
     where: IntArray
@@ -83,9 +81,7 @@ def searched(
         for ufunc in (np.minimum, np.maximum)
     )
     return Searched(
-        chart.discretization.rod,
-        chart.fold,
-        interpolant(chart),
+        charted_rod(chart),
         chart.proximal,
         tree,
         np.array(where),

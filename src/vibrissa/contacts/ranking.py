@@ -69,7 +69,7 @@ from vibrissa.numerics import (
     inlined,
     kernel,
 )
-from vibrissa.rod import LANES, Charted, evaluate
+from vibrissa.rod import LANES, evaluate
 from vibrissa.signals import FT, FX, MB, MD
 from vibrissa.status import Status
 
@@ -124,7 +124,7 @@ def _try(
     for _ in range(passes):
         copy(at, before)
         misfit, least = fit_within(
-            Charted(of.rod, of.fold, of.nodes),
+            of.charted,
             of.proximal,
             how,
             target,
@@ -287,7 +287,7 @@ def _weighed(
     k = how.codes.shape[0]
     residual, jacobian = np.empty(k), np.empty((k, 4))
     if first < n:
-        evaluate(of.rod, x, room.values, third, first, n)
+        evaluate(of.charted.rod, x, room.values, third, first, n)
     for c in range(n):
         if not weigh_any(how, values[c], measured, weights[c]):
             weights[c, 0, 0] = np.nan
@@ -324,7 +324,7 @@ def complete_rows(
                 lanes[n, 0] = 1.0
                 if number[row + n] > 0:
                     copy(out.x[row + n, 0], lanes[n])
-            evaluate(of.rod, lanes, forces, tangents, 0, side)
+            evaluate(of.charted.rod, lanes, forces, tangents, 0, side)
         if not finite(target):
             continue
         x, values, chi = out.x[row], out.values[row], out.chi_squared[row]
@@ -472,8 +472,7 @@ def _leave_room(
     points, likely = probable_nodes(of, white, weights, unit, seen, value[3:], chi)
     bent = not room.described[best] or (_mirrored(how) and not out.valid[row, 0])
     if not described_by_nodes(points, likely[0], spread) and bent:
-        rod = Charted(of.rod, of.fold, of.nodes)
-        follow_valley(rod, of.proximal, how, target, measured, out.x[row, 0], spread)
+        follow_valley(of.charted, of.proximal, how, target, measured, out.x[row, 0], spread)
     log_mass = room.weight[1, best] - sharpness(weights) + _LOG_NORMAL
     share = outside_share(points, likely, value[3:], chi, log_mass, spread, loose)
     out.probability[row, 0] *= 1.0 - share
@@ -504,7 +503,7 @@ def judge_rows(
         if n == 0:
             continue
         judge(
-            Charted(of.rod, of.fold, of.nodes),
+            of.charted,
             of.proximal,
             how.codes,
             target,

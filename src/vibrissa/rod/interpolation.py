@@ -26,7 +26,6 @@ from vibrissa.rod.discretization import Rod
 _PADDED = 8  # (F, p) and two of padding, so that the compiler puts them side by side
 # The compiler does so in one flat buffer only: a corner's rows, and the sums of values and slopes.
 _SUMS = 4 * _PADDED
-BLEND_SIZE = 2 * _SUMS
 # In the first cells from rest a bearing means little; so far beyond the fold, and before the
 # smallest arc length (as η), the outermost cells serve.
 _LEAST, _MOST, _BEFORE = 1.0 / 16.0, 1.02, 1.0 / 32.0

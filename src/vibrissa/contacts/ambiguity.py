@@ -1,10 +1,10 @@
-"""Fewer than three signals: the curve or surface of contacts that explain them, in samples.
+"""Samples of the curve or surface of contacts that explain fewer than three signals.
 
-A contact has three unknowns ξ = (s, f_y, f_z). Two signals leave a curve: at every arc length s of
-a few stations of the map, the forces that give both. One signal leaves a surface: at every station,
-in every direction of the force. Where the set passes the map's chart is seen from the signals at
-its nodes; from there Newton's method on the rod meets it exactly, along the station: where one
-signal leaves the force open, by the shortest step.
+A contact has three unknowns ξ = (s, f_y, f_z). Two signals leave a curve: at each of a few stations
+of the map, the forces that give both. One signal leaves a surface: at each station and in each
+direction of the force. Where the set passes through the chart follows from the signals at its
+nodes; from there Newton's method on the rod finds a point of it exactly, at the same station, by
+the shortest step where one signal leaves the force open.
 """
 
 from __future__ import annotations
@@ -35,27 +35,27 @@ from vibrissa.rod import (
     with_normal_force,
 )
 
-# Every so many of the chart's stations is a sample of arc length, of a surface also of bearings.
+# Stride through the chart's stations, and for a surface also through its bearings.
 _STATIONS = 2
 _BEARINGS = 4
-_MOST = 1024  # at most so many samples
-# A step this small, relative to the force, is the last, and taken to first order.
+_MOST = 1024  # largest number of samples
+# Step, relative to the force, below which it is the last, taken to first order.
 _LAST = 3e-5
 _ROUNDS = 15
-_FAR, _SOON = 0.1, 5  # what is still this far away after so many rounds leads nowhere
-# Signals that are bilinear meet in a face or no farther (in cell widths) from its middle.
+_FAR, _SOON = 0.1, 5  # distance above which a start is given up after these iterations
+# Bilinear signals intersect in a face, or no farther (in cell widths) from its middle.
 _BESIDE = 1.5
-_ONE = 0.1  # where neighbouring faces say that they meet within this (in cell widths) is one place
-# A vanishing force is not a starting point; share of a cell, for one signal and for two.
+_ONE = 0.1  # intersections from adjacent faces within this (in cell widths) are the same
+# Smallest force of a starting point, as a share of a cell, for one signal and for two.
 _REST = (0.05, 0.5)
-_SAME = 1e-4  # two samples of a station within this, relative to the force, are one
-# Directions that signals tell this much worse than others (as a share of variance) they do not
-# tell.
+_SAME = 1e-4  # two samples of a station within this, relative to the force, are the same
+# Ratio of information, relative to other directions, below which signals do not determine a
+# direction.
 _OPEN = 1e-14
 
 
 class Sections(NamedTuple):
-    """A whisker's chart at some stations, non-dimensional but for the units."""
+    """Chart of a whisker at some stations, non-dimensional except for the units."""
 
     rod: Rod
     fold: Fold
@@ -87,7 +87,7 @@ class Ambiguity:
         )
 
     def samples(self, measurement: Measurement) -> tuple[Candidates, int, Array]:
-        """Sample the set: candidates, which one is in their middle, their covariance about it."""
+        """Sample the set: candidates, index of the middle one, their covariance about it."""
         xi, values = np.empty((_MOST, 3)), np.empty((_MOST, 6))
         across, covariance = np.zeros((_MOST, 3, 3)), np.empty((3, 3))
         n, middle = sample(
@@ -128,7 +128,7 @@ def sample(
 
 @inlined
 def _middle(points: Array, across: Array, covariance: Array) -> int:
-    """Which sample is nearest to their mean; fill their covariance about it, and its own."""
+    """Index of the sample nearest to the mean; fill the covariance about it, its own included."""
     n, mean, chosen, least = points.shape[0], np.zeros(3), 0, np.inf
     for row in range(n):
         for a in range(3):
@@ -151,7 +151,7 @@ def _middle(points: Array, across: Array, covariance: Array) -> int:
 
 @kernel
 def _starts(of: Sections, how: Weighing, target: Array, starts: Array) -> int:
-    """Fill ξ where the set about passes the sections; how many."""
+    """Fill ξ near which the set passes through the sections; return their number."""
     q = of.seen.shape[3]
     wanted = np.zeros(q)
     for i in range(q):
@@ -207,7 +207,7 @@ def _starts(of: Sections, how: Weighing, target: Array, starts: Array) -> int:
 
 @inlined
 def _turned(away: Array, turns: AnyArray, j: int, k: int, q: int) -> bool:
-    """Whether a direction in a face, or along the load, only jumps by a turn."""
+    """Whether a direction merely jumps by a full turn in a face, or along the load."""
     turned = False
     for i in range(q):
         a, b = away[j, k, i], away[j, k + 1, i]
@@ -221,10 +221,10 @@ def _turned(away: Array, turns: AnyArray, j: int, k: int, q: int) -> bool:
 
 @inlined
 def _crossings(away: Array, j: int, k: int, crossings: Array) -> int:
-    """Fill where two signals, if they are bilinear, are both met in a face or next to it; how many.
+    """Fill the intersections of two signals, taken as bilinear, in or near a face; their number.
 
-    In cell widths from its corner (j, k); the middle where their curves miss each other, for then
-    they about touch.
+    They are in cell widths from its corner (j, k); where the curves miss each other, the middle,
+    near which they almost touch.
     """
     c = np.empty((2, 4))
     for i in range(2):
@@ -233,7 +233,7 @@ def _crossings(away: Array, j: int, k: int, crossings: Array) -> int:
         scale = 1.0 / (abs(a00) + abs(a01) + abs(a10) + abs(a11))
         c[i, 0], c[i, 1] = scale * a00, scale * (a10 - a00)
         c[i, 2], c[i, 3] = scale * (a01 - a00), scale * (a11 - a10 - a01 + a00)
-    # In the place (u, v) of a face: without v, a u² + b u + d = 0.
+    # At (u, v) in a face: eliminating v gives a u² + b u + d = 0.
     a = c[1, 1] * c[0, 3] - c[0, 1] * c[1, 3]
     b = c[1, 0] * c[0, 3] + c[1, 1] * c[0, 2] - c[0, 0] * c[1, 3] - c[0, 1] * c[1, 2]
     d = c[1, 0] * c[0, 2] - c[0, 0] * c[1, 2]
@@ -257,7 +257,7 @@ def _crossings(away: Array, j: int, k: int, crossings: Array) -> int:
 def _met(
     of: Sections, how: Weighing, target: Array, n: int, xi: Array, values: Array, tangents: Array
 ) -> int:
-    """Move starts along their stations onto the set; keep the stable ones, each once; how many."""
+    """Move starts at their stations onto the set; return the number of stable, distinct ones."""
     b, row, rounds = np.zeros(BUFFER_SIZE), np.full(LANES, -1), np.zeros(LANES, np.int64)
     k, q = how.codes.shape[0], how.mixing.shape[0]
     x, value, third, t = np.zeros(4), np.empty(6), np.empty((6, 3)), np.zeros((6, 4))
@@ -345,7 +345,7 @@ def _shortest(
 def _across(
     how: Weighing, measured: Array, xi: Array, value: Array, tangent: Array, out: Array
 ) -> None:
-    """Fill the covariance (3, 3) of the contact point that noise makes, across the set."""
+    """Fill the covariance (3, 3) of the contact point due to noise, across the set."""
     k, q = how.codes.shape[0], how.mixing.shape[0]
     weights, x, t = np.empty((k, k)), np.zeros(4), np.zeros((6, 4))
     residual, jacobian = np.empty(k), np.empty((k, 4))
@@ -353,7 +353,7 @@ def _across(
         return
     force = np.hypot(xi[1], xi[2])
     x[0], x[2], x[3] = xi[0], xi[1], xi[2]
-    for a in range(6):  # forces in shares of the force
+    for a in range(6):  # forces relative to their size
         t[a, 0], t[a, 2], t[a, 3] = tangent[a, 0], force * tangent[a, 1], force * tangent[a, 2]
     channel_equations(x, value, t, how.codes, np.zeros(k), residual, jacobian)
     j, gram, root = np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((3, 2))
@@ -366,7 +366,7 @@ def _across(
             gram[i, c] = j[i, 0] * j[c, 0] + j[i, 1] * j[c, 1] + j[i, 2] * j[c, 2]
     det = gram[0, 0] * gram[1, 1] - gram[0, 1] * gram[1, 0]
     if q == 1 or not det > _OPEN * gram[0, 0] * gram[1, 1]:
-        more = 1 if gram[1, 1] > gram[0, 0] else 0  # the one that is determined better
+        more = 1 if gram[1, 1] > gram[0, 0] else 0  # the direction that is determined better
         for c in range(2):
             j[1 - more, c], gram[1 - more, c], gram[c, 1 - more] = 0.0, 0.0, 0.0
         j[1 - more, 2], gram[1 - more, 1 - more] = 0.0, 1.0

@@ -1,14 +1,14 @@
-"""Contacts with a known object that touches in several points, or along an arc, from the wrench.
+"""Contacts with a known object, in one or several points or along an arc, from the wrench.
 
-Shape and direction of the object are known, its position up to a shift d with a prior N(0, σ²).
-Any d has one equilibrium (:mod:`vibrissa.rod.around`), hence one force and moment w(d) at the base
-and one set of contacts. The shift of least
+Shape and orientation of the object are known, its position up to a shift d with a prior N(0, σ²).
+Each d has one equilibrium (:mod:`vibrissa.rod.around`), hence one force and moment w(d) at the base
+and one set of contacts. The shift that minimises
 
     χ²(d) = |W (w(d) - measured)|² + |d|² / σ²
 
-is found by Levenberg and Marquardt's method, each equilibrium continuing the one before;
-derivatives are differences at fixed nodes. Six components with three unknowns leave three to tell
-whether the object explains the measurement.
+is found by the Levenberg-Marquardt method, each equilibrium starting from the last one; derivatives
+are finite differences at fixed nodes. Six components with three unknowns leave three degrees of
+freedom to test whether the object explains the measurement.
 """
 
 from __future__ import annotations
@@ -30,12 +30,13 @@ from vibrissa.signals import Coordinates
 from vibrissa.status import Status, flag_attributes
 from vibrissa.whisker import Whisker
 
-# Rounds, the longest step (over L), and the step of the derivatives.
+# Iterations, longest step (over L), and step of the finite differences.
 _ROUNDS, _LONGEST, _STEP = 30, 0.05, 1e-5
-_DONE = 1e-2  # a step of this share of the standard deviations is the last
-# Elements of the last rounds, whose nodes are near enough not to move contacts by what is stated.
+_DONE = 1e-2  # step, in standard deviations, below which it is the last
+# Elements in the last iterations, fine enough that nodes do not shift contacts beyond their error.
 _FINE = 96
-# Between nodes, where an arc may begin, the whisker is along the object to this, over L.
+# Tolerance, over L, within which the whisker follows the object between nodes, where an arc may
+# begin.
 _BETWEEN = 5e-5
 
 
@@ -158,7 +159,7 @@ def _fitted(
     weights: Array,
     sigma: float,
 ) -> _Fit | None:
-    """Equilibrium and shift (3,) of least χ², derivatives (9, 3) of its residuals, and χ²."""
+    """Equilibrium and shift (3,) of minimum χ², derivatives (9, 3) of its residuals, and χ²."""
     coarse, fine = grids
     shift = coarse.reaching(place)
     found = None if shift is None else coarse.from_outside(place, shift)
@@ -182,7 +183,7 @@ def _descended(
     found: Equilibrium,
     shift: Array,
 ) -> _Fit | None:
-    """Fit from an equilibrium on, with its nodes."""
+    """Fit starting from an equilibrium, with its nodes."""
 
     def residual(one: Equilibrium, at: Array) -> Array:
         return np.concatenate([weights @ (one.wrench() - measured), at / sigma])
@@ -221,9 +222,9 @@ def _spread(
     shift: Array,
     covariance: Array,
 ) -> Array:
-    """Second moment of the first contact about its estimate, of second order in the shift.
+    """Second moment of the first contact about its estimate, to second order in the shift.
 
-    By six shifts of √3 standard deviations, along the axes of the shift's covariance.
+    From six shifts of √3 standard deviations along the axes of the shift's covariance.
     """
     out, point = _BETWEEN**2 * np.eye(3), found.first_contact()[1]
     size, axes = np.linalg.eigh(covariance)

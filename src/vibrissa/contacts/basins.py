@@ -1,10 +1,11 @@
-"""Where else contacts may be that explain a measurement: basins of the chart's cells; compiled.
+"""Basins of the chart's cells in which further contacts may explain a measurement; compiled.
 
-The cells of the tree that may hold signals within two standard deviations of the measured ones form
-basins, separated by cells that come less near, or where the vector of a direction may vanish. Each
-that known contacts do not explain by their slopes has a contact from which to look for another.
-Cells at the fold are basins of their own, with starts on it: χ² may be least there, however near a
-contact is that explains the measurement.
+The search tree lists the cells that may contain signals within two standard deviations of the
+measured ones. Adjacent cells belong to one basin unless cells that miss the measurement by more
+separate them, or cells in which the vector of a direction may vanish. A basin that no known
+contact explains through its slopes supplies a starting point for a fit. Cells at the fold form
+basins of their own, with starting points on the fold: χ² may have a minimum there, however near
+another contact explains the measurement.
 """
 
 from __future__ import annotations
@@ -22,19 +23,19 @@ from vibrissa.numerics import Array, IntArray, copy, inlined, kernel
 from vibrissa.rod import MOST_CELLS, along, cells_around, chart_to_contact, fold_force
 from vibrissa.signals import FY, MY
 
-_WIDEST = 1e3  # the most that cells are asked for in a quantity; more than half a turn
-# Between two basins cells must miss the measurement by so much more, relative to the slack.
+_WIDEST = 1e3  # largest distance searched for in one quantity; more than half a turn
+# Height of a sill between two basins: by how much more its cells miss, relative to the slack.
 _SILL = 0.5
-# What a known contact explains by its slopes: χ² of three quantities, each up to the slack away,
-# and as much again for what cells are wrong by.
+# Largest χ² that the slopes of a known contact explain: three quantities, each up to the slack
+# away, and as much again for the errors of cells.
 _LINEAR = 25.0
 
 
 @inlined
 def deviations(of: Searched, how: Weighing, value: Array, measured: Array, out: Array) -> None:
-    """Standard deviations of the three quantities that the tree is asked for, near (F, p)."""
+    """Standard deviations of the three quantities by which the tree is searched, near (F, p)."""
     k = how.codes.shape[0]
-    if how.own[0, 0] > 0.0:  # a mix of components, white
+    if how.own[0, 0] > 0.0:  # mixed components, white
         for q in range(3):
             out[q] = 1.0
         return
@@ -76,10 +77,10 @@ def _start_at(of: Searched, spot: Array, start: Array) -> None:
 
 @inlined
 def _adjacent(of: Searched, a: int, b: int) -> bool:
-    """Whether two cells touch, and both or neither are at the fold, and where a vector may vanish.
+    """Whether two cells may belong to one basin: they touch, and both or neither are at the fold.
 
-    Cells where it may hold any direction: they would join basins that they lie between. Near rest
-    bearings are all one.
+    Cells in which a transverse vector may vanish contain any direction and would join the basins on
+    either side of them, so they are adjacent only to each other. Near rest all bearings are.
     """
     if _at_fold(of, a) != _at_fold(of, b) or (of.tree.polar[a] < 0) != (of.tree.polar[b] < 0):
         return False
@@ -110,7 +111,7 @@ def _at_fold(of: Searched, cell: int) -> bool:
 
 @inlined
 def _root(parent: IntArray, i: int) -> int:
-    """Which basin a cell belongs to."""
+    """Root of the basin that a cell belongs to."""
     while parent[i] != i:
         i = parent[i]
     return i
@@ -122,7 +123,7 @@ def _basins(
 ) -> None:
     """Fill the order of cells by how far they miss, and the basin (its best cell) of each.
 
-    Cells that touch are of one basin unless they are separated by a sill.
+    Cells that touch belong to one basin unless a sill separates them.
     """
     for i in range(n):
         place = i
@@ -147,8 +148,8 @@ def _basins(
 class _Room(NamedTuple):
     """Working memory.
 
-    Target and slack (3,), known contacts in the chart (n, 3); of each cell its number, where in the
-    chart it is nearest (n, 3), how far it misses, its order and its basin.
+    Target and slack (3,), known contacts in the chart (n, 3); for each cell its number, the nearest
+    position in the chart (n, 3), the distance by which it misses, its rank and its basin.
     """
 
     target: Array
@@ -173,9 +174,9 @@ def starts_of_basins(
     number: int,
     starts: Array,
 ) -> tuple[int, bool]:
-    """Fill contacts to start from, one for each basin that known contacts x do not explain.
+    """Fill one starting contact for each basin that the known contacts x do not explain.
 
-    Return how many there are, and whether there are more.
+    Return their number, and whether there are more.
     """
     room = _Room(
         np.empty(3),
@@ -203,7 +204,7 @@ def _starts(
     starts: Array,
     room: _Room,
 ) -> tuple[int, bool]:
-    """Fill starts; arrays made by another function are not counted at each use."""
+    """Fill starting contacts; kernels do not count references to arrays that a caller allocates."""
     target, slack, known, cells, spots, away, order, parent = room
     kept, count = 0, 0
     for q in range(3):

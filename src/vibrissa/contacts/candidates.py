@@ -1,9 +1,9 @@
 """All contacts that explain measurements; compiled.
 
 Three signals have as many unknowns: every contact with T(ξ) = T is found from the search tree. More
-signals are explained by least squares from where the tree has three quantities. Where no such
-contact explains the measurement, the search starts again from the nodes of the chart that come
-nearest, one for each of sixteen parts of it. What noise adds is in
+signals are explained by least squares, starting from the contacts at which three quantities have
+the measured values. If no such contact explains the measurement, fits start from the nodes of the
+chart that come nearest, one in each of its sixteen parts. The treatment of noise is in
 :mod:`~vibrissa.contacts.ranking`.
 """
 
@@ -45,17 +45,19 @@ from vibrissa.status import Status
 
 _UNIQUE, _AMBIGUOUS = int(Status.UNIQUE), int(Status.AMBIGUOUS)
 _OUTSIDE, _FRICTION = int(Status.OUTSIDE_MAP), int(Status.NOT_FRICTIONLESS)
-#: Status of rows of three signals that no contact explains, whose reason is still to be found.
+#: Status of rows of three signals without a contact, before the reason is determined.
 UNEXPLAINED = -1
 _MOST_ROWS = MOST_SEEDS + PARTS
 _TIMES = 8
-# At the foot of a valley fits are slow, and most go the same way: one that is this near in χ² to a
-# better one is given up if on the way there χ² does not rise by more than this.
+# Difference of χ² to a better fit within which one is given up if χ² rises by no more than the
+# second value on the path between them: near the floor of a valley fits are slow, and most end
+# together.
 _CLOSE, _SILL = 0.3, 0.01
-_FORCE = 1e-6  # of candidates that explain signals equally well the one with less force comes first
+# Of candidates that explain signals equally well, the one with less force comes first.
+_FORCE = 1e-6
 
-# Row by row: x (n, 4), (F, p) (n, 6), ∂(F, p)/∂x (n, 6, 4), χ² (n,), and where a fit ended (n,):
-# 2 on the map, 1 nearer to the base, 0 nowhere.
+# By row: x (n, 4), (F, p) (n, 6), ∂(F, p)/∂x (n, 6, 4), χ² (n,), and where a fit ended (n,): 2 on
+# the map, 1 nearer to the base, 0 neither.
 State = tuple[Array, Array, Array, Array, IntArray]
 
 
@@ -72,10 +74,10 @@ def explain_rows(
     first: int,
     last: int,
 ) -> None:
-    """Find the candidates of measurements by least squares; NaN rows are left alone.
+    """Find the candidates of measurements by least squares; NaN rows stay as they are.
 
-    With noise they are completed and ranked before their status is known; ``again`` then states
-    why the rows that are UNEXPLAINED have no contact.
+    With noise the candidates are completed and ranked before their status is determined; ``again``
+    then states why the rows that are UNEXPLAINED have no contact.
     """
     of, how, problem, out = task.of, task.how, task.problem, in_memory(number, flat, valid)
     x, values, chi = (
@@ -97,7 +99,7 @@ def explain_rows(
         if not again:
             x, values, chi = out.x[row], out.values[row], out.chi_squared[row]
         most, starts = _best(of, how, problem, target, seen, state, x, values, chi)
-        if again:  # perhaps a contact nearer to the base than the map goes explains it
+        if again:  # perhaps a contact nearer to the base than the map's limit explains it
             starts = _everywhere(of, how, problem, target, seen, state, starts)
         else:
             out.number[row] = most
@@ -124,7 +126,7 @@ def solve_rows(
     first: int,
     last: int,
 ) -> None:
-    """Find the contacts that give three signals exactly; NaN rows are left alone."""
+    """Find the contacts that give three signals exactly; NaN rows stay as they are."""
     of, out, n = task.of, in_memory(number, flat, valid), last - first
     aims, xi = np.empty((n, 6)), np.empty((n, MOST_CANDIDATES, 3))
     for i in range(n):
@@ -150,7 +152,7 @@ def solve_rows(
 
 @inlined
 def finite(target: Array) -> bool:
-    """Whether all numbers of a measurement are known."""
+    """Whether all values of a measurement are finite."""
     total = 0.0
     for k in range(target.shape[0]):
         total += target[k]
@@ -169,7 +171,7 @@ def _best(
     solved: Array,
     chi: Array,
 ) -> tuple[int, int]:
-    """Fill the contacts that explain a measurement best; how many, and how many fits there are."""
+    """Fill the contacts that explain a measurement best; their number, and that of all fits."""
     x, values, tangents, misfits, inside = state
     limit = problem.limit
     x[:], tangents[:], misfits[:], inside[:] = 0.0, 0.0, np.inf, 0
@@ -191,7 +193,7 @@ def _best(
 
 @inlined
 def _nearest_fit(misfits: Array, inside: IntArray, n: int, kept: IntArray) -> int:
-    """Fill which fit on the map comes nearest; 1, or 0 if there is none."""
+    """Fill the index of the fit on the map that comes nearest; return 1, or 0 if there is none."""
     number, best = 0, np.inf
     for row in range(n):
         if inside[row] == 2 and misfits[row] < best:
@@ -203,7 +205,7 @@ def _nearest_fit(misfits: Array, inside: IntArray, n: int, kept: IntArray) -> in
 def _seeded(
     of: Searched, how: Weighing, target: Array, measured: Array, x: Array, values: Array
 ) -> int:
-    """Fill contacts that about give three quantities, or rather all, and (F, p); how many."""
+    """Fill contacts, and (F, p), that nearly give three quantities or all; their number."""
     found, quality = np.empty((MOST_SEEDS, 3)), np.empty(MOST_SEEDS, np.int64)
     slopes, xi, three = np.empty((MOST_SEEDS, 3, 3)), np.empty(3), np.empty(3)
     number = 0
@@ -233,7 +235,7 @@ def _fitted(
     first: int,
     last: int,
 ) -> None:
-    """Fit from some rows; fill whether a fit is on the map (2), or nearer to the base (1)."""
+    """Fit from some rows; fill whether a fit is on the map (2) or nearer to the base (1)."""
     x, values, tangents, misfits, inside = state
     k, n = how.codes.shape[0], x.shape[0]
     targets, weights = np.empty((n, k)), np.empty((n, k, k))
@@ -286,9 +288,9 @@ def _downhill(
     others: IntArray,
     row: int,
 ) -> bool:
-    """Whether from a contact the way to one on the map that fits a little better goes down.
+    """Whether χ² decreases on the path from a contact to one on the map that fits slightly better.
 
-    It goes where s and s f, about the moment, change evenly: valleys of χ² lie along those.
+    The path is straight in s and s f, about the moment, along which valleys of χ² extend.
     """
     b, k = np.zeros(BUFFER_SIZE), codes.shape[0]
     value, at, t = np.empty(6), np.zeros(4), np.zeros((6, 4))
@@ -347,7 +349,7 @@ def _everywhere(
     state: State,
     n: int,
 ) -> int:
-    """Fit from the nodes of all parts of the map that come nearest; how many rows there are."""
+    """Fit from the nearest node of each part of the map; return the number of rows."""
     x, values = state[0], state[1]
     nearest = np.full(PARTS, -1)
     nearest_of(of, how.mixing, target, nearest)
@@ -368,7 +370,7 @@ def _everywhere(
 def _chosen(
     x: Array, misfits: Array, inside: IntArray, limit: float, n: int, kept: IntArray
 ) -> int:
-    """Fill which fits explain the measurement and are indistinguishable, the best first."""
+    """Fill the fits that explain the measurement and are indistinguishable, the best first."""
     doubt, least = np.full(n, np.inf), np.inf
     for row in range(n):
         if inside[row] == 2:

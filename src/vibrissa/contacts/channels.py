@@ -1,8 +1,8 @@
-"""Channels: what a contact is fitted to, so that noise is as nearly Gaussian as may be.
+"""Channels: the quantities that contacts are fitted to, chosen for nearly Gaussian noise.
 
-A size and its direction, F_T with F_D or M_B with M_D, where both are measured, are taken together
-as the two components that they came from: these stay regular where the size is zero. A size or a
-direction alone is a channel of its own. Everything is non-dimensional.
+A size and its direction, F_T with F_D or M_B with M_D, are replaced by the two components of their
+vector if both are measured: these remain regular where the size is zero. A size or a direction
+alone is a channel of its own. All quantities are non-dimensional.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from vibrissa.signals import (
     wrench_derivatives,
 )
 
-#: What can be fitted to: the signals, and the components that they are made of.
+#: Possible channels: the signals, and the components of force and moment.
 CHANNELS = (*SIGNALS, "Fy", "Fz", "My", "Mz")
-#: What can be held on to as well: arc length and contact point, over L, and the force along the
-#: whisker over that across it.
+#: Further quantities that can be held: arc length and contact point, over L, and the ratio of the
+#: force along the whisker to that across it.
 FITTED = (*CHANNELS, "s", "px", "py", "pz", "ratio")
 RATIO = FITTED.index("ratio")
-#: Which of the channels are angles.
+#: Whether each channel is an angle.
 CIRCULAR = (*CIRCULAR_SIGNALS, False, False, False, False)
 #: The six components of force and moment.
 WRENCH = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
-# Components of (F, M) that are the last channels.
+# Components of (F, M), which are the last channels.
 _COMPONENTS = (1, 2, 4, 5)
 _PAIRS = {("FT", "FD"): ("Fy", "Fz"), ("MB", "MD"): ("My", "Mz")}
 
@@ -54,7 +54,7 @@ class Channels:
 
     @classmethod
     def of(cls, signals: tuple[str, ...]) -> Channels:
-        """Choose the channels of signals in canonical order.
+        """Choose the channels for signals in canonical order.
 
         Parameters
         ----------
@@ -74,12 +74,12 @@ class Channels:
         return cls(signals, tuple(names))
 
     def pairs(self) -> list[int]:
-        """Places where a size is followed by its direction, and both are one vector.
+        """Indices of the sizes that are followed by their direction as components of one vector.
 
         Returns
         -------
         list of int
-            Place of each size.
+            Index of each size.
         """
         return [
             i
@@ -88,7 +88,7 @@ class Channels:
         ]
 
     def targets(self, measured: Array) -> Array:
-        """Turn measured signals into channels.
+        """Convert measured signals to channels.
 
         Parameters
         ----------
@@ -165,7 +165,7 @@ class Channels:
 
 
 def wrenches_of(values: Array) -> Array:
-    """(F, M) (..., 6) of (F, p) (..., 6), or of (F, p, μ) with a moment μ of the weight."""
+    """(F, M) (..., 6) from (F, p) (..., 6), or from (F, p, μ) with the weight's moment μ."""
     moment = np.cross(values[..., 3:6], values[..., :3])
     if values.shape[-1] > len(WRENCH):
         moment = moment + values[..., 6:]
@@ -173,7 +173,7 @@ def wrenches_of(values: Array) -> Array:
 
 
 def channels_of(values: Array) -> Array:
-    """All channels (..., 10) of (F, p) or (F, p, μ)."""
+    """All channels (..., 10) from (F, p) or (F, p, μ)."""
     wrench = wrenches_of(values)
     signals = signals_of(wrench[..., :3], wrench[..., 3:])
     return np.concatenate([signals, wrench[..., _COMPONENTS]], axis=-1)
@@ -190,12 +190,12 @@ def channel_gradients(values: Array, names: tuple[str, ...]) -> Array:
 
 
 def channel_derivatives(values: Array, tangents: Array, names: tuple[str, ...]) -> Array:
-    """Derivatives of channels with respect to unknowns of the contact."""
+    """Derivatives of channels with respect to the unknowns of the contact."""
     return np.asarray(channel_gradients(values, names) @ wrench_tangents(values, tangents))
 
 
 def wrench_tangents(values: Array, tangents: Array) -> Array:
-    """Derivatives of (F, M), (..., 6, u), by those of (F, p) or (F, p, μ)."""
+    """Derivatives of (F, M), (..., 6, u), from those of (F, p) or (F, p, μ)."""
     d_force, d_point = tangents[..., :3, :], tangents[..., 3:6, :]
     d_moment = np.cross(d_point, values[..., :3, None], axis=-2)
     d_moment += np.cross(values[..., 3:6, None], d_force, axis=-2)
@@ -205,7 +205,7 @@ def wrench_tangents(values: Array, tangents: Array) -> Array:
 
 
 def ratio_of(x: Array) -> Array:
-    """Ratios (n,) of the force along the whisker to that across it, of contacts (n, 4)."""
+    """Ratios (n,) of the force along the whisker to that across it, for contacts (n, 4)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(x[:, 1] / np.hypot(x[:, 2], x[:, 3]))
 
@@ -218,11 +218,11 @@ def ratio_derivatives(x: Array) -> Array:
 
 
 def friction_angle(x: Array) -> Array:
-    """Angles (...) of forces x (..., 1:4) from the plane normal to the whisker, rad."""
+    """Angles (...) between forces x (..., 1:4) and the plane normal to the whisker, rad."""
     return np.arctan2(x[..., 1], np.hypot(x[..., 2], x[..., 3]))
 
 
 def friction_angle_derivatives(x: Array) -> Array:
-    """Derivatives (n, 4) of the angles of friction by contacts x (n, 4)."""
+    """Derivatives (n, 4) of the friction angles with respect to contacts x (n, 4)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(ratio_derivatives(x) / (1.0 + ratio_of(x)[:, None] ** 2))

@@ -1,4 +1,4 @@
-"""A whisker with the chart of its contacts: what estimates need of a contact map."""
+"""Protocol of a whisker with the chart of its contacts: the part of a contact map estimates use."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from vibrissa.whisker import Whisker
 
 
 class ChartedWhisker(Protocol):
-    """A :class:`~vibrissa.contacts.ContactMap`, as the modules below it see it."""
+    """A :class:`~vibrissa.contacts.ContactMap`, as the modules below it require it."""
 
     @property
     def whisker(self) -> Whisker:
@@ -30,7 +30,7 @@ class ChartedWhisker(Protocol):
         """Check whether signals determine contacts."""
 
     def sagged(self, gravity: tuple[float, float, float]) -> ChartedWhisker:
-        """Map of a whisker without weight that has the shape of this one under its weight."""
+        """Map of a weightless whisker with the shape of this one under its weight."""
 
     def __hash__(self) -> int:
-        """Maps are kept by identity."""
+        """Hash by identity, so that results are cached per map."""

@@ -1,4 +1,4 @@
-"""Contacts to ask something about: the nodes of a map, the paper's grid, or those of a trial."""
+"""Contacts at which sensitivity is evaluated: nodes of a map, the paper's grid, or a trial's."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ from vibrissa.rod import (
 from vibrissa.signals import base_signals
 from vibrissa.status import Status
 
-#: Where sensitivity is asked for; see :func:`chosen_contacts`.
+#: Choice of contacts; see :func:`chosen_contacts`.
 At: TypeAlias = "xr.DataTree | xr.Dataset | Mapping[str, ArrayLike] | ArrayLike | str | None"
 
 
 @dataclass(frozen=True, eq=False)
 class ChosenContacts:
-    """Contacts in a row, non-dimensional (lengths over L, forces over EI/L²)."""
+    """Contacts in a flat sequence, non-dimensional (lengths over L, forces over EI/L²)."""
 
     contacts: Array  # (n, 3), contacts (s, f_y, f_z)
     values: Array  # (n, 6), base force and contact point
     tangents: Array  # (n, 6, 3), derivatives of those with respect to the contacts
     status: IntArray  # (n,), status of each
-    shape: tuple[int, ...]  # shape that they were given in, n in all
-    dims: tuple[str, ...]  # names of its dimensions
+    shape: tuple[int, ...]  # shape of the input, with n contacts in all
+    dims: tuple[str, ...]  # names of the dimensions
     coords: dict[Hashable, Any]  # coordinates along them
-    volume: Array | None = None  # (n,), volumes of contact points that they stand for, m³
+    volume: Array | None = None  # (n,), volume of contact points that each represents, m³
 
 
 def chosen_contacts(
     contact_map: ContactMap, at: At = None, triplet: tuple[str, ...] = ("Fx", "MB", "MD")
 ) -> ChosenContacts:
-    """Find the contacts that are asked about."""
+    """Contacts at the chosen points, solved with derivatives."""
     if at is None:
         return _nodes(contact_map)
     if isinstance(at, str):
@@ -65,11 +65,11 @@ def chosen_contacts(
 
 
 def _nodes(contact_map: ContactMap) -> ChosenContacts:
-    """All nodes of the chart; the last bearing is the first one again and left out."""
+    """All nodes of the chart without the last bearing, which repeats the first."""
     chart = contact_map.chart
     tangents = chart.tangents[:, :-1]
     shape = tangents.shape[:3]
-    # Each stands for the volume |∂p/∂(η, ψ, ρ)| of its cell, half as large at the box's faces.
+    # Each represents the volume |∂p/∂(η, ψ, ρ)| of its cell, half as large at the box's faces.
     frames = np.abs(np.linalg.det(chart.frames[:, :-1]))
     ends = [np.ones(n) for n in shape]
     for k in (0, 2):
@@ -174,7 +174,7 @@ def _solved(
     dims: tuple[str, ...],
     coords: dict[Hashable, Any],
 ) -> ChosenContacts:
-    """Force, point and derivatives of the contacts that there are."""
+    """Force, point and derivatives of the contacts that exist."""
     n = len(contacts)
     values, tangents = np.full((n, 6), np.nan), np.full((n, 6, 3), np.nan)
     rows = np.flatnonzero(np.isfinite(contacts).all(axis=1))
@@ -185,7 +185,7 @@ def _solved(
 
 
 def large_deflection(contact_map: ContactMap, chosen: ChosenContacts) -> AnyArray:
-    """Whether the deflected whisker points back at each contact; False where there is none."""
+    """Whether the deflected whisker points back at each contact; False without a contact."""
     contacts = with_normal_force(chosen.contacts)
     tangents = contact_tangents(contact_map.chart.discretization, contacts)
     return np.asarray(tangents[:, 0] < 0.0)

@@ -83,12 +83,12 @@ Domain = Literal["reachable", "paper"]
 
 @dataclass(frozen=True, eq=False)
 class ContactMap:
-    """The contacts of one whisker and their signals; made by :meth:`simulate` or :meth:`load`.
+    """Contacts of one whisker and their signals; constructed by :meth:`simulate` or :meth:`load`.
 
     Attributes
     ----------
     whisker : Whisker
-        Whose contacts.
+        The whisker.
     chart : StableSet
         The stable contacts, non-dimensional.
     steps : int
@@ -279,7 +279,7 @@ class ContactMap:
 
     @lru_cache(maxsize=8)  # noqa: B019
     def sagged(self, gravity: tuple[float, float, float]) -> ContactMap:
-        """Map of a whisker without weight that has the shape of this one under its weight."""
+        """Map of a weightless whisker with the shape of this one under its weight."""
         along, around, loads = (n - 1 for n in self.chart.values.shape[:3])
         return ContactMap.simulate(
             resting(self.whisker, gravity).shape(),
@@ -377,7 +377,7 @@ class ContactMap:
         return lines("ContactMap", self._rows())
 
     def _rows(self) -> list[tuple[str, str]]:
-        """Whose contacts they are, how many, and how large the signals."""
+        """Number of contacts, their whisker, and the ranges of the signals."""
         data = self._samples
         rows = [("whisker", repr(self.whisker))]
         rows += [("note", note) for note in self.whisker.notes]
@@ -562,13 +562,13 @@ def _load(path: Path, grid: bool) -> ContactMap:
         whisker = Whisker.from_dataset(groups["whisker"])
         steps = int(groups["/"].attrs["steps"])
         chart = _chart(groups["chart"].variables, discretize(whisker, steps))
-        if solved is not None:  # files keep a coordinate of the root only there
+        if solved is not None:  # files store a coordinate of the root only there
             solved = solved.assign_coords(space=["x", "y", "z"])
     return ContactMap(whisker, chart, steps, solved)
 
 
 def _chart(raw: Mapping[str, AnyArray], discretization: Discretization) -> StableSet:
-    """Contacts of a file."""
+    """Stable set stored in a file."""
     names = ("stations", "bearings", "loads", "contacts", "values", "tangents", "frames")
     return StableSet(
         discretization=discretization,

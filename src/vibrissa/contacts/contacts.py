@@ -1,4 +1,4 @@
-"""Contacts found from measurements: the result of every way of estimating them."""
+"""Estimated contacts: the results of all methods of estimation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vibrissa.signals import Coordinates, spherical
 from vibrissa.sketch import CONTACT, REST, Mark, card, lines, shown, views
 from vibrissa.status import Status, counted, describe, flag_attributes
 
-#: At most so many candidates are kept for one measurement.
+#: Largest number of candidates for one measurement.
 MOST_CANDIDATES = 8
 _CERTAIN = (Status.UNIQUE, Status.TIP_CONTACT)
 _SPACE = ["x", "y", "z"]
@@ -36,15 +36,15 @@ class Candidates(NamedTuple):
 
     @classmethod
     def room(cls, n: int, most: int = MOST_CANDIDATES) -> Candidates:
-        """Make room for candidates of n measurements."""
+        """Allocate candidates of n measurements."""
         return candidates_within(*Room.of(n, most))
 
     def allowed_first(self, allowed: AnyArray) -> Candidates:
-        """Leave out candidates that are not allowed; the others keep their order."""
+        """Drop candidates that are not allowed; the others keep their order."""
         return self.ordered(np.argsort(~allowed, axis=1, kind="stable"), allowed.sum(axis=1))
 
     def ordered(self, order: IntArray, number: IntArray) -> Candidates:
-        """Candidates in another order (n, k), of which as many as stated are left."""
+        """Candidates in another order (n, k), and how many of them remain."""
         line = np.arange(len(order))[:, None]
         gone = np.arange(order.shape[1]) >= number[:, None]
         parts = [values[line, order] for values in self[1:]]
@@ -53,18 +53,18 @@ class Candidates(NamedTuple):
         return Candidates(number, *parts)
 
     def trimmed(self) -> Candidates:
-        """Copy as many candidates as any measurement has."""
+        """Copy of the columns that any measurement uses."""
         most = max(1, int(self.number.max(initial=0)))
         return Candidates(self.number, *(values[:, :most].copy() for values in self[1:]))
 
     @classmethod
     def joined(cls, parts: list[Candidates]) -> Candidates:
-        """Join candidates of measurements that follow one another; the list is emptied."""
+        """Concatenate candidates of successive measurements; the list is emptied."""
         count, most = sum(len(one.number) for one in parts), max(one.x.shape[1] for one in parts)
         number = np.empty(count, np.int64)
         fields = [np.empty((count, most, *v.shape[2:]), v.dtype) for v in parts[0][1:]]
         start = count
-        while parts:  # the memory of a part is free again before more is written
+        while parts:  # free the memory of a part before more is written
             part = parts.pop()
             start, end = start - len(part.number), start
             number[start:end] = part.number
@@ -75,7 +75,7 @@ class Candidates(NamedTuple):
         return cls(number, *fields)
 
     def spread_out(self, rows: IntArray, n: int) -> Candidates:
-        """Place the candidates of some measurements among those of n."""
+        """Candidates of some measurements, at their rows among those of n."""
         out = Candidates.room(n, self.x.shape[1])
         for mine, theirs in zip(out, self, strict=True):
             mine[rows] = theirs
@@ -83,17 +83,17 @@ class Candidates(NamedTuple):
 
 
 class Room(NamedTuple):
-    """Memory of the candidates of n measurements, in few pieces: kernels take them apart."""
+    """Memory for the candidates of n measurements, in few arrays, which kernels divide."""
 
     number: IntArray  # (n,), number of candidates
-    flat: Array  # (22 n k,), all numbers of `Candidates`, one array after the other
+    flat: Array  # (22 n k,), all floating-point arrays of `Candidates`, concatenated
     valid: AnyArray  # (n, k), whether the covariances are valid
 
     @classmethod
     def of(cls, n: int, most: int = MOST_CANDIDATES) -> Room:
-        """Make room for n measurements."""
+        """Allocate memory for n measurements."""
         flat = np.empty(22 * n * most)
-        flat.fill(np.nan)  # in half the time of `np.full`
+        flat.fill(np.nan)  # takes half the time of `np.full`
         return cls(np.zeros(n, np.int64), flat, np.zeros((n, most), np.bool_))
 
 
@@ -114,7 +114,7 @@ def candidates_within(number: IntArray, flat: Array, valid: AnyArray) -> Candida
 
 
 def friction_assumed(friction: float) -> str:
-    """Say what an estimate assumes of friction along the whisker.
+    """Sentence on the friction that an estimate assumes.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def friction_assumed(friction: float) -> str:
 
 
 class _Located:
-    """Properties that follow from what contacts are stored as."""
+    """Properties that follow from the stored fields of contacts."""
 
     point: Array
     force: Array
@@ -349,7 +349,7 @@ def contacts_of(
     coords: Coordinates,
     friction: float = 0.0,
 ) -> Contacts:
-    """Give candidates of flat measurements their units, in place, and the measurements' shape."""
+    """Convert candidates of flat measurements to SI units, in place, in the measurements' shape."""
     d, most = discretization, max(1, int(found.number.max(initial=0)))
     found.values[..., :3] *= d.force
     found.values[..., 3:] *= d.length
@@ -428,7 +428,7 @@ class Contact(_Located):
     contact_force : (3,) array
         Force in the material frame at the contact (tangent, d1, d2), N.
     continuing : int
-        Number of the candidate that goes on from the measurement before; 0 where there was none.
+        Index of the candidate that continues the measurement before; 0 if there was none.
     using : tuple of str
         Signals used.
     friction : float
@@ -540,7 +540,7 @@ def contact_of(
     covariance: Array | None = None,
     friction: float = 0.0,
 ) -> Contact:
-    """Give the candidates of one measurement their units; ``first`` stands for all."""
+    """Convert candidates of one measurement to SI units; ``first`` is the most plausible one."""
     length, force = discretization.length, discretization.force
     rest = continuing, using, friction, found, (length, force)
     if not found.number[0]:

@@ -1,7 +1,7 @@
-"""One measurement at a time: an estimator with its signals, its noise and what is known beforehand.
+"""Estimator of contacts for one measurement at a time, with its signals, noise and prior.
 
-Many measurements at once go through the same rows (:mod:`~vibrissa.contacts.search`). Each is
-searched for in the whole map, so that no candidate is lost by looking only near the last one.
+Many measurements at once pass through the same kernels (:mod:`~vibrissa.contacts.search`). Each is
+searched for in the whole map, so that no candidate is missed by searching only near the last one.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ from vibrissa.sensors import GRAVITY, Sensor
 from vibrissa.signals import selection
 from vibrissa.status import Status
 
-LEAST = 0.05  # smallest arc length, over L, of contacts that the weight is taken from
+# Smallest arc length, over L, of contacts from whose measurements the weight is subtracted.
+LEAST = 0.05
 
 
 class Estimator:
@@ -114,7 +115,7 @@ class Estimator:
     def _allow(
         self, stiffness: float, compliance: float, friction: float, gravity: Gravity | None
     ) -> None:
-        """Allow for weight, friction and an uncertain base."""
+        """Set up weight, friction and an uncertain base."""
         stated = {"compliance_sigma": compliance, "friction": friction, "gravity": gravity}
         if not any(stated.values()):
             return
@@ -227,22 +228,22 @@ class Estimator:
 
     @property
     def softened(self) -> bool:
-        """Whether friction, or anything that measurements share of the rod, is uncertain."""
+        """Whether friction, or any parameter of the rod that measurements share, is uncertain."""
         return self._base is not None or (self._joint is not None and self._joint.uncertain)
 
     @property
     def noisy(self) -> bool:
-        """Whether noise is known, so that there are covariances."""
+        """Whether the noise is known, so that there are covariances."""
         return self.readout.noisy
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Signals that contacts are found from, in canonical order; none of a mix of components."""
+        """Signals used for estimates, in canonical order; none for mixed components."""
         return self.readout.names if isinstance(self.readout, Named) else ()
 
     @cached_property
     def announced(self) -> tuple[str, ...]:
-        """Names of the numbers of one measurement, in their order."""
+        """Names of the values of one measurement, in order."""
         if self._sensor is not None:
             return tuple(self._sensor.channels)
         order = np.argsort(self._order or range(len(self.names))).tolist()
@@ -250,15 +251,15 @@ class Estimator:
 
     @property
     def sensor(self) -> Sensor | None:
-        """The sensor whose readings it takes, if it is of one."""
+        """The sensor whose readings are the measurements, if there is one."""
         return self._sensor
 
     def reset(self) -> None:
-        """Forget the measurement before, as when the whisker has lost touch."""
+        """Discard the measurement before, as when contact has been lost."""
         self._last = None
 
     def restart(self) -> None:
-        """Forget all measurements: the sensor counts as tared in the next pose."""
+        """Discard all measurements: the sensor counts as tared in the next pose."""
         self.reset()
         self._joint = self._untared
 
@@ -416,7 +417,7 @@ class Estimator:
         return self.readout.scaled(self._joint.signals_of(target[None])[0])
 
     def nothing_in(self, measurement: Measurement) -> Status | None:
-        """Why a measurement is not worth a search: ``MISSING``, ``NOT_FELT``, ``DEGENERATE``.
+        """Reason why a measurement needs no search: ``MISSING``, ``NOT_FELT``, ``DEGENERATE``.
 
         Parameters
         ----------

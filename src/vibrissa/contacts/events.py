@@ -1,25 +1,25 @@
-"""Onset, loss and slip of a contact, sample by sample, and the time at which it began.
+"""Onset, loss and slip of a contact, sample by sample, and the time of onset.
 
 **Onset.** A light contact is detected some samples after it began, once signals exceed the noise.
-From its onset τ on, the force of a base that moves steadily grows in proportion to time, so that
+After its onset τ, the force for a steadily moving base grows in proportion to time, so that
 readings y (k,), in standard deviations of the noise of a free whisker, are
 
     y(t) = b max(t - τ, 0) + noise,
 
-with an unknown slope b. Its best fit leaves the likelihood of τ,
+with an unknown slope b. Maximised over b, the log-likelihood of τ is
 
     log p(τ) = |Σ w g y|² / (2 Σ w g²) + const,    g = max(t - τ, 0),    w = 1 / (1 + (0.1 |y|)²),
 
 over the samples since the last contact and the first ones of this; w allows for forces that do not
-grow evenly. All τ being equally probable beforehand, the onset is its mean, with its standard
+grow evenly. With a uniform prior of τ, the onset is its posterior mean, with its standard
 deviation.
 
-**Loss.** The contact is not detected, and readings are as small as noise: with the threshold of
-detection alone noise would end and begin one light contact several times.
+**Loss.** The contact is not detected, and readings are as small as noise. With the threshold of
+detection alone, noise would split one light contact into several.
 
-**Slip.** The contact point has moved, since the last sample in which it was unique, farther than it
-slides and noise moves it. On an object at rest it slides as the whisker moves: at a speed, and
-twice as far as the base has carried the point of the whisker that was there.
+**Slip.** Since the last sample in which it was unique, the contact point has moved farther than
+sliding and noise explain. On an object at rest it slides as the whisker moves: up to twice as far
+as the base has carried the point of the whisker that was there.
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ import numpy as np
 from vibrissa.numerics import Array, IntArray
 from vibrissa.status import Event
 
-# A contact point slips if its step is larger than all but one in a thousand of noise (χ², three
-# degrees of freedom), in samples that are not farther apart than this, s.
+# A contact point slips if its step exceeds the 99.9 % quantile of noise (χ², three degrees of
+# freedom) between samples that are at most this far apart, s.
 _BEYOND_NOISE, _NEXT = 16.27, 0.5
-_CARRIED = 2.0  # how far a contact slides at most, as a multiple of how far the base carries it
-_HALVINGS = 30  # halvings of an interval of 80 in the logarithm of a multiplier
-_SETTLING = 0.01  # slips that follow each other within this time are one, s
-_NO_VARIANCE = 1e-15  # share of the largest variance below which there is none
-# Samples before an onset and after it that it is dated by, and times between two of them.
+_CARRIED = 2.0  # largest sliding distance, as a multiple of the displacement by the base
+_HALVINGS = 30  # bisections of an interval of 80 in the logarithm of a multiplier
+_SETTLING = 0.01  # time within which successive slips are one, s
+_NO_VARIANCE = 1e-15  # share of the largest variance below which one counts as zero
+# Samples before and after an onset by which it is dated, and trial times between two of them.
 _BEFORE, _AFTER, _BETWEEN = 128, 8, 6
-_UNEVEN = 0.1  # share of a reading by which its growth is not even
-_HELD = 2.0  # standard deviations, beyond those of noise, that hold a contact
+_UNEVEN = 0.1  # relative unevenness of a reading's growth
+_HELD = 2.0  # standard deviations, beyond the noise, above which a contact is held
 
-# Lengths of the whisker that a contact point moves in a second from which it slips, by default.
+# Default speed above which a contact point slips, in whisker lengths per second.
 SLIPPING = 2.0
 
 
 class Place(NamedTuple):
-    """Contact point (3,) in the laboratory and its covariance (3, 3), not finite if not known.
+    """Contact point (3,) in the laboratory frame and its covariance (3, 3), not finite if unknown.
 
     Also whether the covariance is valid, and rotation (3, 3) and position (3,) of the base.
     """
@@ -63,7 +63,7 @@ class Place(NamedTuple):
     position: Array | None = None
 
     def carried(self, now: Place) -> float:
-        """How far the base has carried the point of the whisker that was here, m."""
+        """Displacement, by the base, of the point of the whisker that was at the contact, m."""
         if self.rotation is None or now.rotation is None:
             return 0.0
         before, after = self.position, now.position
@@ -74,7 +74,7 @@ class Place(NamedTuple):
 
     @property
     def ellipsoid(self) -> Array:
-        """The covariance; a ball as large where a valley that bends leaves it."""
+        """Covariance; for an invalid one, of a bent valley, that of a sphere as large."""
         return self.covariance if self.valid else np.trace(self.covariance) * np.eye(3)
 
 
@@ -100,7 +100,7 @@ class ContactEvents:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew, with a free whisker."""
+        """Start again with a free whisker."""
         self.onset = math.nan, math.nan
         self._touching = self._datable = False
         self._last: tuple[float, Place] | None = None
@@ -119,7 +119,7 @@ class ContactEvents:
         reading: Array,
         place: Place | None,
     ) -> Event:
-        """Take a sample.
+        """Process a sample.
 
         Parameters
         ----------
@@ -140,7 +140,7 @@ class ContactEvents:
         """
         if touching is None:
             return Event.NONE
-        # A contact that has just been detected, or is nearly lost, does not end by noise.
+        # Noise must not end a contact that has just been detected or is nearly lost.
         if self._touching and not touching and (reading**2).sum() > len(reading) + _HELD**2:
             touching, place = True, None
         before, self._touching = self._touching, touching
@@ -158,12 +158,12 @@ class ContactEvents:
             return Event.ONSET if touching else Event.LOSS
         if not slips:
             return Event.NONE
-        # What has slipped settles, or rings, for some samples.
+        # After a slip the whisker settles, or rings, for some samples.
         settling, self._slipped = time - self._slipped < _SETTLING, time
         return Event.NONE if settling else Event.SLIP
 
     def _date(self, time: float, reading: Array, *, first: bool) -> None:
-        """Remember a reading, and date the onset anew by the first ones of a contact."""
+        """Store a reading, and date the onset again from the first ones of a contact."""
         if first:
             self.onset = time, math.nan
             self._datable = bool(self._times)
@@ -174,18 +174,18 @@ class ContactEvents:
         self._readings.append(reading)
         if self._touching and self._datable:
             dated = dated_onset(np.array(self._times), np.array(self._readings))
-            # Forces that soon fall again do not date it better.
+            # Readings after forces begin to fall do not improve the date.
             if not dated[1] > self.onset[1]:
                 self.onset = dated
 
     def _slips(self, step: float, last: Place, now: Place) -> bool:
-        """Whether the point moved farther in this time than it slides and noise moves it."""
+        """Whether the point moved farther in this time than sliding and noise explain."""
         moved = now.point - last.point
         if not 0.0 < step < _NEXT or math.hypot(*moved.tolist()) < self._slip_speed * step:
             return False
         slid = self._slip_speed * step + _CARRIED * last.carried(now)
         spread = now.ellipsoid + last.ellipsoid
-        if not np.isfinite(spread).all():  # noise is not known
+        if not np.isfinite(spread).all():  # the noise is unknown
             return math.hypot(*moved.tolist()) > slid
         variance, axes = np.linalg.eigh(spread)
         known = variance > _NO_VARIANCE * variance[-1]
@@ -231,10 +231,10 @@ def dated_onset(time: Array, reading: Array) -> tuple[float, float]:
 def in_order(
     time: Array, events: Sequence[Event], onsets: Sequence[Sequence[float]]
 ) -> tuple[IntArray, Array]:
-    """Events (n,) and onsets (n, 2) of samples that are all known: as each contact began at last.
+    """Events (n,) and onsets (n, 2) of a complete series: each contact starts at its final onset.
 
-    An onset is put to the first sample after the contact began, which may be before that by which
-    it was detected.
+    An onset is assigned to the first sample after the contact began, which may precede the one in
+    which it was detected.
     """
     out, known = np.array(events, dtype=np.int64), np.array(onsets, dtype=np.float64).reshape(-1, 2)
     edges = np.flatnonzero((out == Event.ONSET) | (out == Event.LOSS)).tolist()
@@ -250,10 +250,10 @@ def in_order(
 
 
 def _beyond(moved: list[float], variance: list[float], reach: float) -> Array:
-    """What is left of a displacement, along its axes, of which a reach that it exceeds is sliding.
+    """Part of a displacement, along its axes, that sliding up to ``reach`` does not explain.
 
-    The part that slides is moved / (1 + λ variance), where λ makes it as long as the reach: that
-    leaves the least χ².
+    The sliding part is moved / (1 + λ variance), with λ such that its length is ``reach``: this
+    minimises the remaining χ².
     """
     largest = max(variance[-1], 1e-300)
     parts = [(m, max(v, 0.0) / largest) for m, v in zip(moved, variance, strict=True)]

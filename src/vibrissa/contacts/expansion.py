@@ -1,16 +1,16 @@
-"""A contact and the channels that explain it to second order, along valleys of χ²; compiled.
+"""Second-order expansion of channels and contact point along valleys of χ²; compiled.
 
-A contact ξ explains measured channels with residuals r = W (c(ξ) - c̃), in standard deviations.
-These and the contact point p are followed to second order along the principal axes a_i of the noise
-seen in ξ:
+A contact ξ explains measured channels with residuals r = W (c(ξ) - c̃), in standard deviations. The
+residuals and the contact point p are expanded to second order along the principal axes a_i of the
+noise in ξ:
 
     ξ = ξ̂ + Σ a_i (u_i + C_i(u, u)/2),    r(u) = r̂ + B u + H_r(u, u)/2,
     p(u) = p̂ + A u + H_p(u, u)/2.
 
-Valleys of χ² may be bent in ξ, as where a force is known but for its direction. C bends the axes so
-that they follow valleys: it takes out of H_r what a change along other axes than those displaced
-can undo. Axes are shortened where Ω or the second order ends the density sooner, as at folds of the
-signals.
+Valleys of χ² may be bent in ξ, for example where only the direction of a force is unknown. C bends
+the axes so that they follow the valleys: it removes from H_r the part that a change along axes
+other than the displaced ones can cancel. Axes are shortened where Ω, or a fold of the signals in
+second order, ends the density sooner.
 """
 
 from __future__ import annotations
@@ -33,28 +33,29 @@ from vibrissa.rod import (
     set_lane,
 )
 
-# How far along each axis the second order is taken from, and the other end is tried if there is
-# room for the least, in standard deviations.
+# Displacement along each axis from which second derivatives are taken, and the smallest one at
+# which the other end is tried, in standard deviations.
 _REACH, _OTHER_END, _LEAST_END = 2.0, 3.0, 1.0
-_TRIALS, _NOTHING = 4, 1e-12  # how often steps are shortened at most, and what is nothing
-# Axes bend others if their columns of B, of length 1 unless they were shortened, are this long²
-# at least.
+_TRIALS, _NOTHING = 4, 1e-12  # times that steps are shortened at most; negligible
+# Smallest squared length of an axis's column of B for which it bends others; the length is 1 unless
+# the axis was shortened.
 _DETERMINED = 0.5
-# The longest axis, of s (and relative to the force, 1); and the largest second derivative of -log
-# density along an axis, where its length is not changed: for a normal distribution it is 1.
+# Longest axis in s (relative to the force it is 1); and the largest second derivative of -log
+# density along an axis that is not shortened; for a normal distribution it is 1.
 _LONGEST, _SHARP = 0.25, 2.0
-# Unknowns that a measurement determines this much worse than others it does not determine.
+# Ratio of uncertainties above which a measurement does not determine an unknown.
 _OPEN = 1e-8
 _SWEEPS = 12
 
 
 class Expansion(NamedTuple):
-    """Working memory for one candidate: r̂ (k), B (k, 3), H_r (k, 3, 3); A, H_p; axes in columns.
+    """Working memory for one candidate.
 
-    Then C (3, 3, 3), and ∂²s/∂u² (3, 3). r̂, and derivatives of r (k, 3) and p (3, 3) by ξ, by the
-    means by which displaced contacts are known: their x (3, 4), (F, p) (3, 6) and ∂(F, p)/∂x
-    (3, 6, 4), and r (k), and the derivatives again, of one of them. Last residuals, slopes by x
-    (k, 4), the same in standard deviations, and steps (3, 3).
+    r̂ (k), B (k, 3), H_r (k, 3, 3); A, H_p; axes in columns; C (3, 3, 3), and ∂²s/∂u² (3, 3). Then
+    r̂ and the derivatives of r (k, 3) and p (3, 3) with respect to ξ, computed as for displaced
+    contacts (integrated or interpolated); for these x (3, 4), (F, p) (3, 6) and ∂(F, p)/∂x
+    (3, 6, 4); r (k) and the derivatives of one of them. Last, residuals, their slopes with respect
+    to x (k, 4), the same in standard deviations, and steps (3, 3).
     """
 
     r0: Array
@@ -82,7 +83,7 @@ class Expansion(NamedTuple):
 
 @inlined
 def empty_expansion(k: int) -> Expansion:
-    """Make the working memory for k channels."""
+    """Allocate the working memory for k channels."""
     return Expansion(
         np.empty(k),
         np.empty((k, 3)),
@@ -112,9 +113,9 @@ def empty_expansion(k: int) -> Expansion:
 def principal_axes(x: Array, j: Array, axes: Array) -> bool:
     """Fill principal axes of the noise in ξ, one standard deviation long; whether there are any.
 
-    One-sided Jacobi rotations make the columns of W ∂c/∂ξ, brought to length one, orthogonal. That
-    of an unknown that is not determined within its longest change remains shorter: where its
-    derivatives vanish, as in a plane of symmetry, they have no direction.
+    One-sided Jacobi rotations make the normalised columns of W ∂c/∂ξ orthogonal. The axis of an
+    unknown that is not determined within its longest change remains shorter: where its derivatives
+    vanish, as in a plane of symmetry, they have no direction.
     """
     k, force = j.shape[0], max(math.hypot(x[2], x[3]), 1e-300)
     c, size = np.empty((k, 3)), np.empty(3)
@@ -153,7 +154,7 @@ def principal_axes(x: Array, j: Array, axes: Array) -> bool:
                     axes[i, p], axes[i, q] = cos * a - sin * b, sin * a + cos * b
         if largest < 1e-9:
             break
-    for p in range(3):  # longest first: rounding must not choose the axes' order either
+    for p in range(3):  # longest first, so that rounding does not determine the order of the axes
         for q in range(p + 1, 3):
             pp, qq = 0.0, 0.0
             for i in range(k):
@@ -169,7 +170,7 @@ def principal_axes(x: Array, j: Array, axes: Array) -> bool:
             total += c[i, p] * c[i, p]
         length = max(math.sqrt(total), _OPEN)
         largest, best = -1.0, 0
-        for i in range(3):  # rounding must not choose an axis's sign either
+        for i in range(3):  # nor the sign of an axis
             share = abs(axes[i, p]) * size[i]
             if share > 1.001 * largest:
                 largest, best = share, i
@@ -193,14 +194,14 @@ def all_determined(model: Expansion) -> bool:
 
 @inlined
 def axis_length(x: Array, axis: Array) -> float:
-    """Length of a change of ξ, of which the longest axis has 1."""
+    """Length of a change of ξ in units of the longest axis."""
     force = max(math.hypot(x[2], x[3]), 1e-300)
     return float(max(abs(axis[0]) / _LONGEST, math.hypot(axis[1], axis[2]) / force))
 
 
 @inlined
 def cap_axes(x: Array, axes: Array) -> bool:
-    """Shorten axes that leave the whisker, as where signals fold; whether any did."""
+    """Shorten axes that leave the whisker, as where signals fold; whether any was shortened."""
     capped = False
     for i in range(3):
         size = axis_length(x, axes[:, i])
@@ -213,7 +214,7 @@ def cap_axes(x: Array, axes: Array) -> bool:
 
 @inlined
 def shorten_axes(model: Expansion) -> bool:
-    """Shorten axes along which the second order ends the density sooner; whether there are any."""
+    """Shorten axes along which the second order ends the density sooner; whether any was."""
     r0, by_r, bent_r, by_p, bent_p = model.r0, model.by_r, model.bent_r, model.by_p, model.bent_p
     axes, bends, bent_s, share = model.axes, model.bends, model.bent_s, model.steps[0]
     k, some = r0.shape[0], False
@@ -243,13 +244,13 @@ def shorten_axes(model: Expansion) -> bool:
 
 @inlined
 def _room(x: Array, along: float, up: bool) -> float:
-    """How many standard deviations there are on the whisker, one of which changes s by so much."""
+    """Standard deviations that fit on the whisker, where one changes s by ``along``."""
     return float((1.0 - x[0] if up else x[0] - LEAST_ARC) / max(abs(along), _NOTHING))
 
 
 @inlined
 def _ends(x: Array, axes: Array, steps: Array, others: Array) -> None:
-    """Fill how far to go along each axis, signed: where there is more room, and the other way."""
+    """Fill signed displacements along each axis: toward the side with more room, and the other."""
     for i in range(3):
         up, down = _room(x, axes[0, i], True), _room(x, axes[0, i], False)
         far, near = max(up, down), min(up, down)
@@ -280,10 +281,10 @@ def _displace(x: Array, model: Expansion, steps: Array, moved: Array) -> None:
 
 @inlined
 def _follow(rod: Charted, work: Array, near: bool, model: Expansion, slopes: int) -> bool:
-    """Fill (F, p) of the displaced contacts, and ∂(F, p)/∂x if slopes are wanted (3), not 0.
+    """Fill (F, p) of the displaced contacts, and ∂(F, p)/∂x if ``slopes`` is 3 instead of 0.
 
-    They are interpolated if ``near`` and all are on the map, else the rod is integrated. Return
-    which.
+    They are interpolated if ``near`` and if all are on the map; else the rod is integrated. Return
+    whether they were interpolated.
     """
     moved, values, tangents = model.moved, model.values, model.tangents
     for i in range(3):
@@ -305,7 +306,7 @@ def _follow(rod: Charted, work: Array, near: bool, model: Expansion, slopes: int
 
 @inlined
 def _by_axis(derivatives: Array, axes: Array, i: int) -> float:
-    """One derivative along axis i."""
+    """Derivative along axis i."""
     return float(
         derivatives[0] * axes[0, i] + derivatives[1] * axes[1, i] + derivatives[2] * axes[2, i]
     )
@@ -313,7 +314,7 @@ def _by_axis(derivatives: Array, axes: Array, i: int) -> float:
 
 @inlined
 def _missed(model: Expansion, i: int, h: float) -> float:
-    """What the second order misses of r on an axis, at the usual distance."""
+    """Error of the second order of r on an axis, at the usual distance."""
     away = 0.0
     for a in range(model.r.shape[0]):
         by, bent = _by_axis(model.here_j[a], model.axes, i), model.bent_r[a, i, i]
@@ -334,7 +335,7 @@ def _weigh(
     j: Array,
     slopes: Array,
 ) -> None:
-    """Fill r and its derivatives (k, 3) and those of p (3, 3) by ξ of a contact."""
+    """Fill r and the derivatives of r (k, 3) and p (3, 3) with respect to ξ at a contact."""
     channel_equations(x, value, tangents, codes, target, model.residual, model.jacobian)
     whiten(weights, model.residual, model.jacobian, codes.shape[0], r, model.four)
     without_friction(model.four, j)
@@ -356,7 +357,7 @@ def _here(
     j: Array,
     model: Expansion,
 ) -> bool:
-    """Fill r̂ and derivatives by ξ, if ``near`` as interpolated; whether they could be."""
+    """Fill r̂ and derivatives with respect to ξ, interpolated if ``near``; whether this succeeds."""
     here = model.here_r, model.here_j, model.here_slopes
     value, tangents = model.values[0], model.tangents[0]
     if near and interpolate(rod.nodes, rod.fold, work, x, value, tangents, True):
@@ -383,10 +384,10 @@ def expand(
     j: Array,
     model: Expansion,
 ) -> bool:
-    """Fill B, H_r, A, H_p and C of the model, by derivatives at contacts displaced along each axis.
+    """Fill B, H_r, A, H_p and C of the model from derivatives at contacts displaced along axes.
 
-    These come nearer along an axis that leaves a bent valley, or that the second order ends. They
-    are interpolated if ``near`` and all are on the map; return whether.
+    Displacements are smaller along an axis that leaves a bent valley, or that the second order
+    ends. Contacts are interpolated if ``near`` and if all are on the map; return whether they were.
     """
     by_r, bent_r, by_p, bent_p, axes = (
         model.by_r,
@@ -451,7 +452,7 @@ def missed_at_ends(
     j: Array,
     model: Expansion,
 ) -> float:
-    """What the second order misses of the channels at both ends of the bent axes."""
+    """Error of the second order of the channels at both ends of the bent axes."""
     missed, room = 0.0, model.steps[2]
     _ends(x, model.axes, model.steps[0], model.steps[1])
     for end in range(2):
@@ -468,17 +469,17 @@ def missed_at_ends(
                 )
                 whiten(weights, model.residual, model.jacobian, codes.shape[0], model.r, model.four)
                 missed = max(missed, _missed(model, i, steps[i]))
-            elif abs(room[i]) >= _LEAST_END:  # the axis is too bent to be followed
+            elif abs(room[i]) >= _LEAST_END:  # the axis bends too much to be followed
                 missed = np.inf
     return missed
 
 
 @inlined
 def _bend(model: Expansion) -> None:
-    """Fill C, and make second derivatives those along the bent axes.
+    """Fill C, and transform second derivatives to the bent axes.
 
-    A change along axis m undoes what displacements along two others do to residuals, if these
-    determine it: that of a bent valley. What an axis does to itself, as near folds, remains.
+    A change along axis m cancels what displacements along two other axes do to the residuals, if
+    these determine it, as in a bent valley. The effect of an axis on itself, as near folds, stays.
     """
     by_r, bent_r, by_p, bent_p = model.by_r, model.bent_r, model.by_p, model.bent_p
     axes, bends, bent_s = model.axes, model.bends, model.bent_s
@@ -505,7 +506,7 @@ def _bend(model: Expansion) -> None:
 
 @inlined
 def without_friction(four: Array, three: Array) -> None:
-    """Copy derivatives by x (n, 4), those by ξ (n, 3)."""
+    """Copy derivatives with respect to x (n, 4) to those with respect to ξ (n, 3)."""
     for a in range(four.shape[0]):
         three[a, 0], three[a, 1], three[a, 2] = four[a, 0], four[a, 2], four[a, 3]
 
@@ -524,7 +525,7 @@ def _even(model: Expansion) -> None:
 
 @inlined
 def second_order_size(model: Expansion) -> float:
-    """How large second derivatives are in standard deviations of channels and the point."""
+    """Size of the second derivatives, in standard deviations of the channels and of the point."""
     bent_r, by_p, bent_p = model.bent_r, model.by_p, model.bent_p
     root, back, v = np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
     first_order_covariance(by_p, v)

@@ -1,17 +1,17 @@
-"""A contact followed over time: a Bayesian filter, one hypothesis for each explanation.
+"""Bayesian filter that follows a contact over time, with one hypothesis for each explanation.
 
-What a whisker touches mostly stands still, so in the laboratory the contact point moves smoothly
-while the base turns and travels. A hypothesis is a Gaussian over contact point p and velocity v,
-whose velocity forgets itself (Ornstein and Uhlenbeck):
+Objects are mostly at rest, so in the laboratory frame the contact point moves smoothly while the
+base turns and travels. A hypothesis is a Gaussian over contact point p and velocity v, which
+follows an Ornstein-Uhlenbeck process:
 
     dp = v dt,    dv = -v dt / τ + σ √(2 / τ) dW.
 
-The first sample of a contact is taken apart into Gaussians (:mod:`~vibrissa.contacts.onset`).
-Each further one moves them and weighs them by how well they predicted it
-(:mod:`~vibrissa.contacts.mixture`); of two signals it moves p only across the curve of contacts
-that explains them (:mod:`~vibrissa.contacts.ambiguity`), and as the base moves, the curves of
-successive samples cross where the contact is. A candidate that no hypothesis accounts for starts
-another, as improbable as new contacts are.
+The likelihood of a contact's first sample is split into Gaussians
+(:mod:`~vibrissa.contacts.onset`). Each further sample moves them and reweights them by how well
+they predicted it (:mod:`~vibrissa.contacts.mixture`). A sample of two signals moves p only across
+the curve of contacts that explains it (:mod:`~vibrissa.contacts.ambiguity`); as the base moves, the
+curves of successive samples intersect at the contact. A candidate that no hypothesis accounts for
+starts a new one, with the probability of a new contact.
 """
 
 from __future__ import annotations
@@ -36,68 +36,67 @@ from vibrissa.rod import charted_rod
 from vibrissa.status import Status
 
 _UNKNOWNS = 3
-_LEVEL, _ORIGIN = np.eye(3), np.zeros(3)  # the pose of a base that rests in the laboratory's frame
-_LEAST = 1e-6  # hypotheses less probable than this next to the best are dropped
-_MOST = 24  # at most so many are kept
-# Two hypotheses this near (Mahalanobis distance squared, by the sum of both covariances) are one.
+_LEVEL, _ORIGIN = np.eye(3), np.zeros(3)  # pose of a base at rest in the laboratory frame
+_LEAST = 1e-6  # probability relative to the best hypothesis below which one is dropped
+_MOST = 24  # largest number of hypotheses
+# Squared Mahalanobis distance, by the sum of both covariances, below which two hypotheses are
+# merged.
 _ONE = 0.1
-_NEW = 16.0  # a candidate so far (the same) from every hypothesis is a new one
-# Largest deflection (over L) before contact was detected: where the onset is unknown, and at least.
+_NEW = 16.0  # the same distance from every hypothesis above which a candidate is a new one
+# Largest deflection (over L) before contact is detected: if the onset is unknown, and at least.
 _ANYWHERE = 0.3
 _LEAST_REACH = 0.01
-# After a gap in which a contact may have gone so far (over L) all begins anew if nothing is known
-# better than this (RMS error).
+# Distance (over L) that a contact may have moved in a gap, and RMS error of the hypotheses, above
+# which the filter starts anew.
 _GAP, _FORGOTTEN = 0.1, 0.5
 
 
-_SURE = 0.99  # what is surer than this is no longer ambiguous
-# Hypotheses nearer to each other (Mahalanobis distance squared, by the sum of both covariances) run
-# together: there is no gap between them.
+_SURE = 0.99  # probability above which a contact is no longer ambiguous
+# Squared Mahalanobis distance, by the sum of both covariances, below which hypotheses form one
+# group without a gap.
 _TOGETHER = 4.0
-# Factors of a covariance that are tried, and what is nothing among probabilities.
+# Trial factors of a covariance, and a negligible probability.
 _FACTORS, _NOTHING = np.linspace(1.0, 4.0, 31), 1e-12
 _EXPLAINED = (Status.UNIQUE, Status.AMBIGUOUS, Status.UNDERDETERMINED)
 
 
 class Followed(NamedTuple):
-    """What a filter knows after a sample."""
+    """State of a filter after a sample."""
 
-    # (3,) Mean of the most probable hypothesis, laboratory frame, m; NaN if there is none. Where
-    # hypotheses run together, as along the valley that a light contact leaves, it is that of all.
+    # (3,), mean of the most probable hypothesis, laboratory frame, m; NaN if there is none. If
+    # hypotheses form one group, as along the valley of a light contact, it is that of the group.
     point: Array
-    # (3, 3) Covariance of the contact point, m²: over all hypotheses, weighed by their
-    # probabilities, and wide enough for those that run together: 0.3 % of what they hold possible
-    # are beyond three standard deviations.
+    # (3, 3), covariance of the contact point, m²: over all hypotheses, weighted by their
+    # probabilities, and wide enough that 0.3 % of the group's probability is beyond three standard
+    # deviations.
     covariance: Array
     velocity: Array  # (3,), velocity of the contact point in the laboratory, m/s
-    # Probability that the contact is there, within the spread of the hypotheses that run together;
-    # 0 if there is none.
+    # Probability of that group of hypotheses; 0 if there is none.
     probability: float
-    # ``UNIQUE`` where that is above 0.99, else ``AMBIGUOUS``. ``MISSING``, ``NOT_FRICTIONLESS`` and
-    # other reasons are of this sample, which neither a hypothesis nor any contact explains: the
-    # point then is what was known before.
+    # ``UNIQUE`` if that is above 0.99, else ``AMBIGUOUS``. ``MISSING``, ``NOT_FRICTIONLESS`` and
+    # other reasons are those of this sample if neither a hypothesis nor any contact explains it:
+    # the point is then predicted from earlier samples.
     status: Status
-    # (k, 3) Contact points of all hypotheses, the most probable first, laboratory frame, m.
+    # (k, 3), contact points of all hypotheses, the most probable first, laboratory frame, m
     points: Array
     probabilities: Array  # (k,), their probabilities
     point_whisker: Array  # (3,), ``point`` in the whisker's frame, m
-    # Estimate from this sample alone, where it was sought: not of fewer than three signals that a
-    # hypothesis explains.
+    # Estimate from this sample alone; None for fewer than three signals that a hypothesis explains.
     located: Contact | None
 
 
 class Drift:
-    """The law of motion of (p, v)."""
+    """Law of motion of (p, v)."""
 
     def __init__(self, speed: float, persistence: float) -> None:
         self.speed, self._tau = speed, persistence
 
     def over(self, step: float) -> tuple[float, float, Array]:
-        """What happens in some time."""
+        """Coefficients of the motion over a time step."""
         tau, speed = self._tau, self.speed
         x = step / tau
         a = math.exp(-x)
-        # 2x - 3 + 4a - a² loses its digits where x is small.
+        # 2x - 3 + 4a - a² suffers from cancellation if x is small.
         walked = 2.0 * x - 3.0 + 4.0 * a - a * a if x > 0.01 else x**3 * (2.0 / 3.0 - 0.5 * x)
         grown = np.array(
             [
@@ -165,8 +164,8 @@ class ContactFilter:
             raise ValueError(
                 "a filter weighs what it knows against the noise: give its estimator's"
             )
-        # Under its weight contacts are those of a whisker without weight that has the sagged shape,
-        # in measurements that are changed by as much as the weight changes them there.
+        # With weight, contacts are those of a weightless whisker with the sagged shape, for
+        # measurements corrected by the effect of the weight.
         self._weighted = estimator if estimator.weighted else None
         estimator = estimator.sagged() if self._weighted else estimator
         self.estimator = estimator
@@ -181,11 +180,11 @@ class ContactFilter:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything, as when the whisker has lost touch."""
+        """Discard all hypotheses, as when contact has been lost."""
         self._mixture = room(0, self._errors)
         self._time: float | None = None
         self._free: tuple[float, Array, Array] | None = (
-            None  # when and where contact was last absent
+            None  # time and pose of the last sample without contact
         )
         self.estimator.reset()
 
@@ -197,7 +196,7 @@ class ContactFilter:
         position: ArrayLike | None = None,
         gravity: ArrayLike | None = None,
     ) -> Followed:
-        """Take one sample."""
+        """Update the filter by one sample."""
         turn = np.ascontiguousarray(_LEVEL if rotation is None else rotation, dtype=np.float64)
         base = np.asarray(_ORIGIN if position is None else position, dtype=np.float64)
         if turn.shape != (3, 3) or base.shape != (3,):
@@ -229,7 +228,7 @@ class ContactFilter:
     def _learned(
         self, measurement: Measurement, turn: Array, base: Array
     ) -> tuple[Status, Contact | None]:
-        """Take a measurement that is not empty: the estimate from it alone."""
+        """Update by a measurement that is not empty; also the estimate from it alone."""
         three = self.estimator.readout.rank >= _UNKNOWNS
         located = self.estimator.locate(measurement) if three else None
         x, values = np.empty((0, 4)), np.empty((0, 6))
@@ -262,7 +261,7 @@ class ContactFilter:
     def _update(
         self, measurement: Measurement, x: Array, values: Array, turn: Array, base: Array
     ) -> bool:
-        """Let all hypotheses learn; whether any of them explains the measurement."""
+        """Update all hypotheses; whether any of them explains the measurement."""
         chart, readout = self.estimator.contact_map.chart, self.estimator.readout
         most = len(self._mixture.weight) * (1 + len(x))
         out, misfits = room(most, self._errors), np.empty(most)
@@ -283,7 +282,7 @@ class ContactFilter:
                 out,
                 misfits,
             )
-        except np.linalg.LinAlgError:  # a covariance that rounding has made singular
+        except np.linalg.LinAlgError:  # rounding has made a covariance singular
             n = 0
         explains = bool((misfits[:n] < self._limit).any())
         self._mixture = _tidied(out, n)
@@ -292,7 +291,7 @@ class ContactFilter:
     def _unaccounted(self, values: Array, located: Contact, turn: Array, base: Array) -> AnyArray:
         """Which candidates (n,) no hypothesis accounts for."""
         own = turn @ (located.candidates.covariance / self._length**2) @ turn.T
-        if not math.isfinite(float(own.sum())):  # a place that the signals do not determine
+        if not math.isfinite(float(own.sum())):  # a point that the signals do not determine
             unknown = ~np.isfinite(own).all(axis=(1, 2))
             own[unknown] = _FORGOTTEN**2 * np.eye(3)
         out = np.empty(len(values), np.bool_)
@@ -301,7 +300,7 @@ class ContactFilter:
         return out
 
     def _reach(self, turn: Array, base: Array) -> float:
-        """Largest approach of whisker and objects since the last sample without contact."""
+        """Largest possible approach of whisker and objects since the last free sample."""
         if self._free is None or self._time is None:
             return _ANYWHERE
         time, *pose = self._free
@@ -310,7 +309,7 @@ class ContactFilter:
         return min(max(moved, _LEAST_REACH), _ANYWHERE)
 
     def _add(self, found: Gaussians, turn: Array, base: Array, log_prior: float) -> None:
-        """Put Gaussians of the whisker's frame to the hypotheses, those that are possible."""
+        """Add those Gaussians of the whisker's frame to the hypotheses that the prior allows."""
         if self.estimator.prior is not None:
             found = self._possible(self.estimator.prior, found)
         n, old = len(found.weights), len(self._mixture.weight)
@@ -347,10 +346,10 @@ class ContactFilter:
             self._mixture = room(0, self._errors)
 
     def _forget(self, kept: float) -> None:
-        """Let shared errors keep this share; the rest of their effect becomes noise of the state.
+        """Reduce the memory of shared errors to this share; the rest becomes noise of the state.
 
         With ε' = a ε + √(1 - a²) w the state's covariance with the error is a b, and its own
-        covariance, of which b bᵀ is part, stays what it was.
+        covariance, of which b bᵀ is part, does not change.
         """
         spread, by = self._mixture.spread, self._mixture.by_errors
         spread += (1.0 - kept**2) * by @ np.swapaxes(by, 1, 2)
@@ -366,7 +365,7 @@ def _tidied(mixture: Mixture, number: int) -> Mixture:
 
 
 def nothing_known(status: Status, located: Contact | None) -> Followed:
-    """Tell that there is no hypothesis, and why."""
+    """State of a filter without a hypothesis, and the reason."""
     none = np.full(3, np.nan)
     empty = np.empty((0, 3))
     return Followed(
@@ -382,7 +381,7 @@ def combined(
     base: Array,
     length: float,
 ) -> Followed:
-    """What hypotheses tell, in SI units."""
+    """State of a filter with hypotheses, in SI units."""
     n = len(mixture.weight)
     if not n:
         return nothing_known(status, located)
@@ -417,11 +416,11 @@ def combined(
 
 
 def _widening(weights: Array, away: Array, spreads: Array, covariance: Array) -> float:
-    """Factor, 1 at least, by which an ellipsoid of three standard deviations holds what it states.
+    """Factor, at least 1, by which an ellipsoid of three standard deviations contains its share.
 
-    The sum of Gaussians about ``away`` (n, 3) may be bent, and then leaves that of its own second
-    moment. Squared distances of each are taken for gamma distributed, with their exact mean and
-    variance.
+    The sum of Gaussians about ``away`` (n, 3) may be bent and exceed the ellipsoid of its own
+    second moment. The squared distances of each are taken as gamma distributed, with their exact
+    mean and variance.
     """
     root = np.linalg.inv(np.linalg.cholesky(covariance))
     own, middle = root @ spreads @ root.T, away @ root.T
@@ -435,7 +434,7 @@ def _widening(weights: Array, away: Array, spreads: Array, covariance: Array) ->
 
 
 def _groups(points: Array, spreads: Array) -> IntArray:
-    """Number of the group (n,) that each hypothesis belongs to: those that run together."""
+    """Index (n,) of the group of each hypothesis: hypotheses without a gap between them."""
     n = len(points)
     apart = points[:, None] - points[None]
     both = spreads[:, None] + spreads[None]

@@ -1,12 +1,12 @@
-"""The contact of Ω that explains measured signals best: least squares without friction; compiled.
+"""Least-squares contact within Ω that explains measured signals, without friction; compiled.
 
-A fit is kept within Ω, on its boundary where noise has carried the measurement out of it: what
-would leave it stays on its face, in the coordinates (s, ψ, λ) of the chart, as long as χ² falls
-outward there. Elsewhere steps are straight in s and in s f, the moment about the base, along which
-valleys of χ² run. Where signals fold, or valleys are bent, JᵀJ is a poor model of χ²: what the
-curvature of the residuals adds to it is learnt from one contact to the next, as NL2SOL does (J. E.
-Dennis, D. M. Gay, R. E. Welsch, *An adaptive nonlinear least-squares algorithm*, ACM Trans. Math.
-Softw. 7 (1981) 348-368).
+A fit stays within Ω, or on its boundary if noise has carried the measurement out of T(Ω): a step
+that would leave Ω slides along the face, in the coordinates (s, ψ, λ) of the chart, as long as χ²
+falls outward there. Elsewhere steps are straight in s and in s f, the moment about the base, along
+which valleys of χ² extend. Where signals fold, or valleys are bent, JᵀJ is a poor model of the
+Hessian: the contribution of the residuals' curvature is updated from one contact to the next, as in
+NL2SOL (J. E. Dennis, D. M. Gay, R. E. Welsch, *An adaptive nonlinear least-squares algorithm*, ACM
+Trans. Math. Softw. 7 (1981) 348-368).
 """
 
 from __future__ import annotations
@@ -33,30 +33,31 @@ from vibrissa.rod import BUFFER_SIZE, Charted, Fold, fold_force
 _MOST_DAMPING = 1e8
 _LONGEST = 0.1
 _ROUNDS = 100
-# A step that promises less of χ² (as a share of it, and by itself) is not taken.
+# Smallest predicted decrease of χ² for which a step is taken, relative and absolute.
 _IDLE, _LITTLE = 1e-6, 1e-9
-_IDLE_NEAR = 1e-3  # between the map's nodes, where steps are good to about that
-# Nor is one that, undamped or after many rounds, promises less of what χ² is above what counts.
+_IDLE_NEAR = 1e-3  # the same for interpolated contacts, to which steps are accurate
+# The same, relative to the excess of χ² over ``worth``, for undamped steps or after many
+# iterations.
 _SLOW, _PATIENCE, _LATE = 0.05, 3, 25
-# Where the slopes of a fit miss a known contact by so much (χ²), and by no more than this share of
-# the fall of χ² to there, χ² falls all the way: that contact is where the fit would end.
+# Limits of χ² by the slopes of a fit at a known contact, absolute and as a share of the fall of χ²
+# to it: below both, χ² falls all the way, and the fit would end at that contact.
 _FORESEEN, _DOWNHILL = 1.0, 0.25
-_WILD = 4.0  # where χ² rises by more than this factor contacts teach nothing of its curvature
-# Where a fit within Ω ends χ² must be level in each unknown by itself: what that could still gain
-# is at most the square of this.
+_WILD = 4.0  # factor of χ² above which a contact is not used to update the curvature
+# Where a fit ends, χ² must be level in each unknown alone: the possible decrease is at most the
+# square of this.
 _LEVEL = 0.03
-# The longest steps of s; at the fold of ψ and λ; elsewhere of the moment, as a share of itself or
-# of that of the fold.
+# Longest steps: of s; at the fold, of ψ and λ; elsewhere, of the moment, as a share of itself or of
+# that at the fold.
 _LONGEST_TURN, _LONGEST_FALL, _LONGEST_SHARE = 0.5, 0.25, 0.5
-# The chart knows the fold to a part in a million: as near to it contacts are still stable.
+# The chart's fold is accurate to 1e-6: contacts as near to it are still stable.
 _MOST_LOAD = 1.0 - 1e-5
-_AT_FOLD = 1.0 - 1e-12  # what is as near to that is at the fold, whatever rounding makes of it
-_NUDGE = 1e-5  # steps for derivatives of the fold force, which is smooth
+_AT_FOLD = 1.0 - 1e-12  # distance within which a contact is at the fold, despite rounding
+_NUDGE = 1e-5  # steps for finite differences of the fold force, which is smooth
 
 
 @inlined
 def _confine(fold: Fold, proximal: float, x: Array) -> bool:
-    """Bring a contact into Ω; whether it is at the fold."""
+    """Move a contact into Ω; whether it is at the fold."""
     x[0] = min(max(x[0], proximal), 1.0)
     force = math.hypot(x[2], x[3])
     most = _MOST_LOAD * fold_force(fold, x[0], math.atan2(x[3], x[2]))
@@ -69,9 +70,9 @@ def _confine(fold: Fold, proximal: float, x: Array) -> bool:
 
 @inlined
 def _directions(fold: Fold, x: Array, folded: bool, frame: Array) -> None:
-    """Fill ∂ξ/∂z (3, 3) of the coordinates of a fit, in units of their longest steps.
+    """Fill ∂ξ/∂z (3, 3) of a fit's coordinates z, in units of their longest steps.
 
-    These are s and the moment; at the fold s, ψ and the share by which the force falls.
+    These are s and the moment; at the fold s, ψ and the relative decrease of the force.
     """
     s, fy, fz = x[0], x[2], x[3]
     psi, force = math.atan2(fz, fy), math.hypot(fy, fz)
@@ -95,7 +96,7 @@ def _directions(fold: Fold, x: Array, folded: bool, frame: Array) -> None:
 def _go(
     fold: Fold, proximal: float, x: Array, folded: bool, frame: Array, step: Array, to: Array
 ) -> None:
-    """Fill the contact that a step in the coordinates of `_directions` leads to."""
+    """Fill the contact reached by a step in the coordinates of `_directions`."""
     s = min(max(x[0] + _LONGEST * step[0], proximal), 1.0)
     to[0], to[1] = s, 0.0
     if folded:
@@ -111,7 +112,7 @@ def _go(
 def _normal_equations(
     r: Array, j: Array, second: Array, frame: Array, gradient: Array, normal: Array, bent: Array
 ) -> None:
-    """Fill Jᵀr, JᵀJ, and what the curvature of the residuals adds to it, in a fit's coordinates."""
+    """Fill Jᵀr, JᵀJ, and the contribution of the residuals' curvature, in a fit's coordinates."""
     along = np.empty((r.shape[0], 3))
     for p in range(3):
         gradient[p] = 0.0
@@ -133,7 +134,7 @@ def _normal_equations(
 def _bend(
     second: Array, x: Array, to: Array, r: Array, j: Array, r_there: Array, j_there: Array
 ) -> None:
-    """Update the residuals' curvature, Σ r ∂²r/∂ξ² (3, 3), by those at another contact."""
+    """Update the residuals' curvature, Σ r ∂²r/∂ξ² (3, 3), from their values at another contact."""
     d, rise, missed = np.empty(3), np.empty(3), np.empty(3)
     along, size, new, steep, far = 0.0, 0.0, 0.0, 0.0, 0.0
     for p in range(3):
@@ -174,9 +175,9 @@ def _step_within(
     root: Array,
     step: Array,
 ) -> tuple[float, float]:
-    """Fill a damped step within Ω; slope and curvature of χ²/2 along it, of which 1, 0 for none.
+    """Fill a damped step within Ω; return slope and curvature of χ²/2 along it, or (1, 0) for none.
 
-    ``ends`` states whether s cannot fall or rise, and whether the force cannot.
+    ``ends`` states whether s can neither decrease nor increase, and whether the force cannot.
     """
     held = False
     for _ in range(2):
@@ -204,7 +205,7 @@ def _step_within(
 
 @inlined
 def _level(gradient: Array, normal: Array, ends: tuple[bool, bool, bool]) -> bool:
-    """Whether χ² falls nowhere but out of Ω."""
+    """Whether χ² decreases nowhere except out of Ω."""
     for p in range(3):
         slope = gradient[p]
         if p == 0 and ((ends[1] and slope < 0.0) or (ends[0] and slope > 0.0)):
@@ -216,7 +217,7 @@ def _level(gradient: Array, normal: Array, ends: tuple[bool, bool, bool]) -> boo
 
 @inlined
 def by_slopes(x: Array, r: Array, j: Array, other: Array) -> float:
-    """χ² at another contact by the slopes at one; it bends little in s and s f."""
+    """χ² at another contact, linear in s and s f, in which it bends little."""
     total, ds = 0.0, other[0] - x[0]
     dy = other[0] * (other[2] - x[2]) / x[0]
     dz = other[0] * (other[3] - x[3]) / x[0]
@@ -256,7 +257,7 @@ class _Room(NamedTuple):
 
 @inlined
 def _room(k: int) -> _Room:
-    """Make room for fits of k channels."""
+    """Allocate memory for fits of k channels."""
     return _Room(
         np.zeros(BUFFER_SIZE),
         np.empty((k, k)),
@@ -296,10 +297,11 @@ def _descend(
     misfits: Array,
     room: _Room,
 ) -> tuple[float, bool]:
-    """Find the contact of least χ² in Ω, as `fit_within`, of some channels.
+    """Find the contact of minimum χ² in Ω, as `fit_within` does, for some of the channels.
 
-    Where they are ``weighed`` the room has their weights, else those of a measurement at the start
-    serve. Arrays of the room were made by another function and are not counted at each use.
+    If they are ``weighed`` the room contains their weights; else those of a measurement at the
+    start are used. The room's arrays are allocated by the caller, so that Numba does not count
+    references to them.
     """
     b, weights, to, v, t, residual, jacobian, r, j, r_there, j_there = room[:11]
     frame, second, normal, bent, root, gradient, step = room[11:]
@@ -381,11 +383,12 @@ def fit_within(
     known: Array,
     misfits: Array,
 ) -> tuple[float, bool]:
-    """Find the contact of least χ² in Ω, downhill from another, with the weights of that one.
+    """Descend from a contact to the minimum of χ² in Ω, with the weights of the starting contact.
 
-    It is given up if above ``worth``. Where the way leads to a contact that is known and worth it,
-    with its χ² in ``misfits``, x becomes that. Return χ², and whether it is a least one. If
-    worth is limited the way is that between the map's nodes; from its end the rod is integrated.
+    The fit is abandoned if it ends above ``worth``, and x becomes a known contact, with χ² in
+    ``misfits``, if the descent leads to one that is worth it. Return χ², and whether it is a
+    minimum. If ``worth`` is finite, contacts are interpolated up to the end, where the rod is
+    integrated.
     """
     codes, room = how.codes, _room(how.codes.shape[0])
     return _descend(
@@ -419,7 +422,7 @@ def fit_rows_within(
 ) -> None:
     """Fit contacts in Ω to rows of channels, of targets (n, k) and weights (n, k, k).
 
-    Side by side first, of which most remain in Ω, and then from the same start what left it.
+    First in SIMD lanes, where most remain in Ω; those that leave it start anew, one by one.
     """
     start, known, misfits = fits.contacts.copy(), np.zeros((0, 4)), np.zeros(0)
     room = _room(codes.shape[0])

@@ -1,16 +1,15 @@
-"""What noise leaves open where the second order does not describe it: bent valleys; compiled.
+"""Posterior along bent valleys of χ² that the second order does not describe; compiled.
 
-Where χ² hardly determines one unknown, its valley may be long and bent, and so narrow that neither
-an expansion about a contact nor the nodes of the chart describe it: of a contact ξ in the plane of
-a planar whisker some signals do not change, to first order, with the bearing of the force. The
-valley is followed both ways along the longest principal axis a_0 of the noise in ξ, by steps of
-length l that bend as the last one did; at each, steps of Gauss and Newton along the others, a_1 and
-a_2, lead to its floor within the whisker. The density along it, with weights W that are those at
-each node, is
+If χ² hardly depends on one unknown, its valley may be long and bent, and so narrow that neither an
+expansion about a contact nor the nodes of the chart describe it. For a contact ξ in the plane of a
+planar whisker, some signals do not change to first order with the bearing of the force. The valley
+is followed both ways along the longest principal axis a_0 of the noise in ξ, by steps of length l,
+each bent as the last one was; at each, Gauss-Newton steps along the other axes, a_1 and a_2, lead
+to its floor within the whisker. The density along it, with weights W computed at each node, is
 
     exp(-χ²/2) |det W| det ∂p/∂ξ |det(∂ξ/∂l, a_1, a_2)|,
 
-or that without volumes; the mean of both counts, as in :mod:`~vibrissa.contacts.valleys`.
+or that without volumes; the mean of both is used, as in :mod:`~vibrissa.contacts.valleys`.
 """
 
 from __future__ import annotations
@@ -26,25 +25,25 @@ from vibrissa.contacts.weighing import Weighing, sharpness, weigh_any
 from vibrissa.numerics import Array, copy, inlined, kernel, solve
 from vibrissa.rod import BUFFER_SIZE, Charted, point_determinant
 
-_STEPS, _ROUNDS = 12, 40  # steps each way at most, and how often contacts are evaluated for them
-# The first step, in standard deviations, and at most; and the longest: as a share of the force, or
-# of a quarter of L.
+_STEPS, _ROUNDS = 12, 40  # largest numbers of steps each way, and of evaluations of contacts
+# First step, in standard deviations, and its limit; and the longest step: as a share of the force,
+# or of a quarter of L.
 _FIRST, _SHORT, _LONGEST = 0.5, 0.02, 0.5
-# On the floor of a valley χ² could fall by no more than this across it; so often is it looked for.
+# Largest fall of χ² across the floor of a valley, and iterations to reach the floor.
 _FLOOR, _TRIALS = 0.01, 4
-# It is not found where χ² could fall by more than this share of what it could fall by before.
+# Ratio of this fall to the one before above which the floor is not found.
 _SLOW = 0.3
-# A step is halved where the change of ξ, relative to it, is too small or too large, or its turn (as
-# a cosine) too large.
+# Limits of the change of ξ relative to the step, and of the cosine of its turn, outside which the
+# step is halved.
 _SMALLEST, _LARGEST, _STRAIGHT = 0.3, 2.5, 0.5
-# A valley is followed until χ² is so much above its least.
+# Height of χ² above the minimum to which a valley is followed.
 _HIGH = 16.0
-# Where the fold is expected after one more step, and how near to it a valley ends: as shares of the
-# way there, and of the valley so far.
+# Limits near the fold: it is expected within one more step, and the valley ends near it, as shares
+# of the distance to it and of the valley so far.
 _BEFORE, _NEAR = 0.9, 0.05
 _SHORTEST = 2e-3
-_FLAT = 1e-30  # volumes that are nothing
-_FEW = 5  # a valley of fewer nodes is not described by them
+_FLAT = 1e-30  # negligible volumes
+_FEW = 5  # fewest nodes that describe a valley
 
 
 @inlined
@@ -59,7 +58,7 @@ def _cosine(x: Array, a: Array, b: Array) -> float:
 
 @inlined
 def _floor_of(x: Array, r: Array, j: Array, axes: Array, proximal: float, move: Array) -> float:
-    """Fill the move across a valley to its floor within the whisker; return what χ² falls by."""
+    """Fill the move across a valley to its floor within the whisker; return the fall of χ²."""
     away, steep, square, falls = np.zeros(3), 0.0, 0.0, 0.0
     for m in range(1, 3):
         for a in range(r.shape[0]):
@@ -91,10 +90,10 @@ def _node(
     i: int,
     along: Array,
 ) -> tuple[float, float]:
-    """Fill a node, moved across the valley as x is; what χ² falls by then, and det ∂p/∂ξ.
+    """Fill a node, moved across the valley as x is; return the last fall of χ² and det ∂p/∂ξ.
 
-    ``along`` becomes the valley's standard deviation, on the same side. Where there is no valley
-    the determinant is negative.
+    ``along`` becomes the valley's standard deviation, on the same side. If there is no valley the
+    determinant is negative.
     """
     _, misfits, logs, points, spreads = nodes
     codes = how.codes
@@ -143,7 +142,7 @@ def _node(
 
 @inlined
 def _ahead(x: Array, along: Array, bend: Array, step: float, proximal: float, to: Array) -> float:
-    """Fill the contact a step farther, along a direction that bends; how long the step is."""
+    """Fill the contact one step farther along a bending direction; return the step's length."""
     size, turn = axis_length(x, along), axis_length(x, bend)
     up = along[0] / size
     room = (1.0 - x[0]) / up if up > 0.0 else (x[0] - proximal) / max(-up, 1e-300)
@@ -169,7 +168,7 @@ def _one_way(
     nodes: Nodes,
     along: Array,
 ) -> tuple[int, bool]:
-    """Fill the nodes on one side of the start; how many, and whether they end with Ω.
+    """Fill the nodes on one side of the start; return their number, and whether they end with Ω.
 
     ``along`` is the direction at the start, where det ∂p/∂ξ is ``volume``.
     """
@@ -192,7 +191,7 @@ def _one_way(
             spent, trials = spent + 1, trials + 1
             if there <= 0.0 or falls < _FLOOR or falls > _SLOW * before:
                 break
-        if there <= 0.0:  # beyond the fold, where it vanishes
+        if there <= 0.0:  # beyond the fold, where the determinant vanishes
             ended = True
             step *= max(_BEFORE * volume / max(volume - there, 1e-300), 0.1)
             continue
@@ -223,7 +222,7 @@ def _one_way(
 def _described(
     nodes: Nodes, first: int, last: int, more: bool, point: Array, covariance: Array
 ) -> None:
-    """Replace a covariance by that of the nodes; it is added where there may be ``more``."""
+    """Replace a covariance by that of the nodes, or add it if the valley may go on (``more``)."""
     shares, spread = np.empty(nodes[0].shape[0]), np.empty((3, 3))
     shares_of(nodes, first, last, shares)
     mixture(nodes, first, last, shares, point, spread)
@@ -244,8 +243,8 @@ def follow_valley(
 ) -> None:
     """Replace a covariance by that of the valley through x (4,), if enough of it is found.
 
-    It ends where χ² has risen enough, or with Ω. As it may go on there along the fold, or farther
-    than it is followed, its covariance is then added.
+    The valley ends where χ² has risen enough, or with Ω. As it may continue there along the fold,
+    or farther than it is followed, its covariance is then added instead.
     """
     b, most = np.zeros(BUFFER_SIZE), 2 * _STEPS + 1
     nodes = (

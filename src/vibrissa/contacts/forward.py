@@ -1,16 +1,17 @@
-"""What contacts cause at the base of a rod, by itself or under its weight, and what is uncertain.
+"""Forward model of contacts: readings of a rod with weight and with uncertain parameters.
 
-A contact x = (s, f) gives the base force and the contact point (F, p); under weight also the change
-μ of the weight's moment about the base since rest. A sensor that was tared at rest then reads
+A contact x = (s, f) determines the base force and the contact point (F, p), and under weight also
+the change μ of the weight's moment about the base since rest. A sensor that was tared at rest
+then reads
 
     F = φ(0),   M = p × F + μ,
 
-so that M · F ≠ 0. Tared under another gravity, it reads the difference of the two resting wrenches
-in addition, which is the same for every contact.
+so that M · F ≠ 0. If it was tared under another gravity, it reads the difference of the two resting
+wrenches in addition, which is the same for every contact.
 
-What is known of the rod to standard deviations only are further unknowns c ~ N(0, 1): the direction
-of gravity, the density, the compliance of the base. To first order they change readings and contact
-point, at a fixed x, by the difference that one standard deviation makes.
+Parameters of the rod that are uncertain are further unknowns c ~ N(0, 1): the direction of gravity,
+the density, the compliance of the base. Their effect on readings and contact point at a fixed x is
+taken to first order, as the change for one standard deviation.
 """
 
 from __future__ import annotations
@@ -45,20 +46,20 @@ from vibrissa.rod import (
 from vibrissa.signals import within_turn
 from vibrissa.whisker import Whisker
 
-# Rounds of the fit, and the longest steps of arc length (over L) and of force (its own size, and
-# EI/L²) in one.
+# Iterations of a fit, and the longest step of each: of arc length (over L) and of force (over its
+# own size, and over EI/L²).
 _ROUNDS = 30
 _LONGEST, _STRONGER, _LEAST_FORCE = 0.1, 0.5, 0.05
 # A fit has ended when its step is this small, or the damping this large.
 _SETTLED, _MOST_DAMPING = 1e-8, 1e8
 _NUDGE = 1e-4  # turn of gravity (rad) and relative change of density for derivatives
-_RIGID = 1e9  # a rigid base is one so much stiffer than the whisker
+_RIGID = 1e9  # stiffness of a rigid base, relative to the whisker
 _AHEAD = 1e-5  # relative step of the force along the whisker for its derivatives
-# How far apart directions of gravity are at most, and at least, that a turning whisker is solved
-# for, and those whose resting shapes propose contacts, rad; what the former may change of a
-# measurement, in standard deviations.
+# Spacing of the directions of gravity for which a turning whisker is solved, largest and smallest,
+# and of those whose resting shapes propose contacts, rad; and the change of a measurement, in
+# standard deviations, that the former may cause.
 _DIRECTIONS, _FINEST, _SHAPES, _UNSEEN = 2e-4, 1e-9, 0.2, 0.03
-# Rows of the numbers of a solved rod with weight: force, contact point, moment of the weight.
+# Rows of a solved rod with weight: force, contact point, moment of the weight.
 _CAUSED = [0, 1, 2, 3, 4, 5, 9, 10, 11]
 
 
@@ -99,7 +100,7 @@ class Gravity:
 
     @property
     def uncertain(self) -> bool:
-        """Whether anything of it is known to a standard deviation only."""
+        """Whether its direction or the density is uncertain."""
         return self.direction_sigma > 0.0 or self.density_sigma > 0.0
 
     @classmethod
@@ -128,7 +129,7 @@ class Gravity:
         return gravity if any(gravity.acceleration) or gravity.tare is not None else None
 
     def turned(self, rotation: Array, step: float = _DIRECTIONS) -> Gravity:
-        """Gravity of the laboratory frame, in that of a whisker.
+        """Gravity of the laboratory frame in the frame of a turned whisker.
 
         Parameters
         ----------
@@ -147,7 +148,7 @@ class Gravity:
         return replace(self, acceleration=(x, y, z), tare=self.tare or (x, y, z))
 
     def nearly(self, share: float) -> tuple[float, float, float]:
-        """Give a share of the acceleration, in the nearest of directions some degrees apart.
+        """A share of the acceleration, in the nearest of directions some degrees apart.
 
         Parameters
         ----------
@@ -164,7 +165,7 @@ class Gravity:
 
 
 def read_at_rest(whisker: Whisker, gravity: Gravity, rotation: Array | None, n: int) -> Array:
-    """What a tared sensor reads of a free whisker in n poses (n, 6), N and N·m."""
+    """Readings of a tared sensor for a free whisker in n poses (n, 6), N and N·m."""
     if rotation is None:
         there = Forward.of(whisker, gravity)
         return np.tile(there.shift * np.repeat([there.d.force, there.d.moment], 3), (n, 1))
@@ -179,10 +180,10 @@ def read_at_rest(whisker: Whisker, gravity: Gravity, rotation: Array | None, n: 
 
 
 class Solved(NamedTuple):
-    """Contacts with what they cause.
+    """Contacts and their effects at the base.
 
-    x (n, 4); (F, p) or (F, p, μ) (n, 6 or 9) and their derivatives by x (n, 6 or 9, 4); directions
-    of weight at the tip (n, 3), to begin the next solution with.
+    x (n, 4); (F, p) or (F, p, μ) (n, 6 or 9) and their derivatives with respect to x (n, 6 or 9,
+    4); directions of gravity at the tip (n, 3), from which the next solution starts.
     """
 
     x: Array
@@ -192,16 +193,16 @@ class Solved(NamedTuple):
 
 
 class Forward:
-    """A rod with the errors of it that all measurements share; made by :meth:`of`.
+    """Rod with its uncertain parameters, which all measurements share; constructed by :meth:`of`.
 
     Attributes
     ----------
     d : Discretization
         Rod, with its units.
     shift : (6,) array
-        Part of readings in addition to (F, M) since the tare, non-dimensional.
+        Reading in addition to (F, M) due to the pose at the tare, non-dimensional.
     errors : list of (Forward, float)
-        Rods that differ in one unknown, and the standard deviation of it in these differences.
+        Rod that differs in one parameter, and its standard deviation in units of that difference.
     """
 
     def __init__(self, rod: Whisker | Resting, steps: int, before: Resting | None = None) -> None:
@@ -223,7 +224,7 @@ class Forward:
         stiffness_sigma: float = 0.0,
         steps: int = STEPS,
     ) -> Forward:
-        """Put a whisker under gravity, with the standard deviations of what is uncertain."""
+        """Set up a whisker under gravity, with the standard deviations of uncertain parameters."""
 
         def bent(whisker: Whisker, turn: transform.Rotation | None = None) -> Forward:
             if gravity is None:
@@ -258,7 +259,7 @@ class Forward:
         return out
 
     def direction_step(self, noise: float) -> float:
-        """How far directions of gravity may be apart, rad, for noise that does not show it."""
+        """Spacing of the directions of gravity, rad, whose effect is hidden in the noise."""
         if not isinstance(self.rod, Resting):
             return _DIRECTIONS
         force, moment = self.rod.force / self.d.force, self.rod.moment / self.d.moment
@@ -271,7 +272,7 @@ class Forward:
         return self.d.rod.weight is not None
 
     def values(self, x: Array, leans: Array | None = None) -> Array:
-        """(F, p) or (F, p, μ) (n, 6 or 9) of contacts x (n, 4)."""
+        """(F, p) or (F, p, μ) (n, 6 or 9) for contacts x (n, 4)."""
         if not self.weighted:
             return solve_forces(self.d, x)[0]
         return self._since_rest(evaluated(self.d, x, leans).states[:, _CAUSED])
@@ -287,7 +288,7 @@ class Forward:
         return Solved(x, values, out.tangents[:, _CAUSED], out.leans)
 
     def near(self, x: Array) -> tuple[Array, Array]:
-        """Values of contacts x (n, 4) and their derivatives by x."""
+        """Values for contacts x (n, 4) and their derivatives with respect to x."""
         if self.weighted:
             return self.solved(x)[1:3]
         values, exact = solve_forces(self.d, x, tangents=True)
@@ -300,7 +301,7 @@ class Forward:
         return values, slopes
 
     def by_errors(self, x: Array, values: Array) -> tuple[Array, Array]:
-        """What one standard deviation changes of readings and of (F, p), (n, 6, k) each."""
+        """Change of readings and of (F, p), (n, 6, k) each, for one standard deviation."""
         wrench = np.zeros((len(x), 6, len(self.errors)))
         moved = np.zeros_like(wrench)
         for k, (other, share) in enumerate(self.errors):
@@ -321,7 +322,7 @@ class Forward:
     ) -> Fits:
         """Fit contacts to channels from starts x (n, 4), as :func:`~.least_squares.fit` does.
 
-        The names end with ``ratio`` and ``s``, where these are held.
+        The names end with ``ratio`` and ``s`` if these are held.
         """
         if not self.weighted:
             return fit(self.d, names, targets, weights, x, friction=friction, least=least)
@@ -352,7 +353,7 @@ class Forward:
 
 
 class _Aim:
-    """Channels that contacts are fitted to, by damped steps of Gauss and Newton."""
+    """Channels that contacts are fitted to by damped Gauss-Newton steps."""
 
     def __init__(self, names: tuple[str, ...], free: list[int]) -> None:
         self.names, self.free = tuple(n for n in names if n in CHANNELS), free
@@ -374,7 +375,7 @@ class _Aim:
         return np.where(np.isfinite(out), out, np.inf)
 
     def step(self, at: Solved, targets: Array, weights: Array, damping: Array) -> Array:
-        """Damped steps (n, free), no longer than is sensible."""
+        """Damped steps (n, free) of limited length."""
         held = {"ratio": ratio_derivatives(at.x), "s": np.tile(np.eye(4)[0], (len(at.x), 1))}
         rows = [channel_derivatives(at.values, at.tangents, self.names)]
         rows += [held[name][:, None] for name in self.held]
@@ -393,5 +394,5 @@ class _Aim:
 
 
 def finite(values: Array) -> AnyArray:
-    """Which rows (n,) of values (n, ...) are finite."""
+    """Whether each row (n,) of values (n, ...) is finite."""
     return np.asarray(np.isfinite(values).reshape(len(values), -1).all(axis=1))

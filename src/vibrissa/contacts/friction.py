@@ -1,24 +1,24 @@
 """Contacts with unknown friction along the whisker, from three signals or more.
 
 Friction adds one unknown: the ratio µ_x of the force along the whisker to that across it. With the
-prior µ_x ~ N(0, σ²) as one more channel, three signals have as many equations as unknowns.
+prior µ_x ~ N(0, σ²) as one more channel, three signals give as many equations as unknowns.
 
-What measured signals leave open is a curve: one contact for each arc length s, as the force there
-has three components. It is short where four or more signals determine µ_x, and with three it bends
-too much for an ellipsoid. So it is traced along the whisker, finer where contacts are probable. The
-forces at s that noise leaves open have, to first order, a covariance C_f; with all contact points
-as probable beforehand, and ratios as stated, the density of s is
+The contacts that explain measured signals form a curve: one contact for each arc length s, since
+the force there has three components. The curve is short if four or more signals determine µ_x; for
+three it bends too much for an ellipsoid. So it is traced along the whisker, more finely where
+contacts are probable. At each s the force has, to first order, a covariance C_f. With a uniform
+prior of contact points and the stated one of ratios, the density of s is
 
     exp(-χ²/2 - µ_x²/2σ²) |∂(p, µ_x)/∂(s, f)| √det C_f,
 
-and that of the contact point a mixture along the curve. Its second moment about the contact nearest
-to its mean, widened for tails as in :mod:`~vibrissa.contacts.posterior`, is the covariance.
-Where the density has several peaks with valleys between, these are several candidates.
+and the contact point is a mixture along the curve. Its second moment about the contact nearest to
+its mean, widened for tails as in :mod:`~vibrissa.contacts.posterior`, is the covariance. If the
+density has several peaks with valleys between them, these are separate candidates.
 
-Where four or more signals determine µ_x, there is no friction with a probability of one half
-beforehand: the prior of µ_x is (δ(µ_x) + N(0, σ²)) / 2. With p(0) the density of µ_x at zero on
-the curve, no friction then has the odds p(0) √(2π) σ, by Savage and Dickey. The likelier of the two
-is the answer, and both are in the covariance.
+If four or more signals determine µ_x, the prior probability that there is no friction is one half:
+the prior of µ_x is (δ(µ_x) + N(0, σ²)) / 2. With the density p(0) of µ_x at zero on the curve, the
+odds of no friction are p(0) √(2π) σ (the Savage-Dickey ratio). The more probable of the two is the
+answer, and the covariance contains both.
 """
 
 from __future__ import annotations
@@ -44,24 +44,24 @@ _UNKNOWNS = 4
 LARGEST_FRICTION = 3.0
 """Largest ratio of forces along and across a whisker that friction is believed to have."""
 
-_LEAST = 0.01  # the least standard deviation of the prior; with less there is no friction
-# Arc lengths that curves are traced at, and about each peak so many more, so far, in standard
-# deviations of s.
+_LEAST = 0.01  # smallest standard deviation of the prior; below it there is no friction
+# Number of arc lengths at which curves are traced; number of further ones about each peak, and how
+# far from it, in standard deviations of s.
 _STATIONS = 33
 _FINE, _REACH = 17, 4.0
-# Of a peak this much lower than the highest (log density) nothing is kept; two peaks are two
-# candidates where the valley between them is lower than both by so much.
+# Log density below the highest peak at which another one is dropped; and depth of the valley below
+# two peaks from which they are separate candidates.
 _LOW, _VALLEY = 15.0, 3.0
-_PARTS = 8  # parts that each step is divided into for the moments
-_TOGETHER = 1000  # measurements whose curves are traced together: some tens of MB
-# The largest kurtosis, relative to a normal distribution's, at which a covariance is relied on.
+_PARTS = 8  # number of parts of each step for the moments
+_TOGETHER = 1000  # number of measurements whose curves are traced together, in some tens of MB
+# Largest kurtosis of a valid covariance, relative to a normal distribution's.
 _TAILED = 3.0
 
 
 class _Nodes(NamedTuple):
     """Contacts on curves, by curve and arc length.
 
-    ``log`` is the log density of s, ``spread`` and ``angle_spread`` are the covariance of the
+    ``log`` is the log density of s; ``spread`` and ``angle_spread`` are the covariance of the
     contact point and the variance of the friction angle at this s.
     """
 
@@ -78,7 +78,7 @@ class _Nodes(NamedTuple):
         return self.x[:, 0]
 
     def rows(self, kept: AnyArray) -> _Nodes:
-        """Some of them."""
+        """The nodes selected by indices or a mask."""
         parts: list[Any] = [part[kept] for part in self]
         return _Nodes(*parts)
 
@@ -138,17 +138,16 @@ class _Curves:
                 inside = (place >= 0) & (place < _STATIONS)
                 guess = at[inside]
                 guess[:, 0] = stations[place[inside]]
-                guess[:, 1:] *= at[inside, :1] / guess[:, :1]  # of the same moment
+                guess[:, 1:] *= at[inside, :1] / guess[:, :1]  # with the same moment
                 found = self.nodes(now[inside], row[now[inside]], guess, v[inside])
                 parts.append(found)
                 now, at, v = found.curve, found.x, found.values
         return _joined(parts)
 
     def finer(self, row: IntArray, nodes: _Nodes, starts: _Nodes) -> tuple[_Nodes, IntArray]:
-        """Add contacts about the peaks of the density, and about where the curves began.
+        """Insert contacts about the peaks of the density, and about the start of each curve.
 
-        What is left of a curve where the whisker has not slipped off may be several: also the row
-        of each.
+        The stable part of a curve may consist of several pieces: return also the row of each.
         """
         peaks = _joined([nodes.rows(_peaks(nodes)), starts])
         curve = peaks.curve
@@ -176,7 +175,7 @@ class _Curves:
 
 
 def _upright(fits: Fits) -> AnyArray:
-    """Which contacts are those of a whisker that has not slipped off, while the ratio is held."""
+    """Which contacts are stable while the ratio is held."""
     x, t = fits.contacts, np.nan_to_num(fits.tangents)
     by_normal = (ratio_of(x) / np.hypot(x[:, 2], x[:, 3]))[:, None] * x[:, 2:]
     by = t[:, 3:6, [0, 2, 3]].copy()
@@ -185,7 +184,7 @@ def _upright(fits: Fits) -> AnyArray:
 
 
 def _peaks(nodes: _Nodes) -> IntArray:
-    """Places of local maxima of the density."""
+    """Indices of local maxima of the density."""
     log = np.concatenate([[-np.inf], nodes.log, [-np.inf]])
     curve = np.concatenate([[-1], nodes.curve, [-1]])
     left = np.where(curve[:-2] == curve[1:-1], log[:-2], -np.inf)
@@ -194,7 +193,7 @@ def _peaks(nodes: _Nodes) -> IntArray:
 
 
 class _Parts(NamedTuple):
-    """Parts of the steps after nodes: log probability, and the rest as of nodes."""
+    """Parts of the steps after nodes: log probability, and other fields as in nodes."""
 
     node: IntArray
     log: Array
@@ -207,7 +206,7 @@ class _Parts(NamedTuple):
 def _parts(nodes: _Nodes) -> _Parts:
     """Divide the steps between nodes.
 
-    The log density is a cubic between nodes, which meets a normal density exactly, and the rest is
+    The log density is a cubic between nodes, which is exact for a normal density; other fields are
     linear.
     """
     same = nodes.curve[1:] == nodes.curve[:-1]
@@ -240,7 +239,7 @@ def _parts(nodes: _Nodes) -> _Parts:
 
 
 def _divided(nodes: _Nodes) -> IntArray:
-    """Number of the candidate that each node belongs to: curves, divided in their valleys."""
+    """Index of the candidate that each node belongs to: curves are divided in their valleys."""
     out, number = np.zeros(len(nodes.log), np.int64), -1
     first = np.flatnonzero(np.diff(nodes.curve, prepend=-1))
     for begin, end in zip(first.tolist(), [*first[1:].tolist(), len(out)], strict=True):
@@ -341,7 +340,7 @@ def _found(curves: _Curves, x: Array, values: Array) -> Candidates:
 
 
 def or_without(found: Candidates, without: Candidates, sigma: float) -> Candidates:
-    """Join candidates with friction of this prior with the first one without, the one nearest."""
+    """Combine candidates with friction of this prior and the nearest one without friction."""
     row = np.flatnonzero(
         (found.number > 0) & np.isfinite(without.covariances[:, 0]).all(axis=(1, 2))
     )
@@ -380,7 +379,7 @@ def or_without(found: Candidates, without: Candidates, sigma: float) -> Candidat
 
 
 def check_ratio(spread: float, sensor: SensorNoise | None) -> None:
-    """Refuse a prior of friction that is none, or one without noise to weigh it against."""
+    """Refuse a prior of friction that is not a standard deviation, or one without noise."""
     if sensor is None:
         raise ValueError("friction is weighed against the noise of the signals: give its noise")
     if not _LEAST <= spread <= LARGEST_FRICTION:

@@ -1,8 +1,8 @@
-"""From three signals back to every stable contact that gives them.
+"""All stable contacts that have three given signals.
 
-The chart's subdivision tree for the triplet gives a seed for each contact; Newton's method on
-T(ξ) = T_measured makes it exact. Residuals are relative: forces to |F|, moments to |M|, angles in
-rad.
+The subdivision tree of the chart for the triplet supplies a seed for each contact; Newton's method
+on T(ξ) = T_measured makes it exact. Residuals are relative: forces to |F|, moments to |M|, angles
+in rad.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ from vibrissa.signals import (
     signals_of,
 )
 
-_SAME = 1e-7  # two solutions this near (relative to L and to the force) are one
-# More targets than this are brought into an order in which the tree's nodes stay at hand.
+_SAME = 1e-7  # two solutions within this (relative to L and to the force) are the same
+# Number of targets above which they are sorted, so that the tree's nodes stay in the cache.
 _MANY = 1000
 _RANK_BITS = 5
 
@@ -72,7 +72,7 @@ def triplet_tree(chart: StableSet, triplet: tuple[str, ...]) -> SearchTree:
 
 
 def _plane(chart: StableSet, triplet: tuple[str, ...]) -> PlaneVector | None:
-    """The transverse force or the bending moment, if its size or direction is in the triplet."""
+    """Transverse force or bending moment, if its size or direction is in the triplet."""
     force, point = chart.values[..., :3], chart.values[..., 3:]
     d_force, d_point = chart.tangents[..., :3, :], chart.tangents[..., 3:, :]
     for size, direction in (("FT", "FD"), ("MB", "MD")):
@@ -102,7 +102,7 @@ def invert(
 
 
 def _by_neighbourhood(targets: Array) -> IntArray:
-    """Numbers of targets in an order in which neighbours follow each other (Z-order of ranks)."""
+    """Indices that sort targets so that neighbours are adjacent (Z-order of ranks)."""
     code = np.zeros(len(targets), np.int64)
     shares = np.linspace(0.0, 1.0, 2**_RANK_BITS + 1)[1:-1]
     for c, column in enumerate(targets.T):
@@ -137,7 +137,7 @@ def _inverted(
 def polish(
     chart: StableSet, triplet: tuple[str, ...], targets: Array, contacts: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Newton's method on T(ξ) = target from given contacts, stable or not."""
+    """Refine contacts, stable or not, by Newton's method on T(ξ) = target."""
     n = len(targets)
     xi = np.array(contacts, dtype=np.float64)
     values, misfits, signs = np.full((n, 6), np.nan), np.full(n, np.inf), np.full(n, np.nan)
@@ -153,7 +153,7 @@ def polish(
 
 
 def _with_choice(targets: Array, triplet: tuple[str, ...]) -> Array:
-    """Each target with the numbers of its signals behind it, as the equations want it."""
+    """Each target followed by the codes of its signals, as the equations expect it."""
     which = [float(SIGNALS.index(name)) for name in triplet]
     return np.concatenate([targets, np.tile(which, (len(targets), 1))], axis=1)
 
@@ -187,7 +187,7 @@ def _match(
 def _add(
     row: int, xi: Array, value: Array, count: IntArray, contacts: Array, values: Array
 ) -> None:
-    """Put a solution in its place by force, unless it is there already."""
+    """Insert a solution by rising force, unless it is already there."""
     force = np.hypot(xi[1], xi[2])
     n = count[row]
     place = n
@@ -235,7 +235,7 @@ def invert_rows(
         if row < last:
             n = seeds(tree, targets[row], found, slopes, quality)
         elif waiting > 0:
-            n = 1  # the last few, fewer than there are lanes
+            n = 1  # the last ones, fewer than there are lanes
         for seed in range(n):
             if row < last:
                 rows[waiting] = row
@@ -279,7 +279,7 @@ def polish_rows(
     first: int,
     last: int,
 ) -> None:
-    """Newton's method on T(ξ) = target for some rows, four side by side."""
+    """Refine contacts by Newton's method on T(ξ) = target for some rows, four at a time."""
     b = np.zeros(BUFFER_SIZE)
     charts, inverses = np.zeros((LANES, 3)), np.full((LANES, 3, 3), np.nan)
     for row in range(first, last, LANES):
@@ -302,10 +302,10 @@ def polish_rows(
 
 @lru_cache(maxsize=64)
 def seeding_triplet(chart: StableSet, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Choose the three signals that determine contacts best, over the chart.
+    """Choose the three signals that determine contacts best over the chart.
 
-    They are judged by the median volume of the error ellipsoid, with the same relative error of
-    forces and moments.
+    The criterion is the median volume of the error ellipsoid, for the same relative error of forces
+    and moments.
     """
     values = chart.values[::2, ::4, 1::2].reshape(-1, 6)
     tangents = chart.tangents[::2, ::4, 1::2].reshape(-1, 6, 3)

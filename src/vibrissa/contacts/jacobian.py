@@ -31,14 +31,14 @@ from vibrissa.signals import (
     signals_of,
 )
 
-#: A determinant smaller than this, rows and columns being of size one, is zero to rounding.
+#: Determinant, for rows and columns of size one, below which it is zero to rounding.
 SINGULAR = 1e-11
-RANK = 1e-8  # singular values smaller than this share of the largest count as zero
-_LOST = 0.99  # a triplet has lost a dimension if it has at all but this share of the contacts
-# Where the equations make signals depend on each other, the integration does so to its own error.
-# With so many times the steps that is below ``RANK``.
+RANK = 1e-8  # share of the largest singular value below which one counts as zero
+_LOST = 0.99  # a triplet is deficient if it is so at all contacts except this share
+# Signals that the equations make dependent are so only to the error of the integration. With so
+# many times the steps that error is below ``RANK``.
 _FINER = 8
-_TRIED = 256  # how many contacts show whether signals determine contacts at all
+_TRIED = 256  # number of contacts sampled to test whether signals determine contacts
 
 
 def contact_signal_derivatives(
@@ -49,7 +49,7 @@ def contact_signal_derivatives(
     which = [SIGNALS.index(name) for name in names]
     with np.errstate(all="ignore"):
         by_contact = signal_derivatives(values, tangents)[:, which]
-        # What each signal's derivatives are measured against: all of F's or all of M's.
+        # Reference of each signal's derivatives: those of all of F or of all of M.
         rows = _row_sizes(values, tangents)[:, which]
         columns = np.linalg.norm(tangents, axis=1)
         scaled = by_contact / rows[:, :, None] / columns[:, None, :]
@@ -64,7 +64,7 @@ def contact_signal_derivatives(
 
 
 def _row_sizes(values: Array, tangents: Array) -> Array:
-    """Sizes (n, 6) to compare the derivatives of the six signals with."""
+    """Sizes (n, 6) that make the derivatives of the six signals comparable."""
     wrench, slopes = wrenches_of(values), wrench_tangents(values, tangents)
     sizes = [np.linalg.norm(slopes[:, part], axis=(1, 2)) for part in (slice(3), slice(3, 6))]
     transverse = [np.hypot(wrench[:, i], wrench[:, i + 1]) for i in (1, 4)]
@@ -89,7 +89,7 @@ def spherical_derivatives(points: Array) -> Array:
 
 
 def determining(contact_map: ChartedWhisker, names: tuple[str, ...]) -> bool:
-    """Whether signals determine contacts, but for single ones."""
+    """Whether signals determine contacts almost everywhere."""
     chart = contact_map.chart
     nodes = np.random.default_rng(0).choice(chart.values[..., 0].size, _TRIED, replace=False)
     xi, values = chart.contacts.reshape(-1, 3)[nodes], chart.values.reshape(-1, 6)[nodes]
@@ -102,8 +102,8 @@ def determining(contact_map: ChartedWhisker, names: tuple[str, ...]) -> bool:
 def deficient(
     contact_map: ChartedWhisker, names: tuple[str, ...], xi: Array, span: Array
 ) -> int | None:
-    """Steps along the whisker with which signals have lost a dimension at contacts; None if not."""
-    # A signal without a range is zero everywhere, but for rounding.
+    """Integration steps with which signals are deficient at contacts; None if they are not."""
+    # A signal without a range is zero everywhere, up to rounding.
     weight = np.where(span > RANK, 1.0 / np.maximum(span, RANK), 0.0)
     strength = fold_forces(contact_map.chart.fold, xi)
     unit = np.stack([np.ones(len(xi)), strength, strength], axis=1)

@@ -1,10 +1,10 @@
-"""Contacts of a whisker with weight, with friction, with an uncertain base, or with all of these.
+"""Contacts of a whisker with weight, friction or an uncertain base, or with several of these.
 
-The resting whisker sags under its weight. A whisker without weight that has this shape at rest
-proposes contacts: near the truth where gravity acts across the whisker, and within a few per cent
-of the length where it acts along it. They are then fitted to the signals with the whole weight and
-all that is uncertain (:mod:`~vibrissa.contacts.joint_fit`). Unknown friction leaves curves of
-contacts, which begin there (:mod:`~vibrissa.contacts.friction`).
+The resting whisker sags under its weight. A weightless whisker with this resting shape proposes
+contacts: near the truth if gravity acts across the whisker, and within a few per cent of the length
+if it acts along it. They are then fitted to the signals with the full weight and all uncertain
+parameters (:mod:`~vibrissa.contacts.joint_fit`). With unknown friction, curves of contacts are
+traced from there (:mod:`~vibrissa.contacts.friction`).
 """
 
 from __future__ import annotations
@@ -43,24 +43,24 @@ from vibrissa.signals import (
 from vibrissa.status import Status
 from vibrissa.whisker import Whisker
 
-_EXACT = 1e-8  # what exact signals are met to, in χ² of signals known to 1 %
-# Noise, in units of force and moment and in rad, within which the whisker without weight proposes
-# contacts of signals that it does not explain.
+_EXACT = 1e-8  # tolerance for exact signals, in χ² of signals known to 1 %
+# Noise, in units of force and moment and in rad, within which the weightless whisker proposes
+# contacts for signals that it does not explain exactly.
 _NEAR = 0.01
 _MOST = 8
-# Share of the length within which two arc lengths are of the same contact.
+# Difference of arc lengths, over L, within which two contacts are the same.
 _SAME = 0.03
-# Friction angles scatter by so much: of contacts that explain a wrench equally well, those that
-# need less friction come first.
+# Standard deviation of friction angles: of contacts that explain a wrench equally well, those with
+# less friction come first.
 _LIKELY = np.deg2rad(20.0)
 _NO_ERRORS = np.zeros((0, 6, 7))
-_WEIGHTLESS = 1e-9  # a base that falls leaves less than this of gravity, m/s²
+_WEIGHTLESS = 1e-9  # gravity, m/s², below which the base is in free fall
 # Of three signals with all of these unknown, regions hold half to two thirds of the contacts.
 _SEPARATE = 4
 
 
 class JointEstimate:
-    """Finds contacts with weight, friction and what is uncertain of the rod."""
+    """Estimates contacts with weight, friction and uncertain parameters of the rod."""
 
     def __init__(
         self,
@@ -109,7 +109,7 @@ class JointEstimate:
             self._rubbing = JointFit(self.forward, self.channels, sensor, least, True, friction)
 
     def __call__(self, values: Array) -> tuple[Candidates, IntArray]:
-        """Candidates of measurements (n, k), SI units, tared as now, and their statuses."""
+        """Candidates of measurements (n, k), SI units, tared in this pose, and their statuses."""
         flat = values / self.scale
         targets = self.channels.targets(flat)
         found, status = self._without_friction(values, flat, targets)
@@ -141,31 +141,31 @@ class JointEstimate:
 
     @property
     def uncertain(self) -> bool:
-        """Whether friction, or anything that measurements share of the rod, is uncertain."""
+        """Whether friction, or any parameter that measurements share, is uncertain."""
         return bool(self.forward.errors or self._rubbing)
 
     @property
     def sagged(self) -> ChartedWhisker:
-        """Map of a whisker without weight that has the sagged shape, or nearly."""
+        """Map of a weightless whisker with the sagged shape, or nearly so."""
         assert self.contact_map is not None
         assert self._proposing is not None
         return self.contact_map.sagged(self._proposing)
 
     def direction(self, rotation: Array) -> tuple[float, ...]:
-        """Gravity of the laboratory frame where the base is turned (3, 3)."""
+        """Gravity of the laboratory frame in the frame of a base turned by (3, 3)."""
         if self._lab is None or not np.isfinite(rotation).all():
             return ()
         return self._lab.turned(rotation, self._step).acceleration
 
     @property
     def laboratory_gravity(self) -> tuple[float, float, float] | None:
-        """Gravity that was stated, in the frame that rotations of the base lead to."""
+        """Stated gravity in the frame that rotations of the base lead to."""
         return None if self._lab is None else self._lab.acceleration
 
     def turned(self, rotation: Array, gravity: ArrayLike | None = None) -> JointEstimate:
-        """The same with the base turned (3, 3), gravity being that of the laboratory frame.
+        """The same estimate for a turned base (3, 3), with gravity in the laboratory frame.
 
-        It is what was stated, or gravity (3,) minus the acceleration that the base now has.
+        Gravity is the stated one, or ``gravity`` (3,), already reduced by the base's acceleration.
         """
         stated = self._lab
         if stated is None:
@@ -181,7 +181,7 @@ class JointEstimate:
             return self
         names = self.names, self.sensor, self.prior
         out = JointEstimate(self.whisker, self.contact_map, *names, gravity=weight, **self._how)
-        # Contacts are proposed by shapes under gravity of the size that was stated: they are few.
+        # Contacts are proposed by resting shapes under gravity of the stated size, which are few.
         now = max(float(np.linalg.norm(weight.acceleration)), _WEIGHTLESS)
         out._proposing = weight.nearly(float(np.linalg.norm(stated.acceleration)) / now)
         out._lab = replace(stated, tare=weight.tare)
@@ -189,7 +189,7 @@ class JointEstimate:
         return out
 
     def untared(self, values: Array) -> Array:
-        """Measurements (n, k), SI units, as if the sensor had been tared as it is now."""
+        """Measurements (n, k), SI units, as if the sensor had been tared in this pose."""
         if not self._shift.any():
             return values
         targets = self.channels.targets(values / self.scale) - self._shift
@@ -205,7 +205,7 @@ class JointEstimate:
 
     @property
     def _noise(self) -> Noise | None:
-        """Noise as it was stated."""
+        """The stated noise."""
         if self.sensor is None:
             return None
         return self.sensor.deviations if self.sensor.wrench is None else self.sensor.wrench
@@ -213,7 +213,7 @@ class JointEstimate:
     def _without_friction(
         self, values: Array, flat: Array, targets: Array
     ) -> tuple[Candidates, IntArray]:
-        """Candidates without friction, but of the wrench."""
+        """Candidates without friction, except for the wrench."""
         if self.forward.weighted or self.contact_map is None:
             return self._fitted(flat, targets, self._proposed(targets))
         errors = _NO_ERRORS if self.sensor is None else self.sensor.errors
@@ -233,10 +233,10 @@ class JointEstimate:
         return found, status
 
     def _proposed(self, targets: Array) -> list[Contacts]:
-        """Contacts of a whisker without weight of the sagged shape: near the signals, and exact.
+        """Contacts of the weightless whisker of the sagged shape: near ones and exact ones.
 
-        Signals just beyond those of its map have none that is exact; light contacts are found by
-        these.
+        Signals just beyond those of its map have no exact contact; light contacts are found from
+        the near ones.
         """
         values, names = self.signals_of(targets), self.channels.signals
         exact = dict(zip(names, values.T, strict=True))
@@ -251,7 +251,7 @@ class JointEstimate:
     def _fitted(
         self, flat: Array, targets: Array, proposed: list[Contacts]
     ) -> tuple[Candidates, IntArray]:
-        """Candidates by rank, and statuses."""
+        """Candidates in order, and statuses."""
         d, n, fitting = self.d, len(flat), self._fit
         arc = np.concatenate([one.candidates.arc_length for one in proposed], axis=1)
         force = np.concatenate([one.candidates.contact_force for one in proposed], axis=1)
@@ -287,7 +287,7 @@ class JointEstimate:
         return found, status
 
     def _ranked(self, flat: Array, targets: Array, fits: Fits, found: Candidates) -> Candidates:
-        """Candidates by probability, with what noise leaves open."""
+        """Candidates by probability, with their covariances."""
         row, place = np.nonzero(np.isfinite(found.chi_squared))
         joint = self._fit.joint(flat, targets, fits)
         covariance, valid = self._fit.to_second_order(joint, fits)
@@ -306,9 +306,9 @@ class JointEstimate:
     def _as_sagged(
         self, joint: Joint, fits: Fits, covariance: Array, valid: AnyArray
     ) -> tuple[Array, AnyArray]:
-        """Covariances, where they are larger, of the same forces on the sagged whisker.
+        """Covariances, or those of the same forces on the sagged weightless whisker if larger.
 
-        Light contacts leave long, bent valleys, which are followed where there is no weight.
+        Light contacts have long, bent valleys, which are followed only without weight.
         """
         sagged, d = self.sagged, self.d
         load = PointForce(fits.contacts[:, 0] * d.length, components=fits.contacts[:, 1:] * d.force)
@@ -331,7 +331,7 @@ class JointEstimate:
 
 
 def _least_noise(sensor: SensorNoise | None, names: tuple[str, ...], d: Discretization) -> float:
-    """Least standard deviation of a signal, or of a mix of components, non-dimensional."""
+    """Smallest standard deviation of a signal, or of a mix of components, non-dimensional."""
     if sensor is None:
         return 0.0
     if sensor.deviations is not None:
@@ -344,7 +344,7 @@ def _least_noise(sensor: SensorNoise | None, names: tuple[str, ...], d: Discreti
 
 
 def _shifts(names: tuple[str, ...], shift: Array) -> Array:
-    """What a shift of (F, M) adds to channels."""
+    """Change of channels due to a shift of (F, M)."""
     out = np.zeros(len(names))
     for i, name in enumerate(names):
         if name in WRENCH:
@@ -370,9 +370,9 @@ def estimate_jointly(
     stiffness_sigma: float = 0.0,
     rotation: Array | None = None,
 ) -> Contacts:
-    """Find contacts with weight, friction and what is uncertain, as `ContactMap.estimate` does.
+    """Estimate contacts with weight, friction and uncertain parameters; see `ContactMap.estimate`.
 
-    With rotations of the base (..., 3, 3) gravity is that of the laboratory frame.
+    With rotations of the base (..., 3, 3), gravity is that of the laboratory frame.
     """
     names = WRENCH if using == "wrench" else selection(using)
     sensor = sensor_noise(noise, names, errors)
@@ -406,7 +406,7 @@ def estimate_jointly(
 
 
 def _in_poses(find: JointEstimate, flat: Array, rotation: Array) -> tuple[Candidates, IntArray]:
-    """Candidates of measurements with turned bases, those of one direction of gravity at once."""
+    """Candidates of measurements in turned poses, grouped by the direction of gravity."""
     posed = finite(rotation)
     flat = np.where(posed[:, None], flat, np.nan)
     rows: dict[tuple[float, ...], list[int]] = {}

@@ -1,19 +1,20 @@
-"""Contacts fitted together with unknowns that all measurements share: one least squares for all.
+"""Least-squares fits of contacts together with uncertain parameters that all measurements share.
 
-A forward model (:mod:`~vibrissa.contacts.forward`) gives channels T(x) of a contact and, to first
-order, what further unknowns c ~ N(0, 1) change of them, N, and of the contact point, p_c. With the
-noise Σ, a prior of the friction ratio µ_x ~ N(0, σ²) where that is unknown too, and T̃ measured,
+A forward model (:mod:`~vibrissa.contacts.forward`) gives the channels T(x) of a contact and, to
+first order, the effects of further unknowns c ~ N(0, 1) on them, N, and on the contact point, p_c.
+With noise Σ, a prior of the friction ratio µ_x ~ N(0, σ²) if that is unknown too, and measured T̃,
 
     χ²(x, c) = |T(x) + N c - T̃|²_Σ + |c|² + µ_x²/σ².
 
-The least by c is χ² of x alone with the covariance Σ + N Nᵀ, which is fitted; then
+Its minimum over c is χ² of x alone with the covariance Σ + N Nᵀ, which is fitted; then
 c = Nᵀ (Σ + N Nᵀ)⁻¹ (T̃ - T), and the contact point is p(x) + p_c c. Signals that determine no more
-than the contact leave c zero, and the covariance of the contact point takes up what c may move: it
-is that of all unknowns together, (JᵀJ)⁻¹ with J by (x, c) in standard deviations.
+than the contact leave c at zero, and its uncertainty enters the covariance of the contact point:
+that of all unknowns together, (JᵀJ)⁻¹ with J the derivatives with respect to (x, c), in standard
+deviations.
 
-Where that is not enough, residuals and p are followed to second order along its principal axes, and
-the second moment about p is taken of a cloud of contacts, each as probable as its residuals and
-det ∂p/∂x make it, widened for tails as in :mod:`~vibrissa.contacts.posterior`.
+Where this is not accurate enough, residuals and p are expanded to second order along its principal
+axes, and the second moment about p is that of a cloud of contacts, weighted by residuals and
+det ∂p/∂x, and widened for tails as in :mod:`~vibrissa.contacts.posterior`.
 """
 
 from __future__ import annotations
@@ -43,19 +44,19 @@ from vibrissa.signals import within_turn
 from vibrissa.status import Status
 from vibrissa.whisker import Whisker
 
-HELD = 1e-5  # how exactly an arc length is held
-# Rounds in which the effects of shared unknowns, or the noise, are taken anew at the contact.
+HELD = 1e-5  # tolerance for a held arc length
+# Iterations in which the effects of shared unknowns, or the noise, are recomputed at the contact.
 _ROUNDS, _STEADY = 3, 2
-# The second order is taken from this far along each axis, in standard deviations. A covariance is
-# relied on where channels there differ from it by less, in standard deviations, where the kurtosis
-# is at most so many times a normal distribution's, and where this share of the cloud counts; with a
-# smaller share than the last the first order is stated.
+# Displacement along each axis for the second order, in standard deviations. Limits of a valid
+# covariance: difference of the channels there from the second order, in standard deviations;
+# kurtosis relative to a normal distribution's; and effective share of the cloud. Below the last
+# share the covariance is that of the first order.
 _REACH = 2.0
 _MISSED, _TAILED, _COUNTING, _TOO_FEW = 0.03, 1.8, 0.3, 0.1
 # Longest axis of the arc length, over L (and of the force, 1), and largest curvature of the log
 # density along an axis.
 _LONGEST, _SHARP = 0.25, 2.0
-# Log density that the cloud gains at most over a normal distribution's.
+# Largest gain of the cloud's log density over that of a normal distribution.
 _MOST_GAIN = 3.0
 _CLOUD = 128
 _SINGULAR = 1e-9
@@ -66,8 +67,8 @@ class Joint(NamedTuple):
     """Contacts with their shared unknowns, to first order.
 
     χ² of the measurement and c alone (n,); all residuals (n, m), in standard deviations; the values
-    with c (n, 6 or 9); the derivatives of the residuals by (x, c) (n, m, u), those of the contact
-    point (n, 3, u); and the weights of the channels (n, k, k).
+    with c (n, 6 or 9); the derivatives with respect to (x, c) of the residuals (n, m, u) and of the
+    contact point (n, 3, u); and the weights of the channels (n, k, k).
     """
 
     misfit: Array
@@ -78,7 +79,7 @@ class Joint(NamedTuple):
     weights: Array
 
     def spread(self, first: int = 0) -> Array:
-        """Covariances (n, u, u) of the unknowns from this one on, the others being held."""
+        """Covariances (n, u, u) of the unknowns from ``first`` on, the others being held."""
         back = np.linalg.pinv(np.nan_to_num(self.design[..., first:]), rcond=_SINGULAR)
         return np.asarray(back @ np.swapaxes(back, 1, 2))
 
@@ -107,7 +108,7 @@ class JointFit:
         self._turned = np.array([CIRCULAR[i] for i in self._which])
 
     def _errors(self, flat: Array, x: Array, values: Array) -> tuple[Array, Array, Array]:
-        """Covariance of the channels, and what c changes of them and of (F, p)."""
+        """Covariance of the channels, and the effects of c on them and on (F, p)."""
         own = self.channels.covariance(self.sensor, flat, values, self.d)
         wrench, moved = self.forward.by_errors(x, values)
         return own, channel_gradients(values, self.names) @ wrench, moved
@@ -117,7 +118,8 @@ class JointFit:
     ) -> Fits:
         """Fit contacts from starts x (n, 4) to measured signals and channels, row by row.
 
-        With ``values`` (F, p) of the starts, which are near, once; at their arc lengths if held.
+        If ``values``, (F, p) of the starts, are given, these are near and one iteration suffices.
+        If ``held``, arc lengths are held.
         """
         k, more = len(self.names), {"ratio": self.ratio_sigma, "s": HELD if held else np.inf}
         more = {name: sigma for name, sigma in more.items() if sigma < np.inf}
@@ -143,7 +145,7 @@ class JointFit:
         return fits
 
     def joint(self, flat: Array, targets: Array, fits: Fits) -> Joint:
-        """Shared unknowns of fitted contacts, and what all unknowns change."""
+        """Shared unknowns of fitted contacts, and the effects of all unknowns."""
         x, values = fits.contacts, fits.values
         own, change, moved = self._errors(flat, x, values)
         weights, n, m = whitening(own), len(self.free), change.shape[2]
@@ -174,12 +176,12 @@ class JointFit:
         )
 
     def alone(self, joint: Joint) -> Joint:
-        """The same contacts without shared unknowns and friction's prior."""
+        """The same contacts without shared unknowns and without the prior of friction."""
         n, k = len(self.free), len(self.names)
         return joint._replace(design=joint.design[:, :k, :n], moved=joint.moved[..., :n])
 
     def degrees(self, flat: Array, values: Array) -> int:
-        """Number of independent channels less that of the unknowns."""
+        """Number of independent channels minus that of the unknowns."""
         if self.sensor is None or not len(flat):
             return len(self.names) - len(self.free)
         own = self.channels.covariance(self.sensor, flat[:1], values[:1], self.d)
@@ -225,11 +227,12 @@ class JointFit:
     def _second_order(
         self, joint: Joint, fits: Fits, axes: Array
     ) -> tuple[Array, Array, Array, Array]:
-        """What displacements along axes (n, u, a) change of derivatives.
+        """Changes of derivatives for displacements along axes (n, u, a).
 
-        Derivatives of the point, and with friction of its angle, by x, and their changes for a unit
-        of each axis (n, 1 + a, f, f); second derivatives along the axes of residuals (n, m, a, a)
-        and points (n, 3, a, a); and what these miss of the channels (n,).
+        Derivatives of the point, and with friction of its angle, with respect to x, and their
+        changes for a unit of each axis (n, 1 + a, f, f); second derivatives along the axes of
+        residuals (n, m, a, a) and points (n, 3, a, a); and the error of these for the channels
+        (n,).
         """
         x, k = fits.contacts, len(self.names)
         along = axes[:, : len(self.free)]
@@ -262,7 +265,7 @@ class JointFit:
     def _slopes(
         self, joint: Joint, values: Array, tangents: Array, x: Array
     ) -> tuple[Array, Array]:
-        """Channels (n, k), and derivatives by x: of points, the angle of friction, and channels."""
+        """Channels (n, k); derivatives with respect to x of points, friction angle, channels."""
         rows = [tangents[:, 3:6]]
         if self.friction:
             rows.append(friction_angle_derivatives(x)[:, None])
@@ -272,7 +275,7 @@ class JointFit:
     def allow(
         self, flat: Array, targets: Array, found: Candidates, status: IntArray
     ) -> tuple[Candidates, IntArray, Array]:
-        """Candidates of the stated rod with what its shared unknowns move; statuses, first χ²."""
+        """Candidates of the nominal rod with effects of shared unknowns; statuses, first χ²."""
         there = np.arange(found.x.shape[1]) < found.number[:, None]
         row, place = np.nonzero(there)
         out, degrees = found.allowed_first(there), 0  # a copy
@@ -291,7 +294,7 @@ class JointFit:
 
 
 def normal_cloud(dimension: int) -> Array:
-    """Points (n, dimension), symmetric, with the covariance of a normal distribution."""
+    """Symmetric points (n, dimension) with the covariance of a normal distribution."""
     half = np.random.default_rng(0).standard_normal((_CLOUD // 2, dimension))
     points = np.concatenate([half, -half])
     root = np.linalg.cholesky(points.T @ points / _CLOUD)
@@ -299,9 +302,9 @@ def normal_cloud(dimension: int) -> Array:
 
 
 def _moments(first: Array, linear: Array, points: Array, density: Array) -> tuple[Array, AnyArray]:
-    """Covariances (n, 3, 3) of a cloud (n, c, 3) of some density (n, c), and which can serve.
+    """Covariances (n, 3, 3) of a cloud (n, c, 3) with density (n, c), and which are usable.
 
-    Tails are relative to those of its linear part, whose covariances are the first.
+    Tails are relative to those of its linear part, whose covariances are ``first``.
     """
     total = np.maximum(density.sum(axis=1), 1e-300)
     counting = total**2 / (_CLOUD * np.maximum((density**2).sum(axis=1), 1e-300))
@@ -322,7 +325,7 @@ def _moments(first: Array, linear: Array, points: Array, density: Array) -> tupl
 
 
 def check_compliance(sigma: float, sensor: SensorNoise | None) -> None:
-    """Refuse what is not a standard deviation, or one without noise to weigh it against."""
+    """Refuse what is not a standard deviation, or one without noise."""
     if not 0.0 <= sigma < np.inf:
         raise ValueError(
             f"compliance_sigma is a standard deviation, rad/(N·m), not negative; got {sigma!r}"
@@ -341,7 +344,7 @@ def soft_base(
     sigma: float,
     friction: bool = False,
 ) -> JointFit | None:
-    """Fit with an uncertain compliance of the base, rad/(N·m); None where it is certain."""
+    """Fit with an uncertain compliance of the base, rad/(N·m); None if it is certain."""
     check_compliance(sigma, sensor)
     if sigma == 0.0:
         return None

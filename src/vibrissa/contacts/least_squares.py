@@ -1,14 +1,14 @@
-"""Contacts that explain measured signals best: weighted least squares, four contacts side by side.
+"""Weighted least-squares fits of contacts to measured signals, four contacts at a time.
 
-A contact has the unknowns x = (s, f_x, f_y, f_z), or without friction (s, f_y, f_z), and gives
+A contact has the unknowns x = (s, f_x, f_y, f_z), or without friction (s, f_y, f_z), and determines
 channels c(x): signals, or components of force and moment. Measured channels c̃ with covariance
 Σ = (WᵀW)⁻¹ are explained best where
 
     χ²(x) = |W (c(x) - c̃)|²
 
-is least: Gauss-Newton steps with the exact Jacobian of the rod, damped as Levenberg and Marquardt
-do where one fails. The contact may not leave the whisker: at the tip (and at the smallest arc
-length considered) only the force is free. Everything is non-dimensional.
+is a minimum. It is reached by Gauss-Newton steps with the exact Jacobian of the rod, damped as by
+Levenberg and Marquardt where one fails. The contact may not leave the whisker: at the tip (and at
+the smallest arc length considered) only the force is free. All quantities are non-dimensional.
 """
 
 from __future__ import annotations
@@ -54,27 +54,27 @@ from vibrissa.rod import (
 )
 from vibrissa.signals import FD, MD, signal_equations
 
-# Some valleys of χ² are narrow and bent: most fits take 5 rounds, but a few a hundred. What is not
-# at rest after so many goes on only if it may still count.
+# Iterations after which a fit goes on only if its χ² may still count: most fits take 5, but in
+# narrow, bent valleys a few take a hundred.
 _ROUNDS = 15
-#: How often as many rounds are tried anew.
+#: Largest number of continuations by as many iterations.
 TIMES = 8
-# A step this small, relative to the length and to the force, is the last, and taken to first order;
-# a damped one only if it is smaller still.
+# Step, relative to the length and to the force, below which it is the last, taken to first order;
+# and the same for a damped step.
 _LAST = 1e-6
 _SMALL = 1e-9
-# So is one that promises to lower χ² by no more than this share of it.
+# Predicted decrease of χ², as a share of it, below which a step is the last.
 _IDLE = 1e-8
-_IDLE_NEAR = 1e-3  # between the map's nodes, where steps are good to about that
-_FIRST_ROUNDS = 4  # so many steps there before the rod is integrated
+_IDLE_NEAR = 1e-3  # the same for interpolated contacts, to which steps are accurate
+_FIRST_ROUNDS = 4  # steps on interpolated contacts before the rod is integrated
 _LONGEST = 0.1
 _MOST_DAMPING = 1e8
-_SETTLED = 1e-5  # contacts this near (over L, and relative to the force) have the same weights
-_SAME = 1e-3  # contacts within this (over L, and ten times that relative to the force) are one
+_SETTLED = 1e-5  # contacts within this (over L, and relative to the force) have the same weights
+_SAME = 1e-3  # contacts within this (over L, and ten times it relative to the force) are the same
 
 
 class Fits(NamedTuple):
-    """Row by row: x (n, 4), (F, p) (n, 6), ∂(F, p)/∂x (n, 6, 4), χ² (n,), whether at rest (n,)."""
+    """Fits by row: x (n, 4), (F, p) (n, 6), ∂(F, p)/∂x (n, 6, 4), χ² (n,), convergence (n,)."""
 
     contacts: Array
     values: Array
@@ -93,7 +93,7 @@ def channel_equations(
     residual: Array,
     jacobian: Array,
 ) -> None:
-    """Channels of x and (F, p) minus targets (k,), and their derivatives by x (k, 4)."""
+    """Fill channels of x and (F, p) minus targets (k,), and their derivatives (k, 4) in x."""
     signal_equations(x[0], v, t, True, codes, residual, jacobian)
     for k in range(codes.shape[0]):
         if codes[k] == RATIO:
@@ -110,9 +110,9 @@ def channel_equations(
 def contact_equations(
     rod: Charted, work: Array, near: bool, x: Array, value: Array, tangents: Array
 ) -> None:
-    """Fill (F, p) and ∂(F, p)/∂x (6, 4) of a contact; between the map's nodes if ``near``.
+    """Fill (F, p) and ∂(F, p)/∂x (6, 4) of a contact; interpolated if ``near`` and on the map.
 
-    Where it is not on the map the rod is integrated.
+    Otherwise the rod is integrated.
     """
     if near and interpolate(rod.nodes, rod.fold, work, x, value, tangents, True):
         return
@@ -142,7 +142,7 @@ def whiten(w: Array, residual: Array, jacobian: Array, k: int, r: Array, j: Arra
 def _damped_step(
     r: Array, j: Array, k: int, damping: float, fixed: Array, a: Array, step: Array
 ) -> bool:
-    """Solve (jᵀj + damping diag) step = -jᵀr over the unknowns that are not fixed, by Cholesky."""
+    """Solve (jᵀj + damping diag) step = -jᵀr for the free unknowns, by Cholesky's method."""
     for p in range(4):
         for q in range(p + 1):
             total = 0.0
@@ -169,7 +169,7 @@ def _next(
 ) -> float:
     """Fill row 6 of the work with x after a damped step; return its relative size, or -1.
 
-    The size is 0 where the step would gain nothing.
+    The size is 0 if the step would gain nothing.
     """
     a, fixed, step, to = work[:4], work[4], work[5], work[6]
     for p in range(4):
@@ -219,7 +219,7 @@ def _finish(
 
 @inlined
 def lane_contact(b: Array, lane: int, friction: bool, value: Array, t: Array, third: Array) -> None:
-    """Copy (F, p) and ∂(F, p)/∂x (6, 4) of a contact; with friction of its two lanes."""
+    """Copy (F, p) and ∂(F, p)/∂x (6, 4) of a contact; with friction from its two lanes."""
     lane_value(b, lane, value)
     lane_slopes(b, lane, t)
     if friction:
@@ -230,14 +230,14 @@ def lane_contact(b: Array, lane: int, friction: bool, value: Array, t: Array, th
 
 @inlined
 def _integrate_active(rod: Rod, b: Array, to: Array, n: int, lanes: int, active: AnyArray) -> int:
-    """Integrate n contacts, ``lanes`` lanes each; how many are active, -1 if one by itself."""
+    """Integrate n contacts of ``lanes`` lanes each; number of active ones, -1 if one by itself."""
     number, only = 0, 0
     for i in range(n):
         if active[i]:
             number, only = number + 1, i
     if number == 0:
         return 0
-    if number == 1:  # its tangents side by side
+    if number == 1:  # its tangents in separate lanes
         set_all_lanes(b, to[only, 0], to[only, 1], to[only, 2], to[only, 3])
     else:
         for i in range(LANES):
@@ -259,7 +259,7 @@ def fit_rows(
     first: int,
     last: int,
 ) -> None:
-    """Fit contacts for some rows, four side by side (two with friction)."""
+    """Fit contacts for some rows, four at a time (two with friction)."""
     contacts, values, tangents, misfits, converged = fits
     b, k = np.zeros(BUFFER_SIZE), codes.shape[0]
     value, t, third = np.empty(6), np.zeros((6, 4)), np.empty((6, 3))
@@ -268,7 +268,7 @@ def fit_rows(
     r, j = np.empty((LANES, k)), np.empty((LANES, k, 4))
     to, work = np.empty((LANES, 4)), np.empty((7, 4))
     damping, active = np.empty(LANES), np.zeros(LANES, np.bool_)
-    # With friction a contact takes two lanes: their tangents differ in the first unknown.
+    # With friction a contact takes two lanes, whose tangents differ in the first unknown.
     lanes = 2 if free else 1
     for row in range(first, last, LANES // lanes):
         n = min(LANES // lanes, last - row)
@@ -324,7 +324,7 @@ def fit_rows(
 
 @kernel
 def approach(rod: Charted, how: Weighing, target: Array, measured: Array, x: Array) -> None:
-    """Take the first steps of a fit without friction between the map's nodes."""
+    """Take the first steps of a fit without friction on interpolated contacts."""
     k, best = how.codes.shape[0], np.inf
     b, value, t, weights = np.empty(BUFFER_SIZE), np.empty(6), np.zeros((6, 4)), np.zeros((k, k))
     residual, jacobian, work = np.empty(k), np.empty((k, 4)), np.empty((7, 4))
@@ -348,7 +348,7 @@ def approach(rod: Charted, how: Weighing, target: Array, measured: Array, x: Arr
 
 @inlined
 def stable_fit(fold: Fold, proximal: float, x: Array, tangents: Array) -> bool:
-    """Whether a fit without friction is stable and beyond an arc length; tangents (6, 4)."""
+    """Whether a fit without friction is stable and distal to an arc length; tangents (6, 4)."""
     xi, by_xi = np.empty(3), np.empty((6, 3))
     xi[0], xi[1], xi[2] = x[0], x[2], x[3]
     for a in range(6):
@@ -364,7 +364,7 @@ def _charted(fold: Fold, proximal: float, fits: Fits, found: AnyArray) -> None:
 
 
 def charted(chart: StableSet, fits: Fits, proximal: float) -> AnyArray:
-    """Whether fits without friction are stable contacts beyond an arc length, (n,)."""
+    """Whether fits without friction are stable contacts distal to an arc length, (n,)."""
     found = np.zeros(len(fits.contacts), np.bool_)
     _charted(chart.fold, proximal, fits, found)
     return found
@@ -432,7 +432,7 @@ def _once(
 
 @inlined
 def settled(before: Array, after: Array) -> bool:
-    """Whether a fit with weights of the contact it led to leads to about the same, x (4,)."""
+    """Whether weights at the contact reached would lead to about the same contact x (4,)."""
     apart = math.hypot(after[2] - before[2], after[3] - before[3])
     near = abs(after[0] - before[0]) < _SETTLED
     return bool(near and apart < _SETTLED * math.hypot(after[2], after[3]))
@@ -440,7 +440,7 @@ def settled(before: Array, after: Array) -> bool:
 
 @inlined
 def same_contact(a: Array, b: Array) -> bool:
-    """Whether two contacts x (4,) are one."""
+    """Whether two contacts x (4,) are the same."""
     apart = math.hypot(a[2] - b[2], a[3] - b[3])
     return bool(abs(a[0] - b[0]) < _SAME and apart < 10.0 * _SAME * math.hypot(a[2], a[3]))
 
@@ -448,7 +448,7 @@ def same_contact(a: Array, b: Array) -> bool:
 def unknowns_covariance(
     names: tuple[str, ...], values: Array, tangents: Array, weights: Array, *, friction: bool
 ) -> Array:
-    """Covariances of x, (n, 4, 4): (JᵀΣ⁻¹J)⁻¹; NaN where the channels do not determine x."""
+    """Covariances (JᵀΣ⁻¹J)⁻¹ of x, (n, 4, 4); NaN where the channels do not determine x."""
     free = [0, 1, 2, 3] if friction else [0, 2, 3]
     j = weights @ channel_derivatives(values, tangents[..., free], names)
     out = np.zeros((len(values), 4, 4))

@@ -1,22 +1,22 @@
-"""Hypotheses about a contact, a sum of Gaussians, and what they learn from one measurement.
+"""Gaussian mixture over a contact's position and velocity, updated by one measurement; compiled.
 
-Each hypothesis is a Gaussian over (p, v). A measurement moves it to where χ² of the signals and of
-p - p_predicted together is least in Ω, with the exact rod in between. There may be several such
-places: two contacts that give the same signals part where they met, and a Gaussian that covers both
-becomes two. So the least is looked for from where the hypothesis was and from each contact that
-gives the signals exactly and is not far from the prediction. What is left about each is known to
-second order (:mod:`~vibrissa.contacts.moments`), as noise leaves bent valleys and Ω ends at folds:
-its mean and covariance are those of the hypothesis thereafter, and its mass weighs it,
+Each hypothesis is a Gaussian over (p, v). A measurement moves it to the minimum in Ω of χ² of the
+signals and of p - p_predicted together, with the exact rod in between. There may be several minima:
+where two contacts with the same signals separate, a Gaussian that covers both becomes two. So the
+minimum is searched for from the hypothesis and from each contact that gives the signals exactly
+and is near the prediction. The posterior about each minimum is described to second order
+(:mod:`~vibrissa.contacts.moments`), since noise leaves bent valleys and Ω ends at folds. Its mean
+and covariance become those of the hypothesis, and its mass updates the weight,
 
     log w ← log w - χ²/2 + log ∫ exp((χ² - χ²(p))/2) dp - ½ log det P_before + log det W,
 
-with the weights W of the signals, which differ from contact to contact where noise of force and
-moment makes that of a direction.
+with the weights W of the signals, which differ between contacts if noise of force and moment
+determines that of a direction.
 
 An uncertain stiffness, and errors of a sensor's gain and mixing, are the same in all samples, and
-no averaging removes them: how the state depends on each, b = ∂(p, v)/∂ε for an error ε of standard
-deviation one, is carried along, and Σ bbᵀ is part of the covariance ("consider" parameters, as
-Schmidt had it).
+averaging does not reduce them. So the dependence of the state on each, b = ∂(p, v)/∂ε for an error
+ε of standard deviation one, is propagated too, and Σ bbᵀ is part of the covariance ("consider"
+parameters, after Schmidt).
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from vibrissa.contacts.weighing import Weighing, gradients, weigh, wrong_by
 from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel
 from vibrissa.rod import Charted
 
-# A contact that gives the signals is a place to look from if it is no farther (Mahalanobis distance
-# squared) from the prediction.
+# Squared Mahalanobis distance from the prediction within which a contact that gives the signals is
+# a starting point.
 _GATE = 50.0
-_NEAR = 4.0  # with one this near it is not looked for from where the hypothesis was as well
+_NEAR = 4.0  # with a starting point this near, the hypothesis itself is not one
 _PLACE = 11  # codes of px, py and pz among the channels
 
 
@@ -52,7 +52,11 @@ class Mixture(NamedTuple):
 
 @kernel
 def predict(mixture: Mixture, moved: float, kept: float, grown: Array) -> None:
-    """Let time pass: p goes by `moved` v, v keeps a share; `grown` (pp, pv, vv) is added."""
+    """Predict the mixture after a time step.
+
+    p changes by ``moved`` v, v keeps a share ``kept``, and ``grown`` (pp, pv, vv) is added to the
+    covariance.
+    """
     for i in range(mixture.mean.shape[0]):
         m, s, b = mixture.mean[i], mixture.spread[i], mixture.by_errors[i]
         for a in range(3):
@@ -76,7 +80,7 @@ def predict(mixture: Mixture, moved: float, kept: float, grown: Array) -> None:
 
 
 def room(n: int, errors: int) -> Mixture:
-    """Make room for n hypotheses, and so many errors."""
+    """Allocate n hypotheses with so many shared errors."""
     return Mixture(
         np.zeros((n, 6)),
         np.zeros((n, 6, 6)),
@@ -89,7 +93,7 @@ def room(n: int, errors: int) -> Mixture:
 
 @kernel
 def tidy(mixture: Mixture, number: int, least: float, most: int, near: float) -> int:
-    """Sort, normalise, drop what is improbable, and put together what has become the same."""
+    """Sort and normalise hypotheses, drop improbable ones, and merge those that coincide."""
     order = np.argsort(-mixture.weight[:number])
     mean, spread = mixture.mean[order], mixture.spread[order]
     by, contact = mixture.by_errors[order], mixture.contact[order]
@@ -153,7 +157,7 @@ def unaccounted(
     far: float,
     out: AnyArray,
 ) -> None:
-    """Fill which points (n, 3) with covariances (n, 3, 3) are so far from all hypotheses."""
+    """Fill which points (n, 3) of covariances (n, 3, 3) are ``far`` from all hypotheses."""
     both, away = np.empty((3, 3)), np.empty(3)
     for i in range(len(points)):
         out[i] = True
@@ -172,7 +176,7 @@ def unaccounted(
 
 @inlined
 def _log_determinant(a: Array) -> float:
-    """Of a positive matrix (3, 3); -inf where it is not."""
+    """Log determinant of a positive matrix (3, 3); -inf if it is not positive."""
     d = (
         a[0, 0] * (a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1])
         - a[0, 1] * (a[1, 0] * a[2, 2] - a[1, 2] * a[2, 0])
@@ -223,7 +227,7 @@ def _predictions(
     before: Array,
     root: Array,
 ) -> None:
-    """Fill where hypotheses expect p in the whisker's frame, the covariance P, and P^(-1/2)."""
+    """Fill predictions in the whisker's frame by hypothesis: p, covariance P, and P^(-1/2)."""
     for i in range(len(mixture.weight)):
         away = mixture.mean[i, :3] - base
         for a in range(3):
@@ -246,7 +250,7 @@ def _starts(
     x: Array,
     v: Array,
 ) -> int:
-    """Fill from where the least is looked for, and of which hypothesis; how many."""
+    """Fill starting points for the minimum, and the hypothesis of each; return their number."""
     n, c = len(mixture.weight), len(contacts)
     away, rows = np.empty(3), 0
     for i in range(n):
@@ -287,9 +291,9 @@ def _fits(
     weights: Array,
     fits: Fits,
 ) -> None:
-    """Move contacts to where χ² of measurement and prediction is least in Ω, and fill the rest.
+    """Move contacts to the minimum in Ω of χ² of measurement and prediction, and fill the rest.
 
-    Their targets (n, k + 3) and weights (n, k + 3, k + 3) are those of signals, which are filled,
+    Targets (n, k + 3) and weights (n, k + 3, k + 3) are those of the signals, which are filled,
     and of p.
     """
     k = how.codes.shape[0]
@@ -340,7 +344,7 @@ def _moved(
     out: Mixture,
     row: int,
 ) -> bool:
-    """Fill a row with what hypothesis i becomes at a least; False where that is not a Gaussian."""
+    """Fill a row with hypothesis i updated at a minimum; False if it is not a Gaussian."""
     k = how.codes.shape[0]
     shift, after, by_channels = np.empty(3), np.empty((3, 3)), np.empty((3, k + 3))
     own = np.ascontiguousarray(weights[:k, :k])
@@ -354,7 +358,7 @@ def _moved(
     weight += log_weights(own, how.mixing.shape[0])
     if not np.isfinite(weight):
         return False
-    # In the laboratory; G carries what p learns over to v.
+    # In the laboratory frame; G is the gain from p to v.
     after, inverse = turn @ after @ turn.T, turn @ inverse @ turn.T
     spread = mixture.spread[i]
     gain = np.ascontiguousarray(spread[:, :3]) @ inverse
@@ -371,7 +375,7 @@ def _moved(
             for c in range(3):
                 noise[a, c] -= pushed[a] * pushed[c]
         b[:, e] = keep @ np.ascontiguousarray(b[:, e]) + gain @ pushed
-    # What the base's own error adds passes through the same gain.
+    # The error of the base passes through the same gain.
     whole = keep @ spread @ keep.T + gain @ noise @ gain.T + pose * (through @ through.T)
     step = gain @ (turn @ (v[3:] + shift - prior))
     for a in range(6):
@@ -402,7 +406,7 @@ def learn(
     out: Mixture,
     misfits: Array,
 ) -> int:
-    """Update hypotheses."""
+    """Update hypotheses by a measurement."""
     n, c, k = len(mixture.weight), len(contacts), how.codes.shape[0]
     most = n * (1 + c)
     prior, before, root = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3, 3))

@@ -1,15 +1,15 @@
-"""Mean, covariance and mass of what channels leave of a contact point, to second order; compiled.
+"""Mean, covariance and mass of the posterior density of a contact point, to second order; compiled.
 
-A contact ξ̂ explains channels best, among them what is known of the point p beforehand. Each contact
-point of Ω has the density exp(-|r|²/2), zero outside: beyond the tip, before the proximal limit,
-and beyond the fold. With residuals and point to second order in u
-(:mod:`~vibrissa.contacts.expansion`), moments of this density are summed over nodes,
+A contact ξ̂ explains channels best, among them a prior of the point p. Each contact point of Ω has
+the density exp(-|r|²/2), which is zero outside: beyond the tip, proximal to the limit, and beyond
+the fold. With residuals and point to second order in u (:mod:`~vibrissa.contacts.expansion`),
+moments of this density are summed over nodes,
 
     ∫ g(p(u)) exp(-|r(u)|²/2) det ∂p/∂u du.
 
 At a fold of p, where a whisker slips off, the determinant vanishes: to first order the density is a
-sheet without volume, and its maximum lies on the boundary of Ω. To second order it has the
-thickness and the volume that contacts have which noise does not tell from those at the fold.
+sheet without volume, and its maximum is on the boundary of Ω. To second order it has the thickness
+and the volume of the contacts that the noise does not distinguish from those at the fold.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ from vibrissa.rod import BUFFER_SIZE, Charted
 
 
 class Onset(NamedTuple):
-    """What is known of contacts that begin: the density (m² + u²)^(-3/2) at u from the rest.
+    """Prior of a contact at its onset: the density (m² + u²)^(-3/2) at distance u from rest.
 
-    The resting centreline (n, 3) at equal steps of s from 0 to 1, and m; with m = 0 all contact
+    The resting centreline (n, 3) at equal steps of s from 0 to 1, and m; if m is 0, all contact
     points are equally probable.
     """
 
@@ -58,7 +58,7 @@ class Onset(NamedTuple):
 
 @inlined
 def _from_rest(rest: Array, s: float, point: Array) -> float:
-    """Squared distance of a point from where the whisker rests, its centreline (n, 3) by s."""
+    """Squared distance of a contact point at s from its position at rest, on (n, 3) points."""
     last = rest.shape[0] - 1
     i = min(max(int(s * last), 0), last - 1)
     share, total = s * last - i, 0.0
@@ -71,7 +71,7 @@ def _from_rest(rest: Array, s: float, point: Array) -> float:
 def _expect(
     model: Expansion, x: Array, value: Array, onset: Onset, points: Array, out: Array
 ) -> None:
-    """Multiply densities at nodes ±u by that of contacts beforehand, relative to the centre's."""
+    """Multiply densities at nodes ±u by the prior relative to its value at the centre."""
     half, at = NODES.shape[1], np.empty(3)
     square = onset.reach * onset.reach
     here = square + _from_rest(onset.rest, x[0], value[3:])
@@ -99,7 +99,7 @@ def _over_nodes(
     shift: Array,
     covariance: Array,
 ) -> float:
-    """Fill mean minus p̂ and covariance of a density, from those to first order; its mass."""
+    """Fill the mean minus p̂ and the covariance, from those to first order; return the mass."""
     half = NODES.shape[1]
     points, density = rays.points, rays.density
     densities(model, x[0], proximal, turn, rays)
@@ -118,7 +118,8 @@ def _over_nodes(
     if not mass > 0.0:
         return first_order
     if not squares * TOO_FEW < mass * mass:
-        for a in range(3):  # too few nodes are in Ω: what they show is added to first order
+        # Too few nodes are in Ω: their moments are added to those of the first order.
+        for a in range(3):
             for c in range(3):
                 for m in range(2 * half):
                     covariance[a, c] += density[m] * points[a, m] * points[c, m] / mass
@@ -136,10 +137,10 @@ def _over_nodes(
 
 @inlined
 def _or_as_noise(x: Array, j: Array, scale: Array) -> None:
-    """Fill x, with the force that noise alone makes where that is larger.
+    """Fill x, with its force increased to that which noise alone would give.
 
-    Axes are limited relative to the force, which a contact lighter than the noise may change by
-    many times its own; with no force at all they would have no length.
+    Axes are limited relative to the force, which may change by many times its own size for a
+    contact lighter than the noise; without any force they would have no length.
     """
     least = np.inf
     for p in range(1, 3):
@@ -167,12 +168,11 @@ def moments(
     covariance: Array,
     by_channels: Array,
 ) -> float:
-    """Fill mean minus contact point, covariance, and ∂p̂/∂(weighed channels), (3, k).
+    """Fill mean minus contact point, covariance, and ∂p̂/∂(weighted channels), (3, k).
 
-    For a contact x with (F, p) and ∂(F, p)/∂x (6, 4) of least χ² in Ω. Return the mass of the
-    density relative to exp(-χ²/2) (2π)^(3/2), and to the density beforehand of a contact that
-    begins, both at x; NaN where channels do not determine the point. What is known to be
-    ``linear`` is left to first order.
+    For a contact x with (F, p) and ∂(F, p)/∂x (6, 4) of minimum χ² in Ω. Return the mass of the
+    density relative to exp(-χ²/2) (2π)^(3/2) and to the onset prior, both at x; NaN if the channels
+    do not determine the point. If ``linear``, the first order is used.
     """
     k, b, nothing = codes.shape[0], np.zeros(BUFFER_SIZE), np.zeros(3)
     residual, jacobian, four = np.empty(k), np.empty((k, 4)), np.empty((k, 4))
@@ -233,7 +233,7 @@ def moments_of_rows(
     by_channels: Array,
     masses: Array,
 ) -> None:
-    """Fill what `moments` does for rows of contacts."""
+    """Fill the results of `moments` for rows of contacts."""
     for row in range(len(targets)):
         masses[row] = moments(
             rod,

@@ -1,7 +1,7 @@
-"""What is searched for contacts: a map's tree of cells, and the chart's nodes; compiled.
+"""Nodes of the chart as a coarse sample of the posterior, with the search tree of cells; compiled.
 
-The nodes serve where candidates alone do not: the nearest of them are starts, and together they
-show what else is probable than a candidate.
+The nodes complement the candidates: those nearest to a measurement are starting points, and all
+probable nodes together show how much probability lies outside the candidates' regions.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from vibrissa.contacts.posterior import NORMAL_KURTOSIS, second_moment, squared_
 from vibrissa.numerics import Array, IntArray, cholesky, inlined, mahalanobis, quick_exp, vectorised
 from vibrissa.rod import Charted, SearchTree, StableSet, charted_rod
 
-#: Parts of the chart in each of which the nearest node is a start.
+#: Parts of the chart; the nearest node of each is a starting point.
 PARTS = 16
 _PARTS_BY_AXIS = (4, 4, 1)
-# Blocks of the chart's nodes, along each axis, that are left out together where they are far off.
+# Blocks of nodes along each axis of the chart; a block that is too far away is skipped as a whole.
 _BLOCKS = (4, 8, 4)
-# So many of the chart's nodes must count for their moments to replace those about one contact.
+# Effective number of nodes from which their moments replace those about one contact.
 _MANY = 30.0
 # Squared Mahalanobis distance of three standard deviations of a point in space (99.73 %).
 _OUTSIDE_REGION = 14.16
 _MOST_LOG = 700.0
-# Nodes whose χ² is so much worse than the best candidate's do not count: of ten thousand such
-# nodes the likelihood is a ten thousandth of the candidate's.
+# Nodes whose χ² exceeds that of the best candidate by more are neglected: ten thousand of them
+# together have a ten thousandth of the candidate's likelihood.
 _NEGLIGIBLE = 36.0
 
 
 class Searched(NamedTuple):
-    """What is searched, non-dimensional.
+    """Search tree, nodes of the chart and their channels, non-dimensional.
 
-    The chart's nodes lie in blocks: ``blocks`` (n + 1,) has where each begins, ``extent`` (4, q, n)
-    middle and half width of what is seen in it, and the least and the largest of ``sizes``: the
-    noise of a direction falls with the size of what it is the direction of.
+    The nodes are sorted into blocks. ``blocks`` (n + 1,) is the first node of each; ``extent``
+    (4, q, n) contains the middle and half width of the channels within each, and the smallest and
+    largest of the ``sizes`` of vectors, on which the noise of directions depends.
     """
 
     charted: Charted
@@ -68,7 +68,7 @@ def searched(
     turns: Array,
     kinds: Sequence[int],
 ) -> Searched:
-    """Bring a chart's tree and nodes, with what is seen at them (q, nodes), into order."""
+    """Combine a chart, its tree and the channels (q, nodes) at its nodes; sort the nodes."""
     block = _cut(chart, _BLOCKS)
     order = np.argsort(block, kind="stable")
     blocks = np.searchsorted(block[order], np.arange(math.prod(_BLOCKS) + 1))
@@ -108,7 +108,7 @@ def at_nodes(chart: StableSet, names: tuple[str, ...]) -> tuple[Array, Array, Ar
 
 
 def _cut(chart: StableSet, number: tuple[int, int, int]) -> IntArray:
-    """To which of so many blocks along each axis the chart's nodes belong, flat."""
+    """Flat index of the block of each node of the chart, for ``number`` blocks along each axis."""
     size = chart.values.shape[:3]
     axes = [n * np.arange(m) // m for n, m in zip(number, size, strict=True)]
     i, j, k = np.meshgrid(*axes, indexing="ij")
@@ -117,11 +117,11 @@ def _cut(chart: StableSet, number: tuple[int, int, int]) -> IntArray:
 
 @lru_cache(maxsize=16)
 def _volumes(chart: StableSet) -> Array:
-    """Volumes of contact points that the chart's nodes stand for, flat."""
+    """Volume of contact points that each node of the chart represents, flat."""
     size = np.abs(np.linalg.det(chart.tangents[..., 3:, :] @ chart.frames))
     n, m, k = (number - 1 for number in size.shape)
-    size *= 2.0 * np.pi / (n * m * k)  # the chart is 1 × 2π × 1
-    for axis in range(3):  # nodes on its faces stand for half a cell
+    size *= 2.0 * np.pi / (n * m * k)  # the chart measures 1 × 2π × 1
+    for axis in range(3):  # nodes on its faces represent half a cell
         ends = np.ones(size.shape[axis])
         ends[[0, -1]] = 0.5
         size = size * np.expand_dims(ends, [i for i in range(3) if i != axis])
@@ -130,9 +130,9 @@ def _volumes(chart: StableSet) -> Array:
 
 @vectorised
 def nearest_of(of: Searched, mixing: Array, target: Array, out: IntArray) -> None:
-    """Fill the nodes of all parts of the chart that come nearest to one measurement.
+    """Fill the node of each part of the chart that is nearest to one measurement.
 
-    A block of nodes, which is within one part, is left out where its bounds are farther off.
+    A block, which belongs to one part, is skipped if its bounds show that it is farther away.
     """
     q, number, sizes = of.turns.shape[0], of.blocks.shape[0] - 1, np.zeros(2)
     fixed = np.zeros(q)
@@ -172,9 +172,9 @@ def nearest_of(of: Searched, mixing: Array, target: Array, out: IntArray) -> Non
 def _near_blocks(
     of: Searched, weights: Array, unit: Array, target: Array, most: float, blocks: IntArray
 ) -> tuple[int, int]:
-    """List blocks of nodes that may have a χ² of ``most``; how many, with how many nodes.
+    """List the blocks that may contain nodes with a χ² of at most ``most``; count blocks and nodes.
 
-    Each whitened residual is within bounds over a block, as the channels are.
+    Bounds on the channels of a block give bounds on each whitened residual.
     """
     q, number, nodes = of.turns.shape[0], 0, 0
     low, high = np.empty(q), np.empty(q)
@@ -210,9 +210,9 @@ def _misfits_of_block(
     away: Array,
     misfits: Array,
 ) -> None:
-    """Fill χ² (n,) at nodes from the first of a block on; ``away`` (q + 1, n) is for work.
+    """Fill χ² (n,) at nodes from the first of a block on; ``away`` (q + 1, n) is working memory.
 
-    Weights of directions are for sizes of one ``unit``; where that is zero, they are for all sizes.
+    Weights of directions are for vectors of size ``unit``, or for all sizes if that is zero.
     """
     q, number = of.turns.shape[0], misfits.shape[0]
     r = away[q]
@@ -247,7 +247,7 @@ def _likely_nodes(
     near: int,
     size: int,
 ) -> tuple[int, IntArray, Array]:
-    """List the nodes of some blocks with a χ² below ``most``; how many, which, and their χ²."""
+    """List the nodes of some blocks with a χ² below ``most``: their number, indices and χ²."""
     nodes, misfits, kept, longest = np.empty(size, np.int64), np.empty(size), 0, 0
     for i in range(near):
         longest = max(longest, of.blocks[blocks[i] + 1] - of.blocks[blocks[i]])
@@ -256,7 +256,7 @@ def _likely_nodes(
         first = of.blocks[blocks[i]]
         number = of.blocks[blocks[i] + 1] - first
         _misfits_of_block(of, weights, unit, target, first, away, here[:number])
-        for k in range(number):  # without branches: what does not count is written over
+        for k in range(number):  # without branches: entries that do not count are overwritten
             nodes[kept], misfits[kept] = first + k, here[k]
             kept += 1 if here[k] < most else 0
     return kept, nodes, misfits
@@ -266,11 +266,11 @@ def _likely_nodes(
 def probable_nodes(
     of: Searched, white: bool, weights: Array, unit: Array, target: Array, point: Array, chi: float
 ) -> tuple[Array, Array]:
-    """Nodes of the chart that may be right: their points (3, n), density and likelihood (2, n).
+    """Nodes of the chart that may be right: points (3, n), density and likelihood (2, n).
 
-    Points are those about one of the contact points, likelihoods are relative to its χ². What is
-    seen may be ``white`` already. Weights of directions are for sizes of one ``unit``, if that is
-    not zero: of larger ones they are sharper, and so is the density of what was measured.
+    Points are relative to the contact point ``point``, likelihoods to its χ². The channels may be
+    ``white`` already. Weights of directions are for vectors of size ``unit`` unless that is zero;
+    larger vectors have sharper directions, and the density of the measurement is higher there.
     """
     if white:
         weights = np.zeros((of.turns.shape[0], of.turns.shape[0]))
@@ -295,9 +295,9 @@ def probable_nodes(
 
 @vectorised
 def described_by_nodes(points: Array, density: Array, covariance: Array) -> bool:
-    """Replace a covariance by the second moment of the posterior over the nodes, if many count.
+    """Replace a covariance by the second moment of the posterior over the nodes, if enough count.
 
-    That is where noise leaves more open than an expansion about one contact can describe.
+    This applies where the posterior is too wide for an expansion about one contact.
     """
     n, total, squares, fourth = density.shape[0], 0.0, 0.0, 0.0
     for k in range(n):
@@ -325,11 +325,11 @@ def outside_share(
     covariance: Array,
     others: Array,
 ) -> float:
-    """Share of the probability that probable nodes leave to other regions than a candidate's.
+    """Share of the posterior probability, by the probable nodes, outside a candidate's region.
 
-    The share outside three standard deviations is that of contact points or of the chart, whichever
-    is larger: contact points of little volume, as near slip-off, are not left out. Where valleys
-    are too narrow for the nodes, ``others`` (n, 4), χ² and points, count as well.
+    It is the share beyond three standard deviations, with or without volumes of contact points,
+    whichever is larger: near slip-off volumes nearly vanish. ``others`` (n, 4), χ² and points of
+    further contacts, count as well, for valleys that are too narrow for the nodes.
     """
     n, root, away = points.shape[1], np.zeros((3, 3)), np.empty(3)
     if not cholesky(covariance, root):
@@ -349,7 +349,7 @@ def outside_share(
             away[a] = others[k, 1 + a] - point[a]
         if others[k, 0] < np.inf and mahalanobis(root, away) > _OUTSIDE_REGION:
             like_out += quick_exp(min(0.5 * (chi - others[k, 0]), 0.0))
-    # The nodes may be too far apart to see all of the candidate itself.
+    # The nodes may be too far apart to sample the candidate's own peak.
     mass = max(mass, math.exp(min(log_mass + 0.5 * chi, _MOST_LOG)), 1e-300)
     like = max(like, 1.0)
     return max(mass_out / (mass + mass_out), like_out / (like + like_out))

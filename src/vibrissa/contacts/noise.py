@@ -1,18 +1,19 @@
-"""What the noise of a sensor does to the signals, and to the contact point found from them.
+"""Noise of a sensor, and the resulting covariance of signals and weights of a fit.
 
 Noise is one standard deviation per signal, the same everywhere, or a covariance of force and
-moment, as a force/torque sensor has it: then a direction is the noisier the smaller the force or
-moment that it belongs to.
+moment, as for a force/torque sensor; then a direction is noisier the smaller its force or moment
+is.
 
 Errors that all measurements share, of the whisker's stiffness and of the sensor's gain and mixing,
-add to that: a measured wrench is (F, M) + Σ ε E (F, M, 1), with matrices E (6, 7) and ε of standard
-deviation 1, drawn once (:mod:`vibrissa.sensors.sensor`). So Σ E (F, M, 1) (F, M, 1)ᵀ Eᵀ is part of
-the covariance of each measurement, but averaging many does not make it smaller.
+are added: a measured wrench is (F, M) + Σ ε E (F, M, 1), with matrices E (6, 7) and ε of standard
+deviation 1, the same for all measurements (:mod:`vibrissa.sensors.sensor`). So
+Σ E (F, M, 1) (F, M, 1)ᵀ Eᵀ is part of the covariance of each measurement, but averaging many does
+not reduce it.
 
-Weights whiten: W with WᵀW = Σ⁻¹, so that W times an error has variance one in each component. A
-component whose variance is zero counts as exact (next to the others). Directions in which the
-covariance of the others is singular carry no information: a wrench obeys M · F = 0, and noise that
-obeys it too has rank five.
+Weights whiten: with WᵀW = Σ⁻¹, the components of W times an error have variance one. A component
+whose variance is zero counts as exact compared with the others. Directions in which the covariance
+of the others is singular carry no information: a wrench obeys M · F = 0, and noise that obeys it
+too has rank five.
 """
 
 from __future__ import annotations
@@ -32,12 +33,12 @@ from vibrissa.quantities import attributes
 from vibrissa.sensors import Sensor
 from vibrissa.signals import SIGNALS, wrench_derivatives
 
-#: Without noise to go by, components of force and moment count as known to this share of |F|, |M|.
+#: Relative error of force and moment components, as a share of |F| and |M|, if no noise is stated.
 TRUSTED = 0.01
-_EXACT = 1e-6  # what counts as exact, in standard deviations of the rest
+_EXACT = 1e-6  # standard deviation, relative to the others, below which a component is exact
 _SINGULAR = 1e-10  # eigenvalues of a correlation matrix below this are rounding
-_RARE = 1e-3  # a measurement is explained if a perfect model would fit worse in one of a thousand
-#: Contacts whose χ² differ by less are indistinguishable (the odds are below 200 to 1).
+_RARE = 1e-3  # tail probability of χ² above which a measurement is explained
+#: Difference of χ² below which contacts are indistinguishable (odds below 200 to 1).
 INDISTINCT = NormalDist().inv_cdf(1.0 - 0.5 * _RARE) ** 2
 #: Standard deviation of each signal, or covariance (6, 6) of (F, M), SI units.
 Noise: TypeAlias = Mapping[str, float] | ArrayLike
@@ -66,7 +67,7 @@ class SensorNoise:
 
     @classmethod
     def of(cls, noise: Noise, names: tuple[str, ...], errors: Array = _NONE) -> SensorNoise:
-        """Read noise and check it.
+        """Read and check the stated noise.
 
         Parameters
         ----------
@@ -172,7 +173,7 @@ def common_errors(
 
 
 def by_stiffness(mixing: Array, sigma: float) -> Array:
-    """Error that the stiffness of the whisker makes in channels of force and moment."""
+    """Error of force and moment channels due to the whisker's stiffness."""
     relative("stiffness_sigma", sigma)
     out = np.zeros((1 if sigma > 0.0 else 0, len(mixing), 7))
     out[..., :6] = sigma * mixing
@@ -186,13 +187,13 @@ def scaled_errors(errors: Array, force: float, moment: float) -> Array:
 
 
 def common_channels(errors: Array, gradients: Array, wrenches: Array) -> Array:
-    """What errors of one standard deviation change in channels."""
+    """Changes of channels due to errors of one standard deviation."""
     wrong = np.einsum("nac,mc->man", errors[..., :6], wrenches) + errors[..., 6].T
     return np.asarray(gradients @ wrong)
 
 
 def common_covariance(errors: Array, gradients: Array, wrenches: Array) -> Array:
-    """Covariance that shared errors add to channels."""
+    """Covariance of channels due to shared errors."""
     changed = common_channels(errors, gradients, wrenches)
     return np.asarray(changed @ np.swapaxes(changed, -1, -2))
 
@@ -200,7 +201,7 @@ def common_covariance(errors: Array, gradients: Array, wrenches: Array) -> Array
 def sensor_noise(
     noise: Noise | None, names: tuple[str, ...], errors: Array = _NONE
 ) -> SensorNoise | None:
-    """Read noise if there is any."""
+    """Read the noise, if any is stated."""
     if noise is not None:
         return SensorNoise.of(noise, names, errors)
     if len(errors):
@@ -266,7 +267,7 @@ def rms_error(covariance: Array) -> Array:
 
 
 def trusted(wrenches: Array) -> Array:
-    """Covariances (n, 6, 6) of (F, M) known to a share of |F| and |M|, for wrenches (n, 6)."""
+    """Covariances (n, 6, 6) of wrenches (n, 6) for errors in proportion to |F| and |M|."""
     force, moment = (np.linalg.norm(part, axis=1) for part in (wrenches[:, :3], wrenches[:, 3:]))
     out = np.zeros((len(wrenches), 6, 6))
     for i in range(6):

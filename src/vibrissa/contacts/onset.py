@@ -1,23 +1,21 @@
-"""Hypotheses about a contact that begins: all that one measurement leaves, as a sum of Gaussians.
+"""Gaussian mixture for the contact point at contact onset, from one measurement.
 
-A light contact is poorly localised: noise leaves a long, bent valley of contacts. So the
-likelihood is taken apart along the whisker by windows N(s; s_j, h²), a distance h apart, whose sum
-is the same all along it. Where likelihood and window together are largest in Ω lies a Gaussian with
-the mean and covariance (:mod:`~vibrissa.contacts.moments`), and with the weight
+A light contact is poorly localised: the likelihood is a long, bent valley. It is therefore split
+along the whisker by windows N(s; s_j, h²), a distance h apart, whose sum is constant. Where
+likelihood and window together are largest in Ω, a Gaussian is placed with their mean and covariance
+(:mod:`~vibrissa.contacts.moments`), and with the weight
 
-    log w = -χ²/2 + log ∫ exp((χ² - χ²(p))/2) π(p) dp + log det W,
+    log w = -χ²/2 + log ∫ exp((χ² - χ²(p))/2) π(p) dp + log det W.
 
-of what both leave of the contact. They are again one where the measurement determines the arc
-length well.
+If the measurement determines the arc length well, the Gaussians are combined again into one.
 
-A contact that was not detected a moment ago has bent the whisker no farther than its motion since.
-With u for how far the contact's place on the whisker is from where it rests, over L, the density of
-contacts beforehand is
+A contact that was not detected in the sample before has bent the whisker no farther than it has
+moved since. With u, the distance of the contact point from its rest position over L, the prior is
 
     π = m (m² + u²)^(-3/2) / 2π,
 
-with m for how far the whisker and things may have moved toward each other: not more than likely,
-for the tail is long. It is one over the volume of all places.
+with m the distance by which whisker and objects may have approached each other. It is a scale and
+not a bound, since the distribution has a long tail; its integral over all positions is one.
 """
 
 from __future__ import annotations
@@ -50,31 +48,31 @@ from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod import LEAST_ARC, Discretization, charted_rod, solve_forces
 from vibrissa.signals import within_turn
 
-# Windows along the whisker, so many more beyond each of its ends, where the sum of those on it
-# falls, and in each of them so many sectors of bearings to start from.
+# Number of windows along the whisker; further ones beyond each end, where the sum of the others
+# falls; and sectors of bearings in each, from which fits start.
 _WINDOWS = 16
 _BEYOND = 2
 _SECTORS = 4
-_WORSE = 30.0  # of the valley's components those this much worse (χ²) than the best do not count
-# A candidate whose arc length is known to this share of a window may stay whole; its parts are the
-# Gaussians this near (Mahalanobis distance squared, by the sum of both covariances).
+_WORSE = 30.0  # excess of χ² over the best component above which one is dropped
+# Standard deviation of arc length, in windows, below which a candidate may remain whole; its parts
+# are the Gaussians within this squared Mahalanobis distance, by the sum of both covariances.
 _SHARP, _PART = 0.5, 9.0
-_MOST = 24  # of a curve or surface at most so many samples start
-_VAGUE = 0.2  # standard deviation, over L, of what a measurement does not tell
+_MOST = 24  # largest number of samples of a curve or surface from which hypotheses start
+_VAGUE = 0.2  # standard deviation, over L, of what a measurement does not determine
 # Smallest standard deviation of a starting hypothesis, over L, so that matrices stay regular.
 _FINEST = 1e-7
 # Codes of arc length and contact point among the channels.
 _STATION, _POINT = FITTED.index("s"), [FITTED.index(name) for name in ("px", "py", "pz")]
-# How far along each axis of a covariance its linearisation is checked, in standard deviations, and
-# by how much it may err there, as a share of that.
+# Displacement along each axis of a covariance at which its linearisation is checked, in standard
+# deviations, and its largest relative error there.
 _REACH, _BENT = 2.0, 0.25
 
 
 class Gaussians(NamedTuple):
-    """Of contact points in the whisker's frame, in L: one for each of some contacts.
+    """Gaussians of contact points in the whisker's frame, over L, one about each contact.
 
-    x (n, 4), (F, p) (n, 6), means (n, 3), covariances (n, 3, 3), what errors that all samples
-    share change in p (n, 3, e), log weights (n,).
+    x (n, 4), (F, p) (n, 6), means (n, 3), covariances (n, 3, 3), effects of shared errors on p (n,
+    3, e), log weights (n,).
     """
 
     contacts: Array
@@ -92,7 +90,7 @@ class Beginning:
         self._readout, self._chart = estimator.readout, estimator.contact_map.chart
         how = self._readout.how
         self._names = tuple(CHANNELS[code] for code in how.codes)
-        # Noise alone, which differs from sample to sample.
+        # Noise only, without the errors that all samples share.
         self._quiet = how._replace(errors=np.zeros((0, 6, 7)))
         chart = self._chart
         self._width = (1.0 - chart.proximal) / (_WINDOWS - 1)
@@ -115,7 +113,7 @@ class Beginning:
     def all_that_may_be(
         self, measurement: Measurement, located: Contact, reach: float
     ) -> Gaussians:
-        """Take the likelihood of all places apart."""
+        """Split the likelihood over all contacts into Gaussians."""
         nodes, values, window = self._starts(measurement)
         exact, there = self.exact(located)
         nearest = np.abs(exact[:, :1] - self._stations).argmin(axis=1)
@@ -139,15 +137,15 @@ class Beginning:
         return Gaussians(*(np.concatenate([a[kept], b[sharp]]) for a, b in parts))
 
     def candidates(self, measurement: Measurement, located: Contact, reach: float) -> Gaussians:
-        """Take the candidates of one sample, which lie apart, as they are."""
+        """Gaussians of the separate candidates of one sample, unsplit."""
         return self._whole(measurement, located, reach)[0]
 
     def _whole(
         self, measurement: Measurement, located: Contact, reach: float
     ) -> tuple[Gaussians, IntArray]:
-        """Candidates of one sample, and rows of those that lie well within a window, all linear.
+        """Linear candidates of one sample, and the rows of those well within a window.
 
-        Noise moves these about linearly: most probable place and mean are one.
+        Noise moves these nearly linearly: mode and mean coincide.
         """
         x, values = self.exact(located)
         slope = np.insert(
@@ -164,7 +162,7 @@ class Beginning:
         return self._gaussians(measurement, fits, reach, sharp), np.flatnonzero(sharp)
 
     def samples(self, measurement: Measurement, located: Contact, reach: float) -> Gaussians:
-        """Take samples of a curve or surface of contacts, that between them leave no gap."""
+        """Gaussians about samples of a curve or surface of contacts, without gaps."""
         number = located.n_candidates
         some = np.linspace(0, number - 1, min(number, _MOST)).astype(int)
         x, values = (part[some] for part in self.exact(located))
@@ -178,7 +176,7 @@ class Beginning:
         )
 
     def _across(self, measurement: Measurement, values: Array, slope: Array) -> tuple[Array, Array]:
-        """Covariances across a curve or surface, and what errors that all samples share change."""
+        """Covariances across a curve or surface, and the effects of shared errors."""
         w = self._weights(self._quiet, measurement, values)
         force = np.linalg.norm(values[:, :3], axis=1)
         unit = slope * np.stack([np.ones_like(force), force, force], axis=1)[:, None]
@@ -187,12 +185,12 @@ class Beginning:
         return root @ np.swapaxes(root, 1, 2), root @ w @ self._wrong(values)
 
     def _wrong(self, values: Array) -> Array:
-        """What errors that all samples share change in channels, (n, k, e)."""
+        """Effects of shared errors on channels, (n, k, e)."""
         g = channel_gradients(values, self._names)
         return common_channels(self._readout.how.errors, g, wrenches_of(values))
 
     def exact(self, located: Contact) -> tuple[Array, Array]:
-        """The candidates of one sample as x (n, 4) and (F, p) (n, 6), non-dimensional."""
+        """Candidates of one sample as x (n, 4) and (F, p) (n, 6), non-dimensional."""
         d, n, found = self._chart.discretization, located.n_candidates, located.candidates
         x, values = np.empty((n, 4)), np.empty((n, 6))
         x[:, 0], x[:, 1:] = found.arc_length / d.length, found.contact_force / d.force
@@ -200,7 +198,7 @@ class Beginning:
         return x, values
 
     def _starts(self, measurement: Measurement) -> tuple[Array, Array, IntArray]:
-        """Nodes ξ (n, 3) of the chart that come nearest, with (F, p), and in which windows."""
+        """Nearest nodes ξ (n, 3) of the chart, with (F, p), and the window of each."""
         how = self._readout.how
         wanted = how.mixing @ measurement.target
         away = self._seen - wanted
@@ -231,7 +229,7 @@ class Beginning:
         return out
 
     def _fitted(self, measurement: Measurement, x: Array, values: Array, windows: IntArray) -> Fits:
-        """Contacts where χ² of a measurement and of windows is least in Ω; infinite if none is."""
+        """Contacts in Ω of minimum χ² of a measurement and windows; infinite if there is none."""
         chart, how, k = self._chart, self._readout.how, len(self._names)
         n = len(x)
         fits = Fits(
@@ -260,7 +258,7 @@ class Beginning:
         linear: AnyArray,
         windows: IntArray | None = None,
     ) -> Gaussians:
-        """Means, covariances and weights of contacts, by their χ² and, if any, their windows."""
+        """Means, covariances and weights of contacts, from their χ² and windows, if any."""
         n, k, q = len(fits.contacts), len(self._names), len(self._readout.how.mixing)
         chart, x = self._chart, fits.contacts
         w = self._weights(self._quiet, measurement, fits.values)
@@ -297,16 +295,16 @@ class Beginning:
         return np.asarray(math.log(reach / (2.0 * math.pi)) - 1.5 * np.log(reach**2 + u2))
 
     def moved(self, turn: Array, base: Array, before: tuple[Array, Array]) -> float:
-        """How far the resting whisker has moved at most, in L, since another pose of its base."""
+        """Largest displacement of the resting whisker, over L, since another pose of its base."""
         now = self._rest @ turn.T + base
         then = self._rest @ before[0].T + before[1]
         return float(np.sqrt(((now - then) ** 2).sum(axis=1).max()))
 
 
 def _gaps_between(points: Array) -> Array:
-    """Covariances (n, 3, 3) with which samples of a curve or surface fill what lies between them.
+    """Covariances (n, 3, 3) by which samples of a curve or surface fill the gaps between them.
 
-    Along the ways to the nearest two others, half way.
+    They extend half way to the nearest two others.
     """
     if len(points) < 2:
         return np.zeros((len(points), 3, 3))
@@ -317,7 +315,7 @@ def _gaps_between(points: Array) -> Array:
 
 
 def _distinct(x: Array, window: IntArray, rows: IntArray) -> list[int]:
-    """Rows that are not the same contact in the same window as one before."""
+    """Rows that do not repeat the contact and window of an earlier one."""
     kept: list[int] = []
     for row in rows.tolist():
         others = [other for other in kept if window[other] == window[row]]
@@ -339,12 +337,12 @@ def _linear(
     covariance: Array,
     least: float,
 ) -> AnyArray:
-    """Whether a covariance describes how the contact scatters: the map from x is tried out.
+    """Whether a covariance describes the scatter of the contact point, tested on the rod.
 
-    From the contact, two standard deviations to both sides along each principal axis of the
-    covariance of x, the rod is solved. There, channels (in standard deviations) and contact point
-    (relative to its own scatter) must lie where the derivatives say, to a quarter of the way, and
-    the contact must still lie on the whisker.
+    The rod is solved two standard deviations to both sides of the contact along each principal axis
+    of the covariance of x. There, channels (in standard deviations) and contact point (relative to
+    its own scatter) must agree with the derivatives to a quarter of the displacement, and the
+    contact must be on the whisker.
     """
     finite = np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(values).all(axis=1)
     good: AnyArray = np.asarray(finite)
@@ -369,7 +367,7 @@ def _linear(
     point_predicted = np.swapaxes(slope[:, 3:] @ steps, 1, 2)
     off = np.linalg.norm(moved[..., 3:] - value[:, None, 3:] - point_predicted, axis=2)
     scatter = np.sqrt(np.einsum("nij,njk,nik->n", slope[:, 3:], covariance[rows], slope[:, 3:]))
-    with np.errstate(divide="ignore", invalid="ignore"):  # without noise nothing scatters
+    with np.errstate(divide="ignore", invalid="ignore"):  # without noise there is no scatter
         bent = np.maximum(bent, off / scatter[:, None])
     still = (steps == 0.0).all(axis=1)
     good[rows] = (on & (bent <= _BENT * _REACH) | still).all(axis=1)

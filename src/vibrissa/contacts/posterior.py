@@ -1,21 +1,22 @@
-"""What noise leaves open about a contact: covariance, its validity, and what a candidate weighs.
+"""Posterior covariance of a contact point, its validity, and the weight of a candidate.
 
 A contact ξ explains measured channels with residuals r(u) = r̂ + B u + H_r(u, u)/2 in standard
-deviations, about a candidate and along bent axes that are one standard deviation long; its point is
-p(u) = p̂ + A u + H_p(u, u)/2 (:mod:`~vibrissa.contacts.expansion`).
+deviations, where u are coordinates about a candidate along bent axes that are one standard
+deviation long; its contact point is p(u) = p̂ + A u + H_p(u, u)/2
+(:mod:`~vibrissa.contacts.expansion`).
 
-Contact points of Ω are equally probable beforehand, so that the posterior density of u is
-exp(-|r(u)|²/2) det ∂p/∂u within Ω and zero outside: beyond the tip, before the proximal limit, and
-beyond the fold, where the determinant changes its sign. It is summed over nodes on rays, along axes
-that are shortened where Ω or the second order ends the density sooner, as at folds of the signals.
-The volumes nearly vanish near slip-off, where a whisker may yet be: for the covariance the mean of
-this density and of that without volumes counts.
+The prior is uniform over the contact points of Ω, so the posterior density of u is
+exp(-|r(u)|²/2) det ∂p/∂u within Ω and zero outside: beyond the tip, proximal to the limit, and
+beyond the fold, where the determinant changes sign. It is integrated over nodes on rays, along
+axes that are shortened where Ω, or a fold of the signals in second order, ends the density
+sooner. Near slip-off the volumes nearly vanish although contacts occur there, so the covariance is
+that of the mean of this density and of the one without volumes.
 
-To first order the covariance of p is A Aᵀ; near a fold of p that is a sheet that contacts leave,
-and the second moment about p̂ is not. It is widened until the ellipsoid of three standard deviations
-holds what it states: along each ray it is known where the ellipsoid ends, and how much probability
-is beyond. A covariance is valid where the ellipsoid of 95 % then holds about that too, and where
-the channels at both ends of each axis are those of the second order.
+To first order the covariance of p is A Aᵀ. Near a fold of p this degenerates to a sheet, from which
+contacts curve away; the second moment about p̂ does not. It is widened until the ellipsoid of three
+standard deviations contains the share that it states: on each ray the position of the ellipsoid's
+surface and the probability beyond it are known. A covariance is valid if the 95 % ellipsoid
+then contains about 95 %, and if the channels at both ends of each axis agree with the second order.
 """
 
 from __future__ import annotations
@@ -52,44 +53,44 @@ from vibrissa.numerics import (
 )
 from vibrissa.rod import BUFFER_SIZE, Charted
 
-#: A candidate more probable than this is the only one.
+#: Posterior probability above which a candidate is unique.
 CERTAIN = 0.95
-# Where a covariance can be relied on: what the second order misses at most there, in standard
-# deviations of the channels; what ellipsoids of 95 % hold; and how much variances were widened.
+# Limits of a valid covariance: error of the second order, in standard deviations of the channels;
+# share in ellipsoids of 95 %; and factor by which variances were widened.
 _MISSED, _LEAST_HELD, _MOST_HELD, _MOST_WIDENED = 0.09, 0.93, 0.98, 1.7
-#: What may be left outside three standard deviations; the squares of these and of the 95 % region.
+#: Share that may be outside three standard deviations; squared radii of these and of 95 % regions.
 LEFT, THREE_SIGMA, HELD = 0.0033, 14.156, 7.815
-# Where the second order misses so much, densities are not to be trusted: the first order gives the
-# weight of a candidate. A node's log density gains at most so much over the first order's.
+# Error of the second order above which a candidate is weighed to first order; and the most by which
+# a node's log density may exceed that of the first order.
 _BROKEN, _MOST_GAIN = 0.3, 3.0
-_BENT = 1.0  # where it misses so much, the second order does not describe channels even roughly
-TOO_FEW = 0.2  # with a smaller share of the nodes than this moments mean nothing
-# Steps by which a covariance is widened; and what is nothing among probabilities.
+_BENT = 1.0  # error above which the second order does not describe channels even roughly
+TOO_FEW = 0.2  # smallest share of the nodes from which moments are meaningful
+# Number of steps by which a covariance is widened; and a negligible probability.
 _TRIALS, _NOTHING = 4, 1e-12
-# Below this second order (of the point, or the channels, for a standard deviation of each axis) the
-# first will do: variances differ by less than 4 %.
+# Second order, of the point or the channels for one standard deviation along each axis, below which
+# the first order suffices: variances differ by less than 4 %.
 STRAIGHT = 0.06
-# Below this it misses nothing that counts (at most 0.01); and as between the map's nodes what it
-# misses is known to a few hundredths, the rod decides from this share of what counts to this much.
+# Second order below which its error is negligible (at most 0.01). Interpolated errors are
+# themselves uncertain by a few hundredths: between these shares of the limit the rod is integrated.
 _NEARLY_STRAIGHT, _SURE, _DOUBTFUL = 0.03, 0.6, 0.4
-_RADII = 5  # nodes on each ray, a standard deviation apart
-#: Fourth moment of three coordinates that are normally distributed.
+_RADII = 5  # nodes on each ray, one standard deviation apart
+#: Fourth moment of the distance of three normally distributed coordinates.
 NORMAL_KURTOSIS = 15.0
 
 
 def _within(radius: float) -> tuple[float, float]:
-    """Probability within a radius of normal distributions of three and of five coordinates."""
+    """Probability within a radius of standard normal distributions in three and five dimensions."""
     density = math.sqrt(2.0 / math.pi) * math.exp(-0.5 * radius**2)
     three = math.erf(radius / math.sqrt(2.0)) - radius * density
     return three, three - radius**3 * density / 3.0
 
 
 def _along_rays() -> tuple[Array, Array, Array, Array]:
-    """Nodes ±u on rays, of which u (3, n / 2); their weights, those of rays, and what is beyond.
+    """Nodes ±u on rays: u (3, n / 2), their weights, weights of the rays, and probability beyond.
 
-    The axes and diagonals of a cube, weighted so that they integrate polynomials of degree 5 over
-    the sphere; along each the moments of a normal distribution to the second, by radius, and the
-    probability beyond each radius from zero on.
+    Rays are the axes and diagonals of a cube, with weights that integrate polynomials of degree 5
+    over the sphere exactly. Along each, moments of a normal distribution are exact to the second.
+    The last array is the probability beyond each radius, from zero on.
     """
     corners = np.array(list(product([1.0], [-1.0, 1.0], [-1.0, 1.0])))
     rays = np.concatenate([np.eye(3), corners / math.sqrt(3.0)])
@@ -113,8 +114,8 @@ class Rays(NamedTuple):
     """Working memory for the nodes ±u.
 
     Displacements of the point (3, 2 m); densities (2 m,), with volumes and without; ∂p/∂u (3, 3,
-    2 m), arc length, log density and squared distance; what is odd and even in u, and second
-    derivatives, (m,); a Cholesky factor; logs of what is beyond each node of a ray.
+    2 m), arc length, log density and squared distance; odd and even parts in u, and second
+    derivatives, (m,); a Cholesky factor; logs of the probability beyond each node of a ray.
     """
 
     points: Array
@@ -133,7 +134,7 @@ class Rays(NamedTuple):
 
 @inlined
 def empty_rays() -> Rays:
-    """Make the working memory."""
+    """Allocate the working memory."""
     half, pairs = NODES.shape[1], _SHARES.shape[0]
     return Rays(
         np.empty((3, 2 * half)),
@@ -153,10 +154,11 @@ def empty_rays() -> Rays:
 
 @inlined
 def densities(model: Expansion, s: float, proximal: float, turn: float, rays: Rays) -> None:
-    """Fill posterior densities at nodes ±u relative to the nodes' own, and points (3, 2 m).
+    """Fill posterior densities at nodes ±u relative to the nodes' own, and contact points (3, 2 m).
 
-    What is odd in u and what is even is shared by both. ``likely`` leaves volumes out. ``points``
-    are displacements of the point; ``turn`` is 1 where the axes are right-handed, -1 otherwise.
+    Parts that are odd or even in u are computed once for both signs. ``likely`` is the density
+    without volumes, ``points`` are displacements of the contact point; ``turn`` is 1 for
+    right-handed axes, -1 otherwise.
     """
     r0, by_r, bent_r, by_p, bent_p = model.r0, model.by_r, model.bent_r, model.by_p, model.bent_p
     axes, bent_s = model.axes, model.bent_s
@@ -210,7 +212,7 @@ def densities(model: Expansion, s: float, proximal: float, turn: float, rays: Ra
 
 @inlined
 def _change_of_slope(bent: Array, nodes: Array, out: Array) -> None:
-    """Fill what second derivatives (n,) change of a slope at all nodes."""
+    """Fill the change of a slope at all nodes due to second derivatives (n,)."""
     out[:] = 0.0
     for q in range(nodes.shape[0]):
         change, u = bent[q], nodes[q]
@@ -233,7 +235,7 @@ def squared_distances(root: Array, points: Array, out: Array) -> None:
 
 @inlined
 def second_moment(points: Array, density: Array, total: float, covariance: Array) -> None:
-    """Fill the second moment (3, 3) of points (3, n) of some density."""
+    """Fill the second moment (3, 3) of points (3, n) with a density."""
     for a in range(3):
         for c in range(a + 1):
             covariance[a, c] = 0.0
@@ -245,15 +247,15 @@ def second_moment(points: Array, density: Array, total: float, covariance: Array
 
 @inlined
 def holds(held: float, wider: float) -> bool:
-    """Whether a covariance is valid whose 95 % region holds so much, widened by this factor."""
+    """Whether a covariance is valid, by the share in its 95 % region and the factor of widening."""
     return _LEAST_HELD < held < _MOST_HELD and wider < _MOST_WIDENED
 
 
 @inlined
 def _reaches(far: Array, density: Array, centre: float, logs: Array) -> None:
-    """Make squared distances along each ray (rays, radii) rise; fill the logs of what is beyond.
+    """Make squared distances (rays, radii) monotonic; fill logs of the probability beyond.
 
-    ``logs`` (rays, 1 + radii) are those of the probability beyond the centre and each node.
+    ``logs`` (rays, 1 + radii) are for the centre and each node.
     """
     last = far.shape[1]
     for ray in range(far.shape[0]):
@@ -287,7 +289,7 @@ def _outside(far: Array, logs: Array, square: float) -> tuple[float, float]:
 
 @inlined
 def _fitting(far: Array, logs: Array) -> tuple[float, float]:
-    """Factor by which an ellipsoid holds what it states at three deviations; what at 95 %."""
+    """Factor for the 3σ ellipsoid to contain its nominal share, and share in the 95 % one."""
     whole, _ = _outside(far, logs, 0.0)
     square = THREE_SIGMA
     for _ in range(_TRIALS):
@@ -309,7 +311,7 @@ def _moments(
     covariance: Array,
     rays: Rays,
 ) -> tuple[float, bool]:
-    """Fill the second moment about the point, widened; mean density, and whether it can serve."""
+    """Fill the widened second moment about the point; mean density, and whether it is usable."""
     half, pairs = NODES.shape[1], _SHARES.shape[0]
     points, density, likely, root, far, logs = (
         rays.points,
@@ -334,7 +336,8 @@ def _moments(
         density[m] = WEIGHTS[m % half] * likely[m]
         squares += density[m] * likely[m]
     if not squares * TOO_FEW < 1.0:
-        for a in range(3):  # too few of the nodes are in Ω: what they say is added to first order
+        # Too few of the nodes are in Ω: their moment is added to that of the first order.
+        for a in range(3):
             for c in range(3):
                 for m in range(2 * half):
                     covariance[a, c] += density[m] * points[a, m] * points[c, m]
@@ -364,10 +367,10 @@ def _second_order(
     j: Array,
     model: Expansion,
 ) -> tuple[float, float, bool]:
-    """Fill the model; how large the second order is, what it misses, whether axes are shortened.
+    """Fill the model; size of its second order, its error, and whether axes are shortened.
 
-    It is that between the map's nodes where these leave no doubt. If channels do not determine an
-    unknown its size is NaN.
+    Where interpolation between the map's nodes leaves no doubt, it is used. The size is NaN if the
+    channels do not determine an unknown.
     """
     capped, bent, missed, short = cap_axes(x, model.axes), np.inf, np.inf, False
     for attempt in range(2):
@@ -402,7 +405,7 @@ def _judge_one(
     nothing: Array,
     covariance: Array,
 ) -> tuple[float, bool, bool]:
-    """Fill the covariance of one; log weight, whether it is valid and channels are described."""
+    """Fill the covariance of a candidate; log weight, validity, whether channels are described."""
     bent, missed, short = _second_order(rod, b, codes, target, weights, x, slopes, j, model)
     if bent != bent:
         return -np.inf, False, False
@@ -450,11 +453,11 @@ def judge(
     described: AnyArray,
     n: int,
 ) -> None:
-    """Judge candidates of a measurement; see the module.
+    """Judge the candidates of a measurement; see the module.
 
-    Weights, x (n, 4), ∂(F, p)/∂ξ (n, 6, 3), residuals and their slopes by x (n, k, 4) are those of
-    each; out come covariances of points, log weights, and whether covariances are valid, and
-    channels described by the second order at least roughly.
+    Weights, x (n, 4), ∂(F, p)/∂ξ (n, 6, 3), residuals and their slopes with respect to x
+    (n, k, 4) are those of each candidate. Fill covariances of contact points, log weights, whether
+    covariances are valid, and whether the second order describes the channels at least roughly.
     """
     k = codes.shape[0]
     b, j, model = np.zeros(BUFFER_SIZE), np.empty((k, 3)), empty_expansion(k)
@@ -494,7 +497,7 @@ def rank(weight: Array, number: IntArray, probability: Array, order: IntArray) -
         n, log = number[row], weight[row]
         for i in range(order.shape[1]):
             order[row, i], probability[row, i] = i, np.nan
-        for i in range(1, n):  # stable: candidates of equal weight stay by force
+        for i in range(1, n):  # a stable sort: candidates of equal weight remain ordered by force
             place = i
             while place > 0 and log[order[row, place - 1]] < log[i]:
                 order[row, place] = order[row, place - 1]

@@ -1,8 +1,8 @@
-"""What is known of contacts before anything is measured: where they may be, and how strong.
+"""Prior knowledge of contacts: where they may be, and how strong.
 
-A prior leaves out the candidates that it does not allow: a robot whose whisker meets things on one
-side only knows that a contact is not on the other, and of two contacts with the same signals one
-needs a force that the object could not stand.
+A prior leaves out the candidates that it does not allow: for a robot whose whisker meets objects on
+one side only, a contact is not on the other; and of two contacts with the same signals, one may
+need a larger force than the object can exert.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ class Prior:
     region : str or mapping
         Region of the contacts: one of "all", "ELD", "CF", "CB", "ELD CF" and "ELD CB" (concave
         backward and forward; excluding large deflections), or the least and the greatest value of
-        some of ``r`` (m), ``theta`` and ``phi`` (rad) in the whisker's frame. A θ whose least value
-        is above the greatest goes through ±π.
+        some of ``r`` (m), ``theta`` and ``phi`` (rad) in the whisker's frame. A range of θ whose
+        least value is above the greatest passes through ±π.
     least_force, greatest_force : float
         Size of the contact force, N.
     tip : float
-        Probability beforehand that an object touches the very tip, so that the force is normal to
+        Prior probability that an object touches the tip itself, so that the force is normal to
         the object and not to the whisker; 0, the default: contacts of the side only. It is for
         three signals or more with noise; the wrench shows such contacts by itself.
 
@@ -144,7 +144,7 @@ def possible_candidates(
 
 
 def refuse_tip(prior: Prior | None, what: str) -> None:
-    """Refuse contacts of the tip in addition where they cannot be compared with those found."""
+    """Refuse a prior with contacts of the tip where these cannot be compared with the others."""
     if prior is not None and prior.tip > 0.0:
         raise ValueError(
             f"contacts of the tip (tip = {prior.tip:g}) are compared with those of three signals "
@@ -169,7 +169,7 @@ def among_allowed(
 ) -> tuple[Candidates, IntArray, Array]:
     """Add contacts of the tip, and leave out candidates that a prior does not allow.
 
-    ``measured`` has the measurements (n, k) and the channels that they should be.
+    ``measured`` contains the measurements (n, k) and the target values of the channels.
     """
     if prior.tip:
         tips = tip_contacts(contact_map, readout, prior.tip)
@@ -195,9 +195,9 @@ def among_allowed(
 
 
 def _renormalised(probability: Array) -> Array:
-    """Probabilities (..., k) of what is left; NaN stays where there are none.
+    """Probabilities (..., k) of the remaining candidates; NaN if there are none.
 
-    Equal ones where what is left had none worth a number.
+    If the probabilities of the remaining ones all vanish, they become equal.
     """
     total = np.nansum(probability, axis=-1, keepdims=True)
     weight = np.where(total > 0.0, probability, probability + 1.0)
@@ -206,7 +206,7 @@ def _renormalised(probability: Array) -> Array:
 
 
 def _left(status: Status, number: int, probability: float) -> Status:
-    """What to say once so many candidates are left, the first of them with this probability."""
+    """Status for the remaining candidates, the first of them with this probability."""
     if status in (Status.UNIQUE, Status.AMBIGUOUS, Status.APPROXIMATE, Status.UNDERDETERMINED):
         if not number:
             return Status.OUTSIDE_PRIOR

@@ -1,21 +1,25 @@
-"""Candidates under noise: hidden ones are added, all are judged and ranked; compiled.
+"""Completing, judging and ranking candidates under noise; compiled.
 
-A contact near which T(Ω) ends or folds may be the true one although noise has carried the signals
-out of its reach, and another, far away, explains them exactly. So the cells of the chart that may
-hold signals within two standard deviations of the measured ones are listed. They form basins,
-separated by cells that come less near; in each that known contacts do not explain by their slopes
-χ² is minimised within Ω. Where that leads to no least χ², as in long flat valleys, there is no
-candidate, but the chart's nodes show what else is probable. Signals that are the same for a contact
-and its mirror image in the plane of a planar whisker have starts in the images of known contacts,
-which flat valleys (:mod:`~vibrissa.contacts.flat_valleys`) join to them, so that basins do not part
-the two.
+Noise may have carried the signals of the true contact out of T(Ω), across its boundary or a fold,
+while another contact, far away, explains them exactly. Such hidden candidates are searched for in
+three steps:
 
-All candidates are judged (:mod:`~vibrissa.contacts.posterior`). What was measured is as probable as
-noise makes it at each; that of a direction falls with the size of what it is the direction of. The
-volumes of contact points that they stand for nearly vanish near slip-off, where a whisker may yet
-be: probabilities are the mean of those by volumes and of those by likelihoods alone. Where the
-second order does not describe one of the candidates, likelihoods count alone, the valley of χ²
-through the best is followed (:mod:`~vibrissa.contacts.flat_valleys`), and the nodes are asked too.
+1. List the cells of the chart that may contain signals within two standard deviations of the
+   measured ones, and group them into basins (:mod:`~vibrissa.contacts.basins`).
+2. In each basin that no known candidate explains through its slopes, minimise χ² within Ω. If this
+   reaches no minimum, as in long flat valleys, the basin adds no candidate, but the nodes of the
+   chart show how probable the contacts there are.
+3. If a contact and its mirror image in the plane of a planar whisker have the same signals, start
+   also from the images of the known candidates. Flat valleys
+   (:mod:`~vibrissa.contacts.flat_valleys`) can join both into one basin.
+
+All candidates are then judged (:mod:`~vibrissa.contacts.posterior`). The probability density of the
+measurement at a candidate follows from the noise there; the density of a direction decreases with
+the size of its vector. A prior that is uniform in volume nearly vanishes near slip-off, where
+contacts nevertheless occur, so probabilities are the mean of those with volumes and those from
+likelihoods alone. If the second-order expansion does not describe one of the candidates, only the
+likelihoods count, the valley of χ² through the best candidate is followed, and the nodes of the
+chart are evaluated too.
 """
 
 from __future__ import annotations
@@ -74,18 +78,18 @@ from vibrissa.signals import FT, FX, MB, MD
 from vibrissa.status import Status
 
 _UNIQUE, _AMBIGUOUS = int(Status.UNIQUE), int(Status.AMBIGUOUS)
-# How far apart signals are that the tree is asked for as well, in standard deviations; and where
-# nothing that is known explains the measurement.
+# Distance, in standard deviations, within which the tree lists cells: normally, and if no known
+# candidate explains the measurement.
 _APART, _FAR_APART = 2.0, 4.0
-# So many rows at a time are described from kernel to kernel, in some 4 kB each.
+# Rows that pass from kernel to kernel together; the description of each takes about 4 kB.
 _AT_ONCE = 128
-# Logarithm of the volume of a normal distribution of three coordinates, over its peak.
+# Logarithm of the integral of a three-dimensional normal density with a peak of one.
 _LOG_NORMAL = 1.5 * math.log(2.0 * math.pi)
 
 
 @kernel
 def chi_squared_of(how: Weighing, x: Array, value: Array, target: Array, measured: Array) -> float:
-    """χ² of a contact; NaN where it cannot be weighed."""
+    """χ² of a contact; NaN if its weights cannot be computed."""
     k = how.codes.shape[0]
     weights, residual, jacobian = np.empty((k, k)), np.empty(k), np.empty((k, 4))
     if not weigh_any(how, value, measured, weights):
@@ -109,10 +113,10 @@ def _try(
     misfits: Array,
     loose: Array,
 ) -> tuple[int, bool]:
-    """Fit from a contact; add the result if it is a new least χ², at most ``worth``.
+    """Fit from a starting contact, and add the result if it is a new minimum of at most ``worth``.
 
-    Return how many there are then, and whether the fit ended elsewhere although χ² is so small:
-    then χ² and the contact point are added to those ``loose`` (n, 4).
+    Return the number of minima, and whether the fit ended at a contact that is not one of them
+    although its χ² is small; χ² and that contact are then appended to ``loose`` (n, 4).
     """
     if number == MOST_CANDIDATES:
         return number, True
@@ -142,7 +146,7 @@ def _try(
             break
     if not misfit < np.inf:
         return number, False
-    if lost and (number == 0 or misfit < misfits[0]):  # the nearest so far, whatever it is
+    if lost and (number == 0 or misfit < misfits[0]):  # the best so far, whatever its χ²
         copy(at, x[0])
         copy(value, values[0])
         misfits[0] = misfit
@@ -177,10 +181,10 @@ def complete(
     jacobians: Array,
     loose: Array,
 ) -> tuple[int, bool]:
-    """Add contacts of Ω that noise has hidden, given residuals and slopes of those that are known.
+    """Add contacts of Ω that noise has hidden, given residuals and slopes of the known candidates.
 
-    Fill χ² and points (n, 4) of contacts that explain it as well. Return how many there are then,
-    and whether others may be probable that are not among them.
+    Fill ``loose`` with χ² and coordinates (n, 4) of further contacts that explain the measurement
+    as well. Return the number of candidates, and whether other contacts may be probable.
     """
     sigma, starts = np.empty(3), np.empty((MOST_STARTS, 4))
     start, nodes, least = np.zeros(4), np.full(PARTS, -1), np.inf
@@ -208,7 +212,7 @@ def complete(
         others = others or other
     for c in range(number if _mirrored(how) else 0):
         copy(x[c], start)
-        start[3] = -start[3]  # far above the floor of a narrow valley: not given up on the way
+        start[3] = -start[3]  # high above a narrow valley's floor; not abandoned early
         number, other = _try(
             of, how, passes, np.inf, target, measured, start, number, x, values, misfits, loose
         )
@@ -228,7 +232,7 @@ def complete(
 
 @inlined
 def _mirrored(how: Weighing) -> bool:
-    """Whether all channels are those of the mirror image in the plane of a planar whisker."""
+    """Whether the mirror image in the plane of a planar whisker has the same channels."""
     mirrored = True
     for code in how.codes:
         mirrored = mirrored and code in (FX, FT, MB)
@@ -237,7 +241,7 @@ def _mirrored(how: Weighing) -> bool:
 
 @inlined
 def _kept(limit: float, number: int, x: Array, values: Array, misfits: Array) -> int:
-    """Keep candidates that explain a measurement, or the nearest one; how many."""
+    """Keep the candidates that explain a measurement, or else the best one; return their number."""
     best = 0
     for c in range(number):
         if misfits[c] < misfits[best]:
@@ -259,7 +263,10 @@ def _kept(limit: float, number: int, x: Array, values: Array, misfits: Array) ->
 
 
 class _Weighed(NamedTuple):
-    """Working memory of `complete_rows`: (F, p) (m, 6), their derivatives by x (6, 4), χ² (m,)."""
+    """Working memory of `complete_rows`.
+
+    (F, p) (m, 6), their derivatives with respect to x (m, 6, 4), χ² (m,).
+    """
 
     values: Array
     tangents: Array
@@ -281,7 +288,7 @@ def _weighed(
 ) -> None:
     """Fill χ² and the description of n candidates: weights, ∂(F, p)/∂ξ, residuals and slopes.
 
-    ∂(F, p)/∂ξ is known of those before the first.
+    For the candidates before ``first``, ∂(F, p)/∂ξ is already there.
     """
     weights, third, residuals, jacobians = described
     k = how.codes.shape[0]
@@ -310,7 +317,7 @@ def complete_rows(
     first: int,
     last: int,
 ) -> None:
-    """Complete the candidates of noisy measurements, and describe them."""
+    """Complete and describe the candidates of noisy measurements."""
     of, how, problem, out = task.of, task.how, task.problem, in_memory(number, flat, valid)
     known = np.empty((MOST_CANDIDATES, 4))
     room = _Weighed(np.empty((MOST_CANDIDATES, 6)), np.zeros((6, 4)), np.empty(MOST_CANDIDATES))
@@ -318,7 +325,7 @@ def complete_rows(
     for row in range(first, last):
         target, seen, i, before = targets[row], measured[row], row - first, number[row]
         lane = i % LANES
-        if lane == 0:  # the first candidates of the next rows side by side
+        if lane == 0:  # evaluate the first candidates of the next rows together, in SIMD lanes
             side = min(LANES, last - row)
             for n in range(side):
                 lanes[n, 0] = 1.0
@@ -362,7 +369,7 @@ def complete_rows(
 
 @inlined
 def _both_priors(weight: Array, chi: Array, n: int, sound: bool) -> None:
-    """Fill the log weights that count from those with volumes, and χ²."""
+    """Fill log weights that combine both priors, from log weights with volumes and χ²."""
     by_volume, by_fit, volumes, fits = -np.inf, -np.inf, 0.0, 0.0
     for c in range(n):
         by_volume = max(by_volume, weight[1, c])
@@ -382,7 +389,7 @@ def _both_priors(weight: Array, chi: Array, n: int, sound: bool) -> None:
 
 @inlined
 def _units(of: Searched, how: Weighing, value: Array) -> Array:
-    """Sizes of directions (q,) for which weights are those at (F, p); zero: for all sizes."""
+    """Sizes (q,) of the vectors of directions at (F, p); zero where weights do not depend on it."""
     out = np.zeros(of.turns.shape[0])
     for i in range(out.shape[0]):
         if of.turns[i] > 0.0 and not how.deviations[0] >= 0.0:
@@ -396,9 +403,9 @@ def _units(of: Searched, how: Weighing, value: Array) -> Array:
 class _Judged(NamedTuple):
     """Working memory of `judge_rows`, by candidate.
 
-    Covariances (m, 3, 3), log weights (as they count, and with volumes) (2, m), probabilities
-    (1, m), whether covariances are valid, whether the second order describes the channels, order
-    (1, m); copies of x, (F, p) and χ².
+    Covariances (m, 3, 3), log weights (combined, and with volumes) (2, m), probabilities (1, m),
+    validity of the covariances, whether the second order describes the channels, order (1, m);
+    copies of x, (F, p) and χ².
     """
 
     spread: Array
@@ -414,7 +421,7 @@ class _Judged(NamedTuple):
 
 @inlined
 def _judging(most: int) -> _Judged:
-    """Make the working memory of `judge_rows`."""
+    """Allocate the working memory of `judge_rows`."""
     return _Judged(
         np.empty((most, 3, 3)),
         np.empty((2, most)),
@@ -430,7 +437,7 @@ def _judging(most: int) -> _Judged:
 
 @inlined
 def _put_in_order(row: int, n: int, out: Candidates, room: _Judged) -> None:
-    """Write n candidates with what is known of them by falling probability."""
+    """Write n candidates, with all that belongs to them, by falling probability."""
     x, values, chi = out.x[row], out.values[row], out.chi_squared[row]
     for c in range(n):
         copy(x[c], room.x[c])
@@ -462,9 +469,10 @@ def _leave_room(
     out: Candidates,
     room: _Judged,
 ) -> None:
-    """Lower the probability of the first candidate by what is outside its region, which may widen.
+    """Lower the probability of the first candidate by the posterior outside its region.
 
-    ``best`` is which candidate it was before they were put in order, with these weights.
+    Its covariance may be widened. ``best`` is its index before the candidates were ordered, to
+    which ``weights`` and ``loose`` refer.
     """
     white, spread = how.own[0, 0] > 0.0, out.covariances[row, 0]
     value, chi = out.values[row, 0], out.chi_squared[row, 0]
@@ -491,7 +499,7 @@ def judge_rows(
     first: int,
     last: int,
 ) -> None:
-    """Judge the candidates that `complete_rows` has left, and rank them by probability."""
+    """Judge the candidates left by `complete_rows`, and rank them by probability."""
     of, how, limit, out = task.of, task.how, task.problem.limit, in_memory(number, flat, valid)
     room = _judging(MOST_CANDIDATES)
     weight, fine = room.weight, room.fine
@@ -537,9 +545,9 @@ def judge_rows(
 
 
 def stages(of: Searched, how: Weighing, problem: Problem) -> tuple[list[Call], list[Call]]:
-    """Kernels that noisy measurements pass through, and what they are called with, in two halves.
+    """Kernels for noisy measurements and the arguments of each, in two halves.
 
-    Each half takes about as long to compile.
+    Each half takes about as long to compile as the other.
     """
     channels = np.empty((0, how.codes.shape[0]))
     status, about = np.empty(0, np.int64), type_of_description()
@@ -553,7 +561,7 @@ def stages(of: Searched, how: Weighing, problem: Problem) -> tuple[list[Call], l
 
 
 def compile_stages(of: Searched, how: Weighing, problem: Problem) -> None:
-    """Compile what noisy measurements pass through in two processes, if it is needed for once."""
+    """Compile the kernels for noisy measurements in two processes, unless they are cached."""
     if not judge_rows.overloads:  # type: ignore[attr-defined]
         compile_together(*stages(of, how, problem))
 
@@ -568,10 +576,10 @@ def estimate_rows(
     first: int,
     last: int,
 ) -> None:
-    """Find, complete, judge and rank the candidates of measurements; NaN rows are left alone.
+    """Find, complete, judge and rank the candidates of measurements; NaN rows stay as they are.
 
-    Each stage is compiled by itself, so that whoever needs one does not wait for the others, and
-    two processes can compile them.
+    Each stage is compiled separately: a caller that needs one does not wait for the others, and two
+    processes can share the work.
     """
     given = targets, measured, *room
     if problem.exact:

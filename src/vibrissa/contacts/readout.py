@@ -1,7 +1,7 @@
-"""What a stream carries, ready for one measurement at a time: signals by name, or a linear mix.
+"""Readouts: measurements as signals by name or as a linear mix, prepared for the estimator.
 
-A readout turns a measurement into channels with weights (:class:`~vibrissa.contacts.weighing`), and
-knows where contacts that explain it may lie: from a search tree of three quantities over the map.
+A readout converts a measurement to channels with weights (:class:`~vibrissa.contacts.weighing`),
+and provides the search tree, over three quantities of the map, for contacts that may explain it.
 """
 
 from __future__ import annotations
@@ -31,39 +31,39 @@ from vibrissa.rod import search_tree
 from vibrissa.sensors import COMPONENTS
 from vibrissa.signals import CIRCULAR, SIGNALS, signal_scales, signals_of
 
-# A direction of the readings in which contacts of the map vary so much less than the noise and the
-# others carries no information.
+# Ratio to the noise and to the other directions below which the contacts of the map vary too little
+# along a direction of the readings for it to carry information.
 _UNINFORMATIVE = 1e-9
-# How often contacts are fitted with weights of the contact before: where the noise of directions
-# falls with their size; and where errors that measurements share may exceed the noise by far, so
-# that weights by the first contact, wrong by these errors, hold the next back.
+# Number of fits, each with the weights at the contact before: if the noise of directions depends on
+# their size; and if shared errors may far exceed the noise, so that weights at the first contact,
+# which is wrong by these errors, would hold back the next fit.
 _BY_DIRECTION, _WITH_ERRORS = 2, 8
-# Signals this many times larger than any on the map are in another unit.
+# Ratio to the largest signal on the map above which signals are in another unit.
 _FAR_BEYOND = 10.0
 _UNKNOWNS = 3
-# Components that together are signals; a sensor that reads these reads signals by name.
+# Components that together form signals; a sensor that reads these reads signals by name.
 _BY_NAME = (("Fx",), ("Fy", "Fz"), ("Mx",), ("My", "Mz"))
 
 
 class Bounds(NamedTuple):
-    """How large forces and moments are that contacts of a map give."""
+    """Largest forces and moments of the contacts of a map."""
 
     sizes: list[int]
     largest: Array
 
     @classmethod
     def of(cls, contact_map: ChartedWhisker, names: tuple[str, ...]) -> Bounds:
-        """Find them for signals of a map."""
+        """Bounds of signals of a map."""
         sizes = [k for k, name in enumerate(names) if not CIRCULAR[SIGNALS.index(name)]]
         values = contact_map.chart.values.reshape(-1, 6)
         known = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))
         largest = np.abs(known[:, [SIGNALS.index(names[k]) for k in sizes]]).max(axis=0)
-        # M_x is next to nothing on a planar whisker, but for that noise in it is not out of bounds.
+        # M_x nearly vanishes on a planar whisker, but noise in it must not be out of bounds.
         of_kind = {"F": np.abs(values[:, :3]).max(), "M": np.abs(known[:, 3:5]).max()}
         return cls(sizes, np.maximum(largest, [0.1 * of_kind[names[k][0]] for k in sizes]))
 
     def nothing(self, targets: Array) -> AnyArray:
-        """Whether signals (n, k) come from a whisker that touches nothing, shape (n,)."""
+        """Whether signals (n, k) are those of a free whisker, shape (n,)."""
         return np.asarray((targets[:, self.sizes] == 0.0).all(axis=1) & bool(self.sizes))
 
     def exceeded(self, targets: Array) -> AnyArray:
@@ -71,7 +71,7 @@ class Bounds(NamedTuple):
         return np.asarray((np.abs(targets[:, self.sizes]) > _FAR_BEYOND * self.largest).any(axis=1))
 
     def most(self) -> list[tuple[int, float]]:
-        """For each of these signals, what it can be at most."""
+        """Largest possible value of each signal."""
         return list(zip(self.sizes, (_FAR_BEYOND * self.largest).tolist(), strict=True))
 
 
@@ -93,7 +93,7 @@ def check_signals(values: Array, names: tuple[str, ...]) -> None:
 def searched_by_name(
     contact_map: ChartedWhisker, names: tuple[str, ...]
 ) -> tuple[Bounds, Searched | None]:
-    """Bounds of signals, and what is searched for three or more; the same for all noise."""
+    """Bounds of signals, and the search structure for three or more; independent of the noise."""
     chart, channels, bounds = (
         contact_map.chart,
         Channels.of(names).names,
@@ -117,14 +117,14 @@ def searched_by_name(
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """One measurement, non-dimensional: what was measured, and what the channels should be."""
+    """One measurement, non-dimensional: measured values, and target values of the channels."""
 
     measured: Array
     target: Array
 
 
 class Named:
-    """Signals by name, and components of force and moment."""
+    """Readout of signals by name, and of components of force and moment."""
 
     def __init__(
         self, contact_map: ChartedWhisker, names: tuple[str, ...], sensor: SensorNoise | None
@@ -162,7 +162,7 @@ class Named:
         return out
 
     def scaled(self, values: Array) -> Measurement:
-        """Check one measurement (k,), SI units, and make it non-dimensional; NaN stays NaN."""
+        """Check one measurement (k,), SI units, and make it non-dimensional; NaN remains NaN."""
         for i, value in enumerate(values.tolist()):
             if self._circular[i]:
                 if abs(value) > 2.0 * math.pi:
@@ -179,19 +179,20 @@ class Named:
         return Measurement(measured, target)
 
     def nothing(self, measurement: Measurement) -> bool:
-        """Whether the whisker touches nothing."""
+        """Whether the whisker is free."""
         values = measurement.measured.tolist()
         return bool(self._straight) and not any(values[i] for i in self._straight)
 
     def detected(self, measurement: Measurement, above: float) -> bool:
-        """Whether a signal other than a direction is so many standard deviations from zero."""
+        """Whether a signal other than a direction exceeds zero by ``above`` standard deviations."""
         values = measurement.measured.tolist()
         return any(abs(values[i]) > above * sigma for i, sigma in self._noise)
 
     def excess(self, measurement: Measurement) -> Array:
         """Measurement (n,) in standard deviations of a free whisker's noise; empty without noise.
 
-        Sizes with their directions are two components, others what noise does not explain.
+        A size with its direction gives two components; a size alone gives what noise does not
+        explain.
         """
         out: list[float] = []
         for i, sigma in self._noise:
@@ -208,7 +209,7 @@ class Named:
 
 
 class Mixed:
-    """A linear mix of force and moment, z = H (F, M) + noise."""
+    """Readout of a linear mix of force and moment, z = H (F, M) + noise."""
 
     def __init__(
         self, contact_map: ChartedWhisker, mixing: Array, covariance: Array, errors: Array
@@ -224,7 +225,7 @@ class Mixed:
         whiten = axes.T / np.sqrt(size)[:, None]
         wrenches = wrenches_of(chart.values.reshape(-1, 6))
         typical = np.sqrt((wrenches**2).mean(axis=0))
-        # Singular directions of what contacts make of whitened readings, the strongest first.
+        # Singular directions of the whitened readings of contacts, the strongest first.
         u, strength, _ = np.linalg.svd(whiten @ (mixing * sizes) * typical)
         self.noisy = True
         self.rank = int((strength > _UNINFORMATIVE * strength[0]).sum())
@@ -238,7 +239,7 @@ class Mixed:
             np.zeros((6, 6)),
             0.0,
             np.full(6, np.nan),
-            # The reduced reading has full rank, so that wrong readings are those of wrong wrenches.
+            # The reduced reading has full rank, so that errors of readings are those of wrenches.
             np.ascontiguousarray(self._back @ (self._reduce @ errors) * np.append(sizes, 1.0)),
         )
         self.passes = _passes(self.how) if errors[..., :6].any() else 1
@@ -267,16 +268,16 @@ class Mixed:
                 self.rank = 2
 
     def scaled(self, values: Array) -> Measurement:
-        """Make one measurement (k,) non-dimensional and white; NaN stays NaN."""
+        """Make one measurement (k,) non-dimensional and white; NaN remains NaN."""
         z = self._reduce @ values
         return Measurement(z, self._back @ z)
 
     def nothing(self, measurement: Measurement) -> bool:
-        """Whether the whisker touches nothing."""
+        """Whether the whisker is free."""
         return not measurement.measured.any()
 
     def detected(self, measurement: Measurement, above: float) -> bool:
-        """Whether all readings together are so many standard deviations from zero."""
+        """Whether the readings together exceed zero by ``above`` standard deviations."""
         size = float((measurement.measured**2).sum())
         return size > len(measurement.measured) - 1 + above**2
 
@@ -290,7 +291,7 @@ class Mixed:
 
 
 def _passes(how: Weighing) -> int:
-    """How often contacts are fitted at most, each time with weights of the contact before."""
+    """Largest number of fits, each with the weights at the contact before."""
     return _WITH_ERRORS if how.errors.shape[0] else _BY_DIRECTION
 
 
@@ -335,14 +336,14 @@ def constant_weights(channels: Channels, sensor: SensorNoise | None) -> bool:
 
 
 class ByName:
-    """A sensor whose channels tell whole signals: its readings as those."""
+    """A sensor whose channels determine whole signals: its readings as those."""
 
     def __init__(self, named: Named, back: Array, places: list[int]) -> None:
         self.named, self._back, self._places = named, back, places
         self._wrench = np.zeros(6)
 
     def signals(self, values: Array) -> Array:
-        """Turn readings (k,) into the signals."""
+        """Convert readings (k,) to signals."""
         w = self._wrench
         w[self._places] = self._back @ values
         fx, fy, fz, mx, my, mz = w.tolist()
@@ -360,7 +361,7 @@ class ByName:
 def readout_of(
     contact_map: ChartedWhisker, h: Array, covariance: Array, errors: Array
 ) -> ByName | Mixed:
-    """Signals by name if the channels tell these and nothing else, or a mix."""
+    """Readout by name if the channels determine whole signals and nothing else, else of a mix."""
     read = [name for name, column in zip(COMPONENTS, h.T, strict=True) if column.any()]
     whole = [group for group in _BY_NAME if set(group) <= set(read)]
     places = [COMPONENTS.index(name) for name in read]

@@ -1,16 +1,16 @@
-"""Measured signals in, contacts out: all that explain them, each with its covariance.
+"""Estimates of contacts: all that explain measured signals, each with its covariance.
 
 Three signals T have as many unknowns ξ: every contact with T(ξ) = T is a candidate. More signals
-are explained by weighted least squares, χ² = |T(ξ) - T|² in standard deviations. With noise three
-are treated so too: contacts on the boundary of T(Ω) explain what noise has carried out of it. For
-noise of covariance Σ the covariance is ∂p/∂ξ (JᵀΣ⁻¹J)⁻¹ ∂p/∂ξᵀ with J = ∂T/∂ξ to first order, see
-:mod:`~vibrissa.contacts.posterior`. For a covariance of force and moment, Σ is carried over to the
-signals by their derivatives. Fewer than three signals leave a curve or a surface of contacts, see
-:mod:`~vibrissa.contacts.ambiguity`.
+are explained by weighted least squares, χ² = |T(ξ) - T|² in standard deviations. With noise, three
+signals are treated in this way too: contacts on the boundary of T(Ω) explain signals that noise has
+carried out of it. For noise of covariance Σ the covariance of the contact point is, to first order,
+∂p/∂ξ (JᵀΣ⁻¹J)⁻¹ ∂p/∂ξᵀ with J = ∂T/∂ξ; see :mod:`~vibrissa.contacts.posterior`. A covariance of
+force and moment is transformed to the signals by their derivatives. Fewer than three signals leave
+a curve or a surface of contacts; see :mod:`~vibrissa.contacts.ambiguity`.
 
-Many measurements at once and one at a time go through the same compiled rows
+Batches and single measurements pass through the same compiled kernels
 (:mod:`~vibrissa.contacts.candidates`). Each is searched for in the whole map, so that no candidate
-is lost by looking only near the last one.
+is missed by searching only near the last one.
 """
 
 from __future__ import annotations
@@ -54,15 +54,16 @@ from vibrissa.status import Status
 
 #: Signals that determine a contact.
 UNKNOWNS = 3
-#: What is larger is brought to this: no less absurd, in any unit, and its square is still a number.
+#: Limit that larger values are reduced to: as implausible in any unit, and its square is finite.
 LARGEST = 1e100
-# Non-dimensional force or moment that one in twenty exceeds only if its unit is another.
+# Non-dimensional force or moment that 5 % of values exceed only if they are in another unit.
 _LARGEST_SCALE, _OFTEN = 100.0, 0.95
-# A few odd numbers have a status each; so many, nearly all of them, are a table in other units.
+# Number and share of implausible values above which a table is in other units; fewer get a status.
 _TABLE = 20
-# Measurements for which there is room for the most candidates at a time; few have more than one.
+# Number of measurements for which the most candidates are allocated at a time; few have more than
+# one.
 _AT_ONCE = 1 << 16
-#: Statuses by their number.
+#: Statuses by number.
 STATUSES = {int(status): status for status in Status}
 
 
@@ -149,14 +150,14 @@ class Search:
 def why_none(
     contact_map: ChartedWhisker, names: tuple[str, ...], targets: Array
 ) -> tuple[IntArray, Array]:
-    """Why three signals have no contact, and how far the nearest are that have one."""
+    """Reasons why three signals have no contact; distances of the nearest signals that have one."""
     chart, turned = contact_map.chart, circular_among(names)
     known, size, tree, bounds = signals_at_nodes(contact_map, names)
     _, nearest = tree.query(_on_circle(targets, turned, size))
     away = within_turn(known[nearest] - targets, turned)
     span = np.where(turned, 2.0 * np.pi, size)
     misfit = np.abs(away / span).max(axis=1)
-    # Perhaps a contact nearer to the base than the map goes explains them.
+    # Perhaps a contact nearer to the base than the map's limit explains them.
     start = chart.contacts.reshape(-1, 3)[nearest]
     xi, _, residual, sign = polish(chart, names, targets, start)
     nearer = (residual <= TOLERANCE) & (sign > 0.0) & (xi[:, 0] < chart.proximal)
@@ -170,7 +171,7 @@ def why_none(
 def signals_at_nodes(
     contact_map: ChartedWhisker, names: tuple[str, ...]
 ) -> tuple[Array, Array, spatial.cKDTree, Bounds]:
-    """Return the signals at the nodes of the chart, and what searches among them need."""
+    """Signals at the nodes of the chart, with the structures to search among them."""
     values = contact_map.chart.values.reshape(-1, 6)
     which = [SIGNALS.index(name) for name in names]
     known = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))[:, which]
@@ -181,7 +182,7 @@ def signals_at_nodes(
 
 
 def _on_circle(values: Array, turned: AnyArray, size: Array) -> Array:
-    """Signals as points of a space where distance means difference: angles on the unit circle."""
+    """Signals as points whose distance is their difference, angles as points of the circle."""
     parts = []
     for k, turns in enumerate(turned.tolist()):
         v = values[:, k]

@@ -1,7 +1,7 @@
-"""What estimates ask of the kernels, and what these hand on to each other, as one reference each.
+"""Arguments of the estimation kernels and the results they pass on, each bundled as one reference.
 
-A map, the noise and the settings are some forty arrays and numbers; taking them apart at each call
-costs ten microseconds, as much as solving for a contact.
+A map, the noise and the settings comprise some forty arrays and numbers; unpacking them at each
+call would take ten microseconds, as long as solving for a contact.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from vibrissa.contacts.nodes import Searched
 from vibrissa.contacts.weighing import Weighing
 from vibrissa.numerics import AnyArray, Array, inlined, kernel
 
-#: At most so many starts for one measurement.
+#: Largest number of starting points for one measurement.
 MOST_STARTS = 6
 
 
 class Problem(NamedTuple):
-    """How contacts are looked for.
+    """Settings of a search for contacts.
 
-    Whether three signals are solved exactly, whether noise is known, how often weights are taken
-    at the contact, and the largest χ² that counts as explained.
+    Whether three signals are solved exactly, whether the noise is known, how often the weights are
+    recomputed at the contact, and the largest χ² that counts as explained.
     """
 
     exact: bool
@@ -38,11 +38,11 @@ class Problem(NamedTuple):
 
 @structref.register
 class _TaskType(types.StructRef):
-    """Type of `Task` in kernels."""
+    """Numba type of `Task`."""
 
 
 class Task(structref.StructRefProxy):
-    """What is searched, how measurements are weighed, and how contacts are looked for."""
+    """Reference to the map, the weighing of measurements and the settings of the search."""
 
     of: Searched
     how: Weighing
@@ -55,12 +55,12 @@ structref.define_proxy(Task, _TaskType, _OF_TASK)
 
 @kernel
 def task(of: Searched, how: Weighing, problem: Problem) -> Task:
-    """Keep these where kernels find them."""
+    """Store these in memory that kernels can refer to."""
     return Task(of, how, problem)  # type: ignore[no-untyped-call]
 
 
 def type_of_task(of: Searched, how: Weighing, problem: Problem) -> types.Type:
-    """Return the type that `task` gives these in kernels."""
+    """Numba type of the reference that `task` would return."""
     kinds = map(numba.typeof, (of, how, problem))
     return _TaskType(tuple(zip(_OF_TASK, kinds, strict=True)))  # type: ignore[no-untyped-call]
 
@@ -70,15 +70,15 @@ in_memory = inlined(candidates_within)
 
 @structref.register
 class _DescriptionType(types.StructRef):
-    """Type of `Description` in kernels."""
+    """Numba type of `Description`."""
 
 
 class Description(structref.StructRefProxy):
-    """What describes the candidates of noisy measurements, from one kernel to the next.
+    """Reference to the description of noisy measurements' candidates, passed between kernels.
 
     Weights (n, m, k, k), ∂(F, p)/∂ξ (n, m, 6, 3), residuals (n, m, k) and their slopes
-    (n, m, k, 4) in standard deviations; χ² and points (n, l, 4) of contacts that are not
-    candidates, and whether others may be probable (n,).
+    (n, m, k, 4) in standard deviations; χ² and coordinates (n, l, 4) of contacts that are not
+    candidates, and whether further ones may be probable (n,).
     """
 
     weights: Array
@@ -94,7 +94,7 @@ structref.define_proxy(Description, _DescriptionType, _DESCRIBED)
 
 
 def type_of_description() -> types.Type:
-    """Return the type that `description` makes."""
+    """Numba type of the reference that `description` returns."""
     three, four = (types.Array(types.float64, n, "C") for n in (3, 4))
     kinds = four, four, three, four, three, types.Array(types.boolean, 1, "C")
     return _DescriptionType(tuple(zip(_DESCRIBED, kinds, strict=True)))  # type: ignore[no-untyped-call]
@@ -102,7 +102,7 @@ def type_of_description() -> types.Type:
 
 @kernel
 def description(n: int, k: int) -> Description:
-    """Make room to describe the candidates of n measurements of k channels."""
+    """Allocate the description of the candidates of n measurements of k channels."""
     most = MOST_CANDIDATES
     return Description(  # type: ignore[no-untyped-call]
         np.zeros((n, most, k, k)),
@@ -118,7 +118,7 @@ _of_thread = threading.local()
 
 
 def described_in_thread(n: int, k: int) -> Description:
-    """Return room for n measurements, that which this thread has had before if it fits."""
+    """Description for n measurements: the last one of this thread if it fits, else a new one."""
     kept: tuple[int, int, Description] | None = getattr(_of_thread, "kept", None)
     if kept is None or kept[0] < n or kept[1] != k:
         kept = _of_thread.kept = (n, k, description(n, k))

@@ -1,23 +1,24 @@
-"""Contacts of the very tip, whose force is normal to the object and not to the whisker.
+"""Contacts of the tip itself, whose force is normal to the object and not to the whisker.
 
-Such a contact has s = L, and three unknowns too: its force f in the material frame at the tip. The
-whisker is on one side of the object, so that f_x ≤ 0; where f_x = 0 it is a contact of the side.
-It is stable while, on the way from rest with the direction of f held, the tip cannot slide along
-the plane that is normal to f, nor p be the point of another whisker: with the stiffness
-K = (∂F/∂f) (∂p/∂f)⁻¹ and P the projection on that plane, P K P is positive and so is det ∂p/∂f.
+Such a contact has s = L and three unknowns too: its force f in the material frame at the tip. The
+whisker is on one side of the object, so that f_x ≤ 0; with f_x = 0 it is a contact of the side. It
+is stable if, on the path from rest at a constant direction of f, the tip never becomes able to
+slide along the plane normal to f, and p never becomes the tip of a second equilibrium: with the
+stiffness K = (∂F/∂f) (∂p/∂f)⁻¹ and the projection P on that plane, P K P and det ∂p/∂f are
+positive.
 
-The forces that explain a measurement are least squares. A cloud of forces about each, of the
+The forces that explain a measurement are found by least squares. A cloud of forces about each, of
 covariance C_f = (JᵀJ)⁻¹, gives the second moment of the contact point, and the evidence
 
     w = √det C_f · mean of exp(|z|²/2 - χ²/2) |det ∂p/∂f|
 
-over those of the cloud that are possible, z being their distances in standard deviations; so does
-one about the best contact of the side, of its unknowns (s, f_y, f_z). Noise may leave open much of
-what the tip of a slender whisker can touch, which no cloud about one contact resembles: where
-enough nodes of all stable contacts of the tip count, the sums are over these. Second moments are
-widened where regions of 95 % would hold less. Contact points of either kind are equally probable
-beforehand, and those of the tip have the prior's probability together: w is divided by the volume
-that they fill.
+over its possible members, z being their distances in standard deviations. A cloud about the best
+contact of the side, in its unknowns (s, f_y, f_z), gives the evidence of that. For a slender
+whisker the noise may leave much of the surface that the tip can reach possible, which a cloud about
+one contact does not represent: if enough nodes of all stable contacts of the tip count, the sums
+are over these. Second moments are widened where regions of 95 % would hold less. Contact points of
+either kind are uniformly probable, and those of the tip have the prior's probability together: w is
+divided by the volume that they fill.
 """
 
 from __future__ import annotations
@@ -41,19 +42,20 @@ from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.signals import within_turn
 from vibrissa.status import Status
 
-# Nodes: directions around and away from the plane normal to the whisker, and loads up to so many
-# times the force at which the side slips off at the tip.
+# Numbers of nodes by direction, around the whisker and away from its normal plane, and by load; and
+# the largest load, over the force at which the side slips off at the tip.
 _AROUND, _AWAY, _LOADS, _FARTHEST = 24, np.deg2rad(np.linspace(0.0, 80.0, 9)), 32, 3.0
-# Nodes that fits to a measurement begin at, and forces that are one, relative to their size.
+# Number of nodes from which fits start, and relative difference below which forces are the same.
 _STARTS, _SAME = 6, 1e-3
-# The largest standard deviation of a cloud, of s over L and of forces relative to their size; and
-# the share of it that must count for a covariance that is relied on.
+# Largest standard deviation of a cloud, of s over L and of forces relative to their size; and its
+# smallest effective share for a valid covariance.
 _LONGEST, _COUNTING = 1.0, 0.2
-_WIDER = 1.5  # the cloud is so much wider than a normal distribution, whose tails are often shorter
-_DENSE = 4.0  # so many nodes must count to take the place of a cloud
-# Share that a region of 95 % holds, and the square of its radius in standard deviations.
+# Width of the cloud over that of the normal distribution, whose tails are often shorter.
+_WIDER = 1.5
+_DENSE = 4.0  # effective number of nodes from which they replace a cloud
+# Share of a 95 % region, and its squared radius in standard deviations.
 _WITHIN, _REGION = 0.95, 7.815
-# Unknowns of contacts of the side and of the tip, among (s, f_x, f_y, f_z).
+# Unknowns of contacts of the side and of the tip: indices into (s, f_x, f_y, f_z).
 _SIDE, _TIP = [0, 2, 3], [1, 2, 3]
 _SOLVED = (int(Status.UNIQUE), int(Status.AMBIGUOUS))
 _UNSOLVED = (int(Status.NOT_FRICTIONLESS), int(Status.OUTSIDE_MAP))
@@ -62,8 +64,8 @@ _UNSOLVED = (int(Status.NOT_FRICTIONLESS), int(Status.OUTSIDE_MAP))
 class _Nodes(NamedTuple):
     """Stable contacts of the tip: x (n, 4), (F, p) (n, 6), and the largest forces by direction.
 
-    Each stands for contact points of the volume ``cells`` (n,); the share of all contact points
-    that the tip's have in volume is ``volume``, over the side's.
+    Each represents contact points of volume ``cells`` (n,); ``volume`` is that of all contact
+    points of the tip over that of the side's.
     """
 
     x: Array
@@ -74,7 +76,7 @@ class _Nodes(NamedTuple):
 
 
 class _Weighed(NamedTuple):
-    """Log evidence (n,), the likeliest contacts, and the second moment of contact points."""
+    """Log evidence (n,), the most probable contacts, and the second moment of contact points."""
 
     log: Array
     x: Array
@@ -85,7 +87,7 @@ class _Weighed(NamedTuple):
 
 
 def _stable(values: Array, tangents: Array) -> AnyArray:
-    """Whether contacts of the tip are stable, by (F, p) and their derivatives by x."""
+    """Whether contacts of the tip are stable, from (F, p) and their derivatives in x."""
     by_force = np.nan_to_num(tangents[..., 1:4])
     det = np.linalg.det(by_force[..., 3:6, :])
     by_point = by_force[..., 3:6, :] + np.where(det == 0.0, 1.0, 0.0)[..., None, None] * np.eye(3)
@@ -93,7 +95,7 @@ def _stable(values: Array, tangents: Array) -> AnyArray:
     force = values[..., :3] / np.linalg.norm(values[..., :3], axis=-1, keepdims=True)
     across = np.eye(3) - force[..., :, None] * force[..., None, :]
     plane = across @ (stiffness + np.swapaxes(stiffness, -1, -2)) @ across
-    # Along the force it is zero, so that the least of the three is not positive in any case.
+    # Along the force it is zero, so the smallest of the three is never positive.
     least = np.linalg.eigvalsh(np.nan_to_num(plane))
     return np.asarray((det > 0.0) & (least[..., 0] > -1e-9 * np.abs(least[..., 2])))
 
@@ -121,7 +123,8 @@ def _nodes(contact_map: ChartedWhisker) -> _Nodes:
     by_force[:, 0] *= 0.5  # half of the cell pulls at the tip
     cells = by_force[stable] * 2.0 * np.pi * _AWAY[1] / (_AROUND * _LOADS)
     by_chart = np.linalg.det(chart.tangents[..., 3:, :] @ chart.frames)[:, :-1]
-    # The first node that slides off: noise may carry signals a little beyond those of the largest.
+    # Include the first node that slides off: noise may carry signals slightly beyond the stable
+    # ones.
     largest = size.max(axis=2) * ((stable.sum(axis=2) + 1.0) / _LOADS) ** 2
     largest = interpolate.RegularGridInterpolator(
         (np.append(bearing, 2.0 * np.pi), beta), np.concatenate([largest, largest[:1]])
@@ -167,7 +170,7 @@ class TipContacts:
         self._limit = explained(len(names) - 3)
 
     def _embedded(self, channels: Array) -> Array:
-        """Channels (n, k) as points of a space, angles as points of a circle."""
+        """Channels (n, k) as points of a Euclidean space, angles as points of a circle."""
         turned = channels[:, self._turned]
         rest = channels[:, ~self._turned] / self._span[~self._turned]
         return np.concatenate([np.cos(turned), np.sin(turned), rest], axis=1)
@@ -179,9 +182,9 @@ class TipContacts:
         status: IntArray,
         chi_squared: Array,
     ) -> tuple[Candidates, IntArray, Array]:
-        """Candidates of measurements with those of the tip, with statuses and first χ².
+        """Candidates of measurements including the tip's, with statuses and first χ².
 
-        ``measured`` has the measurements (n, k) and the channels that they should be.
+        ``measured`` contains the measurements (n, k) and the target values of the channels.
         """
         rows = np.flatnonzero(np.isin(status, (*_SOLVED, *_UNSOLVED)))
         if not rows.size:
@@ -225,7 +228,7 @@ class TipContacts:
         return out, status, chi_squared
 
     def _found(self, flat: Array, targets: Array) -> tuple[Candidates, Array]:
-        """Candidates of the tip (n, starts), by rising χ², and log evidence of each."""
+        """Candidates of the tip (n, starts), by rising χ², and the log evidence of each."""
         n, most = len(flat), min(_STARTS, len(self._nodes.x))
         _, nearest = self._tree.query(self._embedded(targets), most)
         start = nearest.reshape(-1)
@@ -243,7 +246,7 @@ class TipContacts:
         row, place = row[good], np.tile(np.arange(most), n)[good]
         if row.size:
             some = Fits(*(part[good] for part in fits))
-            some.contacts[:, 0] = 1.0  # it was held to a hundred-thousandth
+            some.contacts[:, 0] = 1.0  # the arc length was held to 1e-5
             weighed = self._weighed(flat[row], targets[row], some, _TIP)
             log[row, place] = weighed.log
             out.x[row, place], out.values[row, place] = weighed.x, weighed.values
@@ -254,7 +257,7 @@ class TipContacts:
         return out._replace(number=there.sum(axis=1)), log
 
     def _over_nodes(self, flat: Array, targets: Array, found: Candidates, log: Array) -> None:
-        """Replace clouds by the nodes where these are dense, about the contact of least χ²."""
+        """Replace clouds by the nodes where these are dense, about the contact of minimum χ²."""
         best = np.where(np.isfinite(log), found.chi_squared, np.inf).argmin(axis=1)
         line = np.arange(len(best))
         rows = np.flatnonzero(np.isfinite(log[line, best]))
@@ -280,7 +283,7 @@ class TipContacts:
         return Fits(x, values, tangents, np.zeros(len(x)), np.ones(len(x), np.bool_))
 
     def _weighed(self, flat: Array, targets: Array, fits: Fits, free: list[int]) -> _Weighed:
-        """Weigh fits by clouds of their free unknowns."""
+        """Weigh fits by clouds in their free unknowns."""
         fitting = self._fit
         own = fitting.channels.covariance(fitting.sensor, flat, fits.values, fitting.d)
         weights = whitening(own)
@@ -320,7 +323,7 @@ class TipContacts:
         )
 
     def _possible(self, x: Array, values: Array, tangents: Array, free: list[int]) -> AnyArray:
-        """Whether contacts (n, 4) are stable; those of the tip also whether they press on it."""
+        """Whether contacts (n, 4) are stable, and those of the tip press on the object."""
         if free == _SIDE:
             fits = Fits(x, values, tangents, np.zeros(len(x)), np.ones(len(x), np.bool_))
             return charted(self._chart, fits, self._chart.proximal) & (x[:, 0] <= 1.0)
@@ -335,7 +338,7 @@ class TipContacts:
 def _covariance(share: Array, moved: Array) -> Array:
     """Second moment (..., 3, 3) of differences (..., m, 3) with weights (..., m).
 
-    It is widened so that its region of 95 % holds that share of them.
+    It is widened so that its 95 % region holds that share of them.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         share = share / share.sum(axis=-1, keepdims=True)
@@ -353,5 +356,5 @@ def _covariance(share: Array, moved: Array) -> Array:
 def tip_contacts(
     contact_map: ChartedWhisker, readout: Named | Mixed, probability: float
 ) -> TipContacts:
-    """Contacts of the tip, made once for a map and its signals."""
+    """Contacts of the tip, cached for a map and its signals."""
     return TipContacts(contact_map, readout, probability)

@@ -1,21 +1,21 @@
-"""Whether a second contact is there: a whisker under several point forces, and what one leaves.
+"""Test for a second contact: whisker under several point forces, and residuals of one contact.
 
-Between contacts the rod carries the force n and the moment m of all that is beyond; in the material
-frame, from the tip (n = m = 0) to the base,
+Between contacts the rod carries the force n and the moment m of all contacts beyond; in the
+material frame, from the tip (n = m = 0) to the base,
 
     n' = n × u,   m' = m × u + n × e₁,   q' = q × u - e₁,   v' = v × u,   u = u₀(s) + c(s) ∘ m,
 
-with n growing by f at each contact; q reaches from r(s) to the tip, and v are axes that are fixed
+where n increases by f at each contact; q is the vector from r(s) to the tip, and v are axes fixed
 in space, which give the frames and so the shape.
 
-One contact with x = (s, f), and a ratio µ_x of its force along the whisker to that across which is
-0 ± σ, explains a measurement z up to the residual of least χ²(x) = |W (z(x) - z)|² + µ_x²/σ². Were
-it the only contact, the residual would be noise. Of six components three numbers are left over, and
-χ² is distributed with as many degrees of freedom. With the shape of the whisker most numbers are
-left over, but a second force changes few of them: with J the derivatives by x, K those by forces
-elsewhere, and P = 1 - J J⁺, the singular vectors of P W K that a force half as large as the first
-would move by some standard deviations; χ² is that of the residual along these. The shape is taken
-up to a rigid motion, so that errors of the pose do not count.
+One contact with x = (s, f), and a ratio µ_x = 0 ± σ of its force along the whisker to that across,
+explains a measurement z up to the residual of minimum χ²(x) = |W (z(x) - z)|² + µ_x²/σ². If it is
+the only contact, the residual is noise. Six components leave three degrees of freedom for χ². With
+the shape of the whisker there are many more, but a second force changes few of them: with J the
+derivatives with respect to x, K those with respect to forces elsewhere, and P = 1 - J J⁺, these are
+the singular vectors of P W K that a force half as large as the first would move by some standard
+deviations; χ² is that of the residual along these. The shape is compared up to a rigid motion, so
+that errors of the pose do not count.
 """
 
 from __future__ import annotations
@@ -39,23 +39,24 @@ from vibrissa.whisker import Whisker
 #: Rate of false alarms.
 FALSE_ALARMS = 0.01
 _STEPS = 24  # steps of the rod between two contacts, and between the last one and each end
-_TOGETHER = 2000  # rows that are integrated together: some tens of MB
-# Fits to a wrench of a χ² that this share exceeds begin elsewhere too, at these arc lengths.
+_TOGETHER = 2000  # number of rows integrated together, in some tens of MB
+# Tail probability of χ² below which a fit to a wrench is repeated from these arc lengths.
 _DOUBTFUL, _ELSEWHERE = 0.2, (0.25, 0.45, 0.65, 0.85, 0.97)
-# Arc lengths of the second force, relative to it the share of the first that is expected, and how
-# many standard deviations that must move the measurement.
+# Arc lengths of the second force; its expected size, over that of the first; and the displacement
+# of the measurement by it, in standard deviations, from which a direction counts.
 _PLACES = np.linspace(0.15, 1.0, 12)
 _SHARE, _CLEAR = 0.5, 3.0
-_STEP, _ROUNDS = 1e-4, 10  # steps of the derivatives, and rounds of the fit to wrench and shape
-# The longest step of arc length (over L), and a third of that of the force (relative to it).
+# Steps of finite differences, and iterations of the fit to wrench and shape.
+_STEP, _ROUNDS = 1e-4, 10
+# Longest step of arc length (over L), and a third of that of the force (relative to it).
 _LONGEST = 0.1
-# A residual of what has no meaning, as of a force that winds the whisker up.
+# Residual of a meaningless model, such as a force that winds the whisker up.
 _LOST = 1e6
 _SOME = np.array([0.5, 0.0, 0.1, 0.0])
 
 
 class Bent(NamedTuple):
-    """A rod under point forces, n rows of m nodes, non-dimensional."""
+    """Rod under point forces: n rows of m nodes, non-dimensional."""
 
     wrench: Array  # (n, 6), force and moment at the base
     arc: Array  # (n, m), arc lengths of the nodes, from the tip to the base
@@ -67,7 +68,7 @@ class Bent(NamedTuple):
         """Points and unit tangents (n, j, 3) at arc lengths (n, j)."""
         arc = self.arc[:, ::-1]
         size = arc.shape[1]
-        # One sorted array of all rows, each by itself.
+        # One sorted array for all rows, offset by row.
         shift = 2.0 * np.arange(len(arc))[:, None]
         at = np.searchsorted((arc + shift).ravel(), (s + shift).ravel(), side="right")
         at = at.reshape(s.shape) - size * np.arange(len(arc))[:, None] - 1
@@ -162,7 +163,7 @@ def _step(
     far: tuple[Array, Array],
     extent: float = 1.0,
 ) -> Array:
-    """One step of Runge and Kutta's method of fourth order."""
+    """One step of the fourth-order Runge-Kutta method."""
     a = _rates(y, near, extent)
     b = _rates(y + 0.5 * h * a, half, extent)
     c = _rates(y + 0.5 * h * b, half, extent)
@@ -171,7 +172,7 @@ def _step(
 
 
 def _joint(whisker: Whisker, state: Array) -> Array:
-    """Take a state through a compliant base, which turns and has no length."""
+    """Carry a state through a compliant base, which turns and has no length."""
     if whisker.base_stiffness is None:
         return state
     bending, twist = whisker.base_stiffness
@@ -298,7 +299,7 @@ def _checked(
 
 
 class _Test:
-    """Fits one contact to measurements, and states what is left over."""
+    """Fits of one contact to measurements, and χ² of their residuals."""
 
     def __init__(self, whisker: Whisker, sensor: SensorNoise, friction: float) -> None:
         self.whisker, self.sensor, self.friction = whisker, sensor, friction
@@ -320,7 +321,7 @@ class _Test:
         return self._with_shapes(flat, weights, fits.contacts, *lines)
 
     def _fitted(self, wrench: Array, flat: Array, weights: Array) -> Fits:
-        """Contacts of least χ² with the prior of friction."""
+        """Contacts of minimum χ² with the prior of friction."""
         signals = dict(zip(WRENCH, wrench.T, strict=True))
         noise = self.sensor.deviations if self.sensor.wrench is None else self.sensor.wrench
         found = estimate_components(self.whisker, signals, noise, self.sensor.errors, None)
@@ -356,7 +357,7 @@ class _Test:
 
     @staticmethod
     def _best(n: int, row: IntArray, fits: Fits) -> Fits:
-        """Fit of least χ² of each row."""
+        """Fit of minimum χ² of each row."""
         lost = ~np.isfinite(fits.values).all(axis=1) | np.isnan(fits.misfits)
         fits.misfits[lost] = np.inf
         order = np.lexsort((fits.misfits, row))
@@ -375,9 +376,9 @@ class _Test:
     def _with_shapes(
         self, flat: Array, weights: Array, x: Array, lines: Array, sigma: Array
     ) -> tuple[Array, IntArray, Array]:
-        """χ² of the directions that a second contact moves, with centrelines."""
+        """χ² along the directions that a second contact moves, with centrelines."""
         measured = _Measured(self.whisker, flat, weights, lines, sigma, self.friction)
-        # A wrench that no contact was found for is fitted from some contact.
+        # A wrench without a contact is fitted from an arbitrary one.
         x, residual, slopes = self._joint(measured, np.where(np.isfinite(x), x, _SOME))
         basis, size, _ = np.linalg.svd(slopes, full_matrices=False)
         basis = basis * (size > 1e-9 * size[:, :1])[:, None, :]
@@ -390,7 +391,7 @@ class _Test:
         return chi_squared, clear.sum(axis=1), measured.bent(x).contacts[:, 0]
 
     def _joint(self, measured: _Measured, x: Array) -> tuple[Array, Array, Array]:
-        """Fit to wrench and shape together, by Gauss and Newton; also residuals and slopes."""
+        """Fit to wrench and shape together by Gauss-Newton steps; also residuals and slopes."""
         share = np.ones(len(x))
         residual = measured.residuals(x)
         for _ in range(_ROUNDS):
@@ -410,7 +411,7 @@ class _Test:
 
 
 class _Measured:
-    """Wrenches and centrelines, and what one contact leaves of them, in standard deviations."""
+    """Wrenches and centrelines, and their residuals for one contact, in standard deviations."""
 
     def __init__(
         self,
@@ -435,7 +436,7 @@ class _Measured:
         self.rigid = np.linalg.svd(rigid.reshape(len(flat), -1, 6), full_matrices=False)[0]
 
     def bent(self, x: Array, extra: tuple[float, Array] | None = None) -> Bent:
-        """One contact, or two."""
+        """Rod bent by one contact, or by two."""
         if extra is None:
             return bent_by_forces(self.whisker, x[:, :1], x[:, None, 1:])
         arc = np.column_stack([x[:, 0], np.full(len(x), extra[0])])
@@ -445,11 +446,11 @@ class _Measured:
         return bent_by_forces(self.whisker, arc[row, order], forces[row, order])
 
     def _model(self, one: Bent) -> Array:
-        """Residuals: of the wrench, and of the centreline across the whisker up to its pose."""
+        """Residuals of the wrench, and of the centreline across the whisker up to its pose."""
         points, tangents = one.shape(np.minimum(self.arc, 1.0))
         past = np.maximum(self.arc - 1.0, 0.0)[..., None]
         points = points + past * tangents
-        # Of the points only the part across counts: along the whisker they may be anywhere.
+        # Only the part across the whisker counts: along it the points may be anywhere.
         away = points - self.lines
         shape = np.einsum("njai,nji->nja", self.across, away).reshape(len(self.flat), -1)
         shape -= (self.rigid @ (np.swapaxes(self.rigid, 1, 2) @ shape[..., None]))[..., 0]
@@ -458,7 +459,7 @@ class _Measured:
         return np.where(np.isfinite(out), out, _LOST)
 
     def residuals(self, x: Array) -> Array:
-        """Residuals (n, k); the last is the ratio, where friction is possible."""
+        """Residuals (n, k); the last is the friction ratio, if friction is possible."""
         out = self._model(self.bent(x))
         if self.friction > 0.0:
             ratio = x[:, 1] / np.hypot(x[:, 2], x[:, 3]) / self.friction
@@ -466,7 +467,7 @@ class _Measured:
         return out
 
     def slopes(self, x: Array) -> Array:
-        """Derivatives (n, k, 4) of the residuals by x."""
+        """Derivatives (n, k, 4) of the residuals with respect to x."""
         size = np.linalg.norm(x[:, 1:], axis=1)
         out = []
         for i in range(4):
@@ -481,7 +482,7 @@ class _Measured:
         return np.stack(out, axis=2)
 
     def by_second(self, x: Array) -> Array:
-        """What second forces change, each of a share of the first: (n, k, places × 2)."""
+        """Change (n, k, positions × 2) due to second forces, each a share of the first."""
         force = _SHARE * np.linalg.norm(x[:, 1:], axis=1)
         small = 0.02
         before = self._model(self.bent(x))

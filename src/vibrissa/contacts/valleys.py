@@ -1,21 +1,20 @@
-"""What noise leaves open about a contact with friction: valleys of χ² along the whisker; compiled.
+"""Posterior of a contact with friction along bent valleys of χ² on the whisker; compiled.
 
-A wrench determines the force well, but where along a thin tip it acts hardly at all: χ² has long,
-bent valleys, which no expansion about their lowest point describes. So a valley is followed from
-there both ways along the arc length s, until χ² has risen enough or the whisker ends. At each s a
-step of Gauss and Newton leads to the force of least χ²; to first order noise leaves open a
-covariance C_f of it. With contact points p and friction angles φ equally probable beforehand the
-density of s is
+A wrench determines the force well, but hardly the position of a contact near a thin tip: χ² has
+long, bent valleys, which no expansion about the minimum describes. So a valley is followed from
+the minimum both ways along the arc length s, until χ² has risen enough or the whisker ends. At each
+s a Gauss-Newton step leads to the force of minimum χ², of covariance C_f to first order. With a
+uniform prior of contact points p and friction angles φ, the density of s is
 
-    exp(-χ²/2) |∂(p, φ)/∂(s, f)| √det C_f,
+    exp(-χ²/2) |∂(p, φ)/∂(s, f)| √det C_f;
 
-or, with s and f instead, that without the second factor; the mean of both counts. Contact points
-are a mixture of normal distributions along the valley. The covariance is their second moment about
-the contact, widened until what the mixture leaves beyond three standard deviations is what these
-state. Of each part the squared distance is a shifted χ² with the same three cumulants (H. Liu,
-Y. Tang, H. H. Zhang, *A new chi-square approximation to the distribution of non-negative definite
-quadratic forms in non-central normal variables*, Comput. Stat. Data Anal. 53 (2009) 853-856), whose
-cube root is about normal.
+with a uniform prior of s and f it is that without the second factor. The mean of both is used.
+Contact points are a mixture of normal distributions along the valley. The covariance is their
+second moment about the contact, widened until the share of the mixture beyond three standard
+deviations is the nominal one. The squared distance of each part is approximated by a shifted χ²
+distribution with the same three cumulants (H. Liu, Y. Tang, H. H. Zhang, *A new chi-square
+approximation to the distribution of non-negative definite quadratic forms in non-central normal
+variables*, Comput. Stat. Data Anal. 53 (2009) 853-856), whose cube root is nearly normal.
 """
 
 from __future__ import annotations
@@ -44,20 +43,20 @@ from vibrissa.numerics import (
 )
 from vibrissa.rod import BUFFER_SIZE, Discretization, Rod, integrate, set_lane
 
-# Steps each way; the first in standard deviations of s, at least and at most over L. Equal steps of
+# Steps each way; the first one in standard deviations of s, and its limits over L. Equal steps of
 # one standard deviation integrate a normal distribution to 1e-7.
 _STEPS = 8
 _FIRST, _SHORTEST, _LONGEST = 1.0, 1e-9, 0.05
-# A valley is followed until χ² is so much above its least, and closed from the second on: then the
-# covariance may be relied on.
+# Height of χ² above the minimum to which a valley is followed, and from which it counts as closed,
+# so that the covariance may be valid.
 HIGH, CLOSED = 30.0, 9.0
-# After a step on which χ² rose by less than this the next is longer, by this factor; of a normal
-# distribution all steps are equal.
+# Factor of the next step's length, by the rise of χ² on the last step; for a normal distribution
+# all steps are equal.
 _PACE = ((0.4, 2.0), (0.8, 1.3), (12.0, 1.0), (math.inf, 0.6))
-_LARGEST_CHANGE = 0.5  # the largest change of the moment of the force in a step, as a share of it
-# A covariance is widened by so much at most, found by so many bisections.
+_LARGEST_CHANGE = 0.5  # largest change of the force's moment in a step, as a share of it
+# Largest factor by which a covariance is widened, and bisections to find it.
 _WIDEST, _BISECTIONS = 8.0, 8
-_NOTHING = 1e-6  # variances, in those of the whole mixture, that are nothing
+_NOTHING = 1e-6  # negligible variances, relative to that of the whole mixture
 
 
 class Valleys(NamedTuple):
@@ -69,11 +68,11 @@ class Valleys(NamedTuple):
 
     @classmethod
     def room(cls, n: int) -> Valleys:
-        """Those of n contacts, of which nothing is known yet."""
+        """Results for n contacts, not computed yet."""
         return cls(np.full((n, 3, 3), np.nan), np.full(n, -np.inf), np.zeros(n, np.bool_))
 
 
-# By node along a valley: s, χ², logs of the two densities (2), point (3), covariance there (3, 3).
+# Row of a node along a valley: s, χ², logs of both densities (2), point (3), its covariance (3, 3).
 Nodes = tuple[Array, Array, Array, Array, Array]
 
 
@@ -89,9 +88,9 @@ def _node(
     i: int,
     along: Array,
 ) -> float:
-    """Fill a node at the arc length of x, which becomes the best there; variance of s by itself.
+    """Fill a node at the arc length of x, moved to minimum χ²; return the variance of s alone.
 
-    ``along`` becomes ∂f/∂s of the valley. The variance is negative where χ² has no least force.
+    ``along`` becomes ∂f/∂s of the valley. The variance is negative if χ² has no minimum.
     """
     s, misfits, logs, points, spreads = nodes
     k = codes.shape[0]
@@ -146,7 +145,7 @@ def _node(
 
 @inlined
 def _ahead(x: Array, along: Array, step: float, least: float, to: Array) -> None:
-    """Fill the contact a step farther along a valley, of which s and s f are about straight."""
+    """Fill the contact one step farther along a valley, which is nearly straight in s and s f."""
     ds = min(max(x[0] + step, least), 1.0) - x[0]
     moment, change = 0.0, 0.0
     for a in range(3):
@@ -161,7 +160,7 @@ def _ahead(x: Array, along: Array, step: float, least: float, to: Array) -> None
 
 @inlined
 def pace(rise: float) -> float:
-    """By what factor the next step is longer, after one on which χ² rose by so much."""
+    """Factor of the next step's length after a step on which χ² rose by ``rise``."""
     for most, factor in _PACE:
         if rise < most:
             return factor
@@ -181,7 +180,7 @@ def _followed(
     tangents: Array,
     nodes: Nodes,
 ) -> tuple[int, int]:
-    """Fill the nodes of a valley, the contact in the middle; the first, and behind the last."""
+    """Fill the nodes of a valley, the contact in the middle; return the range of their indices."""
     misfits = nodes[1]
     at, to, along = np.empty((2, 4)), np.empty((2, 4)), np.empty((2, 3))
     third, t, v = np.empty((6, 3)), np.zeros((6, 4)), np.empty(6)
@@ -223,7 +222,7 @@ def _followed(
 
 @inlined
 def shares_of(nodes: Nodes, first: int, last: int, shares: Array) -> float:
-    """Fill the probabilities of nodes; return the log of the density by volume, integrated."""
+    """Fill the probabilities of nodes; return the log integral of the density with volumes."""
     s, logs = nodes[0], nodes[2]
     middle = s.shape[0] // 2
     mass = np.zeros(2)
@@ -240,7 +239,7 @@ def shares_of(nodes: Nodes, first: int, last: int, shares: Array) -> float:
 
 @inlined
 def _beyond(cumulants: Array, shares: Array, first: int, last: int, square: float) -> float:
-    """Probability that a mixture leaves beyond a squared distance; see the module."""
+    """Probability of a mixture beyond a squared distance; see the module."""
     total = 0.0
     for i in range(first, last):
         mean, spread, skew = cumulants[i]
@@ -255,7 +254,7 @@ def _beyond(cumulants: Array, shares: Array, first: int, last: int, square: floa
 def mixture(
     nodes: Nodes, first: int, last: int, shares: Array, point: Array, covariance: Array
 ) -> bool:
-    """Fill the second moment of a mixture about a point, widened; whether it can be relied on."""
+    """Fill the widened second moment of a mixture about a point; whether it is valid."""
     points, spreads = nodes[3], nodes[4]
     root, y, z, cumulants = np.zeros((3, 3)), np.empty(3), np.empty((3, 3)), np.empty_like(points)
     covariance[:] = 0.0
@@ -362,8 +361,8 @@ def valleys(
 ) -> Valleys:
     """Follow the valleys of contacts with friction that explain measured channels.
 
-    Weights of the channels, contacts x (n, 4), (F, p) and their derivatives by x are those of fits;
-    no contact is nearer to the base than ``least``.
+    Weights of the channels, contacts x (n, 4), (F, p) and their derivatives with respect to x are
+    those of fits; no contact is proximal to ``least``.
     """
     n, rod = len(contacts), discretization.rod
     out = Valleys.room(n)

@@ -1,4 +1,4 @@
-"""Weights of one measurement, by the noise of the sensor; compiled.
+"""Weights of a measurement's channels from the noise of the sensor; compiled.
 
 A measurement is z = A c(x) + noise: a mix A of channels c, the identity for signals by name.
 """
@@ -13,13 +13,13 @@ import numpy as np
 from vibrissa.numerics import Array, IntArray, copy, inlined, kernel
 from vibrissa.signals import FT, FX, FY, FZ, MB, MX, MY, MZ
 
-# Of a channel's variance, what others do not explain; below this the covariance is singular.
+# Share of a channel's variance that the others do not explain; the covariance is singular below.
 _SINGULAR = 1e-10
 _EXACT = 1e-6  # what counts as exact, relative to the other deviations
 
 
 class Weighing(NamedTuple):
-    """How a measurement is weighed, non-dimensional."""
+    """Noise of a sensor and the channels it applies to, non-dimensional."""
 
     codes: IntArray
     mixing: Array
@@ -32,7 +32,7 @@ class Weighing(NamedTuple):
 
 @inlined
 def gradients(codes: IntArray, force: Array, moment: Array, out: Array) -> None:
-    """∂(channels)/∂(F, M), (k, 6)."""
+    """Fill ∂(channels)/∂(F, M), (k, 6)."""
     for k in range(codes.shape[0]):
         for a in range(6):
             out[k, a] = 0.0
@@ -55,7 +55,7 @@ def gradients(codes: IntArray, force: Array, moment: Array, out: Array) -> None:
 
 @inlined
 def wrong_by(error: Array, force: Array, moment: Array, out: Array) -> None:
-    """E (F, M, 1), (6,), for an error E (6, 7)."""
+    """Fill the error E (F, M, 1), (6,), of a wrench for an error matrix E (6, 7)."""
     for a in range(6):
         out[a] = error[a, 6]
         for c in range(3):
@@ -108,7 +108,7 @@ def channel_covariance(how: Weighing, value: Array, measured: Array, sigma: Arra
 
 @kernel
 def weigh(how: Weighing, value: Array, measured: Array, out: Array) -> bool:
-    """Fill weights W (k, k), rows beyond q zero, for a contact with (F, p)."""
+    """Fill weights W (k, k), rows beyond the rank q zero, at a contact with (F, p)."""
     mixing = how.mixing
     q, k = mixing.shape
     sigma, mixed, low = np.empty((k, k)), np.zeros((q, k)), np.zeros((q, q))
@@ -144,7 +144,7 @@ def weigh(how: Weighing, value: Array, measured: Array, out: Array) -> bool:
 
 @kernel
 def weigh_any(how: Weighing, value: Array, measured: Array, out: Array) -> bool:
-    """Fill weights W (k, k) as `weigh`, also for singular noise; False where there is none."""
+    """Fill weights W (k, k) as `weigh` does, also for singular noise; False if there are none."""
     if weigh(how, value, measured, out):
         return True
     k = how.codes.shape[0]
@@ -175,10 +175,9 @@ def weigh_any(how: Weighing, value: Array, measured: Array, out: Array) -> bool:
 
 @inlined
 def sharpness(weights: Array) -> float:
-    """Logarithm of the density that noise with these weights has where it is zero.
+    """Logarithm of the noise's peak density for these weights, up to a common constant.
 
-    Up to what is the same for all contacts. The noise of a direction falls with the size of what it
-    is the direction of.
+    The noise of a direction decreases with the size of its vector, so that contacts differ.
     """
     total = 0.0
     for i in range(weights.shape[0]):

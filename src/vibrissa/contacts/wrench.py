@@ -1,14 +1,14 @@
-"""From force and moment at the base to the contact, whatever the friction there.
+"""Contacts with any friction from the force and moment at the base.
 
 A contact has four unknowns, arc length and three components of force, and a wrench has six numbers.
-Two are left over for checking: the force is normal to the moment (M · F = 0), and its line meets
-the whisker. The rod equations integrated from the base outward (:mod:`vibrissa.rod.outward`) tell
-where the moment vanishes, or nearly; from there the contact that explains the measured wrench best
-is found by weighted least squares, integrating from the contact to the base, which does not
-magnify noise at a thin tip as the way out does.
+The two left over are a check: the force is normal to the moment (M · F = 0), and its line meets the
+whisker. The rod equations integrated from the base outward (:mod:`vibrissa.rod.outward`) show where
+the moment vanishes, or nearly does. From there the contact that explains the measured wrench best
+is found by weighted least squares, integrating from the contact to the base; unlike the integration
+outward, this does not magnify noise near a thin tip.
 
-The rod beyond such a place may carry the same force on to another, where the moment vanishes again:
-then only the friction that each requires distinguishes them.
+The rod beyond such a point may carry the same force on to another one where the moment vanishes
+again: then only the friction that each requires distinguishes them.
 """
 
 from __future__ import annotations
@@ -54,31 +54,32 @@ from vibrissa.whisker import Whisker
 
 #: Steps along the whisker: contact points within 1e-8 L up to loads that slip off.
 STEPS = 192
-#: Contacts are looked for from this arc length on, over L.
+#: Smallest arc length of a contact, over L.
 PROXIMAL = 0.05
 _COARSE = 36
 _UNKNOWNS = 4
 _MOST = 4
-# Of contacts that explain a wrench equally well those that need less friction come first: as if
-# friction angles scattered by so much.
+# Standard deviation of friction angles, by which contacts that explain a wrench equally well are
+# ordered: those with less friction come first.
 _LIKELY = np.deg2rad(20.0)
-# A covariance is not relied on where a contact needs more: valleys end in such places.
+# Friction angle above which a covariance is not valid: valleys end in such contacts.
 _STEEP = 2.0 * _LIKELY
-# Where the way out from the base ends nowhere: arc lengths to start from.
+# Arc lengths to start from if the integration outward gives no contact.
 _ELSEWHERE = (0.25, 0.5, 0.75, 0.95)
-# Lever arms beyond so many lengths are none: force and moment are swapped, or in other units.
+# Lever arm, over L, above which force and moment are swapped, or in other units.
 _LONGEST_ARM = 10.0
-# Seeds whose wrench differs by so many standard deviations are not worth a start, if there are
+# Difference of a seed's wrench, in standard deviations, above which it is dropped if there are
 # others.
 _FAR = 100.0
-# Where the coarse rod gives a wrench within so many standard deviations, it follows valleys.
+# Error of the coarse rod's wrench, in standard deviations, below which it is used to follow
+# valleys.
 _EQUAL = 0.05
-_UNKNOWN = 0.5  # a contact that may lie this far away (over L, one standard deviation) is not known
-_SAME = 1e-3  # contacts within this (over L, and ten times that relative to the force) are one
+_UNKNOWN = 0.5  # standard deviation of a contact point, over L, above which it is unknown
+_SAME = 1e-3  # contacts within this (over L, and ten times it relative to the force) are the same
 
 
 class Fitted(NamedTuple):
-    """Rows × candidates, NaN-padded.
+    """Fits by row and candidate, padded with NaN.
 
     Their number (n,), x (n, k, 4), (F, p) (n, k, 6), ∂(F, p)/∂x (n, k, 6, 4) and χ² (n, k).
     """
@@ -90,14 +91,14 @@ class Fitted(NamedTuple):
     misfits: Array
 
     def replaced(self, row: IntArray, place: IntArray, fits: Fits) -> Fitted:
-        """Put better fits in their places."""
+        """Replace fits at these rows and columns by better ones."""
         out = Fitted(self.number, *(a.copy() for a in self[1:]))
         for mine, theirs in zip(out[1:], fits[:4], strict=True):
             mine[row, place] = theirs
         return out
 
     def allowed_first(self, allowed: AnyArray) -> Fitted:
-        """Leave out candidates that are not allowed; the others keep their order."""
+        """Drop candidates that are not allowed; the others keep their order."""
         order = np.argsort(~allowed, axis=1, kind="stable")
         line = np.arange(len(order))[:, None]
         return Fitted(allowed.sum(axis=1), *(a[line, order] for a in self[1:]))
@@ -178,7 +179,7 @@ def estimate_from_wrench(
 def wrench_on(
     whisker: Whisker, force: ArrayLike | xr.DataArray, moment: ArrayLike | xr.DataArray
 ) -> tuple[Array, Array, tuple[str, ...], Coordinates]:
-    """Force and moment with their labels, unless hardly any contact could give both."""
+    """Force and moment with their labels, checked for plausible lever arms."""
     given = {"force": force, "moment": moment}
     plain = (v if isinstance(v, xr.DataArray) else numbers(n, v) for n, v in given.items())
     labelled = labelled_wrench(*plain)
@@ -256,7 +257,7 @@ def _located(
 
 
 def _covariance(sensor: SensorNoise) -> Array:
-    """Of (F, M), in SI units."""
+    """Covariance of (F, M), in SI units."""
     if sensor.wrench is not None:
         return sensor.wrench
     assert sensor.deviations is not None
@@ -274,10 +275,10 @@ def wrench_weights(sensor: SensorNoise, d: Discretization, wrenches: Array) -> A
 def rubbing_misfits(
     whisker: Whisker, force: Array, moment: Array, noise: Array, fitted: bool
 ) -> Array:
-    """Least χ² (n,) of contacts of wrenches, as if friction angles scattered; infinite: none.
+    """Minimum χ² (n,) of contacts with a prior of friction angles; infinite if there is none.
 
-    Contacts are those ``fitted`` to each wrench, or else those where its moment vanishes, which is
-    found out sooner: their χ² is never less.
+    Contacts are those ``fitted`` to each wrench, or else, which is faster, those where its moment
+    vanishes, whose χ² is never smaller.
     """
     d, coarse = discretize(whisker, STEPS), discretize(whisker, _COARSE)
     scale = np.repeat([d.force, d.moment], 3)
@@ -333,7 +334,7 @@ def _solve(
 
 
 def _candidates(solved: Fitted) -> Candidates:
-    """Fits as candidates, without what noise leaves open."""
+    """Fits as candidates, without covariances."""
     out = Candidates.room(len(solved.number), solved.contacts.shape[1])
     return out._replace(
         number=solved.number, x=solved.contacts, values=solved.values, chi_squared=solved.misfits
@@ -358,7 +359,7 @@ def _fit(
 def _misfits(
     d: Discretization, wrenches: Array, weights: Array, row: IntArray, contacts: Array
 ) -> Array:
-    """By how many standard deviations (n,) contacts miss the wrenches of their rows."""
+    """Misfit (n,), in standard deviations, of contacts to the wrenches of their rows."""
     values, _ = solve_forces(d, contacts)
     away = np.einsum("nij,nj->ni", weights[row], wrenches_of(values) - wrenches[row])
     with np.errstate(over="ignore", invalid="ignore"):
@@ -403,7 +404,7 @@ def _judged(
     wrenches: Array,
     weights: Array,
 ) -> tuple[Candidates, AnyArray]:
-    """Candidates by probability with what noise leaves open, and whether the first is not known."""
+    """Candidates by probability with their covariances, and whether the first one is unknown."""
     n, most = found.chi_squared.shape
     row, place = np.nonzero(np.arange(most) < found.number[:, None])
     x, values, tangents = (a[row, place] for a in (found.x, found.values, solved.tangents))
@@ -434,7 +435,7 @@ def _judged(
 
 
 def chosen(rows: int, row: IntArray, fits: Fits, doubt: Array, limit: float, most: int) -> Fitted:
-    """Choose among fits those that explain their measurement and are indistinguishable."""
+    """Choose the fits that explain their measurement and are indistinguishable."""
     misfit = np.where(np.isfinite(fits.values).all(axis=1), fits.misfits, np.inf)
     best = np.full(rows, np.inf)
     np.minimum.at(best, row, misfit)
@@ -463,7 +464,7 @@ def chosen(rows: int, row: IntArray, fits: Fits, doubt: Array, limit: float, mos
 
 
 def _same(a: Array, b: Array) -> bool:
-    """Whether two contacts x (4,) are one."""
+    """Whether two contacts x (4,) are the same."""
     s, *force = (a - b).tolist()
     size = math.hypot(*a[1:].tolist())
     return abs(s) < _SAME and math.hypot(*force) < 10.0 * _SAME * size

@@ -1,4 +1,4 @@
-"""From two videos to a whisker in space: trace, merge, pose, contact, wrench."""
+"""Tracking: from two videos to a whisker's 3D shape, pose, contact and wrench in every frame."""
 
 from vibrissa.tracking.recording import Tracked
 from vibrissa.tracking.refine.fit import (

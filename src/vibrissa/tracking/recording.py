@@ -1,9 +1,10 @@
-"""Tracked whiskers, and the recording that is made of them.
+"""Recordings of tracked whiskers.
 
-Contact points that do not come from the rod are seen by a person, or nearest to a known object.
-They are compared with the contact points of the fitted rod. It does not depend on those of a
-person: where both agree, each is right. It does on a known object, on whose surface its contacts
-are; then the difference shows how well the measured whisker agrees with the object.
+Contact points that do not come from the fitted rod are marked by a person, or are the points of the
+whisker nearest to a known object. They are compared with the contact points of the fitted rod. The
+rod does not depend on the points of a person, so agreement confirms both. It does depend on a known
+object, on whose surface its contacts are; the difference then shows how well the measured whisker
+agrees with the object.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class ContactPoints(NamedTuple):
 def contacts_at(
     objects: Sequence[Surface], curves: Array, touching: NDArray[np.bool_], rod: RodFit
 ) -> ContactPoints:
-    """Take the point of the whisker that is nearest to an object for the contact point."""
+    """Contact points as the points of the whisker that are nearest to an object."""
     points = np.full((len(curves), 3), np.nan)
     rows = np.flatnonzero(touching & np.isfinite(curves).all(axis=(1, 2)))
     if rows.size:
@@ -59,7 +60,7 @@ def given_contacts(
     whisker: int,
     rod: RodFit,
 ) -> ContactPoints:
-    """Take contact points from a table."""
+    """Read contact points from a table."""
     points = np.full((len(pairs), 3), np.nan)
     number = table["whisker"].values
     if not np.isin(whisker, number):
@@ -88,7 +89,7 @@ def given_contacts(
 
 
 def outside_video(table: xr.Dataset, pairs: NDArray[np.int64], rate: float) -> list[str]:
-    """State how many moments of a table of contact points no frame of the videos has."""
+    """Report the number of rows in a table of contact points for which the videos have no frame."""
     timed = "time" in table.dims
     known = table["time"].values * rate if timed else table["frame"].values.astype(float)
     within = _NEAR if timed else 0.0
@@ -107,7 +108,7 @@ def outside_video(table: xr.Dataset, pairs: NDArray[np.int64], rate: float) -> l
 def _rows(
     known: NDArray[np.generic], wanted: NDArray[np.generic], within: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Indices of wanted moments that are known, and of the rows that are nearest to them."""
+    """Indices of the wanted times that are in the table, and of the nearest rows."""
     order = np.argsort(known, kind="stable")
     sorted_ = np.asarray(known, dtype=np.float64)[order]
     target = np.asarray(wanted, dtype=np.float64)
@@ -120,7 +121,7 @@ def _rows(
 
 
 def _lowest(distance: Array) -> Array:
-    """Index (t,) of the least of rows (t, n), between the samples by a parabola."""
+    """Index (t,) of the minimum of rows (t, n), refined by a parabola."""
     n = distance.shape[1]
     row = np.arange(len(distance))
     k = np.clip(np.argmin(distance, axis=1), 1, n - 2)
@@ -203,7 +204,7 @@ def tracked_recording(
     objects: Sequence[Surface] = (),
     cutoff: float | None = CUTOFF,
 ) -> xr.DataTree:
-    """Make a recording of tracked whiskers."""
+    """Assemble a recording of tracked whiskers."""
     errors = max(one.fit.shared.shape[1] for one in found)
     root = xr.concat([_variables(one, errors) for one in found], "whisker").assign_coords(
         coordinates(pairs[:, 0] / rate, [one.whisker.name for one in found])
@@ -233,7 +234,7 @@ def _labelled(values: Mapping[str, Any]) -> dict[str, xr.Variable]:
 
 
 def _variables(one: Tracked, errors: int) -> xr.Dataset:
-    """Variables of one whisker, dim whisker of length 1, with so many shared errors."""
+    """Variables of one whisker, with a whisker dimension of length 1, and so many shared errors."""
     fit, traces = one.fit, one.traces
     shared = np.pad(fit.shared, ((0, 0), (0, errors - fit.shared.shape[1]), (0, 0)))
     angles = angles_of(np.swapaxes(one.head.rotation, 1, 2) @ fit.rotation)
@@ -279,7 +280,7 @@ def _measured(one: Tracked) -> xr.Dataset:
         "centerline": one.curves,
         **_pose(one, one.pose),
         "base_rotation": one.head.rotation @ one.pose.rotation,
-        # What another cut-off is tried on.
+        # For tests with another cut-off.
         **{f"unfiltered_{name}": array for name, array in _pose(one, one.unfiltered).items()},
         "centerline_sigma": np.sqrt(np.einsum("tnii->tni", one.covariance)),
         "deviation": one.shape.deviation,

@@ -1,7 +1,8 @@
-"""What is to be known before tracked whiskers are believed, in a sentence each.
+"""Remarks on tracked whiskers: what to know before results are believed, one sentence each.
 
-What makes results wrong without any sign in them is stated with what to do: views that do not show
-the same, cameras out of step or shaking, ends that are not seen, a whisker that leaves the plane.
+They report what would make results wrong without any other sign, and what to do about it: views
+that do not show the same whisker, cameras that are not synchronous or that shake, ends that are not
+seen, a whisker that leaves the plane.
 """
 
 from __future__ import annotations
@@ -21,19 +22,19 @@ from vibrissa.tracking.trace.start import base_gap
 from vibrissa.tracking.trace.trace import Trace, doubtful_frames
 from vibrissa.whisker import Whisker
 
-# Share by which its seen length varies from which a whisker leaves the plane of one view.
+# Relative variation of the seen length above which a whisker leaves the plane of a single view.
 _SHORTENED = 0.04
-# Misfit that is not usual, and the share of the frames with it that is worth a remark.
+# Misfit that is unusual, and the share of such frames above which there is a remark.
 _STRANGE, _OFTEN = 2.0, 0.05
-# Share of the uncertainty of contact points that comes from the cameras and is worth a remark.
+# Share of the uncertainty of contact points due to the cameras above which there is a remark.
 _MOST = 0.7
-_FUR_KNOWN = 0.25  # standard deviation of a stated length of fur, as a share of it
-_NEAR = 2.0  # distance between bases in several views that is more than usual, pixels
-_FEWEST = 8  # smallest number of frames that show whether a whisker leaves the plane
+_FUR_KNOWN = 0.25  # relative standard deviation of a stated length of fur
+_NEAR = 2.0  # unusual distance between the bases of several views, pixels
+_FEWEST = 8  # smallest number of frames to decide whether a whisker leaves the plane
 
 
 def remarks_on_shaking(cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]]) -> list[str]:
-    """State which cameras shake, and how well that is known."""
+    """Report which cameras shake, and how accurately the shaking is measured."""
     shifts = [np.array([trace.shift for trace in row]) for row in traces]
     found = []
     for camera, shift in zip(cameras, shifts, strict=True):
@@ -53,7 +54,7 @@ def remarks_on_shaking(cameras: Sequence[Camera], traces: Sequence[Sequence[Trac
 
 
 def remarks_on_optics(one: Tracked, optics: Optics, name: str) -> list[str]:
-    """State by how much unknown optics move contact points, where that is most of the error."""
+    """Report displacements of contact points due to unknown optics, if these dominate the error."""
     moved = np.linalg.norm(optics.displacements(one.fit.contact_point), axis=(0, 2))
     spread = np.sqrt(np.trace(one.fit.contact_covariance, axis1=1, axis2=2))
     if not np.isfinite(moved).any() or np.nanmedian(moved / spread) < _MOST:
@@ -68,7 +69,7 @@ def remarks_on_optics(one: Tracked, optics: Optics, name: str) -> list[str]:
 
 
 def unexplained_frames(misfit: Array) -> Mask:
-    """Frames whose traces the rod does not explain, by their misfits; none if they are few."""
+    """Frames whose traces the rod does not explain, by their misfits; empty if they are few."""
     strange = np.nan_to_num(misfit) > _STRANGE
     return np.asarray(strange & (strange.mean() > _OFTEN))
 
@@ -76,7 +77,7 @@ def unexplained_frames(misfit: Array) -> Mask:
 def remarks_on(
     cameras: Sequence[Camera], series: TraceSeries, length: Length, misfit: Array, name: str
 ) -> list[str]:
-    """State what is unusual about a tracked whisker."""
+    """Report what is unusual about a tracked whisker."""
     found = []
     gap = usual_gap(cameras, series)
     if gap > _NEAR:
@@ -115,7 +116,7 @@ def remarks_on(
 def remarks_on_following(
     cameras: Sequence[Camera], rows: Sequence[Sequence[Trace]], name: str
 ) -> list[str]:
-    """Views in which a whisker is often lost, or not seen as in the frame before."""
+    """Report views in which a whisker is often lost, or differs from the frame before."""
     counts = [int(doubtful_frames(row).sum()) for row in rows]
     return [
         f"not sure: in {count} of {len(row)} frames {camera.name} loses {name}, or sees its length "
@@ -132,7 +133,7 @@ def remarks_on_bases(
     used: Sequence[Sequence[Trace]],
     name: str,
 ) -> list[str]:
-    """Views that show a whisker from nearer to its base on than the other view."""
+    """Report views in which a whisker is seen from closer to its base than in the other view."""
     found = []
     for camera, before, after in zip(cameras, shown, used, strict=True):
         cut = [a.length - b.length for a, b in zip(before, after, strict=True) if len(a.line)]
@@ -145,14 +146,14 @@ def remarks_on_bases(
 
 
 def force_scale_sigma(whisker: Whisker, fur: float) -> float:
-    """Common relative error of all forces by what is not known of the fur over the base."""
+    """Common relative error of all forces due to fur of unknown length over the base."""
     at_edge, at_tip = whisker.radius(np.array([0.0, whisker.length]))
-    # Forces scale with the fourth power of the radius, which falls evenly along the whisker.
+    # Forces scale with the fourth power of the radius, which decreases linearly along the whisker.
     return float(4.0 * (1.0 - at_tip / at_edge) / whisker.length * _FUR_KNOWN * fur)
 
 
 def remarks_on_fur(one: Tracked, fur: float, name: str) -> list[str]:
-    """State by how much forces err together by what is not known of the fur over the base."""
+    """Report the common error of all forces due to fur of unknown length over the base."""
     if fur == 0.0:
         return []
     percent = 100.0 * force_scale_sigma(one.whisker, fur)
@@ -165,7 +166,7 @@ def remarks_on_fur(one: Tracked, fur: float, name: str) -> list[str]:
 
 
 def remarks_on_plane(one: Tracked, name: str) -> list[str]:
-    """How far a whisker may leave the plane of the only view, and what that does to contacts."""
+    """Report how far a whisker may leave the plane of the only view, and the effect on contacts."""
     tips = one.traces.ends.all(axis=(1, 2)) & np.isfinite(one.curves).all(axis=(1, 2))
     if tips.sum() < _FEWEST:
         return [f"{name}: too few frames show its tip to see whether it leaves the plane."]
@@ -192,7 +193,7 @@ def remarks_on_plane(one: Tracked, name: str) -> list[str]:
 def remarks_on_time(
     cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]], offset: int | None
 ) -> list[str]:
-    """Whether cameras seem to be out of step."""
+    """Report cameras that do not seem to be synchronous."""
     if offset is None:
         return []
     found = []
@@ -208,7 +209,7 @@ def remarks_on_time(
 
 
 def usual_gap(cameras: Sequence[Camera], series: TraceSeries) -> float:
-    """Usual distance of the base from where the views together see it, pixels."""
+    """Typical distance of the base in each view from where all views together locate it, pixels."""
     rows = (series.ends[:, :, 0] > 0.5).all(axis=1)
     if not rows.any():
         return 0.0

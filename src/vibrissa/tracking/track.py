@@ -1,6 +1,6 @@
-"""From traces in one view or more to a recording: shape, pose, contact and wrench of every frame.
+"""From traces in one or more views to a recording: shape, pose, contact and wrench in every frame.
 
-What is to be known before it is believed is added in sentences (`vibrissa.tracking.remarks`).
+Remarks state what to know before the results are believed (`vibrissa.tracking.remarks`).
 """
 
 from __future__ import annotations
@@ -60,13 +60,14 @@ from vibrissa.whisker import Pose, Whisker, morphology
 Progress = Callable[[str, int, int], None]
 """Function that is called with the name of a stage, and how much of how much is done."""
 
-# Distance from its plane of a known whisker at most for one view, as a share of its length.
+# Largest distance of a known whisker from its plane for one view, as a share of its length.
 _FLAT = 0.02
-_ANY_ROLL = np.radians(10.0)  # standard deviation of the roll if only bent shapes show it, rad
-# Smallest and largest number of frames in contact from which a length is taken.
+# Standard deviation of a roll that is determined by bent shapes only, rad.
+_ANY_ROLL = np.radians(10.0)
+# Smallest and largest number of frames in contact from which a length is estimated.
 _FEWEST, _FRAMES = 8, 24
-_FAR = 10.0  # distance between bases in several views that are not the same base, pixels
-_SHARE = 0.03  # distance between bases that are not the same, as a share of the whisker's length
+_FAR = 10.0  # distance between the bases of several views above which they differ, pixels
+_SHARE = 0.03  # the same as a share of the whisker's length
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ class TrackOptions:
 
     @property
     def at_base(self) -> dict[str, Any]:
-        """Radius and material, and what is hidden of the whisker, as `whisker_at_rest` has them."""
+        """Radius, material and hidden length of the whisker, as arguments of `whisker_at_rest`."""
         return {**self.properties, "hidden": self.fur}
 
 
@@ -212,7 +213,7 @@ def track(
             remarks += remarks_on(cameras, one.traces, one.length, one.fit.misfit, name)
             if len(cameras) == 1:
                 remarks += remarks_on_plane(one, name)
-        except Exception as fault:  # whatever it is, it must not cost the others
+        except Exception as fault:  # no error of one whisker may discard the others
             if count == 1:
                 raise
             reason = " ".join(str(fault).split()) or type(fault).__name__
@@ -233,7 +234,7 @@ def _corrected(
     pairs: NDArray[np.int64],
     distance: float | None,
 ) -> tuple[Optics | None, Sequence[Camera], list[str]]:
-    """Errors of the cameras that a free whisker shows, cameras to use, and remarks."""
+    """Errors of the cameras inferred from a free whisker, corrected cameras, and remarks."""
     rows = [[view[i] for i in pairs[:, v]] for v, view in enumerate(traces)]
     optics = rough_optics(cameras, rows, distance)
     stated = "orthographic cameras" if distance is None else f"lenses at {distance:g} m"
@@ -255,7 +256,7 @@ def _corrected(
 
 
 def _with_optics_unsure(fit: RodFit, optics: Optics) -> RodFit:
-    """Add to the covariances of points what is not known of the cameras."""
+    """Add the uncertainty of the cameras to the covariances of points."""
     moved = [optics.displacements(points) for points in (fit.contact_point, fit.position)]
     contact, base = moved
     shared = np.pad(np.concatenate(moved, axis=2), ((0, 0), (0, 0), (0, 9)))
@@ -270,9 +271,9 @@ def _with_optics_unsure(fit: RodFit, optics: Optics) -> RodFit:
 
 
 def _with_shift_unsure(cameras: Sequence[Camera], fit: RodFit, shift: Array) -> RodFit:
-    """Add to the covariances of points what is not known of how far cameras had shaken."""
+    """Add the uncertainty of the cameras' shaking to the covariances of points."""
     seen = np.ptp(shift[..., :2], axis=0).any(axis=1)
-    # One of which nothing is known may shake as much as one that does.
+    # A camera for which nothing shows it may shake as much as one that shakes.
     size = float(shift[:, seen, :2].std(axis=0).max(initial=0.0))
     variance = np.nan_to_num(shift[..., 2:], nan=size).reshape(len(shift), -1) ** 2
     if not variance.any():
@@ -291,7 +292,7 @@ def _with_shift_unsure(cameras: Sequence[Camera], fit: RodFit, shift: Array) -> 
 
 
 def _best_seen(traces: Sequence[Sequence[Sequence[Trace]]]) -> list[Sequence[Trace]]:
-    """Traces, view by view, of the whisker that is least often lost."""
+    """Traces, by view, of the whisker that is lost least often."""
     seen = [[sum(len(trace.line) > 0 for trace in row) for row in view] for view in traces]
     best = int(np.argmax(np.min(seen, axis=0)))
     return [view[best] for view in traces]
@@ -360,7 +361,7 @@ def track_whisker(
     if any(trace.sparse for view in traces for trace in view):
         smoothness = replace(smoothness, sharpest=max(smoothness.sharpest, 1.0))
     if not shape.free.any():
-        # Nothing but the bent shapes shows how the whisker is rolled.
+        # Only the bent shapes determine the roll.
         smoothness = replace(smoothness, roll=max(smoothness.roll, _ANY_ROLL))
     fitter = Fitter(cameras, series, touching, on_head, rate, smoothness, head, objects)
     length = Length(whisker.length, 0.0)
@@ -389,7 +390,7 @@ def _silent(stage: str, done: int, total: int) -> None:
 def _at_rest(
     curves: Array, options: TrackOptions, name: str, tips: Mask, flat: bool
 ) -> tuple[RestShape, Whisker]:
-    """Take the rest shape from the frames, or as it is known."""
+    """Rest shape from the frames, or of the known whisker."""
     if options.whisker is not None:
         whisker = options.whisker.with_properties(name=name)
         if flat:
@@ -400,7 +401,7 @@ def _at_rest(
 
 
 def _known_flat(curves: Array, whisker: Whisker, free: float) -> tuple[RestShape, Whisker]:
-    """Lay a known whisker into the plane of a single view, on that side on which it fits."""
+    """Place a known whisker in the plane of a single view, on the side that fits."""
     away = float(np.abs(whisker.centerline()[:, 2]).max())
     if away > _FLAT * whisker.length:
         raise ValueError(
@@ -424,7 +425,7 @@ def _poses(
 
 
 def _in_contact(fitter: Fitter) -> Fitter | None:
-    """The same of some of the frames in contact only, if there are enough of them."""
+    """The same fit restricted to some of the frames in contact, if there are enough."""
     rows = np.flatnonzero(fitter.touching)
     if len(rows) < _FEWEST:
         return None
@@ -437,7 +438,7 @@ def _in_contact(fitter: Fitter) -> Fitter | None:
 def tapered_as_it_bends(
     fitter: Fitter, whisker: Whisker, length: Length, pose: BasePose
 ) -> tuple[Whisker, Length]:
-    """The whisker with the taper that bending shows, and how well its length is known for that."""
+    """Whisker with the taper inferred from its bending, and the uncertainty of its length."""
     some = _in_contact(fitter)
     if some is None:
         return whisker, length
@@ -462,7 +463,7 @@ def tapered_as_it_bends(
 
 
 def _length(fitter: Fitter, shape: RestShape, options: TrackOptions) -> Length:
-    """Length of a whisker whose tip is not seen, from some of the frames in contact."""
+    """Length of a whisker with an unseen tip, from some of the frames in contact."""
     some = _in_contact(fitter)
     if some is None:
         return Length(shape.length, np.nan)
@@ -477,7 +478,7 @@ def _length(fitter: Fitter, shape: RestShape, options: TrackOptions) -> Length:
 
 
 def _check_views(cameras: Sequence[Camera], series: TraceSeries, name: str) -> None:
-    """Make sure that views show one whisker."""
+    """Check that the views show one and the same whisker."""
     gap = usual_gap(cameras, series)
     lengths = np.linalg.norm(np.diff(series.line, axis=2), axis=3).sum(axis=2)
     allowed = max(_FAR, _SHARE * float(np.nanmax(lengths, initial=0.0)))

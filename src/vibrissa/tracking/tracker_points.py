@@ -1,8 +1,8 @@
-"""From the points of other trackers to traces and views, so that they are tracked like videos.
+"""Points of other trackers as traces in views, so that they are processed like videos.
 
-Trackers give a few points along a whisker in one or more views, or points in space. Points in views
-are traces already; points in space are projected into two orthogonal cameras, perpendicular to the
-usual direction of the whisker, so that no whisker points towards one.
+Trackers give a few points along a whisker, in one or more views or in space. Points in views serve
+as traces. Points in space are projected into two orthogonal cameras, perpendicular to the typical
+direction of the whisker, so that no whisker points towards a camera.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from vibrissa.numerics import Array
 from vibrissa.tracking.refine.rods import NODES
 from vibrissa.tracking.trace.trace import STEP, Trace, given
 
-POINT_SIGMA = 0.5  # usual standard deviation of a tracked point across the whisker, pixels
-_SHOWN = 12  # number of whiskers that are listed
-_FEWEST = 3  # smallest number of points that make a trace
-_CONFIDENT = 0.6  # confidence below which a tracker's point is left out
+POINT_SIGMA = 0.5  # typical standard deviation of a tracked point across the whisker, pixels
+_SHOWN = 12  # largest number of whiskers listed in a message
+_FEWEST = 3  # smallest number of points of a trace
+_CONFIDENT = 0.6  # confidence below which a tracker's point is dropped
 _SPACING = 8.0  # distance of points along a trace below which they are averaged, pixels
-_USUAL = 0.5  # share of the frames in which a whisker is seen, from which it is worth tracking
-_SHARE = 1e-3  # usual standard deviation of a point in space, as a share of the whisker's length
-_WIDE = 1000.0  # width of the image of a camera that is added, pixels
+_USUAL = 0.5  # share of the frames with a whisker above which it is tracked
+_SHARE = 1e-3  # typical standard deviation of a point in space, as a share of the whisker's length
+_WIDE = 1000.0  # width of the image of an added camera, pixels
 _MARGIN = 20.0  # distance of the points from the border of such an image, pixels
-_BASES = ("base", "root", "follicle")  # words in the name of the point at a whisker's base
-_ARC_POINTS = 12  # number of points on an arc that stands for a measured curvature
+_BASES = ("base", "root", "follicle")  # words that name the point at a whisker's base
+_ARC_POINTS = 12  # number of points on an arc that represents a measured curvature
 
 
 @dataclass(frozen=True)
 class TrackerTraces:
     """Points of other trackers as traces in cameras."""
 
-    cameras: tuple[Camera, ...]  # of the views; of points in space two that show them
-    traces: list[list[list[Trace]]]  # by view, whisker and frame, as `track` takes them
+    cameras: tuple[Camera, ...]  # cameras of the views, or two added ones for points in space
+    traces: list[list[list[Trace]]]  # by view, whisker and frame, as for `track`
     names: list[str]
     notes: tuple[str, ...]  # assumptions, a sentence each
 
@@ -52,7 +52,7 @@ def tracker_traces(
     names: Sequence[str] | None = None,
     sigma: float | None = None,
 ) -> TrackerTraces:
-    """Make traces of the points of other trackers."""
+    """Convert the points of other trackers to traces."""
     notes: list[str] = []
     tracks = _arcs(_from_base(_apart(tracks, notes), notes), notes)
     if "centerline" in tracks:
@@ -78,14 +78,14 @@ def tracker_traces(
 
 
 def _node_names(tracks: xr.Dataset) -> list[str]:
-    """Names of the points along a whisker; none where they are numbered."""
+    """Names of the points along a whisker; None if they are numbered."""
     if "node" not in tracks.coords or tracks["node"].dtype.kind not in "UO":
         return []
     return [str(name) for name in tracks["node"].values]
 
 
 def _apart(tracks: xr.Dataset, notes: list[str]) -> xr.Dataset:
-    """Separate whiskers of which points of one animal are named, such as C1_base … C2_tip."""
+    """Separate whiskers that are named as points of one animal, such as C1_base … C2_tip."""
     names = _node_names(tracks)
     if tracks.sizes.get("whisker") != 1 or not names:
         return tracks
@@ -108,7 +108,7 @@ def _apart(tracks: xr.Dataset, notes: list[str]) -> xr.Dataset:
 
 
 def _groups(pairs: list[list[str]]) -> dict[str, tuple[list[int], list[str]]] | None:
-    """Rows and names of the points of each whisker, if all have the same ones side by side."""
+    """Rows and names of the points of each whisker, if all have the same ones in sequence."""
     if any(len(pair) != 2 for pair in pairs):
         return None
     found: dict[str, tuple[list[int], list[str]]] = {}
@@ -124,7 +124,7 @@ def _groups(pairs: list[list[str]]) -> dict[str, tuple[list[int], list[str]]] | 
 
 
 def _from_base(tracks: xr.Dataset, notes: list[str]) -> xr.Dataset:
-    """Turn points round that run from tip to base by their names."""
+    """Reverse points that run from tip to base, by their names."""
     names = [name.lower() for name in _node_names(tracks)]
     if not names or "tip" not in names[0] or not any(base in names[-1] for base in _BASES):
         return tracks
@@ -136,7 +136,7 @@ def _from_base(tracks: xr.Dataset, notes: list[str]) -> xr.Dataset:
 
 
 def _confident(tracks: xr.Dataset, name: str, confidence: str) -> Array:
-    """Points (time, whisker[, view], node, axis), NaN where the tracker is not confident."""
+    """Points (time, whisker[, view], node, axis), NaN where the tracker's confidence is low."""
     points = np.array(tracks[name].values, dtype=np.float64)
     if confidence in tracks:
         points[tracks[confidence].values < _CONFIDENT] = np.nan
@@ -144,7 +144,7 @@ def _confident(tracks: xr.Dataset, name: str, confidence: str) -> Array:
 
 
 def _arcs(tracks: xr.Dataset, notes: list[str]) -> xr.Dataset:
-    """Put points on the arc of the measured curvature, where only both ends are there."""
+    """Place points on an arc of the measured curvature, if only both ends are given."""
     if "trace_curvature" not in tracks or tracks.sizes.get("node") != 2:
         return tracks
     ends, curvature = tracks["trace"].values, tracks["trace_curvature"].values[..., None]
@@ -179,7 +179,7 @@ def _views(
     pixel_size: float | None,
     notes: list[str],
 ) -> tuple[Camera, ...]:
-    """Cameras of the views; without calibration one or two orthogonal ones."""
+    """Cameras of the views; without a calibration one or two orthogonal ones."""
     count = points.shape[2]
     if cameras is not None:
         shown = [str(name) for name in tracks["view"].values]
@@ -211,7 +211,7 @@ def _views(
 
 
 def _identified(tracks: xr.Dataset, points: Array, notes: list[str]) -> tuple[Array, list[str]]:
-    """Points of whiskers that are the same in all frames, from base to tip, and their names."""
+    """Points of whiskers with a constant identity, from base to tip, and their names."""
     names = [str(name) for name in tracks["whisker"].values]
     if tracks.attrs.get("identity") != "per frame":
         return points, names
@@ -232,7 +232,7 @@ def _identified(tracks: xr.Dataset, points: Array, notes: list[str]) -> tuple[Ar
             if np.isfinite(cost[row, column]):
                 swap = either and turned[row, column] < same[row, column]
             elif np.isnan(last[row]).any():
-                swap = False  # a whisker that is seen for the first time
+                swap = False  # a whisker seen for the first time
             else:
                 continue
             out[i, row] = _turned(points[i, column]) if swap else points[i, column]
@@ -246,7 +246,7 @@ def _identified(tracks: xr.Dataset, points: Array, notes: list[str]) -> tuple[Ar
 
 
 def _ends(points: Array) -> Array:
-    """First and last known point (time, whisker, 2, axis) of the first view."""
+    """First and last known points (time, whisker, 2, axis) of the first view."""
     first = points[:, :, 0]
     known = np.asarray(np.isfinite(first).all(axis=-1))
     number = known.shape[-1]
@@ -259,7 +259,7 @@ def _ends(points: Array) -> Array:
 
 
 def _turned(points: Array) -> Array:
-    """Points (view, node, axis) from the other end, the missing ones last."""
+    """Points (view, node, axis) in reverse order, the missing ones last."""
     out = np.full_like(points, np.nan)
     for view, one in enumerate(points):
         known = one[np.isfinite(one).all(axis=-1)]
@@ -274,7 +274,7 @@ def _wanted(
     per_frame: bool,
     notes: list[str],
 ) -> list[int]:
-    """Numbers of the whiskers that are tracked."""
+    """Indices of the whiskers to track."""
     if asked is not None:
         if unknown := sorted(set(asked) - set(names)):
             raise ValueError(f"there is no whisker {', '.join(unknown)}; these are {names}")
@@ -305,7 +305,7 @@ def _wanted(
 def _in_two_views(
     space: Array, sigma: float | None, notes: list[str]
 ) -> tuple[Array, tuple[Camera, ...], float]:
-    """Points in space (time, whisker, node, 3) as two cameras show them; sigma in pixels."""
+    """Project points in space (time, whisker, node, 3) into two cameras; sigma in pixels."""
     every = space.reshape(-1, 3)
     every = every[np.isfinite(every).all(axis=1)]
     low, high = every.min(axis=0), every.max(axis=0)
@@ -322,7 +322,7 @@ def _in_two_views(
 
 
 def _looking_across(middle: Array, extent: float, direction: Array) -> tuple[Camera, Camera]:
-    """Two orthogonal cameras whose shared axis is along a direction; the second sees z upward."""
+    """Two orthogonal cameras that share an axis along a direction; the second sees z upward."""
     along = np.array([direction[0], direction[1], 0.0])
     if np.linalg.norm(along) < 0.3 * np.linalg.norm(direction):
         along = direction
@@ -352,7 +352,7 @@ def _looking_across(middle: Array, extent: float, direction: Array) -> tuple[Cam
 
 
 def _trace(points: Array, sigma: float) -> Trace:
-    """The trace through the points (n, 2) of a whisker, from its base; lost without its base."""
+    """Trace through the points (n, 2) of a whisker, from its base; lost without its base."""
     known = np.asarray(np.isfinite(points).all(axis=1))
     if known.sum() < _FEWEST or not known[: max(1, len(points) // 4)].any():
         return Trace.lost()
@@ -362,7 +362,7 @@ def _trace(points: Array, sigma: float) -> Trace:
     if len(kept) < 2 or step.sum() < 2.0 * STEP:
         return Trace.lost()
     trace = given(kept)
-    # Points of the line between those of the tracker are no further measurements.
+    # Interpolated points between those of the tracker are not further measurements.
     scale = max(1.0, NODES / len(kept)) ** 0.5
     return trace._replace(
         sigma=np.full(len(trace.line), sigma * scale),
@@ -373,7 +373,7 @@ def _trace(points: Array, sigma: float) -> Trace:
 
 
 def _thinned(points: Array) -> Array:
-    """Points that are not much nearer to each other than `_SPACING`, by averaging; ends stay."""
+    """Average points that are nearer to each other than `_SPACING`; ends are kept."""
     length = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
     groups = int(length / _SPACING)
     if len(points) < 3 or groups >= len(points) - 2:

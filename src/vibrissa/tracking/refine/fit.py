@@ -1,12 +1,12 @@
-"""The rod that fits the traces: contact and wrench of a whole trial, from the whisker's shape.
+"""Fit of the rod to the traces: contact and wrench over a whole trial, from the whisker's shape.
 
-Per frame the unknowns are where the base is and how it is turned (six numbers) and, in contact,
-the contact's arc length and force (s_c, f_x, f_y, f_z); they give the bent rod exactly. They are
-chosen such that its images in all views are on the traces, by least squares over all frames at
-once: from frame to frame the base moves smoothly, and so does the contact as long as it lasts.
-Friction, the force along the whisker, shows in its shape; it is only kept from being much larger
-than the force across. The contact is found by this even where it is hidden, and so are force and
-moment at the base, with their covariance.
+Per frame the unknowns are position and orientation of the base (six numbers) and, in contact, arc
+length and force of the contact (s_c, f_x, f_y, f_z); they determine the bent rod exactly. Its
+images in all views are fitted to the traces by least squares over all frames at once: the base
+moves smoothly from frame to frame, and so does the contact while it lasts. Friction, the force
+along the whisker, changes its shape; it is only restrained from being much larger than the force
+across. The fit thus finds the contact even where it is hidden, and force and moment at the base,
+with their covariance.
 """
 
 from __future__ import annotations
@@ -38,23 +38,23 @@ from vibrissa.tracking.space.pose import BasePose, HeadPose
 from vibrissa.tracking.trace.trace import correlated
 from vibrissa.whisker import Whisker
 
-# Levenberg's damping at the start, at least, and that at which no step helps.
+# Levenberg's damping: initial, smallest, and that at which the fit ends.
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-8, 1e6
-_SMALL = 1e-4  # share by which the cost must fall for another round
+_SMALL = 1e-4  # relative decrease of the cost for another iteration
 _HELD = 1e8  # weight with which frames without contact keep the contact at rest
 # Unknowns across the plane z = 0: a shift, turns about two axes; the force across it.
 _ACROSS = (slice(2, 5), slice(9, 10))
-# Contact of a frame that has none: no force, half-way along the whisker.
+# Contact of a free frame: no force, half-way along the whisker.
 _REST = np.array([0.5, 0.0, 0.0, 0.0])
 # Standard deviation of the force along the whisker if there is none across, in units of EI/L².
 _RUBBING = 1e-4
-_WAVES = 8  # number of waves along the whisker by which a view's traces may err in all frames alike
+_WAVES = 8  # number of waves along the whisker for common errors of a view's traces
 # Standard deviation of the shift by light from the side at the base, pixels, less where the whisker
 # is thinner, if its profile shows no more; that shift over the profile's third cumulant, in radii,
 # for a flank of 0.65 radii that is lit by half; where on the whisker that is taken; and the largest
 # shift, in radii, which is that by a flank as bright as the background.
 _LIT, _SHIFTED, _NEARER, _MOST_LIT = 0.1, 3.2, 0.25, 0.5
-# Standard deviation of what else shifts the traces of a view, most at the base, pixels.
+# Standard deviation of other shifts of a view's traces, largest at the base, pixels.
 _UNSEEN = 0.02
 _MEDIAN = 1.86  # standard deviation of a median of n normal numbers, over their median size and √n
 _SQUARE = 0.455  # median of the square of a standard normal number
@@ -70,9 +70,9 @@ _PROXIMAL = 0.7  # share of the whisker that determines the roll of its frame
 _ENDS = (3.5, 1.0)
 # Unknowns of a contact without friction: arc length and the force across the whisker.
 _FREE = [0, 2, 3]
-_ROLLED = np.radians(3.0)  # standard deviation of the roll before it is known how it varies, rad
-_WILD = 1e6  # slopes of points of a rod, in units of L, from which it is not in balance
-_HALVED = 6  # number of times at most that forces are halved with which it begins out of balance
+_ROLLED = np.radians(3.0)  # standard deviation of the roll before its variation is known, rad
+_WILD = 1e6  # slopes of points of a rod, in units of L, above which it is not in equilibrium
+_HALVED = 6  # largest number of times that initial forces without equilibrium are halved
 
 
 @dataclass(frozen=True)
@@ -102,12 +102,12 @@ class FitOptions:
 
 @dataclass(frozen=True, eq=False)
 class RodFit:
-    """Pose, contact and wrench of every frame, SI units; NaN where nothing is known.
+    """Pose, contact and wrench of every frame, SI units; NaN where unknown.
 
-    Errors that all frames share, independent of one another, shift the contact point and the base
-    and turn the base by ``shared``, each by one standard deviation. They are part of the
-    covariances. Its last six numbers are changes of force and moment of the same contact, which
-    errors of the whisker's shape make.
+    Errors that all frames share, independent of each other, shift the contact point and the base
+    and turn the base by ``shared``, each for one standard deviation. They are part of the
+    covariances. Its last six values are changes of force and moment, for a fixed contact, due to
+    errors of the whisker's shape.
     """
 
     rotation: Array  # (time, 3, 3), from the whisker's to the laboratory frame
@@ -128,7 +128,7 @@ class RodFit:
 
 @dataclass(frozen=True, eq=False)
 class Fitter:
-    """Tables that are common to rods that are fitted to the same traces."""
+    """Traces, and tables common to all rods fitted to them."""
 
     cameras: Sequence[Camera]
     traces: TraceSeries
@@ -140,16 +140,16 @@ class Fitter:
     objects: Sequence[Surface] = ()
 
     def fit(self, whisker: Whisker, pose: BasePose, nodes: int, unsure: float = 0.0) -> RodFit:
-        """Fit a whisker of an approximate pose, whose length has a standard deviation, m."""
+        """Fit a whisker of approximate pose, whose length has a standard deviation, m."""
         problem, state, linear = self._problem(whisker, pose).trusted()
         found = _answer(problem, state, linear, nodes, unsure)
         return _whole(_in_laboratory(found, problem.head), problem.frames, len(self.curves))
 
     def costs(self, shown: float) -> Callable[[Whisker, BasePose], float]:
-        """Give the function that compares whiskers by how well they explain the traces.
+        """Function that compares whiskers by how well they explain the traces.
 
         Whiskers of all lengths are compared with the same part of the traces, up to the arc length
-        ``shown``, m: a longer one would also have to explain the wandering ends of longer traces.
+        ``shown``, m: a longer one would also have to explain the uncertain ends of longer traces.
         """
         before: tuple[Problem, State] | None = None
         traces = replace(self.traces, ends=self.traces.ends * [1.0, 0.0])
@@ -161,8 +161,8 @@ class Fitter:
             problem = replace(self, traces=traces)._problem(whisker, pose, begun)
             problem = replace(problem, shown=share)
             if before is None:
-                # The first decides how far the traces are to be trusted, but not where: a wrong
-                # length leaves most where it shows.
+                # The first whisker sets the variance of the traces, but not where it is large: the
+                # residuals of a wrong length are largest where it matters.
                 problem, state, linear = problem.trusted(even=True)
             else:
                 trusted = before[0]
@@ -174,7 +174,7 @@ class Fitter:
         return cost
 
     def _problem(self, whisker: Whisker, pose: BasePose, begun: State | None = None) -> Problem:
-        """Equations of the frames that show something, and where they begin to be solved."""
+        """Equations of the frames with traces, and the first guess of the solution."""
         d = discretize(whisker)
         known = np.isfinite(pose.rotation).all(axis=(1, 2))
         frames = np.flatnonzero(known & np.isfinite(self.curves).all(axis=(1, 2)))
@@ -202,7 +202,7 @@ class Fitter:
 
 
 class _Linear(NamedTuple):
-    """Normal equations at a state, and what they were made of."""
+    """Normal equations at a state, and their ingredients."""
 
     smoother: Smoother
     cost: float
@@ -226,7 +226,7 @@ class _Linear(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """The equations of a fit: traces, motion over time, and the state from which it starts."""
+    """Equations of a fit: traces, motion over time, and the initial state."""
 
     whisker: Whisker
     d: Discretization
@@ -244,7 +244,7 @@ class Problem:
     shown: float = 1.0
 
     def trusted(self, even: bool = False) -> tuple[Problem, State, _Linear]:
-        """The problem with traces that are trusted as far as they deserve, and its solution."""
+        """The problem with traces weighted by their residuals, and its solution."""
         loose = replace(self.options, roll=max(self.options.roll, _ROLLED))
         state, fit = replace(self, options=loose).solved()
         covariance = fit.smoother.covariances()
@@ -255,10 +255,10 @@ class Problem:
         return (problem, *problem.solved())
 
     def _unexpected(self, state: State, covariance: Array, loose: float) -> float:
-        """Standard deviation of the roll in contact from what free frames let expect, rad.
+        """Standard deviation of the roll in contact from that expected by free frames, rad.
 
-        Contact takes a whisker to where no free frame shows how it is rolled. Bent rods whose
-        roll was hardly held show it, each as well as stated.
+        Contact moves a whisker to where no free frame shows its roll. Bent rods with a nearly free
+        roll show it, each with its own uncertainty.
         """
         axis = state.rotation[:, :, 0]
         known = np.einsum("ti,tij,tj->t", axis, covariance[:, 3:6, 3:6], axis) / loose**2
@@ -271,18 +271,18 @@ class Problem:
         return min(float(np.sqrt(max(square, self.options.roll**2))), loose)
 
     def _turned(self, state: State) -> Array:
-        """How the base turned since the start (time, 3), rad, in the head's axes."""
+        """Rotation of the base since the start (time, 3), rad, in the head's axes."""
         turn = state.rotation @ np.swapaxes(self.start.rotation, 1, 2)
         return np.asarray(transform.Rotation.from_matrix(turn).as_rotvec())
 
     def solved(self) -> tuple[State, _Linear]:
-        """Gauss–Newton with Levenberg's damping."""
+        """Gauss-Newton iteration with Levenberg's damping."""
         state, damping = self.begun or self.start, _DAMPING
         fit = self.linear(state)
         for _ in range(_HALVED):
             if not fit.wild.any():
                 break
-            # What another rod withstands this one may not.
+            # A force that another rod withstands may exceed the limit of this one.
             factor = np.where(fit.wild[:, None], [1.0, 0.5, 0.5, 0.5], 1.0)
             state = replace(state, contact=state.contact * factor)
             fit = self.linear(state)
@@ -291,7 +291,7 @@ class Problem:
             trial = state.moved(step)
             tried = self.linear(trial)
             if tried.wild.any():
-                # A contact near the thin tip soon has a force under which no rod is in balance.
+                # A contact near the thin tip easily gets a force without an equilibrium.
                 contact = np.where(tried.wild[:, None], state.contact, trial.contact)
                 trial = replace(trial, contact=contact)
                 tried = self.linear(trial)
@@ -308,7 +308,7 @@ class Problem:
         return state, fit
 
     def linear(self, state: State) -> _Linear:
-        """Linearise at a state; rods that are not in balance count as infinitely far away."""
+        """Linearise at a state; rods without equilibrium count as infinitely far away."""
         points, slopes = bent(self.d, state, self.touching, self.shown)
         wild = ~(np.abs(slopes).max(axis=(1, 2, 3)) < _WILD)
         points[wild], slopes[wild] = state.position[wild, None], 0.0
@@ -343,7 +343,7 @@ class Problem:
         return _Linear(smoother, cost, misfit, wild, hessian, along, ends, designs, weights)
 
     def _touched(self, smoother: Smoother, state: State) -> float:
-        """Pull contacts to the surfaces of known objects; what that costs."""
+        """Pull contacts to the surfaces of known objects; return the cost."""
         cost = 0.0
         if not self.objects:
             return cost
@@ -353,7 +353,7 @@ class Problem:
         for i in np.flatnonzero(self.touching):
             found = [thing.local_geometry(points[i]) for thing in self.objects]
             distance, normal, _ = min(found, key=lambda one: abs(one[0]))
-            # What is far from all objects touches something else.
+            # A contact far from all objects touches something else.
             gap = (distance - radius[i]) / self.options.surface
             weight = 1.0 / np.sqrt(max(abs(gap) / FAR, 1.0))
             row = (
@@ -410,13 +410,13 @@ def _turning(rotation: Array) -> Array:
 
 
 def _shared(problem: Problem, fit: _Linear) -> Array:
-    """Changes (error, time, unknown) by errors of traces that all frames share, one sigma each.
+    """Changes (error, time, unknown) due to errors of traces that all frames share, one sigma each.
 
-    Light from the side, a halo of compression or fur over the base shift a trace in the same way in
-    many frames, so that neither many points nor many frames make it smaller: waves along the
-    whisker, a bend at its base, and shifts of its ends along it. What of them the fit does not
-    follow stays in the means of the residuals over frames with and without contact. The edge of an
-    object draws a trace aside next to the contact, by as much again as the residuals there.
+    Light from the side, a halo of compression or fur over the base shift a trace equally in many
+    frames, so neither many points nor many frames average it out: waves along the whisker, a bend
+    at its base, and shifts of its ends along it. The part that the fit does not follow remains in
+    the means of the residuals over frames with and without contact. The edge of an object displaces
+    a trace next to the contact, by as much again as the residuals there.
     """
     pulls = []
     parts = [fit.left(rows) for rows in (problem.touching, ~problem.touching)]
@@ -430,8 +430,8 @@ def _shared(problem: Problem, fit: _Linear) -> Array:
         n = design.shape[1] - 2
         s = np.linspace(0.0, 1.0, n)
         beyond = s > 2.0 * _AT_BASE
-        # What neighbours have in common is as strong in all long waves; what an edge next to the
-        # contact leaves is there only, and no part of them.
+        # Errors common to neighbouring points are as strong in all long waves; the effect of an
+        # edge next to the contact is local, and not part of them.
         square = sum(float(np.median(part[view][beyond] ** 2)) for part in parts) / _SQUARE
         sigma = np.sqrt(2.0 * together / n * square)
         waves = [sigma * np.cos(k * np.pi * s) for k in range(_WAVES)]
@@ -449,10 +449,10 @@ def _shared(problem: Problem, fit: _Linear) -> Array:
 
 
 def _lit(problem: Problem, view: int) -> float:
-    """Root mean square of the shift of a view's traces at the base by light from the side, pixels.
+    """Root mean square shift of a view's traces at the base due to light from the side, pixels.
 
-    Such light makes the profile of a whisker skew. What that shows, and how well, is combined with
-    what is usual.
+    Such light makes the profile of a whisker skew. The measured skewness, with its uncertainty, is
+    combined with a prior.
     """
     skew = problem.traces.skew[:, view]
     skew = skew[np.isfinite(skew)]
@@ -476,7 +476,7 @@ def _scales(problem: Problem) -> list[float]:
 
 
 def _drawn(fit: _Linear) -> list[float]:
-    """Largest of the residuals of each view that all frames share at the base, pixels."""
+    """Largest residual of each view at the base that all frames share, pixels."""
     return [
         float(np.abs(left[: round(2.0 * _AT_BASE * len(left))]).max())
         for left in fit.left(np.ones(len(fit.misfit), dtype=bool))
@@ -484,11 +484,11 @@ def _drawn(fit: _Linear) -> list[float]:
 
 
 def _frame_errors(problem: Problem, fit: _Linear) -> Array:
-    """Shifts and turns (2, 2, 3) of the whisker's frame, in its axes, by its shape at the base.
+    """Shifts and turns (2, 2, 3) of the whisker's frame, in its axes, due to its shape at the base.
 
-    The shape follows the traces there, and the rod the shape: what is wrong with the base, with the
-    tangent at it, which is the x axis, and with the plane of the proximal part, which the roll
-    follows from it, leaves a part of itself as residuals.
+    The shape follows the traces there, and the rod the shape: errors of the base, of its tangent
+    (the x axis), and of the plane of the proximal part (from which the roll follows) leave only a
+    part of themselves as residuals.
     """
     whisker = problem.whisker
     scales = np.array(_scales(problem))
@@ -513,9 +513,10 @@ def _contacts(problem: Problem, state: State) -> tuple[Array, Array]:
 def _by_length(
     problem: Problem, state: State, unsure: float, by_contact: Array, slope: Array
 ) -> tuple[Array, Array]:
-    """Shared changes (t, 15) if the whisker is longer by a standard deviation, and of the wrench.
+    """Shared changes (t, 15) for a whisker longer by one standard deviation, and of the wrench.
 
-    It is then thicker, as it tapers over more: all that a longer tip does to a contact before it.
+    It is then thicker, as it tapers over a longer distance: this is the whole effect of a longer
+    tip on a contact proximal to it.
     """
     whisker, length = problem.whisker, problem.whisker.length
     share = length / (length + unsure)
@@ -531,7 +532,7 @@ def _by_length(
     contact = np.einsum("tij,tj->ti", after.rotation, moved) + shift
     contact -= np.einsum("tij,tj->ti", state.rotation, point)
     moved_by, alike = _contacts(other, state)
-    # Back to the same contact point, without friction of its own.
+    # Back to the same contact point, without additional friction.
     back = by_contact[..., _FREE] @ np.linalg.pinv(slope[:, 3:, _FREE] * length)
     same = alike - wrench - np.einsum("tij,tj->ti", back, moved_by - point)
     return np.concatenate([contact, shift, turn, same], axis=1), changed - wrench
@@ -556,7 +557,7 @@ def _answer(problem: Problem, state: State, fit: _Linear, nodes: int, unsure: fl
     moved = np.einsum("tij,ktj->tki", slopes, shared) * d.length
     moved = np.concatenate([moved, shared.swapaxes(0, 1)[..., :6] * size], axis=2)
     moved = np.pad(moved, ((0, 0), (0, 0), (0, 6)))
-    # An error of the whisker's frame turns force and moment in it the other way.
+    # An error of the whisker's frame turns force and moment in it in the opposite sense.
     errors = _frame_errors(problem, fit)
     framed = np.einsum("tij,kpj->tkpi", state.rotation, errors).reshape(-1, 2, 6)
     framed = np.pad(framed, ((0, 0), (0, 0), (3, 6)))
@@ -615,7 +616,7 @@ def _in_laboratory(found: RodFit, head: HeadPose) -> RodFit:
 
 
 def _whole(found: RodFit, frames: NDArray[np.intp], count: int) -> RodFit:
-    """Put the frames among all; NaN in the others."""
+    """Results for all frames; NaN in those that were not fitted."""
     whole = {}
     for name in (each.name for each in fields(found)):
         values = getattr(found, name)

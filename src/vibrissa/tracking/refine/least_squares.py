@@ -1,19 +1,19 @@
-"""Least squares over time, and how far traces are to be trusted.
+"""Least squares over time, and variances of traces from residuals.
 
-Each frame has its unknowns, and second differences tie frames together. The normal equations are
-block banded, two blocks wide on each side; they are solved by a banded Cholesky factorisation, and
-the covariance of each frame comes from a forward and a backward recursion over pairs of frames.
+Each frame has its own unknowns, and second differences couple frames. The normal equations are
+block banded, with two blocks on each side; they are solved by a banded Cholesky factorisation, and
+the covariance of each frame follows from a forward and a backward recursion over pairs of frames.
 
-The standard deviations of a trace come from the noise of its image. What compression, blur or a
-pattern of the background add is not in them, and the residuals are correlated from point to point,
-for traces are smooth. So the variance of traces, in units of what they claim, is taken from the
-residuals m of the fit,
+The standard deviations of a trace come from the noise of its image. They do not contain the effects
+of compression, blur or a pattern of the background, and the residuals are correlated from point to
+point, since traces are smooth. So the variance of traces, relative to the stated one, is computed
+from the residuals m of the fit,
 
     v = τ Σ m² / (N − τ p),    τ = 1 + 2 Σ ρ_k,
 
-with N residuals and p numbers that were fitted to them; τ, the sum of their correlations over the
-points of the rod, is the number of neighbours that count as one. A frame that fits worse than is
-usual is trusted less, and so is a part of the whisker.
+with N residuals and p fitted parameters; τ, the sum of their correlations over the points of the
+rod, is the number of neighbours that count as one. A frame that fits worse than usual is trusted
+less, and so is such a part of the whisker.
 """
 
 from __future__ import annotations
@@ -37,32 +37,32 @@ class Smoother:
 
     def __init__(self, hessian: Array, gradient: Array) -> None:
         self.diagonal = hessian.copy()
-        self.first = np.zeros_like(hessian)  # frame i with i + 1; all ties are diagonal
+        self.first = np.zeros_like(hessian)  # frame i with i + 1; all couplings are diagonal
         self.second = np.zeros_like(hessian)
         self.gradient = gradient.copy()
 
     def add_at(self, values: Array, weight: Array, begin: int, target: Array) -> float:
-        """Pull unknowns, from number ``begin`` on, to a target; what that costs."""
+        """Pull unknowns, from index ``begin`` on, to a target; return the cost."""
         places = np.arange(begin, begin + values.shape[1])
         self.diagonal[:, places, places] += weight
         self.gradient[:, places] += weight * (target - values)
         return float((weight * (values - target) ** 2).sum())
 
     def add_row(self, i: int, row: Array, value: float) -> float:
-        """Pull a combination of a frame's unknowns to zero; what that costs."""
+        """Pull a combination of a frame's unknowns to zero; return the cost."""
         self.diagonal[i] += np.outer(row, row)
         self.gradient[i] -= row * value
         return value**2
 
     def add_along(self, axis: Array, value: Array, begin: int, weight: float) -> float:
-        """Pull one direction of three unknowns to zero; what that costs."""
+        """Pull one direction of three unknowns to zero; return the cost."""
         part = slice(begin, begin + 3)
         self.diagonal[:, part, part] += weight**2 * axis[:, :, None] * axis[:, None, :]
         self.gradient[:, part] -= weight**2 * axis * value[:, None]
         return float(((weight * value) ** 2).sum())
 
     def add_second(self, i: int, value: Array, weight: Array) -> float:
-        """Pull the second difference at a frame to zero; what that costs."""
+        """Pull the second difference at a frame to zero; return the cost."""
         square = weight**2
         n = np.arange(len(square))
         pull = square * value
@@ -78,7 +78,7 @@ class Smoother:
         return np.asarray(self.responses(self.gradient[None], damping)[0])
 
     def responses(self, pulls: Array, damping: float = 0.0) -> Array:
-        """Solve for the steps (pull, time, unknown) to which pulls on the unknowns lead."""
+        """Steps (pull, time, unknown) in response to pulls on the unknowns."""
         count, n, _ = self.diagonal.shape
         band = np.zeros((3 * n, count * n))
         rows, columns = np.indices((n, n))
@@ -129,12 +129,12 @@ class Smoother:
 def trace_variance(
     misses: Sequence[Array], fitted: Array, least: float, even: bool = False
 ) -> list[Array]:
-    """Variances (time, point) of each view's traces, in units of what they claim.
+    """Variances (time, point) of each view's traces, relative to the stated ones.
 
     ``misses`` are the residuals (time, point) of each view and ``fitted`` is the number of those
-    that each frame's unknowns follow; no variance is below ``least``. The variance changes along
-    the whisker, as a tip is seen worse than is claimed, unless it is to be ``even``. Two points
-    more are the ends.
+    that each frame's unknowns follow; no variance is below ``least``. The variance varies along the
+    whisker, since a tip is often less accurate than stated, unless it is to be ``even``. Two
+    further points are the ends.
     """
     known = [one != 0.0 for one in misses]
     square = np.sum([(one**2).sum(axis=1) for one in misses], axis=0)
@@ -142,7 +142,7 @@ def trace_variance(
     shown = count > 0
     if not square[shown].any():
         return [np.ones((len(one), one.shape[1] + 2)) for one in misses]
-    # Most frames are right, so that the median of them is.
+    # Most frames are right, and so is their median.
     usual = float(np.median(square[shown] / count[shown]))
     each = np.maximum(square / np.maximum(count, 1), usual)
     along = [np.ones(one.shape[1]) for one in misses]

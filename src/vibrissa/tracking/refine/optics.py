@@ -1,15 +1,15 @@
-"""Lenses of cameras that are known only roughly, from what two views disagree about.
+"""Optics of cameras that are known only roughly, from the disagreement of two views.
 
-A free whisker is a rigid body. Its shape S, its pose in every frame and the optics q are chosen
-together such that its images are on the traces of all views, by least squares,
+A free whisker is a rigid body. Its shape S, its pose in every frame and the optics q are fitted
+together so that its images are on the traces of all views, by least squares,
 
     | across the trace: trace − π_q(R_t S + p_t) |² / σ²  +  | (q − q₀) / s |²,
 
-where q holds, of each view, how strong its perspective is (the inverse of its distance, 0 for an
-orthographic one) and, of each but the first, how it is turned, how its scale differs and how far it
-is shifted along its columns. Poses are eliminated frame by frame (Schur), so that what is solved
-has the size of shape and optics together. What the whisker's motion does not show stays as it was
-stated, with the uncertainty s.
+where q contains, for each view, the strength of its perspective (the inverse of its distance, 0 for
+an orthographic one) and, for each but the first, its rotation, its relative scale and its shift
+along its columns. Poses are eliminated frame by frame (Schur complement), so that the system solved
+has the size of shape and optics together. Parameters that the whisker's motion does not determine
+remain as stated, with the uncertainty s.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _STRENGTH = 2.0
 _DISTANCE = 0.1  # standard deviation of a stated distance, as a share of it
 # Inverse of the largest distance that is not infinite, and of the smallest one, 1/m.
 _FLAT, _STRONGEST = 1e-6, 20.0
-_BEHIND = np.diag([-1.0, 1.0, -1.0])  # axes of a camera on the other side
+_BEHIND = np.diag([-1.0, 1.0, -1.0])  # axes of a camera on the opposite side
 # Standard deviations of a turn of a view, rad, of its scale, and of its shift, pixels.
 _TURN, _SCALE, _SHIFT = np.radians(3.0), 0.03, 10.0
 # Number of points of the shape, and the share of the usual length that they cover.
@@ -43,11 +43,11 @@ _SAMPLE = 150  # largest number of frames from which the free ones are selected
 # Deviation from the rest shape up to which a frame may be free, as a share of the whisker's length:
 # wrong optics make free frames differ too, and what is bent is left out later.
 _ALIKE = 0.04
-# Misfit of stated cameras that is visible, pixels; share of it that others must leave at most; and
+# Visible misfit of the stated cameras, pixels; largest share of it that other optics may leave; and
 # standard deviations by which these must differ from the stated ones.
 _VISIBLE, _BETTER, _CERTAIN = 0.05, 0.6, 3.0
 _EXPLAINED = (
-    0.1  # distance of a rigid whisker from the traces that leaves nothing to explain, pixels
+    0.1  # distance of a rigid whisker from the traces below which nothing needs explaining, pixels
 )
 _ROUNDS, _DAMPING = 12, 1e-3  # number of Gauss–Newton steps, and Levenberg's damping
 # Standard deviations of third differences of the shape, and of motions of its points along it, as a
@@ -67,10 +67,10 @@ _FAR = 6.0  # misses from which `TraceSeries.equations` weighs down, standard de
 
 @dataclass(frozen=True, eq=False)
 class Optics:
-    """Errors of the cameras that the motion of a free whisker shows.
+    """Errors of the cameras inferred from the motion of a free whisker.
 
-    Values are the inverse distance of each view, 1/m, and then of each view but the first its turn
-    about the camera's axes, rad, its relative scale and its shift, pixels.
+    Values are the inverse distance of each view, 1/m, and then for each view but the first its
+    rotation about the camera's axes, rad, its relative scale and its shift, pixels.
     """
 
     cameras: tuple[Camera, ...]  # that explain the views
@@ -89,13 +89,13 @@ class Optics:
 
     @property
     def needed(self) -> bool:
-        """Whether the stated cameras cannot explain what these explain."""
+        """Whether only these optics, and not the stated ones, explain the views."""
         apart = np.abs(self.values - self.stated) / self.sigma
         explains = self.after < _BETTER * self.before
         return bool(self.before > _VISIBLE and explains and apart.max() > _CERTAIN)
 
     def as_stated(self) -> Optics:
-        """The stated cameras, uncertain by what was found and by how far they are from that."""
+        """The stated cameras, with their uncertainty and their difference from these optics."""
         apart = self.values - self.stated
         return replace(
             self,
@@ -142,7 +142,7 @@ class Optics:
 def rough_optics(
     cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]], distance: float | None = None
 ) -> Optics | None:
-    """Find the optics of orthographic cameras from traces of frames that belong together.
+    """Find the optics of orthographic cameras from traces of simultaneous frames.
 
     The approximate distance of the lenses is in m; None if too few frames show a free whisker.
     """
@@ -165,10 +165,10 @@ def stated_lenses(cameras: Sequence[Camera], distance: float | None) -> tuple[Ca
 
 
 def lens(camera: Camera, strength: float, turn: Array, scale: float, shift: float) -> Camera:
-    """Give an orthographic view a lens at 1/strength from the origin; turn, scale, shift it.
+    """Give an orthographic view a lens at 1/strength from the origin; rotate, scale, shift it.
 
     An orthographic image does not show from which of two sides it is seen. A lens of negative
-    strength is on the other side than the camera is.
+    strength is on the opposite side of the camera.
     """
     focal = camera.matrix.copy()
     focal[:2, :2] *= 1.0 + scale
@@ -176,7 +176,7 @@ def lens(camera: Camera, strength: float, turn: Array, scale: float, shift: floa
     rotation = transform.Rotation.from_rotvec(turn).as_matrix() @ camera.rotation
     translation = camera.translation
     if strength < 0.0:
-        # From behind the same image is seen in a mirror.
+        # From behind, the same image is mirrored.
         rotation, translation = _BEHIND @ rotation, _BEHIND @ translation
         focal[:, 0] *= -1.0
     if abs(strength) < _FLAT:
@@ -221,7 +221,7 @@ def estimated_optics(
             continue
         rows = rows[np.linspace(0, len(rows) - 1, min(_FRAMES, len(rows))).astype(int)]
         fits.append(_fitted(_Problem.of(cameras, traces.rows(rows), curves[rows], distance)))
-        # Wrong optics may make free frames differ: then what is like them is tried, too.
+        # Wrong optics may make free frames differ: then frames similar to them are tried too.
         if fits[-1].mean_miss < _EXPLAINED:
             break
     if not fits:
@@ -243,7 +243,7 @@ def estimated_optics(
 
 
 def _fitted(problem: _Problem) -> _Problem:
-    """The solution of a problem without the frames that are bent."""
+    """Solution of a problem without the bent frames."""
     fitted = problem.solved()
     for _ in range(_SELECTIONS):
         each = fitted.misses()
@@ -254,12 +254,12 @@ def _fitted(problem: _Problem) -> _Problem:
 
 
 def _mirrored(camera: Camera) -> bool:
-    """Whether an image is exchanged left and right, or seen from the other side than is stated."""
+    """Whether an image is mirrored, or seen from the opposite side."""
     return bool(np.linalg.det(camera.matrix[:2, :2]) < 0.0)
 
 
 def _strength(camera: Camera, distance: float | None) -> tuple[float, float]:
-    """Mean and standard deviation of the inverse of a lens's distance, as it is stated."""
+    """Mean and standard deviation of the inverse of a lens's stated distance."""
     if distance is None:
         return 0.0, _STRENGTH
     if _mirrored(camera):
@@ -316,17 +316,17 @@ class _Problem:
         return np.asarray(np.linalg.inv(self.normal()[0])[-len(self.q) :, -len(self.q) :])
 
     def sharper(self) -> _Problem:
-        """The problem with traces that are known as well as they are explained."""
+        """The problem with traces weighted by their residuals."""
         unit = float(np.clip(_COMMON * self.mean_miss, _SHARPEST, _UNIT))
         sigma = np.where(np.isfinite(self.traces.sigma), unit, np.nan)
         return replace(self, traces=replace(self.traces, sigma=sigma), unit=unit)
 
     def on_one_side(self, distance: float) -> _Problem:
-        """The solution with mirrored views seen from that side that explains them, if one does."""
+        """Solution with mirrored views seen from the side that explains them, if one does."""
         mean, size = (values.copy() for values in self.prior)
         values, variance = mean + self.q * size, np.diag(self.covariance) * size**2
         for view, camera in enumerate(self.stated):
-            # Difference of log-likelihoods of both sides.
+            # Difference of the log-likelihoods of both sides.
             apart = 2.0 * values[view] / (distance * variance[view])
             if _mirrored(camera) and abs(apart) > _DECIDED:
                 mean[view] = np.sign(apart) / distance
@@ -336,7 +336,7 @@ class _Problem:
         return replace(self, prior=(mean, size), q=(values - mean) / size).solved()
 
     def rows(self, used: NDArray[np.bool_]) -> _Problem:
-        """Some of the frames."""
+        """The problem restricted to some frames."""
         return replace(
             self,
             traces=self.traces.rows(np.flatnonzero(used)),
@@ -369,7 +369,7 @@ class _Problem:
         return float(np.sqrt(np.mean(self.misses() ** 2)))
 
     def normal(self) -> tuple[Array, Array, Array, Array, Array, float]:
-        """Normal equations of shape and optics without the poses, and what gives the poses."""
+        """Normal equations of shape and optics without the poses, and data to recover these."""
         t, n, k = len(self.position), len(self.points), len(self.q)
         placed = self.placed()
         turned = placed - self.position[:, None]
@@ -418,7 +418,7 @@ class _Problem:
         return reduced, right, solved, inner, mixed, cost
 
     def _priors(self, common: Array, right: Array) -> float:
-        """Add what keeps the shape smooth, its points in place and the optics near the stated."""
+        """Add priors of a smooth shape, of the points' positions and of the stated optics."""
         n, k = len(self.points), len(self.q)
         spacing = float(np.linalg.norm(self.points[1] - self.points[0]))
         third = np.diff(np.eye(n), n=3, axis=0) / (_LOOSE * spacing)

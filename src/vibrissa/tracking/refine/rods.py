@@ -1,9 +1,9 @@
-"""Bent rods of many frames at once: their points, how these change, and the roll that they show.
+"""Bent rods of many frames at once: their points, derivatives of these, and the roll they imply.
 
-What carries no load keeps its curvature: a whisker that is bent in every frame is rolled, of all
-rolls about the tangent at the base, by the one with which bent rods come nearest to the shapes.
+The part of a whisker without load keeps its curvature: if a whisker is bent in every frame, its
+roll about the tangent at the base is the one with which bent rods come nearest to the shapes.
 
-They are compared with the traces of one whisker over a trial, kept as arrays (`TraceSeries`).
+They are compared with the traces of one whisker over a trial, stored as arrays (`TraceSeries`).
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class TraceSeries:
         line, sigma = self.line[:, view], self.sigma[:, view]
         tangent = np.gradient(line, axis=1)
         tangent /= np.linalg.norm(tangent, axis=2, keepdims=True)
-        # Of a lost trace all numbers are NaN, and the first is as good as any.
+        # All values of a lost trace are NaN, so any index will do.
         square = (line**2).sum(2)[:, None, :] - 2.0 * pixels @ np.swapaxes(line, 1, 2)
         near = np.argmin(square, axis=2)
         row = np.arange(len(line))[:, None]
@@ -92,7 +92,7 @@ class TraceSeries:
         deviation = np.sqrt(sigma[row, near] ** 2 + _FLOOR**2)
         beyond = (np.abs(along) > 1.5 * spacing[:, None] + 1.0) | ~np.isfinite(miss)
         weight = np.where(beyond, 0.0, 1.0 / deviation)
-        # An error far beyond what is usual shows that something else is wrong.
+        # An error far above the usual shows that something else is wrong.
         scaled = np.abs(miss) * weight
         weight = weight / np.sqrt(np.maximum(scaled / FAR, 1.0))
         rows = (across[..., None, :] @ slopes)[..., 0, :] * weight[..., None]
@@ -142,7 +142,7 @@ class State:
         return State(turn @ self.rotation, self.position + step[:, :3], contact)
 
     def scaled(self, ratio: float) -> State:
-        """The same in units of another length, the former over which is the ratio."""
+        """The same in units of another length; the ratio is the old one over the new."""
         contact = self.contact * [ratio, *[ratio**-2] * 3]
         return State(self.rotation, ratio * self.position, contact)
 
@@ -150,7 +150,7 @@ class State:
 def bent(
     d: Discretization, state: State, touching: Mask, shown: float = 1.0
 ) -> tuple[Array, Array]:
-    """Points of the shown share of the bent rods and their derivatives."""
+    """Points of the visible share of the bent rods, and their derivatives."""
     s = np.linspace(0.0, shown, _SAMPLES)
     turned = np.einsum("tij,tnj->tni", state.rotation, rods(d, state.contact, s))
     slopes = np.zeros((*turned.shape, UNKNOWNS))
@@ -200,10 +200,10 @@ def contact_slopes(d: Discretization, state: State) -> tuple[Array, Array, Array
 
 
 def first_contacts(d: Discretization, state: State, curves: Array, touching: Mask) -> Array:
-    """Contacts (n, 4) of the touching frames that make the rod look most like the curves.
+    """Contacts (n, 4) of the touching frames that make the rod most similar to the curves.
 
-    A light contact looks the same at many places: of all ways along the whisker that contacts may
-    go from frame to frame, the likeliest is taken.
+    A light contact looks the same in many positions: among all paths along the whisker from frame
+    to frame, the most probable is chosen.
     """
     contacts, costs = _contacts_at(d, state, curves, np.flatnonzero(touching))
     if not costs.size:
@@ -224,7 +224,7 @@ def first_contacts(d: Discretization, state: State, curves: Array, touching: Mas
 def _contacts_at(
     d: Discretization, state: State, curves: Array, rows: NDArray[np.intp]
 ) -> tuple[Array, Array]:
-    """Best contacts (place, n, 4) of some frames at each start, and distances (place, n)."""
+    """Best contacts (start, n, 4) of some frames for each start, and distances (start, n)."""
     if not rows.size:
         return np.empty((len(_STARTS), 0, 4)), np.empty((len(_STARTS), 0))
     s = np.linspace(0.0, 0.95, 25)

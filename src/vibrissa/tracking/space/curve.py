@@ -1,12 +1,12 @@
 """One whisker in space from its traces in calibrated views.
 
-A point of one trace is in another view on its epipolar line (with the paper's orthogonal views: in
-the column of the shared axis). First the traces are matched point by point, both from base to tip,
-so that the distances from those lines are least in sum; this gives a curve in space. Then a cubic
-spline is moved until its images are on the traces, each trace being weighted by its uncertainty
-across itself. Where the whisker is such that no view sees it move in some direction, the spline's
-covariance is large in that direction. A single view does not
-show depth at all: its whisker is taken to be in the laboratory's plane z = 0.
+A point of one trace is in another view on its epipolar line (for the paper's orthogonal views: in
+the same column of the shared axis). First the traces are matched point by point, both from base to
+tip, such that the sum of distances from those lines is minimal; this gives a curve in space. Then a
+cubic spline is fitted so that its images are on the traces, each trace being weighted by its
+uncertainty across. If no view shows a motion of the whisker in some direction, the spline's
+covariance is large in that direction. A single view does not show depth at all: its whisker is
+assumed to be in the laboratory's plane z = 0.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ _SAMPLES = 51  # number of points of the spline that are compared with the trace
 _CONTROLS = 14  # number of the spline's control points
 _ROUNDS = 5  # largest number of Gauss–Newton steps
 _SPARSE = 2  # distance of the points of traces that are matched, in points
-_FARTHEST = 30.0  # distance from an epipolar line beyond which more counts no more, pixels
+_FARTHEST = 30.0  # distance from an epipolar line at which the cost saturates, pixels
 # Smallest standard deviation of a trace, pixels: calibration and the spline's freedom.
 _FLOOR = 0.05
 # Standard deviation of third differences of the control points, as a share of the length.
 _LOOSE = 0.05
 _END = 1.0  # standard deviation of a trace's ends along it, pixels
-_BEYOND = 6.0  # distance of a tip from the end of a trace from which it is another, pixels
+_BEYOND = 6.0  # distance of a tip from the end of a trace above which it is not the same, pixels
 # Distance of lines of sight at the base, pixels, from which views may begin at different points of
 # the whisker; share of it, and of twice that, left at most where they begin together; and share of
 # a trace within which that is.
@@ -49,7 +49,7 @@ _SLIDING = 0.3
 
 
 class SpaceCurve(NamedTuple):
-    """A whisker in space."""
+    """Whisker in space."""
 
     # (NODES, 3) Points from the base to where the first of the views ends, laboratory frame, m; NaN
     # if there is none.
@@ -60,7 +60,7 @@ class SpaceCurve(NamedTuple):
 
     @classmethod
     def none(cls) -> SpaceCurve:
-        """Make one of a frame without a whisker."""
+        """Empty curve for a frame without a whisker."""
         return cls(np.full((NODES, 3), np.nan), np.full((NODES, 3, 3), np.nan), np.nan)
 
     @property
@@ -70,7 +70,7 @@ class SpaceCurve(NamedTuple):
 
 
 def merge(cameras: Sequence[Camera], traces: Sequence[Trace]) -> SpaceCurve:
-    """Find the whisker in space that views show.
+    """Find the whisker in space that the views show.
 
     Parameters
     ----------
@@ -102,11 +102,11 @@ def merge(cameras: Sequence[Camera], traces: Sequence[Trace]) -> SpaceCurve:
 def begun_together(
     cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]]
 ) -> list[list[Trace]]:
-    """Traces of two views that begin where both show the whisker.
+    """Traces of two views, starting where both show the whisker.
 
-    Fur may hide its base in one view more than in the other, and before grey fur a trace may begin
-    at a streak of it: the base of one view is then in the other one on the whisker, not at its
-    base. What one view alone shows has no position in space.
+    Fur may hide its base in one view more than in the other, and in front of grey fur a trace may
+    begin at a streak of it: the base of one view is then, in the other, on the whisker and not at
+    its base. A part that only one view shows has no position in space.
     """
     if len(cameras) != 2:
         return [list(view) for view in traces]
@@ -160,7 +160,7 @@ def _matched(cameras: Sequence[Camera], traces: Sequence[Trace]) -> Array:
 
 
 def _partners(cost: Array) -> Array:
-    """For each row the mean column of the cheapest monotone path; NaN after its end."""
+    """Mean column of the cheapest monotone path for each row; NaN after its end."""
     rows = np.empty(sum(cost.shape), np.int64)
     columns = np.empty_like(rows)
     count = cheapest_path(np.ascontiguousarray(cost), rows, columns)
@@ -172,7 +172,7 @@ def _partners(cost: Array) -> Array:
 
 @kernel
 def cheapest_path(cost: Any, rows: Any, columns: Any) -> int:
-    """Cheapest path from the first corner to the last row or column, never going back."""
+    """Cheapest monotone path from the first corner to the last row or column."""
     n, m = cost.shape
     total = np.empty((n, m))
     for i in range(n):
@@ -236,11 +236,11 @@ def _basis(count: int) -> Array:
 
 
 def _fitted(cameras: Sequence[Camera], traces: Sequence[Trace], start: Array) -> SpaceCurve:
-    """Gauss–Newton on the distances of the spline's images from the traces."""
+    """Gauss-Newton fit to the distances of the spline's images from the traces."""
     basis = _basis(_SAMPLES)
     control = np.linalg.lstsq(basis, start)[0]
     size = float(np.linalg.norm(np.diff(start, axis=0), axis=1).sum())
-    # Loose: only where nothing is seen does it matter how the whisker continues.
+    # Weak: the continuation of the whisker matters only where nothing is seen.
     stiff = np.kron(_THIRD.T @ _THIRD, np.eye(3)) / (_LOOSE * size) ** 2
     hessian, misfit = stiff, np.nan
     for _ in range(_ROUNDS):
@@ -265,10 +265,10 @@ def _fitted(cameras: Sequence[Camera], traces: Sequence[Trace], start: Array) ->
 def _equations(
     cameras: Sequence[Camera], traces: Sequence[Trace], points: Array
 ) -> tuple[NDArray[np.int64], Array, Array]:
-    """Node (r,), gradient (r, 3) and misses (r,) of all equations, in standard deviations."""
+    """Node (r,), gradient (r, 3) and residuals (r,) of all equations, in standard deviations."""
     along = np.gradient(points, axis=0)
     spacing = np.linalg.norm(along, axis=1, keepdims=True)
-    # Points may slide along the curve by a part of their distance a round, no more.
+    # Points may slide along the curve by a fraction of their spacing per iteration.
     nodes = [np.arange(_SAMPLES)]
     rows = [along / spacing / (_SLIDING * spacing.mean())]
     misses = [np.zeros(_SAMPLES)]

@@ -1,8 +1,8 @@
-"""Pairs of frames of two cameras that belong together.
+"""Pairs of simultaneous frames of two cameras.
 
-Two views of one point are along lines that meet. In frames of different times the lines to the
-whisker's base and tip pass each other at a distance; the shift between the videos is the one for
-which they pass nearest. Frames that a camera dropped change the shift from there on.
+Two views of one point give lines of sight that meet. For frames of different times the lines to the
+whisker's base and tip pass each other at a distance; the offset between the videos is the one for
+which they pass nearest. Frames that a camera dropped change the offset from there on.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from vibrissa.tracking.trace.trace import Trace, correlated
 
 Pairs = NDArray[np.int64]
 
-_LARGEST = 30  # largest shift that is considered, frames
+_LARGEST = 30  # largest offset, frames
 _SHIFTS = np.arange(-_LARGEST, _LARGEST + 1)
 
-_SWITCH = 40.0  # cost of a change of the shift
+_SWITCH = 40.0  # cost of a change of the offset
 _WORST = 6.0  # largest cost of a frame: square of the distance at which lines pass, pixels²
-_CLEARLY = 20.0  # cost by which another shift must fit better than the given one
-# Share of the cost of the given shift that one which explains the misfit leaves at most.
+_CLEARLY = 20.0  # cost by which another offset must fit better than the given one
+# Largest share of the cost of the given offset that remains with one that explains the misfit.
 _LEFT = 0.65
 _DROPPED = 10  # largest number of frames in a row that a camera drops unnoticed
 _KNOWN = 10  # number of frames that must show an end of the whisker
@@ -37,7 +37,7 @@ def paired_frames(
     traces: Sequence[Sequence[Trace]],
     offset: int | None = 0,
 ) -> Pairs:
-    """Find which frames of two or more videos show the same moment.
+    """Find the simultaneous frames of two or more videos.
 
     Parameters
     ----------
@@ -80,9 +80,9 @@ def paired_frames(
 def better_offset(
     first: Camera, second: Camera, a: Sequence[Trace], b: Sequence[Trace], offset: int
 ) -> Pairs:
-    """Shifts with which two videos fit clearly better, one after the other; none if none do.
+    """Offsets with which two videos fit clearly better, by run; empty if there are none.
 
-    An error of the calibration is common to all shifts, and does not count.
+    An error of the calibration is common to all offsets, and does not count.
     """
     ends = []
     for end in (0, -1):
@@ -99,10 +99,10 @@ def better_offset(
         return np.empty(0, dtype=np.int64)
     blank = np.sum([np.where(np.isfinite(one), 0.0, 0.5 * _WORST) for one in ends], axis=0)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of shifts for which no frame is known
+        warnings.simplefilter("ignore", RuntimeWarning)  # for offsets without any frame
         usual = [np.nan_to_num(np.nanmedian(one, axis=0)) for one in ends]
     fits = _costs(ends, usual)
-    # Out of step, the usual distance holds the lag: the best shift leaves the calibration alone.
+    # Without synchrony the usual distance contains the lag; that of the best offset does not.
     best = int(np.argmin((fits + blank).sum(axis=0)))
     cost = _costs(ends, [one[best] for one in usual])
     path = _cheapest(cost + blank)
@@ -123,14 +123,14 @@ def better_offset(
     ]
     power = float(np.mean([(one**2).mean() for one in away]))
     alike = 1.0 + (correlated([one[None] for one in away]) - 1.0) * power / (power + _LOCATED**2)
-    # Of other optics some offset always explains a little; of a true one noise alone is left.
+    # With wrong optics some offset always explains a little; a true one leaves only noise.
     if left + alike * changed >= given or left > _LEFT * given:
         return np.empty(0, dtype=np.int64)
     return np.asarray(_SHIFTS[path[switched]])
 
 
 def _costs(ends: Sequence[Array], usual: Sequence[Array]) -> Array:
-    """Costs (frame, shift) of distances but for what is usual; 0 where they are not known."""
+    """Costs (frame, offset) of distances beyond the usual one; 0 where unknown."""
     away = [np.nan_to_num(one - middle) for one, middle in zip(ends, usual, strict=True)]
     return np.asarray(sum(np.minimum(one**2, _WORST) for one in away))
 
@@ -142,7 +142,7 @@ def _shown(traces: Sequence[Trace], end: int) -> NDArray[np.intp]:
 
 
 def _shifts(first: Camera, second: Camera, a: Sequence[Trace], b: Sequence[Trace]) -> Pairs:
-    """Shift of each frame of the first view, by the cheapest path through all shifts."""
+    """Offset of each frame of the first view, by the cheapest path through all offsets."""
     few = "the whisker is seen in too few frames to find the cameras' offset"
     if not all(any(len(trace.line) for trace in row) for row in (a, b)):
         raise ValueError(few)
@@ -160,7 +160,7 @@ def _shifts(first: Camera, second: Camera, a: Sequence[Trace], b: Sequence[Trace
 def _passing(
     first: Camera, second: Camera, a: Sequence[Trace], b: Sequence[Trace], end: int
 ) -> Array:
-    """Distance (frame, shift), pixels, at which lines to one end pass; NaN where one is not seen.
+    """Distance (frame, offset), pixels, at which lines to one end pass; NaN if one is unseen.
 
     Its sign is the side on which they pass.
     """
@@ -182,7 +182,7 @@ def _passing(
 
 
 def _cheapest(cost: Array) -> NDArray[np.intp]:
-    """Path through (time, shift) that seldom changes its shift."""
+    """Path through (time, offset) that seldom changes its offset."""
     count, width = cost.shape
     total, came = cost[0].copy(), np.zeros(cost.shape, dtype=np.intp)
     for i in range(1, count):

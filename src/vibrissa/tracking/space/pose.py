@@ -1,10 +1,10 @@
 """Pose of the head and of the whisker's base in every frame, and low-pass filtering over time.
 
-Base point and emergence angles are found by the paper's method. Without contact the rest shape, put
-on the whisker, gives all. In contact the direction of the base is that of the tangent there; the
-roll, which a bent whisker does not show, follows the azimuth and the elevation as it does in the
-frames without contact. At the end all is filtered over time without phase shift. A straight whisker
-shows no roll at all; then its y axis is taken as level.
+Base point and emergence angles are found by the paper's method. Without contact, the rest shape
+fitted to the whisker gives them all. In contact, the direction of the base is that of the tangent
+there; the roll, which a bent whisker does not show, follows azimuth and elevation as in the frames
+without contact. Finally all are filtered over time without phase shift. A straight whisker shows no
+roll at all; then its y axis is assumed to be level.
 """
 
 from __future__ import annotations
@@ -26,22 +26,23 @@ CUTOFF = 85.0
 """The paper's cut-off, Hz."""
 
 _ORDER = 2  # order of the Butterworth filter, which is applied forward and backward
-_LATE = 1e-6  # share of a frame by which a table of times may be too short
+_LATE = 1e-6  # fraction of a frame by which a table of times may be too short
 _SMALL = 0.05  # share of the times between frames that may be smaller than the usual small one
 _TANGENT = 0.2  # share of the whisker over which the tangent at the base is fitted
-# Share of the whisker over which the rest shape is put on a frame's shape: tips are uncertain.
+# Share of the whisker over which the rest shape is fitted to a frame's shape: tips are uncertain.
 _WHOLE = 0.85
-# Difference of a roll from what it is at that azimuth and elevation, rad, from which a frame is not
-# free, and in standard deviations; a median of sizes in these; and number of rounds.
+# Difference of a roll from the usual one at that azimuth and elevation above which a frame is not
+# free, rad and in standard deviations; a median of absolute values in these; number of iterations.
 _ROLLED, _UNUSUAL, _MEDIAN, _ROUNDS = np.deg2rad(15.0), 5.0, 0.6745, 4
-_SLOW = 7  # number of free frames of which the median shows how the roll slowly changes
+_SLOW = 7  # number of free frames whose median shows slow changes of the roll
 
 
 def low_pass(values: ArrayLike, rate: ArrayLike, cutoff: float | None = CUTOFF) -> Array:
-    """Filter a signal forward and backward, so that nothing is shifted in time.
+    """Filter a signal forward and backward, without phase shift.
 
-    Instead of the rate, times of frames can be given, s: they may be spaced unequally, and where
-    more than a period of the cut-off is missing, what is before and after is filtered apart.
+    Instead of the rate, times of frames can be given, s. They may be unequally spaced, and where
+    more than a period of the cut-off is missing, the parts before and after are filtered
+    separately.
     """
     array = np.array(values, dtype=np.float64)
     if cutoff is None:
@@ -94,7 +95,7 @@ class HeadPose:
 
     @classmethod
     def still(cls, count: int) -> HeadPose:
-        """Make a head whose frame is that of the laboratory."""
+        """Head whose frame is that of the laboratory."""
         return cls(np.zeros((count, 3)), np.broadcast_to(np.eye(3), (count, 3, 3)))
 
     @classmethod
@@ -186,7 +187,7 @@ def base_pose(curves: Array, shape: RestShape, whisker: Whisker) -> BasePose:
     free = shape.still[seen]
     angles = _emergence(rotation, seen, free)
     if whisker.is_straight:
-        # Nothing shows its roll; its y axis is taken as level.
+        # Nothing shows its roll; its y axis is assumed to be level.
         angles[:, 2] = np.where(np.isfinite(angles[:, 2]), 0.0, np.nan)
         rotation = base_rotation(*angles.T)
     touching = np.flatnonzero(seen)[~free]
@@ -194,7 +195,7 @@ def base_pose(curves: Array, shape: RestShape, whisker: Whisker) -> BasePose:
         angles[seen], position[seen] = _always_bent(shapes, spacing, angles[seen], shape, whisker)
     elif touching.size:
         local, start = _tangents(shapes, spacing, whisker.length)
-        # The fitted tangent differs from the whisker's by what it differs without contact.
+        # The fitted tangent differs from the whisker's as it does without contact.
         bias = np.median(np.einsum("tji,tj->ti", rotation[seen][free], local[free]), axis=0)
         offset = np.median(
             np.einsum("tji,tj->ti", rotation[seen][free], (start - position[seen])[free]), axis=0
@@ -212,9 +213,9 @@ def base_pose(curves: Array, shape: RestShape, whisker: Whisker) -> BasePose:
 
 
 def rolled_over(curves: Array, shape: RestShape, whisker: Whisker) -> Mask:
-    """Find frames that are like the rest shape only as a whisker that is rolled as in no others.
+    """Frames that resemble the rest shape only if the whisker is rolled as in no other frame.
 
-    Contact that bends a whisker against its own bend makes it, for a moment, the same as rolled.
+    Contact that bends a whisker against its intrinsic bend makes it momentarily resemble that.
     """
     alike = shape.still.copy()
     if whisker.is_straight or not alike.any():
@@ -238,7 +239,7 @@ def _seen_shapes(curves: Array, shape: RestShape) -> tuple[Mask, float, Array]:
 def _put_on(
     curves: Array, seen: Mask, shapes: Array, shape: RestShape, whisker: Whisker
 ) -> tuple[Array, Array]:
-    """Rotations and positions of the base with which the rest shape is nearest to each shape."""
+    """Rotations and positions of the base that fit the rest shape to each shape."""
     rotation, position = np.full((len(seen), 3, 3), np.nan), np.full((len(seen), 3), np.nan)
     most = int(_WHOLE * min(curves.shape[1], len(shape.points)))
     known = np.minimum(np.isfinite(shapes[:, :, 0]).sum(axis=1), most)
@@ -252,7 +253,7 @@ def _put_on(
 
 
 def _emergence(rotation: Array, seen: Mask, free: Mask) -> Array:
-    """Emergence angles (time, 3); of rolls about half a turn none is on the other side of it."""
+    """Emergence angles (time, 3), with rolls within half a turn of their mean direction."""
     angles = angles_of(rotation)
     usual = float(np.angle(np.exp(1j * angles[seen, 2])[free if free.any() else ...].sum()))
     angles[:, 2] = usual + np.angle(np.exp(1j * (angles[:, 2] - usual)))
@@ -262,7 +263,7 @@ def _emergence(rotation: Array, seen: Mask, free: Mask) -> Array:
 def _always_bent(
     shapes: Array, spacing: float, angles: Array, shape: RestShape, whisker: Whisker
 ) -> tuple[Array, Array]:
-    """Angles (time, 3) and base points (time, 3) if no frame is free; the roll stays as it is."""
+    """Angles (time, 3) and base points (time, 3) if no frame is free; the roll is constant."""
     local, start = _tangents(shapes, spacing, whisker.length)
     # The known shape gives the difference of the fitted tangent and its start from the whisker's.
     unit, begin = _tangents(shape.points[None], spacing, whisker.length)
@@ -294,16 +295,16 @@ def _tangents(shapes: Array, spacing: float, length: float) -> tuple[Array, Arra
 
 
 def _roll_like(known: Array, guess: Array, free: Mask, slow: int = _SLOW) -> Array:
-    """Roll as a linear function of azimuth and elevation, as without contact; plus slow changes."""
+    """Roll as a linear function of azimuth and elevation, as without contact, plus slow changes."""
     usable = free & np.isfinite(known).all(axis=1)
     design = np.column_stack([np.ones(usable.sum()), known[usable, :2]])
     middle = design.mean(axis=0)
-    # With little movement a slope is not known, and then none is used.
+    # With little motion a slope is not determined, and then none is used.
     pull = np.diag([0.0, 1e-3, 1e-3]) * usable.sum()
     center = design - np.array([0.0, *middle[1:]])
     slope = np.linalg.solve(center.T @ center + pull, center.T @ known[usable, 2])
     line: Array = slope[0] + (guess[:, :2] - middle[1:]) @ slope[1:]
     frames = np.arange(len(known))
-    # A contact that begins is so light that its first frames count as free, though bent.
+    # At onset a contact is so light that its first frames count as free, though bent.
     left = ndimage.median_filter(known[usable, 2] - center @ slope, slow, mode="nearest")
     return np.asarray(line + np.interp(frames, frames[usable], left), dtype=np.float64)

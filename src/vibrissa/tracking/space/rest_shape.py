@@ -1,23 +1,22 @@
-"""The whisker at rest, from its shapes in space over time, and its length.
+"""Shape of the whisker at rest, and its length, from its shapes in space over time.
 
-Whatever bends the whisker changes its shape; how it is held only moves it. Frames whose shapes are
-the same but for a rigid motion are therefore taken for frames without contact, if there are enough
-of them: the largest such group. Their median, each moved to where it fits best, is the rest shape.
-A whisker pressed against an object may keep its shape too, but only while its base hardly moves, so
-that frames count by how fast it moves; and bent to the mirror image of its rest shape, it is the
-same only when rolled over, which no animal does.
+Bending changes the whisker's shape; its pose does not. Frames whose shapes agree up to a rigid
+motion are therefore taken as free of contact, if there are enough of them: the largest such group.
+Their median, each moved to fit best, is the rest shape. A whisker pressed against an object may
+keep its shape too, but only while its base hardly moves, so frames are weighted by its speed; and a
+whisker bent to the mirror image of its rest shape agrees only if rolled over, which no animal does.
 
-After a release a whisker rings, and is bent by its own mass as much as by a light contact. Where
-free frames deviate unevenly, only the quietest of them give the shape, and poses by it.
+After a release a whisker rings, and its own mass bends it as much as a light contact. If free
+frames deviate unevenly, only the quietest of them give the shape, and poses by it.
 
-A whisker tapers to its tip, so that its length determines how thick it is everywhere, and so how it
-bends where. If its tip is too faint to be seen, or not in the image, then of all lengths that are
-not shorter than what is seen, the one is chosen with which the rod explains the traces in contact
-best; how much worse others do gives its standard deviation.
+A whisker tapers to its tip, so its length determines its radius everywhere, and hence how it bends.
+If its tip is too faint to be seen, or not in the image, the length is chosen, among those at least
+as long as what is seen, with which the rod best explains the traces in contact; the misfit of
+others gives its standard deviation.
 
-Before its tip a whisker bends as the cone of which it is a part: it matters where that ends, not
-how much of it is missing. So an unknown taper and a length that is seen to end too early are one
-number, by which bending shows both; it is combined with what is usual.
+Proximal to its tip a whisker bends as the cone of which it is a part: what matters is where the
+cone ends, not how much of it is missing. So an unknown taper and a length seen too short are one
+unknown, which bending determines; it is combined with a prior.
 """
 
 from __future__ import annotations
@@ -37,9 +36,9 @@ from vibrissa.whisker import Whisker
 Counts = NDArray[np.intp]
 
 _COMMON = 0.85  # share of the usual length over which shapes are compared: tips are uncertain
-_LEAST = 0.4  # share of that which must be seen to decide whether the whisker is bent
-_FEWEST = 3  # smallest number of frames from which a shape is taken
-_NEAR = 4.0  # deviation of a free frame at most, in units of the usual one
+_LEAST = 0.4  # visible share of that needed to decide whether the whisker is bent
+_FEWEST = 3  # smallest number of frames that give a shape
+_NEAR = 4.0  # largest deviation of a free frame, in units of the usual one
 # A whisker rings where free frames usually deviate by so many times what this share of them does;
 # then still ones deviate by at most so many times that.
 _UNEVEN, _QUIETEST, _QUIET = 2.5, 0.1, 1.5
@@ -50,9 +49,9 @@ _RINGS = 2e-5
 _DEEP = 10.0
 _LONGER = 1.1  # length over which a known whisker may be seen, in units of its own
 _STILL = 0.01  # usual deviation of free frames at most, as a share of a known whisker's length
-# Spread of lengths, 16 to 84 %, from which ends in a minority of frames are not tips.
+# Spread of lengths, 16 to 84 %, above which ends in a minority of frames are not tips.
 _FADES = 0.02
-_ENDS = 3  # number of frames at rest that show the tip, from which the length is taken
+_ENDS = 3  # number of frames at rest that show the tip, from which the length is computed
 # Factor of the noise of a shape: errors of neighbouring points are correlated, so that they seem
 # smoother than they are right.
 _SMOOTH = 4.0
@@ -72,19 +71,19 @@ _CERTAIN = 0.025
 # The same of the taper of a whisker whose tip is seen; and the step in which tapers are tried and
 # the largest, as shares of the length by which it would have to be longer to be as thick.
 _BENDS, _TAPERS, _STOUTEST = 0.009, 0.03, 0.12
-# Difference of costs up to which a length is hardly less likely: three standard deviations.
+# Largest difference of costs of a probable length: three standard deviations.
 _HARDLY = 9.0
 _ENDED = 0.7  # standard deviation of a seen length by where its tip is seen, pixels
-_OUTER = 0.4  # share of the shape that determines how it continues
+_OUTER = 0.4  # share of the shape by which it is extrapolated
 
 
 @dataclass(frozen=True, eq=False)
 class RestShape:
-    """The whisker at rest and where it would be if it were not bent."""
+    """Whisker at rest, and its deviation from that in each frame."""
 
     points: Array  # (n, 3), equally spaced, in the frame of the best free frame, m
     free: Mask  # (time,): free of contact
-    deviation: Array  # (time,): root mean square distance from the rest shape put on it, m
+    deviation: Array  # (time,): root mean square distance from the fitted rest shape, m
     noise: float  # usual deviation of the free frames, m
     whole: bool = True  # whether it ends at the whisker's tip
     ringing: Mask | None = None  # (time,): bent by its own mass; None: no frame is
@@ -134,7 +133,7 @@ def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> R
     best, near = _largest_group(part, least)
     group = np.flatnonzero(seen)[whole][near]
     length, ends = _length(curves[group], None if tips is None else tips[group])
-    # The same once more, at arc lengths that divide this length evenly.
+    # Repeat with arc lengths that divide this length evenly.
     first = np.flatnonzero(whole)[best]
     _, shapes, known, compared = _compared(curves[seen], length / (curves.shape[1] - 1))
     whole = _whole(known, compared)
@@ -142,7 +141,7 @@ def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> R
     if not near.any():
         raise ValueError("no frame free of contact shows nearly the whole length of the whisker")
     part = shapes[whole, :compared]
-    # The first may show less of the length than is compared now.
+    # The first frame may show less of the length than is compared now.
     mean = shapes[first, :compared] if whole[first] else part[near][0]
     deviation = np.full(len(shapes), np.inf)
     for _ in range(_ROUNDS):
@@ -152,7 +151,7 @@ def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> R
         near = deviation[whole] < max(_NEAR * usual, 1e-9)
     within = _NEAR * float(np.median(deviation[whole][near]))
     quiet, ringing = near, None
-    # A whisker that rings also looks as if it began elsewhere.
+    # A ringing whisker also looks as if it began elsewhere.
     rings = _deviations(part, mean, slides=0.0)
     usual = float(np.median(rings[near]))
     uneven = usual > _UNEVEN * np.quantile(rings[near], _QUIETEST)
@@ -168,7 +167,7 @@ def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> R
     # The quiet frames may all miss the tip.
     by = quiet if np.isfinite(shown[quiet, :, 0]).any(axis=0).all() else near
     points = np.nanmedian(_moved(shown[by], *motions(part[by], mean)), axis=0)
-    # Where less of the whisker is seen, what is seen shows whether it is bent.
+    # If less of the whisker is seen, the visible part shows whether it is bent.
     for i in np.flatnonzero(~whole & (known >= _LEAST * compared)):
         n = min(int(known[i]), len(points))
         deviation[i] = _deviations(shapes[i : i + 1, :n], points[:n])[0]
@@ -181,7 +180,7 @@ def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> R
 
 
 def _seen(curves: Array) -> Mask:
-    """Frames that show the whisker, of which there must be some."""
+    """Frames that show the whisker; there must be some."""
     seen: Mask = np.all(np.isfinite(curves), axis=(1, 2))
     if seen.sum() < _FEWEST:
         raise ValueError(
@@ -192,14 +191,14 @@ def _seen(curves: Array) -> Mask:
 
 
 def _compared(curves: Array, spacing: float | None = None) -> tuple[float, Array, Counts, int]:
-    """Spacing and shapes at equal lengths, points that each shows, and number of those compared."""
+    """Spacing and shapes at equal lengths, visible points of each, number of points compared."""
     spacing, shapes = aligned_lengths(curves, spacing)
     known = np.isfinite(shapes[:, :, 0]).sum(axis=1)
     return spacing, shapes, known, int(_COMMON * (curves.shape[1] - 1)) + 1
 
 
 def _whole(known: Counts, compared: int) -> Mask:
-    """Shapes that show all points that are compared."""
+    """Shapes that show all points compared."""
     whole: Mask = np.asarray(known >= compared, dtype=np.bool_)
     if whole.sum() < _FEWEST:
         raise ValueError("hardly any two frames show the whisker over the same length")
@@ -212,10 +211,10 @@ def _length(curves: Array, tips: Mask | None) -> tuple[float, bool]:
     ends = np.ones(len(curves), dtype=bool) if tips is None else tips
     whole = bool(ends.sum() >= _ENDS)
     if whole and 2 * ends.sum() < len(ends):
-        # Where a whisker usually fades, some lines seem to end, but anywhere.
+        # Where a whisker usually fades, some lines seem to end, but at random positions.
         low, high = np.percentile(lengths[ends], [16.0, 84.0])
         whole = bool(high - low < _FADES * high)
-    # A part of a tip may be missed, but hardly is more seen than there is.
+    # Part of a tip may be missed, but a trace rarely extends beyond it.
     return float(np.percentile(lengths[ends] if whole else lengths, 75.0)), whole
 
 
@@ -250,10 +249,10 @@ def known_rest(curves: Array, whisker: Whisker, least: float = 0.1) -> RestShape
 def _deviations(
     shapes: Array, target: Array, rolled: bool = False, slides: float = _SLIDES
 ) -> Array:
-    """Root mean square distances from a target on which shapes are put, rolled over or not.
+    """Root mean square distances from a target to which shapes are fitted, rolled over or not.
 
-    They may begin a little earlier or later on the whisker than the target: where a trace begins
-    depends on the hairs before it.
+    Shapes may begin slightly earlier or later on the whisker than the target, depending on the
+    hairs in front of it.
     """
     rotation, _ = motions(shapes, target)
     chord = shapes[:, -1] - shapes[:, 0]
@@ -271,7 +270,7 @@ def _deviations(
 
 
 def _slide(shape: Array) -> Array:
-    """Change (3 n,) of a shape that begins later by its length, but for its rigid motion."""
+    """Change (3 n,) of a shape that begins later by its length, up to rigid motion."""
     away = shape - shape.mean(axis=0)
     turns = np.cross(np.eye(3)[:, None], away)
     shifts = np.broadcast_to(np.eye(3)[:, None], turns.shape)
@@ -301,7 +300,7 @@ def _swings(directions: Array, goal: Array) -> Array:
 def whisker_at_rest(
     shape: RestShape, name: str = "tracked", hidden: float = 0.0, **properties: float
 ) -> Whisker:
-    """Make a whisker of the rest shape, whose radii at its base are those before a hidden part."""
+    """Whisker with the rest shape, whose base radii are those before a hidden part."""
     noise = _SMOOTH * shape.noise
     whisker = Whisker.from_points(shape.points, noise=noise, name=name, **properties)  # type: ignore[arg-type]
     if hidden == 0.0:
@@ -316,7 +315,7 @@ def aligned_lengths(curves: Array, spacing: float | None = None) -> tuple[float,
     """Cut curves at the same arc lengths; their spacing, m, and points (t, n, 3)."""
     count = curves.shape[1]
     lengths = [arc_lengths(curve) for curve in curves]
-    # Some frames may show less of the whisker, hardly any more.
+    # Some frames may show less of the whisker, rarely more.
     if spacing is None:
         spacing = float(np.percentile([each[-1] for each in lengths], 75.0)) / (count - 1)
     s = np.arange(int(1.05 * count)) * spacing
@@ -327,13 +326,14 @@ def aligned_lengths(curves: Array, spacing: float | None = None) -> tuple[float,
 
 
 def _largest_group(shapes: Array, least: float) -> tuple[int, Mask]:
-    """Frame that has the nearest neighbours, and which frames are near it."""
+    """Frame with the nearest neighbours, and which frames are near it."""
     points = shapes[:, ::4]
     chords = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1)
     signatures = chords.reshape(len(shapes), -1)
     square = (signatures**2).sum(axis=1)
     away = square[:, None] + square[None] - 2.0 * signatures @ signatures.T
-    # Distances do not distinguish mirror images: opposite bends are as far apart as they are deep.
+    # Distances do not distinguish mirror images, but opposite bends differ by as much as their
+    # depth.
     chord = shapes[:, -1] - shapes[:, 0]
     bends = (shapes - shapes[:, :1]).mean(axis=1) - 0.5 * chord
     bends = np.einsum("tij,tj->ti", _swings(chord, chord.mean(axis=0)), bends)
@@ -352,7 +352,7 @@ def _largest_group(shapes: Array, least: float) -> tuple[int, Mask]:
 
 
 def _pace(shapes: Array) -> Array:
-    """Speed of the base's turning in each frame, at most 1, the usual pace."""
+    """Angular speed of the base in each frame relative to the usual one, at most 1."""
     ahead = shapes[:, shapes.shape[1] // _BASE] - shapes[:, 0]
     ahead = ahead / np.linalg.norm(ahead, axis=1, keepdims=True)
     pace = np.linalg.norm(np.gradient(ahead, axis=0), axis=1)
@@ -361,13 +361,13 @@ def _pace(shapes: Array) -> Array:
 
 
 def motions(shapes: Array, target: Array) -> tuple[Array, Array]:
-    """Find the rigid motions that bring shapes nearest to a target."""
+    """Find the rigid motions that fit shapes to a target."""
     n = min(shapes.shape[1], len(target))
     a, b = shapes[:, :n], target[:n]
     middle, goal = a.mean(axis=1), b.mean(axis=0)
     cross = np.einsum("tni,nj->tij", a - middle[:, None], b - goal)
     if not (np.ptp(a[..., 2]) or np.ptp(b[..., 2])):
-        # What is known in a plane only is turned in it, and not over.
+        # Shapes known only in a plane are rotated within it.
         cross[:, 2, 2] = np.linalg.norm(cross, axis=(1, 2)) + 1.0
     u, _, vt = np.linalg.svd(cross)
     sign = np.linalg.det(u @ vt)
@@ -377,7 +377,7 @@ def motions(shapes: Array, target: Array) -> tuple[Array, Array]:
 
 
 def _onto(shapes: Array, target: Array) -> Array:
-    """Shapes moved to where they are nearest to a target."""
+    """Shapes fitted to a target by rigid motion."""
     return _moved(shapes, *motions(shapes, target))
 
 
@@ -394,9 +394,9 @@ class Length(NamedTuple):
 
 
 def seen_length(curves: Array, lines: Array, tapers: bool = True) -> Length:
-    """Length of whiskers that are seen to end, of which lines in the images have the pixels.
+    """Length of whiskers that are seen to end; their lines in the images give its error in pixels.
 
-    Where it is not known how a whisker tapers, its length does not show how thick it is either.
+    If the taper is unknown, the length does not determine the radius either.
     """
     lengths = np.linalg.norm(np.diff(curves, axis=1), axis=2).sum(axis=1)
     pixels = np.linalg.norm(np.diff(lines, axis=2), axis=3).sum(axis=2)
@@ -407,7 +407,7 @@ def seen_length(curves: Array, lines: Array, tapers: bool = True) -> Length:
 
 
 def lengthened(shape: RestShape, length: float) -> RestShape:
-    """Prolong a shape as it ends."""
+    """Extrapolate a shape beyond its end."""
     points, spacing = shape.points, shape.spacing
     if length <= shape.length:
         return shape
@@ -421,7 +421,7 @@ def lengthened(shape: RestShape, length: float) -> RestShape:
 
 
 def likeliest_length(seen: float, cost: Callable[[float], float]) -> Length:
-    """Find the length with which the rod explains the traces best: its mean over what is likely."""
+    """Find the length with which the rod explains the traces best, as a posterior mean."""
     lengths, costs = [seen], [cost(seen)]
     while costs[-1] <= min(costs) + _HARDLY and lengths[-1] < _LONGEST * seen:
         lengths.append(lengths[-1] + _STEP * seen)
@@ -435,7 +435,7 @@ def likeliest_length(seen: float, cost: Callable[[float], float]) -> Length:
 def likeliest_taper(
     usual: float, thinnest: float, cost: Callable[[float], float]
 ) -> tuple[float, float]:
-    """Find by which share of its length a whisker is thicker before its tip than is assumed.
+    """Find the length of a cone beyond the seen one, as a share of this, from its bending.
 
     Parameters
     ----------
@@ -468,7 +468,7 @@ def likeliest_taper(
 def _likelihood(
     values: Sequence[float], costs: Sequence[float], beyond: float = 0.0
 ) -> tuple[Array, Array]:
-    """How likely a number is, at many values, of which some cost so much."""
+    """Likelihood of a number at many values, interpolated from costs at some."""
     fine = np.linspace(values[0] - beyond, values[-1] + beyond, _FINE)
     between = interpolate.CubicSpline(values, costs)(np.clip(fine, values[0], values[-1]))
     return fine, np.exp(-0.5 * (between - between.min()))

@@ -1,1 +1,1 @@
-"""One image: lines, whiskers in them, and one whisker followed from frame to frame."""
+"""Tracing in the image: lines, whiskers among them, and whiskers followed from frame to frame."""

@@ -1,9 +1,9 @@
-"""Where a view shows a whisker together with something else, so that it is not measured there.
+"""Clutter: where something else in a view disturbs the measurement of a whisker.
 
-Next to another whisker, or to an edge or a line that never moves, the image is dark where that is,
-not where the whisker is. Such pixels are marked; a trace is bridged over them, and its uncertainty
-grows with the distance from where it is seen. What marks a pixel is a bit: one for all that stands
-still, and one for each whisker, so that none hides itself.
+Next to another whisker, or to an edge or a line that never moves, the image is dark because of that
+and not because of the whisker. Such pixels are marked; a trace is bridged over them, and its
+uncertainty grows with the distance from where it is seen. Each source of clutter has a bit: one for
+everything that is static, and one for each whisker, so that no whisker hides itself.
 """
 
 from __future__ import annotations
@@ -21,25 +21,26 @@ Array = NDArray[np.float64]
 Bits = NDArray[np.uint32]
 Mask = NDArray[np.bool_]
 
-# Distance up to which another whisker is in the way, pixels, for a whisker of usual width.
+# Distance within which another whisker disturbs, pixels, for a whisker of typical width.
 NEAR = 5.0
-# Bits of still things that hide whiskers, and of those before or next to which they show.
+# Bits of static objects that hide whiskers, and of those in front of or next to which they are
+# seen.
 STILL, EDGE = np.uint32(1), np.uint32(2)
 _WHISKERS = 30  # number of bits for whiskers
 
 
 class Clutter(NamedTuple):
-    """What is in the way of one whisker: pixels whose bits are among some."""
+    """Clutter for one whisker: pixels with any of the selected bits."""
 
     bits: Bits
     which: int
 
     def hides(self, points: Array) -> Mask:
-        """Whether something is in the way of points (n, 2)."""
+        """Whether clutter hides points (n, 2)."""
         return self._at(points, self.which)
 
     def disturbs(self, points: Array) -> Mask:
-        """Whether something that never moves is behind points (n, 2) or next to them."""
+        """Whether something static is behind points (n, 2) or next to them."""
         return self._at(points, int(EDGE))
 
     def _at(self, points: Array, which: int) -> Mask:
@@ -50,16 +51,16 @@ class Clutter(NamedTuple):
 
     @property
     def still_only(self) -> Clutter:
-        """The clutter that stands still, without other whiskers."""
+        """The static clutter, without other whiskers."""
         return self._replace(which=int(STILL))
 
 
-NOTHING = Clutter(np.zeros((1, 1), dtype=np.uint32), 0)  # nothing is in the way
+NOTHING = Clutter(np.zeros((1, 1), dtype=np.uint32), 0)  # no clutter
 
 
 @inlined
 def in_the_way(bits: Any, which: Any, x: float, y: float) -> Any:
-    """Whether something is in the way of a point."""
+    """Whether a point has any of the selected bits."""
     row = min(max(int(y + 0.5), 0), bits.shape[0] - 1)
     column = min(max(int(x + 0.5), 0), bits.shape[1] - 1)
     return (bits[row, column] & which) != 0
@@ -68,7 +69,7 @@ def in_the_way(bits: Any, which: Any, x: float, y: float) -> Any:
 def between_whiskers(
     lines: Sequence[Array | None], still: Bits | None, shape: tuple[int, int], near: float = NEAR
 ) -> list[Clutter]:
-    """What is in the way of each of some whiskers, whose lines (n, 2) are about known, or None."""
+    """Clutter for each of several whiskers, whose lines (n, 2) are approximately known, or None."""
     bits = np.zeros(shape, np.uint32) if still is None else still.copy()
     for k, line in enumerate(lines):
         if line is not None and len(line):
@@ -83,7 +84,7 @@ def _own(whisker: int) -> int:
 
 @kernel
 def paint(bits: Any, line: Any, near: float, bit: Any) -> None:
-    """Mark what is near a line."""
+    """Mark the pixels near a line."""
     rows, columns = bits.shape
     for k in range(line.shape[0]):
         x, y = line[k, 0], line[k, 1]

@@ -1,14 +1,13 @@
-"""Thin lines in a difference image, what may be whiskers among them, and the whiskers of a frame.
+"""Thin lines in a difference image, candidate curves composed of them, and the whiskers of a frame.
 
-With the image D smoothed by a Gaussian of standard deviation σ and λ the lower eigenvalue of its
-second derivatives, n its eigenvector, a ridge runs through a pixel if λ < 0 and its top, at
+With the image D smoothed by a Gaussian of standard deviation σ, λ the lower eigenvalue of its
+second derivatives and n the eigenvector, a ridge passes through a pixel if λ < 0 and its top, at
 t = −(∇D·n) / λ along n, is within the pixel (Steger 1998). Its strength is −σ²λ.
 
-A segment, points of a ridge in a row, ends where something hides or crosses the whisker. Two ends
-are joined if one smooth curve runs through both segments; the cheapest join comes first, and each
-end is joined once. A curve is the likelier a whisker, the longer it is seen, the more it fades
-toward its tip, and if it begins at a body that is large and at the border of the image, as the face
-is.
+A segment, a chain of ridge points, ends where something hides or crosses the whisker. Two ends are
+joined if one smooth curve passes through both segments; the cheapest join is made first, and each
+end is joined once. A curve is more likely to be a whisker the longer it is seen and the more it
+fades toward its tip, and if it begins at a large body at the border of the image, as the face is.
 """
 
 from __future__ import annotations
@@ -35,11 +34,11 @@ from vibrissa.tracking.trace.trace import (
 
 Array = NDArray[np.float64]
 
-SIGMA = 1.6  # smoothing, pixels, for a whisker of usual width
+SIGMA = 1.6  # smoothing, pixels, for a whisker of typical width
 # Strength of points that belong to a line, and of those that start one, in units of the noise.
 _LEAST, _CLEAR = 2.0, 4.0
-_QUIET = 0.4  # smallest noise that an image is taken to have, grey values
-_STEP = 4.0  # distance from which two points of a curve have something hidden between them, pixels
+_QUIET = 0.4  # smallest assumed noise of an image, grey values
+_STEP = 4.0  # distance between two points of a curve above which something is hidden, pixels
 _SHORTEST = 9  # number of points of the shortest segment
 _ROUND = 0.6  # largest second derivative along a line, relative to that across it
 _MOST = 60_000  # largest number of ridge points of a frame
@@ -53,14 +52,14 @@ class Segment(NamedTuple):
 
     @property
     def reversed(self) -> Segment:
-        """The same from its other end."""
+        """The same segment from its other end."""
         return Segment(self.points[::-1], self.strength[::-1])
 
 
 def smoothed(
     difference: Image, bodies: Bodies, scale: float = 1.0
 ) -> tuple[Image, NDArray[np.float64]]:
-    """Smooth a difference image; strength per second derivative on open ground and on bodies."""
+    """Smoothed difference image; strength per second derivative on open ground and on bodies."""
     sigma = SIGMA * scale
     reach = math.ceil(3.0 * sigma)
     taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
@@ -77,7 +76,7 @@ def smoothed(
 
 
 def segments(difference: Image, bodies: Bodies, scale: float = 1.0) -> list[Segment]:
-    """Find the lines of a difference image, but on bodies."""
+    """Find the lines of a difference image, except on bodies."""
     smooth, factors = smoothed(difference, bodies, scale)
     factors[1] = 0.0
     points, index = np.empty((_MOST, 4)), np.full(difference.shape, -1, dtype=np.int32)
@@ -94,7 +93,7 @@ def segments(difference: Image, bodies: Bodies, scale: float = 1.0) -> list[Segm
 
 @kernel
 def blur(image: Any, taps: Any, work: Any, out: Any) -> None:
-    """Convolve an image with a symmetric row of numbers, along rows and columns."""
+    """Convolve an image with a symmetric kernel along rows and columns."""
     rows, columns = image.shape
     reach = taps.shape[0] // 2
     for row in range(rows):
@@ -147,7 +146,7 @@ def near_body(label: Any, row: int, column: int) -> Any:
 def ridge_points(
     smooth: Any, label: Any, factors: Any, least: float, points: Any, index: Any
 ) -> int:
-    """Find pixels through which a ridge runs."""
+    """Find pixels through which a ridge passes."""
     rows, columns = smooth.shape
     count = 0
     highest = max(factors[0], factors[1])
@@ -188,7 +187,7 @@ def ridge_points(
 
 @kernel
 def link(points: Any, index: Any, order: Any, shortest: int, member: Any, first: Any) -> int:
-    """Put points in rows."""
+    """Link points into chains."""
     used = np.zeros(points.shape[0], np.bool_)
     way = np.empty(2 * points.shape[0] + 1, np.int32)
     number, filled, middle = 0, 0, points.shape[0]
@@ -224,7 +223,7 @@ def _walk(
     at: int,
     step: int,
 ) -> int:
-    """Go from point to point in one direction; return the index in ``way`` of the last."""
+    """Walk from point to point in one direction; return the index in ``way`` of the last."""
     rows, columns = index.shape
     here = seed
     while True:
@@ -250,7 +249,7 @@ def _walk(
                     turn = points[k, 2] if own > 0.0 else points[k, 2] + math.pi
         if best < 0:
             return at
-        # A broad ridge has points side by side: those next to the line are not a second one.
+        # A broad ridge has adjacent parallel points, which are not a second line.
         for i in range(max(row - 1, 0), min(row + 2, rows)):
             for j in range(max(column - 1, 0), min(column + 2, columns)):
                 if index[i, j] >= 0:
@@ -263,11 +262,11 @@ def _walk(
 
 _GAP = 160.0  # largest distance between two ends that are joined, pixels
 _BEGINS = 6.0  # distance from the beginning of a whisker up to which no ends are joined, pixels
-_OPEN = 30.0  # largest part of it that may be open ground, pixels
+_OPEN = 30.0  # largest part of a join that may be open ground, pixels
 _BENT = 0.7  # largest angle between the end of a segment and the chord of a join, rad
 # Numbers of points from which a segment is long, and of those that are used of it.
 _LONG, _PART = 40, 250
-# Points next to a join that are left out: what hides or crosses the whisker draws them aside.
+# Points next to a join that are skipped: what hides or crosses the whisker displaces them.
 _SPOILT = 10
 _EXACT = 0.5  # standard deviation of points of one curve about a polynomial, pixels
 # Standard deviation of the log of the ratio of strengths of two segments of one whisker.
@@ -278,18 +277,19 @@ _DIRECTION = 12  # number of points from which the direction of an end is taken
 _HIDDEN = 24.0
 # Exponent of the ratio of strengths at base and tip, and the largest ratio that counts.
 _TAPER, _FADES = 0.8, 4.0
-# Worth of a curve that begins at a face, at another body, at none.
+# Score of a curve that begins at a face, at another body, at none.
 _AT_FACE, _AT_BODY, _ALONE = 1.0, 0.6, 0.35
-# How far across a line it is dark, pixels, and number of points that have one direction.
+# Half width of a line's darkness, pixels, and number of points over which its direction is
+# constant.
 _ACROSS, _SKIPPED = 6, 5
 _TURNING = 2.0  # largest turn of a whisker, rad
-# Standard deviation of the direction about a smooth one that halves the worth of a curve, rad.
+# Standard deviation of the direction about a smooth one that halves the score of a curve, rad.
 _RAGGED = 0.35
-_EVEN = 6.0  # distance of the points between which the direction is taken, pixels
+_EVEN = 6.0  # distance of the points between which the direction is measured, pixels
 
 
 class Curve(NamedTuple):
-    """What may be a whisker, in one frame of one view."""
+    """Candidate whisker in one frame of one view."""
 
     line: Array
     length: float
@@ -304,13 +304,13 @@ def find_curves(
     options: TraceOptions,
     begins: Array | None = None,
 ) -> list[Curve]:
-    """Find what may be whiskers in a frame; points (n, 2) where some begin are on the face."""
+    """Find candidate whiskers in a frame; some begin on the face at points ``begins`` (n, 2)."""
     bodies, gain = scene.bodies(frame), scene.gain(frame)
     curves, difference = [], scene.difference(frame)
     parts = segments(difference, bodies, options.scale)
     for chain in joined(parts, bodies, begins):
         step = np.hypot(*np.diff(chain.points, axis=0).T)
-        # What is hidden at a join is not seen.
+        # Hidden parts at a join do not count as seen.
         length = float(step[step < _STEP].sum())
         if len(chain.points) >= _DIRECTION and length >= options.shortest:
             moved = scene.moved(frame, chain.points, gain)
@@ -321,7 +321,7 @@ def find_curves(
 
 
 def joined(found: Sequence[Segment], bodies: Bodies, begins: Array | None = None) -> list[Segment]:
-    """Join segments that are parts of one curve; not behind a face, nor where whiskers begin."""
+    """Join segments of one curve, but not behind a face, nor where whiskers begin."""
     if not found:
         return []
     begins = np.empty((0, 2)) if begins is None else begins
@@ -351,7 +351,7 @@ def joined(found: Sequence[Segment], bodies: Bodies, begins: Array | None = None
 
 
 def _outward(points: Array) -> Array:
-    """Unit vector in which a segment ends."""
+    """Unit vector in the direction of a segment's end."""
     part = points[-_DIRECTION:]
     return _unit(part[-1] - part[0])
 
@@ -361,13 +361,13 @@ def _unit(vector: Array) -> Array:
 
 
 def _ending(found: Sequence[Segment], end: int) -> Segment:
-    """The segment of an end, which comes last."""
+    """The segment of an end, ordered so that the end comes last."""
     one = found[end // 2]
     return one if end % 2 else one.reversed
 
 
 def _hidden(starts: Array, ends: Array, bodies: Bodies, faces: Sequence[int]) -> Mask:
-    """Between which of two ends, each (n, 2), little of the chord is open ground."""
+    """Pairs of ends, each (n, 2), with little open ground between them."""
     chord = ends - starts
     far = np.hypot(*chord.T)
     steps = far.astype(np.int64)
@@ -387,7 +387,7 @@ def _apart(point: Array, starts: Array, ends: Array) -> Array:
 
 
 def _cost(one: Segment, other: Segment, far: float) -> float:
-    """Cost of taking two segments, each ending at the join, for one curve."""
+    """Cost of joining two segments, each ending at the join."""
     before, after = one.points[-_PART:], other.points[-_PART:][::-1]
     ratio = np.log(np.median(one.strength[-_LONG:]) / np.median(other.strength[-_LONG:]))
     cost = 0.5 * (ratio / _LIKE) ** 2 + far / _GAP
@@ -395,7 +395,7 @@ def _cost(one: Segment, other: Segment, far: float) -> float:
         spoilt = _SPOILT if far > 3.0 else 0
         both, degree = np.concatenate([before[: len(before) - spoilt], after[spoilt:]]), 4
     else:
-        # Of what is short only a little is known: an arc goes on into the other's middle.
+        # A short segment gives only an arc, which is extrapolated into the middle of the other.
         both, degree = np.concatenate([before[-_LONG:], after[:_LONG]]), 2
     axis = _unit(both[-1] - both[0])
     x = (both - both[0]) @ axis
@@ -405,13 +405,13 @@ def _cost(one: Segment, other: Segment, far: float) -> float:
 
 
 def _left_of(x: Array, y: Array, degree: int) -> Array:
-    """Residuals of values after the best polynomial is subtracted."""
+    """Residuals of values about the best polynomial."""
     basis = np.vander(x, degree + 1)
     return np.asarray(y - basis @ np.linalg.lstsq(basis, y)[0])
 
 
 def _chained(found: Sequence[Segment], joins: Sequence[tuple[float, int, int]]) -> list[Segment]:
-    """Segments in rows, each end joined at most once."""
+    """Chains of segments, each end joined at most once."""
     partner: dict[int, int] = {}
     group = list(range(len(found)))
 
@@ -442,7 +442,7 @@ def _chained(found: Sequence[Segment], joins: Sequence[tuple[float, int, int]]) 
 
 
 def _darkness(difference: Image, line: Array, scale: float) -> Array:
-    """How dark each point of a line is, summed across it: more where a whisker is wider."""
+    """Darkness of each point of a line, summed across it; larger where a whisker is wider."""
     offsets = scale * np.arange(-_ACROSS, _ACROSS + 1)
     direction = np.repeat(np.gradient(line[::_SKIPPED], axis=0), _SKIPPED, axis=0)[: len(line)]
     normal = direction[:, ::-1] * [-1.0, 1.0]
@@ -455,7 +455,7 @@ def _darkness(difference: Image, line: Array, scale: float) -> Array:
 
 
 def _begun(chain: Segment, bodies: Bodies, length: float, moved: float) -> Curve | None:
-    """Let a curve begin at a body, if there is one, and score how much it is like a whisker."""
+    """Start a curve at a body, if there is one, and score its likeness to a whisker."""
     line, strength = chain
     turns = np.unwrap(np.arctan2(*_even_steps(line).T[::-1]))
     if np.ptp(turns) > _TURNING:
@@ -474,14 +474,14 @@ def _begun(chain: Segment, bodies: Bodies, length: float, moved: float) -> Curve
 
 
 def _even_steps(line: Array) -> Array:
-    """Steps of about six pixels along a line."""
+    """Points along a line in steps of about six pixels."""
     s = arc_lengths(line)
     wanted = np.linspace(0.0, s[-1], max(int(s[-1] / _EVEN), 6))
     return np.diff(interpolated(wanted, s, line), axis=0)
 
 
 def _body_before(line: Array, bodies: Bodies) -> tuple[Array, int]:
-    """Where a line, prolonged before its first point, enters a body, and which; 0: none."""
+    """Point where a line, extrapolated before its start, enters a body, and its label or 0."""
     back = _unit(line[0] - line[min(_DIRECTION, len(line) - 1)])
     before = line[0] + np.arange(0.0, _HIDDEN, 0.5)[:, None] * back
     body = bodies.at(before)
@@ -492,7 +492,7 @@ def _body_before(line: Array, bodies: Bodies) -> tuple[Array, int]:
 
 
 class Found(NamedTuple):
-    """A whisker in one frame.
+    """Whisker in one frame.
 
     Attributes
     ----------

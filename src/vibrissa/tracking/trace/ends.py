@@ -1,8 +1,8 @@
-"""Where a line begins and ends: the whisker in one frame, traced from an approximate line.
+"""Ends of a whisker in one frame, traced from an approximate line.
 
-A whisker begins where it leaves the dark face. Before grey fur, or without a face, it begins where
-the line does, if the line is clearly darker than streaks of the fur next to it. It ends where it
-fades.
+A whisker begins where it leaves the dark face. In front of grey fur, or without a face, it begins
+where the line does, if the line is clearly darker than streaks of the fur next to it. It ends where
+it fades.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from vibrissa.tracking.trace.ridge import (
 from vibrissa.tracking.trace.trace import STEP, Trace, TraceOptions, even
 
 OUTSIDE = 12.0  # how far inside the face the base is searched, pixels
-_FUR = 3  # number of points next to the face that are not measured: fur is dark too
+_FUR = 3  # number of points next to the face that are not measured, since fur is dark too
 # Numbers of the last points of a line, which give its bend, and of those beyond the last supported
 # one in which the tip is searched.
 _BENDING, _BEYOND = 30, 12
@@ -36,13 +36,13 @@ _BORDER = 8.0
 # Standard deviations of one point by which a line's last points are darker on average than what is
 # beyond, for its end to be seen, to a few points: nearly five of the mean of ten.
 _CLEAR = 1.5
-# Noise below which an image is not as a sensor gives it, grey values: twice that of rounding.
+# Noise below which an image is not a sensor's raw image, grey values: twice that of rounding.
 _SMOOTHED = 0.6
 _LAST = 10  # number of points before the end, and twice that of points beyond, that decide this
 # Distances from a line at which its profile is taken, and smallest variance of that, samples.
 _ACROSS, _NARROWEST = np.arange(6.0), 0.3
 _FLANKS = (4.0, 7.0)  # distances from the whisker at which the face's edge is searched, pixels
-# Darkness of a whisker next to its base, in standard deviations of the fur's streaks, at least.
+# Smallest darkness of a whisker next to its base, in standard deviations of the fur's streaks.
 _CLEARER = 1.5
 _STREAKS = 40  # number of points of a line's beginning next to which fur may look like it
 # Darkness of a whisker relative to the twenty points before it, at least: toward its tip, as it
@@ -58,22 +58,22 @@ def traced(
     before: float = OUTSIDE,
     clutter: Clutter = NOTHING,
 ) -> tuple[Trace, bool]:
-    """Trace a whisker that is about known, and find its ends; whether it begins at the face."""
+    """Trace a whisker near a line, and find its ends; whether it begins at the face."""
     line = prolonged(even(line), _BENDING, _BEYOND)
     for gate in (3, 2):
         line = even(fitted(frame, line, gate, noise, options, clutter).line)
         if len(line) < FEWEST:
-            # Where nothing is seen, nothing holds the line apart.
+            # Where nothing is seen, nothing determines the line.
             return Trace.lost(), False
     line, from_face = _with_base(frame, line, before, clutter)
     if before > OUTSIDE and len(line) >= FEWEST:
-        # What was only guessed is measured before it counts.
+        # Extrapolated parts are measured before they count.
         fur = _FUR if from_face else 0
         line = even(fitted(frame, line, 3, noise, options, clutter, fur).line)
     if len(line) < FEWEST:
         return Trace.lost(), False
     if not from_face:
-        # Without a face it begins as it ends: where the line does.
+        # Without a face the whisker begins, as it ends, where the line does.
         line = prolonged(line[::-1], _BENDING, _BEYOND)[::-1]
     line, along = measured(frame, line, 1, noise, options, _FUR if from_face else 0, clutter)
     first = 0
@@ -84,7 +84,7 @@ def traced(
     last = _tip(along)
     if last - first < FEWEST:
         return Trace.lost(), False
-    # An image without noise was smoothed, as by compression, and what is faint went with it.
+    # An image without noise was smoothed, as by compression, which removes faint lines.
     tip_seen = noise > _SMOOTHED and _inside(frame, line[last - 1])
     tip_seen = tip_seen and _stops(frame, line, along, last)
     line, along = line[first:last], along.part(slice(first, last))
@@ -97,10 +97,10 @@ def traced(
 def _above_texture(
     frame: Frame, line: Array, along: Measured, options: TraceOptions, clutter: Clutter
 ) -> tuple[Measured, float]:
-    """By how much a line is darker than fur next to its beginning, of which streaks look like it.
+    """Excess darkness of a line over the fur next to its beginning, whose streaks look similar.
 
-    They are measured as the line is, along two others next to it, and their standard deviation is
-    given too.
+    The fur is measured in the same way along two parallel lines; their standard deviation is
+    returned too.
     """
     part = np.ascontiguousarray(line[:_STREAKS])
     n, amplitudes, sigma = len(part), [], along.noise * np.sqrt(DEPTH_VARIANCE)
@@ -125,9 +125,9 @@ def _above_texture(
 def _skew(frame: Frame, line: Array, scale: float, clutter: Clutter) -> float:
     """Third cumulant of the darkness across a line's nearer half, pixels³; NaN if it is hidden.
 
-    Blur that is the same to both sides does not change it. With a Gaussian g as wide as the
-    profile, u being the distance in these widths, the profile's odd part is fitted by a slope of
-    the background, a shift and a skew: b u + c u g + h (u³ − 3 u) g.
+    Symmetric blur does not change it. With a Gaussian g of the profile's width and the distance u
+    in units of it, the odd part of the profile is fitted by a slope of the background, a shift and
+    a skew: b u + c u g + h (u³ − 3 u) g.
     """
     half = line[len(line) // 8 : len(line) // 2]
     sides = np.stack([grey_flanks(frame, half, away * scale, clutter) for away in _ACROSS])
@@ -136,7 +136,7 @@ def _skew(frame: Frame, line: Array, scale: float, clutter: Clutter) -> float:
         return np.nan
     left, right = sides.mean(axis=1).T
     dark = 0.5 * (left[-1] + right[-1]) - 0.5 * (left + right)
-    # What is at a distance is on both sides, and the middle is there once.
+    # Distances occur on both sides, the middle once.
     count = np.where(_ACROSS > 0.0, 2.0, 1.0)
     square = float(count * dark @ _ACROSS**2) / max(float(count @ dark), 1e-9)
     width = np.sqrt(max(square, _NARROWEST))
@@ -148,21 +148,21 @@ def _skew(frame: Frame, line: Array, scale: float, clutter: Clutter) -> float:
 
 
 def _with_base(frame: Frame, line: Array, before: float, clutter: Clutter) -> tuple[Array, bool]:
-    """Let a line begin where the whisker leaves the face."""
+    """Line that begins where the whisker leaves the face."""
     longer = even(line, -before)
     near, far = (_edge(frame, longer[:40], distance, clutter) for distance in _FLANKS)
     if near is None:
         return line, False
     at = near
     if far is not None and abs(far - near) < 2.0:
-        # The face is round: to second order in the distance, its edge on the whisker itself.
+        # The face is round: its edge on the whisker itself, to second order in the distance.
         a, b = _FLANKS
         at = near + (near - far) * a * a / (b * b - a * a)
     return even(longer, max(at, 0.0) * STEP), True
 
 
 def _edge(frame: Frame, line: Array, distance: float, clutter: Clutter) -> float | None:
-    """Point number at which both sides of a line come out of the dark, on average."""
+    """Index of the point at which both sides of a line leave the dark, on average."""
     numbers, points = [], np.arange(len(line))
     for level in grey_flanks(frame, line, distance, clutter).T:
         known = np.isfinite(level)
@@ -186,10 +186,10 @@ def grey_flanks(frame: Frame, line: Array, distance: float, clutter: Clutter = N
 
 
 def _tip(along: Measured, darkness: float = _TAPERED, least: float = 0.0) -> int:
-    """Count the points of a line that belong to the whisker.
+    """Number of points of a line that belong to the whisker.
 
-    Beyond the tip the line is as light as its surroundings; before it, it stays about as dark as it
-    was. The end is where that is most likely, by the sum of log-likelihood ratios.
+    Beyond the tip the line is as bright as its surroundings; before it, it remains about as dark as
+    before. The end is where this is most probable, by the sum of log-likelihood ratios.
     """
     sigma = along.noise * np.sqrt(DEPTH_VARIANCE)
     amplitude = np.where(along.open, along.amplitude, 0.0)
@@ -202,33 +202,33 @@ def _tip(along: Measured, darkness: float = _TAPERED, least: float = 0.0) -> int
 
 
 def _stops(frame: Frame, line: Array, along: Measured, count: int) -> bool:
-    """Whether a line of so many points is seen to end, not to fade or to run behind something."""
+    """Whether a line of so many points is seen to end, rather than to fade or be hidden."""
     before, after = slice(max(count - _LAST, 0), count), slice(count, count + _LAST // 2)
     shown = along.open
     if not shown[after].any() or min(shown[before].mean(), shown[after].mean()) < 0.5:
         return False
     if np.median(grey_flanks(frame, line[before], _FLANKS[0])) >= np.iinfo(frame.dtype).max:
-        # Where the light is more than the image holds, what is faint does not show.
+        # Where the image is saturated, faint lines are invisible.
         return False
     sigma = along.noise * np.sqrt(DEPTH_VARIANCE)
     return bool(along.amplitude[before][shown[before]].mean() > _CLEAR * sigma)
 
 
 def _inside(frame: Frame, point: Array) -> bool:
-    """Whether a point is not at the border of the image."""
+    """Whether a point is away from the border of the image."""
     far = np.array(frame.shape[::-1]) - 1.0 - _BORDER
     return bool((point > _BORDER).all() and (point < far).all())
 
 
 def prolonged(line: Array, used: int, ahead: int) -> Array:
-    """Prolong a line by a number of points, as a parabola through the last ones."""
+    """Extrapolate a line by a number of points, with a parabola through the last ones."""
     n = min(used, len(line))
     return np.concatenate([line, _onward(n, ahead) @ line[-n:]])
 
 
 @cache
 def _onward(used: int, ahead: int) -> Array:
-    """Matrix (ahead, used) that carries a parabola through some points on to the next ones."""
+    """Matrix (ahead, used) that extrapolates a parabola through some points to the next ones."""
     t = np.arange(used + ahead) / max(used - 1, 1) - 0.5
     powers = np.vander(t, 3)
     return np.asarray(powers[used:] @ np.linalg.pinv(powers[:used]))

@@ -1,14 +1,14 @@
-"""A whisker of one view, searched in another along the lines of sight of its points.
+"""Search for a faint whisker in one view along the epipolar lines of its points in another.
 
-Before grey fur a whisker is a faint line among hairs that are as dark, and by itself it is hardly
-seen. Another view, which shows it before open ground, leaves of each of its points one unknown: t,
-how far along its epipolar line the point is seen. Of all smooth t(s) the one is taken along which
-the image is most like a line, by dynamic programming over t and its slope: with derivatives of the
-smoothed image across the curve in units of their noise, r, which is positive on dark lines,
+In front of grey fur a whisker is a faint line among hairs that are as dark, and hard to see in that
+view alone. Another view, which shows it in front of open ground, leaves one unknown for each of its
+points: the distance t along its epipolar line. Of all smooth t(s), dynamic programming over t and
+its slope finds the one along which the image is most like a line: with the curvature of the
+smoothed image across the curve in units of its noise, r, which is positive on dark lines,
 
     Σ r(s, t, t′) − _TURN · (number of changes of slope) → max
 
-The same of the inverted image shows what fur and noise alone make of it.
+The same for the inverted image gives the score of fur and noise alone.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from vibrissa.tracking.trace.scene import Bodies, Image, Scene
 from vibrissa.tracking.trace.trace import arc_lengths, interpolated
 
 _STEP = 4.0  # distance of the points that are searched, pixels
-_STEEP = 8  # largest change of t from one to the next, pixels
+_STEEP = 8  # largest change of t from one point to the next, pixels
 _SLOPES = np.arange(-_STEEP, _STEEP + 1)
 
 _TURN = 0.3  # cost of changing the slope by a pixel
-_MOST = 12.0  # strength, in units of the noise, beyond which a line is no more like one
+_MOST = 12.0  # strength, in units of the noise, at which the score of a line saturates
 _APART = 8.0  # distance from the dark curve within which its own flanks are bright, pixels
 # Number of points next to the base that show whether the line begins there, and the smallest share
 # of them before a body: where less is, the view by itself shows where the whisker begins.
@@ -38,7 +38,7 @@ _FIRST, _MOSTLY = 10, 0.75
 def seen_along(
     curve: Curve, known: Camera, camera: Camera, frame: Frame, scene: Scene
 ) -> Curve | None:
-    """Find what moves along a curve that another camera sees; None where that is not in view."""
+    """Find a moving line along a curve that another camera sees; None if that is out of view."""
     s = arc_lengths(curve.line)
     wanted = np.linspace(0.0, s[-1], max(int(s[-1] / _STEP), 2) + 1)
     start, along = _epipolar_lines(interpolated(wanted, s, curve.line), known, camera)
@@ -60,7 +60,8 @@ def seen_along(
     line = points[np.arange(len(points)), path]
     apart = np.linalg.norm(points - line[:, None], axis=2) > _APART
     bright, _ = _best_path(-strength + np.where(in_image & apart, 0.0, -_MOST)[:, None])
-    # It is seen to begin before a body, where the other view shows it; nothing goes on before that.
+    # Its beginning is in front of a body, where the other view shows it: the line does not extend
+    # beyond.
     on_body = float(np.mean(bodies.at(line[:_FIRST]) != 0))
     back = line[0] - line[min(_FIRST, len(line) - 1)]
     part = np.concatenate([line[0] + np.linspace(1.0, 0.0, _FIRST + 1)[:-1, None] * back, line])
@@ -74,7 +75,7 @@ def seen_along(
 
 
 def _epipolar_lines(pixels: Array, known: Camera, camera: Camera) -> tuple[Array, Array]:
-    """Points (n, 2) in a view of points of another one, and the directions in which they may be."""
+    """Points (n, 2) in a view for points of another one, and directions of epipolar lines."""
     middle = np.broadcast_to(0.5 * (np.array(camera.size) - 1.0), pixels.shape)
     point, _ = triangulate([known, camera], np.stack([pixels, middle]))
     origin, ray = known.rays(pixels)
@@ -85,7 +86,7 @@ def _epipolar_lines(pixels: Array, known: Camera, camera: Camera) -> tuple[Array
 
 
 def _strengths(points: Array, ways: Array, smooth: Image, factors: Array, bodies: Bodies) -> Array:
-    """Darkness of a line, (n, m, t), that runs through points (n, t, 2) in directions (n, m, 2)."""
+    """Darkness (n, m, t) of a line through points (n, t, 2) in directions (n, m, 2)."""
     height, width = smooth.shape
     column = np.rint(points[..., 0]).astype(np.intp).clip(1, width - 2)
     row = np.rint(points[..., 1]).astype(np.intp).clip(1, height - 2)
@@ -104,7 +105,7 @@ def _strengths(points: Array, ways: Array, smooth: Image, factors: Array, bodies
 
 
 def _best_path(reward: Array) -> tuple[float, NDArray[np.intp]]:
-    """The largest sum of rewards (n, slope, t) along a smooth path, and its t, (n,)."""
+    """Largest sum of rewards (n, slope, t) along a smooth path, and its t, (n,)."""
     count = reward.shape[2]
     before = np.arange(count) - _SLOPES[:, None]
     outside = (before < 0) | (before >= count)

@@ -1,15 +1,14 @@
-"""One whisker of one view, followed from frame to frame, and known by its appearance.
+"""Follower of one whisker in one view from frame to frame, with a model of its appearance.
 
-Each frame is expected to show what the two before it lead to: from the expected base a Kalman
-filter goes outward along the expected curve (`vibrissa.tracking.trace.ridge.march`), past whatever
-hides the whisker; the curve found is then measured across and smoothed. If less of it is supported
-than was lately, the frame is searched with fewer expectations: no movement, any curvature, any
-direction.
+The two frames before predict the next one: from the expected base a Kalman filter proceeds outward
+along the expected curve (`vibrissa.tracking.trace.ridge.march`), past whatever hides the whisker;
+the resulting curve is then measured across and smoothed. If less of it is supported than recently,
+the frame is searched with fewer expectations: no motion, any curvature, any direction.
 
-The appearance of a whisker, by which it is recognised where its position does not decide, is the
-length that is seen, how dark the whisker is compared with its surroundings, from its base outward,
-and by how much it turns from one piece to the next. The first two are logarithms, so that
-differences are relative. What it does not show, because the whisker is too short there, is NaN.
+The appearance of a whisker, which identifies it where its position does not, consists of the length
+that is seen, the darkness compared with the surroundings, from its base outward, and the turns from
+one piece to the next. The first two are logarithms, so that differences are relative. Features of
+parts that are not visible are NaN.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from vibrissa.tracking.trace.ends import OUTSIDE, grey_flanks, traced
 from vibrissa.tracking.trace.ridge import FEWEST, march, measure, middle, noise_level, smooth
 from vibrissa.tracking.trace.trace import STEP, Trace, TraceOptions, aligned, overlap
 
-# Points of a trace over which darkness and direction are taken.
+# Points of a trace over which darkness and direction are averaged.
 _DARK = ((5, 25), (25, 50), (50, 80))
 _ALONG = ((3, 11), (20, 28), (40, 48), (60, 68))
 FEATURES = 1 + len(_DARK) + len(_ALONG) - 1
@@ -37,26 +36,26 @@ FEATURES = 1 + len(_DARK) + len(_ALONG) - 1
 _SPREAD = np.array([0.12, *[0.15] * len(_DARK), *[0.03] * (len(_ALONG) - 1)])
 # Factor of the spread toward shorter lengths: a whisker may be hidden, but is never longer.
 _SHORTER = 3.0
-# Standard deviations beyond which a difference counts no more: contact bends, blur pales.
+# Standard deviations at which a difference saturates: contact bends, blur reduces contrast.
 _MOST = 3.0
-_HIDDEN = 2.0  # standard deviations that count where a line does not show what is usual
+_HIDDEN = 2.0  # standard deviations that count where a line lacks a usual feature
 _WEIGHT = 0.5  # weight of the sum of squares: pieces of one whisker do not change independently
 ENOUGH = 5  # number of frames after which the appearance of a whisker is known
 _REMEMBERED = 200  # number of frames over which its appearance is remembered
-_LEARNED = 20  # number of frames from which it changes too little to be learned in each frame
+_LEARNED = 20  # number of frames from which it changes too slowly to be updated in each frame
 _PROXIMAL = 30  # points at the beginning of a line by which it is compared with the expected one
 _TURNED = 0.87  # cosine of the largest turn between frames of a whisker that is wholly seen, 30°
 _COLD = 6  # number of lines near a base that are traced without expectations
 # Number of frames after which a whisker that is seen shorter is searched without expectations.
 _SEARCHED = 5
-# Share of the usual length with which a whisker is found without doubt, and at least.
+# Share of the usual length above which a whisker is certainly found, and the smallest share.
 _WANTED, _LEAST = 0.85, 0.4
 _BETTER = 1.1  # factor by which a line that is found without expectations must be longer
-_REPEATED = 0.5  # distance of two marches that go the same way, pixels, at most
+_REPEATED = 0.5  # largest distance of two marches along the same path, pixels
 _CLICK = 20.0  # standard deviation of a click from the base of its whisker, pixels
 # Smallest brightness on both sides of a whisker, relative to the bright parts of the image.
 _BRIGHT = 0.35
-# Depth inside the face at which the base is searched where it is known by a click only, pixels.
+# Depth inside the face within which the base is searched after a click, pixels.
 _AROUND = 36.0
 # Standard deviations of offset, direction and curvature at the start, and drift of the last.
 _SPREADS = {
@@ -67,14 +66,14 @@ _SPREADS = {
 
 
 class Appearance(NamedTuple):
-    """Usual look of a whisker, and by how much that varies."""
+    """Usual appearance of a whisker, and its variation."""
 
     middle: Array
     spread: Array
 
     @classmethod
     def of(cls, features: Sequence[Array]) -> Appearance:
-        """Take it from the features in some frames."""
+        """Appearance from the features in some frames."""
         if len(features) < ENOUGH:
             return cls(np.full(FEATURES, np.nan), _SPREAD)
         known = np.array(features)
@@ -95,7 +94,7 @@ class Appearance(NamedTuple):
 
 
 def _medians(values: Array) -> Array:
-    """Median of each column without what is NaN, without the checks that take longer than it."""
+    """Median of each column without NaN, without the checks of NumPy, which take longer."""
     count = np.isfinite(values).sum(axis=0)
     ordered, columns = np.sort(values, axis=0), np.arange(values.shape[1])
     low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, len(values) - 1)
@@ -104,7 +103,7 @@ def _medians(values: Array) -> Array:
 
 
 def features_of(frame: Frame, trace: Trace, clutter: Clutter = NOTHING) -> Array:
-    """Features of a traced whisker: length, darkness and turns; infinite what others hide."""
+    """Features of a traced whisker: length, darkness and turns; infinite where others hide them."""
     features = np.full(FEATURES, np.nan)
     n = len(trace.line)
     if n < 2 or not trace.seen.any():
@@ -130,7 +129,7 @@ def features_of(frame: Frame, trace: Trace, clutter: Clutter = NOTHING) -> Array
 
 @dataclass
 class Follower:
-    """One whisker in one view, from frame to frame; its base is where about it leaves the face."""
+    """One whisker in one view, followed from frame to frame; its base is near the face's edge."""
 
     base: Array
     options: TraceOptions = field(default_factory=TraceOptions)
@@ -145,13 +144,13 @@ class Follower:
     clutter: Clutter = NOTHING
 
     def restart(self, trace: Trace) -> None:
-        """Continue from a trace of the last frame that is known to be right."""
+        """Continue from a trace of the last frame that is known to be correct."""
         self._before, self._last, self._missing = None, trace, 0
         self.base = trace.line[0]
         self._supports = [self.length_of(trace)]
 
     def follow(self, frame: Frame) -> Trace:
-        """Find the whisker in the next frame, without regard to others; empty if it is lost."""
+        """Find the whisker in the next frame, regardless of others; empty if it is lost."""
         noise, best = noise_level(frame), Trace.lost()
         for trace in self.along_expected(frame, noise):
             if self.length_of(trace) > self.length_of(best):
@@ -163,7 +162,7 @@ class Follower:
         waits = length >= self.wanted or (steady and self._unsearched < _SEARCHED)
         if not (belongs and waits):
             self._unsearched = 0
-            # What is as good without expectations as with them is no better.
+            # A trace without expectations must be better than one with them.
             least = _BETTER * length * belongs
             cold = max(self.from_base(frame, noise, least), key=self._worth, default=Trace.lost())
             if cold.support > least:
@@ -171,44 +170,44 @@ class Follower:
         return self.accept(best) if self._belongs(best) else self.lose()
 
     def length_of(self, trace: Trace) -> float:
-        """Length that is seen or that something else is in the way of, pixels."""
+        """Length that is seen or hidden by clutter, pixels."""
         hidden = self.clutter.hides(trace.line) & ~trace.seen
         return trace.support + STEP * float(hidden.sum())
 
     @property
     def usual(self) -> float:
-        """Length that is usually seen, pixels; 0 before anything was."""
+        """Length that is usually seen, pixels; 0 at first."""
         return middle(np.array(self._supports)) if self._supports else 0.0
 
     @property
     def _lately(self) -> float:
-        """Length that was seen lately, pixels: it falls as the whisker turns to the camera."""
+        """Length seen recently, pixels; it decreases as the whisker turns to the camera."""
         return middle(np.array(self._supports[-3:])) if self._supports else 0.0
 
     @property
     def wanted(self) -> float:
-        """Length with which it is found without doubt, pixels."""
+        """Length above which the whisker is certainly found, pixels."""
         return _WANTED * self.usual if self._supports else np.inf
 
     @property
     def expected(self) -> Array | None:
-        """Line on which the next frame should show it, (n, 2); None before it was ever seen."""
+        """Expected line in the next frame, (n, 2); None before the first one."""
         moving = self._moving
         return self.last if moving is None else moving
 
     @property
     def last(self) -> Array | None:
-        """Line on which it was seen last, (n, 2)."""
+        """Line on which it was last seen, (n, 2)."""
         return None if self._last is None else self._last.line
 
     @property
     def _moving(self) -> Array | None:
-        """Line on which it will be if it moves on; None if that is not known."""
+        """Expected line if the motion continues; None if that is unknown."""
         if self._last is None or self._before is None or self._missing:
             return None
         before, last = self._before.line, self._last.line
         n = min(len(before), len(last))
-        # Across only: where along itself it is seen to begin varies, and moves no point of it.
+        # Across only: the start of the visible part varies along the whisker without any motion.
         across = np.gradient(last[:n], axis=0)[:, ::-1] * [-1.0, 1.0] / STEP
         velocity = ((last[:n] - before[:n]) * across).sum(axis=1, keepdims=True) * across
         beyond = np.repeat(velocity[-1:], len(last) - n, axis=0)
@@ -216,7 +215,7 @@ class Follower:
 
     @property
     def reach(self) -> float:
-        """Distance from there at which it may be, pixels; it grows while the whisker is lost."""
+        """Largest distance from the expected line, pixels; it grows while the whisker is lost."""
         return self.options.jump + min(self._missing, 60)
 
     def long_enough(self, trace: Trace) -> bool:
@@ -233,14 +232,14 @@ class Follower:
         away = _distances(expected[4:_PROXIMAL], trace.line[: 2 * _PROXIMAL])
         if float(np.median(away)) <= self.reach:
             return True
-        # It may have turned about its base by more: then all of it is seen, and no more than that.
+        # It may have turned about its base by more if all of it, and nothing else, is seen.
         share = self.length_of(trace) / max(self.usual, 1.0)
         base = _distances(last[:1], trace.line[:_PROXIMAL])[0]
         whole = _WANTED <= share <= 1.0 / _WANTED and aligned(last, trace.line) > _TURNED
         return bool(whole and base <= self.options.jump)
 
     def accept(self, trace: Trace) -> Trace:
-        """Take a trace for the whisker in the next frame; less confident if it is short."""
+        """Accept a trace as the whisker in the next frame; less confident if it is short."""
         length = self.length_of(trace)
         usual = self.usual or length
         self._before = self._last if self._missing == 0 else None
@@ -251,7 +250,7 @@ class Follower:
         return trace._replace(confidence=confidence)
 
     def remember(self, features: Array) -> None:
-        """Learn its appearance from a frame in which it was found."""
+        """Update its appearance from a frame in which it was found."""
         self._features = [*self._features[-_REMEMBERED + 1 :], features]
         self._learned += 1
         if self._learned <= _LEARNED or self._learned % ENOUGH == 0:
@@ -263,14 +262,14 @@ class Follower:
         return Trace.lost()
 
     def carry(self, angle: float, shift: Array) -> None:
-        """Let the whisker, while it is lost, turn about its base and shift as others do."""
+        """While it is lost, turn the whisker about its base and shift it as the others."""
         if self._last is not None:
             line = _turned(self._last.line, angle) + shift
             self._last = self._last._replace(line=line)
             self.base = line[0]
 
     def along_expected(self, frame: Frame, noise: float) -> Iterator[Trace]:
-        """Trace along where it is expected, with fewer and fewer expectations, until found."""
+        """Trace near the expected line, with fewer and fewer expectations, until found."""
         if self.last is None:
             return
         moving = self._moving
@@ -280,7 +279,7 @@ class Follower:
         tried: list[tuple[Array, Trace]] = []
         for guess in guesses:
             march = self._expected_march(frame, noise, *guess)
-            # Marches that go the same way are traced once.
+            # Marches along the same path are traced once.
             trace = next((one for line, one in tried if _repeats(march[0], line)), None)
             if trace is None:
                 trace = self._finished(frame, noise, *march)
@@ -309,9 +308,9 @@ class Follower:
         return self._march(frame, noise, start, bend, manner)
 
     def from_base(self, frame: Frame, noise: float, least: float = 0.0) -> list[Trace]:
-        """Trace in all directions from the base, but for what is shorter than a length, pixels.
+        """Trace in all directions from the base, except lines shorter than a length, pixels.
 
-        Traces are different ones, on bright ground: what is seen on the face is fur.
+        The traces are distinct and on bright ground: lines on the face are fur.
         """
         bend = np.zeros(int(np.hypot(*frame.shape) / STEP))
         tries = []
@@ -338,7 +337,7 @@ class Follower:
         return found
 
     def _worth(self, trace: Trace) -> float:
-        """Length that is seen, less the farther from where it is to begin, and the longer."""
+        """Seen length, reduced by the distance from its expected base, more for longer lines."""
         away = float(np.linalg.norm(trace.line[0] - self.base)) / _CLICK
         longer = _WANTED * trace.support / self.usual if self.usual else 1.0
         return trace.support * float(np.exp(-0.5 * away**2)) / max(longer, 1.0) ** 2
@@ -374,7 +373,7 @@ class Follower:
     def _finished(
         self, frame: Frame, noise: float, line: Array, support: Array, before: float = OUTSIDE
     ) -> Trace:
-        """Smooth a marched line over what is hidden, then measure it."""
+        """Smooth a marched line over hidden parts, then measure it."""
         if len(line) < FEWEST:
             return Trace.lost()
         line = smooth(line, np.where(support > 0.0, 4.0, 0.0), self.options.stiffness)
@@ -382,13 +381,13 @@ class Follower:
 
 
 def _turned(line: Array, angle: float) -> Array:
-    """Turn a line about its first point, from the columns toward the rows."""
+    """Rotate a line about its first point, from the columns toward the rows."""
     c, s = np.cos(angle), np.sin(angle)
     return np.asarray(line[0] + (line - line[0]) @ np.array([[c, s], [-s, c]]))
 
 
 def _repeats(line: Array, other: Array) -> bool:
-    """Whether a march goes nowhere but where another one went, and as far."""
+    """Whether a march follows the path of another one, to its end."""
     far = abs(len(line) - len(other)) > 1
     return not far and len(line) > 1 and overlap(line, other, _REPEATED) == 1.0
 
@@ -405,7 +404,7 @@ def _distances(line: Array, other: Array) -> Array:
 
 
 def start_at(base: ArrayLike, options: TraceOptions | None = None) -> Follower:
-    """Begin to follow the whisker that starts about at a column and row."""
+    """Follower of the whisker that starts near a column and row."""
     point = np.asarray(base, dtype=np.float64)
     if point.shape != (2,) or not np.isfinite(point).all():
         raise ValueError(f"base is {point.tolist()}; a column and a row are needed")

@@ -1,14 +1,15 @@
-"""Several whiskers of one view: which line each of them has, over all frames.
+"""Identity of several whiskers of one view over all frames.
 
-A *way* gives lines to whiskers, no two of them to one line; a whisker without a line is lost. A way
-costs what its whiskers look unlike themselves, and what bases cost that have changed their order on
-the face. Costs are negative logarithms of likelihoods. The sum is not one over whiskers, because of
-lines that overlap and bases that swap, so that no linear assignment finds the cheapest way; a
-search, cheapest first, does.
+An *assignment* gives lines to whiskers, each line to at most one; a whisker without a line is lost.
+Its cost is the unlikeness of the whiskers to their usual appearance, plus a cost for bases that
+have changed their order on the face. Costs are negative log-likelihoods. Because of lines that
+overlap and bases that swap, the sum does not separate over whiskers, so that no linear assignment
+gives the minimum; a best-first search does.
 
 From frame to frame lines are proposed (`vibrissa.tracking.trace.row`). When all frames are known,
-motions other than the row's cost too, and the cheapest succession of ways is found, forward and
-backward (Viterbi). A whisker whose line might as well be another's is lost rather than guessed.
+motions other than the row's have a cost too, and the cheapest sequence of assignments is found
+forward and backward (Viterbi). A whisker whose line could equally be another's is lost rather than
+guessed.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from vibrissa.numerics import Array, Mask
 from vibrissa.tracking.trace.follower import ENOUGH, FEATURES, Appearance
 from vibrissa.tracking.trace.trace import STEP, Trace, overlap
 
-# Number of each whisker's line; −1 if it is lost.
+# Index of each whisker's line; −1 if it is lost.
 Ways = NDArray[np.intp]
 Way = tuple[int, ...]
 # Points at the beginning of a line by which it is distinguished from others.
@@ -40,14 +41,14 @@ _ROUNDS = 3  # number of rounds in which the appearance of whiskers is learned
 # Standard deviations of a whisker's shift, pixels, and turn, rad, relative to the row's.
 _SHIFT, _TURN = 4.0, 0.06
 _ROW = 3.0  # standard deviation of the row's motion as a whole, in units of these
-_MOVED = 3.0  # standard deviations beyond which a motion counts no more: whiskers do jump
+_MOVED = 3.0  # standard deviations at which the cost of a motion saturates, since whiskers do jump
 # Largest number of ways of a frame, and the cost by which they may exceed the cheapest.
 _KEPT, _DEARER = 48, 14.0
 
 
 @dataclass
 class Seen:
-    """Lines that are seen in one frame."""
+    """Lines seen in one frame."""
 
     lines: list[Trace]
     features: list[Array]
@@ -64,7 +65,7 @@ class Seen:
 
 
 class Assignment:
-    """Lines of a frame that are given to whiskers."""
+    """Lines of a frame to be assigned to whiskers."""
 
     def __init__(self, lines: Sequence[Trace], bases: Array) -> None:
         self.clash = clashes([trace.line for trace in lines])
@@ -72,7 +73,7 @@ class Assignment:
         between = bases[:, None] - bases[None]
         size = np.maximum(np.linalg.norm(between, axis=2), 1e-9)[..., None, None]
         along = np.einsum("kjx,cdx->kjcd", between, begin[:, None] - begin[None]) / size
-        # How clearly two bases have swapped, 0 to 1.
+        # Degree to which two bases have swapped, 0 to 1.
         self._swaps = (_SWAPPED * np.clip(-along / _APART, 0.0, 1.0)).tolist()
 
     def ways(
@@ -82,10 +83,10 @@ class Assignment:
         limit: float = np.inf,
         settled: frozenset[int] = frozenset(),
     ) -> Iterator[tuple[float, Way]]:
-        """Costs below a limit and their ways, the cheapest first.
+        """Costs below a limit and their assignments, the cheapest first.
 
-        A line (column of ``price``) that is twice as dear as a loss is never given. Settled
-        whiskers may have lines that overlap.
+        A line (column of ``price``) that costs twice as much as a loss is never assigned. Settled
+        whiskers may have overlapping lines.
         """
         order = sorted(range(len(price)), key=lambda k: k not in settled)
         clash = self.clash.tolist()
@@ -96,7 +97,7 @@ class Assignment:
             )
             for k in order
         ]
-        # The least that the whiskers from each on cost.
+        # The smallest cost of each whisker and all later ones.
         rest = np.cumsum([0.0, *(each[0][0] for each in options[::-1])])[::-1].tolist()
         heap: list[tuple[float, int, float, Way]] = [(rest[0], 0, 0.0, ())]
         while heap:
@@ -131,7 +132,7 @@ def clashes(lines: Sequence[Array]) -> Mask:
 
 
 class _Step(NamedTuple):
-    """The cheapest ways of a frame."""
+    """The cheapest assignments of a frame."""
 
     ways: Ways  # (way, whisker), −1 if lost
     cost: Array  # (way,)
@@ -167,7 +168,7 @@ def decided(frames: Sequence[Seen], bases: Array) -> list[list[int]]:
 
 
 def _step(seen: Seen, problem: Assignment, known: Sequence[Appearance], settled: set[int]) -> _Step:
-    """The cheapest ways to give lines to whiskers in one frame."""
+    """The cheapest assignments of one frame."""
     price = np.array(
         [[each.unlikeness(features) for features in seen.features] for each in known]
     ).reshape(len(known), -1)
@@ -190,7 +191,7 @@ def _cheapest(
     steps: Sequence[_Step],
     motions: Sequence[Array],
 ) -> list[list[int]]:
-    """The cheapest succession of ways, without whiskers in doubt."""
+    """The cheapest sequence of assignments, without whiskers in doubt."""
     moves = [
         _moves(motion, one.ways, other.ways)
         for motion, (one, other) in zip(motions, pairwise(steps), strict=True)
@@ -208,7 +209,7 @@ def _cheapest(
 
 
 def _certain(seen: Seen, fixed: set[int], ways: Ways, total: Array) -> list[int]:
-    """The best way of a frame, without those for whom another line is hardly dearer."""
+    """The best assignment of a frame, without whiskers for which another line costs hardly more."""
     best = ways[np.argmin(total)]
     way = []
     for k, c in enumerate(best):
@@ -225,7 +226,7 @@ def _certain(seen: Seen, fixed: set[int], ways: Ways, total: Array) -> list[int]
 
 
 def same_whisker(trace: Trace, other: Trace, near: float = np.inf) -> bool:
-    """Whether two lines begin as one, with first points so near, so that they are one whisker."""
+    """Whether two lines begin so similarly that they are one whisker."""
     n = min(len(trace.line), len(other.line), 3 * int(POINTS[-1]))
     if overlap(trace.line[:n], other.line[:n], 1.5) < 0.8:
         return False
@@ -233,7 +234,7 @@ def same_whisker(trace: Trace, other: Trace, near: float = np.inf) -> bool:
 
 
 def _motions(lines: Sequence[Trace], others: Sequence[Trace]) -> Array:
-    """Shift and turn from each line to each of the next frame's; NaN where there is none."""
+    """Shift and turn from each line to each of the next frame's; NaN if undefined."""
     motion = np.full((len(lines) + 1, len(others) + 1, 2), np.nan)
     for i, trace in enumerate(lines):
         for j, other in enumerate(others):
@@ -242,10 +243,10 @@ def _motions(lines: Sequence[Trace], others: Sequence[Trace]) -> Array:
 
 
 def _moves(motion: Array, one: Ways, other: Ways) -> Array:
-    """Cost of going from each way of a frame to each of the next, (way, way)."""
+    """Cost of the transition from each assignment of a frame to each of the next, (way, way)."""
     moved = motion[one[:, None] + 1, other[None] + 1]
     missing: Mask = np.all(np.isnan(moved[..., 0]), axis=2)
-    # The row moves as the median whisker does, and not at all where none is seen.
+    # The row moves as the median whisker does, and not at all if none is seen.
     row = np.nanmedian(np.where(missing[:, :, None, None], 0.0, moved), axis=2)
     away = np.minimum(np.nan_to_num(moved - row[:, :, None]) ** 2, _MOVED**2)
     gone = ((one[:, None] < 0) != (other[None] < 0)).sum(axis=2)

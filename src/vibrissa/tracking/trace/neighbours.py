@@ -1,9 +1,10 @@
-"""Whiskers next to those that are asked for: they are followed too, so that none takes their lines.
+"""Neighbours of the requested whiskers, which are followed too so that none takes their lines.
 
 In some frames, lines that move and leave the face are found, and the motion of the face between
-these frames from where they begin. What begins at one place of the face is one hair or whisker; a
-whisker is sometimes seen as long as others are. A hair may be joined to the end of a whisker that
-it crosses: in some of the frames all are begun together, and that end is the whisker's.
+these frames from their beginnings. Lines that begin at one position on the face belong to one hair
+or whisker; a whisker is sometimes as long as others. A hair may be joined to the end of a whisker
+that it crosses: in some of the frames all are begun together, which assigns that end to the
+whisker.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
-"""A thin dark line in a grey image: followed, measured across, smoothed, and cut at its ends.
+"""A thin dark line in a grey image: followed, measured across and smoothed.
 
-Across the line, at whole steps, the image is sampled bilinearly. A point is *supported* if it is
-darker than both of its sides: the edge of a dark object is darker than one side only. Where it is
-supported, the line's middle is found to a fraction of a pixel by least squares,
+The image is sampled bilinearly across the line, at whole steps. A point is *supported* if it is
+darker than both of its sides: the edge of a dark object is darker than one side only. At a
+supported point the middle of the line is found to a fraction of a pixel by least squares,
 
     p(x) = b + c x − A g(x − δ) ≈ b + c x − A g(x) + A δ g'(x),
 
-g being a Gaussian about as wide as the blurred line. The smoothing is least squares with a penalty
-on third differences, each point weighted by its own uncertainty, so that what is hidden is bridged
-by a curve of even bend.
+with a Gaussian g about as wide as the blurred line. Smoothing is least squares with a penalty on
+third differences, each point weighted by its own uncertainty, so that hidden parts are bridged by a
+curve of even bend.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ Mask = NDArray[np.bool_]
 
 HALF = 4  # the fit takes samples from −HALF to HALF
 WIDTH = 1.4  # standard deviation of g, in steps
-TURNING = 2.8  # largest turn of a whisker from base to tip, rad: what goes round is not one
-# Depth at which a point is supported while a line is followed, standard deviations.
+TURNING = 2.8  # largest turn of a whisker from base to tip, rad
+# Depth above which a point is supported while a line is followed, standard deviations.
 _CLEARLY_DARK = 3.0
 
 
@@ -51,7 +51,7 @@ ROWS, DEPTH_VARIANCE, SLOPE_VARIANCE = _fit_rows()
 
 @inlined
 def sample(frame: Any, x: float, y: float) -> Any:
-    """Grey value between pixels; the border goes on outside."""
+    """Grey value between pixels; the border continues outside."""
     rows, columns = frame.shape
     x = min(max(x, 0.0), columns - 1.001)
     y = min(max(y, 0.0), rows - 1.001)
@@ -83,7 +83,7 @@ def sample_across(
 
 @inlined
 def depth(p: Any, j: int) -> Any:
-    """How much darker sample j is than the darker one of its two sides."""
+    """Darkness of sample j compared with the darker one of its two sides."""
     left = (p[j - 5] + p[j - 4] + p[j - 3]) / 3.0
     right = (p[j + 3] + p[j + 4] + p[j + 5]) / 3.0
     return min(left, right) - 0.25 * (p[j - 1] + 2.0 * p[j] + p[j + 1])
@@ -91,7 +91,7 @@ def depth(p: Any, j: int) -> Any:
 
 @inlined
 def fit(p: Any, j: int, rows: Any, out: Any) -> None:
-    """Amplitude A and place δ relative to sample j."""
+    """Amplitude A and position δ relative to sample j."""
     amplitude, product = 0.0, 0.0
     for i in range(9):
         amplitude -= rows[0, i] * p[j - 4 + i]
@@ -102,7 +102,7 @@ def fit(p: Any, j: int, rows: Any, out: Any) -> None:
 
 @inlined
 def middle_of(histogram: Any, count: int, width: int) -> Any:
-    """Median of numbers that lie at multiples of a width, each being anywhere within it."""
+    """Median of values binned by multiples of a width, each uniform within its bin."""
     seen = 0
     for d in range(0, histogram.size, width):
         if 2 * (seen + histogram[d]) >= count:
@@ -115,8 +115,8 @@ def middle_of(histogram: Any, count: int, width: int) -> Any:
 def noise_level(frame: Any) -> float:
     """Standard deviation of the noise, from second differences on a sparse grid.
 
-    Compression removes fine noise and leaves coarse: of differences of single pixels and those that
-    `depth` takes, the larger noise counts.
+    Compression removes fine noise and leaves coarse noise: the larger of that of single pixels and
+    of the differences used by `depth` counts.
     """
     rows, columns = frame.shape
     fine, coarse = np.zeros(4096, np.int64), np.zeros(4096, np.int64)
@@ -139,9 +139,9 @@ def noise_level(frame: Any) -> float:
 
 @inlined
 def darkest_expected(profile: Any, gate: int, scale: float, sd: float, variance: float) -> Any:
-    """Depth, in standard deviations, and number of the likeliest sample; depth 0: none is likely.
+    """Depth, in standard deviations, and number of the most probable sample; depth 0 if none.
 
-    Far from where the line is expected only a darker sample counts.
+    Far from the expected position only a darker sample counts.
     """
     reach = gate + 5
     best, value, at = 0.0, 0.0, -1
@@ -181,12 +181,11 @@ def march(
     line: Any,
     support: Any,
 ) -> int:
-    """Follow a line outward from a point, as a Kalman filter along arc length.
+    """Follow a line outward from a point by a Kalman filter along arc length.
 
-    Its state is the sideways offset, the direction and the curvature; what it measures is where
-    across the line the image is darkest. Where nothing is seen it continues with the curvature it
-    had, and the gate widens with its variance. Where something else is in the way nothing is
-    measured, nor missed.
+    Its state is the sideways offset, the direction and the curvature; its measurement is the
+    darkest position across the line. Where nothing is seen it continues with the same curvature,
+    and the gate widens with its variance. Clutter counts neither as seen nor as missed.
     """
     rows, columns = frame.shape
     x, y, angle, bend = start[0], start[1], start[2], 0.0
@@ -264,7 +263,7 @@ def measure(
     flank: Any,
     support: Any,
 ) -> None:
-    """Measure a line across a curve near it, where nothing else is in the way."""
+    """Measure a line across a nearby curve, where there is no clutter."""
     n = line.shape[0]
     rows, columns = frame.shape
     reach = gate + 5
@@ -310,10 +309,9 @@ def measure_ends(
     counts: Any,
     gains: Any,
 ) -> None:
-    """Measure lines that may be the rest of one, and count the points up to where most is seen.
+    """Measure alternative continuations of a line, and count the points up to the best end of each.
 
-    Each point that is seen gains one, and each that is not, but where nothing is in the way, costs
-    one.
+    A supported point adds one; an unsupported one without clutter subtracts one.
     """
     n = lines.shape[1]
     amplitude, flank, support = np.empty(n), np.empty(n), np.empty(n)
@@ -332,7 +330,7 @@ def measure_ends(
 def flanks(frame: Any, line: Any, distance: float, bits: Any, which: int, out: Any) -> None:
     """Grey values at a distance from a curve, to its left (−dy, dx) and to its right.
 
-    NaN where something else is in the way.
+    NaN where there is clutter.
     """
     for k in range(line.shape[0]):
         nx, ny = normal(line, k)
@@ -342,16 +340,16 @@ def flanks(frame: Any, line: Any, distance: float, bits: Any, which: int, out: A
             out[k, side] = np.nan if in_the_way(bits, which, x, y) else sample(frame, x, y)
 
 
-# Depth at which a point of a line that is about known is supported, standard deviations.
+# Depth above which a point of an approximately known line is supported, standard deviations.
 _SUPPORTED = 2.5
 _MEDIAN = 0.455  # median of the square of a standard normal number
-FEWEST = 12  # number of points of the shortest line that is considered
+FEWEST = 12  # number of points of the shortest line
 # Standard deviation next to an edge that never moves, common to neighbouring points, pixels.
 _DISTURBED = 0.15
 
 
 class Measured(NamedTuple):
-    """What was measured along a line, point by point."""
+    """Measurements along a line, point by point."""
 
     amplitude: Array
     sigma: Array
@@ -367,7 +365,7 @@ class Measured(NamedTuple):
 
 
 class Fitted(NamedTuple):
-    """A smooth line through what was measured across another one, and how well it is known."""
+    """Smooth line through measurements across another one, with uncertainties."""
 
     line: Array
     amplitude: Array
@@ -395,9 +393,9 @@ def fitted(
     variance = SLOPE_VARIANCE * (noise * options.scale / np.maximum(amplitude, 1e-3)) ** 2
     weight = seen / (variance + 0.03**2)
     better = smooth(points, weight, options.stiffness)
-    # What is far from its neighbours counts less, the second time.
+    # Points far from their neighbours are weighted down in the second pass.
     miss = ((points - better) ** 2).sum(axis=1) * weight
-    # Compression removes noise where nothing is, and adds it where something is.
+    # Compression removes noise from flat regions, and adds it near edges.
     excess = max(1.0, middle(miss[seen]) / _MEDIAN) if seen.any() else 1.0
     weight *= 9.0 / np.maximum(miss / excess, 9.0) / excess
     better = smooth(points, weight, options.stiffness)
@@ -413,7 +411,7 @@ def measured(
     skipped: int = 0,
     clutter: Clutter = NOTHING,
 ) -> tuple[Array, Measured]:
-    """Measure across a line, smooth it, and state how well each of its points is known."""
+    """Measure across a line, smooth it, and state the uncertainty of each point."""
     fit = fitted(frame, line, gate, noise, options, clutter, skipped)
     information = np.convolve(fit.weight, np.ones(min(9, len(line))), mode="same")
     sigma = 1.0 / np.sqrt(np.maximum(information, 1.0))
@@ -426,7 +424,7 @@ def measured(
 
 
 def middle(values: Array) -> float:
-    """Median of some numbers, without the checks that take longer than it."""
+    """Median, without the checks of NumPy, which take longer."""
     half = len(values) // 2
     before = max(half - 1, 0)
     part = np.partition(values, (before, half))
@@ -434,7 +432,7 @@ def middle(values: Array) -> float:
 
 
 def _distance_to_seen(seen: Mask) -> Array:
-    """Number of points between each and the nearest that is seen; 1000 if none is."""
+    """Number of points to the nearest seen one; 1000 if there is none."""
     known, points = np.flatnonzero(seen), np.arange(len(seen))
     if not known.size:
         return np.full(len(seen), 1e3)
@@ -447,9 +445,9 @@ def _distance_to_seen(seen: Mask) -> Array:
 def smooth(line: Array, weight: Array, stiffness: float) -> Array:
     """Smooth a line (n, 2): weighted least squares with a penalty on third differences."""
     band = stiffness * _third_differences(len(line))
-    # A little pull to the first point, so that lines without any measurement have an answer.
+    # A weak pull to the first point, so that lines without any measurement have a solution.
     band[0] += weight + 1e-6
-    # Not solveh_banded, whose checks take longer than the solution.
+    # solveh_banded is avoided, since its checks take longer than the solution.
     return np.asarray(dpbsv(band, weight[:, None] * (line - line[0]), lower=1)[1] + line[0])
 
 

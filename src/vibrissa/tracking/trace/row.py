@@ -1,14 +1,14 @@
-"""Several whiskers of one view in one frame: which line each of them has.
+"""Several whiskers of one view in one frame: assignment of a line to each.
 
-In the first frame each is known from its click up to where it meets another one. Beyond it may go
-on in several ways, bending about as it did, to where the image shows a line; of all whiskers
-together the likeliest ways are taken, no two to the same end. Where whiskers lie on one another
-nothing is measured. From then on each is followed along where it is expected; one that stops at
-another, or has a kink there, is continued as in the first frame. Where there is any doubt, all
-lines of the frame are found once, and the cheapest way to give lines to whiskers is taken
-(`vibrissa.tracking.trace.identity`). Lines cost the more, the farther they begin from where the
-whisker is expected, and the shorter they are; the whole row may have turned and shifted by more
-than was expected, at a price of its own.
+In the first frame each whisker is known from its click up to where it meets another one. Beyond, it
+may continue in several ways, with about the same bend, to where the image shows a line; the most
+probable combination for all whiskers is chosen, no two with the same end. Where whiskers overlap
+nothing is measured. From then on each is followed along its expected line; one that stops at
+another, or has a kink there, is continued as in the first frame. In case of doubt, all lines of the
+frame are found once, and the cheapest assignment of lines to whiskers is chosen
+(`vibrissa.tracking.trace.identity`). A line costs more the farther it begins from where the whisker
+is expected, and the shorter it is; the whole row may have turned and shifted by more than expected,
+at a cost of its own.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ def _part(
     frame: Frame,
     scene: Scene | None,
 ) -> None:
-    """Let nothing be measured where whiskers lie on one another, on known or expected lines."""
+    """Exclude from measurement the parts where whiskers overlap, on known or expected lines."""
     every = [lines.get(k, follower.expected) for k, follower in enumerate(followers)]
     still = None if scene is None else scene.bits
     near = NEAR * followers[0].options.scale
@@ -159,9 +159,9 @@ def _begun(
     noise: float,
     scene: Scene | None,
 ) -> dict[int, Trace]:
-    """Whiskers in the first frame, each where it was clicked.
+    """Whiskers in the first frame, each at its click.
 
-    Where whiskers cross, a line may go on as another one: each is known up to there at first.
+    Where whiskers cross, a line may continue along another one: at first each is known up to there.
     """
     options = followers[0].options
     scene = scene or Scene.of([frame], options.scale)
@@ -206,7 +206,7 @@ def _through_crossings(
     noise: float,
     scene: Scene | None,
 ) -> dict[int, Trace]:
-    """Whiskers that are known up to where they cross others, each traced to its own end."""
+    """Whiskers known up to where they cross others, each traced to its own end."""
     _part(followers, {**known, **starts}, frame, scene)
     guesses = _continued(followers, starts, [*known.values()], frame, noise)
     lines, found = guesses, dict[int, Trace]()
@@ -235,7 +235,7 @@ def _continued(
     frame: Frame,
     noise: float,
 ) -> dict[int, Array]:
-    """Lines that go on as they bend and as the image shows, no two of them to the same end."""
+    """Continuations that keep the bend and that the image shows, no two of them to the same end."""
     if not starts:
         return {}
     most = max(2, min(_ENDS, int(_COMBINED ** (1.0 / len(starts)))))
@@ -267,7 +267,7 @@ def _shared(line: Array, other: Array) -> bool:
 
 
 def _ends(follower: Follower, start: Array, frame: Frame, noise: float, most: int) -> list[_End]:
-    """Different ways in which a whisker may go on: it bends as before, and changes that slowly."""
+    """Alternative continuations of a whisker, whose bend changes slowly."""
     lines, unlike = _fan(start)
     shown, counts, gains = (
         np.empty_like(lines),
@@ -291,7 +291,7 @@ def _ends(follower: Follower, start: Array, frame: Frame, noise: float, most: in
 
 
 def _fan(start: Array) -> tuple[Array, Array]:
-    """Lines (line, point, 2) that go on from a whisker's beginning, and how unlike it they are."""
+    """Lines (line, point, 2) that continue a whisker's beginning, and the cost of each."""
     n = min(len(start), _POLYNOMIAL)
     curving, slope, begin = np.polyfit(STEP * np.arange(1 - n, 1), start[-n:], 2)
     bend = 2.0 * (slope[0] * curving[1] - slope[1] * curving[0]) / np.hypot(*slope) ** 3
@@ -313,7 +313,7 @@ def _straightened(
     noise: float,
     scene: Scene | None,
 ) -> dict[int, list[Trace]]:
-    """Whiskers anew that end, or have a kink, where others are: theirs is another one's end."""
+    """Retrace whiskers that end, or have a kink, at others, and so may have taken another's end."""
     before = {k: traces[-1] for k, traces in own.items() if traces and len(traces[-1].line)}
     starts = {}
     for k, trace in before.items():
@@ -339,7 +339,7 @@ def _straightened(
 
 
 def _kink(trace: Trace) -> float:
-    """Root mean square distance of what is seen of a whisker from a smooth curve, pixels."""
+    """Root mean square distance of the seen part of a whisker from a smooth curve, pixels."""
     points = trace.line[trace.seen]
     if len(points) < _FEWEST:
         return 0.0
@@ -350,15 +350,15 @@ def _kink(trace: Trace) -> float:
 
 
 def _price(click: Array, curve: Curve, half: float) -> float:
-    """Cost of taking a curve for the whisker that was clicked."""
+    """Cost of assigning a curve to the whisker that was clicked."""
     away = min(from_click(click, curve.line), _passed(click, curve.line)[0])
     return LOST * (away / min(CLICK, half)) ** 2 + _SHORT / (1.0 + curve.score / _LIKELY)
 
 
 def _passed(click: Array, line: Array) -> tuple[float, int]:
-    """Distance of a click from where a line passes it, which has hairs before that, and the point.
+    """Distance of a click from a line, which may start with hairs before it, and the point.
 
-    What is before counts a little.
+    The length of the line before it adds a little.
     """
     near = line[arc_lengths(line) < _HAIR]
     far = np.hypot(*(near - click).T) + _BEFORE * arc_lengths(near)
@@ -383,7 +383,7 @@ def _seen(
     followers: Sequence[Follower],
     fixed: set[int],
 ) -> Seen:
-    """Contents of a frame: lines that were considered, and who was found where."""
+    """Record of a frame: lines that were considered, and the whiskers found."""
     lines = [trace for trace in found if len(trace.line)]
     lines += [trace for trace in pool if not any(trace.line is other.line for other in lines)]
     chosen = [
@@ -403,7 +403,7 @@ def _clearly(
     fixed: Mapping[int, Trace],
     frame: Frame,
 ) -> dict[int, Trace]:
-    """Whiskers about whose own lines there is no doubt."""
+    """Whiskers whose own lines are certain."""
     chosen: dict[int, Trace] = {}
     for k, traces in own.items():
         follower, expected = followers[k], followers[k].expected
@@ -420,7 +420,7 @@ def _clearly(
 
 
 def _without_clashes(chosen: Mapping[int, Trace], fixed: Mapping[int, Trace]) -> dict[int, Trace]:
-    """Whiskers whose lines are nobody else's."""
+    """Whiskers whose lines are not also those of others."""
     every = {**chosen, **fixed}
     clash = clashes([trace.line for trace in every.values()])
     doubtful = {k for k, row in zip(every, clash, strict=True) if row.sum() > 1}
@@ -436,7 +436,7 @@ def _pool(
     noise: float,
     scene: Scene | None,
 ) -> list[Trace]:
-    """Different lines that may be whiskers, the longest first."""
+    """Distinct lines that may be whiskers, the longest first."""
     proposed = [trace for traces in own.values() for trace in traces if len(trace.line)]
     options = followers[0].options
     missing = [followers[k] for k in own if k not in clear]
@@ -471,7 +471,7 @@ def _pool(
 def from_click(click: Array, line: Array) -> float:
     """Distance of a click from the beginning of a line, pixels.
 
-    Along the line's own direction a click may miss by more: the face hides where that begins.
+    Along the line's own direction a click may be farther away, since the face hides the beginning.
     """
     ahead = line[min(_DIRECTION, len(line) - 1)] - line[0]
     ahead = ahead / max(float(np.hypot(*ahead)), 1e-9)
@@ -491,7 +491,7 @@ def _distance_to_next(followers: Sequence[Follower]) -> Array:
 def _assigned(
     followers: Sequence[Follower], pool: Sequence[Trace], features: Sequence[Array], apart: Array
 ) -> Way:
-    """The cheapest way, whatever the row's motion, without whiskers in doubt."""
+    """Cheapest assignment over all motions of the row, without whiskers in doubt."""
     costs = _Costs.of(followers, pool, features, 0.5 * apart)
     problem = Assignment(pool, np.array([follower.base for follower in followers]).reshape(-1, 2))
     lost = np.full(len(followers), LOST)
@@ -513,7 +513,7 @@ def _assigned(
 
 
 class _Costs(NamedTuple):
-    """Costs of lines, by how far they begin from where each whisker is expected."""
+    """Costs of lines, by the distance of their beginning from where each whisker is expected."""
 
     price: Array  # (whisker, line), what does not depend on how the row moves
     offsets: Array  # (whisker, line, point), pixels
@@ -552,9 +552,9 @@ class _Costs(NamedTuple):
         return cls(price, offsets, reach, half[:, None], seen)
 
     def motions(self) -> list[tuple[float, float, float]]:
-        """Price, shift and turn of motions of the whole row that bring some whisker to some line.
+        """Cost, shift and turn of motions of the whole row that bring some whisker to some line.
 
-        They are relative to what is expected; the cheapest comes first.
+        They are relative to the expected motion; the cheapest comes first.
         """
         arms = STEP * POINTS
         design = np.linalg.pinv(np.stack([np.ones(len(arms)), arms], axis=1))
@@ -569,7 +569,7 @@ class _Costs(NamedTuple):
         return [(float(prices[i]), *motions[i].tolist()) for i in order]
 
     def after(self, shift: float, turn: float) -> Array:
-        """Cost of each line for each whisker if the row has moved; infinite beyond its reach."""
+        """Cost of each line for each whisker after a motion of the row; infinite out of reach."""
         moved = (shift + turn * STEP * POINTS) * self.seen[:, None, None]
         away = np.abs(self.offsets - moved)
         mean = away.mean(axis=2) / self.reach
@@ -580,7 +580,7 @@ class _Costs(NamedTuple):
 def _carry(
     followers: Sequence[Follower], before: Sequence[Array | None], found: Sequence[Trace]
 ) -> None:
-    """Let those that are lost move as those that are found did."""
+    """Move lost whiskers as the others have moved."""
     turns, shifts = [], []
     for line, trace in zip(before, found, strict=True):
         if line is not None and len(trace.line):

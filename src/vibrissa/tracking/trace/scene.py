@@ -1,9 +1,8 @@
-"""What does not move in a view: its light, its background, and how dark a body is.
+"""Static scene of a view: its light, its background, and the darkness of bodies.
 
-A whisker is thin and moves. A grey closing removes what is thin, so that light and bodies (the
-face, objects) stay; the value that a pixel exceeds in a sixth of the frames is its background, on
-which moving whiskers leave no mark, so that wires, glints and scale bars do not show in the
-difference from it.
+A whisker is thin and moves. A grey closing removes thin structures, leaving light and bodies (the
+face, objects). The value that a pixel exceeds in a sixth of the frames is its background, on which
+moving whiskers leave no trace; the difference from it does not show wires, glints and scale bars.
 """
 
 from __future__ import annotations
@@ -25,13 +24,13 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Labels = NDArray[np.int32]
 
-_HALF = 2  # factor by which images are made smaller before bodies are searched in them
+_HALF = 2  # factor by which images are reduced before bodies are searched in them
 _THIN = 7  # width of what a closing removes, pixels of half the size, for a whisker of usual width
 # Smoothing of the light, and of bodies before their edge is taken, pixels of half the size.
 _SOFT, _EDGE = 4.0, 0.75
 _SPARSE = 8  # distance of the pixels from which the brightness of a frame is taken
 _RANK = 0.15  # share of the frames in which a pixel is brighter than its background
-_FEWEST = 6  # number of frames from which a background can be taken
+_FEWEST = 6  # number of frames from which a background is computed
 # Largest brightness of bodies, in the mean and at their edges, relative to the light.
 _DARK, _LIT = 0.75, 0.85
 _EVEN = 0.01  # weight of the light being even, relative to that of the pixels
@@ -113,7 +112,7 @@ class Scene:
         scale: float = 1.0,
         mask: NDArray[np.bool_] | None = None,
     ) -> Scene:
-        """Take the scene from frames of one view; in masked pixels there is no whisker."""
+        """Scene from frames of one view; masked pixels contain no whisker."""
         if mask is not None and mask.shape != frames[0].shape:
             raise ValueError(
                 f"a mask has {mask.shape[1]} × {mask.shape[0]} pixels and the video "
@@ -140,7 +139,7 @@ class Scene:
         return _gain(frame[::_SPARSE, ::_SPARSE], self.sample)
 
     def bodies(self, frame: Frame) -> Bodies:
-        """Find what is dark and not thin in a frame."""
+        """Find dark regions that are not thin in a frame."""
         dark = _smoothed(_closed(_halved(frame), self.thin), _EDGE) < self.level * self.gain(frame)
         labels, count = ndimage.label(dark)
         area = np.bincount(labels.ravel(), minlength=count + 1)
@@ -159,13 +158,13 @@ class Scene:
         return Bodies(label_, face)
 
     def difference(self, frame: Frame) -> Image:
-        """How much darker a frame is than the light, pixel by pixel."""
+        """Darkness of a frame compared with the light, by pixel."""
         out = np.empty(frame.shape, dtype=np.float32)
         darker(frame, self.light, self.gain(frame), *_RANGE, out)
         return out
 
     def change(self, frame: Frame) -> Image:
-        """How much darker a frame is than its background or, if that is not known, the light."""
+        """Darkness of a frame compared with its background or, if that is unknown, the light."""
         if self.background is None:
             return self.difference(frame)
         out = np.empty(frame.shape, dtype=np.float32)
@@ -176,7 +175,7 @@ class Scene:
 
     @property
     def bits(self) -> Bits | None:
-        """Bits of `Clutter` of what never moves or is masked; None if neither is known."""
+        """Bits of `Clutter` for static or masked pixels; None if there are none."""
         bits = None if self.still is None else self.still.bits
         if self.mask is None:
             return bits
@@ -184,11 +183,11 @@ class Scene:
         return masked if bits is None else bits | masked
 
     def without_still(self, frame: Frame) -> Frame:
-        """Give a frame without what never moves, where that is known."""
+        """A frame without static objects, if these are known."""
         return frame if self.still is None else self.still.removed(frame, self.gain(frame))
 
     def with_still(self, bases: Array, frames: Sequence[Frame]) -> Scene:
-        """Find what never moves in these frames, but for what whiskers begin at (n, 2)."""
+        """Find static objects in these frames, except those at which whiskers begin (n, 2)."""
         if self.background is None or self.count < _MANY:
             return self
         shown = np.maximum(self.background, 1.0)
@@ -205,7 +204,7 @@ class Scene:
             )
             return np.where(weight > _ENOUGH, light / np.maximum(weight, 1e-6), ground)
 
-        # The soft edge of a shadow, left alone, would be a line.
+        # A soft edge of a shadow without the shadow would be a line.
         wider = ndimage.binary_dilation(stands, iterations=_SHADED)
         soft = wider & (np.abs(shown / around(wider) - 1.0) > _FAINT)
         open_ = around(stands | soft)
@@ -217,15 +216,15 @@ class Scene:
         stands, lines = stands & ~swept, np.where(swept, 0, lines)
         parts, _ = ndimage.label(stands)
         across = np.isin(lines, _long(lines))
-        # The face moves, with whatever hangs on it, but not a line that only passes the base, nor
-        # what a base far inside a body is before.
+        # The face moves, with all that is attached to it, but not a line that only passes the base,
+        # nor a body behind a base.
         row, column = (np.arange(n) for n in stands.shape)
         lifted = np.zeros_like(stands)
         for x, y in bases:
             away = np.hypot.outer(row - y, column - x)
             at_base = np.isin(parts, np.unique(parts[(away < _AT_BASE) & stands]))
             if stands[away < _DEEP].mean() > _COVERED:
-                # What is far darker than that hides the whisker.
+                # Much darker static objects hide the whisker.
                 lifted |= at_base & (shown > _OPAQUE * np.median(shown[away < _DEEP]))
                 continue
             for k in np.unique(lines[(away < _AT_BASE) & across]):
@@ -233,7 +232,7 @@ class Scene:
                     across &= lines != k
             other = (bodies > 0) & ~np.isin(bodies, np.unique(bodies[away < _AT_BASE]))
             stands &= ~at_base | across | other
-        # Where whiskers cross or turn it is always dark too, though not over a long way.
+        # Where whiskers cross or turn it is always dark too, but only over a short length.
         stands &= np.isin(parts, _long(parts)) | np.isin(parts, np.unique(parts[thick]))
         stands = ndimage.binary_dilation(stands, iterations=_SHADED, mask=stands | soft)
         at = np.flatnonzero(stands)
@@ -251,9 +250,10 @@ class Scene:
         )
 
     def _swept(self, frames: Sequence[Frame], lines: NDArray[Any]) -> NDArray[np.bool_]:
-        """Pixels of lines that are nothing but where a whisker moves by less than its width.
+        """Pixels of lines that are only the trace of a whisker moving by less than its width.
 
-        It leaves a part of its darkness in the background, but usually is darker than that.
+        Such a whisker leaves part of its darkness in the background, but is usually darker than
+        that.
         """
         assert self.background is not None
         where = lines > 0
@@ -262,7 +262,7 @@ class Scene:
         grey = np.stack([frame[where] / np.float32(self.gain(frame)) for frame in frames])
         noise = float(np.median([noise_level(frame) for frame in frames[:_FEWEST]]))
         darker_ = np.zeros_like(where)
-        # Compression lets what stands still vary, too, the more the darker it is.
+        # With compression, static objects vary too, more so if they are darker.
         deep = ndimage.maximum_filter(self.light - self.background, 2 * _BLUR + 1)[where]
         least = np.maximum(_SWEPT * noise, _DARKER * deep)
         darker_[where] = self.background[where] - np.median(grey, axis=0) > least
@@ -272,7 +272,7 @@ class Scene:
         return np.asarray(where & (share[lines] > _MOSTLY))
 
     def moved(self, frame: Frame, points: Array, gain: float) -> float:
-        """Share of dark points of a frame, of known brightness, that are usually not dark."""
+        """Share of the dark points of a frame, of known brightness, that are usually not dark."""
         if self.background is None:
             return 1.0
         column, row = np.rint(points).astype(np.int64).T
@@ -283,10 +283,10 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class Still:
-    """What never moves: pixels, and by how much they are darker than open ground would be.
+    """Static objects: pixels, and their darkness compared with open ground.
 
-    Divided by that, an image shows a whisker before bright or grey things, or next to an edge, as
-    it would before open ground. Where little light is left nothing can be seen.
+    An image divided by that shows a whisker in front of bright or grey objects, or next to an edge,
+    as in front of open ground. Where little light is left nothing can be seen.
     """
 
     at: NDArray[np.intp]
@@ -297,7 +297,7 @@ class Still:
     bits: Bits
 
     def removed(self, frame: Frame, gain: float) -> Frame:
-        """Give a frame, of known brightness, without it."""
+        """A frame, of known brightness, without the static objects."""
         if not self.at.size:
             return frame
         out = frame.copy()
@@ -308,13 +308,13 @@ class Still:
 
 
 def _long(labels: Any) -> list[int]:
-    """Numbers of the parts that are long enough for a still line."""
+    """Labels of the parts that are long enough for a static line."""
     boxes = enumerate(ndimage.find_objects(labels), 1)
     return [k for k, box in boxes if box and max(side.stop - side.start for side in box) >= _LONG]
 
 
 def _begins(away: Array) -> bool:
-    """Whether a still line, by its points (n, 2) from a base, may be a whisker that rests."""
+    """Whether a static line, by its points (n, 2) from a base, may be a resting whisker."""
     far = np.hypot(*away.T)
     nearest = away[far.argmin()]
     ways = away - nearest
@@ -328,7 +328,7 @@ def _gain(sparse: Any, usual: Any) -> float:
 
 
 def _halved(image: Any) -> Image:
-    """Image of half the size; of four pixels the brightest stays."""
+    """Image of half the size, with the brightest of four pixels."""
     rows, columns = (n - n % _HALF for n in image.shape)
     image = image[:rows, :columns]
     rowwise = np.maximum(image[::2], image[1::2])
@@ -342,7 +342,7 @@ def _doubled(image: Image, shape: tuple[int, ...]) -> Image:
 
 
 def _closed(image: Image, width: int) -> Image:
-    """Grey closing with a square: what is dark and thinner than it vanishes."""
+    """Grey closing with a square: dark structures thinner than it vanish."""
     return np.asarray(ndimage.grey_closing(image, (width, width), mode="nearest"))
 
 
@@ -352,7 +352,7 @@ def _smoothed(image: Image, sigma: float) -> Image:
 
 
 def _ground(still: Image) -> tuple[Image, np.float32]:
-    """Light on open ground, which may fall unevenly, and the share of it below which bodies are."""
+    """Light on open ground, which may be uneven, and the share of it below which bodies are."""
     part = still[::4, ::4].astype(np.float64)
     rows, columns = (np.linspace(-1.0, 1.0, n) for n in still.shape)
 
@@ -361,12 +361,12 @@ def _ground(still: Image) -> tuple[Image, np.float32]:
 
     y, x = np.meshgrid(rows[::4], columns[::4], indexing="ij")
     design, value = terms(y.ravel(), x.ravel()), np.log(np.maximum(part.ravel(), 1.0))
-    # Where all is dark the light is as it is elsewhere, rather than whatever a parabola becomes.
+    # Where all is dark, the light is that of elsewhere, not an extrapolated parabola.
     even = np.sqrt(_EVEN * len(value)) * np.eye(design.shape[1])[1:]
     coefficients = np.zeros(design.shape[1])
     coefficients[0] = np.quantile(value, 0.9)
     for _ in range(30):
-        # What is darker than the rest is weighted down: the fit rises to the open ground.
+        # Darker pixels are weighted down, so that the fit rises to the open ground.
         low = np.minimum(value - design @ coefficients, 0.0)
         weight = 1.0 / (1.0 + (low / 0.1) ** 2)
         coefficients = np.linalg.lstsq(
@@ -379,7 +379,7 @@ def _ground(still: Image) -> tuple[Image, np.float32]:
 
 
 def _threshold(share: Array) -> float:
-    """Threshold between dark and bright by Otsu; 0 if they do not differ enough."""
+    """Threshold between dark and bright by Otsu's method; 0 if they do not differ enough."""
     counts, edges = np.histogram(share, bins=128, range=(0.0, 1.5))
     middle = 0.5 * (edges[1:] + edges[:-1])
     below = np.cumsum(counts).astype(np.float64)
@@ -390,7 +390,7 @@ def _threshold(share: Array) -> float:
         between = np.nan_to_num(below * above * (bright - dark) ** 2)
     # Nearer to the light it is the light's own unevenness that is divided.
     between[edges[1:] > _LIT] = 0.0
-    # Between empty bins every threshold is as good: the middle one is taken.
+    # Between empty bins all thresholds are equivalent: the middle one is chosen.
     best = np.flatnonzero(between >= (1.0 - 1e-9) * between.max())
     at = int(best[len(best) // 2])
     return float(edges[at + 1]) if dark[at] < _DARK * bright[at] else 0.0
@@ -398,7 +398,7 @@ def _threshold(share: Array) -> float:
 
 @kernel
 def nth_largest(frames: Any, gains: Any, rank: int, out: Any) -> None:
-    """Per pixel the value that is the n-th largest of all frames."""
+    """The n-th largest value of each pixel over all frames."""
     count, rows, columns = frames.shape
     top = np.empty((rank, columns), np.float32)
     for row in range(rows):
@@ -407,7 +407,8 @@ def nth_largest(frames: Any, gains: Any, rank: int, out: Any) -> None:
                 top[k, column] = -1.0
         for i in range(count):
             share = np.float32(1.0) / gains[i]
-            # Each value goes down the list until it meets a smaller one, which goes on instead.
+            # Each value descends the sorted list until it replaces a smaller one, which then
+            # descends.
             for column in range(columns):
                 value = share * frames[i, row, column]
                 for k in range(rank):
@@ -420,7 +421,7 @@ def nth_largest(frames: Any, gains: Any, rank: int, out: Any) -> None:
 
 @kernel
 def darker(frame: Any, light: Any, gain: float, low: float, high: float, out: Any) -> None:
-    """How much darker a frame is than the light."""
+    """Darkness of a frame compared with the light."""
     rows, columns = frame.shape
     for row in range(rows):
         for column in range(columns):

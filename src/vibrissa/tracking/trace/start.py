@@ -1,12 +1,12 @@
-"""Start of a whisker: what several frames of all views show together.
+"""Start of a whisker: the whisker that several frames of all views agree on.
 
-In one view or one frame a hair may be more like a whisker than the whisker is, or the glint of a
-peg. In each of some frames, lines that may be whiskers are combined, one of each view. A
-combination has the more weight, the more its lines are like whiskers and the better the views agree
-about its base and its tip. The bases that outweigh all others over all frames are chosen.
+In one view or one frame, a hair or the glint of a peg may look more like a whisker than the whisker
+does. In each of some frames, candidate lines are combined, one of each view. A combination has more
+weight the more its lines look like whiskers and the better the views agree about its base and its
+tip. The bases with the most weight over all frames are chosen.
 
-What does not move is left out unless nothing moves. Where a view shows the whisker before the
-animal itself, that view does not show where it begins; the other views do.
+Static lines are left out unless nothing moves. Where a view shows the whisker in front of the
+animal itself, it does not show where the whisker begins; the other views do.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ FRAMES = 30
 
 _VOTES = 10  # number of those in which whiskers are searched
 _LINES = 8  # largest number of lines of a view that are combined
-_GAP = 6.0  # standard deviation of bases about where the other views show them, pixels
+_GAP = 6.0  # standard deviation of bases about their position by the other views, pixels
 # The same of tips, which are cut where they are faint or hidden: as a share of the length.
 _TIP = 0.15
 # Distance within which tips of one whisker agree where both views show them, pixels, and the
@@ -45,8 +45,8 @@ _TOGETHER, _SELDOM = 3.0, 0.2
 # its direction, and share of the frames in which tips must be open to be compared.
 _CUT, _LAST, _ENDING = 16.0, 10, 0.3
 _SAME = 25.0  # largest distance between bases of one whisker in two frames, pixels
-_MOVED = 0.4  # share of a whisker that moves, above which it counts as moving wholly
-_BETTER = 1.5  # factor by which more must be seen of a bright whisker than of a dark one
+_MOVED = 0.4  # moving share of a whisker above which all of it counts as moving
+_BETTER = 1.5  # factor by which more of a bright whisker must be seen than of a dark one
 # Scores above which a line is a whisker rather than a hair: likely, and without doubt.
 _LONG, _CERTAIN = 80.0, 200.0
 # Factors of the confidence if one view alone shows where the whisker begins, and if what does not
@@ -82,7 +82,7 @@ class Candidate(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Start of a whisker, as several frames of all views show it together.
+    """Start of a whisker on which several frames of all views agree.
 
     Parameters
     ----------
@@ -124,12 +124,12 @@ class _Combination(NamedTuple):
     bases: Array  # (view, 2)
     gap: float
     tip_gap: float  # as a share of the length
-    share: float  # how good its lines are relative to the best of their views
+    share: float  # score of its lines relative to the best of their views
     curves: tuple[Curve, ...]
 
 
 def negative(frame: Frame) -> Frame:
-    """Turn bright into dark."""
+    """Invert the brightness."""
     return np.asarray(np.iinfo(frame.dtype).max - frame, dtype=frame.dtype)
 
 
@@ -138,7 +138,7 @@ def is_bright(
     bases: Sequence[Sequence[ArrayLike] | None] | None = None,
     options: TraceOptions | None = None,
 ) -> bool:
-    """Decide whether whiskers are bright on a dark background.
+    """Whether whiskers are bright on a dark background.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def is_bright(
 
 
 def _seen(frame: Frame, bases: Sequence[ArrayLike] | None, options: TraceOptions) -> float:
-    """How clearly lines are seen in all: their length over the standard deviation of points."""
+    """Clarity of the lines seen: their length over the standard deviation of points."""
     if bases is None:
         curves = find_curves(frame, Scene.of([frame], options.scale), options)
         return max((curve.score for curve in curves), default=0.0)
@@ -183,7 +183,7 @@ def find_start(
     options: TraceOptions | None = None,
     masks: Sequence[Mask | None] | None = None,
 ) -> Start:
-    """Find the whisker that all views show.
+    """Find the whisker that all views agree on.
 
     Parameters
     ----------
@@ -248,12 +248,12 @@ class _Search:
         return cls(cameras, frames, scenes, options)
 
     def moments(self, count: int) -> list[int]:
-        """Frames that are spread over all of them, the first among them."""
+        """Frames spread over the film, the first among them."""
         whole = len(self.frames[0])
         return sorted({int(i) for i in np.linspace(0, whole - 1, min(count, whole))})
 
     def vote(self) -> _Vote:
-        """What most frames show: of what moves, or if nothing does, of all that is there."""
+        """Choice of most frames among moving lines, or if nothing moves, among all lines."""
         moments = self.moments(_VOTES)
         views = range(len(self.cameras))
         vote = _voted([self._combined(m, self.curves(m)) for m in moments])
@@ -273,13 +273,13 @@ class _Search:
         return vote
 
     def _in_depth(self, view: int, moments: Sequence[int]) -> _Vote:
-        """The vote if one view is along the whisker's motion, so that it hardly moves there."""
+        """Choice if one view is along the whisker's motion, so that it hardly moves there."""
         vote = _voted([self._combined(m, self.curves(m, resting=[view])) for m in moments])
         from_face = all(one.curves[view].from_face for one in vote.winners)
         return vote._replace(confidence=vote.confidence * (1.0 if from_face else _NO_FACE))
 
     def _faint(self, view: int, moments: Sequence[int]) -> _Vote:
-        """The vote if one view shows the whisker only along the lines of sight of another."""
+        """Choice if one view shows the whisker only along the epipolar lines of another."""
         vote = _voted([self._along(m, view) for m in moments])
         clear = [one.curves[view].score / one.curves[view].length for one in vote.winners]
         seen = min(1.0, float(np.median(clear)) / _CLEARLY) if clear else 0.0
@@ -287,7 +287,7 @@ class _Search:
         return vote._replace(hidden=name, confidence=confidence)
 
     def _resting(self, vote: _Vote) -> _Vote:
-        """The vote for what does not move, though it could have been seen to."""
+        """Choice among static lines, if a motion would have been visible."""
         if all(scene.background is None for scene in self.scenes):
             return vote
         from_face = all(curve.from_face for one in vote.winners for curve in one.curves)
@@ -295,7 +295,7 @@ class _Search:
         return vote._replace(moves=False, confidence=confidence)
 
     def curves(self, moment: int, resting: Sequence[int] = ()) -> list[list[Curve]]:
-        """Lines that may be whiskers, the likeliest first: those that move, but in some views."""
+        """Candidate lines, the most probable first: moving ones, except in some views."""
         found = []
         for view in range(len(self.cameras)):
             curves = self._found(view, moment)
@@ -312,12 +312,12 @@ class _Search:
         return self.known[key]
 
     def _shown(self, view: int, moments: Sequence[int]) -> bool:
-        """Whether a view by itself shows something long that moves, in half of the frames."""
+        """Whether a view alone shows a long moving line in half of the frames."""
         best = [max((c.score for c in self.curves(m)[view]), default=0.0) for m in moments]
         return self.scenes[view].background is not None and float(np.median(best)) > _LONG
 
     def _along(self, moment: int, view: int) -> list[_Combination]:
-        """Whiskers of one view, with what a view that shows them faintly shows along them."""
+        """Whiskers of one view, with the faint lines of another view along them."""
         found, camera = self.curves(moment), self.cameras[view]
         first = next(other for other in range(len(found)) if other != view)
         frame, scene = self.frames[view][moment], self.scenes[view]
@@ -349,7 +349,7 @@ class _Search:
         return sorted(found, key=lambda one: -one.worth)
 
     def ends(self, one: _Combination) -> bool:
-        """Whether no line runs behind or along something still at its end, which may cut it."""
+        """Whether a line ends freely: nothing static there may cut it."""
         for view, curve in enumerate(one.curves):
             if view not in self.still:
                 base, frames = one.bases[view][None], self.frames[view]
@@ -368,18 +368,20 @@ class _Search:
 
 
 class _Vote(NamedTuple):
-    """Lines that most frames show."""
+    """Lines chosen by most frames."""
 
     winners: list[_Combination]  # of the frames that show it
     confidence: float
-    agreed: tuple[int, int]  # in how many of how many frames nothing else is likelier
-    others: Sequence[tuple[float, list[_Combination]]] = ()  # with their worth relative to winners
+    # Number of frames in which nothing else is more probable, and number of frames.
+    agreed: tuple[int, int]
+    # With their weight relative to the winners.
+    others: Sequence[tuple[float, list[_Combination]]] = ()
     moves: bool = True
     hidden: str = ""  # the view that shows it only along the lines of sight of another
 
 
 def _voted(found: Sequence[Sequence[_Combination]]) -> _Vote:
-    """Choose the bases that outweigh all others over all frames."""
+    """Choose the bases with the most weight over all frames."""
     left = [list(row) for row in found]
 
     def supporters(center: _Combination) -> list[_Combination]:
@@ -398,7 +400,7 @@ def _voted(found: Sequence[Sequence[_Combination]]) -> _Vote:
     total, *rest = (sum(one.worth for one in row) for row in ranked)
     rival = max(rest, default=0.0)
     agreed = sum(any(one is row[0] for row in found if row) for one in winners)
-    # A whisker that leaves out what a view shows best is in doubt, whatever the others show.
+    # A whisker that omits the best line of a view is in doubt, whatever the others show.
     share = min(1.0, 2.0 * float(np.median([one.share for one in winners])))
     gap = float(np.median([one.gap for one in winners]))
     sure = share * float(np.exp(-0.5 * (gap / _GAP) ** 2))
@@ -414,7 +416,7 @@ def _near(one: _Combination, other: _Combination) -> bool:
 
 
 def _start(search: _Search, vote: _Vote, bright: bool) -> Start:
-    """Return what was found, and what there is to doubt."""
+    """Summary of the choice, with reasons for doubt."""
     if not vote.winners or vote.confidence < _GUESS:
         moment = search.moments(_VOTES)[0]
         alone = [curves[0].line if curves else np.empty((0, 2)) for curves in search.curves(moment)]
@@ -453,7 +455,7 @@ def _start(search: _Search, vote: _Vote, bright: bool) -> Start:
 
 
 def _others(vote: _Vote, best: _Combination, confidence: float) -> tuple[Candidate, ...]:
-    """Other candidates, about the frame of the best, but those that are the same line."""
+    """Other candidates near the frame of the best, except those that are the same line."""
     found = [best]
     shown = []
     for worth, row in vote.others:
@@ -469,7 +471,7 @@ def _others(vote: _Vote, best: _Combination, confidence: float) -> tuple[Candida
 
 
 def base_gap(cameras: Sequence[Camera], pixels: Array) -> Array:
-    """Distance of points from where the views together see them, pixels."""
+    """Distance of points from the position that the views together determine, pixels."""
     point, _ = triangulate(cameras, pixels)
     seen = np.stack([camera.project(point) for camera in cameras])
     return np.asarray(np.linalg.norm(seen - pixels, axis=-1).max(axis=0))

@@ -1,12 +1,12 @@
-"""A camera that shakes: by how much each image is shifted, from what never moves in it.
+"""Shake of a camera: the shift of each image, from what never moves in it.
 
-Edges that stand still give the shift d of a frame I from their usual image M by least squares,
+Static edges give the shift d of a frame I from their usual image M by least squares,
 
     I(x + d) = a M(x) + b,
 
-where a and b are changes of the light. What does not move with the rest, as a part of the face or a
-whisker that passes, is weighted down by what it leaves in all frames. Blocks of the image, whose
-pixels have errors in common, show the error of the shift by what they disagree about.
+where a and b are changes of the light. What moves differently, such as a part of the face or a
+passing whisker, is weighted down by its residuals in all frames. Blocks of the image, whose pixels
+have common errors, give the error of the shift by their disagreement.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ Array = NDArray[np.float64]
 _Numbers = NDArray[np.intp]
 
 _BLOCK, _EACH = 8, 8  # width of a block and largest number of its pixels that are used
-_FEWEST = 4.0  # number of blocks, as far as they count alike, from which a shift is known
-_EDGE = 4.0  # grey values by which an edge's slope over a pixel exceeds the noise's
+_FEWEST = 4.0  # effective number of blocks from which a shift is determined
+_EDGE = 4.0  # grey values by which the slope of an edge over a pixel exceeds that of the noise
 _ROUNDS, _STEPS = 3, 3  # numbers of rounds that change the usual image, and of steps to a shift
-_RARE = 3.0  # standard deviations from which a pixel shows something else
+_RARE = 3.0  # standard deviations above which a pixel shows something else
 _FINE = 0.3  # standard deviation of grey values by rounding
 _FARTHEST = 6.0  # largest shift, pixels
-# What is known of a shift, in pixels, and of the light's changes where nothing shows them.
+# Prior standard deviations of a shift, pixels, and of changes of the light.
 _PRIOR = np.diag([1.0, 1.0, 1.0, 1e-4])
-# Standard deviation of shifts from which a camera shakes, pixels, and in units of their errors.
+# Standard deviation of shifts above which a camera shakes, pixels, and in units of their errors.
 _SHAKES, _CERTAIN = 0.05, 4.0
-_UNSEEN = 0.03  # standard deviation of what compression adds to all blocks alike, pixels
+_UNSEEN = 0.03  # standard deviation of the common shift of all blocks by compression, pixels
 # Mean square change of a block without the shifts, over that with them, below which it stands still
 # in the image, and the largest number of blocks that may.
 _LESS, _MOST = 0.5, 2
@@ -45,19 +45,19 @@ _LESS, _MOST = 0.5, 2
 
 @dataclass(frozen=True, eq=False)
 class Steady:
-    """Where what never moves usually is in a view that shakes."""
+    """Usual image of what never moves, in a view that shakes."""
 
     at: NDArray[np.intp]  # (2, n): column and row of pixels, sorted by blocks
     blocks: NDArray[np.intp]  # (b,) first pixel of each block
     slopes: Array  # (n, 4): change by the shift along columns and rows, the light, and one
     soft: Array  # (n, 4): the same of a smoothed image, whose noise is another one
     weight: Array  # (n,)
-    trust: Array  # (2, 2): share of a measured shift that is believed
-    sigma: Array  # (2,): standard deviation of what is left of it, pixels
+    trust: Array  # (2, 2): weight of a measured shift
+    sigma: Array  # (2,): standard deviation of the remaining shift, pixels
 
     @classmethod
     def of(cls, scene: Scene, frames: Sequence[Frame]) -> Steady | None:
-        """Take it from frames of a view; None if its camera does not shake."""
+        """Usual image from frames of a view; None if its camera does not shake."""
         unknown = cls.unknown()
         # A whisker begins before what moves with it: that may be most of what seems to be still.
         if scene.still is None or scene.still.before_body or scene.background is None:
@@ -99,13 +99,13 @@ class Steady:
 
     @classmethod
     def unknown(cls) -> Steady:
-        """Make one of a view that does not show whether its camera shakes."""
+        """For a view that does not show whether its camera shakes."""
         none, empty = np.zeros(0, dtype=np.intp), np.zeros((0, 4))
         left = np.full(2, np.nan)
         return cls(np.stack([none, none]), none, empty, empty, empty[:, 0], np.eye(2), left)
 
     def moved_back(self, frame: Frame) -> tuple[Frame, tuple[float, float, float, float]]:
-        """The frame as it would be without its shift, and `Trace.shift`."""
+        """Frame with its shift removed, and `Trace.shift`."""
         if not self.at.size:
             return frame, (0.0, 0.0, np.nan, np.nan)
         shift = self.trust @ self.measured(frame)
@@ -123,7 +123,7 @@ class Steady:
         return moved, (column, row, left[0], left[1])
 
     def measured(self, frame: Frame) -> Array:
-        """Shift (2,) of a frame that its edges show, pixels."""
+        """Shift (2,) of a frame by its static edges, pixels."""
         shift = np.zeros(2)
         for _ in range(_STEPS):
             normal, right, _ = self._equations(frame, shift)
@@ -147,12 +147,12 @@ class Steady:
         return replace(one, weight=1.0 / (np.mean(misses**2, axis=0) + _FINE**2))
 
     def _left(self, frame: Frame, shift: Array) -> Array:
-        """What the light's change leaves of the difference from the usual image."""
+        """Residual of a frame from the usual image after the change of light."""
         miss, light = _at(frame, self.at, shift) - self.slopes[:, 2], self.slopes[:, 2:]
         return np.asarray(miss - light @ np.linalg.lstsq(light, miss)[0])
 
     def _equations(self, frame: Frame, shift: Array) -> tuple[Array, Array, Array]:
-        """Normal equations (4, 4), their right sides (block, 4), and what is left (n,)."""
+        """Normal equations (4, 4), their right sides (block, 4), and residuals (n,)."""
         miss = _at(frame, self.at, shift) - self.slopes[:, 2]
 
         def equations(weight: Array) -> tuple[Array, Array]:
@@ -166,7 +166,7 @@ class Steady:
         return normal, np.add.reduceat(right, self.blocks), left
 
     def _disagreement(self, frames: Sequence[Frame], shifts: Array) -> float:
-        """Mean square distance of the shifts of two halves of the image, in their errors."""
+        """Mean square difference of the shifts of two halves of the image, over their errors."""
         along = self.at[int(np.argmax(np.ptp(self.at, axis=1)))]
         order = np.argsort(along)
         known = np.cumsum((self.weight * (self.slopes[:, :2] ** 2).sum(axis=1))[order])
@@ -180,7 +180,7 @@ class Steady:
         return float(np.linalg.norm(inverse @ np.cov(apart.T) @ inverse.T, 2))
 
     def _errors(self, frames: Sequence[Frame], shifts: Array) -> tuple[Array, float]:
-        """Mean square error (2, 2) of shifts, and the number of blocks that show them."""
+        """Mean square error (2, 2) of shifts, and the number of blocks that determine them."""
         error = np.zeros((2, 2))
         for frame, shift in zip(frames, shifts, strict=True):
             normal, right, _ = self._equations(frame, shift)
@@ -191,7 +191,7 @@ class Steady:
 
 
 def _at(frame: Frame, at: NDArray[np.intp], shift: Array) -> Array:
-    """Grey values at pixels, shifted by less than the distance of all of them from the border."""
+    """Grey values at pixels shifted by less than their distance from the border."""
     whole = np.floor(shift).astype(int)
     (x, y), (column, row), wide = shift - whole, at, frame.shape[1]
     first, flat = (row + whole[1]) * wide + column + whole[0], frame.reshape(-1)
@@ -206,7 +206,7 @@ def _slopes(image: Any) -> list[Any]:
 
 
 def _edges(slope: Any, noise: float, still: NDArray[np.intp]) -> tuple[_Numbers, _Numbers]:
-    """Pixels (2, n) of what stands still that change most by a shift, and where blocks begin."""
+    """Static pixels (2, n) that a shift changes most, and the first one of each block."""
     rows, columns = slope.shape
     row, column = np.divmod(still, columns)
     margin = int(_FARTHEST) + 3

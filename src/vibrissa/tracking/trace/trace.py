@@ -1,4 +1,4 @@
-"""A whisker in one frame of one view: its middle, to a fraction of a pixel, from base to tip."""
+"""Trace of a whisker in one frame of one view: middle line and uncertainty, base to tip."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ _JUMPS, _OFTEN = 0.3, 0.05
 # Turn within a fifth of its length from which a trace goes on as something else, as along an edge,
 # rad: contact bends a whisker by less.
 _HOOKED = 0.7
-_SHARPEST = 0.05  # standard deviation from which a point is not seen more clearly, pixels
-_GIVEN = 0.5  # standard deviation of points that a person gives, pixels
+_SHARPEST = 0.05  # lower limit of the standard deviation of a point in `clearness`, pixels
+_GIVEN = 0.5  # standard deviation of points marked by a person, pixels
 _UNLIKE = 0.05  # correlation that counts as none
 
 
@@ -99,7 +99,7 @@ class Trace(NamedTuple):
 
     @classmethod
     def lost(cls) -> Trace:
-        """Make a trace of nothing, with confidence 0.
+        """Empty trace, with confidence 0.
 
         Returns
         -------
@@ -120,7 +120,7 @@ class Trace(NamedTuple):
 
     @property
     def clearness(self) -> float:
-        """Length that is seen, each part of it over the standard deviation across."""
+        """Seen length, each part weighted by the inverse of its standard deviation across."""
         return STEP * float((1.0 / np.hypot(self.sigma[self.seen], _SHARPEST)).sum())
 
 
@@ -147,7 +147,7 @@ def _turn(line: Array) -> float:
 
 
 def given(points: ArrayLike) -> Trace:
-    """Make a trace of points that a person gives."""
+    """Trace through points marked by a person."""
     array = np.asarray(points, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 2 or len(array) < 2 or not np.isfinite(array).all():
         raise ValueError(f"points have shape {array.shape}; finite (n, 2), n ≥ 2, are needed")
@@ -173,7 +173,7 @@ def interpolated(
 
 
 def even(line: Array, start: float = 0.0) -> Array:
-    """Put points `STEP` apart along a line (n, 2), from an arc length on; below zero: before it."""
+    """Points `STEP` apart along a line (n, 2), from an arc length on, which may be negative."""
     s = arc_lengths(line)
     wanted = np.arange(start, s[-1] + 1e-9, STEP)
     if start < 0.0:
@@ -185,14 +185,14 @@ def even(line: Array, start: float = 0.0) -> Array:
 
 
 def aligned(line: Array, other: Array, points: int = 30) -> float:
-    """Cosine between the directions in which two lines begin, over a number of points at most."""
+    """Cosine between the initial directions of two lines, over at most so many points."""
     i = min(points, len(line) - 1, len(other) - 1)
     a, b = line[i] - line[0], other[i] - other[0]
     return float(a @ b / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-9))
 
 
 def overlap(line: Array, other: Array, near: float = 3.0) -> float:
-    """Share of a line that runs along another, nearer than some pixels."""
+    """Share of a line that is nearer to another than some pixels."""
     if not len(line) or not len(other):
         return 0.0
     return count_near(np.asarray(line), np.asarray(other), near) / len(line)
@@ -200,9 +200,9 @@ def overlap(line: Array, other: Array, near: float = 3.0) -> float:
 
 @kernel
 def count_near(line: Any, other: Any, near: float) -> int:
-    """Count the points of a line that are nearer to some point of another than so many pixels.
+    """Number of points of a line that are nearer to some point of another than some pixels.
 
-    Lines run along one another, or do not: the search begins where the point before was near.
+    As lines usually follow each other, the search begins where the point before was near.
     """
     count, last, most = 0, 0, other.shape[0]
     for i in range(line.shape[0]):

@@ -1,4 +1,4 @@
-"""The traces of one video: its whiskers followed from frame to frame, stopped and continued."""
+"""Traces of one video: whiskers followed from frame to frame, with interruption and resumption."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ from vibrissa.tracking.trace.trace import Trace, TraceOptions, given, overlap
 # Points (n, 2) along a whisker from base to tip, column and row, by frame and whisker.
 Corrections = Mapping[tuple[int, int], ArrayLike]
 _BACK = 64  # largest number of frames before its own that a correction can change
-_AGREES = 0.9  # share of a line along another one from which both are the same
+_AGREES = 0.9  # share of a line along another one above which both are the same
 # Factor of the jump of a single whisker before grey fur, where its base is less certain.
 _FAINT = 2.4
 _LOOKED = 9  # number of frames after the first in which neighbours are searched
-_STEADY = (0.0, 0.0, 0.0, 0.0)  # shift of a camera that does not shake
+_STEADY = (0.0, 0.0, 0.0, 0.0)  # shift of a steady camera
 _SPAN = 400  # number of frames at the beginning of a film from which those for its start are taken
 
 
@@ -131,8 +131,8 @@ def trace_video(
             f"corrections are for whiskers {wrong}; there are {len(followers)}, from 0"
         )
     if not done and (len(followers) > 1 or not corrections):
-        # Neighbours are followed too, so that their lines are not taken; none is returned. What a
-        # person corrects may be which of the lines is the only whisker.
+        # Neighbours are followed too, so that their lines are not taken, but not returned. A person
+        # may correct which of the lines is the only whisker.
         clear = [scene.without_still(f) for f in (start, *alike[:: max(len(alike) // _LOOKED, 1)])]
         for base in neighbours(clear, starts, scene, options):
             followers.append(replace(start_at(base, options), clutter=still.still_only))
@@ -185,7 +185,7 @@ def _begun(
     begun: Sequence[Sequence[Trace]],
     options: TraceOptions,
 ) -> list[Follower]:
-    """Followers of whiskers that begin in the first frame, or that were traced before."""
+    """Followers of whiskers that begin in the first frame, or of whiskers traced before."""
     if begun:
         starts = bases if bases is not None else [None] * len(begun)
         return [_resumed(row, base, options) for row, base in zip(begun, starts, strict=True)]
@@ -198,7 +198,7 @@ def _begun(
 
 
 def _resumed(row: Sequence[Trace], base: ArrayLike | None, options: TraceOptions) -> Follower:
-    """Continue after traces that are done, as if they had just been made."""
+    """Follower after traces of an earlier run."""
     if base is None:
         base = next((trace.line[0] for trace in row if len(trace.line)), None)
     if base is None:
@@ -254,7 +254,7 @@ def _backward(
     corrections: Corrections,
     seen: Sequence[Seen],
 ) -> None:
-    """Trace back from a corrected frame, the last of the row, until nothing changes."""
+    """Trace backward from a corrected frame, the last of the row, until nothing changes."""
     follower = Follower(row[-1].line[0], ahead.options, clutter=ahead.clutter.still_only)
     follower.restart(row[-1])
     for back, frame in enumerate(reversed(recent)):
@@ -264,7 +264,7 @@ def _backward(
         trace = follower.follow(frame)
         if overlap(trace.line, row[i].line, 1.0) > _AGREES:
             return
-        # The line that shows more is right; what was lost before is found now.
+        # The longer seen line is right; a whisker lost before is found now.
         if trace.support > 0.9 * row[i].support:
             row[i] = trace
             if seen:
@@ -272,13 +272,13 @@ def _backward(
 
 
 def _spread(count: int) -> NDArray[np.intp]:
-    """Numbers of the frames, of so many, that show where a film begins and what never moves."""
+    """Indices of frames, out of so many, by which a film's start and static objects are found."""
     span = min(_SPAN, count)
     return np.unique(np.linspace(0, span - 1, min(FRAMES, span)).astype(int))
 
 
 def partial_traces(recording: str | PathLike[str], view: int) -> Path:
-    """Give the file that keeps the traces of a view until their recording is written."""
+    """File that stores the traces of a view until their recording is written."""
     recording = Path(recording)
     return recording.with_name(f".{recording.name}.view{view}.npz")
 
@@ -333,7 +333,7 @@ def trace_file(
     mask: Mask | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[list[Trace]]:
-    """Trace the whiskers of a video file, or continue where this was stopped.
+    """Trace the whiskers of a video file, or resume an interrupted run.
 
     Parameters
     ----------

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import vibrissa as vb
-from vibrissa.certificates.certificate import enclosed_on
+from vibrissa.certificates.certificate import enclose_conditions
 from vibrissa.certificates.conditions import DEGREES, spatial_point_conditions
 from vibrissa.certificates.domain import Bounds
 from vibrissa.certificates.equations import exact_rod
@@ -91,7 +91,7 @@ def test_enclosures_hold_what_arb_computes(half):
     )
     boxes = np.stack([middle - size, middle + size], axis=-1)
     tables = spatial_point_conditions("contact")
-    found = enclosed_on(tables, rod, Bounds(alpha, factors, 0.0), boxes, 1e-10)[0][:, 1:]
+    found = enclose_conditions(tables, rod, Bounds(alpha, factors, 0.0), boxes, 1e-10)[0][:, 1:]
     for box, enclosure in zip(boxes, found, strict=True):
         at = [flint.arb(float(x)) for x in rng.uniform(*box.T)]
         step = flint.arb(2) ** -40

@@ -20,9 +20,9 @@ from vibrissa.certificates import (
     prove_witness,
     smallest_cone,
 )
-from vibrissa.certificates.certificate import prepared
+from vibrissa.certificates.certificate import prepare_certificate
 from vibrissa.certificates.checker import covers
-from vibrissa.certificates.equations import enclosed
+from vibrissa.certificates.equations import enclose_rational
 from vibrissa.certificates.search import bounds, cover
 from vibrissa.cli.app import app
 from vibrissa.identifiability import verdict_table
@@ -80,7 +80,7 @@ def test_a_curved_whisker_with_wrong_signs_is_refuted_at_once(steep):
     found = certify(steep, np.deg2rad(3.0))
     assert not found.proved
     assert "outside 7.2" in found.refuted
-    certain = prepared(steep, np.deg2rad(1.0))
+    certain = prepare_certificate(steep, np.deg2rad(1.0))
     certain.probe()
     assert "is certainly wrong" in certain.refuted
 
@@ -89,12 +89,12 @@ def test_the_smallest_cone_of_a_grid_is_that_from_where_on_no_sign_is_wrong(stee
     cone = smallest_cone(steep)
     # Its determinant changes sign at 5.23°; forces begin a little within the cone.
     assert 6.0 < np.rad2deg(cone) < 8.0
-    larger = prepared(steep, 1.01 * cone)
+    larger = prepare_certificate(steep, 1.01 * cone)
     larger.probe()
     assert not larger.refuted
     assert outlook(steep, 0.8 * cone).failing["determinant"] > 0.0
     with pytest.raises(ValueError, match="cones below 18"):
-        prepared(steep, np.deg2rad(19.0))
+        prepare_certificate(steep, np.deg2rad(19.0))
 
 
 def test_a_certificate_with_a_hole_or_a_wrong_whisker_is_noticed(theorem):
@@ -145,7 +145,7 @@ def test_an_independent_check_confirms_boxes_and_no_others(theorem, tmp_path, mo
 
 @pytest.mark.slow
 def test_an_independent_check_of_a_curved_whisker(curved, tmp_path, monkeypatch):
-    path, certificate = tmp_path / "curved.nc", prepared(curved, np.deg2rad(2.0))
+    path, certificate = tmp_path / "curved.nc", prepare_certificate(curved, np.deg2rad(2.0))
     certificate.pursue("rest", 10**4)
     certificate.save(path)
     whole = check_certificate(path, 2, parts=["rest"], whisker=curved.whisker)
@@ -334,7 +334,7 @@ def conditions(certificate, whisker, at):
 def test_enclosures_over_boxes_never_miss_a_point(curved, kind, monkeypatch):
     """Those of the search, and those of the check of curved whiskers."""
     contact_map = curved if kind == "curved" else straight(15.0)
-    certificate, rng = prepared(contact_map), np.random.default_rng(3)
+    certificate, rng = prepare_certificate(contact_map), np.random.default_rng(3)
     data = certificate.to_dataset()
     keep = [0, 1, 2] if kind == "curved" else [0, 2]
     count = 7 if kind == "curved" else 5
@@ -344,7 +344,9 @@ def test_enclosures_over_boxes_never_miss_a_point(curved, kind, monkeypatch):
         near[0, 0] = 0.36  # where forces are large
         ends = np.stack([near - half, near + half], axis=-1)[:, keep]
         found, _ = certificate.evaluate("interior", ends, list(range(count)))
-        checks = curved_checker.wanted(data, "interior", ends) if kind == "curved" else []
+        checks = (
+            curved_checker.condition_polynomials(data, "interior", ends) if kind == "curved" else []
+        )
         for row, (box, enclosure) in enumerate(zip(near, found, strict=True)):
             centre, reach = enclosure[:, 0], enclosure[:, 1:].sum(axis=1)
             at = box + half * (2.0 * rng.random(3) - 1.0)
@@ -360,7 +362,7 @@ def test_enclosures_over_boxes_never_miss_a_point(curved, kind, monkeypatch):
 
 def test_enclosures_are_a_few_times_as_wide_as_the_ranges(curved):
     """On boxes as wide as those that certify, against contacts of the discretised rod."""
-    certificate, rng = prepared(curved, np.deg2rad(2.0)), np.random.default_rng(0)
+    certificate, rng = prepare_certificate(curved, np.deg2rad(2.0)), np.random.default_rng(0)
     low = rng.random((24, 3)) * [0.64, 3.0, 0.9] + [0.35, 0.05, 0.05]
     boxes = np.stack([low, low + np.array([0.006, 0.06, 0.03])], axis=-1)
     found, _ = certificate.evaluate("interior", boxes, list(range(7)))
@@ -378,7 +380,7 @@ def test_enclosures_are_a_few_times_as_wide_as_the_ranges(curved):
 
 def test_a_box_across_an_end_of_polynomials_is_not_enclosed(curved):
     # Contacts on both sides have different equations.
-    certificate = prepared(curved)
+    certificate = prepare_certificate(curved)
     box = np.array([[[0.499, 0.501], [1.0, 1.0], [0.5, 0.5]]])
     assert np.isnan(certificate.evaluate("interior", box, [0])[0]).all()
     assert 0.5 in certificate.stations
@@ -396,7 +398,7 @@ def test_a_grid_shows_whether_a_certificate_can_exist(curved, steep):
 
 
 def test_rational_numbers_are_enclosed():
-    centre, radius = enclosed(Fraction(14, 15))
+    centre, radius = enclose_rational(Fraction(14, 15))
     assert abs(Fraction(14, 15) - Fraction(centre)) <= Fraction(radius)
     assert radius < 1e-15
 
@@ -427,7 +429,7 @@ def test_boxes_are_halved_in_the_unknown_that_makes_remainders_small(cause):
 
 
 def test_the_most_bent_tip_of_a_curved_whisker_takes_few_boxes(curved):
-    certificate = prepared(curved, np.deg2rad(2.0))
+    certificate = prepare_certificate(curved, np.deg2rad(2.0))
     domain, stations = certificate.parts["interior"].domain, certificate.stations
     cell = np.array([[[4, 15], [3, 4], [4, 13]]])  # contacts from 0.96 L to the tip, near the fold
 

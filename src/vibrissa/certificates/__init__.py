@@ -1,4 +1,4 @@
-"""Proofs that base signals locate a contact: validated mechanics and certificates."""
+"""Proofs that base signals locate a contact: certificates, witnesses, and their verification."""
 
 from vibrissa.certificates.certificate import KIND, TRIPLET, Certificate, certify, load_certificate
 from vibrissa.certificates.checker import Checked, check_certificate

@@ -1,16 +1,16 @@
-"""A certificate that (F_x, M_B, M_D) locates every contact: boxes on which all signs are certain.
+"""Certificates that (F_x, M_B, M_D) locates every contact: boxes on which all signs are proved.
 
-The lemma (theory page) needs signs of conditions on a solid domain of contacts and on some of its
-faces; each is a *part* with a cover of its own:
+The lemma (theory page) requires signs of conditions on a solid domain of contacts and on some of
+its faces; each is a *part* with a cover of its own:
 
 - ``interior``: the whole domain;
 - ``proximal``, ``distal``: the faces at the smallest and the largest arc length of a contact;
-- ``fold``: the face of the largest force, beyond the fold, so that the domain holds Ω;
+- ``fold``: the face of the largest force, beyond the fold, so that the domain contains Ω;
 - ``rest``: contacts with less force than the domain's, which are within the cone.
 
-A straight whisker has no cone, and no part ``rest``. For any other the lemma also needs that M_D
-turns once where the direction of the force does; that is shown on one circle, and holds on all as
-M_B is not zero.
+For a straight whisker there is no cone, and no part ``rest``. For any other the lemma also requires
+that M_D turns once while the direction of the force does; this is shown on one circle, and holds on
+all of them because M_B is not zero.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from vibrissa.certificates.conditions import (
 )
 from vibrissa.certificates.domain import Bounds, bounds_of, is_planar, room_within
 from vibrissa.certificates.equations import ExactRod, exact_rod
-from vibrissa.certificates.grid import doubt
+from vibrissa.certificates.grid import objection
 from vibrissa.certificates.search import bounds, cover, volume
 from vibrissa.io import read_dataset, write_netcdf
 from vibrissa.numerics import Array, IntArray, share_out
@@ -47,30 +47,30 @@ from vibrissa.signals import CONE
 if TYPE_CHECKING:
     from vibrissa.contacts import ContactMap
 
-#: The triplet that certificates are for.
+#: Triplet to which certificates apply.
 TRIPLET = "Fx MB MD"
 KIND = "vibrissa certificate"
 _ORDER = 8
-_TOLERANCE = 1e-6  # share of the states to which the last Taylor coefficient falls in a step
-# Conditions by part: of the straight whisker, and of any.
+_TOLERANCE = 1e-6  # ratio of the last Taylor coefficient to the states that determines a step
+# Indices of the conditions of each part: for a straight whisker, and for any other.
 _PLANAR = {"interior": [0, 1, 2, 3], "proximal": [0, 4], "distal": [0, 4], "fold": [0, 1]}
 _SPATIAL = {"interior": [0, 1, 2, 3, 4], "proximal": [0, 1, 5, 6], "distal": [0, 1, 5, 6]}
 _SPATIAL |= {"fold": [0], "rest": [0]}
-# M_y and M_z among the conditions, and the parts of the circle on which they are followed.
+# Indices of M_y and M_z among the conditions, and number of arcs of the circle of directions.
 _MOMENT = [7, 8]
 _ARCS = 48
-_PROBES = 5  # contacts along each unknown at which signs are looked at first
-_AT_A_TIME = 2048  # boxes that are evaluated between two looks at the clock
-_SAVED_EVERY = 60.0  # how often a certificate that is being made is written, s
+_PROBES = 5  # number of contacts along each unknown at which signs are evaluated first
+_BATCH = 2048  # number of boxes evaluated between two checks of the time
+_SAVED_EVERY = 60.0  # interval at which an unfinished certificate is written, s
 
 Progress = Callable[[int, int], None]
 
 
-def enclosed_on(
+def enclose_conditions(
     tables: Conditions, rod: ExactRod, force: Bounds, boxes: Array, tolerance: float
 ) -> tuple[Array, Array]:
-    """Enclose all conditions over boxes, with the relative widths: see `conditions_on`."""
-    alike = np.lexsort(boxes[..., 0].T[::-1])  # neighbours need similar steps
+    """Enclose all conditions over boxes; also return relative widths, as `conditions_on`."""
+    alike = np.lexsort(boxes[..., 0].T[::-1])  # neighbouring boxes need similar steps
     ordered, bound = np.ascontiguousarray(boxes[alike]), force.packed()
     found = np.empty((len(boxes), len(tables.conditions), tables.unknowns + 3))
     widths = np.empty((len(boxes), tables.unknowns))
@@ -88,7 +88,7 @@ def enclosed_on(
 class Part:
     """One part of the domain and the boxes that cover it: levels and indices, by unknown.
 
-    Of an unknown that a face fixes both bounds of the domain are equal.
+    For an unknown that is fixed on a face, both bounds of the domain are equal.
     """
 
     domain: Array
@@ -103,13 +103,13 @@ class Part:
 
     @property
     def complete(self) -> bool:
-        """Whether nothing is undecided, and the certified boxes leave no hole."""
+        """Whether no box is undecided, and the certified boxes leave no gap."""
         return not len(self.undecided) and covers(self.certified)
 
 
 @dataclass(repr=False)
 class Certificate:
-    """Boxes that prove that a whisker's (F_x, M_B, M_D) locates every contact outside a cone.
+    """Boxes that prove that a whisker's (F_x, M_B, M_D) locates each contact outside a cone.
 
     Parameters
     ----------
@@ -118,21 +118,21 @@ class Certificate:
     bounds : Bounds
         Bounds on the force.
     stations : (2^k + 1,) array
-        Arc lengths between which boxes are halved.
+        Arc lengths between which boxes are divided.
     straight : bool
-        Whether the whisker is straight, so that contacts in one plane stand for all.
+        Whether the whisker is straight, so that contacts in one plane represent all.
     sign : float
         Sign of the determinant.
     cone : float
-        Half angle about the resting whisker that is left out, rad.
+        Half angle of the excluded cone about the resting whisker, rad.
     parts : dict of Part
-        Boxes by part.
+        Boxes of each part.
     whisker : str
         Description of the whisker.
     turns : bool
-        Whether M_D certainly turns once where the direction of the force does.
+        Whether M_D is proved to turn once while the direction of the force does.
     refuted : str
-        Place where a condition certainly fails; empty if there is none.
+        Statement of where a condition certainly fails; empty if nowhere.
     seconds : float
         Time spent, s.
     """
@@ -151,22 +151,23 @@ class Certificate:
     _tables: dict[str, Conditions] = field(default_factory=dict, compare=False)
 
     def __repr__(self) -> str:
-        """What is proved and what is not, instead of its boxes."""
+        """Summary of what is proved, instead of the boxes."""
         return f"<{self.summary()}>"
 
     @property
     def proved(self) -> bool:
-        """Whether the theorem follows: all signs are certain everywhere."""
+        """Whether the theorem follows: all signs are proved everywhere."""
         turns = self.straight or self.turns
         return turns and not self.refuted and all(p.complete for p in self.parts.values())
 
     @property
     def _which(self) -> dict[str, list[int]]:
+        """Indices of the conditions of each part."""
         return _PLANAR if self.straight else _SPATIAL
 
     @property
     def share(self) -> float:
-        """Share of the domain's volume on which the signs are certain."""
+        """Share of the domain's volume on which the signs are proved."""
         return self.parts["interior"].share
 
     @property
@@ -184,7 +185,7 @@ class Certificate:
         Returns
         -------
         str
-            One sentence, and one for each part that is not decided.
+            One sentence, and the undecided parts if there are any.
         """
         left = np.rad2deg(self.cone)
         where = f" outside the cone of {left:.3g}°" if self.cone > 0.0 else ""
@@ -202,7 +203,7 @@ class Certificate:
         return f"Certificate{where} not finished: certain by now {shares}; run again to continue."
 
     def _left(self, part: Part) -> str:
-        """Where boxes of a part are undecided: least and largest unknowns."""
+        """Describe where boxes of a part are undecided, by ranges of the unknowns."""
         if not len(part.undecided):
             return ""
         boxes = bounds(part.undecided, part.domain, self.stations)
@@ -212,7 +213,7 @@ class Certificate:
         return f" (undecided: {', '.join(ranges)})"
 
     def is_of(self, contact_map: ContactMap) -> bool:
-        """Whether it is of a map's whisker, and reaches as near to the base as the map does.
+        """Whether the certificate applies to a map's whisker and covers the map's arc lengths.
 
         Parameters
         ----------
@@ -222,7 +223,7 @@ class Certificate:
         Returns
         -------
         bool
-            Whether the polynomials are the same.
+            Whether the polynomials are the same, and the domain reaches as far proximally.
         """
         if contact_map.whisker.base_stiffness is not None:
             return False
@@ -231,7 +232,7 @@ class Certificate:
         return same and bool(self.parts["interior"].domain[0, 0] <= contact_map.chart.proximal)
 
     def evaluate(self, name: str, boxes: Array, which: list[int]) -> tuple[Array, Array]:
-        """Enclose conditions of a part.
+        """Enclose conditions of a part over boxes.
 
         Parameters
         ----------
@@ -240,14 +241,14 @@ class Certificate:
         boxes : (n, unknowns, 2) array
             Bounds of the unknowns.
         which : list of int
-            Conditions that are returned.
+            Indices of the conditions to return.
 
         Returns
         -------
         conditions : (n, c, unknowns + 3) array
-            Centres, shares of the unknowns and of their products, and remainders.
+            Centres, contributions of the unknowns and of their products, and remainders.
         widths : (n, unknowns) array
-            Relative widths by unknown.
+            Relative widths due to each unknown.
         """
         kind = name if name in ("fold", "rest") else ""
         if kind not in self._tables:
@@ -257,11 +258,13 @@ class Certificate:
                 self._tables[kind] = spatial_point_conditions(kind)
             else:
                 self._tables[kind] = spatial_conditions(self.sign)
-        found, widths = enclosed_on(self._tables[kind], self.rod, self.bounds, boxes, _TOLERANCE)
+        found, widths = enclose_conditions(
+            self._tables[kind], self.rod, self.bounds, boxes, _TOLERANCE
+        )
         return found[:, which], widths
 
     def probe(self) -> None:
-        """Look for signs that are not certain at single contacts, so that boxes cannot help."""
+        """Check signs at single contacts; one that is not proved there cannot be on boxes."""
         names = PLANAR if self.straight else SPATIAL
         for part in ("interior", "proximal", "distal"):
             which = self._which[part]
@@ -270,10 +273,10 @@ class Certificate:
             at = low + (high - low) * np.stack([one.ravel() for one in share], axis=1)
             found, _ = self.evaluate(part, np.stack([at, at], axis=-1), which)
             centre, reach = found[..., 0], found[..., 1:].sum(axis=-1)
-            doubt = np.argwhere(~(centre > reach))
-            if doubt.size:
+            doubtful = np.argwhere(~(centre > reach))
+            if doubtful.size:
                 wrong = np.argwhere(centre < -reach)
-                row, column = (wrong if wrong.size else doubt)[0]
+                row, column = (wrong if wrong.size else doubtful)[0]
                 where = ", ".join(f"{x:.4g}" for x in at[row])
                 what = "is certainly wrong" if wrong.size else "cannot be distinguished from zero"
                 unknowns = "(s, ℓ)" if self.straight else "(s, φ, ℓ)"
@@ -289,7 +292,7 @@ class Certificate:
         name : str
             Name of the part.
         most : int
-            Number of boxes that are evaluated, about.
+            Approximate number of boxes to evaluate.
         """
         part, which = self.parts[name], self._which[name]
 
@@ -308,15 +311,15 @@ class Certificate:
             self.refuted = f"a sign is certainly wrong in the part {name}, box {box}"
 
     def _turned(self) -> bool:
-        """Whether M_D certainly turns once with the direction, on the circle s = 1, ℓ = 1/2."""
+        """Whether M_D is proved to turn once with the direction, on the circle s = 1, ℓ = 1/2."""
         low, high = self.parts["interior"].domain[1]
         ends = np.linspace(low, high, _ARCS + 1)
         boxes = np.tile([[1.0, 1.0], [0.0, 0.0], [0.5, 0.5]], (_ARCS, 1, 1))
         boxes[:, 1] = np.stack([ends[:-1], ends[1:]], axis=1)
         found = self.evaluate("distal", boxes, _MOMENT)[0]
         centre, reach = found[..., 0], found[..., 1:].sum(axis=-1)
-        # Each arc's moments are within 45° of their centre, so that neighbouring centres turn
-        # by less than 90°; a half circle by π, as the ends are mirror images of themselves.
+        # Each arc's moments are within 45° of their centre, so neighbouring centres turn by less
+        # than 90°. A half circle turns by π, because its ends are their own mirror images.
         near = 2.01 * (reach**2).sum(axis=1) < (centre**2).sum(axis=1)
         angle = np.arctan2(centre[:, 1], centre[:, 0])
         if low < 0.0:
@@ -325,12 +328,12 @@ class Certificate:
         return bool(near.all()) and abs(turn - (2.0 * np.pi if low < 0.0 else np.pi)) < 1.5
 
     def to_dataset(self) -> xr.Dataset:
-        """Write it as a dataset.
+        """Convert the certificate to a dataset.
 
         Returns
         -------
         Dataset
-            All of it, without loss.
+            Dataset of all fields, without loss.
         """
         data = {f"rod_{n}": (_dims(n, a), a) for n, a in self.rod._asdict().items()}
         data["factors"] = (("polynomial", "power"), self.bounds.factors)
@@ -340,7 +343,7 @@ class Certificate:
             for kind in ("certified", "undecided"):
                 boxes = getattr(part, kind).astype(np.int32)
                 data[f"{name}_{kind}"] = ((f"{name}_{kind}_box", "unknown", "level_index"), boxes)
-        out = xr.Dataset(data).copy(deep=True)  # nobody changes what is proved
+        out = xr.Dataset(data).copy(deep=True)  # independent of the certificate's arrays
         out.attrs = {
             "kind": KIND,
             "triplet": TRIPLET,
@@ -363,22 +366,22 @@ class Certificate:
 
     @classmethod
     def from_dataset(cls, data: xr.Dataset) -> Certificate:
-        """Make a certificate again from its dataset.
+        """Restore a certificate from its dataset.
 
         Parameters
         ----------
         data : Dataset
-            Dataset that `to_dataset` wrote.
+            Dataset from `to_dataset`.
 
         Returns
         -------
         Certificate
-            The certificate.
+            Certificate that was converted.
 
         Raises
         ------
         ValueError
-            If the dataset is not a certificate, or its numbers are not those it was written with.
+            If the dataset is not a certificate, or its numbers have been modified.
         """
         if data.attrs.get("kind") != KIND:
             raise ValueError(
@@ -415,7 +418,7 @@ class Certificate:
         return out
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write it as NetCDF.
+        """Write the certificate as NetCDF.
 
         Parameters
         ----------
@@ -426,27 +429,28 @@ class Certificate:
 
 
 def load_certificate(path: str | PathLike[str]) -> Certificate:
-    """Read a certificate.
+    """Read a certificate from a file.
 
     Parameters
     ----------
     path : str or path
-        File that `Certificate.save` wrote.
+        File written by `Certificate.save`.
 
     Returns
     -------
     Certificate
-        The certificate.
+        Certificate in the file.
     """
     return Certificate.from_dataset(read_dataset(Path(path)))
 
 
 def _dims(name: str, array: Array) -> tuple[str, ...]:
+    """Dimension names of an array of the rod."""
     return tuple(f"{name}_{i}_{size}" for i, size in enumerate(array.shape))
 
 
-def prepared(contact_map: ContactMap, cone: float = CONE) -> Certificate:
-    """Set up a certificate, with nothing decided yet."""
+def prepare_certificate(contact_map: ContactMap, cone: float = CONE) -> Certificate:
+    """Set up a certificate with all boxes undecided."""
     whisker = contact_map.whisker
     straight = bool(whisker.is_straight)
     if straight:
@@ -477,7 +481,7 @@ def prepared(contact_map: ContactMap, cone: float = CONE) -> Certificate:
         start = whole if reach[0] < reach[1] else 0 * whole[:1]
         parts[name] = Part(np.array([reach, *angles, load]), start[:0], start)
     out = Certificate(rod, force, stations, straight, 1.0, cone, parts, f"{whisker!r}")
-    if not straight:  # the sign at one contact, which the cover then shows everywhere
+    if not straight:  # the sign at one contact, which the cover then proves everywhere
         middle = np.array([[[0.65, 0.65], [1.0, 1.0], [0.5, 0.5]]])
         out.sign = float(np.sign(out.evaluate("interior", middle, [4])[0][0, 0, 0]))
         out._tables.clear()
@@ -486,7 +490,7 @@ def prepared(contact_map: ContactMap, cone: float = CONE) -> Certificate:
 
 
 def _stations(rod: ExactRod, near: float) -> Array:
-    """Arc lengths of contacts at which pieces of the rod end, 2^k + 1 in all, with others."""
+    """2^k + 1 arc lengths that include the ends of the rod's pieces."""
     stations = [near, *rod.edges[rod.edges > near].tolist()]
     while (len(stations) - 1) & (len(stations) - 2):
         widest = int(np.argmax(np.diff(stations))) + 1
@@ -507,22 +511,22 @@ def certify(
     Parameters
     ----------
     contact_map : ContactMap
-        Map of the whisker; of a rigid base.
+        Map of the whisker; its base must be rigid.
     cone : float
-        Half angle about the resting whisker within which contacts are left out, rad; a straight
-        whisker needs none.
+        Half angle about the resting whisker within which contacts are excluded, rad; ignored for
+        a straight whisker, which needs none.
     path : str or path, optional
-        File that the certificate is written to, every minute; one of the same whisker and domain
-        that is there already is continued.
+        File to which the certificate is written every minute; an existing one of the same whisker
+        and domain is continued.
     seconds : float
-        Time after which the search stops, s, with some of the domain undecided.
+        Time after which the search stops, s, possibly with undecided boxes.
     progress : callable, optional
         Function called as ``progress(done, total)`` with thousandths of the domain.
 
     Returns
     -------
     Certificate
-        The certificate, with what is undecided; ``proved`` where nothing is.
+        Certificate; ``proved`` if no box is undecided and all signs are right.
 
     Raises
     ------
@@ -533,8 +537,8 @@ def certify(
     if before is None or not sum(len(part.certified) for part in before.parts.values()):
         if not 0.0 <= cone < 0.5 * np.pi:
             raise ValueError(f"cone is a half angle in rad, from 0 to below π/2; got {cone!r}")
-        out = prepared(contact_map, cone)
-        out.refuted = doubt(contact_map, cone)
+        out = prepare_certificate(contact_map, cone)
+        out.refuted = objection(contact_map, cone)
         if not out.refuted:
             out.probe()
     elif before.is_of(contact_map) and (before.straight or np.isclose(before.cone, cone)):
@@ -546,7 +550,7 @@ def certify(
     try:
         for name, part in sorted(out.parts.items(), key=lambda one: one[0] == "interior"):
             while len(part.undecided) and not out.refuted and time.monotonic() - began <= seconds:
-                out.pursue(name, _AT_A_TIME)
+                out.pursue(name, _BATCH)
                 now = time.monotonic()
                 out.seconds = spent + now - began
                 if progress is not None:
@@ -555,7 +559,7 @@ def certify(
                 if path is not None and now - saved > _SAVED_EVERY:
                     out.save(path)
                     saved = now
-    finally:  # also where it is interrupted
+    finally:  # also if interrupted
         if path is not None:
             out.save(path)
     return out

@@ -1,10 +1,11 @@
-"""An independent check of a certificate's file.
+"""Independent verification of a certificate's file.
 
-It shares nothing with the search but the file and the lemma, and halves the boxes as often as it
-must. Curved whiskers are in :mod:`vibrissa.certificates.curved_checker`. For straight ones it has
-another formulation (arc length in units of the contact's, so that the contact is at τ = 0 and the
-base at τ = 1, with derivatives by s_c at fixed τ), another arithmetic (forms of NumPy arrays, many
-boxes side by side, each operation rounded outward by itself), no symbols for remainders.
+It shares nothing with the search but the file and the lemma, and subdivides the boxes as often as
+necessary. Curved whiskers are verified by :mod:`vibrissa.certificates.curved_checker`. For straight
+ones this module uses another formulation (arc length in units of the contact's, so that the contact
+is at τ = 0 and the base at τ = 1, with derivatives by s_c at fixed τ), and another arithmetic
+(linear forms as NumPy arrays over many boxes, each operation rounded outward by itself), without
+symbols for remainders.
 
 With F = f², n = f (-fρ, ν), m = fμ, q = (x, fη), w = cμ, c = b⁻⁴, b = β₀ + β₁ s_c (1 - τ):
 
@@ -27,9 +28,9 @@ from numpy.typing import NDArray
 
 from vibrissa.certificates.curved_checker import (
     CURVED_PARTS,
-    domains_fit as curved_domains_fit,
-    is_of,
-    positive as curved_positive,
+    conditions_hold as curved_conditions_hold,
+    domains_match as curved_domains_match,
+    is_certificate_of,
 )
 from vibrissa.io import read_dataset
 
@@ -38,14 +39,14 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# Each operation adds this share of its operands' sizes: 64 units of rounding, for at most 26 in a
-# sum of nine products.
+# Rounding error of each operation, as a share of its operands' sizes: 64 units of rounding, of
+# which a sum of nine products needs at most 26.
 _LOST = 2.0**-47
 _ORDER = 9
-# Steps in τ are this share of the distance to the pole of b, or of the length in which the load
-# turns the rod, at first, and become shorter with every halving.
+# Initial step in τ, as a share of the distance to the pole of b or of the length in which the load
+# turns the rod, and its reduction with every subdivision.
 _STEP, _SHORTER = 0.25, 0.75
-# How often boxes are halved, and into how many parts in all, before they are not confirmed.
+# Largest number of subdivisions, and of parts per box, before a box is not confirmed.
 _ROUNDS, _MOST = 9, 512
 _BATCH = 256
 _STATES = 5
@@ -54,7 +55,7 @@ PARTS = ("interior", "proximal", "distal", "fold")
 
 @dataclass(frozen=True)
 class Form:
-    """Centre (n,), coefficients (unknowns, n) and remainder (n,) of numbers over n boxes."""
+    """Linear forms over n boxes: centre (n,), coefficients (unknowns, n) and remainder (n,)."""
 
     centre: Array
     slope: Array
@@ -62,7 +63,7 @@ class Form:
 
     @cached_property
     def reach(self) -> Array:
-        """Largest distance from the centre."""
+        """Largest deviation from the centre."""
         return np.asarray((np.abs(self.slope).sum(axis=0) + self.rest) * (1.0 + _LOST))
 
     @cached_property
@@ -103,13 +104,13 @@ class Form:
         return Form(1.0 / self.centre, slope * self.slope, rest + 4.0 * _LOST / least)
 
     def blurred(self, by: Array) -> Form:
-        """As a centre and a remainder alone, larger by so much."""
+        """Form without unknowns: the centre and a remainder enlarged by ``by``."""
         none = np.zeros((0, self.centre.size))
         return Form(self.centre, none, (self.reach + by) * (1.0 + _LOST))
 
 
 class Series:
-    """Taylor coefficients of numbers over n boxes, side by side, up to an order."""
+    """Taylor coefficients of numbers over n boxes, up to an order."""
 
     def __init__(self, first: Form, order: int) -> None:
         self.centre = np.zeros((order + 1, *first.centre.shape))
@@ -119,14 +120,14 @@ class Series:
         self.append(first)
 
     def append(self, form: Form) -> None:
-        """Add the next coefficient."""
+        """Append the next coefficient."""
         k = len(self.forms)
         self.centre[k], self.slope[k], self.rest[k] = form.centre, form.slope, form.rest
         self.reach[k], self.size[k] = form.reach, form.size
         self.forms.append(form)
 
     def __getitem__(self, k: int) -> Form:
-        """One coefficient."""
+        """Coefficient k."""
         return self.forms[k]
 
     def times(self, other: Series, k: int) -> Form:
@@ -140,14 +141,14 @@ class Series:
 
 
 class Checked(NamedTuple):
-    """What a check found.
+    """Result of a verification.
 
     Attributes
     ----------
     covers : bool
-        Whether the boxes of each part fill its domain once, and the domains are those of the lemma.
+        Whether the boxes of each part fill its domain once, and the domains match the lemma.
     boxes, confirmed : int
-        Numbers of boxes tried and confirmed.
+        Numbers of boxes verified and confirmed.
     """
 
     covers: bool
@@ -162,43 +163,43 @@ def check_certificate(
     parts: Sequence[str] | None = None,
     whisker: Whisker | None = None,
 ) -> Checked:
-    """Verify a certificate.
+    """Verify a certificate independently of the search.
 
     Parameters
     ----------
     path : str or path
         File of the certificate.
     number : int, optional
-        Number of boxes of each part that are drawn at random; None for all.
+        Number of randomly drawn boxes of each part; None for all.
     seed : int
         Seed of the draw.
     parts : sequence of str, optional
-        Parts of the domain that are checked; by default all.
+        Parts of the domain to verify; by default all.
     whisker : Whisker, optional
-        Whisker that the certificate is to be of.
+        Whisker to which the certificate should belong.
 
     Returns
     -------
     Checked
-        Whether the boxes cover the domain, and how many hold.
+        Whether the boxes cover the domain, and how many are confirmed.
 
     Raises
     ------
     ValueError
-        If the file is not a certificate, has other numbers than it was written with, or is of
-        another whisker.
+        If the file is not a certificate, its numbers have been modified, or it belongs to another
+        whisker.
     """
     data = read_dataset(Path(path)).load()
     if data.attrs.get("kind") != "vibrissa certificate":
         raise ValueError(f"{path} is not a certificate")
     if _identity(data) != data.attrs["identity"]:
         raise ValueError(f"{path} has other numbers than those that it was written with")
-    if whisker is not None and not is_of(data, whisker):
+    if whisker is not None and not is_certificate_of(data, whisker):
         raise ValueError(f"{path} is a certificate of another whisker")
     straight = bool(data.attrs["straight"])
     rng = np.random.default_rng(seed)
-    whole, tried, held = _domains_fit(data) if straight else curved_domains_fit(data), 0, 0
-    positive = _positive if straight else curved_positive
+    whole, tried, held = _domains_match(data) if straight else curved_domains_match(data), 0, 0
+    conditions_hold = _conditions_hold if straight else curved_conditions_hold
     for part in parts or (PARTS if straight else CURVED_PARTS):
         boxes = data[f"{part}_certified"].values.astype(np.int64)
         domain = data[f"{part}_domain"].values
@@ -210,7 +211,7 @@ def check_certificate(
             rows = boxes[chosen[start : start + _BATCH]]
             tried += len(rows)
             bounds = _bounds(rows, domain, data["stations"].values)
-            held += int(_confirmed(data, part, bounds, positive).sum())
+            held += int(_confirm(data, part, bounds, conditions_hold).sum())
     return Checked(whole, tried, held)
 
 
@@ -224,11 +225,11 @@ def _identity(data: xr.Dataset) -> str:
     return hashlib.sha256(b"".join(flat)).hexdigest()[:16]
 
 
-def _domains_fit(data: xr.Dataset) -> bool:
-    """Whether the rod is a straight cone, and the parts those of the lemma.
+def _domains_match(data: xr.Dataset) -> bool:
+    """Whether the rod is a straight cone, and the parts are those of the lemma.
 
-    These are the domain, its two ends and the face of the largest force. A curved whisker's file
-    that is called straight, or a rod of several pieces, is none that these equations are for.
+    These are the domain, its two ends and the face of the largest force. The equations do not apply
+    to a curved whisker whose file is marked as straight, nor to a rod of several pieces.
     """
     rod = data["rod_coefficients"].values
     cone = len(rod) == 1 and not rod[0, :3].any() and not rod[0, 3, 2:].any()
@@ -242,7 +243,7 @@ def _domains_fit(data: xr.Dataset) -> bool:
 
 
 def covers(boxes: NDArray[np.int64]) -> bool:
-    """Whether boxes, rows of (level, index) by unknown, fill the unit cube once: by halving it."""
+    """Whether boxes, rows of (level, index) by unknown, fill the unit cube exactly once."""
     levels = boxes[..., 0].sum(axis=1).tolist()
     most = max(levels, default=0)
     if sum(1 << (most - level) for level in levels) != 1 << most:
@@ -279,7 +280,7 @@ def covers(boxes: NDArray[np.int64]) -> bool:
 
 
 def _bounds(boxes: NDArray[np.int64], domain: Array, stations: Array) -> Array:
-    """Bounds (n, unknowns, 2), a little wider than they are; arc lengths between stations."""
+    """Bounds (n, unknowns, 2), slightly widened; arc lengths are interpolated between stations."""
     share = (boxes[..., 1, None] + [0, 1]) / 2.0 ** boxes[..., 0, None]
     out = domain[:, :1] + (domain[:, 1:] - domain[:, :1]) * share
     if domain[0, 0] < domain[0, 1]:
@@ -288,16 +289,16 @@ def _bounds(boxes: NDArray[np.int64], domain: Array, stations: Array) -> Array:
     return np.asarray(out + blur * [-1.0, 1.0])
 
 
-def _confirmed(
-    data: xr.Dataset, part: str, bounds: Array, positive: Callable[..., NDArray[np.bool_]]
+def _confirm(
+    data: xr.Dataset, part: str, bounds: Array, conditions_hold: Callable[..., NDArray[np.bool_]]
 ) -> NDArray[np.bool_]:
-    """Whether all conditions hold on each box, halved as often as is needed."""
+    """Whether all conditions hold on each box, subdivided as often as necessary."""
     owner, holds = np.arange(len(bounds)), np.ones(len(bounds), dtype=bool)
     for halved in range(_ROUNDS):
         step = _STEP * max(_SHORTER**halved, 0.25)
         batches = [bounds[i : i + _BATCH] for i in range(0, len(bounds), _BATCH)]
-        with np.errstate(all="ignore"):  # where nothing is enclosed numbers grow out of bounds
-            good = np.concatenate([positive(data, part, batch, step) for batch in batches])
+        with np.errstate(all="ignore"):  # failed enclosures overflow
+            good = np.concatenate([conditions_hold(data, part, batch, step) for batch in batches])
         owner, bounds = owner[~good], bounds[~good]
         if not len(owner):
             return holds
@@ -312,8 +313,8 @@ def _confirmed(
     return holds
 
 
-def _positive(data: xr.Dataset, part: str, bounds: Array, step: float) -> NDArray[np.bool_]:
-    """Whether all conditions of a part are positive on each box."""
+def _conditions_hold(data: xr.Dataset, part: str, bounds: Array, step: float) -> NDArray[np.bool_]:
+    """Whether all conditions of a part are proved to be conditions_hold on each box."""
     n = len(bounds)
     factors = data["factors"].values[1]
 
@@ -327,7 +328,7 @@ def _positive(data: xr.Dataset, part: str, bounds: Array, step: float) -> NDArra
         return Form(middle, slope, np.zeros(n))
 
     s, level = unknown(0), unknown(1)
-    # b = β₀ + β₁ s, from a polynomial in a variable of its own.
+    # b = β₀ + β₁ s, from the stored polynomial in a local variable.
     own = [known(*data["rod_coefficients"].values[0, 3, i]) for i in range(2)]
     slope, offset = (known(*one) for one in data["rod_local"].values[0, 3])
     beta = [own[0] + own[1] * offset, own[1] * slope]
@@ -340,7 +341,7 @@ def _positive(data: xr.Dataset, part: str, bounds: Array, step: float) -> NDArra
     limit = q * q * p
     rise = q * q * dp - q * (inverse * inverse) * p * 2.0
     load = limit * limit * level
-    base = _base(s, load, beta, part == "fold", step)
+    base = _integrate_to_base(s, load, beta, part == "fold", step)
     if base is None:
         return np.zeros(n, dtype=bool)
     (r, _, m, *_), (r_s, _, m_s, x_s, e_s), (r_f, _, m_f, x_f, e_f) = base
@@ -359,10 +360,10 @@ def _positive(data: xr.Dataset, part: str, bounds: Array, step: float) -> NDArra
     return np.asarray(least > 0.0)
 
 
-def _series(
+def _taylor_series(
     s: Form, load: Form, beta: list[Form], rest: Form, states: list[Form], order: int, fold: bool
 ) -> list[Series]:
-    """Taylor coefficients of all states in τ, about where 1 - τ is ``rest``, and of 1/b."""
+    """Taylor coefficients in τ of all states, at 1 - τ = ``rest``, and of 1/b."""
     zero, one = s * 0.0, Form(s.centre * 0.0 + 1.0, s.slope * 0.0, s.rest * 0.0)
     slope = -(beta[1] * s)  # db/dτ
     x = [Series(state, order) for state in states]
@@ -414,10 +415,10 @@ def _series(
     return [*x, g]
 
 
-def _base(
+def _integrate_to_base(
     s: Form, load: Form, beta: list[Form], fold: bool, step: float
 ) -> list[list[Form]] | None:
-    """States at the base with their derivatives by s_c and F."""
+    """States at the base, and their derivatives by s_c and F; None if they cannot be enclosed."""
     zero = s * 0.0
     one = Form(zero.centre + 1.0, zero.slope, zero.rest)
     states = [zero] * (3 * _STATES)
@@ -430,9 +431,9 @@ def _base(
         h = float(step * np.minimum(pole, turn).min())
         if not h > 1e-4:
             return None
-        # A power of two times a small integer: tau is exact.
+        # A multiple of a power of two, so that tau is exact.
         h = min(np.floor(h * 2.0**20) / 2.0**20, 1.0 - tau)
-        x = _series(s, load, beta, one * (1.0 - tau), states, _ORDER - 1, fold)
+        x = _taylor_series(s, load, beta, one * (1.0 - tau), states, _ORDER - 1, fold)
         wide = [f.blurred(none) for f in (s, load, *beta)]
         over = (one * (1.0 - tau - 0.5 * h)).blurred(none + 0.5 * h)
         guess = [a[-1].size * h ** (_ORDER - 1) + 1e-9 * a[0].size + 1e-12 for a in x]
@@ -441,7 +442,7 @@ def _base(
                 a[0].blurred(sum(c.size * h**k for k, c in enumerate(a.forms) if k) + e)
                 for a, e in zip(x, guess, strict=True)
             ]
-            y = _series(wide[0], wide[1], wide[2:], over, spans[:-1], _ORDER, fold)
+            y = _taylor_series(wide[0], wide[1], wide[2:], over, spans[:-1], _ORDER, fold)
             grown = [a[-1].size * h**_ORDER * (1.0 + 1e-9) for a in y]
             if all((e <= p).all() for e, p in zip(grown, guess, strict=True)):
                 break

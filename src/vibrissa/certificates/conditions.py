@@ -1,14 +1,14 @@
-"""The sign conditions over one box of contacts.
+"""Sign conditions of a certificate, and their enclosure over boxes of contacts.
 
-Boxes are in (s, ℓ) for a straight whisker, with F = f² = ℓ f_max(s)², and in (s, φ, ℓ) for any,
-with f = f_min(s) + (f_max(s, φ) - f_min(s)) ℓ; of contacts near rest with f = f_min(s) ℓ. With
-q = 1/s - α and polynomials P_i(s)
+Boxes are in (s, ℓ) for a straight whisker, with F = f² = ℓ f_max(s)², and in (s, φ, ℓ) for any
+other, with f = f_min(s) + (f_max(s, φ) - f_min(s)) ℓ, or f = f_min(s) ℓ for contacts near rest.
+With q = 1/s - α and polynomials P_i(s)
 
     f_min = q² P₀,    f_max = q² (P₁ + P₂ cos φ + P₃ sin φ + P₄ cos² φ).
 
-On each box the sign of every condition is to be that which the proof needs: they are written so
-that all are to be positive. What is computed from the unknowns, and from the states at the base,
-is a table of products like the rod's equations.
+The proof requires a sign of every condition on each box; conditions are written such that all must
+be positive. Quantities computed from the unknowns, and from the states at the base, are tables of
+products like the rod's equations.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ from vibrissa.certificates.forms import (
 )
 from vibrissa.numerics import Array, IntArray, inlined_rigorous, rigorous
 
-#: Conditions of a straight whisker: f_max > 0; μ > 0; ∂ ln M/∂s < 0; ∂(M, R)/∂(s, f) < 0;
-#: ∂R/∂f > 0, which is needed on the faces only.
+#: Conditions for a straight whisker: f_max > 0; μ > 0; ∂ ln M/∂s < 0; ∂(M, R)/∂(s, f) < 0;
+#: ∂R/∂f > 0, which is required on the faces only.
 PLANAR = ("load", "moment", "moment along s", "determinant", "ratio along the load")
-#: Beyond the fold: x_s(η + 2Fη_F) - 2F x_F η_s < 0, the determinant of the contact point in its
-#: plane; η > 0, which makes it that in space.
+#: Conditions beyond the fold: x_s(η + 2Fη_F) - 2F x_F η_s < 0, the determinant of the contact point
+#: in the plane; η > 0, with which it is also that in space.
 PLANAR_FOLD = ("determinant of the point", "deflection")
-#: Conditions of any whisker: f_min > 0; f_ℓ > 0; ∂g₁/∂s < 0; ∂(g₁, g₂)/∂(s, φ) < 0; the sign of
-#: the determinant; ∂g₂/∂φ > 0; the sign of ∂(g₂, g₃)/∂(φ, ℓ). The last two are needed on the faces.
+#: Conditions for any whisker: f_min > 0; f_ℓ > 0; ∂g₁/∂s < 0; ∂(g₁, g₂)/∂(s, φ) < 0; the sign of
+#: the determinant; ∂g₂/∂φ > 0; the sign of ∂(g₂, g₃)/∂(φ, ℓ). The last two apply to the faces.
 SPATIAL = (
     "least load",
     "load",
@@ -61,24 +61,25 @@ SPATIAL = (
     "direction",
     "direction and force",
 )
-#: Beyond the fold: det ∂p/∂(s, f_y, f_z) < 0.
+#: Condition beyond the fold: det ∂p/∂(s, f_y, f_z) < 0.
 SPATIAL_FOLD = ("determinant of the point",)
-#: Near rest: f_min |∂p/∂f| < ``room`` · s, so that contacts with less force are within the cone.
+#: Condition near rest: f_min |∂p/∂f| < ``room`` · s, so that less force leaves the contact in the
+#: cone.
 SPATIAL_REST = ("deflection",)
-# Coefficients of each polynomial P.
+# Number of coefficients of each polynomial P.
 DEGREES = 6
-_GIVEN = ("one", "s", "level", "cos", "sin", "inverse", "alpha")
+_GIVEN_VARIABLES = ("one", "s", "level", "cos", "sin", "inverse", "alpha")
 _POLYNOMIALS = 5
-_ROUNDED = 1e-13  # boxes end at the edges of pieces; only outward rounding may exceed these
+_ROUNDED = 1e-13  # largest distance of a box beyond the ends of its piece, from outward rounding
 
 
 class Conditions(NamedTuple):
-    """What is computed on a box, as tables for the kernel.
+    """Conditions as tables for the kernel.
 
-    The rod's equations, and a table of sums of products before and (from the variable ``middle``
-    on) after they are solved. Variables of it are the states at the contact (``start``, -1 for
-    zero), the load of the equations (-1 if they have none), the first state at the base, and the
-    ``conditions`` that are to be positive.
+    The rod's equations, and a table of sums of products that are computed before and (from the
+    variable ``middle`` on) after the equations are solved. Indices of its variables: the states at
+    the contact (``start``, -1 for zero), the load in the equations (-1 if they have none), the
+    first state at the base, and the ``conditions`` that must be positive.
     """
 
     equations: Program
@@ -92,7 +93,7 @@ class Conditions(NamedTuple):
 
 
 def _polynomial(out: Equations, i: int) -> None:
-    """P_i(s), its derivative, and q² times it with its derivative: names p, dp, b, db."""
+    """Add P_i(s) and q² P_i with their derivatives, named p, dp, b and db."""
     out.add(ALGEBRAIC, f"p{i}_{DEGREES - 1}", f"a{i}_{DEGREES - 1}")
     for k in range(DEGREES - 2, -1, -1):
         out.add(ALGEBRAIC, f"p{i}_{k}", f"p{i}_{k + 1} s", f"a{i}_{k}")
@@ -102,11 +103,11 @@ def _polynomial(out: Equations, i: int) -> None:
     out.add(ALGEBRAIC, f"db{i}", f"q2 d{i}_0", *2 * [f"-qi2 p{i}_0"])
 
 
-def _bounds(polynomials: tuple[int, ...]) -> Equations:
-    """Start of a table: the unknowns, and bounds on the force."""
+def _force_bounds(polynomials: tuple[int, ...]) -> Equations:
+    """Start a table with the unknowns and the bounds on the force."""
     out = Equations()
     factors = (f"a{i}_{k}" for i in range(_POLYNOMIALS) for k in range(DEGREES))
-    out.given(*_GIVEN, *factors, "room")
+    out.given(*_GIVEN_VARIABLES, *factors, "room")
     out.add(ALGEBRAIC, "i2", "inverse inverse")
     out.add(ALGEBRAIC, "q", "inverse", "-alpha")
     out.add(ALGEBRAIC, "q2", "q q")
@@ -116,7 +117,7 @@ def _bounds(polynomials: tuple[int, ...]) -> Equations:
     return out
 
 
-def _assembled(
+def _assemble(
     out: Equations,
     equations: Program,
     middle: int,
@@ -126,6 +127,7 @@ def _assembled(
     unknowns: int,
 ) -> Conditions:
     at = out.names.index
+    """Complete a table with the indices of its inputs and outputs."""
     first = np.full(equations.groups.size, -1)
     for i, name in start.items():
         first[i] = at(name)
@@ -135,8 +137,8 @@ def _assembled(
 
 
 def planar_conditions(fold: bool = False) -> Conditions:
-    """Conditions `PLANAR` of a straight whisker, or `PLANAR_FOLD`."""
-    out = _bounds((1,))
+    """Conditions `PLANAR` of a straight whisker, or with ``fold`` `PLANAR_FOLD`."""
+    out = _force_bounds((1,))
     out.add(ALGEBRAIC, "limit", "b1 b1")
     out.add(ALGEBRAIC, "F", "limit level")
     middle = len(out.names)
@@ -156,12 +158,12 @@ def planar_conditions(fold: bool = False) -> Conditions:
         out.add(ALGEBRAIC, "rise", "e", *2 * ["FeF"])
         out.add(ALGEBRAIC, "beyond", "-xs rise", *2 * ["FxF es"])
         wanted = ("beyond", "e")
-    return _assembled(out, planar_equations(fold), middle, {1: "one"}, "r", wanted, 2)
+    return _assemble(out, planar_equations(fold), middle, {1: "one"}, "r", wanted, 2)
 
 
 def _spatial_load(rest: bool) -> Equations:
-    """Start of a table in space: the force with its derivatives by s, φ and ℓ."""
-    out = _bounds((0,) if rest else tuple(range(_POLYNOMIALS)))
+    """Start a table in space with the force and its derivatives by s, φ and ℓ."""
+    out = _force_bounds((0,) if rest else tuple(range(_POLYNOMIALS)))
     if rest:
         out.add(ALGEBRAIC, "f", "b0 level")
     else:
@@ -179,7 +181,7 @@ def _spatial_load(rest: bool) -> Equations:
 
 
 def spatial_conditions(sign: float) -> Conditions:
-    """Conditions `SPATIAL` of any whisker, and then M_y and M_z.
+    """Conditions `SPATIAL` of any whisker, followed by M_y and M_z.
 
     ``sign`` is that of det ∂(M_y, M_z, F_x)/∂(s, f_y, f_z).
     """
@@ -209,14 +211,14 @@ def spatial_conditions(sign: float) -> Conditions:
     out.add(ALGEBRAIC, "both", f"{mark}turnp zetal", f"{other}turnl zetap")
     wanted = ("b0", "extent", "fall", "moments", "det", "turnp", "both", "My", "Mz")
     start = {1: "fy", 2: "fz", 13: "one", 20: "one"}
-    return _assembled(out, spatial_equations(False), middle, start, "Fx", wanted, 3)
+    return _assemble(out, spatial_equations(False), middle, start, "Fx", wanted, 3)
 
 
 def spatial_point_conditions(kind: str) -> Conditions:
-    """Conditions `SPATIAL_REST` of contacts near rest, ``"rest"``, or `SPATIAL_FOLD`, ``"fold"``.
+    """Conditions `SPATIAL_REST` near rest (``"rest"``), or `SPATIAL_FOLD` (``"fold"``).
 
-    Of a ``"contact"``, with the force of contacts near rest: det ∂p/∂(s, f_y, f_z), positive where
-    it is stable; then F, M and p, and each of these by s, φ and ℓ.
+    For a ``"contact"``, with the force as near rest: det ∂p/∂(s, f_y, f_z), which is positive if
+    the contact is stable; then F, M and p, and the derivatives of each by s, φ and ℓ.
     """
     out = _spatial_load(kind != "fold")
     middle = len(out.names)
@@ -246,12 +248,12 @@ def spatial_point_conditions(kind: str) -> Conditions:
             out.add(ALGEBRAIC, f"{name}l", f"b0 {name}r")
             wanted += (f"{name}s", f"{name}p", f"{name}l")
     start = {1: "fy", 2: "fz", 19: "one", 29: "one"}
-    return _assembled(out, spatial_equations(True), middle, start, "Fx", wanted, 3)
+    return _assemble(out, spatial_equations(True), middle, start, "Fx", wanted, 3)
 
 
 @inlined_rigorous
 def compute(table: Program, z: Array, first: int, end: int) -> None:
-    """Sums of products, row by row."""
+    """Compute the sums of products of a table, row by row."""
     for v in range(first, end):
         if table.kind[v] == 1:
             clear(z, v)
@@ -262,7 +264,7 @@ def compute(table: Program, z: Array, first: int, end: int) -> None:
 
 @inlined_rigorous
 def set_unknown(low: float, high: float, column: int, z: Array, k: int, lane: int) -> None:
-    """All numbers between two, in one lane; not yet closed."""
+    """Set a lane to the interval between two numbers; the form must be closed afterwards."""
     middle = 0.5 * (low + high)
     half = 0.5 * (high - low) * UP + 4e-16 * (abs(low) + abs(high))
     z[k, 0, lane], z[k, column, lane], z[k, z.shape[1] - 1, lane] = middle, half, abs(middle)
@@ -270,10 +272,10 @@ def set_unknown(low: float, high: float, column: int, z: Array, k: int, lane: in
 
 @inlined_rigorous
 def set_angle(low: float, high: float, pure: IntArray, z: Array, k: int, lane: int) -> None:
-    """Cosine, in row k, and sine, in the next, of an angle within ±3.2; not yet closed.
+    """Set cosine (row k) and sine (row k + 1) of an angle within ±3.2, in one lane, to be closed.
 
-    By their series at the middle, and then about it; ``pure`` are the columns of the unknown's
-    powers.
+    They are computed by their series at the middle of the interval, and a series about it; ``pure``
+    are the columns of the powers of the unknown.
     """
     middle = 0.5 * (low + high)
     half = 0.5 * (high - low) * UP + 4e-16 * (abs(low) + abs(high))
@@ -290,7 +292,7 @@ def set_angle(low: float, high: float, pure: IntArray, z: Array, k: int, lane: i
         z[k, pure[n], lane], z[k + 1, pure[n], lane] = cos * power, sin * power
         cos, sin = -sin, cos
         power *= half / (n + 1) * UP
-    # The series at the middle is good to 80 u cosh 3.2 < 1.2e-13, and so are its derivatives.
+    # The error of the series at the middle, and of its derivatives, is 80 u cosh 3.2 < 1.2e-13.
     for row in (k, k + 1):
         z[row, coefficients(z), lane] = power + 1.2e-13 * (1.0 + half) ** 3 * UP
         z[row, z.shape[1] - 1, lane] = (1.0 + half) ** 3
@@ -298,7 +300,7 @@ def set_angle(low: float, high: float, pure: IntArray, z: Array, k: int, lane: i
 
 @inlined_rigorous
 def report(z: Array, row: int, lane: int, unknowns: int, out: Array) -> None:
-    """A form as its centre, the shares of the unknowns, of their products, and the rest."""
+    """Write a form as its centre, contributions of unknowns and products, and remainder."""
     n = coefficients(z)
     out[0], out[unknowns + 1] = z[row, 0, lane], 0.0
     for a in range(1, n):
@@ -312,9 +314,9 @@ def report(z: Array, row: int, lane: int, unknowns: int, out: Array) -> None:
 
 @inlined_rigorous
 def relative_widths(state: Array, states: int, lane: int, out: Array) -> None:
-    """Sum, over vectors of states, of what each unknown changes over the vector's size.
+    """Sum over vectors of states of the change by each unknown, relative to the vector's size.
 
-    The vectors are those of the derivatives by the force, which change only as the rod turns.
+    The vectors are the derivatives by the force, which change only as the rod turns.
     """
     last = state.shape[1] - 1
     for a in range(out.size):
@@ -345,10 +347,10 @@ def conditions_on(
 ) -> None:
     """Enclose the conditions over boxes (n, unknowns, 2), rows from ``first`` to ``end``.
 
-    ``bound`` is the taper α, the coefficients of P₀ … P₄, and ``room``; neighbours are computed
-    side by side. ``found`` (n, c, unknowns + 3) are conditions, each a centre, the share of each
-    unknown and of their products, and the remainder with all else; NaN where the states could not
-    be enclosed. ``widths`` (n, unknowns) are relative widths of the states.
+    ``bound`` is the taper α, the coefficients of P₀ … P₄, and ``room``; neighbouring boxes share
+    the lanes of a batch. ``found`` (n, c, unknowns + 3) are conditions, each a centre, the
+    contribution of each unknown and of their products, and the remainder of all else; NaN where the
+    states cannot be enclosed. ``widths`` (n, unknowns) are relative widths of the states.
     """
     groups, states = conditions.equations.groups.shape
     unknowns, table = conditions.unknowns, conditions.table
@@ -392,7 +394,7 @@ def conditions_on(
             copy_row(state, i, z, conditions.base + i)
         compute(table, z, conditions.middle, table.kind.size)
         for lane in range(number):
-            # Contacts on both sides of an end of pieces have different equations.
+            # A box that extends over the end of a piece would need different equations.
             box = boxes[row + lane, 0]
             apart = max(rod.edges[piece] - box[0], box[1] - rod.edges[piece + 1]) > _ROUNDED
             for c in range(conditions.conditions.size):
@@ -400,6 +402,6 @@ def conditions_on(
             if apart:
                 found[row + lane] = np.nan
             relative_widths(state, states, lane, widths[row + lane])
-            if unknowns == 3:  # the force turns with φ, also where the rod does not
+            if unknowns == 3:  # the force turns with φ even where the rod does not
                 widths[row + lane, 1] += 0.5 * (boxes[row + lane, 1, 1] - boxes[row + lane, 1, 0])
         row += number

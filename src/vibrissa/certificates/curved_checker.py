@@ -1,20 +1,21 @@
-"""The conditions of a curved whisker's certificate on boxes, shown by other means than the search.
+"""Verification of a curved whisker's certificate on boxes, by other means than the search.
 
-Nothing is shared with it but the file and the lemma. Backwards along the rod, with n, m and q the
-force, the moment and the contact point from where the rod is cut,
+It shares nothing with the search but the file and the lemma. Backwards along the rod, with n, m and
+q the force, the moment and the contact point relative to the current cross-section,
 
     n' = u × n,   m' = u × m - n × e₁,   q' = u × q + e₁,   u = κ + c∘m,   c = b⁻⁴,
 
-polynomials X in t and in the unknowns are found in plain floating point, step by step. How far the
-true solution is from them follows from their defect: with balls of radius e about n, m, q and their
-derivatives, as u × turns a difference and does not enlarge it,
+polynomials X in t and in the unknowns are computed in plain floating point, step by step. The
+distance of the true solution from them is bounded through their defect. With balls of radius e
+about n, m, q and their derivatives, as u × rotates a difference without enlarging it,
 
     e_n' ≤ c|n| e_m + d_n,    e_m' ≤ ν c|m| e_m + e_n + d_m,
 
-ν what the rod is softer in twist (a difference of moments is across what it turns), and so on for
-q and for derivatives; d bounds X' - u × X - …: the terms of high order, which are the sizes of all
-products minus those of the products that X contains. A step from the contact, whose arc length is
-an unknown, to the middle of the box comes first: its polynomials are made to agree at the contact.
+with ν the additional compliance in twist (a difference of moments is normal to what it turns), and
+likewise for q and for derivatives. The defect d bounds X' - u × X - …: the terms of high order,
+which are the sizes of all products minus those of the products that X contains. A step from the
+contact, whose arc length is an unknown, to the middle of the box comes first; its polynomials are
+made to agree at the contact.
 """
 
 from __future__ import annotations
@@ -33,23 +34,23 @@ Array = NDArray[np.float64]
 
 CURVED_PARTS = ("interior", "proximal", "distal", "fold", "rest")
 DEGREE, ORDER = 3, 8
-TOLERANCE = 1e-8  # share of the states to which the last Taylor coefficient falls in a step
-# Boxes computed side by side.
+TOLERANCE = 1e-8  # ratio of the last Taylor coefficient to the states that determines a step
+# Number of boxes computed together.
 _SIDE_BY_SIDE = 64
 _MOST_STEPS = 200
-# What rounding adds, over the sum of the sizes of all products of a step (at most 400 units each
-# of 2⁻⁵³) and to bounds themselves.
+# Rounding errors, over the sum of the sizes of all products of a step (at most 400 units each of
+# 2⁻⁵³), and of bounds themselves.
 _LOST, _UP = 1e-12, 1.0 + 1e-10
-_ARCS = 64  # arcs of the circle on which M_D is followed
+_ARCS = 64  # number of arcs of the circle on which the turning of M_D is verified
 
 _ROWS = sorted(
     (e for e in combinations(range(DEGREE + 1), repeat=3) if sum(e) <= DEGREE),
     key=lambda e: (sum(e), e),
 )
 _DEGREES = np.array([sum(e) for e in _ROWS])
-# First monomial of each degree, and number of those up to each.
+# First monomial of each degree, and number of monomials up to each.
 _FIRST, _UP_TO = (np.searchsorted(_DEGREES, range(DEGREE + 1), side) for side in ("left", "right"))
-# For each monomial: how many others may be multiplied with it, and which monomials that gives.
+# For each monomial: number of others with which its product is kept, and indices of the products.
 _MATES = _UP_TO[DEGREE - _DEGREES]
 _TO = [
     np.array([_ROWS.index(tuple(np.add(a, b))) for b in _ROWS[:m]])
@@ -59,7 +60,7 @@ _UNKNOWN = [_ROWS.index(tuple(row)) for row in np.eye(3, dtype=int).tolist()]
 
 
 class Poly(NamedTuple):
-    """Coefficients (monomials, n) of numbers over n boxes, and radii (n,) of the rest."""
+    """Polynomials over n boxes: coefficients (monomials, n), and radii (n,) of the remainder."""
 
     coef: Array
     rest: Array
@@ -85,7 +86,7 @@ class Poly(NamedTuple):
             coef[to] += self.coef[row] * other.coef[:mates]
         a, b = (np.add.reduceat(np.abs(x.coef), _FIRST, axis=0)[None] for x in (self, other))
         rest = a.sum(axis=(0, 1)) * other.rest + (b.sum(axis=(0, 1)) + other.rest) * self.rest
-        return Poly(coef, (_dropped(a, b, 1) + rest) * _UP)
+        return Poly(coef, (_bound_dropped_products(a, b, 1) + rest) * _UP)
 
     @property
     def least(self) -> Array:
@@ -94,13 +95,17 @@ class Poly(NamedTuple):
 
 
 def _constant(value: Array | float, number: int, spread: float = 0.0) -> Poly:
+    """Constant polynomial with a radius."""
     coef = np.zeros((len(_ROWS), number))
     coef[0] = value
     return Poly(coef, np.full(number, spread))
 
 
 def _function(axis: int, half: Array, derivatives: list[Array], beyond: Array) -> Poly:
-    """A function of one unknown by its derivatives in the middle, and a bound on the next."""
+    """Taylor polynomial of a function of one unknown, from its derivatives in the middle.
+
+    ``beyond`` bounds the next derivative.
+    """
     out = _constant(derivatives[0], half.size)
     power, each = 1.0 + 0.0 * half, np.eye(3, dtype=int)[axis]
     for k, value in enumerate(derivatives):
@@ -111,14 +116,14 @@ def _function(axis: int, half: Array, derivatives: list[Array], beyond: Array) -
 
 
 def _norms(x: Array, h: Array) -> Array:
-    """Sizes (order, degree, ..., n) of vectors (order, monomial, ..., 3, n) of series over h."""
+    """Sizes (order, degree, ..., n) over a step h of vector series (order, monomial, ..., 3, n)."""
     size = np.sqrt((np.add.reduceat(np.abs(x), _FIRST, axis=1) ** 2).sum(axis=-2))
     power = h ** np.arange(len(x))[:, None]
     return np.asarray(size * power.reshape(len(x), *(1,) * (size.ndim - 2), h.size) * _UP)
 
 
-def _dropped(a: Array, b: Array, order: int) -> Array:
-    """Bound on products of high order or degree, from sizes (order, degree, ...); and rounding."""
+def _bound_dropped_products(a: Array, b: Array, order: int) -> Array:
+    """Bound on products of high order or degree, from sizes (order, degree, ...), and rounding."""
     total = a.sum(axis=(0, 1)) * b.sum(axis=(0, 1))
     below = b[:order].cumsum(axis=0).cumsum(axis=1)
     kept = 0.0 * total
@@ -129,11 +134,11 @@ def _dropped(a: Array, b: Array, order: int) -> Array:
 
 
 class Rod(NamedTuple):
-    """Polynomials of the whisker about points of it, one for each box, backwards.
+    """Local polynomials of the whisker about one point for each box, backwards along the rod.
 
-    Taylor coefficients of the curvatures and of the radius (4, d, n), and of the compliance; the
-    largest differences (2, n) of curvature and compliance from these over a step; the compliance in
-    twist over that in bending.
+    known: Taylor coefficients of the curvatures and of the radius (4, d, n); soft: those of the
+    compliance; wrong: largest errors (2, n) of curvature and compliance over a step; twist: the
+    compliance in twist over that in bending.
     """
 
     known: Array
@@ -142,14 +147,14 @@ class Rod(NamedTuple):
     twist: float
 
 
-def _rod(data: xr.Dataset, piece: NDArray[np.int64], s: Array) -> Rod:
-    """Taylor coefficients at s, not yet with what may be wrong over a step."""
+def _local_rod(data: xr.Dataset, piece: NDArray[np.int64], s: Array) -> Rod:
+    """Taylor coefficients at s, without error bounds."""
     local, stored = data["rod_local"].values[piece], data["rod_coefficients"].values[piece]
     offset = (local[..., 0, 0] * s[:, None] + local[..., 1, 0]).T
     shift, size = -local[..., 0, 0].T, stored.shape[2]
     column = np.moveaxis(stored[..., 0], 0, -1).swapaxes(0, 1).copy()  # (d, 4, n)
     known = []
-    for k in range(size):  # Horner's scheme, again and again: coefficients about the offset
+    for k in range(size):  # repeated Horner scheme: coefficients about the offset
         for j in range(size - 2, k - 1, -1):
             column[j] += offset * column[j + 1]
         known.append(column[k] * shift**k)
@@ -162,12 +167,14 @@ def _rod(data: xr.Dataset, piece: NDArray[np.int64], s: Array) -> Rod:
     return Rod(np.stack(known, axis=1), np.stack(soft), np.zeros((2, len(s))), twist)
 
 
-def _over(data: xr.Dataset, piece: NDArray[np.int64], s: Array, rod: Rod, h: Array) -> Rod:
-    """The same with bounds on what is wrong over a step h, for c by b⁴c̃ - 1."""
+def _with_error_bounds(
+    data: xr.Dataset, piece: NDArray[np.int64], s: Array, rod: Rod, h: Array
+) -> Rod:
+    """Add error bounds over a step h, for the compliance c̃ from b⁴c̃ - 1."""
     local, stored = data["rod_local"].values[piece], data["rod_coefficients"].values[piece]
     size, order = stored.shape[2], len(rod.soft)
     reach = np.abs(local[..., 0, 0]) * (np.abs(s)[:, None] + h[:, None]) + np.abs(local[..., 1, 0])
-    # The variable is a difference of numbers of this size, and so wrong by a share of it.
+    # The local variable is a difference of numbers of this size, with a proportional error.
     inside = np.maximum(np.abs(local[..., 0, 0] * s[:, None] + local[..., 1, 0]), 1.0)
     inside = inside + np.abs(local[..., 0, 0]) * h[:, None]
     power = inside[..., None] ** np.arange(size)
@@ -193,9 +200,9 @@ def _over(data: xr.Dataset, piece: NDArray[np.int64], s: Array, rod: Rod, h: Arr
 
 
 def _series(rod: Rod, start: Array, order: int) -> tuple[Array, Array]:
-    """Taylor coefficients of the vectors (monomial, vector, group, 3, n), and of their turning u.
+    """Taylor coefficients of the vectors (monomial, vector, group, 3, n), and of the curvature u.
 
-    Vectors are n, m and perhaps q; groups the values and their derivatives by s_c, f_y and f_z.
+    Vectors are n, m and optionally q; groups are the values and their derivatives by s_c, f_y, f_z.
     """
     monomials, vectors, groups, _, number = start.shape
     x = np.zeros((order + 1, *start.shape))
@@ -232,7 +239,7 @@ class Step(NamedTuple):
     soft: Array
 
 
-def _step(rod: Rod, x: Array, u: Array, h: Array) -> Step:
+def _bound_step(rod: Rod, x: Array, u: Array, h: Array) -> Step:
     """Bound the defect of the polynomials over |t| ≤ h."""
     order = len(u)
     turns, vectors = _norms(u, h), _norms(x, h)
@@ -240,26 +247,28 @@ def _step(rod: Rod, x: Array, u: Array, h: Array) -> Step:
     soft = np.zeros((len(rod.soft), DEGREE + 1, 1, h.size))
     soft[:, 0, 0] = np.abs(rod.soft) * h ** np.arange(len(rod.soft))[:, None]
     most = soft.sum(axis=(0, 1, 2)) * _UP + rod.wrong[1]
-    turned = rod.twist * _dropped(soft, vectors[:, :, 1], order) + rod.wrong[1] * size[1]
+    turned = (
+        rod.twist * _bound_dropped_products(soft, vectors[:, :, 1], order) + rod.wrong[1] * size[1]
+    )
     late = np.sqrt((rod.known[:3, order:] ** 2).sum(axis=0))
     late = (late * h ** np.arange(order, order + len(late))[:, None]).sum(axis=0)
     first = np.sqrt((rod.known[:3, :order] ** 2).sum(axis=0)).sum(axis=0)
     turned[0] += rod.wrong[0] + late * _UP + _LOST * first
-    defect = _dropped(turns[:, :, None, :1], vectors, order) + turned[0] * size
-    defect[:, 1:] += _dropped(turns[:, :, None, 1:], vectors[:, :, :, :1], order)
+    defect = _bound_dropped_products(turns[:, :, None, :1], vectors, order) + turned[0] * size
+    defect[:, 1:] += _bound_dropped_products(turns[:, :, None, 1:], vectors[:, :, :, :1], order)
     defect[:, 1:] += turned[1:] * size[:, :1]
     defect[1] += vectors[order, :, 0].sum(axis=0)
     return Step(size, turning, (defect + _LOST * size) * _UP, most)
 
 
-def _grown(step: Step, radii: Array, h: Array, twist: float) -> Array:
-    """Radii (v, g, n) after a step: of the linear equations that bound them."""
+def _propagate_radii(step: Step, radii: Array, h: Array, twist: float) -> Array:
+    """Radii (v, g, n) after a step, from the linear equations that bound them."""
     vectors, groups, number = radii.shape
     size, softest, uneven = step.size, step.soft * max(twist, 1.0), step.soft * abs(twist - 1.0)
     scale = (size + 1e-200).reshape(-1, number)
     start = (radii + h * step.defect).reshape(-1, number) / scale
     out = np.zeros_like(radii)
-    for _ in range(2):  # derivatives depend on the radii of the values, which depend on no others
+    for _ in range(2):  # radii of derivatives depend on those of the values, but not vice versa
         by = np.zeros((vectors, groups, vectors, groups, number))
         for v, g in np.ndindex(vectors, groups):
             soft = uneven if v == 1 else softest
@@ -280,8 +289,8 @@ def _grown(step: Step, radii: Array, h: Array, twist: float) -> Array:
     return out
 
 
-def _composed(x: Array, half: Array) -> tuple[Array, Array]:
-    """Σ x_k t^k at t = -half ε₁, and a bound on what that leaves out."""
+def _compose(x: Array, half: Array) -> tuple[Array, Array]:
+    """Σ x_k t^k at t = -half ε₁, and a bound on the omitted terms."""
     out = np.zeros_like(x[0])
     for k in range(min(len(x), DEGREE + 1)):
         row = _ROWS.index((k, 0, 0))
@@ -294,7 +303,7 @@ def _composed(x: Array, half: Array) -> tuple[Array, Array]:
 def _from_contact(
     rod: Rod, half: Array, force: tuple[Poly, Poly], vectors: int
 ) -> tuple[Array, Array]:
-    """States at the middle of the box's arc lengths, on the rod that is cut at the contact."""
+    """States at the middle of the box's arc lengths, on the rod cut at the contact, and radii."""
     shape = (len(_ROWS), vectors, 4, 3, half.size)
     contact = np.zeros(shape)
     contact[:, 0, 0, 1:] = np.stack([one.coef for one in force], axis=1)
@@ -304,12 +313,12 @@ def _from_contact(
     for _ in range(DEGREE + 3):
         state = state + missing
         x, u = _series(rod, state, order)
-        there, left_out = _composed(x, half)
-        # The contact moves and the load with it: that derivative is dx/dt of the values.
-        rate, rate_left = _composed(x[1:, :, :, :1] * many, half)
+        there, left_out = _compose(x, half)
+        # The contact moves and the load with it: this derivative is dx/dt of the values.
+        rate, rate_left = _compose(x[1:, :, :, :1] * many, half)
         contact[:, :, 1] = rate[:, :, 0]
         missing = contact - there
-    step = _step(rod, x, u, half)
+    step = _bound_step(rod, x, u, half)
     off = np.sqrt((np.abs(missing).sum(axis=0) ** 2).sum(axis=-2)) + left_out
     off[0, 0] += sum(one.rest for one in force)
     values = off[:, 0]
@@ -318,17 +327,19 @@ def _from_contact(
     )
     slope[1] += values[0]
     off[:, 1] += slope + step.defect[:, 0] + rate_left[:, 0]
-    return state, _grown(step, off * _UP, half, rod.twist)
+    return state, _propagate_radii(step, off * _UP, half, rod.twist)
 
 
 def _at_base(
     data: xr.Dataset, s: Array, half: Array, force: tuple[Poly, Poly], vectors: int
 ) -> list[list[list[Poly]]]:
-    """States at the base: by vector, group and component."""
+    """States at the base, by vector, group and component."""
     edges = data["rod_edges"].values
     piece = np.clip(np.searchsorted(edges, s, side="left") - 1, 0, len(edges) - 2)
-    rod = _rod(data, piece, s)
-    state, radii = _from_contact(_over(data, piece, s, rod, half), half, force, vectors)
+    rod = _local_rod(data, piece, s)
+    state, radii = _from_contact(
+        _with_error_bounds(data, piece, s, rod, half), half, force, vectors
+    )
     at = s.copy()
     for _ in range(_MOST_STEPS):
         x, u = _series(rod, state, ORDER)
@@ -339,15 +350,15 @@ def _at_base(
         end = edges[piece]
         low = np.where(at - h > end + 0.05 * (at - end), at - h, end)
         h = (at - low) * (1.0 + 1e-15)
-        step = _step(_over(data, piece, at, rod, h), x, u, h)
-        radii = _grown(step, radii, h, rod.twist) + _LOST * step.size
+        step = _bound_step(_with_error_bounds(data, piece, at, rod, h), x, u, h)
+        radii = _propagate_radii(step, radii, h, rod.twist) + _LOST * step.size
         state = x[ORDER]
         for k in range(ORDER - 1, -1, -1):
             state = state * h + x[k]
         at, piece = low, np.where(low == end, np.maximum(piece - 1, 0), piece)
         if not (at > 0.0).any():
             break
-        rod = _rod(data, piece, at)
+        rod = _local_rod(data, piece, at)
     radii[..., at > 0.0] = np.nan
     return [
         [[Poly(state[:, v, g, i], radii[v, g]) for i in range(3)] for g in range(4)]
@@ -356,7 +367,7 @@ def _at_base(
 
 
 class _Load(NamedTuple):
-    """Unknowns and the force on boxes: values and derivatives by s, φ and ℓ."""
+    """Unknowns and force on boxes, with the force's derivatives by s, φ and ℓ."""
 
     s: Poly
     cos: Poly
@@ -369,7 +380,7 @@ class _Load(NamedTuple):
 
 
 def _loads(data: xr.Dataset, bounds: Array, rest: bool) -> _Load:
-    """Evaluate the bounds on the force; of contacts near rest the force is f_min ℓ."""
+    """Evaluate the bounds on the force; for contacts near rest the force is f_min ℓ."""
     middle, half = bounds.mean(axis=-1).T, 0.5 * np.ptp(bounds, axis=-1).T * (1.0 + 1e-12) + 1e-15
     one, none = np.ones_like(middle[0]), np.zeros_like(middle[0])
     s = _function(0, half[0], [middle[0], one], none)
@@ -402,6 +413,7 @@ def _loads(data: xr.Dataset, bounds: Array, rest: bool) -> _Load:
 
 
 def _determinant(rows: list[list[Poly]]) -> Poly:
+    """Determinant of a (3, 3) matrix of polynomials."""
     a, b, c = rows
     return (
         a[0] * (b[1] * c[2] - b[2] * c[1])
@@ -410,11 +422,11 @@ def _determinant(rows: list[list[Poly]]) -> Poly:
     )
 
 
-def is_of(data: xr.Dataset, whisker: Whisker) -> bool:
-    """Whether the file's polynomials are those of a whisker, at many points of it."""
+def is_certificate_of(data: xr.Dataset, whisker: Whisker) -> bool:
+    """Whether the file's polynomials agree with a whisker's at many points."""
     edges, length = data["rod_edges"].values, whisker.length
     s = (edges[:-1, None] + np.diff(edges)[:, None] * np.linspace(0.05, 0.95, 9)).ravel()
-    rod = _rod(data, np.arange(len(edges) - 1).repeat(9), s)
+    rod = _local_rod(data, np.arange(len(edges) - 1).repeat(9), s)
     curvature = np.asarray(whisker.intrinsic_curvature(s * length)).T * length
     radius = np.asarray(whisker.section_radius(s * length)) / whisker.base_radius
     same = np.abs(np.stack([*curvature, radius]) - rod.known[:, 0]) < 1e-12
@@ -422,11 +434,11 @@ def is_of(data: xr.Dataset, whisker: Whisker) -> bool:
     return bool(same.all() and alike and whisker.base_stiffness is None)
 
 
-def domains_fit(data: xr.Dataset) -> bool:
-    """Whether the parts are those of the lemma, what they leave out is the cone, and M_D turns."""
+def domains_match(data: xr.Dataset) -> bool:
+    """Whether the parts match the lemma, the excluded contacts are in the cone, and M_D turns."""
     attrs, edges, stations = data.attrs, data["rod_edges"].values, data["stations"].values
     near, angle = float(stations[0]), data["interior_domain"].values[1]
-    # A whisker in a plane is its own mirror image; half of a domain then stands for the whole.
+    # A planar whisker is its own mirror image; half of a domain then represents the whole.
     planar = not data["rod_coefficients"].values[:, :2].any()
     circle = angle[1] > np.pi and (angle[0] == -angle[1] or (planar and angle[0] == 0.0))
     for part in CURVED_PARTS:
@@ -448,47 +460,50 @@ def domains_fit(data: xr.Dataset) -> bool:
     sine = float(np.sin(attrs["cone"]))
     k = 1.0 - kappa * sine - (kappa * np.pi * sine) ** 2 / 12.0
     cone = kappa < np.pi and np.pi * sine < 1.0 and k > 0.0 and attrs["room"] <= np.sqrt(k) * sine
-    return bool(circle and pieces and within and cone) and _turns(data, angle)
+    return bool(circle and pieces and within and cone) and _direction_turns_once(data, angle)
 
 
-def _turns(data: xr.Dataset, angle: Array) -> bool:
-    """Whether M_D turns once with φ on the circle s = 1, ℓ = 1/2, or by half on half of it."""
+def _direction_turns_once(data: xr.Dataset, angle: Array) -> bool:
+    """Whether M_D turns once with φ on the circle s = 1, ℓ = 1/2, or by π on half of it."""
     bounds = np.tile([[1.0, 1.0], [0.0, 0.0], [0.5, 0.5]], (_ARCS, 1, 1))
     ends = np.linspace(angle[0], angle[1], _ARCS + 1)
     bounds[:, 1] = np.stack([ends[:-1], ends[1:]], axis=1)
-    moment = _states(data, bounds, _loads(data, bounds, False), 2)[1][0][1:]
-    # Within 45° of its middle on each arc: then middles turn by less than a right angle at once.
+    moment = _states_on_boxes(data, bounds, _loads(data, bounds, False), 2)[1][0][1:]
+    # On each arc M_D is within 45° of its middle, so neighbouring middles differ by less than 90°.
     reach = sum((np.abs(one.coef[1:]).sum(axis=0) + one.rest) ** 2 for one in moment)
     y, z = (one.coef[0] for one in moment)
     turn = np.unwrap(np.arctan2(np.append(z, z[:1]), np.append(y, y[:1])))
     whole = turn[-1 if angle[0] < 0.0 else -2] - turn[0]
-    wanted = 2.0 * np.pi if angle[0] < 0.0 else np.pi
-    return bool((2.1 * reach < y**2 + z**2).all() and abs(whole - wanted) < 1.5)
+    expected = 2.0 * np.pi if angle[0] < 0.0 else np.pi
+    return bool((2.1 * reach < y**2 + z**2).all() and abs(whole - expected) < 1.5)
 
 
-def positive(data: xr.Dataset, part: str, bounds: Array, _step: float) -> NDArray[np.bool_]:
-    """Whether all conditions of a part certainly hold on each box (n, 3, 2)."""
+def conditions_hold(data: xr.Dataset, part: str, bounds: Array, _step: float) -> NDArray[np.bool_]:
+    """Whether all conditions of a part are proved on each box (n, 3, 2)."""
     order = np.argsort(bounds[:, 0, 0])
     inner = data["rod_edges"].values[1:-1, None]
     apart = ((inner > bounds[:, 0, 0] + 1e-11) & (inner < bounds[:, 0, 1] - 1e-11)).any(axis=0)
     holds = np.zeros(len(bounds), dtype=bool)
     for start in range(0, len(bounds), _SIDE_BY_SIDE):
         rows = order[start : start + _SIDE_BY_SIDE]
-        with np.errstate(all="ignore"):  # where nothing is enclosed numbers grow out of bounds
-            forms = wanted(data, part, bounds[rows])
+        with np.errstate(all="ignore"):  # failed enclosures overflow
+            forms = condition_polynomials(data, part, bounds[rows])
             holds[rows] = np.min([one.least for one in forms], axis=0) > 0.0
     return holds & ~apart
 
 
-def _states(data: xr.Dataset, bounds: Array, load: _Load, vectors: int) -> list[list[list[Poly]]]:
+def _states_on_boxes(
+    data: xr.Dataset, bounds: Array, load: _Load, vectors: int
+) -> list[list[list[Poly]]]:
+    """States at the base over boxes (n, 3, 2)."""
     middle, half = bounds[:, 0].mean(axis=1), 0.5 * np.ptp(bounds[:, 0], axis=1) * (1.0 + 1e-12)
     return _at_base(data, middle, half + 1e-15, (load.f * load.cos, load.f * load.sin), vectors)
 
 
-def wanted(data: xr.Dataset, part: str, bounds: Array) -> list[Poly]:
-    """What is to be positive."""
+def condition_polynomials(data: xr.Dataset, part: str, bounds: Array) -> list[Poly]:
+    """Polynomials of the conditions of a part, all of which must be conditions_hold."""
     load = _loads(data, bounds, part == "rest")
-    states = _states(data, bounds, load, 3 if part in ("fold", "rest") else 2)
+    states = _states_on_boxes(data, bounds, load, 3 if part in ("fold", "rest") else 2)
     if part == "fold":
         return [-_determinant([states[2][g] for g in (1, 2, 3)])]
     if part == "rest":
@@ -496,7 +511,7 @@ def wanted(data: xr.Dataset, part: str, bounds: Array) -> list[Poly]:
         moved = [load.least * one for one in along]
         allowed = load.s * float(data.attrs["room"])
         return [allowed * allowed - moved[0] * moved[0] - moved[1] * moved[1] - moved[2] * moved[2]]
-    # M_y, M_z and F_x, and these by s_c, f_y, f_z; then by s, φ and ℓ.
+    # M_y, M_z and F_x, and their derivatives by s_c, f_y, f_z; then by s, φ and ℓ.
     value, *raw = ([states[1][g][1], states[1][g][2], states[0][g][0]] for g in range(4))
     y, z, x = value
     along = [load.cos * a + load.sin * b for a, b in zip(raw[1], raw[2], strict=True)]

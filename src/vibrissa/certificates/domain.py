@@ -1,22 +1,23 @@
-"""The domain of a certificate: bounds on the force that enclose the stable contacts outside a cone.
+"""Domain of a certificate: bounds on the force that enclose the stable contacts outside a cone.
 
 With q = 1/s - α, α = 1 - r_tip/r_base, the bounds are (:mod:`vibrissa.certificates.conditions`)
 
     f_min = q² P₀(s),    f_max = q² (P₁(s) + P₂(s) cos φ + P₃(s) sin φ + P₄(s) cos² φ),
 
-polynomials fitted to the fold forces, a little above all of them, and to the forces that deflect
-the contact by the cone's angle, a little below. Any polynomials make a valid domain; whether it
-holds all stable contacts outside the cone is a condition of its own.
+polynomials fitted to the fold forces, slightly above all of them, and to the forces that deflect
+the contact by the cone's angle, slightly below. Any polynomials define a valid domain; whether it
+contains all stable contacts outside the cone is a condition of its own.
 
-A contact p at s is within the cone of half angle c if f_min |∂p/∂f| ≤ `room` · s on the way from
-rest, r₀(s), for then |p - r₀(s)| ≤ room · s, room = √k sin c: with the nearest point r₀(s') of the
-whisker at rest, e = s - s' > 0 and its largest curvature κ ≤ π/L,
+A contact p at s is within the cone of half angle c if f_min |∂p/∂f| ≤ `room` · s on the path from
+rest, r₀(s), because then |p - r₀(s)| ≤ room · s, with room = √k sin c. Let r₀(s') be the nearest
+point of the resting whisker, e = s - s' > 0, and κ ≤ π/L its largest curvature; then
 
     |p - r₀(s)|² ≥ |p - r₀(s')|² + e² k,    k = 1 - κD - κ²(πD)²/12,    D = s sin c ≥ |p - r₀(s')|,
 
-as p - r₀(s') is across the whisker (s' is not its base, as e ≤ πD < s for π sin c < 1), and the
-chord from s' to s, at most 2D, is at least that of a circle (Schur) and leaves the tangent by κe²/2
-at most. The largest |p - r₀(s')|/s' that this leaves is tan c. With s ≤ L, k holds for D = L sin c.
+because p - r₀(s') is normal to the whisker (s' is not its base, as e ≤ πD < s for π sin c < 1), and
+the chord from s' to s, at most 2D, is at least that of a circle (Schur) and deviates from the
+tangent by at most κe²/2. The largest |p - r₀(s')|/s' that remains is tan c. As s ≤ L, k is valid
+for D = L sin c.
 """
 
 from __future__ import annotations
@@ -34,17 +35,17 @@ if TYPE_CHECKING:
     from vibrissa.contacts import ContactMap
     from vibrissa.whisker import Whisker
 
-# The fold is exceeded, and the cone undercut, by at least these shares.
+# Least shares by which the bounds exceed the fold, and are below the cone.
 _BEYOND, _INSIDE = 2.5e-2, 0.03
-# Largest κ sin c: where k is zero.
+# Largest κ sin c, at which k is zero.
 _MOST_BENT = 0.65
 _STATIONS, _BEARINGS = 40, 24
 
 
 class Bounds(NamedTuple):
-    """Bounds on the force, non-dimensional: their taper α, and the coefficients of P₀ … P₄.
+    """Bounds on the force, non-dimensional: the taper α, and the coefficients of P₀ … P₄.
 
-    ``room`` is the share of the arc length by which contacts within the cone may be deflected.
+    ``room`` is the largest deflection of contacts within the cone, as a share of the arc length.
     """
 
     alpha: float
@@ -52,11 +53,11 @@ class Bounds(NamedTuple):
     room: float
 
     def packed(self) -> Array:
-        """All numbers as the kernel takes them."""
+        """All numbers in one array, in the order expected by the kernel."""
         return np.concatenate([[self.alpha], self.factors.ravel(), [self.room]])
 
     def force(self, s: Array, phi: Array, level: Array) -> tuple[Array, Array, Array, Array]:
-        """Force f at (s, φ, ℓ) with its derivatives by s, φ and ℓ."""
+        """Force f at (s, φ, ℓ), and its derivatives by s, φ and ℓ."""
         q = 1.0 / s - self.alpha
         powers = s[..., None] ** np.arange(DEGREES)
         p = powers @ self.factors.T
@@ -77,7 +78,7 @@ class Bounds(NamedTuple):
 
 
 def room_within(rod: ExactRod, cone: float) -> float:
-    """Share of the arc length by which a contact may be deflected so that it is in the cone."""
+    """Largest deflection, as a share of the arc length, that keeps a contact within the cone."""
     largest = np.abs(rod.coefficients[:, 1:3]).sum(axis=(2, 3)) * (1.0 + 1e-12)
     kappa, sine = float(np.hypot(*largest.T).max()), float(np.sin(cone))
     limit = min(1.0 / np.pi, _MOST_BENT / max(kappa, _MOST_BENT))
@@ -92,7 +93,7 @@ def room_within(rod: ExactRod, cone: float) -> float:
 
 
 def bounds_of(contact_map: ContactMap, room: float) -> Bounds:
-    """Fit the bounds to a whisker."""
+    """Fit the bounds for a whisker."""
     whisker, chart = contact_map.whisker, contact_map.chart
     alpha = 1.0 - whisker.tip_radius / whisker.base_radius
     x = 0.5 - 0.5 * np.cos(np.pi * np.arange(_STATIONS) / (_STATIONS - 1))
@@ -110,7 +111,7 @@ def bounds_of(contact_map: ContactMap, room: float) -> Bounds:
         turn[:, 2] = 0.0
     basis = (turn[:, :, None] * powers[:, None, :]).reshape(len(s), -1)
     target = fold / q**2
-    # Relative misfits count.
+    # Least squares of relative misfits.
     fitted = np.linalg.lstsq(basis / target[:, None], np.ones(len(s)), rcond=1e-9)[0]
     lift = (1.0 + _BEYOND) * (target / (basis @ fitted)).max()
     factors = np.zeros((5, DEGREES))
@@ -130,7 +131,7 @@ def is_planar(whisker: Whisker) -> bool:
 
 
 def _least_force(contact_map: ContactMap, s: Array, phi: Array, fold: Array, room: float) -> Array:
-    """Forces f at which f |∂p/∂f| is a share of the arc length, on the way from rest."""
+    """Forces f at which f |∂p/∂f|, with its largest value on the path from rest, is room · s."""
 
     def compliance(force: Array) -> Array:
         xi = np.stack([s, force * np.cos(phi), force * np.sin(phi)], axis=1)

@@ -1,4 +1,4 @@
-"""The rod's equations as tables of products, and a whisker as exact polynomials.
+"""The rod's equations as tables of products, and whiskers as exact polynomials.
 
 Non-dimensional (lengths over L, forces over EI/L², EI at the base), backwards from the contact,
 t = s_c - s. With b = r/r_base, g = 1/b (a state: ġ = -ḃ g²) and the compliance c = g⁴:
@@ -8,11 +8,12 @@ t = s_c - s. With b = r/r_base, g = 1/b (a state: ġ = -ḃ g²) and the complia
 - in the plane of a straight whisker, scaled so that rest is regular: F = f², n = f (-fρ, ν),
   m = fμ: ρ̇ = νw, ν̇ = -Fρw, μ̇ = ν, w = cμ, from (0, 1, 0); and q = (x, fη): ẋ = 1 - Fwη, η̇ = wx.
 
-q, from which the contact point p = q at the base follows, is needed for the fold only.
+q, which gives the contact point p = q at the base, is needed for the fold only.
 
 Every right-hand side is a sum of products of two variables, so that Taylor coefficients follow by
-convolution, and derivatives by an unknown are more such products. A variable is *given* (known
-coefficients), *algebraic* (a sum of products of its own order) or a *state* (its derivative is).
+convolution, and derivatives by an unknown are further such products. A variable is *given* (known
+coefficients), *algebraic* (a sum of products of its own order) or a *state* (its derivative is a
+sum of products).
 """
 
 from __future__ import annotations
@@ -29,16 +30,16 @@ if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
 GIVEN, ALGEBRAIC, STATE = range(3)
-#: Given variables, in this order, of every set of equations.
+#: Given variables common to all sets of equations, in this order.
 KNOWN = ("k1", "k2", "k3", "b", "db", "one", "twist")
 _POLYNOMIALS = 4
-# Coefficients of a rod stand for all numbers within this of themselves (relative to the largest):
-# so a theorem on a whisker holds for the stored one and for its textbook values.
+# Radius (relative to the largest) of the interval that each coefficient of a rod represents, so
+# that a theorem on a whisker holds for the stored one as well as for its textbook values.
 _SLACK = Fraction(1, 2**49)
 
 
 class Program(NamedTuple):
-    """Equations for the kernels: variables, and products whose signed sums they are.
+    """Equations in the form used by the kernels: variables as signed sums of products.
 
     ``constant`` variables have no higher Taylor coefficients; the products of variable v are those
     from first[v] to first[v + 1]; ``groups`` are the states of the values, then of each derivative.
@@ -56,10 +57,10 @@ class Program(NamedTuple):
 class ExactRod(NamedTuple):
     """A whisker as polynomials with exact coefficients, each a centre and a radius.
 
-    Ends of the n pieces over L, exact numbers (the stored ones rounded to double precision); slope
-    and offset (n, 4, 2, 2) that turn arc length into the polynomials' own variable; coefficients
+    edges: ends of the n pieces over L, exact rationals rounded to double precision; local: slope
+    and offset (n, 4, 2, 2) that map arc length to the polynomials' local variable; coefficients
     (n, 4, d, 2) of the curvatures times L (twist, about d1, about d2) and of the radius over that
-    at the base; compliance in twist over that in bending (2,).
+    at the base; twist (2,): compliance in twist over that in bending.
     """
 
     edges: Array
@@ -70,9 +71,9 @@ class ExactRod(NamedTuple):
 
 @dataclass
 class Equations:
-    """Variables, in the order in which they are computed, to be turned into a `Program`.
+    """Variables in the order of their computation, from which a `Program` is built.
 
-    Each has a kind; its products are (sign, left, right).
+    Each has a kind and products (sign, left, right).
     """
 
     names: list[str] = field(default_factory=list)
@@ -80,7 +81,7 @@ class Equations:
     products: dict[str, list[tuple[float, str, str]]] = field(default_factory=dict)
 
     def add(self, kind: int, name: str, *terms: str) -> None:
-        """Add a variable: terms such as ``"u2 n3"``, ``"-u3 n2"`` or ``"c"``."""
+        """Add a variable with terms such as ``"u2 n3"``, ``"-u3 n2"`` or ``"c"``."""
         self.names.append(name)
         self.kinds.append(kind)
         parsed = []
@@ -95,7 +96,10 @@ class Equations:
         self.kinds += [GIVEN] * len(names)
 
     def differentiate(self, by: str, known: dict[str, str]) -> None:
-        """Add derivatives of all variables that depend on an unknown; some of given ones."""
+        """Add derivatives by an unknown of all variables that depend on it.
+
+        ``known`` names the derivatives of given variables.
+        """
         derivative = dict(known)
         fixed = {*KNOWN, "g", "g2", "c", "c1"}
         original = [n for n in self.names if n not in fixed and "_" not in n]
@@ -113,7 +117,7 @@ class Equations:
             self.add(self.kinds[self.names.index(name)], derivative[name], *terms)
 
     def program(self, states: tuple[str, ...] = (), unknowns: tuple[str, ...] = ()) -> Program:
-        """Number the variables; name the states and the unknowns that they are derived by."""
+        """Build the tables; states are differentiated by the unknowns."""
         number = {name: i for i, name in enumerate(self.names)}
         first, flat = [0], []
         for name in self.names:
@@ -136,6 +140,7 @@ class Equations:
 
 
 def _compliance(out: Equations) -> None:
+    """Add the compliance c = b⁻⁴."""
     out.add(STATE, "g", "-db g2")
     out.add(ALGEBRAIC, "g2", "g g")
     out.add(ALGEBRAIC, "c", "g2 g2")
@@ -181,7 +186,7 @@ def spatial_equations(point: bool) -> Program:
     return out.program(tuple(f"{v}{i}" for v in vectors for i in (1, 2, 3)), ("s", "y", "z"))
 
 
-def enclosed(value: Fraction, slack: Fraction = Fraction(0)) -> tuple[float, float]:
+def enclose_rational(value: Fraction, slack: Fraction = Fraction(0)) -> tuple[float, float]:
     """Centre and radius in double precision of all numbers within ``slack`` of a rational one."""
     centre = float(value)
     radius = float(abs(value - Fraction(centre)) + slack)
@@ -189,7 +194,7 @@ def enclosed(value: Fraction, slack: Fraction = Fraction(0)) -> tuple[float, flo
 
 
 def exact_rod(whisker: Whisker) -> ExactRod:
-    """Polynomials of a whisker, as they are stored, in units of its length and base radius."""
+    """Polynomials of a whisker as stored, in units of its length and base radius."""
     if whisker.base_stiffness is not None:
         raise ValueError("certificates are for whiskers on a rigid base; this one's is compliant")
     length, radius = Fraction(whisker.length), Fraction(whisker.base_radius)
@@ -207,17 +212,19 @@ def exact_rod(whisker: Whisker) -> ExactRod:
             j = min(max(j, 0), len(profile.knots) - 2)
             low, high = (Fraction(float(x)) for x in profile.knots[j : j + 2])
             local[p, i] = [
-                enclosed(2 * length / (high - low)),
-                enclosed(-(low + high) / (high - low)),
+                enclose_rational(2 * length / (high - low)),
+                enclose_rational(-(low + high) / (high - low)),
             ]
             row = [
                 Fraction(float(a)) * scale for a in profile.coefficients[(slice(None), j, *which)]
             ]
             slack = _SLACK * max(map(abs, row))
-            coefficients[p, i, : len(row)] = [enclosed(a, slack if a else Fraction(0)) for a in row]
+            coefficients[p, i, : len(row)] = [
+                enclose_rational(a, slack if a else Fraction(0)) for a in row
+            ]
     return ExactRod(
         np.array([float(one / length) for one in knots]),
         local,
         coefficients,
-        np.array(enclosed(1 + Fraction(whisker.poisson_ratio))),
+        np.array(enclose_rational(1 + Fraction(whisker.poisson_ratio))),
     )

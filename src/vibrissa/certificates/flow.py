@@ -1,14 +1,14 @@
 """Validated integration of the rod from the contact to the base.
 
-One step from s₀ to s₀ - h. The Taylor coefficients x_0 … x_{p-1} of all variables are forms: their
-polynomials in the unknowns carry what depends on these, so that only terms of high degree are left
-to remainders, which a rotation enlarges step by step.
-For the remainder an interval box B is proposed; if Σ_{k<p} x_k t^k + t^p x_p(B) ⊂ B for all t in
-the step, solutions exist and stay in B, and h^p x_p(B) bounds what the polynomial leaves out (the
-*high-order enclosure* of Nedialkov, Jackson and Corliss). x_p(B) comes from the same recursion with
-no unknowns. The contact's arc length enters through the first step alone, whose length is a form;
-later nodes are numbers. Each of the `LANES` boxes has steps of its own; one whose contacts have
-reached the end of a piece waits, with steps of no length, for the others.
+In a step from s₀ to s₀ - h, the Taylor coefficients x_0 … x_{p-1} of all variables are forms: their
+polynomials represent the dependence on the unknowns, so that remainders, which a rotation enlarges
+step by step, contain only terms of high degree. For the remainder of the step an interval box B is
+proposed; if Σ_{k<p} x_k t^k + t^p x_p(B) ⊂ B for all t in the step, solutions exist and stay in B,
+and h^p x_p(B) bounds the terms omitted by the polynomial (the *high-order enclosure* of Nedialkov,
+Jackson and Corliss). x_p(B) is computed by the same recursion without unknowns. The contact's arc
+length enters through the first step alone, whose length is a form; later nodes are numbers. Each of
+the `LANES` boxes has its own steps; a box that has reached the end of a piece takes steps of zero
+length until the others have too.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from vibrissa.numerics import AnyArray, Array, inlined_rigorous
 
 _MOST_STEPS = 400
 _MOST_TRIALS = 12
-_NEAR_EDGE = 0.05  # a step ends at the end of a piece if that is nearer than this share of the way
-# Rows of known coefficients: a curvature in twist, two in bending, the radius and its slope.
+_NEAR_EDGE = 0.05  # a step is extended to the end of a piece if less than this share would remain
+# Rows of given variables: after the three curvatures the radius, its slope, one, and the twist.
 _RADIUS, _SLOPE, _ONE, _TWIST = range(3, 7)
 
 
 @inlined_rigorous
 def recursion(program: Program, x: Array, rows: int, order: int) -> None:
-    """Taylor coefficients of all variables, of states up to an order, of others up to one less.
+    """Compute Taylor coefficients of all variables: of states up to ``order``, else one less.
 
     The coefficients of variable v are the rows from v·rows on.
     """
@@ -57,7 +57,7 @@ def recursion(program: Program, x: Array, rows: int, order: int) -> None:
                     low = k if program.constant[b] else 0
                     high = 0 if program.constant[a] else k
                     for i in range(low, high + 1):
-                        # A form that was closed has a size; what was not is zero in all lanes.
+                        # A closed form has a nonzero size; any other is zero in all lanes.
                         if x[a * rows + i, last, 0] != 0.0 and x[b * rows + k - i, last, 0] != 0.0:
                             add_product(sign, x, a * rows + i, x, b * rows + k - i, x, row)
                 close(x, row, 1.0 if stage == 1 else 1.0 / (k + 1))
@@ -65,7 +65,7 @@ def recursion(program: Program, x: Array, rows: int, order: int) -> None:
 
 @inlined_rigorous
 def set_number(value: float, spread: float, z: Array, k: int) -> None:
-    """A number known to within a spread, in all lanes."""
+    """Set a row to a number with an uncertainty, in all lanes."""
     n = coefficients(z)
     clear(z, k)
     for lane in range(LANES):
@@ -75,10 +75,10 @@ def set_number(value: float, spread: float, z: Array, k: int) -> None:
 
 
 @inlined_rigorous
-def set_known(
+def set_rod_coefficients(
     rod: ExactRod, piece: int, s: Array, x: Array, rows: int, order: int, work: Array
 ) -> None:
-    """Taylor coefficients in t of curvatures and radius, at s - t. Rows of work are spare."""
+    """Compute Taylor coefficients in t of curvatures and radius at s - t; ``work`` is scratch."""
     size = rod.coefficients.shape[2]
     local, scale, spare, row = 0, 1, 2, 3
     for i in range(5 * rows):
@@ -104,7 +104,7 @@ def set_known(
                 copy_row(work, spare, work, row + j)
         for lane in range(LANES):
             work[scale, 0, lane] *= -1.0
-        for k in range(1, size):  # by dτ/dt = -scale, k times
+        for k in range(1, size):  # multiply by dτ/dt = -scale, k times
             for j in range(k, size):
                 product(work, row + j, work, scale, work, spare)
                 copy_row(work, spare, work, row + j)
@@ -119,7 +119,7 @@ def set_known(
 def step_length(
     program: Program, x: Array, lane: int, rows: int, order: int, tolerance: float
 ) -> float:
-    """Length at which the last Taylor coefficients are a small share of the states."""
+    """Step length at which the last Taylor coefficients are a small share of the states."""
     groups, n = program.groups.shape
     size = x.shape[1] - 1
     length = np.inf
@@ -142,7 +142,7 @@ def step_length(
 def propose(
     program: Program, x: Array, y: Array, rows: int, order: int, longest: Array, proposed: Array
 ) -> None:
-    """Set the first rows of y to the ranges over a step, the proposed remainders included."""
+    """Set the first rows of y to the ranges over a step, including the proposed remainders."""
     last = x.shape[1] - 1
     for v in range(_ONE, program.kind.size):
         if program.kind[v] == 1:
@@ -175,7 +175,7 @@ def remainder(
     failed: AnyArray,
     rest: Array,
 ) -> None:
-    """Bound t^p x_p over a step, (variables, lanes) in ``rest``; mark lanes without a bound."""
+    """Bound t^p x_p over a step, (variables, lanes) in ``rest``; mark lanes that have no bound."""
     rows = order + 1
     last = x.shape[1] - 1
     where, power = np.zeros((1, 4, LANES)), np.ones(LANES)
@@ -191,7 +191,7 @@ def remainder(
         where[0, 0, lane] = s[0, 0, lane] - 0.5 * longest[lane]
         where[0, 1, lane] = (0.5 * longest[lane] + spread) * UP + ROUNDING
     close(where, 0, 1.0)
-    set_known(rod, piece, where, y, rows, order, work)
+    set_rod_coefficients(rod, piece, where, y, rows, order, work)
     holds = np.zeros(LANES, dtype=np.bool_)
     for _ in range(_MOST_TRIALS):
         propose(program, x, y, rows, order, longest, rest)
@@ -217,7 +217,7 @@ def remainder(
 
 @inlined_rigorous
 def first_piece(rod: ExactRod, s: float) -> int:
-    """Piece in which a contact is; at an end that before it."""
+    """Index of the piece that contains a contact; at an end, the proximal one."""
     piece = int(rod.edges.shape[0] - 2)
     while piece > 0 and rod.edges[piece] >= s:
         piece -= 1
@@ -225,7 +225,7 @@ def first_piece(rod: ExactRod, s: float) -> int:
 
 
 @inlined_rigorous
-def nodes(
+def choose_nodes(
     program: Program,
     x: Array,
     rows: int,
@@ -236,10 +236,10 @@ def nodes(
     h: Array,
     failed: AnyArray,
 ) -> bool:
-    """Choose the next node of each lane: its step in h, s moved to it; True if all are at the end.
+    """Choose the next node of each lane; return whether all are at the end of the piece.
 
-    A step is at least 1.5 times as long as the contacts' arc lengths are spread, and ends with the
-    piece.
+    The steps are written to h, the nodes to s. A step is at least 1.5 times the spread of the
+    contacts' arc lengths, and ends with the piece.
     """
     n, last = coefficients(x), x.shape[1] - 1
     copy_row(s, 0, h, 0)
@@ -263,7 +263,7 @@ def nodes(
 def advance(
     program: Program, x: Array, rows: int, order: int, h: Array, rest: Array, state: Array
 ) -> None:
-    """States at the end of a step: the polynomials by Horner's scheme, and the remainders."""
+    """States at the end of a step: the polynomials by Horner's scheme, plus the remainders."""
     groups, states = program.groups.shape
     spare = np.zeros((1, x.shape[1], LANES))
     for group in range(groups):
@@ -292,13 +292,13 @@ def enclose(
     order: int,
     tolerance: float,
 ) -> None:
-    """Enclose the states at the base, with their derivatives; NaN where that fails.
+    """Enclose the states at the base, with their derivatives; NaN where this fails.
 
     The contacts' arc lengths (1, columns, lanes) are in one piece; ``load`` is the given variable
-    after the known ones, if the equations have one. ``state`` (states, columns, lanes) holds the
-    states of all groups at the contact, but for the derivative by s_c, which is found; on return,
-    the states at the base. ``order`` is that of the Taylor polynomials, ``tolerance`` the share of
-    the states to which the last coefficient falls in a step.
+    after the common ones, if the equations have one. ``state`` (states, columns, lanes) contains on
+    entry the states of all groups at the contact, except the derivative by s_c, which is computed;
+    on return the states at the base. ``order`` is that of the Taylor polynomials, ``tolerance`` the
+    ratio of the last coefficient to the states that determines a step.
     """
     width, rows, size = arc_length.shape[1], order + 1, program.kind.size
     groups, states = program.groups.shape
@@ -314,22 +314,24 @@ def enclose(
     if program.kind[g] == 0:
         copy_row(load, 0, x, g * rows)
         g += 1
-    begun = False
+    has_started = False
     for _ in range(_MOST_STEPS):
-        set_known(rod, piece, s, x, rows, order, work)
+        set_rod_coefficients(rod, piece, s, x, rows, order, work)
         reciprocal(x, _RADIUS * rows, x, g * rows, work)
         for group in range(groups):
             for i in range(states):
                 copy_row(state, group * states + i, x, program.groups[group, i] * rows)
-        if not begun:  # the contact moves and the load with it: the derivative starts as dx/dt
+        if (
+            not has_started
+        ):  # the contact moves and the load with it: the derivative starts as dx/dt
             recursion(program, x, rows, 1)
             for i in range(states):
                 row = program.groups[0, i] * rows + 1
                 copy_row(x, row, x, program.groups[1, i] * rows)
-            begun = True
+            has_started = True
         recursion(program, x, rows, order - 1)
         copy_row(s, 0, work, 0)
-        done = nodes(program, x, rows, order, tolerance, rod.edges[piece], s, h, failed)
+        done = choose_nodes(program, x, rows, order, tolerance, rod.edges[piece], s, h, failed)
         remainder(program, rod, piece, work[:1], h[0, width - 1], x, y, order, coarse, failed, rest)
         advance(program, x, rows, order, h, rest, state)
         close(s, 0, 1.0)

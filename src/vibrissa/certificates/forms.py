@@ -1,23 +1,24 @@
-"""Taylor models: numbers with their dependence on a box of unknowns, rounded outward.
+"""Taylor models: numbers and their dependence on a box of unknowns, rounded outward.
 
 A form is a polynomial of degree ``DEGREE`` in the unknowns ε_i of a box and a remainder,
 
     Σ_α a_α ε^α + r η,    -1 ≤ ε_i ≤ 1,  -1 ≤ η ≤ 1,
 
-where the ε_i are shared by all forms of a box and η belongs to the form alone. It is a row of a
-table: the coefficients a_α by degree, r, the sums C_d of |a_α| over degrees up to d for each d, and
+where the ε_i are shared by all forms of a box and η belongs to one form alone. A form is a row of a
+table: the coefficients a_α by degree, r, for each d the sum C_d of |a_α| over degrees up to d, and
 its size t ≥ C_q + r. Forms without unknowns are centres and radii, of degree 0. `LANES` boxes are
-computed side by side: tables are (rows, columns, lanes).
+computed together: tables are (rows, columns, lanes).
 
-Rounding. All is IEEE 754 double precision, to nearest, u = 2⁻⁵³; results are not rounded outward
-one by one, but r grows by a bound on all that was lost. A coefficient of a product of two forms is
-a sum of at most 8 products of coefficients, one of a sum of m such products takes at most 8 m + 6
-roundings (multiplication and addition may be fused, which saves one). All |a_α b_β| together are at
-most t_x t_y, so that all coefficients are together wrong by at most (8 m + 6) u Σ t_x t_y (1 +
-10⁻¹²). What products of degrees above q leave out is bounded by t_x t_y - Σ_d (C_d - C_{d-1})(x)
-C_{q-d}(y), remainders included, and wrong by at most 20 u t_x t_y a term. ``ROUNDING`` is 1080 u:
-enough for m ≤ `TERMS` = 128, also where a bound on t has itself been rounded. Underflow is covered
-by ``TINY``. Sizes are rounded up by ``UP``, which covers sums of up to 80 terms.
+Rounding. All arithmetic is IEEE 754 double precision, to nearest, u = 2⁻⁵³; results are not rounded
+outward one by one, but r grows by a bound on all rounding errors. A coefficient of a product of two
+forms is a sum of at most 8 products of coefficients; one of a sum of m such products takes at most
+8 m + 6 roundings (multiplication and addition may be fused, which saves one). All |a_α b_β|
+together are at most t_x t_y, so that the error of all coefficients together is at most
+(8 m + 6) u Σ t_x t_y (1 + 10⁻¹²). The omitted products of degrees above q are bounded by
+t_x t_y - Σ_d (C_d - C_{d-1})(x) C_{q-d}(y), remainders included, with an error of at most
+20 u t_x t_y per term. ``ROUNDING`` is 1080 u: enough for m ≤ `TERMS` = 128, also where a bound on t
+has itself been rounded. Underflow is covered by ``TINY``. Sizes are rounded up by ``UP``, which
+covers sums of up to 80 terms.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from vibrissa.numerics import Array, inlined_rigorous
 
 LANES = 8
 DEGREE = 3
-#: Terms that a sum of products may have.
+#: Largest number of terms of a sum of products.
 TERMS = 128
 ROUNDING = 1.2e-13
 UP = 1.0 + 2e-14
@@ -69,7 +70,7 @@ COLUMNS_0, COLUMNS_2, COLUMNS_3 = columns(0), columns(2), columns(3)
 
 
 def _multiplier(unknowns: int) -> Any:
-    """Compile z_k += sign x_i y_j, all lanes at once, for forms in so many unknowns."""
+    """Compile z_k += sign x_i y_j, all lanes at once, for forms in ``unknowns`` unknowns."""
     degree = DEGREE if unknowns else 0
     rows = monomials(unknowns, degree)
     number, width = len(rows), columns(unknowns)
@@ -138,7 +139,7 @@ _multiply_0, _multiply_2, _multiply_3 = _multiplier(0), _multiplier(2), _multipl
 
 @inlined_rigorous
 def add_product(sign: float, x: Array, i: int, y: Array, j: int, z: Array, k: int) -> None:
-    """z_k += ±x_i·y_j, not yet closed: its last number collects the sizes of the terms."""
+    """z_k += ±x_i·y_j, to be closed afterwards: the last column collects the terms' sizes."""
     if x.shape[1] == COLUMNS_3:
         _multiply_3(sign, x, i, y, j, z, k)
     elif x.shape[1] == COLUMNS_2:
@@ -171,7 +172,7 @@ def copy_row(x: Array, i: int, z: Array, k: int) -> None:
 
 @inlined_rigorous
 def add_multiple(factor: float, x: Array, i: int, z: Array, k: int) -> None:
-    """z_k += factor·x_i, not yet closed."""
+    """z_k += factor·x_i, to be closed afterwards."""
     n, last = coefficients(x), x.shape[1] - 1
     for a in range(n):
         for lane in range(LANES):
@@ -183,7 +184,7 @@ def add_multiple(factor: float, x: Array, i: int, z: Array, k: int) -> None:
 
 @inlined_rigorous
 def close(z: Array, k: int, factor: float) -> None:
-    """Multiply a finished sum by a factor > 0, add what rounding has lost, find the sizes."""
+    """Multiply a completed sum by a factor > 0, add the rounding error, and compute the sizes."""
     n, last = coefficients(z), z.shape[1] - 1
     for lane in range(LANES):
         z[k, n, lane] = factor * (z[k, n, lane] + ROUNDING * z[k, last, lane]) + TINY
@@ -208,7 +209,7 @@ def close(z: Array, k: int, factor: float) -> None:
 
 @inlined_rigorous
 def product(x: Array, i: int, y: Array, j: int, z: Array, k: int) -> None:
-    """z_k = x_i·y_j; z_k is another row than these."""
+    """z_k = x_i·y_j; z_k must be another row than these."""
     clear(z, k)
     add_product(1.0, x, i, y, j, z, k)
     close(z, k, 1.0)
@@ -216,9 +217,9 @@ def product(x: Array, i: int, y: Array, j: int, z: Array, k: int) -> None:
 
 @inlined_rigorous
 def reciprocal(x: Array, i: int, z: Array, k: int, work: Array) -> None:
-    """z_k = 1/x_i by its series about the centre; NaN where x_i may be zero or less.
+    """z_k = 1/x_i by its series about the centre; NaN where x_i may be zero or negative.
 
-    With x = c (1 - δ): 1/x = Σ_{d≤q} δ^d / c + δ^{q+1} / (c (1 - δ)). Three rows of work are spare.
+    With x = c (1 - δ): 1/x = Σ_{d≤q} δ^d / c + δ^{q+1} / (c (1 - δ)). Uses three rows of ``work``.
     """
     n, last = coefficients(x), x.shape[1] - 1
     delta, power, total = 0, 1, 2
@@ -232,7 +233,7 @@ def reciprocal(x: Array, i: int, z: Array, k: int, work: Array) -> None:
         for a in range(1, n):
             work[delta, a, lane] = -x[i, a, lane] * inverse
         work[delta, n, lane] = x[i, n, lane] * inverse
-        work[delta, last, lane] = x[i, last, lane] * inverse  # a division and a product more
+        work[delta, last, lane] = x[i, last, lane] * inverse  # covers one more division and product
     close(work, delta, 1.0)
     close(work, total, 1.0)
     copy_row(work, total, work, power)

@@ -1,9 +1,9 @@
-"""The sign conditions in plain floats on a grid: whether a certificate can exist.
+"""Sign conditions evaluated in floating point on a grid: whether a certificate can exist.
 
-A certificate needs every sign on a whole domain. Where a sign is wrong at one contact it cannot
-exist; where all are right on a grid it probably does. The determinant alone decides near rest, so
-that the largest cone angle of a contact at which it has the wrong sign is where certificates, and
-the upper bounds of critical cones, must end.
+A certificate requires every sign on a whole domain. Where a sign is wrong at one contact it cannot
+exist; where all are right on a grid it probably does. Near rest the determinant is decisive, so the
+largest cone angle of a contact at which it has the wrong sign is a lower limit for the cones of
+certificates, and for upper bounds of critical cones.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ if TYPE_CHECKING:
     from vibrissa.contacts import ContactMap
 
 _STATIONS, _BEARINGS, _LEVELS = 15, 24, 11
-# The grid, and the cones over that of the determinant, with which the smallest cone is looked for.
+# Grid, and cones relative to the determinant's, for the search for the smallest cone.
 _FINE, _SHARES = (29, 24, 21), 1.03 ** np.arange(2, 40)
-_REST = 1e-3  # cone about rest within which a straight whisker's grid does not look
-# Halvings that find where the determinant changes its sign, and where rays begin.
+_REST = 1e-3  # cone about rest that is excluded from a straight whisker's grid
+# Number of bisections for the sign change of the determinant, and smallest load on rays.
 _HALVINGS = 30
 _LEAST_LOAD = 1e-3
 
 
 class Outlook(NamedTuple):
-    """What a grid shows of a certificate.
+    """What a grid shows about the existence of a certificate.
 
     Attributes
     ----------
     failing : dict of float
         Share of the grid on which each condition fails.
     possible : bool
-        Whether none fails outside the cone.
+        Whether no condition fails outside the cone.
     determinant_cone : float
         Smallest cone about rest outside which the determinant keeps its sign on the grid, rad;
-        infinite where certificates are not for cones so large.
+        infinite if certificates do not apply to cones so large.
     """
 
     failing: dict[str, float]
@@ -51,14 +51,14 @@ class Outlook(NamedTuple):
 
 
 def outlook(contact_map: ContactMap, cone: float) -> Outlook:
-    """Look for wrong signs on a grid.
+    """Evaluate the sign conditions on a grid.
 
     Parameters
     ----------
     contact_map : ContactMap
         Map of the whisker.
     cone : float
-        Half angle about the resting whisker within which contacts are left out, rad.
+        Half angle about the resting whisker within which contacts are excluded, rad.
 
     Returns
     -------
@@ -67,7 +67,7 @@ def outlook(contact_map: ContactMap, cone: float) -> Outlook:
     """
     straight = bool(contact_map.whisker.is_straight)
     room = float(np.sin(_REST if straight else cone))
-    failing = _failing(contact_map, room, (_STATIONS, _BEARINGS, _LEVELS))
+    failing = _failing_shares(contact_map, room, (_STATIONS, _BEARINGS, _LEVELS))
     angle = 0.0 if straight else _determinant_cone(contact_map)
     try:
         room_within(exact_rod(contact_map.whisker), angle)
@@ -77,12 +77,12 @@ def outlook(contact_map: ContactMap, cone: float) -> Outlook:
 
 
 def smallest_cone(contact_map: ContactMap) -> float:
-    """Find the smallest cone outside of which all signs are right on a grid.
+    """Find the smallest cone outside which all signs are right on a grid.
 
     Parameters
     ----------
     contact_map : ContactMap
-        Map of the whisker; of a rigid base.
+        Map of the whisker; its base must be rigid.
 
     Returns
     -------
@@ -96,20 +96,22 @@ def smallest_cone(contact_map: ContactMap) -> float:
     low = max(_determinant_cone(contact_map), _REST)
     try:
         for share in _SHARES:
-            failing = _failing(contact_map, room_within(rod, low * share), _FINE)
+            failing = _failing_shares(contact_map, room_within(rod, low * share), _FINE)
             if not any(failing.values()):
                 return float(low * share)
-    except ValueError:  # certificates are not for larger cones
+    except ValueError:  # certificates do not apply to larger cones
         pass
     return np.inf
 
 
-def doubt(contact_map: ContactMap, cone: float) -> str:
-    """What a grid shows against a certificate of a curved whisker, in words; empty if nothing."""
+def objection(contact_map: ContactMap, cone: float) -> str:
+    """State what a grid shows against a certificate of a curved whisker; empty if nothing."""
     if contact_map.whisker.is_straight:
         return ""
     room = room_within(exact_rod(contact_map.whisker), cone)
-    wrong = [name for name, share in _failing(contact_map, room, _FINE).items() if share > 0.0]
+    wrong = [
+        name for name, share in _failing_shares(contact_map, room, _FINE).items() if share > 0.0
+    ]
     if not wrong:
         return ""
     angle = float(np.rad2deg(smallest_cone(contact_map)))
@@ -117,7 +119,9 @@ def doubt(contact_map: ContactMap, cone: float) -> str:
     return fault + (f"; outside {angle:.3g}° all are right" if np.isfinite(angle) else "")
 
 
-def _failing(contact_map: ContactMap, room: float, shape: tuple[int, int, int]) -> dict[str, float]:
+def _failing_shares(
+    contact_map: ContactMap, room: float, shape: tuple[int, int, int]
+) -> dict[str, float]:
     """Share of a grid on which each condition fails."""
     straight, near = bool(contact_map.whisker.is_straight), contact_map.chart.proximal
     s, level = np.linspace(near, 1.0, shape[0]), np.linspace(0.0, 1.0, shape[2])
@@ -153,7 +157,7 @@ def _derivatives(contact_map: ContactMap, xi: Array) -> tuple[Array, Array, Arra
 def _conditions(
     contact_map: ContactMap, bounds: Bounds, s: Array, phi: Array, level: Array
 ) -> Array:
-    """Conditions, to be positive, over a grid: (c, ...)."""
+    """Conditions (c, ...) over a grid, which should all be positive."""
     f, f_s, f_phi, f_l = bounds.force(s, phi, level)
     cos, sin = np.cos(phi), np.sin(phi)
     xi = np.stack([s, f * cos, f * sin], axis=-1).reshape(-1, 3)
@@ -173,7 +177,7 @@ def _conditions(
         ratio = -raw[..., 0, 1] * moment + 2.0 * x * grown[..., 1]
         return np.stack([f_l, moment, -fall, det, ratio])
     square = y**2 + z**2
-    sign = _majority(np.linalg.det(raw))
+    sign = _common_sign(np.linalg.det(raw))
     turn_phi, turn_l = (y * d[..., 2] - z * d[..., 1] for d in (by_phi, by_l))
     zeta_phi, zeta_l = (
         square * d[..., 0] - x * (y * d[..., 1] + z * d[..., 2]) for d in (by_phi, by_l)
@@ -191,7 +195,8 @@ def _conditions(
     )
 
 
-def _majority(x: AnyArray) -> float:
+def _common_sign(x: AnyArray) -> float:
+    """Sign that most values have."""
     return 1.0 if (x > 0.0).mean() > 0.5 else -1.0
 
 
@@ -211,7 +216,7 @@ def _determinant_cone(contact_map: ContactMap) -> float:
 
     shares = np.linspace(1.0, _LEAST_LOAD, 41) ** 2
     signs = np.stack([np.sign(determinant(share * fold)[0]) for share in shares])
-    common = _majority(signs)
+    common = _common_sign(signs)
     wrong = signs != common
     if not wrong.any():
         return 0.0

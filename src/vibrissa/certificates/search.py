@@ -1,6 +1,6 @@
-"""Boxes that cover a domain, halved until the signs of all conditions are certain on each.
+"""Cover of a domain by boxes, subdivided until the signs of all conditions are proved on each.
 
-A box is a row of integers: for each unknown a level and an index, so that it takes the part
+A box is a row of integers, a level and an index for each unknown: it occupies the part
 [i, i + 1]/2^level of the domain's extent.
 """
 
@@ -15,15 +15,15 @@ from vibrissa.numerics import AnyArray, Array, IntArray
 
 _BATCH = 2048
 _MOST_HALVINGS = 3
-_REMAINDER = 4  # remainders fall at least with this power of a box's size
-_CLEAR = 0.1  # largest remainder, relative to a condition, from which one halving is enough
-_LONGER = 4  # how much more often arc length is halved than the other unknowns where nothing helps
+_REMAINDER = 4  # remainders decrease at least with this power of a box's size
+_CLEAR = 0.1  # largest remainder, relative to a condition, for which one halving suffices
+_LONGER = 4  # how many more halvings arc length gets than other unknowns where nothing is enclosed
 
 Evaluate = Callable[[IntArray], tuple[Array, Array]]
 
 
 class Cover(NamedTuple):
-    """Boxes on which all signs are certain, others, and one with a wrong sign, if there is any."""
+    """Boxes on which all signs are proved, undecided ones, and one with a wrong sign if found."""
 
     certified: IntArray
     undecided: IntArray
@@ -34,7 +34,7 @@ class Cover(NamedTuple):
 def bounds(boxes: IntArray, domain: Array, stations: Array) -> Array:
     """Bounds (n, unknowns, 2) of boxes in a domain (unknowns, 2).
 
-    The first unknown is linear between stations, of which there are 2^k + 1, at equal shares: so
+    The first unknown is interpolated between stations, 2^k + 1 of them with equal shares, so that
     boxes can end where the whisker's polynomials do.
     """
     part = 2.0 ** (-boxes[..., 0].astype(np.float64))
@@ -50,18 +50,19 @@ def bounds(boxes: IntArray, domain: Array, stations: Array) -> Array:
 
 
 def volume(boxes: IntArray) -> Array:
-    """Share of the unit cube that each box takes."""
+    """Share of the unit cube that each box occupies."""
     return np.asarray(2.0 ** (-boxes[..., 0].sum(axis=-1).astype(np.float64)))
 
 
 def cover(
     evaluate: Evaluate, start: IntArray, most: int = 10**6, free: AnyArray | None = None
 ) -> Cover:
-    """Halve boxes until all conditions are certainly positive on each.
+    """Subdivide boxes until all conditions are proved to be positive on each.
 
-    ``evaluate`` returns conditions (n, c, unknowns + 3), each a centre, the share of each unknown
-    and of their products in its range, and the remainder, and the relative widths (n, unknowns) of
-    what they are computed from. ``most`` boxes are evaluated, about; ``free`` unknowns not fixed.
+    ``evaluate`` returns conditions (n, c, unknowns + 3), each a centre, the contributions of each
+    unknown and of their products to its range, and the remainder; and the relative widths
+    (n, unknowns) of the quantities from which they are computed. About ``most`` boxes are
+    evaluated; ``free`` marks the unknowns that may be subdivided.
     """
     left, none = start, start[:0]
     free = np.ones(start.shape[1], dtype=bool) if free is None else free
@@ -82,18 +83,18 @@ def cover(
         blurred = open_ & ~(rest < np.abs(centre)).all(axis=-1)
         times = np.zeros(widths.shape, dtype=np.int64)
         clear = open_ & ~blurred
-        times[clear] = _halvings(found[clear], widths[clear] * free)
-        times[blurred] = _clearing(evaluate, batch[blurred], free)
-        left = np.concatenate([left, _halved(batch[open_], times[open_])])
+        times[clear] = _halvings_by_estimate(found[clear], widths[clear] * free)
+        times[blurred] = _halvings_by_trial(evaluate, batch[blurred], free)
+        left = np.concatenate([left, _subdivide(batch[open_], times[open_])])
     return Cover(np.concatenate(done), left, evaluated, none)
 
 
-def _clearing(evaluate: Evaluate, boxes: IntArray, free: AnyArray) -> IntArray:
-    """How often to halve each unknown of boxes with large remainders: tried in their middles.
+def _halvings_by_trial(evaluate: Evaluate, boxes: IntArray, free: AnyArray) -> IntArray:
+    """Number of halvings of each unknown for boxes with large remainders, by trial evaluations.
 
-    A quarter of the box along each unknown is tried. Where none can be enclosed the arc length is
-    halved, as steps of the rod are longer than contacts are spread, but not much more often than
-    the others; then all are.
+    Along each unknown, a quarter of the box at its middle is evaluated. Where none can be enclosed,
+    the arc length is halved, because steps of the rod are longer than the contacts are spread,
+    unless it has been halved much more often than the others; then all are.
     """
     number, unknowns = boxes.shape[:2]
     blur = np.full((number, unknowns), np.inf)
@@ -116,8 +117,8 @@ def _clearing(evaluate: Evaluate, boxes: IntArray, free: AnyArray) -> IntArray:
     return times
 
 
-def _halvings(found: Array, widths: Array) -> IntArray:
-    """How often each unknown is to be halved: where that is expected to make the signs certain."""
+def _halvings_by_estimate(found: Array, widths: Array) -> IntArray:
+    """Number of halvings of each unknown that is expected to make the signs certain."""
     n, unknowns = widths.shape
     times = np.zeros((n, unknowns), dtype=np.int64)
     centre, curved, rest = found[..., 0], found[..., -2], found[..., -1]
@@ -128,7 +129,7 @@ def _halvings(found: Array, widths: Array) -> IntArray:
         beyond = curved * now**2 + rest * now**_REMAINDER
         linear = shares * scale[:, None, :]
         more = (centre <= linear.sum(axis=-1) + beyond).any(axis=1) | (times.sum(axis=1) == 0)
-        # The unknown that matters most to the worst condition, by its own share and its width.
+        # The unknown that contributes most to the worst condition, directly and through its width.
         excess = (linear.sum(axis=-1) + beyond) / np.maximum(np.abs(centre), 1e-300)
         rows, worst = np.arange(n), np.argmax(excess, axis=1)
         gain = 2.0 * curved * now**2 + _REMAINDER * rest * now**_REMAINDER
@@ -138,8 +139,8 @@ def _halvings(found: Array, widths: Array) -> IntArray:
     return times
 
 
-def _halved(boxes: IntArray, times: IntArray) -> IntArray:
-    """Parts of boxes."""
+def _subdivide(boxes: IntArray, times: IntArray) -> IntArray:
+    """Subdivide boxes, each by its number of halvings."""
     parts = [boxes[:0]]
     for pattern in np.unique(times, axis=0):
         rows = boxes[(times == pattern).all(axis=1)]

@@ -1,4 +1,4 @@
-"""Identifiability: which signals locate a contact, critical cones, sensitivity."""
+"""Identifiability of contacts: unique triplets of signals, critical cones, and sensitivity."""
 
 from vibrissa.identifiability.cones import (
     cone_bracket as cone_bracket,

@@ -1,4 +1,4 @@
-"""Critical cones: over curvature and taper, and proved from below and above."""
+"""Critical cones of whiskers over curvature and taper, and proved bounds of a critical cone."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from vibrissa.identifiability.verdicts import SAMPLES, SEPARATION, uniqueness
 from vibrissa.signals import cone_angle
 from vibrissa.whisker import Whisker
 
-#: The triplets that the paper finds unique for its γ whisker.
+#: Triplets that the paper finds to be unique for its γ whisker.
 PAPER = ("Fx MB MD", "Mx MB MD", "Fx FD MD")
-#: A·L of the whiskers y = A x², and ratios of base to tip radius.
+#: Default A·L of the whiskers y = A x², and ratios of base radius to tip radius.
 CURVATURES = np.arange(16) / 10.0
 TAPER_RATIOS = (1.0, 2.0, 4.0, 8.0, 15.0, 30.0, 60.0)
 
-# Verdicts do not depend on size or stiffness: one length and one base radius stand for all.
+# Verdicts do not depend on size or stiffness, so one length and one base radius suffice.
 _LENGTH, _BASE_RADIUS = 40e-3, 100e-6
-_ROUNDS = 2  # verdicts stop searching where a witness is found; here all are wanted
-# Searches for a witness to be proved, each outside this share of the cone before.
+_ROUNDS = 2  # number of searches, since one search for a verdict stops at the first witness
+# Number of searches for a witness to be proved, and the share of the previous cone outside which
+# the next one searches.
 _SEARCHES, _NEARLY = 2, 0.95
 
 
@@ -39,8 +40,8 @@ def critical_cones(
     """Compute critical cones of planar whiskers y = A x² over curvature and taper.
 
     The critical cone is the smallest cone about the resting whisker outside which no two contacts
-    have the same triplet; see :func:`vibrissa.uniqueness`. Contacts that only the plane of the
-    whisker makes equal do not count.
+    have the same triplet; see :func:`vibrissa.uniqueness`. Contacts whose signals coincide only
+    because the whisker is planar do not count.
 
     Parameters
     ----------
@@ -51,9 +52,9 @@ def critical_cones(
     triplets : sequence of str
         Triplets, such as ``"Fx MB MD"``.
     min_separation : float
-        Distance, as a share of the length, below which two contacts count as one.
+        Distance, as a share of the length, below which two contacts are considered the same.
     samples : int
-        Number of contacts of each whisker that are tried.
+        Number of contacts of each whisker that are sampled.
     progress : callable, optional
         Function called as ``progress(done, total)`` after each whisker.
 
@@ -103,7 +104,7 @@ def critical_cones(
 def _critical_cone(
     contact_map: ContactMap, triplet: str, min_separation: float, samples: int
 ) -> float:
-    """The cone of a search, and of further ones outside that cone."""
+    """Critical cone of one triplet from a search, and further searches outside the cone found."""
     cone = 0.0
     for seed in range(_ROUNDS):
         found = uniqueness(
@@ -116,13 +117,13 @@ def _critical_cone(
             resolution=False,
             seed=seed,
         )
-        # Below a right angle, where the cone is all of space.
+        # Keep the cone below a right angle, at which it would be all of space.
         cone = min(max(cone, float(found["critical_cone"].squeeze())), 0.499 * np.pi)
     return cone
 
 
 def with_proved_witnesses(contact_map: ContactMap, verdicts: xr.Dataset) -> xr.Dataset:
-    """Prove the witnesses of verdicts, for the continuous rod."""
+    """Add to verdicts which witnesses are proved for the continuous rod, and their cone angles."""
     order = ("triplet", "region", "witness")
     s = verdicts["witness_arc_length"].transpose(*order, "pair").values
     force = verdicts["witness_contact_force"].transpose(*order, "pair", "component").values
@@ -146,12 +147,12 @@ def with_proved_witnesses(contact_map: ContactMap, verdicts: xr.Dataset) -> xr.D
 def cone_bracket(
     contact_map: ContactMap, certificate: Certificate, samples: int = SAMPLES
 ) -> tuple[float, float]:
-    """Bound the critical cone of (F_x, M_B, M_D): a proved witness below, a certificate above."""
+    """Bound the critical cone of (F_x, M_B, M_D), by a proved witness and by a certificate."""
     high = certificate.cone if certificate.proved else np.inf
     if high == 0.0:
         return 0.0, 0.0
     low = 0.0
-    for _ in range(_SEARCHES):  # the last one's witnesses are all near the largest angle
+    for _ in range(_SEARCHES):  # the last search yields witnesses near the largest angle only
         found = uniqueness(
             contact_map,
             [TRIPLET],

@@ -1,17 +1,16 @@
-"""Sensitivity of the contact point to each signal at the base, and the best triplet.
+"""Sensitivity of the contact point to the base signals, and the best triplet.
 
 Three signals T locate the contact point p, so ∂p/∂T is the effect of a small change of a signal on
-the estimate: noise of covariance Σ spreads p by ∂p/∂T Σ (∂p/∂T)ᵀ, an ellipsoid. The derivatives are
-exact (:mod:`vibrissa.contacts.jacobian`); for those of Huet, Emnett & Hartmann (2022) on an
-interpolated table see :func:`vibrissa.paper.central_differences`.
+the estimate: noise of covariance Σ gives p the covariance ∂p/∂T Σ (∂p/∂T)ᵀ, an ellipsoid. The
+derivatives are exact (:mod:`vibrissa.contacts.jacobian`); for those of Huet, Emnett & Hartmann
+(2022) on an interpolated table see :func:`vibrissa.paper.central_differences`.
 
-Toward rest, where force and moment vanish and directions lose their meaning, the derivatives grow
-without bound. They are given there all the same; summaries leave out contacts within 2° of rest, as
-the paper does.
+Toward rest, where force and moment vanish and directions become undefined, the derivatives diverge.
+They are returned there as well; summaries omit contacts within 2° of rest, as the paper does.
 
 The best triplet of a contact is the one with the smallest RMS 3D error predicted from the sensor's
-noise, the square root of the trace of that covariance. It is about small errors: whether another
-contact far away has the same signals is decided by the uniqueness of the triplet.
+noise, the square root of the trace of that covariance. It refers to small errors: whether a distant
+contact has the same signals is decided by the uniqueness of the triplet.
 """
 
 from __future__ import annotations
@@ -57,22 +56,22 @@ def sensitivity(
     *,
     noise: Noise | None = None,
 ) -> xr.Dataset:
-    """Derivatives of the contact point with respect to the three signals that locate it.
+    """Compute the derivatives of the contact point by the three signals that locate it.
 
     Parameters
     ----------
     contact_map : ContactMap
-        The whisker's map.
+        Map of the whisker.
     triplet : str or tuple of str
         The three signals.
     at : Dataset, DataTree, mapping, array_like, "grid" or None
-        Contacts: None, the nodes of the map, all over Ω; ``"grid"``, the reachable ones of the
-        paper's grid; contact points (..., 3) in the whisker frame, m; or a recording, or any
-        dataset with ``contact_point_whisker``, or else ``force`` and ``moment``, or else the
-        signals of the triplet, which locate the contacts.
+        Contacts: None for the nodes of the map, all over Ω; ``"grid"`` for the reachable ones of
+        the paper's grid; contact points (..., 3) in the whisker frame, m; or a recording or other
+        dataset from whose ``contact_point_whisker``, or else ``force`` and ``moment``, or else
+        signals of the triplet the contacts are found.
     noise : mapping or (6, 6) array_like, optional
-        Standard deviation of each signal of the triplet, or covariance of (F, M), SI units; gives
-        the error ellipsoids.
+        Standard deviation of each signal of the triplet, or covariance of (F, M), SI units, from
+        which error ellipsoids are computed.
 
     Returns
     -------
@@ -80,11 +79,12 @@ def sensitivity(
         Over the contacts' dimensions: ``sensitivity`` (coordinate, signal), ∂(r, θ, φ)/∂(signals),
         and ``point_sensitivity`` (space, signal), ∂(x, y, z)/∂(signals), with the SI unit of each
         entry in the coordinates ``unit`` and ``point_unit``; NaN where the signals do not determine
-        the point. With it the contact point, its spherical form, the six signals, the regions
-        (``small_deflection``, ``concave_backward``, ``large_deflection``, ``within_paper_bounds``),
-        ``status``, and ``volume``, the volume of contact points that a node stands for. With
-        ``noise`` also ``covariance``, ``semi_axes`` and ``axis_directions`` of its ellipsoid (one
-        standard deviation, the longest first), and ``predicted_error``, the RMS 3D error.
+        the point. In addition the contact point, its spherical coordinates, the six signals, the
+        regions (``small_deflection``, ``concave_backward``, ``large_deflection``,
+        ``within_paper_bounds``), ``status``, and ``volume``, the volume of contact points that a
+        node represents. With ``noise`` also ``covariance``, ``semi_axes`` and ``axis_directions``
+        of its ellipsoid (one standard deviation, longest first), and ``predicted_error``, the RMS
+        3D error.
 
     Raises
     ------
@@ -103,7 +103,7 @@ def sensitivity(
     sensor = None if noise is None else SensorNoise.of(noise, names)
     chosen = chosen_contacts(contact_map, at, names)
     d = contact_map.chart.discretization
-    out = _labelled(contact_map, chosen)
+    out = _contact_variables(contact_map, chosen)
     point = chosen.values[:, 3:] * d.length
     by_signal = contact_signal_derivatives(d, chosen.values, chosen.tangents, names)
     in_sphere = spherical_derivatives(point) @ by_signal
@@ -121,8 +121,8 @@ def sensitivity(
     return out
 
 
-def _labelled(contact_map: ContactMap, chosen: ChosenContacts) -> xr.Dataset:
-    """Contacts with their points, signals and regions."""
+def _contact_variables(contact_map: ContactMap, chosen: ChosenContacts) -> xr.Dataset:
+    """Dataset of contacts with their points, signals and regions."""
     d, whisker = contact_map.chart.discretization, contact_map.whisker
     force, point = chosen.values[:, :3] * d.force, chosen.values[:, 3:] * d.length
     known = np.isfinite(point).all(axis=1)
@@ -194,30 +194,30 @@ def best_triplet(
     *,
     triplets: Sequence[str | tuple[str, ...]] = TRIPLETS,
 ) -> xr.Dataset:
-    """Find, contact by contact, the triplet with the smallest predicted 3D error.
+    """Find the triplet with the smallest predicted 3D error for each contact.
 
     Parameters
     ----------
     contact_map : ContactMap
-        The whisker's map.
+        Map of the whisker.
     noise : mapping or (6, 6) array_like
         Standard deviation of each signal, or covariance of (F, M), SI units.
     at : Dataset, DataTree, mapping, array_like, "grid" or None
-        Contacts, as for :func:`~vibrissa.sensitivity`: all over Ω by default. From signals
-        contacts are found with (Fx, MB, MD).
+        Contacts, as for :func:`~vibrissa.sensitivity`: all over Ω by default. If signals are given,
+        contacts are found from (Fx, MB, MD).
     triplets : sequence
-        Triplets that compete; all twenty by default.
+        Triplets to compare; all twenty by default.
 
     Returns
     -------
     Dataset
         ``predicted_error`` (triplet, ...), m, NaN where the triplet does not determine the contact;
-        ``best`` (...), the triplet with the least, empty where none does; for each triplet, over
-        the contacts outside the cone of 2° about rest: ``share`` where it is best, ``determined``
-        where it determines the contact at all, ``median_error`` where it does, and
-        ``median_error_where_best``. Shares are of the volume of contact points, where contacts
-        sample space, or of contacts. With them the variables of contacts
-        that :func:`~vibrissa.sensitivity` gives.
+        ``best`` (...), the triplet of least error, empty where none determines it; for each
+        triplet, over the contacts outside the cone of 2° about rest: ``share`` where it is best,
+        ``determined`` where it determines the contact, ``median_error`` where it does, and
+        ``median_error_where_best``. Shares are of the volume of contact points where contacts
+        sample space, else of the number of contacts. In addition the variables that describe
+        contacts, as from :func:`~vibrissa.sensitivity`.
 
     Raises
     ------
@@ -229,11 +229,13 @@ def best_triplet(
         raise ValueError("at least one triplet is needed; got none")
     sensor = SensorNoise.of(noise, tuple(dict.fromkeys(n for t in chosen_names for n in t)))
     chosen = chosen_contacts(contact_map, at)
-    errors = np.stack([_errors(contact_map, chosen, names, sensor) for names in chosen_names])
+    errors = np.stack(
+        [_predicted_errors(contact_map, chosen, names, sensor) for names in chosen_names]
+    )
     labels = np.array([" ".join(names) for names in chosen_names])
     known = np.isfinite(errors).any(axis=0)
     winner = np.where(known, np.argmin(np.where(np.isfinite(errors), errors, np.inf), axis=0), -1)
-    data = _labelled(contact_map, chosen)
+    data = _contact_variables(contact_map, chosen)
     weight = contact_weights(data)
     wins = winner == np.arange(len(labels))[:, None]
     finite = np.isfinite(errors)
@@ -267,7 +269,7 @@ def best_triplet(
     ).assign_coords(triplet=labels)
 
 
-def _errors(
+def _predicted_errors(
     contact_map: ContactMap,
     chosen: ChosenContacts,
     names: tuple[str, ...],

@@ -1,17 +1,18 @@
-"""Summits: pairs of twins from which no step leads farther from rest.
+"""Local maxima of the cone angle among pairs of twins.
 
-Pairs (ξ1, ξ2) with T(ξ1) = T(ξ2) are a three-dimensional set. On it the smaller of the two cone
-angles is climbed subject to margins that must not be negative: of the region, the separation, the
-fold and the ends of the whisker. A summit is mostly where several margins vanish, so that a linear
-program finds it: each step maximises the linearised angle within a trust region, once more with
-the margins that were found there (a second-order correction), and returns to the set by Newton's
-method. Margins that are violated cost in proportion, so that a climb may begin outside its region.
+Pairs (ξ1, ξ2) with T(ξ1) = T(ξ2) form a three-dimensional set. On it the smaller of the two cone
+angles is maximised by climbs, subject to margins that must not be negative: of the region, the
+separation, the fold and the ends of the whisker. At a maximum mostly several margins vanish, so
+that a linear program finds it: each step maximises the linearised angle within a trust region, once
+more with the margins found there (a second-order correction), and returns to the set by Newton's
+method. Violated margins are penalised in proportion, so that a climb may start outside its region.
 
-Directions are equal where the cross product of the two transverse vectors vanishes, and sizes where
-their squares agree: equations that are regular also where a transverse vector is zero, through
-which ridges lead. Where a triplet collapses, as on the plane of a planar whisker, all pairs solve
-them: climbs keep off contacts where det ∂T/∂ξ vanishes for both. On a whisker of slight taper it is
-small everywhere; so climbs go on from where they end to where twins stop to be distinct.
+Directions are equal where the cross product of the two transverse vectors vanishes, and magnitudes
+where their squares agree. These equations are regular also where a transverse vector is zero, as it
+is on some paths to a maximum. Where a triplet collapses, as in the plane of a planar whisker, all
+pairs satisfy them: climbs avoid contacts where det ∂T/∂ξ vanishes for both. On a whisker of slight
+taper this determinant is small everywhere; there, climbs are continued until twins are no longer
+distinct.
 """
 
 from __future__ import annotations
@@ -28,28 +29,28 @@ from vibrissa.identifiability.twins import (
     FIRM,
     Pairs,
     Search,
+    concatenate,
     contact_set,
-    joined,
     twins_near,
     units,
 )
 from vibrissa.numerics import AnyArray, Array, cross, kernel, solve
 from vibrissa.rod import chart_of, discretize, solve_forces, with_normal_force
 
-# By what an iteration shrinks the complementarity, how near to the faces it goes, and the
-# complementarity at which it ends.
+# Factor by which an iteration reduces the complementarity, share of the distance to the faces that
+# a step may take, and complementarity at which the iteration ends.
 _SHRINK, _NEARLY, _DONE = 0.04, 0.97, 1e-12
 _ITERATIONS = 25
 
 
 @kernel
 def steepest(levels: Array, slopes: Array, within: Array, cost: float, steps: Array) -> None:
-    """Steps (n, 3) in boxes that raise the lower of two levels most, less the worst violation.
+    """Find steps (n, 3) in boxes that maximise the lower of two levels minus a penalty.
 
-    ``levels`` (n, 2 + m) and their ``slopes`` (n, 3, 2 + m): the two, then margins that may not be
-    negative but at a cost; ``within`` (n,): half widths of the boxes. A primal-dual interior
-    method: unknowns are the step over the size of its box, the level reached t, and the worst
-    violation e; maximised is t - cost·e.
+    ``levels`` (n, 2 + m) and their ``slopes`` (n, 3, 2 + m): the two levels, then margins whose
+    worst violation is penalised by ``cost``; ``within`` (n,): half widths of the boxes. A
+    primal-dual interior-point method: the unknowns are the step over the size of its box, the level
+    t, and the worst violation e; t - cost·e is maximised.
     """
     n, m = levels.shape
     count = m + 7
@@ -114,9 +115,9 @@ def steepest(levels: Array, slopes: Array, within: Array, cost: float, steps: Ar
 
 
 class _Round(NamedTuple):
-    """Climbs of each region, the steps they take, and the cost of a violated margin, rad.
+    """A round of climbs: their number per region, their steps, and the penalty of a violation, rad.
 
-    On the finer rod or not; kept off where twins stop to be distinct, or where det ∂T/∂ξ is small.
+    ``finer``: on the finer rod. ``firm``: twins must be distinct; else det ∂T/∂ξ must not be small.
     """
 
     most: int
@@ -126,8 +127,8 @@ class _Round(NamedTuple):
     firm: bool = False
 
 
-# Rounds that go on with the best of them, and end on a finer rod, where witnesses must hold: a
-# summit is where margins vanish, and what the integration errs by would violate them.
+# Rounds, each of which continues the best climbs. They end on a finer rod, on which witnesses must
+# be confirmed: at a maximum margins vanish, and integration errors would violate them.
 _ROUNDS = (
     _Round(20, 8, 30.0),
     _Round(6, 12, 30.0),
@@ -136,39 +137,41 @@ _ROUNDS = (
     _Round(2, 60, 1000.0, firm=True),
     _Round(2, 6, 1000.0, finer=True, firm=True),
 )
-# Of a quarter as many again violations cost so much: where they pay, all others may leave a region.
+# For a quarter as many additional climbs violations cost this much: at a lower cost, violation may
+# pay, and all other climbs may leave a region.
 _STRICT = 1000.0
-# Starts of a region are in different parts of the chart, so many an axis.
+# Number of parts into which each axis of the chart is divided; starts are in different parts.
 _PARTS = np.array([3.0, 3.0 / np.pi, 3.0])
-# Trust regions, in units of L and of the fold force: the first, that on the finer rod, the largest,
-# and where climbs end.
+# Trust regions, in units of L and of the fold force: the initial one, that on the finer rod, the
+# largest, and that at which climbs end.
 _FIRST, _FINE, _LARGEST, _LAST = 0.1, 1e-3, 0.3, 1e-5
-_LEAST_GAIN = 1e-5  # a climb also ends where the linear program promises no more than this, rad
-_KEPT = 1e-5  # what is kept of each margin so that no summit violates one
-_SAME = 1e-6  # climbs of a region whose merits differ by less than this are at the same summit, rad
-# Transverse vectors face each other at least so far, over their whole sizes; where climbs go on,
-# the same of the root, as the product vanishes with the square of what both have left.
+_LEAST_GAIN = 1e-5  # predicted gain below which a climb ends, rad
+_KEPT = 1e-5  # reserve subtracted from each margin, so that no maximum violates one
+_SAME = 1e-6  # climbs of a region whose merits differ by less than this coincide, rad
+# Least scalar product of the transverse vectors, over their magnitudes and those of the whole
+# vectors. In firm rounds the margin is that of its square root, as the product vanishes with the
+# square of the transverse components.
 _FACING = 1e-4
-# Newton steps back to the set, the misfit that they may leave for the next, and that at which none
-# is needed.
+# Number of Newton steps back to the set, the misfit allowed after them, and the misfit at which no
+# step is needed.
 _CORRECTIONS, _MISFIT, _EXACT = 2, 1e-6, 1e-12
-# The larger determinant of a pair, over the lengths of the gradients, is at least this.
+# Lower bound of the larger determinant of a pair, over the lengths of the gradients.
 _REGULAR = 1e-4
-# Where climbs go on, a change of the signals by ``AGREEMENT`` moves one contact by no more than
-# this, over L: less than a twin may be moved.
+# In firm rounds, largest displacement of one contact by a change of the signals by ``AGREEMENT``,
+# over L: less than is allowed for a twin.
 _MOVED = 0.1 * FIRM
-# Climbs go on where one of these margins, which come first, is less than this.
+# Climbs are continued if one of these margins, which come first, is below this.
 _HELD = 0.05
-_STEEP = 0.1  # its logarithm, so scaled, is the margin: no cost lets a pair through
-# Step of the derivatives of margins, and its ridge against singular equations.
+_STEEP = 0.1  # scale of the logarithm that serves as margin, so that no penalty permits violation
+# Step of the derivatives of margins, and ridge that regularises singular equations.
 _STEP, _RIDGE = 1e-5, 1e-14
 
 
 class _State(NamedTuple):
-    """Pairs on the way: contacts (n, 2, 3), linearised equations (n, 3, 6), angles and margins.
+    """Pairs during a climb: contacts (n, 2, 3), linearised equations (n, 3, 6), levels and merit.
 
-    Distinct (n, 2): how far signals fix each contact, 1 where hardly; levels (n, 2 + m): both cone
-    angles, then margins; merit (n,), -inf off the set.
+    distinct (n, 2): how well signals determine each contact, 1 at the limit; levels (n, 2 + m):
+    both cone angles, then margins; merit (n,), -inf off the set.
     """
 
     xi: Array
@@ -186,8 +189,8 @@ class _State(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Mountain:
-    """What is climbed, the cost of a violated margin, rad, and what climbs are kept off."""
+class _Objective:
+    """Objective of climbs: the search, the penalty of a violation, rad, and the kind of margin."""
 
     search: Search
     cost: float
@@ -198,12 +201,13 @@ class _Mountain:
         return units(self.search.contact_map, xi.reshape(-1, 3)).reshape(xi.shape)
 
     def at(self, xi: Array, signs: Array) -> _State:
-        """Pairs of equal triplets next to contacts (n, 2, 3), of regions with such signs."""
-        # A pair that runs off has no signals, and so no merit.
+        """Pairs with equal triplets closest to contacts (n, 2, 3), for signs (n, 2) of regions."""
+        # A pair that diverges has no signals, and so no merit.
         with np.errstate(divide="ignore", invalid="ignore"):
             return self._at(xi, signs)
 
     def _at(self, xi: Array, signs: Array) -> _State:
+        """Return to the set by Newton's method, and evaluate."""
         unit = self.units(xi)
         for step in range(_CORRECTIONS + 1):
             values, away, slope, by_point = self._equations(xi, unit)
@@ -221,9 +225,10 @@ class _Mountain:
         return _State(xi, slope, distinct, levels, merit)
 
     def _equations(self, xi: Array, unit: Array) -> tuple[Array, Array, Array, Array]:
-        """(F, p) (n, 2, 6), triplets' differences (n, 3), their slopes (n, 3, 6).
+        """Evaluate values, equations and derivatives.
 
-        And ∂p/∂ξ (n, 2, 3, 3).
+        Returns (F, p) (n, 2, 6), differences of the triplets (n, 3), their derivatives (n, 3, 6),
+        and ∂p/∂ξ (n, 2, 3, 3).
         """
         d = self.search.contact_map.chart.discretization
         values, tangents = solve_forces(d, with_normal_force(xi.reshape(-1, 3)), tangents=True)
@@ -280,12 +285,12 @@ class _Mountain:
         return levels, np.asarray(one.inside.reshape(-1, 2).all(axis=1))
 
     def _distinct(self, values: Array, slope: Array, by_point: Array) -> Array:
-        """How far signals fix each contact of pairs, (n, 2): climbs are kept off less than 1."""
+        """How well signals determine each contact of pairs, (n, 2); at least 1 is required."""
         rows = slope.reshape(-1, 3, 2, 3).swapaxes(1, 2)
         if not self.firm:
             size = np.linalg.norm(rows, axis=3).prod(axis=2)
             return np.asarray(np.abs(np.linalg.det(rows)) / np.maximum(_REGULAR * size, _RIDGE))
-        # Rows are derivatives of signals, over |F|, |M| and in rad, times these.
+        # Rows are derivatives of signals, over |F|, |M| or in rad, multiplied by these.
         scale = np.ones((len(rows), 2, 3))
         for k, name in enumerate(self.search.names):
             if name[1] != "x":
@@ -298,13 +303,13 @@ class _Mountain:
         return np.asarray(_MOVED * determinant / np.maximum(size, np.finfo(np.float64).tiny))
 
     def _direction(self, values: Array, name: str) -> Array:
-        """Directions (n, 2, 3) of the vector that a signal is of."""
+        """Unit vectors (n, 2, 3) of force or moment, whichever a signal is a component of."""
         force = values[..., :3]
         a = force if name[0] == "F" else cross(values[..., 3:], force)
         return np.asarray(a / np.linalg.norm(a, axis=2, keepdims=True))
 
     def _facing(self, values: Array) -> Array:
-        """How far the transverse vectors of direction signals face each other, (n, k)."""
+        """Margins (n, k) by which transverse vectors of direction signals have the same sense."""
         out = np.empty((len(values), 0))
         for name in self.search.names:
             if name[1] == "D":
@@ -316,7 +321,7 @@ class _Mountain:
         return out
 
     def slopes(self, state: _State, signs: Array) -> tuple[Array, Array]:
-        """A basis of steps in the set (n, 3, 2, 3), and the levels' slopes along it (n, 3, m)."""
+        """Basis (n, 3, 2, 3) of steps in the set, and derivatives (n, 3, m) of the levels."""
         free = np.linalg.svd(state.slope)[2][:, 3:].reshape(-1, 3, 2, 3)
         unit = self.units(state.xi)
         basis = free * unit[:, None]
@@ -329,53 +334,53 @@ class _Mountain:
 
 
 def farthest_twins(search: Search, pools: Sequence[Pairs], regions: tuple[str, ...]) -> Pairs:
-    """Climb from the best pairs of each pool and region to where their cone angle is largest.
+    """Maximise the cone angle from the best pairs of each pool and region.
 
-    Where a climb ends depends on where it begins: the largest is a lower bound. Each pool has its
-    own climbs, so that none crowds out another.
+    The maximum found depends on the start, so the largest is a lower bound. Each pool has its own
+    climbs, so that none displaces another's.
     """
     signs = np.array(
         [[("CB" in r) * 1.0 - ("CF" in r), float("ELD" in r)] for r in regions]
     ).reshape(-1, 2)
-    starts = [_starts(search, pairs, signs) for pairs in pools]
+    starts = [_select_starts(search, pairs, signs) for pairs in pools]
     number = np.concatenate([k * len(regions) + found[0] for k, found in enumerate(starts)])
     xi = np.concatenate([found[1] for found in starts])
     if not number.size:
         return pools[0].rows(number)
     signs = signs[number % len(regions)]
     count = sum(name[1] == "D" for name in search.names)
-    rods, ends = {False: search, True: _finer(search)}, []
+    rods, ends = {False: search, True: _on_finer_rod(search)}, []
     size = np.full(len(xi), _FIRST)
-    mountain = _Mountain(search, _ROUNDS[0].cost, firm=False)
-    state = mountain.at(xi, signs)
+    objective = _Objective(search, _ROUNDS[0].cost, firm=False)
+    state = objective.at(xi, signs)
     for one in _ROUNDS:
         if one.firm:
             number = number % len(regions)  # all pools' together
         merit = np.where(np.isfinite(state.merit), _merit(state.levels, one.cost), -np.inf)
         strict = np.where(np.isfinite(merit), _merit(state.levels, _STRICT), -np.inf)
         kept = np.union1d(
-            _leading(merit, number, one.most), _leading(strict, number, one.most // 4)
+            _largest_merits(merit, number, one.most), _largest_merits(strict, number, one.most // 4)
         )
         number, signs, size = number[kept], signs[kept], size[kept]
         state = state.rows(kept)._replace(merit=merit[kept])
-        mountain = _Mountain(rods[one.finer], one.cost, one.firm)
+        objective = _Objective(rods[one.finer], one.cost, one.firm)
         if one.finer or one.firm:
             held = state.levels[:, 2:][:, : 1 + count].min(axis=1) < _HELD
-            state = mountain.at(state.xi, signs)
+            state = objective.at(state.xi, signs)
             going = np.isfinite(state.merit) & (one.finer | held)
             size = np.where(going, _FINE if one.finer else _FIRST, 0.0)
         for _ in range(one.steps):
             active = np.flatnonzero(size > _LAST)
             if not active.size:
                 break
-            _step(mountain, state, signs, size, active)
+            _advance(objective, state, signs, size, active)
         if one.finer:
-            ends.append(_solved(mountain.search, state))
-    return joined(ends)
+            ends.append(_solve_second_contacts(objective.search, state))
+    return concatenate(ends)
 
 
-def _solved(search: Search, state: _State) -> Pairs:
-    """Pairs whose second contact is solved for, from where its signals fix it better."""
+def _solve_second_contacts(search: Search, state: _State) -> Pairs:
+    """Solve for the second contact of each pair, which signals determine better than the first."""
     turned = state.distinct[:, 0] > state.distinct[:, 1]
     xi = np.where(turned[:, None, None], state.xi[:, ::-1], state.xi)
     contact_map, names, _, domain = search
@@ -385,18 +390,18 @@ def _solved(search: Search, state: _State) -> Pairs:
     return Pairs(chart, np.zeros(len(chart), np.int64), first, second, apart).rows(agrees)
 
 
-def _finer(search: Search) -> Search:
-    """The same on the rod that witnesses are confirmed on."""
+def _on_finer_rod(search: Search) -> Search:
+    """The same search on the finer rod, on which witnesses are confirmed."""
     contact_map = search.contact_map
     finer = discretize(contact_map.whisker, FINER * contact_map.steps)
     chart = replace(contact_map.chart, discretization=finer)
     return search._replace(contact_map=replace(contact_map, chart=chart))
 
 
-def _starts(search: Search, pairs: Pairs, signs: Array) -> tuple[AnyArray, Array]:
-    """The best pairs of each region, in different parts of charts: its number, their contacts."""
+def _select_starts(search: Search, pairs: Pairs, signs: Array) -> tuple[AnyArray, Array]:
+    """Region indices and contacts of the best pairs of each region, in parts of the chart."""
     xi = np.stack([pairs.first.xi, pairs.second.xi], axis=1)
-    # A pair and the same the other way round are one: the outer contact comes first.
+    # A pair and its exchange are equivalent: put the more distal contact first.
     swapped = xi[:, 0, 0] < xi[:, 1, 0]
     xi[swapped] = xi[swapped, ::-1]
     charts = [chart_of(search.contact_map.chart.fold, xi[:, k]) for k in (0, 1)]
@@ -418,8 +423,8 @@ def _starts(search: Search, pairs: Pairs, signs: Array) -> tuple[AnyArray, Array
     return np.concatenate(numbers), np.concatenate(starts)
 
 
-def _leading(merit: Array, number: AnyArray, most: int) -> AnyArray:
-    """Rows of the largest merits of each region."""
+def _largest_merits(merit: Array, number: AnyArray, most: int) -> AnyArray:
+    """Rows with the largest merits of each region."""
     order = np.lexsort([-merit, number])
     order = order[np.isfinite(merit[order])]
     again = (np.diff(number[order]) == 0) & (np.diff(merit[order]) > -_SAME)
@@ -429,26 +434,30 @@ def _leading(merit: Array, number: AnyArray, most: int) -> AnyArray:
 
 
 def _merit(levels: Array, cost: float) -> Array:
-    """The smaller angle, less what the worst violated margin costs."""
+    """The smaller angle minus the penalty of the worst violated margin."""
     return np.asarray(
         levels[..., :2].min(axis=-1) - cost * np.maximum(-levels[..., 2:], 0.0).max(axis=-1)
     )
 
 
-def _step(mountain: _Mountain, state: _State, signs: Array, size: Array, active: AnyArray) -> None:
-    """One step of the climbs that go on, and their new trust regions."""
+def _advance(
+    objective: _Objective, state: _State, signs: Array, size: Array, active: AnyArray
+) -> None:
+    """Take one step of the active climbs, and update their trust regions."""
     here, signs, within = state.rows(active), signs[active], size[active]
-    basis, slopes = mountain.slopes(here, signs)
-    step, promised = _program(here.levels, slopes, within, mountain.cost)
-    trial = mountain.at(here.xi + np.einsum("nk,nkpi->npi", step, basis), signs)
+    basis, slopes = objective.slopes(here, signs)
+    step, promised = _solve_program(here.levels, slopes, within, objective.cost)
+    trial = objective.at(here.xi + np.einsum("nk,nkpi->npi", step, basis), signs)
     promised = promised - here.merit
-    # Where the margins bend, once more with what they were there.
+    # Where the margins are nonlinear, once more with their values at the first trial.
     again = np.flatnonzero(np.isfinite(trial.merit) & (trial.merit - here.merit < 0.75 * promised))
     if again.size:
         bent = trial.levels - here.levels - np.einsum("nk,nkm->nm", step, slopes)
-        step, _ = _program((here.levels + bent)[again], slopes[again], within[again], mountain.cost)
+        step, _ = _solve_program(
+            (here.levels + bent)[again], slopes[again], within[again], objective.cost
+        )
         moved = here.xi[again] + np.einsum("nk,nkpi->npi", step, basis[again])
-        second = mountain.at(moved, signs[again])
+        second = objective.at(moved, signs[again])
         better = second.merit > trial.merit[again]
         trial.replace(again[better], second.rows(better))
     gain = trial.merit - here.merit
@@ -458,7 +467,7 @@ def _step(mountain: _Mountain, state: _State, signs: Array, size: Array, active:
     size[active] = np.where(promised < _LEAST_GAIN, 0.0, np.minimum(within, _LARGEST))
 
 
-def _program(levels: Array, slopes: Array, within: Array, cost: float) -> tuple[Array, Array]:
+def _solve_program(levels: Array, slopes: Array, within: Array, cost: float) -> tuple[Array, Array]:
     """Steps (n, 3) in boxes that maximise the linearised merit, and that merit (n,)."""
     step = np.zeros((len(levels), 3))
     steepest(levels, slopes, within, cost, step)

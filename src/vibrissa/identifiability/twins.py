@@ -1,19 +1,20 @@
-"""Twins: contacts far apart that have the same three signals.
+"""Twins: distant contacts that have the same three signals.
 
 Where the map ξ → T is regular, all contacts with the triplet of a given one are found exactly
-(:mod:`vibrissa.contacts.inversion`); those far from it are its twins.
+(:mod:`vibrissa.contacts.inversion`); the distant ones are its twins.
 
 Where a triplet has lost a dimension, contacts with equal triplets form curves, its *fibres*. A
-straight whisker never twists: M_x = 0 everywhere. In a whisker of one stiffness and one curvature
+straight whisker never twists: M_x = 0 everywhere. In a whisker of uniform stiffness and curvature
 the axial force and the bending moment at the base are related, F_x = -M²/2EI for a straight
 cylinder. Fibres are followed along the direction in which the triplet does not change.
 
-Where the integration errs by more than the signals differ, two contacts can agree on the rod as it
-is discretised and not in truth: a pair counts only if it is found again on a finer rod.
+Where the integration error exceeds the difference of the signals, two contacts can agree on the
+discretised rod but not on the continuous one: a pair counts only if it is found again on a finer
+rod.
+
+A witness is a pair of twins for which the whisker is deflected again, as two whiskers.
 
 All arrays are non-dimensional (lengths over L, forces over EI/L²), as in :mod:`vibrissa.rod`.
-
-A witness is a pair of twins that is bent again, as two whiskers.
 """
 
 from __future__ import annotations
@@ -57,15 +58,16 @@ from vibrissa.signals import (
 )
 from vibrissa.whisker import Whisker
 
-_LEAST_LOAD = 0.01  # directions have no value at zero force: samples are kept off it
+_LEAST_LOAD = 0.01  # smallest ρ of samples: directions are undefined at zero force
 _STEP = 1e-6  # step of the derivatives of the chart, a cube root of rounding
 
 
 class ContactSet(NamedTuple):
-    """Contacts with the regions they belong to.
+    """Contacts and the regions to which they belong.
 
-    ξ (n, 3); (F, p) (n, 6); cone angle from rest, rad; offset backward over L, positive where
-    concave backward; x of the tangent, negative where deflected far; whether inside the domain.
+    xi (n, 3): ξ; values (n, 6): (F, p); angle: cone angle from rest, rad; backward: offset over L,
+    positive if concave backward; tangent_x: x of the tangent, negative at a large deflection;
+    inside: whether in the domain.
     """
 
     xi: Array
@@ -76,11 +78,11 @@ class ContactSet(NamedTuple):
     inside: AnyArray
 
     def rows(self, which: AnyArray | slice) -> ContactSet:
-        """Pick some."""
+        """Select rows."""
         return ContactSet(*(a[which] for a in self))
 
     def members(self, region: str) -> AnyArray:
-        """Whether each belongs to a region, whatever its angle."""
+        """Whether each contact belongs to a region, irrespective of the cone angle."""
         return self.inside & in_region(region, self.backward > 0.0, self.tangent_x < 0.0)
 
     @property
@@ -93,8 +95,8 @@ class ContactSet(NamedTuple):
 class Samples(NamedTuple):
     """Contacts spread over Ω.
 
-    Chart coordinates (η, ψ, ρ) (n, 3); the contacts; directions of the six signals' gradients
-    (n, 6, 3); each one's share of the volume of contact points (n,), up to a common factor.
+    chart (n, 3): coordinates (η, ψ, ρ); the contacts; gradients (n, 6, 3): directions of the six
+    signals' gradients; volume (n,): share of the volume of contact points, up to a common factor.
     """
 
     chart: Array
@@ -103,7 +105,7 @@ class Samples(NamedTuple):
     volume: Array
 
     def rows(self, which: AnyArray | slice) -> Samples:
-        """Pick some."""
+        """Select rows."""
         return Samples(
             self.chart[which], self.contacts.rows(which), self.gradients[which], self.volume[which]
         )
@@ -116,9 +118,9 @@ def contact_set(
     domain: Domain,
     turned: AnyArray | slice = slice(None),
 ) -> ContactSet:
-    """Find the regions of contacts ξ (n, 3) with known (F, p) (n, 6).
+    """Determine the regions of contacts ξ (n, 3) with known (F, p) (n, 6).
 
-    Tangents are found of those which may be ``turned``; the others count as not deflected far.
+    Tangents are computed only for contacts ``turned``; others count as not deflected far.
     """
     whisker, d = contact_map.whisker, contact_map.chart.discretization
     points = values[:, 3:] * d.length
@@ -137,20 +139,20 @@ def contact_set(
     )
 
 
-def solved(contact_map: ContactMap, chart: Array, domain: Domain) -> tuple[ContactSet, Array]:
-    """Solve the contacts at chart coordinates (n, 3); ∂(F, p)/∂ξ (n, 6, 3) too."""
+def solve_chart(contact_map: ContactMap, chart: Array, domain: Domain) -> tuple[ContactSet, Array]:
+    """Solve the contacts at chart coordinates (n, 3); also return ∂(F, p)/∂ξ (n, 6, 3)."""
     xi = contacts_at(contact_map.chart.fold, chart)
     d = contact_map.chart.discretization
     values, tangents = solve_forces(d, with_normal_force(xi), tangents=True)
     contacts = contact_set(contact_map, xi, values, domain)
-    # The chart has the fold to a part in a million: contacts beyond it do not count.
+    # The chart's fold is accurate to one part in a million; contacts beyond the true one are out.
     stable = determinant(tangents) > 0.0
     return contacts._replace(inside=contacts.inside & stable), tangents
 
 
 def sample(contact_map: ContactMap, chart: Array, domain: Domain) -> Samples:
-    """Solve the contacts at chart coordinates (n, 3), with what they stand for."""
-    contacts, tangents = solved(contact_map, chart, domain)
+    """Solve the contacts at chart coordinates (n, 3), with gradients of signals and volumes."""
+    contacts, tangents = solve_chart(contact_map, chart, domain)
     by_chart = tangents[:, 3:] @ _chart_derivatives(contact_map.chart.fold, chart)
     gradients = np.nan_to_num(signal_derivatives(contacts.values, tangents))
     size = np.linalg.norm(gradients, axis=2, keepdims=True)
@@ -161,7 +163,7 @@ def sample(contact_map: ContactMap, chart: Array, domain: Domain) -> Samples:
 def spread(number: int, seed: int | None) -> Array:
     """Low-discrepancy chart coordinates (n, 3), at least ``number`` of them: a power of two.
 
-    Without a seed they are not scrambled.
+    Without a seed the sequence is not scrambled.
     """
     rng = None if seed is None else np.random.default_rng(seed)
     sobol = stats.qmc.Sobol(3, scramble=seed is not None, seed=rng)
@@ -170,7 +172,7 @@ def spread(number: int, seed: int | None) -> Array:
 
 
 def in_chart(chart: Array) -> Array:
-    """Bring chart coordinates (n, 3) back into the chart: reflected at its faces, ψ on a circle."""
+    """Map chart coordinates (n, 3) into the chart: reflected at its faces, ψ modulo 2π."""
     chart = np.array(chart)
     for axis in (0, 2):
         x = np.abs(chart[:, axis]) % 2.0
@@ -189,23 +191,23 @@ def _chart_derivatives(fold: Fold, chart: Array) -> Array:
     return np.stack(columns, axis=-1)
 
 
-#: Agreement of twins' signals: forces relative to |F|, moments to |M|, angles in rad.
+#: Agreement of twins' signals: forces over |F|, moments over |M|, angles in rad.
 AGREEMENT = 1e-10
-#: A solution that ``AGREEMENT`` could move by more than this (over L) is not distinct from its
-#: neighbours.
+#: Displacement (over L) by a change of ``AGREEMENT``, above which a solution is not distinct from
+#: its neighbours.
 FIRM = 1e-3
-#: Factor by which the rod is finer on which pairs are found again.
+#: Factor by which the number of steps is larger on the rod on which pairs are confirmed.
 FINER = 4
-# A pair is confirmed if its second contact moves by less than this share of their distance.
+# Largest displacement of a confirmed pair's second contact, as a share of the pair's distance.
 _STEADY = 0.2
-_SAME = 1e-4  # two solutions nearer than this (over L) are the same contact
-# The search for better twins starts wide, ends where climbs begin, keeps so many of each region.
+_SAME = 1e-4  # distance (over L) below which two solutions are the same contact
+# Widths of the variation in the search for better twins, and pairs kept per region.
 _WIDTHS = np.geomspace(0.2, 0.02, 9)
 _KEPT = 16
 # Length of a step along a fibre, in units in which the chart is about one wide; steps each way.
 _STRIDE = 0.02
 _STRIDES = 60
-# Gauss-Newton steps that bring a contact back to given signals, and singular values that count.
+# Number of Gauss-Newton steps in a correction, and relative cutoff of singular values.
 _CORRECTIONS = 5
 _RCOND = 1e-6
 
@@ -213,8 +215,8 @@ _RCOND = 1e-6
 class Pairs(NamedTuple):
     """Pairs of contacts with equal triplets.
 
-    Chart coordinates of the first (n, 3); number of the sample it came from (n,); both contacts;
-    their distance over L (n,).
+    chart (n, 3): coordinates of the first contact; sample (n,): index of the sample it came from;
+    both contacts; apart (n,): their distance over L.
     """
 
     chart: Array
@@ -224,7 +226,7 @@ class Pairs(NamedTuple):
     apart: Array
 
     def rows(self, which: AnyArray) -> Pairs:
-        """Pick some."""
+        """Select rows."""
         return Pairs(
             self.chart[which],
             self.sample[which],
@@ -244,7 +246,7 @@ class Pairs(NamedTuple):
 
 
 class Search(NamedTuple):
-    """What is searched: twins of a triplet, at least so far apart over L, in a domain."""
+    """Parameters of a search for twins: triplet, least distance over L, and domain."""
 
     contact_map: ContactMap
     names: tuple[str, ...]
@@ -252,8 +254,8 @@ class Search(NamedTuple):
     domain: Domain
 
 
-def joined(parts: list[Pairs]) -> Pairs:
-    """All pairs of several lists; their samples keep their numbers."""
+def concatenate(parts: list[Pairs]) -> Pairs:
+    """Concatenate lists of pairs; the sample indices are unchanged."""
     return Pairs(
         np.concatenate([p.chart for p in parts]),
         np.concatenate([p.sample for p in parts]),
@@ -264,12 +266,12 @@ def joined(parts: list[Pairs]) -> Pairs:
 
 
 def signal_columns(names: tuple[str, ...]) -> list[int]:
-    """Columns of signals among the six."""
+    """Columns of the named signals among the six."""
     return [SIGNALS.index(name) for name in names]
 
 
 def triplet_derivatives(values: Array, tangents: Array, names: tuple[str, ...]) -> Array:
-    """∂T/∂ξ (n, k, 3); zero where a direction has no value."""
+    """∂T/∂ξ (n, k, 3); zero where a direction is undefined."""
     return np.asarray(np.nan_to_num(signal_derivatives(values, tangents)[:, signal_columns(names)]))
 
 
@@ -280,20 +282,20 @@ def twins(
     first: ContactSet,
     domain: Domain,
 ) -> Pairs:
-    """Find all twins of contacts."""
+    """Find all twins of contacts ``first`` at chart coordinates (n, 3)."""
     targets = first.signals[:, signal_columns(names)]
     found = invert(contact_map.chart, contact_map.tree(names), names, targets)
     apart = np.linalg.norm(found.values[:, :, 3:] - first.values[:, None, 3:], axis=2)
-    rows, columns = np.nonzero(apart >= _SAME)  # NaN is not
+    rows, columns = np.nonzero(apart >= _SAME)  # false for NaN
     xi, values = found.contacts[rows, columns], found.values[rows, columns]
-    firm = _firm(contact_map, names, xi)
+    firm = _is_distinct(contact_map, names, xi)
     rows, columns, xi, values = rows[firm], columns[firm], xi[firm], values[firm]
     second = contact_set(contact_map, xi, values, domain)
     return Pairs(chart[rows], rows, first.rows(rows), second, apart[rows, columns])
 
 
-def _firm(contact_map: ContactMap, names: tuple[str, ...], xi: Array) -> AnyArray:
-    """Whether solutions hardly move when their signals change by ``AGREEMENT``."""
+def _is_distinct(contact_map: ContactMap, names: tuple[str, ...], xi: Array) -> AnyArray:
+    """Whether solutions are displaced by at most ``FIRM`` if their signals change by AGREEMENT."""
     values, tangents = solve_forces(
         contact_map.chart.discretization, with_normal_force(xi), tangents=True
     )
@@ -308,33 +310,32 @@ def _firm(contact_map: ContactMap, names: tuple[str, ...], xi: Array) -> AnyArra
 def better_twins(
     search: Search, pairs: Pairs, regions: tuple[str, ...], rng: np.random.Generator
 ) -> Pairs:
-    """Look for twins farther from rest than those found, near them.
+    """Search for twins farther from rest, in the neighbourhood of known pairs.
 
-    An evolution: the pairs of each region that are farthest apart, and among those far enough
-    apart farthest from rest, are varied, ever more finely, and the twins of the varied contacts
-    compete with them.
+    An evolution: the pairs of each region that are farthest from rest and far enough apart are
+    varied with decreasing width, and the twins of the varied contacts compete with them.
     """
     contact_map, names, separation, domain = search
-    best = _best(pairs, regions, separation)
+    best = _select_best(pairs, regions, separation)
     for width in _WIDTHS:
         if not len(best.apart):
             break
         both = np.concatenate([best.chart, chart_of(contact_map.chart.fold, best.second.xi)])
         noise = width * rng.standard_normal(both.shape) * [1.0, np.pi, 1.0]
-        # Differences of good ones point along thin sets of them, which noise alone would miss.
+        # Differences of good pairs point along thin sets of them, which noise alone would miss.
         step = both[rng.permutation(len(both))] - both[rng.permutation(len(both))]
         step = within_turn(step, [False, True, False])
         chart = in_chart(np.concatenate([both + noise, both + 0.7 * step + 0.03 * noise]))
-        varied, _ = solved(contact_map, chart, domain)
+        varied, _ = solve_chart(contact_map, chart, domain)
         found = twins(contact_map, names, chart, varied, domain)
-        best = _best(joined([best, found]), regions, separation)
+        best = _select_best(concatenate([best, found]), regions, separation)
     return best
 
 
 def twins_near(
     contact_map: ContactMap, names: tuple[str, ...], first: Array, second: Array, domain: Domain
 ) -> tuple[ContactSet, ContactSet, AnyArray]:
-    """Both contacts of pairs whose second one is solved for, and whether that is a twin."""
+    """Solve for the second contact of each pair; also return whether it is a twin."""
     chart = contact_map.chart
     values, _ = solve_forces(chart.discretization, with_normal_force(first))
     one = contact_set(contact_map, first, values, domain)
@@ -342,17 +343,17 @@ def twins_near(
     agrees = (misfit <= AGREEMENT) & stable(contact_map, first) & (second[:, 0] <= 1.0)
     second = np.where(agrees[:, None], second, first)
     values = np.where(agrees[:, None], values, one.values)
-    agrees &= stable(contact_map, second) & _firm(contact_map, names, second)
+    agrees &= stable(contact_map, second) & _is_distinct(contact_map, names, second)
     return one, contact_set(contact_map, second, values, domain), agrees
 
 
-def _best(pairs: Pairs, regions: tuple[str, ...], separation: float) -> Pairs:
-    """The best pairs of each region, at most one of each part of the chart so that they differ."""
+def _select_best(pairs: Pairs, regions: tuple[str, ...], separation: float) -> Pairs:
+    """The best pairs of each region, at most one from each part of the chart."""
     far = pairs.apart >= separation
     cells = np.floor(pairs.chart * [4.0, 4.0 / np.pi, 4.0] - 1e-9)
     part = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
     chosen: set[int] = set()
-    # Those that count, and those that may soon: far from rest, though not yet far apart.
+    # Pairs that count, and candidates: far from rest, though not yet far enough apart.
     for score in (
         np.where(far, pairs.angle, -1.0),
         pairs.angle * np.minimum(pairs.apart / separation, 1.0) ** 2,
@@ -375,13 +376,13 @@ def sizes(values: Array, names: tuple[str, ...]) -> Array:
 
 
 def units(contact_map: ContactMap, xi: Array) -> Array:
-    """Scale of a change of each unknown (n, 3): L, and the fold force there."""
+    """Scale of a change of each unknown (n, 3): L, and the fold force at the contact."""
     force = fold_forces(contact_map.chart.fold, xi)
     return np.stack([np.ones(len(xi)), force, force], axis=1)
 
 
 def stable(contact_map: ContactMap, xi: Array) -> AnyArray:
-    """Whether contacts ξ (n, 3) are between rest and the fold, at an arc length of the map."""
+    """Whether contacts ξ (n, 3) are between rest and fold, within the map's arc lengths."""
     force = np.hypot(xi[:, 1], xi[:, 2])
     inside = (xi[:, 0] >= contact_map.chart.proximal) & (xi[:, 0] <= 1.0)
     return np.asarray(inside & (force > 0.0) & (force < units(contact_map, xi)[:, 1]))
@@ -401,28 +402,28 @@ def equations(
     )
 
 
-def corrected(
+def correct(
     discretization: Discretization, names: tuple[str, ...], xi: Array, targets: Array, unit: Array
 ) -> tuple[Array, Array, Array]:
-    """Move contacts the least way to where they have given signals (Gauss and Newton)."""
+    """Move contacts the least distance to where they have given signals, by Gauss-Newton steps."""
     for _ in range(_CORRECTIONS):
         away, slope, _ = equations(discretization, names, xi, targets)
         inverse = np.linalg.pinv(slope * unit[:, None, :], rcond=_RCOND)
         xi = xi - np.einsum("nij,nj->ni", inverse, away) * unit
     away, _, values = equations(discretization, names, xi, targets)
-    # Where a fibre ends at rest nothing is left to compare with: the misfit is infinite.
+    # Where a fibre ends at rest the scale vanishes, and the misfit is set to infinity.
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         misfit = np.abs(away / sizes(values, names)).max(axis=1)
     return xi, values, np.where(np.isfinite(misfit), misfit, np.inf)
 
 
-def found_again(
+def resolve_on_finer_rod(
     contact_map: ContactMap, names: tuple[str, ...], first: Array, second: Array, steps: int
 ) -> tuple[Array, Array]:
-    """Solve for the second contact of each pair on a finer rod, with the first as it is.
+    """Solve for the second contact of each pair on a finer rod, with the first fixed.
 
-    Returns both contact points (n, 2, 3), NaN where there is no such pair, and by how much the
-    second has moved (n,), over L.
+    Returns both contact points (n, 2, 3), NaN where there is no such pair, and the displacement of
+    the second (n,), over L.
     """
     coarse = discretize(contact_map.whisker, steps)
     finer = discretize(contact_map.whisker, FINER * steps)
@@ -430,17 +431,17 @@ def found_again(
     before, _ = solve_forces(coarse, with_normal_force(second))
     force, point = at_first[:, :3], at_first[:, 3:]
     target = signals_of(force, cross(point, force))[:, signal_columns(names)]
-    _, values, misfit = corrected(finer, names, second, target, units(contact_map, second))
+    _, values, misfit = correct(finer, names, second, target, units(contact_map, second))
     points = np.stack([point, values[:, 3:]], axis=1)
     points[~(misfit <= AGREEMENT)] = np.nan
     return points, np.linalg.norm(points[:, 1] - before[:, 3:], axis=1)
 
 
-def confirmed(
+def confirm(
     contact_map: ContactMap, names: tuple[str, ...], pairs: Pairs, steps: int, separation: float
 ) -> tuple[AnyArray, Array]:
     """Whether pairs are found again on a finer rod, and their cone angles there."""
-    points, moved = found_again(contact_map, names, pairs.first.xi, pairs.second.xi, steps)
+    points, moved = resolve_on_finer_rod(contact_map, names, pairs.first.xi, pairs.second.xi, steps)
     apart = np.linalg.norm(points[:, 1] - points[:, 0], axis=1)
     stays = (apart >= separation) & (moved <= _STEADY * apart)
     length = contact_map.chart.discretization.length
@@ -456,7 +457,7 @@ def fibres(
     first: ContactSet,
     domain: Domain,
 ) -> Pairs:
-    """Follow the curves of equal triplets through contacts where these have lost a dimension."""
+    """Follow curves of equal triplets through contacts at which a dimension has been lost."""
     d = discretize(contact_map.whisker, steps)
     values, _ = solve_forces(d, with_normal_force(first.xi))
     first = contact_set(contact_map, first.xi, values, domain)
@@ -468,9 +469,9 @@ def fibres(
         direction = np.full(xi.shape, np.nan)
         for _ in range(_STRIDES):
             _, slope, _ = equations(d, names, xi, targets[running])
-            direction = _along(slope * unit[running, None, :], direction, sense)
+            direction = _null_direction(slope * unit[running, None, :], direction, sense)
             xi = xi + _STRIDE * direction * unit[running]
-            xi, values, misfit = corrected(d, names, xi, targets[running], unit[running])
+            xi, values, misfit = correct(d, names, xi, targets[running], unit[running])
             stays = (misfit <= AGREEMENT) & stable(contact_map, xi)
             xi, running, direction = xi[stays], running[stays], direction[stays]
             if not running.size:
@@ -484,8 +485,8 @@ def fibres(
     return Pairs(chart[row], row, first.rows(row), second, apart)
 
 
-def _along(slope: Array, before: Array, sense: float) -> Array:
-    """Unit vectors (n, 3) in which T does not change, as near to those before as there are."""
+def _null_direction(slope: Array, before: Array, sense: float) -> Array:
+    """Unit vectors (n, 3) along which T does not change, as close to ``before`` as possible."""
     _, singular, rows = np.linalg.svd(slope)
     null = singular <= RANK * singular[:, :1]
     null[:, 2] = True
@@ -496,7 +497,8 @@ def _along(slope: Array, before: Array, sense: float) -> Array:
     return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
 
 
-# Largest difference of a saved witness's signals from those of the whisker.
+# Nodes of witnesses' centrelines, and largest difference of a saved witness's signals from those of
+# the whisker.
 _NODES = 101
 _AGREE = 1e-6
 _NEEDED = {"witness_arc_length", "witness_contact_force", "witness_separation"}
@@ -505,16 +507,16 @@ _NEEDED = {"witness_arc_length", "witness_contact_force", "witness_separation"}
 def witness_pairs(
     whisker: Whisker, verdicts: xr.Dataset, triplets: Iterable[str]
 ) -> Iterator[tuple[str, xr.Dataset]]:
-    """Bend a whisker into the farthest pair of contacts with the same signals, for some triplets.
+    """Deflect a whisker into the most distant pair of contacts with the same signals.
 
     Parameters
     ----------
     whisker : Whisker
-        The whisker that the verdicts are of.
+        Whisker to which the verdicts belong.
     verdicts : xarray.Dataset
-        Verdicts with witnesses, of `uniqueness`.
+        Verdicts with witnesses, from `uniqueness`.
     triplets : iterable of str
-        Names of the triplets that are wanted; those without a witness are left out.
+        Names of triplets; those without a witness are omitted.
 
     Yields
     ------
@@ -527,7 +529,7 @@ def witness_pairs(
     Raises
     ------
     ValueError
-        If the verdicts are of another whisker.
+        If the verdicts belong to another whisker.
     """
     if not set(verdicts.data_vars) >= _NEEDED:
         return
@@ -541,11 +543,14 @@ def witness_pairs(
         apart = found["witness_separation"].transpose("region", "witness").values
         if np.isfinite(apart).any():
             region, witness = np.unravel_index(np.nanargmax(apart), apart.shape)
-            yield triplet, _bent(whisker, found.isel(region=int(region), witness=int(witness)))
+            yield (
+                triplet,
+                _bend_witness(whisker, found.isel(region=int(region), witness=int(witness))),
+            )
 
 
-def _bent(whisker: Whisker, witness: xr.Dataset) -> xr.Dataset:
-    """The two whiskers of one witness."""
+def _bend_witness(whisker: Whisker, witness: xr.Dataset) -> xr.Dataset:
+    """Dataset of the two deflected whiskers of one witness."""
     force = witness["witness_contact_force"].transpose("pair", "component").values
     components = np.column_stack([np.zeros(2), force])
     load = PointForce(witness["witness_arc_length"].values, components=components)
@@ -570,7 +575,7 @@ def _bent(whisker: Whisker, witness: xr.Dataset) -> xr.Dataset:
 def _check_whisker(
     bent: Deflection, signals: xr.Dataset, triplet: str, saved: NDArray[np.float64]
 ) -> None:
-    """Raise unless the first contact has the signals here that it had in the verdicts."""
+    """Raise a ValueError unless the first contact's signals are those saved with the verdicts."""
     names = triplet.split()
     here = np.array([signals[name].values[0] for name in names])
     force, moment = (float(np.linalg.norm(v[0])) for v in (bent.force, bent.moment))
@@ -579,7 +584,7 @@ def _check_whisker(
         abs(a - b) / sizes[name] if name in sizes else abs(np.angle(np.exp(1j * (a - b))))
         for name, a, b in zip(names, here, saved, strict=True)
     ]
-    if not np.max(gap) < _AGREE:  # also where the whisker holds no such contact
+    if not np.max(gap) < _AGREE:  # also if NaN: the whisker has no such contact
         raise ValueError(
             f"the verdicts are not of this map's whisker: for ({triplet}) the first contact of a "
             f"witness has the signals {here} here, and {saved} where the verdicts were made"

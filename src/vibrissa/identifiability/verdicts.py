@@ -1,14 +1,15 @@
-"""Verdicts: which signals locate a contact, with the evidence.
+"""Verdicts on which triplets of signals locate contacts, with the evidence.
 
-Two contacts with the same triplet are a *witness*: a proof that it does not locate the contact. The
-verdict on a triplet and a region is whether there are witnesses outside the cone that is left out;
-:mod:`vibrissa.identifiability.evidence` searches for them.
+Two contacts with the same triplet are a *witness*: a proof that the triplet does not locate the
+contact. The verdict on a triplet and a region states whether there are witnesses outside the
+excluded cone; :mod:`vibrissa.identifiability.evidence` searches for them.
 
-A whisker in one plane is special. There M_x is zero and F_D and M_D are constant for all contacts
-in the plane, a surface of measure zero, so that a triplet with two of these cannot distinguish
-contacts in the plane although it may distinguish all others: it is *unique off a surface*.
+A planar whisker is special. For contacts in its plane, a surface of measure zero, M_x is zero and
+F_D and M_D are constant, so a triplet with two of these cannot distinguish contacts in the plane,
+although it may distinguish all others: it is *unique off a surface*.
 
-They are read as a whole in short, as a table or as files, and show the triplet to use.
+Verdicts can be summarised in short notation, formatted as a table or written to files; they also
+determine the triplet to use.
 """
 
 from __future__ import annotations
@@ -31,17 +32,17 @@ from vibrissa.identifiability.evidence import (
     TOLERANCES,
     UNIQUE,
     WITNESSES,
-    Answer,
-    Question,
-    answer,
-    ask,
+    Evidence,
+    Problem,
+    gather_evidence,
+    prepare,
 )
 from vibrissa.identifiability.twins import (
     FINER,
     Pairs,
-    corrected,
+    correct,
     equations,
-    found_again,
+    resolve_on_finer_rod,
     signal_columns,
     sizes,
     units,
@@ -52,8 +53,8 @@ from vibrissa.quantities import attributes
 from vibrissa.rod import Discretization, discretize, solve_forces, with_normal_force
 from vibrissa.signals import CONE, REGIONS, SIGNALS, TRIPLETS, selection, signal_scales, signals_of
 
-# Parts of each region.
-_PARTS = {
+# Regions contained in each region.
+_SUBREGIONS = {
     "all": {"ELD", "CF", "CB", "ELD CF", "ELD CB"},
     "ELD": {"ELD CF", "ELD CB"},
     "CF": {"ELD CF"},
@@ -62,22 +63,22 @@ _PARTS = {
     "ELD CB": set(),
 }
 _MARKS = {UNIQUE: "unique", OFF_SURFACE: "unique*", NOT_UNIQUE: "–"}
-#: Endings of files that verdicts are written to.
+#: Suffixes of files to which verdicts can be written.
 ENDINGS = (".nc", ".csv")
-# Tolerance whose ambiguous shares decide between triplets that are unique over the same region.
+# Tolerance at which ambiguous shares decide between triplets that are unique in the same region.
 _DECIDING = 1e-3
 
 
 def notation(words: Mapping[str, str]) -> str:
-    """Verdicts of a triplet, by regions, in short."""
+    """Summarise a triplet's verdicts, given by region, in short notation."""
     word = {region: str(verdict) for region, verdict in words.items()}
     good = [region for region in word if word[region] in (UNIQUE, OFF_SURFACE)]
-    # A part adds something only if it is unique where the whole is so off a surface.
+    # A part adds information only if it is unique where the whole is unique off a surface.
     largest = [
         region
         for region in good
-        if not any(region in _PARTS[other] and word[other] == word[region] for other in good)
-        and not any(region in _PARTS[other] and word[other] == UNIQUE for other in good)
+        if not any(region in _SUBREGIONS[other] and word[other] == word[region] for other in good)
+        and not any(region in _SUBREGIONS[other] and word[other] == UNIQUE for other in good)
     ]
     names = [
         ("All" if r == "all" else r) + ("*" if word[r] == OFF_SURFACE else "") for r in largest
@@ -86,7 +87,7 @@ def notation(words: Mapping[str, str]) -> str:
 
 
 def choice(verdicts: xr.Dataset) -> tuple[str, str]:
-    """The triplet to use, with its region, as in the paper's Fig. 1C."""
+    """Choose the triplet to use, with its region, as in the paper's Fig. 1C."""
     best: tuple[float, float, float] | None = None
     chosen = ("", "")
     share = verdicts.region_share.to_series()
@@ -106,23 +107,24 @@ def choice(verdicts: xr.Dataset) -> tuple[str, str]:
 
 
 def verdict_words(cell: xr.Dataset) -> str:
-    """A verdict with its evidence, such as "unique (proved)"."""
+    """Format a verdict with its evidence, such as "unique (proved)"."""
     evidence = str(cell["evidence"].item()) if "evidence" in cell else ""
     return str(cell["verdict"].item()) + (f" ({evidence})" if evidence else "")
 
 
 def verdict_table(verdicts: xr.Dataset) -> str:
-    """Write verdicts as a table for people.
+    """Format verdicts as a text table.
 
     Parameters
     ----------
     verdicts : Dataset
-        Verdicts of :func:`vibrissa.uniqueness`.
+        Verdicts from :func:`vibrissa.uniqueness`.
 
     Returns
     -------
     str
-        A row for each triplet: the critical cone in each region, with the verdict; in short.
+        Row for each triplet: critical cone or verdict in each region, short notation, and twins;
+        followed by notes.
     """
     rows, notes = verdict_rows(verdicts)
     width = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
@@ -133,7 +135,7 @@ def verdict_table(verdicts: xr.Dataset) -> str:
 
 
 def verdict_rows(verdicts: xr.Dataset) -> tuple[list[list[str]], list[str]]:
-    """Arrange verdicts as the cells of a table."""
+    """Arrange verdicts as the cells of a table, and notes."""
     regions = [str(r) for r in verdicts.region.to_numpy()]
     rows = [["triplet", *regions, "in short", "twins"]]
     for triplet in verdicts.triplet.to_numpy():
@@ -169,7 +171,7 @@ def verdict_rows(verdicts: xr.Dataset) -> tuple[list[list[str]], list[str]]:
 
 
 def _rarest(verdicts: xr.Dataset) -> str:
-    """The triplet that is not unique in the first region, with the fewest contacts with twins."""
+    """Note on the triplet that is not unique in the first region but has the fewest twins."""
     cells = verdicts.isel(region=0)
     share = cells.twin_share.where(cells.verdict == NOT_UNIQUE)
     if not share.notnull().any():
@@ -180,7 +182,7 @@ def _rarest(verdicts: xr.Dataset) -> str:
 
 
 def twins_of(verdicts: xr.Dataset, triplet: str) -> str:
-    """Share of contacts that have a twin, in the first region, with the distance of twins."""
+    """Format the share of contacts in the first region that have a twin, and their distance."""
     if triplet not in verdicts["triplet"]:
         return "not asked"
     cell = verdicts.sel(triplet=triplet).isel(region=0)
@@ -194,7 +196,7 @@ def twins_of(verdicts: xr.Dataset, triplet: str) -> str:
 
 
 def _certificate_note(verdicts: xr.Dataset) -> list[str]:
-    """State what a grid shows of a proof."""
+    """Note on what a grid shows about the possibility of a proof."""
     if "determinant_cone" not in verdicts.attrs:
         return []
     angle, cone = (np.rad2deg(verdicts.attrs[name]) for name in ("determinant_cone", "cone"))
@@ -216,17 +218,17 @@ def _plane(verdicts: xr.Dataset) -> str:
 
 
 def save_uniqueness(verdicts: xr.Dataset, path: str | PathLike[str]) -> None:
-    """Write verdicts with their evidence."""
+    """Write verdicts with their evidence to a NetCDF or CSV file."""
     path = Path(path)
     check_writable(path, ENDINGS)
     if path.suffix == ".nc":
         write_netcdf(path, verdicts)
     else:
         with replacing(path) as part:
-            part.write_text(_rows(verdicts), encoding="utf-8")
+            part.write_text(_to_csv(verdicts), encoding="utf-8")
 
 
-def _rows(verdicts: xr.Dataset) -> str:
+def _to_csv(verdicts: xr.Dataset) -> str:
     plain = [n for n, v in verdicts.data_vars.items() if v.dims == ("triplet", "region")]
     header = ["triplet", "region", *map(str, plain)]
     spread = [n for n in ("ambiguous_share", "surface_angle") if n in verdicts]
@@ -262,9 +264,9 @@ def _cell(value: object) -> str:
     return repr(float(value))  # type: ignore[arg-type]
 
 
-#: Contacts nearer to each other than this share of the length count as one.
+#: Distance below which two contacts count as one, over the length.
 SEPARATION = 0.025
-#: Number of contacts that are tried.
+#: Number of contacts that are sampled.
 SAMPLES = 4096
 
 
@@ -337,28 +339,28 @@ def uniqueness(
     Parameters
     ----------
     contact_map : ContactMap
-        The whisker's map.
+        Map of the whisker.
     triplets : "all" or sequence
         Triplets, of the 20: names like ``"Fx MB MD"`` or tuples of signals; or three signals.
     regions : "all" or sequence of str
         Regions: ``"all"``, ``"ELD"`` (excluding large deflections), ``"CF"`` (concave forward),
         ``"CB"`` (concave backward), ``"ELD CF"``, ``"ELD CB"``; the text ``"all"`` means all six,
-        a list ``["all"]`` the region of that name. Of a witness both contacts belong to the region.
+        a list ``["all"]`` the region of that name. Both contacts of a witness are in the region.
     min_separation : float
         Distance, as a share of the length, below which two contact points count as one.
     cone : float
-        Half angle about the resting whisker within which contacts are left out, rad.
+        Half angle of the cone about the resting whisker within which contacts are omitted, rad.
     domain : {"reachable", "paper"}
         Domain of contacts: all stable ones, or those within the bounds of the paper's grid.
     samples : int
-        Number of contacts that are tried; rounded up to a power of two.
+        Number of contacts that are sampled; rounded up to a power of two.
     resolution : bool
-        Whether the shares of contacts that are ambiguous within tolerances are computed too.
+        Whether to compute the shares of contacts that are ambiguous within tolerances as well.
     seed : int
         Seed of the samples and of the search.
     certificate : Certificate, optional
-        Proof for this whisker, of `vibrissa.certificates.certify`, that makes "unique" proved
-        where it applies.
+        Proof for this whisker, from `vibrissa.certificates.certify`, with which "unique" is proved
+        where the proof applies.
     progress : callable, optional
         Function called as ``progress(done, total)`` after each triplet.
 
@@ -375,15 +377,15 @@ def uniqueness(
         twin, and ``twin_distance``, the median distance of these (m); ``ambiguous_share``: share
         that has another contact farther than ``min_separation`` within
         a ``signal_tolerance``, a share of each signal's range; ``surface`` and ``surface_angle``
-        (rad, for "unique off a surface"): off which surface, and the largest elevation from it of
-        a contact that is ambiguous within the tolerance; ``witness_…``: the pairs of contacts
+        (rad, for "unique off a surface"): the surface, and the largest elevation above it of a
+        contact that is ambiguous within the tolerance; ``witness_…``: the pairs of contacts
         farthest apart, with both contacts' arc length, force and point, the three signals, their
         relative difference when the pair is integrated more finely (the signals agree to 1e-10 in
         :func:`vibrissa.deflect` with ``witness_steps``, with which the rod has converged), the
-        separation, and by how much the second contact moves when the pair is found again with
+        separation, and the displacement of the second contact when the pair is found again with
         four times the steps. ``region_share``: the regions' share of the
-        contacts' space; ``notation``: the verdicts of a triplet in short. Attributes name the
-        chosen triplet, the domain, the cone and the separation, and what a grid shows of a
+        volume of contact points; ``notation``: the verdicts of a triplet in short. Attributes name
+        the chosen triplet, the domain, the cone and the separation, and what a grid shows about a
         certificate for (F_x, M_B, M_D): whether one can exist outside the cone
         (``certificate_possible``), and outside which cone the determinant keeps its sign
         (``determinant_cone``, rad).
@@ -405,8 +407,10 @@ def uniqueness(
         raise ValueError(
             f"a ContactMap is needed, such as ContactMap.simulate(whisker); got {contact_map!r}"
         )
-    names = TRIPLETS if isinstance(triplets, str) and triplets == "all" else _listed(triplets)
-    wanted = REGIONS if isinstance(regions, str) and regions == "all" else _regions(regions)
+    names = (
+        TRIPLETS if isinstance(triplets, str) and triplets == "all" else _parse_triplets(triplets)
+    )
+    wanted = REGIONS if isinstance(regions, str) and regions == "all" else _parse_regions(regions)
     if not 0.0 < min_separation < 1.0:
         raise ValueError(
             f"min_separation is a share of the length, above 0 and below 1; got {min_separation}"
@@ -417,20 +421,23 @@ def uniqueness(
         raise ValueError(f"domain is 'reachable' or 'paper'; got {domain!r}")
     if samples < 16:
         raise ValueError(f"at least 16 samples are needed; got {samples}")
-    question = ask(contact_map, wanted, min_separation, cone, domain, samples, seed)
-    answers = []
-    with ThreadPoolExecutor(threads()) as pool:  # half of the time is that of kernels
+    problem = prepare(contact_map, wanted, min_separation, cone, domain, samples, seed)
+    results = []
+    with ThreadPoolExecutor(threads()) as pool:  # kernels, half of the time, release the GIL
         try:
-            for found in pool.map(lambda triplet: answer(question, triplet, resolution), names):
-                answers.append(found)
+            for found in pool.map(
+                lambda triplet: gather_evidence(problem, triplet, resolution), names
+            ):
+                results.append(found)
                 if progress is not None:
-                    progress(len(answers), len(names))
+                    progress(len(results), len(names))
         finally:
             pool.shutdown(cancel_futures=True)
-    return _labelled(question, names, answers, certificate)
+    return _to_dataset(problem, names, results, certificate)
 
 
-def _listed(triplets: str | Sequence[str | tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:
+def _parse_triplets(triplets: str | Sequence[str | tuple[str, ...]]) -> tuple[tuple[str, ...], ...]:
+    """Parse triplets, given as names, tuples of signals, or one triplet's three signals."""
     several: list[str | tuple[str, ...]] = (
         [triplets] if isinstance(triplets, str) else list(triplets)
     )
@@ -442,7 +449,8 @@ def _listed(triplets: str | Sequence[str | tuple[str, ...]]) -> tuple[tuple[str,
     return names
 
 
-def _regions(regions: str | Sequence[str]) -> tuple[str, ...]:
+def _parse_regions(regions: str | Sequence[str]) -> tuple[str, ...]:
+    """Parse regions, and raise a ValueError if one is unknown or repeated."""
     several = [regions] if isinstance(regions, str) else list(regions)
     unknown = [region for region in several if region not in REGIONS]
     if unknown or not several or len(set(several)) < len(several):
@@ -450,38 +458,38 @@ def _regions(regions: str | Sequence[str]) -> tuple[str, ...]:
     return tuple(several)
 
 
-def _labelled(
-    question: Question,
+def _to_dataset(
+    problem: Problem,
     names: tuple[tuple[str, ...], ...],
-    answers: list[Answer],
+    results: list[Evidence],
     certificate: Certificate | None,
 ) -> xr.Dataset:
-    """All verdicts and evidence as one dataset."""
+    """Dataset of all verdicts and evidence."""
     data: dict[str, Any] = {
         name: (
             ("triplet", "region", *dims),
-            np.stack([a.variables[name] for a in answers]),
+            np.stack([a.variables[name] for a in results]),
             about,
         )
         for name, (dims, about) in _VARIABLES.items()
-        if name in answers[0].variables
+        if name in results[0].variables
     }
     data["evidence"] = (
         ("triplet", "region"),
-        _evidence(question, names, data["verdict"][1], certificate),
+        _evidence(problem, names, data["verdict"][1], certificate),
         {"long_name": "evidence for the verdict"},
     )
-    surfaces = np.where(data["verdict"][1] == OFF_SURFACE, _surface(question), "")
+    surfaces = np.where(data["verdict"][1] == OFF_SURFACE, _surface(problem), "")
     data["surface"] = (
         ("triplet", "region"),
         surfaces,
         {"long_name": "surface on which contacts have the same signals"},
     )
-    shares = question.volumes()
+    shares = problem.volumes()
     data["region_share"] = ("region", shares, _about("1", "share of the contacts' space"))
     coords = {
         "triplet": [" ".join(triplet) for triplet in names],
-        "region": list(question.regions),
+        "region": list(problem.regions),
         "signal_tolerance": list(TOLERANCES),
         "bound": ["least", "largest"],
         "pair": ["first", "second"],
@@ -490,27 +498,27 @@ def _labelled(
     }
     data["notation"] = (
         "triplet",
-        [notation(dict(zip(question.regions, row, strict=True))) for row in data["verdict"][1]],
+        [notation(dict(zip(problem.regions, row, strict=True))) for row in data["verdict"][1]],
         {"long_name": "largest regions in which the triplet is unique; *: off a surface"},
     )
-    data |= _witnesses(question, names, answers)  # merging datasets would import dask
+    data |= _witnesses(problem, names, results)  # merging datasets would import dask
     out = xr.Dataset(data, coords=coords)
-    whisker, d = question.contact_map.whisker, question.contact_map.chart.discretization
+    whisker, d = problem.contact_map.whisker, problem.contact_map.chart.discretization
     out.attrs = {
         "kind": "vibrissa uniqueness",
         "whisker": repr(whisker),
-        "domain": question.domain,
-        "cone": question.cone,
-        "min_separation": question.separation * d.length,
-        "samples": len(question.samples.chart),
-        "steps": question.contact_map.steps,
-        "seed": question.seed,
+        "domain": problem.domain,
+        "cone": problem.cone,
+        "min_separation": problem.separation * d.length,
+        "samples": len(problem.samples.chart),
+        "steps": problem.contact_map.steps,
+        "seed": problem.seed,
         "volume_shares": ", ".join(
-            f"{region} {share:.3f}" for region, share in zip(question.regions, shares, strict=True)
+            f"{region} {share:.3f}" for region, share in zip(problem.regions, shares, strict=True)
         ),
     }
     if TRIPLET in out.triplet.values and whisker.base_stiffness is None:
-        seen = outlook(question.contact_map, question.cone)
+        seen = outlook(problem.contact_map, problem.cone)
         out.attrs["certificate_possible"] = int(seen.possible)
         out.attrs["determinant_cone"] = seen.determinant_cone
     out.attrs["chosen_triplet"], out.attrs["chosen_region"] = choice(out)
@@ -518,57 +526,60 @@ def _labelled(
 
 
 def _evidence(
-    question: Question,
+    problem: Problem,
     names: tuple[tuple[str, ...], ...],
     verdict: AnyArray,
     certificate: Certificate | None,
 ) -> AnyArray:
-    """Evidence of each verdict, (triplets, regions).
+    """Evidence for each verdict, (triplets, regions).
 
-    A certificate is for all stable contacts outside a cone, and so for every region and domain.
+    A certificate covers all stable contacts outside a cone, and so every region and domain.
     """
     words = {NOT_UNIQUE: "witness", EMPTY: ""}
     out = np.vectorize(lambda word: words.get(str(word), "no counterexample found"))(verdict)
     if certificate is None:
         return np.asarray(out)
-    if not certificate.is_of(question.contact_map):
+    if not certificate.is_of(problem.contact_map):
         raise ValueError("the certificate is of another whisker or for other arc lengths")
-    if certificate.proved and certificate.cone <= question.cone:
-        # In one plane F_x and M_B fix the contact but for a turn, which either direction shows.
+    if certificate.proved and certificate.cone <= problem.cone:
+        # For a straight whisker F_x and M_B fix the contact up to a rotation about its axis, which
+        # F_D fixes as well as M_D.
         proved = (TRIPLET, "Fx FD MB") if certificate.straight else (TRIPLET,)
         rows = np.isin([" ".join(triplet) for triplet in names], proved)
         out[rows[:, None] & (verdict == UNIQUE)] = "proved"
     return np.asarray(out)
 
 
-def _solved(d: Discretization, triplet: tuple[str, ...], xi: Array) -> tuple[Array, Array]:
-    """Triplet and contact point of contacts."""
+def _signals_and_points(
+    d: Discretization, triplet: tuple[str, ...], xi: Array
+) -> tuple[Array, Array]:
+    """Signals of a triplet (n, 3) and contact points (n, 3) of contacts ξ."""
     values, _ = solve_forces(d, with_normal_force(xi))
     force, point = values[:, :3], values[:, 3:]
     return signals_of(force, cross(point, force))[:, signal_columns(triplet)], point
 
 
-def _surface(question: Question) -> str:
-    """Surface off which a triplet of a planar whisker may be unique."""
-    y, z = question.normal[1:]
+def _surface(problem: Problem) -> str:
+    """Describe the surface off which a triplet of a planar whisker may be unique."""
+    y, z = problem.normal[1:]
     turned = float(np.rad2deg(np.arctan2(-y, z)))
     where = "z = 0" if abs(turned) < 1e-6 else f"turned by {turned:.4g}° about x from z = 0"
     return f"the plane of the whisker, {where}"
 
 
 def _witnesses(
-    question: Question, names: tuple[tuple[str, ...], ...], answers: list[Answer]
+    problem: Problem, names: tuple[tuple[str, ...], ...], results: list[Evidence]
 ) -> dict[str, Any]:
-    """Both contacts of each witness, in SI units, with how well they agree."""
-    cells = (len(names), len(question.regions), WITNESSES)
+    """Both contacts of each witness, in SI units, and how well they agree."""
+    cells = (len(names), len(problem.regions), WITNESSES)
     arrays = {
         name: np.full((*cells, *(_SIZES[dim] for dim in dims)), np.nan)
         for name, (dims, _) in _WITNESS_VARIABLES.items()
     }
-    for i, (triplet, found) in enumerate(zip(names, answers, strict=True)):
+    for i, (triplet, found) in enumerate(zip(names, results, strict=True)):
         for j, pairs in enumerate(found.witnesses):
             if n := len(pairs.apart):
-                for name, values in _witness(question, triplet, pairs, found.steps[j]).items():
+                for name, values in _witness(problem, triplet, pairs, found.steps[j]).items():
                     arrays[name][i, j, :n] = values
     data: dict[str, Any] = {
         f"witness_{name}": (("triplet", "region", "witness", *dims), arrays[name], about)
@@ -576,25 +587,27 @@ def _witnesses(
     }
     data["witness_steps"] = (
         ("triplet", "region"),
-        FINER * np.array([found.steps for found in answers]),
+        FINER * np.array([found.steps for found in results]),
         _about("1", "integration steps with which the witnesses agree"),
     )
     return data
 
 
 def _witness(
-    question: Question, triplet: tuple[str, ...], pairs: Pairs, steps: int
+    problem: Problem, triplet: tuple[str, ...], pairs: Pairs, steps: int
 ) -> dict[str, Array]:
     """Variables of the witnesses of one triplet and region, on a rod that has converged."""
-    contact_map = question.contact_map
+    contact_map = problem.contact_map
     d, finest = (discretize(contact_map.whisker, n * FINER * steps) for n in (1, 2))
     first, unit = pairs.first.xi, units(contact_map, pairs.second.xi)
-    signals, point = _solved(d, triplet, first)
-    second, values, _ = corrected(d, triplet, pairs.second.xi, signals, unit)
+    signals, point = _signals_and_points(d, triplet, first)
+    second, values, _ = correct(d, triplet, pairs.second.xi, signals, unit)
     both = np.stack([first, second], axis=1)
     point = d.length * np.stack([point, values[:, 3:]], axis=1)
-    _, moved = found_again(contact_map, triplet, first, pairs.second.xi, steps)
-    away, _, values = equations(finest, triplet, second, _solved(finest, triplet, first)[0])
+    _, moved = resolve_on_finer_rod(contact_map, triplet, first, pairs.second.xi, steps)
+    away, _, values = equations(
+        finest, triplet, second, _signals_and_points(finest, triplet, first)[0]
+    )
     difference = np.abs(away / sizes(values, triplet)).max(axis=1)
     return {
         "arc_length": both[..., 0] * d.length,

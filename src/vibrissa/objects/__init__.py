@@ -1,4 +1,4 @@
-"""Objects that a whisker touches: solids with signed distance, gradient and curvature."""
+"""Objects that a whisker can touch: solids with signed distance, normal and curvature."""
 
 from vibrissa.objects.mesh import Mesh
 from vibrissa.objects.solids import (

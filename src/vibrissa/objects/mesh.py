@@ -1,11 +1,11 @@
-"""Objects of any shape: closed meshes of triangles.
+"""Solids of arbitrary shape, given by closed triangle meshes.
 
-A mesh stands for a smooth body of which it is a sample; whiskers slide over that body, not over its
-facets. The signed distance from the triangles is computed exactly at the nodes of a grid near the
-surface, its sign by the angle-weighted normals of Bærentzen & Aanæs (IEEE Trans. Vis. Comput.
-Graph. 11 (2005) 243-253), and the cubic B-spline through the nodes is the signed distance that
-counts: twice continuously differentiable, so that a contact can be followed over edges, which it
-rounds by about the grid's spacing.
+A mesh is taken as a sample of a smooth body; whiskers slide over that body, not over facets. The
+signed distance from the triangles is computed exactly at the nodes of a grid near the surface, with
+the sign from the angle-weighted normals of Bærentzen & Aanæs (IEEE Trans. Vis. Comput. Graph. 11
+(2005) 243-253). The cubic B-spline through the nodes is the signed distance used: it is twice
+continuously differentiable, so that a contact can be followed over edges, which it rounds by about
+the grid spacing.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from vibrissa.objects.surface import Surface
 
 Ints = NDArray[np.int64]
 
-NODES = 1_200_000  # nodes of the grid where no spacing is given
+NODES = 1_200_000  # approximate number of nodes of the grid if no spacing is given
 _MOST = 30_000_000
 _BAND = 3
-_PADDING = 8  # cells around the body: room for a whisker's radius, and for the spline to settle
+_PADDING = 8  # cells around the body, for the whisker's radius and the decay of the spline's ends
 # B-spline weights of four neighbours at the fraction t between the middle two, as polynomials in t:
-# rows are powers of t, columns neighbours.
+# rows are powers of t, columns are neighbours.
 _SPLINE = (
     np.array(
         [[1.0, 4.0, 1.0, 0.0], [-3.0, 0.0, 3.0, 0.0], [3.0, -6.0, 3.0, 0.0], [-1.0, 3.0, -3.0, 1.0]]
@@ -45,19 +45,19 @@ class Mesh(Surface):
     Parameters
     ----------
     vertices : array_like (n, 3)
-        Corners in the laboratory frame, m.
+        Vertices in the laboratory frame, m.
     faces : array_like of int (m, 3)
-        Numbers of each triangle's corners; all the same way round.
+        Indices of each triangle's vertices, with consistent orientation.
     resolution : float, optional
-        Grid spacing of the signed distance, m, to which details are kept; by default about a
-        million nodes.
+        Grid spacing of the signed distance, m, which limits the detail; by default there are about
+        a million nodes.
     stiffness : float
-        Force over indentation, N/m; infinite for a rigid one.
+        Force over indentation, N/m; infinite if rigid.
 
     Raises
     ------
     ValueError
-        If numbers are missing, the mesh is not closed, or the resolution needs too large a grid.
+        If values are missing, the mesh is not closed, or the resolution needs too large a grid.
 
     Examples
     --------
@@ -74,10 +74,10 @@ class Mesh(Surface):
     _spline: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Check the mesh and make its signed distance."""
+        """Check the mesh and compute its signed distance."""
         vertices = numbers("vertices", self.vertices).copy()
         faces = np.array(self.faces, dtype=np.int64)
-        _check(vertices, faces, self.stiffness)
+        _check_mesh(vertices, faces, self.stiffness)
         if _volume(vertices, faces) < 0.0:
             faces = np.ascontiguousarray(faces[:, ::-1])
         size = np.ptp(vertices, axis=0)
@@ -113,21 +113,21 @@ class Mesh(Surface):
         resolution: float | None = None,
         stiffness: float = np.inf,
     ) -> Mesh:
-        """Read a mesh from a file, as it stands in the laboratory.
+        """Read a mesh from a file, in laboratory coordinates.
 
         Parameters
         ----------
         path : str or path
-            STL, OBJ, PLY or what else trimesh reads.
+            STL, OBJ, PLY or other file that trimesh can read.
         unit : float
             Unit of the file's lengths, m; by default a millimetre.
         resolution, stiffness : float, optional
-            Fineness and softness of the surface; see `Mesh`.
+            Grid spacing and stiffness of the surface; see `Mesh`.
 
         Returns
         -------
         Mesh
-            The body.
+            Body in the file.
 
         Raises
         ------
@@ -136,7 +136,7 @@ class Mesh(Surface):
         ImportError
             If trimesh is not installed.
         ValueError
-            If it holds no closed mesh.
+            If the file does not contain a closed mesh.
         """
         if not Path(path).exists():
             raise FileNotFoundError(f"there is no file {path}")
@@ -153,7 +153,7 @@ class Mesh(Surface):
 
     @property
     def origin(self) -> Array:
-        """Middle of its bounding box, m."""
+        """Centre of the bounding box, m."""
         middle: Array = 0.5 * (self.vertices.min(axis=0) + self.vertices.max(axis=0))
         return middle
 
@@ -170,7 +170,7 @@ class Mesh(Surface):
 
     def _geometry(self, point: Array) -> tuple[float, Array, Array]:
         at = (point - self._low) / self._step
-        # Beyond the grid nothing touches; the normal there only has to be one.
+        # Beyond the grid there is no contact, so any normal will do.
         at = np.clip(at, 1.0, np.array(self._spline.shape) - 3.0 + 1e-9)
         first = np.floor(at).astype(int) - 1
         t = at - first - 1.0
@@ -202,6 +202,7 @@ class Mesh(Surface):
 
     @property
     def _step(self) -> float:
+        """Grid spacing, m."""
         assert self.resolution is not None
         return self.resolution
 
@@ -215,11 +216,12 @@ class Mesh(Surface):
 
 
 def _mm(size: Array) -> str:
+    """Format a size in mm."""
     return " × ".join(f"{x * 1e3:.3f}" for x in size) + " mm"
 
 
-def _check(vertices: Array, faces: Ints, stiffness: float) -> None:
-    """Raise a ValueError with what is wrong."""
+def _check_mesh(vertices: Array, faces: Ints, stiffness: float) -> None:
+    """Raise a ValueError that lists the faults of a mesh."""
     faults = []
     if vertices.ndim != 2 or vertices.shape[-1] != 3 or not np.isfinite(vertices).all():
         faults.append(f"vertices have shape {vertices.shape}; finite (n, 3) are needed")
@@ -244,12 +246,13 @@ def _check(vertices: Array, faces: Ints, stiffness: float) -> None:
 
 
 def _volume(vertices: Array, faces: Ints) -> float:
+    """Signed volume enclosed by a mesh."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return float(np.einsum("ni,ni->", a, np.cross(b, c)) / 6.0)
 
 
 def _spacing(size: Array) -> float:
-    """Spacing that gives a body of some size about `NODES` nodes."""
+    """Grid spacing at which a body of given size has about `NODES` nodes."""
     spacing = float(size.max()) / 50.0
     for _ in range(50):
         nodes = np.prod(size / spacing + 1.0 + 2.0 * _PADDING)
@@ -260,7 +263,7 @@ def _spacing(size: Array) -> float:
 def _grid_distance(
     vertices: Array, faces: Ints, low: Array, spacing: float, shape: tuple[int, ...]
 ) -> Array:
-    """Signed distance at the nodes: exact near the surface, about right elsewhere."""
+    """Signed distance at the nodes: exact near the surface, approximate elsewhere."""
     nearest = np.full(shape, np.inf)
     closest, sign = np.zeros((*shape, 3)), np.ones(shape)
     corner, edge, face = _normals(vertices, faces)
@@ -272,7 +275,7 @@ def _grid_distance(
         )
         axes = [low[i] + spacing * np.arange(w.start, w.stop) for i, w in enumerate(window)]
         nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-        weights = _closest(nodes, triangle)
+        weights = _nearest_weights(nodes, triangle)
         place = weights @ triangle
         away = nodes - place
         distance = np.linalg.norm(away, axis=-1)
@@ -281,16 +284,16 @@ def _grid_distance(
         side = np.where(np.einsum("ni,ni->n", away[closer], normals) < 0.0, -1.0, 1.0)
         nearest[window][closer] = distance[closer]
         closest[window][closer], sign[window][closer] = place[closer], side
-    # Not at a whole number of cells, where rounding would choose among the nodes of a plane.
+    # The limit is not a whole number of cells, where rounding would select among a plane's nodes.
     known = nearest < (_BAND - 0.5) * spacing
     _, there = ndimage.distance_transform_edt(~known, return_indices=True)
-    # Farther away, the point that is nearest to the nearest node near the surface is near enough.
+    # Farther away, the surface point closest to the nearest exact node is a good approximation.
     away = low + spacing * np.moveaxis(np.indices(shape), 0, -1) - closest[tuple(there)]
     return np.asarray(sign[tuple(there)] * np.linalg.norm(away, axis=-1))
 
 
 def _normals(vertices: Array, faces: Ints) -> tuple[Array, Array, Array]:
-    """Normals that tell inside from outside, by what a nearest point lies on."""
+    """Angle-weighted normals of vertices, edges and faces, which determine the sign."""
     triangles = vertices[faces]
     sides = np.roll(triangles, -1, axis=1) - triangles
     face = np.cross(sides[:, 0], sides[:, 1])
@@ -300,7 +303,7 @@ def _normals(vertices: Array, faces: Ints) -> tuple[Array, Array, Array]:
     corner = np.zeros_like(vertices)
     for i in range(3):
         np.add.at(corner, faces[:, i], angle[:, i, None] * face)
-    # The triangle beyond an edge has it the other way round.
+    # The adjacent triangle has the edge in the opposite direction.
     start = faces[:, [1, 2, 0]]
     end = faces[:, [2, 0, 1]]
     code = (start * len(vertices) + end).ravel()
@@ -309,8 +312,8 @@ def _normals(vertices: Array, faces: Ints) -> tuple[Array, Array, Array]:
     return corner, face[:, None] + face[other].reshape(-1, 3, 3), face
 
 
-def _closest(points: Array, triangle: Array) -> Array:
-    """Weights (..., 3) of a triangle's corners at its points that are nearest to others."""
+def _nearest_weights(points: Array, triangle: Array) -> Array:
+    """Barycentric weights (..., 3) of the points of a triangle that are closest to given points."""
     a, b, c = triangle
     ab, ac, ap = b - a, c - a, points - a
     d = np.array([[ab @ ab, ab @ ac], [ab @ ac, ac @ ac]])
@@ -318,7 +321,7 @@ def _closest(points: Array, triangle: Array) -> Array:
     inner = right @ np.linalg.inv(d).T
     weights = np.concatenate([1.0 - inner.sum(axis=-1, keepdims=True), inner], axis=-1)
     out = (weights < 0.0).any(axis=-1)
-    # Beyond an edge the nearest point is on one of the three.
+    # If the projection is outside, the closest point is on one of the three edges.
     outside = points[out]
     best = np.full(len(outside), np.inf)
     nearest = np.zeros((len(outside), 3))
@@ -337,7 +340,7 @@ def _closest(points: Array, triangle: Array) -> Array:
 
 
 def _feature_normal(weights: Array, corner: Array, edge: Array, face: Array) -> Array:
-    """Normal (n, 3) of the corner, edge or face that the nearest points lie on."""
+    """Normals (n, 3) of the vertex, edge or face on which the closest points are."""
     zero = weights <= 0.0
     count = zero.sum(axis=1)
     normals = np.broadcast_to(face, (len(weights), 3)).copy()

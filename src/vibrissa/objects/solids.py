@@ -1,8 +1,9 @@
-"""Solids in the laboratory: pegs, spheres, planes, boxes; all objects as datasets.
+"""Solids of simple shape (pegs, spheres, planes, boxes), and all objects as datasets.
 
-Each is a solid with a signed distance d (negative inside), its gradient, the outward normal n, and
-∂n/∂x, in closed form; a `vibrissa.objects.Surface`. Each may be compliant: pressed with N it
-gives way by N over its stiffness, locally and along the normal, and keeps its shape elsewhere.
+Each is a `vibrissa.objects.Surface` with closed forms of its signed distance d (negative inside),
+the gradient of d, which is the outward normal n, and ∂n/∂x. Solids may be compliant: under a force
+N the surface is displaced by N over its stiffness, locally and along the normal, and keeps its
+shape elsewhere.
 """
 
 from __future__ import annotations
@@ -23,14 +24,14 @@ from vibrissa.whisker import ORTHOGONALITY
 
 
 class _Faults:
-    """Collects what is wrong with the numbers of one object."""
+    """Collector of the faults in the parameters of one object."""
 
     def __init__(self, what: str) -> None:
         self._what = what
         self._faults: list[str] = []
 
     def vector(self, name: str, value: Any, direction: bool = False) -> Array:
-        """Three finite numbers, of length one if a direction; read-only."""
+        """Check a vector of three finite numbers, normalise it if a direction; read-only."""
         vector = numbers(name, value).copy()
         if vector.shape != (3,) or not np.isfinite(vector).all():
             self._faults.append(f"{name} is {vector.tolist()}; three finite numbers are needed")
@@ -38,14 +39,14 @@ class _Faults:
             size = float(np.linalg.norm(vector))
             if size == 0.0:
                 self._faults.append(f"{name} is (0, 0, 0), which is not a direction")
-            # What already is a unit vector stays as it is, to the last bit, so that files keep it.
+            # A unit vector is not normalised again, so that it is preserved to the last bit.
             elif abs(size - 1.0) > 4.0 * np.finfo(np.float64).eps:
                 vector = vector / size
         vector.flags.writeable = False
         return vector
 
     def positive(self, name: str, value: Any, unit: str, also: str = "") -> float:
-        """Return a positive number; ``also`` names what else is allowed."""
+        """Check a positive number; ``also`` names another allowed value."""
         if np.ndim(value):
             self._faults.append(f"{name} has shape {np.shape(value)}; one number is needed")
             return np.nan
@@ -59,19 +60,19 @@ class _Faults:
         return number
 
     def check(self, ok: bool, fault: str) -> None:
-        """Add a fault of another kind."""
+        """Add a fault if a condition does not hold."""
         if not ok:
             self._faults.append(fault)
 
-    def tell(self) -> None:
+    def raise_if_any(self) -> None:
         """Raise a ValueError with all faults, if there are any."""
         if self._faults:
             raise ValueError(f"no {self._what}: " + "; ".join(self._faults))
 
 
-def _check(thing: Any, faults: _Faults, **values: Any) -> None:
-    """Set the fields of a solid, checked: those that all have alike, and other values."""
-    # In the order of the fields, which a set would lose: a message is the same every time.
+def _set_fields(thing: Any, faults: _Faults, **values: Any) -> None:
+    """Check the fields that solids have in common, and set them and other values."""
+    # Fields keep their order, so that messages are reproducible.
     for name, given in [(n, g) for n, g in vars(thing).items() if n not in values]:
         if name == "stiffness":
             values[name] = faults.positive(name, given, "N/m", "infinite")
@@ -79,20 +80,23 @@ def _check(thing: Any, faults: _Faults, **values: Any) -> None:
             values[name] = faults.positive(name, given, "m")
         else:
             values[name] = faults.vector(name, given, direction=name != "origin")
-    faults.tell()
+    faults.raise_if_any()
     for name, value in values.items():
         object.__setattr__(thing, name, value)
 
 
 def _mm(vector: Array) -> str:
+    """Format a position in mm."""
     return "(" + ", ".join(f"{x * 1e3:z.3f}" for x in vector) + ") mm"
 
 
 def _direction(vector: Array) -> str:
+    """Format a unit vector."""
     return "(" + ", ".join(f"{x:z.3f}" for x in vector) + ")"
 
 
-def _soft(stiffness: float) -> str:
+def _stiffness_text(stiffness: float) -> str:
+    """Format a finite stiffness."""
     return "" if np.isinf(stiffness) else f", stiffness {stiffness:.3g} N/m"
 
 
@@ -103,19 +107,19 @@ class Peg(Surface):
     Parameters
     ----------
     origin : array_like (3,)
-        A point of its axis in the laboratory frame, m.
+        Point on the axis in the laboratory frame, m.
     axis : array_like (3,)
-        Direction of its axis in the laboratory frame, of any length but zero; kept as a unit
+        Direction of the axis in the laboratory frame, of any nonzero length; stored as a unit
         vector.
     radius : float
         Radius of its surface, m.
     stiffness : float
-        Force over indentation, N/m; infinite for a rigid one.
+        Force over indentation, N/m; infinite if rigid.
 
     Raises
     ------
     ValueError
-        If a number is missing, the axis is zero or radius or stiffness are not positive.
+        If a value is missing, the axis is zero, or radius or stiffness are not positive.
 
     Examples
     --------
@@ -129,7 +133,7 @@ class Peg(Surface):
     stiffness: float = np.inf
 
     def __post_init__(self) -> None:
-        _check(self, _Faults("peg"))
+        _set_fields(self, _Faults("peg"))
 
     def _distance(self, points: Array) -> Array:
         away = points - self.origin
@@ -148,19 +152,19 @@ class Peg(Surface):
     def in_whisker_frame(
         self, base_rotation: ArrayLike, base_position: ArrayLike
     ) -> tuple[Array, Array]:
-        """Say where the peg is as seen from the base of the whisker.
+        """Transform the peg's axis into the whisker frame.
 
         Parameters
         ----------
         base_rotation : array_like (..., 3, 3)
             Rotation from the whisker's to the laboratory frame.
         base_position : array_like (..., 3)
-            The base in the laboratory frame, m.
+            Position of the base in the laboratory frame, m.
 
         Returns
         -------
         tuple of arrays (..., 3)
-            A point of the axis, m, and its unit direction, in the whisker's frame.
+            Point on the axis, m, and its unit direction, in the whisker frame.
         """
         rotation = np.asarray(base_rotation, dtype=np.float64)
         away = self.origin - np.asarray(base_position, dtype=np.float64)
@@ -170,13 +174,13 @@ class Peg(Surface):
     def __repr__(self) -> str:
         return (
             f"Peg(origin={_mm(self.origin)}, axis={_direction(self.axis)}, diameter "
-            f"{self.radius * 2e3:.3f} mm{_soft(self.stiffness)})"
+            f"{self.radius * 2e3:.3f} mm{_stiffness_text(self.stiffness)})"
         )
 
 
 @dataclass(frozen=True, eq=False)
 class Sphere(Surface):
-    """A solid ball.
+    """A solid sphere.
 
     Parameters
     ----------
@@ -185,12 +189,12 @@ class Sphere(Surface):
     radius : float
         Radius of the surface, m.
     stiffness : float
-        Force over indentation, N/m; infinite for a rigid one.
+        Force over indentation, N/m; infinite if rigid.
 
     Raises
     ------
     ValueError
-        If a number is missing, or radius or stiffness are not positive.
+        If a value is missing, or radius or stiffness are not positive.
 
     Examples
     --------
@@ -203,7 +207,7 @@ class Sphere(Surface):
     stiffness: float = np.inf
 
     def __post_init__(self) -> None:
-        _check(self, _Faults("sphere"))
+        _set_fields(self, _Faults("sphere"))
 
     def _distance(self, points: Array) -> Array:
         distance: Array = np.linalg.norm(points - self.origin, axis=-1) - self.radius
@@ -218,27 +222,27 @@ class Sphere(Surface):
     def __repr__(self) -> str:
         return (
             f"Sphere(origin={_mm(self.origin)}, diameter {self.radius * 2e3:.3f} "
-            f"mm{_soft(self.stiffness)})"
+            f"mm{_stiffness_text(self.stiffness)})"
         )
 
 
 @dataclass(frozen=True, eq=False)
 class Plane(Surface):
-    """A wall: everything behind a plane.
+    """A wall: the half-space behind a plane.
 
     Parameters
     ----------
     origin : array_like (3,)
-        A point of it in the laboratory frame, m.
+        Point on the plane in the laboratory frame, m.
     normal : array_like (3,)
-        Outward, toward the free side, of any length but zero; kept as a unit vector.
+        Outward normal, toward the free side, of any nonzero length; stored as a unit vector.
     stiffness : float
-        Force over indentation, N/m; infinite for a rigid one.
+        Force over indentation, N/m; infinite if rigid.
 
     Raises
     ------
     ValueError
-        If a number is missing, the normal is zero, or the stiffness is not positive.
+        If a value is missing, the normal is zero, or the stiffness is not positive.
 
     Examples
     --------
@@ -251,7 +255,7 @@ class Plane(Surface):
     stiffness: float = np.inf
 
     def __post_init__(self) -> None:
-        _check(self, _Faults("plane"))
+        _set_fields(self, _Faults("plane"))
 
     def _distance(self, points: Array) -> Array:
         distance: Array = (points - self.origin) @ self.normal
@@ -263,13 +267,13 @@ class Plane(Surface):
     def __repr__(self) -> str:
         return (
             f"Plane(origin={_mm(self.origin)}, normal={_direction(self.normal)}"
-            f"{_soft(self.stiffness)})"
+            f"{_stiffness_text(self.stiffness)})"
         )
 
 
 @dataclass(frozen=True, eq=False)
 class Box(Surface):
-    """A solid block, with sharp or rounded edges.
+    """A solid block with sharp or rounded edges.
 
     Parameters
     ----------
@@ -278,19 +282,19 @@ class Box(Surface):
     size : array_like (3,)
         Lengths of the edges, m.
     rotation : array_like (3, 3)
-        Columns are the directions of its edges in the laboratory frame.
+        Rotation matrix whose columns are the directions of the edges in the laboratory frame.
     edge_radius : float
-        Radius by which edges and corners are rounded, m; 0 for sharp ones. A whisker lies against a
-        sharp edge with its own radius.
+        Radius of edges and corners, m; 0 if sharp. A whisker contacts a sharp edge with its own
+        radius.
     stiffness : float
-        Force over indentation, N/m; infinite for a rigid one. A compliant box needs an edge radius
-        larger than it is indented, for want of a normal inside a sharp edge.
+        Force over indentation, N/m; infinite if rigid. A compliant box needs an edge radius larger
+        than its indentation, because a sharp edge has no normal inside.
 
     Raises
     ------
     ValueError
-        If a number is missing, the rotation is none, an edge or the stiffness is not positive, or
-        the rounding takes more than half of an edge.
+        If a value is missing, the rotation is invalid, an edge or the stiffness is not positive, or
+        the edge radius is more than half of an edge.
 
     Examples
     --------
@@ -319,7 +323,7 @@ class Box(Surface):
                 bool((2.0 * edge <= size).all()),
                 f"edge_radius is {edge}; at most half of the shortest edge, {0.5 * size.min()} m",
             )
-        _check(self, faults, size=size, rotation=rotation, edge_radius=edge)
+        _set_fields(self, faults, size=size, rotation=rotation, edge_radius=edge)
 
     def _distance(self, points: Array) -> Array:
         beyond = np.abs((points - self.origin) @ self.rotation)
@@ -348,7 +352,7 @@ class Box(Surface):
     def __repr__(self) -> str:
         return (
             f"Box(origin={_mm(self.origin)}, size={_mm(self.size)}, edge radius "
-            f"{self.edge_radius * 1e3:.3f} mm{_soft(self.stiffness)})"
+            f"{self.edge_radius * 1e3:.3f} mm{_stiffness_text(self.stiffness)})"
         )
 
 
@@ -389,11 +393,12 @@ _DIMS: dict[str, tuple[str, ...]] = {
 
 
 def objects_datasets(objects: Sequence[Surface]) -> dict[str, xr.Dataset]:
-    """Write objects as datasets."""
-    return {str(i): _dataset(thing) for i, thing in enumerate(objects)}
+    """Convert objects to datasets, by index."""
+    return {str(i): _to_dataset(thing) for i, thing in enumerate(objects)}
 
 
-def _dataset(thing: Surface) -> xr.Dataset:
+def _to_dataset(thing: Surface) -> xr.Dataset:
+    """Convert an object to a dataset."""
     for kind, (known, fields) in _FIELDS.items():
         if isinstance(thing, known):
             rows = {

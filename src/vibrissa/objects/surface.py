@@ -1,4 +1,4 @@
-"""Surfaces that a whisker can touch, and placements of the whisker's base among them."""
+"""Base class of surfaces that a whisker can touch, and placements of the whisker's base."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vibrissa.numerics import Array, numbers
 
 
 class Surface(ABC):
-    """A body in a frame in which it does not move, defined by its signed distance."""
+    """A solid in a frame in which it does not move, defined by its signed distance."""
 
     stiffness: float
 
@@ -32,7 +32,7 @@ class Surface(ABC):
         return self._distance(numbers("points", points))
 
     def local_geometry(self, point: ArrayLike) -> tuple[float, Array, Array]:
-        """Signed distance from one point, with its derivatives.
+        """Signed distance of one point, with its derivatives.
 
         Parameters
         ----------
@@ -51,23 +51,23 @@ class Surface(ABC):
         return self._geometry(np.asarray(point, dtype=np.float64))
 
     def in_words(self) -> str:
-        """Kind and properties, in mm, as reports show them.
+        """Describe kind and properties, in mm, for reports.
 
         Returns
         -------
         str
-            Such as "peg: origin (25.000, 0.000, 0.000) mm, …".
+            Description such as "peg: origin (25.000, 0.000, 0.000) mm, …".
         """
         kind, _, properties = repr(self).removesuffix(")").partition("(")
         return f"{kind.lower()}: {properties.replace('=', ' ')}"
 
     @abstractmethod
     def _distance(self, points: Array) -> Array:
-        """See `signed_distance`."""
+        """Signed distances of points (..., 3); see `signed_distance`."""
 
     @abstractmethod
     def _geometry(self, point: Array) -> tuple[float, Array, Array]:
-        """See `local_geometry`."""
+        """Distance, normal and curvature at a point; see `local_geometry`."""
 
 
 class Placement(NamedTuple):
@@ -77,13 +77,13 @@ class Placement(NamedTuple):
     position: Array  # (3,), m
 
     def outside(self, points: Array) -> Array:
-        """Points in the surfaces' frame."""
+        """Transform points from the whisker's to the surfaces' frame."""
         moved: Array = points @ self.rotation.T + self.position
         return moved
 
 
 def between(before: Placement, now: Placement, share: float) -> Placement:
-    """Placement between two others, turned steadily about one axis and moved straight."""
+    """Interpolate two placements, by rotation about one axis and straight translation."""
     turn = before.rotation.T @ now.rotation
     axis = 0.5 * np.array(
         [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]

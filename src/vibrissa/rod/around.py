@@ -1,8 +1,8 @@
-"""A whisker carried past objects that may touch it in several points, or along an arc.
+"""Deflection of a whisker by rigid objects that may touch it at several points or along an arc.
 
-Placements with one contact are those of :mod:`vibrissa.rod.surfaces`. Where the whisker bent by one
-contact reaches into an object elsewhere, all contacts are solved together
-(:mod:`vibrissa.rod.obstacles`), from the placement before or from that one contact on.
+The placements are first solved with one contact each (:mod:`vibrissa.rod.surfaces`). Where the
+whisker bent by that contact would penetrate an object elsewhere, all contacts are solved together
+(:mod:`vibrissa.rod.obstacles`), starting from the previous placement or from the one contact.
 """
 
 from __future__ import annotations
@@ -35,40 +35,42 @@ from vibrissa.status import Status, counted
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
-#: Overlap from which a second contact counts, m; a tapering whisker along a flat one has less.
+#: Penetration depth above which a second contact is assumed, m. A tapering whisker that lies along
+#: a flat object penetrates less than this.
 OVERLAP = 5e-6
-# Points along the whisker at which a second contact is searched, and the distance of one with the
-# same object from the first, over L. So many rows at once.
+# Number of points along the whisker at which penetration is evaluated; distance from the contact
+# within which penetration of the same object is ignored, over L; rows evaluated at once.
 _SAMPLES, _ASIDE, _ROWS = 129, 0.03, 512
-_PRESSED = 5e-3  # a whisker that objects do not reach is pressed by so much to begin with, over L
-_JUMP = 0.1  # continued from the placement before, no node moves farther, over L
+_PRESSED = 5e-3  # initial penetration given to a whisker that objects do not reach, over L
+_JUMP = 0.1  # largest displacement of a node from the previous placement, over L
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ObstacleDeflection:
-    """Whisker against objects, at n placements, with up to k contacts each.
+    """Deflection of a whisker by objects, at n placements with up to k contacts each.
 
-    All in the whisker frame. Contacts are in order from the base; those in a row next to each other
-    stand for an arc, along which their forces are spread. What is not there is NaN, or -1.
+    All vectors are in the whisker frame. Contacts are ordered from the base; contacts at
+    neighbouring nodes represent an arc along which the force is distributed. Missing entries are
+    NaN, or -1 for integers.
 
     Attributes
     ----------
     whisker : Whisker
         Whisker that is bent.
     force, moment : (n, 3) array
-        Force and moment at the base, N and N·m; zero without contact, NaN without an answer.
+        Force and moment at the base, N and N·m; zero without contact, NaN where unsolved.
     arc_length : (n, k) array
         Arc lengths of the contacts from the base, m.
     contact_point, contact_force : (n, k, 3) array
-        Contacts on the centreline, m, and forces there, N.
+        Contact points on the centreline, m, and contact forces, N.
     surface : (n, k) int array
-        Numbers of the objects that touch there.
+        Index of the object at each contact.
     second_contact : (n,) bool array
-        Whether one contact alone is not all.
+        Whether the placement has more than one contact.
     several : (n,) bool array
-        Whether all contacts are solved together, as they are where one is not all.
+        Whether all contacts of the placement were solved together.
     overlap : (n,) array
-        Depth to which the whisker reaches into an object, m: zero where all contacts are solved.
+        Depth to which the whisker penetrates an object, m; zero where all contacts are solved.
     status : (n,) int array
         :class:`~vibrissa.Status` of each placement.
     """
@@ -88,12 +90,12 @@ class ObstacleDeflection:
     _solved: dict[int, Equilibrium]
 
     def strongest(self) -> tuple[Array, Array, Array, IntArray]:
-        """Return of each placement the contact with the largest force.
+        """Return the contact with the largest force at each placement.
 
         Returns
         -------
         tuple of arrays
-            Arc lengths (n,), contact points (n, 3), forces (n, 3), and objects (n,).
+            Arc lengths (n,), contact points (n, 3), forces (n, 3), and object indices (n,).
         """
         force = np.linalg.norm(self.contact_force, axis=-1)
         rows = np.arange(len(force))
@@ -113,7 +115,7 @@ class ObstacleDeflection:
         Returns
         -------
         (..., n, 3) array
-            Points, m; the resting whisker where there is no contact, NaN where there is no answer.
+            Points, m; the resting whisker where there is no contact, NaN where unsolved.
         """
         lines = self._bent.centerline(n)
         for row, found in self._solved.items():
@@ -121,7 +123,7 @@ class ObstacleDeflection:
         return lines
 
     def __repr__(self) -> str:
-        """Number of placements, and how many have each status."""
+        """Number of placements and the count of each status."""
         return f"<ObstacleDeflection at {self.status.size} placements: {counted(self.status)}>"
 
 
@@ -133,26 +135,26 @@ def deflect_around(
     *,
     progress: Progress | None = None,
 ) -> ObstacleDeflection:
-    """Deflect a whisker by rigid objects that touch it wherever it meets them, without friction.
+    """Deflect a whisker by rigid objects that may touch it anywhere, without friction.
 
     Parameters
     ----------
     whisker : Whisker
-        Whisker, without weight.
+        Whisker; its weight is neglected.
     objects : Peg, Sphere, Plane, Box, Mesh or a sequence of them
         Objects in the laboratory.
     base_rotation : array_like, optional
         Rotations from the whisker's to the laboratory frame, shape (n, 3, 3) or (3, 3); by default
-        the whisker's frame is the laboratory's.
+        the two frames coincide.
     base_position : array_like, optional
         Positions of the base, laboratory frame, m, shape (n, 3) or (3,); by default the origin.
     progress : callable, optional
-        Function called after every placement with the numbers of those done and of all.
+        Function called after every placement with the number done and the total.
 
     Returns
     -------
     ObstacleDeflection
-        Force and moment at the base, and all contacts.
+        Force and moment at the base, and all contacts of each placement.
 
     Raises
     ------
@@ -161,14 +163,15 @@ def deflect_around(
 
     Notes
     -----
-    Placements are passed one after the other. A branch that one contact cannot follow ends with
-    that contact, unless the placement before had several. Against an object the force is normal to
-    the object: where there are several contacts it leans, on a tapering whisker, from the normal
-    of the centreline by the taper, 0.1° for a whisker of a rat.
+    Placements are solved in the order given, each starting from the previous one. A branch that
+    cannot be followed with one contact ends with that contact, unless the previous placement had
+    several. The contact force is normal to the object. Where there are several contacts on a
+    tapering whisker, it therefore deviates from the normal of the centreline by the taper angle,
+    0.1° for a rat's whisker.
 
     Examples
     --------
-    A wire lies with its hollow side on a pipe that is bent less than it is:
+    A curved wire rests with its concave side on a pipe of smaller curvature:
 
     >>> wire = Whisker.from_curvature(0.1, lambda s: [0.0, 0.0, 8.0], base_radius=0.2e-3)
     >>> bent = deflect_around(wire, Peg([0.055, 0.14, 0.0], [0.0, 0.0, 1.0], radius=0.14))
@@ -196,6 +199,7 @@ def deflect_around(
 
 
 def _rigid(objects: Surface | Sequence[Surface]) -> list[Surface]:
+    """Return the objects as a list; raise a ValueError if one is compliant."""
     solids = list(objects) if isinstance(objects, Sequence) else [objects]
     soft = [repr(solid) for solid in solids if np.isfinite(solid.stiffness)]
     if soft:
@@ -204,7 +208,10 @@ def _rigid(objects: Surface | Sequence[Surface]) -> list[Surface]:
 
 
 class NearObjects:
-    """One whisker near rigid objects that are shifted (3,) in the laboratory, over L."""
+    """Equilibria of one whisker near rigid objects that are shifted in the laboratory frame.
+
+    Shifts (3,) are in units of L.
+    """
 
     def __init__(
         self, whisker: Whisker, objects: Surface | Sequence[Surface], elements: int = ELEMENTS
@@ -213,7 +220,7 @@ class NearObjects:
         self._grid, self._length = Grid.of(whisker, elements), whisker.length
 
     def reaching(self, place: Placement) -> Array | None:
-        """Shift of the objects, none where they touch, toward a whisker that they do not reach."""
+        """Shift (3,) that brings objects into contact with the resting whisker; zero if in it."""
         s = np.linspace(0.0, 1.0, _SAMPLES) * self._length
         line, radius = place.outside(self._whisker.position(s)), self._whisker.radius(s)
         gaps = np.array([one.signed_distance(line) - radius for one in self._surfaces])
@@ -224,18 +231,18 @@ class NearObjects:
         return np.asarray(normal * (gaps[which, at] / self._length + _PRESSED))
 
     def from_outside(self, place: Placement, shift: Array) -> Equilibrium | None:
-        """Equilibrium that a whisker comes to that rested clear of the objects."""
+        """Equilibrium reached from a whisker that initially is clear of the objects."""
         there = self._shifted(place, shift)
         turn, move = there.rotation[None], there.position[None]
         found = follow_surfaces(self._whisker, self._surfaces, turn, move)
-        if not _touching(found.bent.status)[0]:
+        if not _has_contact(found.bent.status)[0]:
             return None
-        return _from_one(self._whisker, self._surfaces, there, found, 0, self._grid)
+        return _solve_from_one_contact(self._whisker, self._surfaces, there, found, 0, self._grid)
 
     def moved(
         self, place: Placement, shift: Array, start: Equilibrium, settle: bool = True
     ) -> Equilibrium | None:
-        """Equilibrium from another one on; unless it is to settle, nodes stay where they are."""
+        """Equilibrium continued from ``start``; if ``settle``, nodes move to where contacts end."""
         obstacles = Obstacles(self._surfaces, self._shifted(place, shift), self._length)
         begin = start.grid, start.strain, start.pressing
         if settle:
@@ -247,7 +254,7 @@ class NearObjects:
         return found
 
     def refined(self, place: Placement, shift: Array, start: Equilibrium) -> Equilibrium | None:
-        """Equilibrium near one with other nodes."""
+        """Equilibrium on this object's grid, continued from ``start`` on another grid."""
         obstacles = Obstacles(self._surfaces, self._shifted(place, shift), self._length)
         strain, pressing = strain_on(start, self._grid), start.pressing_on(self._grid)
         found = settled(self._whisker, obstacles, self._grid, strain, pressing)
@@ -267,7 +274,7 @@ def around(
     found: SurfaceDeflection,
     several: bool = True,
 ) -> ObstacleDeflection:
-    """Solve all contacts of placements at which one contact is not all, or only find these."""
+    """Find placements with more than one contact, and if ``several`` solve all their contacts."""
     overlap = overlaps(whisker, surfaces, rotations, positions, found)
     second, solved = overlap > OVERLAP, dict[int, Equilibrium]()
     if several and second.any():
@@ -277,7 +284,7 @@ def around(
     arc, surface = np.full((n, most), np.nan), np.full((n, most), -1)
     points, forces = np.full((n, most, 3), np.nan), np.full((n, most, 3), np.nan)
     force, moment, status = bent.force.copy(), bent.moment.copy(), bent.status.copy()
-    touching = _touching(status)
+    touching = _has_contact(status)
     arc[touching, 0], surface[touching, 0] = bent.arc_length[touching], found.surface[touching]
     points[touching, 0], forces[touching, 0] = bent.contact_point[touching], bent.force[touching]
     together = np.zeros(n, dtype=bool)
@@ -312,7 +319,7 @@ def around(
     )
 
 
-def _touching(status: IntArray) -> Mask:
+def _has_contact(status: IntArray) -> Mask:
     return np.isin(status, (Status.OK, Status.TIP_CONTACT))
 
 
@@ -324,9 +331,9 @@ def _solved(
     found: SurfaceDeflection,
     overlap: Array,
 ) -> dict[int, Equilibrium]:
-    """Placements with several contacts, by number."""
+    """Equilibria of the placements with several contacts, by placement index."""
     solved: dict[int, Equilibrium] = {}
-    touching = _touching(found.bent.status)
+    touching = _has_contact(found.bent.status)
     last: Equilibrium | None = None
     for i in range(len(positions)):
         if overlap[i] <= OVERLAP and (touching[i] or last is None):
@@ -341,14 +348,14 @@ def _solved(
             if one is None or not one.contacts()[0].size or one.farthest(last) > _JUMP:
                 one = None
         if one is None and touching[i]:
-            one = _from_one(whisker, surfaces, place, found, i, grid)
+            one = _solve_from_one_contact(whisker, surfaces, place, found, i, grid)
         last = one
         if one is not None:
             solved[i] = one
     return solved
 
 
-def _from_one(
+def _solve_from_one_contact(
     whisker: Whisker,
     surfaces: Sequence[Surface],
     place: Placement,
@@ -356,7 +363,7 @@ def _from_one(
     row: int,
     grid: Grid,
 ) -> Equilibrium | None:
-    """Equilibrium that a whisker bent by one contact comes to."""
+    """Equilibrium with all contacts, starting from the whisker bent by one contact."""
     bent, d = found.bent, discretize(whisker)
     arc = float(bent.arc_length[row]) / d.length
     force, point = bent.force[row] / d.force, bent.contact_point[row] / d.length
@@ -365,7 +372,7 @@ def _from_one(
     pressing[found.surface[row], nearest] = np.linalg.norm(force)
     strain = bent_by_one(grid, arc, force, point)
     out = settled(whisker, Obstacles(surfaces, place, d.length), grid, strain, pressing)
-    # Pushed off by another object, a whisker may be free.
+    # The other contacts may push the whisker off the objects altogether.
     return None if out is None or not out.contacts()[0].size else out
 
 
@@ -376,13 +383,13 @@ def overlaps(
     positions: Array,
     found: SurfaceDeflection,
 ) -> Array:
-    """Depth (n,) of the bent whisker in objects away from its contact, m."""
+    """Penetration depth (n,) of the bent whisker into objects away from its contact, m."""
     bent = found.bent
     s = np.linspace(0.0, whisker.length, _SAMPLES)
     radius = whisker.radius(s)
     deepest = np.zeros(len(positions))
-    # A whisker at rest was found to be free before.
-    touching = np.flatnonzero(_touching(bent.status))
+    # Without contact the resting whisker is already known to be clear of the objects.
+    touching = np.flatnonzero(_has_contact(bent.status))
     if not touching.size:
         return deepest
     lines = bent.centerline(_SAMPLES)

@@ -1,17 +1,17 @@
-"""Where a whisker can be touched: the stable contacts Ω, as a chart.
+"""Chart of the stable set Ω of frictionless contacts of a whisker.
 
 A frictionless contact is ξ = (s_c, f_y, f_z). At fixed s_c the force grows along a ray of bearing
 ψ, f = f (cos ψ, sin ψ), from rest to the *fold*, where det ∂p/∂ξ first vanishes: there the stable
 equilibrium meets an unstable one and a frictionless whisker slips off. The contacts between rest
-and fold, for s_c between ``proximal`` and the tip, are the stable ones connected to rest. With the
-fold force f*(s_c, ψ) they are charted by
+and fold, for s_c between ``proximal`` and the tip, are the stable ones connected to rest. In terms
+of the fold force f*(s_c, ψ) they are parametrised by
 
     ξ = (s(η), ρ² f*(s, ψ) cos ψ, ρ² f*(s, ψ) sin ψ),   0 ≤ η ≤ 1,   0 ≤ ρ ≤ 1,
     s(η) = 1 - (1 - proximal) ((1 - a)(1 - η) + a (1 - η)²),
 
-a box in (η, ψ, ρ), periodic in ψ. Its cells are denser toward rest, where signals vanish and their
-ratios vary fast, and (by the grading a) toward a thin tip, where the fold force falls steeply. The
-chart is sampled on a grid whose nodes carry base force F, contact point p and their exact
+a box in (η, ψ, ρ), periodic in ψ. Its cells are denser toward rest, where the signals vanish and
+their ratios vary fast, and (by the grading a) toward a thin tip, where the fold force falls
+steeply. Each node of the chart's grid holds the base force F, the contact point p and their exact
 derivatives. ln f* is interpolated by bicubic Hermite patches.
 """
 
@@ -28,30 +28,34 @@ from vibrissa.numerics import AnyArray, Array, inlined, kernel
 from vibrissa.rod.discretization import STEPS, Bendable, Discretization, discretize
 from vibrissa.rod.integration import solve_forces
 
-#: Contacts nearer the base than this fraction of the length are not considered, unless asked for.
+#: Default of the smallest arc length of a contact, over L.
 PROXIMAL = 0.3
 #: Cells of the chart along (η, ψ, ρ).
 CELLS = (16, 32, 16)
-# The fold is looked for up to this many times the force that would bend the contact by its own arc
-# length were the whisker linear; straight, curved, conical and cylindrical whiskers fold below 4.
-_FARTHEST = 12.0
-_SCAN = 0.0625
-# Bent in its plane, a nearly cylindrical whisker begins to slip off in the plane and out of it at
-# nearly the same force, between which det ∂p/∂ξ < 0: where it dips, its least value is looked for
-# in so many parabolas, and is zero if it is less than this share of that at rest.
-_PARABOLAS, _ZERO = 8, 1e-9
+# The fold is searched up to this multiple of the force that would deflect the contact by its own
+# arc length if the whisker were linear; straight, curved, conical and cylindrical whiskers fold
+# below 4.
+_LARGEST_FORCE = 12.0
+_SCAN = 0.0625  # increment of that multiple
+# A nearly cylindrical whisker that is bent in its plane begins to slip off in the plane and out of
+# it at nearly the same force; det ∂p/∂ξ < 0 only between the two. Where sampled values have a
+# minimum, it is refined by this many parabolas, and counts as zero if it is below this share of the
+# value at rest.
+_PARABOLAS, _ZERO_DETERMINANT = 8, 1e-9
 _GRADING = 0.85  # grading toward a tip of radius zero
-#: No solution is looked for nearer to the base than this (over L).
+#: Smallest arc length at which contacts are solved, over L.
 LEAST_ARC = 0.05
-_CURTAILED = 6  # rounds in which a chart is curtailed to what can be solved
-_LEAST_LOAD = 0.01  # directions have no value at zero force; just above it they have their limit
+_MOST_CURTAILMENTS = 6  # most rounds in which the chart is reduced to contacts that can be solved
+# Smallest ρ at which nodes are evaluated: at zero force directions are undefined, and at this ρ
+# they practically have their limits.
+_LEAST_LOAD = 0.01
 
 
 class Fold(NamedTuple):
     """The fold force over the chart, for the kernels."""
 
     bounds: Array  # (2,), smallest arc length, over L, and grading a of the chart
-    # (n, m + 1, 4) ln f* and its derivatives by η, by ψ and by both, at the chart's nodes.
+    # (n, m + 1, 4) ln f* and its derivatives by η, ψ, and both, at the chart's nodes.
     log_force: Array
 
 
@@ -61,7 +65,7 @@ class StableSet:
 
     discretization: Discretization  # rod and units
     stations: Array  # (i,), arc lengths of the nodes, over L
-    # (j,) Directions ψ of the force at the nodes, rad; the last is the first, a turn on.
+    # (j,) Bearings ψ of the force at the nodes, rad; the last is the first plus 2π.
     bearings: Array
     loads: Array  # (k,), square roots ρ of the force at the nodes, relative to the fold force
     fold: Fold  # fold force over the chart
@@ -73,11 +77,11 @@ class StableSet:
 
     @property
     def proximal(self) -> float:
-        """Smallest s_c/L charted."""
+        """Smallest charted arc length, over L."""
         return float(self.stations[0])
 
     def charted(self, derivatives: Array) -> Array:
-        """Turn derivatives by ξ at the nodes into ones by (η, ψ, ρ)."""
+        """Convert derivatives by ξ at the nodes into derivatives by (η, ψ, ρ)."""
         return np.asarray(np.einsum("...ij,...jk->...ik", derivatives, self.frames))
 
 
@@ -88,12 +92,12 @@ def stable_set(
     cells: tuple[int, int, int] = CELLS,
     steps: int = STEPS,
 ) -> StableSet:
-    """Chart the stable contacts of a whisker; cached.
+    """Compute the chart of a whisker's stable contacts; cached.
 
     Parameters
     ----------
     whisker : Bendable
-        Whisker to be touched.
+        Whisker, with or without weight.
     proximal : float
         Smallest arc length of a contact, over L.
     cells : tuple of int
@@ -123,7 +127,7 @@ def stable_set(
     bearings = np.linspace(0.0, 2.0 * np.pi, cells[1] + 1)
     loads = np.linspace(0.0, 1.0, cells[2] + 1)
     force, folded = _fold_forces(discretization, stations, bearings[:-1])
-    for _ in range(_CURTAILED):
+    for _ in range(_MOST_CURTAILMENTS):
         log_fold = _log_fold(eta, bearings, force)
         contacts, frames = _nodes_of(log_fold, stations, bearings, loads, stretch)
         values, tangents = solve_forces(
@@ -132,7 +136,7 @@ def stable_set(
         lost: AnyArray = np.isnan(tangents.sum(axis=(1, 2))).reshape(contacts.shape[:3])
         if discretization.rod.weight is None or not lost.any():
             break
-        # Under its weight a whisker may turn over before it slips off: there the chart ends.
+        # Under its weight a whisker may topple before it slips off; the chart ends there.
         held = np.where(lost.any(axis=2), loads[np.maximum(lost.argmax(axis=2) - 1, 1)], 1.0)
         force *= np.minimum(held[:, :-1], 1.0) ** 2
     grid = contacts.shape[:3]
@@ -153,9 +157,9 @@ def stable_set(
 def _nodes_of(
     log_fold: Array, stations: Array, bearings: Array, loads: Array, stretch: Array
 ) -> tuple[Array, Array]:
-    """Contacts at the nodes, and their derivatives by the chart's coordinates."""
+    """Contacts at the nodes, and their derivatives by (η, ψ, ρ)."""
     s, psi, rho = np.meshgrid(stations, bearings, np.maximum(loads, _LEAST_LOAD), indexing="ij")
-    f, f_eta, f_psi = (a[..., None] for a in _expand(log_fold))
+    f, f_eta, f_psi = (a[..., None] for a in _fold_and_derivatives(log_fold))
     cos, sin = np.cos(psi), np.sin(psi)
     contacts = np.stack([s, rho**2 * f * cos, rho**2 * f * sin], axis=-1)
     zero = np.zeros_like(s)
@@ -177,7 +181,7 @@ def _nodes_of(
 
 
 def with_normal_force(contacts: Array) -> Array:
-    """ξ = (s, f_y, f_z) as (s, 0, f_y, f_z): a frictionless force is normal to the whisker."""
+    """Convert ξ = (s, f_y, f_z) into (s, 0, f_y, f_z): frictionless forces are normal."""
     return np.insert(contacts, 1, 0.0, axis=-1)
 
 
@@ -190,11 +194,12 @@ def determinant(tangents: Array) -> Array:
 def _fold_forces(
     discretization: Discretization, stations: Array, bearings: Array
 ) -> tuple[Array, AnyArray]:
-    """Force at the first zero of det ∂p/∂ξ along each ray, (n, m), and whether there is one."""
+    """Force (n, m) at the first zero of det ∂p/∂ξ along each ray, and whether there is one."""
     rest = np.zeros((stations.size, 4))
     rest[:, 0] = stations
     at_rest = determinant(solve_forces(discretization, rest, tangents=True)[1])
-    # √det is the compliance at the contact: this force deflects it, linearly, by its arc length.
+    # √det is the compliance at the contact: in linear theory this force deflects it by its arc
+    # length.
     unit = np.repeat(stations / np.sqrt(at_rest), bearings.size)
     sign = np.repeat(at_rest, bearings.size)
     s = np.repeat(stations, bearings.size)
@@ -209,7 +214,7 @@ def _fold_forces(
             found = (
                 determinant(solve_forces(discretization, contacts, tangents=True)[1]) / sign[rays]
             )
-        # Far beyond a fold the integration may overflow: certainly not stable.
+        # The integration may overflow far beyond a fold, where no contact is stable.
         return np.where(np.isfinite(found), found, -1.0)
 
     low, high = np.zeros(s.size), np.full(s.size, np.inf)
@@ -217,7 +222,7 @@ def _fold_forces(
     before = np.full(s.size, -np.inf)  # determinant one step before ``low``
     open_rays = np.arange(s.size)
     force = _SCAN
-    while open_rays.size and force <= _FARTHEST:
+    while open_rays.size and force <= _LARGEST_FORCE:
         found = relative_determinant(open_rays, np.full(open_rays.size, force))
         beyond = found <= 0.0
         high[open_rays[beyond]], at_high[open_rays[beyond]] = force, found[beyond]
@@ -225,10 +230,12 @@ def _fold_forces(
         rays = open_rays[dips]
         steps = force + np.array([[-2.0], [-1.0], [0.0]]) * _SCAN
         values = np.stack([before[rays], at_low[rays], found[dips]])
-        where, least = _least(partial(relative_determinant, rays), steps + 0.0 * values, values)
-        crossed = least <= _ZERO
+        where, least = _minimize_by_parabolas(
+            partial(relative_determinant, rays), steps + 0.0 * values, values
+        )
+        crossed = least <= _ZERO_DETERMINANT
         rays = rays[crossed]
-        high[rays], at_high[rays] = where[crossed], np.minimum(least[crossed], -_ZERO)
+        high[rays], at_high[rays] = where[crossed], np.minimum(least[crossed], -_ZERO_DETERMINANT)
         low[rays], at_low[rays] = force - 2.0 * _SCAN, before[rays]
         on = ~np.isfinite(high[open_rays])
         open_rays = open_rays[on]
@@ -248,16 +255,18 @@ def _fold_forces(
         if not rays.size:
             break
     shape = (stations.size, bearings.size)
-    # The stable side of the bracket.
+    # The lower end of the bracket is on the stable side.
     return (low * unit).reshape(shape), folded.reshape(shape)
 
 
-def _least(function: Callable[[Array], Array], x: Array, y: Array) -> tuple[Array, Array]:
-    """Minima by successive parabolas, from values y (3, n) at rising x (3, n), y[1] the least."""
+def _minimize_by_parabolas(
+    function: Callable[[Array], Array], x: Array, y: Array
+) -> tuple[Array, Array]:
+    """Minima by successive parabolas, from values y (3, n) at increasing x (3, n), y[1] least."""
     for _ in range(_PARABOLAS if x.size else 0):
         left, right = (y[1] - y[0]) / (x[1] - x[0]), (y[2] - y[1]) / (x[2] - x[1])
         vertex = 0.5 * (x[0] + x[1]) - 0.5 * left * (x[2] - x[0]) / (right - left)
-        # Not where a value is known already.
+        # Keep away from the point whose value is known already.
         apart = 1e-3 * (x[2] - x[0])
         vertex = np.where(np.abs(vertex - x[1]) < apart, x[1] + apart, vertex)
         at, value = [vertex, x[1]], [function(vertex), y[1]]
@@ -271,7 +280,7 @@ def _least(function: Callable[[Array], Array], x: Array, y: Array) -> tuple[Arra
 
 
 def _log_fold(eta: Array, bearings: Array, force: Array) -> Array:
-    """Ln f* with its derivatives (value, s, ψ, sψ) at the nodes, from splines periodic in ψ."""
+    """Table of ln f* at the nodes: value and derivatives by η, ψ, and both; periodic in ψ."""
     values = np.log(np.concatenate([force, force[:, :1]], axis=1))
     in_psi = _slopes(bearings, values.T, periodic=True).T
     in_s, in_both = _slopes(eta, values), _slopes(eta, in_psi)
@@ -281,16 +290,16 @@ def _log_fold(eta: Array, bearings: Array, force: Array) -> Array:
 def _slopes(x: Array, values: Array, periodic: bool = False) -> Array:
     """Slopes of the cubic spline through values (n, m) at x, periodic or not-a-knot.
 
-    SciPy's `CubicSpline` gives the same; to import it takes longer than to solve for a contact.
+    SciPy's `CubicSpline` gives the same, but importing it takes longer than solving for a contact.
     """
-    if not periodic and len(x) < 4:  # a parabola, or a line
+    if not periodic and len(x) < 4:  # slopes of a parabola or a line
         return np.asarray(np.gradient(values, x, axis=0, edge_order=2 if len(x) > 2 else 1))
     h, secants = np.diff(x), np.diff(values, axis=0) / np.diff(x)[:, None]
     i = np.arange(0 if periodic else 1, len(h))
     size = len(h) if periodic else len(x)
     system, right = np.zeros((size, size)), np.zeros((size, values.shape[1]))
     system[i, i - 1] += h[i]
-    system[i, (i + 1) % size] += h[i - 1]  # the same as before, where there are two around
+    system[i, (i + 1) % size] += h[i - 1]  # with two periodic nodes, the same entry as above
     system[i, i] += 2.0 * (h[i - 1] + h[i])
     right[i] = 3.0 * (h[i, None] * secants[i - 1] + h[i - 1, None] * secants[i])
     if periodic:
@@ -304,13 +313,14 @@ def _slopes(x: Array, values: Array, periodic: bool = False) -> Array:
     return np.asarray(np.linalg.solve(system, right))
 
 
-def _expand(log_fold: Array) -> tuple[Array, Array, Array]:
+def _fold_and_derivatives(log_fold: Array) -> tuple[Array, Array, Array]:
+    """Fold force f* and its derivatives by η and ψ."""
     f = np.exp(log_fold[..., 0])
     return f, f * log_fold[..., 1], f * log_fold[..., 2]
 
 
 def contacts_at(fold: Fold, chart: Array) -> Array:
-    """Turn chart coordinates into contacts.
+    """Convert chart coordinates into contacts.
 
     Parameters
     ----------
@@ -355,7 +365,7 @@ def arc_length(bounds: Array, eta: float) -> float:
 
 @inlined
 def _hermite_slopes(t: float) -> tuple[float, float, float, float]:
-    """Derivatives of these weights."""
+    """Derivatives of the cubic Hermite weights."""
     u = 1.0 - t
     return -6.0 * t * u, u * (1.0 - 3.0 * t), 6.0 * t * u, t * (3.0 * t - 2.0)
 
@@ -394,7 +404,7 @@ def fold_force(fold: Fold, s: float, psi: float) -> float:
 
 @inlined
 def chart_to_contact(fold: Fold, chart: Array, xi: Array) -> None:
-    """Turn (η, ψ, ρ) into ξ."""
+    """Convert (η, ψ, ρ) into ξ, written to ``xi``."""
     xi[0] = min(max(arc_length(fold.bounds, chart[0]), LEAST_ARC), 1.0)
     force = chart[2] * chart[2] * fold_force(fold, xi[0], chart[1])
     xi[1], xi[2] = force * np.cos(chart[1]), force * np.sin(chart[1])
@@ -407,14 +417,14 @@ def _contacts_at(fold: Fold, chart: Array, contacts: Array) -> None:
 
 
 def chart_of(fold: Fold, contacts: Array) -> Array:
-    """Turn contacts into chart coordinates."""
+    """Convert contacts ξ (n, 3) into chart coordinates (η, ψ, ρ)."""
     chart = np.empty((len(contacts), 3))
     _chart_of(fold, np.ascontiguousarray(contacts), chart)
     return chart
 
 
 def fold_forces(fold: Fold, contacts: Array) -> Array:
-    """Fold force at the arc length and bearing of contacts.
+    """Fold force at the arc length and bearing of each contact.
 
     Parameters
     ----------

@@ -1,24 +1,24 @@
-"""Loads followed from a known state to the one asked for, on the stable branch all the way.
+"""Continuation of contacts along the stable branch, from a known solution to the wanted one.
 
-A problem is a set of three equations G(x; p) = 0. The parameters p
-move along a straight line from where the solution is known to where it is wanted; Newton's method
-corrects each step, the step is halved where it struggles and doubled where it does not. A solution
-counts only while det ∂G/∂x keeps the sign it started with: the zero is that load's fold, where the
-whisker slips off. Where no step succeeds, the state reached shows why.
+A problem is a set of three equations G(x; p) = 0. The parameters p move along a straight line from
+their values at a known solution to the wanted ones. Newton's method corrects each step; the step is
+halved where Newton's method fails to contract and doubled where it succeeds. A solution counts only
+while det ∂G/∂x keeps its initial sign: its zero is the fold of that load, where the whisker slips
+off. Where no step succeeds, the last state reached determines the status.
 
-A side contact that slides to the tip goes on as a tip contact; a tip contact whose force turns
-normal to the whisker goes on along the side.
+A side contact that slides to the tip is continued as a tip contact; a tip contact whose force turns
+normal to the whisker is continued as a side contact.
 
-The equations of each load have three unknowns x and parameters p (7):
+The equations of each kind of contact have three unknowns x and seven parameters p:
 
-- ``POINT``: the contact is at a point. x = (s, f_y, f_z); p: the point.
-- ``SIDE``: the whisker's side on a peg. x = (s, λ, ψ) with f = λ (0, cos ψ, sin ψ); p: a point of
-  the peg's axis, its direction, and its radius (negative: a line without thickness). With d the
-  part of p - origin normal to the axis and F̂ = F/λ the force's direction: d = D F̂ and F̂·axis = 0,
-  D the peg's radius plus the whisker's at s, or 0 for a line. Polar unknowns keep F̂ regular down to
-  zero force.
-- ``TIP``: the whisker's tip on a peg, the same equations at s = 1 with the force free to lean back:
-  x = (λ, α, ψ), f = λ (sin α, cos α cos ψ, cos α sin ψ), α ≤ 0.
+- ``POINT``: the contact is at a given point. x = (s, f_y, f_z); p: the point.
+- ``SIDE``: the whisker's side touches a peg. x = (s, λ, ψ) with f = λ (0, cos ψ, sin ψ); p: a point
+  of the peg's axis, its direction, and its radius (negative: a line without thickness). With d the
+  part of p - origin normal to the axis and F̂ = F/λ the force's direction: d = D F̂ and
+  F̂·axis = 0, where D is the peg's radius plus the whisker's at s, or 0 for a line. Polar unknowns
+  keep F̂ regular down to zero force.
+- ``TIP``: the whisker's tip touches a peg: the same equations at s = 1 with a force that may have
+  an axial component: x = (λ, α, ψ), f = λ (sin α, cos α cos ψ, cos α sin ψ), α ≤ 0.
 """
 
 from __future__ import annotations
@@ -42,23 +42,24 @@ from vibrissa.status import Status
 
 POINT, SIDE, TIP = 0, 1, 2
 
-#: A force this small (EI/L²) only marks where an object touches.
+#: Force that stands for the limit of zero force at first contact, EI/L².
 LEAST_FORCE = 1e-7
-# Fractions of the path; points start within a cell of their target.
+# Smallest steps as fractions of the path; points start within a cell of their target.
 _SMALLEST_STEP = 2.0**-12
 _SMALLEST_POINT_STEP = 2.0**-9
 _MOST_ROUNDS = 30
-# A contact may change between side and tip this often; more is dithering at the corner.
+# Largest number of changes between side and tip, so that a contact at the corner cannot alternate
+# for ever.
 _MOST_SWITCHES = 8
-# Toward a fold det ∂G/∂x vanishes and the solution moves ever faster along the path, both like a
-# square root of what is left to it. A path that cannot be followed has met a fold if det has fallen
-# below this share of its start, or if the speed (in longest steps per path) has grown by this
-# factor or is as high as this.
+# Toward a fold det ∂G/∂x vanishes and dx/dp diverges, both as the square root of the distance along
+# the path. A path that cannot be followed is taken to have met a fold if det has fallen below this
+# share of its initial value, or if the speed (in largest steps per path) has grown by this factor
+# or exceeds this value.
 _NEAR_FOLD = 0.5
 _SPED_UP = 2.0
 _FAST = 30.0
-# So near a fold that the solution moves by the square root of the rounding, a contact that Newton's
-# method cannot improve is one if it meets the equations to this.
+# Residual at which a contact is accepted that Newton's method cannot improve, because it is so near
+# a fold that rounding displaces the solution by its square root.
 _AT_FOLD = 8e-10
 
 _OK = int(Status.OK)
@@ -68,14 +69,14 @@ _BEYOND_FOLD = int(Status.BEYOND_FOLD)
 _BEYOND_TIP = int(Status.BEYOND_TIP)
 _PROXIMAL = int(Status.TOO_PROXIMAL)
 _FAILED = int(Status.NOT_CONVERGED)
-_ON_THE_WAY = -1
+_RUNNING = -1
 
 _UNSTABLE, _STABLE, _SOLVED = 0, 1, 2
 
-# What a path remembers: the share of it that is done and the step being tried; det ∂G/∂x at the
-# start, and relative to it at the last solution; rounds of Newton's method and the last one's size;
-# the speed now and the least; the best residual at the end; whether the tip was passed, or contact
-# lost, in the last round; changes between side and tip.
+# State of a path: its completed share and the step being tried; det ∂G/∂x at the start, and
+# relative to it at the last solution; rounds of Newton's method and the size of the last one's
+# step; the present speed and the least; the best residual at the end; whether the contact passed
+# the tip, or was lost, in the last round; number of changes between side and tip.
 _DONE, _STRIDE, _START, _RATIO, _ROUNDS, _SIZE = 0, 1, 2, 3, 4, 5
 _SPEED, _SLOWEST, _BEST, _PAST_TIP, _LOST, _SWITCHES = 6, 7, 8, 9, 10, 11
 _COLUMNS = 12
@@ -83,7 +84,7 @@ _COLUMNS = 12
 
 @inlined
 def _contact_of(kind: int, x: Array, contact: Array) -> None:
-    """Turn unknowns into (s, f_x, f_y, f_z)."""
+    """Convert unknowns into (s, f_x, f_y, f_z)."""
     if kind == POINT:
         contact[0], contact[1], contact[2], contact[3] = x[0], 0.0, x[1], x[2]
     elif kind == SIDE:
@@ -97,7 +98,7 @@ def _contact_of(kind: int, x: Array, contact: Array) -> None:
 
 @inlined
 def _by_unknowns(kind: int, x: Array, t: Array) -> None:
-    """Turn derivatives with respect to (s, f_y, f_z) or (f_x, f_y, f_z) into ones by unknowns."""
+    """Convert derivatives by (s, f_y, f_z) or (f_x, f_y, f_z) into derivatives by the unknowns."""
     if kind == POINT:
         return
     for row in range(6):
@@ -116,7 +117,7 @@ def _by_unknowns(kind: int, x: Array, t: Array) -> None:
 
 @inlined
 def _across(p: Array, e: Array) -> None:
-    """Fill e (3, 3) with two directions normal to the peg's axis, and the axis itself."""
+    """Fill e (3, 3) with two unit vectors normal to the peg's axis, and the axis itself."""
     ax, ay, az = p[3], p[4], p[5]
     if abs(ax) <= abs(ay) and abs(ax) <= abs(az):
         n = 1.0 / np.sqrt(ay * ay + az * az)
@@ -153,7 +154,7 @@ def _equations(
                 j[a, c] = t[3 + a, c]
         return
     force = x[1] if kind == SIDE else x[0]
-    which = 1 if kind == SIDE else 0  # the unknown that is the force's size
+    which = 1 if kind == SIDE else 0  # index of the unknown that is the force's magnitude
     e = np.empty((3, 3))
     _across(p, e)
     distance, slope = 0.0, 0.0
@@ -184,8 +185,8 @@ def _equations(
 
 
 @inlined
-def _longest_step(kind: int, fold: Fold, x: Array) -> Array:
-    """How far each unknown may go in one step."""
+def _largest_steps(kind: int, fold: Fold, x: Array) -> Array:
+    """Largest change of each unknown in one step."""
     most = np.empty(3)
     if kind == POINT:
         most[0] = 0.15
@@ -198,7 +199,8 @@ def _longest_step(kind: int, fold: Fold, x: Array) -> Array:
 
 
 @inlined
-def _begin(path: Array) -> None:
+def _initialize(path: Array) -> None:
+    """Set the initial state of a path."""
     for column in range(_COLUMNS):
         path[column] = 0.0
     path[_STRIDE] = path[_RATIO] = 1.0
@@ -207,7 +209,7 @@ def _begin(path: Array) -> None:
 
 @inlined
 def _parameters(kind: int, begin: Array, end: Array, progress: float, p: Array) -> None:
-    """Parameters on the way; a peg's axis stays a unit vector."""
+    """Parameters at a fraction of the path; a peg's axis stays a unit vector."""
     for a in range(7):
         p[a] = begin[a] + progress * (end[a] - begin[a])
     if kind != POINT:
@@ -217,8 +219,8 @@ def _parameters(kind: int, begin: Array, end: Array, progress: float, p: Array) 
 
 
 @inlined
-def _correct(kind: int, path: Array, step: Array, x: Array) -> None:
-    """Take a Newton step, no longer than trusted, and stay on the whisker with a pushing force."""
+def _newton_update(kind: int, path: Array, step: Array, x: Array) -> None:
+    """Take a Newton step of bounded length; keep s on the whisker and the force compressive."""
     shorten = 1.0 / max(path[_SIZE], 1.0)
     for a in range(3):
         x[a] -= shorten * step[a]
@@ -233,8 +235,8 @@ def _correct(kind: int, path: Array, step: Array, x: Array) -> None:
 
 
 @inlined
-def _struggles(path: Array, size: float, smallest: float) -> bool:
-    """Whether Newton's method fails to contract; ``size`` is its step in longest steps."""
+def _fails_to_contract(path: Array, size: float, smallest: float) -> bool:
+    """Whether Newton's method fails to contract; ``size`` is its step over the largest step."""
     rounds = path[_ROUNDS]
     if rounds == 0.0:
         path[_SPEED] = size / path[_STRIDE]
@@ -245,7 +247,7 @@ def _struggles(path: Array, size: float, smallest: float) -> bool:
 
 @inlined
 def _switch(kind: int, path: Array, stride: float, x: Array, x_ok: Array) -> int:
-    """Go on along the tip instead of the side, or the other way; return the new kind."""
+    """Change from side to tip contact or back; return the new kind."""
     if kind == SIDE:
         x[0], x[1], x[2] = x_ok[1], 0.0, x_ok[2]
     else:
@@ -260,7 +262,7 @@ def _switch(kind: int, path: Array, stride: float, x: Array, x_ok: Array) -> int
 
 @inlined
 def _reason(kind: int, path: Array, x_ok: Array, proximal: float) -> int:
-    """Why a path ends short of its end."""
+    """Status of a path that stops before its end."""
     if path[_LOST] > 0.0:
         return _NO_CONTACT
     if path[_PAST_TIP] > 0.0 or kind == TIP:
@@ -272,7 +274,8 @@ def _reason(kind: int, path: Array, x_ok: Array, proximal: float) -> int:
 
 
 @inlined
-def _arrived(kind: int, s: float, proximal: float) -> int:
+def _status_at_end(kind: int, s: float, proximal: float) -> int:
+    """Status of a contact that reached the end of its path."""
     if s < proximal - ROUNDING:
         return _PROXIMAL
     return _AT_TIP if kind == TIP else _OK
@@ -292,7 +295,7 @@ def _load_lanes(
     x_ok: Array,
     contact: Array,
 ) -> tuple[int, int]:
-    """Load all lanes; one whose path has ended takes the next."""
+    """Load all lanes; a lane whose path has ended takes the next problem."""
     for i in range(LANES):
         if row[i] < 0 and waiting < last:
             row[i] = waiting
@@ -300,7 +303,7 @@ def _load_lanes(
             running += 1
             copy(unknowns[row[i]], x[i])
             copy(x[i], x_ok[i])
-            _begin(paths[i])
+            _initialize(paths[i])
         if row[i] >= 0:
             _contact_of(kinds[row[i]], x[i], contact)
             tip = kinds[row[i]] == TIP
@@ -312,16 +315,16 @@ def _load_lanes(
 
 @inlined
 def _outcome(misfit: float, size: float, relative: float) -> int:
-    """Whether the unknowns are stable, and solve the equations."""
+    """Whether the unknowns are stable, and whether they solve the equations."""
     if not (misfit < np.inf and relative > 0.0):
         return _UNSTABLE
-    # Near zero force the direction is loose: solved means the step is small as well.
+    # Near zero force the direction is poorly determined, so the step must be small as well.
     small = (misfit <= TOLERANCE and size < 1e-6) or misfit <= 1e-3 * TOLERANCE
     return _SOLVED if small else _STABLE
 
 
 @inlined
-def _go_on(
+def _next_step(
     kind: int,
     path: Array,
     progress: float,
@@ -335,7 +338,7 @@ def _go_on(
     arc: float,
     proximal: float,
 ) -> tuple[int, int]:
-    """Choose what follows a round of Newton's method; return the status and the kind of contact."""
+    """Choose the action after a round of Newton's method; return status and kind of contact."""
     smallest = _SMALLEST_POINT_STEP if kind == POINT else _SMALLEST_STEP
     may_switch = path[_SWITCHES] < _MOST_SWITCHES
     if outcome == _SOLVED:
@@ -344,27 +347,27 @@ def _go_on(
         path[_ROUNDS] = path[_PAST_TIP] = path[_LOST] = 0.0
         left = 1.0 - progress
         if kind == TIP and x[1] > 0.0 and may_switch:
-            # The force leans outward, which a tip cannot give: on along the side.
+            # A tip cannot exert an outward axial force: continue along the side.
             path[_BEST] = np.inf
-            return _ON_THE_WAY, _switch(kind, path, min(path[_STRIDE], left), x, x_ok)
+            return _RUNNING, _switch(kind, path, min(path[_STRIDE], left), x, x_ok)
         if progress >= 1.0:
-            return _arrived(kind, arc, proximal), kind
+            return _status_at_end(kind, arc, proximal), kind
         path[_STRIDE] = min(2.0 * path[_STRIDE], left)
-        return _ON_THE_WAY, kind
-    if outcome == _STABLE and not _struggles(path, size, smallest):
+        return _RUNNING, kind
+    if outcome == _STABLE and not _fails_to_contract(path, size, smallest):
         path[_SIZE] = size
-        _correct(kind, path, step, x)
-        return _ON_THE_WAY, kind
+        _newton_update(kind, path, step, x)
+        return _RUNNING, kind
     if path[_STRIDE] > smallest:
         path[_STRIDE] *= 0.5
         path[_ROUNDS] = 0.0
         copy(x_ok, x)
-        return _ON_THE_WAY, kind
+        return _RUNNING, kind
     if path[_BEST] <= _AT_FOLD:
         copy(x_best, x_ok)
-        return _arrived(kind, arc, proximal), kind
+        return _status_at_end(kind, arc, proximal), kind
     if kind == SIDE and path[_PAST_TIP] > 0.0 and may_switch:
-        return _ON_THE_WAY, _switch(kind, path, min(0.01, 1.0 - path[_DONE]), x, x_ok)
+        return _RUNNING, _switch(kind, path, min(0.01, 1.0 - path[_DONE]), x, x_ok)
     return _reason(kind, path, x_ok, proximal), kind
 
 
@@ -385,7 +388,7 @@ def follow(
     first: int,
     last: int,
 ) -> None:
-    """Follow problems from ``begins`` to ``ends``, four at a time; see the module."""
+    """Follow problems from ``begins`` to ``ends``, four at a time; see the module docstring."""
     b = np.zeros(BUFFER_SIZE)
     value, t, g, p = np.empty(6), np.empty((6, 3)), np.empty(3), np.empty(7)
     jacobian, step, contact = np.empty((3, 3)), np.empty(3), np.empty(4)
@@ -414,7 +417,7 @@ def follow(
             if path[_START] == 0.0:
                 path[_START] = det
             relative = det / path[_START]
-            most = _longest_step(kind, fold, x[i])
+            most = _largest_steps(kind, fold, x[i])
             size = max(abs(step[0]) / most[0], abs(step[1]) / most[1], abs(step[2]) / most[2])
             outcome = _outcome(misfit, size, relative)
             if outcome != _UNSTABLE and progress >= 1.0 and misfit < path[_BEST]:
@@ -422,7 +425,7 @@ def follow(
                 _contact_of(kind, x[i], contacts[m])
                 copy(value, values[m])
                 copy(x[i], x_best[i])
-            status, kinds[m] = _go_on(
+            status, kinds[m] = _next_step(
                 kind,
                 path,
                 progress,
@@ -436,9 +439,9 @@ def follow(
                 contacts[m, 0],
                 proximal,
             )
-            if status != _ON_THE_WAY and not (outcome == _SOLVED or path[_BEST] <= _AT_FOLD):
+            if status != _RUNNING and not (outcome == _SOLVED or path[_BEST] <= _AT_FOLD):
                 misfits[m] = misfit
-            if status != _ON_THE_WAY:
+            if status != _RUNNING:
                 statuses[m] = status
                 copy(x_ok[i], unknowns[m])
                 row[i] = -1

@@ -1,4 +1,4 @@
-"""What bends a whisker, any number of loads at once, and the deflection that results."""
+"""Loads that bend a whisker (any number at once), and the resulting deflections."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ if TYPE_CHECKING:
 
 
 def vectors(name: str, value: ArrayLike) -> Array:
-    """Return float64 (..., 3); raise a ValueError that states what is wrong."""
+    """Return ``value`` as float64 (..., 3); raise a ValueError that states what is wrong."""
     return _numbers(name, value, vector=True)
 
 
 def _numbers(name: str, value: ArrayLike, vector: bool) -> Array:
     """Return float64, (..., 3) for vectors; raise a ValueError that states what is wrong."""
-    array = numbers(name, value).copy()  # the caller may go on using theirs
+    array = numbers(name, value).copy()  # the caller may change theirs later
     if vector and (array.ndim == 0 or array.shape[-1] != 3):
         raise ValueError(f"{name} must have shape (..., 3); got {array.shape}")
     if np.isinf(array).any():
@@ -51,7 +51,7 @@ def _numbers(name: str, value: ArrayLike, vector: bool) -> Array:
 
 
 def _directions(vectors: Array) -> Array:
-    """Unit vectors; (0, 0, 0) stays as it is. No square overflows or vanishes."""
+    """Unit vectors, without overflow or underflow; (0, 0, 0) is unchanged."""
     largest = np.abs(vectors).max(axis=-1, keepdims=True)
     scaled = vectors / np.where(largest > 0.0, largest, 1.0)
     length = np.linalg.norm(scaled, axis=-1, keepdims=True)
@@ -59,6 +59,7 @@ def _directions(vectors: Array) -> Array:
 
 
 def _broadcast(**shapes: tuple[int, ...]) -> tuple[int, ...]:
+    """Common leading shape; raise a ValueError that lists the shapes if they do not broadcast."""
     try:
         return np.broadcast_shapes(*shapes.values())
     except ValueError as error:
@@ -68,11 +69,12 @@ def _broadcast(**shapes: tuple[int, ...]) -> tuple[int, ...]:
 
 @dataclass(frozen=True, eq=False)
 class PointForce:
-    """A known force at a known place of the whisker.
+    """A given force at a given arc length.
 
-    Any such force has exactly one equilibrium that grows from rest with the force, and that is what
-    is given; whether an object there could hold it, or the whisker would slip off, is not asked.
-    Only a force that winds the whisker up in waves too short to compute gets a status instead.
+    The equilibrium returned is the one that grows continuously from rest with the force, of which
+    there is always exactly one. It need not be stable for an object at that position: the whisker
+    may slip off. Only a force that winds the whisker up in waves too short to resolve gets a
+    failure status instead.
 
     Parameters
     ----------
@@ -134,13 +136,13 @@ class PointForce:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Leading shape: how many loads."""
+        """Leading shape of the loads."""
         return tuple(np.shape(self.arc_length))
 
 
 @dataclass(frozen=True, eq=False)
 class PointContact:
-    """The whisker's centreline passes through a point, without friction.
+    """A frictionless contact at a given point of the whisker's centreline.
 
     Parameters
     ----------
@@ -160,17 +162,17 @@ class PointContact:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Leading shape: how many loads."""
+        """Leading shape of the loads."""
         return tuple(np.shape(self.points)[:-1])
 
 
 @dataclass(frozen=True, eq=False)
 class PegContact:
-    """The whisker lies against a straight peg, without friction.
+    """A frictionless contact with a straight peg.
 
-    Without a radius the peg is a line that the whisker's centreline meets. With one it is a solid
-    cylinder and the surfaces touch: the centreline passes the axis at the peg's radius plus the
-    whisker's there.
+    With radius zero the peg is a line that the whisker's centreline intersects. Otherwise it is a
+    solid cylinder and the surfaces touch: the distance of the centreline from the peg's axis is the
+    peg's radius plus the whisker's at the contact.
 
     Parameters
     ----------
@@ -181,13 +183,14 @@ class PegContact:
     radius : array_like
         Radius, m, shape (...); 0 for a line.
     side : array_like, optional
-        Approximate direction of the force on the whisker, which shows on which side of the peg the
-        whisker lies, shape (..., 3). By default a line pushes from where the resting whisker is
-        nearest to it, and a cylinder pushes the whisker out on the side that is nearest.
+        Approximate direction of the force on the whisker, which determines on which side of the
+        peg the whisker is, shape (..., 3). By default a line pushes away from the point of the
+        resting whisker that is nearest to it, and a cylinder pushes the whisker out on the nearest
+        side.
     start : Deflection, optional
-        Earlier deflection by a peg (the same one, elsewhere) to go on from: the contact stays on
-        its side, slides and slips as the peg moves. Where it had no contact, the whisker is on the
-        side of the peg where it was.
+        Earlier deflection by the same peg at another position, from which the solution is
+        continued: the contact stays on its side, and slides or slips off as the peg moves. Where
+        ``start`` has no contact, the whisker stays on the side of the peg where it was.
 
     Raises
     ------
@@ -239,15 +242,15 @@ class PegContact:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Leading shape: how many loads."""
+        """Leading shape of the loads."""
         return tuple(np.shape(self.radius))
 
 
 Load = PointForce | PointContact | PegContact
 
 
-def some_of(load: Load, which: IntArray) -> Load:
-    """Loads of these indices (n,), counted without regard to their shape."""
+def select_loads(load: Load, which: IntArray) -> Load:
+    """Loads of flat indices ``which`` (n,)."""
     if isinstance(load, PointContact):
         return PointContact(np.reshape(load.points, (-1, 3))[which])
     if isinstance(load, PointForce):
@@ -262,7 +265,7 @@ def some_of(load: Load, which: IntArray) -> Load:
 
 @dataclass(frozen=True, eq=False)
 class Deflection:
-    """Deflected whiskers, one for each load; all in the whisker frame.
+    """Deflected whiskers, one for each load; all vectors are in the whisker frame.
 
     Attributes
     ----------
@@ -271,24 +274,24 @@ class Deflection:
     load : PointForce, PointContact or PegContact
         Load that bends it.
     force : (..., 3) array
-        Force of the object on the whisker, N; zero without contact, NaN without an answer.
+        Force of the object on the whisker, N; zero without contact, NaN where unsolved.
     moment : (..., 3) array
-        Moment about the base, N·m: contact_point × force, and with gravity what the weight has
-        come to exert in addition since rest, as a sensor reads it that was tared at rest.
+        Moment about the base, N·m: contact_point × force, plus with gravity the change of the
+        weight's moment since rest, as read by a sensor that was tared at rest.
     contact_point : (..., 3) array
-        Contact point on the centreline, m; NaN without contact or answer.
+        Contact point on the centreline, m; NaN without contact or where unsolved.
     arc_length : (...) array
         Arc length of the contact from the base, m.
     contact_force : (..., 3) array
         Force in the material frame at the contact (tangent, d1, d2), N.
     residual : (...) array
-        Error of the load's equations: lengths over L, directions; 0 for a PointForce.
+        Residual of the load's equations: lengths over L, directions; 0 for a PointForce.
     status : (...) int array
         :class:`~vibrissa.Status` of each load.
     steps : int
         Integration steps along the whisker.
     gravity : (..., 3) array or None
-        Gravity of each load, whisker frame, m/s²; None without weight.
+        Gravity of each load, whisker frame, m/s²; None if weight is neglected.
     """
 
     whisker: Whisker
@@ -302,7 +305,7 @@ class Deflection:
     status: IntArray
     steps: int = field(default=STEPS, repr=False)
     gravity: Array | None = None
-    # Steps that each row needs, where some need more.
+    # Steps needed by each load, where some need more than ``steps``.
     _needed: IntArray | None = field(default=None, repr=False)
 
     def to_dataset(self) -> xr.Dataset:
@@ -337,7 +340,7 @@ class Deflection:
         Returns
         -------
         (..., n, 3) array
-            Points, m; the resting whisker where there is no contact, NaN where there is no answer.
+            Points, m; the resting whisker where there is no contact, NaN where unsolved.
         """
         if n < 2:
             raise ValueError(f"a centreline needs at least 2 points; got n={n}")
@@ -345,7 +348,7 @@ class Deflection:
         return self._centerlines(rows, n).reshape(*self.status.shape, n, 3)
 
     def _centerlines(self, rows: IntArray, n: int) -> Array:
-        """Centrelines (rows, n, 3) of some loads, counted without regard to their shape."""
+        """Centrelines (rows, n, 3) of the loads of these flat indices."""
         d = discretize(self.whisker, self.steps)
         needed = np.full(rows.size, self.steps) if self._needed is None else self._needed[rows]
         values = np.concatenate([self.force / d.force, self.contact_point / d.length], axis=-1)
@@ -357,7 +360,7 @@ class Deflection:
             force = np.nan_to_num(self.contact_force.reshape(-1, 3)[rows] / d.force)
             contacts = np.concatenate([arc[:, None], force], axis=1)
             return self._weighted_centerlines(rows, contacts, needed, n)
-        # All that are free are the same: the first of them stands for the others.
+        # All whiskers without contact have the same centreline: it is computed for the first only.
         own = np.delete(np.arange(arc.size), free[1:])
         places = np.empty((arc.size, n, 3))
         for steps in np.unique(needed[own]):
@@ -384,11 +387,11 @@ class Deflection:
         return places
 
     def __repr__(self) -> str:
-        """Number of loads, and how many have each status."""
+        """Number of loads, and the count of each status."""
         return f"<{self._title()}: {counted(self.status)}>"
 
     def _repr_html_(self) -> str:
-        """Show the bent whiskers, the resting one and the contacts, with the numbers."""
+        """Picture of the bent whiskers, the resting one and the contacts, with the numbers."""
         rest = Mark(self.whisker.centerline(41), REST, label="at rest")
         bent = self._centerlines(thinned(np.arange(self.status.size), MOST_CURVES), 41)
         picture = views(
@@ -408,7 +411,7 @@ class Deflection:
         return f"Deflection of {self.status.shape or 'one'} by {type(self.load).__name__}"
 
     def _rows(self) -> list[tuple[str, str]]:
-        """Status, contact, force and moment; of a single load the status in words."""
+        """Labels and values of status, contact, force and moment; one load's status in words."""
         size = np.linalg.norm
         status = counted(self.status)
         if self.status.size == 1:

@@ -1,14 +1,15 @@
-"""The whisker as the kernels see it: non-dimensional pieces of rod, polynomials inside each.
+"""Discretization of a whisker: non-dimensional rod steps with polynomial curvature and radius.
 
 Lengths are divided by L, forces by EI/L² and moments by EI/L, with EI the bending stiffness at the
 base. On each step the intrinsic curvature and the radius are the cubics through their values at the
-step's four Gauss points: a cubic error orthogonal to all cubics costs only O(h⁸) at the step's end.
-Where curvature or radius are rough inside a step, as measured radii with noise are, that would be
-as good as four samples of them; there the cubics have the moments of order 0 to 3 of the curvature
-and of the compliance ∝ r⁻⁴ over the step, so that the noise averages out as it does in the rod.
+step's four Gauss points: a cubic's error, orthogonal to all cubics, costs only O(h⁸) at the step's
+end. Where curvature or radius are rough within a step, as noisy measured radii are, this would be
+no better than four samples of them; there the cubics instead have the moments of order 0 to 3 of
+the curvature and of the compliance ∝ r⁻⁴ over the step, so that noise averages out as in the rod.
 
-Steps are shorter where the whisker is thin (width ∝ radius^0.4, found best for the reference loads
-between 0.2 and 1), follow the intrinsic curvature's total turning, and never straddle a kink.
+Steps are shorter where the whisker is thin (width ∝ radius^0.4, the best exponent between 0.2 and 1
+for the reference loads), follow the total turning of the intrinsic curvature, and never straddle a
+kink.
 """
 
 from __future__ import annotations
@@ -27,25 +28,24 @@ if TYPE_CHECKING:
 #: Steps along a whisker: base force and contact point within 1e-6 (relative) of the exact solution
 #: while the tangent turns by less than about 65°, within 1e-4 up to slip-off.
 STEPS = 36
-#: More steps than this only add rounding.
+#: Largest number of steps; more only adds rounding error.
 MOST_STEPS = 2**8 * STEPS
-# A corkscrew needs more: as many steps as keep the rest whisker's turning per step below this
-# (rad).
+# Largest turning of the resting whisker per step, rad; a helical whisker gets more steps for it.
 _TURN_PER_STEP = 0.08
 _TAPER_EXPONENT = 0.4
-# Of STEPS, so many at least where the radius falls by a factor e.
+# Least number of steps, of STEPS, over which the radius falls by a factor e.
 _STEPS_PER_CHANGE = 6.0
 _JOINT_STEPS = 4
 _ORDER = 4
-# Misfit of a step's cubics, relative to the largest value, from which their moments are matched.
+# Error of a step's cubics, relative to the largest value, above which moments are matched.
 _ROUGH = 1e-4
 
 
 class Bendable(Protocol):
-    """What loads bend: a whisker, by itself or under its weight."""
+    """A body that can be loaded: a whisker with or without its weight."""
 
     def __hash__(self) -> int:
-        """Hash: results are cached."""
+        """Hash, because results are cached."""
 
     @property
     def length(self) -> float:
@@ -60,19 +60,19 @@ class Bendable(Protocol):
         """Radius at the tip, m."""
 
     def radius(self, s: Array) -> Array:
-        """Radii at arc lengths, m."""
+        """Radii at arc lengths s, m."""
 
     def position(self, s: Array) -> Array:
         """Points of the resting whisker at increasing arc lengths, m."""
 
     def frame(self, s: Array) -> Array:
-        """Material frames of the resting whisker there, in columns."""
+        """Material frames of the resting whisker at arc lengths s, in columns."""
 
 
 class Weight(NamedTuple):
-    """Weight of a rod, non-dimensional, for the kernels."""
+    """Weight of a rod, non-dimensional, in the form used by the kernels."""
 
-    # (n, 8) Weight of all that is beyond a place of each step, over EI/L²: polynomials in the
+    # (n, 8) Weight of everything distal to a point of each step, over EI/L²: polynomials in the
     # fraction of the step, constant term first.
     beyond: Array
     toward: Array  # (3,), unit vector along which weight acts, base frame
@@ -80,23 +80,23 @@ class Weight(NamedTuple):
 
 
 class Rod(NamedTuple):
-    """The rod in n steps from base to tip, non-dimensional, for the kernels."""
+    """A rod in n steps from base to tip, non-dimensional, in the form used by the kernels."""
 
     start: Array  # (n,), arc length at which each step begins, over L; negative in a compliant base
     width: Array  # (n,), length of each step in arc length, over L
     extent: Array  # (n,), centreline length per arc length: 1 in the whisker, 0 in a compliant base
-    # (n,) Compliance in twist where the radius is that of the base, over that in bending.
+    # (n,) Torsional compliance where the radius is the base's, over the bending compliance there.
     twist: Array
-    bending: Array  # (n,), compliance in bending there, 1 in the whisker
+    bending: Array  # (n,), bending compliance where the radius is the base's; 1 in the whisker
     # (n, 4, 4) Cubics in the fraction of the step, constant term first: the three intrinsic
-    # curvatures (times L), and the radius over that of the base.
+    # curvatures (times L), and the radius over the base radius.
     shape: Array
-    weight: Weight | None = None  # None where the rod has none
+    weight: Weight | None = None  # None if weight is neglected
 
 
 @dataclass(frozen=True, eq=False)
 class Discretization:
-    """Rod for the kernels, and the scales that make their results dimensional.
+    """Rod for the kernels, and the units that make their results dimensional.
 
     Attributes
     ----------
@@ -121,7 +121,7 @@ class Discretization:
 
 @lru_cache(maxsize=64)
 def discretize(whisker: Bendable, steps: int = STEPS) -> Discretization:
-    """Cut a whisker into steps for the kernels; cached.
+    """Discretize a whisker for the kernels; cached.
 
     Parameters
     ----------
@@ -139,15 +139,15 @@ def discretize(whisker: Bendable, steps: int = STEPS) -> Discretization:
 
 
 def check_whisker(whisker: object) -> None:
-    """Raise a ValueError if this is not a whisker, before caches ask for its hash."""
-    kind = type(whisker)  # its attributes are looked at without being computed
+    """Raise a ValueError if ``whisker`` is not one, before a cache requires its hash."""
+    kind = type(whisker)  # the class, so that no property is computed
     if not (hasattr(kind, "position") and hasattr(kind, "radius")):
         raise ValueError(f"a Whisker is needed; got {kind.__name__}")
 
 
 @singledispatch
 def discretized(whisker: Any, steps: int) -> Discretization:
-    """Cut what bends into steps; a whisker, or what else is registered."""
+    """Discretize a whisker, or an object of another registered type, without the cache."""
     if not 4 <= steps <= MOST_STEPS or int(steps) != steps:
         raise ValueError(f"steps is {steps}; it must be a whole number from 4 to {MOST_STEPS}")
     steps, length = int(steps), whisker.length
@@ -175,7 +175,7 @@ def discretized(whisker: Any, steps: int) -> Discretization:
 
 
 def weight_beyond(rod: Rod, weight: float) -> Array:
-    """Weight of all that is beyond a place, in the polynomials of :class:`Weight`."""
+    """Weight distal to each point, as the polynomials of :class:`Weight`."""
     radius = rod.shape[:, 3]
     integral = np.zeros((len(radius), 8))  # of radius² over the step, from its start
     for i in range(4):
@@ -199,9 +199,9 @@ def _nodes(whisker: Whisker, steps: int) -> Array:
     cumulated /= cumulated[-1]
     ends = np.array([0.0, *(np.array(whisker.breaks) / whisker.length), 1.0])
     edges = np.interp(ends, s, cumulated)
-    # A short, steep piece of a rod with kinks would have too few.
+    # A short, steep piece of a rod with kinks would otherwise have too few steps.
     steep = np.abs(np.diff(np.log(density))) / _TAPER_EXPONENT
-    steep[np.searchsorted(middle, ends[1:-1] * whisker.length) - 1] = 0.0  # where it jumps, perhaps
+    steep[np.searchsorted(middle, ends[1:-1] * whisker.length) - 1] = 0.0  # possible jumps
     changes = np.diff(np.interp(ends * whisker.length, middle[1:], np.cumsum(steep)))
     shares = np.maximum(np.diff(edges), changes * _STEPS_PER_CHANGE / STEPS)
     counts = np.maximum(1, np.ceil(shares * steps - 1e-9)).astype(int)
@@ -209,14 +209,14 @@ def _nodes(whisker: Whisker, steps: int) -> Array:
         np.interp(np.linspace(a, b, n + 1)[:-1], cumulated, s)
         for a, b, n in zip(edges[:-1], edges[1:], counts, strict=True)
     ]
-    # Kinks exactly where they are stated to be, not where the table above puts them.
+    # Kinks are placed exactly, not as interpolated in the table above.
     for piece, kink in zip(pieces[1:], whisker.breaks, strict=True):
         piece[0] = kink / whisker.length
     return np.concatenate([*pieces, [1.0]])
 
 
 def _scaled(whisker: Whisker, s: Array) -> Array:
-    """Curvatures times L, and radius relative to the base's, at arc lengths in units of L."""
+    """Curvatures times L, and radius over base radius, at arc lengths in units of L."""
     arc_length = s * whisker.length
     curvature = whisker.curvature(arc_length) * whisker.length
     radius = whisker.radius(arc_length) / whisker.base_radius
@@ -224,7 +224,7 @@ def _scaled(whisker: Whisker, s: Array) -> Array:
 
 
 def _match_moments(whisker: Whisker, nodes: Array, shape: Array) -> None:
-    """Replace the cubics (n, 4, 4) of steps in which curvature or radius are rough."""
+    """Replace the cubics (n, 4, 4) of steps within which curvature or radius are rough."""
     knots = [
         p.knots / whisker.length for p in (whisker.intrinsic_curvature, whisker.section_radius)
     ]
@@ -254,14 +254,14 @@ def _match_moments(whisker: Whisker, nodes: Array, shape: Array) -> None:
 
 
 def _curvature_cubic(t: Array, weight: Array, values: Array, _: Array) -> Array:
-    """The cubic that has the moments of values at t."""
+    """Coefficients of the cubic with the moments of ``values`` at ``t``."""
     legendre = np.polynomial.legendre.legvander(2.0 * t - 1.0, 3)
     matrix = (weight[:, None] * legendre).T @ np.vander(t, 4, increasing=True)
     return np.asarray(np.linalg.solve(matrix, (weight * values) @ legendre), dtype=np.float64)
 
 
 def _radius_cubic(t: Array, weight: Array, radius: Array, cubic: Array) -> Array:
-    """The cubic whose inverse fourth power has the moments of that of the radius, by Newton."""
+    """Coefficients of the cubic r for which r⁻⁴ has the moments of radius⁻⁴, by Newton's method."""
     legendre = weight[:, None] * np.polynomial.legendre.legvander(2.0 * t - 1.0, 3)
     powers = np.vander(t, 4, increasing=True)
     moments = radius**-4.0 @ legendre
@@ -279,10 +279,10 @@ def _radius_cubic(t: Array, weight: Array, radius: Array, cubic: Array) -> Array
 
 
 def _with_joint(rod: Rod, n: int, moment_scale: float, bending: float, twist: float) -> Rod:
-    """Put a compliant base before the rod: one unit of rod without length, as soft as the joint.
+    """Prepend a compliant base to the rod: n steps of zero length, as compliant as the joint.
 
-    Such a piece turns by the rotation that its moment asks for and moves nothing, so it is a
-    torsion spring; being rod, it needs no equations of its own. It is cut into n steps.
+    These steps rotate the frame under the moment without displacing it, so together they act as a
+    torsion spring and need no equations of their own.
     """
     unit = np.zeros((n, 4, 4))
     unit[:, 3, 0] = 1.0

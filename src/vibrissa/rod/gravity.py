@@ -1,10 +1,10 @@
-"""A whisker under its weight: the resting shape, and what the kernels need.
+"""A whisker under its own weight: its resting shape and its discretization for the kernels.
 
 A gravitational acceleration g in the base frame gives the rod a weight (:mod:`vibrissa.rod.weight`)
-and the whisker a resting shape that sags. That shape is followed from the weightless one while the
-weight grows; if it loses its stability on the way, as an upright whisker does that is too slender
-to stand, the whisker cannot be held so. Where the base turns, the shape under gravity of about the
-same direction is followed instead, which is solved once.
+and makes the resting shape sag. The sagged shape is followed from the weightless one while the
+weight increases; if it loses stability on the way, as an upright whisker does that is too slender,
+the whisker cannot be held in that orientation. For a base that turns, the sagged shape under a
+nearby direction of gravity, which is computed once and cached, is the starting point instead.
 """
 
 from __future__ import annotations
@@ -33,21 +33,21 @@ if TYPE_CHECKING:
 
 #: Standard gravity, m/s².
 STANDARD = 9.80665
-_MOST = 1e4  # more than this (m/s²) is doubted: forces of whisking are below 50 g
-# The weight grows to its size in so many steps, and a step that fails is halved so often.
+_MOST = 1e4  # largest gravity accepted, m/s²; accelerations of whisking are below 50 g
+# Number of increments in which the weight is applied, and how often a failed one may be halved.
 _STEPS, _HALVINGS = 8, 6
-_NUDGE = 1e-5  # by so much (rad) gravity is turned to see whether a whisker stands
-_NEAR = 0.05  # how far apart directions are that resting shapes are followed to others from, rad
-_REST = np.array([[1.0, 0.0, 0.0, 0.0]])  # no contact: (s, f)
-_NODES = 257  # nodes of the sagged curvature
+_NUDGE = 1e-5  # rotation of gravity in the finite differences of the stability test, rad
+_DIRECTION_SPACING = 0.05  # of the directions of gravity with cached resting shapes, rad
+_REST = np.array([[1.0, 0.0, 0.0, 0.0]])  # zero contact force: (s, f)
+_NODES = 257  # number of nodes of the sagged curvature
 
 
 class Traced(NamedTuple):
-    """A whisker followed from tip to base, at m arc lengths, non-dimensional."""
+    """Shape of a solved whisker at m arc lengths, non-dimensional."""
 
     places: Array  # (m, 3), points of the centreline, whisker frame
     frames: Array  # (m, 3, 3), material frames, in columns
-    moments: Array  # (m, 3), moments of the weight beyond each, in the material frame
+    moments: Array  # (m, 3), moments of the weight distal to each point, in the material frame
 
 
 class Weighted(NamedTuple):
@@ -57,11 +57,11 @@ class Weighted(NamedTuple):
     ----------
     states : (n, 13) array
         Force F and contact point p, direction of weight ĝ, moment of the weight μ at the base, and
-        a number that vanishes where the whisker bends over under its weight.
+        a number that vanishes where the whisker topples under its weight.
     tangents : (n, 12, 4) array
-        Derivatives of all but the last by (s, f_x, f_y, f_z); no rows unless wanted.
+        Derivatives of the first 12 by (s, f_x, f_y, f_z); no rows unless requested.
     directions : (n, 12, 3) array
-        Derivatives of the values by the direction of weight; no rows unless wanted.
+        Derivatives of the first 12 by the direction of weight; no rows unless requested.
     leans : (n, 3) array
         Directions of weight in the material frame at the tip.
     """
@@ -74,7 +74,7 @@ class Weighted(NamedTuple):
 
 @dataclass(frozen=True)
 class Resting:
-    """A whisker under its weight at rest, with what a whisker has that loads ask for.
+    """A whisker sagging under its own weight; a :class:`Bendable`.
 
     Attributes
     ----------
@@ -179,12 +179,12 @@ class Resting:
         return self.position(np.linspace(0.0, self.length, n))
 
     def shape(self) -> Whisker:
-        """A whisker without weight that has the sagged shape at rest.
+        """Return a whisker without weight whose resting shape is the sagged one.
 
         Returns
         -------
         Whisker
-            Whisker that has no weight and that shape at rest.
+            Whisker with the curvature of the sagged whisker.
         """
         whisker = self.whisker
         d = discretize(self)
@@ -192,7 +192,7 @@ class Resting:
         s = np.unique(np.concatenate([np.linspace(0.0, whisker.length, _NODES), breaks]))
         moments = self._traced(s).moments * d.moment
         ratio = np.array([1.0 + whisker.poisson_ratio, 1.0, 1.0])
-        # At a jump of the radius the moment is smooth, the curvature is not.
+        # At a jump of the radius the moment is smooth, but the curvature is not.
         smooth = interpolate.CubicSpline(s, moments)
 
         def curvature(at: ArrayLike) -> Array:
@@ -208,6 +208,7 @@ class Resting:
         )
 
     def _traced(self, s: Array) -> Traced:
+        """Sagged shape at arc lengths s (m,), m."""
         if discretize(self).rod.weight is None:
             bare = self.whisker
             return Traced(bare.position(s) / self.length, bare.frame(s), np.zeros((len(s), 3)))
@@ -217,7 +218,7 @@ class Resting:
 
 
 def resting(whisker: Whisker, gravity: ArrayLike) -> Resting:
-    """Check gravity, and put a whisker under its weight.
+    """Apply a whisker's weight to it, and check that it can be held so.
 
     Parameters
     ----------
@@ -229,13 +230,13 @@ def resting(whisker: Whisker, gravity: ArrayLike) -> Resting:
     Returns
     -------
     Resting
-        Whisker under its weight.
+        Whisker that sags under its weight.
 
     Raises
     ------
     ValueError
-        If the density is not known, gravity is not three numbers of a sensible size, or the whisker
-        cannot hold itself.
+        If the density is unknown, gravity is not three finite numbers of plausible size, or the
+        whisker topples under its weight.
     """
     values = np.asarray(gravity, dtype=np.float64)
     if values.shape != (3,) or not np.isfinite(values).all():
@@ -252,12 +253,12 @@ def resting(whisker: Whisker, gravity: ArrayLike) -> Resting:
         )
     x, y, z = values.tolist()
     rest = Resting(whisker, (x, y, z))
-    discretize(rest)  # or the reason why it has no rest
+    discretize(rest)  # raises a ValueError if there is no stable resting shape
     return rest
 
 
 def near_direction(vector: Array, step: float) -> Array:
-    """Vector (3,) of the same size in the nearest of directions a step (rad) apart."""
+    """Vector (3,) of equal magnitude, in the nearest of directions spaced by ``step``, rad."""
     size = float(np.linalg.norm(vector))
     toward = np.round(vector / max(size, 1e-300) / step) * step
     return np.asarray(size * toward / max(float(np.linalg.norm(toward)), 1e-300))
@@ -265,30 +266,31 @@ def near_direction(vector: Array, step: float) -> Array:
 
 @discretized.register(Resting)
 def _with_weight(whisker: Resting, steps: int) -> Discretization:
+    """Discretize a whisker with its weight."""
     gravity = np.array(whisker.gravity)
     if not gravity.any():
         return discretize(whisker.whisker, steps)
-    x, y, z = near_direction(gravity, _NEAR).tolist()
-    near = _near(Resting(whisker.whisker, (x, y, z)), steps)
+    x, y, z = near_direction(gravity, _DIRECTION_SPACING).tolist()
+    near = _cached_lean(Resting(whisker.whisker, (x, y, z)), steps)
     if near is not None:
-        loaded = _loaded(whisker, steps, 1.0, near)
+        loaded = _rod_with_weight(whisker, steps, 1.0, near)
         solved = evaluated(loaded, _REST, leans=near[None], tangents=True)
-        if _stands(loaded, solved):
-            return _loaded(whisker, steps, 1.0, solved.leans[0])
-    return _loaded(whisker, steps, 1.0, _grown(whisker, steps))
+        if _is_stable(loaded, solved):
+            return _rod_with_weight(whisker, steps, 1.0, solved.leans[0])
+    return _rod_with_weight(whisker, steps, 1.0, _lean_by_increments(whisker, steps))
 
 
 @lru_cache(maxsize=64)
-def _near(whisker: Resting, steps: int) -> Array | None:
-    """Direction of weight at the tip under gravity of about some direction, if there is a rest."""
+def _cached_lean(whisker: Resting, steps: int) -> Array | None:
+    """Direction of weight at the tip of the resting whisker, or None if it topples; cached."""
     try:
-        return _grown(whisker, steps)
+        return _lean_by_increments(whisker, steps)
     except ValueError:
         return None
 
 
-def _loaded(whisker: Resting, steps: int, share: float, lean: Array) -> Discretization:
-    """Rod with a share of its weight."""
+def _rod_with_weight(whisker: Resting, steps: int, share: float, lean: Array) -> Discretization:
+    """Rod with a share of its weight, and an estimate of the direction of weight at the tip."""
     bare, density = discretize(whisker.whisker, steps), whisker.whisker.density
     gravity = np.array(whisker.gravity)
     size = float(np.linalg.norm(gravity))
@@ -298,16 +300,16 @@ def _loaded(whisker: Resting, steps: int, share: float, lean: Array) -> Discreti
     return replace(bare, rod=bare.rod._replace(weight=Weight(beyond, gravity / size, lean)))
 
 
-def _grown(whisker: Resting, steps: int) -> Array:
-    """Direction of weight at the tip of the resting whisker, followed while the weight grows."""
+def _lean_by_increments(whisker: Resting, steps: int) -> Array:
+    """Direction of weight at the tip of the resting whisker, followed as the weight increases."""
     lean = np.asarray(whisker.whisker.frame(whisker.length)).T @ whisker.gravity
     lean /= np.linalg.norm(lean)
     done, stride = 0.0, 1.0 / _STEPS
     while done < 1.0:
         share = min(1.0, done + stride)
-        loaded = _loaded(whisker, steps, share, lean)
+        loaded = _rod_with_weight(whisker, steps, share, lean)
         solved = evaluated(loaded, _REST, leans=lean[None], tangents=True)
-        if _stands(loaded, solved):
+        if _is_stable(loaded, solved):
             done, lean = share, solved.leans[0]
         elif stride > 0.5**_HALVINGS / _STEPS:
             stride *= 0.5
@@ -320,12 +322,12 @@ def _grown(whisker: Resting, steps: int) -> Array:
     return lean
 
 
-def _stands(d: Discretization, solved: Weighted) -> bool:
-    """Whether a resting whisker is stable, as it is without weight.
+def _is_stable(d: Discretization, solved: Weighted) -> bool:
+    """Whether a resting whisker is stable and connected to the weightless one.
 
-    The direction of weight at the tip, by that at the base, is then a rotation; where one of its
-    two eigenvalues, or both at once as in a straight upright rod, passes through zero, the whisker
-    bends over.
+    Without weight, the derivative of the direction of weight at the base by that at the tip is a
+    rotation, that of the tip's frame. Where one of its two eigenvalues relative to that frame, or
+    both at once as in a straight upright rod, passes through zero, the whisker topples.
     """
     weight = d.rod.weight
     assert weight is not None
@@ -345,7 +347,7 @@ def _stands(d: Discretization, solved: Weighted) -> bool:
 def evaluated(
     d: Discretization, contacts: Array, leans: Array | None = None, tangents: bool = False
 ) -> Weighted:
-    """Solve contacts of a rod with weight, (s, f) being known."""
+    """Evaluate a rod with weight at contacts (s, f), shape (n, 4), and search their ``leans``."""
     rod, n = d.rod, len(contacts)
     weight = rod.weight
     assert weight is not None
@@ -375,12 +377,12 @@ def evaluated(
 
 @lru_cache(maxsize=64)
 def at_rest(whisker: Resting, steps: int = STEPS) -> Weighted:
-    """Solve the resting whisker; cached."""
+    """Evaluate the resting whisker; cached."""
     return evaluated(discretize(whisker, steps), _REST, tangents=True)
 
 
 def moved_moments(d: Discretization, contacts: Array) -> Array:
-    """What the weight's moment about the base has changed by since rest, non-dimensional."""
+    """Change of the weight's moment about the base since rest (n, 3), non-dimensional."""
     out = np.zeros((len(contacts), 3))
     if d.rod.weight is None:
         return out
@@ -391,7 +393,7 @@ def moved_moments(d: Discretization, contacts: Array) -> Array:
 
 
 def trace(d: Discretization, contact: Array, lean: Array, s: Array) -> Traced:
-    """Follow one solved whisker."""
+    """Positions, frames and moments of one solved whisker at arc lengths s."""
     m = len(s)
     axes, ends, moments = np.empty((m + 1, 3, 3)), np.empty((m + 1, 3)), np.empty((m + 1, 3))
     assert d.rod.weight is not None

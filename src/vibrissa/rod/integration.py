@@ -1,9 +1,9 @@
-"""Base force and contact point of contacts: the rod equations integrated, with weight or without.
+"""Integration of the rod equations: base force and contact point of contacts, and derivatives.
 
 Kernels call :func:`integrate` for the contacts in a buffer (:mod:`vibrissa.rod.kernels`). A rod
-that has a weight is integrated as :mod:`vibrissa.rod.weight` describes, by a kernel of its own that
-is compiled where it is needed, so that a rod without one loses nothing by it. Rows of kernels are
-shared out over the cores of the CPU or the threads of a GPU.
+with weight is integrated by a kernel of its own (:mod:`vibrissa.rod.weight`), compiled only where
+needed, so that a rod without weight is not slowed down. Rows are distributed over the cores of the
+CPU or the threads of a GPU.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ from vibrissa.rod.weight import integrate_weighted
 
 @inlined
 def _integrate(rod: Rod, b: Array, tangents: int, weight: Weight | None) -> None:
-    if weight is None:  # decided by the compiler
+    """Integrate every lane, with or without weight."""
+    if weight is None:  # resolved at compile time
         integrate_weightless(rod, b, tangents)
     else:
         integrate_weighted(rod, weight, b, tangents)
@@ -51,7 +52,7 @@ def _integrate(rod: Rod, b: Array, tangents: int, weight: Weight | None) -> None
 
 @specialised
 def integrate(rod: Rod, b: Array, tangents: int) -> None:
-    """Integrate every lane from its contact to the base, with its first so many tangents."""
+    """Integrate every lane from its contact to the base, with its first ``tangents`` tangents."""
     _integrate(rod, b, tangents, rod.weight)
 
 
@@ -59,10 +60,10 @@ def integrate(rod: Rod, b: Array, tangents: int) -> None:
 def evaluate(
     rod: Rod, contacts: Array, values: Array, tangents: Array, first: int, last: int
 ) -> None:
-    """Base force and contact point of many contacts."""
+    """Evaluate base force and contact point of many contacts, and tangents if there is room."""
     b, four = np.zeros(BUFFER_SIZE), np.empty((6, 4))
     wanted = tangents.shape[0] > 0
-    if LANES > 1 and wanted and last == first + 1:  # a contact by itself: its tangents side by side
+    if LANES > 1 and wanted and last == first + 1:  # one contact: a lane for each of its tangents
         c = contacts[first]
         set_all_lanes(b, c[0], c[1], c[2], c[3])
         integrate(rod, b, 1)
@@ -85,14 +86,14 @@ def evaluate(
 
 @kernel
 def relative_radius(rod: Rod, s: float) -> tuple[float, float]:
-    """Radius of the whisker relative to that of the base at s, and its derivative."""
+    """Radius of the whisker over the base radius at s, and its derivative."""
     return whisker_radius(rod, s)
 
 
 def solve_forces(
     discretization: Discretization, contacts: Array, tangents: bool = False, device: str = "cpu"
 ) -> tuple[Array, Array]:
-    """Base force and contact point of contacts whose force is known, non-dimensional.
+    """Compute base force and contact point of contacts with known force, non-dimensional.
 
     Parameters
     ----------
@@ -101,16 +102,16 @@ def solve_forces(
     contacts : (n, 4) array
         Arc length and force in the material frame there, (s, f_x, f_y, f_z).
     tangents : bool
-        Whether derivatives are wanted.
+        Whether to compute derivatives.
     device : str
-        Device that computes, "cpu" or "cuda".
+        Device on which to compute, "cpu" or "cuda".
 
     Returns
     -------
     values : (n, 6) array
         Base force and contact point (F, p).
     tangents : (n, 6, 3) array
-        Derivatives by ξ = (s, f_y, f_z); no rows unless wanted.
+        Derivatives by ξ = (s, f_y, f_z); no rows unless requested.
     """
     contacts = np.ascontiguousarray(contacts, dtype=np.float64)
     n = contacts.shape[0]
@@ -121,7 +122,7 @@ def solve_forces(
 
 
 def contact_tangents(discretization: Discretization, contacts: Array) -> Array:
-    """Unit tangents of the deflected whisker at its contacts.
+    """Compute unit tangents of the deflected whisker at its contacts.
 
     Parameters
     ----------
@@ -151,10 +152,10 @@ def share_rows(
     outputs: tuple[AnyArray, ...],
     device: str = "cpu",
 ) -> None:
-    """Call ``kernel(*tables, *inputs, *outputs, first, last)`` for parts that cover all rows.
+    """Call ``kernel(*tables, *inputs, *outputs, first, last)`` on parts that cover all rows.
 
-    All rows share the tables, arrays, numbers and named tuples of them; a row reads its inputs and
-    fills its outputs, each (n, ...). A rod with a weight is for the device "cpu" alone.
+    The tables (arrays, numbers, and named tuples of them) are common to all rows; each row reads
+    its inputs and fills its outputs, each (n, ...). A rod with weight requires the device "cpu".
     """
     if device == "cpu":
         share_out(
@@ -168,7 +169,7 @@ def share_rows(
 
 @cache
 def _one_lane() -> Translation:
-    """A thread has one lane: all offsets in the lane buffer are multiples of their number."""
+    """Translation to one lane per thread: offsets in the lane buffer are divided by LANES."""
     offsets = {
         name: value // kernels.LANES
         for name, value in vars(kernels).items()

@@ -1,14 +1,15 @@
-"""Base force and contact point between the nodes of a chart: fifteen times as fast as the rod.
+"""Interpolation of base force and contact point between the nodes of a chart.
 
-In each cell (F, p) is the blend of the cubics along its twelve edges that have the values and the
-slopes of the nodes, as in :mod:`vibrissa.rod.tree`. With l the linear and φ and χ the two Hermite
-weights of a corner's side along an axis, and g = φ - l, a corner contributes
+It is fifteen times as fast as integrating the rod. In each cell (F, p) is a blend of the cubics
+along the cell's twelve edges that have the values and slopes of the nodes, as in
+:mod:`vibrissa.rod.tree`. With l the linear and φ and χ the two Hermite weights of a corner's side
+along an axis, and g = φ - l, a corner contributes
 
     (l l l + g l l + l g l + l l g) v + χ l l ∂v/∂η + l χ l ∂v/∂ψ + l l χ ∂v/∂ρ,
 
-the factors those of η, ψ and ρ. All cubics are reproduced. Differences between neighbouring
-contacts are known to about a part in a thousand: enough to explore what noise leaves open about a
-contact, not to say where it is.
+the three factors of a product belonging to η, ψ and ρ. All cubics are reproduced. Differences
+between neighbouring contacts are accurate to about one part in a thousand: enough to explore the
+uncertainty of a contact, not to locate it.
 """
 
 from __future__ import annotations
@@ -23,11 +24,12 @@ from vibrissa.numerics import Array, inlined, vectorised
 from vibrissa.rod.chart import Fold, StableSet, along, log_fold_force
 from vibrissa.rod.discretization import Rod
 
-_PADDED = 8  # (F, p) and two of padding, so that the compiler puts them side by side
-# The compiler does so in one flat buffer only: a corner's rows, and the sums of values and slopes.
+_PADDED = 8  # (F, p) and two of padding, for vectorisation
+# Vectorisation needs one flat buffer: a corner's four rows, then the sums of values and slopes.
 _SUMS = 4 * _PADDED
-# In the first cells from rest a bearing means little; so far beyond the fold, and before the
-# smallest arc length (as η), the outermost cells serve.
+# Range of validity: ρ from one cell above rest, where the bearing is ill-defined, to slightly
+# beyond the fold; η from slightly below the smallest arc length. Beyond the chart the outermost
+# cells are extrapolated.
 _LEAST, _MOST, _BEFORE = 1.0 / 16.0, 1.02, 1.0 / 32.0
 
 
@@ -36,12 +38,12 @@ class Charted(NamedTuple):
 
     rod: Rod
     fold: Fold
-    nodes: Array  # (i, j, k, 32), see `interpolant`
+    nodes: Array  # (i, j, k, 32), from `interpolant`
 
 
 @lru_cache(maxsize=16)
 def interpolant(chart: StableSet) -> Array:
-    """(F, p) of the chart's nodes, and their changes by a cell along η, ψ and ρ: (i, j, k, 32)."""
+    """(F, p) at the chart's nodes, and its derivatives in cells along η, ψ, ρ: (i, j, k, 32)."""
     size = np.array([1.0, 2.0 * np.pi, 1.0]) / (np.array(chart.values.shape[:3]) - 1)
     nodes = np.zeros((*chart.values.shape[:3], 4, _PADDED))
     nodes[..., 0, :6] = chart.values
@@ -50,13 +52,13 @@ def interpolant(chart: StableSet) -> Array:
 
 
 def charted_rod(chart: StableSet) -> Charted:
-    """Rod and chart together, for the kernels."""
+    """Rod, fold and interpolation table of a chart, for the kernels."""
     return Charted(chart.discretization.rod, chart.fold, interpolant(chart))
 
 
 @inlined
 def _side(t: float, upper: bool) -> tuple[float, float, float, float, float, float]:
-    """Weights l, g and χ of one side of a cell at the fraction t of it, and their slopes."""
+    """Weights l, g and χ of one side of a cell at its fraction t, and their derivatives."""
     u = 1.0 - t
     bent = 6.0 * t * u
     if upper:
@@ -66,7 +68,7 @@ def _side(t: float, upper: bool) -> tuple[float, float, float, float, float, flo
 
 @inlined
 def _add_values(b: Array, n: int, v: float, x: float, y: float, z: float) -> None:
-    """Add the corner in the buffer to the n sums of values, by the weights of its four rows."""
+    """Add the corner in the buffer to the n sums of values, with the weights of its four rows."""
     for q in range(n):
         rows = v * b[q] + x * b[_PADDED + q]
         b[_SUMS + q] += rows + y * b[2 * _PADDED + q] + z * b[3 * _PADDED + q]
@@ -89,7 +91,7 @@ def _add_slopes(
     z_y: float,
     z_z: float,
 ) -> None:
-    """Add the corner in the buffer to the n sums of each slope, by the slopes of these weights."""
+    """Add the corner in the buffer to the n sums of slopes, with the derivatives of the weights."""
     for q in range(n):
         v, x, y, z = b[q], b[_PADDED + q], b[2 * _PADDED + q], b[3 * _PADDED + q]
         b[_SUMS + _PADDED + q] += v_x * v + x_x * x + y_x * y + z_x * z
@@ -99,11 +101,11 @@ def _add_slopes(
 
 @inlined
 def _blend(nodes: Array, x: float, y: float, z: float, b: Array, slopes: bool) -> None:
-    """Leave values, and if wanted their slopes by (x, y, z), which count cells, in the buffer."""
+    """Compute values, and if requested slopes, at (x, y, z) in cells; left in the buffer."""
     i = min(int(x), nodes.shape[0] - 2)
     j = min(int(y), nodes.shape[1] - 2)
     k = min(int(z), nodes.shape[2] - 2)
-    size = nodes.shape[3]  # not a constant: short loops are unrolled before they are vectorised
+    size = nodes.shape[3]  # not a constant: short loops would be unrolled instead of vectorised
     for q in range(size):
         b[_SUMS + q] = 0.0
     for m in range(2):
@@ -146,9 +148,9 @@ def _blend(nodes: Array, x: float, y: float, z: float, b: Array, slopes: bool) -
 def interpolate(
     nodes: Array, fold: Fold, b: Array, x: Array, value: Array, tangents: Array, slopes: bool
 ) -> bool:
-    """Fill (F, p), and if wanted ∂(F, p)/∂x (6, 4), of a contact x without friction.
+    """Fill (F, p), and if requested ∂(F, p)/∂x (6, 4), of a contact x = (s, 0, f_y, f_z).
 
-    Return whether it is on the map; where it is not, or too near rest, nothing is filled.
+    Return whether x is in the range of the interpolation; otherwise nothing is filled.
     """
     s, fy, fz = x[0], x[2], x[3]
     force = math.hypot(fy, fz)

@@ -1,6 +1,6 @@
-"""The rod equations, integrated from the contact to the base, for four contacts at a time.
+"""Integration of the rod equations from the contact to the base, for four contacts at a time.
 
-For a contact at arc length s_c with force f in the material frame there (:doc:`theory`)::
+For a contact at arc length s_c with force f in the material frame at the contact (:doc:`theory`)::
 
     n' = n × u,   q' = q × u - e₁,   u = u₀(s) + c(s) ∘ (q × n),   n(s_c) = f,   q(s_c) = 0
 
@@ -18,15 +18,15 @@ and start as -(n', q')(s_c) for s_c, and as unit forces for the components of f.
 ξ = (s_c, f_y, f_z) for a contact on the whisker's side; for a contact at the very tip, where s_c
 stays at L and the force need not be normal to the whisker, they are (f_x, f_y, f_z).
 
-All lanes share the same steps; the step that holds a lane's contact is shortened to it and the
+All lanes share the same steps; the step that contains a lane's contact is shortened to it, and the
 steps beyond it have length zero, so there are no branches and no gathers, and the loop over lanes
-vectorises. That needs the lane buffer to be one flat array with offsets known to the compiler.
+vectorises. This requires the lane buffer to be one flat array with offsets known to the compiler.
 
-The integrator, for this and for all else that follows the rod, is Butcher's explicit Runge-Kutta
-method of order 6 with 7 stages (J. C. Butcher, *On Runge-Kutta processes of high order*, J.
-Austral. Math. Soc. 4 (1964) 179-194): :func:`runge_kutta_step`, for two vectors at a time. A vector
-that is fixed in space is carried along by v' = v × u. A base of finite stiffness is a piece of rod
-without length (``extent`` 0) ahead of the first step.
+The integrator, used for everything that follows the rod, is Butcher's explicit Runge-Kutta method
+of order 6 with 7 stages (J. C. Butcher, *On Runge-Kutta processes of high order*, J. Austral. Math.
+Soc. 4 (1964) 179-194): :func:`runge_kutta_step`, for two vectors at a time. A vector fixed in space
+obeys v' = v × u in the material frame. A compliant base is a piece of rod without length
+(``extent`` 0) before the first step.
 """
 
 from __future__ import annotations
@@ -43,23 +43,23 @@ from vibrissa.rod.discretization import Rod
 Cubic: TypeAlias = tuple[float, float, float, float]
 Piece: TypeAlias = tuple[tuple[Cubic, Cubic, Cubic, Cubic], float, float, float]
 Pair: TypeAlias = tuple[Vector, Vector]
-#: Two vectors as one.
+#: Two vectors in one tuple.
 Six: TypeAlias = tuple[float, float, float, float, float, float]
 Step = TypeVar("Step", Vector, Six)
 
 LANES = 4
-STAGE = 14 * LANES  # a stage keeps n, q, u (3 each), the two compliances and δu (3)
-TURN = 6 * LANES  # u in a stage
+STAGE = 14 * LANES  # a stage stores n, q, u (3 each), the two compliances and δu (3)
+TURN = 6 * LANES  # offset of u in a stage
 _SOFT = 9 * LANES
 _D_TURN = 11 * LANES
 ARC = 7 * STAGE  # s_c
 FORCE = ARC + LANES
 LEVER = FORCE + 3 * LANES
-TANGENT = LEVER + 3 * LANES  # three tangents of (n, q), or vectors that are carried along
-_H = TANGENT + 18 * LANES  # the step, negative from the contact to the base
+TANGENT = LEVER + 3 * LANES  # three tangents of (n, q), or vectors fixed in space
+_H = TANGENT + 18 * LANES  # step length, negative from the contact to the base
 TIP = _H + LANES  # 1 where the first unknown is f_x instead of s_c
-_MOVING = TIP + LANES  # the tangent that takes a step
-LEAN = _MOVING + 6 * LANES  # direction of weight at the tip, material frame, where it was last
+_MOVING = TIP + LANES  # tangent during its step
+LEAN = _MOVING + 6 * LANES  # last direction of weight at the tip, material frame
 BUFFER_SIZE = LEAN + 3 * LANES
 
 
@@ -81,7 +81,7 @@ def add(a: Vector, b: Vector) -> Vector:
 
 @inlined
 def _axpy(y: Step, a: float, x: Step) -> Step:
-    if len(y) == 6:  # the compiler keeps the branch that is right
+    if len(y) == 6:  # resolved at compile time
         return (
             y[0] + a * x[0],
             y[1] + a * x[1],
@@ -101,13 +101,13 @@ def get(b: Array, row: int, i: int) -> Vector:
 
 @inlined
 def put(b: Array, row: int, i: int, v: Vector) -> None:
-    """Put a vector of lane i in its place in the buffer."""
+    """Write a vector of lane i to a row of the buffer."""
     b[row + i] = v[0]
     b[row + LANES + i] = v[1]
     b[row + 2 * LANES + i] = v[2]
 
 
-# Butcher's tableau, a stage's argument each: y + h Σ a_j k_j.
+# Arguments of the stages in Butcher's tableau: y + h Σ a_j k_j.
 
 
 @inlined
@@ -157,8 +157,8 @@ def runge_kutta_step(
 ) -> tuple[Step, Step]:
     """Take a step of length h with two vectors of lane i.
 
-    ``rates(data, stage, left, i, x, y)`` gives their slopes in a stage (from 0), of which the
-    fraction ``left`` of the step is left to go.
+    ``rates(data, stage, left, i, x, y)`` returns their derivatives in a stage (from 0), where the
+    fraction ``left`` of the step remains.
     """
     x1, y1 = rates(data, 0, 1.0, i, x, y)
     x2, y2 = rates(data, 1, 2.0 / 3.0, i, _y2(x, h, x1), _y2(y, h, y1))
@@ -201,7 +201,7 @@ def section(piece: Piece, t: float) -> Pair:
 
 @inlined
 def turning(u0: Vector, c: Vector, m: Vector) -> Vector:
-    """Curvature under a moment."""
+    """Curvature under a moment m."""
     return (u0[0] + c[0] * m[0], u0[1] + c[1] * m[1], u0[2] + c[2] * m[2])
 
 
@@ -209,7 +209,7 @@ def turning(u0: Vector, c: Vector, m: Vector) -> Vector:
 def _value_rates(
     data: tuple[Array, Piece, float, bool], stage: int, left: float, i: int, n: Vector, q: Vector
 ) -> Pair:
-    """Slopes of (n, q); the stage is kept if tangents follow."""
+    """Derivatives of (n, q); the stage is stored if tangents follow."""
     b, piece, t, keep = data
     u0, c = section(piece, t * left)
     u = turning(u0, c, cross(q, n))
@@ -228,7 +228,7 @@ def _value_rates(
 def _tangent_rates(
     data: tuple[Array, bool], stage: int, left: float, i: int, dn: Vector, dq: Vector
 ) -> Pair:
-    """Slopes of a tangent on the stages that the values left; δu is kept if asked for."""
+    """Derivatives of a tangent, from stages stored with the values; δu is stored if ``keep``."""
     b, keep = data
     row = stage * STAGE
     n, q, u = get(b, row, i), get(b, row + 3 * LANES, i), get(b, row + TURN, i)
@@ -244,7 +244,7 @@ def _tangent_rates(
 def carried_rates(
     data: tuple[Array, float], stage: int, left: float, i: int, v: Vector, w: Vector
 ) -> Pair:
-    """Slopes of a vector that is fixed in space, and of one whose end moves along the rod."""
+    """Derivatives of a vector fixed in space, and of one whose end moves along the rod."""
     b, extent = data
     u = get(b, stage * STAGE + TURN, i)
     dw = cross(w, u)
@@ -255,7 +255,7 @@ def carried_rates(
 def _d_carried_rates(
     data: tuple[Array], stage: int, left: float, i: int, v: Vector, dv: Vector
 ) -> Pair:
-    """Slopes of a vector that is fixed in space and of its tangent."""
+    """Derivatives of a vector fixed in space and of its tangent."""
     b, row = data[0], stage * STAGE
     u, du = get(b, row + TURN, i), get(b, row + _D_TURN, i)
     return cross(v, u), add(cross(dv, u), cross(v, du))
@@ -263,7 +263,7 @@ def _d_carried_rates(
 
 @inlined
 def _value_step(rod: Rod, b: Array, k: int, tangents: bool) -> None:
-    """Take step k with (n, q) of every lane; keep the stages if tangents follow."""
+    """Take step k with (n, q) of every lane; store the stages if tangents follow."""
     start, width, piece = rod.start[k], rod.width[k], piece_of(rod, k)
     inverse_width = 1.0 / width
     for i in range(LANES):
@@ -276,7 +276,7 @@ def _value_step(rod: Rod, b: Array, k: int, tangents: bool) -> None:
         put(b, LEVER, i, q)
         if tangents:
             b[_H + i] = -h
-            # The lane's contact lies in this step: its s-tangent starts here.
+            # The lane's contact is in this step: its s-tangent starts here.
             if s > start and s <= start + width and b[TIP + i] == 0.0:
                 u = get(b, TURN, i)
                 dq = cross(u, q0)
@@ -286,7 +286,7 @@ def _value_step(rod: Rod, b: Array, k: int, tangents: bool) -> None:
 
 @inlined
 def _tangent_step(b: Array, row: int, keep: bool) -> None:
-    """Take the same step with the tangent at ``row``, on the stages that the values left."""
+    """Take the same step with the tangent at ``row``, from the stages stored with the values."""
     for i in range(6 * LANES):
         b[_MOVING + i] = b[row + i]
     for i in range(LANES):
@@ -300,7 +300,7 @@ def _tangent_step(b: Array, row: int, keep: bool) -> None:
 
 @inlined
 def _carry_step(b: Array, row: int) -> None:
-    """Take the same step with a vector that is fixed in space."""
+    """Take the same step with a vector fixed in space."""
     for i in range(LANES):
         v = get(b, row, i)
         v, _ = runge_kutta_step(carried_rates, (b, 0.0), i, b[_H + i], v, v)
@@ -337,7 +337,7 @@ def set_lane(b: Array, i: int, s: float, fx: float, fy: float, fz: float, tip: b
 
 @inlined
 def set_all_lanes(b: Array, s: float, fx: float, fy: float, fz: float) -> None:
-    """Load every lane with one contact; their first tangents are those of s, f_x, f_y, f_z."""
+    """Load every lane with the same contact; first tangents are those of s, f_x, f_y, f_z."""
     for i in range(LANES):
         set_lane(b, i, s, fx, fy, fz, i > 0)
         for row in range(3):
@@ -396,7 +396,7 @@ def integrate_weightless(rod: Rod, b: Array, tangents: int) -> None:
 
 @kernel
 def carry_tangents(rod: Rod, contacts: Array, tangents: Array, first: int, last: int) -> None:
-    """Unit tangents of the deflected whisker at many contacts."""
+    """Compute unit tangents of the deflected whisker at many contacts."""
     b = np.zeros(BUFFER_SIZE)
     for row in range(first, last, LANES):
         for i in range(LANES):
@@ -413,14 +413,14 @@ def carry_tangents(rod: Rod, contacts: Array, tangents: Array, first: int, last:
 
 @kernel
 def contact_state(rod: Rod, contact: Array, state: Array) -> None:
-    """One contact (s, f) with its tangent t, and all derivatives by (s, f_x, f_y, f_z).
+    """Evaluate a contact (s, f) and its tangent t, with derivatives by (s, f_x, f_y, f_z).
 
-    ``state`` (9, 5) is filled: (F, p, t) in column 0, its derivatives in the others.
+    Fills ``state`` (9, 5): (F, p, t) in column 0, its derivatives in the others.
     """
     b = np.zeros(BUFFER_SIZE)
     s = contact[0]
     set_all_lanes(b, s, contact[1], contact[2], contact[3])
-    carried = TANGENT + 6 * LANES  # t and δt take the place of the tangents that are not used
+    carried = TANGENT + 6 * LANES  # rows of t and δt, in place of unused tangents
     for i in range(LANES):
         put(b, carried, i, (1.0, 0.0, 0.0))
         put(b, carried + 3 * LANES, i, (0.0, 0.0, 0.0))
@@ -429,7 +429,7 @@ def contact_state(rod: Rod, contact: Array, state: Array) -> None:
         if rod.start[k] >= s:
             continue
         _value_step(rod, b, k, True)
-        if at_contact:  # where t' = e₁ × u
+        if at_contact:  # there t' = e₁ × u
             b[carried + 4 * LANES] = b[TURN + 2 * LANES]
             b[carried + 5 * LANES] = -b[TURN + LANES]
             at_contact = False

@@ -1,17 +1,17 @@
-"""Newton's method on the rod, four contacts at a time.
+"""Newton's method for contacts of the rod, four at a time.
 
-A problem that starts from a seed of the chart (:mod:`vibrissa.rod.tree`) first takes chord
-steps in the chart's coordinates with the interpolant's own Jacobian, which is right to a part in a
-thousand: three or four evaluations of the rod, no derivatives. What that does not solve takes
-Newton steps in ξ. The exact Jacobian costs four times the values, so it is computed again only
-where the last one has stopped serving (a chord step that reduces the residual less than tenfold).
+A problem that starts from a seed of the chart (:mod:`vibrissa.rod.tree`) first takes chord steps in
+the chart's coordinates with the interpolant's own Jacobian, which is accurate to one part in a
+thousand: three or four evaluations of the rod, no derivatives. Problems not solved by these take
+Newton steps in ξ. The exact Jacobian costs four times as much as the values, so it is recomputed
+only after a chord step that reduces the residual less than tenfold.
 
-An *equation* states what must vanish: an inlined function
+An *equation* is an inlined function
 
     equation(value (6,), tangents (6, 3), wanted, target, residual (3,), jacobian (3, 3)) -> misfit
 
-that fills ``residual`` and, if ``wanted``, ``jacobian`` (its derivatives with respect to ξ) from
-base force and contact point, and returns the residual's norm in units in which 1 is large.
+that computes the ``residual`` to be zeroed and, if ``wanted``, its ``jacobian`` with respect to ξ,
+from base force and contact point, and returns the residual's norm in units in which 1 is large.
 """
 
 from __future__ import annotations
@@ -34,25 +34,25 @@ from vibrissa.rod.kernels import (
     set_lane,
 )
 
-#: Residual at which an equation is solved.
+#: Residual norm below which an equation is solved.
 TOLERANCE = 1e-11
-#: Contacts up to this far (in L) beyond the tip or before the proximal limit are there by rounding.
+#: Distance (over L) beyond the tip or the proximal limit that is attributed to rounding.
 ROUNDING = 1e-9
-# Toward a fold of the equations Newton's method gains a bit a round instead of doubling the digits.
+# Largest number of rounds; near a fold of the equations convergence is only linear.
 _ROUNDS = 30
-# Rounds with a fresh Jacobian that may fail to improve on the best residual.
+# Largest number of rounds with a fresh Jacobian that may fail to reduce the best residual.
 _MOST_FAILURES = 4
 _CHORD_ROUNDS = 6
-# Beyond this share of the fold force a solution's determinant is computed at the solution.
+# Share of the fold force above which the determinant is evaluated at the solution itself.
 _NEAR_FOLD = 0.97
-#: The interpolated fold force is good to a few parts in 10⁴; up to this much above it the
-#: determinant's sign decides.
+#: The interpolated fold force is accurate to a few parts in 10⁴; up to this multiple of it the sign
+#: of the determinant decides on stability.
 ABOVE_FOLD = 1.01
 
 
 @inlined
 def limited_step(fold: Fold, xi: Array, step: Array) -> None:
-    """Take a step of ξ = (s, f_y, f_z), shortened to what a linearisation can be trusted for."""
+    """Take a step of ξ = (s, f_y, f_z), shortened to where the linearisation can be trusted."""
     strength = fold_force(fold, xi[0], float(np.arctan2(xi[2], xi[1])))
     longest = max(abs(step[0]) / 0.1, float(np.hypot(step[1], step[2])) / (0.3 * strength))
     shorten = 1.0 / max(longest, 1.0)
@@ -75,7 +75,7 @@ def _chord_rounds(
     values: Array,
     misfits: Array,
 ) -> None:
-    """Chord steps in the chart for the rows with ``inverses``; see :func:`newton_group`."""
+    """Take chord steps for the rows with finite ``inverses``; see :func:`newton_group`."""
     value, residual = np.empty(6), np.empty(3)
     tangents, jacobian = np.empty((6, 3)), np.empty((3, 3))
     active = np.zeros(LANES, np.bool_)
@@ -115,13 +115,13 @@ def _chord_rounds(
 def _integrate_rows(
     rod: Rod, b: Array, count: int, xi: Array, active: AnyArray, stale: AnyArray
 ) -> tuple[bool, bool]:
-    """Integrate all rows; return whether with tangents, and whether those of one row alone."""
+    """Integrate all rows; return whether with tangents, and whether only one row had them."""
     wanted, number, only = False, 0, 0
     for i in range(count):
         if active[i]:
             wanted = wanted or stale[i]
             number, only = number + 1, i
-    alone = LANES > 1 and wanted and number == 1  # its tangents side by side
+    alone = LANES > 1 and wanted and number == 1  # a lane for each of its tangents
     if alone:
         set_all_lanes(b, xi[only, 0], 0.0, xi[only, 1], xi[only, 2])
     else:
@@ -134,6 +134,7 @@ def _integrate_rows(
 
 @inlined
 def _row_tangents(b: Array, i: int, alone: bool, tangents: Array) -> None:
+    """Copy ∂(F, p)/∂ξ of a row."""
     if not alone:
         lane_tangents(b, i, tangents)
         return
@@ -158,7 +159,7 @@ def newton_group(
     misfits: Array,
     signs: Array,
 ) -> None:
-    """Solve up to four problems side by side, in place."""
+    """Solve up to four problems in parallel, in place; the first ``count`` rows are used."""
     value, tangents = np.empty(6), np.empty((6, 3))
     residual, step = np.empty(3), np.empty(3)
     jacobians = np.empty((LANES, 3, 3))
@@ -189,7 +190,7 @@ def newton_group(
                 signs[i] = point_determinant(tangents)
             misfit = equation(value, tangents, wanted, targets[i], residual, jacobians[i])
             stale[i] = not misfit < 0.1 * misfits[i]
-            # Once a chord has failed there is no gain in trying more of them.
+            # Once a chord step has failed, more of them gain nothing.
             hard[i] = hard[i] or (stale[i] and not wanted)
             if wanted and not misfit < misfits[i]:
                 failures[i] += 1
@@ -221,7 +222,7 @@ def newton_group(
 
 @inlined
 def start_from(found: Array, slopes: Array, quality: int, chart: Array, inverse: Array) -> None:
-    """Set a row of :func:`newton_group` from a seed; what is not solved takes Newton steps."""
+    """Initialise a row of :func:`newton_group` from a seed; one of poor quality has no inverse."""
     copy(found, chart)
     for a in range(3):
         for c in range(3):
@@ -242,7 +243,7 @@ def point_determinant(tangents: Array) -> float:
 
 @inlined
 def stable(fold: Fold, proximal: float, xi: Array, sign: float) -> bool:
-    """Whether a solution lies in the charted, stable set (up to rounding)."""
+    """Whether a solution is in the charted stable set, up to rounding."""
     if not (sign > 0.0 and xi[0] >= proximal - ROUNDING):
         return False
     strength = fold_force(fold, xi[0], float(np.arctan2(xi[2], xi[1])))

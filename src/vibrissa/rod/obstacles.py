@@ -1,23 +1,23 @@
-"""A whisker against objects, touched wherever it meets them: two points, tip and side, an arc.
+"""Equilibrium of a whisker against rigid objects, with any number of contact points and arcs.
 
-Quasi-static, without friction, objects rigid. Elastic energy is least among all shapes that enter
-no object,
+Quasi-static and frictionless. The elastic energy is minimal among all shapes that penetrate no
+object,
 
     minimise ½ ∫ (u - u₀)·B (u - u₀) ds   with   d(r(s_j)) - a(s_j) ≥ 0 at nodes s_j,
 
-d being an object's signed distance and a the whisker's radius. The multipliers λ_j ≥ 0 are normal
-forces; that is, of λ_j and the gap one at least is zero. Where the whisker lies along an object,
-the force per length is λ_j over the spacing of nodes; λ at the ends of such an arc includes the
-concentrated forces there. At a node, the whisker is met from the side or, at the last one, at the
-tip. On a smooth convex object the outer end of an arc is the tip, or where the whisker's intrinsic
-curvature is that of the object: only there is the moment zero, as it is beyond all contacts.
+where d is an object's signed distance and a the whisker's radius. The multipliers λ_j ≥ 0 are the
+normal forces; at each node λ_j or the gap is zero. Where the whisker follows an object along an
+arc, the force per length is λ_j over the node spacing, and λ at the ends of the arc includes the
+concentrated forces there. A contact is on the whisker's side, or at the last node on its tip. On a
+smooth convex object the outer end of an arc is the tip, or where the whisker's intrinsic curvature
+equals that of the object: only there does the moment vanish, as it must beyond all contacts.
 
-On each element between two nodes u is linear through its values at two Gauss points; frames follow
-by Magnus' method and places by the same series, both of fourth order. Turning a cross-section by
-δθ moves what lies beyond it by δθ × (r_j - r), so that the moment there is Σ (r_j - r) × λ_j n_j:
-equilibrium holds at the Gauss points. Newton's method with the exact second derivatives of the
-Lagrangian solves, in each round, the quadratic problem with all linearised gaps by its dual. A
-contact in a single point gets a node of its own.
+On each element between two nodes, u is linear through its values at two Gauss points; frames follow
+from Magnus' method and positions from the same series, both of fourth order. Turning a
+cross-section by δθ moves all distal points by δθ × (r_j - r), so the moment there is
+Σ (r_j - r) × λ_j n_j: equilibrium holds at the Gauss points. Each round of Newton's method, with
+the exact second derivatives of the Lagrangian, solves the dual of the quadratic problem with all
+linearised gaps. A contact at a single point gets a node of its own.
 """
 
 from __future__ import annotations
@@ -35,26 +35,26 @@ from vibrissa.rod.chart import LEAST_ARC
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
-# Elements of the whisker, and of a compliant base.
+# Number of elements of the whisker, and of a compliant base.
 ELEMENTS, _JOINT_ELEMENTS = 32, 4
 _TAPER_EXPONENT = 0.4
 _ROUNDS, _TOLERANCE = 60, 1e-10
-_LONGEST = 0.2  # largest turn of a cross-section in one round, rad
-_NEAR = 0.05  # gaps smaller than this, over L, can close in one round
-# Single contacts move their node this often, or until it moves by less than this, over L.
+_LONGEST = 0.2  # largest rotation of a cross-section in one round, rad
+_NEAR = 0.05  # gaps smaller than this, over L, may close in one round
+# Largest number of times that nodes move to single contacts, and the move, over L, that ends this.
 _MOVES, _MOVED = 6, 1e-6
-_SHARED = 0.02  # error of the end of an arc, over the distance of nodes
-_COMPARED = 33  # points of two shapes that are compared
-# No node comes nearer to another than this share of their distance.
+_SHARED = 0.02  # error of the end of an arc, over the node spacing
+_COMPARED_POINTS = 33  # points at which two shapes are compared
+# Smallest spacing of nodes after a move, as a share of that before.
 _APART = 0.2
-_AHEAD = 1e-6  # step, over L, for the slope of the radius, on the side away from the base
+_AHEAD = 1e-6  # step for the slope of the radius, toward the tip, over L
 _ROOT = np.sqrt(3.0)
 _STAGES = np.array([[0.25, 0.25 - _ROOT / 6.0], [0.25 + _ROOT / 6.0, 0.25]])
 _GAUSS = np.array([0.5 - _ROOT / 6.0, 0.5 + _ROOT / 6.0])
 
 
 class Grid(NamedTuple):
-    """Elements of a whisker, non-dimensional; those of a compliant base have no extent."""
+    """Elements of a whisker, non-dimensional; those of a compliant base have zero extent."""
 
     s: Array  # (n + 1,), arc lengths of the nodes; 0 in a compliant base
     # (n,) Widths of the elements, and centreline length per width.
@@ -71,12 +71,12 @@ class Grid(NamedTuple):
 
     @property
     def first(self) -> float:
-        """Arc length of the first node at which contacts are looked for."""
+        """Arc length of the first node that can be in contact."""
         return float(self.s[self.s > LEAST_ARC][0])
 
     @classmethod
     def of(cls, whisker: Whisker, elements: int = ELEMENTS) -> Grid:
-        """Elements that are shorter where the whisker is thin, with nodes at kinks."""
+        """Grid of elements that are shorter where the whisker is thin, with nodes at kinks."""
         s = np.linspace(0.0, 1.0, 2049)
         density = (whisker.radius(s * whisker.length) / whisker.base_radius) ** -_TAPER_EXPONENT
         even = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
@@ -87,20 +87,20 @@ class Grid(NamedTuple):
 
     @classmethod
     def at(cls, whisker: Whisker, nodes: Array) -> Grid:
-        """Elements between nodes (n + 1,) on the whisker, after those of its base."""
+        """Grid of elements between nodes (n + 1,) of the whisker, after those of its base."""
         length, joint = whisker.length, 0 if whisker.base_stiffness is None else _JOINT_ELEMENTS
         width = np.diff(nodes)
         t, weights = np.polynomial.legendre.leggauss(4)
         inside = (0.5 * (nodes[1:] + nodes[:-1]))[:, None] + 0.5 * width[:, None] * t
         curvature = whisker.curvature(inside * length) * length
         soft = (whisker.radius(inside * length) / whisker.base_radius) ** -4.0
-        # What is linear on an element, and nearest to these samples.
+        # Values at the Gauss points of the linear function nearest to these samples.
         line = 0.5 * weights + np.outer([-1.0, 1.0], 0.5 * _ROOT * weights * t)
         rest = np.einsum("pg,kgi->kpi", line, curvature)
         stiffness = 1.0 / np.multiply.outer(
             np.einsum("pg,kg->kp", line, soft), [1.0 + whisker.poisson_ratio, 1.0, 1.0]
         )
-        at = nodes * length  # where the radius jumps the thick side meets objects first
+        at = nodes * length  # where the radius jumps, the thicker side touches first
         radius = np.maximum(whisker.radius(at), whisker.radius(at, side="left")) / length
         kinks = np.array([0.0, *whisker.breaks, length]) / length
         fixed = np.abs(nodes[:, None] - kinks).min(axis=1) < 1e-12
@@ -130,7 +130,7 @@ class Grid(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """Places and frames at the nodes (n + 1, ...) and at the Gauss points (2n, ...)."""
+    """Positions and frames at the nodes (n + 1, ...) and at the Gauss points (2n, ...)."""
 
     nodes: Array
     frames: Array
@@ -139,7 +139,7 @@ class Shape(NamedTuple):
 
 
 def _rotation(w: Array) -> tuple[Array, Array]:
-    """Matrices (..., 3, 3) exp [w] and ∫ exp [w t] dt from 0 to 1."""
+    """Matrices (..., 3, 3) exp [w], and ∫ exp [w t] dt over t from 0 to 1."""
     cross = np.zeros((*w.shape, 3))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         cross[..., k, j], cross[..., j, k] = w[..., i], -w[..., i]
@@ -155,7 +155,7 @@ def _rotation(w: Array) -> tuple[Array, Array]:
 
 
 def bend(grid: Grid, strain: Array) -> Shape:
-    """Integrate a curvature that differs by ``strain`` (n, 2, 3) from that at rest."""
+    """Integrate the resting curvature plus ``strain`` (n, 2, 3) from base to tip."""
     u = grid.rest + strain
     h = grid.width[:, None]
     turn = 0.5 * h * (u[:, 0] + u[:, 1]) + _ROOT / 12.0 * h**2 * np.cross(u[:, 0], u[:, 1])
@@ -178,13 +178,13 @@ def bend(grid: Grid, strain: Array) -> Shape:
 
 
 class Obstacles:
-    """Objects as seen from the base, non-dimensional."""
+    """Objects in the frame of the base, non-dimensional."""
 
     def __init__(self, surfaces: Sequence[Surface], place: Placement, length: float) -> None:
         self._surfaces, self._place, self._length = surfaces, place, length
 
     def gaps(self, points: Array, radius: Array) -> Array:
-        """Distances (surfaces, n) between the whisker's surface and those of objects."""
+        """Distances (surfaces, n) between the whisker's surface at points and the objects."""
         outside = self._place.outside(points * self._length)
         distances = [surface.signed_distance(outside) for surface in self._surfaces]
         return np.array(distances) / self._length - radius
@@ -203,19 +203,19 @@ class Obstacles:
 
 
 class Equilibrium(NamedTuple):
-    """A whisker against objects, non-dimensional, in the whisker frame."""
+    """Equilibrium of a whisker against objects, non-dimensional, in the whisker frame."""
 
-    grid: Grid  # Elements
+    grid: Grid  # elements
     strain: Array  # (n, 2, 3), curvature minus that at rest, at the Gauss points
     pressing: Array  # (surfaces, n + 1), normal forces at the nodes
-    # (n + 1, 3) Places and frames of the nodes.
+    # (n + 1, 3) and (n + 1, 3, 3) Positions and frames of the nodes.
     nodes: Array
     frames: Array
-    # (surfaces, n + 1, 3) Outward normals of the objects at nodes that they press on, else 0.
+    # (surfaces, n + 1, 3) Outward normals of the objects at the nodes they touch, else 0.
     normals: Array
 
     def contacts(self) -> tuple[Array, IntArray, Array, Array]:
-        """Arc lengths (k,), objects, places (k, 3) and forces (k, 3), from the base outward."""
+        """Arc lengths (k,), object indices, positions (k, 3) and forces (k, 3), ordered by s."""
         node, surface = np.nonzero(self.pressing.T > 0.0)
         push = self.pressing[surface, node, None] * self.normals[surface, node]
         return self.grid.s[node], surface, self.nodes[node], push
@@ -226,10 +226,10 @@ class Equilibrium(NamedTuple):
         return np.concatenate([push.sum(axis=0), np.cross(place, push).sum(axis=0)])
 
     def first_contact(self) -> tuple[float, Array, Array]:
-        """Arc length and place (3,) of the contact nearest to the base, and its deviation (3,).
+        """Arc length, position (3,) and standard deviation (3,) of the most proximal contact.
 
-        The concentrated force at the end of an arc between two nodes is shared by these. What that
-        leaves open is one standard deviation along the whisker.
+        The concentrated force at the end of an arc is shared by the two nodes next to it, from
+        which the end is interpolated. The deviation is along the whisker.
         """
         s, _, _, push = self.contacts()
         node = np.searchsorted(self.grid.s, s)
@@ -243,7 +243,7 @@ class Equilibrium(NamedTuple):
         return at, spline(at), _SHARED * apart * spline(at, 1)
 
     def pressing_on(self, grid: Grid) -> Array:
-        """Normal forces at the nearest nodes of another grid."""
+        """Normal forces at the nearest nodes of another grid, (surfaces, n + 1)."""
         s, surface, _, push = self.contacts()
         out = np.zeros((len(self.pressing), grid.s.size))
         near = np.abs(grid.s[:, None] - s).argmin(axis=0)
@@ -255,21 +255,22 @@ class Equilibrium(NamedTuple):
         return np.asarray(self._spline()(np.linspace(0.0, 1.0, n)))
 
     def _spline(self) -> interpolate.CubicHermiteSpline:
+        """Hermite spline of the centreline over s, without the base."""
         on = slice(np.count_nonzero(self.grid.extent == 0.0), None)
         return interpolate.CubicHermiteSpline(
             self.grid.s[on], self.nodes[on], self.frames[on, :, 0]
         )
 
     def farthest(self, other: Equilibrium) -> float:
-        """Distance between two shapes where they are farthest apart."""
-        away = self.centerline(_COMPARED) - other.centerline(_COMPARED)
+        """Largest distance between two shapes at equal arc lengths."""
+        away = self.centerline(_COMPARED_POINTS) - other.centerline(_COMPARED_POINTS)
         return float(np.linalg.norm(away, axis=1).max())
 
 
 def solve_at(
     obstacles: Obstacles, grid: Grid, strain: Array, pressing: Array
 ) -> Equilibrium | None:
-    """Newton's method from a guess; None if it does not converge."""
+    """Solve by Newton's method from a guess, at fixed nodes; None if it does not converge."""
     weight = (0.5 * grid.width[:, None, None] * grid.stiffness).reshape(-1)
     for _ in range(_ROUNDS):
         shape = bend(grid, strain)
@@ -282,7 +283,7 @@ def solve_at(
         force = pressing[surface, node]
         moves, bends = _derivatives(grid, shape, node, force, normal, curved)
         slopes = np.einsum("jxi,ji->jx", moves, normal)
-        found = _pushed(
+        found = _solve_quadratic_problem(
             np.diag(weight) - bends, weight, weight * strain.ravel(), slopes, gaps[near]
         )
         if found is None:
@@ -305,13 +306,13 @@ def solve_at(
 def _derivatives(
     grid: Grid, shape: Shape, node: IntArray, force: Array, normal: Array, curved: Array
 ) -> tuple[Array, Array]:
-    """Derivatives (j, 6n, 3) of nodes by strains, and the second ones (6n, 6n) of Σ λ gap."""
+    """Derivatives of nodes by strains (j, 6n, 3), and second derivatives (6n, 6n) of Σ λ gap."""
     count = len(shape.stations)
     axes = np.repeat(0.5 * grid.width, 2)[:, None, None] * np.swapaxes(shape.turned, 1, 2)
     away = shape.nodes[node][:, None] - shape.stations
     away[np.arange(count) >= 2 * node[:, None]] = 0.0
     moves = np.cross(axes, away[:, :, None, :])
-    # Two turns, the first nearer to the base: n·(a × (b × c)) = a·((b × c) × n).
+    # Two rotations, the first nearer to the base: n·(a × (b × c)) = a·((b × c) × n).
     pulled = np.cross(moves, (force[:, None] * normal)[:, None, None, :]).sum(axis=0)
     bends = axes.reshape(-1, 3) @ pulled.reshape(-1, 3).T
     order = np.sign(np.arange(count)[None] - np.arange(count)[:, None])
@@ -324,10 +325,10 @@ def _derivatives(
     return moves, bends
 
 
-def _pushed(
+def _solve_quadratic_problem(
     matrix: Array, weight: Array, slope: Array, gap_slopes: Array, gaps: Array
 ) -> tuple[Array, Array] | None:
-    """Step and multipliers of least energy with all linearised gaps open or closed."""
+    """Step and multipliers that minimise the energy with all linearised gaps non-negative."""
     try:
         factor = linalg.cho_factor(matrix)
     except np.linalg.LinAlgError:
@@ -351,7 +352,7 @@ def _pushed(
 def settled(
     whisker: Whisker, obstacles: Obstacles, grid: Grid, strain: Array, pressing: Array
 ) -> Equilibrium | None:
-    """Solve, with nodes where single contacts are."""
+    """Solve, moving nodes to where contacts at single points are; None if it fails."""
     found = solve_at(obstacles, grid, strain, pressing)
     for _ in range(_MOVES):
         if found is None:
@@ -365,7 +366,7 @@ def settled(
 
 
 def strain_on(found: Equilibrium, grid: Grid) -> Array:
-    """Strains on another grid with the moments of an equilibrium."""
+    """Strains on another grid that have the moments of an equilibrium."""
     moment, out = found.grid.stiffness * found.strain, np.empty_like(grid.stiffness)
     before, now = found.grid.extent > 0.0, grid.extent > 0.0
     out[~now] = moment[~before]
@@ -376,7 +377,7 @@ def strain_on(found: Equilibrium, grid: Grid) -> Array:
 
 
 def _nodes_at_contacts(found: Equilibrium, obstacles: Obstacles) -> Array:
-    """Arc lengths of nodes, one of which is where each contact in one point is."""
+    """Arc lengths of the nodes, with one moved to each contact at a single point."""
     grid, nodes = found.grid, found.grid.s.copy()
     last = nodes.size - 1
     for i, pressed in enumerate(found.pressing > 0.0):
@@ -390,7 +391,7 @@ def _nodes_at_contacts(found: Equilibrium, obstacles: Obstacles) -> Array:
             slope = np.einsum("ji,ji->j", along, normal) - grid.slope[around]
             rising = np.flatnonzero((slope[:-1] < 0.0) & (slope[1:] >= 0.0))
             if not rising.size:
-                continue  # the tip
+                continue  # contact of the tip
             k = int(rising[0])
             a, b = grid.s[around[k]], grid.s[around[k + 1]]
             at = a - slope[k] * (b - a) / (slope[k + 1] - slope[k])
@@ -398,7 +399,7 @@ def _nodes_at_contacts(found: Equilibrium, obstacles: Obstacles) -> Array:
             free = [j for j in pair if not grid.fixed[around[j]]]
             if not free:
                 continue
-            # From the node on, the slope grows as the whisker bends and the surface curves away.
+            # Here the slope increases as the whisker bends and the surface curves away.
             j, near = free[0], int(around[free[0]])
             turning = (along[k + 1] - along[k]) @ normal[j] / (b - a)
             steep = turning + along[j] @ curved[j] @ along[j]
@@ -410,7 +411,7 @@ def _nodes_at_contacts(found: Equilibrium, obstacles: Obstacles) -> Array:
 
 
 def bent_by_one(grid: Grid, arc: float, force: Array, point: Array) -> Array:
-    """Strains (n, 2, 3) of a whisker that one force bends at an arc length, in order outward."""
+    """Strains (n, 2, 3) of a whisker bent by one force at an arc length, from the base outward."""
     strain = np.zeros_like(grid.rest)
     frame, place, e = np.eye(3), np.zeros(3), np.array([1.0, 0.0, 0.0])
     for i, (h, extent) in enumerate(zip(grid.width, grid.extent, strict=True)):

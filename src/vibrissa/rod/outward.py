@@ -1,20 +1,19 @@
-"""The rod equations from the base outward, with the base wrench known.
+"""Integration of the rod equations from the base outward, for a known base wrench.
 
-With n = RᵀF the force and m the moment that the whisker carries, both in the material frame,
+With n = RᵀF the force and m the moment in the whisker, both in the material frame,
 
     n' = n × u,   m' = m × u + n × e₁,   u = u₀(s) + c(s) ∘ m,   n(0) = F,   m(0) = M
 
-up to the contact, and u = u₀ beyond it. Vectors that are fixed in space are carried along by
-v' = v × u; the frame's axes seen from the material frame, and r likewise with r' = r × u + e₁, give
-the place r of the whisker. The steps are those of the contact problem, cut at the contact and at
-the places that are asked for.
+up to the contact, and u = u₀ beyond it. Vectors v fixed in space obey v' = v × u in the material
+frame; the axes of the whisker frame, and the position with r' = r × u + e₁, give the centreline.
+The steps are those of the contact problem, cut at the contact and at the requested arc lengths.
 
-The only external force acts where the moment has vanished: at the contact, m(s_c) = 0, whatever the
-direction of the force. A measured wrench never meets that exactly. Since
+The only external force acts where the moment vanishes: at the contact m(s_c) = 0, whatever the
+direction of the force. A measured wrench never satisfies this exactly. Since
 
     d|m|²/ds = 2 m · (n × e₁),
 
-the places where the moment comes nearest to zero are the zeros of m · (n × e₁) with rising sign.
+the minima of the moment are the zeros of m · (n × e₁) with positive derivative.
 """
 
 from __future__ import annotations
@@ -39,15 +38,15 @@ from vibrissa.rod.kernels import (
     turning,
 )
 
-#: At most so many places are kept for one wrench.
+#: Largest number of minima of the moment returned for one wrench.
 MOST_PLACES = 6
-# What is bent more than this (rad) in one step is no longer the rod, but lies beyond a contact.
+# A step with more bending than this (rad) is no longer on the whisker, but beyond any contact.
 _MOST_TURN = 1.5
-_ROUNDS = 30  # rounds of false position for the zero inside a step
-_NOTHING = 1e-14  # what is left of a step is nothing below this (over L)
+_ROUNDS = 30  # rounds of false position for the zero within a step
+_NOTHING = 1e-14  # lengths below this (over L) count as zero
 
-# A buffer for four whiskers: the stages' curvatures, force and moment, the axes x, y, z and r as
-# the material frame sees them, and the step.
+# Buffer for four whiskers: curvatures of the stages; force and moment; the axes x, y, z and the
+# position r in the material frame; and the step length.
 _N = 7 * STAGE
 _X = _N + 6 * LANES
 _Z = _X + 6 * LANES
@@ -64,7 +63,7 @@ def _rates(
     n: Vector,
     m: Vector,
 ) -> Pair:
-    """Slopes of (n, m); the stage's curvature is kept if vectors are to be carried along."""
+    """Derivatives of (n, m); the stage's curvature is stored if ``keep``."""
     b, piece, begin, share, loaded, keep = data
     u0, c = section(piece, begin + (1.0 - left) * share)
     u = turning(u0, c, (loaded * m[0], loaded * m[1], loaded * m[2]))
@@ -78,7 +77,7 @@ def _rates(
 def _step(
     b: Array, piece: Piece, width: float, low: float, high: float, load: float, keep: bool
 ) -> None:
-    """Take each lane's step: under load from ``low`` in a step of the rod, free up to ``high``."""
+    """Take each lane's step within a rod step: loaded from ``low`` on, or free up to ``high``."""
     for i in range(LANES):
         h = b[_H + i]
         at = low if load > 0.0 else high - h
@@ -100,8 +99,8 @@ def _step(
 
 
 @inlined
-def _begin(b: Array, i: int, value: Array) -> None:
-    """Load lane i with (F, p), the frame at the base, and r = 0."""
+def _load_lane(b: Array, i: int, value: Array) -> None:
+    """Load lane i with (F, p), the axes at the base, and r = 0."""
     force, point = (value[0], value[1], value[2]), (value[3], value[4], value[5])
     put(b, _N, i, force)
     put(b, _N + 3 * LANES, i, cross(point, force))
@@ -112,8 +111,8 @@ def _begin(b: Array, i: int, value: Array) -> None:
 
 
 @inlined
-def _place(b: Array, i: int, place: Array) -> None:
-    """Copy r of lane i, in the whisker frame."""
+def _copy_position(b: Array, i: int, place: Array) -> None:
+    """Copy the position r of lane i, in the whisker frame."""
     r = get(b, _Z + 3 * LANES, i)
     for a in range(3):
         axis = get(b, _X + 3 * a * LANES, i)
@@ -124,19 +123,19 @@ def _place(b: Array, i: int, place: Array) -> None:
 def _shapes(
     rod: Rod, values: Array, arc: Array, s: Array, places: Array, first: int, last: int
 ) -> None:
-    """Places (n, m, 3) at increasing arc lengths s (m,), for values (F, p) and contacts at arc."""
+    """Fill positions (n, m, 3) at increasing s (m,), for values (F, p) and contacts at ``arc``."""
     b = np.zeros(_SIZE)
     for row in range(first, last, LANES):
         lanes, wanted = min(LANES, last - row), 0
         for i in range(LANES):
-            _begin(b, i, values[min(row + i, last - 1)])
+            _load_lane(b, i, values[min(row + i, last - 1)])
         for k in range(rod.start.shape[0]):
             here, end, extent = rod.start[k], rod.start[k] + rod.width[k], rod.extent[k]
             piece = piece_of(rod, k)
             while True:
                 while wanted < s.shape[0] and s[wanted] <= here + 1e-12 and extent > 0.0:
                     for i in range(lanes):
-                        _place(b, i, places[row + i, wanted])
+                        _copy_position(b, i, places[row + i, wanted])
                     wanted += 1
                 if here >= end - 1e-15:
                     break
@@ -153,16 +152,17 @@ def _shapes(
                 here = to
         while wanted < s.shape[0]:
             for i in range(lanes):
-                _place(b, i, places[row + i, wanted])
+                _copy_position(b, i, places[row + i, wanted])
             wanted += 1
 
 
 @kernel
 def _contact_forces(rod: Rod, values: Array, arc: Array, forces: Array) -> None:
+    """Fill forces (n, 3) in the material frame at the contacts."""
     b = np.zeros(_SIZE)
     for row in range(0, forces.shape[0], LANES):
         for i in range(LANES):
-            _begin(b, i, values[min(row + i, forces.shape[0] - 1)])
+            _load_lane(b, i, values[min(row + i, forces.shape[0] - 1)])
         for k in range(rod.start.shape[0]):
             for i in range(LANES):
                 left = arc[min(row + i, forces.shape[0] - 1)] - rod.start[k]
@@ -174,16 +174,16 @@ def _contact_forces(rod: Rod, values: Array, arc: Array, forces: Array) -> None:
 
 
 @inlined
-def _slope(n: Vector, m: Vector) -> float:
-    """Half of d|m|²/ds, m · (n × e₁)."""
+def _moment_slope(n: Vector, m: Vector) -> float:
+    """Half of d|m|²/ds, which is m · (n × e₁)."""
     return float(m[1] * n[2] - m[2] * n[1])
 
 
 @inlined
-def _inside(
+def _zero_in_step(
     b: Array, piece: Piece, width: float, n: Vector, m: Vector, before: float, after: float
 ) -> tuple[float, Vector]:
-    """Where in a step the slope vanishes, by false position (Illinois), and the force there."""
+    """Zero of the moment's slope within a step, by false position (Illinois), and force there."""
     low, high, at_low, at_high = 0.0, width, before, after
     here, force = width, n
     for _ in range(_ROUNDS):
@@ -192,7 +192,7 @@ def _inside(
         here = low - at_low * (high - low) / (at_high - at_low)
         data = (b, piece, 0.0, here / width, 1.0, False)
         force, moment = runge_kutta_step(_rates, data, 0, here, n, m)
-        at = _slope(force, moment)
+        at = _moment_slope(force, moment)
         if abs(at) <= 1e-15 * (abs(before) + abs(after)) or high - low < _NOTHING:
             break
         if at < 0.0:
@@ -204,6 +204,7 @@ def _inside(
 
 @inlined
 def _add(contacts: Array, count: int, s: float, force: Vector) -> int:
+    """Append a contact (s, n) if there is room; return the count."""
     if count < contacts.shape[0]:
         contacts[count, 0] = s
         contacts[count, 1], contacts[count, 2], contacts[count, 3] = force[0], force[1], force[2]
@@ -215,6 +216,7 @@ def _add(contacts: Array, count: int, s: float, force: Vector) -> int:
 def _vanishing_moments(
     rod: Rod, wrenches: Array, least: float, count: IntArray, contacts: Array, first: int, last: int
 ) -> None:
+    """Fill contacts (n, MOST_PLACES, 4) at minima of the moment, and their number (n,)."""
     b = np.zeros(_SIZE)
     steps = rod.start.shape[0]
     for row in range(first, last):
@@ -227,14 +229,14 @@ def _vanishing_moments(
             end, moment = runge_kutta_step(_rates, data, 0, h, n, m)
             turn = h * (abs(rate[0]) + abs(rate[1]) + abs(rate[2]))
             lost = not turn < _MOST_TURN * (abs(n[0]) + abs(n[1]) + abs(n[2]))
-            before, after = _slope(n, m), _slope(end, moment)
+            before, after = _moment_slope(n, m), _moment_slope(end, moment)
             last_step = lost or k == steps - 1
             if not lost and rod.extent[k] > 0.0 and before < 0.0 <= after:
-                here, force = _inside(b, piece, h, n, m, before, after)
+                here, force = _zero_in_step(b, piece, h, n, m, before, after)
                 if rod.start[k] + here >= least:
                     found = _add(contacts[row], found, rod.start[k] + here, force)
             elif last_step and before < 0.0:
-                # Still falling where the whisker, or the sense of going on, ends.
+                # The moment still decreases at the end of the whisker, or of its integration.
                 s = rod.start[k] + (0.0 if lost else h)
                 found = _add(contacts[row], found, s, n if lost else end)
             if last_step:
@@ -244,7 +246,7 @@ def _vanishing_moments(
 
 
 def shapes(discretization: Discretization, values: Array, arc: Array, s: Array) -> Array:
-    """Centrelines of deflected whiskers, non-dimensional."""
+    """Centrelines (n, m, 3) of deflected whiskers at arc lengths s, non-dimensional."""
     places = np.full((len(values), s.size, 3), np.nan)
     rows = np.flatnonzero(np.isfinite(values).all(axis=1) & np.isfinite(arc))
     kept, where = np.ascontiguousarray(values[rows]), np.ascontiguousarray(arc[rows])
@@ -256,7 +258,7 @@ def shapes(discretization: Discretization, values: Array, arc: Array, s: Array) 
 
 
 def contact_forces(discretization: Discretization, values: Array, arc: Array) -> Array:
-    """Forces in the material frame at contacts whose base force and contact point are known."""
+    """Contact forces (n, 3) in the material frame, for known base force and contact point."""
     forces = np.full((len(values), 3), np.nan)
     rows = np.flatnonzero(np.isfinite(values).all(axis=1) & np.isfinite(arc))
     at_contact = np.empty((rows.size, 3))
@@ -268,7 +270,10 @@ def contact_forces(discretization: Discretization, values: Array, arc: Array) ->
 def vanishing_moments(
     discretization: Discretization, wrenches: Array, least: float
 ) -> tuple[IntArray, Array]:
-    """Find where the moment in the whisker comes nearest to zero, for known base wrenches."""
+    """Find the minima of the moment in the whisker for base wrenches (n, 6).
+
+    Returns their number (n,), and (s, n) at each, (n, MOST_PLACES, 4).
+    """
     count = np.zeros(len(wrenches), np.int64)
     contacts = np.full((len(wrenches), MOST_PLACES, 4), np.nan)
     rod, wrenches = discretization.rod, np.ascontiguousarray(wrenches)

@@ -1,10 +1,10 @@
-"""The contact with a peg: a line, or a cylinder with a radius; side or tip of the whisker.
+"""Contacts of a whisker with pegs: lines or cylinders, touched by the whisker's side or tip.
 
-A peg met from rest is moved, in thought, from far on its side along the direction in which it
-pushes until it touches the resting whisker, and from there to where it is, the contact followed all
-the way (:mod:`vibrissa.rod.continuation`). A line that so passes by the tip may still hold the
-whisker, which leans over when it is bent; it is moved from a touch near the tip straight to its
-place. A peg met from an earlier deflection moves straight from its place then to its place now.
+A peg is first displaced from its position, against the force, to where it just touches the resting
+whisker, and then moved back with the contact followed (:mod:`vibrissa.rod.continuation`). A line
+whose path misses the tip may still hold the bent whisker; it is moved straight from a contact near
+the tip to its position. With an earlier deflection, a peg is moved straight from its earlier
+position to its present one.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from vibrissa.rod.points import Solutions, follow_all
 from vibrissa.status import Status
 
 _SAMPLES = 513
-_DEPTH = 1e-6  # the first touch, as deep as the least force needs
-# Arc length (over L) of the touch from which a line that passes by the tip is moved.
+_DEPTH = 1e-6  # depth of the first contact, at which the force is about the least one
+# Arc length (over L) of the contact from which a line that misses the tip is moved.
 _NEAR_TIP = 0.95
-# An axis this near (over L) goes through the whisker.
+# An axis nearer than this (over L) to the whisker passes through it.
 _TOUCHING = 1e-9
 _ROWS = 4096
 
 
 class Pegs(NamedTuple):
-    """Pegs row by row, lengths over L: a point of the axis, unit axis, radius (-1: a line)."""
+    """Pegs in rows, lengths over L: a point of the axis, unit axis, radius (-1 for a line)."""
 
     origin: Array
     axis: Array
     radius: Array
 
     def rows(self, which: Any) -> Pegs:
-        """Pick rows."""
+        """Select rows."""
         return Pegs(self.origin[which], self.axis[which], self.radius[which])
 
     def parameters(self) -> Array:
@@ -47,7 +47,7 @@ class Pegs(NamedTuple):
 
 
 class Rest(NamedTuple):
-    """The resting whisker, sampled: s/L, place over L, material frame, radius over L."""
+    """Samples of the resting whisker: s/L, position over L, material frame, radius over L."""
 
     s: Array
     position: Array
@@ -69,7 +69,7 @@ class Rest(NamedTuple):
 
 
 def nearest_side(rest: Rest, pegs: Pegs, outward: bool) -> Array:
-    """Unit vectors (n, 3) between axis and resting whisker where they are nearest."""
+    """Unit vectors (n, 3) between axis and resting whisker at their closest points."""
     rows = np.arange(len(pegs.axis))
     away = _normal_part(rest.position - pegs.origin[:, None], pegs.axis[:, None])
     nearest = np.linalg.norm(away, axis=-1).argmin(axis=1)
@@ -77,12 +77,12 @@ def nearest_side(rest: Rest, pegs: Pegs, outward: bool) -> Array:
     direction = away[rows, nearest]
     length = np.einsum("ni,ni->n", tangent, tangent)
     along = np.einsum("ni,ni->n", direction, tangent) / np.where(length > 0.0, length, 1.0)
-    # The nearest point is next to the nearest sample, unless the axis lies beyond an end.
+    # The closest point is next to the closest sample, unless the axis is beyond an end.
     beyond_tip = (nearest == rest.s.size - 1) & (along < 0.0)
     beyond_base = (nearest == 0) & (along > 0.0)
     along = np.where(beyond_tip | beyond_base, 0.0, along)
     direction = direction - along[:, None] * tangent
-    # An axis through the whisker itself has no nearer side: take the one toward +y.
+    # For an axis that intersects the whisker both sides are equal: take the one toward +y.
     across = np.cross(pegs.axis, tangent)
     across *= np.where(across[:, 1:2] < 0.0, -1.0, 1.0) * (1.0 if outward else -1.0)
     size = np.linalg.norm(direction, axis=-1, keepdims=True)
@@ -95,7 +95,7 @@ def nearest_side(rest: Rest, pegs: Pegs, outward: bool) -> Array:
 def solve_from_rest(
     whisker: Bendable, pegs: Pegs, side: Array, proximal: float, steps: int
 ) -> Solutions:
-    """Solve pegs met from rest."""
+    """Solve pegs that move into contact with the resting whisker."""
     parts = [Solutions.empty(0)]
     rest = Rest.of(whisker)
     for first in range(0, len(side), _ROWS):
@@ -107,14 +107,15 @@ def solve_from_rest(
 def _solve_from_rest(
     whisker: Bendable, rest: Rest, pegs: Pegs, side: Array, proximal: float, steps: int
 ) -> Solutions:
+    """Solve pegs from rest, a block of rows."""
     out = Solutions.empty(len(side))
     there = np.isfinite(pegs.parameters()).all(axis=1) & np.isfinite(side).all(axis=1)
     out.statuses[there] = int(Status.NO_CONTACT)
-    _rest_values(out, np.flatnonzero(there))
+    _set_no_contact(out, np.flatnonzero(there))
     push = _normal_part(side, pegs.axis)
     size = np.linalg.norm(push, axis=-1, keepdims=True)
     push = push / np.where(size > 0.0, size, 1.0)
-    depth, s, direction = _first_touch(rest, pegs, push)
+    depth, s, direction = _first_contact(rest, pegs, push)
     out.statuses[there & (depth < 0.0) & (s < LEAST_ARC)] = int(Status.TOO_PROXIMAL)
     rows = np.flatnonzero(there & (depth < 0.0) & (s >= LEAST_ARC))
     near_base = np.flatnonzero(out.statuses == int(Status.TOO_PROXIMAL))
@@ -124,7 +125,7 @@ def _solve_from_rest(
         ends = pegs.parameters()[rows]
         begins = ends.copy()
         begins[:, :3] += (depth[rows] + _DEPTH)[:, None] * push[rows]
-        kinds, unknowns = _start(rest, s[rows], direction[rows])
+        kinds, unknowns = _first_contact_unknowns(rest, s[rows], direction[rows])
         _follow(whisker, begins, ends, kinds, unknowns, out, rows, proximal, steps)
     missed = there & (pegs.radius < 0.0) & (depth == np.inf)
     _from_near_tip(whisker, rest, pegs, push, out, np.flatnonzero(missed), proximal, steps)
@@ -141,7 +142,7 @@ def _from_near_tip(
     proximal: float,
     steps: int,
 ) -> None:
-    """Solve lines that pass by the tip of the resting whisker, if they hold the bent one."""
+    """Solve lines whose path misses the tip of the resting whisker, if they hold the bent one."""
     ends, axis = pegs.parameters()[rows], pegs.axis[rows]
     i = int(np.searchsorted(rest.s, _NEAR_TIP))
     normal = np.cross(axis, rest.frame[i][:, 0])
@@ -155,7 +156,7 @@ def _from_near_tip(
         return
     begins = ends.copy()
     begins[:, :3] += touch + _DEPTH * normal
-    kinds, unknowns = _start(rest, np.full(rows.size, rest.s[i]), normal)
+    kinds, unknowns = _first_contact_unknowns(rest, np.full(rows.size, rest.s[i]), normal)
     found = Solutions.empty(len(out.statuses))
     _follow(whisker, begins, ends, kinds, unknowns, found, rows, proximal, steps)
     held = rows[found.statuses[rows] == Status.OK]
@@ -171,12 +172,12 @@ def solve_from_contact(
     proximal: float,
     steps: int,
 ) -> Solutions:
-    """Solve pegs that were in contact ``before`` with (s, f) = ``contacts``, and have moved."""
+    """Continue contacts (s, f) from pegs ``before`` to the pegs' present position."""
     begins, ends = before.parameters(), pegs.parameters()
-    # An axis has no sense of direction; take the turn that is less than a quarter.
+    # The sign of an axis is arbitrary; choose that for which it turns by less than 90°.
     turned = np.einsum("ij,ij->i", begins[:, 3:6], ends[:, 3:6]) < 0.0
     ends[turned, 3:6] *= -1.0
-    unknowns = _polar(contacts, tip)
+    unknowns = _polar_unknowns(contacts, tip)
     out = Solutions.empty(len(ends))
     rows = np.flatnonzero(np.isfinite(ends).all(axis=1))
     kinds = np.where(tip, TIP, SIDE)
@@ -197,6 +198,7 @@ def _follow(
     proximal: float,
     steps: int,
 ) -> None:
+    """Follow contacts from ``begins`` to ``ends``, and write them into rows of ``out``."""
     chart = stable_set(whisker, proximal=proximal, steps=steps)
     solved = follow_all(
         chart, np.ascontiguousarray(begins), np.ascontiguousarray(ends), kinds.copy(), unknowns
@@ -205,25 +207,26 @@ def _follow(
     out.statuses[rows], out.misfits[rows] = solved.statuses, solved.misfits
     out.contacts[rows[good]], out.values[rows[good]] = solved.contacts[good], solved.values[good]
     out.contacts[rows[~good]], out.values[rows[~good]] = np.nan, np.nan
-    _rest_values(out, rows[solved.statuses == Status.NO_CONTACT])
+    _set_no_contact(out, rows[solved.statuses == Status.NO_CONTACT])
 
 
-def _rest_values(out: Solutions, rows: IntArray) -> None:
-    """No contact: no force, and no place of contact."""
+def _set_no_contact(out: Solutions, rows: IntArray) -> None:
+    """Set rows without contact: zero force and no contact point."""
     out.contacts[rows, 0], out.contacts[rows, 1:] = np.nan, 0.0
     out.values[rows, :3], out.values[rows, 3:] = 0.0, np.nan
     out.misfits[rows] = 0.0
 
 
 def _normal_part(v: Array, axis: Array) -> Array:
+    """Component of v normal to a unit axis."""
     return np.asarray(v - np.einsum("...i,...i->...", v, axis)[..., None] * axis)
 
 
-def _first_touch(rest: Rest, pegs: Pegs, push: Array) -> tuple[Array, Array, Array]:
-    """Where a peg moving along ``push`` first touches the resting whisker.
+def _first_contact(rest: Rest, pegs: Pegs, push: Array) -> tuple[Array, Array, Array]:
+    """First contact of pegs moving along ``push`` with the resting whisker.
 
-    Returns how far it still has to go to touch (negative: it is past), s there and the unit
-    direction of the force; the distance is inf where it never touches.
+    Returns the distance still to go (negative: it is past), s of the contact and the unit
+    direction of the force; the distance is inf where there is no contact.
     """
     relative = _normal_part(rest.position - pegs.origin[:, None], pegs.axis[:, None])
     across = np.cross(pegs.axis, push)
@@ -238,8 +241,8 @@ def _first_touch(rest: Rest, pegs: Pegs, push: Array) -> tuple[Array, Array, Arr
     i = height.argmin(axis=1)
     depth, s = height[n, i], rest.s[i]
     for row in np.flatnonzero(~solid & np.isfinite(x).all(axis=1)):
-        # A line touches where the whisker crosses the plane through it along the push.
-        # One that lies in that plane touches where it is first met.
+        # A line touches where the whisker crosses the plane through it along the push, and if the
+        # whisker is in that plane, at the first point it meets.
         here, there = x[row, :-1], x[row, 1:]
         within = (here == 0.0) & (there == 0.0)
         cross = np.flatnonzero(((here <= 0.0) != (there <= 0.0)) | within)
@@ -266,8 +269,8 @@ def _first_touch(rest: Rest, pegs: Pegs, push: Array) -> tuple[Array, Array, Arr
     return depth, s, direction
 
 
-def _start(rest: Rest, s: Array, direction: Array) -> tuple[IntArray, Array]:
-    """Kind and unknowns of the first touch."""
+def _first_contact_unknowns(rest: Rest, s: Array, direction: Array) -> tuple[IntArray, Array]:
+    """Kind of contact and unknowns (n, 3) at first contact."""
     i = np.clip(np.searchsorted(rest.s, s), 0, rest.s.size - 1)
     along, first, second = np.einsum("nij,ni->jn", rest.frame[i], direction)
     tip = (s >= 1.0 - 1e-9) & (along < -1e-3)
@@ -280,7 +283,8 @@ def _start(rest: Rest, s: Array, direction: Array) -> tuple[IntArray, Array]:
     return np.where(tip, TIP, SIDE), unknowns
 
 
-def _polar(contacts: Array, tip: AnyArray) -> Array:
+def _polar_unknowns(contacts: Array, tip: AnyArray) -> Array:
+    """Unknowns of contacts (s, f) on the side or at the tip."""
     s, fx, fy, fz = contacts.T
     normal, psi = np.hypot(fy, fz), np.arctan2(fz, fy)
     force = np.maximum(np.hypot(normal, fx), LEAST_FORCE)

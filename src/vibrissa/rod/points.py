@@ -1,10 +1,11 @@
-"""The contact at a given point: seeds from the chart, Newton, and a reason where there is none.
+"""Solver for the frictionless contact at a given point.
 
-The contact point is not injective on Ω for every whisker: a nearly cylindrical corkscrew may hold
-one point in two ways. The answer is the equilibrium of least force. A solution is therefore in
-doubt where another seed has less force, or where the point is so near the resting whisker that a
-light contact may hold it. There, and where no seed leads to a solution, the path is followed from
-all starts, and the contact of least force that is reached is the answer.
+Newton's method starts from seeds of the chart. For some whiskers the contact point is not injective
+on Ω: a nearly cylindrical helix may touch one point in two ways. The answer is the equilibrium of
+least force. A solution is therefore ambiguous where another seed has less force, or where the point
+is so near the resting whisker that a light contact is possible. There, and where no seed leads to a
+solution, contacts are followed from all starts, and the one of least force that arrives is taken.
+Where there is none, the nearest face of the chart determines the status.
 """
 
 from __future__ import annotations
@@ -37,27 +38,28 @@ from vibrissa.rod.search import MOST_SEEDS, seeds
 from vibrissa.rod.tree import SearchTree, search_tree
 from vibrissa.status import Status
 
-# A point without a seed is unreachable, and the nearest face of the chart shows why. This near to
-# a face (over L) it is approached from inside instead, in case the interpolant misjudges; and this
-# near to the resting whisker, where bearings have no meaning and there may be no seed, from there.
+# A point without a seed is unreachable, and the nearest face of the chart determines the status.
+# Points within this distance (over L) of a face are nevertheless approached from inside, in case of
+# an error of the interpolant; and those within it of the resting whisker, where bearings are
+# ill-defined and there may be no seed, are approached from there.
 _NEAR = 0.01
 _FACE = 65  # points along each edge of the chart's faces
 _RESTING = 33  # points along the resting whisker, as a polygon
-# Points this near to the resting whisker (over L) are solved from there. Contacts with more than
-# this share of the fold's force, in ρ, are not light.
+# Points within this distance of the resting whisker (over L) are solved from there. Contacts with
+# more than this ρ (root of the share of the fold force) are not light.
 _LIGHT = 1e-3
 _HEAVY = 0.25
-_APART = 0.05  # seeds nearer than this to each other, in η and ρ, lead to the same solution
-# Starts that are followed for one point, and how near to the fold they are at most, in ρ.
+_APART = 0.05  # seeds closer than this in η and ρ lead to the same solution
+# Largest number of starts followed for one point, and largest ρ at which they start.
 _STARTS = 8
 _SHORT_OF_FOLD = 0.99
-_REACHED = 1e-9  # residual of a point that was reached, if only at a fold
-# Coordinates beyond this (over L) are as far out of reach as this; their squares might overflow.
-_FAR = 1e3
+_REACHED_RESIDUAL = 1e-9  # largest residual of a point that was reached, possibly at a fold
+# Larger coordinates (over L) are clipped, because their squares might overflow.
+_LARGEST_COORDINATE = 1e3
 
 
 class Solutions(NamedTuple):
-    """Solved rows, non-dimensional: (s, f) at the contact, (F, p), residual, status."""
+    """Solved rows, non-dimensional: (s, f) at the contact, (F, p), residual and status."""
 
     contacts: Array
     values: Array
@@ -66,20 +68,21 @@ class Solutions(NamedTuple):
 
     @classmethod
     def empty(cls, n: int) -> Solutions:
-        """Return n rows without an answer."""
+        """Return n rows without a solution."""
         missing = np.full(n, int(Status.MISSING))
         return cls(np.full((n, 4), np.nan), np.full((n, 6), np.nan), np.full(n, np.nan), missing)
 
     def put(self, rows: IntArray, part: Solutions) -> None:
-        """Set rows."""
+        """Replace rows."""
         for mine, theirs in zip(self, part, strict=True):
             mine[rows] = theirs
 
 
 @inlined
-def _at_point(
+def _point_equation(
     value: Array, tangents: Array, wanted: bool, target: Array, residual: Array, jacobian: Array
 ) -> float:
+    """Equation p = target; see :mod:`vibrissa.rod.newton`."""
     for a in range(3):
         residual[a] = value[3 + a] - target[a]
         if wanted:
@@ -90,7 +93,7 @@ def _at_point(
 
 @inlined
 def _force(fold: Fold, chart: Array) -> float:
-    """Force of a seed."""
+    """Force of a seed (η, ψ, ρ)."""
     strength = fold_force(fold, arc_length(fold.bounds, chart[0]), chart[1])
     return float(chart[2] * chart[2] * strength)
 
@@ -115,7 +118,7 @@ def _near_rest(resting: Array, point: Array) -> bool:
 
 @inlined
 def _touch(resting: Array, point: Array) -> tuple[float, float]:
-    """Where the resting whisker is nearest to a point: arc length, and the distance squared."""
+    """Closest point of the resting whisker: its arc length, and the squared distance."""
     last = resting.shape[1] - 1
     least, where = np.inf, 0.0
     for i in range(last):
@@ -132,7 +135,7 @@ def _touch(resting: Array, point: Array) -> tuple[float, float]:
 
 @inlined
 def _light_touch(resting: Array, point: Array) -> float:
-    """Arc length at which the resting whisker is nearest to a point very near to it; else 0."""
+    """Arc length of the closest point of the resting whisker if it is very close; else 0."""
     if not _near_rest(resting, point):
         return 0.0
     touch, distance = _touch(resting, point)
@@ -140,8 +143,8 @@ def _light_touch(resting: Array, point: Array) -> float:
 
 
 @inlined
-def _best(found: Array, quality: IntArray, n: int) -> int:
-    """Which seed to begin with: of two near the fold that of less force is the stable one."""
+def _best_seed(found: Array, quality: IntArray, n: int) -> int:
+    """Index of the seed to start from; of two near the fold, the one of less force is stable."""
     best = 0
     for i in range(1, n):
         better = quality[i] > quality[best]
@@ -151,8 +154,10 @@ def _best(found: Array, quality: IntArray, n: int) -> int:
 
 
 @inlined
-def _in_doubt(fold: Fold, resting: Array, point: Array, found: Array, n: int, best: int) -> bool:
-    """Whether a contact of less force than that of the best seed may be at the point."""
+def _is_ambiguous(
+    fold: Fold, resting: Array, point: Array, found: Array, n: int, best: int
+) -> bool:
+    """Whether there may be a contact of less force than the best seed's."""
     for i in range(n):
         other = i != best and _apart(found[i], found[best])
         if other and _force(fold, found[i]) < _force(fold, found[best]):
@@ -174,8 +179,8 @@ def _find_starts(
 ) -> None:
     """Fill contacts (n, _STARTS, 3) from which points may be reached, by increasing force.
 
-    Near the resting whisker the first of them is the touch without force; the others are seeds.
-    Rows end with NaN.
+    Near the resting whisker the first is its closest point, without force; the others are seeds.
+    Unused entries are NaN.
     """
     found, quality = np.empty((MOST_SEEDS, 3)), np.empty(MOST_SEEDS, np.int64)
     slopes, forces = np.empty((MOST_SEEDS, 3, 3)), np.empty(MOST_SEEDS)
@@ -220,10 +225,10 @@ def _solve_points(
     first: int,
     last: int,
 ) -> None:
-    """Solve contact points (n, 3) from the chart's seeds; very near to rest, from there.
+    """Solve points (n, 3) from the chart's seeds, or from rest if very near to it.
 
-    ``solved`` is 1 there, 2 where the solution is in doubt; -1 where the point may be reached by
-    another path, as there are seeds or the resting whisker is near; 0 elsewhere.
+    ``solved`` is 1 if solved, 2 if solved but ambiguous, -1 if unsolved but possibly reachable by
+    continuation (there are seeds or the resting whisker is near), and 0 if unreachable.
     """
     b = np.zeros(BUFFER_SIZE)
     found, quality = np.empty((MOST_SEEDS, 3)), np.empty(MOST_SEEDS, np.int64)
@@ -242,8 +247,8 @@ def _solve_points(
             group[count, 0], group[count, 1], group[count, 2] = touch, 0.0, 0.0
             charts[count, 2], inverses[count, 0, 0] = 0.0, np.nan
         elif n > 0:
-            best = _best(found, quality, n)
-            doubt[count] = _in_doubt(fold, resting, points[row], found, n, best)
+            best = _best_seed(found, quality, n)
+            doubt[count] = _is_ambiguous(fold, resting, points[row], found, n, best)
             chart_to_contact(fold, found[best], group[count])
             start_from(found[best], slopes[best], quality[best], charts[count], inverses[count])
         if touch > 0.0 or n > 0:
@@ -253,7 +258,7 @@ def _solve_points(
             solved[row] = -1 if _near_rest(resting, points[row]) else 0
         if count == LANES or (row == last - 1 and count > 0):
             newton_group(
-                _at_point,
+                _point_equation,
                 rod,
                 fold,
                 b,
@@ -276,35 +281,35 @@ def _solve_points(
 
 
 class PointSolver:
-    """Contact at a point, for one whisker: tables made once, then microseconds a point."""
+    """Solver for contacts at points, for one whisker; tables are built once."""
 
     def __init__(self, chart: StableSet) -> None:
         self.chart = chart
         points = np.ascontiguousarray(chart.values[..., 3:])
         self._tree = search_tree(chart, points, chart.tangents[..., 3:, :], (False, False, False))
-        self._resting = _at_rest(chart)
+        self._resting = _resting_points(chart)
 
     @cached_property
     def _inner(self) -> tuple[Array, spatial.cKDTree]:
-        """Contacts from which paths start, short of the fold to have room, by their points."""
+        """Contacts from which paths start, away from the fold, and a tree of their points."""
         points = self.chart.values[:, :-1, :-1, 3:].reshape(-1, 3)
         held = np.isfinite(points).all(axis=1)
         return self.chart.contacts[:, :-1, :-1].reshape(-1, 3)[held], spatial.cKDTree(points[held])
 
     @cached_property
     def _beyond(self) -> tuple[IntArray, spatial.cKDTree]:
-        """What lies beyond places on the chart's faces, by the places."""
-        places, reasons = zip(*_faces(self.chart), strict=True)
+        """Status beyond each of the points on the chart's faces, and a tree of the points."""
+        places, reasons = zip(*_face_points(self.chart), strict=True)
         numbers = [np.full(len(p), int(r)) for p, r in zip(places, reasons, strict=True)]
         return np.concatenate(numbers), spatial.cKDTree(np.concatenate(places))
 
     def solve(self, points: Array, device: str = "cpu") -> Solutions:
-        """Find the contact of least force that holds the whisker at each point."""
+        """Find the contact of least force at each point (n, 3)."""
         n = len(points)
         out = Solutions.empty(n)
         contacts, values, misfits, statuses = out
         there = np.flatnonzero(~np.isnan(points).any(axis=1))
-        wanted = np.clip(points[there], -_FAR, _FAR)
+        wanted = np.clip(points[there], -_LARGEST_COORDINATE, _LARGEST_COORDINATE)
         xi, found = np.empty((there.size, 3)), np.empty((there.size, 6))
         residuals, solved = np.empty(there.size), np.zeros(there.size, np.int64)
         chart = self.chart
@@ -322,7 +327,7 @@ class PointSolver:
         return out
 
     def _from_starts(self, points: Array, rows: IntArray, out: Solutions) -> None:
-        """Follow points from their starts; replace what is known by contacts of less force."""
+        """Follow contacts from all starts; keep those of less force than the present ones."""
         least = np.hypot(out.contacts[rows, 2], out.contacts[rows, 3])
         least[np.isnan(least)] = np.inf
         starts = np.empty((rows.size, _STARTS, 3))
@@ -335,16 +340,16 @@ class PointSolver:
             which = np.flatnonzero(np.hypot(start[:, 1], start[:, 2]) < least)
             solved = self._follow(start[which], points[which])
             force = np.hypot(solved.contacts[:, 2], solved.contacts[:, 3])
-            # Before the proximal limit, too, a contact of less force is what holds the point.
+            # A contact of less force takes precedence even before the proximal limit.
             reached = np.isin(solved.statuses, (Status.OK, Status.TOO_PROXIMAL))
-            reached &= solved.misfits < _REACHED
+            reached &= solved.misfits < _REACHED_RESIDUAL
             better = (reached & (force < least[which])) | (least[which] == np.inf)
             out.put(rows[which[better]], Solutions(*(part[better] for part in solved)))
             least[which] = np.where(reached, np.minimum(force, least[which]), least[which])
         _drop_unanswered(out, rows)
 
     def _approach(self, points: Array, hopeful: AnyArray, rows: IntArray, out: Solutions) -> None:
-        """Follow points from the nearest known contact where that may help; say why it fails."""
+        """Follow points from the nearest known contact if promising; set the status of others."""
         if not rows.size:
             return
         reasons, faces = self._beyond
@@ -357,12 +362,12 @@ class PointSolver:
         _drop_unanswered(out, rows)
 
     def _follow(self, starts: Array, points: Array) -> Solutions:
-        """Follow contacts ξ (n, 3) to points."""
+        """Follow contacts ξ (n, 3) to points (n, 3)."""
         begins, ends = np.zeros((len(points), 7)), np.zeros((len(points), 7))
         at_start = solve_forces(self.chart.discretization, with_normal_force(starts))[0]
         begins[:, :3], ends[:, :3] = at_start[:, 3:], points
         solved = follow_all(self.chart, begins, ends, np.full(len(points), POINT), starts.copy())
-        # A step may lead across the fold and beyond, where the determinant has its sign again.
+        # A step may cross the fold to where the determinant has its initial sign again.
         ends = solved.contacts[:, [0, 2, 3]]
         strength = fold_forces(self.chart.fold, ends)
         beyond = np.hypot(ends[:, 1], ends[:, 2]) > ABOVE_FOLD * strength
@@ -371,13 +376,13 @@ class PointSolver:
 
 
 def _drop_unanswered(out: Solutions, rows: IntArray) -> None:
-    """Leave no contact where the status is that of none."""
+    """Remove the contact from rows with another status than OK."""
     lost = rows[out.statuses[rows] != Status.OK]
     out.contacts[lost], out.values[lost] = np.nan, np.nan
 
 
-def _faces(chart: StableSet) -> list[tuple[Array, Status]]:
-    """Places on the chart's outer faces (n, 3), and what lies beyond each."""
+def _face_points(chart: StableSet) -> list[tuple[Array, Status]]:
+    """Points (n, 3) on each of the chart's outer faces, and the status beyond that face."""
     eta, rho = np.linspace(0.0, 1.0, _FACE), np.linspace(0.0, 1.0, _FACE)
     psi = np.linspace(0.0, 2.0 * np.pi, 2 * _FACE, endpoint=False)
     faces = []
@@ -389,12 +394,12 @@ def _faces(chart: StableSet) -> list[tuple[Array, Status]]:
         place = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         contacts = with_normal_force(contacts_at(chart.fold, place))
         points = solve_forces(chart.discretization, contacts)[0][:, 3:]
-        # At the tip of a needle the interpolated fold force may be more than can be integrated.
+        # At a very thin tip the interpolated fold force may be too large to integrate.
         faces.append((points[np.isfinite(points).all(axis=1)], reason))
     return faces
 
 
-def _at_rest(chart: StableSet) -> Array:
+def _resting_points(chart: StableSet) -> Array:
     """Points along the resting whisker from ``LEAST_ARC`` to the tip, (3, n)."""
     contacts = np.zeros((_RESTING, 4))
     contacts[:, 0] = np.linspace(LEAST_ARC, 1.0, _RESTING)
@@ -429,5 +434,5 @@ def follow_all(
 
 @lru_cache(maxsize=16)
 def point_solver(whisker: Bendable, proximal: float, steps: int) -> PointSolver:
-    """Return the point solver of a whisker, made on first use."""
+    """Return the point solver of a whisker; cached."""
     return PointSolver(stable_set(whisker, proximal=proximal, steps=steps))

@@ -1,11 +1,11 @@
-"""Seeds: where in the chart three quantities have given values, by the cells' interpolants.
+"""Search in a chart for contacts at which three quantities have given values.
 
-The tree (:mod:`vibrissa.rod.tree`) shows which cells may hold a target. In each the interpolant
-is inverted by Newton's method, which gives seeds so near the exact solution that it converges at
-once.
+The tree (:mod:`vibrissa.rod.tree`) lists the cells that may contain a target. In each of them the
+interpolant is inverted by Newton's method, which gives seeds so near the exact solution that the
+rod's own Newton iteration converges at once.
 
 In a cell where a vector of the plane may vanish (:class:`~vibrissa.rod.SearchTree`), its length
-ℓ and direction β are not smooth, but its components v are: there the equations are
+ℓ and direction β are not smooth, but its components v are. There the equations are
 
     both known: v - ℓ (cos β, sin β) = 0;   β alone: v × (cos β, sin β) = 0, v · (cos β, sin β) > 0;
     ℓ alone: (v · v - ℓ²) / 2R = 0, with R the largest |v| in the cell.
@@ -20,35 +20,35 @@ import numpy as np
 from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, solve3, vectorised, wrapped
 from vibrissa.rod.tree import EVEN, FOLDED, SearchTree
 
-#: At most so many contacts are found for one target.
+#: Largest number of contacts found for one target.
 MOST_SEEDS = 32
-#: At most so many cells are listed about one target.
+#: Largest number of cells listed around one target.
 MOST_CELLS = 64
-# A solution may lie this far outside a cell (in cell widths) and still be its own: neighbours
-# overlap.
+# Distance (in cell widths) outside a cell within which a solution still counts as the cell's:
+# neighbours overlap.
 _OVERLAP = 0.05
-# What the interpolant misses by this share of a cell's extent at most, the map itself may reach.
+# Miss of the interpolant (over the cell's extent) up to which the map itself may attain the target.
 _NEARLY = 0.02
-# Where a cell that may hold a fold has no solution but misses one by this share of its extent at
-# most, the map may have two, one to either side of the fold; starts this far from it (in cell
-# widths) lead to them.
-_MISSED = 0.3
+# Where a cell that may contain a fold has no solution but misses one by at most this share of its
+# extent, the map may have two, one on either side of the fold. They are reached from starts at this
+# distance from the miss (in cell widths).
+_LARGEST_MISS = 0.3
 _SIDE = 0.2
-# In the first cells from rest, where signals vanish, misses are common and tell of no fold.
+# In the first cells from rest, where signals vanish, misses are common and do not indicate a fold.
 _RESTING = 3
-# Linear equations whose determinant is below this share of the product of their rows are singular.
+# Linear equations with a determinant below this share of the product of their rows are singular.
 _SINGULAR = 1e-3
 _STACK = 256
 
 
-# The interpolant's four lanes, three quantities and padding, lie in one flat buffer, without which
-# the compiler does not put them side by side: coefficients, T - target and ∂T/∂x there, T of the
-# target relative to the cell's base.
+# Buffer of the interpolant, with four lanes: three quantities and padding. It is one flat array,
+# without which the compiler does not vectorise. It holds the coefficients, T - target and ∂T/∂x,
+# and the target relative to the cell's base.
 _MISFIT = 160
 _SLOPES = _MISFIT + 4
 _RELATIVE = _SLOPES + 12
 # For a polar cell: cos β and sin β (both 0 if β is unknown), ℓ (negative if unknown), the largest ℓ
-# in the cell (0 in all other cells), and v · (cos β, sin β) where it was last interpolated.
+# in the cell (0 in all other cells), and the last interpolated v · (cos β, sin β).
 _TARGET = _RELATIVE + 4
 _ALONG = _TARGET + 4
 _BUFFER = _ALONG + 1
@@ -56,21 +56,21 @@ _BUFFER = _ALONG + 1
 
 @inlined
 def _cubic(b: Array, n: int, q: int, t: float) -> tuple[float, float]:
-    """Quantity q along an edge whose four coefficients start at n, and its slope."""
+    """Quantity q along an edge whose four coefficients start at n, and its derivative."""
     c1, c2, c3 = b[4 * n + 4 + q], b[4 * n + 8 + q], b[4 * n + 12 + q]
     return b[4 * n + q] + t * (c1 + t * (c2 + t * c3)), c1 + t * (2.0 * c2 + t * 3.0 * c3)
 
 
 @inlined
 def _bulge(b: Array, n: int, q: int, t: float) -> tuple[float, float]:
-    """What a cubic along an edge adds to the straight line between its ends, and its slope."""
+    """Deviation of an edge's cubic from the straight line between its ends, and its derivative."""
     c1, c2, c3 = b[4 * n + q], b[4 * n + 4 + q], b[4 * n + 8 + q]
     return t * (c1 + t * (c2 + t * c3)), c1 + t * (2.0 * c2 + t * 3.0 * c3)
 
 
 @inlined
 def _interpolate(b: Array, x: Array) -> None:
-    """Leave T - target and ∂T/∂x at the place x of a cell in the buffer."""
+    """Compute T - target and ∂T/∂x at position x of a cell; left in the buffer."""
     x1, y1, z1 = x[0], x[1], x[2]
     x0, y0, z0 = 1.0 - x1, 1.0 - y1, 1.0 - z1
     for q in range(4):
@@ -102,7 +102,7 @@ def _interpolate(b: Array, x: Array) -> None:
 
 @inlined
 def _evaluate(b: Array, x: Array) -> None:
-    """Leave the cell's equations and their derivatives by x in the buffer; see the module."""
+    """Compute the cell's equations and their derivatives by x; left in the buffer."""
     _interpolate(b, x)
     largest = b[_TARGET + 3]
     if largest == 0.0:
@@ -130,7 +130,7 @@ def _evaluate(b: Array, x: Array) -> None:
 
 @inlined
 def _adjugate(b: Array, rows: Array) -> float:
-    """Fill rows (3, 3) with det ∂T/∂x times its inverse; return det."""
+    """Fill rows (3, 3) with the adjugate of ∂T/∂x; return its determinant."""
     for a in range(3):
         u, v = _SLOPES + 4 * ((a + 1) % 3), _SLOPES + 4 * ((a + 2) % 3)
         rows[a, 0] = b[u + 1] * b[v + 2] - b[u + 2] * b[v + 1]
@@ -142,20 +142,20 @@ def _adjugate(b: Array, rows: Array) -> float:
 
 @inlined
 def _outside(x: Array) -> float:
-    """How far a place lies outside its cell, in cell widths."""
+    """Distance of a position outside its cell, in cell widths; negative inside."""
     return float(max(abs(x[0] - 0.5), abs(x[1] - 0.5), abs(x[2] - 0.5)) - 0.5)
 
 
 @inlined
-def _less(tree: SearchTree, q: int, target: float, base: float) -> float:
-    """By how much a target is larger than a base; an angle by at most half a turn."""
+def _difference(tree: SearchTree, q: int, target: float, base: float) -> float:
+    """Difference of target and base; that of angles is wrapped to half a turn."""
     d = target - base
     return float(d - 2.0 * np.pi * np.rint(d * tree.turns[q]))
 
 
 @inlined
-def _aim(tree: SearchTree, target: Array, b: Array) -> None:
-    """Bring direction and length of the target, where polar cells need them, into the buffer."""
+def _set_target(tree: SearchTree, target: Array, b: Array) -> None:
+    """Write the target's length and direction, which polar cells need, into the buffer."""
     length, direction = tree.roles[0], tree.roles[1]
     b[_TARGET] = b[_TARGET + 1] = b[_TARGET + 3] = 0.0
     if direction >= 0:
@@ -164,22 +164,22 @@ def _aim(tree: SearchTree, target: Array, b: Array) -> None:
 
 
 @inlined
-def _begin_polar(tree: SearchTree, row: int, target: Array, b: Array) -> None:
-    """Bring the target as a polar cell sees it into the buffer."""
+def _set_polar_target(tree: SearchTree, row: int, target: Array, b: Array) -> None:
+    """Write the target relative to a polar cell's base into the buffer."""
     frame = tree.polar_frame[row]
     b[_RELATIVE], b[_RELATIVE + 1] = -frame[0], -frame[1]
     for n in range(2):
         q = tree.roles[2 + n]
-        b[_RELATIVE + 2 + n] = _less(tree, q, target[q], frame[2 + n]) if q >= 0 else 0.0
+        b[_RELATIVE + 2 + n] = _difference(tree, q, target[q], frame[2 + n]) if q >= 0 else 0.0
 
 
 @inlined
 def _locate_polar(tree: SearchTree, row: int, b: Array, work: Array, x: Array) -> bool:
-    """Whether a polar cell in the buffer may contain its target; if so, about where.
+    """Whether a polar cell in the buffer may contain the target; if so, x is set to about where.
 
-    Its equations are linear in the components and the other quantities if the direction is known:
-    E T = E target. T is a linear function of x and a rest within bounds, so a solution lies within
-    bounds of that of the linear part.
+    If the direction is known, the equations are linear in the components and the other quantities:
+    E T = E target. T is a linear function of x plus a remainder within bounds, so a solution is
+    within bounds of that of the linear part.
     """
     linear = tree.polar_linear[row]
     cos, sin, length = b[_TARGET], b[_TARGET + 1], b[_TARGET + 2]
@@ -211,12 +211,12 @@ def _locate_polar(tree: SearchTree, row: int, b: Array, work: Array, x: Array) -
             along += max(cos * linear[0, c] + sin * linear[1, c], 0.0)
         if along < 0.0:
             return False
-    return _within(matrix, right, slack, x)
+    return _solution_in_cube(matrix, right, slack, x)
 
 
 @inlined
 def _polar_care(tree: SearchTree, row: int, b: Array) -> int:
-    """How many starts a polar cell in the buffer needs; see `Tree.care`."""
+    """Number of starts that a polar cell in the buffer needs, as in `SearchTree.care`."""
     cos, sin, length = b[_TARGET], b[_TARGET + 1], b[_TARGET + 2]
     if cos == 0.0 and sin == 0.0:
         return 2
@@ -235,10 +235,10 @@ def _polar_care(tree: SearchTree, row: int, b: Array) -> int:
 
 
 @inlined
-def _within(matrix: Array, right: Array, slack: Array, x: Array) -> bool:
-    """Whether matrix x = right, known to within slack, may have a solution in the unit cube.
+def _solution_in_cube(matrix: Array, right: Array, slack: Array, x: Array) -> bool:
+    """Whether matrix x = right, up to ``slack``, may have a solution in the unit cube.
 
-    If so, x is left there, as near as can be; if matrix is singular, it is not changed.
+    If so, x is set to the nearest point of the cube, or left unchanged if matrix is singular.
     """
     y, size = np.empty(3), 1.0
     for a in range(3):
@@ -264,10 +264,10 @@ def _within(matrix: Array, right: Array, slack: Array, x: Array) -> bool:
 
 @inlined
 def _locate(tree: SearchTree, cell: int, target: Array, relative: Array, x: Array) -> bool:
-    """Whether a cell may contain the target; if so, about where."""
+    """Whether a cell may contain the target; if so, x is set to about where."""
     frame = tree.frame[cell]
     for q in range(3):
-        relative[q] = _less(tree, q, target[q], frame[3, q])
+        relative[q] = _difference(tree, q, target[q], frame[3, q])
     for a in range(3):
         y = frame[a, 0] * relative[0] + frame[a, 1] * relative[1] + frame[a, 2] * relative[2]
         if y < frame[4, a] or y > frame[5, a]:
@@ -280,7 +280,7 @@ def _locate(tree: SearchTree, cell: int, target: Array, relative: Array, x: Arra
 def _invert(b: Array, half: Array, work: Array, careful: bool, x: Array) -> int:
     """Solve a cell's interpolant: 2 solved, 1 nearly so (a fold of the map), 0 not in the cell.
 
-    If not solved, x is left where it missed least, by work[5, 0] of the cell's extent.
+    If not solved, x is left where the miss is least: work[5, 0] of the cell's extent.
     """
     rows, step, best = work[:3], work[3], work[4]
     least, done = np.inf, False
@@ -303,7 +303,7 @@ def _invert(b: Array, half: Array, work: Array, careful: bool, x: Array) -> int:
         for a in range(3):
             step[a] = (rows[a, 0] * m0 + rows[a, 1] * m1 + rows[a, 2] * m2) / det
         size = max(abs(step[0]), abs(step[1]), abs(step[2]))
-        if n == 0 and not careful:  # nearly linear: the first step shows which cell it is in
+        if n == 0 and not careful:  # nearly linear: the first step shows if it is in this cell
             reach = max(
                 abs(x[0] - step[0] - 0.5), abs(x[1] - step[1] - 0.5), abs(x[2] - step[2] - 0.5)
             )
@@ -312,7 +312,7 @@ def _invert(b: Array, half: Array, work: Array, careful: bool, x: Array) -> int:
         shorten = min(1.0, 0.6 / max(size, 1e-300))
         for a in range(3):
             x[a] = min(max(x[a] - shorten * step[a], -0.5), 1.5)
-        if size < 2e-2:  # the next step would be of its square
+        if size < 2e-2:  # quadratic convergence: the next step would be about its square
             if _outside(x) > _OVERLAP:
                 return 0
             done = True
@@ -323,16 +323,16 @@ def _invert(b: Array, half: Array, work: Array, careful: bool, x: Array) -> int:
 
 
 @inlined
-def _opposite(b: Array) -> bool:
-    """Whether a polar cell's vector, where last interpolated, points the other way."""
+def _points_opposite(b: Array) -> bool:
+    """Whether a polar cell's vector, as last interpolated, points opposite to the target."""
     directed = b[_TARGET] != 0.0 or b[_TARGET + 1] != 0.0
     polar = b[_TARGET + 3] > 0.0 and directed and b[_TARGET + 2] < 0.0
     return bool(polar and b[_ALONG] < -_NEARLY * b[_TARGET + 3])
 
 
 @inlined
-def _sides(b: Array, half: Array, x: Array, work: Array, sides: Array) -> bool:
-    """Go _SIDE from x both ways, as the interpolant changes least; whether a fold is between."""
+def _fold_sides(b: Array, half: Array, x: Array, work: Array, sides: Array) -> bool:
+    """Fill ``sides`` with points _SIDE from x where T changes least; whether a fold is between."""
     rows, step = work[:3], work[3]
     sign = 1.0
     for at in range(3):
@@ -364,7 +364,7 @@ def _sides(b: Array, half: Array, x: Array, work: Array, sides: Array) -> bool:
 
 
 @inlined
-def _keep(
+def _add_seed(
     grid: Array,
     place: IntArray,
     x: Array,
@@ -376,7 +376,7 @@ def _keep(
     quality: IntArray,
     count: int,
 ) -> int:
-    """Add a seed unless neighbours found it; what is solved replaces what is not."""
+    """Add a seed unless a neighbour found the same; one that is solved replaces one that is not."""
     eta = grid[0, 0] + grid[1, 0] * (place[0] + x[0])
     psi = grid[0, 1] + grid[1, 1] * (place[1] + x[1])
     rho = grid[0, 2] + grid[1, 2] * (place[2] + x[2])
@@ -406,7 +406,7 @@ def _keep(
 
 @inlined
 def _boxes_around(turns: Array, box: Array, target: Array, slack: Array, inside: AnyArray) -> None:
-    """Which of eight sibling boxes contain what is within ``slack`` of the target."""
+    """Which of eight sibling boxes contain values within ``slack`` of the target."""
     t0, t1, t2 = target[0], target[1], target[2]
     s0, s1, s2 = slack[0], slack[1], slack[2]
     for c in range(8):
@@ -422,9 +422,9 @@ def _boxes_around(turns: Array, box: Array, target: Array, slack: Array, inside:
 def _next_cells(
     tree: SearchTree, target: Array, slack: Array, stack: IntArray, top: int, inside: AnyArray
 ) -> tuple[int, int]:
-    """Go on to the next eight cells, and fill which may hold values within ``slack`` of a target's.
+    """Find the next eight cells, and which of them may hold values within ``slack`` of the target.
 
-    Return how many blocks are left on the stack, and the number of the eight; -1 if there are none.
+    Return the number of blocks left on the stack, and the index of the eight; -1 if none is left.
     """
     last = tree.offsets.shape[0] - 2
     while top > 0:
@@ -441,7 +441,7 @@ def _next_cells(
 
 
 @inlined
-def _begin_cell(
+def _load_cell(
     tree: SearchTree,
     cell: int,
     box: Array,
@@ -453,13 +453,13 @@ def _begin_cell(
     half: Array,
     x: Array,
 ) -> int:
-    """Bring a cell into the buffer; return the starts that it needs (see `SearchTree.care`).
+    """Load a cell into the buffer; return the number of starts it needs (see `SearchTree.care`).
 
-    -1 if the target cannot be in it.
+    Returns -1 if the target cannot be in the cell.
     """
     row = tree.polar[cell]
     if row >= 0:
-        _begin_polar(tree, row, target, b)
+        _set_polar_target(tree, row, target, b)
         if not _locate_polar(tree, row, b, work, x):
             return -1
         careful, edge = _polar_care(tree, row, b), tree.polar_edges[row]
@@ -478,13 +478,13 @@ def _begin_cell(
     return int(careful)
 
 
-class _Room(NamedTuple):
+class _Workspace(NamedTuple):
     """Working memory of a search.
 
-    Blocks still to be looked at (256, 2); which of eight cells may hold the target (8,), and how
-    far from it (3,); where in a cell it is (3,), relative to its base (3,), and missed least (3,);
-    rows of `_invert` (6, 3); the buffer of the interpolant; sizes of a cell's values (3,); starts
-    to either side of a fold (3, 3).
+    Stack of blocks to visit (256, 2); which of eight cells may hold the target (8,), and the slack
+    (3,); position in a cell (3,), target relative to the cell's base (3,), and position of the
+    least miss (3,); rows of `_invert` (6, 3); the interpolant's buffer; extent of a cell's values
+    (3,); starts on either side of a fold (3, 3).
     """
 
     stack: IntArray
@@ -500,8 +500,8 @@ class _Room(NamedTuple):
 
 
 @inlined
-def _room() -> _Room:
-    return _Room(
+def _workspace() -> _Workspace:
+    return _Workspace(
         np.zeros((_STACK, 2), np.int64),
         np.empty(8, np.bool_),
         np.zeros(3),
@@ -517,8 +517,12 @@ def _room() -> _Room:
 
 @vectorised
 def seeds(tree: SearchTree, target: Array, found: Array, inverses: Array, quality: IntArray) -> int:
-    """All contacts that may have the target's values, as chart coordinates."""
-    return _seeds(tree, target, found, inverses, quality, _room())
+    """Find all contacts that may have the target's values, as chart coordinates (η, ψ, ρ).
+
+    Fills ``found`` (n, 3), ``inverses`` (n, 3, 3), the derivatives by the quantities, and
+    ``quality`` (n,): 2 solved, 1 nearly, 0 a guess. Returns their number, at most ``MOST_SEEDS``.
+    """
+    return _seeds(tree, target, found, inverses, quality, _workspace())
 
 
 @vectorised
@@ -528,13 +532,13 @@ def _seeds(
     found: Array,
     inverses: Array,
     quality: IntArray,
-    room: _Room,
+    room: _Workspace,
 ) -> int:
-    """Find seeds; arrays made by another function are not counted at each use."""
+    """Find seeds in given memory: arrays passed as arguments need no reference counting."""
     grid, place, cells = tree.grid, tree.place, tree.boxes[tree.offsets[-2] :]
     stack, inside, slack, x, relative, nearest, work, b, half, sides = room
     count = 0
-    _aim(tree, target, b)
+    _set_target(tree, target, b)
     top, node = _next_cells(tree, target, slack, stack, 1, inside)
     while node >= 0:
         box = cells[node]
@@ -542,12 +546,12 @@ def _seeds(
             if not inside[c]:
                 continue
             child = 8 * node + c
-            careful = _begin_cell(tree, child, box, c, target, relative, b, work, half, x)
+            careful = _load_cell(tree, child, box, c, target, relative, b, work, half, x)
             if careful < 0:
                 continue
             least = np.inf
             missed = careful == 2 and place[child, 2] >= _RESTING
-            for start in range(9 if careful > 0 else 1):  # the place itself, then the corners
+            for start in range(9 if careful > 0 else 1):  # from the located position, then corners
                 if start > 0:
                     for a in range(3):
                         x[a] = (start - 1) >> a & 1
@@ -556,17 +560,17 @@ def _seeds(
                 if missed and work[5, 0] < least:
                     least = work[5, 0]
                     copy(x, nearest)
-                if solved > 0 and not _opposite(b):
-                    count = _keep(
+                if solved > 0 and not _points_opposite(b):
+                    count = _add_seed(
                         grid, place[child], x, b, work, solved, found, inverses, quality, count
                     )
                 if solved == 2 and careful < 2:
                     break
-            if not missed or least > _MISSED:
+            if not missed or least > _LARGEST_MISS:
                 continue
-            if _sides(b, half, nearest, work, sides):
+            if _fold_sides(b, half, nearest, work, sides):
                 for side in range(2):
-                    count = _keep(
+                    count = _add_seed(
                         grid,
                         place[child],
                         sides[side],
@@ -584,15 +588,15 @@ def _seeds(
 
 @inlined
 def _near_cell(tree: SearchTree, cell: int, target: Array, slack: Array, x: Array) -> float:
-    """How far outside a cell what is within ``slack`` of the target must lie, -1 if it cannot.
+    """Distance of the target beyond a cell, in units of the slack; -1 if it is more than that.
 
-    It is relative to the slack; where in the cell comes nearest is left in x.
+    x is set to the closest position in the cell.
     """
     frame, most = tree.frame[cell], 0.0
     for a in range(3):
         y, off = 0.0, 1e-300
         for q in range(3):
-            y += frame[a, q] * _less(tree, q, target[q], frame[3, q])
+            y += frame[a, q] * _difference(tree, q, target[q], frame[3, q])
             off += abs(frame[a, q]) * slack[q]
         away = max(frame[4, a] - y, y - frame[5, a], 0.0) / off
         if away > 1.0:
@@ -605,10 +609,10 @@ def _near_cell(tree: SearchTree, cell: int, target: Array, slack: Array, x: Arra
 def cells_around(
     tree: SearchTree, target: Array, slack: Array, cells: IntArray, spots: Array, away: Array
 ) -> int:
-    """List ``cells`` (n,) that may hold values within ``slack`` of a target's.
+    """List ``cells`` (n,) that may hold values within ``slack`` of the target.
 
-    ``spots`` (n, 3) are chart coordinates where in a cell these are nearest, ``away`` (n,) is how
-    far they miss, relative to the slack. Return how many cells there are, at most n.
+    Fills ``spots`` (n, 3), chart coordinates of the closest position in each cell, and ``away``
+    (n,), the distance there in units of the slack. Returns the number of cells, at most n.
     """
     stack, x, inside = np.zeros((_STACK, 2), np.int64), np.empty(3), np.empty(8, np.bool_)
     return _cells_around(tree, target, slack, cells, spots, away, stack, x, inside)
@@ -626,7 +630,7 @@ def _cells_around(
     x: Array,
     inside: AnyArray,
 ) -> int:
-    """List cells; arrays made by another function are not counted at each use."""
+    """List cells in given memory: arrays passed as arguments need no reference counting."""
     grid, place, count = tree.grid, tree.place, 0
     top, node = _next_cells(tree, target, slack, stack, 1, inside)
     while node >= 0:

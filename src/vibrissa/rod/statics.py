@@ -1,10 +1,10 @@
-"""Equilibria of all loads: force, point and peg.
+"""Deflection of a whisker by point forces, contacts at points, and pegs.
 
-A known force, given in the deflected frame at the contact, has one equilibrium whatever its size,
-which grows from rest with the force; nothing is iterated. A strong force winds the whisker up,
-however, in waves as short as √(EI / force), and steps that are good up to slip-off do not follow
-them. The size of the force is an invariant of the equations, and its error is the sign that steps
-are too long. Where it shows, the steps are halved until that changes nothing.
+A known force, given in the deflected frame at the contact, has one equilibrium that grows from rest
+with the force; it is integrated without iteration. A strong force, however, winds the whisker up in
+waves as short as √(EI / force), which steps that are accurate up to slip-off do not resolve. The
+magnitude of the force is an invariant of the equations, and its error indicates that steps are too
+long. Then the number of steps is doubled until the result no longer changes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from vibrissa.rod.deflection import (
     PegContact,
     PointContact,
     PointForce,
-    some_of,
+    select_loads,
     vectors,
 )
 from vibrissa.rod.discretization import (
@@ -45,13 +45,13 @@ if TYPE_CHECKING:
     from vibrissa.objects import Surface
     from vibrissa.whisker import Whisker
 
-_FARTHEST = 1e100  # lengths beyond this (over L) are as good as this: their squares would overflow
-# Relative error of the force's size up to which the steps are not in question; base force and
-# contact point are then good to some 1e-5 (relative to the force and to L).
+_LARGEST_LENGTH = 1e100  # larger lengths (over L) are clipped, because their squares would overflow
+# Relative error of the force's magnitude up to which steps are short enough; base force and contact
+# point are then accurate to some 1e-5 (relative to the force and to L).
 _KEPT = 1e-6
-_SETTLED = 1e-4  # what shorter steps may change, relative to the force and to L
-# Contact points in mm that are taken for m are so many lengths away, up to 20 times as many.
-_FAR_AWAY = 100.0
+_SETTLED = 1e-4  # largest change by shorter steps, relative to the force and to L
+# Contact points in mm given as m are this many lengths away, or up to 20 times as many.
+_SUSPICIOUS_DISTANCE = 100.0
 
 
 def deflect(
@@ -73,31 +73,31 @@ def deflect(
         Load that bends it; arrays of any leading shape.
     gravity : (..., 3) array_like, optional
         Gravitational acceleration minus that of the base, whisker frame, m/s²: one for all loads,
-        or one each. The whisker then sags at rest, and is bent from there; it needs a density. By
-        default it has no weight.
+        or one each. The load then bends the whisker from its sagged shape at rest; the whisker must
+        have a density. By default the weight is neglected.
     proximal : float
-        Smallest arc length of a contact, over L; nearer ones get a status instead of an answer (not
-        for a ``PointForce``).
+        Smallest arc length of a contact, over L; more proximal contacts get a status instead of a
+        solution (except a ``PointForce``).
     steps : int
-        Number of integration steps along the whisker. The default is good to 1e-6 while the tangent
-        turns by less than about 65°, and to 1e-4 up to slip-off; the error falls with the sixth
-        power. A ``PointForce`` that bends the whisker further gets as many more as it needs for
-        1e-4.
+        Number of integration steps along the whisker. The default has an error of 1e-6 while the
+        tangent turns by less than about 65°, and 1e-4 up to slip-off; the error falls with the
+        sixth power. A ``PointForce`` that bends the whisker further gets as many more steps as it
+        needs for 1e-4.
     device : str
         Device that solves: "cpu", on all cores, or "cuda", an NVIDIA GPU (extra ``gpu``), for a
-        ``PointForce`` or a ``PointContact`` without gravity. The answers are the same to 1e-9.
+        ``PointForce`` or a ``PointContact`` without gravity. The results agree to 1e-9.
 
     Returns
     -------
     Deflection
-        Stable equilibrium that is connected to rest, for each contact, or the reason why there
-        is none; the one equilibrium of each ``PointForce``.
+        Stable equilibrium that is connected to rest, for each contact, or a status that states why
+        there is none; the one equilibrium of each ``PointForce``.
 
     Raises
     ------
     ValueError
-        If the load does not fit (see the loads), not if it has no equilibrium; if the device
-        does not solve it.
+        If the load does not fit (see the loads), though not if it has no equilibrium; or if the
+        device cannot solve it.
     ImportError, RuntimeError
         If the device is a GPU, and the extra or the GPU is missing.
 
@@ -141,7 +141,7 @@ def deflect(
         if np.isnan(one).any():
             continue
         rows = np.flatnonzero(kind.reshape(-1) == k)
-        part = load if len(kinds) == 1 else some_of(load, rows)
+        part = load if len(kinds) == 1 else select_loads(load, rows)
         bent = resting(whisker, one)
         found, finer = _solve(bent, part, proximal, steps, device)
         solved.put(rows, found)
@@ -154,8 +154,8 @@ def deflect(
 
 
 def check_reach(whisker: Whisker, what: str, away: Array) -> None:
-    """Refuse what is all as far away from the base as millimetres given as metres."""
-    away, far = away[np.isfinite(away)], _FAR_AWAY * whisker.length
+    """Raise a ValueError if all distances look like millimetres given as metres."""
+    away, far = away[np.isfinite(away)], _SUSPICIOUS_DISTANCE * whisker.length
     if away.size and (away > far).all() and (away < 20.0 * far).all():
         raise ValueError(
             f"all {what} are {away.min() / whisker.length:.0f} lengths of the whisker from "
@@ -164,7 +164,7 @@ def check_reach(whisker: Whisker, what: str, away: Array) -> None:
 
 
 def check_objects(whisker: Whisker, objects: Sequence[Surface], positions: Array) -> None:
-    """Refuse objects that are all as far from the base as millimetres given as metres."""
+    """Raise a ValueError if all objects are so far away that they seem to be given in mm."""
     if objects:
         away = np.min([one.signed_distance(positions) for one in objects], axis=0)
         check_reach(whisker, "objects", away)
@@ -184,20 +184,21 @@ def _gravities(gravity: ArrayLike, load: Load) -> Array:
 def _solve(
     bent: Bendable, load: Load, proximal: float, steps: int, device: str
 ) -> tuple[Solutions, IntArray | None]:
-    """Solve loads; return, of known forces, how many steps each needs."""
+    """Solve loads; for known forces also return the number of steps each needs."""
     d = discretize(bent, steps)
     if isinstance(load, PointForce):
-        return _by_force(bent, d, load, steps, device)
+        return _solve_force(bent, d, load, steps, device)
     if isinstance(load, PegContact):
-        return _by_peg(bent, d, load, proximal, steps), None
+        return _solve_peg(bent, d, load, proximal, steps), None
     with np.errstate(over="ignore"):
         points = np.asarray(load.points).reshape(-1, 3) / d.length
     return point_solver(bent, proximal, steps).solve(points, device), None
 
 
-def _by_force(
+def _solve_force(
     whisker: Bendable, d: Discretization, load: PointForce, steps: int, device: str
 ) -> tuple[Solutions, IntArray]:
+    """Solve known forces; also return the number of steps each needs."""
     s = np.asarray(load.arc_length).reshape(-1) / d.length
     with np.errstate(over="ignore"):
         forces = np.asarray(load.components).reshape(-1, 3) / d.force
@@ -221,7 +222,7 @@ def _by_force(
 def _solve_known_forces(
     whisker: Bendable, contacts: Array, steps: int, device: str
 ) -> tuple[Array, IntArray, AnyArray]:
-    """Base force and contact point of known forces of any size, non-dimensional."""
+    """Base force and contact point of known forces, steps needed, and whether these suffice."""
     values = solve_forces(discretize(whisker, steps), contacts, device=device)[0]
     needed = np.full(len(contacts), steps)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -233,7 +234,7 @@ def _solve_known_forces(
             steps *= 2
             finer = solve_forces(discretize(whisker, steps), contacts[rows], device=device)[0]
             settled = (np.abs(finer - values[rows]) <= _SETTLED * scale[rows]).all(axis=1)
-            # Halving changes nothing while the whole contact is within the first step.
+            # Doubling changes nothing while the whole contact is within the first step.
             error = np.abs(np.linalg.norm(finer[:, :3], axis=1) - size[rows])
             settled &= error <= _SETTLED * size[rows]
             rows, finer = rows[~settled], finer[~settled]
@@ -243,21 +244,23 @@ def _solve_known_forces(
     return values, needed, good
 
 
-def _pegs(load: PegContact, length: float) -> Pegs:
+def _pegs_of(load: PegContact, length: float) -> Pegs:
+    """Pegs with lengths over L, within a range whose squares do not overflow."""
     with np.errstate(over="ignore"):
-        radius = np.minimum(np.asarray(load.radius).reshape(-1) / length, _FARTHEST)
+        radius = np.minimum(np.asarray(load.radius).reshape(-1) / length, _LARGEST_LENGTH)
         origin = np.asarray(load.origin).reshape(-1, 3) / length
     return Pegs(
-        np.clip(origin, -_FARTHEST, _FARTHEST),
+        np.clip(origin, -_LARGEST_LENGTH, _LARGEST_LENGTH),
         np.array(load.axis, dtype=np.float64).reshape(-1, 3),
         np.where(radius == 0.0, -1.0, radius),
     )
 
 
-def _by_peg(
+def _solve_peg(
     whisker: Bendable, d: Discretization, load: PegContact, proximal: float, steps: int
 ) -> Solutions:
-    pegs = _pegs(load, d.length)
+    """Solve contacts with pegs, from rest or continued from an earlier deflection."""
+    pegs = _pegs_of(load, d.length)
     start = load.start
     if start is None:
         if load.side is not None:
@@ -276,13 +279,13 @@ def _by_peg(
         axis=1,
     )
     status: AnyArray = np.broadcast_to(start.status, shape).reshape(-1)
-    assert isinstance(start.load, PegContact)  # checked when the load was made
+    assert isinstance(start.load, PegContact)  # checked when the load was created
     earlier = PegContact(
         np.broadcast_to(start.load.origin, (*shape, 3)),
         np.broadcast_to(start.load.axis, (*shape, 3)),
         np.broadcast_to(start.load.radius, shape),
     )
-    before = _pegs(earlier, d.length)
+    before = _pegs_of(earlier, d.length)
     touching = np.isin(status, (Status.OK, Status.TIP_CONTACT))
     out = Solutions.empty(status.size)
     rows = np.flatnonzero(touching)
@@ -292,7 +295,7 @@ def _by_peg(
             whisker, before.rows(rows), contacts[rows], tip, pegs.rows(rows), proximal, steps
         )
         out.put(rows, moved)
-    # A whisker that was free lies on the side of the peg where it then rested.
+    # A whisker without contact stays on the side of the earlier peg on which it rested.
     rows = np.flatnonzero(~touching)
     if rows.size:
         side = nearest_side(Rest.of(whisker), before.rows(rows), outward=True)
@@ -303,7 +306,7 @@ def _by_peg(
 def dimensional(
     whisker: Whisker, load: Load, solved: Solutions, steps: int, moments: Array | float = 0.0
 ) -> Deflection:
-    """Give solved rows their units and the shape of their load; ``moments`` add to p × F."""
+    """Convert solved rows to SI units and the load's shape; ``moments`` are added to p × F."""
     shape, d = load.shape, discretize(whisker, steps)
     force = solved.values[:, :3] * d.force
     point = solved.values[:, 3:] * d.length

@@ -1,17 +1,17 @@
-"""A whisker carried past surfaces: it touches, bends, sticks or slides, slips off and springs back.
+"""Quasi-static motion of a whisker past surfaces, with contact, friction, slip-off and release.
 
-A surface is anything with a signed distance (`Surface`). The whisker's base moves from placement
+A surface is any object with a signed distance (`Surface`). The whisker's base moves from placement
 to placement; between two of them the contact is followed on the stable branch of
-:mod:`vibrissa.rod.touch`, in steps that are halved where Newton's method struggles. A
-branch that ends (the equations' determinant vanishes) or a force that would have to pull ends the
-contact: the whisker then rests, free, or against whatever stands where it would rest. The first
-surface that a free whisker meets holds it until that contact ends; others are passed through (and
-can be recognised by the distance of the bent whisker from them).
+:mod:`vibrissa.rod.touch`, in steps that are halved where Newton's method fails. The contact ends
+where the branch ends (the determinant of the equations vanishes) or where the force would have to
+pull. The whisker then returns to rest, unless a surface is in the way of the resting whisker. The
+first surface that a free whisker meets holds it until that contact ends; other surfaces are
+penetrated (which shows in the distance of the bent whisker from them).
 
-Where the whisker would rest inside a surface from the very beginning, or after it slipped, it lies
-against the side of it that is nearest: it is brought there, in thought and without friction, from
-outside. A contact that ends while the bent whisker lies against a surface elsewhere as well, such
-as on two edges of a box, goes on there.
+Where the resting whisker would be inside a surface, at the start or after slip-off, it comes to
+bear against that surface's nearest side: it is moved there from outside, without friction. A
+contact that ends while the bent whisker also touches a surface elsewhere, as on two edges of a box,
+is continued with that other contact.
 """
 
 from __future__ import annotations
@@ -37,39 +37,39 @@ from vibrissa.status import Status
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
-# A det below this share of that at the start means that the branch was near its end.
+# Determinant, as a share of its largest value, below which a branch is near its end.
 _NEAR_FOLD = 0.5
-_TOUCHING = 1e-5  # a contact that is only about right enters a surface by no more than this, over L
-_ENTERED = 2e-3  # one of two contacts at once enters a surface by no more than this, over L
-_ELSEWHERE = 0.03  # touches of the same surface are two if they are this far apart, over L
-_MOST_OTHERS = 3  # a contact passes on to another this often in one frame
-_LOOKS = 40  # rounds in which the next contact is looked for
-_SMALLEST_STEP = 2.0**-12  # steps between placements are halved down to this
+_TOUCHING = 1e-5  # largest penetration of an approximate contact, over L
+_ENTERED = 2e-3  # largest penetration at one of two simultaneous contacts, over L
+_ELSEWHERE = 0.03  # distance above which contacts with the same surface are distinct, over L
+_MOST_OTHERS = 3  # largest number of times that a contact is replaced by another in one frame
+_MOST_ROUNDS = 40  # largest number of rounds in the search for the next contact
+_SMALLEST_STEP = 2.0**-12  # smallest step between placements, as a share of their distance
 
-# Every so many samples of the resting whisker are enough to see whether it may touch, and a free
-# whisker is looked at again whenever it has moved by this, m.
+# Every which sample of the resting whisker is used to detect contact, and the motion of a free
+# whisker, m, after which contact is checked again.
 _EVERY = 4
-_LOOK = 1e-4
-# Around the sample that is nearest, so many parts are looked at, so many times.
+_CHECK_DISTANCE = 1e-4
+# Number of parts into which the interval around the nearest sample is divided, and how often.
 _ZOOM, _ZOOMS = 16, 4
-_SIDES = 16  # ways tried to get a whisker out of what it would rest in
+_DIRECTIONS = 16  # number of directions tried to move a whisker out of a surface
 
 Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceDeflection:
-    """Whisker carried past surfaces, at n placements."""
+    """Deflection of a whisker moved past surfaces, at n placements."""
 
     bent: Deflection  # base force and moment, contact and status at each placement
-    surface: IntArray  # (n,), number of the surface that is touched, -1 without contact
+    surface: IntArray  # (n,), index of the touched surface, -1 without contact
     normal: Array  # (n, 3), outward normals of the surface at the contacts, laboratory frame
-    surface_point: Array  # (n, 3), touched point of the surface, laboratory frame, m
+    surface_point: Array  # (n, 3), contact point on the surface, laboratory frame, m
     sliding: np.ndarray  # (n,), whether the contact slides rather than sticks
 
 
 class _Ended(NamedTuple):
-    """A contact that has ended, and why: `Status.NO_CONTACT` if it was let go."""
+    """Status of a contact that has ended; `Status.NO_CONTACT` if it was released."""
 
     reason: Status
 
@@ -85,9 +85,9 @@ def follow_surfaces(
     steps: int = STEPS,
     progress: Progress | None = None,
 ) -> SurfaceDeflection:
-    """Carry a whisker past surfaces, quasi-statically."""
+    """Move a whisker past surfaces, quasi-statically, through n placements in order."""
     if not (np.isfinite(friction) and friction >= 0.0):
-        raise ValueError(f"friction is {friction!r}; a coefficient from 0 on is needed")
+        raise ValueError(f"friction is {friction!r}; it must be a finite coefficient, 0 or more")
     follower = _Follower(whisker, surfaces, friction, steps)
     n = len(positions)
     solved = Solutions.empty(n)
@@ -122,7 +122,7 @@ def follow_surfaces(
 
 
 class _Resting:
-    """The resting whisker among surfaces."""
+    """The resting whisker, and its distance from surfaces."""
 
     def __init__(self, whisker: Whisker, surfaces: Sequence[Surface]) -> None:
         rest = Rest.of(whisker)
@@ -134,7 +134,7 @@ class _Resting:
         self._slope: Array = rest.frame[every, :, 0] * whisker.length
 
     def at(self, s: Array) -> tuple[Array, Array]:
-        """Places (n, 3) and radii (n,) at s/L, m, by cubics between the samples."""
+        """Positions (n, 3) and radii (n,) at s/L, m, by cubic interpolation of the samples."""
         i = np.clip(np.searchsorted(self.s, s) - 1, 0, self.s.size - 2)
         h = self.s[i + 1] - self.s[i]
         t = (s - self.s[i]) / h
@@ -151,7 +151,7 @@ class _Resting:
         return np.asarray(slope / np.linalg.norm(slope))
 
     def gap(self, surface: int, place: Placement) -> tuple[float, float]:
-        """Smallest distance between resting whisker and surface, m, and s/L there."""
+        """Smallest distance between resting whisker and surface, m, and its s/L."""
         solid = self._surfaces[surface]
         gap = solid.signed_distance(place.outside(self.place)) - self.radius
         i = int(np.argmin(gap))
@@ -159,7 +159,7 @@ class _Resting:
         spacing = (self.s[1] - self.s[0]) * self._length
         if abs(least) > spacing:
             return least, at
-        # Between samples it may be nearer, near an edge much nearer.
+        # Between samples it may be nearer, especially near an edge.
         inner = np.concatenate([[np.inf], gap, [np.inf]])
         dips = (inner[1:-1] <= inner[:-2]) & (inner[1:-1] <= inner[2:])
         for dip in np.flatnonzero(dips & (gap < least + 0.5 * spacing)).tolist():
@@ -177,12 +177,12 @@ class _Resting:
     def first_meeting(
         self, before: Placement, now: Placement
     ) -> tuple[int, Placement, Placement] | None:
-        """Surface that the free whisker meets first, a placement where it does and one after."""
+        """First surface that the free whisker meets, the placement at contact and one after it."""
         way = np.linalg.norm(now.outside(self.place) - before.outside(self.place), axis=1).max()
         near = [i for i in range(len(self._surfaces)) if self.gap(i, now)[0] < way]
         if not near:
             return None
-        looks = int(np.ceil(way / _LOOK)) + 1
+        looks = int(np.ceil(way / _CHECK_DISTANCE)) + 1
         last = 0.0
         for look in range(1, looks + 1):
             share = look / looks
@@ -200,7 +200,7 @@ class _Resting:
     def meeting(
         self, surface: int, before: Placement, now: Placement, low: float, high: float
     ) -> float:
-        """Share of the way at which a surface is met, between one that is clear and one inside."""
+        """Share of the motion at which a surface is met, between a clear and a penetrating one."""
         for _ in range(12):
             middle = 0.5 * (low + high)
             if self.gap(surface, between(before, now, middle))[0] < 0.0:
@@ -210,9 +210,9 @@ class _Resting:
         return high
 
     def outside(self, surface: int, now: Placement) -> Placement | None:
-        """Where a whisker that would rest inside a surface is moved to touch it from outside.
+        """Placement at which a whisker that would rest inside a surface touches it from outside.
 
-        On the side of the surface that is nearest; None if there is none within two lengths.
+        It touches the nearest side; None if there is none within two lengths.
         """
         _, s = self.gap(surface, now)
         place, slope = self.at(np.array([s]))[0][0], self.direction(s)
@@ -223,18 +223,18 @@ class _Resting:
             toward = now.rotation[:, 1] - (now.rotation[:, 1] @ along) * along
         toward = toward / np.linalg.norm(toward)
         across = np.cross(along, toward)
-        angles = np.linspace(0.0, 2.0 * np.pi, _SIDES, endpoint=False)
+        angles = np.linspace(0.0, 2.0 * np.pi, _DIRECTIONS, endpoint=False)
         ways = np.cos(angles)[:, None] * toward + np.sin(angles)[:, None] * across
         far = [self._way_out(surface, now, way) for way in ways]
-        # What is nearer by rounding alone is not nearer: then the surface's own normal counts.
-        nearest = int(np.argmin(np.array(far) * np.r_[1.0 - 1e-6, np.ones(_SIDES - 1)]))
+        # Distances that differ only by rounding are equal: then the surface's own normal is taken.
+        nearest = int(np.argmin(np.array(far) * np.r_[1.0 - 1e-6, np.ones(_DIRECTIONS - 1)]))
         if not np.isfinite(far[nearest]):
             return None
         clear = Placement(now.rotation, now.position + far[nearest] * ways[nearest])
         return between(clear, now, self.meeting(surface, clear, now, 0.0, 1.0))
 
     def _way_out(self, surface: int, now: Placement, way: Array) -> float:
-        """How far a resting whisker has to move along a unit vector until it is clear, m."""
+        """Distance by which a resting whisker must move along a unit vector to be clear, m."""
         length = self._length
         distances = length * np.r_[np.linspace(0.0, 0.5, 65)[1:], 0.6, 0.8, 1.0, 1.5, 2.0]
         line = now.outside(self.place) + distances[:, None, None] * way
@@ -244,7 +244,7 @@ class _Resting:
 
 
 class _Follower:
-    """Where the whisker is now, and how it gets to the next placement."""
+    """Present placement and contact of the whisker, and its motion to the next placement."""
 
     def __init__(
         self, whisker: Whisker, surfaces: Sequence[Surface], friction: float, steps: int
@@ -259,13 +259,13 @@ class _Follower:
         self._found: Touch | _Ended = _Ended(Status.NOT_CONVERGED)
 
     def move_to(self, now: Placement) -> Touch | _Ended:
-        """Go on to a placement."""
+        """Move to a placement; return the contact or why there is none."""
         before, self._placement = self._placement, now
         found = self._found
         if isinstance(found, Touch):
             assert before is not None
             found = self._follow(found, before, now, self._friction)
-            before = None  # it was not free there
+            before = None  # the whisker was not free there
         elif found.reason != Status.NO_CONTACT:
             before = None
         if isinstance(found, _Ended):
@@ -273,10 +273,10 @@ class _Follower:
         self._found = found
         return found
 
-    # Touching
+    # Onset of contact
 
     def _from_rest(self, before: Placement | None, now: Placement) -> Touch | _Ended:
-        """Bend a whisker that was free before (or not: None), if anything is in its way."""
+        """Solve a whisker that was free at ``before``, or was not (None)."""
         ended = _Ended(Status.NO_CONTACT)
         if before is not None:
             meeting = self._rest.first_meeting(before, now)
@@ -304,7 +304,7 @@ class _Follower:
     def _enter(
         self, surface: int, touching: Placement, after: Placement, now: Placement, friction: float
     ) -> Touch | _Ended:
-        """Bend a whisker that touches at one placement, lies inside at the next, on to a third."""
+        """Bend a whisker from first contact, through a penetrating placement, to ``now``."""
         _, s = self._rest.gap(surface, touching)
         if s < LEAST_ARC:
             return _Ended(Status.TOO_PROXIMAL)
@@ -314,7 +314,7 @@ class _Follower:
             found = self._follow(found, after, now, friction)
         return found
 
-    # Following
+    # Continuation
 
     def _follow(
         self,
@@ -324,7 +324,7 @@ class _Follower:
         friction: float,
         others: int = _MOST_OTHERS,
     ) -> Touch | _Ended:
-        """Follow a contact from one placement to another, and the next one if it ends there."""
+        """Follow a contact between placements; if it ends, go on with another one."""
         done, stride, largest = 0.0, 1.0, 0.0
         while done < 1.0:
             share = min(done + stride, 1.0)
@@ -333,7 +333,7 @@ class _Follower:
             if found is None or found.pressing < 0.0:
                 stride *= 0.5
                 if found is not None or stride < _SMALLEST_STEP:
-                    reason = Status.NO_CONTACT if found else _reason(touch, largest)
+                    reason = Status.NO_CONTACT if found else _status_at_end(touch, largest)
                     here = between(before, now, done)
                     return self._pass_on(touch, here, now, friction, others) or _Ended(reason)
                 continue
@@ -344,7 +344,7 @@ class _Follower:
     def _pass_on(
         self, touch: Touch, here: Placement, now: Placement, friction: float, others: int
     ) -> Touch | None:
-        """Go on with another contact of a whisker whose contact has ended, if it has one."""
+        """Continue with another contact of a whisker whose contact has ended, if there is one."""
         if not others:
             return None
         other = self._other_touch(touch, here)
@@ -354,7 +354,7 @@ class _Follower:
         return found if isinstance(found, Touch) else self._other_touch(touch, now)
 
     def _other_touch(self, touch: Touch, place: Placement) -> Touch | None:
-        """Where else the whisker, bent by one contact, lies against a surface: the next contact."""
+        """Another contact of the whisker, as bent by one contact, with any of the surfaces."""
         d = self.discretization
         solver = point_solver(self._whisker, LEAST_ARC, self._steps)
         for surface, solid in enumerate(self._surfaces):
@@ -365,9 +365,9 @@ class _Follower:
             same_touch = surface == touch.surface and abs(s - touch.contact[0]) < 1.3 * _ELSEWHERE
             if gap > 0.0 or same_touch:
                 continue
-            # Held out at the point where it is deepest, and again where it then is, nearby.
+            # Push the deepest point out, then the point that is then deepest nearby, and so on.
             allowed = np.abs(self._rest.s - s) < _ELSEWHERE
-            for _ in range(_LOOKS):
+            for _ in range(_MOST_ROUNDS):
                 _, normal, _ = solid.local_geometry(place.outside(point))
                 target = point - gap * (normal @ place.rotation)
                 solved = solver.solve(target[None] / d.length)
@@ -383,8 +383,8 @@ class _Follower:
                             break
                         return found
             else:
-                # It lies against two places at once, and neither alone would hold it: held at one
-                # of them it enters the surface no more than this.
+                # Two contacts at once, neither of which alone holds the whisker: with one of them
+                # solved, the penetration at the other is at most this.
                 held = self._solver.start(surface, place, contact)
                 force = place.rotation @ held.state[:3]
                 if gap > -_ENTERED * d.length and force @ held.normal > 0.0:
@@ -394,7 +394,7 @@ class _Follower:
         return None
 
     def _near(self, surface: int, place: Placement, contact: Array, s: float) -> Touch | None:
-        """Solve a contact that is about known, and about at s."""
+        """Solve a contact from an approximate one, starting at s or at its own arc length."""
         for guess in (s, contact[0]):
             start = self._solver.start(surface, place, np.r_[guess, contact[1:]])
             found = self._solver.solve(start, place, 0.0)
@@ -405,9 +405,9 @@ class _Follower:
     def _bent_gap(
         self, surface: int, place: Placement, contact: Array, value: Array, allowed: np.ndarray
     ) -> tuple[float, float, Array]:
-        """Smallest distance of the bent whisker from a surface, m, and s/L and point there.
+        """Smallest distance of the bent whisker from a surface, m, its s/L and its point.
 
-        Only samples that are ``allowed`` are looked at, and what lies between them.
+        Only samples that are ``allowed``, and the intervals next to the nearest, are searched.
         """
         s = self._rest.s[allowed & (self._rest.s >= LEAST_ARC)]
         for _ in range(_ZOOMS):
@@ -421,8 +421,8 @@ class _Follower:
         return found
 
 
-def _reason(touch: Touch, largest: float) -> Status:
-    """Why a contact could not be followed any further."""
+def _status_at_end(touch: Touch, largest: float) -> Status:
+    """Status that explains why a contact could not be followed further."""
     if touch.contact[0] <= LEAST_ARC * (1.0 + 1e-9):
         return Status.TOO_PROXIMAL
     if touch.tip:

@@ -1,26 +1,27 @@
-"""One contact of a whisker with a surface, with or without friction, by Newton's method.
+"""Contact of a whisker with a surface, with or without friction, solved by Newton's method.
 
 With t the whisker's tangent at the contact (:func:`vibrissa.rod.kernels.contact_state`), d the
-surface's signed distance at p, n its outward normal there, N = F·n the pressing force and T = F - N
-n the friction, four equations fix (s_c, f_x, f_y, f_z):
+surface's signed distance at p, n its outward normal there, N = F·n the normal force and T = F - N n
+the friction force, four equations determine (s_c, f_x, f_y, f_z):
 
 - the surfaces touch, one whisker radius away from the centreline: d - a(s_c) + N/k = 0, with k the
   object's stiffness (1/k = 0: rigid);
-- on the whisker's side it lies along the surface, t·n = 0; at its tip s_c = 1 instead;
+- on its side the whisker is tangent to the surface, t·n = 0; at its tip s_c = 1 instead;
 - two for the friction, in the tangent plane: T = Π(T - c Δ), Π the projection onto the disc of
-  radius µN and c > 0 any number. They say |T| ≤ µN, and either no sliding (Δ = 0) or T = -µN Δ/|Δ|.
+  radius µN and c > 0 any number. They are equivalent to |T| ≤ µN and either sticking (Δ = 0) or
+  sliding with T = -µN Δ/|Δ|.
 
-Δ is how far the whisker's material has slid over the surface since the contact was last known, at
-(p₁, t₁, s₁): the contact's way in space less its way along the whisker,
+Δ is the displacement of the whisker's material along the surface since the last solution
+(p₁, t₁, s₁): the displacement of the contact in space minus that along the whisker,
 
     Δ = p - p₁ - ½ (t + t₁)(s_c - s₁),
 
-so a contact that rolls along both without slip has none. Friction acts on the centreline.
+which vanishes for a contact that rolls without slip. Friction acts on the centreline.
 
-At zero force det of the four rows in the order above is negative wherever a surface first touches
-(n, e₁, e₂ being right-handed): the whisker curves away from the surface and yields to a push. It
-stays so along the branch that is stable and connected to rest, sticking or sliding, and vanishes at
-its end, where the whisker slips off.
+At zero force the determinant of the four rows in this order is negative wherever a surface first
+touches (n, e₁, e₂ being right-handed): the whisker curves away from the surface and yields to a
+push. It remains so along the stable branch connected to rest, sticking or sliding, and vanishes at
+the branch's end, where the whisker slips off.
 """
 
 from __future__ import annotations
@@ -38,18 +39,18 @@ from vibrissa.rod.integration import relative_radius
 from vibrissa.rod.kernels import contact_state
 
 EITHER, STICKING, SLIDING = 0, 1, 2
-# Numbers that an integration gives: (F, p, t).
+# Number of state variables (F, p, t).
 _STATES = 9
 _TOLERANCE = 1e-12
-# So near a branch's end that rounding moves the solution, this is as good as it gets.
+# Residual at which a solution is accepted near a branch's end, where rounding displaces it.
 _AT_FOLD = 1e-9
 _ROUNDS = 40
 _SWITCHES = 6
-# The longest Newton steps that a linearisation is trusted for: in s, in the contact's place (both
-# over L), in the whisker's direction there, and in the surface's normal.
+# Largest Newton steps: in s, in the contact's position (both over L), in the whisker's direction
+# there, and in the surface's normal.
 _LONGEST = (0.15, 0.15, 0.4, 0.5)
-_MOST_TURNED = 0.5  # cosine of the normal's turn in one step of the path
-# A tip contact whose tangent points away from the surface by more than this is one of the side.
+_MOST_TURNED = 0.5  # cosine of the largest rotation of the normal in one step of the path
+# Component of the tangent along the normal above which a tip contact becomes one of the side.
 _OUTWARD = 1e-10
 
 
@@ -69,8 +70,8 @@ def _tangent_plane(n: Array, e: Array) -> None:
 
 
 @inlined
-def _give(n: Array, state: Array) -> float:
-    """Compliance of the contact along the normal, the number c of the friction's equations."""
+def _normal_compliance(n: Array, state: Array) -> float:
+    """Compliance of the contact along the normal; it serves as c of the friction equations."""
     give = 0.0
     for j in range(2, 5):
         part = 0.0
@@ -81,8 +82,8 @@ def _give(n: Array, state: Array) -> float:
 
 
 @inlined
-def _polar(v: Array) -> tuple[float, float, float]:
-    """Length and direction of a vector (2,); no direction where it vanishes."""
+def _length_and_direction(v: Array) -> tuple[float, float, float]:
+    """Length and direction of a vector (2,); the direction of a zero vector is zero."""
     size = np.hypot(v[0], v[1])
     if size > 0.0:
         return float(size), float(v[0] / size), float(v[1] / size)
@@ -104,16 +105,20 @@ def _surface_equations(
     mode: int,
     step: Array,
 ) -> tuple[float, float, float, bool, bool]:
-    """Residual and its derivatives, solved for Newton's step; lengths over L, forces over EI/L²."""
+    """Compute Newton's step from residual and Jacobian; lengths over L, forces over EI/L².
+
+    Returns the residual's norm, the Jacobian's determinant, the normal force, whether the contact
+    slides, and whether this agrees with the friction cone.
+    """
     n, e = geometry[1:4], np.empty((2, 3))
     _tangent_plane(n, e)
     pressing, along, away = 0.0, 0.0, contact[0] - earlier[6]
     for i in range(3):
         pressing += (n[i] + lean[i]) * state[i, 0]
         along += (n[i] + lean[i]) * state[6 + i, 0]
-    # The tangent plane's share of friction, way slid, and what is projected.
+    # In the tangent plane: friction, displacement Δ, and the argument T - c Δ of the projection.
     push, way, wanted = np.zeros(2), np.zeros(2), np.empty(2)
-    give = _give(n, state)
+    give = _normal_compliance(n, state)
     limit = friction * max(pressing, 0.0)
     for r in range(2):
         for i in range(3):
@@ -121,7 +126,7 @@ def _surface_equations(
             push[r] += e[r, i] * (state[i, 0] - pressing * lean[i])
             way[r] += e[r, i] * (state[3 + i, 0] - earlier[i] - away * mean)
         wanted[r] = push[r] - way[r] / give
-    strength, toward0, toward1 = _polar(wanted)
+    strength, toward0, toward1 = _length_and_direction(wanted)
     beyond = bool(strength >= limit)
     sliding = beyond if mode == EITHER else mode == SLIDING
 
@@ -160,7 +165,7 @@ def _surface_equations(
         if sliding:
             d0 = d_push[0] - d_way[0] / give
             d1 = d_push[1] - d_way[1] / give
-            # Across the direction of sliding the projection turns what comes in.
+            # Across the direction of sliding the derivative of the projection is a rotation.
             across = -toward1 * d0 + toward0 * d1
             turned = limit * across / strength if strength > 0.0 else 0.0
             d_limit = friction * d_pressing if pressing > 0.0 else 0.0
@@ -175,7 +180,7 @@ def _surface_equations(
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """A solved contact: which surface, (s, f), (F, p, t), and what friction has to remember."""
+    """A solved contact: surface index, (s, f), (F, p, t), and the state needed for friction."""
 
     surface: int
     tip: bool
@@ -192,7 +197,7 @@ class Touch:
 
 
 class TouchSolver:
-    """Contacts of one whisker with surfaces."""
+    """Solver for contacts of one whisker with surfaces."""
 
     def __init__(self, discretization: Discretization, surfaces: Sequence[Surface]) -> None:
         self.discretization, self._surfaces = discretization, surfaces
@@ -200,7 +205,7 @@ class TouchSolver:
         self._softness = [scale / surface.stiffness for surface in surfaces]
 
     def start(self, surface: int, place: Placement, contact: Array) -> Touch:
-        """Begin with a contact that only about meets the equations."""
+        """Return an initial state from a contact that satisfies the equations approximately."""
         state = np.empty((_STATES, 5))
         contact_state(self.discretization.rod, contact, state)
         point = place.outside(state[3:6, 0] * self.discretization.length)
@@ -222,10 +227,10 @@ class TouchSolver:
         )
 
     def solve(self, last: Touch, place: Placement, friction: float) -> Touch | None:
-        """Solve the contact at a placement, beginning with an earlier one; None if that fails."""
+        """Solve the contact at a placement from an earlier one; None if that fails."""
         found = self._newton(last, place, friction, EITHER)
         if found is None and friction > 0.0:
-            # Newton's method may go round between sticking and sliding.
+            # Newton's method may alternate between sticking and sliding: impose each of them.
             for mode in (STICKING, SLIDING):
                 found = self._newton(last, place, friction, mode)
                 if found is not None:
@@ -233,6 +238,7 @@ class TouchSolver:
         return found
 
     def _newton(self, last: Touch, place: Placement, friction: float, mode: int) -> Touch | None:
+        """Solve with sticking or sliding imposed, or free to be either."""
         length = self.discretization.length
         earlier = np.concatenate(
             [
@@ -246,8 +252,8 @@ class TouchSolver:
         size, past_tip, switches = np.inf, 0, 0
         settled = friction == 0.0 or mode != EITHER
         for rounds in range(_ROUNDS):
-            # The surface as it was where it last was touched predicts, to first order, where it is
-            # touched now; then it counts as it is.
+            # The first round predicts the contact to first order, with the surface's geometry at
+            # the last contact; later rounds evaluate the surface itself.
             predicting = rounds == 0
             linear = self._linearised(
                 last, place, x, tip, earlier, friction, mode, predicting, step
@@ -296,9 +302,9 @@ class TouchSolver:
         predicting: bool,
         step: Array,
     ) -> tuple[Touch, bool, float] | None:
-        """The contact x, whether its friction is right, and the size of the step in longest ones.
+        """The contact x, whether its friction is consistent, and its step over the largest step.
 
-        Newton's ``step`` is filled. None where the whisker cannot be integrated.
+        Fills Newton's ``step``. Returns None where the whisker cannot be integrated.
         """
         d = self.discretization
         surface, rotation = self._surfaces[last.surface], place.rotation

@@ -1,19 +1,19 @@
-"""Which contacts give these three numbers: the tree of all preimages of a map from the chart.
+"""Search tree over the cells of a chart, by the values of three quantities.
 
 Three quantities T (the contact point's coordinates, or three base signals) are known with their
-exact derivatives at the nodes of the chart (:mod:`vibrissa.rod.chart`). In each cell T is the cubic
-blended between the cell's twelve edges: with H the cubic Hermite curve along an edge and V the
-straight line between its ends, Σ w H over the four edges along η plus Σ w (H - V) over those along
-ψ and ρ, w the bilinear weights across. It reproduces all cubics, so its error is of fourth order;
-the Bézier points of the edges bound it.
+exact derivatives at the nodes of the chart (:mod:`vibrissa.rod.chart`). In each cell T is a cubic
+blend over the cell's twelve edges: with H the cubic Hermite curve along an edge and V the straight
+line between its ends, it is Σ w H over the four edges along η plus Σ w (H - V) over those along ψ
+and ρ, with w the bilinear weights across. All cubics are reproduced, so the error is of fourth
+order; the Bézier points of the edges bound it.
 
-Boxes around the cells' values, and around those of 2 × 2 × 2 neighbours, and so on, form a tree;
-the cells that may contain a target are those whose boxes, and all boxes above them, contain it, and
+Boxes around the values in each cell, in blocks of 2 × 2 × 2 cells, and so on, form a tree. The
+cells that may contain a target are those whose boxes, and all boxes above them, contain it, and
 which still contain it in coordinates aligned with the cell (:mod:`vibrissa.rod.search`). Angles are
 compared on the circle.
 
-Length and direction of a vector of the plane, as those of the transverse force, are not smooth
-where the vector vanishes, and no polynomial of them is any good there. Cells where it may are
+Length and direction of a vector of the plane, such as the transverse force, are not smooth where
+the vector vanishes, and cannot be interpolated by polynomials there. Cells where it may vanish are
 *polar*: they interpolate the two components of the vector instead.
 """
 
@@ -26,51 +26,51 @@ import numpy as np
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod.chart import StableSet
 
-_MARGIN = 0.08  # boxes are widened by this share of their size for what the cubic misses
-# Cells whose linear part is flatter than this (det relative to the product of its columns) are not
-# aligned.
+_MARGIN = 0.08  # share by which boxes are widened, for the error of the cubic
+# Relative determinant of a cell's linear part below which the cell is not aligned.
 _FLAT = 1e-3
-#: A cell may hold a fold, and so two solutions, if at a corner the volume that its edges' slopes
-#: span is below this share of the largest, or has another sign.
+#: A cell may contain a fold, and so two solutions, if at a corner the volume spanned by the slopes
+#: is below this share of the largest, or of opposite sign.
 FOLDED = 0.03
-#: One start may fail to find the one solution where that share is below this, or where the cell in
-#: its own aligned coordinates is larger than the next; the unit cube is 1.
+#: One start may miss a cell's only solution if that share is below this, or if the cell is larger
+#: than the next in its own aligned coordinates, in which the unit cube is 1.
 EVEN = 0.1
 _SHEARED = 3.0
-# A cell in which a vector turns by more than this to either side may have it vanish, rad.
+# Angle (to either side, rad) through which a vector turns in a cell in which it may vanish.
 _TURNED = 0.9
 
 
 class SearchTree(NamedTuple):
-    """Cells of a chart by the values of three quantities in them, for the kernels."""
+    """Cells of a chart and the values of three quantities in them, for the kernels."""
 
     grid: Array  # (2, 3), chart coordinates of the first corner, and size of a cell
     turns: Array  # (3,), 1/2π for angles, 0 for other quantities
     offsets: IntArray  # (levels + 1,), first row of each level in ``boxes``
     boxes: Array  # (m, 6, 8), middle and half width of the values in eight sibling blocks
-    place: IntArray  # (n, 3), position of each cell in the grid
+    place: IntArray  # (n, 3), indices of each cell in the grid
     # (n, 6, 3) Coordinates in which a cell is nearly the unit cube (inverse, origin), and its
-    # extent there.
+    # extent in them (lower, upper).
     frame: Array
     edges: Array  # (n, 160), coefficients of the cells' interpolants
-    # (n,) Starts that a cell needs: 0 one, 1 several until one is solved, 2 all of them.
+    # (n,) Starts needed by a cell: 0 one, 1 several until one is solved, 2 all of them.
     care: IntArray
     polar: IntArray  # (n,), row of a polar cell in the arrays below, -1 for other cells
     polar_edges: Array  # (p, 160), coefficients of the polar cells' interpolants
-    polar_frame: Array  # (p, 8), base values, and the sizes that count as the cell's extent
-    polar_linear: Array  # (p, 4, 5), mean slopes, and middle and half width of the rest
-    # (p, 8, 2) Volumes that the slopes span at the corners, for each component of the vector.
+    polar_frame: Array  # (p, 8), base values, and the sizes used as the cell's extent
+    polar_linear: Array  # (p, 4, 5), mean slopes, and middle and half width of the remainder
+    # (p, 8, 2) Volumes spanned by the slopes at the corners, for each component of the vector.
     polar_volumes: Array
+    # (4,) Indices of length, direction and the others among the quantities; -1 for none.
     # (4,) Numbers of length, direction and the others among the quantities; -1 for none.
     roles: IntArray
 
 
 class PlaneVector(NamedTuple):
-    """Vector of the plane of which one or two quantities are length and direction."""
+    """A vector of the plane whose length, direction, or both are among the quantities."""
 
     values: Array  # (i, j, k, 2), components at the chart's nodes
     derivatives: Array  # (i, j, k, 2, 3), derivatives of the values by ξ there
-    # Number of its length and of its direction among the quantities, -1 if it is none of them.
+    # Index of its length and of its direction among the quantities, -1 if it is not one of them.
     length: int
     direction: int
 
@@ -82,12 +82,12 @@ def search_tree(
     angles: tuple[bool, ...],
     plane: PlaneVector | None = None,
 ) -> SearchTree:
-    """Build the tree in which contacts of given quantities are searched.
+    """Build the tree for the search for contacts with given values of three quantities.
 
     Parameters
     ----------
     chart : StableSet
-        Contacts at whose nodes the quantities are known.
+        Chart at whose nodes the quantities are known.
     values : (i, j, k, 3) array
         Three quantities at the nodes, of any unit.
     derivatives : (i, j, k, 3, 3) array
@@ -95,7 +95,7 @@ def search_tree(
     angles : tuple of bool
         Whether each of them is an angle, compared on the circle.
     plane : PlaneVector, optional
-        Vector of which one or two of the quantities are length and direction.
+        Vector whose length, direction, or both are among the quantities.
 
     Returns
     -------
@@ -106,9 +106,9 @@ def search_tree(
     circular = np.array(angles)
     place = _octree_order(tuple(n - 1 for n in values.shape[:3]))
     cells = _Cells.of(place, values, chart.charted(derivatives) * size, circular)
-    aligned = _aligned(cells)
+    aligned = _aligned_coordinates(cells)
     low, high = cells.extent()
-    care = _care(cells.slope, aligned)
+    care = _starts_needed(cells.slope, aligned)
     polar = _Polar.none()
     if plane is not None:
         slopes = chart.charted(plane.derivatives) * size
@@ -121,7 +121,7 @@ def search_tree(
             low[polar.rows, plane.direction] = -np.pi
             high[polar.rows, plane.direction] = np.pi
         care[polar.rows] = 2
-    offsets, boxes = _boxes(low, high, circular)
+    offsets, boxes = _bounding_boxes(low, high, circular)
     row = np.full(len(place), -1)
     row[polar.rows] = np.arange(len(polar.rows))
     return SearchTree(
@@ -131,7 +131,7 @@ def search_tree(
         boxes,
         place,
         aligned,
-        _edges(cells),
+        _edge_coefficients(cells),
         care,
         row,
         polar.edges,
@@ -145,8 +145,8 @@ def search_tree(
 class _Cells(NamedTuple):
     """Quantities in cells.
 
-    base (cells, q): at the first corner; corner (2, 2, 2, cells, q): relative to it; slope
-    (2, 2, 2, cells, q, 3): in cell widths.
+    base (cells, q): values at the first corner; corner (2, 2, 2, cells, q): values relative to it;
+    slope (2, 2, 2, cells, q, 3): derivatives in cell widths.
     """
 
     base: Array
@@ -155,7 +155,7 @@ class _Cells(NamedTuple):
 
     @classmethod
     def of(cls, place: IntArray, values: Array, slopes: Array, circular: AnyArray) -> _Cells:
-        """Take them from the nodes of the chart."""
+        """Gather them from the nodes of the chart."""
         two = np.arange(2)[:, None]
         i, j, k = place.T
         index = (i + two[:, None, None], j + two[:, None], k + two)
@@ -167,12 +167,12 @@ class _Cells(NamedTuple):
         return cls(values[i, j, k], corner, slope)
 
     def _inward(self, axis: int) -> Array:
-        """A third of the slopes along an axis, from each corner into the cell."""
+        """A third of the slopes along an axis, directed from each corner into the cell."""
         sign = np.array([1.0, -1.0]).reshape([2 if a == axis else 1 for a in range(5)])
         return np.asarray(self.slope[..., axis] * (sign / 3.0))
 
     def points(self) -> Array:
-        """Corners moved inward along any of the axes, relative to the base: (64, cells, q)."""
+        """Bézier points (64, cells, q) relative to the base: corners moved along any axes."""
         moved = np.empty((8, *self.corner.shape))
         moved[0] = self.corner
         for axis, first in enumerate((1, 2, 4)):  # with it, each subset of the axes before
@@ -180,7 +180,7 @@ class _Cells(NamedTuple):
         return moved.reshape(64, *self.base.shape)
 
     def extent(self) -> tuple[Array, Array]:
-        """The least and the largest of these points, (cells, q) each."""
+        """Least and largest of the Bézier points, (cells, q) each."""
         low, high = self.corner, self.corner
         for axis in range(3):
             inward = self._inward(axis)
@@ -193,7 +193,7 @@ class _Cells(NamedTuple):
         return np.stack(columns, axis=-1)
 
     def linear(self) -> Array:
-        """Mean slopes, and middle and half width of what they leave: (cells, q, 5)."""
+        """Mean slopes, and middle and half width of the remainder: (cells, q, 5)."""
         slopes = self.slopes()
         ends = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1)
         corner = self.corner - np.einsum("cqa,ijka->ijkcq", slopes, ends)
@@ -203,7 +203,7 @@ class _Cells(NamedTuple):
 
 
 class _Polar(NamedTuple):
-    """Polar cells: rows (n,), which they are; the rest as in `SearchTree`."""
+    """Polar cells: their indices ``rows`` (n,), and arrays as in `SearchTree`."""
 
     rows: IntArray
     edges: Array
@@ -214,14 +214,14 @@ class _Polar(NamedTuple):
 
     @classmethod
     def none(cls) -> _Polar:
-        """No vector may vanish."""
+        """Return an instance without polar cells."""
         edges, frame = np.empty((0, 160)), np.empty((0, 8))
         linear, volumes = np.empty((0, 4, 5)), np.empty((0, 8, 2))
         return cls(np.empty(0, int), edges, frame, linear, volumes, np.full(4, -1))
 
     @classmethod
     def of(cls, cells: _Cells, vector: _Cells, length: int, direction: int, half: Array) -> _Polar:
-        """Find the cells in which a vector may vanish; half (cells, 3): sizes of the quantities."""
+        """Find the cells in which a vector may vanish; half (cells, 3): extents of quantities."""
         y, z = np.moveaxis(vector.points() + vector.base, -1, 0)
         size = np.sqrt(y * y + z * z)
         some = np.where(size > 0.0, size, 1.0)
@@ -247,11 +247,18 @@ class _Polar(NamedTuple):
         linear[:, : both.base.shape[1]] = both.linear()
         roles = np.full(4, -1)
         roles[: 2 + len(others)] = length, direction, *others
-        return cls(rows, _edges(both), frame, linear, _volumes(both.slope, len(others)), roles)
+        return cls(
+            rows,
+            _edge_coefficients(both),
+            frame,
+            linear,
+            _spanned_volumes(both.slope, len(others)),
+            roles,
+        )
 
 
-def _volumes(slope: Array, others: int) -> Array:
-    """See `SearchTree.polar_volumes`; relative to the slopes' lengths."""
+def _spanned_volumes(slope: Array, others: int) -> Array:
+    """Volumes of `SearchTree.polar_volumes`, relative to the slopes' lengths."""
     slope = np.moveaxis(slope.reshape(8, *slope.shape[3:]), 0, 1)
     out = np.zeros((len(slope), 8, 2))
     size = np.linalg.norm(slope[..., 2:, :], axis=-1).prod(axis=-1)
@@ -266,7 +273,7 @@ def _volumes(slope: Array, others: int) -> Array:
 
 
 def _octree_order(cells: tuple[int, ...]) -> IntArray:
-    """Cells (i, j, k) so that each run of 8 is a 2 × 2 × 2 block, each run of 64 one of those."""
+    """Order cells (i, j, k) so that runs of 8 are 2 × 2 × 2 blocks, runs of 64 blocks of those."""
     depth = int(np.log2(min(cells)))
     if any(n % 2**depth for n in cells):
         raise ValueError(f"the chart has {cells} cells; they must be multiples of {2**depth}")
@@ -278,8 +285,8 @@ def _octree_order(cells: tuple[int, ...]) -> IntArray:
     return np.ascontiguousarray(place)
 
 
-def _boxes(low: Array, high: Array, circular: AnyArray) -> tuple[IntArray, Array]:
-    """Middle and half width of the values in each cell and in larger blocks, 8 siblings a row."""
+def _bounding_boxes(low: Array, high: Array, circular: AnyArray) -> tuple[IntArray, Array]:
+    """Middle and half width of the values in cells and in larger blocks, 8 siblings a row."""
     grow = _MARGIN * (high - low) + 1e-12
     low, high = low - grow, high + grow
     levels = []
@@ -288,7 +295,7 @@ def _boxes(low: Array, high: Array, circular: AnyArray) -> tuple[IntArray, Array
         half = np.where(circular & (half > np.pi), np.inf, half)
         box = np.concatenate([0.5 * (low + high), half], axis=-1)
         lone = len(box) % 8
-        if lone:  # the few blocks at the top: fill the row with boxes that contain nothing
+        if lone:  # fill the row of the few blocks at the top with boxes that contain nothing
             box = np.concatenate([box, np.full((8 - lone, 6), -1.0)])
         levels.append(box.reshape(-1, 8, 6).transpose(0, 2, 1))
         if len(box) == 8:
@@ -303,11 +310,11 @@ def _boxes(low: Array, high: Array, circular: AnyArray) -> tuple[IntArray, Array
     return offsets, np.ascontiguousarray(np.concatenate(levels))
 
 
-def _aligned(cells: _Cells) -> Array:
-    """Coordinates in which a cell is nearly the unit cube, and its extent in them."""
+def _aligned_coordinates(cells: _Cells) -> Array:
+    """Coordinates in which each cell is nearly the unit cube, and its extent in them."""
     linear = cells.slopes()
     with np.errstate(divide="ignore", invalid="ignore"):
-        even = linear / np.linalg.norm(linear, axis=2, keepdims=True)  # whatever the units
+        even = linear / np.linalg.norm(linear, axis=2, keepdims=True)  # independent of units
         flatness = np.abs(np.linalg.det(even)) / np.prod(np.linalg.norm(even, axis=1), axis=-1)
     usable = flatness > _FLAT
     inverse = np.zeros_like(linear)
@@ -322,10 +329,10 @@ def _aligned(cells: _Cells) -> Array:
     )
 
 
-def _edges(cells: _Cells) -> Array:
-    """The interpolants' coefficients, quantities and padding side by side: (cells, 160).
+def _edge_coefficients(cells: _Cells) -> Array:
+    """Coefficients of the interpolants, quantities and padding interleaved: (cells, 160).
 
-    Cubics along η at the corners of (ψ, ρ), corrections along ψ and along ρ.
+    In order: cubics along η at the corners of (ψ, ρ), then corrections along ψ and along ρ.
     """
     n, q = cells.base.shape
     out = np.zeros((n, 40, 4))
@@ -343,8 +350,8 @@ def _edges(cells: _Cells) -> Array:
     return out.reshape(n, 160)
 
 
-def _care(slope: Array, aligned: Array) -> IntArray:
-    """How many starts a cell needs: 0 one, 1 several until one is solved, 2 all of them."""
+def _starts_needed(slope: Array, aligned: Array) -> IntArray:
+    """Number of starts that a cell needs: 0 one, 1 several until one is solved, 2 all of them."""
     det = np.linalg.det(slope)
     size = np.prod(np.linalg.norm(slope, axis=-2), axis=-1)
     flatness = (det / np.where(size > 0.0, size, 1.0)).reshape(8, -1)

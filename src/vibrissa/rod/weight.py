@@ -1,23 +1,24 @@
-"""The rod equations with weight, integrated from the tip to the base, four contacts at a time.
+"""Integration of the rod equations with weight, from the tip to the base, four contacts at a time.
 
-Weight acts along a unit vector that is fixed in the base frame, ĝ; let g = Rᵀĝ be the same in the
-material frame, and W(s) the weight of all that is beyond s, a known number. The whisker carries the
-force n = φ + W g, with φ that of the contact, and the moment m = q × φ + μ, with μ the moment that
-the weight beyond s exerts about r(s)::
+Weight acts along a unit vector ĝ fixed in the base frame; g = Rᵀĝ is the same vector in the
+material frame, and W(s) the known weight distal to s. The whisker carries the force n = φ + W g,
+where φ is due to the contact, and the moment m = q × φ + μ, where μ is the moment of the weight
+distal to s about r(s)::
 
     φ' = φ × u,   q' = q × u - e₁,   g' = g × u,   μ' = μ × u + W g × e₁,
     u = u₀(s) + c(s) ∘ (q × φ + μ)
 
-Beyond the contact φ and q are zero, but weight bends the whisker there too. At the tip μ = 0, and
-the direction g(L) is unknown: two numbers, to be chosen such that g(0) = ĝ. At the base φ = F,
-q = p, and the base carries the force F + W(0) ĝ and the moment p × F + μ.
+Distal to the contact φ and q are zero, but weight bends the whisker there too. At the tip μ = 0,
+and the direction g(L) is unknown: two numbers, determined by g(0) = ĝ. At the base φ = F, q = p,
+and the base carries the force F + W(0) ĝ and the moment p × F + μ.
 
-The two unknowns are removed by Newton's method with the derivatives by them, δ₁ and δ₂, integrated
-alongside: with a = -[δ₁ δ₂]⁺ (g(0) - ĝ) the base values are y + a₁ δ₁ y + a₂ δ₂ y, and derivatives
-by any other unknown of the contact get the same correction. So (F, p) are again smooth functions of
-(s_c, f) alone, and what solves a rod without weight solves one with it. A lane starts where it
-ended last: along a path, or in the rounds of another Newton's method, that is next to the solution.
-A base that accelerates by a₀ is one with gravity g - a₀.
+The two unknowns are eliminated by Newton's method, with the derivatives δ₁ and δ₂ by them
+integrated alongside: with a = -[δ₁ δ₂]⁺ (g(0) - ĝ) the base values are y + a₁ δ₁ y + a₂ δ₂ y, and
+the derivatives by any other unknown of the contact get the same correction. (F, p) are thus again
+smooth functions of (s_c, f) alone, and the solvers for a rod without weight apply to one with
+weight. A lane starts from the direction at which it last ended; along a path, or in the rounds of
+an outer Newton's method, that is close to the solution. A base that accelerates by a₀ is equivalent
+to gravity g - a₀.
 """
 
 from __future__ import annotations
@@ -48,27 +49,28 @@ from vibrissa.rod.kernels import (
     turning,
 )
 
-# A stage keeps φ, q, g, μ, u (3 each), two compliances, W.
+# A stage stores φ, q, g, μ, u (3 each), two compliances, W.
 _STAGE = 18 * LANES
 _TURN, _SOFT, _WEIGHT = 12 * LANES, 15 * LANES, 17 * LANES
 _SIX = 6 * LANES
 _STATE = 7 * _STAGE  # φ, q, g, μ
 # Derivatives of the state by the two unknowns at the tip, and up to three more.
 _SLOPES = _STATE + 2 * _SIX
-_MOVING = _SLOPES + 10 * _SIX  # the derivative that takes a step
+_MOVING = _SLOPES + 10 * _SIX  # derivative during its step
 _H = _MOVING + 2 * _SIX
-# Copies of the contacts' arc lengths and kinds: a loop over so few lanes runs side by side only
-# where it uses one array.
+# Copies of the contacts' arc lengths and kinds: the loop over so few lanes is vectorised only if it
+# uses one array.
 _ARC = _H + LANES
 _TIP = _ARC + LANES
-#: Numbers that a buffer for :func:`solve_lanes` holds.
+#: Size of a buffer for :func:`solve_lanes`.
 WEIGHT_BUFFER = _TIP + LANES
-#: Numbers of a solved state: (F, p), ĝ and μ at the base.
+#: Size of a solved state: (F, p), ĝ and μ at the base.
 STATES = 12
 
 _ROUNDS = 8  # rounds of Newton's method for the direction at the tip
-_SHARES = 8  # where they do not converge the force grows from rest to its size in so many steps
-# The error of g(0) that one correction to first order may take away: it leaves its square.
+_SHARES = 8  # number of increments of the force, from rest, if they do not converge
+# Error of g(0) up to which no further round is needed, and up to which a correction to first order
+# suffices: it leaves the square of the error.
 _SMALL, _NEAR = 1e-6, 1e-3
 
 Load = tuple[float, float, float, float, float, float, float, float]
@@ -82,39 +84,40 @@ def _load_of(weight: Weight, k: int) -> Load:
 
 @inlined
 def _beyond(w: Load, t: float) -> float:
-    """Weight of what is beyond the fraction t of a step."""
+    """Weight distal to the fraction t of a step."""
     high = w[4] + t * (w[5] + t * (w[6] + t * w[7]))
     return w[0] + t * (w[1] + t * (w[2] + t * (w[3] + t * high)))
 
 
 @inlined
-def _first(x: Six) -> Vector:
+def _first_three(x: Six) -> Vector:
     return (x[0], x[1], x[2])
 
 
 @inlined
-def _second(x: Six) -> Vector:
+def _last_three(x: Six) -> Vector:
     return (x[3], x[4], x[5])
 
 
 @inlined
-def _both(a: Vector, b: Vector) -> Six:
+def _join(a: Vector, b: Vector) -> Six:
     return (a[0], a[1], a[2], b[0], b[1], b[2])
 
 
 @inlined
 def _get_six(b: Array, row: int, i: int) -> Six:
-    return _both(get(b, row, i), get(b, row + 3 * LANES, i))
+    return _join(get(b, row, i), get(b, row + 3 * LANES, i))
 
 
 @inlined
 def _put_six(b: Array, row: int, i: int, x: Six) -> None:
-    put(b, row, i, _first(x))
-    put(b, row + 3 * LANES, i, _second(x))
+    put(b, row, i, _first_three(x))
+    put(b, row + 3 * LANES, i, _last_three(x))
 
 
 @inlined
-def _keep(b: Array, row: int, i: int, u: Vector, c: Vector, w: float) -> None:
+def _store_stage(b: Array, row: int, i: int, u: Vector, c: Vector, w: float) -> None:
+    """Store curvature, compliance and weight of a stage."""
     put(b, row + _TURN, i, u)
     b[row + _SOFT + i] = c[0]
     b[row + _SOFT + LANES + i] = c[1]
@@ -130,7 +133,7 @@ def _free_rates(
     g: Vector,
     m: Vector,
 ) -> Pair:
-    """Slopes of (g, μ) beyond the contact."""
+    """Derivatives of (g, μ) distal to the contact."""
     b, piece, load, low, span = data
     t = low + span * left
     u0, c = section(piece, t)
@@ -139,7 +142,7 @@ def _free_rates(
     row = stage * _STAGE
     put(b, row + _SIX, i, g)
     put(b, row + _SIX + 3 * LANES, i, m)
-    _keep(b, row, i, u, c, w)
+    _store_stage(b, row, i, u, c, w)
     return cross(g, u), add(cross(m, u), (0.0, w * g[2], -w * g[1]))
 
 
@@ -147,7 +150,7 @@ def _free_rates(
 def _free_slope_rates(
     data: tuple[Array], stage: int, left: float, i: int, dg: Vector, dm: Vector
 ) -> Pair:
-    """Slopes of a derivative of (g, μ) beyond the contact."""
+    """Derivatives of a tangent of (g, μ) distal to the contact."""
     b, row = data[0], stage * _STAGE
     g, m = get(b, row + _SIX, i), get(b, row + _SIX + 3 * LANES, i)
     u, w = get(b, row + _TURN, i), b[row + _WEIGHT + i]
@@ -166,53 +169,53 @@ def _held_rates(
     x: Six,
     y: Six,
 ) -> tuple[Six, Six]:
-    """Slopes of (φ, q) and (g, μ) between contact and base."""
+    """Derivatives of (φ, q) and (g, μ) between contact and base."""
     b, piece, load, low, span = data
     t = low + span * left
-    f, q, g, m = _first(x), _second(x), _first(y), _second(y)
+    f, q, g, m = _first_three(x), _last_three(x), _first_three(y), _last_three(y)
     u0, c = section(piece, t)
     u = turning(u0, c, add(cross(q, f), m))
     w = piece[3] * _beyond(load, t)
     row = stage * _STAGE
     _put_six(b, row, i, x)
     _put_six(b, row + _SIX, i, y)
-    _keep(b, row, i, u, c, w)
+    _store_stage(b, row, i, u, c, w)
     lever = add(cross(q, u), (-piece[3], 0.0, 0.0))
     moment = add(cross(m, u), (0.0, w * g[2], -w * g[1]))
-    return _both(cross(f, u), lever), _both(cross(g, u), moment)
+    return _join(cross(f, u), lever), _join(cross(g, u), moment)
 
 
 @inlined
 def _held_slope_rates(
     data: tuple[Array], stage: int, left: float, i: int, dx: Six, dy: Six
 ) -> tuple[Six, Six]:
-    """Slopes of a derivative of (φ, q) and (g, μ) between contact and base."""
+    """Derivatives of a tangent of (φ, q) and (g, μ) between contact and base."""
     b, row = data[0], stage * _STAGE
     x, y = _get_six(b, row, i), _get_six(b, row + _SIX, i)
-    f, q, g, m = _first(x), _second(x), _first(y), _second(y)
-    df, dq, dg, dm = _first(dx), _second(dx), _first(dy), _second(dy)
+    f, q, g, m = _first_three(x), _last_three(x), _first_three(y), _last_three(y)
+    df, dq, dg, dm = _first_three(dx), _last_three(dx), _first_three(dy), _last_three(dy)
     u, w = get(b, row + _TURN, i), b[row + _WEIGHT + i]
     c0, c1 = b[row + _SOFT + i], b[row + _SOFT + LANES + i]
     more = add(add(cross(dq, f), cross(q, df)), dm)
     du = (c0 * more[0], c1 * more[1], c1 * more[2])
     moment = add(add(cross(dm, u), cross(m, du)), (0.0, w * dg[2], -w * dg[1]))
     return (
-        _both(add(cross(df, u), cross(f, du)), add(cross(dq, u), cross(q, du))),
-        _both(add(cross(dg, u), cross(g, du)), moment),
+        _join(add(cross(df, u), cross(f, du)), add(cross(dq, u), cross(q, du))),
+        _join(add(cross(dg, u), cross(g, du)), moment),
     )
 
 
 @inlined
 def _free_step(rod: Rod, weight: Weight, h: Array, k: int) -> None:
-    """Step k beyond the contacts, with the derivatives by the unknowns at the tip."""
+    """Take step k distal to the contacts, with the derivatives by the unknowns at the tip."""
     start, width, piece, load = rod.start[k], rod.width[k], piece_of(rod, k), _load_of(weight, k)
     for i in range(LANES):
         low = min(max(h[_ARC + i] - start, 0.0), width)
         step = width - low
         data = (h, piece, load, low / width, step / width)
         y = _get_six(h, _STATE + _SIX, i)
-        g, m = runge_kutta_step(_free_rates, data, i, -step, _first(y), _second(y))
-        _put_six(h, _STATE + _SIX, i, _both(g, m))
+        g, m = runge_kutta_step(_free_rates, data, i, -step, _first_three(y), _last_three(y))
+        _put_six(h, _STATE + _SIX, i, _join(g, m))
         h[_H + i] = -step
     for j in range(2):
         row = _SLOPES + (2 * j + 1) * _SIX
@@ -220,15 +223,17 @@ def _free_step(rod: Rod, weight: Weight, h: Array, k: int) -> None:
             h[_MOVING + i] = h[row + i]
         for i in range(LANES):
             y = _get_six(h, _MOVING, i)
-            g, m = runge_kutta_step(_free_slope_rates, (h,), i, h[_H + i], _first(y), _second(y))
-            _put_six(h, _MOVING, i, _both(g, m))
+            g, m = runge_kutta_step(
+                _free_slope_rates, (h,), i, h[_H + i], _first_three(y), _last_three(y)
+            )
+            _put_six(h, _MOVING, i, _join(g, m))
         for i in range(_SIX):
             h[row + i] = h[_MOVING + i]
 
 
 @inlined
 def _held_step(rod: Rod, weight: Weight, h: Array, k: int, slopes: int) -> None:
-    """Step k between contacts and base, with the first so many derivatives."""
+    """Take step k between contacts and base, with the first ``slopes`` derivatives."""
     start, width, piece, load = rod.start[k], rod.width[k], piece_of(rod, k), _load_of(weight, k)
     for i in range(LANES):
         s = h[_ARC + i]
@@ -242,7 +247,7 @@ def _held_step(rod: Rod, weight: Weight, h: Array, k: int, slopes: int) -> None:
         # The lane's contact is in this step: its derivative by s starts here.
         if slopes > 2 and s > start and s <= start + width and h[_TIP + i] == 0.0:
             u = get(h, _TURN, i)
-            turned = cross(u, _first(x0))
+            turned = cross(u, _first_three(x0))
             put(h, _SLOPES + 4 * _SIX, i, turned)
             put(h, _SLOPES + 4 * _SIX + 3 * LANES, i, (piece[3], 0.0, 0.0))
     for j in range(slopes):
@@ -275,8 +280,8 @@ def normal_plane(n: Vector) -> Pair:
 
 
 @inlined
-def _start(weight: Weight, b: Array, h: Array, more: int, share: float) -> None:
-    """Load all lanes from the buffer of contacts, at the tip, with a share of their force."""
+def _load_at_tip(weight: Weight, b: Array, h: Array, more: int, share: float) -> None:
+    """Load all lanes at the tip from the buffer of contacts, with a share of their force."""
     for i in range(_STATE, _MOVING):
         h[i] = 0.0
     for i in range(LANES):
@@ -298,7 +303,7 @@ def _start(weight: Weight, b: Array, h: Array, more: int, share: float) -> None:
 
 @inlined
 def _shares(h: Array, i: int, v: Vector) -> tuple[float, float]:
-    """Shares of the two derivatives of g(0) that come nearest to v."""
+    """Coefficients of δ₁ g(0) and δ₂ g(0) whose sum is closest to v."""
     first, second = get(h, _SLOPES + _SIX, i), get(h, _SLOPES + 3 * _SIX, i)
     aa = ab = bb = av = bv = 0.0
     for j in range(3):
@@ -312,14 +317,14 @@ def _shares(h: Array, i: int, v: Vector) -> tuple[float, float]:
 
 
 @inlined
-def _correct(h: Array, row: int, i: int, a: float, c: float) -> None:
-    """Subtract shares of the two derivatives from the 12 numbers of a lane at ``row``."""
+def _subtract_shares(h: Array, row: int, i: int, a: float, c: float) -> None:
+    """Subtract multiples of δ₁ and δ₂ from the 12 numbers of a lane at ``row``."""
     for j in range(0, 2 * _SIX, LANES):
         h[row + j + i] -= a * h[_SLOPES + j + i] + c * h[_SLOPES + 2 * _SIX + j + i]
 
 
 @inlined
-def _improve(weight: Weight, b: Array, h: Array) -> float:
+def _correct_leans(weight: Weight, b: Array, h: Array) -> float:
     """Correct all lanes' directions at the tip; return the largest error at the base."""
     worst = 0.0
     for i in range(LANES):
@@ -328,7 +333,7 @@ def _improve(weight: Weight, b: Array, h: Array) -> float:
         off = (base[0] - toward[0], base[1] - toward[1], base[2] - toward[2])
         error = np.sqrt(off[0] * off[0] + off[1] * off[1] + off[2] * off[2])
         worst = max(worst, error) if error < np.inf else worst
-        # What turns g(0) into ĝ turns g(L) as well: exactly so, were the shape to stay.
+        # The rotation of g(0) into ĝ also rotates g(L); it is exact if the shape does not change.
         along = base[0] * toward[0] + base[1] * toward[1] + base[2] * toward[2]
         across = (
             toward[0] - along * base[0],
@@ -349,9 +354,9 @@ def _improve(weight: Weight, b: Array, h: Array) -> float:
 
 
 @kernel
-def _pass(rod: Rod, weight: Weight, b: Array, h: Array, more: int, share: float) -> None:
-    """Integrate all lanes from the tip to the base, from the directions there that they have."""
-    _start(weight, b, h, more, share)
+def _integrate_lanes(rod: Rod, weight: Weight, b: Array, h: Array, more: int, share: float) -> None:
+    """Integrate all lanes from the tip to the base, from their present directions at the tip."""
+    _load_at_tip(weight, b, h, more, share)
     nearest = farthest = b[ARC]
     for i in range(1, LANES):
         nearest, farthest = min(nearest, b[ARC + i]), max(farthest, b[ARC + i])
@@ -363,12 +368,14 @@ def _pass(rod: Rod, weight: Weight, b: Array, h: Array, more: int, share: float)
 
 
 @kernel
-def _settle(rod: Rod, weight: Weight, b: Array, h: Array, share: float, enough: float) -> float:
-    """Newton's method for all lanes' directions at the tip; return the largest error."""
+def _solve_leans(
+    rod: Rod, weight: Weight, b: Array, h: Array, share: float, enough: float
+) -> float:
+    """Solve for all lanes' directions at the tip by Newton's method; return the largest error."""
     error = np.inf
     for _ in range(_ROUNDS):
-        _pass(rod, weight, b, h, 0, share)
-        error = _improve(weight, b, h)
+        _integrate_lanes(rod, weight, b, h, 0, share)
+        error = _correct_leans(weight, b, h)
         if error < enough:
             break
     return float(error)
@@ -376,21 +383,21 @@ def _settle(rod: Rod, weight: Weight, b: Array, h: Array, share: float, enough: 
 
 @kernel
 def solve_lanes(rod: Rod, weight: Weight, b: Array, h: Array, more: int) -> bool:
-    """Solve the contacts in the buffer ``b``, with their first so many derivatives.
+    """Solve the contacts in the buffer ``b``, with their first ``more`` derivatives.
 
-    ``h``, of ``WEIGHT_BUFFER`` numbers, has the base values and derivatives afterwards.
+    ``h``, of size ``WEIGHT_BUFFER``, receives the base values and derivatives.
     """
     enough = _SMALL if more == 0 else _NEAR
-    error = _settle(rod, weight, b, h, 1.0, enough)
-    if not error < enough:  # from rest, step by step
+    error = _solve_leans(rod, weight, b, h, 1.0, enough)
+    if not error < enough:  # increase the force from rest in steps
         for i in range(LANES):
             put(b, LEAN, i, (0.0, 0.0, 0.0))
         for n in range(1, _SHARES + 1):
-            error = _settle(rod, weight, b, h, n / _SHARES, enough)
+            error = _solve_leans(rod, weight, b, h, n / _SHARES, enough)
     if more > 0:
         for _ in range(3):
-            _pass(rod, weight, b, h, more, 1.0)
-            error = _improve(weight, b, h)
+            _integrate_lanes(rod, weight, b, h, more, 1.0)
+            error = _correct_leans(weight, b, h)
             if error < _SMALL:
                 break
     for i in range(LANES):
@@ -400,11 +407,11 @@ def solve_lanes(rod: Rod, weight: Weight, b: Array, h: Array, more: int) -> bool
         lost = not abs(off[0]) + abs(off[1]) + abs(off[2]) < 4.0 * _SMALL
         if lost:
             put(b, LEAN, i, (0.0, 0.0, 0.0))
-        _correct(h, _STATE, i, np.nan if lost else a, c)
+        _subtract_shares(h, _STATE, i, np.nan if lost else a, c)
         for j in range(more):
             row = _SLOPES + (4 + 2 * j) * _SIX
             a, c = _shares(h, i, get(h, row + _SIX, i))
-            _correct(h, row, i, np.nan if lost else a, c)
+            _subtract_shares(h, row, i, np.nan if lost else a, c)
     return error < _SMALL
 
 
@@ -422,7 +429,7 @@ def integrate_weighted(rod: Rod, weight: Weight, b: Array, tangents: int) -> Non
 
 @inlined
 def _stability(weight: Weight, h: Array) -> float:
-    """Determinant of g(0) by g(L): positive until the whisker bends over under its weight."""
+    """Determinant of ∂g(0)/∂g(L): positive until the whisker topples under its weight."""
     turned = cross(get(h, _SLOPES + _SIX, 0), get(h, _SLOPES + 3 * _SIX, 0))
     toward = weight.toward
     return float(toward[0] * turned[0] + toward[1] * turned[1] + toward[2] * turned[2])
@@ -440,11 +447,12 @@ def evaluate_weighted(
     first: int,
     last: int,
 ) -> None:
-    """Base values (F, p, ĝ, μ) of contacts (s, f), stability (13 in all), and all derivatives.
+    """Compute base values (F, p, ĝ, μ) and stability (13 in all) of contacts (s, f).
 
-    ``leans`` (n, 3) has the directions of weight at the tip: where to start, NaN for the resting
-    one, and what was found. ``tangents`` (n, 12, 4) are by (s, f_x, f_y, f_z), ``directions``
-    (n, 12, 3) by the direction of weight ĝ; where they have no rows they are not computed.
+    ``leans`` (n, 3) are the directions of weight at the tip: on entry where to start, NaN for that
+    of the resting whisker; on return the solution. ``tangents`` (n, 12, 4) are derivatives by
+    (s, f_x, f_y, f_z), ``directions`` (n, 12, 3) by the direction of weight ĝ; they are not
+    computed if the arrays have no rows.
     """
     b, h = np.zeros(BUFFER_SIZE), np.empty(WEIGHT_BUFFER)
     wanted = tangents.shape[0] > 0
@@ -483,7 +491,7 @@ def evaluate_weighted(
 def _carried_rates(
     data: tuple[Array, float], stage: int, left: float, i: int, v: Vector, w: Vector
 ) -> Pair:
-    """Slopes of a vector that is fixed in space, and of one to the tip (with the extent)."""
+    """Derivatives of a vector fixed in space, and of the vector to the tip (with the extent)."""
     h, extent = data
     u = get(h, stage * _STAGE + _TURN, i)
     return cross(v, u), add(cross(w, u), (-extent, 0.0, 0.0))
@@ -491,6 +499,7 @@ def _carried_rates(
 
 @inlined
 def _record(axes: Array, ends: Array, moments: Array, m: int, x: Six, y: Six, mu: Vector) -> None:
+    """Store axes, vector to the tip and moment at one arc length."""
     for a in range(3):
         axes[m, 0, a], axes[m, 1, a] = x[a], x[3 + a]
         axes[m, 2, a], ends[m, a] = y[a], y[3 + a]
@@ -508,11 +517,11 @@ def trace_weighted(
     ends: Array,
     moments: Array,
 ) -> None:
-    """Follow one solved whisker from the tip to the base.
+    """Compute the shape of one solved whisker, from the tip to the base.
 
-    At increasing arc lengths s (m,), and last at the base: three axes that are fixed in space
-    ``axes`` (m + 1, 3, 3), row by row, the vector to the tip ``ends`` (m + 1, 3) and the moment μ,
-    as the material frame there sees them.
+    Fills, at increasing arc lengths s (m,) and last at the base: ``axes`` (m + 1, 3, 3), the three
+    axes fixed in space, in rows; ``ends`` (m + 1, 3), the vector to the tip; and the moments μ; all
+    in the material frame there.
     """
     h = np.zeros(WEIGHT_BUFFER)
     x = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -526,7 +535,7 @@ def trace_weighted(
             if not held and contact[0] >= here - 1e-15:
                 x, held = (contact[1], contact[2], contact[3], 0.0, 0.0, 0.0), True
             while wanted >= 0 and s[wanted] >= here - 1e-12 and extent > 0.0:
-                _record(axes, ends, moments, wanted, v, w, _second(y))
+                _record(axes, ends, moments, wanted, v, w, _last_three(y))
                 wanted -= 1
             if here <= start + 1e-15:
                 break
@@ -539,18 +548,20 @@ def trace_weighted(
             if held:
                 x, y = runge_kutta_step(_held_rates, data, 0, to - here, x, y)
             else:
-                g, m = runge_kutta_step(_free_rates, data, 0, to - here, _first(y), _second(y))
-                y = _both(g, m)
+                g, m = runge_kutta_step(
+                    _free_rates, data, 0, to - here, _first_three(y), _last_three(y)
+                )
+                y = _join(g, m)
             carried = (h, 0.0)
             one, two = runge_kutta_step(
-                _carried_rates, carried, 0, to - here, _first(v), _second(v)
+                _carried_rates, carried, 0, to - here, _first_three(v), _last_three(v)
             )
             three, end = runge_kutta_step(
-                _carried_rates, (h, extent), 0, to - here, _first(w), _second(w)
+                _carried_rates, (h, extent), 0, to - here, _first_three(w), _last_three(w)
             )
-            v, w = _both(one, two), _both(three, end)
+            v, w = _join(one, two), _join(three, end)
             here = to
     while wanted >= 0:
-        _record(axes, ends, moments, wanted, v, w, _second(y))
+        _record(axes, ends, moments, wanted, v, w, _last_three(y))
         wanted -= 1
-    _record(axes, ends, moments, s.shape[0], v, w, _second(y))
+    _record(axes, ends, moments, s.shape[0], v, w, _last_three(y))

@@ -1,4 +1,4 @@
-"""The six signals at the base of a whisker, their triplets, and regions of contact."""
+"""The six base signals of a whisker, their triplets, and regions of contact."""
 
 from vibrissa.numerics import spherical
 from vibrissa.signals.base import (

@@ -1,4 +1,4 @@
-"""The six signals at the base, and how a choice of them is written.
+"""The six base signals: definition, selection, and derivatives.
 
 Force F and moment M about the base, of the object on the whisker, in the whisker frame::
 
@@ -7,7 +7,7 @@ Force F and moment M about the base, of the object on the whisker, in the whiske
     Mx           twisting moment
     MB, MD       bending moment, its direction:    hypot(My, Mz),  atan2(Mz, My)
 
-Directions are angles in (-π, π] and compared on the circle.
+Directions are angles in (-π, π]; differences of them are taken modulo 2π.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ Coordinates: TypeAlias = "dict[Hashable, xr.Variable]"  # of a DataArray, by nam
 SIGNALS = ("Fx", "FT", "FD", "Mx", "MB", "MD")
 #: All choices of three of the six signals, in canonical order.
 TRIPLETS = tuple(combinations(SIGNALS, 3))
-#: Numbers of the signals, and of the components of force and moment, as channels of kernels.
+#: Indices of the signals, and of other components of force and moment, as channels of kernels.
 FX, FT, FD, MX, MB, MD, FY, FZ, MY, MZ = range(10)
-_LONGEST_ARM = 10.0  # m: no whisker is that long
+_LONGEST_ARM = 10.0  # longest plausible lever arm of a whisker, m
 #: Which of the signals are angles.
 CIRCULAR = (False, False, True, False, False, True)
 
@@ -40,7 +40,7 @@ CIRCULAR = (False, False, True, False, False, True)
 def selection(
     signals: str | Sequence[str], least: int = 3, exactly: int | None = None
 ) -> tuple[str, ...]:
-    """Read a choice of signals."""
+    """Parse a choice of signals into their names, in canonical order."""
     given = signals.replace(",", " ").split() if isinstance(signals, str) else list(signals)
     spelt = {name.lower(): name for name in SIGNALS}
     names = [spelt.get(str(name).lower(), name) for name in given]
@@ -54,7 +54,7 @@ def selection(
 
 
 def base_signals(force: ArrayLike | xr.DataArray, moment: ArrayLike | xr.DataArray) -> xr.Dataset:
-    """Turn force and moment at the base into the six signals.
+    """Convert force and moment at the base into the six signals.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def base_signals(force: ArrayLike | xr.DataArray, moment: ArrayLike | xr.DataArr
     -------
     Dataset
         ``Fx``, ``FT`` (N), ``FD`` (rad), ``Mx``, ``MB`` (N·m), ``MD`` (rad), each of shape (...).
-        Directions are 0 where what they belong to is zero.
+        A direction is 0 where its vector is zero.
 
     Raises
     ------
@@ -79,7 +79,8 @@ def base_signals(force: ArrayLike | xr.DataArray, moment: ArrayLike | xr.DataArr
     Warns
     -----
     UserWarning
-        If no moment is that of a force within 10 m of the base, as when the two are swapped.
+        If all moments are those of forces more than 10 m from the base, as when force and moment
+        are swapped.
     """
     f, m, dims, coords = labelled_wrench(force, moment)
     _check_arms(f, m)
@@ -106,11 +107,11 @@ def _check_arms(force: Array, moment: Array) -> None:
 def labelled_wrench(
     force: ArrayLike | xr.DataArray, moment: ArrayLike | xr.DataArray
 ) -> tuple[Array, Array, tuple[str, ...], Coordinates]:
-    """Force and moment as arrays of one shape, and what their leading dimensions are called."""
-    vectors = [_by_space(force), _by_space(moment)]
+    """Force and moment as arrays of one shape, with names and coordinates of leading dimensions."""
+    vectors = [_space_last(force), _space_last(moment)]
     labels = [a for a in vectors if isinstance(a, xr.DataArray)]
     if len(labels) == 2:
-        together = xr.broadcast(*_aligned(*labels), exclude=("space",))
+        together = xr.broadcast(*_align(*labels), exclude=("space",))
         labels = [a.transpose(..., "space") for a in together]
         vectors = [*labels]
     force, moment = vectors
@@ -125,36 +126,36 @@ def labelled_wrench(
     return f, m, dims, coordinates(labels[0], dims)
 
 
-def _by_space(array: ArrayLike | xr.DataArray) -> ArrayLike | xr.DataArray:
-    """A DataArray with ``space`` last; what has no such dimension, as plain numbers."""
+def _space_last(array: ArrayLike | xr.DataArray) -> ArrayLike | xr.DataArray:
+    """A DataArray with ``space`` last; other input as plain numbers."""
     if isinstance(array, xr.DataArray) and "space" in array.dims:
         return array.transpose(..., "space")
     return np.asarray(array, dtype=np.float64)
 
 
-def _aligned(*arrays: xr.DataArray) -> tuple[xr.DataArray, ...]:
-    """Arrays whose coordinates agree; a ValueError if they do not."""
+def _align(*arrays: xr.DataArray) -> tuple[xr.DataArray, ...]:
+    """Align arrays; raise a ValueError if their coordinates do not agree."""
     try:
         return xr.align(*arrays, join="exact", copy=False)
-    except ValueError as error:  # of xarray: its message names its own options
+    except ValueError as error:  # xarray's message refers to its own options
         sizes = ", ".join(str(dict(a.sizes)) for a in arrays)
         raise ValueError(f"sizes or coordinates do not agree: {sizes}") from error
 
 
 def leading_dims(shape: tuple[int, ...]) -> tuple[str, ...]:
-    """Names for the dimensions of arrays that have none."""
+    """Default names for the leading dimensions of plain arrays."""
     return ("sample",) if len(shape) == 1 else tuple(f"axis_{i}" for i in range(len(shape)))
 
 
 def coordinates(array: xr.DataArray, dims: tuple[str, ...]) -> Coordinates:
-    """Coordinates that lie along the named dimensions, or along none."""
+    """Coordinates along the named dimensions, or without dimensions."""
     return {
         name: coord.variable for name, coord in array.coords.items() if set(coord.dims) <= set(dims)
     }
 
 
 def signals_of(force: Array, moment: Array) -> Array:
-    """Stack the six signals of force and moment.
+    """Compute the six signals of force and moment.
 
     Parameters
     ----------
@@ -180,7 +181,7 @@ def signals_of(force: Array, moment: Array) -> Array:
 
 
 def wrench_derivatives(force: Array, moment: Array) -> Array:
-    """Derivatives of the six signals by force and moment."""
+    """Derivatives (..., 6, 6) of the six signals by force and moment."""
     out = np.zeros((*force.shape[:-1], 6, 6))
     for first, vector in ((0, force), (3, moment)):
         y, z = vector[..., 1], vector[..., 2]
@@ -196,13 +197,13 @@ def wrench_derivatives(force: Array, moment: Array) -> Array:
 def measured(
     signals: xr.Dataset | Mapping[str, ArrayLike], names: tuple[str, ...]
 ) -> tuple[Array, tuple[str, ...], Coordinates]:
-    """Pick signals as one array.
+    """Return the named signals as one array.
 
     Parameters
     ----------
     signals : Dataset or mapping
-        Signals in SI units, the named ones at least, or ``force`` and ``moment``, from which they
-        follow; shapes must broadcast. DataArrays are matched by the names of their dimensions.
+        Signals in SI units, at least the named ones, or ``force`` and ``moment``, from which they
+        are computed; shapes must broadcast. DataArrays are matched by dimension names.
     names : tuple of str
         Names of the signals.
 
@@ -234,9 +235,9 @@ def measured(
         )
     given = [signals[name] for name in names]
     if any(isinstance(a, xr.DataArray) and a.dims for a in given):
-        # A number without dimensions holds for all.
-        labels = [a if isinstance(a, xr.DataArray) else _number(a, names, given) for a in given]
-        arrays = xr.broadcast(*_aligned(*labels))
+        # A value without dimensions applies to all.
+        labels = [a if isinstance(a, xr.DataArray) else _as_scalar(a, names, given) for a in given]
+        arrays = xr.broadcast(*_align(*labels))
         dims = tuple(str(d) for d in arrays[0].dims)
         values = np.stack([a.to_numpy().astype(np.float64) for a in arrays], axis=-1)
         return values, dims, coordinates(arrays[0], dims)
@@ -249,8 +250,8 @@ def measured(
     return values, leading_dims(values.shape[:-1]), {}
 
 
-def _number(value: ArrayLike, names: tuple[str, ...], given: list[ArrayLike]) -> xr.DataArray:
-    """A plain number among labelled arrays; plain arrays there have no names to be matched by."""
+def _as_scalar(value: ArrayLike, names: tuple[str, ...], given: list[ArrayLike]) -> xr.DataArray:
+    """Convert a plain number to a DataArray; plain arrays cannot be matched to dimensions."""
     if np.ndim(value):
         labelled = [n for n, a in zip(names, given, strict=True) if isinstance(a, xr.DataArray)]
         raise ValueError(
@@ -260,17 +261,17 @@ def _number(value: ArrayLike, names: tuple[str, ...], given: list[ArrayLike]) ->
 
 
 def circular_among(names: tuple[str, ...]) -> AnyArray:
-    """Mark the signals that are directions."""
+    """Mask (k,) of the named signals that are angles."""
     return np.array([CIRCULAR[SIGNALS.index(name)] for name in names])
 
 
 def within_turn(signals: Array, circular: ArrayLike) -> Array:
-    """Bring directions, or differences of directions, into (−π, π]."""
+    """Wrap angles, or differences of angles, to (−π, π]."""
     return np.where(circular, np.pi - (np.pi - signals) % (2.0 * np.pi), signals)
 
 
 def signal_scales(names: tuple[str, ...], force: float, moment: float) -> Array:
-    """Units of signals."""
+    """Units of the named signals, given those of force and moment."""
     scales = dict.fromkeys(("Fx", "Fy", "Fz", "FT"), force)
     scales |= dict.fromkeys(("Mx", "My", "Mz", "MB"), moment)
     return np.array([scales.get(name, 1.0) for name in names])
@@ -278,7 +279,7 @@ def signal_scales(names: tuple[str, ...], force: float, moment: float) -> Array:
 
 @inlined
 def _linear_channel(w: int, s: float, force: Vector, moment: Vector, point: Vector) -> float:
-    """A channel that is linear in s, F, M and p, or its derivative from theirs."""
+    """A channel that is linear in s, F, M and p, or its derivative from their derivatives."""
     if w == FX:
         return force[0]
     if w == MX:
@@ -306,11 +307,11 @@ def signal_equations(
     signal: Array,
     jacobian: Array,
 ) -> None:
-    """Chosen channels of a contact and, if ``wanted``, their derivatives by the unknowns.
+    """Compute channels of a contact and, if ``wanted``, their derivatives by the unknowns.
 
     Channels 0 to 5 are the six signals, 6 to 9 (F_y, F_z, M_y, M_z), 10 the arc length s (the first
-    unknown), 11 to 13 the contact point. ``value`` is (F, p) and ``tangents`` its derivatives; both
-    non-dimensional. ``signal`` (k,) and ``jacobian`` (k, unknowns) are filled.
+    unknown), 11 to 13 the contact point. ``value`` is (F, p) and ``tangents`` its derivatives, both
+    non-dimensional. Fills ``signal`` (k,) and ``jacobian`` (k, unknowns).
     """
     fx, fy, fz = value[0], value[1], value[2]
     px, py, pz = value[3], value[4], value[5]
@@ -354,7 +355,7 @@ def signal_equations(
 
 
 def signal_derivatives(values: Array, tangents: Array) -> Array:
-    """Derivatives of the six signals by the contact."""
+    """Derivatives of the six signals by ξ, from (F, p) and its derivatives."""
     force, point = values[..., :3], values[..., 3:]
     d_force, d_point = tangents[..., :3, :], tangents[..., 3:, :]
     by_point = cross(np.swapaxes(d_point, -1, -2), force[..., None, :])

@@ -1,10 +1,13 @@
-"""Parts of the reachable space that the paper distinguishes.
+"""Regions of the reachable space that the paper distinguishes.
 
-- CB, concave backward: the contact has moved toward +y of the resting whisker at the same distance
-  r from the base; CF, concave forward: toward -y. Beyond the resting whisker's largest r its curve
-  is continued along the tip's tangent; where r(s) is not monotone the nearest branch counts.
-- Large deflection: the deflected tangent at the contact points back, its x component is negative.
-- The small-deflection cone: nearer to the resting whisker than tan 2° times the arc length there.
+- CB, concave backward: the contact point is displaced toward +y from the point of the resting
+  whisker at the same distance r from the base; CF, concave forward: toward -y. Beyond the resting
+  whisker's largest r its curve is extended along the tip's tangent; where r(s) is not monotone the
+  nearest branch is used.
+- Large deflection: the tangent of the deflected whisker at the contact points backward, with a
+  negative x component.
+- Small-deflection cone: points closer to the resting whisker than tan 2° times the arc length of
+  the closest point.
 """
 
 from __future__ import annotations
@@ -21,11 +24,11 @@ from vibrissa.whisker import nearest_on_chords
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
-#: Half angle of the cone that the paper leaves out, rad.
+#: Half angle of the cone that the paper excludes, rad.
 CONE = np.deg2rad(2.0)
-#: The regions, from the largest to the smallest; ELD is "excluding large deflections".
+#: Names of the regions, from the largest to the smallest; ELD is "excluding large deflections".
 REGIONS = ("all", "ELD", "CF", "CB", "ELD CF", "ELD CB")
-_BLOCKS, _SIZE = 64, 32  # blocks of chords of the resting whisker
+_BLOCKS, _SIZE = 64, 32  # number of blocks of chords of the resting whisker, and chords per block
 
 
 @lru_cache(maxsize=16)
@@ -41,7 +44,7 @@ def resting(whisker: Whisker) -> tuple[Array, Array, Array, Array]:
     -------
     s : (n,) array
         Arc lengths, m.
-    places : (n, 3) array
+    points_at_rest : (n, 3) array
         Points of the centreline, m.
     bulge : (m,) array
         Largest distance of the points of each of m blocks from the chord of the block, m.
@@ -49,16 +52,16 @@ def resting(whisker: Whisker) -> tuple[Array, Array, Array, Array]:
         Tangent at the tip.
     """
     s = np.linspace(0.0, whisker.length, _BLOCKS * _SIZE + 1)
-    places = whisker.position(s)
-    chord = (places[_SIZE::_SIZE] - places[:-1:_SIZE])[:, None]
-    away = places[:-1].reshape(_BLOCKS, _SIZE, 3) - places[:-1:_SIZE][:, None]
+    points_at_rest = whisker.position(s)
+    chord = (points_at_rest[_SIZE::_SIZE] - points_at_rest[:-1:_SIZE])[:, None]
+    away = points_at_rest[:-1].reshape(_BLOCKS, _SIZE, 3) - points_at_rest[:-1:_SIZE][:, None]
     t = np.clip((away * chord).sum(axis=2) / (chord * chord).sum(axis=2), 0.0, 1.0)
     bulge = np.linalg.norm(away - t[..., None] * chord, axis=2).max(axis=1)
-    return s, places, bulge, whisker.frame(np.array(whisker.length))[:, 0]
+    return s, points_at_rest, bulge, whisker.frame(np.array(whisker.length))[:, 0]
 
 
 def nearest_on_rest(whisker: Whisker, points: Array) -> tuple[Array, Array]:
-    """Distance from the resting whisker, and the arc length of the nearest place.
+    """Distance of points from the resting whisker, and arc length of the closest point.
 
     Parameters
     ----------
@@ -70,18 +73,18 @@ def nearest_on_rest(whisker: Whisker, points: Array) -> tuple[Array, Array]:
     Returns
     -------
     distance, arc_length : (...) arrays
-        Distance and arc length of the nearest point, m.
+        Distance and arc length of the closest point, m.
     """
     points = np.asarray(points, dtype=np.float64)
-    s, places, bulge, _ = resting(whisker)
+    s, points_at_rest, bulge, _ = resting(whisker)
     distance, position = np.empty(points.shape[:-1]), np.empty(points.shape[:-1])
     flat = np.ascontiguousarray(points.reshape(-1, 3))
-    nearest_on_chords(places, bulge, flat, distance.reshape(-1), position.reshape(-1))
+    nearest_on_chords(points_at_rest, bulge, flat, distance.reshape(-1), position.reshape(-1))
     return distance, position * s[1]
 
 
 def in_region(region: str, backward: AnyArray, large: AnyArray) -> AnyArray:
-    """Whether contacts belong to a region."""
+    """Whether contacts belong to a region, given whether they are CB and largely deflected."""
     if region not in REGIONS:
         raise ValueError(f"a region is one of {', '.join(REGIONS)}; got {region!r}")
     inside = np.ones(np.shape(backward), dtype=bool)
@@ -95,12 +98,12 @@ def in_region(region: str, backward: AnyArray, large: AnyArray) -> AnyArray:
 
 
 def cone_angle(whisker: Whisker, points: Array) -> Array:
-    """Half angle of the cone about the resting whisker on which contact points lie."""
+    """Half angle of the cone about the resting whisker on which contact points lie, rad."""
     return np.asarray(np.arctan2(*nearest_on_rest(whisker, points)))
 
 
 def within_cone(whisker: Whisker, points: Array, angle: float = CONE) -> AnyArray:
-    """Whether contact points lie within a cone about the resting whisker.
+    """Whether contact points are within a cone about the resting whisker.
 
     Parameters
     ----------
@@ -114,25 +117,25 @@ def within_cone(whisker: Whisker, points: Array, angle: float = CONE) -> AnyArra
     Returns
     -------
     (...) bool array
-        True inside; False for NaN.
+        Result; False for NaN.
     """
     return np.asarray(cone_angle(whisker, points) < angle)
 
 
 def backward_offset(whisker: Whisker, points: Array) -> Array:
-    """How far contacts have moved toward +y of the resting whisker at the same r."""
+    """Displacement of contact points toward +y from the resting whisker at the same r, m."""
     points = np.asarray(points, dtype=np.float64)
     y = points[..., 1]
     if whisker.is_straight:
         return np.asarray(y)
-    _, places, _, tangent = resting(whisker)
-    r_rest = np.linalg.norm(places, axis=1)
+    _, points_at_rest, _, tangent = resting(whisker)
+    r_rest = np.linalg.norm(points_at_rest, axis=1)
     r = np.linalg.norm(points, axis=-1)
     if np.all(np.diff(r_rest) > 0.0):
-        rest_y = np.interp(r, r_rest, places[:, 1])
+        rest_y = np.interp(r, r_rest, points_at_rest[:, 1])
     else:
-        rest_y = _nearest_branch(points, r, r_rest, places)
-    tip = places[-1]
+        rest_y = _nearest_branch(points, r, r_rest, points_at_rest)
+    tip = points_at_rest[-1]
     beyond = r > r_rest.max()
     along = np.dot(tip, tangent)
     # |tip + a tangent| = r
@@ -141,12 +144,12 @@ def backward_offset(whisker: Whisker, points: Array) -> Array:
 
 
 def concave_backward(whisker: Whisker, points: Array) -> AnyArray:
-    """Whether contacts have moved toward +y of the resting whisker at the same r: CB, not CF."""
+    """Whether contacts are concave backward (CB) rather than concave forward (CF)."""
     return np.asarray(backward_offset(whisker, points) > 0.0)
 
 
-def _nearest_branch(points: Array, r: Array, r_rest: Array, places: Array) -> Array:
-    """Y of the resting whisker at distance r, on the branch that passes nearest to the point."""
+def _nearest_branch(points: Array, r: Array, r_rest: Array, points_at_rest: Array) -> Array:
+    """Y of the resting whisker at distance r, on the branch closest to the point."""
     flat, radius = points.reshape(-1, 3), r.reshape(-1)
     out = np.full(radius.size, np.nan)
     best = np.full(radius.size, np.inf)
@@ -157,7 +160,7 @@ def _nearest_branch(points: Array, r: Array, r_rest: Array, places: Array) -> Ar
         order = np.argsort(r_rest[piece])
         known = r_rest[piece][order]
         place = np.stack(
-            [np.interp(radius, known, places[piece][order, i]) for i in range(3)], axis=1
+            [np.interp(radius, known, points_at_rest[piece][order, i]) for i in range(3)], axis=1
         )
         away = np.linalg.norm(flat - place, axis=1)
         away[(radius < known[0]) | (radius > known[-1])] = np.inf

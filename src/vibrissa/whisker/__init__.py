@@ -1,4 +1,4 @@
-"""Whiskers: shape, section, material and frame, and the array on the face."""
+"""Whiskers: shape, cross-section, material and pose, and the whisker array of a rat."""
 
 from typing import TYPE_CHECKING
 
@@ -43,4 +43,4 @@ __all__ = [
     "whisker_array",
 ]
 
-__getattr__ = names_from(__name__, {"nearest": "nearest_on_chords"})  # compiled where it is used
+__getattr__ = names_from(__name__, {"nearest": "nearest_on_chords"})  # compiled on first use

@@ -1,6 +1,6 @@
-"""All whiskers of a face: a lab's own, or an average rat's by the equations of `morphology`.
+"""Whisker arrays of a face: measured whiskers, or those of an average rat (`morphology`).
 
-The pose of each whisker leads to the head's frame: origin at the tip of the snout, x to the
+The pose of each whisker refers to the head's frame: origin at the tip of the snout, x to the
 animal's right, y forward along the midline, z up.
 """
 
@@ -29,20 +29,20 @@ BOTH: tuple[Side, Side] = ("left", "right")  # sides of an animal
 class WhiskerArray(Mapping[str, Whisker]):
     """Whiskers by name, each with its pose in the head's frame.
 
-    A name is that of `vibrissa.whisker.morphology`: ``LC2``, ``Rγ``. Others are understood when a
-    whisker is asked for (``left C2``, ``Rgamma``), also without the side where only one side has
+    Names have the form of `vibrissa.whisker.morphology`: ``LC2``, ``Rγ``. Other spellings are
+    accepted in look-ups (``left C2``, ``Rgamma``), also without the side where only one side has
     such a whisker.
 
     Parameters
     ----------
     whiskers : iterable of Whisker
-        Whiskers, identified by their names; where a name has no side, that of its base counts.
+        Whiskers, identified by their names; where a name has no side, that of its base is used.
 
     Raises
     ------
     ValueError
-        If there are none, two are the same, a name is not a whisker's, or a base is on another side
-        than the name states.
+        If there are none, two have the same name, a name is not that of a whisker, or a base is on
+        another side than the name states.
 
     Examples
     --------
@@ -53,7 +53,7 @@ class WhiskerArray(Mapping[str, Whisker]):
     kind = "vibrissa whisker array"
 
     def __init__(self, whiskers: Iterable[Whisker]) -> None:
-        found = sorted((_named(w) for w in whiskers), key=lambda pair: pair[0].sort_key)
+        found = sorted((_with_identity(w) for w in whiskers), key=lambda pair: pair[0].sort_key)
         names = [identity.name for identity, _ in found]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
@@ -64,7 +64,7 @@ class WhiskerArray(Mapping[str, Whisker]):
         self._whiskers = {whisker.name: whisker for _, whisker in found}
 
     def __getitem__(self, name: str) -> Whisker:
-        """Give a whisker by any of its names."""
+        """Return a whisker by any of its names."""
         return self._whiskers[self._key(name)]
 
     def __iter__(self) -> Iterator[str]:
@@ -88,7 +88,7 @@ class WhiskerArray(Mapping[str, Whisker]):
         return keys[0]
 
     def identity(self, name: str) -> Identity:
-        """Say side, row and column of a whisker.
+        """Return side, row and column of a whisker.
 
         Parameters
         ----------
@@ -109,18 +109,18 @@ class WhiskerArray(Mapping[str, Whisker]):
         columns: Iterable[int] | None = None,
         names: Iterable[str] | None = None,
     ) -> WhiskerArray:
-        """Choose some of the whiskers.
+        """Select some of the whiskers.
 
         Parameters
         ----------
         side : {"both", "left", "right"}
-            Whose to keep.
+            Side to keep.
         rows : iterable of str, optional
             Rows to keep, such as ``"ABC"``; all by default.
         columns : iterable of int, optional
             Columns to keep, 0 being the Greek one; all by default.
         names : iterable of str, optional
-            Whiskers to keep, on each of the sides unless they tell one; all by default.
+            Whiskers to keep, on both sides unless the name states one; all by default.
 
         Returns
         -------
@@ -130,7 +130,7 @@ class WhiskerArray(Mapping[str, Whisker]):
         Raises
         ------
         ValueError
-            If none is left, or a name is not there.
+            If no whisker is left, or a name is not in the array.
         """
         keep = None if rows is None else {row.upper() for row in rows}
         which = None if columns is None else set(columns)
@@ -166,7 +166,7 @@ class WhiskerArray(Mapping[str, Whisker]):
         return np.stack([w.pose.to_source(w.centerline(n)) for w in self.values()])
 
     def to_tree(self) -> xr.DataTree:
-        """Write the array as labelled datasets, without loss.
+        """Convert the array to labelled datasets, without loss.
 
         Returns
         -------
@@ -179,7 +179,7 @@ class WhiskerArray(Mapping[str, Whisker]):
 
     @classmethod
     def from_tree(cls, tree: xr.DataTree) -> WhiskerArray:
-        """Make an array again.
+        """Restore an array from its tree.
 
         Parameters
         ----------
@@ -193,7 +193,7 @@ class WhiskerArray(Mapping[str, Whisker]):
         Raises
         ------
         ValueError
-            If the tree is not of this kind.
+            If the tree does not hold a whisker array.
         """
         kind = tree.attrs.get("kind")
         if kind != cls.kind or "whiskers" not in tree.children:
@@ -218,7 +218,7 @@ class WhiskerArray(Mapping[str, Whisker]):
         )
 
     def _repr_html_(self) -> str:
-        """Show all whiskers in the head's frame, from above and from behind."""
+        """Picture of all whiskers in the head's frame, from above and from behind."""
         lengths = [w.length for w in self.values()]
         rows = [
             ("whiskers", f"{len(self)}: {', '.join(self)}"),
@@ -228,15 +228,15 @@ class WhiskerArray(Mapping[str, Whisker]):
 
 
 def sides(side: str) -> tuple[Side, ...]:
-    """List the sides that are meant."""
+    """Sides denoted by ``both``, ``left`` or ``right``; raise a ValueError for anything else."""
     meant = BOTH if side == "both" else tuple(one for one in BOTH if one == side)
     if not meant:
         raise ValueError(f"side is {side!r}; both, left or right is needed")
     return meant
 
 
-def _named(whisker: Whisker) -> tuple[Identity, Whisker]:
-    """Say which whisker it is, and call it by its one name."""
+def _with_identity(whisker: Whisker) -> tuple[Identity, Whisker]:
+    """Identify a whisker, with its side, and give it the standard name."""
     identity = Identity.of(whisker.name)
     x = float(whisker.pose.origin[0])
     there: Side = "right" if x > 0.0 else "left"
@@ -251,12 +251,12 @@ def _named(whisker: Whisker) -> tuple[Identity, Whisker]:
     return identity, whisker if same else replace(whisker, name=identity.name)
 
 
-NODES = 33  # points of the centrelines that come along
+NODES = 33  # points of the stored centrelines
 _OF_HEAD = "In the head's frame: origin at the snout, x to the animal's right, y forward, z up."
 
 
 def array_tree(whiskers: Iterable[Whisker], identities: Iterable[Identity]) -> xr.DataTree:
-    """Write an array of whiskers."""
+    """Tree of the datasets of an array of whiskers."""
     them, which = list(whiskers), list(identities)
     rotation = np.stack([w.pose.rotation for w in them])
     angles = angles_of(rotation)
@@ -302,21 +302,21 @@ def whisker_array(
     names: Iterable[str] | None = None,
     **properties: Unpack[Properties],
 ) -> WhiskerArray:
-    """Make an average rat's whiskers by the published equations.
+    """Create an average rat's whiskers from the published equations.
 
     Parameters
     ----------
     side : {"both", "left", "right"}
         Side of the animal.
     rows : iterable of {"A", "B", "C", "D", "E"}
-        Rows to make, from the top down.
+        Rows to include, from the top down.
     columns : iterable of int
-        Columns to make, from the back to the front; 0 is the Greek one. Of these rows and columns
-        those whiskers are made that were measured: A0 to A4, B0 to B5, C0 to C6, D0 to D6 and E1
-        to E6, 31 on each side.
+        Columns to include, from the back to the front; 0 is the Greek one. Of these rows and
+        columns only measured whiskers are created: A0 to A4, B0 to B5, C0 to C6, D0 to D6 and E1 to
+        E6, 31 on each side.
     names : iterable of str, optional
-        Whiskers to make instead of rows and columns, such as ``["C2", "left gamma"]``; on the
-        given side(s) unless they tell one. With a warning also those that were never measured.
+        Whiskers to create instead of rows and columns, such as ``["C2", "left gamma"]``; on the
+        given side(s) unless the name states one. Whiskers that were never measured cause a warning.
     **properties
         Radius and material instead of the published ones and the defaults; see `Whisker`.
 
@@ -329,13 +329,13 @@ def whisker_array(
     Raises
     ------
     ValueError
-        If there is no such side, row, column or whisker, or none is left.
+        If there is no such side, row, column or whisker, or no whisker is left.
 
     Warns
     -----
     UserWarning
-        Where a whisker lies outside the range in which the equations were measured, or is more
-        curved than any.
+        If a whisker lies outside the range in which the equations were measured, or is more curved
+        than any measured one.
 
     References
     ----------
@@ -368,7 +368,7 @@ def whisker_array(
 
 
 def average_whisker(identity: Identity, **properties: Unpack[Properties]) -> Whisker:
-    """Make one whisker of an average rat; see `whisker_array`."""
+    """Create one whisker of an average rat; see `whisker_array`."""
     if identity.side is None:
         raise ValueError(f"{identity.name} does not state a side; left or right is needed")
     row, column = identity.row_number, identity.column
@@ -399,7 +399,7 @@ def average_whisker(identity: Identity, **properties: Unpack[Properties]) -> Whi
 
 
 def _range_notes(identity: Identity, length: float, coefficient: float) -> list[str]:
-    """Say what lies outside the range of the equations."""
+    """Notes on what lies outside the range of the equations."""
     notes = []
     if identity.column not in morphology.MEASURED[identity.row]:
         known = morphology.MEASURED[identity.row]

@@ -1,9 +1,9 @@
-"""A whisker as a labelled dataset, without loss; the model, which writes itself so, is above.
+"""Conversion of a whisker to and from a labelled dataset, without loss.
 
 Curvature and radius are stored as their polynomials, Σ c_k τ^k with τ ∈ [−1, 1] on each interval,
 so that what is read back equals what was written to the last bit. Centreline and radius at 101
-equally spaced points come along for whoever reads the file with other tools; a file in which one
-of them is not there, or they are those of another whisker, was changed by somebody and is refused.
+equally spaced points are included for other tools; a file in which one of them is missing, or
+contradicts the polynomials, has been modified and is rejected.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from vibrissa.quantities import attributes
 from vibrissa.whisker.pose import Pose
 from vibrissa.whisker.profile import Profile
 
-NODES = 101  # points of the centreline that comes along
+NODES = 101  # points of the stored centreline
 
 
 def whisker_dataset(whisker: Any) -> xr.Dataset:
-    """Write a whisker as a dataset."""
+    """Convert a whisker to a dataset."""
     bending, twist = whisker.base_stiffness or (np.inf, np.inf)
     s = np.linspace(0.0, whisker.length, NODES)
     known: dict[str, tuple[tuple[str, ...], object]] = {
@@ -62,6 +62,7 @@ def whisker_dataset(whisker: Any) -> xr.Dataset:
 
 
 def _profile_parts(name: str, profile: Profile) -> dict[str, tuple[tuple[str, ...], object]]:
+    """Variables of one profile."""
     dims = (f"{name}_power", f"{name}_interval", *((f"{name}_component",) * len(profile.shape)))
     return {
         f"{name}_knots": ((f"{name}_knot",), profile.knots),
@@ -71,7 +72,7 @@ def _profile_parts(name: str, profile: Profile) -> dict[str, tuple[tuple[str, ..
 
 
 class Stored(Protocol):
-    """Contents of a whisker's file: a dataset, or plain arrays."""
+    """Contents of a whisker's file: a dataset, or an object with plain arrays."""
 
     @property
     def variables(self) -> Mapping[Any, Any]:
@@ -82,17 +83,17 @@ class Stored(Protocol):
         """Attributes by name."""
 
 
-def check_drawn(dataset: Stored, whisker: Any) -> None:
-    """Raise if a file draws another whisker than its polynomials make."""
-    if dataset.variables.keys().isdisjoint(_DRAWN):
+def check_centerline(dataset: Stored, whisker: Any) -> None:
+    """Raise a ValueError if a file's centreline or radius contradict its polynomials."""
+    if dataset.variables.keys().isdisjoint(_REDUNDANT):
         return
-    s, line, radius = (np.asarray(dataset.variables[name], dtype=np.float64) for name in _DRAWN)
+    s, line, radius = (np.asarray(dataset.variables[name], dtype=np.float64) for name in _REDUNDANT)
     if s.ndim == 1 and line.shape == (*s.shape, 3) and radius.shape == s.shape:
-        inside = (s >= 0.0).all() and (s <= whisker.length * (1.0 + _SAME)).all()
+        inside = (s >= 0.0).all() and (s <= whisker.length * (1.0 + _TOLERANCE)).all()
         s = np.minimum(s, whisker.length)
         drawn = {"centerline": (line, whisker.position), "radius": (radius, whisker.radius)}
         if inside and all(
-            np.abs(stored - own(s)).max() <= _SAME * np.abs(own(s)).max()
+            np.abs(stored - own(s)).max() <= _TOLERANCE * np.abs(own(s)).max()
             for stored, own in drawn.values()
         ):
             return
@@ -103,9 +104,9 @@ def check_drawn(dataset: Stored, whisker: Any) -> None:
     )
 
 
-# Tolerance, as a share of the largest value, between drawn and stated values of a file.
-_DRAWN = ("arc_length", "centerline", "radius")
-_SAME = 1e-6
+# Variables that the polynomials determine, and the tolerance relative to their largest value.
+_REDUNDANT = ("arc_length", "centerline", "radius")
+_TOLERANCE = 1e-6
 
 
 def whisker_fields(dataset: Stored) -> dict[str, Any]:
@@ -114,8 +115,8 @@ def whisker_fields(dataset: Stored) -> dict[str, Any]:
     needed |= {"base_bending_stiffness", "base_twist_stiffness"}
     needed |= {"pose_rotation", "pose_origin", "curvature_knots", "curvature_coefficients"}
     needed |= {"section_knots", "section_coefficients", "curvature_error", "section_error"}
-    if not dataset.variables.keys().isdisjoint(_DRAWN):  # files of many whiskers do without
-        needed |= set(_DRAWN)
+    if not dataset.variables.keys().isdisjoint(_REDUNDANT):  # files of many whiskers omit them
+        needed |= set(_REDUNDANT)
     missing = sorted(needed - set(dataset.variables))
     if missing:
         raise ValueError(f"this is not a dataset of a whisker: it lacks {', '.join(missing)}")

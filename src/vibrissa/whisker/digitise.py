@@ -1,38 +1,33 @@
-"""From digitised points to a whisker's intrinsic curvature.
+"""Length, intrinsic curvature and pose of a whisker from digitised points.
 
-1. A smoothing spline X(t) through the points, t being arc length along the curve itself: points are
-   projected onto the fitted curve, given the arc length found there, and fitted again. (The chord
-   length of noisy points grows with their number and is used for a first guess only.)
-2. Its curvature vector κ = dT/ds, and the rotation-minimising frame R' = [T × κ]ₓ R, which does not
-   spin about its tangent.
+1. A smoothing spline X(t) is fitted to the points, with t the arc length along the curve itself:
+   points are projected onto the fitted curve, given the arc length found there, and fitted again.
+   (The chord length of noisy points increases with their number and serves as a first guess only.)
+2. Its curvature vector κ = dT/ds is computed, and the rotation-minimising frame
+   R' = [T × κ]ₓ R, which does not spin about its tangent.
 3. In that frame u₀ = (0, −κ·d2, κ·d1).
 
 The base is the point of the curve nearest the first point, the tip that nearest the last.
 
-Arc length along a parametric curve, and the nearest points on it.
+Arc length s(t) = ∫ |X′| dt is integrated by Gauss quadrature between the knots of X, and inverted
+by Newton's method.
 
-    s(t) = ∫ |X′| dt
-
-is integrated by Gauss's rule between the knots of the spline X and inverted by Newton's method.
-
-Smoothing splines whose strength follows from the noise.
-
-Through points y_i at parameters t_i ∈ [0, 1] goes the curve f that minimises
+The smoothing spline through points y_i at parameters t_i ∈ [0, 1] is the curve f that minimises
 
     Σ |y_i − f(t_i)|² + λ ∫ |f‴|² dt,
 
 a quintic spline with f‴ = f⁗ = 0 at both ends. Penalising the third derivative leaves the curvature
-at the base free (a cubic smoothing spline would make it zero there) and keeps a parabola, the usual
-whisker, whatever λ is. The spline is written by its values at sites, f = Σ N_j(t) v_j, with natural
-cardinal splines N_j. With A_ij = N_j(t_i), K = ∫ N‴ N‴ᵀ and the hat matrix H = A (AᵀA + λK)⁻¹ Aᵀ,
-λ follows from
+at the base free (a cubic smoothing spline would make it zero there) and reproduces a parabola, the
+usual shape of a whisker, for any λ. The spline is represented by its values at sites,
+f = Σ N_j(t) v_j, with natural cardinal splines N_j. With A_ij = N_j(t_i), K = ∫ N‴ N‴ᵀ and the hat
+matrix H = A (AᵀA + λK)⁻¹ Aᵀ, λ is determined by
 
-- the noise, where it is stated: the least RSS + 2 ρ σ² c tr H, an unbiased estimate of the squared
-  distance to the true curve (Mallows; the discrepancy principle RSS = σ² c (n − tr H) has the same
-  aim, but hangs on how much the noise of one sample happens to differ from σ);
-- else generalised cross-validation: the least RSS / (n − ρ tr H)². Plain cross-validation, ρ = 1,
-  follows the noise of short data at times; counting each degree of freedom as ρ = 1.2 to 1.4 of
-  them ends that (Kim & Gu 2004).
+- the noise σ, where it is given: it minimises RSS + 2 ρ σ² c tr H, an unbiased estimate of the
+  squared distance to the true curve (Mallows). The discrepancy principle RSS = σ² c (n − tr H) has
+  the same aim, but depends on how much the noise of one sample happens to differ from σ;
+- else generalised cross-validation: it minimises RSS / (n − ρ tr H)². Plain cross-validation,
+  ρ = 1, sometimes follows the noise of short data; counting each degree of freedom as ρ = 1.2 to
+  1.4 of them prevents this (Kim & Gu 2004).
 
 Points are free to slide along the curve, so that residuals have c = d − 1 components in d
 dimensions.
@@ -53,27 +48,26 @@ from vibrissa.whisker.pose import Pose, least_turn
 from vibrissa.whisker.profile import Path, Profile, approximate, constant
 from vibrissa.whisker.section import LONGEST, length_faults
 
-ROUNDS = 12  # times at most that points are projected and fitted again
-GROUPS = 24  # points of the first guess; more are averaged in groups
-SIGNIFICANCE = 0.01  # chance that straight noise passes for curvature
+ROUNDS = 12  # largest number of times that points are projected and fitted again
+GROUPS = 24  # number of points of the first guess; more are averaged in groups
+SIGNIFICANCE = 0.01  # probability that the noise of a straight line is taken for curvature
+#: Largest noise that may be stated, over the extent of the points.
 SCATTERED = 0.1
-"""Largest noise that may be stated, in extents of the points."""
 
 # Difference of a hint's distances to both ends, in lengths, below which it is ambiguous.
 HINT_MARGIN = 0.1
 
-
+#: Largest noise that is accepted unless it was stated, over the extent of the points.
 SCATTER = 0.08
-#: Noise that a straight line may leave to points, as a share of their extent, unless it is stated.
+#: Largest noise of points that count as a straight line, unless stated, over their extent.
 STRAIGHT = 0.02
-"""Largest noise, in extents of the points, that is believed unless it was stated."""
 
-WANDERING = 4.0  # length of a curve, in extents of its points, beyond which they are not in order
+WANDERING = 4.0  # length of a curve, over the extent of its points, above which they are unordered
 
 
 @dataclass(frozen=True, eq=False)
 class Digitized:
-    """The shape found in points, in a frame along the base tangent with any roll."""
+    """Shape found from points, in a frame along the base tangent with arbitrary roll."""
 
     length: float
     curvature: Profile
@@ -87,18 +81,18 @@ def digitize(
     base: str | ArrayLike | None,
     any_length: bool = False,
 ) -> Digitized:
-    """Find length, intrinsic curvature and pose in digitised points."""
+    """Determine length, intrinsic curvature and pose from digitised points."""
     array = checked_points(points, noise, any_length)
     array = array[::-1] if _starts_at_tip(array, base) else array
     line = _Line.fitted(array)
     if line.deviation <= 1e-9 * line.extent:
         return line.digitized(noise or 0.0, any_length)
-    # Lengths are counted in extents of the data from here on, about its middle.
+    # From here on, lengths are relative to the data's extent, and positions to their middle.
     middle, unit = array.mean(axis=0), line.extent
     scaled = (array - middle) / unit
     components = max(int(np.linalg.matrix_rank(scaled, tol=1e-9)) - 1, 1)
     relative = None if noise is None else noise / unit
-    fit, parameters = _fitted(scaled, relative, components)
+    fit, parameters = _fit_curve(scaled, relative, components)
     found = fit.noise(components) if len(fit.residuals) else 0.0
     _require_curve(fit.curve, found, relative)
     _require_order(parameters, found)
@@ -107,7 +101,7 @@ def digitize(
         sigma = line.noise(components) if noise is None else noise
         return line.digitized(sigma, any_length)
     curve = interpolate.BSpline(fit.curve.t, fit.curve.c * unit + middle, 5)
-    digitized = _measured(curve, float(parameters[0]), float(parameters[-1]), sigma)
+    digitized = _from_curve(curve, float(parameters[0]), float(parameters[-1]), sigma)
     _require_length(digitized.length, any_length)
     return digitized
 
@@ -115,7 +109,7 @@ def digitize(
 def checked_points(
     points: ArrayLike, noise: float | None = None, any_length: bool = False
 ) -> Array:
-    """Return points as (n, 3), m, or raise a ValueError that names every fault."""
+    """Return points as (n, 3), m, or raise a ValueError that lists every fault."""
     array = numbers("points", points)
     if array.ndim != 2 or array.shape[1] not in (2, 3):
         raise ValueError(f"points have shape {array.shape}; (n, 3) or (n, 2) is needed")
@@ -149,6 +143,7 @@ def checked_points(
 
 
 def _rows(indices: NDArray[np.intp], most: int = 8) -> str:
+    """List row indices, at most ``most`` of them."""
     shown = ", ".join(str(i) for i in indices[:most])
     return shown if indices.size <= most else f"{shown}, … ({indices.size} in all)"
 
@@ -181,7 +176,7 @@ def _starts_at_tip(points: Array, base: str | ArrayLike | None) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Line:
-    """The straight line nearest the points, and how they lie along and about it."""
+    """The straight line nearest to the points, with the points' positions relative to it."""
 
     start: Array
     direction: Array
@@ -193,6 +188,7 @@ class _Line:
 
     @classmethod
     def fitted(cls, points: Array) -> _Line:
+        """Least-squares line through points (n, 3)."""
         middle = points.mean(axis=0)
         direction = np.linalg.svd(points - middle, full_matrices=False)[2][0]
         if (points[-1] - points[0]) @ direction < 0.0:
@@ -212,14 +208,14 @@ class _Line:
     def explains(
         self, points: Array, fit: Smoothed, components: int, unit: float, noise: float | None
     ) -> bool:
-        """Whether the points are no farther from the line than noise puts them."""
+        """Whether the points' distances from the line are explained by noise."""
         n = len(points)
         if noise is not None:
             limit = special.chdtri(components * (n - 2), SIGNIFICANCE)
             return bool(self.rss <= noise**2 * limit)
         rss = float(np.sum(fit.residuals**2)) * unit**2
         left, spent = components * (n - fit.freedom), components * (fit.freedom - 2.0)
-        # A few points leave the test no power: curvature that moves them this far is not noise.
+        # With few points the test has no power: displacements this large are curvature, not noise.
         if left <= 0.0 or rss <= 0.0 or self.noise(components) > STRAIGHT * self.extent:
             return False
         ratio = (self.rss - rss) / spent / (rss / left)
@@ -230,21 +226,22 @@ class _Line:
         return float(np.sqrt(self.rss / (components * (len(self.along) - 2))))
 
     def digitized(self, noise: float, any_length: bool) -> Digitized:
+        """Result for a straight whisker."""
         _require_order(self.along / self.extent, noise / self.extent)
         _require_length(self.length, any_length)
         pose = Pose(least_turn(self.direction), self.start)
         return Digitized(self.length, constant(np.zeros(3), self.length), pose, noise)
 
 
-def _fitted(points: Array, noise: float | None, components: int) -> tuple[Smoothed, Array]:
+def _fit_curve(points: Array, noise: float | None, components: int) -> tuple[Smoothed, Array]:
     """Fit a curve and find the parameter of every point on it."""
     if noise == 0.0:
-        return _interpolated(points)
+        return _interpolate(points)
     groups = np.array_split(points, min(len(points), GROUPS))
     vertices = np.array([group.mean(axis=0) for group in groups])
-    t = _unit_interval(_chords(vertices))
+    t = _unit_interval(_chord_lengths(vertices))
     if len(vertices) < len(points):
-        # Averaging has left less noise than was stated; its amount need not be known here.
+        # Averaging leaves less noise than was stated, by an amount that need not be known here.
         curve = smooth(t, vertices, None, components).curve
         at = np.linspace(0.0, 1.0, len(points))
         t = _unit_interval(nearest_parameters(curve, points, at, 2.0 / GROUPS))
@@ -260,8 +257,9 @@ def _fitted(points: Array, noise: float | None, components: int) -> tuple[Smooth
     return fit, feet
 
 
-def _interpolated(points: Array) -> tuple[Smoothed, Array]:
-    t = _unit_interval(_chords(points))
+def _interpolate(points: Array) -> tuple[Smoothed, Array]:
+    """Fit a curve through all points, without smoothing."""
+    t = _unit_interval(_chord_lengths(points))
     for _ in range(ROUNDS):
         curve = natural_spline(t, points)
         new = _unit_interval(ArcLength(curve).length(t))
@@ -272,7 +270,7 @@ def _interpolated(points: Array) -> tuple[Smoothed, Array]:
     return Smoothed(curve, np.empty((0, 3)), float(len(points))), t
 
 
-def _chords(points: Array) -> Array:
+def _chord_lengths(points: Array) -> Array:
     return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
 
 
@@ -282,7 +280,7 @@ def _unit_interval(t: Array) -> Array:
 
 
 def _require_curve(curve: interpolate.BSpline, found: float, stated: float | None) -> None:
-    """Refuse points that are far from any smooth curve, or joined by a curve that wanders."""
+    """Raise a ValueError if points are far from any smooth curve, or the curve is too long."""
     if found > SCATTER and (stated is None or found > 2.0 * stated):
         raise ValueError(
             f"no whisker in these points: they scatter by {100.0 * found:.0f} % of their extent "
@@ -297,7 +295,7 @@ def _require_curve(curve: interpolate.BSpline, found: float, stated: float | Non
 
 
 def _require_order(parameters: Array, noise: float) -> None:
-    """Refuse points that go back along the fitted curve farther than noise takes them."""
+    """Raise a ValueError if points go back along the fitted curve farther than noise explains."""
     back = np.maximum.accumulate(parameters) - parameters
     worst = int(back.argmax())
     if back[worst] > 10.0 * noise + 0.02:
@@ -314,8 +312,8 @@ def _require_length(length: float, any_length: bool) -> None:
         raise ValueError("no whisker in these points: " + "; ".join(faults))
 
 
-def _measured(curve: interpolate.BSpline, start: float, end: float, noise: float) -> Digitized:
-    """Measure length, base frame and curvature of a fitted curve."""
+def _from_curve(curve: interpolate.BSpline, start: float, end: float, noise: float) -> Digitized:
+    """Compute length, base frame and curvature of a fitted curve."""
     if end <= start:
         raise ValueError(
             "no whisker in these points: the last lies before the first along the curve through "
@@ -340,7 +338,7 @@ def _measured(curve: interpolate.BSpline, start: float, end: float, noise: float
             "much noisier than stated"
         )
     rotation = least_turn(np.asarray(first(start)) / np.linalg.norm(first(start)))
-    # (Rᵀ)' = Rᵀ [−ω]ₓ: the transposed frame turns with the rate −ω seen from the source frame.
+    # (Rᵀ)' = Rᵀ [−ω]ₓ: in the source frame, the transposed frame rotates at the rate −ω.
     path = Path.integrate(lambda s: -spin(s), spin.knots, (0.0, 0.0, 0.0))
 
     def curvature(s: Array) -> Array:
@@ -408,7 +406,7 @@ class ArcLength:
 def nearest_parameters(
     curve: interpolate.BSpline, points: Array, guesses: Array, window: float
 ) -> Array:
-    """Find the nearest points on a curve, each within a window of parameters."""
+    """Parameters (n,) of the nearest points on a curve, each within a window about its guess."""
     grid = np.linspace(-0.02, 1.02, 521)
     apart = np.sum((points[:, np.newaxis] - np.asarray(curve(grid))) ** 2, axis=-1)
     apart[np.abs(grid - guesses[:, np.newaxis]) > window] = np.inf
@@ -426,29 +424,29 @@ def nearest_parameters(
     return t
 
 
-SITES = 48  # values that a smoothing spline has at most, per coordinate
-COST = 1.3  # ρ, what a degree of freedom counts
-LEVELS = 90  # values of λ that are compared
+SITES = 48  # number of values, per coordinate, by which a smoothing spline is represented
+COST = 1.3  # ρ, the weight of a degree of freedom
+LEVELS = 90  # number of values of λ that are compared
 
 
 def natural_spline(t: Array, values: Array) -> interpolate.BSpline:
-    """Interpolate with a quintic spline that has no third and fourth derivative at the ends."""
+    """Interpolate by a quintic spline with zero third and fourth derivatives at the ends."""
     zero = np.zeros(values.shape[1:])
-    # The stubs know conditions by name only.
+    # The type stubs accept conditions by name only.
     ends: Any = ([(3, zero), (4, zero)], [(3, zero), (4, zero)])
     return interpolate.make_interp_spline(t, values, k=5, bc_type=ends)
 
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
-    """A smoothing spline and what is known about it."""
+    """A smoothing spline, with its residuals and its degrees of freedom."""
 
     curve: interpolate.BSpline
     residuals: Array
     freedom: float
 
     def noise(self, components: int) -> float:
-        """Standard deviation per coordinate that the residuals tell of."""
+        """Standard deviation per coordinate, estimated from the residuals."""
         left = max(len(self.residuals) - self.freedom, 1e-3)
         return float(np.sqrt(np.sum(self.residuals**2) / (components * left)))
 
@@ -457,20 +455,20 @@ def smooth(t: Array, points: Array, noise: float | None, components: int) -> Smo
     """Fit a smoothing spline."""
     n = len(t)
     cardinal, roughness = _cardinal()
-    # The least λ does nothing to what n points can show, and makes the system regular where there
-    # are fewer points than sites.
+    # The smallest λ does not affect what n points can resolve, and makes the system regular where
+    # there are fewer points than sites.
     least = 1e-6 * n / (np.pi * min(n, SITES)) ** 6
     design = np.asarray(cardinal(t))
     weights, axes = linalg.eigh(design.T @ design)
     shown_part = np.sqrt(np.clip(weights, 0.0, None))[:, np.newaxis] * axes.T
     rough_part = np.sqrt(least) * roughness
-    # Modes that are orthogonal in both AᵀA and K. K itself is not formed: squared, the roughness of
-    # a smooth curve would drown in the rounding of the rough ones.
+    # Modes that are orthogonal in both AᵀA and K. K itself is not formed: when squared, the
+    # roughness of a smooth curve would be lost in the rounding errors of the rough ones.
     basis, triangle = linalg.qr(np.vstack([shown_part, rough_part]), mode="economic")
     _, rough, turned = linalg.svd(basis[SITES:], full_matrices=False)
     modes = linalg.solve_triangular(triangle, turned.T)
     shown = design @ modes
-    # The last three modes are parabolas, which have no roughness.
+    # The last three modes are the parabolas, which have no roughness.
     rates = rough[:-3] ** 2 / least
     loads = shown.T @ points
 
@@ -479,7 +477,7 @@ def smooth(t: Array, points: Array, noise: float | None, components: int) -> Smo
         weights = damping[:, np.newaxis] * loads
         return weights, points - shown @ weights, damping * (1.0 - rough**2)
 
-    # With the last a parabola is left, which is in a plane exactly.
+    # At the last level only a parabola is left, which is exactly planar.
     levels = np.append(np.geomspace(least, 10.0 * n, LEVELS), np.inf)
     rss, freedom = np.empty((2, len(levels)))
     for k, level in enumerate(levels):
@@ -501,10 +499,10 @@ def smooth(t: Array, points: Array, noise: float | None, components: int) -> Smo
 
 @cache
 def _cardinal() -> tuple[interpolate.BSpline, Array]:
-    """Give N and the triangle D with DᵀD = ∫ N‴ N‴ᵀ dt, on equally spaced sites."""
+    """Return N and the triangular D with DᵀD = ∫ N‴ N‴ᵀ dt, on equally spaced sites."""
     sites = np.linspace(0.0, 1.0, SITES)
     cardinal = natural_spline(sites, np.eye(SITES))
-    # Three Gauss points are exact where N‴ is a parabola.
+    # Three Gauss points are exact because N‴ is piecewise quadratic.
     points, weights = np.polynomial.legendre.leggauss(3)
     halves = 0.5 * np.diff(sites)[:, np.newaxis]
     middles = 0.5 * (sites[1:] + sites[:-1])[:, np.newaxis]

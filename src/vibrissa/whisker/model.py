@@ -3,8 +3,8 @@
     R' = R [u₀(s)]ₓ,    r' = R e₁,    B(s) = diag(GJ, EI, EI),    I = π r(s)⁴ / 4
 
 u₀ = (twist, curvature about d1, curvature about d2), with R' e₁ = R (0, u_z, −u_y): u_z > 0 bends
-toward +y, u_y > 0 toward −z. All is numbers: piecewise polynomials over arc length, so that a
-whisker can be pickled, stored and sent to another machine whatever it was made from.
+toward +y, u_y > 0 toward −z. All data are numbers: piecewise polynomials over arc length, so that
+any whisker can be pickled, stored and sent to another machine.
 
 The whisker frame has its origin at the base and x along the base tangent; the proximal 70 % of the
 whisker lies as close as possible to the x–y plane and bends toward +y.
@@ -24,7 +24,7 @@ from vibrissa.deferred import xr
 from vibrissa.numerics import Array
 from vibrissa.quantities import quantity
 from vibrissa.sketch import BENT, Mark, card, shown, views
-from vibrissa.whisker.dataset import Stored, check_drawn, whisker_dataset, whisker_fields
+from vibrissa.whisker.dataset import Stored, check_centerline, whisker_dataset, whisker_fields
 from vibrissa.whisker.digitise import digitize
 from vibrissa.whisker.pose import Pose, least_turn, roll
 from vibrissa.whisker.profile import (
@@ -47,17 +47,17 @@ from vibrissa.whisker.section import (
     kept_notes,
     length_faults,
     material_faults,
+    parse_properties,
     radius_notes,
     radius_profile,
     renewed_notes,
-    settled,
     split,
 )
 
 ROUNDING = 1e-9
-"""Share of the length by which an arc length may lie outside the whisker and is clipped."""
+"""Largest distance, over the length, of an arc length outside the whisker that is clipped."""
 
-STRAIGHT = 1e-9  # largest curvature times length of a whisker that counts as straight
+STRAIGHT = 1e-9  # curvature times length below which a whisker counts as straight
 
 PROXIMAL = 0.7
 """Proximal share of the whisker that defines the direction of y."""
@@ -72,7 +72,7 @@ STRAIGHT_NOTE = (
 class Whisker:
     """A whisker, or any slender clamped rod, at rest.
 
-    Make one with `from_points`, `parabola`, `straight` or `from_curvature`. These all take the
+    Create one with `from_points`, `parabola`, `straight` or `from_curvature`. These all accept the
     keywords listed under Other Parameters.
 
     Parameters
@@ -88,22 +88,22 @@ class Whisker:
     poisson_ratio : float
         ν, in (−1, 0.5].
     density : float, optional
-        Density of the material, kg/m³, for its weight; None where it is not known.
+        Density of the material, kg/m³, for its weight; None if unknown.
     base_stiffness : tuple of float, optional
         Rotational stiffness of the base (bending, twist), N·m/rad; None is a rigid clamp.
     pose : Pose
-        Place of the whisker frame in the frame that the whisker came from.
+        Pose of the whisker frame in its source frame.
     breaks : tuple of float
-        Arc lengths, m, inside the whisker, at which curvature or radius has a kink or a jump.
+        Arc lengths inside the whisker, m, at which curvature or radius has a kink or a jump.
     name : str
-        Name in messages and figures.
+        Name for messages and figures.
     notes : tuple of str
-        Sentences about how it was made that its user should know.
+        Remarks for the user on how the whisker was created.
 
     Other Parameters
     ----------------
     base_radius, tip_radius : float
-        Radii at base (default 100 µm) and tip (default a fifteenth of the base's), m; linear in
+        Radii at base (default 100 µm) and tip (default: a fifteenth of the base's), m; linear in
         between.
     radius : callable or array
         Any other radius: r(s), radii (n,) equally spaced from base to tip, or pairs (n, 2) of arc
@@ -112,8 +112,8 @@ class Whisker:
         Row and column of a rat's whisker, such as ``"C2"``, or ``"any"`` where only its length is
         known: radii by published regressions (Belli et al. 2017), instead of all other radii.
     any_length : bool
-        Whether a length below 0.5 mm or above 0.5 m, as rods of robots have, is meant; by default
-        such a length is refused as a likely error of units.
+        Whether to accept a length below 0.5 mm or above 0.5 m, as of rods of robots; by default it
+        is rejected as a likely error of units.
     breaks : sequence of float
         Arc lengths, m, at which curvature or radius has a kink or a jump. Those of sampled radii
         and, as far as they exceed the noise, of functions are detected.
@@ -162,7 +162,7 @@ class Whisker:
         object.__setattr__(self, "breaks", tuple(sorted(float(s) for s in self.breaks)))
         object.__setattr__(self, "notes", tuple(self.notes))
 
-    # Ways to make one.
+    # Constructors.
 
     @classmethod
     def from_points(
@@ -173,7 +173,7 @@ class Whisker:
         base: str | ArrayLike | None = None,
         **properties: Unpack[Properties],
     ) -> Whisker:
-        """Make a whisker from a digitised centreline.
+        """Create a whisker from a digitised centreline.
 
         Parameters
         ----------
@@ -181,7 +181,7 @@ class Whisker:
             At least 4 points in order along the whisker, m, in any frame and at any spacing; two
             columns mean z = 0.
         noise : float, optional
-            Standard deviation of a coordinate, m; 0 asks for interpolation. By default it is
+            Standard deviation of a coordinate, m; 0 for interpolation. By default it is
             estimated by cross-validation.
         base : {"first", "last"} or array (3,) or (2,), optional
             End that is the base: by name, or a point near it. By default the first.
@@ -191,12 +191,12 @@ class Whisker:
         Returns
         -------
         Whisker
-            Whisker in its own frame; its pose leads back to the points' frame.
+            Whisker in its own frame; its pose maps it to the points' frame.
 
         Raises
         ------
         ValueError
-            If the points are not a centreline, with all that is wrong with them.
+            If the points are not a centreline, with a list of all faults.
         """
         shape = digitize(points, noise, base, properties.get("any_length", False))
         notes: tuple[str, ...] = ()
@@ -205,7 +205,7 @@ class Whisker:
                 f"the noise of its points was estimated at {shape.noise * 1e3:.2g} mm (standard "
                 "deviation per coordinate) by cross-validation",
             )
-        whisker = _assembled(shape.length, shape.curvature, shape.pose, properties, notes)
+        whisker = _assemble(shape.length, shape.curvature, shape.pose, properties, notes)
         assumed = assumptions(whisker.length, whisker.section_radius, properties)
         return replace(whisker, notes=whisker.notes + assumed).aligned()
 
@@ -213,15 +213,15 @@ class Whisker:
     def parabola(
         cls, length: float, coefficient: float, **properties: Unpack[Properties]
     ) -> Whisker:
-        """Make a planar whisker on the parabola y = A x².
+        """Create a planar whisker on the parabola y = A x².
 
         Parameters
         ----------
         length : float
             Arc length, m.
         coefficient : float
-            A, 1/m. A negative one bends to −y of the source frame; the whisker frame is then
-            turned by 180° about x, so that the whisker bends to +y there, as the pose records.
+            A, 1/m. With a negative one the whisker bends to −y of the source frame; the whisker
+            frame is then rotated by 180° about x, as the pose records, and it bends to +y.
         **properties
             Radius and material; see `Whisker`.
 
@@ -237,11 +237,11 @@ class Whisker:
         curvature = parabola_curvature(length, abs(float(coefficient)))
         pose = Pose(np.diag([1.0, -1.0, -1.0])) if coefficient < 0.0 else Pose()
         properties.setdefault("name", "parabola")
-        return _assembled(length, curvature, pose, properties)
+        return _assemble(length, curvature, pose, properties)
 
     @classmethod
     def straight(cls, length: float, **properties: Unpack[Properties]) -> Whisker:
-        """Make a straight whisker.
+        """Create a straight whisker.
 
         Parameters
         ----------
@@ -258,7 +258,7 @@ class Whisker:
         if faults:
             raise ValueError("no straight whisker: " + "; ".join(faults))
         properties.setdefault("name", "straight")
-        return _assembled(length, constant(np.zeros(3), length), Pose(), properties)
+        return _assemble(length, constant(np.zeros(3), length), Pose(), properties)
 
     @classmethod
     def from_curvature(
@@ -267,14 +267,14 @@ class Whisker:
         curvature: Callable[..., object],
         **properties: Unpack[Properties],
     ) -> Whisker:
-        """Make a whisker from its intrinsic curvature.
+        """Create a whisker from its intrinsic curvature.
 
         Parameters
         ----------
         length : float
             Arc length, m.
         curvature : callable
-            Takes arc lengths, m (an array, or one at a time), and returns (..., 3): twist,
+            Function of arc lengths, m (an array, or one at a time), that returns (..., 3): twist,
             curvature about d1, curvature about d2, 1/m.
         **properties
             Radius, material and breaks; see `Whisker`.
@@ -282,7 +282,7 @@ class Whisker:
         Returns
         -------
         Whisker
-            Whisker in the frame in which the curvature is stated, whichever way it bends; `aligned`
+            Whisker in the frame in which the curvature is given, whichever way it bends; `aligned`
             rolls it so that it bends to +y.
         """
         faults = length_faults(length, properties.get("any_length"))
@@ -301,13 +301,13 @@ class Whisker:
                 f"the curvature is met to {profile.error:.1e} of its largest value only; it has "
                 "kinks or jumps that should be stated as breaks",
             )
-        whisker = _assembled(length, profile, Pose(), properties, notes)
+        whisker = _assemble(length, profile, Pose(), properties, notes)
         if not whisker.is_straight and abs(whisker._proximal_roll()) > np.pi / 2:
             note = "its proximal part bends toward −y in the frame its curvature was stated in"
             whisker = replace(whisker, notes=(*whisker.notes, note))
         return whisker
 
-    # What it is.
+    # Properties and geometry.
 
     @property
     def base_radius(self) -> float:
@@ -336,7 +336,7 @@ class Whisker:
 
     @property
     def assumed(self) -> tuple[str, ...]:
-        """Names of the properties that nobody stated, such as ``radius``; notes say more."""
+        """Names of the properties that are assumed, such as ``radius``; see the notes."""
         return tuple(note.split(ASSUMED)[0] for note in self.notes if ASSUMED in note)
 
     @cached_property
@@ -353,7 +353,7 @@ class Whisker:
         s : array (...)
             Arc lengths from the base, m.
         side : {"right", "left"}
-            Side that counts where the curvature jumps.
+            Side from which the value is taken where the curvature jumps.
 
         Returns
         -------
@@ -370,7 +370,7 @@ class Whisker:
         s : array (...)
             Arc lengths from the base, m; NaN gives NaN.
         side : {"right", "left"}
-            Side that counts where the radius jumps.
+            Side from which the value is taken where the radius jumps.
 
         Returns
         -------
@@ -380,7 +380,7 @@ class Whisker:
         return self.section_radius(self._inside(s), side)
 
     def position(self, s: ArrayLike) -> Array:
-        """Points of the rest whisker at arc lengths.
+        """Points of the resting whisker at arc lengths.
 
         Parameters
         ----------
@@ -395,7 +395,7 @@ class Whisker:
         return self._rest.at(self._inside(s))[1]
 
     def frame(self, s: ArrayLike) -> Array:
-        """Material frames of the rest whisker at arc lengths.
+        """Material frames of the resting whisker at arc lengths.
 
         Parameters
         ----------
@@ -410,7 +410,7 @@ class Whisker:
         return self._rest.at(self._inside(s))[0]
 
     def centerline(self, n: int = 101) -> Array:
-        """Points of the rest whisker, equally spaced in arc length.
+        """Points of the resting whisker, equally spaced in arc length.
 
         Parameters
         ----------
@@ -428,11 +428,13 @@ class Whisker:
 
     @cached_property
     def _rest(self) -> Path:
+        """Integrated resting shape."""
         knots = self.intrinsic_curvature.knots
         joints = np.append(knots[knots < self.length * (1.0 - ROUNDING)], self.length)
         return Path.integrate(self.intrinsic_curvature, joints, (1.0, 0.0, 0.0))
 
     def _inside(self, s: ArrayLike) -> Array:
+        """Arc lengths clipped to the whisker; raise a ValueError if they are outside it."""
         s = np.asarray(s, dtype=np.float64)
         slack = ROUNDING * self.length
         if (s < -slack).any() or (s > self.length + slack).any():
@@ -444,11 +446,12 @@ class Whisker:
         return inside
 
     def _proximal_roll(self) -> float:
+        """Roll that aligns the proximal part with the x–y plane."""
         count = 256
         s = (np.arange(count) + 0.5) * (PROXIMAL * self.length / count)
         return proximal_roll(self.position(s), np.full(count, PROXIMAL * self.length / count))
 
-    # The same whisker, changed.
+    # Modified whiskers.
 
     def aligned(self) -> Whisker:
         """Roll the frame so that the proximal 70 % lies in the x–y plane and bends toward +y.
@@ -456,9 +459,9 @@ class Whisker:
         Returns
         -------
         Whisker
-            The same rod; its pose takes the opposite roll, so that nothing moves in the source
-            frame. A straight whisker is turned so that its axes are nearest those of the source
-            frame.
+            The same rod; its pose gets the opposite roll, so that it is unchanged in the source
+            frame. The axes of a straight whisker are rotated as close as possible to those of the
+            source frame.
         """
         if self.is_straight:
             nearest = least_turn(self.pose.rotation[:, 0])
@@ -474,12 +477,12 @@ class Whisker:
         )
 
     def with_properties(self, **properties: Unpack[Properties]) -> Whisker:
-        """Give the same shape another radius, material, holding or name.
+        """Return a whisker of the same shape with other radius, material, base stiffness or name.
 
         Parameters
         ----------
         **properties
-            Properties that change; see `Whisker`. What is not named stays.
+            Properties to change; see `Whisker`. Others are kept.
 
         Returns
         -------
@@ -494,19 +497,19 @@ class Whisker:
             kept = {s for s in self.breaks if s not in own} | {*stated.get("breaks", ())}
             stated["breaks"] = sorted(kept)
             section = radius_profile(self.length, **stated)
-            breaks = _merged(kept, section.breaks(), self.length)
+            breaks = _merge_breaks(kept, section.breaks(), self.length)
             notes = renewed_notes(kept_notes(self.notes, properties), self.length, section)
             notes += radius_notes(self.length, section, stated)
             whisker = replace(whisker, section_radius=section, breaks=breaks, notes=notes)
         return replace(whisker, notes=kept_notes(whisker.notes, holding), **holding)
 
     def trimmed(self, length: float) -> Whisker:
-        """Cut the tip off; shape and radius of what stays do not change.
+        """Cut off the tip, without a change of shape or radius of the rest.
 
         Parameters
         ----------
         length : float
-            Arc length that stays, m.
+            Arc length to keep, m.
 
         Returns
         -------
@@ -527,14 +530,14 @@ class Whisker:
         )
 
     def scaled(self, length_factor: float = 1.0, radius_factor: float = 1.0) -> Whisker:
-        """Stretch the whole shape, the radius, or both.
+        """Scale the shape, the radius, or both.
 
         Parameters
         ----------
         length_factor : float
-            Factor on every length along and across the shape; curvature is divided by it.
+            Factor of all lengths of the centreline; curvature is divided by it.
         radius_factor : float
-            Factor on the radius.
+            Factor of the radius.
 
         Returns
         -------
@@ -554,10 +557,10 @@ class Whisker:
             breaks=tuple(s * length_factor for s in self.breaks),
         )
 
-    # In and out.
+    # Conversion.
 
     def to_dataset(self) -> xr.Dataset:
-        """Write the whisker as a dataset, without loss.
+        """Convert the whisker to a dataset, without loss.
 
         Returns
         -------
@@ -568,12 +571,12 @@ class Whisker:
 
     @classmethod
     def from_dataset(cls, dataset: Stored) -> Whisker:
-        """Make a whisker again from its dataset.
+        """Restore a whisker from its dataset.
 
         Parameters
         ----------
         dataset : xarray.Dataset
-            Dataset of `to_dataset`, or anything with its ``variables`` and ``attrs``.
+            Dataset from `to_dataset`, or an object with its ``variables`` and ``attrs``.
 
         Returns
         -------
@@ -582,10 +585,10 @@ class Whisker:
         Raises
         ------
         ValueError
-            If something of it is missing, or was changed so that its parts contradict each other.
+            If a part is missing, or has been modified so that parts contradict each other.
         """
         whisker = cls(**whisker_fields(dataset))
-        check_drawn(dataset, whisker)
+        check_centerline(dataset, whisker)
         return whisker
 
     def __repr__(self) -> str:
@@ -603,7 +606,7 @@ class Whisker:
         )
 
     def _repr_html_(self) -> str:
-        """Show its shape, with size and material."""
+        """Picture of the shape, with size and material."""
         names = ["length", "base_radius", "tip_radius", "youngs_modulus", "poisson_ratio"]
         names += [] if self.density is None else ["density"]
         rows = [(quantity(name).long_name, shown(name, getattr(self, name))) for name in names]
@@ -613,14 +616,17 @@ class Whisker:
 
 
 def _break_faults(breaks: Sequence[float], length: float) -> list[str]:
+    """List breaks that are outside the whisker as a fault."""
     outside = [s for s in breaks if not 0.0 < s < length]
     if not outside:
         return []
     return [f"breaks {outside} m; they must lie inside the whisker, between 0 and {length!r} m"]
 
 
-def _merged(stated: Iterable[float], found: Iterable[float], length: float) -> tuple[float, ...]:
-    """Breaks that were stated, and those found that are not among them."""
+def _merge_breaks(
+    stated: Iterable[float], found: Iterable[float], length: float
+) -> tuple[float, ...]:
+    """Combine the stated breaks with those detected that are not among them."""
     breaks = [float(s) for s in stated]
     for s in found:
         if all(abs(s - other) > ROUNDING * length for other in breaks):
@@ -628,20 +634,20 @@ def _merged(stated: Iterable[float], found: Iterable[float], length: float) -> t
     return tuple(sorted(breaks))
 
 
-def _assembled(
+def _assemble(
     length: float,
     curvature: Profile,
     pose: Pose,
     properties: Properties,
     notes: tuple[str, ...] = (),
 ) -> Whisker:
-    """Add radius and material to a shape."""
+    """Create a whisker from a shape, with radius and material from the keywords."""
     stated = properties.get("breaks", ())
     faults = _break_faults(stated, length)
     if faults:
         raise ValueError("no whisker: " + "; ".join(faults))
-    section, holding, remarks = settled(length, properties)
-    breaks = _merged(stated, [*curvature.breaks(), *section.breaks()], length)
+    section, holding, remarks = parse_properties(length, properties)
+    breaks = _merge_breaks(stated, [*curvature.breaks(), *section.breaks()], length)
     return Whisker(
         length, curvature, section, pose=pose, breaks=breaks, notes=notes + remarks, **holding
     )

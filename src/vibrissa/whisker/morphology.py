@@ -1,7 +1,7 @@
-"""An average rat's whiskers by the published equations, as functions of row and column.
+"""Morphology of an average rat's whiskers from published equations, by row and column.
 
-Here rows are counted from 1 (A) to 5 (E) and columns from 0 (Greek) to 6, whatever the source does;
-each equation converts for itself. All results are in SI units.
+Rows are counted from 1 (A) to 5 (E) and columns from 0 (Greek) to 6; each function converts these
+to the numbers of its source. All results are in SI units.
 
 **The head's frame** is that of Towal et al. (2011): origin at the tip of the snout, x to the
 animal's right, y forward along the midline, z up; the rows of whiskers lie parallel to the x–y
@@ -10,33 +10,33 @@ y–z plane.
 
 **Towal et al. (2011)**, *The morphology of the rat vibrissal array*, PLoS Comput Biol 7:e1001120,
 354 whiskers of six rats, counts the Greek column as 1 and column 1 as 2, … 6 as 7. It gives length,
-shape (a planar parabola y = A x²), base points on an ellipsoid, and four angles at which a whisker
-leaves the face. Three of these are angles of projections, to be turned into a rotation so:
+shape (a planar parabola y = A x²), base points on an ellipsoid, and four angles of emergence from
+the face. Three of these are angles of projections, which are converted to a rotation as follows:
 
 - θ, in the horizontal plane, from backward (0°) over sideways (90°) to forward (180°): the azimuth
-  is θ − 90° (`vibrissa.whisker.emergence`: 0 is sideways, forward is positive).
+  is θ − 90° (0 is sideways, forward is positive).
 - φ, in the frontal plane, from sideways (0°) to upward (90°): with the azimuth,
   tan elevation = tan φ cos azimuth.
-- ψ, in the sagittal plane, from backward (0°) over upward (90°) to forward (180°). It is redundant:
-  the three projections of a direction obey an equation. It adds to φ only where a whisker
-  lies within 45° of the midline, and none of a rat's does at rest; so it is given and not used.
+- ψ, in the sagittal plane, from backward (0°) over upward (90°) to forward (180°). It is redundant,
+  because the three projections of a direction are related by an equation. It would be needed only
+  for a whisker within 45° of the midline, and there is none at rest; it is given but not used.
 - ζ, the roll about the tangent at the base: at 0° the whisker is concave downward, at 90° forward:
   the roll is ζ − 90°.
 
-The measured points lie within 0.3 mm of a plane over the proximal 65 % of a whisker; farther out
-these equations were not tested, and real whiskers leave the plane.
+The measured points lie within 0.3 mm of a plane over the proximal 65 % of a whisker. Distally the
+equations were not tested, and real whiskers leave the plane.
 
 **Belli et al. (2017)**, *Variations in vibrissal geometry across the rat mystacial pad*,
 J Neurophysiol 117:1807, 519 whiskers of seven studies, counts the Greek column as 0. It gives base
-diameters and radius slopes. Both are fits of their own, and put together they give tips of no or
-negative radius for most whiskers of the middle columns (`tip_radius` states what is done then).
+diameters and radius slopes. The two are independent fits; combined, they give tips of zero or
+negative radius for most whiskers of the middle columns (see `tip_radius`).
 
 **Quist & Hartmann (2012)**, J Neurophysiol 107:2298: an upper bound of A by length.
 
-**Names**: a whisker is known by side, row and column. The rows of large whiskers on a rat's cheek
-are called A (the uppermost) to E, the columns 1 to 6 from the back to the front. The four hindmost
-whiskers stand between the rows and have Greek letters; each counts with the row above it (α,
-between A and B, with A). They are column 0 here.
+**Names**: a whisker is identified by side, row and column. The rows of large whiskers on a rat's
+cheek are A (the uppermost) to E, the columns 1 to 6 from the back to the front. The four hindmost
+whiskers are between the rows and have Greek letters; each is assigned to the row above it (α,
+between A and B, to A). They are column 0 here.
 """
 
 from __future__ import annotations
@@ -53,11 +53,11 @@ from vibrissa.numerics import Array
 
 # Columns (0: Greek) of each row whose whiskers were measured: the range of validity.
 MEASURED = {"A": range(5), "B": range(6), "C": range(7), "D": range(7), "E": range(1, 7)}
-# Base over tip radius, at most: the largest of the means that studies found (28 to 36).
+# Largest ratio of base to tip radius: the largest of the means in the literature (28 to 36).
 MOST_TAPER = 36.0
-_TOWAL_GREEK = 1  # column number of the Greek whiskers in Towal et al
-_BELLI_GREEK = 0  # column number of the Greek whiskers in Belli et al
-# Ellipsoid of the right cheek: m, and angles about z, y, x, rad, the last one turned first.
+_TOWAL_GREEK = 1  # column number of the Greek whiskers in Towal et al.
+_BELLI_GREEK = 0  # column number of the Greek whiskers in Belli et al.
+# Ellipsoid of the right cheek: m, and angles about z, y, x, rad, the last rotation applied first.
 _CENTER = 1e-3 * np.array([1.9128, -7.6549, -5.4439])
 _RADII = 1e-3 * np.array([9.5304, 5.5393, 6.9745])
 _TURNED = np.radians([106.51, -2.5211, -19.5401])
@@ -68,7 +68,7 @@ def arc_length(row: ArrayLike, column: ArrayLike) -> Array:
 
     S = −7.9312 column + 2.2224 row + 52.1110 mm.
     """
-    row, column = _towal(row, column)
+    row, column = _towal_numbers(row, column)
     return np.asarray(1e-3 * (-7.9312 * column + 2.2224 * row + 52.1110))
 
 
@@ -78,12 +78,12 @@ def curvature_coefficient(column: ArrayLike) -> Array:
     A = exp(1 / (−0.02052 column − 0.2045)) per mm. The table printed in the paper has a misprint;
     this form gives the value of its text, 0.0233 per mm for C2.
     """
-    _, column = _towal(1, column)
+    _, column = _towal_numbers(1, column)
     return np.asarray(1e3 * np.exp(1.0 / (-0.02052 * column - 0.2045)))
 
 
 def curvature_bound(length: ArrayLike) -> Array:
-    """Say how large the coefficient A of a real whisker is at most (Quist & Hartmann 2012).
+    """Largest coefficient A of real whiskers of a length (Quist & Hartmann 2012).
 
     A ≤ 0.156 exp(−S / 15.6 mm) + 0.015 per mm.
     """
@@ -94,10 +94,10 @@ def curvature_bound(length: ArrayLike) -> Array:
 def base_point(row: ArrayLike, column: ArrayLike) -> Array:
     """Points at which whiskers of the right side leave the cheek (Towal et al. 2011).
 
-    On the ellipsoid of the cheek, in whose own axes the direction from its centre has the azimuth
-    15.2953 column − 144.2220 and the angle 18.2237 row + 34.7558 from the third axis, in degrees.
+    They are on the ellipsoid of the cheek. In its own axes the direction from its centre has the
+    azimuth 15.2953 column − 144.2220 and the angle 18.2237 row + 34.7558 from the third axis, °.
     """
-    row, column = _towal(row, column)
+    row, column = _towal_numbers(row, column)
     azimuth = np.radians(15.2953 * column - 144.2220)
     polar = np.radians(18.2237 * row + 34.7558)
     direction = np.stack(
@@ -108,13 +108,13 @@ def base_point(row: ArrayLike, column: ArrayLike) -> Array:
 
 
 def _cheek() -> Array:
-    """transform.Rotation from the ellipsoid's axes to the head's, R_z R_y R_x."""
+    """Rotation matrix from the ellipsoid's axes to the head's, R_z R_y R_x."""
     return np.asarray(transform.Rotation.from_euler("ZYX", _TURNED).as_matrix())
 
 
 def projection_angles(row: ArrayLike, column: ArrayLike) -> Array:
-    """Angles of whiskers as Towal et al. (2011) give them; see the module."""
-    row, column = _towal(row, column)
+    """Projected angles θ, φ, ψ, ζ of whiskers as given by Towal et al. (2011), rad."""
+    row, column = _towal_numbers(row, column)
     degrees = [
         10.6475 * column + 37.3178,
         1.0988 * column - 18.0334 * row + 50.6005,
@@ -126,7 +126,7 @@ def projection_angles(row: ArrayLike, column: ArrayLike) -> Array:
 
 
 def emergence_angles(row: ArrayLike, column: ArrayLike) -> Array:
-    """Angles at which whiskers of the right side leave the face (Towal et al. 2011)."""
+    """Azimuth, elevation and roll at which right-side whiskers emerge (Towal et al. 2011)."""
     theta, phi, _, zeta = np.moveaxis(projection_angles(row, column), -1, 0)
     azimuth = theta - np.pi / 2.0
     elevation = np.arctan(np.tan(phi) * np.cos(azimuth))
@@ -138,50 +138,50 @@ def base_radius(row: ArrayLike, column: ArrayLike, length: ArrayLike) -> Array:
 
     Its diameter is 0.041 + 0.002 S + 0.011 row − 0.0039 column, mm, with the length S in mm.
     """
-    row, column = _belli(row, column)
+    row, column = _belli_numbers(row, column)
     s = 1e3 * np.asarray(length, dtype=np.float64)
     return np.asarray(0.5e-3 * (0.041 + 0.002 * s + 0.011 * row - 0.0039 * column))
 
 
 def radius_slope(row: ArrayLike, column: ArrayLike) -> Array:
-    """Radius that whiskers lose per length, from base to tip (Belli et al. 2017).
+    """Decrease of the radius per length, from base to tip (Belli et al. 2017).
 
     0.0012 + 0.00017 row − 0.000066 column + 0.00011 column².
     """
-    row, column = _belli(row, column)
+    row, column = _belli_numbers(row, column)
     return np.asarray(0.0012 + 0.00017 * row - 0.000066 * column + 0.00011 * column**2)
 
 
 def tip_radius(row: ArrayLike, column: ArrayLike, length: ArrayLike) -> Array:
-    """Radius of whiskers at the tip, by base radius and slope as far as these go together.
+    """Radius of whiskers at the tip, from base radius and slope as far as these are compatible.
 
-    Where the slope would lead to less than the base radius over `MOST_TAPER` (often to less than
-    nothing), that is taken instead.
+    It is at least the base radius over `MOST_TAPER`; the slope alone often leads to less than that,
+    or to negative values.
     """
     base = base_radius(row, column, length)
     by_slope = base - radius_slope(row, column) * np.asarray(length)
     return np.asarray(np.maximum(by_slope, base / MOST_TAPER))
 
 
-def _towal(row: ArrayLike, column: ArrayLike) -> tuple[Array, Array]:
+def _towal_numbers(row: ArrayLike, column: ArrayLike) -> tuple[Array, Array]:
     """Row and column as Towal et al. count them."""
     return np.asarray(row, np.float64), np.asarray(column, np.float64) + _TOWAL_GREEK
 
 
-def _belli(row: ArrayLike, column: ArrayLike) -> tuple[Array, Array]:
+def _belli_numbers(row: ArrayLike, column: ArrayLike) -> tuple[Array, Array]:
     """Row and column as Belli et al. count them."""
     return np.asarray(row, np.float64), np.asarray(column, np.float64) + _BELLI_GREEK
 
 
-ANY = "any"  # name of a whisker of unknown row and column, of which only the length is known
-_ALIKE = 5e-3  # difference of length within which whiskers count as alike, m: about half a column
+ANY = "any"  # name of a whisker of unknown row and column
+_SIMILAR_LENGTH = 5e-3  # scale of the weights by length, m: about half a column
 
 
 def published_radii(name: str, length: float) -> tuple[float, float]:
     """Base and tip radius, m, of a rat's whisker by its name and length, m (Belli et al. 2017).
 
-    For `ANY` the mean of those that were measured, weighted by how near their published lengths
-    (Towal et al. 2011) are.
+    For `ANY`, the mean over the measured whiskers, weighted by the similarity of their published
+    lengths (Towal et al. 2011).
     """
     if name != ANY:
         identity = Identity.of(name)
@@ -191,7 +191,7 @@ def published_radii(name: str, length: float) -> tuple[float, float]:
         which = np.array(
             [(1 + i, column) for i, row in enumerate(ROWS) for column in MEASURED[row]]
         )
-        away = (length - arc_length(*which.T)) / _ALIKE
+        away = (length - arc_length(*which.T)) / _SIMILAR_LENGTH
         weight = np.exp(-0.5 * (away**2 - (away**2).min()))
     row, column = which.T
     base = np.average(base_radius(row, column, length), weights=weight)
@@ -200,7 +200,7 @@ def published_radii(name: str, length: float) -> tuple[float, float]:
 
 
 def published_note(name: str) -> str:
-    """State where such radii come from."""
+    """State the source of published radii."""
     if name == ANY:
         which = "its length, of a rat's whisker of unknown row and column"
     else:
@@ -223,16 +223,16 @@ _PATTERN = re.compile(
 
 @dataclass(frozen=True)
 class Identity:
-    """Name of a whisker in parts.
+    """Name of a whisker, in parts.
 
     Parameters
     ----------
     row : {"A", "B", "C", "D", "E"}
         Row, from the top down.
     column : int
-        0 for the Greek whiskers, then 1 to 6 (of some animals 9) from the back to the front.
+        0 for the Greek whiskers, then 1 to 6 (in some animals 9) from the back to the front.
     side : {"left", "right"} or None
-        Side of the animal; None where it is not stated.
+        Side of the animal; None if not stated.
 
     Raises
     ------
@@ -257,14 +257,14 @@ class Identity:
 
     @classmethod
     def of(cls, name: str) -> Identity:
-        """Read a whisker's name.
+        """Parse a whisker's name.
 
         Parameters
         ----------
         name : str
             Row and column such as ``C2``, a Greek letter or its name (``γ``, ``gamma``, also
             ``C0``), with or without a side before or after it: ``LC2``, ``left C2``,
-            ``C2_right``. Capitals do not matter.
+            ``C2_right``. Case is ignored.
 
         Returns
         -------
@@ -273,7 +273,7 @@ class Identity:
         Raises
         ------
         ValueError
-            If it is not a whisker's name.
+            If ``name`` is not the name of a whisker.
 
         Examples
         --------
@@ -295,7 +295,7 @@ class Identity:
         return cls(found["row"].upper(), int(found["column"]), side)
 
     def on(self, side: Side | None) -> Identity:
-        """Put the same whisker on another side.
+        """Return the whisker of the same row and column on another side.
 
         Parameters
         ----------
@@ -310,12 +310,12 @@ class Identity:
 
     @property
     def row_number(self) -> int:
-        """1 for row A to 5 for row E."""
+        """Row number: 1 for row A to 5 for row E."""
         return ROWS.index(self.row) + 1
 
     @property
     def name(self) -> str:
-        """Name as it is written everywhere: ``C2``, ``γ``, ``LC2``, ``Rγ``."""
+        """Standard name: ``C2``, ``γ``, ``LC2``, ``Rγ``."""
         bare = f"{self.row}{self.column}"
         if self.column == 0 and self.row in ROWS[: len(GREEK)]:
             bare = GREEK[self.row_number - 1]
@@ -323,5 +323,5 @@ class Identity:
 
     @property
     def sort_key(self) -> tuple[str, str, int]:
-        """Left before right, then by row, then from the back to the front."""
+        """Key that sorts left before right, then by row, then from the back to the front."""
         return (self.side or "", self.row, self.column)

@@ -1,19 +1,22 @@
-"""Pose of a whisker in the frame that its points came from.
+"""Pose of a whisker in its source frame, and emergence angles of its base.
+
+The source frame is the one from which the whisker's points came:
 
     x_source = R x_whisker + o
 
-`R` has the whisker's axes as columns (x along the base tangent, y the side it bends to) and `o` is
-its base point. Points are moved by both, vectors (forces, directions) by `R` alone; a moment about
-the base is a vector.
+`R` has the whisker's axes as columns (x along the base tangent, y toward the side to which it
+bends) and `o` is its base point. Points transform with both, vectors (forces, directions) with `R`
+alone; a moment about the base is a vector.
 
-How a whisker leaves the face: azimuth, elevation and roll of its base.
+Azimuth, elevation and roll of the base describe how a whisker emerges from the face:
 
     R = R_z(azimuth) R_y(−elevation) R_x(roll)
 
-takes the whisker's frame to the one it stands in, whose z is up, so that the base tangent is
-(cos el cos az, cos el sin az, sin el). At zero roll the whisker's y axis, the side it bends to, is
-level and points to rising azimuth. A whisker and its mirror image in the y–z plane, one on each
-side of a face, have azimuths az and π − az, the same elevation, and rolls ro and π − ro.
+maps the whisker's frame to a frame whose z is up, so that the base tangent is
+(cos el cos az, cos el sin az, sin el). At zero roll the whisker's y axis, the side to which it
+bends, is horizontal and points toward increasing azimuth. A whisker and its mirror image in the y–z
+plane, one on each side of a face, have azimuths az and π − az, the same elevation, and rolls ro and
+π − ro.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ from numpy.typing import ArrayLike
 
 from vibrissa.numerics import Array
 
-ORTHOGONALITY = 1e-9  # largest entry of RᵀR − 1 that still counts as a rotation
+ORTHOGONALITY = 1e-9  # largest entry of RᵀR − 1 for a rotation
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +77,7 @@ class Pose:
         object.__setattr__(self, "origin", origin)
 
     def to_source(self, points: ArrayLike) -> Array:
-        """Move points from the whisker frame to the source frame.
+        """Transform points from the whisker frame to the source frame.
 
         Parameters
         ----------
@@ -89,7 +92,7 @@ class Pose:
         return self.vectors_to_source(points) + self.origin
 
     def to_whisker(self, points: ArrayLike) -> Array:
-        """Move points from the source frame to the whisker frame.
+        """Transform points from the source frame to the whisker frame.
 
         Parameters
         ----------
@@ -104,7 +107,7 @@ class Pose:
         return self.vectors_to_whisker(_triples(points) - self.origin)
 
     def vectors_to_source(self, vectors: ArrayLike) -> Array:
-        """Turn vectors from the whisker frame to the source frame.
+        """Rotate vectors from the whisker frame to the source frame.
 
         Parameters
         ----------
@@ -119,7 +122,7 @@ class Pose:
         return _triples(vectors) @ self.rotation.T
 
     def vectors_to_whisker(self, vectors: ArrayLike) -> Array:
-        """Turn vectors from the source frame to the whisker frame.
+        """Rotate vectors from the source frame to the whisker frame.
 
         Parameters
         ----------
@@ -141,6 +144,7 @@ class Pose:
 
 
 def _triples(values: ArrayLike) -> Array:
+    """Return float64 (..., 3), or raise a ValueError."""
     array = np.asarray(values, dtype=np.float64)
     if array.ndim == 0 or array.shape[-1] != 3:
         raise ValueError(f"got an array of shape {array.shape}; the last axis must be x, y, z")
@@ -154,9 +158,9 @@ def roll(angle: float) -> Array:
 
 
 def least_turn(direction: ArrayLike) -> Array:
-    """Give the rotation that takes e_x to a unit vector (3,) by the smallest angle.
+    """Rotation that takes e_x to a unit vector (3,) by the smallest angle.
 
-    For the opposite direction, where that rotation is not unique, it turns about z.
+    For the opposite direction, where it is not unique, the rotation is about z.
     """
     x, y, z = np.asarray(direction, dtype=np.float64)
     rho2 = y * y + z * z
@@ -169,7 +173,7 @@ def least_turn(direction: ArrayLike) -> Array:
 
 
 def base_rotation(azimuth: ArrayLike, elevation: ArrayLike, roll: ArrayLike) -> Array:
-    """Turn emergence angles into rotations.
+    """Convert emergence angles into rotations.
 
     Parameters
     ----------
@@ -211,7 +215,7 @@ def angles_of(rotation: Array) -> Array:
 
 
 def mirrored(angles: ArrayLike) -> Array:
-    """Give the emergence angles of the mirror image in the y–z plane, on the other side of a face.
+    """Emergence angles of the mirror image in the y–z plane, on the other side of a face.
 
     Parameters
     ----------
@@ -221,7 +225,7 @@ def mirrored(angles: ArrayLike) -> Array:
     Returns
     -------
     array (..., 3)
-        Angles of the mirror image, which bends to the mirrored side.
+        Angles of the mirror image.
     """
     azimuth, elevation, roll = np.moveaxis(np.asarray(angles, dtype=np.float64), -1, 0)
     return np.stack([np.pi - azimuth, elevation, np.pi - roll], axis=-1)

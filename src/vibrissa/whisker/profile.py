@@ -1,49 +1,49 @@
-"""Functions of arc length as piecewise polynomials, and the rest shape that one integrates to.
+"""Piecewise polynomial functions of arc length, and the integration of the resting shape.
 
 On the interval [s_j, s_{j+1}] a profile is
 
     f(s) = Σ_k c_k τ^k,    τ = (2 s − s_j − s_{j+1}) / (s_{j+1} − s_j) ∈ [−1, 1],
 
-so that all coefficients have the unit of f. Any function is brought into this form once, by
-interpolation at Chebyshev points (interior ones: a jump at a declared break is seen from the
-proper side) on intervals that are halved until points in between agree. Where halving ends without
-that, a jump or kink is searched for by bisection and becomes an interval's end, unless there are so
-many that the function is noise. Constants and straight ramps come out exactly, smooth functions to
-1e-12 of their largest value.
+so that all coefficients have the unit of f. Any function is converted to this form once, by
+interpolation at Chebyshev points (interior ones: a jump at a declared break is evaluated on the
+proper side), on intervals that are halved until points in between agree. Where halving ends without
+agreement, a jump or kink is located by bisection and becomes an interval's end, unless there are so
+many that the function is noise. Constants and linear ramps are represented exactly, smooth
+functions to 1e-12 of their largest value.
 
 A radius from samples consists of smooth pieces between the arc lengths at which it jumps or has a
-kink. Neighbouring samples i, i + 1 are taken as the two sides of a jump where the change between
-them cannot be the continuation of the slopes g on either side, nor noise:
+kink. Neighbouring samples i, i + 1 are the two sides of a jump if the change between them can be
+neither the continuation of the slopes g on either side, nor noise:
 
     x = r_{i+1} − r_i − h_i (g_{i−1} + g_{i+1}) / 2,    |x| > 3 |g_{i+1} − g_{i−1}| h_i,
 
-with x most of the change itself and more than 5.5 standard deviations of the noise. The jump is in
-the middle of the interval: on average over where in the interval it may be, the compliance ∝ r⁻⁴
-is then right. Two samples at one arc length, or so close to each other that nobody samples a slope
-like that, state a jump. A kink is where the straight
-lines through the samples on its two sides meet, if their slopes differ by more than 8 times what
-the slopes change before and after it, and more than the noise lets them.
+with x most of the change itself and more than 5.5 standard deviations of the noise. The jump is
+placed in the middle of the interval: averaged over its possible positions in the interval, the
+compliance ∝ r⁻⁴ is then right. Two samples at one arc length, or much closer to each other than to
+their neighbours, state a jump. A kink is where the straight lines through the samples on its two
+sides intersect, if their slopes differ by more than 8 times the change of slope before and after
+it, and by more than noise explains.
 
 Each piece is a monotone cubic (PCHIP), which has no kinks and cannot overshoot below zero. The
-noise comes from the smallest quarter of the differences, so that a staircase of two samples a step
-does not pass for noise; a smooth profile with noise has neither jumps nor kinks.
+noise is estimated from the smallest quarter of the differences, so that a staircase with two
+samples per step is not taken for noise; a smooth profile with noise has neither jumps nor kinks.
 
-The rest shape of a whisker is its intrinsic curvature, integrated:
+The resting shape of a whisker is the integral of its intrinsic curvature:
 
     R' = R [u₀]ₓ,    r' = R e₁,    R(0) = 1,    r(0) = 0
 
 R has columns (tangent, d1, d2) and u₀ = (twist, curvature about d1, curvature about d2), so that
-R' e₁ = R (0, u_z, −u_y). Both together are one motion g = (R, r) with g' = g ξ, ξ = (u₀, e₁) in
-se(3), integrated by the sixth-order Magnus method (Blanes, Casas & Ros 2000) on three Gauss
-points a step, with the exponential in closed form. Points in between are reached by one shorter
-step of the same kind, so they are as accurate as the nodes.
+R' e₁ = R (0, u_z, −u_y). Together they are one motion g = (R, r) with g' = g ξ, ξ = (u₀, e₁) in
+se(3), integrated by the sixth-order Magnus method (Blanes, Casas & Ros 2000) on three Gauss points
+per step, with the exponential in closed form. Points between nodes are reached by one shorter step
+of the same kind, so they are as accurate as the nodes.
 
-The planar parabola is the usual picture of a whisker's intrinsic shape:
+The planar parabola is the usual model of a whisker's intrinsic shape:
 
     y = A x²,    s = (sinh w cosh w + w) / (4 A),    κ(s) = 2 A / cosh³ w,    sinh w = 2 A x
 
-It is given by its arc length, not by its extent along x. w(s) is found by Newton's method; the
-left side is convex and increasing in w, so that it converges from anywhere.
+It is specified by its arc length, not by its extent along x. w(s) is found by Newton's method,
+which converges from any start because the equation is convex and increasing in w.
 """
 
 from __future__ import annotations
@@ -67,13 +67,13 @@ DEGREES = (1, 3, 7)  # degrees tried on an interval before it is halved
 TOLERANCE = 1e-12
 """Largest error of the polynomials, relative to the function's largest value."""
 
-FINEST = 512  # parts of the domain below which an interval is not halved any more
+FINEST = 512  # number of parts of the domain beyond which intervals are not halved
 UNRESOLVED = 1e-7  # relative error above which a function counts as not resolved
 
 
-MOST_SEARCHED = 64  # intervals not resolved, at most, in which jumps and kinks are searched for
-# Smallest changes of value and of slope times length, relative to the largest value, that count as
-# a jump and as a kink.
+MOST_SEARCHED = 64  # largest number of unresolved intervals in which jumps and kinks are located
+# Smallest changes of value, and of slope times length, that count as a jump and as a kink, relative
+# to the largest value.
 JUMP, KINK = 1e-9, 1e-3
 
 
@@ -81,9 +81,9 @@ JUMP, KINK = 1e-9, 1e-3
 class Profile:
     """A piecewise polynomial function of arc length."""
 
-    knots: Array  # (m + 1,), interval ends, m, rising
-    coefficients: Array  # (k + 1, m, ...), of τ^0 … τ^k, in the unit of the function
-    error: float = 0.0  # relative to its largest value
+    knots: Array  # (m + 1,), interval ends, m, increasing
+    coefficients: Array  # (k + 1, m, ...), coefficients of τ^0 … τ^k, in the unit of the function
+    error: float = 0.0  # largest error, relative to the largest value
 
     def __post_init__(self) -> None:
         knots = np.array(self.knots, dtype=np.float64)
@@ -110,7 +110,7 @@ class Profile:
     def __call__(self, s: ArrayLike, side: Side = "right") -> Array:
         """Values at arc lengths `s` (...), m, as (..., *shape); NaN gives NaN.
 
-        At a knot `side` selects the interval; outside the knots the last polynomial goes on.
+        At a knot `side` selects the interval; outside the knots the end ones are extrapolated.
         """
         s = np.asarray(s, dtype=np.float64)
         last = self.knots.size - 2
@@ -121,11 +121,11 @@ class Profile:
         value: Array = self.coefficients[-1][interval]
         for coefficient in self.coefficients[-2::-1]:
             value = value * tau + coefficient[interval]
-        # A constant is NaN at NaN too.
+        # A constant must be NaN at NaN as well.
         return value + 0.0 * tau
 
     def breaks(self) -> Array:
-        """Find the knots at which the function jumps or has a kink."""
+        """Knots at which the function jumps or has a kink."""
         power = np.arange(len(self.coefficients)).reshape(-1, *(1,) * (1 + len(self.shape)))
         half = (np.diff(self.knots) / 2.0).reshape(-1, *(1,) * len(self.shape))
         signed = self.coefficients * (-1.0) ** power
@@ -139,27 +139,27 @@ class Profile:
         return found
 
     def trimmed(self, length: float) -> Profile:
-        """Drop the intervals that begin at or beyond a length."""
+        """Drop the intervals that start at or beyond a length."""
         count = int(np.searchsorted(self.knots[:-1], length, side="left"))
         return Profile(self.knots[: count + 1], self.coefficients[:, :count], self.error)
 
     def scaled(self, length_factor: float, value_factor: float) -> Profile:
-        """Stretch arc length and multiply values."""
+        """Scale arc length and values."""
         return Profile(self.knots * length_factor, self.coefficients * value_factor, self.error)
 
     def transformed(self, matrix: Array) -> Profile:
-        """Multiply every value by a matrix."""
+        """Multiply all values by a matrix."""
         return Profile(self.knots, self.coefficients @ matrix.T, self.error)
 
 
 def constant(value: ArrayLike, length: float) -> Profile:
-    """Make a profile that has one value from the base to the tip."""
+    """Return a constant profile."""
     array = np.asarray(value, dtype=np.float64)
     return Profile(np.array([0.0, length]), array[np.newaxis, np.newaxis])
 
 
 def linear(start: float, end: float, length: float) -> Profile:
-    """Give the straight ramp from `start` at 0 to `end` at `length`, m."""
+    """Return the linear ramp from `start` at 0 to `end` at `length`, m."""
     coefficients = np.array([[0.5 * (start + end)], [0.5 * (end - start)]])
     return Profile(np.array([0.0, length]), coefficients)
 
@@ -167,21 +167,21 @@ def linear(start: float, end: float, length: float) -> Profile:
 def approximate(
     function: Function, joints: Sequence[float] | Array, tolerance: float = TOLERANCE
 ) -> Profile:
-    """Bring a function into piecewise polynomial form."""
+    """Approximate a function by a piecewise polynomial, with knots at the joints and elsewhere."""
     joints = np.asarray(joints, dtype=np.float64)
-    profile, unresolved = _halved(function, joints, tolerance)
+    profile, unresolved = _approximate_by_halving(function, joints, tolerance)
     if 0 < len(unresolved) <= MOST_SEARCHED:
-        singular = [_singular(function, *interval) for interval in unresolved]
+        singular = [_locate_singularity(function, *interval) for interval in unresolved]
         near = 1e-12 * (joints[-1] - joints[0])
         new = [s for s in singular if np.abs(joints - s).min() > near]
-        profile, _ = _halved(function, np.unique([*joints, *new]), tolerance)
+        profile, _ = _approximate_by_halving(function, np.unique([*joints, *new]), tolerance)
     return profile
 
 
-def _halved(
+def _approximate_by_halving(
     function: Function, joints: Array, tolerance: float
 ) -> tuple[Profile, list[tuple[float, float]]]:
-    """Polynomials on intervals halved as far as allowed, and the intervals not resolved."""
+    """Polynomials on intervals halved as far as allowed, and the unresolved intervals."""
     middles = 0.5 * (joints[1:] + joints[:-1])
     scale = float(np.abs(function(np.concatenate([joints, middles]))).max())
     shortest = (joints[-1] - joints[0]) / FINEST
@@ -200,19 +200,21 @@ def _halved(
         knots.append(end)
         pieces.append(coefficients)
         worst = max(worst, error)
-    profile = Profile(np.array(knots), _padded(pieces), worst / scale if scale > 0.0 else 0.0)
+    profile = Profile(
+        np.array(knots), _stack_coefficients(pieces), worst / scale if scale > 0.0 else 0.0
+    )
     return profile, rough
 
 
-def _singular(function: Function, start: float, end: float) -> float:
-    """Bisect to the worst jump or kink in an interval."""
+def _locate_singularity(function: Function, start: float, end: float) -> float:
+    """Locate the worst jump or kink in an interval by bisection."""
     finest = 4.0 * np.finfo(np.float64).eps * max(abs(start), abs(end))
     while end - start > finest:
         middle = 0.5 * (start + end)
         halves = ((start, middle), (middle, end))
         errors = [_best_polynomial(function, a, b, 0.0)[1] for a, b in halves]
         if not any(errors):
-            # What is left is exactly straight on both sides of the middle.
+            # The function is exactly linear on both sides of the middle.
             return middle
         start, end = halves[int(errors[1] > errors[0])]
     return 0.5 * (start + end)
@@ -224,7 +226,7 @@ _CHECKS = np.cos(np.pi * (np.arange(33) + 0.5) / 33.0)
 def _best_polynomial(
     function: Function, start: float, end: float, scale: float
 ) -> tuple[Array, float, float]:
-    """Coefficients of the lowest sufficient degree on an interval, their error, the largest |f|."""
+    """Coefficients of the lowest sufficient degree on an interval, their error, and largest |f|."""
     nodes = {d: np.cos(np.pi * (np.arange(d + 1) + 0.5) / (d + 1)) for d in DEGREES}
     tau = np.concatenate([*nodes.values(), _CHECKS])
     values = function(0.5 * (start + end) + 0.5 * (end - start) * tau)
@@ -242,7 +244,7 @@ def _best_polynomial(
     return flat.reshape(degree + 1, *values.shape[1:]), error, largest
 
 
-def _padded(pieces: Sequence[Array]) -> Array:
+def _stack_coefficients(pieces: Sequence[Array]) -> Array:
     """Stack coefficients of different degree into (k + 1, m, ...)."""
     size = max(len(piece) for piece in pieces)
     stacked = np.zeros((size, len(pieces), *pieces[0].shape[1:]))
@@ -252,7 +254,7 @@ def _padded(pieces: Sequence[Array]) -> Array:
 
 
 def array_function(function: Callable[..., object], shape: tuple[int, ...], what: str) -> Function:
-    """Make a caller's function of arc length take arrays, and check what it returns."""
+    """Wrap a user's function of arc length so that it accepts arrays and its result is checked."""
 
     def one(s: float) -> Array:
         value = np.asarray(function(s), dtype=np.float64)
@@ -291,25 +293,26 @@ def array_function(function: Callable[..., object], shape: tuple[int, ...], what
     return checked
 
 
-MOST = 64  # jumps and kinks beyond which samples count as rounded, not as a rod with so many steps
-# Share of the radius below which a change is not looked at.
+MOST = 64  # number of jumps and kinks above which samples count as rounded, not as steps of a rod
+# Thresholds of jumps in standard deviations of the noise, of kinks in changes of slope around, and
+# of jumps in changes of slope; and share of the radius below which changes are ignored.
 _SIGNIFICANT = 5.5
 _TURNED = 8.0
 _OUTSTANDING = 3.0
 _NEGLIGIBLE = 1e-4
-# Distance of two samples that state a jump, at most, in distances to the samples around them.
+# Largest distance of two samples that state a jump, over their distances to the samples around.
 _CLOSE = 2e-3
-_MANY = 30  # number of samples from which on noise can be distinguished from shape
-# Share of close pairs among the intervals of a rod that was sampled at the ends of its steps.
+_MANY = 30  # number of samples from which noise can be distinguished from shape
+# Least share of close pairs among the intervals of a rod that was sampled at the ends of its steps.
 _PAIRED = 0.2
-_QUARTILE = 0.3186  # first quartile of |x| where x is normally distributed, in standard deviations
+_QUARTILE = 0.3186  # first quartile of |x| for a normal distribution, in standard deviations
 
 
 def sampled_radius(length: float, s: Array, r: Array) -> Profile:
-    """Join samples of a radius."""
-    ends = _pieces(s, r, jumps(s, r))
+    """Profile of a radius through samples r (n,) at arc lengths s (n,), with jumps and kinks."""
+    ends = _split_at_jumps(s, r, jumps(s, r))
     if len(ends) - 1 > MOST:
-        ends = _pieces(s, r, _stated(s, r), kinked=False)
+        ends = _split_at_jumps(s, r, _stated_jumps(s, r), kinked=False)
     parts = [interpolate.PchipInterpolator(x, y) for x, y in ends]
     edges = np.array([x[0] for x, _ in ends[1:]])
 
@@ -327,16 +330,16 @@ def sampled_radius(length: float, s: Array, r: Array) -> Profile:
 
 
 def jumps(s: Array, r: Array) -> NDArray[np.intp]:
-    """Find the intervals between samples in which a radius jumps."""
-    stated = _stated(s, r)
+    """Indices of the intervals between samples in which a radius jumps."""
+    stated = _stated_jumps(s, r)
     found = [stated]
     for first, last in pairwise([0, *(stated + 1), s.size]):
-        found.append(first + _jumps(s[first:last], r[first:last]))
+        found.append(first + _detect_jumps(s[first:last], r[first:last]))
     return np.sort(np.concatenate(found))
 
 
 def scatter(s: Array, r: Array) -> float:
-    """Estimate the noise of samples, as a share of the radius, from their nearest neighbours."""
+    """Estimate the noise of samples relative to the radius, from their nearest neighbours."""
     if s.size < _MANY:
         return 0.0
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -346,19 +349,19 @@ def scatter(s: Array, r: Array) -> float:
     return float(np.nanquantile(np.abs(misfit), 0.25)) / _QUARTILE
 
 
-def _stated(s: Array, r: Array) -> NDArray[np.intp]:
-    """Jumps between two samples at one arc length, or next to it."""
+def _stated_jumps(s: Array, r: Array) -> NDArray[np.intp]:
+    """Intervals whose samples are at one arc length or very close, and so state a jump."""
     h = np.diff(s)
     around = np.minimum(np.append(np.inf, h[:-1]), np.append(h[1:], np.inf))
     close = (h <= _CLOSE * around) & (np.abs(np.diff(r)) > _NEGLIGIBLE * r[1:])
     close &= np.isfinite(around)  # two samples are the ends of a cone
-    # Points at random spacings have a few close pairs too: those are judged as all others are.
+    # Randomly spaced points have some close pairs as well: those are tested like all others.
     found: NDArray[np.intp] = np.flatnonzero((h == 0.0) | (close & (close.mean() > _PAIRED)))
     return found
 
 
-def _jumps(s: Array, r: Array) -> NDArray[np.intp]:
-    """Jumps among samples at rising arc lengths."""
+def _detect_jumps(s: Array, r: Array) -> NDArray[np.intp]:
+    """Detect jumps among samples at increasing arc lengths."""
     if s.size < 4:
         return np.empty(0, dtype=np.intp)
     h, d = np.diff(s), np.diff(r)
@@ -366,24 +369,26 @@ def _jumps(s: Array, r: Array) -> NDArray[np.intp]:
     before, after = slope[:-2], slope[2:]
     excess = d[1:-1] - h[1:-1] * (before + after) / 2.0
     size, change, here = np.abs(excess), np.abs(d[1:-1]), r[1:-2]
-    # How independent samples scatter in the excess, compared with their differences.
+    # Scatter of the excess due to independent samples, relative to that of their differences.
     left, right = h[1:-1] / h[:-2] / 2.0, h[1:-1] / h[2:] / 2.0
     weight = np.sqrt(((1.0 + left) ** 2 + (1.0 + right) ** 2 + left**2 + right**2) / 2.0)
-    noise = weight * np.minimum(_noise(d[1:-1], here), _noise(excess / weight, here))
+    noise = weight * np.minimum(
+        _noise_of_differences(d[1:-1], here), _noise_of_differences(excess / weight, here)
+    )
     jump = (excess * d[1:-1] > 0.0) & (size > 0.5 * change) & (size < 2.0 * change)
     jump &= size > _OUTSTANDING * np.abs(after - before) * h[1:-1]
     jump &= size > np.maximum(_SIGNIFICANT * noise, _NEGLIGIBLE * here)
     return 1 + np.flatnonzero(jump)
 
 
-def _noise(differences: Array, r: Array) -> Array:
-    """Standard deviations of differences, most of which may be jumps, at radii r."""
+def _noise_of_differences(differences: Array, r: Array) -> Array:
+    """Standard deviations of differences, most of which may be jumps, at radii r (n,)."""
     same, share = np.quantile(np.abs([differences, differences / r]), 0.25, axis=1) / _QUARTILE
     noise: Array = np.maximum(same, share * r)
     return noise
 
 
-def _pieces(
+def _split_at_jumps(
     s: Array, r: Array, before: NDArray[np.intp], kinked: bool = True
 ) -> list[tuple[Array, Array]]:
     """Samples of each smooth piece, with ends where it meets its neighbours."""
@@ -392,26 +397,26 @@ def _pieces(
     for number, (first, last) in enumerate(pairwise(edges)):
         x, y = s[first:last], r[first:last]
         if number > 0:
-            x, y = _extended(x[::-1], y[::-1], s[first - 1], r[first - 1])
+            x, y = _extend_to_jump(x[::-1], y[::-1], s[first - 1], r[first - 1])
             x, y = x[::-1], y[::-1]
         if number < len(edges) - 2:
-            x, y = _extended(x, y, s[last], r[last])
-        pieces += _between_kinks(x, y) if kinked else [(x, y)]
+            x, y = _extend_to_jump(x, y, s[last], r[last])
+        pieces += _split_at_kinks(x, y) if kinked else [(x, y)]
     return pieces
 
 
-def _extended(x: Array, y: Array, beyond: float, other: float) -> tuple[Array, Array]:
-    """Go on straight to the middle of the jump that follows, but not past its other side."""
+def _extend_to_jump(x: Array, y: Array, beyond: float, other: float) -> tuple[Array, Array]:
+    """Extrapolate linearly to the middle of the next jump, but not past its other side."""
     end = 0.5 * (x[-1] + beyond)
     if end == x[-1]:
-        # A piece of one sample between two stated jumps is not possible: arc lengths repeat twice.
+        # A piece of one sample between two stated jumps cannot occur: arc lengths repeat once.
         return x, y
     slope = (y[-1] - y[-2]) / (x[-1] - x[-2]) if x.size > 1 else 0.0
     value = np.clip(y[-1] + slope * (end - x[-1]), *sorted((y[-1], other)))
     return np.append(x, end), np.append(y, value)
 
 
-def _between_kinks(x: Array, y: Array) -> list[tuple[Array, Array]]:
+def _split_at_kinks(x: Array, y: Array) -> list[tuple[Array, Array]]:
     """Cut a piece at its kinks."""
     pieces = []
     for end, value in _kinks(x, y):
@@ -424,20 +429,24 @@ def _between_kinks(x: Array, y: Array) -> list[tuple[Array, Array]]:
 
 
 def _kinks(x: Array, y: Array) -> list[tuple[float, float]]:
-    """Places where the slope of samples changes at once: arc lengths and values, rising."""
+    """Arc lengths and values at which the slope of samples changes abruptly, increasing."""
     if x.size < 6:
         return []
     h = np.diff(x)
     slope = np.diff(y) / h
     turn = np.diff(slope)
     bend = turn / (h[1:] + h[:-1]) * 2.0
-    # In interval i, from slope i − 1 to slope i + 1; the bends outside are at samples i − 1, i + 2.
+    # Interval i is between slopes i − 1 and i + 1; the bends outside are at samples i − 1, i + 2.
     change = turn[1:-2] + turn[2:-1]
     over = (h[1:-3] + h[3:-1]) / 2.0 + h[2:-2]
     around = np.maximum(np.abs(bend[:-3]), np.abs(bend[3:]))
-    # A turn of independent samples scatters by their noise times this.
+    # Standard deviation of a turn of independent samples, in units of their noise.
     weight = np.sqrt(h[1:] ** -2.0 + h[:-1] ** -2.0 + (1.0 / h[1:] + 1.0 / h[:-1]) ** 2)
-    noise = _noise(turn / weight, y[1:-1])[1:-2] * np.sqrt(2.0) * np.hypot(1 / h[1:-3], 1 / h[3:-1])
+    noise = (
+        _noise_of_differences(turn / weight, y[1:-1])[1:-2]
+        * np.sqrt(2.0)
+        * np.hypot(1 / h[1:-3], 1 / h[3:-1])
+    )
     kink = np.abs(change) > _TURNED * np.maximum(around * over, noise)
     kink &= np.abs(change) * h[2:-2] > _NEGLIGIBLE * y[2:-3]
     found: list[tuple[float, float]] = []
@@ -456,15 +465,15 @@ Rate = Callable[[Array], Array]
 STEPS = 96
 """Least number of steps along a whisker."""
 
-TURN = 0.04  # largest angle a step may turn, rad: keeps the method's error near rounding
+TURN = 0.04  # largest rotation per step, rad, at which the method's error is close to rounding
 _GAUSS = 0.5 + np.sqrt(15.0) / 10.0 * np.array([-1.0, 0.0, 1.0])
 
 
 def exponential(w: Array, v: Array) -> tuple[Array, Array]:
     """Rotation (..., 3, 3) and translation (..., 3) of the motions exp(w, v).
 
-    Below 0.1 rad the coefficients come from their series, which are exact to rounding there while
-    (θ − sin θ)/θ³ is not.
+    Below 0.1 rad the coefficients are computed from their series, which are exact to rounding,
+    unlike (θ − sin θ)/θ³.
     """
     x = np.sum(w * w, axis=-1)[..., np.newaxis, np.newaxis]
     small = x < 1e-2
@@ -480,6 +489,7 @@ def exponential(w: Array, v: Array) -> tuple[Array, Array]:
 
 
 def _series(x: Array, first: float, ratios: tuple[int, ...]) -> Array:
+    """Power series with given first term and ratios of denominators."""
     total, term = np.full_like(x, first), np.full_like(x, first)
     for ratio in ratios:
         term = -term * x / ratio
@@ -491,12 +501,13 @@ Screw = tuple[Array, Array]
 
 
 def _bracket(left: Screw, right: Screw) -> Screw:
-    """Commutator in se(3), with the sign that g' = g ξ asks for (opposite to g' = ξ g)."""
+    """Commutator in se(3), with the sign required by g' = g ξ (opposite to g' = ξ g)."""
     (w1, v1), (w2, v2) = left, right
     return np.cross(w2, w1), np.cross(w2, v1) - np.cross(w1, v2)
 
 
-def _sum(*terms: tuple[float, Screw]) -> Screw:
+def _combine(*terms: tuple[float, Screw]) -> Screw:
+    """Linear combination of screws."""
     return (
         np.sum([factor * screw[0] for factor, screw in terms], axis=0),
         np.sum([factor * screw[1] for factor, screw in terms], axis=0),
@@ -512,14 +523,14 @@ def advance(rate: Rate, start: Array, step: Array, direction: Array) -> tuple[Ar
     a2 = (np.sqrt(15.0) / 3.0 * h * (u[..., 2, :] - u[..., 0, :]), still)
     a3 = (10.0 / 3.0 * h * (u[..., 2, :] - 2.0 * u[..., 1, :] + u[..., 0, :]), still)
     c1 = _bracket(a1, a2)
-    c2 = _bracket(a1, _sum((-1 / 30, a3), (-1 / 60, c1)))
-    outer = _bracket(_sum((-20.0, a1), (-1.0, a3), (1.0, c1)), _sum((1.0, a2), (1.0, c2)))
-    return exponential(*_sum((1.0, a1), (1 / 12, a3), (1 / 240, outer)))
+    c2 = _bracket(a1, _combine((-1 / 30, a3), (-1 / 60, c1)))
+    outer = _bracket(_combine((-20.0, a1), (-1.0, a3), (1.0, c1)), _combine((1.0, a2), (1.0, c2)))
+    return exponential(*_combine((1.0, a1), (1 / 12, a3), (1 / 240, outer)))
 
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """Frames and points along a curve, known at nodes and reached in between by one step."""
+    """Frames and points along a curve, stored at nodes and interpolated by one shorter step."""
 
     rate: Rate
     nodes: Array
@@ -550,7 +561,7 @@ class Path:
 
 
 def _step_ends(rate: Rate, joints: Array) -> Array:
-    """Joints, and between them equal steps, short enough."""
+    """Joints, and sufficiently short equal steps between them."""
     longest = (joints[-1] - joints[0]) / STEPS
     ends = [joints[:1]]
     for start, end in pairwise(joints):
@@ -578,14 +589,14 @@ def parabola_curvature(length: float, coefficient: float) -> Profile:
         return constant(np.zeros(3), length)
 
     def curvature(s: Array) -> Array:
-        w = _parameter(4.0 * coefficient * s)
+        w = _parabola_parameter(4.0 * coefficient * s)
         kappa = 2.0 * coefficient / np.cosh(w) ** 3
         return np.stack([np.zeros_like(s), np.zeros_like(s), kappa], axis=-1)
 
     return approximate(curvature, np.array([0.0, length]))
 
 
-def _parameter(arc: Array) -> Array:
+def _parabola_parameter(arc: Array) -> Array:
     """Solve sinh w cosh w + w = arc ≥ 0."""
     w = np.arcsinh(0.5 * arc)
     for _ in range(60):

@@ -1,11 +1,11 @@
-"""Cross-section and material: what makes a whisker stiff.
+"""Cross-section and material of a whisker, which determine its stiffness.
 
 A circular section of radius r(s), of one isotropic material:
 
     B(s) = diag(GJ, EI, EI),    I = π r⁴ / 4,    J = 2 I,    G = E / (2 (1 + ν))
 
-By default r falls linearly from base to tip. Sampled radii are joined by monotone cubics between
-the jumps and kinks found in them (`vibrissa.whisker.profile`).
+By default r decreases linearly from base to tip. Sampled radii are interpolated by monotone cubics
+between the jumps and kinks found in them (`vibrissa.whisker.profile`).
 """
 
 from collections.abc import Callable, Sequence
@@ -32,26 +32,26 @@ TAPER = 15.0
 YOUNGS_MODULUS = 3e9
 POISSON_RATIO = 0.38
 
-# From a soft gel to diamond, Pa; what lies outside is in another unit.
+# Young's moduli from a soft gel to diamond, Pa; values outside are assumed to be in another unit.
 _SOFTEST, _HARDEST = 1e3, 1e13
-# From a foam to osmium, kg/m³.
+# Densities from a foam to osmium, kg/m³.
 _LIGHTEST, _HEAVIEST = 10.0, 23000.0
 SHORTEST, LONGEST = 0.5e-3, 0.5
-"""Lengths, m, between which the unit is not doubted."""
+"""Shortest and longest length, m, accepted without confirmation."""
 
-# How to confirm a length outside them.
+# Ways to confirm other lengths.
 CONFIRMATION = "any_length=True (Python) or --any-length (command line)"
-_STOUT = 0.1  # a rod's radius is at most this share of its length
+_STOUT = 0.1  # largest radius of a rod, over its length
 
-# Share of the radius by which samples scatter before it is worth a note, and how well the base
-# signals follow samples that scatter, in units of it.
-_SCATTERED, _FOLLOWED = 2e-3, 0.04
+# Scatter of samples, as a share of the radius, above which there is a note; and error of the base
+# signals of a rod through samples that scatter, in units of the scatter.
+_NOTABLE_SCATTER, _SIGNAL_ERROR = 2e-3, 0.04
 
-COVERAGE = 0.01  # share of the length by which radius samples may fall short of base or tip
+COVERAGE = 0.01  # largest distance of radius samples from base or tip, over the length
 
 
 class Section(TypedDict, total=False):
-    """Keywords that state the radius, and where it or the curvature has a kink or a jump."""
+    """Keywords for the radius, and for kinks and jumps of it or the curvature."""
 
     base_radius: float
     tip_radius: float | None
@@ -61,7 +61,7 @@ class Section(TypedDict, total=False):
 
 
 class Holding(TypedDict, total=False):
-    """Keywords that state the material, how the base is held, and a name."""
+    """Keywords for the material, the stiffness of the base, and a name."""
 
     youngs_modulus: float
     poisson_ratio: float
@@ -71,13 +71,13 @@ class Holding(TypedDict, total=False):
 
 
 class Properties(Section, Holding, total=False):
-    """Keywords that every constructor of a whisker takes."""
+    """Keywords accepted by every constructor of a whisker."""
 
     any_length: bool
 
 
 def split(properties: Properties) -> tuple[Section, Holding]:
-    """Take the keywords for the radius apart from the others."""
+    """Separate the keywords for the radius from the others."""
     section = {key: value for key, value in properties.items() if key in _SECTION_KEYS}
     others = {
         key: value
@@ -87,16 +87,18 @@ def split(properties: Properties) -> tuple[Section, Holding]:
     return cast(Section, section), cast(Holding, others)
 
 
-# Ending of a note on a property that was not stated.
 _SECTION_KEYS = Section.__optional_keys__
-_BEYOND = 10.0  # so many lengths are no more the rest of a whisker that was trimmed
+_BEYOND = 10.0  # samples up to this many lengths may belong to a whisker before it was trimmed
+# Ending of a note on an assumed property.
 ASSUMED = " assumed, not measured"
 _RADIUS_ASSUMED = f"radius{ASSUMED}"
 _NOTED = {"youngs_modulus": "Young's modulus", "poisson_ratio": "Poisson's ratio"}
 
 
-def settled(length: float, properties: Properties) -> tuple[Profile, Holding, tuple[str, ...]]:
-    """Turn the keywords of a constructor into a radius profile and checked material."""
+def parse_properties(
+    length: float, properties: Properties
+) -> tuple[Profile, Holding, tuple[str, ...]]:
+    """Convert a constructor's keywords to radius profile, checked material, and notes."""
     stated, holding = split(properties)
     faults = material_faults(
         holding.get("youngs_modulus", YOUNGS_MODULUS),
@@ -120,7 +122,7 @@ def settled(length: float, properties: Properties) -> tuple[Profile, Holding, tu
 
 
 def assumptions(length: float, section: Profile, properties: Properties) -> tuple[str, ...]:
-    """Say what of a measured whisker was not stated and is assumed."""
+    """Notes on the properties of a measured whisker that were not given and are assumed."""
     notes = []
     stated = {name for name, value in properties.items() if value is not None}
     if not stated & {"radius", "base_radius", "rat"}:
@@ -138,6 +140,7 @@ def assumptions(length: float, section: Profile, properties: Properties) -> tupl
 
 
 def _assumed_radius(length: float, section: Profile) -> str:
+    """Note on the assumed radius."""
     base, tip = float(section(0.0)) * 1e6, float(section(length, "left")) * 1e6
     return (
         f"{_RADIUS_ASSUMED}: {base:.4g} µm at the base, {tip:.3g} µm at the tip; forces go with "
@@ -147,7 +150,7 @@ def _assumed_radius(length: float, section: Profile) -> str:
 
 
 def kept_notes(notes: Sequence[str], properties: Section | Holding) -> tuple[str, ...]:
-    """Leave out the notes on what is stated anew."""
+    """Omit the notes on properties that are given anew."""
     about = []
     stated = properties.keys() & _SECTION_KEYS - {"breaks"}
     if stated:
@@ -159,7 +162,7 @@ def kept_notes(notes: Sequence[str], properties: Section | Holding) -> tuple[str
 
 
 def renewed_notes(notes: Sequence[str], length: float, section: Profile) -> tuple[str, ...]:
-    """Bring the assumed radius in notes up to date after the radius or the length was changed."""
+    """Update notes on the assumed radius after the radius or the length was changed."""
     return tuple(
         _assumed_radius(length, section) if note.startswith(_RADIUS_ASSUMED) else note
         for note in notes
@@ -167,7 +170,7 @@ def renewed_notes(notes: Sequence[str], length: float, section: Profile) -> tupl
 
 
 def radius_notes(length: float, section: Profile, stated: Section) -> tuple[str, ...]:
-    """Say what the user should know about a radius."""
+    """Notes on a radius that the user should read."""
     notes = []
     rat = stated.get("rat")
     if rat is not None:
@@ -190,11 +193,11 @@ def radius_notes(length: float, section: Profile, stated: Section) -> tuple[str,
             f"the radius jumps at {steps.size} arc lengths, by up to {steps.max():.1%}: these are "
             "taken as steps of the rod, not smoothed"
         )
-    noise = scatter(*_samples(length, np.asarray(radius, dtype=np.float64)))
-    if noise > _SCATTERED:
+    noise = scatter(*_as_samples(length, np.asarray(radius, dtype=np.float64)))
+    if noise > _NOTABLE_SCATTER:
         notes.append(
             f"the radius samples scatter by {noise:.2g} of the radius, and forces go with its "
-            f"fourth power; signals follow the samples to about {_FOLLOWED * noise:.0e}"
+            f"fourth power; signals follow the samples to about {_SIGNAL_ERROR * noise:.0e}"
         )
     return tuple(notes)
 
@@ -205,7 +208,7 @@ def material_faults(
     base_stiffness: tuple[float, float] | None,
     density: float | None,
 ) -> list[str]:
-    """Say what is wrong with a material and its holding; empty if nothing is."""
+    """List the faults of a material and of the base stiffness."""
     faults = []
     if not (np.isfinite(youngs_modulus) and youngs_modulus > 0.0):
         faults.append(f"youngs_modulus is {youngs_modulus!r} Pa; it must be positive")
@@ -234,7 +237,7 @@ def material_faults(
 
 
 def length_faults(length: float, any_length: bool | None = False) -> list[str]:
-    """Say what is wrong with a length; empty if nothing is."""
+    """List the faults of a length."""
     if not (np.isfinite(length) and length > 0.0):
         return [f"length is {length!r} m; it must be positive"]
     if any_length or SHORTEST <= length <= LONGEST:
@@ -264,7 +267,7 @@ def radius_profile(
     breaks: Sequence[float] = (),
     rat: str | None = None,
 ) -> Profile:
-    """Radius over arc length from any of the ways to state it."""
+    """Radius over arc length, from any of its specifications."""
     if rat is not None:
         if not all(other is None for other in (radius, tip_radius, base_radius)):
             raise ValueError("rat and a radius were both given; give one of them")
@@ -287,13 +290,13 @@ def radius_profile(
         function = array_function(radius, (), "radius")
         profile = approximate(function, np.unique([0.0, *breaks, length]))
     else:
-        profile = _joined(length, np.asarray(radius, dtype=np.float64))
+        profile = _profile_of_samples(length, np.asarray(radius, dtype=np.float64))
     _require_positive(profile, length)
     return profile
 
 
-def _samples(length: float, samples: Array) -> tuple[Array, Array]:
-    """Arc lengths and radii of samples, (n,) or (n, 2)."""
+def _as_samples(length: float, samples: Array) -> tuple[Array, Array]:
+    """Arc lengths and radii of samples given as (n,) or (n, 2)."""
     if samples.ndim == 1 and samples.size >= 2:
         return np.linspace(0.0, length, samples.size), samples
     if samples.ndim == 2 and samples.shape[1] == 2 and len(samples) >= 2:
@@ -305,9 +308,9 @@ def _samples(length: float, samples: Array) -> tuple[Array, Array]:
     )
 
 
-def _joined(length: float, samples: Array) -> Profile:
-    """Join radius samples, (n,) or (n, 2)."""
-    s, r = _samples(length, samples)
+def _profile_of_samples(length: float, samples: Array) -> Profile:
+    """Profile through radius samples, (n,) or (n, 2)."""
+    s, r = _as_samples(length, samples)
     steps = np.diff(s)
     twice = np.flatnonzero(steps == 0.0)
     if not (np.isfinite(samples).all() and (steps >= 0.0).all()):
@@ -333,6 +336,7 @@ def _joined(length: float, samples: Array) -> Profile:
 
 
 def _require_positive(profile: Profile, length: float) -> None:
+    """Raise a ValueError if the radius is not positive everywhere."""
     fine = np.concatenate([np.linspace(0.0, length, 2001), profile.knots])
     values = profile(fine)
     if not (values > 0.0).all():

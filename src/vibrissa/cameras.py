@@ -1,15 +1,16 @@
-"""Cameras: from the laboratory to the pixels of a view.
+"""Camera models, triangulation, and calibration.
+
+A camera maps points of the laboratory frame to the pixels of a view:
 
     x_camera = R x_laboratory + t,    pixel = K d(x_camera)
 
 with d(x) = (x, y) for an orthographic camera (far away, or telecentric), and for a perspective one
-the division by z with OpenCV's distortion. A pixel is (column, row); whole numbers are the middle
-of a pixel, (0, 0) the top left one. A mirror is a negative focal length in K.
+the division by z followed by OpenCV's distortion. A pixel is (column, row); integers are centres of
+pixels, (0, 0) the top left one. A mirror image has a negative focal length in K.
 
-Points in space from the pixels of several views, with their covariance.
-
-One view does not show how far away a point is: it is then taken to be in the laboratory's plane
-z = 0, in which the paper's top view looks down on x and y.
+Points are triangulated from the pixels of several views, with their covariance. With a single view
+the distance is unknown: points are then assumed to be in the laboratory's plane z = 0, which the
+paper's top view sees from above.
 """
 
 from __future__ import annotations
@@ -40,14 +41,14 @@ __all__ = [
 
 
 PIXEL_SIZE = 58e-6
-"""Size of a pixel of the paper's cameras in the scene, m."""
+"""Size of a pixel of the paper's cameras in object space, m."""
 
 SIZE = (1024, 1024)
 """Width and height of the paper's frames, pixels."""
 
-_COEFFICIENTS = 8  # number of OpenCV's distortion coefficients that are used
-_ROUNDS = 20  # largest number of Newton steps that remove the distortion
-_SINGULAR = 1e-9  # determinant of the directions of the image's axes below which they are parallel
+_MOST_COEFFICIENTS = 8  # largest number of OpenCV's distortion coefficients that is supported
+_ROUNDS = 20  # largest number of Newton steps in the removal of distortion
+_SINGULAR = 1e-9  # determinant of the unit image axes below which they are parallel
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,18 +58,18 @@ class Camera:
     Parameters
     ----------
     matrix : array (3, 3)
-        Focal lengths and middle of the image, K; pixels per m for an orthographic camera.
+        Camera matrix K with focal lengths and principal point; pixels per m if orthographic.
     rotation : array (3, 3)
-        Rotation R from the laboratory's to the camera's axes (right, down, forward).
+        Rotation R from the laboratory to the camera axes (right, down, forward).
     translation : array (3,)
-        Shift t, m.
+        Translation t, m.
     distortion : array (n,), optional
-        Distortion coefficients of OpenCV (k1, k2, p1, p2, k3, k4, k5, k6), or the first 4 or 5 of
-        them; perspective only.
+        Distortion coefficients of OpenCV (k1, k2, p1, p2, k3, k4, k5, k6), or the first 4 or 5;
+        perspective only.
     size : tuple of int
-        Width and height, pixels.
+        Image width and height, pixels.
     projection : {"perspective", "orthographic"}
-        Kind of projection.
+        Type of projection.
     name : str
         Name of the view.
 
@@ -82,7 +83,7 @@ class Camera:
     matrix: Array
     rotation: Array
     translation: Array
-    distortion: Array = field(default_factory=lambda: np.zeros(_COEFFICIENTS))
+    distortion: Array = field(default_factory=lambda: np.zeros(_MOST_COEFFICIENTS))
     size: tuple[int, int] = SIZE
     projection: Literal["perspective", "orthographic"] = "perspective"
     name: str = "camera"
@@ -95,9 +96,9 @@ class Camera:
                 faults.append(f"{name} has shape {values.shape}; finite {shape} is needed")
             object.__setattr__(self, name, values)
         bent = np.array(self.distortion, dtype=np.float64).reshape(-1)
-        if bent.size > _COEFFICIENTS or not np.isfinite(bent).all():
+        if bent.size > _MOST_COEFFICIENTS or not np.isfinite(bent).all():
             faults.append(f"distortion has {bent.size} coefficients; up to 8 finite ones are known")
-        bent = np.pad(bent, (0, max(0, _COEFFICIENTS - bent.size)))
+        bent = np.pad(bent, (0, max(0, _MOST_COEFFICIENTS - bent.size)))
         object.__setattr__(self, "distortion", bent)
         if np.shape(self.size) != (2,) or min(self.size) < 1:
             faults.append(f"size is {self.size!r}; columns and rows of its images are needed")
@@ -145,7 +146,7 @@ class Camera:
         pixels : array (..., 2)
             Column and row.
         slopes : array (..., 2, 3)
-            Derivatives of these by the points, pixels per m.
+            Derivatives of the pixels by the points, pixels per m.
         """
         seen = numbers("points", points) @ self.rotation.T + self.translation
         if self.projection == "orthographic":
@@ -155,7 +156,7 @@ class Camera:
             return seen[..., :2] @ self.matrix[:2, :2].T + self.matrix[:2, 2], slopes
         depth = np.where(seen[..., 2:] > 0.0, seen[..., 2:], np.nan)
         flat = seen[..., :2] / depth
-        bent, jacobian = _distorted(flat, self.distortion)
+        bent, jacobian = _distort(flat, self.distortion)
         pixels = bent @ self.matrix[:2, :2].T + self.matrix[:2, 2]
         along = np.concatenate(
             [np.broadcast_to(np.eye(2), (*flat.shape, 2)), -flat[..., None]], axis=-1
@@ -164,7 +165,7 @@ class Camera:
         return pixels, slopes
 
     def rays(self, pixels: ArrayLike) -> tuple[Array, Array]:
-        """Find the lines that are seen in pixels.
+        """Compute the lines of sight of pixels.
 
         Parameters
         ----------
@@ -174,7 +175,7 @@ class Camera:
         Returns
         -------
         origin, direction : array (..., 3)
-            Point of each line, m, and its unit direction away from the camera, laboratory frame.
+            Point on each line, m, and its unit direction away from the camera, laboratory frame.
         """
         pixels = numbers("pixels", pixels)
         flat = (pixels - self.matrix[:2, 2]) @ np.linalg.inv(self.matrix[:2, :2]).T
@@ -182,14 +183,14 @@ class Camera:
             start = np.concatenate([flat, np.zeros_like(flat[..., :1])], axis=-1)
             origin = (start - self.translation) @ self.rotation
             return origin, np.broadcast_to(self.rotation[2], origin.shape).copy()
-        flat = _undistorted(flat, self.distortion)
+        flat = _undistort(flat, self.distortion)
         ahead = np.concatenate([flat, np.ones_like(flat[..., :1])], axis=-1) @ self.rotation
         center = np.broadcast_to(-self.translation @ self.rotation, ahead.shape).copy()
         return center, ahead / np.linalg.norm(ahead, axis=-1, keepdims=True)
 
 
 def _faults_of_matrix(matrix: Array) -> list[str]:
-    """Faults of a matrix that leave pixels without rays."""
+    """Faults of a camera matrix with which pixels would have no line of sight."""
     if not np.array_equal(matrix[2], (0.0, 0.0, 1.0)):
         row = ", ".join(f"{value:g}" for value in matrix[2])
         return [f"the last row of matrix is ({row}), not (0, 0, 1): is it transposed?"]
@@ -205,24 +206,24 @@ def orthogonal_views(
     size: tuple[int, int] = SIZE,
     center: ArrayLike = (0.0, 0.0, 0.0),
 ) -> tuple[Camera, Camera]:
-    """Give the paper's two views: from the top and from the front, of one scale.
+    """Create the paper's two views, from the top and from the front, with equal scale.
 
     Parameters
     ----------
     pixel_size : float
-        Size of a pixel in the scene, m.
+        Size of a pixel in object space, m.
     size : tuple of int
-        Width and height, pixels.
+        Image width and height, pixels.
     center : array_like (3,)
-        Point in the middle of both images, laboratory frame, m.
+        Point at the centre of both images, laboratory frame, m.
 
     Returns
     -------
     top : Camera
-        View of x to the right and y upward.
+        View with x to the right and y upward.
     front : Camera
-        View of x to the right and z upward: that from +y, mirrored so that both images have the
-        same x in the same column.
+        View with x to the right and z upward: the view from +y, mirrored so that both images have
+        the same x in the same column.
 
     Raises
     ------
@@ -245,8 +246,8 @@ def orthogonal_views(
     return views[0], views[1]
 
 
-def _distorted(flat: Array, k: Array) -> tuple[Array, Array]:
-    """OpenCV's distortion of (..., 2) and its derivatives (..., 2, 2)."""
+def _distort(flat: Array, k: Array) -> tuple[Array, Array]:
+    """Apply OpenCV's distortion to points (..., 2); also return derivatives (..., 2, 2)."""
     x, y = flat[..., 0], flat[..., 1]
     r2 = x * x + y * y
     top = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
@@ -269,13 +270,13 @@ def _distorted(flat: Array, k: Array) -> tuple[Array, Array]:
     return bent, slopes
 
 
-def _undistorted(bent: Array, k: Array) -> Array:
-    """Newton's method on `_distorted`."""
+def _undistort(bent: Array, k: Array) -> Array:
+    """Invert `_distort` by Newton's method."""
     flat = bent.copy()
     if not k.any():
         return flat
     for _ in range(_ROUNDS):
-        found, slopes = _distorted(flat, k)
+        found, slopes = _distort(flat, k)
         miss = bent - found
         a, b = slopes[..., 0, 0], slopes[..., 0, 1]
         c, d = slopes[..., 1, 0], slopes[..., 1, 1]
@@ -289,35 +290,35 @@ def _undistorted(bent: Array, k: Array) -> Array:
     return flat
 
 
-# Smallest sine of the angle between a single camera's line of sight and the plane z = 0.
+# Smallest sine of the angle between a single camera's viewing direction and the plane z = 0.
 _STEEP = 0.2
 
 
 def triangulate(
     cameras: Sequence[Camera], pixels: ArrayLike, sigma: ArrayLike = 1.0
 ) -> tuple[Array, Array]:
-    """Find the points that cameras see.
+    """Triangulate points from the pixels of one or more cameras.
 
     Parameters
     ----------
     cameras : sequence of Camera
-        Cameras of the views; the points of a single one are those in the plane z = 0.
+        Cameras of the views; with a single one, points are assumed to be in the plane z = 0.
     pixels : array_like (camera, ..., 2)
-        Column and row at which each camera sees each point; NaN gives NaN.
+        Column and row of each point in each camera; NaN gives NaN.
     sigma : array_like
-        Standard deviation of a pixel coordinate, broadcast to (camera, ...).
+        Standard deviation of pixel coordinates, broadcast to (camera, ...).
 
     Returns
     -------
     points : array (..., 3)
-        Points that are seen nearest to the pixels, each weighted by its sigma, m.
+        Points with least squared pixel errors, weighted by sigma, m.
     covariance : array (..., 3, 3)
         Covariance of the points, m².
 
     Raises
     ------
     ValueError
-        If shapes do not fit, or a single camera looks along the plane z = 0.
+        If shapes do not match, or a single camera looks along the plane z = 0.
     """
     pixels = numbers("pixels", pixels)
     if not cameras or pixels.ndim < 2 or pixels.shape[0] != len(cameras):
@@ -341,15 +342,15 @@ def triangulate(
             miss = (wanted - seen) * w[..., None]
             hessian += np.swapaxes(scaled, -1, -2) @ scaled
             gradient += (np.swapaxes(scaled, -1, -2) @ miss[..., None])[..., 0]
-        step = np.linalg.solve(_regular(hessian), gradient[..., None])[..., 0]
+        step = np.linalg.solve(_regularise(hessian), gradient[..., None])[..., 0]
         points = points + step
         if not np.nanmax(np.abs(step), initial=0.0) > 1e-12:
             break
-    return points, np.asarray(np.linalg.inv(_regular(hessian)), dtype=np.float64)
+    return points, np.asarray(np.linalg.inv(_regularise(hessian)), dtype=np.float64)
 
 
 def _in_plane(camera: Camera, pixels: Array, sigma: ArrayLike) -> tuple[Array, Array]:
-    """Points (..., 3) of the plane z = 0, and their covariance, of which none is across it."""
+    """Points (..., 3) in the plane z = 0, and their covariance, which is zero normal to it."""
     if abs(camera.rotation[2, 2]) < _STEEP:
         raise ValueError(
             f"camera {camera.name!r} looks along the plane z = 0 of the laboratory, in which what "
@@ -365,15 +366,15 @@ def _in_plane(camera: Camera, pixels: Array, sigma: ArrayLike) -> tuple[Array, A
     return points, covariance
 
 
-def _regular(hessian: Array) -> Array:
-    """Hessian of which parallel rays leave a finite, huge uncertainty; NaN stays NaN."""
+def _regularise(hessian: Array) -> Array:
+    """Regularise Hessians, so that parallel rays have a finite, huge uncertainty; NaN is kept."""
     scale = np.trace(hessian, axis1=-2, axis2=-1)[..., None, None]
     floored: Array = hessian + 1e-12 * scale * np.eye(3)
     return floored
 
 
 def _nearest_to_rays(cameras: Sequence[Camera], pixels: Array) -> Array:
-    """Points (..., 3) that are nearest to all rays."""
+    """Points (..., 3) with least squared distance from all rays."""
     matrix: Array = np.zeros((*pixels.shape[1:-1], 3, 3))
     right: Array = np.zeros((*pixels.shape[1:-1], 3))
     for camera, seen in zip(cameras, pixels, strict=True):
@@ -381,11 +382,11 @@ def _nearest_to_rays(cameras: Sequence[Camera], pixels: Array) -> Array:
         across: Array = np.eye(3) - direction[..., :, None] * direction[..., None, :]
         matrix += across
         right += (across @ origin[..., None])[..., 0]
-    solved = np.linalg.solve(_regular(matrix), right[..., None])[..., 0]
+    solved = np.linalg.solve(_regularise(matrix), right[..., None])[..., 0]
     return np.asarray(solved, dtype=np.float64)
 
 
-# Attribute of a camera, and dimensions, of each variable.
+# Variables of a dataset of cameras: attribute of a camera, and dimensions.
 _VARIABLES: dict[str, tuple[str, tuple[str, ...]]] = {
     "camera_matrix": ("matrix", ("row", "column")),
     "camera_rotation": ("rotation", ("row", "column")),
@@ -402,9 +403,9 @@ def load_cameras(path: str | PathLike[str], unit: float = 1e-3) -> tuple[Camera,
     Parameters
     ----------
     path : str or path
-        File in Anipose's TOML (`vibrissa.io.anipose`).
+        File in Anipose's TOML format (`vibrissa.io.anipose`).
     unit : float
-        Unit of the file's lengths, m; that of the board that calibrated the cameras, usually mm.
+        Unit of the file's lengths, m; that of the calibration board, usually mm.
 
     Returns
     -------
@@ -416,7 +417,7 @@ def load_cameras(path: str | PathLike[str], unit: float = 1e-3) -> tuple[Camera,
     FileNotFoundError
         If there is no such file.
     ValueError
-        If it is not a calibration, or one with faults.
+        If it is not a calibration, or has faults.
     """
     cameras = []
     for table in read_calibration(path):
@@ -437,12 +438,12 @@ def load_cameras(path: str | PathLike[str], unit: float = 1e-3) -> tuple[Camera,
 
 
 def save_cameras(path: str | PathLike[str], cameras: Sequence[Camera], unit: float = 1e-3) -> None:
-    """Write cameras so that `load_cameras`, and for perspective ones Anipose, can read them.
+    """Write cameras to a file for `load_cameras` and, if perspective, for Anipose.
 
     Parameters
     ----------
     path : str or path
-        File to write, usually with the ending ``.toml``.
+        File to write, usually with the suffix ``.toml``.
     cameras : sequence of Camera
         Cameras of the views.
     unit : float
@@ -470,7 +471,7 @@ def save_cameras(path: str | PathLike[str], cameras: Sequence[Camera], unit: flo
 
 
 def cameras_dataset(cameras: Sequence[Camera]) -> xr.Dataset:
-    """Write cameras as a dataset, the group ``cameras`` of a recording."""
+    """Convert cameras to a dataset, the group ``cameras`` of a recording."""
     return xr.Dataset(
         {
             name: (
@@ -486,7 +487,7 @@ def cameras_dataset(cameras: Sequence[Camera]) -> xr.Dataset:
 
 
 def cameras_from_dataset(dataset: xr.Dataset) -> tuple[Camera, ...]:
-    """Read the cameras that `cameras_dataset` wrote."""
+    """Restore cameras from the dataset of `cameras_dataset`."""
     return tuple(
         Camera(
             matrix=row["camera_matrix"].values,
@@ -504,37 +505,37 @@ def cameras_from_dataset(dataset: xr.Dataset) -> tuple[Camera, ...]:
 Image = NDArray[np.uint8]
 Board = NDArray[np.float32]
 
-_FEWEST = 4  # smallest number of moments in which all cameras see the board
+_FEWEST = 4  # smallest number of moments at which all cameras must see the board
 
 
 def calibrate(
     images: Mapping[str, Sequence[Image]], corners: tuple[int, int], square: float
 ) -> tuple[tuple[Camera, ...], float]:
-    """Calibrate cameras that look at one checkerboard at the same moments.
+    """Calibrate cameras from simultaneous images of one checkerboard.
 
     Parameters
     ----------
     images : mapping of str to sequence of array (height, width)
-        Grey images of each camera by its name, moment by moment; the board need not be seen in all.
+        Grey images of each camera by name, moment by moment; not all need to show the board.
     corners : tuple of int
-        Numbers of inner corners along the longer and along the shorter side of the board.
+        Numbers of inner corners along the longer and the shorter side of the board.
     square : float
-        Side of a square, m.
+        Side of a square of the board, m.
 
     Returns
     -------
     cameras : tuple of Camera
-        Cameras in the laboratory frame that is that of the board in the first moment in which all
+        Cameras in the laboratory frame, which is that of the board at the first moment at which all
         cameras see it: origin at its first inner corner, x along its rows, y along its columns.
     error : float
-        Root mean square distance of the corners from where the cameras see them, pixels.
+        Root mean square reprojection error of the corners, pixels.
 
     Raises
     ------
     ImportError
         If OpenCV is not installed.
     ValueError
-        If the cameras differ in their number of images, or the board is seen too seldom.
+        If the cameras have different numbers of images, or too few show the board.
     """
     counts = {name: len(series) for name, series in images.items()}
     if len(counts) < 2 or len(set(counts.values())) != 1:
@@ -546,7 +547,7 @@ def calibrate(
     board: Board = np.zeros((corners[0] * corners[1], 3), np.float32)
     board[:, :2] = np.indices(corners).T.reshape(-1, 2) * square
     seen = {
-        name: [_corners(np.asarray(image), corners) for image in series]
+        name: [_find_corners(np.asarray(image), corners) for image in series]
         for name, series in images.items()
     }
     moments = range(next(iter(counts.values())))
@@ -557,19 +558,22 @@ def calibrate(
             "the board turned and at different places"
         )
     cameras = tuple(
-        _camera(name, rows, board, images[name][0].shape, shared[0]) for name, rows in seen.items()
+        _calibrate_one(name, rows, board, images[name][0].shape, shared[0])
+        for name, rows in seen.items()
     )
-    cameras = _together(cameras, seen, board, shared)
-    return cameras, _error(cameras, seen, board, shared)
+    cameras = _stereo_poses(cameras, seen, board, shared)
+    return cameras, _reprojection_error(cameras, seen, board, shared)
 
 
-def _corners(image: Image, corners: tuple[int, int]) -> Any:
+def _find_corners(image: Image, corners: tuple[int, int]) -> Any:
+    """Pixels (n, 2) of the board's corners in an image, or None."""
     cv2 = _opencv()
     found, points = cv2.findChessboardCornersSB(image, corners)
     return points.reshape(-1, 2) if found else None
 
 
 def _opencv() -> Any:
+    """Import OpenCV."""
     try:
         import cv2
     except ImportError as error:
@@ -577,10 +581,10 @@ def _opencv() -> Any:
     return cv2
 
 
-def _camera(
+def _calibrate_one(
     name: str, rows: Sequence[Any], board: Board, shape: tuple[int, ...], first: int
 ) -> Camera:
-    """One camera by itself, in the frame of the board's first shared moment."""
+    """Calibrate one camera, in the frame of the board at the first shared moment."""
     cv2 = _opencv()
     usable = [i for i, points in enumerate(rows) if points is not None]
     size = (shape[1], shape[0])
@@ -598,10 +602,10 @@ def _camera(
     )
 
 
-def _together(
+def _stereo_poses(
     cameras: tuple[Camera, ...], seen: Mapping[str, Sequence[Any]], board: Board, shared: list[int]
 ) -> tuple[Camera, ...]:
-    """Pose of every camera relative to the first from all shared moments, not from one."""
+    """Poses of all cameras relative to the first, from all shared moments rather than one."""
     cv2 = _opencv()
     main = cameras[0]
     placed = [main]
@@ -623,10 +627,10 @@ def _together(
     return tuple(placed)
 
 
-def _error(
+def _reprojection_error(
     cameras: Sequence[Camera], seen: Mapping[str, Sequence[Any]], board: Board, shared: list[int]
 ) -> float:
-    """Root mean square distance of the corners from the images of the points they give."""
+    """Root mean square reprojection error of the triangulated corners."""
     squares = []
     for i in shared:
         pixels = np.stack([seen[camera.name][i] for camera in cameras]).astype(np.float64)

@@ -1,7 +1,7 @@
-"""Libraries and our own names that take long to import, imported where they are first used.
+"""Deferred imports of slow libraries, and of package members, at first use.
 
-xarray brings pandas, and both take longer than finding a contact: a stream or a single solution
-does without them.
+xarray imports pandas, and both take longer than finding a contact, so streams and single solutions
+avoid them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 else:
 
     class _Deferred:
-        """A module that is imported when something of it is asked for."""
+        """A module that is imported on first access to an attribute."""
 
         def __init__(self, name: str) -> None:
             self._name = name
@@ -41,7 +41,7 @@ else:
 def names_from(
     package: str, homes: Mapping[str, str], modules: Collection[str] = ()
 ) -> Callable[[str], object]:
-    """Make the ``__getattr__`` of a package whose names come from its modules, and are modules."""
+    """Create the ``__getattr__`` of a package from the modules in which its names are defined."""
     home = {name: module for module, names in homes.items() for name in names.split()}
 
     def attribute(name: str) -> object:

@@ -1,7 +1,7 @@
-"""Display of the results that are plain datasets, in a notebook or a terminal.
+"""Display of results that are plain datasets, in a notebook or a terminal.
 
-Whiskers, deflections, maps and estimates show themselves. Verdicts on triplets and recordings are
-xarray's own types, whose display lists variables; `show` explains them.
+Whiskers, deflections, maps and estimates have their own displays. Verdicts on triplets and
+recordings are xarray types, whose display lists variables; `show` explains their content.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from vibrissa.sketch import BENT, CONTACT, MOST_CURVES, REST, Mark, card, table,
 
 @dataclass(frozen=True, repr=False)
 class Shown:
-    """Something to look at: HTML in a notebook, text in a terminal."""
+    """A display: HTML in a notebook, text in a terminal."""
 
     html: str
     text: str
@@ -34,23 +34,23 @@ class Shown:
 
 
 def show(result: Any) -> Shown:
-    """Show a result at a glance.
+    """Display a result at a glance.
 
     Parameters
     ----------
     result : Dataset or DataTree or other
-        Verdicts of :func:`vibrissa.uniqueness`; a recording; or anything that shows itself in a
-        notebook, such as a `Whisker`.
+        Verdicts from :func:`vibrissa.uniqueness`; a recording; or an object with a notebook
+        display, such as a `Whisker`.
 
     Returns
     -------
     Shown
-        A small picture and a table with units; in a terminal, the table.
+        Small picture and table with units; in a terminal, the table.
 
     Raises
     ------
     ValueError
-        If it is none of these.
+        If ``result`` is none of these.
     """
     if isinstance(result, xr.Dataset) and "verdict" in result and "critical_cone" in result:
         rows, notes = verdict_rows(result)
@@ -73,7 +73,7 @@ def show(result: Any) -> Shown:
 
 
 def _facts(recording: xr.DataTree) -> list[tuple[str, str]]:
-    """Describe what a recording is of, in words."""
+    """Facts about a recording, as labels and texts."""
     root = recording.to_dataset()
     time = root["time"].values
     facts = [("origin", str(recording.attrs.get("origin", "unknown")))]
@@ -96,7 +96,7 @@ def _facts(recording: xr.DataTree) -> list[tuple[str, str]]:
 
 
 def _picture(recording: xr.DataTree) -> str:
-    """The whisker now and then, where its base was, and the contact points, laboratory frame."""
+    """Picture of some frames' whisker, the base, and the contact points, laboratory frame."""
     marks = []
     trial = Recording(recording)
     for name, colour, dots, label in (

@@ -1,7 +1,7 @@
-"""Errors of tracks, signals and contacts against the truth, the same for demo, reports and studies.
+"""Errors of tracks, signals and contacts relative to the truth, for demo, reports and studies.
 
-Predictions of contacts' errors are drawn, not linearised: the estimated covariance of every contact
-gives as many errors as there are replicates, each replicate is scored like the trial itself, and
+Predicted errors of contacts are sampled, not linearised: errors are drawn from the estimated
+covariance of every contact, once per replicate, each replicate is scored like the trial itself, and
 the median over replicates is the prediction.
 """
 
@@ -36,7 +36,7 @@ __all__ = [
 
 
 ERRORS = ("error_r", "error_theta", "error_phi", "error_distance")
-"""Names of the errors of r, θ, φ, and of the distance in space."""
+"""Names of the errors in r, θ, φ, and of the distance in space."""
 
 REPLICATES = 25
 ANGLES = ANGLE_CLASSES
@@ -47,9 +47,9 @@ _QUANTILES = (0.5, 0.95, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class ErrorRow:
-    """Errors of some contacts in one quantity: median, 95 % and largest size, SI units.
+    """Errors of some contacts in one quantity: median, 95 % quantile and largest, SI units.
 
-    As measured, and as the covariance predicts; `contacts` is the number with an estimate.
+    Both measured, and predicted from the covariance; `contacts` is the number with an estimate.
     """
 
     quantity: str
@@ -61,22 +61,22 @@ class ErrorRow:
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """All numbers of a trial.
+    """All scores of a trial.
 
     Parameters
     ----------
     touching : int
-        Number of frames in which the whisker truly touches.
+        Number of frames in which the whisker is truly in contact.
     detected : int
         Number of frames in which a contact is detected.
     false : int
-        Number of frames in which a contact is detected without a true one.
+        Number of frames in which a contact is detected but there is none.
     candidates : array (3,)
-        Numbers of detected contacts with no, one, or several candidates.
+        Numbers of detected contacts with no, one, and several candidates.
     errors : tuple of ErrorRow
-        Errors of r, θ, φ and in space, all contacts.
+        Errors in r, θ, φ and in space, all contacts.
     by_angle : tuple of ErrorRow
-        Errors in space, by deflection angle.
+        Errors in space by deflection angle.
     offset : array (3,)
         Vector from the peg's true axis to the fitted one, m, at the height of the contacts.
     tilt : float
@@ -84,7 +84,7 @@ class Scores:
     diameter_error : float
         Error of the fitted peg's diameter, m.
     surface : array (3,)
-        Median, 95 % and largest distance of the contacts from the true surface, m.
+        Median, 95 % quantile and largest distance of the contacts from the true surface, m.
     """
 
     touching: int
@@ -112,25 +112,25 @@ def contact_errors(
     Parameters
     ----------
     contacts : xarray.Dataset
-        Dataset of `vibrissa.pipeline.estimates_of`, of one whisker, dimension time.
+        Dataset from `vibrissa.pipeline.estimates_of`, of one whisker, dimension time.
     truth : xarray.Dataset
         Truth of the recording, dimension time: ``contact_point``, ``contact_point_whisker``.
     whisker : Whisker
-        True whisker, not as it was tracked.
+        True whisker, rather than the tracked one.
     seed : int
         Seed of the draws.
 
     Returns
     -------
     xarray.Dataset
-        Dataset of dimensions time, replicate: the size of each error, ``…_predicted`` and
-        ``deflection_angle``. r, θ and φ are in the whisker's frame, and the error in space is in
-        the laboratory, so that it includes that of the pose.
+        Dataset of dimensions time, replicate: the absolute value of each error, ``…_predicted`` and
+        ``deflection_angle``. Errors in r, θ and φ are in the whisker frame, that in space is in the
+        laboratory frame, so that it includes the error of the pose.
     """
     point, true = (d["contact_point_whisker"].values for d in (contacts, truth))
     draw = np.random.default_rng(seed).normal(size=(REPLICATES, len(point), 3))
-    deviation = np.einsum("tij,rtj->rti", _roots(contacts["covariance"].values), draw)
-    placed = np.einsum("tij,rtj->rti", _roots(contacts["contact_covariance"].values), draw)
+    deviation = np.einsum("tij,rtj->rti", _square_roots(contacts["covariance"].values), draw)
+    placed = np.einsum("tij,rtj->rti", _square_roots(contacts["contact_covariance"].values), draw)
     away = contacts["contact_point"].values - truth["contact_point"].values
     errors = _with_size(_errors(point, true), away)
     drawn = _with_size(_errors(point + deviation, point), placed)
@@ -143,14 +143,14 @@ def contact_errors(
 
 
 def deflection_angle(truth: xr.Dataset, whisker: Whisker) -> Array:
-    """Angle by which the true contact has moved from the whisker at rest, seen from the base.
+    """Angle at the base between the true contact and the resting whisker.
 
     Parameters
     ----------
     truth : xarray.Dataset
         Truth of one whisker, dimension time: ``contact_point_whisker``.
     whisker : Whisker
-        True whisker: the shape that was tracked has other angles.
+        True whisker; the angles of the tracked shape differ.
 
     Returns
     -------
@@ -162,18 +162,18 @@ def deflection_angle(truth: xr.Dataset, whisker: Whisker) -> Array:
 
 
 def _errors(estimated: Array, true: Array) -> Array:
-    """Sizes (..., 3) of the errors in r, θ, φ."""
+    """Absolute errors (..., 3) in r, θ, φ."""
     away = within_turn(spherical(estimated) - spherical(true), [False, True, False])
     return np.asarray(np.abs(away))
 
 
 def _with_size(errors: Array, away: Array) -> Array:
-    """Add the size of errors in space as a fourth column."""
+    """Append the magnitude of errors in space as a fourth column."""
     return np.concatenate([errors, np.linalg.norm(away, axis=-1, keepdims=True)], axis=-1)
 
 
-def _roots(covariance: Array) -> Array:
-    """Matrices A (n, 3, 3) with A Aᵀ = covariance, of any rank; NaN where it is."""
+def _square_roots(covariance: Array) -> Array:
+    """Matrices A (n, 3, 3) with A Aᵀ = covariance, of any rank; NaN where the covariance is."""
     known = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
     size, direction = np.linalg.eigh(np.where(known[:, None, None], covariance, 0.0))
     root = direction * np.sqrt(np.maximum(size, 0.0))[:, None, :]
@@ -188,7 +188,7 @@ def score(
     peg: Peg,
     radius: Array,
 ) -> Scores:
-    """Scores of a trial with a peg, at whose contacts the whisker has these radii (time,), m."""
+    """Score a trial with a peg; ``radius`` (time,) is the whisker's at the contacts, m."""
     detected = contacts["in_contact"].values
     touching = truth["in_contact"].values
     number = contacts["candidates"].values[detected]
@@ -211,23 +211,24 @@ def score(
 
 
 def error_rows(errors: xr.Dataset) -> tuple[tuple[ErrorRow, ...], tuple[ErrorRow, ...]]:
-    """Summarise errors of contacts."""
+    """Summarise errors of contacts, for all and by deflection angle."""
     known = np.isfinite(errors["error_distance"].values)
     angle = np.degrees(errors["deflection_angle"].values)
     by_angle = []
     for low, high in itertools.pairwise(ANGLES):
         rows = known & (angle >= low) & (angle < high)
         if rows.any():
-            by_angle.append(_row(errors, "error_distance", angle_label(low, high), rows))
-    return tuple(_row(errors, name, "all", known) for name in ERRORS), tuple(by_angle)
+            by_angle.append(_error_row(errors, "error_distance", angle_label(low, high), rows))
+    return tuple(_error_row(errors, name, "all", known) for name in ERRORS), tuple(by_angle)
 
 
 def angle_label(low: float, high: float) -> str:
-    """Name a class of deflection angle."""
+    """Label of a class of deflection angle."""
     return f"{low:g}–{high:g}°" if high < ANGLES[-1] else f"over {low:g}°"
 
 
-def _row(errors: xr.Dataset, name: str, label: str, rows: NDArray[np.bool_]) -> ErrorRow:
+def _error_row(errors: xr.Dataset, name: str, label: str, rows: NDArray[np.bool_]) -> ErrorRow:
+    """Summarise the errors of some frames in one quantity."""
     drawn = errors[f"{name}_predicted"].values[:, rows]
     drawn = drawn[:, np.isfinite(drawn).all(axis=0)]
     predicted = np.median([_quantiles(replicate) for replicate in drawn], axis=0)
@@ -236,7 +237,7 @@ def _row(errors: xr.Dataset, name: str, label: str, rows: NDArray[np.bool_]) -> 
 
 
 def _quantiles(values: Array) -> Array:
-    """Median, 95 % and largest of values (n,)."""
+    """Median, 95 % quantile and largest of values (n,)."""
     if values.size == 0:
         return np.full(len(_QUANTILES), np.nan)
     return np.asarray(np.quantile(values, _QUANTILES))
@@ -247,21 +248,21 @@ _SPREAD = (50.0, 95.0)
 
 @dataclass(frozen=True, eq=False)
 class TrackingScores:
-    """Errors of tracking: medians and 95 %, SI units but for pixels.
+    """Errors of tracking: medians and 95 % quantiles, SI units except for pixels.
 
     Parameters
     ----------
     frames, lost : int
-        Numbers of frames, and of those in which the whisker was not found.
+        Number of frames, and of those in which the whisker was not found.
     trace : array (view, 2)
-        Distance of traced points from the whisker in the image, pixels; without views where no
-        traces are known.
+        Distance of traced points from the true whisker in the image, pixels; without views if
+        traces are unknown.
     centerline : array (2,)
         Errors of points in space from the whisker's centreline, m.
     base : array (2,)
         Errors of the whisker's base, m.
     contact : array (2,)
-        Errors of the contact point, m, in frames that truly are in contact and were found to be.
+        Errors of the contact point, m, in frames that are in contact and were found to be.
     classified : float
         Share of the frames in which contact is classified correctly.
     """
@@ -279,7 +280,8 @@ class TrackingScores:
 class SignalRow:
     """Errors of force and moment in a class of deflection angle.
 
-    Median and 95 % (2,) of the size of the error over that of the vector, laboratory frame.
+    Median and 95 % quantile (2,) of the magnitude of the error relative to that of the vector,
+    laboratory frame.
     """
 
     label: str
@@ -289,20 +291,20 @@ class SignalRow:
 
 
 def tracking_scores(tracked: xr.Dataset, truth: xr.Dataset) -> TrackingScores:
-    """Compare what was tracked with the truth.
+    """Compare tracking results with the truth.
 
     Parameters
     ----------
     tracked : xarray.Dataset
-        Tracked recording of one whisker: ``in_contact``, ``contact_point``, and as far as they are
-        known ``trace``, ``trace_visible``, ``centerline``, ``base_position``, ``confidence``.
+        Tracked recording of one whisker: ``in_contact``, ``contact_point``, and if known ``trace``,
+        ``trace_visible``, ``centerline``, ``base_position``, ``confidence``.
     truth : xarray.Dataset
-        Truth of the same whisker in the same frames, see `truth_of`.
+        Truth of the same whisker in the same frames, from `truth_of`.
 
     Returns
     -------
     TrackingScores
-        The numbers; NaN for what is not known of both.
+        Errors; NaN for what is unknown in either.
     """
     unknown = np.full(2, np.nan)
     touching = [Group(data)["in_contact"] for data in (tracked, truth)]
@@ -312,7 +314,7 @@ def tracking_scores(tracked: xr.Dataset, truth: xr.Dataset) -> TrackingScores:
         base = spread(_distances(tracked, truth, "base_position"))
     if "centerline" in tracked and "centerline" in truth:
         lines = [Group(data)["centerline"] for data in (tracked, truth)]
-        centerline = spread(from_curves(lines[0], refined(lines[1])))
+        centerline = spread(distances_from_curves(lines[0], refine_curves(lines[1])))
     lost = int((tracked["confidence"].values == 0.0).sum()) if "confidence" in tracked else 0
     return TrackingScores(
         frames=tracked.sizes["time"],
@@ -326,21 +328,21 @@ def tracking_scores(tracked: xr.Dataset, truth: xr.Dataset) -> TrackingScores:
 
 
 def _distances(tracked: xr.Dataset, truth: xr.Dataset, name: str) -> Array:
-    """Distances of a point (time, space) from the true one."""
+    """Distances (time,) of a point from the true one."""
     pair = [Group(data)[name] for data in (tracked, truth)]
     return np.asarray(np.linalg.norm(pair[0] - pair[1], axis=-1))
 
 
 def _trace_errors(tracked: xr.Dataset, truth: xr.Dataset) -> Array:
-    """Median and 95 % distance of traced points that were seen, view by view."""
+    """Median and 95 % quantile of the distances of visible traced points, view by view."""
     if "trace" not in tracked or "trace" not in truth:
         return np.empty((0, 2))
     traced, true = (np.swapaxes(Group(data)["trace"], 0, 1) for data in (tracked, truth))
     seen = np.ones(traced.shape[:3], dtype=bool)
     if "trace_visible" in tracked:
         seen = np.swapaxes(Group(tracked)["trace_visible"], 0, 1)
-    views = zip(traced, map(refined, true), seen, strict=True)
-    return np.array([spread(from_curves(a, b)[visible]) for a, b, visible in views])
+    views = zip(traced, map(refine_curves, true), seen, strict=True)
+    return np.array([spread(distances_from_curves(a, b)[visible]) for a, b, visible in views])
 
 
 def signal_errors(signals: xr.Dataset, truth: xr.Dataset, angle: Array) -> tuple[SignalRow, ...]:
@@ -349,16 +351,16 @@ def signal_errors(signals: xr.Dataset, truth: xr.Dataset, angle: Array) -> tuple
     Parameters
     ----------
     signals : xarray.Dataset
-        The group ``signals``, one whisker.
+        Dataset of the group ``signals``, one whisker.
     truth : xarray.Dataset
-        Truth of the same whisker in the same frames, see `truth_of`.
+        Truth of the same whisker in the same frames, from `truth_of`.
     angle : array (time,)
         Deflection angle, rad.
 
     Returns
     -------
     tuple of SignalRow
-        One for each class that there is.
+        Errors in each class that has frames.
     """
     errors = {}
     for name in ("force", "moment"):
@@ -377,13 +379,13 @@ def signal_errors(signals: xr.Dataset, truth: xr.Dataset, angle: Array) -> tuple
 
 
 def _in_laboratory(data: xr.Dataset, name: str) -> Array:
-    """Turn vectors (time, 3) from the whisker's frame into the laboratory's."""
+    """Rotate vectors (time, 3) from the whisker to the laboratory frame."""
     known = Group(data)
     return np.asarray(np.einsum("tij,tj->ti", known["base_rotation"], known[name]))
 
 
-def refined(curves: Array, times: int = 8) -> Array:
-    """Take more points of smooth curves, whose chords would cut their bends."""
+def refine_curves(curves: Array, times: int = 8) -> Array:
+    """Interpolate more points of smooth curves, whose chords would cut across bends."""
     steps = np.arange(curves.shape[1])
     at = np.linspace(0.0, steps[-1], times * int(steps[-1]) + 1)
     before = np.minimum(at.astype(int), steps[-1] - 1)
@@ -395,8 +397,8 @@ def refined(curves: Array, times: int = 8) -> Array:
     return np.asarray(fine)
 
 
-def from_curves(points: Array, curves: Array) -> Array:
-    """Distances of points from curves, frame by frame."""
+def distances_from_curves(points: Array, curves: Array) -> Array:
+    """Distances of points (time, n, d) from curves (time, m, d), frame by frame."""
     out = np.full(points.shape[:2], np.nan)
     for i, (some, curve) in enumerate(zip(points, curves, strict=True)):
         start, step = curve[:-1], np.diff(curve, axis=0)
@@ -411,17 +413,17 @@ def from_curves(points: Array, curves: Array) -> Array:
 
 
 def spread(values: Array) -> Array:
-    """Median and 95 % of what is known.
+    """Median and 95 % quantile of the known values.
 
     Parameters
     ----------
     values : array
-        Any shape; NaN is left out.
+        Values of any shape; NaN is ignored.
 
     Returns
     -------
     array (2,)
-        NaN if nothing is known.
+        Quantiles; NaN if no value is known.
     """
     known = values[np.isfinite(values)]
     return np.percentile(known, _SPREAD) if known.size else np.full(2, np.nan)
@@ -436,11 +438,11 @@ _CIRCULAR = (
 
 
 def with_truth(tracked: xr.DataTree, simulated: xr.DataTree) -> xr.DataTree:
-    """Tracked recording with the truth of its simulated trial."""
+    """Add the truth of a simulated trial to its tracked recording."""
     groups = {group.path: group.to_dataset(inherit=False) for group in tracked.subtree}
     for group in simulated.subtree:
         if group.path.startswith(("/truth", "/objects")):
-            # The curves of the truth have nodes of their own.
+            # The curves of the truth have different nodes.
             data = group.to_dataset(inherit=False)
             groups[group.path] = data.rename(node="true_node") if "node" in data.dims else data
         elif group.path.startswith("/whiskers"):
@@ -451,22 +453,22 @@ def with_truth(tracked: xr.DataTree, simulated: xr.DataTree) -> xr.DataTree:
 
 
 def truth_of(recording: xr.DataTree, whisker: int = 0) -> tuple[xr.Dataset, Whisker]:
-    """Truth of one whisker.
+    """Return the truth of one whisker.
 
     Parameters
     ----------
     recording : xarray.DataTree
-        Recording with a group ``truth``, simulated or of `with_truth`.
+        Recording with a group ``truth``, simulated or from `with_truth`.
     whisker : int
-        Number of the whisker along the dimension ``whisker``.
+        Index of the whisker along the dimension ``whisker``.
 
     Returns
     -------
     truth : xarray.Dataset
-        Truth, dimension time, with the base's true ``base_position`` and ``base_rotation`` unless
-        they are not known.
+        Truth, dimension time, with the true ``base_position`` and ``base_rotation`` if they are
+        known.
     whisker : Whisker
-        True whisker; the tracked one where nothing else is known.
+        True whisker; the tracked one if no other is known.
     """
     group = recording.children["truth"]
     truth = group.to_dataset()
@@ -478,5 +480,5 @@ def truth_of(recording: xr.DataTree, whisker: int = 0) -> tuple[xr.Dataset, Whis
 
 
 def caution(source: object) -> str | None:
-    """State what errors of contacts do not test, by the source of their signals."""
+    """State what the errors of contacts do not test, given the source of their signals."""
     return _CIRCULAR if source in ("contact point", "rod") else None

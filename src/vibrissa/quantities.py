@@ -1,12 +1,12 @@
-"""One table of every physical quantity: its name, symbol, unit and meaning.
+"""Table of all physical quantities: names, symbols, units and meanings.
 
-The table itself is ``quantities.csv``, one row a quantity. The attributes of datasets, the labels
-of figures and the headings of tables come from here. Values are in SI units everywhere (``unit``);
-figures and printed tables show ``value * display_factor`` in ``display_unit``. F is the force of
-the object on the whisker and M = p × F its moment about the base, both in the whisker frame: base
-at the origin, x along the tangent at the base, y toward the side to which the whisker curves. Names
-and symbols are those of the paper (Huet, Emnett & Hartmann 2022, doi:10.1371/journal.pcbi.1007763);
-its mN·mm is our µN·m.
+The table is ``quantities.csv``, one row per quantity, from which the attributes of datasets, labels
+of figures and headings of tables are taken. Values are in SI units (``unit``) everywhere; figures
+and printed tables show ``value * display_factor`` in ``display_unit``. F is the force of the object
+on the whisker and M = p × F its moment about the base, both in the whisker frame: base at the
+origin, x along the tangent at the base, y toward the side to which the whisker curves. Names and
+symbols are those of the paper (Huet, Emnett & Hartmann 2022, doi:10.1371/journal.pcbi.1007763); its
+mN·mm is our µN·m.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ class Quantity:
     Parameters
     ----------
     name : str
-        The name of its variable in datasets and of its column in tables.
+        Name of the variable in datasets and of the column in tables.
     symbol : str
         Symbol in mathtext, without the dollar signs.
     unit : str
-        SI unit of every stored value; ``"1"`` for a number without one.
+        SI unit of every stored value; ``"1"`` if dimensionless.
     display_unit : str
-        Unit in figures and printed tables; empty for a number without one.
+        Unit in figures and printed tables; empty if dimensionless.
     display_factor : float
-        Factor from the stored value to the one in ``display_unit``.
+        Factor from the stored value to that in ``display_unit``.
     long_name : str
-        A few words, as in a legend.
+        Short description, as in a legend.
     description : str
-        Exact meaning: frame, sign, convention.
+        Exact meaning: frame, sign, conventions.
     """
 
     name: str
@@ -54,8 +54,8 @@ class Quantity:
     description: str
 
 
-_SAME = {("pixel", "px"), ("1", "")}  # pairs of one size, written in two ways
-# What a value in a unit of storage is multiplied with to be in the unit that it is shown in.
+_SAME = {("pixel", "px"), ("1", "")}  # pairs of names of the same unit
+# Factors from units of storage to units of display.
 _FACTORS = {
     ("m", "mm"): 1e3,
     ("m", "µm"): 1e6,
@@ -74,8 +74,8 @@ _FACTORS = {
 
 
 def _display_factor(unit: str, shown: str) -> float:
-    """Factor from one unit to another; ValueError if it is not known."""
-    # Units of covariances are made of others, whose products are written with a dot.
+    """Factor from a unit to its display unit; raise a ValueError if it is unknown."""
+    # Units of covariances are products, which are displayed with a dot.
     if unit.replace("N m", "N·m").replace("^2", "²") == shown or (unit, shown) in _SAME:
         return 1.0
     if (unit, shown) not in _FACTORS:
@@ -96,11 +96,11 @@ def _table() -> dict[str, Quantity]:
 
 
 QUANTITIES: Mapping[str, Quantity] = MappingProxyType(_table())
-"""Every quantity by its name."""
+"""All quantities by name."""
 
 
 def quantity(name: str) -> Quantity:
-    """Look a quantity up.
+    """Look up a quantity.
 
     Parameters
     ----------
@@ -110,12 +110,12 @@ def quantity(name: str) -> Quantity:
     Returns
     -------
     Quantity
-        Row of the table.
+        Row of the table for this name.
 
     Raises
     ------
     ValueError
-        If the table has no such name; the message lists names that are close.
+        If the table has no such name; the message lists similar names.
     """
     if name not in QUANTITIES:
         allowed = difflib.get_close_matches(name, QUANTITIES) or list(QUANTITIES)
@@ -124,12 +124,12 @@ def quantity(name: str) -> Quantity:
 
 
 def attributes(name: str) -> dict[str, str]:
-    """Attributes that a dataset's variable of this name carries.
+    """Return the attributes of a dataset's variable of this name.
 
     Parameters
     ----------
     name : str
-        A name of :data:`QUANTITIES`.
+        Name in :data:`QUANTITIES`.
 
     Returns
     -------
@@ -146,17 +146,17 @@ def attributes(name: str) -> dict[str, str]:
 
 
 def axis_label(name: str) -> str:
-    """Label an axis or a column with symbol and display unit.
+    """Return the label of an axis or a column, with symbol and display unit.
 
     Parameters
     ----------
     name : str
-        A name of :data:`QUANTITIES`.
+        Name in :data:`QUANTITIES`.
 
     Returns
     -------
     str
-        Label in mathtext; without parentheses where the quantity has no unit.
+        Label in mathtext; without parentheses if the quantity is dimensionless.
 
     Examples
     --------
@@ -171,21 +171,21 @@ _LARGER = {"µN": "mN", "mN": "N", "µN·m": "mN·m", "mN·m": "N·m"}
 
 
 def shown_unit(name: str, values: ArrayLike) -> tuple[float, str]:
-    """Choose the unit in which values are read most easily.
+    """Choose the most readable unit for given values.
 
     Parameters
     ----------
     name : str
-        A name of :data:`QUANTITIES`.
+        Name in :data:`QUANTITIES`.
     values : array_like, any shape
-        Values in the quantity's SI unit; NaN is left out.
+        Values in the quantity's SI unit; NaN is ignored.
 
     Returns
     -------
     factor : float
-        Factor from the SI unit to that unit.
+        Factor from the SI unit to the chosen unit.
     unit : str
-        The display unit or, of forces and moments far larger than a rat's, one that is larger.
+        Display unit or, for forces and moments far larger than a rat's, a larger one.
 
     Examples
     --------
@@ -202,12 +202,12 @@ def shown_unit(name: str, values: ArrayLike) -> tuple[float, str]:
 
 
 def to_display(name: str, values: ArrayLike) -> NDArray[np.float64]:
-    """Convert SI values to the unit they are shown in.
+    """Convert SI values to the display unit.
 
     Parameters
     ----------
     name : str
-        A name of :data:`QUANTITIES`.
+        Name in :data:`QUANTITIES`.
     values : array_like, any shape
         Values in the quantity's SI unit.
 

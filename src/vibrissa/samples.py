@@ -1,10 +1,11 @@
-"""Whiskers to begin with, built from published figures.
+"""Built-in whiskers with published dimensions.
 
-`gamma` stands for a γ whisker of a rat: 40 mm long, in its plane the parabola y = A x² with
-A·L = 0.4, out of the plane by 1.5 mm at the tip (real ones are planar to 0.3 mm over the proximal
-65 %: Towal et al. 2011; here the third dimension begins at 0.6 L, its curvature growing with the
-square of the distance from there). Base radius, taper and material are those of Huet, Emnett &
-Hartmann (2022). The others are the four canonical rods, straight or curved, tapered or not.
+`gamma` represents a γ whisker of a rat: 40 mm long, in its plane the parabola y = A x² with
+A·L = 0.4, and out of the plane by 1.5 mm at the tip (real ones are planar to 0.3 mm over the
+proximal 65 %: Towal et al. 2011; here the deviation begins at 0.6 L, with a curvature that grows
+with the square of the distance from there). Base radius, taper and material are those of Huet,
+Emnett & Hartmann (2022). The others are the four canonical rods, straight or curved, tapered or
+cylindrical.
 """
 
 import numpy as np
@@ -15,14 +16,14 @@ from vibrissa.whisker import Whisker, parabola_curvature
 LENGTH = 40e-3
 COEFFICIENT = 10.0
 OUT_OF_PLANE = 0.6
-"""Share of the length at which the γ whisker begins to leave its plane."""
+"""Share of the length at which the γ whisker leaves its plane."""
 
 TIP_HEIGHT = 1.5e-3
-"""About how far the γ whisker's tip lies from that plane, m."""
+"""Approximate distance of the γ whisker's tip from that plane, m."""
 
 
 def gamma() -> Whisker:
-    """Give a γ whisker, the built-in default.
+    """Return a γ whisker, the built-in default.
 
     Returns
     -------
@@ -44,7 +45,7 @@ def gamma() -> Whisker:
 
 
 def straight() -> Whisker:
-    """Give a straight tapered whisker of 40 mm.
+    """Return a straight tapered whisker of 40 mm.
 
     Returns
     -------
@@ -55,18 +56,18 @@ def straight() -> Whisker:
 
 
 def straight_cylinder() -> Whisker:
-    """Give a straight cylinder of 40 mm, radius 100 µm.
+    """Return a straight cylinder of 40 mm, radius 100 µm.
 
     Returns
     -------
     Whisker
-        The textbook's cantilever.
+        Straight cantilever of constant section.
     """
     return Whisker.straight(LENGTH, tip_radius=100e-6, name="straight cylinder")
 
 
 def curved() -> Whisker:
-    """Give a planar tapered whisker of 40 mm on y = 10 x².
+    """Return a planar tapered whisker of 40 mm on y = 10 x².
 
     Returns
     -------
@@ -77,7 +78,7 @@ def curved() -> Whisker:
 
 
 def curved_cylinder() -> Whisker:
-    """Give a planar cylinder of 40 mm, radius 100 µm, on y = 10 x².
+    """Return a planar cylinder of 40 mm, radius 100 µm, on y = 10 x².
 
     Returns
     -------

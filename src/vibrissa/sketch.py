@@ -1,7 +1,7 @@
-"""Display of results in a notebook: a small picture, a table with units, progress bars.
+"""Notebook display of results: small pictures, tables with units, progress bars.
 
-The picture is a few lines of SVG, so that showing a value never loads a plotting library: the
-whisker's x–y and x–z planes at one scale, with a bar of round length. Figures are in
+A picture is a few lines of SVG, so that displaying a value does not load a plotting library: the
+whisker's x–y and x–z planes at one scale, with a scale bar of round length. Figures are in
 `vibrissa.plots`.
 """
 
@@ -34,7 +34,7 @@ CONTACT = "#d55e00"
 MOST_CURVES = 40
 MOST_POINTS = 800
 
-# Height of a panel over its width, at least and (inverse) at most.
+# Width of a panel, its margin, and the gap between panels, pixels; least height over width.
 _PANEL, _MARGIN, _GAP = 260.0, 14.0, 18.0
 _LEAST = 0.25
 _STYLE = "border-collapse:collapse;font-size:90%"
@@ -46,15 +46,15 @@ _NAME = ";white-space:nowrap"
 class Mark:
     """Curves or points of one colour."""
 
-    places: ArrayLike  # (..., n, 3), m, in any one frame; what is NaN is left out
-    colour: str  # in any notation of CSS
+    places: ArrayLike  # (..., n, 3), m, in any common frame; NaN is ignored
+    colour: str  # CSS colour
     dots: bool = False
-    width: float = 1.5  # of a line, or diameter of a dot, pixels
+    width: float = 1.5  # width of lines or diameter of dots, pixels
     label: str = ""
 
 
 def views(marks: Sequence[Mark]) -> str:
-    """Draw marks, from back to front, in the x–y and the x–z plane; empty if no place is known."""
+    """Draw marks, from back to front, in the x–y and x–z planes; empty if all are NaN."""
     every = np.concatenate([np.asarray(mark.places, dtype=float).reshape(-1, 3) for mark in marks])
     every = every[np.isfinite(every).all(axis=1)]
     if not len(every):
@@ -72,7 +72,7 @@ def views(marks: Sequence[Mark]) -> str:
         for mark in marks:
             flat = np.asarray(mark.places, dtype=float)[..., [0, j]]
             pixels = centre + (flat - middle) * scale * [1.0, -1.0]
-            parts.append(_drawn(mark, pixels))
+            parts.append(_mark_svg(mark, pixels))
         parts.append(_text(left + 2.0, 11.0, f"x–{'xyz'[j]}"))
     parts.append(_bar(extent, scale, height))
     width = 2.0 * _PANEL + _GAP
@@ -85,7 +85,7 @@ def views(marks: Sequence[Mark]) -> str:
 
 
 def _legend(marks: Sequence[Mark]) -> str:
-    """Labels of the marks that have one and can be seen, in their colours."""
+    """Labels of the visible marks in their colours."""
     labels = [
         f'<span style="color:{mark.colour}">{"●" if mark.dots else "━"}</span> {escape(mark.label)}'
         for mark in marks
@@ -94,12 +94,12 @@ def _legend(marks: Sequence[Mark]) -> str:
     return f"<br><small>{' &emsp; '.join(labels)}</small>" if labels else ""
 
 
-def _drawn(mark: Mark, pixels: Array) -> str:
-    """SVG of one mark, places (..., n, 2) in pixels."""
+def _mark_svg(mark: Mark, pixels: Array) -> str:
+    """SVG of one mark, at positions (..., n, 2) in pixels."""
     if mark.dots:
         points = pixels.reshape(-1, 2)
         points = thinned(points[np.isfinite(points).all(axis=1)], MOST_POINTS)
-        # A line of no length with round ends is a dot: one element for all of them.
+        # A line of zero length with round ends is a dot: one element for all of them.
         path = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in points)
         ends = ' stroke-linecap="round"'
     else:
@@ -113,7 +113,7 @@ def _drawn(mark: Mark, pixels: Array) -> str:
 
 
 def thinned(values: NDArray[_Kind], most: int) -> NDArray[_Kind]:
-    """Take at most so many rows, evenly among all of them, first and last included."""
+    """Select at most ``most`` rows, evenly spaced, including the first and the last."""
     if len(values) <= most:
         return values
     rows: NDArray[_Kind] = values[np.linspace(0, len(values) - 1, most).astype(int)]
@@ -121,14 +121,14 @@ def thinned(values: NDArray[_Kind], most: int) -> NDArray[_Kind]:
 
 
 def round_step(size: float) -> float:
-    """Give the largest of 1, 2 and 5 times a power of ten that is at most a size."""
-    size *= 1.0 + 1e-9  # a third of 300 mm is a round length, but for rounding
+    """Largest of 1, 2 and 5 times a power of ten that is at most ``size``."""
+    size *= 1.0 + 1e-9  # so that a third of 300 mm is a round length despite rounding
     power = 10.0 ** np.floor(np.log10(size))
     return float(max(f for f in (1.0, 2.0, 5.0) if f * power <= size) * power)
 
 
 def _bar(extent: float, scale: float, height: float) -> str:
-    """A bar of round length, m, below the left panel."""
+    """Scale bar of round length, below the left panel."""
     length = round_step(extent / 3.0)
     y, x = height + 6.0, _MARGIN
     line = f'<path d="M{x} {y}h{length * scale:.1f}" stroke="currentColor" stroke-width="2"/>'
@@ -136,6 +136,7 @@ def _bar(extent: float, scale: float, height: float) -> str:
 
 
 def _text(x: float, y: float, text: str) -> str:
+    """SVG of a text."""
     return (
         f'<text x="{x:.1f}" y="{y:.1f}" font-size="11" fill="currentColor" '
         f'font-family="sans-serif">{escape(text)}</text>'
@@ -143,12 +144,12 @@ def _text(x: float, y: float, text: str) -> str:
 
 
 def card(title: str, rows: Sequence[tuple[str, str]], picture: str = "") -> str:
-    """Lay out a title, a picture and a table of names and values."""
+    """Return HTML with a title, a picture and a table of names and values."""
     return f"<div><strong>{escape(title)}</strong><br>{picture}{table(rows)}</div>"
 
 
 def lines(title: str, rows: Sequence[tuple[str, str]]) -> str:
-    """Lay out a title and a table of names and values for a terminal of 80 columns."""
+    """Format a title and a table of names and values for a terminal of 80 columns."""
     width = max(len(name) for name, _ in rows) + 4
     filled = [
         textwrap.fill(f"  {name:{width - 4}}  {value}", 80, subsequent_indent=" " * width)
@@ -158,7 +159,7 @@ def lines(title: str, rows: Sequence[tuple[str, str]]) -> str:
 
 
 def table(rows: Sequence[Sequence[str]], heading: Sequence[str] = ()) -> str:
-    """Lay out a table."""
+    """Return an HTML table."""
     head = "".join(f'<th style="{_CELL}">{escape(cell)}</th>' for cell in heading)
     body = "".join(
         "<tr>"
@@ -174,7 +175,7 @@ def table(rows: Sequence[Sequence[str]], heading: Sequence[str] = ()) -> str:
 
 
 def shown(name: str, values: ArrayLike) -> str:
-    """Write a quantity: the one value, or the median and the range of several."""
+    """Format a quantity: the single value, or the median and the range of several."""
     known = np.asarray(values, dtype=np.float64).reshape(-1)
     known = known[np.isfinite(known)]
     if not known.size:
@@ -189,7 +190,7 @@ def shown(name: str, values: ArrayLike) -> str:
 
 
 def symbol(name: str) -> str:
-    """Write the symbol of a quantity without mathtext."""
+    """Return the symbol of a quantity without mathtext."""
     plain = quantity(name).symbol.replace("\\mathrm", "")
     for command, letter in (("\\theta", "θ"), ("\\phi", "φ"), ("\\varphi", "φ")):
         plain = plain.replace(command, letter)
@@ -198,18 +199,18 @@ def symbol(name: str) -> str:
 
 @contextmanager
 def progress(console: Console | None = None) -> Iterator[Callable[..., None]]:
-    """Show a bar for each stage of a computation, in a notebook or a terminal.
+    """Show a progress bar for each stage of a computation, in a notebook or a terminal.
 
     Parameters
     ----------
     console : rich.console.Console, optional
-        Terminal to write to; by default the notebook, where there is one, or standard error.
+        Terminal to write to; by default the notebook, if there is one, or standard error.
 
     Yields
     ------
     callable
-        Function to be passed as ``progress=``; it is called as ``(done, total)`` or as ``(stage,
-        done, total)``.
+        Function to be passed as ``progress=``; called as ``(done, total)`` or
+        ``(stage, done, total)``.
     """
     stages: dict[str, Any] = {}
 
@@ -247,12 +248,12 @@ def progress(console: Console | None = None) -> Iterator[Callable[..., None]]:
 
 
 def _report(*report: Any) -> tuple[str, int, int]:
-    """Stage, which not all computations name, and how much of how much is done."""
+    """Stage, which not all computations name, number done, and total."""
     *stage, done, total = report
     return (stage[0] if stage else "done"), done, total
 
 
 def _in_notebook() -> bool:
-    """Whether code runs in a notebook's kernel."""
+    """Whether the code runs in a notebook's kernel."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return shell is not None and hasattr(shell, "kernel")

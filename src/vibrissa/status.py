@@ -1,8 +1,8 @@
-"""Why something has no answer, as sentences with advice.
+"""Statuses of loads and estimates, as sentences with advice.
 
-A load that has no equilibrium, or signals that no contact explains, give a row with a status, so
-that one bad case never stops a grid. The numbers are stored in datasets as CF flags and never
-change their meaning: 0-9 a load with an answer, 10-19 a load without, 20-29 an estimate.
+A load without equilibrium, or signals that no contact explains, result in a row with a status, so
+that one bad case does not stop a grid. The numbers are stored in datasets as CF flags and never
+change their meaning: 0-9 for a load with a solution, 10-19 for a load without, 20-29 for estimates.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from numpy.typing import ArrayLike, NDArray
 class Status(enum.IntEnum):
     """Outcome of one load or one estimate.
 
-    ``str(status)`` is a sentence that explains, followed by one that advises.
+    ``str(status)`` is a sentence of explanation, followed by one of advice if there is any.
 
     Attributes
     ----------
     explanation : str
-        Sentence on what happened.
+        Sentence that states what happened.
     advice : str
-        Sentence on what to do; empty where there is nothing to do.
+        Sentence that states what to do; empty if nothing is to be done.
     ok : bool
-        Whether the row can be used as it stands, so that there is nothing to advise.
+        Whether the row can be used as it is, so that there is no advice.
     """
 
     explanation: str
@@ -104,8 +104,8 @@ class Status(enum.IntEnum):
     )
     APPROXIMATE = (
         26,
-        "A look-up table or network gave this contact; whether others explain the signals too it "
-        "cannot see.",
+        "A look-up table or network gave this contact, and cannot show whether others explain the "
+        "signals too.",
     )
     UNDERDETERMINED = (
         27,
@@ -127,7 +127,7 @@ class Status(enum.IntEnum):
     )
 
     def __new__(cls, code: int, explanation: str = "", advice: str = "") -> Status:
-        """Make a member; the defaults let type checkers see that ``Status(code)`` looks one up."""
+        """Create a member; the defaults let type checkers see that ``Status(code)`` is a lookup."""
         member = int.__new__(cls, code)
         member._value_ = code
         member.explanation, member.advice, member.ok = explanation, advice, not advice
@@ -138,7 +138,7 @@ class Status(enum.IntEnum):
 
 
 class Event(enum.IntEnum):
-    """What happens to a contact: its onset, its loss, or a slip of its point."""
+    """Event of a contact: its onset, its loss, or a slip of its point."""
 
     NONE = 0
     ONSET = 1
@@ -150,7 +150,7 @@ _OK_CODES = np.array([status for status in Status if status.ok], dtype=np.int8)
 
 
 def is_ok(codes: ArrayLike) -> NDArray[np.bool_]:
-    """Tell which rows can be used as they stand.
+    """Determine which rows can be used as they are.
 
     Parameters
     ----------
@@ -160,13 +160,13 @@ def is_ok(codes: ArrayLike) -> NDArray[np.bool_]:
     Returns
     -------
     ndarray of bool, the shape of ``codes``
-        True where :attr:`Status.ok` is.
+        True where :attr:`Status.ok` is true.
     """
     return np.isin(np.asarray(codes), _OK_CODES)
 
 
 def describe(codes: ArrayLike) -> Counter[str]:
-    """Count the statuses of many rows, in words.
+    """Count the statuses of many rows, by their sentences.
 
     Parameters
     ----------
@@ -176,12 +176,12 @@ def describe(codes: ArrayLike) -> Counter[str]:
     Returns
     -------
     collections.Counter
-        Number of times that each status occurs, by its sentence.
+        Number of occurrences of each status, by its sentence.
 
     Raises
     ------
     ValueError
-        Where a number is not a status.
+        If a number is not a status.
 
     Examples
     --------
@@ -204,7 +204,7 @@ def describe(codes: ArrayLike) -> Counter[str]:
 
 
 def names(codes: ArrayLike) -> NDArray[np.str_]:
-    """Name the statuses of many rows.
+    """Return the names of the statuses of many rows.
 
     Parameters
     ----------
@@ -219,7 +219,7 @@ def names(codes: ArrayLike) -> NDArray[np.str_]:
     Raises
     ------
     ValueError
-        Where a number is not a status.
+        If a number is not a status.
 
     Examples
     --------
@@ -236,7 +236,7 @@ def names(codes: ArrayLike) -> NDArray[np.str_]:
 
 
 def flag_attributes(kind: type[enum.IntEnum] = Status) -> dict[str, NDArray[np.int8] | str]:
-    """Describe the numbers of :class:`Status` in a dataset, as the CF conventions ask.
+    """Return the dataset attributes that describe the numbers of :class:`Status`, as CF flags.
 
     Parameters
     ----------
@@ -246,7 +246,7 @@ def flag_attributes(kind: type[enum.IntEnum] = Status) -> dict[str, NDArray[np.i
     Returns
     -------
     dict
-        ``flag_values`` (int8) and ``flag_meanings`` (words separated by blanks, in the same order).
+        ``flag_values`` (int8) and ``flag_meanings`` (words separated by spaces, in the same order).
     """
     return {
         "flag_values": np.array([int(one) for one in kind], dtype=np.int8),
@@ -255,7 +255,7 @@ def flag_attributes(kind: type[enum.IntEnum] = Status) -> dict[str, NDArray[np.i
 
 
 def counted(codes: ArrayLike) -> str:
-    """Count the statuses of many rows, in short.
+    """Summarise the statuses of many rows in a short text.
 
     Parameters
     ----------
@@ -265,7 +265,7 @@ def counted(codes: ArrayLike) -> str:
     Returns
     -------
     str
-        Names and how often they occur, by rising number.
+        Names and numbers of occurrences, in order of the statuses' numbers.
 
     Examples
     --------

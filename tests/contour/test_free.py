@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from vibrissa.contour import fit_free, shape_from_dataset, surface_grid
-from vibrissa.contour.free_surface import Support, merged
+from vibrissa.contour.free_surface import Support, merge_neighbours
 
 SEMIAXES = np.array([3e-3, 2e-3, 4e-3])
 CENTER = np.array([20e-3, 1e-3, 0.0])
@@ -91,13 +91,13 @@ def test_merging_keeps_what_is_known():
     whole = Support(
         generator.normal(size=(500, 3)), generator.normal(size=500), generator.uniform(1, 2, 500)
     )
-    few = merged(whole, 40)
+    few = merge_neighbours(whole, 40)
     assert 20 < len(few.value) <= 40
     weights = [1.0 / s.variance for s in (whole, few)]
     assert weights[1].sum() == pytest.approx(weights[0].sum())
     means = [w @ s.value / w.sum() for w, s in zip(weights, (whole, few), strict=True)]
     assert means[1] == pytest.approx(means[0])
-    assert merged(whole, 500) is whole
+    assert merge_neighbours(whole, 500) is whole
 
 
 def test_outliers_do_little_harm(contacts):

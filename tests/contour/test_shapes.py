@@ -180,7 +180,7 @@ def test_datasets_keep_fits(kind, joint_errors):
     with pytest.raises(ValueError, match="None"):
         shape_from_dataset(stored.assign_attrs(shape=None))
     for name in {"object_radius", "object_axis"} & set(stored):
-        with pytest.raises(ValueError, match="which it cannot be"):
+        with pytest.raises(ValueError, match="which is not valid"):
             shape_from_dataset(stored.assign({name: -0.5 * stored[name]}))
 
 

@@ -11,7 +11,13 @@ from vibrissa import samples
 from vibrissa.cli import figures
 from vibrissa.cli.app import app
 from vibrissa.demo import run_demo
-from vibrissa.evaluation import caution, from_curves, refined, tracking_scores, truth_of
+from vibrissa.evaluation import (
+    caution,
+    distances_from_curves,
+    refine_curves,
+    tracking_scores,
+    truth_of,
+)
 from vibrissa.io import load_contacts, load_recording
 from vibrissa.pipeline import fit_contacts, reconstruct
 from vibrissa.recording import Recording
@@ -317,7 +323,7 @@ def test_a_coarse_circle_is_a_circle():
     turn = np.linspace(0.0, 2.0, 33)
     coarse = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     hidden = np.where(turn[:, None] < 1.0, coarse, np.nan)
-    circle, part = refined(np.stack([coarse, hidden]))
+    circle, part = refine_curves(np.stack([coarse, hidden]))
     np.testing.assert_allclose(np.linalg.norm(circle, axis=1), 1.0, rtol=0, atol=1e-6)
     np.testing.assert_allclose(circle[::8], coarse, rtol=0, atol=1e-12)
     np.testing.assert_allclose(part[:8], np.linspace(*coarse[:2], 9)[:8], rtol=0, atol=1e-12)
@@ -327,4 +333,4 @@ def test_a_coarse_circle_is_a_circle():
 def test_distances_from_curves():
     curve = np.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]])
     points = np.array([[[0.5, 0.3], [2.0, 1.0], [-3.0, 4.0], [np.nan, 0.0]]])
-    np.testing.assert_allclose(from_curves(points, curve), [[0.3, 1.0, 5.0, np.nan]])
+    np.testing.assert_allclose(distances_from_curves(points, curve), [[0.3, 1.0, 5.0, np.nan]])

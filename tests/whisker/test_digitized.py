@@ -144,10 +144,10 @@ def test_tip_first_is_turned_around(base):
 
 def test_base_hint_that_does_not_tell():
     points = digitized(20)
-    with pytest.raises(ValueError, match="does not tell them apart"):
+    with pytest.raises(ValueError, match="does not identify the base"):
         Whisker.from_points(points, base=(points[0] + points[-1]) / 2)
     # Millimetres, of a point near the first, were nearer to the last.
-    with pytest.raises(ValueError, match="does not tell them apart"):
+    with pytest.raises(ValueError, match="does not identify the base"):
         Whisker.from_points(points, base=points[0] + [0.5, 0.2, 0.0])
     with pytest.raises(ValueError, match="standard deviation of a coordinate in m"):
         Whisker.from_points(points, noise=0.01)
@@ -210,7 +210,7 @@ def test_a_robots_whisker():
         (np.zeros((5, 4)), r"shape \(5, 4\)"),
         (np.zeros(5), r"shape \(5,\)"),
         (digitized(3), "points is 3; at least 4"),
-        (np.zeros((5, 3)), "rows 1, 2, 3, 4 repeat.*all points are one"),
+        (np.zeros((5, 3)), "rows 1, 2, 3, 4 repeat.*all points coincide"),
         (digitized(20)[[*range(10), *range(9, 20)]], "rows 10 repeat"),
         (digitized(20) * 1e3, "millimetres given as metres"),
         (digitized(20) * 1e-3, "converted once too often"),

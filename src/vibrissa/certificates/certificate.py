@@ -310,7 +310,7 @@ class Certificate:
             box = where(found.refuted)[0].tolist()
             self.refuted = f"a sign is certainly wrong in the part {name}, box {box}"
 
-    def _turned(self) -> bool:
+    def _direction_turns_once(self) -> bool:
         """Whether M_D is proved to turn once with the direction, on the circle s = 1, ℓ = 1/2."""
         low, high = self.parts["interior"].domain[1]
         ends = np.linspace(low, high, _ARCS + 1)
@@ -414,7 +414,7 @@ class Certificate:
             float(attrs["seconds"]),
         )
         if out.identity != data.attrs["identity"]:
-            raise ValueError("the certificate's numbers are not those that it was written with")
+            raise ValueError("the certificate's numbers have been modified since it was written")
         return out
 
     def save(self, path: str | PathLike[str]) -> None:
@@ -485,7 +485,7 @@ def prepare_certificate(contact_map: ContactMap, cone: float = CONE) -> Certific
         middle = np.array([[[0.65, 0.65], [1.0, 1.0], [0.5, 0.5]]])
         out.sign = float(np.sign(out.evaluate("interior", middle, [4])[0][0, 0, 0]))
         out._tables.clear()
-        out.turns = out._turned()
+        out.turns = out._direction_turns_once()
     return out
 
 

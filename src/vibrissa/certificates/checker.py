@@ -193,7 +193,7 @@ def check_certificate(
     if data.attrs.get("kind") != "vibrissa certificate":
         raise ValueError(f"{path} is not a certificate")
     if _identity(data) != data.attrs["identity"]:
-        raise ValueError(f"{path} has other numbers than those that it was written with")
+        raise ValueError(f"{path} has been modified since it was written")
     if whisker is not None and not is_certificate_of(data, whisker):
         raise ValueError(f"{path} is a certificate of another whisker")
     straight = bool(data.attrs["straight"])
@@ -314,7 +314,7 @@ def _confirm(
 
 
 def _conditions_hold(data: xr.Dataset, part: str, bounds: Array, step: float) -> NDArray[np.bool_]:
-    """Whether all conditions of a part are proved to be conditions_hold on each box."""
+    """Whether all conditions of a part are proved to be positive on each box."""
     n = len(bounds)
     factors = data["factors"].values[1]
 

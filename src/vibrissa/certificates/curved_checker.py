@@ -501,7 +501,7 @@ def _states_on_boxes(
 
 
 def condition_polynomials(data: xr.Dataset, part: str, bounds: Array) -> list[Poly]:
-    """Polynomials of the conditions of a part, all of which must be conditions_hold."""
+    """Polynomials of the conditions of a part, all of which must be positive."""
     load = _loads(data, bounds, part == "rest")
     states = _states_on_boxes(data, bounds, load, 3 if part in ("fold", "rest") else 2)
     if part == "fold":

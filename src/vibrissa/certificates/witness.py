@@ -115,7 +115,7 @@ def prove_witness(
     Returns
     -------
     Witness
-        What is proved about the pair.
+        Result for the pair, and the statement that could not be proved if there is one.
     """
     names = triplet.split() if isinstance(triplet, str) else list(triplet)
     d = contact_map.chart.discretization

@@ -1,4 +1,4 @@
-"""From contact points to the object's contour, in the laboratory frame, without a solver."""
+"""Fits of an object's shape to contact points, in the laboratory frame."""
 
 from vibrissa.contour.comparison import axis_offset as axis_offset, compare_with, distances_by
 from vibrissa.contour.drawing import Ellipsoids, ellipsoids, surface_grid

@@ -1,9 +1,9 @@
-"""Comparison of contact points and fitted axes with objects that are known.
+"""Comparison of contact points and fitted axes with known objects.
 
-Distances are those of the whisker's surface from the object's, d(p) − ρ. What to expect is drawn,
-not linearised: each point is put where the object's surface should be, moved by errors of its
-covariance as many times as there are replicates, and its distance is computed again. So a point
-that is uncertain along a small round object is expected outside of it.
+Distances are those of the whisker's surface from the object's, d(p) − ρ. The expected distances are
+sampled, not linearised: each point is moved to where it touches the object's surface, displaced by
+errors drawn from its covariance, once per replicate, and its distance is computed again. In this
+way a point that is uncertain along a small round object is correctly expected outside of it.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from vibrissa.contour.fitted_shape import Body
 from vibrissa.numerics import Array, numbers
 from vibrissa.quantities import QUANTITIES, attributes, to_display
 
-REPLICATES = 20  # number of draws of each distance
-CLASSES = 5  # number of classes where their edges are not given
-_STEP = 1e-6  # step of differences, m
+REPLICATES = 20  # number of draws for each distance
+CLASSES = 5  # default number of classes
+_STEP = 1e-6  # step of finite differences, m
 
 
 def compare_with(
@@ -35,7 +35,7 @@ def compare_with(
     coords: Any = None,
     seed: int = 0,
 ) -> xr.Dataset:
-    """Compare contact points with an object that is known.
+    """Compare contact points with a known object.
 
     Parameters
     ----------
@@ -44,11 +44,11 @@ def compare_with(
     points : array_like (..., 3)
         Contact points on the whisker's centreline, m; NaN gives NaN.
     covariance : array_like (..., 3, 3), optional
-        Covariance of the points, m²; without it nothing is predicted.
+        Covariance of the points, m²; without it no distances are predicted.
     whisker_radius : array_like (...)
         Radius of the whisker at the contacts, m.
     dims : sequence of str
-        Dimensions of the points, without that of space.
+        Dimensions of the points other than that of space.
     coords : mapping, optional
         Coordinates of these dimensions.
     seed : int
@@ -58,13 +58,13 @@ def compare_with(
     -------
     xarray.Dataset
         ``surface_distance``, m, positive outside, and with a covariance
-        ``surface_distance_predicted``: ``REPLICATES`` of them as they would be if points erred by
-        it alone.
+        ``surface_distance_predicted``: ``REPLICATES`` samples of the distances expected if the
+        covariance were the only error.
 
     Raises
     ------
     ValueError
-        If shapes do not fit.
+        If shapes do not match.
     """
     p = numbers("points", points)
     if p.ndim != len(dims) + 1 or p.shape[-1] != 3:
@@ -82,14 +82,18 @@ def compare_with(
             raise ValueError(f"covariance has shape {spread.shape}; {(*p.shape, 3)} is needed")
         known = known & np.isfinite(spread).all(axis=(-2, -1))
         drawn = np.full((REPLICATES, *gap.shape), np.nan)
-        drawn[:, known] = _drawn(body, p[known], spread[known], gap[known], radius[known], seed)
+        drawn[:, known] = _draw_distances(
+            body, p[known], spread[known], gap[known], radius[known], seed
+        )
         name = "surface_distance_predicted"
         data[name] = (("replicate", *dims), drawn, attributes(name))
     return xr.Dataset(data, coords)
 
 
-def _drawn(body: Body, points: Array, spread: Array, gap: Array, radius: Array, seed: int) -> Array:
-    """Distances (replicates, n) of points that err by their covariance from the surface."""
+def _draw_distances(
+    body: Body, points: Array, spread: Array, gap: Array, radius: Array, seed: int
+) -> Array:
+    """Sample distances (replicates, n) of points on the surface displaced by their errors."""
     steps = _STEP * np.eye(3)
     ahead, back = (body.signed_distance(points[:, None] + sign * steps) for sign in (1.0, -1.0))
     normal = (ahead - back) / (2.0 * _STEP)
@@ -107,31 +111,31 @@ def distances_by(
     values: ArrayLike,
     edges: ArrayLike | None = None,
 ) -> xr.Dataset:
-    """Summarise sizes of distances by classes of another quantity.
+    """Summarise absolute distances by classes of another quantity.
 
     Parameters
     ----------
     compared : xarray.Dataset
-        Dataset of `compare_with`.
+        Dataset from `compare_with`.
     quantity : str
         Quantity of the classes, such as ``"deflection_angle"``, ``"r"`` or ``"MB"``.
     values : array_like (...)
         Value of the quantity at each contact, SI units.
     edges : array_like (k + 1,), optional
-        Edges of the classes, rising; the last class includes its upper edge. By default five
-        classes of equally many contacts.
+        Edges of the classes, increasing; the last class includes its upper edge. By default five
+        classes with equal numbers of contacts.
 
     Returns
     -------
     xarray.Dataset
-        Dataset of dimension class with its label: ``lower``, ``upper``, the number of ``contacts``,
-        ``median`` and ``largest_95`` (95 %) of the size of the distance, and both as predicted, m.
-        Classes without contacts are kept, with NaN.
+        Dataset with the dimension class and its label: ``lower``, ``upper``, the number of
+        ``contacts``, ``median`` and ``largest_95`` (95 % quantile) of the absolute distance, and
+        both as predicted, m. Classes without contacts are included, with NaN.
 
     Raises
     ------
     ValueError
-        If shapes do not fit, the quantity is unknown, or the edges do not rise.
+        If shapes do not match, the quantity is unknown, or the edges do not increase.
     """
     if quantity not in QUANTITIES:
         raise ValueError(f"{quantity!r} is not a known quantity")
@@ -142,14 +146,14 @@ def distances_by(
     known = np.isfinite(size) & np.isfinite(v)
     limits = _edges(v[known]) if edges is None else np.asarray(edges, dtype=np.float64)
     if limits.ndim != 1 or limits.size < 2 or not (np.diff(limits) > 0.0).all():
-        raise ValueError(f"edges are {limits.tolist()}; two or more, rising, are needed")
+        raise ValueError(f"edges are {limits.tolist()}; two or more, increasing, are needed")
     predicted = compared.get("surface_distance_predicted")
     drawn = None if predicted is None else np.abs(predicted.values)
     rows: dict[str, list[Any]] = {name: [] for name in ("contacts", *_SUMS)}
     for low, high in itertools.pairwise(limits):
         within = known & (v >= low) & ((v < high) | ((high == limits[-1]) & (v == high)))
         rows["contacts"].append(int(within.sum()))
-        sums = (*_sums(size[within]), *_predicted(drawn, within))
+        sums = (*_median_and_95(size[within]), *_median_over_replicates(drawn, within))
         for name, number in zip(_SUMS, sums, strict=True):
             rows[name].append(number)
     data: dict[str, Any] = {
@@ -173,23 +177,23 @@ _SUMS = {
 
 
 def _edges(values: Array) -> Array:
-    """Edges of classes of as many values each."""
+    """Edges of classes with equal numbers of values."""
     if values.size == 0:
         raise ValueError("no classes: no contact has a distance and a value")
     edges = np.unique(np.quantile(values, np.linspace(0.0, 1.0, CLASSES + 1)))
     return edges if edges.size > 1 else np.array([edges[0], np.nextafter(edges[0], np.inf)])
 
 
-def _sums(size: Array) -> tuple[float, float]:
-    """Median and 95 %; NaN without values."""
+def _median_and_95(size: Array) -> tuple[float, float]:
+    """Median and 95 % quantile; NaN without values."""
     if size.size == 0:
         return float("nan"), float("nan")
     median, most = np.quantile(size, [0.5, 0.95])
     return float(median), float(most)
 
 
-def _predicted(drawn: Array | None, within: Any) -> tuple[float, float]:
-    """Median and 95 % of draws, the median over replicates."""
+def _median_over_replicates(drawn: Array | None, within: Any) -> tuple[float, float]:
+    """Median and 95 % quantile of samples, as medians over the replicates."""
     if drawn is None:
         return float("nan"), float("nan")
     rows = drawn[:, within]
@@ -201,7 +205,7 @@ def _predicted(drawn: Array | None, within: Any) -> tuple[float, float]:
 
 
 def _label(quantity: str, low: float, high: float) -> str:
-    """Name a class by its edges, as shown."""
+    """Label of a class: its edges in display units."""
     ends = to_display(quantity, [low, high])
     return f"{ends[0]:.3g}–{ends[1]:.3g}"
 
@@ -209,11 +213,11 @@ def _label(quantity: str, low: float, high: float) -> str:
 def axis_offset(
     origin: ArrayLike, axis: ArrayLike, true_origin: ArrayLike, true_axis: ArrayLike
 ) -> tuple[Array, float]:
-    """Offset and tilt of one axis relative to another."""
+    """Offset vector and tilt angle of an axis relative to a true one."""
     direction, true = (np.asarray(a, dtype=np.float64) for a in (axis, true_axis))
     direction, true = direction / np.linalg.norm(direction), true / np.linalg.norm(true)
     away = np.asarray(origin, dtype=np.float64) - np.asarray(true_origin, dtype=np.float64)
     offset = away - (away @ true) * true
-    # From the cross product: the arc cosine loses half the digits of a small angle.
+    # By the cross product, because the arc cosine loses half the digits of a small angle.
     tilt = np.arctan2(np.linalg.norm(np.cross(direction, true)), abs(direction @ true))
     return offset, float(tilt)

@@ -1,4 +1,4 @@
-"""Grids of points for drawing: fitted shapes as far as they were touched, and error ellipsoids."""
+"""Grids of points for drawing: touched parts of fitted shapes, and error ellipsoids."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from vibrissa.deferred import special
 from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
 
-_INWARD = 0.9  # largest depth of a surface inside its base, as a share of the radius
-_ROUND = np.pi / 3.0  # gap between azimuths from which a shape is drawn open
-_MARGIN = 0.15  # margin of a drawn surface beyond the points, as a share of their width
+_INWARD = 0.9  # largest depth of a free surface inside its base, over the radius
+_OPEN_GAP = np.pi / 3.0  # gap between azimuths above which a shape is drawn open
+_MARGIN = 0.15  # margin of a drawn surface around the points, over their extent
 
 
 def surface_grid(shape: FittedShape, points: ArrayLike, count: int = 41) -> xr.Dataset:
-    """Grid over the part of a fitted shape that was touched.
+    """Compute a grid over the touched part of a fitted shape.
 
     Parameters
     ----------
     shape : CylinderFit, SphereFit, PlaneFit or FreeFit
         Fitted shape.
     points : array_like (n, 3)
-        Contact points, in its frame, m; rows with NaN are left out.
+        Contact points, in the frame of the shape, m; rows with NaN are ignored.
     count : int
-        Number of points of the grid in each of its two directions.
+        Number of grid points along each of the two directions.
 
     Returns
     -------
     xarray.Dataset
         Dataset of dimensions u, v, space: ``surface_grid_point`` and its standard deviation
-        ``surface_sigma`` across the surface, m.
+        ``surface_sigma`` normal to the surface, m.
 
     Raises
     ------
@@ -50,10 +50,10 @@ def surface_grid(shape: FittedShape, points: ArrayLike, count: int = 41) -> xr.D
     if not len(p):
         raise ValueError("no grid: no points")
     base = shape.base if isinstance(shape, FreeFit) else shape
-    grid = _over(base, p, count)
+    grid = _base_grid(base, p, count)
     if isinstance(shape, FreeFit):
         added, _ = shape.deviation(grid)
-        # Far from all contacts the surface must not pass through the middle of the base.
+        # Far from all contacts the surface must not pass through the centre of the base.
         added = np.minimum(added, _INWARD * getattr(base, "radius", np.inf))
         grid = grid - added[..., None] * base.outward_normals(grid)
     data = {
@@ -63,47 +63,47 @@ def surface_grid(shape: FittedShape, points: ArrayLike, count: int = 41) -> xr.D
     return xr.Dataset(data, {"space": list("xyz")}, {"shape": shape.kind})
 
 
-def _over(base: FittedShape, points: Array, count: int) -> Array:
-    """Points (count, count, 3) of a simple shape."""
+def _base_grid(base: FittedShape, points: Array, count: int) -> Array:
+    """Grid (count, count, 3) over a simple shape."""
     if isinstance(base, PlaneFit):
         first, second = np.linalg.svd(points - points.mean(axis=0), full_matrices=True)[2][:2]
         first = first - (first @ base.normal) * base.normal
         first = first / np.linalg.norm(first)
         second = np.cross(base.normal, first)
         away = points - base.origin
-        u, v = (_range(away @ axis, count) for axis in (first, second))
+        u, v = (_covered_range(away @ axis, count) for axis in (first, second))
         return np.asarray(base.origin + u[:, None, None] * first + v[:, None] * second)
     if isinstance(base, CylinderFit):
         across = frame_across(base.axis)
         away = points - base.origin
-        u = _turn(np.arctan2(away @ across[1], away @ across[0]), count)[:, None, None]
-        v = _range(away @ base.axis, count)[:, None]
+        u = _covered_angles(np.arctan2(away @ across[1], away @ across[0]), count)[:, None, None]
+        v = _covered_range(away @ base.axis, count)[:, None]
         round_ = np.cos(u) * across[0] + np.sin(u) * across[1]
         return np.asarray(base.origin + base.radius * round_ + v * base.axis)
     assert isinstance(base, SphereFit)
     normal = base.outward_normals(points)
     pole = np.linalg.svd(normal, full_matrices=True)[2][-1]
     across = frame_across(pole)
-    u = _turn(np.arctan2(normal @ across[1], normal @ across[0]), count)[:, None, None]
+    u = _covered_angles(np.arctan2(normal @ across[1], normal @ across[0]), count)[:, None, None]
     latitude = np.arcsin(np.clip(normal @ pole, -1.0, 1.0))
-    v = np.clip(_range(latitude, count), -0.5 * np.pi, 0.5 * np.pi)[:, None]
+    v = np.clip(_covered_range(latitude, count), -0.5 * np.pi, 0.5 * np.pi)[:, None]
     round_ = np.cos(v) * (np.cos(u) * across[0] + np.sin(u) * across[1]) + np.sin(v) * pole
     return np.asarray(base.origin + base.radius * round_)
 
 
-def _range(values: Array, count: int) -> Array:
-    """Evenly from the least to the largest, and beyond by a margin."""
+def _covered_range(values: Array, count: int) -> Array:
+    """Evenly spaced values over the range of ``values``, with margins."""
     low, high = float(values.min()), float(values.max())
     beyond = _MARGIN * (high - low)
     return np.linspace(low - beyond, high + beyond, count)
 
 
-def _turn(angles: Array, count: int) -> Array:
-    """Evenly over the part of the circle that is covered."""
+def _covered_angles(angles: Array, count: int) -> Array:
+    """Evenly spaced angles over the covered part of the circle."""
     order = np.sort(angles)
     gaps = np.diff(order, append=order[0] + 2.0 * np.pi)
     widest = int(np.argmax(gaps))
-    if gaps[widest] < _ROUND:
+    if gaps[widest] < _OPEN_GAP:
         return np.linspace(-np.pi, np.pi, count)
     start = order[(widest + 1) % len(order)]
     width = 2.0 * np.pi - gaps[widest]
@@ -112,28 +112,28 @@ def _turn(angles: Array, count: int) -> Array:
 
 
 class Ellipsoids(NamedTuple):
-    """Ellipsoids about points.
+    """Ellipsoids centred at points.
 
     Attributes
     ----------
     semiaxes : array (..., 3)
-        Lengths of the semiaxes, m, the longest first; NaN where the covariance is.
+        Lengths of the semiaxes, m, longest first; NaN where the covariance is.
     directions : array (..., 3, 3)
-        Unit vectors along them, in rows, right-handed.
+        Unit vectors along the semiaxes, in rows, right-handed.
     """
 
     semiaxes: Array
     directions: Array
 
     def surface(self, points: ArrayLike, count: int = 21) -> Array:
-        """Grids over the ellipsoids.
+        """Compute grids over the ellipsoids.
 
         Parameters
         ----------
         points : array_like (..., 3)
             Centres of the ellipsoids, m.
         count : int
-            Number of points of a grid in each of its two directions.
+            Number of grid points along each of the two directions.
 
         Returns
         -------
@@ -150,7 +150,7 @@ class Ellipsoids(NamedTuple):
 
 
 def ellipsoids(covariance: ArrayLike, share: float = 0.95) -> Ellipsoids:
-    """Ellipsoids that contain points with a given probability.
+    """Compute ellipsoids that contain points with a given probability.
 
     Parameters
     ----------

@@ -1,29 +1,29 @@
-"""The fit of simple shapes to contacts: few outliers, equations by contact, a stated spread.
+"""Robust fits of simple shapes to contacts, with the covariance of the parameters.
 
-A contact point p lies on the whisker's centreline, one whisker radius ρ off the surface; n is the
-surface's outward normal there. For a surface with signed distance d and its gradient N,
+A contact point p is on the whisker's centreline, one whisker radius ρ from the surface, whose
+outward normal there is n. For a surface with signed distance d and its gradient N,
 
     d(p) = ρ    and    N(p) = n.
 
-**With normals and their covariance** both are used. Each shape writes them as equations that are
-linear in p and n, E (p, n) = e, and their misses are weighed by the inverse of E Σ Eᵀ, Σ being the
-joint covariance (6 × 6) of p and n. Their correlation counts: three signals determine a contact by
-three unknowns, so that Σ is of rank three, and where the point is wrong along the whisker the
-normal is turned with it (correlation 0.9 and more).
+**With normals and their covariance** both equations are used. Each shape states them as equations
+linear in p and n, E (p, n) = e, and their residuals are weighted by the inverse of E Σ Eᵀ, where Σ
+is the joint covariance (6 × 6) of p and n. The correlation matters: three signals determine a
+contact by three unknowns, so that Σ has rank three, and an error of the point along the whisker
+comes with a rotation of the normal (correlation 0.9 and more).
 
 **With normals alone** these count as exact, and the equations hold in two or three directions.
 
-**Without normals** d(p) = ρ is left. Points are located badly in one direction and well in the
-others; what counts is the spread along the normal, σ² = N·ΣN. Spread along a curved surface
-matters to second order: with the curvature H = ∂N/∂p a scattered point is tr(HΣ)/2 farther out in
-the mean, which is subtracted, and tr(HΣHΣ)/2 is added to σ². What stays is a bias of that order, as
-each point brings its own unknown location on the surface. (Moving each point to the foot of its
-error ellipse, orthogonal distance regression, is worse, and so is integrating over all feet: the
+**Without normals** d(p) = ρ remains. Points are poorly located in one direction and well in the
+others; what matters is the variance along the normal, σ² = N·ΣN. Scatter along a curved surface
+matters to second order: with the curvature H = ∂N/∂p a scattered point is on average tr(HΣ)/2
+farther out, which is subtracted, and tr(HΣHΣ)/2 is added to σ². A bias of that order remains, as
+each point adds its own unknown location on the surface. (Moving each point to the foot of its error
+ellipse, orthogonal distance regression, is worse, and so is integrating over all feet, because the
 points are on parts of the object only.)
 
-In all cases outliers count less (soft L1), and points that scatter by more than half the object's
-radius are left out where enough others are there: they contain little about a curve that small, and
-how much they count depends on their own error.
+In all cases outliers are downweighted (soft L1). Points that scatter by more than half the object's
+radius are excluded if there are enough others: they contain little information on such a strong
+curvature, and their weights depend on their own errors.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from typing import Any, Literal, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.contour.fitted_shape import FLOOR, Checked, Touches, checked, excess_of, whitened
+from vibrissa.contour.fitted_shape import FLOOR, Checked, Touches, check_contacts, excess_of, whiten
 from vibrissa.contour.simple_shapes import (
     SHAPES,
     CylinderFit,
@@ -48,21 +48,21 @@ from vibrissa.contour.simple_shapes import (
 from vibrissa.deferred import optimize, special
 from vibrissa.numerics import Array
 
-_SOFT = 2.0  # residual, in standard deviations, from which points count less
-# Chance of missing by as much as counts as an outlier: that of four standard deviations.
+_SOFT = 2.0  # residual, in standard deviations, above which points are downweighted
+# Tail probability of an outlier: that of four standard deviations.
 _OUTLIER = math.erfc(4.0 / math.sqrt(2.0))
-_WIDE = 0.5  # spread, as a share of the shape's size, beyond which a point is left out
-_ENOUGH = 50  # number of points with less spread from which wide ones are left out
-TO_SIGMA = 1.4826  # standard deviation over the median size of normally distributed numbers
-_ROUGH = 1e-2  # standard deviation to begin with, as a share of the extent, where it is not known
+_WIDE = 0.5  # standard deviation, over the shape's size, above which a point is excluded
+_ENOUGH = 50  # number of other points needed to exclude such points
+TO_SIGMA = 1.4826  # ratio of standard deviation and median absolute value of a normal distribution
+_ROUGH = 1e-2  # initial standard deviation if unknown, over the extent
 _ROUNDS = 4  # number of times that the noise is estimated from the scatter
-_PRECISE = 1e-6  # tolerance up to which derivatives are central differences
-_SINGULAR = 1e-7  # least over largest singular value from which the parameters are determined
-_HOLLOW = 3.0  # standard deviations below zero from which a radius is that of a hollow
-# Squared misses, relative to what is stated, from which most normals contradict the points.
-_ALIKE = 4.0
-_LARGEST = 1e3  # size, in units of the extent, from which a shape is of no size
-# Options that apply to some shapes only, and what they must be.
+_PRECISE = 1e-6  # tolerance below which derivatives are central differences
+_SINGULAR = 1e-7  # least ratio of singular values at which the parameters are determined
+_HOLLOW = 3.0  # standard deviations below zero beyond which a radius is that of a hollow
+# Median of squared residuals, per equation, above which normals contradict the points.
+_CONTRADICTION = 4.0
+_LARGEST = 1e3  # size, over the extent, above which a shape counts as infinitely large
+# Options for particular shapes only, and requirements on them.
 _NEEDS = {
     "axis": ("cylinder", "three numbers, not all zero, are needed"),
     "outside": ("plane", "three finite numbers are needed"),
@@ -96,28 +96,29 @@ def fit_shape(
     kind : {"plane", "sphere", "cylinder"}
         Shape of the object.
     points : array_like (n, 3)
-        Contact points on the whisker's centreline, m, in any one frame; rows with NaN are left out.
+        Contact points on the whisker's centreline, m, in any common frame; rows with NaN are
+        ignored.
     covariance : array_like (n, 3, 3), optional
-        Covariance of each point, m². Without it all points count the same, and their scatter gives
-        the noise.
+        Covariance of each point, m². Without it all points have equal weights, and the noise is
+        estimated from their scatter.
     whisker_radius : array_like (n,) or float, optional
         Radius of the whisker at each contact, m; 0 by default.
     normals : array_like (n, 3), optional
         Outward normals of the surface at the contacts, such as the directions of the contact
-        forces; of any length but zero. With them a fit is several times more accurate. Of a plane
-        without ``normal_covariance`` only their side counts.
+        forces; of any nonzero length. They make a fit several times more accurate. Without
+        ``normal_covariance``, a plane's normals only determine its free side.
     normal_covariance : array_like (n, 3, 3), optional
-        Covariance of each unit normal; without it they count as exact. With it they determine the
-        axis of a cylinder too, several times more accurately than the points.
+        Covariance of each unit normal; without it they count as exact. With it they also determine
+        the axis of a cylinder, several times more accurately than the points.
     point_normal_covariance : array_like (n, 3, 3), optional
-        Covariance of each point (rows) with its unit normal (columns), m; none by default. Where
+        Covariance of each point (rows) with its unit normal (columns), m; zero by default. Where
         both come from the same few signals their errors are correlated (0.9 and more), and this
         matters.
     axis : array_like (3,), optional
-        Direction of a cylinder's axis where it is known.
+        Known direction of a cylinder's axis.
     outside : array_like (3,), optional
-        Point on the free side of a plane, such as the whisker's base, where normals are not known.
-        By default the largest component of its normal is positive.
+        Point on the free side of a plane, such as the whisker's base, if normals are unknown. By
+        default the largest component of the normal is positive.
 
     Returns
     -------
@@ -128,8 +129,8 @@ def fit_shape(
     ------
     ValueError
         If shapes are wrong, if there are too few points (4 for a plane, 5 for a sphere, 6 for a
-        cylinder, 4 with a known axis), if a covariance is none, or if the points do not determine
-        the shape, as on a line.
+        cylinder, 4 with a known axis), if a covariance is invalid, or if the points do not
+        determine the shape, such as points on a line.
     """
     if kind not in SHAPES:
         raise ValueError(f"the shape is {kind!r}; it must be one of {', '.join(SHAPES)}")
@@ -139,7 +140,7 @@ def fit_shape(
         if value is not None:
             _check_known(kind, name, np.asarray(value, dtype=np.float64))
     count = declared.steps if axis is None else declared.steps - 2
-    given = checked(
+    given = check_contacts(
         kind,
         points,
         least=count + 1,
@@ -150,10 +151,11 @@ def fit_shape(
         point_normal_covariance=point_normal_covariance,
     )
     starts = declared.starts(given, outside if axis is None else axis)
-    return _fitted([_Posed.at(shape, toward, count) for shape, toward in starts], given)
+    return _fit([_SteppedShape.at(shape, toward, count) for shape, toward in starts], given)
 
 
 def _check_known(kind: str, name: str, value: Array) -> None:
+    """Check an option that applies to one kind of shape only."""
     of, needed = _NEEDS[name]
     if kind != of:
         raise ValueError(f"{name} is given; only a {of} has one, and the shape is {kind!r}")
@@ -163,29 +165,29 @@ def _check_known(kind: str, name: str, value: Array) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class _Posed:
-    """A shape that is being fitted, with the frame of its steps, of which so many are free."""
+class _SteppedShape:
+    """A shape during a fit, with the frame of its steps and the number of free ones."""
 
     shape: SimpleShape
     frame: Array
     count: int
 
     @classmethod
-    def at(cls, shape: SimpleShape, toward: Array, count: int) -> _Posed:
-        """Shape with the frame whose first vector points ``toward`` as far as it can."""
+    def at(cls, shape: SimpleShape, toward: Array, count: int) -> _SteppedShape:
+        """Shape with the frame whose first vector is as close to ``toward`` as possible."""
         return cls(shape, frame_across(shape.direction, toward), count)
 
-    def moved(self, step: Array) -> _Posed:
-        """Same, changed by a step."""
-        return _Posed.at(self.shape.moved(step, self.frame), self.frame[0], self.count)
+    def moved(self, step: Array) -> _SteppedShape:
+        """Shape after a step."""
+        return _SteppedShape.at(self.shape.moved(step, self.frame), self.frame[0], self.count)
 
     def misses(self, touches: Touches) -> Array:
-        """Misses (n, m) of the equations, in standard deviations."""
+        """Residuals (n, m) of the equations, in standard deviations."""
         spread = touches.covariance
         assert spread is not None
         if touches.normal is not None:
             miss, by = self.shape.misses(touches, self.frame)
-            return whitened(miss, by @ spread @ np.swapaxes(by, 1, 2))
+            return whiten(miss, by @ spread @ np.swapaxes(by, 1, 2))
         normal, curvature = self.shape.local(touches)
         bent = curvature @ spread
         shift = 0.5 * np.trace(bent, axis1=1, axis2=2)
@@ -194,28 +196,28 @@ class _Posed:
         return np.asarray((self.shape.gaps(touches) - shift) / np.sqrt(variance))[:, None]
 
     def spread(self, covariance: Array) -> Array:
-        """Largest standard deviation (n,) of points of covariance (n, 3, 3) that matters."""
+        """Largest relevant standard deviation (n,) of points of covariance (n, 3, 3)."""
         directions = self.shape.relevant(self.frame)
         widest = np.linalg.eigvalsh(directions @ covariance @ directions.T)[:, -1]
         return np.asarray(np.sqrt(np.maximum(widest, 0.0)))
 
 
-def _fitted(starts: Sequence[_Posed], given: Checked) -> SimpleShape:
-    """Fit a shape to contacts."""
+def _fit(starts: Sequence[_SteppedShape], given: Checked) -> SimpleShape:
+    """Fit a shape to checked contacts from several starts."""
     touches = given.touches
     if touches.covariance is None:
-        touches, starts = _scattered(starts, touches)
+        touches, starts = _with_estimated_noise(starts, touches)
     used = np.ones(len(touches.position), dtype=bool)
-    best = _best(starts, touches)
+    best = _fit_best(starts, touches)
     if given.touches.point_covariance is not None:
         narrow = best.spread(given.touches.point_covariance) < _WIDE * best.shape.size
         if narrow.sum() >= _ENOUGH:
             used = narrow
-            best = _best([best], touches.rows(used))
-    best = best.moved(_solved(best, touches.rows(used), 1e-15).x)
+            best = _fit_best([best], touches.rows(used))
+    best = best.moved(_minimise(best, touches.rows(used), 1e-15).x)
     if not best.shape.size > 0.0:
-        best = _solid(best, touches.rows(used))
-    best = _Posed.at(best.shape.arranged(), best.frame[0], best.count)
+        best = _with_positive_size(best, touches.rows(used))
+    best = _SteppedShape.at(best.shape.arranged(), best.frame[0], best.count)
     covariance, excess, squares, equations = _uncertainty(best, touches.rows(used))
     covariance = covariance * excess
     scale = np.where(best.shape.directions, 1.0, given.extent)
@@ -232,11 +234,11 @@ def _fitted(starts: Sequence[_Posed], given: Checked) -> SimpleShape:
     )
 
 
-def _solid(best: _Posed, touches: Touches) -> _Posed:
-    """The shape of positive size that is as probable as a fit of negative size allows."""
+def _with_positive_size(best: _SteppedShape, touches: Touches) -> _SteppedShape:
+    """Replace a negative size by its expectation given that it is positive."""
     covariance, _, squares, equations = _uncertainty(best, touches)
     size, sigma = best.shape.size, float(np.sqrt(covariance[-1, -1]))
-    contradicted = float(np.median(squares)) > _ALIKE * equations
+    contradicted = float(np.median(squares)) > _CONTRADICTION * equations
     if contradicted or not size > -_HOLLOW * sigma:
         raise ValueError(
             f"no {best.shape.kind}: points and normals fit only a hollow one, of negative radius; "
@@ -250,22 +252,24 @@ def _solid(best: _Posed, touches: Touches) -> _Posed:
     return best.moved(steps * (positive - size) / covariance[-1, -1])
 
 
-def _scattered(starts: Sequence[_Posed], touches: Touches) -> tuple[Touches, Sequence[_Posed]]:
-    """Contacts with one covariance, the same in all directions, by how they scatter."""
+def _with_estimated_noise(
+    starts: Sequence[_SteppedShape], touches: Touches
+) -> tuple[Touches, Sequence[_SteppedShape]]:
+    """Contacts with one isotropic covariance, estimated from their scatter; and improved starts."""
     noise, n = _ROUGH, len(touches.position)
     for _ in range(_ROUNDS):
         alike = touches._replace(covariance=np.broadcast_to(noise**2 * np.eye(3), (n, 3, 3)))
-        best = _best(starts, alike)
+        best = _fit_best(starts, alike)
         starts = [best]
         size = np.abs(noise * best.misses(alike))
         noise = max(TO_SIGMA * float(np.median(size)), FLOOR)
     return alike, starts
 
 
-def _solved(
-    start: _Posed, touches: Touches, tolerance: float = 1e-8, most: int = 50
+def _minimise(
+    start: _SteppedShape, touches: Touches, tolerance: float = 1e-8, most: int = 50
 ) -> optimize.OptimizeResult:
-    """Change a shape until it fits best."""
+    """Minimise the robust misfit of a shape."""
 
     def misses(step: Array) -> Array:
         return start.moved(step).misses(touches).reshape(-1)
@@ -284,22 +288,22 @@ def _solved(
     )
 
 
-def _best(starts: Sequence[_Posed], touches: Touches) -> _Posed:
-    """Fit from every start, roughly; refine the best that is of some size."""
+def _fit_best(starts: Sequence[_SteppedShape], touches: Touches) -> _SteppedShape:
+    """Fit roughly from every start, and refine the best one of finite size."""
     best, least = None, np.inf
     for start in starts:
-        solved = _solved(start, touches, 1e-2, 10)
+        solved = _minimise(start, touches, 1e-2, 10)
         moved = start.moved(solved.x)
         if 0.0 < moved.shape.size < _LARGEST and solved.cost < least:
             best, least = moved, float(solved.cost)
     if best is None:
-        raise ValueError(f"no {starts[0].shape.kind}: none of any size fits the points")
-    return best.moved(_solved(best, touches).x)
+        raise ValueError(f"no {starts[0].shape.kind}: none of finite size fits the points")
+    return best.moved(_minimise(best, touches).x)
 
 
-def _uncertainty(best: _Posed, touches: Touches) -> tuple[Array, float, Array, int]:
-    """Covariance of the parameters as stated, and by how much contacts scatter more than stated."""
-    solved = _solved(best, touches, most=1)
+def _uncertainty(best: _SteppedShape, touches: Touches) -> tuple[Array, float, Array, int]:
+    """Covariance of the parameters, excess of the scatter over the stated noise, and residuals."""
+    solved = _minimise(best, touches, most=1)
     design, z = np.asarray(solved.jac), np.asarray(solved.fun)
     size = np.linalg.norm(design, axis=0)
     determined = bool((size > 0.0).all())
@@ -314,8 +318,8 @@ def _uncertainty(best: _Posed, touches: Touches) -> tuple[Array, float, Array, i
     free = max(z.size - best.count, 1)
     misses = z.reshape(len(touches.position), -1)
     squares, equations = (misses**2).sum(axis=1), misses.shape[1]
-    # Where points scatter more than stated the fit is that much less certain: a little by a few
-    # that are far off, but fully where most of them are off, as on an object of another shape.
+    # Scatter beyond the stated noise makes the fit less certain: slightly if due to a few outliers,
+    # fully if due to most points, as for an object of another shape.
     soft = float((z**2 / np.sqrt(1.0 + (z / _SOFT) ** 2)).sum()) / free
     excess = max(1.0, soft, excess_of(squares, equations))
     slopes = best.shape.step_slopes(best.frame)[:, : best.count]

@@ -1,7 +1,8 @@
-"""Contacts as fits use them, and fitted shapes: surfaces with the uncertainty of their parameters.
+"""Checked contacts as used in fits, and the base class of fitted shapes.
 
-Contacts are checked, and taken about their mean in units of their extent. In the laboratory they
-are at x_lab = R x_whisker + o; of several candidates one continues those before.
+For a fit contacts are shifted by their mean and scaled by their extent. In the laboratory frame
+contacts are at x_lab = R x_whisker + o; of several candidates the one that continues its neighbours
+in time is chosen.
 """
 
 from __future__ import annotations
@@ -19,16 +20,16 @@ from vibrissa.deferred import special
 from vibrissa.numerics import Array, Mask, numbers
 from vibrissa.quantities import QUANTITIES, attributes
 
-# Smallest standard deviation, as a share of the points' extent, where their noise is zero.
+# Smallest standard deviation, over the points' extent, which replaces zero noise.
 FLOOR = 1e-7
-# Variance of the least noisy combination as a share of that of the point or normal, at least.
+# Smallest variance of a combination, over that of the point or normal.
 _FINE = 1e-10
-# Largest negative eigenvalue of a covariance by rounding, as a share of the largest.
+# Largest negative eigenvalue of a covariance that is attributed to rounding, over the largest.
 _NEGATIVE = 1e-8
 
 
 class Touches(NamedTuple):
-    """Contacts in units of their extent, with what is known of them."""
+    """Contacts in units of their extent, with normals and covariances if known."""
 
     position: Array
     whisker_radius: Array
@@ -36,18 +37,18 @@ class Touches(NamedTuple):
     covariance: Array | None
 
     def rows(self, which: Mask) -> Touches:
-        """Some of the contacts."""
+        """Select contacts."""
         normal = None if self.normal is None else self.normal[which]
         spread = None if self.covariance is None else self.covariance[which]
         return Touches(self.position[which], self.whisker_radius[which], normal, spread)
 
     @property
     def joint(self) -> bool:
-        """Whether the normals' covariance is known too."""
+        """Whether the covariance includes that of the normals."""
         return self.covariance is not None and self.covariance.shape[1] == 6
 
     def weights(self) -> Array:
-        """Weight (n,) of each point, whatever the direction of its error; at most 1."""
+        """Weights (n,) of the points by their total variance, at most 1."""
         if self.covariance is None:
             return np.ones(len(self.position))
         spread = np.trace(self.covariance[:, :3, :3], axis1=1, axis2=2) + FLOOR**2
@@ -61,7 +62,7 @@ class Touches(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Checked:
-    """Contacts that can be used."""
+    """Usable contacts, and the mean and extent by which they are scaled."""
 
     usable: Mask
     touches: Touches
@@ -70,7 +71,7 @@ class Checked:
 
 
 class ContactArrays(TypedDict, total=False):
-    """Optional facts on contacts in addition to their points; see `fit_shape`."""
+    """Optional properties of contacts other than their points; see `fit_shape`."""
 
     covariance: ArrayLike | None
     whisker_radius: ArrayLike | None
@@ -79,13 +80,13 @@ class ContactArrays(TypedDict, total=False):
     point_normal_covariance: ArrayLike | None
 
 
-def checked(
+def check_contacts(
     what: str, points: ArrayLike, *, least: int, **contacts: Unpack[ContactArrays]
 ) -> Checked:
-    """Check contacts and bring them into units of their extent."""
+    """Check contacts, select the usable ones, and scale them by their extent."""
     if unknown := sorted(contacts.keys() - ContactArrays.__annotations__.keys()):
         known = ", ".join(ContactArrays.__annotations__)
-        raise TypeError(f"of contacts {', '.join(unknown)} is given; {known} can be")
+        raise TypeError(f"unknown property of contacts: {', '.join(unknown)}; {known} are known")
     n = _number(what, points)
     given: dict[str, Any] = {"points": points, "whisker_radius": 0.0}
     given |= {name: values for name, values in contacts.items() if values is not None}
@@ -114,17 +115,19 @@ def checked(
     if faults:
         raise ValueError(f"no {what}: " + "; ".join(faults))
     arrays["whisker_radius"] = np.broadcast_to(arrays["whisker_radius"], (n,))
-    return _scaled(what, arrays, n, least)
+    return _scale_contacts(what, arrays, n, least)
 
 
 def _number(what: str, points: ArrayLike) -> int:
+    """Number of points; raise a ValueError if their shape is wrong."""
     shape = np.shape(points)
     if len(shape) != 2 or shape[1] != 3:
         raise ValueError(f"no {what}: points have shape {shape}; (n, 3) is needed")
     return int(shape[0])
 
 
-def _scaled(what: str, arrays: dict[str, Array], n: int, least: int) -> Checked:
+def _scale_contacts(what: str, arrays: dict[str, Array], n: int, least: int) -> Checked:
+    """Select the usable contacts and scale them."""
     usable = np.ones(n, dtype=bool)
     for values in arrays.values():
         usable &= np.isfinite(values.reshape(n, -1)).all(axis=1)
@@ -149,7 +152,7 @@ def _scaled(what: str, arrays: dict[str, Array], n: int, least: int) -> Checked:
 def _covariance(
     what: str, kept: dict[str, Array], rows: NDArray[np.intp], extent: float
 ) -> Array | None:
-    """Covariances (n, 3, 3) or (n, 6, 6), in units of the extent; or none."""
+    """Covariances (n, 3, 3) or (n, 6, 6) in units of the extent, or None."""
     if "covariance" not in kept:
         return None
     out = kept["covariance"] / extent**2
@@ -161,15 +164,15 @@ def _covariance(
     bad = np.flatnonzero(least < -_NEGATIVE * np.abs(largest))
     if bad.size:
         raise ValueError(
-            f"no {what}: the covariance of point {rows[bad[0]]} is not one: a variance is negative"
+            f"no {what}: the covariance of point {rows[bad[0]]} is invalid: a variance is negative"
         )
     return np.asarray(out)
 
 
-def whitened(misses: Array, covariance: Array) -> Array:
-    """Express misses in standard deviations."""
+def whiten(misses: Array, covariance: Array) -> Array:
+    """Express residuals (n, m) in standard deviations, uncorrelated."""
     m = misses.shape[1]
-    # Rounding must not make the least noisy combination look exact.
+    # Rounding must not make the least noisy combination appear exact.
     floor = FLOOR**2 + _FINE * np.trace(covariance, axis1=1, axis2=2)
     root = np.linalg.cholesky(covariance + floor[:, None, None] * np.eye(m))
     return np.asarray(np.linalg.solve(root, misses[..., None])[..., 0])
@@ -190,29 +193,29 @@ def covariance_to_laboratory(covariance: ArrayLike, base_rotation: ArrayLike) ->
 
 
 def continuing_candidates(candidates: ArrayLike, frames: ArrayLike) -> NDArray[np.int64]:
-    """Choose one candidate for each contact by its neighbours in time.
+    """Select one candidate for each contact by continuity in time.
 
-    During a contact its point moves little from frame to frame, least of all in the laboratory. So
-    where signals have several explanations, the one nearest to the contact of the nearest frame
-    with a single one is chosen, within the same unbroken run of frames.
+    During a contact the contact point moves little from frame to frame, especially in the
+    laboratory. If the signals of a frame have several explanations, the candidate closest to the
+    contact of the nearest frame with only one is selected, within the same unbroken run of frames.
 
     Parameters
     ----------
     candidates : array_like (n, k, 3)
-        Candidate points, m, laboratory frame; the more plausible first, padded with NaN.
+        Candidate points, m, laboratory frame; the most plausible first, padded with NaN.
     frames : array_like (n,) of int
-        Numbers of the frames, rising.
+        Frame numbers, increasing.
 
     Returns
     -------
     array (n,) of int
-        Number of the candidate: the first where a run has no frame with a single one; -1 where
-        there is none.
+        Index of the selected candidate: 0 if the run has no frame with a single candidate, -1 if
+        there is no candidate.
 
     Raises
     ------
     ValueError
-        If shapes do not fit.
+        If shapes do not match.
 
     Examples
     --------
@@ -241,54 +244,53 @@ def continuing_candidates(candidates: ArrayLike, frames: ArrayLike) -> NDArray[n
 
 
 _UNIT = 1e-6  # largest deviation of the length of a stored direction from 1
-DIRECTION = "object_axis"  # quantity of unit vectors; all other parameters are lengths
+DIRECTION = "object_axis"  # quantity of unit vectors; other parameters are lengths
 
 
 class Body(Protocol):
-    """Anything with a surface: a fitted shape, or an object of a trial."""
+    """An object with a surface: a fitted shape, or an object of a trial."""
 
     def signed_distance(self, points: ArrayLike, /) -> Array:
         """Signed distances of points (..., 3) from its surface, m; negative inside."""
 
 
-def _nothing() -> Array:
+def _empty() -> Array:
     return np.empty(0)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FittedShape(ABC):
-    """A shape that was fitted to contacts, in the frame of their points.
+    """A shape fitted to contacts, in the frame of their points.
 
     Attributes
     ----------
     covariance : array (k, k)
         Covariance of the parameters, in the order of ``parameters``, SI units.
     residuals : array (n,)
-        Distances of the whisker's surface from the shape's, m, positive outside; NaN for
-        points that were missing.
+        Distances of the whisker's surface from the shape's, m, positive outside; NaN for missing
+        points.
     inliers : array (n,) of bool
-        Points that were used and whose misfit is at most that of four standard deviations in one
+        Points that were used and whose residual is at most that of four standard deviations in one
         dimension.
     chi_squared : array (n,)
-        Squared misfits of each point's equations, in standard deviations; NaN for points that were
-        not used.
+        Squared residuals of each point's equations, in standard deviations; NaN for unused points.
     equations : int
-        Number of equations of each point: the distance and, where they count, those of its normal;
-        0 if the noise is known from the scatter alone.
+        Number of equations per point: the distance and, if used, those of the normal; 0 if the
+        noise was estimated from the scatter.
     """
 
-    covariance: Array = field(default_factory=_nothing)
-    residuals: Array = field(default_factory=_nothing)
+    covariance: Array = field(default_factory=_empty)
+    residuals: Array = field(default_factory=_empty)
     inliers: Mask = field(default_factory=lambda: np.empty(0, dtype=bool))
-    chi_squared: Array = field(default_factory=_nothing)
+    chi_squared: Array = field(default_factory=_empty)
     equations: int = 0
 
     kind: ClassVar[str]
     fields: ClassVar[dict[str, str]]
-    """Names of the parameters, and the quantities that they are."""
+    """Names of the parameters, and their quantities."""
 
     def signed_distance(self, points: ArrayLike) -> Array:
-        """Signed distances of points from the surface.
+        """Compute signed distances of points from the surface.
 
         Parameters
         ----------
@@ -303,7 +305,7 @@ class FittedShape(ABC):
         return self._distance(numbers("points", points))
 
     def outward_normals(self, points: ArrayLike) -> Array:
-        """Outward normals of the surface nearest to points.
+        """Compute outward normals of the surface at the points nearest to given points.
 
         Parameters
         ----------
@@ -313,13 +315,13 @@ class FittedShape(ABC):
         Returns
         -------
         array (..., 3)
-            Unit vectors; NaN where there is none, as on the axis.
+            Unit vectors; NaN where undefined, as on the axis.
         """
         normal = self._normals(numbers("points", points))
         return np.where(normal.any(axis=-1, keepdims=True), normal, np.nan)
 
     def distance_sigma(self, points: ArrayLike) -> Array:
-        """Standard deviation of distances from the surface.
+        """Compute the standard deviation of distances from the surface.
 
         Parameters
         ----------
@@ -329,23 +331,23 @@ class FittedShape(ABC):
         Returns
         -------
         array (...)
-            Standard deviation by the uncertainty of the parameters, m.
+            Standard deviation due to the uncertainty of the parameters, m.
         """
         return self._sigma(numbers("points", points))
 
     def _sigma(self, points: Array) -> Array:
-        """See `distance_sigma`."""
+        """Standard deviation of distances (...); see `distance_sigma`."""
         slopes = self._slopes(points)
         variance = np.einsum("...i,ij,...j->...", slopes, self.covariance, slopes)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     @abstractmethod
     def _distance(self, points: Array) -> Array:
-        """See `signed_distance`."""
+        """Signed distances (...); see `signed_distance`."""
 
     @abstractmethod
     def _normals(self, points: Array) -> Array:
-        """Unit normals (..., 3); zero where there is none."""
+        """Unit normals (..., 3); zero where undefined."""
 
     @abstractmethod
     def _curvature(self, points: Array, height: Array | float = 0.0) -> Array:
@@ -363,7 +365,7 @@ class FittedShape(ABC):
             sigma = np.sqrt(np.diag(self.covariance)[rows])
             length = QUANTITIES[quantity].unit == "m"
             factor, unit, digits = (1e3, " mm", 3) if length else (1.0, "", 4)
-            if name == "radius":  # as objects that are known are described
+            if name == "radius":  # shown as for known objects
                 name, factor = "diameter", 2.0 * factor
             numbers = [
                 f"{factor * v:.{digits}f} ± {factor * s:.{digits}f}"
@@ -384,33 +386,33 @@ class FittedShape(ABC):
 
     @property
     def directions(self) -> Mask:
-        """Parameters (k,) that are components of a unit vector, and not lengths."""
+        """Whether parameters (k,) are components of a unit vector rather than lengths."""
         counts = [np.size(getattr(self, name)) for name in self.fields]
         return np.repeat([q == DIRECTION for q in self.fields.values()], counts)
 
     @property
     def rms(self) -> float:
-        """Root mean square of the inliers' residuals, m; NaN if there are none."""
+        """Root mean square of the inliers' residuals, m; NaN without inliers."""
         size = self.residuals[self.inliers]
         return float(np.sqrt(np.mean(size**2))) if size.size else float("nan")
 
     @property
     def median(self) -> float:
-        """Median size of the inliers' residuals, m; NaN if there are none."""
+        """Median absolute residual of the inliers, m; NaN without inliers."""
         size = np.abs(self.residuals[self.inliers])
         return float(np.median(size)) if size.size else float("nan")
 
     @property
     def used(self) -> Mask:
-        """Points (n,) that were used: not missing, nor too uncertain for a shape this small."""
+        """Points (n,) used in the fit: neither missing nor too uncertain for the shape's size."""
         return np.asarray(np.isfinite(self.chi_squared))
 
     @property
     def misfit(self) -> float:
-        """χ² per degree of freedom, by the median; NaN if the points' noise is not known.
+        """χ² per degree of freedom, by the median; NaN if the points' noise is unknown.
 
-        1 where shape and noise are right; much more means that the points are of another shape, or
-        noisier than stated. Few outliers hardly change it. The covariance is as much larger.
+        It is 1 if shape and noise are right, and much larger if the points belong to another shape
+        or are noisier than stated. Few outliers hardly change it. The covariance is scaled by it.
         """
         return excess_of(self.chi_squared, self.equations)
 
@@ -426,14 +428,14 @@ class FittedShape(ABC):
         shape: tuple[int, ...] | None = None,
         coords: Any = None,
     ) -> xr.Dataset:
-        """Write the fitted shape as a dataset.
+        """Convert the fitted shape to a dataset.
 
         Parameters
         ----------
         dims : sequence of str
-            Dimensions of the points that it was fitted to, such as ``("time", "whisker")``.
+            Dimensions of the points used in the fit, such as ``("time", "whisker")``.
         shape : tuple of int, optional
-            Shape of these points, where they were flattened.
+            Shape of these points, if they were flattened.
         coords : mapping, optional
             Coordinates of these dimensions.
 
@@ -442,23 +444,23 @@ class FittedShape(ABC):
         xarray.Dataset
             Parameters as ``object_position``, ``object_axis`` and ``object_radius``,
             ``parameter_covariance``, and along ``dims`` ``surface_distance``, ``inlier`` and
-            ``chi_squared``; the attribute ``shape`` is its kind. A free surface is written as its
+            ``chi_squared``; the attribute ``shape`` is the kind. A free surface is stored as its
             base with ``support_point``, ``support_value``, ``support_variance``,
             ``shape_amplitude`` and ``shape_length``, and the attribute ``base``.
         """
-        data, about = self._written()
+        data, about = self._parameter_variables()
         size = self.residuals.shape if shape is None else shape
         square = ("parameter", "parameter_2")
         data["parameter_covariance"] = (square, self.covariance, attributes("parameter_covariance"))
         rows = (self.residuals, self.inliers, self.chi_squared)
-        for name, values in zip(_EACH, rows, strict=True):
+        for name, values in zip(_POINT_VARIABLES, rows, strict=True):
             data[name] = (tuple(dims), values.reshape(size), attributes(name))
         known = {"space": list("xyz"), "parameter": list(self.parameters)}
         about |= {"shape": self.kind, "equations": self.equations}
         return xr.Dataset(data, {**(coords or {}), **known}, about)
 
-    def _written(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Variables of the parameters, and attributes, of the dataset."""
+    def _parameter_variables(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Variables and attributes of the parameters in the dataset."""
         data: dict[str, Any] = {}
         for name, quantity in self.fields.items():
             value = np.asarray(getattr(self, name), dtype=np.float64)
@@ -466,7 +468,7 @@ class FittedShape(ABC):
         return data, {}
 
     @classmethod
-    def _stored(cls, dataset: xr.Dataset) -> Self:
+    def _from_dataset(cls, dataset: xr.Dataset) -> Self:
         """Restore a shape of this kind from its dataset."""
         check_complete(dataset, cls.kind, {"parameter_covariance", *cls.fields.values()})
         values: dict[str, Any] = {}
@@ -474,25 +476,25 @@ class FittedShape(ABC):
             value = dataset[quantity].values.astype(np.float64)
             right = bool(np.isfinite(value).all()) and (name != "radius" or value > 0.0)
             if not right or (quantity == DIRECTION and abs(np.linalg.norm(value) - 1.0) > _UNIT):
-                raise ValueError(f"{name} of a fitted {cls.kind} is {value}, which it cannot be")
+                raise ValueError(f"{name} of a fitted {cls.kind} is {value}, which is not valid")
             values[name] = float(value) if value.ndim == 0 else value
         return cls(covariance=dataset["parameter_covariance"].values, **rows_of(dataset), **values)
 
 
-# Variables of the points that a shape was fitted to.
-_EACH = ("surface_distance", "inlier", "chi_squared")
+# Variables along the points to which a shape was fitted.
+_POINT_VARIABLES = ("surface_distance", "inlier", "chi_squared")
 
 
 def check_complete(dataset: xr.Dataset, kind: str, names: set[str]) -> None:
-    """Make sure that a stored shape has all its variables."""
-    missing = sorted((names | set(_EACH)) - set(dataset.data_vars))
+    """Raise a ValueError if variables of a stored shape are missing."""
+    missing = sorted((names | set(_POINT_VARIABLES)) - set(dataset.data_vars))
     if missing:
         raise ValueError(f"a fitted {kind} lacks {', '.join(missing)}")
 
 
 def rows_of(dataset: xr.Dataset) -> dict[str, Any]:
-    """Residuals, inliers and squared misfits in one row."""
-    residuals, inliers, squares = (dataset[name].values.reshape(-1) for name in _EACH)
+    """Residuals, inliers and squared residuals, flattened, and the number of equations."""
+    residuals, inliers, squares = (dataset[name].values.reshape(-1) for name in _POINT_VARIABLES)
     return {
         "residuals": residuals,
         "inliers": inliers.astype(bool),
@@ -510,6 +512,6 @@ def excess_of(chi_squared: Array, equations: int) -> float:
 
 
 def evidence_of(chi_squared: Array, unknowns: int) -> float:
-    """Bayesian information criterion of a shape, which few outliers change little."""
+    """Bayesian information criterion of a shape, robust to few outliers."""
     cost = 8.0 * (np.sqrt(1.0 + 0.25 * chi_squared) - 1.0)
     return float(cost.sum() + unknowns * np.log(max(chi_squared.size, 1)))

@@ -1,49 +1,50 @@
-"""A smooth surface of any shape through contact points, with the uncertainty that these leave.
+"""Smooth surface of arbitrary shape through contact points, with its uncertainty.
 
-Contacts cover only part of an object, unevenly, and their errors differ by a hundred times. So the
-surface is what deviates smoothly from the simple shape that fits best (plane, sphere or cylinder,
-signed distance d₀): the zero set of
+Contacts cover an object partially and unevenly, and their errors differ by a factor of a hundred.
+The surface is therefore modelled as a smooth deviation from the simple shape that fits best (plane,
+sphere or cylinder, with signed distance d₀): the zero set of
 
     f(x) = d₀(x) + g(x₀),
 
-x₀ being the foot of x on the simple shape and g a Gaussian process in space of covariance
+where x₀ is the foot of x on the simple shape and g a Gaussian process in space with covariance
 
     a² (1 + r + r²/3) exp(−r) + ∂d₀/∂θ · B · ∂d₀/∂θ′,    r = √5 |x − x′| / ℓ:
 
-smooth deviations (Matérn 5/2) of amplitude a and length ℓ, while the simple shape's parameters θ
-are left open (universal kriging): B is diagonal, the points' extent squared for
-lengths, one for directions.
+smooth deviations (Matérn 5/2) of amplitude a and length ℓ, with the simple shape's parameters θ
+left free (universal kriging): B is diagonal, the points' extent squared for lengths, one for
+directions.
 
 Each contact states that f is zero at the point p − ρ n of the surface, with the variance ∇f·Σ∇f of
-its error across the surface, so that errors along it count by its slope (as in McHutchon &
-Rasmussen, NIPS 2011). Where nothing was touched g returns to zero, and its standard deviation to
-a and beyond: the simple shape, not known to be there. That is why the deviation is modelled, and
-not the signed distance itself, which far from all points would be anything. Because g is evaluated
-at the foot, f grows by one a metre along the base's normals; g at x itself would not do, as
-contacts are on the surface only, where g = −d₀ explains them all with no surface left. With
-positions in space as inputs the surface may close round a cylinder or a sphere without a seam.
+its error normal to the surface, so that errors along it matter in proportion to its slope (as in
+McHutchon & Rasmussen, NIPS 2011). Away from all contacts g returns to zero and its standard
+deviation to a and more: the simple shape, with a corresponding uncertainty. This is why the
+deviation is modelled and not the signed distance itself, which would be arbitrary far from the
+points. Because g is evaluated at the foot, the gradient of f along the base's normals is one. With
+g at x itself, g = −d₀ would explain all contacts, which are on the surface only, without defining a
+surface. With positions in space as inputs, the surface may close around a cylinder or a sphere
+without a seam.
 
-**The fit** determines the base, the deviation from it, and how far and fast that varies.
+**The fit** determines the base, the deviation from it, and the amplitude and length.
 
 Amplitude a and length ℓ maximise the likelihood within bounds. a is at least a tenth of the points'
 extent, or of the radius of the base if that is smaller, even if no deviation is seen: that an
-object is a cylinder where it was touched does not mean that it is one elsewhere. ℓ is at most that
-size, and no less than a tenth of it. The cost grows with the third power of the number of points;
-at most 600 are used, neighbours being merged, 200 for a and ℓ.
+object is cylindrical where it was touched does not mean that it is so elsewhere. ℓ is between a
+tenth of that size and that size. The cost grows with the third power of the number of points; at
+most 600 are used, after merging neighbours, and 200 for a and ℓ.
 
-A contact that is missed by more than four standard deviations is an outlier: at first by the median
-of its neighbours, then by the surface, and in both cases by how far the others scatter.
+A contact with a residual of more than four standard deviations is an outlier: at first relative to
+the median of its neighbours, then to the surface, in both cases scaled by the others' scatter.
 
-Normals help to find the base and the location of contacts on it. A contact point is often known
-badly along the surface (0.1 to 1 mm) and its normal well (10 mrad, on a peg some 10 µm of its
+Normals help to find the base and the location of contacts on it. A contact point is often poorly
+known along the surface (0.1 to 1 mm) and its normal well (10 mrad, on a peg some 10 µm of its
 circumference). With N, T and H normal, tangents and curvature of the base at x₀, the surface is at
 a height h above it at the offset τ from x₀, where
 
     Tᵀ (p − ρ n − x₀) = τ,    N·(p − ρ n − x₀) = h,    Tᵀ (n − N) = TᵀHT τ − ∇h,
 
-with the errors of p and n, and the unknown slope ∇h of the surface as one more error of n. Solved
-by weighted least squares, x₀ being moved until τ is zero. Without normals it is the foot of the
-point.
+with the errors of p and n, and the unknown slope ∇h of the surface as a further error of n. These
+equations are solved by weighted least squares, and x₀ is moved until τ is zero. Without normals x₀
+is the foot of the point.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ from vibrissa.contour.fitted_shape import (
     ContactArrays,
     FittedShape,
     check_complete,
-    checked,
+    check_contacts,
     excess_of,
     rows_of,
 )
@@ -71,27 +72,26 @@ from vibrissa.deferred import linalg, spatial
 from vibrissa.numerics import Array, Mask
 from vibrissa.quantities import attributes
 
-_AT_ONCE = 4096  # rows that are done at once, so that intermediate arrays do not fill the memory
-_STEP = 1e-4  # step of differences, as a share of the length
-_FINER = 0.9  # edge of the next smaller cubes that neighbours are merged in
-_FINEST = 1e-3  # edge of the smallest cubes, as a share of the points' extent
+_BLOCK = 4096  # number of rows processed at a time, which limits the memory
+_STEP = 1e-4  # step of finite differences, over the length
+_FINER = 0.9  # ratio of the edges of successive cubes in which neighbours are merged
+_FINEST = 1e-3  # edge of the smallest cubes, over the points' extent
 
 
 class Support(NamedTuple):
-    """Values (n,) that a surface is made from, at positions (n, 3), with variances (n,)."""
+    """Values (n,) that determine a surface, at positions (n, 3), with variances (n,)."""
 
     position: Array
     value: Array
     variance: Array
 
 
-def merged(support: Support, most: int) -> Support:
-    """Merge neighbours until no more are left than wanted.
+def merge_neighbours(support: Support, most: int) -> Support:
+    """Merge neighbours until at most ``most`` values are left.
 
-    Space is divided into cubes, whose edge is the smallest for which no more are occupied than
-    wanted. What is in one cube becomes one value at the mean position, all weighed by the inverse
-    of their variances, as by a surface that is smooth on this scale; its variance is that of the
-    weighted mean.
+    Space is divided into cubes with the smallest edge for which at most that many are occupied. The
+    values in a cube are replaced by their mean at the mean position, weighted by inverse variances,
+    assuming that the surface is smooth on this scale; its variance is that of the weighted mean.
     """
     if len(support.value) <= most:
         return support
@@ -114,32 +114,32 @@ def merged(support: Support, most: int) -> Support:
 
 
 def _cells(position: Array, edge: float) -> NDArray[np.intp]:
-    """Number of the occupied cube of each position."""
+    """Index of the occupied cube of each position."""
     cube = np.floor(position / edge).astype(np.int64)
     return np.unique(cube, axis=0, return_inverse=True)[1].reshape(-1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class FreeFit(FittedShape):
-    """A smooth surface, in the frame of the points.
+    """A fitted smooth surface, in the frame of the points.
 
     Attributes
     ----------
     base : CylinderFit, SphereFit or PlaneFit
-        Simple shape that the surface deviates from.
+        Simple shape from which the surface deviates.
     support : Support
-        Positions (n, 3) on the base, m, values (n,) to be added to the base's signed distance
-        there, m, and the variances of these, m².
+        Positions (n, 3) on the base, m, values (n,) of the deviation, which is added to the base's
+        signed distance, m, and their variances, m².
     amplitude : float
-        Standard deviation of the deviation before anything is touched, m.
+        Prior standard deviation of the deviation, m.
     length : float
-        Length over which the deviation changes, m.
+        Length scale of the deviation, m.
     covariance : array (k, k)
         Covariance of the base's parameters.
     inliers : array (n,) of bool
         Points within four standard deviations.
     chi_squared : array (n,)
-        Squared distances of the points used, over their variance and that of the surface.
+        Squared distances of the points used, over the sum of their variance and the surface's.
     """
 
     base: SimpleShape
@@ -176,7 +176,7 @@ class FreeFit(FittedShape):
         )
 
     def deviation(self, points: ArrayLike) -> tuple[Array, Array]:
-        """Deviation: what is added to the base's signed distance.
+        """Compute the deviation, which is added to the base's signed distance.
 
         Parameters
         ----------
@@ -186,13 +186,13 @@ class FreeFit(FittedShape):
         Returns
         -------
         mean, sigma : array (...)
-            Mean of the deviation, m, negative where the surface is outside of the base, and its
+            Mean of the deviation, m, negative where the surface is outside the base, and its
             standard deviation, m.
         """
         p = np.asarray(points, dtype=np.float64)
         rows = self._feet(p.reshape(-1, 3))
         mean, variance = np.empty(len(rows)), np.empty(len(rows))
-        for part in _parts(len(rows)):
+        for part in _row_blocks(len(rows)):
             shared = self._kernel(rows[part], self.support.position)
             mean[part] = shared @ self._weights
             explained = linalg.solve_triangular(self._root, shared.T, lower=True)
@@ -228,7 +228,7 @@ class FreeFit(FittedShape):
         """Function f (...), zero on the surface."""
         feet = self._feet(points.reshape(-1, 3))
         added = np.empty(len(feet))
-        for part in _parts(len(feet)):
+        for part in _row_blocks(len(feet)):
             added[part] = self._kernel(feet[part], self.support.position) @ self._weights
         return np.asarray(self.base.signed_distance(points) + added.reshape(points.shape[:-1]))
 
@@ -246,7 +246,7 @@ class FreeFit(FittedShape):
         slopes = self.base._slopes(first), self.base._slopes(second)
         return np.asarray(free + (slopes[0] * self._loose) @ slopes[1].T)
 
-    def _written(self) -> tuple[dict[str, Any], dict[str, Any]]:
+    def _parameter_variables(self) -> tuple[dict[str, Any], dict[str, Any]]:
         rows: dict[str, tuple[tuple[str, ...], Any]] = {
             "support_point": (("support", "space"), self.support.position),
             "support_value": (("support",), self.support.value),
@@ -255,10 +255,10 @@ class FreeFit(FittedShape):
             "shape_length": ((), self.length),
         }
         own = {name: (dims, values, attributes(name)) for name, (dims, values) in rows.items()}
-        return self.base._written()[0] | own, {"base": self.base.kind}
+        return self.base._parameter_variables()[0] | own, {"base": self.base.kind}
 
     @classmethod
-    def _stored(cls, dataset: xr.Dataset) -> Self:
+    def _from_dataset(cls, dataset: xr.Dataset) -> Self:
         kind = dataset.attrs.get("base")
         if kind not in SHAPES:
             raise ValueError(
@@ -266,7 +266,7 @@ class FreeFit(FittedShape):
             )
         support = ("support_point", "support_value", "support_variance")
         check_complete(dataset, cls.kind, {*support, "shape_amplitude", "shape_length"})
-        base = SHAPES[kind]._stored(dataset)
+        base = SHAPES[kind]._from_dataset(dataset)
         return cls(
             base=base,
             support=Support(*(dataset[name].values for name in support)),
@@ -278,78 +278,79 @@ class FreeFit(FittedShape):
 
 
 def shape_from_dataset(dataset: xr.Dataset) -> FittedShape:
-    """Restore a fitted shape from the dataset that it was written to.
+    """Restore a fitted shape from its dataset.
 
     Parameters
     ----------
     dataset : xarray.Dataset
-        Dataset of ``FittedShape.to_dataset``.
+        Dataset from ``FittedShape.to_dataset``.
 
     Returns
     -------
     CylinderFit, SphereFit, PlaneFit or FreeFit
-        Shape as it was; residuals and inliers in one row.
+        Restored shape, with flattened residuals and inliers.
 
     Raises
     ------
     ValueError
-        If its kind is unknown, or something is missing.
+        If its kind is unknown, or a variable is missing.
     """
     kinds: dict[str, type[FittedShape]] = {**SHAPES, FreeFit.kind: FreeFit}
     kind = dataset.attrs.get("shape")
     if kind not in kinds:
         raise ValueError(f"the shape is {kind!r}; it must be one of {', '.join(kinds)}")
-    return kinds[kind]._stored(dataset)
+    return kinds[kind]._from_dataset(dataset)
 
 
-def _parts(count: int) -> list[slice]:
-    """Rows that are done together."""
-    return [slice(start, start + _AT_ONCE) for start in range(0, count, _AT_ONCE)]
+def _row_blocks(count: int) -> list[slice]:
+    """Blocks of rows that are processed together."""
+    return [slice(start, start + _BLOCK) for start in range(0, count, _BLOCK)]
 
 
-# Largest deviations from a base, as a share of those from simpler ones, for it to be chosen. Where
-# a sphere fits, a plane is no worse only if the object is flat; a cylinder must fit well, as an
-# object that is round at its ends does not deviate smoothly from one.
+# Largest deviation from a base, over the least deviation from simpler ones, at which it is chosen.
+# Where a sphere fits, a plane fits as well only if the object is flat; a cylinder must fit well,
+# because an object with rounded ends does not deviate smoothly from one.
 _BETTER = {"plane": 1.0, "sphere": 0.9, "cylinder": 0.5}
-_MOST = 0.95  # share of the contacts whose deviations are at most these
-# Bounds of amplitude and length, as shares of the points' extent or the base's radius.
+_MOST = 0.95  # quantile of the contacts' deviations that is compared
+# Bounds of amplitude and length, over the smaller of the points' extent and the base's radius.
 _AMPLITUDES = (0.1, 2.0)
 _LENGTHS = (0.1, 1.0)
-_FOR_BOUNDS = 200  # number of positions that amplitude and length are estimated from, at most
-_OUTLIER = 4.0  # miss, in standard deviations, from which a contact is an outlier
-# Standard deviation, as a share of radius and extent, up to which contacts are used. A contact far
-# along a round surface is mostly there by error, and always outside of it.
-_SHARP = 0.1
-_FEW = 50  # number of the sharpest contacts to use if fewer are left, or less than a quarter
-# Standard deviation of the surface's slope against its base, at first and at least.
+_FOR_BOUNDS = 200  # largest number of positions from which amplitude and length are estimated
+_OUTLIER = 4.0  # residual, in standard deviations, above which a contact is an outlier
+# Standard deviation, over radius or extent, above which contacts are not used. A contact that is
+# displaced far along a round surface is displaced mostly by its error, and always outward.
+_PRECISE = 0.1
+_FEW = 50  # number of most precise contacts used if fewer are left, or less than a quarter
+# Standard deviation of the surface's slope relative to its base: initial and least value.
 _SLOPE, _LEAST_SLOPE = 0.2, 0.02
-_NEIGHBOURS = 9  # number of contacts whose median an outlier is found by at first
-_ROUNDS = 2  # number of times that the deviation is fitted, with the slope of the fit before
-_PLACING_ROUNDS = 5  # largest number of moves of a contact's foot until its offset is zero
-# Bounds of the variance that no covariance contains, in units of the extent squared.
+_NEIGHBOURS = 9  # number of contacts in the median by which outliers are found at first
+_ROUNDS = 2  # number of fits of the deviation, each with the slope of the previous one
+_PLACING_ROUNDS = 5  # number of moves of a contact's foot toward zero offset
+# Bounds of the noise variance in excess of the covariances, over the extent squared.
 _NOISES = (1e-10, 1e-2)
 _FLOOR = 1e-9  # standard deviation, m, of a contact that is stated to be exact
-_TINY = 1e-12  # standard deviation, m, of a distance at least
+_TINY = 1e-12  # smallest standard deviation of a distance, m
 
 
 def fit_free(
     points: ArrayLike, base: str | None = None, most: int = 600, **contacts: Unpack[ContactArrays]
 ) -> FreeFit:
-    """Fit a smooth surface of any shape to contact points on parts of it.
+    """Fit a smooth surface of arbitrary shape to contact points on parts of it.
 
     Parameters
     ----------
     points : array_like (n, 3)
-        Contact points on the whisker's centreline, m, in any one frame; rows with NaN are left out.
+        Contact points on the whisker's centreline, m, in any common frame; rows with NaN are
+        ignored.
     base : {"plane", "sphere", "cylinder"}, optional
-        Simple shape that the surface deviates from; by default the simplest from which less simple
-        ones are not much nearer to the points.
+        Simple shape from which the surface deviates; by default the simplest from which less simple
+        ones do not fit much better.
     most : int
-        Number of positions that the points are merged to at most; the time grows with the third
+        Largest number of positions to which the points are merged; the time grows with its third
         power.
     **contacts
-        covariance, whisker_radius, normals, normal_covariance and point_normal_covariance, as for
-        `fit_shape`.
+        Further properties of the contacts: covariance, whisker_radius, normals, normal_covariance
+        and point_normal_covariance, as for `fit_shape`.
 
     Returns
     -------
@@ -359,27 +360,27 @@ def fit_free(
     Raises
     ------
     ValueError
-        If shapes are wrong, if there are fewer than 6 points, if a covariance is none, if the base
-        is unknown, or if the points determine none, as on a line.
+        If shapes are wrong, if there are fewer than 6 points, if a covariance is invalid, if the
+        base is unknown, or if the points do not determine it, such as points on a line.
     """
     if base is not None and base not in SHAPES:
         raise ValueError(f"base is {base!r}; it must be one of {', '.join(SHAPES)}")
     if most < 6:
         raise ValueError(f"most is {most}; at least 6 positions are needed")
-    given = checked("surface", points, least=6, **contacts)
-    # Rows that are not usable for the base are not usable for what deviates from it.
+    given = check_contacts("surface", points, least=6, **contacts)
+    # Rows that cannot be used for the base cannot be used for the deviation either.
     rows = np.flatnonzero(given.usable)
     known = {name: v for name, v in contacts.items() if name != "whisker_radius" and v is not None}
     picked = {name: np.asarray(v, dtype=np.float64)[rows] for name, v in known.items()}
     p = np.asarray(points, dtype=np.float64)[rows]
     radius = given.touches.whisker_radius * given.extent
-    shape = _base(p, radius, picked, (base,) if base else tuple(SHAPES))
+    shape = _select_base(p, radius, picked, (base,) if base else tuple(SHAPES))
     touches = given.touches
     normal = shape.outward_normals(p) if touches.normal is None else touches.normal
     spread = np.zeros((len(p), 3, 3)) if touches.covariance is None else touches.covariance
     unit = np.repeat([given.extent, 1.0], 3)[: spread.shape[1]]
     touched = _Contacts(p - radius[:, None] * normal, touches.normal, spread * unit[:, None] * unit)
-    fit, squares, sharp = _with_deviation(shape, touched, given.extent, most)
+    fit, squares, sharp = _fit_deviation(shape, touched, given.extent, most)
     residuals, chi_squared = np.full((2, given.usable.size), np.nan)
     residuals[rows] = fit.signed_distance(p) - radius
     chi_squared[rows] = np.where(sharp, squares, np.nan)
@@ -394,12 +395,12 @@ def fit_free(
     )
 
 
-def _base(
+def _select_base(
     points: Array, radius: Array, known: dict[str, Array], kinds: tuple[str, ...]
 ) -> SimpleShape:
-    """The simplest shape from which less simple ones are not much nearer to the points."""
+    """The simplest shape from which less simple ones do not fit much better."""
     best, least, fault = None, np.inf, ""
-    # On an object of another shape points and normals may contradict each other.
+    # For an object of another shape, points and normals may contradict each other.
     alone = {name: v for name, v in known.items() if name == "covariance"}
     for kind, given in ((kind, given) for kind in kinds for given in (known, alone)):
         if given is alone and len(known) == len(alone):
@@ -411,7 +412,9 @@ def _base(
             continue
         sigma = np.ones(len(points))
         if "covariance" in known:
-            sigma = np.maximum(_across(fit.outward_normals(points), known["covariance"]), _TINY)
+            sigma = np.maximum(
+                _sigma_along(fit.outward_normals(points), known["covariance"]), _TINY
+            )
         miss = float(np.quantile(np.abs(fit.residuals) / sigma, _MOST))
         if miss < _BETTER[kind] * least:
             best, least = fit, miss
@@ -424,33 +427,35 @@ def _base(
     return best
 
 
-def _across(normal: Array, covariance: Array) -> Array:
+def _sigma_along(normal: Array, covariance: Array) -> Array:
     """Standard deviations (n,) along normals."""
     variance = np.einsum("ni,nij,nj->n", normal, covariance, normal)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
-def _with_deviation(
+def _fit_deviation(
     base: SimpleShape, contacts: _Contacts, extent: float, most: int
 ) -> tuple[FreeFit, Array, Mask]:
-    """Fit the deviation from a base, again and again: with its slopes, without outliers."""
+    """Fit the deviation from a base repeatedly, with its slopes and without outliers."""
     scale = min(extent, float(getattr(base, "radius", np.inf)))
     slope, inside, fit = _SLOPE, None, None
     for _ in range(_ROUNDS):
-        there = _placed(base, contacts, slope)
-        known = _sharp(there.covariance, scale)
+        there = _place_contacts(base, contacts, slope)
+        known = _is_precise(there.covariance, scale)
         bent = base._curvature(there.foot) @ there.covariance
-        # A point that is scattered along a curved surface lies farther out in the mean.
+        # A point that is scattered along a curved surface is farther out on average.
         value = 0.5 * np.trace(bent, axis1=1, axis2=2) - there.height
         normal = (base if fit is None else fit).outward_normals(there.foot)
-        variance = _across(normal, there.covariance) ** 2 + (FLOOR * extent) ** 2
+        variance = _sigma_along(normal, there.covariance) ** 2 + (FLOOR * extent) ** 2
         variance = variance + 0.5 * np.einsum("nij,nji->n", bent, bent)
         if inside is None:
-            inside = _like_neighbours(there.foot, value, variance)
+            inside = _agrees_with_neighbours(there.foot, value, variance)
         rows = known & inside
         support = Support(there.foot[rows], value[rows], variance[rows])
-        amplitude, length, noise = _varying(merged(support, min(_FOR_BOUNDS, most)), scale)
-        few = merged(support._replace(variance=support.variance + noise), most)
+        amplitude, length, noise = _fit_hyperparameters(
+            merge_neighbours(support, min(_FOR_BOUNDS, most)), scale
+        )
+        few = merge_neighbours(support._replace(variance=support.variance + noise), most)
         fit = FreeFit(
             covariance=base.covariance,
             base=base,
@@ -467,23 +472,23 @@ def _with_deviation(
     return fit, miss**2, known
 
 
-def _sharp(covariance: Array, scale: float) -> Mask:
-    """Contacts whose position is known well, or at least better than that of most."""
+def _is_precise(covariance: Array, scale: float) -> Mask:
+    """Whether contacts are precisely located, or at least more precisely than most."""
     widest = np.sqrt(np.linalg.eigvalsh(covariance)[:, -1].clip(0.0))
     enough = min(len(widest), max(_FEW, len(widest) // 4))
-    return np.asarray(widest <= max(_SHARP * scale, np.sort(widest)[enough - 1]))
+    return np.asarray(widest <= max(_PRECISE * scale, np.sort(widest)[enough - 1]))
 
 
-def _like_neighbours(position: Array, value: Array, variance: Array) -> Mask:
-    """Contacts that are not far from the median of those about them."""
+def _agrees_with_neighbours(position: Array, value: Array, variance: Array) -> Mask:
+    """Whether contacts are close to the median of their neighbours."""
     _, near = spatial.cKDTree(position).query(position, min(_NEIGHBOURS, len(position)))
     away = value - np.median(value[near], axis=1)
     usual = TO_SIGMA * float(np.median(np.abs(away)))
     return np.asarray(np.abs(away) < _OUTLIER * np.sqrt(variance + usual**2))
 
 
-def _varying(support: Support, scale: float) -> tuple[float, float, float]:
-    """Amplitude and length, m, and the variance that no covariance contains, m²."""
+def _fit_hyperparameters(support: Support, scale: float) -> tuple[float, float, float]:
+    """Estimate amplitude and length, m, and the noise variance in excess of covariances, m²."""
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
@@ -512,23 +517,23 @@ def _varying(support: Support, scale: float) -> tuple[float, float, float]:
 
 
 class _Contacts(NamedTuple):
-    """Usable contacts, SI units: points of the surface, normals, covariances."""
+    """Usable contacts in SI units: points of the surface, normals, covariances."""
 
     surface: Array
     normal: Array | None
     covariance: Array
 
 
-class _Placed(NamedTuple):
-    """Contacts on a simple shape."""
+class _PlacedContacts(NamedTuple):
+    """Contacts on a simple shape: feet, heights above them, and covariances."""
 
     foot: Array
     height: Array
     covariance: Array
 
 
-def _placed(base: SimpleShape, contacts: _Contacts, slope: float) -> _Placed:
-    """Place contacts on a simple shape."""
+def _place_contacts(base: SimpleShape, contacts: _Contacts, slope: float) -> _PlacedContacts:
+    """Determine the feet of contacts on a simple shape, and their heights."""
     p = contacts.surface
     foot = p - base.signed_distance(p)[:, None] * base.outward_normals(p)
     for _ in range(1 if contacts.normal is None else _PLACING_ROUNDS):
@@ -540,21 +545,21 @@ def _placed(base: SimpleShape, contacts: _Contacts, slope: float) -> _Placed:
         covariance = np.linalg.inv(turned @ design)
         offset = (covariance @ turned @ seen[..., None])[..., 0]
         moved = foot + np.einsum("ni,nij->nj", offset[:, :2], axes[:, :2])
-        # The location belongs to the shape; the height was found above its tangent plane.
+        # The foot must be on the shape; the height was computed above the tangent plane.
         foot = moved - base.signed_distance(moved)[:, None] * base.outward_normals(moved)
     height = np.einsum("ni,ni->n", p - foot, base.outward_normals(foot))
     if contacts.normal is None:
-        return _Placed(foot, height, contacts.covariance)
-    # Given the location that was chosen, the height above it is that of the last round.
+        return _PlacedContacts(foot, height, contacts.covariance)
+    # The height above the final foot is that of the last round.
     bent = np.einsum("ni,nij,nj->n", offset[:, :2], _bending(base, foot, axes), offset[:, :2])
     height = offset[:, 2] + 0.5 * bent
-    return _Placed(foot, height, np.swapaxes(axes, 1, 2) @ covariance @ axes)
+    return _PlacedContacts(foot, height, np.swapaxes(axes, 1, 2) @ covariance @ axes)
 
 
 def _equations(
     base: SimpleShape, contacts: _Contacts, foot: Array, axes: Array, slope: float
 ) -> tuple[Array, Array, Array]:
-    """Measurements (n, m), their derivatives by offset and height (n, m, 3), their covariance."""
+    """Measurements (n, m), derivatives by offset and height (n, m, 3), and covariance."""
     n = len(foot)
     seen = np.einsum("nij,nj->ni", axes, contacts.surface - foot)
     design = np.broadcast_to(np.eye(3), (n, 3, 3))
@@ -578,7 +583,7 @@ def _equations(
 
 
 def _bending(base: SimpleShape, foot: Array, axes: Array) -> Array:
-    """Curvature (n, 2, 2) along the tangents."""
+    """Curvature (n, 2, 2) along the two tangents."""
     across = axes[:, :2]
     return np.asarray(across @ base._curvature(foot) @ np.swapaxes(across, 1, 2))
 

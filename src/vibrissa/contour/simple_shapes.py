@@ -1,17 +1,17 @@
-"""Shapes of a few numbers, each declared by what a fit to contacts needs of it.
+"""Plane, sphere and cylinder as parametric shapes that can be fitted to contacts.
 
-With a contact's point p on the whisker's centreline, n the surface's outward normal there and ρ the
+With p a contact's point on the whisker's centreline, n the surface's outward normal there and ρ the
 whisker's radius, the equations of contacts with normals are
 
-    cylinder (q the part of p − c across the axis a through c):  q = (R + ρ) n,  n · a = 0,
+    cylinder (q the part of p − c normal to the axis a through c):  q = (R + ρ) n,  n · a = 0,
     sphere (centre c):  p − c = (R + ρ) n,
-    plane (normal N, height h):  N · p = h + ρ,  n · t = 0 for both t across N.
+    plane (normal N, height h):  N · p = h + ρ,  n · t = 0 for both t normal to N.
 
-Normals that count as exact are first projected across a cylinder's axis and contain nothing about
-its direction; of a plane they show only on which side the whisker is.
+Normals that count as exact are first projected normal to a cylinder's axis, and contain no
+information on its direction; for a plane they only determine on which side the whisker is.
 
-While a shape is being fitted its lengths are in units of the points' extent. It moves by steps in a
-frame: two unit vectors (2, 3) across its direction, which the fit carries along smoothly.
+During a fit lengths are in units of the points' extent. The shape moves by steps in a frame: two
+unit vectors (2, 3) normal to its direction, which the fit updates smoothly.
 """
 
 from __future__ import annotations
@@ -26,27 +26,27 @@ from numpy.typing import ArrayLike
 from vibrissa.contour.fitted_shape import DIRECTION, FLOOR, Checked, FittedShape, Touches
 from vibrissa.numerics import Array
 
-# Radius to start from, at least, as a share of that of the surface that the points are on.
+# Smallest initial radius, over that of the surface on which the points are.
 _SMALLEST = 1e-3
-_TINY = 1e-12  # squared radius to start from, at least, in units of the extent squared
+_TINY = 1e-12  # smallest initial squared radius, over the extent squared
 
 
-def _every_way(number: int) -> Array:
-    """Directions (n, 3) spread evenly over half a sphere, along a spiral of golden angles."""
+def _spiral_directions(number: int) -> Array:
+    """Directions (n, 3) spread evenly over a hemisphere, along a spiral of golden angles."""
     height = (np.arange(number) + 0.5) / number
     turn = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(number)
     across = np.sqrt(1.0 - height**2)
     return np.column_stack([across * np.cos(turn), across * np.sin(turn), height])
 
 
-# Axes among which those are sought that circles across fit best, and how many of them start a fit:
-# the axis of few points on a short arc is along none of their principal directions.
-_AXES, _MOST_AXES = _every_way(64), 6
+# Candidate axes, and number of those to which circles fit best from which a fit starts: the axis of
+# few points on a short arc is along none of their principal directions.
+_AXES, _MOST_AXES = _spiral_directions(64), 6
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class SimpleShape(FittedShape):
-    """A shape of a few numbers."""
+    """A shape with few parameters."""
 
     origin: Array
 
@@ -56,39 +56,39 @@ class SimpleShape(FittedShape):
     @classmethod
     @abstractmethod
     def starts(cls, given: Checked, known: ArrayLike | None) -> list[tuple[Self, Array]]:
-        """Shapes to start a fit from, and where their frame's first vector points to.
+        """Initial shapes for a fit, and the direction of their frame's first vector.
 
-        ``known`` is a cylinder's axis or a point on a plane's free side.
+        ``known`` is a cylinder's axis, or a point on a plane's free side.
         """
 
     @property
     def direction(self) -> Array:
-        """Unit vector (3,) across which the frame is; any for a shape without one."""
+        """Unit vector (3,) to which the frame is normal; arbitrary for a shape without one."""
         return np.array([0.0, 0.0, 1.0])
 
     @property
     def size(self) -> float:
-        """Length that a point's scatter is compared with, and that must be positive."""
+        """Length with which a point's scatter is compared; must be positive."""
         return 1.0
 
     @abstractmethod
     def moved(self, step: Array, frame: Array) -> Self:
-        """Shape changed by a step, smoothly, as derivatives by differences need it."""
+        """Shape after a step; a smooth function, so that it can be differentiated numerically."""
 
     @abstractmethod
     def step_slopes(self, frame: Array) -> Array:
-        """Derivatives (parameters, steps) of the parameters with respect to a step."""
+        """Derivatives (parameters, steps) of the parameters by a step."""
 
     @abstractmethod
     def misses(self, touches: Touches, frame: Array) -> tuple[Array, Array]:
-        """Misses (n, m) of contacts with normals, and their derivatives (n, m, 3 or 6)."""
+        """Residuals (n, m) of contacts with normals, and their derivatives (n, m, 3 or 6)."""
 
     def relevant(self, frame: Array) -> Array:
-        """Directions (k, 3) in which the scatter of a point matters."""
+        """Directions (k, 3) along which the scatter of a point matters."""
         return np.eye(3)
 
     def arranged(self) -> Self:
-        """Same shape in its usual form."""
+        """The same shape in standard form."""
         return self
 
     def gaps(self, touches: Touches) -> Array:
@@ -101,7 +101,7 @@ class SimpleShape(FittedShape):
         return self._normals(points), self._curvature(points, touches.whisker_radius)
 
     def in_metres(self, given: Checked, **statistics: Any) -> Self:
-        """Same shape in the frame and unit of the points, with the statistics of its fit."""
+        """The same shape in the frame and unit of the points, with the statistics of its fit."""
         lengths = {
             name: given.extent * getattr(self, name)
             for name, quantity in self.fields.items()
@@ -113,13 +113,13 @@ class SimpleShape(FittedShape):
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class RoundShape(SimpleShape):
-    """A shape whose surface is at one distance from its middle, an axis or a point."""
+    """A shape whose surface is at constant distance from a centre, an axis or a point."""
 
     radius: float
 
     @abstractmethod
     def _away(self, points: Array) -> Array:
-        """Vectors (..., 3) from the middle to points."""
+        """Vectors (..., 3) from the centre to points."""
 
     @property
     def size(self) -> float:
@@ -150,7 +150,7 @@ class RoundShape(SimpleShape):
         return np.asarray(away / np.where(size > 0.0, size, 1.0))
 
     def _far(self, height: Array | float) -> Array:
-        """Distances (..., 1, 1) from the middle at a height above the surface."""
+        """Distances (..., 1, 1) from the centre at a height above the surface."""
         far = np.maximum(np.abs(self.radius + np.asarray(height)), FLOOR)
         return np.asarray(far[..., None, None])
 
@@ -168,11 +168,11 @@ class Cylinder(RoundShape):
         "radius": "object_radius",
     }
     steps: ClassVar[int] = 5
-    """Two of the origin, one of the radius, two of the axis, which may be left out."""
+    """Two of the origin, one of the radius, two of the axis, which are omitted if it is known."""
 
     @classmethod
     def starts(cls, given: Checked, known: ArrayLike | None) -> list[tuple[Self, Array]]:
-        """Circles fitted algebraically across the likely axes."""
+        """Circles fitted algebraically normal to the likely axes."""
         touches = given.touches
         axes = [np.asarray(known, dtype=np.float64)]
         if known is None:
@@ -186,7 +186,7 @@ class Cylinder(RoundShape):
             axis = axis / np.linalg.norm(axis)
             sideways = np.eye(3)[int(np.argmin(np.abs(axis)))]
             frame = frame_across(axis, sideways)
-            center, size = _round(touches.position @ frame.T, weight)
+            center, size = _fit_algebraically(touches.position @ frame.T, weight)
             radius = max(size - whisker, _SMALLEST * size)
             return cls(origin=center @ frame, axis=axis, radius=radius), sideways
 
@@ -199,7 +199,7 @@ class Cylinder(RoundShape):
 
     @property
     def direction(self) -> Array:
-        """The axis."""
+        """Direction of the axis."""
         return self.axis
 
     def moved(self, step: Array, frame: Array) -> Self:
@@ -235,11 +235,11 @@ class Cylinder(RoundShape):
         return np.column_stack([q - far * normal, touches.normal @ self.axis]), by
 
     def relevant(self, frame: Array) -> Array:
-        """See `SimpleShape.relevant`: across the axis."""
+        """See `SimpleShape.relevant`: the directions normal to the axis."""
         return frame
 
     def arranged(self) -> Self:
-        """Same cylinder, its origin at the height of the mean and its axis upward."""
+        """The same cylinder with its origin at the height of the mean, and its axis upward."""
         origin = self.origin - (self.origin @ self.axis) * self.axis
         return replace(self, origin=origin, axis=_upward(self.axis))
 
@@ -272,7 +272,7 @@ class Sphere(RoundShape):
         touches = given.touches
         p, n, weight = touches.position, len(touches.position), touches.weights()
         whisker = float(np.average(touches.whisker_radius, weights=weight))
-        center, size = _round(p, weight)
+        center, size = _fit_algebraically(p, weight)
         any_ = np.array([1.0, 0.0, 0.0])
         shapes = [(cls(origin=center, radius=max(size - whisker, _SMALLEST * size)), any_)]
         if touches.normal is not None:
@@ -334,7 +334,7 @@ class Plane(SimpleShape):
 
     @classmethod
     def starts(cls, given: Checked, known: ArrayLike | None) -> list[tuple[Self, Array]]:
-        """The plane across which the points spread least, facing the free side."""
+        """The plane normal to which the points scatter least, facing the free side."""
         touches = given.touches
         weight = touches.weights()[:, None]
         middle = (weight * touches.position).sum(axis=0) / weight.sum()
@@ -353,7 +353,7 @@ class Plane(SimpleShape):
 
     @property
     def direction(self) -> Array:
-        """The normal."""
+        """The plane's normal."""
         return self.normal
 
     def moved(self, step: Array, frame: Array) -> Self:
@@ -402,13 +402,13 @@ class CylinderFit(Cylinder):
     Attributes
     ----------
     origin : array (3,)
-        Point of the axis at the height of the points' mean, m.
+        Point on the axis at the height of the points' mean, m.
     axis : array (3,)
         Unit vector along the axis; its largest component is positive.
     radius : float
         Radius of the surface, m.
     covariance : array (7, 7)
-        Covariance of (origin, axis, radius), m and 1; of rank 5, or 3 where the axis was given.
+        Covariance of (origin, axis, radius), m and 1; of rank 5, or 3 if the axis was given.
     """
 
 
@@ -434,7 +434,7 @@ class PlaneFit(Plane):
     Attributes
     ----------
     origin : array (3,)
-        Point of the plane nearest to the points' mean, m.
+        Point of the plane closest to the points' mean, m.
     normal : array (3,)
         Outward unit vector, toward the whisker.
     covariance : array (6, 6)
@@ -442,14 +442,14 @@ class PlaneFit(Plane):
     """
 
 
-# Shapes by their kind, the simpler first.
+# Shapes by kind, simpler ones first.
 SHAPES: dict[str, type[SimpleShape]] = {
     shape.kind: shape for shape in (PlaneFit, SphereFit, CylinderFit)
 }
 
 
 def frame_across(direction: Array, toward: Array | None = None) -> Array:
-    """Two unit vectors (..., 2, 3) across directions, the first as near to ``toward`` as can be."""
+    """Two unit vectors (..., 2, 3) normal to directions, the first closest to ``toward``."""
     if toward is None:
         toward = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction), axis=-1)])
     along = (toward * direction).sum(axis=-1, keepdims=True)
@@ -459,12 +459,12 @@ def frame_across(direction: Array, toward: Array | None = None) -> Array:
 
 
 def _upward(direction: Array) -> Array:
-    """The direction or its opposite, so that its largest component is positive."""
+    """The direction or its opposite, such that its largest component is positive."""
     return np.asarray(direction * np.sign(direction[np.argmax(np.abs(direction))]))
 
 
-def _round(points: Array, weight: Array) -> tuple[Array, float]:
-    """Centre and radius of the circle or sphere, fitted algebraically to points (n, 2 or 3)."""
+def _fit_algebraically(points: Array, weight: Array) -> tuple[Array, float]:
+    """Centre and radius of a circle or sphere, fitted algebraically to points (n, 2 or 3)."""
     root = np.sqrt(weight)
     # |x|² = 2 c·x + (R² − c²)
     system = np.column_stack([2.0 * points, np.ones(len(points))]) * root[:, None]

@@ -1,6 +1,6 @@
-"""Support for compiled kernels: array types, compilation, threads, small linear systems.
+"""Array types, compilation of kernels, threads, and small linear systems.
 
-What needs Numba or xarray is imported when it is first used, so that array types cost nothing.
+Modules that need Numba or xarray are imported on first use, so that array types cost nothing.
 """
 
 from __future__ import annotations

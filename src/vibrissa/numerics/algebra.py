@@ -1,4 +1,4 @@
-"""Small linear systems and angles inside kernels."""
+"""Small linear systems, Cholesky factors and angles for use in kernels."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from vibrissa.numerics.arrays import Array
 from vibrissa.numerics.compiled import inlined
 
-# Of a variance, what other coordinates do not explain; below this a covariance is singular.
+# Smallest share of a variance that other coordinates leave unexplained; below, it is singular.
 _SINGULAR = 1e-14
 
 
@@ -19,7 +19,7 @@ def wrapped(angle: float) -> float:
 
 @inlined
 def quick_exp(x: float) -> float:
-    """Exponential, of -20 to 20 to a part in 10⁷; loops over it vectorise."""
+    """Exponential, accurate to one part in 10⁷ from -20 to 20; loops over it vectorise."""
     power = max(x, -700.0) / 4096.0
     power = 1.0 + power * (1.0 + power * (0.5 + power / 6.0))
     for _ in range(12):  # 4096 = 2¹²
@@ -35,7 +35,7 @@ def norm3(v: Array) -> float:
 
 @inlined
 def solve3(a: Array, r: Array, x: Array) -> float:
-    """Solve a x = r by Cramer's rule; return det a (x is not set if that is 0)."""
+    """Solve a x = r by Cramer's rule; return det a (if it is 0, x is not set)."""
     c0 = a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1]
     c1 = a[1, 2] * a[2, 0] - a[1, 0] * a[2, 2]
     c2 = a[1, 0] * a[2, 1] - a[1, 1] * a[2, 0]
@@ -62,7 +62,7 @@ def solve3(a: Array, r: Array, x: Array) -> float:
 
 @inlined
 def solve(a: Array, x: Array) -> float:
-    """Solve a y = x in place (y in x; a is lost) with pivoting; return det a."""
+    """Solve a y = x in place, with pivoting (y in x; a is overwritten); return det a."""
     n, det = x.shape[0], 1.0
     for c in range(n):
         pivot = c
@@ -91,7 +91,7 @@ def solve(a: Array, x: Array) -> float:
 
 @inlined
 def cholesky(v: Array, root: Array) -> bool:
-    """Fill the lower root of a covariance, which may be v itself; False where it is singular."""
+    """Fill the lower Cholesky factor of a covariance, possibly in place; False if singular."""
     for a in range(v.shape[0]):
         for c in range(a + 1):
             total = v[a, c]
@@ -108,7 +108,7 @@ def cholesky(v: Array, root: Array) -> bool:
 
 @inlined
 def forward(root: Array, x: Array) -> None:
-    """Solve root y = x in place for a lower root."""
+    """Solve root y = x in place for a lower triangular root."""
     for a in range(x.shape[0]):
         for c in range(a):
             x[a] -= root[a, c] * x[c]
@@ -117,7 +117,7 @@ def forward(root: Array, x: Array) -> None:
 
 @inlined
 def solve_root(root: Array, x: Array) -> None:
-    """Solve root rootᵀ y = x in place for a lower root."""
+    """Solve root rootᵀ y = x in place for a lower triangular root."""
     forward(root, x)
     for a in range(x.shape[0] - 1, -1, -1):
         for c in range(a + 1, x.shape[0]):
@@ -127,7 +127,7 @@ def solve_root(root: Array, x: Array) -> None:
 
 @inlined
 def mahalanobis(root: Array, x: Array) -> float:
-    """Squared Mahalanobis distance of x, which is overwritten, for the root of a covariance."""
+    """Squared Mahalanobis distance of x for the Cholesky factor of a covariance; overwrites x."""
     forward(root, x)
     total = 0.0
     for a in range(x.shape[0]):

@@ -1,9 +1,9 @@
-"""How kernels are compiled: cached on disk, errors as NumPy has them, contraction allowed.
+"""Compilation of kernels: cached on disk, with NumPy's error model and contraction allowed.
 
-Compiling takes seconds, once for a given installation (:mod:`~vibrissa.numerics.kernel_cache`).
-Numba links and optimises every function by itself, and again within each function that calls it,
-and so on up to what Python calls. Here that alone is linked and optimised, with all that it
-consists of: functions that kernels call are only translated (:class:`_Part`).
+Compilation takes seconds, once per installation (:mod:`~vibrissa.numerics.kernel_cache`). Numba
+links and optimises every function by itself, again within each function that calls it, and so on up
+to the one called by Python. Here only the latter is linked and optimised, together with all
+functions it calls; functions called by kernels alone are only translated (:class:`_Part`).
 """
 
 from __future__ import annotations
@@ -29,33 +29,34 @@ from vibrissa.numerics.kernel_cache import PackageCache
 P = ParamSpec("P")
 R = TypeVar("R")
 
-# Reassociation stays off: results must not depend on how the compiler orders a sum.
+# Reassociation is disabled: results must not depend on how the compiler orders a sum.
 _FASTMATH = {"contract", "nsz", "arcp"}
 _OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "nogil": True,
-    "no_cfunc_wrapper": True,  # nobody calls a kernel from C
+    "no_cfunc_wrapper": True,  # kernels are not called from C
     "fastmath": _FASTMATH,
 }
 
 
-#: Older ones put attributes of functions at what these return, which LLVM refuses.
+#: Whether llvmlite supports function attributes; older versions attach them to return values, which
+#: LLVM rejects.
 _ATTRIBUTES = tuple(map(int, llvmlite.__version__.split(".")[:2])) >= (0, 48)
-#: Number of functions from which on a kernel is mostly bookkeeping around fast ones.
+#: Number of functions above which a kernel is mostly bookkeeping around fast ones.
 _LARGE = 40
-#: Objects that may be new before garbage among them is looked for.
+#: Number of new objects that trigger garbage collection during compilation.
 _YOUNG = 50_000
-#: Ends of LLVM's names of functions whose loops are worth their size in large kernels, too.
+#: Parts of LLVM's names of functions whose loops are vectorised even in large kernels.
 _VECTORISED: set[str] = set()
-#: Expressions whose value refers to arrays that are there already.
+#: Expressions whose value refers to existing arrays.
 _VIEWS = {"getitem", "static_getitem", "getattr", "build_tuple", "cast", "exhaust_iter", "phi"}
 
 
 class _Part(JITCodeLibrary):
-    """Code that is not linked, optimised or run by itself, but in what it is a part of."""
+    """Code that is linked, optimised and run only as part of a kernel."""
 
     def finalize(self) -> None:
-        """Keep the code for linking; numba looks for its environment in what can be run."""
+        """Keep the code for linking; numba looks up its environment in executable modules."""
         for variable in self._final_module.global_variables:
             if "NumbaEnv" in variable.name:
                 self._codegen._add_module(parse_assembly(str(variable)))
@@ -64,21 +65,21 @@ class _Part(JITCodeLibrary):
 
 
 class _Whole(JITCodeLibrary):
-    """Code that is linked with all its parts, and optimised with them."""
+    """Code that is linked and optimised together with all its parts."""
 
     def finalize(self) -> None:
-        """Link each part once, not once more for each that calls it."""
+        """Link each part once, rather than once per caller."""
         found: dict[JITCodeLibrary, None] = {}
-        _visit(self._linking_libraries, found)
-        # Callers first: LLVM leaves out what nothing that is linked already refers to.
+        _collect_parts(self._linking_libraries, found)
+        # Callers first: LLVM omits what nothing already linked refers to.
         self._linking_libraries = list(reversed(found))
         super().finalize()  # type: ignore[no-untyped-call]
 
     def _finalize_final_module(self) -> None:
-        """Bind what is linked in to this code alone.
+        """Restrict linked functions to this kernel.
 
-        Otherwise a copy that other code has brought, and that was optimised with that, would be
-        run in its place: results would depend on what a process has compiled or loaded before.
+        Otherwise a copy of a function from another kernel, optimised for that one, would be called:
+        results would depend on what the process has compiled or loaded before.
         """
         self._finalized = True
         self._get_module_for_linking()  # type: ignore[no-untyped-call]
@@ -89,7 +90,7 @@ class _Whole(JITCodeLibrary):
 
 
 class _Compact(_Whole):
-    """Such code, for size where it is large, but for what is to be fast: half of LLVM's time."""
+    """Such code optimised for size if large, except for fast functions: it halves LLVM's time."""
 
     def _optimize_final_module(self) -> None:
         fast = {
@@ -105,19 +106,20 @@ class _Compact(_Whole):
         super()._optimize_final_module()  # type: ignore[no-untyped-call]
 
 
-def _visit(libraries: list[JITCodeLibrary], found: dict[JITCodeLibrary, None]) -> None:
+def _collect_parts(libraries: list[JITCodeLibrary], found: dict[JITCodeLibrary, None]) -> None:
+    """Collect the parts of libraries, each once, parts of parts first."""
     for library in libraries:
         if library not in found:
             if isinstance(library, _Part):
-                _visit(library._linking_libraries, found)
+                _collect_parts(library._linking_libraries, found)
             found[library] = None
 
 
 @register_pass(mutates_CFG=False, analysis_only=True)
 class _Borrowing(AnalysisPass):
-    """References are not counted in a function that only uses arrays of its caller.
+    """Disable reference counting in functions that only use arrays of their caller.
 
-    An array that something else makes or returns, or the function itself returns, is counted.
+    Arrays that a called function creates or returns, or that the function returns, are counted.
     """
 
     _name = "borrowing"
@@ -126,7 +128,7 @@ class _Borrowing(AnalysisPass):
         super().__init__()  # type: ignore[no-untyped-call]
 
     def run_pass(self, state: Any) -> bool:
-        """Compile without counting where nothing is there to count."""
+        """Disable counting where there is nothing to count."""
         counted = state.targetctx.data_model_manager
         made = [state.return_type]
         for block in state.func_ir.blocks.values():
@@ -140,7 +142,7 @@ class _Borrowing(AnalysisPass):
 
 
 class _Flags(Flags):
-    """Numba's options, which it compares at every call that it compiles; here quickly."""
+    """Numba's options with fast hashing and comparison, which happen at every compiled call."""
 
     __slots__ = ()
 
@@ -148,18 +150,18 @@ class _Flags(Flags):
         return _HASH
 
     def values(self) -> dict[str, Any]:
-        """Give all options by name."""
+        """Return all options by name."""
         return {**_DEFAULTS, **self._values, **_FORM}
 
 
 _DEFAULTS = {name: option.default for name, option in Flags.options.items()}
-#: Options that make no difference to what is called: that is compiled once for all of them.
+#: Options that do not affect the called function, which is compiled once for all their values.
 _FORM = {"forceinline": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-_HASH = hash(Flags())  # of the names of all options alone
+_HASH = hash(Flags())  # depends on the names of the options alone
 
 
 class _WholeCompiler(Compiler):
-    """Numba's compiler, with such a library."""
+    """Numba's compiler with such a library."""
 
     library_type: type[JITCodeLibrary] = _Whole
 
@@ -171,7 +173,7 @@ class _WholeCompiler(Compiler):
         super().__init__(typing, target, library, args, returned, flags, types_of_locals)  # type: ignore[no-untyped-call]
 
     def compile_extra(self, func: Any) -> Any:
-        """Compile while cyclic garbage is looked for less often: else that is a sixth of all."""
+        """Compile with less frequent garbage collection, which else takes a sixth of the time."""
         young, *older = gc.get_threshold()
         gc.set_threshold(max(young, _YOUNG) if young else 0, *older)
         try:
@@ -180,7 +182,7 @@ class _WholeCompiler(Compiler):
             gc.set_threshold(young, *older)
 
     def define_pipelines(self) -> list[Any]:
-        """Decide about references when types are known."""
+        """Add the decision on reference counting after type inference."""
         (manager,) = super().define_pipelines()  # type: ignore[no-untyped-call]
         manager.add_pass_after(_Borrowing, NopythonTypeInference)
         manager.finalize()
@@ -196,24 +198,24 @@ class _PartCompiler(_WholeCompiler):
 
 
 class _Kernel(CPUDispatcher):
-    """What Python calls; where kernels call it, it is a part of them."""
+    """Dispatcher of a function called by Python; in kernels its part is called."""
 
     part: Any
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """Compile the part, once for all constants that it is called with."""
+        """Compile the part once for all constant arguments."""
         return self.part.get_call_template(tuple(types.unliteral(a) for a in args), kws)
 
     def get_overload(self, sig: Any) -> Any:
-        """Find the compiled part."""
+        """Return the compiled part."""
         return self.part.get_overload(sig)
 
 
 class _Inlined(CPUDispatcher):
-    """What only kernels can call: wrappers for Python would be a third of all compiling."""
+    """Dispatcher for kernels only: wrappers for Python would take a third of the compilation."""
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """Compile it once for all constants: where it is inlined, LLVM sees them."""
+        """Compile once for all constant arguments: where inlined, LLVM propagates them."""
         return super().get_call_template(tuple(map(types.unliteral, args)), kws)
 
     def __call__(self, *args: object, **options: object) -> object:
@@ -221,48 +223,50 @@ class _Inlined(CPUDispatcher):
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a function that Python calls; cached on disk, releases the GIL."""
-    compiled = _cached(function, pipeline_class=_CompactCompiler)
+    """Compile a function for calls from Python; it is cached on disk and releases the GIL."""
+    compiled = _compile_cached(function, pipeline_class=_CompactCompiler)
     compiled.__class__ = _Kernel
-    compiled.part = _part(function)
+    compiled.part = _compile_part(function)
     return cast("Callable[P, R]", compiled)
 
 
 def vectorised(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a kernel with long loops, which stay side by side within large kernels."""
+    """Compile a kernel with long loops, which are vectorised even within large kernels."""
     name = function.__name__
     _VECTORISED.add(f"{len(name)}{name}B")
     return kernel(function)
 
 
 def specialised(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a kernel anew for each constant that others call it with, so that it is faster."""
-    return cast("Callable[P, R]", _cached(function))
+    """Compile a kernel separately for each constant argument, so that it is faster."""
+    return cast("Callable[P, R]", _compile_cached(function))
 
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a small function into its callers, so that their lane loops still vectorise."""
-    return cast("Callable[P, R]", _part(function, forceinline=True))
+    """Compile a small function inline into its callers, so that their lane loops vectorise."""
+    return cast("Callable[P, R]", _compile_part(function, forceinline=True))
 
 
 def rigorous(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a function whose rounding is that of IEEE 754, operation by operation."""
-    return cast("Callable[P, R]", _cached(function, fastmath=False))
+    """Compile a function with IEEE 754 rounding of every operation."""
+    return cast("Callable[P, R]", _compile_cached(function, fastmath=False))
 
 
 def inlined_rigorous(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a small function into its callers as :func:`rigorous` ones are compiled."""
-    return cast("Callable[P, R]", _part(function, fastmath=False))
+    """Compile a small function, for callers of the kind :func:`rigorous`."""
+    return cast("Callable[P, R]", _compile_part(function, fastmath=False))
 
 
-def _cached(function: Any, **options: Any) -> Any:
+def _compile_cached(function: Any, **options: Any) -> Any:
+    """Compile a function with the cache on disk."""
     compiled: Any = numba.njit(**_OPTIONS | {"pipeline_class": _WholeCompiler} | options)(function)
-    with suppress(RuntimeError):  # numba finds no folder that it may write to
+    with suppress(RuntimeError):  # numba finds no writable folder
         compiled._cache = PackageCache(function)
     return compiled
 
 
-def _part(function: Any, **options: Any) -> Any:
+def _compile_part(function: Any, **options: Any) -> Any:
+    """Compile a function for calls from kernels only."""
     compiled: Any = numba.njit(
         **_OPTIONS | {"no_cpython_wrapper": True, "pipeline_class": _PartCompiler} | options
     )(function)
@@ -272,6 +276,6 @@ def _part(function: Any, **options: Any) -> Any:
 
 @inlined
 def copy(source: Any, target: Any) -> None:
-    """Copy a row; Numba compiles this in a tenth of the time that a slice takes it."""
+    """Copy a row; Numba compiles this in a tenth of the time of a slice assignment."""
     for i in range(target.shape[0]):
         target[i] = source[i]

@@ -1,9 +1,9 @@
-"""Row kernels on a GPU: the functions that the CPU runs, compiled once more for a row a thread.
+"""Execution of row kernels on a GPU: the CPU's functions compiled for one row per thread.
 
-A row kernel ``kernel(*tables, *inputs, *outputs, first, last)`` works on the rows from ``first`` to
-``last``. On the GPU each thread takes one row. It and all that it calls are compiled from the same
-source, with as little changed as a thread needs: arrays made inside are its own, and names may have
-substitutes. A GPU needs no lanes, as its threads are the lanes.
+A row kernel ``kernel(*tables, *inputs, *outputs, first, last)`` processes rows ``first`` to
+``last``. On the GPU each thread processes one row. The kernel and the functions it calls are
+compiled from the same source with few changes: arrays created inside are local to the thread, and
+names may have substitutes. There are no lanes, because the threads take their role.
 """
 
 from __future__ import annotations
@@ -21,29 +21,30 @@ import numpy as np
 
 from vibrissa.numerics.arrays import AnyArray
 
-# Rows on the GPU at a time, so that its memory does not limit a call.
+# Number of rows on the GPU at a time, so that its memory does not limit a call.
 _ROWS = 1 << 20
 _THREADS = 128
 _ARRAYS = ("empty", "zeros", "ones")
-# Functions of NumPy that Numba does not compile for a GPU.
+# NumPy functions that Numba does not compile for a GPU.
 _ROUNDING = ("exp", "floor", "rint", "sqrt")
 
 
 def check_device(device: str) -> None:
-    """Raise unless kernels can run on a device."""
+    """Raise an error unless kernels can run on a device."""
     if device not in ("cpu", "cuda"):
         raise ValueError(f"device is {device!r}; it must be 'cpu' or 'cuda'")
     if device == "cpu":
         return
     from numba import cuda
 
-    if not _simulated() and find_spec("numba_cuda") is None:
+    if not _is_simulated() and find_spec("numba_cuda") is None:
         raise ImportError("a GPU needs numba-cuda: pip install 'vibrissa[gpu]'")
     if not cuda.is_available():
         raise RuntimeError("no NVIDIA GPU with a driver was found; use device 'cpu'")
 
 
-def _simulated() -> bool:
+def _is_simulated() -> bool:
+    """Whether Numba's CUDA simulator is enabled."""
     from numba.core import config
 
     return bool(config.ENABLE_CUDASIM)  # type: ignore[attr-defined]
@@ -52,8 +53,8 @@ def _simulated() -> bool:
 class Translation:
     """Compiler of row kernels for the GPU.
 
-    Global names of the kernels and of what they call have other values, functions of the CPU or
-    numbers, where there are substitutes.
+    Global names used by the kernels and the functions they call can be replaced by ``substitutes``:
+    functions of the CPU, or numbers.
     """
 
     def __init__(self, substitutes: Mapping[str, Any]) -> None:
@@ -72,7 +73,7 @@ class Translation:
         from numba import cuda
 
         if kernel not in self._launchers:
-            scope = _own_functions() | {"_gpu_kernel": self._translated(kernel)}
+            scope = _gpu_functions() | {"_gpu_kernel": self._translate(kernel)}
             self._launchers[kernel] = cuda.jit(FunctionType(_launch.__code__, scope, "launch"))
         launch, shared = self._launchers[kernel], _on_gpu(tables)
         for first in range(0, len(inputs[0]), _ROWS):
@@ -86,11 +87,11 @@ class Translation:
 
     @staticmethod
     def launch(configured: Any, *args: Any) -> None:
-        """Launch a compiled kernel; benchmarks measure the GPU here."""
+        """Launch a compiled kernel; a separate method so that benchmarks can time it."""
         configured(*args)
 
-    def _translated(self, function: Any) -> Any:
-        """Compile a function of the CPU for the GPU, with what it calls."""
+    def _translate(self, function: Any) -> Any:
+        """Compile a CPU function, and those it calls, for the GPU."""
         if function not in self._compiled:
             from numba import cuda
 
@@ -98,8 +99,8 @@ class Translation:
         return self._compiled[function]
 
     def _source(self, function: Any) -> FunctionType:
-        """The function as the GPU can compile it."""
-        scope = dict(function.__globals__) | _own_functions()
+        """The function rewritten so that the GPU can compile it."""
+        scope = dict(function.__globals__) | _gpu_functions()
         scope |= {name: self._substitutes[name] for name in self._substitutes if name in scope}
         tree = ast.parse(inspect.getsource(function))
         definition = tree.body[0]
@@ -111,13 +112,13 @@ class Translation:
         ast.increment_lineno(tree, function.__code__.co_firstlineno - 1)
         code = compile(tree, function.__code__.co_filename, "exec").co_consts[0]
         for name in code.co_names:
-            if hasattr(scope.get(name), "py_func") and name not in _own_functions():
-                scope[name] = self._translated(scope[name])
+            if hasattr(scope.get(name), "py_func") and name not in _gpu_functions():
+                scope[name] = self._translate(scope[name])
         return FunctionType(code, scope, function.__name__, function.__defaults__)
 
 
 class _Local(ast.NodeTransformer):
-    """Makes arrays local to a thread, and names what takes the place of NumPy's functions."""
+    """Rewriter that makes arrays local to a thread and replaces NumPy functions."""
 
     def __init__(self, scope: Mapping[str, Any]) -> None:
         self._scope = dict(scope)
@@ -138,51 +139,55 @@ class _Local(ast.NodeTransformer):
 
 
 def _fill(array: Any, value: Any) -> Any:
+    """Set all elements of an array."""
     for i in range(array.shape[0]):
         array[i] = value
     return array
 
 
 def _sign(x: float) -> float:
+    """Sign of a number."""
     return 1.0 if x > 0.0 else (-1.0 if x < 0.0 else x)
 
 
 @cache
-def _own_functions() -> dict[str, Any]:
-    """What translated functions call by names of our own."""
+def _gpu_functions() -> dict[str, Any]:
+    """Functions available to translated code under reserved names."""
     from numba import cuda, types
 
     library: Any = np
-    if not _simulated():
+    if not _is_simulated():
         from numba.cuda import libdevice as library
     own = {f"_gpu_{name}": getattr(library, name) for name in _ROUNDING}
     own |= {"_gpu_fill": cuda.jit(device=True)(_fill), "_gpu_sign": cuda.jit(device=True)(_sign)}
     return own | {"_gpu_cuda": cuda, "_gpu_types": types}
 
 
-# Names in the scope in which each launch is compiled.
+# Names defined in the scope in which each launch is compiled.
 _gpu_cuda: Any
 _gpu_kernel: Any
 
 
 def _launch(count: Any, tables: Any, rows: Any) -> None:
+    """Process the row of this thread."""
     row = _gpu_cuda.grid(1)  # noqa: F821
     if row < count:
         _gpu_kernel(*(tables + rows + (row, row + 1)))  # noqa: F821
 
 
 @cache
-def _without_gaps(kind: str, names: tuple[str, ...]) -> Any:
+def _namedtuple_type(kind: str, names: tuple[str, ...]) -> Any:
+    """Named tuple type with some of the fields."""
     return namedtuple(kind, names)
 
 
 def _on_gpu(value: Any) -> Any:
-    """Copy arrays to the GPU, also those in named tuples; fields that are None are left out."""
+    """Copy arrays, also those in named tuples, to the GPU; fields that are None are omitted."""
     if isinstance(value, np.ndarray):
         from numba import cuda
 
         return cuda.to_device(np.ascontiguousarray(value))
     if hasattr(value, "_fields"):
         parts = {name: _on_gpu(part) for name, part in value._asdict().items() if part is not None}
-        return _without_gaps(type(value).__name__, tuple(parts))(**parts)
+        return _namedtuple_type(type(value).__name__, tuple(parts))(**parts)
     return tuple(_on_gpu(part) for part in value) if isinstance(value, tuple) else value

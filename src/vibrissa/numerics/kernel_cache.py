@@ -1,14 +1,13 @@
-"""Compiled kernels are kept on disk, and a listener reports compilation.
+"""Cache of compiled kernels on disk, and messages about compilation.
 
-Numba knows a cached kernel by its own file alone, and would go on using it after a function that it
-inlines from another file has changed; here all files with kernels of its own package, and of
-``numerics``, ``rod`` and ``signals``, whose helpers others use, are part of the key. By their
-content: the time at which a file was written, by which numba knows it, does not identify a copy.
+Numba identifies a cached kernel by its own file alone, and would continue to use it after a change
+of a function in another file that is inlined into it. Here the key includes all files with kernels
+of the same package, and of ``numerics``, ``rod`` and ``signals``, whose functions others use. They
+are identified by content, because the modification time used by numba does not identify a copy.
 
-A result must not depend on the cache. A file in it that is not as it was written, whatever cut it
-or changed it, counts as none: each has its SHA-256 in front, for machine code that is not whole
-would not be noticed otherwise. Where nothing can be written, as on a full disk, kernels are
-compiled anew in each run.
+Results must not depend on the cache. A truncated or altered file is ignored: each begins with its
+SHA-256, because incomplete machine code would not be detected otherwise. If nothing can be written,
+as on a full disk, kernels are compiled in each run.
 """
 
 from __future__ import annotations
@@ -29,11 +28,12 @@ _DIGEST = hashlib.sha256().digest_size
 
 
 @cache
-def _sources(package: Path) -> str:
+def _source_digest(package: Path) -> str:
+    """Hash of all files with kernels in a package and the shared packages."""
     digest = hashlib.sha256()
     for path in sorted(path for folder in {package, *_SHARED} for path in folder.glob("*.py")):
         source = path.read_bytes()
-        # Written so that this file, which has no kernels, is none of them.
+        # Written such that this file, which has no kernels, does not match itself.
         if any(
             b"@" + name in source for name in (b"kernel", b"specialised", b"vectorised", b"inlined")
         ):
@@ -42,25 +42,25 @@ def _sources(package: Path) -> str:
 
 
 class _Files(IndexDataCacheFile):
-    """A file for each signature, named by its key, which it holds; damaged ones count as none.
+    """Cache with one file per signature, named by its key and containing it.
 
-    Numba numbers files, and writes an index of them first. Where two processes save at once, or one
-    is stopped in between, the index names code of another signature, which is run.
+    Numba numbers the files and writes an index first. If two processes save at once, or one is
+    stopped in between, the index refers to code of another signature, which would be run.
     """
 
     def save(self, key: object, data: object) -> None:
-        """Keep data with their key."""
+        """Save data with their key."""
         self._save_data(self._name(key), (key, data))  # type: ignore[no-untyped-call]
 
     def load(self, key: object) -> Any:
-        """Load what was kept with a key; None if that is not what the file holds."""
+        """Load the data saved with a key; None if the file is damaged or has another key."""
         content = Path(self._data_path(self._name(key))).read_bytes()  # type: ignore[no-untyped-call]
         digest, kept = content[:_DIGEST], io.BytesIO(content[_DIGEST:])
         whole = hashlib.sha256(kept.getbuffer()).digest() == digest
         return pickle.load(kept) if whole and pickle.load(kept) == key else None
 
     def holds(self, key: object) -> bool:
-        """Whether there is a file of a key, whole or not."""
+        """Whether there is a file for a key, intact or not."""
         return Path(self._data_path(self._name(key))).exists()  # type: ignore[no-untyped-call]
 
     def _name(self, key: object) -> str:
@@ -73,9 +73,9 @@ class _Files(IndexDataCacheFile):
 
 
 class PackageCache(FunctionCache):
-    """Keeps a compiled function on disk, as long as the kernels of its package are the same."""
+    """Cache of a compiled function, valid as long as the kernels of its package are unchanged."""
 
-    _told = False
+    _warned = False
 
     def __init__(self, function: object) -> None:
         super().__init__(function)  # type: ignore[no-untyped-call]
@@ -83,32 +83,34 @@ class PackageCache(FunctionCache):
 
     def _index_key(self, sig: object, codegen: object) -> tuple[object, ...]:
         package = Path(self._py_func.__code__.co_filename).parent
-        return (*super()._index_key(sig, codegen), _sources(package))  # type: ignore[no-untyped-call]
+        return (*super()._index_key(sig, codegen), _source_digest(package))  # type: ignore[no-untyped-call]
 
     def holds(self, sig: object, codegen: object) -> bool:
-        """Whether what was compiled for a signature is on disk."""
+        """Whether there is a file for a signature."""
         files = cast("_Files", self._cache_file)
         return files.holds(self._index_key(sig, codegen))
 
     def load_overload(self, sig: object, target_context: object) -> Any:
-        """Load what was compiled; None if there is none that can be used."""
+        """Load a compiled function; None if there is no usable one."""
         try:
             return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         except Exception:
             return None
 
     def save_overload(self, sig: object, data: object) -> None:
-        """Keep what was compiled, if that is possible; say once if it is not."""
+        """Save a compiled function if possible; warn once if not."""
         try:
             super().save_overload(sig, data)  # type: ignore[no-untyped-call]
         except (OSError, pickle.PickleError) as fault:
-            if not PackageCache._told:
-                PackageCache._told = True
-                _say(f"compiled kernels cannot be kept and are compiled in each run: {fault}")
+            if not PackageCache._warned:
+                PackageCache._warned = True
+                _write_message(
+                    f"compiled kernels cannot be kept and are compiled in each run: {fault}"
+                )
 
 
 class _FirstCompilation(event.Listener):
-    """Say once for a verb, in a library once a package, that kernels are being compiled."""
+    """Listener that reports compilation once per verb, or in a library once per package."""
 
     def __init__(self) -> None:
         self.reported: set[str] = set()
@@ -121,20 +123,23 @@ class _FirstCompilation(event.Listener):
         what = f"for `{verb}`" if verb else f"of {package}"
         if module.startswith("vibrissa.") and what not in self.reported:
             self.reported.add(what)
-            _say(f"compiling kernels {what} (once for this installation, a minute or two) ...")
+            _write_message(
+                f"compiling kernels {what} (once for this installation, a minute or two) ..."
+            )
 
     def on_end(self, event: event.Event) -> None:
         pass
 
 
 def _verb() -> str:
-    """Verb of the command line that this process was called with; nothing in a library."""
+    """Verb of the command line with which this process was called; empty in a library."""
     if "vibrissa.cli.app" not in sys.modules:
         return ""
     return next((word for word in sys.argv[1:] if not word.startswith("-")), "")
 
 
-def _say(sentence: str) -> None:
+def _write_message(sentence: str) -> None:
+    """Write a message to standard error."""
     sys.stderr.write(f"vibrissa: {sentence}\n")
     sys.stderr.flush()
 

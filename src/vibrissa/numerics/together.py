@@ -1,9 +1,9 @@
-"""Kernels that do not call each other are compiled at the same time, by this process and a helper.
+"""Concurrent compilation of kernels in this process and a helper process.
 
-Compiling is mostly Python, which keeps one core busy. Where several kernels are needed and none of
-them is on disk, another interpreter compiles some of them, and this one finds them in the cache.
-The helper prints nothing and changes nothing else; whatever it does not finish is compiled here
-when it is called, as without it.
+Compilation is mostly Python code, which uses one core. If several kernels that do not call each
+other are needed and not cached, another interpreter compiles some of them into the cache, from
+which this process loads them. The helper has no other effects; kernels that it does not finish are
+compiled here when they are called.
 """
 
 from __future__ import annotations
@@ -22,32 +22,32 @@ from numba.core import types
 from vibrissa.numerics.arrays import Call, threads
 from vibrissa.numerics.kernel_cache import PackageCache
 
-# The helper has the sources that this process has, wherever they were found.
+# The helper gets this process's search path, so that it imports the same sources.
 _HELPER = (
     "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "
-    "from vibrissa.numerics.together import compile_asked; compile_asked(sys.stdin.buffer)"
+    "from vibrissa.numerics.together import compile_listed; compile_listed(sys.stdin.buffer)"
 )
-# The helper has about as much to do: it is waited for so many times as long as this process took
-# for its own share, and so many seconds more.
+# Longest wait for the helper, whose share is about as large: this many times the duration of this
+# process's own share, plus this many seconds.
 _PATIENCE, _AT_LEAST = 2.0, 10.0
 _lock = threading.Lock()
 
 
 def compile_together(here: list[Call], there: list[Call]) -> None:
-    """Compile kernels that will be called, some ``here`` and some ``there``, in a helper.
+    """Compile kernels that will be called, ``here`` in this process and ``there`` in a helper.
 
-    Nothing is done where that gains nothing: kernels were used before or are on disk, there is one
-    core, or what a helper compiles cannot be handed over.
+    Does nothing if there is nothing to gain: kernels have been used or are cached, there is one
+    core, or the helper could not hand over its results.
     """
     if any(kernel.overloads for kernel, _ in there):  # type: ignore[attr-defined]
         return
     with _lock:
-        mine, others = _missing(here), _missing(there)
+        mine, others = _not_cached(here), _not_cached(there)
         if not (mine and others and threads() > 1 and _runs_python()):
             return
         if any(_name(kernel) is None for kernel, _ in others):
             return
-        helper = _started(others)
+        helper = _start_helper(others)
         begun = time.monotonic()
         try:
             for kernel, signature in mine:
@@ -62,15 +62,15 @@ def compile_together(here: list[Call], there: list[Call]) -> None:
                 helper.wait()
 
 
-def compile_asked(file: BinaryIO) -> None:
-    """Compile the kernels that a file lists, into the cache: all that a helper does."""
+def compile_listed(file: BinaryIO) -> None:
+    """Compile the kernels listed in a file into the cache; run by the helper."""
     for module, name in pickle.load(file):
         kernel = getattr(import_module(module), name)
         kernel.compile(pickle.load(file))
 
 
-def _missing(calls: list[Call]) -> list[tuple[Any, tuple[types.Type, ...]]]:
-    """Kernels that are not on disk, with the types of their arguments."""
+def _not_cached(calls: list[Call]) -> list[tuple[Any, tuple[types.Type, ...]]]:
+    """Kernels that are not cached, with the types of their arguments."""
     found = []
     for call, arguments in calls:
         kernel: Any = call
@@ -78,20 +78,20 @@ def _missing(calls: list[Call]) -> list[tuple[Any, tuple[types.Type, ...]]]:
             one if isinstance(one, types.Type) else kernel.typeof_pyval(one) for one in arguments
         )
         cache, codegen = kernel._cache, kernel.targetctx.codegen()
-        # Where there is no folder for a cache, numba has another kind of it.
+        # Without a writable folder numba uses another kind of cache.
         if isinstance(cache, PackageCache) and not cache.holds(signature, codegen):
             found.append((kernel, signature))
     return found
 
 
 def _runs_python() -> bool:
-    """Whether the executable of this process is an interpreter, not a program that holds one."""
+    """Whether this process's executable is a Python interpreter, not an embedding program."""
     name = Path(sys.executable or "").stem.lower()
     return name.startswith("python") and not getattr(sys, "frozen", False)
 
 
 def _name(kernel: Any) -> tuple[str, str] | None:
-    """Module and name by which a helper finds a kernel; None if it does not."""
+    """Module and name under which a helper can import a kernel; None if it cannot."""
     function = kernel.py_func
     module = sys.modules.get(function.__module__)
     if function.__module__ == "__main__" or getattr(module, function.__name__, None) is not kernel:
@@ -99,8 +99,10 @@ def _name(kernel: Any) -> tuple[str, str] | None:
     return function.__module__, function.__name__
 
 
-def _started(calls: list[tuple[Any, tuple[types.Type, ...]]]) -> subprocess.Popen[bytes] | None:
-    """Start a helper that compiles kernels; None where no process can be started."""
+def _start_helper(
+    calls: list[tuple[Any, tuple[types.Type, ...]]],
+) -> subprocess.Popen[bytes] | None:
+    """Start a helper that compiles kernels; None if no process can be started."""
     parts = [sys.path, [_name(kernel) for kernel, _ in calls], *(each for _, each in calls)]
     try:
         asked = b"".join(map(pickle.dumps, parts))
@@ -109,7 +111,7 @@ def _started(calls: list[tuple[Any, tuple[types.Type, ...]]]) -> subprocess.Pope
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),  # a window, on Windows
+            creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),  # no window on Windows
         )
     except (OSError, pickle.PicklingError):
         return None
@@ -117,6 +119,6 @@ def _started(calls: list[tuple[Any, tuple[types.Type, ...]]]) -> subprocess.Pope
     try:
         with helper.stdin:
             helper.stdin.write(asked)
-    except OSError:  # it has ended already
+    except OSError:  # the helper has ended already
         pass
     return helper

@@ -228,7 +228,7 @@ def _check_mesh(vertices: Array, faces: Ints, stiffness: float) -> None:
     if faces.ndim != 2 or faces.shape[-1] != 3 or not len(faces):
         faults.append(f"faces have shape {faces.shape}; (m, 3) are needed")
     elif faces.min() < 0 or faces.max() >= len(vertices):
-        faults.append(f"faces name vertices {faces.min()} to {faces.max()} of {len(vertices)}")
+        faults.append(f"faces refer to vertices {faces.min()} to {faces.max()} of {len(vertices)}")
     else:
         edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
         code = edges[:, 0] * len(vertices) + edges[:, 1]
@@ -237,7 +237,7 @@ def _check_mesh(vertices: Array, faces: Ints, stiffness: float) -> None:
         if open_edges or np.unique(code).size != code.size:
             faults.append(
                 f"it is not closed: {open_edges} edges have a triangle on one side only, or "
-                "triangles are not all the same way round"
+                "triangles are not consistently oriented"
             )
     if not stiffness > 0.0:
         faults.append(f"stiffness is {stiffness!r}; it must be positive, or infinite, in N/m")

@@ -1,4 +1,4 @@
-"""The methods of Huet, Emnett & Hartmann (2022), for comparison."""
+"""Methods of Huet, Emnett & Hartmann (2022), for comparison."""
 
 from vibrissa.paper.lookup import (
     METHODS,

@@ -1,24 +1,23 @@
-"""The paper's look-up table: contacts of its grid over the space of three signals, interpolated.
+"""The paper's look-up table, estimates with it or a network, and its interpolation errors.
 
-Each reachable contact of the grid is a point in the space of the three signals, each signal over
-its range, with (r, θ, φ) as values; between points the table interpolates by natural neighbours or
+Each reachable contact of the paper's grid is a point in the space of three signals, each divided by
+its range, with (r, θ, φ) as values; the table interpolates between points by natural neighbours or
 linearly. A direction is an axis of one turn; points within half a radian of ±π are repeated a turn
 away, so that the table has no seam. For estimates, contacts within 2° of the resting whisker are
-left out, as in the paper's figures: near rest directions lose their meaning, and all contacts have
+excluded, as in the paper's figures: near rest directions become undefined, and all contacts have
 nearly the same signals.
 
-Outside the convex hull of the points there is no answer. The hull of a curved cloud also contains
-signals that no contact comes near; there the table answers from contacts far apart, as the paper's
-does. And it gives one contact wherever two have the same signals: a mean of both.
+Outside the convex hull of the points the result is NaN. The hull of a curved cloud also contains
+signals that no contact comes near; there the table interpolates between contacts far apart, as the
+paper's does. Where two contacts have the same signals it returns one contact, a mean of both.
 
-Contacts by the paper's methods, a look-up table or a network, for comparison.
+Estimates by a table or a network are one contact point for three signals. Force, moment and arc
+length are those of the exact contact at that point, and the misfit compares this contact's signals
+with the measured ones, in shares of each signal's range. The covariance is computed from central
+differences of the table or network, with steps of 0.05 % of each signal's range, as in the paper's
+sensitivity.
 
-Either gives one contact point for three signals. Its force, moment and arc length are those of the
-exact contact at that point, and the misfit compares that contact's signals with the measured ones,
-in shares of each signal's range. The covariance comes from central differences of the table or
-network, steps of 0.05 % of each signal's range, as in the paper's sensitivity.
-
-The solid that contacts fill in the space of three signals: slices, and errors of a look-up.
+Slices and errors describe the solid that contacts occupy in the space of three signals.
 """
 
 from __future__ import annotations
@@ -64,35 +63,35 @@ from vibrissa.signals import (
 )
 from vibrissa.status import Status
 
-#: Natural-neighbour as the paper's, or linear, or a function of points (n, 3) and values (n, 3)
-#: that returns a function of other points (m, 3).
+#: Natural-neighbour interpolation as in the paper, or linear, or a function of points (n, 3) and
+#: values (n, 3) that returns a function of other points (m, 3).
 Interpolation: TypeAlias = (
     Literal["natural", "linear"] | Callable[[Array, Array], Callable[[Array], Array]]
 )
 
 #: Step of the paper's central differences, as a share of a signal's range.
 STEP = 5e-4
-# A signal whose range is below this share of the whisker's unit of force or moment is zero.
-_NOTHING = 1e-9
-# Points within this share of a turn from ±π are repeated a turn away, so that the table closes.
+# Range, over the whisker's unit of force or moment, below which a signal is considered zero.
+_ZERO_RANGE = 1e-9
+# Distance from ±π, in turns, within which points are repeated a turn away.
 _OVERLAP = 0.08
 
 
 @dataclass(frozen=True, eq=False)
 class LookupTable:
-    """Contact points over the space of three signals; made by :meth:`of`.
+    """Contact points over the space of three signals; created by :meth:`of`.
 
     Attributes
     ----------
     names : tuple of str
-        The signals.
+        Names of the signals.
     low, span : (3,) arrays
         Start and size of each axis's range, SI units.
     components : bool
-        Whether a size and its direction stand as two Cartesian components.
+        Whether a magnitude and its direction are replaced by two Cartesian components.
     interpolation : callable
-        (r, θ, φ) of points over the ranges; of a :class:`NaturalNeighbour`, with the method as a
-        second argument.
+        Function from points over the ranges to (r, θ, φ); for a :class:`NaturalNeighbour`, the
+        method is a second argument.
     """
 
     names: tuple[str, ...]
@@ -111,31 +110,31 @@ class LookupTable:
         near_rest: bool = False,
         interpolation: Interpolation | None = None,
     ) -> LookupTable:
-        """Make the table of three signals.
+        """Create the table of three signals.
 
         Parameters
         ----------
         contact_map : ContactMap
             Map with the paper's grid.
         names : tuple of str
-            The signals, in canonical order.
+            Names of the signals, in canonical order.
         components : bool
-            Whether a size and its direction, where both are among the signals, are turned into two
-            Cartesian components first: not the paper's method, but a better one.
+            Whether to replace a magnitude and its direction, if both are among the signals, by two
+            Cartesian components: not the paper's method, but a better one.
         near_rest : bool
-            Whether contacts within 2° of rest are kept.
+            Whether to include contacts within 2° of rest.
         interpolation : {"natural", "linear"} or callable, optional
-            Interpolation for good; by default natural or linear, as each look-up asks.
+            Fixed interpolation; by default natural or linear as chosen at each look-up.
 
         Returns
         -------
         LookupTable
-            The table.
+            Table of the reachable contacts.
 
         Raises
         ------
         ValueError
-            If the map has no grid, or one of the signals is next to zero everywhere.
+            If the map has no grid, or a signal is practically zero everywhere.
         """
         if contact_map.grid is None:
             raise ValueError("the map has no grid to look up in: simulate it with grid=True")
@@ -153,11 +152,11 @@ class LookupTable:
         low = np.where(circular, -np.pi, signals.min(axis=0))
         span = np.where(circular, 2.0 * np.pi, np.ptp(signals, axis=0))
         _check_ranges(contact_map, names, span)
-        points, values = _closed((signals - low) / span, values, circular)
-        return cls(names, low, span, components, _interpolated(points, values, interpolation))
+        points, values = _close_circle((signals - low) / span, values, circular)
+        return cls(names, low, span, components, _make_interpolation(points, values, interpolation))
 
     def points(self, signals: Array) -> Array:
-        """Compute the points of signals in the table.
+        """Convert signals to the table's coordinates.
 
         Parameters
         ----------
@@ -180,22 +179,23 @@ class LookupTable:
 
 
 def cartesian(spheres: Array) -> Array:
-    """Points (..., 3) of spherical coordinates (r, θ, φ) (..., 3)."""
+    """Convert spherical coordinates (r, θ, φ) (..., 3) to points (..., 3)."""
     r, theta, phi = np.moveaxis(spheres, -1, 0)
     across = r * np.cos(phi)
     return np.stack([across * np.cos(theta), across * np.sin(theta), r * np.sin(phi)], axis=-1)
 
 
-def _interpolated(
+def _make_interpolation(
     points: Array, values: Array, interpolation: Interpolation | None
 ) -> Callable[..., Array]:
+    """Interpolation of values at points."""
     if callable(interpolation):
         return interpolation(points, values)
     natural: Any = NaturalNeighbour(points, values, scale=np.ones(3))
     return natural if interpolation is None else partial(natural, method=interpolation)
 
 
-def _closed(points: Array, values: Array, circular: Array) -> tuple[Array, Array]:
+def _close_circle(points: Array, values: Array, circular: Array) -> tuple[Array, Array]:
     """Add copies a turn away, so that directions near ±π have neighbours on both sides."""
     for k in np.flatnonzero(circular):
         turn = np.eye(3)[k]
@@ -206,7 +206,7 @@ def _closed(points: Array, values: Array, circular: Array) -> tuple[Array, Array
 
 
 def _with_components(signals: Array, names: tuple[str, ...]) -> tuple[Array, AnyArray]:
-    """Signals with each size and its direction as components; which are still directions."""
+    """Replace each magnitude and its direction by components; also mark remaining directions."""
     out, circular = signals.copy(), circular_among(names)
     for size, direction in (("FT", "FD"), ("MB", "MD")):
         if size in names and direction in names:
@@ -218,24 +218,25 @@ def _with_components(signals: Array, names: tuple[str, ...]) -> tuple[Array, Any
 
 
 def _check_ranges(contact_map: ContactMap, names: tuple[str, ...], span: Array) -> None:
+    """Raise a ValueError if a signal is practically zero for every contact."""
     d = contact_map.chart.discretization
     unit = {"F": d.force, "M": d.moment}
     for name, size in zip(names, span, strict=True):
-        if size < _NOTHING * unit[name[0]]:
+        if size < _ZERO_RANGE * unit[name[0]]:
             raise ValueError(
-                f"{name} is next to zero for every contact of this whisker, so that "
+                f"{name} is practically zero for every contact of this whisker, so that "
                 f"({', '.join(names)}) do not span a table"
             )
 
 
-#: Methods of estimating other than the exact one.
+#: Methods of estimation other than the exact one.
 METHODS = ("lookup", "lookup-linear", "network")
 
-#: Signals (n, 3), SI units, to contact points (n, 3), m.
+#: Function from signals (n, 3), SI units, to contact points (n, 3), m.
 Solver = Callable[[Array], Array]
 
-# Tables and networks of each map that is alive, by kind and signals.
-_made: WeakKeyDictionary[
+# Tables and networks of existing maps, by kind and signals.
+_solvers: WeakKeyDictionary[
     ContactMap, dict[tuple[str, tuple[str, ...]], LookupTable | NetworkSolver]
 ] = WeakKeyDictionary()
 
@@ -260,26 +261,26 @@ def estimate(
     using : str or tuple of str
         Three signals to use.
     method : {"lookup", "lookup-linear", "network"}
-        Look-up table interpolated by natural neighbours or linearly, or a network. Either is made
-        at the first use and kept as long as the map (the network: ten seconds).
+        Look-up table, interpolated by natural neighbours or linearly, or network. Each is created
+        at first use and kept with the map (a network takes ten seconds).
     noise : mapping or (6, 6) array_like, optional
-        Standard deviation of each signal, or covariance of (F, M), SI units; gives covariances.
+        Standard deviation of each signal, or covariance of (F, M), SI units, for covariances.
     prior : Prior, optional
-        Possible contacts; others get the status ``OUTSIDE_PRIOR``.
+        Restriction of the possible contacts; others get the status ``OUTSIDE_PRIOR``.
 
     Returns
     -------
     Contacts
-        At most one candidate for each measurement. The status is ``APPROXIMATE``, as neither table
-        nor network shows whether contacts are ambiguous; ``OUTSIDE_MAP`` outside the table;
+        Result with at most one candidate per measurement. The status is ``APPROXIMATE``, because
+        neither table nor network shows ambiguity; ``OUTSIDE_MAP`` outside the table;
         ``OUTSIDE_PRIOR``; or ``MISSING``. ``chi_squared`` is the largest difference between the
-        signals of the contact given and those measured, in shares of their ranges.
+        signals of the estimated contact and those measured, in shares of their ranges.
 
     Raises
     ------
     ValueError
-        If the method is not known, there are not three signals, the map has no grid to look up in,
-        or signals or noise do not fit.
+        If the method is unknown, there are not three signals, the map has no grid, or signals or
+        noise are invalid.
     """
     if method not in METHODS:
         known = ", ".join(repr(name) for name in METHODS)
@@ -325,8 +326,8 @@ def estimate(
 
 
 def _solver(contact_map: ContactMap, method: str, names: tuple[str, ...]) -> Solver:
-    """The table or network of three signals, made if it is not there yet."""
-    made = _made.setdefault(contact_map, {})
+    """Return the table or network for three signals, created at first use."""
+    made = _solvers.setdefault(contact_map, {})
     key = (method.split("-", maxsplit=1)[0], names)
     if key not in made:
         make = train_network if method == "network" else LookupTable.of
@@ -338,7 +339,7 @@ def _solver(contact_map: ContactMap, method: str, names: tuple[str, ...]) -> Sol
 
 
 def _ranges(contact_map: ContactMap, names: tuple[str, ...]) -> Array:
-    """Range of each signal over the map, SI units; of a direction, a turn."""
+    """Range of each signal over the map, SI units; of a direction, 2π."""
     d = contact_map.chart.discretization
     values = contact_map.chart.values.reshape(-1, 6)
     known = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))
@@ -348,7 +349,7 @@ def _ranges(contact_map: ContactMap, names: tuple[str, ...]) -> Array:
 
 
 def _differences(solve: Solver, signals: Array, ranges: Array) -> Array:
-    """∂(contact point)/∂(signals), (n, 3, 3); NaN where a step leaves what is known."""
+    """∂(contact point)/∂(signals), (n, 3, 3); NaN where a step leaves the table."""
     out = np.empty((len(signals), 3, 3))
     for k in range(3):
         step = STEP * ranges[k] * np.eye(3)[k]
@@ -360,6 +361,7 @@ def _differences(solve: Solver, signals: Array, ranges: Array) -> Array:
 def _misfit(
     signals: Array, force: Array, moment: Array, names: tuple[str, ...], ranges: Array
 ) -> Array:
+    """Largest difference (n,) between signals of contacts and measured ones, over the ranges."""
     which = [SIGNALS.index(name) for name in names]
     away = signals_of(force, moment)[:, which] - signals
     away = within_turn(away, circular_among(names))
@@ -367,8 +369,8 @@ def _misfit(
         return np.asarray(np.abs(away / ranges).max(axis=1))
 
 
-# The slice extends as far as the map's nodes within this share of the held signal's range (of a
-# turn, for an angle).
+# Distance from the held value, as a share of the signal's range (of a turn for an angle), within
+# which the map's nodes determine the extent of a slice.
 _NEAR = 0.04
 
 
@@ -381,23 +383,23 @@ def signal_slice(
     domain: Domain = "paper",
     interpolation: Interpolation = "natural",
 ) -> xr.Dataset:
-    """Find the contacts on a plane through the space of three signals, exactly.
+    """Compute the exact contacts on a plane through the space of three signals.
 
     Parameters
     ----------
     contact_map : ContactMap
-        The whisker's map.
+        Map of the whisker.
     fixed : mapping, optional
-        Signal that is held, with its value, SI units; by default the paper's M_D = 3π/2, which is
-        −π/2.
+        Signal that is held constant and its value, SI units; by default the paper's M_D = 3π/2,
+        which is −π/2.
     using : str or tuple of str
-        The three signals.
+        Three signals.
     points : int
-        Number of samples of each of the other two signals.
+        Number of samples along each of the other two signals.
     domain : {"paper", "reachable"}
-        Contacts within the bounds of the paper's grid, or all of Ω.
+        Domain of contacts: within the bounds of the paper's grid, or all of Ω.
     interpolation : {"natural", "linear"} or callable
-        Interpolation of the look-up whose errors are given.
+        Interpolation of the look-up for which errors are computed.
 
     Returns
     -------
@@ -410,14 +412,14 @@ def signal_slice(
     Raises
     ------
     ValueError
-        If not one signal of the triplet is held, or there are too few points.
+        If other than one signal of the triplet is held, or there are too few points.
     """
     names = selection(using, exactly=3)
     fixed = {"MD": -0.5 * np.pi} if fixed is None else fixed
     if len(fixed) != 1 or not set(fixed) <= set(names):
         raise ValueError(f"one of {', '.join(names)} is to be fixed; got {dict(fixed)}")
     if points < 2:
-        raise ValueError(f"a slice needs at least 2 points a side; got {points}")
+        raise ValueError(f"a slice needs at least 2 points per side; got {points}")
     ((held, value),) = fixed.items()
     free = [name for name in names if name != held]
     axes = _axes(contact_map, held, value, free, points, domain)
@@ -465,7 +467,7 @@ def error_solid(
     stride: int = 3,
     interpolation: Interpolation = "natural",
 ) -> xr.Dataset:
-    """Look up contacts midway between those of the paper's grid, where its errors are largest."""
+    """Errors of the look-up midway between contacts of the paper's grid, where they are largest."""
     if contact_map.grid is None:
         raise ValueError("the map has no grid to interpolate: simulate it with grid=True")
     axes = [contact_map.grid[name].to_numpy() for name in ("r", "theta", "phi")]
@@ -482,7 +484,7 @@ def interpolation_errors(
     using: str | tuple[str, ...] = ("Fx", "MB", "MD"),
     interpolation: Interpolation = "natural",
 ) -> xr.DataArray:
-    """Look up contacts in the interpolated grid, and compare them with the true ones."""
+    """Distances of contacts looked up in the interpolated grid from the true ones."""
     names = selection(using, exactly=3)
     values, dims, _ = measured(contacts, names)
     table = LookupTable.of(contact_map, names, near_rest=True, interpolation=interpolation)
@@ -502,7 +504,7 @@ def interpolation_errors(
 def _axes(
     contact_map: ContactMap, held: str, value: float, free: list[str], points: int, domain: Domain
 ) -> list[tuple[Array, float]]:
-    """Samples of the free signals over the contacts near the slice, and where they turn sparse."""
+    """Samples of the free signals over contacts near the slice, and widths of the linear parts."""
     nodes = contact_map.to_dataset(domain)
     away = np.abs(nodes[held].to_numpy() - value)
     if CIRCULAR[SIGNALS.index(held)]:

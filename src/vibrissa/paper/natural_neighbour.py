@@ -1,24 +1,23 @@
-"""Natural-neighbour interpolation of values at scattered points in space, as of the paper's tables.
+"""Natural-neighbour interpolation of values at scattered points, as used by the paper.
 
-Sibson's weights of the points around a query are shares of volumes.
+If a query x were added to the points, its Voronoi cell would take volumes from the cells of its
+neighbours; the shares λᵢ of these volumes are Sibson's weights. They are positive, sum to one, and
+Σ λᵢ xᵢ = x, so linear functions are reproduced; they are smooth except at the points themselves.
 
-A query x, put among the points as one more, would take a piece of volume from the Voronoi cells of
-its neighbours; the shares λᵢ of those pieces are Sibson's weights. They are positive, sum to one,
-and Σ λᵢ xᵢ = x, so linear functions are reproduced; they are smooth but at the points themselves.
-
-Of the Delaunay triangulation the query changes only its cavity, the tetrahedra whose circumspheres
-contain it: they give way to the tetrahedra from x to the cavity's faces. The circumcentre of a
-tetrahedron parts it among its vertices by Voronoi cells, into the signed volumes::
+The query changes the Delaunay triangulation only in its cavity, the tetrahedra whose circumspheres
+contain it: they are replaced by the tetrahedra from x to the cavity's faces. The circumcentre of a
+tetrahedron divides it among its vertices, by Voronoi cells, into the signed volumes::
 
     w_i(T) = Σ over edges ij and triangles ijk of T: |x_i − x_j|² (x_i − x_k)·(x_j − x_k) h / 24|N|²
 
 with N = (x_j − x_i) × (x_k − x_i), and h = ± (c − x_i)·N the circumcentre's height over the
-triangle, positive toward the fourth vertex. What x takes from point i is the sum of w_i over the
-cavity less that over the new tetrahedra. No Voronoi cell is made, and cells need not be bounded.
+triangle, positive toward the fourth vertex. The volume taken from point i is the sum of w_i over
+the cavity minus that over the new tetrahedra. No Voronoi cell is constructed, and cells may be
+unbounded.
 
-Four points on a circle make a flat tetrahedron; it belongs to no cell and is passed through. On
-the convex hull, where volumes grow without bound, the weights tend to the barycentric ones; these
-are taken where roundoff has spoilt the volumes: nearer than about 1e-11 to the hull, or to a point.
+Four points on a circle form a flat tetrahedron; it belongs to no cell and is ignored. On the convex
+hull, where volumes diverge, the weights tend to the barycentric ones; these are used where roundoff
+dominates the volumes: closer than about 1e-11 to the hull, or to a point.
 
 References
 ----------
@@ -35,22 +34,22 @@ from scipy.spatial import Delaunay, QhullError
 
 from vibrissa.numerics import Array, IntArray, copy, inlined, kernel, share_out
 
-#: Vertices (n, 3); corners and neighbours (t, 4); circumcentres from the first corner (t, 3);
-#: volumes w_i (t, 4); which tetrahedra are flat (t,).
+#: Vertices (n, 3); corners and neighbours (t, 4); circumcentres relative to the first corner
+#: (t, 3); volumes w_i (t, 4); kinds of flat tetrahedra (t,).
 Mesh = tuple[Array, IntArray, IntArray, Array, Array, IntArray]
-#: Where each vertex (n,) stands among a query's neighbours or -1; the neighbours; their weights.
+#: Index of each vertex (n,) among a query's neighbours, or -1; the neighbours; their weights.
 Found = tuple[IntArray, IntArray, Array]
 
-_FLAT = 1e-12  # a tetrahedron is flat below this share of its longest edge cubed
-_SAME = 1e-13  # points nearer than this, in coordinates with ranges of about one, are one
-_ROUNDOFF = 1e-15  # volumes below this share of the longest edge cubed have no sure sign
-_ON_CIRCLE = 1e-6  # four points are on a circle to this share of its radius
-_REPRODUCED = 1e-9  # to this share of the neighbours' distance the weights must reproduce the query
+_FLAT = 1e-12  # volume over the longest edge cubed below which a tetrahedron is flat
+_SAME = 1e-13  # distance below which points coincide, in coordinates with ranges of about one
+_ROUNDOFF = 1e-15  # volume over the longest edge cubed below which its sign is uncertain
+_ON_CIRCLE = 1e-6  # largest relative deviation of a point's power from zero for four on a circle
+_REPRODUCED = 1e-9  # largest error, over the neighbours' distance, of a query from its weights
 
 
 @inlined
-def _part(tetrahedron: Array, centre: Array, shares: Array) -> None:
-    """w_i of a tetrahedron (4, 3) whose circumcentre is given; added to ``shares`` (4,)."""
+def _add_cell_volumes(tetrahedron: Array, centre: Array, shares: Array) -> None:
+    """Add w_i of a tetrahedron (4, 3) with known circumcentre to ``shares`` (4,)."""
     for last in range(4):
         i, j, k = (last + 1) % 4, (last + 2) % 4, (last + 3) % 4
         ax = tetrahedron[j, 0] - tetrahedron[i, 0]
@@ -78,7 +77,7 @@ def _part(tetrahedron: Array, centre: Array, shares: Array) -> None:
         aa, bb = ax * ax + ay * ay + az * az, bx * bx + by * by + bz * bz
         ab = ax * bx + ay * by + az * bz
         factor = height / (24.0 * square)
-        # The angles at k, j and i stand over the edges ij, ik and jk.
+        # The angles at k, j and i are opposite the edges ij, ik and jk.
         ij = factor * aa * (bb - ab)
         ik = factor * bb * (aa - ab)
         jk = factor * (aa + bb - 2.0 * ab) * ab
@@ -89,7 +88,7 @@ def _part(tetrahedron: Array, centre: Array, shares: Array) -> None:
 
 @inlined
 def _circumcentre(tetrahedron: Array, centre: Array) -> float:
-    """Fill the circumcentre relative to the first vertex; return volume over longest edge³."""
+    """Fill the circumcentre relative to the first vertex; return 6 × volume over longest edge³."""
     a0 = tetrahedron[1, 0] - tetrahedron[0, 0]
     a1 = tetrahedron[1, 1] - tetrahedron[0, 1]
     a2 = tetrahedron[1, 2] - tetrahedron[0, 2]
@@ -118,7 +117,7 @@ def _circumcentre(tetrahedron: Array, centre: Array) -> float:
 
 @inlined
 def _on_a_circle(tetrahedron: Array) -> bool:
-    """Whether four points in a plane lie on a circle."""
+    """Whether four coplanar points are on a circle."""
     a, b = tetrahedron[1] - tetrahedron[0], tetrahedron[2] - tetrahedron[0]
     d = tetrahedron[3] - tetrahedron[0]
     aa, bb, ab = np.sum(a * a), np.sum(b * b), np.sum(a * b)
@@ -140,9 +139,9 @@ def measure(
     first: int,
     last: int,
 ) -> None:
-    """Circumcentres (from the first vertex) and parts of tetrahedra.
+    """Compute circumcentres (relative to the first vertex) and volumes w_i of tetrahedra.
 
-    ``flat``: 1 for four points on a circle, 2 for four in a plane that are not, at the hull.
+    ``flat``: 1 for four points on a circle, 2 for other coplanar points, which occur at the hull.
     """
     tetrahedron, centre = np.empty((4, 3)), np.empty(3)
     for t in range(first, last):
@@ -154,7 +153,7 @@ def measure(
         copy(centre, centres[t])
         for c in range(3):
             centre[c] += tetrahedron[0, c]
-        _part(tetrahedron, centre, shares[t])
+        _add_cell_volumes(tetrahedron, centre, shares[t])
 
 
 @inlined
@@ -173,6 +172,7 @@ def _contains(mesh: Mesh, t: int, query: Array) -> bool:
 
 @inlined
 def _distance2(a: Array, b: Array) -> float:
+    """Squared distance of two points."""
     return float((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
 
 
@@ -187,7 +187,7 @@ def _volume(a: Array, b: Array, c: Array, d: Array) -> float:
 
 @inlined
 def _beyond(mesh: Mesh, t: int, k: int, query: Array) -> bool:
-    """Whether the query lies behind the face opposite corner k, and not only by roundoff."""
+    """Whether the query is behind the face opposite corner k, by more than roundoff."""
     vertices, corners = mesh[0], mesh[1]
     a, b = vertices[corners[t, (k + 1) % 4]], vertices[corners[t, (k + 2) % 4]]
     c, top = vertices[corners[t, (k + 3) % 4]], vertices[corners[t, k]]
@@ -197,8 +197,8 @@ def _beyond(mesh: Mesh, t: int, k: int, query: Array) -> bool:
 
 
 @inlined
-def _holds(mesh: Mesh, t: int, query: Array) -> bool:
-    """Whether a tetrahedron that is not flat holds the query."""
+def _encloses(mesh: Mesh, t: int, query: Array) -> bool:
+    """Whether a tetrahedron that is not flat contains the query."""
     if mesh[5][t] > 0:
         return False
     behind = 0
@@ -209,10 +209,10 @@ def _holds(mesh: Mesh, t: int, query: Array) -> bool:
 
 @kernel
 def locate(mesh: Mesh, queries: Array, inside: IntArray, first: int, last: int) -> None:
-    """Fill ``inside`` with the tetrahedra that hold the queries, -1 outside the convex hull.
+    """Fill ``inside`` with the tetrahedra that contain the queries, -1 outside the convex hull.
 
-    From one tetrahedron to the next, through a face that the query lies behind; of a flat one,
-    which has no sides, through any.
+    Walks from one tetrahedron to the next through a face that the query is behind, or through any
+    face of a flat one.
     """
     neighbours, flat = mesh[2], mesh[5]
     total = len(neighbours)
@@ -228,7 +228,7 @@ def locate(mesh: Mesh, queries: Array, inside: IntArray, first: int, last: int) 
             turn = (turn * 1103515245 + 12345) % 2147483648
             out = -1
             for c in range(4):
-                # Another order each time: in the same one roundoff could make it go in circles.
+                # Faces are tried in varying order: in a fixed one roundoff could cause cycles.
                 k = (turn // 65536 + c) % 4
                 if flat[t] > 0 or _beyond(mesh, t, k, query):
                     out = k
@@ -239,14 +239,14 @@ def locate(mesh: Mesh, queries: Array, inside: IntArray, first: int, last: int) 
             t = neighbours[t, out]
         if steps == total:
             for other in range(total):
-                if _holds(mesh, other, query):
+                if _encloses(mesh, other, query):
                     inside[row] = start = other
                     break
 
 
 @inlined
-def _at(v: int, found: Found, count: IntArray) -> int:
-    """Where vertex v stands among the neighbours; it is added if it is new."""
+def _slot_of(v: int, found: Found, count: IntArray) -> int:
+    """Index of vertex v among the neighbours; it is added if new."""
     slots, members, weights = found
     if slots[v] < 0:
         slots[v] = count[0]
@@ -266,10 +266,10 @@ def sibson_weights(
     cavity: IntArray,
     found: Found,
 ) -> int:
-    """Weights of the query's neighbours; return how many there are.
+    """Compute the weights of the query's neighbours; return their number.
 
-    ``marks`` (one a tetrahedron) must not hold ``mark``; the slots (one a vertex) are -1 before and
-    after.
+    ``marks`` (one per tetrahedron) must not contain ``mark``; the slots (one per vertex) are -1
+    before and after.
     """
     vertices, corners, neighbours, _, shares, _ = mesh
     slots, members, weights = found
@@ -286,7 +286,7 @@ def sibson_weights(
         t = cavity[done]
         done += 1
         for k in range(4):
-            weights[_at(corners[t, k], found, count)] += shares[t, k]
+            weights[_slot_of(corners[t, k], found, count)] += shares[t, k]
             other = neighbours[t, k]
             if other >= 0 and marks[other] == mark:
                 continue
@@ -294,7 +294,7 @@ def sibson_weights(
                 marks[other], cavity[size] = mark, other
                 size += 1
                 continue
-            # A face of the cavity: with the query a new tetrahedron.
+            # A face of the cavity forms a new tetrahedron with the query.
             for c in range(1, 4):
                 copy(vertices[corners[t, (k + c) % 4]], tetrahedron[c])
             if _circumcentre(tetrahedron, centre) < _FLAT:
@@ -302,21 +302,21 @@ def sibson_weights(
             for c in range(3):
                 centre[c] += query[c]
             new[:] = 0.0
-            _part(tetrahedron, centre, new)
+            _add_cell_volumes(tetrahedron, centre, new)
             for c in range(1, 4):
-                weights[_at(corners[t, (k + c) % 4], found, count)] -= new[c]
+                weights[_slot_of(corners[t, (k + c) % 4], found, count)] -= new[c]
     for j in range(count[0]):
         slots[members[j]] = -1
-    if _normalised(vertices, query, count[0], members, weights):
+    if _normalise(vertices, query, count[0], members, weights):
         return int(count[0])
     return _barycentric(mesh, query, start, members, weights)
 
 
 @inlined
-def _normalised(
+def _normalise(
     vertices: Array, query: Array, count: int, members: IntArray, weights: Array
 ) -> bool:
-    """Let the weights sum to one; whether they are not negative and reproduce the query."""
+    """Normalise the weights; return whether they are non-negative and reproduce the query."""
     total = 0.0
     for j in range(count):
         total += weights[j]
@@ -335,7 +335,7 @@ def _normalised(
 
 @inlined
 def _barycentric(mesh: Mesh, query: Array, t: int, members: IntArray, weights: Array) -> int:
-    """Weights of the corners of the tetrahedron around the query."""
+    """Barycentric weights of the corners of the tetrahedron around the query."""
     vertices, corners = mesh[0], mesh[1]
     a, b = vertices[corners[t, 0]], vertices[corners[t, 1]]
     c, d = vertices[corners[t, 2]], vertices[corners[t, 3]]
@@ -360,7 +360,7 @@ def interpolate(
     first: int,
     last: int,
 ) -> None:
-    """Fill ``out`` for the queries whose tetrahedron, in ``inside``, is not -1."""
+    """Fill ``out`` for the queries inside a tetrahedron (``inside`` not -1)."""
     vertices, corners = mesh[0], mesh[1]
     n, tetrahedra = len(vertices), len(corners)
     found = (np.full(n, -1), np.empty(n, np.int64), np.empty(n))
@@ -382,22 +382,22 @@ def interpolate(
 
 
 class NaturalNeighbour:
-    """Values at scattered points in space, interpolated.
+    """Natural-neighbour or linear interpolation of values at scattered points in space.
 
     Parameters
     ----------
     points : (n, 3) array_like
-        Places where the values are known; not all in one plane. Of points that coincide one counts.
+        Points at which the values are known; not all in one plane. Duplicates are ignored.
     values : (n, k) array_like
-        The values.
+        Values at the points.
     scale : (3,) array_like, optional
-        Divisors of the coordinates, so that distances along all axes are comparable; by default
-        their ranges.
+        Divisors of the coordinates that make distances along all axes comparable; by default their
+        ranges.
 
     Raises
     ------
     ValueError
-        If shapes do not fit, something is not finite, or all points lie in one plane.
+        If shapes do not match, values are not finite, or all points are in one plane.
     """
 
     def __init__(
@@ -422,15 +422,15 @@ class NaturalNeighbour:
             triangulation = Delaunay(places / self.scale)
         except QhullError as error:
             raise ValueError("the points do not span space: all lie in one plane") from error
-        self._mesh = _mesh(triangulation)
+        self._mesh = _build_mesh(triangulation)
 
     def __call__(
         self, queries: ArrayLike, method: Literal["natural", "linear"] = "natural"
     ) -> Array:
-        """Interpolate."""
+        """Interpolate values at queries (m, 3); NaN outside the convex hull."""
         if method not in ("natural", "linear"):
             raise ValueError(f"method is 'natural' or 'linear'; got {method!r}")
-        wanted, inside = self._located(queries)
+        wanted, inside = self._locate(queries)
         out = np.full((len(wanted), self.values.shape[1]), np.nan)
         natural = method == "natural"
         share_out(
@@ -442,21 +442,21 @@ class NaturalNeighbour:
         return out
 
     def weights(self, query: ArrayLike) -> tuple[IntArray, Array]:
-        """Sibson's weights of the points around one query.
+        """Sibson's weights of the points around a query.
 
         Parameters
         ----------
         query : (3,) array_like
-            Place of the query.
+            Position of the query.
 
         Returns
         -------
         indices : (j,) int array
-            The natural neighbours; none outside the convex hull.
+            Indices of the natural neighbours; none outside the convex hull.
         weights : (j,) array
             Weights of these points; they sum to one.
         """
-        wanted, inside = self._located(np.asarray(query, dtype=np.float64)[None])
+        wanted, inside = self._locate(np.asarray(query, dtype=np.float64)[None])
         if inside[0] < 0:
             return np.empty(0, np.int64), np.empty(0)
         n, tetrahedra = len(self._mesh[0]), len(self._mesh[1])
@@ -466,8 +466,8 @@ class NaturalNeighbour:
         _, members, weights = found
         return members[:count].copy(), weights[:count].copy()
 
-    def _located(self, queries: ArrayLike) -> tuple[Array, IntArray]:
-        """Scaled queries (m, 3), and the tetrahedra that hold them, -1 outside."""
+    def _locate(self, queries: ArrayLike) -> tuple[Array, IntArray]:
+        """Scaled queries (m, 3), and the tetrahedra that contain them, -1 outside."""
         wanted = np.asarray(queries, dtype=np.float64)
         if wanted.ndim != 2 or wanted.shape[1] != 3:
             raise ValueError(f"queries must be (m, 3); got {wanted.shape}")
@@ -477,7 +477,8 @@ class NaturalNeighbour:
         return wanted, inside
 
 
-def _mesh(triangulation: Delaunay) -> Mesh:
+def _build_mesh(triangulation: Delaunay) -> Mesh:
+    """Mesh with circumcentres and volumes, from a Delaunay triangulation."""
     vertices = np.ascontiguousarray(triangulation.points)
     corners = triangulation.simplices.astype(np.int64)
     n = len(corners)

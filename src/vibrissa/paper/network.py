@@ -1,10 +1,10 @@
-"""The paper's network: trained on contacts, it computes a contact point from three signals.
+"""The paper's network, trained to compute a contact point from three signals.
 
-A perceptron of three layers of rectifiers learns contact points from random contacts of Ω outside
-the cone of 2° about rest. Sizes span orders of magnitude, so their cube roots go in, directions as
-cosine and sine, all standardised. Where two contacts have the same signals no function can give
-both; a large error on contacts that it was not trained on is therefore evidence (weak, for it also
-comes from training too short) that the triplet is not unique.
+A perceptron of three layers of rectifiers is trained on random contacts of Ω outside the cone of 2°
+about rest. Its inputs are cube roots of magnitudes, which span orders of magnitude, and cosine and
+sine of directions, all standardised. Where two contacts have the same signals no function can
+return both; a large error on contacts not used in training is therefore evidence (weak, because
+insufficient training causes it too) that the triplet is not unique.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from vibrissa.numerics import AnyArray, Array
 from vibrissa.rod import contacts_at, solve_forces, with_normal_force
 from vibrissa.signals import CIRCULAR, SIGNALS, cone_angle, selection, signals_of, within_cone
 
-#: Quantiles of a network's errors that are evidence on a triplet.
+#: Quantiles of a network's errors that are stored as evidence on a triplet.
 QUANTILES = (0.5, 0.95)
-# Up to this share of the force at slip-off, which the chart has to about 1e-4.
+# Largest share of the force at slip-off, which the chart approximates to about 1e-4.
 _SHARE_OF_FOLD = 0.999
 _LAYERS = (64, 64, 64)
 _BATCH = 256
 _EPOCHS = 60
 _PATIENCE = 10
-# Signals this many times as far from those trained on as the farthest held out are outside.
+# Distance from training signals, over the largest of held-out ones, above which the result is NaN.
 _MARGIN = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnContacts:
-    """Random stable contacts."""
+    """Random stable contacts, SI units except ξ."""
 
     contacts: Array  # (n, 3), ξ
     point: Array
@@ -55,7 +55,7 @@ class DrawnContacts:
 def draw_contacts(
     contact_map: ContactMap, number: int, seed: int, *, near_rest: bool = False
 ) -> DrawnContacts:
-    """Draw stable contacts, uniform in arc length, bearing and share of the force at slip-off."""
+    """Draw stable contacts, uniform in arc length, bearing and share of the fold force."""
     rng, kept, missing = np.random.default_rng(seed), [], number
     d, fold = contact_map.chart.discretization, contact_map.chart.fold
     while missing > 0:
@@ -74,16 +74,16 @@ def draw_contacts(
 
 @dataclass(frozen=True, eq=False)
 class NetworkSolver:
-    """A trained network; made by :func:`train_network`.
+    """A trained network; created by :func:`train_network`.
 
     Attributes
     ----------
     names : tuple of str
-        The three signals.
+        Names of the three signals.
     held_out : DrawnContacts
-        Contacts that it was not trained on.
+        Contacts not used in training.
     errors : (n,) array
-        Distances of its answers from those contacts, m.
+        Distances of the predictions for those contacts, m.
     """
 
     names: tuple[str, ...]
@@ -92,20 +92,20 @@ class NetworkSolver:
     _predict: _Prediction
 
     def __call__(self, signals: Array) -> Array:
-        """Predict contact points."""
+        """Predict contact points (n, 3) from signals (n, 3)."""
         return self._predict(signals)
 
     def error_quantiles(
         self, shares: ArrayLike = (0.5, 0.95), keep: AnyArray | None = None
     ) -> Array:
-        """Quantiles of the errors on contacts held out.
+        """Quantiles of the errors on held-out contacts.
 
         Parameters
         ----------
         shares : array_like
             Quantiles, as shares of the contacts.
         keep : (n,) bool array, optional
-            Contacts held out to count, such as those in a region; by default all.
+            Held-out contacts to include, such as those in a region; by default all.
 
         Returns
         -------
@@ -121,7 +121,7 @@ class NetworkSolver:
 
 @dataclass(frozen=True, eq=False)
 class _Prediction:
-    """The network between its standardised inputs and contact points."""
+    """The network with standardisation of its inputs and outputs."""
 
     circular: AnyArray
     mean: Array
@@ -137,7 +137,7 @@ class _Prediction:
         rows = np.flatnonzero(np.isfinite(signals).all(axis=1))
         if rows.size:
             features = (_features(signals[rows], self.circular) - self.mean) / self.deviation
-            near = _away(self.known, features) <= self.reach
+            near = _nearest_distance(self.known, features) <= self.reach
             if near.any():
                 out[rows[near]] = self.centre + self.size * self.network.predict(features[near])
         return out
@@ -151,31 +151,32 @@ def train_network(
     held_out: int = 5_000,
     seed: int = 0,
 ) -> NetworkSolver:
-    """Train a network to give contact points for three signals, and test it on other contacts.
+    """Train a network to predict contact points from three signals, and test it.
 
     Parameters
     ----------
     contact_map : ContactMap
-        The whisker's map.
+        Map of the whisker.
     triplet : str or tuple of str
-        The signals.
+        Names of the three signals.
     samples : int
-        Number of contacts to train on; a tenth of them decide when to stop. About ten seconds for
+        Number of training contacts, a tenth of which is used for early stopping. Training takes
+        about ten seconds for 30,000.
         30,000.
     held_out : int
-        Number of contacts to test on.
+        Number of test contacts.
     seed : int
-        Seed of the contacts and of the network's first weights.
+        Seed of the contacts and of the network's initial weights.
 
     Returns
     -------
     NetworkSolver
-        Network, contacts held out, and errors.
+        Network with held-out contacts and errors.
 
     Raises
     ------
     ValueError
-        If there are not three signals, or fewer than 100 contacts to train on or 1 to test on.
+        If there are not three signals, fewer than 100 training contacts, or no test contact.
     """
     if samples < 100 or held_out < 1:
         raise ValueError(
@@ -184,20 +185,20 @@ def train_network(
     names = selection(triplet, exactly=3)
     which = [SIGNALS.index(name) for name in names]
     circular = np.array([CIRCULAR[w] for w in which])
-    # Two different draws from one seed.
+    # Two independent draws from one seed.
     first, second = np.random.SeedSequence(seed).generate_state(2)
     trained = draw_contacts(contact_map, samples, int(first))
     tested = draw_contacts(contact_map, held_out, int(second))
     features = _features(trained.signals[:, which], circular)
     mean, deviation = features.mean(axis=0), features.std(axis=0)
-    # A signal that is zero everywhere stays zero.
+    # A signal that is zero everywhere remains zero.
     deviation = np.where(deviation > 1e-6 * np.abs(features).max(), deviation, 1.0)
     features = (features - mean) / deviation
     centre, size = trained.point.mean(axis=0), trained.point.std(axis=0)
-    network = _fitted(features, (trained.point - centre) / size, seed)
+    network = _fit_network(features, (trained.point - centre) / size, seed)
     known = cKDTree(features)
     test = (_features(tested.signals[:, which], circular) - mean) / deviation
-    reach = _MARGIN * float(_away(known, test).max())
+    reach = _MARGIN * float(_nearest_distance(known, test).max())
     predict = _Prediction(circular, mean, deviation, centre, size, network, known, reach)
     errors = np.linalg.norm(predict(tested.signals[:, which]) - tested.point, axis=1)
     return NetworkSolver(names, tested, errors, predict)
@@ -211,27 +212,27 @@ def with_network_errors(
     held_out: int = 5_000,
     progress: Callable[[int, int], None] | None = None,
 ) -> xr.Dataset:
-    """Add the paper's evidence to verdicts on triplets: errors of a network trained for each.
+    """Add to verdicts the errors of a network trained for each triplet, as in the paper.
 
     Parameters
     ----------
     contact_map : ContactMap
-        Map that the verdicts are of.
+        Map to which the verdicts belong.
     verdicts : Dataset
-        Verdicts of :func:`vibrissa.uniqueness`.
+        Verdicts from :func:`vibrissa.uniqueness`.
     samples : int
-        Number of contacts to train each network on; about ten seconds for 30,000.
+        Number of training contacts of each network; about ten seconds for 30,000.
     held_out : int
-        Number of other contacts to test it on.
+        Number of test contacts.
     progress : callable, optional
         Function called as ``progress(done, total)`` after each triplet.
 
     Returns
     -------
     Dataset
-        The verdicts with ``network_error`` (triplet, region, quantile), m: median and 95 %
-        quantile of the errors on contacts of each region, outside the cone, that the network was
-        not trained on. A network that fails is evidence that the triplet is not unique.
+        Verdicts with ``network_error`` (triplet, region, quantile), m: median and 95 % quantile of
+        the errors on held-out contacts of each region outside the cone. A large error is evidence
+        that the triplet is not unique.
     """
     errors = []
     for triplet in verdicts["triplet"].to_numpy().tolist():
@@ -242,7 +243,7 @@ def with_network_errors(
             held_out=held_out,
             seed=int(verdicts.attrs["seed"]),
         )
-        counted = _counted(contact_map, solver.held_out, verdicts)
+        counted = _contacts_in_regions(contact_map, solver.held_out, verdicts)
         errors.append([solver.error_quantiles(QUANTILES, keep) for keep in counted])
         if progress is not None:
             progress(len(errors), verdicts.sizes["triplet"])
@@ -255,7 +256,9 @@ def with_network_errors(
     )
 
 
-def _counted(contact_map: ContactMap, drawn: DrawnContacts, verdicts: xr.Dataset) -> list[AnyArray]:
+def _contacts_in_regions(
+    contact_map: ContactMap, drawn: DrawnContacts, verdicts: xr.Dataset
+) -> list[AnyArray]:
     """Select the contacts in each region of verdicts, outside the cone."""
     whisker, d = contact_map.whisker, contact_map.chart.discretization
     inside = cone_angle(whisker, drawn.point) > verdicts.attrs["cone"]
@@ -270,18 +273,20 @@ def _counted(contact_map: ContactMap, drawn: DrawnContacts, verdicts: xr.Dataset
 
 
 def _features(signals: Array, circular: AnyArray) -> Array:
+    """Inputs of the network (n, k) from signals (n, 3)."""
     columns = []
     for column, turned in zip(signals.T, circular, strict=True):
         columns += [np.cos(column), np.sin(column)] if turned else [np.cbrt(column)]
     return np.stack(columns, axis=1)
 
 
-def _away(known: cKDTree, features: Array) -> Array:
-    """Distances (n,) from the nearest of the points in a tree."""
+def _nearest_distance(known: cKDTree, features: Array) -> Array:
+    """Distances (n,) from the nearest point in a tree."""
     return np.asarray(known.query(features)[0])
 
 
-def _fitted(features: Array, targets: Array, seed: int) -> Any:
+def _fit_network(features: Array, targets: Array, seed: int) -> Any:
+    """Fit a network to standardised features and targets."""
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.neural_network import MLPRegressor
     from threadpoolctl import threadpool_limits  # comes with scikit-learn
@@ -296,8 +301,8 @@ def _fitted(features: Array, targets: Array, seed: int) -> Any:
         alpha=0.0,
         random_state=seed,
     )
-    # Several threads would wait for each other longer than they compute on matrices this small.
+    # On matrices this small several threads spend more time waiting than computing.
     with warnings.catch_warnings(), threadpool_limits(limits=1):
-        # The last epoch is as good a place to stop as any.
+        # Reaching the last epoch is an acceptable end of training.
         warnings.simplefilter("ignore", ConvergenceWarning)
         return network.fit(features, targets)

@@ -1,13 +1,12 @@
-"""The paper's sensitivity: central differences on its look-up table, and what it found.
+"""The paper's sensitivity by central differences of its look-up table, and its findings.
 
-The derivative with respect to a signal is the difference between one step (0.05 % of the signal's
-range) more and one less. It is as inaccurate as the table is coarse, and there is none where a step
-leaves the table: the exact derivatives of :func:`vibrissa.sensitivity` are compared with it.
+The derivative by a signal is the central difference over one step (0.05 % of the signal's range) to
+either side. Its accuracy is limited by the table's, and it is undefined where a step leaves the
+table; the exact derivatives are those of :func:`vibrissa.sensitivity`.
 
-Huet, Emnett & Hartmann (2022) found three things of the Jacobian ∂(r, θ, φ)/∂(M_D, M_B, F_x): M_D
-acts mainly on θ and φ; the mapping is most sensitive where F_x and M_B are small; concave forward
-and backward differ. Each has a number here, from the exact derivatives; see
-:func:`sensitivity_findings`.
+Huet, Emnett & Hartmann (2022) have three findings about the Jacobian ∂(r, θ, φ)/∂(M_D, M_B, F_x):
+M_D acts mainly on θ and φ; the mapping is most sensitive where F_x and M_B are small; concave
+forward and backward differ. :func:`sensitivity_findings` quantifies each by exact derivatives.
 """
 
 from __future__ import annotations
@@ -31,21 +30,21 @@ def central_differences(
     interpolation: Interpolation = "natural",
     step: float = STEP,
 ) -> xr.Dataset:
-    """Derivatives of the contact point by central differences on the paper's interpolated grid.
+    """Compute derivatives of the contact point by central differences of the paper's grid.
 
     Parameters
     ----------
     contact_map : ContactMap
         Map with the paper's grid.
     using : str or tuple of str
-        Three signals.
+        Names of the three signals.
     at : Dataset, DataTree, mapping, array_like, "grid" or None
         Contacts, as for :func:`vibrissa.sensitivity`.
     noise : mapping or (6, 6) array_like, optional
-        Standard deviation of each signal, or covariance of (F, M), SI units; gives the error
-        ellipsoids.
+        Standard deviation of each signal, or covariance of (F, M), SI units, from which error
+        ellipsoids are computed.
     interpolation : {"natural", "linear"} or callable
-        Natural-neighbour as the paper's, or linear; or a function that, called as
+        Natural-neighbour interpolation as in the paper, or linear; or a function that, called as
         ``interpolation(points, values)``, returns a function of other points.
     step : float
         Step of the differences, as a share of each signal's range; the paper's is 0.05 %.
@@ -54,12 +53,12 @@ def central_differences(
     -------
     Dataset
         Variables of :func:`vibrissa.sensitivity`; NaN where a step leaves the table, and everywhere
-        for signals of which one is next to zero throughout.
+        if one of the signals is practically zero throughout.
 
     Raises
     ------
     ValueError
-        If the map has no grid, or signals, contacts, noise or step do not fit.
+        If the map has no grid, or signals, contacts, noise or step are invalid.
     """
     if not 0.0 < step < 1.0:
         raise ValueError(f"the step is a share of the range, above 0 and below 1; got {step}")
@@ -69,7 +68,7 @@ def central_differences(
     table = LookupTable.of(contact_map, names, near_rest=True, interpolation=interpolation)
     in_sphere = _differences(table, values.reshape(-1, 3), step)
     point = out["contact_point"].transpose(*dims, "space").to_numpy().reshape(-1, 3)
-    by_signal = _inverted(spherical_derivatives(point)) @ in_sphere
+    by_signal = _inverse(spherical_derivatives(point)) @ in_sphere
     shape = values.shape[:-1]
     for name, matrix in (("sensitivity", in_sphere), ("point_sensitivity", by_signal)):
         exact = out[name].transpose(*dims, ...)
@@ -95,8 +94,8 @@ def _differences(table: LookupTable, signals: Array, step: float) -> Array:
     return out
 
 
-def _inverted(matrices: Array) -> Array:
-    """Inverses of matrices (n, 3, 3), NaN for those with NaN."""
+def _inverse(matrices: Array) -> Array:
+    """Inverses of matrices (n, 3, 3); NaN where they contain NaN."""
     out = np.full_like(matrices, np.nan)
     known = np.isfinite(matrices).all(axis=(1, 2))
     out[known] = np.linalg.inv(matrices[known])
@@ -104,7 +103,7 @@ def _inverted(matrices: Array) -> Array:
 
 
 def _wrench(contacts: xr.Dataset, dims: tuple[str, ...]) -> tuple[Array, Array]:
-    """Force and moment (n, 3) of contacts with their six signals."""
+    """Force and moment (n, 3) of contacts, from their six signals."""
     signals = {name: contacts[name].transpose(*dims).to_numpy().ravel() for name in SIGNALS}
     force, moment = (
         np.stack(
@@ -120,33 +119,33 @@ def _wrench(contacts: xr.Dataset, dims: tuple[str, ...]) -> tuple[Array, Array]:
     return force, moment
 
 
-#: Central share of a quantity's values that makes its range.
+#: Central share of a quantity's values that defines its range.
 RANGE = 0.99
 _FIFTH = 0.2
 
 
 def sensitivity_findings(data: xr.Dataset, region: xr.DataArray | None = None) -> xr.Dataset:
-    """Sum up derivatives: which signal acts on what, where they are large, which side differs.
+    """Summarise derivatives: effect of each signal, where it is large, and how the sides differ.
 
     Parameters
     ----------
     data : Dataset
         Result of :func:`~vibrissa.sensitivity`, for any triplet.
     region : DataArray of bool, optional
-        Contacts to sum up, such as ``data.within_paper_bounds & ~data.small_deflection``; by
+        Contacts to include, such as ``data.within_paper_bounds & ~data.small_deflection``; by
         default those outside the cone of 2° about rest.
 
     Returns
     -------
     Dataset
-        Medians, each contact counted by the volume that it stands for:
+        Medians, with each contact weighted by the volume that it represents:
 
         - ``median_size`` (coordinate, signal): of |∂c/∂s|, SI units;
         - ``relative_size`` (coordinate, signal): of |∂c/∂s| times the range of s over the range
-          of c (99 % of the values each): how many ranges the coordinate would move for one range of
-          the signal;
+          of c (99 % of the values each): by how many of its ranges the coordinate would change for
+          one range of the signal;
         - ``share_of_motion`` (coordinate, signal): the mean squared share of the motion of the
-          contact point that goes along r, θ and φ (all in m) when one signal changes;
+          contact point along r, θ and φ (all in m) when one signal changes;
         - ``small_over_large`` (coordinate, signal, sorted_by): the median of |∂c/∂s| over the
           fifth of contacts with the smallest |signal|, over that of the fifth with the largest;
         - ``rank_correlation`` (coordinate, signal, sorted_by): Spearman's, of |∂c/∂s| with
@@ -174,12 +173,12 @@ def sensitivity_findings(data: xr.Dataset, region: xr.DataArray | None = None) -
                 "share_of_motion": (both, _motion(size, flat["r"], flat["phi"], weight), ratio),
                 "small_over_large": (
                     (*both, "sorted_by"),
-                    _stacked([_small_over_large(size, flat[n], weight) for n in sorted_by]),
+                    _stack_tables([_small_over_large(size, flat[n], weight) for n in sorted_by]),
                     ratio,
                 ),
                 "rank_correlation": (
                     (*both, "sorted_by"),
-                    _stacked([_rank_correlations(size, flat[n], weight) for n in sorted_by]),
+                    _stack_tables([_rank_correlations(size, flat[n], weight) for n in sorted_by]),
                     ratio,
                 ),
                 "backward_over_forward": (
@@ -195,17 +194,19 @@ def sensitivity_findings(data: xr.Dataset, region: xr.DataArray | None = None) -
     return out
 
 
-def _stacked(tables: list[Array]) -> Array:
+def _stack_tables(tables: list[Array]) -> Array:
+    """Stack tables along a last axis."""
     return np.stack(tables, axis=-1) if tables else np.empty((3, 3, 0))
 
 
 def _range(values: Array, weight: Array) -> float:
+    """Central range of values, by weighted quantiles."""
     low, high = weighted_quantile(values, weight, np.array([0.5 - 0.5 * RANGE, 0.5 + 0.5 * RANGE]))
     return float(high - low)
 
 
 def _medians(size: Array, weight: Array) -> Array:
-    """Medians (3, 3) of sizes (n, 3, 3)."""
+    """Weighted medians (3, 3) of sizes (n, 3, 3)."""
     return np.array(
         [[float(weighted_quantile(size[:, i, j], weight)) for j in range(3)] for i in range(3)]
     )
@@ -224,7 +225,7 @@ def _motion(size: Array, r: Array, phi: Array, weight: Array) -> Array:
 
 
 def _small_over_large(size: Array, signal: Array, weight: Array) -> Array:
-    """Medians over the fifth with the smallest |signal|, over those with the largest."""
+    """Medians for the fifth with the smallest |signal| over those for that with the largest."""
     signal = np.abs(signal)
     low, high = weighted_quantile(signal, weight, np.array([_FIFTH, 1.0 - _FIFTH]))
     return _medians(size, weight * (signal <= low)) / _medians(size, weight * (signal >= high))
@@ -245,7 +246,7 @@ def _rank_correlations(size: Array, signal: Array, weight: Array) -> Array:
 
 
 def _ranks(values: Array, weight: Array) -> Array:
-    """Weighted ranks; equal values are as good as never there."""
+    """Weighted ranks; ties, which practically do not occur, are broken by position."""
     order = np.argsort(values, kind="stable")
     ranks = np.empty_like(values)
     ranks[order] = np.cumsum(weight[order]) - 0.5 * weight[order]

@@ -23,10 +23,10 @@ from vibrissa.rod.obstacles import (
     Equilibrium,
     Grid,
     Obstacles,
-    bent_by_one,
-    settled,
-    solve_at,
-    strain_on,
+    solve_at_nodes,
+    solve_with_moving_nodes,
+    strain_under_force,
+    transfer_strain,
 )
 from vibrissa.rod.statics import check_objects
 from vibrissa.rod.surfaces import Progress, SurfaceDeflection, follow_surfaces
@@ -242,13 +242,13 @@ class NearObjects:
     def moved(
         self, place: Placement, shift: Array, start: Equilibrium, settle: bool = True
     ) -> Equilibrium | None:
-        """Equilibrium continued from ``start``; if ``settle``, nodes move to where contacts end."""
+        """Equilibrium continued from ``start``; if ``settle``, nodes move to the contacts."""
         obstacles = Obstacles(self._surfaces, self._shifted(place, shift), self._length)
         begin = start.grid, start.strain, start.pressing
         if settle:
-            found = settled(self._whisker, obstacles, *begin)
+            found = solve_with_moving_nodes(self._whisker, obstacles, *begin)
         else:
-            found = solve_at(obstacles, *begin)
+            found = solve_at_nodes(obstacles, *begin)
         if found is None or not found.contacts()[0].size or found.farthest(start) > _JUMP:
             return None
         return found
@@ -256,8 +256,8 @@ class NearObjects:
     def refined(self, place: Placement, shift: Array, start: Equilibrium) -> Equilibrium | None:
         """Equilibrium on this object's grid, continued from ``start`` on another grid."""
         obstacles = Obstacles(self._surfaces, self._shifted(place, shift), self._length)
-        strain, pressing = strain_on(start, self._grid), start.pressing_on(self._grid)
-        found = settled(self._whisker, obstacles, self._grid, strain, pressing)
+        strain, pressing = transfer_strain(start, self._grid), start.pressing_on(self._grid)
+        found = solve_with_moving_nodes(self._whisker, obstacles, self._grid, strain, pressing)
         if found is None or not found.contacts()[0].size or found.farthest(start) > _JUMP:
             return None
         return found
@@ -278,7 +278,7 @@ def around(
     overlap = overlaps(whisker, surfaces, rotations, positions, found)
     second, solved = overlap > OVERLAP, dict[int, Equilibrium]()
     if several and second.any():
-        solved = _solved(whisker, surfaces, rotations, positions, found, overlap)
+        solved = _solve_several_contacts(whisker, surfaces, rotations, positions, found, overlap)
     bent, d = found.bent, discretize(whisker)
     n, most = len(positions), max([1, *(one.contacts()[0].size for one in solved.values())])
     arc, surface = np.full((n, most), np.nan), np.full((n, most), -1)
@@ -323,7 +323,7 @@ def _has_contact(status: IntArray) -> Mask:
     return np.isin(status, (Status.OK, Status.TIP_CONTACT))
 
 
-def _solved(
+def _solve_several_contacts(
     whisker: Whisker,
     surfaces: Sequence[Surface],
     rotations: Array,
@@ -344,7 +344,9 @@ def _solved(
         one = None
         if last is not None:
             obstacles = Obstacles(surfaces, place, whisker.length)
-            one = settled(whisker, obstacles, grid, strain_on(last, grid), last.pressing_on(grid))
+            one = solve_with_moving_nodes(
+                whisker, obstacles, grid, transfer_strain(last, grid), last.pressing_on(grid)
+            )
             if one is None or not one.contacts()[0].size or one.farthest(last) > _JUMP:
                 one = None
         if one is None and touching[i]:
@@ -370,8 +372,10 @@ def _solve_from_one_contact(
     pressing = np.zeros((len(surfaces), grid.s.size))
     nearest = int(np.argmin(np.abs(grid.s - arc)))
     pressing[found.surface[row], nearest] = np.linalg.norm(force)
-    strain = bent_by_one(grid, arc, force, point)
-    out = settled(whisker, Obstacles(surfaces, place, d.length), grid, strain, pressing)
+    strain = strain_under_force(grid, arc, force, point)
+    out = solve_with_moving_nodes(
+        whisker, Obstacles(surfaces, place, d.length), grid, strain, pressing
+    )
     # The other contacts may push the whisker off the objects altogether.
     return None if out is None or not out.contacts()[0].size else out
 

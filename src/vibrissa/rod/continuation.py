@@ -51,10 +51,10 @@ _MOST_ROUNDS = 30
 # Largest number of changes between side and tip, so that a contact at the corner cannot alternate
 # for ever.
 _MOST_SWITCHES = 8
-# Toward a fold det ∂G/∂x vanishes and dx/dp diverges, both as the square root of the distance along
-# the path. A path that cannot be followed is taken to have met a fold if det has fallen below this
-# share of its initial value, or if the speed (in largest steps per path) has grown by this factor
-# or exceeds this value.
+# Toward a fold det ∂G/∂x vanishes as the square root of the remaining path, and dx/dp diverges as
+# its inverse. A path that cannot be followed is taken to have met a fold if det has fallen below
+# this share of its initial value, or if the speed (in largest steps per path) has grown by this
+# factor or exceeds this value.
 _NEAR_FOLD = 0.5
 _SPED_UP = 2.0
 _FAST = 30.0
@@ -220,7 +220,7 @@ def _parameters(kind: int, begin: Array, end: Array, progress: float, p: Array) 
 
 @inlined
 def _newton_update(kind: int, path: Array, step: Array, x: Array) -> None:
-    """Take a Newton step of bounded length; keep s on the whisker and the force compressive."""
+    """Take a Newton step of bounded length; keep s on the whisker and the force positive."""
     shorten = 1.0 / max(path[_SIZE], 1.0)
     for a in range(3):
         x[a] -= shorten * step[a]

@@ -215,7 +215,9 @@ class PegContact:
                 f"a peg's radius must not be negative; the smallest is {np.nanmin(radius)} m"
             )
         if (radius == 0.0).any() != (radius == 0.0).all():
-            raise ValueError("lines (radius 0) and cylinders do not mix in one load: give two")
+            raise ValueError(
+                "lines (radius 0) and cylinders cannot be mixed in one load: use two loads"
+            )
         axis = _directions(axis)
         if (axis == 0.0).all(axis=-1).any():
             raise ValueError("a peg's axis must not be (0, 0, 0)")
@@ -257,7 +259,7 @@ def select_loads(load: Load, which: IntArray) -> Load:
         parts = np.reshape(load.components, (-1, 3))[which]
         return PointForce(np.reshape(load.arc_length, -1)[which], components=parts)
     if load.start is not None:
-        raise ValueError("pegs that go on from a start have one gravity in common")
+        raise ValueError("pegs with a start must all have the same gravity")
     side = None if load.side is None else np.reshape(load.side, (-1, 3))[which]
     origin, axis = (np.reshape(a, (-1, 3))[which] for a in (load.origin, load.axis))
     return PegContact(origin, axis, np.reshape(load.radius, -1)[which], side)

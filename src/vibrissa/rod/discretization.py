@@ -2,7 +2,7 @@
 
 Lengths are divided by L, forces by EI/L² and moments by EI/L, with EI the bending stiffness at the
 base. On each step the intrinsic curvature and the radius are the cubics through their values at the
-step's four Gauss points: a cubic's error, orthogonal to all cubics, costs only O(h⁸) at the step's
+step's four Gauss points: their error, orthogonal to all cubics, costs only O(h⁸) at the step's
 end. Where curvature or radius are rough within a step, as noisy measured radii are, this would be
 no better than four samples of them; there the cubics instead have the moments of order 0 to 3 of
 the curvature and of the compliance ∝ r⁻⁴ over the step, so that noise averages out as in the rod.
@@ -279,7 +279,7 @@ def _radius_cubic(t: Array, weight: Array, radius: Array, cubic: Array) -> Array
 
 
 def _with_joint(rod: Rod, n: int, moment_scale: float, bending: float, twist: float) -> Rod:
-    """Prepend a compliant base to the rod: n steps of zero length, as compliant as the joint.
+    """Prepend a compliant base to the rod: n steps of zero extent, as compliant as the joint.
 
     These steps rotate the frame under the moment without displacing it, so together they act as a
     torsion spring and need no equations of their own.

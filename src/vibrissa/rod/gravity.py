@@ -130,7 +130,7 @@ class Resting:
         (m, 3) array
             Points, whisker frame, m.
         """
-        return self._traced(s).places * self.length
+        return self._shape_at(s).places * self.length
 
     def frame(self, s: Array) -> Array:
         """Material frames of the sagged whisker.
@@ -145,7 +145,7 @@ class Resting:
         (m, 3, 3) array
             Tangent, d1 and d2 in columns.
         """
-        return self._traced(s).frames
+        return self._shape_at(s).frames
 
     @property
     def force(self) -> Array:
@@ -190,7 +190,7 @@ class Resting:
         d = discretize(self)
         breaks = np.array([0.0, *whisker.breaks, whisker.length])
         s = np.unique(np.concatenate([np.linspace(0.0, whisker.length, _NODES), breaks]))
-        moments = self._traced(s).moments * d.moment
+        moments = self._shape_at(s).moments * d.moment
         ratio = np.array([1.0 + whisker.poisson_ratio, 1.0, 1.0])
         # At a jump of the radius the moment is smooth, but the curvature is not.
         smooth = interpolate.CubicSpline(s, moments)
@@ -207,7 +207,7 @@ class Resting:
             whisker, intrinsic_curvature=shaped.intrinsic_curvature, breaks=shaped.breaks
         )
 
-    def _traced(self, s: Array) -> Traced:
+    def _shape_at(self, s: Array) -> Traced:
         """Sagged shape at arc lengths s (m,), m."""
         if discretize(self).rod.weight is None:
             bare = self.whisker
@@ -248,7 +248,7 @@ def resting(whisker: Whisker, gravity: ArrayLike) -> Resting:
         )
     if whisker.density is None:
         raise ValueError(
-            "gravity needs the density of the whisker, and it is not known: "
+            "gravity requires the density of the whisker, which is not known: set it by "
             "with_properties(density=...), in kg/m³ (command line: --density)"
         )
     x, y, z = values.tolist()
@@ -315,9 +315,9 @@ def _lean_by_increments(whisker: Resting, steps: int) -> Array:
             stride *= 0.5
         else:
             raise ValueError(
-                f"this whisker cannot hold itself in gravity {whisker.gravity} m/s²: it bends "
-                f"over under {done:.0%} of its weight; it is stiffer when thicker, shorter, "
-                "hanging, or of a larger youngs_modulus"
+                f"this whisker topples in gravity {whisker.gravity} m/s², under {done:.0%} of its "
+                "weight; a whisker that is thicker, shorter, hanging, or of a larger "
+                "youngs_modulus is more stable"
             )
     return lean
 
@@ -347,7 +347,7 @@ def _is_stable(d: Discretization, solved: Weighted) -> bool:
 def evaluated(
     d: Discretization, contacts: Array, leans: Array | None = None, tangents: bool = False
 ) -> Weighted:
-    """Evaluate a rod with weight at contacts (s, f), shape (n, 4), and search their ``leans``."""
+    """Evaluate a rod with weight at contacts (s, f) (n, 4), and solve for their ``leans``."""
     rod, n = d.rod, len(contacts)
     weight = rod.weight
     assert weight is not None

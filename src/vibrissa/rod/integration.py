@@ -60,7 +60,7 @@ def integrate(rod: Rod, b: Array, tangents: int) -> None:
 def evaluate(
     rod: Rod, contacts: Array, values: Array, tangents: Array, first: int, last: int
 ) -> None:
-    """Evaluate base force and contact point of many contacts, and tangents if there is room."""
+    """Evaluate base force and contact point of contacts, and tangents if the array has rows."""
     b, four = np.zeros(BUFFER_SIZE), np.empty((6, 4))
     wanted = tangents.shape[0] > 0
     if LANES > 1 and wanted and last == first + 1:  # one contact: a lane for each of its tangents

@@ -267,7 +267,7 @@ class Equilibrium(NamedTuple):
         return float(np.linalg.norm(away, axis=1).max())
 
 
-def solve_at(
+def solve_at_nodes(
     obstacles: Obstacles, grid: Grid, strain: Array, pressing: Array
 ) -> Equilibrium | None:
     """Solve by Newton's method from a guess, at fixed nodes; None if it does not converge."""
@@ -349,11 +349,11 @@ def _solve_quadratic_problem(
     return free + yielded @ force, force
 
 
-def settled(
+def solve_with_moving_nodes(
     whisker: Whisker, obstacles: Obstacles, grid: Grid, strain: Array, pressing: Array
 ) -> Equilibrium | None:
     """Solve, moving nodes to where contacts at single points are; None if it fails."""
-    found = solve_at(obstacles, grid, strain, pressing)
+    found = solve_at_nodes(obstacles, grid, strain, pressing)
     for _ in range(_MOVES):
         if found is None:
             return None
@@ -361,11 +361,11 @@ def settled(
         if np.abs(nodes - found.grid.s).max() < _MOVED:
             return found
         grid = Grid.at(whisker, nodes[found.grid.s.size - np.count_nonzero(nodes) - 1 :])
-        found = solve_at(obstacles, grid, strain_on(found, grid), found.pressing)
+        found = solve_at_nodes(obstacles, grid, transfer_strain(found, grid), found.pressing)
     return found
 
 
-def strain_on(found: Equilibrium, grid: Grid) -> Array:
+def transfer_strain(found: Equilibrium, grid: Grid) -> Array:
     """Strains on another grid that have the moments of an equilibrium."""
     moment, out = found.grid.stiffness * found.strain, np.empty_like(grid.stiffness)
     before, now = found.grid.extent > 0.0, grid.extent > 0.0
@@ -410,7 +410,7 @@ def _nodes_at_contacts(found: Equilibrium, obstacles: Obstacles) -> Array:
     return nodes
 
 
-def bent_by_one(grid: Grid, arc: float, force: Array, point: Array) -> Array:
+def strain_under_force(grid: Grid, arc: float, force: Array, point: Array) -> Array:
     """Strains (n, 2, 3) of a whisker bent by one force at an arc length, from the base outward."""
     strain = np.zeros_like(grid.rest)
     frame, place, e = np.eye(3), np.zeros(3), np.array([1.0, 0.0, 0.0])

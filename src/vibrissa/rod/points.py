@@ -346,7 +346,7 @@ class PointSolver:
             better = (reached & (force < least[which])) | (least[which] == np.inf)
             out.put(rows[which[better]], Solutions(*(part[better] for part in solved)))
             least[which] = np.where(reached, np.minimum(force, least[which]), least[which])
-        _drop_unanswered(out, rows)
+        _clear_unsolved(out, rows)
 
     def _approach(self, points: Array, hopeful: AnyArray, rows: IntArray, out: Solutions) -> None:
         """Follow points from the nearest known contact if promising; set the status of others."""
@@ -359,7 +359,7 @@ class PointSolver:
         contacts, inner = self._inner
         _, start = inner.query(points[near])
         out.put(rows[near], self._follow(contacts[start], points[near]))
-        _drop_unanswered(out, rows)
+        _clear_unsolved(out, rows)
 
     def _follow(self, starts: Array, points: Array) -> Solutions:
         """Follow contacts ξ (n, 3) to points (n, 3)."""
@@ -375,7 +375,7 @@ class PointSolver:
         return solved
 
 
-def _drop_unanswered(out: Solutions, rows: IntArray) -> None:
+def _clear_unsolved(out: Solutions, rows: IntArray) -> None:
     """Remove the contact from rows with another status than OK."""
     lost = rows[out.statuses[rows] != Status.OK]
     out.contacts[lost], out.values[lost] = np.nan, np.nan

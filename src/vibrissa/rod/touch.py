@@ -255,9 +255,7 @@ class TouchSolver:
             # The first round predicts the contact to first order, with the surface's geometry at
             # the last contact; later rounds evaluate the surface itself.
             predicting = rounds == 0
-            linear = self._linearised(
-                last, place, x, tip, earlier, friction, mode, predicting, step
-            )
+            linear = self._linearise(last, place, x, tip, earlier, friction, mode, predicting, step)
             if linear is None:
                 return None
             found, right, now = linear
@@ -290,7 +288,7 @@ class TouchSolver:
             x[0] = min(max(x[0], LEAST_ARC), 1.0)
         return best
 
-    def _linearised(
+    def _linearise(
         self,
         last: Touch,
         place: Placement,

@@ -61,7 +61,6 @@ class SearchTree(NamedTuple):
     # (p, 8, 2) Volumes spanned by the slopes at the corners, for each component of the vector.
     polar_volumes: Array
     # (4,) Indices of length, direction and the others among the quantities; -1 for none.
-    # (4,) Numbers of length, direction and the others among the quantities; -1 for none.
     roles: IntArray
 
 

@@ -1,6 +1,6 @@
-"""Contents of pictures, without a renderer: marks, shapes as triangles, solids, trials.
+"""Contents of pictures without a renderer: marks, triangulated shapes, solids and trials.
 
-Figures, the viewer and the report draw what is made here.
+Figures, the viewer and the report draw these.
 """
 
 from vibrissa.scene.course import (

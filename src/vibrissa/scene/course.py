@@ -1,4 +1,4 @@
-"""One whisker of a recorded trial as plain arrays, frame by frame, and where the head must be."""
+"""One whisker of a recorded trial as plain arrays, frame by frame, for drawing."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from vibrissa.recording import Group, Recording
 from vibrissa.scene.solids import nearest_at_rest
 
 TRIPLET = ("Fx", "MB", "MD")
-"""The signals that are drawn, those of the paper."""
+"""Signals that are drawn, those of the paper."""
 
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """One whisker of a trial, frame by frame; None or NaN where the recording lacks it.
+    """One whisker of a trial, frame by frame; None or NaN where the recording lacks data.
 
     Parameters
     ----------
@@ -27,27 +27,27 @@ class Course:
     touching : array (n,) of bool
         Frames in contact.
     signals : dict of str to array (n,), optional
-        F_x, M_B, M_D, SI units; NaN out of contact where they are only known there.
+        F_x, M_B, M_D, SI units; NaN out of contact if they are known in contact only.
     known : array (n, 3), optional
-        Contact points to compare with, whisker frame, m.
+        Contact points for comparison, whisker frame, m.
     known_as : str
-        Kind of these: "true" or "tracked".
+        Kind of the known points: "true" or "tracked".
     estimated : array (n, 3), optional
         Contact points estimated from signals, whisker frame, m.
     places : array (n, 3), optional
         Contact points, laboratory frame, m: estimated ones if there are any, else known ones.
     places_as : str
-        Kind of these: "estimated", "tracked" or "true".
+        Kind of these points: "estimated", "tracked" or "true".
     centerline : array (n, k, 3), optional
         Deflected whisker from base to tip, laboratory frame, m.
     traces : tuple of array (n, k, 2)
-        Deflected whisker in the images, view by view, pixels, as far as it was traced.
+        Traced part of the deflected whisker in the images, view by view, pixels.
     position : array (n, 3)
         Position of the base, laboratory frame, m.
     rotation : array (n, 3, 3)
         Rotation from the whisker's to the laboratory frame.
     frames : array (n, views) of int, optional
-        Frame of each view's video at each time.
+        Frame number of each view's video at each time.
     head : tuple of array (n, 3) and array (n, 3, 3), optional
         Position of the head, laboratory frame, m, and rotation from its frame to the laboratory's.
     """
@@ -68,7 +68,7 @@ class Course:
     head: tuple[Array, Array] | None
 
     def at_base(self, points: Array) -> Array:
-        """Take points of the laboratory to the whisker's frame, frame by frame.
+        """Transform points from the laboratory to the whisker frame, frame by frame.
 
         Parameters
         ----------
@@ -78,7 +78,7 @@ class Course:
         Returns
         -------
         array (n, ..., 3)
-            The points, whisker frame, m.
+            Points in the whisker frame, m.
         """
         shape = (len(self.time),) + (1,) * (points.ndim - 2) + (3,)
         moved = points - self.position.reshape(shape)
@@ -86,28 +86,27 @@ class Course:
 
 
 def course_of(trial: xr.DataTree, whisker: int = 0) -> Course:
-    """Take what is drawn out of a recording.
+    """Extract what is drawn from a recording.
 
-    The groups ``signals``, ``estimates`` and ``truth`` are used as far as they are there. What
-    contacts are compared with is the truth, or else the tracked contacts.
+    The groups ``signals``, ``estimates`` and ``truth`` are used if they exist. Contacts are
+    compared with the truth, or else with the tracked contacts.
 
     Parameters
     ----------
     trial : DataTree
-        A recording, dims time, whisker, ...; SI units.
+        Recording with dims time, whisker, ...; SI units.
     whisker : int
-        Number of the whisker, from 0.
+        Index of the whisker.
 
     Returns
     -------
     Course
-        All that is known of that whisker.
+        Data of that whisker.
 
     Raises
     ------
     ValueError
-        If there is no such whisker, or the recording has no times or lacks the pose of the
-        base.
+        If there is no such whisker, or the recording lacks times or the pose of the base.
     """
     lacking = [n for n in ("time", "base_position", "base_rotation") if n not in trial.variables]
     if lacking:
@@ -134,7 +133,7 @@ def course_of(trial: xr.DataTree, whisker: int = 0) -> Course:
     order = (signals, estimates, root, truth)
     return Course(
         time=np.asarray(root.data["time"].values, dtype=np.float64),
-        touching=_touching(order, root.data.sizes["time"]),
+        touching=_in_contact(order, root.data.sizes["time"]),
         signals=_signals(signals),
         known=known,
         known_as=known_as,
@@ -151,13 +150,14 @@ def course_of(trial: xr.DataTree, whisker: int = 0) -> Course:
 
 
 def _signals(data: Group) -> dict[str, Array] | None:
+    """Signals of the triplet, if all are known."""
     found = {name: data.known(name) for name in TRIPLET}
     known = {name: values for name, values in found.items() if values is not None}
     return known if len(known) == len(TRIPLET) else None
 
 
-def _touching(order: tuple[Group, ...], count: int) -> Mask:
-    """Whether there is contact, by the first group that has it."""
+def _in_contact(order: tuple[Group, ...], count: int) -> Mask:
+    """Whether there is contact (n,), from the first group that states it."""
     for group in order:
         if "in_contact" in group:
             return group["in_contact"]
@@ -165,12 +165,13 @@ def _touching(order: tuple[Group, ...], count: int) -> Mask:
 
 
 def _head(root: Group) -> tuple[Array, Array] | None:
+    """Position and rotation of the head, if known."""
     position, rotation = (root.known(name) for name in ("head_position", "head_rotation"))
     return None if position is None or rotation is None else (position, rotation)
 
 
 def _traces(root: Group, truth: Group) -> tuple[Array, ...]:
-    """Traces in each view: tracked ones, or else true ones."""
+    """Traces in each view, tracked or else true."""
     for data in (root, truth):
         if "trace" in data:
             return tuple(np.swapaxes(data["trace"], 0, 1))
@@ -178,20 +179,20 @@ def _traces(root: Group, truth: Group) -> tuple[Array, ...]:
 
 
 def deflection_angles(course: Course, centerline: ArrayLike) -> Array:
-    """Give the angle at the base between contacts and the resting whisker.
+    """Compute the angle at the base between contacts and the resting whisker.
 
     Parameters
     ----------
     course : Course
-        The trial.
+        Whisker of a trial.
     centerline : array_like (k, 3)
         Resting whisker, whisker frame, m.
 
     Returns
     -------
     array (n,)
-        Angle in each frame, rad: its tangent is the distance of the contact from the
-        resting whisker over the arc length of its nearest point; NaN without contact.
+        Angle in each frame, rad; its tangent is the distance of the contact from the resting
+        whisker over the arc length of the closest point; NaN without contact.
     """
     angles = np.full(len(course.time), np.nan)
     if course.places is None:

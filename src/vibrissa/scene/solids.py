@@ -1,20 +1,20 @@
-"""What is drawn: the solid of all stable contacts, and marks without a renderer, as triangles.
+"""Triangulated surfaces and marks for pictures, without a renderer.
 
-**Solids** are sampled finely and cut open, with surfaces of equal value in them. A map has contact
-point and signals at the nodes of a grid over arc length, bearing and load. In between both are
-smooth and are interpolated by cubic splines, for pictures only. Every node carries one row of
-numbers, its columns named in :data:`COLUMNS`, so that what is cut out carries the contact point and
-all signals along. Directions are carried as the components of a vector, which are smooth where
-angles jump.
+**Solids** are the sets of stable contacts of a map, sampled finely and cut open, with surfaces of
+equal value in them. A map has contact point and signals at the nodes of a grid over arc length,
+bearing and load. Between nodes both are smooth and are interpolated by cubic splines, for pictures
+only. Every node is one row of numbers, with columns named in :data:`COLUMNS`, so that cut surfaces
+have contact points and all signals at their vertices. Directions are stored as vector components,
+which are smooth where angles jump.
 
-**Marks**, in mm, are bodies, clouds, arrows, lines and labels; limits of colours and axes are those
-that hold most values, and roots show small ones.
+**Marks**, in mm, are bodies, clouds, arrows, lines and labels. Limits of colours and axes are those
+that contain most values, and square-root scales show small ones.
 
-**Shapes** are tubes along whiskers, ellipsoids, the objects of a recording, a head. A surface is a
-pair of vertices (n, 3) and faces (m, 3) of their numbers, so that triangles share vertices where it
-is smooth. All lengths go in and come out in the same unit, but for objects and head, which come out
-in mm. The head is a sketch, after no measured one: sections through it, one behind the other, whose
-sides pass near the base points of an average rat's whiskers.
+**Shapes** are tubes along whiskers, ellipsoids, the objects of a recording, and a head. A surface
+is a pair of vertices (n, 3) and faces (m, 3) of vertex indices; triangles share vertices where it
+is smooth. Lengths are returned in the unit of the input, except for objects and the head, which are
+returned in mm. The head is a sketch, not based on a measured one: a series of sections whose sides
+pass near the base points of an average rat's whiskers.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ COLUMNS = (
     *("Fx", "FT cos FD", "FT sin FD", "Mx", "MB cos MD", "MB sin MD"),
     *("arc_length", "deflection"),
 )
-"""SI units; ``deflection`` is how far outside the cone of small deflections a contact lies, m."""
+"""SI units; ``deflection`` is the distance outside the cone of small deflections, m."""
 
-# Cells of the whole chart.
+# Number of cells of the whole chart in ``_SHAPE``.
 _COLUMN = {name: i for i, name in enumerate(COLUMNS)}
 _DIMS = ("station", "bearing", "load")
 _CONE = np.deg2rad(2.0)
@@ -52,12 +52,12 @@ _SHAPE = (36, 72, 24)
 
 
 def column(name: str) -> int:
-    """Give the column of a quantity."""
+    """Index of a quantity's column."""
     return _COLUMN[name]
 
 
 def values_of(name: str, rows: Array) -> Array:
-    """Take a signal, a coordinate or another column out of rows."""
+    """Return a signal, a coordinate or another column of rows (..., k)."""
     if name in _COLUMN:
         return np.asarray(rows[..., _COLUMN[name]])
     kind = name[0]
@@ -72,7 +72,7 @@ def sample_contacts(
     bearings: tuple[float, float] | None = None,
     shape: tuple[int, int, int] | None = None,
 ) -> Array:
-    """Sample the contacts of a map as finely as a picture needs."""
+    """Sample the contacts of a map as finely as a picture requires, as rows (l, m, n, k)."""
     names = ("contact_point", "arc_length", *SIGNALS)
     missing = [name for name in names if name not in samples]
     if missing:
@@ -96,17 +96,18 @@ def sample_contacts(
     if not np.isfinite(nodes).all():
         raise ValueError("the map lacks some values; all of the reachable space is needed")
     axes = [np.asarray(samples[dim].to_numpy(), dtype=np.float64) for dim in _DIMS]
-    return _rows(
-        _refined(nodes, axes, bearings, shape or _SHAPE), np.asarray(centerline, dtype=np.float64)
+    return _complete_rows(
+        _refine(nodes, axes, bearings, shape or _SHAPE), np.asarray(centerline, dtype=np.float64)
     )
 
 
-def _refined(
+def _refine(
     nodes: Array,
     axes: list[Array],
     bearings: tuple[float, float] | None,
     shape: tuple[int, int, int],
 ) -> Array:
+    """Interpolate nodes on a finer grid, in a range of bearings."""
     station, bearing, load = axes
     start, stop = (bearing[0], bearing[-1]) if bearings is None else bearings
     around = max(2, round(shape[1] * (stop - start) / (2.0 * np.pi)))
@@ -122,8 +123,8 @@ def _refined(
     return np.asarray(fine, dtype=np.float64)
 
 
-def _rows(nodes: Array, line: Array) -> Array:
-    """Add what follows from contact points (the first three columns) to interpolated nodes."""
+def _complete_rows(nodes: Array, line: Array) -> Array:
+    """Add the columns that follow from contact points (the first three columns)."""
     point = nodes[..., :3]
     x, y, z = np.moveaxis(point, -1, 0)
     ball = np.stack(
@@ -134,13 +135,13 @@ def _rows(nodes: Array, line: Array) -> Array:
 
 
 def outside_cone(points: Array, centerline: Array) -> Array:
-    """Distance of contacts from the cone of small deflections."""
+    """Distance of contacts outside the cone of small deflections."""
     distance, arc_length = nearest_at_rest(points, centerline)
     return np.asarray(distance - arc_length * np.tan(_CONE))
 
 
 def nearest_at_rest(points: Array, centerline: Array) -> tuple[Array, Array]:
-    """Distance of contacts from the resting whisker."""
+    """Distance of contacts from the resting whisker, and arc length of the closest point."""
     count = max(2000, len(centerline))
     at = np.linspace(0.0, len(centerline) - 1.0, count)
     fine = np.stack([np.interp(at, np.arange(len(centerline)), c) for c in centerline.T], axis=1)
@@ -154,29 +155,29 @@ _QUAD = ((0, 1, 2), (0, 2, 3))
 
 
 def skin(nodes: Array, closed: bool) -> Array:
-    """Triangles on the outside of a chart."""
+    """Triangles (n, 3, k) of the outer faces of a chart."""
     faces = [nodes[:, :, -1], nodes[0], nodes[-1]]
     if not closed:
         faces += [nodes[:, 0], nodes[:, -1]]
-    return np.concatenate([_triangulated(face) for face in faces])
+    return np.concatenate([_triangulate(face) for face in faces])
 
 
-def _triangulated(face: Array) -> Array:
-    """Two triangles for each cell of a face (m, n, k)."""
+def _triangulate(face: Array) -> Array:
+    """Triangles of a face (m, n, k), two per cell."""
     corners = np.stack([face[:-1, :-1], face[1:, :-1], face[1:, 1:], face[:-1, 1:]], axis=2)
     corners = corners.reshape(-1, 4, face.shape[-1])
     return np.concatenate([corners[:, pick] for pick in _QUAD])
 
 
 def level_surface(nodes: Array, column: int, value: float) -> Array:
-    """Find the surface on which a column has a given value."""
+    """Triangles (n, 3, k) of the surface on which a column has a given value."""
     rows = nodes.reshape(-1, nodes.shape[-1])
     height = rows[:, column] - value
     corners = _tetrahedra(nodes.shape[:3])
     above = height[corners] > 0.0
     count = above.sum(axis=1)
     pieces = []
-    # Corners above come first; an edge between one above and one below is crossed.
+    # Corners above come first; edges between a corner above and one below are crossed.
     for several, edges in (
         (1, ((0, 1), (0, 2), (0, 3))),
         (3, ((3, 0), (3, 1), (3, 2))),
@@ -192,7 +193,7 @@ def level_surface(nodes: Array, column: int, value: float) -> Array:
 
 @lru_cache(maxsize=4)
 def _tetrahedra(shape: tuple[int, ...]) -> NDArray[np.intp]:
-    """Nodes (n, 4) of six tetrahedra for each cell, all along the same diagonal."""
+    """Nodes (n, 4) of six tetrahedra per cell, all along the same diagonal."""
     index = np.arange(np.prod(shape), dtype=np.intp).reshape(shape)
     a, b, c = shape
     corner = {
@@ -213,13 +214,13 @@ def _tetrahedra(shape: tuple[int, ...]) -> NDArray[np.intp]:
 
 
 def _crossing(rows: Array, height: Array, i: int, j: int) -> Array:
-    """Rows (n, k) at which the height is zero between corners i and j."""
+    """Rows (n, k) on the edges between corners i and j at which the height is zero."""
     share = height[:, i] / (height[:, i] - height[:, j])
     return np.asarray(rows[:, i] + share[:, None] * (rows[:, j] - rows[:, i]))
 
 
 def clip(triangles: Array, column: int) -> Array:
-    """Cut triangles off where a column is negative."""
+    """Cut off the parts of triangles in which a column is negative."""
     height = triangles[..., column]
     inside: Mask = height > 0.0
     count = inside.sum(axis=1)
@@ -240,7 +241,7 @@ def clip(triangles: Array, column: int) -> Array:
 
 
 def subdivide(triangles: Array, chosen: Mask, times: int = 3) -> Array:
-    """Halve the edges of some triangles, so that they can be coloured finely."""
+    """Subdivide some triangles by halving their edges, so that they can be coloured finely."""
     pieces = triangles[chosen]
     for _ in range(times):
         middles = 0.5 * (pieces + np.roll(pieces, -1, axis=1))
@@ -252,7 +253,7 @@ def subdivide(triangles: Array, chosen: Mask, times: int = 3) -> Array:
 
 
 def solid_surface(nodes: Array, closed: bool, *columns: int) -> Array:
-    """Find the surface around the contacts where some columns are positive."""
+    """Triangles of the surface around the contacts for which all given columns are positive."""
     around = []
     for cut in (None, *columns):
         part = skin(nodes, closed) if cut is None else level_surface(nodes, cut, 0.0)
@@ -283,7 +284,7 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class Painted:
-    """A surface of many colours, or one that is large: it costs little to draw."""
+    """A surface of many colours, or a large one: it is fast to draw."""
 
     triangles: Array  # (n, 3, 3), mm
     colours: Bytes  # (n, 3, 3), of the corners
@@ -302,7 +303,7 @@ class Cloud:
 
 @dataclass(frozen=True, eq=False)
 class Arrows:
-    """Arrows that are drawn as one."""
+    """Arrows that are drawn together."""
 
     start: Array  # (n, 3), mm
     end: Array
@@ -312,7 +313,7 @@ class Arrows:
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """Straight pieces of one colour."""
+    """Straight segments of one colour."""
 
     pieces: Array  # (n, 2, 3), ends of each, mm
     colour: Colour
@@ -321,25 +322,25 @@ class Line:
 
 @dataclass(frozen=True, eq=False)
 class Label:
-    """A few words."""
+    """A short text."""
 
-    position: Array  # (3,), of the lower left corner, mm
+    position: Array  # (3,), lower left corner, mm
     text: str
 
 
-# Marks by name; what is missing from the next drawing goes.
+# Marks by name; marks missing from the next drawing are removed.
 Mark = Body | Painted | Cloud | Arrows | Line | Label
 Drawing = Mapping[str, Mark]
 
 
 def pieces(points: Array) -> Array:
-    """Cut a line into straight pieces."""
+    """Cut a polyline into its finite segments (n, 2, 3)."""
     parts = np.stack([points[:-1], points[1:]], axis=1)
     return np.asarray(parts[np.isfinite(parts).all(axis=(1, 2))])
 
 
 def robust_limits(values: ArrayLike, share: float = 0.98, symmetric: bool = False) -> Array:
-    """Give limits between which most of the finite values are."""
+    """Limits that contain most of the finite values."""
     finite = np.asarray(values, dtype=np.float64)
     finite = finite[np.isfinite(finite)]
     if finite.size == 0:
@@ -355,19 +356,19 @@ def robust_limits(values: ArrayLike, share: float = 0.98, symmetric: bool = Fals
 
 
 def root(values: ArrayLike) -> Array:
-    """Take square roots of sizes and keep signs, for scales on which small values are seen."""
+    """Square roots of magnitudes with signs kept, for scales on which small values are visible."""
     x = np.asarray(values, dtype=np.float64)
     return np.asarray(np.sign(x) * np.sqrt(np.abs(x)))
 
 
 def squared(values: ArrayLike) -> Array:
-    """Take squares and keep signs: the inverse of `root`."""
+    """Squares with signs kept: the inverse of `root`."""
     x = np.asarray(values, dtype=np.float64)
     return np.asarray(np.sign(x) * np.square(x))
 
 
-_SIDES = 8  # corners of the section of a whisker
-# Radius of an eye, mm, and points around a section of the head.
+_SIDES = 8  # number of corners of a whisker's cross-section
+# Sections of the head.
 _SECTIONS = np.array(
     [
         # forward, half width, middle height, half height; mm
@@ -391,7 +392,7 @@ _EYE, _AROUND = 1.5, 40
 
 
 def across(direction: Array) -> tuple[Array, Array]:
-    """Give two unit vectors that make a right-handed frame with a direction."""
+    """Two unit vectors that form a right-handed frame with a direction."""
     along = direction / np.linalg.norm(direction)
     helper = np.eye(3)[np.argmin(np.abs(along))]
     first = np.cross(along, helper)
@@ -401,7 +402,7 @@ def across(direction: Array) -> tuple[Array, Array]:
 
 @lru_cache(maxsize=32)
 def _faces(rows: int, columns: int, closed: bool = False) -> Ints:
-    """Two triangles for each cell between points of a grid, which may close upon itself."""
+    """Faces, two per cell, of a grid of points, which may be closed in the second direction."""
     number = np.arange(rows * columns).reshape(rows, columns)
     if closed:
         number = np.concatenate([number, number[:, :1]], axis=1)
@@ -411,15 +412,15 @@ def _faces(rows: int, columns: int, closed: bool = False) -> Ints:
 
 
 def sheet(grid: Array) -> tuple[Array, Ints]:
-    """Make a surface of the points of a grid."""
+    """Surface through the points of a grid."""
     return grid.reshape(-1, 3), _faces(*grid.shape[:2])
 
 
 def tube(line: Array, radius: Array, sides: int = _SIDES) -> tuple[Array, Ints]:
-    """Make a closed tube about a line."""
+    """Closed tube around a polyline."""
     tangents = np.gradient(line, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-    normals = np.array(_transported(across(tangents[0])[0].tolist(), tangents.tolist()))
+    normals = np.array(_transport_normal(across(tangents[0])[0].tolist(), tangents.tolist()))
     turn = np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False)
     ring = np.cos(turn)[:, None] * normals[:, None]
     ring += np.sin(turn)[:, None] * np.cross(tangents, normals)[:, None]
@@ -427,8 +428,8 @@ def tube(line: Array, radius: Array, sides: int = _SIDES) -> tuple[Array, Ints]:
     return np.concatenate([walls.reshape(-1, 3), line[[0, -1]]]), _tube_faces(len(line), sides)
 
 
-def _transported(normal: list[float], tangents: list[list[float]]) -> list[list[float]]:
-    """A normal carried along; in plain numbers, which are faster than small arrays."""
+def _transport_normal(normal: list[float], tangents: list[list[float]]) -> list[list[float]]:
+    """Parallel transport of a normal; plain numbers are faster than small arrays here."""
     x, y, z = normal
     out = []
     for a, b, c in tangents:
@@ -442,6 +443,7 @@ def _transported(normal: list[float], tangents: list[list[float]]) -> list[list[
 
 @lru_cache(maxsize=32)
 def _tube_faces(count: int, sides: int) -> Ints:
+    """Faces of a tube, including its ends."""
     around = np.arange(sides)
     beyond = (around + 1) % sides
     first, last = count * sides, (count - 1) * sides
@@ -455,13 +457,13 @@ def _tube_faces(count: int, sides: int) -> Ints:
 def cylinder(
     origin: Array, axis: Array, radius: float, length: float, sides: int = 32
 ) -> tuple[Array, Ints]:
-    """Make a closed cylinder."""
+    """Closed cylinder."""
     along = 0.5 * length * axis / np.linalg.norm(axis)
     return tube(np.stack([origin - along, origin + along]), np.full(2, radius), sides)
 
 
 def ellipsoid(centre: Array, axes: Array, around: int = 24) -> tuple[Array, Ints]:
-    """Make an ellipsoid."""
+    """Surface of an ellipsoid with semiaxes in the columns of ``axes``."""
     latitude = np.linspace(-np.pi / 2, np.pi / 2, around // 2 + 1)
     longitude = np.linspace(0.0, 2.0 * np.pi, around, endpoint=False)
     lat, lon = np.meshgrid(latitude, longitude, indexing="ij")
@@ -473,16 +475,16 @@ def ellipsoid(centre: Array, axes: Array, around: int = 24) -> tuple[Array, Ints
 def error_ellipsoid(
     centre: Array, covariance: Array, sigmas: float, most: float = np.inf
 ) -> tuple[Array, Ints]:
-    """Make the ellipsoid of an uncertain position."""
+    """Error ellipsoid of an uncertain position."""
     values, directions = np.linalg.eigh(covariance)
     sizes = np.minimum(sigmas * np.sqrt(np.clip(values, 0.0, None)), most)
     return ellipsoid(centre, directions * sizes)
 
 
 def head_surfaces(rotation: Array, position: Array) -> tuple[Array, Array]:
-    """Sketch a rat's head."""
+    """Triangles of a sketch of a rat's head, and of its eyes, mm."""
     turn = np.linspace(0.0, 2.0 * np.pi, _AROUND)
-    # Smooth between the sections, which are closer together near the snout.
+    # Smooth interpolation between the sections, which are closer together near the snout.
     number = np.arange(len(_SECTIONS))
     fine = np.linspace(0.0, number[-1], 6 * number[-1] + 1)
     forward, half, middle, tall = interpolate.PchipInterpolator(number, _SECTIONS)(fine).T[
@@ -497,7 +499,7 @@ def head_surfaces(rotation: Array, position: Array) -> tuple[Array, Array]:
 
 
 def object_surface(thing: xr.Dataset, limits: Array) -> tuple[Array, Ints]:
-    """Make the surface of an object of a recording."""
+    """Surface of an object of a recording, within limits (3, 2) if unbounded, mm."""
     kind = str(thing.attrs.get("kind"))
     if kind not in _KINDS:
         raise ValueError(f"an object is of kind {kind!r}; one of {', '.join(_KINDS)} is known")
@@ -505,7 +507,7 @@ def object_surface(thing: xr.Dataset, limits: Array) -> tuple[Array, Ints]:
 
 
 def is_bounded(thing: xr.Dataset) -> bool:
-    """Check whether an object of a recording ends on all sides."""
+    """Whether an object of a recording is bounded."""
     return thing.attrs.get("kind") in ("sphere", "box", "mesh")
 
 
@@ -520,14 +522,14 @@ def _sphere(thing: xr.Dataset, limits: Array) -> tuple[Array, Ints]:
 def _peg(thing: xr.Dataset, limits: Array) -> tuple[Array, Ints]:
     axis, origin = thing["object_axis"].values, _mm(thing, "object_position")
     first, second = across(axis)
-    ends = _within(limits, origin, axis)
+    ends = _visible_range(limits, origin, axis)
     turn = np.linspace(0.0, 2.0 * np.pi, 49)[:, None]
     ring = _mm(thing, "object_radius") * (np.cos(turn) * first + np.sin(turn) * second)
     return sheet(origin + ends[:, None, None] * axis + ring)
 
 
-def _within(limits: Array, origin: Array, axis: Array) -> Array:
-    """From where to where (2,) a line is seen; if nowhere, where it comes nearest to the middle."""
+def _visible_range(limits: Array, origin: Array, axis: Array) -> Array:
+    """Range (2,) along a line that is within limits; if there is none, a range near the middle."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = np.sort((limits - origin[:, None]) / axis[:, None], axis=1)
     crossing = np.abs(axis) > 1e-9
@@ -550,7 +552,7 @@ def _plane(thing: xr.Dataset, limits: Array) -> tuple[Array, Ints]:
 def _box(thing: xr.Dataset, limits: Array) -> tuple[Array, Ints]:
     half = 0.5 * _mm(thing, "object_size")
     square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-    # Its sides share no corners, so that edges stay sharp.
+    # Sides share no vertices, so that edges remain sharp.
     sides = [np.insert(square, k, end, axis=1) * half for k in range(3) for end in (-1.0, 1.0)]
     rotation = thing["object_rotation"].values
     faces = np.array([[0, 1, 2], [0, 2, 3]]) + 4 * np.arange(6)[:, None, None]

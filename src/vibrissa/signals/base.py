@@ -97,8 +97,8 @@ def _check_arms(force: Array, moment: Array) -> None:
     arm = float(np.min(turning[known] / size[known])) if known.any() else 0.0
     if arm > _LONGEST_ARM:
         warnings.warn(
-            f"the moment is that of a force {arm:.3g} m from the base or farther: force, N, comes "
-            "before moment, N·m (1 N·mm is 1e-3 N·m)",
+            f"all moments are those of forces {arm:.3g} m from the base or farther: force, N, "
+            "comes before moment, N·m (1 N·mm is 1e-3 N·m)",
             UserWarning,
             stacklevel=3,
         )

@@ -59,7 +59,7 @@ class WhiskerArray(Mapping[str, Whisker]):
         if twice:
             raise ValueError(f"no array of whiskers: there are two of {', '.join(twice)}")
         if not found:
-            raise ValueError("no array of whiskers: there is none in it")
+            raise ValueError("no array of whiskers: it is empty")
         self._identities = {identity.name: identity for identity, _ in found}
         self._whiskers = {whisker.name: whisker for _, whisker in found}
 
@@ -83,7 +83,7 @@ class WhiskerArray(Mapping[str, Whisker]):
         sides: Sequence[Side] = (identity.side,) if identity.side else ("left", "right")
         keys = [k for k in (identity.on(side).name for side in sides) if k in self._whiskers]
         if len(keys) != 1:
-            why = f"{' and '.join(keys)} are meant by it" if keys else "there is no such whisker"
+            why = f"it may be {' or '.join(keys)}" if keys else "there is no such whisker"
             raise KeyError(f"{name!r}: {why}; this array has {', '.join(self)}")
         return keys[0]
 
@@ -350,9 +350,9 @@ def whisker_array(
         identities = [Identity.of(name) for name in names]
         away = [one.name for one in identities if one.side not in (None, *sides(side))]
         if away:
-            raise ValueError(f"{', '.join(away)} are not on the {side} side, which is asked for")
+            raise ValueError(f"{', '.join(away)} are not on the requested {side} side")
         if set(rows) != set("ABCDE") or set(columns) != set(range(7)):
-            raise ValueError("names are given, and rows or columns instead; give one")
+            raise ValueError("names and rows or columns were both given; give one of them")
         wanted = [
             one.on(s) for one in identities for s in ((one.side,) if one.side else sides(side))
         ]
@@ -385,8 +385,8 @@ def average_whisker(identity: Identity, **properties: Unpack[Properties]) -> Whi
     own = {"base_radius", "tip_radius", "radius", "rat"} & set(properties)
     if not own and radii["tip_radius"] == radii["base_radius"] / morphology.MOST_TAPER:
         notes.append(
-            "the published radius slope leaves it no tip (or too thin a one); its base radius over "
-            f"{morphology.MOST_TAPER:g} is taken instead"
+            "the published radius slope gives a tip radius near or below zero; base radius over "
+            f"{morphology.MOST_TAPER:g} is used instead"
         )
     stated: Any = ({} if own else radii) | dict(properties) | {"name": identity.name}
     whisker = Whisker.parabola(length, coefficient, **stated)

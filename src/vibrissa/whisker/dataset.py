@@ -99,8 +99,8 @@ def check_centerline(dataset: Stored, whisker: Any) -> None:
             return
     raise ValueError(
         "this dataset of a whisker was changed: centerline and radius at arc_length are not those "
-        "of its curvature and section coefficients, which alone count; make it anew from points "
-        "(Whisker.from_points) instead of changing the file"
+        "of its curvature and section coefficients, which define the whisker; create a new one "
+        "from points (Whisker.from_points) instead of changing the file"
     )
 
 

@@ -129,13 +129,13 @@ def checked_points(
             faults.append(f"rows {_rows(repeated)} repeat earlier points (counted from 0)")
         extent = float(np.linalg.norm(np.ptp(good, axis=0)))
         if not extent:
-            faults += ["all points are one: " + fault for fault in length_faults(extent)]
+            faults += ["all points coincide: " + fault for fault in length_faults(extent)]
         elif extent > LONGEST:
             faults += length_faults(extent, any_length)
         if noise is not None and 0.0 < SCATTERED * extent < noise:
             faults.append(
-                f"noise is {noise:.4g} m, of points that extend over {extent:.4g} m: it is the "
-                "standard deviation of a coordinate in m"
+                f"noise is {noise:.4g} m for points that extend over {extent:.4g} m: it is the "
+                "standard deviation of a coordinate, in m"
             )
     if faults:
         raise ValueError("no whisker in these points: " + "; ".join(faults))
@@ -168,7 +168,7 @@ def _starts_at_tip(points: Array, base: str | ArrayLike | None) -> bool:
     if abs(first - last) < HINT_MARGIN * apart or min(first, last) > apart:
         raise ValueError(
             f"base is {hint.tolist()} m, which is {first:.4g} m from the first point and "
-            f"{last:.4g} m from the last: it does not tell them apart; give a nearer point, "
+            f"{last:.4g} m from the last: it does not identify the base; give a nearer point, "
             '"first" or "last"'
         )
     return last < first
@@ -373,14 +373,14 @@ class ArcLength:
         inside = knots[(knots > start + slack) & (knots < end - slack)]
         self._velocity = curve.derivative(1)
         self._knots = np.concatenate([[start], inside, [end]])
-        pieces = self._between(self._knots[:-1], self._knots[1:])
+        pieces = self._segment_lengths(self._knots[:-1], self._knots[1:])
         self.ends: Array = np.append(0.0, np.cumsum(pieces))
         self.total = float(self.ends[-1])
 
     def _speed(self, t: Array) -> Array:
         return np.asarray(np.linalg.norm(self._velocity(t), axis=-1))
 
-    def _between(self, start: Array, end: Array) -> Array:
+    def _segment_lengths(self, start: Array, end: Array) -> Array:
         half = 0.5 * (end - start)
         t = 0.5 * (start + end)[..., np.newaxis] + half[..., np.newaxis] * _POINTS
         lengths: Array = half * (self._speed(t) @ _WEIGHTS)
@@ -389,7 +389,7 @@ class ArcLength:
     def length(self, t: Array) -> Array:
         """Arc lengths (...) at parameters (...)."""
         k = np.clip(np.searchsorted(self._knots, t, side="right") - 1, 0, self._knots.size - 2)
-        lengths: Array = self.ends[k] + self._between(self._knots[k], t)
+        lengths: Array = self.ends[k] + self._segment_lengths(self._knots[k], t)
         return lengths
 
     def parameter(self, s: Array) -> Array:

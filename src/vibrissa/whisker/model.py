@@ -298,8 +298,8 @@ class Whisker:
         notes: tuple[str, ...] = ()
         if profile.error > UNRESOLVED:
             notes += (
-                f"the curvature is met to {profile.error:.1e} of its largest value only; it has "
-                "kinks or jumps that should be stated as breaks",
+                f"the curvature is approximated to {profile.error:.1e} of its largest value only; "
+                "it has kinks or jumps that should be stated as breaks",
             )
         whisker = _assemble(length, profile, Pose(), properties, notes)
         if not whisker.is_straight and abs(whisker._proximal_roll()) > np.pi / 2:

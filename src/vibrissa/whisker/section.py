@@ -143,9 +143,9 @@ def _assumed_radius(length: float, section: Profile) -> str:
     """Note on the assumed radius."""
     base, tip = float(section(0.0)) * 1e6, float(section(length, "left")) * 1e6
     return (
-        f"{_RADIUS_ASSUMED}: {base:.4g} µm at the base, {tip:.3g} µm at the tip; forces go with "
-        "its fourth power. --rat C2 (in Python rat=) takes it from published regressions, by row "
-        "and column of a rat's whisker or by its length"
+        f"{_RADIUS_ASSUMED}: {base:.4g} µm at the base, {tip:.3g} µm at the tip; forces scale "
+        "with its fourth power. --rat C2 (in Python rat=) uses published regressions instead, by "
+        "row and column of a rat's whisker or by its length"
     )
 
 
@@ -179,8 +179,8 @@ def radius_notes(length: float, section: Profile, stated: Section) -> tuple[str,
         notes.append("the tip is thicker than the base")
     if section.error > UNRESOLVED:
         notes.append(
-            f"the radius is met to {section.error:.1e} of its largest value only; it has kinks or "
-            "jumps that should be stated as breaks"
+            f"the radius is approximated to {section.error:.1e} of its largest value only; it has "
+            "kinks or jumps that should be stated as breaks"
         )
     radius = stated.get("radius")
     if radius is None or callable(radius):
@@ -191,13 +191,13 @@ def radius_notes(length: float, section: Profile, stated: Section) -> tuple[str,
     if steps.size:
         notes.append(
             f"the radius jumps at {steps.size} arc lengths, by up to {steps.max():.1%}: these are "
-            "taken as steps of the rod, not smoothed"
+            "treated as steps of the rod, not smoothed"
         )
     noise = scatter(*_as_samples(length, np.asarray(radius, dtype=np.float64)))
     if noise > _NOTABLE_SCATTER:
         notes.append(
-            f"the radius samples scatter by {noise:.2g} of the radius, and forces go with its "
-            f"fourth power; signals follow the samples to about {_SIGNAL_ERROR * noise:.0e}"
+            f"the radius samples scatter by {noise:.2g} of the radius, and forces scale with "
+            f"its fourth power; signals follow the samples to about {_SIGNAL_ERROR * noise:.0e}"
         )
     return tuple(notes)
 
@@ -214,14 +214,14 @@ def material_faults(
         faults.append(f"youngs_modulus is {youngs_modulus!r} Pa; it must be positive")
     elif not _SOFTEST <= youngs_modulus <= _HARDEST:
         faults.append(
-            f"youngs_modulus is {youngs_modulus:.4g} Pa, and from a gel to diamond it is between "
-            f"{_SOFTEST:.0e} and {_HARDEST:.0e}: is it in Pa? 1 GPa is 1e9"
+            f"youngs_modulus is {youngs_modulus:.4g} Pa; materials from gels to diamond are "
+            f"between {_SOFTEST:.0e} and {_HARDEST:.0e}: is it in Pa? 1 GPa is 1e9"
         )
     if density is not None and not (np.isfinite(density) and density > 0.0):
         faults.append(f"density is {density!r} kg/m³; it must be positive, or None if not known")
     elif density is not None and not _LIGHTEST <= density <= _HEAVIEST:
         faults.append(
-            f"density is {density:.4g} kg/m³, and of a foam to osmium it is between "
+            f"density is {density:.4g} kg/m³; materials from foams to osmium are between "
             f"{_LIGHTEST:g} and {_HEAVIEST:g}: is it in kg/m³? 1 g/cm³ is 1000"
         )
     if not -1.0 < poisson_ratio <= 0.5:

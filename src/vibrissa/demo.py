@@ -1,6 +1,6 @@
-"""The main job from end to end, compared with the truth: a trial filmed, tracked, located, fitted.
+"""Demonstration of the whole pipeline on a simulated trial, compared with the truth.
 
-Files go to a folder. What is there of the same trial is not done again.
+Results are written to a folder. Files of the same trial that already exist there are reused.
 """
 
 from __future__ import annotations
@@ -65,25 +65,26 @@ FULL_DURATION = 3.5
 """Duration of a trial like the paper's, s."""
 
 SIMULATED, TRACKED = "simulated.nc", "tracked.nc"
-"""Recordings that are kept from one run to the next, as videos are."""
+"""Recordings that are reused in later runs, as videos are."""
 
-# Files that are made anew each time.
+# Files that are written again in each run.
 _VIEWS = ("top", "front")
 _WRITTEN = ("trial.nc", "seen.nc", "contacts.csv", "map.nc")
-# Points by which it is known whether a whisker is the same.
+# Number of points by which whiskers are compared.
 _SETTINGS = ".settings.json"
 _NODES = 9
-# Properties that no camera sees, and a lab has from elsewhere.
+# Properties that cameras cannot measure, and that a laboratory knows from other measurements.
 _PROPERTIES = ("base_radius", "tip_radius", "youngs_modulus", "poisson_ratio")
 _DIM = {"whisker": 0}
 
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """Contact points estimated from signals of one source, and how good they are.
+    """Contacts estimated from signals of one source, with their errors.
 
     The recording has the groups ``signals``, ``estimates`` and ``contour``; `contacts` are its
-    estimates and `fit` the peg fitted to them, errors by frame, in numbers, and of the signals.
+    estimates and `fit` the peg fitted to them. Errors are given by frame, as summary, and for the
+    signals.
     """
 
     recording: xr.DataTree
@@ -96,12 +97,12 @@ class Located:
 
 @dataclass(frozen=True, eq=False)
 class DemoResult:
-    """Everything that the main job gives: the simulated trial, and what was made of it.
+    """Results of the demonstration: the simulated trial, and all estimates.
 
-    Contacts were found by the map of the whisker as it was tracked, or without video of the one
-    that whisked: `sensed` from what the sensor read, in the laboratory by the pose that was
-    tracked, or without video by the true one; `seen` by the paper's method, from signals that the
-    model gives for the contact point that was tracked.
+    Contacts are estimated by the map of the tracked whisker, or of the true one without video:
+    `sensed` from the readings of the sensor, transformed to the laboratory frame by the tracked
+    pose (the true one without video), and `seen` by the paper's method, from signals computed for
+    the tracked contact point.
     """
 
     whisker: Whisker
@@ -125,12 +126,12 @@ def run_demo(
     video: bool = True,
     progress: Progress | None = None,
 ) -> DemoResult:
-    """Whisk against a peg, film it, measure at the whisker's base, and find the peg again.
+    """Simulate whisking against a peg, with videos and a sensor, and reconstruct the peg.
 
-    Recordings, videos and tables go to a folder, made if need be; by default nothing is kept. What
-    is there already of the same trial is not done again. Without ``video`` the base's true pose is
-    taken. A ValueError states that the whisker cannot whisk past the peg, that there are too few
-    contacts to fit it, or that files are in the way.
+    Recordings, videos and tables are written to the folder ``output``, which is created if needed;
+    by default nothing is kept. Existing results of the same trial are reused. Without ``video`` the
+    true pose of the base is used. ValueError is raised if the whisker cannot whisk past the peg,
+    there are too few contacts to fit it, or other files would be replaced.
     """
     tell = progress or (lambda stage, done, total: None)
     whisker = samples.gamma() if whisker is None else whisker
@@ -160,7 +161,7 @@ def run_demo(
 
 @contextmanager
 def _folder(output: str | PathLike[str] | None) -> Iterator[Path]:
-    """The folder that is asked for, or one that goes away again."""
+    """Context with the requested folder, or with a temporary one."""
     if output is not None:
         yield Path(output)
         return
@@ -169,7 +170,7 @@ def _folder(output: str | PathLike[str] | None) -> Iterator[Path]:
 
 
 def begin(folder: Path, whisker: Whisker, **settings: object) -> None:
-    """Make the folder, and clear away what was made there with other settings by name."""
+    """Create the folder, and remove results made there with other settings."""
     folder.mkdir(parents=True, exist_ok=True)
     arc_length = np.linspace(0.0, whisker.length, _NODES)
     shape = np.column_stack([whisker.centerline(_NODES), whisker.radius(arc_length)])
@@ -183,7 +184,7 @@ def begin(folder: Path, whisker: Whisker, **settings: object) -> None:
     there = [file.name for file in made if file.exists()]
     if there and not path.exists():
         raise ValueError(
-            f"{folder} holds {', '.join(there)}, which this would replace: choose another folder"
+            f"{folder} contains {', '.join(there)}, which would be replaced: choose another folder"
         )
     for file in made:
         file.unlink(missing_ok=True)
@@ -199,7 +200,7 @@ def video_files(folder: Path) -> list[Path]:
 def _simulated(
     whisker: Whisker, seed: int, noise: bool, duration: float, rate: float, tell: Progress
 ) -> xr.DataTree:
-    """The trial, with what a sensor at the whisker's base reads."""
+    """Simulated trial, with the readings of a sensor at the whisker's base."""
     force_noise, moment_noise = (FORCE_NOISE, MOMENT_NOISE) if noise else (0.0, 0.0)
     peg = facing_peg(whisker)
     tell("how far to whisk", 0, 1)
@@ -210,13 +211,13 @@ def _simulated(
 
 
 def _filmed(trial: xr.DataTree, folder: Path, seed: int, tell: Progress) -> xr.DataTree:
-    """The trial with cameras and true traces; its videos are made where they are not there."""
+    """Trial with cameras and true traces; missing videos are rendered."""
     path = folder / SIMULATED
     if path.exists():
         return load_recording(path)
     cameras = views_of(trial)
     for view, (camera, file) in enumerate(zip(cameras, video_files(folder), strict=True)):
-        # A video is there only if it is whole.
+        # An existing video is complete.
         if not file.exists():
             report = partial(tell, f"filming, {camera.name}")
             film(trial, {camera.name: file}, [camera], seed=seed + view, progress=report)
@@ -226,7 +227,7 @@ def _filmed(trial: xr.DataTree, folder: Path, seed: int, tell: Progress) -> xr.D
 
 
 def _tracked(trial: xr.DataTree, folder: Path, tell: Progress) -> xr.DataTree:
-    """The whisker as it is tracked in the videos of a trial."""
+    """Recording tracked in the videos of a trial."""
     path = folder / TRACKED
     if path.exists():
         return load_recording(path)
@@ -273,7 +274,7 @@ def _located(recording: xr.DataTree, contact_map: ContactMap, seed: int) -> Loca
 def _written(
     folder: Path, sensed: Located, seen: Located | None, contact_map: ContactMap, tell: Progress
 ) -> tuple[Path, ...]:
-    """Write everything and return where."""
+    """Write all results and return their paths."""
     recordings = {"trial.nc": sensed.recording}
     if seen is not None:
         recordings["seen.nc"] = seen.recording

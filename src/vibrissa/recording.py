@@ -1,20 +1,20 @@
-"""The recording: all that is known of a trial, declared once and read by one accessor.
+"""Data model of a recording (all data of a trial), and accessors to its variables.
 
-Declared are dimensions, frame and type of variables, and the groups with them.
+Each variable is declared once, with its dimensions, frame, type and the groups that may contain it.
 
-    /            what is known of the trial: the base's pose, and what was measured or tracked
-    /truth       the same names and more, as they truly are (simulated trials only)
-    /measured    what tracking found before the rod was fitted
+    /            measured or tracked variables of the trial, and the pose of the base
+    /truth       true values of these and other variables (simulated trials only)
+    /measured    results of tracking before the rod was fitted
     /signals     force, moment and the six signals of every frame
-    /estimates   contact points from the signals
+    /estimates   contact points estimated from the signals
     /whiskers/0  the first whisker along the dimension ``whisker``, and so on
     /cameras     the views
     /objects/0   the first object in the laboratory, and so on
 
-A group cannot be called ``whisker``: a file has one name space for groups and dimensions. Missing
-is NaN. Force and moment act at the whisker's base, the force being that of the object on the
-whisker; at the top they are what the sensor reads, in contact or not, and contact points there are
-estimates. Units and long names are those of :mod:`vibrissa.quantities`.
+No group is named ``whisker``, as groups and dimensions of a file share one name space. Missing
+values are NaN. Force and moment act at the whisker's base; the force is that of the object on the
+whisker. In the root they are the readings of the sensor, with or without contact, and contact
+points are estimates. Units and long names are those of :mod:`vibrissa.quantities`.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ __all__ = [
 class RecordedVariable:
     """Declaration of one variable of a recording.
 
-    Dimensions in the order of the arrays that `Group` returns; groups that may hold it, of which
-    the empty name is the recording itself; the frame of its components, empty for what has none;
-    and the type of its values, "float", "bool" or "int".
+    It states the dimensions in the order of the arrays that `Group` returns; the groups that may
+    contain the variable, where the empty name stands for the root; the frame of its components,
+    empty if it has none; and the type of its values, "float", "bool" or "int".
     """
 
     dims: tuple[str, ...]
@@ -77,7 +77,7 @@ _LAB, _WHISKER, _HEAD = "laboratory", "whisker", "head"
 
 VARIABLES: Mapping[str, RecordedVariable] = MappingProxyType(
     {
-        # How the whisker is held
+        # Pose of the base and of the head
         "base_position": RecordedVariable(_VECTOR, _POSED, _LAB),
         "base_rotation": RecordedVariable(_TURN, _POSED),
         **{name: RecordedVariable(_EACH, ("", "measured")) for name in _ANGLES},
@@ -88,7 +88,7 @@ VARIABLES: Mapping[str, RecordedVariable] = MappingProxyType(
         "pose_shared": RecordedVariable((*_EACH, "error", "pose"), _TOP),
         "unfiltered_base_position": RecordedVariable(_VECTOR, _MEASURED, _LAB),
         **{f"unfiltered_{name}": RecordedVariable(_EACH, _MEASURED) for name in _ANGLES},
-        # Where it is
+        # Position of the whisker
         "centerline": RecordedVariable(_POINTS, ("", "truth", "measured"), _LAB),
         "centerline_sigma": RecordedVariable(_POINTS, _MEASURED),
         "deviation": RecordedVariable(_EACH, _MEASURED),
@@ -98,7 +98,7 @@ VARIABLES: Mapping[str, RecordedVariable] = MappingProxyType(
         "trace_visible": RecordedVariable(_IMAGE[:-1], _SEEN, kind="bool"),
         "trace_confidence": RecordedVariable(_IMAGE[:-2], _TOP),
         "trace_misfit": RecordedVariable(_EACH, _TOP),
-        # What it touches
+        # Contacts
         "contact_point": RecordedVariable(_VECTOR, ("", "truth", "measured", "estimates"), _LAB),
         "contact_point_whisker": RecordedVariable(_VECTOR, ("", "truth", "estimates"), _WHISKER),
         "contact_covariance": RecordedVariable(_SQUARE, ("", "estimates"), _LAB),
@@ -126,7 +126,7 @@ VARIABLES: Mapping[str, RecordedVariable] = MappingProxyType(
         "onset_sigma": RecordedVariable(_EACH, _ESTIMATES),
         "confidence": RecordedVariable(_EACH, ("", "truth")),
         "status": RecordedVariable(_EACH, _ANYWHERE, kind="int"),
-        # What its base measures
+        # Force, moment and signals at the base
         "force": RecordedVariable(_VECTOR, _FORCED, _WHISKER),
         "moment": RecordedVariable(_VECTOR, _FORCED, _WHISKER),
         **{
@@ -141,15 +141,15 @@ VARIABLES: Mapping[str, RecordedVariable] = MappingProxyType(
         "mixing": RecordedVariable(("channel", "component"), _TOP),
     }
 )
-"""Every variable that runs along the frames of a recording, by name."""
+"""Declarations of all variables over the frames of a recording, by name."""
 
-# Dimensions that a dataset of one frame, whisker or view lacks.
+# Dimensions of components, which a selection of one frame, whisker or view keeps.
 _AXES = frozenset({"space", "whisker_axis", "head_axis", "space_"})
 _SELECTED = frozenset({"time", "whisker", "view"})
-# Dimensions that go by another name, where a dataset has two of a kind.
+# Alternative names of dimensions, for datasets with two of the same kind.
 _ALSO_CALLED = MappingProxyType({"true_node": "node", "space_2": "space_"})
 _NUMBERS = "fiub"
-# Labels of dimensions whose values are read by position.
+# Required labels of dimensions whose values are accessed by position.
 _LABELS = MappingProxyType(
     {
         "space": ["x", "y", "z"],
@@ -158,7 +158,7 @@ _LABELS = MappingProxyType(
         "image_axis": ["column", "row"],
     }
 )
-# Other names of units.
+# Alternative names of units.
 _UNITS = MappingProxyType(
     dict.fromkeys(("meter", "meters", "metre", "metres"), "m")
     | dict.fromkeys(("sec", "second", "seconds"), "s")
@@ -171,7 +171,7 @@ _OF = "recorded_as"  # attribute of a whisker's group: its label along the dimen
 
 
 def recorded(name: str, values: ArrayLike) -> xr.Variable:
-    """Label one variable of a recording."""
+    """Create a labelled variable of a recording from an array."""
     about = _declared(name)
     array = np.asarray(values)
     if "whisker" in about.dims and array.ndim == len(about.dims) - 1:
@@ -192,7 +192,7 @@ def recorded(name: str, values: ArrayLike) -> xr.Variable:
 
 
 def coordinates(time: ArrayLike, names: Sequence[str]) -> dict[Hashable, Any]:
-    """List the coordinates of a recording."""
+    """Coordinates of a recording."""
     return {
         "time": xr.Variable("time", np.asarray(time), attributes("time")),
         "whisker": list(names),
@@ -202,7 +202,7 @@ def coordinates(time: ArrayLike, names: Sequence[str]) -> dict[Hashable, Any]:
 
 
 def faults_in(data: xr.Dataset) -> list[str]:
-    """List what is wrong with the variables of a recording or of one of its groups."""
+    """List faults of the variables of a recording or of one of its groups."""
     known = {name: data[name].variable for name in VARIABLES if name in data}
     faults = [_fault(name, variable, frozenset()) for name, variable in known.items()]
     faults += [_unit_fault(name, variable) for name, variable in known.items()]
@@ -223,7 +223,7 @@ def faults_in(data: xr.Dataset) -> list[str]:
 
 
 def _unit_fault(name: str, variable: xr.Variable) -> str:
-    """State that a variable is in another unit than declared, as where it was converted."""
+    """Describe the fault of a variable in another unit than declared; empty if there is none."""
     wanted = attributes(name.removeprefix("unfiltered_"))["units"]
     got = str(variable.attrs.get("units", ""))
     if not got or wanted == "1" or _plain_unit(got) == _plain_unit(wanted):
@@ -232,14 +232,15 @@ def _unit_fault(name: str, variable: xr.Variable) -> str:
 
 
 def _plain_unit(text: str) -> str:
-    """A unit without what is between its parts."""
+    """Unit without separators between its parts, for comparison."""
     return re.sub(r"[\s·⋅*.^]", "", _UNITS.get(text.strip(), text))
 
 
 def ordered(name: str, variable: xr.Variable) -> NDArray[Any]:
-    """Give the values of a variable in the declared order and type; a missing truth is False.
+    """Values of a variable in the declared order of dimensions and type.
 
-    Of vectors what is infinite is missing, too, and of statuses NaN is that of what is missing.
+    Missing booleans are False, a missing status is that of missing data, and infinite components of
+    vectors count as missing.
     """
     fault = _fault(name, variable, _SELECTED)
     if fault:
@@ -263,7 +264,7 @@ def _declared(name: str) -> RecordedVariable:
 
 
 def _fault(name: str, variable: xr.Variable, selected: frozenset[str]) -> str:
-    """State what is wrong with a variable, of whose dimensions those selected may be missing."""
+    """Describe the fault of a variable, which may lack selected dimensions; empty if none."""
     dims = _declared(name).dims
     sizes = {_ALSO_CALLED.get(str(dim), str(dim)): n for dim, n in variable.sizes.items()}
     if not set(dims) - selected <= set(sizes) <= set(dims):
@@ -282,19 +283,19 @@ ONE_VIEW = (
     "(Mz). Not measured, and given as 0: elevation, depth, force across the plane (Fz), and the "
     "moments Mx and My; roll is 0° or 180°. What turns out of the plane looks shorter and bent."
 )
-"""Variables of a trial that was filmed by one camera."""
+"""Variables of a trial filmed by one camera."""
 
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """One group of a recording, or one whisker of it, as arrays by name.
+    """Access to the variables of one group, or of one whisker in it, as arrays by name.
 
     Parameters
     ----------
     data : xarray.Dataset
         Variables of the group.
     name : str
-        Name of the group; empty for the recording itself.
+        Name of the group; empty for the root.
     """
 
     data: xr.Dataset
@@ -304,7 +305,7 @@ class Group:
         return name in self.data
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """Give a variable in the declared order of dimensions; ValueError if it is missing."""
+        """Values in the declared order of dimensions; raise ValueError if they are missing."""
         values = self.get(name)
         if values is None:
             here = f"the group {self.name} of the recording" if self.name else "the recording"
@@ -313,7 +314,7 @@ class Group:
         return values
 
     def get(self, name: str) -> NDArray[Any] | None:
-        """Give a variable in the declared order of dimensions.
+        """Values of a variable in the declared order of dimensions.
 
         Parameters
         ----------
@@ -328,12 +329,12 @@ class Group:
         Raises
         ------
         ValueError
-            If it has other dimensions or sizes than declared, or holds no numbers.
+            If it has other dimensions or sizes than declared, or is not numeric.
         """
         return ordered(name, self.data[name].variable) if name in self.data else None
 
     def known(self, name: str) -> NDArray[Any] | None:
-        """Give a variable of which something is known.
+        """Values of a variable that is not entirely missing.
 
         Parameters
         ----------
@@ -343,13 +344,13 @@ class Group:
         Returns
         -------
         array or None
-            Values; None if it is missing or not finite anywhere.
+            Values; None if it is missing or nowhere finite.
         """
         values = self.get(name)
         return None if values is None or not np.isfinite(values).any() else values
 
     def whisker(self, index: int) -> Group:
-        """Take one whisker.
+        """Select one whisker.
 
         Parameters
         ----------
@@ -374,29 +375,29 @@ class Group:
         return Group(self.data.isel(whisker=index), self.name)
 
     def each_whisker(self) -> Iterator[Group]:
-        """Take one whisker after the other.
+        """Iterate over the whiskers.
 
         Returns
         -------
         iterator of Group
-            One for each whisker.
+            Groups of single whiskers.
         """
         return (self.whisker(k) for k in range(self.data.sizes.get("whisker", 1)))
 
 
 def _number(key: str) -> tuple[int, str]:
-    """Order of groups that are called by their numbers."""
+    """Sort key of groups named by numbers."""
     return (int(key), "") if key.isdecimal() else (sys.maxsize, key)
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """All that is known of a trial.
+    """Access to the groups of a recording, and to its whiskers, cameras and objects.
 
     Parameters
     ----------
     tree : xarray.DataTree
-        Recording as `vibrissa.io.load_recording`, simulation and tracking return it.
+        Recording, as returned by `vibrissa.io.load_recording`, simulation and tracking.
     """
 
     tree: xr.DataTree
@@ -407,18 +408,18 @@ class Recording:
         Parameters
         ----------
         name : str
-            Name of the group; empty for the recording itself.
+            Name of the group; empty for the root.
 
         Returns
         -------
         Group or None
-            Group with the coordinates of the recording; None if there is none of that name.
+            Group with the coordinates of the recording; None if it does not exist.
         """
         node = self.tree.children.get(name) if name else self.tree
         return None if node is None else Group(node.to_dataset(), name)
 
     def __getitem__(self, name: str) -> Group:
-        """Give a group by name; ValueError if there is none."""
+        """Group by name; raise ValueError if it does not exist."""
         group = self.find(name)
         if group is None:
             got = ", ".join(sorted(self.tree.children)) or "no groups"
@@ -430,28 +431,28 @@ class Recording:
 
     @property
     def root(self) -> Group:
-        """Variables of the recording itself."""
+        """Variables of the root."""
         return self[""]
 
     @property
     def names(self) -> list[str]:
-        """Names of the whiskers, along the dimension ``whisker``."""
+        """Names of the whiskers along the dimension ``whisker``."""
         return [str(name) for name in np.atleast_1d(self.root.data["whisker"].values)]
 
     def known(self, name: str, groups: Sequence[str]) -> NDArray[Any] | None:
-        """Give a variable from the first group in which something is known of it.
+        """Values of a variable from the first group in which it is not entirely missing.
 
         Parameters
         ----------
         name : str
             Name of a declared variable.
         groups : sequence of str
-            Names of groups, the most trusted first; empty for the recording itself.
+            Names of groups in order of priority; the empty name stands for the root.
 
         Returns
         -------
         array or None
-            Values in the declared order; None if no group has any.
+            Values in the declared order of dimensions; None if no group has any.
         """
         for group in filter(None, map(self.find, groups)):
             values = group.known(name)
@@ -460,7 +461,7 @@ class Recording:
         return None
 
     def whisker(self, index: int = 0) -> Whisker:
-        """Make a whisker of the recording again.
+        """Restore a whisker of the recording.
 
         Parameters
         ----------
@@ -475,7 +476,7 @@ class Recording:
         Raises
         ------
         ValueError
-            If the recording carries no such whisker.
+            If the recording does not contain this whisker.
         """
         groups = self._whisker_groups()
         if not 0 <= index < len(groups):
@@ -485,9 +486,10 @@ class Recording:
         return Whisker.from_dataset(groups[index].to_dataset(inherit=False))
 
     def _whisker_groups(self) -> list[xr.DataTree]:
-        """Groups of the whiskers along the dimension ``whisker``: by label, which selection keeps.
+        """Groups of the whiskers along the dimension ``whisker``, matched by label.
 
-        Where no group has a label of that dimension, as when all were renamed, they are in order.
+        Labels survive selection. If no group has a label of that dimension, as after renaming, the
+        groups are assigned in order.
         """
         whiskers = self.tree.children.get("whiskers")
         children = {} if whiskers is None else whiskers.children
@@ -500,31 +502,31 @@ class Recording:
             return [groups[labels.index(name)] for name in names]
         if len(groups) != self.tree.sizes.get("whisker") or set(names) & set(labels):
             raise ValueError(
-                f"the whiskers are called {', '.join(names) or 'nothing'}; the recording carries "
+                f"the whiskers are named {', '.join(names) or 'nothing'}; the recording contains "
                 f"the shapes of {', '.join(labels)}"
             )
         return groups
 
     @property
     def whiskers(self) -> list[Whisker]:
-        """Whiskers of the recording, made again."""
+        """Whiskers of the recording, restored."""
         return [self.whisker(k) for k in range(self.tree.sizes["whisker"])]
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
-        """Cameras of a filmed or tracked recording, made again; ValueError if it has none."""
+        """Cameras of a filmed or tracked recording; raise ValueError if there are none."""
         if "cameras" not in self:
             raise ValueError("the recording has no cameras")
         return cameras_from_dataset(self["cameras"].data)
 
     @property
     def planar(self) -> bool:
-        """Whether one camera alone has seen the trial, so that it is known in a plane only."""
+        """Whether the trial was filmed by a single camera, so that it is known in a plane only."""
         return "cameras" in self and self["cameras"].data.sizes.get("view") == 1
 
     @property
     def objects(self) -> tuple[Surface, ...]:
-        """Objects of the recording, made again, in the laboratory frame; there may be none."""
+        """Objects of the recording in the laboratory frame; may be empty."""
         objects = self.tree.children.get("objects")
         if objects is None:
             return ()
@@ -533,7 +535,7 @@ class Recording:
 
     @property
     def pegs(self) -> tuple[Peg, ...]:
-        """Pegs of the recording, made again, in the laboratory frame; there may be none."""
+        """Pegs of the recording in the laboratory frame; may be empty."""
         return tuple(thing for thing in self.objects if isinstance(thing, Peg))
 
 
@@ -546,18 +548,19 @@ def recording_tree(
     objects: Sequence[Surface] | None = None,
     cameras: Sequence[Camera] = (),
 ) -> xr.DataTree:
-    """Put a recording together."""
+    """Assemble a recording from its root, whiskers and further groups."""
     tree = {"/": root.assign_attrs(kind=RECORDING_KIND, origin=origin)}
     tree |= {f"/{name}": data for name, data in (groups or {}).items()}
     if cameras:
         tree["/cameras"] = cameras_dataset(cameras).drop_vars("view")
     for i, (whisker, label) in enumerate(zip(whiskers, root["whisker"].values, strict=True)):
-        # Its centreline is for readers of lone whisker files, and its nodes are others than ours.
+        # The stored centreline serves readers of whisker files, and its dimension node would
+        # conflict with that of the recording.
         own = whisker.to_dataset().drop_dims("node")
         tree[f"/whiskers/{i}"] = own.assign_attrs({_OF: str(label)})
     if objects is not None:
         tree["/objects"] = xr.Dataset(attrs={"reference_frame": "laboratory"})
-        # The coordinates of the root are seen from below.
+        # Groups inherit the coordinates of the root.
         tree |= {
             f"/objects/{i}": data.drop_vars("space")
             for i, data in objects_datasets(objects).items()

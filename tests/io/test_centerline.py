@@ -197,7 +197,7 @@ def test_radii_and_points_that_are_missing(tmp_path):
         ("x_mm,y_mm,z_mm,radius_um", 1e3, RADII * 1e6 - 20, r"positive; .* µm at point 11"),
         ("x_mm,y_mm,z_mm,radius_um", 1e3, RADII - RADII[-1], "0 µm at point 12"),
         ("x_mm,y_mm,z_mm,radius", 1e3, RADII * 1e6, r"radius is 1e\+05 µm on a whisker of 39"),
-        ("x_mm,y_mm,z_mm,radius_um", 1e3, RADII, "called by its unit"),
+        ("x_mm,y_mm,z_mm,radius_um", 1e3, RADII, "must state its unit"),
         ("x_mm,y_mm,z_mm,ring", 1e6, RADII, r"micrometres as millimetres.*are in mm"),
         ("x_um,y_um,z_um,ring", 1e3, RADII, r"shorter than the 0\.5 mm.*are in um"),
         ("x,y,z,ring", 1e3, RADII, "millimetres given as metres.*are in m"),
@@ -245,5 +245,5 @@ def test_points_of_several_whiskers_are_refused_by_their_column(tmp_path):
 def test_millimetres_under_the_header_of_metres_name_the_remedy(tmp_path):
     path = tmp_path / "w.csv"
     path.write_text("\n".join([",X,Y,Z", *(f"{i},{i},{i * i / 80},0" for i in range(30))]))
-    with pytest.raises(ValueError, match="millimetres are called x_mm, y_mm, z_mm"):
+    with pytest.raises(ValueError, match="millimetres must be named x_mm, y_mm, z_mm"):
         load_whisker(path)

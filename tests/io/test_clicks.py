@@ -30,7 +30,7 @@ def test_masks_and_regions_are_pixels():
     [
         ("videos = []", "no \\[\\[view\\]\\]"),
         ("[[view]]\nbase = [1.0, 2.0]", "base of view 0"),
-        ("[[view]]\nmask = [[[1, 2], [3, 4]]]", "three at least"),
+        ("[[view]]\nmask = [[[1, 2], [3, 4]]]", "at least three corners"),
         ("pixel_size = -1\n[[view]]", "pixel_size is -1"),
         ("[[view]]\npeg = 1", "peg"),
     ],

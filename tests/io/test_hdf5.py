@@ -157,7 +157,7 @@ HARMFUL = (
     (reference, "section_error is neither numbers nor text"),
     (compound, "length is neither numbers nor text"),
     (nothing, "force is neither numbers nor text"),
-    (of_other_shape, "not a recording as it is known, or damaged"),
+    (of_other_shape, "not a recording in a known form, or damaged"),
     (no_utf8, "can't decode byte 0x94"),
 )
 

@@ -114,7 +114,7 @@ def test_bad_deeplabcut(tmp_path, rng):
         ("a,b,c\n1,2,3\n", "not a table of DeepLabCut"),
         (text[text.index("bodyparts") :], "header rows are bodyparts, coords; it lacks scorer"),
         (text.split("\n", 1)[0] + "\n" + text, "line 2 is the header row scorer a second time"),
-        (text + text, "line 9 is a header row once more"),
+        (text + text, "line 9 repeats the header row"),
     ):
         path.write_text(spoilt)
         with pytest.raises(ValueError, match=message) as caught:

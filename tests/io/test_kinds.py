@@ -61,7 +61,7 @@ def test_other_netcdf(tmp_path):
     path = tmp_path / "a.nc"
     xr.Dataset({"a": ("x", np.zeros(3))}, {"x": np.arange(3)}).to_netcdf(path, engine="h5netcdf")
     assert recognise(path) == Kind.NETCDF
-    with pytest.raises(ValueError, match=r"a.nc holds no tracks .*NetCDF file.*DeepLabCut"):
+    with pytest.raises(ValueError, match=r"a.nc does not contain tracks .*NetCDF file.*DeepLabCut"):
         load_tracks(path)
 
 

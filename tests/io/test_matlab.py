@@ -154,7 +154,7 @@ def test_traces_of_several_whiskers_in_pixels(tmp_path, write):
 def test_several_variables_must_be_chosen_from(tmp_path, write):
     path = tmp_path / "both.mat"
     write(path, {"left": structs(FRAMES), "right": structs(FRAMES[::-1])})
-    with pytest.raises(ValueError, match="in left and in right; say which by variable="):
+    with pytest.raises(ValueError, match="in left and in right; choose one by variable="):
         load_matlab(path, unit="mm")
     check(load_matlab(path, "right", unit="mm"), FRAMES[::-1])
     with pytest.raises(ValueError, match="no whiskers frame by frame in middle; it has left"):
@@ -196,5 +196,5 @@ def test_elements_of_no_kind_are_refused(tmp_path, kind, compressed):
         packed = zlib.compress(content[128:])
         content[128:] = struct.pack("<II", 15, len(packed)) + packed
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=rf"a\.mat.*of the kind {kind}"):
+    with pytest.raises(ValueError, match=rf"a\.mat.*of the unknown type {kind}"):
         matlab_values(path)

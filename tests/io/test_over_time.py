@@ -63,13 +63,15 @@ def test_faults_of_a_head_are_named(tmp_path):
 
     with pytest.raises(ValueError, match=r"not of unit length: 2 in row 3"):
         load(turns=q * np.where(np.arange(6) == 2, 2.0, 1.0)[:, None])
-    with pytest.raises(ValueError, match=r"frame does not rise: 2 is followed by 1 \(rows 3 and 4"):
+    with pytest.raises(
+        ValueError, match=r"frame does not increase: 2 is followed by 1 \(rows 3 and 4"
+    ):
         load(frames=np.array([0.0, 1, 2, 1, 4, 5]))
     with pytest.raises(ValueError, match="missing in rows 5"):
         load(places=np.where(np.arange(6)[:, None] == 4, np.nan, PLACES))
     with pytest.raises(ValueError, match=r"frame 0\.5 in row 2"):
         load(frames=np.arange(6) * 0.5)
-    with pytest.raises(ValueError, match="one way of orientation"):
+    with pytest.raises(ValueError, match="an orientation are"):
         load(names=[*names[:-1], "other"])
     with pytest.raises(ValueError, match="either time or frame"):
         load(names=["number", *names[1:]])
@@ -113,11 +115,11 @@ def test_faults_of_contact_points_are_named(tmp_path):
     def load(names, *columns):
         return load_contact_points(written(tmp_path / "c.csv", names, *columns))
 
-    with pytest.raises(ValueError, match="rows 2 tell of a contact that an earlier one has"):
+    with pytest.raises(ValueError, match="rows 2 repeat a contact of an earlier row"):
         load(["frame", "x", "y", "z"], [1.0, 1.0], PLACES[:2])
     with pytest.raises(ValueError, match="view 0 only"):
         load(["view", "frame", "x", "y"], [0.0, 0.0], [1.0, 2.0], PLACES[:2, :2])
     with pytest.raises(ValueError, match="view, frame, x, y are needed"):
         load(["time", "x", "y"], [1.0, 2.0], PLACES[:2, :2])
-    with pytest.raises(ValueError, match="whisker is not a number"):
+    with pytest.raises(ValueError, match="whisker is not a whole number"):
         load(["frame", "whisker", "x", "y", "z"], [1.0, 2.0], [-1.0, 0.0], PLACES[:2])

@@ -59,7 +59,7 @@ def test_what_is_no_recording(tmp_path, recording):
         load_recording(tmp_path)
     path = tmp_path / "whisker.nc"
     WHISKER.to_dataset().to_netcdf(path, engine="h5netcdf")
-    with pytest.raises(ValueError, match="holds vibrissa whisker, not a recording"):
+    with pytest.raises(ValueError, match="contains vibrissa whisker, not a recording"):
         load_recording(path)
     xr.Dataset({"a": 1.0}).to_netcdf(path, engine="h5netcdf")
     with pytest.raises(ValueError, match="another kind"):

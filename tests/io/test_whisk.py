@@ -145,7 +145,7 @@ def test_whole_or_refused(tmp_path):
     with pytest.raises(ValueError, match="nodes is 1"):
         load_whiskers(whiskers_file(tmp_path / "whole"), nodes=1)
     nothing = whiskers_file(tmp_path / "nothing", {})
-    with pytest.raises(ValueError, match="holds no whiskers"):
+    with pytest.raises(ValueError, match="contains no whiskers"):
         load_whiskers(nothing)
 
 
@@ -167,5 +167,5 @@ def test_a_real_file():
 
 def test_no_map_is_a_file_of_whisk_and_it_is_said_what_takes_it(tmp_path):
     measurements_file(tmp_path / "b.measurements")
-    with pytest.raises(ValueError, match=r"b.measurements holds measurements .*vibrissa import"):
+    with pytest.raises(ValueError, match=r"b.measurements contains measurements .*vibrissa import"):
         ContactMap.load(tmp_path / "b.measurements")

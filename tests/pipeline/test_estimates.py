@@ -151,7 +151,7 @@ def test_the_rod_knows_what_pose_and_wrench_have_in_common(tracked, trial, conta
 
 def test_a_map_of_another_whisker_is_noted(tracked):
     other = ContactMap.simulate(samples.curved(), grid=False, cells=(8, 16, 8))
-    with pytest.warns(UserWarning, match="another whisker than the recording's"):
+    with pytest.warns(UserWarning, match="map's whisker differs from the recording's"):
         estimates_of(with_signals(tracked), contact_maps=[other])
 
 

@@ -76,7 +76,7 @@ def test_plain_numbers_in_other_units_are_noted(trial):
     """Where the attribute is lost, nothing but their size shows that these are µN."""
     data = trial.to_dataset()
     data["force"] = data["force"].variable.copy(data=1e6 * data["force"].values)
-    with pytest.warns(UserWarning, match="natural to this whisker") as notes:
+    with pytest.warns(UserWarning, match="times this whisker.s scale") as notes:
         predictors(recording_tree(data, [vb.samples.gamma()] * 2, "made by hand"))
     assert [str(note.message)[:2] for note in notes] == ["C1", "C2"]
 

@@ -142,7 +142,7 @@ def test_the_pose_is_filtered_as_asked(tracked, cutoff):
 
 def test_frames_that_are_missing_are_stated(tracked):
     part = tracked.isel(time=np.r_[0:40, 90 : tracked.sizes["time"]])
-    with pytest.warns(UserWarning, match="0.17 s in a row: the base's pose is filtered in 2"):
+    with pytest.warns(UserWarning, match="0.17 s in a row: the base pose is filtered in 2"):
         signals = signals_of(part, "contact point", 60.0)
     whole = signals_of(tracked, "contact point", 60.0).sel(time=part["time"])
     np.testing.assert_allclose(signals["base_position"], whole["base_position"], atol=3e-5)
@@ -327,8 +327,8 @@ def test_contact_points_from_a_table_count_more(tracked, trial):
             lambda d: d.assign(base_rotation=2.0 * d["base_rotation"]),
             "is not a rotation",
         ),
-        (lambda d: d.assign_coords(time=d["time"].values[::-1]), "its time does not rise"),
-        (lambda d: d.assign_coords(time=d["time"] * np.nan), "its time does not rise"),
+        (lambda d: d.assign_coords(time=d["time"].values[::-1]), "its time does not increase"),
+        (lambda d: d.assign_coords(time=d["time"] * np.nan), "its time does not increase"),
         (lambda d: d.assign(force=d["force"].astype(str)), "not numbers"),
     ],
 )
@@ -341,5 +341,5 @@ def test_recordings_from_elsewhere_are_checked(trial, change, said):
 def test_what_a_group_lacks_is_said(trial):
     tree = with_signals(trial)
     tree["signals"] = xr.DataTree(tree["signals"].to_dataset(inherit=False).drop_vars("moment"))
-    with pytest.raises(ValueError, match=r"group signals .* lacks moment; make it anew"):
+    with pytest.raises(ValueError, match=r"group signals .* lacks moment; compute it again"):
         estimates_of(tree)

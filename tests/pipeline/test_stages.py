@@ -64,7 +64,7 @@ def _changed(tree, group, name):
     ],
 )
 def test_what_was_edited_since_a_stage_was_made_is_stated(stages, group, name, stage):
-    with pytest.warns(UserWarning, match=f"edited after its {stage} had been made"):
+    with pytest.warns(UserWarning, match=f"edited after its {stage} had been computed"):
         check_recording(_changed(stages, group, name))
     due = STAGES[STAGES.index(stage) :]
     assert due_stages(_changed(stages, group, name), "contour") == due

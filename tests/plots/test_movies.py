@@ -152,7 +152,7 @@ def test_movies_that_cannot_be_written_leave_nothing(tmp_path):
     odd = np.zeros((2, 47, 64, 3), np.uint8)
     with pytest.raises(ValueError, match="even height and width"):
         write_movie(tmp_path / "a.mp4", odd)
-    with pytest.raises(ValueError, match=r"ends on \.mp4"):
+    with pytest.raises(ValueError, match=r"must end in \.mp4"):
         write_movie(tmp_path / "a.avi", odd)
     with pytest.raises(ValueError, match="no frames"):
         write_movie(tmp_path / "a.mp4", [])
@@ -171,7 +171,7 @@ def test_single_frames_are_those_of_the_whole_video(tmp_path, ending):
     np.testing.assert_array_equal(got, sent[[1, 4, 4, 11]])
     with pytest.raises(ValueError, match="no frame 12"):
         list(video_frames(path, [3, 12]))
-    with pytest.raises(ValueError, match="must not fall"):
+    with pytest.raises(ValueError, match="must not decrease"):
         list(video_frames(path, [3, 2]))
 
 

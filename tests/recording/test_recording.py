@@ -136,7 +136,7 @@ def test_renamed_whiskers_are_in_order_and_other_labels_are_refused():
     tree = _two_whiskers()
     tree.dataset = tree.to_dataset().assign_coords(whisker=["c", "d"])
     assert [one.name for one in Recording(tree).whiskers] == ["a", "b"]
-    with pytest.raises(ValueError, match="carries the shapes of a, b"):
+    with pytest.raises(ValueError, match="contains the shapes of a, b"):
         _ = Recording(tree.isel(whisker=[1])).whiskers
 
 
@@ -165,4 +165,4 @@ def test_what_was_edited_by_hand_is_refused(edit, fault):
 def test_info_states_what_is_wrong(tmp_path):
     vb.io.save_recording(tmp_path / "back.nc", _two_whiskers().isel(time=slice(None, None, -1)))
     done = CliRunner().invoke(app, ["info", str(tmp_path / "back.nc")])
-    assert "time does not rise" in str(done.exception)
+    assert "time does not increase" in str(done.exception)

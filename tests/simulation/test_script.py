@@ -116,7 +116,7 @@ def test_motions_from_tables(tmp_path):
         ("[sensor]\nforce = 1", "has force; known are"),
         ("[motion]\nrow = 'Q'\nkind = 'whisking'", "row is 'Q'"),
         ("[motion]\namplitude = 500\nkind = 'whisking'", "azimuth is an angle in rad"),
-        ("[array]\nrows = 'A'\nwhiskers = ['C2']", "has whiskers, and rows instead"),
+        ("[array]\nrows = 'A'\nwhiskers = ['C2']", "has both whiskers and rows"),
         ("[array]\nside = 'left'\nwhiskers = ['RC2']", "RC2 are not on the left side"),
         ("[head]\nfile = 'head.csv'\nposition = [1, 0, 0]", "has position; known are file"),
         ("duration = 1\n[motion]\nkind = 'table'\nfile = 'motion.csv'", "has its own"),
@@ -136,7 +136,7 @@ def test_faulty_tables(tmp_path):
         read('motion = {kind = "table", file = "motion.csv"}', tmp_path)
     for rows in ("0,0\n2,0.01\n1,0.02", "0,0\n1,nan"):
         (tmp_path / "head.csv").write_text(f"time,z\n{rows}\n")
-        with pytest.raises(ValueError, match="missing, or time that does not rise"):
+        with pytest.raises(ValueError, match="missing, or time that does not increase"):
             read('head = {file = "head.csv"}', tmp_path)
 
 
@@ -170,5 +170,5 @@ def test_dynamics_are_asked_for():
 
 
 def test_a_mesh_without_a_file_is_told_what_it_needs(tmp_path):
-    with pytest.raises(ValueError, match="an object of kind mesh is a file"):
+    with pytest.raises(ValueError, match="an object of kind mesh needs a file"):
         read('[[object]]\nkind = "mesh"\n', tmp_path)

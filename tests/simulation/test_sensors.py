@@ -85,7 +85,7 @@ def test_missing_frames_stay_missing():
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"channels": ("Fx", "Q")}, "none of Fx"),
+        ({"channels": ("Fx", "Q")}, "not among Fx"),
         ({"noise": -1.0}, "noise is -1"),
         ({"bias": [1.0, 2.0]}, r"bias has shape \(2,\)"),
         ({"channels": ("a",), "mixing": np.eye(6)}, r"mixing has shape \(6, 6\)"),

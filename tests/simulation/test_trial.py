@@ -251,7 +251,7 @@ class TestMotion:
         one = np.zeros(3)
         with pytest.raises(ValueError, match=r"roll has shape \(2,\).*base_position has shape"):
             Motion(np.arange(3.0), one, one, np.zeros(2), one)
-        with pytest.raises(ValueError, match="time does not rise"):
+        with pytest.raises(ValueError, match="time does not increase"):
             Motion(one, one, one, one, np.zeros((3, 3)))
 
 

@@ -1,8 +1,8 @@
-"""Files and nothing else: one module a format.
+"""Readers and writers of files, one module per format.
 
-Every reader raises FileNotFoundError where there is no such file, and ValueError, in one line that
-names the file and what is wrong with it, where it is of another kind, empty, cut short or damaged.
-Nothing in a file is run or unpickled, and no file leads to another.
+Readers raise FileNotFoundError if a file does not exist, and ValueError with a one-line message
+that names the file and the fault if it is of another kind, empty, truncated or damaged. Nothing in
+a file is executed or unpickled, and references to other files are not followed.
 """
 
 from __future__ import annotations

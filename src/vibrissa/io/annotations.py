@@ -1,25 +1,25 @@
-"""What persons and other programs state about a recording's videos: tables as CSV, and clicks.
+"""Annotations of a recording's videos: contact points, head pose, corrected traces and clicks.
 
-The first column of a table is ``time``, seconds since the first frame of the first video, or
-``frame``, which counts its frames from 0. Views and whiskers are counted from 0 too; other columns
-are left alone.
+Tables are CSV. Their first column is ``time``, in seconds since the first frame of the first video,
+or ``frame``, counted from 0. Views and whiskers are counted from 0 too; unknown columns are
+ignored.
 
-**Contact points** that were tracked otherwise, for comparison: ``x, y, z``, m, in the laboratory,
-or ``view, frame, x, y``, column and row in at least two views; and ``whisker`` where there are
-several. Moments without contact are left out, or their numbers are empty.
+**Contact points** tracked by other means: ``x, y, z``, m, laboratory frame, or
+``view, frame, x, y``, column and row in at least two views; and ``whisker`` if there are several.
+Times without contact are omitted, or their cells are empty.
 
-**Pose of the head**: ``x, y, z``, m, the origin of its frame in the laboratory, and the orientation
-from the head's to the laboratory frame in one of three ways:
+**Pose of the head**: ``x, y, z``, m, the origin of the head frame in the laboratory frame, and the
+rotation from the head frame to the laboratory frame in one of three forms:
 
 - ``qw, qx, qy, qz``: a unit quaternion, real part first,
 - ``r11, r12, r13, r21, …, r33``: a rotation matrix, row by row,
 - ``azimuth, elevation, roll``, rad: R_z(azimuth) R_y(−elevation) R_x(roll).
 
-**Corrected traces**, which a person has confirmed, ``view,frame,whisker,x,y``: the points of a
-whisker in one frame of one view, from base to tip, column and row in pixels, a line each.
+**Corrected traces**, confirmed by a person, ``view,frame,whisker,x,y``: one row for each point of a
+whisker in one frame of one view, from base to tip, column and row in pixels.
 
-**Clicks** in the images, TOML; pixels, column and row. A mask is left out; where there are regions,
-all else is.
+**Clicks** in the images, TOML; pixels, column and row. Masks are excluded from tracking; if there
+are regions, everything outside them is excluded.
 
     videos = ["top.mp4", "front.mp4"]
     pixel_size = 0.058                                # mm
@@ -60,7 +60,7 @@ _SHOWN = 5
 
 
 def read_over_time(path: str | PathLike[str]) -> tuple[str, dict[str, Array]]:
-    """Read a table whose rows are moments."""
+    """Read a table over time; return ``time`` or ``frame``, whichever it has, and its columns."""
     names, values = read_numbers(path)
     columns = dict(zip(names, values.T, strict=True))
     keys = [name for name in ("time", "frame") if name in columns]
@@ -80,18 +80,18 @@ def read_over_time(path: str | PathLike[str]) -> tuple[str, dict[str, Array]]:
 
 
 def check_rising(path: str | PathLike[str], key: str, moments: Array) -> None:
-    """Refuse moments that do not rise from row to row."""
+    """Raise ValueError if times or frames do not increase from row to row."""
     back = np.flatnonzero(np.diff(moments) <= 0.0)
     if back.size:
         i = int(back[0])
         raise ValueError(
-            f"{path}: {key} does not rise: {moments[i]:g} is followed by {moments[i + 1]:g} (rows "
-            f"{i + 1} and {i + 2}, and {back.size - 1} more times)"
+            f"{path}: {key} does not increase: {moments[i]:g} is followed by {moments[i + 1]:g} "
+            f"(rows {i + 1} and {i + 2}, and {back.size - 1} more times)"
         )
 
 
 def moments_coordinate(key: str, moments: Array) -> xr.Variable:
-    """Label moments."""
+    """Coordinate ``time`` or ``frame``."""
     if key == "time":
         return xr.Variable("time", moments, attributes("time"))
     about = {"units": "1", "long_name": "frame of the first video"}
@@ -99,13 +99,13 @@ def moments_coordinate(key: str, moments: Array) -> xr.Variable:
 
 
 def few(numbers: NDArray[np.int64]) -> str:
-    """Write the first of some numbers."""
+    """Format the first of some numbers for a message."""
     text = ", ".join(str(int(n)) for n in numbers[:_SHOWN])
     return text + (f" and {len(numbers) - _SHOWN} more" if len(numbers) > _SHOWN else "")
 
 
 def _first(mask: NDArray[np.bool_]) -> int:
-    """Row of the first that is true, from 1."""
+    """Row of the first true value, counted from 1."""
     return int(np.flatnonzero(mask)[0]) + 1
 
 
@@ -144,7 +144,7 @@ def load_contact_points(path: str | PathLike[str]) -> xr.Dataset:
     _, first = np.unique(places, return_index=True)
     twice = np.setdiff1d(np.arange(count), first)
     if twice.size:
-        raise ValueError(f"{path}: rows {few(twice + 1)} tell of a contact that an earlier one has")
+        raise ValueError(f"{path}: rows {few(twice + 1)} repeat a contact of an earlier row")
     values = np.full((len(moments), len(whiskers), len(views), len(axes)), np.nan)
     values[moment, whisker, view] = np.stack([columns[axis] for axis in axes], axis=1)
     coordinates = {key: moments_coordinate(key, moments), "whisker": whiskers}
@@ -162,10 +162,10 @@ def load_contact_points(path: str | PathLike[str]) -> xr.Dataset:
 
 
 def _numbers(path: Path, column: Array, name: str) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
-    """Numbers that a column has, and the index of each of its rows among them."""
+    """Distinct whole numbers of a column, and the index among them for each row."""
     wrong = np.flatnonzero(~(column >= 0.0) | (column != np.round(column)))
     if wrong.size:
-        raise ValueError(f"{path}: {name} is not a number from 0 on in rows {few(wrong + 1)}")
+        raise ValueError(f"{path}: {name} is not a whole number from 0 in rows {few(wrong + 1)}")
     numbers, places = np.unique(column.astype(np.int64), return_inverse=True)
     return numbers, places
 
@@ -175,11 +175,11 @@ ANGLES = ("azimuth", "elevation", "roll")
 QUATERNION = ("qw", "qx", "qy", "qz")
 MATRIX = tuple(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))
 
-_ROUNDED = 1e-3  # largest error of a quaternion's length and of a matrix's RᵀR: tables cut decimals
+_ROUNDED = 1e-3  # largest rounding error of a quaternion's length and of a matrix's RᵀR
 
 
 def load_head(path: str | PathLike[str]) -> xr.Dataset:
-    """Read how the head moves.
+    """Read the motion of the head.
 
     Parameters
     ----------
@@ -190,15 +190,15 @@ def load_head(path: str | PathLike[str]) -> xr.Dataset:
     -------
     xarray.Dataset
         Dim ``time`` or ``frame``: ``head_position`` (…, space), m, and ``head_rotation``
-        (…, space, head_axis), from the head's to the laboratory frame.
+        (…, space, head_axis), from the head frame to the laboratory frame.
     """
     path = Path(path)
     key, columns = read_over_time(path)
     ways = [way for way in (QUATERNION, MATRIX, ANGLES) if set(way) <= set(columns)]
     if not set(PLACE) <= set(columns) or len(ways) != 1:
         raise ValueError(
-            f"{path} has the columns {', '.join(columns)}; x, y, z and one way of orientation are "
-            f"needed: {', '.join(QUATERNION)}, or r11, r12, …, r33, or {', '.join(ANGLES)}"
+            f"{path} has the columns {', '.join(columns)}; x, y, z and an orientation are needed: "
+            f"{', '.join(QUATERNION)}, or r11, r12, …, r33, or {', '.join(ANGLES)}"
         )
     way = ways[0]
     check_rising(path, key, columns[key])
@@ -208,7 +208,7 @@ def load_head(path: str | PathLike[str]) -> xr.Dataset:
     if holes.size:
         raise ValueError(
             f"{path}: numbers are missing in rows {few(holes + 1)}; the head's pose is needed in "
-            "every row, so leave such rows out (by time, what is between rows is interpolated)"
+            "every row: omit such rows (in a table by time, poses are interpolated)"
         )
     turn = {QUATERNION: _of_quaternions, MATRIX: _of_matrices, ANGLES: _of_angles}[way](
         path, values
@@ -299,9 +299,10 @@ def load_corrections(path: str | PathLike[str]) -> dict[int, dict[tuple[int, int
 def save_corrections(
     path: str | PathLike[str], corrections: Mapping[int, Mapping[tuple[int, int], ArrayLike]]
 ) -> None:
-    """Write corrected traces so that `load_corrections` reads them.
+    """Write corrected traces to a file for `load_corrections`.
 
-    They are points (n, 2) from base to tip, column and row, by view and then by frame and whisker.
+    ``corrections`` are points (n, 2) from base to tip, column and row, by view and then by frame
+    and whisker.
     """
     rows: list[list[float]] = []
     for view, each in sorted(corrections.items()):
@@ -335,17 +336,19 @@ class ViewClicks:
     region: tuple[Points, ...] = ()
 
     def masked(self, size: Sequence[int]) -> Mask | None:
-        """Find the pixels of an image without whiskers."""
+        """Mask of the pixels (height, width) excluded from tracking; None if there are none."""
         masked = _inside(self.mask, size) if self.mask else None
         return together([masked, ~_inside(self.region, size) if self.region else None])
 
 
 def together(masks: Iterable[Mask | None]) -> Mask | None:
-    """Join masks of one view; None if there is none."""
+    """Union of masks of one view; None if there is none."""
     shown = [mask for mask in masks if mask is not None]
     if len({mask.shape for mask in shown}) > 1:
         sizes = sorted({f"{mask.shape[1]} × {mask.shape[0]}" for mask in shown})
-        raise ValueError(f"masks of one view have {' and '.join(sizes)} pixels; give the video's")
+        raise ValueError(
+            f"masks of one view have {' and '.join(sizes)} pixels; they must have the video's size"
+        )
     return np.logical_or.reduce(shown) if shown else None
 
 
@@ -359,7 +362,7 @@ class Clicks:
 
 
 def _inside(polygons: Iterable[Points], size: Sequence[int]) -> Mask:
-    """Pixels (height, width) whose middle is in any of some polygons."""
+    """Mask of the pixels (height, width) whose centre is inside any of the polygons."""
     width, height = size
     x, y = np.arange(width)[None], np.arange(height)[:, None]
     whole = np.zeros((height, width), dtype=bool)
@@ -375,15 +378,15 @@ def _inside(polygons: Iterable[Points], size: Sequence[int]) -> Mask:
 
 
 def polygon_of(points: ArrayLike, name: str) -> Points:
-    """Check the corners of a polygon, (n, 2)."""
+    """Validate the corners (n, 2) of a polygon."""
     array = number_array(points, name, "corners [column, row] are needed")
     if array.ndim != 2 or array.shape[1] != 2 or len(array) < _FEWEST:
-        raise ValueError(f"{name} is {quoted(points)}; corners, three at least, are needed")
+        raise ValueError(f"{name} is {quoted(points)}; at least three corners are needed")
     return tuple((float(x), float(y)) for x, y in array)
 
 
 def load_clicks(path: str | PathLike[str]) -> Clicks:
-    """Read what was shown in the images of a recording."""
+    """Read the clicks in the images of a recording."""
     table = read_toml(path)
     with in_file(path):
         check_keys(table, {"videos", "pixel_size", "view"}, "it")
@@ -394,7 +397,7 @@ def load_clicks(path: str | PathLike[str]) -> Clicks:
         if size is not None:
             size = 1e-3 * float(number_array(size, "pixel_size"))
             if not 0.0 < size < np.inf:
-                raise ValueError(f"pixel_size is {1e3 * size:g}; mm, more than 0, are needed")
+                raise ValueError(f"pixel_size is {1e3 * size:g}; it must be positive, mm")
         read = tuple(_view(view, i) for i, view in enumerate(views))
         return Clicks(read, tuple(map(str, table.get("videos", ()))), size)
 
@@ -414,7 +417,7 @@ def _view(table: dict[str, Any], number: int) -> ViewClicks:
 
 
 def save_clicks(path: str | PathLike[str], clicks: Clicks) -> None:
-    """Write what was shown in the images of a recording."""
+    """Write the clicks in the images of a recording."""
     check_writable(path, (".toml",))
     lines = [f"videos = {json.dumps(clicks.videos, ensure_ascii=False)}"]
     if clicks.pixel_size is not None:

@@ -1,33 +1,34 @@
-"""Keypoints as DeepLabCut, LightningPose, SLEAP, *movement* and Anipose keep them.
+"""Readers of keypoints from DeepLabCut, LightningPose, SLEAP, *movement* and Anipose.
 
-**DeepLabCut and LightningPose**: tables as CSV, or as pandas writes them to HDF5.
+**DeepLabCut and LightningPose**: tables as CSV, or as HDF5 written by pandas.
 
-Each column is headed by scorer, (individual,) body part and coordinate: x, y, likelihood in pixels,
-or x, y, z where DeepLabCut has triangulated two views. Other coordinates, such as the spread of an
-ensemble, are left alone. An individual is a whisker, its body parts the whisker's nodes.
+The header of a column consists of scorer, (individual,) body part and coordinate: x, y, likelihood
+in pixels, or x, y, z if DeepLabCut has triangulated two views. Other coordinates, such as the
+spread of an ensemble, are ignored. An individual is a whisker, and its body parts are the nodes of
+the whisker.
 
-Tables of pandas are read without it. Its two formats: "table", one compound dataset whose column
-names are pickled in attributes, and "fixed", plain arrays of values, levels and labels. Nothing is
-unpickled, since a pickle can run code and build objects of chosen bytes: names are read off its
-text, and blocks that are not numbers are refused.
+Tables of pandas are read without pandas. There are two formats: "table", one compound dataset whose
+column names are pickled in attributes, and "fixed", plain arrays of values, levels and labels.
+Nothing is unpickled, since a pickle can execute code: names are parsed from its instructions, and
+blocks that are not numbers are rejected.
 
-**SLEAP**: analysis files (HDF5), and labels (``.slp``, through sleap-io). An analysis file holds
-dense arrays of tracks, nodes and scores. Their dimensions are named in an attribute where sleap-io
-wrote them, and are (track, xy, node, frame) in SLEAP's own. Labels are lists of instances in
-frames, of one video or of several, which become views; sleap-io reads their many versions.
+**SLEAP**: analysis files (HDF5), and labels (``.slp``, read by sleap-io). An analysis file contains
+dense arrays of tracks, nodes and scores. If sleap-io wrote the file, an attribute names their
+dimensions; SLEAP itself writes (track, xy, node, frame). Labels are lists of instances in frames of
+one or several videos, which become views.
 
 **movement**: datasets (NetCDF) with ``position`` and ``confidence`` of keypoints. Up to its version
 0.16 the dimensions are called individuals and keypoints, since 0.17 individual and keypoint.
-Datasets of several cameras have a dimension ``view``. Positions in a plane are pixels unless the
-attribute ``space_unit`` states another.
+Datasets of several cameras have a dimension ``view``. Positions in a plane must be in pixels, the
+default of the attribute ``space_unit``.
 
 **Anipose**: its table of triangulated points (CSV),
 ``tip_x, tip_y, tip_z, tip_error, tip_ncams, …``.
 
-The unit is that of the calibration board, mostly mm, which the file does not say. Points have
-already been turned by the matrix M and moved to the center that stand in its last columns.
+The unit is that of the calibration board, usually mm, which the file does not state. Points have
+already been transformed by the matrix M and the center in the last columns.
 
-Calibrations of cameras as TOML, as Anipose and aniposelib write them.
+**Calibrations** of cameras by Anipose and aniposelib (TOML):
 
     [cam_0]
     name = "top"
@@ -37,9 +38,9 @@ Calibrations of cameras as TOML, as Anipose and aniposelib write them.
     rotation = [rx, ry, rz]
     translation = [tx, ty, tz]
 
-The rotation is a vector along the axis, as long as the angle, rad; the translation has the unit of
-the board that calibrated the cameras, usually mm. An orthographic camera, which Anipose does not
-know, has ``projection = "orthographic"`` besides, and pixels per unit on its matrix's diagonal.
+The rotation is a rotation vector, rad; the translation has the unit of the calibration board,
+usually mm. As an extension, orthographic cameras have ``projection = "orthographic"``, and pixels
+per unit on the diagonal of their matrix.
 """
 
 from __future__ import annotations
@@ -112,7 +113,7 @@ def read_deeplabcut(path: str | PathLike[str]) -> RawTracks:
 
 
 def _four_levels(path: Path, name: tuple[str, ...]) -> tuple[str, ...]:
-    """Scorer, individual (empty if there are none), body part, coordinate."""
+    """Split a column name into scorer, individual (empty if absent), body part and coordinate."""
     if len(name) not in (3, 4):
         raise ValueError(f"{path} has columns such as {'/'.join(name)}. {_NEEDED}")
     return name if len(name) == 4 else (name[0], "", *name[1:])
@@ -131,8 +132,8 @@ def _csv(path: Path) -> tuple[Names, Array, list[str]]:
     for line, cells in rows:
         if cells[0] in _LEVELS:
             raise ValueError(
-                f"{path}: line {line} is a header row once more, {cells[0]}; tables one below the "
-                "other are to be read each on its own"
+                f"{path}: line {line} repeats the header row {cells[0]}; concatenated tables must "
+                "be read separately"
             )
         try:
             numbers = [float(cell) if cell else np.nan for cell in cells[first:]]
@@ -151,7 +152,7 @@ def _csv(path: Path) -> tuple[Names, Array, list[str]]:
 
 
 def _header(path: Path, rows: Iterator[tuple[int, list[str]]]) -> dict[str, list[str]]:
-    """Header rows by the words that they begin with, up to the coordinates."""
+    """Header rows by their first cell, up to the row of coordinates."""
     header: dict[str, list[str]] = {}
     other = ""
     for line, cells in rows:
@@ -182,7 +183,7 @@ def _hdf5(path: Path) -> tuple[Names, Array, list[str]]:
 
 
 def _frames(path: Path, index: list[str], count: int) -> NDArray[np.int64]:
-    """Numbers of the frames: of the rows, or of the images, such as img0042.png."""
+    """Frame numbers from the index of rows, or from names of images such as img0042.png."""
     numbers = [re.search(r"(\d+)(?:\.0)?(?:\.[A-Za-z]+)?$", cell) for cell in index]
     if not index or any(number is None for number in numbers):
         return np.arange(count)
@@ -191,7 +192,7 @@ def _frames(path: Path, index: list[str], count: int) -> NDArray[np.int64]:
 
 
 def pandas_tables(file: h5py.File) -> Iterator[tuple[str, h5py.Group]]:
-    """Find the tables of a file."""
+    """Yield the names and groups of the tables in a file written by pandas."""
     for name, group in file.items():
         if isinstance(group, h5py.Group) and _as_str(group.attrs.get("pandas_type", "")) in (
             "frame",
@@ -201,11 +202,11 @@ def pandas_tables(file: h5py.File) -> Iterator[tuple[str, h5py.Group]]:
 
 
 def read_pandas(group: h5py.Group) -> tuple[Names, Array, list[str]]:
-    """Read one table of numbers."""
+    """Read the column names, values and index of one table of pandas."""
     table = _as_str(group.attrs["pandas_type"]) == "frame_table"
     names, values, index = _appendable(group) if table else _fixed(group)
     if sum(block.shape[1] for block in values) != len(names):
-        raise ValueError(f"the table {group.name} has other columns than names")
+        raise ValueError(f"the columns of the table {group.name} are not named by text")
     return names, np.concatenate(values, axis=1), index
 
 
@@ -261,10 +262,10 @@ def _as_str(value: Any) -> str:
 
 
 def _column_names(value: Any) -> Names:
-    """Names of columns from a pickle, of which nothing is run.
+    """Parse column names from a pickle without executing it.
 
-    A pickle is a program, so it is not unpickled: its instructions are listed, and those that lay
-    text, numbers, tuples and lists upon each other are followed. No other has a meaning here.
+    A pickle is a program and is not unpickled. Its instructions are disassembled, and only those
+    that build text, numbers, tuples and lists are interpreted; any other raises ValueError.
     """
     content = value.encode("latin-1") if isinstance(value, str) else bytes(value)
     stack: list[Any] = []
@@ -300,7 +301,7 @@ _MARK = object()
 
 
 def _above_mark(stack: list[Any]) -> list[Any]:
-    """Take what lies above the last mark off a stack, and the mark."""
+    """Remove and return the items above the last mark of a stack, and remove the mark."""
     at = len(stack) - 1
     while stack[at] is not _MARK:  # from above: a pickle may be made of marks
         at -= 1
@@ -310,7 +311,7 @@ def _above_mark(stack: list[Any]) -> list[Any]:
 
 
 def _checked_names(stack: list[Any]) -> Names:
-    """Check what is left of a pickle: a list of text or of tuples of text."""
+    """Validate the parsed contents of a pickle: a list of text or of tuples of text."""
     if len(stack) != 1 or not isinstance(stack[0], list):
         raise ValueError("the names of its columns are not a list")
     names: Names = [name if isinstance(name, tuple) else (name,) for name in stack[0]]
@@ -320,7 +321,7 @@ def _checked_names(stack: list[Any]) -> Names:
 
 
 def _block(name: str, data: Any) -> Array:
-    """Values as they are, if they are numbers: those of other types may be pickles."""
+    """Values of a block of numbers; other types are rejected, as they may be pickles."""
     if data.dtype.kind not in "fiub":
         raise ValueError(f"{name} is of type {data.dtype}; numbers are needed")
     return np.asarray(data, dtype=np.float64)
@@ -403,18 +404,18 @@ def read_sleap_labels(path: str | PathLike[str]) -> RawTracks:
 
 
 def _of_video(labels: sleap_io.Labels, video: sleap_io.Video) -> tuple[int, Array]:
-    """First frame of a video's labels, and these (frame, track, node, column, row and score)."""
+    """First frame of a video's labels; their column, row and score (frame, track, node, 3)."""
     numbers = [frame.frame_idx for frame in labels.labeled_frames if frame.video == video]
     if not numbers:
         return 0, np.full((0, 1, 1, 3), np.nan)
     found = labels.numpy(video=video, untracked=not labels.tracks, return_confidence=True)
-    # Versions of sleap-io begin at frame 0, or at the first that has a label.
+    # Depending on its version, sleap-io starts at frame 0 or at the first labelled frame.
     first = min(numbers) if len(found) == max(numbers) - min(numbers) + 1 else 0
     return first, found.astype(np.float64)
 
 
 def _ordered(array: h5py.Dataset, wanted: tuple[str, ...]) -> Array:
-    """Bring the dimensions of an array in order."""
+    """Transpose an array to the wanted order of dimensions."""
     stated = array.attrs.get("dims")
     dims = tuple(json.loads(stated)) if stated is not None else _OWN[array.name.strip("/")]
     values: Array = np.asarray(array[:], dtype=np.float64)
@@ -428,7 +429,7 @@ def _numbered(count: int) -> list[str]:
 
 
 def _confidence(scores: Array) -> Array:
-    """Scores are peaks of confidence maps, which noise can lift a little over 1."""
+    """Clip scores, peaks of confidence maps, which can slightly exceed 1, to confidences."""
     return np.clip(scores, 0.0, 1.0)
 
 
@@ -485,7 +486,7 @@ def _raw(path: Path, poses: xr.Dataset) -> RawTracks:
 
 
 def _clock(poses: xr.Dataset) -> tuple[float | None, Array | None, Frames | None]:
-    """Frames a second, times and numbers of the frames, as far as they are known."""
+    """Frame rate, times and frame numbers, each None if unknown."""
     fps = poses.attrs.get("fps")
     time = poses["time"].values.astype(np.float64)
     if poses.attrs.get("time_unit", "frames") == "frames":
@@ -496,7 +497,7 @@ def _clock(poses: xr.Dataset) -> tuple[float | None, Array | None, Frames | None
 
 
 def read_anipose(path: str | PathLike[str]) -> RawTracks:
-    """Read a table of Anipose as raw tracks; ``cameras`` is how many saw each point."""
+    """Read a table of Anipose as raw tracks; ``cameras`` is the number of cameras per point."""
     path = Path(path)
     names, values = read_numbers(path)
     parts = [name.removesuffix("_ncams") for name in names if name.endswith("_ncams")]
@@ -569,7 +570,7 @@ def read_calibration(path: str | PathLike[str]) -> list[dict[str, Any]]:
 
 
 def _checked(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Numbers of a camera, each checked for its shape."""
+    """Validated parameters of a camera."""
     out: dict[str, Any] = {}
     for key, shape in _SHAPES.items():
         values = number_array(table.get(key, []), key)
@@ -597,7 +598,7 @@ def _checked(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write_calibration(path: str | PathLike[str], cameras: Sequence[Mapping[str, Any]]) -> None:
-    """Write a calibration that `read_calibration` reads."""
+    """Write a calibration to a file for `read_calibration`."""
     lines = []
     for i, camera in enumerate(cameras):
         lines.append(f"[cam_{i}]")

@@ -1,7 +1,4 @@
-"""Kind of a file, by its content.
-
-Tracks from any file that is known.
-"""
+"""Recognition of file formats by content, and reading of tracks in any known format."""
 
 from __future__ import annotations
 
@@ -35,7 +32,7 @@ from vibrissa.io.whisk import MEASUREMENTS, WHISKERS, read_measurements, read_wh
 
 
 class Kind(StrEnum):
-    """Kinds of files, in the words that are shown."""
+    """Kinds of files; values are descriptions for messages."""
 
     WHISKERS = "traces of whisk (.whiskers)"
     MEASUREMENTS = "measurements of whisk (.measurements)"
@@ -63,24 +60,24 @@ class Kind(StrEnum):
 
 
 def recognise(path: str | PathLike[str]) -> Kind:
-    """Tell what kind a file is, by its content rather than its name.
+    """Recognise the kind of a file by its content rather than its name.
 
     Parameters
     ----------
     path : str or path
-        The file.
+        Path of the file.
 
     Returns
     -------
     Kind
-        Kind by its beginning; ``UNKNOWN`` if nothing fits.
+        Kind of the file; ``UNKNOWN`` if it is not recognised.
 
     Raises
     ------
     FileNotFoundError
-        If there is no such file.
+        If the file does not exist.
     ValueError
-        If it is a folder, empty, or HDF5 that is cut short.
+        If it is a folder, empty, or truncated HDF5.
     """
     path, _ = without_part(check_readable(path))
     with path.open("rb") as file:
@@ -157,7 +154,7 @@ def _of_text(path: Path) -> Kind:
     return Kind.UNKNOWN
 
 
-# Reader of each kind of other programs' files.
+# Readers of other programs' files, by kind.
 READERS: Mapping[Kind, Callable[[Path], RawTracks]] = MappingProxyType(
     {
         Kind.WHISKERS: read_whiskers,
@@ -177,20 +174,20 @@ READERS: Mapping[Kind, Callable[[Path], RawTracks]] = MappingProxyType(
 def load_tracks(
     path: str | PathLike[str], kind: Kind | None = None, **labels: Unpack[Labels]
 ) -> xr.Dataset:
-    """Read tracks, whatever program made them.
+    """Read tracks from a file in any known format.
 
-    Known are files of whisk, DeepLabCut, LightningPose, SLEAP, Anipose, movement, NWB (ndx-pose)
-    and MATLAB, tables of points, and our own tracks and recordings. `load_whiskers` and
-    `load_matlab` have more to choose.
+    Supported are files of whisk, DeepLabCut, LightningPose, SLEAP, Anipose, movement, NWB
+    (ndx-pose) and MATLAB, tables of points, and vibrissa's own tracks and recordings.
+    `load_whiskers` and `load_matlab` have more options.
 
     Parameters
     ----------
     path : str or path
-        The file.
+        Path of the file.
     kind : Kind, optional
-        Kind of the file; by default it follows from its content.
+        Kind of the file; by default it is recognised by content.
     **labels
-        Facts that the file may not state: fps (frames per second), view (name of the camera), and
+        Metadata that the file may lack: fps (frames per second), view (name of the camera), and
         for points in space unit ("m", "cm", "mm" or "um") and reference_frame; see `Labels`.
 
     Returns
@@ -198,7 +195,7 @@ def load_tracks(
     xarray.Dataset
         ``trace`` (time, whisker, view, node, image_axis) in pixels for points in images,
         ``centerline`` (time, whisker, node, space) in m for points in space, and ``confidence``.
-        Missing is NaN. Attributes say the source.
+        Missing values are NaN. Attributes name the source.
     """
     path = Path(path)
     kind = recognise(path) if kind is None else kind
@@ -208,7 +205,7 @@ def load_tracks(
         return load_own_tracks(path)
     if kind not in READERS:
         raise ValueError(
-            f"{path} holds no tracks that are known (its kind: {kind}). Known are: "
+            f"{path} does not contain tracks in a known format (it is: {kind}). Known are: "
             f"{'; '.join(READERS)}; {Kind.TRACKS}; {Kind.RECORDING}"
         )
     return labelled(READERS[kind](path), path, **labels)

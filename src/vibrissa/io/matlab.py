@@ -1,20 +1,19 @@
-"""Whiskers in MATLAB files, version 5 (SciPy) and 7.3 (which is HDF5).
+"""Reader of whiskers from MATLAB files, version 5 (by SciPy) and 7.3 (HDF5).
 
-There is no standard; what laboratories use is looked for:
+There is no standard layout. Those in common use are recognised:
 
-- a struct array with the fields x, y, z and perhaps time and id: an entry a frame (and whisker),
+- a struct array with fields x, y, z and optionally time and id: one entry per frame (and whisker),
 - a cell array with a matrix (points, 3) for each frame,
 - three variables whose names differ in x, y and z: cell arrays of vectors, or matrices (frame,
   point),
 - one array (frame, point, 3), (point, 3, frame) or (3, point, frame).
 
-With two coordinates instead of three they are pixels. Frames may have different numbers of points;
-zeros behind the last one are padding.
+With two coordinates instead of three, points are in pixels. Frames may have different numbers of
+points; zeros after the last point are padding.
 
-What MATLAB files hold, of version 5 and 7.3, as the same plain values.
-
-Numbers are arrays with MATLAB's dimensions, cell arrays are lists, struct arrays lists of dicts;
-what is anything else (text, functions, objects of classes) is left out.
+Variables of both file versions are converted to the same Python values: numbers to arrays with
+MATLAB's dimensions, cell arrays to lists, struct arrays to lists of dicts. Anything else (text,
+functions, objects of classes) is ignored.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ from vibrissa.numerics import Array
 
 @dataclass(frozen=True, eq=False)
 class _Frames:
-    """Points of each entry of one layout, and which frame and whisker it is."""
+    """Points of each entry of a recognised layout, with its frame and whisker."""
 
     points: Sequence[Array]
     frames: Sequence[float] | None = None
@@ -57,10 +56,11 @@ def load_matlab(
     path : str or path
         The ``.mat`` file.
     variable : str, optional
-        Variable that holds the whiskers, or the three that hold x, y and z, separated by commas.
-        Needed only if there are several.
+        Name of the variable with the whiskers, or of the three with x, y and z, separated by
+        commas. Required only if there are several candidates.
     **labels
-        fps; unit (needed for points in space) and reference_frame, or view; see `Labels`.
+        Metadata: fps; unit (required for points in space) and reference_frame, or view; see
+        `Labels`.
 
     Returns
     -------
@@ -86,7 +86,7 @@ def read_matlab(path: str | PathLike[str], variable: str | None = None) -> RawTr
         )
     if len(found) > 1:
         raise ValueError(
-            f"{path} may have whiskers in {' and in '.join(found)}; say which by variable="
+            f"{path} may have whiskers in {' and in '.join(found)}; choose one by variable="
         )
     ((name, frames),) = found.items()
     return _tracks(path, name, frames)
@@ -100,7 +100,7 @@ def _candidates(values: Mapping[str, Any]) -> Iterator[tuple[str, _Frames]]:
             yield from _cells(name, value)
         elif isinstance(value, np.ndarray) and value.ndim == 3 and 3 in value.shape:
             axis = 2 if value.shape[2] == 3 else value.shape.index(3)
-            # MATLAB's way is to stack frames last.
+            # In MATLAB, frames are usually stacked along the last dimension.
             frame = 0 if axis == 2 else 2
             yield name, _Frames(list(np.moveaxis(value, (frame, axis), (0, 2))))
     yield from _triples(values)
@@ -136,7 +136,7 @@ def _cells(name: str, value: list[Any]) -> Iterator[tuple[str, _Frames]]:
 
 
 def _triples(values: Mapping[str, Any]) -> Iterator[tuple[str, _Frames]]:
-    """Variables such as x, y, z; xw3d, yw3d, zw3d; tracked_x, tracked_y, tracked_z."""
+    """Yield triples of variables such as x, y, z; xw3d, yw3d, zw3d; tracked_x, …, tracked_z."""
     for name in values:
         for i, letter in enumerate(name):
             if letter not in "xX":
@@ -158,7 +158,7 @@ def _triples(values: Mapping[str, Any]) -> Iterator[tuple[str, _Frames]]:
 
 
 def _columns(parts: Sequence[Any]) -> Array | None:
-    """Put coordinates side by side; None if they are not vectors of one length."""
+    """Stack coordinates as columns; None if they are not vectors of equal length."""
     if not all(isinstance(part, np.ndarray) for part in parts):
         return None
     vectors = [np.asarray(part, dtype=np.float64).reshape(-1) for part in parts]
@@ -166,7 +166,7 @@ def _columns(parts: Sequence[Any]) -> Array | None:
 
 
 def _scalars(entries: list[dict[str, Any]], field: str | None) -> list[float] | None:
-    """One number of each entry; None where some have none."""
+    """Value of a scalar field of each entry; None if an entry lacks it."""
     if field is None:
         return None
     values = [np.asarray(entry[field]).reshape(-1) for entry in entries]
@@ -176,7 +176,7 @@ def _scalars(entries: list[dict[str, Any]], field: str | None) -> list[float] | 
 
 
 def _numbers(time: list[float], who: list[float] | None) -> list[int]:
-    """Tell entries of one frame apart, by their id or their order."""
+    """Whisker number of each entry, by its id or by its order within a frame."""
     if who is not None and len(set(zip(time, who, strict=True))) == len(time):
         return [int(one) for one in who]
     counts: dict[float, itertools.count[int]] = {}
@@ -208,13 +208,13 @@ def _tracks(path: Path, name: str, found: _Frames) -> RawTracks:
 
 
 def _without_padding(points: Array) -> Array:
-    """Cut off zeros and NaN behind the last point."""
+    """Remove zeros and NaN after the last point."""
     points = np.asarray(points, dtype=np.float64)
     there = np.flatnonzero((np.nan_to_num(points) != 0.0).any(axis=1))
     return points[: there[-1] + 1 if there.size else 0]
 
 
-# Kinds of elements of version 5: integers, floats, matrices, what is compressed, text.
+# Known types of elements in version 5: integers, floats, matrices, compressed data, text.
 _HEADER = 128
 _MATRIX, _COMPRESSED = 14, 15
 _ELEMENTS = {*range(1, 8), 9, 12, 13, _MATRIX, _COMPRESSED, 16, 17, 18}
@@ -251,17 +251,17 @@ def _version_5(path: Path) -> dict[str, Any]:
 
 
 def _check_elements(content: bytes, order: str) -> None:
-    """Refuse elements of kinds that there are none of, at which the library crashes."""
+    """Raise ValueError for elements of unknown type, at which the library would crash."""
     at = 0
     while at + 8 <= len(content):
         kind, size = struct.unpack_from(f"{order}II", content, at)
         start = at + 8
-        # All but what is compressed is filled up to a multiple of eight bytes.
+        # All elements but compressed ones are padded to a multiple of eight bytes.
         after = start + (size if kind == _COMPRESSED else -(-size // 8) * 8)
-        if kind >> 16:  # of up to four bytes, which stand in the tag itself
+        if kind >> 16:  # small element: its data, up to four bytes, are in the tag itself
             kind, size, start, after = kind & 0xFFFF, kind >> 16, at + 4, at + 8
         if kind not in _ELEMENTS:
-            raise ValueError(f"it has an element of the kind {kind}, which there is not")
+            raise ValueError(f"it has an element of the unknown type {kind}")
         part = content[start : start + size]
         if kind in (_MATRIX, _COMPRESSED):
             _check_elements(zlib.decompress(part) if kind == _COMPRESSED else part, order)
@@ -288,12 +288,12 @@ def _of_hdf5(file: h5py.File, item: Any) -> Any:
     if item.attrs.get("MATLAB_empty", 0):
         return np.zeros([int(size) for size in item[:]]) if item.ndim == 1 else np.zeros((0, 0))
     numbers = item.dtype.kind in "fiub" and kind not in (b"char", b"function_handle")
-    # MATLAB's first dimension runs fastest.
+    # In MATLAB the first dimension varies fastest.
     return np.asarray(item[:]).T if numbers else None
 
 
 def _structs_of(file: h5py.File, group: h5py.Group) -> list[dict[str, Any]]:
-    """Entries of a struct array; of one entry the fields are stored as they are."""
+    """Entries of a struct array; the fields of a single entry are stored without references."""
     fields: Mapping[str, Any] = dict(group.items())
     many = bool(fields) and all(
         isinstance(field, h5py.Dataset)

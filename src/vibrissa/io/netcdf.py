@@ -1,15 +1,13 @@
-"""Files in HDF5, opened as what somebody else may have damaged or made to do harm.
+"""Safe reading of HDF5, and datasets and trees of datasets as NetCDF-4 files.
 
-Before anything is read, everything in a file is looked at: nothing may lead out of it (external
-links, external storage, virtual datasets), go round in circles, or claim to be larger than a file
-of its size can hold, and no type may be built by name. What is read after that can still be
-damaged; whatever the libraries raise then becomes one error that names the file.
+Files may be damaged or malicious. Before reading, all objects of a file are checked: they must not
+refer to other files (external links, external storage, virtual datasets), form cycles, claim more
+data than a file of this size can contain, or have types that are constructed by name. Errors of the
+libraries while reading are converted to one ValueError that names the file.
 
-Datasets and trees of datasets as NetCDF-4 files.
-
-They are written in memory and then to the disk with ordinary calls, because HDF5 takes the whole
-interpreter down when a disk that is full lets it not close a file. So writing takes as much memory
-as the compressed file, in addition to the data.
+Files are first written in memory and then to disk with ordinary calls, because HDF5 aborts the
+interpreter if it cannot close a file on a full disk. Writing therefore needs memory for the
+compressed file in addition to the data.
 """
 
 from __future__ import annotations
@@ -34,12 +32,12 @@ from vibrissa.deferred import xr
 from vibrissa.io.paths import NETCDF, check_readable, refuse_whisk, replacing
 from vibrissa.numerics import AnyArray
 
-# Deflate, the densest of the filters that are read, makes at most 1032 bytes of one.
+# Largest ratio of compression: deflate, the densest supported filter, reaches 1032.
 _DENSEST = 1100
 ALWAYS_ALLOWED = 1 << 28
-"""Bytes that any file may claim to hold."""
+"""Size of the data that a file of any size may claim to contain, bytes."""
 
-_TICK = 100_000_000  # time by which clocks of file systems may be behind, ns, with room
+_TICK = 100_000_000  # upper bound of the resolution of file times, ns
 _HEAP = b"GCOL\1\0\0\0"
 
 # Name of a dimension that has no coordinates.
@@ -51,12 +49,12 @@ _FORMAT |= {"_NCProperties", "_Netcdf4Coordinates", "_Netcdf4Dimid"}
 
 @contextmanager
 def opened(path: str | PathLike[str], what: str, *, soft_links: bool = True) -> Iterator[h5py.File]:
-    """Open a file in HDF5 for reading, once it has been found harmless."""
+    """Open an HDF5 file for reading after checking that it is harmless."""
     path = check_readable(path)
     refuse_whisk(path)
     about, now = path.stat(), time_ns()
     changed = about.st_ctime_ns
-    # What is changed again within a tick of the clock has the same time.
+    # A file changed again within the resolution of its times may have the same time.
     version = about.st_dev, about.st_ino, changed, now if abs(now - changed) < _TICK else 0
     with naming(path, what):
         _check(path.absolute(), about.st_size, soft_links, version)
@@ -66,7 +64,7 @@ def opened(path: str | PathLike[str], what: str, *, soft_links: bool = True) -> 
 
 @contextmanager
 def naming(path: Path, what: str) -> Iterator[None]:
-    """Turn whatever is raised while a file is read into one error that names it."""
+    """Convert errors raised while reading a file to a ValueError that names it."""
     try:
         yield
     except (OSError, RuntimeError) as error:
@@ -75,12 +73,12 @@ def naming(path: Path, what: str) -> Iterator[None]:
             f"({_line(error)})"
         ) from error
     except ValueError as error:
-        # Those of our own name the file already.
+        # Our own errors already name the file.
         if str(path) in str(error):
             raise
         raise ValueError(f"{path}: {_line(error)}") from error
-    except Exception as error:  # What libraries raise for a damaged file is not documented.
-        raise ValueError(f"{path} is not {what} as it is known, or damaged: {error!r}") from error
+    except Exception as error:  # The libraries' errors for damaged files are not documented.
+        raise ValueError(f"{path} is not {what} in a known form, or damaged: {error!r}") from error
 
 
 def _line(error: Exception) -> str:
@@ -88,7 +86,7 @@ def _line(error: Exception) -> str:
 
 
 def _check_heaps(path: Path) -> None:
-    """Refuse heaps with an entry of no size, through which the library would go for ever."""
+    """Raise ValueError for heaps with an entry of size zero, on which the library would hang."""
     with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
         start = content.find(_HEAP)
         while start >= 0:
@@ -99,13 +97,13 @@ def _check_heaps(path: Path) -> None:
                 number, length = struct.unpack_from("<H6xQ", content, entry)
                 if number == 0 and length == 0:
                     raise ValueError("a heap of text is damaged")
-                # That of free space counts its own head.
+                # The size of the free space includes its header.
                 entry += length if number == 0 else 16 + -(-length // 8) * 8
             start = content.find(_HEAP, start + 4)
 
 
 def _items(file: h5py.File, soft_links: bool) -> Iterator[tuple[str, h5py.HLObject]]:
-    """All that a file holds, each once; raise at a link that leads out of it or in a circle."""
+    """Yield all objects of a file once; raise ValueError for external links and cycles."""
     groups: list[tuple[str, h5py.Group]] = [("", file)]
     while groups:
         above, group = groups.pop()
@@ -129,21 +127,21 @@ def _items(file: h5py.File, soft_links: bool) -> Iterator[tuple[str, h5py.HLObje
 
 @lru_cache(maxsize=64)
 def _check(path: Path, size: int, soft_links: bool, version: tuple[int, ...]) -> None:
-    """Refuse what may do harm; a file that is as it was, which `version` shows, is checked once."""
+    """Raise ValueError for harmful files; ``version`` marks changes, as results are cached."""
     _check_heaps(path)
     with h5py.File(path, "r") as file:
         _check_items(file, size, soft_links)
 
 
 def _check_items(file: h5py.File, size: int, soft_links: bool) -> None:
-    """Refuse data kept elsewhere, and more of them than a file of `size` bytes holds."""
+    """Raise ValueError for external data, or more data than ``size`` bytes can contain."""
     claimed = 0
     for name, item in _items(file, soft_links):
         for key in item.attrs:
             attribute = item.attrs.get_id(key)
             _check_type(f"the attribute {key} of {name}", attribute.get_type())
             claimed += _bytes(attribute.shape, attribute.get_type())
-            # The library would read past the end of a list that is too long or too short.
+            # The library would read beyond the end of a list of the wrong length.
             if key == "DIMENSION_LIST" and attribute.shape != (item.ndim,):
                 raise ValueError(f"{name} has {item.ndim} dimensions, and scales of others")
         if isinstance(item, h5py.Dataset):
@@ -158,7 +156,7 @@ def _check_items(file: h5py.File, size: int, soft_links: bool) -> None:
 
 
 def _checked_size(name: str, data: h5py.Dataset) -> int:
-    """Bytes that reading a dataset takes; raise if they are kept elsewhere."""
+    """Size of a dataset in memory, bytes; raise ValueError if its data are external."""
     _check_type(name, data.id.get_type())
     layout = data.id.get_create_plist()
     if layout.get_external_count() or layout.get_layout() == h5d.VIRTUAL:
@@ -172,19 +170,19 @@ def _bytes(shape: tuple[int, ...] | None, kind: h5t.TypeID) -> int:
 
 
 def _is_plain(data: h5py.Dataset) -> bool:
-    """Whether a variable of NetCDF-4 holds real numbers or text, as all that are known do."""
+    """Whether a variable of NetCDF-4 contains real numbers or text."""
     plain = data.dtype.kind in "biufSU" or h5py.check_string_dtype(data.dtype) is not None
     return plain and data.shape is not None
 
 
 def _as_text(value: str | bytes) -> str:
-    """Decode text strictly: h5py lets bytes through that are not UTF-8 and cannot be printed."""
+    """Decode text strictly: h5py accepts bytes that are not UTF-8 and cannot be printed."""
     raw = value if isinstance(value, bytes) else value.encode("utf-8", "surrogateescape")
     return raw.decode("utf-8")
 
 
 def _check_type(name: str, kind: h5t.TypeID) -> None:
-    """Refuse bytes without a meaning, for which a file may name any type of NumPy's."""
+    """Raise ValueError for opaque bytes, for which a file may name any NumPy type."""
     if kind.get_class() == h5t.OPAQUE or kind.detect_class(h5t.OPAQUE):
         raise ValueError(f"{name} holds opaque bytes, which are not read")
 
@@ -196,7 +194,7 @@ COMPRESSED: Mapping[str, Any] = {"zlib": True, "complevel": 1, "shuffle": True}
 
 
 def is_netcdf(path: str | PathLike[str]) -> bool:
-    """Tell whether a file is to be read as NetCDF-4."""
+    """Whether a file is NetCDF-4, by its ending or its first bytes."""
     path = Path(path)
     if path.suffix.lower() in NETCDF:
         return True
@@ -207,7 +205,7 @@ def is_netcdf(path: str | PathLike[str]) -> bool:
 
 
 def kind_of(path: str | PathLike[str]) -> str:
-    """Read the kind of content that a NetCDF-4 file states."""
+    """Attribute ``kind`` of a NetCDF-4 file."""
     with opened(path, "NetCDF-4") as file:
         return _kind(file)
 
@@ -220,14 +218,14 @@ def _kind(file: h5py.File) -> str:
 def read_dataset(
     path: str | PathLike[str], group: str | None = None, names: Sequence[str] | None = None
 ) -> xr.Dataset:
-    """Read the dataset of one group; of its variables those by name and their coordinates."""
+    """Read the dataset of one group, or only its variables ``names`` and their coordinates."""
     with opened(path, "NetCDF-4", soft_links=False) as file:
         data = _dataset(file[group or "/"], _names_by_address(file), names)
     return data if names is None else data[[name for name in names if name in data]]
 
 
 class Group(NamedTuple):
-    """Numbers and attributes of a group, as they are in a file."""
+    """Arrays and attributes of a group, as stored."""
 
     variables: dict[str, AnyArray]
     attrs: dict[str, Any]
@@ -236,7 +234,7 @@ class Group(NamedTuple):
 def read_groups(
     path: str | PathLike[str], names: Sequence[str], empty: Collection[str] = ()
 ) -> dict[str, Group]:
-    """Read groups, those that are ``empty`` without variables, without xarray, for the time."""
+    """Read groups without xarray, for speed; of groups in ``empty`` only the attributes."""
     with opened(path, "NetCDF-4", soft_links=False) as file:
         return {name: _group(file[name], name not in empty) for name in names if name in file}
 
@@ -249,7 +247,7 @@ def _group(group: h5py.Group, full: bool) -> Group:
 
 
 def _plain(value: Any) -> Any:
-    """Turn an attribute into text or, if it is an array of one, a number."""
+    """Convert an attribute to text or, if it is an array of one element, to a number."""
     if isinstance(value, str | bytes):
         return _as_text(value)
     return value.item() if getattr(value, "size", 0) == 1 else value
@@ -258,18 +256,18 @@ def _plain(value: Any) -> Any:
 def read_tree(path: str | PathLike[str], kind: str, what: str) -> xr.DataTree:
     """Read the datasets of all groups of a file of one kind.
 
-    xarray decodes what h5py reads: its own backend asks for the encoding of each variable as well,
-    which takes four times as long.
+    Data are read by h5py and decoded by xarray, whose own backend takes four times as long because
+    it also queries the encoding of each variable.
     """
     with opened(path, "NetCDF-4", soft_links=False) as file:
         if (found := _kind(file)) != kind:
-            raise ValueError(f"{path} holds {found or 'data of another kind'}, not {what}")
+            raise ValueError(f"{path} contains {found or 'data of another kind'}, not {what}")
         known = _names_by_address(file)
         return xr.DataTree.from_dict({str(one.name): _dataset(one, known) for one in _groups(file)})
 
 
 def _groups(group: h5py.Group) -> Iterator[h5py.Group]:
-    """The group itself and all below it, in the order of the file."""
+    """Yield the group itself and all groups below it, in the order of the file."""
     yield group
     for item in group.values():
         if isinstance(item, h5py.Group):
@@ -277,7 +275,7 @@ def _groups(group: h5py.Group) -> Iterator[h5py.Group]:
 
 
 def _names_by_address(file: h5py.File) -> dict[int, str]:
-    """Names of all variables: the library looks long for that of what a reference leads to."""
+    """Names of all variables by address; the library is slow to find the name for a reference."""
     each = (item for group in _groups(file) for item in group.items())
     return {_address(item.id): name for name, item in each if isinstance(item, h5py.Dataset)}
 
@@ -289,7 +287,7 @@ def _address(item: h5py.h5g.GroupID | h5d.DatasetID) -> int:
 def _dataset(
     group: h5py.Group, known: Mapping[int, str], names: Sequence[str] | None = None
 ) -> xr.Dataset:
-    """Read the variables and attributes of a group, or those by name and their coordinates."""
+    """Read a group's attributes, and all variables or only ``names`` and their coordinates."""
     found = {
         name: (_dims(name, item, known), item, _attributes(item))
         for name, item in group.items()
@@ -307,7 +305,7 @@ def _dataset(
 
 
 def _dims(name: str, data: h5py.Dataset, known: Mapping[int, str]) -> list[str]:
-    """Names of the dimensions of a variable; of one that is a dimension itself, its own."""
+    """Names of the dimensions of a variable; a dimension's own variable has its own name."""
     scales = data.attrs.get("DIMENSION_LIST", ())
     if len(scales) < data.ndim:
         if data.ndim > 1 or "CLASS" not in data.attrs:
@@ -322,12 +320,12 @@ def _values(data: h5py.Dataset) -> AnyArray:
 
 
 def _attributes(item: h5py.HLObject) -> dict[str, Any]:
-    """Attributes but those of the format, with text as such."""
+    """Attributes other than those of the format, with text decoded."""
     return {name: _attribute(item.attrs[name]) for name in item.attrs if name not in _FORMAT}
 
 
 def _attribute(value: Any) -> Any:
-    """Give what is not an array of several as itself, and text as a list."""
+    """Convert arrays of one element to scalars, and arrays of text to lists."""
     if isinstance(value, h5py.Empty):
         return "" if h5py.check_string_dtype(value.dtype) else np.array([], value.dtype)
     array = np.atleast_1d(value)
@@ -348,7 +346,7 @@ def write_netcdf(
 def netcdf_image(
     data: xr.Dataset | xr.DataTree, encoding: Mapping[str, Mapping[str, Any]] | None = None
 ) -> memoryview:
-    """Give the bytes of the file that `write_netcdf` writes."""
+    """Bytes of the file that `write_netcdf` writes."""
     import h5netcdf
     from xarray.backends import H5NetCDFStore
 
@@ -357,7 +355,7 @@ def netcdf_image(
     with h5netcdf.File(image, "w") as file:
         for node in tree.subtree:
             store = H5NetCDFStore(file, group=node.path, mode="a")
-            # A coordinate that a group inherits is written only where it is.
+            # An inherited coordinate is written only in the group that defines it.
             dataset = node.to_dataset(inherit=node is tree)
             dataset.dump_to_store(store, encoding=(encoding or {}).get(node.path))
     return image.getbuffer()

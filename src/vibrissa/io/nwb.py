@@ -1,15 +1,13 @@
-"""Poses in Neurodata Without Borders files (ndx-pose), read as the HDF5 that they are.
+"""Reader of poses and signals from Neurodata Without Borders files, which are HDF5.
 
-A `PoseEstimation` holds a series for each node, in pixels of one camera or in space; a
-`MultiCameraPoseEstimation` (ndx-pose 0.4 and later) holds points in space and one PoseEstimation
-for each camera. Each such container is a whisker; lone PoseEstimations that differ in their camera
-only are views of one whisker.
+**Poses** (ndx-pose): a `PoseEstimation` contains one series per node, in pixels of one camera or in
+space; a `MultiCameraPoseEstimation` (ndx-pose 0.4 and later) contains points in space and one
+PoseEstimation per camera. Each such container is a whisker; separate PoseEstimations that differ
+only in their camera are views of one whisker.
 
-Contents of our NWB files in addition to traces: poses, signals and contacts of whiskers.
-
-`save_nwb` writes a series for each quantity and whisker, called as the quantity and the whisker,
-such as ``force_C2``. They need no extension of NWB, so that a simulated trial, which nobody traced,
-comes back as well.
+**Poses of bases, signals and contacts**: `save_nwb` writes one series per quantity and whisker,
+named after both, such as ``force_C2``. These need no extension of NWB and also exist for simulated
+trials without traces.
 """
 
 from __future__ import annotations
@@ -40,7 +38,7 @@ _LENGTHS = {
 
 @dataclass(frozen=True, eq=False)
 class _Series:
-    """Points of the nodes of one whisker, in one view or in space."""
+    """Points of all nodes of one whisker, in one view or in space."""
 
     nodes: Sequence[str]
     points: Array
@@ -59,13 +57,13 @@ def read_nwb(path: str | PathLike[str]) -> RawTracks:
         space, image = _found(file)
     if not space and not image:
         raise ValueError(
-            f"{path} has no poses: no PoseEstimation holds any series of points; "
+            f"{path} has no poses: no PoseEstimation contains a series of points; "
             "forces and poses of the base are read by load_nwb_series"
         )
     every = [*space.values(), *image.values()]
     time = every[0].time
     if any(not np.array_equal(one.time, time) for one in every):
-        raise ValueError(f"{path} has poses at different times; one clock is needed")
+        raise ValueError(f"{path} has poses at different times; common times are needed")
     nodes = list(dict.fromkeys(node for one in every for node in one.nodes))
     whiskers = list(dict.fromkeys([*space, *(who for who, _ in image)]))
     views = list(dict.fromkeys(view for _, view in image))
@@ -91,7 +89,7 @@ def read_nwb(path: str | PathLike[str]) -> RawTracks:
 
 
 def _found(file: h5py.File) -> tuple[dict[str, _Series], dict[tuple[str, str], _Series]]:
-    """Points in space by whisker, and in the image by whisker and view."""
+    """Find points in space by whisker, and points in images by whisker and view."""
     groups: dict[str, h5py.Group] = {}
 
     def note(name: str, item: Any) -> None:
@@ -138,7 +136,7 @@ def _type(item: Any) -> str:
 
 
 def _view(group: h5py.Group) -> str:
-    """Name of its camera, or else its own."""
+    """Name of the camera of a container, or of the container itself."""
     for key, item in group.items():
         if _type(item) in ("Device", "CalibratedCamera"):
             link = group.get(key, getlink=True)
@@ -148,11 +146,11 @@ def _view(group: h5py.Group) -> str:
 
 
 def _series(group: h5py.Group) -> _Series | None:
-    """All nodes of one container; None if it has none."""
+    """Points of all nodes of one container; None if it has none."""
     children = {name: one for name, one in group.items() if _type(one) == "PoseEstimationSeries"}
     if not children:
         return None
-    # Before ndx-pose 0.2 the names stood in the container itself.
+    # Before ndx-pose 0.2 the names of nodes were in the container itself.
     skeleton = next((one for one in group.values() if _type(one) == "Skeleton"), group)
     order = skeleton["nodes"].asstr()[:] if "nodes" in skeleton else []
     nodes = [str(name) for name in order if name in children]
@@ -216,7 +214,7 @@ def _frame(item: Any) -> str:
 
 
 def series_time(series: h5py.Group) -> Array:
-    """Give the times of a series."""
+    """Times of a series."""
     if "timestamps" in series:
         return series_values(series, "timestamps")
     if "starting_time" not in series:
@@ -225,13 +223,13 @@ def series_time(series: h5py.Group) -> Array:
     rate = _number(series, series["starting_time"].attrs, "rate", np.nan)
     if not (start.shape == () and 0.0 < rate < np.inf):
         raise ValueError(
-            f"{series.name} has a starting_time of rate {rate}, by which nobody can count"
+            f"{series.name} has a starting_time of rate {rate}; it must be positive and finite"
         )
     return np.asarray(start + np.arange(len(series_values(series, "data"))) / rate)
 
 
 def series_values(series: h5py.Group, name: str) -> Array:
-    """Give the numbers of one dataset of a series."""
+    """Values of one dataset of a series, which must be numbers."""
     data = series.get(name)
     if not isinstance(data, h5py.Dataset):
         raise ValueError(f"{series.name} has no {name}")
@@ -260,7 +258,7 @@ def _table(
     return table
 
 
-# Dimensions in addition to time and whisker; longer names before those that they begin with.
+# Dimensions in addition to time and whisker; longer names precede those that are their prefixes.
 _SPACE = ("space",)
 _SERIES: dict[str, tuple[str, ...]] = {
     "base_position": _SPACE,
@@ -287,9 +285,10 @@ def load_nwb_series(path: str | PathLike[str]) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        Dims time, whisker, space, as at the top of a recording: of ``base_position``,
-        ``base_rotation``, ``contact_point``, ``contact_point_whisker``, ``force``, ``moment``,
-        ``head_position`` and ``head_rotation`` what the file has; SI units.
+        Dataset with dimensions time, whisker, space, like the root of a recording: those of
+        ``base_position``, ``base_rotation``, ``contact_point``, ``contact_point_whisker``,
+        ``force``, ``moment``, ``head_position`` and ``head_rotation`` that the file contains; SI
+        units.
     """
     path = Path(path)
     with opened(path, "an NWB file") as file:
@@ -297,12 +296,12 @@ def load_nwb_series(path: str | PathLike[str]) -> xr.Dataset:
         found = {} if behavior is None else _found_series(behavior)
         if not found:
             raise ValueError(
-                f"{path} has no series of {', '.join(_SERIES)}, called as these and the whisker: "
+                f"{path} has no series of {', '.join(_SERIES)}, named after quantity and whisker: "
                 "it was not written by save_nwb"
             )
         time = series_time(next(iter(found.values())))
         if any(not np.array_equal(series_time(series), time) for series in found.values()):
-            raise ValueError(f"{path} has series at different times; one clock is needed")
+            raise ValueError(f"{path} has series at different times; common times are needed")
         values = {key: series_values(series, "data") for key, series in found.items()}
     for (name, who), array in values.items():
         shape = (time.size, *(3,) * len((_SERIES | _HEAD)[name]))
@@ -328,7 +327,7 @@ def load_nwb_series(path: str | PathLike[str]) -> xr.Dataset:
 
 
 def _found_series(behavior: h5py.Group) -> dict[tuple[str, str], h5py.Group]:
-    """Series by quantity and whisker; of the head by quantity and nothing."""
+    """Series by quantity and whisker; the whisker of head series is empty."""
     found = {}
     for key, item in behavior.items():
         name = str(key)

@@ -1,14 +1,14 @@
-"""Recordings as Neurodata Without Borders files (pynwb, ndx-pose 0.4 or later).
+"""Writer of recordings as Neurodata Without Borders files (pynwb, ndx-pose 0.4 or later).
 
     devices              a CalibratedCamera for each view whose calibration is known, else a Device
     processing/behavior  for each whisker a MultiCameraPoseEstimation: its centreline in space, node
                          by node, in metres, and a PoseEstimation in pixels for each view;
                          ``contact_point_…`` and ``base_position_…`` in metres, ``base_rotation_…``
                          (time, 3, 3), ``force_…`` in newtons and ``moment_…`` in newton-metres;
-                         and how the head is held, if it moves
-    intervals/contacts   when which whisker touched something
+                         and the pose of the head, if it moves
+    intervals/contacts   start and end of the contacts of each whisker
 
-Missing is NaN. The truth of a simulated trial is left out.
+Missing values are NaN. The truth of a simulated trial is omitted.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ _SERIES |= {
         *(f"signals_{name}" for name in ("base_position", "force", "moment")),
     )
 }
-# Remark on what differs from the table that other formats hold.
+# Remark on quantities that differ from those in the table of predictors.
 _NOT_OF = "As recorded; that of the {0} is the series with {0} before its name"
-# Validators require these; each value states that it is unknown.
+# Fields of the subject that validators require, with values that stand for unknown.
 _NOBODY = {"subject_id": "unknown", "sex": "U", "age": "P0D/", "description": "not stated"}
 
 
@@ -64,21 +64,21 @@ _VECTORS = 2  # number of dimensions of vectors over time
 
 @dataclass(frozen=True)
 class Session:
-    """Facts on the experiment that NWB requires and a recording does not know.
+    """Metadata of the experiment that NWB requires and a recording lacks.
 
     Parameters
     ----------
     start : datetime
-        Time at which the recording began, with its time zone.
+        Start time of the recording, with time zone.
     description : str
         Description of the session.
     identifier : str
-        Identifier of the file, unique in the world; by default a random one.
+        Globally unique identifier of the file; by default a random one.
     subject : mapping
-        Fields of the animal, as in NWB: subject_id, species, sex, age, description, …. What is
-        missing is written as unknown: sex "U", an age of 0 days or more ("P0D/").
+        Fields of the animal, as in NWB: subject_id, species, sex, age, description, …. Missing
+        ones are written as unknown: sex "U", an age of 0 days or more ("P0D/").
     about : mapping
-        More fields of NWB: experimenter, institution, lab, keywords, ….
+        Other fields of NWB: experimenter, institution, lab, keywords, ….
     """
 
     start: datetime
@@ -105,13 +105,13 @@ def save_nwb(
     path : str or path
         Path with the ending ``.nwb``; an existing file is replaced once the new one is complete.
     recording : xarray.DataTree or Dataset
-        A recording, with the group ``cameras`` if they are calibrated; or tracks. What it lacks
-        is left out.
+        Recording, with the group ``cameras`` if cameras are calibrated, or tracks. Missing
+        quantities are omitted.
     session : Session
-        Facts of the experiment that a recording does not hold.
+        Metadata of the experiment.
     predictors : xarray.Dataset, optional
-        Table of `vibrissa.pipeline.predictors`, whose 16 predictors of models of spikes are written
-        as one series for each whisker.
+        Table of `vibrissa.pipeline.predictors`, whose 16 predictors of spike models are written as
+        one series per whisker.
 
     Raises
     ------
@@ -134,7 +134,7 @@ def save_nwb(
     _check(data)
     cameras = None
     if isinstance(recording, xr.DataTree) and "cameras" in recording.children:
-        # The names of the views may stand above.
+        # The names of the views may be defined in the root group.
         cameras = recording.children["cameras"].to_dataset()
     file = _file(session)
     _fill(file, _completed(data, predictors), cameras, predictors)
@@ -157,7 +157,7 @@ def _check(data: xr.Dataset) -> None:
 
 
 def _completed(data: xr.Dataset, table: xr.Dataset | None) -> xr.Dataset:
-    """Add the contacts of a table, and state of what else differs from it that it does."""
+    """Add the contacts of a table of predictors, and a remark to quantities that differ from it."""
     if table is None:
         return data
     found = {n: table[n] for n in ("in_contact",) if n in table and n not in data}
@@ -235,7 +235,7 @@ def _fill(
 
 
 def _names(data: xr.Dataset) -> list[str]:
-    """Names of the whiskers as NWB allows them."""
+    """Names of the whiskers, with characters that NWB does not allow replaced."""
     names = data["whisker"].values if "whisker" in data.coords else range(data.sizes["whisker"])
     return [_allowed(str(name)) for name in names]
 
@@ -245,7 +245,7 @@ def _allowed(name: str) -> str:
 
 
 def _clock(time: Array) -> dict[str, Any]:
-    """Say a rate where frames are evenly spaced to a part in a million, else every time."""
+    """Rate if frames are evenly spaced to one part in a million, otherwise all times."""
     steps = np.diff(time)
     if steps.size and np.allclose(steps, steps.mean(), rtol=1e-6, atol=1e-9 * abs(time[-1])):
         return {"starting_time": float(time[0]), "rate": float(1.0 / steps.mean())}
@@ -278,7 +278,7 @@ def _camera(name: str, index: int, cameras: xr.Dataset | None) -> Any:
 def _pose(
     name: str, whisker: xr.Dataset, clock: dict[str, Any], devices: dict[Any, Any], skeletons: Any
 ) -> Any:
-    """One whisker: its centreline in space and its traces in the views."""
+    """Container of one whisker: centreline in space and traces in the views."""
     from ndx_pose import MultiCameraPoseEstimation, PoseEstimation, Skeleton
 
     nodes = _nodes(whisker)
@@ -327,7 +327,7 @@ def _nodes(whisker: xr.Dataset) -> list[str]:
 
 
 def _confidence(whisker: xr.Dataset, name: str, view: object) -> Array | None:
-    """Confidence (time, node), also where there is one a frame; None if unknown."""
+    """Confidence (time, node), expanded from one value per frame if needed; None if unknown."""
     if name not in whisker:
         return None
     sure = whisker[name]
@@ -349,7 +349,7 @@ def _points(
     frame: str,
     clock: dict[str, Any],
 ) -> list[Any]:
-    """Make a series of each node."""
+    """Series of all nodes."""
     from ndx_pose import PoseEstimationSeries
 
     return [
@@ -374,7 +374,7 @@ def _squeezed(values: Array) -> Any:
 
 
 def _series(data: xr.Dataset, clock: dict[str, Any], whisker: str | None = None) -> Iterator[Any]:
-    """Series over time of one whisker, or of the head."""
+    """Yield the series over time of one whisker, or of the head."""
     from pynwb import TimeSeries
     from pynwb.behavior import SpatialSeries
 
@@ -401,7 +401,7 @@ def _series(data: xr.Dataset, clock: dict[str, Any], whisker: str | None = None)
 
 
 def _predictors(table: xr.Dataset, whisker: int, name: str, clock: dict[str, Any]) -> Any:
-    """Predictors of models of spikes, as columns of one series."""
+    """Predictors of spike models, as columns of one series."""
     from pynwb import TimeSeries
 
     columns = table.attrs["predictors"].split()
@@ -421,13 +421,13 @@ _EVENTS = "Onset, loss and slip of contacts, each from its time on for the lengt
 
 
 def _step(data: xr.Dataset) -> float:
-    """Time from frame to frame, s."""
+    """Time between frames, s."""
     time = data["time"].values
     return float(np.median(np.diff(time))) if time.size > 1 else 0.0
 
 
 def _add_events(file: NWBFile, table: xr.Dataset) -> None:
-    """Write onset, loss and slip as intervals of a frame, as NWB wants a duration."""
+    """Add onset, loss and slip as intervals of one frame, as NWB requires a duration."""
     from pynwb.epoch import TimeIntervals
 
     found = sorted(events_in(table))
@@ -445,7 +445,7 @@ def _add_events(file: NWBFile, table: xr.Dataset) -> None:
 
 
 def _add_contacts(file: NWBFile, data: xr.Dataset) -> None:
-    """Write when which whisker touched something."""
+    """Add the intervals of contact of each whisker."""
     from pynwb.epoch import TimeIntervals
 
     time = data["time"].values

@@ -1,12 +1,12 @@
-"""Paths: what they end in, and whether they can be read or written.
+"""Checks of paths before reading and writing, and atomic writing of files.
 
-Verbs ask before they compute, so that nobody waits for a result that cannot be written.
+Commands check output paths before they compute, so that no result is lost because it cannot be
+written.
 
-A file is either written whole or left as it was.
-
-What is being written has its own name next to the target and a lock, which ends with whoever
-writes. So what a killed run left behind is known by its name and by nobody holding it, and the
-next one who writes into that folder removes it.
+A file is either written completely or left unchanged: it is written under a temporary name next to
+the target and renamed at the end. The temporary file is locked, and the lock ends with the process.
+A temporary file without a lock was therefore left by a killed process, and the next process that
+writes to the folder removes it.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ _VIDEO_PART = re.compile(r"^(?P<file>.+)#(?P<part>\d+,\d+,\d+,\d+(?::[a-z]+)*)$"
 
 
 def without_part(path: str | PathLike[str]) -> tuple[Path, str]:
-    """Separate the file of a video from the part of its images that is meant."""
+    """Split a video's name into its path and the suffix that selects a part of the images."""
     path = Path(path)
     match = _VIDEO_PART.match(str(path))
     return (path, "") if match is None or path.exists() else (Path(match["file"]), match["part"])
 
 
 def refuse_whisk(path: str | PathLike[str]) -> None:
-    """Raise where a file is whisk's and something else is needed."""
+    """Raise ValueError for a file of whisk, where another format is needed."""
     path = Path(path)
     if not path.is_file():
         return
@@ -50,13 +50,13 @@ def refuse_whisk(path: str | PathLike[str]) -> None:
     for begin, kind in _WHISK.items():
         if head.startswith(begin):
             raise ValueError(
-                f"{path} holds {kind}: whiskers traced in one film, in pixels. `vibrissa import` "
-                "makes a recording of it, which the other verbs take"
+                f"{path} contains {kind}: whiskers traced in one video, in pixels. `vibrissa "
+                "import` converts it to a recording, which the other commands accept"
             )
 
 
 def check_readable(path: str | PathLike[str]) -> Path:
-    """Make sure that there is a file with something in it."""
+    """Raise an error unless a path is a file that is not empty."""
     file, _ = without_part(path)
     if not file.exists():
         raise FileNotFoundError(f"there is no file {file}")
@@ -68,7 +68,7 @@ def check_readable(path: str | PathLike[str]) -> Path:
 
 
 def check_writable(path: str | PathLike[str], endings: Sequence[str] = ()) -> Path:
-    """Make sure that a file can be written, or replaced, here."""
+    """Raise an error unless a file can be created or replaced at a path."""
     path = Path(path)
     if path.is_dir():
         raise ValueError(f"{path} is a folder; the name of a file is needed")
@@ -81,7 +81,7 @@ def check_writable(path: str | PathLike[str], endings: Sequence[str] = ()) -> Pa
 
 
 def check_folder(path: str | PathLike[str]) -> Path:
-    """Make sure that a folder for results is there or can be made."""
+    """Raise an error unless a folder for results exists or can be created."""
     path = Path(path)
     above = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
     if not above.is_dir():
@@ -104,11 +104,11 @@ _PART = re.compile(rf"\..+{re.escape(_MARK)}[a-z0-9_]{{8}}(\.[^.]*)?")
 
 @contextmanager
 def replacing(path: str | PathLike[str]) -> Iterator[Path]:
-    """Give a place to write to, and put what was written in place of the file at the end."""
+    """Context with a temporary path, which replaces the file at the end."""
     path = check_writable(path)
     _remove_left(path.parent)
     with _failing(path):
-        # Some writers look at the ending.
+        # Some writers depend on the ending.
         handle, name = tempfile.mkstemp(
             prefix=f".{path.stem}{_MARK}", suffix=path.suffix, dir=path.parent
         )
@@ -129,7 +129,7 @@ def replacing(path: str | PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def _failing(path: Path) -> Iterator[None]:
-    """Name the file that the user asked for, not the temporary one."""
+    """Replace the name of the temporary file in errors by that of the target."""
     try:
         yield
     except OSError as error:
@@ -141,17 +141,17 @@ def _failing(path: Path) -> Iterator[None]:
 
 
 def _finish(part: Path) -> None:
-    """Have the system say now if it has no room, and open the file as any other new one."""
+    """Flush the file to disk, which shows a lack of space, and set the default permissions."""
     with part.open("r+b") as file:
         os.fsync(file.fileno())
-    # A temporary file is private; only its owner could read the finished one.
+    # A temporary file is readable by its owner only.
     mask = os.umask(0)
     os.umask(mask)
     part.chmod(0o666 & ~mask)
 
 
 def _held(handle: int) -> bool:
-    """Take the lock of a part; False if somebody has it, or there are no locks here."""
+    """Acquire the lock of a temporary file; False if it is held, or locks are not supported."""
     if not _LOCKS:
         return False
     import fcntl
@@ -164,7 +164,7 @@ def _held(handle: int) -> bool:
 
 
 def _remove_left(folder: Path) -> None:
-    """Remove what runs that were killed left in a folder; of those that live the lock is held."""
+    """Remove temporary files that killed processes left in a folder; others are locked."""
     for part in [one for one in folder.iterdir() if _PART.fullmatch(one.name)]:
         with contextlib.suppress(OSError):
             handle = os.open(part, os.O_RDWR)

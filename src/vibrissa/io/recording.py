@@ -1,21 +1,16 @@
 """Recordings as NetCDF-4 files with groups, without loss.
 
-Every float is kept to the last bit; arrays are compressed. Any reader of NetCDF or HDF5 can open
-the file; what the groups and variables mean is stated by their own attributes and in
-:mod:`vibrissa.recording`. In the file several whiskers are together in one group
-(:mod:`vibrissa.io.recording`).
+Floats are stored exactly; arrays are compressed. Any reader of NetCDF or HDF5 can open the files;
+groups and variables are described by their attributes and in :mod:`vibrissa.recording`.
 
-The whiskers of a tree, side by side in one group of its file.
+In memory every whisker has its own group, ``/whiskers/0``, ``/whiskers/1``, … The time to read or
+write a file depends on the number of variables rather than on its size: sixty whiskers of fourteen
+variables each would take ten seconds. In files, two or more whiskers are therefore stacked in one
+group ``/whiskers`` along the dimension ``whisker``, with text variables for their individual
+attributes (name, notes). If whiskers differ in size along a dimension, the shorter ones are padded
+with NaN, and a variable ``size_of_DIMENSION`` contains the true sizes.
 
-In memory every whisker has a group, ``/whiskers/0``, ``/whiskers/1``, … A file takes its time by
-the variable, not by the byte: sixty whiskers of fourteen variables each are some nine hundred,
-and ten seconds. So in files two whiskers or more are one group ``/whiskers`` with the dimension
-``whisker``, and what each calls its own (name, notes) is a variable of text. Where whiskers differ
-in size along a dimension, the shorter ones are filled up with NaN, and a variable
-``size_of_DIMENSION`` is the true size of each.
-
-Whiskers that do not fit together so, whatever the reason, keep a group each; so do those of files
-written before.
+Whiskers that cannot be stacked keep their own groups, as do those of older files.
 """
 
 from __future__ import annotations
@@ -83,7 +78,7 @@ def load_recording(path: str | PathLike[str]) -> xr.DataTree:
     Returns
     -------
     xarray.DataTree
-        All of it, in memory.
+        Recording, in memory.
     """
     path = Path(path)
     tree = read_tree(path, RECORDING_KIND, "a recording")
@@ -100,7 +95,7 @@ _SIZE = "size_of_"
 
 
 def stacked_whiskers(tree: xr.DataTree) -> xr.DataTree:
-    """Lay the whiskers of a tree side by side, if they fit."""
+    """Stack the whiskers of a tree in one group, if possible."""
     group = tree.children.get(GROUP)
     if group is None or len(group.children) < 2 or group.to_dataset(inherit=False).variables:
         return tree
@@ -117,7 +112,7 @@ def stacked_whiskers(tree: xr.DataTree) -> xr.DataTree:
 
 
 def separate_whiskers(tree: xr.DataTree) -> xr.DataTree:
-    """Give every whisker its own group again."""
+    """Split stacked whiskers into one group each."""
     group = tree.children.get(GROUP)
     if group is None or _OWN not in group.attrs:
         return tree
@@ -127,7 +122,7 @@ def separate_whiskers(tree: xr.DataTree) -> xr.DataTree:
 
 
 def _with_group(tree: xr.DataTree, groups: Mapping[str, xr.Dataset]) -> xr.DataTree:
-    """Exchange the whiskers of a tree; all else and the order of groups stay."""
+    """Replace the groups of whiskers of a tree, and keep other groups and their order."""
     out: dict[str, xr.Dataset] = {}
     for node in tree.subtree:
         if node.path == f"/{GROUP}":
@@ -138,7 +133,7 @@ def _with_group(tree: xr.DataTree, groups: Mapping[str, xr.Dataset]) -> xr.DataT
 
 
 def _stacked(each: Sequence[xr.Dataset]) -> xr.Dataset | None:
-    """Several whiskers as one dataset; None where that would lose something."""
+    """Stack several whiskers in one dataset; None if this would lose information."""
     first = each[0]
     own = [
         name
@@ -165,7 +160,7 @@ def _stacked(each: Sequence[xr.Dataset]) -> xr.Dataset | None:
 
 
 def _alike(one: xr.Dataset, first: xr.Dataset, own: Sequence[str], uneven: set[Any]) -> bool:
-    """Whether a whisker differs from the first in nothing but what a stack can tell."""
+    """Whether a whisker can be stacked with the first without loss."""
     if set(one.attrs) != set(first.attrs) or set(own) & set(map(str, first.variables)):
         return False
     if not all(type(one.attrs[name]) is str and name.isidentifier() for name in own):
@@ -187,7 +182,7 @@ def _fits(one: xr.Variable, first: xr.Variable, uneven: set[Any]) -> bool:
 
 
 def _filled(each: Sequence[np.ndarray]) -> np.ndarray:
-    """Arrays one upon the other, the smaller filled up with NaN."""
+    """Stack arrays, padding smaller ones with NaN."""
     shape = np.max([one.shape for one in each], axis=0).astype(int)
     if all(one.shape == tuple(shape) for one in each):
         return np.stack(each)
@@ -198,7 +193,7 @@ def _filled(each: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _unstacked(together: xr.Dataset, index: int) -> xr.Dataset:
-    """A whisker of a stack as it was before."""
+    """Extract one whisker from a stack."""
     own = str(together.attrs[_OWN]).split()
     attrs = {key: value for key, value in together.attrs.items() if key != _OWN}
     attrs |= {name: str(together[name].values[index]) for name in own}

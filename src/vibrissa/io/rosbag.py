@@ -1,14 +1,14 @@
-"""ROS 2 bags: wrenches in, contact points out (extra ``ros``: rosbags, which needs no ROS).
+"""Reading of wrenches from and writing of contact points to ROS bags (by rosbags, without ROS).
 
 `geometry_msgs/WrenchStamped` is read, and `PoseStamped` or `TransformStamped` for the pose of the
-base, from ROS 1 bags as well. Written are, of each sample, `geometry_msgs/PointStamped` and
-`PoseWithCovarianceStamped` for the contact point, `WrenchStamped` for the force at it, and
-`sensor_msgs/PointCloud2` for all candidates. Time stamps are whole nanoseconds
-throughout: seconds since 1970 as a 64-bit float are rounded to a quarter of a microsecond.
+base, from bags of ROS 1 and ROS 2. For each sample, `geometry_msgs/PointStamped` and
+`PoseWithCovarianceStamped` are written for the contact point, `WrenchStamped` for the force there,
+and `sensor_msgs/PointCloud2` for all candidates. Time stamps are integer nanoseconds throughout, as
+seconds since 1970 in a 64-bit float are rounded to a quarter of a microsecond.
 
-The writer of rosbags leaves a bag that can be read only when it is closed. A stream may be stopped
-by anything, so a bag is written here as the format prescribes (SQLite, schema 4, and
-``metadata.yaml`` of version 9), and both are brought up to date every half second.
+A bag written by rosbags is readable only after it has been closed. As a stream may be interrupted
+at any time, bags are written here directly (SQLite, schema 4, and ``metadata.yaml`` of version 9),
+and both files are updated every half second.
 """
 
 from __future__ import annotations
@@ -45,21 +45,21 @@ _TOPICS = {
     _CLOUD: "/contact_candidates",
 }
 _FLOAT32 = 7  # of sensor_msgs/PointField: 32-bit floats
-# Variance of an angle of which nothing is known.
+# Variance of a uniformly distributed angle.
 _ANY_ANGLE = np.pi**2 / 3.0
 _SECOND = 1_000_000_000
 _LARGEST_SECOND = 2**31 - 1  # seconds of a ROS time stamp are 32-bit numbers
-_KEPT_EVERY = 0.5  # seconds between two moments at which a bag is whole
+_KEPT_EVERY = 0.5  # time between two updates of a bag, s
 
 
 def is_bag(path: str | PathLike[str]) -> bool:
-    """Tell whether a path looks like a bag."""
+    """Whether a path looks like a bag."""
     path = Path(path)
     return (path / "metadata.yaml").is_file() or (path.is_file() and path.suffix in _SUFFIXES)
 
 
 class BagMessage(NamedTuple):
-    """One message of a bag: times of the measurement and of its recording, ns, and SI values."""
+    """Message of a bag: times of measurement and of recording, ns, and values in SI units."""
 
     stamp: int
     recorded: int
@@ -87,7 +87,7 @@ def _opened(path: str | PathLike[str]) -> Iterator[Any]:
     try:
         yield reader
     finally:
-        with suppress(Exception):  # of a bag that is damaged, not all has been opened
+        with suppress(Exception):  # a damaged bag may be open only partially
             reader.close()
 
 
@@ -148,7 +148,7 @@ def _messages(
 
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
-    """Turn whatever the library stumbles over in a damaged bag into one message."""
+    """Convert the library's errors for damaged bags to ValueError."""
     try:
         yield
     except Exception as error:
@@ -157,9 +157,9 @@ def _readable(path: Path) -> Iterator[None]:
 
 
 def _finish(path: Path) -> None:
-    """Let SQLite take back what a process that was killed had half written.
+    """Let SQLite roll back the unfinished transaction of a killed process.
 
-    The library opens databases as files that do not change, and would not do so.
+    The library opens databases as immutable and would not do so.
     """
     files = [path] if path.is_file() else path.glob("*.db3")
     for file in files:
@@ -169,7 +169,7 @@ def _finish(path: Path) -> None:
 
 
 def _which_topic(connections: Any, there: list[str], topic: str | None, named: str) -> str:
-    """Say why it is open from which topic messages are read."""
+    """Describe why the topic to read from is not determined."""
     if there:
         lacks = "" if topic is None else f"there is no {topic!r} with {named}; "
         return f"{lacks}name one of those with {named} messages: {', '.join(there)}"
@@ -202,13 +202,13 @@ _METADATA_VERSION: Final = 9
 
 
 class ContactBag:
-    """Writes contacts of one or several whiskers into a ROS 2 bag; a context manager.
+    """Context manager that writes contacts of one or several whiskers to a ROS 2 bag.
 
-    A folder is whole every half second, however the process ends; a power cut may spoil it. An
-    MCAP file is written next to it and takes its name once it is complete.
+    A folder is consistent every half second, however the process ends, unless the power fails. An
+    MCAP file is written under a temporary name and renamed once it is complete.
 
-    The folder, or the file that ends in ``.mcap``, must not exist. With names of whiskers topics
-    begin with them: ``/left/contact_point``.
+    The folder, or the file ending in ``.mcap``, must not exist. With names of whiskers, topics
+    start with these: ``/left/contact_point``.
     """
 
     def __init__(
@@ -249,8 +249,8 @@ class ContactBag:
         self._path.mkdir()
         file = self._path / f"{self._path.name}.db3"
         self._database = sqlite3.connect(file, check_same_thread=False)
-        # Waiting for the disk would hold up samples. What is not kept yet stays in memory, so that
-        # between two moments the file is as readers that know no journal expect it.
+        # Waiting for the disk would delay samples. Pending samples stay in memory, so that between
+        # updates the file is valid for readers that do not support journals.
         self._database.executescript(
             f"PRAGMA synchronous = OFF; PRAGMA cache_spill = OFF; {_SCHEMA}"
         )
@@ -300,7 +300,7 @@ class ContactBag:
         force: Array | None = None,
         whisker: str = "",
     ) -> None:
-        """Write one sample of a whisker; covariance (3, 3) of the point, force (3,) at it."""
+        """Write one sample of a whisker, with the point's covariance (3, 3) and the force (3,)."""
         if self._fault is not None:
             raise self._fault
         types = self._types.types
@@ -338,7 +338,7 @@ class ContactBag:
             )
 
     def _uncertain(self, header: Any, place: Any, covariance: Array) -> Any:
-        """Pose of a contact point, with an orientation of which nothing is known."""
+        """Pose message of a contact point, with an unknown orientation."""
         types = self._types.types
         whole = _ANY_ANGLE * np.eye(6)
         whole[:3, :3] = covariance
@@ -370,7 +370,7 @@ class ContactBag:
         )
 
     def _keep_on(self) -> None:
-        """Keep the bag whole, also while no samples come."""
+        """Update the bag regularly, also while no samples arrive."""
         while not self._closed.wait(_KEPT_EVERY):
             try:
                 self._keep()
@@ -379,9 +379,9 @@ class ContactBag:
                 return
 
     def _keep(self) -> None:
-        """Write what came since the last time, and what the metadata say of it."""
+        """Write the samples since the last update, and the metadata."""
         with self._lock, _kept(self._path):
-            # Counted here and not by `write`, which an exception may leave at any line.
+            # Messages are counted here, as an exception may interrupt `write` at any line.
             new = self._database.execute(
                 "SELECT topic_id, count(*), min(timestamp), max(timestamp), max(id) FROM messages "
                 "WHERE id > ? GROUP BY topic_id",
@@ -439,7 +439,7 @@ class ContactBag:
 
 @contextmanager
 def _kept(path: Path) -> Iterator[None]:
-    """Name the bag in errors of its database."""
+    """Convert errors of the database to an OSError that names the bag."""
     try:
         yield
     except (sqlite3.Error, OSError) as fault:
@@ -447,7 +447,7 @@ def _kept(path: Path) -> Iterator[None]:
 
 
 class _Rosbags:
-    """The parts of the library that are used."""
+    """Parts of rosbags that are used here."""
 
     def __init__(self) -> None:
         from rosbags.highlevel import AnyReader

@@ -1,13 +1,12 @@
-"""Text files: tables, which are lines of cells, and settings (TOML).
+"""Text files: tables with names and units of columns, and settings (TOML).
 
-As spreadsheets and loggers write them: cells are separated by commas, semicolons, tabs or blanks,
-whichever the first line has most of; where it is not commas, a number may have a decimal comma.
+**Tables** are read as spreadsheets and loggers write them: cells are separated by commas,
+semicolons, tabs or blanks, whichever is most frequent in the first line; unless it is the comma,
+numbers may have a decimal comma.
 
-Names and units of columns as labs write them.
-
-A force along x may be called ``Fx``, ``fx``, ``Force X`` or ``wrench.force.x``, a moment ``Mx``,
-``Tx``, ``torque_x``; the unit, if any, follows: ``Fx_mN``, ``Fx (mN)``, ``Fx [mN]``, ``Fx/mN``.
-Without one it is SI.
+**Columns** may be named in various ways: a force along x as ``Fx``, ``fx``, ``Force X`` or
+``wrench.force.x``, a moment as ``Mx``, ``Tx`` or ``torque_x``, followed by an optional unit:
+``Fx_mN``, ``Fx (mN)``, ``Fx [mN]``, ``Fx/mN``. The default is the SI unit.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from vibrissa.io.paths import check_readable, refuse_whisk, replacing
 _MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--"})
 _COMMA = re.compile(r"[+-]?(?:\d+,\d*|,\d+)(?:[eE][+-]?\d+)?")
 _STATED = re.compile(r"sep=([,;\t])", re.IGNORECASE)
-# Spreadsheets in Western Europe write µ, ° and umlauts so; anything else is not theirs.
+# Bytes of text in Latin-1, as written by spreadsheets with µ, ° and umlauts.
 _SPREADSHEET = re.compile(rb"[\t\n\r\x20-\x7e\xa0-\xff]*")
 
 
@@ -58,7 +57,7 @@ def read_text(path: str | PathLike[str]) -> str:
 
 
 def table_rows(text: str) -> Iterator[tuple[int, list[str]]]:
-    """Take a table apart."""
+    """Yield the line number and cells of each row of a table."""
     lines = [
         (number, line)
         for number, line in enumerate(text.splitlines(), start=1)
@@ -78,25 +77,25 @@ def table_rows(text: str) -> Iterator[tuple[int, list[str]]]:
 
 
 def delimiter_of(header: str) -> str:
-    """Tell what separates the cells of a table."""
+    """Delimiter of the cells of a table, from its header."""
     most = max(",;\t", key=header.count)
     return most if header.count(most) or len(header.split()) < 2 else " "
 
 
 def cells_of(line: str, delimiter: str) -> list[str]:
-    """Take a line of a table apart."""
+    """Split a line of a table into cells."""
     if delimiter == " ":
         return line.split()
     return [cell.strip() for cell in next(csv.reader([line.rstrip("\r\n")], delimiter=delimiter))]
 
 
 def with_point(cell: str) -> str:
-    """Write a number that has a decimal comma with a point; leave other text alone."""
+    """Replace the decimal comma of a number by a point; other text is unchanged."""
     return cell.replace(",", ".") if _COMMA.fullmatch(cell) else cell
 
 
 def is_number(cell: str) -> bool:
-    """Tell whether a cell is a number."""
+    """Whether a cell is a number."""
     try:
         number(cell)
     except ValueError:
@@ -105,7 +104,7 @@ def is_number(cell: str) -> bool:
 
 
 def number(cell: str) -> float:
-    """Read a cell."""
+    """Convert a cell to a number."""
     return float("nan") if cell.lower() in _MISSING else float(cell)
 
 
@@ -129,14 +128,14 @@ def read_rows(
     if faults:
         advice = "; decimal commas need semicolons or tabs between cells, and no points elsewhere"
         raise ValueError(
-            f"{path} has cells that are not numbers, or not one for each of the {width} columns: "
+            f"{path} has cells that are not numbers, or rows without {width} cells: "
             f"{few_faults(faults)}{advice if commas else ''}"
         )
     return np.array(values, dtype=np.float64).reshape(-1, len(columns))
 
 
 class Table:
-    """A table under one line of names; what is wrong with it names the file and the lines."""
+    """A table with one header line; errors name the file and the lines."""
 
     def __init__(self, path: str | PathLike[str], expected: Sequence[str] = ()) -> None:
         self.path = Path(path)
@@ -164,12 +163,12 @@ class Table:
             )
 
     def text(self, name: str) -> list[str]:
-        """Cells of a column as they are."""
+        """Cells of a column as text."""
         at = self.names.index(name)
         return [cells[at] for cells in self.rows]
 
     def numbers(self, name: str, *, labels: bool = False) -> NDArray[np.float64]:
-        """Numbers of a column; NaN where they are missing, and in a column of labels if allowed."""
+        """Numbers of a column, NaN if missing or, if ``labels`` are allowed, not numbers."""
         values, faults = np.full(len(self.rows), np.nan), []
         for i, cell in enumerate(self.text(name)):
             try:
@@ -183,14 +182,14 @@ class Table:
         return values
 
     def refuse(self, wrong: NDArray[np.bool_], what: str) -> None:
-        """Raise if some rows are wrong, with the first of them."""
+        """Raise ValueError if any row is wrong, quoting the first of them."""
         for i in np.flatnonzero(wrong):
             cells = ",".join(self.rows[i])
             raise ValueError(f"{self.path}: line {self.lines[i]} reads {cells!r}, which is {what}")
 
 
 def read_numbers(path: str | PathLike[str]) -> tuple[list[str], NDArray[np.float64]]:
-    """Read a table of numbers under one line of names."""
+    """Read a table of numbers with one header line; return names and values."""
     table = Table(path)
     columns = [table.numbers(name, labels=True) for name in table.names]
     return table.names, np.stack(columns, axis=1)
@@ -199,7 +198,7 @@ def read_numbers(path: str | PathLike[str]) -> tuple[list[str], NDArray[np.float
 def table_text(
     header: Sequence[str], rows: Iterable[Sequence[object]], quoted: bool = False
 ) -> str:
-    """Write a table as text, numbers in full, and words in quotation marks on request."""
+    """Format a table as text with full precision; ``quoted`` puts words in quotation marks."""
     out = io.StringIO()
     writer = csv.writer(
         out, lineterminator="\n", quoting=csv.QUOTE_NONNUMERIC if quoted else csv.QUOTE_MINIMAL
@@ -219,12 +218,12 @@ def write_table(
 
 
 def few_faults(faults: Sequence[str]) -> str:
-    """Join faults, and count those after the fifth."""
+    """Join the first five faults, and count the others."""
     more = "" if len(faults) <= 5 else f"; and {len(faults) - 5} more lines"
     return "; ".join(faults[:5]) + more
 
 
-# Units of length, with how many metres they are; µ is written u.
+# Factors of unit prefixes; µ is written u.
 _SMALLER = {"": 1.0, "m": 1e-3, "u": 1e-6, "n": 1e-9}
 LENGTHS: Mapping[str, float] = MappingProxyType({"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6})
 _UNITS: Mapping[str, Mapping[str, float]] = MappingProxyType(
@@ -244,13 +243,13 @@ _KINDS = {"t": "time", "F": "force", "M": "moment", "T": "force", "B": "moment",
 _COMPONENT = re.compile(
     r"(?:.*[./])?(force|moment|torque|[FMT])[ _.]?([xyz])(?![a-z0-9])(.*)", re.IGNORECASE
 )
-# A capital T alone is a temperature.
+# A capital T alone stands for temperature.
 _OTHER = re.compile(r"((?i:FT|FD|MB|MD|time[ _]?stamp|time)|t)(?![A-Za-z0-9])(.*)")
 _BETWEEN = re.compile(r"[\s·⋅×*.^_-]")
 
 
 def signal_column(header: str) -> tuple[str, float | None]:
-    """Tell which signal a column holds, and in which unit."""
+    """Signal of a column by its header, and the factor of its unit, None if unknown."""
     text = header.strip()
     if text.lower() == "stamp":  # as a header of ROS; with a unit it is one of `streaming.lines`
         return "time", 1.0
@@ -266,7 +265,7 @@ def signal_column(header: str) -> tuple[str, float | None]:
 
 
 def unit_factor(text: str, kind: str) -> float | None:
-    """Read a unit."""
+    """Factor of a unit of some kind to SI; None if unknown."""
     bare = text.strip().lstrip("_/,: ").strip("()[] ")
     unit = _BETWEEN.sub("", bare).replace("µ", "u").replace("μ", "u")
     if kind in ("time", "length"):
@@ -280,11 +279,11 @@ def units_of(kind: str) -> str:
 
 
 def check_one_column_each(header: Sequence[str], names: Sequence[str]) -> None:
-    """Refuse two columns of one signal; with a dot in their names they are of other whiskers."""
+    """Raise ValueError for two columns of one signal; names with a dot belong to other whiskers."""
     known = {cell: signal_column(cell) for cell in header if "." not in cell}
     for name in names:
         here = [c for c in header if known.get(c, ("", None))[0] == name and known[c][1]]
-        # A clock in other units next to the time is usual, a second force is not.
+        # A second column of time, in other units, is common; a second force is an error.
         if len(here) > 1 and not (name == "time" and here.count(name) == 1):
             raise ValueError(f"{', '.join(here)} are {len(here)} columns of {name}; one is needed")
 
@@ -307,7 +306,7 @@ def signal_columns(
     return found, strange
 
 
-_QUOTED = 60  # so much of a value that is wrong is quoted
+_QUOTED = 60  # largest number of characters quoted of a wrong value
 
 _THREE_NUMBERS = "three numbers are needed"
 
@@ -325,7 +324,7 @@ def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
 
 
 def parsed_toml(text: str) -> dict[str, Any]:
-    """Read TOML."""
+    """Parse TOML."""
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -338,7 +337,7 @@ def parsed_toml(text: str) -> dict[str, Any]:
 
 @contextmanager
 def in_file(path: object) -> Iterator[None]:
-    """Name the file in what is raised because of its content."""
+    """Add the name of the file to errors caused by its content."""
     try:
         yield
     except ValueError as error:
@@ -350,7 +349,7 @@ def in_file(path: object) -> Iterator[None]:
 def number_array(
     value: Any, name: str, needed: str = "numbers, or lists of as many each, are needed"
 ) -> NDArray[np.float64]:
-    """Read a number, or lists of them, from a value of TOML."""
+    """Array from a number or nested lists of numbers in TOML."""
     try:
         if _numeric(value):
             return np.array(value, dtype=np.float64)

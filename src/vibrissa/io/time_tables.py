@@ -1,30 +1,29 @@
-"""Tables over time: base signals in; contact points, contour points and predictors out.
+"""Tables over time: reading of base signals; writing of contacts, contour points and predictors.
 
-Base signals: columns ``time, Fx, Fy, Fz, Mx, My, Mz`` in s, N and N·m, as CSV, or a NetCDF file
-with variables of these names along one dimension. Lines that are empty or begin with # are passed
-over, other columns are left alone, and an empty cell or ``nan`` is missing. A name may carry a unit
-(:mod:`vibrissa.io.table`), ``Fx_mN`` or ``Mx (µN·m)``; other suffixes are refused by name, and so
-are numbers that cannot be what they say: too large, or with a moment too large or small for the
-force, as |M| / |F| is at most the distance of the contact.
+**Base signals**: columns ``time, Fx, Fy, Fz, Mx, My, Mz`` in s, N and N·m, as CSV, or a NetCDF file
+with variables of these names along one dimension. Empty lines, lines that begin with # and other
+columns are ignored; an empty cell or ``nan`` is missing. A name may have a unit
+(:mod:`vibrissa.io.table`), ``Fx_mN`` or ``Mx (µN·m)``; other suffixes are errors, and so are
+implausible values: too large, or with moments too large or small for the forces, as |M| / |F| is at
+most the distance of the contact.
 
-Contact points as CSV: ``time, x, y, z, r, theta, phi, sigma_x, …, status``. In SI units and the
-whisker's frame; the status is written by its name, and missing is ``nan``. Estimates have a column
-``friction`` before the status, the same in all lines: what was assumed of it; and ``event`` (none,
-onset, loss, slip), with the time at which the present contact began, ``onset_time``, and its
-standard deviation ``onset_sigma``. Those around known objects have the arc lengths of the first and
-the last contact, ``arc_length`` and ``last_arc_length``, and by how much the objects are shifted in
-the laboratory, ``shift_x``, ``shift_y``, ``shift_z``.
+**Contact points** (CSV): ``time, x, y, z, r, theta, phi, sigma_x, …, status``, in SI units and the
+whisker frame; the status is written by name, and missing values as ``nan``. Estimates also have the
+assumed ``friction``, the same in all rows; ``event`` (none, onset, loss, slip); and the time of the
+current contact's onset, ``onset_time``, with its standard deviation ``onset_sigma``. Estimates
+around known objects have the arc lengths of the first and the last contact, ``arc_length`` and
+``last_arc_length``, and the displacement of the objects in the laboratory frame, ``shift_x``,
+``shift_y``, ``shift_z``.
 
-Contour points as CSV: ``time, whisker, x, y, z, sigma_x, …``, a line for each contact. In SI units
+**Contour points** (CSV): ``time, whisker, x, y, z, sigma_x, …``, one row per contact, in SI units
 and the laboratory frame: the contact point on the whisker's centreline with its standard
-deviations, the surface's outward normal there, the point of the surface, one whisker radius away,
-and, where an object was fitted, how far the surface of the whisker is from it and whether the
-contact is not an outlier.
+deviations, the surface's outward normal there, the point on the surface, one whisker radius away,
+and, if an object was fitted, the distance of the whisker's surface from it and a flag for inliers.
 
-Predictors of a trial as CSV, first a line ``# name [unit]: meaning`` for each column, then the
-header and a line for each frame and whisker; or for MATLAB, a matrix (frames, whiskers) for each
-column, ``time``, ``whisker``, the names of the ``predictors`` of models of spikes, and ``units``
-and ``descriptions`` by column.
+**Predictors** of a trial: as CSV, with one line ``# name [unit]: meaning`` per column, the header,
+and one row per frame and whisker; or for MATLAB, with a matrix (frames, whiskers) per column,
+``time``, ``whisker``, the names of the ``predictors`` of spike models, and ``units`` and
+``descriptions`` by column.
 """
 
 from __future__ import annotations
@@ -60,15 +59,16 @@ from vibrissa.whisker import Whisker
 
 # Names of the columns, in the order in which they are written.
 COLUMNS = ("time", "Fx", "Fy", "Fz", "Mx", "My", "Mz")
-# Note on a table without time.
+# Note for tables without time.
 NUMBERED = "there is no time, so the rows are numbered from 0 in its column"
 _KINDS = {"t": "time", "F": "force", "M": "moment"}
-_LARGEST = {"F": (1e4, "N"), "M": (1e3, "N·m")}  # what a wire of steel as thick as a finger holds
-_LATEST = 1e11  # seconds since any epoch are fewer
-# Time between rows, s, of several from which it is likelier in ms.
+_LARGEST = {"F": (1e4, "N"), "M": (1e3, "N·m")}  # strength of a steel wire as thick as a finger
+_LATEST = 1e11  # largest plausible time since any epoch, s
+# Interval between rows, s, above which the unit of time is probably ms; smallest number of rows.
 _SLOW, _SEVERAL = 1.0, 10
 _LEVER_ARMS = (1e-4, 1.0)
-# Of whiskers bent to their fold 0.3 L from the base, forces and moments stay below 40 times these.
+# Largest plausible force and moment, in units of the whisker's scales: for contacts at 0.3 L they
+# stay below 40 up to slip-off.
 _LARGEST_SCALES = 100.0
 
 
@@ -83,9 +83,9 @@ def load_signals(path: str | PathLike[str]) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        Dims time, space: ``force``, N, and ``moment``, N·m, in the whisker's frame at its base.
-        Rows of a CSV without time are numbered from 0 instead. The attribute ``notes``, if there,
-        states that, or where time does not increase.
+        Dataset with dimensions time, space: ``force``, N, and ``moment``, N·m, at the base, in the
+        whisker frame. Without a time column, rows are numbered from 0. The attribute ``notes``, if
+        present, states this, or where time does not increase.
     """
     path = Path(path)
     table = _netcdf(path) if is_netcdf(path) else _csv(path)
@@ -99,7 +99,7 @@ def load_signals(path: str | PathLike[str]) -> xr.Dataset:
 
 
 def time_notes(time: Array) -> list[str]:
-    """Note where time does not rise, as when trials stand one below the other."""
+    """Notes on times that do not increase, as in concatenated trials, and on implausible steps."""
     known = np.flatnonzero(np.isfinite(time))
     step = np.diff(time[known])
     notes = []
@@ -120,7 +120,7 @@ def time_notes(time: Array) -> list[str]:
 
 
 def check_scale(wrench: xr.Dataset, whisker: Whisker) -> None:
-    """Refuse forces and moments that are far too large to have bent this whisker."""
+    """Raise ValueError for forces and moments far too large for this whisker."""
     stiffness = whisker.base_bending_stiffness
     scales = {"force": stiffness / whisker.length**2, "moment": stiffness / whisker.length}
     faults = []
@@ -131,8 +131,8 @@ def check_scale(wrench: xr.Dataset, whisker: Whisker) -> None:
         if typical > _LARGEST_SCALES * scale:
             unit = attributes(name)["units"].replace(" ", "·")
             faults.append(
-                f"the {name} reaches {typical:.3g} {unit}, {typical / scale:.2g} times the "
-                f"{scale:.2g} {unit} that is natural to this whisker"
+                f"the {name} reaches {typical:.3g} {unit}, {typical / scale:.2g} times this "
+                f"whisker's scale of {scale:.2g} {unit}"
             )
     if faults:
         raise ValueError(
@@ -142,7 +142,7 @@ def check_scale(wrench: xr.Dataset, whisker: Whisker) -> None:
 
 
 def save_signals(path: str | PathLike[str], signals: xr.Dataset) -> None:
-    """Write a table of base signals as CSV, every number in full.
+    """Write a table of base signals as CSV, with full precision.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ def _csv(path: Path) -> Array:
     if header is None:
         raise ValueError(f"{path} is empty; a header {','.join(COLUMNS)} and rows are needed")
     names, later = header[1], list(rows)
-    # Some programs write units in a line of their own.
+    # Some programs write units in a separate line.
     if later and not any(is_number(cell) for cell in later[0][1]):
         names = [f"{name} ({unit})" for name, unit in zip_longest(names, later[0][1], fillvalue="")]
         del later[0]
@@ -187,7 +187,7 @@ def _csv(path: Path) -> Array:
 
 
 def _signal_places(path: Path, header: list[str]) -> tuple[list[int], Array]:
-    """Find each column and its unit; all that is wrong with the header is one error."""
+    """Indices and units of the columns; raise one ValueError for all faults of the header."""
     with in_file(path):
         check_one_column_each(header, COLUMNS)
     found, strange = signal_columns(header, COLUMNS)
@@ -264,7 +264,7 @@ def _check_magnitudes(path: Path, table: Array) -> None:
 
 
 def _check_lever_arm(path: Path, table: Array) -> None:
-    """Refuse forces and moments in units that do not belong together."""
+    """Raise ValueError for forces and moments in inconsistent units."""
     force, moment = (np.linalg.norm(table[:, part], axis=1) for part in (slice(1, 4), slice(4, 7)))
     known = np.isfinite(force + moment)
     if not known.any():
@@ -283,8 +283,8 @@ def _check_lever_arm(path: Path, table: Array) -> None:
     if least < 1.0 / arm < most:
         advice += ", or force and moment are in each other's columns"
     raise ValueError(
-        f"{path}: force and moment do not belong together: |M| / |F|, the distance of the contact "
-        f"or less, is {arm:.2g} m, and {least:g} to {most:g} m is possible. The {advice}; the "
+        f"{path}: force and moment are inconsistent: |M| / |F|, at most the distance of the "
+        f"contact, is {arm:.2g} m, and {least:g} to {most:g} m is possible. The {advice}; the "
         "table must be in N and N·m"
     )
 
@@ -303,17 +303,17 @@ def _dataset(table: Array) -> xr.Dataset:
     )
 
 
-# Names of the columns with numbers, in their order; the last column is the status.
+# Names of the numeric columns, in order; the last column is the status.
 NUMBERS = ("time", "x", "y", "z", "r", "theta", "phi", "sigma_x", "sigma_y", "sigma_z")
-# Columns of numbers that are written where there is something to write.
+# Numeric columns that are written only if the dataset has them.
 _AROUND = ("arc_length", "last_arc_length", "shift_x", "shift_y", "shift_z")
 _OPTIONAL = (*_AROUND, "one_contact", "friction", "onset_time", "onset_sigma")
-# Columns of words before the status, by the kind of word, also only where there are any.
+# Columns of names before the status, with their enumerations, also written only if present.
 _FLAGS: dict[str, type[Status | Event]] = {"event": Event}
 
 
 def save_contacts(path: str | PathLike[str], contacts: xr.Dataset) -> None:
-    """Write contact points, every number in full.
+    """Write contact points as CSV, with full precision.
 
     Parameters
     ----------
@@ -343,7 +343,7 @@ def save_contacts(path: str | PathLike[str], contacts: xr.Dataset) -> None:
 def _columns(
     data: xr.Dataset, what: str, names: Sequence[str], dim: str, needed: Sequence[str] = ()
 ) -> list[np.ndarray]:
-    """Columns along the one dimension of a table, NaN where there are none."""
+    """Columns along the dimension of a table; missing ones are NaN."""
     missing = [n for n in ("time", "x", "y", "z", *needed) if n not in data.variables]
     if missing:
         raise ValueError(f"{what} lack {', '.join(missing)}")
@@ -356,7 +356,7 @@ def _columns(
 
 
 def load_contacts(path: str | PathLike[str]) -> xr.Dataset:
-    """Read contact points that `save_contacts` wrote.
+    """Read contact points written by `save_contacts`.
 
     Parameters
     ----------
@@ -394,7 +394,7 @@ def events_in(contacts: xr.Dataset) -> Iterator[tuple[float, str, str, float]]:
     ------
     (float, str, str, float)
         Time, s, name of the whisker, ``onset``, ``loss`` or ``slip``, and the standard deviation of
-        an onset, s, NaN where it is not known; nothing where there are no events.
+        an onset, s, NaN if unknown.
     """
     names = ("event", "onset_time", "onset_sigma")
     if not set(names) <= set(contacts):
@@ -418,7 +418,7 @@ CONTOUR = (
 
 
 def save_contour(path: str | PathLike[str], contour: xr.Dataset) -> None:
-    """Write contour points, every number in full.
+    """Write contour points as CSV, with full precision.
 
     Parameters
     ----------
@@ -439,7 +439,7 @@ def save_contour(path: str | PathLike[str], contour: xr.Dataset) -> None:
 
 
 def holds_contour(path: str | PathLike[str], contour: xr.Dataset) -> bool:
-    """Tell whether a file is just what `save_contour` writes of contour points."""
+    """Whether a file is identical to what `save_contour` would write."""
     return Path(path).read_bytes() == _contour_text(contour).encode("utf-8")
 
 
@@ -475,13 +475,13 @@ def _text(table: xr.Dataset, columns: dict[str, xr.DataArray]) -> str:
         for i, moment in enumerate(time)
         for k, whisker in enumerate(whiskers)
     )
-    # Readers that skip comments drop the rest of a line from a # that is not quoted.
+    # Readers that skip comments drop the rest of a line after a # that is not quoted.
     marked = any("#" in str(name) for name in whiskers)
     return "\n".join(about) + "\n" + table_text(("time", "whisker", *columns), rows, marked)
 
 
 def _plain(name: str, values: np.ndarray) -> list[list[object]]:
-    """Numbers as they are written: flags as 0 and 1, statuses and events by name."""
+    """Values as written: flags as 0 and 1, statuses and events by name."""
     kind = Status if name == "status" else _FLAGS.get(name)
     if kind is not None:
         return [[kind(int(code)).name.lower() for code in row] for row in values]

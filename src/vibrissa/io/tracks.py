@@ -1,26 +1,26 @@
-"""Tracks: where whiskers were in every frame, as any tracker saw them.
+"""Tracks: positions of whiskers in every frame, from any tracker.
 
-Every reader of another program's files fills in :class:`RawTracks`; :func:`labelled` is the one
-border where these are checked and named. Beyond it they are a dataset like a recording's:
+Readers of other programs' files return :class:`RawTracks`, which :func:`labelled` validates and
+converts to a dataset with the variables of a recording:
 
     trace             (time, whisker, view, node, image_axis)   pixels, column and row
     centerline        (time, whisker, node, space)              m, in ``reference_frame``
     confidence        (time, whisker[, view], node)             0 to 1, NaN where none is given
     trace_confidence  the same of the trace, where there is a centreline too
 
-with ``time`` in seconds, or in frames where the frame rate is unknown. An animal,
-track or instance of other programs is a whisker, and a body part or keypoint a node of it, from
-the base to the tip. Missing is NaN: also points at exactly zero that no confidence speaks for.
+with ``time`` in seconds, or in frames if the frame rate is unknown. An animal, track or instance of
+other programs is a whisker, and a body part or keypoint is a node of it, from base to tip. Missing
+values are NaN; points at exactly zero without a confidence count as missing.
 
-Our own files are NetCDF, without loss, and CSV, a line for each point. The lines of a table have
-the columns ``frame``, ``time`` (s), ``whisker``, ``view``, ``node`` and then ``column``, ``row``
-(pixels) or ``x``, ``y``, ``z`` (m, or with the unit at the end of the name, as in ``x_mm``), and
-``confidence``. Of these a table that somebody else made needs frame or time, and the coordinates;
-points of one frame and whisker without a name are in their order from the base.
+Vibrissa's own files are NetCDF, without loss, and CSV, one row per point. Tables have the columns
+``frame``, ``time`` (s), ``whisker``, ``view``, ``node``, then ``column``, ``row`` (pixels) or
+``x``, ``y``, ``z`` (m, or with the unit at the end of the name, as in ``x_mm``), and
+``confidence``. Only frame or time, and the coordinates, are required; without node names, points of
+a whisker in a frame are in order from the base.
 
-Traces on their way are what is done of a video, kept while the rest is traced: those of some
-whiskers from the first frame on, as one array of points with their number per frame, and a key of
-the video and the settings.
+Partial traces of a video are stored while the rest is traced: those of some whiskers from the first
+frame on, as one array of points with the number of points per frame, and a key that identifies the
+video and the settings.
 """
 
 from __future__ import annotations
@@ -48,18 +48,19 @@ KIND = "vibrissa tracks"
 
 # Units of length that can be stated, and their size, m.
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6}
-LONGEST = 1.0  # no whisker reaches across more in one frame, m
+LONGEST = 1.0  # largest plausible extent of a whisker, m
 IMAGE = ("time", "whisker", "view", "node", "image_axis")
 SPACE = ("time", "whisker", "node", "space")
 
 
 class Labels(TypedDict, total=False):
-    """Facts that files of other programs may lack.
+    """Metadata that files of other programs may lack.
 
-    ``fps``: frames per second; by default that of the file, else time counts frames. ``view``: name
-    of the camera of a file with pixels; by default that of the file, or ``camera``. ``unit``: of
-    points in space, "m", "cm", "mm" or "um", where the file does not say. ``reference_frame``: of
-    points in space; by default that of the file, or ``laboratory``.
+    ``fps`` is the frame rate, Hz, by default that of the file; without one, time is in frames.
+    ``view`` is the name of the camera of points in pixels, by default that of the file, or
+    ``camera``. ``unit`` is the unit of points in space, "m", "cm", "mm" or "um", if the file does
+    not state it. ``reference_frame`` is the frame of points in space, by default that of the file,
+    or ``laboratory``.
     """
 
     fps: float
@@ -70,11 +71,11 @@ class Labels(TypedDict, total=False):
 
 @dataclass(frozen=True, eq=False)
 class RawTracks:
-    """Contents of a tracker's file as they are."""
+    """Contents of a tracker's file before conversion."""
 
     software: str  # name of the program that wrote the file
     whiskers: Sequence[str]  # names of the whiskers
-    # (time, whisker, view, node, 2) Column and row of points in images, pixels.
+    # (time, whisker, view, node, 2), column and row of points in images, pixels.
     image: Array | None = None
     space: Array | None = None  # (time, whisker, node, 3), points in space, in ``unit``
     # Confidence of each of these points, 0 to 1.
@@ -85,7 +86,7 @@ class RawTracks:
     frames: NDArray[np.integer[Any]] | None = None  # (time,), numbers of the frames
     time: Array | None = None  # (time,), times, s
     fps: float | None = None  # frames per second
-    # Unit and frame of points in space; empty where the file does not state them.
+    # Unit and frame of points in space; empty if the file does not state them.
     unit: str = ""
     reference_frame: str = ""
     # Further variables of the format.
@@ -102,7 +103,7 @@ class RawTracks:
 
 
 def labelled(raw: RawTracks, path: str | PathLike[str], **labels: Unpack[Labels]) -> xr.Dataset:
-    """Check tracks, bring them to SI units and name everything."""
+    """Validate tracks and convert them to a labelled dataset in SI units."""
     path = Path(path)
     _check_size(raw, path)
     data: dict[str, xr.Variable] = {}
@@ -147,14 +148,14 @@ def _check_size(raw: RawTracks, path: Path) -> None:
     }
     for name, missing in empty.items():
         if missing:
-            raise ValueError(f"{path} holds no {name}")
+            raise ValueError(f"{path} contains no {name}")
 
 
 def _without_zeros(points: Array, sure: Array | None) -> tuple[Array, Array]:
-    """Mark points at exactly zero as missing where no confidence speaks for them."""
+    """Set points at exactly zero without a confidence to NaN."""
     sure = np.full(points.shape[:-1], np.nan) if sure is None else np.array(sure, dtype=np.float64)
     zero = (points == 0.0).all(axis=-1) & ~(sure > 0.0)
-    # A lone whisker's base may truly be at the origin of space; a pixel never is by chance.
+    # In space, the base of a single whisker may be at the origin; a point in an image hardly is.
     if points.shape[-1] == 3:
         zero &= (sure == 0.0) | zero.all(axis=-1, keepdims=True)
     missing = zero | np.isnan(points).any(axis=-1)
@@ -163,7 +164,7 @@ def _without_zeros(points: Array, sure: Array | None) -> tuple[Array, Array]:
 
 
 def _stated(path: Path, name: str, stated: str, given: str | None) -> str:
-    """Value in the file, or the one given; they must agree."""
+    """Value stated in the file or given by the caller; the two must agree."""
     if stated and given and stated != given:
         raise ValueError(f"{path} states the {name} {stated!r}, but {given!r} is given")
     return stated or given or ""
@@ -198,7 +199,7 @@ def _views(raw: RawTracks, path: Path, labels: Labels) -> list[str]:
 
 
 def _clock(raw: RawTracks, path: Path, fps: float | None) -> dict[str, Any]:
-    """Coordinates time and frame."""
+    """Coordinates ``time`` and ``frame``."""
     array = raw.image if raw.image is not None else raw.space
     assert array is not None
     frames = np.arange(len(array)) if raw.frames is None else np.asarray(raw.frames)
@@ -227,13 +228,13 @@ def _clock(raw: RawTracks, path: Path, fps: float | None) -> dict[str, Any]:
 
 
 def join_views(*tracks: xr.Dataset) -> xr.Dataset:
-    """Put tracks of one trial by several cameras together.
+    """Combine tracks of one trial from several cameras.
 
     Parameters
     ----------
     *tracks : xarray.Dataset
-        Each with a ``trace``, and views with names of their own. Whiskers and nodes are matched by
-        their names, times by their frame; what one view lacks is NaN there.
+        Tracks with a ``trace`` and distinct names of views. Whiskers and nodes are matched by name,
+        times by frame; what a view lacks is NaN.
 
     Returns
     -------
@@ -249,10 +250,10 @@ def join_views(*tracks: xr.Dataset) -> xr.Dataset:
         raise ValueError("each of the tracks to join needs a trace, and there must be some")
     names = [str(name) for one in tracks for name in one["view"].values]
     if len(set(names)) != len(names):
-        raise ValueError(f"the views are called {', '.join(names)}; each needs a name of its own")
+        raise ValueError(f"the views are called {', '.join(names)}; their names must differ")
     units = {one["time"].attrs.get("units", "") for one in tracks}
     if len(units) != 1:
-        raise ValueError("some tracks know their time in seconds and some do not: give fps to all")
+        raise ValueError("some tracks have times in seconds and some do not: give fps to all")
     parts = [one.swap_dims(time="frame") for one in tracks]
     points = [_with_nodes(part[["trace", "confidence"]].drop_vars("time")) for part in parts]
     # Joining sorts names, but nodes run from the base to the tip.
@@ -290,7 +291,7 @@ def join_views(*tracks: xr.Dataset) -> xr.Dataset:
 
 
 def _with_nodes(tracks: xr.Dataset) -> xr.Dataset:
-    """Number nodes without names, so that they are matched."""
+    """Name nodes without names by their numbers, so that they can be matched."""
     if "node" in tracks.coords:
         return tracks
     return tracks.assign_coords(node=np.arange(tracks.sizes["node"]))
@@ -317,7 +318,7 @@ def save_tracks(path: str | PathLike[str], tracks: xr.Dataset) -> None:
     FileNotFoundError
         If the folder does not exist.
     ValueError
-        If these are not tracks, or a table is asked of tracks with both.
+        If these are not tracks, or tracks with both are to be written as a table.
     """
     path = check_writable(path, (*NETCDF, *CSV))
     if tracks.attrs.get("kind") != KIND:
@@ -332,7 +333,7 @@ def save_tracks(path: str | PathLike[str], tracks: xr.Dataset) -> None:
 
 
 def load_own_tracks(path: str | PathLike[str]) -> xr.Dataset:
-    """Read tracks that `save_tracks` wrote as NetCDF, or those of a recording."""
+    """Read tracks from NetCDF written by `save_tracks`, or from a recording."""
     path = Path(path)
     kind = kind_of(path)
     if kind not in (KIND, _RECORDING):
@@ -390,7 +391,7 @@ def read_tracks_table(path: str | PathLike[str]) -> RawTracks:
 
 
 def _coordinates(path: Path, names: Sequence[str]) -> tuple[list[str], str]:
-    """Names of the columns with coordinates, and the unit of points in space."""
+    """Names of the columns of coordinates, and the unit of points in space."""
     for pixels in (["column", "row"], ["x_px", "y_px"]):
         if set(pixels) <= set(names):
             return pixels, ""
@@ -407,13 +408,13 @@ def _coordinates(path: Path, names: Sequence[str]) -> tuple[list[str], str]:
 
 
 def _numbered(names: Sequence[str] | None) -> Sequence[Any] | None:
-    """Names as whole numbers, where all are."""
+    """Names as integers if all are whole numbers, otherwise unchanged."""
     whole = names is not None and all(name.isdecimal() for name in names)
     return [int(name) for name in names] if names is not None and whole else names
 
 
 def _ordered(names: Sequence[Any]) -> tuple[list[str], NDArray[np.int64]]:
-    """Names in the order they appear in, numbers in theirs, and which of them each row has."""
+    """Distinct names in order of appearance, or numbers in order, and the index for each row."""
     known = dict.fromkeys(names)
     numbered = all(isinstance(name, int) for name in known)
     order = {name: i for i, name in enumerate(sorted(known) if numbered else known)}
@@ -421,7 +422,7 @@ def _ordered(names: Sequence[Any]) -> tuple[list[str], NDArray[np.int64]]:
 
 
 def _counted(*keys: NDArray[np.int64]) -> list[int]:
-    """Count rows with the same keys."""
+    """Running number of each row among the rows with the same keys."""
     counts: dict[tuple[int, ...], int] = {}
     out = []
     for key in zip(*(array.tolist() for array in keys), strict=True):
@@ -431,7 +432,7 @@ def _counted(*keys: NDArray[np.int64]) -> list[int]:
 
 
 def _text(tracks: xr.Dataset) -> str:
-    """Lines of a table."""
+    """Text of a table."""
     points = [name for name in ("trace", "centerline") if name in tracks]
     if len(points) != 1:
         raise ValueError(
@@ -467,8 +468,8 @@ def _names(tracks: xr.Dataset, dim: str) -> list[str]:
     return [str(i) for i in range(tracks.sizes[dim])]
 
 
-# Points (n, 2), deviations (n,), seen (n,), confidence, whether base and tip are, skew, sparse; the
-# last is not stored, as traces of videos never are.
+# Points (n, 2), deviations (n,), visibility (n,), confidence, visibility of base and of tip, skew,
+# sparse. The last is not stored, as traces of videos never are sparse.
 Row = tuple[Array, Array, NDArray[np.bool_], float, bool, bool, float, bool]
 
 

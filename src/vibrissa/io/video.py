@@ -1,19 +1,19 @@
-"""Videos, read and written frame by frame.
+"""Reading and writing of videos, frame by frame.
 
-Frames are read one after the other, some of them, or any in any order. Any container and codec that
-FFmpeg knows can be read; colour is turned into grey. Images that several cameras took at the same
-moments are numbered files or a video each: ``top_01.png … front_01.png …`` are of the cameras
-``top`` and ``front``; where the names are only numbers, the folder is the camera. Images of one
-number belong together. Of videos the same frames of each are taken.
+Frames can be read in sequence, selected, or accessed at random. Any container and codec supported
+by FFmpeg can be read; colour is converted to grey.
 
-A view may be a part of the images of a video, as where a mirror shows the other side: wherever a
-video is read its name may be followed by ``#COLUMN,ROW,WIDTH,HEIGHT``, and by ``:mirrored`` if left
-and right, ``:flipped`` if up and down are to be exchanged, as in
-``film.mp4#512,0,512,512:mirrored``.
+Simultaneous images of several cameras are numbered files, or one video per camera:
+``top_01.png … front_01.png …`` belong to the cameras ``top`` and ``front``; if the names are only
+numbers, the folder is the name of the camera. Images with the same number belong together. From
+several videos, the same frames are used.
 
-Videos that are written for computers are 8 bit grey frames, of which every value counts: FFV1
-(lossless) in Matroska, or H.264 in MP4. Movies for people are coloured frames as H.264 in MP4, such
-as any player shows.
+A view may be a part of the images of a video, as with a mirror: wherever a video is read, its name
+may be followed by ``#COLUMN,ROW,WIDTH,HEIGHT``, and by ``:mirrored`` to exchange left and right or
+``:flipped`` to exchange up and down, as in ``film.mp4#512,0,512,512:mirrored``.
+
+Videos for analysis are written as 8-bit grey frames: FFV1 (lossless) in Matroska, or H.264 in MP4.
+Movies for viewing are written as colour frames by H.264 in MP4, which any player supports.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ Frame = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """Properties that a video states: size of a frame, pixels; number of frames, 0 if not stated.
+    """Properties stated by a video: frame size, pixels; number of frames, 0 if not stated.
 
-    The rate is that at which it is to be shown, frames per second, which for high-speed video is
-    usually not the rate at which it was taken; 0 if it does not say. The codec is FFmpeg's name.
+    The rate is that of playback, frames per second, which for high-speed video usually differs from
+    the rate of recording; 0 if not stated. The codec is named as by FFmpeg.
     """
 
     width: int
@@ -68,7 +68,7 @@ class _Part:
 
     @classmethod
     def of(cls, path: str | PathLike[str], container: InputContainer) -> _Part | None:
-        """The part that a video's name states, if it does."""
+        """Part stated in a video's name; None if there is none."""
         file, text = without_part(path)
         if not text:
             return None
@@ -79,26 +79,26 @@ class _Part:
         if not inside or not width * height or not {*turned} <= {"mirrored", "flipped"}:
             raise ValueError(
                 f"the part {text} of {file}, whose images are {context.width} × {context.height} "
-                "pixels, cannot be: COLUMN,ROW,WIDTH,HEIGHT within them are needed, and then "
-                "nothing, :mirrored or :flipped"
+                "pixels, is not valid: COLUMN,ROW,WIDTH,HEIGHT within the images are needed, "
+                "optionally followed by :mirrored or :flipped"
             )
         return cls(left, top, width, height, tuple(turned))
 
     def cut(self, frame: Frame) -> Frame:
-        """Take the part of an image."""
+        """Cut the part out of an image."""
         cut = frame[self.top : self.top + self.height, self.left : self.left + self.width]
         cut = cut[:, ::-1] if "mirrored" in self.turned else cut
         return np.ascontiguousarray(cut[::-1] if "flipped" in self.turned else cut)
 
 
 def _grey_frames(path: str | PathLike[str], container: InputContainer) -> Callable[[Any], Frame]:
-    """The function that turns a decoded frame of a video into what its name states."""
+    """Function that converts a decoded frame to grey values and cuts out the stated part."""
     part = _Part.of(path, container)
     return grey_frame if part is None else lambda frame: part.cut(grey_frame(frame))
 
 
 def video_info(path: str | PathLike[str]) -> VideoInfo:
-    """Read what a video holds."""
+    """Read the properties of a video."""
     with opened_video(path) as container:
         stream = container.streams.video[0]
         context = stream.codec_context
@@ -143,10 +143,10 @@ def read_video(path: str | PathLike[str]) -> Iterator[Frame]:
 
 
 def video_frames(path: str | PathLike[str], numbers: Iterable[int]) -> Iterator[Frame]:
-    """Read some frames of a video, and decode no more than need be."""
+    """Read selected frames of a video, decoding no more than necessary."""
     wanted = [int(number) for number in numbers]
     if any(b < a for a, b in pairwise([0, *wanted])):
-        raise ValueError("numbers of frames must not be negative and must not fall")
+        raise ValueError("frame numbers must not be negative and must not decrease")
     found = _decoded(path, set(wanted))
     number, image = -1, None
     for want in wanted:
@@ -159,7 +159,7 @@ def video_frames(path: str | PathLike[str], numbers: Iterable[int]) -> Iterator[
 
 
 def _decoded(path: str | PathLike[str], wanted: set[int]) -> Iterator[tuple[int, Frame | None]]:
-    """Numbers and images, in order, of all that is decoded; None of what is not wanted."""
+    """Yield number and image of each frame in order; the image is None if it is not wanted."""
     import av
 
     with opened_video(path) as container:
@@ -170,7 +170,7 @@ def _decoded(path: str | PathLike[str], wanted: set[int]) -> Iterator[tuple[int,
         packets: Iterator[Any] = pairwise(chain(container.demux(stream), [None]))
         try:
             for number, (packet, following) in enumerate(packets):
-                # Between two key frames nothing else depends on a frame.
+                # No other frame depends on a key frame that is followed by a key frame.
                 alone = packet.is_keyframe and following is not None and following.is_keyframe
                 if alone and number not in wanted:
                     continue
@@ -186,7 +186,7 @@ def _decoded(path: str | PathLike[str], wanted: set[int]) -> Iterator[tuple[int,
 
 
 def opened_video(path: str | PathLike[str]) -> InputContainer:
-    """Open a file that holds a video, or raise an error that states why not."""
+    """Open a video file; raise an error that states why if it cannot be read."""
     import av
 
     path, _ = without_part(path)
@@ -203,12 +203,12 @@ def opened_video(path: str | PathLike[str]) -> InputContainer:
         ) from error
     if not container.streams.video:
         container.close()
-        raise ValueError(f"{path} holds no video")
+        raise ValueError(f"{path} contains no video")
     return container
 
 
 def grey_frame(frame: Any) -> Frame:
-    """Luminance over the full range, whatever the video's own format."""
+    """Luminance of a frame over the full range 0 to 255, whatever the video's format."""
     if frame.format.name in ("gray", "yuvj420p", "yuvj422p", "yuvj444p"):
         plane = frame.planes[0]
         rows = np.frombuffer(plane, dtype=np.uint8).reshape(-1, plane.line_size)
@@ -217,11 +217,11 @@ def grey_frame(frame: Any) -> Frame:
     return np.asarray(frame.to_ndarray(format="gray"), dtype=np.uint8)
 
 
-AHEAD = 60  # frames that are rather decoded one after another than jumped over
+AHEAD = 60  # number of frames up to which decoding in sequence is preferred to seeking
 
 
 class Footage:
-    """A video to look at frame by frame, open until `close`, which jumps to a frame by its time."""
+    """Random access to the frames of a video, by seeking to their times; open until `close`."""
 
     def __init__(self, path: str | PathLike[str]) -> None:
         self.info = video_info(path)
@@ -236,7 +236,7 @@ class Footage:
         self._last: Frame | None = None
 
     def frame(self, number: int) -> Frame:
-        """Give one frame."""
+        """Frame by its number, counted from 0."""
         import av
 
         if number < 0:
@@ -258,7 +258,7 @@ class Footage:
         return self._last
 
     def _jump(self, number: int) -> None:
-        """Go on from the last frame before that can be decoded by itself."""
+        """Seek to the last key frame before a frame."""
         rate, base = self._stream.average_rate, self._stream.time_base
         place = 0 if rate is None or base is None else round(number / rate / base)
         self._container.seek(self._start + place, stream=self._stream)
@@ -283,8 +283,8 @@ _MEMORY = 200e6
 class FrameReader:
     """Frames of a video by number.
 
-    Frames are decoded one after the other, so that their numbers are right in every kind of video;
-    the latest are kept, in so many bytes of memory. Going back farther than that begins anew.
+    Frames are decoded in sequence, so that their numbers are correct in every kind of video. The
+    latest are cached, in at most ``memory`` bytes; access to earlier frames restarts the decoding.
     """
 
     def __init__(self, path: str | PathLike[str], memory: float = _MEMORY) -> None:
@@ -296,7 +296,7 @@ class FrameReader:
         self._count: int | None = None
 
     def __getitem__(self, number: int) -> Frame:
-        """Give a frame, counted from 0; an ``IndexError`` if there are fewer."""
+        """Frame by its number, counted from 0; raise IndexError if there are fewer."""
         if number < 0:
             raise IndexError(f"frame {number}; they are counted from 0")
         if number in self._kept:
@@ -308,7 +308,7 @@ class FrameReader:
         while self._next <= number:
             frame = next(self._coming, None)
             if frame is None:
-                # So that the next request does not go on with a decoder that is done.
+                # The next request must not continue with an exhausted decoder.
                 self._count, self._coming, self._next = self._next, read_video(self.path), 0
                 raise self._beyond(number)
             self._keep(self._next, frame)
@@ -329,7 +329,7 @@ _NUMBERED = re.compile(r"^(.*?)[ _.-]*(\d+)$")
 
 
 def load_series(paths: Sequence[str | PathLike[str]], most: int = 40) -> dict[str, list[Frame]]:
-    """Read images of several cameras."""
+    """Read simultaneous images of several cameras, by the names of the cameras."""
     files = [Path(path) for path in paths]
     videos = [recognise(path) == Kind.VIDEO for path in files]
     if all(videos):
@@ -347,7 +347,7 @@ def _of_videos(files: Sequence[Path], most: int) -> dict[str, list[Frame]]:
         raise ValueError(f"two videos have the same name: {', '.join(sorted(names))}")
     count = min(video_info(path).frames for path in files)
     if not count:
-        raise ValueError("a video does not say how many frames it has: save frames as images")
+        raise ValueError("a video does not state its number of frames: save frames as images")
     chosen = set(np.linspace(0, count - 1, min(most, count)).astype(int).tolist())
     return {
         name: [frame.copy() for i, frame in enumerate(read_video(path)) if i in chosen]
@@ -360,7 +360,7 @@ def _of_images(files: Sequence[Path]) -> dict[str, list[Frame]]:
     for path in files:
         match = _NUMBERED.match(path.stem)
         if match is None:
-            raise ValueError(f"{path} has no number; images are called like top_01.png")
+            raise ValueError(f"{path} has no number; names of images must be like top_01.png")
         name, number = match[1] or path.resolve().parent.name, int(match[2])
         if number in numbered.setdefault(name, {}):
             raise ValueError(f"{path} and {numbered[name][number]} have the same camera and number")
@@ -380,11 +380,11 @@ def _of_images(files: Sequence[Path]) -> dict[str, list[Frame]]:
 
 
 CODECS = {".mkv": "ffv1", ".mp4": "h264"}  # codec of a video by the ending of its file
-# H.264's constant rate factor: 0 is lossless, 23 its usual default; here faint tips must last.
+# Constant rate factor of H.264: 0 is lossless, 23 the usual default; 16 preserves faint tips.
 QUALITY = 16
-_MOVIE_QUALITY = 20  # H.264's constant rate factor that is good enough for thin lines
-# FFmpeg's numbers for: grey values from 0 to 255; from 16 to 235, as players expect; and the
-# colours of HD television (BT.709).
+_MOVIE_QUALITY = 20  # constant rate factor of H.264 sufficient for thin lines
+# FFmpeg's codes for grey values from 0 to 255, for those from 16 to 235 as players expect, and for
+# the colours of HD television (BT.709).
 _FULL, _TELEVISION, _HD = 2, 1, 1
 
 
@@ -394,19 +394,19 @@ def write_video(
     rate: float = 50.0,
     quality: int = QUALITY,
 ) -> int:
-    """Write a grey video, and return the number of its frames.
+    """Write a grey video, and return the number of frames.
 
-    Frames are (height, width) of 8 bits, all of one size. The ending ``.mkv`` is for FFV1,
-    lossless, ``.mp4`` for H.264 of a constant rate factor from 0 (lossless) to 51; the rate is
-    that at which it is to be shown. An existing file is replaced once the new one is complete.
+    Frames are 8-bit arrays (height, width) of equal size. The ending ``.mkv`` selects FFV1
+    (lossless), ``.mp4`` H.264 with the constant rate factor ``quality`` from 0 (lossless) to 51.
+    ``rate`` is that of playback, Hz. An existing file is replaced once the new one is complete.
     """
     import av
 
     path = Path(path)
     codec = CODECS.get(path.suffix.lower())
     if codec is None:
-        raise ValueError(f"{path} ends on {path.suffix!r}; one of {', '.join(CODECS)} is needed")
-    # Of FFV1 every frame is a key frame, so that one can be read without those before it.
+        raise ValueError(f"{path} ends in {path.suffix!r}; one of {', '.join(CODECS)} is needed")
+    # With FFV1 every frame is a key frame, so that frames can be read independently.
     options = {"level": "3", "slices": "4", "g": "1"}
     if codec == "h264":
         options = {"crf": str(quality), "preset": "ultrafast"}
@@ -433,9 +433,9 @@ def write_movie(path: str | PathLike[str], frames: Iterable[Frame], rate: float 
     path : str or path
         File with the ending ``.mp4``; an existing file is replaced once the new one is complete.
     frames : iterable of array (height, width, 3 or 4)
-        Red, green, blue (and opacity, which is not used) of 8 bits, all of one even size.
+        8-bit values of red, green, blue (and opacity, which is ignored), all of one even size.
     rate : float
-        Frames per second at which it is to be shown.
+        Frame rate of playback, Hz.
 
     Returns
     -------
@@ -452,10 +452,10 @@ def write_movie(path: str | PathLike[str], frames: Iterable[Frame], rate: float 
     """
     path = Path(path)
     if path.suffix.lower() != ".mp4":
-        raise ValueError(f"{path} ends on {path.suffix!r}; a movie ends on .mp4")
+        raise ValueError(f"{path} ends in {path.suffix!r}; a movie must end in .mp4")
     if not (np.isfinite(rate) and rate > 0.0):
         raise ValueError(f"rate is {rate!r}; it must be positive, in frames per second")
-    # A key frame every two seconds, so that one can wind to and fro.
+    # A key frame every two seconds allows quick seeking.
     options = {"crf": str(_MOVIE_QUALITY), "preset": "veryfast", "g": str(max(1, round(2 * rate)))}
 
     def start(container: Any, shape: tuple[int, ...]) -> Any:
@@ -469,12 +469,12 @@ def write_movie(path: str | PathLike[str], frames: Iterable[Frame], rate: float 
         context.colorspace = context.color_primaries = context.color_trc = _HD
         return stream
 
-    # The index comes first, so that a player can begin before it has read everything.
+    # The index comes first, so that playback can start before the whole file is read.
     return _write(path, "mp4", frames, start, _coloured, {"movflags": "+faststart"})
 
 
 def _coloured(frame: Frame) -> Any:
-    """Brightness and colours as players expect them."""
+    """Convert a frame to the brightness and colours that players expect."""
     import av
 
     kind = "rgb24" if frame.shape[2] == 3 else "rgba"
@@ -507,7 +507,7 @@ def _write(
     coded: Callable[[Frame], Any],
     options: Mapping[str, str] | None = None,
 ) -> int:
-    """Encode frames of one shape; `start` adds the stream, `coded` makes a frame of the codec."""
+    """Encode frames of one shape; ``start`` adds the stream, ``coded`` converts a frame."""
     import av
 
     count = 0

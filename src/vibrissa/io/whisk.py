@@ -1,12 +1,12 @@
-"""Files of the tracker *whisk*: `.whiskers` (traces) and `.measurements` (one line a trace).
+"""Reader of files of the tracker *whisk*: `.whiskers` (traces) and `.measurements`.
 
-Little endian. A whiskers file is the header ``bwhiskbin1``, for each segment its id, frame and
-number of points n with n times x, y, thickness and score as float32, and at the end the number of
-segments. The id counts the segments of one frame and is not an identity; points run in either
-direction; traces reach beyond the tip and into the face by some pixels. A measurements file is the
-header ``measv3``, numbers of rows and of measures, and for each row its frame, segment, state and
-measures. The state is the whisker's identity once somebody has had whiskers classified (−1: none);
-before, it is the same for all.
+Files are little endian. A whiskers file consists of the header ``bwhiskbin1``; for each segment its
+id, frame and number of points n with n times x, y, thickness and score as float32; and the number
+of segments. The id numbers the segments of one frame and is not an identity; points run in either
+direction; traces extend beyond the tip and into the face by some pixels. A measurements file
+consists of the header ``measv3``, the numbers of rows and measures, and for each row (one per
+trace) its frame, segment, state and measures. The state is the whisker's identity if whiskers have
+been classified (−1: none), and otherwise the same for all.
 
 Clack et al. 2012, doi:10.1371/journal.pcbi.1002591.
 """
@@ -49,17 +49,17 @@ def load_whiskers(
     Parameters
     ----------
     path : str or path
-        The ``.whiskers`` file.
+        Path of the ``.whiskers`` file.
     measurements : str or path, optional
-        The ``.measurements`` file of the same video, by default that of the same name next to
-        it, if there is one. It states which end is the follicle and, if classified, which segments
-        are whiskers and which whisker each is. Without it whisker i is the i-th segment of each
-        frame, which is not an identity, and the direction of the points is left as it is.
+        Path of the ``.measurements`` file of the same video, by default that of the same name in
+        the same folder, if it exists. It states which end is the follicle and, if classified, the
+        whisker of each segment. Without it, whisker i is the i-th segment of each frame, which is
+        not an identity, and the direction of the points is unchanged.
     nodes : int, optional
-        Points of each whisker, evenly along it; by default all that were traced, as many as the
-        longest trace has, the others NaN beyond their end.
+        Number of points per whisker, resampled at equal distances; by default all traced points,
+        padded with NaN to the length of the longest trace.
     **labels
-        fps and view; see `Labels`.
+        Metadata fps and view; see `Labels`.
 
     Returns
     -------
@@ -220,7 +220,7 @@ def _rows(path: Path) -> NDArray[Any]:
 
 
 def _identity(rows: NDArray[Any]) -> tuple[Numbers, str]:
-    """Tell which whisker each row is, −1 for none, and how that is known."""
+    """Whisker of each row, −1 for none, and a description of how it is known."""
     state = rows["state"].astype(np.int64)
     classified = state >= 0
     pairs = np.stack([rows["frame"], state], axis=1)[classified]
@@ -237,7 +237,7 @@ def _matched(
     segments: list[Array],
     rows: NDArray[Any],
 ) -> tuple[list[Array], Numbers]:
-    """Turn segments to begin at the follicle, and tell their identity, −1 for none."""
+    """Orient segments from follicle to tip; also return their identities, −1 for none."""
     identity, _ = _identity(rows)
     found = {
         (int(row["frame"]), int(row["segment"])): (int(who), row["data"][4:6])
@@ -261,7 +261,7 @@ def _matched(
 
 
 def _resampled(points: Array, nodes: int) -> Array:
-    """Points (nodes, 4) evenly along a segment."""
+    """Points (nodes, 4) at equal distances along a segment."""
     if len(points) < 2:
         return np.full((nodes, 4), np.nan)
     along = np.concatenate(
@@ -274,9 +274,9 @@ def _resampled(points: Array, nodes: int) -> Array:
 def _places(
     path: Path, frames: Numbers, identity: Numbers
 ) -> tuple[Numbers, list[str], tuple[Numbers, Numbers]]:
-    """All frames from the first to the last, whiskers, and where each row goes among them."""
+    """All frames from first to last, names of whiskers, and the indices of each row in these."""
     if not frames.size:
-        raise ValueError(f"{path} holds no whiskers")
+        raise ValueError(f"{path} contains no whiskers")
     if frames.max() - frames.min() > _MOST_FRAMES or frames.min() < 0:
         raise ValueError(
             f"{path} is damaged: its frames are numbered from {frames.min()} to {frames.max()}"

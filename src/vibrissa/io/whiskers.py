@@ -1,34 +1,33 @@
-"""Files of whiskers: digitised centrelines as CSV, and arrays.
+"""Files of whiskers: digitised centrelines (CSV), and arrays of whiskers.
 
-**Centreline**: the first line that is neither empty nor a comment (#) is the header. It names the
-coordinates and with them the unit: `x_mm,y_mm,z_mm` (also `_um`, `_cm`, `_m`; `x (mm)`), or `x,y,z`
-in metres. Without z the points lie in the plane z = 0. A column `radius_um` or `diameter_um`, in
-any of these units or that of the coordinates, is the thickness of the whisker there; where its
-cells are empty, the radius goes on smoothly between its neighbours, and at the ends as it was.
-Where it jumps, one point may stand in two rows with two radii. Other columns are left alone, and so
-are rows without any coordinate.
+**Centreline**: the first line that is neither empty nor a comment (#) is the header, which states
+the coordinates and their unit: `x_mm,y_mm,z_mm` (also `_um`, `_cm`, `_m`; `x (mm)`), or `x,y,z` in
+metres. Without z the points are in the plane z = 0. A column `radius_um` or `diameter_um`, in any
+of these units or that of the coordinates, is the thickness of the whisker; in empty cells the
+radius is interpolated, and constant at the ends. At a discontinuity of the radius, a point may be
+in two rows with two radii. Other columns and rows without coordinates are ignored.
 
-Arrays are our own files, a lab's table, or a folder of centrelines. All whiskers are in one frame,
-that of the head: origin at the tip of the snout (or anywhere on the midline), x to the animal's
-right, y forward, z up.
+**Arrays** are vibrissa's own files, tables, or folders of centrelines. All whiskers are in the head
+frame: origin at the tip of the snout (or anywhere on the midline), x to the animal's right, y
+forward, z up.
 
-**Table** (CSV), a line a whisker. The unit stands at the end of a column's name: ``_mm``, ``_um``
-or ``_m`` for lengths, ``_deg`` or ``_rad`` for angles.
+**Table** of an array (CSV), one row per whisker. The name of a column ends with its unit: ``_mm``,
+``_um`` or ``_m`` for lengths, ``_deg`` or ``_rad`` for angles.
 
 | columns | |
 |---|---|
-| `name` | row and column: C2, gamma; L or R before it, or the side is that of the base |
+| `name` | row and column: C2, gamma; with L or R before it, else the side follows from the base |
 | `x_mm, y_mm, z_mm` | base point |
-| `azimuth_deg, elevation_deg, roll_deg` | as `vibrissa.whisker.pose` has them; or |
-| `r11, r12, … r33` | the rotation from the whisker's to the head's frame, row by row |
+| `azimuth_deg, elevation_deg, roll_deg` | angles as defined in `vibrissa.whisker.pose`; or |
+| `r11, r12, … r33` | the rotation from the whisker frame to the head frame, row by row |
 | `length_mm` | arc length |
 | `coefficient_per_mm` | A of the whisker's shape y = A x² (also ``_per_m``) |
-| `base_radius_um, tip_radius_um` | may be left out: then they are the published ones of its name |
+| `base_radius_um, tip_radius_um` | optional; by default the published ones for its name |
 
-Other columns are left alone.
+Other columns are ignored.
 
-**Folder**: a CSV file each with columns ``x_mm,y_mm,z_mm`` (`load_centerline`), from base to tip,
-named after the whisker: ``C2.csv``, ``left_gamma.csv``.
+**Folder** of an array: one CSV file per whisker with columns ``x_mm,y_mm,z_mm``
+(`load_centerline`), from base to tip, named after the whisker: ``C2.csv``, ``left_gamma.csv``.
 """
 
 from __future__ import annotations
@@ -76,15 +75,15 @@ from vibrissa.whisker import (
 UNITS = {"": 1.0, "_m": 1.0, "_mm": 1e-3, "_um": 1e-6, "_µm": 1e-6}
 ALLOWED = "x_mm,y_mm,z_mm (also _um, _cm, _m) or x,y,z in metres; z may be left out"
 
-# Share of the mean radius by which an end is thicker, at least, that counts as the base.
+# Smallest relative difference of thickness that determines the base.
 _COORDINATE = re.compile(r"([xyz])(?![a-z0-9])(.*)", re.IGNORECASE)
 _THICKNESS = re.compile(r"(radius|diameter)(?![a-z0-9])(.*)", re.IGNORECASE)
 _THINNEST, _THICKEST = 1e-5, 0.1
 _TAPERED = 0.01
 # Columns that name the whisker to which a point belongs.
 _NAMING = frozenset({"whisker", "whisker_id", "name", "label", "id"})
-_FEWEST = 3  # points of a whisker among others
-_SURE = 4.0  # standard errors by which it is thicker, at least
+_FEWEST = 3  # smallest mean number of points per whisker in a table of several whiskers
+_SURE = 4.0  # smallest difference of thickness that determines the base, in standard errors
 _PLANAR = "the file has no column z: the whisker was taken to be planar"
 _FIRST = (
     "the first point of the file was taken as the base; base='last' (Python) takes the other end"
@@ -108,7 +107,7 @@ def load_centerline(path: str | PathLike[str]) -> Array:
 
 
 class _Centreline(NamedTuple):
-    """Points (n, 3) and, if stated, radii (n,), m; the coordinates' unit; what is worth a note."""
+    """Points (n, 3) and, if stated, radii (n,), m; unit of the coordinates; notes."""
 
     points: Array
     radii: Array | None
@@ -143,12 +142,12 @@ def _table(path: Path) -> _Centreline:
 
 
 def _check_one_whisker(path: Path, header: list[str], rows: list[tuple[int, list[str]]]) -> None:
-    """Refuse points of several whiskers one below the other."""
+    """Raise ValueError for a table with points of several whiskers."""
     place = next((i for i, name in enumerate(header) if name.lower() in _NAMING), None)
     if place is None:
         return
     names = list(dict.fromkeys(cells[place] for _, cells in rows if place < len(cells)))
-    # Names of single points are not those of whiskers.
+    # A name with very few rows is that of a point, not of a whisker.
     if 1 < len(names) <= len(rows) / _FEWEST:
         raise ValueError(
             f"{path} has points of {len(names)} whiskers by its column {header[place]}: "
@@ -158,7 +157,7 @@ def _check_one_whisker(path: Path, header: list[str], rows: list[tuple[int, list
 
 
 def _left_out(known: AnyArray, filled: AnyArray) -> list[str]:
-    """Note rows without coordinates, but for empty ones at the end of a file."""
+    """Notes on rows without coordinates, except empty ones at the end of a file."""
     last = int(np.flatnonzero(filled)[-1]) + 1 if filled.any() else 0
     missing = np.flatnonzero(~known[:last])
     if not missing.size:
@@ -205,21 +204,21 @@ def _thickness(path: Path, header: list[str], coordinates: float) -> list[tuple[
 
 
 def check_slender(radius: float, length: float) -> None:
-    """Refuse a radius whose unit is not the stated one."""
+    """Raise ValueError for an implausible radius, as in another unit than stated."""
     if not _THINNEST < radius / length < _THICKEST:
         raise ValueError(
-            f"the radius is {radius * 1e6:.4g} µm on a whisker of {length * 1e3:.4g} mm; its "
-            "column must be called by its unit, such as radius_um"
+            f"the radius is {radius * 1e6:.4g} µm on a whisker of {length * 1e3:.4g} mm; the name "
+            "of its column must state its unit, as radius_um does"
         )
 
 
-def tells_radius(path: str | PathLike[str]) -> bool:
-    """Tell whether a table of a centreline has a column of radii."""
+def states_radius(path: str | PathLike[str]) -> bool:
+    """Whether a table of a centreline has a column of radii."""
     return _table(Path(path)).radii is not None
 
 
 def save_centerline(path: str | PathLike[str], points: ArrayLike) -> None:
-    """Write a centreline as CSV in mm, to 1 nm.
+    """Write a centreline as CSV in mm, with a resolution of 1 nm.
 
     Parameters
     ----------
@@ -242,25 +241,25 @@ def load_whisker(
     base: str | ArrayLike | None = None,
     **properties: Unpack[Properties],
 ) -> Whisker:
-    """Read a digitised centreline and make a whisker of it.
+    """Read a digitised centreline and construct a whisker from it.
 
     Parameters
     ----------
     path : str or path
-        CSV file with columns `x_mm,y_mm,z_mm`, or `x,y,z` in metres. Without z the whisker is taken
-        to be planar, as its notes state.
+        CSV file with columns `x_mm,y_mm,z_mm`, or `x,y,z` in metres. Without z the whisker is
+        assumed to be planar, as its notes state.
     noise : float, optional
-        Standard deviation of a coordinate, m; 0 asks for interpolation. By default it is estimated.
+        Standard deviation of a coordinate, m; 0 for interpolation. By default it is estimated.
     base : {"first", "last"} or array (3,), optional
-        End that is the base: by name, or a point near it, m. By default the thicker one where the
-        file has radii that differ, and otherwise the first.
+        End that is the base: by name, or a point near it, m. By default the thicker end if the file
+        has radii that differ, otherwise the first point.
     **properties
-        Radius and material; see `Whisker`. A radius that is given counts more than the file's.
+        Radius and material; see `Whisker`. They take precedence over the radii in the file.
 
     Returns
     -------
     Whisker
-        Named after the file unless a name is given.
+        Whisker named after the file, unless a name is given.
     """
     points, radii, unit, notes = _table(Path(path))
     properties.setdefault("name", Path(path).stem)
@@ -277,8 +276,8 @@ def load_whisker(
             whisker = _tapered(points, radii, noise, base, properties)
     except ValueError as fault:
         raise ValueError(
-            f"{path}: {fault} (by the header coordinates are in {unit}; columns of millimetres are "
-            "called x_mm, y_mm, z_mm)"
+            f"{path}: {fault} (by the header, coordinates are in {unit}; columns in millimetres "
+            "must be named x_mm, y_mm, z_mm)"
         ) from None
     return replace(whisker, notes=(*whisker.notes, *notes)) if notes else whisker
 
@@ -290,7 +289,7 @@ def _tapered(
     base: str | ArrayLike | None,
     properties: Properties,
 ) -> Whisker:
-    """A whisker with the radius that was measured along it; its thicker end is the base."""
+    """Whisker with radii measured along it; by default the thicker end is the base."""
     known = np.isfinite(radii)
     if not known.any():
         return Whisker.from_points(points, noise=noise, base=base, **properties)
@@ -304,7 +303,7 @@ def _tapered(
     if base is None and _thickens(radii[known]):
         base = "last"
         notes = ("its thicker end, the last point of the file, was taken as the base",)
-    # A point in two rows states two radii; rows that repeat their radius too are kept, and refused.
+    # A point in two rows may have two radii; rows that also repeat the radius raise an error later.
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     jump = (steps == 0.0) & (np.diff(radii) != 0.0)
     whisker = Whisker.from_points(
@@ -325,7 +324,7 @@ def _tapered(
 
 
 def _thickens(radii: Array) -> bool:
-    """Whether the last of some radii belong to the thicker end, beyond their scatter."""
+    """Whether the whisker is significantly thicker at its last point than at its first."""
     if radii.size < 2:
         return False
     x = np.linspace(-0.5, 0.5, radii.size)
@@ -343,8 +342,8 @@ def load_array(
     Parameters
     ----------
     path : str or path
-        File of `save_array` (``.nc``), a table of whiskers (``.csv``), or a folder of centrelines,
-        a file each.
+        File written by `save_array` (``.nc``), table of whiskers (``.csv``), or folder of
+        centrelines, one file per whisker.
     base : {"first", "last"} or array_like (3,), optional
         End of a centreline that is the base; see `load_whisker`.
     noise : float, optional
@@ -353,12 +352,12 @@ def load_array(
     Returns
     -------
     WhiskerArray
-        Poses lead to the frame of the file.
+        Whiskers with their poses in the frame of the file.
 
     Warns
     -----
     UserWarning
-        If a whisker of a table is more curved than any of a rat.
+        If a whisker of a table is more curved than any whisker of a rat.
     """
     path = Path(path)
     if not path.exists():
@@ -376,17 +375,17 @@ def save_array(path: str | PathLike[str], array: WhiskerArray) -> None:
     Parameters
     ----------
     path : str or path
-        ``.nc``: without loss, whatever the whiskers' shapes. ``.csv``: a table, for whiskers that
-        are parabolas with a linear taper, such as an average rat's.
+        Path ending in ``.nc``, without loss for any whiskers, or in ``.csv``, a table for whiskers
+        that are parabolas with a linear taper, such as those of an average rat.
     array : WhiskerArray
-        Array that is written.
+        Array to write.
 
     Raises
     ------
     FileNotFoundError
         If the folder does not exist.
     ValueError
-        If a table was asked for and a whisker is of another shape.
+        If a table is to be written and a whisker has another shape.
     """
     path = Path(path)
     if path.suffix.lower() != ".csv":
@@ -402,7 +401,7 @@ def _netcdf(path: Path) -> WhiskerArray:
 
 
 def _folder(path: Path, base: Any, noise: float | None) -> WhiskerArray:
-    """A digitised centreline each."""
+    """Array from a folder with one digitised centreline per whisker."""
     files = sorted(file for file in path.iterdir() if file.suffix.lower() == ".csv")
     if not files:
         raise ValueError(f"{path} {_of_folder(path)}")
@@ -414,7 +413,7 @@ def _folder(path: Path, base: Any, noise: float | None) -> WhiskerArray:
         except ValueError as fault:
             faults.append(f"{file.name}: {fault}")
             continue
-        if not tells_radius(file):
+        if not states_radius(file):
             whisker = whisker.with_properties(rat=identity.name)
         whiskers.append(whisker)
     if faults:
@@ -423,7 +422,7 @@ def _folder(path: Path, base: Any, noise: float | None) -> WhiskerArray:
 
 
 def _of_folder(path: Path) -> str:
-    """Why a folder is not a folder of centrelines."""
+    """Describe why a folder is not a folder of centrelines."""
     names = sorted(file.name for file in path.iterdir())
     if {".zgroup", ".zarray", "zarr.json"}.intersection(names):
         return "is a Zarr folder, as NWB can be kept in; save it as HDF5, in one file .nwb"
@@ -475,7 +474,7 @@ def whiskers_from_table(path: Path) -> list[Whisker]:
 def _whisker(
     name: str, pose: Pose, length: float, coefficient: float, radii: dict[str, float]
 ) -> Whisker:
-    """One line's whisker."""
+    """Whisker described by one row of a table."""
     published = dict(zip(_RADII, published_radii(name, length), strict=True))
     stated: Any = published | radii
     whisker = Whisker.parabola(length, coefficient, name=name, **stated)
@@ -490,12 +489,12 @@ def _whisker(
             f"rat's whisker of this length ({bound * 1e-3:.4f} per mm): check the units",
             stacklevel=4,
         )
-    # A negative coefficient turns the whisker's frame within that of the table.
+    # A negative coefficient rotates the whisker frame relative to that of the table.
     return replace(whisker, pose=Pose(pose.rotation @ whisker.pose.rotation, pose.origin))
 
 
 class _Columns(Table):
-    """Numbers of a table by name, in SI units, and what is wrong with it."""
+    """Columns of a table in SI units, with a list of faults."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -515,7 +514,7 @@ class _Columns(Table):
         return any(name + suffix in self.names for suffix in units)
 
     def values(self, name: str, units: Mapping[str, float]) -> Array:
-        """Values of a quantity; NaN, and a fault, where there is none."""
+        """Values of a quantity; missing ones are NaN and recorded as faults."""
         values = np.full(len(self.lines), np.nan)
         suffix = next((suffix for suffix in units if name + suffix in self.names), None)
         if suffix is None:
@@ -546,13 +545,13 @@ def _rotations(columns: _Columns) -> Array:
         )
     if columns.faults:
         return matrix
-    # What rounding in the table left over is taken away: the nearest rotation.
+    # The nearest rotation removes rounding errors of the table.
     left, _, right = np.linalg.svd(matrix)
     return np.asarray(left @ right)
 
 
 def _as_table(array: WhiskerArray) -> tuple[list[str], list[list[str]]]:
-    """Write whiskers as the header and the rows of a table."""
+    """Header and rows of a table of whiskers."""
     header = ["name", "x_mm", "y_mm", "z_mm", *(f"{name}_deg" for name in _ANGLES)]
     header += ["length_mm", "coefficient_per_mm", "base_radius_um", "tip_radius_um"]
     rows = []
@@ -574,7 +573,7 @@ def _coefficient(whisker: Whisker) -> float:
     bent = np.abs(whisker.curvature(s) - parabola).max() * whisker.length
     if bent > 1e-6 or np.abs(whisker.radius(s) / taper - 1.0).max() > 1e-6:
         raise ValueError(
-            f"{whisker.name} is not a planar parabola with a linear taper, which is all that a "
-            "table holds; NetCDF (.nc) keeps it"
+            f"{whisker.name} is not a planar parabola with a linear taper, as a table requires; "
+            "NetCDF (.nc) supports any shape"
         )
     return coefficient

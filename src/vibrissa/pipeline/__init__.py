@@ -1,4 +1,7 @@
-"""The stages between tracks and a contour, each from a recording to a dataset of its own."""
+"""Processing stages of a recording: signals, contact estimates and the object's contour.
+
+Each stage is a function that takes a recording and returns a new dataset.
+"""
 
 from vibrissa.pipeline.axes import doubted_axes as doubted_axes
 from vibrissa.pipeline.estimates import (

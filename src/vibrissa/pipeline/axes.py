@@ -1,9 +1,10 @@
-"""Whether force and moment are measured along the axes of the whisker.
+"""Detection of exchanged or sign-reversed axes in measured force and moment.
 
 A contact at p, with friction or without, gives the moment M = p × F: M is normal to F, and the line
-of the force meets the bent whisker. With two columns exchanged, a sign wrong, or axes that form the
-other hand, most contacts satisfy neither, and with the mistake undone all do. A mistake that leaves
-a contact of the whisker, such as a turn of a straight whisker's axes about x, does not show.
+of action of the force meets the bent whisker. If two columns are exchanged, a sign is wrong or the
+axes are left-handed, most measurements violate both conditions, and correcting the mistake restores
+both. A mistake after which the wrench is still that of a possible contact, such as a rotation of a
+straight whisker's axes about x, cannot be detected.
 """
 
 from __future__ import annotations
@@ -18,34 +19,35 @@ from vibrissa.numerics import Array
 from vibrissa.recording import Group
 from vibrissa.whisker import Whisker
 
-# Contacts that are looked at, at least and at most, from those with the larger moments.
+# Smallest and largest number of contacts tested, chosen from those with the larger moments.
 _FEW, _MOST = 6, 24
-# Errors that are no matter of axes, such as those of stiffness: share of force and of moment.
+# Model errors unrelated to the axes, such as those of stiffness, relative to force and moment.
 _MODEL = 0.05
-_EXPLAINED = 9.0  # a contact is explained up to this χ², to which a friction angle of 20° adds one
-# Axes that explain no more than this share of the contacts are doubted; others are believed that
-# explain so much, and so much more than these. Among others as good the simplest is stated.
+_EXPLAINED = 9.0  # largest χ² of an explained contact; a friction angle of 20° adds one to χ²
+# The stated axes are doubted if they explain at most the share _DOUBTED of the contacts. Other axes
+# are reported if they explain at least _BELIEVED, and _BETTER more than the stated ones; of those
+# within _EQUAL of the best, the simplest is reported.
 _DOUBTED, _BELIEVED, _BETTER, _EQUAL = 0.5, 0.9, 0.25, 0.05
-# Largest |F · M| / |F| |M| in the median of axes that are tried, which saves time.
+# Axes with a larger median |F · M| / |F| |M| are rejected at once, which saves time.
 _OBLIQUE = 0.2
 
 
 def doubted_axes(whisker: Whisker, wrench: xr.Dataset, noise: Array) -> str:
-    """State which axes of force and moment seem to be exchanged, or of a wrong sign.
+    """Describe which axes of force and moment seem to be exchanged or to have the wrong sign.
 
     Parameters
     ----------
     whisker : Whisker
-        Whisker that touches, without weight.
+        Whisker in contact; its weight is neglected.
     wrench : xarray.Dataset
-        Measured ``force`` and ``moment``, whisker's frame, N and N·m, dimensions time, space.
+        Measured ``force`` and ``moment``, whisker frame, N and N·m, dimensions time, space.
     noise : array (6, 6)
         Covariance of (F, M), SI units.
 
     Returns
     -------
     str
-        A sentence; empty where the axes explain most contacts, or no other axes explain them.
+        A sentence; empty if the stated axes explain most contacts or no other axes explain them.
     """
     force, moment = (Group(wrench)[name] for name in ("force", "moment"))
     size = np.linalg.norm(moment, axis=1)
@@ -61,7 +63,7 @@ def doubted_axes(whisker: Whisker, wrench: xr.Dataset, noise: Array) -> str:
     covariance = noise + np.diag((_MODEL * spread) ** 2)
 
     def explained(turns: Array, fitted: bool) -> Array:
-        """Shares of the contacts that are explained with signed exchanges (n, 2, 3, 3)."""
+        """Shares (n,) of the contacts explained after signed permutations (n, 2, 3, 3)."""
         f, m = np.moveaxis(turns @ np.array([force.T, moment.T]), 1, 0)
         size = np.linalg.norm(f, axis=1) * np.linalg.norm(m, axis=1)
         near = np.median(np.abs((f * m).sum(axis=1)) / size, axis=1) < _OBLIQUE
@@ -72,7 +74,7 @@ def doubted_axes(whisker: Whisker, wrench: xr.Dataset, noise: Array) -> str:
         return shares
 
     stated, own = np.eye(3)[None, None].repeat(2, axis=1), 0.0
-    for fitted in (False, True):  # most recordings need no fits, nor kernels for them
+    for fitted in (False, True):  # most recordings need neither the fits nor their kernels
         own = explained(stated, fitted)[0]
         if own > _DOUBTED:
             return ""
@@ -91,7 +93,7 @@ def doubted_axes(whisker: Whisker, wrench: xr.Dataset, noise: Array) -> str:
 
 
 def _mistakes() -> Array:
-    """Signed exchanges of axes (n, 2, 3, 3), of force and of moment, those of few columns first."""
+    """Signed axis permutations (n, 2, 3, 3) of force and moment, fewest changed columns first."""
     one = np.eye(3)
     signed = [
         np.diag(signs) @ one[list(order)]
@@ -109,5 +111,6 @@ def _mistakes() -> Array:
 
 
 def _column(kind: str, row: Array) -> str:
+    """Name of the measured column, with its sign, that a row of a permutation selects."""
     at = int(np.abs(row).argmax())
     return f"{'-' if row[at] < 0.0 else ''}{kind}{'xyz'[at]}"

@@ -1,6 +1,7 @@
-"""Contact points of every frame and whisker from the signals of a recording.
+"""Contact estimates of every frame and whisker of a recording.
 
-They are transformed to the laboratory, where continuity decides between several candidates.
+Contacts are estimated in the whisker frame and transformed to the laboratory frame, where
+continuity in time selects among several candidates.
 """
 
 from __future__ import annotations
@@ -29,12 +30,12 @@ from vibrissa.status import Status, is_ok
 from vibrissa.whisker import Whisker
 
 Progress = Callable[[str, int, int], None]
-"""Function called with the present stage, and the numbers of steps done and of all steps."""
+"""Function called with the name of the current stage, the steps done and the total steps."""
 
-WHOLE = "wrench"  # value of ``using`` for force and moment whole, instead of names of signals
-# Standard deviation of the normals of swept surfaces, rad: friction across the wire turns them.
+WHOLE = "wrench"  # value of ``signals`` that selects the full force and moment
+# Standard deviation of the normals of swept surfaces, rad: friction across the wire rotates them.
 NORMAL_SIGMA = 0.1
-_OTHER = 0.01  # share by which the whisker of a map may differ from that of a recording
+_OTHER = 0.01  # largest relative difference between the whiskers of a map and of a recording
 _LABORATORY = {"reference_frame": "laboratory"}
 _SQUARE = ("time", "space", "space_2")
 
@@ -81,63 +82,65 @@ def estimates_of(
     recording : xarray.DataTree
         Recording with a group ``signals``; see `signals_of`.
     signals : str or sequence of str, optional
-        Signals, three or more of the six, or "wrench": force and moment whole, which allows for
-        friction. By default `TRIPLET`, but of the rod "wrench", whose friction is not zero.
+        Three or more of the six signals, or "wrench" for the full force and moment, which allows
+        for friction. The default is `TRIPLET`, or "wrench" for signals of the fitted rod, whose
+        friction is not zero.
     noise : array_like (6, 6), optional
-        Covariance of (F, M), SI units; by default that stated with the signals. Signals of a sensor
-        need one of the two; without any there are no covariances.
+        Covariance of (F, M), SI units; by default that stored with the signals. Sensor signals
+        require one of the two; for other signals without noise there are no covariances.
     contact_maps : sequence of ContactMap, optional
-        Contact map of each whisker; by default simulated for those with a contact.
+        Contact map of each whisker; by default maps are simulated for whiskers with a contact.
     whiskers : sequence of Whisker, optional
-        Whiskers, where there are no maps; by default those of the recording.
+        Whiskers, used if no maps are given; by default those of the recording.
     method : {"exact", "lookup", "lookup-linear", "network"}
-        Exact, or one of the paper's methods, as of :func:`vibrissa.paper.estimate`.
+        Exact, or one of the paper's methods; see :func:`vibrissa.paper.estimate`.
     errors : mapping of str to float, optional
-        ``stiffness_sigma``, ``gain_sigma`` and ``mixing_sigma``, as of ``ContactMap.estimate``:
-        the same errors in all frames. They need noise.
+        Standard deviations ``stiffness_sigma``, ``gain_sigma`` and ``mixing_sigma`` of errors
+        common to all frames; see ``ContactMap.estimate``. They require noise.
     prior : Prior, optional
-        Contacts that are possible; others are left out of the candidates.
+        Prior over contacts; contacts that it excludes are not candidates.
     friction : float
-        Standard deviation of the ratio of the force along the whisker to that across it, as of
-        ``ContactMap.estimate``; 0, the default, for contacts without friction.
+        Standard deviation of the ratio of the force along the whisker to that across it; see
+        ``ContactMap.estimate``. The default of 0 stands for frictionless contacts.
     second_contacts : float
-        Rate of false alarms at which frames are detected that more than one contact explains, by
-        force and moment whole (`second_contact`), such as 0.01; they get the status
-        ``NOT_ONE_CONTACT``. 0, the default: no test. With the wrench ratios of friction are taken
-        to be 0.3 (one sigma), otherwise as by ``friction``.
+        False-alarm rate, such as 0.01, of the test for frames whose full force and moment one
+        contact does not explain (`second_contact`); these get the status ``NOT_ONE_CONTACT``.
+        The default of 0 disables the test. For "wrench" the test assumes friction ratios of 0.3
+        (one sigma), otherwise ``friction``.
     gravity : Gravity, optional
-        Gravity that whiskers of known density bend under, laboratory frame, as of
-        ``ContactMap.estimate``; by default the sensor was tared in the first frame with a pose.
+        Gravity under which whiskers of known density bend, laboratory frame; see
+        ``ContactMap.estimate``. By default the sensor was tared in the first frame with a pose.
     proximal : float
-        Smallest arc length of a contact of maps that are simulated, share of the length.
+        Smallest arc length of a contact in simulated maps, as a share of the whisker's length.
     progress : callable, optional
-        Called as ``progress(stage, done, total)``.
+        Function called as ``progress(stage, done, total)``.
 
     Returns
     -------
     xarray.Dataset
         Group ``estimates`` of a recording, dimensions time, whisker, space. In the laboratory
-        ``contact_point`` with ``contact_covariance``, ``contact_normal`` with
-        ``normal_covariance``, and ``point_normal_covariance``; in the whisker's frame
-        ``contact_point_whisker`` with ``covariance``, ``arc_length`` and ``force``; how many
-        ``candidates`` there were, of which the one that continues its neighbours in time is chosen;
-        ``in_contact`` (detected) and ``status``; ``event`` (onset, loss or slip), and when each
-        contact began, ``onset_time`` with ``onset_sigma``, s. Attributes ``signals``, ``source``
-        and ``felt_above``, M_B from which contacts are detected, N·m, and ``friction``, as of
-        `vibrissa.contacts.Contacts`. Frames whose signals have no
-        answer keep the status that states the reason.
+        frame: ``contact_point`` with ``contact_covariance``, ``contact_normal`` with
+        ``normal_covariance``, and ``point_normal_covariance``. In the whisker frame:
+        ``contact_point_whisker`` with ``covariance``, ``arc_length`` and ``force``. Also the number
+        of ``candidates``, of which the one most continuous in time is selected; ``in_contact``
+        (detected) and ``status``; ``event`` (onset, loss or slip) and the time of each contact's
+        onset, ``onset_time`` with ``onset_sigma``, s. Attributes: ``signals``, ``source``,
+        ``felt_above``, the M_B from which contacts are detected, N·m, and ``friction``, as in
+        `vibrissa.contacts.Contacts`. In frames whose signals no contact explains, ``status`` states
+        the reason.
 
     Raises
     ------
     ValueError
-        If there are no signals, their noise is not known, or names or numbers do not fit.
+        If there are no signals, their noise is unknown, or names or numbers do not match.
 
     Notes
     -----
-    Covariances come from the noise of the signals and from that of the base's pose: of signals of
-    the rod and of the tracked contact point both, with their correlation; of a sensor the pose's
-    where a camera gives it (`placed_by`). So an error of the pose does not move a contact point
-    that was tracked, as the same pose transforms it there and back, but it turns the normal.
+    Covariances combine the noise of the signals with that of the base pose. For signals of the
+    fitted rod or the tracked contact point both are included, with their correlation; for sensor
+    signals the pose covariance is included if a camera supplies it (`placed_by`). Thus an error of
+    the pose does not move a tracked contact point, which the same pose transforms there and back,
+    but it does rotate the normal.
     """
     data = signals_in(recording)
     if signals is None:
@@ -187,10 +190,10 @@ def estimates_of(
             shared = np.nan_to_num(tracked.root["wrench_shared"][:, k]) * same
         parts.append(_one_whisker(one, found, shared, other_noise=noise is not None))
         report("contact points", k + 1, count)
-    if mapped:  # whiskers without contact need none
+    if mapped:  # whiskers without contact have no map, so this stage may not be complete yet
         report("map of all contacts", count, count)
     out = xr.concat(parts, "whisker").transpose("time", "whisker", ...)
-    # What else was assumed is stated where it is not the default.
+    # Other assumptions are stated where they are not the default.
     out.attrs = {
         "signals": WHOLE if whole else " ".join(names),
         "source": str(data.attrs.get("source", "not known")),
@@ -210,7 +213,7 @@ def _whiskers(
     given: Sequence[Whisker] | None,
     maps: Sequence[ContactMap] | None,
 ) -> Sequence[Whisker]:
-    """Whiskers of so many signals: those given, those of the maps, or the recording's."""
+    """Whiskers of ``count`` signals: those given, those of the maps, or those of the recording."""
     if given is None:
         given = Recording(recording).whiskers if maps is None else [one.whisker for one in maps]
     for things in (given, maps):
@@ -220,7 +223,7 @@ def _whiskers(
     for one, own in zip(maps or (), known, strict=False):
         if others := _differences(one.whisker, own):
             warnings.warn(
-                f"the map is of another whisker than the recording's {own.name!r}: {others}",
+                f"the map's whisker differs from the recording's {own.name!r}: {others}",
                 UserWarning,
                 stacklevel=3,
             )
@@ -228,7 +231,7 @@ def _whiskers(
 
 
 def _differences(whisker: Whisker, other: Whisker) -> str:
-    """State in what two whiskers differ by more than rounding; empty if they do not."""
+    """Describe the properties in which two whiskers differ by more than 1 %; empty if none."""
     pair, tips = (whisker, other), [one.centerline(2)[1] for one in (whisker, other)]
     measures = {
         "length": (1e3, "mm", [one.length for one in pair]),
@@ -249,12 +252,12 @@ def _differences(whisker: Whisker, other: Whisker) -> str:
 def _one_whisker(
     signals: xr.Dataset, found: xr.Dataset, shared: Array | None, *, other_noise: bool
 ) -> xr.Dataset:
-    """Contacts of one whisker in the laboratory, with the status of frames without signals."""
+    """Contacts of one whisker in the laboratory frame; frames without signals keep their status."""
     known = Group(signals)
     names = ("pose_covariance", "pose_wrench_covariance")
     pose = {name: known[name] for name in names if name in known}
     if other_noise:
-        # The noise is that of another instrument, without correlation with the pose.
+        # Noise given by the caller is that of another instrument, uncorrelated with the pose.
         pose.pop("pose_wrench_covariance", None)
     held = known["base_rotation"], known["base_position"]
     placed = in_laboratory(found, *held, **pose, wrench_shared=shared)
@@ -273,10 +276,11 @@ def in_laboratory(
     pose_wrench_covariance: ArrayLike | None = None,
     wrench_shared: Array | None = None,
 ) -> xr.Dataset:
-    """Contacts in the laboratory, chosen among candidates by continuity there.
+    """Transform contacts to the laboratory frame, selecting candidates by continuity there.
 
-    Errors of the whisker's shape move them as the force and moment (time, error, 6) would that they
-    add to those of the same contact point.
+    ``wrench_shared`` (time, error, 6) is the change of force and moment, for a given contact point,
+    by one standard deviation of each error of the whisker's shape. The opposite change of wrench
+    moves the estimated contacts.
     """
     rotation, position = np.asarray(base_rotation), np.asarray(base_position)
     points = contacts["candidate_points"].values
@@ -338,10 +342,10 @@ def _laboratory_covariance(
     pose: Array | None,
     pose_wrench: Array | None,
 ) -> Array:
-    """Covariances (n, 6, 6) of contact point and normal in the laboratory.
+    """Covariances (n, 6, 6) of contact point and normal in the laboratory frame.
 
-    An error of the wrench moves both by the gain; one of the pose, a shift and a turn, moves the
-    point by shift + turn × arm and the normal by turn × normal.
+    Wrench errors propagate by the gain. A pose error, a shift and a small rotation, moves the point
+    by shift + rotation × arm and the normal by rotation × normal.
     """
     turned = np.zeros((len(gain), 6, 6))
     turned[:, :3, :3] = turned[:, 3:, 3:] = rotation
@@ -363,7 +367,7 @@ def swept_recording(
 ) -> xr.DataTree:
     """Recording of a sweep with a suspended whisker, with its contacts as estimates.
 
-    Its time is the number of the sample, and it has the errors that contacts share.
+    Time is the sample number. The recording includes the errors that all contacts share.
     """
     pose, n, on = sensor.whisker.pose, len(found.points), found.in_contact
     held = {
@@ -396,13 +400,13 @@ def swept_recording(
 
 
 def _chosen(candidates: xr.DataArray, chosen: NDArray[np.int64]) -> xr.DataArray:
-    """One candidate of each frame; NaN where the number is -1."""
+    """Chosen candidate of each frame; NaN where the index is -1."""
     which = xr.DataArray(np.maximum(chosen, 0), dims="time")
     return candidates.isel(candidate=which).where(xr.DataArray(chosen >= 0, dims="time"))
 
 
 def contact_columns(contacts: xr.Dataset) -> xr.Dataset:
-    """Columns of a table of contacts, whisker's frame."""
+    """Columns of a table of contacts, whisker frame."""
     point = contacts["contact_point_whisker"].values
     variance = np.einsum("tii->ti", contacts["covariance"].values)
     values = np.concatenate([point, spherical(point), np.sqrt(variance)], axis=1)

@@ -1,7 +1,7 @@
-"""Events of contacts in a recording: onset, loss and slip, as `vibrissa.contacts.ContactEvents`.
+"""Contact events of a recording: onset, loss and slip, by `vibrissa.contacts.ContactEvents`.
 
-Onsets are dated by the sensor's readings where these also decide which frames are in contact;
-otherwise an onset is the first frame of a contact, without a standard deviation.
+If contact is detected from the sensor's readings, these also give the onset time. Otherwise the
+onset is the first frame of a contact, without a standard deviation.
 """
 
 from __future__ import annotations
@@ -32,15 +32,17 @@ def with_events(
     located : xarray.Dataset
         Result of `locate`, or the same in the laboratory.
     point, covariance : str
-        Variables that hold the contact point, best in the laboratory, and its covariance.
+        Names of the variables with the contact point, preferably in the laboratory frame, and its
+        covariance.
     pose : tuple, optional
-        Rotations (n, 3, 3) and positions (n, 3) of the base, where the point is in the laboratory.
+        Rotations (n, 3, 3) and positions (n, 3) of the base, if the point is in the laboratory
+        frame.
 
     Returns
     -------
     xarray.Dataset
-        The same with `EVENTS`. A contact in the first frame has no onset, and slips are found where
-        covariances are known.
+        Copy of ``located`` with the variables `EVENTS`. A contact that includes the first frame has
+        no onset; slips are detected only where covariances are known.
     """
     time, touching = located["time"].values, located["in_contact"].values
     known = located["status"].values != Status.MISSING
@@ -69,20 +71,20 @@ def with_events(
 
 
 def contact_events(contacts: xr.Dataset) -> xr.Dataset:
-    """List contacts, from onset to release.
+    """List contacts with their onset and release.
 
     Parameters
     ----------
     contacts : xarray.Dataset
-        Group ``estimates`` or ``signals`` of a recording, as of `estimates_of` and `signals_of`;
-        of signals with ``dynamics`` inertia does not count.
+        Group ``estimates`` or ``signals`` of a recording, as returned by `estimates_of` or
+        `signals_of`. Inertia does not cause spurious contacts in signals made with ``dynamics``.
 
     Returns
     -------
     xarray.Dataset
-        Dimension ``contact``, in order of time: name of the ``whisker``, ``onset`` and ``release``,
-        s, NaN where the recording begins or ends in contact, and ``largest_force``, N. Of estimates
-        also ``onset_sigma``, s, and the number of ``slips``.
+        Dataset with the dimension ``contact``, in order of time: name of the ``whisker``, ``onset``
+        and ``release``, s, NaN where the recording begins or ends in contact, and
+        ``largest_force``, N. For estimates also ``onset_sigma``, s, and the number of ``slips``.
     """
     time, rows = contacts["time"].values, []
     dated = all(name in contacts for name in EVENTS)
@@ -111,4 +113,5 @@ def contact_events(contacts: xr.Dataset) -> xr.Dataset:
 
 
 def _largest(sizes: Any) -> float:
+    """Largest finite value; NaN if there is none."""
     return float(np.nanmax(sizes)) if np.isfinite(sizes).any() else np.nan

@@ -1,4 +1,4 @@
-"""Variables that stages need of a recording, and labels of signals."""
+"""Validation of recordings before each stage, and construction of labelled signal datasets."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from vibrissa.signals import base_signals
 from vibrissa.whisker import Whisker
 
 EACH = ("time", "whisker")  # dimensions of contacts
-# Covariances of the wrench and of the pose.
+# Covariances of the wrench and the pose, and their cross-covariance.
 SQUARES = ("wrench_covariance", "pose_covariance", "pose_wrench_covariance")
-# Variables of the group ``signals``.
+# Required variables of the group ``signals``.
 MEASURED = ("force", "moment", "base_position", "base_rotation", "in_contact", "status")
-# Variables of the group ``estimates``.
+# Required variables of the group ``estimates``.
 ESTIMATED = (
     "contact_point",
     "contact_covariance",
@@ -36,14 +36,14 @@ ESTIMATED = (
 
 
 def check_recording(recording: xr.DataTree) -> None:
-    """Make sure that a recording has frames and whiskers, and variables with their dimensions."""
+    """Raise ValueError unless a recording has frames and whiskers, and variables of valid shape."""
     root = recording.to_dataset(inherit=False)
     missing = [name for name in ("time", "whisker") if name not in root.dims]
     if missing:
         got = ", ".join(str(name) for name in root.dims) or "none"
         raise ValueError(
-            f"the recording lacks the dimensions {', '.join(missing)}; it has {got}: one that was "
-            "tracked, simulated or measured is needed"
+            f"the recording lacks the dimensions {', '.join(missing)}; it has {got}: a tracked, "
+            "simulated or measured recording is needed"
         )
     faults = faults_in(root)
     faults += _label_faults(root)
@@ -53,20 +53,20 @@ def check_recording(recording: xr.DataTree) -> None:
     elif time.dtype.kind not in "fiu":
         faults.append(f"its time is {time.dtype}; numbers are needed, in seconds")
     elif not np.isfinite(time).all() or (np.diff(time) <= 0).any():
-        faults.append("its time does not rise from frame to frame, or is missing in some")
+        faults.append("its time does not increase from frame to frame, or is missing in some")
     if faults:
         raise ValueError(f"the recording cannot be used: {'; '.join(faults)}")
     if changed := edited(recording):
         warnings.warn(
-            f"the recording was edited after its {changed[0]} had been made, which are of the "
-            "former values, with all that depends on them, until `vibrissa reconstruct` has run",
+            f"the recording was edited after its {changed[0]} had been computed: these, and all "
+            "that depends on them, are out of date until `vibrissa reconstruct` has run",
             UserWarning,
             stacklevel=1,
         )
 
 
 def _label_faults(root: xr.Dataset) -> list[str]:
-    """List what is wrong with the labels of frames and whiskers."""
+    """List faults of the time and whisker coordinates."""
     faults = []
     if (unit := str(root["time"].attrs.get("units", "s"))) not in ("s", "sec", "seconds", ""):
         faults.append(f"time is in {unit}; s is needed")
@@ -77,12 +77,12 @@ def _label_faults(root: xr.Dataset) -> list[str]:
 
 
 def names_of(data: xr.Dataset) -> str:
-    """Names of the variables of a dataset, for a message."""
+    """Names of the variables of a dataset, as text for a message."""
     return ", ".join(sorted(map(str, data.data_vars))) or "no variables"
 
 
 def needed(root: xr.Dataset, names: Sequence[str], source: str) -> None:
-    """Make sure that variables are there."""
+    """Raise ValueError if the root lacks variables that signals of this source require."""
     missing = [name for name in names if name not in root]
     if not missing:
         return
@@ -92,7 +92,7 @@ def needed(root: xr.Dataset, names: Sequence[str], source: str) -> None:
 
 
 def one_whisker(values: Mapping[str, Any], status: NDArray[np.int64]) -> xr.Dataset:
-    """Signals of one whisker, with a dimension ``whisker`` of length one."""
+    """Dataset of one whisker's variables and six signals; dimension ``whisker`` of length one."""
     six = base_signals(values["force"], values["moment"])
     known = {
         **values,
@@ -103,34 +103,34 @@ def one_whisker(values: Mapping[str, Any], status: NDArray[np.int64]) -> xr.Data
 
 
 def with_coordinates(data: xr.Dataset, root: xr.Dataset, about: Mapping[str, Any]) -> xr.Dataset:
-    """Dataset with the coordinates of a recording."""
+    """Assign the coordinates of a recording, and attributes, to a dataset."""
     names = ("time", "whisker", "space", "whisker_axis")
     coordinates = {name: root[name].variable for name in names if name in root.coords}
     return data.assign_coords({"space": list("xyz"), **coordinates}).assign_attrs(about)
 
 
 def estimates_in(recording: xr.DataTree) -> xr.Dataset:
-    """Find the estimates in a recording."""
+    """Group ``estimates`` of a recording, checked for completeness."""
     return _group_in(recording, "estimates", ESTIMATED)
 
 
 def signals_in(recording: xr.DataTree) -> xr.Dataset:
-    """Find the signals in a recording."""
+    """Group ``signals`` of a recording, checked for completeness."""
     return _group_in(recording, "signals", MEASURED)
 
 
-# Function and verb of the command line that make a group.
+# Function and command-line verb that compute each group.
 _VERBS = {"signals": ("signals_of", "signals"), "estimates": ("estimates_of", "estimate")}
 
 
 def _group_in(recording: xr.DataTree, name: str, needs: Sequence[str]) -> xr.Dataset:
-    """A group of a recording that has what the stages after it need."""
+    """Group of a recording, with all variables that later stages need."""
     group = recording.children.get(name)
     function, verb = _VERBS[name]
     if group is None:
         got = ", ".join(sorted(recording.children)) or "no groups"
         raise ValueError(
-            f"the recording has no group {name} (it has {got}): make them first, by {function} or "
+            f"the recording has no group {name} (it has {got}): compute it first by {function} or "
             f"`vibrissa {verb}`"
         )
     data = group.to_dataset()
@@ -139,14 +139,14 @@ def _group_in(recording: xr.DataTree, name: str, needs: Sequence[str]) -> xr.Dat
     faults += faults_in(data)
     if faults:
         raise ValueError(
-            f"the group {name} of the recording cannot be used: {'; '.join(faults)}; make it anew "
-            f"by `vibrissa {verb}`"
+            f"the group {name} of the recording cannot be used: {'; '.join(faults)}; compute it "
+            f"again by `vibrissa {verb}`"
         )
     return data
 
 
 def whisker_radii(estimates: xr.Dataset, whiskers: Sequence[Whisker]) -> Array:
-    """Radii of whiskers at their contacts."""
+    """Radii (time, whisker) of the whiskers at their contacts, m; NaN without contact."""
     arc_length = Group(estimates)["arc_length"]
     radius = np.full(arc_length.shape, np.nan)
     for k, whisker in enumerate(whiskers):

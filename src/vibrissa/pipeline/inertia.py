@@ -1,12 +1,13 @@
-"""What inertia and damping of a whisker add to signals of a sensor; frames in contact.
+"""Removal of a whisker's inertia and damping from sensor signals, and detection of contact.
 
-The motion of the base and vibrations decide which frames are in contact
-(:class:`vibrissa.simulation.Vibration`). There the whisker is bent otherwise than a force alone
-would bend it, so that no wrench subtracted once is right. At first its bending lags behind the
-moment. Later, contacts by the present correction are smoothed in the laboratory, where objects are
-at rest, a chain with mass is moved through them and one without, and the difference of their
-wrenches (:func:`vibrissa.simulation.chain.inertial_wrench`) is the next correction. What is not
-known of a correction is added to the noise.
+Frames are in contact if the motion of the base and free vibration do not explain the signals
+(:class:`vibrissa.simulation.Vibration`). A whisker in contact that moves is bent differently from
+one under the contact force alone, so that the correction is iterative. Just after an onset, the
+bending lags behind the moment. Later, the contacts estimated with the current correction are
+smoothed in the laboratory frame, where objects are at rest; a chain with mass and a massless one
+are moved through them, and the difference of their wrenches
+(:func:`vibrissa.simulation.chain.inertial_wrench`) is the next correction. The uncertainty of the
+correction is added to the noise.
 """
 
 from __future__ import annotations
@@ -28,28 +29,28 @@ from vibrissa.status import Status
 from vibrissa.whisker import Whisker
 
 _ROUNDS = 2  # number of corrections
-# Components of the wrench along the whisker at its base.
+# Components Fx and Mx, along the whisker at its base.
 _ALONG = np.array([1.0, 0.0, 0.0, 1.0, 0.0, 0.0])
-_SETTLED = 10e-3  # age of a contact from which a held chain is nearer, s
+_SETTLED = 10e-3  # time after an onset over which the chain takes over from the lag model, s
 _KNOWN_TO = 0.2  # relative standard deviation of mass and damping
-# Relative standard deviation of the stiffness, by which ringing also shows the mass.
+# Relative standard deviation of the stiffness, which lets the vibration frequency give the mass.
 _STIFFNESS_KNOWN_TO = 0.1
-# Error as a share of how far two ways are apart, and of the root mean square of that and of the
-# correction.
+# Standard deviation of the correction relative to the difference between the two models, and
+# relative to the local root mean square of that difference and of the correction.
 _APART, _LEFT = 0.3, 0.15
-# Contact force from which contact points must be wrong, over the largest that is measured.
+# Largest plausible contact force of the chain, relative to the largest measured force.
 _SLIPS = 2.0
-_MEMORY = 4e-3  # standard deviation of the window in which that is taken, s
+_MEMORY = 4e-3  # standard deviation of the window of that root mean square, s
 _SMOOTH = 3e-3  # standard deviation of the window in which contact points are smoothed, s
-_ONSET = 4e-3  # time constant with which contact points after an onset begin to count, s
-_POINT = 1e-6  # least standard deviation of a contact point, m
-_FEWEST = 8  # fewest frames with force and moment
-_UNEQUAL = 1e-3  # largest relative difference of the times between frames
-_LEAST = 4  # fewest frames of a contact with a correction of its own
+_ONSET = 4e-3  # time constant by which the weight of contact points rises after an onset, s
+_POINT = 1e-6  # smallest standard deviation of a contact point, m
+_FEWEST = 8  # smallest number of frames with force and moment
+_UNEQUAL = 1e-3  # largest range of frame intervals, relative to their mean
+_LEAST = 4  # smallest number of usable frames of a contact for the chain
 
 
 class _Trial(NamedTuple):
-    """Measured wrench (n, 6) and its covariance (n, 6, 6), and the motion of the base."""
+    """Measured wrench (n, 6) of a whisker, its covariance, and the motion of the base."""
 
     whisker: Whisker
     time: Array
@@ -68,7 +69,10 @@ class _Trial(NamedTuple):
 def without_inertia(
     own: Group, whisker: Whisker, dynamics: Dynamics | Literal["fitted"], noise: Array
 ) -> xr.Dataset:
-    """Signals of one whisker without its inertia and damping, which are attributes."""
+    """Signals of one whisker corrected for inertia and damping.
+
+    Density and damping ratio, given or fitted, are attributes of the result.
+    """
     trial, known = _trial(own, whisker, noise)
     course = trial.time, trial.wrench, trial.rotation, trial.position
     if dynamics == "fitted":
@@ -92,7 +96,7 @@ def without_inertia(
 
 
 def _trial(own: Group, whisker: Whisker, noise: Array) -> tuple[_Trial, NDArray[np.bool_]]:
-    """Trial with gaps filled, and the frames whose wrench is known."""
+    """Trial with gaps in the wrench interpolated, and a mask of frames with a measured wrench."""
     time = np.asarray(own.data["time"].values, dtype=np.float64)
     rotation, position = own["base_rotation"], own["base_position"]
     wrench = np.concatenate([own["force"], own["moment"]], axis=1)
@@ -117,11 +121,11 @@ def _trial(own: Group, whisker: Whisker, noise: Array) -> tuple[_Trial, NDArray[
 
 
 def _added(trial: _Trial, dynamics: Dynamics, vibration: Vibration) -> tuple[Array, Array]:
-    """Wrench (n, 6) that inertia and damping add, and how far two ways to it are apart.
+    """Wrench (n, 6) due to inertia and damping, and the difference between two models of it.
 
-    After an onset the bending lags behind the moment by the time constant of the damping, and the
-    contact bears what inertia there is but along the whisker. Later a chain that is held at the
-    contact points is nearer.
+    The first model holds after an onset: bending lags behind the moment by the time constant of the
+    damping, and only the inertia along the whisker reaches the base. Later a chain held at
+    the contact points is more accurate.
     """
     along = vibration.in_air(trial.time, trial.rotation, trial.position) * _ALONG
     quick = trial.wrench - _lagged(trial.wrench - along, trial.step / vibration.damping)
@@ -135,7 +139,7 @@ def _added(trial: _Trial, dynamics: Dynamics, vibration: Vibration) -> tuple[Arr
             trial.whisker, dynamics, trial.time, *pose, points, arc_length, _SLIPS * most
         )
         apart, share = held - quick, np.full((len(quick), 1), np.inf)
-        # A chain that does not follow the points makes more than was measured.
+        # A correction larger than the largest measured value means that the chain has failed.
         apart[(np.abs(apart) > size).any(axis=1)] = 0.0
         for first, end in contacts_in(trial.touching):
             share[first:end, 0] = trial.step * np.arange(end - first) / _SETTLED
@@ -144,10 +148,10 @@ def _added(trial: _Trial, dynamics: Dynamics, vibration: Vibration) -> tuple[Arr
 
 
 def _lagged(values: Array, steps: float) -> Array:
-    """Values (n, k) after a lag of first order of so many steps to a time constant."""
+    """Filter values (n, k) by a first-order lag whose time constant is 1 / ``steps`` samples."""
     old = np.exp(-steps)
     mean = (1.0 - old) / steps
-    # Exact where values change linearly between samples.
+    # Exact for values that change linearly between samples.
     start = (values[0] * old - values[0] * (mean - old))[None]
     return np.asarray(
         signal.lfilter([1.0 - mean, mean - old], [1.0, -old], values, axis=0, zi=start)[0]
@@ -155,7 +159,7 @@ def _lagged(values: Array, steps: float) -> Array:
 
 
 def _smoothed(trial: _Trial, left: Array, added: Array) -> tuple[Array, Array]:
-    """Smooth contact points (n, 3) in the laboratory, NaN without contact, and arc lengths (n,)."""
+    """Smoothed contact points (n, 3), laboratory frame, and arc lengths (n,); NaN elsewhere."""
     wrench = xr.Dataset(
         {"force": (("time", "space"), left[:, :3]), "moment": (("time", "space"), left[:, 3:])},
         {"time": trial.time},
@@ -174,16 +178,16 @@ def _smoothed(trial: _Trial, left: Array, added: Array) -> tuple[Array, Array]:
         if usable[first:end].sum() < _LEAST:
             continue
         since = trial.step * (np.arange(end - first) + 0.5)
-        begun = weight[first:end] * (1.0 - np.exp(-since / _ONSET)) ** 2
-        out[first:end] = _local_quadratic(rows[first:end], begun, _SMOOTH / trial.step)
+        rising = weight[first:end] * (1.0 - np.exp(-since / _ONSET)) ** 2
+        out[first:end] = _local_quadratic(rows[first:end], rising, _SMOOTH / trial.step)
     return out[:, :3], out[:, 3]
 
 
 def _local_quadratic(rows: Array, weight: Array, width: float) -> Array:
-    """Rows (n, k) smoothed by weighted quadratics in windows of a width, in rows."""
+    """Smooth rows (n, k) by weighted local quadratics in Gaussian windows, ``width`` in rows."""
     number = np.arange(len(rows))
     out = np.empty_like(rows)
-    # A window that holds too little to bend by is fitted by a line.
+    # Weak regularisation: a window with too few data for a quadratic is fitted by a line.
     stiff = np.diag([0.0, 1e-3, 1e-2])
     for i in number:
         apart = (number - i) / width
@@ -198,9 +202,9 @@ def _local_quadratic(rows: Array, weight: Array, width: float) -> Array:
 def _uncertainty(trial: _Trial, added: Array, apart: Array, vibration: Vibration) -> Array:
     """Covariance (n, 6, 6) of the correction.
 
-    It grows with the correction, with how far two ways to it are apart, and for a radian of the
-    first mode before a release, in which no contact is in equilibrium, and half as long after an
-    onset.
+    It grows with the correction and with the difference between its two models. It is as large as
+    the wrench itself for about one radian of the first mode before a release, when no contact is in
+    equilibrium, and for half as long after an onset.
     """
     out = _KNOWN_TO**2 * np.einsum("ti,tj->tij", added, added)
     out += _APART**2 * np.einsum("ti,tj->tij", apart, apart)

@@ -1,23 +1,23 @@
-"""From the measured wrench to contact points in the whisker's frame, with their derivatives.
+"""Contact estimates in the whisker frame from the measured wrench, with error propagation.
 
 A contact is detected where the bending moment M_B exceeds five standard deviations of its noise.
-Where several contacts explain the signals, that with the least force is the first, until continuity
-in the laboratory decides (`vibrissa.pipeline.estimates`).
+If several contacts explain the signals, the one with the least force is listed first; continuity in
+the laboratory frame selects among them later (`vibrissa.pipeline.estimates`).
 
-A contact is x = (s, f_x, f_y, f_z): arc length, and force in the material frame there. It gives
-base force and contact point (F, p), the wrench w = (F, p × F) and the direction
+A contact is x = (s, f_x, f_y, f_z): the arc length and the force in the material frame there. It
+determines the base force and contact point (F, p), the wrench w = (F, p × F) and the direction
 
     n = g / |g|,    g = F − (F · t) t,
 
-of the force across the whisker, t being the whisker's tangent at the contact. A whisker that is
-touched on its side is in the tangent plane of the surface, so that n is the surface's normal even
-where the contact rubs along the whisker; without friction it is the direction of the force. To
+of the force across the whisker, where t is the whisker's tangent at the contact. At a contact on
+the whisker's side, the tangent lies in the tangent plane of the surface, so that n is the surface
+normal even with friction along the whisker; without friction n is the direction of the force. To
 first order an error δw of the measured wrench causes errors δ(p, n) = G δw with the gain
 
     G = ∂(p, n)/∂x · K · ∂c/∂w,
 
-c being the signals that the contact is found from, and K the inverse of ∂c/∂x for three of them, or
-(JᵀWᵀWJ)⁻¹JᵀWᵀW for more, weighted by W.
+where c are the signals used for the estimate, J = ∂c/∂x, and K is J⁻¹ for three signals or
+(JᵀWᵀWJ)⁻¹JᵀWᵀW, with weights W, for more.
 """
 
 from __future__ import annotations
@@ -56,18 +56,19 @@ from vibrissa.status import Status, flag_attributes
 from vibrissa.whisker import Whisker
 
 TRIPLET = ("Fx", "MB", "MD")
-"""Signals that contacts are estimated from by default."""
+"""Signals from which contacts are estimated by default."""
 
-# Bending moment from which a contact is detected, in standard deviations of its noise.
+# Bending moment above which a contact is detected, in standard deviations of its noise.
 DETECTED = 5.0
-# Ratio of forces along and across the whisker, one sigma, where second contacts are looked for.
+# Standard deviation of the ratio of forces along and across the whisker, for the test of second
+# contacts.
 _FRICTION = 0.3
 _OF_ROD = ("stiffness_sigma", "compliance_sigma")  # errors of the whisker and its base
 _WHISKER = {"reference_frame": "whisker"}
 
 
 class _Candidates(NamedTuple):
-    """Candidates of the frames with a contact: rows × candidates, padded with NaN, SI units."""
+    """Candidates (rows, candidates, ...) of frames in contact, padded with NaN, SI units."""
 
     points: Array
     arc_lengths: Array
@@ -79,7 +80,7 @@ class _Candidates(NamedTuple):
 
     @classmethod
     def of(cls, found: Contacts) -> Self:
-        """Candidates of estimates."""
+        """Candidates of estimated contacts."""
         one = found.candidates
         arrays = (one.point, one.arc_length, one.force, one.contact_force)
         return cls(*arrays, found.n_candidates, found.status, found.covariance_valid)
@@ -105,46 +106,45 @@ def locate(
     contact_map : ContactMap
         Contact map of the whisker.
     wrench : xarray.Dataset
-        Measured ``force`` and ``moment``, whisker's frame, N and N·m, dimensions time, space. Where
-        it has ``in_contact``, other frames are without contact.
+        Measured ``force`` and ``moment``, whisker frame, N and N·m, dimensions time, space. If it
+        has a variable ``in_contact``, frames where this is false are without contact.
     triplet : tuple of str
         Signals to estimate from, three or more.
     noise : array_like (6, 6) or (time, 6, 6), optional
         Covariance of (F, M), SI units, of all frames or of each; see `component_noise`. Without it
-        there are no covariances, and every frame in which M_B is not zero has a contact.
+        no covariances are computed, and every frame with nonzero M_B counts as a contact.
     method : str
         Method, as for `estimates_of`.
     errors : mapping of str to float, optional
         Standard deviations of common errors, as for `estimates_of`.
     prior : Prior, optional
-        Contacts that are possible, as for `estimates_of`.
+        Prior over contacts, as for `estimates_of`.
     friction : float
-        Ratio of forces, as for `estimates_of`; only with the exact method.
+        Standard deviation of the ratio of forces, as for `estimates_of`; requires the exact method.
     gravity : Gravity, optional
-        Gravity that the whisker bends under, as of ``ContactMap.estimate``; only with the exact
-        method. Where ``wrench`` has ``base_rotation``, it is that of the laboratory. Derivatives
-        are those of a whisker without weight that has the resting shape.
+        Gravity under which the whisker bends, as for ``ContactMap.estimate``; requires the exact
+        method. It is in the laboratory frame if ``wrench`` has ``base_rotation``. Derivatives are
+        computed for a weightless whisker with the shape at rest.
     second_contacts : float
-        Rate of false alarms at which frames of more than one contact are detected, as for
-        `estimates_of`.
+        False-alarm rate of the test for more than one contact, as for `estimates_of`.
 
     Returns
     -------
     xarray.Dataset
-        Contacts of all frames of ``wrench``, dimension time: ``contact_point_whisker`` with
-        ``covariance``, ``arc_length``, ``force`` at the base by the model of the contact, the same
-        of all candidates (``candidate_points``, ``candidate_covariance``, ...), their number
-        ``candidates``, ``in_contact`` (detected) and ``status``; what `with_events` needs;
-        ``candidate_gain``, the
-        derivatives of the candidates with respect to the wrench, and ``wrench_covariance``, the
-        covariance of the wrench by noise and errors. Covariances are those of the exact method in
-        every method. Frames without detected contact are NaN, with the status ``NOT_FELT``, or
-        ``NO_CONTACT`` where force and moment are zero or ``in_contact`` is false.
+        Contacts in all frames of ``wrench``, dimension time: ``contact_point_whisker`` with
+        ``covariance``, ``arc_length``, the modelled ``force`` at the base; the same of all
+        candidates (``candidate_points``, ``candidate_covariance``, ...) and their number
+        ``candidates``; ``in_contact`` (detected) and ``status``; ``candidate_gain``, the
+        derivatives of the candidates with respect to the wrench; ``wrench_covariance``, the
+        covariance of the wrench from noise and common errors; and the variables that `with_events`
+        needs. Covariances are those of the exact method whatever the method. Frames without a
+        detected contact are NaN, with the status ``NOT_FELT``, or ``NO_CONTACT`` where force and
+        moment are zero or ``in_contact`` is false.
 
     Raises
     ------
     ValueError
-        If the noise does not fit.
+        If the shape of the noise is wrong.
     """
     names = selection(triplet)
     measured = _Measured.of(wrench, noise, errors, contact_map.whisker, gravity)
@@ -161,13 +161,13 @@ def locate(
             **(errors or {}),
         )
     else:
-        from vibrissa.paper import estimate  # it loads what only comparisons need
+        from vibrissa.paper import estimate  # imports modules that only these methods need
 
         found = estimate(contact_map, signals, names, method=method, prior=prior)
     stated = found.candidates.covariance if method == "exact" else None
     whisker = measured.at_rest(contact_map.whisker, gravity)
     out = _located(whisker, names, measured, _Candidates.of(found), stated, friction)
-    return _alone(out, whisker, measured, errors, friction, second_contacts)
+    return _mark_second_contacts(out, whisker, measured, errors, friction, second_contacts)
 
 
 def without_contact(
@@ -177,7 +177,7 @@ def without_contact(
     *,
     noise: ArrayLike | None,
 ) -> xr.Dataset | None:
-    """Result of `locate`, without a map, where no frame has a contact; None otherwise."""
+    """Result of `locate` if no frame has a contact, for which no map is needed; None otherwise."""
     measured = _Measured.of(wrench, noise)
     if measured.rows.any():
         return None
@@ -195,12 +195,12 @@ def locate_from_wrench(
     gravity: Gravity | None = None,
     second_contacts: float = 0.0,
 ) -> xr.Dataset:
-    """Locate contacts from all six components, with friction or without.
+    """Locate contacts, with or without friction, from all six components of the wrench.
 
     Parameters
     ----------
     whisker : Whisker
-        Whisker that touches.
+        Whisker in contact.
     wrench : xarray.Dataset
         Measured wrench, as for `locate`.
     noise : array_like (6, 6) or (time, 6, 6), optional
@@ -208,16 +208,16 @@ def locate_from_wrench(
     errors : mapping of str to float, optional
         Standard deviations of common errors, as for `locate`.
     prior : Prior, optional
-        Contacts that are possible, as for `locate`.
+        Prior over contacts, as for `locate`.
     gravity : Gravity, optional
-        Gravity that the whisker bends under, as for `locate`.
+        Gravity under which the whisker bends, as for `locate`.
     second_contacts : float
-        Rate of false alarms, as for `locate`.
+        False-alarm rate, as for `locate`.
 
     Returns
     -------
     xarray.Dataset
-        Contacts as of `locate`, with ``friction_angle``.
+        Contacts as returned by `locate`, with ``friction_angle``.
     """
     measured = _Measured.of(wrench, noise, errors, whisker, gravity)
     force, moment = measured.force[measured.rows], measured.moment[measured.rows]
@@ -241,7 +241,7 @@ def locate_from_wrench(
     stated = found.candidates.covariance
     rest = measured.at_rest(whisker, gravity)
     out = _located(rest, WRENCH, measured, _Candidates.of(found), stated)
-    return _alone(out, rest, measured, errors, _FRICTION, second_contacts)
+    return _mark_second_contacts(out, rest, measured, errors, _FRICTION, second_contacts)
 
 
 def locate_around(
@@ -252,34 +252,35 @@ def locate_around(
     position_sigma: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> xr.Dataset:
-    """Locate contacts with known objects, in one point, in several or along an arc.
+    """Locate contacts with known objects at one point, at several points or along an arc.
 
     Parameters
     ----------
     whisker : Whisker
-        Whisker that touches, without weight and friction.
+        Whisker in contact; weight and friction are neglected.
     wrench : xarray.Dataset
-        Measured wrench, as for `locate`; with ``base_rotation`` and ``base_position`` objects are
-        in the laboratory, otherwise in the whisker's frame.
+        Measured wrench, as for `locate`. If it has ``base_rotation`` and ``base_position``, objects
+        are in the laboratory frame, otherwise in the whisker frame.
     noise : array_like (6, 6) or (time, 6, 6)
         Covariance of (F, M), as for `locate`.
     objects : sequence of Peg, Sphere, Plane, Box or Mesh
-        Rigid objects where they are thought to be.
+        Rigid objects at their presumed positions.
     position_sigma : float
-        Standard deviation of their position along each axis, as for `estimate_around`, m.
+        Standard deviation of these positions along each axis, as for `estimate_around`, m.
     progress : callable, optional
-        Function called before each contact with the numbers of those done and of all.
+        Function called before each contact with the numbers of contacts done and in total.
 
     Returns
     -------
     xarray.Dataset
-        Contacts nearest to the base, as of `locate` without candidates and derivatives;
-        ``last_arc_length`` and the objects' ``shift_x``, ``shift_y`` and ``shift_z``.
+        Contacts nearest to the base, as returned by `locate` but without candidates and
+        derivatives; ``last_arc_length`` of the contact farthest from the base; and the estimated
+        shift of the objects, ``shift_x``, ``shift_y`` and ``shift_z``.
 
     Raises
     ------
     ValueError
-        If the noise is not known, or as of `estimate_around`.
+        If the noise is unknown, or `estimate_around` raises it.
     """
     measured, known = _Measured.of(wrench, noise), Group(wrench)
     pose: dict[str, Any] = {}
@@ -289,7 +290,7 @@ def locate_around(
         rows = rows & np.isfinite(held[0]).all(axis=(1, 2)) & np.isfinite(held[1]).all(axis=1)
         pose = dict(zip(("base_rotation", "base_position"), (a[rows] for a in held), strict=True))
     if measured.typical is None and rows.any():
-        raise ValueError("the objects' position is weighed against the noise: give the noise")
+        raise ValueError("the objects' position is weighted against the noise: give the noise")
     force, moment = measured.force[rows], measured.moment[rows]
     found = estimate_around(
         whisker,
@@ -327,11 +328,11 @@ def locate_around(
 
 
 def _of_wrench(errors: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Errors of a measured wrench, without those of the base that the whisker is held by."""
+    """Errors of the measured wrench, without that of the base's compliance."""
     return {name: value for name, value in (errors or {}).items() if name != "compliance_sigma"}
 
 
-def _alone(
+def _mark_second_contacts(
     found: xr.Dataset,
     whisker: Whisker,
     measured: _Measured,
@@ -339,11 +340,11 @@ def _alone(
     friction: float,
     rate: float,
 ) -> xr.Dataset:
-    """Mark the frames that one contact does not explain, at this rate of false alarms."""
+    """Mark the frames that one contact does not explain, at a false-alarm rate; 0 marks none."""
     if not rate > 0.0:
         return found
     if measured.typical is None:
-        raise ValueError("second contacts are detected by what exceeds the noise: give the noise")
+        raise ValueError("the test for second contacts needs the noise: give the noise")
     rows = measured.rows
     force, moment = measured.force[rows], measured.moment[rows]
     test = second_contact(
@@ -366,14 +367,16 @@ def _alone(
 
 
 class _Measured(NamedTuple):
-    """Measured force and moment (n, 3), and their covariance (n, 6, 6), NaN if not known.
+    """Measured wrench of n frames, its noise, and the frames in contact.
 
-    Also the frames (n,) in which they are known, in which a contact is detected and in which there
-    is none; what exceeds a free whisker's (n, 6), in standard deviations, or (n, 0) where not that
-    decides what is a contact; the typical noise (6, 6) of the frames, if there is any; errors that
-    all frames share (k, 6, 7); M_B from which contacts are detected, N·m; whether all frames have
-    the same noise; and under gravity the rotations (n, 3, 3) of the base in those frames, if they
-    are known.
+    ``force`` and ``moment`` are (n, 3), and ``covariance`` is (n, 6, 6), NaN if unknown. ``known``,
+    ``rows`` and ``free`` (n,) mark the frames in which the wrench is known, a contact is detected,
+    and there is no contact. ``excess`` (n, 6) is the whitened difference from the wrench of a free
+    whisker, or (n, 0) if contact is not detected from it. ``typical`` (6, 6) is the typical noise
+    of the frames, if known; ``errors`` (k, 6, 7) are the errors that all frames share; ``above`` is
+    the M_B above which contacts are detected, N·m; ``steady`` is true if all frames have the same
+    noise; ``rotation`` (rows, 3, 3) is that of the base in the frames with a contact, under gravity
+    and if known.
     """
 
     time: xr.Variable
@@ -418,10 +421,10 @@ class _Measured(NamedTuple):
         free = known & ~force.any(axis=1) & ~moment.any(axis=1)
         if "in_contact" in wrench:
             touching = Group(wrench)["in_contact"]
-            # Without inertia frames of contact are those that vibration does not explain.
+            # If inertia was removed, `in_contact` already is the result of a detection.
             rows = known & touching if "density" in wrench.attrs else rows & touching
             free |= known & ~touching
-        # Where no contact is detected, of the frames in which one could have been.
+        # If no contact is detected, the threshold is that of the frames that could have had one.
         possible = rows if rows.any() else known & ~free
         above = float(np.median(least[possible])) if possible.any() else 0.0
         typical, steady = None, bool((covariance == covariance[:1]).all())
@@ -453,7 +456,7 @@ class _Measured(NamedTuple):
         )
 
     def at_rest(self, whisker: Whisker, gravity: Gravity | None) -> Whisker:
-        """Whisker without weight that has the resting shape, in the middle of all poses."""
+        """Weightless whisker with the resting shape for the mean direction of gravity."""
         if gravity is None:
             return whisker
         pull = np.array(gravity.acceleration)
@@ -463,7 +466,7 @@ class _Measured(NamedTuple):
 
 
 def _noise_of_frames(noise: ArrayLike | None, n: int) -> Array:
-    """Covariances (n, 6, 6)."""
+    """Covariances (n, 6, 6) of all frames; NaN without noise."""
     if noise is None:
         return np.full((n, 6, 6), np.nan)
     array = np.asarray(noise, dtype=np.float64)
@@ -473,7 +476,7 @@ def _noise_of_frames(noise: ArrayLike | None, n: int) -> Array:
 
 
 def _typical(covariance: Array) -> Array | None:
-    """Typical noise of frames (n, 6, 6), the same in all axes of force and of moment."""
+    """Typical noise (6, 6) of frames (n, 6, 6), isotropic in force and in moment."""
     variances = np.diagonal(covariance, axis1=1, axis2=2)
     variances = variances[np.isfinite(variances).all(axis=1)]
     if not variances.size:
@@ -490,10 +493,10 @@ def _located(
     stated: Array | None = None,
     friction: float = 0.0,
 ) -> xr.Dataset:
-    """Dataset of all frames from candidates of those with a contact.
+    """Dataset of all frames from the candidates of those with a contact.
 
-    Covariances are those ``stated`` (n, some, 3, 3) by the estimate, which are valid up to
-    slip-off, where all frames have the noise that it used; otherwise of first order.
+    Covariances are of first order, unless all frames have the same noise: then the covariances
+    ``stated`` (n, candidates, 3, 3) by the estimate, which remain valid up to slip-off, are used.
     """
     rows = measured.rows
     shape = found.arc_lengths.shape
@@ -504,7 +507,7 @@ def _located(
     point_gain = gain[..., :3, :]
     spread = point_gain @ measured.covariance[rows][:, None] @ np.swapaxes(point_gain, -1, -2)
     if not measured.steady:
-        # To second order in errors that bend with the whisker, over its length.
+        # Second-order term: errors follow an arc whose radius is of the order of the length.
         size = np.einsum("ncii->nc", spread) / whisker.length
         spread = spread + size[..., None, None] ** 2 * np.eye(3)
     elif stated is not None:
@@ -561,7 +564,7 @@ def _located(
 
 
 def _everywhere(rows: NDArray[np.bool_], values: Array) -> Array:
-    """Values (n, ...) of some rows as values of all rows, the others NaN."""
+    """Expand values (n, ...) of the marked rows to all rows, with NaN elsewhere."""
     out = np.full((rows.size, *values.shape[1:]), np.nan)
     out[rows] = values
     return out

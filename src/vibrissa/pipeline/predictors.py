@@ -1,9 +1,9 @@
-"""A trial as a table of predictors: what a model of spikes, or any statistics, starts from.
+"""Table of predictors of a trial for spike models and other statistical analyses.
 
-Models that relate the responses of primary sensory neurons to a whisker's mechanics take 16
+Models that relate the responses of primary sensory neurons to a whisker's mechanics use 16
 predictors: three components of force, three of moment, two angles of the whisker's base, and the
-rate of change of these eight (Bush, Solla & Hartmann 2021, doi:10.1073/pnas.2020194118). They are
-columns of this table, with the six signals, the remaining pose, contacts and flags.
+rates of change of these eight (Bush, Solla & Hartmann 2021, doi:10.1073/pnas.2020194118). The table
+also contains the six signals, the rest of the base's pose, contacts and flags.
 """
 
 from __future__ import annotations
@@ -27,47 +27,48 @@ _COMPONENTS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 _ANGLES = ("base_azimuth", "base_elevation", "base_roll")
 _RATE = "_rate"
 
-# Names of the 16 columns that models of spikes use.
+# Names of the 16 columns that spike models use.
 PREDICTORS = (
     *_COMPONENTS,
     *_ANGLES[:2],
     *(name + _RATE for name in (*_COMPONENTS, *_ANGLES[:2])),
 )
-# Columns that one view does not measure: they are zero but for rounding.
+# Columns that a single camera view cannot measure: they are zero up to rounding.
 _UNSEEN = ("Fz", "Mx", "My", "base_elevation")
 
-# Groups that hold force, moment and pose, the first one that has them counts.
+# Groups searched, in this order, for force, moment and pose.
 _GROUPS = ("signals", "", "truth")
 
 
 def predictors(recording: xr.DataTree) -> xr.Dataset:
-    """List per frame and whisker what an analysis of a trial needs.
+    """Tabulate mechanical predictors of every frame and whisker of a trial.
 
     Parameters
     ----------
     recording : xarray.DataTree
-        Recording with force and moment, best with the group ``signals``; contact points are those
-        of ``estimates`` or, without, of the recording.
+        Recording with force and moment, preferably in the group ``signals``. Contact points are
+        those of the group ``estimates`` if there is one, otherwise those of the recording.
 
     Returns
     -------
     xarray.Dataset
         Variables over (time, whisker), SI units, each with ``units``, ``long_name`` and
-        ``description``: the six components of force and moment, the signals, the angles of the
-        base and its position, the rates of change of components and angles, the contact point in
-        the laboratory and its arc length, ``in_contact``, ``status``, ``confidence``, ``event`` and
-        ``onset_time`` with ``onset_sigma``. The attribute ``predictors`` names the 16 of models of
-        spikes, of a trial that was filmed by one camera the 8 that it shows. Missing is NaN.
+        ``description``: the six components of force and moment, the signals, the angles and
+        position of the base, the rates of change of components and angles, the contact point in
+        the laboratory frame and its arc length, ``in_contact``, ``status``, ``confidence``,
+        ``event`` and ``onset_time`` with ``onset_sigma``. The attribute ``predictors`` lists the 16
+        predictors of spike models, or for a trial filmed by one camera the 8 that it measures.
+        Missing values are NaN.
 
     Raises
     ------
     ValueError
-        If force and moment are not known.
+        If force and moment are unknown.
 
     Warns
     -----
     UserWarning
-        If these are far too large to have bent the recording's whisker, as in other units.
+        If force or moment is far too large for the recording's whisker, which suggests wrong units.
     """
     record = Recording(recording)
     force, moment = (record.known(name, _GROUPS) for name in ("force", "moment"))
@@ -108,7 +109,7 @@ def predictors(recording: xr.DataTree) -> xr.Dataset:
         "confidence": record.known("confidence", ("",)),
     }
     if (estimates := record.find("estimates")) and estimates.known("event") is not None:
-        others |= {name: estimates.get(name) for name in EVENTS}  # NaN where none is dated
+        others |= {name: estimates.get(name) for name in EVENTS}  # NaN where there is no time
     columns |= {name: values for name, values in others.items() if values is not None}
     data = {
         name: xr.Variable(("time", "whisker"), values, _about(name))
@@ -138,14 +139,14 @@ def _angles(rotation: Array) -> Array:
 
 
 def _rate(values: Array, time: Array) -> Array:
-    """Central difference over time; NaN next to what is missing."""
+    """Central differences over time (axis 0); NaN next to missing values."""
     if len(time) < 2:
         return np.full(values.shape, np.nan)
     return np.asarray(np.gradient(values, time, axis=0))
 
 
 def _about(name: str) -> dict[str, object]:
-    """Unit and meaning of a column."""
+    """Attributes of a column: unit, name and description."""
     if name == "status":
         return {**attributes(name), **flag_attributes()}
     if name == "event":

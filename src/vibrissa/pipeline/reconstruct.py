@@ -1,11 +1,11 @@
-"""The object that estimated contacts are on, and its comparison with objects that are known.
+"""Reconstruction of the touched object from contacts, and comparison with known objects.
 
 Contact points are on the whisker's centreline, one whisker radius off the surface, which the fit
-takes into account. All whiskers of a recording count together: they touch one object.
+takes into account. All whiskers of a recording are assumed to touch the same object.
 
-Shapes are compared by χ² per degree of freedom, which is 1 where shape and noise are right, and by
-the Bayesian information criterion on the contacts that all of them use. Contacts whose errors are
-correlated from frame to frame count as fewer.
+Shapes are compared by χ² per degree of freedom, which is 1 if shape and noise are correct, and by
+the Bayesian information criterion on the contacts that all fits use. The effective number of
+contacts is reduced if their errors are correlated from frame to frame.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ from vibrissa.status import describe
 from vibrissa.whisker import Whisker
 
 Shape = Literal["cylinder", "sphere", "plane", "free"]  # shapes that can be fitted to contacts
-# Uncertainty of every contact apart from the signals', m: the tolerance of the mechanics.
+# Numerical error of every contact point, m: the tolerance of the mechanics.
 SOLVED_TO = 1e-6
-# Share of the variance by errors that all frames share that need not be followed to the object.
+# Share of the variance of shared errors that may be neglected in their effect on the object.
 _LEFT_OUT = 1e-4
-# Standard deviation of the angle between normal and force across the whisker, rad. For contacts
-# with friction: along the whisker it is measured by the wrench and removed, across the whisker and
-# along the object it is not. Pegs are found best with 0.05 to 0.3 at any coefficient of friction up
-# to 0.5, and hardly worse without friction (docs/validation.md).
+# Standard deviation of the angle between the normal and the force across the whisker, rad, for
+# contacts with friction. Friction along the whisker is measured by the wrench and removed; friction
+# along the object, across the whisker, is not. Pegs are reconstructed best with 0.05 to 0.3 at any
+# coefficient of friction up to 0.5, and hardly worse without friction (docs/validation.md).
 LEAN = 0.1
 
 
@@ -68,36 +68,36 @@ def reconstruct(
     recording : xarray.DataTree
         Recording with a group ``estimates``; see `estimates_of`.
     shape : {"cylinder", "sphere", "plane", "free"}
-        Shape of the object; free is any smooth surface.
+        Shape of the object; "free" is any smooth surface.
     axis : array_like (3,), optional
         Direction of a cylinder's axis, laboratory frame, where it is known.
     lean : float, optional
-        Standard deviation of the lean of normals, rad, as for `fit_contacts`.
+        Standard deviation of the angle between normals and forces, rad, as for `fit_contacts`.
     whiskers : sequence of Whisker, optional
         Whiskers along the dimension ``whisker``; by default those of the recording.
     objects : sequence of Surface, optional
-        Known objects in the laboratory to compare with; by default those of the recording.
+        Known objects in the laboratory frame to compare with; by default those of the recording.
 
     Returns
     -------
     xarray.Dataset
         Group ``contour`` of a recording, laboratory frame: ``object_position``,
         ``object_axis`` and ``object_radius``, as far as the shape has them, with
-        ``parameter_covariance``; dims time, whisker: ``surface_distance`` from the fitted object,
-        ``inlier`` and ``chi_squared``; attributes ``shape`` and ``misfit``, χ² per degree of
-        freedom: much more than 1 means that the object has another shape.
-        `vibrissa.contour.shape_from_dataset` restores the shape. The covariance is larger by the
-        misfit, and counts contacts of consecutive frames whose errors are correlated as one; the
-        attribute ``frames_together`` is their number. Of simple shapes it includes the errors that
-        all contacts of a tracked recording share (its ``contact_shared``). With known objects also
-        ``object_distance`` of each contact from the one that is nearest to them (attribute
-        ``object``, its number), and for a cylinder compared with a peg ``axis_offset``,
-        ``axis_tilt`` and ``diameter_error``, for spheres ``center_offset`` and ``diameter_error``.
+        ``parameter_covariance``; dimensions time, whisker: ``surface_distance`` from the fitted
+        object, ``inlier`` and ``chi_squared``; attributes ``shape`` and ``misfit``, χ² per degree
+        of freedom, of which a value much above 1 means that the object has another shape.
+        `vibrissa.contour.shape_from_dataset` restores the shape. The covariance is scaled by the
+        misfit and by the attribute ``frames_together``, the number of consecutive frames whose
+        errors are correlated. For simple shapes it includes the errors that all contacts of a
+        tracked recording share (its ``contact_shared``). With known objects also
+        ``object_distance`` of each contact from the object nearest to all contacts (attribute
+        ``object``, its index); for a cylinder compared with a peg ``axis_offset``, ``axis_tilt``
+        and ``diameter_error``; for spheres ``center_offset`` and ``diameter_error``.
 
     Raises
     ------
     ValueError
-        If there are no estimates, or too few, or they do not determine the object.
+        If there are no estimates or too few, or they do not determine the object.
     """
     if shape not in get_args(Shape):
         raise ValueError(f"shape is {shape!r}; one of {', '.join(get_args(Shape))} is needed")
@@ -131,7 +131,7 @@ def scores_of(fit: FittedShape, estimates: xr.Dataset) -> Array:
 
 
 def _widened(fit: FittedShape, together: float) -> FittedShape:
-    """Same fit with all variances larger by a factor."""
+    """Copy of a fit with all variances multiplied by ``together``."""
     covariance = together * fit.covariance
     if not isinstance(fit, FreeFit):
         return replace(fit, covariance=covariance)
@@ -141,11 +141,11 @@ def _widened(fit: FittedShape, together: float) -> FittedShape:
 
 
 def _moved_together(recording: xr.DataTree, estimates: xr.Dataset) -> Iterator[xr.Dataset]:
-    """Estimates moved by the errors that all frames of a tracked recording share.
+    """Yield estimates displaced by the errors that all frames of a tracked recording share.
 
-    They move a contact that was tracked as they do the trace, and one of a sensor with the pose by
-    which it is in the laboratory; the pose turns normals. Few combinations of them, independent as
-    they are themselves, do nearly all that they do.
+    A tracked contact moves with the trace, and a contact from sensor signals with the pose that
+    transforms it to the laboratory frame; an error of the pose rotates normals. The errors are
+    replaced by the few independent combinations that account for nearly all of their variance.
     """
     root, found = Recording(recording).root, Group(estimates)
     point, normal = found["contact_point"], found["contact_normal"]
@@ -153,7 +153,7 @@ def _moved_together(recording: xr.DataTree, estimates: xr.Dataset) -> Iterator[x
     if not len(moves):
         return
     for k, (moved, turned) in enumerate(moves):
-        # What was not tracked does not show by how much it is moved.
+        # NaN where the contact was not tracked: its displacement is unknown and set to zero below.
         moved[:] = root["contact_shared"][:, :, k]
         if "pose_shared" in root:
             pose = np.nan_to_num(root["pose_shared"][:, :, k])
@@ -175,7 +175,7 @@ def _moved_together(recording: xr.DataTree, estimates: xr.Dataset) -> Iterator[x
 
 
 def _with_shared_errors(fit: FittedShape, others: Sequence[FittedShape]) -> FittedShape:
-    """Same fit, less certain by what errors that all contacts share, one a fit, change of it."""
+    """Add to a fit's covariance the effect of shared errors: differences from ``others``."""
 
     def numbers(one: FittedShape) -> Array:
         return np.concatenate([np.ravel(getattr(one, name)) for name in one.fields])
@@ -190,8 +190,8 @@ def _with_shared_errors(fit: FittedShape, others: Sequence[FittedShape]) -> Fitt
 def frames_together(scores: ArrayLike) -> float:
     """Mean number of consecutive frames whose errors are correlated.
 
-    Errors of tracked contacts are alike from frame to frame, as those of the whisker's shape and
-    the base's pose, so that a hundred of them contain less than a hundred of a sensor.
+    Errors of tracked contacts, such as those of the whisker's shape and the base pose, are similar
+    from frame to frame, so that a hundred of them hold less information than a hundred of a sensor.
     """
     z = np.asarray(scores, dtype=np.float64)
     known = np.isfinite(z)
@@ -220,28 +220,28 @@ def fit_contacts(
     axis: ArrayLike | None = None,
     lean: float | None = None,
 ) -> FittedShape:
-    """Fit a shape to contacts in the laboratory.
+    """Fit a shape to contacts in the laboratory frame.
 
     Parameters
     ----------
     estimates : xarray.Dataset
         Dataset of `estimates_of`, dimensions time, whisker.
     whiskers : sequence of Whisker
-        Whiskers that touched it.
+        Whiskers that touched the object.
     shape : {"cylinder", "sphere", "plane", "free"}
         Shape of the object.
     axis : array_like (3,), optional
         Direction of a cylinder's axis where it is known.
     lean : float, optional
-        Standard deviation of the angle between the surface's normal and the force across the
-        whisker, rad; by default `LEAN` for contacts from the whole wrench, which allows for
-        friction, and 0 for others, which are of a whisker without friction.
+        Standard deviation of the angle between the surface normal and the force across the
+        whisker, rad; by default `LEAN` for contacts from the full wrench, which allows for
+        friction, and 0 for others, which assume no friction.
 
     Returns
     -------
     CylinderFit, SphereFit, PlaneFit or FreeFit
-        Shape to which each contact contributes by its covariance, where that is known, and by the
-        direction of its force as the normal of the surface. Rows are frames × whiskers.
+        Fitted shape. Contacts are weighted by their covariance, where known, and the direction of
+        the force serves as the surface normal. Rows are frames × whiskers.
 
     Raises
     ------
@@ -251,15 +251,15 @@ def fit_contacts(
     if shape not in get_args(Shape):
         raise ValueError(f"shape is {shape!r}; one of {', '.join(get_args(Shape))} is needed")
     if axis is not None and shape != "cylinder":
-        raise ValueError(f"an axis is given; only a cylinder has one, and the shape is {shape!r}")
+        raise ValueError(f"an axis is given for the shape {shape!r}; only a cylinder has one")
     count = estimates.sizes["whisker"]
     if len(whiskers) != count:
         raise ValueError(f"there are estimates of {count} whiskers; {len(whiskers)} are given")
     spread = _rows(estimates["contact_covariance"])
     if lean and not np.isfinite(spread).any():
         raise ValueError(
-            f"lean is {lean!r}, but these contacts have no covariance, without which it cannot "
-            "count: estimate them with the noise of the signals"
+            f"lean is {lean!r}, but these contacts have no covariance, so that it has no effect: "
+            "estimate them with the noise of the signals"
         )
     if lean is None:
         lean = LEAN if estimates.attrs.get("signals") == WHOLE else 0.0
@@ -290,7 +290,7 @@ def fit_contacts(
 
 
 def contour_points(recording: xr.DataTree, whiskers: Sequence[Whisker] | None = None) -> xr.Dataset:
-    """Contacts of all whiskers as points of a contour, laboratory frame."""
+    """Table of all contacts as points of a contour, laboratory frame, dimension ``contact``."""
     estimates = estimates_in(recording)
     known = Recording(recording).whiskers if whiskers is None else whiskers
     point = _rows(estimates["contact_point"])
@@ -311,7 +311,7 @@ def contour_points(recording: xr.DataTree, whiskers: Sequence[Whisker] | None = 
 
 
 def _rows(variable: xr.DataArray) -> Array:
-    """Values (frames × whiskers, ...)."""
+    """Values (frames × whiskers, ...) of a variable over time and whisker."""
     values = variable.transpose(*EACH, ...).values
     return np.asarray(values.reshape(-1, *values.shape[2:]))
 
@@ -322,7 +322,7 @@ def _compared(
     whiskers: Sequence[Whisker],
     objects: Sequence[Surface],
 ) -> dict[str, Any]:
-    """Distances of contacts from the known object nearest to them, and of the fit from it."""
+    """Variables that compare contacts and fit with the known object nearest to the contacts."""
     number = nearest_object(estimates, whiskers, objects)
     points = Group(estimates)["contact_point"]
     there = np.isfinite(points).all(axis=-1)
@@ -348,8 +348,9 @@ def _compared(
 
 # Shapes with few parameters.
 SIMPLE: tuple[Shape, ...] = tuple(shape for shape in get_args(Shape) if shape != "free")
-AGREES = 4.0  # χ² per degree of freedom up to which contacts agree with a shape: twice their noise
-STRONG = 10.0  # difference of the information criterion from which one shape is better than another
+# Largest χ² per degree of freedom of a shape that agrees with the contacts: twice their noise.
+AGREES = 4.0
+STRONG = 10.0  # smallest difference of the information criterion that prefers one shape to another
 
 
 def compare_shapes(
@@ -370,19 +371,14 @@ def compare_shapes(
     axis : array_like (3,), optional
         Direction of a cylinder's axis where it is known.
     lean : float, optional
-        Standard deviation of the lean of normals, rad, as for `fit_contacts`.
+        Standard deviation of the angle between normals and forces, rad, as for `fit_contacts`.
 
     Returns
     -------
     xarray.Dataset
         Dataset of dimension ``shape``: ``misfit``, χ² per degree of freedom, and ``evidence``, the
-        excess of its information criterion over that of the best, which has 0. Both are NaN for
-        shapes that cannot be fitted, and for all where the contacts' noise is not known.
-
-    Raises
-    ------
-    ValueError
-        If whiskers or lean do not fit.
+        excess of its information criterion over that of the best shape, for which it is 0. Both are
+        NaN for shapes that cannot be fitted, and for all if the noise of the contacts is unknown.
     """
     fits: dict[str, FittedShape] = {}
     for shape in SIMPLE:
@@ -390,7 +386,7 @@ def compare_shapes(
         try:
             fits[shape] = fit_contacts(estimates, whiskers, shape, axis=known, lean=lean)
         except ValueError:
-            continue  # perhaps there is none of this shape
+            continue  # contacts may not determine every shape
     misfit, evidence = np.full((2, len(SIMPLE)), np.nan)
     if fits and min(fit.equations for fit in fits.values()) > 0:
         rows = np.all([fit.used for fit in fits.values()], axis=0)
@@ -419,7 +415,7 @@ ANGLE_CLASSES = (0.0, 2.0, 5.0, 10.0, 15.0, 90.0)
 def nearest_object(
     estimates: xr.Dataset, whiskers: Sequence[Whisker], objects: Sequence[Surface]
 ) -> int:
-    """Number of the object that contacts are nearest to."""
+    """Index of the object with the smallest median distance from the contacts."""
     if not objects:
         raise ValueError("no object is known to compare with")
     points = Group(estimates)["contact_point"]
@@ -439,26 +435,26 @@ def compare_contacts(
     whiskers: Sequence[Whisker] | None = None,
     seed: int = 0,
 ) -> xr.Dataset:
-    """Compare the contacts of a recording with the known object that they are nearest to.
+    """Compare the contacts of a recording with the known object nearest to them.
 
     Parameters
     ----------
     recording : xarray.DataTree
         Recording with a group ``estimates``.
     objects : sequence of Surface, optional
-        Objects in the laboratory; by default those of the recording.
+        Objects in the laboratory frame; by default those of the recording.
     whiskers : sequence of Whisker, optional
         Whiskers; by default those of the recording.
     seed : int
-        Seed of the draws by the covariance.
+        Seed of the random draws from the covariances.
 
     Returns
     -------
     xarray.Dataset
         Dataset of dimensions time, whisker: ``surface_distance`` and, over ``replicate`` too,
-        ``surface_distance_predicted`` (`vibrissa.contour.compare_with`), and of each contact
-        ``deflection_angle``, ``r`` and, where there are signals, ``MB``. Attribute ``object``: its
-        number.
+        ``surface_distance_predicted`` (`vibrissa.contour.compare_with`); ``deflection_angle`` and
+        ``r`` of each contact and, if there are signals, ``MB``. The attribute ``object`` is the
+        index of the object.
 
     Raises
     ------
@@ -494,7 +490,7 @@ def compare_contacts(
 
 
 def distances_by_class(compared: xr.Dataset) -> dict[str, xr.Dataset]:
-    """Summarise distances from a known object by classes of deflection, distance and moment."""
+    """Summarise distances from a known object by classes of deflection angle, r and M_B."""
     tables = {}
     for name in ("deflection_angle", "r", "MB"):
         if name in compared:

@@ -1,18 +1,18 @@
 """Base signals of every frame of a recording, from one of three sources.
 
-**The contact point** (the paper's method): the contact point that was tracked in the laboratory is
+**Contact point** (the paper's method): the contact point tracked in the laboratory frame is
 expressed in the frame of the whisker's base, whose pose is filtered without phase shift; force and
-moment are those of the frictionless rod that passes through it (`vibrissa.deflect`). Points that
-the rod cannot reach keep their frame and have a status. A table of contact points that was given to
-the tracker has priority over the points that it found. The wrench has the covariance of the point,
-and of the pose: its usual distance from that of the rod, where that is known.
+moment are those of the frictionless rod through this point (`vibrissa.deflect`). A status marks
+frames whose point the rod cannot reach. Contact points given to the tracker in a table take
+precedence over those it found. The covariance of the wrench follows from those of the point and of
+the pose; the latter includes the typical difference from the pose of the fitted rod, if known.
 
-**The rod**: force and moment of the rod that fits the whisker's images, with their covariance.
+**Rod**: force and moment of the rod fitted to the images of the whisker, with their covariance.
 
-**A sensor**: force and moment as they were read, in a simulated or a robot's recording; or the
-readings of its channels, if these are six or more that determine force and moment.
+**Sensor**: force and moment as measured, in a simulated or robotic recording, or computed from the
+readings of other channels if these determine force and moment (six or more channels).
 
-On request a sensor's signals are without what the whisker's inertia and damping add to them
+The contributions of the whisker's inertia and damping can be removed from sensor signals
 (:mod:`vibrissa.pipeline.inertia`).
 """
 
@@ -48,8 +48,8 @@ from vibrissa.tracking import CUTOFF, BasePose, HeadPose, pieces
 from vibrissa.whisker import Whisker, angles_of
 
 Source = Literal["contact point", "rod", "sensor"]  # source of signals
-# Values in frames without signals where these are not NaN.
-_ELSEWHERE = {"in_contact": (False,), "status": (np.int8(Status.MISSING),)}
+# Fill values, other than NaN, in frames without signals.
+_FILL_VALUES = {"in_contact": (False,), "status": (np.int8(Status.MISSING),)}
 
 
 def signals_of(
@@ -66,38 +66,38 @@ def signals_of(
     Parameters
     ----------
     recording : xarray.DataTree
-        Recording, tracked, simulated or measured.
+        Tracked, simulated or measured recording.
     source : {"contact point", "rod", "sensor"}, optional
-        Source of the signals; by default that of `default_source`.
+        Source of the signals; by default the result of `default_source`.
     cutoff : float, optional
-        Cut-off of the low pass on the pose that the contact point is expressed in, Hz; None filters
-        nothing. The other sources have a pose of their own.
+        Cut-off frequency of the low-pass filter of the base pose for the source "contact point",
+        Hz; None disables filtering. The other sources use the pose of the recording.
     whiskers : sequence of Whisker, optional
-        Whiskers along the dimension ``whisker``; by default those of the recording. Only the
-        contact point needs them.
+        Whiskers along the dimension ``whisker``; by default those of the recording. They are used
+        by the source "contact point" and to remove inertia.
     proximal : float
-        Smallest arc length of a contact point with signals, as a share of the length; others have a
-        status only.
+        Smallest arc length of a contact with signals, as a share of the whisker's length; contacts
+        nearer to the base only have a status. Source "contact point" only.
     dynamics : Dynamics or "fitted", optional
-        Density and damping, known to 20 %, of whiskers whose inertia is to be removed from signals
-        of a sensor, or "fitted": as `vibrissa.simulation.fit_dynamics` finds them in this
-        recording. The motion of the base must be smooth. By default nothing is removed.
+        Density and damping, known to 20 %, of whiskers whose inertia is removed from sensor
+        signals, or "fitted" to fit them to this recording (`vibrissa.simulation.fit_dynamics`). The
+        motion of the base must be smooth. By default inertia is not removed.
 
     Returns
     -------
     xarray.Dataset
         Group ``signals`` of a recording, dimensions time, whisker, space: ``force``, ``moment`` and
-        ``Fx`` … ``MD``, whisker's frame, zero without contact; ``base_position`` and
-        ``base_rotation``, the pose that they refer to; ``in_contact`` (of a sensor whose noise is
-        known: where M_B exceeds five standard deviations), ``status``, and where known
-        ``wrench_covariance`` and the pose's. Attributes ``source``, ``cutoff`` and, of a sensor,
-        ``noise``: standard deviations of (F, M).
+        ``Fx`` … ``MD``, whisker frame, zero without contact; ``base_position`` and
+        ``base_rotation``, the pose to which they refer; ``in_contact`` (for a sensor of known
+        noise: M_B above five standard deviations), ``status``, and, if known,
+        ``wrench_covariance`` and the covariances of the pose. Attributes: ``source``, ``cutoff``
+        and, for a sensor, ``noise``, the standard deviations of (F, M).
 
     Raises
     ------
     ValueError
-        If the recording lacks what the source needs, the cut-off is not below half the rate, or
-        inertia is to be removed from a trial that was simulated without it.
+        If the recording lacks variables that the source needs, the cut-off is not below half the
+        frame rate, or inertia is to be removed from a trial that was simulated without it.
     """
     check_recording(recording)
     chosen = default_source(recording) if source is None else source
@@ -108,12 +108,12 @@ def signals_of(
     if chosen == "sensor":
         if dynamics is not None and "quasi-static" in str(recording.attrs.get("origin")):
             raise ValueError(
-                "this trial was simulated without inertia: there is none to remove from its signals"
+                "this trial was simulated without inertia, so none can be removed from its signals"
             )
         known = known_trial.whiskers if whiskers is None else whiskers
         return _by_sensor(root, known, dynamics)
     if dynamics is not None:
-        raise ValueError(f"inertia is removed from signals of a sensor; these are of the {chosen}")
+        raise ValueError(f"inertia can be removed from sensor signals only, not from the {chosen}")
     if chosen == "rod":
         return _by_rod(root)
     count = root.sizes["whisker"]
@@ -134,11 +134,11 @@ def signals_of(
 
 
 def default_source(recording: xr.DataTree) -> Source:
-    """Source of signals that a recording has: a sensor or else the tracked contact point.
+    """Source of a recording's signals: a sensor if there is one, else the tracked contact point.
 
-    The rod of a tracked recording is never the default. It fits the images with a little
-    friction, which hardly moves the contact point but is a large share of the axial force, so that
-    its wrench is to be used whole, not by signals that presume no friction.
+    The fitted rod of a tracked recording is never the default. Its fit includes some friction,
+    which hardly moves the contact point but is a large share of the axial force, so that its wrench
+    must be used in full rather than by signals that assume no friction.
     """
     root = recording.to_dataset()
     measured = {"force", "moment"} <= set(root.data_vars) or "reading" in root
@@ -147,13 +147,14 @@ def default_source(recording: xr.DataTree) -> Source:
     if "contact_point" in root:
         return "contact point"
     raise ValueError(
-        f"the recording has no signals and nothing to make them of: it has {names_of(root)}; force "
-        "and moment, or contact_point with base_position and base_rotation, are needed"
+        f"the recording has no signals and lacks the variables to compute them: it has "
+        f"{names_of(root)}; force and moment, or contact_point with base_position and "
+        "base_rotation, are needed"
     )
 
 
 def _given_points(recording: Recording) -> Array | None:
-    """Contact points (time, whisker, 3) that were not tracked but given in a table."""
+    """Contact points (time, whisker, 3) that were given in a table; None if there is none."""
     measured = recording.find("measured")
     if measured is None or "contact_point" not in measured:
         return None
@@ -164,6 +165,7 @@ def _given_points(recording: Recording) -> Array | None:
 def _by_sensor(
     root: xr.Dataset, whiskers: Sequence[Whisker], dynamics: Dynamics | Literal["fitted"] | None
 ) -> xr.Dataset:
+    """Signals measured by a sensor."""
     covariance: Array | None
     if "force" not in root and {"reading", "mixing"} <= set(root.data_vars):
         root, covariance = _from_channels(root)
@@ -173,8 +175,8 @@ def _by_sensor(
     needed(root, ("base_position", "base_rotation"), "sensor")
     if "wrench_covariance" in root:
         raise ValueError(
-            "there was no sensor: force and moment of this recording are those of the rod that "
-            "fits its images; take them from the source 'rod'"
+            "force and moment of this recording are not a sensor's but those of the rod fitted to "
+            "its images; use the source 'rod'"
         )
     if dynamics is not None:
         noise = component_noise(FORCE_NOISE, MOMENT_NOISE) if covariance is None else covariance
@@ -203,7 +205,7 @@ def _by_sensor(
 
 
 def _own_noise(root: xr.Dataset) -> Array | None:
-    """Covariance (6, 6) of force and moment, where their noise is stated."""
+    """Covariance (6, 6) of force and moment from their attributes ``noise``; None without."""
     deviations = np.concatenate(
         [
             _deviations(name, root[name].attrs.get("noise", np.nan), 3)
@@ -214,17 +216,18 @@ def _own_noise(root: xr.Dataset) -> Array | None:
 
 
 def _deviations(name: str, noise: Any, count: int) -> Array:
-    """Standard deviations of components, as an attribute states them."""
+    """Standard deviations (count,) of components from an attribute ``noise``."""
     given = np.ravel(noise)
     if given.dtype.kind not in "fiu" or given.size not in (1, count) or (given < 0.0).any():
         raise ValueError(
-            f"the noise of {name} is {noise!r}; a standard deviation or {count} are needed, from 0"
+            f"the noise of {name} is {noise!r}; one or {count} standard deviations, not negative, "
+            "are needed"
         )
     return np.broadcast_to(given.astype(np.float64), count)
 
 
 def _from_channels(root: xr.Dataset) -> tuple[xr.Dataset, Array]:
-    """Force and moment, and their covariance (6, 6), from readings of other channels."""
+    """Add force and moment computed from other channels; also return their covariance (6, 6)."""
     known = Group(root)
     sensor = Sensor(
         [str(name) for name in root["channel"].values],
@@ -237,6 +240,7 @@ def _from_channels(root: xr.Dataset) -> tuple[xr.Dataset, Array]:
 
 
 def _by_rod(root: xr.Dataset) -> xr.Dataset:
+    """Signals of the rod fitted to the images."""
     names = ("force", "moment", "base_position", "base_rotation", "wrench_covariance")
     needed(root, names, "rod")
     trial = Group(root)
@@ -252,7 +256,7 @@ def _by_rod(root: xr.Dataset) -> xr.Dataset:
 
 
 def _known(force: Array, moment: Array) -> NDArray[np.bool_]:
-    """Frames (time, whisker) in which force and moment are numbers."""
+    """Frames (time, whisker) in which force and moment are finite."""
     return np.asarray(np.isfinite(force + moment).all(axis=-1))
 
 
@@ -262,7 +266,7 @@ def _labelled(
     status: NDArray[np.int64],
     about: Mapping[str, Any],
 ) -> xr.Dataset:
-    """Signals of a wrench that the recording itself has, with its own pose."""
+    """Signals from the recording's own wrench and pose."""
     names = ("force", "moment", "base_position", "base_rotation")
     parts = []
     for k, one in enumerate(Group(root).each_whisker()):
@@ -272,7 +276,7 @@ def _labelled(
 
 
 def sensor_noise(signals: xr.Dataset) -> Array | None:
-    """Noise that is stated with signals."""
+    """Covariance of (F, M), (6, 6) or (time, ..., 6, 6), of signals; None if unknown."""
     if "wrench_covariance" in signals:
         return Group(signals)["wrench_covariance"]
     if "noise" in signals.attrs:
@@ -281,7 +285,7 @@ def sensor_noise(signals: xr.Dataset) -> Array | None:
 
 
 def placed_by(signals: xr.Dataset, recording: xr.DataTree) -> xr.Dataset:
-    """Signals of a sensor with the pose that was tracked in another recording of the trial.
+    """Combine sensor signals with the pose tracked in another recording of the same trial.
 
     Parameters
     ----------
@@ -293,9 +297,9 @@ def placed_by(signals: xr.Dataset, recording: xr.DataTree) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        Signals in the frames and with the whiskers' names of the tracked recording: of each frame
-        those that are nearest in time, at most half of the time between them away, with
-        ``base_position``, ``base_rotation`` and, where known, ``pose_covariance`` as tracked.
+        Signals at the times and with the whisker names of the tracked recording, with its
+        ``base_position``, ``base_rotation`` and, if known, ``pose_covariance``. Each frame has the
+        signals nearest in time, or none if these are more than half a sampling interval away.
 
     Raises
     ------
@@ -305,11 +309,11 @@ def placed_by(signals: xr.Dataset, recording: xr.DataTree) -> xr.Dataset:
     check_recording(recording)
     root = recording.to_dataset()
     names = ("base_position", "base_rotation")
-    needed(root, names, "sensor, placed by this recording,")
+    needed(root, names, "sensor, with the pose of this recording,")
     if root.sizes["whisker"] != signals.sizes["whisker"]:
         raise ValueError(
-            f"the signals are those of {signals.sizes['whisker']} whiskers, and the recording that "
-            f"places them has {root.sizes['whisker']}"
+            f"there are signals of {signals.sizes['whisker']} whiskers, and the recording with the "
+            f"pose has {root.sizes['whisker']}"
         )
     time, wanted = signals["time"].values, root["time"].values
     later = np.searchsorted(time, wanted).clip(0, time.size - 1)
@@ -322,7 +326,7 @@ def placed_by(signals: xr.Dataset, recording: xr.DataTree) -> xr.Dataset:
         kept["wrench_covariance"] = signals["wrench_covariance"].isel(time=near)
     kept = kept.drop_vars(["time", "whisker"], errors="ignore")
     placed = {
-        str(name): variable.where(there, *_ELSEWHERE.get(str(name), ())).assign_attrs(
+        str(name): variable.where(there, *_FILL_VALUES.get(str(name), ())).assign_attrs(
             variable.attrs
         )
         for name, variable in kept.data_vars.items()
@@ -332,7 +336,7 @@ def placed_by(signals: xr.Dataset, recording: xr.DataTree) -> xr.Dataset:
 
 
 class Pose(NamedTuple):
-    """Pose of one whisker's base, frame by frame, laboratory frame."""
+    """Pose of one whisker's base in every frame, laboratory frame, with covariances (n, 6, 6)."""
 
     rotation: Array
     position: Array
@@ -340,9 +344,10 @@ class Pose(NamedTuple):
 
 
 def paper_pose(recording: Recording, cutoff: float | None) -> list[Pose]:
-    """Pose of each whisker's base, filtered relative to the head.
+    """Pose of each whisker's base, low-pass filtered relative to the head.
 
-    That from before the rod was fitted, or the recording's own.
+    The pose measured before the rod was fitted is used if there is one, otherwise that of the
+    recording.
     """
     root = recording.root
     head = HeadPose.still(root.data.sizes["time"])
@@ -360,8 +365,8 @@ def paper_pose(recording: Recording, cutoff: float | None) -> list[Pose]:
     elif f"{prefix}base_azimuth" not in measured:
         if measured.data.attrs.get("cutoff", CUTOFF) != cutoff:
             raise ValueError(
-                f"the pose of this recording is kept as it was filtered; a cut-off of {cutoff} Hz "
-                "needs the unfiltered one: track the videos again"
+                f"this recording contains the filtered pose only; a cut-off of {cutoff} Hz needs "
+                "the unfiltered one: track the videos again"
             )
         prefix, cutoff = "", None
     poses = []
@@ -379,8 +384,8 @@ def paper_pose(recording: Recording, cutoff: float | None) -> list[Pose]:
         poses.append(Pose(rotation, position, _pose_covariance(own, rotation, position)))
     if cutoff is not None and (count := len(pieces(time, cutoff))) > 1:
         warnings.warn(
-            f"frames are missing, up to {np.diff(time).max():.3g} s in a row: the base's pose is "
-            f"filtered in {count} pieces, of which those of one frame stay as they are",
+            f"frames are missing, up to {np.diff(time).max():.3g} s in a row: the base pose is "
+            f"filtered in {count} pieces; those of a single frame are not filtered",
             UserWarning,
             stacklevel=3,
         )
@@ -388,10 +393,10 @@ def paper_pose(recording: Recording, cutoff: float | None) -> list[Pose]:
 
 
 def _pose_covariance(own: Group, rotation: Array, position: Array) -> Array:
-    """Covariance (time, 6, 6) of a pose compared with that of the recording.
+    """Covariance (time, 6, 6) of a pose: the recording's, plus the mean square difference from it.
 
-    The recording's counts as the truth, within its own covariance: the causes of their difference
-    are hardly the same.
+    The two are added because the error of the recording's pose and the difference from it have
+    largely independent causes.
     """
     out = np.zeros((len(rotation), 6, 6))
     if "pose_covariance" not in own:
@@ -418,7 +423,7 @@ def signals_by_point(
     whisker: Whisker,
     proximal: float,
 ) -> xr.Dataset:
-    """Signals of the rod that passes through the tracked contact point."""
+    """Signals of the frictionless rod through the tracked or tabulated contact points."""
     rotation, position = pose.rotation, pose.position
     point = one["contact_point"]
     tabulated = np.zeros(len(point), dtype=bool)
@@ -454,7 +459,7 @@ def signals_by_point(
     spread = one["contact_covariance"]
     spread = np.where(touching[:, None, None], spread, 0.0)
     spread[tabulated] = np.nan
-    # Small errors of the base's position and rotation move the point in the whisker's frame.
+    # Effect of small errors of the base's position and rotation on the point in the whisker frame.
     moved = np.concatenate([-np.eye(3) + np.zeros_like(spread), cross_matrix(point - position)], 2)
     moved = np.where(touching[:, None, None], moved, 0.0)
     both = pose.covariance @ np.swapaxes(moved, 1, 2)

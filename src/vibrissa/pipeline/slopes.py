@@ -1,4 +1,7 @@
-"""Derivatives of contacts with respect to the wrench at the base, and of the wrench by contacts."""
+"""Derivatives of contact points and normals with respect to the base wrench, and the inverse.
+
+The unknowns of a contact are x = (s, f_x, f_y, f_z), as in `vibrissa.pipeline.locate`.
+"""
 
 from __future__ import annotations
 
@@ -22,13 +25,13 @@ from vibrissa.signals import signals_of
 from vibrissa.whisker import Whisker
 
 _FREE = [0, 2, 3]  # unknowns of x without friction
-_STEP = 1e-5  # relative step of differences
-# Least singular value, of columns scaled to one, from which derivatives can be inverted.
+_STEP = 1e-5  # relative step of finite differences
+# Smallest singular value of invertible derivatives whose columns are scaled to length one.
 _SINGULAR = 1e-10
 
 
 class _Touch(NamedTuple):
-    """(F, p) (n, 6), ∂(F, p)/∂x (n, 6, 4) and ∂n/∂x (n, 3, 4), n being the normal."""
+    """(F, p) (n, 6), ∂(F, p)/∂x (n, 6, 4) and, for the normal n, ∂n/∂x (n, 3, 4)."""
 
     values: Array
     value_slopes: Array
@@ -44,7 +47,12 @@ def gains(
     errors: Array | None = None,
     friction: float = 0.0,
 ) -> Array:
-    """Derivatives (n, 6, 6) of contact points and normals with respect to the measured wrench."""
+    """Derivatives (n, 6, 6) of contact points and normals with respect to the measured wrench.
+
+    With more than three signals, these are weighted by the noise ``weighing`` (6, 6) of the wrench
+    and the common ``errors`` (k, 6, 7). ``friction`` is the standard deviation of the ratio of
+    forces along and across the whisker.
+    """
     rubbing = signals == WRENCH or friction > 0.0
     d, x, rows = _unknowns(whisker, arc_length, contact_force)
     out = np.full((len(rows), 6, 6), np.nan)
@@ -59,7 +67,7 @@ def gains(
     if not three:
         weights = _weights(d, channels, touch.values, weighing, errors)
         slopes, by_wrench = weights @ slopes, weights @ by_wrench
-    if friction > 0.0:  # the prior is one more measurement, which the wrench does not change
+    if friction > 0.0:  # the prior acts as one more measurement, independent of the wrench
         prior = ratio_derivatives(x)[:, None] / friction
         slopes = np.concatenate([slopes, prior], axis=1)
         by_wrench = np.concatenate([by_wrench, np.zeros_like(by_wrench[:, :1])], axis=1)
@@ -70,7 +78,7 @@ def gains(
 
 
 def wrench_slopes(whisker: Whisker, arc_length: Array, contact_force: Array) -> Array:
-    """Derivatives (n, 6, 3) of the wrench of frictionless contacts by their points."""
+    """Derivatives (n, 6, 3) of the wrench of frictionless contacts with respect to their points."""
     d, x, rows = _unknowns(whisker, arc_length, contact_force)
     out = np.full((len(rows), 6, 3), np.nan)
     if not rows.any():
@@ -83,6 +91,7 @@ def wrench_slopes(whisker: Whisker, arc_length: Array, contact_force: Array) -> 
 
 
 def _touch(d: Discretization, x: Array) -> _Touch:
+    """Values and derivatives of contacts x (n, 4), scaled, partly by central differences."""
     values, exact = solve_forces(d, x, tangents=True)
     tangent = contact_tangents(d, x)
     slopes, turning = np.empty((len(x), 6, 4)), np.empty((len(x), 3, 4))
@@ -93,7 +102,7 @@ def _touch(d: Discretization, x: Array) -> _Touch:
         ahead[:, k] += step
         back[:, k] -= step
         if k == 0:
-            # There is no whisker beyond the tip.
+            # The whisker ends at the tip, s = 1.
             ahead[:, 0] = np.minimum(ahead[:, 0], np.maximum(1.0, x[:, 0]))
         width = (ahead[:, k] - back[:, k])[:, None]
         turning[..., k] = (contact_tangents(d, ahead) - contact_tangents(d, back)) / width
@@ -116,7 +125,7 @@ def _touch(d: Discretization, x: Array) -> _Touch:
 
 
 def contact_normals(whisker: Whisker, arc_length: Array, contact_force: Array) -> Array:
-    """Directions (n, 3) of contact forces across the whisker."""
+    """Unit vectors (n, 3) of the contact forces across the whisker."""
     d, x, rows = _unknowns(whisker, arc_length, contact_force)
     out = np.full((len(rows), 3), np.nan)
     if rows.any():
@@ -130,7 +139,7 @@ def contact_normals(whisker: Whisker, arc_length: Array, contact_force: Array) -
 def _unknowns(
     whisker: Whisker, arc_length: Array, contact_force: Array
 ) -> tuple[Discretization, Array, NDArray[np.bool_]]:
-    """Scaled unknowns x (m, 4) of the contacts that are known, and which of all (n,) these are."""
+    """Scaled unknowns x (m, 4) of the finite contacts, and a mask (n,) of these."""
     d = discretize(whisker)
     x = np.concatenate([arc_length[:, None] / d.length, contact_force / d.force], axis=1)
     rows = np.isfinite(x).all(axis=1)
@@ -144,6 +153,7 @@ def _weights(
     weighing: Array | None,
     errors: Array | None,
 ) -> Array:
+    """Whitening matrices of the channels at contacts with given values (F, p)."""
     sensor = None
     if weighing is not None:
         sensor = SensorNoise(None, weighing, np.zeros((0, 6, 7)) if errors is None else errors)
@@ -152,7 +162,7 @@ def _weights(
 
 
 def _inverse(slopes: Array) -> Array:
-    """Pseudo-inverses (n, m, k) of slopes (n, k, m); NaN where they are not of full rank."""
+    """Pseudo-inverses (n, m, k) of slopes (n, k, m); NaN for those not of full rank."""
     usable = np.asarray(np.isfinite(slopes).all(axis=(1, 2)))
     whole = np.where(usable[:, None, None], slopes, 0.0)
     size = np.linalg.norm(whole, axis=1)

@@ -1,7 +1,7 @@
-"""The stages of a recording: signals, estimates and contour, each one more group.
+"""The stages of a recording: its groups signals, estimates and contour, added one after another.
 
-A stage makes the stages before it that are missing, and removes the later ones, which depend on it.
-Nothing else changes, and the recording that was passed stays as it is.
+Adding a group first computes missing earlier ones and removes the later ones, which depend on it.
+The functions return a new recording and leave the one passed unchanged.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from vibrissa.pipeline.signals import signals_of
 from vibrissa.recording import Recording
 from vibrissa.status import Status
 
-STAGES = ("signals", "estimates", "contour")  # groups in the order in which they are made
+STAGES = ("signals", "estimates", "contour")  # groups in the order in which they are computed
 
 
 def due_stages(recording: xr.DataTree, last: str, asked: Collection[str] = ()) -> tuple[str, ...]:
-    """Stages that have to be made, in order, so that the last one is new.
+    """Stages that have to be computed, in order, to bring the stage ``last`` up to date.
 
-    One before it is due if it is missing, if it is asked for, if what it was made of was edited
-    since, or if one that it depends on is due.
+    ``last`` itself is always due. An earlier stage is due if it is missing or named in ``asked``,
+    if its inputs were edited since it was computed, or if a stage before it is due.
     """
     for name in (last, *asked):
         if name not in STAGES:
@@ -47,7 +47,7 @@ def due_stages(recording: xr.DataTree, last: str, asked: Collection[str] = ()) -
 
 
 def with_group(recording: xr.DataTree, name: str, dataset: xr.Dataset) -> xr.DataTree:
-    """Add the group of a stage to a recording."""
+    """Add the group of a stage to a recording, and remove the groups of later stages."""
     if name not in STAGES:
         raise ValueError(f"the group is called {name!r}; one of {', '.join(STAGES)} is needed")
     check_recording(recording)
@@ -55,8 +55,8 @@ def with_group(recording: xr.DataTree, name: str, dataset: xr.Dataset) -> xr.Dat
     shapes = [tuple(data.sizes.get(d) for d in ("time", "whisker")) for data in (dataset, root)]
     if shapes[0] != shapes[1] or not np.allclose(dataset["time"], root["time"], rtol=0, atol=1e-6):
         raise ValueError(
-            f"the {name} have frames and whiskers {shapes[0]}, the recording {shapes[1]}, or they "
-            "are of other times"
+            f"the {name} have frames and whiskers {shapes[0]} and the recording {shapes[1]}, or "
+            "their times differ"
         )
     own = dataset.drop_vars([n for n in dataset.coords if n in root.coords])
     own[MADE_FROM] = made_from(recording, name)
@@ -75,7 +75,7 @@ def with_signals(recording: xr.DataTree, *args: Any, **options: Any) -> xr.DataT
     Parameters
     ----------
     recording : xarray.DataTree
-        Recording, tracked, simulated or measured.
+        Tracked, simulated or measured recording.
     *args, **options
         Arguments of `signals_of`.
 
@@ -90,12 +90,12 @@ def with_signals(recording: xr.DataTree, *args: Any, **options: Any) -> xr.DataT
 def with_estimates(
     recording: xr.DataTree, *args: Any, progress: Progress | None = None, **options: Any
 ) -> xr.DataTree:
-    """Add the group ``estimates``, and ``signals`` where there are none.
+    """Add the group ``estimates``, and ``signals`` if missing.
 
     Parameters
     ----------
     recording : xarray.DataTree
-        Recording, tracked, simulated or measured.
+        Tracked, simulated or measured recording.
     *args
         Arguments of `estimates_of`.
     progress : callable, optional
@@ -117,12 +117,12 @@ def with_estimates(
 def with_contour(
     recording: xr.DataTree, *args: Any, progress: Progress | None = None, **options: Any
 ) -> xr.DataTree:
-    """Add the group ``contour``, and ``signals`` and ``estimates`` where there are none.
+    """Add the group ``contour``, and ``signals`` and ``estimates`` if missing.
 
     Parameters
     ----------
     recording : xarray.DataTree
-        Recording, tracked, simulated or measured.
+        Tracked, simulated or measured recording.
     *args
         Arguments of `reconstruct`.
     progress : callable, optional
@@ -140,17 +140,19 @@ def with_contour(
     return with_group(recording, "contour", reconstruct(recording, *args, **options))
 
 
-_BEFORE = ("signals", "", "truth")  # groups in which contacts are looked for, the best known first
+_BEFORE = ("signals", "", "truth")  # groups searched for contacts, in this order
 
 
 @dataclass(frozen=True)
 class TrialSummary:
-    """Summary of a recording: what it is in words, numbers of frames and contacts, SI units.
+    """Summary of a recording in words and numbers, SI units.
 
-    ``in_contact`` and ``contacts``, frames in contact and uninterrupted contacts of all whiskers,
-    are None where that is not known; bases move within ``extent``; ``estimated`` counts frames and
-    whiskers with an estimate, ``assumption`` is what these assume of friction, and ``events``
-    counts onsets, losses and slips. ``fitted`` is the fitted ``shape`` in words.
+    ``in_contact`` and ``contacts`` are the number of frames in contact and the number of
+    uninterrupted contacts of all whiskers, None if unknown. ``extent`` is the largest range of
+    motion of a base. ``estimated`` counts the estimates of all frames and whiskers, ``assumption``
+    describes the friction they assume, and ``events`` counts onsets, losses and slips. ``fitted``
+    describes the fitted ``shape``, ``known`` the known objects, and ``distance`` is the median
+    distance of contacts from the fitted shape.
     """
 
     origin: str
@@ -204,7 +206,7 @@ def summarise(recording: xr.DataTree) -> TrialSummary:
         fitted = repr(shape).strip("<>")
         if "surface_distance" in contour:
             away = np.abs(contour["surface_distance"].values)
-            if "inlier" in contour:  # as `FittedShape.median`
+            if "inlier" in contour:  # as in `FittedShape.median`
                 away = away[contour["inlier"].values > 0]
             distance = float(np.nanmedian(away)) if np.isfinite(away).any() else np.nan
     return TrialSummary(
@@ -229,7 +231,7 @@ def summarise(recording: xr.DataTree) -> TrialSummary:
 
 
 def _largest(values: np.ndarray | None, touching: np.ndarray | None) -> float:
-    """Largest length of vectors (time, whisker, 3) where there is contact."""
+    """Largest length of vectors (time, whisker, 3) in contact; NaN if unknown."""
     if values is None or touching is None:
         return np.nan
     sizes = np.linalg.norm(values, axis=-1)[touching]

@@ -1,4 +1,4 @@
-"""The sensor at the whisker's base: its readings, mounting and calibration."""
+"""Sensors at the whisker's base: readings, frame and calibration."""
 
 from vibrissa.sensors.calibration import (
     MixingCalibration,

@@ -1,25 +1,25 @@
-"""Calibration of a sensor and of the whisker that it holds, from known wrenches and free poses.
+"""Calibration of a sensor and of its whisker from known wrenches and from readings without contact.
 
-**Mixing and offset**, y = A w + b, channel by channel. The wrenches are those of known loads, or of
-contacts of the whisker itself by its model.
+**Mixing and offset**, y = A w + b, are fitted channel by channel. The wrenches are those of known
+loads, or those computed for contacts of the whisker.
 
-**Offset and weight** that a sensor carries, from readings without contact,
+**Offset and weight** are fitted to readings without contact in several orientations,
 
     y = b + H (m g, μ × g),
 
-linear in the offset b, the mass m and its moment μ = m c, with g turning as the base does.
+linear in the offset b, the mass m and its moment μ = m c, with g in the frame of the base.
 
-**Modulus and base radius** from measured loads, as far as loads determine them. For contacts at
-known points on the centreline the shape does not depend on how stiff the whisker is: force and
-moment are proportional to EI = E π r⁴ / 4 at the base (the twisting stiffness follows by Poisson's
-ratio, the others by the taper). So loads determine EI, and only another measurement separates E
-from r⁴: a radius under the microscope, or a modulus from a data sheet. Given the uncertainties of
-both before, log E and log r are moved along their line
+**Modulus and base radius** are fitted to measured loads. For contacts at known points on the
+centreline the shape does not depend on the whisker's stiffness, and force and moment are
+proportional to EI = E π r⁴ / 4 at the base (the torsional stiffness follows from Poisson's ratio,
+the stiffness elsewhere from the taper). Loads therefore determine EI only; separating E from r⁴
+requires another measurement, such as a radius under the microscope or a modulus from a data sheet.
+Given prior uncertainties of both, Bayes' rule updates log E and log r subject to
 
-    log E + 4 log r = log(4 EI / π)
+    log E + 4 log r = log(4 EI / π).
 
-by Bayes' rule. Loads do determine how the stiffness falls toward the tip, if contacts are at
-several positions along the whisker: the taper can be fitted too.
+If contacts are at several positions along the whisker, loads also determine how the stiffness
+decreases toward the tip, so that the taper can be fitted too.
 """
 
 from __future__ import annotations
@@ -41,28 +41,28 @@ from vibrissa.sensors.sensor import COMPONENTS, GRAVITY, Sensor, with_offset
 from vibrissa.status import describe, is_ok
 from vibrissa.whisker import Whisker
 
-_ROUNDING = 1e-6  # share of the largest component of its kind below which a component is rounding
+_ROUNDING = 1e-6  # relative size below which components of a force or moment are set to zero
 _ADVICE = (
-    "touch the whisker at other places and in other directions, or state by `components` what the "
-    "channels cannot read"
+    "touch the whisker at other points and in other directions, or restrict `components` to those "
+    "that the channels read"
 )
 
 
 @dataclass(frozen=True, eq=False)
 class MixingCalibration:
-    """A sensor's mixing as determined by known wrenches.
+    """Mixing of a sensor, calibrated by known wrenches.
 
     Attributes
     ----------
     sensor : Sensor
-        Sensor with the mixing (in the whisker's frame), offset and noise that were found, and their
-        covariance.
+        Sensor with the fitted mixing (in the whisker frame), offset and noise, and the covariance
+        of mixing and offset.
     components : tuple of str
         Components that the channels may read.
     covariance : (k, p + 1, p + 1) array
         Covariance of each channel's mixing of these p components and, last, its offset.
     residual : (k,) array
-        Root mean square residual of the mix, in the unit of the channel.
+        Root mean square residual of each channel, in its unit.
     """
 
     sensor: Sensor
@@ -80,23 +80,23 @@ def calibrate_mixing(
     resolution: ArrayLike = 0.0,
     largest: ArrayLike = np.inf,
 ) -> MixingCalibration:
-    """Find linear mix, offset and noise of a sensor from known wrenches.
+    """Fit mixing, offset and noise of a sensor to readings of known wrenches.
 
     Parameters
     ----------
     readings : array_like (n, k)
-        Readings of the channels; rows with NaN are left out.
+        Readings of the channels; rows with NaN are ignored.
     wrenches : array_like (n, 6)
-        Wrenches (F, M) at the whisker's base, whisker's frame, N and N·m: of known loads, or of
-        contacts at known points. They count as exact.
+        Wrenches (F, M) at the whisker's base, whisker frame, N and N·m, of known loads or of
+        contacts at known points. They are treated as exact.
     channels : sequence of str, optional
         Names of the k channels.
     components : sequence of str
-        Components that a channel may read; the others' mixing is zero. Wrenches of a frictionless
-        whisker are a small part of all: most have nearly no Mx.
+        Components that a channel may read; the mixing of the others is zero. The wrenches of
+        frictionless contacts span only a small part of all wrenches; in most, Mx is nearly zero.
     resolution, largest : array_like (k,)
-        Step of the readings and size of the largest, as of `Sensor`, which keeps them. Rows with a
-        saturated reading are left out, and the noise does not include rounding.
+        Resolution and largest reading of the channels, as in `Sensor`. Rows with a saturated
+        reading are ignored, and the fitted noise excludes rounding.
 
     Returns
     -------
@@ -106,7 +106,7 @@ def calibrate_mixing(
     Raises
     ------
     ValueError
-        If shapes do not fit or the wrenches do not separate the components.
+        If shapes do not match or the wrenches do not separate the components.
     """
     y, w = numbers("readings", readings, channels or ()), numbers("wrenches", wrenches, components)
     if y.ndim != 2 or w.shape != (len(y), 6):
@@ -155,7 +155,7 @@ def calibrate_mixing(
 
 
 def _loaded(wrenches: Array) -> Array:
-    """Wrenches (n, 6) without components that are rounding compared with those of their kind."""
+    """Set components of wrenches (n, 6) that are due to rounding to zero."""
     out = wrenches.copy()
     for kind in (slice(0, 3), slice(3, 6)):
         size = np.abs(out[:, kind]).max(axis=0, initial=0.0)
@@ -164,7 +164,7 @@ def _loaded(wrenches: Array) -> Array:
 
 
 def wrenches_of_contacts(whisker: Whisker, points: ArrayLike) -> Array:
-    """Wrenches at the base of frictionless contacts at known points."""
+    """Wrenches (n, 6) at the base of frictionless contacts at known points (n, 3)."""
     contacts = numbers("points", points)
     if contacts.ndim != 2 or contacts.shape[1] != 3:
         raise ValueError(f"contact points are (n, 3), m; got {contacts.shape}")
@@ -179,22 +179,22 @@ def wrenches_of_contacts(whisker: Whisker, points: ArrayLike) -> Array:
 def calibrate_on_contacts(
     whisker: Whisker, points: ArrayLike, readings: ArrayLike, **options: Any
 ) -> MixingCalibration:
-    """Find linear mix, offset and noise of a sensor from contacts at known points.
+    """Fit mixing, offset and noise of a sensor to readings of contacts at known points.
 
-    The whisker's stiffness becomes part of the mix: with twice the stiffness channels read half as
-    much. So contacts found with that calibration are right in spite of a wrong stiffness, forces
-    are not.
+    Any error of the assumed stiffness is absorbed by the mixing: if the whisker is assumed twice
+    too stiff, the mixing is half of the true one. With such a calibration, estimated contact points
+    are correct in spite of the wrong stiffness, but forces are not.
 
     Parameters
     ----------
     whisker : Whisker
-        Whisker that the sensor holds.
+        Whisker on the sensor.
     points : array_like (n, 3)
-        Contact points on its centreline, whisker's frame, m; without friction.
+        Frictionless contact points on its centreline, whisker frame, m.
     readings : array_like (n, k)
-        Readings of the channels at these contacts; rows with NaN in either are left out.
+        Readings of the channels at these contacts; rows with NaN in either are ignored.
     **options
-        Names of channels, components, resolution and largest reading, as of `calibrate_mixing`.
+        Names of channels, components, resolution and largest reading, as in `calibrate_mixing`.
 
     Returns
     -------
@@ -209,27 +209,28 @@ def calibrate_on_contacts(
     return calibrate_mixing(readings, wrenches_of_contacts(whisker, points), **options)
 
 
-_HEAVY = 5.0  # mass that no sensor of a whisker carries, kg
-_SURELY = 4.0  # standard deviations below zero at which a mass is not noise
-_IN_OTHER_UNITS = 300.0  # times as stiff as stated, from which units or radii are in question
-_IDLE = 1e-12  # share of the largest effect on a channel below which an unknown has none
+_HEAVY = 5.0  # mass above which the user is warned, kg
+_SURELY = 4.0  # standard deviations by which a mass may be negative owing to noise
+_IN_OTHER_UNITS = 300.0  # factor of the stated stiffness above which units are in question
+_IDLE = 1e-12  # relative effect on the channels below which an unknown has none
 _POSES = (
-    "hold the whisker free in more orientations, at least three that differ in how the weight pulls"
+    "hold the whisker free of contact in more orientations, at least three that differ in the "
+    "direction of gravity"
 )
 _MASS = ("the mass", "its moment along x", "along y", "along z")
 
 
 @dataclass(frozen=True, eq=False)
 class WeightCalibration:
-    """Offset and weight as determined by free poses.
+    """Offset and weight, calibrated without contact.
 
     Attributes
     ----------
     sensor : Sensor
-        Sensor with offset, and where orientations were given mass and its moment.
+        Sensor with the fitted offset and, if orientations were given, mass and its moment.
     covariance : (k + 4, k + 4) array
-        Covariance of the offsets, the mass (kg) and its moment (kg·m); zero for what was not asked
-        or has no effect on these channels.
+        Covariance of the offsets, the mass (kg) and its moment (kg·m); zero for quantities that
+        were not fitted or have no effect on these channels.
     residual : (k,) array
         Root mean square residual of each channel.
     misfit : float
@@ -248,19 +249,19 @@ def calibrate_weight(
     rotations: ArrayLike | None = None,
     gravity: ArrayLike = GRAVITY,
 ) -> WeightCalibration:
-    """Find offset and weight from readings of a free whisker.
+    """Fit offset and weight to readings without contact.
 
     Parameters
     ----------
     sensor : Sensor
-        Sensor whose mixing and frame are known; its noise weighs the channels.
+        Sensor with known mixing and frame; channels are weighted by its noise.
     readings : array_like (n, k)
-        Readings without contact; rows with NaN or a saturated channel are left out.
+        Readings without contact; rows with NaN or a saturated channel are ignored.
     rotations : array_like (n, 3, 3), optional
-        Rotations from the whisker's to the laboratory frame. Without them only the offset is found,
-        for this one orientation: the weight is part of it.
+        Rotations from the whisker frame to the laboratory frame. Without them only the offset is
+        fitted, which then includes the weight in this one orientation.
     gravity : array_like (3,)
-        Acceleration in the laboratory frame, m/s².
+        Gravitational acceleration in the laboratory frame, m/s².
 
     Returns
     -------
@@ -270,8 +271,8 @@ def calibrate_weight(
     Raises
     ------
     ValueError
-        If shapes do not fit, the orientations do not separate weight from offset, or the weight is
-        negative.
+        If shapes do not match, the orientations do not separate weight from offset, or the mass is
+        significantly negative.
 
     Warns
     -----
@@ -294,7 +295,7 @@ def calibrate_weight(
     if turn.shape != (n, 3, 3):
         raise ValueError(f"{n} readings need as many rotations (3, 3); got {turn.shape}")
     design = _design(sensor, turn[known], np.asarray(gravity, dtype=np.float64))
-    # What has no effect in any orientation is left at zero; what has must be determined here.
+    # Unknowns without effect in any orientation stay zero; the others must be determined.
     every = np.array([np.eye(3), *np.eye(3)[[[1, 2, 0], [2, 0, 1]]]])
     every = np.concatenate([every, -every, every[:, ::-1]])
     possible = _design(sensor, every, np.asarray(gravity, dtype=np.float64))[:, :, k:]
@@ -311,7 +312,7 @@ def calibrate_weight(
                 "reports a reaction (`reaction` of its frame), has other axes, or gravity or the "
                 "rotations point the other way"
             )
-        effective[k] = False  # too light to be weighed
+        effective[k] = False  # the mass is too small to be measured
         found, unknowns, covariance = _solved(sensor, design, y, noise, effective)
     calibrated = replace(
         sensor,
@@ -322,16 +323,16 @@ def calibrate_weight(
     )
     if unknowns[k] > _HEAVY:
         warnings.warn(
-            f"the sensor seems to carry {unknowns[k]:.3g} kg: are its channels in N and N·m, or "
-            "does its mixing say what they are in?",
+            f"the sensor seems to carry {unknowns[k]:.3g} kg: are its channels in N and N·m, or in "
+            "the units that its mixing implies?",
             stacklevel=2,
         )
     left = found.residuals.reshape(-1, k) * noise
     misfit = float((found.residuals**2).sum() / max(found.residuals.size - effective.sum(), 1))
     warn_of_misfit(
         misfit,
-        "that the rotations are of the whisker's base (not of a flange), that they turn the "
-        "whisker's into the laboratory frame, and the sensor's axes and hand",
+        "that the rotations are those of the whisker's base (not of a flange), from the whisker "
+        "frame to the laboratory frame, and the sensor's axes and handedness",
     )
     return WeightCalibration(calibrated, covariance, np.sqrt((left**2).mean(axis=0)), misfit)
 
@@ -342,18 +343,19 @@ def tare(
     rotations: ArrayLike | None = None,
     gravity: ArrayLike = GRAVITY,
 ) -> Sensor:
-    """Find the offset anew, as after a drift; mass and its moment are kept.
+    """Measure the offset again, as after a drift; mass and its moment are kept.
 
     Parameters
     ----------
     sensor : Sensor
         Calibrated sensor.
     readings : array_like (n, k)
-        Readings without contact; those with NaN or a saturated channel are left out.
+        Readings without contact; those with NaN or a saturated channel are ignored.
     rotations : array_like (3, 3) or (n, 3, 3), optional
-        Rotation from the whisker's to the laboratory frame; needed where the sensor carries a mass.
+        Rotation from the whisker frame to the laboratory frame, required if the sensor carries a
+        mass.
     gravity : array_like (3,)
-        Acceleration in the laboratory frame, m/s².
+        Gravitational acceleration in the laboratory frame, m/s².
 
     Returns
     -------
@@ -363,7 +365,7 @@ def tare(
     Raises
     ------
     ValueError
-        If shapes do not fit, the rotation is needed but not given, or no reading is complete.
+        If shapes do not match, a required rotation is missing, or no reading is complete.
     """
     free = np.atleast_2d(sensor.compensated(readings, rotations, gravity))
     free = free[np.isfinite(free).all(axis=1)]
@@ -392,6 +394,7 @@ def _solved(
 
 
 def _tared(sensor: Sensor, y: Array, noise: Array) -> WeightCalibration:
+    """Calibrate the offset only, as the mean of readings (n, k)."""
     k = y.shape[1]
     bias = y.mean(axis=0)
     covariance = np.zeros((k + 4, k + 4))
@@ -405,7 +408,7 @@ def _tared(sensor: Sensor, y: Array, noise: Array) -> WeightCalibration:
 
 
 def _design(sensor: Sensor, rotations: Array, gravity: Array) -> Array:
-    """∂y/∂(b, m, μ), shape (n, k, k + 4)."""
+    """Derivatives ∂y/∂(b, m, μ) of readings, (n, k, k + 4)."""
     g = gravity @ rotations
     h = sensor.base_mixing
     n, k = len(g), len(h)
@@ -416,22 +419,22 @@ def _design(sensor: Sensor, rotations: Array, gravity: Array) -> Array:
     return out
 
 
-_OPEN = 2.0  # standard deviation of the logarithm of a taper from which it is not determined
+_OPEN = 2.0  # standard deviation of a logarithm above which a quantity is not determined
 _SLIM, _WIDE = 0.01, 2.0  # bounds of a fitted taper
-# Bounds of the fitted stiffness of a base, over EI/L; what is stiffer is rigid.
+# Bounds of the fitted stiffness of a base, in units of EI/L; a stiffer base is rigid in effect.
 _SOFT, _STIFF = 1.0, 1e4
-_SPRING = 30.0  # stiffness of a base that the fit begins with, over EI/L
-_TYPICAL_NOISE = 0.01  # noise of channels that state none, as a share of the size of their readings
+_SPRING = 30.0  # initial stiffness of a base in the fit, in units of EI/L
+_TYPICAL_NOISE = 0.01  # noise of channels without stated noise, relative to their readings
 
 
 @dataclass(frozen=True, eq=False)
 class StiffnessFit:
-    """A whisker's stiffness as determined by loads; standard deviations are relative.
+    """Stiffness of a whisker, fitted to loads; standard deviations are relative.
 
     Attributes
     ----------
     whisker : Whisker
-        Whisker with the modulus, radius and taper that were found.
+        Whisker with the fitted modulus, radius and taper.
     stiffness : float
         Bending stiffness EI at the base, N·m².
     stiffness_sigma : float
@@ -439,18 +442,19 @@ class StiffnessFit:
     modulus, radius : float
         Young's modulus, Pa, and base radius, m.
     modulus_sigma, radius_sigma : float
-        Standard deviations of these; infinite if both were unknown before.
+        Standard deviations of modulus and radius.
     covariance : (2, 2) array
         Covariance of (log E, log r): strongly correlated, as loads determine log E + 4 log r.
     taper, taper_sigma : float
-        Tip radius over base radius; the deviation is 0 where it was not fitted.
+        Ratio of tip to base radius, and its standard deviation, which is 0 if it was not fitted.
     misfit : float
-        χ² per degree of freedom; where larger than 1 the deviations are scaled up by its
+        χ² per degree of freedom; if it is above 1, standard deviations are multiplied by its square
         root.
     base_stiffness : float
-        Stiffness of the base in bending and in twist, N·m/rad; infinite where it was not fitted.
+        Stiffness of the base in bending and twist, N·m/rad; infinite if it was not fitted.
     compliance_sigma : float
-        Standard deviation of its inverse, rad/(N·m), as of ``ContactMap.estimate``; 0 likewise.
+        Standard deviation of its inverse, rad/(N·m), as used by ``ContactMap.estimate``; 0 if it
+        was not fitted.
     """
 
     whisker: Whisker
@@ -486,16 +490,16 @@ def fit_stiffness(
     whisker : Whisker
         Whisker with the stated shape, modulus and radius.
     points : array_like (n, 3)
-        Contact points on the centreline, whisker's frame, m; without friction.
+        Frictionless contact points on the centreline, whisker frame, m.
     readings : array_like (n, k)
         Readings of the sensor's channels, without offset and weight (`Sensor.compensated`).
     sensor : Sensor, optional
-        Sensor with mixing and noise; by default (F, M) at the base with the usual noise. It must
-        not have been calibrated on contacts of this whisker: that makes the stiffness part of the
-        mix.
+        Sensor with mixing and noise; by default (F, M) at the base with the default noise. It must
+        not have been calibrated on contacts of this whisker, as its mixing then absorbs errors of
+        the stiffness.
     modulus_sigma, radius_sigma : float
-        Relative standard deviations of the whisker's modulus and radius before: ``inf`` for
-        unknown, 0 for exact. At least one must be finite.
+        Prior relative standard deviations of the whisker's modulus and radius: ``inf`` for unknown,
+        0 for exact. At least one must be finite.
     taper : bool
         Whether the ratio of tip to base radius is fitted too (the radius then is linear).
     base : bool
@@ -509,13 +513,14 @@ def fit_stiffness(
     Raises
     ------
     ValueError
-        If shapes do not fit, nothing is measured, or what is asked for is not determined.
+        If shapes do not match, the readings do not follow the loads, or the contacts do not
+        determine the taper or base stiffness to be fitted.
 
     Warns
     -----
     UserWarning
         If residuals are more than five times the noise, or E r⁴ is more than five standard
-        deviations from what was known before.
+        deviations from its prior value.
     """
     sensor = sensor or Sensor()
     y = numbers("readings", readings)
@@ -542,8 +547,8 @@ def fit_stiffness(
     scaled = y / noise
     if not len(y) or not (modelled(ratio) * scaled).sum() > 0.0:
         raise ValueError(
-            "the readings do not grow with the loads: check the sensor's axes, sign (`reaction`) "
-            "and offset, or nothing is measured"
+            "the readings do not increase with the loads: check the sensor's axes, sign "
+            "(`reaction`) and offset, and whether the channels respond at all"
         )
     ratio, factor, spring, spread, left = _fitted(modelled, scaled, ratio, taper, base)
     degrees = y.size - 1 - taper - base
@@ -589,18 +594,18 @@ def fit_stiffness(
 
 
 def _warn_of_units(factor: float) -> None:
-    """Warn of a stiffness that is so many times what the whisker was stated to have."""
+    """Warn if the fitted stiffness differs from the stated one by an implausible factor."""
     if not 1.0 / _IN_OTHER_UNITS < factor < _IN_OTHER_UNITS:
         warnings.warn(
-            f"the stiffness is {factor:.3g} times that of the whisker as it was stated: are the "
-            "readings in N and N·m, and the whisker's radius right?",
+            f"the fitted stiffness is {factor:.3g} times the whisker's stated one: are the "
+            "readings in N and N·m, and is the whisker's radius right?",
             UserWarning,
             stacklevel=3,
         )
 
 
 def _on_spring(whisker: Whisker, spring: float | None) -> Whisker:
-    """The whisker on a spring of this stiffness over EI/L; as it is held where there is none."""
+    """Whisker on a base spring of a stiffness in units of EI/L; unchanged if it is None."""
     if spring is None:
         return whisker
     stiffness = spring * whisker.base_bending_stiffness / whisker.length
@@ -608,6 +613,7 @@ def _on_spring(whisker: Whisker, spring: float | None) -> Whisker:
 
 
 def _tapered(whisker: Whisker, ratio: float) -> Whisker:
+    """Whisker with another ratio of tip to base radius."""
     if ratio == whisker.tip_radius / whisker.base_radius:
         return whisker
     return whisker.with_properties(
@@ -618,9 +624,10 @@ def _tapered(whisker: Whisker, ratio: float) -> Whisker:
 def _fitted(
     modelled: Callable[..., Array], scaled: Array, ratio: float, taper: bool, base: bool
 ) -> tuple[float, float, float | None, Array, Array]:
-    """Taper, factor of the stiffness, spring of the base, covariance of their logs, residuals.
+    """Fit taper, stiffness factor and base spring; return these, a covariance and residuals.
 
-    The covariance is that of factor, taper and spring in this order, as far as they are fitted.
+    The covariance is that of the logarithms of factor, taper and spring in this order, as far as
+    they are fitted.
     """
     model = modelled(ratio, _SPRING if base else None)
     factor = float((model * scaled).sum() / (model**2).sum())
@@ -652,10 +659,10 @@ def _fitted(
 def _separated(
     log_factor: float, sigma: float, modulus_sigma: float, radius_sigma: float
 ) -> tuple[Array, Array]:
-    """Shift of (log E, log r) by which log E + 4 log r grows so much, and their covariance."""
+    """Change of (log E, log r) for a given change of log E + 4 log r, and their covariance."""
     by = np.array([1.0, 4.0])
     if np.isinf(modulus_sigma) or np.isinf(radius_sigma):
-        # One is free: the other keeps its value and uncertainty, and it takes up the rest.
+        # The unknown one is free; the other keeps its value and uncertainty.
         free = 0 if np.isinf(modulus_sigma) else 1
         kept = radius_sigma if free == 0 else modulus_sigma
         slope = by[1 - free] / by[free]

@@ -1,12 +1,14 @@
-"""Files of sensors, TOML in SI units, and of touches on a positioning stage.
+"""Files of sensors, and descriptions of tables from a positioning stage.
+
+**Sensors** are described in TOML files, in SI units.
 
     channels = ["Fx", "My", "Mz"]
-    mixing = [[1, 0, 0, 0, 0, 0], …]   # a line a channel: of Fx, Fy, Fz, Mx, My, Mz
+    mixing = [[1, 0, 0, 0, 0, 0], …]   # a row per channel: weights of Fx, Fy, Fz, Mx, My, Mz
     noise = [1e-6, 2e-8, 2e-8]         # standard deviations; or one number for all
     bias = 0.0
     gain_error = 0.01                  # relative standard deviation, the same error in all readings
-    mixing_error = 0.01                # or a matrix of standard deviations, as mixing
-    mixing_covariance = [[[1e-6, …], …], …]   # a channel: 7 × 7, of its mixing and offset
+    mixing_error = 0.01                # or a matrix of standard deviations, shaped like mixing
+    mixing_covariance = [[[1e-6, …], …], …]   # per channel: 7 × 7, of its mixing and offset
 
     [frame]
     axes = ["x", "-z", "y"]            # or a 3 × 3 matrix, the sensor's axes in its columns
@@ -17,14 +19,14 @@
     mass = 0.002                       # kg
     moment = [0, 0, 0]                 # kg·m
 
-A maker's matrix may be given the other way round, from the channels to Fx, Fy, Fz, Mx, My, Mz, as
-``calibration`` (6 lines, a number a channel) instead of ``mixing``. A matrix that seems to be under
-the wrong name is refused: of a sensor that is small compared with a metre, readings per N·m are
+A manufacturer's calibration matrix, from the channels to Fx, Fy, Fz, Mx, My, Mz, may be given as
+``calibration`` (6 rows, one number per channel) instead of ``mixing``. A matrix that seems to have
+the wrong name is an error: for a sensor that is small compared with a metre, readings per N·m are
 larger than those per N.
 
-Everything but channels and noise may be left out. Channels that are components in other units
-need one number only: ``mixing = 1e3`` for mN and mN·m (= N·mm). Noise, bias and the largest reading
-are in the channels' units.
+Only channels and noise are required. Channels that are components in other units need one number
+as mixing: ``mixing = 1e3`` for mN and mN·m (= N·mm). Noise, bias and the largest reading are in
+the units of the channels.
 
 **Tables of a positioning stage**: touches at known points, the resting shape, sweeps.
 
@@ -34,32 +36,33 @@ are in the channels' units.
 
     [touches]                                # a probe on the stage touches the whisker
     file = "touches.csv"
-    origin = [64.3, 98.1, 16.1]              # where the stage is when the probe is at the base
-    axes = ["x", "y", "z"]                   # the sensor's along the stage's; or a 3 × 3 matrix
-    farthest = 40                            # contacts farther from the base are not used
-    rest = [0, 0, 0]                         # readings of the free whisker; by default those of
-                                             # rows in which the probe is at the base
+    origin = [64.3, 98.1, 16.1]              # position of the stage with the probe at the base
+    axes = ["x", "y", "z"]                   # sensor axes along those of the stage, or 3 × 3 matrix
+    farthest = 40                            # contacts farther from the base are ignored
+    rest = [0, 0, 0]                         # readings of the untouched whisker; by default those
+                                             # of rows with the probe at the base
     drift = [15, 40, 40]                     # change from one recording to the next; by default
-                                             # that of those rows from the stated rest
+                                             # that of these rows from the stated rest
 
     [[shape]]                                # points along the whisker at rest, from base to tip
     file = "shape_y.csv"
-    columns = {x = "px", y = "py"}           # the sensor's coordinates
-    [[shape]]                                # one that the first lacks is read off another
+    columns = {x = "px", y = "py"}           # coordinates in the sensor's frame
+    [[shape]]                                # supplies coordinates that the first table lacks
     file = "shape_x.csv"
     columns = {x = "px", z = "pz"}
-    leave_out = [7]                          # rows that are wrong, from 0
+    leave_out = [7]                          # rows to ignore, counted from 0
 
-    [whisker]                                # only their ratios count but for forces
+    [whisker]                                # apart from forces, only the ratio matters
     base_radius = 0.1
     tip_radius = 0.1
 
-    [sweep]                                  # a moving sensor, or the thing that it touches
+    [sweep]                                  # the sensor moves, or the object that it touches
     moves = "sensor"
     origin = [60.4, 86.9, 47.0]
     axes = ["-x", "-y", "z"]
 
-Files are found next to the description. A calibrated sensor is a NetCDF file that carries it.
+Files are relative to the description's folder. A calibrated sensor is a NetCDF file that includes
+the description.
 """
 
 from __future__ import annotations
@@ -100,17 +103,17 @@ from vibrissa.sensors.suspended import FEATURES, SuspendedWhisker
 from vibrissa.sensors.suspension import SuspensionCalibration
 from vibrissa.whisker import Whisker
 
-# Ratios of readings per N·m and per N from which they differ, and up to which they are alike.
 _NUMBERS = ("noise", "bias", "drift", "resolution", "largest", "gain_error")
 _OTHERS = ("relative_noise", "mixing_error", "mixing_covariance")
 _TOP = {"channels", "mixing", "calibration", *_NUMBERS, *_OTHERS, "frame", "weight"}
 _FRAME = {"axes", "position", "reaction"}
 _WEIGHT = {"mass", "moment"}
+# Smallest ratio of two sizes (readings per N·m and per N) that differ, and largest of similar ones.
 _APART, _ALIKE = 3.0, 2.0
 
 
 def load_sensor(path: str | PathLike[str]) -> Sensor:
-    """Sensor of a file.
+    """Read a sensor from a TOML file.
 
     Parameters
     ----------
@@ -138,7 +141,7 @@ def load_sensor(path: str | PathLike[str]) -> Sensor:
 
 
 def _described(table: dict[str, Any]) -> Sensor:
-    """Sensor that a file describes."""
+    """Sensor described by the contents of a file."""
     frame, weight = subtable(table, "frame"), subtable(table, "weight")
     check_keys(table, _TOP, "the file")
     check_keys(frame, _FRAME, "[frame]")
@@ -154,11 +157,11 @@ def _described(table: dict[str, Any]) -> Sensor:
             values[name] = number_array(table[name], name)
     if "calibration" in table:
         if "mixing" in table:
-            raise ValueError("calibration is another form of mixing: one of them is needed")
+            raise ValueError("calibration is the inverse of mixing: give one of them")
         values["mixing"] = _inverted(number_array(table["calibration"], "calibration"))
     elif _has_halves(values.get("mixing")) and _apart(values["mixing"].T):
         raise ValueError(
-            "mixing seems to lead from the channels to forces and moments, as its lines of moments "
+            "mixing seems to lead from the channels to forces and moments, as its last three rows "
             "are the small ones; if so, name it calibration"
         )
     _check_lever(values.get("mixing"))
@@ -186,52 +189,52 @@ def _described(table: dict[str, Any]) -> Sensor:
 
 
 def _inverted(calibration: Any) -> Any:
-    """Mixing (k, 6) of a matrix (6, k) from channels to forces and moments."""
+    """Mixing (k, 6) as the inverse of a matrix (6, k) from channels to forces and moments."""
     if calibration.ndim != 2 or len(calibration) != 6 or calibration.shape[1] < 6:
         raise ValueError(
-            f"calibration has shape {calibration.shape}; six lines are needed, of Fx, Fy, Fz, Mx, "
+            f"calibration has shape {calibration.shape}; six rows are needed, for Fx, Fy, Fz, Mx, "
             "My, Mz, with a number for each of six or more channels"
         )
     if np.linalg.matrix_rank(calibration) < 6:
-        raise ValueError("calibration has no inverse: its six lines are not independent")
+        raise ValueError("calibration has no inverse: its six rows are not independent")
     if calibration.shape == (6, 6) and _apart(calibration):
         raise ValueError(
-            "calibration seems to lead from forces and moments to the channels, as its columns of "
-            "moments are the large ones; if so, name it mixing"
+            "calibration seems to lead from forces and moments to the channels, as its last three "
+            "columns are the large ones; if so, name it mixing"
         )
     return np.linalg.pinv(calibration)
 
 
 def _check_lever(mixing: Any) -> None:
-    """Warn of a sensor that reads moments hardly, as no sensor does that can be held in a hand."""
+    """Warn if a sensor is implausibly insensitive to moments compared with forces."""
     if np.shape(mixing)[1:] != (6,):
         return
     force, moment = np.linalg.norm(mixing[:, :3]), np.linalg.norm(mixing[:, 3:])
     if force > _APART * moment > 0.0:
         warnings.warn(
-            f"the sensor reads a force of 1 N as it reads a moment of {force / moment:.3g} N·m: "
-            "does the matrix lead the other way (mixing: from forces and moments to the channels; "
-            "calibration: back), or has it another unit than N and N·m?",
+            f"a force of 1 N causes the same reading as a moment of {force / moment:.3g} N·m: is "
+            "the matrix the inverse (mixing: from forces and moments to the channels; calibration: "
+            "from the channels to forces and moments), or in units other than N and N·m?",
             stacklevel=5,
         )
 
 
 def _has_halves(matrix: Any) -> bool:
-    """Whether a matrix is (6, 6), and none of the halves of its lines and columns is zero."""
+    """Whether a matrix is (6, 6), and no half of its rows or columns is zero."""
     if np.shape(matrix) != (6, 6):
         return False
     return all(half.any() for m in (matrix, matrix.T) for half in (m[:3], m[3:]))
 
 
 def _apart(matrix: Any) -> bool:
-    """Whether columns (6, 6) of forces and moments differ in size as of wrenches, and lines not."""
+    """Whether the columns of forces and moments differ in size as in a mixing, and rows do not."""
     lines, columns = (np.linalg.norm(m[3:]) / np.linalg.norm(m[:3]) for m in (matrix, matrix.T))
     differ = max(columns, 1.0 / columns) > _APART
     return bool(differ and max(lines, 1.0 / lines) < _ALIKE)
 
 
 def _axes(value: Any) -> Any:
-    """Axes by name as they are, or the numbers of a matrix."""
+    """Names of axes, or a matrix of numbers."""
     named = isinstance(value, list) and all(isinstance(name, str) for name in value)
     if named or isinstance(value, str):
         return value
@@ -242,7 +245,7 @@ def _axes(value: Any) -> Any:
 
 
 def save_sensor(path: str | PathLike[str], sensor: Sensor) -> None:
-    """Write a sensor that `load_sensor` reads, every number in full.
+    """Write a sensor to a file for `load_sensor`, with full precision.
 
     Parameters
     ----------
@@ -270,39 +273,39 @@ def save_sensor(path: str | PathLike[str], sensor: Sensor) -> None:
 
 
 def _array(values: Any) -> str:
+    """Array as TOML text."""
     return str(np.asarray(values, dtype=np.float64).tolist())
 
 
-# Distance from the base, m, up to which a probe touches nothing.
 _UNITS = {"m": 1.0, "mm": 1e-3, "um": 1e-6}
 _STAGE_KEYS = {"unit", "readings", "position", "touches", "shape", "whisker", "sweep"}
 _TOUCHES = {"file", "origin", "axes", "farthest", "base_sigma", "rest", "drift", "largest"}
 _SHAPE = {"file", "columns", "leave_out"}
 _WHISKER = {"base_radius", "tip_radius", "youngs_modulus", "noise"}
 _SWEEP = {"origin", "axes", "moves"}
-_AT_BASE = 1e-6
+_AT_BASE = 1e-6  # distance from the base up to which a probe is at the base, m
 
 
 class StageTouches(NamedTuple):
-    """Touches of a table."""
+    """Touches read from a table."""
 
     points: Array  # (n, 3), sensor frame, m
     readings: Array
-    rest: Array | None  # as stated, or the median of those with the probe at the base
-    drift: Array  # standard deviation from one recording to the next; zero where not known
+    rest: Array | None  # as stated, or the median of rows with the probe at the base
+    drift: Array  # standard deviation from one recording to the next; zero if unknown
 
 
 class StageSweep(NamedTuple):
-    """A sweep of a table."""
+    """Sweep read from a table."""
 
     readings: Array
-    position: Array  # (n, 3), of the sensor's origin in the frame of what is touched, m
-    rotation: Array  # (3, 3), from the sensor's frame to it
+    position: Array  # (n, 3), of the sensor's origin in the frame of the touched object, m
+    rotation: Array  # (3, 3), from the sensor's frame to that of the object
 
 
 @dataclass(frozen=True)
 class Stage:
-    """Description of a stage's tables."""
+    """Description of the tables of a positioning stage."""
 
     text: str
     folder: Path = Path()
@@ -314,7 +317,7 @@ class Stage:
             check_keys(subtable(table, name), keys, f"[{name}]")
         shapes = table.get("shape", [])
         if not isinstance(shapes, list) or not all(isinstance(s, Mapping) for s in shapes):
-            raise ValueError(f"shape is {quoted(shapes)}; write [[shape]] for each of its tables")
+            raise ValueError(f"shape is {quoted(shapes)}; write [[shape]] for each table")
         for shape in shapes:
             check_keys(shape, _SHAPE, "[[shape]]")
         if table.get("unit", "mm") not in _UNITS:
@@ -341,11 +344,11 @@ class Stage:
 
     @property
     def base_sigma(self) -> float:
-        """Standard deviation of the stated place of the base, m."""
+        """Standard deviation of the stated position of the base, m."""
         return self._unit * one_number(subtable(self._table, "touches"), "base_sigma", 0.15)
 
     def _columns(self, file: Any, names: tuple[str, ...]) -> Array:
-        """Columns of a file of the description, or of any other."""
+        """Columns of a table; relative paths are relative to the description."""
         if isinstance(file, Path):
             path = file
         elif isinstance(file, str):
@@ -373,8 +376,7 @@ class Stage:
             largest = number_array(own["largest"], "largest")
             if largest.shape not in ((), readings.shape[1:]):
                 raise ValueError(
-                    f"largest is {quoted(own['largest'])}; a number, or one of each channel, is "
-                    "needed"
+                    f"largest is {quoted(own['largest'])}; a number, or one per channel, is needed"
                 )
             touched &= (np.abs(readings) < largest).all(axis=1)
         free = np.median(readings[rest], axis=0) if rest.any() else None
@@ -389,7 +391,7 @@ class Stage:
         return StageTouches(points[touched], readings[touched], free, drift)
 
     def whisker(self) -> Whisker:
-        """Whisker at rest, in the sensor's frame, its base at the origin."""
+        """Whisker at rest, in the sensor's frame, with the base at the origin."""
         shapes = self._table.get("shape", [])
         if not shapes:
             raise ValueError("[[shape]] is missing: points along the whisker at rest are needed")
@@ -420,7 +422,7 @@ class Stage:
         )
 
     def _shape(self, shape: Mapping[str, Any]) -> dict[str, Array]:
-        """Coordinates of a table of the shape, m, less those of its first point."""
+        """Coordinates of a table of the shape, m, relative to its first point."""
         columns = shape.get("columns", {"x": "px", "y": "py", "z": "pz"})
         if not isinstance(columns, Mapping) or not set(columns) <= set("xyz"):
             raise ValueError(f"columns is {quoted(columns)}; as {{x = 'px', y = 'py'}} is needed")
@@ -430,7 +432,7 @@ class Stage:
         return dict(zip(columns, self._unit * (values - values[0]).T, strict=True))
 
     def sweep(self, path: str | PathLike[str]) -> StageSweep:
-        """Read a sweep."""
+        """Read a sweep from a table."""
         own = subtable(self._table, "sweep")
         moves = own.get("moves", "sensor")
         if moves not in ("sensor", "object"):
@@ -446,6 +448,7 @@ class Stage:
 
 
 def _names(table: Mapping[str, Any], key: str) -> tuple[str, ...]:
+    """Names of columns under a key."""
     names = table.get(key)
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ValueError(f"{key} is {quoted(names)}; the names of columns are needed")
@@ -455,23 +458,23 @@ def _names(table: Mapping[str, Any], key: str) -> tuple[str, ...]:
 
 
 def _directions(table: Mapping[str, Any], where: str) -> Array:
-    """Sensor's axes (columns) along the stage's."""
+    """Axes of the sensor (columns) in the stage's frame."""
     axes = table.get("axes", ["x", "y", "z"])
     with in_file(f"[{where}]"):
         return np.asarray(SensorFrame(axes=axes).axes)
 
 
 def _read_off(known: Array, values: Array, wanted: Array, name: str) -> Array:
-    """Values where a shared coordinate is the wanted one."""
+    """Interpolate values at given values of a shared coordinate."""
     forward = known if known[-1] >= known[0] else -known
     order = np.argsort(forward, kind="stable")
     if np.abs(forward[order] - forward).max() > 0.1 * np.ptp(known):
-        raise ValueError(f"{name} turns back along the shape: nothing can be read off by it")
+        raise ValueError(f"{name} is not monotone along the shape: it cannot be interpolated")
     sign = 1.0 if known[-1] >= known[0] else -1.0
     return np.interp(sign * wanted, forward[order], values[order])
 
 
-# Dimensions and unit of what is stored of a sensor; a channel's own where there is none.
+# Dimensions and unit of the stored fields of a sensor; an empty unit is that of the channel.
 _STORED: dict[str, tuple[tuple[str, ...], str]] = {
     "rotation_compliance": ((), "rad N-1 m-1"),
     "shift_compliance": ((), "m N-1"),
@@ -486,7 +489,7 @@ _STORED: dict[str, tuple[tuple[str, ...], str]] = {
 def save_suspended(
     path: str | PathLike[str], calibration: SuspensionCalibration, stage: Stage
 ) -> None:
-    """Write a calibrated sensor that `load_suspended` reads."""
+    """Write a calibrated sensor to a file for `load_suspended`."""
     sensor = calibration.sensor
     channel, unknown = ("channel", list(sensor.channels)), ("unknown", list(calibration.names))
     stored = {
@@ -519,10 +522,13 @@ KIND = "suspended whisker"
 
 
 def load_suspended(path: str | PathLike[str]) -> tuple[SuspendedWhisker, Stage]:
-    """Read a calibrated sensor, and the description of its stage's tables."""
+    """Read a calibrated sensor, and the description of its stage."""
     data = read_dataset(path) if is_netcdf(path) else xr.Dataset()
     if data.attrs.get("kind") != KIND:
-        raise ValueError(f"{path} holds no calibrated suspended whisker; `vibrissa calibrate` does")
+        raise ValueError(
+            f"{path} does not contain a calibrated suspended whisker, as written by "
+            "`vibrissa calibrate`"
+        )
     residual = None
     if "plate_points" in data:
         residual = ThinPlate(

@@ -1,16 +1,16 @@
-"""A sensor's frame at the whisker: axes, handedness, origin and sign, and its calibration.
+"""Frame of a sensor relative to the whisker (axes, handedness, origin, sign) and its calibration.
 
 With the sensor's axes as the columns of Q, in the whisker's frame, and its origin at o,
 
     x = Q x_s + o,    F = σ Q F_s,    M = σ det(Q) Q M_s + o × F,
 
-where σ = -1 for a sensor that reports the force with which it holds the whisker, instead of that of
-the object on the whisker. Axes that form a left hand have det Q = -1, and moments that follow the
-left hand: M_s = x_s × F_s in the sensor's own numbers.
+where σ = -1 for a sensor that reports its own force on the whisker instead of that of the object on
+the whisker. Left-handed axes have det Q = -1, and their moments follow the left-hand rule:
+M_s = x_s × F_s in the sensor's coordinates.
 
-Known loads determine a frame: forces give P = σQ, by the rotation or reflection that fits them
-best; moments then follow P or -P, which distinguishes a left hand or a reaction from their
-opposites; and the rest of the moments gives the origin. All six unknowns are then fitted together.
+Known loads determine the frame. Forces give P = σQ as the best-fitting rotation or reflection;
+moments then transform by P or -P, which separates handedness from sign; the remaining part of the
+moments gives the origin. Finally, all six unknowns are fitted together.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ from vibrissa.deferred import optimize, transform
 from vibrissa.numerics import Array, cross_matrix, numbers
 from vibrissa.sensors.regression import solve, warn_of_misfit
 
-_ORTHOGONAL = 1e-3  # stretch up to which axes, typed with few digits, are brought to right angles
+_ORTHOGONAL = 1e-3  # largest deviation from orthonormal axes, as of rounded digits, to be corrected
 
 
 @dataclass(frozen=True, eq=False)
 class SensorFrame:
-    """A sensor's frame relative to the whisker's frame at its base.
+    """Frame of a sensor relative to the whisker frame at its base.
 
     Parameters
     ----------
     axes : array_like (3, 3) or sequence of str
-        Axes of the sensor as columns, in the whisker's frame; or the directions of its x, y and z
-        as signed names: ``("x", "-z", "y")``. A left hand is allowed.
+        Axes of the sensor as columns, in the whisker frame; or the directions of its x, y and z
+        as signed names: ``("x", "-z", "y")``. Left-handed axes are allowed.
     position : array_like (3,)
-        Point about which the sensor's moments are, whisker's frame, m.
+        Reference point of the sensor's moments, whisker frame, m.
     reaction : bool
-        Whether the sensor reports the force that it exerts on the whisker, not the one on itself:
-        all six components then have the other sign.
+        Whether the sensor reports the force that it exerts on the whisker instead of that on
+        itself: all six components then have the opposite sign.
 
     Raises
     ------
     ValueError
-        If the axes are not at right angles, or something is not finite.
+        If the axes are not orthonormal, or a number is not finite.
 
     Examples
     --------
@@ -60,7 +60,7 @@ class SensorFrame:
     reaction: bool = False
 
     def __post_init__(self) -> None:
-        """Check, and bring the axes to right angles."""
+        """Validate the fields, and make the axes exactly orthonormal."""
         axes = _axes(self.axes)
         position = np.array(self.position, dtype=np.float64)
         if position.shape != (3,) or not np.isfinite(position).all():
@@ -71,11 +71,11 @@ class SensorFrame:
 
     @property
     def handedness(self) -> int:
-        """1 where the axes form a right hand, -1 where they form a left hand."""
+        """Sign of the handedness of the axes: 1 for right-handed, -1 for left-handed."""
         return 1 if np.linalg.det(self.axes) > 0.0 else -1
 
     def to_base(self) -> Array:
-        """Matrix from the sensor's (F, M) to that at the whisker's base.
+        """Matrix from the sensor's (F, M) to (F, M) at the whisker's base.
 
         Returns
         -------
@@ -101,6 +101,7 @@ class SensorFrame:
 
 
 def _axes(value: Any) -> Array:
+    """Orthonormal axes (3, 3) from numbers or names."""
     if isinstance(value, str):
         value = value.replace(",", " ").split()
     if isinstance(value, Sequence) and all(isinstance(name, str) for name in value):
@@ -118,6 +119,7 @@ def _axes(value: Any) -> Array:
 
 
 def _named_axes(names: Sequence[str]) -> Array:
+    """Axes (3, 3) from signed names."""
     axes = np.zeros((3, 3))
     letters = [name.lstrip("+-") for name in names]
     if sorted(letters) != ["x", "y", "z"]:
@@ -129,27 +131,26 @@ def _named_axes(names: Sequence[str]) -> Array:
     return axes
 
 
-# Ratio of the residuals of two signs of the moments from which the better one is chosen.
-_ADVICE = "apply forces in at least two directions, at two places or more"
-_CLEARLY = 2.0
-_GAIN = 2.0  # ratio of forces to loads from which they are in another unit, or have an offset
-# Shares of the largest spread of forces below which they are on a line, or in a plane.
+_ADVICE = "apply forces in at least two directions, at two points or more"
+_CLEARLY = 2.0  # smallest ratio of the residuals of the two signs of moments that decides
+_GAIN = 2.0  # largest ratio of measured forces to loads without an error of units or offset
+# Relative spreads of forces below which these are on one line, or in one plane.
 _ALONG, _FLAT = 1e-4, 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class FrameCalibration:
-    """A sensor's frame as determined by known loads.
+    """Frame of a sensor, calibrated by known loads.
 
     Attributes
     ----------
     frame : SensorFrame
         Frame of the sensor.
     covariance : (6, 6) array
-        Covariance of a small rotation of the axes (about x, y, z of the whisker's frame, rad) and
+        Covariance of a small rotation of the axes (about x, y, z of the whisker frame, rad) and
         of the origin (m).
     force_residual, moment_residual : float
-        Root mean square residual of a component, N and N·m.
+        Root mean square residuals of components, N and N·m.
     misfit : float
         χ² per degree of freedom: near 1, unless noise, loads or gain are not as stated.
     """
@@ -168,14 +169,14 @@ def calibrate_frame(
     force_noise: float,
     moment_noise: float,
 ) -> FrameCalibration:
-    """Find the frame of a six-component sensor from known loads.
+    """Fit the frame of a six-component sensor to known loads.
 
     Parameters
     ----------
     readings : array_like (n, 6)
         Readings (F, M) in the sensor's frame, without offset, N and N·m.
     wrenches : array_like (n, 6)
-        Loads: (F, M) at the whisker's base, whisker's frame.
+        Loads (F, M) at the whisker's base, whisker frame, N and N·m.
     force_noise, moment_noise : float
         Standard deviations of the readings' components, N and N·m.
 
@@ -187,7 +188,7 @@ def calibrate_frame(
     Raises
     ------
     ValueError
-        If shapes do not fit, readings are in other units, or the loads do not determine the frame.
+        If shapes or units do not match, or the loads do not determine the frame.
 
     Warns
     -----
@@ -221,7 +222,7 @@ def calibrate_frame(
     def residuals(unknowns: Array) -> Array:
         return np.asarray(((read - true @ frame(unknowns).from_base().T) / noise).ravel())
 
-    # The lever arm's scale, so that both kinds of unknowns count alike.
+    # Typical lever arm, by which rotations and positions have comparable scales.
     scale = max(float(np.linalg.norm(position)), moment_noise / force_noise)
     fit = optimize.least_squares(
         residuals,
@@ -244,33 +245,33 @@ def calibrate_frame(
 
 
 def _check_units(read: Array, true: Array) -> None:
-    """Refuse forces of another size than the loads: a frame turns and does not stretch."""
+    """Raise ValueError if forces and loads differ in size, which a frame cannot cause."""
     loads = float(np.linalg.norm(true[:, :3]))
     gain = float(np.linalg.norm(read[:, :3])) / loads if loads > 0.0 else 1.0
     if not 1.0 / _GAIN < gain < _GAIN:
         raise ValueError(
-            f"the forces read are {gain:.3g} times the loads: readings are needed in N and N·m, "
-            "without offset"
+            f"the measured forces are {gain:.3g} times the loads: readings are needed in N and "
+            "N·m, without offset"
         )
 
 
 def _matched(read: Array, true: Array) -> Array:
-    """The rotation or reflection P for which P read comes nearest to true."""
+    """Rotation or reflection P that minimises |P read − true|."""
     u, size, v = np.linalg.svd(true.T @ read)
     if not size[0] > 0.0 or size[1] < _ALONG * size[0]:
         raise ValueError(
-            "all forces are along one line, so the turn about it is not determined: " + _ADVICE
+            "all forces are along one line, so the rotation about it is not determined: " + _ADVICE
         )
     if size[2] < _FLAT * size[0]:
         raise ValueError(
-            "all forces are in one plane, so left and right hand cannot be distinguished: apply "
-            "forces in three directions"
+            "all forces are in one plane, so the axes' handedness is not determined: apply forces "
+            "in three directions"
         )
     return np.asarray(u @ v)
 
 
 def _placed(read: Array, true: Array, force: Array, hand: int) -> tuple[Array, float]:
-    """Origin and root mean square residual of the moments, for moments that follow ±P."""
+    """Origin, and root mean square residual of the moments if these transform by ``hand`` × P."""
     arms = -cross_matrix(true[:, :3]).reshape(-1, 3)  # o × F = -F × o
     rest = (true[:, 3:] - hand * read[:, 3:] @ force.T).reshape(-1)
     size = np.abs(arms).max()

@@ -1,11 +1,11 @@
-"""Linear least squares that name what the data do not determine; readings over contact points.
+"""Linear least squares with a check of identifiability, and thin-plate Gaussian processes.
 
-The latter are a Gaussian process with the thin-plate kernel,
+The Gaussian process models readings as a function of the contact point, with the thin-plate kernel
 
     k(d) = a² (2 d³ − 3 R d² + R³) / R³ for distances d ≤ R
 
-(Williams & Fitzgibbon, *Gaussian process implicit surfaces*, 2007): it has no length to be fitted
-and does not fall back to its mean between points, as a squared exponential does.
+(Williams & Fitzgibbon, *Gaussian process implicit surfaces*, 2007): unlike the squared exponential,
+it has no length scale to be fitted and does not revert to the mean between points.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 from vibrissa.deferred import linalg, spatial
 from vibrissa.numerics import Array
 
-# Condition number, of columns scaled to one, from which unknowns are not determined.
+# Largest condition number, with columns scaled to length one, at which unknowns are determined.
 _CONDITION = 1e4
 
 
@@ -34,7 +34,7 @@ class Solution(NamedTuple):
 
 
 def solve(design: Array, values: Array, names: Sequence[str], advice: str) -> Solution:
-    """Solve A x = y by least squares."""
+    """Solve A x = y by least squares; raise ValueError that names undetermined unknowns."""
     n, p = design.shape
     if n < p:
         raise ValueError(f"{n} equations do not determine {p} unknowns: {advice}")
@@ -52,43 +52,45 @@ def solve(design: Array, values: Array, names: Sequence[str], advice: str) -> So
 
 
 def _combination(direction: Array, names: Sequence[str]) -> str:
+    """Describe the undetermined combination of unknowns."""
     largest = np.abs(direction).max()
     parts = [name for name, c in zip(names, direction, strict=True) if abs(c) > 0.1 * largest]
     return parts[0] if len(parts) == 1 else "how much comes from each of " + ", ".join(parts)
 
 
-_MANY = 5.0  # residuals over the noise up to which the noise may have been stated too small
+_MANY = 5.0  # ratio of residuals to noise above which the user is warned
 
 
 def warn_of_misfit(misfit: float, advice: str) -> None:
-    """Warn where residuals are far larger than the noise."""
+    """Warn if residuals are far larger than the noise; ``misfit`` is χ² per degree of freedom."""
     if misfit > _MANY**2:
         warnings.warn(
-            f"what is left unexplained is {math.sqrt(misfit):.0f} times the noise: check {advice}",
+            f"the residuals are {math.sqrt(misfit):.0f} times the noise: check {advice}",
             stacklevel=3,
         )
 
 
 def warn_of_surprise(log_factor: float, sigma: float) -> None:
-    """Warn where loads contradict the modulus and radius that were stated for a whisker."""
+    """Warn if loads contradict a whisker's stated modulus and radius."""
     if abs(log_factor) > _MANY * sigma:
         warnings.warn(
-            f"the loads make E r⁴ {math.exp(log_factor):.3g} times that of the given modulus and "
+            f"E r⁴ by the loads is {math.exp(log_factor):.3g} times that of the given modulus and "
             f"radius, {abs(log_factor) / sigma if sigma else math.inf:.0f} standard deviations "
-            "off: check their units, whether the radius is a diameter, and the readings' units",
+            "away: check their units, whether the radius is a diameter, and the readings' units",
             stacklevel=4,
         )
 
 
-# Noise variance over that of the process; the one of largest marginal likelihood is taken.
+# Candidate ratios of the noise variance to that of the process.
 _RATIOS = np.logspace(-7, 1, 17)
 
 
 @dataclass(frozen=True, eq=False)
 class ThinPlate:
-    """Mean of a thin-plate Gaussian process; no two of its points are farther apart than its reach.
+    """Mean of a thin-plate Gaussian process of k quantities.
 
-    Its noise is the standard deviation that was found.
+    ``reach`` is the R of the kernel, at least the distance between any two ``points`` (n, 3);
+    ``noise`` (k,) is the fitted standard deviation of the noise.
     """
 
     points: Array
@@ -98,7 +100,11 @@ class ThinPlate:
 
     @classmethod
     def fit(cls, points: Array, values: Array, ratio: float | None = None) -> ThinPlate:
-        """Fit values (n, k) of zero mean; where no noise is stated, by the largest likelihood."""
+        """Fit values (n, k) of zero mean at points (n, 3).
+
+        ``ratio`` is the ratio of noise variance to that of the process, by default that of maximum
+        marginal likelihood for each quantity.
+        """
         reach = 2.0 * float(np.linalg.norm(np.ptp(points, axis=0)))
         kernel = _kernel(spatial.distance.cdist(points, points) / reach)
         n, k = values.shape
@@ -126,5 +132,6 @@ class ThinPlate:
 
 
 def _kernel(x: Array) -> Array:
+    """Kernel at distances x, in units of R."""
     x = np.minimum(x, 1.0)
     return np.asarray((2.0 * x - 3.0) * x * x + 1.0)

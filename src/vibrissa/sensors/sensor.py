@@ -1,26 +1,27 @@
-"""A force and torque sensor at the base: its readings and their errors.
+"""Model of a force and torque sensor at the whisker's base, with its errors.
 
-A sensor has channels, each a linear mix of the six components (F_x, F_y, F_z, M_x, M_y, M_z):
+A sensor has channels, each a linear mixture of the components (F_x, F_y, F_z, M_x, M_y, M_z):
 
     reading = round((1 + g)(1 + ε)(A w) + b + d(t) + n),    at most ± the largest reading,
 
-with the mixing A, an error of gain g and noise ε relative to the signal, a bias b, a drift d that
-is a random walk, white noise n, and rounding to the channel's resolution. The usual sensor has the
-six components themselves as channels; whiskers of robots often have two or three.
+with the mixing A, a gain error g and noise ε relative to the signal, a bias b, a drift d that is a
+random walk, white noise n, and rounding to the channel's resolution. By default the channels are
+the six components themselves; robotic whiskers often have two or three channels.
 
-w is in the sensor's own frame: H = A X⁻¹ mixes the wrench at the whisker's base, with X of
-:class:`~vibrissa.sensors.SensorFrame`. To the contact's wrench comes the weight of what the sensor
-carries: (m g, m c × g) for its mass m with its centre at c, g as seen from the base.
+The wrench w is in the sensor's own frame: H = A X⁻¹ is the mixing of the wrench at the whisker's
+base, with X of :class:`~vibrissa.sensors.SensorFrame`. The weight that the sensor carries is added
+to the wrench of the contact: (m g, m c × g) for a mass m with its centre at c, with g in the frame
+of the base.
 
-The same description serves in both directions: :meth:`Sensor.read` simulates,
-:meth:`Sensor.compensated` removes offset and weight, and :meth:`Sensor.to_wrench` returns to force
-and moment at the base.
+:meth:`Sensor.read` simulates readings, :meth:`Sensor.compensated` removes offset and weight from
+readings, and :meth:`Sensor.to_wrench` converts them to force and moment at the base.
 
-Noise differs from reading to reading. Errors of gain, of the mixing and of a calibration are the
-same in all of them, and averaging leaves them: a channel with the stated mix a w + b and the true
-one (a + δa) w + b + δb has the error (δa, δb) (w, 1) in every reading of the wrench w. Such errors
-are written as independent ones of standard deviation one, each a matrix E (k, 7) with the errors
-ε E (w, 1) of the k channels; so the covariance of readings gets Σ E (w, 1) (w, 1)ᵀ Eᵀ.
+Noise differs from reading to reading. Errors of gain, mixing and calibration are the same in all
+readings, so that averaging does not reduce them: a channel with the stated response a w + b and the
+true one (a + δa) w + b + δb has the error (δa, δb) (w, 1) in every reading of the wrench w. Such
+errors are represented by independent variables ε of standard deviation one, each with a matrix E
+(k, 7) of the errors ε E (w, 1) of the k channels; they add Σ E (w, 1) (w, 1)ᵀ Eᵀ to the covariance
+of readings.
 """
 
 from __future__ import annotations
@@ -43,14 +44,14 @@ MOMENT_NOISE = 0.02e-6
 """Standard deviation of a component of the measured moment, N·m."""
 
 COMPONENTS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
-"""Components that are mixed, in this order."""
+"""Components of the wrench, in this order."""
 
 GRAVITY = (0.0, 0.0, -9.80665)
-"""Acceleration of a falling body in the laboratory frame, m/s²."""
+"""Gravitational acceleration in the laboratory frame, m/s²."""
 
-_UNREAD = 1e-9  # relative size below which a combination of components is not read
-_ROUNDING = 1e-12  # size below which eigenvalues of a matrix of correlations are rounding
-# Size from which asymmetries and negative eigenvalues of correlations are faults.
+_UNREAD = 1e-9  # relative size below which a combination of components is not measured
+_ROUNDING = 1e-12  # size below which eigenvalues of a correlation matrix are due to rounding
+# Size above which asymmetries and negative eigenvalues of a correlation matrix are errors.
 _INDEFINITE = 1e-9
 
 
@@ -58,51 +59,51 @@ _INDEFINITE = 1e-9
 class Sensor:
     """A force and torque sensor at the base of a whisker.
 
-    Quantities of channels are numbers for all of them or one number each, in the channel's unit:
-    that of the component it reads (N, N·m), or the unit by its mixing.
+    Values of channels are one number for all or one per channel, in the unit of the channel: that
+    of its component (N, N·m), or the one implied by its mixing.
 
     Parameters
     ----------
     channels : sequence of str
-        Names of the channels. Without a mixing, the components that are read.
+        Names of the channels. Without a mixing, these are the measured components.
     mixing : array_like (k, 6), optional
-        Weights of each of the k channels for (Fx, Fy, Fz, Mx, My, Mz). Of channels that are
-        components, numbers for all or one each are enough: 1e3 for mN and mN·m (= N·mm).
+        Weights of (Fx, Fy, Fz, Mx, My, Mz) in each of the k channels. If channels are components,
+        one number for all or one per channel suffices: 1e3 for mN and mN·m (= N·mm).
     noise : array_like, optional
         Standard deviation of white noise; by default that of `FORCE_NOISE` and `MOMENT_NOISE` in
         every component.
     bias : array_like
         Constant offset.
     drift : array_like
-        Standard deviation of a random walk after one second; it begins at zero.
+        Standard deviation, after one second, of a random walk that starts at zero.
     resolution : array_like
-        Readings are rounded to multiples of this; 0 for none.
+        Resolution to whose multiples readings are rounded; 0 for no rounding.
     largest : array_like
-        Size of the largest reading; one that has reached it is saturated and missing. Infinite,
-        the default, for none.
+        Size of the largest reading. A reading that reaches it is saturated and counts as missing.
+        The default, infinity, stands for no limit.
     relative_noise : float
         Standard deviation of white noise relative to the signal.
     gain_error : array_like
-        Standard deviation of the channels' errors of gain, relative: the same in all readings, one
-        channel's independent of another's.
+        Relative standard deviation of the channels' gain errors, which are the same in all readings
+        and independent among channels.
     mixing_error : float or array_like (k, 6)
-        Standard deviation of the errors of the mixing, the same in all readings: of each number of
-        it, in its unit; or, as one number, relative to the channel's largest mixing of a force, or
-        of a moment, so that cross-talk among forces and among moments is part of it.
+        Standard deviation of the errors of the mixing, the same in all readings. An array states
+        that of each entry, in its unit; one number is relative to the channel's largest weight of a
+        force or of a moment, and so includes cross-talk among forces and among moments.
     mixing_covariance : array_like (k, 7, 7), optional
-        Covariance of each channel's mixing of the six components and, last, its offset, as a
-        calibration leaves it; in addition to the two stated errors.
+        Covariance of each channel's mixing of the six components and, last, its offset, as
+        determined by a calibration; in addition to the two stated errors.
     frame : SensorFrame
-        Frame of the sensor; by default the whisker's.
+        Frame of the sensor; by default the whisker frame.
     mass : float
-        Mass that it carries, kg, whose weight is in the readings.
+        Mass carried by the sensor, kg, whose weight is part of the readings.
     mass_moment : array_like (3,)
-        First moment of that mass, mass times centre, in the whisker's frame, kg·m.
+        First moment of that mass, mass times centre, whisker frame, kg·m.
 
     Raises
     ------
     ValueError
-        If numbers do not fit or are negative where they cannot be.
+        If shapes do not match, or a number is negative or not finite.
 
     Examples
     --------
@@ -128,7 +129,7 @@ class Sensor:
     mass_moment: Any = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        """Check, and give every channel its numbers."""
+        """Validate the fields, and expand values to all channels."""
         names = tuple(self.channels)
         faults: list[str] = []
         if not names or len(set(names)) != len(names):
@@ -159,13 +160,13 @@ class Sensor:
         if not isinstance(self.frame, SensorFrame):
             faults.append(f"frame is {self.frame!r}; a SensorFrame is needed")
         if faults:
-            raise ValueError("no sensor: " + "; ".join(faults))
+            raise ValueError("the sensor is not valid: " + "; ".join(faults))
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
     @property
     def reads_wrench(self) -> bool:
-        """Whether the channels are the six components at the whisker's base, in their order."""
+        """Whether the channels are the six components at the whisker's base, in this order."""
         return self.channels == COMPONENTS and bool((self.base_mixing == np.eye(6)).all())
 
     @cached_property
@@ -175,17 +176,17 @@ class Sensor:
         return np.asarray(self.mixing if plain else self.mixing @ self.frame.from_base())
 
     def covariance(self, reading: ArrayLike = 0.0) -> Array:
-        """Covariance of one reading's noise: white, relative, and that of rounding.
+        """Covariance of the noise of one reading: white noise, relative noise and rounding.
 
         Parameters
         ----------
         reading : array_like (k,)
-            Reading that the relative noise is relative to.
+            Reading, which scales the relative noise.
 
         Returns
         -------
         array (k, k)
-            Diagonal covariance; drift is not in it, nor are the `common_errors`.
+            Diagonal covariance, without drift and `common_errors`.
         """
         relative = self.relative_noise * np.asarray(reading, dtype=np.float64)
         variance = self.noise**2 + self.resolution**2 / 12.0 + relative**2
@@ -193,10 +194,10 @@ class Sensor:
 
     @cached_property
     def common_errors(self) -> Array:
-        """Errors of gain, mixing and offset that all readings share, E (n, k, 7).
+        """Errors E (n, k, 7) of gain, mixing and offset that all readings share.
 
-        Each is independent of the others: readings of (F, M) at the whisker's base are wrong by
-        ε E (F, M, 1), where ε is drawn once, with standard deviation 1.
+        The n errors are independent: each adds ε E (F, M, 1) to the readings of the wrench (F, M)
+        at the whisker's base, with one ε of standard deviation 1 for all readings.
         """
         own = np.concatenate(
             [
@@ -210,19 +211,19 @@ class Sensor:
         return own
 
     def with_new_offset(self, readings: int, bias: ArrayLike | None = None) -> Sensor:
-        """Same sensor with an offset that was found as the mean of so many readings.
+        """Copy of the sensor with an offset determined as the mean of readings.
 
         Parameters
         ----------
         readings : int
-            Number of readings.
+            Number of readings in the mean.
         bias : array_like (k,), optional
-            New offset; by default the present one.
+            New offset; by default the current one.
 
         Returns
         -------
         Sensor
-            Sensor whose `mixing_covariance` has the offset's new variance, by the noise.
+            Sensor whose `mixing_covariance` contains the variance of the new offset.
         """
         variance = np.diag(self.covariance()) / readings
         return replace(
@@ -232,19 +233,19 @@ class Sensor:
         )
 
     def weight(self, rotation: ArrayLike, gravity: ArrayLike = GRAVITY) -> Array:
-        """Wrench at the base of the weight that the sensor carries.
+        """Wrench at the base due to the weight that the sensor carries.
 
         Parameters
         ----------
         rotation : array_like (..., 3, 3)
-            Rotation from the whisker's to the laboratory frame.
+            Rotation from the whisker frame to the laboratory frame.
         gravity : array_like (3,)
-            Acceleration in the laboratory frame, m/s².
+            Gravitational acceleration in the laboratory frame, m/s².
 
         Returns
         -------
         array (..., 6)
-            Wrench (F, M), whisker's frame, N and N·m.
+            Wrench (F, M), whisker frame, N and N·m.
         """
         g = numbers("gravity", gravity) @ rotation_matrices("rotation", rotation)
         return np.concatenate([self.mass * g, np.cross(self.mass_moment, g)], axis=-1)
@@ -255,7 +256,7 @@ class Sensor:
         rotation: ArrayLike | None = None,
         gravity: ArrayLike = GRAVITY,
     ) -> Array:
-        """Readings without offset and weight: H (F, M) of the contact, and noise.
+        """Remove offset and weight from readings, which leaves H (F, M) of the contact and noise.
 
         Parameters
         ----------
@@ -270,12 +271,12 @@ class Sensor:
         Returns
         -------
         array (..., k)
-            Readings in the units of the channels; NaN for what is saturated.
+            Readings in the units of the channels; NaN if saturated.
 
         Raises
         ------
         ValueError
-            If there are not as many channels, or the orientation is not known but needed.
+            If the number of channels differs, or a required rotation is missing.
         """
         values = numbers("readings", readings, self.channels)
         if values.shape[-1:] != (len(self.channels),):
@@ -299,7 +300,7 @@ class Sensor:
         rotation: ArrayLike | None = None,
         gravity: ArrayLike = GRAVITY,
     ) -> tuple[Array, Array]:
-        """Force and moment at the whisker's base, weighted by the noise.
+        """Estimate force and moment at the whisker's base by weighted least squares.
 
         Parameters
         ----------
@@ -314,9 +315,9 @@ class Sensor:
         Returns
         -------
         wrench : array (..., 6)
-            Wrench (F, M), whisker's frame, N and N·m.
+            Wrench (F, M), whisker frame, N and N·m.
         covariance : array (6, 6)
-            Covariance of its noise; the `common_errors` are not in it.
+            Covariance of its noise, without `common_errors`.
 
         Raises
         ------
@@ -329,7 +330,7 @@ class Sensor:
         if h.shape[0] < 6 or np.linalg.cond(h / np.where(size > 0.0, size, 1.0)) > 1.0 / _UNREAD:
             raise ValueError(
                 f"the channels {', '.join(self.channels)} do not determine all six components of "
-                "force and moment: estimate from the channels themselves"
+                "force and moment: estimate contacts from the channels themselves"
             )
         back = np.linalg.pinv(weight[:, None] * h) * weight
         wrench = self.compensated(readings, rotation, gravity) @ back.T
@@ -342,16 +343,16 @@ class Sensor:
         seed: int = 0,
         rotation: ArrayLike | None = None,
     ) -> Array:
-        """Readings of a wrench over time.
+        """Simulate readings of a wrench over time.
 
         Parameters
         ----------
         time : array_like (n,)
-            Times of the samples, s, not falling.
+            Times of the samples, s, not decreasing.
         wrench : array_like (n, 6)
             Force, N, and moment, N·m, at the whisker's base; NaN gives NaN.
         seed : int
-            Seed of all that is random.
+            Seed of the random errors.
         rotation : array_like (n, 3, 3), optional
             Rotation from the whisker's to the laboratory frame; needed where the sensor carries a
             mass.
@@ -364,8 +365,8 @@ class Sensor:
         Raises
         ------
         ValueError
-            If shapes do not fit, time falls or is not finite, or the orientation is not known but
-            needed.
+            If shapes do not match, time decreases or is not finite, or a required rotation is
+            missing.
         """
         at, true = numbers("time", time), numbers("wrench", wrench, COMPONENTS)
         if at.ndim != 1 or true.shape != (at.size, 6):
@@ -373,11 +374,11 @@ class Sensor:
                 f"times (n,) and wrenches (n, 6) are needed; got {at.shape} and {true.shape}"
             )
         if not np.isfinite(at).all() or (np.diff(at) < 0.0).any():
-            raise ValueError(f"times are finite and do not fall; got {_first_fault(at)}")
+            raise ValueError(f"times must be finite and not decrease; got {_first_fault(at)}")
         generator = np.random.default_rng(seed)
         if self.mass > 0.0 or self.mass_moment.any():
             if rotation is None:
-                raise ValueError("the sensor carries a mass, so the rotation is needed to weigh it")
+                raise ValueError("the sensor carries a mass, so the rotation is needed")
             true = true + self.weight(rotation)
         reading = true @ self.base_mixing.T
         size = reading.shape
@@ -399,21 +400,21 @@ class Sensor:
 
 
 def component_noise(force_noise: float, moment_noise: float) -> Array:
-    """Covariance of a sensor whose components have independent noise."""
+    """Covariance (6, 6) of (F, M) with independent noise of equal size in force and in moment."""
     return np.diag(np.repeat([force_noise**2, moment_noise**2], 3))
 
 
 def _checked_mixing(names: tuple[str, ...], mixing: Any, faults: list[str]) -> Array:
-    """Mixing (k, 6) of channels; what is wrong is added to the faults."""
+    """Mixing (k, 6) of channels; errors are appended to ``faults``."""
     array = np.array(1.0 if mixing is None else mixing, dtype=np.float64)
     if array.ndim < 2:
         unknown = [name for name in names if name not in COMPONENTS]
         if unknown:
             known = ", ".join(COMPONENTS)
-            faults.append(f"channels {unknown} are none of {known}, so mixing (k, 6) is needed")
+            faults.append(f"channels {unknown} are not among {known}, so mixing (k, 6) is needed")
         rows = [[float(name == component) for component in COMPONENTS] for name in names]
         if array.shape not in ((), (len(names),)):
-            faults.append(f"mixing has shape {array.shape}; one number a channel is needed")
+            faults.append(f"mixing has shape {array.shape}; one number per channel is needed")
             array = np.ones(())
         array = array[..., None] * np.array(rows).reshape(-1, 6)
     if array.shape != (len(names), 6) or not np.isfinite(array).all():
@@ -424,7 +425,7 @@ def _checked_mixing(names: tuple[str, ...], mixing: Any, faults: list[str]) -> A
 def _checked_numbers(
     sensor: Sensor, mixing: Array, channels: int, faults: list[str]
 ) -> dict[str, Array]:
-    """Numbers of each channel; what is wrong is added to the faults."""
+    """Values (k,) of all channels by name; errors are appended to ``faults``."""
     usual = np.repeat([FORCE_NOISE, MOMENT_NOISE], 3)
     numbers = {}
     for name in ("noise", "bias", "drift", "resolution", "largest", "gain_error"):
@@ -447,7 +448,7 @@ def _checked_numbers(
 
 
 def _first_fault(time: Array) -> str:
-    """Text of where times fall or are not finite."""
+    """Describe the first time that decreases or is not finite."""
     bad = ~np.isfinite(time)
     bad[1:] |= np.diff(time) < 0.0
     i = int(bad.argmax())
@@ -455,7 +456,7 @@ def _first_fault(time: Array) -> str:
 
 
 def _by_gain(mixing: Array, sigma: Array) -> Array:
-    """Errors of gain."""
+    """Shared errors (n, k, 7) of gain."""
     which = np.flatnonzero(sigma > 0.0)
     out = np.zeros((which.size, len(mixing), 7))
     out[range(which.size), which, :6] = sigma[which, None] * mixing[which]
@@ -463,7 +464,7 @@ def _by_gain(mixing: Array, sigma: Array) -> Array:
 
 
 def _by_mixing(mixing: Array, sigma: Array) -> Array:
-    """Errors of the mixing."""
+    """Shared errors (n, k, 7) of the mixing."""
     if sigma.ndim == 0:
         largest = np.abs(mixing.reshape(-1, 2, 3)).max(axis=2)
         sigma = sigma * np.repeat(largest, 3, axis=1)
@@ -474,7 +475,7 @@ def _by_mixing(mixing: Array, sigma: Array) -> Array:
 
 
 def _by_calibration(covariance: Array) -> Array:
-    """Errors of the results of a calibration."""
+    """Shared errors (n, k, 7) equivalent to the covariance (k, 7, 7) of a calibration."""
     found = [np.zeros((0, len(covariance), 7))]
     for channel, own in enumerate(covariance):
         size = np.sqrt(np.diag(own))
@@ -488,7 +489,7 @@ def _by_calibration(covariance: Array) -> Array:
 
 
 def with_offset(covariance: Array, variance: Array) -> Array:
-    """Covariance of mixing and offset once the offset was found anew, by itself."""
+    """Covariance (k, 7, 7) of mixing and offset after the offset alone was measured again."""
     out = covariance.copy()
     out[:, 6, :] = out[:, :, 6] = 0.0
     out[:, 6, 6] = variance
@@ -496,7 +497,7 @@ def with_offset(covariance: Array, variance: Array) -> Array:
 
 
 def _checked_covariance(value: Any, channels: int) -> tuple[Array, list[str]]:
-    """Check covariances of mixing and offset."""
+    """Covariance (k, 7, 7) of mixing and offset, and its faults."""
     shape = (channels, 7, 7)
     if value is None:
         return np.zeros(shape), []

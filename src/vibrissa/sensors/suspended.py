@@ -1,21 +1,23 @@
-"""A whisker on a compliant suspension that is read by the motion of its base.
+"""Model of a whisker on a compliant suspension whose base motion is measured.
 
-The usual read-out is a magnet over a Hall sensor. The contact's force F and its moment M about a
-pivot turn the base by θ and shift it by u:
+Typically a Hall sensor measures the motion of a magnet at the base. The contact force F and its
+moment M about a pivot rotate the base by θ and shift it by u:
 
     θ = c_r M,    u = c_t F,    p = o + b + u + exp(θ) (D x − b),
 
-with the contact x(ξ), ξ = (s, f_y, f_z), of the rod in the frame of its base section, the base o,
-the pivot o + b and the base's orientation D at rest, in the sensor's frame. Each channel reads
+where x(ξ), ξ = (s, f_y, f_z), is the contact point of the rod in the frame of its base section; o
+is the base, o + b the pivot and D the orientation of the base at rest, in the sensor's frame. Each
+channel reads
 
     y = w · φ,    φ = (1, θ, u / L, θ_i θ_j),
 
-for the field of a magnet that turns and moves is linear in neither. The force is normal to the
-whisker, or with friction µ has the component µ |f| along it towards the tip. All of it is explicit
-in ξ: the suspension does not enter the rod, and a compliant base costs no more than a rigid one.
+as the field of a magnet is not linear in its rotation and shift. The force is normal to the whisker
+or, with friction µ, has the component µ |f| along it towards the tip. All equations are explicit in
+ξ: the suspension does not affect the equations of the rod, and a compliant base costs no more than
+a rigid one.
 
-Lengths are in units of L, forces in EI/L² and moments in EI/L inside. Readings determine the
-compliances only relative to the whisker's stiffness; in SI they hold for the modulus it has.
+Internally, lengths are in units of L, forces of EI/L² and moments of EI/L. Readings determine the
+compliances only relative to the whisker's stiffness; their SI values presume its stated modulus.
 """
 
 from __future__ import annotations
@@ -33,27 +35,28 @@ from vibrissa.sensors.regression import ThinPlate
 from vibrissa.status import Status
 from vibrissa.whisker import Whisker
 
-# What a channel reads a combination of: rotation, rad, and shift over L, of the base.
+# Features of the base's motion that channels combine: rotation, rad, and shift in units of L.
 FEATURES = (
     "1",
     *(f"θ{a}" for a in "xyz"),
     *(f"u{a}" for a in "xyz"),
     *(f"θ{a}θ{b}" for i, a in enumerate("xyz") for b in "xyz"[i:]),
 )
-# Turns of the path from rest to a contact, and Newton steps after each of them and the last.
 _PAIRS = np.triu_indices(3)
+# Steps of the path from rest to a contact, and Newton iterations after each step and the last.
 _STEPS, _ROUNDS, _LAST_ROUNDS = 16, 4, 12
-_SOLVED = 1e-8  # miss of the point, over L, up to which a contact is solved
-_MOST_ARC, _MOST_FORCE = 0.1, 3.0  # largest Newton steps of s, over L, and of the force, over EI/L²
-# Step of differences, and angle squared below which series replace quotients.
-_LEAST_ARC = 0.01
+_SOLVED = 1e-8  # largest distance from the point, in units of L, of a solved contact
+_MOST_ARC, _MOST_FORCE = 0.1, 3.0  # largest Newton steps of s, in L, and of the force, in EI/L²
+_LEAST_ARC = 0.01  # smallest arc length of a contact, in units of L
+# Step of finite differences, and squared angle below which series replace quotients.
 _SMALL = 1e-6
 
 
 class Touches(NamedTuple):
     """Contacts of a suspended whisker, non-dimensional: points and forces in the sensor's frame.
 
-    Features are the motion of the base (`FEATURES`); slopes are derivatives by ξ = (s, f_y, f_z).
+    Features describe the motion of the base (`FEATURES`); slopes are derivatives with respect to
+    ξ = (s, f_y, f_z).
     """
 
     points: Array
@@ -65,7 +68,7 @@ class Touches(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SuspendedWhisker:
-    """A whisker on a compliant suspension, with channels that read the motion of its base.
+    """A whisker on a compliant suspension, with channels that measure the motion of its base.
 
     Parameters
     ----------
@@ -78,23 +81,23 @@ class SuspendedWhisker:
     pivot : array_like (3,)
         Pivot relative to the base, sensor frame, m.
     friction : float
-        Force along the whisker, towards the tip, over the normal force at contacts.
+        Ratio of the force along the whisker, towards the tip, to the normal force at contacts.
     channels : sequence of str
         Names of the channels.
     readout : array_like (k, 13), optional
         Weights of `FEATURES` in each channel, in the channel's unit.
     noise : array_like (k,)
-        Standard deviation of what the model leaves unexplained of a reading; most of it is the same
-        in neighbouring contacts.
+        Standard deviation of the model's error of a reading, most of which is the same in
+        neighbouring contacts.
     residual : ThinPlate, optional
         Correction of the readings as a function of the contact point, m, sensor frame.
     drift : float or array_like (k,)
-        Standard deviation of what readings change by from one recording to the next.
+        Standard deviation of the change of readings from one recording to the next.
 
     Raises
     ------
     ValueError
-        If compliances are negative, or shapes do not fit.
+        If a compliance is negative, or shapes do not match.
     """
 
     whisker: Whisker
@@ -129,7 +132,7 @@ class SuspendedWhisker:
 
     @property
     def uncertainty(self) -> Array:
-        """Standard deviation (k,) of readings in another recording than the calibration's."""
+        """Standard deviation (k,) of readings in a recording other than the calibration."""
         return np.asarray(np.hypot(self.noise, self.drift), dtype=np.float64)
 
     def touches(self, contacts: Array) -> Touches:
@@ -158,21 +161,21 @@ class SuspendedWhisker:
             _right_jacobian(angle) @ d_angle,
         )
         pull = (turned @ force[:, :, None])[:, :, 0]
-        d_felt = turned @ (d_force - cross_matrix(force) @ spin)
+        d_pull = turned @ (d_force - cross_matrix(force) @ spin)
         base = self.whisker.pose.origin / d.length + pivot
         point = base + shift / d.length * pull + (turned @ arm[:, :, None])[:, :, 0]
-        d_point = shift / d.length * d_felt + turned @ (d_arm - cross_matrix(arm) @ spin)
+        d_point = shift / d.length * d_pull + turned @ (d_arm - cross_matrix(arm) @ spin)
         i, j = _PAIRS
         n = len(contacts)
         features = (np.ones((n, 1)), angle, shift / d.length * pull, angle[:, i] * angle[:, j])
         product = d_angle[:, i] * angle[:, j, None] + angle[:, i, None] * d_angle[:, j]
-        slopes = (np.zeros((n, 1, 3)), d_angle, shift / d.length * d_felt, product)
+        slopes = (np.zeros((n, 1, 3)), d_angle, shift / d.length * d_pull, product)
         return Touches(
             point, np.concatenate(features, axis=1), pull, d_point, np.concatenate(slopes, axis=1)
         )
 
     def _rod(self, contacts: Array) -> tuple[Array, Array]:
-        """Force and point of the rod in its base frame, with derivatives by ξ."""
+        """Force and point (n, 6) of the rod in its base frame, and their derivatives by ξ."""
         d = discretize(self.whisker)
         size = np.hypot(contacts[:, 1], contacts[:, 2])
         along = self.friction * size
@@ -185,21 +188,21 @@ class SuspendedWhisker:
         return value, slope
 
     def solve(self, points: ArrayLike, start: Array | None = None) -> tuple[Array, AnyArray]:
-        """Contacts at known points.
+        """Solve for the contacts at known points.
 
         Parameters
         ----------
         points : array_like (n, 3)
             Contact points, sensor frame, m.
         start : (n, 3) array, optional
-            Contacts ξ nearby; by default they are followed from rest.
+            Nearby contacts ξ; by default contacts are followed from rest.
 
         Returns
         -------
         contacts : (n, 3) array
             Contacts ξ, non-dimensional.
         statuses : (n,) int array
-            `Status` of each: ``OK``, or ``BEYOND_FOLD`` where there is no equilibrium with this
+            `Status` of each: ``OK``, or ``BEYOND_FOLD`` if there is no equilibrium with this
             friction.
         """
         target = numbers("points", points) / self.length
@@ -214,7 +217,7 @@ class SuspendedWhisker:
         return contacts, statuses
 
     def _from_rest(self, target: Array) -> tuple[Array, Array]:
-        """Follow contacts from the resting whisker by turning their radius vector."""
+        """Follow contacts from the resting whisker by rotating their radius vector in steps."""
         base = self.whisker.pose.origin / self.length
         s = np.linspace(2.0 * _LEAST_ARC, 1.0, 400)
         rest = self.whisker.pose.vectors_to_source(self.whisker.position(s * self.length))
@@ -235,7 +238,7 @@ class SuspendedWhisker:
         return contacts, miss
 
     def _newton(self, target: Array, contacts: Array, rounds: int) -> tuple[Array, Array]:
-        """Newton's method for the contacts at points; and by how much they miss them."""
+        """Solve for contacts at points by Newton's method; also return the distances from these."""
         contacts = contacts.copy()
         for last in (*([False] * rounds), True):
             touch = self.touches(contacts)
@@ -254,7 +257,7 @@ class SuspendedWhisker:
         return contacts, miss
 
     def readings(self, touches: Touches) -> tuple[Array, Array]:
-        """Readings of contacts, and their derivatives by ξ.
+        """Readings of contacts, and their derivatives with respect to ξ.
 
         Parameters
         ----------
@@ -266,7 +269,7 @@ class SuspendedWhisker:
         readings : (n, k) array
             Readings without noise.
         slopes : (n, k, 3) array
-            Derivatives by ξ.
+            Derivatives with respect to ξ.
         """
         weights = np.asarray(self.readout)
         values, slopes = touches.features @ weights.T, weights @ touches.feature_slopes
@@ -277,19 +280,19 @@ class SuspendedWhisker:
         return values, slopes
 
     def read(self, points: ArrayLike, seed: int | None = None) -> tuple[Array, AnyArray]:
-        """Readings while the whisker is touched at known points.
+        """Simulate the readings of contacts at known points.
 
         Parameters
         ----------
         points : array_like (n, 3)
             Contact points, sensor frame, m.
         seed : int, optional
-            Seed of the noise; by default there is none.
+            Seed of the noise; by default no noise is added.
 
         Returns
         -------
         readings : (n, k) array
-            Readings; NaN where there is no equilibrium.
+            Readings; NaN if there is no equilibrium.
         statuses : (n,) int array
             `Status` of each contact.
         """

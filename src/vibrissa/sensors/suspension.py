@@ -1,11 +1,11 @@
-"""Calibration of a suspended whisker from touches at known points.
+"""Calibration of a suspended whisker from contacts ("touches") at known points.
 
-Unknown are the two compliances, and with more touches, each with its prior, the pivot, and the
-place and direction of the base; on request the rest curvature, the taper and the friction. The
-read-out is linear in its weights, which are solved for within the fit (variable projection), so
-that it is a problem of 2 to 19 unknowns. The prior of the weights is a normal distribution, of a
-size that makes the readings most probable. What remains is given to a thin-plate Gaussian process
-where there are touches enough.
+The unknowns are the two compliances and, given enough touches, the pivot and the position and
+direction of the base, each with its prior; optionally also the rest curvature, the taper and the
+friction. The readings are linear in the weights of the features, which are eliminated from the fit
+(variable projection), so that 2 to 19 nonlinear unknowns remain. The weights have a normal prior
+whose size maximises the likelihood of the readings. With enough touches, a thin-plate Gaussian
+process models the remaining error.
 """
 
 from __future__ import annotations
@@ -25,36 +25,36 @@ from vibrissa.sensors.suspended import SuspendedWhisker, Touches
 from vibrissa.status import Status
 from vibrissa.whisker import Whisker
 
-# Touches that are needed, above which more than the compliances may be free, and from which on
-# there is a Gaussian process.
+# Number of touches that are required, above which more than the compliances may be free, and from
+# which a Gaussian process is used.
 FEWEST, SOME, PLENTY = 20, 40, 100
-# Mechanical unknowns that may be free: the compliances; the pivot too; and the pose of the base.
-# Chosen are those that predict whole regions of touches which were left out: what neighbours share,
-# and unknowns take up that the wire does not have, misleads there. Single touches that are left out
-# do not show it, for they have neighbours. Below `PLENTY` too few would be left to judge by, and no
-# process takes up what is left: the pose is free. Curvature, taper and friction mislead more than
-# they help.
+# Numbers of mechanical unknowns that may be free: the compliances; the pivot too; and the pose of
+# the base. The choice is made by cross-validation on whole regions of touches: errors that
+# neighbouring touches share, and that superfluous unknowns absorb, then show in the prediction, as
+# they would not with single touches left out. Below `PLENTY` there are too few touches for this,
+# and no process that absorbs the remaining error: the pose is free. Curvature, taper and friction
+# do more harm than good.
 CHOICES = (2, 5, 11)
-# Regions that are left out in turn, and touches that the choice is made with at most.
+# Number of regions for cross-validation, and largest number of touches used for it.
 _REGIONS, _ENOUGH_TO_CHOOSE = 5, 300
-# Variances of the noise over those of the (scaled) weights that are tried.
+# Candidate ratios of the variance of the noise to that of the (scaled) weights.
 _RATIOS = np.logspace(-6, 1, 15)
-# Gauss-Newton steps, dampings of each, and the relative gain below which they end.
+# Largest numbers of Gauss-Newton steps and of dampings of each; relative gain at which they end.
 _ROUNDS, _TRIES, _ENOUGH = 20, 6, 2e-3
-# Share of its prior's standard deviation from which an unknown counts as not determined.
+# Posterior standard deviation, relative to the prior one, above which an unknown is undetermined.
 _OPEN = 0.7
 _LOST = 5.0  # residual of a touch without equilibrium, in units of the noise
-# Residual from which a touch is an outlier: over the usual one of a channel (the median, so that
-# outliers do not hide themselves), and over the channel's range. Of the real touches of a wire one
-# in 1,200 was 15 % of the range from the same touch made again, the others less than 4 %.
+# Residual above which a touch is an outlier, relative to the channel's median (which outliers
+# hardly affect), and to the channel's range. Of the repeated touches of a real wire, one in 1,200
+# differed by 15 % of the range, the others by less than 4 %.
 _OUTLYING, _LEAST_OUTLYING = 10.0, 0.05
-# Logarithms of compliances in L/EI and L³/EI from which the best is improved; the prior's mean is
-# the middle one.
+# Initial logarithms of compliances in L/EI and L³/EI, of which the best is used; the middle one is
+# the mean of the prior.
 _STARTS = [(np.log(r), np.log(t)) for r in (0.1, 0.5, 2.0) for t in (3e-4, 3e-3, 3e-2)]
 
 
 class Unknown(NamedTuple):
-    """A mechanical unknown: its name, standard deviation of its prior, and step of differences."""
+    """Mechanical unknown: name, standard deviation of its prior, and finite-difference step."""
 
     name: str
     sigma: float
@@ -78,30 +78,30 @@ def _unknowns(length: float, base_sigma: float) -> tuple[Unknown, ...]:
 
 @dataclass(frozen=True, eq=False)
 class SuspensionCalibration:
-    """A suspended whisker as determined by touches at known points.
+    """Suspended whisker, calibrated by touches at known points.
 
     Attributes
     ----------
     sensor : SuspendedWhisker
-        Whisker, suspension, read-out and noise that were found.
+        Whisker with the fitted suspension, read-out and noise.
     names : tuple of str
-        Mechanical unknowns that were free; lengths are over the whisker's, compliances those over
-        L/EI and L³/EI, curvature in Legendre polynomials of arc length, times L.
+        Free mechanical unknowns; lengths are relative to the whisker's, compliances in units of
+        L/EI and L³/EI, curvatures as coefficients of Legendre polynomials of arc length, times L.
     values : (p,) array
-        Values of the parameters, as changes of what was stated.
+        Values of the unknowns, as changes of the stated values.
     covariance : (p, p) array
         Covariance of the values.
     undetermined : tuple of str
-        Parameters that the readings hardly determine: their uncertainty is that of their prior.
+        Unknowns that the readings hardly determine: their uncertainty is nearly that of the prior.
     readout_covariance : (k, 13, 13) array
-        Covariance of each channel's read-out, the mechanics being known.
+        Covariance of each channel's read-out for given mechanics.
     residual : (k,) array
-        Root mean square of what the rod leaves unexplained.
+        Root mean square error of the readings by the rod model.
     used : (n,) bool array
-        Touches that were used; the others have no equilibrium in this model, or are outliers.
+        Touches used for the fit; the others have no equilibrium in this model, or are outliers.
     outliers : (n,) bool array
-        Touches with a reading more than ten times as far from the model as is usual: the probe
-        slipped, or the wire was caught.
+        Touches with a residual more than ten times the median, as when the probe slipped or the
+        wire was caught.
     """
 
     sensor: SuspendedWhisker
@@ -131,24 +131,24 @@ def calibrate_suspension(
     Parameters
     ----------
     whisker : Whisker
-        Whisker at rest, as `Whisker.from_points` makes it of points in the sensor's frame.
+        Whisker at rest, as returned by `Whisker.from_points` for points in the sensor's frame.
     points : array_like (n, 3)
-        Contact points, sensor frame, m; rows with NaN are left out.
+        Contact points, sensor frame, m; rows with NaN are ignored.
     readings : array_like (n, k)
         Readings of the channels, in any unit.
     channels : tuple of str, optional
         Names of the channels.
     rest : array_like (k,), optional
-        Readings of the untouched whisker; by default they are zero.
+        Readings of the untouched whisker; by default zero.
     base_sigma : float
-        Standard deviation of the stated place of the base, m.
+        Standard deviation of the stated position of the base, m.
     drift : array_like (k,)
-        Standard deviation of what readings change by from one recording to the next.
+        Standard deviation of the change of readings from one recording to the next.
     free : int, optional
-        Number of mechanical unknowns that are free, 2 to 19; by default the two compliances up to
-        40 touches, and with pivot and pose of the base 11 below 100. From there on a Gaussian
-        process explains what is left, and those of 2, 5 (with the pivot) and 11 are free that
-        predict regions of touches best which are left out of the fit.
+        Number of free mechanical unknowns, 2 to 19. By default 2 (the compliances) for up to 40
+        touches, and 11 (with pivot and pose of the base) below 100. For more touches a Gaussian
+        process models the remaining error, and the best of 2, 5 (with the pivot) and 11 is chosen
+        by cross-validation on regions of touches.
 
     Returns
     -------
@@ -158,7 +158,7 @@ def calibrate_suspension(
     Raises
     ------
     ValueError
-        If shapes do not fit, or there are too few touches or no signal.
+        If shapes do not match, or there are too few touches or no signal.
     """
     p, y = numbers("points", points), numbers("readings", readings, channels or ())
     if p.ndim != 2 or p.shape[1] != 3 or y.ndim != 2 or len(y) != len(p):
@@ -188,10 +188,10 @@ def calibrate_suspension(
 
 
 def _chosen(whisker: Whisker, points: Array, readings: Array, unknowns: tuple[Unknown, ...]) -> int:
-    """Number of unknowns that predicts regions best which are left out."""
+    """Number of unknowns that best predicts regions of touches left out of the fit."""
     if len(points) < PLENTY:
         return CHOICES[0] if len(points) <= SOME else CHOICES[-1]
-    from scipy.cluster.vq import kmeans2  # imports much that nothing else needs
+    from scipy.cluster.vq import kmeans2  # a slow import that nothing else needs
 
     kept = np.random.default_rng(0).permutation(len(points))[:_ENOUGH_TO_CHOOSE]
     points, readings = points[kept], readings[kept]
@@ -200,7 +200,7 @@ def _chosen(whisker: Whisker, points: Array, readings: Array, unknowns: tuple[Un
     start = _Problem(whisker, points, readings, unknowns[: CHOICES[0]]).minimise()[0].values
     misses = []
     for number in CHOICES:
-        miss = np.ones_like(readings)  # where nothing is predicted: as bad as their mean
+        miss = np.ones_like(readings)  # without a prediction, the error is that of the mean
         for one in range(_REGIONS):
             out = region == one
             if (~out).sum() < FEWEST:
@@ -215,7 +215,7 @@ def _chosen(whisker: Whisker, points: Array, readings: Array, unknowns: tuple[Un
 
 
 class _State(NamedTuple):
-    """The model for some values of the unknowns, its linear fit, and the cost."""
+    """Model, linear fit and cost for given values of the unknowns."""
 
     values: Array
     sensor: SuspendedWhisker
@@ -227,7 +227,7 @@ class _State(NamedTuple):
 
 
 class _Weights(NamedTuple):
-    """Weights of the features with ridge: scaled design, weights, residuals, leverages, noise."""
+    """Ridge regression of readings on scaled features; see `_weights`."""
 
     scale: Array
     design: Array
@@ -238,7 +238,7 @@ class _Weights(NamedTuple):
 
 
 class _Problem:
-    """Touches, and what is fitted to them."""
+    """Nonlinear least-squares fit of the mechanical unknowns to touches."""
 
     def __init__(
         self, whisker: Whisker, points: Array, readings: Array, unknowns: tuple[Unknown, ...]
@@ -250,7 +250,7 @@ class _Problem:
         self.noise = 0.02 * np.ptp(readings, axis=0)
 
     def model(self, x: Array) -> SuspendedWhisker:
-        """Suspended whisker of some values."""
+        """Suspended whisker for given values of the unknowns."""
         full = np.zeros(19)
         full[: x.size] = x
         whisker, d = self.whisker, discretize(self.whisker)
@@ -267,7 +267,7 @@ class _Problem:
         )
 
     def state(self, x: Array, contacts: Array | None) -> _State:
-        """Solve all touches, and the weights."""
+        """Solve for all contacts and for the weights of the features."""
         sensor = self.model(x)
         found, status = sensor.solve(self.points, contacts)
         ok = status == int(Status.OK)
@@ -279,11 +279,11 @@ class _Problem:
         return _State(x, sensor, found, touches, ok, fit, cost)
 
     def penalty(self, x: Array) -> float:
-        """Part of the cost that is the prior's."""
+        """Part of the cost due to the prior."""
         return float((((x - self.mean) / self.sigma) ** 2).sum())
 
     def slopes(self, at: _State) -> Array:
-        """Derivatives of the residuals by the unknowns, with weights that follow (Kaufman)."""
+        """Derivatives of scaled residuals by the unknowns, by Kaufman's variable projection."""
         q = np.linalg.qr(
             np.concatenate([at.fit.design, np.diag(np.sqrt(at.fit.ratio.mean(axis=1)))])
         )[0]
@@ -303,7 +303,7 @@ class _Problem:
         return np.array(out).T
 
     def minimise(self, starts: Sequence[Any] = _STARTS) -> tuple[_State, Array]:
-        """Least cost from the best start of the compliances, and the derivatives there."""
+        """Minimise the cost from the best initial compliances; also return the derivatives."""
         p = len(self.unknowns)
         begin = [np.append(pair, np.zeros(p - 2)) for pair in starts]
         at = min((self.state(x, None) for x in begin), key=lambda one: one.cost)
@@ -329,7 +329,7 @@ class _Problem:
             else:
                 break
             gain, damping = at.cost - new.cost, max(0.1 * damping, 1e-7)
-            # What is noise shows as the fit improves; the weights of the channels follow.
+            # The noise, and with it the weight of each channel, is estimated from the current fit.
             self.noise = np.maximum(self.left(new), 1e-9 * np.ptp(self.readings, axis=0))
             settled = gain < _ENOUGH * at.cost
             at = self.state(new.values, new.contacts)
@@ -338,28 +338,29 @@ class _Problem:
         return at, self.slopes(at)
 
     def check(self, at: _State) -> None:
-        """Refuse touches of which the whisker reaches too few."""
+        """Raise ValueError if the whisker reaches too few of the touches."""
         held, length = int(at.ok.sum()), self.whisker.length
         if held >= min(FEWEST, len(self.points) // 2):
             return
         near, far = np.quantile(np.linalg.norm(self.points, axis=1), (0.1, 0.9))
         raise ValueError(
-            f"{held} of {len(at.ok)} touches can be of this whisker: most are {1e3 * near:.3g} to "
-            f"{1e3 * far:.3g} mm from its base, and it is {1e3 * length:.3g} mm long. Are origin, "
-            "axes and unit of the touches right, and does its shape begin at the base?"
+            f"this whisker can reach only {held} of {len(at.ok)} touches: most are "
+            f"{1e3 * near:.3g} to {1e3 * far:.3g} mm from its base, and its length is "
+            f"{1e3 * length:.3g} mm. Are origin, axes and unit of the touches right, and does its "
+            "shape begin at the base?"
         )
 
     def misses(self, at: _State) -> Array:
-        """Residuals of touches that were left out one by one."""
+        """Leave-one-out residuals of the touches."""
         free = at.fit.leverage[at.ok] + len(self.unknowns) / max(at.ok.sum(), 1) / 3.0
         return np.asarray(at.fit.residuals[at.ok] / np.maximum(1.0 - free, 0.1))
 
     def left(self, at: _State) -> Array:
-        """Standard deviation of those residuals."""
+        """Standard deviation of the leave-one-out residuals."""
         return np.asarray(np.sqrt((self.misses(at) ** 2).mean(axis=0)))
 
     def outliers(self) -> AnyArray:
-        """Touches (n,) with a reading that is far from the model."""
+        """Mask (n,) of touches with a reading far from the model."""
         at, _ = self.minimise()
         size = np.abs(self.misses(at))
         usual = 1.4826 * np.median(size, axis=0)
@@ -375,7 +376,7 @@ class _Problem:
         known: AnyArray,
         starts: Sequence[Any] = _STARTS,
     ) -> SuspensionCalibration:
-        """Fit, and describe the result."""
+        """Fit the model and return the calibration."""
         at, jacobian = self.minimise(starts)
         noise, spread = self.left(at), np.diag(1.0 / self.sigma**2)
         covariance = np.linalg.inv(jacobian.T @ jacobian + spread)
@@ -408,7 +409,7 @@ class _Problem:
 
 
 def _weights(features: Array, readings: Array) -> _Weights:
-    """Weights of the features without the constant; of all but rotations with a ridge."""
+    """Regress readings on all features but the constant, with a ridge on all but rotations."""
     design = features[:, 1:]
     n = len(design)
     scale = np.sqrt((design**2).mean(axis=0))
@@ -442,7 +443,7 @@ def _weights(features: Array, readings: Array) -> _Weights:
 
 
 def _reshaped(whisker: Whisker, first: Array, second: Array, taper: float) -> Whisker:
-    """Whisker with other curvature and taper."""
+    """Whisker with changed curvature and taper."""
     length = whisker.length
     s = np.linspace(0.0, length, 65)
     t = 2.0 * s / length - 1.0

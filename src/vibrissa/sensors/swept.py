@@ -1,21 +1,20 @@
-"""Contacts of a suspended whisker that is swept over things with a known motion.
+"""Contacts of a suspended whisker that is swept over objects with a known motion.
 
-All samples of a touch are explained at once. Unknown are the contact ξ_k of each sample, and the
-errors b_k of the model, which hardly change from one sample to the next: what a calibration leaves
-unexplained, and the drift of the sensor. The most probable minimise
+All samples of a touch are estimated together. The unknowns are the contact ξ_k of each sample and
+the error b_k of the readings, which changes slowly: the error of the calibrated model and the drift
+of the sensor. The most probable values minimise
 
     Σ w_k |y(ξ_k) + b_k − y_k|² / (ε σ)² + Σ |b_k − a_k b_(k−1)|² / ((1 − a_k²) σ²)
       + Σ (n · Δp_k)² / (ν² ℓ d_k) + Σ |Δp_k − n (n · Δp_k)|² / (τ² ℓ d_k),
 
-with σ the sensor's noise and drift, d the motion of the base between samples and Δp the steps of
-the contact point in the laboratory: a contact slides along the surface of what it touches, whose
-normal n is the direction of the force, so that it hardly moves along n. Nothing needs to be known
-of where a touch begins: the steps of all samples show it.
+where σ is the noise and drift of the sensor, d the motion of the base between samples and Δp the
+step of the contact point in the laboratory frame. A contact slides along the surface of the object,
+whose normal n is the direction of the force, so that it hardly moves along n. The position of the
+first contact need not be known.
 
-All of it is by the path of the base, so that contacts and covariances do not depend on how many
-samples are taken along it: the variance of steps grows with d, that of b with the distance over
-which it changes, and samples that are closer than the model's errors change share one reading,
-w = min(1, d / w₀).
+Variances refer to the path of the base, so that contacts and covariances do not depend on the
+number of samples along it: the variance of steps grows with d, that of b with the distance over
+which it changes, and samples less than w₀ apart have reduced weights w = min(1, d / w₀).
 """
 
 from __future__ import annotations
@@ -29,24 +28,25 @@ from vibrissa.deferred import linalg, sparse_linalg
 from vibrissa.numerics import AnyArray, Array, numbers, rotation_matrices
 from vibrissa.sensors.suspended import SuspendedWhisker, Touches
 
-# Standard deviations of what differs from sample to sample, and of what hardly does, over that of a
-# calibration's residuals.
+# Standard deviations of the error that varies from sample to sample and of the slowly varying one,
+# relative to that of the calibration's residuals.
 WHITE, BIAS = 0.5, 1.0
-PERSISTENCE = 0.1  # motion of the base over which the errors change, m
-GRAIN = 0.3e-3  # motion of the base up to which samples share what differs from sample to sample, m
-# Motion of contact points along the force and across it while the base moves by `STRETCH`, m, over
-# that. Three sweeps past a cylinder and a cone are most probable with 0.2 across the force, of 0.12
-# to 0.8, and about as probable with 0.006 to 0.03 along it.
+PERSISTENCE = 0.1  # motion of the base over which the slowly varying error changes, m
+GRAIN = 0.3e-3  # motion of the base below which samples share their error, m
+# Motion of contact points along and across the force, relative to the motion of the base, while the
+# base moves by `STRETCH`, m. For three sweeps past a cylinder and a cone, the likelihood is largest
+# for 0.2 across the force (of 0.12 to 0.8), and hardly depends on the value along it from 0.006 to
+# 0.03.
 NORMAL, SLIDING, STRETCH = 0.017, 0.2, 5e-3
-_LEAST_STEP = 1e-6  # motion of the base between two samples, over L, that is supposed at least
+_LEAST_STEP = 1e-6  # smallest motion of the base between two samples, in units of L
 _FEWEST = 5
 _STARTS = (0.45, 0.65, 0.85)
-# Steps, and the relative gain of the last: at 1e-4 points are up to 0.4 mm from where they end.
+# Largest number of steps, and relative gain at which they end: at 1e-4 the error is up to 0.4 mm.
 _SWEEP_ROUNDS, _ENOUGH = 100, 1e-6
 _MOST_STEP = 0.1
 _SWEEP_LEAST_ARC = 0.05
-_HELD = 1e12  # factor on the Hessian's diagonal that holds an arc length at the end of its range
-# Errors of a touch that are stated as shared: of its three channels level, slope and bend.
+_HELD = 1e12  # factor on the Hessian's diagonal that fixes an arc length at the end of its range
+# Number of shared errors of a touch: offset, slope and curvature over time in three channels.
 _SHARED = 9
 
 
@@ -56,20 +56,20 @@ class SweptContacts(NamedTuple):
     Attributes
     ----------
     points : (n, 3) array
-        Contact points, laboratory frame, m; NaN where nothing is touched.
+        Contact points, laboratory frame, m; NaN without contact.
     covariance : (n, 3, 3) array
         Covariances of the points, m².
     normal : (n, 3) array
-        Direction of the force on the whisker, laboratory frame: the surface's normal.
+        Direction of the force on the whisker, laboratory frame, which is the surface normal.
     arc_length : (n,) array
         Arc lengths of the contacts, m.
     in_contact : (n,) bool array
-        Whether the whisker touches.
+        Whether the whisker is in contact.
     bias : (n, k) array
-        Errors of the model that were found, in the channels' units.
+        Estimated slowly varying errors of the readings, in the units of the channels.
     shared : (m, n, 3) array
-        Shifts of all points, m, by one standard deviation of each of the errors that samples of a
-        touch share; they are part of the covariance.
+        Displacements of all points, m, by one standard deviation of each error that the samples of
+        a touch share; the covariance includes them.
     """
 
     points: Array
@@ -90,7 +90,7 @@ def follow_sweep(
     rest: ArrayLike | None = None,
     threshold: float = 4.0,
 ) -> SweptContacts:
-    """Find the contacts of a sweep, with their onset and loss.
+    """Estimate the contacts during a sweep, with their onset and loss.
 
     Parameters
     ----------
@@ -99,24 +99,24 @@ def follow_sweep(
     readings : array_like (n, k)
         Readings of its channels in order of time, at equal or unequal steps.
     position : array_like (n, 3)
-        Positions of the sensor's origin in the laboratory, m.
+        Positions of the sensor's origin in the laboratory frame, m.
     rotation : array_like (3, 3) or (n, 3, 3), optional
-        Rotation from the sensor's to the laboratory frame; by default they are parallel.
+        Rotation from the sensor's frame to the laboratory frame; by default the identity.
     rest : array_like (k,) or (n, k), optional
-        Readings of the untouched whisker, for each sample where they drift during the sweep; by
+        Readings of the untouched whisker, of each sample if they drift during the sweep; by
         default those of the first sample.
     threshold : float
-        Change of a reading, over its noise and drift, from which the whisker touches.
+        Change of a reading above which there is contact, in standard deviations of noise and drift.
 
     Returns
     -------
     SweptContacts
-        Contact points with covariance, and the normal of the surface there.
+        Contact points with covariance, and the surface normal there.
 
     Raises
     ------
     ValueError
-        If shapes do not fit.
+        If shapes do not match.
     """
     y, base = numbers("readings", readings, sensor.channels), numbers("position", position)
     k = len(sensor.channels)
@@ -154,7 +154,7 @@ def follow_sweep(
 
 
 class _State(NamedTuple):
-    """Unknowns of all samples, and what follows from them."""
+    """Unknowns of all samples, with the resulting model values."""
 
     contacts: Array
     bias: Array
@@ -165,7 +165,7 @@ class _State(NamedTuple):
 
 
 class _Touch:
-    """Samples of one touch; lengths are over the whisker's."""
+    """Estimation problem of the samples of one touch; lengths are in units of the whisker's."""
 
     def __init__(self, sensor: SuspendedWhisker, readings: Array, base: Array, turn: Array) -> None:
         self.sensor, self.readings, self.turn = sensor, readings, turn
@@ -173,7 +173,7 @@ class _Touch:
         noise = sensor.uncertainty
         moved = np.linalg.norm(np.diff(self.base, axis=0), axis=1) + _LEAST_STEP
         apart = np.convolve(np.pad(moved, 1, mode="edge"), [0.5, 0.5], "valid") * sensor.length
-        # Samples of a base at rest are together as good as one.
+        # Samples with the base at rest together have the weight of one.
         share = np.clip(apart / GRAIN, 1.0 / len(apart), 1.0)
         self.weight = share[:, None] / (WHITE * noise) ** 2
         self.kept = np.exp(-moved * sensor.length / PERSISTENCE)[:, None]
@@ -183,21 +183,21 @@ class _Touch:
         self.normal, self.sliding = 1.0 / (NORMAL**2 * stretch), 1.0 / (SLIDING**2 * stretch)
 
     def state(self, contacts: Array, bias: Array) -> _State:
-        """Evaluate unknowns."""
+        """Evaluate the model for given unknowns."""
         touches = self.sensor.touches(contacts)
         points = self.base + (self.turn @ touches.points[:, :, None])[:, :, 0]
         values, slopes = self.sensor.readings(touches)
         return _State(contacts, bias, touches, points, values + bias - self.readings, slopes)
 
     def cost(self, at: _State, metric: Array) -> float:
-        """What is minimised, with the weights of the steps."""
+        """Function to be minimised, for given weights of the steps."""
         step, drift = np.diff(at.points, axis=0), at.bias[1:] - self.kept * at.bias[:-1]
         cost = (at.misfit**2 * self.weight).sum() + (at.bias[0] ** 2 * self.first).sum()
         cost += np.einsum("ki,kij,kj->", step, metric, step) + (drift**2 * self.change).sum()
         return float(cost)
 
     def normals(self, touches: Touches) -> Array:
-        """Directions of the forces, laboratory frame."""
+        """Directions (n, 3) of the forces, laboratory frame."""
         force = (self.turn @ touches.force[:, :, None])[:, :, 0]
         return np.asarray(force / np.maximum(np.linalg.norm(force, axis=1), 1e-12)[:, None])
 
@@ -214,7 +214,7 @@ class _Touch:
     def system(self, at: _State, metric: Array) -> tuple[Array, Array]:
         """Gradient (n, m) and banded Hessian of half the cost, by contacts and bias.
 
-        An arc length at an end of its range that the gradient drives outwards is held there.
+        An arc length at an end of its range is fixed if the gradient points out of the range.
         """
         n, k = at.bias.shape
         size = 3 + k
@@ -246,7 +246,7 @@ class _Touch:
         return gradient, _banded(own, cross)
 
     def minimise(self, start: float) -> tuple[_State, Array, float]:
-        """Least cost from contacts at some arc length, and the weights of the steps there."""
+        """Minimise the cost from contacts at one arc length; also return weights and cost."""
         n, k = self.readings.shape
         at, damping = self.state(np.tile([start, 1e-3, 1e-3], (n, 1)), np.zeros((n, k))), 1e-2
         for _ in range(_SWEEP_ROUNDS):
@@ -308,7 +308,7 @@ def _banded(own: Array, cross: Array) -> Array:
 
 
 def _inverse_blocks(root: Array, n: int) -> Array:
-    """Diagonal blocks of (L Lᵀ)⁻¹, from the last, of the band of a block-bidiagonal L."""
+    """Diagonal blocks of (L Lᵀ)⁻¹ for the band of a block-bidiagonal L, by backward recursion."""
     size = len(root) // 2
     i, j = np.indices((size, size))
     columns = size * np.arange(n)[:, None, None] + j
@@ -321,7 +321,7 @@ def _inverse_blocks(root: Array, n: int) -> Array:
 
 
 def _largest_errors(root: Array, point: Array) -> Array:
-    """Shifts of all points by the largest errors that they share, one standard deviation each."""
+    """Displacements of all points by one standard deviation of each of their largest errors."""
     n = len(point)
 
     def spread(vector: Array) -> Array:

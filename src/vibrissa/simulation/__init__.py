@@ -1,4 +1,4 @@
-"""Simulated trials with known truth: motion, dynamics, films, sensor readings."""
+"""Simulated trials with ground truth: motion, dynamics, videos and sensor readings."""
 
 from vibrissa.simulation.dynamics import (
     Dynamics,

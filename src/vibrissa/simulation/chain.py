@@ -1,17 +1,17 @@
-"""A whisker as a chain of straight links and elastic joints, for motion that is not slow.
+"""Discrete whisker model for dynamics: a chain of rigid straight links and elastic joints.
 
-Cut into segments of length h, the whisker bends and twists at one joint in the middle of each: the
-joint turns by a rotation vector θ, R' = R exp θ, against a spring whose compliance is that of its
-segment, ∫ ds/B. Links cannot stretch or shear, so θ is all there is, and statics and small
-vibrations are those of the Kirchhoff rod to second order in h. A base of finite stiffness is one
-more joint, at s = 0.
+The whisker is divided into segments of length h and bends and twists at one joint in the middle of
+each. A joint rotates by a rotation vector θ, R' = R exp θ, against a spring whose compliance is
+that of its segment, ∫ ds/B. Links cannot stretch or shear, so that the vectors θ are the only
+degrees of freedom; statics and small vibrations agree with those of the Kirchhoff rod to second
+order in h. A base of finite stiffness is one more joint, at s = 0.
 
-Turning joint j by δφ_j = A_j δθ_j (laboratory frame, A = R times the left Jacobian of exp) moves
-every point x beyond it by δφ_j × (x - p_j). The mass, two points a link, therefore enters by its
-first three moments beyond each joint alone.
+A rotation of joint j by δφ_j = A_j δθ_j (laboratory frame, A = R times the left Jacobian of exp)
+moves every point x beyond it by δφ_j × (x - p_j). Therefore the mass, two points per link, enters
+only by its moments of order zero to two beyond each joint.
 
-The smooth centreline, which touches objects, is the quadratic B-spline of the joints: on each
-segment the parabola through its two ends, with the joint as control point.
+The smooth centreline, used for contact with objects, is the quadratic B-spline of the joints: on
+each segment a parabola between its two ends, with the joint as control point.
 """
 
 from __future__ import annotations
@@ -24,13 +24,19 @@ from vibrissa.deferred import transform
 from vibrissa.numerics import Array, IntArray, kernel
 from vibrissa.whisker import Whisker
 
-_GRADING = 0.4  # exponent by which segments are shorter where the whisker is thin
+_GRADING = 0.4  # exponent of the radius in the lengths of segments, shorter where it is thin
 _GAUSS = np.polynomial.legendre.leggauss(5)
 
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """A whisker in links; SI units."""
+    """Links, joints and point masses of a whisker, SI units.
+
+    ``nodes`` (n + 1,) are arc lengths of the ends of segments and ``joints`` (m,) those of joints;
+    ``stiffness`` and ``rest`` (m, 3) are the stiffness of each joint in twist and bending and its
+    rotation vector at rest. ``mass``, ``mass_arc`` and ``mass_link`` (k,) are the point masses,
+    their arc lengths and the indices of their links.
+    """
 
     nodes: Array
     joints: Array
@@ -42,7 +48,10 @@ class Chain:
 
     @classmethod
     def of(cls, whisker: Whisker, density: tuple[float, float], segments: int) -> Chain:
-        """Chain of a whisker, with shorter segments where it is thin."""
+        """Chain of a whisker, with shorter segments where it is thin.
+
+        ``density`` is that at base and tip, kg/m³, linear in arc length in between.
+        """
         nodes = _nodes(whisker, segments)
         h = np.diff(nodes)
         joints = nodes[:-1] + 0.5 * h
@@ -61,7 +70,7 @@ class Chain:
             stiffness = np.concatenate([[[soft_twist, soft_bend, soft_bend]], stiffness])
             rest = np.concatenate([np.zeros((1, 3)), rest])
         edges = np.concatenate([[0.0], joints, [whisker.length]])
-        # Two points with half of a link's mass have its centre and moment of inertia, about.
+        # Two points of half a link's mass approximate its centre of mass and moment of inertia.
         middle, half = 0.5 * (edges[1:] + edges[:-1]), 0.5 * np.diff(edges)
         arc = (middle[:, None] + half[:, None] * np.array([-1.0, 1.0]) / np.sqrt(3.0)).ravel()
         rho = density[0] + (density[1] - density[0]) * arc / whisker.length
@@ -96,6 +105,7 @@ def bezier(t: Array) -> Array:
 
 
 def _nodes(whisker: Whisker, segments: int) -> Array:
+    """Arc lengths (segments + 1,) of the ends of the segments, m."""
     s = np.linspace(0.0, whisker.length, 1025)
     middle = 0.5 * (s[1:] + s[:-1])
     thin = np.maximum(whisker.radius(middle) / whisker.base_radius, 0.02)
@@ -113,7 +123,11 @@ def configure(
     pivots: Array,
     turns: Array,
 ) -> None:
-    """Frames, pivots and turns of the links."""
+    """Compute the pose of the links from the joint rotations θ (m, 3) and the pose of the base.
+
+    Fills ``frames`` (m + 1, 3, 3), the rotations of the links; ``pivots`` (m, 3), the positions of
+    the joints; and ``turns`` (m, 3, 3), the matrices A of the module.
+    """
     exp, left = np.empty((3, 3)), np.empty((3, 3))
     for a in range(3):
         for b in range(3):
@@ -168,7 +182,7 @@ def inertia(
     residual: Array,
     matrix: Array,
 ) -> None:
-    """Generalised inertial forces and the mass matrix."""
+    """Fill the generalised forces of ``pull`` (k, 3) on the masses, and the mass matrix."""
     m = pivots.shape[0]
     total, first, second = 0.0, np.zeros(3), np.zeros((3, 3))
     force, moment = np.zeros(3), np.zeros(3)
@@ -219,7 +233,7 @@ def inertia(
 
 
 def jacobian(points: Array, links: IntArray, weights: Array, pivots: Array, turns: Array) -> Array:
-    """Derivatives of a weighted sum of points of links with respect to the joints."""
+    """Derivatives (3, 3 m) of a weighted sum of points of links with respect to the joints."""
     out = np.zeros((3, pivots.shape[0], 3))
     for point, link, weight in zip(points, links, weights, strict=True):
         away = weight * (point - pivots[:link])

@@ -1,30 +1,29 @@
-"""A trial with inertia and damping: collisions, ringing, whisking that bends the whisker.
+"""Dynamic simulation of a whisker: collisions, vibration, and bending by its own inertia.
 
 The chain of :mod:`vibrissa.simulation.chain` obeys d'Alembert's principle: for every δθ
 
     Σ m δx·ẍ + δθ·(K (θ - θ₀) + η K θ̇) = Σ δp·F,
 
-x the points of mass, p the contacts, η = 2 ζ/ω₁ a damping of the material by which the first
-vibration has the damping ratio ζ (higher ones have more, in proportion to their frequency). The
-base is carried along its path, which is a spline through the frames. At first the whisker moves
-along without bending (or rests against what is in its way, held still). Velocities and
-accelerations are backward differences of second order (BDF2) of positions in the laboratory; the
-step is implicit, solved by Newton's method, and stable whatever the stiffness; vibrations too fast
-for the step decay.
+where x are the point masses, p the contacts, and η = 2 ζ/ω₁ is a material damping that gives the
+first vibration mode the damping ratio ζ (that of higher modes is larger in proportion to their
+frequency). The base moves along a spline through its poses in the frames. Initially the whisker
+moves with the base without bending or, if an object is in its way, settles against it with the base
+at rest. Velocities and accelerations are second-order backward differences (BDF2) of positions in
+the laboratory frame. The step is implicit, solved by Newton's method, and stable for any stiffness;
+vibrations too fast for the step decay.
 
-Objects are touched where the distance of the smooth centreline has a minimum that is less than the
-whisker's radius, with a force along the normal in proportion to the indentation: the object's
-stiffness, or one at which it is indented by micrometres. Sliding is opposed by µ times that force,
-against the velocity of the whisker's material.
+An object is touched where the distance of the smooth centreline from its surface has a minimum
+below the whisker's radius. The normal force is proportional to the indentation, with the stiffness
+of the object or, for a rigid one, a stiffness that keeps the indentation at micrometres. Friction
+is µ times this force, opposite to the sliding velocity of the whisker's material.
 
 The wrench at the base is that of the objects minus the rate of change of the masses' momentum.
 
-A whisker that is held at known points has a wrench to which inertia and damping add: the chain is
-moved at its base and slides, without friction, through a given point of the laboratory while it is
-in contact there, and vibrates freely otherwise. A chain without mass and damping that goes through
-the same points has the same contact points in statics, so that the difference of their wrenches is
-what a measured wrench has too much. The error of the chain, of second order in its links, is in
-both.
+`inertial_wrench` computes the part of the wrench due to inertia and damping for known contact
+points: the chain is moved at its base and slides without friction through a given point of the
+laboratory frame during contact, and vibrates freely otherwise. A chain without mass and damping
+through the same points gives the static wrench; the difference is the inertial part. The
+discretisation error of the chain, of second order in the length of links, cancels largely.
 """
 
 from __future__ import annotations
@@ -46,42 +45,42 @@ Progress = Callable[[int, int], None]
 
 # Density of a rat's whisker at base and tip, kg/m³ (Yang et al. 2019).
 DENSITY = (1220.0, 1632.0)
-# Damping ratio of the first vibration: the middle of 0.11 to 0.17 (Hartmann et al. 2003).
+# Damping ratio of the first mode: the middle of 0.11 to 0.17 (Hartmann et al. 2003).
 DAMPING_RATIO = 0.14
-# Time that a whisker whose rest is inside an object is held still at first, to settle, s.
+# Time for which the base is initially at rest, if the resting whisker intersects an object, s.
 _SETTLE = 0.06
-_MOST_DAMPED = 2.0  # ratio above which per cent were meant
-_LIGHTEST = 10.0  # density of a foam, kg/m³
-_AT_ONCE = 4096  # number of steps whose placements are computed together
-_EAGER = 8  # rounds with the full derivative of friction, before its secant
-_MOST_TURNED = 0.3  # largest turn of a joint in one round, rad
-_PARTS = 4  # samples of the distance from objects on each segment
-_NEAR = 1e-4  # distance from which a minimum is refined, m
+_MOST_DAMPED = 2.0  # largest damping ratio; a larger value is taken for a percentage
+_LIGHTEST = 10.0  # smallest density, that of a foam, kg/m³
+_AT_ONCE = 4096  # number of steps whose base poses are computed together
+_EAGER = 8  # number of iterations with the full derivative of friction, before its secant
+_MOST_TURNED = 0.3  # largest rotation of a joint in one iteration, rad
+_PARTS = 4  # number of samples of the distance from objects on each segment
+_NEAR = 1e-4  # gap below which a minimum of the distance is refined, m
 _ZOOM = np.linspace(-1.0, 1.0, 9) / _PARTS  # offsets at which a minimum is refined, in segments
-_CREEP = 1e-3  # speed below which sliding is opposed by less than full friction, m/s
+_CREEP = 1e-3  # speed below which friction is regularised, m/s
 
 
 @dataclass(frozen=True)
 class Dynamics:
-    """Inertia and damping of a whisker that moves fast.
+    """Inertia and damping of a whisker, and parameters of its dynamic simulation.
 
     Parameters
     ----------
     density : tuple of float
         Density at base and tip, kg/m³.
     damping_ratio : float
-        Damping ratio of the first vibration.
+        Damping ratio of the first vibration mode.
     segments : int
-        Number of segments of the whisker.
+        Number of segments of the whisker, more than three.
     step : float
-        Longest step in time, s.
+        Longest time step, s.
     contact_stiffness : float
-        Stiffness of rigid objects, N/m: indented by micrometres only.
+        Stiffness of rigid objects, N/m; the default allows indentations of micrometres.
 
     Raises
     ------
     ValueError
-        If a number is not positive, or the damping negative.
+        If a number is not positive, or the damping ratio is outside [0, 2].
     """
 
     density: tuple[float, float] = DENSITY
@@ -107,15 +106,15 @@ class Dynamics:
             faults.append(
                 f"damping_ratio is {self.damping_ratio!r}; 0 to {_MOST_DAMPED:g} (14 % is 0.14)"
             )
-        # Of what is positive; a density in g/cm³ is a thousandth.
+        # A density in g/cm³ would be a thousandth of that in kg/m³.
         if not faults and min(self.density) < _LIGHTEST:
             faults.append(f"density is {self.density!r}; it is in kg/m³: 1 g/cm³ is 1000")
         if faults:
-            raise ValueError("no dynamics: " + "; ".join(faults))
+            raise ValueError("the dynamics are not valid: " + "; ".join(faults))
 
 
 def resonances(whisker: Whisker, dynamics: Dynamics | None = None, count: int = 3) -> Array:
-    """Resonance frequencies of a free whisker, held at its base."""
+    """Lowest resonance frequencies (count,) of a whisker held at its base only, Hz."""
     dynamics = dynamics or Dynamics()
     return frequencies(Chain.of(whisker, dynamics.density, dynamics.segments), count)
 
@@ -129,7 +128,7 @@ def move_dynamically(
     friction: float = 0.0,
     progress: Progress | None = None,
 ) -> list[Moment]:
-    """Move a whisker among objects."""
+    """Simulate the motion of a whisker among objects; return its state in every frame."""
     chain = Chain.of(whisker, dynamics.density, dynamics.segments)
     frame = float(np.diff(motion.time).min())
     parts = int(np.ceil(frame / dynamics.step * (1.0 - 1e-9)))
@@ -160,7 +159,7 @@ def move_dynamically(
 
 
 class Path:
-    """Placements of the base, step by step."""
+    """Poses of the base at equal time steps, by a spline through the frames."""
 
     def __init__(self, time: Array, rotation: Array, position: Array, step: float) -> None:
         time = time - time[0]
@@ -177,7 +176,11 @@ class Path:
 
 
 class Contact(NamedTuple):
-    """One contact: which object, arc length, control points' numbers and weights, gap, normal."""
+    """Contact of the centreline with an object.
+
+    Attributes are the index of the object, the arc length, the segment with the weights (3,) of its
+    control points, the point on the centreline, the (negative) gap and the object's normal.
+    """
 
     surface: int
     arc_length: float
@@ -190,7 +193,10 @@ class Contact(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """A moment of the movement, laboratory frame, SI units."""
+    """State of the whisker in one frame and its wrench at the base, laboratory frame, SI units.
+
+    ``contact_force`` and ``sliding`` are those of the strongest contact, which comes first.
+    """
 
     force: Array
     moment: Array
@@ -201,7 +207,7 @@ class Moment:
     sliding: bool
 
     def centerline(self, n: int) -> Array:
-        """Centreline (n, 3)."""
+        """Points (n, 3) of the centreline, equally spaced in arc length."""
         s = np.linspace(0.0, self.nodes[-1], n)
         segment = np.clip(np.searchsorted(self.nodes, s) - 1, 0, self.nodes.size - 2)
         part = (s - self.nodes[segment]) / np.diff(self.nodes)[segment]
@@ -209,14 +215,14 @@ class Moment:
 
 
 def frequencies(chain: Chain, count: int) -> Array:
-    """Lowest frequencies of a chain at rest, held at its base: (count,), Hz."""
+    """Lowest resonance frequencies (count,) of a chain clamped at its base, Hz."""
     slow, _ = slowest(at_rest(chain), count)
     return np.asarray(1.0 / np.sqrt(slow) / (2.0 * np.pi))
 
 
 def slowest(state: State, count: int) -> tuple[Array, Array]:
-    """Inverse squares (count,) of the lowest rates of a chain at rest, and its modes (n, count)."""
-    # The stiffness is regular, the mass need not be: twist of a straight whisker has none.
+    """Inverse squares (count,) of the lowest angular frequencies, and their modes (n, count)."""
+    # The stiffness is regular; the mass need not be, as twist of a straight whisker moves no mass.
     stiffness = state.chain.stiffness.ravel()
     which = [stiffness.size - count, stiffness.size - 1]
     slow, modes = linalg.eigh(state.matrix, np.diag(stiffness), subset_by_index=which)
@@ -224,7 +230,7 @@ def slowest(state: State, count: int) -> tuple[Array, Array]:
 
 
 def damping_time(chain: Chain, ratio: float) -> float:
-    """Time constant of a damping by which the first vibration has a damping ratio, s."""
+    """Time constant η of material damping that gives the first mode a damping ratio, s."""
     return ratio / (np.pi * float(frequencies(chain, 1)[0]))
 
 
@@ -237,7 +243,7 @@ def at_rest(chain: Chain) -> State:
 
 
 class State:
-    """Present state of the links; its arrays are overwritten in every round."""
+    """Current state of the links; its arrays are overwritten in every iteration."""
 
     def __init__(self, chain: Chain) -> None:
         m = chain.joints.size
@@ -250,7 +256,7 @@ class State:
         self.controls = np.empty((chain.nodes.size - 1, 3, 3))
 
     def move(self, theta: Array, rotation: Array, base: Array) -> None:
-        """Turn the joints and place the base."""
+        """Set the joint rotations θ (m, 3) and the pose of the base."""
         chain = self.chain
         configure(
             theta,
@@ -266,14 +272,14 @@ class State:
         self.controls = chain.controls(self.frames, self.pivots, base)
 
     def accelerate(self, pull: Array) -> None:
-        """Fill the generalised inertial forces of a pull (m, 3) on the masses, and their matrix."""
+        """Fill the generalised forces of ``pull`` (k, 3) on the masses, and the mass matrix."""
         mass, link = self.chain.mass, self.chain.mass_link
         joints = self.pivots, self.turns
         inertia(self.masses, mass, link, pull, *joints, self.residual, self.matrix)
 
 
 class History(NamedTuple):
-    """Values of one quantity in the last two steps, and its rates."""
+    """Values and rates of change of one quantity in the last two steps."""
 
     value: Array
     before: Array
@@ -288,8 +294,8 @@ class History(NamedTuple):
 
     @classmethod
     def before_first(cls, values: Array, step: float) -> History:
-        """History of the first of four values (4, ...), continued backward smoothly."""
-        # Newton's backward differences, through the first four.
+        """History at the first of four values (4, ...), extrapolated backward by a cubic."""
+        # Newton's formula with the differences of the first four values.
         one, two, three = (np.diff(values, k, axis=0)[0] for k in (1, 2, 3))
         value = [
             values[0] - k * one + k * (k + 1) / 2 * two - k * (k + 1) * (k + 2) / 6 * three
@@ -299,26 +305,26 @@ class History(NamedTuple):
         return cls(value[0], value[1], rates[0], rates[1])
 
     def rate_of(self, now: Array, step: float) -> Array:
-        """Rate of a present value."""
+        """Rate of change at the new value."""
         return np.asarray((1.5 * now - 2.0 * self.value + 0.5 * self.before) / step)
 
     def acceleration_of(self, rate: Array, step: float) -> Array:
-        """Acceleration of a present rate."""
+        """Acceleration at the new rate."""
         return np.asarray((1.5 * rate - 2.0 * self.rate + 0.5 * self.rate_before) / step)
 
     def then(self, now: Array, step: float) -> History:
-        """History one step later."""
+        """History after one more step, with the new value."""
         return History(now.copy(), self.value, self.rate_of(now, step), self.rate)
 
 
 class Walk:
-    """The whisker, step by step."""
+    """Time integration of a whisker among objects."""
 
     turned = 1e-9
-    """Largest turn of a joint in the last round of a step, rad."""
+    """Largest rotation of a joint in the last iteration of a step, rad."""
 
     rounds = 60
-    """Most rounds of Newton's method in a step."""
+    """Largest number of Newton iterations in a step."""
 
     def __init__(
         self,
@@ -344,9 +350,10 @@ class Walk:
         self._theta = self._masses = self._controls = History.still(np.zeros(1))
 
     def begin(self, rotations: Array, places: Array) -> bool:
-        """Begin unbent, moved along by the first placements (4, ...), if nothing is in the way.
+        """Set the initial state from the first four poses of the base; return whether it is free.
 
-        Otherwise begin unbent and still. Returns whether it was free.
+        If the unbent whisker touches no object, it starts unbent and moving with the base;
+        otherwise it starts unbent and at rest.
         """
         state, rest = self._state, self._chain.rest
         state.move(rest, rotations[0], places[0])
@@ -364,7 +371,7 @@ class Walk:
         return free
 
     def step(self, rotation: Array, base: Array) -> Moment:
-        """Next step, to a placement of the base."""
+        """Advance by one step to a new pose of the base."""
         chain, state = self._chain, self._state
         h, theta = self._step, self._theta.value.copy()
         rate = 1.5 / h
@@ -381,7 +388,7 @@ class Walk:
             residual: Array = state.residual + elastic.ravel()
             matrix = rate**2 * state.matrix
             matrix[np.diag_indices_from(matrix)] += spring.ravel()
-            # Near sticking Newton's method overshoots, where the secant of friction does not.
+            # Near sticking, Newton's method overshoots; the secant of friction does not.
             eager = rounds < _EAGER
             touching = [
                 self._push(contact, residual, matrix, eager) for contact in self._contacts()
@@ -397,7 +404,7 @@ class Walk:
         return self._moment(base, pull, touching)
 
     def _contacts(self) -> list[Contact]:
-        """Contacts of the whisker."""
+        """Contacts of the whisker with all objects."""
         contacts = []
         controls = self._state.controls
         line = np.einsum("kc,kci->ki", self._weights, controls[self._segment])
@@ -415,7 +422,7 @@ class Walk:
         return contacts
 
     def _nearest(self, number: int, dip: int) -> Contact:
-        """The minimum of the distance near a sample."""
+        """Contact at the refined minimum of the distance near a sample."""
         at = np.clip(self._segment[dip] + self._part[dip] + _ZOOM, 0.0, self._chain.nodes.size - 1)
         away = self._away(number, at)
         i = int(np.argmin(away))
@@ -436,7 +443,7 @@ class Walk:
         return Contact(number, float(arc), segment, weights, place, distance - radius, normal)
 
     def _away(self, number: int, at: Array) -> Array:
-        """Distances of the centreline from an object, at segments and fractions of them."""
+        """Distances of the centreline from an object, at positions in (fractional) segments."""
         segment = np.minimum(at.astype(int), self._chain.nodes.size - 2)
         place = np.einsum("kc,kci->ki", bezier(at - segment), self._state.controls[segment])
         return self._surfaces[number].signed_distance(place)
@@ -444,7 +451,7 @@ class Walk:
     def _push(
         self, contact: Contact, residual: Array, matrix: Array, eager: bool
     ) -> tuple[Contact, Array, bool]:
-        """Add a contact's force and its derivative to the equations."""
+        """Add a contact's force and its derivative to the equations; return force and sliding."""
         state, segment = self._state, contact.segment
         links = self._links[[segment, segment, segment + 1]]
         points = state.controls[segment]
@@ -494,11 +501,12 @@ class Walk:
         )
 
 
+# Parameters of `inertial_wrench`.
 _SEGMENTS = 16  # number of segments of the chains
-_STEP = 0.4  # longest step, as a share of the time in which the first vibration turns by one radian
-_HOLD = 5e3  # stiffness with which a point is held, over EI/L³ at the base
-_WEIGHTLESS = 1e-6  # share of the mass that the chain without mass has
-_PROXIMAL = 0.02  # smallest arc length at which a chain is held, over L
+_STEP = 0.4  # longest time step, in radians of the first vibration mode
+_HOLD = 5e3  # stiffness of the constraint at the point, in units of EI/L³ at the base
+_WEIGHTLESS = 1e-6  # mass of the massless chain, relative to that of the whisker
+_PROXIMAL = 0.02  # smallest arc length of the constraint, in units of L
 
 
 def inertial_wrench(
@@ -513,9 +521,10 @@ def inertial_wrench(
 ) -> Array:
     """Part of the wrench (n, 6) at the base that is due to inertia and damping, SI units.
 
-    Points of the centreline are held, laboratory frame, NaN where nothing is touched; only the
-    first arc length of a contact counts. Where a chain without mass would need a force above
-    ``most``, the point of the nearest frame takes its place, or the contact ends.
+    The centreline is constrained to pass through ``points`` (n, 3), laboratory frame, NaN without
+    contact; of ``arc_length`` (n,) only the value in the first frame of a contact is used. Where
+    the massless chain would need a force above ``most``, the point is replaced by that of the
+    nearest other frame; if this does not suffice, the contact ends there.
     """
     frame = float(time[-1] - time[0]) / (len(time) - 1)
     chain = Chain.of(whisker, dynamics.density, _SEGMENTS)
@@ -534,7 +543,7 @@ def inertial_wrench(
 
 
 def _nearest(points: Array, wrong: AnyArray) -> Array:
-    """Points of which those that are wrong are those of the nearest other frames."""
+    """Replace the points of wrong frames by those of the nearest other frames."""
     right = np.flatnonzero(np.isfinite(points).all(axis=1) & ~wrong)
     if not right.size:
         return np.full_like(points, np.nan)
@@ -545,7 +554,7 @@ def _nearest(points: Array, wrong: AnyArray) -> Array:
 
 
 def _until(points: Array, wrong: AnyArray) -> Array:
-    """Points of contacts that end where they are wrong."""
+    """Remove the points of contacts from their first wrong frame on."""
     out = points.copy()
     for row in range(len(points)):
         if wrong[row] or (row and np.isfinite(points[row - 1]).all() and np.isnan(out[row - 1, 0])):
@@ -554,7 +563,7 @@ def _until(points: Array, wrong: AnyArray) -> Array:
 
 
 class _Held(Walk):
-    """Chain that slides through one point."""
+    """Chain constrained to slide through one point."""
 
     turned = 1e-6
     rounds = 12
@@ -567,10 +576,10 @@ class _Held(Walk):
         self._at = 0.0
 
     def wrench(self, path: Path, points: Array, arc_length: Array) -> tuple[Array, Array]:
-        """Wrench (n, 6) and force (n,) that holds the point in every frame."""
+        """Wrench (n, 6), base frame, and size of the constraint force (n,) in every frame."""
         parts = (path.count - 1) // (len(points) - 1)
         turns, places = path.at(np.arange(path.count))
-        # A point is held from its first frame to its last; NaN on either side gives NaN.
+        # Between frames the point is interpolated; it is NaN unless both frames have a point.
         time = np.arange(path.count) / parts
         first = time.astype(int)
         share = (time - first)[:, None]
@@ -594,7 +603,7 @@ class _Held(Walk):
         return out, force
 
     def _contacts(self) -> list[Contact]:
-        """Contact with the point, in two directions across the whisker."""
+        """Constraint at the point, as two contacts in directions across the whisker."""
         if self._point is None:
             return []
         nodes = self._chain.nodes

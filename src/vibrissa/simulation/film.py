@@ -1,23 +1,23 @@
-"""Films of a simulated trial: the videos that two cameras would have recorded.
+"""Synthetic videos of a simulated trial, as two cameras would record it.
 
-Backlit, the whisker, the object and the face are dark on uneven light. The whisker has its true
-tapering width, down to a fraction of a pixel; it is blurred by the lens, by the pixel and by its
-movement while the shutter is open; an object between it and the camera hides it. Photons and
-electronics add noise.
+Whisker, object and face are backlit: dark on an uneven bright background. The whisker has its true
+tapering width, down to a fraction of a pixel; it is blurred by the lens, by the pixels and by its
+motion during the exposure; objects between it and the camera hide it. Shot noise and read noise are
+added.
 
-A film has as many frames as its trial. The true traces, the centreline in pixels and which part of
-it is hidden, are added to the recording's group ``truth``.
+A video has as many frames as the trial. The true traces, the centreline in pixels and a mask of its
+visible part, are added to the recording's group ``truth``.
 
-Objects hide what is behind them, for any signed distance: along a line of sight the distance to the
-nearest surface is also a length on which it is not met, so that few steps lead past an object or
-into it. The least distance along the line gives the share of a pixel that the object covers.
+Occlusion works for any object with a signed distance (sphere tracing): from a point of a line of
+sight the surface is at least the signed distance away, so that few steps lead past an object or
+into it. The smallest distance along the line gives the share of a pixel that the object covers.
 
 The image of a thin dark strip of half width w, blurred by a Gaussian of standard deviation σ, is
 
     c(d) = ½ [erf((w + d) / √2 σ) + erf((w − d) / √2 σ)]
 
-at the distance d from its middle, whatever w is: a strip far thinner than a pixel is a faint line
-of the right darkness. σ includes both the blur of the lens and the size of a pixel.
+at the distance d from its middle, for any w: a strip far thinner than a pixel is a faint line of
+correct integrated darkness. σ includes both the blur of the lens and the size of a pixel.
 """
 
 from __future__ import annotations
@@ -44,56 +44,56 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 Progress = Callable[[int, int], None]
-"""Called with the number of frames done and of all frames."""
+"""Function called with the number of frames done and the total number."""
 
-_STEP = 2.0  # length of a piece of painted whisker, pixels
+_STEP = 2.0  # length of a rendered piece of whisker, pixels
 _CHEEK = 0.5e-3  # margin of the face of several whiskers beyond their bases, m
 _MARGIN = 0.05  # margin of the image of several whiskers, as a share of their extent
-_REACH = 0.15  # distance before and behind the scene up to which objects are searched, m
-_STEPS = 200  # most steps along a line of sight
-_COARSE = 8  # pitch of the grid on which an object's outline is searched, pixels
-_SOFT = 3.0  # standard deviations of the blur up to which an outline is computed pixel by pixel
-_TAIL = 3.5  # standard deviations of the blur beyond which a strip's image is zero
+_REACH = 0.15  # distance in front of and behind the scene at which objects are considered, m
+_STEPS = 200  # largest number of steps along a line of sight
+_COARSE = 8  # spacing of the coarse grid used to find an object's outline, pixels
+_SOFT = 3.0  # half width of the outline computed pixel by pixel, standard deviations of the blur
+_TAIL = 3.5  # distance beyond which a strip's image is zero, standard deviations of the blur
 _NEXT_SEED = 7919  # difference between the seeds of two cameras
 _FUR = 2.0  # softness of the face's edge, standard deviation, pixels
 
 
 @dataclass(frozen=True)
 class ImageConditions:
-    """Light, optics and noise of a film.
+    """Light, optics and noise of a synthetic video.
 
     Parameters
     ----------
     light : float
         Brightest grey value of the background.
     unevenness : float
-        Share of the light that is missing at the corners and between brighter patches.
+        Relative loss of light in the corners and between brighter patches.
     dark : float
         Grey value of face and objects.
     contrast : float
-        Share of the light that the whisker blocks where it covers a pixel.
+        Share of the light that a whisker blocks in a pixel it covers.
     blur : float
-        Standard deviation of the lens's blur, pixels.
+        Standard deviation of the blur of the lens, pixels.
     exposure : float
-        Time that the shutter is open, s.
+        Exposure time, s.
     gain : float
         Electrons per grey value, which set the shot noise.
     read_noise : float
         Standard deviation of the read noise, grey values.
     face : tuple of float
-        Half the length, width and height of the face, m, zeros for none. The base is on its
-        surface; the face of several whiskers is as large as their bases need, or at least this
-        size if it has fur.
+        Half the length, width and height of the face, m; zeros for no face. The base is on its
+        surface. With several whiskers the face just encloses their bases; with fur it has at least
+        the stated size.
     fur : float
-        Standard deviation of the texture of the face, grey values; with it, hairs stand out from
-        the face's edge and lie over the bases.
+        Standard deviation of the texture of the face, grey values. If positive, hairs also protrude
+        from the edge of the face and cover the bases.
     cheek : float
-        Contrast of a whisker before the animal's grey cheek, grey values: 0 for no cheek, 10–20 in
-        the paper's films. The cheek is behind half of the whisker in views along y.
+        Contrast of a whisker in front of the animal's grey cheek, grey values: 0 for no cheek,
+        10–20 in the paper's videos. The cheek is behind half of the whisker in views along y.
     wires : int
-        Number of thin dark lines in the background, which do not move.
+        Number of thin, stationary dark lines in the background.
     side_light : float
-        Brightness of the lit flank of a whisker relative to the darkness of its middle, 0 to 1.
+        Brightness of the whisker's side-lit edge relative to the darkness of its middle, 0 to 1.
     """
 
     light: float = 200.0
@@ -131,19 +131,19 @@ class ImageConditions:
             if not right(getattr(self, name))
         ]
         if faults:
-            raise ValueError("no film: " + "; ".join(faults))
+            raise ValueError("the image conditions are not valid: " + "; ".join(faults))
 
     @property
     def sigma(self) -> float:
-        """Blur of lens and pixel together, pixels."""
+        """Standard deviation of the blur of lens and pixel together, pixels."""
         return float(np.sqrt(self.blur**2 + 1.0 / 12.0))
 
 
 def views_of(recording: xr.DataTree, pixel_size: float | None = None) -> tuple[Camera, Camera]:
-    """Cameras of the paper, pointed at the middle of the space that a trial's whiskers sweep."""
+    """Cameras of the paper, centred on the region that a trial's whiskers sweep."""
     lines = _truth(recording)["centerline"].values
     low, high = np.nanmin(lines, axis=(0, 1, 2)), np.nanmax(lines, axis=(0, 1, 2))
-    # A whole tenth of a millimetre is easier to note.
+    # Rounded to a tenth of a millimetre for readability.
     middle = np.round(0.5 * (low + high), 4)
     if pixel_size is None:
         whole = (1.0 + _MARGIN) * float((high - low).max()) / min(orthogonal_views()[0].size)
@@ -161,24 +161,24 @@ def film(
     rate: float = 50.0,
     progress: Progress | None = None,
 ) -> xr.DataTree:
-    """Film a simulated trial.
+    """Render the videos of a simulated trial.
 
     Parameters
     ----------
     recording : xarray.DataTree
         Recording of `vibrissa.simulation.simulate`.
     paths : mapping of str to path
-        Path of each view's video by its name, ``.mkv`` (lossless) or ``.mp4``.
+        Path of the video, ``.mkv`` (lossless) or ``.mp4``, by the name of its view.
     cameras : sequence of Camera, optional
-        Cameras, whose names are those of the paths; by default `views_of` the trial.
+        Cameras, with the names of the views; by default the result of `views_of`.
     conditions : ImageConditions, optional
         Light, blur and noise of the images.
     seed : int
         Seed of the noise.
     rate : float
-        Frame rate at which the videos are to be shown, Hz.
+        Frame rate at which the videos are played, Hz.
     progress : callable, optional
-        Function called after every frame with the numbers of frames done and of all frames.
+        Function called after every frame with the number of frames done and the total number.
 
     Returns
     -------
@@ -189,7 +189,7 @@ def film(
     Raises
     ------
     ValueError
-        If the recording has no true centrelines, or views and paths differ.
+        If the recording has no true centrelines, or the names of cameras and paths differ.
     """
     cameras = views_of(recording) if cameras is None else tuple(cameras)
     names = [camera.name for camera in cameras]
@@ -216,7 +216,7 @@ def film_frames(
     *,
     seed: int = 0,
 ) -> Iterator[Frame]:
-    """Frames of a simulated trial, filmed with one camera."""
+    """Yield the frames of a simulated trial in one camera view."""
     conditions = conditions or ImageConditions()
     truth = _truth(recording)
     lines = truth["centerline"].values
@@ -282,7 +282,7 @@ def _expose_whisker(
     shown: Array,
     conditions: ImageConditions,
 ) -> None:
-    """Add the light that a whisker takes, which drifts while the shutter is open, to a total."""
+    """Add the light blocked by a whisker to ``total``, with motion blur by its ``drift``."""
     sigma = conditions.sigma
     count = max(1, int(np.ceil(np.nanmax(np.linalg.norm(drift, axis=1), initial=0.0))))
     reach = float(wide.max()) + 4.0 * sigma
@@ -300,21 +300,21 @@ def _expose_whisker(
 def _surroundings(
     camera: Camera, lines: Array, conditions: ImageConditions, seed: int
 ) -> Surroundings:
-    """Fur, cheek and wires around whiskers whose longest one decides how far they go."""
+    """Fur, cheek and wires, with sizes relative to the longest whisker in the first frame."""
     ends = camera.project(lines[0, :, [0, -1]])
     extent = float(np.nanmax(np.linalg.norm(ends[1] - ends[0], axis=-1)))
     return Surroundings.of(camera, conditions.fur, conditions.cheek, conditions.wires, extent, seed)
 
 
 def _to_the_left(line: Array) -> Array:
-    """Unit vectors to the left (−dy, dx) of a line (n, 2)."""
+    """Unit normals (−dy, dx) of a line (n, 2)."""
     dx, dy = np.gradient(line, axis=0).T
     left = np.stack([-dy, dx], axis=1)
     return np.asarray(left / np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-9))
 
 
 def with_true_traces(recording: xr.DataTree, cameras: Sequence[Camera]) -> xr.DataTree:
-    """Recording with the true traces of a simulated trial in the images of cameras."""
+    """Add cameras, and the true traces in their images, to the recording of a simulated trial."""
     truth = _truth(recording)
     line = Group(truth)["centerline"]
     objects = Recording(recording).objects
@@ -338,14 +338,15 @@ def with_true_traces(recording: xr.DataTree, cameras: Sequence[Camera]) -> xr.Da
 
 
 def _truth(recording: xr.DataTree) -> xr.Dataset:
+    """Group ``truth`` of a recording, with the coordinate ``time``."""
     truth = recording.children.get("truth")
     if truth is None or "centerline" not in truth.data_vars:
-        raise ValueError("the recording has no true centrelines to film")
+        raise ValueError("the recording has no true centrelines, which a video needs")
     return truth.to_dataset().assign_coords(time=recording["time"])
 
 
 def _moves(lines: Array, time: Array, exposure: float) -> Array:
-    """Displacement of each node while the shutter is open, (time, whisker, node, 3), m."""
+    """Displacement (time, whisker, node, 3) of each node during the exposure, m."""
     if len(lines) < 2:
         return np.zeros_like(lines)
     step = np.diff(lines, axis=0) / np.diff(time)[:, None, None, None]
@@ -355,7 +356,7 @@ def _moves(lines: Array, time: Array, exposure: float) -> Array:
 
 
 def _fine(line: Array, radius: Array, camera: Camera) -> tuple[Array, Array]:
-    """Points (n, 3) about two pixels apart and radii (n,), m."""
+    """Resample a centreline to points (n, 3) about two pixels apart, with radii (n,), m."""
     pixels = camera.project(line)
     length = float(np.linalg.norm(np.diff(pixels, axis=0), axis=1).sum())
     s = np.linspace(0.0, 1.0, len(line))
@@ -364,6 +365,7 @@ def _fine(line: Array, radius: Array, camera: Camera) -> tuple[Array, Array]:
 
 
 def _at(move: Array, fine: Array, line: Array) -> Array:
+    """Displacements of the nodes of a line, interpolated to its resampled points."""
     s = np.linspace(0.0, 1.0, len(line))
     t = np.linspace(0.0, 1.0, len(fine))
     return np.stack([np.interp(t, s, move[:, k]) for k in range(3)], axis=-1)
@@ -372,7 +374,7 @@ def _at(move: Array, fine: Array, line: Array) -> Array:
 def _scene(
     camera: Camera, objects: Sequence[Surface], conditions: ImageConditions, center: Array
 ) -> Image:
-    """Light and objects, (height, width)."""
+    """Image (height, width) of the background light and the objects."""
     width, height = camera.size
     x, y = np.meshgrid(np.linspace(-1.0, 1.0, width), np.linspace(-1.0, 1.0, height))
     patches = np.sin(3.1 * x + 1.0) * np.cos(2.3 * y - 0.5) + np.cos(5.3 * x - 3.7 * y)
@@ -393,7 +395,7 @@ def _face(
         center = bases.mean(axis=0)
         size = np.abs(bases - center).max(axis=0) + _CHEEK
         if conditions.fur > 0.0:
-            # A furry face is as large as it is stated to be, and the foremost base on its surface.
+            # A furry face has at least the stated size, with the foremost base on its surface.
             size = np.maximum(size, conditions.face)
             center[0] = bases[:, 0].max() - size[0]
     middle, slopes = camera.project_with_slopes(center)
@@ -407,7 +409,7 @@ def _face(
 
 
 def hidden(points: Array, camera: Camera, objects: Sequence[Surface]) -> Array:
-    """Which points (...) are hidden by an object: 1, or 0."""
+    """Mask (...) of the points (..., 3) hidden by an object: 1 hidden, 0 visible."""
     flat = points.reshape(-1, 3)
     out = np.zeros(len(flat))
     known = np.isfinite(flat).all(axis=1)
@@ -420,7 +422,7 @@ def hidden(points: Array, camera: Camera, objects: Sequence[Surface]) -> Array:
 
 
 def silhouette(camera: Camera, objects: Sequence[Surface], center: Array, soft: float) -> Array:
-    """Share of each pixel that objects cover."""
+    """Share of each pixel (height, width) covered by objects, with edges of width ``soft``."""
     width, height = camera.size
     covered = np.zeros((height, width))
     if not objects:
@@ -446,18 +448,19 @@ def silhouette(camera: Camera, objects: Sequence[Surface], center: Array, soft: 
 
 
 def _block(place: int) -> slice:
-    """Pixels that are nearest to a corner."""
+    """Pixels nearest to a point of the coarse grid, along one axis."""
     return slice(max(place - _COARSE // 2, 0), place + _COARSE // 2)
 
 
 def _pixels_per_m(camera: Camera, point: Array) -> float:
+    """Scale of the image at a point, pixels per metre."""
     return float(np.linalg.norm(camera.project_with_slopes(point)[1]) / np.sqrt(2.0))
 
 
 def _nearest(
     camera: Camera, thing: Surface, pixels: NDArray[np.int64], center: Array, scale: float
 ) -> Array:
-    """Least distance of an object from the lines of sight, m."""
+    """Smallest signed distance of an object from the line of sight of each pixel (n, 2), m."""
     origin, direction = camera.rays(pixels)
     along = ((center - origin) * direction).sum(axis=1) - _REACH
     start = origin + along[:, None] * direction
@@ -465,7 +468,7 @@ def _nearest(
 
 
 def _least(thing: Surface, start: Array, direction: Array, reach: float, step: float) -> Array:
-    """Least signed distance along the line from each start (n, 3), m."""
+    """Smallest signed distance from an object along the line from each start (n, 3), m."""
     least = np.full(len(start), np.inf)
     gone = np.zeros(len(start))
     active = np.arange(len(start))
@@ -473,7 +476,7 @@ def _least(thing: Surface, start: Array, direction: Array, reach: float, step: f
         distance = thing.signed_distance(start[active] + gone[active, None] * direction[active])
         least[active] = np.minimum(least[active], distance)
         gone[active] += np.maximum(np.abs(distance), step)
-        # Deep inside the least distance no longer matters.
+        # Deep inside the object, the exact distance no longer matters.
         active = active[(gone[active] < reach) & (least[active] > -20.0 * step)]
         if not active.size:
             break
@@ -482,7 +485,7 @@ def _least(thing: Surface, start: Array, direction: Array, reach: float, step: f
 
 @kernel
 def cover(image: Any, line: Any, half_width: Any, shown: Any, sigma: float, share: float) -> None:
-    """Share of each pixel that a strip covers, at most ``share`` of it."""
+    """Draw the coverage of pixels by a strip, scaled by ``share``, as a maximum with the image."""
     rows, columns = image.shape
     last = line.shape[0] - 2
     scale = 1.0 / (math.sqrt(2.0) * sigma)
@@ -522,7 +525,7 @@ def cover(image: Any, line: Any, half_width: Any, shown: Any, sigma: float, shar
 
 @kernel
 def collect(covered: Any, total: Any, line: Any, reach: float, sign: float) -> None:
-    """Add what was covered, near a line, to the total, and clear it."""
+    """Add the coverage near a line to ``total``, times ``sign``, and clear it."""
     rows, columns = covered.shape
     for k in range(line.shape[0] - 1):
         left = max(0, math.floor(min(line[k, 0], line[k + 1, 0]) - reach))
@@ -546,7 +549,7 @@ def expose(
     read_noise: float,
     frame: Any,
 ) -> None:
-    """Turn light into grey values with noise."""
+    """Convert light into grey values with shot and read noise."""
     rows, columns = frame.shape
     for row in range(rows):
         start = starts[row]
@@ -559,7 +562,7 @@ def expose(
 
 @kernel
 def shade(image: Any, center: Any, inverse: Any, level: float, edge: float, box: Any) -> None:
-    """Paint a soft dark ellipse."""
+    """Draw an ellipse of grey value ``level`` with a soft edge, within a box of the image."""
     scale = 1.0 / (math.sqrt(2.0) * edge)
     a, b, c = inverse[0, 0], inverse[0, 1], inverse[1, 1]
     for row in range(box[0], box[1]):
@@ -568,7 +571,7 @@ def shade(image: Any, center: Any, inverse: Any, level: float, edge: float, box:
             x = column - center[0]
             gx, gy = a * x + b * y, b * x + c * y
             m = math.sqrt(x * gx + y * gy) + 1e-12
-            # Distance from the edge, to first order.
+            # Distance from the edge, to first order, over √2 times its standard deviation.
             v = (m - 1.0) * m / (math.sqrt(gx * gx + gy * gy) + 1e-12) * scale
             if v <= 2.5:
                 w = 1.0 if v < -2.5 else 0.5 * (1.0 - math.erf(v))

@@ -1,28 +1,25 @@
-"""Motion of a whisker's base, whisking in closed form, and of all whiskers of a face.
+"""Motion of whisker bases: whisking of one whisker or a whole array, and suitable objects.
 
-The laboratory frame has z up; the base sits near its origin, the whisker points along x (away from
-the head) at azimuth 0, and protraction, which raises the azimuth, moves it toward y (forward):
+The laboratory frame has z up; the base is near its origin, the whisker points along x (away from
+the head) at azimuth 0, and protraction, which increases the azimuth, moves it toward y (forward):
 
     x_lab = R x_whisker + o,    R = R_z(azimuth) R_y(−elevation) R_x(roll)
 
 so that the base tangent is (cos el cos az, cos el sin az, sin el). At zero angles the whisker's
-intrinsic curvature bends its tip forward; pushed against something in front of it the whisker is
-concave forward, and against something behind it concave backward.
+intrinsic curvature bends its tip forward; pushed against an object in front of it the whisker is
+concave forward, and against an object behind it concave backward.
 
-Elevation and roll follow the azimuth by a fixed ratio (Knutsen, Biess & Ahissar 2008), row by row
-of the mystacial array; to this slow drifts of set point, amplitude, elevation and position are
-added, sums of three sinusoids with random phases. All is smooth.
+Elevation and roll change with the azimuth by ratios that depend on the row of the mystacial array
+(Knutsen, Biess & Ahissar 2008). Slow drifts of set point, amplitude, elevation and position are
+added, each a sum of three sinusoids with random phases, so that the motion is smooth.
 
-Every whisker of a face protracts by the same angle, forward on both sides, about its own rest pose
-(`vibrissa.whisker.array`); elevation and roll follow by the ratios of its row. The two sides are
-mirror images of each other. The face is not an obstacle: neither whiskers nor objects are kept out
-of it.
+All whiskers of an array protract by the same angle, forward on both sides, about their own rest
+pose (`vibrissa.whisker.array`), with the ratios of their row. The two sides are mirror images of
+each other. The face is not an obstacle to whiskers or objects.
 
-Position of an object and amplitude of whisking, for whiskers of any length and shape.
-
-The peg is at a share of the whisker's reach. The turn at which the whisker slips past depends on
-its shape and taper and is found by a coarse sweep in each direction, from clear of the peg until
-the whisker is clear again on the other side.
+Objects are placed at a share of the whisker's reach. The rotation at which a whisker slips past an
+object depends on its shape and taper, and is found by a coarse sweep in each direction, until the
+whisker is free again on the other side.
 """
 
 from __future__ import annotations
@@ -49,15 +46,15 @@ from vibrissa.whisker import (
     mirrored,
 )
 
-# Elevation gained per azimuth by row (Knutsen et al. 2008).
+# Change of elevation per azimuth by row (Knutsen et al. 2008).
 ELEVATION_PER_AZIMUTH: Mapping[str, float] = MappingProxyType(
     {"A": 0.12, "B": 0.30, "C": 0.30, "D": 0.14, "E": 0.02}
 )
-# Roll about the base tangent per azimuth by row (Knutsen et al. 2008).
+# Change of roll about the base tangent per azimuth by row (Knutsen et al. 2008).
 ROLL_PER_AZIMUTH: Mapping[str, float] = MappingProxyType(
     {"A": -0.76, "B": -0.25, "C": 0.22, "D": 0.43, "E": 0.73}
 )
-# Frequencies of the slow drifts, Hz: their common period is far longer than a trial.
+# Frequencies of the slow drifts, Hz; their common period is far longer than a trial.
 _DRIFT = np.array([0.31, 0.57, 0.93])
 
 
@@ -68,20 +65,20 @@ class Motion:
     Parameters
     ----------
     time : array (n,)
-        Times of the frames, s, rising.
+        Times of the frames, s, strictly increasing.
     azimuth, elevation, roll : array (n,)
-        Angles of the base, rad; see the module. Where the head turns, they are relative to it.
+        Angles of the base, rad, as defined in the module; relative to the head if it rotates.
     base_position : array (n, 3)
         Position of the base in the laboratory frame, m.
     head_rotation : array (n, 3, 3), optional
-        Rotation from the head's to the laboratory frame, where the head turns.
+        Rotation from the head frame to the laboratory frame, if the head rotates.
     head_position : array (n, 3), optional
-        Origin of the head's frame in the laboratory, m, where the head moves.
+        Origin of the head frame in the laboratory frame, m, if the head moves.
 
     Raises
     ------
     ValueError
-        If shapes differ, a number is not finite or time does not rise.
+        If shapes differ, a number is not finite or time does not increase.
     """
 
     time: Array
@@ -110,9 +107,9 @@ class Motion:
                 faults.append(f"{name} is an angle in rad; got {largest:g}, as of degrees")
             object.__setattr__(self, name, values)
         if not faults and (np.diff(self.time) <= 0.0).any():
-            faults.append("time does not rise")
+            faults.append("time does not increase")
         if faults:
-            raise ValueError("no motion: " + "; ".join(faults))
+            raise ValueError("the motion is not valid: " + "; ".join(faults))
 
     def __repr__(self) -> str:
         """Number of frames and duration."""
@@ -121,32 +118,32 @@ class Motion:
 
     @property
     def base_rotation(self) -> Array:
-        """Rotations (n, 3, 3) from the whisker's to the laboratory frame."""
+        """Rotations (n, 3, 3) from the whisker frame to the laboratory frame."""
         on_head = base_rotation(self.azimuth, self.elevation, self.roll)
         return on_head if self.head_rotation is None else self.head_rotation @ on_head
 
     def on_head(self, rotation: ArrayLike, position: ArrayLike) -> Motion:
-        """Same motion on a head that moves as well.
+        """Combine this motion, relative to the head, with a motion of the head.
 
         Parameters
         ----------
         rotation : array_like (n, 3, 3) or (3, 3)
-            Rotation from the head's to the laboratory frame.
+            Rotation from the head frame to the laboratory frame.
         position : array_like (n, 3) or (3,)
-            Origin of the head's frame in the laboratory, m.
+            Origin of the head frame in the laboratory frame, m.
 
         Returns
         -------
         Motion
-            Motion with the base carried along.
+            Combined motion.
 
         Raises
         ------
         ValueError
-            If shapes do not fit, a matrix is not a rotation, or the head moves already.
+            If shapes do not match, a matrix is not a rotation, or the motion already has a head.
         """
         if self.head_rotation is not None:
-            raise ValueError("the head moves already: a motion goes on a head once")
+            raise ValueError("this motion already includes a motion of the head")
         n = len(self)
         turn = np.array(np.broadcast_to(numbers("rotation", rotation), (n, 3, 3)))
         shift = np.array(np.broadcast_to(np.asarray(position, dtype=np.float64), (n, 3)))
@@ -177,7 +174,7 @@ def whisking(
     position_drift: float = 1e-3,
     seed: int = 0,
 ) -> Motion:
-    """Whisking: sweeps back and forth, a little different each time.
+    """Simulate whisking: sweeps back and forth with slow drifts.
 
     Parameters
     ----------
@@ -188,23 +185,23 @@ def whisking(
     frequency : float
         Frequency of whisking, Hz.
     amplitude : float
-        Half of the sweep, rad; the trial begins at the rear end of a sweep.
+        Half the range of a sweep, rad; the trial begins at the rear end of a sweep.
     set_point : float
         Azimuth in the middle of the sweep, rad.
     protraction : float
-        Share of a whisk that goes forward, from 0.3 to 0.7; above one half retraction is faster.
+        Protraction's share of a whisk, from 0.3 to 0.7; above one half retraction is faster.
     row : {"A", "B", "C", "D", "E"}
-        Row of the array, by which elevation and roll follow the azimuth.
+        Row of the array, which sets the default ratios of elevation and roll to azimuth.
     elevation : float
         Elevation at the set point, rad.
     elevation_per_azimuth, roll_per_azimuth : float
-        Gain of elevation and roll per azimuth from the set point; by default those of the row.
+        Ratios of elevation and roll to the azimuth from the set point; by default those of the row.
     variation : float
         Largest drift of amplitude and of set point, as a share of the amplitude.
     elevation_drift : float
         Largest drift of the elevation, rad.
     position_drift : float
-        Largest drift of the base along each axis of the laboratory, m.
+        Largest drift of the base along each axis of the laboratory frame, m.
     seed : int
         Seed of the drifts.
 
@@ -216,8 +213,8 @@ def whisking(
     Raises
     ------
     ValueError
-        If duration, rate or frequency are not positive, fewer than two frames result, the share of
-        protraction is out of bounds, or there is no such row.
+        If duration, rate or frequency is not positive, fewer than two frames result, the share of
+        protraction is out of bounds, or the row is unknown.
 
     Examples
     --------
@@ -237,7 +234,7 @@ def whisking(
     if not 0.3 <= protraction <= 0.7:
         faults.append(f"protraction is {protraction!r}; a share from 0.3 to 0.7 is needed")
     if faults:
-        raise ValueError("no whisking: " + "; ".join(faults))
+        raise ValueError("the whisking is not valid: " + "; ".join(faults))
     if elevation_per_azimuth is None:
         elevation_per_azimuth = ELEVATION_PER_AZIMUTH[row]
     if roll_per_azimuth is None:
@@ -246,7 +243,7 @@ def whisking(
     drifts = _drifts(time, 6, seed)
     size = amplitude * (1.0 + variation * drifts[0])
     phase = 2.0 * np.pi * frequency * time
-    # The turning points are where the warped phase is a multiple of π.
+    # Turning points are where the warped phase is a multiple of π.
     forward = 2.0 * np.pi * protraction
     phase = phase + (np.pi - forward) / (1.0 - np.cos(forward)) * (1.0 - np.cos(phase))
     offset = amplitude * variation * drifts[1] - size * np.cos(phase)
@@ -268,12 +265,12 @@ def tabulated(
     *,
     rate: float = 1000.0,
 ) -> Motion:
-    """Motion through the rows of a table, smooth in between.
+    """Interpolate the rows of a table smoothly to a motion.
 
     Parameters
     ----------
     time : array_like (m,)
-        Times of the rows, s, rising.
+        Times of the rows, s, strictly increasing.
     azimuth, elevation, roll : array_like (m,) or ()
         Angles of the base, rad.
     base_position : array_like (m, 3) or (3,)
@@ -284,14 +281,14 @@ def tabulated(
     Returns
     -------
     Motion
-        Motion with frames at the first time, 1/rate later, … up to the last; cubic splines between
-        the rows.
+        Motion with frames from the first to the last time at intervals of 1/rate, interpolated by
+        cubic splines.
 
     Raises
     ------
     ValueError
-        If shapes do not fit, a number is missing, time does not rise, or fewer than two frames
-        result.
+        If shapes do not match, a number is missing, time does not increase, or fewer than two
+        frames result.
 
     Examples
     --------
@@ -327,7 +324,7 @@ def array_whisking(
     head_position: ArrayLike | None = None,
     **motion: Any,
 ) -> dict[str, Motion]:
-    """Whisking of all whiskers of a face.
+    """Simulate whisking of all whiskers of an array.
 
     Parameters
     ----------
@@ -338,21 +335,21 @@ def array_whisking(
     rate : float
         Frame rate, Hz.
     head_rotation : array_like (n, 3, 3) or (3, 3), optional
-        Rotation from the head's to the laboratory frame; by default they are the same.
+        Rotation from the head frame to the laboratory frame; by default the identity.
     head_position : array_like (n, 3) or (3,), optional
-        Position of the snout in the laboratory, m; by default its origin.
+        Position of the snout in the laboratory frame, m; by default its origin.
     **motion
         Other parameters of `whisking`, except ``row`` and the ratios, which are those of each row.
 
     Returns
     -------
     dict of str to Motion
-        Motions by the whiskers' names, n frames each.
+        Motion of each whisker, n frames, by its name.
 
     Raises
     ------
     ValueError
-        As `whisking` and `Motion.on_head` do.
+        If `whisking` or `Motion.on_head` raises it.
 
     Examples
     --------
@@ -374,7 +371,7 @@ def shared_whisking(
     position_drift: float = 0.0,
     **motion: Any,
 ) -> Motion:
-    """Whisking about rest, as all whiskers of an array share it; the azimuth is from rest."""
+    """Whisking shared by all whiskers of an array; angles are relative to the rest pose."""
     return whisking(
         duration,
         rate,
@@ -394,11 +391,11 @@ def protracted(
     head_rotation: ArrayLike | None = None,
     head_position: ArrayLike | None = None,
 ) -> dict[str, Motion]:
-    """Motions of all whiskers by one protraction, each from its own pose of rest.
+    """Motions of all whiskers of an array for one shared protraction.
 
-    The azimuth of ``motion`` is the angle by which whiskers are protracted from rest, to which each
-    row's elevation and roll are added; its own elevation, roll and displacement (of the right side,
-    mirrored on the left one) are added to these.
+    The azimuth of ``motion`` is the protraction from each whisker's rest pose; elevation and roll
+    follow by the ratios of its row. The elevation, roll and displacement of ``motion``, those of
+    the right side and mirrored for the left, are added.
     """
     turn = np.eye(3) if head_rotation is None else head_rotation
     shift = np.zeros(3) if head_position is None else head_position
@@ -408,7 +405,7 @@ def protracted(
         identity = array.identity(name)
         left = identity.side == "left"
         rest = angles_of(whisker.pose.rotation)
-        # On the left the angles are those of the mirror image, mirrored back in the end.
+        # On the left side, angles are those of the mirror image and are mirrored back at the end.
         azimuth, elevation, roll = mirrored(rest) if left else rest
         angles = np.stack(
             [
@@ -432,28 +429,28 @@ def head_path(
     to_position: ArrayLike | None = None,
     to_angles: ArrayLike | None = None,
 ) -> tuple[Array, Array]:
-    """Path of a head from one pose to another, smooth, beginning and ending at rest.
+    """Smooth path of a head from one pose to another, starting and ending at rest.
 
     Parameters
     ----------
     time : array_like (n,)
         Times of the frames, s.
     position : array_like (3,)
-        Position of the snout at the beginning, laboratory frame, m.
+        Initial position of the snout, laboratory frame, m.
     angles : array_like (3,)
-        Angles of the head at the beginning, rad: azimuth turns it to its left, elevation raises
-        its right side, roll raises its snout (`base_rotation`).
+        Initial angles of the head, rad: azimuth turns it to its left, elevation raises its right
+        side, roll raises its snout (`base_rotation`).
     to_position, to_angles : array_like (3,), optional
-        Position and angles at the end; by default as at the beginning.
+        Final position and angles; by default the initial ones.
 
     Returns
     -------
     tuple of array (n, 3, 3) and array (n, 3)
-        Rotations from the head's to the laboratory frame, and positions of the snout, m.
+        Rotations from the head frame to the laboratory frame, and positions of the snout, m.
     """
     t = np.asarray(time, dtype=np.float64)
     share = (t - t[0]) / (t[-1] - t[0])
-    # The path of least jerk.
+    # Minimum-jerk path.
     share = (share**3 * (10.0 - 15.0 * share + 6.0 * share**2))[:, None]
     ends = [(position, to_position), (angles, to_angles)]
     place, turned = (
@@ -463,7 +460,7 @@ def head_path(
 
 
 def _drifts(time: Array, count: int, seed: int) -> Array:
-    """Smooth slow functions (count, n) of time (n,), s, within ±1."""
+    """Slow random functions (count, n) of time (n,), s, with values within ±1."""
     phases = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, (count, _DRIFT.size))
     angles = 2.0 * np.pi * _DRIFT[:, None] * time + phases[..., None]
     values: Array = np.sin(angles).mean(axis=1)
@@ -471,9 +468,9 @@ def _drifts(time: Array, count: int, seed: int) -> Array:
 
 
 PEG_RADIUS = 1.35e-3  # half the diameter of the paper's peg, m
-_STEP = np.radians(1.5)  # turn of a step of the coarse sweep
-_FARTHEST = np.radians(120.0)  # largest turn of the coarse sweep
-_MARGIN = np.radians(5.0)  # turn beyond the slip
+_STEP = np.radians(1.5)  # step of the coarse sweep
+_FARTHEST = np.radians(120.0)  # largest angle of the coarse sweep
+_MARGIN = np.radians(5.0)  # margin beyond the angle at which the whisker slips
 
 
 def facing_peg(whisker: Whisker, distance: float = 0.65, radius: float = PEG_RADIUS) -> Peg:
@@ -482,22 +479,22 @@ def facing_peg(whisker: Whisker, distance: float = 0.65, radius: float = PEG_RAD
     Parameters
     ----------
     whisker : Whisker
-        Whisker that is to touch it.
+        Whisker that should be able to touch the peg.
     distance : float
-        Distance from the base to the peg's axis, as a share of the farthest reach of the resting
-        whisker.
+        Distance from the base to the peg's axis, as a share of the largest distance of the resting
+        whisker from its base.
     radius : float
         Radius of the peg, m.
 
     Returns
     -------
     Peg
-        Peg on the x axis of the laboratory.
+        Peg whose axis crosses the x axis of the laboratory frame.
 
     Raises
     ------
     ValueError
-        If the distance is not a share of the reach, or if the base would touch the peg.
+        If the distance is not in (0, 1), or the base would be too close to the peg.
     """
     if not 0.0 < distance < 1.0:
         raise ValueError(f"distance is {distance!r}; a share of the reach, in (0, 1), is needed")
@@ -512,21 +509,21 @@ def facing_peg(whisker: Whisker, distance: float = 0.65, radius: float = PEG_RAD
 
 
 def within_reach(whisker: Whisker | WhiskerArray, kind: str | None = None) -> Surface:
-    """Object within reach of a whisker, or of the whiskers of a face.
+    """Object within reach of a whisker, or of the whiskers of an array.
 
     Parameters
     ----------
     whisker : Whisker or WhiskerArray
-        Whisker that is to touch it, or whiskers.
+        Whisker or whiskers that should be able to touch the object.
     kind : {"peg", "sphere", "box", "plane"}, optional
         Kind of the object; by default a peg for a whisker, and a sphere for an array.
 
     Returns
     -------
     Peg, Sphere, Box or Plane
-        Object near the base of the whisker; or before the right side of a face at the origin of the
-        laboratory, out of the reach of whiskers at rest, for a head that moves forward by 14 mm (a
-        plane is square to its path).
+        Object near the base of a whisker. For an array, the object is in front of the right side of
+        a face at the origin of the laboratory frame, and whiskers at rest do not reach it until the
+        head moves forward by 14 mm (a plane is perpendicular to this path).
 
     Raises
     ------
@@ -554,8 +551,8 @@ def within_reach(whisker: Whisker | WhiskerArray, kind: str | None = None) -> Su
     chosen = next(iter(things)) if kind is None else kind
     if chosen not in things:
         raise ValueError(
-            f"the object is of kind {kind!r}; one of {', '.join(things)} is needed (a mesh is "
-            "written in the trial's text)"
+            f"the object is of kind {kind!r}; one of {', '.join(things)} is needed (a mesh must be "
+            "described in the trial's script)"
         )
     return things[chosen]
 
@@ -575,15 +572,15 @@ def sweep_past(
     Parameters
     ----------
     whisker : Whisker
-        Whisker that whisks.
+        Whisker to move.
     thing : Peg, Sphere or Box
-        Object near it; a peg more or less vertical.
+        Object near the whisker; a peg should be approximately vertical.
     duration : float
         Duration of the trial, s.
     rate : float
         Frame rate, Hz.
     row : {"A", "B", "C", "D", "E"}
-        Row of the array, by which elevation and roll follow the azimuth.
+        Row of the array, which sets the default ratios of elevation and roll to azimuth.
     seed : int
         Seed of the drifts.
     **motion
@@ -592,12 +589,12 @@ def sweep_past(
     Returns
     -------
     Motion
-        Motion whose set point and amplitude lead past the slips on either side of the object.
+        Motion whose set point and amplitude make the whisker slip off both sides of the object.
 
     Raises
     ------
     ValueError
-        If the row is unknown, if the whisker does not touch the object, or does not slip past it
+        If the row is unknown, the whisker does not touch the object, or it does not slip past it
         within 120°.
     """
     if row not in ROLL_PER_AZIMUTH:
@@ -609,7 +606,7 @@ def sweep_past(
     ratios = motion["elevation_per_azimuth"], motion["roll_per_azimuth"]
     rear = _slip(whisker, thing, -1.0, ratios) - _MARGIN
     front = _slip(whisker, thing, 1.0, ratios) + _MARGIN
-    # A drift of set point or amplitude must not keep the whisker from slipping.
+    # The whisker must slip in spite of drifts of set point and amplitude.
     amplitude = 0.5 * (front - rear) * (1.0 + 2.0 * motion["variation"])
     motion.setdefault("amplitude", amplitude)
     motion.setdefault("set_point", 0.5 * (front + rear))
@@ -617,11 +614,11 @@ def sweep_past(
 
 
 def _toward(whisker: Whisker, thing: Peg | Sphere | Box) -> float:
-    """Azimuth of the base at which the resting whisker would run through an object, rad."""
+    """Azimuth of the base at which the resting whisker would pass through an object, rad."""
     points = whisker.centerline(801)
     distance = np.hypot(*thing.origin[:2])
     near = np.abs(np.hypot(points[:, 0], points[:, 1]) - distance)
-    # The nearest branch counts, where a whisker curls back to the same distance.
+    # If the whisker curls back to the same distance, the part nearer to the base is used.
     i = int(np.argmax(near <= near.min() + 1e-3 * whisker.length))
     there = np.arctan2(thing.origin[1], thing.origin[0])
     return float(there - np.arctan2(points[i, 1], points[i, 0]))
@@ -630,7 +627,7 @@ def _toward(whisker: Whisker, thing: Peg | Sphere | Box) -> float:
 def _slip(
     whisker: Whisker, thing: Peg | Sphere | Box, sense: float, ratios: tuple[float, float]
 ) -> float:
-    """Azimuth at which the whisker slips past, sweeping forward (sense 1) or back (−1), rad."""
+    """Azimuth at which the whisker slips past an object in a forward (1) or backward (−1) sweep."""
     middle = _toward(whisker, thing)
     turned = np.arange(-0.5 * _FARTHEST, _FARTHEST, _STEP) * sense
     rotations = base_rotation(middle + turned, ratios[0] * turned, ratios[1] * turned)

@@ -1,6 +1,6 @@
-"""The text of a trial: whiskers, objects, motion, head, sensor; in mm and °.
+"""Script of a simulated trial: whiskers, objects, motion, head and sensor; in mm and degrees.
 
-The text is TOML, and everything in it may be left out. `EXAMPLE` has all of it.
+Scripts are TOML, and every key is optional. `EXAMPLE` shows all keys.
 """
 
 from __future__ import annotations
@@ -41,34 +41,34 @@ from vibrissa.simulation.motion import (
 from vibrissa.whisker import Whisker, WhiskerArray, base_rotation, whisker_array
 
 _MOST_FRAMES = 10_000_000  # largest number of frames of a trial
-# Every key of a trial, with its default.
+# Every key of a script, with its default.
 EXAMPLE = """\
 # A trial for `vibrissa simulate`: lengths in mm, angles in degrees, forces in µN, moments in µN·m.
-# What is left out has the value shown here, unless stated otherwise.
+# Every key is optional; defaults are the values shown, unless stated otherwise.
 
 duration = 3.5          # s
 rate = 1000.0           # frames per second
 friction = 0.0          # Coulomb's coefficient between whisker and objects
-seed = 0                # of drifts and noise
+seed = 0                # seed of drifts and noise
 
 # [dynamics]            # inertia and damping; without it the whisker moves quasi-statically
 # density = [1220.0, 1632.0]  # at base and tip, kg/m³
-# damping_ratio = 0.14  # of the first vibration
+# damping_ratio = 0.14  # of the first vibration mode
 # segments = 32
 # step = 0.1            # ms
 
 # [whisker]
 # file = "C1.csv"       # its centreline; by default a built-in γ whisker
 
-# [array]               # instead of one whisker all of a face, in the head's frame: snout at the
-#                       # origin, x to the right, y forward, z up; they whisk about their rest
-# file = "rat7.csv"     # a table or a folder of centrelines; by default an average rat's
+# [array]               # all whiskers of a face instead of one, in the head frame: snout at the
+#                       # origin, x to the right, y forward, z up; they whisk about their rest pose
+# file = "rat7.csv"     # a table or a folder of centrelines; by default those of an average rat
 # side = "both"         # or left, right
 # rows = "ABCDE"
-# columns = [0, 1, 2, 3, 4, 5, 6]   # 0 is the Greek one
+# columns = [0, 1, 2, 3, 4, 5, 6]   # 0 stands for the Greek whiskers
 # whiskers = ["C2", "gamma"]        # instead of rows and columns
 
-# The objects; by default one peg within reach. More of them: repeat [[object]].
+# Objects; by default one peg within reach. For several objects, repeat [[object]].
 [[object]]
 kind = "peg"            # or sphere, plane, box, mesh
 position = [26.0, 0.0, 0.0]
@@ -77,35 +77,35 @@ diameter = 2.7
 # stiffness = 10.0      # N/m; rigid by default
 # A sphere has position and diameter; a plane position and normal (toward the free side); a box
 # position, size = [x, y, z], angles = [azimuth, elevation, roll] and edge_radius; a mesh file,
-# unit (what 1 in the file is, mm) and resolution.
+# unit (length of one unit of the file, mm) and resolution.
 
 [motion]
 kind = "past"           # past the first object and back; or "whisking", or "table"
-row = "C"               # of the array: how elevation and roll follow the azimuth
+row = "C"               # row of the array, which sets how elevation and roll follow the azimuth
 frequency = 5.0         # whisks per second
 protraction = 0.5       # share of a whisk that goes forward, 0.3 to 0.7
 variation = 0.05        # drift of amplitude and set point, as a share of the amplitude
 elevation = 0.0         # at the set point
 elevation_drift = 4.0
 # position_drift = 1.2  # by default 3 % of the whisker's length
-# amplitude = 30.0      # half of the sweep; "past" finds what it takes
+# amplitude = 30.0      # half the range of a sweep; "past" chooses it so that the whisker slips
 # set_point = 0.0
-# file = "motion.csv"   # of a table: columns time, azimuth, elevation, roll, x, y, z (s, rad, m)
+# file = "motion.csv"   # for kind "table": time, azimuth, elevation, roll, x, y, z (s, rad, m)
 
 # [head]                # moves everything but the objects
 # position = [0.0, 0.0, 0.0]
 # angles = [0.0, 0.0, 0.0]  # azimuth, elevation, roll
-# to_position, to_angles    # the same at the end; it goes there smoothly
-# file = "head.csv"     # instead: columns as of a motion
+# to_position, to_angles    # final pose, reached smoothly
+# file = "head.csv"     # instead: a table with the columns of a motion
 
 [sensor]
 # channels = ["Fx", "My", "Mz"]     # all six by default
-# mixing = [[1, 0, 0, 0, 0, 0], …]  # what each channel reads of Fx, Fy, Fz (N), Mx, My, Mz (N·m)
-force_noise = 1.0       # white
+# mixing = [[1, 0, 0, 0, 0, 0], …]  # weights of Fx, Fy, Fz (N), Mx, My, Mz (N·m) in each channel
+force_noise = 1.0       # standard deviation of white noise
 moment_noise = 0.02
 force_bias = 0.0
 moment_bias = 0.0
-force_drift = 0.0       # random walk, after one second
+force_drift = 0.0       # standard deviation of a random walk after one second
 moment_drift = 0.0
 force_resolution = 0.0
 moment_resolution = 0.0
@@ -115,7 +115,7 @@ gain_error = 0.0
 _MICRO = 1e-6
 _TOP = {"duration", "rate", "friction", "seed"}
 _TOP |= {"whisker", "array", "object", "motion", "head", "sensor", "dynamics"}
-# Motion of the head of an array by default: forward, toward the object there.
+# Default motion of an array's head: forward, toward the object.
 _ADVANCE = MappingProxyType({"to_position": [0.0, 14.0, 0.0]})
 # Columns of a table of motion.
 MM = 1e-3
@@ -132,7 +132,7 @@ class Script:
 
     whisker: Whisker | WhiskerArray
     objects: tuple[Surface, ...]
-    motion: Motion | Mapping[str, Motion]  # of each base by the whisker's name
+    motion: Motion | Mapping[str, Motion]  # of each base, by the name of the whisker
     friction: float
     sensor: Sensor
     seed: int
@@ -142,7 +142,7 @@ class Script:
 def read_script(
     text: str, folder: Path, read_whisker: Callable[[Path | None], Whisker], **changes: Any
 ) -> Script:
-    """Trial from its text."""
+    """Read a trial from the text of its script, in which ``changes`` replace values."""
     table = parsed_toml(text)
     given = {name: value for name, value in changes.items() if value is not None}
     table |= {k: given[k] for k in ("duration", "rate", "friction", "seed") if k in given}
@@ -157,13 +157,13 @@ def read_script(
         sensor |= {"force_noise": 0.0, "moment_noise": 0.0}
     seed = int(one_number(table, "seed", 0.0))
     if moves.get("kind") == "table" and "duration" in table:
-        raise ValueError("duration is stated, and a motion of kind table has its own")
+        raise ValueError("duration is given, but a motion of kind table has its own duration")
     usual = 3.5 if isinstance(whisker, Whisker) else 0.5
     duration, rate = one_number(table, "duration", usual), one_number(table, "rate", 1000.0)
     if not 0.0 < duration * rate <= _MOST_FRAMES:
         raise ValueError(
-            f"duration is {duration:g} s and rate {rate:g} frames/s; both are positive, and a "
-            f"trial has up to {_MOST_FRAMES:,} frames"
+            f"duration is {duration:g} s and rate {rate:g} frames/s; both must be positive, and a "
+            f"trial has at most {_MOST_FRAMES:,} frames"
         )
     head = subtable(table, "head")
     motion: Motion | Mapping[str, Motion]
@@ -190,11 +190,11 @@ def _whisker(
     folder: Path,
     read_whisker: Callable[[Path | None], Whisker],
 ) -> Whisker | WhiskerArray:
-    """The whisker, or the array."""
+    """Whisker or array of whiskers of a script."""
     alone = "whisker" in given or "whisker" in table
     together = {"array", "side", "whiskers"} & set(given) or "array" in table
     if alone and together:
-        raise ValueError("both a whisker and an array are asked for; one of them is needed")
+        raise ValueError("both a whisker and an array are given; give one of them")
     if together:
         return _array(subtable(table, "array"), given, folder)
     about = subtable(table, "whisker")
@@ -205,13 +205,13 @@ def _whisker(
 
 
 def _array(table: Mapping[str, Any], given: Mapping[str, Any], folder: Path) -> WhiskerArray:
-    """Chosen whiskers of the array."""
+    """Selected whiskers of the array."""
     check_keys(table, {"file", "side", "rows", "columns", "whiskers"}, "[array]")
     choice: dict[str, Any] = {"side": str(given.get("side", table.get("side", "both")))}
     names = given.get("whiskers", table.get("whiskers"))
     by_place = {key: table[key] for key in ("rows", "columns") if key in table}
     if by_place and "whiskers" in table:
-        raise ValueError(f"[array] has whiskers, and {', '.join(by_place)} instead; give one")
+        raise ValueError(f"[array] has both whiskers and {', '.join(by_place)}; give one")
     if names is None:
         choice |= by_place
     else:
@@ -231,13 +231,13 @@ def _objects(
     if not isinstance(things, list):
         raise ValueError("objects are written as [[object]], in double brackets")
     if "object" in given and things:
-        raise ValueError("an object is asked for, but the text has objects already")
+        raise ValueError("an object is given, but the script already has objects")
     known = tuple(object_of(thing, folder) for thing in things)
     return known or (within_reach(whisker, given.get("object")),)
 
 
 def read_objects(text: str, folder: Path) -> tuple[Surface, ...]:
-    """Objects of a trial, and nothing else of it."""
+    """Objects of a script; its other contents are ignored."""
     things = parsed_toml(text).get("object", [])
     if not isinstance(things, list) or not things:
         raise ValueError("there is no object; one is written as [[object]], in double brackets")
@@ -245,7 +245,7 @@ def read_objects(text: str, folder: Path) -> tuple[Surface, ...]:
 
 
 def _dynamics(table: Mapping[str, Any], wanted: bool) -> Dynamics | None:
-    """Inertia and damping, where they are stated or wanted."""
+    """Inertia and damping, if the script states them or ``wanted`` is true."""
     if not (wanted or "dynamics" in table):
         return None
     how = subtable(table, "dynamics")
@@ -263,7 +263,7 @@ def _dynamics(table: Mapping[str, Any], wanted: bool) -> Dynamics | None:
 
 
 def _sensor(table: Mapping[str, Any]) -> Sensor:
-    """Sensor; values of forces and moments are those of its channels' components."""
+    """Sensor; noise values of force and moment are propagated to its channels."""
     own = {f"{part}_{name}" for part in ("force", "moment") for name in _PER_COMPONENT}
     check_keys(table, own | {"channels", "mixing", "relative_noise", "gain_error"}, "[sensor]")
     channels = tuple(str(name) for name in table.get("channels", COMPONENTS))
@@ -285,7 +285,7 @@ def _sensor(table: Mapping[str, Any]) -> Sensor:
 
 
 def object_of(table: Any, folder: Path) -> Surface:
-    """Object of its table."""
+    """Object described by a table."""
     if not isinstance(table, Mapping):
         raise ValueError(f"an object is {quoted(table)}; it is written as [[object]]")
     kind = table.get("kind", "peg")
@@ -303,7 +303,7 @@ def object_of(table: Any, folder: Path) -> Surface:
     if kind == "mesh":
         if "file" not in table:
             raise ValueError(
-                'an object of kind mesh is a file: file = "body.stl" (STL, OBJ or PLY) is needed'
+                'an object of kind mesh needs a file (STL, OBJ or PLY), as file = "body.stl"'
             )
         resolution = table.get("resolution")
         return Mesh.load(
@@ -333,7 +333,7 @@ def motion_of(
     rate: float,
     seed: int,
 ) -> Motion:
-    """Motion of the base of one whisker on the head."""
+    """Motion of the base of one whisker relative to the head."""
     kind = table.pop("kind", "past")
     if kind == "table":
         return _tabulated(table, folder, rate)
@@ -352,7 +352,7 @@ def motion_of(
 def array_motion_of(
     table: dict[str, Any], folder: Path, duration: float, rate: float, seed: int
 ) -> Motion:
-    """Motion of the whiskers of an array about their rest, the same for all."""
+    """Motion shared by all whiskers of an array, relative to their rest pose."""
     kind = table.pop("kind", "whisking")
     if kind == "table":
         return _tabulated(table, folder, rate)
@@ -374,6 +374,7 @@ def _numbers(table: Mapping[str, Any], degrees: tuple[str, ...]) -> dict[str, An
 
 
 def _tabulated(table: Mapping[str, Any], folder: Path, rate: float) -> Motion:
+    """Motion read from a table in a file."""
     check_keys(table, {"file"}, "a motion of kind table")
     columns = columns_of(folder / str(table.get("file", "")))
     place = np.stack([columns[axis] for axis in "xyz"], axis=-1)
@@ -382,7 +383,7 @@ def _tabulated(table: Mapping[str, Any], folder: Path, rate: float) -> Motion:
 
 
 def head_of(table: Mapping[str, Any], folder: Path, time: Array) -> tuple[Array, Array]:
-    """Motion of the head."""
+    """Rotations (n, 3, 3) and positions (n, 3) of the head."""
     ends = {"position", "angles", "to_position", "to_angles"}
     check_keys(table, {"file"} if "file" in table else ends, "[head]")
     if "file" not in table:
@@ -401,12 +402,12 @@ def head_of(table: Mapping[str, Any], folder: Path, time: Array) -> tuple[Array,
 
 
 def turned(table: Mapping[str, Any]) -> Array:
-    """Rotation by the angles of a table."""
+    """Rotation matrix of the angles of a table."""
     return base_rotation(*np.radians(three_numbers(table, "angles", (0.0, 0.0, 0.0))))
 
 
 def columns_of(path: Path) -> dict[str, Array]:
-    """Columns of a table of motion; those that are missing are zero, except the time."""
+    """Columns of a table of motion; missing columns other than the time are zero."""
     rows = list(table_rows(read_text(path)))
     names = rows[0][1] if rows else []
     unknown = [name for name in names if name not in COLUMNS]
@@ -423,5 +424,5 @@ def columns_of(path: Path) -> dict[str, Array]:
         ) from None
     columns = dict(zip(names, values.T, strict=True))
     if not (np.isfinite(values).all() and (np.diff(columns["time"]) > 0.0).all()):
-        raise ValueError(f"{path} has a number that is missing, or time that does not rise")
+        raise ValueError(f"{path} has a number that is missing, or time that does not increase")
     return {name: columns.get(name, np.zeros(len(values))) for name in COLUMNS}

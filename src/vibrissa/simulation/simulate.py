@@ -1,23 +1,23 @@
-"""A trial, frame by frame: the base moves, the whisker bends, slips and springs free.
+"""Simulation of trials, and of sensor readings.
 
-Each frame continues the one before: the objects, seen from the base, move a little, and the
-contact sticks or slides along on the stable branch (:mod:`vibrissa.rod.surfaces`). Where that
-branch ends the whisker has slipped off; it springs back to rest, clear of the object (or against
-it, where it obstructs the rest shape), and meets it next from the side where it then is. A whisker
-is therefore never pulled through a peg. Quasi-static.
+By default the simulation is quasi-static. Each frame continues the previous one: the objects,
+relative to the base, move a little, and the contact sticks or slides on the stable branch of
+equilibria (:mod:`vibrissa.rod.surfaces`). Where that branch ends, the whisker slips off and springs
+back to rest, free of the object (or against it, if it obstructs the rest shape), and next meets the
+object from that side. A whisker is therefore never pulled through a peg.
 
-The contact followed is that with the object met first. Where the bent whisker would reach into
-another object, or into the same one elsewhere, the truth has ``second_contact``. Without friction
-and between rigid objects all contacts are then solved (:mod:`vibrissa.rod.around`), of which the
-strongest is recorded; else the depth is recorded as ``overlap``, and the wrench lacks what the
-other contacts would add.
+The simulated contact is with the object touched first. Where the bent whisker would penetrate
+another object, or the same one elsewhere, ``second_contact`` is true. Without friction and with
+rigid objects, all contacts are then solved (:mod:`vibrissa.rod.around`) and the strongest is
+recorded; otherwise the depth of penetration is recorded as ``overlap``, and the wrench lacks the
+contribution of the other contacts.
 
-Several whiskers are simulated one after the other: they do not touch each other.
+Several whiskers are simulated independently, without contact among them.
 
-With `vibrissa.simulation.dynamics` the whisker has inertia and damping: it collides, rings after it
-has slipped, and may touch at several places, of which the strongest is recorded.
+With `vibrissa.simulation.dynamics` the whisker has inertia and damping: it collides, vibrates after
+a slip, and may have several contacts, of which the strongest is recorded.
 
-`measure` adds what a sensor at the base reads.
+`measure` simulates the readings of a sensor at the base.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ from vibrissa.simulation.motion import Motion
 from vibrissa.status import Status
 from vibrissa.whisker import Whisker
 
-_ROUGHEST = 5.0  # coefficient of friction above which degrees were meant
+_ROUGHEST = 5.0  # largest coefficient of friction; a larger value is taken for an angle in degrees
 
 NODES = 33  # number of points of the recorded centrelines
 
 Progress = Callable[[int, int], None]
-"""Called with the number of frames done and of all frames."""
+"""Function called with the number of frames done and the total number."""
 
 
 T = TypeVar("T")
@@ -66,28 +66,28 @@ def simulate(
     Parameters
     ----------
     whisker : Whisker, sequence or mapping of Whisker
-        Whisker; several, such as a `WhiskerArray`, whisk together.
+        Whisker or whiskers, such as a `WhiskerArray`.
     motion : Motion, sequence or mapping of Motion
-        Motion of its base; as many as there are whiskers, in the same order or by the same names,
-        with the same frames and on the same head.
+        Motion of each whisker's base, in the same order or by the same names, with the same frames
+        and the same motion of the head.
     objects : Peg, Sphere, Plane, Box, Mesh or a sequence of them
-        Objects in the laboratory. With friction, or if they are not rigid, the one met first holds
-        the whisker alone.
+        Objects in the laboratory frame. With friction, or if objects are not rigid, only the object
+        touched first exerts a force in the quasi-static simulation.
     friction : float
-        Coulomb's coefficient between whisker and objects.
+        Coefficient of Coulomb friction between whisker and objects.
     dynamics : Dynamics, optional
-        Inertia and damping; by default the whisker moves quasi-statically.
+        Inertia and damping; by default the simulation is quasi-static.
     nodes : int
         Number of points of the recorded centrelines, equally spaced in arc length.
     progress : callable, optional
-        Function called after every frame of every whisker with the numbers of frames done and of
-        all frames.
+        Function called after every frame of every whisker with the number of frames done and the
+        total number.
 
     Returns
     -------
     xarray.DataTree
-        Recording (`vibrissa.recording`): the reading of a perfect sensor at the base, the pose of
-        the base, and everything else in the group ``truth``.
+        Recording (`vibrissa.recording`) with the noise-free force and moment at the base, the pose
+        of the base, and all other variables in the group ``truth``.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def _recording(
     truths: Sequence[Mapping[str, Array]],
     origin: str,
 ) -> xr.DataTree:
-    """Write a simulated trial as a recording."""
+    """Assemble a recording of a simulated trial."""
     pose = {
         "base_position": [motion.base_position for motion in motions],
         "base_rotation": [motion.base_rotation for motion in motions],
@@ -166,7 +166,7 @@ def _recording(
 
 
 def _pairs(whisker: Whiskers, motion: Motions) -> list[tuple[Whisker, Motion]]:
-    """Whiskers with their motions."""
+    """Pair whiskers with their motions, and check that these match."""
     if isinstance(whisker, Mapping) and isinstance(motion, Mapping):
         missing = [name for name in whisker if name not in motion]
         if missing:
@@ -176,8 +176,8 @@ def _pairs(whisker: Whiskers, motion: Motions) -> list[tuple[Whisker, Motion]]:
     motions = [motion] if isinstance(motion, Motion) else _listed(motion)
     if not whiskers or len(whiskers) != len(motions):
         raise ValueError(
-            f"there are {len(whiskers)} whiskers and {len(motions)} motions; one motion a whisker, "
-            "and at least one, is needed"
+            f"there are {len(whiskers)} whiskers and {len(motions)} motions; one motion per "
+            "whisker, and at least one whisker, is needed"
         )
     names = [one.name for one in whiskers]
     twice = sorted({name for name in names if names.count(name) > 1})
@@ -192,10 +192,12 @@ def _pairs(whisker: Whiskers, motion: Motions) -> list[tuple[Whisker, Motion]]:
 
 
 def _listed(things: Sequence[T] | Mapping[str, T]) -> list[T]:
+    """List of the items of a sequence or the values of a mapping."""
     return list(things.values() if isinstance(things, Mapping) else things)
 
 
 def _same(a: Array | None, b: Array | None) -> bool:
+    """Whether two arrays are equal, or both are None."""
     return a is b if a is None or b is None else np.array_equal(a, b)
 
 
@@ -207,7 +209,7 @@ def _truth(
     friction: float,
     nodes: int,
 ) -> dict[str, Array]:
-    """Variables of the truth, quasi-static."""
+    """Variables of the group ``truth`` of a quasi-static simulation."""
     rotation, position = motion.base_rotation, motion.base_position
     solvable = friction == 0.0 and all(np.isinf(solid.stiffness) for solid in solids)
     bent = around(whisker, solids, rotation, position, found, several=solvable)
@@ -243,7 +245,7 @@ def _truth(
 def _dynamic_truth(
     whisker: Whisker, motion: Motion, moments: Sequence[Moment], nodes: int
 ) -> dict[str, Array]:
-    """Variables of the truth, with inertia."""
+    """Variables of the group ``truth`` of a dynamic simulation."""
     rotation, position = motion.base_rotation, motion.base_position
     n = len(moments)
     truth = {
@@ -289,32 +291,32 @@ def measure(
     *,
     sensor: Sensor | None = None,
 ) -> xr.DataTree:
-    """Measure the wrench of a simulated trial.
+    """Simulate the readings of a sensor at the base in a simulated trial.
 
     Parameters
     ----------
     recording : xarray.DataTree
         Recording with ``force`` and ``moment`` in the group ``truth``.
     force_noise : float
-        Standard deviation of each component of the force, N: white, Gaussian.
+        Standard deviation of white Gaussian noise in each component of the force, N.
     moment_noise : float
-        Standard deviation of each component of the moment, N·m.
+        Standard deviation of white Gaussian noise in each component of the moment, N·m.
     seed : int
         Seed of the noise.
     sensor : Sensor, optional
-        Sensor instead of one with that noise only.
+        Sensor to use instead of one with this white noise only.
 
     Returns
     -------
     xarray.DataTree
-        New recording, whose ``force`` and ``moment`` at the top are the sensor's readings, with
-        their noise in the attribute ``noise``. Missing frames stay missing. A sensor with other
-        channels gives ``reading`` and its ``mixing`` instead of them.
+        New recording whose ``force`` and ``moment`` in the root are the sensor's readings, with
+        their noise in the attribute ``noise``. Missing frames stay missing. For a sensor with other
+        channels, ``reading`` and ``mixing`` replace them.
 
     Raises
     ------
     ValueError
-        If a noise is negative, or if the recording has no true wrench.
+        If a noise is negative, or the recording has no true wrench.
     """
     for name, value in (("force_noise", force_noise), ("moment_noise", moment_noise)):
         if not (np.isfinite(value) and value >= 0.0):
@@ -322,12 +324,12 @@ def measure(
     names = ("force", "moment")
     truth = Recording(recording).find("truth")
     if truth is None or not all(name in truth for name in names):
-        raise ValueError("the recording has no true force and moment to measure")
+        raise ValueError("the recording has no true force and moment, which a sensor would measure")
     if sensor is None:
         sensor = Sensor(noise=np.repeat([force_noise, moment_noise], 3))
     wrench = np.concatenate([truth[name] for name in names], axis=-1)
     time = np.asarray(recording.to_dataset()["time"].values, dtype=np.float64)
-    # One sensor a whisker: each has noise of its own.
+    # One sensor per whisker, with independent noise.
     readings = [sensor.read(time, wrench[:, i], seed + i) for i in range(wrench.shape[1])]
     reading = np.stack(readings, axis=1)
     measured = recording.copy()
@@ -348,5 +350,5 @@ def measure(
 
 
 def _one(values: Array) -> float | Array:
-    """One number where all are the same."""
+    """The first value if all are equal, otherwise all values."""
     return float(values[0]) if (values == values[0]).all() else values

@@ -1,7 +1,7 @@
-"""Surroundings of the whiskers in a film: fur with hairs, the animal's cheek, wires.
+"""Surroundings of the whiskers in a synthetic video: fur with hairs, the animal's cheek, wires.
 
-The fur's texture, its hairs and the cheek move with the face, by whole pixels. Nothing of it is
-part of the truth.
+The texture and hairs of the fur and the cheek move with the face; textures move by whole pixels.
+None of these is part of the recorded truth.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ Image = NDArray[np.float32]
 
 # Standard deviations of the fur's texture across and along its hairs, and of its tufts, pixels.
 _GRAIN, _ALONG, _COARSE = 0.8, 3.0, 6.0
-_APART = 4.0  # distance of hairs along the outline of the face, pixels
+_APART = 4.0  # spacing of hairs along the outline of the face, pixels
 _HAIR = (4.0, 4.0)  # shape and scale, pixels, of the distribution of the lengths of hairs
 _THICKNESS = (0.3, 0.7)  # smallest and largest half width of a hair, pixels
 _WIRE = (0.6, 1.6)  # smallest and largest half width of a wire, pixels
-# Reach of the cheek, as a share of the length of the longest whisker in the image.
+# Smallest and largest length of the cheek, relative to the longest whisker in the image.
 _BEHIND = (0.35, 0.5)
 _CHEEK = 48.0  # grey value of the cheek
 
@@ -34,16 +34,16 @@ class Surroundings:
     """Fur, cheek and wires in the images of one camera."""
 
     texture: Image
-    hairs: list[Array]  # relative to the face: angle on its outline, direction, length, half width
+    hairs: list[Array]  # (4,): angle on the outline of the face, direction, length, half width
     wires: list[Array]  # (n, 3): column, row and half width
-    cheek: float  # length, pixels; 0 where the camera does not see it
+    cheek: float  # length, pixels; 0 if the camera does not see it
     contrast: float
 
     @classmethod
     def of(
         cls, camera: Camera, fur: float, cheek: float, wires: int, extent: float, seed: int
     ) -> Surroundings:
-        """Draw them from a seed; whiskers are of so many pixels' extent in the image."""
+        """Generate surroundings at random; ``extent`` is the length of whiskers, pixels."""
         random = np.random.default_rng([seed, 11])
         width, height = camera.size
         texture = np.zeros((height, width), dtype=np.float32)
@@ -72,12 +72,12 @@ class Surroundings:
         return cls(texture, hairs, lines, far, cheek)
 
     def furred(self, light: Image, middle: Array, share: Image) -> None:
-        """Give the face, which covers a share of each pixel, its texture."""
+        """Add the fur's texture to an image, scaled by the face's share of each pixel."""
         row, column = (round(float(x)) for x in middle[::-1])
         light += share * np.roll(self.texture, (row, column), (0, 1))
 
     def before_cheek(self, light: Image, base: Array, toward: float) -> Image | None:
-        """Paint the cheek behind a base; the factor of a whisker's contrast before it."""
+        """Draw the cheek behind a base; return the factor of a whisker's contrast, or None."""
         if not self.cheek:
             return None
         column = np.arange(light.shape[1])
@@ -91,7 +91,7 @@ class Surroundings:
         return np.asarray(1.0 - behind * (1.0 - min(self.contrast / _CHEEK, 1.0)), np.float32)
 
     def hair_lines(self, middle: Array, inverse: Array) -> list[tuple[Array, Array]]:
-        """Lines (n, 2) and half widths (n,) of the hairs of a face that is an ellipse."""
+        """Lines (n, 2) and half widths (n,) of the hairs of an elliptical face."""
         values, axes = np.linalg.eigh(inverse)
         t = np.linspace(0.0, 1.0, 9)[:, None]
         found = []
@@ -108,7 +108,7 @@ class Surroundings:
 
 
 def _wire(width: int, height: int, random: Any) -> Array:
-    """A thin bent line from one border of the image to another, with its half width."""
+    """Random thin curve (n, 3) between two borders of the image: column, row, half width."""
     ends = np.array(
         [
             [random.uniform(0.3, 0.95) * width, -5.0],

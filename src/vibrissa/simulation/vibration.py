@@ -1,38 +1,35 @@
-"""Vibrations: what a whisker's mass adds to the wrench at its base, and detection of contact.
+"""Vibration modes of a free whisker, fits of its mass and damping, and detection of contact.
 
-About its rest shape a free whisker that is held at a moving base vibrates in modes S_k, which
-:mod:`vibrissa.simulation.chain` has: with a the acceleration of its points if it did not bend,
+**Modes.** A free whisker on a moving base vibrates about its rest shape in modes S_k, computed from
+the chain of :mod:`vibrissa.simulation.chain`. If a is the acceleration of its points without
+bending,
 
     q̈ + η ω² q̇ + ω² q = -Σ m S·a,    F = -Σ m (a + Σ S_k q̈_k),    M = -Σ m x × (a + Σ S_k q̈_k),
 
-in the frame of the base, with η = 2 ζ/ω₁ for a damping of the material. Two pairs of modes are
-enough. What is left of the measured wrench of a free whisker is vibration after a release or an
-impact, which decays in the same modes from an unknown start; which frames are of a free whisker,
-the switching below finds.
+in the frame of the base, with material damping η = 2 ζ/ω₁. Two pairs of modes are sufficient. The
+remaining wrench of a free whisker is free vibration after a release or an impact, which decays in
+the same modes from unknown initial conditions.
 
-**Mass, resonances and damping** from the wrench at the base while the whisker is free.
-
-The motion of the base gives the mass, ringing after a release or a tap the frequencies and the
-damping. All windows in which nothing is touched are fitted at once: in each, free vibrations of an
-unknown start are left out of M_y and M_z (`Vibration`), and what the
-model leaves besides the noise is a share of the window's own size. Three factors are fitted, of
+**Mass, resonances and damping** are fitted to the wrench at the base while the whisker is free. The
+motion of the base determines the mass; vibration after a release or a tap determines the
+frequencies and the damping. All windows without contact are fitted together: in each, free
+vibrations with arbitrary initial conditions are projected out of M_y and M_z, and the model error
+is assumed to be a share of the size of the signal in the window. Three factors are fitted: those of
 mass, of frequency and of the time constant of the damping.
 
-**Switching** between a free whisker and one in contact: which of the two each frame is.
+**Contact** is detected by a hidden Markov model with forward and backward recursions. The whisker
+is either in contact, or free since some frame. Each frame of release is a separate hypothesis with
+a Kalman filter, whose state consists of the amplitude and velocity of each free mode, in units of
+the noise of the moment they cause, and of the relative error of the wrench in air, which is that of
+the mass. The covariance of the remaining wrench decides between hypotheses: it includes the
+sensor's noise, the covariance of the state, and nonlinear shares of the vibration that grow with
+the deflection. A recent release has a large covariance of the state and therefore explains larger
+wrenches. An error of mass or stiffness scales all frequencies by one factor and causes a growing
+error of phase; the factor is chosen by maximum likelihood over all frames, in steps of 10 %.
 
-A hidden Markov model, forward and backward. A whisker is in contact, or free since some frame, and
-each such frame is a hypothesis of its own with a Kalman filter: its state are amplitude and speed
-of each mode of free vibration, in units of the noise of the moment that they make, and the factor
-by which the wrench in air is wrong, as the mass is. So what decides is the covariance of what is
-left of the wrench: the sensor's noise, the state's own, and shares of the vibration that linear
-modes do not explain, which grow with the deflection. A hypothesis that is young knows its state
-badly, and explains the more. A wrong mass or stiffness makes all frequencies wrong by one factor,
-and with it the phase of every vibration ever more; the factor is that by which all frames are most
-probable, in steps of 10 %.
-
-In contact the wrench changes from frame to frame by what is usual for it, with long tails: a
-Student distribution about the last frame, as wide as the noise and the change before. A contact
-begins with a change that is well above the noise. All likelihoods are of (F, M_y, M_z).
+In contact the change of the wrench from frame to frame has a heavy-tailed (Student) distribution,
+whose width is given by the noise and the previous change. A contact begins with a change well above
+the noise. All likelihoods are those of (F, M_y, M_z).
 """
 
 from __future__ import annotations
@@ -48,26 +45,26 @@ from vibrissa.simulation.chain import Chain, jacobian
 from vibrissa.simulation.dynamics import Dynamics, at_rest, slowest
 from vibrissa.whisker import Whisker
 
-_MODES = 4  # modes, a pair of them for each number of nodes
+_MODES = 4  # number of modes: two pairs, as modes in the two directions come in pairs
 _PERIODS = 1.2  # length of a window, in periods of the first mode
 
 
 @dataclass(frozen=True, eq=False)
 class Vibration:
-    """Vibration of a free whisker that is held at its base; made by :meth:`of`.
+    """Vibration modes of a whisker held at its base and otherwise free; see :meth:`of`.
 
     Attributes
     ----------
     rates : (k,) array
-        Angular frequencies of the modes without damping, rad/s.
+        Undamped angular frequencies of the modes, rad/s.
     damping : float
         Time constant η of the damping, s.
     mass : (m,) array
-        Masses of points of the whisker, kg.
+        Point masses of the whisker, kg.
     places : (m, 3) array
-        Places of these points at rest, whisker frame, m.
+        Positions of the point masses at rest, whisker frame, m.
     shapes : (k, m, 3) array
-        Displacements of the modes, of mass one, 1/√kg.
+        Displacements of the point masses in the modes, normalised to unit modal mass, 1/√kg.
     """
 
     rates: Array
@@ -78,19 +75,19 @@ class Vibration:
 
     @classmethod
     def of(cls, whisker: Whisker, dynamics: Dynamics | None = None) -> Vibration:
-        """Find the modes of a whisker.
+        """Compute the modes of a whisker.
 
         Parameters
         ----------
         whisker : Whisker
             Whisker at rest.
         dynamics : Dynamics, optional
-            Density and damping, known to 20 %.
+            Density and damping.
 
         Returns
         -------
         Vibration
-            Vibration in the two lowest pairs of modes.
+            The two lowest pairs of modes.
         """
         dynamics = dynamics or Dynamics()
         chain = Chain.of(whisker, dynamics.density, dynamics.segments)
@@ -108,16 +105,16 @@ class Vibration:
 
     @property
     def window(self) -> float:
-        """Time over which free vibration is recognised, s."""
+        """Length of a window in which free vibration is fitted, s."""
         return float(_PERIODS * 2.0 * np.pi / self.rates[0])
 
     def base_wrench(self, accelerations: Array) -> Array:
-        """Wrench at the base of points that are accelerated.
+        """Wrench at the base due to accelerations of the point masses.
 
         Parameters
         ----------
         accelerations : (..., m, 3) array
-            Accelerations of the points, whisker frame, m/s².
+            Accelerations of the point masses, whisker frame, m/s².
 
         Returns
         -------
@@ -129,14 +126,14 @@ class Vibration:
         return np.concatenate([pull.sum(axis=-2), moment], axis=-1)
 
     def in_air(self, time: Array, rotation: Array, position: Array) -> Array:
-        """Wrench of a whisker that touches nothing while its base moves.
+        """Wrench at the base of a whisker without contact whose base moves.
 
         Parameters
         ----------
         time : (n,) array
             Times, s, equally spaced.
         rotation : (n, 3, 3) array
-            Rotation of the base, from the whisker's to the laboratory frame; smooth.
+            Rotation from the whisker frame to the laboratory frame, smooth in time.
         position : (n, 3) array
             Position of the base, laboratory frame, m.
 
@@ -159,12 +156,12 @@ class Vibration:
         return self.base_wrench(carried + np.einsum("tk,kma->tma", bent, self.shapes))
 
     def free_moments(self, scale: float, step: float, width: int) -> Array:
-        """Moments of free vibrations.
+        """Basis of the moments of free vibrations.
 
         Parameters
         ----------
         scale : float
-            Factor of all frequencies.
+            Factor applied to all frequencies.
         step : float
             Time between frames, s.
         width : int
@@ -173,7 +170,7 @@ class Vibration:
         Returns
         -------
         (2 width, 2 k) array
-            M_y of all frames, then M_z, of two vibrations of each mode.
+            M_y of all frames, then M_z, of two independent free vibrations in each mode.
         """
         gains = self.base_wrench(self.shapes)[:, 4:]
         time = step * np.arange(width)
@@ -187,7 +184,7 @@ class Vibration:
     def in_contact(
         self, time: Array, wrench: Array, rotation: Array, position: Array, noise: Array
     ) -> AnyArray:
-        """Frames in which something is touched.
+        """Detect the frames in which the whisker is in contact.
 
         Parameters
         ----------
@@ -196,14 +193,14 @@ class Vibration:
         wrench : (n, 6) array
             Measured force and moment, whisker frame, N and N·m.
         rotation, position : (n, 3, 3) and (n, 3) arrays
-            Pose of the base in the laboratory, as for `in_air`.
+            Pose of the base in the laboratory frame, as for `in_air`.
         noise : (6, 6) array
             Covariance of the noise of force and moment, SI units.
 
         Returns
         -------
         (n,) array
-            True where contact is more probable than free vibration and the motion of the base, by
+            True where contact is more probable than free vibration and motion of the base, given
             all frames (:mod:`vibrissa.simulation.vibration`).
         """
         air = self.in_air(time, rotation, position)
@@ -218,35 +215,35 @@ class Vibration:
         return contact_probability(modes, step, wrench - air, air, noise) > 0.5
 
 
-_LEAST_KNOWN = 0.3  # relative standard deviation from which a quantity is not determined
-_WITHIN = np.log(3.0)  # largest factor that is tried, as a logarithm
-_SHARE = 0.1  # share of a window's own size that linear modes do not explain
-# Factors of the frequency that the fit is begun from, as logarithms.
+_LEAST_KNOWN = 0.3  # largest relative standard deviation of a quantity that counts as determined
+_WITHIN = np.log(3.0)  # bound of the fitted factors, as a logarithm
+_SHARE = 0.1  # model error of linear modes, relative to the size of the signal in a window
+# Initial values of the frequency's factor in the fit, as logarithms.
 _STARTS = np.log([0.8, 0.9, 1.0, 1.1, 1.25])
-# Quantities that are fitted, and what determines each.
+# Fitted quantities, and the condition under which each is determined.
 _QUANTITIES = {
     "mass": "the base must be moved",
-    "resonances": "the whisker must ring, after a release or a tap",
-    "damping": "the whisker must ring, after a release or a tap",
+    "resonances": "the whisker must vibrate freely, after a release or a tap",
+    "damping": "the whisker must vibrate freely, after a release or a tap",
 }
 
 
 @dataclass(frozen=True)
 class FittedDynamics:
-    """Mass, resonances and damping that were fitted by `fit_dynamics`.
+    """Mass, resonances and damping fitted by `fit_dynamics`.
 
     Parameters
     ----------
     dynamics : Dynamics
         Density and damping ratio.
     youngs_modulus : float
-        Young's modulus with which the whisker has these resonances, Pa.
+        Young's modulus consistent with the mass and the resonances, Pa.
     resonances : (4,) array
-        Frequencies of the modes without damping, Hz.
+        Undamped frequencies of the modes, Hz.
     covariance : (3, 3) array
         Covariance of the logarithms of mass, resonances and time constant of the damping.
     misfit : float
-        χ² per degree of freedom; the covariance is larger by it where it is above 1.
+        χ² per degree of freedom, by which the covariance is multiplied if it is above 1.
     """
 
     dynamics: Dynamics
@@ -266,7 +263,7 @@ def fit_dynamics(
     dynamics: Dynamics | None = None,
     stiffness_sigma: float = np.inf,
 ) -> FittedDynamics:
-    """Fit mass, resonances and damping to the wrench of a whisker that is free at times.
+    """Fit mass, resonances and damping to the wrench of a whisker while it is not in contact.
 
     Parameters
     ----------
@@ -277,16 +274,16 @@ def fit_dynamics(
     wrench : (n, 6) array
         Measured force and moment, whisker frame, N and N·m.
     rotation : (n, 3, 3) array
-        Rotation of the base, from the whisker's to the laboratory frame; smooth.
+        Rotation from the whisker frame to the laboratory frame, smooth in time.
     position : (n, 3) array
         Position of the base, laboratory frame, m.
     noise : (6, 6) array
         Covariance of the noise of force and moment, SI units.
     dynamics : Dynamics, optional
-        Density and damping to begin from, known to 20 % or so.
+        Initial values of density and damping, correct to about 20 %.
     stiffness_sigma : float
-        Relative standard deviation of the whisker's stiffness, by which resonances also give the
-        mass; by default it is not known.
+        Relative standard deviation of the whisker's stiffness. If it is finite, the resonances
+        also constrain the mass.
 
     Returns
     -------
@@ -296,7 +293,7 @@ def fit_dynamics(
     Raises
     ------
     ValueError
-        If no window is free, or the data do not determine one of the three.
+        If there is no window without contact, or the data do not determine one of the quantities.
     """
     dynamics = dynamics or Dynamics()
     first = Vibration.of(whisker, dynamics)
@@ -305,29 +302,30 @@ def fit_dynamics(
     starts, width = _windows(free, step, first)
     if not starts.size:
         raise ValueError(
-            f"no free window of {1e3 * first.window:.3g} ms was found in {len(time)} frames; a few "
-            "seconds of motion in air and of ringing are needed"
+            f"no window of {1e3 * first.window:.3g} ms without contact was found in {len(time)} "
+            "frames; a few seconds of motion in air and of free vibration are needed"
         )
 
-    def left(factors: Array) -> Array:
-        varied = _varied(first, *np.exp(factors))
-        moments = (wrench - varied.in_air(time, rotation, position))[:, 4:]
+    def residuals(factors: Array) -> Array:
+        """Scaled residuals of all windows for factors (3,), as logarithms."""
+        vibration = _scaled(first, *np.exp(factors))
+        moments = (wrench - vibration.in_air(time, rotation, position))[:, 4:]
         windows = np.stack([moments[i : i + width].T.ravel() for i in starts])
-        basis = np.linalg.qr(varied.free_moments(1.0, step, width)).Q
+        basis = np.linalg.qr(vibration.free_moments(1.0, step, width)).Q
         away = (windows - (windows @ basis) @ basis.T) / spread[:, None]
         return np.append(away, (factors[0] + 2.0 * factors[1]) / stiffness_sigma)
 
     size = np.array([np.mean(wrench[i : i + width, 4:] ** 2) for i in starts])
-    # What is not linear in ringing grows with its size.
+    # The nonlinear part of free vibration grows with its amplitude.
     driven = np.mean(first.in_air(time, rotation, position)[:, 4:] ** 2)
     spread = np.sqrt(
         0.5 * (noise[4, 4] + noise[5, 5])
         + _SHARE**2 * size * np.sqrt(np.maximum(size / driven, 1.0))
     )
-    begun = [np.array([0.0, start, 0.0]) for start in _STARTS]
-    best = min(begun, key=lambda one: float((left(one) ** 2).sum()))
-    fit = optimize.least_squares(left, best, bounds=(-_WITHIN, _WITHIN))
-    # Each window gives as many numbers to its own vibration as there are amplitudes.
+    initial = [np.array([0.0, start, 0.0]) for start in _STARTS]
+    best = min(initial, key=lambda one: float((residuals(one) ** 2).sum()))
+    fit = optimize.least_squares(residuals, best, bounds=(-_WITHIN, _WITHIN))
+    # The free vibration of each window uses two degrees of freedom per mode.
     misfit = 2.0 * fit.cost / (starts.size * (2 * width - 2 * len(first.rates)) - 3)
     slopes = np.asarray(fit.jac, dtype=np.float64)
     covariance: Array = np.linalg.pinv(slopes.T @ slopes, rcond=1e-15).astype(np.float64)
@@ -339,7 +337,9 @@ def fit_dynamics(
         if not 0.0 < one < _LEAST_KNOWN
     ]
     if unknown:
-        raise ValueError(f"{starts.size} free windows do not determine {', '.join(unknown)}")
+        raise ValueError(
+            f"{starts.size} windows without contact do not determine {', '.join(unknown)}"
+        )
     mass, rate, damping = (float(one) for one in np.exp(fit.x))
     base, tip = dynamics.density
     return FittedDynamics(
@@ -355,8 +355,8 @@ def fit_dynamics(
     )
 
 
-def _varied(vibration: Vibration, mass: float, rate: float, damping: float) -> Vibration:
-    """Vibration with factors of mass, frequency and time constant of the damping."""
+def _scaled(vibration: Vibration, mass: float, rate: float, damping: float) -> Vibration:
+    """Scale mass, frequencies and the time constant of the damping by factors."""
     return replace(
         vibration,
         mass=mass * vibration.mass,
@@ -367,43 +367,45 @@ def _varied(vibration: Vibration, mass: float, rate: float, damping: float) -> V
 
 
 def _windows(free: AnyArray, step: float, vibration: Vibration) -> tuple[AnyArray, int]:
-    """First frames of windows in which nothing is touched, and their width in frames."""
+    """First frames of the windows without contact, and their width in frames."""
     width = max(round(vibration.window / step), len(vibration.rates) + 1)
     edges = np.flatnonzero(np.diff(free.astype(int), prepend=0, append=0))
-    # The end of a contact is known to two frames or so.
+    # The end of a contact is uncertain by about two frames.
     runs = zip(edges[::2] + 2, edges[1::2] - 2, strict=True)
     starts = [i for first, end in runs for i in range(first, end - width + 1, width)]
     return np.array(starts, dtype=int), width
 
 
-# Components of the wrench: F_x, F_y, F_z, M_y, M_z; vibration hardly makes M_x.
+# Components F_x, F_y, F_z, M_y, M_z of the wrench; vibration hardly contributes to M_x.
 _CHANNELS = [0, 1, 2, 4, 5]
 _FORCES, _MOMENTS = slice(1, 3), slice(3, 5)  # channels across the whisker
-_RATE = 3.0  # onsets, and releases, per second
+_RATE = 3.0  # rate of onsets, and of releases, 1/s
 _MASS = 0.2  # relative standard deviation of the mass
-# Logarithms of factors of the frequencies: step, standard deviation, and most steps.
+# Logarithm of the frequencies' factor: step, standard deviation, and largest number of steps.
 _STEP, _FREQUENCY, _FARTHEST = 0.1, 0.1, 4
-_TURN = 0.12  # relative error of frequencies: share of a vibration that is unknown after a radian
-# Share of the vibration that linear modes leave across the whisker, and its share along it.
+_TURN = 0.12  # relative error of frequencies: unknown share of a vibration after one radian
+# Relative model error of the vibration across the whisker, and size of the axial force relative to
+# the force across it.
 _MODELLED, _AXIAL = 0.15, 0.4
-_BEND = 0.2  # the same share for a tip that is deflected by the whisker's length
+_BEND = 0.2  # additional relative model error if the tip is deflected by the whisker's length
 # Degrees of freedom of the Student distributions of a free whisker and of one in contact.
 _FREEDOM, _FREEDOM_IN_CONTACT = 4.0, 1.0
-# Change from frame to frame in contact, and when it begins, over noise, and over the last one.
+# Width of the distribution of changes between frames in contact, and at its onset, in units of the
+# noise; and relative to the previous change.
 _CHANGE, _ONSET, _AS_BEFORE = 1.5, 5.0, 0.6
-# Standard deviation of amplitudes at a release: least, over noise, and as a share of the moment,
-# which modes in some phase make together.
+# Standard deviation of modal amplitudes at a release: smallest value, in units of the noise, and
+# relative to the moment, to which all modes contribute with unknown phases.
 _START, _RELEASED = 5.0, 0.35
-# Log likelihood below the best from which a hypothesis is dropped, and most hypotheses.
+# Difference of log likelihood from the best at which hypotheses are dropped, and largest number.
 _LOST, _MOST = 60.0, 64
-_FINEST = 1e-4  # least noise, over the largest wrench
+_FINEST = 1e-4  # smallest noise, relative to the largest wrench
 
 
 class Modes(NamedTuple):
-    """Modes of free vibration: angular frequencies ω (k,), rad/s, and rates of their loss (k,).
+    """Modes of free vibration: angular frequencies ω (k,), rad/s, and damping η ω (k,).
 
-    Also the wrench at the base (k, 6) that an acceleration of one makes, and the displacement of
-    the tip (k, 3) over the whisker's reach.
+    Also the wrench at the base (k, 6) per unit modal acceleration, and the displacement of the tip
+    (k, 3) relative to the whisker's reach.
     """
 
     rates: Array
@@ -413,9 +415,12 @@ class Modes(NamedTuple):
 
 
 class _Model(NamedTuple):
-    """Modes in units of the noise: steps (d, d), wrench (5, d), tip over L (3, d), errors (d,).
+    """Linear state-space model of k modes in units of the noise, with d = 2 k + 1 state variables.
 
-    Also the noise (5,) of the channels and its correlation (5, 5).
+    The last variable is the relative error of the wrench in air, the others are modal. ``step``
+    (d, d) is the transition matrix; ``wrench`` (5, 2 k) and ``tip`` (3, 2 k) map the modal state to
+    the wrench and to the displacement of the tip over L; ``wrong`` (k,) is the error of each mode
+    per step; ``noise`` (5,) and ``correlation`` (5, 5) are those of the sensor.
     """
 
     step: Array
@@ -427,7 +432,7 @@ class _Model(NamedTuple):
 
     @classmethod
     def of(cls, modes: Modes, step: float, noise: Array, largest: Array) -> _Model:
-        """Model of a whisker."""
+        """Model for frames ``step`` apart; ``largest`` (6,) is the largest wrench measured."""
         square = noise[np.ix_(_CHANNELS, _CHANNELS)]
         sigma = np.maximum(np.sqrt(np.diag(square)), _FINEST * largest[_CHANNELS])
         correlation = square / np.outer(sigma, sigma)
@@ -435,7 +440,7 @@ class _Model(NamedTuple):
         rates, loss = modes.rates, modes.loss
         gains = modes.wrench[:, _CHANNELS] / sigma
         size = np.linalg.norm(gains[:, _MOMENTS], axis=1)
-        # Per mode the state is (q, q̇ / ω) ω² size, so that q̈ = -(1, η ω) · state / size.
+        # The state of a mode is (q, q̇ / ω) ω² size, so that q̈ = -(1, η ω) · state / size.
         wrench = -np.stack([gains.T / size, gains.T * loss / size], axis=2)
         tip = np.stack([modes.tip.T / (rates**2 * size), np.zeros((3, len(rates)))], axis=2)
         turns = [
@@ -453,7 +458,7 @@ class _Model(NamedTuple):
 
 
 class _Free(NamedTuple):
-    """Hypotheses: free since a frame (k,), with state (k, d), covariance (k, d, d), log weight."""
+    """Hypotheses (n,) "free since a frame": state (n, d), covariance (n, d, d) and log weight."""
 
     since: IntArray
     state: Array
@@ -461,13 +466,13 @@ class _Free(NamedTuple):
     weight: Array
 
     def kept(self, which: IntArray) -> _Free:
-        """Some of the hypotheses."""
+        """Subset of the hypotheses."""
         return _Free(
             self.since[which], self.state[which], self.covariance[which], self.weight[which]
         )
 
     def predicted(self, model: _Model) -> _Free:
-        """State a frame later: what the frequencies' error makes of a vibration is unknown."""
+        """Predict the state one frame later; errors of the frequencies increase its covariance."""
         state = self.state @ model.step.T
         covariance = model.step @ self.covariance @ model.step.T
         number = np.arange(state.shape[1] - 1)
@@ -477,7 +482,7 @@ class _Free(NamedTuple):
         return self._replace(state=state, covariance=covariance)
 
     def with_release(self, frame: int, size: float, weight: float) -> _Free:
-        """Add a release in this frame, at a moment of this size."""
+        """Add the hypothesis of a release in ``frame``, where the moment has the given size."""
         covariance = np.diag(np.full(self.state.shape[1], (_RELEASED * size + _START) ** 2))
         covariance[-1, -1] = _MASS**2
         return _Free(
@@ -488,7 +493,7 @@ class _Free(NamedTuple):
         )
 
     def observed(self, model: _Model, measured: Array, air: Array) -> tuple[_Free, Array]:
-        """Hypotheses after one measurement (5,), and its log likelihoods (k,)."""
+        """Update the hypotheses by one measurement (5,); also return its log likelihoods (n,)."""
         slopes = np.column_stack([model.wrench, air])
         spread = slopes @ self.covariance @ slopes.T + model.correlation
         vibration = self.covariance[:, :-1, :-1]
@@ -517,7 +522,7 @@ class _Free(NamedTuple):
 
 
 def _student(square: Array, freedom: float) -> Array:
-    """Log density of Student's distribution in five dimensions, of squared distances."""
+    """Log density of Student's distribution in five dimensions at squared distances."""
     n = len(_CHANNELS)
     constant = special.gammaln(0.5 * (freedom + n)) - special.gammaln(0.5 * freedom)
     constant -= 0.5 * n * np.log(freedom * np.pi)
@@ -525,7 +530,7 @@ def _student(square: Array, freedom: float) -> Array:
 
 
 def _touching(measured: Array, correlation: Array) -> tuple[Array, Array]:
-    """Log likelihoods (n,) of frames in contact, and of those in which it begins."""
+    """Log likelihoods (n,) of frames in contact, and of frames in which contact begins."""
     change = np.diff(measured, axis=0, prepend=measured[:1])
     square = (change * np.linalg.solve(correlation, change.T).T).sum(axis=1)
     before = _AS_BEFORE**2 * np.append(square[:1], square[:-1]) / len(_CHANNELS)
@@ -539,21 +544,23 @@ def _touching(measured: Array, correlation: Array) -> tuple[Array, Array]:
 
 
 def contact_probability(modes: Modes, step: float, left: Array, air: Array, noise: Array) -> Array:
-    """Probability (n,) that a whisker is in contact, by all frames, which also show frequencies.
+    """Probability (n,) that a whisker is in contact in each frame, given all frames.
 
-    The wrench (n, 6) minus that in air and the latter, its noise (6, 6), SI units, and the time
-    between frames.
+    ``left`` (n, 6) is the measured wrench minus that in air, ``air`` (n, 6) the wrench in air,
+    ``noise`` (6, 6) the covariance of the wrench, SI units, and ``step`` the time between frames,
+    s. The factor of the frequencies is fitted by maximum likelihood.
     """
 
-    def tried(number: int) -> tuple[float, Array]:
+    def evaluate(number: int) -> tuple[float, Array]:
+        """Log posterior of a step of the frequencies' factor, and probabilities of contact."""
         factor = np.exp(_STEP * number)
         now = modes._replace(rates=factor * modes.rates, loss=factor * modes.loss)
         log, probability = _switching(now, step, left, air, noise)
         return log - 0.5 * (_STEP * number / _FREQUENCY) ** 2, probability
 
-    best, number = tried(0), 0
+    best, number = evaluate(0), 0
     for way in (1, -1):
-        while abs(number + way) <= _FARTHEST and (other := tried(number + way))[0] > best[0]:
+        while abs(number + way) <= _FARTHEST and (other := evaluate(number + way))[0] > best[0]:
             best, number = other, number + way
         if number:
             break
@@ -576,8 +583,8 @@ def _switching(
     last = np.log(0.5)
     free = free.with_release(-1, size[0], last)
     for frame, (now, driven_now) in enumerate(zip(measured, driven, strict=True)):
-        begun = special.logsumexp(free.weight) + switch + onset[frame]
-        forward[frame] = np.logaddexp(last + stay + contact[frame], begun)
+        starting = special.logsumexp(free.weight) + switch + onset[frame]
+        forward[frame] = np.logaddexp(last + stay + contact[frame], starting)
         free = free.predicted(model)._replace(weight=free.weight + stay)
         free = free.with_release(frame, size[frame], last + switch)
         free, found = free.observed(model, now, driven_now)

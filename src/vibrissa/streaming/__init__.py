@@ -1,4 +1,4 @@
-"""Signals as they come in, line by line, to contacts as they go out."""
+"""Estimation of contacts from streams of signals, line by line."""
 
 from vibrissa.streaming.contacts import (
     COMPONENTS,

@@ -1,4 +1,4 @@
-"""From samples to contacts, as plain records that are written as JSON lines."""
+"""Streams of contact records, for output as JSON lines, from streams of samples."""
 
 from __future__ import annotations
 
@@ -27,55 +27,54 @@ from vibrissa.signals import SIGNALS, signals_of
 from vibrissa.status import Event
 from vibrissa.streaming.lines import FRAME, LineKind, Lines, Poses, Sample
 
-_ANEW = 1.0  # time that falls by more than this comes from a sender that has begun anew, s
-_SLOW = 100.0  # samples farther apart than this seem to have times in a smaller unit, s
-# Statuses that show neither that something is touched nor that nothing is.
+_ANEW = 1.0  # decrease of time above which the sender has restarted, s
+_SLOW = 100.0  # interval of samples above which the unit of time is probably smaller than s
+# Statuses that state neither contact nor its absence.
 _SILENT = ("missing", "tare", "degenerate")
-_MESSAGE = 400  # longest message about a line that cannot be read; it may quote the line
+_MESSAGE = 400  # largest length of a message about an unreadable line, which may quote the line
 
 COMPONENTS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 """Components of force and moment that signals are computed from."""
 
 
 class ContactStream:
-    """Lines in, records out.
+    """Converter from lines of signals to records of contacts.
 
     Parameters
     ----------
     estimator : Estimator
         Estimator of contacts from single samples.
     names : sequence of str, optional
-        Channels of a sensor that a line must carry, in their order. By default the estimator's
-        signals, or components of force and moment from which these are computed, whichever the
+        Channels of a sensor that a line must contain, in this order. By default the estimator's
+        signals, or the components of force and moment from which they are computed, whichever the
         first line has.
     follow : ContactFilter, optional
-        Filter of contacts over time, with the base's pose if there is one; made of the same
-        estimator.
+        Filter of contacts over time, with the pose of the base if known, with the same estimator.
     poses : Poses, optional
-        Poses of the base, with its position on what the lines' poses are of.
+        Poses of the base, with its position on the carrier whose poses the lines contain.
     tare : int
-        Number of complete samples at the beginning, of a free whisker, that give the offset of the
-        sensor anew. It needs an estimator of a sensor.
+        Number of initial complete samples without contact from which the offset of the sensor is
+        measured again. Requires the estimator of a sensor.
     whisker : str
-        Name of the whisker, where lines carry the signals of several: its own are called
-        ``name.Fx`` and so on, and lines without any are left to the others.
+        Name of the whisker, if lines contain signals of several: its own are named ``name.Fx`` and
+        so on, and lines without any of them are ignored.
     slip_speed : float, optional
-        Speed of a contact point in the laboratory from which it slips, m/s; by default two lengths
-        of the whisker a second.
+        Speed of a contact point in the laboratory frame above which it slips, m/s; by default two
+        lengths of the whisker per second.
 
     Attributes
     ----------
     samples, faults, untimed : int
-        Numbers of samples so far, of lines that could not be read, and of samples without a time,
-        which get that of the clock.
+        Numbers of samples so far, of unreadable lines, and of samples without a time, which get the
+        time of the clock.
     statuses, events : Counter
         Numbers of samples by status, and by event.
     poses : Poses
         Poses of the base.
     friction : float
-        Standard deviation of the ratio of forces, as of `vibrissa.contacts.Contacts`.
+        Standard deviation of the ratio of forces, as in `vibrissa.contacts.Contacts`.
     laboratory : str
-        Name of the frame that poses are in, where they state it; empty where they do not.
+        Name of the frame of the poses, if they state it; otherwise empty.
     """
 
     def __init__(
@@ -89,7 +88,7 @@ class ContactStream:
         slip_speed: float | None = None,
     ) -> None:
         if tare and estimator.sensor is None:
-            raise ValueError("the offset is that of a sensor's channels, and there is no sensor")
+            raise ValueError("tare needs a sensor, to whose channels the offset belongs")
         by_name = estimator.announced
         self._announced = by_name
         choices = (names,) if names else (by_name, _components(by_name))
@@ -114,20 +113,21 @@ class ContactStream:
         self._offset: Array | float = 0.0
 
     def records(self, lines: Iterable[str]) -> Iterator[dict[str, Any]]:
-        """Turn lines into records, one for each sample, and one for each line that is none.
+        """Convert lines to records, one per sample and one per unreadable line.
 
         Parameters
         ----------
         lines : iterable of str
-            Lines as they come.
+            Lines in order of arrival.
 
         Yields
         ------
         dict
-            Record for JSON: ``time``, ``status`` and the contact, with the line's ``stamp_ns``,
-            ``recorded_ns`` and ``frame_id`` as they are; ``whisker``, if it has a name, and
-            ``event`` (``onset``, ``loss`` or ``slip``) of a sample with one; in contact
-            ``onset_time`` and ``onset_sigma``, when it began; or ``line`` and ``error``.
+            Record for JSON: ``time``, ``status`` and the contact, with the unchanged ``stamp_ns``,
+            ``recorded_ns`` and ``frame_id`` of the line; ``whisker``, if it has a name; ``event``
+            (``onset``, ``loss`` or ``slip``), if there is one; and in contact the time of its
+            onset, ``onset_time`` with ``onset_sigma``. For an unreadable line, ``line`` and
+            ``error``.
         """
         for line in lines:
             try:
@@ -158,9 +158,9 @@ class ContactStream:
         (self._follow or self._estimator).reset()
 
     def warm_up(self) -> None:
-        """Locate what samples may be of once each, so that none waits for code to be loaded.
+        """Process one sample of each kind, so that later samples do not wait for code to load.
 
-        These are a contact, a lighter one, a free whisker and a wrench that no contact has.
+        These are a contact, a light contact, a free whisker and a wrench that no contact explains.
         """
         whisker, sensor = self._estimator.contact_map.whisker, self._estimator.sensor
         size = 0.5 * whisker.base_bending_stiffness / whisker.length**2
@@ -180,12 +180,12 @@ class ContactStream:
         self._estimator.restart()
 
     def record(self, sample: Sample) -> dict[str, Any]:
-        """Locate one sample.
+        """Estimate the contact of one sample.
 
         Parameters
         ----------
         sample : Sample
-            Sample with the values in the order of the names.
+            Sample with values in the order of the names.
 
         Returns
         -------
@@ -195,12 +195,12 @@ class ContactStream:
         Raises
         ------
         ValueError
-            If the estimator or the filter refuses it.
+            If the estimator or the filter rejects the sample.
         """
         self.untimed += sample.time is None
         time = clock.monotonic() - self._begun if sample.time is None else sample.time
-        # After a header time may begin anew by less; senders also repeat it, as nothing is sure to
-        # arrive by UDP.
+        # After a header any decrease of time is a restart. Senders may repeat headers, as UDP does
+        # not guarantee delivery.
         if time < self._time - (_ANEW if self.lines.headers == self._headers else 0.0):
             self._forget()
         self._headers = self.lines.headers
@@ -258,7 +258,7 @@ class ContactStream:
         return known | ({"onset_time": begun, "onset_sigma": sigma} if begun == begun else {})
 
     def _put(self, sample: Sample) -> None:
-        """Remember a pose that came alone."""
+        """Store a pose that arrived without signals."""
         assert sample.time is not None
         assert sample.rotation is not None
         assert sample.position is not None
@@ -266,14 +266,14 @@ class ContactStream:
         self.poses.put(sample.time, sample.rotation, sample.position)
 
     def _pose(self, sample: Sample, time: float) -> tuple[Array | None, Array | None]:
-        """Pose of the base: the line's own, or what the poses before tell."""
+        """Pose of the base: that of the line, or the one interpolated from earlier poses."""
         rotation, position = sample.rotation, sample.position
         if rotation is not None and position is not None and np.isfinite(rotation).all():
             return self.poses.put(time, rotation, position)
         return self.poses.at(time) or (rotation, position)
 
     def _tared(self, values: Array, rotation: Array | None, gravity: Array | None) -> str:
-        """Take one sample of a free whisker."""
+        """Use one sample without contact to measure the offset."""
         sensor = self._estimator.sensor
         assert sensor is not None
         pull = GRAVITY if gravity is None else gravity
@@ -287,7 +287,7 @@ class ContactStream:
 
 
 class ContactStreams:
-    """Several whiskers whose signals come in the same lines, each with its own stream.
+    """Streams of several whiskers whose signals are in the same lines.
 
     Parameters
     ----------
@@ -302,17 +302,17 @@ class ContactStreams:
         self.streams = tuple(streams)
 
     def records(self, lines: Iterable[str]) -> Iterator[dict[str, Any]]:
-        """Turn lines into records, one for each whisker that a line has signals of.
+        """Convert lines to records, one for each whisker with signals in a line.
 
         Parameters
         ----------
         lines : iterable of str
-            Lines as they come.
+            Lines in order of arrival.
 
         Yields
         ------
         dict
-            Record as of `ContactStream.records`; one error for a line that no whisker can read.
+            Record as from `ContactStream.records`; one error for a line that no whisker can read.
         """
         for line in lines:
             found = [record for one in self.streams for record in one.records((line,))]
@@ -325,12 +325,12 @@ class ContactStreams:
         return sum(one.samples for one in self.streams)
 
     def warm_up(self) -> None:
-        """Locate samples of every kind once; see `ContactStream.warm_up`."""
+        """Process one sample of each kind; see `ContactStream.warm_up`."""
         for one in self.streams:
             one.warm_up()
 
     def kind(self, line: str) -> LineKind:
-        """Tell what a line is to any of the whiskers; see `Lines.kind`.
+        """Kind of a line; see `Lines.kind`.
 
         Parameters
         ----------
@@ -340,7 +340,7 @@ class ContactStreams:
         Returns
         -------
         LineKind
-            Sample, if any of the whiskers has one in it.
+            Kind of the line; a sample if it is one for any of the whiskers.
         """
         kinds = [one.lines.kind(line) for one in self.streams]
         return next((kind for kind in (LineKind.SAMPLE, LineKind.POSE) if kind in kinds), kinds[0])
@@ -354,7 +354,7 @@ def _components(signals: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def located_record(found: Contact) -> dict[str, Any]:
-    """Contact of a single sample, in the whisker's frame and SI units."""
+    """Record of the contact of a single sample, whisker frame, SI units."""
     record: dict[str, Any] = {"status": found.status.name.lower()}
     if not found.n_candidates:
         return record
@@ -371,7 +371,7 @@ def located_record(found: Contact) -> dict[str, Any]:
 
 
 def followed_record(known: Followed, rotation: Array | None = None) -> dict[str, Any]:
-    """Contact of a filter."""
+    """Record of a contact estimated by a filter."""
     record: dict[str, Any] = {"status": known.status.name.lower()}
     if not len(known.points):
         return record
@@ -382,7 +382,7 @@ def followed_record(known: Followed, rotation: Array | None = None) -> dict[str,
     record["lab_covariance"] = known.covariance.tolist()
     record |= {f"lab_{name}": value for name, value in _sigma(known.covariance).items()}
     record["velocity"] = known.velocity.tolist()
-    record["friction"] = 0.0  # a filter takes no other estimator
+    record["friction"] = 0.0  # a filter requires an estimator without friction
     record["probability"] = known.probability
     record["hypotheses"] = known.points.tolist()
     record["probabilities"] = known.probabilities.tolist()
@@ -390,7 +390,7 @@ def followed_record(known: Followed, rotation: Array | None = None) -> dict[str,
 
 
 def as_json(record: dict[str, Any]) -> str:
-    """Write a record as one line of JSON; numbers that are not finite become null."""
+    """Format a record as one line of JSON; numbers that are not finite become null."""
     try:
         return _ENCODER.encode(record)
     except ValueError:
@@ -401,7 +401,7 @@ _ENCODER = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
 
 
 def _place(point: Array) -> dict[str, float]:
-    x, y, z = point.tolist()  # a single point: NumPy would take ten times as long
+    x, y, z = point.tolist()  # for a single point, ten times as fast as NumPy
     r = math.hypot(x, y, z)
     return {"x": x, "y": y, "z": z, "r": r, "theta": math.atan2(y, x), "phi": math.asin(z / r)}
 
@@ -419,11 +419,11 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-_NEARLY_ALL = 0.9  # share of samples above which something is wrong in general
+_NEARLY_ALL = 0.9  # share of samples above which a general error is suspected
 
 
 def advice(stream: ContactStream) -> list[str]:
-    """Suspect what users get wrong most often."""
+    """Advice on common mistakes that the statuses of all samples suggest."""
     counts, total = stream.statuses, stream.samples
     measured = total - counts["missing"] - counts["tare"]
     touching = measured - counts["not_felt"]
@@ -441,9 +441,9 @@ def advice(stream: ContactStream) -> list[str]:
             else "are of no contact that this whisker can have"
         )
         out.append(
-            f"Nearly all signals {larger}: are they in N and N·m (or does the sensor's mixing say "
-            "what they are in), is the offset taken away, are the sensor's axes, sign and weight "
-            "and the base's rotation right, and the whisker's stiffness?"
+            f"Nearly all signals {larger}: are they in N and N·m (or in the units of the sensor's "
+            "mixing), is the offset removed, and are the sensor's axes, sign and weight, the "
+            "base's rotation and the whisker's stiffness right?"
         )
     if measured > 0 and not touching:
         out.append(
@@ -452,8 +452,8 @@ def advice(stream: ContactStream) -> list[str]:
         )
     if total and counts["missing"] == total:
         out.append(
-            "All samples are missing something: a number, the pose at that time, or readings are "
-            "as large as the largest that the sensor can say."
+            "All samples are incomplete: a number or the pose at that time is missing, or readings "
+            "have reached the sensor's largest reading."
         )
     if stream.slow > _NEARLY_ALL * max(total - 1, 1):
         out.append("Samples lie minutes apart: is their time in s?")

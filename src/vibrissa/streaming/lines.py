@@ -1,18 +1,17 @@
-"""Lines of signals: CSV with a header, or one JSON object a line.
+"""Parsing of lines of signals, CSV with a header or one JSON object per line, and poses over time.
 
-Both carry numbers by name, in SI units; signals of a table may be in others if its header states
-them (:mod:`vibrissa.io.table`), and its cells may be separated by semicolons, tabs or blanks. The
-pose of the base may be added: ``base_x``, ``base_y`` and ``base_z`` (m, laboratory), and a unit
-quaternion ``base_qw``, ``base_qx``, ``base_qy``, ``base_qz`` that turns the whisker's into the
-laboratory frame; and what an accelerometer reads there, ``imu_ax``, ``imu_ay``, ``imu_az`` (m/s²,
-9.81 upward at rest), in the axes that poses are of. A JSON object may hold a pose and its time
-alone. Fields that ROS adds are passed on unchanged: ``stamp_ns`` and ``recorded_ns`` (whole
-numbers) and ``frame_id``.
+Both formats contain named numbers in SI units. The header of a table may state other units for
+signals (:mod:`vibrissa.io.table`), and cells may be separated by semicolons, tabs or blanks. Lines
+may also contain the pose of the base: ``base_x``, ``base_y`` and ``base_z`` (m, laboratory frame),
+and a unit quaternion ``base_qw``, ``base_qx``, ``base_qy``, ``base_qz`` from the whisker frame to
+the laboratory frame; and the readings of an accelerometer there, ``imu_ax``, ``imu_ay``, ``imu_az``
+(m/s², 9.81 upward at rest), in the axes of the poses. A JSON object may contain a pose and its time
+only. Fields of ROS are passed on unchanged: ``stamp_ns`` and ``recorded_ns`` (whole numbers) and
+``frame_id``.
 
-Rows are read by the last header. So after a header that is refused no row is read until there is
-another one.
+Rows refer to the last header. After an invalid header, rows are errors until the next header.
 
-Poses of the base may come at another rate: they are interpolated to the time of each sample.
+Poses of the base may arrive at another rate and are interpolated to the time of each sample.
 """
 
 from __future__ import annotations
@@ -51,13 +50,13 @@ _SHARED = (*POSITION, *QUATERNION, *ACCELERATION)
 STAMP = "stamp_ns"  # column with the time stamp of ROS, ns
 RECORDED = "recorded_ns"  # column with the time at which ROS recorded it, ns
 FRAME = "frame_id"  # column with the name of the frame that ROS gives it
-LONGEST = 65536  # characters that a line may have; a datagram holds no more
-# What a header may call otherwise, or give in other units.
+LONGEST = 65536  # largest number of characters of a line, which exceeds the size of a datagram
+# Columns for which a header may use other names or units.
 _SIGNALS = ("time", "Fx", "Fy", "Fz", "Mx", "My", "Mz", *SIGNALS)
-_UNIT = 0.01  # a quaternion that was rounded is no longer of unit length by this much
-_LATEST = 1e11  # seconds since any epoch are fewer; what is more is in a smaller unit
-_FARTHEST = 1e9  # largest distance of a base, m; infinite ones are not numbers either
-_DIGITS = frozenset("0123456789+-.")  # characters that a number in a table may begin with
+_UNIT = 0.01  # largest deviation of a rounded quaternion from unit length
+_LATEST = 1e11  # largest plausible time since any epoch, s
+_FARTHEST = 1e9  # largest plausible coordinate of a base, m
+_DIGITS = frozenset("0123456789+-.")  # characters with which a number in a table may begin
 
 
 class LineKind(Enum):
@@ -69,11 +68,11 @@ class LineKind(Enum):
 
 
 class Sample(NamedTuple):
-    """One line: its number from 1, the named values, and the pose of the base, where it is there.
+    """Contents of one line: its number from 1, the named values, and the pose of the base, if any.
 
-    Of several choices of names that were asked for, those that the line has; a pose that the line
-    leaves empty is NaN, as is an acceleration. Passed on as they are: ``stamp_ns``, ``recorded_ns``
-    and ``frame_id``.
+    If there are several choices of names, the values are those of the first that the line has. An
+    empty pose or acceleration is NaN. ``stamp_ns``, ``recorded_ns`` and ``frame_id`` are passed on
+    unchanged.
     """
 
     line: int
@@ -87,12 +86,12 @@ class Sample(NamedTuple):
 
 
 class Lines:
-    """Takes lines apart; the first one that is not JSON is a header, others may follow.
+    """Parser of lines; the first line that is not JSON is a header, and others may follow.
 
-    Of several choices of names the first that a line has counts. Raw names are a sensor's channels,
-    which are called as they are and have no units; channels that are Fx to Mz may also have the
-    other names of these, such as ``wrench.force.x``. With the name of a whisker its own values are
-    called ``name.value``, and lines that have only others' are passed over.
+    Of several choices of names, the first that a line has is used. ``raw`` names are those of a
+    sensor's channels, which must match exactly and have no units; channels Fx to Mz may also have
+    alternative names, such as ``wrench.force.x``. For a named whisker, its values are named
+    ``name.value``, and lines with only those of others are ignored.
     """
 
     def __init__(self, *names: tuple[str, ...], raw: bool = False, whisker: str = "") -> None:
@@ -105,7 +104,7 @@ class Lines:
         self._refused = 0
 
     def __call__(self, line: str) -> Sample | None:
-        """Read one line."""
+        """Parse one line; None for a header or a line of other whiskers."""
         self.number += 1
         if len(line) > LONGEST:
             raise ValueError(f"a line of more than {LONGEST} characters")
@@ -118,16 +117,16 @@ class Lines:
         return self._sample(known)
 
     def _of_others(self, known: Mapping[str, object]) -> bool:
-        """Whether a line has named values, and none that this whisker shares or owns."""
+        """Whether a line has only values of other whiskers."""
         wanted = {*_SHARED, *(name for names in self.names for name in names)}
         return any("." in name for name in known) and not wanted & set(known)
 
     def _own(self, name: str) -> str:
-        """Name of a value without the whisker's."""
+        """Name of a value without the name of the whisker."""
         return name.removeprefix(self._prefix) if self._prefix else name
 
     def kind(self, line: str) -> LineKind:
-        """Tell what a line is without taking it apart."""
+        """Kind of a line, without parsing it."""
         text = line.lstrip()
         if not text.startswith("{"):
             return LineKind.SAMPLE if text[:1] in _DIGITS else LineKind.OTHER
@@ -156,7 +155,7 @@ class Lines:
             cells = cells_of(text, delimiter_of(text) if self._header is None else self._delimiter)
         except csv.Error as error:
             raise ValueError(f"no CSV: {error}") from None
-        # A first cell that is empty is an index without a name, or a number that is missing.
+        # An empty first cell is either an index without a name, or a missing number.
         named = self._header is None if cells[0] == "" else not is_number(cells[0])
         if named and self._heads(text):
             return None
@@ -175,10 +174,7 @@ class Lines:
         return known
 
     def _heads(self, text: str) -> bool:
-        """Take a line as the header if it is one.
-
-        A ValueError if it is a header that cannot be used; rows are then not read.
-        """
+        """Whether a line is a header, which is then used; raise ValueError if it is not valid."""
         delimiter = delimiter_of(text)
         cells = cells_of(text, delimiter)
         names, factors = self._named(cells)
@@ -202,7 +198,7 @@ class Lines:
         return True
 
     def _like_header(self, cells: list[str]) -> bool:
-        """Whether a line that cannot be used as a header is one, and not noise on a serial line."""
+        """Whether an invalid header is a header at all, rather than noise on a serial line."""
         if len(cells) < 2 or not all(cell[:1].isalpha() and not is_number(cell) for cell in cells):
             return False
         wanted = {"time", *_SHARED, *(name for names in self.names for name in names)}
@@ -211,7 +207,7 @@ class Lines:
         )
 
     def _named(self, cells: list[str]) -> tuple[list[str], dict[str, float]]:
-        """Names of columns as they are used here, and what makes their numbers SI."""
+        """Canonical names of columns, and the factors to SI units."""
         names = cells = [self._own(cell) for cell in cells]
         found, _ = signal_columns(cells, _SIGNALS)
         factors = {}
@@ -257,13 +253,13 @@ class Lines:
 
 
 def _passed(known: Mapping[str, object]) -> dict[str, Any]:
-    """Values that are passed on as they are."""
+    """Values that are passed on unchanged."""
     out: dict[str, Any] = {}
     for name in (STAMP, RECORDED):
         if known.get(name) in (None, ""):
             continue
         try:
-            # Never by way of a float, which has not as many digits.
+            # Not converted by a float, which would lose digits.
             out[name] = int(str(known[name]))
         except ValueError:
             out[name] = None
@@ -289,7 +285,7 @@ def _number(name: str, value: object) -> float:
 
 
 def rotation_of(quaternion: Sequence[float]) -> Array:
-    """Return the rotation matrix of a quaternion."""
+    """Rotation matrix of a quaternion."""
     q = np.array(quaternion)
     size = math.hypot(*quaternion)
     if not math.isfinite(size):
@@ -306,9 +302,9 @@ def rotation_of(quaternion: Sequence[float]) -> Array:
     )
 
 
-# A motion is continued past the last pose for so many times the step between the last two.
+# Largest extrapolation beyond the last pose, in units of the interval between the last two.
 _LONGEST = 5.0
-_TOO_FAST = 50.0  # nothing that holds a whisker is as fast, m/s
+_TOO_FAST = 50.0  # implausible speed of a base, m/s
 
 
 class Pose(NamedTuple):
@@ -317,9 +313,9 @@ class Pose(NamedTuple):
     Attributes
     ----------
     rotation : (3, 3) array
-        Rotation from the whisker's to the laboratory frame.
+        Rotation from the whisker frame to the laboratory frame.
     position : (3,) array
-        Position of the base in the laboratory, m.
+        Position of the base in the laboratory frame, m.
     """
 
     rotation: Array
@@ -327,13 +323,13 @@ class Pose(NamedTuple):
 
 
 class Poses:
-    """Poses as they come; between the last two, and past them, they change evenly.
+    """Interpolation and extrapolation of incoming poses at constant velocity.
 
     Parameters
     ----------
     rotation : (3, 3) array_like, optional
-        Rotation from the whisker's frame to that of what carries it, where poses are those of a
-        carrier such as a robot's flange.
+        Rotation from the whisker frame to the frame of its carrier, if poses are those of a
+        carrier, such as the flange of a robot.
     position : (3,) array_like, optional
         Position of the whisker's base in the carrier's frame, m.
 
@@ -342,7 +338,7 @@ class Poses:
     number : int
         Number of poses so far.
     too_fast : int
-        Number of poses at a speed of more than 50 m/s, which are in other units.
+        Number of poses at a speed of more than 50 m/s, which suggests wrong units.
     """
 
     def __init__(
@@ -358,39 +354,39 @@ class Poses:
         self.number, self.too_fast = 0, 0
 
     def forget(self) -> None:
-        """Begin anew."""
+        """Discard all poses."""
         self._last.clear()
 
     def in_base(self, vector: Array) -> Array:
-        """Turn a vector of the carrier's axes into the whisker's frame.
+        """Rotate a vector from the carrier's frame to the whisker frame.
 
         Parameters
         ----------
         vector : (3,) array
-            Vector, of any unit.
+            Vector, in any unit.
 
         Returns
         -------
         (3,) array
-            The same in the whisker's frame.
+            Vector in the whisker frame.
         """
         return np.asarray(vector @ self._turn)
 
     def _base(self, rotation: Array, position: Array) -> Pose:
-        """Pose of the base from that of what carries it."""
+        """Pose of the base from that of the carrier."""
         return Pose(rotation @ self._turn, position + rotation @ self._place)
 
     def put(self, time: float, rotation: Array, position: Array) -> Pose:
-        """Take a pose; one that is not finite or not later than the last is not remembered.
+        """Add a pose; it is not stored if it is not finite or not later than the last.
 
         Parameters
         ----------
         time : float
             Time of the pose, s, by the clock of the samples.
         rotation : (3, 3) array
-            Rotation from the carrier's to the laboratory frame.
+            Rotation from the carrier's frame to the laboratory frame.
         position : (3,) array
-            Position of the carrier in the laboratory, m.
+            Position of the carrier in the laboratory frame, m.
 
         Returns
         -------
@@ -421,9 +417,9 @@ class Poses:
         Returns
         -------
         Pose or None
-            Pose of the base; None before the first. One alone holds at all times; past the last of
-            several the motion continues for five times the step between the last two, and then it
-            is not known (NaN).
+            Pose of the base; None before the first pose. A single pose holds at all times. Beyond
+            the last of several poses, the motion is extrapolated for five times the interval
+            between the last two; after that the pose is unknown (NaN).
         """
         if not self._last:
             return None

@@ -1,8 +1,8 @@
-"""Sources of lines: a file, pipe, serial device, UDP datagrams or ROS bag; and targets of answers.
+"""Sources of lines (file, pipe, serial device, UDP, ROS bag), and destinations of results.
 
-A pipe holds its sender up until what it sent is read. Datagrams wait instead, and where more come
-than can be answered, answers fall behind by as many as the system keeps, and what comes then is
-lost. So of those that wait only the newest is answered (`NewestLines`).
+A pipe blocks its sender until data are read. Datagrams are queued instead: if more arrive than can
+be processed, results would lag behind by the length of the system's queue, and further datagrams
+would be lost. Therefore only the newest of the waiting datagrams is processed (`NewestLines`).
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ from vibrissa.streaming.lines import (
     LineKind,
 )
 
-_LARGEST = 65535  # a datagram holds no more
-_WAITING = 1 << 22  # bytes that may wait to be read
-# Seconds after which the newest datagram so far is answered, though others go on coming.
+_LARGEST = 65535  # largest size of a datagram, bytes
+_WAITING = 1 << 22  # requested size of the receive buffer, bytes
+# Time after which the newest datagram so far is processed although others keep arriving, s.
 _DRAINED = 0.02
-_POSES = 2  # poses that a motion is continued from
-# Of Linux: the option of a socket that gives its counters, and which of them counts what is lost.
+_POSES = 2  # number of poses needed to extrapolate a motion
+# On Linux, the socket option that returns counters, and the index of lost datagrams among these.
 _COUNTERS, _LOST = 55, 8
-_BACK = 0.2  # seconds after which a line that has closed is opened anew
+_BACK = 0.2  # time after which a closed source is reopened, s
 
 
 def file_lines(
     path: Path, reconnect: bool = False, report: Callable[[str], None] | None = None
 ) -> Iterator[str]:
-    """Read lines as they come, from a file, named pipe or device, until it ends."""
+    """Yield lines of a file, named pipe or device as they arrive, until it ends."""
     if not path.exists():
         raise FileNotFoundError(f"there is no file {path}")
     if not reconnect:
@@ -59,7 +59,7 @@ def file_lines(
             ) from fault
         return
     if stat.S_ISREG(path.stat().st_mode):
-        raise ValueError(f"{path} is a file, which ends; a named pipe or device opens anew")
+        raise ValueError(f"{path} is a file; only a named pipe or device can be reopened")
     remark = report or (lambda sentence: None)
     closed = False
     while True:
@@ -81,7 +81,7 @@ def file_lines(
 
 
 def bounded_lines(file: TextIO) -> Iterator[str]:
-    """Read lines as they come; of longer ones only the first part is kept."""
+    """Yield lines as they arrive, truncated to the largest length."""
     while line := file.readline(LONGEST + 1):
         yield line
         while len(line) > LONGEST and not line.endswith("\n"):
@@ -89,7 +89,7 @@ def bounded_lines(file: TextIO) -> Iterator[str]:
 
 
 def udp_address(text: str) -> tuple[str, int]:
-    """Read an address written as ``HOST:PORT``."""
+    """Parse an address ``HOST:PORT``."""
     host, colon, port = text.rpartition(":")
     if not colon or not port.isdigit() or int(port) > 65535:
         raise ValueError(f"an address is HOST:PORT, such as 127.0.0.1:5005; got {text!r}")
@@ -97,7 +97,7 @@ def udp_address(text: str) -> tuple[str, int]:
 
 
 def udp_socket(host: str, port: int) -> socket.socket:
-    """Open the socket that `udp_lines` reads."""
+    """Open a UDP socket for `udp_lines`."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     opened = socket.socket(family, socket.SOCK_DGRAM)
     opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _WAITING)  # or what the system allows
@@ -110,13 +110,13 @@ def udp_socket(host: str, port: int) -> socket.socket:
 
 
 def udp_lines(opened: socket.socket) -> Iterator[str]:
-    """Receive lines without end; a datagram holds one or several whole ones."""
+    """Yield lines of datagrams indefinitely; a datagram contains one or several complete lines."""
     while True:
         yield from _text(opened.recv(_LARGEST))
 
 
 def udp_lost(opened: socket.socket) -> int:
-    """Count the datagrams that the system discarded because too many were waiting."""
+    """Number of datagrams that the system discarded because its queue was full."""
     if sys.platform != "linux":
         return 0
     try:
@@ -127,7 +127,7 @@ def udp_lost(opened: socket.socket) -> int:
 
 
 class Answers:
-    """Answers as messages to another program: a UDP datagram each, or lines of a TCP connection."""
+    """Output of results to another program, as UDP datagrams or lines of a TCP connection."""
 
     def __init__(self, text: str) -> None:
         scheme, mark, rest = text.partition("://")
@@ -140,7 +140,7 @@ class Answers:
             family, *_, address = socket.getaddrinfo(host, port, type=kind)[0]
             self._socket = socket.socket(family, kind)
             if not self._datagrams:
-                # A small line waits for nothing.
+                # Send short lines without delay.
                 self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             try:
                 self._socket.connect(address)
@@ -151,7 +151,7 @@ class Answers:
             raise ValueError(f"answers cannot go to {text}: {error}") from error
 
     def send(self, line: str) -> None:
-        """Send one answer."""
+        """Send one result."""
         data = (line + "\n").encode()
         if not self._datagrams:
             self._socket.sendall(data)
@@ -167,10 +167,10 @@ class Answers:
 
 
 class NewestLines:
-    """Lines of the newest datagram that has come; iterates without end.
+    """Endless iterator over the lines of the newest datagram.
 
-    Samples of datagrams before it are dropped and counted. Headers are not, nor poses that the
-    motion of the base is continued from.
+    Samples of earlier waiting datagrams are dropped and counted; headers, and the poses needed to
+    extrapolate the motion of the base, are kept.
     """
 
     def __init__(self, opened: socket.socket, kind: Callable[[str], LineKind]) -> None:
@@ -178,14 +178,14 @@ class NewestLines:
         self._opened, self._kind = opened, kind
 
     def __iter__(self) -> Iterator[str]:
-        """Receive."""
+        """Yield lines as they arrive."""
         while True:
             *before, newest = self._waiting(self._opened.recv(_LARGEST))
             yield from self._latest_poses([line for data in before for line in self._needed(data)])
             yield from _text(newest)
 
     def _waiting(self, first: bytes) -> list[bytes]:
-        """All datagrams that wait, after one that does not any more."""
+        """All waiting datagrams, after the first one received."""
         datagrams, end = [first], time.monotonic() + _DRAINED
         self._opened.setblocking(False)
         try:
@@ -198,7 +198,7 @@ class NewestLines:
         return datagrams
 
     def _needed(self, data: bytes) -> list[str]:
-        """Lines of a datagram that is not the newest which later ones rely on."""
+        """Lines of an older datagram that later ones depend on."""
         lines = _text(data)
         kept = [line for line in lines if self._kind(line) is not LineKind.SAMPLE]
         self.dropped += len(lines) - len(kept)
@@ -215,7 +215,7 @@ def _text(data: bytes) -> list[str]:
 
 
 def bag_lines(source: Path, topic: str | None, pose_topic: str | None) -> Iterator[str]:
-    """Read lines from a bag, poses and wrenches in the order of their times."""
+    """Yield poses and wrenches of a bag as lines, in order of time."""
 
     def named(messages: Iterator[BagMessage], names: tuple[str, ...]) -> Iterator[dict[str, Any]]:
         for stamp, recorded, frame, values in messages:
@@ -231,10 +231,10 @@ def bag_lines(source: Path, topic: str | None, pose_topic: str | None) -> Iterat
 
 
 class ContactRecorder:
-    """Writer of records to a bag, as long as that can be written; the stream goes on without.
+    """Writer of records to a bag; if writing fails, the stream continues without it.
 
-    Points are in the frame of the measurements (same), that of a sensor unless it is mounted
-    otherwise than along the whisker, or are followed in the laboratory.
+    Points are in the frame of the measurements if ``same`` is true, as for a sensor aligned with
+    the whisker, or in the laboratory frame if contacts are followed there.
     """
 
     def __init__(
@@ -251,7 +251,7 @@ class ContactRecorder:
         self.broken = False
 
     def put(self, record: dict[str, Any]) -> None:
-        """Write the record of a sample; those of faults are left out."""
+        """Write the record of a sample; records of errors are ignored."""
         if self.broken or "error" in record:
             return
         points = np.reshape(record.get("hypotheses", record.get("candidates", [])), (-1, 3))
@@ -281,7 +281,7 @@ class ContactRecorder:
             self._remark(f"{fault}; the stream goes on without it")
 
     def _frame(self, record: dict[str, Any]) -> str | None:
-        """Name of the frame that points are in, where the input states it."""
+        """Name of the frame of points, if the input states it."""
         running = self._poses[record.get("whisker", "")]
         if self._follow and running.poses.number:
             return running.laboratory or None

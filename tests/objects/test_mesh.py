@@ -136,7 +136,7 @@ def test_faulty_meshes():
         Mesh(vertices, faces[1:])
     with pytest.raises(ValueError, match="not closed"):
         Mesh(vertices, np.r_[faces[:1, ::-1], faces[1:]])
-    with pytest.raises(ValueError, match="name vertices 0 to 9 of 8"):
+    with pytest.raises(ValueError, match="refer to vertices 0 to 9 of 8"):
         Mesh(vertices, np.r_[faces, [[0, 1, 9]]])
     with pytest.raises(ValueError, match="resolution is 1e-06"):
         Mesh(vertices, faces, resolution=1e-6)

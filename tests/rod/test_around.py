@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 import vibrissa as vb
 from vibrissa.objects import Peg, Placement, Plane, Sphere
 from vibrissa.rod import discretize
-from vibrissa.rod.obstacles import Grid, Obstacles, bent_by_one, settled
+from vibrissa.rod.obstacles import Grid, Obstacles, solve_with_moving_nodes, strain_under_force
 
 LENGTH = 0.1
 AT_ORIGIN = Placement(np.eye(3), np.zeros(3))
@@ -91,9 +91,9 @@ def test_one_contact_is_that_of_a_peg(base_stiffness):
         axis = [0.2, 0.0, 1.0]
         exact = vb.deflect(whisker, vb.PegContact(place, axis, radius, side=[0.0, 1.0, 0.0]))
         arc, point = float(exact.arc_length) / d.length, exact.contact_point / d.length
-        strain = bent_by_one(grid, arc, exact.force / d.force, point)
+        strain = strain_under_force(grid, arc, exact.force / d.force, point)
         pressing = np.zeros((1, grid.s.size))
-        found = settled(
+        found = solve_with_moving_nodes(
             whisker,
             Obstacles([Peg(place, axis, radius)], AT_ORIGIN, d.length),
             grid,

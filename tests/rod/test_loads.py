@@ -56,7 +56,7 @@ def test_points(points, said):
         ({"origin": (0.02, 0.0), "axis": Z}, r"origin must have shape \(\.\.\., 3\); got \(2,\)"),
         ({"origin": (0.02, 0.0, 0.0), "axis": (0, 0, 0)}, r"axis must not be \(0, 0, 0\)"),
         ({"origin": (0.02, 0.0, 0.0), "axis": Z, "radius": -1e-3}, "smallest is -0.001 m"),
-        ({"origin": (0.02, 0.0, 0.0), "axis": Z, "radius": [0.0, 1e-3]}, "do not mix"),
+        ({"origin": (0.02, 0.0, 0.0), "axis": Z, "radius": [0.0, 1e-3]}, "cannot be mixed"),
         ({"origin": np.zeros((2, 3)), "axis": np.ones((3, 3))}, r"origin \(2,\), axis \(3,\)"),
         ({"origin": (0.02, 0.0, 0.0), "axis": Z, "side": (1.0, 0.0)}, "side must have shape"),
     ],

@@ -149,7 +149,7 @@ def test_base_hint_that_does_not_tell():
     # Millimetres, of a point near the first, were nearer to the last.
     with pytest.raises(ValueError, match="does not identify the base"):
         Whisker.from_points(points, base=points[0] + [0.5, 0.2, 0.0])
-    with pytest.raises(ValueError, match="standard deviation of a coordinate in m"):
+    with pytest.raises(ValueError, match="standard deviation of a coordinate, in m"):
         Whisker.from_points(points, noise=0.01)
     with pytest.raises(ValueError, match='"first", "last"'):
         Whisker.from_points(points, base="tip")

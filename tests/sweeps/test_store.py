@@ -357,7 +357,7 @@ def test_what_is_not_a_store_is_left_alone(study, tmp_path):
         open_sweep(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
     (tmp_path / ".study.json").write_text('{"name": "of long ago", "layout": 1}')
-    with pytest.raises(ValueError, match=r"laid out as by another version.*do the study again"):
+    with pytest.raises(ValueError, match=r"has the layout of another version.*run the study again"):
         open_sweep(tmp_path)
 
 

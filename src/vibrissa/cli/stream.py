@@ -83,9 +83,7 @@ class LineOptions:
         if self.source.is_dir() or not self.source.exists():
             vb.io.check_readable(self.source)
         if self.reconnect and self.source.is_file():
-            raise ValueError(
-                f"{self.source} is a file; --reconnect is for named pipes and devices"
-            )
+            raise ValueError(f"{self.source} is a file; --reconnect is for named pipes and devices")
         return vb.streaming.file_lines(self.source, self.reconnect, remark)
 
 

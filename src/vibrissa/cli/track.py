@@ -447,7 +447,7 @@ def _where_lost(traces: _Traces) -> int | None:
 
 
 def _where_unexplained(result: xr.DataTree) -> list[int] | None:
-    """Frame of each view with the largest misfit of the rod; None if the rods explain enough frames."""
+    """Frame of each view with the largest misfit; None if the rods explain enough frames."""
     data = result.to_dataset()
     misfit = np.nan_to_num(data["trace_misfit"].values)
     if not any(vb.tracking.unexplained_frames(one).any() for one in misfit.T):

@@ -237,7 +237,7 @@ def test_what_is_known_besides_the_videos_is_used(videos, tmp_path):
         (("--jump", "-1"), "--jump is -1"),
         (("--fur", "30"), "--fur is 30 mm; 0 to 20"),
         (("--region", "0:1,1 2,2"), "at least three corners"),
-        (("--pixel-size", "58"), "11.136 m wide; it is in mm"),
+        (("--pixel-size", "58"), "11.136 m wide; it must be in mm"),
         (("--rate", "0"), "--rate is 0"),
         (("--rate", "170"), "below half of 170 frames/s"),
         (("--base-radius", "-1"), "--base-radius is -1"),

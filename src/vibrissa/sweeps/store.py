@@ -386,8 +386,8 @@ def described(path: Path, layouts: Collection[int] = (LAYOUT,)) -> dict[str, Any
     unchecked = isinstance(kept, dict) and kept.get("layout") == min(OLD_LAYOUTS)
     if not isinstance(kept, dict) or (kept.pop(_SUM, None) != _sum(kept) and not unchecked):
         raise ValueError(
-            f"{file}, the description of the store, is damaged: restore a copy of it, or remove it "
-            "to start the study again"
+            f"{file} is damaged, which describes the store: restore a copy of it, or remove it to "
+            "start the study again"
         )
     return kept
 

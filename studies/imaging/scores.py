@@ -65,7 +65,7 @@ def started(film: Filmed) -> Start:
     rows = np.unique(np.linspace(0, count - 1, min(FRAMES, count)).astype(int))
     start = find_start(film.cameras, [[view[i] for i in rows] for view in film.frames])
     if start.bases is None:
-        raise ValueError(f"where the whisker begins was not found: {start.doubts[0]}")
+        raise ValueError(f"the base of the whisker was not found: {start.doubts[0]}")
     return start
 
 

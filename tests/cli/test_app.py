@@ -145,5 +145,5 @@ def test_a_warning_is_a_note(tmp_path):
         text=True,
         check=True,
     )
-    assert done.stderr.startswith("note: the sensor reads a force of 1 N")
+    assert done.stderr.startswith("note: a force of 1 N causes the same reading")
     assert "Warning" not in done.stderr

@@ -101,7 +101,7 @@ def test_a_table_of_protraction(own, tmp_path):
         ("[array]\nfil = 'x'", {}, "has fil"),
         ("[whisker]\nfile = 'x.csv'", {"array": "average"}, "both a whisker and an array"),
         ("", {"array": "average", "object": "torus"}, "of kind 'torus'"),
-        ("[[object]]\nposition = [1, 2, 3]", {"object": "peg"}, "has objects already"),
+        ("[[object]]\nposition = [1, 2, 3]", {"object": "peg"}, "already has objects"),
         ("[motion]\nkind = 'past'", {"whiskers": ["C2"]}, "of kind 'past'"),
         ("[motion]\nrow = 'C'", {"whiskers": ["C2"]}, "has row"),
         ("", {"whiskers": ["C9"]}, "reach to column 6"),

@@ -252,7 +252,7 @@ def test_files_of_the_wrong_kind(monkeypatch, capsys, folder, table, chart):
     bad = folder / "bad.csv"
     bad.write_text("time,Fx\n0,1\n")
     assert "lacks Fy" in fault(monkeypatch, capsys, "estimate", bad, "--map", chart)
-    assert "not a table that is known" in fault(monkeypatch, capsys, "info", bad)
+    assert "not a table of a known kind" in fault(monkeypatch, capsys, "info", bad)
     few = folder / "few.csv"
     few.write_text("time,Fx_uN,MB_uNm,MD_deg\n0,-100,2,45\n")
     assert f"vibrissa estimate {few} --using Fx,MB,MD" in run("info", few).replace("\n", "")
@@ -261,7 +261,7 @@ def test_files_of_the_wrong_kind(monkeypatch, capsys, folder, table, chart):
     assert load_contacts(folder / "few-out.csv")["time"].values.tolist() == [0.0, 1.0]
     few.write_text("FT_uN,MB_uNm,MD_deg\n100,2,45\n")
     named = fault(monkeypatch, capsys, "estimate", few, "--map", chart).replace("\n", " ")
-    assert "state --using FT,MB,MD" in named
+    assert "use --using FT,MB,MD" in named
     both = ("--map", chart, "--whisker", table[0])
     assert "either --map" in fault(monkeypatch, capsys, "estimate", table[0], *both)
     triplet = ("--using", "Fx,MB")

@@ -140,7 +140,7 @@ def test_faults_are_told_before_anything_is_drawn(chart, tmp_path, monkeypatch, 
     assert "there is no file" in fault(monkeypatch, capsys, missing, "-o", folder)
     assert "there is no file" in fault(monkeypatch, capsys, *there, "--uniqueness", missing)
     said = fault(monkeypatch, capsys, *there, "--uniqueness", chart)
-    assert "holds vibrissa contact map, and no variable 'verdict'" in said
+    assert "contains vibrissa contact map, and no variable 'verdict'" in said
     table = tmp_path / "verdicts.csv"
     assert "NetCDF (-o FILE.nc) is needed" in fault(
         monkeypatch, capsys, *there, "--uniqueness", table

@@ -284,7 +284,7 @@ def test_the_frame_rate_is_asked_for_and_views_are_matched_by_name(trial, tmp_pa
         run("import", *files, "--pixel-size", 0.05, "-o", tmp_path / "t.nc")
     single = tmp_path / "single.csv"
     single.write_text("frame,node,column,row\n7,0,1,1\n7,1,9,2\n")
-    with pytest.raises(ValueError, match="holds one frame"):
+    with pytest.raises(ValueError, match="contains one frame"):
         run("import", single, "--rate", 500, "-o", tmp_path / "t.nc")
     image = np.random.default_rng(5).uniform(0.0, 300.0, (4, 1, 2, 5, 2))
     for views, order, guessed in (

@@ -129,7 +129,7 @@ def test_what_is_wrong_is_told(study, tmp_path):
     for words, said in (
         (["sweep"], "a study is needed"),
         (["sweep", "show"], "what to show"),
-        (["sweep", str(study), "more"], "one word too many"),
+        (["sweep", str(study), "more"], "is not expected here"),
         (["sweep", "show", str(tmp_path)], "not a store of a sweep"),
     ):
         result = RUN.invoke(app, words)

@@ -140,7 +140,7 @@ def test_a_mask_hides_what_is_in_it_and_a_region_what_is_not(videos, tmp_path):
     assert np.nanmax(seen[..., 0]) > whole
     assert np.nanmax(seen[..., 0]) < 130.0
     done = run(*arguments(videos, "--mask", "2:1,1 2,2 3,1", "-o", tmp_path / "u.nc"))
-    assert "views 0 to 1 are there" in str(done.exception)
+    assert "with a view from 0 to 1" in str(done.exception)
 
 
 def test_the_stated_radius_is_that_of_the_base_inside_the_fur(videos, tmp_path):
@@ -230,14 +230,14 @@ def test_what_is_known_besides_the_videos_is_used(videos, tmp_path):
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        (("--base", "20,30"), "each needs as many"),
+        (("--base", "20,30"), "all views need as many"),
         (("--offset", "some"), "a number of frames or auto"),
         (("--pixel-size", "0"), "--pixel-size is 0 mm"),
         (("--base-width", "nan"), "--base-width is nan"),
         (("--jump", "-1"), "--jump is -1"),
         (("--fur", "30"), "--fur is 30 mm; 0 to 20"),
         (("--region", "0:1,1 2,2"), "at least three corners"),
-        (("--pixel-size", "58"), "11.136 m wide; it is in mm"),
+        (("--pixel-size", "58"), "11.136 m wide; it must be in mm"),
         (("--rate", "0"), "--rate is 0"),
         (("--rate", "170"), "below half of 170 frames/s"),
         (("--base-radius", "-1"), "--base-radius is -1"),
@@ -256,7 +256,7 @@ def test_what_cannot_be_tracked_says_why_before_the_work(videos, tmp_path, monke
 
 def test_one_video_is_not_two_views(videos, tmp_path):
     done = run("track", videos / "top.mkv", videos / "top.mkv", "-o", tmp_path / "t.nc")
-    assert "a video is there twice" in str(done.exception)
+    assert "a video is given twice" in str(done.exception)
 
 
 def test_videos_that_differ_in_length_are_told(videos, tmp_path):

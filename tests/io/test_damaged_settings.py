@@ -224,7 +224,7 @@ def test_cameras_that_do_not_fit_the_videos_are_refused(tmp_path):
         return str(result.exception)
 
     said = fault(orthogonal_views(size=(64, 64))[:1])
-    assert "2 videos, 1 a trial, are 2 trials" in said
+    assert "2 videos, 1 per trial, are 2 trials" in said
     said = fault(orthogonal_views(size=(64, 48)))
     assert f"{videos[0]} is 64 × 64 pixels" in said
     assert "calibrates camera 'top' for 64 × 48" in said

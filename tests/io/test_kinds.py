@@ -119,10 +119,10 @@ def test_info_of_other_files(tmp_path):
     save_centerline(path, samples.gamma().centerline(12))
     assert "centreline of a whisker" in info(path)
     path.write_bytes(b"\0\1\2 a video perhaps")
-    with pytest.raises(ValueError, match=r"a.csv is of no kind that is known.*SLEAP"):
+    with pytest.raises(ValueError, match=r"a.csv is not of a known kind.*SLEAP"):
         info(path)
     path.write_text("name,age\nC2,3\n")
-    with pytest.raises(ValueError, match="not a table that is known"):
+    with pytest.raises(ValueError, match="not a table of a known kind"):
         info(path)
 
 

@@ -155,7 +155,7 @@ class TestMotion:
             whisking(protraction=0.8)
         with pytest.raises(ValueError, match="not a rotation matrix"):
             whisking(0.1).on_head(2.0 * np.eye(3), np.zeros(3))
-        with pytest.raises(ValueError, match="moves already"):
+        with pytest.raises(ValueError, match="already includes a motion"):
             whisking(0.1).on_head(np.eye(3), np.zeros(3)).on_head(np.eye(3), np.zeros(3))
         with pytest.raises(ValueError, match="azimuth has shape"):
             tabulated([0.0, 1.0], [0.0, 1.0, 2.0])

@@ -868,7 +868,7 @@ def test_two_whiskers_from_the_command_line(map_file, bent, wrench, tmp_path):
     assert "right: 2 samples" in done.stderr
     (_, first), _ = bag_messages(tmp_path / "out")["/right/contact_point"]
     np.testing.assert_allclose([first.point.x, first.point.y], bent.contact_point[2, :2], atol=1e-8)
-    with pytest.raises(ValueError, match="each has a name"):
+    with pytest.raises(ValueError, match="several whiskers need names"):
         stream(path, "--map", map_file, "--map", map_file)
     with pytest.raises(ValueError, match="--sensor is of other"):
         stream(path, *maps, "--sensor", "other=sensor.toml")
@@ -947,7 +947,7 @@ def test_a_bag_may_hold_the_pose_of_what_carries_the_base(map_file, wrench, tmp_
         (["--udp", "127.0.0.1:0", "--speed", 1.0], "add --filter"),
         (["--every"], "only of what comes by --udp"),
         (["--reconnect"], "neither a named pipe nor a device"),
-        ([__file__, "--reconnect"], "for pipes and devices"),
+        ([__file__, "--reconnect"], "for named pipes and devices"),
     ],
 )
 def test_what_cannot_be_is_said(options, message, map_file):

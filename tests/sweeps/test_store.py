@@ -216,7 +216,7 @@ def test_a_full_disk_is_named_and_the_run_can_go_on(study, whole, tmp_path):
             (store / "map.cells").rename(tmp_path / "aside")
             (store / "map.cells").symlink_to(FULL)
 
-    with pytest.raises(OSError, match=r"No space left .*map\.cells.* goes on") as raised:
+    with pytest.raises(OSError, match=r"No space left .*map\.cells.* continues") as raised:
         run_sweep(study, store, workers=0, progress=fill)
     assert raised.value.errno == errno.ENOSPC
     (tmp_path / "aside").replace(store / "map.cells")
@@ -233,7 +233,7 @@ def test_a_disk_without_room_for_a_description_is_named(study, whole, tmp_path, 
     store.mkdir()
     (store / ".sweep.lock").touch()
     (store / name).symlink_to(FULL)
-    with pytest.raises(OSError, match=r"No space left .* the same call goes on") as raised:
+    with pytest.raises(OSError, match=r"No space left .* the same call continues") as raised:
         run_sweep(study, store, workers=0)
     assert raised.value.errno == errno.ENOSPC
     assert name.removesuffix(".part") in str(raised.value)
@@ -357,7 +357,7 @@ def test_what_is_not_a_store_is_left_alone(study, tmp_path):
         open_sweep(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
     (tmp_path / ".study.json").write_text('{"name": "of long ago", "layout": 1}')
-    with pytest.raises(ValueError, match=r"laid out as by another version.*do the study again"):
+    with pytest.raises(ValueError, match=r"has the layout of another version.*run the study again"):
         open_sweep(tmp_path)
 
 

@@ -128,7 +128,7 @@ def test_a_cell_is_the_same_in_any_study_that_has_it():
         (WHISKERS + 'kind = "array"\nrows = "Q"\n' + TASKS, r"\[\[whiskers\]\] 1: "),
         (WHISKERS + '[[tasks]]\nkind = "dance"\n', "kind is 'dance'; one of map, uniqueness"),
         (WHISKERS + '[[tasks]]\nkind = ["map"]\n', "one of map, uniqueness"),
-        (WHISKERS + TASKS + "samples = 3\n", "sets samples; of map can be set: nothing"),
+        (WHISKERS + TASKS + "samples = 3\n", "sets samples; settings of map are: nothing"),
         (WHISKERS + TASKS + TASKS, "another name for each task"),
         (WHISKERS + '[[tasks]]\nkind = "uniqueness"\nsamples = 3\n', "samples is 3; a number from"),
         (WHISKERS + '[[tasks]]\nkind = "uniqueness"\nregions = ["N"]\n', "known are all"),

@@ -1,6 +1,6 @@
-"""The command line: parse, call, print.
+"""Command-line interface: each verb parses its options, calls a function and prints the results.
 
-What is typed and printed is in mm, µN, µN·m, degrees; files hold SI units.
+Options and printed values are in mm, µN, µN·m and degrees; files are in SI units.
 """
 
 from vibrissa.cli.app import main

@@ -1,4 +1,4 @@
-"""The command `vibrissa` and its verbs."""
+"""Command `vibrissa` with its verbs."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Lengths typed and printed are in mm, forces in µN, moments in µN·m and angles
 SI units. Existing files are not replaced without --force; stages are added to the recording itself.
 """
 
-# The verbs, in the order in which they are listed.
+# Verbs, in the order in which they are listed.
 VERBS: dict[str, Callable[..., None]] = {
     "demo": demo,
     "deflect": deflect,
@@ -90,11 +90,11 @@ def options(
         typer.Option("--version", help="Print the version.", callback=_version, is_eager=True),
     ] = False,
 ) -> None:
-    """Take the options that belong to no verb."""
+    """Process the options that precede the verb."""
 
 
 def main() -> None:
-    """Run the command line; a fault of the input is one message and exit status 2."""
+    """Run the command line; an error of the input gives one message and exit status 2."""
     usual = warnings.showwarning
 
     def note(

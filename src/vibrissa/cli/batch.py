@@ -1,4 +1,4 @@
-"""`vibrissa batch`: all recordings of a folder, to their objects, with one table and one page."""
+"""`vibrissa batch`: reconstruction of all recordings of a folder, with a table and a page."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vibrissa.cli.reconstruct import ShapeOptions, stages
 from vibrissa.cli.signals import SourceOptions
 from vibrissa.cli.terminal import Tell, progress_bars, say, shown
 
-# Files that are written into the folder, replaced by each run.
+# Files written to the folder by each run.
 TABLE, PAGE = "summary.csv", "summary.html"
 _COLUMNS = (
     *("file", "whiskers", "duration", "frames", "frames_in_contact", "contacts"),
@@ -35,20 +35,22 @@ def batch(
     objects: Path | None = None,
     force: bool = False,
 ) -> None:
-    """Find the object in every recording of a folder, and summarise them in one table and page.
+    """Reconstruct the object of every recording in a folder, and summarise all in a table and page.
 
-    Each recording is treated as by `vibrissa reconstruct`, and its groups are added to it. Those
-    that have a contour are left as they are unless --force is given, so that a run that was stopped
-    goes on where it was. A recording that cannot be done does not stop the others: the table states
-    the fault, and the next run tries it again. The table is FOLDER/summary.csv, in SI units, the
-    page FOLDER/summary.html.
+    Each recording is processed as by `vibrissa reconstruct`, and the results are added to it.
+    Recordings that have a contour are skipped unless --force is given, so that an interrupted run
+    can be continued. A recording that fails does not stop the others: the table states the error,
+    and the next run tries again. The table is FOLDER/summary.csv, in SI units, and the page
+    FOLDER/summary.html.
     Example: `vibrissa batch trials --shape sphere`
     """
     if not folder.is_dir():
         raise ValueError(f"{folder} is not a folder; one with recordings is needed")
     paths = [path for path in sorted(folder.glob("*.nc")) if _is_recording(path)]
     if not paths:
-        raise ValueError(f"{folder} holds no recordings; `vibrissa track` and `import` make them")
+        raise ValueError(
+            f"{folder} contains no recordings; `vibrissa track` and `vibrissa import` create them"
+        )
     known = None if objects is None else objects_from(objects)
     rows, lines = [], []
     with progress_bars() as tell:
@@ -57,7 +59,7 @@ def batch(
             found, fault = _one(path, wanted, source, how, known, force, tell)
             rows.append(_cells(path, found, fault))
             lines.append(_shown(path, found, fault))
-            # What is done is in the table even if the next one is interrupted.
+            # The table is complete up to here even if the next recording is interrupted.
             vb.io.write_table(folder / TABLE, _COLUMNS, rows)
         tell("recordings", len(paths), len(paths))
     failed = sum(bool(row[-1]) for row in rows)
@@ -74,11 +76,11 @@ def batch(
 
 
 def _is_recording(path: Path) -> bool:
-    """Whether a file is a recording, or perhaps one that is damaged; not a map or signals."""
+    """Whether a file is a recording, or may be a damaged one, rather than a map or signals."""
     try:
         return vb.io.recognise(path) in (vb.io.Kind.RECORDING, vb.io.Kind.UNKNOWN)
     except (ValueError, OSError):
-        return True  # reading it states what is wrong
+        return True  # reading it will raise an error
 
 
 def _one(
@@ -90,7 +92,7 @@ def _one(
     again: bool,
     tell: Tell,
 ) -> tuple[vb.pipeline.TrialSummary | None, str]:
-    """Bring one recording to its object; its summary, and what was wrong."""
+    """Reconstruct the object of one recording; return a summary (or None) and the fault."""
     fault, found, tree, made = "", None, None, False
     try:
         tree = recording_from(path)
@@ -111,7 +113,7 @@ def _one(
 
 
 def _cells(path: Path, found: vb.pipeline.TrialSummary | None, fault: str) -> list[object]:
-    """A line of the table."""
+    """Row of the table."""
     if found is None:
         return [path.name, *[""] * (len(_COLUMNS) - 2), fault]
     names = " ".join(found.whiskers)
@@ -122,7 +124,7 @@ def _cells(path: Path, found: vb.pipeline.TrialSummary | None, fault: str) -> li
 
 
 def _object(shape: vb.contour.FittedShape | None) -> list[object]:
-    """Kind, position and diameter of the fitted object, as far as it has them."""
+    """Cells with kind, position and diameter of the fitted object, empty if not applicable."""
     if shape is None:
         return [""] * 6
     position = next(n for n, meant in shape.fields.items() if meant == "object_position")
@@ -137,7 +139,7 @@ def _short(value: object) -> object:
 
 
 def _shown(path: Path, found: vb.pipeline.TrialSummary | None, fault: str) -> list[str]:
-    """A line of the page, in the units that are shown."""
+    """Row of the page, in display units."""
     if found is None:
         return [path.name, *[""] * (len(_HEADING) - 2), fault]
 

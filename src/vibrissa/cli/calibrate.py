@@ -1,4 +1,4 @@
-"""`vibrissa calibrate`: cameras by images of a checkerboard, sensors by touches at known points."""
+"""`vibrissa calibrate`: calibration of cameras by a checkerboard, and of suspended whiskers."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import vibrissa as vb
 from vibrissa.cli.options import check_new, refuse, with_options
 from vibrissa.cli.terminal import remark, say
 
-# Noise, as a share of the range of the readings, above which something is wrong.
+# Noise relative to the range of the readings above which the user is warned.
 _UNEXPLAINED = 0.05
-_AGAIN = 4  # touches with the same largest reading from which a channel seems to saturate
-_MOST_NAMED = 5  # touches that are named
-_POOR = 1.0  # reprojection error above which something is wrong, pixels
-_SMALLEST, _LARGEST = 0.05, 200.0  # sides of squares, mm: what is smaller was typed in m
-_FRAMES = 40  # frames that are used of a video, by default
+_AGAIN = 4  # number of touches with the same extreme reading that suggests saturation
+_MOST_NAMED = 5  # largest number of touches listed
+_POOR = 1.0  # reprojection error above which the user is warned, pixels
+_SMALLEST, _LARGEST = 0.05, 200.0  # plausible sides of squares, mm; smaller ones may be in m
+_FRAMES = 40  # default number of frames used from a video
 
 
 @with_options("the cameras, TOML of Anipose; or the sensor, NetCDF (.nc)")
@@ -31,11 +31,11 @@ def calibrate(
 ) -> None:
     """Calibrate cameras by a checkerboard, or a suspended whisker by touches at known points.
 
-    All cameras must see the board at the same moments (extra cameras); it is turned and moved
-    between images. The file is for `vibrissa track --cameras`; its laboratory frame is that of the
-    board at the first moment at which all cameras see it. The description of a stage
-    (vibrissa.sensors.Stage) names tables of touches and of the resting whisker; the calibrated
-    sensor is for `vibrissa estimate --sensor`.
+    All cameras must record the board at the same times (requires the extra "cameras"); the board is
+    rotated and moved between images. The result is for `vibrissa track --cameras`; its laboratory
+    frame is that of the board in the first images in which all cameras see it. For a suspended
+    whisker, the description of a stage (vibrissa.sensors.Stage) names tables of touches and of the
+    resting whisker; the calibrated sensor is for `vibrissa estimate --sensor`.
     Example: `vibrissa calibrate --pattern 9x6 --square 5 top_*.png front_*.png -o cameras.toml`;
     `vibrissa calibrate stage.toml -o sensor.nc`
     """
@@ -94,7 +94,7 @@ def _suspended(description: Path, target: Path, force: bool) -> None:
 
 
 def _check_saturation(channels: Sequence[str], readings: vb.numerics.Array) -> None:
-    """Report channels that read their largest or smallest value again and again."""
+    """Warn of channels that repeatedly read their largest or smallest value."""
     for name, values in zip(channels, readings.T, strict=True):
         for end in (values.min(initial=np.inf), values.max(initial=-np.inf)):
             count = int((values == end).sum())
@@ -138,11 +138,11 @@ def _cameras(
 
 
 def _corners(text: str) -> tuple[int, int]:
-    """Read 9x6."""
+    """Parse the numbers of inner corners, such as 9x6."""
     parts = text.lower().replace("×", "x").split("x")
     if len(parts) != 2 or not all(part.strip().isdigit() for part in parts):
         raise ValueError(f"--pattern is {text!r}; the numbers of inner corners as 9x6 are needed")
     corners = int(parts[0]), int(parts[1])
     if min(corners) < 3:
-        raise ValueError(f"--pattern is {text!r}; a board has at least 3 inner corners each way")
+        raise ValueError(f"--pattern is {text!r}; at least 3 inner corners each way are needed")
     return corners

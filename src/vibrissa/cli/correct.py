@@ -1,4 +1,4 @@
-"""`vibrissa correct`: a window in which traces are corrected."""
+"""`vibrissa correct`: a window for the correction of traces."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-_ENDLESS = 1 << 31  # number of frames of a video that does not state it
+_ENDLESS = 1 << 31  # assumed number of frames of a video that does not state it
 
 
 @with_options("corrections, .csv, which are added to those that it holds already")
@@ -23,10 +23,11 @@ def correct(
     trace: Path | None = None,
     view: int = 0,
 ) -> None:
-    """Click the right trace of a whisker in some frames, for `vibrissa track --corrections`.
+    """Click the correct trace of a whisker in some frames, for `vibrissa track --corrections`.
 
-    Click points from base to tip; arrows go to other frames, s saves, q saves and closes; all keys
-    are shown in the window. Example: `vibrissa correct top.mp4 -o corrections.csv --trace trial.nc`
+    Click points from base to tip; the arrow keys change the frame, s saves, q saves and closes; the
+    window shows all keys.
+    Example: `vibrissa correct top.mp4 -o corrections.csv --trace trial.nc`
     """
     if view < 0:
         raise ValueError(f"--view is {view}; views are counted from 0")

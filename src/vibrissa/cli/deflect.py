@@ -1,4 +1,4 @@
-"""`vibrissa deflect`: bend a whisker once."""
+"""`vibrissa deflect`: equilibrium of a whisker under one load."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vibrissa.cli.terminal import fixed, print_table, remark, say
 
 _MM = 1e-3
 _MICRO = 1e-6
-# Share of the length below which a position looks like metres typed for mm.
+# Distance, relative to the whisker's length, below which a position may be in m instead of mm.
 _NEXT_TO_BASE = 0.02
 _XYZ = ("X", "Y", "Z")
 
@@ -34,10 +34,10 @@ def deflect(
 ) -> None:
     """Bend a whisker by a point, a force or a peg, and print force and moment at its base.
 
-    Everything is in the whisker's frame. Give one of --point, --point-force and --peg (upright
+    All coordinates are in the whisker frame. Give one of --point, --point-force and --peg (vertical
     without --axis). With --gravity the whisker sags under its weight, and force and moment are
-    those of a sensor that was tared at rest. Where there is no equilibrium the status states why,
-    and the exit status is 1.
+    those of a sensor that was tared at rest. If there is no equilibrium, the status states why, and
+    the exit status is 1.
     Example: `vibrissa deflect --point 25,12,1`
     """
     load = _load(point, point_force, peg, axis, push)
@@ -51,7 +51,7 @@ def deflect(
     pull = None if gravity is None else numbers(gravity, _XYZ, "--gravity")
     bent = vb.deflect(whisker, load, gravity=pull, proximal=smallest_arc(proximal), device=device)
     status = vb.Status(int(bent.status))
-    # The advice by the name that the option has here.
+    # Advice with the name of the command-line option.
     option = " The option is --proximal." if status == vb.Status.TOO_PROXIMAL else ""
     say(f"{status}{option}")
     say(repr(whisker))
@@ -63,7 +63,7 @@ def deflect(
 
 
 def _doubt_the_unit(load: vb.rod.Load, whisker: vb.Whisker) -> None:
-    """Ask whether metres were meant where a position would then be on the whisker."""
+    """Warn if a position seems to be in metres instead of mm."""
     import numpy as np
 
     if isinstance(load, vb.PointForce):
@@ -82,7 +82,7 @@ def _doubt_the_unit(load: vb.rod.Load, whisker: vb.Whisker) -> None:
 def _load(
     point: str | None, force: str | None, peg: str | None, axis: str | None, push: str | None
 ) -> vb.rod.Load:
-    """Make the one load that was asked for."""
+    """Construct the load from the options."""
     kinds = {"--point": point, "--point-force": force, "--peg": peg}
     given = [name for name, value in kinds.items() if value]
     if len(given) != 1:

@@ -1,4 +1,4 @@
-"""`vibrissa demo`: the main job from end to end."""
+"""`vibrissa demo`: demonstration of the whole pipeline on a simulated trial."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def demo(
     duration: float | None = None,
     rate: float | None = None,
 ) -> None:
-    """Whisk against a peg, film it, measure at the whisker's base, and find the peg again.
+    """Simulate whisking against a peg, with videos and a sensor, and reconstruct the peg.
 
-    A whisker sweeps past a peg and back before two cameras. Tracking gives the pose of its
-    base, three signals at the base give the contact points, and these the peg. All stages are
-    compared with the truth. Stopped with Ctrl-C it continues when it is called again.
+    A whisker sweeps past a peg and back in front of two cameras. The pose of its base is tracked,
+    contact points are estimated from three signals at the base, and the peg is fitted to these. All
+    stages are compared with the truth. After Ctrl-C the same command continues.
     Example: `vibrissa demo --output try --seed 1`
     """
     from vibrissa.demo import DURATION, FULL_DURATION, run_demo
@@ -65,7 +65,7 @@ def demo(
 
 
 def _pictures(result: DemoResult, folder: Path, tell: Tell) -> list[Path]:
-    """The figures of the trial, and signals over the space of all contacts."""
+    """Draw the figures of the trial, and signals over the space of all contacts."""
     from vibrissa.demo import video_files
 
     videos = None if result.tracking is None else video_files(folder)
@@ -129,7 +129,7 @@ def _print_tracking(scores: vb.evaluation.TrackingScores) -> None:
 
 
 def _print_signals(sensed: Located, seen: Located) -> None:
-    """Errors of force and moment by deflection angle, from both sources."""
+    """Print errors of force and moment by deflection angle, from both sources."""
     of_seen = {row.label: row for row in seen.signals}
     rows = []
     for row in sensed.signals:
@@ -149,7 +149,7 @@ def _print_errors(
     rows: Sequence[vb.evaluation.ErrorRow],
     noise: bool,
 ) -> None:
-    """Errors as measured and, with noise, as predicted."""
+    """Print actual errors and, with noise, predicted ones."""
     cells: list[Row] = []
     for row in rows:
         values = [*row.measured, *(row.predicted[:2] if noise else ())]
@@ -165,7 +165,7 @@ def _print_errors(
 
 
 def _print_peg(result: DemoResult) -> None:
-    """The peg, fitted and true."""
+    """Print the fitted and the true peg."""
     from rich.text import Text
 
     found = {_SENSED: result.sensed}

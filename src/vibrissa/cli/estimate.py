@@ -1,4 +1,4 @@
-"""`vibrissa estimate`: from signals to contact points."""
+"""`vibrissa estimate`: estimation of contact points from signals."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _XYZ = ("X", "Y", "Z")
 
 @dataclass(frozen=True)
 class GravityOptions:
-    """Gravity that a whisker bends under, and how well it is known."""
+    """Options for gravity and its uncertainty."""
 
     gravity: str | None = None
     tare_gravity: str | None = None
@@ -58,7 +58,7 @@ class GravityOptions:
 
     @property
     def known(self) -> vb.Gravity | None:
-        """Gravity; None: the whisker has no weight."""
+        """Gravity; None to neglect the weight of the whisker."""
         if self.gravity is None:
             return None
         x, y, z = numbers(self.gravity, _XYZ, "--gravity")
@@ -74,24 +74,24 @@ class GravityOptions:
         )
 
     def check(self, how: EstimateOptions) -> None:
-        """Raise where a weight does not go with how contacts are estimated."""
+        """Raise ValueError if gravity is incompatible with the options of the estimate."""
         if how.method != "exact":
             refuse({"--gravity": self.gravity}, f"--method {how.method} has no weight")
         if how.map:
             refuse({"--density": self.density}, "a map states that of its whisker")
 
     def of(self, whisker: vb.Whisker) -> vb.Whisker:
-        """The whisker with the density that is stated."""
+        """Whisker with the stated density."""
         return whisker if self.density is None else whisker.with_properties(density=self.density)
 
     def described(self) -> str:
-        """State the gravity, to be put at the end of a sentence; empty where there is none."""
+        """Description of gravity for the end of a sentence; empty without gravity."""
         return "" if self.gravity is None else f"; bent by gravity of {self.gravity} m/s²"
 
 
 @dataclass(frozen=True)
 class AroundOptions:
-    """Known objects that a whisker may lie along, and how well their position is known."""
+    """Options for contacts with known objects, and the uncertainty of their position."""
 
     around: Path | None = None
     position_sigma: float | None = None
@@ -99,12 +99,12 @@ class AroundOptions:
     def __post_init__(self) -> None:
         if (self.around is None) != (self.position_sigma is None):
             raise ValueError(
-                "--around and --position-sigma belong together: where objects are is known up to a "
-                "shift (mm, one sigma, along each axis)"
+                "--around and --position-sigma belong together: the position of objects is known "
+                "up to a shift (mm, one sigma, along each axis)"
             )
 
     def check(self, how: EstimateOptions, weight: GravityOptions) -> None:
-        """Raise where options are stated that the contacts of an arc do not take."""
+        """Raise ValueError for options that are incompatible with known objects."""
         others = {
             "--map": how.map,
             "--using": how.using,
@@ -121,14 +121,14 @@ class AroundOptions:
             raise ValueError("--around takes no prior of contacts: its objects are the prior")
 
 
-_SHOWN = 5  # faults of a table that are reported
+_SHOWN = 5  # largest number of faults of a table that are reported
 _ONSET = ("onset_time", "onset_sigma")
 _NUMBERS = ("time", "x", "y", "z", "r", "theta", "phi", "sigma_x", "sigma_y", "sigma_z")
 
 
 @dataclass(frozen=True, kw_only=True)
 class EstimateOptions:
-    """From which signals contacts are estimated, and how."""
+    """Options for the signals and the method of the estimate."""
 
     map: list[Path] | None = None
     using: str | None = None
@@ -164,12 +164,12 @@ class EstimateOptions:
 
     @property
     def whole(self) -> bool:
-        """Whether force and moment are used whole."""
+        """Whether the full force and moment are used."""
         return self.using == WRENCH
 
     @property
     def names(self) -> tuple[str, ...] | None:
-        """Signals that are stated, but the wrench."""
+        """Stated signals; None if there are none, or for the full wrench."""
         return None if self.using is None or self.whole else vb.signals.selection(self.using)
 
     @property
@@ -179,24 +179,24 @@ class EstimateOptions:
 
     @property
     def special(self) -> bool:
-        """Whether contacts are found otherwise than in a stream."""
+        """Whether options are used that a stream does not support."""
         beyond = (self.friction_sigma, self.second_contacts, self.compliance_sigma)
         return self.method != "exact" or any(beyond)
 
     @property
     def given(self) -> bool:
-        """Whether anything is stated, so that contacts are to be estimated anew."""
+        """Whether any option is stated, so that contacts must be estimated again."""
         stated = (self.map, self.using, self.own.whisker, self.noise.given, self.special)
         return any(map(bool, (*stated, self.proximal is not None, self.assumed.described())))
 
     @property
     def known(self) -> WhiskerOptions:
-        """The one whisker that is stated, perhaps by its map."""
+        """Options of the stated whisker, which may be that of a map."""
         one = self.map is not None and len(self.map) == 1
         return WhiskerOptions(self.map[0]) if self.map and one else self.own
 
     def keywords(self) -> dict[str, Any]:
-        """Options of all functions that estimate."""
+        """Keyword arguments shared by all estimates."""
         errors = dict(self.assumed.errors)
         if self.compliance_sigma:
             errors["compliance_sigma"] = math.radians(self.compliance_sigma) * 1e6
@@ -209,7 +209,7 @@ class EstimateOptions:
         }
 
     def described(self, names: str, friction: float, noise: str, least: float) -> str:
-        """State from which signals contacts are found, and what is known beforehand."""
+        """Description of the signals, and of the assumptions of the estimate."""
         by = "" if self.method == "exact" else f" by {self.method}"
         used = f"signals ({', '.join(names.split())}){by}"
         if self.compliance_sigma:
@@ -236,24 +236,25 @@ def estimate(
     target: Path | None = None,
     force: bool = False,
 ) -> None:
-    """Find the contact point in each frame or row of signals, with its uncertainty.
+    """Estimate the contact point in each frame or row of signals, with its uncertainty.
 
-    Three signals give all contacts that explain them exactly, more are fitted by least squares;
-    --using wrench allows for friction. Where M_B is within five standard deviations of zero the
-    status is not_felt.
+    Three signals give all contacts that explain them exactly; more signals are fitted by least
+    squares. --using wrench allows for friction. If M_B is within five standard deviations of zero,
+    the status is not_felt.
 
-    A table gives a table. To a recording contacts are added as a group `estimates`, in the
-    laboratory frame too, where continuity decides between several contacts; missing signals are
-    computed first (see `vibrissa signals`), and a contour of other contacts is removed.
+    The results for a table are written to a table. For a recording they are added as the group
+    `estimates`, also in the laboratory frame, where continuity selects among several contacts;
+    missing signals are computed first (see `vibrissa signals`), and a contour of earlier contacts
+    is removed.
 
-    With a --sensor (.toml) the columns of a table are the sensor's channels, and poses of the base,
-    as in lines of `vibrissa stream`; with a --sensor of `vibrissa calibrate` (.nc) the table is a
-    sweep: positions of the stage, and the channels. A sweep may give a recording (.nc), in which
-    `vibrissa reconstruct` finds the object.
+    With a --sensor (.toml) the columns of a table are the sensor's channels and poses of the base,
+    as in lines of `vibrissa stream`. With a --sensor of `vibrissa calibrate` (.nc) the table is a
+    sweep, with positions of the stage and the channels; its results may be written to a recording
+    (.nc), from which `vibrissa reconstruct` reconstructs the object.
 
-    With --gravity a whisker of known density sags; gravity is that of the laboratory where poses of
-    the base are known, as in a recording. With --around contacts are those with known objects,
-    which a whisker may lie along; they go to a table.
+    With --gravity a whisker of known density sags; gravity is in the laboratory frame if poses of
+    the base are known, as in a recording. With --around contacts with known objects are estimated,
+    also along an arc, and written to a table.
 
     Example: `vibrissa estimate signals.csv --map map.nc --using Fx,FT,MB,MD -o contacts.csv`
     """
@@ -288,7 +289,7 @@ def estimate(
 
 
 def _named_signals(table: Path, how: EstimateOptions) -> bool:
-    """Whether a table has the signals that are used, and not what they are computed from."""
+    """Whether a table has the signals themselves rather than force and moment."""
     if how.whole or how.special:
         return False
     names = how.names or vb.pipeline.TRIPLET
@@ -300,8 +301,8 @@ def _named_signals(table: Path, how: EstimateOptions) -> bool:
     known = [name for name in vb.signals.SIGNALS if _is_header(first, (name,))]
     if len(known) >= 3:
         raise ValueError(
-            f"{table} has the signals {', '.join(known)}, and {', '.join(names)} are asked for: "
-            f"state --using {','.join(known)}"
+            f"{table} has the signals {', '.join(known)}, but {', '.join(names)} are requested: "
+            f"use --using {','.join(known)}"
         )
     return False
 
@@ -321,7 +322,7 @@ def _from_lines(
     weight: GravityOptions,
     sensor: vb.sensors.Sensor | None,
 ) -> None:
-    """Contacts of a table whose lines are those of a stream."""
+    """Estimate contacts for a table whose lines are those of a stream."""
     import numpy as np
 
     weight.check(how)
@@ -366,7 +367,7 @@ def _from_lines(
 
 
 def _from_table(signals: Path, target: Path, how: EstimateOptions, weight: GravityOptions) -> None:
-    """Contacts in the whisker's frame, as a table."""
+    """Estimate contacts for a table of signals, whisker frame."""
     weight.check(how)
     noise = how.noise.matrix()
     wrench = wrench_from(signals)
@@ -403,12 +404,12 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions, weight: Gravi
     print_written(target)
 
 
-# Signals that are proposed where others do not determine contacts, the fewest first.
+# Signals proposed if the requested ones do not determine contacts, fewest first.
 _INSTEAD = (("FT", "MB", "MD"), ("Fx", "FT", "MB", "MD"))
 
 
 def _doubt_names(contact_map: vb.ContactMap, names: tuple[str, ...]) -> None:
-    """Name signals that determine contacts where those that are used do not."""
+    """Propose other signals if the requested ones do not determine contacts."""
     if contact_map.determines(names):
         return
     better = next((one for one in _INSTEAD if contact_map.determines(one)), None)
@@ -420,7 +421,7 @@ def _doubt_names(contact_map: vb.ContactMap, names: tuple[str, ...]) -> None:
 
 
 def _around(signals: Path, target: Path, how: EstimateOptions, known: AroundOptions) -> None:
-    """Contacts with known objects, which may be several or an arc, as a table."""
+    """Estimate contacts with known objects, at several points or along an arc, for a table."""
     assert known.around is not None
     assert known.position_sigma is not None
     objects, noise = objects_from(known.around), how.noise.matrix()
@@ -469,13 +470,13 @@ def _around(signals: Path, target: Path, how: EstimateOptions, known: AroundOpti
 def _doubt_axes(
     whisker: vb.Whisker, wrench: xr.Dataset, noise: vb.numerics.Array, weight: GravityOptions
 ) -> None:
-    """Print which axes of the sensor seem to be others; a weight would look like such."""
+    """Warn of apparently wrong axes of the sensor; not with gravity, whose effects are similar."""
     if weight.gravity is None and (doubt := vb.pipeline.doubted_axes(whisker, wrench, noise)):
         remark(f"note: {doubt}")
 
 
 def _from_sweep(table: Path, target: Path, path: Path) -> None:
-    """Contacts of a sweep with a suspended whisker, laboratory frame, as a table."""
+    """Estimate contacts of a sweep with a suspended whisker, laboratory frame."""
     sensor, stage = vb.sensors.load_suspended(path)
     sweep = stage.sweep(table)
     found = vb.sensors.follow_sweep(sensor, *sweep)
@@ -502,7 +503,7 @@ def _from_sweep(table: Path, target: Path, path: Path) -> None:
 def _from_recording(
     signals: Path, target: Path, how: EstimateOptions, weight: GravityOptions
 ) -> None:
-    """Contacts added to a recording, or as a table."""
+    """Estimate contacts for a recording, and add them to it or write a table."""
     tree = recording_from(signals)
     table = target.suffix.lower() in vb.io.CSV
     if table:
@@ -530,10 +531,10 @@ def estimated(
     name: str,
     weight: GravityOptions | None = None,
 ) -> tuple[xr.DataTree, str]:
-    """Add contacts to a recording that has signals, and describe how they were found."""
+    """Add contacts to a recording with signals; also return a description of the method."""
     signals = tree["signals"].to_dataset()
     source = signals.attrs.get("source")
-    # A sensor that does not state its noise is a usual one.
+    # A sensor without stated noise is assumed to have the default noise.
     noisy = how.noise.given or (source == "sensor" and vb.pipeline.sensor_noise(signals) is None)
     maps = maps_from(how.map, tree.sizes["whisker"], how.grid) if how.map else []
     weight = weight or GravityOptions()

@@ -1,4 +1,4 @@
-"""`vibrissa export`: a trial as a table of predictors for other programs."""
+"""`vibrissa export`: export of a trial as a table of predictors."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def export(
 ) -> None:
     """Write a table by frame and whisker: forces, angles, their rates, contacts.
 
-    The table holds force and moment, the six signals, the pose of the base, rates of change,
-    contact points and flags, in SI units; every column is described in the file. Signals are made
-    first where there are none, by `vibrissa signals`. NWB holds the tracked whisker too.
-    Of several recordings there is a table each, next to it.
+    The table contains force and moment, the six signals, the pose of the base, rates of change,
+    contact points and flags, in SI units; the file describes every column. Missing signals are
+    computed first, as by `vibrissa signals`. NWB files also contain the tracked whisker.
+    For several recordings, each table is written next to its recording.
     Example: `vibrissa export trial.nc --to nwb --session-start 2026-03-01T14:30+01:00`
     """
     ending = f".{to}"
@@ -72,7 +72,7 @@ def _export(recording: Path, target: Path, subject: dict[str, Any], start: str |
 
 
 def _start(text: str | None, recording: Path) -> datetime:
-    """Return when the session began; by default when the file was written."""
+    """Start time of the session; by default the time at which the file was written."""
     if text is None:
         start = datetime.fromtimestamp(recording.stat().st_mtime, UTC)
         remark(f"--session-start is not stated: {start:%Y-%m-%dT%H:%MZ}, when {recording} was made")

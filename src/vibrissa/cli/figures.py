@@ -1,4 +1,4 @@
-"""`vibrissa figures`: what figures, movies and reports draw of a map, a trial or an array."""
+"""`vibrissa figures`: figures of a map, a trial or an array, also for movies and reports."""
 
 from __future__ import annotations
 
@@ -19,46 +19,46 @@ from vibrissa.cli.terminal import Tell, progress_bars, say
 from vibrissa.deferred import xr
 
 Draw = Callable[[], Any]  # draws a figure when it is called
-NODES = 101  # points of a whisker that is drawn
-_LIGHT, _DARK = 235.0, 70.0  # grey values of the background and of objects, where there is no video
-_VIEWS = 2  # largest number of views that are drawn
-# Groups of a recording whose contact points an array's figure shows, the first there is.
+NODES = 101  # number of points of a drawn whisker
+_LIGHT, _DARK = 235.0, 70.0  # grey values of background and objects without a video
+_VIEWS = 2  # largest number of drawn views
+# Groups searched, in this order, for the contact points in an array's figure.
 _CONTACTS = ("estimates", "truth")
 
 
 @dataclass(frozen=True)
 class TrialOptions:
-    """Options for the picture of a trial, and of which whisker."""
+    """Options for figures of a trial, and the selection of a whisker."""
 
     videos: list[Path] | None = None
     map: Path | None = None
     which: int | None = None
 
     def given(self) -> dict[str, object]:
-        """Return the options by their names."""
+        """Options by their names."""
         return {"--video": self.videos, "--map": self.map, "--which": self.which}
 
     def of(self, trial: xr.DataTree) -> TrialOptions:
-        """Return the options with the whisker that is most in contact, unless one is chosen."""
+        """Options for a trial, with the whisker longest in contact unless one is chosen."""
         if self.which is not None:
             return self
         return replace(self, which=int(np.argmax(vb.report.contacts_by_whisker(trial))))
 
     @property
     def whisker(self) -> int:
-        """Number of the whisker."""
+        """Index of the whisker."""
         return self.which or 0
 
     def contact_map(self, trial: xr.DataTree, tell: Tell) -> vb.ContactMap:
-        """Read the map of a trial's whisker, or simulate it."""
+        """Read or simulate the map of a trial's whisker."""
         own = vb.recording.Recording(trial).whisker(self.whisker)
         if self.map is None:
             return map_of(own, tell)
         found = vb.ContactMap.load(self.map)
         if not np.isclose(found.whisker.length, own.length, rtol=1e-6):
             raise ValueError(
-                f"{self.map} is the map of a whisker of {1e3 * found.whisker.length:.3f} mm, that "
-                f"of the trial has {1e3 * own.length:.3f} mm: leave --map out to have its own"
+                f"{self.map} is the map of a whisker of {1e3 * found.whisker.length:.3f} mm, but "
+                f"that of the trial has {1e3 * own.length:.3f} mm: omit --map to simulate its map"
             )
         return found
 
@@ -69,7 +69,7 @@ class TrialOptions:
 def sights_of(
     trial: xr.DataTree, course: vb.scene.Course, videos: Sequence[Path], rows: NDArray[np.intp]
 ) -> list[vb.plots.Sight]:
-    """Return what the cameras of a trial see in some frames; without videos it is drawn."""
+    """Views of some frames of a trial, from videos or drawn."""
     cameras = _cameras(trial)
     if videos and len(videos) != len(cameras):
         raise ValueError(
@@ -89,7 +89,7 @@ def sights_of(
 
 
 def _cameras(trial: xr.DataTree) -> tuple[vb.cameras.Camera, ...]:
-    """Cameras of a recording; for a simulated trial without, two that look at it."""
+    """Cameras of a recording; for a simulated trial without cameras, two suitable ones."""
     if "cameras" in trial.children:
         return vb.recording.Recording(trial).cameras
     if "truth" in trial.children and "centerline" in trial["truth"]:
@@ -109,7 +109,7 @@ def _check_video(video: Path, camera: vb.cameras.Camera, frames: Sequence[int]) 
 
 
 def _backdrop(trial: xr.DataTree, camera: vb.cameras.Camera, course: vb.scene.Course) -> Any:
-    """Objects as a camera sees them, on even light."""
+    """Image of the objects in a camera's view, on a uniform background."""
     middle = np.nanmean(course.position, axis=0)
     covered = vb.simulation.silhouette(
         camera, list(vb.recording.Recording(trial).objects), middle, 0.7
@@ -118,7 +118,7 @@ def _backdrop(trial: xr.DataTree, camera: vb.cameras.Camera, course: vb.scene.Co
 
 
 def fits_of(trial: xr.DataTree) -> list[vb.contour.FittedShape]:
-    """List the shapes that were fitted to the contacts of a trial."""
+    """Shapes fitted to the contacts of a trial."""
     if "contour" not in trial.children:
         return []
     return [vb.contour.shape_from_dataset(trial["contour"].to_dataset())]
@@ -128,7 +128,7 @@ def fits_of(trial: xr.DataTree) -> list[vb.contour.FittedShape]:
 
 
 def array_drawings(path: Path, width: Any) -> dict[str, Draw]:
-    """Return the figure of an array of whiskers, or of a trial with one; none of other files."""
+    """Figure of an array of whiskers, or of a trial with one; empty for other files."""
     kind = None if path.is_dir() else vb.io.recognise(path)
     if kind in (None, vb.io.Kind.ARRAY, vb.io.Kind.ARRAY_TABLE):
         face = vb.load_array(path).to_tree()
@@ -154,12 +154,12 @@ def map_drawings(
     gridded = contact_map.grid is not None
 
     def solid() -> Any:
-        """The slice at M_D = −π/2, and all contacts with the errors of a look-up in the grid."""
+        """Slice at M_D = −π/2, and all contacts with the errors of a look-up in the grid."""
         errors = vb.paper.error_solid(contact_map) if gridded else None
         return vb.plots.solid_slices(vb.paper.signal_slice(contact_map), errors, width=width)
 
     def panels() -> Any:
-        """Derivatives at the paper's contacts, which fill the panels best, or at the map's."""
+        """Derivatives at the contacts of the paper's grid if there is one, or of the map."""
         found = vb.sensitivity(contact_map, at="grid" if gridded else None)
         return vb.plots.sensitivity_panels(found, width=width)
 
@@ -194,7 +194,7 @@ def _whisker_drawing(whisker: vb.Whisker, width: Any) -> Draw:
 def trial_drawings(
     path: Path, width: Any, given: TrialOptions, tell: Tell, colour: str = "time"
 ) -> dict[str, Draw]:
-    """Return the figures of a trial; what it lacks is printed, with the verb that makes it."""
+    """Figures of a trial; missing stages are printed, with the verb that computes them."""
     trial = recording_from(path)
     given = given.of(trial)
     course = vb.scene.course_of(trial, given.whisker)
@@ -222,7 +222,7 @@ def _lacking(course: vb.scene.Course, trial: xr.DataTree, path: Path) -> Iterato
 def _radii(
     trial: xr.DataTree, course: vb.scene.Course, whisker: vb.Whisker, number: int
 ) -> NDArray[np.float64] | None:
-    """Radius of the whisker at the contact points that are drawn; None where it is not known."""
+    """Radius of the whisker at the drawn contact points; None if unknown."""
     group = {"estimated": "estimates", "true": "truth"}.get(course.places_as, "")
     known = vb.recording.Recording(trial).known("arc_length", [group])
     return None if known is None else np.asarray(whisker.radius(known[:, number]))
@@ -300,13 +300,13 @@ def figures(
     colour: Literal["time", "deflection"] | None = None,
     force: bool = False,
 ) -> None:
-    """Draw the figures that a map or a trial allows.
+    """Draw all figures of a map, a trial or an array.
 
-    A map: whisker, signals over space, surfaces, sensitivity; with a saved result of `vibrissa
-    uniqueness` also the verdicts, the resolution and pairs of contacts with the same signals. A
-    trial: frames, signals and their trajectory in the solids of a map, contacts about the whisker
-    and in the laboratory, estimates, contour. An array of whiskers, or a trial of several: the
-    face, the whiskers, and what they touch.
+    For a map: whisker, signals over space, surfaces, sensitivity; with a saved result of `vibrissa
+    uniqueness` also the verdicts, the resolution and pairs of contacts with the same signals. For a
+    trial: frames, signals and their trajectory in the solids of a map, contacts relative to the
+    whisker and in the laboratory, estimates, contour. For an array of whiskers, or a trial of
+    several: the face, the whiskers and the objects.
     Example: `vibrissa figures map.nc -o figures --width single`
     """
     endings = tuple(dict.fromkeys(map(str, format_ or ("png", "pdf"))))
@@ -340,7 +340,7 @@ def saved(
 
 
 def drawn(drawings: Mapping[str, Draw], tell: Tell) -> Iterator[tuple[str, Any]]:
-    """Draw figures one after the other."""
+    """Yield figures one after the other."""
     for i, (name, draw) in enumerate(drawings.items()):
         tell("figures", i, len(drawings))
         yield name, draw()
@@ -348,13 +348,13 @@ def drawn(drawings: Mapping[str, Draw], tell: Tell) -> Iterator[tuple[str, Any]]
 
 
 def dataset_with(path: Path, needed: str) -> xr.Dataset:
-    """Read a dataset that holds a variable."""
+    """Read a dataset that contains a given variable."""
     if path.suffix.lower() in vb.io.CSV:
-        raise ValueError(f"{path} is a table; the same saved as NetCDF (-o FILE.nc) is needed")
+        raise ValueError(f"{path} is a table; the result saved as NetCDF (-o FILE.nc) is needed")
     kind = vb.io.kind_of(path)
     data = vb.io.read_dataset(path)
     if needed not in data:
         raise ValueError(
-            f"{path} holds {kind or 'data of another kind'}, and no variable {needed!r}"
+            f"{path} contains {kind or 'data of another kind'}, and no variable {needed!r}"
         )
     return data

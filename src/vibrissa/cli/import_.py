@@ -1,4 +1,4 @@
-"""`vibrissa import`: from the files of other trackers to a recording."""
+"""`vibrissa import`: conversion of other trackers' files to a recording."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 
-_VIEWS = ("top", "front")  # names of views that neither files nor cameras name
+_VIEWS = ("top", "front")  # default names of views
 
 
 @with_options("the recording, .nc")
@@ -38,11 +38,11 @@ def import_tracks(
     objects: Path | None = None,
     force: bool = False,
 ) -> None:
-    """Make a recording of whiskers that another program tracked.
+    """Create a recording from whiskers tracked by another program.
 
-    Two files are two views of the same whiskers; one file may hold points in space, several views,
-    or one view, in whose plane the whisker is then taken to stay. The rod is fitted to the points
-    as `vibrissa track` fits it to videos; `vibrissa reconstruct` goes on from there.
+    Two files are two views of the same whiskers. One file may contain points in space, several
+    views, or one view, in whose plane the whisker is then assumed to remain. The rod is fitted to
+    the points as `vibrissa track` fits it to videos; the next step is `vibrissa reconstruct`.
     Example: `vibrissa import topDLC.csv frontDLC.csv --pixel-size 0.058 --rate 1000 -o trial.nc`
     """
     check_new(target, vb.io.NETCDF, force)
@@ -66,7 +66,7 @@ def import_tracks(
         result = vb.tracking.track(
             traces.cameras,
             traces.traces,
-            # Differences of times have errors of rounding, which a number of 12 digits has not.
+            # Twelve digits remove the rounding errors of differences of times.
             float(f"{1.0 / float(np.median(np.diff(found['time'].values))):.12g}"),
             how,
             names=traces.names,
@@ -81,11 +81,11 @@ def import_tracks(
 
 
 def _sigma(stated: float | None, tracks: xr.Dataset) -> float | None:
-    """Standard deviation of points: pixels as typed, mm in m."""
+    """Standard deviation of points: in pixels, or converted from mm to m."""
     if stated is None:
         return None
     if not 0.0 < stated < 100.0:
-        raise ValueError(f"--point-sigma is {stated:g}; more than 0 and less than 100 are needed")
+        raise ValueError(f"--point-sigma is {stated:g}; it must be more than 0 and less than 100")
     return 1e-3 * stated if "centerline" in tracks else stated
 
 
@@ -104,12 +104,12 @@ def _tracks(
         parts.append(vb.load_tracks(path, **({} if own else labels)))
     if len(paths) > 1:
         if cameras is None and len(paths) > len(_VIEWS):
-            raise ValueError(f"{len(paths)} files of views; give the --cameras of all of them")
+            raise ValueError(f"{len(paths)} views are given; their --cameras are needed")
         named = _VIEWS if cameras is None else [f"{path.parent.name}/{path.stem}" for path in paths]
         if any(part.sizes.get("view", 1) > 1 for part in parts):
-            raise ValueError("several files must hold one view each")
+            raise ValueError("several files must contain one view each")
         if spatial := [str(p) for p, part in zip(paths, parts, strict=True) if "trace" not in part]:
-            raise ValueError(f"{', '.join(spatial)}: points in space come as one file")
+            raise ValueError(f"{', '.join(spatial)}: points in space must be in a single file")
         together = [
             part.assign_coords(view=[name]) for part, name in zip(parts, named, strict=False)
         ]
@@ -118,10 +118,10 @@ def _tracks(
     else:
         found = parts[0]
     if found["time"].attrs.get("units") != "s":
-        raise ValueError(f"{paths[0]} does not state frames per second: give --rate")
+        raise ValueError(f"{paths[0]} does not state the frame rate: give --rate")
     frames = found["frame"].values
     if len(frames) < 2:
-        raise ValueError(f"{paths[0]} holds one frame; a trial with many is needed")
+        raise ValueError(f"{paths[0]} contains one frame; a trial of several is needed")
     every = np.arange(frames.min(), frames.max() + 1)
     if len(every) > len(frames):
         # What no row holds is a whisker that is lost.

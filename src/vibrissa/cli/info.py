@@ -1,4 +1,4 @@
-"""`vibrissa info`: versions and settings, or what a file holds."""
+"""`vibrissa info`: versions and settings, or the contents of a file."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _TABLES = """\
   corrections     view, frame, whisker, x, y
   whiskers        name, x_mm, y_mm, z_mm, azimuth_deg, …, length_mm, coefficient_per_mm"""
 _VERDICTS = "vibrissa uniqueness"
-# What goes on from a file, by its kind.
+# Command for the next step after a file, by its kind.
 _NEXT = {
     MAP: "estimate SIGNALS.csv --map {} -o contacts.csv",
     _VERDICTS: "figures MAP.nc --uniqueness {} -o figures",
@@ -51,11 +51,11 @@ def info(
     path: Path | None = None,
     all_: bool = False,
 ) -> None:
-    """List versions and settings of this installation, or what a file holds.
+    """List versions and settings of this installation, or describe the contents of a file.
 
-    Of a recording that is what it is, its duration, contacts, stages and object; groups and
-    variables follow with --all, which also checks boxes of a certificate. The last line is the
-    command that goes on from the file.
+    For a recording these are its origin, duration, contacts, stages and object. With --all, groups
+    and variables follow, and boxes of a certificate are checked. The last line is the command for
+    the next step.
     Example: `vibrissa info trial.nc`
     """
     print_properties(_installation() if path is None else _file(path, all_))
@@ -77,7 +77,7 @@ def _installation() -> Iterator[tuple[str, str]]:
 
 
 def _follows(kind: str | None, path: Path) -> Iterator[tuple[str, str]]:
-    """The command that goes on from a file, if there is one."""
+    """Yield the command for the next step after a file, if there is one."""
     if kind in _NEXT:
         yield "next", f"vibrissa {_NEXT[kind].format(path)}"
 
@@ -89,7 +89,7 @@ def _bag(path: Path) -> Iterator[tuple[str, str]]:
     yield "kind", f"bag of ROS, {len(topics)} topics"
     for topic, (kind, count) in sorted(topics.items()):
         yield topic, f"{count} messages, {kind}"
-    # Bags that `stream` writes hold the force at the contact, from which nothing goes on.
+    # Bags written by `stream` contain the force at the contact, which no verb uses.
     wrenches = [t for t, (kind, _) in topics.items() if kind.endswith("WrenchStamped")]
     if any(not topic.endswith("/contact_force") for topic in wrenches):
         yield "next", f"vibrissa stream {path} --map MAP.nc --bag-out contacts"
@@ -132,7 +132,7 @@ def _file(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
         known = "; ".join(
             [*vb.io.READERS, vb.io.Kind.TRACKS, vb.io.Kind.RECORDING, "tables as text"]
         )
-        raise ValueError(f"{path} is of no kind that is known. Known are: {known}")
+        raise ValueError(f"{path} is not of a known kind. Known are: {known}")
     else:
         yield from _table(path)
 
@@ -171,14 +171,14 @@ def _recording(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
         yield from listed
     else:
         yield from (line for line in listed if line[0] == "note")
-    # What was estimated does not make an object.
+    # Estimates exist, but without contacts from which an object could be reconstructed.
     stuck = "estimates" in found.stages and not found.estimated
     follows = "report" if stuck or not missing else "reconstruct"
     yield "next", f"vibrissa {follows} {path}{'' if whole else '  # groups and variables: --all'}"
 
 
 def _contacts(found: vb.pipeline.TrialSummary) -> str:
-    """Contacts and their forces, and how many contact points were estimated."""
+    """Description of contacts, their forces, and the number of estimated contact points."""
     if found.contacts is None:
         return "not known"
     text = f"{found.contacts}, in {found.in_contact} frames"
@@ -192,7 +192,7 @@ def _contacts(found: vb.pipeline.TrialSummary) -> str:
 
 
 def _summarised(path: Path) -> xr.DataTree:
-    """Read what a summary needs of a recording; a long one takes a while to read whole."""
+    """Read only the variables of a recording needed for a summary, for speed."""
     with vb.io.opened(path, "a recording") as file:
         groups = [name for name in ("truth", "signals", "estimates", "contour") if name in file]
         objects = [f"objects/{name}" for name in file["objects"]] if "objects" in file else []
@@ -201,14 +201,14 @@ def _summarised(path: Path) -> xr.DataTree:
     parts = {"/": vb.io.read_dataset(path, None, [*pose, *needed])}
     for group in (*groups, *objects):
         along = needed if group in ("truth", "signals", "estimates") else None
-        # Of what it was made is not read here.
+        # Without all inputs, their checksums cannot be compared.
         data = vb.io.read_dataset(path, group, along).drop_vars("made_from", errors="ignore")
         parts[f"/{group}"] = data
     return xr.DataTree.from_dict(parts)
 
 
 def _settings(path: Path) -> Iterator[tuple[str, str]]:
-    """Describe other settings; they are checked by the verb that takes them."""
+    """Describe other settings, which are checked by the verbs that use them."""
     settings = vb.io.read_toml(path)
     study = {"whiskers", "tasks"} & set(settings)
     yield "kind", "a study, for vibrissa sweep" if study else "settings, as of vibrissa simulate"
@@ -224,7 +224,7 @@ def _is_sensor(path: Path) -> bool:
 
 
 def _sensor(path: Path) -> Iterator[tuple[str, str]]:
-    """A sensor, a line for each channel."""
+    """Describe a sensor, one line per channel."""
     sensor = vb.sensors.load_sensor(path)
     yield "kind", "sensor"
     numbers = zip(
@@ -254,7 +254,7 @@ def _sensor(path: Path) -> Iterator[tuple[str, str]]:
 
 
 def _array(path: Path, kind: str) -> Iterator[tuple[str, str]]:
-    """The whiskers of an array, a line each."""
+    """Describe the whiskers of an array, one line each."""
     array = vb.load_array(path)
     yield "kind", kind
     sides = [array.identity(name).side for name in array]
@@ -288,7 +288,7 @@ def _is_text(path: Path) -> bool:
 
 
 def _tracks(path: Path, kind: str) -> Iterator[tuple[str, str]]:
-    """Sizes, times and how much is missing of tracks; also where their unit is not stated."""
+    """Describe sizes, times and missing points of tracks, whose unit may be unknown."""
     yield "kind", kind
     note = ""
     if kind == vb.io.Kind.TRACKS:
@@ -320,7 +320,7 @@ def _tracks(path: Path, kind: str) -> Iterator[tuple[str, str]]:
 
 
 def _import(path: Path, tracks: xr.Dataset, *, stated: bool) -> str:
-    """The command that makes a recording of tracks."""
+    """Command that converts tracks to a recording."""
     words = ["vibrissa import", str(path)]
     hint = ""
     if "centerline" in tracks:
@@ -341,7 +341,7 @@ def _without_unit(raw: vb.io.RawTracks, path: Path) -> tuple[xr.Dataset, str]:
     """Label tracks even if the unit of their points is not stated, with a note on it."""
     if raw.space is None or raw.unit:
         return vb.io.labelled(raw, path), ""
-    # The smallest unit passes for any: no number is shown.
+    # With the smallest unit, tracks pass all checks; no coordinates are shown.
     return vb.io.labelled(raw, path, unit="um"), "unit not stated: give it when reading"
 
 
@@ -354,7 +354,7 @@ def _listed(tracks: xr.Dataset, dim: str) -> str:
 
 
 def _groups(path: Path, whole: bool = False) -> Iterator[tuple[str, str]]:
-    """Kind, groups and variables of a NetCDF file; of its values only names are read."""
+    """Describe kind, groups and variables of a NetCDF file; of its values only names are read."""
     import h5netcdf
 
     kind = vb.io.kind_of(path)
@@ -384,7 +384,7 @@ def _groups(path: Path, whole: bool = False) -> Iterator[tuple[str, str]]:
 
 
 def _verdicts(path: Path) -> Iterator[tuple[str, str]]:
-    """Which triplets locate contacts, in which regions."""
+    """List which triplets locate contacts uniquely in which regions."""
     found = vb.io.read_dataset(path)
     regions = found["notation"].to_series()
     held = regions[regions != "–"]
@@ -397,7 +397,7 @@ def _verdicts(path: Path) -> Iterator[tuple[str, str]]:
 
 
 def _certificate(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
-    """Describe what a certificate proves, and by how many boxes."""
+    """Describe the statement of a certificate, and its number of boxes."""
     found = vb.certificates.load_certificate(path)
     yield "whisker", found.whisker
     yield "states", found.summary()
@@ -414,7 +414,7 @@ def _certificate(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
 
 
 def _many(file: Any) -> bool:
-    """Whether there are several whiskers, whose names are listed instead of their variables."""
+    """Whether a file has several whiskers, whose names are listed instead of their variables."""
     if "whiskers" not in file.groups or "whisker" not in file.variables:
         return False
     group = file.groups["whiskers"]
@@ -422,14 +422,14 @@ def _many(file: Any) -> bool:
 
 
 def _within(group: Any, name: str) -> Iterator[tuple[str, Any]]:
-    """A group and those below it, by their paths."""
+    """Yield a group and all groups below it, with their paths."""
     yield name, group
     for key, below in group.groups.items():
         yield from _within(below, f"{name.rstrip('/')}/{key}")
 
 
 def _variables(name: str, group: Any) -> Iterator[tuple[str, str]]:
-    """Sizes of a group and its variables; coordinates are known by their dimension."""
+    """List sizes and variables of a group, without the coordinates of dimensions."""
     sizes: dict[str, int] = {}
     apart: set[str] = set()
     for variable in group.variables.values():
@@ -448,7 +448,7 @@ def _variables(name: str, group: Any) -> Iterator[tuple[str, str]]:
 
 
 def _notes(group: Any) -> Iterator[tuple[str, str]]:
-    """List the assumptions about the whisker of a group, or about all that are stacked in it."""
+    """List the assumptions about the whiskers of a group."""
     import json
 
     if _text(group.attrs.get("kind", "")) != "vibrissa whisker":
@@ -468,11 +468,11 @@ def _text(value: Any) -> str:
 
 
 def _compared(path: Path) -> Iterator[tuple[str, str]]:
-    """Compare contact points that do not come from the rod with those that do."""
+    """Compare contact points from other sources with those of the fitted rod."""
     with vb.io.opened(path, "a recording") as file:
         if "measured/contact_difference" not in file:
             return
-    # A long recording takes a while to read whole.
+    # Only the necessary variables are read, for speed.
     names = {
         None: ["arc_length"],
         "measured": ["contact_difference", "contact_point", "arc_length"],
@@ -486,7 +486,7 @@ def _compared(path: Path) -> Iterator[tuple[str, str]]:
 
 def _table(path: Path) -> Iterator[tuple[str, str]]:
     """Describe a CSV file."""
-    # A centreline comes last: other tables have columns x, y and z too.
+    # Centrelines are tried last, as other tables have columns x, y and z too.
     readers: tuple[tuple[str, vb.io.Kind | None, Callable[[Path], Any]], ...] = (
         ("contacts", vb.io.Kind.CONTACTS, vb.io.load_contacts),
         ("signals", vb.io.Kind.SIGNALS, vb.load_signals),
@@ -500,7 +500,7 @@ def _table(path: Path) -> Iterator[tuple[str, str]]:
         try:
             data = reader(path)
         except ValueError:
-            # What it looks like explains best what is wrong with it.
+            # The error for the most similar kind of table is the most helpful one.
             if known == looks:
                 raise
             continue
@@ -514,7 +514,9 @@ def _table(path: Path) -> Iterator[tuple[str, str]]:
         yield "kind", f"table of the signals {', '.join(used)}"
         yield "next", f"vibrissa {_NEXT['signals']}".format(f"{path} --using {','.join(used)}")
         return
-    raise ValueError(f"{path} is not a table that is known: {_header(path)}. Known are\n{_TABLES}")
+    raise ValueError(
+        f"{path} is not a table of a known kind: {_header(path)}. Known are\n{_TABLES}"
+    )
 
 
 def _header(path: Path) -> str:

@@ -1,4 +1,4 @@
-"""Inputs that verbs share: options that belong together, and files that are read and written."""
+"""Inputs shared by verbs: groups of options, and reading and writing of files."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from vibrissa.cli.terminal import Tell, remark, say
 from vibrissa.deferred import xr
 
 RECORDING, MAP = "vibrissa recording", "vibrissa contact map"  # kinds of NetCDF files
-_THICKEST = 10.0  # radius of a whisker from which micrometres were typed for mm, mm
+_THICKEST = 10.0  # radius of a whisker above which it may be in micrometres instead of mm, mm
 # Unit of each limit of a region on the command line.
 _UNITS = {"r": 1e-3, "theta": math.pi / 180.0, "phi": math.pi / 180.0}
 
 
 @dataclass(frozen=True)
 class WhiskerOptions:
-    """A whisker, and what its file does not state."""
+    """Options for a whisker, and for properties that its file does not state."""
 
     whisker: Path | None = None
     rat: str | None = None
@@ -31,12 +31,12 @@ class WhiskerOptions:
         self.check(self.whisker is not None)
 
     def check(self, given: bool) -> None:
-        """Raise if something is stated about a whisker that is not given."""
+        """Raise ValueError for options about a whisker if none is given."""
         if (self.rat is not None or self.any_length) and not given:
             raise ValueError("--rat and --any-length are about a --whisker, and none is given")
 
     def read(self, path: Path | None = None) -> vb.Whisker:
-        """Read the whisker, or that of another file; by default it is the γ whisker."""
+        """Read the whisker, or that of another file; by default the built-in γ whisker."""
         path = self.whisker if path is None else path
         if path is None:
             return vb.samples.gamma()
@@ -44,13 +44,13 @@ class WhiskerOptions:
             raise FileNotFoundError(f"there is no file {path}")
         if not vb.io.is_netcdf(path):
             if vb.io.recognise(path) == vb.io.Kind.VIDEO:
-                raise ValueError(f"{path} is a video, and no whisker, map or recording")
+                raise ValueError(f"{path} is a video; a whisker, map or recording is needed")
             return vb.load_whisker(path, rat=self.rat, any_length=self.any_length)
         whisker = _whisker_in(path)
         return whisker if self.rat is None else whisker.with_properties(rat=self.rat)
 
     def in_recording(self, recording: xr.DataTree) -> list[vb.Whisker]:
-        """Find the whisker of each that a recording has signals of."""
+        """Whiskers along the dimension ``whisker`` of a recording."""
         count = recording.sizes["whisker"]
         if self.whisker is not None:
             if count > 1:
@@ -64,14 +64,14 @@ class WhiskerOptions:
 
 @dataclass(frozen=True)
 class TrackedOptions(WhiskerOptions):
-    """A whisker that is tracked; its shape is that of the frames unless a file is given."""
+    """Options for a tracked whisker, whose shape is that in the frames unless a file is given."""
 
     def __post_init__(self) -> None:
         if self.any_length and self.whisker is None:
             raise ValueError("--any-length is about a --whisker, and none is given")
 
     def tracked(self, base_radius: float | None, tip_radius: float | None) -> dict[str, Any]:
-        """Options of tracking: the whisker, if it is given, with radii that are stated."""
+        """Keyword arguments of tracking: the whisker, if given, with the stated radii."""
         stated = {"--base-radius": base_radius, "--tip-radius": tip_radius}
         properties: dict[str, Any] = {
             name[2:].replace("-", "_"): metres_of(radius, name)
@@ -82,14 +82,14 @@ class TrackedOptions(WhiskerOptions):
             return {"whisker": self.read().with_properties(**properties)}
         if self.rat is not None:
             refuse(stated, "--rat gives the radii")
-            vb.Whisker.straight(0.03, rat=self.rat)  # a wrong name is refused before the work
+            vb.Whisker.straight(0.03, rat=self.rat)  # rejects unknown names early
             properties["rat"] = self.rat
         return {"properties": properties}
 
 
 @dataclass(frozen=True)
 class NoiseOptions:
-    """Noise of the sensor: that of each component, or their covariance."""
+    """Options for the noise of the sensor: that of each component, or their covariance."""
 
     force_noise: float | None = None
     moment_noise: float | None = None
@@ -115,14 +115,14 @@ class NoiseOptions:
         return any(one is not None for one in self.stated.values())
 
     def _usual(self) -> tuple[float, float]:
-        """Noise of force and moment, µN and µN·m; what is not stated is that of a usual sensor."""
+        """Noise of force and moment, µN and µN·m, with defaults for unstated values."""
         return (
             vb.sensors.FORCE_NOISE * 1e6 if self.force_noise is None else self.force_noise,
             vb.sensors.MOMENT_NOISE * 1e6 if self.moment_noise is None else self.moment_noise,
         )
 
     def matrix(self) -> vb.numerics.Array:
-        """Covariance of force and moment, (6, 6), SI units."""
+        """Covariance (6, 6) of force and moment, SI units."""
         import numpy as np
 
         if self.covariance is None:
@@ -135,11 +135,11 @@ class NoiseOptions:
             raise ValueError(f"{self.covariance} is not a covariance: {fault}") from None
         if covariance.shape != (6, 6):
             got = covariance.shape
-            raise ValueError(f"{self.covariance} must hold six lines of six numbers; got {got}")
+            raise ValueError(f"{self.covariance} must contain six rows of six numbers; got {got}")
         return covariance
 
     def described(self) -> str:
-        """State the noise, in the units of the options."""
+        """Description of the noise, in the units of the options."""
         if self.covariance is not None:
             return f"noise of {self.covariance}"
         return "noise {:g} µN and {:g} µN·m".format(*self._usual())
@@ -147,7 +147,7 @@ class NoiseOptions:
 
 @dataclass(frozen=True)
 class AssumptionOptions:
-    """Assumptions: errors that all samples share, and which contacts are possible."""
+    """Options for assumptions: errors that all samples share, and the prior over contacts."""
 
     stiffness_sigma: float = 0.0
     gain_sigma: float = 0.0
@@ -159,13 +159,13 @@ class AssumptionOptions:
 
     @property
     def errors(self) -> dict[str, float]:
-        """Standard deviations by the names that estimates take; only those that are not zero."""
+        """Nonzero standard deviations, by the names of the arguments of estimates."""
         names = ("stiffness_sigma", "gain_sigma", "mixing_sigma")
         return {name: 0.01 * getattr(self, name) for name in names if getattr(self, name) > 0.0}
 
     @property
     def prior(self) -> vb.Prior | None:
-        """The contacts that are possible; None: all."""
+        """Prior over contacts; None for the default."""
         stated = (self.region, self.least_force, self.greatest_force, self.tip or None)
         if all(value is None for value in stated):
             return None
@@ -181,7 +181,7 @@ class AssumptionOptions:
         return vb.Prior(limits, least, greatest, 0.01 * self.tip)
 
     def described(self) -> str:
-        """State all of it, to be put at the end of a sentence; empty where there is nothing."""
+        """Description of the assumptions for the end of a sentence; empty if there are none."""
         parts = [
             f"{name.removesuffix('_sigma')} known to {100.0 * value:g} %"
             for name, value in self.errors.items()
@@ -203,7 +203,7 @@ class AssumptionOptions:
 
 
 def _limits(text: str) -> dict[str, tuple[float, float]]:
-    """Read limits as ``r=20:35,theta=-30:30``, in SI units."""
+    """Parse limits such as ``r=20:35,theta=-30:30``; return them in SI units."""
     limits = {}
     for part in text.split(","):
         name, _, values = part.partition("=")
@@ -227,7 +227,7 @@ def estimator_of(
     gravity: vb.Gravity | None,
     felt_above: float,
 ) -> vb.Estimator:
-    """Make what estimates contacts from single measurements, of a sensor or by signals."""
+    """Create an estimator for single measurements, from a sensor or from signals."""
     prior, errors = assumed.prior, assumed.errors
     if sensor is None:
         return vb.Estimator(
@@ -246,7 +246,7 @@ def estimator_of(
 
 
 def metres_of(radius: float, option: str) -> float:
-    """Take the radius of a whisker from mm to m."""
+    """Convert the radius of a whisker from mm to m."""
     if not 0.0 < radius < _THICKEST:
         raise ValueError(
             f"{option} is {radius:g} mm; more than 0 and less than {_THICKEST:g} are needed"
@@ -255,18 +255,18 @@ def metres_of(radius: float, option: str) -> float:
 
 
 def smallest_arc(proximal: float | None) -> float:
-    """Return the smallest arc length of a contact, share of the whisker's length."""
+    """Smallest arc length of a contact, as a share of the whisker's length."""
     return vb.rod.PROXIMAL if proximal is None else proximal
 
 
 def print_notes(*whiskers: vb.Whisker) -> None:
-    """Print what is assumed about whiskers, and all else that their user should know."""
+    """Print the assumptions and notes of whiskers."""
     for note in dict.fromkeys(note for whisker in whiskers for note in whisker.notes):
         remark(f"note: {note}")
 
 
 def kind_in(path: Path) -> str:
-    """Return the kind of a NetCDF file; empty for other files."""
+    """Kind of a NetCDF file; empty for other files."""
     if not path.is_file() or path.stat().st_size == 0:
         return ""
     return (vb.io.kind_of(path) or "") if vb.io.is_netcdf(path) else ""
@@ -279,16 +279,16 @@ def _whisker_in(path: Path) -> vb.Whisker:
         return vb.recording.Recording(vb.load_recording(path)).whisker()
     if kind == MAP:
         return vb.ContactMap.load(path, grid=False).whisker
-    raise ValueError(f"{path} holds {kind or 'data of another kind'}, and no whisker")
+    raise ValueError(f"{path} contains {kind or 'data of another kind'}, and no whisker")
 
 
 def refuse_tracks(path: Path) -> None:
-    """Raise, with the verb that takes it, if a file holds the tracks of another program."""
+    """Raise ValueError for tracks of another program, with the verb that converts them."""
     kind = vb.io.recognise(path)
     if kind in (vb.io.Kind.TRACKS, *vb.io.READERS):
         raise ValueError(
-            f"{path} holds tracks ({kind}): make a recording of it by `vibrissa import {path} "
-            "-o trial.nc` first"
+            f"{path} contains tracks ({kind}): convert it to a recording by `vibrissa import "
+            f"{path} -o trial.nc` first"
         )
 
 
@@ -347,13 +347,13 @@ def objects_from(path: Path) -> tuple[vb.objects.Surface, ...]:
 
 
 def print_statuses(codes: object, each: str = "") -> None:
-    """Print how many frames have which status."""
+    """Print the number of frames with each status."""
     for sentence, count in vb.status.describe(codes).most_common():  # type: ignore[arg-type]
         say(f"{count:6d} {each} {sentence}")
 
 
 def free_beside(recording: Path, files: Iterable[Path], force: bool) -> None:
-    """Raise if files are there that are not to be replaced; a recording is added to."""
+    """Raise an error if files other than the recording exist and must not be replaced."""
     free([file for file in files if not _same(file, recording)], force)
 
 
@@ -362,13 +362,13 @@ def _same(path: Path, other: Path) -> bool:
 
 
 def print_written(path: Path, recording: Path | None = None, stage: str = "") -> None:
-    """Print that a file is there, or that a recording has a stage more."""
+    """Report that a file was written, or that a stage was added to a recording."""
     added = recording is not None and _same(path, recording)
     say(f"added {stage} to {path}" if added else f"wrote {path}")
 
 
 def check_one_whisker(recording: xr.DataTree, path: Path) -> None:
-    """Raise if a recording has several whiskers, of which a table has no room."""
+    """Raise ValueError if a recording has several whiskers, which do not fit into a table."""
     count = recording.sizes["whisker"]
     if count != 1:
         raise ValueError(
@@ -385,6 +385,6 @@ def maps_from(paths: Sequence[Path], count: int, grid: bool = False) -> list[vb.
     for path, contact_map in zip(paths, found, strict=True):
         if grid and contact_map.grid is None:
             raise ValueError(
-                f"{path} has no grid to look up in: make it by `vibrissa map` without --no-grid"
+                f"{path} has no grid to look up in: create it by `vibrissa map` without --no-grid"
             )
     return found

@@ -1,4 +1,4 @@
-"""`vibrissa map`: all contacts of a whisker."""
+"""`vibrissa map`: the map of all contacts of a whisker."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vibrissa.cli.terminal import progress_bars, say
 
 @dataclass(frozen=True)
 class MadeOptions(WhiskerOptions):
-    """A whisker of a file or a straight one, of any thickness and material."""
+    """Options for a whisker from a file or a straight one, of any thickness and material."""
 
     length: float | None = None
     base_radius: float | None = None
@@ -33,7 +33,7 @@ class MadeOptions(WhiskerOptions):
             refuse(radii, "--rat gives the radii")
 
     def read(self, path: Path | None = None) -> vb.Whisker:
-        """Read or make the whisker, of the thickness and material that are stated."""
+        """Read or construct the whisker with the stated thickness and material."""
         if self.length is None:
             whisker = super().read(path)
         else:
@@ -73,7 +73,7 @@ def simulate_map(
 ) -> None:
     """Find all stable contacts of a whisker, and solve the paper's grid of contact points.
 
-    Radii, modulus and ratio are those of the file or, where not given, of an average whisker.
+    Radii, modulus and Poisson's ratio are those of the file, or by default of an average whisker.
     Example: `vibrissa map --whisker C1.csv -o map.nc`; steel wire:
     `vibrissa map --length 300 --base-radius 0.5 --tip-radius 0.25 --modulus 200 --poisson 0.29`
     """

@@ -1,4 +1,4 @@
-"""`vibrissa movie`: a trial as movies."""
+"""`vibrissa movie`: movies of a trial."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _LASTS = 45.0
 
 @dataclass(frozen=True)
 class FrameOptions:
-    """Range of frames that a movie shows, and its rate."""
+    """Options for the range of frames and the rate of a movie."""
 
     fps: float = 25.0
     step: int | None = None
@@ -33,7 +33,7 @@ class FrameOptions:
     stop: float | None = None
 
     def rows(self, time: NDArray[np.float64]) -> NDArray[np.intp]:
-        """Choose frames of a trial."""
+        """Indices of the frames to show."""
         if not (np.isfinite(self.fps) and self.fps > 0.0):
             raise ValueError(f"--fps is {self.fps!r}; it must be positive")
         if self.step is not None and self.step < 1:
@@ -58,10 +58,10 @@ def movie(
     target: Path = Path("movies"),
     force: bool = False,
 ) -> None:
-    """Make movies of a trial: its signals in the solids of all contacts; the contour as it grows.
+    """Create movies of a trial: its signals in the solids of all contacts, and the growing contour.
 
-    Without videos the whisker is drawn as the cameras would see it. Stopped with Ctrl-C it leaves
-    what was done in a file NAME-part.mp4 that can be played.
+    Without videos the whisker is drawn as the cameras would see it. After Ctrl-C the completed part
+    remains in a playable file NAME-part.mp4.
     Example: `vibrissa movie trial.nc --video top.mp4 --video front.mp4 -o movies`
     """
     if kind == "contour":
@@ -80,7 +80,7 @@ def make_movies(
     frames: FrameOptions,
     force: bool,
 ) -> list[Path]:
-    """Make the movies that a trial allows."""
+    """Create the movies for which a trial has the data."""
     files = _files(target, path, kinds)
     free(files.values(), force)
     trial = recording_from(path)
@@ -112,7 +112,7 @@ def _files(target: Path, trial: Path, kinds: Sequence[str]) -> dict[str, Path]:
 def _possible(
     kinds: Sequence[str], course: vb.scene.Course, rows: NDArray[np.intp], path: Path
 ) -> list[str]:
-    """Kinds for which the trial has what is needed; prints what is lacking for others."""
+    """Kinds of movies for which the trial has the data; report what others lack."""
     lacking = {}
     if course.signals is None:
         lacking["signals"] = f"no signals: `vibrissa signals {path}` makes them"
@@ -138,7 +138,7 @@ def _frames(
     of_trial: TrialOptions,
     tell: Tell,
 ) -> Iterator[Any]:
-    """Images of a kind of movie."""
+    """Yield the images of a movie."""
     if name == "signals":
         contact_map = of_trial.contact_map(trial, tell)
         line = contact_map.whisker.centerline(NODES)
@@ -158,7 +158,7 @@ def _write(
     tell: Tell,
     stopped: Callable[[], bool],
 ) -> None:
-    """Write a movie; if it is stopped, what was done stays next to it."""
+    """Write a movie; if it is interrupted, keep the completed part next to it."""
     name, total = about
     stage = f"movie of {'the contour' if name == 'contour' else name}"
 

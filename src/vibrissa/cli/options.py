@@ -1,9 +1,9 @@
-"""Options and arguments of the command line, each defined once: a name means the same in all verbs.
+"""Options and arguments of the command line, each defined once for all verbs.
 
 Lengths are in mm, forces in µN, moments in µN·m and angles in degrees, unless the help of an option
-states another unit. A verb has options as parameters, by their names; their types say which values
-there are; `options.csv` describes them, a row an option, and one more for verbs in which its
-defaults or values differ: `track|import.whisker`.
+states another unit. The options of a verb are the parameters of its function, whose types define
+the possible values. `options.csv` describes them, one row per option, with further rows for verbs
+in which an option differs: `track|import.whisker`.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ _NAMED = 3  # number of files named in one message
 
 
 class Option(NamedTuple):
-    """Meaning of an option.
+    """Description of an option.
 
-    Its names are that of the parameter, and of a switch that is on by default also its opposite,
-    unless others are stated; an argument has none.
+    By default it has the name of the parameter and, for a switch that is on by default, also the
+    name of the opposite; an argument has no names.
     """
 
     help: str
@@ -51,13 +51,13 @@ def _options() -> dict[tuple[str, str], Option]:
     return found
 
 
-OPTIONS = _options()  # the options by verb, "" in all others, and name of the parameter
+OPTIONS = _options()  # options by verb ("" for all others) and name of the parameter
 Source = Literal["contact-point", "rod", "sensor"]
 Method = Literal["exact", "lookup", "lookup-linear", "network"]
 
 
 class Region(StrEnum):
-    """Regions of contacts that have a name."""
+    """Named regions of contacts."""
 
     ALL = "all"
     ELD = "ELD"
@@ -79,15 +79,15 @@ Verb = TypeVar("Verb", bound=Callable[..., None])
 
 
 def with_options(output: str = "") -> Callable[[Verb], Verb]:
-    """Make parameters of a verb options, also those that are fields of its data classes.
+    """Decorator that declares the parameters of a verb, and fields of data classes, as options.
 
-    ``output`` describes what the verb writes to its parameter ``target``.
+    ``output`` describes the output that the verb writes to its parameter ``target``.
     """
 
     def decorated(verb: Verb) -> Verb:
         hints = get_type_hints(verb, include_extras=True)
         given = inspect.signature(verb).parameters.values()
-        # A file has the name of its verb.
+        # Modules are named after their verbs.
         kind = verb.__module__.rpartition(".")[2].rstrip("_")
         flat = _flat({one.name: (hints[one.name], one.default) for one in given}, kind, output)
 
@@ -103,7 +103,7 @@ def with_options(output: str = "") -> Callable[[Verb], Verb]:
 
 
 def _flat(kinds: Mapping[str, tuple[Any, Any]], verb: str, output: str) -> list[inspect.Parameter]:
-    """Options, with the fields of data classes in their place."""
+    """Parameters of a verb, with data classes replaced by their fields."""
     found = []
     for name, (kind, default) in kinds.items():
         if is_dataclass(kind):
@@ -114,7 +114,7 @@ def _flat(kinds: Mapping[str, tuple[Any, Any]], verb: str, output: str) -> list[
         default = inspect.Parameter.empty if default is MISSING else default
         declared = _declared(name, default, verb, output)
         annotation = Annotated[kind, declared]  # type: ignore[valid-type]
-        # Options are passed by name, so that those without a default may follow others.
+        # Keyword-only parameters without a default may follow those with one.
         how = inspect.Parameter.KEYWORD_ONLY
         found.append(inspect.Parameter(name, how, default=default, annotation=annotation))
     return found
@@ -138,7 +138,7 @@ def _declared(name: str, default: Any, verb: str, output: str) -> Any:
 
 
 def _filled(kinds: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Values by name, those of data classes put together."""
+    """Arguments of a verb, with data classes constructed from their fields."""
     found = {}
     for name, kind in kinds.items():
         if is_dataclass(kind):
@@ -149,7 +149,7 @@ def _filled(kinds: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, An
 
 
 def numbers(text: str, names: Sequence[str], option: str) -> list[float]:
-    """Read numbers separated by commas."""
+    """Parse numbers separated by commas."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
@@ -160,7 +160,7 @@ def numbers(text: str, names: Sequence[str], option: str) -> list[float]:
 
 
 def free(files: Iterable[Path], force: bool) -> None:
-    """Raise if files are there that are not to be replaced."""
+    """Raise FileExistsError if files exist and must not be replaced."""
     there = [str(file) for file in files if not force and file.exists()]
     if there:
         more = f" and {len(there) - _NAMED} more" if len(there) > _NAMED else ""
@@ -172,18 +172,18 @@ def free(files: Iterable[Path], force: bool) -> None:
 
 
 def check_new(path: Path, endings: Sequence[str], force: bool) -> None:
-    """Raise if a file cannot be written, or is there and not to be replaced."""
+    """Raise an error if a file cannot be written, or exists and must not be replaced."""
     vb.io.check_writable(path, endings)
     free([path], force)
 
 
 def refuse(options: Mapping[str, object], reason: str) -> None:
-    """Raise if options are given that would have no effect."""
+    """Raise ValueError if options are given that would have no effect."""
     given = [name for name, value in options.items() if not _nothing(value)]
     if given:
         raise ValueError(f"{', '.join(given)} cannot be used: {reason}")
 
 
 def _nothing(value: object) -> bool:
-    # Zero is a number that was given.
+    # Zero counts as given.
     return value is None or value is False or value in ([], ())

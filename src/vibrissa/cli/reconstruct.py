@@ -1,4 +1,4 @@
-"""`vibrissa reconstruct`: from a recording to the object that was touched."""
+"""`vibrissa reconstruct`: reconstruction of the touched object from a recording."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from vibrissa.cli.signals import SourceOptions, described
 from vibrissa.cli.terminal import Tell, fixed, print_table, progress_bars, remark, say
 from vibrissa.deferred import xr
 
-_SUSPECT = 1.5  # χ² per degree of freedom from which it is asked whether another shape fits better
-# Predicted distance, m, longer than whiskers: the covariance leaves the contact anywhere.
+_SUSPECT = 1.5  # χ² per degree of freedom above which other shapes are compared
+# Predicted distance, m, larger than a whisker, above which the contact is undetermined.
 _ANYWHERE = 0.1
 _TURNED = ("axis", "normal")  # parameters of a shape that are directions, not lengths
 
 
 @dataclass(frozen=True)
 class ShapeOptions:
-    """The object that is looked for."""
+    """Options for the shape of the object."""
 
     shape: Literal["cylinder", "sphere", "plane", "free"] = "cylinder"
     axis: str | None = None
@@ -45,10 +45,10 @@ class ShapeOptions:
         if self.axis is not None and self.shape != "cylinder":
             raise ValueError(f"--axis is for a cylinder; --shape is {self.shape}")
         if self.lean is not None and not 0.0 <= self.lean < 90.0:
-            raise ValueError(f"--lean is {self.lean:g}; degrees from 0 to 90 are needed")
+            raise ValueError(f"--lean is {self.lean:g}; it must be from 0 to 90 degrees")
 
     def keywords(self) -> dict[str, Any]:
-        """Options of fits."""
+        """Keyword arguments of fits."""
         axis = None if self.axis is None else numbers(self.axis, ("X", "Y", "Z"), "--axis")
         return {"axis": axis, "lean": None if self.lean is None else math.radians(self.lean)}
 
@@ -64,13 +64,13 @@ def reconstruct(
     csv: Path | None = None,
     force: bool = False,
 ) -> None:
-    """Find the object that was touched from a recording alone.
+    """Reconstruct the touched object from a recording.
 
-    Signals and estimates that the recording already has are used; what is missing is computed
-    first, by defaults that are printed, and what options ask for is computed again. All is added to
-    the recording as groups `signals`, `estimates` and `contour`; its other groups are kept. The
-    contour points are written as a table, too; an existing one is replaced only if it holds the
-    recording's previous contour.
+    Existing signals and estimates are used. Missing ones are computed first, with defaults that are
+    printed, and those that options change are computed again. Results are added to the recording as
+    groups `signals`, `estimates` and `contour`; its other groups are kept. The contour points are
+    also written to a table; an existing table is replaced only if it contains the recording's
+    previous contour.
     The contacts are compared with --objects, by default those of the recording.
     Example: `vibrissa reconstruct trial.nc --shape cylinder`
     """
@@ -111,8 +111,9 @@ def stages(
     tell: Tell,
     name: str,
 ) -> Iterator[tuple[str, xr.DataTree]]:
-    """The recording after each stage that is due."""
-    again = how.own.whisker is not None and "signals" in tree.children  # by another whisker
+    """Yield the name of each due stage, and the recording after it."""
+    # Existing signals may be those of another whisker.
+    again = how.own.whisker is not None and "signals" in tree.children
     asked = {"signals": source.given or again, "estimates": how.given}
     if not source.given:
         source = SourceOptions.of(tree)
@@ -142,7 +143,7 @@ def stages(
 
 
 def _of_contour(points: Path, tree: xr.DataTree, own: WhiskerOptions) -> bool:
-    """Whether a table holds what the recording does: replaced with it, nothing else is lost."""
+    """Whether a table contains the contour of the recording, so that replacing it loses nothing."""
     if not points.is_file() or not {"estimates", "contour"} <= set(tree.children):
         return False
     try:
@@ -151,7 +152,7 @@ def _of_contour(points: Path, tree: xr.DataTree, own: WhiskerOptions) -> bool:
         return False
 
 
-# What is printed of the object --------------------------------------------------------------------
+# Report on the object -----------------------------------------------------------------------------
 
 
 def _report(
@@ -160,7 +161,7 @@ def _report(
     whiskers: list[vb.Whisker],
     wanted: ShapeOptions,
 ) -> None:
-    """Report on frames, object, and distances of contacts from an object that is known."""
+    """Report on frames, object, and distances of contacts from a known object."""
     contour, estimates = (tree[name].to_dataset() for name in ("contour", "estimates"))
     shapes, fit = None, vb.contour.shape_from_dataset(contour)
     if wanted.shape != "free" and fit.misfit > _SUSPECT:
@@ -185,7 +186,7 @@ def _report(
 def _print_object(
     fit: vb.contour.FittedShape, contour: xr.Dataset, known: tuple[vb.objects.Surface, ...]
 ) -> None:
-    """The fitted object with its uncertainty, and how far it is from the known one."""
+    """Print the fitted object with its uncertainty, and its distance from the known one."""
     true = _matching(contour, known)
     title = f"The {fit.kind}"
     if isinstance(fit, vb.contour.FreeFit):
@@ -198,7 +199,7 @@ def _print_object(
         values = np.atleast_1d(value)
         for i, pair in enumerate(zip(values, np.atleast_1d(sigma), strict=True)):
             label = name if values.size == 1 else f"{name}, {'xyz'[i]}"
-            # Adding zero turns −0 into 0.
+            # Adding zero converts −0 to 0.
             cells = [f"{round(factor * float(x), 4) + 0.0:.4f}{unit}" for x in pair]
             rows.append([label, *cells, *(true.get(label, ["", ""]) if true else ())])
     if "tilt" in true:
@@ -220,7 +221,7 @@ def _parameters(fit: vb.contour.FittedShape) -> list[tuple[str, Any, Any]]:
 
 
 def _matching(contour: xr.Dataset, known: tuple[vb.objects.Surface, ...]) -> dict[str, list[str]]:
-    """Known value and error of each row, where a known object is of the fitted kind."""
+    """Known value and error of each row, if a known object has the fitted shape."""
     offset = next((n for n in ("axis_offset", "center_offset") if n in contour), None)
     if offset is None:
         return {}
@@ -239,7 +240,7 @@ def _matching(contour: xr.Dataset, known: tuple[vb.objects.Surface, ...]) -> dic
 
 
 def _agreement(fit: vb.contour.FittedShape, contour: xr.Dataset) -> str:
-    """State how well contacts agree with the fitted object."""
+    """Description of the agreement of contacts with the fitted object."""
     found, used = int(np.isfinite(fit.residuals).sum()), int(fit.used.sum())
     inside = int((fit.used & fit.inliers).sum())
     share = f"all {used}" if used < inside + 1 else f"{inside} of {used}"
@@ -258,7 +259,7 @@ def _agreement(fit: vb.contour.FittedShape, contour: xr.Dataset) -> str:
 
 
 def _judgement(fit: vb.contour.FittedShape, shapes: xr.Dataset | None) -> Iterator[str]:
-    """Whether the contacts are of another shape."""
+    """Yield remarks on whether another shape fits the contacts better."""
     if fit.misfit > vb.pipeline.AGREES:
         yield (
             f"The contacts do not fit a {fit.kind}{_by(fit.misfit)}: the object has another "
@@ -282,12 +283,12 @@ def _by(misfit: float) -> str:
 
 
 def _distance(value: float) -> str:
-    """A distance; a covariance may leave the lightest contacts anywhere along the whisker."""
+    """Format a distance; light contacts may be anywhere along the whisker."""
     return "not determined" if value > _ANYWHERE else fixed("surface_distance", value, 1)
 
 
 def _print_distances(rows: xr.Dataset) -> None:
-    """Distances of contacts from the known object, by how far the whisker is bent."""
+    """Print distances of contacts from the known object, by deflection angle."""
     predicted = bool(np.isfinite(rows["median_predicted"]).any())
     names = ["median", "largest_95"]
     names += ["median_predicted", "largest_95_predicted"] if predicted else []

@@ -1,4 +1,4 @@
-"""`vibrissa report`: a trial or a map as one web page."""
+"""`vibrissa report`: report on a trial or a map as one web page."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from vibrissa.cli.options import check_new, refuse, with_options
 from vibrissa.cli.terminal import Tell, progress_bars, say
 from vibrissa.deferred import xr
 
-_LARGEST = 15_000_000  # bytes of a page at most, as far as movies decide about it
-_TAGS = 10_000  # bytes for the names and tags of movies
+_LARGEST = 15_000_000  # size of a page up to which movies are embedded, bytes
+_TAGS = 10_000  # size reserved for the names and tags of movies, bytes
 
 
 class _Content(NamedTuple):
@@ -50,11 +50,12 @@ def report(
     seed: int | None = None,
     force: bool = False,
 ) -> None:
-    """Write a page that opens offline: results, errors, figures, and a contour to turn.
+    """Write a self-contained page with results, errors, figures and an interactive contour.
 
-    It shows the whisker most in contact, unless --which chooses another; the seed is for the draws
-    of predicted errors. With SOURCE_DATE_EPOCH set, the same command gives the same
-    page. Example: `vibrissa report trial.nc --video top.mp4 --video front.mp4 -o report.html`
+    It shows the whisker longest in contact, unless --which selects another. The seed is that of the
+    random draws for predicted errors. If SOURCE_DATE_EPOCH is set, the same command gives the same
+    page.
+    Example: `vibrissa report trial.nc --video top.mp4 --video front.mp4 -o report.html`
     """
     check_new(target, (".html", ".htm"), force)
     movies = list(movie or [])
@@ -64,7 +65,7 @@ def report(
         vb.io.check_readable(file)
     for file in movies:
         if file.suffix.lower() != ".mp4":
-            raise ValueError(f"--movie is {file}; a movie that ends in .mp4 is needed")
+            raise ValueError(f"--movie is {file}; a movie ending in .mp4 is needed")
     is_trial = _is_trial(path)
     with progress_bars() as tell:
         if is_trial:
@@ -81,7 +82,7 @@ def report(
     if make:
         kinds = ("signals", "contour")
         movies += sorted(make_movies(path, target.parent, kinds, of_trial, FrameOptions(), force))
-    # The page is the same, whether there was one before or not.
+    # The page must not depend on whether it replaces another.
     command = ["vibrissa", *(word for word in sys.argv[1:] if word != "--force")]
     origin = vb.report.provenance_section(command, given, (seed or 0) if is_trial else None)
     about = "From the forces and moments at a whisker's base to the object that it touched."
@@ -102,8 +103,8 @@ def _is_trial(path: Path) -> bool:
     kind = kind_in(path)
     if kind not in (RECORDING, MAP):
         raise ValueError(
-            f"{path} holds {kind or 'data of another kind'}; a recording of a trial or a map of "
-            "contacts is needed, as `vibrissa track` or `vibrissa map` writes them"
+            f"{path} contains {kind or 'data of another kind'}; a recording of a trial or a map of "
+            "contacts is needed, as written by `vibrissa track` or `vibrissa map`"
         )
     return kind == RECORDING
 
@@ -111,7 +112,7 @@ def _is_trial(path: Path) -> bool:
 def _of_trial(
     path: Path, trial: xr.DataTree, of_trial: TrialOptions, seed: int, tell: Tell
 ) -> _Content:
-    """The page of a trial."""
+    """Contents of the page of a trial."""
     course = vb.scene.course_of(trial, of_trial.whisker)
     sections, script = vb.report.trial_sections(trial, of_trial.whisker, seed), ""
     drawings = array_drawings(path, "double")
@@ -130,7 +131,7 @@ def _of_trial(
 
 
 def _of_map(path: Path, uniqueness: Path | None) -> _Content:
-    """The page of a map."""
+    """Contents of the page of a map."""
     contact_map = vb.ContactMap.load(path)
     verdicts = None if uniqueness is None else dataset_with(uniqueness, "verdict")
     sections, script = vb.report.chart_sections(contact_map, verdicts), ""
@@ -145,7 +146,7 @@ def _of_map(path: Path, uniqueness: Path | None) -> _Content:
 
 
 def _can_draw() -> bool:
-    """Whether there can be a picture in 3D; prints so if not."""
+    """Whether a 3D figure can be drawn; report if not."""
     if not vb.report.can_draw():
         say(vb.report.NO_SPACE)
     return vb.report.can_draw()

@@ -1,4 +1,4 @@
-"""`vibrissa sensitivity`: how far the contact point moves when a signal changes."""
+"""`vibrissa sensitivity`: sensitivity of the contact point to changes of the signals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vibrissa.cli.options import check_new, with_options
 from vibrissa.cli.terminal import Row, print_table, progress_bars, say, shown
 from vibrissa.deferred import xr
 
-_SHOWN = 5  # number of the best triplets that are shown
+_SHOWN = 5  # number of triplets shown
 
 
 @with_options("everything, NetCDF (.nc), SI units; by default nowhere")
@@ -26,10 +26,10 @@ def sensitivity(
     target: Path | None = None,
     force: bool = False,
 ) -> None:
-    """Find how the contact point depends on three signals, and which three would be the best.
+    """Compute how the contact point depends on three signals, and which triplet is best.
 
-    Derivatives are exact. Without --trial they are those of all contacts on the map. Contacts
-    within 2° of rest are left out of the tables, not of the file.
+    Derivatives are exact, and computed for the contacts of --trial or for all contacts of the map.
+    Contacts within 2° of rest are omitted from the tables but included in the file.
     Example: `vibrissa sensitivity map.nc --using Fx,MB,MD -o sensitivity.nc`
     """
     if target is not None:
@@ -59,9 +59,9 @@ def sensitivity(
 
 
 def _contacts_of(path: Path, moment_noise: float) -> xr.Dataset:
-    """Contact points or, where they are not known, signals of a trial; NaN without contact.
+    """Contact points of a trial or, if unknown, its signals; NaN without contact.
 
-    As for estimates, there is a contact where M_B exceeds five standard deviations of its noise.
+    As for estimates, there is a contact if M_B exceeds five standard deviations of its noise.
     """
     if kind_in(path) == RECORDING:
         recording = vb.load_recording(path).to_dataset(inherit=False)
@@ -76,7 +76,7 @@ def _contacts_of(path: Path, moment_noise: float) -> xr.Dataset:
 
 
 def _print_derivatives(findings: xr.Dataset) -> None:
-    """Median sizes, where they are large, and what differs between the sides."""
+    """Print median sizes of derivatives, their variation, and differences between the sides."""
     by = [str(n) for n in findings["sorted_by"].values]
     rows: list[list[str] | None] = []
     for signal in map(str, findings["signal"].values):
@@ -116,7 +116,7 @@ def _ratio(value: float) -> str:
 def _print_rivals(
     rivals: xr.Dataset, names: tuple[str, ...], noise: str, verdicts: xr.Dataset | None
 ) -> None:
-    """The triplets that are best most often, and the one that was asked for."""
+    """Print the triplets that are most often best, and the requested one."""
     from rich.text import Text
 
     order = np.argsort(-rivals["share"].values, kind="stable")

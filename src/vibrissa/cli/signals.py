@@ -1,4 +1,4 @@
-"""`vibrissa signals`: force, moment and signals at a whisker's base, from a recording."""
+"""`vibrissa signals`: force, moment and signals at a whisker's base from a recording."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from vibrissa.deferred import xr
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """Source of the signals."""
+    """Options for the source of the signals."""
 
     source: Source | None = None
     cutoff: float | None = None
@@ -46,7 +46,7 @@ class SourceOptions:
 
     @classmethod
     def of(cls, tree: xr.DataTree) -> SourceOptions:
-        """Options by which signals that are there were made; the usual ones without signals."""
+        """Options with which existing signals were computed; defaults without signals."""
         about: Any = tree["signals"].attrs if "signals" in tree.children else {}
         source: Any = about.get("source", "").replace(" ", "-") or None
         cutoff = float(about.get("cutoff", 0.0)) if source == "contact-point" else None
@@ -58,12 +58,12 @@ class SourceOptions:
 
     @property
     def given(self) -> bool:
-        """Whether anything is stated."""
+        """Whether any option is stated."""
         return self.source is not None or self.cutoff is not None or self.inertia
 
     @property
     def dynamics(self) -> vb.simulation.Dynamics | Literal["fitted"] | None:
-        """Density and damping; None: the whisker has no mass."""
+        """Density and damping; None to neglect the mass of the whisker."""
         if not self.inertia:
             return None
         if self.fit_dynamics:
@@ -77,7 +77,7 @@ class SourceOptions:
     def as_keywords(
         self, recording: xr.DataTree, own: WhiskerOptions, proximal: float | None = None
     ) -> dict[str, Any]:
-        """Turn options into those of `signals_of`."""
+        """Keyword arguments of `signals_of`."""
         source = (
             vb.pipeline.default_source(recording)
             if self.source is None
@@ -109,10 +109,10 @@ def signals(
     target: Path | None = None,
     force: bool = False,
 ) -> None:
-    """Find force, moment and the six signals at the base in every frame.
+    """Compute force, moment and the six signals at the base in every frame.
 
-    They are added to the recording as a group `signals`. Its other groups are kept, except
-    estimates and a contour that were computed from other signals.
+    They are added to the recording as the group `signals`. Other groups are kept, except estimates
+    and a contour computed from earlier signals.
     Example: `vibrissa signals trial.nc`
     """
     refuse_tracks(recording)
@@ -153,7 +153,7 @@ def signals(
 
 
 def described(tree: xr.DataTree) -> str:
-    """State what the signals of a recording come from."""
+    """Description of the source of the signals of a recording."""
     flat = (
         "; one view: depth, Fz, Mx and My are taken for 0"
         if vb.recording.Recording(tree).planar
@@ -192,7 +192,7 @@ def _origin(tree: xr.DataTree) -> str:
 
 
 def _print_largest(found: xr.Dataset) -> None:
-    """Print in how many frames each whisker is in contact, and the largest force and moment."""
+    """Print the number of frames in contact and the largest force and moment of each whisker."""
     for k, name in enumerate(found["whisker"].values):
         one = found.isel(whisker=k)
         sizes = {n: np.linalg.norm(one[n].values, axis=-1) for n in ("force", "moment")}

@@ -1,4 +1,4 @@
-"""`vibrissa simulate`: a trial whose truth is known."""
+"""`vibrissa simulate`: simulation of a trial with ground truth."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vibrissa.deferred import xr
 
 @dataclass(frozen=True)
 class PlanOptions:
-    """What is simulated; it counts more than the file. Names are those of `read_script`."""
+    """Options that override the script of a trial, with the names of `read_script`."""
 
     array: str | None = None
     side: Literal["both", "left", "right"] | None = None
@@ -35,7 +35,7 @@ class PlanOptions:
     seed: int | None = None
 
     def changes(self) -> dict[str, Any]:
-        """Return them by the names that a trial has."""
+        """Options by the names of `read_script`."""
         names = None if self.names is None else self.names.replace(",", " ").split()
         return {name: v for name, v in asdict(self).items() if name != "names"} | {
             "whiskers": names
@@ -52,11 +52,12 @@ def simulate(
     example: bool = False,
     force: bool = False,
 ) -> None:
-    """Simulate a whisking trial among objects, with its truth.
+    """Simulate a whisking trial among objects, with its ground truth.
 
-    By default the trial of the demo: a γ whisker sweeps past a peg and back, in 3.5 s (an array:
-    0.5 s). Options override the file. Example: `vibrissa simulate --duration 0.5
-    --friction 0.3 -o trial.nc`; `vibrissa simulate --array average --object sphere -o face.nc`
+    By default the trial is that of the demo: a γ whisker sweeps past a peg and back, for 3.5 s (an
+    array: 0.5 s). Options override the script.
+    Example: `vibrissa simulate --duration 0.5 --friction 0.3 -o trial.nc`;
+    `vibrissa simulate --array average --object sphere -o face.nc`
     """
     if example:
         output.out(vb.simulation.EXAMPLE, highlight=False, end="")
@@ -125,7 +126,7 @@ def _films(folder: Path) -> list[Path]:
 
 
 def _film(trial: xr.DataTree, path: Path, folder: Path, seed: int) -> None:
-    """Film the trial, and add cameras and true traces to the recording."""
+    """Render videos of the trial, and add cameras and true traces to the recording."""
     folder.mkdir(parents=True, exist_ok=True)
     cameras = vb.simulation.views_of(trial)
     files = dict(zip([camera.name for camera in cameras], _films(folder), strict=True))

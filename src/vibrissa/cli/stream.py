@@ -1,4 +1,4 @@
-"""`vibrissa stream`: contacts while signals come in."""
+"""`vibrissa stream`: estimation of contacts from a stream of signals."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from vibrissa.cli.terminal import Ended, ending_in_order, remark
 if TYPE_CHECKING:
     import socket
 
-_SOON = 500  # samples after which advice is given; it is given again at the end
-_REPORTED = 1.0  # seconds between two reports of samples that are dropped
+_SOON = 500  # number of samples after which advice is given for the first time; again at the end
+_REPORTED = 1.0  # time between two reports of dropped samples, s
 _MOUNT = ("X", "Y", "Z", "QW", "QX", "QY", "QZ")
 
 
 @dataclass(frozen=True)
 class LineOptions:
-    """Source of the lines."""
+    """Options for the source of lines."""
 
     source: Path | None = None
     udp: str | None = None
@@ -70,7 +70,7 @@ class LineOptions:
         return self.source is not None and vb.io.is_bag(self.source)
 
     def lines(self, heard: socket.socket | None) -> Iterator[str]:
-        """Return lines as they come."""
+        """Yield lines as they arrive."""
         if heard is not None:
             return vb.streaming.udp_lines(heard)
         if self.source is None or str(self.source) == "-":
@@ -83,15 +83,13 @@ class LineOptions:
         if self.source.is_dir() or not self.source.exists():
             vb.io.check_readable(self.source)
         if self.reconnect and self.source.is_file():
-            raise ValueError(
-                f"{self.source} is a file, which ends; --reconnect is for pipes and devices"
-            )
+            raise ValueError(f"{self.source} is a file; --reconnect is for named pipes and devices")
         return vb.streaming.file_lines(self.source, self.reconnect, remark)
 
 
 @dataclass(frozen=True, kw_only=True)
 class MeasurementOptions:
-    """The whisker and what is measured at its base."""
+    """Options for the whiskers and the measurements at their bases."""
 
     map: list[str] | None = None
     proximal: float | None = None
@@ -127,7 +125,7 @@ class MeasurementOptions:
 
     @property
     def whiskers(self) -> tuple[str, ...]:
-        """Names of the whiskers, by their maps; one without a name where there is one only."""
+        """Names of the whiskers, from their maps; a single whisker has an empty name."""
         return tuple(_named(self.map, "--map")) or ("",)
 
     def contact_map(self, name: str) -> vb.ContactMap:
@@ -140,13 +138,13 @@ class MeasurementOptions:
         return vb.ContactMap.simulate(whisker, grid=False, proximal=smallest_arc(self.proximal))
 
     def described(self, name: str) -> vb.sensors.Sensor | None:
-        """Read the sensor of a whisker: its own, or that of all."""
+        """Read the sensor of a whisker: its own, or the common one."""
         sensors = _named(self.sensor, "--sensor")
         path = sensors.get(name, sensors.get(""))
         return None if path is None else vb.sensors.load_sensor(path)
 
     def estimator(self, name: str, sensor: vb.sensors.Sensor | None) -> vb.Estimator:
-        """Return what estimates contacts of a whisker from measurements."""
+        """Create the estimator of a whisker."""
         if sensor is not None and self.tare:
             sensor = sensor.with_new_offset(self.tare)
         return estimator_of(
@@ -162,7 +160,7 @@ class MeasurementOptions:
 
 @dataclass(frozen=True)
 class FollowOptions:
-    """Options for contacts that are followed over time, and the place of the whisker."""
+    """Options for filtering contacts over time, and for the mounting of the whisker."""
 
     filter: bool = False
     speed: float | None = None
@@ -174,7 +172,7 @@ class FollowOptions:
             refuse({"--speed": self.speed}, "it is of the filter: add --filter")
 
     def poses(self, name: str) -> vb.streaming.Poses:
-        """Return the poses of what a whisker is mounted on."""
+        """Create the poses of the carrier on which a whisker is mounted."""
         mounts = _named(self.mount, "--mount")
         mount = mounts.get(name, mounts.get(""))
         if mount is None:
@@ -192,13 +190,13 @@ class FollowOptions:
         bag: bool,
         tare: int,
     ) -> vb.streaming.ContactStream:
-        """Return what turns lines into contacts."""
+        """Create the converter from lines to contacts."""
         speed = None if self.speed is None else 1e-3 * self.speed
         filtered = vb.ContactFilter(estimator, speed=speed) if self.filter else None
         names = None if sensor is None else tuple(sensor.channels)
         if bag and names is not None and not set(names) <= set(vb.streaming.COMPONENTS):
             raise ValueError(
-                f"a bag of wrenches carries {', '.join(vb.streaming.COMPONENTS)}; the sensor has "
+                f"a bag of wrenches contains {', '.join(vb.streaming.COMPONENTS)}; the sensor has "
                 f"{', '.join(names)}"
             )
         slip = None if self.slip_speed is None else 1e-3 * self.slip_speed
@@ -209,12 +207,12 @@ class FollowOptions:
 
 
 def _named(given: list[str] | None, option: str) -> dict[str, str]:
-    """Values of an option by the names of whiskers: NAME=VALUE, or one value without a name."""
+    """Values of an option by whisker: NAME=VALUE, or one value without a name."""
     pairs = [one.rpartition("=") if "=" in one else ("", "", one) for one in given or ()]
     names = [name for name, _, _ in pairs]
     if len(set(names)) < len(names) or ("" in names and len(names) > 1):
         raise ValueError(
-            f"{option} is given {len(names)} times; of several whiskers each has a name, as "
+            f"{option} is given {len(names)} times; several whiskers need names, as in "
             f"{option} left=VALUE {option} right=VALUE"
         )
     return {name: value for name, _, value in pairs}
@@ -228,14 +226,14 @@ def stream(
     bag: Path | None = None,
     answers: str | None = None,
 ) -> None:
-    """Find contacts while signals arrive; each sample is answered by one line of JSON.
+    """Estimate contacts while signals arrive; the result for each sample is one line of JSON.
 
-    Lines are CSV with a header, or JSON objects, in SI units, with the signals that are used or
-    Fx, Fy, Fz, Mx, My, Mz; a column time is passed on. A line that cannot be read gives a line with
-    its number and the error; after a header that cannot be used, rows wait for another one. Points
-    are in the whisker's frame, m; with --filter also in the laboratory's (lab_x, ...). Onset, loss
-    and slip of a contact are in the field event. Of several whiskers, --map left=left.nc --map
-    right=right.nc, lines carry left.Fx, right.Fx and so on. Stop with Ctrl-C or any signal.
+    Lines are CSV with a header, or JSON objects, in SI units, with the signals used or Fx, Fy, Fz,
+    Mx, My, Mz; a column time is passed on. The result for an unreadable line is its number and the
+    error; after an invalid header, rows are errors until the next header. Points are in the whisker
+    frame, m; with --filter also in the laboratory frame (lab_x, ...). The field event states onset,
+    loss and slip of a contact. For several whiskers, --map left=left.nc --map right=right.nc, lines
+    contain left.Fx, right.Fx and so on. Stop with Ctrl-C or any signal.
     Example: `vibrissa stream --udp 127.0.0.1:5005 --map wire.nc --sensor sensor.toml`
     """
     sensors = {name: measured.described(name) for name in measured.whiskers}
@@ -273,7 +271,7 @@ def stream(
             recorder = vb.streaming.ContactRecorder(writer, running, same, follow.filter, remark)
         try:
             _write(running, islice(lines, source.count), recorder, losses, sent)
-        except Ended as signalled:  # the usual end
+        except Ended as signalled:  # the normal end
             remark(f"stopped: {signalled}")
         lost = "" if losses is None else losses.described()
     for one in running.streams:
@@ -284,9 +282,9 @@ def stream(
 
 @contextmanager
 def _without_long_collections() -> Iterator[Callable[[], None]]:
-    """Collect no garbage until all is loaded, and what is there then never.
+    """Suspend garbage collection during loading, and exclude all loaded objects from it later.
 
-    To look through all objects of the libraries takes longer than a sample may wait.
+    Collection over all objects of the libraries takes longer than a sample may wait.
     """
 
     def settled() -> None:
@@ -319,7 +317,7 @@ def _advise(running: vb.streaming.ContactStream) -> None:
 
 
 def _socket(udp: str, opened: ExitStack) -> socket.socket:
-    """Listen before the map is made, so that nothing is lost."""
+    """Open the UDP socket before the map is computed, so that no datagram is lost."""
     heard = opened.enter_context(vb.streaming.udp_socket(*vb.streaming.udp_address(udp)))
     host, port = heard.getsockname()[:2]
     remark(f"listening at {host}:{port}")
@@ -327,7 +325,7 @@ def _socket(udp: str, opened: ExitStack) -> socket.socket:
 
 
 class _Losses:
-    """Samples that came by UDP and are not answered, reported once a second."""
+    """Counter of UDP samples without a result, reported once per second."""
 
     def __init__(self, heard: socket.socket) -> None:
         self._heard = heard
@@ -335,12 +333,12 @@ class _Losses:
         self._before, self._next = (0, 0), 0.0
 
     def newest(self, running: vb.streaming.ContactStreams) -> vb.streaming.NewestLines:
-        """Lines of which only the newest are passed on."""
+        """Lines of the newest datagrams only."""
         self._lines = vb.streaming.NewestLines(self._heard, running.kind)
         return self._lines
 
     def report(self) -> None:
-        """Print how many there are so far, if it is time to, and there are more."""
+        """Report the number of lost samples if it has grown, at most once per second."""
         if (now := time.monotonic()) < self._next:
             return
         self._next = now + _REPORTED
@@ -349,7 +347,7 @@ class _Losses:
             remark(f"so far{self.described()[1:]}")
 
     def described(self) -> str:
-        """All of them, as the end of a sentence; nothing where there are none."""
+        """Description of all lost samples for the end of a sentence; empty if there are none."""
         dropped, lost = self._counts()
         text = f", {dropped} samples dropped because newer ones had come" if dropped else ""
         return text + (f", {lost} datagrams lost because too many waited" if lost else "")
@@ -365,10 +363,10 @@ def _write(
     losses: _Losses | None,
     sent: vb.streaming.Answers | None,
 ) -> None:
-    """Print records as they come, each at once; stop quietly when nobody reads any more."""
+    """Print each record immediately; stop quietly if the output is closed."""
     try:
         for record in running.records(lines):
-            # First, so that all that was answered is in the bag, wherever a signal comes.
+            # The bag is written first, so that it has all printed results after any signal.
             if recorder is not None:
                 recorder.put(record)
             answer = vb.streaming.as_json(record)
@@ -386,5 +384,5 @@ def _write(
                 for one in running.streams:
                     _advise(one)
     except BrokenPipeError:
-        # What is flushed at the end must not fail again.
+        # Flushing at exit must not fail again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -11,7 +11,7 @@ import vibrissa as vb
 from vibrissa.cli.options import refuse, with_options
 from vibrissa.cli.terminal import output, progress_bars, remark, say
 
-# Number of failures that are listed.
+# Largest number of failures listed.
 _SHOW = "show"
 _LISTED = 3
 
@@ -29,7 +29,7 @@ def sweep(
     example: bool = False,
     force: bool = False,
 ) -> None:
-    """Run a study of many whiskers, here or on a cluster; if stopped, it continues where it was.
+    """Run a study of many whiskers on this machine or a cluster; interrupted runs can be continued.
 
     Example: `vibrissa sweep study.toml -o study.zarr`, then `vibrissa sweep show study.zarr`
     """
@@ -37,7 +37,7 @@ def sweep(
         import zarr  # noqa: F401
     except ModuleNotFoundError as missing:
         raise ModuleNotFoundError(
-            "studies are kept with zarr: pip install 'vibrissa[sweeps]'"
+            "studies are stored with zarr: pip install 'vibrissa[sweeps]'"
         ) from missing
     if example:
         output.out(vb.sweeps.EXAMPLE, highlight=False, end="")
@@ -48,9 +48,9 @@ def sweep(
         refuse(options | {"--dry-run": dry_run}, "results are only shown")
         _show(store, target or Path(), force)
     elif store is not None:
-        raise ValueError(f"{store} is one word too many; the store is stated with -o")
+        raise ValueError(f"{store} is not expected here; state the store by -o")
     elif force:
-        raise ValueError("--force is for the figures of `show`; a study goes on with its results")
+        raise ValueError("--force is for the figures of `show`; a study continues with its results")
     else:
         if scheduler not in (None, "local"):
             refuse({"--workers": workers}, f"the workers are those of {scheduler}")

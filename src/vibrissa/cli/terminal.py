@@ -14,11 +14,11 @@ from rich.text import Text
 from vibrissa.quantities import quantity
 from vibrissa.sketch import progress
 
-# Console for results, written as they are: names of files and whiskers may have brackets.
+# Console for results, without markup, as names of files and whiskers may contain brackets.
 output = Console(markup=False, emoji=False)
 # Console for progress and messages, so that results can be piped.
 errors = Console(stderr=True, markup=False, emoji=False)
-# Called with what is being done, and how much of how much is.
+# Function called with the current stage, the steps done and the total steps.
 Tell = Callable[[str, int, int], None]
 
 
@@ -28,18 +28,18 @@ def say(line: str = "") -> None:
 
 
 def remark(line: str) -> None:
-    """Print a line that is not a result: what is assumed, or done by default."""
+    """Print a remark that is not a result, such as an assumption or a default."""
     errors.print(line, highlight=False, soft_wrap=True)
 
 
 def progress_bars() -> AbstractContextManager[Tell]:
-    """Show a bar for each stage that is reported."""
+    """Context that shows a progress bar for each reported stage."""
     return progress(errors)
 
 
 @contextmanager
 def stoppable() -> Iterator[Callable[[], bool]]:
-    """Take Ctrl-C as the wish to stop soon; a second one stops at once."""
+    """Context in which Ctrl-C requests a stop, and a second Ctrl-C stops immediately."""
     asked = False
 
     def ask(number: int, frame: object) -> None:
@@ -48,7 +48,7 @@ def stoppable() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt
         asked = True
 
-    # Elsewhere than in the main thread there is no Ctrl-C to take.
+    # Only the main thread can handle Ctrl-C.
     before = None
     if threading.current_thread() is threading.main_thread():
         before = signal.signal(signal.SIGINT, ask)
@@ -59,7 +59,7 @@ def stoppable() -> Iterator[Callable[[], bool]]:
             signal.signal(signal.SIGINT, before)
 
 
-# What does not end a process by itself, cannot be taken, or is a fault of the process.
+# Signals that do not end a process by default, cannot be handled, or are faults of the process.
 _LEFT_ALONE = (
     *("SIGKILL", "SIGSTOP", "SIGCHLD", "SIGURG", "SIGWINCH", "SIGCONT", "SIGTSTP", "SIGTTIN"),
     *("SIGTTOU", "SIGINFO", "SIGSEGV", "SIGBUS", "SIGFPE", "SIGILL", "SIGTRAP", "SIGSYS"),
@@ -67,14 +67,14 @@ _LEFT_ALONE = (
 
 
 class Ended(KeyboardInterrupt):
-    """A signal asked the process to end."""
+    """Raised at a signal that ends the process."""
 
 
 @contextmanager
 def ending_in_order() -> Iterator[None]:
-    """Raise `Ended` at a signal that would end the process; while that is done others wait.
+    """Context that raises `Ended` at a signal that would end the process, and then blocks others.
 
-    Signals that are ignored (``nohup``) or handled otherwise are left as they are.
+    Signals that are ignored (``nohup``) or have other handlers are not affected.
     """
     taken: dict[int, Any] = {}
 
@@ -83,7 +83,7 @@ def ending_in_order() -> Iterator[None]:
             signal.signal(each, signal.SIG_IGN)
         raise Ended(signal.strsignal(number) or f"signal {number}")
 
-    # Elsewhere than in the main thread no signal can be taken.
+    # Only the main thread can handle signals.
     if threading.current_thread() is threading.main_thread():
         ending = (signal.SIG_DFL, signal.default_int_handler)
         left = {getattr(signal, name, None) for name in _LEFT_ALONE}
@@ -98,13 +98,13 @@ def ending_in_order() -> Iterator[None]:
 
 
 def shown(name: str, value: float, digits: int = 4) -> str:
-    """Write an SI value with the unit in which it is shown."""
+    """Format an SI value in its display unit."""
     return _with_unit(f"{value * quantity(name).display_factor:.{digits}g}", name)
 
 
 def fixed(name: str, value: float, decimals: int = 4) -> str:
-    """Write an SI value with the unit in which it is shown, to so many decimals there."""
-    # Adding zero turns −0 into 0.
+    """Format an SI value in its display unit, with a fixed number of decimals."""
+    # Adding zero converts −0 to 0.
     number = round(value * quantity(name).display_factor, decimals) + 0.0
     return _with_unit(f"{number:.{decimals}f}", name)
 
@@ -125,10 +125,10 @@ def print_table(
     *,
     left: Sequence[int] = (0,),
 ) -> None:
-    """Print rows of cells; ``None`` is a line between two sections.
+    """Print rows of cells; ``None`` stands for a line between two sections.
 
-    The columns numbered in ``left`` are text, the others numbers, which are aligned at the right.
-    Without names of columns there is no head.
+    Columns with an index in ``left`` are text, aligned left; the others are numbers, aligned right.
+    Without names of columns there is no header.
     """
     from rich.table import Table
 
@@ -150,7 +150,7 @@ def print_table(
 
 
 def print_properties(rows: Iterable[tuple[str, str]]) -> None:
-    """Print names and values, without lines between them; ``next`` is a command to be copied."""
+    """Print names and values; the value of ``next`` is a command that can be copied."""
     from rich.table import Table
 
     table = Table(show_header=False, box=None)
@@ -164,5 +164,5 @@ def print_properties(rows: Iterable[tuple[str, str]]) -> None:
             table.add_row(Text(name, style="bold"), Text(value))
     output.print(table, highlight=False)
     for command in commands:
-        # On one line, whatever the width of the terminal.
+        # The command is not wrapped, whatever the width of the terminal.
         output.print(Text.assemble((" next: ", "bold"), command), soft_wrap=True)

@@ -1,4 +1,4 @@
-"""`vibrissa track`: from one or two videos to a recording."""
+"""`vibrissa track`: tracking of whiskers in videos."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ from vibrissa.deferred import xr
 if TYPE_CHECKING:
     _Traces = Sequence[Sequence[Sequence[vb.tracking.Trace]]]
 
-_WIDEST = 1.0  # largest width of views of a whisker, m
-_FINEST = 3.0  # width of a whisker's base in the images for which traces are tuned, pixels
-# Misfit of traces, in their standard deviation, from which the rod does not explain them.
+_WIDEST = 1.0  # largest plausible width of a view, m
+_FINEST = 3.0  # width of a whisker's base in the images for which tracing is tuned, pixels
+# Misfit of traces, in standard deviations, above which the rod does not explain them.
 _POOR = 2.0
 _VIEW = re.compile(r"\d+,\d+,\d+,\d+(:[a-z]+)*")  # part of the images of a video
 _NEAREST, _FARTHEST = 0.03, 30.0  # smallest and largest distance of a lens, m
 _RATE, _CUTOFF = 1000.0, 85.0
 
 _LONGEST_FUR = 20.0  # longest part of a whisker that fur hides, mm
-_HALF = 127  # grey value above which a pixel of an image of a mask is bright
-# Why a frame is shown in which what is followed may not be the whisker.
+_HALF = 127  # grey value above which a pixel of a mask image is bright
+# Reason for showing a frame in which the whisker may have been lost.
 _LOST = "here a whisker is lost, has a hook, or differs much in length from the frame before"
 _UNEXPLAINED = "here the bent rod explains the traces worst: one of them may be on something else"
 
 
 @dataclass(frozen=True)
 class FilmOptions:
-    """Options on how the videos were filmed."""
+    """Options for cameras and recording of the videos."""
 
     pixel_size: float | None = None
     distance: float | None = None
@@ -57,7 +57,7 @@ class FilmOptions:
         if self.offset != "auto" and not self.offset.lstrip("+-").isdigit():
             raise ValueError(f"--offset is {self.offset!r}; a number of frames or auto is needed")
         if not 0.0 < self.frames_per_second < math.inf:
-            raise ValueError(f"--rate is {self.rate:g}; frames per second, more than 0, are needed")
+            raise ValueError(f"--rate is {self.rate:g}; it must be positive, in frames per second")
         if self.cameras is not None:
             given = {"--pixel-size": self.pixel_size, "--distance": self.distance}
             refuse(given, "the --cameras determine it")
@@ -70,29 +70,29 @@ class FilmOptions:
 
     @property
     def frames_per_second(self) -> float:
-        """Frames per second, 1000 by default."""
+        """Frame rate, 1000 Hz by default."""
         return _RATE if self.rate is None else self.rate
 
     def split(self, stated: Sequence[Path]) -> list[Path]:
-        """Return the videos of the views: files, or with --views parts of them."""
-        # The parts after the first are words without an option of their own.
+        """Videos of the views: files or, with --views, parts of them."""
+        # Parts after the first are parsed as positional arguments.
         more = [str(video) for video in stated if self.views and _VIEW.fullmatch(str(video))]
         videos = [video for video in stated if str(video) not in more]
         parts = [part for text in self.views or () for part in text.split()] + more
         for part in parts:
             if not _VIEW.fullmatch(part):
                 raise ValueError(
-                    f"--views is {part!r}; COLUMN,ROW,WIDTH,HEIGHT of each view are needed, and "
-                    "after it nothing, :mirrored or :flipped"
+                    f"--views is {part!r}; COLUMN,ROW,WIDTH,HEIGHT of each view are needed, "
+                    "optionally followed by :mirrored or :flipped"
                 )
         return [Path(f"{v}#{part}") for v in videos for part in parts] if parts else videos
 
     def seen_by(self, videos: Sequence[Path]) -> tuple[vb.cameras.Camera, ...]:
-        """Return the cameras of the views: those that are calibrated, or orthogonal ones."""
+        """Cameras of the views, calibrated or orthogonal."""
         if self.cameras is not None:
             return _calibrated(self.cameras, videos)
         if len(videos) % 2 and len(videos) > 1:
-            raise ValueError(f"{len(videos)} videos: give one or two a trial, or their --cameras")
+            raise ValueError(f"{len(videos)} videos: give one or two per trial, or their --cameras")
         sizes = [(info.width, info.height) for info in map(vb.io.video_info, videos)]
         if len(set(sizes)) > 1:
             raise ValueError(f"the videos differ in size, {sorted(set(sizes))}: give --cameras")
@@ -100,15 +100,15 @@ class FilmOptions:
         wide = pixel_size * sizes[0][0]
         if not 0.0 < wide <= _WIDEST:
             raise ValueError(
-                f"--pixel-size is {1e3 * pixel_size:g} mm, by which the views are {wide:g} m wide; "
-                "it is in mm, such as 0.058"
+                f"--pixel-size is {1e3 * pixel_size:g} mm, which makes the views {wide:g} m wide; "
+                "it must be in mm, such as 0.058"
             )
         return vb.cameras.orthogonal_views(pixel_size, sizes[0])[: len(videos)]
 
 
 @dataclass(frozen=True)
 class TraceStatements:
-    """Options on how whiskers look in the images, and where they begin."""
+    """Options for the appearance of whiskers in the images, and the positions of their bases."""
 
     base: list[str] | None = None
     base_width: float = _FINEST
@@ -122,15 +122,15 @@ class TraceStatements:
     def __post_init__(self) -> None:
         for name, pixels in (("base-width", self.base_width), ("jump", self.jump)):
             if not 0.0 < pixels < math.inf:
-                raise ValueError(f"--{name} is {pixels:g}; pixels, more than 0, are needed")
+                raise ValueError(f"--{name} is {pixels:g}; it must be positive, in pixels")
 
     def trace_options(self) -> vb.tracking.TraceOptions:
-        """Return the options of traces."""
+        """Options of tracing."""
         scale = max(self.base_width / _FINEST, 1.0)
         return vb.tracking.TraceOptions(scale=scale, jump=self.jump, bright=self.bright)
 
     def stored(self, videos: Sequence[Path], target: Path, count: int) -> vb.io.Clicks | None:
-        """Read what was clicked before in these videos of one or more trials, and state it."""
+        """Read and report earlier clicks in these videos of one or more trials."""
         names = tuple(video.name for video in videos)
         file = self.clicks or clicks_of(target)
         if self.clicks is None and (len(videos) > count or not file.exists()):
@@ -152,12 +152,12 @@ class TraceStatements:
     def bases(
         self, cameras: Sequence[vb.cameras.Camera], clicks: vb.io.Clicks | None
     ) -> list[list[list[float]] | None]:
-        """Return the bases in each view; None: to be found."""
+        """Bases in each view; None if they have to be found."""
         views = len(cameras)
         points = [numbers(text, ("x", "y"), "--base") for text in self.base or ()]
         if len(points) % views:
             raise ValueError(
-                f"there are {len(points)} --base for {views} views; each needs as many"
+                f"there are {len(points)} --base for {views} views; all views need as many"
             )
         each = len(points) // views
         found = [points[v * each : (v + 1) * each] for v in range(views)]
@@ -165,7 +165,7 @@ class TraceStatements:
             found = [[list(point) for point in view.base] for view in clicks.views]
         counts = [len(view) for view in found]
         if len(set(counts)) > 1:
-            raise ValueError(f"the views have {counts} bases; each needs as many")
+            raise ValueError(f"the views have {counts} bases; all views need as many")
         if not any(found):
             return [None] * views
         for i, camera in enumerate(cameras):
@@ -180,7 +180,7 @@ class TraceStatements:
     def masks(
         self, cameras: Sequence[vb.cameras.Camera], clicks: vb.io.Clicks | None
     ) -> list[vb.numerics.Mask | None]:
-        """Return the pixels of each view in which no whisker is; None where all may be."""
+        """Masks of the pixels of each view that are excluded from tracking; None for no mask."""
         views = list(clicks.views if clicks else [vb.io.ViewClicks()] * len(cameras))
         images: list[list[vb.numerics.Mask]] = [[] for _ in views]
         for name, stated in (("mask", self.mask), ("region", self.region)):
@@ -188,8 +188,8 @@ class TraceStatements:
                 number, _, area = text.partition(":")
                 if not number.isdigit() or int(number) >= len(views) or not area:
                     raise ValueError(
-                        f"--{name} is {text!r}; VIEW:X,Y X,Y X,Y… or VIEW:IMAGE is needed, and "
-                        f"views 0 to {len(views) - 1} are there"
+                        f"--{name} is {text!r}; VIEW:X,Y X,Y X,Y… or VIEW:IMAGE is needed, with "
+                        f"a view from 0 to {len(views) - 1}"
                     )
                 view = int(number)
                 if Path(area).suffix and Path(area).exists():
@@ -207,7 +207,7 @@ class TraceStatements:
 
 
 def clicks_of(recording: Path) -> Path:
-    """Return the file in which what was clicked for a recording is kept."""
+    """File in which the clicks for a recording are stored."""
     return recording.with_name(f"{recording.stem}.clicks.toml")
 
 
@@ -217,7 +217,7 @@ def _picked(
     file: Path,
     clicks: vb.io.Clicks | None,
 ) -> vb.io.Clicks:
-    """Open the window on the first frames, and save what is clicked."""
+    """Open a window with the first frames, and save the clicks."""
     images = [next(iter(vb.io.read_video(video))) for video in videos]
     known = tuple(video.name for video in videos)
 
@@ -230,7 +230,7 @@ def _picked(
 
 @dataclass(frozen=True)
 class KnownOptions:
-    """Options on what is known besides the videos."""
+    """Options for data in addition to the videos."""
 
     corrections: Path | None = None
     head: Path | None = None
@@ -238,11 +238,11 @@ class KnownOptions:
     objects: Path | None = None
 
     def alone(self) -> dict[str, Path | None]:
-        """Return the options that are for one trial only."""
+        """Options that apply to a single trial only."""
         return {"--corrections": self.corrections, "--head": self.head, "--contact": self.contact}
 
     def corrected(self, views: int) -> Any:
-        """Read corrected traces, by view."""
+        """Read corrected traces by view."""
         fixed = {} if self.corrections is None else vb.io.load_corrections(self.corrections)
         if unknown := sorted(view for view in fixed if view >= views):
             raise ValueError(
@@ -251,7 +251,7 @@ class KnownOptions:
         return fixed
 
     def read(self, video: Path, rate: float) -> dict[str, Any]:
-        """Read the head, the contact points and the objects, by the names that `track` has."""
+        """Read head, contact points and objects; return keyword arguments of tracking."""
         if self.contact is not None and self.objects is not None:
             raise ValueError("--contact and --objects both state where the contact is; give one")
         known: dict[str, Any] = {}
@@ -278,15 +278,15 @@ def track(
     cutoff: float | None = None,
     force: bool = False,
 ) -> None:
-    """Track a whisker in videos: its shape, pose, contact, and force and moment at its base.
+    """Track a whisker in videos: its shape, pose and contact, and force and moment at its base.
 
-    Two views show it in space. Of one view it is taken to move and bend in the plane of the image;
-    what that leaves out is printed. A mirror gives two views in one video, which --views separate.
+    Two views determine it in space. With one view it is assumed to move and bend in the image
+    plane; what this neglects is printed. A mirror gives two views in one video, which --views
+    separates.
 
-    The whisker at rest is that of --whisker, or is taken from the frames without contact; its base
-    is 0.1 mm in radius if nothing else is stated. With --objects or --contact the contact is
-    compared with one that was found otherwise. The result is a recording. Stopped with Ctrl-C it
-    continues when it is called again.
+    The whisker at rest is that of --whisker, or is determined from frames without contact; the
+    default radius of its base is 0.1 mm. With --objects or --contact the contact is compared with
+    independent data. The result is a recording. After Ctrl-C the same command continues.
     Example: `vibrissa track top.mp4 front.mp4 --pixel-size 0.058 --rate 1000 -o trial.nc`
     """
     videos = filmed.split(videos)
@@ -343,7 +343,7 @@ def track(
 
 @dataclass(frozen=True)
 class _Job:
-    """How trials that were filmed alike are tracked."""
+    """Settings and steps of tracking, shared by trials with the same cameras."""
 
     cameras: tuple[vb.cameras.Camera, ...]
     rate: float
@@ -355,7 +355,7 @@ class _Job:
     known: Mapping[str, Any]
 
     def track(self, videos: Sequence[Path], recording: Path, alone: bool) -> None:
-        """Track one trial and report what was found; pictures of one alone have short names."""
+        """Track one trial and report the results; images of a single trial have short names."""
         start, doubt = (
             recording.with_name(f"{'' if alone else f'{recording.stem}.'}{kind}.png")
             for kind in ("start", "doubt")
@@ -401,7 +401,7 @@ class _Job:
     def _found(
         self, videos: Sequence[Path], picture: Path
     ) -> tuple[Sequence[Any], vb.tracking.TraceOptions]:
-        """Find the whisker, and show what is taken for it before any time is spent on it."""
+        """Find the start of the whiskers, and save an image of it before tracing."""
         numbers, frames = vb.tracking.start_frames(videos, self.how.offset or 0)
         start = vb.tracking.find_start(self.cameras, frames, self.options, self.masks)
         names = [camera.name for camera in self.cameras]
@@ -414,8 +414,8 @@ class _Job:
         vb.plots.save(figure, picture.with_suffix(""), ("png",))
         if start.bases is None:
             raise ValueError(
-                f"where the whisker begins was not found: {start.doubts[0]}. See {picture}, and "
-                "state where it leaves the face, once for each view: "
+                f"the base of the whisker was not found: {start.doubts[0]}. See {picture}, and "
+                "state where the whisker leaves the face, once for each view: "
                 + " ".join("--base X,Y" for _ in videos)
                 + " (or click it: --pick)"
             )
@@ -425,7 +425,7 @@ class _Job:
     def _show_doubt(
         self, videos: Sequence[Path], traces: _Traces, at: Sequence[int], why: str, picture: Path
     ) -> None:
-        """Show one frame of each view with its traces."""
+        """Save an image of one frame of each view with its traces, and report the reason."""
         images = [next(vb.io.video_frames(v, [i])) for v, i in zip(videos, at, strict=True)]
         names = [f"{camera.name}, frame {i}" for camera, i in zip(self.cameras, at, strict=True)]
         whiskers = [
@@ -439,7 +439,7 @@ class _Job:
 
 
 def _where_lost(traces: _Traces) -> int | None:
-    """Find a frame in which whiskers seem to be lost, if there is one."""
+    """Frame in which whiskers seem to be lost; None if there is none."""
     count = min(len(view[0]) for view in traces)
     rows = [row[:count] for view in traces for row in view]
     wrong = np.any([vb.tracking.doubtful_frames(row) for row in rows], axis=0)
@@ -447,7 +447,7 @@ def _where_lost(traces: _Traces) -> int | None:
 
 
 def _where_unexplained(result: xr.DataTree) -> list[int] | None:
-    """Find the frame of each view that rods explain worst, if they leave many unexplained."""
+    """Frame of each view with the largest misfit; None if the rods explain enough frames."""
     data = result.to_dataset()
     misfit = np.nan_to_num(data["trace_misfit"].values)
     if not any(vb.tracking.unexplained_frames(one).any() for one in misfit.T):
@@ -457,10 +457,10 @@ def _where_unexplained(result: xr.DataTree) -> list[int] | None:
 
 
 def _calibrated(path: Path, videos: Sequence[Path]) -> tuple[vb.cameras.Camera, ...]:
-    """Cameras of a file, each for videos of its size."""
+    """Read calibrated cameras, and check them against the sizes of the videos."""
     cameras = cameras_from(path)
     if len(videos) % len(cameras):
-        raise ValueError(f"{path} holds {len(cameras)} cameras; there are {len(videos)} videos")
+        raise ValueError(f"{path} contains {len(cameras)} cameras; there are {len(videos)} videos")
     for i, video in enumerate(videos):
         camera, info = cameras[i % len(cameras)], vb.io.video_info(video)
         if (info.width, info.height) != tuple(camera.size):
@@ -475,31 +475,31 @@ def _calibrated(path: Path, videos: Sequence[Path]) -> tuple[vb.cameras.Camera, 
 def _trials(
     videos: Sequence[Path], count: int, recording: Path, alone: Mapping[str, object]
 ) -> dict[Path, Sequence[Path]]:
-    """Videos of each trial, by the recording that they give."""
+    """Videos of each trial, by the path of its recording."""
     trials = [videos[i : i + count] for i in range(0, len(videos), count)]
     files = [recording]
     if len(trials) > 1:
         refuse(alone, "it is for one trial; track that by itself")
         if recording.suffix and not recording.is_dir():
             raise ValueError(
-                f"--output is {recording}; {len(videos)} videos, {count} a trial, are "
+                f"--output is {recording}; {len(videos)} videos, {count} per trial, are "
                 f"{len(trials)} trials, for which a folder is needed"
             )
         files = [recording / f"{trial[0].stem}.nc" for trial in trials]
         if len(set(files)) < len(files):
-            raise ValueError("two trials would have one file: their first videos share a name")
+            raise ValueError("two trials would have the same file: their first videos share a name")
         recording.mkdir(parents=True, exist_ok=True)
     for file, trial in zip(files, trials, strict=True):
         vb.io.check_writable(file, vb.io.NETCDF)
         # One video cannot show a whisker from two sides.
         if len({path.resolve() for path in trial}) < len(trial):
             names = ", ".join(map(str, trial))
-            raise ValueError(f"{names}: a video is there twice; each view needs its own")
+            raise ValueError(f"{names}: a video is given twice; each view needs its own")
     return dict(zip(files, trials, strict=True))
 
 
 def _head(path: Path, video: Path, rate: float) -> xr.Dataset:
-    """The head's pose; whether it is known in all frames is found out before the work."""
+    """Read the pose of the head, and check in advance that it is known in all frames."""
     if path.suffix.lower() in vb.io.NETCDF:
         head = vb.load_recording(path).to_dataset()
         if "head_rotation" not in head:
@@ -511,7 +511,7 @@ def _head(path: Path, video: Path, rate: float) -> xr.Dataset:
     return head
 
 
-# What is printed ----------------------------------------------------------------------------------
+# Reports ------------------------------------------------------------------------------------------
 
 
 def _compare_lengths(videos: Sequence[Path], traces: Sequence[Sequence[Any]], used: int) -> None:
@@ -526,7 +526,7 @@ def _compare_lengths(videos: Sequence[Path], traces: Sequence[Sequence[Any]], us
 
 
 def _report_assumed(filmed: FilmOptions, clicks: vb.io.Clicks | None) -> None:
-    """Report what is assumed of the film because it is not stated."""
+    """Report assumptions about the cameras that are not stated."""
     if filmed.pixel_size is None and filmed.cameras is None and not (clicks and clicks.pixel_size):
         say(
             f"note: pixel size assumed, not stated: {1e3 * vb.cameras.PIXEL_SIZE:g} mm; all "
@@ -537,7 +537,7 @@ def _report_assumed(filmed: FilmOptions, clicks: vb.io.Clicks | None) -> None:
 
 
 def _report_swapped(videos: Sequence[Path], filmed: FilmOptions) -> None:
-    """Report videos that are named after each other's views."""
+    """Warn of videos whose names suggest that the views are swapped."""
     if filmed.cameras is not None or len(videos) < 2:
         return
     names = [view.name for view in filmed.seen_by(videos)]
@@ -551,7 +551,7 @@ def _report_swapped(videos: Sequence[Path], filmed: FilmOptions) -> None:
 
 
 def _report_start(start: vb.tracking.Start, names: Sequence[str], picture: Path) -> None:
-    """Report what is taken for the whisker."""
+    """Report the start of the whiskers and its image."""
     bases = start.bases or []
     points = " and ".join(
         f"{column:.0f},{row:.0f} ({name})" for name, (column, row) in zip(names, bases, strict=True)
@@ -571,7 +571,7 @@ def _report_start(start: vb.tracking.Start, names: Sequence[str], picture: Path)
 
 
 def print_tracked(result: xr.DataTree, path: Path) -> None:
-    """Report what was tracked of each whisker."""
+    """Report the results for each whisker."""
     data = result.to_dataset()
     for k, name in enumerate(data["whisker"].values):
         one = data.isel(whisker=k)
@@ -597,7 +597,7 @@ def print_tracked(result: xr.DataTree, path: Path) -> None:
 
 
 def compared_contacts(recording: xr.DataTree, whisker: int) -> Iterator[str]:
-    """Compare contact points that were found otherwise with those of the rod."""
+    """Compare contact points from other sources with those of the fitted rod."""
     measured = recording.children.get("measured")
     if measured is None or "contact_difference" not in measured:
         return

@@ -1,4 +1,4 @@
-"""`vibrissa uniqueness`: which signals locate a contact."""
+"""`vibrissa uniqueness`: signals that locate a contact uniquely."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from vibrissa.cli.options import Region, check_new, with_options
 from vibrissa.cli.terminal import output, progress_bars, remark, say, shown
 from vibrissa.deferred import xr
 
-_DIGITS = 14  # enough for the signals to agree to 1e-10 when the pair is bent again
-_ASKED = "Fx MB MD"  # the triplet whose witness is printed, if it has one: that of the paper
+_DIGITS = 14  # number of digits for which the recomputed signals of a pair agree to 1e-10
+_ASKED = "Fx MB MD"  # triplet of the paper, whose witness is printed if there is one
 
 
 @with_options("all evidence, .nc or .csv; by default nowhere")
@@ -32,10 +32,10 @@ def uniqueness(
     target: Path | None = None,
     force: bool = False,
 ) -> None:
-    """Find which triplets of signals locate the contact uniquely, with witnesses where not.
+    """Find which triplets of signals locate the contact uniquely, and witnesses against others.
 
-    A witness is a pair of contacts with the same three signals. Where there are any, the table
-    states how far from rest they are found; contacts within --cone of rest do not count.
+    A witness is a pair of contacts with the same three signals. If there are any, the table states
+    up to which deflection from rest they exist; contacts within --cone of rest do not count.
 
     Example: `vibrissa uniqueness map.nc -o uniqueness.nc`
     """
@@ -97,7 +97,7 @@ def uniqueness(
 
 
 def _print_proofs(found: xr.Dataset, bracket: tuple[float, float]) -> None:
-    """Print what is proved: bounds on the critical cone, and triplets with proved witnesses."""
+    """Print proved bounds on the critical cone, and triplets with proved witnesses."""
     low, high = np.rad2deg(bracket)
     below = f"{low:.3g}° (witness, proved) ≤ " if low > 0.0 else ""
     above = f" ≤ {high:.3g}° (certificate)" if np.isfinite(high) else ""
@@ -113,7 +113,7 @@ def _print_proofs(found: xr.Dataset, bracket: tuple[float, float]) -> None:
 
 
 def _print_witness(found: xr.Dataset) -> None:
-    """One witness in numbers, so that it can be bent again."""
+    """Print one witness with enough digits to reproduce it."""
     apart = found["witness_separation"].isel(witness=0).max("region").to_series().dropna()
     if apart.empty:
         return

@@ -1,4 +1,4 @@
-"""`vibrissa view`: a whisker, a map or a trial in the browser."""
+"""`vibrissa view`: interactive view of a whisker, a map or a trial in the browser."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ def view(
     any_length: bool = False,
     live: str | None = None,
 ) -> None:
-    """Bend a whisker with the mouse and see its signals; look at a map; watch a trial.
+    """Bend a whisker with the mouse and view its signals, or view a map or a trial.
 
     Serves a page on this machine until Ctrl-C. Example: `vibrissa view trial.nc --video top.mp4
     --video front.mp4`
 
-    With --stream HOST:PORT the answers that `vibrissa stream --send udp://HOST:PORT` sends there
+    With --stream HOST:PORT the results that `vibrissa stream --send udp://HOST:PORT` sends there
     are drawn as they arrive. Example: `vibrissa view wire.nc --stream 127.0.0.1:5006`
     """
     kind = "" if path is None else kind_in(path)
@@ -65,5 +65,5 @@ def _served(
     refuse({"--video": videos or None}, "a stream has none")
     whisker = viewed.whisker if isinstance(viewed, vb.ContactMap) else viewed
     if not isinstance(whisker, vb.Whisker):
-        raise ValueError("--stream is of a whisker or its map, and this is a recording")
+        raise ValueError("--stream needs a whisker or its map, and this is a recording")
     return vb.viewer.view_stream(whisker, live, host=host, port=port)

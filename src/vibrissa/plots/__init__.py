@@ -1,4 +1,4 @@
-"""Datasets and arrays to figures, one function each; nothing is solved here."""
+"""Figures of datasets and arrays, one function each; nothing is computed here."""
 
 from vibrissa.plots.array import array_views
 from vibrissa.plots.contact_surfaces import contact_surfaces, solid_slices

@@ -1,7 +1,7 @@
-"""The face, its whiskers, what they touch and where: from above, from the front, from the side.
+"""Figures of a face with its whiskers, objects and contacts: from above, the front and the side.
 
-Of an array of whiskers they are drawn at rest; of a recording, as they are at one moment, with the
-contact points of all of it.
+The whiskers of an array are drawn at rest; those of a recording in one frame, with the contact
+points of all frames.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ _LEFT, _GAP, _BOTTOM, _TOP, _RIGHT = 10.0, 13.0, 8.5, 6.5, 3.0
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """Things that are drawn, mm: at one moment, but for the contact points."""
+    """Objects to draw, mm: those of one frame, and all contact points."""
 
     lines: Array  # (whisker, node, 3)
     names: list[str]
@@ -98,7 +98,7 @@ def array_views(
     contacts: str = "truth",
     width: Width = "double",
 ) -> Figure:
-    """Draw the whiskers of a face, and what they touch, from three sides and in space.
+    """Draw the whiskers of a face and the objects, in three views and in space.
 
     Parameters
     ----------
@@ -163,7 +163,7 @@ def _drawn(scene: _Scene, width: Width) -> Figure:
 
 
 def _finding(scene: _Scene) -> str:
-    """State how many whiskers there are, and how many of them touch."""
+    """Describe the number of whiskers, and of those in contact."""
     touching = [name for name, points in zip(scene.names, scene.points, strict=True) if len(points)]
     if not touching:
         return f"{len(scene.names)} whiskers at rest"
@@ -174,7 +174,7 @@ def _finding(scene: _Scene) -> str:
 
 
 def _panel(axes: Axes, scene: _Scene, limits: Array, view: tuple[int, int], toward: int) -> None:
-    """Draw one view, what is farther away first."""
+    """Draw one view, farther objects first."""
     skull, eyes = head_surfaces(*scene.head)
     middle = scene.head[1] * 1e3
     for thing in scene.objects:
@@ -201,7 +201,7 @@ def _panel(axes: Axes, scene: _Scene, limits: Array, view: tuple[int, int], towa
 
 
 def _flat(axes: Axes, triangles: Array, colour: str, edge: str, order: float) -> None:
-    """Draw triangles (n, 3, 2) in one colour, and the outline of them all."""
+    """Draw triangles (n, 3, 2) in one colour, with their common outline."""
     rim: Any = {"edgecolors": edge, "facecolors": edge, "linewidths": 1.2, "zorder": order}
     axes.add_collection(PolyCollection(list(triangles), **rim), autolim=False)
     fill: Any = {"edgecolors": colour, "facecolors": colour, "linewidths": 0.2}
@@ -214,7 +214,7 @@ def _triangles(thing: xr.Dataset, limits: Array) -> Array:
 
 
 def _space(figure: Figure, box: Box, scene: _Scene, limits: Array) -> None:
-    """Draw all of it in space, what is farther away first."""
+    """Draw all objects in space, farther ones first."""
     view = _AT_REST if not scene.moment else _IN_A_TRIAL
     axes = space_axes(figure, box, limits, view, zoom=1.3, frame=False)
     elevation, azimuth = np.radians(view)
@@ -249,7 +249,7 @@ def _space(figure: Figure, box: Box, scene: _Scene, limits: Array) -> None:
 
 
 def _legend(axes: Axes, scene: _Scene) -> None:
-    """Name the rows in their colours."""
+    """Draw a legend of the rows in their colours."""
     rows = [
         "rows",
         *sorted({Identity.of(name).row for name in scene.names if _colour(name) != INK}),
@@ -275,7 +275,7 @@ def _colour(name: str) -> str:
 
 
 def _scene(tree: xr.DataTree, frame: int | None, contacts: str) -> _Scene | None:
-    """Collect what is to be drawn."""
+    """Collect the objects to draw."""
     root = tree.to_dataset()
     truth = tree.children["truth"].to_dataset() if "truth" in tree.children else root
     held = truth if "centerline" in truth else root
@@ -316,7 +316,7 @@ def _scene(tree: xr.DataTree, frame: int | None, contacts: str) -> _Scene | None
 
 
 def _contacts(tree: xr.DataTree, group: str) -> tuple[Mask, Array]:
-    """Whether (time, whisker) whiskers touch, and where (time, whisker, 3), mm."""
+    """Contact (time, whisker) and contact points (time, whisker, 3), mm."""
     part = tree if group in ("/", "") else tree.children.get(group)
     if part is None or "contact_point" not in part:
         raise ValueError(f"the recording has no contact points in its group {group!r}")

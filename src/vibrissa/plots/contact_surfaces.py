@@ -1,9 +1,9 @@
 """Contacts in the space of three signals: surfaces of equal r, θ and φ (Fig. 3), and slices.
 
-Slices, as in the paper's S1 Fig. C: one signal is held: on the plane of the other two, lines of
-equal r, θ and φ of the contact, and the error of a look-up table. Next to it the whole solid,
-coloured by that error: the third signal, such as the axial force, upward, the moment as components
-M_B cos M_D, M_B sin M_D.
+Slices are drawn as in the paper's S1 Fig. C: one signal is fixed, and the plane of the other two
+shows lines of equal r, θ and φ of the contact, and the error of a look-up table. Next to it the
+whole solid is coloured by that error, with the third signal, such as the axial force, as the height
+and the moment as components M_B cos M_D, M_B sin M_D.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _OPEN = (np.pi, 2.5 * np.pi)
 
 
 class _Panel(NamedTuple):
-    """One of nine."""
+    """One of the nine panels."""
 
     letter: str
     title: str
@@ -124,7 +124,7 @@ def contact_surfaces(
 def _level_sets(
     nodes: Array, name: str, norm: Normalize, marks: list[float]
 ) -> tuple[Array, Array]:
-    """Surfaces on which a coordinate has certain values, and their colours."""
+    """Surfaces of constant values of a coordinate, and their colours."""
     surfaces, hues = [], []
     for mark in marks:
         value = mark / quantity(name).display_factor
@@ -155,7 +155,7 @@ def _places(triangles: Array) -> Array:
 
 
 def levels(name: str, shell: Array) -> tuple[Normalize, list[float]]:
-    """Limits of the colours, and round values for surfaces."""
+    """Limits of the colours, and round values of the surfaces."""
     values = to_display(name, scene.values_of(name, shell))
     low, high = scene.robust_limits(values)
     locator = MaxNLocator(12, steps=[1, 2, 2.5, 5, 10])
@@ -240,7 +240,7 @@ def solid_panels(
     panels: Sequence[style.Box],
     measured: Array,
 ) -> tuple[list[Any], Array]:
-    """Draw the solid of all signals that is near those measured (n, 3) once a panel; its limits."""
+    """Draw the solid of signals near the measured ones (n, 3) in each panel; return its limits."""
     nodes = scene.sample_contacts(samples, centerline)
     within: list[int] = []
     if np.isfinite(measured).all(axis=1).any():
@@ -259,7 +259,7 @@ def solid_panels(
 def course_scales(
     figure: Figure, rails: Sequence[style.Box], coordinates: Array
 ) -> list[tuple[Array, Normalize]]:
-    """Values of r, θ and φ (n, 3) in display units, each with its colours, shown on a bar."""
+    """Values of r, θ and φ (n, 3) in display units, with colours and colour bars."""
     scales = []
     for name, rail, column_of in zip(scene.COORDINATES, rails, coordinates.T, strict=True):
         values = to_display(name, column_of)
@@ -389,7 +389,7 @@ def _title(name: str) -> str:
 
 
 def _lines(axes: Axes, x: Array, y: Array, values: Array, name: str) -> None:
-    """Values in colour, with labelled lines where they are equal."""
+    """Draw values in colour, with labelled contour lines."""
     error = name == "error_distance"
     low, high = robust_limits(values, 0.96)
     if not error and max(abs(low), abs(high)) < _NOTHING and quantity(name).display_unit == "°":
@@ -440,7 +440,7 @@ def _decades(values: Array) -> tuple[float, float]:
 
 
 def _solid(figure: Figure | SubFigure, solid: xr.Dataset, plane: xr.Dataset) -> str:
-    """Draw the solid, and state what its errors are."""
+    """Draw the solid, and describe the errors."""
     names = str(plane.attrs.get("triplet", "Fx MB MD")).split()
     turn = next((n for n in names if n in _CIRCLES and _CIRCLES[n][0] in names), None)
     if turn is None:

@@ -1,4 +1,4 @@
-"""Contacts about the whisker and in the laboratory (Fig. 6), and next to true ones (Fig. 4E)."""
+"""Figures of contacts in the whisker and laboratory frames (Fig. 6), and of errors (Fig. 4E)."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def contact_places(
     colour: Literal["time", "deflection_angle"] = "time",
     width: style.Width = "double",
 ) -> Figure:
-    """Draw contacts in the whisker's frame and in the laboratory, each from two sides.
+    """Draw contacts in the whisker frame and the laboratory frame, in two views each.
 
     In the whisker's frame they lie about the resting whisker, drawn black; in the laboratory, with
     the deflected whisker at some times and a simple head at its base, they gather where the object
@@ -132,7 +132,7 @@ def _sheet(width: style.Width) -> tuple[float, tuple[style.Box, ...], style.Box]
 
 
 def _about(figure: Figure, boxes: Sequence[style.Box], own: Array, line: Array) -> list[Axes]:
-    """Panels about the resting whisker."""
+    """Draw panels with the resting whisker."""
     rest, points = to_display("centerline", line), to_display("contact_point", own)
     limits = _limits(np.concatenate([rest, _inner(points)]))
     found = []
@@ -152,7 +152,7 @@ def _laboratory(
     places: Array,
     bodies: tuple[Sequence[Body], Sequence[Body]],
 ) -> list[Axes]:
-    """Panels with the head, the whisker at some times, and objects."""
+    """Draw panels with the head, the whisker at some times, and objects."""
     points = to_display("contact_point", places)
     lines = _snapshots(course)
     rat = head_of(course)
@@ -178,7 +178,7 @@ def _laboratory(
 
 
 def _snapshots(course: Course) -> Array:
-    """The whisker (m, k, 3) at a few times in contact, mm."""
+    """Whisker (m, k, 3) at a few times in contact, mm."""
     if course.centerline is None:
         return np.full((1, 2, 3), np.nan)
     rows = np.flatnonzero(course.touching & np.isfinite(course.centerline).all(axis=(1, 2)))
@@ -187,7 +187,7 @@ def _snapshots(course: Course) -> Array:
 
 
 def _inner(points: Array) -> Array:
-    """Lowest and highest of all points but the outermost."""
+    """Limits of all points but the outermost."""
     return np.quantile(points, [0.02, 0.98], axis=0)
 
 
@@ -293,13 +293,13 @@ def _usable(
 
 
 def _difference(name: str, true: Array, estimated: Array) -> Array:
-    """Estimate minus truth; of the azimuth, the short way round."""
+    """Estimate minus truth, wrapped for the azimuth."""
     away = estimated - true
     return (away + 180.0) % 360.0 - 180.0 if name == "theta" else away
 
 
 def _range(true: Array, estimated: Array) -> Array:
-    """Limits that hold all that is true and most of the estimates, but not the wildest."""
+    """Limits that include all true values and most of the estimates, but no outliers."""
     low, high = robust_limits(true, share=1.0)
     span = high - low
     least, most = robust_limits(estimated, share=0.95)
@@ -348,17 +348,17 @@ def _errors(
 
 
 def _within(values: Array, limits: tuple[float, float]) -> int:
-    """Share of values between limits, in whole per cent."""
+    """Share of values between limits, as a whole percentage."""
     return round(100.0 * float(np.mean((values >= limits[0]) & (values <= limits[1]))))
 
 
 def _remark(axes: Axes, words: str) -> None:
-    """Write above the upper right corner of a panel."""
+    """Write a text above the upper right corner of a panel."""
     axes.set_title(words, loc="right", fontsize=SMALL, color=MUTED, pad=3.0)
 
 
 def _broken(time: Array, values: Array) -> tuple[Array, Array]:
-    """A line with gaps where no frames are."""
+    """Draw a line with gaps where frames are missing."""
     order = np.argsort(time, kind="stable")
     time, values = time[order], values[order]
     step = np.diff(time)

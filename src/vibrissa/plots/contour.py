@@ -1,9 +1,9 @@
-"""Contact points and the object that they outline (Fig. 6C), and their distances from it.
+"""Figures of contact points with the object they outline (Fig. 6C), and distances from it.
 
 Contact points are on the whisker's centreline, one whisker radius (some 50 µm) off the surface.
-Pegs, cylinders and fitted spheres are drawn in outline. Other objects appear as their section at
-the median position of the contacts, from the side as a silhouette where they are known; a fitted
-surface has its 95 % band about it, and ends where it is not known.
+Pegs, cylinders and fitted spheres are drawn in outline. Other objects are drawn as a section at the
+median position of the contacts, and known ones from the side as a silhouette. A fitted surface is
+drawn with its 95 % band, and ends where it is too uncertain.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ def contour_views(
 
 
 def _conclude(figure: Figure, away: Array, thing: str, look: str) -> None:
-    """State how far contacts are from the surface that was fitted, or is known."""
+    """Describe the distances of contacts from the fitted or known surface."""
     median = np.nanmedian(np.abs(to_display("r", away)))
     style.conclude(
         figure,
@@ -144,7 +144,7 @@ def _conclude(figure: Figure, away: Array, thing: str, look: str) -> None:
 def _draw(
     axes: Axes, body: Body, look: str, view: tuple[int, int], places: Array, limits: Array
 ) -> None:
-    """Draw an object from one side; nothing of a fitted one that lies flat in the picture."""
+    """Draw an object in one view, except for fitted surfaces that face the view."""
     middle = np.median(places, axis=0)
     if is_cylinder(body):
         shown = outline(body, view, float(middle[2]), limits)
@@ -176,7 +176,7 @@ _LOOKS = {"true": _PEG, "fitted": _FITTED}
 
 
 def _limits(places: Array, body: Body | None) -> Array:
-    """Limits (3, 2), mm: as wide along x as along y, and so that what is round fills the view."""
+    """Limits (3, 2), mm, equally wide along x and y, and suitable for round objects."""
     limits = np.array([robust_limits(c) for c in places.T])
     radius = float(to_display("object_radius", getattr(body, "radius", np.nan)))
     if np.isnan(radius):
@@ -194,7 +194,7 @@ def _limits(places: Array, body: Body | None) -> Array:
 def _panels(
     limits: Array, width: style.Width, right: float, above: float
 ) -> tuple[Figure, list[Axes]]:
-    """Three axes, all as tall as the view from above, with room (mm) to the right and above."""
+    """Create three axes as tall as the view from above, with margins to the right and above, mm."""
     page = style.page_width(width)
     across, tall = np.ptp(limits[0]), np.ptp(limits[2])
     size = (page - _LEFT - 2.0 * _GAP - right) / (1.0 + 2.0 * across / tall)
@@ -214,7 +214,7 @@ def _panels(
 
 
 def _ellipses(axes: Axes, places: Array, spread: Array, view: tuple[int, int]) -> None:
-    """95 % ellipses about evenly chosen points, where they are no wider than the view."""
+    """Draw 95 % ellipses of evenly selected points, unless they are wider than the view."""
     i, j = view
     plane = spread[:, [i, j]][:, :, [i, j]]
     chosen = np.flatnonzero(np.isfinite(plane).all(axis=(1, 2)))
@@ -279,7 +279,7 @@ def _legend(
 
 
 def _across(body: Body) -> str:
-    """Diameter of a shape, where it has one."""
+    """Diameter of a shape, if it has one."""
     radius = getattr(body, "radius", None)
     return "" if radius is None else f", {2.0 * float(to_display('object_radius', radius)):.2f} mm"
 

@@ -1,8 +1,8 @@
-"""Trials as movies: what stays is drawn once, what moves is drawn on top of it.
+"""Movies of trials, in which the static background is drawn once.
 
-A figure of three solids takes seconds to draw, a dot in it no time at all. So the figure is drawn
-once and kept as a picture; for every frame the picture is put back and only moving artists are
-drawn, and now and then one of them is drawn into the picture for good.
+A figure of three solids takes seconds to draw, a marker hardly any time. The figure is therefore
+drawn once and stored as a picture; for every frame the picture is restored and only animated
+artists are drawn. Some of these are eventually added to the picture permanently.
 """
 
 from __future__ import annotations
@@ -59,14 +59,14 @@ _DPI = 160.0
 
 
 def screen_figure() -> Figure:
-    """Make the empty figure of a movie."""
+    """Create the empty figure of a movie."""
     figure = style.sized_figure(WIDTH, HEIGHT)
     figure.set_dpi(_DPI)
     return figure
 
 
 class Screen:
-    """A figure of which only some artists move."""
+    """Figure of which only some artists are redrawn in each frame."""
 
     def __init__(self, figure: Figure) -> None:
         self._figure = figure
@@ -77,7 +77,7 @@ class Screen:
         self._background = self._agg.copy_from_bbox(figure.bbox)
 
     def keep(self, artists: Iterable[Artist]) -> None:
-        """Draw artists into all frames from now on."""
+        """Add artists that are drawn in all further frames."""
         self._agg.restore_region(self._background)
         self._draw(artists)
         self._background = self._agg.copy_from_bbox(self._figure.bbox)
@@ -95,7 +95,7 @@ class Screen:
         return buffer.copy()
 
     def pixels(self, axes: Axes) -> tuple[int, int]:
-        """Tell how large a panel is."""
+        """Size of a panel, pixels."""
         return self._place(axes)[2:]
 
     def _place(self, axes: Axes) -> tuple[int, int, int, int]:
@@ -110,14 +110,14 @@ class Screen:
 
 
 def moving_line(axes: Any, **look: Any) -> Line2D:
-    """Add a line that moves."""
+    """Add an animated line."""
     (line,) = axes.plot([], [], animated=True, **look)
     assert isinstance(line, Line2D)
     return line
 
 
 def flat_line(axes: Any, **look: Any) -> Line2D:
-    """Add a line to axes in space that lies on the paper, see :func:`flattened`."""
+    """Add a line to 3D axes in the plane of projection; see :func:`flattened`."""
     line = Line2D([], [], transform=axes.transData, **look)
     line.set_clip_on(False)
     axes.figure.add_artist(line)
@@ -125,7 +125,7 @@ def flat_line(axes: Any, **look: Any) -> Line2D:
 
 
 def flattened(axes: Any, places: Array) -> Array:
-    """Say where places in space lie on the paper."""
+    """Project positions in space to the figure."""
     from mpl_toolkits.mplot3d import proj3d  # type: ignore[import-untyped]
 
     # Matplotlib sets the size of the box of space only while it draws.
@@ -151,7 +151,7 @@ _CONTACT: dict[str, Any] = {
 
 
 class _Part(NamedTuple):
-    """A panel: what moves in it, and where that is in each frame of the trial."""
+    """Panel with animated artists, and their positions in each frame of the trial."""
 
     line: Line2D
     lines: Array
@@ -160,7 +160,7 @@ class _Part(NamedTuple):
 
 
 class _Cloud(NamedTuple):
-    """Points that stay, and where they lie in a panel."""
+    """Static points, and their positions in a panel."""
 
     points: CircleCollection
     places: Array
@@ -176,7 +176,7 @@ _OUTLINES: tuple[dict[str, Any], ...] = (
 
 
 class _Outline:
-    """An outline (n, 2, 2) that appears near contacts."""
+    """Outline (n, 2, 2) that is revealed near contacts."""
 
     def __init__(self, axes: Axes, segments: Array, reach: float, look: dict[str, Any]) -> None:
         self.lines = LineCollection([], animated=True, **look)
@@ -185,7 +185,7 @@ class _Outline:
         self._shown = np.zeros(len(segments), dtype=bool)
 
     def reveal(self, contacts: Array | None) -> None:
-        """Show what is near contacts (n, 2); all of it if there are none."""
+        """Show the part near contacts (n, 2); all of it without contacts."""
         middle = self._segments.mean(axis=1)
         if contacts is None:
             self._shown[:] = True
@@ -196,7 +196,7 @@ class _Outline:
 
 
 class _Sight(NamedTuple):
-    """A panel for what a camera sees, and which part of its images is shown there."""
+    """Panel for a camera view, and the part of its images shown there."""
 
     axes: Axes
     low: Array
@@ -315,7 +315,7 @@ def _contour_frames(
 def _views(
     figure: Figure, course: Course, sights: Sequence[Sight], span: slice
 ) -> tuple[list[_Sight], list[_Part]]:
-    """Panels for what the cameras see."""
+    """Create panels for the camera views."""
     panels, parts = [], []
     views = [sight.view for sight in sights]
     for number, (view, box) in enumerate(zip(views, _SIGHT_BOXES, strict=False)):
@@ -405,12 +405,12 @@ def _sides(
 
 
 def _dot_size(count: int) -> float:
-    """Area of the dots for so many contacts, square points: many are drawn small."""
+    """Area of the markers for a number of contacts, square points."""
     return float(np.clip(7.0 * (300.0 / max(count, 1)) ** 0.7, 1.5, 7.0))
 
 
 def _window(limits: Array, view: tuple[int, int], both: Array) -> Array:
-    """Limits of a panel, and along the line of sight those of the contacts."""
+    """Limits of a panel, and of the contacts along the line of sight."""
     window = limits.copy()
     window[list(view)] = both
     return window

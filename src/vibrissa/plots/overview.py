@@ -1,6 +1,6 @@
-"""A trial at a glance: frames, signals, their trajectory in signal space, estimates (Fig. 4).
+"""Overview of a trial: frames, signals, trajectory in signal space, estimates (Fig. 4).
 
-Views of the cameras are a part of an image with the traced whisker and the contact point.
+Camera views show a part of the image with the traced whisker and the contact point.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _LIGHT = 235
 
 
 class _View(Protocol):
-    """A camera."""
+    """Interface of a camera."""
 
     @property
     def name(self) -> str:
@@ -55,7 +55,7 @@ class Sight(NamedTuple):
 
 
 def seen(course: Course, views: Sequence[_View], number: int) -> tuple[Array, Array]:
-    """Tell where whisker and contact are in the images of a view."""
+    """Positions of whisker and contact in the images of a view."""
     count = len(course.time)
     if number < len(course.traces):
         line = course.traces[number]
@@ -69,7 +69,7 @@ def seen(course: Course, views: Sequence[_View], number: int) -> tuple[Array, Ar
 
 
 def part_of(lines: Array, shape: tuple[float, float], size: tuple[int, int]) -> tuple[Array, Array]:
-    """Choose the part of images in which a whisker moves."""
+    """Part of the images in which a whisker moves."""
     places = lines.reshape(-1, 2)
     places = places[np.isfinite(places).all(axis=1)]
     whole = np.asarray(size, dtype=np.float64)
@@ -86,7 +86,7 @@ def part_of(lines: Array, shape: tuple[float, float], size: tuple[int, int]) -> 
 
 
 class Window:
-    """A part of images, brought to the size of a panel by averaging over areas."""
+    """Part of images, resampled to the size of a panel by area averaging."""
 
     def __init__(
         self, low: Array, high: Array, size: tuple[int, int], panel: tuple[int, int]
@@ -109,7 +109,7 @@ class Window:
 
 
 def _averaging(low: float, high: float, size: int, count: int) -> Any:
-    """Matrix (count, size) of the share of each pixel of an image in each of a panel."""
+    """Matrix (count, size) of the weights of image pixels in the pixels of a panel."""
     from scipy.sparse import csr_matrix
 
     ends = np.linspace(low, high, count + 1) + 0.5
@@ -207,7 +207,7 @@ _CONTACT: dict[str, Any] = {"facecolor": "#f0e442", "edgecolor": "black", "linew
 
 
 class _Sheet(NamedTuple):
-    """Places of the panels, mm."""
+    """Positions of the panels, mm."""
 
     height: float
     sights: tuple[style.Box, ...]
@@ -219,7 +219,7 @@ class _Sheet(NamedTuple):
 
 
 def key_frames(course: Course) -> NDArray[np.intp]:
-    """Choose two frames in contact that show most of a trial."""
+    """Choose two representative frames in contact."""
     rows = np.flatnonzero(course.touching)
     if not rows.size:
         return np.array([0, len(course.time) - 1], dtype=np.intp)
@@ -242,7 +242,7 @@ def trial_overview(
     *,
     width: style.Width = "double",
 ) -> Figure:
-    """Draw a trial: what cameras see, signals and contacts over time, solids, estimates.
+    """Draw a trial: camera views, signals and contacts over time, solids, estimates.
 
     Frames show the traced whisker in red and the contact point. Below the three signals and the
     coordinates of the contact over time, with contact shaded; the trajectory in signal space,
@@ -302,13 +302,13 @@ def trial_overview(
 
 
 def _spans(course: Course, span: slice = slice(None)) -> Array:
-    """When contacts begin and end, s; a frame without a pose of the base does not end one."""
+    """Start and end times of contacts, s; frames without a pose do not end a contact."""
     seen = np.asarray(np.isfinite(course.position).all(axis=1))
     return intervals(course.time[span], course.touching[span], seen[span])
 
 
 def _finding(course: Course) -> str:
-    """State how often and how strongly the whisker touched, and how well that was located."""
+    """Describe number and strength of contacts, and the accuracy of their positions."""
     assert course.signals is not None
     count = len(_spans(course))
     largest = np.nanmax(to_display("MB", course.signals["MB"]), initial=0.0)
@@ -354,7 +354,7 @@ def _images(
     sights: Sequence[Sight],
     rows: NDArray[np.intp],
 ) -> None:
-    """Frame by frame all views."""
+    """Draw all views of the chosen frames."""
     views = [sight.view for sight in sights]
     streams = [iter(sight.images) for sight in sights]
     places = iter(boxes)
@@ -447,7 +447,7 @@ def _letters(figure: Figure, sheet: _Sheet) -> None:
 
 
 class Curve(NamedTuple):
-    """A panel over time, and what is drawn in it last, in display units, over all of the trial."""
+    """Panel over time, and its foreground values in display units, over the whole trial."""
 
     axes: Axes
     values: Array
@@ -515,7 +515,7 @@ def _coordinate(
     column: int,
     true: bool,
 ) -> Array:
-    """Draw a coordinate over time; give what was drawn last."""
+    """Draw a coordinate over time; return the foreground values."""
     shown = np.full(time.size, np.nan)
     limits = []
     known, estimated = points
@@ -540,7 +540,7 @@ def _coordinate(
 
 
 def _ends(values: Array, left_out: float) -> Array:
-    """Lowest and highest value, but for a share at either end; NaN if there are none."""
+    """Limits of the values without a share at either end; NaN if there are none."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return np.full(2, np.nan)
@@ -548,7 +548,7 @@ def _ends(values: Array, left_out: float) -> Array:
 
 
 def curve_legend(figure: Figure, course: Course, place: tuple[float, float]) -> None:
-    """Say what shades, lines and dots of :func:`curves_over_time` mean."""
+    """Draw a legend of the shades, lines and dots of :func:`curves_over_time`."""
     handles: list[Line2D | Patch] = [Patch(facecolor=style.SHADE, label="in contact")]
     if course.known is not None:
         handles.append(Line2D([], [], color=style.MUTED, linewidth=1.6, label=course.known_as))

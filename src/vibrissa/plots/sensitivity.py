@@ -1,4 +1,4 @@
-"""The nine derivatives of the contact point, each over its signal (the paper's Fig. 5)."""
+"""Figure of the nine derivatives of the contact point over the signals (the paper's Fig. 5)."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _LEAST = 0.01  # share of the contacts of a side that a bin needs for its median
 
 @dataclass(frozen=True, eq=False)
 class _Contacts:
-    """Contacts outside the cone about rest, as rows: display units."""
+    """Contacts outside the cone around rest, as rows in display units."""
 
     signals: dict[str, Array]
     derivatives: dict[tuple[str, str], Array]
@@ -111,7 +111,7 @@ def sensitivity_panels(data: xr.Dataset, *, width: style.Width = "double") -> Fi
 
 
 def _finding(contacts: _Contacts) -> str:
-    """State how the median slope in the fifth of smallest signals exceeds that of the largest."""
+    """Describe the ratio of median slopes in the fifths of smallest and largest signals."""
     kept, parts = contacts.weight > 0.0, []
     for name in (n for n in contacts.signals if n not in DIRECTIONS):
         size = np.abs(contacts.signals[name][kept])
@@ -196,12 +196,12 @@ def _quantiles(values: Array, weight: Array, shares: list[float]) -> Array:
 
 
 def _limits(values: Array, weight: Array) -> Array:
-    """Limits that hold the central share of the values; never equal."""
+    """Limits of the central share of the values; never equal."""
     return robust_limits(_quantiles(values, weight, [0.5 - SHARE / 2, 0.5 + SHARE / 2]), 1.0)
 
 
 def _bend(x: Array, weight: Array, direction: bool) -> float | None:
-    """Value from which an axis is logarithmic; None where it stays linear."""
+    """Value above which an axis is logarithmic; None for a linear axis."""
     if direction:
         return None
     low, high = _quantiles(np.abs(x), weight, [0.1, SHARE])

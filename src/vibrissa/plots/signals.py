@@ -1,4 +1,4 @@
-"""The six signals over time, and in the space that a whisker can reach (the paper's Fig. 2)."""
+"""Figures of the six signals over time, and over the reachable space (the paper's Fig. 2)."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def _seen(signals: xr.Dataset) -> Mask | None:
 
 
 def intervals(time: Array, contact: Mask, known: Mask | None = None) -> Array:
-    """Find when contacts begin and end; ``known`` are the frames of which that is known."""
+    """First and last times of contacts; ``known`` marks the frames with data."""
     if time.size < 2:
         return np.empty((0, 2))
     halfway = 0.5 * (time[1:] + time[:-1])
@@ -129,7 +129,7 @@ def _panel(
 
 
 def _drawn(name: str, data: xr.Dataset, contact: Mask | None) -> Array:
-    """Values in display units, of a direction only those in contact."""
+    """Values in display units; directions only in contact."""
     values = to_display(name, data[name])
     return (
         values if name not in DIRECTIONS or contact is None else np.where(contact, values, np.nan)
@@ -154,7 +154,7 @@ _TITLES = {"FD": "direction of $F_T$", "MD": "direction of $M_B$"}
 
 
 class _Sheet(NamedTuple):
-    """Places of the panels."""
+    """Positions of the panels."""
 
     height: float
     space: style.Box
@@ -178,7 +178,7 @@ def signal_clouds(
     elevation: float = ELEVATION,
     azimuth: float = AZIMUTH,
 ) -> Figure:
-    """Draw the space that a whisker can reach, and the six signals over it.
+    """Draw the reachable space of a whisker, and the six signals over it.
 
     The reachable space is seen from aside and from before the tip, and then once for each signal,
     which gives the colour: forces above, moments below. The quarter that faces the viewer is taken
@@ -244,7 +244,7 @@ def signal_clouds(
 
 
 def _finding(nodes: Array) -> str:
-    """State how far contacts and signals reach."""
+    """Describe the ranges of contacts and signals."""
     near, far, push, pull, bend = (
         f"{float(f'{np.quantile(to_display(name, scene.values_of(name, nodes)), share):.2g}'):g}"
         for name, share in (("r", 0.01), ("r", 0.99), ("Fx", 0.01), ("Fx", 0.99), ("MB", 0.99))
@@ -289,7 +289,7 @@ def _reach(
     limits: Array,
     view: tuple[float, float],
 ) -> None:
-    """The reachable space from aside, and from before the tip."""
+    """Draw the reachable space from the side, and from in front of the tip."""
     colours = np.broadcast_to(np.array(_SKIN), (len(triangles), 4))
     left, bottom, width, height = sheet.space
     box = left - 0.03 * width, bottom + 0.5 * (height - width), width, width
@@ -345,7 +345,7 @@ def _pulled(
     line: Array,
     view: tuple[float, float],
 ) -> None:
-    """Inset with only the contacts at which the whisker is pulled, with colours of its own."""
+    """Draw an inset of the contacts that pull the whisker, with its own colours."""
     triangles = scene.solid_surface(nodes, False, scene.column("deflection"), scene.column("Fx"))
     if not len(triangles):
         return
@@ -368,7 +368,7 @@ def _pulled(
 
 
 def _scale(name: str, values: Array) -> tuple[Normalize, Colormap, str]:
-    """Limits and map of the colours of a signal, and which ends of the map are exceeded."""
+    """Limits and colormap of a signal, and the ends of the map that are exceeded."""
     norm, colours = style.scale_of(name, values)
     low, high = norm.vmin or 0.0, norm.vmax or 0.0
     ends = ("neither", "max", "min", "both")[2 * (values.min() < low) + (values.max() > high)]

@@ -1,11 +1,11 @@
-"""Three-dimensional panels: axes to one scale, lit surfaces, and signals in a cylinder.
+"""Three-dimensional panels, and two-dimensional views of objects and heads.
 
-Matplotlib's 3D axes carry no types, hence ``Any``. Surfaces are painted as pixels in a PDF too, so
-that files stay small. The space of (F_x, M_B, M_D) is a cylinder: M_B is the distance from
-the axis, M_D the angle about it, and F_x the height. M_B and F_x are drawn on square-root scales,
-as most contacts are light, and in parallel projection, so that heights can be read off the axis.
+Matplotlib's 3D axes have no type annotations, hence ``Any``. Surfaces are rasterised, also in PDF,
+to keep files small. The space of (F_x, M_B, M_D) is a cylinder: M_B is the distance from the axis,
+M_D the angle around it, and F_x the height. M_B and F_x are drawn on square-root scales, as most
+contacts are light, and in parallel projection, so that heights can be read from the axis.
 
-Objects and a rat's head as they are seen from a side: silhouettes and sections.
+Views of objects and a rat's head show silhouettes and sections.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def space_axes(
 
 
 def name_axes(axes: Any, pads: Sequence[float] = (-9.0, -10.0, -11.0)) -> None:
-    """Write x, y and z at the axes."""
+    """Label the axes x, y and z."""
     for name, pad in zip("xyz", pads, strict=True):
         axis = getattr(axes, f"{name}axis")
         axis.set_label_text(axis_label(name))
@@ -74,7 +74,7 @@ def name_axes(axes: Any, pads: Sequence[float] = (-9.0, -10.0, -11.0)) -> None:
 
 
 def bounds(points: ArrayLike, room: float = 0.02) -> Array:
-    """Limits that hold points and the origin."""
+    """Limits that include points and the origin."""
     places = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     places = np.concatenate([places, np.zeros((1, 3))])
     low, high = np.nanmin(places, axis=0), np.nanmax(places, axis=0)
@@ -90,7 +90,7 @@ def painted(values: Array, norm: Normalize, colours: Colormap) -> Array:
 def paint(
     axes: Any, triangles: Array, colours: ArrayLike, *, opacity: float = 1.0, flat: float = _FLAT
 ) -> None:
-    """Draw lit triangles; those of one call hide each other rightly."""
+    """Draw lit triangles; those of one call occlude each other correctly."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
 
     limits = np.array([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()])
@@ -114,7 +114,7 @@ def paint(
 
 
 def _light(elevation: float, azimuth: float) -> Array:
-    """Toward the light: from above the viewer's left shoulder."""
+    """Direction of the light, from above the viewer's left shoulder."""
     e, a = np.radians(elevation + 25.0), np.radians(azimuth - 30.0)
     return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
 
@@ -142,7 +142,7 @@ def signal_rows(rows: Array) -> Array:
 
 
 def signal_limits(places: Array) -> Array:
-    """Limits of axes that hold places in the cylinder."""
+    """Limits of axes that include positions in the cylinder."""
     reach = float(np.hypot(places[..., 0], places[..., 1]).max()) * 1.02
     low, high = float(places[..., 2].min()), float(places[..., 2].max())
     room = 0.02 * (high - low)
@@ -150,7 +150,7 @@ def signal_limits(places: Array) -> Array:
 
 
 def square(box: Box) -> Box:
-    """Give axes in space, which are square, the room of a panel, and somewhat more."""
+    """Extend square 3D axes somewhat beyond their panel."""
     left, bottom, width, height = box
     side = max(width, height)
     return left + 0.5 * (width - side), bottom - 1.0 + 0.5 * (height - side), side, side
@@ -188,7 +188,7 @@ def signal_axes(figure: Figure, panel: Box, limits: Array) -> Any:
 
 
 def _height_axis(axes: Any, limits: Array) -> None:
-    """The axis of F_x, upright at the left."""
+    """Draw the axis of F_x, vertical at the left."""
     reach, (floor, top) = limits[0, 1], limits[2]
     left = _VIEW[1] - 90.0
     place = _AXIS * reach * _toward(left)
@@ -205,7 +205,7 @@ def _height_axis(axes: Any, limits: Array) -> None:
 
 
 def drop_lines(axes: Any, limits: Array, place: Array) -> None:
-    """Lead from a place in the cylinder to the axis of F_x and to its foot on the floor."""
+    """Draw lines from a position in the cylinder to the axis of F_x and to the floor."""
     axis = _AXIS * limits[0, 1] * _toward(_VIEW[1] - 90.0)
     look = {"color": MUTED, "linewidth": 0.5, "linestyle": (0, (2, 2)), "zorder": 11}
     axes.plot(*np.stack([place, [*axis, place[2]]]).T, **look)
@@ -225,7 +225,7 @@ def _toward(angle: float) -> Array:
 
 
 def _write(axes: Any, angle: float, size: float, height: float, text: str, **look: Any) -> None:
-    """A word in the cylinder, behind what is painted."""
+    """Draw a word in the cylinder, behind the surfaces."""
     plain_look = {"fontsize": SMALL, "ha": "center", "va": "center", "zorder": 0}
     axes.text(*(size * _toward(angle)), height, text, **(plain_look | look))
 
@@ -247,14 +247,14 @@ _FULL = 0.97
 
 
 class Body(Protocol):
-    """An object in the laboratory, m."""
+    """Interface of an object in the laboratory frame, m."""
 
     def signed_distance(self, points: ArrayLike) -> Array:
         """Distances (...) of points (..., 3) from its surface, negative inside."""
 
 
 def draw_body(axes: Axes, body: Body, view: tuple[int, int], limits: Array, look: str) -> None:
-    """Draw the outline of an object, or rather of what of it lies within limits."""
+    """Draw the outline of the part of an object within limits."""
     right, up, nearest = _shadow(body, view, limits)
     if 0.0 < np.mean(nearest < 0.0) < _FULL:
         _draw_zero(axes, right, up, nearest, look)
@@ -270,7 +270,7 @@ def outline_segments(body: Body, view: tuple[int, int], limits: Array) -> Array:
 
 
 def _shadow(body: Body, view: tuple[int, int], limits: Array) -> tuple[Array, Array, Array]:
-    """Least distance from a body, mm, over a grid of lines of sight, and the grid's axes."""
+    """Smallest distance from a body, mm, over a grid of lines of sight, and the grid's axes."""
     i, j = view
     right, up = (np.linspace(limits[n, 0], limits[n, 1], _CELLS) for n in view)
     points: Array = np.zeros((_CELLS, _CELLS, 3))
@@ -279,7 +279,7 @@ def _shadow(body: Body, view: tuple[int, int], limits: Array) -> tuple[Array, Ar
 
 
 def _draw_zero(axes: Axes, right: Array, up: Array, distance: Array, look: str) -> None:
-    """Draw where a distance is negative: filled where it is true, dashed where it is fitted."""
+    """Draw the region of negative distance: filled for a true object, dashed for a fitted one."""
     if look == "true":
         axes.contourf(right, up, distance, [-np.inf, 0.0], colors=["#ececec"], zorder=1)
         axes.contour(right, up, distance, [0.0], colors=[MUTED], linewidths=0.8, zorder=1.5)
@@ -290,7 +290,7 @@ def _draw_zero(axes: Axes, right: Array, up: Array, distance: Array, look: str) 
 
 
 def _nearest(body: Body, points: Array, limits: Array, depth: int) -> Array:
-    """Least distance from a body along lines of sight through points (m, m, 3), mm."""
+    """Smallest distance from a body along lines of sight through points (m, m, 3), mm."""
     rough = np.arange(0, _CELLS, _COARSE)
     corners = points[np.ix_(rough, rough)]
     cell = float(np.ptp(corners[:2, :2].reshape(-1, 3), axis=0).max())
@@ -307,7 +307,7 @@ def _nearest(body: Body, points: Array, limits: Array, depth: int) -> Array:
 
 
 def _marched(body: Body, points: Array, limits: Array, depth: int, deep: float) -> Array:
-    """Least distance from a body along lines of sight through points (n, 3), mm."""
+    """Smallest distance from a body along lines of sight through points (n, 3), mm."""
     start, end = limits[depth]
     least_step = 0.25 * deep
     points = points.copy()
@@ -324,7 +324,7 @@ def _marched(body: Body, points: Array, limits: Array, depth: int, deep: float) 
 
 
 def room_for(places: Array, bodies: Sequence[Body]) -> Array:
-    """Limits, mm, that hold most places, and the objects there as far as they end nearby."""
+    """Limits, mm, that include most positions, and nearby bounded objects."""
     low, high = np.quantile(places, [0.04, 0.96], axis=0)
     half = 0.5 * (high - low)
     near = np.array([[-1.0], [1.0]]) * (2.0 * half.max() + 3.0)
@@ -345,7 +345,7 @@ def room_for(places: Array, bodies: Sequence[Body]) -> Array:
 
 
 def one_scale(limits: Array, views: Sequence[tuple[int, int]], sizes: Sequence[Any]) -> Array:
-    """Widen limits so that panels of given sizes show all of them to one scale."""
+    """Widen limits so that panels of given sizes have the same scale."""
     middle, span = limits.mean(axis=1), np.ptp(limits, axis=1)
     scale = max(
         max(span[i] / wide, span[j] / tall)
@@ -382,7 +382,7 @@ def has_band(body: Body) -> bool:
 
 
 def lies_flat(body: Body, view: tuple[int, int], places: Array) -> bool:
-    """Whether a surface faces the view, so that a section would lie in it."""
+    """Whether a surface faces the view, so that it has no section."""
     normals = getattr(body, "outward_normals", None)
     if normals is None:
         return False
@@ -391,7 +391,7 @@ def lies_flat(body: Body, view: tuple[int, int], places: Array) -> bool:
 
 
 def outline(cylinder: Any, view: tuple[int, int], height: float, limits: Array) -> Array:
-    """Give the outline of a cylinder: from above its section, from the side its silhouette."""
+    """Outline of a cylinder: its section from above, its silhouette from the side."""
     origin = to_display("peg_position", cylinder.origin)
     radius = float(to_display("peg_radius", cylinder.radius))
     axis = np.asarray(cylinder.axis, dtype=np.float64)
@@ -420,7 +420,7 @@ def outline(cylinder: Any, view: tuple[int, int], height: float, limits: Array) 
 def draw_section(
     axes: Axes, body: Body, view: tuple[int, int], depth: float, limits: Array, look: str
 ) -> None:
-    """Draw a section through an object, with its 95 % band where it has one."""
+    """Draw a section through an object, with its 95 % band if it has one."""
     i, j = view
     right, up = (np.linspace(limits[n, 0], limits[n, 1], _SECTION_CELLS) for n in view)
     points: Array = np.empty((_SECTION_CELLS, _SECTION_CELLS, 3))
@@ -449,7 +449,7 @@ _SKIN, _EDGE, _EYE = "#efe6dc", "#a89a8c", "#5a4f45"
 
 
 class Head(NamedTuple):
-    """Place of a head."""
+    """Pose of a head."""
 
     snout: Array
     axes: Array
@@ -505,6 +505,6 @@ def draw_head(axes: Axes, head: Head, view: tuple[int, int]) -> None:
 
 
 def _outline(triangles: Array, view: tuple[int, int]) -> Array:
-    """Hull (n, 2) of what is seen: a head has no hollows."""
+    """Convex hull (n, 2) of the projected head."""
     points = triangles.reshape(-1, 3)[:, list(view)]
     return np.asarray(points[spatial.ConvexHull(points).vertices])

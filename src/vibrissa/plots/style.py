@@ -1,13 +1,13 @@
-"""One look for all figures: sizes, fonts, colours, colormaps, labels, files.
+"""Common style of all figures: sizes, fonts, colours, colormaps, labels, files.
 
 Figures are made for print at the width of one or two columns (85 and 178 mm), with lettering of 6
 to 8 points at that size. Only Matplotlib's object-oriented interface is used: no window opens, no
-global state changes, and a figure is freed with its last name. Colours can be distinguished with
+global state changes, and figures are garbage collected. Colours can be distinguished with
 any colour vision (Okabe & Ito 2008, https://jfly.uni-koeln.de/color/); colormaps are perceptual.
 The cyclic one is a closed curve in OKLab (B. Ottosson 2020,
 https://bottosson.github.io/posts/oklab/) through blue, magenta, yellow and green, at equal steps of
-colour. Its green is light and its magenta dark, so that opposite directions also differ where green
-and red look alike, and nothing is so pale that it is lost on white paper.
+colour. Its green is light and its magenta dark, so that opposite directions also differ for readers
+who do not distinguish green from red, and no colour is too pale for white paper.
 """
 
 from __future__ import annotations
@@ -108,10 +108,10 @@ LOOK: Mapping[str, Any] = MappingProxyType(
 
 
 class _StyledFigure(Figure):
-    """A figure that is drawn with the same settings with which it was made."""
+    """Figure that is drawn with the settings with which it was created."""
 
     above = 0.0
-    """Height of what is written above the panels, mm."""
+    """Height of the text above the panels, mm."""
 
     def draw(self, renderer: RendererBase) -> None:
         """Draw."""
@@ -119,7 +119,7 @@ class _StyledFigure(Figure):
             super().draw(renderer)
 
     def savefig(self, fname: Any, **how: Any) -> None:
-        """Write the panels, and what is written above them."""
+        """Save the figure with the text above its panels."""
         if self.above:
             wide, tall = self.get_size_inches()
             how.setdefault("bbox_inches", Bbox([[0.0, 0.0], [wide, tall + self.above / 25.4]]))
@@ -134,25 +134,25 @@ class _StyledFigure(Figure):
 
 
 def looking() -> AbstractContextManager[None]:
-    """Apply the look of these figures to Matplotlib as long as a ``with`` block lasts."""
+    """Context that applies the style of these figures to Matplotlib."""
     settings: Any = dict(LOOK)
     return mpl.rc_context(settings)
 
 
 def new_figure(width: Width, height: float, layout: Literal["constrained"] | None) -> Figure:
-    """Make an empty figure."""
+    """Create an empty figure."""
     return sized_figure(page_width(width), height, layout)
 
 
 def sized_figure(
     width: float, height: float, layout: Literal["constrained"] | None = None
 ) -> Figure:
-    """Make an empty figure of any size."""
+    """Create an empty figure of any size."""
     return _StyledFigure(figsize=(width / 25.4, height / 25.4), layout=layout)
 
 
 def box_axes(figure: Figure, box: Box, **settings: Any) -> Axes:
-    """Add a panel at a place in mm."""
+    """Add a panel at a position in mm."""
     wide, tall = 25.4 * figure.get_size_inches()
     left, bottom, width, height = box
     return figure.add_axes((left / wide, bottom / tall, width / wide, height / tall), **settings)
@@ -166,19 +166,19 @@ def page_width(width: Width) -> float:
 
 
 def sentence(message: str, width: Width) -> Figure:
-    """Make a figure of one sentence, where there is nothing to draw."""
+    """Create a figure of one sentence, for cases with nothing to draw."""
     figure = new_figure(width, 40.0, None)
     say(figure, message)
     return figure
 
 
 def say(figure: Figure, message: str) -> None:
-    """Write one sentence where there is nothing to draw."""
+    """Write one sentence in a panel with nothing to draw."""
     figure.text(0.5, 0.5, message, ha="center", va="center", color=MUTED, fontsize=LARGE)
 
 
 def conclude(figure: Figure, finding: str) -> None:
-    """Write above a figure, in a sentence, what it shows."""
+    """Write a sentence above a figure that states its main finding."""
     assert isinstance(figure, _StyledFigure)
     wide, tall = 25.4 * figure.get_size_inches()
     lines = [""]
@@ -232,7 +232,7 @@ def force_arrow(axes: Axes, start: Array, end: Array, colour: str, width: float)
 
 
 def limits_around(points: Array, margin: float, narrowest: float) -> Array:
-    """Limits (3, 2) that hold points, none so narrow that its axis could not be read."""
+    """Limits (3, 2) that include points, wide enough for readable axes."""
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     middle, half = 0.5 * (low + high), np.maximum(0.5 * (high - low) + margin, narrowest)
     return np.stack([middle - half, middle + half], axis=1)
@@ -282,7 +282,7 @@ def scale_near_zero(axes: Axes, axis: str, limits: Array, width: float | None) -
 def save(
     figure: Figure, path_stem: str | Path, formats: Sequence[str] = ("png", "pdf")
 ) -> list[Path]:
-    """Write a figure into files.
+    """Write a figure to files.
 
     Parameters
     ----------
@@ -309,7 +309,7 @@ def save(
 
 
 def png(figure: Figure, dots: float = 200.0) -> bytes:
-    """Write a figure into memory.
+    """Write a figure to memory.
 
     Parameters
     ----------
@@ -364,7 +364,7 @@ def _srgb(lab: Array) -> Array:
 
 
 def cyclic() -> Colormap:
-    """Make a colormap for directions over one turn, from −π to π."""
+    """Create a cyclic colormap for directions from −π to π."""
     quarters = np.arange(len(_QUARTERS) + 1)
     curve = CubicSpline(quarters, np.vstack([_QUARTERS, _QUARTERS[:1]]), bc_type="periodic")
     fine = np.linspace(0.0, quarters[-1], 2001)
@@ -377,14 +377,14 @@ def cyclic() -> Colormap:
 
 
 def sequential() -> Colormap:
-    """Make a colormap for what grows from one end, without the pale end lost on white paper."""
+    """Create a sequential colormap without the pale end, which is hardly visible on white."""
     return ListedColormap(
         mpl.colormaps["viridis"](np.linspace(0.0, 0.93, 256)), name="vibrissa_sequential"
     )
 
 
 def diverging() -> Colormap:
-    """Make a colormap for what has a sign."""
+    """Create a diverging colormap for signed quantities."""
     return mpl.colormaps["coolwarm"]
 
 

@@ -1,4 +1,4 @@
-"""Results of a study: which whiskers are unique, how far, and how large errors are."""
+"""Figures of the results of a study: uniqueness, critical cones and errors."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _ROW, _FRAME = 4.4, 20.0  # height of a row of marks, and of what is around the 
 def sweep_overview(
     found: xr.Dataset, *, task: str | None = None, width: style.Width = "double"
 ) -> Figure:
-    """Draw what a task of a study found.
+    """Draw the results of a task of a study.
 
     Of verdicts: a row of panels for each triplet, where the left one shows every whisker by its
     taper and by how much it turns, coloured by the critical cone, and the right one the critical
@@ -62,7 +62,7 @@ def sweep_overview(
 
 
 def drawable(found: xr.Dataset) -> list[str]:
-    """Say what of a study can be drawn."""
+    """List the drawable results of a study."""
     return [
         task
         for task in map(str, found["task"].values)
@@ -82,7 +82,7 @@ def _verdicts(
 def _of_many(
     names: Sequence[str], verdict: NDArray[np.str_], degrees: Array, width: style.Width
 ) -> Figure:
-    """One row a triplet, all whiskers together."""
+    """Draw one row per triplet, with all whiskers together."""
     figure = style.new_figure(width, _FRAME + _ROW * len(names), "constrained")
     axes = figure.subplots()
     _lines(axes, [triplet_label(name) for name in names])
@@ -117,7 +117,7 @@ def _of_few(
     degrees: Array,
     width: style.Width,
 ) -> Figure:
-    """Two panels a triplet: whiskers by their shape, and by their group."""
+    """Draw two panels per triplet: whiskers by shape, and by group."""
     groups = found["group"].values.astype(str)
     rows = list(dict.fromkeys(groups))
     at = np.array([rows.index(group) for group in groups], dtype=int)
@@ -153,7 +153,7 @@ def _of_few(
 
 
 def _chart(axes: Axes, found: xr.Dataset, words: NDArray[np.str_], degrees: Array) -> None:
-    """Every whisker by taper and turn; the widest cones below, so that none hides another."""
+    """Draw whiskers by taper and turning angle, those with the widest cones first."""
     x, y = found["taper_ratio"].values, np.degrees(found["turn"].values)
     size = 9.0 + 15.0 * np.clip(degrees / _CONES[-1], 0.0, 1.0) ** 0.5
     crowded = _crowded(x, y)
@@ -194,7 +194,7 @@ def _lines(axes: Axes, labels: list[str]) -> None:
 
 
 def _spread(axes: Axes, x: Array, words: NDArray[np.str_], line: NDArray[np.int_]) -> None:
-    """Marks along lines, neighbours a little above and below each other."""
+    """Draw marks along lines, with small vertical offsets of neighbours."""
     place = np.argsort(np.argsort(x)) * 2 % 5
     for word, mark in _MARKS.items():
         here = words == word

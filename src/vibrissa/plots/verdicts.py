@@ -1,4 +1,4 @@
-"""Verdicts on triplets of signals (Table A), how finely, and for which whiskers."""
+"""Figures of uniqueness verdicts on triplets (Table A), required resolution, and whiskers."""
 
 from __future__ import annotations
 

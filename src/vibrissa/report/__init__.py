@@ -1,7 +1,8 @@
-"""A trial or a map as one web page that opens offline: what was done, how well, pictures, origin.
+"""Report of a trial or a map as one self-contained web page.
 
-Sections are made by pure functions of datasets; figures are drawn elsewhere and handed in. The page
-loads nothing: pictures, movies and scripts are in the file, and its security policy forbids more.
+The page contains results, errors, figures and provenance. Sections are computed by pure functions
+of datasets; figures are drawn elsewhere and passed in. Pictures, movies and scripts are embedded in
+the file, and its security policy forbids loading anything else.
 """
 
 from vibrissa.report.page import (

@@ -1,6 +1,6 @@
-"""The page itself: sections, tables, figures, movies and the frame about them, as HTML.
+"""HTML of a report: sections, tables, figures, movies and the page around them.
 
-Plain text becomes HTML here and nowhere else; whoever makes a body by hand escapes what is in it.
+Plain text is escaped in this module only; other code that writes HTML must escape its contents.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ import numpy as np
 from vibrissa._version import __version__
 from vibrissa.quantities import shown_unit
 
-# Rule on what the page may load: only what is in it.
+# Security policy of the page: it may use embedded content only.
 _POLICY = (
     "default-src 'none'; img-src data: blob:; media-src data:; style-src 'unsafe-inline'; "
-    # The library that draws in 3D compiles functions.
+    # The 3D drawing library compiles functions.
     "script-src 'unsafe-inline' 'unsafe-eval'"
 )
 _STYLE = Path(__file__).with_suffix(".css").read_text(encoding="utf-8")
@@ -35,7 +35,7 @@ _STYLE = Path(__file__).with_suffix(".css").read_text(encoding="utf-8")
 _CODE = re.compile(r"`([^`]+)`")
 
 
-# Names of sections as they follow each other: results first, settings and origin last.
+# Names of sections in their order: results first, settings and provenance last.
 _ORDER = (
     "results",
     "picture",
@@ -59,14 +59,14 @@ _ORDER = (
 
 
 class Tile(NamedTuple):
-    """A number that stands out, and its meaning, plain text."""
+    """A main number of the report and its meaning, plain text."""
 
     number: str
     meaning: str
 
 
 class Section(NamedTuple):
-    """A part of the page: its name in the page's address, its title, plain text, and its HTML."""
+    """A section of the page: its anchor, its title as plain text, and its HTML."""
 
     name: str
     title: str
@@ -79,7 +79,7 @@ def table(
     caption: str = "",
     note: str = "",
 ) -> str:
-    """Lay out a table; the first column names the rows, and under a heading others are numbers."""
+    """HTML of a table; the first column names the rows, and with a heading others are numbers."""
     kind = ' class="number"' if heading else ""
     parts = [f'<div class="scroll"><table class="{"data" if heading else "facts"}">']
     if caption:
@@ -100,13 +100,13 @@ def table(
 
 
 def paragraph(text: str, kind: str = "") -> str:
-    """Write a paragraph."""
+    """HTML of a paragraph."""
     named = f' class="{kind}"' if kind else ""
     return f"<p{named}>{_marked(text)}</p>"
 
 
 def tiles(numbers: Iterable[Tile]) -> str:
-    """Lay out the main numbers side by side."""
+    """HTML of the main numbers side by side."""
     items = "".join(
         f"<li><b>{escape(one.number)}</b><span>{_marked(one.meaning)}</span></li>"
         for one in numbers
@@ -115,26 +115,26 @@ def tiles(numbers: Iterable[Tile]) -> str:
 
 
 def _marked(text: str) -> str:
-    """Plain text as HTML, with `code`."""
+    """HTML of plain text, in which `code` is marked."""
     return _CODE.sub(r"<code>\1</code>", escape(text))
 
 
 def document(title: str, about: str, sections: Sequence[Section], script: str = "") -> str:
-    """Put a page together.
+    """Assemble a page.
 
     Parameters
     ----------
     title, about : str
-        Plain text: its heading, and a line below.
+        Heading, and a line below it, plain text.
     sections : sequence of Section
-        Parts of the page, in any order: results come first, settings and origin last.
+        Sections of the page, in any order; results are placed first, settings and provenance last.
     script : str
-        JavaScript that sections need, once.
+        JavaScript that the sections share.
 
     Returns
     -------
     str
-        HTML, the whole file.
+        HTML of the complete file.
     """
     sections = sorted(sections, key=lambda s: _ORDER.index(s.name) if s.name in _ORDER else 0)
     links = "".join(f'<li><a href="#{escape(s.name)}">{escape(s.title)}</a></li>' for s in sections)
@@ -155,7 +155,7 @@ def document(title: str, about: str, sections: Sequence[Section], script: str = 
     )
 
 
-# Captions of figures, by name, in the order in which they come.
+# Captions of figures, by name, in their order.
 CAPTIONS = {
     "trial": "The trial at a glance: what the cameras see where the whisker is bent most, signals "
     "and contact over time, the trajectory in the space of signals, and estimated against known "
@@ -207,7 +207,7 @@ def movies_section(movies: Sequence[Path], folder: Path, room: int) -> Section:
     parts = []
     for path in movies:
         name = escape(path.name)
-        # Four characters for three bytes.
+        # Base64 takes four characters for three bytes.
         size = 4 * (path.stat().st_size // 3 + 1)
         if size > room:
             parts.append(_link(path, folder))
@@ -222,14 +222,14 @@ def movies_section(movies: Sequence[Path], folder: Path, room: int) -> Section:
 
 
 def _link(path: Path, folder: Path) -> str:
-    """A link to a movie that is too large to be in the page."""
+    """HTML of a link to a movie that is too large to be embedded."""
     where = Path(os.path.relpath(path, folder)).as_posix()
     size = f"{path.stat().st_size / 1e6:.1f} MB"
     marked_up = paragraph(f"{size}: too large for the page; the file is next to it.", "note")
     return f'<p><a href="{escape(quote(where))}">{escape(path.name)}</a></p>{marked_up}'
 
 
-_LEAST = 1e-5  # smallest error that is stated, in a display unit; nothing is known so well
+_LEAST = 1e-5  # smallest value shown, in the display unit
 
 
 def shown_value(name: str, value: float, digits: int = 4) -> str:
@@ -246,7 +246,7 @@ def shown_value(name: str, value: float, digits: int = 4) -> str:
 
 
 def with_sigma(name: str, value: float, sigma: float) -> tuple[str, str]:
-    """Write an SI value and its standard deviation, both with the decimals that it determines."""
+    """Format an SI value and its standard deviation, with decimals set by the latter."""
     factor, unit = shown_unit(name, value)
     spread = sigma * factor
     if not np.isfinite(value * spread) or spread < _LEAST:
@@ -264,10 +264,10 @@ _EPOCH = "SOURCE_DATE_EPOCH"
 
 
 def provenance_section(command: Sequence[str], inputs: Sequence[Path], seed: int | None) -> Section:
-    """Show what is needed to make a page again.
+    """Section with the information needed to reproduce a page.
 
     The date is that of the environment variable ``SOURCE_DATE_EPOCH``, seconds since 1970 in UTC,
-    if it is set; then the same command gives the same page.
+    if it is set; the same command then gives the same page.
     """
     drawn = "none: no random numbers are used"
     if seed is not None:

@@ -1,7 +1,7 @@
-"""Sections about a trial, what was done with it and how well; and about a map of contacts.
+"""Sections of a report on a trial, with its stages and errors, and on a contact map.
 
-Errors are given where the truth is part of the recording; without it there is
-still what the fits report. What a recording lacks is named with the verb that makes it.
+Errors are stated if the recording contains the truth; otherwise the uncertainties of the fits are.
+Missing stages are named with the command that computes them.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from vibrissa.signals import CIRCULAR, SIGNALS, base_signals, within_turn
 from vibrissa.status import Status, describe
 from vibrissa.whisker import Whisker
 
-# Groups of a recording, and the verbs that make them.
+# Groups of a recording, and the commands that compute them.
 STAGES = {"signals": "signals", "estimates": "estimate", "contour": "reconstruct"}
-# What can be compared.
+# Variables of tracking that are compared with the truth.
 _TRACKED = ("contact_point", "in_contact")
 _FELT = ("force", "moment", "in_contact", "base_rotation")
 _FOUND = ("contact_point", "contact_point_whisker", "in_contact")
@@ -75,7 +75,7 @@ def trial_sections(recording: xr.DataTree, whisker: int = 0, seed: int = 0) -> l
 
 
 def _one(recording: xr.DataTree, name: str, whisker: int) -> xr.Dataset | None:
-    """A group for one whisker."""
+    """Group of a recording for one whisker; None if it does not exist."""
     group = Recording(recording).find(name)
     return None if group is None else group.whisker(whisker).data
 
@@ -87,7 +87,7 @@ def _results(
     whisker: Whisker,
     seed: int,
 ) -> str:
-    """The four numbers of a trial: contacts, their error, the object's size, how well it fits."""
+    """Main numbers of a trial: contacts, their error, the object's size and the misfit."""
     estimates = groups["estimates"]
     if estimates is None:
         missing = "no contacts yet: `vibrissa estimate` adds them"
@@ -119,7 +119,7 @@ def _results(
 def _error_tile(
     estimates: xr.Dataset, truth: xr.Dataset | None, whisker: Whisker, seed: int
 ) -> Tile:
-    """Median error of the contact point: true where the truth is known, else predicted."""
+    """Median error of contact points: actual if the truth is known, otherwise predicted."""
     known = np.isfinite(estimates["contact_point"].values).any()
     if truth is not None and known and not _lacking(_FOUND, estimates, truth, _SPREADS):
         rows, _ = evaluation.error_rows(evaluation.contact_errors(estimates, truth, whisker, seed))
@@ -135,7 +135,7 @@ def _error_tile(
     return Tile(error, "predicted error of the contact point, median")
 
 
-# Settings that are shown, by the attribute that holds them.
+# Labels of settings, by attribute.
 _LABELS = {
     "origin": "origin",
     "source": "source of the signals",
@@ -151,7 +151,7 @@ _LABELS = {
 
 
 def _settings(recording: xr.DataTree) -> str:
-    """Settings of the stages, and which stages are missing."""
+    """Settings of the stages, and missing stages."""
     rows = [
         (f"{group.path.strip('/') or 'recording'}: {label}", _shown_setting(name, value))
         for group in recording.subtree
@@ -171,7 +171,7 @@ def _settings(recording: xr.DataTree) -> str:
 
 
 def _shown_setting(name: object, value: object) -> str:
-    """Write an attribute; what is known to be a signal's size in its unit."""
+    """Format an attribute, with its unit if it is a physical quantity."""
     if name == "felt_above":
         return f"bending moments above {shown_value('MB', float(str(value)), 2)}"
     if name == "signals":
@@ -190,7 +190,7 @@ def _shown_setting(name: object, value: object) -> str:
 
 
 def _one_or_all(name: str, sigma: Array) -> str:
-    """Standard deviations of three components."""
+    """Format the standard deviations of three components, as one value if they are equal."""
     text = [shown_value(name, float(each), 3) for each in sigma]
     return f"{text[0]} each" if len(set(text)) == 1 else ", ".join(text)
 
@@ -202,7 +202,7 @@ def _against_truth(
     whisker: Whisker,
     seed: int,
 ) -> Iterator[Section]:
-    """Sections on stages that can be compared with the truth."""
+    """Yield sections on stages that can be compared with the truth."""
     root, signals, estimates = groups.values()
     assert root is not None
     if "measured" in recording.children:
@@ -259,7 +259,7 @@ def _lacking(
     also_found: Sequence[str] = (),
     also_true: Sequence[str] = (),
 ) -> str:
-    """A note on what is not there to be compared; nothing where all is."""
+    """Note on quantities missing for a comparison; empty if there are none."""
     text = []
     for where, data, also in (
         ("the result", found, also_found),
@@ -318,7 +318,7 @@ def _spread_cells(name: str, values: Array) -> list[str]:
 
 
 def six_rows(signals: xr.Dataset, truth: xr.Dataset) -> list[tuple[str, ...]]:
-    """Sum up the errors of the six signals."""
+    """Rows of a table of the errors of the six signals."""
     both = truth["in_contact"].values.astype(bool) & signals["in_contact"].values.astype(bool)
     detected, true = (base_signals(data["force"], data["moment"]) for data in (signals, truth))
     rows = []
@@ -336,7 +336,7 @@ def six_rows(signals: xr.Dataset, truth: xr.Dataset) -> list[tuple[str, ...]]:
 
 
 def signal_rows(signals: xr.Dataset, truth: xr.Dataset, whisker: Whisker) -> list[tuple[str, ...]]:
-    """Sum up errors of force and moment by deflection angle."""
+    """Rows of a table of the errors of force and moment by deflection angle."""
     angle = evaluation.deflection_angle(truth, whisker)
     rows = []
     for row in evaluation.signal_errors(signals, truth, angle):
@@ -364,7 +364,7 @@ def _detected(estimates: xr.Dataset, truth: xr.Dataset) -> str:
 
 
 def _errors(of_all: Sequence[evaluation.ErrorRow], by_angle: Sequence[evaluation.ErrorRow]) -> str:
-    """Errors of estimated contacts, and what their covariance predicts."""
+    """Table of the errors of estimated contacts, actual and predicted by their covariance."""
     names = (*_SPREAD, "largest", *(f"{name}*" for name in _SPREAD))
     note = "* what the estimates' own covariance predicts"
     all_rows = [(quantity(row.quantity).long_name, *_cells(row)) for row in of_all]
@@ -384,7 +384,7 @@ def _cells(row: evaluation.ErrorRow) -> list[str]:
 
 
 def _contour(recording: xr.DataTree, seed: int) -> str:
-    """The fit with its uncertainty, and how far it and the contacts are from a known object."""
+    """Fitted shape with its uncertainty, and distances from a known object."""
     data = recording["contour"].to_dataset()
     fit = shape_from_dataset(data)
     sigma = fit.sigma
@@ -424,7 +424,7 @@ def _contour(recording: xr.DataTree, seed: int) -> str:
 
 
 def _component_text(name: str, values: Array) -> str:
-    """A number, or a vector in parentheses with its size."""
+    """Format a number, or a vector in parentheses with its length."""
     if values.ndim == 0:
         return shown_value(name, float(values), 2)
     each = ", ".join(shown_value(name, float(value), 2) for value in values)
@@ -432,7 +432,7 @@ def _component_text(name: str, values: Array) -> str:
 
 
 def _distances(recording: xr.DataTree, seed: int) -> str:
-    """Distances of contacts from the object that is known."""
+    """Distances of contacts from the known object."""
     trial = Recording(recording)
     estimates = trial.find("estimates")
     if estimates is None or "contact_covariance" not in estimates or not trial.objects:
@@ -459,7 +459,7 @@ def _distances(recording: xr.DataTree, seed: int) -> str:
 
 
 def _events(recording: xr.DataTree) -> str:
-    """Onset, loss and slip of contacts of all whiskers, with their times."""
+    """Table of onset, loss and slip of all whiskers, with their times."""
     group = Recording(recording).find("estimates")
     found = [] if group is None else sorted(events_in(group.data))
     rows = []
@@ -489,7 +489,7 @@ def _statuses(groups: dict[str, xr.Dataset | None]) -> str:
 
 
 def whiskers_table(recording: xr.DataTree, chosen: int) -> str:
-    """Table of the whiskers that touched, for how long and with which force."""
+    """Table of the whiskers in contact, with duration and force."""
     names = [str(name) for name in recording.coords["whisker"].values]
     touching = contacts_by_whisker(recording)
     force = Recording(recording).root.get("force")
@@ -512,7 +512,7 @@ def whiskers_table(recording: xr.DataTree, chosen: int) -> str:
 
 
 def contacts_by_whisker(recording: xr.DataTree) -> NDArray[np.int64]:
-    """Count frames in contact, from the first of estimates, signals, tracking and truth."""
+    """Frames in contact of each whisker, from estimates, signals, tracking or truth."""
     trial = Recording(recording)
     for group in map(trial.find, ("estimates", "signals", "", "truth")):
         if group is not None and "in_contact" in group:
@@ -521,7 +521,7 @@ def contacts_by_whisker(recording: xr.DataTree) -> NDArray[np.int64]:
 
 
 def tracked_table(root: xr.Dataset) -> str:
-    """Table of what tracking found, with its own standard deviations."""
+    """Table of the results of tracking, with their standard deviations."""
     touching = root["in_contact"].values.astype(bool)
     rows = [
         ("frames", str(touching.size)),
@@ -544,7 +544,7 @@ def tracked_table(root: xr.Dataset) -> str:
 
 
 def chart_sections(contact_map: ContactMap, verdicts: xr.Dataset | None = None) -> list[Section]:
-    """Describe a contact map, and which signals locate its contacts."""
+    """Sections on a contact map and on the signals that locate its contacts."""
     about = Section("map", "The map", contact_map._repr_html_() + _ranges(contact_map.to_dataset()))
     if verdicts is None:
         advice = paragraph(
@@ -584,7 +584,7 @@ def _verdicts(verdicts: xr.Dataset) -> str:
 
 
 def _witnesses(verdicts: xr.Dataset) -> str:
-    """The farthest pair of contacts with the same signals, by triplet."""
+    """Table of the most distant pair of contacts with the same signals, by triplet."""
     if "witness_separation" not in verdicts:
         return ""
     apart = verdicts["witness_separation"].transpose("triplet", "region", "witness").values

@@ -1,7 +1,7 @@
-"""Whiskers, contacts and objects as a picture in 3D that can be turned.
+"""Interactive 3D figures of whiskers, contacts and objects.
 
-Numbers are in mm, in the laboratory frame for a trial and in the whisker's for a map. The drawing
-library is an extra: it is loaded here only, and its script goes into the page once.
+Coordinates are in mm, in the laboratory frame for a trial and in the whisker frame for a map. The
+drawing library is optional: it is imported in this module only, and its script is embedded once.
 """
 
 from __future__ import annotations
@@ -30,36 +30,36 @@ _NODES = 101  # number of points of a whisker
 # Number of bent whiskers that are drawn.
 _MOST_POINTS = 4000
 _SHAPES = 7
-_ROOM = 0.15  # left about the contacts, as a share of their extent
+_ROOM = 0.15  # margin around the contacts, as a share of their extent
 _CAMERA = {"eye": {"x": 1.65, "y": -1.8, "z": 1.05}, "center": {"x": 0.0, "y": 0.0, "z": -0.12}}
 
 
 def can_draw() -> bool:
-    """Check whether the drawing library is installed."""
+    """Whether the drawing library is installed."""
     return find_spec("plotly") is not None
 
 
 def in_space(result: Any) -> Any:
-    """Draw a result as a picture in 3D that can be turned, such as in a notebook.
+    """Draw a result as an interactive 3D figure, as in a notebook.
 
     Parameters
     ----------
     result : Whisker, Deflection, ContactMap or DataTree
-        Whisker at rest; whisker bent by loads, of which some are drawn, with all contacts; all
-        contacts that a whisker can hold, coloured by the bending moment; or a recording, whose
-        first whisker is drawn with its contact points and the objects, known and fitted.
+        Whisker at rest; bent whiskers, of which some are drawn, with all contacts; all stable
+        contacts of a whisker, coloured by the bending moment; or a recording, whose first whisker
+        is drawn with its contact points and the known and fitted objects.
 
     Returns
     -------
     plotly.graph_objects.Figure
-        Picture, which a notebook shows by itself; axes in mm.
+        Figure with axes in mm, which notebooks display.
 
     Raises
     ------
     ModuleNotFoundError
         If Plotly is not installed.
     ValueError
-        If it is none of these, or there are no contacts to be drawn.
+        If ``result`` is none of these, or there are no contacts to draw.
     """
     if not can_draw():
         raise ModuleNotFoundError(NO_SPACE)
@@ -92,7 +92,7 @@ def _bent_in_space(bent: Deflection) -> Any:
 
 
 def trial_in_space(trial: xr.DataTree, course: Course) -> Any:
-    """Draw contact points of a recording with its objects, known and fitted."""
+    """Draw contact points of a recording with its known and fitted objects."""
     things = trial["objects"].children.values() if "objects" in trial.children else ()
     fits = []
     if "contour" in trial.children:
@@ -103,13 +103,13 @@ def trial_in_space(trial: xr.DataTree, course: Course) -> Any:
 def _contacts_in_space(
     course: Course, objects: Sequence[xr.Dataset], fits: Sequence[FittedShape]
 ) -> Any:
-    """Draw contact points in the laboratory with the object, as known and as fitted."""
+    """Draw contact points in the laboratory frame with known and fitted objects."""
     import plotly.graph_objects as go
 
     places = course.places
     known = np.zeros(0, bool) if places is None else np.isfinite(places).all(axis=-1)
     if places is None or not known.any():
-        raise ValueError("there are no contact points to be drawn")
+        raise ValueError("there are no contact points to draw")
     points = 1e3 * places[known]
     drawn = [_points(points, "time", course.time[known], f"{course.places_as} contacts")]
     limits = _limits(points)
@@ -139,7 +139,7 @@ def _contacts_in_space(
 
 
 def reachable_space(samples: xr.Dataset, centerline: Array) -> Any:
-    """Draw all contacts that a whisker can hold, coloured by the bending moment.
+    """Draw all stable contacts of a whisker, coloured by the bending moment.
 
     Parameters
     ----------
@@ -151,20 +151,20 @@ def reachable_space(samples: xr.Dataset, centerline: Array) -> Any:
     Returns
     -------
     plotly.graph_objects.Figure
-        Axes in mm.
+        Figure with axes in mm.
     """
     points = 1e3 * samples["contact_point"].transpose(..., "space").values.reshape(-1, 3)
     values = samples["MB"].values.reshape(-1)
     known = np.isfinite(points).all(axis=1) & np.isfinite(values)
     both = np.column_stack([points[known], values[known]])
-    # Any even choice will do, but not one that follows the grid.
+    # A random choice avoids patterns due to the grid.
     both = thinned(np.random.default_rng(0).permutation(both), _MOST_POINTS)
     drawn = [_points(both[:, :3], "MB", both[:, 3], "contacts")]
     return _framed([*drawn, *_whiskers(centerline[None], "resting whisker")], "whisker")
 
 
 def space_section(figure: Any, about: str) -> tuple[Section, str]:
-    """Put a picture into the page."""
+    """Section with an interactive figure, and its script."""
     from plotly.offline import get_plotlyjs
 
     drawn = figure.to_html(
@@ -180,7 +180,7 @@ def space_section(figure: Any, about: str) -> tuple[Section, str]:
 
 
 def _points(points: Array, name: str, values: Array, label: str) -> Any:
-    """Dots coloured by a quantity, SI units."""
+    """Markers coloured by a quantity in SI units."""
     import plotly.graph_objects as go
 
     known = quantity(name)
@@ -196,7 +196,7 @@ def _points(points: Array, name: str, values: Array, label: str) -> Any:
 
 
 def _triangles(vertices: Array, faces: Ints, label: str) -> Any:
-    """A surface, mm."""
+    """Triangulated surface, mm."""
     import plotly.graph_objects as go
 
     (x, y, z), (i, j, k) = vertices.T, faces.T
@@ -206,7 +206,7 @@ def _triangles(vertices: Array, faces: Ints, label: str) -> Any:
 
 
 def _whiskers(lines: Array, label: str = "whisker", colour: str = "#a0522d") -> list[Any]:
-    """Some of the whiskers (n, k, 3), m."""
+    """Lines of some of the whiskers (n, k, 3), m."""
     import plotly.graph_objects as go
 
     some = thinned(lines[np.isfinite(lines).all(axis=(1, 2))], _SHAPES)
@@ -231,14 +231,14 @@ def _whiskers(lines: Array, label: str = "whisker", colour: str = "#a0522d") -> 
 
 
 def _limits(points: Array) -> Array:
-    """Limits of the view (3, 2), with room about the points."""
+    """Limits of the view (3, 2), with a margin around the points."""
     low, high = points.min(axis=0), points.max(axis=0)
     room = _ROOM * max(float((high - low).max()), 1.0)
     return np.stack([low - room, high + room], axis=1)
 
 
 def _framed(drawn: list[Any], frame: str) -> Any:
-    """Put things into axes of one scale."""
+    """Figure with axes of equal scale."""
     import plotly.graph_objects as go
 
     titles = {f"{axis}axis": {"title": {"text": f"{axis} (mm)"}} for axis in "xyz"}

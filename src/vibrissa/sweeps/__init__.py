@@ -1,4 +1,4 @@
-"""Studies of many whiskers: plain data in, one labelled store out, on one machine or many."""
+"""Studies of many whiskers on one machine or a cluster, with results in one labelled store."""
 
 from vibrissa.sweeps.run import (
     Outcome as Outcome,

@@ -1,14 +1,13 @@
-"""A run of a study, on this machine or on a cluster, and its results so far.
+"""Execution of a study on this machine or on a cluster, and reading of its results.
 
-One process, the one that calls, writes; others only compute. So results do not depend on how many
-there are, nor on which of them did what. At any time only as many cells are under way as keep the
-workers busy, and nothing is kept of those that are written: memory does not grow with the study.
+Only the calling process writes; worker processes only compute. Results therefore do not depend on
+the number of workers or on the assignment of cells. Only as many cells are in progress as keep the
+workers busy, and results are discarded once written, so that memory does not grow with the study.
 
-Each process of this machine has one cell at a time and a pipe of its own. So when one dies it is
-known which cell it had, and no other is touched; and when the calling process is killed, its
-workers end too.
+Each local worker has its own pipe and computes one cell at a time. If a worker dies, its cell is
+known and no other is affected; if the calling process is killed, its workers end too.
 
-Results are read as one dataset, with failures and a summary in a few lines.
+Results are read as one dataset; failures and a short summary are available separately.
 """
 
 from __future__ import annotations
@@ -60,22 +59,23 @@ def open_sweep(path: str | PathLike[str]) -> xr.Dataset:
     Parameters
     ----------
     path : str or path
-        Store of the study; it may be written to meanwhile.
+        Store of the study, which another process may be writing.
 
     Returns
     -------
     Dataset
-        Over ``whisker`` and the dimensions of the tasks. Variables are named after their task and
-        their name, ``uniqueness_verdict``; verdicts are words. A dimension along which a task has
-        other values than one before it has the task's name before its own. With them the numbers
-        that describe every whisker, and over ``task`` ``seconds``, ``status``: 0 not done, 1 done,
-        2 failed, 3 damaged, −1 not asked, and ``origin``, the number of the code, in the attribute
-        ``origins``, that found it. NaN, or an empty word, where nothing is known.
+        Results over ``whisker`` and the dimensions of the tasks. Variables are named after task and
+        variable, as ``uniqueness_verdict``; verdicts are words. If a task's coordinates along a
+        dimension differ from those of an earlier task, the name of the dimension is prefixed by
+        that of the task. The dataset also contains the properties of every whisker and, over
+        ``task``, ``seconds``, ``status`` (0 not done, 1 done, 2 failed, 3 damaged, −1 not
+        requested) and ``origin``, the index in the attribute ``origins`` of the code that computed
+        the result. Missing values are NaN or empty words.
 
     Raises
     ------
     ValueError
-        If it is not a store, or so damaged that it cannot be read.
+        If it is not a store, or too damaged to be read.
     """
     path = Path(path)
     kept = described(path, (LAYOUT, *OLD_LAYOUTS))
@@ -112,7 +112,7 @@ def _records(path: Path, kept: dict[str, Any], names: list[str], groups: list[st
     seconds, origin = np.full(shape, np.nan), np.full(shape, -1, dtype=np.int16)
     numbers = {name: np.full(len(names), np.nan) for name in DESCRIBED}
     found = {}
-    # First, for a cell may be done while this is read.
+    # Failures are read first, as cells may be completed during reading.
     failed = list(read_failures(path))
     for k, task in enumerate(tasks):
         if (cells := Cells.read(path, task, len(names))) is None:
@@ -132,7 +132,7 @@ def _records(path: Path, kept: dict[str, Any], names: list[str], groups: list[st
 
 
 def _arrays(path: Path, kept: dict[str, Any], names: list[str], groups: list[str]) -> _Read:
-    """Read a store of before, a Zarr group for each task, without looking for damage in it."""
+    """Read a store of the old layout, a Zarr group per task, without checking for damage."""
     cells, whiskers = (_group(path / name) for name in ("cells", "whiskers"))
     status = cells["status"].values.astype(np.int8)
     some = (status == DONE).any(axis=1)
@@ -153,10 +153,10 @@ def _arrays(path: Path, kept: dict[str, Any], names: list[str], groups: list[str
 
 
 def _group(path: Path) -> xr.Dataset:
-    """A group of a store of before, as it is stored."""
+    """Group of a store of the old layout, as stored."""
     try:
         data: xr.Dataset = xr.open_zarr(path, chunks=None, decode_cf=False).load()
-    except Exception as fault:  # of a damaged file, libraries raise whatever they meet
+    except Exception as fault:  # the libraries' errors for damaged files are not documented
         raise ValueError(f"{path} is damaged: {' '.join(str(fault).split())[:200]}") from fault
     for each in data.variables.values():
         each.attrs.pop("_FillValue", None)
@@ -166,7 +166,7 @@ def _group(path: Path) -> xr.Dataset:
 def _worded(
     values: NDArray[Any], attributes: Mapping[Any, Any]
 ) -> tuple[NDArray[Any], dict[str, Any]]:
-    """Words in place of flags, and the attributes that remain."""
+    """Convert flags to words; also return the remaining attributes."""
     about = {str(key): one for key, one in attributes.items() if not str(key).startswith("flag_")}
     if meanings := attributes.get("flag_meanings"):
         words = [word.replace("_", " ") for word in meanings.split()]
@@ -175,7 +175,7 @@ def _worded(
 
 
 def _results(cells: Cells) -> xr.Dataset:
-    """Results of one task, of all whiskers; words in place of flags."""
+    """Results of one task for all whiskers, with flags converted to words."""
     data: dict[str, Any] = {}
     for name, (dims, _, kind, attributes) in cells.layout.variables.items():
         values = cells.column("result", name, fill=-1 if kind == "<i1" else np.nan)
@@ -185,7 +185,7 @@ def _results(cells: Cells) -> xr.Dataset:
 
 
 def _differing(out: xr.Dataset, found: xr.Dataset, task: str) -> dict[str, str]:
-    """New names for dimensions along which a task has other values than those before it."""
+    """New names for dimensions along which a task's coordinates differ from earlier ones."""
     return {
         str(dim): f"{task}_{dim}"
         for dim in found.dims
@@ -194,7 +194,7 @@ def _differing(out: xr.Dataset, found: xr.Dataset, task: str) -> dict[str, str]:
 
 
 def failures(path: str | PathLike[str]) -> dict[str, str]:
-    """Read which cells failed, and why.
+    """Read the failed cells and their errors.
 
     Parameters
     ----------
@@ -204,8 +204,8 @@ def failures(path: str | PathLike[str]) -> dict[str, str]:
     Returns
     -------
     dict
-        Whisker's name and traceback by task and number of the whisker, such as ``uniqueness-12``;
-        of cells that have not been done since.
+        Name of the whisker and traceback, by task and number of the whisker, as
+        ``uniqueness-12``, of failed cells that have not been completed since.
     """
     path = Path(path)
     kept = described(path, (LAYOUT, *OLD_LAYOUTS))
@@ -222,7 +222,7 @@ def failures(path: str | PathLike[str]) -> dict[str, str]:
 
 
 def sweep_summary(found: xr.Dataset) -> str:
-    """Summarise how far a study is, and what it found."""
+    """Summary of the progress and the results of a study, as text."""
     return "\n".join(_lines(found))
 
 
@@ -290,9 +290,9 @@ def _errors(rows: xr.Dataset, task: str, group: str) -> Iterator[str]:
 
 Answers = Generator[tuple[Cell, dict[str, Any]], None, None]
 
-_TRIES = 2  # a cell whose process dies may not be to blame: somebody killed it, or memory ran out
-_STARTS = 3  # processes that may die, one after the other, before they are ready
-# Cells under way for each worker of a cluster.
+_TRIES = 2  # attempts for a cell whose process dies, as the cell may not be the cause
+_STARTS = 3  # successive processes that may die before they are ready
+# Cells in progress for each worker of a cluster.
 _PROCESS_DIED = (
     f"the process that worked on this cell died, {_TRIES} times: killed, or out of memory\n"
 )
@@ -310,7 +310,7 @@ class _Worker:
 
 
 def answers_by_processes(cells: Iterable[Cell], workers: int) -> Answers:
-    """Answers from processes on this machine."""
+    """Yield the results of cells computed by processes on this machine."""
     waiting, again = iter(cells), deque[Cell]()
     deaths: Counter[tuple[str, int]] = Counter()
     stillborn = 0
@@ -344,7 +344,7 @@ def answers_by_processes(cells: Iterable[Cell], workers: int) -> Answers:
                     worker.ready, stillborn = True, 0
                     continue
                 done = worker.cell
-                # It continues before the answer is handled.
+                # The worker gets its next cell before the result is handled.
                 if (cell := _next(again, waiting)) is not None:
                     worker.cell = cell
                     _send(worker)
@@ -361,7 +361,7 @@ def _next(again: deque[Cell], waiting: Iterator[Cell]) -> Cell | None:
 
 
 def _context() -> Any:
-    """Processes that begin alike; where fork is safe, from one that has imported all they need."""
+    """Context for starting processes: a fork server with all imports, or spawn."""
     if sys.platform != "linux":
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
@@ -381,7 +381,7 @@ def _hire(cell: Cell) -> _Worker:
 
 
 def _send(worker: _Worker) -> None:
-    with contextlib.suppress(OSError):  # it died: its end of the pipe is closed
+    with contextlib.suppress(OSError):  # the worker has died and closed its end of the pipe
         worker.pipe.send(worker.cell)
 
 
@@ -401,8 +401,8 @@ def _check_start(count: int, worker: _Worker) -> None:
 
 
 def _work(pipe: Connection) -> None:
-    """Do what comes, until killed."""
-    # Ctrl-C goes to all processes of a terminal; the one that called handles it.
+    """Compute cells received from a pipe until killed."""
+    # Ctrl-C reaches all processes of a terminal, and is handled by the calling one.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_follow_parent, daemon=True).start()
     os.environ["VIBRISSA_THREADS"] = "1"  # there are other workers
@@ -412,7 +412,7 @@ def _work(pipe: Connection) -> None:
 
 
 def _follow_parent() -> None:
-    """End when the process that called is gone."""
+    """End this process when the calling process has ended."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         wait([parent.sentinel])
@@ -420,7 +420,7 @@ def _follow_parent() -> None:
 
 
 def answers_by_dask(cells: Iterable[Cell], scheduler: str, workers: int) -> Answers:
-    """Answers from a Dask cluster."""
+    """Yield the results of cells computed by a Dask cluster."""
     try:
         from distributed import Client, LocalCluster
     except ModuleNotFoundError as missing:
@@ -448,7 +448,7 @@ def answers_by_dask(cells: Iterable[Cell], scheduler: str, workers: int) -> Answ
                 killed.append(cell)
             else:
                 yield cell, found
-        # A worker that dies takes others' cells with it: who is to blame shows when it is alone.
+        # A dying worker loses all its cells: each is computed alone to find the cause.
         for suspect in killed:
             for cell, found in _submitted(client, scheduler, [suspect]):
                 yield cell, found or {"failure": _WORKERS_DIED, "seconds": float("nan")}
@@ -462,7 +462,7 @@ def answers_by_dask(cells: Iterable[Cell], scheduler: str, workers: int) -> Answ
 def _submitted(
     client: Any, scheduler: str, cells: Iterable[Cell]
 ) -> Iterator[tuple[Cell, dict[str, Any] | None]]:
-    """Answers, as they come; None for a cell with which workers died."""
+    """Yield results as they arrive; None for a cell whose workers died."""
     from concurrent.futures import CancelledError
 
     from distributed import as_completed
@@ -474,7 +474,7 @@ def _submitted(
     def submit() -> None:
         if (cell := next(waiting, None)) is None:
             return
-        # Never the same again: Dask would give the old answer to a question that failed before.
+        # Keys are unique, as Dask would return the old result for the key of a failed cell.
         key = f"{cell.task}-{cell.index}-{uuid.uuid4().hex}"
         asked[key] = cell
         under_way.add(client.submit(answer, cell, key=key))
@@ -490,13 +490,13 @@ def _submitted(
             yield cell, None
         except (CancelledError, OSError) as fault:
             raise ValueError(
-                f"the Dask scheduler at {scheduler} is gone. What is written is whole; the same "
-                "call goes on from it"
+                f"the Dask scheduler at {scheduler} is gone. All written results are intact; the "
+                "same call continues from them"
             ) from fault
 
 
 def _check_workers(client: Any, scheduler: str) -> None:
-    """Whether there are workers that compute as this process does."""
+    """Raise ValueError unless there are workers with the same code and libraries."""
     try:
         client.wait_for_workers(1, timeout=_PATIENCE)
     except TimeoutError:
@@ -512,10 +512,10 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of a run: numbers of cells, and parts of the store that were damaged and made anew.
+    """Numbers of cells in a run, and damaged parts of the store that were replaced.
 
-    Of cells done now, of those of them that failed, and of those that were there before: skipped,
-    or with a failure, or damaged, which were done again.
+    Counted are cells computed now, failed ones among them, and existing ones: skipped, failed
+    earlier, or damaged and computed again.
     """
 
     done: int
@@ -536,26 +536,27 @@ def run_sweep(
     any_version: bool = False,
     progress: Progress | None = None,
 ) -> Outcome:
-    """Do the cells of a study that are not done yet, and those that were damaged since.
+    """Compute the cells of a study that are missing or damaged.
 
     Parameters
     ----------
     study : Study
-        The study.
+        Study to run.
     path : str or path
-        Store for its results; it also gets all of them as a Zarr group ``results`` at the end.
+        Store for the results, to which they are also written as a Zarr group ``results`` at the
+        end.
     workers : int
-        Number of processes on this machine; 0 does everything in this one. A script that asks
-        for any calls this under ``if __name__ == "__main__"``.
+        Number of processes on this machine; 0 computes in the calling process. A script with
+        workers must call this function under ``if __name__ == "__main__"``.
     scheduler : str, optional
         Address of a Dask scheduler, or "local" for a Dask cluster with ``workers`` processes on
         this machine (extra ``cluster``).
     again : bool
-        Whether cells that failed before are tried again.
+        Whether cells that failed earlier are computed again.
     any_version : bool
-        Whether a store that another version of vibrissa began is continued.
+        Whether to continue a store started by another version of vibrissa.
     progress : callable, optional
-        Function called as ``progress(done, total)``, cells that were there before included.
+        Function called as ``progress(done, total)``, including existing cells.
 
     Returns
     -------
@@ -565,10 +566,10 @@ def run_sweep(
     Raises
     ------
     ValueError
-        If the store is of another study or version or being written to, or there is no such
-        scheduler.
+        If the store is that of another study or version, another run is writing to it, or there is
+        no such scheduler.
     OSError
-        If a result cannot be written (what was written before is whole), or no process started.
+        If a result cannot be written (earlier results remain intact), or no process started.
     """
     if workers < 0:
         raise ValueError(f"workers is {workers}; 0 or more are needed")

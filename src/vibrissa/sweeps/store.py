@@ -1,14 +1,14 @@
-"""Store of a study's results: one record a cell, appended to the file of its task.
+"""Store of a study's results: one record per cell, appended to the file of its task.
 
-    .study.json      what the study is, and which codes computed
-    TASK.json        what a result of the task looks like: variables, dimensions, coordinates
-    TASK.cells       records of the cells that are done, all of one size
-    failures.jsonl   a line for each cell that failed
-    results/         what :func:`~vibrissa.sweeps.open_sweep` gives, as Zarr, after each run
+    .study.json      description of the study, and of the codes that computed results
+    TASK.json        layout of a result of the task: variables, dimensions, coordinates
+    TASK.cells       records of completed cells, all of the same size
+    failures.jsonl   one line per failed cell
+    results/         dataset of :func:`~vibrissa.sweeps.open_sweep` as Zarr, written after each run
 
-A record or line is appended whole and carries a CRC-32 of itself. The part of one that a killed run
-left at the end of a file is ignored, and cut off by the next run; one that was damaged since is
-found by its checksum, and its cell is done again. Descriptions are written aside and renamed.
+Records and lines contain their CRC-32. An incomplete record that a killed run left at the end of a
+file is ignored, and removed by the next run; a damaged record is detected by its checksum, and its
+cell is computed again. Descriptions are written to a temporary file and renamed.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from vibrissa._version import __version__
 from vibrissa.sweeps.study import Cell, Study
 
 NOT_ASKED, TO_DO, DONE, FAILED, DAMAGED = -1, 0, 1, 2, 3  # statuses of cells
-# Numbers that describe every whisker, and their units.
+# Numeric properties of every whisker, and their units.
 DESCRIBED = {
     "length": "m",
     "base_radius": "m",
@@ -46,25 +46,25 @@ DESCRIBED = {
     "youngs_modulus": "Pa",
     "turn": "rad",
 }
-# Layouts that can be read but not written to: a Zarr group for each task.
+# Old layouts, with a Zarr group per task, which can be read but not written.
 _STUDY, _LOCK, _FAILURES, RESULTS = ".study.json", ".sweep.lock", "failures.jsonl", "results"
 LAYOUT = 4
 OLD_LAYOUTS = (2, 3)
 _SUM = "checksum"
 _LIBRARIES = ("numpy", "scipy", "numba")
-# Modules that compute a cell; results depend on them and on the packages that they import.
+# Modules that compute a cell; results depend on these and the packages that they import.
 _COMPUTING = ("study", "tasks")
 _SOURCES = {".csv", ".py", ".toml"}
 _IMPORTED = re.compile(r"(?:from|import) vibrissa\.(\w+)")
 
 
 class Busy(ValueError):
-    """Another run writes to the store."""
+    """Error raised if another run is writing to the store."""
 
 
 @cache
 def origin() -> str:
-    """Version and sources that this process computes with, and versions of libraries."""
+    """Description of the version, the sources and the libraries of this process."""
     digest = hashlib.sha256()
     for source in computing_sources():
         digest.update(source.read_bytes())
@@ -73,7 +73,7 @@ def origin() -> str:
 
 
 def computing_sources() -> list[Path]:
-    """Sources that results depend on: of a cell's modules, and all packages that these import."""
+    """Source files on which results depend: the computing modules and the packages they import."""
     package = Path(__file__).parents[1]
     sources = {package / "sweeps" / f"{name}.py" for name in _COMPUTING}
     left = set(sources)
@@ -88,14 +88,14 @@ def computing_sources() -> list[Path]:
 
 @dataclass(frozen=True)
 class Layout:
-    """Form of a task's results: (dims, shape, dtype, attributes) of each variable."""
+    """Layout of a task's results: (dims, shape, dtype, attributes) of each variable."""
 
     variables: Mapping[str, tuple[list[str], list[int], str, dict[str, Any]]]
     coordinates: Mapping[str, tuple[list[Any], dict[str, Any]]]
 
     @classmethod
     def of(cls, result: xr.Dataset) -> Layout:
-        """Layout of a result; words are numbers of flags."""
+        """Layout of a result, with words stored as flags."""
         return cls(
             {
                 str(name): (
@@ -114,20 +114,20 @@ class Layout:
 
     @classmethod
     def read(cls, folder: Path, task: str) -> Layout | None:
-        """Read the layout of a task, if there is one."""
+        """Read the layout of a task; None if there is none."""
         path = folder / f"{task}.json"
         if not path.exists():
             return None
         kept = _read_json(path)
         if kept is None:
             raise ValueError(
-                f"{path} is damaged: `vibrissa sweep` with the same study does its task again"
+                f"{path} is damaged: `vibrissa sweep` with the same study computes the task again"
             )
         return cls(kept["variables"], kept["coordinates"])
 
     @property
     def record(self) -> np.dtype[np.void]:
-        """Type of a cell's record."""
+        """Data type of a record."""
         values = [
             (name, kind, tuple(shape)) for name, (_, shape, kind, _) in self.variables.items()
         ]
@@ -136,7 +136,7 @@ class Layout:
         return np.dtype([(_SUM, "<u4"), *head, ("whisker", whisker), ("result", values)])
 
     def misfit(self, result: xr.Dataset) -> str:
-        """Why a result cannot be kept together with those of other whiskers; empty if it can."""
+        """Describe why a result does not match this layout; empty if it does."""
         names = {*map(str, result.variables)}
         for name in sorted(names ^ {*self.variables, *self.coordinates}):
             return f"{name} is a result of this whisker or of others, and not of both\n"
@@ -153,7 +153,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Cells:
-    """Records of one task: those of whiskers that are done, and which are damaged."""
+    """Records of the completed cells of one task, and which are damaged."""
 
     layout: Layout
     records: NDArray[np.void]
@@ -162,7 +162,7 @@ class Cells:
 
     @classmethod
     def read(cls, folder: Path, task: str, count: int) -> Cells | None:
-        """Read the records of a task, if there are any, of so many whiskers."""
+        """Read the records of a task for ``count`` whiskers; None if there are none."""
         if (layout := Layout.read(folder, task)) is None:
             return None
         content = b""
@@ -189,11 +189,11 @@ class Cells:
 
     @property
     def done(self) -> NDArray[np.bool_]:
-        """Whether each whisker is done."""
+        """Mask of the whiskers whose cell is completed."""
         return self.rows >= 0
 
     def column(self, *names: str, fill: Any) -> NDArray[Any]:
-        """A field of every whisker's record; ``fill`` where there is none."""
+        """Field of the records of all whiskers; ``fill`` where there is no record."""
         values: NDArray[Any] = self.records
         for name in names:
             values = values[name]
@@ -205,11 +205,11 @@ class Cells:
 
 
 class Store:
-    """The results of one study, open for writing; to be used as a context manager.
+    """Context manager of a study's store, open for writing.
 
-    The folder is made if need be. Unless any version is allowed, a store that another version of
-    vibrissa began is refused; `Busy` is raised if another run has it open. `faults` are parts that
-    were damaged and made anew.
+    The folder is created if needed. A store started by another version of vibrissa is an error
+    unless any version is allowed; `Busy` is raised if another run has the store open. `faults` are
+    damaged parts that were replaced.
     """
 
     def __init__(
@@ -223,11 +223,11 @@ class Store:
         self._layouts: dict[str, Layout] = {}
 
     def __enter__(self) -> Store:
-        """Take the store, and make it if it is not there."""
+        """Lock the store, and create it if needed."""
         if self.path.exists() and not self.path.is_dir():
             raise ValueError(f"{self.path} is a file; the folder of a store is needed")
         if self.path.exists() and any(self.path.iterdir()) and not (self.path / _LOCK).exists():
-            raise ValueError(f"{self.path} is a folder with other things in it, and not a store")
+            raise ValueError(f"{self.path} is a folder with other contents, not a store")
         self.path.mkdir(parents=True, exist_ok=True)
         try:
             self._lock = _hold(self.path / _LOCK)
@@ -248,7 +248,7 @@ class Store:
     def _begin(self) -> None:
         if not (self.path / _STUDY).exists():
             for left in (*self.path.glob("*.json"), *self.path.glob("*.cells")):
-                left.unlink()  # perhaps of another study
+                left.unlink()  # it may belong to another study
             (self.path / _FAILURES).unlink(missing_ok=True)
             _write_json(self.path / _STUDY, {**_described(self.study), "origins": []})
         self._origin = self._admitted(described(self.path))
@@ -276,12 +276,12 @@ class Store:
         (self.path / f"{task}.json").unlink(missing_ok=True)
 
     def _admitted(self, kept: dict[str, Any]) -> int:
-        """Check that this study, done by this code, belongs to the store; number of the code."""
+        """Check that study and code match the store; return the index of the code."""
         own = _described(self.study)
         differing = [name for name in own if kept.get(name) != own[name]]
         if differing:
             raise ValueError(
-                f"{self.path} holds the results of a study with other {' and '.join(differing)}: "
+                f"{self.path} contains results of a study with other {' and '.join(differing)}: "
                 "give another store, or remove this one"
             )
         origins: list[str] = kept["origins"]
@@ -290,16 +290,16 @@ class Store:
             this, known = _version(mine), [*map(_version, origins)]
             if origins and this not in known and not self._any_version:
                 raise ValueError(
-                    f"the results in {self.path} are of {known[-1]}, this is {this}, which may "
-                    "find others: give another store, or allow any version (--any-version) and "
-                    "the store keeps which cell is of which"
+                    f"the results in {self.path} were computed by {known[-1]}, and this is {this}, "
+                    "whose results may differ: give another store, or allow any version "
+                    "(--any-version); the store then records the version of each cell"
                 )
             origins.append(mine)
             _write_json(self.path / _STUDY, kept)
         return origins.index(mine)
 
     def statuses(self) -> NDArray[np.int8]:
-        """Read what is there."""
+        """Read the statuses (whisker, task) of all cells."""
         columns = {name: k for k, name in enumerate(self.study.tasks)}
         count = len(self.study.specimens)
         asked = np.zeros((count, len(columns)), dtype="S16")
@@ -317,7 +317,7 @@ class Store:
         return out
 
     def write(self, cell: Cell, answer: Mapping[str, Any]) -> bool:
-        """Keep the outcome of a cell."""
+        """Write the result or the failure of a cell."""
         failure = answer.get("failure") or self._kept(cell, answer)
         if failure:
             line = {
@@ -333,7 +333,7 @@ class Store:
         return not failure
 
     def _kept(self, cell: Cell, answer: Mapping[str, Any]) -> str:
-        """Append a result; why it cannot be kept together with others, if so."""
+        """Append a result; return the reason if it does not match the others, else empty."""
         result: xr.Dataset = answer["result"]
         layout = self._layouts.get(cell.task)
         if layout is None:
@@ -353,9 +353,9 @@ class Store:
         return ""
 
     def publish(self, results: xr.Dataset, changed: bool) -> None:
-        """Write all results as Zarr, unless they have not changed and are there whole."""
+        """Write all results as Zarr, unless an unchanged complete copy exists."""
         if not changed and (there := self.path / RESULTS).exists():
-            # What libraries raise for damaged files is not documented.
+            # The libraries' errors for damaged files are not documented.
             with contextlib.suppress(Exception):
                 if xr.open_zarr(there, zarr_format=2).load().equals(results):
                     return
@@ -369,7 +369,7 @@ class Store:
 
 
 def described(path: Path, layouts: Collection[int] = (LAYOUT,)) -> dict[str, Any]:
-    """Read what the study of a store is, and by which codes it was done."""
+    """Read the description of a store's study and of the codes that computed its results."""
     file = path / _STUDY
     if not file.exists():
         raise ValueError(f"{path} is not a store of a sweep")
@@ -379,21 +379,21 @@ def described(path: Path, layouts: Collection[int] = (LAYOUT,)) -> dict[str, Any
     if isinstance(kept, dict) and kept.get("layout") not in layouts:
         able = "its results can be shown (`vibrissa sweep show`), but it cannot be continued"
         raise ValueError(
-            f"{path} is laid out as by another version of vibrissa: "
+            f"{path} has the layout of another version of vibrissa: "
             f"{able if kept.get('layout') in OLD_LAYOUTS else 'open it with that one'}; "
-            "to do the study again give another store"
+            "to run the study again give another store"
         )
     unchecked = isinstance(kept, dict) and kept.get("layout") == min(OLD_LAYOUTS)
     if not isinstance(kept, dict) or (kept.pop(_SUM, None) != _sum(kept) and not unchecked):
         raise ValueError(
-            f"{file} is damaged, which describes what the store holds: put back a copy of it, "
-            "or remove it, and the study is begun anew"
+            f"{file} is damaged, which describes the store: restore a copy of it, or remove it to "
+            "start the study again"
         )
     return kept
 
 
 def read_failures(path: Path) -> Iterator[dict[str, Any]]:
-    """Read the cells that failed; a damaged line counts as a cell that is to be done."""
+    """Yield the failed cells; cells of damaged lines count as not computed."""
     with contextlib.suppress(FileNotFoundError):
         for line in (path / _FAILURES).read_bytes().splitlines():
             total, _, text = line.partition(b" ")
@@ -402,7 +402,7 @@ def read_failures(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def _described(study: Study) -> dict[str, Any]:
-    """Facts that two studies must have in common to share a store."""
+    """Properties that must agree for studies to share a store."""
     content = {
         "layout": LAYOUT,
         "name": study.name,
@@ -416,7 +416,7 @@ def _described(study: Study) -> dict[str, Any]:
 
 
 def _version(name: str) -> str:
-    """The part of an origin that is vibrissa's."""
+    """Vibrissa's part of an origin."""
     return name.partition(",")[0]
 
 
@@ -429,7 +429,7 @@ def _sum(content: Mapping[str, Any]) -> int:
 
 
 def _read_json(path: Path) -> dict[str, Any] | None:
-    """Content of a file of `_write_json`; None if it is damaged."""
+    """Read a file written by `_write_json`; None if it is damaged."""
     with contextlib.suppress(ValueError):
         kept = json.loads(path.read_bytes())
         if isinstance(kept, dict) and kept.pop(_SUM, None) == _sum(kept):
@@ -438,7 +438,7 @@ def _read_json(path: Path) -> dict[str, Any] | None:
 
 
 def _write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a description with its checksum, aside, and put it in place whole."""
+    """Write a description with its checksum to a temporary file, and rename it."""
     part = path.with_name(f"{path.name}.part")
     with _naming(path):
         part.write_text(json.dumps({**content, _SUM: _sum(content)}), encoding="utf-8")
@@ -446,7 +446,7 @@ def _write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def _append(path: Path, content: bytes) -> None:
-    """Append to a file; what cannot be written whole is cut off again."""
+    """Append to a file; an incomplete write is undone."""
     with _naming(path), path.open("ab", buffering=0) as file:
         before, left = file.tell(), memoryview(content)
         try:
@@ -459,7 +459,7 @@ def _append(path: Path, content: bytes) -> None:
 
 
 def _cut(path: Path, size: int) -> None:
-    """Cut off so many bytes that a run that was killed left at the end of a file."""
+    """Remove the last ``size`` bytes of a file, a partial record left by a killed run."""
     if size:
         with path.open("r+b") as file:
             file.truncate(path.stat().st_size - size)
@@ -467,19 +467,19 @@ def _cut(path: Path, size: int) -> None:
 
 @contextlib.contextmanager
 def _naming(path: Path) -> Iterator[None]:
-    """State which file cannot be written, and that nothing is lost."""
+    """Add the name of the file, and advice, to errors of writing."""
     try:
         yield
     except OSError as fault:
         raise OSError(
             fault.errno,
-            f"{fault.strerror or fault}: {path} cannot be written. What is there is whole; the "
-            "same call goes on from it",
+            f"{fault.strerror or fault}: {path} cannot be written. All written results are intact; "
+            "the same call continues from them",
         ) from fault
 
 
 def _hold(path: Path) -> IO[str]:
-    """Take a lock that the system releases when its holder ends, however it ends."""
+    """Acquire a lock that the system releases when the process ends for any reason."""
     file = path.open("a", encoding="utf-8")
     try:
         if sys.platform == "win32":
@@ -507,7 +507,7 @@ def _plain(attributes: Mapping[Any, Any]) -> dict[str, Any]:
 
 
 def _same(first: NDArray[Any], second: NDArray[Any]) -> bool:
-    """Whether coordinates agree, but for what another machine's rounding may change."""
+    """Whether coordinates agree up to rounding."""
     if first.shape != second.shape:
         return False
     if first.dtype.kind == "f":

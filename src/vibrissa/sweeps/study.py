@@ -1,7 +1,7 @@
-"""A study as plain data: whiskers, and the tasks of each.
+"""Definition of a study as plain data: whiskers, and the tasks for each of them.
 
-A study may have thousands: a `Specimen` is a name, a few numbers and how it is made, and its
-whisker is made when it is needed.
+As a study may have thousands of whiskers, a `Specimen` contains only a name, a few numbers and a
+recipe, and its whisker is constructed when it is needed.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from vibrissa.whisker import Whisker, whisker_array
 
 EXAMPLE = Path(__file__).with_name("example.toml").read_text(encoding="utf-8")
 
-# Functions that cache results of the last whiskers; a study does not return to any.
+# Functions that cache results of recent whiskers, to which a study does not return.
 _KEPT = (
     discretize,
     stable_set,
@@ -42,14 +42,14 @@ _KEPT = (
     seeding_triplet,
     searched_by_name,
 )
-_OF_WHISKER, _OF_CELL = 16, 4  # numbers stored for each whisker, with its name, and for each cell
+_OF_WHISKER, _OF_CELL = 16, 4  # numbers stored for each whisker, including its name, and each cell
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One task for one whisker, which has a number.
+    """One task for one whisker.
 
-    The seed is the same for the same whisker in any study with the same seed; the identity is a
+    The seed is the same for the same whisker in all studies with the same seed; the identity is a
     hash of whisker, task, settings and seed.
     """
 
@@ -64,9 +64,10 @@ class Cell:
 
 @dataclass(frozen=True)
 class Study:
-    """Whiskers × tasks: kind and settings of each task by its name.
+    """Whiskers and tasks of a study.
 
-    Groups of whiskers are those that a task is asked of, by its name; by default all.
+    ``tasks`` are the kind and settings of each task by its name, and ``groups`` the groups of
+    whiskers to which a task is restricted, by its name; by default it applies to all.
     """
 
     name: str
@@ -76,11 +77,11 @@ class Study:
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def asks(self, task: str, specimen: Specimen) -> bool:
-        """Whether a task is asked of a whisker: unless it is for other groups."""
+        """Whether a task applies to a whisker."""
         return task not in self.groups or specimen.group in self.groups[task]
 
     def cells(self) -> Iterator[Cell]:
-        """List what is to be done, one whisker after the other."""
+        """Yield the cells, one whisker after the other."""
         for index, specimen in enumerate(self.specimens):
             for task, (kind, settings) in self.tasks.items():
                 if not self.asks(task, specimen):
@@ -89,12 +90,12 @@ class Study:
                     [specimen.identity, kind, dict(settings), self.seed], default=list
                 )
                 digest = hashlib.sha256(asked.encode()).hexdigest()
-                # The seed is the whisker's: a study with more whiskers has the same cells again.
+                # The seed depends on the whisker only, so that adding whiskers keeps other cells.
                 own = hashlib.sha256(f"{self.seed} {specimen.identity}".encode()).hexdigest()
                 yield Cell(task, kind, settings, index, specimen, int(own[:7], 16), digest[:16])
 
     def count(self, task: str) -> int:
-        """Count the whiskers of which a task is asked."""
+        """Number of whiskers to which a task applies."""
         return sum(self.asks(task, specimen) for specimen in self.specimens)
 
     @property
@@ -112,7 +113,7 @@ class Study:
 
     @property
     def bytes(self) -> int:
-        """Approximate size of its results on disk: eight bytes a number."""
+        """Approximate size of the results on disk: eight bytes per number."""
         each = sum(TASKS[kind].numbers(settings) for kind, settings in self.tasks.values())
         return 8 * len(self.specimens) * (each + _OF_WHISKER + _OF_CELL * len(self.tasks))
 
@@ -123,19 +124,19 @@ def read_study(text: str, folder: Path) -> Study:
     Parameters
     ----------
     text : str
-        Study in TOML, as `EXAMPLE`.
+        Study in TOML, such as `EXAMPLE`.
     folder : Path
-        Folder that file names are relative to.
+        Folder to which file names are relative.
 
     Returns
     -------
     Study
-        Checked, nothing done.
+        Validated study.
 
     Raises
     ------
     ValueError
-        If it is not TOML, or has keys that are not known or values out of range.
+        If the text is not TOML, or has unknown keys or values out of range.
     """
     try:
         content = tomllib.loads(text)
@@ -175,7 +176,7 @@ def read_study(text: str, folder: Path) -> Study:
     for name, some in groups.items():
         if unknown := sorted(set(some) - known_groups):
             raise ValueError(
-                f"task {name} is asked of the groups {', '.join(unknown)}; there are "
+                f"task {name} is restricted to the groups {', '.join(unknown)}; there are "
                 f"{', '.join(sorted(known_groups))}"
             )
     return Study(str(content.get("name", "study")), seed, specimens, tasks, groups)
@@ -188,11 +189,11 @@ def _groups(value: Any, where: str) -> tuple[str, ...]:
 
 
 def answer(cell: Cell) -> dict[str, Any]:
-    """Do one task for one whisker, wherever this runs."""
+    """Compute one cell in the current process."""
     started = time.process_time()
     try:
         whisker = cell.specimen.make()
-        # Threads of linear algebra would change the last digits with their number.
+        # The number of threads in linear algebra would affect the last digits.
         with threadpool_limits(1):
             result = TASKS[cell.kind].run(whisker, cell.settings, cell.seed).load()
         described = _described(whisker)
@@ -222,9 +223,9 @@ def _described(whisker: Whisker) -> dict[str, float]:
 
 
 # Parameters of a grid or a random population: default, factor to SI units, exclusive minimum.
-# ``curvature`` is A·L of the parabola y = A x². ``bend`` instead turns the tangent at a constant
-# rate by so many degrees from base to tip, and ``corkscrew`` turns the plane of bending by so many.
-# ``trim`` is the share of the length that is left, the radius being what it was.
+# ``curvature`` is A·L of the parabola y = A x². ``bend`` is the angle in degrees by which the
+# tangent of an arc turns from base to tip, and ``corkscrew`` that by which its plane of bending
+# turns. ``trim`` is the share of the length that is kept, with unchanged radii.
 PARAMETERS: Mapping[str, tuple[float, float, float]] = {
     "length": (39.4, 1e-3, 0.0),
     "taper_ratio": (15.0, 1.0, 0.0),
@@ -237,12 +238,12 @@ PARAMETERS: Mapping[str, tuple[float, float, float]] = {
 }
 
 
-_MOST = 10_000_000  # largest number of whiskers: the calling process holds them all, 2.5 kB each
+_MOST = 10_000_000  # largest number of whiskers, each of which takes 2.5 kB of memory
 
 
 @dataclass(frozen=True)
 class Specimen:
-    """A whisker that can be made."""
+    """Recipe of a whisker, with its name and properties."""
 
     name: str
     parameters: Mapping[str, float]
@@ -252,7 +253,7 @@ class Specimen:
 
 
 def population(tables: Sequence[Any], folder: Path, seed: int) -> list[Specimen]:
-    """List the whiskers of a study."""
+    """Whiskers of a study, from its tables ``[[whiskers]]``."""
     found: list[Specimen] = []
     for number, table in enumerate(tables):
         where = f"[[whiskers]] {number + 1}"
@@ -277,7 +278,7 @@ def population(tables: Sequence[Any], folder: Path, seed: int) -> list[Specimen]
 
 
 def _grid(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterator[Specimen]:
-    """All combinations of values."""
+    """Yield whiskers for all combinations of parameters."""
     check_keys(stated, {"prefix", *PARAMETERS}, "a grid")
     names = [name for name in PARAMETERS if name in stated]
     values = [_numbers(name, stated[name]) for name in names]
@@ -287,7 +288,7 @@ def _grid(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Itera
 
 
 def _random(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterator[Specimen]:
-    """Values drawn between bounds."""
+    """Yield whiskers with random parameters between bounds."""
     check_keys(stated, {"prefix", "count", "logarithmic", *PARAMETERS}, "a random population")
     count = stated.get("count")
     if not isinstance(count, int) or isinstance(count, bool) or count < 1:
@@ -320,7 +321,7 @@ def _random(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Ite
 
 
 def _files(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterator[Specimen]:
-    """Digitised whiskers, one a file."""
+    """Yield digitised whiskers, one per file."""
     check_keys(stated, {"prefix", "files", "base_radius", "youngs_modulus"}, "files")
     pattern = stated.get("files")
     if not isinstance(pattern, str):
@@ -334,7 +335,7 @@ def _files(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iter
     prefix = str(stated.get("prefix", ""))
     for name in ("base_radius", "youngs_modulus"):
         if len(_numbers(name, stated.get(name, 1.0))) > 1:
-            raise ValueError(f"{name} is {stated[name]!r}; of files one number is needed")
+            raise ValueError(f"{name} is {stated[name]!r}; for files one number is needed")
     changes = {
         name: _numbers(name, stated[name])[0] * PARAMETERS[name][1]
         for name in ("base_radius", "youngs_modulus")
@@ -346,7 +347,7 @@ def _files(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iter
 
 
 def _array(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterator[Specimen]:
-    """Whiskers of an average rat's face."""
+    """Yield whiskers of an average rat's face."""
     check_keys(stated, {"prefix", "side", "rows", "columns", "names"}, "an array")
     choice = {key: value for key, value in stated.items() if key != "prefix"}
     choice.setdefault("side", "right")
@@ -386,7 +387,7 @@ def _formula(stated: dict[str, float], prefix: str, name: str | None = None) -> 
 
 @dataclass(frozen=True)
 class _Formula:
-    """Makes a parabola or an arc."""
+    """Callable that constructs a parabola or an arc."""
 
     name: str
     stated: Mapping[str, float]
@@ -405,7 +406,7 @@ class _Formula:
             def curvature(s: Any) -> Any:
                 turned = corkscrew * np.asarray(s) / length
                 rate = bend / length
-                # About d2: it bends toward +y at the base.
+                # Curvature about d2 bends toward +y at the base.
                 return np.stack([0 * turned, -rate * np.sin(turned), rate * np.cos(turned)], -1)
 
             whisker = Whisker.from_curvature(length, curvature, **properties)
@@ -418,7 +419,7 @@ class _Formula:
 
 @dataclass(frozen=True)
 class _FromFile:
-    """Reads a whisker from a file that is still what it was."""
+    """Callable that reads a whisker from a file, which must be unchanged."""
 
     path: Path
     changes: Mapping[str, float]
@@ -435,7 +436,7 @@ class _FromFile:
 
 @dataclass(frozen=True)
 class _Made:
-    """Returns a whisker that is made already."""
+    """Callable that returns an existing whisker."""
 
     whisker: Whisker
 
@@ -455,7 +456,7 @@ def _words(name: str, value: Any) -> list[str]:
 
 
 def _numbers(name: str, value: Any) -> list[float]:
-    """One number or several of a parameter, within its bounds."""
+    """Numbers of a parameter, checked against its bounds."""
     values = value if isinstance(value, list) else [value]
     least = PARAMETERS[name][2]
     for one in values:
@@ -468,7 +469,7 @@ def _numbers(name: str, value: Any) -> list[float]:
         if one <= least:
             raise ValueError(f"{name} is {one!r}; it must be above {least:g}")
         if name == "trim" and one > 1.0:
-            raise ValueError(f"trim is {one!r}; it is the share that is left, at most 1")
+            raise ValueError(f"trim is {one!r}; it is the share that is kept, at most 1")
     if not values:
         raise ValueError(f"{name} is an empty list")
     return [float(one) for one in values]

@@ -1,7 +1,7 @@
-"""The tasks of a study: each gives the same few numbers for any whisker.
+"""Tasks of a study, each of which computes the same few numbers for any whisker.
 
-A task is a function from a whisker, settings and a seed to a dataset whose dimensions and
-coordinates follow from the settings alone. Words are written as numbers of CF flags.
+A task is a function of a whisker, settings and a seed that returns a dataset, whose dimensions and
+coordinates depend on the settings only. Words are stored as CF flags.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from vibrissa.whisker import Whisker
 Settings = Mapping[str, Any]
 
 PAPERS = ("Fx MB MD", "Mx MB MD", "Fx FD MD")  # the triplets that the paper found unique
-# Samples of a whisker; more would not fit into memory.
+# Largest number of samples per whisker, limited by memory.
 VERDICTS = ("unique", "unique off a surface", "not unique")
 PROOFS = ("proved", "refused", "not finished")
 _MICRO = 1e-6
@@ -41,7 +41,7 @@ _STATIONS = np.linspace(0.3, 1.0, 15)
 
 @dataclass(frozen=True)
 class Task:
-    """One question to every whisker."""
+    """Definition of a task: its function, default settings, and estimates of time and size."""
 
     run: Callable[[Whisker, Settings, int], xr.Dataset]
     defaults: Settings
@@ -50,7 +50,7 @@ class Task:
 
 
 def settings_of(stated: Mapping[str, Any], where: str) -> tuple[str, Settings]:
-    """Kind and settings of a task, checked."""
+    """Validated kind and settings of a task."""
     kind = stated.get("kind")
     if not isinstance(kind, str) or kind not in TASKS:
         raise ValueError(f"{where}: kind is {kind!r}; one of {', '.join(TASKS)} is needed")
@@ -58,7 +58,7 @@ def settings_of(stated: Mapping[str, Any], where: str) -> tuple[str, Settings]:
     own = {key: value for key, value in stated.items() if key not in ("kind", "name")}
     if unknown := sorted(set(own) - set(task.defaults)):
         allowed = ", ".join(task.defaults) or "nothing"
-        raise ValueError(f"{where} sets {', '.join(unknown)}; of {kind} can be set: {allowed}")
+        raise ValueError(f"{where} sets {', '.join(unknown)}; settings of {kind} are: {allowed}")
     settings = {**task.defaults, **own}
     try:
         _check(settings)
@@ -75,7 +75,7 @@ def _map_summary(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
     for name in names:
         for end, value in (("least", data[name].min()), ("largest", data[name].max())):
             out[f"{name}_{end}"] = ((), float(value), attributes(name))
-    # The logarithm of the force is smooth between the stations of the map.
+    # The logarithm of the force is smooth, so that it can be interpolated between stations.
     least = np.log(np.nanmin(_fold_forces(data), axis=1))
     slip = np.exp(CubicSpline(data["station"].values, least)(_STATIONS))
     about = {"units": "N", "long_name": "least force at which the whisker slips off"}
@@ -86,7 +86,7 @@ def _map_summary(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
 
 
 def _uniqueness(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
-    """Verdicts with the numbers behind them."""
+    """Uniqueness verdicts with the numbers on which they are based."""
     found = uniqueness(
         ContactMap.simulate(whisker, grid=False),
         _triplets(settings),
@@ -104,7 +104,7 @@ def _uniqueness(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
 
 
 def _flags(words: xr.DataArray, known: tuple[str, ...]) -> xr.DataArray:
-    """Words as numbers of CF flags, -1 for those that are not known."""
+    """Convert words to CF flags, -1 for unknown words."""
     codes = np.select([words.values == word for word in known], range(len(known)), -1)
     meanings = " ".join(word.replace(" ", "_") for word in known)
     flags = {"flag_values": np.arange(len(known), dtype=np.int8), "flag_meanings": meanings}
@@ -112,7 +112,7 @@ def _flags(words: xr.DataArray, known: tuple[str, ...]) -> xr.DataArray:
 
 
 def _certificate(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
-    """How far (Fx, MB, MD) is proved to be unique outside a cone; 0: the smallest that may do."""
+    """Proved uniqueness of (Fx, MB, MD) outside a cone; a cone of 0 selects the smallest one."""
     contact_map, path = ContactMap.simulate(whisker, grid=False), None
     cone = float(np.radians(settings["cone"])) or smallest_cone(contact_map)
     if not np.isfinite(cone):
@@ -133,7 +133,7 @@ def _certificate(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
 
 
 def _sensitivity(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
-    """Errors that a sensor's noise leads to, triplet by triplet."""
+    """Errors of contact points due to a sensor's noise, for each triplet."""
     found = best_triplet(
         ContactMap.simulate(whisker, grid=False), _noise(settings), triplets=_triplets(settings)
     )
@@ -176,7 +176,7 @@ def _estimation(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
 
 
 def _friction(whisker: Whisker, settings: Settings, seed: int) -> xr.Dataset:
-    """Errors where friction, fully mobilised along the whisker, is not allowed for."""
+    """Errors if friction, fully mobilised along the whisker, is neglected in the estimate."""
     contact_map = ContactMap.simulate(whisker, grid=False)
     s, (_, fy, fz) = _some_contacts(contact_map, int(settings["contacts"]), seed)
     across = np.hypot(fy, fz)
@@ -264,7 +264,7 @@ def _noise(settings: Settings) -> Array:
 
 
 def _check(settings: Settings) -> None:
-    """Check settings, each by its name."""
+    """Validate settings."""
     for name in settings:
         if name in _BOUNDS:
             _check_number(settings, name, *_BOUNDS[name])
@@ -292,14 +292,14 @@ def _check_number(settings: Settings, name: str, least: float, most: float = np.
         raise ValueError(f"{name} is {value!r}; a number from {least:g}{upto} is needed")
 
 
-# Least and largest values of numbers.
+# Smallest and largest values of numbers.
 _BOUNDS = {
     **dict.fromkeys(("minutes", "force_noise", "moment_noise"), (0.0, np.inf)),
     "cone": (0.0, 89.0),
     "samples": (16, _MOST),
     "contacts": (1, _MOST),
 }
-# What reads a setting, and raises where it cannot.
+# Functions that parse a setting and raise ValueError if it is not valid.
 _READ: Mapping[str, Callable[[Settings], object]] = {
     "triplets": _triplets,
     "signals": _sets,

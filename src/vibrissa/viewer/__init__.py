@@ -1,6 +1,7 @@
-"""Whiskers, maps and trials on a page in the browser, to take hold of and turn about.
+"""Interactive viewer of whiskers, maps and trials in the browser.
 
-What turns states into drawings and texts is pure; only the binding imports viser (extra ``view``).
+Drawings and texts are computed from states by pure functions; only the binding to the page imports
+viser (extra ``view``).
 """
 
 from __future__ import annotations

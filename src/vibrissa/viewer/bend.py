@@ -1,4 +1,4 @@
-"""Mode Bend: drag the contact, turn the peg, push with a force; the whisker's own sliders."""
+"""Mode Bend: a whisker bent by a dragged contact, a peg or a force, and controls of its shape."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ def whisker_body(
     colour: scene.Colour = WHISKER,
     opacity: float | None = None,
 ) -> scene.Body:
-    """A whisker along a centreline (n, 3), m, so many times as thick as it is."""
+    """Body of a whisker along a centreline (n, 3), m, with its thickness exaggerated."""
     radius = whisker.radius(np.linspace(0.0, whisker.length, len(line)))
     vertices, faces = scene.tube(mm(line), exaggeration * mm(radius))
     return scene.Body(vertices, faces, colour, opacity)
 
 
 def follicle(whisker: Whisker, exaggeration: float) -> scene.Body:
-    """A sleeve in which the base is clamped, so that one sees where it is."""
+    """Sleeve that marks the clamped base."""
     radius = 1.9 * exaggeration * whisker.base_radius
     depth = 0.06 * whisker.length
     middle = np.array([-0.5 * depth, 0.0, 0.0])
@@ -58,7 +58,7 @@ def follicle(whisker: Whisker, exaggeration: float) -> scene.Body:
 
 
 def axes(whisker: Whisker) -> dict[str, scene.Mark]:
-    """The whisker frame at the base: x red, y green, z blue."""
+    """Axes of the whisker frame at the base: x red, y green, z blue."""
     size = _size(0.14 * whisker.length)
     ends = size * np.eye(3)
     out: dict[str, scene.Mark] = {"axes": scene.Arrows(np.zeros((3, 3)), ends, _AXES, 0.05 * size)}
@@ -68,7 +68,7 @@ def axes(whisker: Whisker) -> dict[str, scene.Mark]:
 
 
 def ruler(start: Array, length: float, view: float) -> dict[str, scene.Mark]:
-    """Ticks with values along x from a place (3,), mm, over a length, in a view so wide, mm."""
+    """Ruler along x from a position (3,), over a length, for a view of a given width, mm."""
     step = round_step(length / 4.0)
     ticks = np.arange(0.0, length + 1e-9, step)
     at = start + ticks[:, None] * np.array([1.0, 0.0, 0.0])
@@ -82,7 +82,7 @@ def ruler(start: Array, length: float, view: float) -> dict[str, scene.Mark]:
 
 
 def force_arrow(whisker: Whisker, force: Array, at: Array) -> dict[str, scene.Mark]:
-    """The force on a whisker as an arrow that ends where it acts, with its size."""
+    """Arrow of the force on a whisker, ending where it acts, with its magnitude."""
     size = float(np.linalg.norm(force))
     if not (np.isfinite(at).all() and size > 0.0):
         return {}
@@ -97,7 +97,7 @@ def force_arrow(whisker: Whisker, force: Array, at: Array) -> dict[str, scene.Ma
 
 
 def bend_drawing(bend: state.Bend, exaggeration: float) -> scene.Drawing:
-    """Draw whisker, load and force; without an answer the last shape as a ghost."""
+    """Draw whisker, load and force; without an equilibrium, the last shape is drawn transparent."""
     whisker, held, ok = bend.whisker, bend.held, bend.status.ok
     out = dict(resting(whisker, exaggeration))
     line = held.centerline(NODES)
@@ -117,7 +117,7 @@ def bend_drawing(bend: state.Bend, exaggeration: float) -> scene.Drawing:
 
 @lru_cache(maxsize=4)
 def resting(whisker: Whisker, exaggeration: float) -> dict[str, scene.Mark]:
-    """Draw what stays as it is while a whisker is bent."""
+    """Draw the parts that do not change while a whisker is bent."""
     return {
         "follicle": follicle(whisker, exaggeration),
         **axes(whisker),
@@ -126,7 +126,7 @@ def resting(whisker: Whisker, exaggeration: float) -> dict[str, scene.Mark]:
 
 
 def _peg(bend: state.Bend) -> scene.Body:
-    """The peg; a line is drawn a little thick, so that it is seen."""
+    """Body of the peg; a line is drawn with a visible thickness."""
     length = bend.whisker.length
     radius = max(bend.radius, 0.004 * length)
     vertices, faces = scene.cylinder(mm(bend.origin), bend.axis, _size(radius), _size(0.8 * length))
@@ -135,7 +135,7 @@ def _peg(bend: state.Bend) -> scene.Body:
 
 @lru_cache(maxsize=4)
 def _ball(whisker: Whisker, exaggeration: float) -> scene.Body:
-    """Mark of the contact: it sticks out of the whisker where this can touch."""
+    """Ball that marks the contact, larger than the whisker."""
     own = float(whisker.radius(0.5 * whisker.length))
     radius = max(1.7 * exaggeration * own, 0.006 * whisker.length)
     vertices, faces = scene.ellipsoid(np.zeros(3), _size(radius) * np.eye(3), 12)
@@ -143,7 +143,7 @@ def _ball(whisker: Whisker, exaggeration: float) -> scene.Body:
 
 
 def _missed(bend: state.Bend) -> dict[str, scene.Mark]:
-    """A line from the last contact to where it was wanted, and why it did not go there."""
+    """Line from the last contact to the requested one, with the reason why it is not reached."""
     last = np.asarray(bend.held.contact_point)
     out: dict[str, scene.Mark] = {}
     if np.isfinite(last).all() and bend.kind == "point":
@@ -168,7 +168,7 @@ _HELD = "The whisker is in stable equilibrium."
 
 
 class BendMode(Mode):
-    """The controls of a load, and the whisker that it bends."""
+    """Mode with the controls of a load, and the bent whisker."""
 
     name = "Bend"
 
@@ -235,7 +235,7 @@ class BendMode(Mode):
         self._page.stage.show("reachable", {})
 
     def redraw(self) -> None:
-        """Draw the whisker, and what it can reach."""
+        """Draw the whisker and its reachable space."""
         page, bend = self._page, self._page.bend
         page.stage.show("bend", bend_drawing(bend, page.exaggeration))
         if page.chart is not self._clouded:
@@ -244,7 +244,7 @@ class BendMode(Mode):
             page.stage.show("reachable", cloud)
 
     def write(self, brief: bool = False) -> None:
-        """Write signals and contact, and where the load is."""
+        """Show signals, contact and position of the load."""
         bend = self._page.bend
         show(self._state, sentence(bend.status, _HELD if bend.kind == "force" else None))
         show(self._numbers, numbers(bend.deflection))
@@ -273,7 +273,7 @@ _GPA = 1e-9
 
 
 class WhiskerControls:
-    """Length, turn, taper, modulus, and how thick the whisker is drawn."""
+    """Controls of length, turning angle, taper, modulus, and the drawn thickness of the whisker."""
 
     def __init__(self, page: Page) -> None:
         own = state.shape_of(page.original)
@@ -322,7 +322,7 @@ class WhiskerControls:
             page.reshape(**vars(own))
 
     def _shown(self, shape: state.Shape) -> state.Shape:
-        """Put the sliders to a shape, as far as they go, and return the shape that they show."""
+        """Set the sliders to a shape within their ranges, and return the shape shown."""
         sliders = self._length, self._turn, self._taper, self._modulus
         values = _MM * shape.length, np.rad2deg(shape.turn), shape.taper, _GPA * shape.modulus
         length, turn, taper, modulus = (
@@ -335,5 +335,5 @@ class WhiskerControls:
 
 
 def _rounded(value: float) -> float:
-    """Round to four digits, however small: rubber has a thousandth of a hair's modulus."""
+    """Round to four significant digits, as moduli range over orders of magnitude."""
     return float(f"{value:.4g}")

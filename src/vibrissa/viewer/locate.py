@@ -1,4 +1,4 @@
-"""Mode Locate: which contacts have the same signals, and how exactly they are located."""
+"""Mode Locate: contacts with the same signals, and the accuracy of their positions."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _APART = 0.005
 
 @dataclass(frozen=True)
 class Sensor:
-    """Signals that locate the contact."""
+    """Signals used to locate the contact, and their noise."""
 
     triplet: tuple[str, ...] = ("Fx", "MB", "MD")
     force_noise: float = 1e-6
@@ -48,13 +48,13 @@ class Sensor:
 
     @property
     def covariance(self) -> Array | None:
-        """Covariance of force and moment (6, 6); None where there is no noise."""
+        """Covariance of force and moment (6, 6); None without noise."""
         sigma = np.repeat([self.force_noise, self.moment_noise], 3)
         return np.diag(sigma**2) if (sigma > 0.0).all() else None
 
 
 def usual_sensor(whisker: Whisker) -> Sensor:
-    """A sensor that suits a whisker: as exact for a rod as 1 µN and 0.02 µN·m are for a rat's."""
+    """Default sensor: noise of 1 µN and 0.02 µN·m for a rat's whisker, scaled for other rods."""
     moment = whisker.base_bending_stiffness / whisker.length
     powers = np.log10([moment / whisker.length / _RAT[0], moment / _RAT[1]])
     force, turning = 10.0 ** np.round(powers)
@@ -67,7 +67,7 @@ def usual_sensor(whisker: Whisker) -> Sensor:
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """Contacts that three signals of a bent whisker allow."""
+    """Contacts compatible with three signals of a bent whisker."""
 
     sensor: Sensor
     signals: xr.Dataset
@@ -87,12 +87,12 @@ class Located:
         return np.asarray(np.linalg.norm(self.points - self.contact, axis=-1))
 
     def others(self, length: float) -> scene.Ints:
-        """Numbers of the candidates that are not the contact itself."""
+        """Indices of the candidates other than the contact itself."""
         return np.flatnonzero(self.distances > _APART * length)
 
 
 def located(chart: Chart, bend: Bend, sensor: Sensor) -> Located | None:
-    """Find every contact with the same three signals; None where there is no contact."""
+    """Find all contacts with the same three signals; None without a contact."""
     bent = bend.deflection
     if not bend.status.ok or bend.status is Status.NO_CONTACT:
         return None
@@ -140,7 +140,7 @@ MOST = 0.3  # longest semi-axis that is drawn, over the length: what is longer i
 
 
 def locate_drawing(whisker: Whisker, found: Located, exaggeration: float) -> scene.Drawing:
-    """Draw the whisker at every other contact with the same signals, and the errors of all."""
+    """Draw the whisker at all other contacts with the same signals, and the errors of all."""
     out: dict[str, scene.Mark] = {}
     covariances = found.estimate.candidates.covariance
     others = set(found.others(whisker.length).tolist())
@@ -160,7 +160,7 @@ def locate_drawing(whisker: Whisker, found: Located, exaggeration: float) -> sce
 
 
 def of_located(whisker: Whisker, found: Located | None, status: Status) -> str:
-    """State how many contacts three signals allow, how far apart, how exact."""
+    """Describe the number of contacts with the same signals, their distances and errors."""
     if found is None:
         return sentence(status)
     names = found.sensor.triplet
@@ -188,7 +188,7 @@ _UNM = quantity("moment").display_factor
 
 
 class LocateMode(Mode):
-    """Controls of a sensor, and the contacts that it cannot distinguish."""
+    """Mode with the controls of a sensor, and the contacts that it cannot distinguish."""
 
     name = "Locate"
 
@@ -237,7 +237,7 @@ class LocateMode(Mode):
             self._page.stage.show(layer, {})
 
     def redraw(self) -> None:
-        """Draw whisker, candidates and errors; colour the cloud if it is another."""
+        """Draw whisker, candidates and errors; colour the cloud of contacts if it has changed."""
         page, bend, chart = self._page, self._page.bend, self._page.chart
         page.stage.show("bend", bend_drawing(bend, page.exaggeration))
         if chart is None:
@@ -254,7 +254,7 @@ class LocateMode(Mode):
         self._paint(chart)
 
     def write(self, brief: bool = False) -> None:
-        """Write what follows from the three signals."""
+        """Show the contacts that follow from the three signals."""
         bend = self._page.bend
         if self._page.chart is None:
             self._words.content = note("Sampling all contacts of this whisker …")

@@ -1,9 +1,9 @@
-"""Mode Map: all contacts, and all their signals, side by side as solids (the paper's Fig. 3).
+"""Mode Map: all contacts and all their signals as solids side by side (the paper's Fig. 3).
 
-Signals are laid out in a cylinder: M_B is the distance from its axis, M_D the angle about it, F_x
-the height; M_B and F_x by their square roots, as most contacts are gentle. Four spaces are
-side by side: that of contacts, and three times that of signals, coloured by r, θ and φ. What is
-picked in one is shown in all.
+Signals are positions in a cylinder: M_B is the distance from its axis, M_D the angle around it, and
+F_x the height. M_B and F_x are on square-root scales, as most contacts are light. Four spaces are
+side by side: that of contacts, and three times that of signals, coloured by r, θ and φ. A contact
+selected in one of them is marked in all.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ TURN = float(np.deg2rad(62.0))
 
 @dataclass(frozen=True, eq=False)
 class Solids:
-    """The contacts of a whisker, ready to be laid out."""
+    """Sampled contacts of a whisker, with their layout in the scene."""
 
     chart: Chart
     nodes: Array
@@ -73,7 +73,7 @@ class Solids:
         )
 
     def value(self, name: str, share: float) -> float:
-        """The value at a share of a range, SI units; of signals by square roots, as in space."""
+        """Value of a quantity at a share of its range, SI units; signals on a square-root scale."""
         low, high = self.range(name)
         if name not in SIGNALS:
             return low + share * (high - low)
@@ -82,12 +82,12 @@ class Solids:
         return float(np.sign(middle) * middle**2)
 
     def range(self, name: str) -> tuple[float, float]:
-        """Least and largest value of what a slice can hold fixed, SI units."""
+        """Smallest and largest value of a quantity that defines slices, SI units."""
         values = self.nodes[..., scene.column(name)]
         return float(values.min()), float(values.max())
 
     def signal_rows(self, rows: Array) -> Array:
-        """Places (..., 3), mm, of rows in the space of signals, its axis at the origin."""
+        """Positions (..., 3) of rows in the space of signals, with the axis at the origin, mm."""
         reach, low, high = self.limits
         size = np.sqrt(scene.values_of("MB", rows)) / reach
         turn = scene.values_of("MD", rows) + TURN
@@ -97,7 +97,7 @@ class Solids:
 
     @property
     def limits(self) -> tuple[float, float, float]:
-        """Largest √M_B, least and largest root of F_x."""
+        """Largest √M_B, and smallest and largest signed root of F_x."""
         heights = scene.root(scene.values_of("Fx", self.nodes))
         reach = float(np.sqrt(scene.values_of("MB", self.nodes).max()))
         return reach, float(heights.min()), float(heights.max())
@@ -108,25 +108,25 @@ class Solids:
         return self.length * _HEIGHT * (-low / (high - low) - 0.5)
 
     def place(self, number: int | None) -> Array:
-        """Place of a space, mm: contacts (None), or signals coloured by r, θ, φ (0, 1, 2)."""
+        """Position of a space, mm: contacts (None), or signals coloured by r, θ, φ (0, 1, 2)."""
         x, z = _CONTACTS if number is None else _PLACES[number]
         return self.length * np.array([x, 0.0, z])
 
     def seen(self, rows: Array, number: int | None) -> Array:
-        """Places (..., 3), mm, of rows: as contacts (None) or as signals of a coordinate."""
+        """Positions (..., 3) of rows in a space: contacts (None) or signals of a coordinate, mm."""
         if number is None:
             return to_display("contact_point", rows[..., :3]) + self.place(None)
         return self.signal_rows(rows) + self.place(number)
 
 
 def solids(chart: Chart, cut: bool) -> Solids:
-    """Sample a chart for solids, whole or cut open."""
+    """Sample the solids of a map, whole or cut open."""
     nodes = scene.sample_contacts(chart.samples, chart.line, _OPEN if cut else None, _SHAPE)
     return Solids(chart, nodes, cut)
 
 
 def picked(triangles: Array, places: Array, origin: Array, direction: Array) -> Array | None:
-    """The contact that a ray meets first."""
+    """Contact that a ray meets first; None if there is none."""
     a, b, c = places.transpose(1, 0, 2)
     first, second = b - a, c - a
     across = np.cross(direction, second)
@@ -150,7 +150,7 @@ _RINGS = 2
 
 
 def frame_drawing(solids: Solids, exaggeration: float) -> scene.Drawing:
-    """Draw what does not change: the resting whisker, and rings, rays and axes of the signals."""
+    """Draw the static parts: the resting whisker, and rings, rays and axes of the signals."""
     whisker, length = solids.chart.whisker, solids.length
     here = solids.place(None)
     line = whisker.centerline(NODES)
@@ -199,7 +199,7 @@ def _moved(body: scene.Body, by: Array) -> scene.Body:
 def solids_drawing(
     solids: Solids, triangles: Array, by: str
 ) -> tuple[dict[str, scene.Painted], dict[str, Legend]]:
-    """Paint contacts where they are, coloured by a coordinate, and where their signals are."""
+    """Draw contacts, coloured by a coordinate, in space and in the space of signals."""
     painted: dict[str, scene.Painted] = {}
     legends: dict[str, Legend] = {}
     for i, name in enumerate(scene.COORDINATES):
@@ -211,7 +211,7 @@ def solids_drawing(
 
 
 def picked_drawing(solids: Solids, row: Array, exaggeration: float) -> tuple[scene.Drawing, str]:
-    """Mark a contact in all spaces, bend the whisker there, and write its signals."""
+    """Mark a contact in all spaces, and draw the bent whisker; also return its signals as HTML."""
     whisker = solids.chart.whisker
     radius = 0.016 * solids.length
     out: dict[str, scene.Mark] = {}
@@ -241,7 +241,7 @@ _HINT = "Click on a solid: the same contact is marked in all four spaces."
 
 
 class MapMode(Mode):
-    """The controls of solids and slices, and what was picked."""
+    """Mode with the controls of solids and slices, and the selected contact."""
 
     name = "Map"
 
@@ -284,7 +284,7 @@ class MapMode(Mode):
             self._page.stage.show(layer, {})
 
     def redraw(self) -> None:
-        """Draw what is not yet drawn."""
+        """Draw the solids if they have not been drawn."""
         page, chart = self._page, self._page.chart
         if chart is None:
             self._words.content = note("Charting all contacts of this whisker …")
@@ -299,7 +299,7 @@ class MapMode(Mode):
         self._mark()
 
     def write(self, brief: bool = False) -> None:
-        """Nothing: all is written as it is drawn."""
+        """Do nothing, as texts are written with the drawings."""
 
     def _paint(self, found: Solids) -> None:
         what, share, by = str(self._slice.value), float(self._share.value), str(self._by.value)

@@ -1,9 +1,8 @@
-"""The page: one scene, one panel, and several modes.
+"""Page of the viewer: one scene, one panel, and several modes.
 
-Everything that happens on the page ends in one thread (:class:`~vibrissa.viewer.page.Latest`),
-which changes the state and draws it, so that no state is ever changed by two at a time.
-
-Other threads are a clock that plays, and one that compiles kernels ahead.
+All events of the page are handled by one thread (:class:`~vibrissa.viewer.page.Latest`), which
+changes and draws the state, so that the state is never changed concurrently. Other threads are the
+clock of a trial, and one that compiles kernels in advance.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ Transition = Callable[[Bend], Bend]
 
 
 class Mode(Protocol):
-    """One mode of the page: its own controls and objects in the scene."""
+    """Interface of a mode of the page, with its controls and objects in the scene."""
 
     name: str
 
@@ -70,17 +69,17 @@ class Mode(Protocol):
         """Hide them."""
 
     def redraw(self) -> None:
-        """Follow a change of the whisker or of its load with what is in the scene."""
+        """Update the scene after a change of the whisker or its load."""
 
     def write(self, brief: bool = False) -> None:
-        """Follow it with what is written in the panel; briefly: with what one reads meanwhile."""
+        """Update the texts of the panel; if ``brief``, only those read while dragging."""
 
     def link(self) -> dict[str, str]:
-        """Words of a link that restore what is chosen."""
+        """Parameters of a link that restore the state of the mode."""
         return {}
 
     def restore(self, asked: Mapping[str, str]) -> None:
-        """Choose what the words of a link ask for."""
+        """Restore the state of the mode from the parameters of a link."""
         del asked  # there is nothing to choose
 
 
@@ -118,7 +117,7 @@ class Page:
         self.change("drag", lambda bend: moved(bend, place, turn[:, 2]), dragging=True)
 
     def change(self, topic: str, transition: Transition, dragging: bool = False) -> None:
-        """Change what is bent as soon as there is time; a newer change replaces an older one."""
+        """Schedule a change of the load; a newer change replaces an older one."""
 
         def job() -> None:
             self.bend = transition(self.bend)
@@ -128,11 +127,11 @@ class Page:
 
     @property
     def has_map(self) -> bool:
-        """Whether a map was given, rather than made."""
+        """Whether a map was given rather than computed."""
         return self._contact_map is not None
 
     def reshape(self, **asked: float) -> None:
-        """Change the whisker: length, turn, taper, modulus (SI)."""
+        """Change length, turning angle, taper or modulus of the whisker, SI units."""
         values = {**vars(self.shape), **asked}
         self.shape = type(self.shape)(**values)
 
@@ -162,15 +161,15 @@ class Page:
         self.slow_work.put("chart", job)
 
     def settle(self, timeout: float = 60.0) -> bool:
-        """Wait, s, until nothing is left to do; return whether that happened."""
+        """Wait up to ``timeout`` s until all work is done; return whether it is."""
         return self.work.wait(timeout) and self.slow_work.wait(timeout) and self.work.wait(timeout)
 
     def bend_by_point(self) -> Bend:
-        """The bend that a point makes where the load now acts."""
+        """State with a point load at the current contact."""
         return loaded(self.bend, "point")
 
     def thicken(self, factor: float) -> None:
-        """Draw the whisker thicker than it is by a factor."""
+        """Set the factor by which the drawn thickness of the whisker is exaggerated."""
 
         def job() -> None:
             self.exaggeration = factor
@@ -194,7 +193,7 @@ class Page:
         self.work.put("mode", job)
 
     def redraw(self, dragging: bool = False) -> None:
-        """Draw the mode; what is being dragged stays where the mouse has it.
+        """Draw the mode; a dragged object stays at the mouse.
 
         All comes into sight together, as the browser draws anew for each part that comes alone.
         """
@@ -216,7 +215,7 @@ class Page:
             self.work.drop("words")
 
     def _write(self, brief: bool = False) -> None:
-        """Write what is read."""
+        """Update the texts of the panel."""
         self._written = time.monotonic()
         if self.mode is None:
             return
@@ -224,11 +223,11 @@ class Page:
         self._link()
 
     def _viewed(self) -> None:
-        """Someone has turned the view: the link follows when it is at rest."""
+        """Schedule an update of the link after a change of the view."""
         self.work.put("link", self._link, time.monotonic() + _REST)
 
     def _link(self) -> None:
-        """Write the link that leads back to what is seen."""
+        """Update the link that restores the current view."""
         if self.mode is None or self.linked is None:
             return
         state = {"mode": self.mode.name, **self.mode.link()}
@@ -241,7 +240,7 @@ class Page:
         show(self.linked, f'<i hidden data-link="{escape(urlencode(state))}"></i>')
 
     def restore(self, asked: Mapping[str, str]) -> None:
-        """Show what a link asks for, as far as there is such a thing."""
+        """Restore the state in the parameters of a link, as far as they are valid."""
         mode = self.modes.get(asked.get("mode", ""))
         if mode is None:
             return
@@ -259,7 +258,7 @@ class Page:
         return self.mode is not None and self.mode.name in ("Bend", "Locate")
 
     def place_grip(self) -> None:
-        """Put what can be dragged where the load is."""
+        """Move the grip to the load."""
         bend = self.bend
         if not self._draggable or bend.kind == "force":
             self.grip.show(None)
@@ -289,12 +288,12 @@ class Page:
         self.say("Error", str(error) or type(error).__name__, "red")
 
     def say(self, title: str, body: str, colour: Any = None, seconds: float | None = 8.0) -> None:
-        """Notify all browsers."""
+        """Show a notification in all browsers."""
         for client in self.server.get_clients().values():
             client.add_notification(title, body, color=colour, auto_close_seconds=seconds)
 
     def close(self) -> None:
-        """End everything; what is drawn from, such as a video, after what draws."""
+        """Stop all threads, and then close their sources, such as videos."""
         self.slow_work.close()
         self.work.close()
         for end in self.closing:
@@ -303,7 +302,7 @@ class Page:
 
 
 def asked(handle: viser.GuiInputHandle[Any], then: Callable[[Any], None]) -> None:
-    """Call with the value of a control when someone changes it on the page (not when we do)."""
+    """Call ``then`` with the value of a control when a user changes it on the page."""
 
     @handle.on_update
     async def _(event: Any) -> None:
@@ -312,13 +311,13 @@ def asked(handle: viser.GuiInputHandle[Any], then: Callable[[Any], None]) -> Non
 
 
 def put(handle: viser.GuiInputHandle[Any], value: Any) -> None:
-    """Show a value in a control."""
+    """Set the value of a control."""
     control: Any = handle  # type checkers take its value for read-only
     control.value = value
 
 
 def show(handle: viser.GuiHtmlHandle, content: str) -> None:
-    """Write something in the panel, unless it is there already."""
+    """Update a text of the panel if it has changed."""
     if handle.content != content:
         handle.content = content
 
@@ -330,7 +329,7 @@ Moved = Callable[[Array, Array], None]
 
 
 class Grip:
-    """A ball and a gizmo at one place of the scene."""
+    """A ball and a gizmo in the scene that can be dragged."""
 
     def __init__(self, server: viser.ViserServer, size: float, moved: Moved) -> None:
         self._moved = moved
@@ -377,14 +376,14 @@ class Grip:
         self._moved(np.array(place, dtype=np.float64) / _MM, turn)
 
     def follow(self, place: Array) -> None:
-        """Be where it was dragged to, (3,), m, as far as the mouse does not do that itself."""
+        """Move the part that the mouse does not hold to the position (3,) it was dragged to, m."""
         x, y, z = (_MM * place).tolist()
         self._ball.position = (x, y, z)
         if self._by_ball:
             self._gizmo.position = (x, y, z)
 
     def show(self, place: Array | None, axis: Array | None = None) -> None:
-        """Stand at a place (3,), m; with arcs that turn an axis, if there is one; None hides it."""
+        """Show the grip at a position (3,), m, with arcs to rotate an axis; None hides it."""
         if place is not None:
             x, y, z = (_MM * place).tolist()
             self._gizmo.position = self._ball.position = (x, y, z)
@@ -400,7 +399,7 @@ class Grip:
         self._gizmo.visible = self._ball.visible = place is not None
 
     def remove(self) -> None:
-        """Take it away."""
+        """Remove it from the scene."""
         self._gizmo.remove()
         self._ball.remove()
 
@@ -419,13 +418,13 @@ _WIDTH = 1.25  # width of what is shown, over the distance from which it is look
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A place to be looked at."""
+    """View of a region: centre, distance and direction."""
 
     centre: Array
     distance: float
     way: Array
     height: float = 0.0
-    """Height of what is shown, over the distance; it matters on a phone."""
+    """Height of the region relative to the distance, used in narrow windows."""
 
 
 def framed(shot: Shot, width: float, height: float, fov: float) -> tuple[Array, Array]:
@@ -448,14 +447,14 @@ def framed(shot: Shot, width: float, height: float, fov: float) -> tuple[Array, 
 
 
 def whole(whisker: Whisker) -> Shot:
-    """Look at all of a whisker."""
+    """View of the whole whisker."""
     length = float(to_display("length", whisker.length))
     middle = np.array([0.45, 0.1, 0.0]) * length
     return Shot(middle, 0.95 * length, np.array([0.15, -0.8, 0.6]))
 
 
 class Framing:
-    """Keeps the cameras of all browsers on a shot, also of those that connect later."""
+    """Controller of the cameras of all browsers, including those that connect later."""
 
     def __init__(
         self, server: viser.ViserServer, viewed: Callable[[], None] = lambda: None
@@ -464,12 +463,12 @@ class Framing:
         self._viewed = viewed
         self._shot: Shot | None = None
         self.turned: Array | None = None
-        """Camera position and target (6,), mm, of the view that someone turned last."""
+        """Camera position and target (6,) of the view changed last, mm."""
         self._placed: dict[int, tuple[int, int, Array]] = {}
         server.on_client_connect(self._came)
 
     def show(self, shot: Shot) -> None:
-        """Point all cameras at this."""
+        """Point all cameras at a shot."""
         self._shot, self.turned = shot, None
         camera = self._server.initial_camera
         place, target = framed(shot, 1280.0, 720.0, camera.fov)
@@ -518,7 +517,7 @@ Job = Callable[[], None]
 
 
 class Latest:
-    """One thread, one pending job per topic, the one that is due first comes first."""
+    """Worker thread with at most one pending job per topic, in order of due times."""
 
     def __init__(self, fault: Callable[[Exception], None]) -> None:
         self._fault = fault
@@ -530,7 +529,7 @@ class Latest:
         self._thread.start()
 
     def put(self, topic: str, job: Job, due: float = 0.0) -> None:
-        """Ask for a job, in place of a pending one of the same topic; not once it is closed."""
+        """Schedule a job, replacing a pending one of the same topic, unless closed."""
         with self._wake:
             if self._closed:
                 return
@@ -538,18 +537,18 @@ class Latest:
             self._wake.notify_all()
 
     def drop(self, topic: str) -> None:
-        """Take back what is pending of a topic."""
+        """Cancel the pending job of a topic."""
         with self._wake:
             self._jobs.pop(topic, None)
             self._wake.notify_all()
 
     def wait(self, timeout: float = 30.0) -> bool:
-        """Wait until nothing is pending; return whether that happened in time, s."""
+        """Wait up to ``timeout`` s until no job is pending; return whether this is the case."""
         with self._wake:
             return self._wake.wait_for(lambda: not self._jobs and not self._busy, timeout)
 
     def close(self) -> None:
-        """Drop what is pending and end the thread."""
+        """Cancel pending jobs and end the thread."""
         with self._wake:
             self._closed = True
             self._jobs.clear()
@@ -558,7 +557,7 @@ class Latest:
             self._thread.join(timeout=5.0)
 
     def _pause(self) -> float:
-        """Time for which nothing is due, s."""
+        """Time until the next job is due, s."""
         first = min((due for due, _ in self._jobs.values()), default=inf)
         return first - time.monotonic()
 
@@ -600,11 +599,11 @@ class Player:
         return self._playing.is_set()
 
     def play(self) -> None:
-        """Let time go on."""
+        """Start the clock."""
         self._playing.set()
 
     def pause(self) -> None:
-        """Let it stand still."""
+        """Stop the clock."""
         self._playing.clear()
 
     def close(self) -> None:
@@ -631,7 +630,7 @@ _done = threading.Event()  # set once this process has gone through all: kernels
 
 
 class CompileNotice(event.Listener):
-    """Runs jobs in its own thread, and reports when kernels are being compiled."""
+    """Runner of jobs in a thread, which reports when kernels are being compiled."""
 
     def __init__(self, report: Callable[[bool], None]) -> None:
         self._report = report
@@ -641,7 +640,7 @@ class CompileNotice(event.Listener):
         event.register("numba:compile", self)
 
     def start(self, jobs: Sequence[Rehearsal]) -> None:
-        """Go through jobs, once in a process; what fails will fail where it counts."""
+        """Run jobs, once per process, ignoring errors, which will occur again when it matters."""
         if not _done.is_set():
             self._running = True
             threading.Thread(target=self._run, args=(jobs,), name="warming", daemon=True).start()
@@ -660,12 +659,12 @@ class CompileNotice(event.Listener):
             self._count(0)
 
     def on_start(self, event: event.Event) -> None:
-        """Hear that Numba begins to compile something."""
+        """Handle the start of a compilation by Numba."""
         if _ours(event):
             self._count(+1)
 
     def on_end(self, event: event.Event) -> None:
-        """Hear that it has done so."""
+        """Handle the end of a compilation by Numba."""
         if _ours(event):
             self._count(-1)
 
@@ -678,7 +677,7 @@ class CompileNotice(event.Listener):
                 self._report(busy)
 
     def close(self) -> None:
-        """Begin no more jobs, and report nothing."""
+        """Start no more jobs and stop reporting."""
         self._closed = True
         event.unregister("numba:compile", self)
 

@@ -1,4 +1,4 @@
-"""Numbers with units, sentences and signals over time, as HTML and SVG; values as colours."""
+"""HTML and SVG of numbers, sentences and signals over time, and colours of values."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ _GREEK = {"theta": "θ", "varphi": "φ", "sigma": "σ"}
 
 
 def plain(text: str) -> str:
-    """Text as HTML shows it."""
+    """Escape text for HTML."""
     return _escape(text, quote=False)
 
 
 def symbol(name: str) -> str:
-    """Write the symbol of a quantity: `F_x` as F with an index."""
+    """HTML of the symbol of a quantity: `F_x` as F with an index."""
     text = re.sub(r"\\math(?:rm|bf){(\w+)}", r"\1", quantity(name).symbol)
     text = re.sub(r"\\([a-z]+)", lambda found: _GREEK.get(found[1], found[1]), text)
     return re.sub(r"_(\w)", r"<sub>\1</sub>", text)
 
 
 def number(name: str, value: float, digits: int = 4) -> str:
-    """Write an SI value in the unit in which it is shown; a dash where it is missing.
+    """Format an SI value in its display unit; a dash if it is missing.
 
     Angles have two decimals, other numbers so many digits but at most four decimals.
     """
@@ -52,7 +52,7 @@ def number(name: str, value: float, digits: int = 4) -> str:
 
 
 def table(rows: Mapping[str, float], heading: str = "") -> str:
-    """Quantities and their values in two columns; each cell names its quantity."""
+    """HTML table of quantities and their values."""
     cells = [
         f'<td style="padding:1px 0;opacity:.75" title="{_escape(quantity(name).long_name)}">'
         f"<i>{symbol(name)}</i></td>"
@@ -70,7 +70,7 @@ def table(rows: Mapping[str, float], heading: str = "") -> str:
 
 
 def sentence(status: Status, good: str | None = None) -> str:
-    """Say what became of a load or an estimate, in the colour of good or bad news.
+    """HTML of the status of a load or an estimate, coloured by success.
 
     A valid status may be stated in other words.
     """
@@ -85,7 +85,7 @@ def sentence(status: Status, good: str | None = None) -> str:
 
 
 def note(text: str) -> str:
-    """A remark."""
+    """HTML of a remark."""
     return (
         '<div data-note style="margin:0 12px 8px;font-size:13px;line-height:1.35;opacity:.8">'
         f"{plain(text)}</div>"
@@ -97,12 +97,12 @@ def _framed(body: str) -> str:
 
 
 def of_deflection(bent: Deflection) -> str:
-    """Status of the load, signals at the base, and contact point."""
+    """HTML with status of the load, signals at the base, and contact point."""
     return sentence(Status(int(bent.status))) + numbers(bent)
 
 
 def numbers(bent: Deflection) -> str:
-    """Signals at the base, and contact point."""
+    """HTML tables of the signals at the base and the contact point."""
     signals = signals_of(np.asarray(bent.force), np.asarray(bent.moment))
     measured = dict(zip(SIGNALS, signals.tolist(), strict=True))
     where = (float(bent.arc_length), *spherical(np.asarray(bent.contact_point)).tolist())
@@ -118,7 +118,7 @@ _MOST = 700
 
 
 def chart(time: Array, signals: dict[str, Array], touching: NDArray[np.bool_]) -> str:
-    """Draw the six signals over time."""
+    """SVG of the six signals over time."""
     parts = [_shade(time, touching, len(ROWS) * ROW)]
     for row, names in enumerate(ROWS):
         parts.append(_row(time, signals, names, row * ROW))
@@ -134,7 +134,7 @@ def height() -> float:
 
 
 def cursor(share: float, *, strip: bool = False) -> str:
-    """A line at a share of the time, to be laid over the chart, or over the timeline."""
+    """SVG of a line at a share of the time, to be overlaid on the chart or the timeline."""
     x = LEFT + (WIDTH - LEFT) * share
     tall, end = (STRIP, 12.0) if strip else (height(), len(ROWS) * ROW)
     line = (
@@ -149,7 +149,7 @@ STRIP = 20.0  # height of the timeline, pixels per :data:`WIDTH` of them
 
 
 def timeline(time: Array, touching: NDArray[np.bool_], onsets: NDArray[np.int64]) -> str:
-    """Draw contacts, their onsets and the time over a whole trial, in ms."""
+    """SVG of contacts, onsets and a time axis in ms of a whole trial."""
     duration = 1e3 * float(time[-1] - time[0])
     parts = [_shade(time, touching, 10.0)]
     parts += [
@@ -166,7 +166,7 @@ def timeline(time: Array, touching: NDArray[np.bool_], onsets: NDArray[np.int64]
 
 
 def _svg(body: str, tall: float, mark: str = "") -> str:
-    """A picture over time; the page's script seeks where it is clicked."""
+    """SVG over time, in which the page's script handles clicks."""
     return (
         f'<svg{mark} data-seek="{LEFT / WIDTH:.4f}" viewBox="0 0 {WIDTH:.0f} {tall:.0f}" '
         f'style="display:block;width:100%;padding-right:{PAD}px;box-sizing:border-box;'
@@ -196,7 +196,7 @@ def _shade(time: Array, touching: NDArray[np.bool_], tall: float) -> str:
 
 
 def _row(time: Array, signals: dict[str, Array], names: tuple[str, str], top: float) -> str:
-    """Two signals of one unit in one row."""
+    """SVG of a row with two signals of the same unit."""
     shown = {name: to_display(name, signals[name]) for name in names}
     low, high = _limits(np.concatenate(list(shown.values())), quantity(names[0]).display_unit)
     inside, bottom = ROW - 12.0, top + ROW - 4.0
@@ -231,7 +231,7 @@ def _brief(value: float) -> str:
 
 
 def _thinned(time: Array, values: Array) -> tuple[Array, Array]:
-    """Few enough points, with the extremes of what they stand for."""
+    """Reduce a signal to few points that keep its extremes."""
     step = int(np.ceil(2 * time.size / _MOST))
     if step <= 1:
         return time, values
@@ -244,7 +244,7 @@ def _thinned(time: Array, values: Array) -> tuple[Array, Array]:
 
 
 def _path(x: Array, y: Array, colour: str, direction: bool) -> str:
-    """A line that is broken where values are missing, or where a direction goes round."""
+    """SVG path, interrupted at missing values and where a direction wraps around."""
     broken = ~np.isfinite(y)
     jump = np.zeros(y.size, dtype=bool)
     if direction:
@@ -277,7 +277,7 @@ _COUNTS = ((0.80, 0.82, 0.84), (0.35, 0.62, 0.80), (0.90, 0.55, 0.10), (0.75, 0.
 
 @dataclass(frozen=True)
 class Legend:
-    """Meaning of the colours."""
+    """Legend of colours."""
 
     title: str
     steps: tuple[tuple[str, str], ...]
@@ -320,7 +320,7 @@ def shaded(name: str, values: Array) -> tuple[Bytes, Legend]:
 
 
 def counted(numbers: Ints) -> tuple[Bytes, Legend]:
-    """Colours of numbers of candidates, and their legend."""
+    """Colours (..., 3) of numbers of candidates, and their legend."""
     rgb = np.array(_COUNTS)[np.clip(numbers, 0, 3)]
     words = ("none found", "one", "two", "more")
     steps = tuple((_css(np.array(c)), word) for c, word in zip(_COUNTS, words, strict=True))

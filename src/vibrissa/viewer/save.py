@@ -1,8 +1,8 @@
-"""Files of what is on the page, and the buttons that hand them over.
+"""Downloads from the page: files of the displayed data, pictures and movies.
 
-The page is given a name, an icon, and less work for weak graphics before it starts: viser serves
-one that is ready made and has no place for such things, so they are written into its head on the
-way to the browser. Without them the page works as well, but not as fast.
+A title, an icon and a script that reduces the load of weak graphics are inserted into the head of
+the page when it is served, as viser serves a prebuilt page without such settings. The page also
+works without them, but more slowly.
 """
 
 from __future__ import annotations
@@ -35,32 +35,32 @@ _MARGIN = 24
 
 
 def whisker_csv(whisker: Whisker) -> bytes:
-    """The resting centreline as a table, which `vibrissa.load_whisker` reads."""
+    """CSV file of the resting centreline, for `vibrissa.load_whisker`."""
     return _written("whisker.csv", lambda path: save_centerline(path, whisker.centerline(NODES)))
 
 
 def whisker_netcdf(whisker: Whisker) -> bytes:
-    """The whisker without loss: shape, radius, material."""
+    """NetCDF file of the whisker, without loss."""
     return netcdf(whisker.to_dataset())
 
 
 def map_netcdf(contact_map: ContactMap) -> bytes:
-    """A map without loss, which `ContactMap.load` reads."""
+    """NetCDF file of a map, without loss, for `ContactMap.load`."""
     return _written("map.nc", contact_map.save)
 
 
 def recording_netcdf(recording: xr.DataTree) -> bytes:
-    """A trial with all its groups, which every verb reads."""
+    """NetCDF file of a recording with all groups."""
     return _written("trial.nc", lambda path: save_recording(path, recording))
 
 
 def netcdf(data: xr.Dataset) -> bytes:
-    """A dataset as a file."""
+    """NetCDF file of a dataset."""
     return bytes(netcdf_image(data))
 
 
 def deflection_dataset(bent: Deflection) -> xr.Dataset:
-    """One bent whisker as a labelled dataset."""
+    """Dataset of one bent whisker."""
     out = bent.to_dataset().assign_attrs(reference_frame="whisker")
     out["centerline"] = ("node", "space"), bent.centerline(NODES), attributes("centerline")
     out["contact_point"].attrs |= attributes("contact_point_whisker")
@@ -68,7 +68,7 @@ def deflection_dataset(bent: Deflection) -> xr.Dataset:
 
 
 def png(image: Picture) -> bytes:
-    """A picture (height, width, 3 or 4) as PNG."""
+    """PNG file of a picture (height, width, 3 or 4)."""
     import imageio.v3 as imageio
 
     encoded: bytes = imageio.imwrite("<bytes>", image, extension=".png")
@@ -76,13 +76,13 @@ def png(image: Picture) -> bytes:
 
 
 def _on_white(image: Picture) -> Picture:
-    """A picture (height, width, 4) on white (height, width, 3)."""
+    """Blend a picture (height, width, 4) with white (height, width, 3)."""
     share = image[..., 3:] / 255.0
     return np.round(image[..., :3] * share + 255.0 * (1.0 - share)).astype(np.uint8)
 
 
 def on_paper(image: Picture) -> Picture:
-    """A picture (height, width, 4) on white (height, width, 3), without its empty margins."""
+    """Blend a picture (height, width, 4) with white and crop its empty margins (h, w, 3)."""
     out = _on_white(image)
     rows, columns = np.nonzero((out != 255).any(axis=-1))
     if not rows.size:
@@ -92,7 +92,7 @@ def on_paper(image: Picture) -> Picture:
 
 
 def _written(name: str, write: Callable[[Path], object]) -> bytes:
-    """Return the bytes that a writer of files writes."""
+    """Contents of the file written by a function."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
         write(path)
@@ -105,7 +105,7 @@ _FRAMES = 100
 
 
 def _render(client: viser.ClientHandle) -> Picture:
-    """Render what a browser shows, without the panels."""
+    """Render the scene of a browser, without the panels."""
     camera = client.camera
     return client.get_render(
         camera.image_height, camera.image_width, transport_format="png", timeout=_TIMEOUT
@@ -113,7 +113,7 @@ def _render(client: viser.ClientHandle) -> Picture:
 
 
 def movie(client: viser.ClientHandle, mode: TrialMode) -> bytes:
-    """A trial as a browser sees it, frame by frame on white, as MP4."""
+    """MP4 movie of a trial in the view of a browser, on white."""
     mode.pause()
     count = min(mode.trial.frames, _FRAMES)
     rows = np.linspace(0, mode.trial.frames - 1, count).round().astype(int)
@@ -129,7 +129,7 @@ def movie(client: viser.ClientHandle, mode: TrialMode) -> bytes:
 
 
 class SaveControls:
-    """Whisker, picture and data, downloaded by whoever asks."""
+    """Buttons to download the whisker, a picture and data."""
 
     def __init__(self, page: Page, recording: xr.DataTree | None = None) -> None:
         self._page = page
@@ -167,7 +167,7 @@ class SaveControls:
         return "bent.nc", lambda: netcdf(deflection_dataset(bent))
 
     def _picture(self, event: viser.GuiEvent[Any]) -> None:
-        """Picture of what the one who asks sees, without the panel."""
+        """Send a picture of the requesting browser's view, without the panel."""
         client = event.client
         if client is None:
             return
@@ -182,7 +182,7 @@ class SaveControls:
         self._send(event, "vibrissa.png", drawn)
 
     def _movie(self, event: viser.GuiEvent[Any]) -> None:
-        """A short movie of the trial, seen as the browser that asks sees it."""
+        """Send a short movie of the trial in the requesting browser's view."""
         client, mode = event.client, self._page.mode
         if client is None:
             return
@@ -216,7 +216,7 @@ _ICON = (
 
 
 def amended(response: Any) -> Any:
-    """Put the script into a response that is a page; leave every other as it is."""
+    """Insert the script into a response that is a page; other responses are unchanged."""
     if response is None or not response.headers.get("Content-Type", "").startswith("text/html"):
         return response
     zipped = response.headers.get("Content-Encoding") == "gzip"
@@ -232,7 +232,7 @@ def _zipped(page: bytes) -> bytes:
 
 
 def with_script(page: bytes) -> bytes:
-    """Put the script, an icon and a title first of all that a page loads."""
+    """Insert the script, an icon and a title at the beginning of a page's head."""
     ours = (
         f'<link rel="icon" href="{_ICON}"/><title>vibrissa</title><style>{STYLE}</style>'
         f"<script>{SCRIPT}</script>"

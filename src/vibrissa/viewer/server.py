@@ -1,8 +1,8 @@
-"""Serve the page on this machine, to the page itself and to programs that are not browsers.
+"""Local web server of the viewer, and display of running streams.
 
-Answers of a running stream are drawn as they come: `vibrissa stream --send udp://HOST:PORT` sends
-each answer as a line of JSON. Of those that come between two pictures only the newest is drawn; the
-contact points of all remain as a cloud. All of it is in the whisker's frame.
+Results of a running stream are drawn as they arrive: `vibrissa stream --send udp://HOST:PORT` sends
+each result as a line of JSON. Of the results between two updates only the newest is drawn; the
+contact points of all remain as a cloud. All coordinates are in the whisker frame.
 """
 
 from __future__ import annotations
@@ -81,16 +81,16 @@ _COMPILING = (
 
 
 class Shown(Protocol):
-    """Thing that is served."""
+    """Interface of a served page."""
 
     server: viser.ViserServer
 
     def close(self) -> None:
-        """End it."""
+        """Stop it."""
 
 
 class Served:
-    """A page that is being served; ends with its ``with`` block.
+    """Handle of a served page; a context manager that stops it.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ class Served:
 
 
 class Viewer(Served):
-    """A page of a whisker, a map or a trial that is being served; ends with its ``with`` block.
+    """Handle of a served page of a whisker, a map or a trial; a context manager that stops it.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ class Viewer(Served):
         self.page = page
 
     def put_contact(self, point: ArrayLike) -> None:
-        """Put the wanted contact point where it would otherwise be dragged to.
+        """Set the requested contact point, as by dragging.
 
         Parameters
         ----------
@@ -164,7 +164,7 @@ def view_stream(
     host: str = HOST,
     port: int | None = None,
 ) -> Served:
-    """Serve a page that draws the answers of a running stream as they come.
+    """Serve a page that draws the results of a running stream as they arrive.
 
     Parameters
     ----------
@@ -272,14 +272,14 @@ def view(
 
 
 def _once(given: Any, shown: Any, name: str) -> Any:
-    """Return what is shown, where it is not given a second time."""
+    """Return the object to show; raise ValueError if it is given twice."""
     if given is not None:
         raise ValueError(f"got two {name}s; give one")
     return shown
 
 
 def _of_one(contact_map: ContactMap, whisker: Whisker) -> Whisker:
-    """The whisker of a map, where it is the one that is asked for."""
+    """Whisker of a map; raise ValueError if it is another than the requested one."""
     own = contact_map.whisker
     names = ("length", "base_radius", "tip_radius", "youngs_modulus")
     same = all(np.isclose(getattr(own, name), getattr(whisker, name)) for name in names)
@@ -294,7 +294,7 @@ def _of_one(contact_map: ContactMap, whisker: Whisker) -> Whisker:
 def _furnished(
     page: Page, recording: xr.DataTree | None, trial: Watched | None, footage: Sequence[Footage]
 ) -> None:
-    """Give a page its controls and its modes, and begin with the one that shows most."""
+    """Add controls and modes to a page, and start with the most informative mode."""
     names = ("Bend", "Locate", "Map") if trial is None else ("Bend", "Locate", "Map", "Trial")
     choice = page.server.gui.add_button_group("Mode", names)
     choice.on_click(lambda event: page.choose(event.target.value.removeprefix(_HERE)))
@@ -326,7 +326,7 @@ def _furnished(
 
 
 def rehearsal(page: Page) -> list[Rehearsal]:
-    """Make requests that someone may make of a page, as jobs that change nothing."""
+    """Jobs that run typical requests of a page without changing it, to compile kernels."""
     bend = page.bend
 
     def locate() -> None:
@@ -384,7 +384,7 @@ def _served(
 
 
 def free_port(host: str) -> int:
-    """The first free port from the usual one on."""
+    """First free port from the default one on."""
     for port in range(PORT, PORT + 200):
         if is_free(host, port):
             return port
@@ -392,7 +392,7 @@ def free_port(host: str) -> int:
 
 
 def is_free(host: str, port: int) -> bool:
-    """Whether a port can be listened on."""
+    """Whether a port is free."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
         if os.name == "posix":  # a port that was just given back is free
@@ -410,7 +410,7 @@ _ONE_AT_A_TIME = threading.Lock()
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address or name is that of this machine, for this machine alone."""
+    """Whether an address or name is a loopback address of this machine."""
     if host.lower() == "localhost":
         return True
     try:
@@ -435,7 +435,7 @@ def from_own_page(origin: str | None, asked: str | None, host: str) -> bool:
 
 @contextmanager
 def guarded(host: str, restore: Restore) -> Iterator[None]:
-    """Let servers that start meanwhile refuse pages from elsewhere, and follow links.
+    """Context in which started servers reject requests of other pages, and handle links.
 
     viser has no place for such a check, so what it calls to listen is wrapped while it starts.
     """
@@ -484,7 +484,7 @@ _WIDEST = 0.25
 
 
 class Live:
-    """Answers of a stream so far, of one whisker; those of others, by name, are left out."""
+    """Results of a stream for one whisker; those of other names are ignored."""
 
     def __init__(self, whisker: Whisker, name: str = "") -> None:
         self.whisker, self.name = whisker, name
@@ -493,7 +493,7 @@ class Live:
         self._points: deque[tuple[float, ...]] = deque(maxlen=_POINTS)
 
     def put(self, line: str) -> None:
-        """Take one line; what is not an answer is counted."""
+        """Process one line; invalid lines are counted."""
         try:
             answer = json.loads(line)
             status = Status[answer["status"].upper()] if answer["status"] != "tare" else None
@@ -508,7 +508,7 @@ class Live:
             self._points.append(point)
 
     def drawing(self, exaggeration: float) -> Drawing:
-        """Draw the newest contact on the bent whisker, and the points of those before."""
+        """Draw the newest contact with the bent whisker, and earlier contact points."""
         whisker, answer = self.whisker, self.newest
         out: dict[str, Mark] = dict(resting(whisker, exaggeration))
         size = float(mm(0.011 * whisker.length))
@@ -532,7 +532,7 @@ class Live:
         return out
 
     def html(self) -> str:
-        """State status, point and force of the newest answer, and how many there were."""
+        """HTML with status, point and force of the newest result, and the number of results."""
         answer = self.newest
         if not answer:
             return note("Waiting for answers of `vibrissa stream --send`.")
@@ -548,7 +548,7 @@ class Live:
 
 
 class LivePage:
-    """Page that draws the answers which come to a UDP address until it is closed."""
+    """Page that draws the results arriving at a UDP address until it is closed."""
 
     def __init__(self, server: viser.ViserServer, live: Live, address: str) -> None:
         self.server, self.live = server, live
@@ -564,7 +564,7 @@ class LivePage:
 
     @property
     def address(self) -> str:
-        """Address at which answers are listened for."""
+        """UDP address at which results are received."""
         host, port = self._socket.getsockname()[:2]
         return f"{host}:{port}"
 

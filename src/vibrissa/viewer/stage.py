@@ -1,11 +1,10 @@
-"""Drawings onto the page: things are added, changed or taken away by name.
+"""Display of drawings on the page: named objects are added, changed and removed.
 
-A surface of many colours goes to the browser as a GLB file (binary glTF 2.0), whose colours are
-shown as they are: a surface that is lit in the browser costs many times what it costs to fill it
-with the colours of its corners, and a colour that stands for a number must not depend on the light.
-So a little shade, by which one sees the shape, is in the colours here, and the material is
-`KHR_materials_unlit`. The page's tone mapping (ACES, as three.js has it), which would make all
-colours paler than those of the legend, is undone beforehand.
+A surface with vertex colours is sent to the browser as a GLB file (binary glTF 2.0) with the
+material `KHR_materials_unlit`, as lighting a surface in the browser is many times slower than
+interpolating its colours, and colours that represent numbers must not depend on the light. Slight
+shading, which makes the shape visible, is included in the colours. The page's tone mapping (ACES,
+as in three.js), which would make colours paler than those of the legend, is inverted beforehand.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from vibrissa.scene import (
 
 
 def lit(scene: viser.SceneApi) -> None:
-    """Light a scene from above and a little from everywhere.
+    """Set the lights of a scene: one from above, and weak ambient light.
 
     Reflections of a surrounding, which viser lights with, take most of the time of a frame where
     there is no graphics card, and nothing here is shiny; so do shadows.
@@ -52,14 +51,14 @@ def lit(scene: viser.SceneApi) -> None:
 
 
 class Stage:
-    """The 3D scene of a server, in layers of things by name."""
+    """The 3D scene of a server, in layers of named objects."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
         self._shown: dict[str, dict[str, tuple[Mark, viser.SceneNodeHandle]]] = {}
 
     def show(self, layer: str, drawing: Drawing) -> None:
-        """Make a layer look like a drawing; all changes come into sight together."""
+        """Update a layer to a drawing; all changes become visible together."""
         before = self._shown.get(layer, {})
         after: dict[str, tuple[Mark, viser.SceneNodeHandle]] = {}
         with self._server.atomic():
@@ -74,7 +73,7 @@ class Stage:
         self._shown[layer] = after
 
     def node(self, layer: str, name: str) -> viser.SceneNodeHandle | None:
-        """Node of a thing on the page, if there is one."""
+        """Scene node of an object; None if it does not exist."""
         found = self._shown.get(layer, {}).get(name)
         return None if found is None else found[1]
 
@@ -129,7 +128,7 @@ class Stage:
 
 
 def _changed(handle: viser.SceneNodeHandle, old: Mark, new: Mark) -> bool:
-    """Change what is on the page into a new thing, if it is near enough to the old one."""
+    """Change an object into a similar new one; return whether this is possible."""
     node = cast(Any, handle)  # every kind has attributes of its own
     match old, new:
         case Body(), Body() if old.side == new.side and np.array_equal(old.faces, new.faces):
@@ -205,7 +204,7 @@ def glb(
 
 
 def before_tone_mapping(light: Array) -> Array:
-    """Light (..., 3) that the page's tone mapping turns into the light that is given."""
+    """Inverse of the page's tone mapping for light (..., 3)."""
     y = np.clip(light, 0.0, 1.0) @ np.linalg.inv(_OUT).T
     a, b, c = 1.0 - 0.983729 * y, 0.0245786 - 0.432951 * y, -(0.000090537 + 0.238081 * y)
     curve = (-b + np.sqrt(np.maximum(b * b - 4.0 * a * c, 0.0))) / (2.0 * a)
@@ -213,7 +212,7 @@ def before_tone_mapping(light: Array) -> Array:
 
 
 def _linear(share: Array) -> Array:
-    """Light of what the screen shows (sRGB, 0 to 1)."""
+    """Linear light of sRGB values from 0 to 1."""
     return np.asarray(np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4))
 
 
@@ -226,7 +225,7 @@ def _shade(triangles: Array) -> Array:
 
 
 def _welded(corners: Array) -> tuple[Array, Ints, Ints]:
-    """Places that differ (m, 3), the first corner at each (m,), and the place of each corner."""
+    """Distinct vertices (m, 3), the first corner at each (m,), and the vertex of each corner."""
     size = float(np.ptp(corners)) or 1.0
     cells = np.round(corners / (_WELD * size)).astype(np.int64)
     key = cells.view([("", np.int64)] * 3).ravel()

@@ -1,7 +1,7 @@
 """States of the page and their transitions: whisker, load, deflection, contacts.
 
-Nothing here needs a browser. A load without an equilibrium leaves the last shape that had one,
-so that there is something to look at along with the reason.
+This module does not need a browser. For a load without an equilibrium, the last shape is kept, to
+be shown together with the reason.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _GPA = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Bend:
-    """A whisker, a load, and the deflection by it."""
+    """State of a whisker with a load and the resulting deflection."""
 
     whisker: Whisker
     kind: Kind
@@ -54,7 +54,7 @@ class Bend:
 
     @property
     def target(self) -> Array:
-        """Point that is dragged: wanted contact point, origin of the peg, or place of the force."""
+        """Dragged point: requested contact point, origin of the peg, or position of the force."""
         if self.kind == "point":
             return self.point
         if self.kind == "peg":
@@ -63,12 +63,12 @@ class Bend:
 
 
 def force_scale(whisker: Whisker) -> float:
-    """EI / L² at the base, N: about the force that bends a whisker a lot near its base."""
+    """EI / L² at the base, N: order of the force for large bending near the base."""
     return whisker.base_bending_stiffness / whisker.length**2
 
 
 def begin(whisker: Whisker) -> Bend:
-    """Bend a whisker by a point a little aside of where it rests."""
+    """Initial state: a whisker deflected slightly by a point."""
     place = whisker.position(0.65 * whisker.length)
     frame = whisker.frame(0.65 * whisker.length)
     point = place + 0.12 * whisker.length * frame[:, 1]
@@ -91,7 +91,7 @@ def begin(whisker: Whisker) -> Bend:
 
 
 def moved(bend: Bend, to: ArrayLike, axis: ArrayLike | None = None) -> Bend:
-    """Put the contact point or the peg elsewhere, m, and perhaps turn the peg."""
+    """Move the contact point or the peg, m, and optionally rotate the peg."""
     place = np.array(to, dtype=np.float64)
     if bend.kind == "peg":
         turned = bend.axis if axis is None else np.array(axis, dtype=np.float64)
@@ -100,7 +100,7 @@ def moved(bend: Bend, to: ArrayLike, axis: ArrayLike | None = None) -> Bend:
 
 
 def loaded(bend: Bend, kind: Kind) -> Bend:
-    """Take another load, which begins where the one before acts."""
+    """Change the kind of load, starting from the current contact."""
     at = np.asarray(bend.held.contact_point)
     if not np.isfinite(at).all():
         at = bend.target
@@ -114,7 +114,7 @@ def loaded(bend: Bend, kind: Kind) -> Bend:
 
 
 def _as_force(bend: Bend) -> Bend:
-    """Take place, size and direction of the force that now acts."""
+    """Convert the current contact to a force with the same position, magnitude and direction."""
     _, fy, fz = np.asarray(bend.held.contact_force)
     arc_length = float(bend.held.arc_length)
     if not np.isfinite([fy, fz, arc_length]).all() or arc_length <= 0.0:
@@ -128,17 +128,17 @@ def _as_force(bend: Bend) -> Bend:
 
 
 def with_radius(bend: Bend, radius: float) -> Bend:
-    """Give the peg a radius, m."""
+    """Set the radius of the peg, m."""
     return _solved(replace(bend, radius=radius))
 
 
 def with_force(bend: Bend, place: float, magnitude: float, direction: float) -> Bend:
-    """Say where (share of the length) a force acts, how large it is, N, and its direction, rad."""
+    """Set position (share of the length), magnitude (N) and direction (rad) of a force."""
     return _solved(replace(bend, place=place, magnitude=magnitude, direction=direction))
 
 
 def link_of(bend: Bend) -> dict[str, str]:
-    """The word of a link that restores the load: mm, µN, degrees."""
+    """Parameter of a link that restores the load: mm, µN, degrees."""
     if bend.kind == "point":
         return {"contact": words_of(_MM * bend.point)}
     if bend.kind == "peg":
@@ -147,7 +147,7 @@ def link_of(bend: Bend) -> dict[str, str]:
 
 
 def restored(bend: Bend, asked: Mapping[str, str]) -> Bend:
-    """Take the load that the words of a link state, if they do."""
+    """Restore the load from the parameters of a link, if they state one."""
     if (contact := numbers_in(asked.get("contact", ""), 3)) is not None:
         return moved(loaded(bend, "point"), contact / _MM)
     if (peg := numbers_in(asked.get("peg", ""), 7)) is not None and peg[3:6].any():
@@ -160,12 +160,12 @@ def restored(bend: Bend, asked: Mapping[str, str]) -> Bend:
 
 
 def words_of(numbers: ArrayLike) -> str:
-    """Numbers as a word of a link."""
+    """Numbers as the value of a link's parameter."""
     return ",".join(f"{x:.6g}" for x in np.asarray(numbers, dtype=np.float64))
 
 
 def numbers_in(word: str, count: int) -> Array | None:
-    """So many finite numbers of a word of a link; None if they are not there."""
+    """Parse ``count`` finite numbers from a link's parameter; None if this fails."""
     try:
         numbers = np.array(word.split(","), dtype=np.float64)
     except ValueError:
@@ -174,7 +174,7 @@ def numbers_in(word: str, count: int) -> Array | None:
 
 
 def with_whisker(bend: Bend, whisker: Whisker) -> Bend:
-    """Bend another whisker by the same load; points and pegs move along with its length."""
+    """Apply the same load to another whisker; points and pegs scale with its length."""
     scale = whisker.length / bend.whisker.length
     rest = deflect(whisker, PointForce(0.5 * whisker.length, 0.0, 0.0))
     stretched = replace(
@@ -189,7 +189,7 @@ def with_whisker(bend: Bend, whisker: Whisker) -> Bend:
 
 
 def _solved(bend: Bend) -> Bend:
-    """Deflect; what has no answer leaves the last shape."""
+    """Solve for the deflection; without an equilibrium the last shape is kept."""
     bent = deflect(bend.whisker, _load(bend))
     return replace(bend, deflection=bent, held=bent if Status(int(bent.status)).ok else bend.held)
 
@@ -215,7 +215,7 @@ def _load(bend: Bend) -> PointContact | PegContact | PointForce:
 
 @dataclass(frozen=True)
 class Shape:
-    """Shape that the sliders set."""
+    """Shape parameters set by the sliders."""
 
     length: float
     turn: float
@@ -224,12 +224,12 @@ class Shape:
 
 
 def words_of_shape(shape: Shape) -> str:
-    """A shape as a word of a link: mm, degrees, ratio, GPa."""
+    """Parameter of a link that restores a shape: mm, degrees, ratio, GPa."""
     return words_of([_MM * shape.length, np.rad2deg(shape.turn), shape.taper, _GPA * shape.modulus])
 
 
 def shape_in(word: str) -> Shape | None:
-    """Shape that a word of a link states; None if it is not there."""
+    """Parse a shape from a link's parameter; None if this fails."""
     numbers = numbers_in(word, 4)
     if numbers is None:
         return None
@@ -245,13 +245,13 @@ def whole_turn(whisker: Whisker) -> float:
 
 
 def shape_of(whisker: Whisker) -> Shape:
-    """Shape of a whisker as it is."""
+    """Shape parameters of a whisker."""
     taper = whisker.base_radius / whisker.tip_radius
     return Shape(whisker.length, whole_turn(whisker), taper, whisker.youngs_modulus)
 
 
 def shaped(whisker: Whisker, asked: Shape) -> Whisker:
-    """Change a whisker to a shape that is asked for.
+    """Change a whisker to a requested shape.
 
     The base radius stays. A taper other than its own is linear; a straight whisker that is to turn
     gets the same curvature everywhere.
@@ -277,7 +277,7 @@ _SKIN, _SOLID = (12, 48, 6), (36, 72, 16)
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """A whisker's map with the samples that are drawn."""
+    """Map of a whisker with the drawn samples."""
 
     contact_map: ContactMap
     samples: xr.Dataset
@@ -287,12 +287,12 @@ class Chart:
 
     @property
     def whisker(self) -> Whisker:
-        """Whose contacts."""
+        """Whisker of the map."""
         return self.contact_map.whisker
 
 
 def charted(whisker: Whisker, contact_map: ContactMap | None = None) -> Chart:
-    """Sample all stable contacts of a whisker; its map is made unless it is given."""
+    """Sample all stable contacts of a whisker; its map is computed unless given."""
     contact_map = contact_map or ContactMap.simulate(whisker, grid=False)
     samples, line = contact_map.to_dataset(), whisker.centerline()
     # The last bearing is the first again, and no load is not a contact.
@@ -303,7 +303,7 @@ def charted(whisker: Whisker, contact_map: ContactMap | None = None) -> Chart:
 
 
 def envelope(chart: Chart) -> Painted:
-    """The surface at which the whisker slips off, seen from inside, so that it hides nothing."""
+    """Surface at which the whisker slips off, drawn from the inside only."""
     nodes = sample_contacts(chart.samples, chart.line, shape=_SKIN)[..., :3]
     # The end near the base stays open.
     skin = np.concatenate([nodes[:, :, -1], nodes[-1, :, -2::-1].swapaxes(0, 1)])

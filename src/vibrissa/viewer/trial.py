@@ -1,7 +1,7 @@
 """Mode Trial: a recording over time, in space, in both cameras, in signals.
 
-Lines, contacts and forces are in the laboratory frame. Of what is recorded several times the first
-counts of: the groups of the stages, the recording itself, the truth.
+Lines, contacts and forces are in the laboratory frame. Variables that exist in several groups are
+taken from the first of: the groups of the stages, the root, the truth.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from vibrissa.whisker import Whisker
 
 @dataclass(frozen=True, eq=False)
 class Watched:
-    """A trial of n frames, w whiskers and v views."""
+    """Data of a trial of n frames, w whiskers and v views, prepared for drawing."""
 
     time: Array
     whiskers: tuple[Whisker, ...]
@@ -63,23 +63,23 @@ class Watched:
 
     @property
     def busiest(self) -> int:
-        """The whisker that touches most of the time; the first of equals."""
+        """Index of the whisker longest in contact; the first of equals."""
         return int(np.argmax(self.touching.sum(axis=0)))
 
     def onsets(self) -> NDArray[np.int64]:
-        """Frames in which a whisker begins to touch."""
+        """Frames in which a contact begins."""
         before = np.concatenate([np.zeros((1, self.touching.shape[1]), bool), self.touching[:-1]])
         return np.flatnonzero((self.touching & ~before).any(axis=1))
 
     def next_contact(self, frame: int) -> int:
-        """The frame in which the next contact begins; the first after the last, else the same."""
+        """Frame of the next onset; after the last that of the first, or the same without onsets."""
         onsets = self.onsets()
         after = onsets[onsets > frame]
         return int(after[0] if after.size else onsets[0] if onsets.size else frame)
 
 
 def watched(recording: xr.DataTree) -> Watched:
-    """Take from a recording what can be looked at."""
+    """Extract the data to be drawn from a recording."""
     root = recording.to_dataset()
     if not root.sizes.get("time") or not root.sizes.get("whisker"):
         raise ValueError("the recording has no frames of a whisker to look at")
@@ -114,7 +114,7 @@ def watched(recording: xr.DataTree) -> Watched:
 
 
 def _lines(trial: Recording, whiskers: Sequence[Whisker]) -> Array:
-    """Centrelines as recorded, else the resting whisker where its base is."""
+    """Recorded centrelines, or else the resting whisker at the pose of its base."""
     lines = trial.known("centerline", ("", "truth"))
     if lines is not None:
         return lines
@@ -127,7 +127,7 @@ def _lines(trial: Recording, whiskers: Sequence[Whisker]) -> Array:
 
 
 def _measured(trial: Recording, shape: tuple[int, int]) -> tuple[Array, dict[str, Array]]:
-    """Forces in the laboratory and the six signals; NaN where nothing is known."""
+    """Forces in the laboratory frame and the six signals; NaN where unknown."""
     missing = np.full((*shape, 3), np.nan)
     force = trial.known("force", ("signals", "", "truth"))
     moment = trial.known("moment", ("signals", "", "truth"))
@@ -148,7 +148,7 @@ _TRACE, _CONTACT = (255, 96, 0), (0, 150, 255)
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One camera's window onto a trial."""
+    """Part of a camera's images shown for a trial."""
 
     name: str
     number: int
@@ -162,7 +162,7 @@ class View:
 
 
 def views(trial: Watched) -> tuple[View, ...]:
-    """One window per camera: where its traces go, with some room."""
+    """Views of all cameras: the regions of their traces, with a margin."""
     if trial.traces is None:
         return ()
     out = []
@@ -183,7 +183,7 @@ def views(trial: Watched) -> tuple[View, ...]:
 
 
 def picture(view: View, trial: Watched, frame: int, image: Frame | None = None) -> Bytes:
-    """Show one frame of one camera."""
+    """Picture of one frame of one camera."""
     left, top, right, bottom = view.box
     source = view.empty if image is None else image
     rows = np.arange(top, bottom, 1.0 / view.scale).astype(int)
@@ -211,7 +211,7 @@ _COLOURS = np.array(
 
 
 def extent(trial: Watched) -> tuple[Array, float]:
-    """Middle, mm, and size, mm, of where whiskers go."""
+    """Centre (3,) and size of the region of the whiskers, mm."""
     points = trial.lines.reshape(-1, 3)
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     return mm(0.5 * (low + high)), float(mm(np.linalg.norm(high - low)))
@@ -266,7 +266,7 @@ def moment_drawing(
 
 
 def touched(trial: Watched, frame: int) -> scene.Drawing:
-    """All contact points up to a frame in their whisker's colour, paler where uncertain."""
+    """Draw all contact points up to a frame in their whisker's colour, paler if uncertain."""
     points = trial.contacts[: frame + 1]
     known = np.isfinite(points).all(axis=-1)
     which = np.nonzero(known)[1]
@@ -284,7 +284,7 @@ def touched(trial: Watched, frame: int) -> scene.Drawing:
 
 
 def surroundings(trial: Watched, layers: Collection[str] = LAYERS) -> scene.Drawing:
-    """Objects, the shape fitted to the contacts, and a scale."""
+    """Draw objects, the shape fitted to the contacts, and a scale."""
     middle, size = extent(trial)
     near = trial.contacts[np.isfinite(trial.contacts).all(axis=-1)]
     centre = np.mean(near, axis=0) if near.size else middle / to_display("length", 1.0)
@@ -304,7 +304,7 @@ def surroundings(trial: Watched, layers: Collection[str] = LAYERS) -> scene.Draw
 
 
 def object_body(thing: Surface, extent: float, near: Array) -> scene.Body:
-    """An object; what has no end is shown within a cube, mm wide, about a place (3,), mm."""
+    """Body of an object; unbounded ones are clipped to a cube around a position (3,), mm."""
     half = 0.5 * extent
     (held,) = objects_datasets([thing]).values()
     vertices, faces = scene.object_surface(held, np.stack([near - half, near + half], axis=1))
@@ -312,7 +312,7 @@ def object_body(thing: Surface, extent: float, near: Array) -> scene.Body:
 
 
 def fitted_body(contour: xr.Dataset, near: Array) -> tuple[Array, scene.Ints] | None:
-    """Vertices, m, and triangles of a fitted shape; None for what has no picture."""
+    """Vertices, m, and triangles of a fitted shape; None if it cannot be drawn."""
     try:
         shape = shape_from_dataset(contour)
     except ValueError:
@@ -337,7 +337,7 @@ BACK, AHEAD = "◀ frame", "frame ▶"
 
 
 class TrialMode(Mode):
-    """Time, and what depends on it."""
+    """Mode with the controls of time, and the drawings that depend on it."""
 
     name = "Trial"
 
@@ -423,7 +423,7 @@ class TrialMode(Mode):
             self._page.stage.show(layer, {})
 
     def redraw(self) -> None:
-        """Draw the frame of now."""
+        """Draw the current frame."""
         trial, stage, frame = self.trial, self._page.stage, self.frame
         layers = self._layers
         stage.show("moment", moment_drawing(trial, frame, self._page.exaggeration, layers))
@@ -436,7 +436,7 @@ class TrialMode(Mode):
             shown.image = picture(view, trial, frame, image)
 
     def write(self, brief: bool = False) -> None:
-        """Write the signals and the time of the current frame."""
+        """Show the signals and the time of the current frame."""
         trial, frame = self.trial, self.frame
         put(self._time, _MS * float(trial.time[frame] - trial.time[0]))
         share = self._share
@@ -446,12 +446,12 @@ class TrialMode(Mode):
 
     @property
     def _share(self) -> float:
-        """Share of the trial that has passed."""
+        """Current time as a share of the trial."""
         time = self.trial.time
         return float((time[self.frame] - time[0]) / max(np.ptp(time), 1e-12))
 
     def link(self) -> dict[str, str]:
-        """Time, as a share of the trial."""
+        """Parameter of a link with the time, as a share of the trial."""
         return {"t": f"{self._share:.4f}"}
 
     def restore(self, asked: Mapping[str, str]) -> None:
@@ -494,7 +494,7 @@ class TrialMode(Mode):
         self._speed = SPEEDS[words]
 
     def jump(self) -> None:
-        """Go to where the next contact begins."""
+        """Go to the next onset of a contact."""
         self.go(float(self.trial.time[self.trial.next_contact(self.frame)]))
 
     def show(self, frame: int) -> None:
@@ -503,7 +503,7 @@ class TrialMode(Mode):
         self._page.work.wait()
 
     def step(self, frames: int) -> None:
-        """Go so many frames on, or back."""
+        """Go forward or back by a number of frames."""
         self.pause()
         frame = int(np.clip(self.frame + frames, 0, self.trial.frames - 1))
         self.go(float(self.trial.time[frame]))
@@ -521,7 +521,7 @@ class TrialMode(Mode):
         self._page.work.put("time", self._page.redraw)
 
     def _has(self, layer: str) -> bool:
-        """Whether there is anything in a layer."""
+        """Whether a layer has contents."""
         there = {
             "Objects": bool(self.trial.objects),
             "Fitted shape": self.trial.contour is not None,

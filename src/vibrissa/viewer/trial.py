@@ -231,6 +231,21 @@ _LEGEND: dict[str, tuple[scene.Colour, str]] = {
 }
 
 
+def legends(trial: Watched, layers: Collection[str]) -> list[Legend]:
+    """Meaning of the colours: of several whiskers, contacts have that of their whisker."""
+    steps = [_LEGEND[layer] for layer in layers]
+    names: list[tuple[scene.Colour, str]] = []
+    if len(trial.names) > 1:
+        steps.remove(_LEGEND["Contacts"])
+        touching = np.flatnonzero(np.isfinite(trial.contacts).all(axis=-1).any(axis=0))
+        names = [(tuple(_COLOURS[i % len(_COLOURS)].tolist()), trial.names[i]) for i in touching]
+    return [
+        Legend(title, tuple((f"rgb{colour}", words) for colour, words in these), smooth=False)
+        for title, these in (("Contacts of", names), ("", steps))
+        if these
+    ]
+
+
 def moment_drawing(
     trial: Watched, frame: int, exaggeration: float, layers: Collection[str] = LAYERS
 ) -> scene.Drawing:
@@ -369,9 +384,8 @@ class TrialMode(Mode):
                 for layer in LAYERS:
                     box = gui.add_checkbox(layer, True, visible=self._has(layer))
                     asked(box, partial(self._see, layer))
-            steps = [_LEGEND[layer] for layer in _LEGEND if self._has(layer)]
-            colours = tuple((f"rgb{colour}", words) for colour, words in steps)
-            gui.add_html(Legend("", colours, smooth=False).html())
+            for legend in legends(trial, [layer for layer in _LEGEND if self._has(layer)]):
+                gui.add_html(legend.html())
             self._words = gui.add_html("")
             self._chart = gui.add_html("")
             self._cursor = gui.add_html("")

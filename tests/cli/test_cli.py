@@ -1,16 +1,18 @@
 """The command line: each verb does its stage, and a fault is one message."""
 
+import io
 import sys
 
 import numpy as np
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 import vibrissa as vb
 from vibrissa import samples
 from vibrissa.cli.app import app, main
 from vibrissa.cli.options import numbers
-from vibrissa.cli.terminal import fixed, shown
+from vibrissa.cli.terminal import fixed, say, shown
 from vibrissa.io import load_contacts, save_centerline, save_signals
 
 
@@ -311,3 +313,14 @@ def test_info_says_what_settings_are_for_and_what_is_wrong_with_them(monkeypatch
     said = fault(monkeypatch, capsys, "info", path)
     assert f"{path}: it is not TOML" in said
     assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_lines_are_broken_between_words_in_a_terminal_alone(monkeypatch, terminal):
+    seen = io.StringIO()
+    console = Console(file=seen, force_terminal=terminal, color_system=None, width=20)
+    monkeypatch.setattr("vibrissa.cli.terminal.output", console)
+    line = "  12 frames: nothing is touched, in /a/path/that/is/longer.nc"
+    say(line)
+    broken = ["  12 frames: nothing", "  is touched, in", "  /a/path/that/is/longer.nc"]
+    assert seen.getvalue().splitlines() == (broken if terminal else [line])

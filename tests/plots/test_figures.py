@@ -145,6 +145,8 @@ def test_contours_state_the_distance_of_the_whisker_from_the_surface() -> None:
     )
     figure = contour_views(points + 1e-6, peg, whisker_radius=np.full(50, whisker))
     assert "the whisker is within 0.00" in "".join(texts(figure))
+    figure = contour_views(points, peg, whisker_radius=np.full(50, whisker))
+    assert "the whisker is on the" in "".join(texts(figure))  # not within 4e-15 mm
 
 
 def test_what_a_figure_shows_is_written_above_it(tmp_path) -> None:

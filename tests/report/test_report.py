@@ -191,7 +191,8 @@ def test_numbers_are_those_of_the_recording(written, folder):
     assert row[0] == "3D error"
     assert int(row[1]) == size.size
     expected = [np.median(size), np.quantile(size, 0.95), size.max()]
-    np.testing.assert_allclose([number(cell) for cell in row[2:5]], expected, rtol=1e-3)
+    shown = [number(cell) for cell in row[2:5]]
+    np.testing.assert_allclose(shown, expected, rtol=5e-3)  # three digits
     classes = tables["Error in space by deflection angle"][1:]
     assert sum(int(row[1]) for row in classes) == size.size
 

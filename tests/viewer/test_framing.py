@@ -1,11 +1,15 @@
 """What is shown stands in the middle of what the panel leaves free, as large as fits."""
 
+import asyncio
+from contextlib import nullcontext
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 pytest.importorskip("viser", reason="viser is not installed", exc_type=ImportError)
 
-from vibrissa.viewer.page import PANEL, Shot, framed
+from vibrissa.viewer.page import PANEL, Framing, Shot, framed
 
 FOV = np.deg2rad(75.0)
 
@@ -49,3 +53,28 @@ def test_what_is_tall_is_above_the_panel_of_a_phone():
     rows = [on_screen(shot.centre + s * up, position, look_at, width, height)[1] for s in (1, -1)]
     assert rows[0] >= -1e-6
     assert rows[1] <= 0.45 * height + 1e-6
+
+
+def test_a_window_that_missed_its_camera_gets_it_again_and_one_that_was_turned_keeps_its_own():
+    shot = Shot(np.array([16.0, 4.0, -2.0]), 38.0, np.array([0.15, -0.8, 0.6]))
+    heard = []
+    sight = SimpleNamespace(
+        image_width=390, image_height=844, fov=FOV, on_update=heard.append, look_at=(0.0, 0.0, 0.0)
+    )
+    window = SimpleNamespace(camera=sight, client_id=0, atomic=nullcontext)
+    start = SimpleNamespace(fov=FOV)
+    came = []
+    server = SimpleNamespace(
+        initial_camera=start, on_client_connect=came.append, get_clients=lambda: {0: window}
+    )
+    framing = Framing(server)
+    framing.show(shot)
+    came[0](window)
+    sight.position = start.position  # the page was not ready for its own
+    asyncio.run(heard[0](sight))
+    np.testing.assert_allclose(sight.position, framed(shot, 390, 844, FOV)[0])
+    assert framing.turned is None
+    sight.position = (1.0, 2.0, 3.0)
+    asyncio.run(heard[0](sight))
+    assert sight.position == (1.0, 2.0, 3.0)
+    np.testing.assert_allclose(framing.turned[:3], sight.position)

@@ -15,6 +15,7 @@ from vibrissa.recording import Recording
 from vibrissa.viewer.readout import chart, cursor
 from vibrissa.viewer.trial import (
     fitted_body,
+    legends,
     moment_drawing,
     picture,
     surroundings,
@@ -221,3 +222,9 @@ def test_several_whiskers_are_drawn_each_in_its_colour(recording):
     cloud = touched(trial, frame)["contacts"]
     assert len(cloud.points) == 2 * int(trial.touching[: frame + 1, 0].sum())
     assert len(np.unique(cloud.colours, axis=0)) == 2
+    whose, rest = legends(trial, ["Contacts", "Objects"])
+    assert [words for _, words in whose.steps] == ["left", "right"]
+    assert {colour for colour, _ in whose.steps} == {
+        "rgb({}, {}, {})".format(*colour) for colour in np.unique(cloud.colours, axis=0).tolist()
+    }
+    assert [words for _, words in rest.steps] == ["object"]

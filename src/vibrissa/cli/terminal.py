@@ -6,6 +6,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from textwrap import fill
 from typing import Any
 
 from rich.console import Console
@@ -24,12 +25,26 @@ Tell = Callable[[str, int, int], None]
 
 def say(line: str = "") -> None:
     """Print a line of the results."""
-    output.print(line, highlight=False, soft_wrap=True)
+    _print(output, line)
 
 
 def remark(line: str) -> None:
     """Print a remark that is not a result, such as an assumption or a default."""
-    errors.print(line, highlight=False, soft_wrap=True)
+    _print(errors, line)
+
+
+def _print(console: Console, line: str) -> None:
+    """Print a line, in a terminal broken between words so that paths remain whole."""
+    if console.is_terminal and len(line) > console.width:
+        indent = " " * (len(line) - len(line.lstrip()))
+        line = fill(
+            line,
+            console.width,
+            subsequent_indent=indent,
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+    console.print(line, highlight=False, soft_wrap=True)
 
 
 def progress_bars() -> AbstractContextManager[Tell]:

@@ -134,10 +134,11 @@ def contour_views(
 def _conclude(figure: Figure, away: Array, thing: str, look: str) -> None:
     """Describe the distances of contacts from the fitted or known surface."""
     median = np.nanmedian(np.abs(to_display("r", away)))
+    # A nanometre is rounding, of contacts that are the truth.
+    where = f"within {median:.2g} mm of" if median > 1e-6 else "on"
     style.conclude(
         figure,
-        f"{len(away)} contact points: in half of them the {thing} is within {median:.2g} mm "
-        f"of the {look} surface",
+        f"{len(away)} contact points: in half of them the {thing} is {where} the {look} surface",
     )
 
 

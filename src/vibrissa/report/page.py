@@ -232,7 +232,7 @@ def _link(path: Path, folder: Path) -> str:
 _LEAST = 1e-5  # smallest value shown, in the display unit
 
 
-def shown_value(name: str, value: float, digits: int = 4) -> str:
+def shown_value(name: str, value: float, digits: int = 3) -> str:
     """Write an SI value with its unit."""
     if not np.isfinite(value):
         return "–"
@@ -250,7 +250,7 @@ def with_sigma(name: str, value: float, sigma: float) -> tuple[str, str]:
     factor, unit = shown_unit(name, value)
     spread = sigma * factor
     if not np.isfinite(value * spread) or spread < _LEAST:
-        return shown_value(name, value), shown_value(name, sigma, 2)
+        return shown_value(name, value, 4), shown_value(name, sigma, 2)
     decimals = int(np.clip(1.0 - np.floor(np.log10(spread)), 0, 5))
     # Adding zero turns −0 into 0.
     numbers = (f"{round(x, decimals) + 0.0:.{decimals}f}" for x in (value * factor, spread))

@@ -91,7 +91,7 @@ def _results(
     estimates = groups["estimates"]
     if estimates is None:
         missing = "no contacts yet: `vibrissa estimate` adds them"
-        found = [Tile("–", missing), Tile("–", "error of the contact point")]
+        found = [Tile("–", missing), Tile("–", "error of the contact point: no contacts yet")]
     else:
         located = np.isfinite(estimates["contact_point"].values).all(axis=-1)
         detected = estimates["in_contact"].values.astype(bool)
@@ -102,7 +102,7 @@ def _results(
         ]
     if "contour" not in recording.children:
         missing = "no contour yet: `vibrissa reconstruct` adds it"
-        return tiles([*found, Tile("–", missing), Tile("–", "misfit of the shape")])
+        return tiles([*found, Tile("–", missing), Tile("–", "misfit of the shape: no contour yet")])
     fit = shape_from_dataset(recording["contour"].to_dataset())
     size = Tile(f"{fit.kind}", "shape fitted to the contacts")
     if "radius" in fit.sigma:
@@ -191,7 +191,7 @@ def _shown_setting(name: object, value: object) -> str:
 
 def _one_or_all(name: str, sigma: Array) -> str:
     """Format the standard deviations of three components, as one value if they are equal."""
-    text = [shown_value(name, float(each), 3) for each in sigma]
+    text = [shown_value(name, float(each)) for each in sigma]
     return f"{text[0]} each" if len(set(text)) == 1 else ", ".join(text)
 
 
@@ -314,7 +314,7 @@ def tracking_tables(root: xr.Dataset, truth: xr.Dataset) -> str:
 
 
 def _spread_cells(name: str, values: Array) -> list[str]:
-    return [shown_value(name, float(value), 3) for value in values]
+    return [shown_value(name, float(value)) for value in values]
 
 
 def six_rows(signals: xr.Dataset, truth: xr.Dataset) -> list[tuple[str, ...]]:
@@ -330,7 +330,7 @@ def six_rows(signals: xr.Dataset, truth: xr.Dataset) -> list[tuple[str, ...]]:
             continue
         values = (*evaluation.spread(size), size.max())
         usual = np.nan if direction else float(np.nanmedian(np.abs(true[name].values[both])))
-        cells = (shown_value(name, float(value), 3) for value in (*values, usual))
+        cells = (shown_value(name, float(value)) for value in (*values, usual))
         rows.append((quantity(name).long_name, str(size.size), *cells))
     return rows
 
@@ -538,7 +538,7 @@ def tracked_table(root: xr.Dataset) -> str:
         covariance = root["contact_covariance"].values[touching]
         sigma = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
         if np.isfinite(sigma).any():
-            text = shown_value("contact_point", float(np.nanmedian(sigma)), 3)
+            text = shown_value("contact_point", float(np.nanmedian(sigma)))
             rows.append(("standard deviation of the contact point", f"{text}, median, in space"))
     return table(rows, caption="By the rod that fits the images")
 

@@ -66,6 +66,8 @@
       page.classList.toggle("narrow", drawn.clientWidth < 0.65 * drawn.clientHeight);
       page.style.setProperty("--drawn", `${drawn.clientWidth}px`);
     }
+    const strip = document.querySelector("svg[data-timeline]");
+    if (strip) page.style.setProperty("--fine", 300 / strip.getBoundingClientRect().width);
     const state = document.querySelector("[data-link]")?.dataset.link;
     if (state && location.hash !== "#" + state)
       history.replaceState(null, "", location.search + "#" + state);

@@ -489,11 +489,14 @@ class Framing:
 
         @client.camera.on_update
         async def _(camera: viser.CameraHandle) -> None:
-            # Panels come and go; who has turned the view keeps it.
+            # Panels come and go; who has turned the view keeps it. A window that has just opened
+            # may have missed where its camera belongs: it reports where all of them begin.
             wide, tall, place = self._placed.get(client.client_id, (0, 0, np.zeros(3)))
             resized = (camera.image_width, camera.image_height) != (wide, tall)
-            framed = np.allclose(camera.position, place, atol=0.1)
-            if self._shot is not None and resized and framed:
+            here = np.allclose(camera.position, place, atol=0.1)
+            missed = np.allclose(camera.position, self._server.initial_camera.position, atol=0.1)
+            framed = here or missed
+            if self._shot is not None and framed and (resized or not here):
                 self._turn(client, self._shot)
             self.turned = None if framed else np.concatenate([camera.position, camera.look_at])
             self._viewed()

@@ -222,20 +222,28 @@ LAYERS = ("Whiskers", "Forces", "Contacts", "Uncertainty", "Objects", "Fitted sh
 _SIGMAS = 2.0  # size of the ellipsoid of a contact, standard deviations
 _SHARP = 0.3e-3  # standard deviation, m, from which on contacts are paler
 # Colour of the least certain contacts, as faint on white as on black.
-_PALE = np.array([150.0, 152.0, 155.0])
-_LEGEND = Legend(
-    "",
-    tuple(
-        (f"rgb{colour}", words)
-        for colour, words in (
-            (CONTACT, "contacts"),
-            (tuple(_PALE.astype(int).tolist()), "uncertain ones"),
-            (OBJECT, "object"),
-            (FIT, "fitted shape"),
-        )
-    ),
-    smooth=False,
-)
+_PALE: scene.Colour = (150, 152, 155)
+_LEGEND: dict[str, tuple[scene.Colour, str]] = {
+    "Contacts": (CONTACT, "contacts"),
+    "Uncertainty": (_PALE, "uncertain"),
+    "Objects": (OBJECT, "object"),
+    "Fitted shape": (FIT, "fitted shape"),
+}
+
+
+def legends(trial: Watched, layers: Collection[str]) -> list[Legend]:
+    """Meaning of the colours: of several whiskers, contacts have that of their whisker."""
+    steps = [_LEGEND[layer] for layer in layers]
+    names: list[tuple[scene.Colour, str]] = []
+    if len(trial.names) > 1:
+        steps.remove(_LEGEND["Contacts"])
+        touching = np.flatnonzero(np.isfinite(trial.contacts).all(axis=-1).any(axis=0))
+        names = [(tuple(_COLOURS[i % len(_COLOURS)].tolist()), trial.names[i]) for i in touching]
+    return [
+        Legend(title, tuple((f"rgb{colour}", words) for colour, words in these), smooth=False)
+        for title, these in (("Contacts of", names), ("", steps))
+        if these
+    ]
 
 
 def moment_drawing(
@@ -376,7 +384,8 @@ class TrialMode(Mode):
                 for layer in LAYERS:
                     box = gui.add_checkbox(layer, True, visible=self._has(layer))
                     asked(box, partial(self._see, layer))
-            gui.add_html(_LEGEND.html())
+            for legend in legends(trial, [layer for layer in _LEGEND if self._has(layer)]):
+                gui.add_html(legend.html())
             self._words = gui.add_html("")
             self._chart = gui.add_html("")
             self._cursor = gui.add_html("")
@@ -398,7 +407,7 @@ class TrialMode(Mode):
                 timeline(trial.time, np.asarray(trial.touching.any(axis=1)), trial.onsets())
             )
             self._now_line = gui.add_html("")
-        self._timeline.float(x=16.0, y=-16.0, width=520.0, height=96.0)
+        self._timeline.float(x=16.0, y=-16.0, width=520.0, height=112.0)
         self._play.on_click(lambda _: self.toggle())
         jump.on_click(lambda _: self.jump())
 

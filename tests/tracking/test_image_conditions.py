@@ -25,6 +25,8 @@ from vibrissa.tracking.space.rest_shape import (
     likeliest_taper,
     seen_length,
 )
+from vibrissa.tracking.trace.scene import Scene
+from vibrissa.tracking.trace.steady import Steady
 
 
 def image(begin, end, fade=0.0, noise=2.0, seed=0, size=(120, 200)):
@@ -300,3 +302,48 @@ def test_what_is_not_known_of_shaking_is_in_covariances(filmed, shaken, known):
     chi = np.einsum("ti,tij,tj->t", away[rows], np.linalg.inv(spread[rows]), away[rows])
     assert rows.sum() > 15
     assert (chi < 7.8).mean() > 0.85
+
+
+def test_dirt_on_the_sensor_does_not_hide_that_a_camera_shakes():
+    """It stands still in the images, unlike all else that does not move."""
+    random = np.random.default_rng(3)
+    y, x = np.mgrid[0:200, 0:240].astype(float)
+    spots = [(30, 150), (60, 170), (100, 40), (210, 150), (150, 180), (200, 20)]
+    dirt = 1.0 - 0.2 * sum(np.exp(-((x - a) ** 2 + (y - b) ** 2) / 18.0) for a, b in spots)
+    shifts = 0.4 * random.normal(size=(30, 2))
+    shifts -= shifts.mean(axis=0)
+    frames = []
+    for i, (right, down) in enumerate(shifts):
+        u, v = x - right, y - down
+        peg = 0.8 / (1.0 + np.exp((np.hypot(u - 170.0, v - 60.0) - 12.0) / 0.7))
+        whisker = 0.6 * np.exp(-((v - 60.0 - 3.0 * i - 0.2 * u) ** 2) / 3.0) * (u < 120.0)
+        grey = 190.0 * (1.0 - np.maximum(peg, whisker)) * dirt + random.normal(0.0, 2.0, x.shape)
+        frames.append(grey.clip(0, 255).round().astype(np.uint8))
+    steady = Steady.of(Scene.of(frames).with_still(np.array([[0.0, 60.0]]), frames), frames)
+    found = np.array([steady.moved_back(frame)[1] for frame in frames])
+    assert np.abs(found[:, :2] - shifts).max() < 0.05
+    assert found[:, 2:].max() < 0.05
+
+
+def test_a_camera_that_was_moved_may_have_been_calibrated_before_or_after(filmed, traced):
+    """Half-way through the film it moves by a pixel: all is half a pixel off, and said to be."""
+    half, moved = len(traced[0][0]) // 2, []
+    for (row,) in traced:
+        sides = np.where(np.arange(len(row)) < half, -0.5, 0.5)
+        moved.append(
+            [
+                [
+                    one._replace(line=one.line + 0.5, shift=(side, side, 0.03, 0.03))
+                    for one, side in zip(row, sides, strict=True)
+                ]
+            ]
+        )
+    found = track(filmed.cameras, moved, 1000.0)
+    assert "Part of it is slow, or a step, of 1.0 pixels" in found.attrs["remarks"]
+    away = found["contact_point"].values[:, 0] - filmed.truth["contact_point"].values
+    spread, shared = (found[f"contact_{name}"].values[:, 0] for name in ("covariance", "shared"))
+    rows = np.isfinite(away).all(axis=1) & np.isfinite(spread).all(axis=(1, 2))
+    chi = np.einsum("ti,tij,tj->t", away[rows], np.linalg.inv(spread[rows]), away[rows])
+    assert (chi < 7.8).mean() > 0.9
+    alone = spread[rows] - np.einsum("tei,tej->tij", shared[rows], shared[rows])
+    assert (np.linalg.eigvalsh(alone) > -1e-15).all()

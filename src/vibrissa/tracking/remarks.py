@@ -19,6 +19,7 @@ from vibrissa.tracking.refine.rods import TraceSeries
 from vibrissa.tracking.space.frame_pairs import better_offset
 from vibrissa.tracking.space.rest_shape import Length
 from vibrissa.tracking.trace.start import base_gap
+from vibrissa.tracking.trace.steady import slow_motion
 from vibrissa.tracking.trace.trace import Trace, doubtful_frames
 from vibrissa.whisker import Whisker
 
@@ -30,6 +31,8 @@ _STRANGE, _OFTEN = 2.0, 0.05
 _MOST = 0.7
 _FUR_KNOWN = 0.25  # relative standard deviation of a stated length of fur
 _NEAR = 2.0  # unusual distance between the bases of several views, pixels
+# Slow motion of a camera above which there is a remark, pixels, and as a share of its shaking.
+_SLOW, _MOSTLY = 0.25, 0.8
 _FEWEST = 8  # smallest number of frames to decide whether a whisker leaves the plane
 
 
@@ -45,6 +48,13 @@ def remarks_on_shaking(cameras: Sequence[Camera], traces: Sequence[Sequence[Trac
                 "along rows (standard deviations), as what never moves in its images shows; traces "
                 f"are moved back by that, which is known to {left[0]:.2f} and {left[1]:.2f} pixels."
             )
+            slow = float(slow_motion(shift[:, None, :2]).max())
+            if slow > max(_SLOW, _MOSTLY * float(size.max())):
+                found[-1] += (
+                    f" Part of it is slow, or a step, of {2.0 * slow:.1f} pixels: at which moment "
+                    "the camera was where it was calibrated is not known, by which all contact "
+                    "points may be shifted together (in their covariances)."
+                )
         elif np.isnan(left).any() and any(other[:, :2].any() for other in shifts):
             found.append(
                 f"nothing shows whether {camera.name} shakes, too: it is taken to do so as much as "

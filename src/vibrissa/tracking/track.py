@@ -54,6 +54,7 @@ from vibrissa.tracking.space.rest_shape import (
     seen_length,
     whisker_at_rest,
 )
+from vibrissa.tracking.trace.steady import slow_motion
 from vibrissa.tracking.trace.trace import Trace
 from vibrissa.whisker import Pose, Whisker, morphology
 
@@ -275,20 +276,32 @@ def _with_shift_unsure(cameras: Sequence[Camera], fit: RodFit, shift: Array) -> 
     seen = np.ptp(shift[..., :2], axis=0).any(axis=1)
     # A camera for which nothing shows it may shake as much as one that shakes.
     size = float(shift[:, seen, :2].std(axis=0).max(initial=0.0))
-    variance = np.nan_to_num(shift[..., 2:], nan=size).reshape(len(shift), -1) ** 2
-    if not variance.any():
+    sigma = np.nan_to_num(shift[..., 2:], nan=size).reshape(len(shift), -1)
+    if not sigma.any():
         return fit
+    common = slow_motion(shift[..., :2]).ravel()
 
-    def spread(points: Array) -> Array:
+    def moved(points: Array) -> Array:
         known = np.isfinite(points)
         slopes = [camera.project_with_slopes(np.where(known, points, 0.0))[1] for camera in cameras]
-        back = np.linalg.pinv(np.concatenate(slopes, axis=1))
-        return np.asarray(np.einsum("tij,tj,tkj->tik", back, variance, back))
+        back = np.asarray(np.linalg.pinv(np.concatenate(slopes, axis=1)))
+        back[~np.all(known, axis=1)] = np.nan
+        return back
 
+    contact, base = (moved(points) for points in (fit.contact_point, fit.position))
+    spread = [
+        np.einsum("tij,tj,tkj->tik", one, sigma**2 + common**2, one) for one in (contact, base)
+    ]
+    shared = np.swapaxes(np.concatenate([contact, base], axis=1) * common, 1, 2)
+    shared = np.pad(shared[:, common > 0.0], ((0, 0), (0, 0), (0, 9)))
     pose = fit.pose_covariance.copy()
-    pose[:, :3, :3] += spread(fit.position)
-    contact = fit.contact_covariance + spread(fit.contact_point)
-    return replace(fit, contact_covariance=contact, pose_covariance=pose)
+    pose[:, :3, :3] += spread[1]
+    return replace(
+        fit,
+        contact_covariance=fit.contact_covariance + spread[0],
+        shared=np.append(fit.shared, shared, axis=1),
+        pose_covariance=pose,
+    )
 
 
 def _best_seen(traces: Sequence[Sequence[Sequence[Trace]]]) -> list[Sequence[Trace]]:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from vibrissa.deferred import ndimage
 from vibrissa.io import Frame
+from vibrissa.numerics import Mask
 from vibrissa.tracking.trace.ridge import noise_level
 from vibrissa.tracking.trace.scene import Scene
 
@@ -38,9 +39,11 @@ _PRIOR = np.diag([1.0, 1.0, 1.0, 1e-4])
 # Standard deviation of shifts above which a camera shakes, pixels, and in units of their errors.
 _SHAKES, _CERTAIN = 0.05, 4.0
 _UNSEEN = 0.03  # standard deviation of the common shift of all blocks by compression, pixels
-# Mean square change of a block without the shifts, over that with them, below which it stands still
-# in the image, and the largest number of blocks that may.
-_LESS, _MOST = 0.5, 2
+# Motion of a block, as a share of the shifts, below which it is fixed in the image, as dirt on the
+# sensor is; required significance of that; and number of such blocks, and their share of all edges,
+# above which something else moves instead.
+_LESS, _KNOWN, _MOST, _DIRT = 0.5, 5.0, 2, 0.2
+_PARTS = 8  # number of parts of a film whose means show slow motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,17 +73,21 @@ class Steady:
         soft = np.stack([*(-each[at[1], at[0]] for each in slopes), ones, ones], axis=1)
         one = cls(at, blocks, soft, soft, ones, np.eye(2), np.zeros(2))
         shifts = np.zeros((len(frames), 2))
-        still = one = one._with_usual(frames, shifts)
-        for _ in range(_ROUNDS):
+        one = one._with_usual(frames, shifts)
+        for i in range(_ROUNDS + 1):
             shifts = np.array([one.measured(frame) for frame in frames])
             shifts -= shifts.mean(axis=0)
             if np.linalg.norm(np.cov(shifts.T), 2) < _SHAKES**2:
                 return None
             one = one._with_usual(frames, shifts)
+            if i == _ROUNDS - 1:
+                rests, share = one._resting(frames, shifts)
+                if rests.sum() > _MOST and share > _DIRT:
+                    return None
+                if not rests.any():
+                    break
+                one = one._without(rests)
         error, number = one._errors(frames, shifts)
-        before, after = (np.add.reduceat(1.0 / each.weight, blocks) for each in (still, one))
-        if (before < _LESS * after).sum() > _MOST:
-            return None
         if number < _FEWEST:
             return unknown
         error *= number / (number - 2.0) * max(1.0, one._disagreement(frames, shifts))
@@ -92,9 +99,9 @@ class Steady:
         size = float(sizes.max(initial=0.0))
         if size < _SHAKES**2:
             return unknown
-        # As much in a direction in which nothing shows it; and they have a mean in the sample.
+        # As much in a direction in which nothing shows it.
         trust = np.asarray(size * np.linalg.inv(error + size * np.eye(2)))
-        sigma = np.sqrt(np.diag(error @ trust) + size / len(frames) + _UNSEEN**2)
+        sigma = np.sqrt(np.diag(error @ trust) + _UNSEEN**2)
         return replace(one, trust=trust, sigma=sigma)
 
     @classmethod
@@ -146,6 +153,34 @@ class Steady:
         misses = np.array([one._left(frame, d) for frame, d in pairs])
         return replace(one, weight=1.0 / (np.mean(misses**2, axis=0) + _FINE**2))
 
+    def _resting(self, frames: Sequence[Frame], shifts: Array) -> tuple[Mask, float]:
+        """Blocks (b,) that do not move with the shifts, and their share of all edges."""
+        moved = shifts @ self.slopes[:, :2].T
+        seen = np.empty_like(moved)
+        for i, (frame, shift) in enumerate(zip(frames, shifts, strict=True)):
+            light = _at(frame, self.at, shift) - self.slopes[:, 2] - self._left(frame, shift)
+            seen[i] = _at(frame, self.at, np.zeros(2)) - self.slopes[:, 2] - light
+        both, known = (
+            np.add.reduceat((each * moved).sum(axis=0) * self.weight, self.blocks)
+            for each in (seen, moved)
+        )
+        rests = (both < _LESS * known) & (known > _KNOWN**2)
+        edges = np.add.reduceat((self.slopes[:, :2] ** 2).sum(axis=1), self.blocks)
+        return rests, float(edges[rests].sum() / edges.sum())
+
+    def _without(self, some: Mask) -> Steady:
+        """The usual image without some blocks (b,)."""
+        size = np.diff(np.append(self.blocks, self.at.shape[1]))
+        kept = np.repeat(~some, size)
+        parts = (each[kept] for each in (self.slopes, self.soft, self.weight))
+        first = np.cumsum(np.append(0, size[~some][:-1]))
+        return replace(
+            self,
+            **dict(zip(("slopes", "soft", "weight"), parts, strict=True)),
+            at=self.at[:, kept],
+            blocks=first,
+        )
+
     def _left(self, frame: Frame, shift: Array) -> Array:
         """Residual of a frame from the usual image after the change of light."""
         miss, light = _at(frame, self.at, shift) - self.slopes[:, 2], self.slopes[:, 2:]
@@ -188,6 +223,16 @@ class Steady:
             error += (inverse @ (right.T @ right + _PRIOR) @ inverse.T)[:2, :2] / len(frames)
         known = np.add.reduceat(self.weight * (self.slopes[:, :2] ** 2).sum(axis=1), self.blocks)
         return 0.5 * (error + error.T), float(known.sum() ** 2 / (known**2).sum())
+
+
+def slow_motion(shifts: Array) -> Array:
+    """Possible displacement (view, 2) of cameras since their calibration, pixels.
+
+    Shifts (time, view, 2) are relative to the mean of a film, or of a part of it. A fast motion has
+    the same mean during calibration; in a slow motion the calibration may be at any moment.
+    """
+    means = np.array([part.mean(axis=0) for part in np.array_split(shifts, _PARTS) if len(part)])
+    return np.asarray(0.5 * np.ptp(means, axis=0))
 
 
 def _at(frame: Frame, at: NDArray[np.intp], shift: Array) -> Array:

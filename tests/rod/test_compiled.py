@@ -104,7 +104,8 @@ def test_a_kernel_runs_its_own_copies_of_what_it_calls():
             for _ in range(n):
                 x = math.sin(x) + math.cos(3.0 * x) + math.atan2(x, 1.0 + x * x)
                 x += math.exp(-x * x) + math.tanh(x) - math.sinh(0.1 * x) / (1.0 + math.cosh(x))
-                x -= math.log1p(x * x) * math.erf(x) + math.gamma(1.0 + x * x)
+                x -= math.log1p(x * x) * math.erf(x) + math.gamma(1.0 + x * x) - math.hypot(x, 2.0)
+                x *= math.asinh(x) + math.expm1(-abs(x)) * math.sqrt(abs(x)) - math.atan(x)
             return x
 
         @kernel

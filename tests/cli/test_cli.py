@@ -12,7 +12,7 @@ import vibrissa as vb
 from vibrissa import samples
 from vibrissa.cli.app import app, main
 from vibrissa.cli.options import numbers
-from vibrissa.cli.terminal import fixed, say, shown
+from vibrissa.cli.terminal import fixed, print_table, say, shown
 from vibrissa.io import load_contacts, save_centerline, save_signals
 
 
@@ -324,3 +324,11 @@ def test_lines_are_broken_between_words_in_a_terminal_alone(monkeypatch, termina
     say(line)
     broken = ["  12 frames: nothing", "  is touched, in", "  /a/path/that/is/longer.nc"]
     assert seen.getvalue().splitlines() == (broken if terminal else [line])
+
+
+def test_titles_may_be_wider_than_their_table(capsys):
+    title, caption = "the error of all contacts, in a title", "and a caption as wide as that title"
+    print_table(["of"], [["r"]], title, caption)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].rstrip() == title
+    assert lines[-1].rstrip() == caption

@@ -147,13 +147,10 @@ def print_table(
     """
     from rich.table import Table
 
-    table = Table(
-        title=title,
-        caption=caption,
-        title_justify="left",
-        caption_justify="left",
-        show_header=any(columns),
-    )
+    # Title and caption may be wider than the table.
+    if title:
+        output.print(Text(title, style="table.title"))
+    table = Table(show_header=any(columns))
     for number, name in enumerate(columns):
         table.add_column(name, justify="left" if number in left else "right")
     for row in rows:
@@ -162,6 +159,8 @@ def print_table(
         else:
             table.add_row(*row)
     output.print(table)
+    if caption:
+        output.print(Text(caption, style="table.caption"))
 
 
 def print_properties(rows: Iterable[tuple[str, str]]) -> None:

@@ -44,7 +44,8 @@ _GRADING = 0.85  # grading toward a tip of radius zero
 #: No solution is looked for nearer to the base than this (over L).
 LEAST_ARC = 0.05
 _CURTAILED = 6  # rounds in which a chart is curtailed to what can be solved
-_LEAST_LOAD = 0.01  # directions have no value at zero force; just above it they have their limit
+#: Directions have no value at zero force; just above it, at this ρ, they have their limit.
+LEAST_LOAD = 0.01
 
 
 class Fold(NamedTuple):
@@ -154,7 +155,7 @@ def _nodes_of(
     log_fold: Array, stations: Array, bearings: Array, loads: Array, stretch: Array
 ) -> tuple[Array, Array]:
     """Contacts at the nodes, and their derivatives by the chart's coordinates."""
-    s, psi, rho = np.meshgrid(stations, bearings, np.maximum(loads, _LEAST_LOAD), indexing="ij")
+    s, psi, rho = np.meshgrid(stations, bearings, np.maximum(loads, LEAST_LOAD), indexing="ij")
     f, f_eta, f_psi = (a[..., None] for a in _expand(log_fold))
     cos, sin = np.cos(psi), np.sin(psi)
     contacts = np.stack([s, rho**2 * f * cos, rho**2 * f * sin], axis=-1)

@@ -7,6 +7,7 @@ import xarray as xr
 
 import vibrissa as vb
 from vibrissa.contacts import within_paper_bounds
+from vibrissa.contacts.inversion import invert
 from vibrissa.rod import CELLS, MOST_CELLS, cells_around, contacts_at, solve_forces
 from vibrissa.signals import SIGNALS, signals_of, spherical
 
@@ -139,6 +140,21 @@ def test_cells_about_measurements_hold_the_contacts_that_noise_has_moved(gamma_m
         apart[:, 1] = (apart[:, 1] + np.pi) % (2.0 * np.pi) - np.pi
         assert (np.abs(apart) <= cell + 1e-9).all(axis=1).any()
         assert (away[:n] <= 1.0).all()
+
+
+@pytest.mark.parametrize("triplet", [("Fx", "MB", "MD"), ("FD", "MB", "MD")])
+def test_the_lightest_contacts_are_found(gamma_map, rng, triplet):
+    """Signals vanish at rest, but over the force they locate a contact there as elsewhere."""
+    chart, number = gamma_map.chart, 500
+    charted = rng.uniform([0.02, -np.pi, -3.0], [0.98, np.pi, -1.0], (number, 3))
+    charted[:, 2] = 10.0 ** charted[:, 2]  # 10⁻⁶ to 10⁻² of the force that slips off
+    contacts = contacts_at(chart.fold, charted)
+    values, _ = solve_forces(chart.discretization, np.insert(contacts, 1, 0.0, axis=1))
+    signals = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))
+    aims = np.ascontiguousarray(signals[:, [SIGNALS.index(name) for name in triplet]])
+    found = invert(chart, gamma_map.tree(triplet), triplet, aims)
+    away = np.abs(found.contacts[..., 0] - contacts[:, None, 0])
+    assert (np.nanmin(np.where(np.isnan(away), 1.0, away), axis=1) < 1e-4).mean() > 0.99
 
 
 @pytest.mark.parametrize("cells", [8, (8, 16), None, (8.0, 16.0, 8.0), (8, 0, 8)])

@@ -38,6 +38,7 @@ from vibrissa.rod import (
     evaluate,
     integrate,
     lane_value,
+    seed_room,
     seeds,
     set_lane,
 )
@@ -206,15 +207,13 @@ def _seeded(
     of: Searched, how: Weighing, target: Array, measured: Array, x: Array, values: Array
 ) -> int:
     """Fill contacts, and (F, p), that nearly give three quantities or all; their number."""
-    found, quality = np.empty((MOST_SEEDS, 3)), np.empty(MOST_SEEDS, np.int64)
-    slopes, xi, three = np.empty((MOST_SEEDS, 3, 3)), np.empty(3), np.empty(3)
-    number = 0
+    room, xi, three, number = seed_room(), np.empty(3), np.empty(3), 0
     for k in range(3):
         three[k] = measured[of.where[k]]
-    n = int(seeds(of.tree, three, found, slopes, quality))
+    n = int(seeds(of.tree, three, room))
     for row in range(n):
         at, new = x[number], True
-        chart_to_contact(of.charted.fold, found[row], xi)
+        chart_to_contact(of.charted.fold, room.found[row], xi)
         at[0], at[1], at[2], at[3] = xi[0], 0.0, xi[1], xi[2]
         approach(of.charted, how, target, measured, at)
         for other in range(number):

@@ -18,7 +18,6 @@ from vibrissa.numerics import Array, IntArray, copy, inlined, kernel, share_out,
 from vibrissa.rod import (
     BUFFER_SIZE,
     LANES,
-    MOST_SEEDS,
     TOLERANCE,
     Fold,
     PlaneVector,
@@ -28,6 +27,7 @@ from vibrissa.rod import (
     chart_to_contact,
     newton_group,
     search_tree,
+    seed_room,
     seeds,
     stable,
     start_from,
@@ -68,7 +68,8 @@ def triplet_tree(chart: StableSet, triplet: tuple[str, ...]) -> SearchTree:
     derivatives = signal_derivatives(chart.values, chart.tangents)[..., which, :]
     angles = tuple(CIRCULAR[w] for w in which)
     plane = _plane(chart, triplet)
-    return search_tree(chart, np.ascontiguousarray(values), derivatives, angles, plane)
+    vanishing = tuple(not turns for turns in angles)
+    return search_tree(chart, np.ascontiguousarray(values), derivatives, angles, plane, vanishing)
 
 
 def _plane(chart: StableSet, triplet: tuple[str, ...]) -> PlaneVector | None:
@@ -223,8 +224,8 @@ def invert_rows(
 ) -> None:
     """Find all stable contacts that give three signals, by rising force, for some rows."""
     b = np.zeros(BUFFER_SIZE)
-    found, quality = np.empty((MOST_SEEDS, 3)), np.empty(MOST_SEEDS, np.int64)
-    slopes = np.empty((MOST_SEEDS, 3, 3))
+    room = seed_room()
+    found, slopes, quality = room.found, room.inverses, room.quality
     charts, inverses = np.empty((LANES, 3)), np.empty((LANES, 3, 3))
     rows, group_targets = np.empty(LANES, np.int64), np.empty((LANES, 6))
     group, group_values = np.empty((LANES, 3)), np.empty((LANES, 6))
@@ -233,7 +234,7 @@ def invert_rows(
     for row in range(first, last + 1):
         n = 0
         if row < last:
-            n = seeds(tree, targets[row], found, slopes, quality)
+            n = seeds(tree, targets[row], room)
         elif waiting > 0:
             n = 1  # the last ones, fewer than there are lanes
         for seed in range(n):

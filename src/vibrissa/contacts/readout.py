@@ -249,8 +249,8 @@ class Mixed:
             n, m, k = chart.values.shape[:3]
             values = seen[:, :3].reshape(n, m, k, 3)
             slopes = h[:3] @ wrench_tangents(chart.values, chart.tangents)
-            straight = (False, False, False)
-            tree = search_tree(chart, np.ascontiguousarray(values), slopes, straight)
+            no, yes = (False, False, False), (True, True, True)
+            tree = search_tree(chart, np.ascontiguousarray(values), slopes, no, vanishing=yes)
             self.searched = searched(
                 chart,
                 tree,

@@ -74,7 +74,13 @@ from vibrissa.rod.outward import (
     vanishing_moments as vanishing_moments,
 )
 from vibrissa.rod.points import PointSolver as PointSolver, point_solver as point_solver
-from vibrissa.rod.search import MOST_CELLS, MOST_SEEDS, cells_around as cells_around, seeds
+from vibrissa.rod.search import (
+    MOST_CELLS,
+    MOST_SEEDS,
+    cells_around as cells_around,
+    seed_room as seed_room,
+    seeds,
+)
 from vibrissa.rod.statics import check_objects as check_objects, deflect
 from vibrissa.rod.surfaces import (
     SurfaceDeflection as SurfaceDeflection,

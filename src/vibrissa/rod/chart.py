@@ -46,9 +46,8 @@ _GRADING = 0.85  # grading toward a tip of radius zero
 #: Smallest arc length at which contacts are solved, over L.
 LEAST_ARC = 0.05
 _MOST_CURTAILMENTS = 6  # most rounds in which the chart is reduced to contacts that can be solved
-# Smallest ρ at which nodes are evaluated: at zero force directions are undefined, and at this ρ
-# they practically have their limits.
-_LEAST_LOAD = 0.01
+#: Directions have no value at zero force; just above it, at this ρ, they have their limit.
+LEAST_LOAD = 0.01
 
 
 class Fold(NamedTuple):
@@ -158,7 +157,7 @@ def _nodes_of(
     log_fold: Array, stations: Array, bearings: Array, loads: Array, stretch: Array
 ) -> tuple[Array, Array]:
     """Contacts at the nodes, and their derivatives by (η, ψ, ρ)."""
-    s, psi, rho = np.meshgrid(stations, bearings, np.maximum(loads, _LEAST_LOAD), indexing="ij")
+    s, psi, rho = np.meshgrid(stations, bearings, np.maximum(loads, LEAST_LOAD), indexing="ij")
     f, f_eta, f_psi = (a[..., None] for a in _fold_and_derivatives(log_fold))
     cos, sin = np.cos(psi), np.sin(psi)
     contacts = np.stack([s, rho**2 * f * cos, rho**2 * f * sin], axis=-1)

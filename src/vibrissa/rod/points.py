@@ -34,7 +34,7 @@ from vibrissa.rod.discretization import Bendable, Rod
 from vibrissa.rod.integration import share_rows, solve_forces
 from vibrissa.rod.kernels import BUFFER_SIZE, LANES
 from vibrissa.rod.newton import ABOVE_FOLD, TOLERANCE, newton_group, stable, start_from
-from vibrissa.rod.search import MOST_SEEDS, seeds
+from vibrissa.rod.search import MOST_SEEDS, seed_room, seeds
 from vibrissa.rod.tree import SearchTree, search_tree
 from vibrissa.status import Status
 
@@ -182,15 +182,15 @@ def _find_starts(
     Near the resting whisker the first is its closest point, without force; the others are seeds.
     Unused entries are NaN.
     """
-    found, quality = np.empty((MOST_SEEDS, 3)), np.empty(MOST_SEEDS, np.int64)
-    slopes, forces = np.empty((MOST_SEEDS, 3, 3)), np.empty(MOST_SEEDS)
+    room, forces = seed_room(), np.empty(MOST_SEEDS)
+    found, quality = room.found, room.quality
     for row in range(first, last):
         count = 0
         arc, distance = _touch(resting, points[row])
         if distance < _NEAR * _NEAR:
             starts[row, 0, 0], starts[row, 0, 1], starts[row, 0, 2] = arc, 0.0, 0.0
             count = 1
-        n = seeds(tree, points[row], found, slopes, quality)
+        n = seeds(tree, points[row], room)
         for i in range(n):
             forces[i] = _force(fold, found[i])
         while count < _STARTS and n > 0:
@@ -231,8 +231,8 @@ def _solve_points(
     continuation (there are seeds or the resting whisker is near), and 0 if unreachable.
     """
     b = np.zeros(BUFFER_SIZE)
-    found, quality = np.empty((MOST_SEEDS, 3)), np.empty(MOST_SEEDS, np.int64)
-    slopes = np.empty((MOST_SEEDS, 3, 3))
+    room = seed_room()
+    found, slopes, quality = room.found, room.inverses, room.quality
     charts, inverses = np.empty((LANES, 3)), np.empty((LANES, 3, 3))
     rows, targets, group = np.empty(LANES, np.int64), np.empty((LANES, 3)), np.empty((LANES, 3))
     group_values, group_misfits = np.empty((LANES, 6)), np.empty(LANES)
@@ -242,7 +242,7 @@ def _solve_points(
         rows[count], doubt[count] = row, False
         copy(points[row], targets[count])
         touch = _light_touch(resting, points[row])
-        n = 0 if touch > 0.0 else seeds(tree, points[row], found, slopes, quality)
+        n = 0 if touch > 0.0 else seeds(tree, points[row], room)
         if touch > 0.0:
             group[count, 0], group[count, 1], group[count, 2] = touch, 0.0, 0.0
             charts[count, 2], inverses[count, 0, 0] = 0.0, np.nan

@@ -4,6 +4,14 @@ The tree (:mod:`vibrissa.rod.tree`) lists the cells that may contain a target. I
 interpolant is inverted by Newton's method, which gives seeds so near the exact solution that the
 rod's own Newton iteration converges at once.
 
+Forces and moments vanish at rest in proportion to the force f = ρ² f*. So V = T / f is interpolated
+instead, and the equations compare ratios: with t_p the largest of the targets t that vanish,
+
+    V_j - (t_j / t_p) V_p = 0   and   ρ - √(t_p / V_p f*) = 0,
+
+or V_p f - t_p = 0 in cells where V_p changes sign. The interpolated f* is accurate to 1e-3; a last
+step uses f* itself.
+
 In a cell where a vector of the plane may vanish (:class:`~vibrissa.rod.SearchTree`), its length
 ℓ and direction β are not smooth, but its components v are. There the equations are
 
@@ -17,7 +25,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, solve3, vectorised, wrapped
+from vibrissa.numerics import Array, IntArray, copy, inlined, solve3, vectorised, wrapped
+from vibrissa.rod.chart import log_fold_force
 from vibrissa.rod.tree import EVEN, FOLDED, SearchTree
 
 #: Largest number of contacts found for one target.
@@ -34,8 +43,12 @@ _NEARLY = 0.02
 # distance from the miss (in cell widths).
 _LARGEST_MISS = 0.3
 _SIDE = 0.2
-# In the first cells from rest, where signals vanish, misses are common and do not indicate a fold.
-_RESTING = 3
+# Distance from the middle of a cell (in cell widths) beyond which a first step leaves it; and the
+# same if the cell may contain a fold and is less linear.
+_REACH, _REACH_CAREFUL = 1.3, 4.0
+# Step (in cell widths) below which the next one, about its square, is the last: if there is one
+# solution at most, and if two may be close together.
+_LAST, _LAST_CAREFUL = 0.02, 0.002
 # Linear equations with a determinant below this share of the product of their rows are singular.
 _SINGULAR = 1e-3
 _STACK = 256
@@ -51,7 +64,19 @@ _RELATIVE = _SLOPES + 12
 # in the cell (0 in all other cells), and the last interpolated v · (cos β, sin β).
 _TARGET = _RELATIVE + 4
 _ALONG = _TARGET + 4
-_BUFFER = _ALONG + 1
+# For quantities that vanish at rest: index of the one that determines the force (-1 if none) and
+# its target; the targets over that one, 0 for the others; ρ of the cell's near side, in cells, and
+# whether that quantity has one sign in the cell; the last root of the force, and value and slopes
+# of the quantity over the force.
+_PIVOT = _ALONG + 1
+_SHARES = _PIVOT + 2
+_LAYER = _SHARES + 4
+_SIGNED = _LAYER + 1
+_ROOT = _SIGNED + 1
+_HELD = _ROOT + 1
+# For each target: the others over it and, at its own index, its root.
+_AIMS = _HELD + 4
+_BUFFER = _AIMS + 9
 
 
 @inlined
@@ -101,11 +126,47 @@ def _interpolate(b: Array, x: Array) -> None:
 
 
 @inlined
+def _compare(b: Array, x: Array) -> None:
+    """Convert the interpolant in the buffer to equations; see the module."""
+    p = int(b[_PIVOT])
+    if p < 0:
+        return
+    value, by_x, by_y = b[_MISFIT + p], b[_SLOPES + p], b[_SLOPES + 4 + p]
+    by_z = b[_SLOPES + 8 + p]
+    for q in range(4):
+        share = b[_SHARES + q]
+        b[_MISFIT + q] -= share * value
+        b[_SLOPES + q] -= share * by_x
+        b[_SLOPES + 4 + q] -= share * by_y
+        b[_SLOPES + 8 + q] -= share * by_z
+    b[_HELD], b[_HELD + 1], b[_HELD + 2], b[_HELD + 3] = value, by_x, by_y, by_z
+    wide, rho = b[_MISFIT + 3], b[_LAYER] + x[2]
+    root = rho / wide
+    if b[_SIGNED] != 0.0:
+        root = np.sqrt(max(b[_PIVOT + 1] / value, 0.0))
+        b[_MISFIT + p], rise, by_force, by_root = (
+            rho - root * wide,
+            1.0,
+            0.5 * root * wide / value,
+            root,
+        )
+    else:
+        b[_MISFIT + p] = root * root * value - b[_PIVOT + 1]
+        by_root = 2.0 * root * root * value / wide
+        rise, by_force = 2.0 * root * value / wide, root * root
+    b[_SLOPES + p] = by_force * by_x - by_root * b[_SLOPES + 3]
+    b[_SLOPES + 4 + p] = by_force * by_y - by_root * b[_SLOPES + 7]
+    b[_SLOPES + 8 + p] = rise + by_force * by_z - by_root * b[_SLOPES + 11]
+    b[_ROOT] = root
+
+
+@inlined
 def _evaluate(b: Array, x: Array) -> None:
     """Compute the cell's equations and their derivatives by x; left in the buffer."""
     _interpolate(b, x)
     largest = b[_TARGET + 3]
     if largest == 0.0:
+        _compare(b, x)
         return
     cos, sin, length = b[_TARGET], b[_TARGET + 1], b[_TARGET + 2]
     directed = cos != 0.0 or sin != 0.0
@@ -161,6 +222,21 @@ def _set_target(tree: SearchTree, target: Array, b: Array) -> None:
     if direction >= 0:
         b[_TARGET], b[_TARGET + 1] = np.cos(target[direction]), np.sin(target[direction])
     b[_TARGET + 2] = target[length] if length >= 0 else -1.0
+    pivot, most = -1, 0.0
+    for q in range(3):
+        scale = tree.scale[q]
+        if scale > 0.0 and abs(target[q]) > most * scale:
+            pivot, most = q, abs(target[q]) / scale
+    b[_PIVOT], b[_SHARES + 3] = pivot, 0.0
+    for q in range(3):
+        b[_SHARES + q] = 0.0
+        if pivot >= 0 and q != pivot and tree.scale[q] > 0.0:
+            b[_SHARES + q] = target[q] / target[pivot]
+        for p in range(3):
+            root = np.sqrt(abs(target[p]))
+            b[_AIMS + 3 * p + q] = root if p == q else target[q] / target[p]
+    if pivot >= 0:
+        b[_PIVOT + 1] = target[pivot]
 
 
 @inlined
@@ -263,16 +339,26 @@ def _solution_in_cube(matrix: Array, right: Array, slack: Array, x: Array) -> bo
 
 
 @inlined
-def _locate(tree: SearchTree, cell: int, target: Array, relative: Array, x: Array) -> bool:
+def _locate(tree: SearchTree, cell: int, target: Array, b: Array, x: Array) -> bool:
     """Whether a cell may contain the target; if so, x is set to about where."""
-    frame = tree.frame[cell]
+    frame, pivot = tree.blown[cell], tree.pivot[cell]
+    p = abs(pivot) - 1
+    if pivot != 0 and target[p] * pivot <= 0.0:
+        return False
     for q in range(3):
-        relative[q] = _difference(tree, q, target[q], frame[3, q])
+        aim = target[q]
+        if p >= 0 and tree.scale[q] > 0.0:
+            aim = b[_AIMS + 3 * p + q]
+        b[_RELATIVE + q] = _difference(tree, q, aim, frame[3, q])
+    r0, r1, r2 = b[_RELATIVE], b[_RELATIVE + 1], b[_RELATIVE + 2]
     for a in range(3):
-        y = frame[a, 0] * relative[0] + frame[a, 1] * relative[1] + frame[a, 2] * relative[2]
+        y = frame[a, 0] * r0 + frame[a, 1] * r1 + frame[a, 2] * r2
         if y < frame[4, a] or y > frame[5, a]:
             return False
         x[a] = min(max(y, 0.0), 1.0)
+    if p < 0 and b[_PIVOT] >= 0.0:
+        layer = tree.place[cell, 2]
+        x[2] = np.sqrt(layer * layer + x[2] * (2.0 * layer + 1.0)) - layer
     return True
 
 
@@ -283,12 +369,16 @@ def _invert(b: Array, half: Array, work: Array, careful: bool, x: Array) -> int:
     If not solved, x is left where the miss is least: work[5, 0] of the cell's extent.
     """
     rows, step, best = work[:3], work[3], work[4]
-    least, done = np.inf, False
+    least, done, farthest, last = np.inf, False, _REACH, _LAST
+    if careful:
+        farthest, last = _REACH_CAREFUL, _LAST_CAREFUL
+        if b[_TARGET + 3] > 0.0:  # polar
+            farthest, last = np.inf, _LAST
     work[5, 0] = np.inf
     for n in range(9):
         _evaluate(b, x)
         if done:
-            return 2
+            return 2 if b[_ROOT] > 0.0 else 0
         if n == 8:
             break
         m0, m1, m2 = b[_MISFIT], b[_MISFIT + 1], b[_MISFIT + 2]
@@ -303,16 +393,16 @@ def _invert(b: Array, half: Array, work: Array, careful: bool, x: Array) -> int:
         for a in range(3):
             step[a] = (rows[a, 0] * m0 + rows[a, 1] * m1 + rows[a, 2] * m2) / det
         size = max(abs(step[0]), abs(step[1]), abs(step[2]))
-        if n == 0 and not careful:  # nearly linear: the first step shows if it is in this cell
+        if n == 0:  # the first step shows whether it is in this cell
             reach = max(
                 abs(x[0] - step[0] - 0.5), abs(x[1] - step[1] - 0.5), abs(x[2] - step[2] - 0.5)
             )
-            if reach > 1.3:
+            if reach > farthest:
                 return 0
         shorten = min(1.0, 0.6 / max(size, 1e-300))
         for a in range(3):
             x[a] = min(max(x[a] - shorten * step[a], -0.5), 1.5)
-        if size < 2e-2:  # quadratic convergence: the next step would be about its square
+        if size < last:
             if _outside(x) > _OVERLAP:
                 return 0
             done = True
@@ -364,9 +454,38 @@ def _fold_sides(b: Array, half: Array, x: Array, work: Array, sides: Array) -> b
 
 
 @inlined
+def _refine(tree: SearchTree, place: IntArray, b: Array, work: Array, x: Array) -> float:
+    """Take a last step from x with the exact fold force; leave ∂x/∂T in work and return det."""
+    grid, p = tree.grid, int(b[_PIVOT])
+    force = 1.0
+    if p >= 0:
+        eta, psi = grid[1, 0] * (place[0] + x[0]), grid[1, 1] * (place[1] + x[1])
+        log, by_eta, by_psi = log_fold_force(tree.fold, eta, psi)
+        rho, strength, value = grid[1, 2] * (place[2] + x[2]), np.exp(log), b[_HELD]
+        force = rho * rho * strength
+        b[_MISFIT + p] = force * value - b[_PIVOT + 1]
+        b[_SLOPES + p] = force * (b[_HELD + 1] + value * by_eta * grid[1, 0])
+        b[_SLOPES + 4 + p] = force * (b[_HELD + 2] + value * by_psi * grid[1, 1])
+        b[_SLOPES + 8 + p] = force * b[_HELD + 3] + 2.0 * rho * strength * value * grid[1, 2]
+    det = _adjugate(b, work)
+    if det == 0.0:
+        return 0.0
+    inverse = 1.0 / det
+    for a in range(3):
+        for c in range(3):
+            work[a, c] *= inverse
+        x[a] -= work[a, 0] * b[_MISFIT] + work[a, 1] * b[_MISFIT + 1] + work[a, 2] * b[_MISFIT + 2]
+        for c in range(3):
+            if tree.scale[c] > 0.0 and c != p:
+                work[a, c] /= force
+                work[a, p] -= work[a, c] * b[_SHARES + c]
+    return det
+
+
+@inlined
 def _add_seed(
-    grid: Array,
-    place: IntArray,
+    tree: SearchTree,
+    cell: int,
     x: Array,
     b: Array,
     work: Array,
@@ -376,7 +495,11 @@ def _add_seed(
     quality: IntArray,
     count: int,
 ) -> int:
-    """Add a seed unless a neighbour found the same; one that is solved replaces one that is not."""
+    """Add a seed unless a neighbour found the same; a solved one replaces an unsolved one."""
+    grid, place = tree.grid, tree.place[cell]
+    det = 0.0
+    if solved == 2 and b[_TARGET + 3] == 0.0:
+        det = _refine(tree, place, b, work, x)
     eta = grid[0, 0] + grid[1, 0] * (place[0] + x[0])
     psi = grid[0, 1] + grid[1, 1] * (place[1] + x[1])
     rho = grid[0, 2] + grid[1, 2] * (place[2] + x[2])
@@ -388,7 +511,7 @@ def _add_seed(
             abs(rho - found[n, 2]) / grid[1, 2],
         )
         both = solved + quality[n]
-        if apart < 0.02 or (both < 4 and apart < (0.5 if both > 1 else 0.15)):
+        if apart < 0.005 or (both < 4 and apart < (0.5 if both > 1 else 0.15)):
             if solved <= quality[n]:
                 return count
             row = n
@@ -397,47 +520,55 @@ def _add_seed(
         return count
     found[row, 0], found[row, 1], found[row, 2] = eta, psi, rho
     quality[row] = solved
-    det = _adjugate(b, work) if b[_TARGET + 3] == 0.0 else 0.0
     for a in range(3):
-        for c in range(3):  # ∂(η, ψ, ρ)/∂T from ∂T/∂x in cell widths
-            inverses[row, a, c] = np.nan if det == 0.0 else work[a, c] * grid[1, a] / det
+        for c in range(3):
+            inverses[row, a, c] = np.nan if det == 0.0 else work[a, c] * grid[1, a]
     return max(count, row + 1)
 
 
 @inlined
-def _boxes_around(turns: Array, box: Array, target: Array, slack: Array, inside: AnyArray) -> None:
-    """Which of eight sibling boxes contain values within ``slack`` of the target."""
+def _boxes_around(turns: Array, box: Array, target: Array, slack: Array) -> int:
+    """Bits of the eight sibling boxes that contain values within ``slack`` of the target."""
     t0, t1, t2 = target[0], target[1], target[2]
     s0, s1, s2 = slack[0], slack[1], slack[2]
-    for c in range(8):
+    turn0, turn1, turn2, inside = turns[0], turns[1], turns[2], 0
+    for c in range(8):  # without branches and stores, so that it vectorises
         d0, d1, d2 = t0 - box[0, c], t1 - box[1, c], t2 - box[2, c]
-        d0 -= 2.0 * np.pi * np.rint(d0 * turns[0])
-        d1 -= 2.0 * np.pi * np.rint(d1 * turns[1])
-        d2 -= 2.0 * np.pi * np.rint(d2 * turns[2])
-        near = (abs(d0) <= box[3, c] + s0) & (abs(d1) <= box[4, c] + s1)
-        inside[c] = near & (abs(d2) <= box[5, c] + s2) & (box[3, c] >= 0.0)  # not a filler
+        d0 -= 2.0 * np.pi * np.rint(d0 * turn0)
+        d1 -= 2.0 * np.pi * np.rint(d1 * turn1)
+        d2 -= 2.0 * np.pi * np.rint(d2 * turn2)
+        most = max(abs(d0) - box[3, c] - s0, abs(d1) - box[4, c] - s1)
+        most = max(most, abs(d2) - box[5, c] - s2, -box[3, c])  # fillers have a negative width
+        # The right side is NaN if any difference is, which a maximum may ignore.
+        inside |= (1 << c) if most <= 0.0 * (d0 + d1 + d2) else 0
+    return inside
 
 
 @inlined
 def _next_cells(
-    tree: SearchTree, target: Array, slack: Array, stack: IntArray, top: int, inside: AnyArray
-) -> tuple[int, int]:
-    """Find the next eight cells, and which of them may hold values within ``slack`` of the target.
+    tree: SearchTree, target: Array, slack: Array, stack: IntArray, top: int, near: IntArray
+) -> tuple[int, int, int]:
+    """Advance to the next eight cells, and list those that may contain values near a target.
 
-    Return the number of blocks left on the stack, and the index of the eight; -1 if none is left.
+    Return the number of blocks left on the stack, the index of the eight (-1 if there are none),
+    and how many of them are listed in ``near``, within ``slack`` of the target.
     """
     last = tree.offsets.shape[0] - 2
     while top > 0:
         top -= 1
         level, node = stack[top, 0], stack[top, 1]
-        _boxes_around(tree.turns, tree.boxes[tree.offsets[level] + node], target, slack, inside)
+        inside = _boxes_around(tree.turns, tree.boxes[tree.offsets[level] + node], target, slack)
         if level == last:
-            return top, node
+            number = 0
+            for c in range(8):
+                near[number] = c
+                number += (inside >> c) & 1
+            return top, node, number
+        top = min(top, _STACK - 8)
         for c in range(8):
-            if inside[c] and top < _STACK:
-                stack[top, 0], stack[top, 1] = level + 1, 8 * node + c
-                top += 1
-    return top, -1
+            stack[top, 0], stack[top, 1] = level + 1, 8 * node + c
+            top += (inside >> c) & 1
+    return top, -1, 0
 
 
 @inlined
@@ -447,7 +578,6 @@ def _load_cell(
     box: Array,
     c: int,
     target: Array,
-    relative: Array,
     b: Array,
     work: Array,
     half: Array,
@@ -463,49 +593,57 @@ def _load_cell(
         if not _locate_polar(tree, row, b, work, x):
             return -1
         careful, edge = _polar_care(tree, row, b), tree.polar_edges[row]
-        b[_TARGET + 3] = tree.polar_frame[row, 7]
+        b[_TARGET + 3], b[_ROOT] = tree.polar_frame[row, 7], 1.0
         for a in range(3):
             half[a] = tree.polar_frame[row, 4 + a]
     else:
-        if not _locate(tree, cell, target, relative, x):
+        if not _locate(tree, cell, target, b, x):
             return -1
         careful, edge = tree.care[cell], tree.edges[cell]
         b[_TARGET + 3] = b[_RELATIVE + 3] = 0.0
-        for a in range(3):
-            half[a], b[_RELATIVE + a] = box[3 + a, c], relative[a]
+        extent, pivot = tree.blown[cell, 6], int(b[_PIVOT])
+        for q in range(3):
+            if tree.scale[q] > 0.0:
+                b[_RELATIVE + q] = 0.0
+                half[q] = extent[q] + abs(b[_SHARES + q]) * extent[pivot]
+            else:
+                half[q] = box[3 + q, c]
+        if pivot >= 0:
+            b[_LAYER], b[_SIGNED] = tree.place[cell, 2], tree.pivot[cell]
+            half[pivot] = 1.0 if tree.pivot[cell] != 0 else box[3 + pivot, c]
     for k in range(_MISFIT):
         b[k] = edge[k]
     return int(careful)
 
 
-class _Workspace(NamedTuple):
-    """Working memory of a search.
+class SeedRoom(NamedTuple):
+    """The seeds of a target, and working memory of the search for them; see :func:`seed_room`."""
 
-    Stack of blocks to visit (256, 2); which of eight cells may hold the target (8,), and the slack
-    (3,); position in a cell (3,), target relative to the cell's base (3,), and position of the
-    least miss (3,); rows of `_invert` (6, 3); the interpolant's buffer; extent of a cell's values
-    (3,); starts on either side of a fold (3, 3).
-    """
-
-    stack: IntArray
-    inside: AnyArray
-    slack: Array
-    x: Array
-    relative: Array
-    nearest: Array
-    work: Array
-    b: Array
-    half: Array
-    sides: Array
+    found: Array  # (n, 3), chart coordinates
+    inverses: Array  # (n, 3, 3), their derivatives by the target, NaN where they are not known
+    # (n,) 2: solved; 1: nearly so, as near a fold; 0: to one side of a fold.
+    quality: IntArray
+    stack: IntArray  # (256, 2), blocks still to be looked at
+    near: IntArray  # (8,), which of eight cells may hold the target
+    slack: Array  # (3,), how far from it
+    x: Array  # (3,), where in a cell
+    nearest: Array  # (3,), where in a cell it was missed least
+    work: Array  # (6, 3), rows of `_invert`
+    b: Array  # buffer of the interpolant
+    half: Array  # (3,), sizes of a cell's equations
+    sides: Array  # (3, 3), starts to either side of a fold
 
 
 @inlined
-def _workspace() -> _Workspace:
-    return _Workspace(
-        np.zeros((_STACK, 2), np.int64),
-        np.empty(8, np.bool_),
+def seed_room() -> SeedRoom:
+    """Allocate working memory for seeds, once for many targets."""
+    return SeedRoom(
+        np.empty((MOST_SEEDS, 3)),
+        np.empty((MOST_SEEDS, 3, 3)),
+        np.empty(MOST_SEEDS, np.int64),
+        np.empty((_STACK, 2), np.int64),
+        np.empty(8, np.int64),
         np.zeros(3),
-        np.empty(3),
         np.empty(3),
         np.empty(3),
         np.empty((6, 3)),
@@ -516,41 +654,25 @@ def _workspace() -> _Workspace:
 
 
 @vectorised
-def seeds(tree: SearchTree, target: Array, found: Array, inverses: Array, quality: IntArray) -> int:
-    """Find all contacts that may have the target's values, as chart coordinates (η, ψ, ρ).
-
-    Fills ``found`` (n, 3), ``inverses`` (n, 3, 3), the derivatives by the quantities, and
-    ``quality`` (n,): 2 solved, 1 nearly, 0 a guess. Returns their number, at most ``MOST_SEEDS``.
-    """
-    return _seeds(tree, target, found, inverses, quality, _workspace())
-
-
-@vectorised
-def _seeds(
-    tree: SearchTree,
-    target: Array,
-    found: Array,
-    inverses: Array,
-    quality: IntArray,
-    room: _Workspace,
-) -> int:
-    """Find seeds in given memory: arrays passed as arguments need no reference counting."""
-    grid, place, cells = tree.grid, tree.place, tree.boxes[tree.offsets[-2] :]
-    stack, inside, slack, x, relative, nearest, work, b, half, sides = room
+def seeds(tree: SearchTree, target: Array, room: SeedRoom) -> int:
+    """Fill all contacts that may have the target's values; return their number."""
+    cells = tree.boxes[tree.offsets[-2] :]
+    found, inverses, quality, stack, near, slack, x, nearest, work, b, half, sides = room
+    stack[0, 0] = stack[0, 1] = 0
     count = 0
     _set_target(tree, target, b)
-    top, node = _next_cells(tree, target, slack, stack, 1, inside)
+    b[_ROOT] = 1.0
+    top, node, number = _next_cells(tree, target, slack, stack, 1, near)
     while node >= 0:
         box = cells[node]
-        for c in range(8):
-            if not inside[c]:
-                continue
+        for i in range(number):
+            c = near[i]
             child = 8 * node + c
-            careful = _load_cell(tree, child, box, c, target, relative, b, work, half, x)
+            careful = _load_cell(tree, child, box, c, target, b, work, half, x)
             if careful < 0:
                 continue
             least = np.inf
-            missed = careful == 2 and place[child, 2] >= _RESTING
+            missed = careful == 2
             for start in range(9 if careful > 0 else 1):  # from the located position, then corners
                 if start > 0:
                     for a in range(3):
@@ -562,7 +684,7 @@ def _seeds(
                     copy(x, nearest)
                 if solved > 0 and not _points_opposite(b):
                     count = _add_seed(
-                        grid, place[child], x, b, work, solved, found, inverses, quality, count
+                        tree, child, x, b, work, solved, found, inverses, quality, count
                     )
                 if solved == 2 and careful < 2:
                     break
@@ -571,8 +693,8 @@ def _seeds(
             if _fold_sides(b, half, nearest, work, sides):
                 for side in range(2):
                     count = _add_seed(
-                        grid,
-                        place[child],
+                        tree,
+                        child,
                         sides[side],
                         b,
                         work,
@@ -582,7 +704,7 @@ def _seeds(
                         quality,
                         count,
                     )
-        top, node = _next_cells(tree, target, slack, stack, top, inside)
+        top, node, number = _next_cells(tree, target, slack, stack, top, near)
     return count
 
 
@@ -614,8 +736,8 @@ def cells_around(
     Fills ``spots`` (n, 3), chart coordinates of the closest position in each cell, and ``away``
     (n,), the distance there in units of the slack. Returns the number of cells, at most n.
     """
-    stack, x, inside = np.zeros((_STACK, 2), np.int64), np.empty(3), np.empty(8, np.bool_)
-    return _cells_around(tree, target, slack, cells, spots, away, stack, x, inside)
+    stack, x, near = np.zeros((_STACK, 2), np.int64), np.empty(3), np.empty(8, np.int64)
+    return _cells_around(tree, target, slack, cells, spots, away, stack, x, near)
 
 
 @vectorised
@@ -628,16 +750,14 @@ def _cells_around(
     away: Array,
     stack: IntArray,
     x: Array,
-    inside: AnyArray,
+    near: IntArray,
 ) -> int:
     """List cells in given memory: arrays passed as arguments need no reference counting."""
     grid, place, count = tree.grid, tree.place, 0
-    top, node = _next_cells(tree, target, slack, stack, 1, inside)
+    top, node, number = _next_cells(tree, target, slack, stack, 1, near)
     while node >= 0:
-        for c in range(8):
-            child, miss = 8 * node + c, 0.0
-            if not inside[c]:
-                continue
+        for i in range(number):
+            child, miss = 8 * node + near[i], 0.0
             x[:] = 0.5
             if tree.polar[child] < 0:
                 miss = _near_cell(tree, child, target, slack, x)
@@ -649,5 +769,5 @@ def _cells_around(
             count += 1
             if count == spots.shape[0]:
                 return count
-        top, node = _next_cells(tree, target, slack, stack, top, inside)
+        top, node, number = _next_cells(tree, target, slack, stack, top, near)
     return count

@@ -2,13 +2,16 @@
 
 Three quantities T (the contact point's coordinates, or three base signals) are known with their
 exact derivatives at the nodes of the chart (:mod:`vibrissa.rod.chart`). In each cell T is a cubic
-blend over the cell's twelve edges: with H the cubic Hermite curve along an edge and V the straight
-line between its ends, it is Σ w H over the four edges along η plus Σ w (H - V) over those along ψ
-and ρ, with w the bilinear weights across. All cubics are reproduced, so the error is of fourth
-order; the Bézier points of the edges bound it.
+blended between the cell's twelve edges: with H the cubic Hermite curve along an edge and V the
+straight line between its ends, Σ w H over the four edges along η plus Σ w (H - V) over those along
+ψ and ρ, w the bilinear weights across. It reproduces all cubics, so its error is of fourth order;
+the Bézier points of the edges bound it.
 
-Boxes around the values in each cell, in blocks of 2 × 2 × 2 cells, and so on, form a tree. The
-cells that may contain a target are those whose boxes, and all boxes above them, contain it, and
+Quantities that vanish at rest in proportion to the force are divided by it, and by one of them in
+the coordinates aligned with a cell, so that cells at rest are as regular as others.
+
+Boxes around the cells' values, and around those of 2 × 2 × 2 neighbours, and so on, form a tree;
+the cells that may contain a target are those whose boxes, and all boxes above them, contain it, and
 which still contain it in coordinates aligned with the cell (:mod:`vibrissa.rod.search`). Angles are
 compared on the circle.
 
@@ -24,9 +27,14 @@ from typing import NamedTuple
 import numpy as np
 
 from vibrissa.numerics import AnyArray, Array, IntArray
-from vibrissa.rod.chart import StableSet
+from vibrissa.rod.chart import LEAST_LOAD, Fold, StableSet
 
-_MARGIN = 0.08  # share by which boxes are widened, for the error of the cubic
+_MARGIN = 0.08  # boxes are widened by this share of their size for what the cubic misses
+# A quantity that vanishes at rest faster than the force is not regular over the force: its ratio to
+# the force at rest is below this share of the largest one.
+_FASTER = 0.3
+# A quantity has one sign in a cell if its least absolute value exceeds this share of the largest.
+_SIGNED = 0.1
 # Relative determinant of a cell's linear part below which the cell is not aligned.
 _FLAT = 1e-3
 #: A cell may contain a fold, and so two solutions, if at a corner the volume spanned by the slopes
@@ -43,14 +51,22 @@ _TURNED = 0.9
 class SearchTree(NamedTuple):
     """Cells of a chart and the values of three quantities in them, for the kernels."""
 
+    fold: Fold  # fold force over the chart
     grid: Array  # (2, 3), chart coordinates of the first corner, and size of a cell
     turns: Array  # (3,), 1/2π for angles, 0 for other quantities
     offsets: IntArray  # (levels + 1,), first row of each level in ``boxes``
     boxes: Array  # (m, 6, 8), middle and half width of the values in eight sibling blocks
-    place: IntArray  # (n, 3), indices of each cell in the grid
+    scale: Array  # (3,), sizes over the force of quantities that vanish at rest; 0 for the others
+    place: IntArray  # (n, 3), position of each cell in the grid
     # (n, 6, 3) Coordinates in which a cell is nearly the unit cube (inverse, origin), and its
     # extent in them (lower, upper).
     frame: Array
+    # (n, 7, 3) The same for quantities over one of those that vanish at rest, and the root of that
+    # one; and half widths of the interpolated values.
+    blown: Array
+    # (n,) Index of that one, from 1, with its sign in the cell; 0 if none has one sign: then the
+    # quantities themselves are used.
+    pivot: IntArray
     edges: Array  # (n, 160), coefficients of the cells' interpolants
     # (n,) Starts needed by a cell: 0 one, 1 several until one is solved, 2 all of them.
     care: IntArray
@@ -80,6 +96,7 @@ def search_tree(
     derivatives: Array,
     angles: tuple[bool, ...],
     plane: PlaneVector | None = None,
+    vanishing: tuple[bool, ...] = (False, False, False),
 ) -> SearchTree:
     """Build the tree for the search for contacts with given values of three quantities.
 
@@ -95,6 +112,8 @@ def search_tree(
         Whether each of them is an angle, compared on the circle.
     plane : PlaneVector, optional
         Vector whose length, direction, or both are among the quantities.
+    vanishing : tuple of bool
+        Whether each of them is proportional to the force near rest.
 
     Returns
     -------
@@ -104,10 +123,22 @@ def search_tree(
     size = np.array([1.0, 2.0 * np.pi, 1.0]) / (np.array(values.shape[:3]) - 1)
     circular = np.array(angles)
     place = _octree_order(tuple(n - 1 for n in values.shape[:3]))
-    cells = _Cells.of(place, values, chart.charted(derivatives) * size, circular)
-    aligned = _aligned_coordinates(cells)
+    slopes, scaled = chart.charted(derivatives) * size, np.array(vanishing)
+    cells = _Cells.of(place, values, slopes, circular)
     low, high = cells.extent()
-    care = _starts_needed(cells.slope, aligned)
+    smooth, smooth_slopes = _smooth(chart, values, slopes, scaled)
+    size_of = np.nanmax(np.abs(smooth[..., :3]), axis=(0, 1, 2))
+    at_rest = np.nanmax(np.abs(smooth[:, :, 0, :3]), axis=(0, 1))
+    if (scaled & (at_rest < _FASTER * size_of)).any():  # of a straight whisker
+        scaled = np.zeros(3, dtype=bool)
+        smooth, smooth_slopes = _smooth(chart, values, slopes, scaled)
+    scale = np.where(scaled, size_of, 0.0)
+    interpolated = _Cells.of(place, smooth, smooth_slopes, np.append(circular, False))
+    half = 0.5 * np.subtract(*interpolated.extent()[::-1])[:, None, :3]
+    interpolated.corner[...] += np.where([*scaled, True], interpolated.base, 0.0)
+    blown, pivot = _blown_up(cells, interpolated, scale, place[:, 2])
+    in_blown = _aligned_coordinates(blown)
+    care = _starts_needed(blown.slope, in_blown)
     polar = _Polar.none()
     if plane is not None:
         slopes = chart.charted(plane.derivatives) * size
@@ -124,13 +155,17 @@ def search_tree(
     row = np.full(len(place), -1)
     row[polar.rows] = np.arange(len(polar.rows))
     return SearchTree(
+        chart.fold,
         np.stack([np.zeros(3), size]),
         np.where(circular, 0.5 / np.pi, 0.0),
         offsets,
         boxes,
+        scale,
         place,
-        aligned,
-        _edge_coefficients(cells),
+        _aligned_coordinates(cells),
+        np.ascontiguousarray(np.concatenate([in_blown, half], axis=1)),
+        pivot,
+        _edge_coefficients(interpolated),
         care,
         row,
         polar.edges,
@@ -154,10 +189,9 @@ class _Cells(NamedTuple):
 
     @classmethod
     def of(cls, place: IntArray, values: Array, slopes: Array, circular: AnyArray) -> _Cells:
-        """Gather them from the nodes of the chart."""
-        two = np.arange(2)[:, None]
+        """Take them from the nodes of the chart."""
         i, j, k = place.T
-        index = (i + two[:, None, None], j + two[:, None], k + two)
+        index = _corners(place)
         corner, slope = values[index], slopes[index]
         corner = corner - corner[0, 0, 0]
         if circular.any():
@@ -269,6 +303,74 @@ def _spanned_volumes(slope: Array, others: int) -> Array:
     for component in range(2):
         out[..., component] = np.linalg.det(slope[..., [component, 2, 3], :]) / size
     return out
+
+
+def _corners(place: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Indices of the cells' corners among the nodes: (2, 2, 2, cells)."""
+    two = np.arange(2)[:, None]
+    i, j, k = place.T
+    return i + two[:, None, None], j + two[:, None], k + two
+
+
+def _smooth(
+    chart: StableSet, values: Array, slopes: Array, scaled: AnyArray
+) -> tuple[Array, Array]:
+    """What cells interpolate, at the nodes, with its slopes.
+
+    What vanishes at rest is divided by the force, and 1/√f* in cells joins it.
+    """
+    grid, step = values.shape[:3], chart.loads[1]
+    loads = np.maximum(chart.loads, LEAST_LOAD) / step
+    log, by_eta, by_psi = np.moveaxis(chart.fold.log_force[:, :, None, :3], -1, 0)
+    rise = np.empty((*grid, 3))
+    rise[..., 0], rise[..., 1], rise[..., 2] = by_eta / (grid[0] - 1), by_psi, 2.0 / loads
+    rise[..., 1] *= 2.0 * np.pi / (grid[1] - 1)
+    force = np.where(scaled, (np.exp(log) * (step * loads) ** 2)[..., None], 1.0)
+    out, by = np.empty((*grid, 4)), np.zeros((*grid, 4, 3))
+    out[..., :3], out[..., 3] = values / force, np.exp(-0.5 * log) / step
+    by[..., :3, :] = slopes / force[..., None]
+    by[..., :3, :] -= np.where(scaled, out[..., :3], 0.0)[..., None] * rise[..., None, :]
+    by[..., 3, :2] = -0.5 * out[..., 3, None] * rise[..., :2]
+    if scaled.any():  # near rest all of it is linear in the force, ρ²: the nodes lead there
+        out[:, :, 0] -= 0.5 * loads[0] * by[:, :, 0, :, 2]
+        by[:, :, 0, :, 2] = 0.0
+        rest = loads[0] ** 2 / (loads[1] ** 2 - loads[0] ** 2)
+        by[:, :, 0, :, :2] -= rest * (by[:, :, 1, :, :2] - by[:, :, 0, :, :2])
+    return out, by
+
+
+def _blown_up(
+    cells: _Cells, interpolated: _Cells, scale: Array, layer: IntArray
+) -> tuple[_Cells, IntArray]:
+    """Quantities over the one that vanishes at rest and nowhere else in a cell, and its root.
+
+    These are regular at rest. Return which one it is, see `SearchTree.pivot`.
+    """
+    value, slope = interpolated.corner[..., :3], interpolated.slope[..., :3, :]
+    sign = np.sign(value[0, 0, 0])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        least = np.where(scale > 0.0, (sign * value).min(axis=(0, 1, 2)) / scale, -np.inf)
+        number = np.argmax(least, axis=-1)
+        every = np.arange(len(number))
+        most = np.abs(value).max(axis=(0, 1, 2))[every, number] / scale[number]
+        usable = least[every, number] > _SIGNED * most
+        over, by = value[..., every, number], slope[..., every, number, :]
+        ratio = value / over[..., None]
+        by_ratio = (slope - ratio[..., None] * by[..., None, :]) / over[..., None, None]
+        root = np.sqrt(np.abs(over)) / interpolated.corner[..., 3]
+        shrink = interpolated.slope[..., 3, :] / interpolated.corner[..., 3, None]
+        load = (layer + np.arange(2)[:, None]) * root
+        by_load = load[..., None] * (0.5 * by / over[..., None] - shrink)
+    by_load[..., 2] += root
+    pivots = np.arange(3) == number[:, None]
+    blown = np.where(pivots, load[..., None], np.where(scale > 0.0, ratio, value))
+    by_blown = np.where((scale > 0.0)[:, None], by_ratio, slope)
+    by_blown = np.where(pivots[..., None], by_load[..., None, :], by_blown)
+    corner = np.where(usable[:, None], blown, cells.corner)
+    base = np.where((scale > 0.0) & usable[:, None], corner[0, 0, 0], cells.base)
+    corner = corner - corner[0, 0, 0]
+    out = _Cells(base, corner, np.where(usable[:, None, None], by_blown, cells.slope))
+    return out, np.where(usable, sign[every, number] * (number + 1), 0.0).astype(np.int64)
 
 
 def _octree_order(cells: tuple[int, ...]) -> IntArray:

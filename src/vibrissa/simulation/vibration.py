@@ -32,7 +32,9 @@ probable, in steps of 10 %.
 
 In contact the wrench changes from frame to frame by what is usual for it, with long tails: a
 Student distribution about the last frame, as wide as the noise and the change before. A contact
-begins with a change that is well above the noise. All likelihoods are of (F, M_y, M_z).
+begins with a change that is well above the noise, and is as improbable without one: otherwise a
+vibration just before an onset, which a wrong mass explains badly, is called contact too. All
+likelihoods are of (F, M_y, M_z).
 """
 
 from __future__ import annotations
@@ -391,6 +393,8 @@ _BEND = 0.2  # the same share for a tip that is deflected by the whisker's lengt
 _FREEDOM, _FREEDOM_IN_CONTACT = 4.0, 1.0
 # Change from frame to frame in contact, and when it begins, over noise, and over the last one.
 _CHANGE, _ONSET, _AS_BEFORE = 1.5, 5.0, 0.6
+# Power of the change with which the density of an onset begins, over two: 1 to 5 do as well.
+_ABRUPT = 2.0
 # Standard deviation of amplitudes at a release: least, over noise, and as a share of the moment,
 # which modes in some phase make together.
 _START, _RELEASED = 5.0, 0.35
@@ -526,16 +530,23 @@ def _student(square: Array, freedom: float) -> Array:
 
 def _touching(measured: Array, correlation: Array) -> tuple[Array, Array]:
     """Log likelihoods (n,) of frames in contact, and of those in which it begins."""
+    n = len(_CHANNELS)
     change = np.diff(measured, axis=0, prepend=measured[:1])
     square = (change * np.linalg.solve(correlation, change.T).T).sum(axis=1)
-    before = _AS_BEFORE**2 * np.append(square[:1], square[:-1]) / len(_CHANNELS)
+    before = _AS_BEFORE**2 * np.append(square[:1], square[:-1]) / n
     constant = 0.5 * np.linalg.slogdet(correlation)[1]
     out = []
     for least in (_CHANGE, _ONSET):
         width = least**2 + before
         found = _student(square / width, _FREEDOM_IN_CONTACT) - constant
-        out.append(found - 0.5 * len(_CHANNELS) * np.log(width))
-    return out[0], out[1]
+        out.append(found - 0.5 * n * np.log(width))
+    # The share of a Student variable's square that is not its scale's has a beta distribution;
+    # its power, over the mean of that, takes small changes away and leaves a density.
+    ratio = square / width / _FREEDOM_IN_CONTACT
+    share = _ABRUPT * np.log(np.maximum(ratio / (1.0 + ratio), np.finfo(np.float64).tiny))
+    share -= special.betaln(0.5 * n + _ABRUPT, 0.5 * _FREEDOM_IN_CONTACT)
+    share += special.betaln(0.5 * n, 0.5 * _FREEDOM_IN_CONTACT)
+    return out[0], out[1] + share
 
 
 def contact_probability(modes: Modes, step: float, left: Array, air: Array, noise: Array) -> Array:

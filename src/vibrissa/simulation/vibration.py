@@ -393,7 +393,7 @@ _BEND = 0.2  # the same share for a tip that is deflected by the whisker's lengt
 _FREEDOM, _FREEDOM_IN_CONTACT = 4.0, 1.0
 # Change from frame to frame in contact, and when it begins, over noise, and over the last one.
 _CHANGE, _ONSET, _AS_BEFORE = 1.5, 5.0, 0.6
-# Power of the change with which the density of an onset begins, over two: 1 to 5 do as well.
+# Power of the change with which the density of an onset begins, over two; 2 to 5 do as well.
 _ABRUPT = 2.0
 # Standard deviation of amplitudes at a release: least, over noise, and as a share of the moment,
 # which modes in some phase make together.

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_t
 from typer.testing import CliRunner
 
 import vibrissa as vb
@@ -18,6 +19,7 @@ from vibrissa.simulation import (
     simulate,
     sweep_past,
 )
+from vibrissa.simulation.vibration import _touching
 
 NOISE = component_noise(FORCE_NOISE, MOMENT_NOISE)
 
@@ -131,3 +133,17 @@ def test_what_is_not_determined_is_stated(whisker, in_air):
         fit_dynamics(whisker, *air, NOISE)
     with pytest.raises(ValueError, match=r"no window of .* without contact"):
         fit_dynamics(whisker, *(x[:9] for x in air), NOISE)
+
+
+def test_an_onset_is_a_change():
+    # Its density over the changes that follow on none is one in all, and small at small changes.
+    rng = np.random.default_rng(0)
+    changes = np.zeros((40000, 5))
+    changes[1::2] = 5.0 * multivariate_t(shape=np.eye(5), df=1).rvs(20000, random_state=rng)
+    onset = _touching(changes.cumsum(axis=0), np.eye(5))[1][1::2]
+    drawn = multivariate_t(shape=25.0 * np.eye(5), df=1).logpdf(changes[1::2])
+    assert np.mean(np.exp(onset - drawn)) == pytest.approx(1.0, abs=0.01)
+    sizes = np.zeros((4, 5))
+    sizes[1::2, 0] = 1.0, 10.0
+    onset = _touching(sizes.cumsum(axis=0), np.eye(5))[1]
+    assert onset[1] < onset[3] - 1.0

@@ -29,7 +29,9 @@ error of phase; the factor is chosen by maximum likelihood over all frames, in s
 
 In contact the change of the wrench from frame to frame has a heavy-tailed (Student) distribution,
 whose width is given by the noise and the previous change. A contact begins with a change well above
-the noise. All likelihoods are those of (F, M_y, M_z).
+the noise; without a change an onset is improbable, because otherwise a vibration just before an
+onset, which a wrong mass explains badly, would count as contact too. All likelihoods are those of
+(F, M_y, M_z).
 """
 
 from __future__ import annotations
@@ -393,6 +395,8 @@ _FREEDOM, _FREEDOM_IN_CONTACT = 4.0, 1.0
 # Width of the distribution of changes between frames in contact, and at its onset, in units of the
 # noise; and relative to the previous change.
 _CHANGE, _ONSET, _AS_BEFORE = 1.5, 5.0, 0.6
+# Half the power of the change in the density of an onset; 2 to 5 are equally good.
+_ABRUPT = 2.0
 # Standard deviation of modal amplitudes at a release: smallest value, in units of the noise, and
 # relative to the moment, to which all modes contribute with unknown phases.
 _START, _RELEASED = 5.0, 0.35
@@ -531,16 +535,23 @@ def _student(square: Array, freedom: float) -> Array:
 
 def _touching(measured: Array, correlation: Array) -> tuple[Array, Array]:
     """Log likelihoods (n,) of frames in contact, and of frames in which contact begins."""
+    n = len(_CHANNELS)
     change = np.diff(measured, axis=0, prepend=measured[:1])
     square = (change * np.linalg.solve(correlation, change.T).T).sum(axis=1)
-    before = _AS_BEFORE**2 * np.append(square[:1], square[:-1]) / len(_CHANNELS)
+    before = _AS_BEFORE**2 * np.append(square[:1], square[:-1]) / n
     constant = 0.5 * np.linalg.slogdet(correlation)[1]
     out = []
     for least in (_CHANGE, _ONSET):
         width = least**2 + before
         found = _student(square / width, _FREEDOM_IN_CONTACT) - constant
-        out.append(found - 0.5 * len(_CHANNELS) * np.log(width))
-    return out[0], out[1]
+        out.append(found - 0.5 * n * np.log(width))
+    # The share of a Student variable's square that is not its scale's has a beta distribution;
+    # its power, over the mean of that, takes small changes away and leaves a density.
+    ratio = square / width / _FREEDOM_IN_CONTACT
+    share = _ABRUPT * np.log(np.maximum(ratio / (1.0 + ratio), np.finfo(np.float64).tiny))
+    share -= special.betaln(0.5 * n + _ABRUPT, 0.5 * _FREEDOM_IN_CONTACT)
+    share += special.betaln(0.5 * n, 0.5 * _FREEDOM_IN_CONTACT)
+    return out[0], out[1] + share
 
 
 def contact_probability(modes: Modes, step: float, left: Array, air: Array, noise: Array) -> Array:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from vibrissa.cameras import Camera
 from vibrissa.deferred import transform
-from vibrissa.numerics import Array, Mask
+from vibrissa.numerics import Array, Mask, without_blas_threads
 from vibrissa.objects import Surface
 from vibrissa.recording import ONE_VIEW
 from vibrissa.tracking.recording import (
@@ -114,6 +114,7 @@ class TrackOptions:
         return {**self.properties, "hidden": self.fur}
 
 
+@without_blas_threads
 def track(
     cameras: Sequence[Camera],
     traces: Sequence[Sequence[Sequence[Trace]]],

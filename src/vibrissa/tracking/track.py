@@ -6,6 +6,7 @@ What is to be known before it is believed is added in sentences (`vibrissa.track
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
@@ -36,11 +37,14 @@ from vibrissa.tracking.remarks import (
     remarks_on_fur,
     remarks_on_optics,
     remarks_on_plane,
+    remarks_on_row,
     remarks_on_shaking,
     remarks_on_time,
+    unexplained_frames,
     usual_gap,
 )
 from vibrissa.tracking.space.curve import begun_together, merge
+from vibrissa.tracking.space.exchange import Known, exchanged
 from vibrissa.tracking.space.frame_pairs import paired_frames
 from vibrissa.tracking.space.pose import CUTOFF, BasePose, HeadPose, base_pose, rolled_over
 from vibrissa.tracking.space.rest_shape import (
@@ -65,6 +69,8 @@ _FLAT = 0.02
 _ANY_ROLL = np.radians(10.0)  # standard deviation of the roll if only bent shapes show it, rad
 # Smallest and largest number of frames in contact from which a length is taken.
 _FEWEST, _FRAMES = 8, 24
+# Misfit up to which there is no doubt about whose the traces of a row are, and in usual ones.
+_WELL, _WORSE = 1.0, 3.0
 _FAR = 10.0  # distance between bases in several views that are not the same base, pixels
 _SHARE = 0.03  # distance between bases that are not the same, as a share of the whisker's length
 
@@ -191,14 +197,22 @@ def track(
     if len(cameras) == 1:
         remarks.append(ONE_VIEW)
     count = counts.pop()
-    for k in range(count):
-        rows = [[view[k][i] for i in pairs[:, v]] for v, view in enumerate(traces)]
-        name = names[k] if names is not None else f"whisker {k}"
-        remarks += remarks_on_following(cameras, rows, name)
-        shown, rows = rows, begun_together(cameras, rows)
-        remarks += remarks_on_bases(cameras, shown, rows, name)
+    called = [f"whisker {k}" for k in range(count)] if names is None else list(names)
+    timed_rows = [[[row[i] for i in pairs[:, v]] for row in view] for v, view in enumerate(traces)]
+    rows = [list(row) for row in zip(*timed_rows, strict=True)]
+
+    def tracked(k: int, used: Sequence[Sequence[Trace]]) -> Tracked:
+        return track_whisker(cameras, used, rate, options, called[k], progress, moving, objects)
+
+    together, before, changes = _sorted_out(cameras, rows, tracked)
+    for k, name in enumerate(called):
+        remarks += remarks_on_following(cameras, rows[k], name)
+        remarks += remarks_on_bases(cameras, rows[k], begun_together(cameras, rows[k]), name)
         try:
-            one = track_whisker(cameras, rows, rate, options, name, progress, moving, objects)
+            one = before[k] if k in before else tracked(k, together[k])
+            if count > 1:
+                one, left_out = _without_contradictions(one)
+                remarks += remarks_on_row(changes[k][0], changes[k][1] + left_out, name)
             if contacts is not None:
                 other = given_contacts(contacts, cameras, pairs, rate, k, one.fit)
                 one = replace(one, contacts=other)
@@ -226,6 +240,57 @@ def track(
     if remarks:
         recording.attrs["remarks"] = "\n".join(remarks)
     return recording
+
+
+def _sorted_out(
+    cameras: Sequence[Camera],
+    rows: Sequence[Sequence[Sequence[Trace]]],
+    tracked: Callable[[int, Sequence[Sequence[Trace]]], Tracked],
+) -> tuple[list[list[list[Trace]]], dict[int, Tracked], dict[int, tuple[int, int]]]:
+    """Traces that begin together, those in doubt exchanged; whiskers that keep theirs; changes.
+
+    Of each whisker the numbers of frames in which traces were exchanged, and in which it is lost.
+    """
+    begun = [begun_together(cameras, row) for row in rows]
+    first, known = dict[int, Tracked](), list[Known | None]()
+    if len(rows) == 1 or len(cameras) == 1:
+        return begun, first, dict.fromkeys(range(len(rows)), (0, 0))
+    for k, row in enumerate(begun):
+        with suppress(Exception):  # it is tried again, and its fault stated then
+            first[k] = tracked(k, row)
+        one = first.get(k)
+        known.append(None if one is None else _known(one))
+    found, changes = exchanged(cameras, begun, known), dict[int, tuple[int, int]]()
+    for k, (row, new) in enumerate(zip(begun, found, strict=True)):
+        points = [np.array([[len(t.line) for t in view] for view in one]) for one in (row, new)]
+        same = np.array(
+            [[a is b for a, b in zip(*both, strict=True)] for both in zip(row, new, strict=True)]
+        )
+        shown, left = ((one > 0).all(axis=0) for one in points)
+        changes[k] = int((left & ~same.all(axis=0)).sum()), int((shown & ~left).sum())
+        if not same.all():
+            first.pop(k, None)
+    return found, first, changes
+
+
+def _known(one: Tracked) -> Known:
+    """What the frames that the rod explains as well as usual show of a whisker."""
+    misfit, wrong = one.fit.misfit, unexplained_frames(one.fit.misfit)
+    usual = np.nanmedian(misfit) if np.isfinite(misfit).any() else 0.0
+    doubtful = ~(misfit <= max(_WELL, _WORSE * usual)) | wrong
+    return Known(one.curves, one.shape.points, doubtful, wrong)
+
+
+def _without_contradictions(one: Tracked) -> tuple[Tracked, int]:
+    """A whisker of a row without frames that the rod does not explain, and how many they are."""
+    strange = unexplained_frames(one.fit.misfit)
+    if not strange.any():
+        return one, 0
+    values = {name: array.copy() for name, array in vars(one.fit).items()}
+    for array in values.values():
+        array[strange] = np.nan
+    fit = replace(one.fit, **values)
+    return replace(one, fit=fit, touching=one.touching & ~strange), int(strange.sum())
 
 
 def _corrected(

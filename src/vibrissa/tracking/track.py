@@ -71,6 +71,8 @@ _ANY_ROLL = np.radians(10.0)  # standard deviation of the roll if only bent shap
 _FEWEST, _FRAMES = 8, 24
 # Misfit up to which there is no doubt about whose the traces of a row are, and in usual ones.
 _WELL, _WORSE = 1.0, 3.0
+# Share of the frames of a whisker in a row that the rod explains, from which others contradict it.
+_EXPLAINED = 0.1
 _FAR = 10.0  # distance between bases in several views that are not the same base, pixels
 _SHARE = 0.03  # distance between bases that are not the same, as a share of the whisker's length
 
@@ -273,17 +275,24 @@ def _sorted_out(
     return found, first, changes
 
 
+def _contradicted(misfit: Array) -> Mask:
+    """Frames that the rod does not explain; none if it explains hardly any, and is itself wrong."""
+    strange = unexplained_frames(misfit)
+    most = (1.0 - _EXPLAINED) * np.isfinite(misfit).sum()
+    return np.asarray(strange & (strange.sum() < most))
+
+
 def _known(one: Tracked) -> Known:
     """What the frames that the rod explains as well as usual show of a whisker."""
-    misfit, wrong = one.fit.misfit, unexplained_frames(one.fit.misfit)
+    misfit, wrong = one.fit.misfit, _contradicted(one.fit.misfit)
     usual = np.nanmedian(misfit) if np.isfinite(misfit).any() else 0.0
     doubtful = ~(misfit <= max(_WELL, _WORSE * usual)) | wrong
     return Known(one.curves, one.shape.points, doubtful, wrong)
 
 
 def _without_contradictions(one: Tracked) -> tuple[Tracked, int]:
-    """A whisker of a row without frames that the rod does not explain, and how many they are."""
-    strange = unexplained_frames(one.fit.misfit)
+    """A whisker of a row without frames that contradict the others, and how many they are."""
+    strange = _contradicted(one.fit.misfit)
     if not strange.any():
         return one, 0
     values = {name: array.copy() for name, array in vars(one.fit).items()}

@@ -1,11 +1,13 @@
 """Who is who, from all frames together: lines are drawn, so that seeing them costs nothing."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 
 from vibrissa.tracking import Trace
 from vibrissa.tracking.trace.follower import FEATURES, Appearance, features_of
-from vibrissa.tracking.trace.identity import Seen, decided, sideways
+from vibrissa.tracking.trace.identity import LOST, Assignment, Seen, decided, sideways
 from vibrissa.tracking.trace.trace import overlap
 
 BASES = np.array([[20.0, 60.0], [20.0, 72.0]])
@@ -123,3 +125,24 @@ def test_the_usual_look_is_the_median_of_what_is_known():
     np.testing.assert_array_equal(usual.middle[1:], np.nanmedian(features[:, 1:], axis=0))
     assert np.isnan(usual.middle[0])
     assert np.isfinite(usual.spread).all()
+
+
+def test_the_cheapest_ways_are_those_of_all():
+    """Every way that is allowed, by hand: no line twice, none too dear, swapped bases cost."""
+    random = np.random.default_rng(3)
+    lines = [straight(random.uniform(0.0, 40.0, 2), 0.1 * k, 60.0) for k in range(5)]
+    problem = Assignment(lines, np.array([[20.0, 60.0], [20.0, 72.0], [20.0, 84.0]]))
+    price, lost = random.uniform(0.0, 15.0, (3, 5)), np.array([6.0, 6.0, 5.0])
+    every = {}
+    for way in product(range(-1, 5), repeat=3):
+        pairs = [(j, k) for k in range(3) for j in range(k) if way[j] >= 0 and way[k] >= 0]
+        if any(problem.clash[way[j], way[k]] for j, k in pairs):
+            continue
+        each = [lost[k] if c < 0 else price[k, c] for k, c in enumerate(way)]
+        if all(c < 0 or cost < 2.0 * LOST for c, cost in zip(way, each, strict=True)):
+            every[way] = sum(each) + sum(problem.swaps[k, j, way[k], way[j]] for j, k in pairs)
+    expected = sorted(every.values())
+    cost, ways = problem.ways(price, lost, limit=expected[20], most=12)
+    np.testing.assert_allclose(cost, expected[:12])
+    np.testing.assert_allclose([every[tuple(way)] for way in ways.tolist()], cost)
+    assert len(problem.ways(price, lost, limit=expected[4])[0]) == 4

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from vibrissa.cameras import Camera, orthogonal_views
 from vibrissa.tracking import Trace, low_pass, merge, paired_frames
 from vibrissa.tracking.space.curve import begun_together
+from vibrissa.tracking.space.exchange import Known, exchanged
 from vibrissa.tracking.space.pose import base_pose, rolled_over
 from vibrissa.tracking.space.rest_shape import RestShape, whisker_at_rest
 from vibrissa.tracking.trace.start import base_gap
@@ -224,3 +225,44 @@ def test_contact_that_makes_a_whisker_look_rolled_leaves_its_roll():
     np.testing.assert_allclose(
         (found.roll - found.roll[0])[bent], (roll - roll[0])[bent], atol=0.03
     )
+
+
+def test_far_ends_that_were_exchanged_in_one_view_are_put_right():
+    """Two whiskers cross in the front view: in frames 3 and 4 each goes on as the other there."""
+    cameras, frames, bases = PAIRS["orthogonal"], 6, ([0.0, -1e-3, -5e-4], [0.0, 1e-3, 2e-3])
+    shapes = [
+        [curve(azimuth + 0.02 * i, bend) + base for i in range(frames)]
+        for azimuth, bend, base in zip((0.1, -0.1), (12.0, -6.0), bases, strict=True)
+    ]
+    right = [[[traced(camera, p) for p in points] for camera in cameras] for points in shapes]
+    doubtful = np.isin(np.arange(frames), [3, 4, 5])
+    curves = [
+        np.array([merge(cameras, both).points for both in zip(*r, strict=True)]) for r in right
+    ]
+    known = [Known(points, points[0], doubtful, doubtful) for points in curves]
+    swapped = [[list(view) for view in row] for row in right]
+    for i in (3, 4):
+        (a, one), (b, other) = cut_at_crossing(right[0][1][i], right[1][1][i])
+        swapped[0][1][i] = joined(one, a, other, b)
+        swapped[1][1][i] = joined(other, b, one, a)
+    # In frame 5 whisker 0 is on something that is no whisker of this row.
+    swapped[0][1][5] = traced(cameras[1], curve(0.2, -25.0) + bases[0])
+    found = exchanged(cameras, swapped, known)
+    for k, row in enumerate(found):
+        for i in range(5):
+            away = cKDTree(right[k][1][i].line).query(row[1][i].line)[0]
+            assert away.max() < 2.0
+            np.testing.assert_array_equal(row[0][i].line, right[k][0][i].line)
+    assert [len(found[0][v][5].line) for v in range(2)] == [0, 0]
+    np.testing.assert_array_equal(found[1][1][5].line, right[1][1][5].line)
+
+
+def cut_at_crossing(one, other):
+    away = np.linalg.norm(one.line[:, None] - other.line[None], axis=2)
+    a, b = np.unravel_index(np.argmin(away), away.shape)
+    return (a, one), (b, other)
+
+
+def joined(one, a, other, b):
+    line = np.concatenate([one.line[:a], other.line[b:]])
+    return Trace(line, np.full(len(line), 0.03), np.ones(len(line), dtype=bool), 1.0)

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import xarray as xr
 from scipy.spatial.transform import Rotation
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from vibrissa import PointContact, Whisker, deflect
+from vibrissa.numerics import without_blas_threads
 from vibrissa.recording import Recording
 from vibrissa.status import Status
 from vibrissa.tracking import (
@@ -15,6 +17,7 @@ from vibrissa.tracking import (
     TrackOptions,
     base_pose,
     rest_shape,
+    trace_video,
     track,
     whisker_at_rest,
 )
@@ -506,3 +509,17 @@ def test_the_rest_shape_of_a_whisker_whose_tip_is_mostly_hidden():
     shape = rest_shape(curves, 0.9, lengths > 15e-3)
     assert shape.length == pytest.approx(20e-3, rel=0.05)
     assert shape.free.all()
+
+
+def test_linear_algebra_does_not_wait_for_threads_of_its_own():
+    """Where other work keeps cores busy, that took most of the time of following and fitting."""
+
+    @without_blas_threads
+    def used():
+        return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+    with threadpool_limits(2, user_api="blas"):
+        assert used() == {1}
+        assert used.__wrapped__() == {2}
+    assert trace_video.__wrapped__
+    assert track.__wrapped__

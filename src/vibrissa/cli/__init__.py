@@ -3,6 +3,12 @@
 Options and printed values are in mm, µN, µN·m and degrees; files are in SI units.
 """
 
+import os
+
+# Set before NumPy is loaded: for small matrices, threads of linear algebra mostly wait, and take
+# cores from the threads over which rows are distributed.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 from vibrissa.cli.app import main
 
 __all__ = [

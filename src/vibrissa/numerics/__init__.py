@@ -26,6 +26,7 @@ from vibrissa.numerics.arrays import (
     spherical as spherical,
     threads as threads,
     weighted_quantile,
+    without_blas_threads as without_blas_threads,
 )
 
 if TYPE_CHECKING:

@@ -10,14 +10,16 @@ import os
 import reprlib
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
-from typing import Any, TypeAlias, cast
+from functools import cache, wraps
+from typing import Any, ParamSpec, TypeAlias, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.deferred import xr
 
+P = ParamSpec("P")
+R = TypeVar("R")
 Array: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.int64]
 Mask: TypeAlias = NDArray[np.bool_]
@@ -197,6 +199,23 @@ def weighted_quantile(values: AnyArray, weight: Array, shares: float | AnyArray 
     sorted_values, w = values[kept][order], weight[kept][order]
     middle = (np.cumsum(w) - 0.5 * w) / w.sum()
     return np.asarray(np.interp(shares, middle, sorted_values))
+
+
+def without_blas_threads(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorator: run linear algebra in the thread that calls a function.
+
+    For small matrices, threads of BLAS mostly wait for each other; if other work keeps the cores
+    busy, that takes up to a hundred times as long as the product itself.
+    """
+
+    @wraps(function)
+    def alone(*args: P.args, **kwargs: P.kwargs) -> R:
+        from threadpoolctl import threadpool_limits  # comes with scikit-learn
+
+        with threadpool_limits(1, user_api="blas"):
+            return function(*args, **kwargs)
+
+    return alone
 
 
 # Number of rows below which starting a thread costs more than it saves.

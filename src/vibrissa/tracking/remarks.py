@@ -123,6 +123,23 @@ def remarks_on(
     return found
 
 
+def remarks_on_row(exchanges: int, left_out: int, name: str) -> list[str]:
+    """Frames in which a whisker of a row had another one's traces."""
+    found = []
+    if exchanges:
+        found.append(
+            f"{name}: in {exchanges} frames its trace was exchanged with a neighbour's, as its "
+            "shape and base in both views then are those of the other frames."
+        )
+    if left_out:
+        found.append(
+            f"{name}: in {left_out} frames the bent rod does not explain the traces (a misfit "
+            f"above {_STRANGE:g}), as where one of them is a neighbour's: they are left out "
+            "(confidence 0, status MISSING). Compare traces and video (vibrissa correct)."
+        )
+    return found
+
+
 def remarks_on_following(
     cameras: Sequence[Camera], rows: Sequence[Sequence[Trace]], name: str
 ) -> list[str]:

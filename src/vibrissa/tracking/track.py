@@ -6,6 +6,7 @@ Remarks state what to know before the results are believed (`vibrissa.tracking.r
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from vibrissa.cameras import Camera
 from vibrissa.deferred import transform
-from vibrissa.numerics import Array, Mask
+from vibrissa.numerics import Array, Mask, without_blas_threads
 from vibrissa.objects import Surface
 from vibrissa.recording import ONE_VIEW
 from vibrissa.tracking.recording import (
@@ -36,11 +37,14 @@ from vibrissa.tracking.remarks import (
     remarks_on_fur,
     remarks_on_optics,
     remarks_on_plane,
+    remarks_on_row,
     remarks_on_shaking,
     remarks_on_time,
+    unexplained_frames,
     usual_gap,
 )
 from vibrissa.tracking.space.curve import begun_together, merge
+from vibrissa.tracking.space.exchange import Known, exchanged
 from vibrissa.tracking.space.frame_pairs import paired_frames
 from vibrissa.tracking.space.pose import CUTOFF, BasePose, HeadPose, base_pose, rolled_over
 from vibrissa.tracking.space.rest_shape import (
@@ -67,6 +71,10 @@ _FLAT = 0.02
 _ANY_ROLL = np.radians(10.0)
 # Smallest and largest number of frames in contact from which a length is estimated.
 _FEWEST, _FRAMES = 8, 24
+# Misfit, absolute and relative to the usual one, below which the traces of a row are its whiskers'.
+_WELL, _WORSE = 1.0, 3.0
+# Share of the frames of a whisker in a row that the rod must explain before others are left out.
+_EXPLAINED = 0.1
 _FAR = 10.0  # distance between the bases of several views above which they differ, pixels
 _SHARE = 0.03  # the same as a share of the whisker's length
 
@@ -116,6 +124,7 @@ class TrackOptions:
         return {**self.properties, "hidden": self.fur}
 
 
+@without_blas_threads
 def track(
     cameras: Sequence[Camera],
     traces: Sequence[Sequence[Sequence[Trace]]],
@@ -192,14 +201,22 @@ def track(
     if len(cameras) == 1:
         remarks.append(ONE_VIEW)
     count = counts.pop()
-    for k in range(count):
-        rows = [[view[k][i] for i in pairs[:, v]] for v, view in enumerate(traces)]
-        name = names[k] if names is not None else f"whisker {k}"
-        remarks += remarks_on_following(cameras, rows, name)
-        shown, rows = rows, begun_together(cameras, rows)
-        remarks += remarks_on_bases(cameras, shown, rows, name)
+    called = [f"whisker {k}" for k in range(count)] if names is None else list(names)
+    timed_rows = [[[row[i] for i in pairs[:, v]] for row in view] for v, view in enumerate(traces)]
+    rows = [list(row) for row in zip(*timed_rows, strict=True)]
+
+    def tracked(k: int, used: Sequence[Sequence[Trace]]) -> Tracked:
+        return track_whisker(cameras, used, rate, options, called[k], progress, moving, objects)
+
+    together, before, changes = _sorted_out(cameras, rows, tracked)
+    for k, name in enumerate(called):
+        remarks += remarks_on_following(cameras, rows[k], name)
+        remarks += remarks_on_bases(cameras, rows[k], begun_together(cameras, rows[k]), name)
         try:
-            one = track_whisker(cameras, rows, rate, options, name, progress, moving, objects)
+            one = before[k] if k in before else tracked(k, together[k])
+            if count > 1:
+                one, left_out = _without_contradictions(one)
+                remarks += remarks_on_row(changes[k][0], changes[k][1] + left_out, name)
             if contacts is not None:
                 other = given_contacts(contacts, cameras, pairs, rate, k, one.fit)
                 one = replace(one, contacts=other)
@@ -227,6 +244,64 @@ def track(
     if remarks:
         recording.attrs["remarks"] = "\n".join(remarks)
     return recording
+
+
+def _sorted_out(
+    cameras: Sequence[Camera],
+    rows: Sequence[Sequence[Sequence[Trace]]],
+    tracked: Callable[[int, Sequence[Sequence[Trace]]], Tracked],
+) -> tuple[list[list[list[Trace]]], dict[int, Tracked], dict[int, tuple[int, int]]]:
+    """Traces that begin together, exchanged where in doubt; whiskers that keep theirs; changes.
+
+    Changes are, for each whisker, the numbers of frames with exchanged traces and without any.
+    """
+    begun = [begun_together(cameras, row) for row in rows]
+    first, known = dict[int, Tracked](), list[Known | None]()
+    if len(rows) == 1 or len(cameras) == 1:
+        return begun, first, dict.fromkeys(range(len(rows)), (0, 0))
+    for k, row in enumerate(begun):
+        with suppress(Exception):  # it is tried again, and its fault stated then
+            first[k] = tracked(k, row)
+        one = first.get(k)
+        known.append(None if one is None else _known(one))
+    found, changes = exchanged(cameras, begun, known), dict[int, tuple[int, int]]()
+    for k, (row, new) in enumerate(zip(begun, found, strict=True)):
+        points = [np.array([[len(t.line) for t in view] for view in one]) for one in (row, new)]
+        same = np.array(
+            [[a is b for a, b in zip(*both, strict=True)] for both in zip(row, new, strict=True)]
+        )
+        shown, left = ((one > 0).all(axis=0) for one in points)
+        changes[k] = int((left & ~same.all(axis=0)).sum()), int((shown & ~left).sum())
+        if not same.all():
+            first.pop(k, None)
+    return found, first, changes
+
+
+def _contradicted(misfit: Array) -> Mask:
+    """Frames that the rod does not explain; none if it explains hardly any, and is itself wrong."""
+    strange = unexplained_frames(misfit)
+    most = (1.0 - _EXPLAINED) * np.isfinite(misfit).sum()
+    return np.asarray(strange & (strange.sum() < most))
+
+
+def _known(one: Tracked) -> Known:
+    """Shape and position of a whisker by the frames that the rod explains as well as usual."""
+    misfit, wrong = one.fit.misfit, _contradicted(one.fit.misfit)
+    usual = np.nanmedian(misfit) if np.isfinite(misfit).any() else 0.0
+    doubtful = ~(misfit <= max(_WELL, _WORSE * usual)) | wrong
+    return Known(one.curves, one.shape.points, doubtful, wrong)
+
+
+def _without_contradictions(one: Tracked) -> tuple[Tracked, int]:
+    """Whisker of a row without the frames that the rod does not explain, and their number."""
+    strange = _contradicted(one.fit.misfit)
+    if not strange.any():
+        return one, 0
+    values = {name: array.copy() for name, array in vars(one.fit).items()}
+    for array in values.values():
+        array[strange] = np.nan
+    fit = replace(one.fit, **values)
+    return replace(one, fit=fit, touching=one.touching & ~strange), int(strange.sum())
 
 
 def _corrected(

@@ -23,7 +23,7 @@ from vibrissa.io import Frame
 from vibrissa.numerics import Mask, inlined, kernel
 from vibrissa.tracking.trace.ends import traced
 from vibrissa.tracking.trace.ridge import noise_level
-from vibrissa.tracking.trace.scene import Bodies, Image, Scene
+from vibrissa.tracking.trace.scene import Bodies, Image, Scene, blurred
 from vibrissa.tracking.trace.trace import (
     Trace,
     TraceOptions,
@@ -61,10 +61,7 @@ def smoothed(
 ) -> tuple[Image, NDArray[np.float64]]:
     """Smoothed difference image; strength per second derivative on open ground and on bodies."""
     sigma = SIGMA * scale
-    reach = math.ceil(3.0 * sigma)
-    taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
-    smooth = np.empty_like(difference)
-    blur(difference, (taps / taps.sum()).astype(np.float32), np.empty_like(difference), smooth)
+    smooth = blurred(difference, sigma)
     factors = np.zeros(2)
     for kind in range(2):
         values = np.empty(difference.size // 16 + 1)
@@ -89,31 +86,6 @@ def segments(difference: Image, bodies: Bodies, scale: float = 1.0) -> list[Segm
         Segment(points[chosen, :2], points[chosen, 3])
         for chosen in (member[first[i] : first[i + 1]] for i in range(number))
     ]
-
-
-@kernel
-def blur(image: Any, taps: Any, work: Any, out: Any) -> None:
-    """Convolve an image with a symmetric kernel along rows and columns."""
-    rows, columns = image.shape
-    reach = taps.shape[0] // 2
-    for row in range(rows):
-        for column in range(columns):
-            work[row, column] = 0.0
-        for k in range(taps.shape[0]):
-            at = min(max(row + k - reach, 0), rows - 1)
-            tap = taps[k]
-            for column in range(columns):
-                work[row, column] += tap * image[at, column]
-    padded = np.empty(columns + 2 * reach, taps.dtype)
-    for row in range(rows):
-        for column in range(columns + 2 * reach):
-            padded[column] = work[row, min(max(column - reach, 0), columns - 1)]
-        for column in range(columns):
-            out[row, column] = 0.0
-        for k in range(taps.shape[0]):
-            tap = taps[k]
-            for column in range(columns):
-                out[row, column] += tap * padded[column + k]
 
 
 @kernel

@@ -13,15 +13,16 @@ parts that are not visible are NaN.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.io import Frame
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, kernel
 from vibrissa.tracking.trace.clutter import NOTHING, Clutter
 from vibrissa.tracking.trace.ends import OUTSIDE, grey_flanks, traced
 from vibrissa.tracking.trace.ridge import FEWEST, march, measure, middle, noise_level, smooth
@@ -82,15 +83,16 @@ class Appearance(NamedTuple):
         spread = 1.4826 * _medians(np.abs(known - usual))
         return cls(usual, np.hypot(_SPREAD, np.nan_to_num(spread)))
 
-    def unlikeness(self, features: Array) -> float:
-        """Negative log-likelihood that a line of these features is this whisker."""
+    def unlikeness(self, features: Array) -> Array:
+        """Negative log-likelihood (...) that lines of some features (..., n) are this whisker."""
         away = (features - self.middle) / self.spread
-        if away[0] < 0.0:
-            away[0] /= _SHORTER
-        if np.isfinite(features[0]):
-            away[np.isnan(features) & np.isfinite(self.middle)] = _HIDDEN
+        length = away[..., 0]
+        length[length < 0.0] /= _SHORTER
+        missing = np.isnan(features) & np.isfinite(self.middle)
+        away[missing & np.isfinite(features[..., :1])] = _HIDDEN
         away[np.isinf(features)] = 0.0
-        return float(0.5 * _WEIGHT * np.minimum(np.nan_to_num(away) ** 2, _MOST**2).sum())
+        square = np.nan_to_num(away) ** 2
+        return np.asarray(0.5 * _WEIGHT * np.minimum(square, _MOST**2).sum(axis=-1))
 
 
 def _medians(values: Array) -> Array:
@@ -400,7 +402,20 @@ def _alike(line: Array, other: Array) -> bool:
 
 def _distances(line: Array, other: Array) -> Array:
     """Distance of each point of a line from the nearest one of another, pixels."""
-    return np.asarray(np.linalg.norm(line[:, None] - other[None], axis=2).min(axis=1))
+    away = np.empty(len(line))
+    nearest_distances(line, other, away)
+    return away
+
+
+@kernel
+def nearest_distances(line: Any, other: Any, away: Any) -> None:
+    """Distance of each point of a line from the nearest one of another."""
+    for i in range(line.shape[0]):
+        least = np.inf
+        for k in range(other.shape[0]):
+            dx, dy = other[k, 0] - line[i, 0], other[k, 1] - line[i, 1]
+            least = min(least, dx * dx + dy * dy)
+        away[i] = math.sqrt(least)
 
 
 def start_at(base: ArrayLike, options: TraceOptions | None = None) -> Follower:

@@ -4,7 +4,7 @@ An *assignment* gives lines to whiskers, each line to at most one; a whisker wit
 Its cost is the unlikeness of the whiskers to their usual appearance, plus a cost for bases that
 have changed their order on the face. Costs are negative log-likelihoods. Because of lines that
 overlap and bases that swap, the sum does not separate over whiskers, so that no linear assignment
-gives the minimum; a best-first search does.
+gives the minimum; a branch-and-bound search does.
 
 From frame to frame lines are proposed (`vibrissa.tracking.trace.row`). When all frames are known,
 motions other than the row's have a cost too, and the cheapest sequence of assignments is found
@@ -14,22 +14,22 @@ guessed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from heapq import heappop, heappush
-from itertools import islice, pairwise, takewhile
-from typing import NamedTuple
+from itertools import pairwise, takewhile
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.numerics import Array, Mask
+from vibrissa.numerics import Array, Mask, kernel
 from vibrissa.tracking.trace.follower import ENOUGH, FEATURES, Appearance
+from vibrissa.tracking.trace.ridge import normal
 from vibrissa.tracking.trace.trace import STEP, Trace, overlap
 
 # Index of each whisker's line; −1 if it is lost.
 Ways = NDArray[np.intp]
-Way = tuple[int, ...]
 # Points at the beginning of a line by which it is distinguished from others.
 POINTS = np.arange(0, 31, 5)
 SAME = 0.5  # share of a line along another one from which both are one whisker
@@ -74,7 +74,7 @@ class Assignment:
         size = np.maximum(np.linalg.norm(between, axis=2), 1e-9)[..., None, None]
         along = np.einsum("kjx,cdx->kjcd", between, begin[:, None] - begin[None]) / size
         # Degree to which two bases have swapped, 0 to 1.
-        self._swaps = (_SWAPPED * np.clip(-along / _APART, 0.0, 1.0)).tolist()
+        self.swaps = _SWAPPED * np.clip(-along / _APART, 0.0, 1.0)
 
     def ways(
         self,
@@ -82,44 +82,81 @@ class Assignment:
         lost: Array,
         limit: float = np.inf,
         settled: frozenset[int] = frozenset(),
-    ) -> Iterator[tuple[float, Way]]:
-        """Costs below a limit and their assignments, the cheapest first.
+        most: int = _KEPT,
+    ) -> tuple[Array, Ways]:
+        """Costs below a limit and their assignments, at most so many, the cheapest first.
 
         A line (column of ``price``) that costs twice as much as a loss is never assigned. Settled
         whiskers may have overlapping lines.
         """
-        order = sorted(range(len(price)), key=lambda k: k not in settled)
-        clash = self.clash.tolist()
-        options = [
-            sorted(
-                [(float(lost[k]), -1)]
-                + [(float(price[k, c]), int(c)) for c in np.flatnonzero(price[k] < 2.0 * LOST)]
-            )
-            for k in order
-        ]
-        # The smallest cost of each whisker and all later ones.
-        rest = np.cumsum([0.0, *(each[0][0] for each in options[::-1])])[::-1].tolist()
-        heap: list[tuple[float, int, float, Way]] = [(rest[0], 0, 0.0, ())]
-        while heap:
-            _, depth, spent, way = heappop(heap)
-            at = -depth
-            if at == len(order):
-                yield spent, tuple(c for _, c in sorted(zip(order, way, strict=True)))
-                continue
-            k = order[at]
-            lines = [(j, d) for j, d in zip(order, way, strict=False) if d >= 0]
-            for cost, c in options[at]:
-                total = spent + cost
-                if not total + rest[at + 1] < limit:
-                    break
-                if c >= 0:
-                    taken = clash[c]
-                    if k not in settled and any(taken[d] for _, d in lines):
-                        continue
-                    total += sum(self._swaps[k][j][c][d] for j, d in lines)
-                bound = total + rest[at + 1]
-                if bound < limit:
-                    heappush(heap, (bound, depth - 1, total, (*way, c)))
+        order = np.array(sorted(range(len(price)), key=lambda k: k not in settled), dtype=np.intp)
+        options = np.concatenate([lost[:, None], np.where(price < 2.0 * LOST, price, np.inf)], 1)
+        ranked = np.argsort(options, axis=1, kind="stable") - 1
+        free = np.array([k not in settled for k in range(len(price))], dtype=np.bool_)
+        cost, way = np.full(most, np.inf), np.empty((most, len(price)), dtype=np.intp)
+        count = cheapest_ways(
+            options, ranked, order, free, self.clash, self.swaps, limit, cost, way
+        )
+        return cost[:count], way[:count]
+
+
+@kernel
+def cheapest_ways(
+    options: Any,
+    ranked: Any,
+    order: Any,
+    free: Any,
+    clash: Any,
+    swaps: Any,
+    limit: float,
+    cost: Any,
+    way: Any,
+) -> int:
+    """Cheapest assignments by depth-first branch and bound; the bound is the last one kept.
+
+    Options (whisker, 1 + line) are costs of being lost and of lines, ``ranked`` the lines in their
+    order, −1 for being lost.
+    """
+    n, most, count = len(order), len(cost), 0
+    # The smallest cost of each whisker and all later ones.
+    rest = np.zeros(n + 1)
+    for depth in range(n - 1, -1, -1):
+        k = order[depth]
+        rest[depth] = rest[depth + 1] + options[k, ranked[k, 0] + 1]
+    spent, at, given = np.zeros(n + 1), np.zeros(n + 1, np.intp), np.full(n, -1, np.intp)
+    depth = 0
+    while depth >= 0:
+        bound = limit if count < most else min(limit, cost[most - 1])
+        if depth == n:
+            if spent[n] < bound:
+                i = min(count, most - 1)
+                while i > 0 and cost[i - 1] > spent[n]:
+                    cost[i], way[i] = cost[i - 1], way[i - 1]
+                    i -= 1
+                cost[i], way[i] = spent[n], given
+                count = min(count + 1, most)
+            depth -= 1
+            continue
+        k = order[depth]
+        c = ranked[k, at[depth]] if at[depth] < ranked.shape[1] else -2
+        if c == -2 or not spent[depth] + options[k, c + 1] + rest[depth + 1] < bound:
+            at[depth] = 0
+            depth -= 1
+            continue
+        at[depth] += 1
+        total = spent[depth] + options[k, c + 1]
+        if c >= 0:
+            for j in order[:depth]:
+                d = given[j]
+                if d >= 0:
+                    total += swaps[k, j, c, d]
+                    if free[k] and clash[c, d]:
+                        total = np.inf
+        if total + rest[depth + 1] < bound:
+            given[k] = c
+            depth += 1
+            spent[depth] = total
+    return count
 
 
 def clashes(lines: Sequence[Array]) -> Mask:
@@ -169,9 +206,8 @@ def decided(frames: Sequence[Seen], bases: Array) -> list[list[int]]:
 
 def _step(seen: Seen, problem: Assignment, known: Sequence[Appearance], settled: set[int]) -> _Step:
     """The cheapest assignments of one frame."""
-    price = np.array(
-        [[each.unlikeness(features) for features in seen.features] for each in known]
-    ).reshape(len(known), -1)
+    features = np.array(seen.features).reshape(-1, FEATURES)
+    price = np.array([each.unlikeness(features) for each in known])
     lost = np.full(len(known), LOST)
     price[:, [seen.chosen[k] for k in settled if seen.chosen[k] >= 0]] = np.inf
     for k in settled:
@@ -179,10 +215,9 @@ def _step(seen: Seen, problem: Assignment, known: Sequence[Appearance], settled:
         lost[k], price[k] = (np.inf if c >= 0 else 0.0), np.inf
         if c >= 0:
             price[k, c] = 0.0
-    ways = list(islice(problem.ways(price, lost, settled=frozenset(settled)), _KEPT))
-    ways = [each for each in ways if each[0] <= ways[0][0] + _DEARER]
-    cost, lines = zip(*ways, strict=True)
-    return _Step(np.array(lines, dtype=np.intp), np.array(cost))
+    cost, ways = problem.ways(price, lost, settled=frozenset(settled))
+    near = cost <= cost[0] + _DEARER
+    return _Step(ways[near], cost[near])
 
 
 def _cheapest(
@@ -214,12 +249,8 @@ def _certain(seen: Seen, fixed: set[int], ways: Ways, total: Array) -> list[int]
     way = []
     for k, c in enumerate(best):
         if c >= 0 and k not in fixed:
-            differs = [
-                d != c and (d < 0 or not same_whisker(seen.lines[d], seen.lines[c]))
-                for d in range(-1, len(seen.lines))
-            ]
-            others = total[np.array(differs, dtype=np.bool_)[ways[:, k] + 1]]
-            if len(others) and others.min() < total.min() + _DOUBT:
+            near = ways[total < total.min() + _DOUBT, k]
+            if any(d < 0 or not same_whisker(seen.lines[d], seen.lines[c]) for d in {*near} - {c}):
                 c = -1
         way.append(int(c))
     return way
@@ -243,15 +274,44 @@ def _motions(lines: Sequence[Trace], others: Sequence[Trace]) -> Array:
 
 
 def _moves(motion: Array, one: Ways, other: Ways) -> Array:
-    """Cost of the transition from each assignment of a frame to each of the next, (way, way)."""
-    moved = motion[one[:, None] + 1, other[None] + 1]
-    missing: Mask = np.all(np.isnan(moved[..., 0]), axis=2)
-    # The row moves as the median whisker does, and not at all if none is seen.
-    row = np.nanmedian(np.where(missing[:, :, None, None], 0.0, moved), axis=2)
-    away = np.minimum(np.nan_to_num(moved - row[:, :, None]) ** 2, _MOVED**2)
-    gone = ((one[:, None] < 0) != (other[None] < 0)).sum(axis=2)
-    whole = np.minimum((row / _ROW) ** 2, _MOVED**2)
-    return np.asarray(0.5 * (away.sum(axis=(2, 3)) + whole.sum(axis=2)) + _GONE * gone)
+    """Cost of going from each way of a frame to each of the next, (way, way)."""
+    cost = np.empty((len(one), len(other)))
+    costs_of_moves(motion, one, other, cost)
+    return cost
+
+
+@kernel
+def costs_of_moves(motion: Any, one: Any, other: Any, cost: Any) -> None:
+    """Cost of the row's motion, and of whiskers that move otherwise, get lost or are found.
+
+    The row moves as the median whisker does, and not at all if none is seen.
+    """
+    steps = np.empty(one.shape[1])
+    for i in range(len(one)):
+        for j in range(len(other)):
+            total = 0.0
+            for axis in range(motion.shape[2]):
+                count = 0
+                for k in range(one.shape[1]):
+                    step = motion[one[i, k] + 1, other[j, k] + 1, axis]
+                    if math.isnan(step):
+                        continue
+                    at = count
+                    while at > 0 and steps[at - 1] > step:
+                        steps[at] = steps[at - 1]
+                        at -= 1
+                    steps[at] = step
+                    count += 1
+                if count == 0:
+                    continue
+                row = 0.5 * (steps[(count - 1) // 2] + steps[count // 2])
+                total += 0.5 * min((row / _ROW) ** 2, _MOVED**2)
+                for k in range(count):
+                    total += 0.5 * min((steps[k] - row) ** 2, _MOVED**2)
+            for k in range(one.shape[1]):
+                if (one[i, k] < 0) != (other[j, k] < 0):
+                    total += _GONE
+            cost[i, j] = total
 
 
 def motion_between(line: Array, other: Array) -> Array:
@@ -262,9 +322,16 @@ def motion_between(line: Array, other: Array) -> Array:
 
 def sideways(expected: Array, line: Array) -> Array:
     """Distance of a line to the left (−dy, dx) of an expected one, at its first points, pixels."""
-    points = np.minimum(POINTS, min(len(expected), len(line)) - 1)
-    tangent = np.gradient(expected[: POINTS[-1] + 2], axis=0)
-    size = np.linalg.norm(tangent[points], axis=1, keepdims=True)
-    tangent = tangent[points] / np.maximum(size, 1e-9)
-    away = line[points] - expected[points]
-    return np.asarray(away[:, 1] * tangent[:, 0] - away[:, 0] * tangent[:, 1])
+    away = np.empty(len(POINTS))
+    distances_across(np.asarray(expected), np.asarray(line), POINTS, away)
+    return away
+
+
+@kernel
+def distances_across(expected: Any, line: Any, points: Any, away: Any) -> None:
+    """Distances of points of a line to the left of points of another one with equal index."""
+    last = min(expected.shape[0], line.shape[0]) - 1
+    for i in range(len(points)):
+        k = min(points[i], last)
+        nx, ny = normal(expected, k)
+        away[i] = (line[k, 0] - expected[k, 0]) * nx + (line[k, 1] - expected[k, 1]) * ny

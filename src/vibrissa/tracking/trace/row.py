@@ -25,14 +25,13 @@ from vibrissa.numerics import Array, Mask
 from vibrissa.tracking.trace.clutter import NEAR, between_whiskers
 from vibrissa.tracking.trace.curves import Curve, find_curves
 from vibrissa.tracking.trace.ends import prolonged, traced
-from vibrissa.tracking.trace.follower import Follower, features_of
+from vibrissa.tracking.trace.follower import FEATURES, Follower, features_of
 from vibrissa.tracking.trace.identity import (
     LOST,
     POINTS,
     SAME,
     Assignment,
     Seen,
-    Way,
     clashes,
     motion_between,
     same_whisker,
@@ -43,6 +42,7 @@ from vibrissa.tracking.trace.scene import Scene
 from vibrissa.tracking.trace.trace import STEP, Trace, aligned, arc_lengths, even, given, overlap
 
 _DOUBT = 0.6  # least difference to a way that gives a whisker another line
+_WAYS = 256  # largest number of ways to give lines to whiskers that are compared
 _ROUNDS = 3  # number of rounds in which whiskers are kept apart where they cross
 _SHORT = 3.0  # cost of a line that is hardly seen
 # Turn, rad, and shift, pixels, of the whole row in a frame that cost as much as a lost whisker.
@@ -490,26 +490,23 @@ def _distance_to_next(followers: Sequence[Follower]) -> Array:
 
 def _assigned(
     followers: Sequence[Follower], pool: Sequence[Trace], features: Sequence[Array], apart: Array
-) -> Way:
+) -> list[int]:
     """Cheapest assignment over all motions of the row, without whiskers in doubt."""
     costs = _Costs.of(followers, pool, features, 0.5 * apart)
     problem = Assignment(pool, np.array([follower.base for follower in followers]).reshape(-1, 2))
     lost = np.full(len(followers), LOST)
     least, best = np.inf, (0.0, 0.0, 0.0)
     for motion in costs.motions():
-        cheapest = next(problem.ways(costs.after(*motion[1:]), lost, least - motion[0]), None)
-        if cheapest is not None:
-            least, best = cheapest[0] + motion[0], motion
-    ways = problem.ways(costs.after(*best[1:]), lost, least - best[0] + _DOUBT)
-    _, chosen = next(ways)
-    others = [way for _, way in ways]
+        cost, _ = problem.ways(costs.after(*motion[1:]), lost, least - motion[0], most=1)
+        if len(cost):
+            least, best = cost[0] + motion[0], motion
+    _, ways = problem.ways(costs.after(*best[1:]), lost, least - best[0] + _DOUBT, most=_WAYS)
+    chosen, *others = ways.tolist()
 
     def differs(c: int, d: int) -> bool:
         return c != d and (min(c, d) < 0 or not same_whisker(pool[c], pool[d]))
 
-    return tuple(
-        -1 if any(differs(c, way[k]) for way in others) else c for k, c in enumerate(chosen)
-    )
+    return [-1 if any(differs(c, way[k]) for way in others) else c for k, c in enumerate(chosen)]
 
 
 class _Costs(NamedTuple):
@@ -532,8 +529,9 @@ class _Costs(NamedTuple):
         shape = len(followers), len(pool)
         price, offsets = np.full(shape, np.inf), np.zeros((*shape, len(POINTS)))
         longest = max((trace.support for trace in pool), default=1.0)
+        looks = np.array(features).reshape(-1, FEATURES)
         for k, follower in enumerate(followers):
-            expected = follower.expected
+            expected, unlike = follower.expected, follower.appearance.unlikeness(looks)
             for c, trace in enumerate(pool):
                 if not follower.long_enough(trace):
                     continue
@@ -545,8 +543,7 @@ class _Costs(NamedTuple):
                 else:
                     continue
                 share = min(1.0, trace.support / (follower.usual or longest))
-                unlike = follower.appearance.unlikeness(features[c])
-                price[k, c] = _SHORT * (1.0 - share) + unlike + far
+                price[k, c] = _SHORT * (1.0 - share) + unlike[c] + far
         reach = np.array([[follower.reach] for follower in followers])
         seen = np.array([follower.expected is not None for follower in followers], dtype=bool)
         return cls(price, offsets, reach, half[:, None], seen)

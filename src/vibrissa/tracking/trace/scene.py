@@ -7,6 +7,7 @@ moving whiskers leave no trace; the difference from it does not show wires, glin
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -129,7 +130,7 @@ class Scene:
             nth_largest(np.stack(frames), gains, rank, background)
             background -= np.median(background[::_SPARSE, ::_SPARSE] - usual)
         still = _closed(_halved(frames[0] if background is None else background), thin + 2)
-        light = _doubled(_smoothed(still, _SOFT), frames[0].shape)
+        light = _doubled(blurred(still, _SOFT), frames[0].shape)
         ground, share = _ground(still)
         usual = np.asarray(usual, dtype=np.float32)
         return cls(light, share * ground, background, usual, thin, ground, len(frames), mask)
@@ -140,7 +141,7 @@ class Scene:
 
     def bodies(self, frame: Frame) -> Bodies:
         """Find dark regions that are not thin in a frame."""
-        dark = _smoothed(_closed(_halved(frame), self.thin), _EDGE) < self.level * self.gain(frame)
+        dark = blurred(_closed(_halved(frame), self.thin), _EDGE) < self.level * self.gain(frame)
         labels, count = ndimage.label(dark)
         area = np.bincount(labels.ravel(), minlength=count + 1)
         area[0] = 0
@@ -342,13 +343,70 @@ def _doubled(image: Image, shape: tuple[int, ...]) -> Image:
 
 
 def _closed(image: Image, width: int) -> Image:
-    """Grey closing with a square: dark structures thinner than it vanish."""
-    return np.asarray(ndimage.grey_closing(image, (width, width), mode="nearest"))
+    """Grey closing with a square of odd width: dark structures thinner than it vanish."""
+    work, out = np.empty_like(image), np.empty_like(image)
+    close(image, width // 2, work, out)
+    return out
 
 
-def _smoothed(image: Image, sigma: float) -> Image:
+@kernel
+def close(image: Any, reach: int, work: Any, out: Any) -> None:
+    """Grey closing with a square: the largest of all around, and the smallest of these."""
+    rows, columns = image.shape
+    source = image
+    for sign in (np.float32(1.0), np.float32(-1.0)):
+        for row in range(rows):
+            first, last = max(row - reach, 0), min(row + reach, rows - 1)
+            for column in range(columns):
+                work[row, column] = sign * source[first, column]
+            for i in range(first + 1, last + 1):
+                for column in range(columns):
+                    work[row, column] = max(work[row, column], sign * source[i, column])
+        for row in range(rows):
+            for column in range(columns):
+                out[row, column] = sign * work[row, column]
+            for k in range(1, reach + 1):
+                for column in range(columns - k):
+                    a, b = out[row, column], sign * work[row, column + k]
+                    out[row, column] = sign * max(sign * a, sign * b)
+                for column in range(k, columns):
+                    a, b = out[row, column], sign * work[row, column - k]
+                    out[row, column] = sign * max(sign * a, sign * b)
+        source = out.copy()
+
+
+def blurred(image: Image, sigma: float) -> Image:
     """Smooth an image with a Gaussian."""
-    return np.asarray(ndimage.gaussian_filter(image, sigma, truncate=3.0, mode="nearest"))
+    reach = math.ceil(3.0 * sigma)
+    taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    out = np.empty_like(image)
+    blur(image, (taps / taps.sum()).astype(np.float32), np.empty_like(image), out)
+    return out
+
+
+@kernel
+def blur(image: Any, taps: Any, work: Any, out: Any) -> None:
+    """Convolve an image with a symmetric row of numbers, along rows and columns."""
+    rows, columns = image.shape
+    reach = taps.shape[0] // 2
+    for row in range(rows):
+        for column in range(columns):
+            work[row, column] = 0.0
+        for k in range(taps.shape[0]):
+            at = min(max(row + k - reach, 0), rows - 1)
+            tap = taps[k]
+            for column in range(columns):
+                work[row, column] += tap * image[at, column]
+    padded = np.empty(columns + 2 * reach, taps.dtype)
+    for row in range(rows):
+        for column in range(columns + 2 * reach):
+            padded[column] = work[row, min(max(column - reach, 0), columns - 1)]
+        for column in range(columns):
+            out[row, column] = 0.0
+        for k in range(taps.shape[0]):
+            tap = taps[k]
+            for column in range(columns):
+                out[row, column] += tap * padded[column + k]
 
 
 def _ground(still: Image) -> tuple[Image, np.float32]:

@@ -205,8 +205,14 @@ def count_near(line: Any, other: Any, near: float) -> int:
     As lines usually follow each other, the search begins where the point before was near.
     """
     count, last, most = 0, 0, other.shape[0]
+    left, right, top, low = np.inf, -np.inf, np.inf, -np.inf
+    for j in range(most):
+        left, right = min(left, other[j, 0] - near), max(right, other[j, 0] + near)
+        top, low = min(top, other[j, 1] - near), max(low, other[j, 1] + near)
     for i in range(line.shape[0]):
         x, y = line[i, 0], line[i, 1]
+        if x < left or x > right or y < top or y > low:
+            continue
         for k in range(most):
             j = last + k
             if j >= most:

@@ -23,7 +23,7 @@ from vibrissa.io import (
     video_info,
     without_part,
 )
-from vibrissa.numerics import Mask
+from vibrissa.numerics import Mask, without_blas_threads
 from vibrissa.tracking.trace.clutter import between_whiskers
 from vibrissa.tracking.trace.curves import find_whiskers
 from vibrissa.tracking.trace.follower import Follower, features_of, start_at
@@ -46,6 +46,7 @@ _STEADY = (0.0, 0.0, 0.0, 0.0)  # shift of a steady camera
 _SPAN = 400  # number of frames at the beginning of a film from which those for its start are taken
 
 
+@without_blas_threads
 def trace_video(
     frames: Iterable[Frame],
     bases: Sequence[ArrayLike] | None = None,

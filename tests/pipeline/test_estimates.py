@@ -323,8 +323,12 @@ def test_two_whiskers_touch_one_peg(quiet):
     one = reconstruct(alone, objects=Recording(trial).pegs)
     np.testing.assert_allclose(contour["object_radius"], one["object_radius"], atol=1e-6)
     assert "object_distance" not in reconstruct(done)
-    ratio = np.diag(one["parameter_covariance"])[6] / np.diag(contour["parameter_covariance"])[6]
-    assert ratio == pytest.approx(2.0, rel=0.05)
+    # Half the variance of independent contacts; their residuals here are the solver's rounding.
+    one_variance, variance = (
+        np.diag(each["parameter_covariance"])[6] / each.attrs["frames_together"]
+        for each in (one, contour)
+    )
+    assert one_variance / variance == pytest.approx(2.0, rel=0.05)
 
 
 def test_what_cannot_be_done_is_said(trial, felt, contact_map):

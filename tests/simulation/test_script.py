@@ -117,7 +117,7 @@ def test_motions_from_tables(tmp_path):
         ("[motion]\nrow = 'Q'\nkind = 'whisking'", "row is 'Q'"),
         ("[motion]\namplitude = 500\nkind = 'whisking'", "azimuth is an angle in rad"),
         ("[array]\nrows = 'A'\nwhiskers = ['C2']", "has both whiskers and rows"),
-        ("[array]\nside = 'left'\nwhiskers = ['RC2']", "RC2 are not on the left side"),
+        ("[array]\nside = 'left'\nwhiskers = ['RC2']", "RC2 are not on the requested left side"),
         ("[head]\nfile = 'head.csv'\nposition = [1, 0, 0]", "has position; known are file"),
         ("duration = 1\n[motion]\nkind = 'table'\nfile = 'motion.csv'", "has its own"),
         ("[dynamics]\ndamping_ratio = 14", "14 % is 0.14"),

@@ -142,9 +142,17 @@ def test_cells_about_measurements_hold_the_contacts_that_noise_has_moved(gamma_m
         assert (away[:n] <= 1.0).all()
 
 
-@pytest.mark.parametrize("triplet", [("Fx", "MB", "MD"), ("FD", "MB", "MD")])
-def test_the_lightest_contacts_are_found(gamma_map, rng, triplet):
-    """Signals vanish at rest, but over the force they locate a contact there as elsewhere."""
+@pytest.mark.parametrize(
+    ("straight", "triplet"),
+    [(False, ("Fx", "MB", "MD")), (False, ("FD", "MB", "MD")), (True, ("Fx", "MB", "MD"))],
+)
+def test_the_lightest_contacts_are_found(gamma_map, rng, straight, triplet):
+    """Signals vanish at rest, but over the force they locate a contact there as elsewhere.
+
+    On a straight whisker F_x vanishes faster than the force.
+    """
+    if straight:
+        gamma_map = vb.ContactMap.simulate(vb.Whisker.straight(length=0.04), grid=False)
     chart, number = gamma_map.chart, 500
     charted = rng.uniform([0.02, -np.pi, -3.0], [0.98, np.pi, -1.0], (number, 3))
     charted[:, 2] = 10.0 ** charted[:, 2]  # 10⁻⁶ to 10⁻² of the force that slips off

@@ -46,6 +46,9 @@ _SIDE = 0.2
 # Distance from the middle of a cell (in cell widths) beyond which a first step leaves it; and the
 # same if the cell may contain a fold and is less linear.
 _REACH, _REACH_CAREFUL = 1.3, 4.0
+# Cells from rest in which signals that are not interpolated over the force are far from linear, and
+# misses are common without a fold.
+_RESTING = 3
 # Step (in cell widths) below which the next one, about its square, is the last: if there is one
 # solution at most, and if two may be close together.
 _LAST, _LAST_CAREFUL = 0.02, 0.002
@@ -372,7 +375,8 @@ def _invert(b: Array, half: Array, work: Array, careful: bool, x: Array) -> int:
     least, done, farthest, last = np.inf, False, _REACH, _LAST
     if careful:
         farthest, last = _REACH_CAREFUL, _LAST_CAREFUL
-        if b[_TARGET + 3] > 0.0:  # polar
+        resting = b[_PIVOT] < 0.0 and b[_LAYER] < _RESTING
+        if resting or b[_TARGET + 3] > 0.0:  # polar
             farthest, last = np.inf, _LAST
     work[5, 0] = np.inf
     for n in range(9):
@@ -588,6 +592,7 @@ def _load_cell(
     Returns -1 if the target cannot be in the cell.
     """
     row = tree.polar[cell]
+    b[_LAYER] = tree.place[cell, 2]
     if row >= 0:
         _set_polar_target(tree, row, target, b)
         if not _locate_polar(tree, row, b, work, x):
@@ -609,7 +614,7 @@ def _load_cell(
             else:
                 half[q] = box[3 + q, c]
         if pivot >= 0:
-            b[_LAYER], b[_SIGNED] = tree.place[cell, 2], tree.pivot[cell]
+            b[_SIGNED] = tree.pivot[cell]
             half[pivot] = 1.0 if tree.pivot[cell] != 0 else box[3 + pivot, c]
     for k in range(_MISFIT):
         b[k] = edge[k]
@@ -672,7 +677,7 @@ def seeds(tree: SearchTree, target: Array, room: SeedRoom) -> int:
             if careful < 0:
                 continue
             least = np.inf
-            missed = careful == 2
+            missed = careful == 2 and (b[_PIVOT] >= 0.0 or b[_LAYER] >= _RESTING)
             for start in range(9 if careful > 0 else 1):  # from the located position, then corners
                 if start > 0:
                     for a in range(3):

@@ -1,5 +1,6 @@
 """The whole way, from filmed frames to contact and wrench, against the simulated truth."""
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -340,6 +341,21 @@ def test_a_whisker_that_cannot_be_tracked_does_not_cost_the_others(
     assert "bad could not be tracked and is left out: " in found.attrs["remarks"]
     with pytest.raises(ValueError, match=r"no whisker could be tracked: .*bad could.*worse could"):
         track(filmed.cameras, [[row, row] for row in bad], 1000.0, names=["bad", "worse"])
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_frames_that_no_rod_explains_are_left_out_if_two_views_contradict_each_other(
+    filmed, traces, monkeypatch, views
+):
+    """In a single view whiskers that turn out of the plane are not explained, yet seen."""
+    few = [[view[0][:40]] * 2 for view in traces[:views]]
+    every_fifth = np.arange(40) % 5 == 0
+    module = sys.modules["vibrissa.tracking.track"]
+    monkeypatch.setattr(module, "_contradicted", lambda misfit: every_fifth)
+    found = track(filmed.cameras[:views], few, 1000.0)
+    lost = np.isnan(found["base_position"].values).any(axis=2)
+    expected = every_fifth if views == 2 else np.zeros(40, dtype=bool)
+    np.testing.assert_array_equal(lost, np.stack([expected, expected], axis=1))
 
 
 def test_a_tip_that_is_not_seen_is_found_by_how_the_whisker_bends(filmed, traces):

@@ -214,7 +214,7 @@ def track(
         remarks += remarks_on_bases(cameras, rows[k], begun_together(cameras, rows[k]), name)
         try:
             one = before[k] if k in before else tracked(k, together[k])
-            if count > 1:
+            if count > 1 and len(cameras) > 1:
                 one, left_out = _without_contradictions(one)
                 remarks += remarks_on_row(changes[k][0], changes[k][1] + left_out, name)
             if contacts is not None:

@@ -60,22 +60,41 @@ def test_what_is_tall_is_above_the_panel_of_a_phone():
     assert rows[1] <= 0.45 * height + 1e-6
 
 
+def _window(number):
+    """A window that has not been told where its camera belongs, and what its camera calls."""
+    heard = []
+    camera = SimpleNamespace(
+        image_width=390,
+        image_height=844,
+        fov=FOV,
+        on_update=heard.append,
+        position=(300.0, 300.0, 300.0),
+        look_at=(0.0, 0.0, 0.0),
+    )
+    return SimpleNamespace(camera=camera, client_id=number, atomic=nullcontext), heard
+
+
+def _server(windows):
+    """A server with these windows, and what it calls when one connects."""
+    came = []
+    start = SimpleNamespace(fov=FOV)
+    clients = dict(enumerate(windows))
+    server = SimpleNamespace(
+        initial_camera=start, on_client_connect=came.append, get_clients=lambda: clients
+    )
+    return server, came
+
+
 def test_a_window_that_missed_its_camera_gets_it_again_and_one_that_was_turned_keeps_its_own():
     shot = Shot(np.array([16.0, 4.0, -2.0]), 38.0, np.array([0.15, -0.8, 0.6]))
-    heard = []
-    sight = SimpleNamespace(
-        image_width=390, image_height=844, fov=FOV, on_update=heard.append, look_at=(0.0, 0.0, 0.0)
-    )
-    window = SimpleNamespace(camera=sight, client_id=0, atomic=nullcontext)
-    start = SimpleNamespace(fov=FOV)
-    came = []
-    server = SimpleNamespace(
-        initial_camera=start, on_client_connect=came.append, get_clients=lambda: {0: window}
-    )
+    window, heard = _window(0)
+    sight = window.camera
+    began = sight.position
+    server, came = _server([window])
     framing = Framing(server)
-    framing.show(shot)
     came[0](window)
-    sight.position = start.position  # the page was not ready for its own
+    framing.show(shot)
+    sight.position = began  # the page was not ready for its own
     _finish(heard[0](sight))
     np.testing.assert_allclose(sight.position, framed(shot, 390, 844, FOV)[0])
     assert framing.turned is None
@@ -83,3 +102,21 @@ def test_a_window_that_missed_its_camera_gets_it_again_and_one_that_was_turned_k
     _finish(heard[0](sight))
     assert sight.position == (1.0, 2.0, 3.0)
     np.testing.assert_allclose(framing.turned[:3], sight.position)
+
+
+def test_a_window_that_connects_after_a_link_was_opened_gets_the_camera_of_the_link():
+    window, heard = _window(0)
+    server, came = _server([])
+    framing = Framing(server)
+    framing.show(Shot(np.zeros(3), 38.0, np.array([0.15, -0.8, 0.6])))
+    position, target = np.array([1.0, 2.0, 30.0]), np.array([4.0, 5.0, 6.0])
+    framing.place(position, target)
+    began = window.camera.position
+    came[0](window)
+    np.testing.assert_allclose(window.camera.position, position)
+    np.testing.assert_allclose(window.camera.look_at, target)
+    window.camera.position = began  # the page was not ready for it
+    _finish(heard[0](window.camera))
+    np.testing.assert_allclose(window.camera.position, position)
+    _finish(heard[0](window.camera))
+    np.testing.assert_allclose(framing.turned, [*position, *target])

@@ -1,6 +1,7 @@
 """The page in a real browser: it loads in silence, follows the mouse, and says why it cannot."""
 
 import urllib.request
+from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
@@ -259,7 +260,9 @@ def test_keys_clicks_and_links_lead_through_a_trial(browser, recording):
         third.wait_for_function("location.hash.includes('camera=')")
         viewer.page.reshape(length=50e-3, turn=0.5)
         third.wait_for_function("location.hash.includes('whisker=50%2C28.6')")
-        link, wanted = third.evaluate("location.href"), viewer.page._framing.turned
+        link = third.evaluate("location.href")
+        (words,) = parse_qs(urlsplit(link).fragment)["camera"]
+        wanted = np.array(words.split(","), dtype=float)
         viewer.page.reshape(**vars(shape_of(viewer.page.original)))
         third.close()
         viewer.page.choose("Bend")

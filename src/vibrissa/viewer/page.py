@@ -461,54 +461,70 @@ class Framing:
     ) -> None:
         self._server = server
         self._viewed = viewed
-        self._shot: Shot | None = None
+        self._goal: Shot | Array | None = None  # a shot, or a position and a target (6,), mm
         self.turned: Array | None = None
         """Camera position and target (6,) of the view changed last, mm."""
         self._placed: dict[int, tuple[int, int, Array]] = {}
+        self._lock = threading.RLock()  # a window may connect while all are being moved
         server.on_client_connect(self._came)
 
     def show(self, shot: Shot) -> None:
         """Point all cameras at a shot."""
-        self._shot, self.turned = shot, None
-        camera = self._server.initial_camera
-        place, target = framed(shot, 1280.0, 720.0, camera.fov)
-        camera.position, camera.look_at = _triple(place), _triple(target)
-        for client in self._server.get_clients().values():
-            self._turn(client, shot)
+        self._move(shot, None)
 
     def place(self, position: Array, target: Array) -> None:
         """Put all cameras at a position and point them at a target, mm."""
-        self._shot, self.turned = None, np.concatenate([position, target])
-        cameras: list[Any] = [client.camera for client in self._server.get_clients().values()]
-        for camera in (self._server.initial_camera, *cameras):
-            camera.position, camera.look_at = _triple(position), _triple(target)
+        placed = np.concatenate([position, target])
+        self._move(placed, placed)
+
+    def _move(self, goal: Shot | Array, turned: Array | None) -> None:
+        with self._lock:
+            self._goal, self.turned = goal, turned
+            camera = self._server.initial_camera
+            place, target = self._wanted(goal, 1280.0, 720.0, camera.fov)
+            camera.position, camera.look_at = _triple(place), _triple(target)
+            for client in self._server.get_clients().values():
+                self._turn(client, goal)
 
     def _came(self, client: viser.ClientHandle) -> None:
-        if self._shot is not None:
-            self._turn(client, self._shot)
+        start = np.array(client.camera.position)
+        with self._lock:
+            if self._goal is not None:
+                self._turn(client, self._goal)
 
         @client.camera.on_update
         async def _(camera: viser.CameraHandle) -> None:
             # Panels come and go; who has turned the view keeps it. A window that has just opened
-            # may have missed where its camera belongs: it reports where all of them begin.
-            wide, tall, place = self._placed.get(client.client_id, (0, 0, np.zeros(3)))
-            resized = (camera.image_width, camera.image_height) != (wide, tall)
-            here = np.allclose(camera.position, place, atol=0.1)
-            missed = np.allclose(camera.position, self._server.initial_camera.position, atol=0.1)
-            framed = here or missed
-            if self._shot is not None and framed and (resized or not here):
-                self._turn(client, self._shot)
-            self.turned = None if framed else np.concatenate([camera.position, camera.look_at])
+            # may have missed where its camera belongs: it reports where it began.
+            with self._lock:
+                wide, tall, place = self._placed.get(client.client_id, (0, 0, np.zeros(3)))
+                resized = (camera.image_width, camera.image_height) != (wide, tall)
+                here = np.allclose(camera.position, place, atol=0.1)
+                unturned = here or np.allclose(camera.position, start, atol=0.1)
+                goal = self._goal
+                if goal is not None and unturned and (resized or not here):
+                    self._turn(client, goal)
+                if not unturned:
+                    self.turned = np.concatenate([camera.position, camera.look_at])
+                elif isinstance(goal, Shot):
+                    self.turned = None
             self._viewed()
 
-    def _turn(self, client: viser.ClientHandle, shot: Shot) -> None:
+    def _turn(self, client: viser.ClientHandle, goal: Shot | Array) -> None:
         camera = client.camera
         wide, tall = camera.image_width, camera.image_height
-        place, target = framed(shot, wide, tall, camera.fov)
+        place, target = self._wanted(goal, wide, tall, camera.fov)
         self._placed[client.client_id] = wide, tall, place
         with client.atomic():
             camera.position = _triple(place)
             camera.look_at = _triple(target)
+
+    @staticmethod
+    def _wanted(goal: Shot | Array, wide: float, tall: float, fov: float) -> tuple[Array, Array]:
+        """Position and target, mm, of a camera with a window of this size."""
+        if isinstance(goal, Shot):
+            return framed(goal, wide, tall, fov)
+        return goal[:3], goal[3:]
 
 
 def _triple(values: Array) -> tuple[float, float, float]:

@@ -104,7 +104,9 @@ def picture(results) -> Figure:
         ):
             for name, (label, colour) in SHOWN.items():
                 first = np.sort(errors(point, found[name])[0])
-                axes.step(first, 100.0 * share, where="post", color=colour, label=label)
+                # Green and grey look alike to some readers.
+                line = "--" if name == WRENCH else "-"
+                axes.step(first, 100.0 * share, line, where="post", color=colour, label=label)
             axes.set(xscale="log", xlim=(1e-3, 30.0), ylim=(0.0, 100.0), xlabel="3D error (mm)")
             axes.set_xticks([0.001, 0.01, 0.1, 1, 10], ["0.001", "0.01", "0.1", "1", "10"])
             head(axes, letter, title)

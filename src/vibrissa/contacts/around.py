@@ -22,7 +22,7 @@ from vibrissa.contacts.channels import WRENCH
 from vibrissa.contacts.noise import Noise, SensorNoise, explained
 from vibrissa.contacts.wrench import wrench_on, wrench_weights
 from vibrissa.deferred import xr
-from vibrissa.numerics import AnyArray, Array, numbers, rotation_matrices
+from vibrissa.numerics import AnyArray, Array, numbers, rotation_matrices, without_blas_threads
 from vibrissa.objects import Placement, Surface
 from vibrissa.quantities import attributes
 from vibrissa.rod import Equilibrium, NearObjects, discretize
@@ -40,6 +40,7 @@ _FINE = 96
 _BETWEEN = 5e-5
 
 
+@without_blas_threads
 def estimate_around(
     whisker: Whisker,
     force: ArrayLike | xr.DataArray,

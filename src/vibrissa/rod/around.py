@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.numerics import Array, IntArray, Mask, rotation_matrices
+from vibrissa.numerics import Array, IntArray, Mask, rotation_matrices, without_blas_threads
 from vibrissa.objects import Placement, Surface
 from vibrissa.rod.deflection import Deflection, vectors
 from vibrissa.rod.discretization import discretize
@@ -266,6 +266,7 @@ class NearObjects:
         return Placement(place.rotation, place.position - shift * self._length)
 
 
+@without_blas_threads
 def around(
     whisker: Whisker,
     surfaces: Sequence[Surface],

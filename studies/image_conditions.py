@@ -21,12 +21,12 @@ from pages import few, put, table
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "output" / "image_conditions"
 HEAD = (
-    "what is different",
+    "condition",
     "images lost, wrong",
     "trace, px",
     "contact right, %",
     "contact point, µm",
-    "its covariance states, µm",
+    "predicted by its covariance, µm",
     "errors, in sigmas",
     "length, %",
     "",

@@ -24,7 +24,7 @@ from furry import Film, Setup
 
 ROOT = Path(__file__).parents[1]
 CASES: dict[str, tuple[dict[str, Any], tuple[int, ...]]] = {
-    "as it is, 512 × 512": ({}, (101, 102, 103, 104, 116)),
+    "reference, 512 × 512": ({}, (101, 102, 103, 104, 116)),
     "640 × 480": ({"size": (640, 480)}, (108, 109)),
     "1024 × 1024, base 7 pixels wide": ({"size": (1024, 1024)}, (113,)),
     "H.264, rate factor 30": ({"crf": 30}, (105, 117)),
@@ -37,7 +37,7 @@ CASES: dict[str, tuple[dict[str, Any], tuple[int, ...]]] = {
     "no whisker": ({"whisker": False}, (110, 111)),
 }
 HEAD = (
-    "what is different",
+    "condition",
     "films",
     "within 5 px in both views",
     "base, px",

@@ -50,7 +50,7 @@ WRONG_MASSES = {
     "parabola of 28 mm, 7 Hz, + 20 %": (BENT_28, 0.55, 1e-3, 7.0, 86, 1.2, 0.16),
     "γ, 5 Hz, + 20 %, ⅓ noise": (GAMMA, 0.65, 0.7e-3, 5.0, 87, 1.2, 0.13, 1.0 / 3.0),
 }
-HEAD = ("trial", "touching", "M_B > 5σ: false, %", "false, %", "without a touch since the last, %")
+HEAD = ("trial", "in contact", "M_B > 5σ: false, %", "false, %", "untouched since the last, %")
 HEAD = (*HEAD, "found, %", "onset late, ms")
 BY_AGE = {"all": (0, 999), "0–8 ms": (0, 8), "8–20 ms": (8, 20), "later": (20, 999)}
 HEAD_ERRORS = ("trial", "inertia", *BY_AGE, "in 95 % region", "located")

@@ -297,7 +297,7 @@ _WIRE = Whisker.straight(
 _ARM = ImageConditions(face=(60e-3, 30e-3, 40e-3))
 
 CASES = (
-    Case("as it is", "ordinary"),
+    Case("reference", "ordinary"),
     Case("lens out of focus, 2 pixels", "blur", change=defocus(2.0)),
     Case("lens out of focus, 3 pixels", "blur", change=defocus(3.0)),
     Case("shutter open for 1 ms", "blur", conditions=ImageConditions(exposure=1e-3)),
@@ -347,10 +347,10 @@ CASES = (
         shift=(2.6e-3, 0.0, 0.0),
     ),
     Case("thick peg", "hidden", peg=2.5),
-    Case("one frame dropped, not given", "frames", shown=without(1, 70)),
+    Case("one frame dropped, offset not stated", "frames", shown=without(1, 70)),
     Case("one frame dropped, offset auto", "frames", shown=without(1, 70), offset=None),
     Case("one view 30 frames shorter", "frames", shown=shorter(1, 30)),
-    Case("one frame out of step, not given", "frames", shown=late(1, 1)),
+    Case("one frame out of step, offset not stated", "frames", shown=late(1, 1)),
     Case("one frame out of step, offset auto", "frames", shown=late(1, 1), offset=None),
     Case("γ whisker, 0.3 s", "ordinary", whisker=gamma(), duration=0.3, pixel=95e-6),
 )

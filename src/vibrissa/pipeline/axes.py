@@ -35,19 +35,9 @@ _OBLIQUE = 0.2
 def doubted_axes(whisker: Whisker, wrench: xr.Dataset, noise: Array) -> str:
     """Describe which axes of force and moment seem to be exchanged or to have the wrong sign.
 
-    Parameters
-    ----------
-    whisker : Whisker
-        Whisker in contact; its weight is neglected.
-    wrench : xarray.Dataset
-        Measured ``force`` and ``moment``, whisker frame, N and N·m, dimensions time, space.
-    noise : array (6, 6)
-        Covariance of (F, M), SI units.
-
-    Returns
-    -------
-    str
-        A sentence; empty if the stated axes explain most contacts or no other axes explain them.
+    ``wrench`` has ``force`` and ``moment`` over (time, space) in the whisker frame, and ``noise``
+    (6, 6) is the covariance of (F, M), SI units. The whisker's weight is neglected. The text is
+    empty if the stated axes explain most contacts, or no other axes explain them.
     """
     force, moment = (Group(wrench)[name] for name in ("force", "moment"))
     size = np.linalg.norm(moment, axis=1)
@@ -83,7 +73,10 @@ def doubted_axes(whisker: Whisker, wrench: xr.Dataset, noise: Array) -> str:
     simple = int(np.argmax(shares > shares.max() - _EQUAL))
     if shares[simple] < max(_BELIEVED, own + _BETTER):
         return ""
-    columns = [_column(*row) for row in zip("FFFMMM", turns[simple].reshape(6, 3), strict=True)]
+    columns = [
+        f"{'-' if row.min() < 0.0 else ''}{kind}{'xyz'[int(np.abs(row).argmax())]}"
+        for kind, row in zip("FFFMMM", turns[simple].reshape(6, 3), strict=True)
+    ]
     return (
         f"the whisker explains {100 * own:.0f} % of {rows.size} strong contacts, and "
         f"{100 * shares[simple]:.0f} % for example with {', '.join(columns)} as Fx, Fy, Fz, Mx, "
@@ -108,9 +101,3 @@ def _mistakes() -> Array:
     every = np.unique(pairs, axis=0)
     changed, negative = (every != one).any(axis=-1).sum(axis=(1, 2)), (every < 0.0).sum((1, 2, 3))
     return np.asarray(every[np.lexsort((negative, changed))][1:])
-
-
-def _column(kind: str, row: Array) -> str:
-    """Name of the measured column, with its sign, that a row of a permutation selects."""
-    at = int(np.abs(row).argmax())
-    return f"{'-' if row[at] < 0.0 else ''}{kind}{'xyz'[at]}"

@@ -45,18 +45,18 @@ from vibrissa.whisker import Identity
 ROW_COLOURS: Mapping[str, str] = MappingProxyType(
     {"A": "#0072b2", "B": "#56b4e9", "C": "#009e73", "D": "#e69f00", "E": "#d55e00"}
 )
-# From where space is seen: elevation and azimuth, degrees; from before the animal's right, and from
-# behind it, where one sees the side of things that whiskers touch.
 _HEAD, _THING, _EDGE = "#e9e2da", "#d5d9de", "#b3aba2"
+# Views of space, elevation and azimuth, degrees: from in front of the animal's right, and from
+# behind it, where the touched sides of objects are visible.
 _AT_REST, _IN_A_TRIAL = (22.0, 38.0), (26.0, -22.0)
 _CLEAR = 0.7  # opacity of objects in space, which hide what touches them from behind
-# Room around and between the panels, mm.
 _PANELS = (
     # letter, title, right and up, sense of the axis to the right, axis toward the viewer
     ("a", "from above", (0, 1), 1.0, 2),
     ("c", "from the front", (0, 2), -1.0, 1),
     ("d", "from its right", (1, 2), 1.0, 0),
 )
+# Room around and between the panels, mm.
 _LEFT, _GAP, _BOTTOM, _TOP, _RIGHT = 10.0, 13.0, 8.5, 6.5, 3.0
 
 
@@ -77,9 +77,13 @@ class _Scene:
     def colours(self) -> list[str]:
         return [_colour(name) for name in self.names]
 
+    def rows(self, names: list[str]) -> list[str]:
+        """Known rows of some whiskers."""
+        return sorted({Identity.of(name).row for name in names if _colour(name) != INK})
+
     @property
     def limits(self) -> Array:
-        """Limits (3, 2) that hold whiskers, head and objects with an end."""
+        """Limits (3, 2) that include whiskers, head and bounded objects."""
         parts = [self.lines.reshape(-1, 3), head_surfaces(*self.head)[0].reshape(-1, 3)]
         everywhere = np.zeros((3, 2))
         parts += [object_surface(o, everywhere)[0] for o in self.objects if is_bounded(o)]
@@ -167,7 +171,7 @@ def _finding(scene: _Scene) -> str:
     touching = [name for name, points in zip(scene.names, scene.points, strict=True) if len(points)]
     if not touching:
         return f"{len(scene.names)} whiskers at rest"
-    rows = ", ".join(sorted({Identity.of(name).row for name in touching if _colour(name) != INK}))
+    rows = ", ".join(scene.rows(touching))
     ever = f"Contact points of {len(touching)} of {len(scene.names)} whiskers"
     ever += f" (rows {rows})" if rows else ""
     return f"{ever}; {int(scene.touching.sum())} touch at {scene.moment}"
@@ -249,11 +253,8 @@ def _space(figure: Figure, box: Box, scene: _Scene, limits: Array) -> None:
 
 
 def _legend(axes: Axes, scene: _Scene) -> None:
-    """Draw a legend of the rows in their colours."""
-    rows = [
-        "rows",
-        *sorted({Identity.of(name).row for name in scene.names if _colour(name) != INK}),
-    ]
+    """Draw the names of the rows in their colours."""
+    rows = ["rows", *scene.rows(scene.names)]
     for i, row in enumerate(rows):
         look: dict[str, Any] = {"fontweight": "bold", "ha": "right", "va": "bottom"}
         axes.annotate(

@@ -28,10 +28,10 @@ from vibrissa.plots.style import (
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import COORDINATES, Course, deflection_angles, robust_limits
 
-# Visible part of the head: its eyes and the snout, mm.
 _SNAPSHOTS = 7
+# Visible part of the head: its eyes and the snout, mm.
 _FACE = np.array([[-11.0, -26.0, 2.0], [11.0, -26.0, 2.0], [0.0, 0.0, 0.0]])
-_ROOM = 2.0  # around what is to be seen, mm
+_ROOM = 2.0  # margin of the views, mm
 _VIEWS = ((0, 1), (0, 2), (0, 1), (1, 2))
 _TITLES = (
     "about the whisker, top",
@@ -156,7 +156,6 @@ def _laboratory(
     points = to_display("contact_point", places)
     lines = _snapshots(course)
     rat = head_of(course)
-    # The head is seen as far as its eyes.
     face = 1e3 * rat.snout + _FACE @ rat.axes.T
     shown = np.concatenate([lines.reshape(-1, 3), _inner(points), face])
     limits = _limits(shown[np.isfinite(shown).all(axis=1)])
@@ -344,12 +343,9 @@ def _errors(
     axes.set(xlabel=axis_label("time"), ylabel=axis_label(f"error_{name}"))
     unit = quantity(name).display_unit
     size = f"{np.median(np.abs(error)):.2g}{'' if unit == '°' else ' '}{unit}"
-    _remark(axes, f"median {size}, {_within(error, axes.get_ylim())} % shown")
-
-
-def _within(values: Array, limits: tuple[float, float]) -> int:
-    """Share of values between limits, as a whole percentage."""
-    return round(100.0 * float(np.mean((values >= limits[0]) & (values <= limits[1]))))
+    low, high = axes.get_ylim()
+    shown = 100.0 * float(np.mean((error >= low) & (error <= high)))
+    _remark(axes, f"median {size}, {round(shown)} % shown")
 
 
 def _remark(axes: Axes, words: str) -> None:
@@ -358,7 +354,7 @@ def _remark(axes: Axes, words: str) -> None:
 
 
 def _broken(time: Array, values: Array) -> tuple[Array, Array]:
-    """Draw a line with gaps where frames are missing."""
+    """Line over time with gaps where frames are missing."""
     order = np.argsort(time, kind="stable")
     time, values = time[order], values[order]
     step = np.diff(time)

@@ -3,7 +3,12 @@
 Each stage is a function that takes a recording and returns a new dataset.
 """
 
-from vibrissa.pipeline.axes import doubted_axes as doubted_axes
+from vibrissa.pipeline.checks import (
+    check_recording as check_recording,
+    doubted_axes as doubted_axes,
+    edited as edited,
+    whisker_radii as whisker_radii,
+)
 from vibrissa.pipeline.estimates import (
     EVENTS as EVENTS,
     Progress as Progress,
@@ -13,11 +18,6 @@ from vibrissa.pipeline.estimates import (
     in_laboratory as in_laboratory,
     swept_recording as swept_recording,
     with_events as with_events,
-)
-from vibrissa.pipeline.frames import (
-    check_recording as check_recording,
-    edited as edited,
-    whisker_radii as whisker_radii,
 )
 from vibrissa.pipeline.locate import (
     DETECTED as DETECTED,

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from vibrissa.contacts import SLIPPING, ContactEvents, ContactMap, Gravity, Place, Prior, in_order
 from vibrissa.contour import continuing_candidates, to_laboratory
 from vibrissa.numerics import Array, contacts_in, cross_matrix
-from vibrissa.pipeline.frames import signals_in
+from vibrissa.pipeline.checks import signals_in
 from vibrissa.pipeline.locate import TRIPLET, locate, locate_from_wrench, without_contact
 from vibrissa.pipeline.signals import sensor_noise
 from vibrissa.quantities import attributes

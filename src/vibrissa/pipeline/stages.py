@@ -18,8 +18,8 @@ from vibrissa.contacts import friction_assumed
 from vibrissa.contour import FittedShape, shape_from_dataset
 from vibrissa.io import events_in
 from vibrissa.numerics import contacts_in
+from vibrissa.pipeline.checks import MADE_FROM, check_recording, edited, made_from
 from vibrissa.pipeline.estimates import Progress, estimates_of, largest_of
-from vibrissa.pipeline.frames import MADE_FROM, check_recording, edited, made_from
 from vibrissa.pipeline.reconstruct import reconstruct
 from vibrissa.pipeline.signals import signals_of
 from vibrissa.recording import Recording

@@ -110,24 +110,24 @@ def array_views(
         An array of whiskers (`WhiskerArray.to_tree`), which is drawn at rest in the head's frame;
         or a recording of a trial, in the laboratory frame.
     frame : int, optional
-        Moment of a recording at which whiskers and head are drawn; by default that at which most
-        whiskers touch.
+        Frame of a recording in which whiskers and head are drawn; by default the one in which most
+        whiskers are in contact.
     contacts : str
-        Group of a recording whose ``contact_point`` are drawn, at all times where ``in_contact``,
-        such as ``truth`` or ``estimates``; ``/`` is the top.
+        Group of a recording whose ``contact_point`` are drawn, for all frames ``in_contact``, such
+        as ``truth`` or ``estimates``; ``/`` is the root.
     width : {"single", "double"}
         Columns of the page.
 
     Returns
     -------
     Figure
-        Four panels; a colour each row of whiskers, and the head as a sketch. Dots are contact
-        points, those of the moment that is drawn ringed.
+        Four panels with a colour per row of whiskers, and a sketch of the head. Dots are contact
+        points; those of the drawn frame have rings.
 
     Raises
     ------
     ValueError
-        If there are no centrelines, the frame is none of the recording, or there is no such group.
+        If there are no centrelines, no such frame, or no such group.
     """
     scene = _scene(tree, frame, contacts)
     with looking():
@@ -194,7 +194,7 @@ def _panel(axes: Axes, scene: _Scene, limits: Array, view: tuple[int, int], towa
         near = eyes[eyes[..., toward].mean(axis=1) > skull[..., toward].mean()]
         _flat(axes, near[..., view], INK, INK, 2.2)
     for line, colour, touching in zip(scene.lines, scene.colours, scene.touching, strict=True):
-        # Whiskers of the far side are drawn behind the head, all others in front of it.
+        # Whiskers on the far side are drawn behind the head, all others in front of it.
         behind = toward == 0 and line[0, 0] < middle[0]
         look: dict[str, Any] = {"color": colour, "linewidth": 1.1 if touching else 0.7}
         axes.plot(*line[:, view].T, zorder=1.5 if behind else 3.0, **look)
@@ -243,7 +243,7 @@ def _space(figure: Figure, box: Box, scene: _Scene, limits: Array) -> None:
     things = [_triangles(thing, limits) for thing in scene.objects]
     items = [(float((sketch[0] @ eye).mean()), skull)]
     items += [(float((t @ eye).mean()), partial(solid, t, _THING)) for t in things]
-    # A whisker's base counts as well: it grows out of its side of the head.
+    # The base counts as much as the mean, so that a whisker is on its side of the head.
     sides = 0.5 * (scene.lines[:, 0] + scene.lines.mean(axis=1)) @ eye
     items += [(float(side), partial(whisker, i)) for i, side in enumerate(sides)]
     for order, (_, draw) in enumerate(sorted(items, key=lambda item: item[0])):

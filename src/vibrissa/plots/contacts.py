@@ -52,18 +52,18 @@ def contact_places(
 ) -> Figure:
     """Draw contacts in the whisker frame and the laboratory frame, in two views each.
 
-    In the whisker's frame they lie about the resting whisker, drawn black; in the laboratory, with
-    the deflected whisker at some times and a simple head at its base, they gather where the object
-    is.
+    In the whisker frame, contacts are around the resting whisker, which is black. In the laboratory
+    frame they outline the object, and are drawn with the deflected whisker at some times and a
+    sketch of the head.
 
     Parameters
     ----------
     course : Course
-        The trial.
+        Trial with contact points.
     centerline : array_like (k, 3)
         Resting whisker, whisker frame, m.
     bodies, fitted : sequence of object
-        Objects as they are, filled grey, and as they were fitted to contacts, dashed: with
+        Known objects, filled grey, and shapes fitted to contacts, dashed: with
         ``signed_distance``, laboratory frame, m.
     colour : {"time", "deflection_angle"}
         Quantity that colours the contacts: their time, or the angle at the base between the resting
@@ -204,14 +204,14 @@ def estimated_against_true(
     colour_name: str = "deflection_angle",
     known_as: str = "true",
 ) -> Figure:
-    """Draw estimated against true r, θ and φ; below, over time: their course, and the error.
+    """Draw estimated against true r, θ and φ, and below both and the error over time.
 
     Parameters
     ----------
     true_spherical, estimated_spherical : array_like (n, 3)
         (r, θ, φ) of the contact points, whisker frame, m and rad; rows with NaN are left out.
     time : array_like (n,), optional
-        Times of the frames, s; without them the courses over time are left out.
+        Times of the frames, s; without them nothing is drawn over time.
     colour : array_like (n,), optional
         Values that colour the points, SI units: by default the time, if known.
     colour_name : str
@@ -223,8 +223,8 @@ def estimated_against_true(
     -------
     Figure
         Two columns wide, three panels a row, in mm and degrees; or the sentence "no contacts".
-        Limits follow the true values, and nine tenths of the errors; how much lies outside, and the
-        median size of the error, are written above.
+        Limits include the true values and 90 % of the errors; the number of values outside and the
+        median absolute error are written above.
 
     Raises
     ------

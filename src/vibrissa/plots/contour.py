@@ -83,7 +83,7 @@ def contour_views(
     -------
     Figure
         Three axes of equal aspect in mm; how many points lie outside the first is written above
-        it. Or the sentence "no contacts".
+        it; or the sentence "no contacts".
 
     Raises
     ------
@@ -303,8 +303,8 @@ def distances_by_class(summaries: Sequence[xr.Dataset], *, width: style.Width = 
     -------
     Figure
         Median and 95 % of the sizes of the distances, µm, on a logarithmic scale that ends at
-        100 mm: filled as measured, open as predicted. The number of contacts stands below each
-        class. Or the sentence "no contacts".
+        100 mm; filled markers are measured, open ones predicted. The number of contacts is below
+        each class. Or the sentence "no contacts".
     """
     shown = [s for s in summaries if int(s["contacts"].sum())]
     with style.looking():

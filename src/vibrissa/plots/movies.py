@@ -213,21 +213,21 @@ def contour_frames(
 ) -> Iterator[Picture]:
     """Draw the frames of a movie: camera views, and a contour that grows contact by contact.
 
-    Above both views with the traced whisker and the contact point, and contacts about the resting
-    whisker; below contacts in the laboratory from above, from the front and from the side, in the
-    colour of their time. The outlines of objects and fitted shapes appear where contacts are, and
-    wholly in the last frame.
+    The upper row shows the camera views with the traced whisker and the contact point, and contacts
+    around the resting whisker; the lower row shows contacts in the laboratory from above, the front
+    and the side, coloured by time. The outlines of objects and fitted shapes appear near contacts,
+    and are complete in the last frame.
 
     Parameters
     ----------
     course : Course
-        The trial, with contact points.
+        Trial with contact points.
     centerline : array_like (k, 3)
         Resting whisker, whisker frame, m.
     sights : sequence of Sight
         One or two views, each with an image for each row.
     rows : array_like (m,) of int
-        Indices of the trial's frames, rising. Contacts in between are shown too.
+        Indices of the trial's frames, increasing. Contacts in between are shown too.
     bodies, fitted : sequence of object
         True objects, grey, and shapes fitted to the contacts, orange: with ``signed_distance``,
         laboratory frame, m.
@@ -235,7 +235,7 @@ def contour_frames(
     Returns
     -------
     iterator of array (720, 1280, 4)
-        8 bit red, green, blue and opacity, one for each row.
+        Images with 8-bit red, green, blue and opacity, one per row.
 
     Raises
     ------
@@ -431,18 +431,18 @@ def signal_frames(
     Parameters
     ----------
     course : Course
-        The trial, with signals.
+        Trial with signals.
     samples : Dataset
         ``ContactMap.to_dataset()`` of the whisker.
     centerline : array_like (k, 3)
         Resting whisker, whisker frame, m.
     rows : array_like (m,) of int
-        Indices of the trial's frames, rising; time axes reach from the first to the last.
+        Indices of the trial's frames, increasing; time axes range from the first to the last.
 
     Returns
     -------
     iterator of array (720, 1280, 4)
-        8 bit red, green, blue and opacity, one for each row.
+        Images with 8-bit red, green, blue and opacity, one per row.
 
     Raises
     ------

@@ -145,7 +145,7 @@ def start_views(
     names: Sequence[str],
     remarks: Sequence[str] = (),
 ) -> Figure:
-    """Draw lines that may be the whisker, with their confidence, into an image of each view."""
+    """Draw candidate whiskers, with their confidence, on an image of each view."""
     wide = (style.page_width("double") - _GAP * (len(images) - 1)) / len(images)
     heights = [wide * image.shape[0] / image.shape[1] for image in images]
     below = _LINE * len(remarks) + _GAP
@@ -229,14 +229,15 @@ def trial_overview(
 ) -> Figure:
     """Draw a trial: camera views, signals and contacts over time, solids, estimates.
 
-    Frames show the traced whisker in red and the contact point. Below the three signals and the
-    coordinates of the contact over time, with contact shaded; the trajectory in signal space,
-    coloured by r, θ and φ; and, two columns wide only, estimated against known coordinates.
+    The camera views show the traced whisker in red, and the contact point. Below are the three
+    signals and the coordinates of the contact over time, with contacts shaded; the trajectory in
+    signal space, coloured by r, θ and φ; and, at double width only, estimated against known
+    coordinates.
 
     Parameters
     ----------
     course : Course
-        The trial, with signals.
+        Trial with signals.
     samples : Dataset
         ``ContactMap.to_dataset()`` of the whisker.
     centerline : array_like (k, 3)
@@ -244,7 +245,7 @@ def trial_overview(
     sights : sequence of Sight
         One or two views, each with an image for each row.
     rows : array_like (m,) of int
-        Frames of the trial to be shown, one or two, rising.
+        Indices of one or two frames to show, increasing.
     width : {"single", "double"}
         Columns of the page.
 
@@ -287,7 +288,7 @@ def trial_overview(
 
 
 def _spans(course: Course, span: slice = slice(None)) -> Array:
-    """Start and end times of contacts, s; frames without a pose do not end a contact."""
+    """Start and end times (n, 2) of contacts, s; frames without a pose do not end a contact."""
     seen = np.asarray(np.isfinite(course.position).all(axis=1))
     return intervals(course.time[span], course.touching[span], seen[span])
 

@@ -51,11 +51,11 @@ def derivative_label(coordinate: str, signal: str) -> str:
 def sensitivity_panels(data: xr.Dataset, *, width: style.Width = "double") -> Figure:
     """Draw the derivatives of r, θ and φ with respect to three signals, over these signals.
 
-    Nine panels: a row for each coordinate, a column for each signal, in each the derivative over
-    the signal, of concave forward and concave backward contacts (by the volume that they stand for,
-    if the dataset has it): the median in 25 bins, and bands that hold half and four fifths of the
-    contacts. Axes hold the central 99 % of the signals; contacts within 2° of rest are left out.
-    Signals that pile up near zero have an axis that is wider there.
+    The nine panels have a row per coordinate and a column per signal. Each shows the derivative
+    over the signal, for concave forward and concave backward contacts (weighted by the volume that
+    they represent, if known): the median in 25 bins, and bands that contain 50 % and 80 % of the
+    contacts. Axes include the central 99 % of the signals; contacts within 2° of rest are left out.
+    The axis of a signal with most values near zero is linear there and logarithmic beyond.
 
     Parameters
     ----------

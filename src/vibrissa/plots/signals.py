@@ -185,13 +185,12 @@ def signal_clouds(
 ) -> Figure:
     """Draw the reachable space of a whisker, and the six signals over it.
 
-    The reachable space is seen from aside and from before the tip, and then once for each signal,
-    which gives the colour: forces above, moments below. The quarter that faces the viewer is taken
-    away along the resting whisker, so that the whisker and what is about it are seen. Small
-    deflections (2° about rest) are left out as in the paper. Colours of forces and moments go with
-    the square root of the signal; they leave out the outermost 2 % of its values, and the colour
-    bar then has a pointed end. An inset shows where the whisker is pulled (F_x > 0), which only
-    happens if it is curved.
+    The reachable space is shown from the side and from the tip, and then once for each signal,
+    coloured by it: forces above, moments below. The quarter that faces the viewer is removed along
+    the resting whisker, so that the inside is visible. Small deflections (2° about rest) are left
+    out as in the paper. Colours of forces and moments are on a square-root scale without the
+    outermost 2 % of the values, for which the colour bar has a pointed end. An inset shows where
+    the whisker is pulled (F_x > 0), which happens only if it is curved.
 
     Parameters
     ----------
@@ -207,7 +206,7 @@ def signal_clouds(
     Returns
     -------
     Figure
-        3D axes, all to one scale but for the inset, and six colour bars.
+        3D axes, all to one scale except for the inset, and six colour bars.
 
     Raises
     ------

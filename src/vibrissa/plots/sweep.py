@@ -38,10 +38,10 @@ def sweep_overview(
 ) -> Figure:
     """Draw the results of a task of a study.
 
-    Of verdicts: a row of panels for each triplet, where the left one shows every whisker by its
-    taper and by how much it turns, coloured by the critical cone, and the right one the critical
-    cones by group of whiskers; of more than three triplets the critical cones only, a line for
-    each triplet. Of errors: a line for each set of signals or friction coefficient. The shape of a
+    For verdicts there is a row of panels per triplet: the left one shows every whisker by its taper
+    and turning angle, coloured by the critical cone, and the right one the critical cones by group
+    of whiskers. For more than three triplets only the critical cones are drawn, in a line per
+    triplet. For errors there is a line per set of signals or friction coefficient. The shape of a
     mark is the verdict.
     """
     known = drawable(found)

@@ -45,13 +45,13 @@ _TOLERANCE = 1e-3  # share of each signal's range at which the resolution is sta
 def verdict_table(verdicts: xr.Dataset, *, width: style.Width = "double") -> Figure:
     """Draw the table of verdicts: a row for each triplet, a column for each region.
 
-    A full disc stands for unique, one in a ring for proved to be, a half one for unique off a
-    surface, an open ring for not unique. The triplet chosen is printed in blue, with a mark. At
-    double width, what is not unique is given with the largest distance of two contacts with the
-    same signals, and three more columns follow, of all contacts and only if the region "all" was
-    judged: a lower bound of the critical cone, outside which no two contacts have the same
-    signals; the share of contacts that have such a twin; and the share that another one resembles
-    within 1e-3 of the signals' ranges.
+    A full disc stands for unique, one in a ring for proved unique, a half disc for unique off a
+    surface, and an open ring for not unique. The chosen triplet is printed in blue with a mark. At
+    double width, verdicts of "not unique" are followed by the largest distance between two contacts
+    with the same signals. If the region "all" was judged, three more columns refer to all contacts:
+    a lower bound of the critical cone, outside which no two contacts have the same signals; the
+    share of contacts that have such a twin; and the share that another contact resembles within
+    1e-3 of the signals' ranges.
 
     Parameters
     ----------
@@ -257,7 +257,7 @@ _JUMP = 25.0
 def resolution(verdicts: xr.Dataset, *, width: style.Width = "double") -> Figure:
     """Draw how many contacts another one resembles, against the signals' tolerance.
 
-    A panel for each region. The paper's three triplets stand out by colour, dashes and markers; the
+    There is one panel per region. The paper's three triplets have colours, dashes and markers; the
     others are pale.
 
     Parameters

@@ -48,12 +48,12 @@ def whisker_views(
     radius : array_like (n,) or float
         Radius of the whisker at these points, m.
     name : str, optional
-        Written above.
+        Title of the figure.
     magnification : float, optional
-        Factor by which the whisker is drawn too wide; chosen by default so that the base is easily
-        seen, and always stated in the figure.
+        Factor by which the width of the whisker is magnified, which the figure states; by default
+        it is chosen so that the base is easily visible.
     assumed : sequence of str
-        Properties of the whisker that were not measured; written under the magnification.
+        Properties of the whisker that were not measured, listed below the magnification.
     width : {"single", "double"}
         Columns of the page.
 
@@ -193,27 +193,27 @@ def bent_views(
     Parameters
     ----------
     rest : array_like (n, 3)
-        The resting whisker, from base to tip, whisker frame, m.
+        Resting whisker, from base to tip, whisker frame, m.
     centerlines : array_like (m, k, 3)
-        The bent ones, m; those with NaN, which have no equilibrium, are left out.
+        Bent whiskers, m; those with NaN, which have no equilibrium, are left out.
     contact_points : array_like (m, 3), optional
         Contact point of each whisker, m.
     forces : array_like (m, 3), optional
-        Forces on the whisker, whisker frame, N: drawn as arrows that end in the contact points, the
-        longest a fifth as long as the whisker.
+        Forces on the whisker, whisker frame, N, drawn as arrows that end at the contact points; the
+        longest arrow is a fifth as long as the whisker.
     labels : sequence of str, optional
-        One for each. With up to four curves each has a colour of its own; more are shaded from
-        first to last.
+        Labels of the bent whiskers. Up to four have distinct colours; more are shaded from first to
+        last.
     finding : str, optional
         Sentence above the figure; by default the range of the forces.
     width : {"single", "double"}
-        Columns of the page: the views stand side by side in two, one below the other in one.
+        Columns of the page: the views are side by side in two, one below the other in one.
 
     Returns
     -------
     Figure
-        Two axes, in mm, and where there is room for it the sizes of the forces; or the sentence
-        "nothing bent".
+        Two axes in mm and, if there is room, the sizes of the forces; or the sentence "nothing
+        bent".
 
     Raises
     ------

@@ -67,12 +67,11 @@ FULL_DURATION = 3.5
 SIMULATED, TRACKED = "simulated.nc", "tracked.nc"
 """Recordings that are reused in later runs, as videos are."""
 
-# Files that are written again in each run.
 _VIEWS = ("top", "front")
+# Files that are written again in each run.
 _WRITTEN = ("trial.nc", "seen.nc", "contacts.csv", "map.nc")
-# Number of points by which whiskers are compared.
 _SETTINGS = ".settings.json"
-_NODES = 9
+_NODES = 9  # number of points by which whiskers are compared
 # Properties that cameras cannot measure, and that a laboratory knows from other measurements.
 _PROPERTIES = ("base_radius", "tip_radius", "youngs_modulus", "poisson_ratio")
 _DIM = {"whisker": 0}

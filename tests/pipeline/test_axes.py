@@ -6,7 +6,7 @@ import xarray as xr
 
 import vibrissa as vb
 from vibrissa.contacts import rubbing_misfits
-from vibrissa.pipeline import axes, doubted_axes
+from vibrissa.pipeline import checks, doubted_axes
 from vibrissa.sensors import SensorFrame, component_noise
 
 NOISE = component_noise(1e-6, 2e-8)
@@ -61,7 +61,7 @@ def test_axes_that_are_right_need_no_fits(monkeypatch):
         asked.append(given[-1])
         return rubbing_misfits(*given)
 
-    monkeypatch.setattr(axes, "rubbing_misfits", noted)
+    monkeypatch.setattr(checks, "rubbing_misfits", noted)
     assert doubted_axes(vb.samples.gamma(), measured(vb.samples.gamma()), NOISE) == ""
     assert asked == [False]
 

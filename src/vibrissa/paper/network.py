@@ -162,7 +162,6 @@ def train_network(
     samples : int
         Number of training contacts, a tenth of which is used for early stopping. Training takes
         about ten seconds for 30,000.
-        30,000.
     held_out : int
         Number of test contacts.
     seed : int

@@ -3,22 +3,21 @@
 Each stage is a function that takes a recording and returns a new dataset.
 """
 
-from vibrissa.pipeline.axes import doubted_axes as doubted_axes
+from vibrissa.pipeline.checks import (
+    check_recording as check_recording,
+    doubted_axes as doubted_axes,
+    edited as edited,
+    whisker_radii as whisker_radii,
+)
 from vibrissa.pipeline.estimates import (
+    EVENTS as EVENTS,
     Progress as Progress,
     contact_columns as contact_columns,
+    contact_events,
     estimates_of,
     in_laboratory as in_laboratory,
     swept_recording as swept_recording,
-)
-from vibrissa.pipeline.events import (
-    EVENTS as EVENTS,
-    contact_events,
     with_events as with_events,
-)
-from vibrissa.pipeline.frames import (
-    check_recording as check_recording,
-    whisker_radii as whisker_radii,
 )
 from vibrissa.pipeline.locate import (
     DETECTED as DETECTED,
@@ -27,7 +26,6 @@ from vibrissa.pipeline.locate import (
     locate_around,
     locate_from_wrench,
 )
-from vibrissa.pipeline.made_from import edited as edited
 from vibrissa.pipeline.predictors import PREDICTORS as PREDICTORS, predictors
 from vibrissa.pipeline.reconstruct import (
     AGREES as AGREES,

@@ -14,11 +14,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.contacts import ContactMap, Gravity, Prior
+from vibrissa.contacts import SLIPPING, ContactEvents, ContactMap, Gravity, Place, Prior, in_order
 from vibrissa.contour import continuing_candidates, to_laboratory
-from vibrissa.numerics import Array, cross_matrix
-from vibrissa.pipeline.events import EVENTS, with_events
-from vibrissa.pipeline.frames import signals_in
+from vibrissa.numerics import Array, contacts_in, cross_matrix
+from vibrissa.pipeline.checks import signals_in
 from vibrissa.pipeline.locate import TRIPLET, locate, locate_from_wrench, without_contact
 from vibrissa.pipeline.signals import sensor_noise
 from vibrissa.quantities import attributes
@@ -26,7 +25,7 @@ from vibrissa.recording import Group, Recording, coordinates, recorded, recordin
 from vibrissa.rod import PROXIMAL
 from vibrissa.sensors import StageSweep, SuspendedWhisker, SweptContacts
 from vibrissa.signals import selection, spherical
-from vibrissa.status import Status, is_ok
+from vibrissa.status import Event, Status, flag_attributes, is_ok
 from vibrissa.whisker import Whisker
 
 Progress = Callable[[str, int, int], None]
@@ -38,6 +37,8 @@ NORMAL_SIGMA = 0.1
 _OTHER = 0.01  # largest relative difference between the whiskers of a map and of a recording
 _LABORATORY = {"reference_frame": "laboratory"}
 _SQUARE = ("time", "space", "space_2")
+_UNIQUE = (Status.OK, Status.UNIQUE)
+EVENTS = ("event", "onset_time", "onset_sigma")  # variables that `with_events` adds
 
 _KEPT = (
     "contact_point",
@@ -420,3 +421,87 @@ def contact_columns(contacts: xr.Dataset) -> xr.Dataset:
     around = ("arc_length", "last_arc_length", "shift_x", "shift_y", "shift_z")
     kept = ("one_contact", "status", *EVENTS, *(around if "shift_x" in contacts else ()))
     return table.assign({name: contacts[name] for name in kept if name in contacts})
+
+
+def with_events(
+    located: xr.Dataset, point: str, covariance: str, pose: tuple[Array, Array] | None = None
+) -> xr.Dataset:
+    """Add onset, loss and slip (variables `EVENTS`) to the contacts of one whisker from `locate`.
+
+    ``point`` and ``covariance`` name the variables with the contact point and its covariance;
+    ``pose`` are the rotations (n, 3, 3) and positions (n, 3) of the base if the point is in the
+    laboratory frame. A contact that includes the first frame has no onset, and slips are detected
+    only where covariances are known. If contact is detected from the sensor's readings, these also
+    give the onset time; otherwise it is that of the first frame, without a standard deviation.
+    """
+    time, touching = located["time"].values, located["in_contact"].values
+    known = located["status"].values != Status.MISSING
+    events = ContactEvents(SLIPPING * float(located.attrs["length"]))
+    points, spreads = located[point].values, located[covariance].values
+    unique = np.isin(located["status"].values, _UNIQUE) & np.isfinite(spreads).all(axis=(1, 2))
+    readings, valid = located["excess"].values, located["covariance_valid"].values
+    happened, onsets = [], []
+    for i, moment in enumerate(time.tolist()):
+        held = () if pose is None else (pose[0][i], pose[1][i])
+        place = Place(points[i], spreads[i], bool(valid[i]), *held) if unique[i] else None
+        on = bool(touching[i]) if known[i] else None
+        happened.append(events(moment, on, readings[i], place))
+        onsets.append(events.onset)
+    if known.any() and touching[first := int(known.argmax())]:
+        happened[first] = Event.NONE
+    codes, begun = in_order(time, happened, onsets)
+    values = (codes.astype(np.int8), begun[:, 0], begun[:, 1])
+    about = {"event": flag_attributes(Event)}
+    return located.assign(
+        {
+            name: ("time", each, {**attributes(name), **about.get(name, {})})
+            for name, each in zip(EVENTS, values, strict=True)
+        }
+    )
+
+
+def contact_events(contacts: xr.Dataset) -> xr.Dataset:
+    """List contacts with their onset and release.
+
+    Parameters
+    ----------
+    contacts : xarray.Dataset
+        Group ``estimates`` or ``signals`` of a recording, as returned by `estimates_of` or
+        `signals_of`. Inertia does not cause spurious contacts in signals made with ``dynamics``.
+
+    Returns
+    -------
+    xarray.Dataset
+        Dataset with the dimension ``contact``, in order of time: name of the ``whisker``, ``onset``
+        and ``release``, s, NaN where the recording begins or ends in contact, and
+        ``largest_force``, N. For estimates also ``onset_sigma``, s, and the number of ``slips``.
+    """
+    time, rows = contacts["time"].values, []
+    dated = all(name in contacts for name in EVENTS)
+    for k, name in enumerate(contacts["whisker"].values):
+        one = contacts.isel(whisker=k)
+        size = np.linalg.norm(one["force"].values, axis=-1)
+        seen = one["status"].values != Status.MISSING if "status" in one else None
+        for first, end in contacts_in(one["in_contact"].values.astype(bool), seen):
+            onset = time[first] if first else np.nan
+            release = time[end] if end < len(time) else np.nan
+            row = [first, str(name), onset, release, largest_of(size[first:end])]
+            if dated:
+                inside = one.isel(time=slice(first, end))
+                begun = inside["onset_time"].values[-1]
+                row[2] = begun if first and np.isfinite(begun) else onset
+                row += [inside["onset_sigma"].values[-1]]
+                row += [int((inside["event"].values == Event.SLIP).sum())]
+            rows.append(tuple(row))
+    rows.sort()
+    names = ("onset", "release", "largest_force", *(("onset_sigma", "slips") if dated else ()))
+    columns: list[Any] = list(zip(*(row[1:] for row in rows), strict=True)) or [()] * 6
+    data: dict[str, Any] = {"whisker": ("contact", list(columns[0]))}
+    for name, values in zip(names, columns[1 : len(names) + 1], strict=True):
+        data[name] = ("contact", np.array(values), attributes(name))
+    return xr.Dataset(data)
+
+
+def largest_of(sizes: Array) -> float:
+    """Largest finite value; NaN if there is none."""
+    return float(np.nanmax(sizes)) if np.isfinite(sizes).any() else np.nan

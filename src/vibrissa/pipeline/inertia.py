@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from vibrissa.contour import to_laboratory
 from vibrissa.deferred import ndimage, signal
 from vibrissa.numerics import Array, contacts_in
-from vibrissa.pipeline.frames import one_whisker
+from vibrissa.pipeline.checks import one_whisker
 from vibrissa.pipeline.locate import locate_from_wrench
 from vibrissa.recording import Group, recorded
 from vibrissa.simulation import Dynamics, Vibration, fit_dynamics, inertial_wrench

@@ -16,7 +16,7 @@ import xarray as xr
 from vibrissa.contacts import friction_assumed
 from vibrissa.io import check_scale
 from vibrissa.numerics import Array
-from vibrissa.pipeline.events import EVENTS
+from vibrissa.pipeline.estimates import EVENTS
 from vibrissa.quantities import attributes
 from vibrissa.recording import ONE_VIEW, Recording
 from vibrissa.signals import base_signals

@@ -32,8 +32,8 @@ from vibrissa.contour import (
 )
 from vibrissa.numerics import Array
 from vibrissa.objects import Peg, Sphere, Surface
+from vibrissa.pipeline.checks import EACH, estimates_in, whisker_radii
 from vibrissa.pipeline.estimates import WHOLE
-from vibrissa.pipeline.frames import EACH, estimates_in, whisker_radii
 from vibrissa.quantities import attributes
 from vibrissa.recording import Group, Recording
 from vibrissa.signals import nearest_on_rest

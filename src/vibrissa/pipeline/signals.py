@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from vibrissa.deferred import transform
 from vibrissa.numerics import Array, cross_matrix
-from vibrissa.pipeline.frames import (
+from vibrissa.pipeline.checks import (
     SQUARES,
     check_recording,
     names_of,

@@ -18,9 +18,8 @@ from vibrissa.contacts import friction_assumed
 from vibrissa.contour import FittedShape, shape_from_dataset
 from vibrissa.io import events_in
 from vibrissa.numerics import contacts_in
-from vibrissa.pipeline.estimates import Progress, estimates_of
-from vibrissa.pipeline.frames import check_recording
-from vibrissa.pipeline.made_from import MADE_FROM, edited, made_from
+from vibrissa.pipeline.checks import MADE_FROM, check_recording, edited, made_from
+from vibrissa.pipeline.estimates import Progress, estimates_of, largest_of
 from vibrissa.pipeline.reconstruct import reconstruct
 from vibrissa.pipeline.signals import signals_of
 from vibrissa.recording import Recording
@@ -234,5 +233,4 @@ def _largest(values: np.ndarray | None, touching: np.ndarray | None) -> float:
     """Largest length of vectors (time, whisker, 3) in contact; NaN if unknown."""
     if values is None or touching is None:
         return np.nan
-    sizes = np.linalg.norm(values, axis=-1)[touching]
-    return float(np.nanmax(sizes)) if np.isfinite(sizes).any() else np.nan
+    return largest_of(np.linalg.norm(values, axis=-1)[touching])

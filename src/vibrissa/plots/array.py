@@ -45,18 +45,18 @@ from vibrissa.whisker import Identity
 ROW_COLOURS: Mapping[str, str] = MappingProxyType(
     {"A": "#0072b2", "B": "#56b4e9", "C": "#009e73", "D": "#e69f00", "E": "#d55e00"}
 )
-# From where space is seen: elevation and azimuth, degrees; from before the animal's right, and from
-# behind it, where one sees the side of things that whiskers touch.
 _HEAD, _THING, _EDGE = "#e9e2da", "#d5d9de", "#b3aba2"
+# Views of space, elevation and azimuth, degrees: from in front of the animal's right, and from
+# behind it, where the touched sides of objects are visible.
 _AT_REST, _IN_A_TRIAL = (22.0, 38.0), (26.0, -22.0)
 _CLEAR = 0.7  # opacity of objects in space, which hide what touches them from behind
-# Room around and between the panels, mm.
 _PANELS = (
     # letter, title, right and up, sense of the axis to the right, axis toward the viewer
     ("a", "from above", (0, 1), 1.0, 2),
     ("c", "from the front", (0, 2), -1.0, 1),
     ("d", "from its right", (1, 2), 1.0, 0),
 )
+# Room around and between the panels, mm.
 _LEFT, _GAP, _BOTTOM, _TOP, _RIGHT = 10.0, 13.0, 8.5, 6.5, 3.0
 
 
@@ -77,9 +77,13 @@ class _Scene:
     def colours(self) -> list[str]:
         return [_colour(name) for name in self.names]
 
+    def rows(self, names: list[str]) -> list[str]:
+        """Known rows of some whiskers."""
+        return sorted({Identity.of(name).row for name in names if _colour(name) != INK})
+
     @property
     def limits(self) -> Array:
-        """Limits (3, 2) that hold whiskers, head and objects with an end."""
+        """Limits (3, 2) that include whiskers, head and bounded objects."""
         parts = [self.lines.reshape(-1, 3), head_surfaces(*self.head)[0].reshape(-1, 3)]
         everywhere = np.zeros((3, 2))
         parts += [object_surface(o, everywhere)[0] for o in self.objects if is_bounded(o)]
@@ -106,24 +110,24 @@ def array_views(
         An array of whiskers (`WhiskerArray.to_tree`), which is drawn at rest in the head's frame;
         or a recording of a trial, in the laboratory frame.
     frame : int, optional
-        Moment of a recording at which whiskers and head are drawn; by default that at which most
-        whiskers touch.
+        Frame of a recording in which whiskers and head are drawn; by default the one in which most
+        whiskers are in contact.
     contacts : str
-        Group of a recording whose ``contact_point`` are drawn, at all times where ``in_contact``,
-        such as ``truth`` or ``estimates``; ``/`` is the top.
+        Group of a recording whose ``contact_point`` are drawn, for all frames ``in_contact``, such
+        as ``truth`` or ``estimates``; ``/`` is the root.
     width : {"single", "double"}
         Columns of the page.
 
     Returns
     -------
     Figure
-        Four panels; a colour each row of whiskers, and the head as a sketch. Dots are contact
-        points, those of the moment that is drawn ringed.
+        Four panels with a colour per row of whiskers, and a sketch of the head. Dots are contact
+        points; those of the drawn frame have rings.
 
     Raises
     ------
     ValueError
-        If there are no centrelines, the frame is none of the recording, or there is no such group.
+        If there are no centrelines, no such frame, or no such group.
     """
     scene = _scene(tree, frame, contacts)
     with looking():
@@ -167,7 +171,7 @@ def _finding(scene: _Scene) -> str:
     touching = [name for name, points in zip(scene.names, scene.points, strict=True) if len(points)]
     if not touching:
         return f"{len(scene.names)} whiskers at rest"
-    rows = ", ".join(sorted({Identity.of(name).row for name in touching if _colour(name) != INK}))
+    rows = ", ".join(scene.rows(touching))
     ever = f"Contact points of {len(touching)} of {len(scene.names)} whiskers"
     ever += f" (rows {rows})" if rows else ""
     return f"{ever}; {int(scene.touching.sum())} touch at {scene.moment}"
@@ -190,7 +194,7 @@ def _panel(axes: Axes, scene: _Scene, limits: Array, view: tuple[int, int], towa
         near = eyes[eyes[..., toward].mean(axis=1) > skull[..., toward].mean()]
         _flat(axes, near[..., view], INK, INK, 2.2)
     for line, colour, touching in zip(scene.lines, scene.colours, scene.touching, strict=True):
-        # Whiskers of the far side are drawn behind the head, all others in front of it.
+        # Whiskers on the far side are drawn behind the head, all others in front of it.
         behind = toward == 0 and line[0, 0] < middle[0]
         look: dict[str, Any] = {"color": colour, "linewidth": 1.1 if touching else 0.7}
         axes.plot(*line[:, view].T, zorder=1.5 if behind else 3.0, **look)
@@ -239,7 +243,7 @@ def _space(figure: Figure, box: Box, scene: _Scene, limits: Array) -> None:
     things = [_triangles(thing, limits) for thing in scene.objects]
     items = [(float((sketch[0] @ eye).mean()), skull)]
     items += [(float((t @ eye).mean()), partial(solid, t, _THING)) for t in things]
-    # A whisker's base counts as well: it grows out of its side of the head.
+    # The base counts as much as the mean, so that a whisker is on its side of the head.
     sides = 0.5 * (scene.lines[:, 0] + scene.lines.mean(axis=1)) @ eye
     items += [(float(side), partial(whisker, i)) for i, side in enumerate(sides)]
     for order, (_, draw) in enumerate(sorted(items, key=lambda item: item[0])):
@@ -249,11 +253,8 @@ def _space(figure: Figure, box: Box, scene: _Scene, limits: Array) -> None:
 
 
 def _legend(axes: Axes, scene: _Scene) -> None:
-    """Draw a legend of the rows in their colours."""
-    rows = [
-        "rows",
-        *sorted({Identity.of(name).row for name in scene.names if _colour(name) != INK}),
-    ]
+    """Draw the names of the rows in their colours."""
+    rows = ["rows", *scene.rows(scene.names)]
     for i, row in enumerate(rows):
         look: dict[str, Any] = {"fontweight": "bold", "ha": "right", "va": "bottom"}
         axes.annotate(

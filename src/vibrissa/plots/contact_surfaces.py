@@ -26,6 +26,7 @@ from vibrissa.numerics import Array
 from vibrissa.plots import style
 from vibrissa.plots.space import (
     bounds,
+    contact_points,
     name_axes,
     paint,
     painted,
@@ -38,8 +39,8 @@ from vibrissa.plots.space import (
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import robust_limits
 
-# Values of the paper's surfaces, mm and degrees.
 _LEVELS = 3
+# Values of the paper's surfaces, mm and degrees.
 _PAPER = {"r": (11.0, 15.0, 24.0), "theta": (-25.0, 5.0, 35.0), "phi": (-25.0, 5.0, 35.0)}
 # Bearings drawn where solids and surfaces are cut open: all but a quarter.
 _OPEN = (np.pi, 2.5 * np.pi)
@@ -60,10 +61,9 @@ def contact_surfaces(
 
     For each of r, θ and φ: three surfaces on which it is the same, in the space of contact points;
     the same three in the space of (F_x, M_B, M_D); and the solid of all signals that contacts make,
-    coloured by it. It is cut open where the force's bearing at the contact is
-    between 90° and 180°, as are the signals of equal r. Contacts within
-    2° of rest are left out. Where two colours meet in the solid, the signals do
-    not determine the contact.
+    coloured by it. It is cut open where the force's bearing at the contact is between 90° and 180°,
+    as are the signals of equal r. Contacts within 2° of rest are left out. Where two colours meet
+    in the solid, the signals do not determine the contact.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def contact_surfaces(
     outside = scene.column("deflection")
     body = scene.solid_surface(opened, False, outside)
     line = to_display("centerline", centerline)
-    contacts = bounds(np.concatenate([_places(body).reshape(-1, 3), line]))
+    contacts = bounds(np.concatenate([contact_points(body).reshape(-1, 3), line]))
     shell = scene.solid_surface(whole, True, outside)
     signals = signal_limits(signal_rows(shell))
     with style.looking():
@@ -103,11 +103,11 @@ def contact_surfaces(
             among, into, inside = panels[3 * i : 3 * i + 3]
             axes = _contact_axes(figure, among, contacts)
             surface, hues = _level_sets(whole, name, norm, marks)
-            paint(axes, _places(surface), hues)
+            paint(axes, contact_points(surface), hues)
             axes.plot(*line.T, color="black", linewidth=1.2, zorder=10)
             _write_values(figure, among.box, name, norm, marks)
             axes = _cylinder(figure, into, signals)
-            if name == "r":  # its surfaces lie one within the other
+            if name == "r":  # its surfaces enclose one another
                 surface, hues = _level_sets(opened, name, norm, marks)
             paint(axes, signal_rows(surface), hues)
             axes = _cylinder(figure, inside, signals)
@@ -148,10 +148,6 @@ def _write_values(
         place = (box[0] + 5.5 + 9.5 * i) / wide, (box[1] + box[3] - 3.6) / tall
         look: dict[str, Any] = {"fontsize": style.SMALL, "fontweight": "bold", "va": "top"}
         figure.text(*place, text, color=style.sequential()(norm(mark)), **look)
-
-
-def _places(triangles: Array) -> Array:
-    return to_display("contact_point", triangles[..., :3])
 
 
 def levels(name: str, shell: Array) -> tuple[Normalize, list[float]]:
@@ -284,8 +280,8 @@ def _gentle(nodes: Array, measured: Array) -> Array:
 _PANELS = ("r", "theta", "phi", "error_distance")
 _CIRCLES = {"MD": ("MB", "My", "Mz"), "FD": ("FT", "Fy", "Fz")}
 _STEPS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)  # errors, mm, that have a tick
-# Angles below this, degrees, are not worth lines: a planar whisker stays in its plane.
 _MOST = 12_000
+# Angles below this, degrees, are not worth lines: a planar whisker stays in its plane.
 _NOTHING = 0.1
 
 
@@ -351,20 +347,20 @@ def _slices(
 ) -> None:
     grid = figure.subplots(*shape, sharex=True, sharey=True, squeeze=False)
     panels = grid.ravel()
-    # The dimension that is a size lies on the vertical axis, that with both signs on the other.
+    # The signal that is a size is on the vertical axis, the one with both signs on the other.
     dims = sorted(map(str, plane["r"].dims), key=lambda n: n in ("FT", "MB"))
     x, y = (to_display(n, plane[n].to_numpy()) for n in dims)
-    # Before anything is drawn, as labels of lines are fitted to the axes as they are.
+    # Scales are set before anything is drawn, as labels of lines are fitted to the axes.
     known = np.isfinite(plane["r"].transpose(*dims).to_numpy())
     for i, (axis, values) in enumerate(zip("xy", (x, y), strict=True)):
         there = values[known.any(axis=1 - i)]
-        style.scale_near_zero(
-            panels[0], axis, np.array([there.min(), there.max()]), _width(plane, dims[i])
-        )
+        width = plane[dims[i]].attrs.get("linear_width")
+        width = None if width is None else float(to_display(dims[i], width))
+        style.scale_near_zero(panels[0], axis, np.array([there.min(), there.max()]), width)
     for axes, name, letter in zip(panels, names, letters, strict=False):
         values = to_display(name, plane[name].transpose(*dims[::-1]).to_numpy())
         _lines(axes, x, y, values, name)
-        style.head(axes, letter, _title(name))
+        style.head(axes, letter, f"{quantity(name).long_name} ({quantity(name).display_unit})")
     if "small_deflection" in plane:
         near = plane["small_deflection"].transpose(*dims[::-1]).to_numpy()
         for axes in panels[: len(names)]:
@@ -376,16 +372,6 @@ def _slices(
         axes.set_xlabel(axis_label(dims[0]))
     for axes in grid[:, 0]:
         axes.set_ylabel(axis_label(dims[1]))
-
-
-def _width(plane: xr.Dataset, name: str) -> float | None:
-    width = plane[name].attrs.get("linear_width")
-    return None if width is None else float(to_display(name, width))
-
-
-def _title(name: str) -> str:
-    q = quantity(name)
-    return f"{q.long_name} ({q.display_unit})"
 
 
 def _lines(axes: Axes, x: Array, y: Array, values: Array, name: str) -> None:
@@ -457,12 +443,9 @@ def _solid(figure: Figure | SubFigure, solid: xr.Dataset, plane: xr.Dataset) -> 
         kept &= ~solid["small_deflection"].transpose(*dims).to_numpy().ravel().astype(bool)
     first = to_display(across, rows[size] * np.cos(rows[turn]))
     second = to_display(along, rows[size] * np.sin(rows[turn]))
-    third, error = (
-        to_display(upward, rows[upward]),
-        to_display("error_distance", rows["error_distance"]),
-    )
+    third, error = (to_display(n, rows[n]) for n in (upward, "error_distance"))
     every = kept.copy()
-    # The half before the plane of the slice is taken away, so that the inside is seen.
+    # The half in front of the plane of the slice is omitted, so that the inside is visible.
     value = float(plane.attrs.get("value", -0.5 * np.pi))
     if plane.attrs.get("fixed", turn) == turn:
         kept &= np.sin(rows[turn] - value) <= 0.02

@@ -28,10 +28,10 @@ from vibrissa.plots.style import (
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import COORDINATES, Course, deflection_angles, robust_limits
 
-# Visible part of the head: its eyes and the snout, mm.
 _SNAPSHOTS = 7
+# Visible part of the head: its eyes and the snout, mm.
 _FACE = np.array([[-11.0, -26.0, 2.0], [11.0, -26.0, 2.0], [0.0, 0.0, 0.0]])
-_ROOM = 2.0  # around what is to be seen, mm
+_ROOM = 2.0  # margin of the views, mm
 _VIEWS = ((0, 1), (0, 2), (0, 1), (1, 2))
 _TITLES = (
     "about the whisker, top",
@@ -52,18 +52,18 @@ def contact_places(
 ) -> Figure:
     """Draw contacts in the whisker frame and the laboratory frame, in two views each.
 
-    In the whisker's frame they lie about the resting whisker, drawn black; in the laboratory, with
-    the deflected whisker at some times and a simple head at its base, they gather where the object
-    is.
+    In the whisker frame, contacts are around the resting whisker, which is black. In the laboratory
+    frame they outline the object, and are drawn with the deflected whisker at some times and a
+    sketch of the head.
 
     Parameters
     ----------
     course : Course
-        The trial.
+        Trial with contact points.
     centerline : array_like (k, 3)
         Resting whisker, whisker frame, m.
     bodies, fitted : sequence of object
-        Objects as they are, filled grey, and as they were fitted to contacts, dashed: with
+        Known objects, filled grey, and shapes fitted to contacts, dashed: with
         ``signed_distance``, laboratory frame, m.
     colour : {"time", "deflection_angle"}
         Quantity that colours the contacts: their time, or the angle at the base between the resting
@@ -156,7 +156,6 @@ def _laboratory(
     points = to_display("contact_point", places)
     lines = _snapshots(course)
     rat = head_of(course)
-    # The head is seen as far as its eyes.
     face = 1e3 * rat.snout + _FACE @ rat.axes.T
     shown = np.concatenate([lines.reshape(-1, 3), _inner(points), face])
     limits = _limits(shown[np.isfinite(shown).all(axis=1)])
@@ -205,14 +204,14 @@ def estimated_against_true(
     colour_name: str = "deflection_angle",
     known_as: str = "true",
 ) -> Figure:
-    """Draw estimated against true r, θ and φ; below, over time: their course, and the error.
+    """Draw estimated against true r, θ and φ, and below both and the error over time.
 
     Parameters
     ----------
     true_spherical, estimated_spherical : array_like (n, 3)
         (r, θ, φ) of the contact points, whisker frame, m and rad; rows with NaN are left out.
     time : array_like (n,), optional
-        Times of the frames, s; without them the courses over time are left out.
+        Times of the frames, s; without them nothing is drawn over time.
     colour : array_like (n,), optional
         Values that colour the points, SI units: by default the time, if known.
     colour_name : str
@@ -224,8 +223,8 @@ def estimated_against_true(
     -------
     Figure
         Two columns wide, three panels a row, in mm and degrees; or the sentence "no contacts".
-        Limits follow the true values, and nine tenths of the errors; how much lies outside, and the
-        median size of the error, are written above.
+        Limits include the true values and 90 % of the errors; the number of values outside and the
+        median absolute error are written above.
 
     Raises
     ------
@@ -344,12 +343,9 @@ def _errors(
     axes.set(xlabel=axis_label("time"), ylabel=axis_label(f"error_{name}"))
     unit = quantity(name).display_unit
     size = f"{np.median(np.abs(error)):.2g}{'' if unit == '°' else ' '}{unit}"
-    _remark(axes, f"median {size}, {_within(error, axes.get_ylim())} % shown")
-
-
-def _within(values: Array, limits: tuple[float, float]) -> int:
-    """Share of values between limits, as a whole percentage."""
-    return round(100.0 * float(np.mean((values >= limits[0]) & (values <= limits[1]))))
+    low, high = axes.get_ylim()
+    shown = 100.0 * float(np.mean((error >= low) & (error <= high)))
+    _remark(axes, f"median {size}, {round(shown)} % shown")
 
 
 def _remark(axes: Axes, words: str) -> None:
@@ -358,7 +354,7 @@ def _remark(axes: Axes, words: str) -> None:
 
 
 def _broken(time: Array, values: Array) -> tuple[Array, Array]:
-    """Draw a line with gaps where frames are missing."""
+    """Line over time with gaps where frames are missing."""
     order = np.argsort(time, kind="stable")
     time, values = time[order], values[order]
     step = np.diff(time)

@@ -35,13 +35,12 @@ from vibrissa.plots.space import (
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import robust_limits
 
-# 95 % of a chi-square of two degrees of freedom.
 _VIEWS = ((0, 1), (0, 2), (1, 2))
 _NAMES = "xyz"
 _TITLES = ("top", "front", "side")
-_CHI2_95 = 5.991464547107979
-# Room around and between the views, mm on paper.
+_CHI2_95 = 5.991464547107979  # 95 % of a chi-square of two degrees of freedom
 _MOST_ELLIPSES = 60
+# Room around and between the views, mm on paper.
 _LEFT, _GAP, _BAR, _BOTTOM, _TOP = 12.0, 12.0, 15.0, 8.5, 11.0
 
 
@@ -84,7 +83,7 @@ def contour_views(
     -------
     Figure
         Three axes of equal aspect in mm; how many points lie outside the first is written above
-        it. Or the sentence "no contacts".
+        it; or the sentence "no contacts".
 
     Raises
     ------
@@ -285,8 +284,8 @@ def _across(body: Body) -> str:
     return "" if radius is None else f", {2.0 * float(to_display('object_radius', radius)):.2f} mm"
 
 
-# Largest distance that is shown, µm: predictions for the lightest contacts may be any larger.
 _HEIGHT = 52.0
+# Largest distance shown, µm; predictions for the lightest contacts have no upper limit.
 _FARTHEST = 1e5
 
 
@@ -304,8 +303,8 @@ def distances_by_class(summaries: Sequence[xr.Dataset], *, width: style.Width = 
     -------
     Figure
         Median and 95 % of the sizes of the distances, µm, on a logarithmic scale that ends at
-        100 mm: filled as measured, open as predicted. The number of contacts stands below each
-        class. Or the sentence "no contacts".
+        100 mm; filled markers are measured, open ones predicted. The number of contacts is below
+        each class. Or the sentence "no contacts".
     """
     shown = [s for s in summaries if int(s["contacts"].sum())]
     with style.looking():

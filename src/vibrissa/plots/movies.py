@@ -26,7 +26,6 @@ from vibrissa.numerics import Array, spherical
 from vibrissa.plots import style
 from vibrissa.plots.contact_surfaces import course_scales, solid_panels
 from vibrissa.plots.overview import (
-    Curve,
     Sight,
     Window,
     curve_legend,
@@ -214,21 +213,21 @@ def contour_frames(
 ) -> Iterator[Picture]:
     """Draw the frames of a movie: camera views, and a contour that grows contact by contact.
 
-    Above both views with the traced whisker and the contact point, and contacts about the resting
-    whisker; below contacts in the laboratory from above, from the front and from the side, in the
-    colour of their time. The outlines of objects and fitted shapes appear where contacts are, and
-    wholly in the last frame.
+    The upper row shows the camera views with the traced whisker and the contact point, and contacts
+    around the resting whisker; the lower row shows contacts in the laboratory from above, the front
+    and the side, coloured by time. The outlines of objects and fitted shapes appear near contacts,
+    and are complete in the last frame.
 
     Parameters
     ----------
     course : Course
-        The trial, with contact points.
+        Trial with contact points.
     centerline : array_like (k, 3)
         Resting whisker, whisker frame, m.
     sights : sequence of Sight
         One or two views, each with an image for each row.
     rows : array_like (m,) of int
-        Indices of the trial's frames, rising. Contacts in between are shown too.
+        Indices of the trial's frames, increasing. Contacts in between are shown too.
     bodies, fitted : sequence of object
         True objects, grey, and shapes fitted to the contacts, orange: with ``signed_distance``,
         laboratory frame, m.
@@ -236,7 +235,7 @@ def contour_frames(
     Returns
     -------
     iterator of array (720, 1280, 4)
-        8 bit red, green, blue and opacity, one for each row.
+        Images with 8-bit red, green, blue and opacity, one per row.
 
     Raises
     ------
@@ -263,17 +262,16 @@ def _contour_frames(
     bodies: tuple[Sequence[Body], Sequence[Body]],
 ) -> Iterator[Picture]:
     first, last = int(rows[0]), int(rows[-1])
+    span = slice(first, last + 1)
     time = to_display("time", course.time)
     norm = Normalize(time[first], max(time[last], time[first] + 1e-3))
     with style.looking():
         figure = screen_figure()
-        panels, parts = _views(figure, course, sights, slice(first, last + 1))
-        clouds = []
-        part, cloud = _about_whisker(figure, course, places, centerline, slice(first, last + 1))
+        panels, parts = _views(figure, course, sights, span)
+        part, cloud = _about_whisker(figure, course, places, centerline, span)
         parts.append(part)
-        clouds.append(cloud)
-        outlines = []
-        for part, cloud, lines_of in _sides(figure, course, places, bodies, slice(first, last + 1)):
+        clouds, outlines = [cloud], []
+        for part, cloud, lines_of in _sides(figure, course, places, bodies, span):
             parts.append(part)
             clouds.append(cloud)
             outlines += [(outline, cloud.places) for outline in lines_of]
@@ -334,7 +332,7 @@ def _views(
 def _about_whisker(
     figure: Figure, course: Course, places: Array, centerline: ArrayLike, span: slice
 ) -> tuple[_Part, _Cloud]:
-    """Contacts in the whisker's frame, with the resting and the deflected whisker."""
+    """Draw contacts in the whisker's frame, with the resting and the deflected whisker."""
     rest = to_display("centerline", centerline)
     points = to_display("contact_point", course.at_base(places))
     count = len(course.time)
@@ -366,7 +364,7 @@ def _sides(
     bodies: tuple[Sequence[Body], Sequence[Body]],
     span: slice,
 ) -> Iterator[tuple[_Part, _Cloud, list[_Outline]]]:
-    """Contacts in the laboratory from three sides, with outlines that are still hidden."""
+    """Draw contacts in the laboratory from three sides; yield panels with hidden outlines."""
     points = to_display("contact_point", places)
     known = points[span][np.isfinite(points[span]).all(axis=1)]
     limits = room_for(known, [*bodies[0], *bodies[1]])
@@ -383,7 +381,8 @@ def _sides(
         axes = style.box_axes(figure, box, xlim=both[0], ylim=both[1])
         axes.set(xlabel=axis_label("xyz"[i]), ylabel=axis_label("xyz"[j]))
         axes.set_title(title, loc="left", pad=3.0)
-        window = _window(limits, view, both)
+        window = limits.copy()
+        window[list(view)] = both
         reach = _REVEALED * float(np.ptp(both[0]))
         outlines = [
             _Outline(axes, outline_segments(body, view, window), reach, look)
@@ -409,13 +408,6 @@ def _dot_size(count: int) -> float:
     return float(np.clip(7.0 * (300.0 / max(count, 1)) ** 0.7, 1.5, 7.0))
 
 
-def _window(limits: Array, view: tuple[int, int], both: Array) -> Array:
-    """Limits of a panel, and of the contacts along the line of sight."""
-    window = limits.copy()
-    window[list(view)] = both
-    return window
-
-
 def _bar(figure: Figure, norm: Normalize) -> None:
     rail = style.box_axes(figure, _RAIL)
     style.colour_bar(figure, ScalarMappable(norm, style.sequential()), cax=rail)
@@ -423,7 +415,7 @@ def _bar(figure: Figure, norm: Normalize) -> None:
     rail.tick_params(length=2.0, pad=1.5)
 
 
-_TRAIL = 0.05  # duration for which the way just gone stays bold, s
+_TRAIL = 0.05  # duration of the path behind the dot that is drawn bold, s
 _BOXES = tuple(
     (left, bottom, wide, 12.0)
     for left, wide in ((14.0, 83.0), (115.0, 86.0))
@@ -439,18 +431,18 @@ def signal_frames(
     Parameters
     ----------
     course : Course
-        The trial, with signals.
+        Trial with signals.
     samples : Dataset
         ``ContactMap.to_dataset()`` of the whisker.
     centerline : array_like (k, 3)
         Resting whisker, whisker frame, m.
     rows : array_like (m,) of int
-        Indices of the trial's frames, rising; time axes reach from the first to the last.
+        Indices of the trial's frames, increasing; time axes range from the first to the last.
 
     Returns
     -------
     iterator of array (720, 1280, 4)
-        8 bit red, green, blue and opacity, one for each row.
+        Images with 8-bit red, green, blue and opacity, one per row.
 
     Raises
     ------
@@ -487,40 +479,34 @@ def _signal_frames(
         points = course.known if course.estimated is None else course.estimated
         coordinates = np.full(places.shape, np.nan) if points is None else spherical(points)
         scales = course_scales(figure, rails, coordinates[span])
-        for axes, way, (values, norm) in zip(solids, ways, scales, strict=True):
-            segments, means = coloured_segments(way[span], values)
+        for axes, way, (shade, norm) in zip(solids, ways, scales, strict=True):
+            segments, means = coloured_segments(way[span], shade)
             path = LineCollection(
                 list(segments), cmap=style.sequential(), norm=norm, linewidths=1.0
             )
             path.set(array=means, transform=axes.transData, clip_on=False)
             figure.add_artist(path)
-        curves = curves_over_time(figure, _BOXES, course, signals, slice(first, last + 1))
+        curves = curves_over_time(figure, _BOXES, course, signals, span)
         curve_legend(figure, course, (1.0 - 2.0 / WIDTH, 48.0 / HEIGHT))
-        marks = [_mark(curve, time[first]) for curve in curves]
+        dot_look = {"marker": "o", "color": style.ORANGE}
+        cursors = [
+            curve.axes.axvline(time[first], color=style.ORANGE, linewidth=0.8, animated=True)
+            for curve in curves
+        ]
+        values = [moving_line(c.axes, markersize=3.5, zorder=5, **dot_look) for c in curves]
         clock = figure.text(0.0125, 0.985, "", va="top", fontsize=style.LARGE, animated=True)
         trails = [flat_line(a, color=style.INK, linewidth=0.6, animated=True) for a in solids]
         look = {"markeredgecolor": "white", "markeredgewidth": 0.6, "linestyle": "none"}
-        dots = [
-            flat_line(a, marker="o", markersize=5.5, color=style.ORANGE, animated=True, **look)
-            for a in solids
-        ]
+        dots = [flat_line(a, markersize=5.5, animated=True, **dot_look, **look) for a in solids]
         screen = Screen(figure)
-    moving = [cursor for cursor, _ in marks] + [dot for _, dot in marks]
     for row in rows:
         begin = int(np.searchsorted(course.time, course.time[row] - _TRAIL))
         begin = max(begin, first)
         for way, trail, dot in zip(ways, trails, dots, strict=True):
             trail.set_data(*way[begin : row + 1].T)
             dot.set_data(*way[row : row + 1].T)
-        for curve, (cursor, point) in zip(curves, marks, strict=True):
+        for curve, cursor, point in zip(curves, cursors, values, strict=True):
             cursor.set_xdata([time[row], time[row]])
             point.set_data([time[row]], curve.values[row : row + 1])
         clock.set_text(f"{time[row]:.3f} s" + (", in contact" if course.touching[row] else ""))
-        yield screen.frame([*trails, *dots, *moving, clock])
-
-
-def _mark(curve: Curve, time: float) -> tuple[Line2D, Line2D]:
-    """A cursor and a dot that move over a curve."""
-    cursor = curve.axes.axvline(time, color=style.ORANGE, linewidth=0.8, animated=True)
-    dot = moving_line(curve.axes, marker="o", markersize=3.5, color=style.ORANGE, zorder=5)
-    return cursor, dot
+        yield screen.frame([*trails, *dots, *cursors, *values, clock])

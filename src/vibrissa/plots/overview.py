@@ -6,7 +6,7 @@ Camera views show a part of the image with the traced whisker and the contact po
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -25,36 +25,23 @@ from vibrissa.plots.space import coloured_segments, drop_lines, signal_places
 from vibrissa.quantities import axis_label, to_display
 from vibrissa.scene import COORDINATES, TRIPLET, Course
 
+if TYPE_CHECKING:
+    from vibrissa.cameras import Camera
+
 Grey = NDArray[np.uint8]
 
-# Grey value beyond the edge of an image.
 _ROOM = 0.08
-_LIGHT = 235
-
-
-class _View(Protocol):
-    """Interface of a camera."""
-
-    @property
-    def name(self) -> str:
-        """Name of the view."""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height of its images, pixels."""
-
-    def project(self, points: ArrayLike) -> Array:
-        """Column and row (..., 2), pixels, of points (..., 3), laboratory frame, m."""
+_LIGHT = 235  # grey value beyond the edge of an image
 
 
 class Sight(NamedTuple):
     """One view of a trial."""
 
-    view: _View
+    view: Camera
     images: Iterable[Grey]
 
 
-def seen(course: Course, views: Sequence[_View], number: int) -> tuple[Array, Array]:
+def seen(course: Course, views: Sequence[Camera], number: int) -> tuple[Array, Array]:
     """Positions of whisker and contact in the images of a view."""
     count = len(course.time)
     if number < len(course.traces):
@@ -69,7 +56,7 @@ def seen(course: Course, views: Sequence[_View], number: int) -> tuple[Array, Ar
 
 
 def part_of(lines: Array, shape: tuple[float, float], size: tuple[int, int]) -> tuple[Array, Array]:
-    """Part of the images in which a whisker moves."""
+    """Lower and upper corner of the part of the images in which a whisker moves."""
     places = lines.reshape(-1, 2)
     places = places[np.isfinite(places).all(axis=1)]
     whole = np.asarray(size, dtype=np.float64)
@@ -98,7 +85,7 @@ class Window:
         self._beyond = np.float32(_LIGHT) * (1.0 - covered.astype(np.float32))
 
     def of(self, image: Grey) -> Grey:
-        """Show the part."""
+        """Resample the part of an image."""
         if image.shape != self._size[::-1]:
             raise ValueError(
                 f"an image has {image.shape[1]} × {image.shape[0]} pixels; the camera has "
@@ -126,7 +113,7 @@ def sight_axes(figure: Figure, box: style.Box, low: Array, high: Array) -> Axes:
     return axes
 
 
-def scale_bar(axes: Axes, course: Course, view: _View) -> None:
+def scale_bar(axes: Axes, course: Course, view: Camera) -> None:
     """Draw a bar of 5 mm below the right end of an image."""
     base = np.nanmean(course.position, axis=0)
     ends = view.project(base + 0.5e-3 * np.concatenate([np.eye(3), -np.eye(3)]))
@@ -149,9 +136,7 @@ def scale_bar(axes: Axes, course: Course, view: _View) -> None:
     )
 
 
-_GAP = 2.0
-_TITLE = 6.0
-_LINE = 4.0
+_GAP, _TITLE, _LINE = 2.0, 6.0, 4.0  # gap between images, title, and a line of a remark, mm
 
 
 def start_views(
@@ -160,7 +145,7 @@ def start_views(
     names: Sequence[str],
     remarks: Sequence[str] = (),
 ) -> Figure:
-    """Draw lines that may be the whisker, with their confidence, into an image of each view."""
+    """Draw candidate whiskers, with their confidence, on an image of each view."""
     wide = (style.page_width("double") - _GAP * (len(images) - 1)) / len(images)
     heights = [wide * image.shape[0] / image.shape[1] for image in images]
     below = _LINE * len(remarks) + _GAP
@@ -244,14 +229,15 @@ def trial_overview(
 ) -> Figure:
     """Draw a trial: camera views, signals and contacts over time, solids, estimates.
 
-    Frames show the traced whisker in red and the contact point. Below the three signals and the
-    coordinates of the contact over time, with contact shaded; the trajectory in signal space,
-    coloured by r, θ and φ; and, two columns wide only, estimated against known coordinates.
+    The camera views show the traced whisker in red, and the contact point. Below are the three
+    signals and the coordinates of the contact over time, with contacts shaded; the trajectory in
+    signal space, coloured by r, θ and φ; and, at double width only, estimated against known
+    coordinates.
 
     Parameters
     ----------
     course : Course
-        The trial, with signals.
+        Trial with signals.
     samples : Dataset
         ``ContactMap.to_dataset()`` of the whisker.
     centerline : array_like (k, 3)
@@ -259,7 +245,7 @@ def trial_overview(
     sights : sequence of Sight
         One or two views, each with an image for each row.
     rows : array_like (m,) of int
-        Frames of the trial to be shown, one or two, rising.
+        Indices of one or two frames to show, increasing.
     width : {"single", "double"}
         Columns of the page.
 
@@ -302,7 +288,7 @@ def trial_overview(
 
 
 def _spans(course: Course, span: slice = slice(None)) -> Array:
-    """Start and end times of contacts, s; frames without a pose do not end a contact."""
+    """Start and end times (n, 2) of contacts, s; frames without a pose do not end a contact."""
     seen = np.asarray(np.isfinite(course.position).all(axis=1))
     return intervals(course.time[span], course.touching[span], seen[span])
 
@@ -384,7 +370,7 @@ def _trajectory(
     centerline: ArrayLike,
     rows: NDArray[np.intp],
 ) -> None:
-    """The trial in the space of signals, coloured by r, θ and φ; shown frames with drop lines."""
+    """Draw the trial in the space of signals, coloured by r, θ and φ; mark the shown frames."""
     from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-untyped]
 
     assert course.signals is not None
@@ -412,7 +398,7 @@ def _trajectory(
 
 
 def _compared(figure: Figure, boxes: Sequence[style.Box], course: Course) -> None:
-    """Estimated against known coordinates, coloured by time."""
+    """Draw estimated against known coordinates, coloured by time."""
     assert course.known is not None
     assert course.estimated is not None
     known, estimated = spherical(course.known), spherical(course.estimated)
@@ -432,7 +418,7 @@ def _compared(figure: Figure, boxes: Sequence[style.Box], course: Course) -> Non
 
 
 def _letters(figure: Figure, sheet: _Sheet) -> None:
-    """Bold letters, row by row."""
+    """Label the panels with bold letters, row by row."""
     wide, tall = 25.4 * figure.get_size_inches()
     rows = [
         [(box[0], box[1] + box[3] + 1.0) for box in sheet.sights[:1]],
@@ -522,7 +508,7 @@ def _coordinate(
     if known is not None:
         shown = to_display(name, known[:, column])
         axes.plot(time[span], shown[span], color=style.MUTED, linewidth=1.6, zorder=1)
-        # What is tracked may be wrong now and then, what is true is not.
+        # Tracked values may contain outliers; true values do not.
         limits.append(_ends(shown[span], 0.0 if true else 0.01))
     if estimated is not None:
         shown = to_display(name, estimated[:, column])

@@ -18,15 +18,15 @@ from vibrissa.plots import style
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import COORDINATES, DIRECTIONS, robust_limits
 
-# Quantiles that are drawn, which of them is the median, and which bound the two bands.
 BINS = 25
 SHARE = 0.99
 _PAPER = ("MD", "MB", "Fx")
+# Quantiles that are drawn, which of them is the median, and which bound the two bands.
 _SHARES = (0.1, 0.25, 0.5, 0.75, 0.9)
 _MEDIAN = 2
 _BANDS = ((0, 4), (1, 3))
-# Signals that reach so many times their lowest tenth get an axis that is wider near zero.
 _HEIGHTS = {"single": 104.0, "double": 125.0}
+# Signals that reach so many times their lowest tenth get an axis that is wider near zero.
 _SKEWED = 30.0
 _LEAST = 0.01  # share of the contacts of a side that a bin needs for its median to be drawn
 
@@ -51,11 +51,11 @@ def derivative_label(coordinate: str, signal: str) -> str:
 def sensitivity_panels(data: xr.Dataset, *, width: style.Width = "double") -> Figure:
     """Draw the derivatives of r, θ and φ with respect to three signals, over these signals.
 
-    Nine panels: a row for each coordinate, a column for each signal, in each the derivative over
-    the signal, of concave forward and concave backward contacts (by the volume that they stand for,
-    if the dataset has it): the median in 25 bins, and bands that hold half and four fifths of the
-    contacts. Axes hold the central 99 % of the signals; contacts within 2° of rest are left out.
-    Signals that pile up near zero have an axis that is wider there.
+    The nine panels have a row per coordinate and a column per signal. Each shows the derivative
+    over the signal, for concave forward and concave backward contacts (weighted by the volume that
+    they represent, if known): the median in 25 bins, and bands that contain 50 % and 80 % of the
+    contacts. Axes include the central 99 % of the signals; contacts within 2° of rest are left out.
+    The axis of a signal with most values near zero is linear there and logarithmic beyond.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def _panel(axes: Axes, contacts: _Contacts, coordinate: str, name: str, *, small
     limits = np.array([-180.0, 180.0]) if direction else _limits(x, weight)
     bend = _bend(x, weight, direction)
     axes.axhline(0.0, color=style.MUTED, linewidth=0.5, zorder=0)
-    edges = _edges(limits, BINS, bend)
+    edges = _edges(limits, bend)
     bands = []
     for side, colour in ((~backward, style.BLUE), (backward, style.ORANGE)):
         middle, curves = _spread(x[side], y[side], weight[side], edges)
@@ -208,10 +208,10 @@ def _bend(x: Array, weight: Array, direction: bool) -> float | None:
     return float(low) if 0.0 < low * _SKEWED < high else None
 
 
-def _edges(limits: Array, bins: int, bend: float | None) -> Array:
+def _edges(limits: Array, bend: float | None) -> Array:
     """Edges of bins that look equally wide on the axis."""
     low, high = limits if bend is None else np.arcsinh(limits / bend)
-    edges = np.linspace(float(low), float(high), bins + 1)
+    edges = np.linspace(float(low), float(high), BINS + 1)
     return edges if bend is None else np.asarray(bend * np.sinh(edges))
 
 

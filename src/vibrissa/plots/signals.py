@@ -8,7 +8,6 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colorbar import Colorbar
 from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -18,7 +17,16 @@ from numpy.typing import ArrayLike
 from vibrissa import scene
 from vibrissa.numerics import Array, Mask, contacts_in
 from vibrissa.plots import style
-from vibrissa.plots.space import AZIMUTH, ELEVATION, bounds, name_axes, paint, painted, space_axes
+from vibrissa.plots.space import (
+    AZIMUTH,
+    ELEVATION,
+    bounds,
+    contact_points,
+    name_axes,
+    paint,
+    painted,
+    space_axes,
+)
 from vibrissa.plots.style import BLUE, INK, SHADE, Width, conclude, head, looking, new_figure, say
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.recording import Group
@@ -47,8 +55,13 @@ def signals_over_time(
     time = to_display("time", signals["time"])
     if truth is not None and truth.sizes.get("time") != time.size:
         raise ValueError(f"the truth has {dict(truth.sizes)}, the signals {time.size} times")
-    contact = _contact(signals)
-    spans = np.empty((0, 2)) if contact is None else intervals(time, contact, _seen(signals))
+    contact, seen, spans = None, None, np.empty((0, 2))
+    if "status" in signals:
+        seen = np.asarray(signals["status"] != Status.MISSING)
+    if "in_contact" in signals:
+        touching = signals["in_contact"].to_numpy().astype(np.float64)
+        contact = np.asarray(np.nan_to_num(touching) > 0.5)
+        spans = intervals(time, contact, seen)
     with looking():
         layout: tuple[int, int, float] = (3, 2, 92.0) if width == "double" else (6, 1, 130.0)
         figure = new_figure(width, layout[2], "constrained")
@@ -80,17 +93,6 @@ def signals_over_time(
         if largest:
             conclude(figure, f"{' and '.join(largest)}{count}")
         return figure
-
-
-def _contact(signals: xr.Dataset) -> Mask | None:
-    if "in_contact" not in signals:
-        return None
-    return np.asarray(np.nan_to_num(signals["in_contact"].to_numpy().astype(np.float64)) > 0.5)
-
-
-def _seen(signals: xr.Dataset) -> Mask | None:
-    """Frames that are not missing."""
-    return np.asarray(signals["status"] != Status.MISSING) if "status" in signals else None
 
 
 def intervals(time: Array, contact: Mask, known: Mask | None = None) -> Array:
@@ -147,9 +149,12 @@ def _legend(figure: Figure, truth: bool, contact: bool) -> None:
         figure.legend(handles=handles, loc="outside upper right", ncols=len(handles))
 
 
-_SKIN = (0.80, 0.85, 0.90, 1.0)  # colour of the reachable space where it stands for no signal
-
-
+_SKIN = (
+    0.80,
+    0.85,
+    0.90,
+    1.0,
+)  # colour of the reachable space where it does not represent a signal
 _TITLES = {"FD": "direction of $F_T$", "MD": "direction of $M_B$"}
 
 
@@ -180,13 +185,12 @@ def signal_clouds(
 ) -> Figure:
     """Draw the reachable space of a whisker, and the six signals over it.
 
-    The reachable space is seen from aside and from before the tip, and then once for each signal,
-    which gives the colour: forces above, moments below. The quarter that faces the viewer is taken
-    away along the resting whisker, so that the whisker and what is about it are seen. Small
-    deflections (2° about rest) are left out as in the paper. Colours of forces and moments go with
-    the square root of the signal; they leave out the outermost 2 % of its values, and the colour
-    bar then has a pointed end. An inset shows where the whisker is pulled (F_x > 0), which only
-    happens if it is curved.
+    The reachable space is shown from the side and from the tip, and then once for each signal,
+    coloured by it: forces above, moments below. The quarter that faces the viewer is removed along
+    the resting whisker, so that the inside is visible. Small deflections (2° about rest) are left
+    out as in the paper. Colours of forces and moments are on a square-root scale without the
+    outermost 2 % of the values, for which the colour bar has a pointed end. An inset shows where
+    the whisker is pulled (F_x > 0), which happens only if it is curved.
 
     Parameters
     ----------
@@ -202,7 +206,7 @@ def signal_clouds(
     Returns
     -------
     Figure
-        3D axes, all to one scale but for the inset, and six colour bars.
+        3D axes, all to one scale except for the inset, and six colour bars.
 
     Raises
     ------
@@ -214,7 +218,7 @@ def signal_clouds(
     outside = scene.column("deflection")
     triangles = scene.solid_surface(nodes, False, outside)
     line = to_display("centerline", centerline)
-    limits = bounds(np.concatenate([_mm(triangles).reshape(-1, 3), line]))
+    limits = bounds(np.concatenate([contact_points(triangles).reshape(-1, 3), line]))
     view = elevation, azimuth
     sheet = _sheet(width)
     with style.looking():
@@ -237,7 +241,7 @@ def signal_clouds(
                 _say_zero(figure, cell)
                 continue
             _body(axes, body, _mean(name, shown, norm, colours), line)
-            _bar(figure, _rail(figure, cell), norm, colours, ends, name)
+            _bar(figure, cell, norm, colours, ends, name)
         _pulled(figure, sheet.signals[0], nodes, line, view)
         style.conclude(figure, _finding(whole))
         return figure
@@ -256,13 +260,9 @@ def _finding(nodes: Array) -> str:
 
 
 def _kept(elevation: float, azimuth: float) -> tuple[float, float]:
-    """Bearings that remain when the quarter toward the viewer is taken away."""
+    """Bearings that remain when the quarter facing the viewer is removed."""
     toward = np.arctan2(np.sign(elevation), np.sign(np.sin(np.radians(azimuth))))
     return float(toward + np.pi / 4.0), float(toward + 7.0 * np.pi / 4.0)
-
-
-def _mm(triangles: Array) -> Array:
-    return to_display("contact_point", triangles[..., :3])
 
 
 def _turning(name: str, triangles: Array) -> Mask:
@@ -308,7 +308,7 @@ def _reach(
 
 
 def _body(axes: Any, triangles: Array, colours: Array, line: Array, flat: float = 0.75) -> None:
-    paint(axes, _mm(triangles), colours, flat=flat)
+    paint(axes, contact_points(triangles), colours, flat=flat)
     axes.plot(*line.T, color="black", linewidth=1.2, zorder=10, solid_capstyle="round")
 
 
@@ -350,7 +350,7 @@ def _pulled(
     if not len(triangles):
         return
     left, bottom, width, height = cell
-    limits = bounds(np.concatenate([_mm(triangles).reshape(-1, 3), line]))
+    limits = bounds(np.concatenate([contact_points(triangles).reshape(-1, 3), line]))
     side = 0.42 * width
     box = left + width - 1.03 * side, bottom + 0.845 * height - 0.5 * side, side, side
     axes = space_axes(figure, box, limits, view, zoom=1.1, frame=False)
@@ -382,15 +382,12 @@ def _square(cell: style.Box) -> style.Box:
     return left - 0.07 * width, bottom + 0.50 * height - 0.5 * side, side, side
 
 
-def _rail(figure: Figure, cell: style.Box) -> Any:
-    """Axes for a colour bar at the lower end of a panel."""
-    left, bottom, width, _ = cell
-    return style.box_axes(figure, (left + 0.2 * width, bottom + 6.8, 0.6 * width, 1.5))
-
-
 def _bar(
-    figure: Figure, rail: Any, norm: Normalize, colours: Colormap, ends: str, name: str
-) -> Colorbar:
+    figure: Figure, cell: style.Box, norm: Normalize, colours: Colormap, ends: str, name: str
+) -> None:
+    """Draw a colour bar at the lower end of a panel."""
+    left, bottom, width, _ = cell
+    rail = style.box_axes(figure, (left + 0.2 * width, bottom + 6.8, 0.6 * width, 1.5))
     mapped = ScalarMappable(norm, colours)
     bar = style.colour_bar(figure, mapped, cax=rail, extend=ends, orientation="horizontal")
     bar.ax.tick_params(length=2.0, pad=1.5)
@@ -403,11 +400,10 @@ def _bar(
         marks = _round_roots(norm.vmin, norm.vmax)
         bar.set_ticks(marks, labels=[f"{mark:g}".replace("-", "−") for mark in marks])
     bar.minorticks_off()
-    return bar
 
 
 def _round_roots(low: float, high: float) -> list[float]:
-    """Round numbers that lie about evenly on a square-root scale."""
+    """Round numbers spaced about evenly on a square-root scale."""
     largest = max(abs(low), abs(high))
     step = 10.0 ** np.floor(np.log10(largest))
     step *= max(f for f in (1.0, 2.0, 5.0) if f * step <= largest)

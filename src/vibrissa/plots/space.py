@@ -82,6 +82,11 @@ def bounds(points: ArrayLike, room: float = 0.02) -> Array:
     return np.stack([low - margin, high + margin], axis=1)
 
 
+def contact_points(rows: Array) -> Array:
+    """Contact points, mm, of rows of a sampled surface."""
+    return to_display("contact_point", rows[..., :3])
+
+
 def painted(values: Array, norm: Normalize, colours: Colormap) -> Array:
     """Colours of triangles by the mean of the values at their corners."""
     return np.asarray(colours(norm(values.mean(axis=1))), dtype=np.float64)
@@ -102,7 +107,7 @@ def paint(
     rgba = np.broadcast_to(np.asarray(colours, dtype=np.float64), (len(triangles), 4))[kept].copy()
     rgba[:, :3] *= (flat + (1.0 - flat) * lit)[:, None]
     rgba[:, 3] = opacity
-    # Edges in the same colour close the seams; where one sees through, they would show twice.
+    # Edges of the same colour close the seams; in translucent surfaces they would be visible.
     surface = Poly3DCollection(
         triangles[kept],
         facecolors=rgba,
@@ -119,10 +124,9 @@ def _light(elevation: float, azimuth: float) -> Array:
     return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
 
 
-# Direction, degrees, in which rings carry their labels: toward the viewer.
 _VIEW = (16.0, -152.0)
 _ASPECT = (1.0, 1.0, 0.85)
-_FRONT = 222.0
+_FRONT = 222.0  # direction, degrees, in which rings carry their labels: toward the viewer
 _AXIS = 1.4  # distance of the axis of F_x from the cylinder's axis, over its radius
 _FLOOR: dict[str, Any] = {"color": "#c8c8c8", "linewidth": 0.4, "zorder": 0}
 
@@ -179,8 +183,8 @@ def signal_axes(figure: Figure, panel: Box, limits: Array) -> Any:
         if angle == 0:
             continue  # its end is hidden behind the solid
         label = f"{angle}°" if angle != 180 else f"${quantity('MD').symbol}$ = 180°"
-        # The rays to the left end next to the solid and the largest ring's label, which centred
-        # words would cover.
+        # The labels of the rays to the left are right-aligned, so that they do not cover the solid
+        # and the label of the largest ring.
         far = {"ha": "right"} if angle in (90, 180) else {}
         _write(axes, angle, 1.17 * reach, floor, label.replace("-", "−"), **far)
     _height_axis(axes, limits)
@@ -241,8 +245,8 @@ def _round_squares(low: float, high: float) -> list[float]:
     )
 
 
-# Share of a panel from which an object is taken to fill it, beyond which drawing it has no use.
 _CELLS, _COARSE = 121, 4
+# Share of a panel covered by an object above which it is not drawn.
 _FULL = 0.97
 
 
@@ -300,7 +304,7 @@ def _nearest(body: Body, points: Array, limits: Array, depth: int) -> Array:
     )
     rows, columns = np.indices((_CELLS, _CELLS))
     nearest = np.asarray(table((rows, columns)), dtype=np.float64)
-    # Within a cell a distance changes by no more than the way.
+    # A distance changes by no more than the length of the path.
     near = np.abs(nearest) < 1.5 * cell
     nearest[near] = _marched(body, points[near], limits, depth, 2.0 * cell)
     return nearest
@@ -333,41 +337,29 @@ def room_for(places: Array, bodies: Sequence[Body]) -> Array:
     grid = np.stack(np.meshgrid(*steps.T, indexing="ij"), axis=-1)
     for body in bodies:
         inside = grid[body.signed_distance(1e-3 * grid) < 0.0]
-        for n in range(3):
-            if (
-                inside.size
-                and inside[:, n].min() > lines[0, n]
-                and inside[:, n].max() < lines[1, n]
-            ):
-                low[n], high[n] = min(low[n], inside[:, n].min()), max(high[n], inside[:, n].max())
+        if inside.size:
+            least, most = inside.min(axis=0), inside.max(axis=0)
+            bounded = (least > lines[0]) & (most < lines[1])
+            low = np.where(bounded, np.minimum(low, least), low)
+            high = np.where(bounded, np.maximum(high, most), high)
     margin = np.maximum(0.15 * (high - low), 1.0)
     return np.stack([low - margin, high + margin], axis=1)
 
 
 def one_scale(limits: Array, views: Sequence[tuple[int, int]], sizes: Sequence[Any]) -> Array:
     """Widen limits so that panels of given sizes have the same scale."""
-    middle, span = limits.mean(axis=1), np.ptp(limits, axis=1)
-    scale = max(
-        max(span[i] / wide, span[j] / tall)
-        for (i, j), (wide, tall) in zip(views, sizes, strict=True)
-    )
-    return np.array(
-        [
-            [
-                [middle[n] - 0.5 * scale * size, middle[n] + 0.5 * scale * size]
-                for n, size in zip(view, both, strict=True)
-            ]
-            for view, both in zip(views, sizes, strict=True)
-        ]
-    )
+    shown, size = np.array(views), np.array(sizes)
+    middle, span = limits.mean(axis=1)[shown], np.ptp(limits, axis=1)[shown]
+    half = 0.5 * (span / size).max() * size
+    return np.stack([middle - half, middle + half], axis=-1)
 
 
-# Look of a band.
+# Look of the 95 % band of a surface.
 BAND: dict[str, Any] = {"facecolor": ORANGE, "alpha": 0.25, "linewidth": 0.0, "zorder": 2}
-# Standard deviation, as a share of the view's width, from which a surface is not drawn.
 _SECTION_CELLS = 91
 _NORMAL_95 = 1.959963984540054
 _FACING = 0.8
+# Standard deviation, as a share of the view's width, from which a surface is not drawn.
 _UNKNOWN = 0.05
 
 
@@ -464,7 +456,8 @@ def head_of(course: Course) -> Head:
     base = np.nanmean(course.position, axis=0)
     if course.head is not None:
         position, rotation = course.head
-        axes = _nearest_rotation(np.nanmean(rotation, axis=0))
+        left, _, right = np.linalg.svd(np.nanmean(rotation, axis=0))
+        axes = np.asarray(left @ right)  # the nearest rotation
         snout = np.nanmean(position, axis=0)
         if np.linalg.norm(base - snout) > _FAR:
             return Head(snout, axes)
@@ -480,18 +473,13 @@ def _level(mean: Array) -> Array:
     sideways, forward = mean[:2, 0], mean[:2, 1]
     n = int(np.argmax(np.abs(sideways)))
     way = np.zeros(3)
-    # A whisker that points more or less along x or y belongs to a head that stands straight.
+    # The head is assumed to be aligned with x or y, whichever the whisker is closer to.
     way[n] = np.sign(sideways[n]) or 1.0
     ahead = np.cross([0.0, 0.0, 1.0], way)
     if forward @ ahead[:2] < 0.0:
         ahead = -ahead
     right = np.cross(ahead, [0.0, 0.0, 1.0])
     return np.stack([right, ahead, [0.0, 0.0, 1.0]], axis=1)
-
-
-def _nearest_rotation(mean: Array) -> Array:
-    left, _, right = np.linalg.svd(mean)
-    return np.asarray(left @ right)
 
 
 def draw_head(axes: Axes, head: Head, view: tuple[int, int]) -> None:

@@ -46,7 +46,7 @@ _LETTER = 1.5  # mean width of a letter of 8 points, mm
 _UNSEEN = str.maketrans("", "", "$_{}\\")  # marks of formulas
 # Sizes of type, points: findings and the letters of panels; titles and axes; all else.
 LARGE, PLAIN, SMALL = 8.0, 7.0, 6.0
-# Text, what is secondary, shaded areas, three colours of lines, and that of a traced whisker.
+# Colours of text, secondary items, shaded areas, three kinds of lines, and a traced whisker.
 INK = "#1a1a1a"
 MUTED = "#8c8c8c"
 SHADE = "#e3ebf2"
@@ -58,7 +58,7 @@ RED = "#e8000b"
 TRACE: Mapping[str, Any] = MappingProxyType(
     {"color": RED, "linewidth": 1.0, "linestyle": (0, (1.0, 3.0)), "dash_capstyle": "round"}
 )
-# Matplotlib's settings while a figure of ours is made and drawn.
+# Matplotlib's settings for creating and drawing these figures.
 LOOK: Mapping[str, Any] = MappingProxyType(
     {
         "font.family": "sans-serif",
@@ -127,7 +127,7 @@ class _StyledFigure(Figure):
                 layout.execute(self)
             self.set_layout_engine("none")
             for legend in self.legends:
-                # Those without an anchor would move to the top of what is written.
+                # Legends without an anchor would move to the top of the enlarged figure.
                 if legend.get_bbox_to_anchor() is self.bbox:
                     legend.set_bbox_to_anchor((0.0, 0.0, 1.0, 1.0), self.transFigure)
         super().savefig(fname, **how)
@@ -209,7 +209,7 @@ def head(axes: Axes, letter: str, title: str, left: float = 0.0) -> None:
 
 
 def corner_title(figure: Figure, box: Box, letter: str, title: str) -> None:
-    """Write a bold letter and a few words at the upper left of a panel in space."""
+    """Write a bold letter and a title at the upper left of a 3D panel."""
     wide, tall = 25.4 * figure.get_size_inches()
     left, bottom, _, height = box
     for text, right, size, weight in ((letter, 1.5, LARGE, "bold"), (title, 5.5, PLAIN, "normal")):
@@ -265,7 +265,7 @@ def colour_bar(figure: Any, coloured: ScalarMappable, **place: Any) -> Colorbar:
 
 def scale_near_zero(axes: Axes, axis: str, limits: Array, width: float | None) -> None:
     """Scale an axis linearly near zero and logarithmically beyond, ticks at powers of ten."""
-    panel: Any = axes  # what is chosen by name has no type
+    panel: Any = axes  # methods selected by name have no type
     if width is not None:
         getattr(panel, f"set_{axis}scale")("asinh", linear_width=width)
     getattr(panel, f"set_{axis}lim")(*limits)

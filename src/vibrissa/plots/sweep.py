@@ -25,12 +25,12 @@ _MOST = 3  # triplets that get panels of their own; more share one
 _CONES = (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 90.0)  # classes of critical cones, degrees
 _NORM = BoundaryNorm(_CONES, 256)
 
-# Range of errors drawn, mm: smaller ones are exact, larger ones do not locate the contact.
 _TURNS = (0, 20, 50, 90, 180, 360)
+# Range of errors drawn, mm: smaller ones are exact, larger ones do not locate the contact.
 _ERRORS = (1e-4, 1e3)
-# So near, as a share of a panel, and so many: marks that are drawn small.
+# Distance, as a share of a panel, and number of neighbours from which on marks are drawn small.
 _NEAR, _SEVERAL = 0.04, 4
-_ROW, _FRAME = 4.4, 20.0  # height of a row of marks, and of what is around the rows, mm
+_ROW, _FRAME = 4.4, 20.0  # heights of a row of marks and of the margins together, mm
 
 
 def sweep_overview(
@@ -38,10 +38,10 @@ def sweep_overview(
 ) -> Figure:
     """Draw the results of a task of a study.
 
-    Of verdicts: a row of panels for each triplet, where the left one shows every whisker by its
-    taper and by how much it turns, coloured by the critical cone, and the right one the critical
-    cones by group of whiskers; of more than three triplets the critical cones only, a line for
-    each triplet. Of errors: a line for each set of signals or friction coefficient. The shape of a
+    For verdicts there is a row of panels per triplet: the left one shows every whisker by its taper
+    and turning angle, coloured by the critical cone, and the right one the critical cones by group
+    of whiskers. For more than three triplets only the critical cones are drawn, in a line per
+    triplet. For errors there is a line per set of signals or friction coefficient. The shape of a
     mark is the verdict.
     """
     known = drawable(found)
@@ -58,7 +58,11 @@ def sweep_overview(
         verdict = verdict.isel({verdict.dims[2]: 0})
         degrees = np.degrees(found[f"{task}_critical_cone"].values[:, :, 0])
         done = (verdict.values != "").any(axis=1)
-        return _verdicts(found.isel(whisker=done), verdict[done], degrees[done], width)
+        names = [str(name) for name in verdict[verdict.dims[1]].values]
+        words, degrees = verdict.values[done], degrees[done]
+        if len(names) > _MOST:
+            return _of_many(names, words, degrees, width)
+        return _of_few(found.isel(whisker=done), names, words, degrees, width)
 
 
 def drawable(found: xr.Dataset) -> list[str]:
@@ -68,15 +72,6 @@ def drawable(found: xr.Dataset) -> list[str]:
         for task in map(str, found["task"].values)
         if f"{task}_verdict" in found or f"{task}_median_error" in found
     ]
-
-
-def _verdicts(
-    found: xr.Dataset, verdict: xr.DataArray, degrees: Array, width: style.Width
-) -> Figure:
-    names = [str(name) for name in verdict[verdict.dims[1]].values]
-    if len(names) > _MOST:
-        return _of_many(names, verdict.values, degrees, width)
-    return _of_few(found, names, verdict.values, degrees, width)
 
 
 def _of_many(
@@ -203,7 +198,7 @@ def _spread(axes: Axes, x: Array, words: NDArray[np.str_], line: NDArray[np.int_
 
 
 def _look(degrees: Array, edge: float) -> dict[str, Any]:
-    """Look of marks whose colours are critical cones, with edges of a width."""
+    """Settings of marks coloured by critical cones, with a given edge width."""
     colours: dict[str, Any] = {"norm": _NORM, "cmap": style.sequential().reversed()}
     return {"c": degrees, "edgecolors": style.INK, "linewidths": edge, **colours}
 

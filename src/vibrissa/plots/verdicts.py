@@ -20,25 +20,23 @@ from vibrissa.numerics import Array
 from vibrissa.plots import style
 from vibrissa.quantities import quantity, to_display
 
-# Verdicts in words: a search proves what it refutes, and nothing else.
+# Verdicts and their words: a search can refute uniqueness but not prove it.
 VERDICTS = ("unique", "unique off a surface", "not unique")
 WORDS = {
     "unique": "unique (no counterexample found)",
     "unique off a surface": "unique off a surface",
     "not unique": "not unique (witness)",
 }
-# The verdict on a region without contacts: nothing is drawn.
 PROVED = "unique (proved)"
-EMPTY = "no contacts"
+EMPTY = "no contacts"  # the verdict on a region without contacts: nothing is drawn
 _ROW = 4.2  # height of a row, mm
-# Room for a letter of the key, mm.
 _HEAD, _FOOT = 11.0, 13.5
 _KEY = (
     "numbers: largest distance (mm) of two contacts with the same signals",
     "critical cone: about rest, outside it no such pair was found",
     "; ambiguous: share of contacts that another one resembles within 0.1 % of ranges",
 )
-_LETTER = 1.25
+_LETTER = 1.25  # room for a letter of the key, mm
 # Widths of the triplets' names, of a region's column and of the notation, mm.
 _EDGES = {"single": (18.5, 7.3, 20.0), "double": (24.0, 13.5, 25.0)}
 _TOLERANCE = 1e-3  # share of each signal's range at which the resolution is stated
@@ -47,13 +45,13 @@ _TOLERANCE = 1e-3  # share of each signal's range at which the resolution is sta
 def verdict_table(verdicts: xr.Dataset, *, width: style.Width = "double") -> Figure:
     """Draw the table of verdicts: a row for each triplet, a column for each region.
 
-    A full disc stands for unique, one in a ring for proved to be, a half one for unique off a
-    surface, an open ring for not unique. The triplet chosen is printed in blue, with a mark. At
-    double width, what is not unique is given with the largest distance of two contacts with the
-    same signals, and three more columns follow, of all contacts and only if the region "all" was
-    judged: a lower bound of the critical cone, outside which no two contacts have the same
-    signals; the share of contacts that have such a twin; and the share that another one resembles
-    within 1e-3 of the signals' ranges.
+    A full disc stands for unique, one in a ring for proved unique, a half disc for unique off a
+    surface, and an open ring for not unique. The chosen triplet is printed in blue with a mark. At
+    double width, verdicts of "not unique" are followed by the largest distance between two contacts
+    with the same signals. If the region "all" was judged, three more columns refer to all contacts:
+    a lower bound of the critical cone, outside which no two contacts have the same signals; the
+    share of contacts that have such a twin; and the share that another contact resembles within
+    1e-3 of the signals' ranges.
 
     Parameters
     ----------
@@ -207,7 +205,7 @@ def _separation(verdict: xr.Dataset, region: int) -> str:
 
 
 def _evidence(axes: Axes, verdict: xr.Dataset, left: float, y: float) -> None:
-    """Critical cone, share with a twin, and of ambiguous contacts as a bar, of all contacts."""
+    """Write the critical cone and the share with a twin; draw the share of ambiguous contacts."""
     look: dict[str, Any] = {"fontsize": style.SMALL, "va": "center"}
     if "critical_cone" in verdict:
         cone = float(np.degrees(verdict["critical_cone"].sel(region="all")))
@@ -246,13 +244,12 @@ def _key(axes: Axes, height: float, lines: Sequence[str], proved: bool) -> None:
 
 # The three triplets that the paper finds unique for its γ whisker.
 HIGHLIGHTED = ("Fx MB MD", "Mx MB MD", "Fx FD MD")
-# Degrees that the paper leaves out about rest.
 _LINES: tuple[tuple[str, Any, str], ...] = (
     (style.BLUE, "-", "o"),
     (style.ORANGE, "--", "s"),
     (style.GREEN, ":", "^"),
 )
-PAPERS_CONE = 2.0
+PAPERS_CONE = 2.0  # degrees that the paper leaves out about rest
 # Degrees by which neighbours in a map of critical cones differ at most if it is continuous.
 _JUMP = 25.0
 
@@ -260,7 +257,7 @@ _JUMP = 25.0
 def resolution(verdicts: xr.Dataset, *, width: style.Width = "double") -> Figure:
     """Draw how many contacts another one resembles, against the signals' tolerance.
 
-    A panel for each region. The paper's three triplets stand out by colour, dashes and markers; the
+    There is one panel per region. The paper's three triplets have colours, dashes and markers; the
     others are pale.
 
     Parameters
@@ -428,7 +425,7 @@ def critical_cones(cones: xr.Dataset, *, width: style.Width = "double") -> Figur
 
 
 def _trend(values: Array, axis: int) -> str:
-    """How values change along an axis on the whole."""
+    """Describe the overall change of values along an axis."""
     steps = np.diff(values, axis=axis)
     total = float(steps[np.isfinite(steps)].sum())
     return "grows" if total > 0.0 else "shrinks" if total < 0.0 else "does not change"
@@ -437,7 +434,7 @@ def _trend(values: Array, axis: int) -> str:
 def _cone_map(
     axes: Axes, cone: xr.DataArray, degrees: Array, norm: Normalize, colours: Any
 ) -> None:
-    """Heat map with contours; what was not computed is hatched."""
+    """Draw a heat map with contours; whiskers without a result are hatched."""
     x = np.asarray(cone["curvature"].values, dtype=np.float64)
     y = np.asarray(cone["taper_ratio"].values, dtype=np.float64)
     across, up = _edges(x), np.exp(_edges(np.log(y)))
@@ -469,9 +466,9 @@ def _contours(axes: Axes, x: Array, y: Array, degrees: Array, high: float) -> No
 
 
 def _exceptional(degrees: Array) -> NDArray[np.bool_]:
-    """Whether whiskers stand far above a neighbour, as straight ones and cylinders do.
+    """Whether the cone of a whisker is far above a neighbour's, as of straight ones and cylinders.
 
-    There a triplet loses a dimension; nothing leads gradually up to them, so contours keep off.
+    There a triplet loses a dimension abruptly, so that contours are not drawn there.
     """
     out = np.zeros(degrees.shape, dtype=bool)
     for grid, marks in ((degrees, out), (degrees.T, out.T)):
@@ -489,7 +486,7 @@ def _cone_label(degrees: Array) -> str:
 
 
 def _edges(centres: Array) -> Array:
-    """Edges of cells around given places."""
+    """Edges of cells around given centres."""
     if centres.size == 1:
         return np.asarray(centres[0] + np.array([-0.5, 0.5]))
     between = 0.5 * (centres[1:] + centres[:-1])

@@ -21,9 +21,8 @@ from vibrissa.plots.verdicts import triplet_label
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import DIRECTIONS, SIGNALS
 
-# Drawn width at the base, as a share of the whisker's extent, that is aimed at.
 _MAGNIFICATIONS = (1, 2, 3, 5, 10, 20, 50, 100)
-_WIDE = 0.02
+_WIDE = 0.02  # drawn width at the base, as a share of the whisker's extent, that is aimed at
 # Room around and between the views, mm on paper.
 _LEFT, _RIGHT, _BOTTOM, _TOP, _GAP = 10.0, 2.0, 8.5, 6.5, 3.5
 
@@ -49,12 +48,12 @@ def whisker_views(
     radius : array_like (n,) or float
         Radius of the whisker at these points, m.
     name : str, optional
-        Written above.
+        Title of the figure.
     magnification : float, optional
-        Factor by which the whisker is drawn too wide; chosen by default so that the base is easily
-        seen, and always stated in the figure.
+        Factor by which the width of the whisker is magnified, which the figure states; by default
+        it is chosen so that the base is easily visible.
     assumed : sequence of str
-        Properties of the whisker that were not measured; written under the magnification.
+        Properties of the whisker that were not measured, listed below the magnification.
     width : {"single", "double"}
         Columns of the page.
 
@@ -124,7 +123,7 @@ def _views(
 
 
 def _tube(places: Array, radii: Array) -> Path:
-    """Outline of a tube seen from the side: what lies between its places, and discs at some."""
+    """Outline of a tube seen from the side: quadrilaterals between nodes, and discs at some."""
     step = np.diff(places, axis=0)
     length = np.hypot(*step.T)
     along = step / np.where(length > 0.0, length, 1.0)[:, None]
@@ -144,7 +143,7 @@ def _tube(places: Array, radii: Array) -> Path:
 
 
 def _caption(axes: Axes, name: str | None, magnification: float, assumed: Sequence[str]) -> None:
-    """Say whose views these are, how much too wide, and what is assumed."""
+    """Write the whisker's name, the magnification of its width, and what is assumed."""
     axes.set_title(name or "whisker", loc="left", fontsize=style.LARGE)
     lines = [f"width × {magnification:g}" if magnification != 1 else "true width"]
     lines += [f"assumed: {one}" for one in assumed]
@@ -159,10 +158,9 @@ def _caption(axes: Axes, name: str | None, magnification: float, assumed: Sequen
     )
 
 
-# Length of the longest arrow, as a share of the whiskers' extent.
 _COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.INK)
 _REST = "#c4c4c4"
-_ARROW = 0.2
+_ARROW = 0.2  # length of the longest arrow, as a share of the whiskers' extent
 _BENT_GAP = 10.0  # room around and between the views, mm on paper
 _ROW = 4.0  # room of a row of the legend, mm
 _FORCES = 25.0  # room below the side view from which on forces are drawn there, mm
@@ -190,32 +188,32 @@ def bent_views(
     finding: str | None = None,
     width: style.Width = "double",
 ) -> Figure:
-    """Draw a whisker bent in some ways, from above (x–y) and from the side (x–z), to one scale.
+    """Draw bent shapes of a whisker from above (x–y) and from the side (x–z), to one scale.
 
     Parameters
     ----------
     rest : array_like (n, 3)
-        The resting whisker, from base to tip, whisker frame, m.
+        Resting whisker, from base to tip, whisker frame, m.
     centerlines : array_like (m, k, 3)
-        The bent ones, m; those with NaN, which have no equilibrium, are left out.
+        Bent whiskers, m; those with NaN, which have no equilibrium, are left out.
     contact_points : array_like (m, 3), optional
         Contact point of each whisker, m.
     forces : array_like (m, 3), optional
-        Forces on the whisker, whisker frame, N: drawn as arrows that end in the contact points, the
-        longest a fifth as long as the whisker.
+        Forces on the whisker, whisker frame, N, drawn as arrows that end at the contact points; the
+        longest arrow is a fifth as long as the whisker.
     labels : sequence of str, optional
-        One for each. With up to four curves each has a colour of its own; more are shaded from
-        first to last.
+        Labels of the bent whiskers. Up to four have distinct colours; more are shaded from first to
+        last.
     finding : str, optional
         Sentence above the figure; by default the range of the forces.
     width : {"single", "double"}
-        Columns of the page: the views stand side by side in two, one below the other in one.
+        Columns of the page: the views are side by side in two, one below the other in one.
 
     Returns
     -------
     Figure
-        Two axes, in mm, and where there is room for it the sizes of the forces; or the sentence
-        "nothing bent".
+        Two axes in mm and, if there is room, the sizes of the forces; or the sentence "nothing
+        bent".
 
     Raises
     ------
@@ -258,7 +256,7 @@ def _check(
     contact_points: ArrayLike | None,
     forces: ArrayLike | None,
 ) -> tuple[Array, Array, Array, Array]:
-    """Places in mm, and forces, NaN where there are none."""
+    """Check shapes; return positions in mm, and forces, NaN where they are not given."""
     straight, lines = to_display("centerline", rest), to_display("centerline", centerlines)
     none = np.full((len(lines), 3), np.nan) if lines.ndim else np.empty((0, 3))
     points = none if contact_points is None else to_display("contact_point", contact_points)
@@ -283,7 +281,7 @@ def _colours(count: int) -> list[str]:
 
 
 def _limits(drawn: _Drawn, extent: float, tail: float = 1.0) -> Array:
-    """Limits (3, 2), mm, that hold whiskers and arrows, these so many times as long."""
+    """Limits (3, 2), mm, that include whiskers, and arrows lengthened by the factor ``tail``."""
     ends = drawn.points - tail * drawn.arrows
     parts = (drawn.rest, drawn.lines.reshape(-1, 3), drawn.points, ends)
     everything = np.concatenate(parts)
@@ -329,7 +327,7 @@ def _bent_figure(drawn: _Drawn, limits: Array, width: style.Width) -> Figure:
 
 
 def _forces(axes: Axes, drawn: _Drawn) -> None:
-    """State how large the forces are, over how far from the resting whisker they act."""
+    """Draw the sizes of the forces over the distances of the contacts from rest."""
     away = np.linalg.norm(drawn.points[:, None] - drawn.rest, axis=-1).min(axis=1)
     axes.scatter(away, drawn.forces, 14.0, color=drawn.colours, zorder=3)
     axes.set(xlabel="distance of the contact from rest (mm)", ylabel=style.size_label("force"))
@@ -358,11 +356,10 @@ def _panel(figure: Figure, box: style.Box, drawn: _Drawn, limits: Array, j: int)
     return axes
 
 
-# Length of the longer force's arrow, as a share of the whisker's extent.
 _PAIR_COLOURS = (style.BLUE, style.ORANGE)
 _DASHES = ("-", (0, (5, 1.5)))
 _NAMES = ("A", "B")
-_PAIR_ARROW = 0.22
+_PAIR_ARROW = 0.22  # length of the longer force's arrow, as a share of the whisker's extent
 _CENTRED: dict[str, Any] = {"ha": "center", "va": "center"}
 
 # Width of the table next to the views, mm; its height is as large where it is below them.
@@ -393,6 +390,7 @@ def witness_pair(witness: xr.Dataset, *, width: style.Width = "double") -> Figur
         If something is missing or not finite, or if there are not two contacts.
     """
     triplet = _checked_pair(witness)
+    witness = witness.transpose("pair", "node", "space", ..., missing_dims="ignore")
     extent = float(np.ptp(to_display("centerline", witness["rest"].values), axis=0).max())
     drawn = _pair(witness, extent)
     limits = _limits(drawn, extent, 1.3)  # with the letters at the arrows' tails
@@ -454,19 +452,17 @@ def _checked_pair(witness: xr.Dataset) -> tuple[str, ...]:
 
 def _sizes(witness: xr.Dataset) -> Array:
     """Sizes of the two forces, N."""
-    force = witness["force"].transpose("pair", "space").values
-    return np.asarray(np.linalg.norm(force, axis=1))
+    return np.asarray(np.linalg.norm(witness["force"].values, axis=1))
 
 
 def _pair(witness: xr.Dataset, extent: float) -> _Drawn:
     """The two whiskers with their contacts and forces."""
-    sizes, force = _sizes(witness), witness["force"].transpose("pair", "space").values
-    lines = witness["centerline"].transpose("pair", "node", "space").values
+    sizes = _sizes(witness)
     return _Drawn(
-        to_display("centerline", witness["rest"].transpose("node", "space").values),
-        to_display("centerline", lines),
-        to_display("contact_point", witness["contact_point"].transpose("pair", "space").values),
-        _PAIR_ARROW * extent * force / sizes.max(),
+        to_display("centerline", witness["rest"].values),
+        to_display("centerline", witness["centerline"].values),
+        to_display("contact_point", witness["contact_point"].values),
+        _PAIR_ARROW * extent * witness["force"].values / sizes.max(),
         to_display("force", sizes),
         list(_PAIR_COLOURS),
         (),
@@ -480,7 +476,7 @@ def _table(
     witness: xr.Dataset,
     triplet: tuple[str, ...],
 ) -> None:
-    """Signals and contacts of both, what is the same shaded."""
+    """Draw a table of the signals and contacts of both, with equal signals shaded."""
     axes = figure.add_axes(box, xlim=(0.0, 1.0), ylim=(13.2, -0.6))
     axes.set_axis_off()
     look: dict[str, Any] = {"va": "center_baseline"}
@@ -495,28 +491,21 @@ def _table(
         same = name in triplet
         if same:
             axes.fill_between([0.0, 1.0], y - 0.5, y + 0.5, color=style.SHADE, linewidth=0.0)
-        symbol = "$|\\mathbf{F}|$" if name == "force" else f"${_symbol(name)}$"
+        own = {"force": "|\\mathbf{F}|", "arc_length": "s_c"}
+        symbol = f"${own.get(name) or quantity(name).symbol}$"
         axes.text(0.02, y, f"{symbol}  ({quantity(name).display_unit})", **look)
         for x, value in zip((0.62, 0.97), to_display(name, values), strict=True):
-            text = _number(float(value), 7 if same else 4)
+            text = f"{value:#.{7 if same else 4}g}".rstrip(".").replace("-", "−")
             axes.text(x, y, text, ha="right", color=style.INK if same else style.MUTED, **look)
     axes.axhline(9.2, color=style.INK, linewidth=0.5)
     for line, text in enumerate(_sentences(witness, triplet)):
         axes.text(0.02, 10.0 + line, text, **(look | {"fontsize": style.SMALL}))
 
 
-def _symbol(name: str) -> str:
-    return "s_c" if name == "arc_length" else quantity(name).symbol
-
-
-def _number(value: float, digits: int) -> str:
-    return f"{value:#.{digits}g}".rstrip(".").replace("-", "−")
-
-
 def _sentences(witness: xr.Dataset, triplet: tuple[str, ...]) -> list[str]:
     """State how equal the signals are, and how far apart the contacts."""
     apart = float(np.linalg.norm(np.diff(witness["contact_point"].values, axis=0)))
-    step = np.diff(witness["rest"].transpose("node", "space").values, axis=0)
+    step = np.diff(witness["rest"].values, axis=0)
     length = float(np.linalg.norm(step, axis=1).sum())
     return [
         f"the shaded signals differ by {_power(_difference(witness, triplet))} of their size",

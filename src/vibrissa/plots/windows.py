@@ -1,8 +1,8 @@
-"""Windows in which a person marks things in images.
+"""Windows for marking whiskers, areas and lengths in images.
 
-`correct` opens one to mark where a whisker is, points from base to tip, frame by frame; `pick` one
-to show where whiskers begin, areas without whiskers, and the scale. The logic is in `Correction`
-and `Picking`, which need only a figure and work without a screen.
+`correct` opens a window for marking whiskers frame by frame, with points from base to tip; `pick`
+one for marking the bases of whiskers, areas without whiskers, and the scale. `Correction` and
+`Picking` contain the logic, need only a figure, and work without a screen.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Frames(Protocol):
 
 
 class Correction:
-    """Corrected points of one view, and the figure in which they are made."""
+    """Corrected points of one view, and the figure for editing them."""
 
     def __init__(
         self,
@@ -117,7 +117,7 @@ class Correction:
             self._change((self.frame, self.whisker), [])
 
     def undo(self) -> None:
-        """Take the last change back, and show where it was."""
+        """Undo the last change, and show its frame."""
         if not self._before:
             self._said = "nothing to undo"
             self._draw()
@@ -128,12 +128,12 @@ class Correction:
         self._draw()
 
     def choose(self, whisker: int) -> None:
-        """Turn to another whisker."""
+        """Select another whisker."""
         self.whisker = whisker
         self._draw()
 
     def save(self) -> None:
-        """Hand over what is corrected; traces of one point are kept here, but not saved."""
+        """Save the corrections; traces of one point are kept in the window, but not saved."""
         single = sum(len(points) == 1 for points in self._points.values())
         if self._save is not None:
             self._save(self.corrections)
@@ -156,7 +156,7 @@ class Correction:
             self._points.pop(key, None)
 
     def _known(self, frame: int) -> Array:
-        """The trace of a frame; empty where it is lost."""
+        """Trace in a frame; empty if it is lost."""
         line = np.asarray(self._traces.get((frame, self.whisker), np.empty((0, 2))))
         return line if np.isfinite(line).all() else np.empty((0, 2))
 
@@ -208,12 +208,12 @@ class Correction:
             getattr(self, _KEYS[key])()
 
     def close(self, event: Any = None) -> None:
-        """Save what is not saved; to be called when the window is closed."""
+        """Save unsaved changes; to be called when the window is closed."""
         if self.changed:
             self.save()
 
     def discard(self) -> None:
-        """Forget that there is anything to save."""
+        """Discard unsaved changes."""
         self.changed = False
 
 
@@ -235,14 +235,14 @@ _KEYS: Mapping[str, str] = MappingProxyType(
 
 class _Window(Protocol):
     def close(self, event: Any = None) -> None:
-        """Save what is not saved."""
+        """Save unsaved changes."""
 
 
 W = TypeVar("W", bound=_Window)
 
 
 def opened(make: Callable[[Figure], W], instead: str, size: tuple[float, float]) -> W:
-    """Open a window, wait until it is closed, and return it; without a screen tell what to do."""
+    """Open a window, wait until it is closed, and return it; an error without a screen."""
     import matplotlib as mpl
     import matplotlib.pyplot as plt
 
@@ -253,7 +253,7 @@ def opened(make: Callable[[Figure], W], instead: str, size: tuple[float, float])
             raise ValueError(
                 f"there is no screen for a window: {instead}, or run this where there is one"
             )
-        # Matplotlib's own keys do other things with s, q, l and the arrows.
+        # Matplotlib's own shortcuts for s, q, l and the arrows are disabled.
         handler = getattr(manager, "key_press_handler_id", None)
         if handler is not None:
             figure.canvas.mpl_disconnect(handler)
@@ -287,7 +287,6 @@ def correct(
     return window.corrections
 
 
-# Number of corners of a polygon, at least.
 _PICKING_HELP = (
     "b base of a whisker (in every view, in the same order) · m corners of an area without "
     "whiskers, as a peg · r corners of where whiskers are\nl two ends of a known length, then type "
@@ -298,7 +297,7 @@ _MODES: Mapping[str, str] = MappingProxyType(
     {"b": "base", "m": "mask", "r": "region", "l": "length"}
 )
 _COLOURS = MappingProxyType({"base": GREEN, "mask": RED, "region": BLUE, "length": ORANGE})
-_CORNERS = 3
+_CORNERS = 3  # number of corners of a polygon, at least
 
 
 @dataclass(frozen=True)
@@ -360,7 +359,7 @@ class Picks:
 
 @dataclass(eq=False)
 class Picking:
-    """The window: images side by side, what was clicked in them, and the keys."""
+    """Window with images side by side, in which clicks and keys are handled."""
 
     images: Sequence[NDArray[np.uint8]]
     names: Sequence[str]
@@ -413,7 +412,7 @@ class Picking:
             self._draw()
 
     def close(self, event: Any = None) -> None:
-        """Save what is not saved; to be called when the window is closed."""
+        """Save unsaved changes; to be called when the window is closed."""
         if self.picks.clicks != self.saved:
             self.saved = self.picks.clicks
             self.save(self.saved)
@@ -445,7 +444,7 @@ def pick(
     clicks: Clicks | None,
     save: Callable[[Clicks], None],
 ) -> Clicks:
-    """Open a window to show bases, masks and the scale in, and wait until it is closed."""
+    """Open a window for marking bases, masks and the scale, and wait until it is closed."""
     begun = clicks or Clicks(tuple(ViewClicks() for _ in images))
     window = opened(
         lambda figure: Picking(images, names, Picks(begun), save, figure),

@@ -31,9 +31,7 @@ _POLICY = (
     "script-src 'unsafe-inline' 'unsafe-eval'"
 )
 _STYLE = Path(__file__).with_suffix(".css").read_text(encoding="utf-8")
-
 _CODE = re.compile(r"`([^`]+)`")
-
 
 # Names of sections in their order: results first, settings and provenance last.
 _ORDER = (
@@ -238,7 +236,7 @@ def shown_value(name: str, value: float, digits: int = 3) -> str:
         return "–"
     factor, unit = shown_unit(name, value)
     number = value * factor
-    # What is smaller is so by rounding.
+    # Smaller values are due to rounding.
     if 0.0 < abs(number) < _LEAST:
         return f"below {_LEAST:g}{'' if unit in ('', '°') else ' '}{unit}"
     text = f"{number:.0f}" if abs(number) >= 10.0**digits else f"{number:.{digits}g}"
@@ -274,17 +272,14 @@ def provenance_section(command: Sequence[str], inputs: Sequence[Path], seed: int
         drawn = f"{seed}, for the predicted errors"
     made = _date().strftime("%Y-%m-%d %H:%M:%S UTC")
     rows = [("command", shlex.join(command)), ("made", made), ("seed", drawn)]
-    files = [
-        (str(path), f"{path.stat().st_size / 1e6:.3f} MB", f"SHA-256 {_sha256(path)}")
-        for path in inputs
-    ]
+    files = []
+    for path in inputs:
+        with path.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        size = f"{path.stat().st_size / 1e6:.3f} MB"
+        files.append((str(path), size, f"SHA-256 {digest}"))
     body = table(rows) + table(files, caption="Files that were read")
     return Section("provenance", "Provenance", body + table(_versions(), caption="Versions"))
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _versions() -> list[tuple[str, str]]:

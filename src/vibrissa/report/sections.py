@@ -29,20 +29,15 @@ from vibrissa.whisker import Whisker
 
 # Groups of a recording, and the commands that compute them.
 STAGES = {"signals": "signals", "estimates": "estimate", "contour": "reconstruct"}
-# Variables of tracking that are compared with the truth.
+# Variables of tracking, signals and estimates that are compared with the truth.
 _TRACKED = ("contact_point", "in_contact")
 _FELT = ("force", "moment", "in_contact", "base_rotation")
 _FOUND = ("contact_point", "contact_point_whisker", "in_contact")
 _SPREADS = ("covariance", "contact_covariance", "candidates")
-
 _SPREAD = ("median", "95 %")
-
 _DISTANCES = ("median", "largest_95", "median_predicted", "largest_95_predicted")
-
 _NOTHING = "None of this whisker's true contacts was detected, so there is nothing to compare."
-
 _SIGNAL_NAMES = {"wrench": "all components of force and moment"}
-
 _MOST_EVENTS = 60
 _SUSPECT = 1.5  # misfit above which another shape may fit better
 
@@ -50,7 +45,11 @@ _SUSPECT = 1.5  # misfit above which another shape may fit better
 def trial_sections(recording: xr.DataTree, whisker: int = 0, seed: int = 0) -> list[Section]:
     """Sections that describe a recording, its stages and their errors."""
     bent = Recording(recording).whisker(whisker)
-    groups = {name: _one(recording, name, whisker) for name in ("", "signals", "estimates")}
+    found = {name: Recording(recording).find(name) for name in ("", "signals", "estimates")}
+    groups = {
+        name: None if group is None else group.whisker(whisker).data
+        for name, group in found.items()
+    }
     truth, true_whisker = None, bent
     if "truth" in recording.children:
         truth, true_whisker = evaluation.truth_of(recording, whisker)
@@ -72,12 +71,6 @@ def trial_sections(recording: xr.DataTree, whisker: int = 0, seed: int = 0) -> l
     parts += [Section("events", "Events", happened)] if happened else []
     counted = _statuses(groups)
     return [*parts, Section("statuses", "Statuses", counted)] if counted else parts
-
-
-def _one(recording: xr.DataTree, name: str, whisker: int) -> xr.Dataset | None:
-    """Group of a recording for one whisker; None if it does not exist."""
-    group = Recording(recording).find(name)
-    return None if group is None else group.whisker(whisker).data
 
 
 def _results(

@@ -6,7 +6,6 @@ drawing library is optional: it is imported in this module only, and its script 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from html import escape
 from importlib.util import find_spec
 from typing import Any
@@ -15,7 +14,7 @@ import numpy as np
 import xarray as xr
 
 from vibrissa.contacts import ContactMap
-from vibrissa.contour import FittedShape, shape_from_dataset, surface_grid
+from vibrissa.contour import shape_from_dataset, surface_grid
 from vibrissa.numerics import Array
 from vibrissa.quantities import quantity, shown_unit
 from vibrissa.report.page import Section, paragraph
@@ -27,9 +26,8 @@ from vibrissa.whisker import Whisker
 # Message shown where the drawing library is not installed.
 NO_SPACE = "The 3D picture needs Plotly: `pip install 'vibrissa[report]'`."
 _NODES = 101  # number of points of a whisker
-# Number of bent whiskers that are drawn.
 _MOST_POINTS = 4000
-_SHAPES = 7
+_SHAPES = 7  # number of bent whiskers that are drawn
 _ROOM = 0.15  # margin around the contacts, as a share of their extent
 _CAMERA = {"eye": {"x": 1.65, "y": -1.8, "z": 1.05}, "center": {"x": 0.0, "y": 0.0, "z": -0.12}}
 
@@ -92,18 +90,7 @@ def _bent_in_space(bent: Deflection) -> Any:
 
 
 def trial_in_space(trial: xr.DataTree, course: Course) -> Any:
-    """Draw contact points of a recording with its known and fitted objects."""
-    things = trial["objects"].children.values() if "objects" in trial.children else ()
-    fits = []
-    if "contour" in trial.children:
-        fits.append(shape_from_dataset(trial["contour"].to_dataset()))
-    return _contacts_in_space(course, [thing.to_dataset() for thing in things], fits)
-
-
-def _contacts_in_space(
-    course: Course, objects: Sequence[xr.Dataset], fits: Sequence[FittedShape]
-) -> Any:
-    """Draw contact points in the laboratory frame with known and fitted objects."""
+    """Draw contact points of a recording, laboratory frame, with its known and fitted objects."""
     import plotly.graph_objects as go
 
     places = course.places
@@ -112,12 +99,14 @@ def _contacts_in_space(
         raise ValueError("there are no contact points to draw")
     points = 1e3 * places[known]
     drawn = [_points(points, "time", course.time[known], f"{course.places_as} contacts")]
-    limits = _limits(points)
-    drawn += [
-        _triangles(*object_surface(thing, limits), f"{thing.attrs['kind']}, known")
-        for thing in objects
-    ]
-    for fit in fits:
+    low, high = points.min(axis=0), points.max(axis=0)
+    room = _ROOM * max(float((high - low).max()), 1.0)
+    limits = np.stack([low - room, high + room], axis=1)
+    for thing in trial["objects"].children.values() if "objects" in trial.children else ():
+        surface = object_surface(thing.to_dataset(), limits)
+        drawn.append(_triangles(*surface, f"{thing.attrs['kind']}, known"))
+    if "contour" in trial.children:
+        fit = shape_from_dataset(trial["contour"].to_dataset())
         grid = 1e3 * surface_grid(fit, places[known])["surface_grid_point"].values
         x, y, z = np.moveaxis(grid, -1, 0)
         colours = [[0.0, BENT], [1.0, BENT]]
@@ -228,13 +217,6 @@ def _whiskers(lines: Array, label: str = "whisker", colour: str = "#a0522d") -> 
             )
         )
     return drawn
-
-
-def _limits(points: Array) -> Array:
-    """Limits of the view (3, 2), with a margin around the points."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    room = _ROOM * max(float((high - low).max()), 1.0)
-    return np.stack([low - room, high + room], axis=1)
 
 
 def _framed(drawn: list[Any], frame: str) -> Any:

@@ -44,11 +44,10 @@ COLUMNS = (
 )
 """SI units; ``deflection`` is the distance outside the cone of small deflections, m."""
 
-# Number of cells of the whole chart in ``_SHAPE``.
 _COLUMN = {name: i for i, name in enumerate(COLUMNS)}
 _DIMS = ("station", "bearing", "load")
 _CONE = np.deg2rad(2.0)
-_SHAPE = (36, 72, 24)
+_SHAPE = (36, 72, 24)  # number of cells of the whole chart in ``_SHAPE``
 
 
 def column(name: str) -> int:

@@ -117,9 +117,8 @@ _TOP = {"duration", "rate", "friction", "seed"}
 _TOP |= {"whisker", "array", "object", "motion", "head", "sensor", "dynamics"}
 # Default motion of an array's head: forward, toward the object.
 _ADVANCE = MappingProxyType({"to_position": [0.0, 14.0, 0.0]})
-# Columns of a table of motion.
 MM = 1e-3
-COLUMNS = ("time", "azimuth", "elevation", "roll", "x", "y", "z")
+COLUMNS = ("time", "azimuth", "elevation", "roll", "x", "y", "z")  # columns of a table of motion
 _DEGREES = ("amplitude", "set_point", "elevation_drift")
 _SHARES = ("frequency", "protraction", "variation")
 

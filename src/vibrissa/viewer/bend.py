@@ -24,13 +24,14 @@ from vibrissa.viewer.readout import (
     numbers,
     sentence,
 )
+from vibrissa.viewer.stage import triple
 from vibrissa.whisker import Whisker
 
-# Start of the ruler, over its length: below the contacts, where it meets no other label.
 NODES = 48
 _AXES = np.array([(190, 60, 60), (70, 140, 70), (70, 90, 190)], dtype=np.uint8)
+# Start of the ruler, over its length: below the contacts, away from other labels.
 _ASIDE = np.array([0.0, -0.15, -0.55])
-_ARROW = 0.3  # length of the arrow of a force of EI/L², over L; others go with the square root
+_ARROW = 0.3  # length of the arrow of a force of EI/L², over L; lengths vary as the square root
 
 
 def whisker_body(
@@ -110,8 +111,8 @@ def bend_drawing(bend: state.Bend, exaggeration: float) -> scene.Drawing:
     if bend.kind == "peg":
         out["peg"] = _peg(bend)
     elif ok:
-        x, y, z = mm(held.contact_point).tolist()
-        out["contact"] = replace(_ball(whisker, exaggeration), position=(x, y, z))
+        at = triple(mm(held.contact_point))
+        out["contact"] = replace(_ball(whisker, exaggeration), position=at)
     return out
 
 
@@ -171,16 +172,15 @@ class BendMode(Mode):
     """Mode with the controls of a load, and the bent whisker."""
 
     name = "Bend"
+    layers = ("bend", "reachable")
 
     def __init__(self, page: Page) -> None:
-        self._page = page
+        gui = page.server.gui
+        super().__init__(page, gui.add_folder("Load", visible=False))
         self._clouded: state.Chart | None = None
         self._shown_kind: state.Kind | None = None
-        gui = page.server.gui
         bend = page.bend
         length = page.original.length
-        x, y, z = (_MM * bend.point).tolist()
-        self._folder = gui.add_folder("Load", visible=False)
         with self._folder:
             self._kind = gui.add_dropdown(
                 "Load",
@@ -188,7 +188,7 @@ class BendMode(Mode):
                 hint="What bends the whisker: a point, a straight peg, or a force",
             )
             self._target = gui.add_vector3(
-                "Position (mm)", (x, y, z), step=0.05, hint="Drag the ball, or type"
+                "Position (mm)", triple(_MM * bend.point), step=0.05, hint="Drag the ball, or type"
             )
             self._radius = gui.add_slider(
                 "Radius (mm)", 0.0, _MM * 0.08 * length, 0.01, bend.radius, visible=False
@@ -223,16 +223,10 @@ class BendMode(Mode):
             asked(slider, lambda _: self._pushed())
 
     def enter(self) -> None:
-        """Show controls."""
-        self._folder.visible = True
-        self._page.face_whisker()
-
-    def leave(self) -> None:
-        """Hide controls and things."""
-        self._folder.visible = False
+        """Show the controls, and point the cameras at the whisker."""
+        super().enter()
         self._clouded = None
-        self._page.stage.show("bend", {})
-        self._page.stage.show("reachable", {})
+        self._page.face_whisker()
 
     def redraw(self) -> None:
         """Draw the whisker and its reachable space."""
@@ -254,9 +248,8 @@ class BendMode(Mode):
         self._radius.visible = bend.kind == "peg"
         self._place.visible = self._size.visible = self._way.visible = bend.kind == "force"
         if bend.kind != "force":
-            x, y, z = np.round(_MM * bend.target, 3).tolist()
-            put(self._target, (x, y, z))
-        if bend.kind != self._shown_kind:  # not while someone moves the sliders
+            put(self._target, triple(np.round(_MM * bend.target, 3)))
+        if bend.kind != self._shown_kind:  # sliders are not set while they are being moved
             self._shown_kind = bend.kind
             put(self._kind, bend.kind)
             put(self._radius, round(_MM * bend.radius, 2))

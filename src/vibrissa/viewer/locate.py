@@ -33,8 +33,8 @@ from vibrissa.viewer.state import Bend, Chart, coloured_solid, numbers_in, words
 from vibrissa.whisker import Whisker
 
 _RAT = (1.5e-4, 6e-6)  # EI/L², N, and EI/L, N·m, of a rat's whisker
-# Candidates nearer to the contact than this share of the length are the contact itself.
 COLOURS = ("uniqueness", "ambiguity", "sensitivity", *SIGNALS)
+# Candidates nearer to the contact than this share of the length are the contact itself.
 _APART = 0.005
 
 
@@ -130,13 +130,13 @@ def _separation(estimate: Contacts, points: Array) -> Array:
     """Distance (n,), m, of the farthest other candidate of each contact; NaN without candidates."""
     away = np.linalg.norm(estimate.candidates.point - points[:, None], axis=-1)
     farthest = np.nanmax(np.nan_to_num(away), axis=1)
-    farthest[farthest < 1e-9] = 0.0  # the contact itself, found again
+    farthest[farthest < 1e-9] = 0.0  # the contact itself
     return np.where(estimate.status == Status.DEGENERATE, np.nan, farthest)
 
 
 SIGMAS = 2.0  # standard deviations of the ellipsoids
 _CLEAR = 0.5  # opacity of all contacts, so that the whisker is seen among them
-MOST = 0.3  # longest semi-axis that is drawn, over the length: what is longer is as good as unknown
+MOST = 0.3  # longest semi-axis drawn, over the length; longer ones mean an undetermined position
 
 
 def locate_drawing(whisker: Whisker, found: Located, exaggeration: float) -> scene.Drawing:
@@ -191,17 +191,17 @@ class LocateMode(Mode):
     """Mode with the controls of a sensor, and the contacts that it cannot distinguish."""
 
     name = "Locate"
+    layers = ("bend", "candidates", "cloud")
 
     def __init__(self, page: Page) -> None:
-        self._page = page
+        gui = page.server.gui
+        super().__init__(page, gui.add_folder("Three signals", visible=False))
         self._sensor = usual_sensor(page.original)
         self._what = "uniqueness"
         self._cut = True
         self._drawn: tuple[object, ...] | None = None
         self._cloud: tuple[Chart, scene.Bytes] | None = None
         self.found: Located | None = None
-        gui = page.server.gui
-        self._folder = gui.add_folder("Three signals", visible=False)
         with self._folder:
             self._triplet = gui.add_dropdown(
                 "Signals",
@@ -223,18 +223,12 @@ class LocateMode(Mode):
         asked(cut, self._open)
 
     def enter(self) -> None:
-        """Show controls."""
-        self._folder.visible = True
+        """Show the controls, and point the cameras at the whisker."""
+        super().enter()
         self._page.face_whisker()
         self._drawn = None
         if self._page.bend.kind != "point":
             self._page.bend = self._page.bend_by_point()
-
-    def leave(self) -> None:
-        """Hide controls and things."""
-        self._folder.visible = False
-        for layer in ("bend", "candidates", "cloud"):
-            self._page.stage.show(layer, {})
 
     def redraw(self) -> None:
         """Draw whisker, candidates and errors; colour the cloud of contacts if it has changed."""
@@ -245,11 +239,8 @@ class LocateMode(Mode):
             page.stage.show("candidates", {})
             return
         self.found = located(chart, bend, self._sensor)
-        drawing = (
-            {}
-            if self.found is None
-            else locate_drawing(bend.whisker, self.found, page.exaggeration)
-        )
+        found = self.found
+        drawing = {} if found is None else locate_drawing(bend.whisker, found, page.exaggeration)
         page.stage.show("candidates", drawing)
         self._paint(chart)
 

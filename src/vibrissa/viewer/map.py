@@ -37,14 +37,13 @@ from vibrissa.viewer.state import Chart
 
 # Quantities that can be held fixed in a slice.
 SLICES = ("x", "y", "z", "r", "theta", "phi", "Fx", "Mx", "arc_length")
-# Bearings of the force that are kept where solids are cut open.
 _SHAPE = (24, 48, 12)
-_OPEN = (np.pi, 2.5 * np.pi)
-# Places of spaces in the plane that faces the viewer: two above, two below, in L.
+_OPEN = (np.pi, 2.5 * np.pi)  # bearings of the force that are kept where solids are cut open
 _HEIGHT = 0.85
+# Positions of the spaces in the plane that faces the viewer, two above and two below, over L.
 _PLACES = ((1.75, 0.62), (0.4, -0.78), (1.75, -0.78))
 _CONTACTS = (0.0, 0.62)
-# Angle by which signals are turned about their axis, so that one looks into what is cut open.
+# Angle by which signals are turned about their axis, so that cut solids are seen from the cut.
 TURN = float(np.deg2rad(62.0))
 
 
@@ -181,7 +180,7 @@ def frame_drawing(solids: Solids, exaggeration: float) -> scene.Drawing:
         out[f"axis {name} name"] = scene.Label(pole[1] + above, "Fx")
         out[f"zero {name}"] = scene.Label(centre + np.array([0.0, 0.0, solids.axis_height()]), "0")
         edge = 0.5 * length * np.array([np.cos(TURN), np.sin(TURN), 0.0])
-        # At heights of their own, so that none hides another on a small screen.
+        # The labels have different heights, so that none hides another on a small screen.
         apart = np.array([0.0, 0.0, 0.06 * length])
         out[f"rim {name}"] = scene.Label(bottom + edge + apart, "MD = 0°")
         out[f"ring {name}"] = scene.Label(bottom - edge - apart, f"MB = {largest}")
@@ -244,15 +243,15 @@ class MapMode(Mode):
     """Mode with the controls of solids and slices, and the selected contact."""
 
     name = "Map"
+    layers = ("frame", "solids", "picked")
 
     def __init__(self, page: Page) -> None:
-        self._page = page
+        gui = page.server.gui
+        super().__init__(page, gui.add_folder("Contacts and signals", visible=False))
         self._solids: Solids | None = None
         self._triangles: Array = np.empty((0, 3, 0))
         self.row: Array | None = None
         self._drawn: tuple[Any, ...] | None = None
-        gui = page.server.gui
-        self._folder = gui.add_folder("Contacts and signals", visible=False)
         with self._folder:
             self._by = gui.add_dropdown("Colours", scene.COORDINATES, hint="Of the contacts")
             self._cut = gui.add_checkbox("Cut open", True)
@@ -263,25 +262,25 @@ class MapMode(Mode):
             self._value = gui.add_html("")
             self._legends = gui.add_html("")
             self._words = gui.add_html(note(_HINT))
-        shown: Any = page.server.scene  # coroutines may be given, and run one after the other
+        shown: Any = (
+            page.server.scene
+        )  # its type does not allow coroutines, which run one after the other
         shown.on_click()(self._clicked)
         for control in (self._by, self._cut, self._slice, self._share):
             asked(control, lambda _: page.work.put("map", self.redraw))
 
     def enter(self) -> None:
-        """Show controls, and look at all four spaces."""
-        self._folder.visible = True
+        """Show the controls, and point the cameras at all four spaces."""
+        super().enter()
         self._drawn = None
         length = float(to_display("length", self._page.bend.whisker.length))
         middle = np.array([1.0, 0.0, 0.0]) * length
         self._page.look_at(middle, 2.2 * length, (0.0, -0.95, 0.33), height=1.6)
 
     def leave(self) -> None:
-        """Hide controls and things."""
-        self._folder.visible = False
+        """Hide the controls and the objects."""
+        super().leave()
         self._solids = None
-        for layer in ("frame", "solids", "picked"):
-            self._page.stage.show(layer, {})
 
     def redraw(self) -> None:
         """Draw the solids if they have not been drawn."""
@@ -297,9 +296,6 @@ class MapMode(Mode):
         page.stage.show("frame", frame_drawing(self._solids, page.exaggeration))
         self._paint(self._solids)
         self._mark()
-
-    def write(self, brief: bool = False) -> None:
-        """Do nothing, as texts are written with the drawings."""
 
     def _paint(self, found: Solids) -> None:
         what, share, by = str(self._slice.value), float(self._share.value), str(self._by.value)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape
 from math import inf
-from typing import Any, Protocol
+from typing import Any
 from urllib.parse import urlencode
 
 import numpy as np
@@ -27,7 +27,7 @@ from vibrissa.contacts import ContactMap
 from vibrissa.numerics import Array
 from vibrissa.quantities import quantity, to_display
 from vibrissa.scene import across
-from vibrissa.viewer.stage import Stage
+from vibrissa.viewer.stage import Stage, triple
 from vibrissa.viewer.state import (
     Bend,
     Chart,
@@ -50,23 +50,32 @@ from vibrissa.whisker import Whisker
 
 EXAGGERATION = 8.0
 
-# How often numbers change while something is dragged, s: the browser takes half as long for them as
-# for a whisker, and nobody reads faster.
+# Interval at which numbers are updated during dragging, s: the browser takes half as long for them
+# as for a whisker.
 _READ = 0.05
-_REST = 0.15  # time that the mouse rests before everything is written, s
+_REST = 0.15  # time without dragging after which all texts are updated, s
 Transition = Callable[[Bend], Bend]
 
 
-class Mode(Protocol):
-    """Interface of a mode of the page, with its controls and objects in the scene."""
+class Mode:
+    """A mode of the page, with a folder of controls and layers of objects in the scene."""
 
     name: str
+    layers: tuple[str, ...]
+
+    def __init__(self, page: Page, folder: viser.GuiFolderHandle) -> None:
+        self._page = page
+        self._folder = folder
 
     def enter(self) -> None:
-        """Show controls and things."""
+        """Show the controls."""
+        self._folder.visible = True
 
     def leave(self) -> None:
-        """Hide them."""
+        """Hide the controls and the objects."""
+        self._folder.visible = False
+        for layer in self.layers:
+            self._page.stage.show(layer, {})
 
     def redraw(self) -> None:
         """Update the scene after a change of the whisker or its load."""
@@ -80,11 +89,10 @@ class Mode(Protocol):
 
     def restore(self, asked: Mapping[str, str]) -> None:
         """Restore the state of the mode from the parameters of a link."""
-        del asked  # there is nothing to choose
 
 
 class Page:
-    """Base of all modes."""
+    """State of the page that is common to all modes."""
 
     def __init__(
         self, server: viser.ViserServer, whisker: Whisker, contact_map: ContactMap | None = None
@@ -110,8 +118,6 @@ class Page:
         self.linked: viser.GuiHtmlHandle | None = None
         self._written = 0.0
         self.grip = Grip(server, float(to_display("length", 0.2 * whisker.length)), self._dragged)
-
-    # What happens
 
     def _dragged(self, place: Array, turn: Array) -> None:
         self.change("drag", lambda bend: moved(bend, place, turn[:, 2]), dragging=True)
@@ -195,7 +201,7 @@ class Page:
     def redraw(self, dragging: bool = False) -> None:
         """Draw the mode; a dragged object stays at the mouse.
 
-        All comes into sight together, as the browser draws anew for each part that comes alone.
+        All changes are sent together, as the browser redraws the scene after each message.
         """
         now = time.monotonic()
         words = not dragging or now >= self._written + _READ
@@ -324,7 +330,7 @@ def show(handle: viser.GuiHtmlHandle, content: str) -> None:
 
 _MM = quantity("length").display_factor
 
-# Called with the place (3,), m, and the orientation (3, 3) to which it was dragged.
+# Function called with the position (3,), m, and the orientation (3, 3) after dragging.
 Moved = Callable[[Array, Array], None]
 
 
@@ -356,7 +362,7 @@ class Grip:
         self._turning = False
         self._by_ball = False
 
-        # Coroutines run one after the other, so that no older place can overtake a newer one.
+        # Coroutines run one after the other, so that no older position can overtake a newer one.
         @self._gizmo.on_update
         async def _(event: viser.TransformControlsEvent) -> None:
             if event.phase == "update":
@@ -365,7 +371,7 @@ class Grip:
 
         @self._ball.on_drag
         async def _(event: viser.SceneNodeDragEvent[viser.IcosphereHandle]) -> None:
-            # What is not held would only be drawn in vain.
+            # The gizmo is hidden while the ball is dragged.
             self._gizmo.visible = event.phase == "end" and self._ball.visible
             if event.phase == "update":
                 self._by_ball = True
@@ -377,16 +383,14 @@ class Grip:
 
     def follow(self, place: Array) -> None:
         """Move the part that the mouse does not hold to the position (3,) it was dragged to, m."""
-        x, y, z = (_MM * place).tolist()
-        self._ball.position = (x, y, z)
+        self._ball.position = triple(_MM * place)
         if self._by_ball:
-            self._gizmo.position = (x, y, z)
+            self._gizmo.position = self._ball.position
 
     def show(self, place: Array | None, axis: Array | None = None) -> None:
         """Show the grip at a position (3,), m, with arcs to rotate an axis; None hides it."""
         if place is not None:
-            x, y, z = (_MM * place).tolist()
-            self._gizmo.position = self._ball.position = (x, y, z)
+            self._gizmo.position = self._ball.position = triple(_MM * place)
         if axis is not None:
             first, second = across(axis)
             turn = np.stack([first, second, axis / np.linalg.norm(axis)], axis=1)
@@ -398,22 +402,16 @@ class Grip:
             self._gizmo.disable_rotations = not self._turning
         self._gizmo.visible = self._ball.visible = place is not None
 
-    def remove(self) -> None:
-        """Remove it from the scene."""
-        self._gizmo.remove()
-        self._ball.remove()
-
 
 # Width of the panel and its margin, over the height of a usual window; in a narrow one at most half
-# of the width counts. How many pixels it has is not known: screens have one or more to each of the
-# page's.
+# of the width counts. Its width in pixels is unknown, as the pixel ratio of screens differs.
 PANEL = 0.52
-# Width over height of a window in which the panel is below what is drawn, and its share of the
+# Width over height of a window below which the panel is below the scene, and its share of the
 # height there.
 PHONE, LOW = 0.65, 0.55
-# Directions from which things can be looked at; with x to the right in the first two.
+# Named directions of view; in the first two, x points to the right.
 VIEWS = {"Top": (0.0, -1e-3, 1.0), "Front": (0.0, -1.0, 0.0), "Side": (1.0, 0.0, 0.0)}
-_WIDTH = 1.25  # width of what is shown, over the distance from which it is looked at
+_WIDTH = 1.25  # width of the region shown, over the distance of the camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -482,7 +480,7 @@ class Framing:
             self._goal, self.turned = goal, turned
             camera = self._server.initial_camera
             place, target = self._wanted(goal, 1280.0, 720.0, camera.fov)
-            camera.position, camera.look_at = _triple(place), _triple(target)
+            camera.position, camera.look_at = triple(place), triple(target)
             for client in self._server.get_clients().values():
                 self._turn(client, goal)
 
@@ -494,8 +492,8 @@ class Framing:
 
         @client.camera.on_update
         async def _(camera: viser.CameraHandle) -> None:
-            # Panels come and go; who has turned the view keeps it. A window that has just opened
-            # may have missed where its camera belongs: it reports where it began.
+            # When a window is resized, views that the user has turned are kept. A window that has
+            # just opened may have missed its camera position, and reports its initial one.
             with self._lock:
                 wide, tall, place = self._placed.get(client.client_id, (0, 0, np.zeros(3)))
                 resized = (camera.image_width, camera.image_height) != (wide, tall)
@@ -516,8 +514,7 @@ class Framing:
         place, target = self._wanted(goal, wide, tall, camera.fov)
         self._placed[client.client_id] = wide, tall, place
         with client.atomic():
-            camera.position = _triple(place)
-            camera.look_at = _triple(target)
+            camera.position, camera.look_at = triple(place), triple(target)
 
     @staticmethod
     def _wanted(goal: Shot | Array, wide: float, tall: float, fov: float) -> tuple[Array, Array]:
@@ -525,11 +522,6 @@ class Framing:
         if isinstance(goal, Shot):
             return framed(goal, wide, tall, fov)
         return goal[:3], goal[3:]
-
-
-def _triple(values: Array) -> tuple[float, float, float]:
-    x, y, z = values.tolist()
-    return x, y, z
 
 
 Job = Callable[[], None]
@@ -595,8 +587,7 @@ class Latest:
             try:
                 job()
             except Exception as error:
-                # A window must not die of one bad input.
-                self._fault(error)
+                self._fault(error)  # one invalid input must not end the viewer
 
 
 RATE = 25.0  # ticks per second
@@ -645,7 +636,7 @@ class Player:
 
 Rehearsal = Callable[[], object]
 
-_done = threading.Event()  # set once this process has gone through all: kernels stay
+_done = threading.Event()  # set once all jobs have run in this process, whose kernels remain
 
 
 class CompileNotice(event.Listener):
@@ -659,7 +650,7 @@ class CompileNotice(event.Listener):
         event.register("numba:compile", self)
 
     def start(self, jobs: Sequence[Rehearsal]) -> None:
-        """Run jobs, once per process, ignoring errors, which will occur again when it matters."""
+        """Run jobs, once per process, ignoring errors, which occur again when a job is needed."""
         if not _done.is_set():
             self._running = True
             threading.Thread(target=self._run, args=(jobs,), name="warming", daemon=True).start()

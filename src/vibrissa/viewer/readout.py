@@ -63,9 +63,9 @@ def table(rows: Mapping[str, float], heading: str = "") -> str:
     lines = ["".join(cells[i : i + 2]) for i in range(0, len(cells), 2)]
     head = f'<div style="font-weight:600;margin-bottom:2px">{plain(heading)}</div>'
     body = "".join(f"<tr>{line}</tr>" for line in lines)
-    return _framed(
-        (head if heading else "")
-        + f'<table style="width:100%;border-collapse:collapse;font-size:13px">{body}</table>'
+    return (
+        f'<div style="margin:0 12px 8px">{head if heading else ""}'
+        f'<table style="width:100%;border-collapse:collapse;font-size:13px">{body}</table></div>'
     )
 
 
@@ -92,10 +92,6 @@ def note(text: str) -> str:
     )
 
 
-def _framed(body: str) -> str:
-    return f'<div style="margin:0 12px 8px">{body}</div>'
-
-
 def of_deflection(bent: Deflection) -> str:
     """HTML with status of the load, signals at the base, and contact point."""
     return sentence(Status(int(bent.status))) + numbers(bent)
@@ -110,11 +106,10 @@ def numbers(bent: Deflection) -> str:
     return table(measured, "At the base") + table(contact, "Contact")
 
 
-# Points of a line; each stands for the least and the largest value around it.
 ROWS = (("Fx", "FT"), ("Mx", "MB"), ("FD", "MD"))
 WIDTH, ROW, LEFT = 300.0, 62.0, 40.0
 _COLOURS = ("#0072b2", "#d55e00")
-_MOST = 700
+_MOST = 700  # largest number of points of a line, which has the extremes of the values around each
 
 
 def chart(time: Array, signals: dict[str, Array], touching: NDArray[np.bool_]) -> str:
@@ -144,7 +139,7 @@ def cursor(share: float, *, strip: bool = False) -> str:
     return f'<div style="margin-top:{-100.0 * tall / WIDTH:.3f}%">{_svg(line, tall)}</div>'
 
 
-PAD = 8  # empty pixels at the right of a picture over time; the page's script knows them
+PAD = 8  # empty pixels at the right of a plot over time, as assumed by the page's script
 STRIP = 20.0  # height of the timeline, pixels per :data:`WIDTH` of them
 
 

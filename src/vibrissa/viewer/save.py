@@ -29,9 +29,8 @@ from vibrissa.whisker import Whisker
 
 Picture = np.ndarray[Any, np.dtype[np.uint8]]
 
-# White around a picture, pixels.
 NODES = 200
-_MARGIN = 24
+_MARGIN = 24  # white around a picture, pixels
 
 
 def whisker_csv(whisker: Whisker) -> bytes:
@@ -99,9 +98,8 @@ def _written(name: str, write: Callable[[Path], object]) -> bytes:
         return path.read_bytes()
 
 
-# Most frames of a movie.
 _TIMEOUT = 20.0
-_FRAMES = 100
+_FRAMES = 100  # most frames of a movie
 
 
 def _render(client: viser.ClientHandle) -> Picture:
@@ -173,7 +171,7 @@ class SaveControls:
             return
 
         def drawn() -> bytes:
-            self._page.grip.show(None)  # nobody takes hold of a picture
+            self._page.grip.show(None)
             try:
                 return png(on_paper(_render(client)))
             finally:

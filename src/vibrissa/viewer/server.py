@@ -23,8 +23,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from http import HTTPStatus
 from os import PathLike
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import Any, Self
 from urllib.parse import parse_qsl, urlsplit
 
 import numpy as np
@@ -66,10 +65,6 @@ from vibrissa.viewer.state import loaded, moved, with_radius
 from vibrissa.viewer.trial import TrialMode, Watched, watched
 from vibrissa.whisker import Whisker
 
-if TYPE_CHECKING:
-    import viser
-
-
 HOST = "127.0.0.1"
 PORT = 8080
 
@@ -78,15 +73,6 @@ _COMPILING = (
     "Compiling, once for this installation, which takes a minute or two. Pegs, candidates and "
     "their errors follow when their part is ready."
 )
-
-
-class Shown(Protocol):
-    """Interface of a served page."""
-
-    server: viser.ViserServer
-
-    def close(self) -> None:
-        """Stop it."""
 
 
 class Served:
@@ -98,7 +84,7 @@ class Served:
         Page that is served.
     """
 
-    def __init__(self, page: Shown) -> None:
+    def __init__(self, page: Page | LivePage) -> None:
         self.shown = page
 
     @property
@@ -116,18 +102,13 @@ class Served:
 
     def close(self) -> None:
         """Stop serving."""
-        with contextlib.redirect_stdout(io.StringIO()):  # it would say so
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a message
             self.shown.close()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
 
@@ -171,10 +152,9 @@ def view_stream(
     whisker : Whisker
         Whisker of the stream.
     address : str
-        UDP address on which the answers come, ``HOST:PORT``, as ``vibrissa stream --send`` sends
-        them.
+        UDP address ``HOST:PORT`` to which ``vibrissa stream --send`` sends its results.
     name : str
-        Name of the whisker, where the stream is of several.
+        Name of the whisker, if the stream is of several.
     host : str
         Address to serve the page on; the default can only be reached from this machine.
     port : int, optional
@@ -188,7 +168,7 @@ def view_stream(
     Raises
     ------
     ValueError
-        If one of the two addresses is not one, or is taken.
+        If one of the two addresses is invalid or taken.
     """
     with contextlib.ExitStack() as opened:
         live = LivePage(_served(host, port, opened, lambda _: None), Live(whisker, name), address)
@@ -213,9 +193,9 @@ def view(
         Whisker, contact map or recording to show; of a recording the whisker with the most frames
         in contact.
     contact_map : ContactMap, optional
-        The map of the whisker, if there is one already.
+        Map of the whisker; by default it is computed.
     recording : DataTree, optional
-        A trial to watch in addition to another whisker or a map.
+        Trial to show in addition to another whisker or a map.
     videos : sequence of path
         Videos of the recording, one for each of its cameras, in their order.
     host : str
@@ -231,9 +211,9 @@ def view(
     Raises
     ------
     ValueError
-        If it is none of these, the same is given twice, the map is that of another whisker, the
-        recording has no frames, there are not as many videos as cameras, or the port is
-        taken or not on this machine.
+        If ``shown`` is of another type, a map or recording is given twice, the map is that of
+        another whisker, the recording has no frames, the numbers of videos and cameras differ, or
+        the port is taken or not on this machine.
     """
     if isinstance(shown, xr.DataTree):
         recording = _once(recording, shown, "recording")
@@ -314,7 +294,7 @@ def _furnished(
     SaveControls(page, recording)
     page.linked = page.server.gui.add_html("")
     page.choose("Trial" if trial is not None else "Map" if page.has_map else "Bend")
-    page.work.wait()  # one thing is compiled at a time; this is what the page needs to be there
+    page.work.wait()  # kernels are compiled one at a time, those of the first view before others
     page.prepare()
 
     def report(busy: bool) -> None:
@@ -358,7 +338,7 @@ def _footage(
     return tuple(opened.enter_context(contextlib.closing(Footage(path))) for path in videos)
 
 
-Restore = Callable[[dict[str, str]], None]  # called with the words of a link that a browser follows
+Restore = Callable[[dict[str, str]], None]  # called with the parameters of a link
 
 
 def _served(
@@ -366,12 +346,9 @@ def _served(
 ) -> viser.ViserServer:
     if port is None:
         port = free_port(host)
-    elif not is_free(host, port):  # viser would take another one without a word
+    elif not is_free(host, port):  # viser would silently use another one
         raise ValueError(f"port {port} of {host} is taken; leave it out for one that is free")
-    with (
-        guarded(host, restore),
-        contextlib.redirect_stdout(io.StringIO()),
-    ):  # it would announce itself
+    with guarded(host, restore), contextlib.redirect_stdout(io.StringIO()):  # viser prints its URL
         server = viser.ViserServer(host=host, port=port, label="vibrissa", verbose=False)
     opened.callback(server.stop)
     server.gui.configure_theme(
@@ -395,7 +372,7 @@ def is_free(host: str, port: int) -> bool:
     """Whether a port is free."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
-        if os.name == "posix":  # a port that was just given back is free
+        if os.name == "posix":  # a port that was released a moment ago is free
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((host, port))
@@ -437,7 +414,7 @@ def from_own_page(origin: str | None, asked: str | None, host: str) -> bool:
 def guarded(host: str, restore: Restore) -> Iterator[None]:
     """Context in which started servers reject requests of other pages, and handle links.
 
-    viser has no place for such a check, so what it calls to listen is wrapped while it starts.
+    viser has no hook for such a check, so the function by which it listens is wrapped as it starts.
     """
     from websockets.asyncio import server
 
@@ -476,11 +453,10 @@ def guarded(host: str, restore: Restore) -> Iterator[None]:
         )
 
 
-_POINTS = 5000  # contact points that remain; those before are forgotten
-_PICTURE = 0.05  # seconds between two pictures
-# Largest semi-axis of an ellipsoid of uncertainty, over the whisker's length.
+_POINTS = 5000  # number of contact points kept, the newest ones
+_PICTURE = 0.05  # interval between two updates of the scene, s
 _SIGMAS = 2.0
-_WIDEST = 0.25
+_WIDEST = 0.25  # largest semi-axis of an ellipsoid of uncertainty, over the whisker's length
 
 
 class Live:
@@ -525,7 +501,7 @@ class Live:
         covariance = np.array(answer.get("covariance", np.full((3, 3), np.nan)), dtype=np.float64)
         if not np.isfinite(covariance).all():
             covariance = np.zeros((3, 3))
-        # At least as large as a point that is seen.
+        # The ellipsoid is at least as large as a visible point.
         widened = mm(mm(covariance)) + (size / _SIGMAS) ** 2 * np.eye(3)
         most = float(mm(_WIDEST * whisker.length))
         out["contact"] = Body(*error_ellipsoid(mm(point), widened, _SIGMAS, most), CONTACT, 0.6)
@@ -573,7 +549,7 @@ class LivePage:
         while self._open:
             try:
                 self.live.put(next(lines))
-            except TimeoutError:  # a generator that has raised is at its end
+            except TimeoutError:  # which ends a generator
                 lines = udp_lines(self._socket)
             except OSError:  # closed
                 return

@@ -15,7 +15,7 @@ from typing import Any, cast
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.numerics import Array
 from vibrissa.scene import (
@@ -122,14 +122,13 @@ class Stage:
                     thickness_units="screen",
                 )
             case Label():
-                return scene.add_label(
-                    path, thing.text, position=_vector(thing.position), anchor="bottom-left"
-                )
+                position = triple(thing.position)
+                return scene.add_label(path, thing.text, position=position, anchor="bottom-left")
 
 
 def _changed(handle: viser.SceneNodeHandle, old: Mark, new: Mark) -> bool:
     """Change an object into a similar new one; return whether this is possible."""
-    node = cast(Any, handle)  # every kind has attributes of its own
+    node = cast(Any, handle)  # each kind of node has other attributes
     match old, new:
         case Body(), Body() if old.side == new.side and np.array_equal(old.faces, new.faces):
             if new.vertices is not old.vertices:
@@ -139,34 +138,31 @@ def _changed(handle: viser.SceneNodeHandle, old: Mark, new: Mark) -> bool:
                 node.position = new.position
         case Cloud(), Cloud() if old.size == new.size:
             node.points, node.colors = new.points.astype(np.float32), new.colours
-        case Arrows(), Arrows() if _like(old, new):
+        case Arrows(), Arrows() if old.thickness == new.thickness and np.array_equal(
+            old.colours, new.colours
+        ):
             node.points = np.stack([new.start, new.end], axis=1).astype(np.float32)
-        case Line(), Line() if _alike(old, new):
+        case Line(), Line() if (old.colour, old.width, old.pieces.shape) == (
+            new.colour,
+            new.width,
+            new.pieces.shape,
+        ):
             node.points = new.pieces.astype(np.float32)
         case Label(), Label():
-            node.text, node.position = new.text, _vector(new.position)
+            node.text, node.position = new.text, triple(new.position)
         case _:
             return False
     return True
 
 
-def _like(old: Arrows, new: Arrows) -> bool:
-    return old.thickness == new.thickness and np.array_equal(old.colours, new.colours)
-
-
-def _alike(old: Line, new: Line) -> bool:
-    look = (old.colour, old.width, old.pieces.shape)
-    return look == (new.colour, new.width, new.pieces.shape)
-
-
-def _vector(values: Any) -> tuple[float, float, float]:
+def triple(values: ArrayLike) -> tuple[float, float, float]:
+    """Three numbers as a tuple."""
     x, y, z = np.asarray(values, dtype=np.float64).tolist()
     return x, y, z
 
 
-# Brightness of what is seen by a grazing light, as a share of the full one.
 _TO_LIGHT = np.array([-0.25, -0.55, 0.8]) / np.linalg.norm([-0.25, -0.55, 0.8])
-_SHADE = 0.75
+_SHADE = 0.75  # brightness of surfaces in grazing light, over the full brightness
 # ACES filmic tone mapping of three.js: in, a curve per channel, out; and its exposure.
 _IN = np.array(
     [[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]]
@@ -200,7 +196,9 @@ def glb(
     if opacity is not None:
         material["alphaMode"] = "BLEND"
         material["pbrMetallicRoughness"]["baseColorFactor"][3] = opacity
-    return _file(vertices, before_tone_mapping(_linear(seen)), faces, material)
+    # From sRGB to linear light.
+    linear = np.where(seen <= 0.04045, seen / 12.92, ((seen + 0.055) / 1.055) ** 2.4)
+    return _file(vertices, before_tone_mapping(linear), faces, material)
 
 
 def before_tone_mapping(light: Array) -> Array:
@@ -209,11 +207,6 @@ def before_tone_mapping(light: Array) -> Array:
     a, b, c = 1.0 - 0.983729 * y, 0.0245786 - 0.432951 * y, -(0.000090537 + 0.238081 * y)
     curve = (-b + np.sqrt(np.maximum(b * b - 4.0 * a * c, 0.0))) / (2.0 * a)
     return np.asarray(np.maximum(curve @ np.linalg.inv(_IN).T, 0.0) / _EXPOSURE)
-
-
-def _linear(share: Array) -> Array:
-    """Linear light of sRGB values from 0 to 1."""
-    return np.asarray(np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4))
 
 
 def _shade(triangles: Array) -> Array:
@@ -228,12 +221,12 @@ def _welded(corners: Array) -> tuple[Array, Ints, Ints]:
     """Distinct vertices (m, 3), the first corner at each (m,), and the vertex of each corner."""
     size = float(np.ptp(corners)) or 1.0
     cells = np.round(corners / (_WELD * size)).astype(np.int64)
-    key = cells.view([("", np.int64)] * 3).ravel()
-    _, first, which = np.unique(key, return_index=True, return_inverse=True)
+    _, first, which = np.unique(cells, return_index=True, return_inverse=True, axis=0)
     return corners[first], first, which.ravel()
 
 
 def _file(vertices: Array, colours: Array, faces: Ints, material: dict[str, Any]) -> bytes:
+    """GLB file of vertices (n, 3) with linear colours (n, 3), triangles and a material."""
     parts: list[NDArray[Any]] = [
         np.asarray(vertices, dtype="<f4"),
         np.asarray(colours, dtype="<f4"),
@@ -247,7 +240,7 @@ def _file(vertices: Array, colours: Array, faces: Ints, material: dict[str, Any]
         number = 5126 if part.dtype.kind == "f" else 5125
         accessors.append(
             {
-                "bufferView": len(accessors),
+                "bufferView": len(views) - 1,
                 "componentType": number,
                 "count": len(part),
                 "type": kind,

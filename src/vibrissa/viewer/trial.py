@@ -348,17 +348,18 @@ class TrialMode(Mode):
     """Mode with the controls of time, and the drawings that depend on it."""
 
     name = "Trial"
+    layers = ("moment", "touched", "surroundings")
 
     def __init__(self, page: Page, trial: Watched, videos: Sequence[Footage] = ()) -> None:
+        super().__init__(page, page.server.gui.add_folder("Trial", visible=False))
         self.trial = trial
         self.frame = 0
-        self._page = page
         self._videos = tuple(videos)
         self._now = float(trial.time[0])
         self._speed = SPEEDS[_USUAL]
         self._whisker = trial.busiest
         self._still: frozenset[str] | None = None
-        self._layers = frozenset(LAYERS)
+        self._visible = frozenset(LAYERS)
         self._views = views(trial)
         self._player = Player(self._tick)
         page.closing.append(self._player.close)
@@ -366,7 +367,6 @@ class TrialMode(Mode):
 
     def _controls(self, server: viser.ViserServer) -> None:
         gui, trial = server.gui, self.trial
-        self._folder = gui.add_folder("Trial", visible=False)
         end = round(_MS * float(trial.time[-1] - trial.time[0]), 3)
         step = max(round(end / max(trial.frames - 1, 1), 3), 1e-3)
         with self._folder:
@@ -412,8 +412,8 @@ class TrialMode(Mode):
         jump.on_click(lambda _: self.jump())
 
     def enter(self) -> None:
-        """Show controls, and point the camera at the whiskers."""
-        self._folder.visible = True
+        """Show the controls, and point the cameras at the whiskers."""
+        super().enter()
         self._timeline.visible = True
         if self._window is not None:
             self._window.visible = True
@@ -422,19 +422,18 @@ class TrialMode(Mode):
         self._draw_chart()
 
     def leave(self) -> None:
-        """Stop, and hide controls and things."""
+        """Stop, and hide the controls and the objects."""
+        super().leave()
         self.pause()
-        self._folder.visible = self._timeline.visible = False
+        self._timeline.visible = False
         if self._window is not None:
             self._window.visible = False
         self._still = None
-        for layer in ("moment", "touched", "surroundings"):
-            self._page.stage.show(layer, {})
 
     def redraw(self) -> None:
         """Draw the current frame."""
         trial, stage, frame = self.trial, self._page.stage, self.frame
-        layers = self._layers
+        layers = self._visible
         stage.show("moment", moment_drawing(trial, frame, self._page.exaggeration, layers))
         stage.show("touched", touched(trial, frame) if "Contacts" in layers else {})
         if self._still != layers:
@@ -539,7 +538,7 @@ class TrialMode(Mode):
         return there.get(layer, True)
 
     def _see(self, layer: str, shown: bool) -> None:
-        self._layers = self._layers | {layer} if shown else self._layers - {layer}
+        self._visible = self._visible | {layer} if shown else self._visible - {layer}
         self._page.work.put("time", self._page.redraw)
 
     def _draw_chart(self) -> None:

@@ -245,7 +245,7 @@ def _pool(process: int) -> ThreadPoolExecutor:
 def threads() -> int:
     """Return the number of cores that this process may use; ``VIBRISSA_THREADS`` overrides it."""
     wanted = os.environ.get("VIBRISSA_THREADS")
-    if wanted is not None:
+    if wanted:
         try:
             return max(1, int(wanted))
         except ValueError:

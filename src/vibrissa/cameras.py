@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.deferred import transform
 from vibrissa.io import in_file, read_calibration, write_calibration
-from vibrissa.numerics import Array, numbers
+from vibrissa.numerics import Array, numbers, vectors
 from vibrissa.quantities import attributes
 
 __all__ = [
@@ -148,7 +148,7 @@ class Camera:
         slopes : array (..., 2, 3)
             Derivatives of the pixels by the points, pixels per m.
         """
-        seen = numbers("points", points) @ self.rotation.T + self.translation
+        seen = vectors("points", points) @ self.rotation.T + self.translation
         if self.projection == "orthographic":
             slopes = np.broadcast_to(
                 self.matrix[:2, :2] @ self.rotation[:2], (*seen.shape[:-1], 2, 3)

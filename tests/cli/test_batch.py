@@ -77,11 +77,13 @@ def test_links_and_groups_that_were_edited_stop_nothing(tmp_path):
     tree = load_recording(tmp_path / "miss.nc")
     tree["/contour"] = xr.DataTree(xr.Dataset(attrs={"shape": "cylinder"}))
     save_recording(tmp_path / "lacking.nc", tree)
-    (tmp_path / "gone.nc").symlink_to(tmp_path / "nowhere.nc")
-    assert "3 recordings, 3 with a fault" in run("batch", tmp_path)
+    (tmp_path / "gone.NC").symlink_to(tmp_path / "nowhere.nc")
+    result = CliRunner().invoke(app, ["batch", str(tmp_path)])
+    assert "3 recordings, 3 with a fault" in result.output
+    assert result.exit_code == 1
     with (tmp_path / "summary.csv").open() as file:
         faults = {row["file"]: row["fault"] for row in csv.DictReader(file)}
-    assert "there is no file" in faults["gone.nc"]
+    assert "there is no file" in faults["gone.NC"]
     assert "lacks" in faults["lacking.nc"]
 
 

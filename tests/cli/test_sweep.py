@@ -62,6 +62,15 @@ def test_a_dry_run_counts_and_does_nothing(study, tmp_path):
     assert not (tmp_path / "s").exists()
 
 
+def test_a_failed_cell_shows_in_the_exit_status(tmp_path):
+    path = tmp_path / "study.toml"
+    path.write_text("[[whiskers]]\nlength = [0.04, 40]\n[[tasks]]\nkind = 'map'\n")
+    for _ in range(2):
+        result = RUN.invoke(app, ["sweep", str(path), "-o", str(tmp_path / "s"), "--workers", "0"])
+        assert result.exit_code == 1
+        assert "map: 1 done, 1 failed" in result.output
+
+
 def test_done_shown_and_not_done_again(study, tmp_path):
     store = tmp_path / "s.zarr"
     said = done("sweep", study, "-o", store, "--workers", 0)

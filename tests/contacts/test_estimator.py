@@ -1,5 +1,8 @@
 """A stream of measurements: the same answers as in a batch, one at a time, and in sequence."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 
@@ -41,6 +44,22 @@ def test_a_stream_is_the_same_as_a_batch(gamma_map, sweep, names, noise):
     # One branch, after one taken first (of Fx, FT and MB alone) has come to its end.
     path = np.linalg.norm(np.diff(bent.contact_point, axis=0), axis=1).max()
     assert np.linalg.norm(np.diff(followed[8:], axis=0), axis=1).max() < 2.0 * path
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
+def test_a_copy_goes_on_as_the_original(gamma_map, sweep, copied):
+    """As where processes share the work."""
+    first, second = (sweep[1][["Fx", "MB", "MD"]].to_array().values.T)[:2]
+    of_sensor = vb.Estimator.of_sensor(gamma_map, vb.sensors.Sensor(noise=SIGMA))
+    bent = sweep[0]
+    np.testing.assert_array_equal(
+        copied(of_sensor)(np.append(bent.force[0], bent.moment[0])).point,
+        of_sensor(np.append(bent.force[0], bent.moment[0])).point,
+    )
+    follow = vb.ContactFilter(vb.Estimator(gamma_map, noise=np.diag(SIGMA**2)))
+    follow(0.0, first)
+    other = copied(follow)
+    np.testing.assert_array_equal(other(1e-3, second).point, follow(1e-3, second).point)
 
 
 def test_under_noise_a_stream_is_the_same(gamma_map, sweep, rng):

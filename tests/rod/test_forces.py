@@ -98,3 +98,15 @@ def test_a_soft_base_follows_strong_forces_as_well(gamma):
     bent, finer = vb.deflect(soft, load), vb.deflect(soft, load, steps=36 * 32)
     np.testing.assert_array_equal(bent.status, OK)
     assert (sizes(bent.contact_point - finer.contact_point) <= 2e-4 * gamma.length).all()
+
+
+def test_a_soft_base_that_turns_far_is_as_accurate_as_the_whisker(gamma):
+    stiffness = discretize(gamma).moment / 6.0
+    soft = gamma.with_properties(base_stiffness=(stiffness, stiffness))
+    fold = vb.ContactMap.simulate(soft, cells=(4, 8, 4), grid=False).to_dataset().fold_force[2]
+    load = vb.PointForce(0.65 * gamma.length, 0.9 * fold.values, fold.bearing.values)
+    bent = vb.deflect(soft, load, steps=36 * 8)
+    np.testing.assert_array_equal(bent.status, OK)
+    found = vb.deflect(soft, vb.PointContact(bent.contact_point))
+    np.testing.assert_allclose(found.arc_length, bent.arc_length, atol=2e-5 * gamma.length)
+    np.testing.assert_allclose(found.force, bent.force, atol=1e-5 * sizes(bent.force).max())

@@ -79,6 +79,11 @@ def test_files_are_whiskers_and_their_content_is_their_identity(tmp_path):
             comments="",
         )
     text = f'[[whiskers]]\nkind = "files"\nfiles = "*.csv"\nyoungs_modulus = 2.5\n{TASKS}'
+    folder = tmp_path / "[a]"  # not those of a folder called "a"
+    for other in (folder, tmp_path / "a"):
+        other.mkdir()
+        (other / f"{other.name}.csv").write_bytes((tmp_path / "one.csv").read_bytes())
+    assert [one.name for one in read_study(text, folder).specimens] == ["[a]"]
     one, two = read_study(text, tmp_path).specimens
     assert (one.name, two.name) == ("one", "two")
     assert two.make().length == pytest.approx(33e-3, rel=0.01)
@@ -133,6 +138,10 @@ def test_a_cell_is_the_same_in_any_study_that_has_it():
         (WHISKERS + '[[tasks]]\nkind = "uniqueness"\nsamples = 3\n', "samples is 3; a number from"),
         (WHISKERS + '[[tasks]]\nkind = "uniqueness"\nregions = ["N"]\n', "known are all"),
         (WHISKERS + '[[tasks]]\nkind = "uniqueness"\ntriplets = "Fx"\n', "a list without"),
+        (
+            WHISKERS + '[[tasks]]\nkind = "uniqueness"\ntriplets = ["Fx MB MD", "MD,fx,MB"]\n',
+            "without repetitions",
+        ),
         (WHISKERS + '[[tasks]]\nkind = "uniqueness"\nresolution = "no"\n', "true or false"),
         (WHISKERS + '[[tasks]]\nkind = "estimation"\nsignals = ["Q"]\n', r"\[\[tasks\]\] 1: "),
         (WHISKERS + '[[tasks]]\nkind = "friction"\nfriction = [-1]\n', "coefficients from 0"),

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import typer
+
 import vibrissa as vb
 from vibrissa.cli.estimate import EstimateOptions
 from vibrissa.cli.inputs import objects_from, recording_from
@@ -40,13 +42,14 @@ def batch(
     Each recording is processed as by `vibrissa reconstruct`, and the results are added to it.
     Recordings that have a contour are skipped unless --force is given, so that an interrupted run
     can be continued. A recording that fails does not stop the others: the table states the error,
-    and the next run tries again. The table is FOLDER/summary.csv, in SI units, and the page
-    FOLDER/summary.html.
+    and the next run tries again; the exit status is then 1. The table is FOLDER/summary.csv, in SI
+    units, and the page FOLDER/summary.html.
     Example: `vibrissa batch trials --shape sphere`
     """
     if not folder.is_dir():
         raise ValueError(f"{folder} is not a folder; one with recordings is needed")
-    paths = [path for path in sorted(folder.glob("*.nc")) if _is_recording(path)]
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".nc")
+    paths = [path for path in files if _is_recording(path)]
     if not paths:
         raise ValueError(
             f"{folder} contains no recordings; `vibrissa track` and `vibrissa import` create them"
@@ -73,6 +76,8 @@ def batch(
         say(f"{row[0]}: {row[-1] or row[-2]}")
     say(about)
     say(f"wrote {folder / TABLE}\nwrote {folder / PAGE}")
+    if failed:
+        raise typer.Exit(1)
 
 
 def _is_recording(path: Path) -> bool:

@@ -31,6 +31,7 @@ def sweep(
 ) -> None:
     """Run a study of many whiskers on this machine or a cluster; interrupted runs can be continued.
 
+    A whisker that fails does not stop the others; the exit status is then 1.
     Example: `vibrissa sweep study.toml -o study.zarr`, then `vibrissa sweep show study.zarr`
     """
     try:
@@ -95,8 +96,11 @@ def _run(plan: vb.sweeps.Study, path: Path, **how: Any) -> None:
         remark(line)
     say(text)
     say(vb.sweeps.sweep_summary(vb.sweeps.open_sweep(path)))
-    _print_failures(vb.sweeps.failures(path))
+    faults = vb.sweeps.failures(path)
+    _print_failures(faults)
     say(f"results are in {path}")
+    if faults:
+        raise typer.Exit(1)
 
 
 def _cost(plan: vb.sweeps.Study, workers: int) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from vibrissa.contacts.contact_map import ContactMap, node_coordinates
 from vibrissa.deferred import xr
-from vibrissa.numerics import AnyArray, Array, IntArray
+from vibrissa.numerics import AnyArray, Array, IntArray, vectors
 from vibrissa.rod import (
     PointContact,
     contact_forces,
@@ -58,7 +58,7 @@ def chosen_contacts(
         return _of_dataset(contact_map, at, triplet)
     if isinstance(at, Mapping):
         return _of_signals(contact_map, at, triplet, {})
-    points = np.asarray(at, dtype=np.float64)
+    points = vectors("at", at)
     shape = points.shape[:-1]
     dims = ("contact",) if len(shape) == 1 else tuple(f"axis_{i}" for i in range(len(shape)))
     return _of_points(contact_map, points, dims, {})

@@ -38,7 +38,7 @@ from vibrissa.io import (
     refuse_whisk,
     write_netcdf,
 )
-from vibrissa.numerics import AnyArray, Array, numbers, rotation_matrices
+from vibrissa.numerics import AnyArray, Array, rotation_matrices
 from vibrissa.quantities import attributes
 from vibrissa.rod import (
     CELLS,
@@ -213,9 +213,6 @@ class ContactMap:
             One contact for each measurement, with all candidates.
         """
         errors = common_errors(stiffness_sigma, gain_sigma, mixing_sigma)
-        if isinstance(signals, dict):
-            unlabelled = {n: v for n, v in signals.items() if not isinstance(v, xr.DataArray)}
-            signals = {**signals, **{name: numbers(name, v) for name, v in unlabelled.items()}}
         weight = Gravity.of(gravity)
         if base_rotation is not None and gravity is None:
             raise ValueError("base_rotation turns gravity, and none is given")

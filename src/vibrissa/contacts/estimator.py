@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -81,7 +81,7 @@ class Estimator:
     _base: JointFit | None = None
     _joint: JointEstimate | None = None
     _untared: JointEstimate | None = None
-    _again: Callable[[ChartedWhisker], Estimator]
+    _again: Callable[..., Estimator]
 
     def __init__(
         self,
@@ -109,7 +109,7 @@ class Estimator:
         readout = Named(contact_map, names, sensor)
         self._start(contact_map, readout, len(names), felt_above, prior)
         stated = (noise, stiffness_sigma, felt_above, gain_sigma, mixing_sigma, prior)
-        self._again = lambda other: Estimator(other, names, *stated)
+        self._again = partial(_on_map, Estimator, names, *stated)
         self._allow(stiffness_sigma, compliance_sigma, friction, Gravity.of(gravity))
 
     def _allow(
@@ -194,7 +194,7 @@ class Estimator:
         out._start(contact_map, readout, len(sensor.channels), felt_above, prior)
         out._sensor = sensor
         stated = (stiffness_sigma, felt_above, prior)
-        out._again = lambda other: Estimator.of_sensor(other, sensor, *stated)
+        out._again = partial(_on_map, Estimator.of_sensor, sensor, *stated)
         out._allow(stiffness_sigma, 0.0, 0.0, Gravity.of(gravity))
         return out
 
@@ -383,7 +383,7 @@ class Estimator:
             The same signals, noise and prior.
         """
         assert self._joint is not None
-        return self._again(self._joint.sagged)
+        return self._again(contact_map=self._joint.sagged)
 
     def of_sagged(self, measurement: Measurement, sagged: Estimator) -> Measurement:
         """Return what the sagged whisker without weight would measure of the same contact point.
@@ -461,3 +461,9 @@ class Estimator:
             covariance[:], found.covariances[:] = np.nan, np.nan
         status, size = Status.UNDERDETERMINED, d.length**2
         return contact_of(found, status, 0.0, d, self.names, middle, middle, covariance * size)
+
+
+def _on_map(
+    made: Callable[..., Estimator], *stated: object, contact_map: ChartedWhisker
+) -> Estimator:
+    return made(contact_map, *stated)

@@ -79,6 +79,10 @@ class Search:
             compile_stages(readout.searched, readout.how, self._problem)
         self._task = task(readout.searched, readout.how, self._problem)
 
+    def __reduce__(self) -> tuple[type[Search], tuple[ChartedWhisker, Named | Mixed]]:
+        """Copy what the search is made of, as memory of compiled code cannot be copied."""
+        return Search, (self.contact_map, self.readout)
+
     def batch(self, values: Array, targets: Array) -> tuple[Candidates, IntArray, Array]:
         """Candidates of measurements (n, k), with statuses and χ² of the first (n,)."""
         readout = self.readout

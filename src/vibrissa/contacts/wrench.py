@@ -46,7 +46,7 @@ from vibrissa.contacts.posterior import CERTAIN, ranked
 from vibrissa.contacts.prior import Prior, possible_candidates, refuse_tip
 from vibrissa.contacts.valleys import Valleys, valleys
 from vibrissa.deferred import xr
-from vibrissa.numerics import AnyArray, Array, IntArray, numbers
+from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod import Discretization, discretize, solve_forces, vanishing_moments
 from vibrissa.signals import Coordinates, labelled_wrench, measured
 from vibrissa.status import Status
@@ -180,9 +180,7 @@ def wrench_on(
     whisker: Whisker, force: ArrayLike | xr.DataArray, moment: ArrayLike | xr.DataArray
 ) -> tuple[Array, Array, tuple[str, ...], Coordinates]:
     """Force and moment with their labels, checked for plausible lever arms."""
-    given = {"force": force, "moment": moment}
-    plain = (v if isinstance(v, xr.DataArray) else numbers(n, v) for n, v in given.items())
-    labelled = labelled_wrench(*plain)
+    labelled = labelled_wrench(force, moment)
     size, turning = (np.linalg.norm(vectors, axis=-1) for vectors in labelled[:2])
     known = (size > 0.0) & np.isfinite(turning)
     arm = float(np.min(turning[known] / size[known])) if known.any() else 0.0

@@ -130,7 +130,7 @@ def _scale_contacts(what: str, arrays: dict[str, Array], n: int, least: int) -> 
     """Select the usable contacts and scale them."""
     usable = np.ones(n, dtype=bool)
     for values in arrays.values():
-        usable &= np.isfinite(values.reshape(n, -1)).all(axis=1)
+        usable &= np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
     if "normals" in arrays:
         length = np.linalg.norm(arrays["normals"], axis=1)
         usable &= length > 0.0

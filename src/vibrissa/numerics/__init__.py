@@ -25,6 +25,7 @@ from vibrissa.numerics.arrays import (
     share_out as share_out,
     spherical as spherical,
     threads as threads,
+    vectors as vectors,
     weighted_quantile,
     without_blas_threads as without_blas_threads,
 )

@@ -10,11 +10,12 @@ import os
 import reprlib
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import cache, wraps
 from typing import Any, ParamSpec, TypeAlias, TypeVar, cast
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.deferred import xr
 
@@ -78,6 +79,9 @@ def numbers(name: str, value: object, order: Sequence[str] = ("x", "y", "z")) ->
     position.
     """
     given: Any = value
+    if isinstance(given, list | tuple) and any(isinstance(v, np.ma.MaskedArray) for v in given):
+        with suppress(ValueError):
+            given = np.ma.array(given)  # np.asarray would use the hidden values of the items
     if type(given) in (np.ndarray, list, tuple):  # the usual case: quick for single measurements
         try:
             plain = np.asarray(given)
@@ -104,6 +108,14 @@ def numbers(name: str, value: object, order: Sequence[str] = ("x", "y", "z")) ->
         of = getattr(given, "dtype", None)
         kind = reprlib.repr(given) if of is None else f"{type(given).__name__} of {of}"
         raise ValueError(f"{name} must be numbers; got {kind}") from error
+
+
+def vectors(name: str, value: object) -> Array:
+    """Convert a user's vectors (..., 3) to float64."""
+    array = numbers(name, value)
+    if array.ndim == 0 or array.shape[-1] != 3:
+        raise ValueError(f"{name} must have shape (..., 3); got {array.shape}")
+    return array
 
 
 def _last_labels(value: Any) -> Iterable[object]:
@@ -147,12 +159,12 @@ def relative(name: str, value: object) -> Array:
     return sigma
 
 
-def spherical(points: Array) -> Array:
+def spherical(points: ArrayLike) -> Array:
     """Spherical coordinates of points: distance, azimuth atan2(y, x), elevation asin(z / r).
 
     Parameters
     ----------
-    points : (..., 3) array
+    points : (..., 3) array_like
         Points, whisker frame, m.
 
     Returns
@@ -160,6 +172,7 @@ def spherical(points: Array) -> Array:
     (..., 3) array
         Distance r, m, azimuth θ and elevation φ, rad.
     """
+    points = vectors("points", points)
     r = np.linalg.norm(points, axis=-1)
     theta = np.arctan2(points[..., 1], points[..., 0])
     phi = np.arctan2(points[..., 2], np.hypot(points[..., 0], points[..., 1]))
@@ -232,8 +245,13 @@ def _pool(process: int) -> ThreadPoolExecutor:
 def threads() -> int:
     """Return the number of cores that this process may use; ``VIBRISSA_THREADS`` overrides it."""
     wanted = os.environ.get("VIBRISSA_THREADS")
-    if wanted is not None:
-        return max(1, int(wanted))
+    if wanted:
+        try:
+            return max(1, int(wanted))
+        except ValueError:
+            raise ValueError(
+                f"VIBRISSA_THREADS is {wanted!r}; a whole number of threads is needed"
+            ) from None
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

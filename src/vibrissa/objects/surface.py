@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.numerics import Array, numbers
+from vibrissa.numerics import Array, vectors
 
 
 class Surface(ABC):
@@ -29,7 +29,7 @@ class Surface(ABC):
         array (...)
             Distances, m; negative inside.
         """
-        return self._distance(numbers("points", points))
+        return self._distance(vectors("points", points))
 
     def local_geometry(self, point: ArrayLike) -> tuple[float, Array, Array]:
         """Signed distance of one point, with its derivatives.

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from vibrissa.numerics import Array, IntArray, Mask, rotation_matrices, without_blas_threads
 from vibrissa.objects import Placement, Surface
-from vibrissa.rod.deflection import Deflection, vectors
+from vibrissa.rod.deflection import Deflection, finite_vectors
 from vibrissa.rod.discretization import discretize
 from vibrissa.rod.obstacles import (
     ELEMENTS,
@@ -180,7 +180,7 @@ def deflect_around(
     """
     solids = _rigid(objects)
     turn = np.eye(3) if base_rotation is None else rotation_matrices("base_rotation", base_rotation)
-    move = np.zeros(3) if base_position is None else vectors("base_position", base_position)
+    move = np.zeros(3) if base_position is None else finite_vectors("base_position", base_position)
     if turn.ndim < 2 or turn.shape[-2] != 3 or turn.ndim > 3 or move.ndim > 2:
         raise ValueError(
             "base_rotation must have shape (n, 3, 3) or (3, 3) and base_position (n, 3) or (3,); "

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.deferred import xr
-from vibrissa.numerics import Array, IntArray, numbers
+from vibrissa.numerics import Array, IntArray, numbers, vectors
 from vibrissa.quantities import attributes
 from vibrissa.rod.discretization import STEPS, discretize
 from vibrissa.rod.gravity import evaluated, resting, trace
@@ -33,16 +33,14 @@ if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
 
-def vectors(name: str, value: ArrayLike) -> Array:
+def finite_vectors(name: str, value: ArrayLike) -> Array:
     """Return ``value`` as float64 (..., 3); raise a ValueError that states what is wrong."""
     return _numbers(name, value, vector=True)
 
 
 def _numbers(name: str, value: ArrayLike, vector: bool) -> Array:
     """Return float64, (..., 3) for vectors; raise a ValueError that states what is wrong."""
-    array = numbers(name, value).copy()  # the caller may change theirs later
-    if vector and (array.ndim == 0 or array.shape[-1] != 3):
-        raise ValueError(f"{name} must have shape (..., 3); got {array.shape}")
+    array = (vectors if vector else numbers)(name, value).copy()  # the caller may change theirs
     if np.isinf(array).any():
         raise ValueError(
             f"{name} has {int(np.isinf(array).sum())} infinite values; NaN means missing"
@@ -214,7 +212,7 @@ class PegContact:
             raise ValueError(
                 f"a peg's radius must not be negative; the smallest is {np.nanmin(radius)} m"
             )
-        if (radius == 0.0).any() != (radius == 0.0).all():
+        if len(set((radius == 0.0).flat)) > 1:
             raise ValueError(
                 "lines (radius 0) and cylinders cannot be mixed in one load: use two loads"
             )

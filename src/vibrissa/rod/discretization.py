@@ -35,7 +35,8 @@ _TURN_PER_STEP = 0.08
 _TAPER_EXPONENT = 0.4
 # Least number of steps, of STEPS, over which the radius falls by a factor e.
 _STEPS_PER_CHANGE = 6.0
-_JOINT_STEPS = 4
+# Steps of a compliant base, for each unit of its compliance in L/EI; a soft one turns by up to π.
+_JOINT_STEPS, _LEAST_JOINT_STEPS, _MOST_JOINT_STEPS = 40, 4, 16
 _ORDER = 4
 # Error of a step's cubics, relative to the largest value, above which moments are matched.
 _ROUGH = 1e-4
@@ -163,7 +164,9 @@ def discretized(whisker: Any, steps: int) -> Discretization:
     rod = Rod(nodes[:-1].copy(), width, ones, ones * (1.0 + whisker.poisson_ratio), ones, shape)
     stiffness = whisker.base_bending_stiffness
     if whisker.base_stiffness is not None:
-        pieces = _JOINT_STEPS * max(1, steps // STEPS)
+        turning = _JOINT_STEPS * stiffness / length / min(whisker.base_stiffness)
+        pieces = int(np.ceil(np.clip(turning, _LEAST_JOINT_STEPS, _MOST_JOINT_STEPS)))
+        pieces *= max(1, steps // STEPS)
         rod = _with_joint(rod, pieces, stiffness / length, *whisker.base_stiffness)
     return Discretization(
         rod=Rod._make([*(np.ascontiguousarray(a, dtype=np.float64) for a in rod[:-1]), None]),

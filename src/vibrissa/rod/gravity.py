@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.deferred import interpolate
-from vibrissa.numerics import Array, share_out
+from vibrissa.numerics import Array, numbers, share_out
 from vibrissa.rod.discretization import (
     STEPS,
     Discretization,
@@ -238,7 +238,7 @@ def resting(whisker: Whisker, gravity: ArrayLike) -> Resting:
         If the density is unknown, gravity is not three finite numbers of plausible size, or the
         whisker topples under its weight.
     """
-    values = np.asarray(gravity, dtype=np.float64)
+    values = numbers("gravity", gravity)
     if values.shape != (3,) or not np.isfinite(values).all():
         raise ValueError(f"gravity is (x, y, z) in m/s², in the whisker frame; got {gravity!r}")
     if np.linalg.norm(values) > _MOST:

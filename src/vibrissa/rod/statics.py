@@ -24,8 +24,8 @@ from vibrissa.rod.deflection import (
     PegContact,
     PointContact,
     PointForce,
+    finite_vectors,
     select_loads,
-    vectors,
 )
 from vibrissa.rod.discretization import (
     MOST_STEPS,
@@ -172,7 +172,7 @@ def check_objects(whisker: Whisker, objects: Sequence[Surface], positions: Array
 
 def _gravities(gravity: ArrayLike, load: Load) -> Array:
     """Gravity of each load, (n, 3)."""
-    values = vectors("gravity", gravity)
+    values = finite_vectors("gravity", gravity)
     try:
         return np.broadcast_to(values, (*load.shape, 3)).reshape(-1, 3)
     except ValueError as error:

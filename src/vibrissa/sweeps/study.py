@@ -17,6 +17,7 @@ import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from glob import glob
 from pathlib import Path
 from typing import Any
 
@@ -326,12 +327,11 @@ def _files(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iter
     pattern = stated.get("files")
     if not isinstance(pattern, str):
         raise ValueError(f"files is {pattern!r}; a pattern such as 'whiskers/*.csv' is needed")
-    path = folder / pattern
-    root = Path(path.anchor) if path.anchor else Path()
-    rest = str(path.relative_to(root))
-    paths = sorted(path for path in root.glob(rest) if path.is_file())
+    # The folder's own name may contain brackets, which are not part of the pattern.
+    paths = sorted(folder / name for name in glob(pattern, root_dir=folder, recursive=True))
+    paths = [path for path in paths if path.is_file()]
     if not paths:
-        raise ValueError(f"no file is called {path}")
+        raise ValueError(f"no file is called {folder / pattern}")
     prefix = str(stated.get("prefix", ""))
     for name in ("base_radius", "youngs_modulus"):
         if len(_numbers(name, stated.get(name, 1.0))) > 1:

@@ -241,21 +241,24 @@ def _table(
 def _triplets(settings: Settings) -> list[str]:
     if settings["triplets"] == "all":
         return [" ".join(triplet) for triplet in TRIPLETS]
-    return [" ".join(selection(one, exactly=3)) for one in _several(settings, "triplets")]
+    return _several(settings, "triplets", lambda one: " ".join(selection(one, exactly=3)))
 
 
 def _sets(settings: Settings) -> list[str]:
-    return [
-        "wrench" if one == "wrench" else " ".join(selection(one))
-        for one in _several(settings, "signals")
-    ]
+    return _several(
+        settings, "signals", lambda one: one if one == "wrench" else " ".join(selection(one))
+    )
 
 
-def _several(settings: Settings, name: str) -> Sequence[Any]:
+def _several(
+    settings: Settings, name: str, spelt: Callable[[Any], Any] = lambda one: one
+) -> list[Any]:
+    """Items of a list, spelt in one way, without repetitions."""
     value = settings[name]
-    if not isinstance(value, list | tuple) or not value or len(set(value)) < len(value):
+    items = [spelt(one) for one in value] if isinstance(value, list | tuple) else []
+    if not items or len(set(items)) < len(items):
         raise ValueError(f"{name} is {value!r}; a list without repetitions is needed")
-    return tuple(value)
+    return items
 
 
 def _noise(settings: Settings) -> Array:

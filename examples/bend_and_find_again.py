@@ -1,8 +1,8 @@
 """Bend one whisker, measure at its base, and find the contact again from three signals.
 
-Aim: the whole idea in one screen. Data: the built-in γ whisker. Lesson: force and moment at the
-base determine where a frictionless whisker is touched; near rest a small error of the signals is a
-large error of the position, and several contacts may have the same signals.
+Aim: a short overview of the method. Data: the built-in γ whisker. Lesson: force and moment at the
+base determine where a frictionless whisker is touched; near rest a small error of the signals
+causes a large error of the position, and several contacts may have the same signals.
 """
 
 # %% A whisker: 40 mm long, tapered, curved, its tip bent out of the plane
@@ -42,7 +42,7 @@ for true, guess, covariance, n in zip(
         error = np.linalg.norm(guess - true)
         print(f"{n} candidate(s), {error * 1e9:.3f} nm off, ± {sigma * 1e3:.2f} mm with the sensor")
 
-# %% The bent whiskers with the forces on them; what has slipped off is not there to be drawn
+# %% The bent whiskers with the forces on them; the contact that slipped off is not drawn
 names = [f"{1e6 * np.linalg.norm(force):.1f} µN" for force in bent.force]
 held = np.isfinite(bent.force).all(axis=1)
 sigma = 1e3 * np.sqrt(np.trace(found.covariance[held], axis1=1, axis2=2))

@@ -1,8 +1,8 @@
-"""A real whisker: points digitised in any frame, with noise, to a whisker that bends.
+"""A real whisker: from noisy points, digitised in any frame, to a whisker that bends.
 
-Aim: from what a microscope or a scanner gives to a whisker. Data: a centreline that is digitised
-here, from a known whisker, with noise of 20 µm. Lesson: noise and frame are found by themselves,
-and what remains of the noise moves the signals by a hundredth.
+Aim: to obtain a whisker from the points of a microscope or a scanner. Data: a centreline that is
+digitised here, from a known whisker, with noise of 20 µm. Lesson: noise and frame are estimated
+automatically, and the remaining error changes the signals by a hundredth.
 """
 
 # %% Points along a whisker, in the scanner's frame, mm
@@ -39,7 +39,7 @@ rms = np.sqrt(np.mean(np.sum((whisker.centerline(200) - true.centerline(200)) **
 print(f"Length {1e3 * whisker.length:.2f} mm, truly {1e3 * true.length:.2f} mm.")
 print(f"Error of the direction at the base {off:.2f}°, of the shape {1e6 * rms:.0f} µm.")
 
-# %% What that means for the signals: both are pushed to the same point
+# %% The effect on the signals: both whiskers are pushed to the same point
 touch = vb.PointContact([22e-3, 11e-3, 1e-3])
 bent, expected = vb.deflect(whisker, touch), vb.deflect(true, touch)
 for name in ("force", "moment"):

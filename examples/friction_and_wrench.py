@@ -1,11 +1,11 @@
-"""Friction, which all six components of force and moment reveal.
+"""Friction, estimated from all six components of force and moment.
 
-Aim: to find contacts of a whisker that rubs. Data: the built-in γ whisker, touched at the same
+Aim: to locate contacts with friction. Data: the built-in γ whisker, touched at the same
 point with and without friction along it. Lesson: three signals, used as if there were no friction,
 have errors of millimetres; force and moment together give the right point, and the friction.
 """
 
-# %% The same touch with a force that leans toward the tip, or toward the base, by 0.3 of itself
+# %% The same contact without friction, and with 0.3 along the whisker toward the tip or the base
 import sys
 from pathlib import Path
 

@@ -1,8 +1,8 @@
 """Your own object: a mesh that a whisker explores, and a free surface through its contacts.
 
-Aim: to find the shape of something of which nothing is known. Data: a rounded stone as a closed
-mesh, and a whisker that whisks while its base rises. Lesson: a surface through the contacts shows
-the stone where it was touched, and how well; beyond, it can but go on smoothly.
+Aim: to estimate the shape of an unknown object. Data: a rounded stone as a closed
+mesh, and a whisker that whisks while its base rises. Lesson: a surface through the contacts gives
+the shape where the stone was touched, with its uncertainty; elsewhere it is only extrapolated.
 """
 
 # %% A stone: corners and triangles; your own is read with Mesh.load("stone.stl") (extra mesh)

@@ -1,8 +1,8 @@
 """The space that a whisker can reach, and its signals there.
 
-Aim: to see all contacts of a whisker at once. Data: the built-in γ whisker. Lesson: a whisker
-reaches a solid around its resting shape that ends where it slips off. How far it goes, and with
-what force, depends on the side and on where along the whisker it is touched.
+Aim: to see all contacts of a whisker at once. Data: the built-in γ whisker. Lesson: the points that
+a whisker can touch form a solid around its resting shape, bounded by slip-off. The largest
+displacement and force depend on the side and on where along the whisker it is touched.
 """
 
 # %% All contacts between 0.3 L and the tip that the whisker can hold

@@ -2,8 +2,8 @@
 
 Aim: from a bare sensor to contact points on a robot. Data: simulated wires and rods of 300 mm, a
 thousand times stiffer than a rat's whisker, and a sensor that reads two bending moments, mixed and
-offset. Lesson: on a cylinder the axial force adds nothing to the moment; loads determine
-E r⁴ but not E; two signals leave a curve of contacts, and the motion of the base finds the one.
+offset. Lesson: on a cylinder the axial force follows from the moment; loads determine
+E r⁴ but not E; two signals leave a curve of contacts, of which the base's motion selects one.
 """
 
 # %% Wires and rods: the same 300 mm, forces from millinewtons to tens of newtons
@@ -46,7 +46,7 @@ for name, contacts in maps.items():
     locating = [text for text in ("Fx MB MD", "FT MB MD") if contacts.determines(text)]
     print(f"{name:24s} contacts are determined by {' and by '.join(locating)}")
 
-# %% The sensor: two channels, each a mix of both moments with an offset, not known to us
+# %% The sensor: two channels, each a mix of both moments with an offset, which are unknown
 wire, contacts = rods["steel wire, tapered"], maps["steel wire, tapered"]
 true = Sensor(
     ("bridge a", "bridge b"),
@@ -79,7 +79,7 @@ try:
 except ValueError as refusal:
     print("all six components at once:", refusal)
 
-# %% How stiff is it really? A wire from a reel, 6 % softer than tabulated
+# %% Measuring the stiffness: a wire from a reel, 6 % softer than tabulated
 soft = wire.with_properties(youngs_modulus=0.94 * wire.youngs_modulus)
 bent = vb.deflect(soft, vb.PointContact(touched.contact_point))
 weighed = Sensor(("Fy", "Fz"), noise=0.5e-3)  # by a scale, in newtons
@@ -125,7 +125,7 @@ for i in (0, 20, 60, len(time) - 1):
         f" {len(known[i].points)} hypotheses"
     )
 
-# %% What the two signals leave, and how the motion of the base narrows it down
+# %% The curve of possible contacts, and how the motion of the base reduces it
 with plots.looking():
     figure, (left, right) = plt.subplots(1, 2, figsize=(7.0, 2.6), layout="constrained")
     for line, style, name in (

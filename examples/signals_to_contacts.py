@@ -1,8 +1,8 @@
 """From a table of signals to contact points.
 
-Aim: to locate contacts from what a sensor has read. Data: a CSV of force and moment over time, made
-here by a simulated trial with a noisy sensor. Lesson: a table, a whisker and the sensor's noise are
-all that is needed; every contact comes with its uncertainty.
+Aim: to locate contacts from a sensor's readings. Data: a CSV of force and moment over time, from a
+trial that is simulated here with a noisy sensor. Lesson: a table, a whisker and the sensor's noise
+are all that is needed; every contact has a stated uncertainty.
 """
 
 # %% The table: time, Fx, Fy, Fz, Mx, My, Mz in s, N and N·m, whisker frame
@@ -35,7 +35,7 @@ found = locate(contact_map, wrench, ("Fx", "MB", "MD"), noise=component_noise(1e
 save_contacts(folder / "contacts.csv", contact_columns(found))
 # The same on the command line: vibrissa estimate signals.csv --whisker whisker.csv -o contacts.csv
 
-# %% How far from the truth, which only a simulation shows
+# %% Errors, compared with the truth, which is known in a simulation only
 truth = trial["truth"].to_dataset()
 true, guess = truth["contact_point_whisker"].values, found["contact_point_whisker"].values
 error = np.linalg.norm(guess - true, axis=1)

@@ -1,11 +1,11 @@
 """Two videos to the contour of an object.
 
-Aim: from what two cameras see to the object that was touched. Data: a whisk of 0.2 s past a peg,
-simulated and filmed here, coarsely: 300 frames a second, 0.12 mm a pixel. Lesson: from two films
-come the whisker in space, where it is touched, how hard, and the peg.
+Aim: to reconstruct a touched object from the videos of two cameras. Data: a whisk of 0.2 s past a
+peg, simulated and filmed here, coarsely: 300 frames a second, 0.12 mm a pixel. Lesson: two films
+give the whisker in space, the contact points and forces, and the peg.
 """
 
-# %% Two small films of a whisk past a peg, which stand for your own
+# %% Two small films of a whisk past a peg, to be replaced by your own
 import sys
 from pathlib import Path
 
@@ -32,7 +32,7 @@ cameras = orthogonal_views(0.12e-3, (360, 360), center=[15e-3, 2e-3, 0.0])
 files = {camera.name: folder / f"{camera.name}.mp4" for camera in cameras}
 film(trial, files, cameras, seed=1)
 
-# %% Trace the whisker in each view, merge them, fit the rod; radii no camera sees, so you give them
+# %% Trace the whisker in each view, merge the views, fit the rod with the stated radii
 # Your own cameras come from their calibration: vibrissa.cameras.load_cameras("cameras.toml").
 traces = [trace_video(read_video(files[camera.name])) for camera in cameras]
 known = {"base_radius": whisker.base_radius, "tip_radius": whisker.tip_radius}

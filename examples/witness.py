@@ -1,8 +1,8 @@
 """A witness: two contacts that three signals cannot distinguish.
 
 Aim: to see what "not unique" means. Data: a whisker that is curved as strongly as a rat's C2,
-y = A x² with A·L = 0.82. Lesson: also (F_x, M_B, M_D), which is unique for less curved whiskers,
-has pairs of contacts with the same signals, a third of the whisker apart.
+y = A x² with A·L = 0.82. Lesson: for this whisker even (F_x, M_B, M_D), which is unique for less
+curved whiskers, has pairs of contacts with the same signals, a third of the whisker apart.
 """
 
 # %% A strongly curved whisker, and the search for such pairs
@@ -28,7 +28,7 @@ print(
     f"twins are found up to {np.degrees(found.critical_cone.item()):.1f}° from rest",
 )
 
-# %% The pair that lies farthest apart, bent anew: nothing is taken on trust
+# %% The pair that is farthest apart, verified by bending the whisker again
 pair = found.isel(witness=int(np.nanargmax(found.witness_separation)))
 forces = np.column_stack([np.zeros(2), pair.witness_contact_force.transpose("pair", "component")])
 bent = vb.deflect(whisker, vb.PointForce(pair.witness_arc_length.values, components=forces))

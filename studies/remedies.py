@@ -1,7 +1,7 @@
 """Effects that the model of one contact leaves out: the errors they cause, without and with remedy.
 
 `python studies/remedies.py [--count N] [--whisker FILE] [--page]` prints two tables: median errors
-of three signals, six, and force and moment whole, ignoring what is true and with its remedy; and
+of three signals, six, and force and moment whole, ignoring the effect and with its remedy; and
 how often second contacts are detected. Contacts are deflected by more than 5°, with noise of 1 µN
 and 0.02 µN·m in each component; rods under their weight are those of `studies/weight.py`, with
 noise of a thousandth of the units of force and moment. `--page` writes them to
@@ -24,7 +24,7 @@ from vibrissa.simulation import Dynamics, facing_peg, measure, simulate, sweep_p
 
 SETS = ("Fx MB MD", "Fx FT FD Mx MB MD", "wrench")
 HEAD = (
-    "what is true",
+    "effect",
     "remedy",
     *(f"{name}{part}" for name in ("F_x, M_B, M_D", "six", "wrench") for part in ("", ": remedy")),
 )
@@ -186,7 +186,7 @@ def rows(contact_map, asked):
     soft = whisker.with_properties(base_stiffness=(spring, spring))
     rubbing = {"friction": PRIOR}
     cases = (
-        ("the model", "friction 0.3", {}, rubbing),
+        ("none", "friction 0.3", {}, rubbing),
         ("friction 0.1", "friction 0.3", {"coefficient": 0.1}, rubbing),
         ("friction 0.3", "friction 0.3", {"coefficient": 0.3}, rubbing),
         ("modulus or relaxation + 10 %", "σ 10 %", {"stiffer": 1.1}, {"stiffness_sigma": SOFTER}),

@@ -112,7 +112,7 @@ def wrenches(n) -> str:
         worst = power(away(found, bent, whisker).max())
         unique = (found.status == vb.Status.UNIQUE).mean()
         rows.append([LABELS[name], f"{n:,}", worst, f"{100 * unique:.1f} %"])
-    return table(["whisker", "loads", "farthest, of L", "one candidate only"], rows)
+    return table(["whisker", "loads", "largest distance, of L", "one candidate only"], rows)
 
 
 def noise(contacts, n) -> str:

@@ -59,7 +59,7 @@ def signals(result: DemoResult) -> str:
         ]
         rows.append([label, str(row.contacts), *cells])
     head = [f"{name}: {way}" for name in ("force", "moment") for way in WAYS]
-    return table(["bent by", "contacts", *head], rows)
+    return table(["deflection", "contacts", *head], rows)
 
 
 def errors(result: DemoResult) -> str:
@@ -69,7 +69,7 @@ def errors(result: DemoResult) -> str:
         cells = [few(1e3 * value) for value in (*row.measured[:2], *row.predicted[:2])]
         other = [few(1e3 * v) for v in seen[label].measured[:2]] if label in seen else ["–", "–"]
         rows.append([label, str(row.contacts), *cells, *other])
-    head = ["bent by", "contacts", "median", "95 %", "median predicted", "95 % predicted"]
+    head = ["deflection", "contacts", "median", "95 %", "median predicted", "95 % predicted"]
     return table([*head, "the paper's method: median", "95 %"], rows)
 
 
@@ -83,7 +83,7 @@ def peg(result: DemoResult) -> str:
             ("diameter", scores.diameter_error, fit.diameter_sigma),
         ):
             rows.append([way, name, f"{1e6 * error:.1f}".replace("-", "−"), f"{1e6 * sigma:.1f}"])
-    return table(["signals", "peg's", "error, µm", "its sigma, µm"], rows, 2)
+    return table(["signals", "parameter", "error, µm", "standard deviation, µm"], rows, 2)
 
 
 def draws(duration: float, number: int) -> str:
@@ -112,5 +112,5 @@ def draws(duration: float, number: int) -> str:
         mean = f"{column.mean():.2f} ± {column.std() / np.sqrt(number):.2f}".replace("-", "−")
         inside = f"{100 * (np.abs(column) < 1.96).mean():.0f} %"
         rows.append([name, str(number), mean, f"{column.std():.2f}", inside])
-    head = ["peg's", "draws", "mean error, sigmas", "its spread, sigmas", "within 1.96"]
+    head = ["parameter", "draws", "mean error, σ", "standard deviation, σ", "within 1.96 σ"]
     return table(head, rows)

@@ -27,7 +27,7 @@ def blocks(folder: Path, quick: bool) -> dict[str, str]:
     head = [
         f"{len(whiskers)} whiskers",
         "uniform up to the fold",
-        "crowded: 0.9 to 1 − 10⁻⁸ of it, a quarter at the tip",
+        "near the fold: 0.9 to 1 − 10⁻⁸ of the fold force, a quarter at the tip",
     ]
     return {"real": table(head, rows)}
 
@@ -48,7 +48,7 @@ def summed(found: list[Found]) -> list[tuple[str, str]]:
         ("on the whisker with the fewest", share(least)),
         ("reported as slipped", str(total("slipped"))),
         (
-            "points 10⁻⁴, 10⁻³, 10⁻² L beyond the fold that get another reason",
+            "points 10⁻⁴, 10⁻³, 10⁻² L beyond the fold that get another status",
             f"{total('fold_wrong')} of {total('fold_asked'):,}",
         ),
         ("the same beyond the tip", f"{total('tip_wrong')} of {total('tip_asked'):,}"),

@@ -78,7 +78,7 @@ def speeds(found: list[dict[str, Any]], module: str) -> str:
         clock = duration(info["seconds_each"])
         rows.append([info["what"], times, spent, part, clock, info["aim"]])
     head = ["what", "times as fast as SciPy", "CPU each", "flop rate over dgemm's"]
-    head += ["by the clock each", "aim, by the clock"]
+    head += ["wall-clock time each", "aim, wall-clock"]
     return table(head, rows)
 
 

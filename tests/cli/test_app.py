@@ -127,6 +127,20 @@ def test_the_shell_completes_verbs_options_and_choices(typed, offered):
     assert done.stdout.split() == offered, done.stderr
 
 
+@pytest.mark.parametrize("encoding", ["cp1252", "gbk"])
+def test_other_encodings_stop_nothing(encoding):
+    """As of output that is piped on Windows."""
+    program = "from vibrissa.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", program, "deflect", "--help"],
+        env=os.environ | {"PYTHONIOENCODING": encoding, "PYTHONUTF8": "0"},
+        capture_output=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert any(unit in done.stdout.decode(encoding) for unit in ("µN", "uN"))
+
+
 def test_completion_can_be_shown(monkeypatch):
     monkeypatch.setenv("_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION", "1")
     done = run("--show-completion", "bash", prog_name="vibrissa")

@@ -85,6 +85,10 @@ def test_links_and_groups_that_were_edited_stop_nothing(tmp_path):
         faults = {row["file"]: row["fault"] for row in csv.DictReader(file)}
     assert "there is no file" in faults["gone.NC"]
     assert "lacks" in faults["lacking.nc"]
+    (tmp_path / "summary.csv").write_text("my,own\n")
+    with pytest.raises(ValueError, match=r"summary.csv is not a table of this command"):
+        run("batch", tmp_path)
+    assert (tmp_path / "summary.csv").read_text() == "my,own\n"
 
 
 def test_a_table_of_each_recording(tmp_path):

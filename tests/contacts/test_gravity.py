@@ -248,6 +248,12 @@ def test_a_base_that_turns_under_gravity_of_the_laboratory(nitinol, swung):
         signals, ("Fx", "MB", "MD"), **how, gravity=lab, base_rotation=rotations
     )
     np.testing.assert_allclose(one, found.point, atol=1e-9)
+    with pytest.raises(ValueError, match="base_rotation has shape"):
+        nitinol.estimate(signals, **how, gravity=lab, base_rotation=rotations[:-1])
+    still = {name: value[:2] for name, value in signals.items()}
+    one_turn = nitinol.estimate(still, **how, gravity=lab, base_rotation=rotations[0])
+    each = nitinol.estimate(still, **how, gravity=lab, base_rotation=[rotations[0]] * 2)
+    np.testing.assert_array_equal(one_turn.point, each.point)
 
 
 def test_the_filter_follows_contacts_of_a_whisker_with_weight(nitinol, swung):

@@ -54,6 +54,11 @@ def batch(
         raise ValueError(
             f"{folder} contains no recordings; `vibrissa track` and `vibrissa import` create them"
         )
+    table = folder / TABLE
+    if table.exists() and not vb.io.read_text(table).startswith(",".join(_COLUMNS[:2])):
+        raise ValueError(
+            f"{table} is not a table of this command, which would replace it: rename it"
+        )
     known = None if objects is None else objects_from(objects)
     rows, lines = [], []
     with progress_bars() as tell:
@@ -63,7 +68,7 @@ def batch(
             rows.append(_cells(path, found, fault))
             lines.append(_shown(path, found, fault))
             # The table is complete up to here even if the next recording is interrupted.
-            vb.io.write_table(folder / TABLE, _COLUMNS, rows)
+            vb.io.write_table(table, _COLUMNS, rows)
         tell("recordings", len(paths), len(paths))
     failed = sum(bool(row[-1]) for row in rows)
     about = f"{len(rows)} recordings, {failed} with a fault"
@@ -75,7 +80,7 @@ def batch(
     for row in rows:
         say(f"{row[0]}: {row[-1] or row[-2]}")
     say(about)
-    say(f"wrote {folder / TABLE}\nwrote {folder / PAGE}")
+    say(f"wrote {table}\nwrote {folder / PAGE}")
     if failed:
         raise typer.Exit(1)
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import codecs
+import io
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -21,6 +24,23 @@ output = Console(markup=False, emoji=False)
 errors = Console(stderr=True, markup=False, emoji=False)
 # Function called with the current stage, the steps done and the total steps.
 Tell = Callable[[str, int, int], None]
+
+
+def spell_out() -> None:
+    """Print what a stream's encoding lacks in other characters, as where Windows pipes output."""
+    codecs.register_error("spelt", _spelt)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="spelt")
+
+
+def _spelt(fault: UnicodeError) -> tuple[str | bytes, int]:
+    """Replace one character: a unit must not become ambiguous, and frames remain frames."""
+    assert isinstance(fault, UnicodeEncodeError)
+    character = fault.object[fault.start]
+    frame = "─" <= character <= "╿"
+    other = "u" if character == "µ" else "-" if frame else f"\\u{ord(character):04x}"
+    return other, fault.start + 1
 
 
 def say(line: str = "") -> None:

@@ -204,7 +204,7 @@ class ContactMap:
             tare and what is uncertain, a `Gravity`. Contacts are proposed by a second map, of the
             sagged whisker, made on first use.
         base_rotation : (..., 3, 3) array_like, optional
-            Rotation of the base for each measurement, from the whisker's to the laboratory frame:
+            Rotation of the base for each measurement or all, from whisker's to laboratory frame:
             gravity and tare are then those of the laboratory and of the first pose.
 
         Returns

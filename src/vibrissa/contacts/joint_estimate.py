@@ -394,13 +394,17 @@ def estimate_jointly(
         compliance_sigma=compliance_sigma,
         stiffness_sigma=stiffness_sigma,
     )
-    flat = values.reshape(-1, len(names))
+    flat, shape = values.reshape(-1, len(names)), values.shape[:-1]
     if rotation is None or gravity is None:
         found, status = find(find.untared(flat))
+    elif rotation.shape[:-2] not in ((), shape):
+        raise ValueError(
+            f"base_rotation has shape {rotation.shape}; {(3, 3)} or {(*shape, 3, 3)} is needed"
+        )
     else:
-        found, status = _in_poses(find, flat, np.reshape(rotation, (-1, 3, 3)))
+        turns = np.broadcast_to(rotation, (*shape, 3, 3)).reshape(-1, 3, 3)
+        found, status = _in_poses(find, flat, turns)
     chi_squared = found.chi_squared[:, 0].copy()
-    shape = values.shape[:-1]
     assumed = np.inf if names == WRENCH else friction
     return contacts_of(found, status, chi_squared, find.d, names, shape, dims, coords, assumed)
 

@@ -12,7 +12,6 @@ import json
 import math
 import sys
 import time
-import tomllib
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -26,7 +25,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from vibrissa.contacts import searched_by_name, seeding_triplet, signals_at_nodes
-from vibrissa.io import check_keys, load_whisker
+from vibrissa.io import check_keys, load_whisker, parsed_toml
 from vibrissa.rod import discretize, point_solver, stable_set
 from vibrissa.signals import resting
 from vibrissa.sweeps.tasks import TASKS, Settings, settings_of
@@ -140,10 +139,7 @@ def read_study(text: str, folder: Path) -> Study:
     ValueError
         If the text is not TOML, or has unknown keys or values out of range.
     """
-    try:
-        content = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as fault:
-        raise ValueError(f"this is not TOML: {fault}") from None
+    content = parsed_toml(text)
     check_keys(content, {"name", "seed", "whiskers", "tasks"}, "the study")
     seed = content.get("seed", 0)
     if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:

@@ -159,7 +159,7 @@ def test_a_cell_is_the_same_in_any_study_that_has_it():
         (WHISKERS + 'kind = "random"\ncount = 1000000000000\n' + TASKS, "1e.12 whiskers"),
         (WHISKERS + 'kind = "random"\ncount = 1\nlogarithmic = [[]]\n' + TASKS, "list of words"),
         (WHISKERS + f"length = {'9' * 400}\n" + TASKS, "a number or a list of numbers"),
-        ("a = " + 5000 * "[", "not TOML"),
+        ("a = " + 5000 * "[", "nested too deeply"),
     ],
 )
 def test_what_is_wrong_is_told_with_what_is_allowed(text, message):

@@ -62,10 +62,9 @@ class GravityOptions:
         if self.gravity is None:
             return None
         x, y, z = numbers(self.gravity, _XYZ, "--gravity")
-        tare = None
-        if self.tare_gravity is not None:
-            tare_x, tare_y, tare_z = numbers(self.tare_gravity, _XYZ, "--tare-gravity")
-            tare = (tare_x, tare_y, tare_z)
+        tare: Any = self.tare_gravity
+        if tare is not None:
+            tare = tuple(numbers(tare, _XYZ, "--tare-gravity"))
         return vb.Gravity(
             (x, y, z),
             tare,
@@ -386,8 +385,8 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions, weight: Gravi
             maps = [map_of(known, tell, grid=how.grid, proximal=smallest_arc(how.proximal))]
         tell("contact points", 0, 1)
         if how.whole:
-            others = how.keywords()
-            others = {n: others[n] for n in ("errors", "prior", "second_contacts")}
+            named = how.keywords()
+            others = {n: named[n] for n in ("errors", "prior", "second_contacts")}
             found = vb.pipeline.locate_from_wrench(known, wrench, noise, gravity=gravity, **others)
         else:
             names, others = how.names or vb.pipeline.TRIPLET, how.keywords()
@@ -429,10 +428,7 @@ def _around(signals: Path, target: Path, how: EstimateOptions, known: AroundOpti
     if kind_in(signals) == RECORDING:
         tree = recording_from(signals)
         check_one_whisker(tree, signals)
-        if "signals" in vb.pipeline.due_stages(tree, "estimates"):
-            tree = vb.pipeline.with_signals(
-                tree, **SourceOptions.of(tree).as_keywords(tree, how.known, how.proximal)
-            )
+        tree = _with_signals(tree, how)
         wrench, whisker = (
             tree["signals"].to_dataset().isel(whisker=0),
             how.own.in_recording(tree)[0],
@@ -509,11 +505,7 @@ def _from_recording(
     if table:
         check_one_whisker(tree, signals)
     with progress_bars() as tell:
-        if "signals" in vb.pipeline.due_stages(tree, "estimates"):
-            tree = vb.pipeline.with_signals(
-                tree, **SourceOptions.of(tree).as_keywords(tree, how.known, how.proximal)
-            )
-        done, used = estimated(tree, how, tell, str(signals), weight)
+        done, used = estimated(_with_signals(tree, how), how, tell, str(signals), weight)
     remark(f"{described(done)}; {used}")
     found = done["estimates"].to_dataset()
     print_statuses(found["status"].values)
@@ -522,6 +514,14 @@ def _from_recording(
     else:
         vb.io.save_recording(target, done)
     print_written(target, signals, "estimates")
+
+
+def _with_signals(tree: xr.DataTree, how: EstimateOptions) -> xr.DataTree:
+    """Add signals to a recording if they are due."""
+    if "signals" not in vb.pipeline.due_stages(tree, "estimates"):
+        return tree
+    keywords = SourceOptions.of(tree).as_keywords(tree, how.known, how.proximal)
+    return vb.pipeline.with_signals(tree, **keywords)
 
 
 def estimated(

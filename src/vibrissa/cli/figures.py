@@ -63,9 +63,6 @@ class TrialOptions:
         return found
 
 
-# Views of a trial ---------------------------------------------------------------------------------
-
-
 def sights_of(
     trial: xr.DataTree, course: vb.scene.Course, videos: Sequence[Path], rows: NDArray[np.intp]
 ) -> list[vb.plots.Sight]:
@@ -122,9 +119,6 @@ def fits_of(trial: xr.DataTree) -> list[vb.contour.FittedShape]:
     if "contour" not in trial.children:
         return []
     return [vb.contour.shape_from_dataset(trial["contour"].to_dataset())]
-
-
-# Figures ------------------------------------------------------------------------------------------
 
 
 def array_drawings(path: Path, width: Any) -> dict[str, Draw]:

@@ -330,7 +330,7 @@ def _import(path: Path, tracks: xr.Dataset, *, stated: bool) -> str:
     else:
         if tracks.sizes["view"] == 1:
             words += ["[FILE of the other view]"]
-            hint = "  # of one view alone the whisker is taken to stay in its plane"
+            hint = "  # with one view the whisker is assumed to stay in its plane"
         words += ["--pixel-size MM (or --cameras CAMERAS.toml)"]
     if tracks["time"].attrs.get("units") != "s":
         words += ["--rate FRAMES_A_SECOND"]

@@ -18,9 +18,8 @@ from vibrissa.cli.options import free, refuse, with_options
 from vibrissa.cli.terminal import Tell, progress_bars, say, stoppable
 from vibrissa.deferred import xr
 
-# Longest duration of a movie of a whole trial, s, unless a step is given.
 _KINDS = ("signals", "contour")
-_LASTS = 45.0
+_LASTS = 45.0  # longest duration of a movie of a whole trial, s, unless a step is given
 
 
 @dataclass(frozen=True)

@@ -179,11 +179,8 @@ def check_new(path: Path, endings: Sequence[str], force: bool) -> None:
 
 def refuse(options: Mapping[str, object], reason: str) -> None:
     """Raise ValueError if options are given that would have no effect."""
-    given = [name for name, value in options.items() if not _nothing(value)]
+    given = [  # zero counts as given
+        n for n, v in options.items() if v is not None and v is not False and v not in ([], ())
+    ]
     if given:
         raise ValueError(f"{', '.join(given)} cannot be used: {reason}")
-
-
-def _nothing(value: object) -> bool:
-    # Zero counts as given.
-    return value is None or value is False or value in ([], ())

@@ -152,9 +152,6 @@ def _of_contour(points: Path, tree: xr.DataTree, own: WhiskerOptions) -> bool:
         return False
 
 
-# Report on the object -----------------------------------------------------------------------------
-
-
 def _report(
     tree: xr.DataTree,
     known: tuple[vb.objects.Surface, ...],

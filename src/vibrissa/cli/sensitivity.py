@@ -54,7 +54,9 @@ def sensitivity(
     _print_derivatives(vb.sensitivity_findings(found))
     _print_rivals(rivals, names, noise.described(), verdicts)
     if target is not None:
-        _save(target, found)
+        floats = [str(name) for name, v in found.data_vars.items() if v.dtype.kind == "f"]
+        about = found.assign_attrs(kind="vibrissa sensitivity")
+        vb.io.write_netcdf(target, about, {"/": dict.fromkeys(floats, vb.io.COMPRESSED)})
         say(f"wrote {target}")
 
 
@@ -152,9 +154,3 @@ def _print_rivals(
 
 def _error(value: float) -> str:
     return shown("predicted_error", value, 3) if value == value else "-"
-
-
-def _save(path: Path, found: xr.Dataset) -> None:
-    floats = [str(name) for name, v in found.data_vars.items() if v.dtype.kind == "f"]
-    about = found.assign_attrs(kind="vibrissa sensitivity")
-    vb.io.write_netcdf(path, about, {"/": dict.fromkeys(floats, vb.io.COMPRESSED)})

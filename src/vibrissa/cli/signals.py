@@ -154,12 +154,8 @@ def signals(
 
 def described(tree: xr.DataTree) -> str:
     """Description of the source of the signals of a recording."""
-    flat = (
-        "; one view: depth, Fz, Mx and My are taken for 0"
-        if vb.recording.Recording(tree).planar
-        else ""
-    )
-    return f"{_origin(tree)}{flat}"
+    planar = vb.recording.Recording(tree).planar
+    return _origin(tree) + "; one view: depth, Fz, Mx and My are taken for 0" * planar
 
 
 def _origin(tree: xr.DataTree) -> str:

@@ -11,9 +11,8 @@ import vibrissa as vb
 from vibrissa.cli.options import refuse, with_options
 from vibrissa.cli.terminal import output, progress_bars, remark, say
 
-# Largest number of failures listed.
 _SHOW = "show"
-_LISTED = 3
+_LISTED = 3  # largest number of failures listed
 
 
 @with_options("the results, a Zarr folder; with `show`, a folder for the figures")
@@ -56,19 +55,16 @@ def sweep(
         if scheduler not in (None, "local"):
             refuse({"--workers": workers}, f"the workers are those of {scheduler}")
         workers = 1 if workers is None else workers
-        plan = _plan(Path(study))
+        path = Path(study)
+        text = vb.io.read_text(path)
+        with vb.io.in_file(path):
+            plan = vb.sweeps.read_study(text, path.parent)
         if dry_run:
             _cost(plan, max(workers, 1))
             return
-        target = target or Path(study).with_suffix(".zarr")
+        target = target or path.with_suffix(".zarr")
         how = {"scheduler": scheduler, "again": again, "any_version": any_version}
         _run(plan, target, workers=workers, **how)
-
-
-def _plan(path: Path) -> vb.sweeps.Study:
-    text = vb.io.read_text(vb.io.check_readable(path))
-    with vb.io.in_file(path):
-        return vb.sweeps.read_study(text, path.parent)
 
 
 def _run(plan: vb.sweeps.Study, path: Path, **how: Any) -> None:

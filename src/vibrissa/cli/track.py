@@ -388,10 +388,7 @@ class _Job:
             )
         frames = None if lost is not None else _where_unexplained(result)
         if frames is not None:
-            why = (
-                "here the bent rod explains the traces worst: one of them may be on something else"
-            )
-            self._show_doubt(videos, traces, frames, why, doubt)
+            self._show_doubt(videos, traces, frames, _UNEXPLAINED, doubt)
         _compare_lengths(videos, traces, result.sizes["time"])
         vb.io.save_recording(recording, result)
         for file in kept:
@@ -509,9 +506,6 @@ def _head(path: Path, video: Path, rate: float) -> xr.Dataset:
     if frames := vb.io.video_info(video).frames:
         vb.tracking.HeadPose.of(head, np.arange(frames), rate)
     return head
-
-
-# Reports ------------------------------------------------------------------------------------------
 
 
 def _compare_lengths(videos: Sequence[Path], traces: Sequence[Sequence[Any]], used: int) -> None:

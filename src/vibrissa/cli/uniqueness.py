@@ -13,7 +13,7 @@ from vibrissa.cli.terminal import output, progress_bars, remark, say, shown
 from vibrissa.deferred import xr
 
 _DIGITS = 14  # number of digits for which the recomputed signals of a pair agree to 1e-10
-_ASKED = "Fx MB MD"  # triplet of the paper, whose witness is printed if there is one
+_ASKED = "Fx MB MD"  # triplet of the paper; its witness, if any, is the one printed
 
 
 @with_options("all evidence, .nc or .csv; by default nowhere")

@@ -31,6 +31,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import Delaunay, QhullError
+from threadpoolctl import threadpool_limits  # comes with scikit-learn
 
 from vibrissa.numerics import Array, IntArray, copy, inlined, kernel, share_out
 
@@ -42,7 +43,6 @@ Found = tuple[IntArray, IntArray, Array]
 
 _FLAT = 1e-12  # volume over the longest edge cubed below which a tetrahedron is flat
 _SAME = 1e-13  # distance below which points coincide, in coordinates with ranges of about one
-_ROUNDOFF = 1e-15  # volume over the longest edge cubed below which its sign is uncertain
 _ON_CIRCLE = 1e-6  # largest relative deviation of a point's power from zero for four on a circle
 _REPRODUCED = 1e-9  # largest error, over the neighbours' distance, of a query from its weights
 
@@ -183,65 +183,6 @@ def _volume(a: Array, b: Array, c: Array, d: Array) -> float:
     u, v, w = b[0] - d[0], b[1] - d[1], b[2] - d[2]
     p, q, r = c[0] - d[0], c[1] - d[1], c[2] - d[2]
     return float(x * (v * r - w * q) + y * (w * p - u * r) + z * (u * q - v * p))
-
-
-@inlined
-def _beyond(mesh: Mesh, t: int, k: int, query: Array) -> bool:
-    """Whether the query is behind the face opposite corner k, by more than roundoff."""
-    vertices, corners = mesh[0], mesh[1]
-    a, b = vertices[corners[t, (k + 1) % 4]], vertices[corners[t, (k + 2) % 4]]
-    c, top = vertices[corners[t, (k + 3) % 4]], vertices[corners[t, k]]
-    far = max(_distance2(a, query), _distance2(a, top), _distance2(a, b), _distance2(a, c))
-    here, there = _volume(query, b, c, a), _volume(top, b, c, a)
-    return bool(abs(here) > _ROUNDOFF * far * np.sqrt(far) and (here < 0.0) != (there < 0.0))
-
-
-@inlined
-def _encloses(mesh: Mesh, t: int, query: Array) -> bool:
-    """Whether a tetrahedron that is not flat contains the query."""
-    if mesh[5][t] > 0:
-        return False
-    behind = 0
-    for k in range(4):
-        behind += _beyond(mesh, t, k, query)
-    return behind == 0
-
-
-@kernel
-def locate(mesh: Mesh, queries: Array, inside: IntArray, first: int, last: int) -> None:
-    """Fill ``inside`` with the tetrahedra that contain the queries, -1 outside the convex hull.
-
-    Walks from one tetrahedron to the next through a face that the query is behind, or through any
-    face of a flat one.
-    """
-    neighbours, flat = mesh[2], mesh[5]
-    total = len(neighbours)
-    start, turn = 0, 1
-    for row in range(first, last):
-        inside[row] = -1
-        query = queries[row]
-        if not np.isfinite(query[0] + query[1] + query[2]):
-            continue
-        t, steps = start, 0
-        while t >= 0 and steps < total:
-            steps += 1
-            turn = (turn * 1103515245 + 12345) % 2147483648
-            out = -1
-            for c in range(4):
-                # Faces are tried in varying order: in a fixed one roundoff could cause cycles.
-                k = (turn // 65536 + c) % 4
-                if flat[t] > 0 or _beyond(mesh, t, k, query):
-                    out = k
-                    break
-            if out < 0:
-                inside[row] = start = t
-                break
-            t = neighbours[t, out]
-        if steps == total:
-            for other in range(total):
-                if _encloses(mesh, other, query):
-                    inside[row] = start = other
-                    break
 
 
 @inlined
@@ -419,10 +360,12 @@ class NaturalNeighbour:
                 f"the scale is {self.scale.tolist()}"
             )
         try:
-            triangulation = Delaunay(places / self.scale)
+            self._triangulation = Delaunay(places / self.scale)
         except QhullError as error:
             raise ValueError("the points do not span space: all lie in one plane") from error
-        self._mesh = _build_mesh(triangulation)
+        self._mesh = _build_mesh(self._triangulation)
+        with threadpool_limits(limits=1):  # threads of linear algebra wait for each other here
+            _ = self._triangulation.transform
 
     def __call__(
         self, queries: ArrayLike, method: Literal["natural", "linear"] = "natural"
@@ -472,8 +415,9 @@ class NaturalNeighbour:
         if wanted.ndim != 2 or wanted.shape[1] != 3:
             raise ValueError(f"queries must be (m, 3); got {wanted.shape}")
         wanted = np.ascontiguousarray(wanted / self.scale)
-        inside = np.empty(len(wanted), np.int64)
-        share_out(len(wanted), lambda first, last: locate(self._mesh, wanted, inside, first, last))
+        inside = np.full(len(wanted), -1)
+        known = np.isfinite(wanted).all(axis=1)
+        inside[known] = self._triangulation.find_simplex(wanted[known])
         return wanted, inside
 
 

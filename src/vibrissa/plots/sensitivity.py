@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from vibrissa.numerics import Array, Mask
+from vibrissa.numerics import Array, Mask, weighted_quantile
 from vibrissa.plots import style
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import COORDINATES, DIRECTIONS, robust_limits
@@ -22,12 +22,13 @@ BINS = 25
 SHARE = 0.99
 _PAPER = ("MD", "MB", "Fx")
 # Quantiles that are drawn, which of them is the median, and which bound the two bands.
-_SHARES = (0.1, 0.25, 0.5, 0.75, 0.9)
+_SHARES = np.array([0.1, 0.25, 0.5, 0.75, 0.9])
 _MEDIAN = 2
 _BANDS = ((0, 4), (1, 3))
 _HEIGHTS = {"single": 104.0, "double": 125.0}
 # Signals that reach so many times their lowest tenth get an axis that is wider near zero.
 _SKEWED = 30.0
+_FIFTHS = np.array([0.2, 0.8])
 _LEAST = 0.01  # share of the contacts of a side that a bin needs for its median to be drawn
 
 
@@ -116,9 +117,9 @@ def _finding(contacts: _Contacts) -> str:
     for name in (n for n in contacts.signals if n not in DIRECTIONS):
         size = np.abs(contacts.signals[name][kept])
         slope, weight = np.abs(contacts.derivatives["r", name][kept]), contacts.weight[kept]
-        low, high = _quantiles(size, weight, [0.2, 0.8])
+        low, high = weighted_quantile(size, weight, _FIFTHS)
         medians = [
-            float(_quantiles(slope[part], weight[part], [0.5])[0])
+            float(weighted_quantile(slope[part], weight[part]))
             for part in (size <= low, size >= high)
         ]
         if min(medians) > 0.0:
@@ -188,23 +189,17 @@ def _panel(axes: Axes, contacts: _Contacts, coordinate: str, name: str, *, small
     )
 
 
-def _quantiles(values: Array, weight: Array, shares: list[float]) -> Array:
-    order = np.argsort(values)
-    total = np.cumsum(weight[order])
-    at = np.searchsorted(total, np.array(shares) * total[-1])
-    return np.asarray(values[order[np.minimum(at, values.size - 1)]])
-
-
 def _limits(values: Array, weight: Array) -> Array:
     """Limits of the central share of the values; never equal."""
-    return robust_limits(_quantiles(values, weight, [0.5 - SHARE / 2, 0.5 + SHARE / 2]), 1.0)
+    ends = weighted_quantile(values, weight, np.array([0.5 - SHARE / 2, 0.5 + SHARE / 2]))
+    return robust_limits(ends, 1.0)
 
 
 def _bend(x: Array, weight: Array, direction: bool) -> float | None:
     """Value above which an axis is logarithmic; None for a linear axis."""
     if direction:
         return None
-    low, high = _quantiles(np.abs(x), weight, [0.1, SHARE])
+    low, high = weighted_quantile(np.abs(x), weight, np.array([0.1, SHARE]))
     return float(low) if 0.0 < low * _SKEWED < high else None
 
 
@@ -229,7 +224,7 @@ def _spread(x: Array, y: Array, weight: Array, edges: Array) -> tuple[Array, Arr
         rows = np.flatnonzero(place == k)
         if weight[rows].sum() > _LEAST * weight.sum():
             middle[k] = np.median(x[rows])
-            curves[:, k] = _quantiles(y[rows], weight[rows], list(_SHARES))
+            curves[:, k] = weighted_quantile(y[rows], weight[rows], _SHARES)
     return middle, curves
 
 

@@ -49,6 +49,7 @@ from vibrissa.sweeps.store import (
     read_failures,
 )
 from vibrissa.sweeps.study import Cell, Study, answer
+from vibrissa.sweeps.tasks import VERDICTS
 
 _MM = 1e3
 
@@ -232,10 +233,9 @@ def _lines(found: xr.Dataset) -> Iterator[str]:
         yield f"  {int((found['origin'] == number).sum())} cells by {code}"
     for task in found["task"].values:
         status = found["status"].sel(task=task).values
-        counts = [int((status == code).sum()) for code in (1, 2, 0)]
+        *counts, damaged = ((status == code).sum() for code in (DONE, FAILED, TO_DO, DAMAGED))
         seconds = float(np.nansum(found["seconds"].sel(task=task).values))
-        spoilt = int((status == 3).sum())
-        again = f", {spoilt} damaged (`vibrissa sweep` does them again)" if spoilt else ""
+        again = f", {damaged} damaged (`vibrissa sweep` does them again)" if damaged else ""
         yield "  {}: {} done, {} failed, {} to do{}; {:.0f} s of CPU".format(
             task, *counts, again, seconds
         )
@@ -261,10 +261,7 @@ def _verdicts(rows: xr.Dataset, task: str, group: str) -> Iterator[str]:
         for b in rows[second].values:
             at = {first: a, second: b}
             words = verdict.sel(at).values
-            counts = [
-                int((words == one).sum())
-                for one in ("unique", "unique off a surface", "not unique")
-            ]
+            counts = [int((words == one).sum()) for one in VERDICTS]
             degrees = np.degrees(cone.sel(at).values[words != ""])
             if degrees.size:
                 label = str(a) if rows.sizes[second] == 1 else f"{a}, {b}"
@@ -292,11 +289,10 @@ Answers = Generator[tuple[Cell, dict[str, Any]], None, None]
 
 _TRIES = 2  # attempts for a cell whose process dies, as the cell may not be the cause
 _STARTS = 3  # successive processes that may die before they are ready
-# Cells in progress for each worker of a cluster.
 _PROCESS_DIED = (
     f"the process that worked on this cell died, {_TRIES} times: killed, or out of memory\n"
 )
-_AHEAD = 2
+_AHEAD = 2  # cells in progress for each worker of a cluster
 _PATIENCE = 20.0  # longest wait for a scheduler and its first worker, s
 _WORKERS_DIED = "the workers that had this cell died (killed, or out of memory)\n"
 
@@ -576,8 +572,7 @@ def run_sweep(
     with Store(path, study, any_version=any_version) as store:
         status = store.statuses()
         columns = {name: k for k, name in enumerate(study.tasks)}
-        ready = [DONE] if again else [DONE, FAILED]
-        skip = np.isin(status, ready)
+        skip = np.isin(status, [DONE] if again else [DONE, FAILED])
         todo = (cell for cell in study.cells() if not skip[cell.index, columns[cell.task]])
         skipped, done, failed = int(skip.sum()), 0, 0
         before = 0 if again else int((status == FAILED).sum())

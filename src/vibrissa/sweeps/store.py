@@ -46,10 +46,9 @@ DESCRIBED = {
     "youngs_modulus": "Pa",
     "turn": "rad",
 }
-# Old layouts, with a Zarr group per task, which can be read but not written.
 _STUDY, _LOCK, _FAILURES, RESULTS = ".study.json", ".sweep.lock", "failures.jsonl", "results"
 LAYOUT = 4
-OLD_LAYOUTS = (2, 3)
+OLD_LAYOUTS = (2, 3)  # old layouts, with a Zarr group per task, which can be read but not written
 _SUM = "checksum"
 _LIBRARIES = ("numpy", "scipy", "numba")
 # Modules that compute a cell; results depend on these and the packages that they import.

@@ -12,11 +12,12 @@ import json
 import math
 import sys
 import time
-import tomllib
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import partial
 from glob import glob
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from vibrissa.contacts import searched_by_name, seeding_triplet, signals_at_nodes
-from vibrissa.io import check_keys
+from vibrissa.io import check_keys, load_whisker, parsed_toml
 from vibrissa.rod import discretize, point_solver, stable_set
 from vibrissa.signals import resting
 from vibrissa.sweeps.tasks import TASKS, Settings, settings_of
@@ -33,7 +34,7 @@ from vibrissa.whisker import Whisker, whisker_array
 
 EXAMPLE = Path(__file__).with_name("example.toml").read_text(encoding="utf-8")
 
-# Functions that cache results of recent whiskers, to which a study does not return.
+# Functions with caches by whisker, which are cleared after each cell, as whiskers do not recur.
 _KEPT = (
     discretize,
     stable_set,
@@ -139,15 +140,8 @@ def read_study(text: str, folder: Path) -> Study:
     ValueError
         If the text is not TOML, or has unknown keys or values out of range.
     """
-    try:
-        content = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as fault:
-        raise ValueError(f"this is not TOML: {fault}") from None
-    known = {"name", "seed", "whiskers", "tasks"}
-    if unknown := sorted(set(content) - known):
-        raise ValueError(
-            f"the study has {', '.join(unknown)}; known are {', '.join(sorted(known))}"
-        )
+    content = parsed_toml(text)
+    check_keys(content, {"name", "seed", "whiskers", "tasks"}, "the study")
     seed = content.get("seed", 0)
     if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
         raise ValueError(f"seed is {seed!r}; a whole number from 0 is needed")
@@ -332,18 +326,16 @@ def _files(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iter
     paths = [path for path in paths if path.is_file()]
     if not paths:
         raise ValueError(f"no file is called {folder / pattern}")
-    prefix = str(stated.get("prefix", ""))
-    for name in ("base_radius", "youngs_modulus"):
-        if len(_numbers(name, stated.get(name, 1.0))) > 1:
+    prefix, changes = str(stated.get("prefix", "")), {}
+    for name in [one for one in ("base_radius", "youngs_modulus") if one in stated]:
+        values = _numbers(name, stated[name])
+        if len(values) > 1:
             raise ValueError(f"{name} is {stated[name]!r}; for files one number is needed")
-    changes = {
-        name: _numbers(name, stated[name])[0] * PARAMETERS[name][1]
-        for name in ("base_radius", "youngs_modulus")
-        if name in stated
-    }
+        changes[name] = values[0] * PARAMETERS[name][1]
     for path in paths:
-        made = _FromFile(path.resolve(), changes, _content(path))
-        yield Specimen(f"{prefix}{path.stem}", {}, _hash([made.content, changes]), made)
+        content = _content(path)
+        make = partial(_whisker_from_file, path.resolve(), changes, content)
+        yield Specimen(f"{prefix}{path.stem}", {}, _hash([content, changes]), make)
 
 
 def _array(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iterator[Specimen]:
@@ -362,7 +354,7 @@ def _array(stated: Mapping[str, Any], folder: Path, seed: Sequence[int]) -> Iter
     prefix = str(stated.get("prefix", ""))
     for name, whisker in whisker_array(**choice).items():
         identity = _hash(["array", choice["side"], name])
-        yield Specimen(f"{prefix}{name}", {}, identity, _Made(whisker))
+        yield Specimen(f"{prefix}{name}", {}, identity, partial(copy, whisker))
 
 
 _KINDS: Mapping[str, Callable[..., Iterator[Specimen]]] = {
@@ -382,66 +374,42 @@ def _formula(stated: dict[str, float], prefix: str, name: str | None = None) -> 
     if name is None:
         varied = [f"{key.replace('_', ' ')} {value:g}" for key, value in stated.items()]
         name = prefix + (", ".join(varied) or "default")
-    return Specimen(name, whole, _hash(["formula", whole]), _Formula(name, whole))
+    make = partial(_whisker_of_parameters, name, whole)
+    return Specimen(name, whole, _hash(["formula", whole]), make)
 
 
-@dataclass(frozen=True)
-class _Formula:
-    """Callable that constructs a parabola or an arc."""
+def _whisker_of_parameters(name: str, stated: Mapping[str, float]) -> Whisker:
+    """Construct a parabola or an arc."""
+    value = {key: stated[key] * PARAMETERS[key][1] for key in PARAMETERS}
+    length, bend, corkscrew = value["length"], value["bend"], value["corkscrew"]
+    properties: dict[str, Any] = {
+        "base_radius": value["base_radius"],
+        "tip_radius": value["base_radius"] / value["taper_ratio"],
+        "youngs_modulus": value["youngs_modulus"],
+        "name": name,
+    }
+    if bend or corkscrew:
 
-    name: str
-    stated: Mapping[str, float]
+        def curvature(s: Any) -> Any:
+            turned = corkscrew * np.asarray(s) / length
+            rate = bend / length
+            # Curvature about d2 bends toward +y at the base.
+            return np.stack([0 * turned, -rate * np.sin(turned), rate * np.cos(turned)], -1)
 
-    def __call__(self) -> Whisker:
-        value = {key: self.stated[key] * PARAMETERS[key][1] for key in PARAMETERS}
-        length, bend, corkscrew = value["length"], value["bend"], value["corkscrew"]
-        properties: dict[str, Any] = {
-            "base_radius": value["base_radius"],
-            "tip_radius": value["base_radius"] / value["taper_ratio"],
-            "youngs_modulus": value["youngs_modulus"],
-            "name": self.name,
-        }
-        if bend or corkscrew:
-
-            def curvature(s: Any) -> Any:
-                turned = corkscrew * np.asarray(s) / length
-                rate = bend / length
-                # Curvature about d2 bends toward +y at the base.
-                return np.stack([0 * turned, -rate * np.sin(turned), rate * np.cos(turned)], -1)
-
-            whisker = Whisker.from_curvature(length, curvature, **properties)
-        elif value["curvature"]:
-            whisker = Whisker.parabola(length, value["curvature"] / length, **properties)
-        else:
-            whisker = Whisker.straight(length, **properties)
-        return whisker if value["trim"] == 1.0 else whisker.trimmed(value["trim"] * length)
+        whisker = Whisker.from_curvature(length, curvature, **properties)
+    elif value["curvature"]:
+        whisker = Whisker.parabola(length, value["curvature"] / length, **properties)
+    else:
+        whisker = Whisker.straight(length, **properties)
+    return whisker if value["trim"] == 1.0 else whisker.trimmed(value["trim"] * length)
 
 
-@dataclass(frozen=True)
-class _FromFile:
-    """Callable that reads a whisker from a file, which must be unchanged."""
-
-    path: Path
-    changes: Mapping[str, float]
-    content: str
-
-    def __call__(self) -> Whisker:
-        from vibrissa.io import load_whisker
-
-        if _content(self.path) != self.content:
-            raise ValueError(f"{self.path} was changed while the study ran: run it again")
-        whisker = load_whisker(self.path)
-        return whisker.with_properties(**self.changes) if self.changes else whisker  # type: ignore[arg-type]
-
-
-@dataclass(frozen=True)
-class _Made:
-    """Callable that returns an existing whisker."""
-
-    whisker: Whisker
-
-    def __call__(self) -> Whisker:
-        return self.whisker
+def _whisker_from_file(path: Path, changes: Mapping[str, Any], content: str) -> Whisker:
+    """Read a whisker from a file, which must have the same contents as when the study was read."""
+    if _content(path) != content:
+        raise ValueError(f"{path} was changed while the study ran: run it again")
+    whisker = load_whisker(path)
+    return whisker.with_properties(**changes) if changes else whisker
 
 
 def _check_count(count: int) -> None:

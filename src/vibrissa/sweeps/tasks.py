@@ -31,11 +31,10 @@ from vibrissa.whisker import Whisker
 Settings = Mapping[str, Any]
 
 PAPERS = ("Fx MB MD", "Mx MB MD", "Fx FD MD")  # the triplets that the paper found unique
-# Largest number of samples per whisker, limited by memory.
 VERDICTS = ("unique", "unique off a surface", "not unique")
 PROOFS = ("proved", "refused", "not finished")
 _MICRO = 1e-6
-_MOST = 10_000_000
+_MOST = 10_000_000  # largest number of samples per whisker, limited by memory
 _STATIONS = np.linspace(0.3, 1.0, 15)
 
 

@@ -6,7 +6,6 @@ from vibrissa.contour.fit import fit_shape
 from vibrissa.contour.fitted_shape import (
     FittedShape,
     continuing_candidates,
-    covariance_to_laboratory as covariance_to_laboratory,
     evidence_of as evidence_of,
     to_laboratory as to_laboratory,
 )

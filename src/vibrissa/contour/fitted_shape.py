@@ -185,13 +185,6 @@ def to_laboratory(points: ArrayLike, base_rotation: ArrayLike, base_position: Ar
     return np.asarray(turned + np.asarray(base_position, dtype=np.float64))
 
 
-def covariance_to_laboratory(covariance: ArrayLike, base_rotation: ArrayLike) -> Array:
-    """Transform covariances of points from the whisker's to the laboratory frame."""
-    rotation = np.asarray(base_rotation, dtype=np.float64)
-    turned = rotation @ np.asarray(covariance, dtype=np.float64) @ np.swapaxes(rotation, -1, -2)
-    return np.asarray(turned, dtype=np.float64)
-
-
 def continuing_candidates(candidates: ArrayLike, frames: ArrayLike) -> NDArray[np.int64]:
     """Select one candidate for each contact by continuity in time.
 

@@ -111,8 +111,8 @@ def remarks_on(
     if np.isnan(length.sigma):
         found.append(
             f"{name}: its tip is not seen, nor is it bent enough to show its length; it is "
-            f"{1e3 * length.value:.1f} mm at least, and contacts are wrong if it is more: give "
-            "--whisker."
+            f"{1e3 * length.value:.1f} mm at least. Its true length is needed to find contacts: "
+            "give --length."
         )
     elif length.sigma > 0.0 and not length.seen:
         found.append(
@@ -121,6 +121,21 @@ def remarks_on(
             "covariances."
         )
     return found
+
+
+def remarks_on_unseen_contacts(one: Tracked, name: str) -> list[str]:
+    """Report contacts beyond what is seen of a whisker whose tip is not seen."""
+    arcs = one.fit.arc_length
+    shown = np.linalg.norm(np.diff(one.curves, axis=1), axis=2).sum(axis=1)
+    count, unseen = int(np.isfinite(arcs).sum()), int((arcs > shown).sum())
+    if not np.isfinite(one.length.shown) or not unseen:
+        return []
+    remedy = "" if one.length.seen else ", or give its length (--length)"
+    return [
+        f"not sure where {name} touches: in {unseen} of {count} frames in contact that is beyond "
+        "what both views show of it, and follows from how the part before it bends. Film more of "
+        f"the whisker{remedy}."
+    ]
 
 
 def remarks_on_row(exchanges: int, left_out: int, name: str) -> list[str]:

@@ -40,6 +40,7 @@ from vibrissa.tracking.remarks import (
     remarks_on_row,
     remarks_on_shaking,
     remarks_on_time,
+    remarks_on_unseen_contacts,
     unexplained_frames,
     usual_gap,
 )
@@ -56,6 +57,8 @@ from vibrissa.tracking.space.rest_shape import (
     likeliest_taper,
     rest_shape,
     seen_length,
+    stated_length,
+    unseen_part,
     whisker_at_rest,
 )
 from vibrissa.tracking.trace.steady import slow_motion
@@ -99,6 +102,9 @@ class TrackOptions:
     whisker : Whisker, optional
         Whisker at rest, where it is known: its base is where it leaves the face. By default it is
         taken from the frames that are free of contact.
+    length : float, optional
+        Length of the whisker from where it leaves the face, m, where it is known but for its shape.
+        By default it is seen, or inferred from how the whisker bends.
     fur : float
         Length of the whisker that fur hides, m: stated radii at the base are those before it.
     rough : bool
@@ -114,6 +120,7 @@ class TrackOptions:
     fit: FitOptions = field(default_factory=FitOptions)
     properties: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     whisker: Whisker | None = None
+    length: float | None = None
     fur: float = 0.0
     rough: bool = False
     distance: float | None = None
@@ -229,6 +236,7 @@ def track(
             found.append(one)
             remarks += remarks_on_fur(one, options.fur, name)
             remarks += remarks_on(cameras, one.traces, one.length, one.fit.misfit, name)
+            remarks += remarks_on_unseen_contacts(one, name)
             if len(cameras) == 1:
                 remarks += remarks_on_plane(one, name)
         except Exception as fault:  # no error of one whisker may discard the others
@@ -454,16 +462,19 @@ def track_whisker(
     fitter = Fitter(cameras, series, touching, on_head, rate, smoothness, head, objects)
     length = Length(whisker.length, 0.0)
     tapers = bool(options.properties.keys() & {"tip_radius", "radius"})
-    if options.whisker is None and shape.whole:
+    if options.whisker is None and options.length is not None:
+        length = unseen_part(shape, stated_length(shape, options.length, tapers))
+    elif options.whisker is None and shape.whole:
         length = seen_length(on_head[shape.free & tips], series.line, tapers)
     elif options.whisker is None:
-        length = _length(fitter, shape, options)
+        length = unseen_part(shape, _length(fitter, shape, options))
+    if length.value > length.shown:
         shape = lengthened(shape, length.value)
         whisker = whisker_at_rest(shape, name, **options.at_base)
     unfiltered, pose = _poses(fitter, shape, whisker, options)
     if length.seen and not tapers:
         whisker, length = tapered_as_it_bends(fitter, whisker, length, pose)
-    fit = fitter.fit(whisker, pose, on_head.shape[1], length.sigma)
+    fit = fitter.fit(whisker, pose, on_head.shape[1], length)
     report(f"contact of {name}", 2, 2)
     covariance = np.array([curve.covariance for curve in curves])
     return Tracked(
@@ -531,7 +542,7 @@ def tapered_as_it_bends(
     if some is None:
         return whisker, length
     at_base, at_tip = whisker.radius(np.array([0.0, whisker.length]))
-    cost = some.costs(whisker.length)
+    cost = some.costs(min(length.shown, whisker.length))
 
     def thicker(share: float) -> Whisker:
         return whisker.with_properties(
@@ -540,7 +551,10 @@ def tapered_as_it_bends(
 
     thinnest = (1.0 - at_tip / at_base) / (1.0 - 1.0 / morphology.MOST_TAPER) - 1.0
     share, sigma = likeliest_taper(
-        length.sigma / length.value, float(thinnest), lambda share: cost(thicker(share), pose)
+        length.sigma / length.value,
+        float(thinnest),
+        lambda share: cost(thicker(share), pose),
+        length.shown / length.value,
     )
     found = thicker(share)
     tip = 100.0 * float(found.radius(whisker.length) / at_base)
@@ -554,7 +568,9 @@ def _length(fitter: Fitter, shape: RestShape, options: TrackOptions) -> Length:
     """Length of a whisker with an unseen tip, from some of the frames in contact."""
     some = _in_contact(fitter)
     if some is None:
-        return Length(shape.length, np.nan)
+        # Few bent frames do not show it, so that it is only known what is usual.
+        touched = bool(fitter.touching.any())
+        return likeliest_length(shape.length, _alike) if touched else Length(shape.length, np.nan)
     cost = some.costs(shape.length)
 
     def of(length: float) -> float:
@@ -563,6 +579,10 @@ def _length(fitter: Fitter, shape: RestShape, options: TrackOptions) -> Length:
         return cost(whisker, _poses(fitter, longer, whisker, options)[1])
 
     return likeliest_length(shape.length, of)
+
+
+def _alike(_: float) -> float:
+    return 0.0
 
 
 def _check_views(cameras: Sequence[Camera], series: TraceSeries, name: str) -> None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -35,6 +36,7 @@ from vibrissa.tracking.refine.rods import (
     rods,
 )
 from vibrissa.tracking.space.pose import BasePose, HeadPose
+from vibrissa.tracking.space.rest_shape import Length
 from vibrissa.tracking.trace.trace import correlated
 from vibrissa.whisker import Whisker
 
@@ -72,6 +74,8 @@ _ENDS = (3.5, 1.0)
 _FREE = [0, 2, 3]
 _ROLLED = np.radians(3.0)  # standard deviation of the roll before its variation is known, rad
 _WILD = 1e6  # slopes of points of a rod, in units of L, above which it is not in equilibrium
+# Change of the inverse length, as a share, up to which its effects are linear, and the largest.
+_LINEAR, _MOST_UNSURE = 0.04, 0.6
 _HALVED = 6  # largest number of times that initial forces without equilibrium are halved
 
 
@@ -139,10 +143,13 @@ class Fitter:
     head: HeadPose
     objects: Sequence[Surface] = ()
 
-    def fit(self, whisker: Whisker, pose: BasePose, nodes: int, unsure: float = 0.0) -> RodFit:
-        """Fit a whisker of approximate pose, whose length has a standard deviation, m."""
+    def fit(
+        self, whisker: Whisker, pose: BasePose, nodes: int, length: Length | None = None
+    ) -> RodFit:
+        """Fit a whisker of approximate pose, whose length may be uncertain."""
         problem, state, linear = self._problem(whisker, pose).trusted()
-        found = _answer(problem, state, linear, nodes, unsure)
+        length = length or Length(whisker.length, 0.0)
+        found = _answer(problem, state, linear, nodes, length)
         return _whole(_in_laboratory(found, problem.head), problem.frames, len(self.curves))
 
     def costs(self, shown: float) -> Callable[[Whisker, BasePose], float]:
@@ -513,32 +520,54 @@ def _contacts(problem: Problem, state: State) -> tuple[Array, Array]:
 def _by_length(
     problem: Problem, state: State, unsure: float, by_contact: Array, slope: Array
 ) -> tuple[Array, Array]:
-    """Shared changes (t, 15) for a whisker longer by one standard deviation, and of the wrench.
+    """Shared changes (k, t, 15) for a longer or shorter whisker, and of the wrench (k, t, 6).
 
-    It is then thicker, as it tapers over a longer distance: this is the whole effect of a longer
-    tip on a contact proximal to it.
+    A longer one is thicker, as it tapers over a longer distance: this is the whole effect of a
+    longer tip on a contact proximal to it. The inverse length, which is what bending shows, changes
+    by a standard deviation; if that is large, to either side, each for half of the variance.
     """
     whisker, length = problem.whisker, problem.whisker.length
-    share = length / (length + unsure)
-    thicker = whisker.with_properties(radius=lambda s: whisker.radius(share * s))
-    other = replace(problem, whisker=thicker, d=discretize(thicker), begun=state)
-    after = other.solved()[0]
     point, wrench = _contacts(problem, state)
-    moved, changed = _contacts(other, after)
-    turn = transform.Rotation.from_matrix(
-        after.rotation @ np.swapaxes(state.rotation, 1, 2)
-    ).as_rotvec()
-    shift = (after.position - state.position) * length
-    contact = np.einsum("tij,tj->ti", after.rotation, moved) + shift
-    contact -= np.einsum("tij,tj->ti", state.rotation, point)
-    moved_by, alike = _contacts(other, state)
     # Back to the same contact point, without additional friction.
     back = by_contact[..., _FREE] @ np.linalg.pinv(slope[:, 3:, _FREE] * length)
-    same = alike - wrench - np.einsum("tij,tj->ti", back, moved_by - point)
-    return np.concatenate([contact, shift, turn, same], axis=1), changed - wrench
+    changes, wrenches = [], []
+    signs = (1.0, -1.0) if unsure > _LINEAR * length else (1.0,)
+    for sign in signs:
+        share = 1.0 - sign * min(unsure / length, _MOST_UNSURE)
+        other = whisker.with_properties(radius=partial(_tapered, whisker, share))
+        altered = replace(problem, whisker=other, d=discretize(other), begun=state)
+        after = altered.solved()[0]
+        moved, changed = _contacts(altered, after)
+        turn = transform.Rotation.from_matrix(
+            after.rotation @ np.swapaxes(state.rotation, 1, 2)
+        ).as_rotvec()
+        shift = (after.position - state.position) * length
+        contact = np.einsum("tij,tj->ti", after.rotation, moved) + shift
+        contact -= np.einsum("tij,tj->ti", state.rotation, point)
+        moved_by, alike = _contacts(altered, state)
+        same = alike - wrench - np.einsum("tij,tj->ti", back, moved_by - point)
+        changes.append(np.concatenate([contact, shift, turn, same], axis=1))
+        wrenches.append(changed - wrench)
+    return np.array(changes) / np.sqrt(len(signs)), np.array(wrenches) / np.sqrt(len(signs))
 
 
-def _answer(problem: Problem, state: State, fit: _Linear, nodes: int, unsure: float) -> RodFit:
+def _tapered(whisker: Whisker, share: float, s: Array) -> Array:
+    """Radius of a whisker that reaches its tip where only a share of the length is left."""
+    return whisker.radius(np.minimum(share * s, whisker.length))
+
+
+def _by_bend(problem: Problem, state: State, length: Length) -> Array:
+    """Shared changes (3, t, 15) of contacts beyond what is seen of the whisker.
+
+    Its shape at rest is extrapolated to there.
+    """
+    beyond = np.maximum(state.contact[:, 0] * problem.d.length - length.shown, 0.0)
+    changes = np.zeros((3, len(beyond), 15))
+    changes[..., :3] = np.moveaxis(state.rotation, 2, 0)
+    return changes * (0.5 * length.bend * beyond**2)[:, None]
+
+
+def _answer(problem: Problem, state: State, fit: _Linear, nodes: int, length: Length) -> RodFit:
     """Results in SI units, relative to the head."""
     d, touching = problem.d, problem.touching
     shared, misfit = _shared(problem, fit), fit.misfit
@@ -563,10 +592,14 @@ def _answer(problem: Problem, state: State, fit: _Linear, nodes: int, unsure: fl
     framed = np.pad(framed, ((0, 0), (0, 0), (3, 6)))
     against = [np.cross(part[:, None], errors[:, 1]) for part in (wrench[:, :3], wrench[:, 3:])]
     aside = np.concatenate(against, axis=2)
-    if unsure > 0.0:
-        by_length, changed = _by_length(problem, state, unsure, by_contact, slope)
-        framed = np.append(framed, by_length[:, None], axis=1)
-        aside = np.append(aside, changed[:, None], axis=1)
+    if length.sigma > 0.0:
+        by_length, changed = _by_length(problem, state, length.sigma, by_contact, slope)
+        framed = np.append(framed, np.moveaxis(by_length, 0, 1), axis=1)
+        aside = np.append(aside, np.moveaxis(changed, 0, 1), axis=1)
+    if length.shown < length.value:
+        by_bend = np.moveaxis(_by_bend(problem, state, length), 0, 1)
+        framed = np.append(framed, by_bend, axis=1)
+        aside = np.append(aside, by_bend[..., 9:], axis=1)
     held = held + np.einsum("tki,tkj->tij", framed[..., 3:9], framed[..., 3:9])
     both = both + np.einsum("tki,tkj->tij", framed[..., 3:9], aside)
     spread = slopes @ covariance @ np.swapaxes(slopes, 1, 2) * d.length**2

@@ -10,9 +10,10 @@ After a release a whisker rings, and its own mass bends it as much as a light co
 frames deviate unevenly, only the quietest of them give the shape, and poses by it.
 
 A whisker tapers to its tip, so its length determines its radius everywhere, and hence how it bends.
-If its tip is too faint to be seen, or not in the image, the length is chosen, among those at least
-as long as what is seen, with which the rod best explains the traces in contact; the misfit of
-others gives its standard deviation.
+If its tip is too faint to be seen, or not in the image, its length is inferred from how well rods
+of different lengths explain the traces in contact; what they leave open is left to a prior. The
+inverse of the length is what bending shows with even accuracy. A contact beyond what is seen and a
+longer whisker bend the seen part alike: the length then determines where the contact is.
 
 Proximal to its tip a whisker bends as the cone of which it is a part: what matters is where the
 cone ends, not how much of it is missing. So an unknown taper and a length seen too short are one
@@ -62,17 +63,20 @@ _SLIDES, _TINY = 0.02, 1e-30
 _OVER = np.deg2rad(120.0)
 _BASE = 6  # number of parts of a shape of which the first shows the direction of its base
 _ROUNDS = 4  # number of rounds in which the free frames are selected
-# Step and largest value of the lengths that are tried, as a share of what is seen, and number of
-# those between which costs are interpolated.
-_STEP, _LONGEST, _FINE = 0.03, 1.45, 600
-# Smallest standard deviation of a length that bending shows, as a share: errors of traces, and of
-# the taper, that all frames share.
+# Step and smallest value of the seen share of a length that are tried, and number of those between
+# which costs are interpolated.
+_STEP, _LEAST_SEEN, _FINE = 0.03, 0.34, 600
+# Usual length of what is not seen, over that of what is.
+_UNSEEN = 0.5
+# Smallest standard deviation of the share of a length that is seen, as bending shows it: errors of
+# traces, and of the taper, that all frames share.
 _CERTAIN = 0.025
 # The same of the taper of a whisker whose tip is seen; and the step in which tapers are tried and
 # the largest, as shares of the length by which it would have to be longer to be as thick.
 _BENDS, _TAPERS, _STOUTEST = 0.009, 0.03, 0.12
 # Largest difference of costs of a probable length: three standard deviations.
 _HARDLY = 9.0
+_STATED = 0.01  # standard deviation of a stated length, as a share: fur hides the base
 _ENDED = 0.7  # standard deviation of a seen length by where its tip is seen, pixels
 _OUTER = 0.4  # share of the shape by which it is extrapolated
 
@@ -386,11 +390,13 @@ def _moved(shapes: Array, rotation: Array, shift: Array) -> Array:
 
 
 class Length(NamedTuple):
-    """Length of a whisker, m, its standard deviation, NaN if unknown, and whether it is seen."""
+    """Length of a whisker, and how much of it the views show."""
 
-    value: float
-    sigma: float
-    seen: bool = False
+    value: float  # m; the seen length, if nothing bends the whisker
+    sigma: float  # its standard deviation, m; NaN if nothing bends the whisker
+    seen: bool = False  # whether it is seen or stated, not inferred from bending
+    shown: float = np.inf  # length of the part that is seen, m
+    bend: float = 0.0  # standard deviation of the curvature of the other part, 1/m
 
 
 def seen_length(curves: Array, lines: Array, tapers: bool = True) -> Length:
@@ -404,6 +410,29 @@ def seen_length(curves: Array, lines: Array, tapers: bool = True) -> Length:
     seen = np.hypot(_ENDED * value / np.nanpercentile(pixels, 95.0), 0.5 * (high - low))
     sigma = seen if tapers else np.hypot(seen, _CERTAIN * value)
     return Length(float(value), float(sigma), seen=True)
+
+
+def stated_length(shape: RestShape, length: float, tapers: bool = True) -> Length:
+    """Check and weigh a length that is stated; see `seen_length`."""
+    if shape.length > _LONGER * length:
+        raise ValueError(
+            f"the whisker is seen over {1e3 * shape.length:.1f} mm, but its stated length is "
+            f"{1e3 * length:.1f} mm: it is another, or the scale is wrong"
+        )
+    value = max(length, shape.length)
+    return Length(value, float(np.hypot(_STATED, 0.0 if tapers else _CERTAIN)) * value, seen=True)
+
+
+def unseen_part(shape: RestShape, length: Length) -> Length:
+    """Add the length that a shape shows, and how uncertain the curvature beyond it is.
+
+    That is by how much the curvature of its outer part differs from that of the whole.
+    """
+    s = np.arange(len(shape.points)) * shape.spacing
+    outer = s > s[-1] - _OUTER * shape.length
+    bends = [np.polynomial.polynomial.polyfit(s[i], shape.points[i], 2)[2] for i in (outer, s >= 0)]
+    bend = 2.0 * float(np.linalg.norm(bends[0] - bends[1]))
+    return length._replace(shown=shape.length, bend=bend)
 
 
 def lengthened(shape: RestShape, length: float) -> RestShape:
@@ -421,19 +450,22 @@ def lengthened(shape: RestShape, length: float) -> RestShape:
 
 
 def likeliest_length(seen: float, cost: Callable[[float], float]) -> Length:
-    """Find the length with which the rod explains the traces best, as a posterior mean."""
-    lengths, costs = [seen], [cost(seen)]
-    while costs[-1] <= min(costs) + _HARDLY and lengths[-1] < _LONGEST * seen:
-        lengths.append(lengths[-1] + _STEP * seen)
-        costs.append(cost(lengths[-1]))
-    if max(costs) <= min(costs) + _HARDLY:
-        return Length(seen, np.nan)
-    value, spread = _moments(*_likelihood(lengths, costs))
-    return Length(value, float(np.hypot(spread, _CERTAIN * seen)))
+    """Find the length with which the rod explains the traces best, as a posterior mean.
+
+    The seen part of a cone bends by the share of it that is seen: that is estimated.
+    """
+    shares, costs = [1.0], [cost(seen)]
+    while costs[-1] <= min(costs) + _HARDLY and shares[-1] - _STEP >= _LEAST_SEEN:
+        shares.append(shares[-1] - _STEP)
+        costs.append(cost(seen / shares[-1]))
+    share, shown = _likelihood(shares[::-1], costs[::-1])
+    usual = np.exp((1.0 - 1.0 / share) / _UNSEEN) / share**2
+    value, spread = _moments(share, shown * usual)
+    return Length(seen / value, float(np.hypot(spread, _CERTAIN)) * seen / value**2)
 
 
 def likeliest_taper(
-    usual: float, thinnest: float, cost: Callable[[float], float]
+    usual: float, thinnest: float, cost: Callable[[float], float], seen: float = 1.0
 ) -> tuple[float, float]:
     """Find the length of a cone beyond the seen one, as a share of this, from its bending.
 
@@ -445,6 +477,8 @@ def likeliest_taper(
         Smallest share, below which the tip would have no thickness.
     cost : callable
         Misfit of the rod and the traces at a share.
+    seen : float
+        Share of the whisker's length that is seen.
 
     Returns
     -------
@@ -458,8 +492,9 @@ def likeliest_taper(
     while costs[0] <= min(costs) + _HARDLY and shares[0] - _TAPERS >= thinnest:
         shares.insert(0, shares[0] - _TAPERS)
         costs.insert(0, cost(shares[0]))
-    fine, shown = _likelihood(shares, costs, 3.0 * _BENDS)
-    blurred = np.exp(-0.5 * ((fine[:, None] - fine) / _BENDS) ** 2)
+    errs = _BENDS if seen >= 1.0 else _CERTAIN / seen
+    fine, shown = _likelihood(shares, costs, 3.0 * errs)
+    blurred = np.exp(-0.5 * ((fine[:, None] - fine) / errs) ** 2)
     blurred /= blurred.sum(axis=1, keepdims=True)
     share, sigma = _moments(fine, blurred @ shown * np.exp(-0.5 * (fine / usual) ** 2))
     return max(share, thinnest), sigma

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.deferred import xr
-from vibrissa.numerics import AnyArray, Array, IntArray, Vector, cross, inlined
+from vibrissa.numerics import AnyArray, Array, IntArray, Vector, cross, inlined, numbers
 from vibrissa.quantities import attributes
 
 Coordinates: TypeAlias = "dict[Hashable, xr.Variable]"  # of a DataArray, by name
@@ -108,29 +108,22 @@ def labelled_wrench(
     force: ArrayLike | xr.DataArray, moment: ArrayLike | xr.DataArray
 ) -> tuple[Array, Array, tuple[str, ...], Coordinates]:
     """Force and moment as arrays of one shape, with names and coordinates of leading dimensions."""
-    vectors = [_space_last(force), _space_last(moment)]
-    labels = [a for a in vectors if isinstance(a, xr.DataArray)]
+    given: list[ArrayLike | xr.DataArray] = [force, moment]
+    labels = [a for a in given if isinstance(a, xr.DataArray)]
     if len(labels) == 2:
         together = xr.broadcast(*_align(*labels), exclude=("space",))
         labels = [a.transpose(..., "space") for a in together]
-        vectors = [*labels]
-    force, moment = vectors
-    f, m = np.asarray(force, dtype=np.float64), np.asarray(moment, dtype=np.float64)
+        given = [*labels]
+    f, m = (numbers(name, a) for name, a in zip(("force", "moment"), given, strict=True))
     if f.shape != m.shape or f.ndim == 0 or f.shape[-1] != 3:
         raise ValueError(
             f"force and moment must have the same shape (..., 3); got {f.shape} and {m.shape}"
         )
     if not labels:
         return f, m, leading_dims(f.shape[:-1]), {}
-    dims = tuple(str(d) for d in labels[0].dims[:-1])
+    last = "space" if "space" in labels[0].dims else labels[0].dims[-1]
+    dims = tuple(str(d) for d in labels[0].dims if d != last)
     return f, m, dims, coordinates(labels[0], dims)
-
-
-def _space_last(array: ArrayLike | xr.DataArray) -> ArrayLike | xr.DataArray:
-    """A DataArray with ``space`` last; other input as plain numbers."""
-    if isinstance(array, xr.DataArray) and "space" in array.dims:
-        return array.transpose(..., "space")
-    return np.asarray(array, dtype=np.float64)
 
 
 def _align(*arrays: xr.DataArray) -> tuple[xr.DataArray, ...]:
@@ -241,7 +234,7 @@ def measured(
         dims = tuple(str(d) for d in arrays[0].dims)
         values = np.stack([a.to_numpy().astype(np.float64) for a in arrays], axis=-1)
         return values, dims, coordinates(arrays[0], dims)
-    plain = [np.asarray(a, dtype=np.float64) for a in given]
+    plain = [numbers(name, a) for name, a in zip(names, given, strict=True)]
     try:
         values = np.stack(np.broadcast_arrays(*plain), axis=-1)
     except ValueError as error:

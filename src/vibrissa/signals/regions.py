@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vibrissa.numerics import AnyArray, Array
+from vibrissa.numerics import AnyArray, Array, numbers
 from vibrissa.whisker import nearest_on_chords
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def nearest_on_rest(whisker: Whisker, points: Array) -> tuple[Array, Array]:
     distance, arc_length : (...) arrays
         Distance and arc length of the closest point, m.
     """
-    points = np.asarray(points, dtype=np.float64)
+    points = numbers("points", points)
     s, points_at_rest, bulge, _ = resting(whisker)
     distance, position = np.empty(points.shape[:-1]), np.empty(points.shape[:-1])
     flat = np.ascontiguousarray(points.reshape(-1, 3))
@@ -124,7 +124,7 @@ def within_cone(whisker: Whisker, points: Array, angle: float = CONE) -> AnyArra
 
 def backward_offset(whisker: Whisker, points: Array) -> Array:
     """Displacement of contact points toward +y from the resting whisker at the same r, m."""
-    points = np.asarray(points, dtype=np.float64)
+    points = numbers("points", points)
     y = points[..., 1]
     if whisker.is_straight:
         return np.asarray(y)

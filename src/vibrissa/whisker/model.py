@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.deferred import xr
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, numbers
 from vibrissa.quantities import quantity
 from vibrissa.sketch import BENT, Mark, card, shown, views
 from vibrissa.whisker.dataset import Stored, check_centerline, whisker_dataset, whisker_fields
@@ -435,7 +435,7 @@ class Whisker:
 
     def _inside(self, s: ArrayLike) -> Array:
         """Arc lengths clipped to the whisker; raise a ValueError if they are outside it."""
-        s = np.asarray(s, dtype=np.float64)
+        s = numbers("arc lengths", s)
         slack = ROUNDING * self.length
         if (s < -slack).any() or (s > self.length + slack).any():
             raise ValueError(

@@ -14,6 +14,7 @@ from __future__ import annotations
 import csv
 import difflib
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -143,6 +144,31 @@ def attributes(name: str) -> dict[str, str]:
     """
     q = quantity(name)
     return {"units": q.unit, "long_name": q.long_name, "description": q.description}
+
+
+# Alternative names of units.
+_UNITS = MappingProxyType(
+    dict.fromkeys(("meter", "meters", "metre", "metres"), "m")
+    | dict.fromkeys(("sec", "second", "seconds"), "s")
+    | dict.fromkeys(("newton", "newtons"), "N")
+    | dict.fromkeys(("radian", "radians"), "rad")
+    | dict.fromkeys(("px", "pixels"), "pixel")
+    | dict.fromkeys(("", "dimensionless"), "1")
+)
+
+
+def unit_fault(name: str, unit: object) -> str:
+    """Describe the fault of a unit other than that of a quantity; empty if there is none."""
+    wanted = attributes(name.removeprefix("unfiltered_"))["units"]
+    if _plain_unit(str(unit)) == _plain_unit(wanted):
+        return ""
+    got = f"is in {unit}" if unit else "states no unit"
+    return f"{name} {got}; {wanted} is needed (attribute units)"
+
+
+def _plain_unit(text: str) -> str:
+    """Unit without separators between its parts, for comparison."""
+    return re.sub(r"[\s·⋅*.^]", "", _UNITS.get(text.strip(), text))
 
 
 def axis_label(name: str) -> str:

@@ -19,8 +19,8 @@ points are estimates. Units and long names are those of :mod:`vibrissa.quantitie
 
 from __future__ import annotations
 
-import re
 import sys
+import warnings
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -33,7 +33,7 @@ from numpy.typing import ArrayLike, NDArray
 from vibrissa.cameras import Camera, cameras_dataset, cameras_from_dataset
 from vibrissa.io import RECORDING_KIND
 from vibrissa.objects import Peg, Surface, object_from_dataset, objects_datasets
-from vibrissa.quantities import attributes
+from vibrissa.quantities import attributes, unit_fault
 from vibrissa.status import Event, Status, flag_attributes
 from vibrissa.whisker import Whisker
 
@@ -158,14 +158,6 @@ _LABELS = MappingProxyType(
         "image_axis": ["column", "row"],
     }
 )
-# Alternative names of units.
-_UNITS = MappingProxyType(
-    dict.fromkeys(("meter", "meters", "metre", "metres"), "m")
-    | dict.fromkeys(("sec", "second", "seconds"), "s")
-    | dict.fromkeys(("newton", "newtons"), "N")
-    | dict.fromkeys(("radian", "radians"), "rad")
-    | dict.fromkeys(("px", "pixels"), "pixel")
-)
 _SKEW = 1e-3  # largest deviation of a rotation times its transpose from the identity
 _OF = "recorded_as"  # attribute of a whisker's group: its label along the dimension ``whisker``
 
@@ -205,7 +197,11 @@ def faults_in(data: xr.Dataset) -> list[str]:
     """List faults of the variables of a recording or of one of its groups."""
     known = {name: data[name].variable for name in VARIABLES if name in data}
     faults = [_fault(name, variable, frozenset()) for name, variable in known.items()]
-    faults += [_unit_fault(name, variable) for name, variable in known.items()]
+    faults += [
+        unit_fault(name, variable.attrs["units"])
+        for name, variable in known.items()
+        if "units" in variable.attrs
+    ]
     for dim, labels in _LABELS.items():
         got = data[dim].values.tolist() if dim in data.coords else labels
         if got != labels:
@@ -220,20 +216,6 @@ def faults_in(data: xr.Dataset) -> list[str]:
         if away > _SKEW or (np.linalg.det(turned) < 0.0).any():
             faults.append(f"{name} is not a rotation in some frames")
     return [fault for fault in faults if fault]
-
-
-def _unit_fault(name: str, variable: xr.Variable) -> str:
-    """Describe the fault of a variable in another unit than declared; empty if there is none."""
-    wanted = attributes(name.removeprefix("unfiltered_"))["units"]
-    got = str(variable.attrs.get("units", ""))
-    if not got or wanted == "1" or _plain_unit(got) == _plain_unit(wanted):
-        return ""
-    return f"{name} is in {got}; {wanted} is needed"
-
-
-def _plain_unit(text: str) -> str:
-    """Unit without separators between its parts, for comparison."""
-    return re.sub(r"[\s·⋅*.^]", "", _UNITS.get(text.strip(), text))
 
 
 def ordered(name: str, variable: xr.Variable) -> NDArray[Any]:
@@ -489,7 +471,7 @@ class Recording:
         """Groups of the whiskers along the dimension ``whisker``, matched by label.
 
         Labels survive selection. If no group has a label of that dimension, as after renaming, the
-        groups are assigned in order.
+        groups are assigned in order, with a warning.
         """
         whiskers = self.tree.children.get("whiskers")
         children = {} if whiskers is None else whiskers.children
@@ -505,12 +487,18 @@ class Recording:
                 f"the whiskers are named {', '.join(names) or 'nothing'}; the recording contains "
                 f"the shapes of {', '.join(labels)}"
             )
+        if pairs := ", ".join(f"{a} has that of {b}" for a, b in zip(names, labels, strict=False)):
+            warnings.warn(
+                f"whiskers and shapes have different names and are matched in order: {pairs}",
+                UserWarning,
+                stacklevel=3,
+            )
         return groups
 
     @property
     def whiskers(self) -> list[Whisker]:
         """Whiskers of the recording, restored."""
-        return [self.whisker(k) for k in range(self.tree.sizes["whisker"])]
+        return [self.whisker(k) for k in range(len(self.names))]
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
@@ -530,8 +518,8 @@ class Recording:
         objects = self.tree.children.get("objects")
         if objects is None:
             return ()
-        numbers = sorted(objects.children, key=int)
-        return tuple(object_from_dataset(objects.children[i].to_dataset()) for i in numbers)
+        names = sorted(objects.children, key=_number)
+        return tuple(object_from_dataset(objects.children[i].to_dataset()) for i in names)
 
     @property
     def pegs(self) -> tuple[Peg, ...]:

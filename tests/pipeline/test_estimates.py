@@ -307,8 +307,12 @@ def test_two_whiskers_touch_one_peg(quiet):
     two = xr.DataTree.from_dict(
         {
             "/": xr.concat([trial.to_dataset()] * 2, "whisker").assign_coords(whisker=["a", "b"]),
-            "/whiskers/0": trial["whiskers/0"].to_dataset(inherit=False),
-            "/whiskers/1": trial["whiskers/0"].to_dataset(inherit=False),
+            **{
+                f"/whiskers/{k}": trial["whiskers/0"]
+                .to_dataset(inherit=False)
+                .assign_attrs(recorded_as=name)
+                for k, name in enumerate("ab")
+            },
         }
     )
     done = with_estimates(two)
@@ -352,6 +356,10 @@ def test_what_cannot_be_done_is_said(trial, felt, contact_map):
     few = with_estimates(trial.isel(time=slice(0, 5)), contact_maps=[contact_map])
     with pytest.raises(ValueError, match=r"no cylinder.*contacts were estimated in \d of 5 frames"):
         reconstruct(few)
+    nowhere = trial.copy()
+    nowhere.dataset = root.assign(base_position=np.nan * root["base_position"])
+    with pytest.raises(ValueError, match="frames: The pose of the base is not known"):
+        reconstruct(with_estimates(with_signals(nowhere, "sensor"), contact_maps=[contact_map]))
     with pytest.raises(ValueError, match="frames and whiskers"):
         with_group(trial, "signals", felt["signals"].to_dataset().isel(time=slice(5)))
     with pytest.raises(ValueError, match="one of signals, estimates, contour"):

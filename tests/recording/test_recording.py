@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 import vibrissa as vb
 from vibrissa import samples
 from vibrissa.cli.app import app
+from vibrissa.objects import Sphere, objects_datasets
 from vibrissa.quantities import attributes
 from vibrissa.recording import (
     VARIABLES,
@@ -135,7 +136,8 @@ def test_selected_whiskers_keep_their_shapes(kept, tmp_path):
 def test_renamed_whiskers_are_in_order_and_other_labels_are_refused():
     tree = _two_whiskers()
     tree.dataset = tree.to_dataset().assign_coords(whisker=["c", "d"])
-    assert [one.name for one in Recording(tree).whiskers] == ["a", "b"]
+    with pytest.warns(UserWarning, match="matched in order: c has that of a, d has that of b"):
+        assert [one.name for one in Recording(tree).whiskers] == ["a", "b"]
     with pytest.raises(ValueError, match="contains the shapes of a, b"):
         _ = Recording(tree.isel(whisker=[1])).whiskers
 
@@ -152,6 +154,9 @@ def test_renamed_whiskers_are_in_order_and_other_labels_are_refused():
             "time is in ms; s is needed",
         ),
         (lambda d: d.isel(space=[1, 2, 0]), "space is y, z, x; x, y, z is needed"),
+        (lambda d: d.drop_vars("time"), "without a coordinate time"),
+        (lambda d: d.drop_vars("whisker"), "without a coordinate whisker"),
+        (lambda d: d.isel(whisker=0), r"lacks the dimensions whisker.*isel\(whisker=\[0\]\)"),
         (lambda d: d.assign_coords(whisker=["a", "a"]), "share a name"),
         (lambda d: d.assign_coords(time=d["time"].values.astype("M8[ns]")), "numbers are needed"),
     ],
@@ -160,6 +165,59 @@ def test_what_was_edited_by_hand_is_refused(edit, fault):
     data = edit(_two_whiskers().to_dataset())
     with pytest.raises(ValueError, match=fault):
         vb.pipeline.check_recording(xr.DataTree(data))
+
+
+def test_faults_of_the_truth_are_named():
+    tree = _two_whiskers()
+    tree["truth"] = xr.DataTree(tree.to_dataset()[["base_position"]] * 1e3)
+    tree["truth/base_position"].attrs["units"] = "mm"
+    with pytest.raises(ValueError, match="in the group truth, base_position is in mm; m is"):
+        vb.pipeline.check_recording(tree)
+
+
+@pytest.mark.parametrize("place", ["base_position", "time", "whiskers/0/length", "objects/0"])
+def test_a_file_states_its_units(place, tmp_path):
+    """Numbers without units, as they remain after arithmetic, are not taken for SI units."""
+    tree = _two_whiskers()
+    tree["objects/0"] = _ball()
+    at = tree[place]["object_radius"] if place == "objects/0" else tree[place]
+    del at.attrs["units"]
+    vb.io.save_recording(path := tmp_path / "bare.nc", tree)
+    with pytest.raises(ValueError, match=r"states no unit; (m|s) is needed"):
+        vb.load_recording(path)
+    if place == "time":
+        done = CliRunner().invoke(app, ["info", str(path)])
+        assert "time states no unit; s is needed" in str(done.exception)
+
+
+def test_objects_may_have_names_and_single_whiskers_no_dimension(tmp_path):
+    tree = _two_whiskers()
+    tree["objects/ball"] = _ball()
+    assert len(Recording(tree).objects) == 1
+    assert [one.name for one in Recording(tree.isel(whisker=1)).whiskers] == ["b"]
+
+
+def test_single_precision_is_enough(tmp_path):
+    tree = _two_whiskers()
+    tilted = vb.Whisker.from_points(vb.Whisker.straight(0.03).centerline(9) @ _turned(0.7))
+    tree["whiskers/0"].dataset = tilted.to_dataset().drop_dims("node").assign_attrs(name="a")
+    vb.io.save_recording(path := tmp_path / "single.nc", tree.map_over_datasets(_single))
+    np.testing.assert_allclose(Recording(vb.load_recording(path)).whisker().length, 0.03, rtol=1e-6)
+
+
+def _ball():
+    (data,) = objects_datasets([Sphere([0.0, 0.0, 0.0], 1e-3)]).values()
+    return xr.DataTree(data.drop_vars("space"))
+
+
+def _turned(angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _single(data):
+    wide = [name for name, variable in data.data_vars.items() if variable.dtype == np.float64]
+    return data.assign({name: data[name].astype(np.float32) for name in wide})
 
 
 def test_info_states_what_is_wrong(tmp_path):

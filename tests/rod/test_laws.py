@@ -210,6 +210,13 @@ def many_loads(whisker, n=3000):
     return vb.PointForce(s, strength * rng.uniform(0, 1, n), rng.uniform(-np.pi, np.pi, n))
 
 
+@pytest.mark.parametrize("threads", ["many", "0", "1.5"])
+def test_a_number_of_cores_is_needed(gamma, monkeypatch, threads):
+    monkeypatch.setenv("VIBRISSA_THREADS", threads)
+    with pytest.raises(ValueError, match=f"VIBRISSA_THREADS is '{threads}'"):
+        vb.deflect(gamma, many_loads(gamma))
+
+
 def test_one_thread_and_many_agree_to_the_bit(gamma, monkeypatch):
     load = many_loads(gamma)
     results = []

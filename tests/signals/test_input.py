@@ -6,7 +6,7 @@ import xarray as xr
 
 import vibrissa as vb
 from vibrissa.cameras import orthogonal_views, triangulate
-from vibrissa.numerics import spherical, threads
+from vibrissa.numerics import spherical
 from vibrissa.objects import Peg
 from vibrissa.signals import nearest_on_rest
 
@@ -52,9 +52,3 @@ def test_masked_pixels_and_arc_lengths_are_missing():
     assert np.isnan(found).all(axis=1).tolist() == [True, False, False]
     along = np.ma.array([5e-3, 10e-3], mask=[True, False])
     assert np.isnan(WHISKER.position(along)[:, 0]).tolist() == [True, False]
-
-
-def test_a_number_of_threads_that_is_none_is_refused(monkeypatch):
-    monkeypatch.setenv("VIBRISSA_THREADS", "two")
-    with pytest.raises(ValueError, match="VIBRISSA_THREADS is 'two'"):
-        threads()

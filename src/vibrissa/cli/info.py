@@ -141,6 +141,7 @@ def _recording(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
     """Describe a recording in five lines: contents, assumptions, and what comes next."""
     with vb.io.naming(path, "a recording"):
         tree = _summarised(path)
+        vb.io.check_units(tree)
         vb.pipeline.check_recording(tree)
         found = vb.pipeline.summarise(tree)
     one = len(found.whiskers) == 1
@@ -506,7 +507,9 @@ def _table(path: Path) -> Iterator[tuple[str, str]]:
             continue
         yield "kind", f"table of {kind}" if kind != "whisker" else "centreline of a whisker"
         yield from _rows(kind, data)
-        yield from _follows(kind, path)
+        # The next verb would refuse a whisker of such a length.
+        if kind != "whisker" or not vb.whisker.length_faults(data.length):
+            yield from _follows(kind, path)
         return
     columns = {re.split(r"[ _/(\[]", cell)[0] for cell in _header_cells(path)}
     used = [name for name in vb.signals.SIGNALS if name in columns]
@@ -555,6 +558,10 @@ def _rows(kind: str, data: Any) -> Iterator[tuple[str, str]]:
         )
         yield "rows", f"{time.size}" if vb.io.NUMBERED in notes else f"{time.size}, {span}"
         yield from (("note", note) for note in notes)
+        if kind == "signals":
+            sizes = {n: np.linalg.norm(data[n].values, axis=-1) for n in ("force", "moment")}
+            most = [shown(n, float(np.nanmax(v, initial=0.0)), 3) for n, v in sizes.items()]
+            yield "largest", f"force {most[0]}, moment {most[1]}"
         if kind == "contacts":
             for sentence, count in vb.status.describe(data["status"].values).most_common():
                 yield str(count), sentence

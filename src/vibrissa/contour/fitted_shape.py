@@ -180,9 +180,9 @@ def whiten(misses: Array, covariance: Array) -> Array:
 
 def to_laboratory(points: ArrayLike, base_rotation: ArrayLike, base_position: ArrayLike) -> Array:
     """Transform points from the whisker's to the laboratory frame."""
-    p = np.asarray(points, dtype=np.float64)
-    turned = np.einsum("...ij,...j->...i", np.asarray(base_rotation, dtype=np.float64), p)
-    return np.asarray(turned + np.asarray(base_position, dtype=np.float64))
+    p, rotation = numbers("points", points), numbers("base_rotation", base_rotation)
+    turned = np.einsum("...ij,...j->...i", rotation, p)
+    return np.asarray(turned + numbers("base_position", base_position))
 
 
 def continuing_candidates(candidates: ArrayLike, frames: ArrayLike) -> NDArray[np.int64]:

@@ -50,7 +50,12 @@ from vibrissa.io.paths import (
     replacing as replacing,
     without_part as without_part,
 )
-from vibrissa.io.recording import RECORDING_KIND as RECORDING_KIND, load_recording, save_recording
+from vibrissa.io.recording import (
+    RECORDING_KIND as RECORDING_KIND,
+    check_units as check_units,
+    load_recording,
+    save_recording,
+)
 from vibrissa.io.rosbag import (
     BagMessage as BagMessage,
     ContactBag as ContactBag,

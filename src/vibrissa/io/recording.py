@@ -24,6 +24,7 @@ import numpy as np
 
 from vibrissa.deferred import xr
 from vibrissa.io.netcdf import COMPRESSED, naming, read_tree, write_netcdf
+from vibrissa.quantities import QUANTITIES, unit_fault
 from vibrissa.whisker import Whisker
 
 GROUP = "whiskers"
@@ -86,7 +87,21 @@ def load_recording(path: str | PathLike[str]) -> xr.DataTree:
         tree = separate_whiskers(tree)
         for group in tree.children[GROUP].children.values() if GROUP in tree.children else ():
             Whisker.from_dataset(group.to_dataset(inherit=False))
+        check_units(tree)
     return tree
+
+
+def check_units(tree: xr.DataTree) -> None:
+    """Raise ValueError unless all quantities in the groups of a file state their SI units."""
+    faults = [
+        f"{group.path.strip('/')} {fault}".strip()
+        for group in tree.subtree
+        for name, variable in group.to_dataset(inherit=False).variables.items()
+        if str(name).removeprefix("unfiltered_") in QUANTITIES
+        and (fault := unit_fault(str(name), variable.attrs.get("units", "")))
+    ]
+    if faults:
+        raise ValueError(f"the recording cannot be used: {'; '.join(faults)}")
 
 
 _WHISKER = "whisker"

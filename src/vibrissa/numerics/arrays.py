@@ -246,12 +246,12 @@ def threads() -> int:
     """Return the number of cores that this process may use; ``VIBRISSA_THREADS`` overrides it."""
     wanted = os.environ.get("VIBRISSA_THREADS")
     if wanted:
-        try:
-            return max(1, int(wanted))
-        except ValueError:
+        if not wanted.strip().isdecimal() or int(wanted) == 0:
             raise ValueError(
-                f"VIBRISSA_THREADS is {wanted!r}; a whole number of threads is needed"
-            ) from None
+                f"the environment variable VIBRISSA_THREADS is {wanted!r}; a number of cores, 1 or "
+                "more, is needed"
+            )
+        return int(wanted)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from vibrissa.contacts import rubbing_misfits
 from vibrissa.numerics import Array
+from vibrissa.quantities import unit_fault
 from vibrissa.recording import VARIABLES, Group, Recording, faults_in, recorded
 from vibrissa.signals import base_signals
 from vibrissa.whisker import Whisker
@@ -55,10 +56,13 @@ def check_recording(recording: xr.DataTree) -> None:
         got = ", ".join(str(name) for name in root.dims) or "none"
         raise ValueError(
             f"the recording lacks the dimensions {', '.join(missing)}; it has {got}: a tracked, "
-            "simulated or measured recording is needed"
+            "simulated or measured recording is needed (one whisker: isel(whisker=[0]))"
         )
-    faults = faults_in(root)
-    faults += _label_faults(root)
+    faults = [*faults_in(root), *_label_faults(root)]
+    for name in ("truth", "measured"):  # later groups are computed anew
+        group = recording.children.get(name)
+        found = [] if group is None else faults_in(group.to_dataset())
+        faults += [f"in the group {name}, {fault}" for fault in found]
     time = np.asarray(root["time"].values)
     if time.size == 0 or root.sizes["whisker"] == 0:
         faults.append(f"it has {time.size} frames of {root.sizes['whisker']} whiskers")
@@ -79,9 +83,9 @@ def check_recording(recording: xr.DataTree) -> None:
 
 def _label_faults(root: xr.Dataset) -> list[str]:
     """List faults of the time and whisker coordinates."""
-    faults = []
-    if (unit := str(root["time"].attrs.get("units", "s"))) not in ("s", "sec", "seconds", ""):
-        faults.append(f"time is in {unit}; s is needed")
+    if bare := [f"it is without a coordinate {d}" for d in ("time", "whisker") if d not in root]:
+        return bare
+    faults = [fault] if (fault := unit_fault("time", root["time"].attrs.get("units", "s"))) else []
     names = [str(name) for name in root["whisker"].values]
     if len(set(names)) < len(names):
         faults.append(f"whiskers share a name: {', '.join(names)}")

@@ -37,7 +37,7 @@ from vibrissa.pipeline.estimates import WHOLE
 from vibrissa.quantities import attributes
 from vibrissa.recording import Group, Recording
 from vibrissa.signals import nearest_on_rest
-from vibrissa.status import describe
+from vibrissa.status import Status, describe
 from vibrissa.whisker import Whisker
 
 Shape = Literal["cylinder", "sphere", "plane", "free"]  # shapes that can be fitted to contacts
@@ -282,7 +282,11 @@ def fit_contacts(
         return fit_shape(shape, points, axis=axis, **known)
     except ValueError as fault:
         found = np.isfinite(points).all(axis=1)
-        reasons = describe(estimates["status"].values.reshape(-1)[~found]).most_common(2)
+        codes = estimates["status"].values.reshape(-1)
+        lost = ~found & np.isin(codes, (Status.UNIQUE, Status.AMBIGUOUS))
+        reasons = describe(codes[~found & ~lost]).most_common(2)
+        if lost.any():
+            reasons.append(("The pose of the base is not known", int(lost.sum())))
         others = "".join(f"; {count} frames: {why.rstrip('.')}" for why, count in reasons)
         raise ValueError(
             f"{fault} (contacts were estimated in {found.sum()} of {len(points)} frames{others})"

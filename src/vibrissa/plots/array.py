@@ -310,7 +310,7 @@ def _scene(tree: xr.DataTree, frame: int | None, contacts: str) -> _Scene | None
         touching=touching[at],
         points=[places[touching[:, i], i] for i in range(len(names))],
         now=places[at],
-        objects=[things[k].to_dataset() for k in sorted(things, key=int)],
+        objects=[thing.to_dataset() for thing in things.values()],
         head=(turn, place),
         moment=f"{float(root['time'].values[at]):.3f} s",
     )

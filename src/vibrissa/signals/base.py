@@ -108,30 +108,22 @@ def labelled_wrench(
     force: ArrayLike | xr.DataArray, moment: ArrayLike | xr.DataArray
 ) -> tuple[Array, Array, tuple[str, ...], Coordinates]:
     """Force and moment as arrays of one shape, with names and coordinates of leading dimensions."""
-    wrench = [_space_last("force", force), _space_last("moment", moment)]
-    labels = [a for a in wrench if isinstance(a, xr.DataArray)]
+    given: list[ArrayLike | xr.DataArray] = [force, moment]
+    labels = [a for a in given if isinstance(a, xr.DataArray)]
     if len(labels) == 2:
         together = xr.broadcast(*_align(*labels), exclude=("space",))
         labels = [a.transpose(..., "space") for a in together]
-        wrench = [*labels]
-    force, moment = wrench
-    f, m = np.asarray(force, dtype=np.float64), np.asarray(moment, dtype=np.float64)
+        given = [*labels]
+    f, m = (numbers(name, a) for name, a in zip(("force", "moment"), given, strict=True))
     if f.shape != m.shape or f.ndim == 0 or f.shape[-1] != 3:
         raise ValueError(
             f"force and moment must have the same shape (..., 3); got {f.shape} and {m.shape}"
         )
     if not labels:
         return f, m, leading_dims(f.shape[:-1]), {}
-    dims = tuple(str(d) for d in labels[0].dims[:-1])
+    last = "space" if "space" in labels[0].dims else labels[0].dims[-1]
+    dims = tuple(str(d) for d in labels[0].dims if d != last)
     return f, m, dims, coordinates(labels[0], dims)
-
-
-def _space_last(name: str, array: ArrayLike | xr.DataArray) -> Array | xr.DataArray:
-    """A DataArray with ``space`` last; other input as plain numbers."""
-    values = numbers(name, array)
-    if isinstance(array, xr.DataArray) and "space" in array.dims:
-        return array.transpose(..., "space").copy(data=values)
-    return values
 
 
 def _align(*arrays: xr.DataArray) -> tuple[xr.DataArray, ...]:

@@ -26,9 +26,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, numbers
 
-ORTHOGONALITY = 1e-9  # largest entry of RᵀR − 1 for a rotation
+ORTHOGONALITY = 1e-6  # largest entry of RᵀR − 1 for a rotation, in float32 too
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +145,7 @@ class Pose:
 
 def _triples(values: ArrayLike) -> Array:
     """Return float64 (..., 3), or raise a ValueError."""
-    array = np.asarray(values, dtype=np.float64)
+    array = numbers("the points", values)
     if array.ndim == 0 or array.shape[-1] != 3:
         raise ValueError(f"got an array of shape {array.shape}; the last axis must be x, y, z")
     return array

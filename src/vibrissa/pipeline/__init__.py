@@ -21,8 +21,6 @@ from vibrissa.pipeline.frames import (
     whisker_radii as whisker_radii,
 )
 from vibrissa.pipeline.locate import (
-    DETECTED as DETECTED,
-    TRIPLET as TRIPLET,
     locate,
     locate_around,
     locate_from_wrench,

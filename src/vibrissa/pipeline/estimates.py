@@ -19,13 +19,13 @@ from vibrissa.contour import continuing_candidates, to_laboratory
 from vibrissa.numerics import Array, cross_matrix
 from vibrissa.pipeline.events import EVENTS, with_events
 from vibrissa.pipeline.frames import signals_in
-from vibrissa.pipeline.locate import TRIPLET, locate, locate_from_wrench, without_contact
+from vibrissa.pipeline.locate import locate, locate_from_wrench, without_contact
 from vibrissa.pipeline.signals import sensor_noise
 from vibrissa.quantities import attributes
 from vibrissa.recording import Group, Recording, coordinates, recorded, recording_tree
 from vibrissa.rod import PROXIMAL
 from vibrissa.sensors import StageSweep, SuspendedWhisker, SweptContacts
-from vibrissa.signals import selection, spherical
+from vibrissa.signals import TRIPLET, selection, spherical
 from vibrissa.status import Status, is_ok
 from vibrissa.whisker import Whisker
 

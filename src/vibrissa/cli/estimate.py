@@ -141,7 +141,7 @@ class EstimateOptions:
     own: WhiskerOptions
 
     def __post_init__(self) -> None:
-        names = self.names or vb.pipeline.TRIPLET
+        names = self.names or vb.signals.TRIPLET
         if self.whole and self.method != "exact":
             raise ValueError(f"--using wrench has no --method {self.method}")
         if self.method != "exact" and len(names) != 3:
@@ -291,7 +291,7 @@ def _named_signals(table: Path, how: EstimateOptions) -> bool:
     """Whether a table has the signals themselves rather than force and moment."""
     if how.whole or how.special:
         return False
-    names = how.names or vb.pipeline.TRIPLET
+    names = how.names or vb.signals.TRIPLET
     first = next((line for line in vb.io.read_text(table).splitlines() if line.strip()), "")
     if not first or _is_header(first, vb.streaming.COMPONENTS):
         return False
@@ -333,9 +333,9 @@ def _from_lines(
             remark(f"no map given; simulating that of {known!r}")
             contact_map = map_of(known, tell, grid=False, proximal=smallest_arc(how.proximal))
         names = None if sensor is None else tuple(sensor.channels)
-        used = names or how.names or vb.pipeline.TRIPLET
+        used = names or how.names or vb.signals.TRIPLET
         estimator = estimator_of(
-            contact_map, sensor, used, how.noise, how.assumed, weight.known, vb.pipeline.DETECTED
+            contact_map, sensor, used, how.noise, how.assumed, weight.known, vb.signals.DETECTED
         )
         running = vb.streaming.ContactStream(estimator, names)
         records = list(running.records(vb.io.read_text(signals).splitlines()))
@@ -353,10 +353,8 @@ def _from_lines(
     happened = [vb.status.Event[one.get("event", "none").upper()] for one in records]
     begun = [[one.get(name, float("nan")) for name in _ONSET] for one in records]
     events, onsets = vb.contacts.in_order(np.array(columns["time"]), happened, begun)
-    found = xr.Dataset({name: ("time", values) for name, values in columns.items()})
-    found = found.assign(event=("time", events))
-    found = found.assign({n: ("time", v) for n, v in zip(_ONSET, onsets.T, strict=True)})
-    vb.io.save_contacts(target, found.assign(status=("time", statuses)))
+    begun_at = dict(zip(_ONSET, onsets.T, strict=True))
+    vb.io.save_contacts(target, {**columns, **begun_at, "event": events, "status": statuses})
     for sentence in vb.streaming.advice(running):
         remark(sentence)
     friction = vb.contacts.friction_assumed(estimator.friction)
@@ -389,7 +387,7 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions, weight: Gravi
             others = {n: named[n] for n in ("errors", "prior", "second_contacts")}
             found = vb.pipeline.locate_from_wrench(known, wrench, noise, gravity=gravity, **others)
         else:
-            names, others = how.names or vb.pipeline.TRIPLET, how.keywords()
+            names, others = how.names or vb.signals.TRIPLET, how.keywords()
             _doubt_names(maps[0], names)
             found = vb.pipeline.locate(
                 maps[0], wrench, names, noise=noise, gravity=gravity, **others

@@ -72,7 +72,7 @@ def _contacts_of(path: Path, moment_noise: float) -> xr.Dataset:
     wrench = wrench_from(path)
     touching = (
         vb.base_signals(wrench["force"], wrench["moment"])["MB"]
-        > vb.pipeline.DETECTED * moment_noise
+        > vb.signals.DETECTED * moment_noise
     )
     return wrench[["force", "moment"]].where(touching)
 

@@ -28,12 +28,13 @@ and one row per frame and whisker; or for MATLAB, with a matrix (frames, whisker
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import zip_longest
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from vibrissa.deferred import xr
 from vibrissa.io.netcdf import is_netcdf, naming, read_dataset
@@ -312,14 +313,16 @@ _OPTIONAL = (*_AROUND, "one_contact", "friction", "onset_time", "onset_sigma")
 _FLAGS: dict[str, type[Status | Event]] = {"event": Event}
 
 
-def save_contacts(path: str | PathLike[str], contacts: xr.Dataset) -> None:
+def save_contacts(
+    path: str | PathLike[str], contacts: xr.Dataset | Mapping[str, ArrayLike]
+) -> None:
     """Write contact points as CSV, with full precision.
 
     Parameters
     ----------
     path : str or path
         Path of the table; an existing file is replaced.
-    contacts : xarray.Dataset
+    contacts : xarray.Dataset, or mapping of name to array (n,)
         Dim time; a variable for each column. Columns that it lacks are written as missing, but
         ``time``, ``x``, ``y``, ``z`` and ``status`` must be there.
 
@@ -341,18 +344,23 @@ def save_contacts(path: str | PathLike[str], contacts: xr.Dataset) -> None:
 
 
 def _columns(
-    data: xr.Dataset, what: str, names: Sequence[str], dim: str, needed: Sequence[str] = ()
+    data: xr.Dataset | Mapping[str, ArrayLike],
+    what: str,
+    names: Sequence[str],
+    dim: str,
+    needed: Sequence[str] = (),
 ) -> list[np.ndarray]:
     """Columns along the dimension of a table; missing ones are NaN."""
-    missing = [n for n in ("time", "x", "y", "z", *needed) if n not in data.variables]
+    missing = [n for n in ("time", "x", "y", "z", *needed) if n not in data]
     if missing:
         raise ValueError(f"{what} lack {', '.join(missing)}")
-    there = [name for name in names if name in data.variables]
-    faults = [name for name in there if data[name].dims != (dim,)]
+    there = [name for name in names if name in data]
+    faults = [name for name in there if getattr(data[name], "dims", (dim,)) != (dim,)]
     if faults:
         raise ValueError(f"{', '.join(faults)} must have the one dim {dim}")
-    nothing = np.full(data.sizes[dim], np.nan)
-    return [data[name].values if name in there else nothing for name in names]
+    columns = {name: np.asarray(data[name]) for name in there}
+    nothing = np.full(len(columns[there[0]]), np.nan)
+    return [columns.get(name, nothing) for name in names]
 
 
 def load_contacts(path: str | PathLike[str]) -> xr.Dataset:

@@ -20,8 +20,6 @@ from vibrissa.pipeline.estimates import (
     with_events as with_events,
 )
 from vibrissa.pipeline.locate import (
-    DETECTED as DETECTED,
-    TRIPLET as TRIPLET,
     locate,
     locate_around,
     locate_from_wrench,

@@ -18,13 +18,13 @@ from vibrissa.contacts import SLIPPING, ContactEvents, ContactMap, Gravity, Plac
 from vibrissa.contour import continuing_candidates, to_laboratory
 from vibrissa.numerics import Array, contacts_in, cross_matrix
 from vibrissa.pipeline.checks import signals_in
-from vibrissa.pipeline.locate import TRIPLET, locate, locate_from_wrench, without_contact
+from vibrissa.pipeline.locate import locate, locate_from_wrench, without_contact
 from vibrissa.pipeline.signals import sensor_noise
 from vibrissa.quantities import attributes
 from vibrissa.recording import Group, Recording, coordinates, recorded, recording_tree
 from vibrissa.rod import PROXIMAL
 from vibrissa.sensors import StageSweep, SuspendedWhisker, SweptContacts
-from vibrissa.signals import selection, spherical
+from vibrissa.signals import TRIPLET, selection, spherical
 from vibrissa.status import Event, Status, flag_attributes, is_ok
 from vibrissa.whisker import Whisker
 

@@ -51,15 +51,10 @@ from vibrissa.quantities import attributes
 from vibrissa.recording import Group
 from vibrissa.rod import resting
 from vibrissa.sensors import component_noise
-from vibrissa.signals import base_signals, selection
+from vibrissa.signals import DETECTED, TRIPLET, base_signals, selection
 from vibrissa.status import Status, flag_attributes
 from vibrissa.whisker import Whisker
 
-TRIPLET = ("Fx", "MB", "MD")
-"""Signals from which contacts are estimated by default."""
-
-# Bending moment above which a contact is detected, in standard deviations of its noise.
-DETECTED = 5.0
 # Standard deviation of the ratio of forces along and across the whisker, for the test of second
 # contacts.
 _FRICTION = 0.3

@@ -37,11 +37,11 @@ from vibrissa.pipeline.checks import (
     with_coordinates,
 )
 from vibrissa.pipeline.inertia import without_inertia
-from vibrissa.pipeline.locate import DETECTED
 from vibrissa.pipeline.slopes import wrench_slopes
 from vibrissa.recording import Group, Recording, recorded
 from vibrissa.rod import PROXIMAL, PointContact, deflect
 from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE, Sensor, component_noise
+from vibrissa.signals import DETECTED
 from vibrissa.simulation import Dynamics
 from vibrissa.status import Status
 from vibrissa.tracking import CUTOFF, BasePose, HeadPose, pieces

@@ -375,7 +375,7 @@ def _invert(b: Array, half: Array, work: Array, careful: bool, x: Array) -> int:
     least, done, farthest, last = np.inf, False, _REACH, _LAST
     if careful:
         farthest, last = _REACH_CAREFUL, _LAST_CAREFUL
-        resting = b[_PIVOT] < 0.0 and b[_LAYER] < _RESTING
+        resting = b[_LAYER] < _RESTING
         if resting or b[_TARGET + 3] > 0.0:  # polar
             farthest, last = np.inf, _LAST
     work[5, 0] = np.inf
@@ -629,6 +629,7 @@ class SeedRoom(NamedTuple):
     # (n,) 2: solved; 1: nearly so, as near a fold; 0: to one side of a fold.
     quality: IntArray
     stack: IntArray  # (256, 2), blocks still to be looked at
+    listed: IntArray  # (512,), cells whose boxes contain the target, see `_list_cells`
     near: IntArray  # (8,), which of eight cells may hold the target
     slack: Array  # (3,), how far from it
     x: Array  # (3,), where in a cell
@@ -647,6 +648,7 @@ def seed_room() -> SeedRoom:
         np.empty((MOST_SEEDS, 3, 3)),
         np.empty(MOST_SEEDS, np.int64),
         np.empty((_STACK, 2), np.int64),
+        np.empty(2 * _STACK, np.int64),
         np.empty(8, np.int64),
         np.zeros(3),
         np.empty(3),
@@ -658,21 +660,48 @@ def seed_room() -> SeedRoom:
     )
 
 
+@inlined
+def _list_cells(
+    tree: SearchTree, target: Array, slack: Array, stack: IntArray, near: IntArray, listed: IntArray
+) -> tuple[int, int]:
+    """List cells whose boxes contain the target: the polar ones backward, from the end.
+
+    Goes on with the blocks on the stack, ``listed[0]`` of them, until the list may be full.
+    Returns how many other cells are listed, from index 1 on, and the index of the last polar cell.
+    """
+    top, first, last = listed[0], 1, listed.shape[0]
+    while top > 0 and first + 8 <= last - 8:
+        top, node, number = _next_cells(tree, target, slack, stack, top, near)
+        for i in range(number):
+            child = 8 * node + near[i]
+            if tree.polar[child] >= 0:
+                last -= 1
+                listed[last] = child
+            else:
+                listed[first] = child
+                first += 1
+    listed[0] = top
+    return first, last
+
+
 @vectorised
 def seeds(tree: SearchTree, target: Array, room: SeedRoom) -> int:
-    """Fill all contacts that may have the target's values; return their number."""
+    """Fill all contacts that may have the target's values; return their number.
+
+    Polar cells come last: where the other quantities vanish with the vector, as on a curve through
+    Ω, each of them has dozens of solutions near a light target, which must not crowd out others.
+    """
     cells = tree.boxes[tree.offsets[-2] :]
-    found, inverses, quality, stack, near, slack, x, nearest, work, b, half, sides = room
+    found, inverses, quality, stack, listed, near, slack, x, nearest, work, b, half, sides = room
     stack[0, 0] = stack[0, 1] = 0
-    count = 0
+    listed[0], count = 1, 0
     _set_target(tree, target, b)
     b[_ROOT] = 1.0
-    top, node, number = _next_cells(tree, target, slack, stack, 1, near)
-    while node >= 0:
-        box = cells[node]
-        for i in range(number):
-            c = near[i]
-            child = 8 * node + c
+    while listed[0] > 0:
+        end, polar = _list_cells(tree, target, slack, stack, near, listed)
+        for i in range(1, end + listed.shape[0] - polar):
+            child = listed[i if i < end else polar + i - end]
+            c, box = child % 8, cells[child // 8]
             careful = _load_cell(tree, child, box, c, target, b, work, half, x)
             if careful < 0:
                 continue
@@ -709,7 +738,6 @@ def seeds(tree: SearchTree, target: Array, room: SeedRoom) -> int:
                         quality,
                         count,
                     )
-        top, node, number = _next_cells(tree, target, slack, stack, top, near)
     return count
 
 

@@ -139,6 +139,8 @@ def search_tree(
     blown, pivot = _blown_up(cells, interpolated, scale, place[:, 2])
     in_blown = _aligned_coordinates(blown)
     care = _starts_needed(blown.slope, in_blown)
+    if scaled.any():  # equations of quantities that are not of one sign are far from linear at rest
+        care[(pivot == 0) & (place[:, 2] == 0) & (care == 0)] = 1
     polar = _Polar.none()
     if plane is not None:
         slopes = chart.charted(plane.derivatives) * size
@@ -454,7 +456,11 @@ def _edge_coefficients(cells: _Cells) -> Array:
 def _starts_needed(slope: Array, aligned: Array) -> IntArray:
     """Number of starts that a cell needs: 0 one, 1 several until one is solved, 2 all of them."""
     det = np.linalg.det(slope)
-    size = np.prod(np.linalg.norm(slope, axis=-2), axis=-1)
+    # Slopes along ρ vanish at rest, which is not a fold. Those along ψ may vanish on one: where
+    # signals are the same on either side of the plane of a planar whisker.
+    length = np.linalg.norm(slope, axis=-2)
+    length[..., :2] = length[..., :2].max(axis=(0, 1, 2))
+    size = np.prod(length, axis=-1)
     flatness = (det / np.where(size > 0.0, size, 1.0)).reshape(8, -1)
     flatness *= np.sign(flatness[0])
     least, most = flatness.min(axis=0), np.abs(flatness).max(axis=0)

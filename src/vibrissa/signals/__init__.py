@@ -3,6 +3,7 @@
 from vibrissa.numerics import spherical
 from vibrissa.signals.base import (
     CIRCULAR,
+    DETECTED as DETECTED,
     FD,
     FT,
     FX,
@@ -14,6 +15,7 @@ from vibrissa.signals.base import (
     MY,
     MZ,
     SIGNALS,
+    TRIPLET as TRIPLET,
     TRIPLETS,
     Coordinates,
     base_signals,

@@ -35,6 +35,10 @@ FX, FT, FD, MX, MB, MD, FY, FZ, MY, MZ = range(10)
 _LONGEST_ARM = 10.0  # longest plausible lever arm of a whisker, m
 #: Which of the signals are angles.
 CIRCULAR = (False, False, True, False, False, True)
+#: Signals from which contacts are estimated by default.
+TRIPLET = ("Fx", "MB", "MD")
+#: Bending moment above which a contact is detected, in standard deviations of its noise.
+DETECTED = 5.0
 
 
 def selection(

@@ -21,8 +21,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.linalg import solveh_banded
 
+from vibrissa.deferred import linalg
 from vibrissa.numerics import Array
 from vibrissa.tracking.trace.trace import correlated
 
@@ -91,7 +91,7 @@ class Smoother:
             if i + 2 < count:
                 band[2 * n + rows - columns, start + columns] = self.second[i].T
         band[0] += damping * band[0] + _REGULAR * band[0].max()
-        step = solveh_banded(band, pulls.reshape(len(pulls), -1).T, lower=True)
+        step = linalg.solveh_banded(band, pulls.reshape(len(pulls), -1).T, lower=True)
         return np.asarray(step.T).reshape(len(pulls), count, n)
 
     def covariances(self) -> Array:

@@ -158,7 +158,20 @@ _UNITS = MappingProxyType(
 
 
 def unit_fault(name: str, unit: object) -> str:
-    """Describe the fault of a unit other than that of a quantity; empty if there is none."""
+    """Describe the fault of a unit other than that of a quantity.
+
+    Parameters
+    ----------
+    name : str
+        Name in :data:`QUANTITIES`, which ``unfiltered_`` may precede.
+    unit : object
+        Stated unit; empty if there is none.
+
+    Returns
+    -------
+    str
+        Fault, as part of a message; empty if the unit is that of the quantity.
+    """
     wanted = attributes(name.removeprefix("unfiltered_"))["units"]
     if _plain_unit(str(unit)) == _plain_unit(wanted):
         return ""

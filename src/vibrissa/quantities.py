@@ -165,7 +165,7 @@ def unit_fault(name: str, unit: object) -> str:
     name : str
         Name in :data:`QUANTITIES`, which ``unfiltered_`` may precede.
     unit : object
-        Stated unit; empty if there is none.
+        Stated unit.
 
     Returns
     -------
@@ -175,8 +175,7 @@ def unit_fault(name: str, unit: object) -> str:
     wanted = attributes(name.removeprefix("unfiltered_"))["units"]
     if _plain_unit(str(unit)) == _plain_unit(wanted):
         return ""
-    got = f"is in {unit}" if unit else "states no unit"
-    return f"{name} {got}; {wanted} is needed (attribute units)"
+    return f"{name} is in {unit}; {wanted} is needed"
 
 
 def _plain_unit(text: str) -> str:

@@ -471,7 +471,7 @@ class Recording:
         """Groups of the whiskers along the dimension ``whisker``, matched by label.
 
         Labels survive selection. If no group has a label of that dimension, as after renaming, the
-        groups are assigned in order, with a warning.
+        groups are assigned in order, with a warning if they have different labels.
         """
         whiskers = self.tree.children.get("whiskers")
         children = {} if whiskers is None else whiskers.children
@@ -487,7 +487,8 @@ class Recording:
                 f"the whiskers are named {', '.join(names) or 'nothing'}; the recording contains "
                 f"the shapes of {', '.join(labels)}"
             )
-        if pairs := ", ".join(f"{a} has that of {b}" for a, b in zip(names, labels, strict=False)):
+        if len(set(labels)) > 1:
+            pairs = ", ".join(f"{a} has that of {b}" for a, b in zip(names, labels, strict=False))
             warnings.warn(
                 f"whiskers and shapes have different names and are matched in order: {pairs}",
                 UserWarning,

@@ -261,6 +261,10 @@ def test_files_of_the_wrong_kind(monkeypatch, capsys, folder, table, chart):
     few.write_text("Fx_uN,MB_uNm,MD_deg\n" + 2 * "-100,2,45\n")
     assert "numbered from 0" in run("estimate", few, "--map", chart, "-o", folder / "few-out.csv")
     assert load_contacts(folder / "few-out.csv")["time"].values.tolist() == [0.0, 1.0]
+    few.write_text("Fx_uN,MB_uNm,MD_deg\n" + 2 * "0,0,0\n" + 2 * "-100,2,45\n")
+    run("estimate", few, "--map", chart, "-o", folder / "few-out.csv", "--force")
+    onset = load_contacts(folder / "few-out.csv")["onset_time"].values[-1]
+    assert 1.0 <= onset <= 2.0  # in numbers of rows, as the time
     few.write_text("FT_uN,MB_uNm,MD_deg\n100,2,45\n")
     named = fault(monkeypatch, capsys, "estimate", few, "--map", chart).replace("\n", " ")
     assert "use --using FT,MB,MD" in named

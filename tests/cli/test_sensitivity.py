@@ -12,6 +12,7 @@ import vibrissa as vb
 from vibrissa import samples
 from vibrissa.cli.app import app, main
 from vibrissa.io import save_recording, save_signals
+from vibrissa.recording import recorded
 
 NOISE = np.diag(np.repeat([1e-12, 4e-16], 3))
 
@@ -85,7 +86,7 @@ def test_twins_are_beside_the_advice(chart, monkeypatch, capsys):
 def test_a_trial_as_signals_or_as_contact_points(chart, points, wrench):
     table, recording = chart.with_name("signals.csv"), chart.with_name("trial.nc")
     save_signals(table, wrench)
-    known = xr.Dataset({"contact_point_whisker": (("time", "whisker", "space"), points[:, None])})
+    known = xr.Dataset({"contact_point_whisker": recorded("contact_point_whisker", points)})
     save_recording(
         recording, xr.DataTree.from_dict({"/": known.assign_attrs(kind="vibrissa recording")})
     )

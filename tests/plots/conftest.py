@@ -9,6 +9,7 @@ from vibrissa.cameras import cameras_dataset, orthogonal_views
 from vibrissa.io import RECORDING_KIND
 from vibrissa.objects import Peg, objects_datasets
 from vibrissa.quantities import attributes
+from vibrissa.recording import recorded
 
 COUNT, LENGTH, NODES = 12, 40e-3, 21
 AZIMUTH = np.linspace(-0.3, 0.3, COUNT)
@@ -41,16 +42,15 @@ class KnownTrial:
             lab = np.where(self.touching[:, None], radius * way, np.nan)
             own = np.where(self.touching[:, None], [radius, 0.0, 0.0], np.nan)
             return {
-                "contact_point": (("time", "whisker", "space"), lab[:, None]),
-                "contact_point_whisker": (("time", "whisker", "space"), own[:, None]),
-                "in_contact": (("time", "whisker"), self.touching[:, None]),
+                "contact_point": recorded("contact_point", lab),
+                "contact_point_whisker": recorded("contact_point_whisker", own),
+                "in_contact": recorded("in_contact", self.touching),
             }
 
-        point = ("time", "whisker", "space")
         root = xr.Dataset(
             {
-                "base_position": (point, np.zeros((COUNT, 1, 3))),
-                "base_rotation": ((*point, "whisker_axis"), turn),
+                "base_position": recorded("base_position", np.zeros((COUNT, 1, 3))),
+                "base_rotation": recorded("base_rotation", turn),
             },
             {
                 "time": ("time", self.time, attributes("time")),
@@ -60,7 +60,7 @@ class KnownTrial:
             {"kind": RECORDING_KIND},
         )
         truth = contact(self.radius) | {
-            "centerline": (("time", "whisker", "node", "space"), line[:, None]),
+            "centerline": recorded("centerline", line),
         }
         groups = {"/": root, "/truth": xr.Dataset(truth)}
         groups["/cameras"] = cameras_dataset(self.views)
@@ -68,15 +68,14 @@ class KnownTrial:
         groups["/objects"] = xr.Dataset()
         for name, dataset in objects_datasets([self.peg]).items():
             groups[f"/objects/{name}"] = dataset.drop_vars("space")
-        over = ("time", "whisker")
-        share = np.linspace(0.0, 1.0, COUNT)[:, None]
+        share = np.linspace(0.0, 1.0, COUNT)
         if signals:
             groups["/signals"] = xr.Dataset(
                 {
-                    "Fx": (over, -2e-5 * share),
-                    "MB": (over, 4e-7 * share),
-                    "MD": (over, np.full((COUNT, 1), 1.5)),
-                    "in_contact": (over, self.touching[:, None]),
+                    "Fx": recorded("Fx", -2e-5 * share),
+                    "MB": recorded("MB", 4e-7 * share),
+                    "MD": recorded("MD", np.full(COUNT, 1.5)),
+                    "in_contact": recorded("in_contact", self.touching),
                 }
             )
         if estimates:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -337,7 +338,8 @@ def _from_lines(
         estimator = estimator_of(
             contact_map, sensor, used, how.noise, how.assumed, weight.known, vb.signals.DETECTED
         )
-        running = vb.streaming.ContactStream(estimator, names)
+        rows = itertools.count()
+        running = vb.streaming.ContactStream(estimator, names, clock=lambda: float(next(rows)))
         records = list(running.records(vb.io.read_text(signals).splitlines()))
     faults = [f"line {one['line']}: {one['error']}" for one in records if "error" in one]
     if faults or not records:

@@ -15,6 +15,7 @@ Whiskers that cannot be stacked keep their own groups, as do those of older file
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -92,16 +93,24 @@ def load_recording(path: str | PathLike[str]) -> xr.DataTree:
 
 
 def check_units(tree: xr.DataTree) -> None:
-    """Raise ValueError unless all quantities in the groups of a file state their SI units."""
-    faults = [
-        f"{group.path.strip('/')} {fault}".strip()
-        for group in tree.subtree
-        for name, variable in group.to_dataset(inherit=False).variables.items()
-        if str(name).removeprefix("unfiltered_") in QUANTITIES
-        and (fault := unit_fault(str(name), variable.attrs.get("units", "")))
-    ]
+    """Raise ValueError for units in a file that are not SI units; warn if units are missing."""
+    faults, unstated = [], set()
+    for group in tree.subtree:
+        for name, variable in group.to_dataset(inherit=False).variables.items():
+            if str(name).removeprefix("unfiltered_") not in QUANTITIES:
+                continue
+            if not variable.attrs.get("units"):
+                unstated.add(str(name))
+            elif fault := unit_fault(str(name), variable.attrs["units"]):
+                faults.append(f"{group.path.strip('/')} {fault}".strip())
     if faults:
         raise ValueError(f"the recording cannot be used: {'; '.join(faults)}")
+    if unstated:
+        warnings.warn(
+            f"the recording states no units of {', '.join(sorted(unstated))}; SI units are assumed",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
 _WHISKER = "whisker"

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-import time as clock
+import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -61,6 +61,9 @@ class ContactStream:
     slip_speed : float, optional
         Speed of a contact point in the laboratory frame above which it slips, m/s; by default two
         lengths of the whisker per second.
+    clock : callable, optional
+        Time of a sample whose line has none, s; called once per such sample. By default the time
+        since the stream was created.
 
     Attributes
     ----------
@@ -86,6 +89,7 @@ class ContactStream:
         tare: int = 0,
         whisker: str = "",
         slip_speed: float | None = None,
+        clock: Callable[[], float] | None = None,
     ) -> None:
         if tare and estimator.sensor is None:
             raise ValueError("tare needs a sensor, to whose channels the offset belongs")
@@ -101,7 +105,8 @@ class ContactStream:
         self._estimator, self._follow = estimator, follow
         self.friction = estimator.friction
         self._which = [SIGNALS.index(name) for name in by_name] if names is None else []
-        self._begun, self._time = clock.monotonic(), -math.inf
+        begun, self._time = time.monotonic(), -math.inf
+        self._clock = clock or (lambda: time.monotonic() - begun)
         self.statuses: Counter[str] = Counter()
         self.events: Counter[str] = Counter()
         self._headers = 0
@@ -198,7 +203,7 @@ class ContactStream:
             If the estimator or the filter rejects the sample.
         """
         self.untimed += sample.time is None
-        time = clock.monotonic() - self._begun if sample.time is None else sample.time
+        time = self._clock() if sample.time is None else sample.time
         # After a header any decrease of time is a restart. Senders may repeat headers, as UDP does
         # not guarantee delivery.
         if time < self._time - (_ANEW if self.lines.headers == self._headers else 0.0):

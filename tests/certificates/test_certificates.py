@@ -113,6 +113,7 @@ def test_a_certificate_with_a_hole_or_a_wrong_whisker_is_noticed(theorem):
         certify(straight(8.0), path=path)
 
 
+@pytest.mark.slow
 def test_an_independent_check_confirms_boxes_and_no_others(theorem, tmp_path, monkeypatch):
     path, _, found = theorem
     monkeypatch.setattr(checker, "_ROUNDS", 4)

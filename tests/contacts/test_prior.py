@@ -131,6 +131,7 @@ def misfit_of(force, point, signals, noise):
     return sum(((float(at_contact[n]) - signals[n]) / noise[n]) ** 2 for n in noise)
 
 
+@pytest.mark.slow
 def test_samples_of_a_curve_are_those_that_are_possible(gamma_map, bent):
     """Two signals leave a curve of contacts; of it the part on one side is left."""
     signals = vb.base_signals(*bent[:2])

@@ -235,6 +235,7 @@ def test_what_is_no_shape_is_refused(joint_errors):
         fit_shape("plane", points, outside=[0.0, 1.0])
 
 
+@pytest.mark.slow
 def test_a_cylinder_of_few_points_does_not_end_in_another_one():
     """Whichever way its axis points in the frame of the points, its fit is as good as the truth."""
     rng, sigma, radius = np.random.default_rng(4), 1e-4, 8e-3

@@ -64,6 +64,7 @@ def test_contacts_are_as_near_as_stated_with_a_wrong_mass(trial, truth):
     errors, stated = [], []
     for dynamics in (None, Dynamics()):
         done = with_signals(measured, "sensor", dynamics=dynamics)
+        assert done["signals"]["force"].attrs["units"] == "N"
         found = estimates_of(done, "wrench").isel(whisker=0)
         away = found.contact_point_whisker.values - truth.contact_point_whisker.values
         rows = settled(truth.in_contact.values.astype(bool))

@@ -120,6 +120,7 @@ def test_before_grey_fur_a_whisker_is_found_along_the_lines_of_sight_of_the_othe
     assert np.mean(away < 4.0) > 0.9
 
 
+@pytest.mark.slow
 def test_before_grey_fur_it_is_followed_from_its_base():
     """Not only beyond the cheek, where it is dark before open ground."""
     film = Film(Setup(seed=101, frames=16, rate=250.0, cheek=True))

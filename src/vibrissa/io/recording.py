@@ -97,10 +97,11 @@ def check_units(tree: xr.DataTree) -> None:
     faults, unstated = [], set()
     for group in tree.subtree:
         for name, variable in group.to_dataset(inherit=False).variables.items():
-            if str(name).removeprefix("unfiltered_") not in QUANTITIES:
+            quantity = QUANTITIES.get(str(name).removeprefix("unfiltered_"))
+            if quantity is None:
                 continue
             if not variable.attrs.get("units"):
-                unstated.add(str(name))
+                unstated |= {str(name)} if quantity.unit != "1" else set()
             elif fault := unit_fault(str(name), variable.attrs["units"]):
                 faults.append(f"{group.path.strip('/')} {fault}".strip())
     if faults:

@@ -184,7 +184,9 @@ def _by_sensor(
         parts = [without_inertia(one, whisker, dynamics, noise) for one, whisker in each]
         of_each = {name: np.ravel([part.attrs[name] for part in parts]) for name in parts[0].attrs}
         about = {"source": "sensor", **of_each, "fitted": int(dynamics == "fitted")}
-        return with_coordinates(xr.concat(parts, "whisker", combine_attrs="drop"), root, about)
+        return with_coordinates(
+            xr.concat(parts, "whisker", combine_attrs="drop_conflicts"), root, about
+        )
     force, moment = (Group(root)[name] for name in ("force", "moment"))
     known = _known(force, moment)
     least = 0.0

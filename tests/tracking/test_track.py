@@ -358,6 +358,16 @@ def test_frames_that_no_rod_explains_are_left_out_if_two_views_contradict_each_o
     np.testing.assert_array_equal(lost, np.stack([expected, expected], axis=1))
 
 
+def squared_errors(recording, filmed):
+    """Squared errors of contact points over their covariance, in every other frame filmed."""
+    found = recording.to_dataset().isel(whisker=0)
+    truth = filmed.truth.isel(time=slice(None, None, 2))
+    both = (truth["in_contact"].values > 0) & (found["in_contact"].values > 0)
+    away = (found["contact_point"].values - truth["contact_point"].values)[both]
+    spread = found["contact_covariance"].values[both]
+    return np.einsum("ti,tij,tj->t", away, np.linalg.inv(spread), away)
+
+
 def test_a_tip_that_is_not_seen_is_found_by_how_the_whisker_bends(filmed, traces):
     """Without the last 3 to 9 % of every trace, said to go on; of every other frame.
 
@@ -381,12 +391,7 @@ def test_a_tip_that_is_not_seen_is_found_by_how_the_whisker_bends(filmed, traces
     true = Recording(filmed.recording).whisker().length
     assert Recording(recording).whisker().length == pytest.approx(true, rel=0.03)
     assert "its tip is too faint" in recording.attrs["remarks"]
-    found = recording.to_dataset().isel(whisker=0)
-    truth = filmed.truth.isel(time=slice(None, None, 2))
-    both = (truth["in_contact"].values > 0) & (found["in_contact"].values > 0)
-    away = (found["contact_point"].values - truth["contact_point"].values)[both]
-    spread = found["contact_covariance"].values[both]
-    squares = np.einsum("ti,tij,tj->t", away, np.linalg.inv(spread), away)
+    squares = squared_errors(recording, filmed)
     assert np.median(squares) < 2.366 * 2.0**2
 
 
@@ -408,12 +413,7 @@ def test_a_contact_beyond_what_is_seen_is_as_uncertain_as_stated(filmed, traces,
     true = Recording(filmed.recording).whisker().length
     how = TrackOptions(fit=FitOptions(rounds=6), length=true if stated else None)
     recording = track(filmed.cameras, [[row] for row in cut], 500.0, how)
-    found = recording.to_dataset().isel(whisker=0)
-    truth = filmed.truth.isel(time=slice(None, None, 2))
-    both = (truth["in_contact"].values > 0) & (found["in_contact"].values > 0)
-    away = (found["contact_point"].values - truth["contact_point"].values)[both]
-    spread = found["contact_covariance"].values[both]
-    squares = np.einsum("ti,tij,tj->t", away, np.linalg.inv(spread), away)
+    squares = squared_errors(recording, filmed)
     assert (squares < 7.81).mean() > 0.8
     assert "not sure where whisker 0 touches" in recording.attrs["remarks"]
     assert ("(--length)" in recording.attrs["remarks"]) != stated

@@ -10,10 +10,11 @@ After a release a whisker rings, and its own mass bends it as much as a light co
 frames deviate unevenly, only the quietest of them give the shape, and poses by it.
 
 A whisker tapers to its tip, so its length determines its radius everywhere, and hence how it bends.
-If its tip is too faint to be seen, or not in the image, its length is inferred from how well rods
-of different lengths explain the traces in contact; what they leave open is left to a prior. The
-inverse of the length is what bending shows with even accuracy. A contact beyond what is seen and a
-longer whisker bend the seen part alike: the length then determines where the contact is.
+If its tip is too faint to be seen, or not in the image, its length is estimated from how well rods
+of different lengths explain the traces in contact, with a weak prior. The estimate is made in terms
+of the visible share of the length, because bending determines this share equally well for all
+lengths. If the contact is beyond the visible part, a longer whisker that is touched farther out has
+nearly the same visible shape; the position of the contact then depends on the length.
 
 Proximal to its tip a whisker bends as the cone of which it is a part: what matters is where the
 cone ends, not how much of it is missing. So an unknown taper and a length seen too short are one

@@ -169,6 +169,53 @@ def test_light_contacts_near_the_plane_of_a_planar_whisker_are_found(gamma_map, 
     assert _share_found(gamma_map, triplet, charted) > 0.99
 
 
+def _wire(curvature, taper=1.0):
+    """A steel wire of constant curvature (over 1/L)."""
+    return vb.Whisker.from_curvature(
+        0.15,
+        lambda s: np.stack([0 * s, 0 * s, curvature / 0.15 + 0 * s], -1),
+        base_radius=3e-4,
+        tip_radius=3e-4 / taper,
+        youngs_modulus=200e9,
+    )
+
+
+def _signals_of_contacts(contact_map, charted):
+    """Signals and contact points (n, 3), in m, of positions in the chart."""
+    chart, d = contact_map.chart, contact_map.chart.discretization
+    contacts = contacts_at(chart.fold, charted)
+    values, _ = solve_forces(d, np.insert(contacts, 1, 0.0, axis=1))
+    force, point = values[:, :3] * d.force, values[:, 3:] * d.length
+    return vb.base_signals(force, np.cross(point, force)), point
+
+
+@pytest.mark.parametrize(("curvature", "taper"), [(0.1, 1.0), (0.1, 1.02), (0.6, 1.3), (0.0, 1.05)])
+@pytest.mark.parametrize("light", [False, True])
+def test_contacts_of_wires_are_right_or_called_undetermined(rng, curvature, taper, light):
+    """F_x of a uniform wire nearly follows from its moment; what remains locates the contact."""
+    contact_map = vb.ContactMap.simulate(_wire(curvature, taper), grid=False)
+    low, high = (0.01, 0.2) if light else (0.2, 0.95)
+    charted = rng.uniform([0.02, -np.pi, low], [0.98, np.pi, high], (500, 3))
+    signals, point = _signals_of_contacts(contact_map, charted)
+    found = contact_map.estimate(signals, "Fx MB MD")
+    away = np.linalg.norm(found.candidates.point - point[:, None], axis=-1)
+    near = np.nanmin(np.where(np.isnan(away), np.inf, away), axis=1) < 1e-5 * 0.15
+    undetermined = found.status == vb.Status.DEGENERATE
+    assert (near | undetermined).mean() > 0.99
+    assert undetermined.mean() <= (0.4 if taper == 1.0 else 0.0)
+    assert not (undetermined & np.isfinite(found.point[:, 0])).any()
+
+
+def test_contacts_in_the_plane_of_a_uniform_wire_are_undetermined(rng):
+    """In the plane the moment alone gives F_x, wherever the contact is."""
+    contact_map = vb.ContactMap.simulate(_wire(0.4), grid=False)
+    charted = rng.uniform([0.1, 0.0, 0.2], [0.9, 0.0, 0.6], (100, 3))
+    signals, _ = _signals_of_contacts(contact_map, charted)
+    found = contact_map.estimate(signals, "Fx MB MD")
+    assert (found.status == vb.Status.DEGENERATE).mean() > 0.95
+    assert not (found.status == vb.Status.UNIQUE).any()
+
+
 def _share_found(contact_map, triplet, charted):
     """Share of contacts (n, 3), given by η, ψ and log ρ, that are found from exact signals."""
     chart = contact_map.chart

@@ -45,6 +45,7 @@ from vibrissa.rod import (
 from vibrissa.status import Status
 
 _UNIQUE, _AMBIGUOUS = int(Status.UNIQUE), int(Status.AMBIGUOUS)
+_DEGENERATE = int(Status.DEGENERATE)
 _OUTSIDE, _FRICTION = int(Status.OUTSIDE_MAP), int(Status.NOT_FRICTIONLESS)
 #: Status of rows of three signals without a contact, before the reason is determined.
 UNEXPLAINED = -1
@@ -129,7 +130,7 @@ def solve_rows(
 ) -> None:
     """Find the contacts that give three signals exactly; NaN rows stay as they are."""
     of, out, n = task.of, in_memory(number, flat, valid), last - first
-    aims, xi = np.empty((n, 6)), np.empty((n, MOST_CANDIDATES, 3))
+    aims, xi, loose = np.empty((n, 6)), np.empty((n, MOST_CANDIDATES, 3)), np.zeros(n, np.bool_)
     for i in range(n):
         row, known = first + i, finite(targets[first + i])
         for k in range(3):
@@ -137,11 +138,15 @@ def solve_rows(
             aims[i, 3 + k] = of.codes[k]
     found, values = number[first:last], out.values[first:last]
     rod, fold, _ = of.charted
-    invert_rows(rod, fold, of.tree, of.proximal, aims, found, xi, values, 0, n)
+    invert_rows(rod, fold, of.tree, of.proximal, aims, found, xi, values, loose, 0, n)
     for i in range(n):
         if aims[i, 0] != aims[i, 0]:
             continue
         row = first + i
+        if loose[i]:
+            found[i], status[row] = 0, _DEGENERATE
+            values[i] = np.nan
+            continue
         for c in range(found[i]):
             x = out.x[row, c]
             x[0], x[1], x[2], x[3] = xi[i, c, 0], 0.0, xi[i, c, 1], xi[i, c, 2]

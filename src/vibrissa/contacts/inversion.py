@@ -1,8 +1,9 @@
 """All stable contacts that have three given signals.
 
 The subdivision tree of the chart for the triplet supplies a seed for each contact; Newton's method
-on T(ξ) = T_measured makes it exact. Residuals are relative: forces to |F|, moments to |M|, angles
-in rad.
+on T(ξ) = T_measured, with H (:mod:`vibrissa.rod.balance`) instead of F_x, makes it exact. Residuals
+are relative: forces to |F|, moments to |M|, angles in rad. Where small errors of the signals would
+move a contact far, the signals do not determine it.
 """
 
 from __future__ import annotations
@@ -14,27 +15,46 @@ from typing import NamedTuple
 import numpy as np
 
 from vibrissa.contacts.contacts import MOST_CANDIDATES
-from vibrissa.numerics import Array, IntArray, copy, inlined, kernel, share_out, wrapped
+from vibrissa.numerics import (
+    AnyArray,
+    Array,
+    IntArray,
+    copy,
+    inlined,
+    kernel,
+    share_out,
+    solve3,
+    wrapped,
+)
 from vibrissa.rod import (
     BUFFER_SIZE,
     LANES,
     TOLERANCE,
+    Balance,
     Fold,
     PlaneVector,
     Rod,
     SearchTree,
     StableSet,
+    balance_rows,
+    balanced,
     chart_to_contact,
+    integrate,
+    lane_value,
+    lanes_tangents,
     newton_group,
     search_tree,
     seed_room,
     seeds,
+    set_all_lanes,
     stable,
     start_from,
 )
 from vibrissa.signals import (
     CIRCULAR,
     FD,
+    FX,
+    MB,
     MD,
     MX,
     SIGNALS,
@@ -44,9 +64,16 @@ from vibrissa.signals import (
 )
 
 _SAME = 1e-7  # two solutions within this (relative to L and to the force) are the same
+# Relative error of signals, about that of the integration, and how far (over L) it may move a
+# contact that the signals determine.
+_ERROR, _MOVED = 1e-7, 0.01
+# Share of that up to which the slopes of an interpolant, in units of the chart, are trusted.
+_CERTAIN = 0.01
 # Number of targets above which they are sorted, so that the tree's nodes stay in the cache.
 _MANY = 1000
 _RANK_BITS = 5
+# The signals of a :class:`~vibrissa.rod.Balance`.
+_BALANCED = (FX, MB, MD, MX)
 
 
 class Solutions(NamedTuple):
@@ -69,7 +96,15 @@ def triplet_tree(chart: StableSet, triplet: tuple[str, ...]) -> SearchTree:
     angles = tuple(CIRCULAR[w] for w in which)
     plane = _plane(chart, triplet)
     vanishing = tuple(not turns for turns in angles)
-    return search_tree(chart, np.ascontiguousarray(values), derivatives, angles, plane, vanishing)
+    balance, values = _balance_of(chart, triplet), np.ascontiguousarray(values)
+    return search_tree(chart, values, derivatives, angles, plane, vanishing, balance)
+
+
+def _balance_of(chart: StableSet, triplet: tuple[str, ...]) -> Balance:
+    """Balance of force and moment as far as it concerns three signals."""
+    names = [SIGNALS[code] for code in _BALANCED]
+    parts = [triplet.index(name) if name in triplet else -1 for name in names]
+    return Balance.of(chart.discretization.rod, parts)
 
 
 def _plane(chart: StableSet, triplet: tuple[str, ...]) -> PlaneVector | None:
@@ -125,11 +160,11 @@ def _inverted(
         np.full((n, MOST_CANDIDATES, 6), np.nan),
     )
     targets = _with_choice(targets, triplet)
-    rod = chart.discretization.rod
+    rod, loose = chart.discretization.rod, np.zeros(n, dtype=bool)
     share_out(
         n,
         lambda first, last: invert_rows(
-            rod, chart.fold, tree, chart.proximal, targets, *out, first, last
+            rod, chart.fold, tree, chart.proximal, targets, *out, loose, first, last
         ),
     )
     return out
@@ -142,8 +177,11 @@ def polish(
     n = len(targets)
     xi = np.array(contacts, dtype=np.float64)
     values, misfits, signs = np.full((n, 6), np.nan), np.full(n, np.inf), np.full(n, np.nan)
+    rod, fold, balance = chart.discretization.rod, chart.fold, _balance_of(chart, triplet)
     targets = _with_choice(targets, triplet)
-    rod, fold = chart.discretization.rod, chart.fold
+    aims = np.ascontiguousarray(targets[:, :3])
+    balance_rows(balance, aims, np.zeros((n, 3, 3)))
+    targets[:, :3], targets[:, 6:] = aims, balance.weights
     share_out(
         n,
         lambda first, last: polish_rows(
@@ -156,7 +194,42 @@ def polish(
 def _with_choice(targets: Array, triplet: tuple[str, ...]) -> Array:
     """Each target followed by the codes of its signals, as the equations expect it."""
     which = [float(SIGNALS.index(name)) for name in triplet]
-    return np.concatenate([targets, np.tile(which, (len(targets), 1))], axis=1)
+    return np.concatenate([targets, np.tile([*which, *np.zeros(5)], (len(targets), 1))], axis=1)
+
+
+@inlined
+def _sizes(value: Array) -> tuple[float, float]:
+    """Sizes of force and moment of (F, p)."""
+    fx, fy, fz = value[0], value[1], value[2]
+    px, py, pz = value[3], value[4], value[5]
+    mx, my, mz = py * fz - pz * fy, pz * fx - px * fz, px * fy - py * fx
+    return (
+        float(np.sqrt(fx * fx + fy * fy + fz * fz)),
+        float(np.sqrt(mx * mx + my * my + mz * mz)),
+    )
+
+
+@inlined
+def _size_of(signal: int, sizes: tuple[float, float]) -> float:
+    """Unit of a signal's residual, from the sizes of force and moment."""
+    if signal in (FD, MD):
+        return 1.0
+    return sizes[0] if signal < MX else sizes[1]
+
+
+@inlined
+def _balance(which: IntArray, weights: Array, wanted: bool, values: Array, jacobian: Array) -> None:
+    """Replace F_x by H in three signals and, if ``wanted``, in their derivatives."""
+    parts, slopes = np.full(4, -1), np.empty(3)
+    for k in range(3):
+        for part in range(4):
+            if which[k] == _BALANCED[part]:
+                parts[part] = k
+    balanced(Balance(parts, weights), values, values, slopes)
+    if wanted:
+        for k in range(3):
+            for a in range(3):
+                jacobian[parts[0], a] += slopes[k] * jacobian[k, a]
 
 
 @inlined
@@ -167,20 +240,15 @@ def _match(
     for k in range(3):
         which[k] = int(target[3 + k])
     signal_equations(0.0, value, tangents, wanted, which, residual, jacobian)
-    fx, fy, fz = value[0], value[1], value[2]
-    px, py, pz = value[3], value[4], value[5]
-    mx, my, mz = py * fz - pz * fy, pz * fx - px * fz, px * fy - py * fx
-    force, moment = np.sqrt(fx * fx + fy * fy + fz * fz), np.sqrt(mx * mx + my * my + mz * mz)
-    total = 0.0
+    if target[6] != 0.0 or target[10] != 0.0:
+        _balance(which, target[6:], wanted, residual, jacobian)
+    sizes, total = _sizes(value), 0.0
     for k in range(3):
         residual[k] -= target[k]
         w = which[k]
-        scale = 1.0
         if w in (FD, MD):
             residual[k] = wrapped(residual[k])
-        else:
-            scale = 1.0 / (force if w < MX else moment)
-        total += (scale * residual[k]) ** 2
+        total += (residual[k] / _size_of(w, sizes)) ** 2
     return float(np.sqrt(total))
 
 
@@ -209,6 +277,44 @@ def _add(
     count[row] = min(n + 1, MOST_CANDIDATES)
 
 
+@inlined
+def _certain(inverse: Array, value: Array, target: Array) -> bool:
+    """Whether ∂chart/∂T of an interpolant shows that the signals determine a contact."""
+    sizes, most = _sizes(value), 0.0
+    for k in range(3):
+        size = _size_of(int(target[3 + k]), sizes)
+        for a in range(3):
+            most = max(most, abs(inverse[a, k]) * size)
+    return bool(inverse[0, 0] == inverse[0, 0] and _ERROR * most < _CERTAIN * _MOVED)
+
+
+@kernel
+def _determined(rod: Rod, b: Array, xi: Array, target: Array) -> bool:
+    """Whether signals determine a contact in spite of the errors of the integration."""
+    value, tangents, four = np.empty(6), np.empty((6, 3)), np.empty((6, 4))
+    residual, jacobian, moves = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    set_all_lanes(b, xi[0], 0.0, xi[1], xi[2])
+    integrate(rod, b, 1)
+    lane_value(b, 0, value)
+    lanes_tangents(b, four)
+    for a in range(6):
+        tangents[a, 0], tangents[a, 1], tangents[a, 2] = four[a, 0], four[a, 2], four[a, 3]
+    _match(value, tangents, True, target, residual, jacobian)
+    sizes = _sizes(value)
+    for k in range(3):
+        residual[:] = 0.0
+        residual[k] = _ERROR * _size_of(int(target[3 + k]), sizes)
+        if solve3(jacobian, residual, moves[k]) == 0.0:
+            return False
+        for a in range(3, 6):
+            moved = 0.0
+            for c in range(3):
+                moved += tangents[a, c] * moves[k, c]
+            if not abs(moved) < _MOVED:
+                return False
+    return True
+
+
 @kernel
 def invert_rows(
     rod: Rod,
@@ -219,15 +325,19 @@ def invert_rows(
     number: IntArray,
     contacts: Array,
     values: Array,
+    loose: AnyArray,
     first: int,
     last: int,
 ) -> None:
-    """Find all stable contacts that give three signals, by rising force, for some rows."""
+    """Find all stable contacts that give three signals, by rising force, for some rows.
+
+    ``loose`` (n,) is set where the signals do not determine one of them.
+    """
     b = np.zeros(BUFFER_SIZE)
     room = seed_room()
     found, slopes, quality = room.found, room.inverses, room.quality
     charts, inverses = np.empty((LANES, 3)), np.empty((LANES, 3, 3))
-    rows, group_targets = np.empty(LANES, np.int64), np.empty((LANES, 6))
+    rows, group_targets = np.empty(LANES, np.int64), np.empty((LANES, 11))
     group, group_values = np.empty((LANES, 3)), np.empty((LANES, 6))
     misfits, signs = np.empty(LANES), np.empty(LANES)
     waiting = 0
@@ -240,7 +350,9 @@ def invert_rows(
         for seed in range(n):
             if row < last:
                 rows[waiting] = row
-                copy(targets[row], group_targets[waiting])
+                copy(room.aim, group_targets[waiting, :3])
+                copy(targets[row, 3:], group_targets[waiting, 3:6])
+                copy(tree.balance.weights, group_targets[waiting, 6:])
                 chart_to_contact(fold, found[seed], group[waiting])
                 start_from(
                     found[seed], slopes[seed], quality[seed], charts[waiting], inverses[waiting]
@@ -263,7 +375,11 @@ def invert_rows(
                 signs,
             )
             for i in range(waiting):
-                if misfits[i] <= TOLERANCE and stable(fold, proximal, group[i], signs[i]):
+                if not (misfits[i] <= _ERROR and stable(fold, proximal, group[i], signs[i])):
+                    continue
+                if not _certain(inverses[i], group_values[i], group_targets[i]):
+                    loose[rows[i]] |= not _determined(rod, b, group[i], group_targets[i])
+                if misfits[i] <= TOLERANCE:
                     _add(rows[i], group[i], group_values[i], number, contacts, values)
             waiting = 0
 

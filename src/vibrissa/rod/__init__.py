@@ -10,6 +10,11 @@ from vibrissa.rod.around import (
     around as around,
     deflect_around,
 )
+from vibrissa.rod.balance import (
+    Balance as Balance,
+    balance_rows as balance_rows,
+    balanced as balanced,
+)
 from vibrissa.rod.chart import (
     CELLS,
     LEAST_ARC,

@@ -7,8 +7,10 @@ straight line between its ends, Σ w H over the four edges along η plus Σ w (H
 ψ and ρ, w the bilinear weights across. It reproduces all cubics, so its error is of fourth order;
 the Bézier points of the edges bound it.
 
-Quantities that vanish at rest in proportion to the force are divided by it, and by one of them in
-the coordinates aligned with a cell, so that cells at rest are as regular as others.
+Quantities that vanish at rest in proportion to the force or to its square are divided by it, and by
+one of them in the coordinates aligned with a cell, so that cells at rest are as regular as others.
+Instead of F_x cells interpolate H (:mod:`vibrissa.rod.balance`), the part of it that does not
+follow from the moment.
 
 Boxes around the cells' values, and around those of 2 × 2 × 2 neighbours, and so on, form a tree;
 the cells that may contain a target are those whose boxes, and all boxes above them, contain it, and
@@ -27,12 +29,13 @@ from typing import NamedTuple
 import numpy as np
 
 from vibrissa.numerics import AnyArray, Array, IntArray
+from vibrissa.rod.balance import Balance, balance_rows
 from vibrissa.rod.chart import LEAST_LOAD, Fold, StableSet
 
 _MARGIN = 0.08  # boxes are widened by this share of their size for what the cubic misses
-# A quantity that vanishes at rest faster than the force is not regular over the force: its ratio to
-# the force at rest is below this share of the largest one.
-_FASTER = 0.3
+# A quantity whose ratio to the force is at rest below this share of the largest one vanishes at
+# rest in proportion to the square of the force.
+_FASTER = 1e-6
 # A quantity has one sign in a cell if its least absolute value exceeds this share of the largest.
 _SIGNED = 0.1
 # Relative determinant of a cell's linear part below which the cell is not aligned.
@@ -56,7 +59,11 @@ class SearchTree(NamedTuple):
     turns: Array  # (3,), 1/2π for angles, 0 for other quantities
     offsets: IntArray  # (levels + 1,), first row of each level in ``boxes``
     boxes: Array  # (m, 6, 8), middle and half width of the values in eight sibling blocks
-    scale: Array  # (3,), sizes over the force of quantities that vanish at rest; 0 for the others
+    balance: Balance  # quantities that cells interpolate
+    # (3,) Power of the force that quantities vanish with at rest: 1, 2, or 0 if they do not; and
+    # their sizes over it, 0 for the latter.
+    powers: IntArray
+    scale: Array
     place: IntArray  # (n, 3), position of each cell in the grid
     # (n, 6, 3) Coordinates in which a cell is nearly the unit cube (inverse, origin), and its
     # extent in them (lower, upper).
@@ -97,6 +104,7 @@ def search_tree(
     angles: tuple[bool, ...],
     plane: PlaneVector | None = None,
     vanishing: tuple[bool, ...] = (False, False, False),
+    balance: Balance | None = None,
 ) -> SearchTree:
     """Build the tree for the search for contacts with given values of three quantities.
 
@@ -113,7 +121,9 @@ def search_tree(
     plane : PlaneVector, optional
         Vector whose length, direction, or both are among the quantities.
     vanishing : tuple of bool
-        Whether each of them is proportional to the force near rest.
+        Whether each of them vanishes at rest.
+    balance : Balance, optional
+        Balance of force and moment, if F_x is among them.
 
     Returns
     -------
@@ -123,29 +133,28 @@ def search_tree(
     size = np.array([1.0, 2.0 * np.pi, 1.0]) / (np.array(values.shape[:3]) - 1)
     circular = np.array(angles)
     place = _octree_order(tuple(n - 1 for n in values.shape[:3]))
-    slopes, scaled = chart.charted(derivatives) * size, np.array(vanishing)
+    slopes, balance = chart.charted(derivatives) * size, balance or Balance.none()
     cells = _Cells.of(place, values, slopes, circular)
     low, high = cells.extent()
-    smooth, smooth_slopes = _smooth(chart, values, slopes, scaled)
-    size_of = np.nanmax(np.abs(smooth[..., :3]), axis=(0, 1, 2))
-    at_rest = np.nanmax(np.abs(smooth[:, :, 0, :3]), axis=(0, 1))
-    if (scaled & (at_rest < _FASTER * size_of)).any():  # of a straight whisker
-        scaled = np.zeros(3, dtype=bool)
-        smooth, smooth_slopes = _smooth(chart, values, slopes, scaled)
-    scale = np.where(scaled, size_of, 0.0)
+    frame = _aligned_coordinates(cells)
+    values, slopes = values.copy(), np.ascontiguousarray(slopes)
+    balance_rows(balance, values.reshape(-1, 3), slopes.reshape(-1, 3, 3))
+    cells = _Cells.of(place, values, slopes, circular)
+    powers, scale, smooth, smooth_slopes = _smooth(chart, values, slopes, np.array(vanishing))
     interpolated = _Cells.of(place, smooth, smooth_slopes, np.append(circular, False))
     half = 0.5 * np.subtract(*interpolated.extent()[::-1])[:, None, :3]
-    interpolated.corner[...] += np.where([*scaled, True], interpolated.base, 0.0)
-    blown, pivot = _blown_up(cells, interpolated, scale, place[:, 2])
+    interpolated.corner[...] += np.where([*(powers > 0), True], interpolated.base, 0.0)
+    blown, pivot = _blown_up(cells, interpolated, powers, scale, place[:, 2])
     in_blown = _aligned_coordinates(blown)
     care = _starts_needed(blown.slope, in_blown)
-    if scaled.any():  # equations of quantities that are not of one sign are far from linear at rest
+    if powers.any():  # equations of quantities that are not of one sign are far from linear at rest
         care[(pivot == 0) & (place[:, 2] == 0) & (care == 0)] = 1
     polar = _Polar.none()
     if plane is not None:
         slopes = chart.charted(plane.derivatives) * size
         vector = _Cells.of(place, plane.values, slopes, np.zeros(2, dtype=bool))
-        polar = _Polar.of(cells, vector, plane.length, plane.direction, 0.5 * (high - low))
+        extent = 0.5 * np.subtract(*cells.extent()[::-1])
+        polar = _Polar.of(cells, vector, plane.length, plane.direction, extent)
         if plane.length >= 0:
             low[polar.rows, plane.length] = 0.0
             high[polar.rows, plane.length] = polar.frame[:, 7]
@@ -162,9 +171,11 @@ def search_tree(
         np.where(circular, 0.5 / np.pi, 0.0),
         offsets,
         boxes,
+        balance,
+        powers,
         scale,
         place,
-        _aligned_coordinates(cells),
+        frame,
         np.ascontiguousarray(np.concatenate([in_blown, half], axis=1)),
         pivot,
         _edge_coefficients(interpolated),
@@ -315,25 +326,41 @@ def _corners(place: IntArray) -> tuple[IntArray, IntArray, IntArray]:
 
 
 def _smooth(
-    chart: StableSet, values: Array, slopes: Array, scaled: AnyArray
-) -> tuple[Array, Array]:
-    """What cells interpolate, at the nodes, with its slopes.
+    chart: StableSet, values: Array, slopes: Array, vanishing: AnyArray
+) -> tuple[IntArray, Array, Array, Array]:
+    """What cells interpolate, at the nodes, with its slopes; see `SearchTree.powers` for the rest.
 
-    What vanishes at rest is divided by the force, and 1/√f* in cells joins it.
+    What vanishes at rest is divided by the force or its square, and 1/√f* in cells joins it.
     """
+    powers = vanishing.astype(np.int64)
+    out, by = _over_force(chart, values, slopes, powers)
+    size = np.abs(out[..., :3]).max(axis=(0, 1, 2))
+    powers[vanishing & (np.abs(out[:, :, 0, :3]).max(axis=(0, 1)) < _FASTER * size)] = 2
+    if (powers == 2).any():
+        if not (powers == 1).any():  # no other quantity determines the force
+            powers[:] = 0
+        out, by = _over_force(chart, values, slopes, powers)
+        size = np.abs(out[..., :3]).max(axis=(0, 1, 2))
+    return powers, np.where(powers > 0, size, 0.0), out, by
+
+
+def _over_force(
+    chart: StableSet, values: Array, slopes: Array, powers: IntArray
+) -> tuple[Array, Array]:
+    """Quantities at the nodes over powers of the force, and 1/√f* in cells, with their slopes."""
     grid, step = values.shape[:3], chart.loads[1]
     loads = np.maximum(chart.loads, LEAST_LOAD) / step
     log, by_eta, by_psi = np.moveaxis(chart.fold.log_force[:, :, None, :3], -1, 0)
     rise = np.empty((*grid, 3))
     rise[..., 0], rise[..., 1], rise[..., 2] = by_eta / (grid[0] - 1), by_psi, 2.0 / loads
     rise[..., 1] *= 2.0 * np.pi / (grid[1] - 1)
-    force = np.where(scaled, (np.exp(log) * (step * loads) ** 2)[..., None], 1.0)
+    force = (np.exp(log) * (step * loads) ** 2)[..., None] ** powers
     out, by = np.empty((*grid, 4)), np.zeros((*grid, 4, 3))
     out[..., :3], out[..., 3] = values / force, np.exp(-0.5 * log) / step
     by[..., :3, :] = slopes / force[..., None]
-    by[..., :3, :] -= np.where(scaled, out[..., :3], 0.0)[..., None] * rise[..., None, :]
+    by[..., :3, :] -= (powers * out[..., :3])[..., None] * rise[..., None, :]
     by[..., 3, :2] = -0.5 * out[..., 3, None] * rise[..., :2]
-    if scaled.any():  # near rest all of it is linear in the force, ρ²: the nodes lead there
+    if powers.any():  # near rest all of it is linear in the force, ρ²: the nodes lead there
         out[:, :, 0] -= 0.5 * loads[0] * by[:, :, 0, :, 2]
         by[:, :, 0, :, 2] = 0.0
         rest = loads[0] ** 2 / (loads[1] ** 2 - loads[0] ** 2)
@@ -342,7 +369,7 @@ def _smooth(
 
 
 def _blown_up(
-    cells: _Cells, interpolated: _Cells, scale: Array, layer: IntArray
+    cells: _Cells, interpolated: _Cells, powers: IntArray, scale: Array, layer: IntArray
 ) -> tuple[_Cells, IntArray]:
     """Quantities over the one that vanishes at rest and nowhere else in a cell, and its root.
 
@@ -351,25 +378,27 @@ def _blown_up(
     value, slope = interpolated.corner[..., :3], interpolated.slope[..., :3, :]
     sign = np.sign(value[0, 0, 0])
     with np.errstate(divide="ignore", invalid="ignore"):
-        least = np.where(scale > 0.0, (sign * value).min(axis=(0, 1, 2)) / scale, -np.inf)
+        least = np.where(powers == 1, (sign * value).min(axis=(0, 1, 2)) / scale, -np.inf)
         number = np.argmax(least, axis=-1)
         every = np.arange(len(number))
         most = np.abs(value).max(axis=(0, 1, 2))[every, number] / scale[number]
         usable = least[every, number] > _SIGNED * most
         over, by = value[..., every, number], slope[..., every, number, :]
-        ratio = value / over[..., None]
-        by_ratio = (slope - ratio[..., None] * by[..., None, :]) / over[..., None, None]
+        power = over[..., None] ** powers
+        ratio = value / power
+        by_over = (powers * value / over[..., None])[..., None] * by[..., None, :]
+        by_ratio = (slope - by_over) / power[..., None]
         root = np.sqrt(np.abs(over)) / interpolated.corner[..., 3]
         shrink = interpolated.slope[..., 3, :] / interpolated.corner[..., 3, None]
         load = (layer + np.arange(2)[:, None]) * root
         by_load = load[..., None] * (0.5 * by / over[..., None] - shrink)
     by_load[..., 2] += root
     pivots = np.arange(3) == number[:, None]
-    blown = np.where(pivots, load[..., None], np.where(scale > 0.0, ratio, value))
-    by_blown = np.where((scale > 0.0)[:, None], by_ratio, slope)
+    blown = np.where(pivots, load[..., None], np.where(powers > 0, ratio, value))
+    by_blown = np.where((powers > 0)[:, None], by_ratio, slope)
     by_blown = np.where(pivots[..., None], by_load[..., None, :], by_blown)
     corner = np.where(usable[:, None], blown, cells.corner)
-    base = np.where((scale > 0.0) & usable[:, None], corner[0, 0, 0], cells.base)
+    base = np.where((powers > 0) & usable[:, None], corner[0, 0, 0], cells.base)
     corner = corner - corner[0, 0, 0]
     out = _Cells(base, corner, np.where(usable[:, None, None], by_blown, cells.slope))
     return out, np.where(usable, sign[every, number] * (number + 1), 0.0).astype(np.int64)

@@ -1,6 +1,6 @@
 """The figure of the page, from the results."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from vibrissa.plots.style import (
 )
 
 COLOURS = dict(zip(METHODS, (BLUE, MUTED, GREEN, ORANGE), strict=True))
+MARKERS = dict(zip(METHODS, "osD^", strict=True))
 SYMBOLS = {
     TRIPLET: "$F_x$, $M_B$, $M_D$",
     OTHER: "$F_x$, $F_T$, $M_D$",
@@ -61,7 +62,17 @@ def draw(results: Mapping[str, Any]) -> Figure:
             # Predictions beyond a whisker's length mean only that nothing is known.
             axes.set_ylim(least, LARGEST)
         panels[0, 0].set_ylabel("3D error, median (mm)")
-        lines = [Line2D([], [], color=COLOURS[method], label=SYMBOLS[method]) for method in METHODS]
+        lines = [
+            Line2D(
+                [],
+                [],
+                color=COLOURS[method],
+                marker=MARKERS[method],
+                markersize=3.0,
+                label=SYMBOLS[method],
+            )
+            for method in METHODS
+        ]
         predicted = Line2D([], [], color=INK, linestyle=":", label="predicted")
         by_friction(panels[1, 0], results)
         head(panels[1, 0], "d", f"by friction, {RUBBED}")
@@ -95,11 +106,16 @@ def finding(results: Mapping[str, Any]) -> str:
 def errors(axes: Axes, one: Mapping[str, Any]) -> None:
     for method in METHODS:
         rows = [one[method]["classes"][label] for label in LABELS]
-        for name, style in (("median", "o-"), ("predicted", ":")):
-            values = [row[name] * 1e3 for row in rows]
-            axes.plot(range(len(LABELS)), values, style, color=COLOURS[method], markersize=2.5)
-    axes.set_yscale("log")
+        method_lines(axes, method, range(len(LABELS)), rows)
     by_class(axes)
+
+
+def method_lines(axes: Axes, method: str, x: Sequence[float], rows: list[dict[str, float]]) -> None:
+    """Measured and predicted errors of a method, on a logarithmic axis."""
+    for name, look in (("median", f"{MARKERS[method]}-"), ("predicted", ":")):
+        values = [row[name] * 1e3 for row in rows]
+        axes.plot(x, values, look, color=COLOURS[method], markersize=3.0)
+    axes.set_yscale("log")
 
 
 def by_class(axes: Axes) -> None:
@@ -112,10 +128,7 @@ def by_friction(axes: Axes, results: Mapping[str, Any]) -> None:
     at = [c.friction for c in still]
     for method in METHODS:
         rows = [results[c.name]["true"][method]["classes"][RUBBED] for c in still]
-        for name, style in (("median", "o-"), ("predicted", ":")):
-            values = [row[name] * 1e3 for row in rows]
-            axes.plot(at, values, style, color=COLOURS[method], markersize=2.5)
-    axes.set_yscale("log")
+        method_lines(axes, method, at, rows)
     axes.set_xticks(at)
     axes.set_xlabel("coefficient of friction")
     axes.set_ylabel("3D error, median (mm)")

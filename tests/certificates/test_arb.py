@@ -77,7 +77,10 @@ def contact(rod, alpha, s, phi, level):
     return at_base(rod, s, force * phi.cos(), force * phi.sin())
 
 
-@pytest.mark.parametrize("half", [1e-12, 2e-3, 1e-2])
+@pytest.mark.parametrize(
+    "half",
+    [pytest.param(1e-12, marks=pytest.mark.slow), 2e-3, pytest.param(1e-2, marks=pytest.mark.slow)],
+)
 def test_enclosures_hold_what_arb_computes(half):
     flint.ctx.prec = 120
     whisker = vb.Whisker.parabola(length=39.4e-3, coefficient=10.0)

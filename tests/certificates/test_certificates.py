@@ -225,8 +225,8 @@ def test_witnesses_are_proved_and_other_pairs_are_not(curved):
     ("ratio", "triplet", "turn"),
     [
         (15.0, "FT MB MD", 0.3),
-        (15.0, "Mx MB MD", 0.3),
-        (15.0, "Fx FT MB", 2.0),
+        pytest.param(15.0, "Mx MB MD", 0.3, marks=pytest.mark.slow),
+        pytest.param(15.0, "Fx FT MB", 2.0, marks=pytest.mark.slow),
         (1.0, "Fx MB MD", 0),
     ],
 )

@@ -38,8 +38,8 @@ def misses(film, start):
     [
         (200, {}),
         pytest.param(201, {}, marks=pytest.mark.slow),
-        (202, {"crf": 28}),
-        (206, {"noise": 8.0}),
+        pytest.param(202, {"crf": 28}, marks=pytest.mark.slow),
+        pytest.param(206, {"noise": 8.0}, marks=pytest.mark.slow),
         (203, {"bright": True}),
         (207, {"still": True}),
     ],

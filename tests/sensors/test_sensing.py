@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 import vibrissa as vb
 from vibrissa.cli.app import app
+from vibrissa.contacts.noise import SensorNoise
 from vibrissa.sensors import (
     Sensor,
     SensorFrame,
@@ -92,6 +93,22 @@ def test_a_left_hand_has_moments_of_its_own_numbers(rng):
 def test_what_are_no_axes_is_refused(given_axes, message):
     with pytest.raises(ValueError, match=message):
         SensorFrame(given_axes)
+
+
+@pytest.mark.parametrize("name", ["noise", "bias", "largest", "mixing", "mixing_error"])
+def test_masked_values_are_missing_not_numbers(name):
+    shape = (6, 6) if name.startswith("mixing") else (6,)
+    mask = np.broadcast_to(np.arange(6) == 2, shape)
+    values = np.ma.masked_array(np.full(shape, 0.5), mask=mask)
+    with pytest.raises(ValueError, match=name):
+        Sensor(**{name: values})
+
+
+def test_masked_frames_and_noise_are_refused():
+    with pytest.raises(ValueError, match="position"):
+        SensorFrame(position=np.ma.masked_array(np.zeros(3), mask=[0, 1, 0]))
+    with pytest.raises(ValueError, match="finite variances"):
+        SensorNoise.of(np.ma.masked_array(np.eye(6), mask=np.eye(6)), ("Fx",))
 
 
 @given(st.integers(0, 2**32 - 1))

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_t
 from typer.testing import CliRunner
 
 import vibrissa as vb
@@ -19,7 +18,7 @@ from vibrissa.simulation import (
     simulate,
     sweep_past,
 )
-from vibrissa.simulation.vibration import _touching
+from vibrissa.simulation.vibration import Modes, _Free, _Model
 
 NOISE = component_noise(FORCE_NOISE, MOMENT_NOISE)
 
@@ -135,15 +134,21 @@ def test_what_is_not_determined_is_stated(whisker, in_air):
         fit_dynamics(whisker, *(x[:9] for x in air), NOISE)
 
 
-def test_an_onset_is_a_change():
-    # Its density over the changes that follow on none is one in all, and small at small changes.
-    rng = np.random.default_rng(0)
-    changes = np.zeros((40000, 5))
-    changes[1::2] = 5.0 * multivariate_t(shape=np.eye(5), df=1).rvs(20000, random_state=rng)
-    onset = _touching(changes.cumsum(axis=0), np.eye(5))[1][1::2]
-    drawn = multivariate_t(shape=25.0 * np.eye(5), df=1).logpdf(changes[1::2])
-    assert np.mean(np.exp(onset - drawn)) == pytest.approx(1.0, abs=0.01)
-    sizes = np.zeros((4, 5))
-    sizes[1::2, 0] = 1.0, 10.0
-    onset = _touching(sizes.cumsum(axis=0), np.eye(5))[1]
-    assert onset[1] < onset[3] - 1.0
+def test_a_contact_begins_where_the_whisker_deviates_from_free_vibration(whisker):
+    vibration = Vibration.of(whisker)
+    reach = np.linalg.norm(vibration.places, axis=1).max()
+    gains = vibration.base_wrench(vibration.shapes)
+    loss = vibration.damping * vibration.rates
+    modes = Modes(vibration.rates, loss, gains, vibration.shapes[:, -1] / reach)
+    model = _Model.of(modes, 1e-3, NOISE, np.zeros(6))
+    size = 2 * len(vibration.rates) + 1
+    free = _Free(np.zeros(1, int), np.zeros((1, size)), 0.1 * np.eye(size)[None], np.zeros(1))
+    free.state[0, :4] = 60.0, 10.0, -40.0, 30.0
+    expected = model.wrench @ free.state[0, :-1]
+    likelihoods = []
+    for deviation in (0.0, 100.0):
+        measured = expected + deviation * np.eye(5)[4]
+        _, still, begins = free.observed(model, measured, np.zeros(5))
+        likelihoods.append(float((begins - still)[0]))
+    assert likelihoods[0] < -3.0
+    assert likelihoods[1] > 1.0

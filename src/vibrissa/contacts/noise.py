@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.deferred import special, xr
-from vibrissa.numerics import Array, relative
+from vibrissa.numerics import Array, numbers, relative
 from vibrissa.quantities import attributes
 from vibrissa.sensors import Sensor
 from vibrissa.signals import SIGNALS, wrench_derivatives
@@ -95,7 +95,7 @@ class SensorNoise:
                     f"noise lacks {', '.join(missing)}; it has {', '.join(noise) or 'none'}"
                 )
             try:
-                sigma = {name: float(noise[name]) for name in names}
+                sigma = {name: float(numbers(name, noise[name])) for name in names}
             except (TypeError, ValueError) as error:
                 given = {name: noise[name] for name in names}
                 raise ValueError(f"noise must be standard deviations ≥ 0; got {given}") from error
@@ -103,13 +103,15 @@ class SensorNoise:
                 raise ValueError(f"noise must be standard deviations ≥ 0; got {sigma}")
             return cls(sigma, None, errors)
         try:
-            wrench = np.asarray(noise, dtype=np.float64)
-        except (TypeError, ValueError) as error:
+            wrench = numbers("noise", noise)
+        except ValueError as error:
             raise ValueError(
                 "noise must be {signal: standard deviation} or a symmetric 6 × 6 covariance of "
                 f"(F, M); got {noise!r}"
             ) from error
-        if wrench.shape != (6, 6) or not np.allclose(wrench, wrench.T, rtol=1e-9, atol=0.0):
+        if wrench.shape != (6, 6) or not np.allclose(
+            wrench, wrench.T, rtol=1e-9, atol=0.0, equal_nan=True
+        ):
             raise ValueError(
                 "noise must be {signal: standard deviation} or a symmetric 6 × 6 covariance of "
                 f"(F, M); got shape {wrench.shape}"

@@ -294,11 +294,11 @@ def calibrate_weight(
     turn = rotation_matrices("rotations", rotations)
     if turn.shape != (n, 3, 3):
         raise ValueError(f"{n} readings need as many rotations (3, 3); got {turn.shape}")
-    design = _design(sensor, turn[known], np.asarray(gravity, dtype=np.float64))
+    design = _design(sensor, turn[known], numbers("gravity", gravity))
     # Unknowns without effect in any orientation stay zero; the others must be determined.
     every = np.array([np.eye(3), *np.eye(3)[[[1, 2, 0], [2, 0, 1]]]])
     every = np.concatenate([every, -every, every[:, ::-1]])
-    possible = _design(sensor, every, np.asarray(gravity, dtype=np.float64))[:, :, k:]
+    possible = _design(sensor, every, numbers("gravity", gravity))[:, :, k:]
     effect = np.abs(possible).max(axis=(0, 1))
     effective = np.concatenate(
         [np.ones(k, bool), effect > _IDLE * max(float(effect.max()), 1e-300)]

@@ -62,7 +62,7 @@ class SensorFrame:
     def __post_init__(self) -> None:
         """Validate the fields, and make the axes exactly orthonormal."""
         axes = _axes(self.axes)
-        position = np.array(self.position, dtype=np.float64)
+        position = numbers("position", self.position)
         if position.shape != (3,) or not np.isfinite(position).all():
             raise ValueError(f"a sensor's position is three numbers, m; got {self.position!r}")
         object.__setattr__(self, "axes", axes)
@@ -106,7 +106,7 @@ def _axes(value: Any) -> Array:
         value = value.replace(",", " ").split()
     if isinstance(value, Sequence) and all(isinstance(name, str) for name in value):
         return _named_axes(value)
-    axes = np.array(value, dtype=np.float64)
+    axes = numbers("axes", value)
     if axes.shape != (3, 3) or not np.isfinite(axes).all():
         raise ValueError(f"a sensor's axes are three columns of three numbers; got {value!r}")
     u, size, v = np.linalg.svd(axes)

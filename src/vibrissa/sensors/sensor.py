@@ -137,10 +137,10 @@ class Sensor:
         mixing = _checked_mixing(names, self.mixing, faults)
         values: dict[str, Any] = {"channels": names, "mixing": mixing}
         values |= _checked_numbers(self, mixing, len(names), faults)
-        values["mixing_error"] = np.asarray(self.mixing_error, dtype=np.float64)
+        values["mixing_error"] = numbers("mixing_error", self.mixing_error, COMPONENTS)
         values["mixing_covariance"], fault = _checked_covariance(self.mixing_covariance, len(names))
         faults += fault
-        error, moment = values["mixing_error"], np.asarray(self.mass_moment, dtype=np.float64)
+        error, moment = values["mixing_error"], numbers("mass_moment", self.mass_moment)
         if error.shape not in ((), (len(names), 6)):
             faults.append(
                 f"mixing_error has shape {error.shape}; () or ({len(names)}, 6) is needed"
@@ -188,7 +188,7 @@ class Sensor:
         array (k, k)
             Diagonal covariance, without drift and `common_errors`.
         """
-        relative = self.relative_noise * np.asarray(reading, dtype=np.float64)
+        relative = self.relative_noise * numbers("reading", reading, self.channels)
         variance = self.noise**2 + self.resolution**2 / 12.0 + relative**2
         return np.diag(variance)
 
@@ -406,7 +406,7 @@ def component_noise(force_noise: float, moment_noise: float) -> Array:
 
 def _checked_mixing(names: tuple[str, ...], mixing: Any, faults: list[str]) -> Array:
     """Mixing (k, 6) of channels; errors are appended to ``faults``."""
-    array = np.array(1.0 if mixing is None else mixing, dtype=np.float64)
+    array = numbers("mixing", 1.0 if mixing is None else mixing, COMPONENTS).copy()
     if array.ndim < 2:
         unknown = [name for name in names if name not in COMPONENTS]
         if unknown:
@@ -427,12 +427,12 @@ def _checked_numbers(
 ) -> dict[str, Array]:
     """Values (k,) of all channels by name; errors are appended to ``faults``."""
     usual = np.repeat([FORCE_NOISE, MOMENT_NOISE], 3)
-    numbers = {}
+    checked = {}
     for name in ("noise", "bias", "drift", "resolution", "largest", "gain_error"):
         value = getattr(sensor, name)
         if value is None and mixing.shape == (channels, 6):
             value = np.sqrt(mixing**2 @ usual**2)
-        array = np.asarray(value, dtype=np.float64)
+        array = numbers(name, value, sensor.channels)
         finite = np.isfinite(array) | ((name == "largest") & (array == np.inf))
         if array.shape not in ((), (channels,)):
             faults.append(f"{name} has shape {array.shape}; () or ({channels},) is needed")
@@ -443,8 +443,8 @@ def _checked_numbers(
         elif name != "bias" and (array < 0.0).any():
             faults.append(f"{name} is {array.tolist()}; it must not be negative")
         else:
-            numbers[name] = np.broadcast_to(array, (channels,))
-    return numbers
+            checked[name] = np.broadcast_to(array, (channels,))
+    return checked
 
 
 def _first_fault(time: Array) -> str:
@@ -501,7 +501,7 @@ def _checked_covariance(value: Any, channels: int) -> tuple[Array, list[str]]:
     shape = (channels, 7, 7)
     if value is None:
         return np.zeros(shape), []
-    covariance = np.asarray(value, dtype=np.float64)
+    covariance = numbers("mixing_covariance", value)
     if covariance.shape != shape or not np.isfinite(covariance).all():
         return covariance, [
             f"mixing_covariance has shape {covariance.shape}; finite {shape} is needed"

@@ -117,7 +117,7 @@ class SuspendedWhisker:
             object.__setattr__(self, "drift", np.full(k, np.sum(self.drift)))
         shapes = {"pivot": (3,), "readout": (k, len(FEATURES)), "noise": (k,), "drift": (k,)}
         for name, shape in shapes.items():
-            value = np.asarray(getattr(self, name), dtype=np.float64)
+            value = numbers(name, getattr(self, name))
             if value.shape != shape or not np.isfinite(value).all():
                 raise ValueError(f"{name} has shape {value.shape}; finite {shape} is needed")
             object.__setattr__(self, name, value)

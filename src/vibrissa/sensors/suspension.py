@@ -166,7 +166,7 @@ def calibrate_suspension(
             f"points (n, 3) and readings (n, k) are needed; got {p.shape} and {y.shape}"
         )
     names = channels or tuple(f"channel {i + 1}" for i in range(y.shape[1]))
-    zero = np.zeros(y.shape[1]) if rest is None else np.asarray(rest, dtype=np.float64)
+    zero = np.zeros(y.shape[1]) if rest is None else numbers("rest", rest)
     if len(names) != y.shape[1] or zero.shape != (y.shape[1],):
         raise ValueError(f"{y.shape[1]} channels have names {names} and rest {zero.tolist()}")
     known = np.isfinite(p).all(axis=1) & np.isfinite(y).all(axis=1)

@@ -127,7 +127,7 @@ def follow_sweep(
             f"got {y.shape}, {base.shape} and {turn.shape}"
         )
     turn = np.broadcast_to(turn, (len(y), 3, 3))
-    change = y - (y[0] if rest is None else np.asarray(rest, dtype=np.float64))
+    change = y - (y[0] if rest is None else numbers("rest", rest))
     touching = (np.abs(change) > threshold * sensor.uncertainty).any(axis=1)
     n = len(y)
     out = SweptContacts(

@@ -28,9 +28,10 @@ wrenches. An error of mass or stiffness scales all frequencies by one factor and
 error of phase; the factor is chosen by maximum likelihood over all frames, in steps of 10 %.
 
 In contact the change of the wrench from frame to frame has a heavy-tailed (Student) distribution,
-whose width is given by the noise and the previous change. A contact begins with a change well above
-the noise; without a change an onset is improbable, because otherwise a vibration just before an
-onset, which a wrong mass explains badly, would count as contact too. All likelihoods are those of
+whose width is given by the noise and the previous change. A contact begins with a deviation from
+what the free whisker is predicted to do, which also has a Student distribution, wider than that of
+a free whisker. It must not be the change since the previous frame: where a vibration turns round,
+changes are small, and frames before an impact would count as contact. All likelihoods are those of
 (F, M_y, M_z).
 """
 
@@ -388,15 +389,14 @@ _STEP, _FREQUENCY, _FARTHEST = 0.1, 0.1, 4
 _TURN = 0.12  # relative error of frequencies: unknown share of a vibration after one radian
 # Relative model error of the vibration across the whisker, and size of the axial force relative to
 # the force across it.
-_MODELLED, _AXIAL = 0.15, 0.4
+_MODELLED, _AXIAL = 0.1, 0.4
 _BEND = 0.2  # additional relative model error if the tip is deflected by the whisker's length
 # Degrees of freedom of the Student distributions of a free whisker and of one in contact.
 _FREEDOM, _FREEDOM_IN_CONTACT = 4.0, 1.0
-# Width of the distribution of changes between frames in contact, and at its onset, in units of the
-# noise; and relative to the previous change.
-_CHANGE, _ONSET, _AS_BEFORE = 1.5, 5.0, 0.6
-# Half the power of the change in the density of an onset; 2 to 5 are equally good.
-_ABRUPT = 2.0
+# Width of the distribution of changes between frames in contact, in units of the noise and relative
+# to the previous change; and that of the first frame in contact, in units of the uncertainty of a
+# free whisker.
+_CHANGE, _AS_BEFORE, _ONSET = 1.5, 0.6, 3.0
 # Standard deviation of modal amplitudes at a release: smallest value, in units of the noise, and
 # relative to the moment, to which all modes contribute with unknown phases.
 _START, _RELEASED = 5.0, 0.35
@@ -496,8 +496,11 @@ class _Free(NamedTuple):
             np.append(self.weight, weight),
         )
 
-    def observed(self, model: _Model, measured: Array, air: Array) -> tuple[_Free, Array]:
-        """Update the hypotheses by one measurement (5,); also return its log likelihoods (n,)."""
+    def observed(self, model: _Model, measured: Array, air: Array) -> tuple[_Free, Array, Array]:
+        """Update the hypotheses by one measurement (5,).
+
+        Also return its log likelihoods (n,) if the whisker is free, and if a contact begins.
+        """
         slopes = np.column_stack([model.wrench, air])
         spread = slopes @ self.covariance @ slopes.T + model.correlation
         vibration = self.covariance[:, :-1, :-1]
@@ -514,7 +517,8 @@ class _Free(NamedTuple):
         solved = np.linalg.solve(spread, away[..., None])
         gain = np.swapaxes(np.linalg.solve(spread, slopes @ self.covariance), 1, 2)
         far = (away[:, None] @ solved)[:, 0, 0]
-        found = _student(far, _FREEDOM) - 0.5 * np.linalg.slogdet(spread)[1]
+        size = 0.5 * np.linalg.slogdet(spread)[1]
+        found = _student(far, _FREEDOM) - size
         return (
             self._replace(
                 state=self.state + (gain @ away[..., None])[..., 0],
@@ -522,6 +526,7 @@ class _Free(NamedTuple):
                 weight=self.weight + found,
             ),
             found,
+            _student(far / _ONSET**2, _FREEDOM_IN_CONTACT) - len(_CHANNELS) * np.log(_ONSET) - size,
         )
 
 
@@ -533,25 +538,15 @@ def _student(square: Array, freedom: float) -> Array:
     return np.asarray(constant - 0.5 * (freedom + n) * np.log1p(square / freedom))
 
 
-def _touching(measured: Array, correlation: Array) -> tuple[Array, Array]:
-    """Log likelihoods (n,) of frames in contact, and of frames in which contact begins."""
+def _touching(measured: Array, correlation: Array) -> Array:
+    """Log likelihoods (n,) of frames in contact."""
     n = len(_CHANNELS)
     change = np.diff(measured, axis=0, prepend=measured[:1])
     square = (change * np.linalg.solve(correlation, change.T).T).sum(axis=1)
     before = _AS_BEFORE**2 * np.append(square[:1], square[:-1]) / n
-    constant = 0.5 * np.linalg.slogdet(correlation)[1]
-    out = []
-    for least in (_CHANGE, _ONSET):
-        width = least**2 + before
-        found = _student(square / width, _FREEDOM_IN_CONTACT) - constant
-        out.append(found - 0.5 * n * np.log(width))
-    # The share of a Student variable's square that is not its scale's has a beta distribution;
-    # its power, over the mean of that, takes small changes away and leaves a density.
-    ratio = square / width / _FREEDOM_IN_CONTACT
-    share = _ABRUPT * np.log(np.maximum(ratio / (1.0 + ratio), np.finfo(np.float64).tiny))
-    share -= special.betaln(0.5 * n + _ABRUPT, 0.5 * _FREEDOM_IN_CONTACT)
-    share += special.betaln(0.5 * n, 0.5 * _FREEDOM_IN_CONTACT)
-    return out[0], out[1] + share
+    width = _CHANGE**2 + before
+    found = _student(square / width, _FREEDOM_IN_CONTACT) - 0.5 * n * np.log(width)
+    return np.asarray(found - 0.5 * np.linalg.slogdet(correlation)[1])
 
 
 def contact_probability(modes: Modes, step: float, left: Array, air: Array, noise: Array) -> Array:
@@ -584,7 +579,7 @@ def _switching(
     """Log likelihood of all frames, and the probability (n,) of contact in each."""
     model = _Model.of(modes, step, noise, np.abs(left).max(axis=0))
     measured, driven = (part[:, _CHANNELS] / model.noise for part in (left, air))
-    contact, onset = _touching(measured, model.correlation)
+    contact = _touching(measured, model.correlation)
     size = np.linalg.norm(measured[:, _MOMENTS], axis=1)
     rate = min(_RATE * step, 0.5)
     switch, stay = np.log(rate), np.log1p(-rate)
@@ -594,26 +589,27 @@ def _switching(
     last = np.log(0.5)
     free = free.with_release(-1, size[0], last)
     for frame, (now, driven_now) in enumerate(zip(measured, driven, strict=True)):
-        starting = special.logsumexp(free.weight) + switch + onset[frame]
-        forward[frame] = np.logaddexp(last + stay + contact[frame], starting)
-        free = free.predicted(model)._replace(weight=free.weight + stay)
+        before = free.weight
+        free = free.predicted(model)._replace(weight=before + stay)
         free = free.with_release(frame, size[frame], last + switch)
-        free, found = free.observed(model, now, driven_now)
+        free, found, onset = free.observed(model, now, driven_now)
+        begins = switch + onset[:-1]
+        starting = special.logsumexp(before + begins)
+        forward[frame] = np.logaddexp(last + stay + contact[frame], starting)
         best = max(forward[frame], free.weight.max())
         some = np.argsort(free.weight)[-_MOST:]
         some = np.sort(some[free.weight[some] > best - _LOST])
         free, last = free.kept(some), forward[frame]
-        history.append((free.since, found[some], free.weight))
-    whole = special.logsumexp(np.append(history[-1][2], last))
+        history.append((free.since, found[some], begins, free.weight))
+    whole = special.logsumexp(np.append(history[-1][-1], last))
     later, ahead = 0.0, np.zeros(len(history[-1][0]))
     log = forward - whole
     for frame in range(len(left) - 2, -1, -1):
-        since, found, _ = history[frame + 1]
+        since, found, begins, _ = history[frame + 1]
         goes_on = dict(zip(since.tolist(), found + ahead, strict=True))
         released = switch + goes_on.get(frame + 1, -np.inf)
-        touched = switch + onset[frame + 1] + later
         still = [stay + goes_on.get(one, -np.inf) for one in history[frame][0].tolist()]
-        ahead = np.logaddexp(still, touched)
+        ahead = np.logaddexp(still, begins + later)
         later = np.logaddexp(stay + contact[frame + 1] + later, released)
         log[frame] += later
     return float(whole), np.asarray(np.exp(np.minimum(log, 0.0)))

@@ -502,6 +502,21 @@ def test_the_rest_shape_ignores_where_hairs_let_a_trace_begin():
     np.testing.assert_array_equal(rest_shape(curves).free, ~touched)
 
 
+def test_a_whisker_that_rests_for_long_and_then_whisks_is_not_touched():
+    """Errors of traces repeat while it rests; as it moves, they differ from frame to frame."""
+    rng, s, rest = np.random.default_rng(3), np.linspace(0.0, 20e-3, 101), np.arange(150) < 100
+    touched = (np.arange(150) >= 120) & (np.arange(150) < 135)
+    bent = 8.0 + 2.0 * touched
+    shapes = np.stack(np.broadcast_arrays(s, bent[:, None] * s**2, 0.0), axis=-1)
+    azimuth = np.where(rest, 0.0, 0.5 * np.sin(np.linspace(-4.0 * np.pi, 2.0 * np.pi, 150)))
+    held = base_rotation(azimuth, np.zeros(150), np.zeros(150))
+    size = np.where(rest, 0.7e-6, 2.5e-6)[:, None, None]
+    waves = np.cos(np.pi * np.outer(s / 20e-3, np.arange(4)))
+    noise = size * np.einsum("nk,tki->tni", waves, rng.normal(size=(150, 4, 3)))
+    curves = np.einsum("tij,tnj->tni", held, shapes) + noise
+    np.testing.assert_array_equal(rest_shape(curves).free, ~touched)
+
+
 def test_ringing_does_not_roll_the_base():
     # A curved whisker that whisks, and rings across its plane after each of four releases.
     rng, time, s = np.random.default_rng(4), np.arange(600) / 1000.0, np.linspace(0.0, 0.04, 81)

@@ -149,12 +149,15 @@ def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> R
     # The first frame may show less of the length than is compared now.
     mean = shapes[first, :compared] if whole[first] else part[near][0]
     deviation = np.full(len(shapes), np.inf)
+    # Over the way of the whisker rather than over time: while it rests its traces have the same
+    # errors in all frames, and hardly deviate.
+    way = _pace(part)
     for _ in range(_ROUNDS):
         mean = np.median(_onto(part[near], mean), axis=0)
         deviation[whole] = _deviations(part, mean)
-        usual = float(np.median(deviation[whole][near]))
+        usual = _weighted_median(deviation[whole][near], way[near])
         near = deviation[whole] < max(_NEAR * usual, 1e-9)
-    within = _NEAR * float(np.median(deviation[whole][near]))
+    within = _NEAR * _weighted_median(deviation[whole][near], way[near])
     quiet, ringing = near, None
     # A ringing whisker also looks as if it began elsewhere.
     rings = _deviations(part, mean, slides=0.0)
@@ -347,6 +350,8 @@ def _largest_group(shapes: Array, least: float) -> tuple[int, Mask]:
     away += over * chords[0].size * (2.0 * np.minimum(depth[:, None], depth)) ** 2
     distance = np.sqrt(np.maximum(away, 0.0))
     pace = _pace(shapes)
+    usual = float(np.median(pace))
+    pace = np.minimum(pace / usual, 1.0) if usual else np.ones(len(pace))
     order = np.argsort(distance, axis=1)
     rank = np.argmax(np.cumsum(pace[order], axis=1) >= least * pace.sum(), axis=1)
     nearest = np.take_along_axis(distance, order, axis=1)
@@ -357,12 +362,17 @@ def _largest_group(shapes: Array, least: float) -> tuple[int, Mask]:
 
 
 def _pace(shapes: Array) -> Array:
-    """Angular speed of the base in each frame relative to the usual one, at most 1."""
+    """Angular speed of the base in each frame, rad a frame."""
     ahead = shapes[:, shapes.shape[1] // _BASE] - shapes[:, 0]
     ahead = ahead / np.linalg.norm(ahead, axis=1, keepdims=True)
-    pace = np.linalg.norm(np.gradient(ahead, axis=0), axis=1)
-    usual = float(np.median(pace))
-    return np.minimum(pace / usual, 1.0) if usual else np.ones(len(pace))
+    return np.asarray(np.linalg.norm(np.gradient(ahead, axis=0), axis=1))
+
+
+def _weighted_median(values: Array, weight: Array) -> float:
+    """Median of values, each of which counts by its weight; all alike if they have none."""
+    order = np.argsort(values)
+    total = np.cumsum(weight[order] if weight.any() else np.ones(len(values)))
+    return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
 
 
 def motions(shapes: Array, target: Array) -> tuple[Array, Array]:

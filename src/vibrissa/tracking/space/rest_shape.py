@@ -62,6 +62,7 @@ _SMOOTH = 4.0
 _SLIDES, _TINY = 0.02, 1e-30
 # Roll about the whisker's chord from which a rigid motion is not one that an animal makes.
 _OVER = np.deg2rad(120.0)
+_RESTS = 0.25  # share of the root mean square speed of the base below which a whisker rests
 _BASE = 6  # number of parts of a shape of which the first shows the direction of its base
 _ROUNDS = 4  # number of rounds in which the free frames are selected
 # Step and smallest value of the seen share of a length that are tried, and number of those between
@@ -74,7 +75,7 @@ _UNSEEN = 0.5
 _CERTAIN = 0.025
 # The same of the taper of a whisker whose tip is seen; and the step in which tapers are tried and
 # the largest, as shares of the length by which it would have to be longer to be as thick.
-_BENDS, _TAPERS, _STOUTEST = 0.009, 0.03, 0.12
+_BENDS, _TAPERS, _STOUTEST = 0.014, 0.03, 0.12
 # Largest difference of costs of a probable length: three standard deviations.
 _HARDLY = 9.0
 _STATED = 0.01  # standard deviation of a stated length, as a share: fur hides the base
@@ -149,15 +150,15 @@ def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> R
     # The first frame may show less of the length than is compared now.
     mean = shapes[first, :compared] if whole[first] else part[near][0]
     deviation = np.full(len(shapes), np.inf)
-    # Over the way of the whisker rather than over time: while it rests its traces have the same
-    # errors in all frames, and hardly deviate.
-    way = _pace(part)
+    # While it rests, its traces have the same errors in all frames, and hardly deviate.
+    pace = _pace(part)
+    moves = np.minimum(pace, _RESTS * np.sqrt(np.mean(pace**2)))
     for _ in range(_ROUNDS):
         mean = np.median(_onto(part[near], mean), axis=0)
         deviation[whole] = _deviations(part, mean)
-        usual = _weighted_median(deviation[whole][near], way[near])
+        usual = _weighted_median(deviation[whole][near], moves[near])
         near = deviation[whole] < max(_NEAR * usual, 1e-9)
-    within = _NEAR * _weighted_median(deviation[whole][near], way[near])
+    within = _NEAR * _weighted_median(deviation[whole][near], moves[near])
     quiet, ringing = near, None
     # A ringing whisker also looks as if it began elsewhere.
     rings = _deviations(part, mean, slides=0.0)

@@ -205,11 +205,13 @@ def _tip(along: Measured, darkness: float = _TAPERED, least: float = 0.0) -> int
 
 
 def _connected(seen: Mask) -> int:
-    """Number of points of a line before a long hidden part beyond which hardly any is seen."""
+    """Number of points of a line before a long hidden part, unless there is a line beyond it."""
     at = np.flatnonzero(seen)
-    far = np.flatnonzero(np.diff(at) > _ASTRAY)
-    far = far[len(at) - 1 - far < FEWEST]
-    return int(at[far[0]]) + 1 if far.size else len(seen)
+    for before in at[:-1][np.diff(at) > _ASTRAY]:
+        # By chance, or where something casts a soft shadow, every second point may seem seen.
+        if not (np.convolve(seen[before + 1 :], np.ones(FEWEST)) > FEWEST - 0.5).any():
+            return int(before) + 1
+    return len(seen)
 
 
 def _stops(frame: Frame, line: Array, along: Measured, count: int) -> bool:

@@ -374,12 +374,15 @@ def test_a_tip_that_is_not_seen_is_found_by_how_the_whisker_bends(filmed, traces
     What is shown of the last tenth wanders, as where noise is followed.
     """
     cut, generator = [], np.random.default_rng(0)
+    bent = np.flatnonzero(filmed.truth["in_contact"].values[::2] > 0)
     for (whole,) in traces:
         row = []
         for trace in whole[::2]:
             last = np.linspace(-9.0, 1.0, len(trace.line)).clip(0.0)[:, None]
             row.append(trace._replace(line=trace.line + generator.normal(0.0, 3.0, 2) * last**2))
         ends = [int(generator.uniform(0.91, 0.97) * len(trace.line)) for trace in row]
+        # An object hides most of it in one frame of a contact.
+        ends[bent[len(bent) // 2]] //= 5
         cut.append(
             [
                 t._replace(line=t.line[:n], sigma=t.sigma[:n], seen=t.seen[:n], tip_seen=False)
@@ -392,7 +395,7 @@ def test_a_tip_that_is_not_seen_is_found_by_how_the_whisker_bends(filmed, traces
     assert Recording(recording).whisker().length == pytest.approx(true, rel=0.03)
     assert "its tip is too faint" in recording.attrs["remarks"]
     squares = squared_errors(recording, filmed)
-    assert np.median(squares) < 2.366 * 2.0**2
+    assert np.nanmedian(squares) < 2.366 * 2.0**2
 
 
 @pytest.mark.parametrize("stated", [True, pytest.param(False, marks=pytest.mark.slow)])

@@ -67,7 +67,7 @@ _BASE = 6  # number of parts of a shape of which the first shows the direction o
 _ROUNDS = 4  # number of rounds in which the free frames are selected
 # Step and smallest value of the seen share of a length that are tried, and number of those between
 # which costs are interpolated.
-_STEP, _LEAST_SEEN, _FINE = 0.03, 0.34, 600
+_STEP, LEAST_SEEN, _FINE = 0.03, 0.34, 600
 # Usual length of what is not seen, over that of what is.
 _UNSEEN = 0.5
 # Smallest standard deviation of the share of a length that is seen, as bending shows it: errors of
@@ -467,7 +467,7 @@ def likeliest_length(seen: float, cost: Callable[[float], float]) -> Length:
     The seen part of a cone bends by the share of it that is seen: that is estimated.
     """
     shares, costs = [1.0], [cost(seen)]
-    while costs[-1] <= min(costs) + _HARDLY and shares[-1] - _STEP >= _LEAST_SEEN:
+    while costs[-1] <= min(costs) + _HARDLY and shares[-1] - _STEP >= LEAST_SEEN:
         shares.append(shares[-1] - _STEP)
         costs.append(cost(seen / shares[-1]))
     share, shown = _likelihood(shares[::-1], costs[::-1])

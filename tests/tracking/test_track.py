@@ -133,7 +133,7 @@ def test_bending_shows_how_a_whisker_tapers(stated):
     found, length = tapered_as_it_bends(fitter, other, usual, pose)
     tips = np.array([each.radius(true.length) for each in (true, other, found)])
     assert abs(tips[2] - tips[0]) < 0.2 * abs(tips[1] - tips[0])
-    assert length.sigma < 0.3 * usual.sigma
+    assert length.sigma < 0.4 * usual.sigma
     assert found.notes[-1].startswith("radius of the tip: 1")
 
 

@@ -239,7 +239,7 @@ def test_what_is_known_besides_the_videos_is_used(videos, tmp_path):
         (("--region", "0:1,1 2,2"), "at least three corners"),
         (("--pixel-size", "58"), "11.136 m wide; it must be in mm"),
         (("--rate", "0"), "--rate is 0"),
-        (("--rate", "170"), "below half of 170 frames/s"),
+        (("--rate", "170", "--cutoff", "85"), "below half of 170 frames/s"),
         (("--base-radius", "-1"), "--base-radius is -1"),
         (("--rat", "C2", "--base-radius", "0.1"), "--rat gives the radii"),
         (("--rat", "Z9"), "Z9"),

@@ -174,7 +174,7 @@ def test_a_length_of_which_only_the_least_is_known_is_among_the_likely_ones():
 
 def test_a_taper_is_what_bending_and_what_is_usual_show():
     found, sigma = likeliest_taper(0.025, -0.04, lambda share: ((share - 0.05) / 0.004) ** 2)
-    shown = 0.025**2 / (0.025**2 + 0.004**2 + 0.009**2)
+    shown = 0.025**2 / (0.025**2 + 0.004**2 + 0.014**2)
     assert found == pytest.approx(0.05 * shown, rel=0.02)
     assert sigma == pytest.approx(0.025 * np.sqrt(1.0 - shown), rel=0.02)
     # What bending does not show stays as it is usual.

@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from vibrissa.cameras import Camera, orthogonal_views
-from vibrissa.tracking import Trace, low_pass, merge, paired_frames
+from vibrissa.tracking import Trace, low_pass, merge, paired_frames, usual_cutoff
 from vibrissa.tracking.space.curve import begun_together
 from vibrissa.tracking.space.exchange import Known, exchanged
 from vibrissa.tracking.space.pose import base_pose, rolled_over
@@ -166,6 +166,10 @@ def test_the_filter_shifts_nothing_and_stops_what_is_fast():
     assert np.abs(out[50:-50, 1]).max() < 0.01
     lag = np.argmax(np.correlate(out[:, 0], slow, "full")) - 999
     assert lag == 0
+
+
+def test_by_default_a_slow_film_is_not_filtered():
+    assert [usual_cutoff(rate) for rate in (60.0, 170.0, 171.0)] == [None, None, 85.0]
 
 
 def test_the_filter_keeps_gaps():

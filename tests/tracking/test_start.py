@@ -87,6 +87,18 @@ def test_films_without_a_whisker_are_in_doubt(films):
     assert start.doubts
 
 
+def test_a_wall_that_hides_the_tip_from_one_view_is_no_reason_for_doubt(films):
+    film = films(202)
+    line, front = film.curves[1][0], [frame.copy() for frame in film.frames[1]]
+    at = int(line[int(0.45 * len(line)), 0])
+    for frame in front:
+        frame[:, slice(at, None) if line[-1, 0] > at else slice(at)] = 40
+    start = find_start(film.cameras, [film.frames[0], front])
+    assert max(misses(film, start)) < 3.0
+    assert start.agreed == (10, 10)
+    assert not start.doubts
+
+
 def test_views_of_different_whiskers_are_in_doubt(films):
     """Each view shows a whisker, at other columns and in other frames than the other one."""
     one, other = films(200), films(201)

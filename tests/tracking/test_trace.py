@@ -7,6 +7,7 @@ from scipy.ndimage import gaussian_filter
 from vibrissa.status import Status
 from vibrissa.tracking import Trace, TraceOptions, find_whiskers, trace_video
 from vibrissa.tracking.trace import ridge
+from vibrissa.tracking.trace.clutter import Clutter
 from vibrissa.tracking.trace.curves import find_curves
 from vibrissa.tracking.trace.ends import traced
 from vibrissa.tracking.trace.scene import Scene
@@ -250,6 +251,20 @@ def test_a_trace_with_a_hook_is_in_doubt():
     straight = given(np.stack([s, 0.002 * s**2], axis=1))
     assert doubtful_frames([hooked, *[straight] * 9]).tolist() == [True] + 9 * [False]
     assert not doubtful_frames([hooked, *[straight] * 30]).any()
+
+
+@pytest.mark.parametrize(("dash", "end"), [(8, 100.0), (40, 210.0)])
+def test_a_speck_far_behind_an_object_is_not_the_whisker(dash, end):
+    """What hides it for long may hide where it ends; a line behind that is its other part."""
+    frame = np.full((80, 260), 180.0)
+    frame[40, 20:100] = frame[40, 170 : 170 + dash] = 60.0
+    rng = np.random.default_rng(0)
+    frame = gaussian_filter(frame, 1.0) + rng.normal(0.0, 2.0, frame.shape)
+    bits = np.zeros(frame.shape, np.uint32)
+    bits[:, 100:170] = 1
+    guess = np.stack([np.arange(20.0, 230.0, 2.0), np.full(105, 40.0)], axis=1)
+    trace, _ = traced(frame.astype(np.uint8), 2.0, guess, TraceOptions(), clutter=Clutter(bits, 1))
+    assert trace.line[-1, 0] == pytest.approx(end, abs=5.0)
 
 
 def test_a_whisker_that_rests_is_not_divided_out():

@@ -133,7 +133,7 @@ def test_bending_shows_how_a_whisker_tapers(stated):
     found, length = tapered_as_it_bends(fitter, other, usual, pose)
     tips = np.array([each.radius(true.length) for each in (true, other, found)])
     assert abs(tips[2] - tips[0]) < 0.2 * abs(tips[1] - tips[0])
-    assert length.sigma < 0.3 * usual.sigma
+    assert length.sigma < 0.4 * usual.sigma
     assert found.notes[-1].startswith("radius of the tip: 1")
 
 
@@ -374,12 +374,15 @@ def test_a_tip_that_is_not_seen_is_found_by_how_the_whisker_bends(filmed, traces
     What is shown of the last tenth wanders, as where noise is followed.
     """
     cut, generator = [], np.random.default_rng(0)
+    bent = np.flatnonzero(filmed.truth["in_contact"].values[::2] > 0)
     for (whole,) in traces:
         row = []
         for trace in whole[::2]:
             last = np.linspace(-9.0, 1.0, len(trace.line)).clip(0.0)[:, None]
             row.append(trace._replace(line=trace.line + generator.normal(0.0, 3.0, 2) * last**2))
         ends = [int(generator.uniform(0.91, 0.97) * len(trace.line)) for trace in row]
+        # An object hides most of it in one frame of a contact.
+        ends[bent[len(bent) // 2]] //= 5
         cut.append(
             [
                 t._replace(line=t.line[:n], sigma=t.sigma[:n], seen=t.seen[:n], tip_seen=False)
@@ -392,7 +395,7 @@ def test_a_tip_that_is_not_seen_is_found_by_how_the_whisker_bends(filmed, traces
     assert Recording(recording).whisker().length == pytest.approx(true, rel=0.03)
     assert "its tip is too faint" in recording.attrs["remarks"]
     squares = squared_errors(recording, filmed)
-    assert np.median(squares) < 2.366 * 2.0**2
+    assert np.nanmedian(squares) < 2.366 * 2.0**2
 
 
 @pytest.mark.parametrize("stated", [True, pytest.param(False, marks=pytest.mark.slow)])
@@ -499,6 +502,21 @@ def test_the_rest_shape_ignores_where_hairs_let_a_trace_begin():
     shapes = np.stack([x, 600.0 * x**3 + 2.0 * touched[:, None] * x**2, 0.0 * x], axis=-1)
     held = base_rotation(0.8 * np.sin(np.linspace(0.0, np.pi, 90)), np.zeros(90), np.zeros(90))
     curves = np.einsum("tij,tnj->tni", held, shapes) + rng.normal(0.0, 2e-6, shapes.shape)
+    np.testing.assert_array_equal(rest_shape(curves).free, ~touched)
+
+
+def test_a_whisker_that_rests_for_long_and_then_whisks_is_not_touched():
+    """Errors of traces repeat while it rests; as it moves, they differ from frame to frame."""
+    rng, s, rest = np.random.default_rng(3), np.linspace(0.0, 20e-3, 101), np.arange(150) < 100
+    touched = (np.arange(150) >= 120) & (np.arange(150) < 135)
+    bent = 8.0 + 2.0 * touched
+    shapes = np.stack(np.broadcast_arrays(s, bent[:, None] * s**2, 0.0), axis=-1)
+    azimuth = np.where(rest, 0.0, 0.5 * np.sin(np.linspace(-4.0 * np.pi, 2.0 * np.pi, 150)))
+    held = base_rotation(azimuth, np.zeros(150), np.zeros(150))
+    size = np.where(rest, 0.7e-6, 2.5e-6)[:, None, None]
+    waves = np.cos(np.pi * np.outer(s / 20e-3, np.arange(4)))
+    noise = size * np.einsum("nk,tki->tni", waves, rng.normal(size=(150, 4, 3)))
+    curves = np.einsum("tij,tnj->tni", held, shapes) + noise
     np.testing.assert_array_equal(rest_shape(curves).free, ~touched)
 
 

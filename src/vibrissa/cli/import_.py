@@ -57,8 +57,10 @@ def import_tracks(
     )
     for note in traces.notes:
         remark(f"note: {note}")
+    # Twelve digits remove the rounding errors of differences of times.
+    per_second = float(f"{1.0 / float(np.median(np.diff(found['time'].values))):.12g}")
     how = vb.tracking.TrackOptions(
-        cutoff=vb.tracking.CUTOFF if cutoff is None else cutoff or None,
+        cutoff=vb.tracking.usual_cutoff(per_second) if cutoff is None else cutoff or None,
         **own.tracked(base_radius, tip_radius),
     )
     known: dict[str, Any] = {} if objects is None else {"objects": objects_from(objects)}
@@ -66,8 +68,7 @@ def import_tracks(
         result = vb.tracking.track(
             traces.cameras,
             traces.traces,
-            # Twelve digits remove the rounding errors of differences of times.
-            float(f"{1.0 / float(np.median(np.diff(found['time'].values))):.12g}"),
+            per_second,
             how,
             names=traces.names,
             progress=tell,

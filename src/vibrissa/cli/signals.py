@@ -25,6 +25,13 @@ from vibrissa.cli.terminal import progress_bars, remark, say, shown
 from vibrissa.deferred import xr
 
 
+def _usual_cutoff(recording: xr.DataTree) -> float | None:
+    """Cut-off that a recording is filtered with by default, Hz."""
+    time = recording.to_dataset()["time"].values
+    rate = 1.0 / float(np.median(np.diff(time))) if len(time) > 1 else np.inf
+    return vb.tracking.usual_cutoff(rate)
+
+
 @dataclass(frozen=True)
 class SourceOptions:
     """Options for the source of the signals."""
@@ -89,7 +96,7 @@ class SourceOptions:
             return {"source": source, "whiskers": whiskers, "dynamics": self.dynamics}
         return {
             "source": source,
-            "cutoff": vb.tracking.CUTOFF if self.cutoff is None else self.cutoff or None,
+            "cutoff": _usual_cutoff(recording) if self.cutoff is None else self.cutoff or None,
             "whiskers": own.in_recording(recording),
             "proximal": smallest_arc(proximal),
             "dynamics": self.dynamics,

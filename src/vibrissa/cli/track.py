@@ -33,7 +33,7 @@ _FINEST = 3.0  # width of a whisker's base in the images for which tracing is tu
 _POOR = 2.0
 _VIEW = re.compile(r"\d+,\d+,\d+,\d+(:[a-z]+)*")  # part of the images of a video
 _NEAREST, _FARTHEST = 0.03, 30.0  # smallest and largest distance of a lens, m
-_RATE, _CUTOFF = 1000.0, 85.0
+_RATE = 1000.0
 
 _LONGEST = 500.0  # longest whisker, mm
 _LONGEST_FUR = 20.0  # longest part of a whisker that fur hides, mm
@@ -304,11 +304,9 @@ def track(
     if clicks and clicks.pixel_size and filmed.cameras is None and filmed.pixel_size is None:
         views = replace(filmed, pixel_size=1e3 * clicks.pixel_size).seen_by(videos)
     rate = filmed.frames_per_second
-    low_pass = _CUTOFF if cutoff is None else cutoff
-    if not 0.0 <= low_pass < 0.5 * rate:
+    if cutoff is not None and not 0.0 <= cutoff < 0.5 * rate:
         raise ValueError(
-            f"--cutoff is {low_pass:g} Hz; it must be below half of {rate:g} frames/s, or 0 for "
-            "none"
+            f"--cutoff is {cutoff:g} Hz; it must be below half of {rate:g} frames/s, or 0 for none"
         )
     if not fur <= _LONGEST_FUR:
         raise ValueError(f"--fur is {fur:g} mm; 0 to {_LONGEST_FUR:g} mm are allowed")
@@ -318,7 +316,7 @@ def track(
         refuse({"--fur": fur or None}, "the --whisker begins where it is seen: cut it there")
         refuse({"--length": length}, "the --whisker has a length")
     how = vb.tracking.TrackOptions(
-        cutoff=low_pass or None,
+        cutoff=vb.tracking.usual_cutoff(rate) if cutoff is None else cutoff or None,
         offset=None if filmed.offset == "auto" else int(filmed.offset),
         rough=filmed.cameras is None and filmed.distance != math.inf,
         distance=filmed.distance,

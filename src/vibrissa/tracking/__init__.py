@@ -16,6 +16,7 @@ from vibrissa.tracking.space.pose import (
     base_pose,
     low_pass as low_pass,
     pieces as pieces,
+    usual_cutoff as usual_cutoff,
 )
 from vibrissa.tracking.space.rest_shape import (
     RestShape as RestShape,

@@ -33,6 +33,7 @@ _FUR_KNOWN = 0.25  # relative standard deviation of a stated length of fur
 _NEAR = 2.0  # unusual distance between the bases of several views, pixels
 # Slow motion of a camera above which there is a remark, pixels, and as a share of its shaking.
 _SLOW, _MOSTLY = 0.25, 0.8
+_BEYOND = 0.05  # share of the length beyond what is seen from which a contact is not seen
 _FEWEST = 8  # smallest number of frames to decide whether a whisker leaves the plane
 
 
@@ -124,11 +125,12 @@ def remarks_on(
 
 
 def remarks_on_unseen_contacts(one: Tracked, name: str) -> list[str]:
-    """Report contacts beyond what is seen of a whisker whose tip is not seen."""
+    """Report contacts beyond what is seen of a whisker, as behind an object or off the image."""
     arcs = one.fit.arc_length
     shown = np.linalg.norm(np.diff(one.curves, axis=1), axis=2).sum(axis=1)
-    count, unseen = int(np.isfinite(arcs).sum()), int((arcs > shown).sum())
-    if not np.isfinite(one.length.shown) or not unseen:
+    far = _BEYOND * one.length.value
+    count, unseen = int(np.isfinite(arcs).sum()), int((arcs > shown + far).sum())
+    if not unseen:
         return []
     remedy = "" if one.length.seen else ", or give its length (--length)"
     return [

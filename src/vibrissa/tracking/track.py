@@ -49,6 +49,7 @@ from vibrissa.tracking.space.exchange import Known, exchanged
 from vibrissa.tracking.space.frame_pairs import paired_frames
 from vibrissa.tracking.space.pose import CUTOFF, BasePose, HeadPose, base_pose, rolled_over
 from vibrissa.tracking.space.rest_shape import (
+    LEAST_SEEN,
     Length,
     RestShape,
     known_rest,
@@ -566,7 +567,11 @@ def tapered_as_it_bends(
 
 def _length(fitter: Fitter, shape: RestShape, options: TrackOptions) -> Length:
     """Length of a whisker with an unseen tip, from some of the frames in contact."""
-    some = _in_contact(fitter)
+    # All lengths are compared by the same frames: short traces have no pose for the longest.
+    longest = lengthened(shape, shape.length / LEAST_SEEN)
+    pose = _poses(fitter, longest, whisker_at_rest(longest, **options.at_base), options)[1]
+    posed = np.isfinite(pose.rotation).all(axis=(1, 2))
+    some = _in_contact(replace(fitter, touching=fitter.touching & posed))
     if some is None:
         # Few bent frames do not show it, so that it is only known what is usual.
         touched = bool(fitter.touching.any())

@@ -37,6 +37,11 @@ _ROLLED, _UNUSUAL, _MEDIAN, _ROUNDS = np.deg2rad(15.0), 5.0, 0.6745, 4
 _SLOW = 7  # number of free frames whose median shows slow changes of the roll
 
 
+def usual_cutoff(rate: float) -> float | None:
+    """Default cut-off at a frame rate, Hz; None if there is nothing above it to be removed."""
+    return CUTOFF if 0.5 * rate > CUTOFF else None
+
+
 def low_pass(values: ArrayLike, rate: ArrayLike, cutoff: float | None = CUTOFF) -> Array:
     """Filter a signal forward and backward, without phase shift.
 

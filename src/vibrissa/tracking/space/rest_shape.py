@@ -62,11 +62,12 @@ _SMOOTH = 4.0
 _SLIDES, _TINY = 0.02, 1e-30
 # Roll about the whisker's chord from which a rigid motion is not one that an animal makes.
 _OVER = np.deg2rad(120.0)
+_RESTS = 0.25  # share of the root mean square speed of the base below which a whisker rests
 _BASE = 6  # number of parts of a shape of which the first shows the direction of its base
 _ROUNDS = 4  # number of rounds in which the free frames are selected
 # Step and smallest value of the seen share of a length that are tried, and number of those between
 # which costs are interpolated.
-_STEP, _LEAST_SEEN, _FINE = 0.03, 0.34, 600
+_STEP, LEAST_SEEN, _FINE = 0.03, 0.34, 600
 # Usual length of what is not seen, over that of what is.
 _UNSEEN = 0.5
 # Smallest standard deviation of the share of a length that is seen, as bending shows it: errors of
@@ -74,7 +75,7 @@ _UNSEEN = 0.5
 _CERTAIN = 0.025
 # The same of the taper of a whisker whose tip is seen; and the step in which tapers are tried and
 # the largest, as shares of the length by which it would have to be longer to be as thick.
-_BENDS, _TAPERS, _STOUTEST = 0.009, 0.03, 0.12
+_BENDS, _TAPERS, _STOUTEST = 0.014, 0.03, 0.12
 # Largest difference of costs of a probable length: three standard deviations.
 _HARDLY = 9.0
 _STATED = 0.01  # standard deviation of a stated length, as a share: fur hides the base
@@ -149,12 +150,15 @@ def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> R
     # The first frame may show less of the length than is compared now.
     mean = shapes[first, :compared] if whole[first] else part[near][0]
     deviation = np.full(len(shapes), np.inf)
+    # While it rests, its traces have the same errors in all frames, and hardly deviate.
+    pace = _pace(part)
+    moves = np.minimum(pace, _RESTS * np.sqrt(np.mean(pace**2)))
     for _ in range(_ROUNDS):
         mean = np.median(_onto(part[near], mean), axis=0)
         deviation[whole] = _deviations(part, mean)
-        usual = float(np.median(deviation[whole][near]))
+        usual = _weighted_median(deviation[whole][near], moves[near])
         near = deviation[whole] < max(_NEAR * usual, 1e-9)
-    within = _NEAR * float(np.median(deviation[whole][near]))
+    within = _NEAR * _weighted_median(deviation[whole][near], moves[near])
     quiet, ringing = near, None
     # A ringing whisker also looks as if it began elsewhere.
     rings = _deviations(part, mean, slides=0.0)
@@ -347,6 +351,8 @@ def _largest_group(shapes: Array, least: float) -> tuple[int, Mask]:
     away += over * chords[0].size * (2.0 * np.minimum(depth[:, None], depth)) ** 2
     distance = np.sqrt(np.maximum(away, 0.0))
     pace = _pace(shapes)
+    usual = float(np.median(pace))
+    pace = np.minimum(pace / usual, 1.0) if usual else np.ones(len(pace))
     order = np.argsort(distance, axis=1)
     rank = np.argmax(np.cumsum(pace[order], axis=1) >= least * pace.sum(), axis=1)
     nearest = np.take_along_axis(distance, order, axis=1)
@@ -357,12 +363,17 @@ def _largest_group(shapes: Array, least: float) -> tuple[int, Mask]:
 
 
 def _pace(shapes: Array) -> Array:
-    """Angular speed of the base in each frame relative to the usual one, at most 1."""
+    """Angular speed of the base in each frame, rad a frame."""
     ahead = shapes[:, shapes.shape[1] // _BASE] - shapes[:, 0]
     ahead = ahead / np.linalg.norm(ahead, axis=1, keepdims=True)
-    pace = np.linalg.norm(np.gradient(ahead, axis=0), axis=1)
-    usual = float(np.median(pace))
-    return np.minimum(pace / usual, 1.0) if usual else np.ones(len(pace))
+    return np.asarray(np.linalg.norm(np.gradient(ahead, axis=0), axis=1))
+
+
+def _weighted_median(values: Array, weight: Array) -> float:
+    """Median of values, each of which counts by its weight; all alike if they have none."""
+    order = np.argsort(values)
+    total = np.cumsum(weight[order] if weight.any() else np.ones(len(values)))
+    return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
 
 
 def motions(shapes: Array, target: Array) -> tuple[Array, Array]:
@@ -456,7 +467,7 @@ def likeliest_length(seen: float, cost: Callable[[float], float]) -> Length:
     The seen part of a cone bends by the share of it that is seen: that is estimated.
     """
     shares, costs = [1.0], [cost(seen)]
-    while costs[-1] <= min(costs) + _HARDLY and shares[-1] - _STEP >= _LEAST_SEEN:
+    while costs[-1] <= min(costs) + _HARDLY and shares[-1] - _STEP >= LEAST_SEEN:
         shares.append(shares[-1] - _STEP)
         costs.append(cost(seen / shares[-1]))
     share, shown = _likelihood(shares[::-1], costs[::-1])

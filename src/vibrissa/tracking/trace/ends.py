@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 
 from vibrissa.io import Frame
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, Mask
 from vibrissa.tracking.trace.clutter import NOTHING, Clutter
 from vibrissa.tracking.trace.ridge import (
     DEPTH_VARIANCE,
@@ -48,6 +48,9 @@ _STREAKS = 40  # number of points of a line's beginning next to which fur may lo
 # Darkness of a whisker relative to the twenty points before it, at least: toward its tip, as it
 # tapers, and toward its base.
 _TAPERED, _EVEN = 0.6, 0.9
+# Number of hidden points from which a line may go on anywhere behind them, by a pixel or more (with
+# the usual stiffness): what follows then belongs to it only if it is a line itself.
+_ASTRAY = 23
 
 
 def traced(
@@ -81,7 +84,7 @@ def traced(
         bare, texture = _above_texture(frame, line, along, options, clutter)
         inward = bare.part(slice(None, None, -1))
         first = len(line) - _tip(inward, _EVEN, _CLEARER * texture)
-    last = _tip(along)
+    last = _connected(along.seen[: _tip(along)])
     if last - first < FEWEST:
         return Trace.lost(), False
     # An image without noise was smoothed, as by compression, which removes faint lines.
@@ -199,6 +202,16 @@ def _tip(along: Measured, darkness: float = _TAPERED, least: float = 0.0) -> int
     usual = np.maximum(usual, least)
     gain = np.where(along.open, (amplitude * usual - 0.5 * usual**2) / sigma**2, 0.0)
     return int(np.argmax(np.cumsum(np.clip(gain, -8.0, 8.0)))) + 1
+
+
+def _connected(seen: Mask) -> int:
+    """Number of points of a line before a long hidden part, unless there is a line beyond it."""
+    at = np.flatnonzero(seen)
+    for before in at[:-1][np.diff(at) > _ASTRAY]:
+        # By chance, or where something casts a soft shadow, every second point may seem seen.
+        if not (np.convolve(seen[before + 1 :], np.ones(FEWEST)) > FEWEST - 0.5).any():
+            return int(before) + 1
+    return len(seen)
 
 
 def _stops(frame: Frame, line: Array, along: Measured, count: int) -> bool:

@@ -36,7 +36,8 @@ FRAMES = 30
 _VOTES = 10  # number of those in which whiskers are searched
 _LINES = 8  # largest number of lines of a view that are combined
 _GAP = 6.0  # standard deviation of bases about their position by the other views, pixels
-# The same of tips, which are cut where they are faint or hidden: as a share of the length.
+# The same of tips, which are cut where they are faint: as a share of the length. Where something
+# hides one they may be anywhere.
 _TIP = 0.15
 # Distance within which tips of one whisker agree where both views show them, pixels, and the
 # smallest share of frames in which they do: less than half, for they may be faint.
@@ -338,28 +339,35 @@ class _Search:
         ends = np.array([[[c.line[0], c.line[-1]] for c in one] for one in every])
         gaps = base_gap(self.cameras, np.moveaxis(ends, 1, 0))
         best = [view[0].score for view in curves]
+        cut = [{id(c): self._cut(view, c) for c in row} for view, row in enumerate(curves)]
         found = []
         for one, bases, (gap, tip_gap) in zip(every, ends[:, :, 0], gaps, strict=True):
             tip = float(tip_gap) / min(curve.length for curve in one)
             worth = float(np.exp(np.mean([np.log(max(c.score, 1e-9)) for c in one])))
-            worth *= np.exp(-0.5 * (gap / _GAP) ** 2) / (1.0 + (tip / _TIP) ** 2)
+            # What cuts a line in one view hides its tip there.
+            hidden = any(known[id(c)] for known, c in zip(cut, one, strict=True))
+            apart = min(tip, _TIP) if hidden else tip
+            worth *= np.exp(-0.5 * (gap / _GAP) ** 2) / (1.0 + (apart / _TIP) ** 2)
             share = min(c.score / most for c, most in zip(one, best, strict=True))
             if worth > 1.0:
                 found.append(_Combination(moment, worth, bases, float(gap), tip, share, one))
         return sorted(found, key=lambda one: -one.worth)
 
     def ends(self, one: _Combination) -> bool:
-        """Whether a line ends freely: nothing static there may cut it."""
-        for view, curve in enumerate(one.curves):
-            if view not in self.still:
-                base, frames = one.bases[view][None], self.frames[view]
-                self.still[view] = self.scenes[view].with_still(base, frames).bits
-            bits, (before, last) = self.still[view], curve.line[[-_LAST, -1]]
-            ahead = np.linspace(0.0, _CUT, 9)[:, None] * (last - before)
-            ahead /= max(float(np.hypot(*(last - before))), 1e-9)
-            if bits is not None and Clutter(bits, 0).disturbs(last + ahead).any():
-                return False
-        return True
+        """Whether a line ends freely in all views."""
+        return not any(self._cut(view, curve) for view, curve in enumerate(one.curves))
+
+    def _cut(self, view: int, curve: Curve) -> bool:
+        """Whether something static, or the image's border, may cut a line."""
+        if view not in self.still:
+            base, frames = curve.line[:1], self.frames[view]
+            self.still[view] = self.scenes[view].with_still(base, frames).bits
+        bits, (before, last) = self.still[view], curve.line[[-_LAST, -1]]
+        ahead = np.linspace(0.0, _CUT, 9)[:, None] * (last - before)
+        ahead = last + ahead / max(float(np.hypot(*(last - before))), 1e-9)
+        size = np.array(self.frames[view][0].shape[::-1]) - 1.0
+        outside = bool(((ahead < 0.0) | (ahead > size)).any())
+        return outside or (bits is not None and bool(Clutter(bits, 0).disturbs(ahead).any()))
 
     def worth(self, moments: Sequence[int]) -> float:
         """Evidence of whiskers in some frames."""

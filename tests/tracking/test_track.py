@@ -23,8 +23,10 @@ from vibrissa.tracking import (
     whisker_at_rest,
 )
 from vibrissa.tracking.refine.least_squares import Smoother
+from vibrissa.tracking.space.exchange import exchanged
 from vibrissa.tracking.space.rest_shape import Length
-from vibrissa.tracking.track import tapered_as_it_bends
+from vibrissa.tracking.trace.trace import STEP
+from vibrissa.tracking.track import known_of, tapered_as_it_bends, track_whisker
 from vibrissa.whisker import angles_of, base_rotation
 
 
@@ -341,6 +343,33 @@ def test_a_whisker_that_cannot_be_tracked_does_not_cost_the_others(
     assert "bad could not be tracked and is left out: " in found.attrs["remarks"]
     with pytest.raises(ValueError, match=r"no whisker could be tracked: .*bad could.*worse could"):
         track(filmed.cameras, [[row, row] for row in bad], 1000.0, names=["bad", "worse"])
+
+
+def test_the_far_end_of_a_bent_whisker_is_given_back(filmed, traces):
+    """In the front view a line crosses the whisker that an object bends, and has its far end."""
+    mine = [list(view[0]) for view in traces]
+    one = track_whisker(filmed.cameras, mine, 1000.0, TrackOptions())
+    most = np.argsort(np.where(one.touching, one.shape.deviation, 0.0))[-3:]
+    known = known_of(filmed.cameras, one, 1000.0, FitOptions())
+    doubtful = known.doubtful | np.isin(np.arange(len(known.doubtful)), most)
+    other = [[t._replace(line=t.line + np.array([20.0, 0.0])) for t in view] for view in mine]
+    rows = [[list(view) for view in mine], other]
+    for i in most:
+        right = mine[1][i]
+        n, half = len(right.line), len(right.line) // 2
+        ahead = right.line[half + 5] - right.line[half - 5]
+        along = np.exp(0.2j) * complex(*ahead / np.hypot(*ahead))
+        steps = STEP * np.arange(-half, n - half)[:, None]
+        crossing = right.line[half] + steps * [along.real, along.imag]
+        for row, (begin, end) in zip(
+            rows, ((right.line, crossing), (crossing, right.line)), strict=True
+        ):
+            line = np.concatenate([begin[:half], end[half:]])
+            row[1][i] = right._replace(line=line)
+    found = exchanged(filmed.cameras, rows, [known._replace(doubtful=doubtful), None])
+    for i in most:
+        np.testing.assert_allclose(found[0][1][i].line, mine[1][i].line, atol=1e-9)
+        assert found[0][0][i] is mine[0][i]
 
 
 @pytest.mark.parametrize("views", [1, 2])

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -216,7 +217,8 @@ def track(
     def tracked(k: int, used: Sequence[Sequence[Trace]]) -> Tracked:
         return track_whisker(cameras, used, rate, options, called[k], progress, moving, objects)
 
-    together, before, changes = _sorted_out(cameras, rows, tracked)
+    known = partial(known_of, cameras, rate=rate, options=options.fit)
+    together, before, changes = _sorted_out(cameras, rows, tracked, known)
     for k, name in enumerate(called):
         remarks += remarks_on_following(cameras, rows[k], name)
         remarks += remarks_on_bases(cameras, rows[k], begun_together(cameras, rows[k]), name)
@@ -259,6 +261,7 @@ def _sorted_out(
     cameras: Sequence[Camera],
     rows: Sequence[Sequence[Sequence[Trace]]],
     tracked: Callable[[int, Sequence[Sequence[Trace]]], Tracked],
+    known_by: Callable[[Tracked], Known],
 ) -> tuple[list[list[list[Trace]]], dict[int, Tracked], dict[int, tuple[int, int]]]:
     """Traces that begin together, exchanged where in doubt; whiskers that keep theirs; changes.
 
@@ -272,7 +275,7 @@ def _sorted_out(
         with suppress(Exception):  # it is tried again, and its fault stated then
             first[k] = tracked(k, row)
         one = first.get(k)
-        known.append(None if one is None else _known(one))
+        known.append(None if one is None else known_by(one))
     found, changes = exchanged(cameras, begun, known), dict[int, tuple[int, int]]()
     for k, (row, new) in enumerate(zip(begun, found, strict=True)):
         points = [np.array([[len(t.line) for t in view] for view in one]) for one in (row, new)]
@@ -293,12 +296,54 @@ def _contradicted(misfit: Array) -> Mask:
     return np.asarray(strange & (strange.sum() < most))
 
 
-def _known(one: Tracked) -> Known:
+def known_of(cameras: Sequence[Camera], one: Tracked, rate: float, options: FitOptions) -> Known:
     """Shape and position of a whisker by the frames that the rod explains as well as usual."""
     misfit, wrong = one.fit.misfit, _contradicted(one.fit.misfit)
     usual = np.nanmedian(misfit) if np.isfinite(misfit).any() else 0.0
     doubtful = ~(misfit <= max(_WELL, _WORSE * usual)) | wrong
-    return Known(one.curves, one.shape.points, doubtful, wrong)
+
+    def bent(frames: Sequence[int], pairs: Sequence[Sequence[Trace]]) -> Array:
+        return _misfits_bent(cameras, one, frames, pairs, rate, options)
+
+    touched = one.touching & ~doubtful
+    return Known(
+        one.curves,
+        one.shape.points,
+        doubtful,
+        wrong,
+        bent if touched.any() else None,
+        max(_WELL, float(np.median(misfit[touched])) if touched.any() else 0.0),
+    )
+
+
+def _misfits_bent(
+    cameras: Sequence[Camera],
+    one: Tracked,
+    frames: Sequence[int],
+    pairs: Sequence[Sequence[Trace]],
+    rate: float,
+    options: FitOptions,
+) -> Array:
+    """Misfits of the bent rod to pairs of traces, each for itself; infinite if they show none."""
+    # A frame without traces between them, so that none continues the one before.
+    apart = [
+        [t for trace in view for t in (trace, Trace.lost())] for view in zip(*pairs, strict=True)
+    ]
+    head = one.head.rows(np.repeat(np.asarray(frames, dtype=np.intp), 2))
+    curves = head.seen_from(
+        np.array([merge(cameras, views).points for views in zip(*apart, strict=True)])
+    )
+    none = np.zeros(len(curves), dtype=bool)
+    shape = replace(
+        one.shape,
+        free=np.concatenate([one.shape.still, none]),
+        deviation=np.concatenate([one.shape.deviation, np.full(len(curves), np.nan)]),
+        ringing=None,
+    )
+    every = np.concatenate([one.head.seen_from(one.curves), curves])
+    pose = base_pose(every, shape, one.whisker).rows(slice(len(one.curves), None))
+    fitter = Fitter(cameras, TraceSeries.of(apart), ~none, curves, rate, options, head)
+    return fitter.misfits(one.whisker, pose)[::2]
 
 
 def _without_contradictions(one: Tracked) -> tuple[Tracked, int]:

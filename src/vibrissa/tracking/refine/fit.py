@@ -152,6 +152,15 @@ class Fitter:
         found = _answer(problem, state, linear, nodes, length)
         return _whole(_in_laboratory(found, problem.head), problem.frames, len(self.curves))
 
+    def misfits(self, whisker: Whisker, pose: BasePose) -> Array:
+        """Misfits of a rod (time,), in stated deviations; infinite where there are no traces."""
+        problem = self._problem(whisker, pose)
+        found = np.full(len(self.curves), np.inf)
+        if len(problem.frames):
+            _, linear = problem.solved()
+            found[problem.frames] = np.where(linear.wild, np.inf, linear.misfit)
+        return found
+
     def costs(self, shown: float) -> Callable[[Whisker, BasePose], float]:
         """Function that compares whiskers by how well they explain the traces.
 

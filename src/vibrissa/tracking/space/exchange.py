@@ -9,7 +9,7 @@ it fits far better than any other pair. Otherwise the whisker is lost in that fr
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import permutations, product
 from typing import NamedTuple
 
@@ -42,6 +42,10 @@ class Known(NamedTuple):
     rest: Array  # (n, 3), equally spaced, m
     doubtful: Mask  # (time,)
     wrong: Mask  # (time,): lost unless an exchange explains the views
+    # Misfits of the bent rod to pairs of traces in some frames, if contact bends it in frames
+    # without doubt, and the misfit that is usual there.
+    bent: Callable[[Sequence[int], Sequence[Sequence[Trace]]], Array] | None = None
+    misfit: float = 0.0
 
 
 def exchanged(
@@ -53,23 +57,29 @@ def exchanged(
     """
     found = [[list(view) for view in row] for row in rows]
     looks = {k: _Look.of(k, known, cameras) for k, one in enumerate(known) if one is not None}
-    for i in range(len(rows[0][0])):
-        free = [k for k, one in enumerate(known) if one is None or one.doubtful[i]]
-        lines = [_lines({k: rows[k][v][i] for k in free}) for v in range(len(cameras))]
-        offers = []
-        for k, look in looks.items():
-            if k in free:
-                offers += [(unlike, k, pair) for unlike, pair in _offers(cameras, look, lines, i)]
+    count = len(rows[0][0])
+    free = [
+        {k for k, one in enumerate(known) if one is None or one.doubtful[i]} for i in range(count)
+    ]
+    lines = [
+        [_lines({k: rows[k][v][i] for k in sorted(free[i])}) for v in range(len(cameras))]
+        for i in range(count)
+    ]
+    offers: list[list[tuple[float, int, Pair]]] = [[] for _ in range(count)]
+    for k, look in looks.items():
+        for i, (unlike, pair) in _offers(cameras, look, [k in one for one in free], lines).items():
+            offers[i].append((unlike, k, pair))
+    for i in range(count):
         taken: set[tuple[int, int, int]] = set()
         settled = set[int]()
-        for _, k, pair in sorted(offers, key=lambda offer: offer[0]):
+        for _, k, pair in sorted(offers[i], key=lambda offer: offer[0]):
             mine = {(v, end, one.parts[end]) for v, one in enumerate(pair) for end in range(2)}
             if not taken & mine:
                 taken |= mine
                 settled.add(k)
                 for v, one in enumerate(pair):
                     found[k][v][i] = one.trace
-        for k in set(free) & set(looks) - settled:
+        for k in free[i] & set(looks) - settled:
             lent = any((v, end, k) in taken for v in range(len(cameras)) for end in range(2))
             if lent or looks[k].wrong[i]:
                 for view in found[k]:
@@ -82,6 +92,10 @@ class _Line(NamedTuple):
 
     trace: Trace
     parts: tuple[int, int]
+
+
+Pair = tuple[_Line, ...]
+"""Lines of all views that may be one whisker."""
 
 
 def _lines(traces: Mapping[int, Trace]) -> list[_Line]:
@@ -103,9 +117,42 @@ def _lines(traces: Mapping[int, Trace]) -> list[_Line]:
 
 
 def _offers(
+    cameras: Sequence[Camera],
+    look: _Look,
+    doubtful: Sequence[bool],
+    lines: Sequence[Sequence[Sequence[_Line]]],
+) -> dict[int, tuple[float, Pair]]:
+    """Pairs of lines that show the whisker, in frames where one does so far more clearly.
+
+    It has its rest shape, or else that of the rod which an object bends.
+    """
+    offers, left = dict[int, tuple[float, Pair]](), dict[int, list[tuple[Array, Pair]]]()
+    for i in np.flatnonzero(doubtful).tolist():
+        every = _pairs(cameras, look, lines[i], i)
+        deviations = [_deviation(curve, look.rest) for curve, _ in every]
+        offer = _clearest(every, deviations, look.usual, look.usual)
+        if offer is not None:
+            offers[i] = offer
+        elif every:
+            left[i] = every
+    if look.bent is None or not left:
+        return offers
+    frames = [i for i, every in left.items() for _ in every]
+    misfits = look.bent(
+        frames, [[one.trace for one in pair] for every in left.values() for _, pair in every]
+    )
+    for i, every in left.items():
+        some = misfits[np.array(frames) == i].tolist()
+        offer = _clearest(every, some, _ALIKE * look.misfit, look.usual)
+        if offer is not None:
+            offers[i] = offer
+    return offers
+
+
+def _pairs(
     cameras: Sequence[Camera], look: _Look, lines: Sequence[Sequence[_Line]], frame: int
-) -> list[tuple[float, tuple[_Line, ...]]]:
-    """Pair of lines that shows the whisker, if one does so far more clearly than others."""
+) -> list[tuple[Array, Pair]]:
+    """Pairs of lines that begin at the whisker's base, and the curves that they show."""
     wholes = [[one for one in view if one.parts[0] == one.parts[1]] for view in lines]
     every = []
     for whole in product(*wholes):
@@ -119,17 +166,23 @@ def _offers(
                     line for line in lines[v] if line.parts[0] == one.parts[0] and line is not one
                 ]
                 pairs += [(*whole[:v], line, *whole[v + 1 :]) for line in other]
-            for pair in pairs:
-                curve = merge(cameras, [one.trace for one in pair]).points
-                every.append((_deviation(curve, look.rest), curve, pair))
+            every += [(merge(cameras, [one.trace for one in pair]).points, pair) for pair in pairs]
+    return every
+
+
+def _clearest(
+    every: Sequence[tuple[Array, Pair]], deviations: Sequence[float], usual: float, differs: float
+) -> tuple[float, Pair] | None:
+    """Pair that deviates least, if as usual, and far less than those with another curve."""
     if not every:
-        return []
-    best, curve, found = min(every, key=lambda offer: offer[0])
-    for deviation, points, _ in every:
-        differs = np.linalg.norm(points - curve, axis=1).max() > look.usual
-        if differs and deviation < _CLEARER * best:
-            return []
-    return [(best / look.usual, found)] if best < look.usual else []
+        return None
+    best = int(np.argmin(deviations))
+    curve, pair = every[best]
+    for (points, _), deviation in zip(every, deviations, strict=True):
+        apart = np.linalg.norm(points - curve, axis=1).max() > differs
+        if apart and deviation < _CLEARER * deviations[best]:
+            return None
+    return (deviations[best] / usual, pair) if deviations[best] < usual else None
 
 
 class _Look(NamedTuple):
@@ -140,6 +193,8 @@ class _Look(NamedTuple):
     base: Array  # (time, 3), m
     near: float  # distance from there at which it may be, m
     wrong: Mask  # (time,): lost unless an exchange explains the views
+    bent: Callable[[Sequence[int], Sequence[Sequence[Trace]]], Array] | None
+    misfit: float
 
     @classmethod
     def of(cls, k: int, known: Sequence[Known | None], cameras: Sequence[Camera]) -> _Look:
@@ -153,7 +208,7 @@ class _Look(NamedTuple):
         pixel = 1.0 / np.linalg.norm(cameras[0].project_with_slopes(one.rest.mean(axis=0))[1], 2)
         usual = max(_ALIKE * usual, _PIXELS * float(pixel))
         near = 0.5 * float(min(away, default=np.inf))
-        return cls(one.rest, usual, paths[k], near, one.wrong)
+        return cls(one.rest, usual, paths[k], near, one.wrong, one.bent, one.misfit)
 
     def begins(self, base: Array, frame: int) -> bool:
         """Whether its base may be at this position."""

@@ -160,6 +160,10 @@ class BasePose:
         """Rotation from the whisker's to the laboratory frame, (time, 3, 3)."""
         return base_rotation(self.azimuth, self.elevation, self.roll)
 
+    def rows(self, frames: slice) -> BasePose:
+        """Select frames."""
+        return BasePose(*(getattr(self, name)[frames] for name in vars(self)))
+
     def filtered(self, rate: ArrayLike, cutoff: float | None = CUTOFF) -> BasePose:
         """Filter everything over time, at a rate or at times of frames, as `low_pass`."""
         angles = np.stack([self.azimuth, self.elevation, self.roll], axis=1)

@@ -8,7 +8,8 @@ the frame is searched with fewer expectations: no motion, any curvature, any dir
 The appearance of a whisker, which identifies it where its position does not, consists of the length
 that is seen, the darkness compared with the surroundings, from its base outward, and the turns from
 one piece to the next. The first two are logarithms, so that differences are relative. Features of
-parts that are not visible are NaN.
+parts that are not visible are NaN. An object that the whisker meets may bend it, which changes all
+turns at once: the last feature states whether it meets one.
 """
 
 from __future__ import annotations
@@ -31,10 +32,12 @@ from vibrissa.tracking.trace.trace import STEP, Trace, TraceOptions, aligned, ov
 # Points of a trace over which darkness and direction are averaged.
 _DARK = ((5, 25), (25, 50), (50, 80))
 _ALONG = ((3, 11), (20, 28), (40, 48), (60, 68))
-FEATURES = 1 + len(_DARK) + len(_ALONG) - 1
+_TURNS = slice(1 + len(_DARK), len(_DARK) + len(_ALONG))
+FEATURES = _TURNS.stop + 1
+_MEETS = 15  # number of points from the base beyond which it meets objects
 
 # Smallest standard deviation of a whisker's appearance between frames.
-_SPREAD = np.array([0.12, *[0.15] * len(_DARK), *[0.03] * (len(_ALONG) - 1)])
+_SPREAD = np.array([0.12, *[0.15] * len(_DARK), *[0.03] * (len(_ALONG) - 1), 1.0])
 # Factor of the spread toward shorter lengths: a whisker may be hidden, but is never longer.
 _SHORTER = 3.0
 # Standard deviations at which a difference saturates: contact bends, blur reduces contrast.
@@ -92,6 +95,10 @@ class Appearance(NamedTuple):
         away[missing & np.isfinite(features[..., :1])] = _HIDDEN
         away[np.isinf(features)] = 0.0
         square = np.nan_to_num(away) ** 2
+        square[..., -1] = 0.0
+        bent = features[..., -1] > 0.0
+        square[bent, _TURNS.start] = square[bent, _TURNS].sum(axis=-1)
+        square[bent, _TURNS.start + 1 : _TURNS.stop] = 0.0
         return np.asarray(0.5 * _WEIGHT * np.minimum(square, _MOST**2).sum(axis=-1))
 
 
@@ -125,7 +132,8 @@ def features_of(frame: Frame, trace: Trace, clutter: Clutter = NOTHING) -> Array
     steps = np.diff(line, axis=0)
     angle = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
     along = [float(angle[a:b].mean()) if len(angle) >= b else np.nan for a, b in _ALONG]
-    features[1 + len(_DARK) :] = np.diff(along)
+    features[_TURNS] = np.diff(along)
+    features[-1] = clutter.disturbs(line[_MEETS:]).any()
     return features
 
 

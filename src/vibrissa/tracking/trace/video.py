@@ -216,7 +216,7 @@ def _resumed(row: Sequence[Trace], base: ArrayLike | None, options: TraceOptions
 def _seen_before(frame: Frame, found: Sequence[Trace], followers: Sequence[Follower]) -> Seen:
     """Result for a frame that is not traced again."""
     lines = [trace for trace in found if len(trace.line)]
-    features = [features_of(frame, trace) for trace in lines]
+    features = [features_of(frame, trace, followers[0].clutter) for trace in lines]
     chosen, rest = [], iter(range(len(lines)))
     for follower, trace in zip(followers, found, strict=True):
         chosen.append(next(rest) if len(trace.line) else -1)

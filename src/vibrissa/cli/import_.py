@@ -34,6 +34,7 @@ def import_tracks(
     point_sigma: float | None = None,
     base_radius: float | None = None,
     tip_radius: float | None = None,
+    length: float | None = None,
     cutoff: float | None = None,
     objects: Path | None = None,
     force: bool = False,
@@ -54,11 +55,13 @@ def import_tracks(
         pixel_size=None if pixel_size is None else 1e-3 * pixel_size,
         names=None if names is None else names.replace(",", " ").split(),
         sigma=_sigma(point_sigma, found),
+        tip=length is None,
     )
     for note in traces.notes:
         remark(f"note: {note}")
     how = vb.tracking.TrackOptions(
         cutoff=vb.tracking.CUTOFF if cutoff is None else cutoff or None,
+        length=own.tracked_length(length),
         **own.tracked(base_radius, tip_radius),
     )
     known: dict[str, Any] = {} if objects is None else {"objects": objects_from(objects)}

@@ -1,6 +1,7 @@
 """From the files of other trackers to a contour, by the command line alone."""
 
 import csv
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from typer.testing import CliRunner
 import vibrissa as vb
 from vibrissa.cameras import orthogonal_views, save_cameras
 from vibrissa.cli.app import app
-from vibrissa.io import RawTracks, labelled, load_recording, save_tracks
+from vibrissa.io import RawTracks, join_views, labelled, load_recording, save_tracks
 from vibrissa.objects import Peg
 from vibrissa.recording import Recording
 from vibrissa.simulation import Motion, simulate
@@ -189,6 +190,49 @@ def test_points_are_ordered_and_separated_by_their_names(trial):
     # Names with a number each are not whiskers.
     numbered = plain.assign_coords(node=[f"w_{i}" for i in range(count)])
     assert len(tracker_traces(numbered, CAMERAS).names) == 1
+
+
+def test_points_that_mislead_are_noticed(trial):
+    """Exchanged in frames, from tip to base, few, without a base, or of other names in a view."""
+    image = np.stack([camera.project(trial[1]) for camera in CAMERAS], axis=2)
+
+    def raw(points):
+        return RawTracks("test", ["w"], image=points, views=[c.name for c in CAMERAS], fps=1000.0)
+
+    assert not tracker_traces(labelled(raw(image), "a"), CAMERAS).notes
+    swapped = image.copy()
+    swapped[::4, :, 0, [3, 5]] = image[::4, :, 0, [5, 3]]
+    found = tracker_traces(labelled(raw(swapped), "a"), CAMERAS)
+    seen = [len(trace.line) > 0 for trace in found.traces[0][0]]
+    assert seen == [i % 4 > 0 for i in range(len(image))]
+    assert "10 of 40 frames" in found.notes[0]
+    found = tracker_traces(labelled(raw(image[..., ::-1, :]), "a"), CAMERAS)
+    assert "from tip to base" in found.notes[0]
+    few = tracker_traces(labelled(raw(image[..., ::4, :]), "a"), CAMERAS)
+    assert any("track more points" in note for note in few.notes)
+    image[:, :, 1, 0] = np.nan
+    with pytest.raises(ValueError, match=f"never known in {CAMERAS[1].name}"):
+        tracker_traces(labelled(raw(image), "a"), CAMERAS)
+    one = RawTracks("test", ["w"], image=image[:, :, :1], nodes=list("abcdefghi"), fps=1000.0)
+    other = replace(one, nodes=list("jklmnopqr"))
+    with pytest.raises(ValueError, match="no node in common"):
+        join_views(labelled(one, "a", view="top"), labelled(other, "b", view="front"))
+
+
+def test_a_whisker_may_end_beyond_its_last_point(trial):
+    """Points without names end where the line does; of named ones the last is the tip."""
+    image = np.stack([camera.project(trial[1]) for camera in CAMERAS], axis=2)
+    image[..., 6:, :] = np.nan
+    about = {"image": image, "views": [c.name for c in CAMERAS], "fps": 1000.0}
+    named = labelled(RawTracks("test", ["w"], nodes=[f"w{i}" for i in range(NODES)], **about), "a")
+    ragged = labelled(RawTracks("test", ["w"], **about), "a")
+    assert tracker_traces(ragged, CAMERAS).traces[0][0][5].tip_seen
+    assert not tracker_traces(named, CAMERAS).traces[0][0][5].tip_seen
+    ends = named.isel(node=slice(0, 6))
+    found = tracker_traces(ends, CAMERAS)
+    assert "w5, is taken as the whisker's tip" in found.notes[0]
+    assert found.traces[0][0][5].tip_seen
+    assert not tracker_traces(ends, CAMERAS, tip=False).traces[0][0][5].tip_seen
 
 
 def test_lines_between_few_points_are_not_trusted_beyond_their_noise(trial):

@@ -11,6 +11,7 @@ from vibrissa.pipeline import (
     sensor_noise,
     signals_of,
     with_signals,
+    without_faulty_stages,
 )
 from vibrissa.sensors import Sensor
 from vibrissa.signals import SIGNALS, base_signals
@@ -330,10 +331,12 @@ def test_contact_points_from_a_table_count_more(tracked, trial):
         (lambda d: d.assign_coords(time=d["time"].values[::-1]), "its time does not increase"),
         (lambda d: d.assign_coords(time=d["time"] * np.nan), "its time does not increase"),
         (lambda d: d.assign(force=d["force"].astype(str)), "not numbers"),
+        (lambda d: d.assign(base_position=1e3 * d["base_position"] + 1.0), "millimetres given"),
     ],
 )
 def test_recordings_from_elsewhere_are_checked(trial, change, said):
-    tree = xr.DataTree(change(trial.to_dataset()))
+    truth = trial["truth"].to_dataset(inherit=False)
+    tree = xr.DataTree.from_dict({"/": change(trial.to_dataset()), "/truth": truth})
     with pytest.raises(ValueError, match=said):
         signals_of(tree)
 
@@ -343,3 +346,5 @@ def test_what_a_group_lacks_is_said(trial):
     tree["signals"] = xr.DataTree(tree["signals"].to_dataset(inherit=False).drop_vars("moment"))
     with pytest.raises(ValueError, match=r"group signals .* lacks moment; compute it again"):
         estimates_of(tree)
+    with pytest.warns(UserWarning, match="lacks moment.* until then it is ignored"):
+        assert "signals" not in without_faulty_stages(tree).children

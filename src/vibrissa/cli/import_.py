@@ -34,6 +34,7 @@ def import_tracks(
     point_sigma: float | None = None,
     base_radius: float | None = None,
     tip_radius: float | None = None,
+    length: float | None = None,
     cutoff: float | None = None,
     objects: Path | None = None,
     force: bool = False,
@@ -54,6 +55,7 @@ def import_tracks(
         pixel_size=None if pixel_size is None else 1e-3 * pixel_size,
         names=None if names is None else names.replace(",", " ").split(),
         sigma=_sigma(point_sigma, found),
+        tip=length is None,
     )
     for note in traces.notes:
         remark(f"note: {note}")
@@ -61,6 +63,7 @@ def import_tracks(
     per_second = float(f"{1.0 / float(np.median(np.diff(found['time'].values))):.12g}")
     how = vb.tracking.TrackOptions(
         cutoff=vb.tracking.usual_cutoff(per_second) if cutoff is None else cutoff or None,
+        length=own.tracked_length(length),
         **own.tracked(base_radius, tip_radius),
     )
     known: dict[str, Any] = {} if objects is None else {"objects": objects_from(objects)}

@@ -14,6 +14,7 @@ from vibrissa.cli.terminal import Tell, remark, say
 from vibrissa.deferred import xr
 
 RECORDING, MAP = "vibrissa recording", "vibrissa contact map"  # kinds of NetCDF files
+_LONGEST = 500.0  # longest whisker, mm
 _THICKEST = 10.0  # radius of a whisker above which it may be in micrometres instead of mm, mm
 # Unit of each limit of a region on the command line.
 _UNITS = {"r": 1e-3, "theta": math.pi / 180.0, "phi": math.pi / 180.0}
@@ -69,6 +70,18 @@ class TrackedOptions(WhiskerOptions):
     def __post_init__(self) -> None:
         if self.any_length and self.whisker is None:
             raise ValueError("--any-length is about a --whisker, and none is given")
+
+    def tracked_length(self, length: float | None) -> float | None:
+        """Stated length of the whisker, m."""
+        if length is None:
+            return None
+        if not 0.0 < length <= _LONGEST:
+            raise ValueError(
+                f"--length is {length:g} mm; more than 0 to {_LONGEST:g} mm are allowed"
+            )
+        if self.whisker is not None:
+            refuse({"--length": length}, "the --whisker has a length")
+        return 1e-3 * length
 
     def tracked(self, base_radius: float | None, tip_radius: float | None) -> dict[str, Any]:
         """Keyword arguments of tracking: the whisker, if given, with the stated radii."""
@@ -299,7 +312,7 @@ def recording_from(path: Path) -> xr.DataTree:
     with vb.io.naming(path, "a recording"):
         vb.pipeline.check_recording(recording)
         _ = vb.recording.Recording(recording).objects
-    return recording
+        return vb.pipeline.without_faulty_stages(recording)
 
 
 def map_of(whisker: vb.Whisker, tell: Tell, *, grid: bool = False, **how: Any) -> vb.ContactMap:

@@ -35,7 +35,6 @@ _VIEW = re.compile(r"\d+,\d+,\d+,\d+(:[a-z]+)*")  # part of the images of a vide
 _NEAREST, _FARTHEST = 0.03, 30.0  # smallest and largest distance of a lens, m
 _RATE = 1000.0
 
-_LONGEST = 500.0  # longest whisker, mm
 _LONGEST_FUR = 20.0  # longest part of a whisker that fur hides, mm
 _HALF = 127  # grey value above which a pixel of a mask image is bright
 # Reason for showing a frame in which the whisker may have been lost.
@@ -310,17 +309,14 @@ def track(
         )
     if not fur <= _LONGEST_FUR:
         raise ValueError(f"--fur is {fur:g} mm; 0 to {_LONGEST_FUR:g} mm are allowed")
-    if length is not None and not 0.0 < length <= _LONGEST:
-        raise ValueError(f"--length is {length:g} mm; more than 0 to {_LONGEST:g} mm are allowed")
     if own.whisker is not None:
         refuse({"--fur": fur or None}, "the --whisker begins where it is seen: cut it there")
-        refuse({"--length": length}, "the --whisker has a length")
     how = vb.tracking.TrackOptions(
         cutoff=vb.tracking.usual_cutoff(rate) if cutoff is None else cutoff or None,
         offset=None if filmed.offset == "auto" else int(filmed.offset),
         rough=filmed.cameras is None and filmed.distance != math.inf,
         distance=filmed.distance,
-        length=None if length is None else 1e-3 * length,
+        length=own.tracked_length(length),
         fur=1e-3 * fur,
         **own.tracked(base_radius, tip_radius),
     )

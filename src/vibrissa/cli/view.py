@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import vibrissa as vb
-from vibrissa.cli.inputs import MAP, RECORDING, WhiskerOptions, kind_in, print_notes
+from vibrissa.cli.inputs import MAP, RECORDING, WhiskerOptions, kind_in, print_notes, recording_from
 from vibrissa.cli.options import refuse, with_options
 from vibrissa.cli.terminal import say
 from vibrissa.deferred import xr
@@ -37,7 +37,7 @@ def view(
             raise ValueError(
                 f"--rat and --any-length are about a whisker, and {path} is not its file"
             )
-        viewed = vb.ContactMap.load(path, live is None) if kind == MAP else vb.load_recording(path)
+        viewed = vb.ContactMap.load(path, live is None) if kind == MAP else recording_from(path)
     else:
         viewed = WhiskerOptions(path, rat, any_length).read()
         print_notes(viewed)

@@ -244,7 +244,8 @@ def join_views(*tracks: xr.Dataset) -> xr.Dataset:
     Raises
     ------
     ValueError
-        If there is no trace, views share a name, or times do not agree.
+        If there is no trace, views share a name, times do not agree, or views have no whisker or
+        node in common.
     """
     if not tracks or any("trace" not in one for one in tracks):
         raise ValueError("each of the tracks to join needs a trace, and there must be some")
@@ -256,6 +257,12 @@ def join_views(*tracks: xr.Dataset) -> xr.Dataset:
         raise ValueError("some tracks have times in seconds and some do not: give fps to all")
     parts = [one.swap_dims(time="frame") for one in tracks]
     points = [_with_nodes(part[["trace", "confidence"]].drop_vars("time")) for part in parts]
+    for dim in ("whisker", "node"):
+        if not set.intersection(*(set(one.indexes[dim]) for one in points)):
+            listed = "; ".join(", ".join(map(str, one.indexes[dim])) for one in points)
+            raise ValueError(
+                f"the views have no {dim} in common ({listed}): the same names are needed in all"
+            )
     # Joining sorts names, but nodes run from the base to the tip.
     order = {
         dim: list(dict.fromkeys(name for one in points for name in one.indexes[dim]))

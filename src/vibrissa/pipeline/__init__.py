@@ -54,6 +54,7 @@ from vibrissa.pipeline.stages import (
     with_estimates,
     with_group as with_group,
     with_signals,
+    without_faulty_stages as without_faulty_stages,
 )
 
 __all__ = [

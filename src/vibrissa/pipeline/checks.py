@@ -70,7 +70,7 @@ def check_recording(recording: xr.DataTree) -> None:
         faults.append(f"its time is {time.dtype}; numbers are needed, in seconds")
     elif not np.isfinite(time).all() or (np.diff(time) <= 0).any():
         faults.append("its time does not increase from frame to frame, or is missing in some")
-    if faults:
+    if faults := faults or _position_faults(Recording(recording)):
         raise ValueError(f"the recording cannot be used: {'; '.join(faults)}")
     if changed := edited(recording):
         warnings.warn(
@@ -90,6 +90,25 @@ def _label_faults(root: xr.Dataset) -> list[str]:
     if len(set(names)) < len(names):
         faults.append(f"whiskers share a name: {', '.join(names)}")
     return faults
+
+
+def _position_faults(recording: Recording) -> list[str]:
+    """List a base that is farther from the centreline than the whisker is long, as by its unit."""
+    base = recording.root.known("base_position")
+    groups = (recording.root, recording.find("truth"))
+    lines = [group.known("centerline") for group in groups if group is not None]
+    line = next((line for line in lines if line is not None), None)
+    if base is None or line is None:
+        return []
+    length = np.linalg.norm(np.diff(line, axis=2), axis=3).sum(axis=2)
+    ratio = np.linalg.norm(line[:, :, 0] - base, axis=2) / length
+    ratio = ratio[np.isfinite(ratio)]
+    if not ratio.size or (away := float(np.median(ratio))) <= 1.0:
+        return []
+    return [
+        f"base_position is {away:.3g} lengths of the whisker from the base of its centerline; are "
+        "millimetres given as metres?"
+    ]
 
 
 def names_of(data: xr.Dataset) -> str:

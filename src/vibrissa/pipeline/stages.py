@@ -6,6 +6,7 @@ The functions return a new recording and leave the one passed unchanged.
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -18,7 +19,14 @@ from vibrissa.contacts import friction_assumed
 from vibrissa.contour import FittedShape, shape_from_dataset
 from vibrissa.io import events_in
 from vibrissa.numerics import contacts_in
-from vibrissa.pipeline.checks import MADE_FROM, check_recording, edited, made_from
+from vibrissa.pipeline.checks import (
+    MADE_FROM,
+    check_recording,
+    edited,
+    estimates_in,
+    made_from,
+    signals_in,
+)
 from vibrissa.pipeline.estimates import Progress, estimates_of, largest_of
 from vibrissa.pipeline.reconstruct import reconstruct
 from vibrissa.pipeline.signals import signals_of
@@ -43,6 +51,18 @@ def due_stages(recording: xr.DataTree, last: str, asked: Collection[str] = ()) -
             break
         first = number
     return STAGES[first : STAGES.index(last) + 1]
+
+
+def without_faulty_stages(recording: xr.DataTree) -> xr.DataTree:
+    """Remove groups of stages that lack variables or hold other than numbers; warn of each."""
+    for name, read in (("signals", signals_in), ("estimates", estimates_in)):
+        if name in recording.children:
+            try:
+                read(recording)
+            except ValueError as fault:
+                warnings.warn(f"{fault}; until then it is ignored", UserWarning, stacklevel=2)
+                recording = recording.drop_nodes(name)
+    return recording
 
 
 def with_group(recording: xr.DataTree, name: str, dataset: xr.Dataset) -> xr.DataTree:

@@ -247,7 +247,8 @@ def remarks_on_time(
             listed = ", ".join(map(str, shifts))
             found.append(
                 f"{cameras[0].name} and {camera.name} are out of step: with an offset of {listed} "
-                f"frames instead of {offset} they agree better. Track with --offset auto."
+                f"frames instead of {offset} they agree better. Track with --offset auto; in files "
+                "of other trackers, correct the numbers of the frames."
             )
     return found
 

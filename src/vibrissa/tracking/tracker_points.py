@@ -16,10 +16,10 @@ import numpy as np
 import xarray as xr
 
 from vibrissa.cameras import Camera, orthogonal_views
-from vibrissa.deferred import optimize
+from vibrissa.deferred import interpolate, optimize
 from vibrissa.numerics import Array
 from vibrissa.tracking.refine.rods import NODES
-from vibrissa.tracking.trace.trace import STEP, Trace, given
+from vibrissa.tracking.trace.trace import STEP, Trace, arc_lengths, given
 
 POINT_SIGMA = 0.5  # typical standard deviation of a tracked point across the whisker, pixels
 _SHOWN = 12  # largest number of whiskers listed in a message
@@ -30,6 +30,11 @@ _USUAL = 0.5  # share of the frames with a whisker above which it is tracked
 _SHARE = 1e-3  # typical standard deviation of a point in space, as a share of the whisker's length
 _WIDE = 1000.0  # width of the image of an added camera, pixels
 _MARGIN = 20.0  # distance of the points from the border of such an image, pixels
+_TESTED = 20  # largest number of frames from which the error between points is estimated
+# The error of a line between points relative to that of a line without one of the points, whose
+# gap is twice as wide; and the latter, in standard deviations of the points, due to their noise.
+_NARROWER, _OF_NOISE = 0.25, 3.0
+_STILLER = 3.0  # ratio by which a base moves more than a tip above which order is doubted
 _BASES = ("base", "root", "follicle")  # words that name the point at a whisker's base
 _ARC_POINTS = 12  # number of points on an arc that represents a measured curvature
 
@@ -51,8 +56,9 @@ def tracker_traces(
     pixel_size: float | None = None,
     names: Sequence[str] | None = None,
     sigma: float | None = None,
+    tip: bool = True,
 ) -> TrackerTraces:
-    """Convert the points of other trackers to traces."""
+    """Convert the points of other trackers to traces, of which the last is the whisker's tip."""
     notes: list[str] = []
     tracks = _arcs(_from_base(_apart(tracks, notes), notes), notes)
     if "centerline" in tracks:
@@ -70,8 +76,27 @@ def tracker_traces(
     if views is None:
         points, views, sigma = _in_two_views(points, sigma, notes)
     scatter = POINT_SIGMA if sigma is None else sigma
+    nodes, shown = _node_names(tracks), [camera.name for camera in views]
+    for k, name in enumerate(known):
+        notes += _order_faults(points[:, k], name, shown, nodes)
+        for v, view in enumerate(shown):
+            between = _interpolation_error(points[:, k, v], scatter)
+            if between > scatter:
+                notes.append(
+                    f"{name}: its points in {view} are so far apart that the line between them has "
+                    f"an error of some {between:.1f} pixels, which is in no covariance: track more "
+                    "points along the whisker"
+                )
+    if tip and nodes and "tip" not in nodes[-1].lower():
+        notes.append(
+            f"the last point, {nodes[-1]}, is taken as the whisker's tip; if the whisker is "
+            "longer, state its length (--length)"
+        )
     traces = [
-        [[_trace(points[i, k, v], scatter) for i in range(len(points))] for k in range(len(known))]
+        [
+            [_trace(points[i, k, v], scatter, tip, bool(nodes)) for i in range(len(points))]
+            for k in range(len(known))
+        ]
         for v in range(len(views))
     ]
     return TrackerTraces(tuple(views), traces, known, tuple(notes))
@@ -302,6 +327,68 @@ def _wanted(
     return [longest]
 
 
+def _order_faults(points: Array, name: str, views: Sequence[str], nodes: list[str]) -> list[str]:
+    """Notes on points (time, view, node, 2) of one whisker that may not run from base to tip."""
+    each_view = np.moveaxis(points, 1, 0)
+    notes = []
+    for view, each in zip(views, each_view, strict=True):
+        if not np.isfinite(each[:, 0]).all(axis=-1).any():
+            base = f"{nodes[0]}, " if nodes else ""
+            raise ValueError(f"{name}: its first point, {base}the base, is never known in {view}")
+    base, tip = (np.median([_motion(each[:, k]) for each in each_view]) for k in (0, -1))
+    if base > _STILLER * tip:
+        notes.append(
+            f"{name}: the first point, the base, moves by {base:.0f} pixels and the last by "
+            f"{tip:.0f} (standard deviations): if the points run from tip to base, all results are "
+            "wrong"
+        )
+    for view, each in zip(views, each_view, strict=True):
+        folds = [_folded(one) for one in each]
+        if not (often := [fold for fold in folds if fold is not None]):
+            continue
+        node = max(set(often), key=often.count)
+        notes.append(
+            f"{name}: in {len(often)} of {len(folds)} frames its points fold back in {view}, most "
+            f"often at {nodes[node] if nodes else f'point {node}'}; these frames are left out, as "
+            "the points may be exchanged"
+        )
+    return notes
+
+
+def _interpolation_error(points: Array, sigma: float) -> float:
+    """Error of the lines between points (time, node, 2), pixels, from lines without one of them."""
+    away = []
+    for row in points[np.linspace(0, len(points) - 1, min(len(points), _TESTED)).astype(int)]:
+        known = row[np.isfinite(row).all(axis=1)]
+        if len(known) < _FEWEST or _folded(row) is not None:
+            continue
+        kept = _thinned(known)
+        s = arc_lengths(kept)
+        for i in range(1, len(kept) - 1):
+            rest = np.delete(np.arange(len(kept)), i)
+            line = interpolate.make_interp_spline(s[rest], kept[rest], k=min(3, len(rest) - 1))
+            away.append(np.linalg.norm(line(s[i]) - kept[i]))
+    excess = np.percentile(away, 90.0) ** 2 - (_OF_NOISE * sigma) ** 2 if away else 0.0
+    return float(_NARROWER * np.sqrt(max(excess, 0.0)))
+
+
+def _motion(points: Array) -> float:
+    """Standard deviation of the position of a point (time, 2); NaN if it is never known."""
+    known = points[np.isfinite(points).all(axis=1)]
+    return float(np.linalg.norm(known.std(axis=0))) if len(known) else np.nan
+
+
+def _folded(points: Array) -> int | None:
+    """Number of the point (n, 2) at which a line turns back on itself; None if it does not."""
+    known = np.flatnonzero(np.isfinite(points).all(axis=1))
+    step = np.diff(points[known], axis=0)
+    # Near points may be in any order within their noise.
+    far = np.linalg.norm(step, axis=1) > _SPACING
+    back = (step[1:] * step[:-1]).sum(axis=1) < 0.0
+    folds = np.flatnonzero(back & far[1:] & far[:-1])
+    return int(known[folds[0] + 1]) if folds.size else None
+
+
 def _in_two_views(
     space: Array, sigma: float | None, notes: list[str]
 ) -> tuple[Array, tuple[Camera, ...], float]:
@@ -351,10 +438,14 @@ def _looking_across(middle: Array, extent: float, direction: Array) -> tuple[Cam
     return cameras[0], cameras[1]
 
 
-def _trace(points: Array, sigma: float) -> Trace:
-    """Trace through the points (n, 2) of a whisker, from its base; lost without its base."""
+def _trace(points: Array, sigma: float, tip: bool, named: bool) -> Trace:
+    """Trace through the points (n, 2) of a whisker, from its base; lost without its base.
+
+    The last of ``named`` points is the tip; lines of points without names differ in their number.
+    """
     known = np.asarray(np.isfinite(points).all(axis=1))
-    if known.sum() < _FEWEST or not known[: max(1, len(points) // 4)].any():
+    near_base = known[: max(1, len(points) // 4)].any()
+    if known.sum() < _FEWEST or not near_base or _folded(points) is not None:
         return Trace.lost()
     kept = _thinned(points[known])
     step = np.linalg.norm(np.diff(kept, axis=0), axis=1)
@@ -367,7 +458,7 @@ def _trace(points: Array, sigma: float) -> Trace:
     return trace._replace(
         sigma=np.full(len(trace.line), sigma * scale),
         base_seen=bool(known[0]),
-        tip_seen=bool(known[-1]) or known.argmin() == known.sum(),
+        tip_seen=tip and (bool(known[-1]) or (not named and known.argmin() == known.sum())),
         sparse=True,
     )
 

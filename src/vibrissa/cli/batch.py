@@ -105,7 +105,7 @@ def _one(
     """Reconstruct the object of one recording; return a summary (or None) and the fault."""
     fault, found, tree, made = "", None, None, False
     try:
-        tree = recording_from(path)
+        tree = vb.pipeline.without_faulty_stages(recording_from(path))
         if again or "contour" not in tree.children or vb.pipeline.edited(tree):
             known = vb.recording.Recording(tree).objects if objects is None else objects
             for stage, after in stages(tree, wanted, source, how, known, tell, str(path)):

@@ -312,7 +312,7 @@ def recording_from(path: Path) -> xr.DataTree:
     with vb.io.naming(path, "a recording"):
         vb.pipeline.check_recording(recording)
         _ = vb.recording.Recording(recording).objects
-        return vb.pipeline.without_faulty_stages(recording)
+    return recording
 
 
 def map_of(whisker: vb.Whisker, tell: Tell, *, grid: bool = False, **how: Any) -> vb.ContactMap:

@@ -79,7 +79,7 @@ def reconstruct(
     points = target.with_name(f"{target.stem}_contour.csv") if csv is None else csv
     vb.io.check_writable(target, vb.io.NETCDF)
     vb.io.check_writable(points, vb.io.CSV)
-    tree = recording_from(recording)
+    tree = vb.pipeline.without_faulty_stages(recording_from(recording))
     own = not force and _of_contour(points, tree, how.own)
     free_beside(recording, [target] if own else [target, points], force)
     known = vb.recording.Recording(tree).objects if objects is None else objects_from(objects)

@@ -70,7 +70,7 @@ def report(
     with progress_bars() as tell:
         if is_trial:
             refuse({"--uniqueness": uniqueness}, f"{path} is a recording")
-            trial = recording_from(path)
+            trial = vb.pipeline.without_faulty_stages(recording_from(path))
             of_trial = of_trial.of(trial)
             content = _of_trial(path, trial, of_trial, seed or 0, tell)
         else:

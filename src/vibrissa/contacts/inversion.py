@@ -289,10 +289,13 @@ def _certain(inverse: Array, value: Array, target: Array) -> bool:
 
 
 @kernel
-def _determined(rod: Rod, b: Array, xi: Array, target: Array) -> bool:
-    """Whether signals determine a contact in spite of the errors of the integration."""
+def _moves_far(rod: Rod, b: Array, xi: Array, target: Array, step: Array) -> bool:
+    """Whether errors of the integration move a contact by 1 % of the length.
+
+    ``step`` is the change of (s, f₁, f₂) that moves it by 1 % in the direction least determined.
+    """
     value, tangents, four = np.empty(6), np.empty((6, 3)), np.empty((6, 4))
-    residual, jacobian, moves = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    residual, jacobian, moves = np.empty(3), np.empty((3, 3)), np.empty(3)
     set_all_lanes(b, xi[0], 0.0, xi[1], xi[2])
     integrate(rod, b, 1)
     lane_value(b, 0, value)
@@ -300,19 +303,41 @@ def _determined(rod: Rod, b: Array, xi: Array, target: Array) -> bool:
     for a in range(6):
         tangents[a, 0], tangents[a, 1], tangents[a, 2] = four[a, 0], four[a, 2], four[a, 3]
     _match(value, tangents, True, target, residual, jacobian)
-    sizes = _sizes(value)
+    sizes, farthest = _sizes(value), 0.0
+    step[:] = 0.0
     for k in range(3):
         residual[:] = 0.0
         residual[k] = _ERROR * _size_of(int(target[3 + k]), sizes)
-        if solve3(jacobian, residual, moves[k]) == 0.0:
-            return False
+        if solve3(jacobian, residual, moves) == 0.0:
+            return True
         for a in range(3, 6):
             moved = 0.0
             for c in range(3):
-                moved += tangents[a, c] * moves[k, c]
-            if not abs(moved) < _MOVED:
-                return False
-    return True
+                moved += tangents[a, c] * moves[c]
+            if not abs(moved) < np.inf:
+                return True
+            if abs(moved) > farthest:
+                farthest = abs(moved)
+                for c in range(3):
+                    step[c] = _MOVED / farthest * moves[c]
+    return farthest >= _MOVED
+
+
+@kernel
+def _determined(rod: Rod, b: Array, xi: Array, target: Array) -> bool:
+    """Whether signals determine a contact in spite of the errors of the integration.
+
+    Where two contacts merge they do: the derivatives are singular there only, not 1 % away.
+    """
+    step, further, nearby = np.empty(3), np.empty(3), np.empty(3)
+    if not _moves_far(rod, b, xi, target, step):
+        return True
+    for sign in (-1.0, 1.0):
+        for c in range(3):
+            nearby[c] = xi[c] + sign * step[c]
+        if not _moves_far(rod, b, nearby, target, further):
+            return True
+    return False
 
 
 @kernel

@@ -198,9 +198,10 @@ class Contacts(_Located):
         ``TIP_CONTACT`` as ``UNIQUE``, of a contact of the tip that the prior allows for;
         ``DEGENERATE`` where forces and moments are zero, where the signals do not determine
         contacts (:meth:`ContactMap.determines`), where without ``noise`` a relative error of 1e-7
-        of three signals would move the contact by 1 % of the length, or where with this noise the
-        contact may be anywhere; ``MISSING``. Of the wrench also ``NOT_ONE_CONTACT`` where χ² is too
-        large, ``BEYOND_TIP`` where moreover the nearest contact is the tip, ``TOO_PROXIMAL`` where
+        of three signals would move the contact by 1 % of the length, and also contacts 1 % to
+        either side of it, or where with this noise the contact may be anywhere; ``MISSING``. Of the
+        wrench also ``NOT_ONE_CONTACT`` where χ² is too large, ``BEYOND_TIP`` where moreover the
+        nearest contact is the tip, ``TOO_PROXIMAL`` where
         it is at 0.05 L. Of fewer than three signals ``UNDERDETERMINED``: candidates are samples of
         the curve or surface of contacts that explain them. Of the paper's methods, which cannot see
         whether contacts are ambiguous: ``APPROXIMATE``, ``OUTSIDE_MAP`` or ``MISSING``.

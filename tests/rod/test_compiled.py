@@ -89,6 +89,37 @@ def test_a_kernel_is_compiled_within_those_that_call_it():
     )
 
 
+def test_only_arrays_that_a_kernel_creates_or_returns_are_counted():
+    run(
+        """
+        import sys
+        import numpy as np
+        from vibrissa.numerics.compiled import kernel
+
+        def total(rows):
+            sums = np.zeros(3)
+            for i in range(len(rows)):
+                row = rows[i]
+                sums[i] += row[0] + row[1]
+            return sums.sum()
+
+        def row_of(rows, i):
+            row = rows[i]
+            return row
+
+        total, row_of, rows = kernel(total), kernel(row_of), np.ones((3, 2))
+        assert total(rows) == 6.0
+        (code,) = total.inspect_llvm().values()
+        assert "call void @NRT_incref" not in code
+        before = sys.getrefcount(rows)
+        kept = [row_of(rows, 1) for _ in range(5)]
+        assert sys.getrefcount(rows) > before
+        del kept
+        assert sys.getrefcount(rows) == before
+        """
+    )
+
+
 def test_a_kernel_runs_its_own_copies_of_what_it_calls():
     """Not those that other kernels have brought: digits would depend on what was compiled first."""
     run(

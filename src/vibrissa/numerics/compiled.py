@@ -20,9 +20,12 @@ from numba import types
 from numba.core import ir
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, Flags
-from numba.core.compiler_machinery import AnalysisPass, register_pass
+from numba.core.compiler_machinery import register_pass
+from numba.core.cpu import CPUContext
+from numba.core.lowering import Lower
 from numba.core.registry import CPUDispatcher
-from numba.core.typed_passes import NopythonTypeInference
+from numba.core.runtime.context import NRTContext
+from numba.core.typed_passes import NativeLowering
 
 from vibrissa.numerics.kernel_cache import PackageCache
 
@@ -115,30 +118,82 @@ def _collect_parts(libraries: list[JITCodeLibrary], found: dict[JITCodeLibrary, 
             found[library] = None
 
 
-@register_pass(mutates_CFG=False, analysis_only=True)
-class _Borrowing(AnalysisPass):
-    """Disable reference counting in functions that only use arrays of their caller.
+class _Uncounted(CPUContext):
+    """Target without reference counting, which can still read what references refer to."""
 
-    Arrays that a called function creates or returns, or that the function returns, are counted.
+    @property
+    def nrt(self) -> NRTContext:
+        """Access to memory that is counted elsewhere."""
+        return NRTContext(self, True)
+
+
+class _Lower(Lower):
+    """Numba's code generator, without reference counting of arrays that belong to the caller.
+
+    Views of arguments refer to arrays that the caller keeps alive. Counting is atomic, so that
+    threads that use the same map would wait for each other. Arrays that the function or a function
+    called by it creates, or that it returns, are counted.
     """
 
-    _name = "borrowing"
-
-    def __init__(self) -> None:
-        super().__init__()  # type: ignore[no-untyped-call]
-
-    def run_pass(self, state: Any) -> bool:
-        """Disable counting where there is nothing to count."""
-        counted = state.targetctx.data_model_manager
-        made = [state.return_type]
-        for block in state.func_ir.blocks.values():
+    def __init__(self, context: Any, library: Any, description: Any, *rest: Any, **named: Any):
+        kinds, counted = description.typemap, context.data_model_manager
+        holding = {name for name in kinds if counted[kinds[name]].contains_nrt_meminfo()}
+        values: dict[str, list[Any]] = {}
+        returned = set()
+        for block in rest[0].blocks.values():
             for statement in block.find_insts(ir.Assign):
-                value = statement.value
-                if isinstance(value, ir.Expr) and value.op not in _VIEWS:
-                    made.append(state.typemap[statement.target.name])
-        if not any(counted[kind].contains_nrt_meminfo() for kind in made):
-            state.targetctx = state.targetctx.subtarget(enable_nrt=False)
+                values.setdefault(statement.target.name, []).append(statement.value)
+            returned |= {statement.value.name for statement in block.find_insts(ir.Return)}
+        borrowed, before = (holding & values.keys()) - returned, -1
+        while len(borrowed) != before:
+            before, owned = len(borrowed), holding - borrowed
+            borrowed = {
+                name
+                for name in borrowed
+                if all(_is_view(value, owned, holding) for value in values[name])
+            }
+        uncounted = context.subtarget(enable_nrt=False)
+        uncounted.__class__ = _Uncounted
+        if not (holding & values.keys()) - borrowed:
+            context = uncounted
+        super().__init__(context, library, description, *rest, **named)  # type: ignore[no-untyped-call]
+        self._borrowed, self._uncounted = borrowed, uncounted
+
+    def lower_inst(self, statement: Any) -> Any:
+        """Generate code for a statement, without counting if its variable is a borrowed array."""
+        name = ""
+        if isinstance(statement, ir.Assign):
+            name = statement.target.name
+        elif isinstance(statement, ir.Del):
+            name = statement.value
+        context = self.context
+        if name in self._borrowed:
+            self.context = self._uncounted
+        try:
+            return super().lower_inst(statement)  # type: ignore[no-untyped-call]
+        finally:
+            self.context = context
+
+
+def _is_view(value: Any, owned: set[str], holding: set[str]) -> bool:
+    """Whether a value refers to arrays that exist outside of a function, none of them ``owned``."""
+    if not isinstance(value, ir.Expr):
+        return not (isinstance(value, ir.Var) and value.name in owned)
+    if value.op == "getitem" and value.index.name in holding:  # an array as an index makes a copy
         return False
+    return value.op in _VIEWS and not any(used.name in owned for used in value.list_vars())
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _Lowering(NativeLowering):
+    """Code generation by `_Lower`."""
+
+    _name = "lowering_without_counting"
+
+    @property
+    def lowering_class(self) -> type[Lower]:
+        """Class of the code generator."""
+        return _Lower
 
 
 class _Flags(Flags):
@@ -182,9 +237,11 @@ class _WholeCompiler(Compiler):
             gc.set_threshold(young, *older)
 
     def define_pipelines(self) -> list[Any]:
-        """Add the decision on reference counting after type inference."""
+        """Generate code without reference counting where possible."""
         (manager,) = super().define_pipelines()  # type: ignore[no-untyped-call]
-        manager.add_pass_after(_Borrowing, NopythonTypeInference)
+        manager.passes = [
+            (_Lowering if step is NativeLowering else step, text) for step, text in manager.passes
+        ]
         manager.finalize()
         return [manager]
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import vibrissa as vb
-from vibrissa.contacts.inversion import invert
+from vibrissa.contacts.fitting.inversion import invert
 from vibrissa.rod import discretize, solve_forces
 from vibrissa.signals import SIGNALS
 

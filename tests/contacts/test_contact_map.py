@@ -7,7 +7,7 @@ import xarray as xr
 
 import vibrissa as vb
 from vibrissa.contacts import within_paper_bounds
-from vibrissa.contacts.inversion import invert
+from vibrissa.contacts.fitting.inversion import invert
 from vibrissa.rod import CELLS, MOST_CELLS, cells_around, contacts_at, solve_forces
 from vibrissa.signals import SIGNALS, signals_of, spherical
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from vibrissa.contacts import ContactEvents, in_order
-from vibrissa.contacts.events import dated_onset
+from vibrissa.contacts.following.events import dated_onset
 from vibrissa.status import Event
 
 TIME = np.arange(60) / 500.0

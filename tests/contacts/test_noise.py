@@ -7,9 +7,9 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 import vibrissa as vb
-from vibrissa.contacts import search
-from vibrissa.contacts.posterior import ranked
-from vibrissa.contacts.ranking import stages
+from vibrissa.contacts.engine import search
+from vibrissa.contacts.engine.ranking import stages
+from vibrissa.contacts.uncertainty.posterior import ranked
 from vibrissa.identifiability.twins import sample
 from vibrissa.numerics import quick_exp
 from vibrissa.rod import fold_forces, solve_forces

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 import vibrissa as vb
 from vibrissa.cli.app import app
-from vibrissa.contacts.noise import SensorNoise
+from vibrissa.contacts.sensing.noise import SensorNoise
 from vibrissa.sensors import (
     Sensor,
     SensorFrame,

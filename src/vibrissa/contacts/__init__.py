@@ -1,13 +1,6 @@
 """From base signals to contacts: the map of all contacts and its inversion."""
 
 from vibrissa.contacts.around import estimate_around
-from vibrissa.contacts.channels import (
-    WRENCH,
-    Channels,
-    channel_derivatives as channel_derivatives,
-    channel_gradients as channel_gradients,
-    ratio_derivatives as ratio_derivatives,
-)
 from vibrissa.contacts.chosen_contacts import (
     At,
     ChosenContacts as ChosenContacts,
@@ -27,28 +20,41 @@ from vibrissa.contacts.contacts import (
     contacts_of as contacts_of,
     friction_assumed,
 )
+from vibrissa.contacts.engine.prior import Prior
+from vibrissa.contacts.engine.readout import (
+    check_signals as check_signals,
+    searched_by_name as searched_by_name,
+)
+from vibrissa.contacts.engine.search import signals_at_nodes as signals_at_nodes
 from vibrissa.contacts.estimator import Estimator
-from vibrissa.contacts.events import (
+from vibrissa.contacts.fitting.inversion import (
+    invert as invert,
+    polish as polish,
+    seeding_triplet as seeding_triplet,
+)
+from vibrissa.contacts.following.events import (
     SLIPPING as SLIPPING,
     ContactEvents as ContactEvents,
     Place as Place,
     in_order as in_order,
 )
-from vibrissa.contacts.filter import ContactFilter, Followed as Followed
-from vibrissa.contacts.forward import Gravity, read_at_rest as read_at_rest
-from vibrissa.contacts.inversion import (
-    invert as invert,
-    polish as polish,
-    seeding_triplet as seeding_triplet,
+from vibrissa.contacts.following.filter import ContactFilter, Followed as Followed
+from vibrissa.contacts.joint.forward import Gravity, read_at_rest as read_at_rest
+from vibrissa.contacts.joint_estimate import estimate_jointly as estimate_jointly
+from vibrissa.contacts.sensing.channels import (
+    WRENCH,
+    Channels,
+    channel_derivatives as channel_derivatives,
+    channel_gradients as channel_gradients,
+    ratio_derivatives as ratio_derivatives,
 )
-from vibrissa.contacts.jacobian import (
+from vibrissa.contacts.sensing.jacobian import (
     RANK,
     contact_signal_derivatives as contact_signal_derivatives,
     deficient as deficient,
     spherical_derivatives as spherical_derivatives,
 )
-from vibrissa.contacts.joint_estimate import estimate_jointly as estimate_jointly
-from vibrissa.contacts.noise import (
+from vibrissa.contacts.sensing.noise import (
     Noise,
     SensorNoise,
     common_covariance as common_covariance,
@@ -57,12 +63,6 @@ from vibrissa.contacts.noise import (
     rms_error as rms_error,
     whitening as whitening,
 )
-from vibrissa.contacts.prior import Prior
-from vibrissa.contacts.readout import (
-    check_signals as check_signals,
-    searched_by_name as searched_by_name,
-)
-from vibrissa.contacts.search import signals_at_nodes as signals_at_nodes
 from vibrissa.contacts.two_contacts import bent_by_forces as bent_by_forces, second_contact
 from vibrissa.contacts.wrench import estimate_from_wrench, rubbing_misfits as rubbing_misfits
 

@@ -18,8 +18,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.contacts.channels import WRENCH
-from vibrissa.contacts.noise import Noise, SensorNoise, explained
+from vibrissa.contacts.sensing.channels import WRENCH
+from vibrissa.contacts.sensing.noise import Noise, SensorNoise, explained
 from vibrissa.contacts.wrench import wrench_on, wrench_weights
 from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, numbers, rotation_matrices, without_blas_threads

@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.contacts.contacts import Contacts
-from vibrissa.contacts.forward import Gravity
-from vibrissa.contacts.inversion import triplet_tree
-from vibrissa.contacts.jacobian import determining
+from vibrissa.contacts.engine.prior import Prior
+from vibrissa.contacts.engine.search import estimate
+from vibrissa.contacts.fitting.inversion import triplet_tree
+from vibrissa.contacts.joint.forward import Gravity
 from vibrissa.contacts.joint_estimate import estimate_jointly
-from vibrissa.contacts.noise import common_errors
-from vibrissa.contacts.prior import Prior
-from vibrissa.contacts.search import estimate
+from vibrissa.contacts.sensing.jacobian import determining
+from vibrissa.contacts.sensing.noise import common_errors
 from vibrissa.contacts.wrench import estimate_components
 from vibrissa.deferred import xr
 from vibrissa.io import (

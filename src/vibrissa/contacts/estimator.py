@@ -1,7 +1,8 @@
 """Estimator of contacts for one measurement at a time, with its signals, noise and prior.
 
-Many measurements at once pass through the same kernels (:mod:`~vibrissa.contacts.search`). Each is
-searched for in the whole map, so that no candidate is missed by searching only near the last one.
+Many measurements at once pass through the same kernels (:mod:`~vibrissa.contacts.engine.search`).
+Each is searched for in the whole map, so that no candidate is missed by searching only near the
+last one.
 """
 
 from __future__ import annotations
@@ -13,17 +14,17 @@ from functools import cached_property, partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.contacts.ambiguity import Ambiguity
-from vibrissa.contacts.channels import CHANNELS, channels_of
 from vibrissa.contacts.charted_whisker import ChartedWhisker
 from vibrissa.contacts.contacts import Candidates, Contact, contact_of, nowhere
-from vibrissa.contacts.forward import Gravity
+from vibrissa.contacts.engine.ambiguity import Ambiguity
+from vibrissa.contacts.engine.prior import Prior, among_allowed, possible_candidates, refuse_tip
+from vibrissa.contacts.engine.readout import ByName, Measurement, Mixed, Named, readout_of
+from vibrissa.contacts.engine.search import LARGEST, STATUSES, UNKNOWNS, Search
+from vibrissa.contacts.joint.forward import Gravity
+from vibrissa.contacts.joint.joint_fit import JointFit, soft_base
 from vibrissa.contacts.joint_estimate import JointEstimate
-from vibrissa.contacts.joint_fit import JointFit, soft_base
-from vibrissa.contacts.noise import by_stiffness, common_errors, sensor_noise
-from vibrissa.contacts.prior import Prior, among_allowed, possible_candidates, refuse_tip
-from vibrissa.contacts.readout import ByName, Measurement, Mixed, Named, readout_of
-from vibrissa.contacts.search import LARGEST, STATUSES, UNKNOWNS, Search
+from vibrissa.contacts.sensing.channels import CHANNELS, channels_of
+from vibrissa.contacts.sensing.noise import by_stiffness, common_errors, sensor_noise
 from vibrissa.numerics import Array, numbers, rotation_matrices
 from vibrissa.rod import PointContact, deflect
 from vibrissa.sensors import GRAVITY, Sensor

@@ -3,8 +3,8 @@
 The resting whisker sags under its weight. A weightless whisker with this resting shape proposes
 contacts: near the truth if gravity acts across the whisker, and within a few per cent of the length
 if it acts along it. They are then fitted to the signals with the full weight and all uncertain
-parameters (:mod:`~vibrissa.contacts.joint_fit`). With unknown friction, curves of contacts are
-traced from there (:mod:`~vibrissa.contacts.friction`).
+parameters (:mod:`~vibrissa.contacts.joint.joint_fit`). With unknown friction, curves of contacts
+are traced from there (:mod:`~vibrissa.contacts.joint.friction`).
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.contacts.channels import WRENCH, Channels, friction_angle
 from vibrissa.contacts.charted_whisker import ChartedWhisker
 from vibrissa.contacts.contacts import Candidates, Contacts, contacts_of
-from vibrissa.contacts.forward import Forward, Gravity, finite
-from vibrissa.contacts.friction import along_curves, check_ratio, or_without
-from vibrissa.contacts.joint_fit import Joint, JointFit, check_compliance
-from vibrissa.contacts.least_squares import Fits
-from vibrissa.contacts.noise import Noise, SensorNoise, explained, sensor_noise
-from vibrissa.contacts.posterior import ranked
-from vibrissa.contacts.prior import Prior, possible_candidates, refuse_tip
-from vibrissa.contacts.readout import check_signals
-from vibrissa.contacts.search import estimate
+from vibrissa.contacts.engine.prior import Prior, possible_candidates, refuse_tip
+from vibrissa.contacts.engine.readout import check_signals
+from vibrissa.contacts.engine.search import estimate
+from vibrissa.contacts.fitting.least_squares import Fits
+from vibrissa.contacts.joint.forward import Forward, Gravity, finite
+from vibrissa.contacts.joint.friction import along_curves, check_ratio, or_without
+from vibrissa.contacts.joint.joint_fit import Joint, JointFit, check_compliance
+from vibrissa.contacts.sensing.channels import WRENCH, Channels, friction_angle
+from vibrissa.contacts.sensing.noise import Noise, SensorNoise, explained, sensor_noise
+from vibrissa.contacts.uncertainty.posterior import ranked
 from vibrissa.contacts.wrench import PROXIMAL, by_probability, chosen, estimate_components
 from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray

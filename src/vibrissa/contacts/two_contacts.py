@@ -25,10 +25,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.contacts.channels import WRENCH
-from vibrissa.contacts.friction import LARGEST_FRICTION
-from vibrissa.contacts.least_squares import Fits, fit
-from vibrissa.contacts.noise import Noise, SensorNoise, common_errors
+from vibrissa.contacts.fitting.least_squares import Fits, fit
+from vibrissa.contacts.joint.friction import LARGEST_FRICTION
+from vibrissa.contacts.sensing.channels import WRENCH
+from vibrissa.contacts.sensing.noise import Noise, SensorNoise, common_errors
 from vibrissa.contacts.wrench import PROXIMAL, estimate_components, wrench_on, wrench_weights
 from vibrissa.deferred import special, xr
 from vibrissa.numerics import AnyArray, Array, IntArray, numbers

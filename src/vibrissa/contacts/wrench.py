@@ -20,17 +20,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.contacts.channels import (
+from vibrissa.contacts.contacts import Candidates, Contacts, contacts_of
+from vibrissa.contacts.engine.prior import Prior, possible_candidates, refuse_tip
+from vibrissa.contacts.fitting.least_squares import Fits, fit, unknowns_covariance
+from vibrissa.contacts.joint.joint_fit import soft_base
+from vibrissa.contacts.sensing.channels import (
     WRENCH,
     Channels,
     friction_angle,
     friction_angle_derivatives,
     wrenches_of,
 )
-from vibrissa.contacts.contacts import Candidates, Contacts, contacts_of
-from vibrissa.contacts.joint_fit import soft_base
-from vibrissa.contacts.least_squares import Fits, fit, unknowns_covariance
-from vibrissa.contacts.noise import (
+from vibrissa.contacts.sensing.noise import (
     INDISTINCT,
     SensorNoise,
     common_covariance,
@@ -42,9 +43,8 @@ from vibrissa.contacts.noise import (
     trusted,
     whitening,
 )
-from vibrissa.contacts.posterior import CERTAIN, ranked
-from vibrissa.contacts.prior import Prior, possible_candidates, refuse_tip
-from vibrissa.contacts.valleys import Valleys, valleys
+from vibrissa.contacts.uncertainty.posterior import CERTAIN, ranked
+from vibrissa.contacts.uncertainty.valleys import Valleys, valleys
 from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod import Discretization, discretize, solve_forces, vanishing_moments

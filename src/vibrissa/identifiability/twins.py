@@ -1,7 +1,7 @@
 """Twins: distant contacts that have the same three signals.
 
 Where the map ξ → T is regular, all contacts with the triplet of a given one are found exactly
-(:mod:`vibrissa.contacts.inversion`); the distant ones are its twins.
+(:mod:`vibrissa.contacts.fitting.inversion`); the distant ones are its twins.
 
 Where a triplet has lost a dimension, contacts with equal triplets form curves, its *fibres*. A
 straight whisker never twists: M_x = 0 everywhere. In a whisker of uniform stiffness and curvature

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vibrissa.contacts.noise import SensorNoise, common_covariance, scaled_errors, trusted
+from vibrissa.contacts.sensing.noise import SensorNoise, common_covariance, scaled_errors, trusted
 from vibrissa.numerics import Array
 from vibrissa.rod import Discretization
 from vibrissa.signals import (

@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.channels import FITTED, RATIO, channel_derivatives
-from vibrissa.contacts.weighing import Weighing, weigh_any
+from vibrissa.contacts.sensing.channels import FITTED, RATIO, channel_derivatives
+from vibrissa.contacts.sensing.weighing import Weighing, weigh_any
 from vibrissa.numerics import (
     AnyArray,
     Array,

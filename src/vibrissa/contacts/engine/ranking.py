@@ -5,21 +5,21 @@ while another contact, far away, explains them exactly. Such hidden candidates a
 three steps:
 
 1. List the cells of the chart that may contain signals within two standard deviations of the
-   measured ones, and group them into basins (:mod:`~vibrissa.contacts.basins`).
+   measured ones, and group them into basins (:mod:`~vibrissa.contacts.uncertainty.basins`).
 2. In each basin that no known candidate explains through its slopes, minimise χ² within Ω. If this
    reaches no minimum, as in long flat valleys, the basin adds no candidate, but the nodes of the
    chart show how probable the contacts there are.
 3. If a contact and its mirror image in the plane of a planar whisker have the same signals, start
    also from the images of the known candidates. Flat valleys
-   (:mod:`~vibrissa.contacts.flat_valleys`) can join both into one basin.
+   (:mod:`~vibrissa.contacts.uncertainty.flat_valleys`) can join both into one basin.
 
-All candidates are then judged (:mod:`~vibrissa.contacts.posterior`). The probability density of the
-measurement at a candidate follows from the noise there; the density of a direction decreases with
-the size of its vector. A prior that is uniform in volume nearly vanishes near slip-off, where
-contacts nevertheless occur, so probabilities are the mean of those with volumes and those from
-likelihoods alone. If the second-order expansion does not describe one of the candidates, only the
-likelihoods count, the valley of χ² through the best candidate is followed, and the nodes of the
-chart are evaluated too.
+All candidates are then judged (:mod:`~vibrissa.contacts.uncertainty.posterior`). The probability
+density of the measurement at a candidate follows from the noise there; the density of a direction
+decreases with the size of its vector. A prior that is uniform in volume nearly vanishes near
+slip-off, where contacts nevertheless occur, so probabilities are the mean of those with volumes and
+those from likelihoods alone. If the second-order expansion does not describe one of the candidates,
+only the likelihoods count, the valley of χ² through the best candidate is followed, and the nodes
+of the chart are evaluated too.
 """
 
 from __future__ import annotations
@@ -29,28 +29,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.basins import deviations, starts_of_basins
-from vibrissa.contacts.candidates import (
+from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates, Room
+from vibrissa.contacts.engine.candidates import (
     UNEXPLAINED,
     explain_rows,
     finite,
     solve_rows,
 )
-from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates, Room
-from vibrissa.contacts.fit_within import fit_within
-from vibrissa.contacts.flat_valleys import follow_valley
-from vibrissa.contacts.least_squares import channel_equations, same_contact, settled, whiten
-from vibrissa.contacts.nodes import (
-    PARTS,
-    Searched,
-    described_by_nodes,
-    nearest_of,
-    outside_share,
-    probable_nodes,
-)
-from vibrissa.contacts.noise import INDISTINCT
-from vibrissa.contacts.posterior import CERTAIN, judge, rank
-from vibrissa.contacts.task import (
+from vibrissa.contacts.engine.task import (
     MOST_STARTS,
     Description,
     Problem,
@@ -62,7 +48,21 @@ from vibrissa.contacts.task import (
     type_of_description,
     type_of_task,
 )
-from vibrissa.contacts.weighing import Weighing, sharpness, weigh_any
+from vibrissa.contacts.fitting.fit_within import fit_within
+from vibrissa.contacts.fitting.least_squares import channel_equations, same_contact, settled, whiten
+from vibrissa.contacts.sensing.noise import INDISTINCT
+from vibrissa.contacts.sensing.weighing import Weighing, sharpness, weigh_any
+from vibrissa.contacts.uncertainty.basins import deviations, starts_of_basins
+from vibrissa.contacts.uncertainty.flat_valleys import follow_valley
+from vibrissa.contacts.uncertainty.nodes import (
+    PARTS,
+    Searched,
+    described_by_nodes,
+    nearest_of,
+    outside_share,
+    probable_nodes,
+)
+from vibrissa.contacts.uncertainty.posterior import CERTAIN, judge, rank
 from vibrissa.numerics import (
     AnyArray,
     Array,

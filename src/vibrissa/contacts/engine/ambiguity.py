@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.channels import CIRCULAR, channels_of
 from vibrissa.contacts.contacts import Candidates
-from vibrissa.contacts.least_squares import channel_equations
-from vibrissa.contacts.readout import Measurement, Mixed, Named
-from vibrissa.contacts.weighing import Weighing, weigh
+from vibrissa.contacts.engine.readout import Measurement, Mixed, Named
+from vibrissa.contacts.fitting.least_squares import channel_equations
+from vibrissa.contacts.sensing.channels import CIRCULAR, channels_of
+from vibrissa.contacts.sensing.weighing import Weighing, weigh
 from vibrissa.numerics import AnyArray, Array, copy, inlined, kernel
 from vibrissa.rod import (
     BUFFER_SIZE,

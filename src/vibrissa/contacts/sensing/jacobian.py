@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.contacts.channels import wrench_tangents, wrenches_of
 from vibrissa.contacts.charted_whisker import ChartedWhisker
+from vibrissa.contacts.sensing.channels import wrench_tangents, wrenches_of
 from vibrissa.numerics import Array
 from vibrissa.rod import (
     Discretization,

@@ -4,7 +4,7 @@ Three signals have as many unknowns: every contact with T(ξ) = T is found from 
 signals are explained by least squares, starting from the contacts at which three quantities have
 the measured values. If no such contact explains the measurement, fits start from the nodes of the
 chart that come nearest, one in each of its sixteen parts. The treatment of noise is in
-:mod:`~vibrissa.contacts.ranking`.
+:mod:`~vibrissa.contacts.engine.ranking`.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ from __future__ import annotations
 import numpy as np
 
 from vibrissa.contacts.contacts import MOST_CANDIDATES
-from vibrissa.contacts.inversion import invert_rows
-from vibrissa.contacts.least_squares import (
+from vibrissa.contacts.engine.task import Problem, Task, in_memory
+from vibrissa.contacts.fitting.inversion import invert_rows
+from vibrissa.contacts.fitting.least_squares import (
     Fits,
     approach,
     channel_equations,
@@ -22,10 +23,9 @@ from vibrissa.contacts.least_squares import (
     settled,
     stable_fit,
 )
-from vibrissa.contacts.nodes import PARTS, Searched, nearest_of
-from vibrissa.contacts.noise import INDISTINCT
-from vibrissa.contacts.task import Problem, Task, in_memory
-from vibrissa.contacts.weighing import Weighing, weigh
+from vibrissa.contacts.sensing.noise import INDISTINCT
+from vibrissa.contacts.sensing.weighing import Weighing, weigh
+from vibrissa.contacts.uncertainty.nodes import PARTS, Searched, nearest_of
 from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel
 from vibrissa.rod import (
     BUFFER_SIZE,

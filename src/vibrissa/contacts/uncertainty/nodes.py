@@ -13,8 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.channels import CHANNELS, CIRCULAR, channels_of
-from vibrissa.contacts.posterior import NORMAL_KURTOSIS, second_moment, squared_distances
+from vibrissa.contacts.sensing.channels import CHANNELS, CIRCULAR, channels_of
+from vibrissa.contacts.uncertainty.posterior import (
+    NORMAL_KURTOSIS,
+    second_moment,
+    squared_distances,
+)
 from vibrissa.numerics import Array, IntArray, cholesky, inlined, mahalanobis, quick_exp, vectorised
 from vibrissa.rod import Charted, SearchTree, StableSet, charted_rod
 

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.least_squares import channel_equations, whiten
+from vibrissa.contacts.fitting.least_squares import channel_equations, whiten
 from vibrissa.numerics import Array, IntArray, cholesky, copy, inlined, mahalanobis
 from vibrissa.rod import (
     LANES,

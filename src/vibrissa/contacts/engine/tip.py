@@ -28,15 +28,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.channels import CHANNELS, CIRCULAR, channel_derivatives, channels_of
 from vibrissa.contacts.charted_whisker import ChartedWhisker
 from vibrissa.contacts.contacts import Candidates
-from vibrissa.contacts.forward import Forward
-from vibrissa.contacts.joint_fit import JointFit, normal_cloud
-from vibrissa.contacts.least_squares import Fits, charted
-from vibrissa.contacts.noise import INDISTINCT, explained, whitening
-from vibrissa.contacts.posterior import CERTAIN
-from vibrissa.contacts.readout import Mixed, Named
+from vibrissa.contacts.engine.readout import Mixed, Named
+from vibrissa.contacts.fitting.least_squares import Fits, charted
+from vibrissa.contacts.joint.forward import Forward
+from vibrissa.contacts.joint.joint_fit import JointFit, normal_cloud
+from vibrissa.contacts.sensing.channels import CHANNELS, CIRCULAR, channel_derivatives, channels_of
+from vibrissa.contacts.sensing.noise import INDISTINCT, explained, whitening
+from vibrissa.contacts.uncertainty.posterior import CERTAIN
 from vibrissa.deferred import interpolate, spatial
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.signals import within_turn

@@ -7,11 +7,12 @@ follows an Ornstein-Uhlenbeck process:
     dp = v dt,    dv = -v dt / τ + σ √(2 / τ) dW.
 
 The likelihood of a contact's first sample is split into Gaussians
-(:mod:`~vibrissa.contacts.onset`). Each further sample moves them and reweights them by how well
-they predicted it (:mod:`~vibrissa.contacts.mixture`). A sample of two signals moves p only across
-the curve of contacts that explains it (:mod:`~vibrissa.contacts.ambiguity`); as the base moves, the
-curves of successive samples intersect at the contact. A candidate that no hypothesis accounts for
-starts a new one, with the probability of a new contact.
+(:mod:`~vibrissa.contacts.following.onset`). Each further sample moves them and reweights them by
+how well they predicted it (:mod:`~vibrissa.contacts.following.mixture`). A sample of two signals
+moves p only across the curve of contacts that explains it
+(:mod:`~vibrissa.contacts.engine.ambiguity`); as the base moves, the curves of successive samples
+intersect at the contact. A candidate that no hypothesis accounts for starts a new one, with the
+probability of a new contact.
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.contacts.contacts import Contact
+from vibrissa.contacts.engine.prior import Prior, refuse_tip
+from vibrissa.contacts.engine.readout import Measurement
 from vibrissa.contacts.estimator import Estimator
-from vibrissa.contacts.mixture import Mixture, learn, predict, room, tidy, unaccounted
-from vibrissa.contacts.noise import explained
-from vibrissa.contacts.onset import Beginning, Gaussians
-from vibrissa.contacts.posterior import LEFT, THREE_SIGMA
-from vibrissa.contacts.prior import Prior, refuse_tip
-from vibrissa.contacts.readout import Measurement
+from vibrissa.contacts.following.mixture import Mixture, learn, predict, room, tidy, unaccounted
+from vibrissa.contacts.following.onset import Beginning, Gaussians
+from vibrissa.contacts.sensing.noise import explained
+from vibrissa.contacts.uncertainty.posterior import LEFT, THREE_SIGMA
 from vibrissa.deferred import special
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod import charted_rod

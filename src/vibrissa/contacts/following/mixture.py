@@ -3,10 +3,10 @@
 Each hypothesis is a Gaussian over (p, v). A measurement moves it to the minimum in Ω of χ² of the
 signals and of p - p_predicted together, with the exact rod in between. There may be several minima:
 where two contacts with the same signals separate, a Gaussian that covers both becomes two. So the
-minimum is searched for from the hypothesis and from each contact that gives the signals exactly
-and is near the prediction. The posterior about each minimum is described to second order
-(:mod:`~vibrissa.contacts.moments`), since noise leaves bent valleys and Ω ends at folds. Its mean
-and covariance become those of the hypothesis, and its mass updates the weight,
+minimum is searched for from the hypothesis and from each contact that gives the signals exactly and
+is near the prediction. The posterior about each minimum is described to second order
+(:mod:`~vibrissa.contacts.uncertainty.moments`), since noise leaves bent valleys and Ω ends at
+folds. Its mean and covariance become those of the hypothesis, and its mass updates the weight,
 
     log w ← log w - χ²/2 + log ∫ exp((χ² - χ²(p))/2) dp - ½ log det P_before + log det W,
 
@@ -25,10 +25,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.fit_within import fit_rows_within
-from vibrissa.contacts.least_squares import Fits, same_contact, settled
-from vibrissa.contacts.moments import Onset, moments
-from vibrissa.contacts.weighing import Weighing, gradients, weigh, wrong_by
+from vibrissa.contacts.fitting.fit_within import fit_rows_within
+from vibrissa.contacts.fitting.least_squares import Fits, same_contact, settled
+from vibrissa.contacts.sensing.weighing import Weighing, gradients, weigh, wrong_by
+from vibrissa.contacts.uncertainty.moments import Onset, moments
 from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel
 from vibrissa.rod import Charted
 

@@ -22,7 +22,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.contacts.channels import (
+from vibrissa.contacts.fitting.least_squares import Fits, fit
+from vibrissa.contacts.sensing.channels import (
     CHANNELS,
     CIRCULAR,
     channel_derivatives,
@@ -31,7 +32,6 @@ from vibrissa.contacts.channels import (
     ratio_of,
     wrenches_of,
 )
-from vibrissa.contacts.least_squares import Fits, fit
 from vibrissa.deferred import transform
 from vibrissa.numerics import AnyArray, Array, relative
 from vibrissa.rod import (

@@ -14,10 +14,10 @@ import numpy as np
 
 from vibrissa.contacts.charted_whisker import ChartedWhisker
 from vibrissa.contacts.contacts import Candidates
-from vibrissa.contacts.posterior import CERTAIN
-from vibrissa.contacts.ranking import chi_squared_of
-from vibrissa.contacts.readout import Mixed, Named
-from vibrissa.contacts.tip import tip_contacts
+from vibrissa.contacts.engine.ranking import chi_squared_of
+from vibrissa.contacts.engine.readout import Mixed, Named
+from vibrissa.contacts.engine.tip import tip_contacts
+from vibrissa.contacts.uncertainty.posterior import CERTAIN
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod import Discretization, contact_tangents, discretize
 from vibrissa.signals import REGIONS, concave_backward, in_region, spherical

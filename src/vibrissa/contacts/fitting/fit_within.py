@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.least_squares import (
+from vibrissa.contacts.fitting.least_squares import (
     TIMES,
     Fits,
     channel_equations,
@@ -26,7 +26,7 @@ from vibrissa.contacts.least_squares import (
     stable_fit,
     whiten,
 )
-from vibrissa.contacts.weighing import Weighing, weigh_any
+from vibrissa.contacts.sensing.weighing import Weighing, weigh_any
 from vibrissa.numerics import Array, IntArray, cholesky, copy, inlined, kernel, solve_root
 from vibrissa.rod import BUFFER_SIZE, Charted, Fold, fold_force
 

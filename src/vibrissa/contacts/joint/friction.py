@@ -12,8 +12,9 @@ prior of contact points and the stated one of ratios, the density of s is
     exp(-χ²/2 - µ_x²/2σ²) |∂(p, µ_x)/∂(s, f)| √det C_f,
 
 and the contact point is a mixture along the curve. Its second moment about the contact nearest to
-its mean, widened for tails as in :mod:`~vibrissa.contacts.posterior`, is the covariance. If the
-density has several peaks with valleys between them, these are separate candidates.
+its mean, widened for tails as in :mod:`~vibrissa.contacts.uncertainty.posterior`, is the
+covariance. If the density has several peaks with valleys between them, these are separate
+candidates.
 
 If four or more signals determine µ_x, the prior probability that there is no friction is one half:
 the prior of µ_x is (δ(µ_x) + N(0, σ²)) / 2. With the density p(0) of µ_x at zero on the curve, the
@@ -27,17 +28,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.channels import (
+from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates
+from vibrissa.contacts.fitting.least_squares import Fits
+from vibrissa.contacts.joint.joint_fit import HELD, Joint, JointFit
+from vibrissa.contacts.sensing.channels import (
     friction_angle,
     friction_angle_derivatives,
     ratio_derivatives,
     ratio_of,
 )
-from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates
-from vibrissa.contacts.joint_fit import HELD, Joint, JointFit
-from vibrissa.contacts.least_squares import Fits
-from vibrissa.contacts.noise import SensorNoise
-from vibrissa.contacts.posterior import NORMAL_KURTOSIS, ranked
+from vibrissa.contacts.sensing.noise import SensorNoise
+from vibrissa.contacts.uncertainty.posterior import NORMAL_KURTOSIS, ranked
 from vibrissa.numerics import AnyArray, Array, IntArray
 
 _UNKNOWNS = 4

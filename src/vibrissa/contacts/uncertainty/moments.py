@@ -2,8 +2,8 @@
 
 A contact ξ̂ explains channels best, among them a prior of the point p. Each contact point of Ω has
 the density exp(-|r|²/2), which is zero outside: beyond the tip, proximal to the limit, and beyond
-the fold. With residuals and point to second order in u (:mod:`~vibrissa.contacts.expansion`),
-moments of this density are summed over nodes,
+the fold. With residuals and point to second order in u
+(:mod:`~vibrissa.contacts.uncertainty.expansion`), moments of this density are summed over nodes,
 
     ∫ g(p(u)) exp(-|r(u)|²/2) det ∂p/∂u du.
 
@@ -19,7 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.expansion import (
+from vibrissa.contacts.fitting.least_squares import Fits, channel_equations, whiten
+from vibrissa.contacts.uncertainty.expansion import (
     Expansion,
     all_determined,
     cap_axes,
@@ -31,8 +32,7 @@ from vibrissa.contacts.expansion import (
     shorten_axes,
     without_friction,
 )
-from vibrissa.contacts.least_squares import Fits, channel_equations, whiten
-from vibrissa.contacts.posterior import (
+from vibrissa.contacts.uncertainty.posterior import (
     NODES,
     STRAIGHT,
     TOO_FEW,

@@ -1,7 +1,8 @@
 """Readouts: measurements as signals by name or as a linear mix, prepared for the estimator.
 
-A readout converts a measurement to channels with weights (:class:`~vibrissa.contacts.weighing`),
-and provides the search tree, over three quantities of the map, for contacts that may explain it.
+A readout converts a measurement to channels with weights
+(:class:`~vibrissa.contacts.sensing.weighing`), and provides the search tree, over three quantities
+of the map, for contacts that may explain it.
 """
 
 from __future__ import annotations
@@ -13,7 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.channels import (
+from vibrissa.contacts.charted_whisker import ChartedWhisker
+from vibrissa.contacts.fitting.inversion import seeding_triplet
+from vibrissa.contacts.sensing.channels import (
     CHANNELS,
     FITTED,
     WRENCH,
@@ -21,11 +24,9 @@ from vibrissa.contacts.channels import (
     wrench_tangents,
     wrenches_of,
 )
-from vibrissa.contacts.charted_whisker import ChartedWhisker
-from vibrissa.contacts.inversion import seeding_triplet
-from vibrissa.contacts.nodes import Searched, at_nodes, searched
-from vibrissa.contacts.noise import TRUSTED, SensorNoise, rank, scaled_errors
-from vibrissa.contacts.weighing import Weighing
+from vibrissa.contacts.sensing.noise import TRUSTED, SensorNoise, rank, scaled_errors
+from vibrissa.contacts.sensing.weighing import Weighing
+from vibrissa.contacts.uncertainty.nodes import Searched, at_nodes, searched
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.rod import search_tree
 from vibrissa.sensors import COMPONENTS

@@ -3,7 +3,7 @@
 A contact ξ explains measured channels with residuals r(u) = r̂ + B u + H_r(u, u)/2 in standard
 deviations, where u are coordinates about a candidate along bent axes that are one standard
 deviation long; its contact point is p(u) = p̂ + A u + H_p(u, u)/2
-(:mod:`~vibrissa.contacts.expansion`).
+(:mod:`~vibrissa.contacts.uncertainty.expansion`).
 
 The prior is uniform over the contact points of Ω, so the posterior density of u is
 exp(-|r(u)|²/2) det ∂p/∂u within Ω and zero outside: beyond the tip, proximal to the limit, and
@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.expansion import (
+from vibrissa.contacts.uncertainty.expansion import (
     Expansion,
     all_determined,
     cap_axes,

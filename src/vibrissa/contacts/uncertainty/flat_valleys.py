@@ -9,7 +9,8 @@ to its floor within the whisker. The density along it, with weights W computed a
 
     exp(-χ²/2) |det W| det ∂p/∂ξ |det(∂ξ/∂l, a_1, a_2)|,
 
-or that without volumes; the mean of both is used, as in :mod:`~vibrissa.contacts.valleys`.
+or that without volumes; the mean of both is used, as in
+:mod:`~vibrissa.contacts.uncertainty.valleys`.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ import math
 
 import numpy as np
 
-from vibrissa.contacts.expansion import axis_length, principal_axes, without_friction
-from vibrissa.contacts.least_squares import channel_equations, contact_equations, whiten
-from vibrissa.contacts.valleys import CLOSED, Nodes, mixture, pace, shares_of
-from vibrissa.contacts.weighing import Weighing, sharpness, weigh_any
+from vibrissa.contacts.fitting.least_squares import channel_equations, contact_equations, whiten
+from vibrissa.contacts.sensing.weighing import Weighing, sharpness, weigh_any
+from vibrissa.contacts.uncertainty.expansion import axis_length, principal_axes, without_friction
+from vibrissa.contacts.uncertainty.valleys import CLOSED, Nodes, mixture, pace, shares_of
 from vibrissa.numerics import Array, copy, inlined, kernel, solve
 from vibrissa.rod import BUFFER_SIZE, Charted, point_determinant
 

@@ -1,8 +1,9 @@
 """Least-squares fits of contacts together with uncertain parameters that all measurements share.
 
-A forward model (:mod:`~vibrissa.contacts.forward`) gives the channels T(x) of a contact and, to
-first order, the effects of further unknowns c ~ N(0, 1) on them, N, and on the contact point, p_c.
-With noise Σ, a prior of the friction ratio µ_x ~ N(0, σ²) if that is unknown too, and measured T̃,
+A forward model (:mod:`~vibrissa.contacts.joint.forward`) gives the channels T(x) of a contact and,
+to first order, the effects of further unknowns c ~ N(0, 1) on them, N, and on the contact point,
+p_c. With noise Σ, a prior of the friction ratio µ_x ~ N(0, σ²) if that is unknown too, and measured
+T̃,
 
     χ²(x, c) = |T(x) + N c - T̃|²_Σ + |c|² + µ_x²/σ².
 
@@ -14,7 +15,7 @@ deviations.
 
 Where this is not accurate enough, residuals and p are expanded to second order along its principal
 axes, and the second moment about p is that of a cloud of contacts, weighted by residuals and
-det ∂p/∂x, and widened for tails as in :mod:`~vibrissa.contacts.posterior`.
+det ∂p/∂x, and widened for tails as in :mod:`~vibrissa.contacts.uncertainty.posterior`.
 """
 
 from __future__ import annotations
@@ -23,7 +24,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.channels import (
+from vibrissa.contacts.contacts import Candidates
+from vibrissa.contacts.fitting.least_squares import Fits
+from vibrissa.contacts.joint.forward import Forward
+from vibrissa.contacts.sensing.channels import (
     CHANNELS,
     CIRCULAR,
     Channels,
@@ -34,11 +38,8 @@ from vibrissa.contacts.channels import (
     ratio_derivatives,
     ratio_of,
 )
-from vibrissa.contacts.contacts import Candidates
-from vibrissa.contacts.forward import Forward
-from vibrissa.contacts.least_squares import Fits
-from vibrissa.contacts.noise import SensorNoise, explained, rank, whitening
-from vibrissa.contacts.posterior import CERTAIN
+from vibrissa.contacts.sensing.noise import SensorNoise, explained, rank, whitening
+from vibrissa.contacts.uncertainty.posterior import CERTAIN
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.signals import within_turn
 from vibrissa.status import Status

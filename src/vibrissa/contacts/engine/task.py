@@ -15,8 +15,8 @@ from numba.core import types
 from numba.experimental import structref
 
 from vibrissa.contacts.contacts import MOST_CANDIDATES, candidates_within
-from vibrissa.contacts.nodes import Searched
-from vibrissa.contacts.weighing import Weighing
+from vibrissa.contacts.sensing.weighing import Weighing
+from vibrissa.contacts.uncertainty.nodes import Searched
 from vibrissa.numerics import AnyArray, Array, inlined, kernel
 
 #: Largest number of starting points for one measurement.

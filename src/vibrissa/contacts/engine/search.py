@@ -4,13 +4,13 @@ Three signals T have as many unknowns ξ: every contact with T(ξ) = T is a cand
 are explained by weighted least squares, χ² = |T(ξ) - T|² in standard deviations. With noise, three
 signals are treated in this way too: contacts on the boundary of T(Ω) explain signals that noise has
 carried out of it. For noise of covariance Σ the covariance of the contact point is, to first order,
-∂p/∂ξ (JᵀΣ⁻¹J)⁻¹ ∂p/∂ξᵀ with J = ∂T/∂ξ; see :mod:`~vibrissa.contacts.posterior`. A covariance of
-force and moment is transformed to the signals by their derivatives. Fewer than three signals leave
-a curve or a surface of contacts; see :mod:`~vibrissa.contacts.ambiguity`.
+∂p/∂ξ (JᵀΣ⁻¹J)⁻¹ ∂p/∂ξᵀ with J = ∂T/∂ξ; see :mod:`~vibrissa.contacts.uncertainty.posterior`. A
+covariance of force and moment is transformed to the signals by their derivatives. Fewer than three
+signals leave a curve or a surface of contacts; see :mod:`~vibrissa.contacts.engine.ambiguity`.
 
 Batches and single measurements pass through the same compiled kernels
-(:mod:`~vibrissa.contacts.candidates`). Each is searched for in the whole map, so that no candidate
-is missed by searching only near the last one.
+(:mod:`~vibrissa.contacts.engine.candidates`). Each is searched for in the whole map, so that no
+candidate is missed by searching only near the last one.
 """
 
 from __future__ import annotations
@@ -21,15 +21,12 @@ from functools import lru_cache, partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.contacts.candidates import UNEXPLAINED
 from vibrissa.contacts.charted_whisker import ChartedWhisker
 from vibrissa.contacts.contacts import Candidates, Contacts, Room, candidates_within, contacts_of
-from vibrissa.contacts.inversion import polish
-from vibrissa.contacts.joint_fit import soft_base
-from vibrissa.contacts.noise import explained, sensor_noise
-from vibrissa.contacts.prior import Prior, among_allowed, refuse_tip
-from vibrissa.contacts.ranking import compile_stages, estimate_rows
-from vibrissa.contacts.readout import (
+from vibrissa.contacts.engine.candidates import UNEXPLAINED
+from vibrissa.contacts.engine.prior import Prior, among_allowed, refuse_tip
+from vibrissa.contacts.engine.ranking import compile_stages, estimate_rows
+from vibrissa.contacts.engine.readout import (
     Bounds,
     Measurement,
     Mixed,
@@ -37,7 +34,10 @@ from vibrissa.contacts.readout import (
     check_signals,
     independent,
 )
-from vibrissa.contacts.task import Problem, task
+from vibrissa.contacts.engine.task import Problem, task
+from vibrissa.contacts.fitting.inversion import polish
+from vibrissa.contacts.joint.joint_fit import soft_base
+from vibrissa.contacts.sensing.noise import explained, sensor_noise
 from vibrissa.deferred import spatial, xr
 from vibrissa.numerics import AnyArray, Array, IntArray, share_out
 from vibrissa.rod import TOLERANCE

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 
 from vibrissa.contacts.contacts import MOST_CANDIDATES
-from vibrissa.contacts.fit_within import by_slopes
-from vibrissa.contacts.nodes import Searched
-from vibrissa.contacts.weighing import Weighing, channel_covariance
+from vibrissa.contacts.fitting.fit_within import by_slopes
+from vibrissa.contacts.sensing.weighing import Weighing, channel_covariance
+from vibrissa.contacts.uncertainty.nodes import Searched
 from vibrissa.numerics import Array, IntArray, copy, inlined, kernel
 from vibrissa.rod import MOST_CELLS, along, cells_around, chart_to_contact, fold_force
 from vibrissa.signals import FY, MY

@@ -3,7 +3,7 @@
 A light contact is poorly localised: the likelihood is a long, bent valley. It is therefore split
 along the whisker by windows N(s; s_j, h²), a distance h apart, whose sum is constant. Where
 likelihood and window together are largest in Ω, a Gaussian is placed with their mean and covariance
-(:mod:`~vibrissa.contacts.moments`), and with the weight
+(:mod:`~vibrissa.contacts.uncertainty.moments`), and with the weight
 
     log w = -χ²/2 + log ∫ exp((χ² - χ²(p))/2) π(p) dp + log det W.
 
@@ -26,7 +26,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.channels import (
+from vibrissa.contacts.contacts import Contact
+from vibrissa.contacts.engine.readout import Measurement, Named
+from vibrissa.contacts.estimator import Estimator
+from vibrissa.contacts.fitting.fit_within import fit_rows_within
+from vibrissa.contacts.fitting.least_squares import Fits, unknowns_covariance
+from vibrissa.contacts.following.mixture import log_weights
+from vibrissa.contacts.sensing.channels import (
     CHANNELS,
     CIRCULAR,
     FITTED,
@@ -35,15 +41,9 @@ from vibrissa.contacts.channels import (
     channels_of,
     wrenches_of,
 )
-from vibrissa.contacts.contacts import Contact
-from vibrissa.contacts.estimator import Estimator
-from vibrissa.contacts.fit_within import fit_rows_within
-from vibrissa.contacts.least_squares import Fits, unknowns_covariance
-from vibrissa.contacts.mixture import log_weights
-from vibrissa.contacts.moments import Onset, moments_of_rows
-from vibrissa.contacts.noise import common_channels
-from vibrissa.contacts.readout import Measurement, Named
-from vibrissa.contacts.weighing import Weighing, weigh
+from vibrissa.contacts.sensing.noise import common_channels
+from vibrissa.contacts.sensing.weighing import Weighing, weigh
+from vibrissa.contacts.uncertainty.moments import Onset, moments_of_rows
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod import LEAST_ARC, Discretization, charted_rod, solve_forces
 from vibrissa.signals import within_turn

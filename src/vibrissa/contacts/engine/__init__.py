@@ -1,0 +1,1 @@
+"""From measurements to ranked candidates, row by row."""

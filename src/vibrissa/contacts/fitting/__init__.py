@@ -1,0 +1,1 @@
+"""Contacts of given signals: exact solutions and least squares."""

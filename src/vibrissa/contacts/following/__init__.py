@@ -1,0 +1,1 @@
+"""Contacts over time: the filter and events."""

@@ -1,0 +1,1 @@
+"""Fits of contacts together with shared unknowns: weight, friction, a soft base."""

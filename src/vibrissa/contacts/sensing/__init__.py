@@ -1,0 +1,1 @@
+"""Channels of measurements, their noise, weights and derivatives."""

@@ -1,0 +1,1 @@
+"""How certain a contact is: posterior, its covariance, and what else is possible."""

@@ -183,13 +183,14 @@ def test_the_node_for_ros_answers_a_wrench_with_its_contact(tmp_path, monkeypatc
             assert qos == "best effort"  # reliable ones do not receive what sensors publish
             heard.append((kind, answer))
 
-    kinds = ("WrenchStamped", "PoseWithCovarianceStamped")
+    names = ("WrenchStamped", "PoseWithCovarianceStamped")
+    kinds = {name: ros_kind(types, f"geometry_msgs/msg/{name}") for name in names}
     for name, held in (
         ("rclpy", {"init": lambda: None, "spin": lambda node: None}),
         ("rclpy.node", {"Node": Node}),
         ("rclpy.qos", {"qos_profile_sensor_data": "best effort"}),
         ("geometry_msgs", {}),
-        ("geometry_msgs.msg", {kind: ros_kind(types, f"geometry_msgs/msg/{kind}") for kind in kinds}),
+        ("geometry_msgs.msg", kinds),
     ):
         module = ModuleType(name)
         vars(module).update(held)

@@ -163,12 +163,12 @@ class NoiseOptions:
     def doubt(self, whisker: vb.Whisker) -> None:
         """Question the default noise, that of a rat's whisker, for a far stiffer one."""
         size = whisker.base_bending_stiffness / whisker.length**2
-        if self.given or vb.sensors.FORCE_NOISE > _FAINT * size:
+        if self.given or _FAINT * size < vb.sensors.FORCE_NOISE:
             return
         remark(
-            f"no noise is stated; the default, {self.described()}, is for a rat's whisker, and this "
-            f"one is stiffer (EI/L² is {size:.2g} N): state --force-noise and --moment-noise, or "
-            "contacts and their standard deviations are wrong"
+            f"no noise is stated; the default, {self.described()}, is for a rat's whisker, and "
+            f"this one is stiffer (EI/L² is {size:.2g} N): state --force-noise and --moment-noise, "
+            "or contacts and their standard deviations are wrong"
         )
 
 

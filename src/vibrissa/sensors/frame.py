@@ -232,10 +232,14 @@ def calibrate_frame(
         method="lm",
     )
     misfit = float((fit.fun**2).sum() / max(fit.fun.size - 6, 1))
-    warn_of_misfit(misfit, "the loads and where they pull, their signs, offset and units")
+    warn_of_misfit(
+        misfit,
+        "the loads and where they pull, their signs, offset and units, and the sensor's gain and "
+        "cross-talk (`calibrate_mixing` fits these)",
+    )
     rows = fit.fun.reshape(-1, 6) * noise
     jacobian = np.asarray(fit.jac, dtype=np.float64)
-    spread = max(1.0, misfit) * np.asarray(np.linalg.inv(jacobian.T @ jacobian), dtype=np.float64)
+    spread = np.asarray(max(1.0, misfit) * np.linalg.inv(jacobian.T @ jacobian))
     return FrameCalibration(
         frame(fit.x),
         spread,

@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
+import numpy as np
 import pytest
 import typer
 
@@ -118,33 +119,76 @@ def test_pictures_are_small(picture):
     assert picture.stat().st_size < LARGEST
 
 
-def test_the_node_for_ros_answers_a_wrench_with_its_contact(tmp_path, monkeypatch):
-    """With stand-ins of ROS, which is not on PyPI."""
+def ros_kind(types, name):
+    """Class of messages with the fields, and types of these, of a definition of ROS."""
+    fields = dict(types.fielddefs[name][1])
+    plain = {"float64": float, "string": str, "int32": int, "uint32": int}
+
+    class Message:
+        __slots__ = tuple(fields)
+
+        def __init__(self):
+            for field, (_, detail) in fields.items():
+                if isinstance(detail, str):
+                    setattr(self, field, ros_kind(types, detail)())
+                elif detail[0] in plain:
+                    setattr(self, field, plain[detail[0]]())
+
+        def __setattr__(self, field, value):
+            detail = fields[field][1]
+            if isinstance(detail, str):
+                assert tuple(value.__slots__) == tuple(dict(types.fielddefs[detail][1]))
+            elif detail[0] in plain:
+                assert isinstance(value, plain[detail[0]])
+            else:
+                ((_, (item, _)), size) = detail
+                assert [type(one) for one in value] == [plain[item]] * size
+            object.__setattr__(self, field, value)
+
+    return Message
+
+
+@pytest.mark.parametrize("mass", [0.0, 0.01])
+def test_the_node_for_ros_answers_a_wrench_with_its_contact(tmp_path, monkeypatch, mass):
+    """With the definitions of its messages, but stand-ins of ROS itself, which is not on PyPI."""
+    pytest.importorskip("rosbags")
+    from rosbags.typesys import Stores, get_typestore
+
+    types = get_typestore(Stores.ROS2_HUMBLE)
     contact_map = vb.ContactMap.simulate(vb.samples.gamma(), grid=False)
-    contact_map.save(tmp_path / "wire.nc")
-    sensor = vb.sensors.Sensor(noise=[1e-6] * 3 + [2e-8] * 3)
+    contact_map.save(tmp_path / "own.nc")
+    sensor = vb.sensors.Sensor(noise=[1e-6] * 3 + [2e-8] * 3, mass=mass)
     vb.sensors.save_sensor(tmp_path / "sensor.toml", sensor)
     monkeypatch.chdir(tmp_path)
-    asked, published = [], []
+    stated = {"map": "own.nc", "frame_id": "left_whisker"}
+    heard, published = [], []
 
     class Node:
         def __init__(self, name):
             assert name == "vibrissa"
 
-        def create_publisher(self, kind, topic, depth):
-            return SimpleNamespace(publish=published.append)
+        def declare_parameter(self, name, value):
+            return SimpleNamespace(value=stated.get(name, value))
 
-        def create_subscription(self, kind, topic, answer, depth):
-            asked.append(answer)
+        def create_publisher(self, kind, topic, qos):
+            assert isinstance(qos, int)
 
-    def pose():
-        inner = SimpleNamespace(position=SimpleNamespace())
-        return SimpleNamespace(pose=SimpleNamespace(pose=inner))
+            def publish(message):
+                assert isinstance(message, kind)
+                published.append(message)
 
-    kinds = {"PoseWithCovarianceStamped": pose, "WrenchStamped": None}
+            return SimpleNamespace(publish=publish)
+
+        def create_subscription(self, kind, topic, answer, qos):
+            assert qos == "best effort"  # reliable ones do not receive what sensors publish
+            heard.append((kind, answer))
+
+    names = ("WrenchStamped", "PoseWithCovarianceStamped")
+    kinds = {name: ros_kind(types, f"geometry_msgs/msg/{name}") for name in names}
     for name, held in (
         ("rclpy", {"init": lambda: None, "spin": lambda node: None}),
         ("rclpy.node", {"Node": Node}),
+        ("rclpy.qos", {"qos_profile_sensor_data": "best effort"}),
         ("geometry_msgs", {}),
         ("geometry_msgs.msg", kinds),
     ):
@@ -153,16 +197,24 @@ def test_the_node_for_ros_answers_a_wrench_with_its_contact(tmp_path, monkeypatc
         monkeypatch.setitem(sys.modules, name, module)
     (code,) = blocks(PAGES["streams.md"], "py")
     exec(compile(code, "streams.md", "exec"), {})
+    ((kind, answer),) = heard
     bent = vb.deflect(contact_map.whisker, vb.PointContact([24e-3, 14e-3, 2e-3]))
-    for force, moment in ((bent.force, bent.moment), (0.0 * bent.force, 0.0 * bent.moment)):
-        wrench = SimpleNamespace(
-            force=SimpleNamespace(**dict(zip("xyz", force, strict=True))),
-            torque=SimpleNamespace(**dict(zip("xyz", moment, strict=True))),
-        )
-        asked[0](SimpleNamespace(header="stamp", wrench=wrench))
-    (answer,) = published
-    place = answer.pose.pose.position
+    noise = np.random.default_rng(1).normal(size=(100, 6)) * sensor.noise
+    contact = np.concatenate([bent.force, bent.moment])
+    for wrench in (contact, *noise):  # noise of a free whisker has no contact
+        message = kind()
+        message.header.frame_id, message.header.stamp.sec = "sensor", 7
+        for part, values in (("force", wrench[:3]), ("torque", wrench[3:])):
+            for axis, value in zip("xyz", values.tolist(), strict=True):
+                setattr(getattr(message.wrench, part), axis, value)
+        if mass:
+            with pytest.raises(ValueError, match="the rotation from whisker to laboratory"):
+                answer(message)
+            return
+        answer(message)
+    (found,) = published
+    place = found.pose.pose.position
     assert [place.x, place.y, place.z] == pytest.approx(bent.contact_point, abs=1e-6)
-    assert answer.header == "stamp"
-    assert len(answer.pose.covariance) == 36
-    assert 0.0 < answer.pose.covariance[0] < 1e-6
+    assert (found.header.frame_id, found.header.stamp.sec) == ("left_whisker", 7)
+    assert 0.0 < found.pose.covariance[0] < 1e-6
+    assert found.pose.covariance[21] > 1.0

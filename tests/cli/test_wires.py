@@ -23,6 +23,23 @@ def test_a_map_of_a_steel_wire(tmp_path):
     assert "100 mm" in wire._repr_html_()  # the bar in its picture: a third of it
 
 
+@pytest.mark.parametrize("scale", [1.0, 20.0])
+def test_the_noise_of_a_rat_s_whisker_is_questioned_for_a_rod(tmp_path, gamma_map, scale):
+    """A rod of the same shape: its contacts would be stated far too exactly."""
+    stiff = gamma_map.whisker.scaled(radius_factor=scale)
+    contact_map = vb.ContactMap.simulate(stiff, grid=False)
+    contact_map.save(tmp_path / "rod.nc")
+    bent = vb.deflect(stiff, vb.PointContact([24e-3, 13e-3, 2e-3]))
+    row = ",".join(map(repr, [*bent.force.tolist(), *bent.moment.tolist()]))
+    (tmp_path / "one.csv").write_text(f"Fx,Fy,Fz,Mx,My,Mz\n{row}\n")
+    words = ["estimate", str(tmp_path / "one.csv"), "--map", str(tmp_path / "rod.nc"), "--force"]
+    for noise in ((), ("--force-noise", "3000", "--moment-noise", "50")):
+        done = CliRunner().invoke(app, [*words, "-o", str(tmp_path / "out.csv"), *noise])
+        assert done.exit_code == 0, done.exception
+        questioned = "no noise is stated" in " ".join(done.output.split())
+        assert questioned == (scale > 1.0 and not noise)
+
+
 def test_the_same_shape_in_another_material(tmp_path):
     path = tmp_path / "map.nc"
     assert run("--base-radius", 0.15, "--modulus", 2, "-o", path).exit_code == 0

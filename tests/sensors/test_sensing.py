@@ -245,6 +245,32 @@ def test_any_frame_is_found_from_known_loads(rng, number):
     assert np.mean(away) == pytest.approx(6.0, rel=0.35)
 
 
+@pytest.mark.filterwarnings("ignore:the residuals are")
+def test_covariances_of_frame_offset_and_weight_hold_what_the_misfit_shows(rng):
+    """With readings eight times as noisy as stated, as by a table's vibration."""
+    stated, actual = Sensor(noise=[3e-3] * 3 + [5e-5] * 3), 8.0
+    squared = []
+    for frame in frames(rng, 24):
+        arms = np.repeat([[0.05, 0.0, 0.0], [0.1, 0.0, 0.0]], 6, axis=0)
+        loads = np.tile(np.concatenate([np.eye(3), -np.eye(3)]), (2, 1))
+        loads = np.concatenate([loads, np.cross(arms, loads)], axis=1)
+        read = loads @ frame.from_base().T + actual * stated.noise * rng.normal(size=(12, 6))
+        found = calibrate_frame(read, loads, force_noise=3e-3, moment_noise=5e-5)
+        turn = Rotation.from_matrix(found.frame.axes @ frame.axes.T).as_rotvec()
+        away = np.concatenate([turn, found.frame.position - frame.position])
+        squared.append(away @ np.linalg.solve(found.covariance, away) / 6)
+        held = replace(stated, frame=frame, bias=0.1, mass=0.05, mass_moment=(1e-4, 0.0, 2e-4))
+        turns = Rotation.random(12, random_state=rng.integers(1 << 30)).as_matrix()
+        free = replace(held, noise=actual * stated.noise)
+        read = free.read(np.arange(12.0), np.zeros((12, 6)), rng.integers(1 << 30), turns)
+        weighed = calibrate_weight(held, read, turns)
+        away = np.array([*weighed.sensor.bias - 0.1, weighed.sensor.mass - 0.05])
+        known = weighed.covariance[:7, :7]
+        squared.append(away @ np.linalg.solve(known, away) / 7)
+    for kind in (squared[::2], squared[1::2]):
+        assert 0.6 < np.mean(kind) < 1.5
+
+
 def test_loads_that_leave_the_frame_open_are_refused(rng):
     force = np.outer(rng.uniform(0.1, 1.0, 10), [0.0, 0.0, 1.0])
     loads = np.concatenate([force, np.zeros((10, 3))], axis=1)

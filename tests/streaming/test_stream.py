@@ -371,6 +371,7 @@ def test_the_verb_answers_each_line_at_once_and_ends_cleanly(map_file, bent, wre
         rest, told = process.communicate()
         assert rest == ""
         assert "2 samples, 1 lines that could not be read" in told
+        assert "unique: 2" in told
         assert "Traceback" not in told
         assert process.returncode == 0
 
@@ -562,13 +563,32 @@ def test_the_offset_is_found_anew_from_the_first_samples(gamma_map, bent, wrench
         ContactStream(estimator(gamma_map), tare=3)
 
 
+def test_a_general_error_is_suspected_where_many_samples_have_no_contact(gamma_map, wrench):
+    """As with forces in gf, or rotations inverted: some contacts are found, and are wrong too."""
+    wrong = wrench[:8] * np.repeat([0.1, 1.0], 3)
+    for share, suspected in ((wrong, True), (wrench[:8], False)):
+        running = ContactStream(estimator(gamma_map, "Fx FT FD Mx MB MD", felt_above=5.0))
+        list(running.records(csv_lines(np.concatenate([share, wrench]))))
+        assert bool(advice(running)) == suspected
+        assert not suspected or "8 of 20 samples with signals" in advice(running)[0]
+
+
+def test_a_base_that_moves_now_and_then_in_millimetres_is_questioned(gamma_map):
+    running = ContactStream(estimator(gamma_map))
+    for i in range(100):  # at rest, and for a tenth of the time at 50 mm/s
+        running.poses.put(0.001 * i, np.eye(3), np.array([0.05 * min(i, 10), 0.0, 0.0]))
+    assert "is its position in m" in " ".join(advice(running))
+
+
 def test_times_in_a_smaller_unit_are_noticed(gamma_map, wrench):
     row = dict(zip(COMPONENTS, wrench[8].tolist(), strict=True))
     running = ContactStream(estimator(gamma_map))
     (record,) = running.records([json.dumps({"time": 1.7e18} | row)])
     assert "in ms, µs or ns" in record["error"]
-    list(running.records(json.dumps({"time": 1e6 * i} | row) for i in range(5)))
-    assert "is their time in s?" in " ".join(advice(running))
+    for step, noticed in ((1e6, True), (1.0, True), (0.01, False)):
+        running = ContactStream(estimator(gamma_map))
+        list(running.records(json.dumps({"time": step * i} | row) for i in range(5)))
+        assert ("is their time in s?" in " ".join(advice(running))) == noticed
 
 
 def test_a_serial_line_that_is_unplugged_is_named(tmp_path, monkeypatch):

@@ -378,6 +378,7 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions, weight: Gravi
     print_notes(known)
     with vb.io.in_file(signals):
         vb.io.check_scale(wrench, known)
+    how.noise.doubt(known)
     _doubt_axes(known, wrench, noise, weight)
     with progress_bars() as tell:
         if not maps and not how.whole:
@@ -440,6 +441,7 @@ def _around(signals: Path, target: Path, how: EstimateOptions, known: AroundOpti
             wrench = wrench.drop_vars("in_contact")
     else:
         wrench, whisker = wrench_from(signals), how.own.read()
+        how.noise.doubt(whisker)
     print_notes(whisker)
     with vb.io.in_file(signals):
         vb.io.check_scale(wrench, whisker)

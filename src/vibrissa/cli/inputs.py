@@ -100,6 +100,9 @@ class TrackedOptions(WhiskerOptions):
         return {"properties": properties}
 
 
+_FAINT = 1e-3  # default noise of a force, in units of EI/L², below which it is questioned
+
+
 @dataclass(frozen=True)
 class NoiseOptions:
     """Options for the noise of the sensor: that of each component, or their covariance."""
@@ -156,6 +159,17 @@ class NoiseOptions:
         if self.covariance is not None:
             return f"noise of {self.covariance}"
         return "noise {:g} µN and {:g} µN·m".format(*self._usual())
+
+    def doubt(self, whisker: vb.Whisker) -> None:
+        """Question the default noise, that of a rat's whisker, for a far stiffer one."""
+        size = whisker.base_bending_stiffness / whisker.length**2
+        if self.given or _FAINT * size < vb.sensors.FORCE_NOISE:
+            return
+        remark(
+            f"no noise is stated; the default, {self.described()}, is for a rat's whisker, and "
+            f"this one is stiffer (EI/L² is {size:.2g} N): state --force-noise and --moment-noise, "
+            "or contacts and their standard deviations are wrong"
+        )
 
 
 @dataclass(frozen=True)
@@ -243,6 +257,7 @@ def estimator_of(
     """Create an estimator for single measurements, from a sensor or from signals."""
     prior, errors = assumed.prior, assumed.errors
     if sensor is None:
+        noise.doubt(contact_map.whisker)
         return vb.Estimator(
             contact_map,
             using,

@@ -306,6 +306,8 @@ def _report(running: vb.streaming.ContactStream, lost: str, follow: bool) -> Non
     friction = vb.contacts.friction_assumed(running.friction)
     unread = f"{running.faults} lines that could not be read{lost}"
     remark(f"{whose}{running.samples} samples, {unread}; {friction}")
+    if running.statuses:
+        remark(whose + ", ".join(f"{name}: {n}" for name, n in running.statuses.most_common()))
     if running.events:
         remark(whose + ", ".join(f"{name}: {n}" for name, n in running.events.items()))
     _advise(running)

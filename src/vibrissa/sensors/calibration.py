@@ -234,7 +234,8 @@ class WeightCalibration:
     residual : (k,) array
         Root mean square residual of each channel.
     misfit : float
-        χ² per degree of freedom: near 1, unless the noise or something else is not as stated.
+        χ² per degree of freedom: near 1, unless the noise or something else is not as stated; if
+        it is above 1, the covariance is multiplied by it.
     """
 
     sensor: Sensor
@@ -314,6 +315,8 @@ def calibrate_weight(
             )
         effective[k] = False  # the mass is too small to be measured
         found, unknowns, covariance = _solved(sensor, design, y, noise, effective)
+    misfit = float((found.residuals**2).sum() / max(found.residuals.size - effective.sum(), 1))
+    covariance = max(1.0, misfit) * covariance
     calibrated = replace(
         sensor,
         bias=unknowns[:k],
@@ -328,7 +331,6 @@ def calibrate_weight(
             stacklevel=2,
         )
     left = found.residuals.reshape(-1, k) * noise
-    misfit = float((found.residuals**2).sum() / max(found.residuals.size - effective.sum(), 1))
     warn_of_misfit(
         misfit,
         "that the rotations are those of the whisker's base (not of a flange), from the whisker "

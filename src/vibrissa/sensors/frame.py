@@ -152,7 +152,8 @@ class FrameCalibration:
     force_residual, moment_residual : float
         Root mean square residuals of components, N and N·m.
     misfit : float
-        χ² per degree of freedom: near 1, unless noise, loads or gain are not as stated.
+        χ² per degree of freedom: near 1, unless noise, loads or gain are not as stated; if it is
+        above 1, the covariance is multiplied by it.
     """
 
     frame: SensorFrame
@@ -231,10 +232,14 @@ def calibrate_frame(
         method="lm",
     )
     misfit = float((fit.fun**2).sum() / max(fit.fun.size - 6, 1))
-    warn_of_misfit(misfit, "the loads and where they pull, their signs, offset and units")
+    warn_of_misfit(
+        misfit,
+        "the loads and where they pull, their signs, offset and units, and the sensor's gain and "
+        "cross-talk (`calibrate_mixing` fits these)",
+    )
     rows = fit.fun.reshape(-1, 6) * noise
     jacobian = np.asarray(fit.jac, dtype=np.float64)
-    spread = np.asarray(np.linalg.inv(jacobian.T @ jacobian), dtype=np.float64)
+    spread = np.asarray(max(1.0, misfit) * np.linalg.inv(jacobian.T @ jacobian))
     return FrameCalibration(
         frame(fit.x),
         spread,

@@ -28,7 +28,7 @@ from vibrissa.status import Event
 from vibrissa.streaming.lines import FRAME, LineKind, Lines, Poses, Sample
 
 _ANEW = 1.0  # decrease of time above which the sender has restarted, s
-_SLOW = 100.0  # interval of samples above which the unit of time is probably smaller than s
+_SLOW = 0.9  # interval of samples from which the unit of time is probably smaller than s
 # Statuses that state neither contact nor its absence.
 _SILENT = ("missing", "tare", "degenerate")
 _MESSAGE = 400  # largest length of a message about an unreadable line, which may quote the line
@@ -209,7 +209,7 @@ class ContactStream:
         if time < self._time - (_ANEW if self.lines.headers == self._headers else 0.0):
             self._forget()
         self._headers = self.lines.headers
-        self.slow += time > self._time + _SLOW > -math.inf
+        self.slow += sample.time is not None and time > self._time + _SLOW > -math.inf
         self._time = max(self._time, time)
         rotation, position = self._pose(sample, time)
         sensor, gravity = self._estimator.sensor, None
@@ -424,7 +424,11 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-_NEARLY_ALL = 0.9  # share of samples above which a general error is suspected
+_NEARLY_ALL = 0.9  # share of samples above which a wrong unit of time is suspected
+# Share of samples with signals that no contact explains, and their number, from which a general
+# error is suspected: noise alone leaves one in a thousand unexplained.
+_MANY, _SEVERAL = 0.2, 5
+_FAST = 0.02  # share of poses at an implausible speed above which their unit is questioned
 
 
 def advice(stream: ContactStream) -> list[str]:
@@ -439,16 +443,17 @@ def advice(stream: ContactStream) -> list[str]:
             "The accelerometer's readings change nothing: neither the whisker (gravity, with its "
             "density) nor the sensor has a weight."
         )
-    if touching > 0 and unexplained > _NEARLY_ALL * touching:
+    if unexplained > _MANY * touching and (unexplained >= _SEVERAL or unexplained == touching):
         larger = (
             "are larger than any that this whisker can give"
             if counts["outside_map"] > unexplained / 2
-            else "are of no contact that this whisker can have"
+            else "are of no contact without friction that this whisker can have"
         )
         out.append(
-            f"Nearly all signals {larger}: are they in N and N·m (or in the units of the sensor's "
-            "mixing), is the offset removed, and are the sensor's axes, sign and weight, the "
-            "base's rotation and the whisker's stiffness right?"
+            f"{unexplained} of {touching} samples with signals {larger}: are they in N and N·m (or "
+            "in the units of the sensor's mixing), is the offset removed, and are the sensor's "
+            "axes, sign and weight, the base's rotation and the whisker's stiffness right? The "
+            "other contacts may be wrong as well."
         )
     if measured > 0 and not touching:
         out.append(
@@ -461,7 +466,7 @@ def advice(stream: ContactStream) -> list[str]:
             "have reached the sensor's largest reading."
         )
     if stream.slow > _NEARLY_ALL * max(total - 1, 1):
-        out.append("Samples lie minutes apart: is their time in s?")
-    if stream.poses.too_fast > 0.5 * stream.poses.number > 0:
-        out.append("The base moves at more than 50 m/s: is its position in m, its time in s?")
+        out.append("Samples are a second or more apart: is their time in s?")
+    if stream.poses.too_fast > _FAST * stream.poses.number > 0:
+        out.append("The base moves at more than 20 m/s: is its position in m, its time in s?")
     return out

@@ -304,7 +304,7 @@ def rotation_of(quaternion: Sequence[float]) -> Array:
 
 # Largest extrapolation beyond the last pose, in units of the interval between the last two.
 _LONGEST = 5.0
-_TOO_FAST = 50.0  # implausible speed of a base, m/s
+_TOO_FAST = 20.0  # implausible speed of a base, m/s
 
 
 class Pose(NamedTuple):
@@ -338,7 +338,7 @@ class Poses:
     number : int
         Number of poses so far.
     too_fast : int
-        Number of poses at a speed of more than 50 m/s, which suggests wrong units.
+        Number of poses at a speed of more than 20 m/s, which suggests wrong units.
     """
 
     def __init__(

@@ -28,11 +28,11 @@ from vibrissa.contacts.engine.prior import Prior, refuse_tip
 from vibrissa.contacts.engine.readout import Measurement
 from vibrissa.contacts.estimator import Estimator
 from vibrissa.contacts.following.mixture import Mixture, learn, predict, room, tidy, unaccounted
-from vibrissa.contacts.following.onset import Beginning, Gaussians
+from vibrissa.contacts.following.onset import Beginning, Gaussians, groups
 from vibrissa.contacts.sensing.noise import explained
 from vibrissa.contacts.uncertainty.posterior import LEFT, THREE_SIGMA
 from vibrissa.deferred import special
-from vibrissa.numerics import AnyArray, Array, IntArray
+from vibrissa.numerics import AnyArray, Array
 from vibrissa.rod import charted_rod
 from vibrissa.status import Status
 
@@ -53,9 +53,6 @@ _GAP, _FORGOTTEN = 0.1, 0.5
 
 
 _SURE = 0.99  # probability above which a contact is no longer ambiguous
-# Squared Mahalanobis distance, by the sum of both covariances, below which hypotheses form one
-# group without a gap.
-_TOGETHER = 4.0
 # Trial factors of a covariance, and a negligible probability.
 _FACTORS, _NOTHING = np.linspace(1.0, 4.0, 31), 1e-12
 _EXPLAINED = (Status.UNIQUE, Status.AMBIGUOUS, Status.UNDERDETERMINED)
@@ -393,7 +390,7 @@ def combined(
     if n == 1:
         mean, probability, covariance = mixture.mean[0], 1.0, spreads[0]
     else:
-        group = _groups(points, spreads)
+        group = groups(points, mixture.spread[:, :3, :3], b)
         shares = np.bincount(group, weights)
         best = group == shares.argmax()
         mean = weights[best] @ mixture.mean[best] / weights[best].sum()
@@ -432,27 +429,3 @@ def _widening(weights: Array, away: Array, spreads: Array, covariance: Array) ->
     beyond = special.gammaincc(mean**2 / variance, squares * mean / variance) @ weights
     left = np.log(np.maximum(beyond / weights.sum(), _NOTHING))
     return float(np.interp(-math.log(LEFT), -left, _FACTORS))
-
-
-def _groups(points: Array, spreads: Array) -> IntArray:
-    """Index (n,) of the group of each hypothesis: hypotheses without a gap between them."""
-    n = len(points)
-    apart = points[:, None] - points[None]
-    both = spreads[:, None] + spreads[None]
-    far = (apart * np.linalg.solve(both, apart[..., None])[..., 0]).sum(axis=-1)
-    near = far < _TOGETHER
-    group = np.full(n, -1)
-    number = 0
-    for i in range(n):
-        if group[i] >= 0:
-            continue
-        reached = np.zeros(n, np.bool_)
-        reached[i] = True
-        while True:
-            more = near[reached].any(axis=0) | reached
-            if (more == reached).all():
-                break
-            reached = more
-        group[reached] = number
-        number += 1
-    return group

@@ -9,6 +9,11 @@ likelihood and window together are largest in Ω, a Gaussian is placed with thei
 
 If the measurement determines the arc length well, the Gaussians are combined again into one.
 
+Near slip-off, volumes of contact points nearly vanish although contacts occur there. Separate
+groups of Gaussians therefore have the mean of two probabilities: with volumes, and from the highest
+likelihood in each group alone, as the candidates of an estimate do
+(:mod:`~vibrissa.contacts.ranking`).
+
 A contact that was not detected in the sample before has bent the whisker no farther than it has
 moved since. With u, the distance of the contact point from its rest position over L, the prior is
 
@@ -61,18 +66,25 @@ _MOST = 24  # largest number of samples of a curve or surface from which hypothe
 _VAGUE = 0.2  # standard deviation, over L, of what a measurement does not determine
 # Smallest standard deviation of a starting hypothesis, over L, so that matrices stay regular.
 _FINEST = 1e-7
+# Squared Mahalanobis distance, by the sum of both covariances, below which hypotheses form one
+# group without a gap.
+_TOGETHER = 4.0
+# Squared Mahalanobis distance, by either covariance, below which Gaussians form one group for the
+# prior; a narrow one within a wide one is separate.
+_SEPARATE = 9.0
 # Codes of arc length and contact point among the channels.
 _STATION, _POINT = FITTED.index("s"), [FITTED.index(name) for name in ("px", "py", "pz")]
 # Displacement along each axis of a covariance at which its linearisation is checked, in standard
 # deviations, and its largest relative error there.
 _REACH, _BENT = 2.0, 0.25
+_FLAT = 1e-12  # smallest variance of a contact point, relative to that in all directions
 
 
 class Gaussians(NamedTuple):
     """Gaussians of contact points in the whisker's frame, over L, one about each contact.
 
     x (n, 4), (F, p) (n, 6), means (n, 3), covariances (n, 3, 3), effects of shared errors on p (n,
-    3, e), log weights (n,).
+    3, e), log weights, and log densities of the measurement at the contacts (n,).
     """
 
     contacts: Array
@@ -81,6 +93,7 @@ class Gaussians(NamedTuple):
     covariances: Array
     by_errors: Array
     weights: Array
+    likely: Array
 
 
 class Beginning:
@@ -134,7 +147,7 @@ class Beginning:
             far = (away * np.linalg.solve(both, away[..., None])[..., 0]).sum(axis=1)
             kept &= far > _PART
         parts = zip(valley, whole, strict=True)
-        return Gaussians(*(np.concatenate([a[kept], b[sharp]]) for a, b in parts))
+        return _both_priors(Gaussians(*(np.concatenate([a[kept], b[sharp]]) for a, b in parts)))
 
     def candidates(self, measurement: Measurement, located: Contact, reach: float) -> Gaussians:
         """Gaussians of the separate candidates of one sample, unsplit."""
@@ -169,11 +182,10 @@ class Beginning:
         _, slope = solve_forces(self._chart.discretization, x, tangents=True)
         across, by_errors = self._across(measurement, values, slope)
         covariance = across + _gaps_between(values[:, 3:]) + _FINEST**2 * np.eye(3)
-        weights = 0.5 * np.linalg.slogdet(covariance)[1] - 0.5 * located.chi_squared
         points = values[:, 3:]
-        return Gaussians(
-            x, values, points, covariance, by_errors, weights + self._log_prior(x, points, reach)
-        )
+        likely = self._log_prior(x, points, reach) - 0.5 * located.chi_squared
+        weights = likely + 0.5 * np.linalg.slogdet(covariance)[1]
+        return Gaussians(x, values, points, covariance, by_errors, weights, likely)
 
     def _across(self, measurement: Measurement, values: Array, slope: Array) -> tuple[Array, Array]:
         """Covariances across a curve or surface, and the effects of shared errors."""
@@ -278,14 +290,14 @@ class Beginning:
         covariance[~known] = _VAGUE**2 * np.eye(3)
         covariance += _FINEST**2 * np.eye(3)
         by_errors = by_channels[:, :, :k] @ w @ self._wrong(fits.values)
-        total = np.log(np.where(known, mass, 1.0)) - 0.5 * fits.misfits
-        total += 1.5 * math.log(2.0 * math.pi) + np.array([log_weights(one, q) for one in w])
+        likely = np.array([log_weights(one, q) for one in w]) - 0.5 * fits.misfits
+        likely += self._log_prior(x, fits.values[:, 3:], reach)
+        total = likely + np.log(np.where(known, mass, 1.0)) + 1.5 * math.log(2.0 * math.pi)
         if windows is not None:
             total -= 0.5 * math.log(2.0 * math.pi)
-        total += self._log_prior(x, fits.values[:, 3:], reach)
         total[~known] = -np.inf
         points = fits.values[:, 3:] + shift
-        return Gaussians(x, fits.values, points, covariance, by_errors, total)
+        return Gaussians(x, fits.values, points, covariance, by_errors, total, likely)
 
     def _log_prior(self, x: Array, points: Array, reach: float) -> Array:
         rest = np.stack(
@@ -299,6 +311,51 @@ class Beginning:
         now = self._rest @ turn.T + base
         then = self._rest @ before[0].T + before[1]
         return float(np.sqrt(((now - then) ** 2).sum(axis=1).max()))
+
+
+def _both_priors(found: Gaussians) -> Gaussians:
+    """Average the probabilities of separate groups with volumes and from likelihoods alone.
+
+    Near slip-off volumes nearly vanish, although contacts occur there.
+    """
+    known = np.isfinite(found.weights)
+    found = Gaussians(*(part[known] for part in found))
+    spreads = _whole_covariances(found.covariances, found.by_errors)
+    far = _squared_distances(found.points, spreads[:, None])
+    group = _connected(np.maximum(far, far.T) < _SEPARATE)
+    if not group.any():
+        return found
+    volumes, fits = np.full((2, group.max() + 1), -np.inf)
+    np.logaddexp.at(volumes, group, found.weights)
+    np.maximum.at(fits, group, found.likely)
+    shares = [np.exp(log - np.logaddexp.reduce(log)) for log in (volumes, fits)]
+    change = np.log(0.5 * (shares[0] + shares[1])) - volumes
+    return found._replace(weights=found.weights + change[group])
+
+
+def groups(points: Array, covariances: Array, by_errors: Array) -> IntArray:
+    """Index (n,) of the group of each Gaussian: Gaussians without a gap between them."""
+    spreads = _whole_covariances(covariances, by_errors)
+    return _connected(_squared_distances(points, spreads[:, None] + spreads) < _TOGETHER)
+
+
+def _whole_covariances(covariances: Array, by_errors: Array) -> Array:
+    """Covariances that include the effects of shared errors."""
+    return np.asarray(covariances + by_errors @ np.swapaxes(by_errors, 1, 2))
+
+
+def _squared_distances(points: Array, covariances: Array) -> Array:
+    """Squared Mahalanobis distances (n, n) of all points (n, 3) from each other."""
+    apart = points[:, None] - points
+    return np.asarray((apart * np.linalg.solve(covariances, apart[..., None])[..., 0]).sum(axis=-1))
+
+
+def _connected(near: AnyArray) -> IntArray:
+    """Index (n,) of the connected part of a symmetric graph (n, n) to which each node belongs."""
+    reached, before = near, ~near
+    while (reached != before).any():
+        before, reached = reached, reached @ reached
+    return np.unique(reached.argmax(axis=1), return_inverse=True)[1]
 
 
 def _gaps_between(points: Array) -> Array:
@@ -340,9 +397,10 @@ def _linear(
     """Whether a covariance describes the scatter of the contact point, tested on the rod.
 
     The rod is solved two standard deviations to both sides of the contact along each principal axis
-    of the covariance of x. There, channels (in standard deviations) and contact point (relative to
-    its own scatter) must agree with the derivatives to a quarter of the displacement, and the
-    contact must be on the whisker.
+    of the covariance of x. There, channels and contact point must agree with the derivatives to a
+    quarter of the displacement, in standard deviations, and the contact must be on the whisker.
+    Near slip-off the derivatives leave the contact point one direction in which it cannot move,
+    and its true displacement there is many standard deviations long.
     """
     finite = np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(values).all(axis=1)
     good: AnyArray = np.asarray(finite)
@@ -365,10 +423,12 @@ def _linear(
     predicted = np.swapaxes(channel_derivatives(value, slope, names) @ steps, 1, 2)
     bent = np.linalg.norm(np.einsum("nij,nmj->nmi", w, away - predicted), axis=2)
     point_predicted = np.swapaxes(slope[:, 3:] @ steps, 1, 2)
-    off = np.linalg.norm(moved[..., 3:] - value[:, None, 3:] - point_predicted, axis=2)
-    scatter = np.sqrt(np.einsum("nij,njk,nik->n", slope[:, 3:], covariance[rows], slope[:, 3:]))
-    with np.errstate(divide="ignore", invalid="ignore"):  # without noise there is no scatter
-        bent = np.maximum(bent, off / scatter[:, None])
+    off = moved[..., 3:] - value[:, None, 3:] - point_predicted
+    spread = np.einsum("nij,njk,nlk->nil", slope[:, 3:], covariance[rows], slope[:, 3:])
+    size = np.trace(spread, axis1=1, axis2=2)[:, None, None]
+    spread += (_FINEST**2 + _FLAT * size) * np.eye(3)
+    off = (off[..., None, :] @ np.linalg.solve(spread[:, None], off[..., None]))[..., 0, 0]
+    bent = np.maximum(bent, np.sqrt(off))
     still = (steps == 0.0).all(axis=1)
     good[rows] = (on & (bent <= _BENT * _REACH) | still).all(axis=1)
     return good

@@ -226,6 +226,10 @@ class Estimator:
             self._ambiguity = Ambiguity(contact_map.chart, self.readout)
         self._last: Array | None = None
 
+    def __repr__(self) -> str:
+        of = self.contact_map.whisker
+        return f"<Estimator from ({', '.join(self.announced)}) of {of!r}>"
+
     @property
     def softened(self) -> bool:
         """Whether friction, or any parameter of the rod that measurements share, is uncertain."""

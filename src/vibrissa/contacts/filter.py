@@ -179,6 +179,9 @@ class ContactFilter:
         self._limit = explained(len(how.own))
         self.reset()
 
+    def __repr__(self) -> str:
+        return f"<ContactFilter of {self.estimator!r}>"
+
     def reset(self) -> None:
         """Discard all hypotheses, as when contact has been lost."""
         self._mixture = room(0, self._errors)

@@ -218,3 +218,13 @@ def test_progress_in_a_notebook_and_in_a_terminal(monkeypatch, capsys):
     assert 'value="1" max="4"' in first
     assert "&lt;signals&gt; 1/4" in first
     assert second.endswith("done 3/4")
+
+
+def test_what_a_session_prints_is_short():
+    contact_map = vb.ContactMap.simulate(WHISKER, grid=False)
+    locate = vb.Estimator(contact_map, "MD Fx MB", noise={"Fx": 1e-6, "MB": 2e-8, "MD": 0.1})
+    nothing = vb.deflect(WHISKER, vb.PointContact(np.zeros((0, 3))))
+    assert repr(locate) == f"<Estimator from (MD, Fx, MB) of {WHISKER!r}>"
+    assert repr(vb.ContactFilter(locate)) == f"<ContactFilter of {locate!r}>"
+    assert repr(nothing) == "<Deflection of (0,) by PointContact: none>"
+    assert len(repr(vb.sensors.Sensor())) < 120

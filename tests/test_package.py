@@ -33,6 +33,12 @@ def test_every_package_is_public():
     assert set(dir(vibrissa)) == set(vibrissa.__all__)
 
 
+@pytest.mark.parametrize("name", ["cameras", "contacts", "recording", "viewer", "whisker"])
+def test_completion_lists_public_names(name):
+    module = importlib.import_module(f"vibrissa.{name}")
+    assert dir(module) == sorted(module.__all__)
+
+
 def imports_of(path):
     """Modules of vibrissa that a file names in its imports."""
     for node in ast.walk(ast.parse(path.read_text())):

@@ -147,6 +147,7 @@ __all__ = [
     "whisker",
     "whisker_array",
 ]
+__dir__ = __all__.copy  # completion lists the public names only, here and in every package
 
 # Names by the package or module that they are imported from.
 _HOMES = {
@@ -165,7 +166,3 @@ _HOMES = {
 }
 
 __getattr__ = names_from(__name__, _HOMES, __all__)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)

@@ -38,6 +38,7 @@ __all__ = [
     "save_cameras",
     "triangulate",
 ]
+__dir__ = __all__.copy
 
 
 PIXEL_SIZE = 58e-6

@@ -33,6 +33,7 @@ __all__ = [
     "tracking_scores",
     "truth_of",
 ]
+__dir__ = __all__.copy
 
 
 ERRORS = ("error_r", "error_theta", "error_phi", "error_distance")

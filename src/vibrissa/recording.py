@@ -42,6 +42,7 @@ __all__ = [
     "Group",
     "Recording",
 ]
+__dir__ = __all__.copy
 
 
 @dataclass(frozen=True)

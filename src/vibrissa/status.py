@@ -272,7 +272,8 @@ def counted(codes: ArrayLike) -> str:
     >>> counted([0, 0, 2])
     'ok 2, no contact 1'
     """
-    return ", ".join(
+    texts = (
         f"{Status(code).name.lower().replace('_', ' ')} {count}"
         for code, count in zip(*np.unique(codes, return_counts=True), strict=True)
     )
+    return ", ".join(texts) or "none"

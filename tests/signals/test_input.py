@@ -52,3 +52,24 @@ def test_masked_pixels_and_arc_lengths_are_missing():
     assert np.isnan(found).all(axis=1).tolist() == [True, False, False]
     along = np.ma.array([5e-3, 10e-3], mask=[True, False])
     assert np.isnan(WHISKER.position(along)[:, 0]).tolist() == [True, False]
+
+
+def test_components_may_be_along_any_dimension_of_labelled_arrays():
+    force, moment = 1e-3 * POINTS, 1e-5 * POINTS[::-1]
+    expected = vb.base_signals(force, moment)
+    first, last = (("space", "time"), force.T), (("time", "axis"), force)
+    for labelled in (xr.DataArray(data, dims=dims) for dims, data in (first, last)):
+        for other in (moment, xr.DataArray(moment, dims=("time", "component"))):
+            found = vb.base_signals(labelled, other)
+            assert found.sizes == {"time": 3}
+            np.testing.assert_array_equal(found.to_array(), expected.to_array())
+
+
+def test_signals_may_be_chosen_by_an_array_and_not_by_nothing():
+    force = vb.deflect(WHISKER, vb.PointContact(POINTS[0]))
+    signals = vb.base_signals(force.force, force.moment)
+    contact_map = vb.ContactMap.simulate(WHISKER, grid=False)
+    found = contact_map.estimate(signals, np.array(["Fx", "MB", "MD"]))
+    np.testing.assert_allclose(found.point, POINTS[0], atol=1e-9)
+    with pytest.raises(ValueError, match=r"3 different signals.* got None"):
+        contact_map.estimate(signals, None)

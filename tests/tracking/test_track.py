@@ -1,5 +1,6 @@
 """The whole way, from filmed frames to contact and wrench, against the simulated truth."""
 
+import pickle
 import sys
 from dataclasses import replace
 
@@ -615,3 +616,7 @@ def test_linear_algebra_does_not_wait_for_threads_of_its_own():
         assert used.__wrapped__() == {2}
     assert trace_video.__wrapped__
     assert track.__wrapped__
+
+
+def test_options_can_be_sent_to_processes():
+    assert pickle.loads(pickle.dumps(TrackOptions())) == TrackOptions()

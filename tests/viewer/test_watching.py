@@ -14,6 +14,7 @@ from vibrissa.io import Footage, write_video
 from vibrissa.recording import Recording
 from vibrissa.viewer.readout import chart, cursor
 from vibrissa.viewer.trial import (
+    LAYERS,
     fitted_body,
     legends,
     moment_drawing,
@@ -135,6 +136,13 @@ def test_an_unknown_shape_has_no_picture(trial):
 def test_surroundings_can_be_hidden(trial):
     assert {"object 0", "ruler"} <= set(surroundings(trial))
     assert surroundings(trial, layers=()) == {}
+
+
+def test_contacts_can_be_hidden(trial):
+    frame = int(np.flatnonzero(trial.touching[:, 0])[0])
+    layers = set(LAYERS) - {"Contacts"}
+    hidden = moment_drawing(trial, frame, 5.0).keys() - moment_drawing(trial, frame, 5.0, layers)
+    assert hidden == {"contact 0"}
 
 
 def test_pictures_show_the_trace_where_the_camera_sees_the_whisker(trial, recording):

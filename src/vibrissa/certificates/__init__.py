@@ -19,3 +19,4 @@ __all__ = [
     "prove_witness",
     "smallest_cone",
 ]
+__dir__ = __all__.copy

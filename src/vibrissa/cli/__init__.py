@@ -14,3 +14,4 @@ from vibrissa.cli.app import main
 __all__ = [
     "main",
 ]
+__dir__ = __all__.copy

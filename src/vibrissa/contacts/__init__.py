@@ -88,3 +88,4 @@ __all__ = [
     "friction_assumed",
     "second_contact",
 ]
+__dir__ = __all__.copy

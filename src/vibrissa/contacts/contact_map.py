@@ -212,6 +212,7 @@ class ContactMap:
         Contacts
             One contact for each measurement, with all candidates.
         """
+        using = using if isinstance(using, str) else selection(using)
         errors = common_errors(stiffness_sigma, gain_sigma, mixing_sigma)
         weight = Gravity.of(gravity)
         if base_rotation is not None and gravity is None:

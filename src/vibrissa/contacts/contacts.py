@@ -521,7 +521,7 @@ class Contact(_Located):
 
     def __repr__(self) -> str:
         where = ", ".join(f"{1e3 * value:.4g}" for value in self.point.tolist())
-        return f"<Contact {self.status.name} at ({where}) mm, {self.n_candidates} candidates>"
+        return f"<Contact {self.status.name} at ({where}) mm, candidates: {self.n_candidates}>"
 
     def _repr_html_(self) -> str:
         """Show the contact point about the base, with the numbers."""

@@ -43,35 +43,35 @@ class Estimator:
     contact_map : ContactMap
         Map of the whisker's contacts.
     using : str or sequence of str
-        Signals that a measurement has, in this order; fewer than three do not determine a contact,
-        but leave a curve or surface of them.
+        Signals of a measurement, in this order; fewer than three do not determine a contact, but
+        leave a curve or surface of contacts.
     noise : mapping or (6, 6) array_like, optional
-        Standard deviation of each signal, or covariance of (F, M), SI units: gives covariances, and
-        weighs more than three signals.
+        Standard deviation of each signal, or covariance of (F, M), SI units. Covariances of
+        contacts are computed from it, and it weights the signals if they are more than three.
     stiffness_sigma : float
-        Relative standard deviation of the whisker's bending stiffness E r⁴, in the covariances:
-        √(σ_E² + 16 σ_r²) of those of modulus and radius. It needs noise.
+        Relative standard deviation of the whisker's bending stiffness E r⁴, part of the
+        covariances: √(σ_E² + 16 σ_r²) for those of modulus and radius. It requires noise.
     felt_above : float
         Number of standard deviations within which signals count as zero, ``NOT_FELT``; 0, the
-        default, locates all. It needs noise.
+        default, locates all. It requires noise.
     gain_sigma : float or (6,) array_like
-        Relative standard deviation of the sensor's gains, of all or each of Fx, Fy, Fz, Mx, My, Mz.
+        Relative standard deviation of the sensor's gain, for all or each of Fx, Fy, Fz, Mx, My, Mz.
     mixing_sigma : float or (6, 6) array_like
-        Standard deviations of what each of these reads of all six; or one number, relative: of the
-        cross-talk among forces, and among moments.
+        Standard deviation of the response of each of these to each of the six components; or one
+        number, the relative standard deviation of the cross-talk among forces and among moments.
     prior : Prior, optional
         Possible contacts; others are left out of the candidates.
     compliance_sigma : float
-        Standard deviation of the base's compliance, rad/(N·m), as of `ContactMap.estimate`, for
-        three signals or more. It needs noise, and takes a millisecond more.
+        Standard deviation of the base's compliance, rad/(N·m), as in `ContactMap.estimate`, for
+        three signals or more. It requires noise, and takes a millisecond more.
     friction : float
-        Standard deviation of the ratio of the force along the whisker to that across it, as of
+        Standard deviation of the ratio of the force along the whisker to that across it, as in
         `ContactMap.estimate`, for three signals or more; it takes some tens of milliseconds more.
     gravity : Gravity or (3,) array_like, optional
-        Gravity that the whisker bends under, as of `ContactMap.estimate`, for three signals or
-        more; it takes some tens of milliseconds more. Where a measurement comes with the rotation
-        of the base, it is in the laboratory frame, and without a `Gravity.tare` the sensor counts
-        as tared in the first pose.
+        Gravity under which the whisker bends, as in `ContactMap.estimate`, for three signals or
+        more; it takes some tens of milliseconds more. For measurements with the rotation of the
+        base, it is in the laboratory frame, and without a `Gravity.tare` the sensor is taken to
+        have been tared in the first pose.
 
     See Also
     --------
@@ -226,6 +226,10 @@ class Estimator:
             refuse_tip(prior, f"{rank} do not determine a contact")
             self._ambiguity = Ambiguity(contact_map.chart, self.readout)
         self._last: Array | None = None
+
+    def __repr__(self) -> str:
+        of = self.contact_map.whisker
+        return f"<Estimator from ({', '.join(self.announced)}) of {of!r}>"
 
     @property
     def softened(self) -> bool:

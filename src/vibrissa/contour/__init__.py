@@ -28,3 +28,4 @@ __all__ = [
     "shape_from_dataset",
     "surface_grid",
 ]
+__dir__ = __all__.copy

@@ -25,3 +25,4 @@ __all__ = [
     "verdict_table",
     "witness_pairs",
 ]
+__dir__ = __all__.copy

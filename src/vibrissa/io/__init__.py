@@ -158,3 +158,4 @@ __all__ = [
     "save_tracks",
     "write_movie",
 ]
+__dir__ = __all__.copy

@@ -63,6 +63,7 @@ __all__ = [
     "solve",
     "weighted_quantile",
 ]
+__dir__ = __all__.copy
 
 __getattr__ = names_from(
     __name__,

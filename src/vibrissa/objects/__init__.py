@@ -19,3 +19,4 @@ __all__ = [
     "Sphere",
     "Surface",
 ]
+__dir__ = __all__.copy

@@ -30,3 +30,4 @@ __all__ = [
     "train_network",
     "with_network_errors",
 ]
+__dir__ = __all__.copy

@@ -74,3 +74,4 @@ __all__ = [
     "with_estimates",
     "with_signals",
 ]
+__dir__ = __all__.copy

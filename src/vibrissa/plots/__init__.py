@@ -52,3 +52,4 @@ __all__ = [
     "whisker_views",
     "witness_pair",
 ]
+__dir__ = __all__.copy

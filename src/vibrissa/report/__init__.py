@@ -32,3 +32,4 @@ __all__ = [
     "in_space",
     "reachable_space",
 ]
+__dir__ = __all__.copy

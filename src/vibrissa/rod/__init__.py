@@ -131,3 +131,4 @@ __all__ = [
     "stable",
     "stable_set",
 ]
+__dir__ = __all__.copy

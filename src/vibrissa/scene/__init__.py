@@ -52,3 +52,4 @@ __all__ = [
     "course_of",
     "deflection_angles",
 ]
+__dir__ = __all__.copy

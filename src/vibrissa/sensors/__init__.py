@@ -58,3 +58,4 @@ __all__ = [
     "save_sensor",
     "tare",
 ]
+__dir__ = __all__.copy

@@ -164,6 +164,10 @@ class Sensor:
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
+    def __repr__(self) -> str:
+        noise = ", ".join(f"{n} {s:.3g}" for n, s in zip(self.channels, self.noise, strict=True))
+        return f"<Sensor of {len(self.channels)} channels, with noise: {noise}>"
+
     @property
     def reads_wrench(self) -> bool:
         """Whether the channels are the six components at the whisker's base, in this order."""

@@ -68,3 +68,4 @@ __all__ = [
     "spherical",
     "within_cone",
 ]
+__dir__ = __all__.copy

@@ -42,10 +42,11 @@ DETECTED = 5.0
 
 
 def selection(
-    signals: str | Sequence[str], least: int = 3, exactly: int | None = None
+    signals: str | Sequence[str] | None, least: int = 3, exactly: int | None = None
 ) -> tuple[str, ...]:
     """Parse a choice of signals into their names, in canonical order."""
-    given = signals.replace(",", " ").split() if isinstance(signals, str) else list(signals)
+    given = signals.replace(",", " ").split() if isinstance(signals, str) else signals
+    given = [] if given is None else list(given)
     spelt = {name.lower(): name for name in SIGNALS}
     names = [spelt.get(str(name).lower(), name) for name in given]
     unknown = [name for name in names if name not in SIGNALS]
@@ -63,9 +64,10 @@ def base_signals(force: ArrayLike | xr.DataArray, moment: ArrayLike | xr.DataArr
     Parameters
     ----------
     force : array_like or DataArray
-        Force on the whisker in the whisker frame, N, shape (..., 3). The dimensions of a DataArray
-        other than ``space`` are kept, with their coordinates; those of a plain array are called
-        ``sample``, or ``axis_0``, ``axis_1``, ... if several.
+        Force on the whisker in the whisker frame, N, shape (..., 3). The components of
+        a DataArray are along ``space``, or else along its last dimension; its other dimensions are
+        kept, with their coordinates. Those of a plain array are called ``sample``, or ``axis_0``,
+        ``axis_1``, ... if several.
     moment : array_like or DataArray
         Moment about the base, N·m, same shape.
 
@@ -112,7 +114,7 @@ def labelled_wrench(
     force: ArrayLike | xr.DataArray, moment: ArrayLike | xr.DataArray
 ) -> tuple[Array, Array, tuple[str, ...], Coordinates]:
     """Force and moment as arrays of one shape, with names and coordinates of leading dimensions."""
-    given: list[ArrayLike | xr.DataArray] = [force, moment]
+    given = [_space_last(a) if isinstance(a, xr.DataArray) else a for a in (force, moment)]
     labels = [a for a in given if isinstance(a, xr.DataArray)]
     if len(labels) == 2:
         together = xr.broadcast(*_align(*labels), exclude=("space",))
@@ -125,9 +127,15 @@ def labelled_wrench(
         )
     if not labels:
         return f, m, leading_dims(f.shape[:-1]), {}
-    last = "space" if "space" in labels[0].dims else labels[0].dims[-1]
-    dims = tuple(str(d) for d in labels[0].dims if d != last)
+    dims = tuple(str(d) for d in labels[0].dims[:-1])
     return f, m, dims, coordinates(labels[0], dims)
+
+
+def _space_last(array: xr.DataArray) -> xr.DataArray:
+    """Array whose last dimension is that of the components, called ``space``."""
+    if "space" in array.dims:
+        return array.transpose(..., "space")
+    return array.rename({array.dims[-1]: "space"}) if array.dims else array.expand_dims("space")
 
 
 def _align(*arrays: xr.DataArray) -> tuple[xr.DataArray, ...]:

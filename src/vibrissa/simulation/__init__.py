@@ -52,3 +52,4 @@ __all__ = [
     "whisking",
     "within_reach",
 ]
+__dir__ = __all__.copy

@@ -35,3 +35,4 @@ __all__ = [
     "Pose",
     "Poses",
 ]
+__dir__ = __all__.copy

@@ -16,3 +16,4 @@ __all__ = [
     "read_study",
     "run_sweep",
 ]
+__dir__ = __all__.copy

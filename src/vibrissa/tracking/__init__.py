@@ -69,3 +69,4 @@ __all__ = [
     "track",
     "track_whisker",
 ]
+__dir__ = __all__.copy

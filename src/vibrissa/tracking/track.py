@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -120,7 +119,7 @@ class TrackOptions:
     offset: int | None = 0
     free: float = 0.1
     fit: FitOptions = field(default_factory=FitOptions)
-    properties: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    properties: Mapping[str, Any] = field(default_factory=dict)
     whisker: Whisker | None = None
     length: float | None = None
     fur: float = 0.0

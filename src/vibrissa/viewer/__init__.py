@@ -17,6 +17,7 @@ __all__ = [
     "view",
     "view_stream",
 ]
+__dir__ = __all__.copy
 
 
 def __getattr__(name: str) -> object:

@@ -260,9 +260,10 @@ def moment_drawing(
         at, force = trial.contacts[frame, i], trial.forces[frame, i]
         if not np.isfinite(at).all():
             continue
-        radius = float(mm(0.012 * whisker.length))
-        vertices, faces = scene.ellipsoid(mm(at), radius * np.eye(3))
-        out[f"contact {i}"] = scene.Body(vertices, faces, CONTACT)
+        if "Contacts" in layers:
+            radius = float(mm(0.012 * whisker.length))
+            vertices, faces = scene.ellipsoid(mm(at), radius * np.eye(3))
+            out[f"contact {i}"] = scene.Body(vertices, faces, CONTACT)
         if "Uncertainty" in layers and trial.covariance is not None:
             covariance = trial.covariance[frame, i]
             if np.isfinite(covariance).all() and np.sqrt(np.trace(covariance)) < _SHARP * 10.0:

@@ -42,5 +42,6 @@ __all__ = [
     "morphology",
     "whisker_array",
 ]
+__dir__ = __all__.copy
 
 __getattr__ = names_from(__name__, {"nearest": "nearest_on_chords"})  # compiled on first use

@@ -112,21 +112,21 @@ class ContactFilter:
     Parameters
     ----------
     estimator : Estimator
-        Locates single samples; it must know the noise.
+        Estimator of single samples, with noise.
     speed : float, optional
         Standard deviation of a component of the contact point's velocity in the laboratory, m/s; by
-        default a quarter of the whisker's length a second.
+        default a quarter of the whisker's length per second.
     persistence : float
-        Time after which the velocity has changed, τ, s.
+        Correlation time τ of the velocity, s.
     pose_sigma : float
-        Standard deviation of a component of the base's position, m: independent from sample to
+        Standard deviation of a component of the base's position, m, independent from sample to
         sample.
     birth : float
-        Probability that a sample shows another contact than any before.
+        Probability that a sample belongs to a new contact.
     memory : float
-        Time after which the errors that samples share, of the stiffness and of the sensor's gain
-        and mixing, have become others, s: first-order Gauss-Markov processes, as where a material
-        relaxes. By default infinite: they stay the same.
+        Correlation time, s, of the errors that samples share, those of the stiffness and of the
+        sensor's gain and mixing: first-order Gauss-Markov processes. By default infinite, so that
+        these errors are constant.
 
     Raises
     ------
@@ -176,6 +176,9 @@ class ContactFilter:
         self._errors = len(how.errors)
         self._limit = explained(len(how.own))
         self.reset()
+
+    def __repr__(self) -> str:
+        return f"<ContactFilter of {self.estimator!r}>"
 
     def reset(self) -> None:
         """Discard all hypotheses, as when contact has been lost."""

@@ -12,7 +12,7 @@ If the measurement determines the arc length well, the Gaussians are combined ag
 Near slip-off, volumes of contact points nearly vanish although contacts occur there. Separate
 groups of Gaussians therefore have the mean of two probabilities: with volumes, and from the highest
 likelihood in each group alone, as the candidates of an estimate do
-(:mod:`~vibrissa.contacts.ranking`).
+(:mod:`~vibrissa.contacts.engine.ranking`).
 
 A contact that was not detected in the sample before has bent the whisker no farther than it has
 moved since. With u, the distance of the contact point from its rest position over L, the prior is

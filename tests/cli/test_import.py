@@ -210,6 +210,9 @@ def test_points_that_mislead_are_noticed(trial):
     assert "from tip to base" in found.notes[0]
     few = tracker_traces(labelled(raw(image[..., ::4, :]), "a"), CAMERAS)
     assert any("track more points" in note for note in few.notes)
+    image[:, :, 1, 4] = np.nan
+    without = tracker_traces(labelled(raw(image), "a"), CAMERAS)
+    assert f"point 4 is never known in {CAMERAS[1].name}" in without.notes[0]
     image[:, :, 1, 0] = np.nan
     with pytest.raises(ValueError, match=f"never known in {CAMERAS[1].name}"):
         tracker_traces(labelled(raw(image), "a"), CAMERAS)

@@ -23,6 +23,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.contacts import rubbing_misfits
+from vibrissa.io import slow_steps
 from vibrissa.numerics import Array
 from vibrissa.quantities import unit_fault
 from vibrissa.recording import VARIABLES, Group, Recording, faults_in, recorded
@@ -72,6 +73,13 @@ def check_recording(recording: xr.DataTree) -> None:
         faults.append("its time does not increase from frame to frame, or is missing in some")
     if faults := faults or _position_faults(Recording(recording)):
         raise ValueError(f"the recording cannot be used: {'; '.join(faults)}")
+    if usual := slow_steps(time):
+        warnings.warn(
+            f"the recording has frames {usual:.3g} s apart: its time has to be in seconds, and "
+            "rates of change are wrong if it is in ms",
+            UserWarning,
+            stacklevel=1,
+        )
     if changed := edited(recording):
         warnings.warn(
             f"the recording was edited after its {changed[0]} had been computed: these, and all "

@@ -311,7 +311,8 @@ def _wanted(
     if not often.size:
         raise ValueError(
             f"no whisker has {_FEWEST} points or more in half of the frames: "
-            f"{names[int(np.argmax(share))]} has them in {100.0 * share.max():.0f} %"
+            f"{names[int(np.argmax(share))]} has them in {100.0 * share.max():.0f} % (points whose "
+            f"confidence is below {_CONFIDENT:g} are dropped)"
         )
     if not per_frame:
         return [int(k) for k in often]

@@ -210,6 +210,9 @@ def test_points_that_mislead_are_noticed(trial):
     assert "from tip to base" in found.notes[0]
     few = tracker_traces(labelled(raw(image[..., ::4, :]), "a"), CAMERAS)
     assert any("track more points" in note for note in few.notes)
+    image[:, :, 1, 4] = np.nan
+    without = tracker_traces(labelled(raw(image), "a"), CAMERAS)
+    assert f"point 4 is never known in {CAMERAS[1].name}" in without.notes[0]
     image[:, :, 1, 0] = np.nan
     with pytest.raises(ValueError, match=f"never known in {CAMERAS[1].name}"):
         tracker_traces(labelled(raw(image), "a"), CAMERAS)
@@ -330,6 +333,17 @@ def test_the_frame_rate_is_asked_for_and_views_are_matched_by_name(trial, tmp_pa
     single.write_text("frame,node,column,row\n7,0,1,1\n7,1,9,2\n")
     with pytest.raises(ValueError, match="contains one frame"):
         run("import", single, "--rate", 500, "-o", tmp_path / "t.nc")
+    numbers = np.array([7, 8, 8])
+    twice = RawTracks("test", ["w"], image=np.ones((3, 1, 1, 5, 2)), frames=numbers, fps=500.0)
+    save_tracks(tmp_path / "twice.nc", labelled(twice, "a"))
+    with pytest.raises(ValueError, match="frame 8 follows frame 8"):
+        run("import", tmp_path / "twice.nc", "-o", tmp_path / "t.nc")
+    late = tmp_path / "late.csv"
+    late.write_text("\n".join(["frame,node,column,row", *(f"{i},0,1,1" for i in (90, 91))]))
+    early = tmp_path / "early.csv"
+    early.write_text("\n".join(["frame,node,column,row", *(f"{i},0,1,1" for i in (0, 1))]))
+    with pytest.raises(ValueError, match="no frames in common"):
+        run("import", early, late, "--rate", 500, "-o", tmp_path / "t.nc")
     image = np.random.default_rng(5).uniform(0.0, 300.0, (4, 1, 2, 5, 2))
     for views, order, guessed in (
         (("front", "top"), [1, 0], False),

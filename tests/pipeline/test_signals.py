@@ -341,6 +341,15 @@ def test_recordings_from_elsewhere_are_checked(trial, change, said):
         signals_of(tree)
 
 
+def test_a_centreline_in_millimetres_is_rejected(trial):
+    tree = trial.copy()
+    tree["truth"].dataset = (data := trial["truth"].to_dataset(inherit=False)).assign(
+        centerline=1e3 * data["centerline"]
+    )
+    with pytest.raises(ValueError, match="1e\\+03 times as long as its whisker"):
+        signals_of(tree)
+
+
 def test_what_a_group_lacks_is_said(trial):
     tree = with_signals(trial)
     tree["signals"] = xr.DataTree(tree["signals"].to_dataset(inherit=False).drop_vars("moment"))

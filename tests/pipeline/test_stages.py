@@ -70,6 +70,17 @@ def test_what_was_edited_since_a_stage_was_made_is_stated(stages, group, name, s
     assert due_stages(_changed(stages, group, name), "contour") == due
 
 
+def test_times_that_seem_to_be_in_milliseconds_are_noted(stages):
+    def timed(step):
+        data = stages["signals"].to_dataset()[["base_position", "status"]].drop_vars("status")
+        data = xr.concat([data] * 3, "time").assign_coords(time=step * np.arange(18))
+        return xr.DataTree(data)
+
+    with pytest.warns(UserWarning, match="frames 2 s apart: its time has to be in seconds"):
+        check_recording(timed(2.0))
+    check_recording(timed(2e-3))
+
+
 def test_what_no_group_can_hold_is_refused(stages):
     data = stages["signals"].to_dataset()
     turned = data["base_rotation"].copy(data=data["base_rotation"].values * [1.0, 1.0, -1.0])

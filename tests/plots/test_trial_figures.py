@@ -110,6 +110,9 @@ def test_contacts_lie_where_they_are_in_both_frames(known):
         spans = np.ptp(axes.get_xlim()) / box.width, np.ptp(axes.get_ylim()) / box.height
         assert spans[0] == pytest.approx(spans[1])
     assert {"$x$ (mm)", "$y$ (mm)", "$z$ (mm)", "$t$ (s)"} <= texts(figure)
+    # A frame whose base is missing is left out.
+    course.position[np.flatnonzero(course.touching)[2]] = np.nan
+    assert len(dots(contact_places(course, LINE).axes[2])) == 7
 
 
 def test_contacts_are_coloured_by_deflection(known):

@@ -408,7 +408,12 @@ def test_a_map_with_verdicts(map_page, folder):
 
 
 def test_what_is_missing_is_named_with_the_verb_that_makes_it(folder):
-    text = run("report", folder / "bare.nc", "-o", folder / "bare.html")
+    bare = load_recording(folder / "bare.nc")
+    del bare["moment"].attrs["units"]
+    save_recording(folder / "bare.nc", bare)
+    with pytest.warns(UserWarning, match="states no units of moment") as notes:
+        text = run("report", folder / "bare.nc", "-o", folder / "bare.html")
+    assert len(notes) == 1
     assert "no signals" in text
     page = (folder / "bare.html").read_text(encoding="utf-8")
     for verb in ("signals", "estimate", "reconstruct"):

@@ -523,6 +523,20 @@ def test_the_rest_shape_ignores_how_it_is_held():
     assert whisker.curvature(10e-3)[2] == pytest.approx(expected, rel=0.05)
 
 
+def test_noisy_points_of_a_whisker_in_contact_most_of_the_time():
+    """Straightened by a peg it keeps its shape near the turning point, to within the noise."""
+    rng, s = np.random.default_rng(1), np.linspace(0.0, 25e-3, 101)
+    azimuth = 0.6 * np.cos(np.linspace(-0.5 * np.pi, 0.5 * np.pi, 60))
+    push = np.maximum(azimuth - 0.3, 0.0) / 0.3
+    shapes = np.stack(np.broadcast_arrays(s, (10.0 - 9.0 * push[:, None]) * s**2, 0.0), axis=-1)
+    held = base_rotation(azimuth, np.zeros(60), np.zeros(60))
+    waves = np.cos(np.pi * np.outer(s / 25e-3, np.arange(6)))
+    noise = 15e-6 * np.einsum("nk,tki->tni", waves, rng.normal(size=(60, 6, 3)))
+    shape = rest_shape(np.einsum("tij,tnj->tni", held, shapes) + noise)
+    assert shape.free[push == 0.0].all()
+    assert not shape.free[push > 0.2].any()
+
+
 def test_the_rest_shape_ignores_where_hairs_let_a_trace_begin():
     """In two of three frames hairs hide 0.4 mm of a whisker that curves more and more."""
     rng, s = np.random.default_rng(2), np.linspace(0.0, 20e-3, 101)

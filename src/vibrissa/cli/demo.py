@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import vibrissa as vb
 from vibrissa.cli.figures import NODES, TrialOptions, saved, trial_drawings
-from vibrissa.cli.inputs import WhiskerOptions, print_notes
+from vibrissa.cli.inputs import WhiskerOptions, print_notes, recording_from
 from vibrissa.cli.options import with_options
 from vibrissa.cli.terminal import Row, Tell, print_table, progress_bars, say, shown
 
@@ -69,8 +69,8 @@ def _pictures(result: DemoResult, folder: Path, tell: Tell) -> list[Path]:
     from vibrissa.demo import video_files
 
     videos = None if result.tracking is None else video_files(folder)
-    given = TrialOptions(videos, folder / "map.nc")
-    drawings = trial_drawings(folder / "trial.nc", "double", given, tell)
+    given, path = TrialOptions(videos, folder / "map.nc"), folder / "trial.nc"
+    drawings = trial_drawings(path, recording_from(path), "double", given, tell)
     contact_map = result.contact_map
     line = contact_map.whisker.centerline(NODES)
     drawings["signal_space"] = lambda: vb.plots.signal_clouds(contact_map.to_dataset(), line)

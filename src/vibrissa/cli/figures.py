@@ -121,15 +121,8 @@ def fits_of(trial: xr.DataTree) -> list[vb.contour.FittedShape]:
     return [vb.contour.shape_from_dataset(trial["contour"].to_dataset())]
 
 
-def array_drawings(path: Path, width: Any) -> dict[str, Draw]:
-    """Figure of an array of whiskers, or of a trial with one; empty for other files."""
-    kind = None if path.is_dir() else vb.io.recognise(path)
-    if kind in (None, vb.io.Kind.ARRAY, vb.io.Kind.ARRAY_TABLE):
-        face = vb.load_array(path).to_tree()
-        return {"array": lambda: vb.plots.array_views(face, width=width)}
-    if kind != vb.io.Kind.RECORDING:
-        return {}
-    trial = recording_from(path)
+def array_drawings(trial: xr.DataTree, width: Any) -> dict[str, Draw]:
+    """Figure of a trial with several whiskers; empty for one."""
     groups = {name: group for name in _CONTACTS if (group := trial.get(name)) is not None}
     groups["/"] = trial
     contacts = [name for name, group in groups.items() if "contact_point" in group.data_vars]
@@ -186,10 +179,14 @@ def _whisker_drawing(whisker: vb.Whisker, width: Any) -> Draw:
 
 
 def trial_drawings(
-    path: Path, width: Any, given: TrialOptions, tell: Tell, colour: str = "time"
+    path: Path,
+    trial: xr.DataTree,
+    width: Any,
+    given: TrialOptions,
+    tell: Tell,
+    colour: str = "time",
 ) -> dict[str, Draw]:
     """Figures of a trial; missing stages are printed, with the verb that computes them."""
-    trial = recording_from(path)
     given = given.of(trial)
     course = vb.scene.course_of(trial, given.whisker)
     for reason in _lacking(course, trial, path):
@@ -308,13 +305,18 @@ def figures(
     verdicts = None if uniqueness is None else dataset_with(uniqueness, "verdict")
     sweep = None if cones is None else dataset_with(cones, "critical_cone")
     with progress_bars() as tell:
-        drawings = array_drawings(path, width)
-        if not path.is_dir() and vb.io.recognise(path) == vb.io.Kind.RECORDING:
+        kind = None if path.is_dir() else vb.io.recognise(path)
+        if kind == vb.io.Kind.RECORDING:
             refuse({"--uniqueness": uniqueness, "--cones": cones}, f"{path} is a recording")
-            drawings |= trial_drawings(path, width, of_trial, tell, colour or "time")
+            trial = recording_from(path)
+            drawings = array_drawings(trial, width)
+            drawings |= trial_drawings(path, trial, width, of_trial, tell, colour or "time")
         else:
             refuse(of_trial.given() | {"--colour": colour}, f"{path} is not a recording")
-        if not drawings:
+        if kind in (None, vb.io.Kind.ARRAY, vb.io.Kind.ARRAY_TABLE):
+            face = vb.load_array(path).to_tree()
+            drawings = {"array": lambda: vb.plots.array_views(face, width=width)}
+        elif kind != vb.io.Kind.RECORDING:
             drawings = dict(map_drawings(vb.ContactMap.load(path), width, verdicts, sweep))
         free([target / f"{name}.{ending}" for name in drawings for ending in endings], force)
         target.mkdir(parents=True, exist_ok=True)

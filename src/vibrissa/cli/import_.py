@@ -17,6 +17,8 @@ from vibrissa.deferred import xr
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from numpy.typing import NDArray
+
 
 _VIEWS = ("top", "front")  # default names of views
 
@@ -106,6 +108,7 @@ def _tracks(
     for path in paths:
         own = vb.io.recognise(path) in (vb.io.Kind.TRACKS, vb.io.Kind.RECORDING)
         parts.append(vb.load_tracks(path, **({} if own else labels)))
+    _check_frames(paths, [part["frame"].values for part in parts])
     if len(paths) > 1:
         if cameras is None and len(paths) > len(_VIEWS):
             raise ValueError(f"{len(paths)} views are given; their --cameras are needed")
@@ -124,8 +127,6 @@ def _tracks(
     if found["time"].attrs.get("units") != "s":
         raise ValueError(f"{paths[0]} does not state the frame rate: give --rate")
     frames = found["frame"].values
-    if len(frames) < 2:
-        raise ValueError(f"{paths[0]} contains one frame; a trial of several is needed")
     every = np.arange(frames.min(), frames.max() + 1)
     if len(every) > len(frames):
         # What no row holds is a whisker that is lost.
@@ -133,3 +134,21 @@ def _tracks(
         step = np.median(np.diff(found["time"].values) / np.diff(frames))
         found = rows.assign_coords(time=("frame", step * every)).swap_dims(frame="time")
     return found
+
+
+def _check_frames(paths: Sequence[Path], numbers: Sequence[NDArray[Any]]) -> None:
+    """Raise ValueError unless the frames of every view increase, and views have some in common."""
+    for path, frames in zip(paths, numbers, strict=True):
+        if len(frames) < 2:
+            raise ValueError(f"{path} contains one frame; a trial of several is needed")
+        wrong = np.flatnonzero(np.diff(frames) <= 0)
+        if wrong.size:
+            before, after = frames[wrong[0] : wrong[0] + 2]
+            raise ValueError(
+                f"{path}: frame {after} follows frame {before}; numbers of frames must increase"
+            )
+    first = max(frames[0] for frames in numbers)
+    last = min(frames[-1] for frames in numbers)
+    if first > last:
+        spans = (f"{p} {f[0]} to {f[-1]}" for p, f in zip(paths, numbers, strict=True))
+        raise ValueError(f"the views have no frames in common: {', '.join(spans)}")

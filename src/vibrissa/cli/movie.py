@@ -68,11 +68,12 @@ def movie(
     if kind == "signals":
         refuse({"--video": of_trial.videos}, "the movie of the signals shows no video")
     kinds = _KINDS if kind == "both" else (kind,)
-    make_movies(path, target, kinds, of_trial, frames, force)
+    make_movies(path, recording_from(path), target, kinds, of_trial, frames, force)
 
 
 def make_movies(
     path: Path,
+    trial: xr.DataTree,
     target: Path,
     kinds: Sequence[str],
     of_trial: TrialOptions,
@@ -82,7 +83,6 @@ def make_movies(
     """Create the movies for which a trial has the data."""
     files = _files(target, path, kinds)
     free(files.values(), force)
-    trial = recording_from(path)
     of_trial = of_trial.of(trial)
     course = vb.scene.course_of(trial, of_trial.whisker)
     rows = frames.rows(course.time)

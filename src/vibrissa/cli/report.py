@@ -81,7 +81,8 @@ def report(
         content.sections.extend(vb.report.figure_sections(pictures))
     if make:
         kinds = ("signals", "contour")
-        movies += sorted(make_movies(path, target.parent, kinds, of_trial, FrameOptions(), force))
+        how = (kinds, of_trial, FrameOptions(), force)
+        movies += sorted(make_movies(path, trial, target.parent, *how))
     # The page must not depend on whether it replaces another.
     command = ["vibrissa", *(word for word in sys.argv[1:] if word != "--force")]
     origin = vb.report.provenance_section(command, given, (seed or 0) if is_trial else None)
@@ -115,8 +116,8 @@ def _of_trial(
     """Contents of the page of a trial."""
     course = vb.scene.course_of(trial, of_trial.whisker)
     sections, script = vb.report.trial_sections(trial, of_trial.whisker, seed), ""
-    drawings = array_drawings(path, "double")
-    drawings |= trial_drawings(path, "double", of_trial, tell)
+    drawings = array_drawings(trial, "double")
+    drawings |= trial_drawings(path, trial, "double", of_trial, tell)
     if course.places is not None and np.isfinite(course.places).any() and _can_draw():
         shown = ["Contact points in the laboratory"]
         shown += ["the known object"] if "objects" in trial.children else []

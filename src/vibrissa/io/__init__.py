@@ -98,6 +98,7 @@ from vibrissa.io.time_tables import (
     save_contour,
     save_predictors as save_predictors,
     save_signals,
+    slow_steps as slow_steps,
     time_notes as time_notes,
 )
 from vibrissa.io.tracks import (

@@ -113,11 +113,18 @@ def time_notes(time: Array) -> list[str]:
                 f"{after + 1}, from {time[before]:g} to {time[after]:g} s; rows are "
                 "evaluated each on its own, in the order of the file"
             )
-    if step.size >= _SEVERAL and (usual := float(np.median(step))) >= _SLOW:
+    if usual := slow_steps(time):
         notes.append(
             f"rows are {usual:.3g} s apart: where time is in ms the column is called time_ms"
         )
     return notes
+
+
+def slow_steps(time: Array) -> float:
+    """Usual interval between times, s, if it is so long that these may be in ms; otherwise 0."""
+    step = np.diff(time[np.isfinite(time)])
+    usual = float(np.median(step)) if step.size >= _SEVERAL else 0.0
+    return usual if usual >= _SLOW else 0.0
 
 
 def check_scale(wrench: xr.Dataset, whisker: Whisker) -> None:

@@ -23,6 +23,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.contacts import rubbing_misfits
+from vibrissa.io import slow_steps
 from vibrissa.numerics import Array
 from vibrissa.quantities import unit_fault
 from vibrissa.recording import VARIABLES, Group, Recording, faults_in, recorded
@@ -72,6 +73,13 @@ def check_recording(recording: xr.DataTree) -> None:
         faults.append("its time does not increase from frame to frame, or is missing in some")
     if faults := faults or _position_faults(Recording(recording)):
         raise ValueError(f"the recording cannot be used: {'; '.join(faults)}")
+    if usual := slow_steps(time):
+        warnings.warn(
+            f"the recording has frames {usual:.3g} s apart: its time has to be in seconds, and "
+            "rates of change are wrong if it is in ms",
+            UserWarning,
+            stacklevel=1,
+        )
     if changed := edited(recording):
         warnings.warn(
             f"the recording was edited after its {changed[0]} had been computed: these, and all "
@@ -93,14 +101,24 @@ def _label_faults(root: xr.Dataset) -> list[str]:
 
 
 def _position_faults(recording: Recording) -> list[str]:
-    """List a base that is farther from the centreline than the whisker is long, as by its unit."""
+    """List a centreline or a base of another scale than the whisker, as by its unit."""
     base = recording.root.known("base_position")
     groups = (recording.root, recording.find("truth"))
     lines = [group.known("centerline") for group in groups if group is not None]
     line = next((line for line in lines if line is not None), None)
-    if base is None or line is None:
+    if line is None:
         return []
     length = np.linalg.norm(np.diff(line, axis=2), axis=3).sum(axis=2)
+    if "whiskers" in recording.tree.children:
+        scales = np.nanmedian(length, axis=0) / [one.length for one in recording.whiskers]
+        if np.nanmax(scales) > _SCALE or np.nanmin(scales) < 1.0 / _SCALE:
+            listed = ", ".join(f"{scale:.3g}" for scale in scales)
+            return [
+                f"its centerline is {listed} times as long as its whisker; are millimetres given "
+                "as metres?"
+            ]
+    if base is None:
+        return []
     ratio = np.linalg.norm(line[:, :, 0] - base, axis=2) / length
     ratio = ratio[np.isfinite(ratio)]
     if not ratio.size or (away := float(np.median(ratio))) <= 1.0:
@@ -190,6 +208,7 @@ def whisker_radii(estimates: xr.Dataset, whiskers: Sequence[Whisker]) -> Array:
     return radius
 
 
+_SCALE = 10.0  # ratio of the lengths of centreline and whisker from which the unit is wrong
 MADE_FROM = "made_from"
 _POSE = ("base_position", "base_rotation", "pose_covariance")
 _WRENCH = ("force", "moment", "wrench_covariance", "in_contact")

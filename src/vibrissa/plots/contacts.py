@@ -87,8 +87,11 @@ def contact_places(
     with style.looking():
         if course.places is None or not np.isfinite(course.places).any():
             return style.sentence("no contacts", width)
-        rows = np.flatnonzero(np.isfinite(course.places).all(axis=1))
-        own = course.at_base(course.places)[rows]
+        own = course.at_base(course.places)
+        rows = np.flatnonzero(np.isfinite(course.places + own).all(axis=1))
+        if not rows.size:
+            return style.sentence("no contacts of which the base is known", width)
+        own = own[rows]
         shade = course.time[rows]
         if colour == "deflection_angle":
             shade = deflection_angles(course, line)[rows]

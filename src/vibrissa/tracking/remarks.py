@@ -34,6 +34,8 @@ _NEAR = 2.0  # unusual distance between the bases of several views, pixels
 # Slow motion of a camera above which there is a remark, pixels, and as a share of its shaking.
 _SLOW, _MOSTLY = 0.25, 0.8
 _BEYOND = 0.05  # share of the length beyond what is seen from which a contact is not seen
+# Bending below which contacts are not detected, over the length, above which there is a remark.
+_COARSE = 2e-3
 _FEWEST = 8  # smallest number of frames to decide whether a whisker leaves the plane
 
 
@@ -137,6 +139,19 @@ def remarks_on_unseen_contacts(one: Tracked, name: str) -> list[str]:
         f"not sure where {name} touches: in {unseen} of {count} frames in contact that is beyond "
         "what both views show of it, and follows from how the part before it bends. Film more of "
         f"the whisker{remedy}."
+    ]
+
+
+def remarks_on_rest(one: Tracked, name: str) -> list[str]:
+    """Report contacts that are too light to be distinguished from errors of the traces."""
+    least = one.shape.undetected
+    if least <= _COARSE * one.length.value:
+        return []
+    free, count = int(one.shape.free.sum()), int(np.isfinite(one.shape.deviation).sum())
+    return [
+        f"{name}: its shapes in the {free} of {count} frames taken to be free of contact differ by "
+        f"up to {1e6 * least:.0f} µm (root mean square along it), as traces scatter: contacts that "
+        "bend it by less are not found, and their frames counted as free."
     ]
 
 

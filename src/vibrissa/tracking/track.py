@@ -37,6 +37,7 @@ from vibrissa.tracking.remarks import (
     remarks_on_fur,
     remarks_on_optics,
     remarks_on_plane,
+    remarks_on_rest,
     remarks_on_row,
     remarks_on_shaking,
     remarks_on_time,
@@ -238,7 +239,7 @@ def track(
             found.append(one)
             remarks += remarks_on_fur(one, options.fur, name)
             remarks += remarks_on(cameras, one.traces, one.length, one.fit.misfit, name)
-            remarks += remarks_on_unseen_contacts(one, name)
+            remarks += remarks_on_unseen_contacts(one, name) + remarks_on_rest(one, name)
             if len(cameras) == 1:
                 remarks += remarks_on_plane(one, name)
         except Exception as fault:  # no error of one whisker may discard the others

@@ -311,7 +311,8 @@ def _wanted(
     if not often.size:
         raise ValueError(
             f"no whisker has {_FEWEST} points or more in half of the frames: "
-            f"{names[int(np.argmax(share))]} has them in {100.0 * share.max():.0f} %"
+            f"{names[int(np.argmax(share))]} has them in {100.0 * share.max():.0f} % (points whose "
+            f"confidence is below {_CONFIDENT:g} are dropped)"
         )
     if not per_frame:
         return [int(k) for k in often]
@@ -343,6 +344,13 @@ def _order_faults(points: Array, name: str, views: Sequence[str], nodes: list[st
             "wrong"
         )
     for view, each in zip(views, each_view, strict=True):
+        known = np.isfinite(each).all(axis=-1).any(axis=0)
+        if (gaps := np.flatnonzero(~known[: np.flatnonzero(known)[-1]])).size:
+            listed = ", ".join(nodes[k] if nodes else f"point {k}" for k in gaps)
+            notes.append(
+                f"{name}: {listed} is never known in {view}, where the line between its neighbours "
+                "is taken instead"
+            )
         folds = [_folded(one) for one in each]
         if not (often := [fold for fold in folds if fold is not None]):
             continue

@@ -40,7 +40,9 @@ Counts = NDArray[np.intp]
 _COMMON = 0.85  # share of the usual length over which shapes are compared: tips are uncertain
 _LEAST = 0.4  # visible share of that needed to decide whether the whisker is bent
 _FEWEST = 3  # smallest number of frames that give a shape
-_NEAR = 4.0  # largest deviation of a free frame, in units of the usual one
+# Largest deviation of a free frame in units of the usual one, and if that is white noise.
+_NEAR, _OF_NOISE = 4.0, 2.0
+_EXACT = 1e-5  # deviation, over the length, below which a frame is always free
 # A whisker rings where free frames usually deviate by so many times what this share of them does;
 # then still ones deviate by at most so many times that.
 _UNEVEN, _QUIETEST, _QUIET = 2.5, 0.1, 1.5
@@ -100,6 +102,11 @@ class RestShape:
         return self.free if self.ringing is None else self.free & ~self.ringing
 
     @property
+    def undetected(self) -> float:
+        """Largest deviation of a free frame, m: contacts that bend it less are not detected."""
+        return float(np.max(self.deviation[self.free], initial=0.0))
+
+    @property
     def spacing(self) -> float:
         """Distance of the points, m."""
         return float(np.median(np.linalg.norm(np.diff(self.points, axis=0), axis=1)))
@@ -154,11 +161,14 @@ def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> R
     pace = _pace(part)
     moves = np.minimum(pace, _RESTS * np.sqrt(np.mean(pace**2)))
     for _ in range(_ROUNDS):
-        mean = np.median(_onto(part[near], mean), axis=0)
+        fitted = _onto(part, mean)
+        mean = np.median(fitted[near], axis=0)
         deviation[whole] = _deviations(part, mean)
+        away = (fitted - mean).reshape(len(part), -1) / len(mean) ** 0.5
         usual = _weighted_median(deviation[whole][near], moves[near])
-        near = deviation[whole] < max(_NEAR * usual, 1e-9)
-    within = _NEAR * _weighted_median(deviation[whole][near], moves[near])
+        within = _limit(usual, _noise(away, near))
+        near = deviation[whole] < max(within, _EXACT * length)
+    within = _limit(_weighted_median(deviation[whole][near], moves[near]), _noise(away, near))
     quiet, ringing = near, None
     # A ringing whisker also looks as if it began elsewhere.
     rings = _deviations(part, mean, slides=0.0)
@@ -175,7 +185,8 @@ def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> R
     shown = shapes[whole][:, : curves.shape[1]]
     # The quiet frames may all miss the tip.
     by = quiet if np.isfinite(shown[quiet, :, 0]).any(axis=0).all() else near
-    points = np.nanmedian(_moved(shown[by], *motions(part[by], mean)), axis=0)
+    shown = shown[by][:, np.isfinite(shown[by, :, 0]).any(axis=0)]
+    points = np.nanmedian(_moved(shown, *motions(part[by], mean)), axis=0)
     # If less of the whisker is seen, the visible part shows whether it is bent.
     for i in np.flatnonzero(~whole & (known >= _LEAST * compared)):
         n = min(int(known[i]), len(points))
@@ -184,8 +195,17 @@ def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> R
     out = np.full(len(curves), np.nan)
     out[seen] = np.where(np.isfinite(deviation), deviation, np.nan)
     with np.errstate(invalid="ignore"):
-        free = out < max(within, 1e-9)
+        free = out < max(within, _EXACT * length)
     return RestShape(points, free, out, noise, ends, ringing)
+
+
+def _limit(usual: float, white: float) -> float:
+    """Largest deviation of a free frame, by the usual one and the part of it that is white noise.
+
+    The deviation due to noise of many points is nearly the same in all frames.
+    """
+    white = min(white, usual)
+    return float(np.hypot(_NEAR * np.sqrt(usual**2 - white**2), _OF_NOISE * white))
 
 
 def _seen(curves: Array) -> Mask:
@@ -337,18 +357,20 @@ def aligned_lengths(curves: Array, spacing: float | None = None) -> tuple[float,
 def _largest_group(shapes: Array, least: float) -> tuple[int, Mask]:
     """Frame with the nearest neighbours, and which frames are near it."""
     points = shapes[:, ::4]
-    chords = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1)
-    signatures = chords.reshape(len(shapes), -1)
-    square = (signatures**2).sum(axis=1)
-    away = square[:, None] + square[None] - 2.0 * signatures @ signatures.T
-    # Distances do not distinguish mirror images, but opposite bends differ by as much as their
-    # depth.
+    # Arrows of all arcs: unlike chords they show how a nearly straight whisker bends, too.
+    first, last = np.triu_indices(points.shape[1], 2)
+    first, last = (one[(last - first) % 2 == 0] for one in (first, last))
+    middle = points[:, (first + last) // 2]
+    arrows = np.linalg.norm(0.5 * (points[:, first] + points[:, last]) - middle, axis=-1)
+    square = (arrows**2).sum(axis=1)
+    away = square[:, None] + square[None] - 2.0 * arrows @ arrows.T
+    # They do not distinguish mirror images, but opposite bends differ by as much as their depth.
     chord = shapes[:, -1] - shapes[:, 0]
     bends = (shapes - shapes[:, :1]).mean(axis=1) - 0.5 * chord
     bends = np.einsum("tij,tj->ti", _swings(chord, chord.mean(axis=0)), bends)
     depth = np.linalg.norm(bends, axis=1)
     over = bends @ bends.T < np.cos(_OVER) * depth[:, None] * depth
-    away += over * chords[0].size * (2.0 * np.minimum(depth[:, None], depth)) ** 2
+    away += over * arrows.shape[1] * (2.0 * np.minimum(depth[:, None], depth)) ** 2
     distance = np.sqrt(np.maximum(away, 0.0))
     pace = _pace(shapes)
     usual = float(np.median(pace))
@@ -356,10 +378,20 @@ def _largest_group(shapes: Array, least: float) -> tuple[int, Mask]:
     order = np.argsort(distance, axis=1)
     rank = np.argmax(np.cumsum(pace[order], axis=1) >= least * pace.sum(), axis=1)
     nearest = np.take_along_axis(distance, order, axis=1)
-    last = np.clip(rank, 2, len(shapes) - 1)
-    radius = np.take_along_axis(nearest, last[:, None], axis=1)[:, 0]
-    best = int(np.argmin(radius))
-    return best, distance[best] <= max(2.0 * float(radius[best]), 1e-12)
+    rank = np.clip(rank, 2, len(shapes) - 1)
+    radius = np.take_along_axis(nearest, rank[:, None], axis=1)[:, 0]
+    # No distance counts that is smaller than the noise by which any two shapes differ.
+    within = max(float(radius.min()), 2.0**0.5 * _noise(arrows))
+    best = int(np.argmax((distance <= within) @ pace))
+    return best, distance[best] <= max(2.0 * within, 1e-12)
+
+
+def _noise(values: Array, near: Mask | None = None) -> float:
+    """Norm of what is independent from frame to frame in values (time, n), or in some frames."""
+    change = np.linalg.norm(np.diff(values, 4, axis=0), axis=1) / 70.0**0.5
+    if near is not None:
+        change = change[np.lib.stride_tricks.sliding_window_view(near, 5).all(axis=1)]
+    return float(np.median(change)) if change.size else 0.0
 
 
 def _pace(shapes: Array) -> Array:

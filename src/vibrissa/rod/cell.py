@@ -37,6 +37,11 @@ _REACH, _REACH_CAREFUL = 1.3, 4.0
 # Cells from rest in which signals that are not interpolated over the force are far from linear, and
 # misses are common without a fold.
 _RESTING = 3
+# Longest step (in cell widths), and the share of the squared slopes by which a first one that
+# leaves the cell is damped: it mostly follows the direction that is determined least.
+_LONGEST, _DAMPING = 0.6, 0.01
+# Miss of the linear equations (over the cell's extent) beyond which a damped step leaves the cell.
+_FAR = 0.5
 # Step (in cell widths) below which the next one, about its square, is the last: if there is one
 # solution at most, and if two may be close together.
 _LAST, _LAST_CAREFUL = 0.02, 0.002
@@ -360,13 +365,42 @@ def _locate(tree: SearchTree, cell: int, target: Array, b: Array, x: Array) -> b
 
 
 @inlined
-def invert(b: Array, half: Array, work: Array, careful: bool, x: Array) -> int:
+def _damped_step(b: Array, half: Array, x: Array, rows: Array, step: Array) -> float:
+    """Fill a step that is short in directions that hardly matter; return what it would miss.
+
+    The miss is that of the linear equations, over the cell's extent, nearest to it in the cell.
+    """
+    right, size, most = np.empty(3), 0.0, 0.0
+    for a in range(3):
+        right[a] = 0.0
+        for q in range(3):
+            by, scale = b[_SLOPES + 4 * a + q], 1.0 / (half[q] * half[q])
+            right[a] += by * b[_MISFIT + q] * scale
+            size += by * by * scale
+    for a in range(3):
+        for c in range(3):
+            rows[a, c] = _DAMPING * size if a == c else 0.0
+            for q in range(3):
+                scale = 1.0 / (half[q] * half[q])
+                rows[a, c] += b[_SLOPES + 4 * a + q] * b[_SLOPES + 4 * c + q] * scale
+    solve3(rows, right, step)
+    for q in range(3):
+        miss = b[_MISFIT + q]
+        for a in range(3):
+            miss += b[_SLOPES + 4 * a + q] * (min(max(x[a] - step[a], 0.0), 1.0) - x[a])
+        most = max(most, abs(miss) / half[q])
+    return most
+
+
+@inlined
+def invert(b: Array, half: Array, work: Array, careful: bool, patient: bool, x: Array) -> int:
     """Solve a cell's interpolant: 2 solved, 1 nearly so (a fold of the map), 0 not in the cell.
 
-    If not solved, x is left where the miss is least: work[5, 0] of the cell's extent.
+    If ``patient``, the search goes on where only a direction that is hardly determined leads out of
+    the cell. If not solved, x is left where the miss is least: work[5, 0] of the cell's extent.
     """
     rows, step, best = work[:3], work[3], work[4]
-    least, done, farthest, last = np.inf, False, _REACH, _LAST
+    least, done, left, farthest, last = np.inf, False, False, _REACH, _LAST
     if careful:
         farthest, last = _REACH_CAREFUL, _LAST_CAREFUL
         resting = b[_LAYER] < _RESTING
@@ -396,8 +430,10 @@ def invert(b: Array, half: Array, work: Array, careful: bool, x: Array) -> int:
                 abs(x[0] - step[0] - 0.5), abs(x[1] - step[1] - 0.5), abs(x[2] - step[2] - 0.5)
             )
             if reach > farthest:
-                return 0
-        shorten = min(1.0, 0.6 / max(size, 1e-300))
+                if not patient or _damped_step(b, half, x, rows, step) > _FAR:
+                    return 0
+                left, size = True, max(abs(step[0]), abs(step[1]), abs(step[2]))
+        shorten = min(1.0, _LONGEST / max(size, 1e-300))
         for a in range(3):
             x[a] = min(max(x[a] - shorten * step[a], -0.5), 1.5)
         if size < last:
@@ -406,7 +442,8 @@ def invert(b: Array, half: Array, work: Array, careful: bool, x: Array) -> int:
             done = True
     for a in range(3):
         x[a] = best[a]
-    work[5, 0] = least if _outside(x) <= 0.25 else np.inf
+    # After a damped step the miss was least along the valley, not at a fold.
+    work[5, 0] = least if _outside(x) <= 0.25 and not left else np.inf
     return 1 if least <= _NEARLY and _outside(x) <= 0.25 else 0
 
 

@@ -28,7 +28,7 @@ from vibrissa.rod.cell import (
 from vibrissa.rod.tree import SearchTree
 
 #: Largest number of contacts found for one target.
-MOST_SEEDS = 32
+MOST_SEEDS = 64
 #: Largest number of cells listed around one target.
 MOST_CELLS = 64
 # Where a cell that may contain a fold has no solution but misses one by at most this share of its
@@ -72,7 +72,10 @@ def _add_seed(
             row = n
             break
     if row == MOST_SEEDS:
-        return count
+        for n in range(count):
+            row = n if row == MOST_SEEDS and quality[n] < solved else row
+        if row == MOST_SEEDS:
+            return count
     found[row, 0], found[row, 1], found[row, 2] = eta, psi, rho
     quality[row] = solved
     for a in range(3):
@@ -219,7 +222,7 @@ def seeds(tree: SearchTree, target: Array, room: SeedRoom) -> int:
                 if start > 0:
                     for a in range(3):
                         x[a] = (start - 1) >> a & 1
-                solved = invert(b, half, work, careful > 0, x)
+                solved = invert(b, half, work, careful > 0, careful > 0 and start == 0, x)
                 missed = missed and solved < 2
                 if missed and work[5, 0] < least:
                     least = work[5, 0]

@@ -198,10 +198,10 @@ def test_a_shape_goes_on_as_it_bends():
 def test_a_length_is_as_uncertain_as_what_tapers():
     """A tip that is seen does not show how thick the whisker is before it."""
     s = np.linspace(0.0, 20e-3, 33)
-    curves = np.repeat(np.stack([s, 0.0 * s, 0.0 * s], axis=1)[None], 5, axis=0)
-    lines = 10e3 * curves[:, None, :, :2]
-    assert seen_length(curves, lines).sigma == pytest.approx(0.7 / 10e3)
-    assumed = seen_length(curves, lines, tapers=False)
+    lines = 10e3 * np.stack([s, 0.0 * s], axis=1) * np.ones((5, 1, 1, 1))
+    lengths = np.full(5, 20e-3)
+    assert seen_length(lengths, lines).sigma == pytest.approx(0.7 / 10e3)
+    assumed = seen_length(lengths, lines, tapers=False)
     assert assumed.sigma == pytest.approx(np.hypot(0.7 / 10e3, 0.5e-3))
 
 

@@ -452,6 +452,18 @@ def test_a_contact_beyond_what_is_seen_is_as_uncertain_as_stated(filmed, traces,
     assert ("(--length)" in recording.attrs["remarks"]) != stated
 
 
+def test_a_whisker_that_a_wall_cuts_in_one_view_goes_on_as_the_other_shows(filmed, traces):
+    cut = [list(whole[::2]) for (whole,) in traces]
+    for i, t in enumerate(cut[1]):
+        n = int(0.55 * len(t.line))
+        cut[1][i] = t._replace(line=t.line[:n], sigma=t.sigma[:n], seen=t.seen[:n], tip_seen=False)
+    how = TrackOptions(fit=FitOptions(rounds=6))
+    recording = track(filmed.cameras, [[row] for row in cut], 500.0, how)
+    true = Recording(filmed.recording).whisker().length
+    assert Recording(recording).whisker().length == pytest.approx(true, rel=0.03)
+    assert (squared_errors(recording, filmed) < 7.81).mean() > 0.88
+
+
 def test_the_smoother_solves_its_equations():
     """Against the dense normal equations."""
     generator = np.random.default_rng(0)

@@ -27,6 +27,7 @@ from vibrissa.tracking.recording import (
     outside_video,
     tracked_recording,
 )
+from vibrissa.tracking.refine.continuation import continued
 from vibrissa.tracking.refine.fit import FitOptions, Fitter, RodFit
 from vibrissa.tracking.refine.optics import Optics, rough_optics, stated_lenses
 from vibrissa.tracking.refine.rods import TraceSeries, rolled
@@ -502,18 +503,27 @@ def track_whisker(
     smoothness = options.fit
     if any(trace.sparse for view in traces for trace in view):
         smoothness = replace(smoothness, sharpest=max(smoothness.sharpest, 1.0))
+    tapers = bool(options.properties.keys() & {"tip_radius", "radius"})
+    further = None
+    if options.whisker is None:
+        further = continued(shape, on_head, cameras, series, head, tapers)
+    if further is not None:
+        shape = further[0]
+        whisker = whisker_at_rest(shape, name, **options.at_base)
     if not shape.free.any():
         # Only the bent shapes determine the roll.
         smoothness = replace(smoothness, roll=max(smoothness.roll, _ANY_ROLL))
     fitter = Fitter(cameras, series, touching, on_head, rate, smoothness, head, objects)
     length = Length(whisker.length, 0.0)
-    tapers = bool(options.properties.keys() & {"tip_radius", "radius"})
     if options.whisker is None and options.length is not None:
         length = unseen_part(shape, stated_length(shape, options.length, tapers))
     elif options.whisker is None and shape.whole:
-        length = seen_length(on_head[shape.free & tips], series.line, tapers)
+        lengths = np.linalg.norm(np.diff(on_head[shape.free & tips], axis=1), axis=2).sum(axis=1)
+        length = further[1] if further else seen_length(lengths, series.line, tapers)
     elif options.whisker is None:
         length = unseen_part(shape, _length(fitter, shape, options))
+    if further is not None:
+        length = length._replace(shown=further[1].shown, bending=further[1].bending)
     if length.value > length.shown:
         shape = lengthened(shape, length.value)
         whisker = whisker_at_rest(shape, name, **options.at_base)

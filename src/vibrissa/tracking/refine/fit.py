@@ -76,6 +76,7 @@ _ROLLED = np.radians(3.0)  # standard deviation of the roll before its variation
 _WILD = 1e6  # slopes of points of a rod, in units of L, above which it is not in equilibrium
 # Change of the inverse length, as a share, up to which its effects are linear, and the largest.
 _LINEAR, _MOST_UNSURE = 0.04, 0.6
+_CURVED = 0.05  # distance of points that show the curvature at a contact, as a share of the length
 _HALVED = 6  # largest number of times that initial forces without equilibrium are halved
 
 
@@ -565,15 +566,35 @@ def _tapered(whisker: Whisker, share: float, s: Array) -> Array:
     return whisker.radius(np.minimum(share * s, whisker.length))
 
 
-def _by_bend(problem: Problem, state: State, length: Length) -> Array:
-    """Shared changes (3, t, 15) of contacts beyond what is seen of the whisker.
+def _by_bend(problem: Problem, state: State, length: Length, spread: Array) -> Array:
+    """Shared changes (3, t, 15) of contacts beyond what all views show of the whisker.
 
-    Its shape at rest is extrapolated to there.
+    Its shape at rest is extrapolated to there, and to where they may be by their covariance.
     """
     beyond = np.maximum(state.contact[:, 0] * problem.d.length - length.shown, 0.0)
+    # The fourth power of a distance with an error is on average nearly this one's.
+    farther = np.where(beyond > 0.0, 3.0 * np.trace(spread, axis1=1, axis2=2), 0.0)
     changes = np.zeros((3, len(beyond), 15))
-    changes[..., :3] = np.moveaxis(state.rotation, 2, 0)
-    return changes * (0.5 * length.bend * beyond**2)[:, None]
+    vectors = length.bending @ problem.whisker.pose.rotation
+    changes[..., :3] = np.einsum("tij,kj->kti", state.rotation, vectors)
+    return changes * length.astray(np.sqrt(beyond**2 + farther))[:, None]
+
+
+def _off_tangent(line: Array, share: Array, spread: Array) -> Array:
+    """Second moments (t, 3, 3) of how far contacts that slide along a bent line leave its tangent.
+
+    Covariances are those of points on the tangent. At the contact, lines bend as at rest.
+    """
+    n = line.shape[1]
+    step = max(1, round(_CURVED * n))
+    middle = np.clip(np.rint(share * (n - 1)).astype(int), step, n - 1 - step)
+    before, here, after = (line[np.arange(len(line)), middle + k * step] for k in (-1, 0, 1))
+    chord = after - before
+    square = (chord**2).sum(axis=1)
+    along = np.einsum("ti,tij,tj->t", chord, spread, chord) / square
+    aside = 4.0 * (after - 2.0 * here + before) / square[:, None] * (0.5 * along)[:, None]
+    # The mean of the fourth power of a normal number is three.
+    return np.asarray(3.0 * aside[:, :, None] * aside[:, None])
 
 
 def _answer(problem: Problem, state: State, fit: _Linear, nodes: int, length: Length) -> RodFit:
@@ -605,18 +626,20 @@ def _answer(problem: Problem, state: State, fit: _Linear, nodes: int, length: Le
         by_length, changed = _by_length(problem, state, length.sigma, by_contact, slope)
         framed = np.append(framed, np.moveaxis(by_length, 0, 1), axis=1)
         aside = np.append(aside, np.moveaxis(changed, 0, 1), axis=1)
+    spread = slopes @ covariance @ np.swapaxes(slopes, 1, 2) * d.length**2
+    spread += np.einsum("tki,tkj->tij", framed[..., :3], framed[..., :3])
     if length.shown < length.value:
-        by_bend = np.moveaxis(_by_bend(problem, state, length), 0, 1)
+        by_bend = np.moveaxis(_by_bend(problem, state, length, spread), 0, 1)
+        spread += np.einsum("tki,tkj->tij", by_bend[..., :3], by_bend[..., :3])
         framed = np.append(framed, by_bend, axis=1)
         aside = np.append(aside, by_bend[..., 9:], axis=1)
     held = held + np.einsum("tki,tkj->tij", framed[..., 3:9], framed[..., 3:9])
     both = both + np.einsum("tki,tkj->tij", framed[..., 3:9], aside)
-    spread = slopes @ covariance @ np.swapaxes(slopes, 1, 2) * d.length**2
-    spread += np.einsum("tki,tkj->tij", framed[..., :3], framed[..., :3])
     wrench_spread = by_contact @ inside @ np.swapaxes(by_contact, 1, 2)
     wrench_spread += np.einsum("tki,tkj->tij", aside, aside)
     line = rods(d, state.contact, np.linspace(0.0, 1.0, nodes))
     line = np.einsum("tij,tnj->tni", state.rotation, line) + state.position[:, None]
+    spread += _off_tangent(line * d.length, state.contact[:, 0], spread)
     shared = np.concatenate([moved, framed], axis=1)
     shared[..., [0, 1, 2, *range(9, 15)]] *= none
     return RodFit(

@@ -28,7 +28,9 @@ CUTOFF = 85.0
 _ORDER = 2  # order of the Butterworth filter, which is applied forward and backward
 _LATE = 1e-6  # fraction of a frame by which a table of times may be too short
 _SMALL = 0.05  # share of the times between frames that may be smaller than the usual small one
-_TANGENT = 0.2  # share of the whisker over which the tangent at the base is fitted
+# Share of the whisker over which the tangent at the base is fitted, largest one of what is seen,
+# and share of the frames that may show less.
+_TANGENT, _MOST, _HIDDEN = 0.2, 0.6, 0.1
 # Share of the whisker over which the rest shape is fitted to a frame's shape: tips are uncertain.
 _WHOLE = 0.85
 # Difference of a roll from the usual one at that azimuth and elevation above which a frame is not
@@ -294,7 +296,9 @@ def _azimuth_elevation(direction: Array) -> Array:
 
 def _tangents(shapes: Array, spacing: float, length: float) -> tuple[Array, Array]:
     """Unit tangents (time, 3) and points (time, 3) at the base, from a cubic over its beginning."""
-    count = max(6, int(_TANGENT * length / spacing))
+    # A whisker may be much longer than what all views show of it, in some frames.
+    shown = np.quantile(np.isfinite(shapes[:, :, 0]).sum(axis=1), _HIDDEN)
+    count = max(6, min(int(_TANGENT * length / spacing), int(_MOST * shown)))
     s = np.arange(count) * spacing
     fit: Array = np.linalg.pinv(np.vander(s, 4, increasing=True))
     coefficients = np.einsum("kn,tni->tki", fit, shapes[:, :count])

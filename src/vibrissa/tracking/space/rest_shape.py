@@ -145,7 +145,8 @@ def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> R
     part = shapes[whole, :compared]
     best, near = _largest_group(part, least)
     group = np.flatnonzero(seen)[whole][near]
-    length, ends = _length(curves[group], None if tips is None else tips[group])
+    lengths = np.linalg.norm(np.diff(curves[group], axis=1), axis=2).sum(axis=1)
+    length, ends = length_shown(lengths, None if tips is None else tips[group])
     # Repeat with arc lengths that divide this length evenly.
     first = np.flatnonzero(whole)[best]
     _, shapes, known, compared = _compared(curves[seen], length / (curves.shape[1] - 1))
@@ -234,10 +235,9 @@ def _whole(known: Counts, compared: int) -> Mask:
     return whole
 
 
-def _length(curves: Array, tips: Mask | None) -> tuple[float, bool]:
-    """Length of the whisker, m, and whether its tip is seen."""
-    lengths = np.linalg.norm(np.diff(curves, axis=1), axis=2).sum(axis=1)
-    ends = np.ones(len(curves), dtype=bool) if tips is None else tips
+def length_shown(lengths: Array, tips: Mask | None) -> tuple[float, bool]:
+    """Length of the whisker, by those that are seen, m, and whether its tip is seen."""
+    ends = np.ones(len(lengths), dtype=bool) if tips is None else tips
     whole = bool(ends.sum() >= _ENDS)
     if whole and 2 * ends.sum() < len(ends):
         # Where a whisker usually fades, some lines seem to end, but at random positions.
@@ -440,15 +440,23 @@ class Length(NamedTuple):
     sigma: float  # its standard deviation, m; NaN if nothing bends the whisker
     seen: bool = False  # whether it is seen or stated, not inferred from bending
     shown: float = np.inf  # length of the part that is seen, m
-    bend: float = 0.0  # standard deviation of the curvature of the other part, 1/m
+    # Standard deviations (vector, 3) of the slope of the other part's curvature, 1/m², in the frame
+    # of the shape.
+    bending: Array = np.zeros((3, 3))
+
+    def astray(self, beyond: Array) -> Array:
+        """Displacements of points so far beyond the part that is seen, over `bending`, m³.
+
+        The shape is extrapolated with the curvature of the outer part.
+        """
+        return np.asarray(beyond**2 * (0.25 * _OUTER * self.shown + beyond / 6.0))
 
 
-def seen_length(curves: Array, lines: Array, tapers: bool = True) -> Length:
+def seen_length(lengths: Array, lines: Array, tapers: bool = True) -> Length:
     """Length of whiskers that are seen to end; their lines in the images give its error in pixels.
 
     If the taper is unknown, the length does not determine the radius either.
     """
-    lengths = np.linalg.norm(np.diff(curves, axis=1), axis=2).sum(axis=1)
     pixels = np.linalg.norm(np.diff(lines, axis=2), axis=3).sum(axis=2)
     low, value, high = np.percentile(lengths, [16.0, 50.0, 84.0])
     seen = np.hypot(_ENDED * value / np.nanpercentile(pixels, 95.0), 0.5 * (high - low))
@@ -470,13 +478,14 @@ def stated_length(shape: RestShape, length: float, tapers: bool = True) -> Lengt
 def unseen_part(shape: RestShape, length: Length) -> Length:
     """Add the length that a shape shows, and how uncertain the curvature beyond it is.
 
-    That is by how much the curvature of its outer part differs from that of the whole.
+    It may go on to change as it does between the middle of the whole and that of the outer part.
     """
     s = np.arange(len(shape.points)) * shape.spacing
     outer = s > s[-1] - _OUTER * shape.length
     bends = [np.polynomial.polynomial.polyfit(s[i], shape.points[i], 2)[2] for i in (outer, s >= 0)]
-    bend = 2.0 * float(np.linalg.norm(bends[0] - bends[1]))
-    return length._replace(shown=shape.length, bend=bend)
+    change = 2.0 * float(np.linalg.norm(bends[0] - bends[1]))
+    bending = change / (0.5 * (1.0 - _OUTER) * shape.length)
+    return length._replace(shown=shape.length, bending=bending * np.eye(3))
 
 
 def lengthened(shape: RestShape, length: float) -> RestShape:

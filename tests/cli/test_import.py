@@ -142,7 +142,15 @@ def errors(path, truth):
     return np.linalg.norm(away[both, 0], axis=-1)
 
 
-@pytest.mark.parametrize("write", [tables, labels, analysis, movement])
+@pytest.mark.parametrize(
+    "write",
+    [
+        tables,
+        pytest.param(labels, marks=pytest.mark.slow),
+        analysis,
+        pytest.param(movement, marks=pytest.mark.slow),
+    ],
+)
 def test_two_views_to_a_recording(trial, tmp_path, write):
     truth, line = trial
     save_cameras(tmp_path / "cameras.toml", CAMERAS)

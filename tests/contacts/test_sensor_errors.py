@@ -52,7 +52,7 @@ def located(estimator, reading, truth):
     return nees(found.candidates.point, found.candidates.covariance, truth)
 
 
-@pytest.mark.parametrize("channels", [3, 6, 8])
+@pytest.mark.parametrize("channels", [3, pytest.param(6, marks=pytest.mark.slow), 8])
 @pytest.mark.parametrize("which", ["gain", "mixing", "calibration"])
 def test_a_wrong_matrix_makes_errors_as_stated(gamma_map, bent, wrench, rng, channels, which):
     """In each trial the sensor's matrix is wrong anew, by 1 %."""

@@ -373,12 +373,17 @@ def test_where_it_comes_from(written, folder):
     assert facts["seed"].startswith("3")
 
 
-def test_the_same_command_gives_the_same_page(map_page, folder, monkeypatch):
+@pytest.mark.slow
+def test_the_same_command_gives_the_same_page(map_page):
     path, words = map_page
     before = path.read_bytes()
-    assert "is there already" in fault("report", *words, "-o", path)
     run("report", *words, "-o", path, "--force")
     assert path.read_bytes() == before
+
+
+def test_a_page_is_replaced_only_if_asked_and_its_date_is_a_number(map_page, folder, monkeypatch):
+    path, words = map_page
+    assert "is there already" in fault("report", *words, "-o", path)
     monkeypatch.setattr(reporting, "drawn", lambda drawings, tell: [])
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "yesterday")
     text = fault("report", folder / "map.nc", "-o", folder / "same.html")

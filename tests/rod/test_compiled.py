@@ -5,9 +5,10 @@ import subprocess
 import sys
 import textwrap
 
+import numpy as np
 import pytest
 
-from vibrissa.numerics import copy
+from vibrissa.numerics import copy, order_of
 
 
 def run(code, **environment):
@@ -128,9 +129,9 @@ def test_a_kernel_runs_its_own_copies_of_what_it_calls():
 
         from llvmlite.binding import Linkage
 
-        from vibrissa.numerics.compiled import kernel, specialised
+        from vibrissa.numerics.compiled import kernel
 
-        @specialised
+        @kernel
         def chaos(x, n):
             for _ in range(n):
                 x = math.sin(x) + math.cos(3.0 * x) + math.atan2(x, 1.0 + x * x)
@@ -152,6 +153,63 @@ def test_a_kernel_runs_its_own_copies_of_what_it_calls():
         assert {f.linkage for f in called} == {Linkage.internal}
         """
     )
+
+
+MADE = """
+import math
+
+from vibrissa.numerics.compiled import kernel, shared, specialised
+
+@specialised
+def power(x, n):
+    return x**n
+
+@shared
+def root(x, n):
+    if x < 0.0:
+        raise ValueError("below 0")
+    return math.sqrt(power(x, 2)) + n
+
+@kernel
+def inner(x):
+    return root(x, 1) + root(x, 2)
+
+@kernel
+def outer(x):
+    return inner(x) + root(x, 3)
+"""
+CALLED = """
+from made import inner, outer, power, root
+
+assert outer(2.0) == 12.0
+try:
+    outer(-1.0)
+except ValueError as fault:
+    assert str(fault) == "below 0"
+else:
+    raise AssertionError
+assert len(root.overloads) == 1  # for all constants
+if not outer.stats.cache_hits:
+    assert not inner.overloads
+    ((compiled,), (own,)) = outer.overloads.values(), root.overloads.values()
+    name = own.fndesc.llvm_func_name
+    (called,) = [f for f in compiled.library._final_module.functions if f.name == name]
+    assert called.is_declaration
+print(*(sum(each.stats.cache_hits.values()) for each in (outer, root, power)))
+"""
+
+
+def test_a_shared_kernel_is_compiled_once_and_called(tmp_path):
+    """Also by kernels from the cache, which need it in the process: without it they would crash."""
+    (tmp_path / "made.py").write_text(MADE)
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
+    settings = os.environ | {"NUMBA_CACHE_DIR": str(kept), "PYTHONPATH": path}
+    assert run(CALLED, **settings).stdout == "0 0 0\n"
+    for file in kept.rglob("made.root*.nbc"):
+        file.unlink()
+    assert run(CALLED, **settings).stdout == "1 0 1\n"
 
 
 SQUARE = """
@@ -298,3 +356,8 @@ def test_what_is_inlined_cannot_be_called_from_python():
     """It has no wrapper for that; without this guard the interpreter would crash."""
     with pytest.raises(TypeError, match="copy can be called by kernels only"):
         copy([0.0], [1.0])
+
+
+def test_a_few_values_are_put_in_order():
+    values = np.array([3.0, np.nan, 1.0, np.inf, np.nan, -1.0, 1.0])
+    assert order_of.py_func(values).tolist() == [5, 2, 6, 0, 3, 1, 4]

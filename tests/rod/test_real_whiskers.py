@@ -26,7 +26,14 @@ def acceptance():
     del sys.modules[spec.name]
 
 
-@pytest.mark.parametrize("name", ["1LC01", pytest.param("1LA05", marks=pytest.mark.slow), "1LD02"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "1LC01",
+        pytest.param("1LA05", marks=pytest.mark.slow),
+        pytest.param("1LD02", marks=pytest.mark.slow),
+    ],
+)
 @pytest.mark.parametrize("crowded", [False, True], ids=["up to the fold", "near the fold"])
 def test_every_contact_is_found_again(acceptance, name, crowded):
     """A γ whisker, the shortest of a row and the most slender: all of 2,000 contacts of each."""

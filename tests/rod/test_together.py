@@ -66,9 +66,11 @@ def test_a_helper_compiles_what_is_found_on_disk_here(run):
     "why",
     [
         pytest.param("together.threads = lambda: 1", id="one core"),
-        pytest.param("sys.frozen = True", id="a frozen program"),
-        pytest.param("sys.executable = '/usr/bin/matlab'", id="embedded in a program"),
-        pytest.param("sys.executable = None", id="no executable"),
+        pytest.param("sys.frozen = True", id="a frozen program", marks=pytest.mark.slow),
+        pytest.param(
+            "sys.executable = '/usr/bin/matlab'", id="embedded in a program", marks=pytest.mark.slow
+        ),
+        pytest.param("sys.executable = None", id="no executable", marks=pytest.mark.slow),
         pytest.param("thrice.py_func.__module__ = '__main__'", id="not in a module"),
     ],
 )
@@ -77,7 +79,14 @@ def test_nobody_is_asked_where_that_gains_nothing(run, why):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="the stand-ins for Python are shell scripts")
-@pytest.mark.parametrize("does", ["exit 3", "exec sleep 1000", "head -c 1; kill -9 $$"])
+@pytest.mark.parametrize(
+    "does",
+    [
+        pytest.param("exit 3", marks=pytest.mark.slow),
+        "exec sleep 1000",
+        pytest.param("head -c 1; kill -9 $$", marks=pytest.mark.slow),
+    ],
+)
 def test_a_helper_that_fails_or_hangs_is_done_without(run, tmp_path, does):
     helper = tmp_path / "python"
     helper.write_text(f"#!/bin/sh\n{does}\n")

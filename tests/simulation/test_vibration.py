@@ -67,7 +67,7 @@ def test_whisking_in_air_is_predicted(whisker, in_air):
         assert np.median(left) < 0.1 * np.median(np.linalg.norm(known, axis=1))
 
 
-@pytest.mark.parametrize("assumed", [1.0, 1.3])
+@pytest.mark.parametrize("assumed", [pytest.param(1.0, marks=pytest.mark.slow), 1.3])
 def test_contact_is_distinguished_from_inertia_with_a_wrong_mass(whisker, past_peg, assumed):
     trial = past_peg
     touching = trial["truth"].to_dataset().isel(whisker=0).in_contact.values.astype(bool)

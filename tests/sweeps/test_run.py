@@ -238,11 +238,16 @@ def test_certificates_are_tasks_that_go_on_from_their_files(tmp_path):
     "task",
     [
         'kind = "map"',
-        'kind = "certificate"\nminutes = 0',
-        'kind = "uniqueness"\ntriplets = ["Fx MB MD"]\nsamples = 16',
-        'kind = "sensitivity"\ntriplets = ["Fx MB MD"]',
         'kind = "estimation"\nsignals = ["Fx MB MD", "Fx FT FD MB", "wrench"]\ncontacts = 20',
-        'kind = "friction"\ncontacts = 20',
+        *(
+            pytest.param(task, marks=pytest.mark.slow)
+            for task in (
+                'kind = "certificate"\nminutes = 0',
+                'kind = "uniqueness"\ntriplets = ["Fx MB MD"]\nsamples = 16',
+                'kind = "sensitivity"\ntriplets = ["Fx MB MD"]',
+                'kind = "friction"\ncontacts = 20',
+            )
+        ),
     ],
 )
 def test_nothing_is_kept_of_a_whisker_that_is_done(task):

@@ -40,7 +40,7 @@ def misses(film, start):
         pytest.param(201, {}, marks=pytest.mark.slow),
         pytest.param(202, {"crf": 28}, marks=pytest.mark.slow),
         pytest.param(206, {"noise": 8.0}, marks=pytest.mark.slow),
-        (203, {"bright": True}),
+        pytest.param(203, {"bright": True}, marks=pytest.mark.slow),
         (207, {"still": True}),
     ],
     ids=["left", "another", "compressed", "noisy", "bright", "at rest"],

@@ -33,8 +33,10 @@ from vibrissa.numerics.arrays import (
 if TYPE_CHECKING:
     from vibrissa.numerics.algebra import (
         cholesky,
+        forward as forward,
         mahalanobis as mahalanobis,
         norm3 as norm3,
+        order_of as order_of,
         quick_exp as quick_exp,
         solve,
         solve3 as solve3,
@@ -47,6 +49,7 @@ if TYPE_CHECKING:
         inlined_rigorous as inlined_rigorous,
         kernel as kernel,
         rigorous as rigorous,
+        shared as shared,
         specialised as specialised,
         vectorised as vectorised,
     )
@@ -68,8 +71,10 @@ __dir__ = __all__.copy
 __getattr__ = names_from(
     __name__,
     {
-        "algebra": "cholesky mahalanobis norm3 quick_exp solve solve3 solve_root wrapped",
-        "compiled": "copy inlined inlined_rigorous kernel rigorous specialised vectorised",
+        "algebra": (
+            "cholesky forward mahalanobis norm3 order_of quick_exp solve solve3 solve_root wrapped"
+        ),
+        "compiled": "copy inlined inlined_rigorous kernel rigorous shared specialised vectorised",
         "device": "Translation check_device",
         "together": "compile_together",
     },

@@ -1,10 +1,10 @@
-"""Small linear systems, Cholesky factors and angles for use in kernels."""
+"""Small linear systems, Cholesky factors, angles and orders for use in kernels."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.numerics.arrays import Array
+from vibrissa.numerics.arrays import Array, IntArray
 from vibrissa.numerics.compiled import inlined
 
 # Smallest share of a variance that other coordinates leave unexplained; below, it is singular.
@@ -133,3 +133,19 @@ def mahalanobis(root: Array, x: Array) -> float:
     for a in range(x.shape[0]):
         total += x[a] * x[a]
     return total
+
+
+@inlined
+def order_of(values: Array) -> IntArray:
+    """Indices that sort a few values, smallest first and NaN last."""
+    order = np.empty(values.shape[0], np.int64)
+    for i in range(values.shape[0]):
+        k = i
+        while k > 0 and (
+            values[order[k - 1]] > values[i]
+            or (np.isnan(values[order[k - 1]]) and not np.isnan(values[i]))
+        ):
+            order[k] = order[k - 1]
+            k -= 1
+        order[k] = i
+    return order

@@ -3,7 +3,8 @@
 Compilation takes seconds, once per installation (:mod:`~vibrissa.numerics.kernel_cache`). Numba
 links and optimises every function by itself, again within each function that calls it, and so on up
 to the one called by Python. Here only the latter is linked and optimised, together with all
-functions it calls; functions called by kernels alone are only translated (:class:`_Part`).
+functions it calls; functions called by kernels alone are only translated (:class:`_Part`). Large
+functions that several kernels call are compiled once, and called by them (:func:`shared`).
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from numba.core.registry import CPUDispatcher
 from numba.core.runtime.context import NRTContext
 from numba.core.typed_passes import NativeLowering
 
-from vibrissa.numerics.kernel_cache import PackageCache
+from vibrissa.numerics.kernel_cache import Called, PackageCache
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -51,6 +52,8 @@ _LARGE = 40
 _YOUNG = 50_000
 #: Parts of LLVM's names of functions whose loops are vectorised even in large kernels.
 _VECTORISED: set[str] = set()
+#: Code of shared kernels.
+_SHARED: dict[JITCodeLibrary, Called] = {}
 #: Expressions whose value refers to existing arrays.
 _VIEWS = {"getitem", "static_getitem", "getattr", "build_tuple", "cast", "exhaust_iter", "phi"}
 
@@ -68,14 +71,18 @@ class _Part(JITCodeLibrary):
 
 
 class _Whole(JITCodeLibrary):
-    """Code that is linked and optimised together with all its parts."""
+    """Code that is linked and optimised together with all its parts, apart from shared kernels."""
+
+    #: Shared kernels called.
+    calls: tuple[Called, ...] = ()
 
     def finalize(self) -> None:
         """Link each part once, rather than once per caller."""
         found: dict[JITCodeLibrary, None] = {}
         _collect_parts(self._linking_libraries, found)
+        self.calls = tuple(_SHARED[library] for library in found if library in _SHARED)
         # Callers first: LLVM omits what nothing already linked refers to.
-        self._linking_libraries = list(reversed(found))
+        self._linking_libraries = [each for each in reversed(found) if each not in _SHARED]
         super().finalize()  # type: ignore[no-untyped-call]
 
     def _finalize_final_module(self) -> None:
@@ -215,16 +222,27 @@ _FORM = {"forceinline": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": T
 _HASH = hash(Flags())  # depends on the names of the options alone
 
 
+class _SharedFlags(_Flags):
+    """The same for shared kernels, whose names do not depend on what calls them first."""
+
+    __slots__ = ()
+
+    def get_mangle_string(self) -> str:
+        """Return the part of names in machine code that else lists the options."""
+        return "shared"
+
+
 class _WholeCompiler(Compiler):
     """Numba's compiler with such a library."""
 
     library_type: type[JITCodeLibrary] = _Whole
+    flags_type: type[_Flags] = _Flags
 
     def __init__(self, typing: Any, target: Any, library: Any, *rest: Any) -> None:
         library = self.library_type(target.codegen(), "kernel")
         library.enable_object_caching()
         args, returned, flags, types_of_locals = rest
-        flags = _Flags(flags)  # type: ignore[no-untyped-call]
+        flags = self.flags_type(flags)
         super().__init__(typing, target, library, args, returned, flags, types_of_locals)  # type: ignore[no-untyped-call]
 
     def compile_extra(self, func: Any) -> Any:
@@ -250,6 +268,17 @@ class _CompactCompiler(_WholeCompiler):
     library_type = _Compact
 
 
+class _SharedCompiler(_CompactCompiler):
+    """Compiler of a kernel whose name in machine code is the same in all processes."""
+
+    flags_type = _SharedFlags
+
+    def _compile_bytecode(self) -> Any:
+        """Replace Numba's number of the function, by which cached callers would not find it."""
+        self.state.func_id.unique_id = 0
+        return super()._compile_bytecode()  # type: ignore[no-untyped-call]
+
+
 class _PartCompiler(_WholeCompiler):
     library_type = _Part
 
@@ -266,6 +295,23 @@ class _Kernel(CPUDispatcher):
     def get_overload(self, sig: Any) -> Any:
         """Return the compiled part."""
         return self.part.get_overload(sig)
+
+
+class _Specialised(CPUDispatcher):
+    """Dispatcher of a kernel called, in the same compiled form, by Python and by kernels."""
+
+    def add_overload(self, cres: Any) -> None:
+        """Note what is compiled, so that callers do not contain it."""
+        super().add_overload(cres)
+        _SHARED[cres.library] = Called(self.py_func, cres)
+
+
+class _Shared(_Specialised):
+    """The same, compiled once for all constant arguments."""
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """Compile without the values of constants."""
+        return super().get_call_template(tuple(map(types.unliteral, args)), kws)
 
 
 class _Inlined(CPUDispatcher):
@@ -294,9 +340,21 @@ def vectorised(function: Callable[P, R]) -> Callable[P, R]:
     return kernel(function)
 
 
+def shared(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile a kernel once for Python and all kernels, which call it instead of containing it.
+
+    For large functions: a call takes some nanoseconds, and nothing is inlined across it.
+    """
+    compiled = _compile_cached(function, pipeline_class=_SharedCompiler)
+    compiled.__class__ = _Shared
+    return cast("Callable[P, R]", compiled)
+
+
 def specialised(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a kernel separately for each constant argument, so that it is faster."""
-    return cast("Callable[P, R]", _compile_cached(function))
+    """Compile a shared kernel separately for each constant argument, so that it is faster."""
+    compiled: Any = shared(function)
+    compiled.__class__ = _Specialised
+    return cast("Callable[P, R]", compiled)
 
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:

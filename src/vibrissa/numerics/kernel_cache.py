@@ -16,12 +16,14 @@ import hashlib
 import io
 import pickle
 import sys
+from collections.abc import Callable
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any, cast
 
 from numba.core import event
-from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 
 _SHARED = tuple(Path(__file__).parents[1] / name for name in ("numerics", "rod", "signals"))
 _DIGEST = hashlib.sha256().digest_size
@@ -35,7 +37,8 @@ def _source_digest(package: Path) -> str:
         source = path.read_bytes()
         # Written such that this file, which has no kernels, does not match itself.
         if any(
-            b"@" + name in source for name in (b"kernel", b"specialised", b"vectorised", b"inlined")
+            b"@" + name in source
+            for name in (b"kernel", b"shared", b"specialised", b"vectorised", b"inlined")
         ):
             digest.update(source)
     return digest.hexdigest()
@@ -72,9 +75,41 @@ class _Files(IndexDataCacheFile):
         return hashlib.sha256(content).digest() + content
 
 
+class Called:
+    """Kernel that others call by its name in machine code, compiled for some types."""
+
+    def __init__(self, function: Callable[..., object], compiled: Any) -> None:
+        self._module, self._function = function.__module__, function.__name__
+        self._types, self._name = compiled.signature.args, compiled.fndesc.llvm_func_name
+
+    def prepare(self) -> None:
+        """Load or compile it; a call of a name that is not in the process would crash."""
+        kernel: Any = getattr(import_module(self._module), self._function)
+        kernel.compile(self._types)
+        name = kernel.overloads[self._types].fndesc.llvm_func_name
+        if name != self._name:
+            raise LookupError(f"{self._function} is called {name}, not {self._name}")
+
+
+class _Linked(CompileResultCacheImpl):
+    """Form in which compiled functions are kept: together with what they call."""
+
+    def reduce(self, cres: Any) -> object:
+        """Return what can be pickled."""
+        return cres.library.calls, super().reduce(cres)  # type: ignore[no-untyped-call]
+
+    def rebuild(self, target_context: object, payload: tuple[Any, Any]) -> object:
+        """Load a function after those it calls."""
+        calls, kept = payload
+        for called in calls:
+            called.prepare()
+        return super().rebuild(target_context, kept)  # type: ignore[no-untyped-call]
+
+
 class PackageCache(FunctionCache):
     """Cache of a compiled function, valid as long as the kernels of its package are unchanged."""
 
+    _impl_class = _Linked
     _warned = False
 
     def __init__(self, function: object) -> None:

@@ -26,7 +26,7 @@ from vibrissa.contacts.fitting.least_squares import (
 from vibrissa.contacts.sensing.noise import INDISTINCT
 from vibrissa.contacts.sensing.weighing import Weighing, weigh
 from vibrissa.contacts.uncertainty.nodes import PARTS, Searched, nearest_of
-from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel
+from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel, order_of
 from vibrissa.rod import (
     BUFFER_SIZE,
     LANES,
@@ -256,7 +256,7 @@ def _fitted(
             if not weigh(how, values[row], measured, weights[row]):
                 return
         fit_rows(rod, False, LEAST_ARC, codes, targets, weights, fits, first, last)
-        order = first + np.argsort(misfits[first:last])
+        order = first + order_of(misfits[first:last])
         for i in range(last - first):
             row = order[i]
             for _again in range(_TIMES):

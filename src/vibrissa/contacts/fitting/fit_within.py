@@ -27,7 +27,7 @@ from vibrissa.contacts.fitting.least_squares import (
     whiten,
 )
 from vibrissa.contacts.sensing.weighing import Weighing, weigh_any
-from vibrissa.numerics import Array, IntArray, cholesky, copy, inlined, kernel, solve_root
+from vibrissa.numerics import Array, IntArray, cholesky, copy, inlined, kernel, shared, solve_root
 from vibrissa.rod import BUFFER_SIZE, Charted, Fold, fold_force
 
 _MOST_DAMPING = 1e8
@@ -280,7 +280,7 @@ def _room(k: int) -> _Room:
     )
 
 
-@kernel
+@shared
 def _descend(
     rod: Charted,
     proximal: float,
@@ -436,7 +436,8 @@ def fit_rows_within(
         if fits.misfits[row] < np.inf and stable_fit(rod.fold, proximal, x, tangents):
             continue
         copy(start[row], x)
-        room.weights[:] = weights[row]
+        for i in range(codes.shape[0]):
+            copy(weights[row, i], room.weights[i])
         fits.misfits[row], _ = _descend(
             rod,
             proximal,

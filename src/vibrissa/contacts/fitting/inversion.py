@@ -23,6 +23,7 @@ from vibrissa.numerics import (
     inlined,
     kernel,
     share_out,
+    shared,
     solve3,
     wrapped,
 )
@@ -340,7 +341,7 @@ def _determined(rod: Rod, b: Array, xi: Array, target: Array) -> bool:
     return False
 
 
-@kernel
+@shared
 def invert_rows(
     rod: Rod,
     fold: Fold,

@@ -29,6 +29,7 @@ from vibrissa.numerics import (
     inlined,
     kernel,
     share_out,
+    shared,
     solve_root,
     wrapped,
 )
@@ -247,7 +248,7 @@ def _integrate_active(rod: Rod, b: Array, to: Array, n: int, lanes: int, active:
     return -1 if number == 1 else number
 
 
-@kernel
+@shared
 def fit_rows(
     rod: Rod,
     free: bool,

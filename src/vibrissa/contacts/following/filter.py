@@ -266,25 +266,22 @@ class ContactFilter:
         chart, readout = self.estimator.contact_map.chart, self.estimator.readout
         most = len(self._mixture.weight) * (1 + len(x))
         out, misfits = room(most, self._errors), np.empty(most)
-        try:
-            n = learn(
-                charted_rod(chart),
-                chart.proximal,
-                readout.how,
-                measurement.target,
-                measurement.measured,
-                readout.passes,
-                turn,
-                base,
-                self._pose,
-                self._mixture,
-                x,
-                values,
-                out,
-                misfits,
-            )
-        except np.linalg.LinAlgError:  # rounding has made a covariance singular
-            n = 0
+        n = learn(
+            charted_rod(chart),
+            chart.proximal,
+            readout.how,
+            measurement.target,
+            measurement.measured,
+            readout.passes,
+            turn,
+            base,
+            self._pose,
+            self._mixture,
+            x,
+            values,
+            out,
+            misfits,
+        )
         explains = bool((misfits[:n] < self._limit).any())
         self._mixture = _tidied(out, n)
         return explains

@@ -29,7 +29,18 @@ from vibrissa.contacts.fitting.fit_within import fit_rows_within
 from vibrissa.contacts.fitting.least_squares import Fits, same_contact, settled
 from vibrissa.contacts.sensing.weighing import Weighing, gradients, weigh, wrong_by
 from vibrissa.contacts.uncertainty.moments import Onset, moments
-from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel
+from vibrissa.numerics import (
+    AnyArray,
+    Array,
+    IntArray,
+    cholesky,
+    copy,
+    forward,
+    inlined,
+    kernel,
+    mahalanobis,
+    order_of,
+)
 from vibrissa.rod import Charted
 
 # Squared Mahalanobis distance from the prediction within which a contact that gives the signals is
@@ -94,7 +105,7 @@ def room(n: int, errors: int) -> Mixture:
 @kernel
 def tidy(mixture: Mixture, number: int, least: float, most: int, near: float) -> int:
     """Sort and normalise hypotheses, drop improbable ones, and merge those that coincide."""
-    order = np.argsort(-mixture.weight[:number])
+    order, both, away = order_of(-mixture.weight[:number]), np.empty((3, 3)), np.empty(3)
     mean, spread = mixture.mean[order], mixture.spread[order]
     by, contact = mixture.by_errors[order], mixture.contact[order]
     value, weight = mixture.value[order], mixture.weight[order]
@@ -104,21 +115,19 @@ def tidy(mixture: Mixture, number: int, least: float, most: int, near: float) ->
             break
         twin = -1
         for j in range(kept):
-            both = np.empty((3, 3))
-            away = np.empty(3)
             for a in range(3):
                 away[a] = mean[i, a] - mixture.mean[j, a]
                 for b in range(3):
                     both[a, b] = spread[i, a, b] + mixture.spread[j, a, b]
-            if away @ np.linalg.solve(both, away) < near:
+            if cholesky(both, both) and mahalanobis(both, away) < near:
                 twin = j
                 break
         if twin >= 0:
             top = mixture.weight[twin]
             share = np.exp(weight[i] - top) / (1.0 + np.exp(weight[i] - top))
-            away = mean[i] - mixture.mean[twin]
+            apart = mean[i] - mixture.mean[twin]
             for a in range(6):
-                mixture.mean[twin, a] += share * away[a]
+                mixture.mean[twin, a] += share * apart[a]
                 for e in range(by.shape[2]):
                     old = mixture.by_errors[twin, a, e]
                     mixture.by_errors[twin, a, e] = old + share * (by[i, a, e] - old)
@@ -127,7 +136,7 @@ def tidy(mixture: Mixture, number: int, least: float, most: int, near: float) ->
                     mixture.spread[twin, a, b] = (
                         old
                         + share * (spread[i, a, b] - old)
-                        + share * (1.0 - share) * away[a] * away[b]
+                        + share * (1.0 - share) * apart[a] * apart[b]
                     )
             mixture.weight[twin] = top + np.log1p(np.exp(weight[i] - top))
             continue
@@ -169,7 +178,7 @@ def unaccounted(
                     both[a, e] = mixture.spread[j, a, e] + covariances[i, a, e]
                     for k in range(b.shape[1]):
                         both[a, e] += b[a, k] * b[e, k]
-            if not away @ np.linalg.solve(both, away) > far:
+            if not (cholesky(both, both) and mahalanobis(both, away) > far):
                 out[i] = False
                 break
 
@@ -226,8 +235,12 @@ def _predictions(
     prior: Array,
     before: Array,
     root: Array,
-) -> None:
-    """Fill predictions in the whisker's frame by hypothesis: p, covariance P, and P^(-1/2)."""
+) -> bool:
+    """Fill predictions in the whisker's frame by hypothesis: p, covariance P, and P^(-1/2).
+
+    False if rounding has made a covariance singular.
+    """
+    low, column = np.empty((3, 3)), np.empty(3)
     for i in range(len(mixture.weight)):
         away = mixture.mean[i, :3] - base
         for a in range(3):
@@ -235,8 +248,18 @@ def _predictions(
         spread = mixture.spread[i, :3, :3].copy()
         for a in range(3):
             spread[a, a] += pose
-        before[i] = turn.T @ spread @ turn
-        root[i] = np.linalg.inv(np.linalg.cholesky(before[i]))
+        here = turn.T @ spread @ turn
+        if not cholesky(here, low):
+            return False
+        for c in range(3):
+            for a in range(3):
+                column[a] = 1.0 if a == c else 0.0
+            forward(low, column)
+            for a in range(3):
+                root[i, a, c] = column[a]
+        for a in range(3):
+            copy(here[a], before[i, a])
+    return True
 
 
 @kernel
@@ -305,7 +328,8 @@ def _fits(
             copy(fits.contacts[row], before[row])
             if not weigh(how, fits.values[row], measured, own):
                 own[:] = 0.0
-            weights[row, :k, :k] = own
+            for a in range(k):
+                copy(own[a], weights[row, a, :k])
         fit_rows_within(rod, proximal, how, codes, targets, measured, weights, fits)
         rest = True
         for row in range(len(targets)):
@@ -364,7 +388,9 @@ def _moved(
     gain = np.ascontiguousarray(spread[:, :3]) @ inverse
     through = gain @ (np.eye(3) - after @ inverse)
     keep = np.eye(6)
-    keep[:, :3] -= through
+    for a in range(6):
+        for c in range(3):
+            keep[a, c] -= through[a, c]
     noise = after - after @ inverse @ after
     b, g, wrong = mixture.by_errors[i].copy(), np.empty((k, 6)), np.empty(6)
     gradients(how.codes, v[:3], _moment(v), g)
@@ -374,7 +400,7 @@ def _moved(
         for a in range(3):
             for c in range(3):
                 noise[a, c] -= pushed[a] * pushed[c]
-        b[:, e] = keep @ np.ascontiguousarray(b[:, e]) + gain @ pushed
+        copy(keep @ np.ascontiguousarray(b[:, e]) + gain @ pushed, b[:, e])
     # The error of the base passes through the same gain.
     whole = keep @ spread @ keep.T + gain @ noise @ gain.T + pose * (through @ through.T)
     step = gain @ (turn @ (v[3:] + shift - prior))
@@ -406,21 +432,24 @@ def learn(
     out: Mixture,
     misfits: Array,
 ) -> int:
-    """Update hypotheses by a measurement."""
+    """Update hypotheses by a measurement; their number, 0 if a covariance is singular."""
     n, c, k = len(mixture.weight), len(contacts), how.codes.shape[0]
     most = n * (1 + c)
     prior, before, root = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3, 3))
-    _predictions(mixture, turn, base, pose, prior, before, root)
+    if not _predictions(mixture, turn, base, pose, prior, before, root):
+        return 0
     x, v, of = np.zeros((most, 4)), np.empty((most, 6)), np.empty(most, np.int64)
     rows = _starts(mixture, prior, root, contacts, values, of, x, v)
     codes, targets = np.empty(k + 3, np.int64), np.empty((rows, k + 3))
     weights = np.zeros((rows, k + 3, k + 3))
-    codes[:k] = how.codes
+    copy(how.codes, codes[:k])
     for a in range(3):
         codes[k + a] = _PLACE + a
     for row in range(rows):
-        targets[row, :k], targets[row, k:] = target, prior[of[row]]
-        weights[row, k:, k:] = root[of[row]]
+        copy(target, targets[row, :k])
+        copy(prior[of[row]], targets[row, k:])
+        for a in range(3):
+            copy(root[of[row], a], weights[row, k + a, k:])
     fits = Fits(
         x[:rows], v[:rows], np.zeros((rows, 6, 4)), np.full(rows, np.inf), np.zeros(rows, np.bool_)
     )
@@ -434,7 +463,8 @@ def learn(
             continue
         if not weigh(how, v[row], measured, own):
             continue
-        weights[row, :k, :k] = own
+        for a in range(k):
+            copy(own[a], weights[row, a, :k])
         if _moved(
             rod,
             proximal,

@@ -41,7 +41,7 @@ from vibrissa.contacts.uncertainty.posterior import (
     densities,
     empty_rays,
 )
-from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel, solve
+from vibrissa.numerics import AnyArray, Array, IntArray, copy, inlined, kernel, shared, solve
 from vibrissa.rod import BUFFER_SIZE, Charted
 
 
@@ -152,7 +152,7 @@ def _or_as_noise(x: Array, j: Array, scale: Array) -> None:
     scale[2], scale[3] = max(math.hypot(x[2], x[3]), 1.0 / math.sqrt(max(least, 1e-300))), 0.0
 
 
-@kernel
+@shared
 def moments(
     rod: Charted,
     proximal: float,

@@ -411,7 +411,7 @@ def _alike(line: Array, other: Array) -> bool:
 def _distances(line: Array, other: Array) -> Array:
     """Distance of each point of a line from the nearest one of another, pixels."""
     away = np.empty(len(line))
-    nearest_distances(line, other, away)
+    nearest_distances(np.ascontiguousarray(line), np.ascontiguousarray(other), away)
     return away
 
 

@@ -323,7 +323,7 @@ def motion_between(line: Array, other: Array) -> Array:
 def sideways(expected: Array, line: Array) -> Array:
     """Distance of a line to the left (−dy, dx) of an expected one, at its first points, pixels."""
     away = np.empty(len(POINTS))
-    distances_across(np.asarray(expected), np.asarray(line), POINTS, away)
+    distances_across(np.ascontiguousarray(expected), np.ascontiguousarray(line), POINTS, away)
     return away
 
 

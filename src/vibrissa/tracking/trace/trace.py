@@ -195,7 +195,9 @@ def overlap(line: Array, other: Array, near: float = 3.0) -> float:
     """Share of a line that is nearer to another than some pixels."""
     if not len(line) or not len(other):
         return 0.0
-    return count_near(np.asarray(line), np.asarray(other), near) / len(line)
+    # One memory layout, for which the kernel is compiled once.
+    line, other = np.ascontiguousarray(line), np.ascontiguousarray(other)
+    return count_near(line, other, near) / len(line)
 
 
 @kernel

@@ -4,11 +4,14 @@ import os
 import subprocess
 import sys
 import textwrap
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from vibrissa.numerics import copy, order_of
+from vibrissa.contacts.engine.ranking import judge_rows
+from vibrissa.numerics import copy, kernel_cache, order_of
+from vibrissa.rod.integration import integrate
 
 
 def run(code, **environment):
@@ -262,6 +265,15 @@ def test_kernels_are_known_by_what_their_files_contain(square, tmp_path):
     assert call().stdout == "2\n"
     script.write_text(SQUARE.replace("return x * x", "return x**2"))
     assert call().stdout == "0\n"
+
+
+def test_kernels_in_folders_are_known_by_all_of_their_package(monkeypatch):
+    """They contain functions from other folders of the package."""
+    packages = []
+    monkeypatch.setattr(kernel_cache, "_source_digest", lambda folder: packages.append(folder))
+    for kernel in (integrate, judge_rows):
+        kernel._cache._index_key((), SimpleNamespace(magic_tuple=tuple))
+    assert [folder.name for folder in packages] == ["rod", "contacts"]
 
 
 @pytest.mark.slow

@@ -25,7 +25,8 @@ from typing import Any, cast
 from numba.core import event
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 
-_SHARED = tuple(Path(__file__).parents[1] / name for name in ("numerics", "rod", "signals"))
+_ROOT = Path(__file__).parents[1]
+_SHARED = tuple(_ROOT / name for name in ("numerics", "rod", "signals"))
 _DIGEST = hashlib.sha256().digest_size
 
 
@@ -33,7 +34,7 @@ _DIGEST = hashlib.sha256().digest_size
 def _source_digest(package: Path) -> str:
     """Hash of all files with kernels in a package and the shared packages."""
     digest = hashlib.sha256()
-    for path in sorted(path for folder in {package, *_SHARED} for path in folder.glob("*.py")):
+    for path in sorted(path for folder in {package, *_SHARED} for path in folder.rglob("*.py")):
         source = path.read_bytes()
         # Written such that this file, which has no kernels, does not match itself.
         if any(
@@ -118,6 +119,8 @@ class PackageCache(FunctionCache):
 
     def _index_key(self, sig: object, codegen: object) -> tuple[object, ...]:
         package = Path(self._py_func.__code__.co_filename).parent
+        while _ROOT in package.parents and package.parent != _ROOT:  # a folder of the package
+            package = package.parent
         return (*super()._index_key(sig, codegen), _source_digest(package))  # type: ignore[no-untyped-call]
 
     def holds(self, sig: object, codegen: object) -> bool:

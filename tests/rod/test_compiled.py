@@ -270,7 +270,7 @@ def test_kernels_are_known_by_what_their_files_contain(square, tmp_path):
 def test_kernels_in_folders_are_known_by_all_of_their_package(monkeypatch):
     """They contain functions from other folders of the package."""
     packages = []
-    monkeypatch.setattr(kernel_cache, "_source_digest", lambda folder: packages.append(folder))
+    monkeypatch.setattr(kernel_cache, "_source_digest", packages.append)
     for kernel in (integrate, judge_rows):
         kernel._cache._index_key((), SimpleNamespace(magic_tuple=tuple))
     assert [folder.name for folder in packages] == ["rod", "contacts"]

@@ -73,7 +73,7 @@ def check_recording(recording: xr.DataTree) -> None:
         faults.append("its time does not increase from frame to frame, or is missing in some")
     if faults := faults or _position_faults(Recording(recording)):
         raise ValueError(f"the recording cannot be used: {'; '.join(faults)}")
-    if usual := slow_steps(time):
+    if not root["time"].attrs.get("numbered") and (usual := slow_steps(time)):
         warnings.warn(
             f"the recording has frames {usual:.3g} s apart: its time has to be in seconds, and "
             "rates of change are wrong if it is in ms",

@@ -397,6 +397,7 @@ def swept_recording(
         )
         for given in (held | shared, estimates)
     )
+    root["time"].attrs["numbered"] = 1  # rows have no time
     return recording_tree(root, [sensor.whisker], "swept by a stage", groups={"estimates": group})
 
 

@@ -91,6 +91,15 @@ def test_estimates_show_points_and_their_uncertainty(bent, whole):
     sigma = np.sqrt(np.einsum("nii->ni", found.covariance).max(axis=1))
     assert f"{1e3 * np.median(sigma):.4g} mm" in html
     assert "unique 5" in html
+    # The first contacts, in a table: arc length, point, standard deviation, force.
+    point, force = 1e3 * found.point[1], 1e6 * np.linalg.norm(found.contact_force[1])
+    cells = re.findall(r"<td[^>]*>([^<]*)</td>", html.split("s (mm)")[1].split("</table>")[0])
+    row = cells[cells.index("1") :][:8]
+    values = np.array([text.replace("−", "-") for text in row[1:7]], float)
+    expected = [1e3 * found.arc_length[1], *point, 1e3 * sigma[1], force]
+    np.testing.assert_allclose(values, expected, rtol=0.05, atol=2e-3)
+    assert row[7] == "unique"
+    assert not re.search(r"e[-−]\d", html.split("</svg>")[1] + str(found))
 
 
 def test_a_recording_shows_what_it_holds():
@@ -151,8 +160,27 @@ def test_what_is_printed_fits_a_terminal_and_tells_numbers(bent):
         assert max(map(len, printed.splitlines())) <= 80
     # A value that is the same but for rounding has no range.
     assert shown("force", [1e-4, 1.0000000001e-4]) == "100 µN"
+    assert shown("force", [0.0, -1e-18, 1e-4]) == "0 µN (0 to 100)"
+    assert shown("theta", [1e-13, -1e-10]) == "0°"
     # A wire's forces are not told in a million micronewtons.
     assert shown("force", [2.0, 4.0]) == "3000 mN (2000 to 4000)"
+
+
+def test_one_contact_lists_its_candidates_and_many_the_first(bent):
+    contact_map = vb.ContactMap.simulate(WHISKER, grid=False)
+    signals = vb.base_signals(bent.force, bent.moment)
+    noise = {"Fx": 1e-6, "FT": 1e-6, "MB": 2e-8}
+    locate = vb.Estimator(contact_map, "Fx FT MB", noise=noise)
+    one = locate([float(signals[name][0]) for name in noise])
+    listed = str(one).split("probability\n")[1].splitlines()
+    assert len(listed) == one.n_candidates == 2
+    assert [float(line.split()[-1]) for line in listed] == pytest.approx(
+        one.candidates.probability, abs=1e-3
+    )
+    assert "(25.000, 0.000, " in repr(one)
+    twice = {name: np.tile(signals[name], 2) for name in noise}
+    many = contact_map.estimate(twice, "Fx FT MB", noise=noise)
+    assert str(many).splitlines()[-1].split() == ["…", "5", "more"]
 
 
 def curves_in(figure, label):

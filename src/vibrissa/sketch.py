@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from html import escape
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -158,6 +159,15 @@ def lines(title: str, rows: Sequence[tuple[str, str]]) -> str:
     return "\n".join([title, *filled])
 
 
+def columns(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table for a terminal, of which later rows may be shorter than the first."""
+    widths = [max(map(len, column)) for column in zip_longest(*rows, fillvalue="")]
+    return [
+        "  " + "  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=False))
+        for row in rows
+    ]
+
+
 def table(rows: Sequence[Sequence[str]], heading: Sequence[str] = ()) -> str:
     """Return an HTML table."""
     head = "".join(f'<th style="{_CELL}">{escape(cell)}</th>' for cell in heading)
@@ -182,6 +192,8 @@ def shown(name: str, values: ArrayLike) -> str:
         return "–"
     factor, unit = shown_unit(name, known)
     known = known * factor
+    rounding = 1e-6 if unit == "°" else 1e-9 * abs(known).max()
+    known = np.where(abs(known) < rounding, 0.0, known)
     middle = f"{np.median(known):.4g}{'' if unit in ('', '°') else ' '}{unit}"
     least, largest = f"{known.min():.4g}", f"{known.max():.4g}"
     if least != largest:

@@ -10,14 +10,15 @@ import numpy as np
 
 from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray
-from vibrissa.quantities import attributes
+from vibrissa.quantities import attributes, shown_unit
 from vibrissa.rod import Discretization
 from vibrissa.signals import Coordinates, spherical
-from vibrissa.sketch import CONTACT, REST, Mark, card, lines, shown, views
-from vibrissa.status import Status, counted, describe, flag_attributes
+from vibrissa.sketch import CONTACT, REST, Mark, card, columns, lines, shown, table, views
+from vibrissa.status import Status, counted, describe, flag_attributes, names
 
 #: Largest number of candidates for one measurement.
 MOST_CANDIDATES = 8
+_LISTED = 5  # contacts in the table of a display
 _CERTAIN = (Status.UNIQUE, Status.TIP_CONTACT)
 _SPACE = ["x", "y", "z"]
 
@@ -314,10 +315,13 @@ class Contacts(_Located):
 
     def _repr_html_(self) -> str:
         """Show the contact points about the base, with the numbers."""
-        return card(self._title(), self._rows(), self.plot())
+        heading, listed = self._listed()
+        return card(self._title(), self._rows(), self.plot() + table(listed, heading))
 
     def __str__(self) -> str:
-        return lines(self._title(), self._rows())
+        heading, listed = self._listed()
+        every = columns([heading, *listed]) if listed else []
+        return "\n".join([lines(self._title(), self._rows()), *every])
 
     def _title(self) -> str:
         return f"Contacts of {self.status.shape or 'one'} from ({', '.join(self.using)})"
@@ -332,12 +336,46 @@ class Contacts(_Located):
             ("θ", shown("theta", theta)),
             ("φ", shown("phi", phi)),
             ("largest standard deviation of x, y, z", shown("r", sigma)),
+            ("arc length", shown("arc_length", self.arc_length)),
+            ("contact force", shown("force", np.linalg.norm(self.contact_force, axis=-1))),
             ("candidates", shown("candidates", self.n_candidates)),
             ("assumption", friction_assumed(self.friction)),
         ]
         if np.nan_to_num(self.contact_force[..., 0]).any():
             rows.append(("friction angle", shown("friction_angle", self.friction_angle)))
         return rows
+
+    def _listed(self) -> tuple[list[str], list[list[str]]]:
+        """Heading and rows of a table: the candidates of one measurement, or the first contacts."""
+        one = self.status.size == 1 and self._candidates is not None
+        whole = self.candidates if one else self
+        found = np.isfinite(whole.point).all(axis=-1).reshape(-1)
+        at = np.flatnonzero(found)[:_LISTED]
+        force = np.linalg.norm(whole.contact_force, axis=-1).reshape(-1)[at]
+        sigma = np.sqrt(np.einsum("...ii->...i", whole.covariance).max(axis=-1)).reshape(-1)[at]
+        newton, unit = shown_unit("force", force)
+        heading = ["candidate" if one else "contact", "s (mm)", "x", "y", "z (mm)", "σ (mm)"]
+        heading += [f"force ({unit})", "probability" if one else "status"]
+        last = (
+            [f"{value:.3f}" for value in whole.probability.reshape(-1)[at]]
+            if one
+            else [name.lower().replace("_", " ") for name in names(whole.status.reshape(-1)[at])]
+        )
+        place = np.column_stack([whole.arc_length.reshape(-1)[at], whole.point.reshape(-1, 3)[at]])
+        cells = [
+            [
+                str(at[i]),
+                *(f"{value:z.3f}" for value in 1e3 * place[i]),
+                f"{1e3 * sigma[i]:.2g}",
+                f"{newton * force[i]:.4g}",
+                last[i],
+            ]
+            for i in range(at.size)
+        ]
+        rows = [[cell.replace("nan", "–").replace("-", "−") for cell in row] for row in cells]
+        if found.sum() > _LISTED:
+            rows.append(["…", f"{found.sum() - _LISTED} more"])
+        return heading, rows
 
 
 def contacts_of(
@@ -520,7 +558,7 @@ class Contact(_Located):
         )
 
     def __repr__(self) -> str:
-        where = ", ".join(f"{1e3 * value:.4g}" for value in self.point.tolist())
+        where = ", ".join(f"{1e3 * value:z.3f}" for value in self.point.tolist())
         return f"<Contact {self.status.name} at ({where}) mm, candidates: {self.n_candidates}>"
 
     def _repr_html_(self) -> str:

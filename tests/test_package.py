@@ -33,7 +33,10 @@ def test_every_package_is_public():
     assert set(dir(vibrissa)) == set(vibrissa.__all__)
 
 
-@pytest.mark.parametrize("name", ["cameras", "contacts", "recording", "viewer", "whisker"])
+@pytest.mark.parametrize(
+    "name",
+    ["cameras", "contacts", "quantities", "recording", "samples", "status", "viewer", "whisker"],
+)
 def test_completion_lists_public_names(name):
     module = importlib.import_module(f"vibrissa.{name}")
     assert dir(module) == sorted(module.__all__)

@@ -23,6 +23,18 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+__all__ = [
+    "QUANTITIES",
+    "Quantity",
+    "attributes",
+    "axis_label",
+    "quantity",
+    "shown_unit",
+    "to_display",
+    "unit_fault",
+]
+__dir__ = __all__.copy
+
 
 @dataclass(frozen=True)
 class Quantity:

@@ -13,6 +13,17 @@ from collections import Counter
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+__all__ = [
+    "Event",
+    "Status",
+    "counted",
+    "describe",
+    "flag_attributes",
+    "is_ok",
+    "names",
+]
+__dir__ = __all__.copy
+
 
 class Status(enum.IntEnum):
     """Outcome of one load or one estimate.

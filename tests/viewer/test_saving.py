@@ -88,7 +88,9 @@ def test_a_movie_shows_all_of_a_trial_on_white(tmp_path):
     trial = SimpleNamespace(frames=frames)
     mode = SimpleNamespace(trial=trial, pause=lambda: None, show=seen.append)
     path = tmp_path / "trial.mp4"
-    path.write_bytes(movie(client, mode))
+    told = []
+    path.write_bytes(movie(client, mode, lambda *progress: told.append(progress)))
+    assert told == [(done, 100) for done in range(100)]
     assert (seen[0], seen[-1], len(seen)) == (0, frames - 1, 100)
     found = video_info(path)
     assert (found.width, found.height, found.rate) == (180, 120, 25.0)

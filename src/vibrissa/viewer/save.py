@@ -98,7 +98,7 @@ def _written(name: str, write: Callable[[Path], object]) -> bytes:
         return path.read_bytes()
 
 
-_TIMEOUT = 20.0
+_TIMEOUT = 60.0  # of a picture that the browser draws, s
 _FRAMES = 100  # most frames of a movie
 
 
@@ -110,14 +110,17 @@ def _render(client: viser.ClientHandle) -> Picture:
     )
 
 
-def movie(client: viser.ClientHandle, mode: TrialMode) -> bytes:
+def movie(
+    client: viser.ClientHandle, mode: TrialMode, progress: Callable[[int, int], None]
+) -> bytes:
     """MP4 movie of a trial in the view of a browser, on white."""
     mode.pause()
     count = min(mode.trial.frames, _FRAMES)
     rows = np.linspace(0, mode.trial.frames - 1, count).round().astype(int)
 
     def frames() -> Iterator[Picture]:
-        for row in rows:
+        for done, row in enumerate(rows):
+            progress(done, count)
             mode.show(int(row))
             paper = _on_white(_render(client))
             # Encoders need even sizes.
@@ -137,9 +140,9 @@ class SaveControls:
         with self.folder:
             files = gui.add_button_group("Whisker", ("CSV", "NetCDF"))
             picture = gui.add_button_group("Picture", ("PNG",))
-            movie = gui.add_button_group("Movie", ("MP4",), hint="The trial from where one looks")
+            movie = gui.add_button_group("Movie", ("MP4",), hint="The trial in the current view")
             data = gui.add_button_group(
-                "Data", ("NetCDF",), hint="The bent whisker, the map or the trial that is seen"
+                "Data", ("NetCDF",), hint="The bent whisker, the map or the trial that is shown"
             )
         files.on_click(self._whisker)
         picture.on_click(self._picture)
@@ -187,8 +190,15 @@ class SaveControls:
         if not isinstance(mode, TrialMode):
             self._page.say("Not saved", "a movie is of a trial: choose the mode Trial", "red")
             return
-        self._page.say("Movie", f"{_FRAMES} frames are drawn; it takes about a minute")
-        self._send(event, "trial.mp4", lambda: movie(client, mode))
+        note = client.add_notification("Movie", "drawn by this browser", loading=True)
+
+        def tell(done: int, total: int) -> None:
+            note.body = f"frame {done + 1} of {total}"
+
+        try:
+            self._send(event, "trial.mp4", lambda: movie(client, mode, tell))
+        finally:
+            note.remove()
 
     def _send(self, event: viser.GuiEvent[Any], name: str, made: Callable[[], bytes]) -> None:
         client = event.client

@@ -51,7 +51,7 @@ from vibrissa.scene import (
 )
 from vibrissa.signals import SIGNALS
 
-WIDTH, HEIGHT = 182.0, 119.0
+WIDTH, HEIGHT = 182.0, 121.0
 HEADS = (
     (2.0, "A whisker is bent,"),
     (66.0, "three signals locate the contacts,"),
@@ -126,7 +126,7 @@ def bent(
     rest = to_display("centerline", line)
     limits = bounds(np.concatenate([places.reshape(-1, 3), rest, now]))
     axes = space_axes(figure, (-7.0, 40.0, 71.0, 71.0), limits, (38.0, -66.0), zoom=0.9)
-    name_axes(axes, (-8.0, -9.0, -10.5))
+    name_axes(axes, (-8.0, -9.0, -7.5))
     paint(axes, places, SKIN, opacity=0.13)
     paint(axes, peg_triangles(course, peg, moment), PEG)
     draw_whisker(axes, rest, MUTED, 8)
@@ -196,11 +196,11 @@ def solids(figure: Figure, course: Course, samples: xr.Dataset, line: Array, mom
     limits = signal_limits(signal_rows(body))
     course_way = signal_places(*way.T)
     for i, name in enumerate(("r", "theta", "phi")):
-        axes = signal_axes(figure, (65.5, 80.0 - 37.5 * i, 51.0, 30.0), limits)
+        axes = signal_axes(figure, (65.5, 79.0 - 37.0 * i, 51.0, 30.0), limits)
         norm, marks = levels(name, body)
         values = to_display(name, values_of(name, body))
         paint(axes, signal_rows(body), painted(values, norm, sequential()), flat=0.8)
-        coordinate_bar(figure, (118.0, 86.5 - 37.5 * i, 1.6, 15.0), name, norm, marks)
+        coordinate_bar(figure, (118.0, 85.5 - 37.0 * i, 1.6, 15.0), name, norm, marks)
         axes.plot(*course_way.T, color=ORANGE, linewidth=0.7, zorder=12)
         axes.scatter(*course_way[moment], s=14.0, color=ORANGE, zorder=14, depthshade=False)
         drop_lines(axes, limits, course_way[moment])

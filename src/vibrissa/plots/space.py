@@ -186,7 +186,8 @@ def signal_axes(figure: Figure, panel: Box, limits: Array) -> Any:
         # The labels of the rays to the left are right-aligned, so that they do not cover the solid
         # and the label of the largest ring.
         far = {"ha": "right"} if angle in (90, 180) else {}
-        _write(axes, angle, 1.17 * reach, floor, label.replace("-", "−"), **far)
+        far_out = 1.3 if angle == -90 else 1.17  # clear of the solid's corner
+        _write(axes, angle, far_out * reach, floor, label.replace("-", "−"), **far)
     _height_axis(axes, limits)
     return axes
 

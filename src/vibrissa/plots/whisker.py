@@ -332,7 +332,7 @@ def _forces(axes: Axes, drawn: _Drawn) -> None:
     axes.scatter(away, drawn.forces, 14.0, color=drawn.colours, zorder=3)
     axes.set(xlabel="distance of the contact from rest (mm)", ylabel=style.size_label("force"))
     axes.set(xlim=(0.0, None), ylim=(0.0, None))
-    style.head(axes, "c", "force")
+    style.head(axes, "c", "force on each whisker, in its colour")
 
 
 def _panel(figure: Figure, box: style.Box, drawn: _Drawn, limits: Array, j: int) -> Axes:

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from vibrissa.tracking import Trace
+from vibrissa.tracking.trace.crossings import settle_crossings
 from vibrissa.tracking.trace.follower import FEATURES, Appearance, features_of
 from vibrissa.tracking.trace.identity import LOST, Assignment, Seen, decided, sideways
-from vibrissa.tracking.trace.trace import overlap
+from vibrissa.tracking.trace.trace import TraceOptions, overlap
 
 BASES = np.array([[20.0, 60.0], [20.0, 72.0]])
 FRAMES = 24
@@ -155,3 +156,50 @@ def test_the_cheapest_ways_are_those_of_all():
     np.testing.assert_allclose(cost, expected[:12])
     np.testing.assert_allclose([every[tuple(way)] for way in ways.tolist()], cost)
     assert len(problem.ways(price, lost, limit=expected[4])[0]) == 4
+
+
+def arc(base, angle, bend, length=200.0):
+    """A whisker of even bend, seen except next to the others."""
+    turned = angle + bend * np.arange(0.0, length, 2.0)
+    line = base + np.cumsum(2.0 * np.stack([np.cos(turned), np.sin(turned)], axis=1), axis=0)
+    return Trace(line, np.full(len(line), 0.1), np.ones(len(line), dtype=bool), 1.0)
+
+
+def crossed(one, other):
+    """Each goes on as the other from where they meet, and nothing is seen next to that."""
+    away = np.linalg.norm(one.line[:, None] - other.line[None], axis=2)
+    a, b = np.unravel_index(np.argmin(away), away.shape)
+    seen = [trace.seen & (away.min(axis=axis) > 5.0) for axis, trace in ((1, one), (0, other))]
+    cuts = [(one.line, seen[0], a), (other.line, seen[1], b)]
+    return [
+        Trace(
+            np.concatenate([mine[:n], others[m:]]),
+            np.full(n + len(others) - m, 0.1),
+            np.concatenate([shown[:n], beyond[m:]]),
+            1.0,
+        )
+        for (mine, shown, n), (others, beyond, m) in (cuts, cuts[::-1])
+    ]
+
+
+def test_far_ends_exchanged_at_a_crossing_are_put_right():
+    """From frame 8 to 15 each of two goes on as the other; a third one crosses both."""
+    bends, bases = (4e-4, 2e-3, -1e-3), (60.0, 42.0, 120.0)
+    sweep = 0.05 * np.sin(0.3 * np.arange(FRAMES))
+    right = [
+        [arc(np.array([20.0, y]), a, bend) for a in turn + sweep]
+        for y, turn, bend in zip(bases, (0.0, 0.1, -0.3), bends, strict=True)
+    ]
+    traces = [list(each) for each in right]
+    for i in range(8, 16):
+        traces[0][i], traces[1][i] = crossed(right[0][i], right[1][i])
+    found = settle_crossings(traces, [set()] * FRAMES, TraceOptions())
+    for row_, true in zip(found, right, strict=True):
+        assert all(overlap(a.line, b.line, 1.0) == 1.0 for a, b in zip(row_, true, strict=True))
+    # What a person marked is not changed.
+    kept = settle_crossings(traces, [{0}] * FRAMES, TraceOptions())
+    assert all(
+        a is b
+        for one, other in zip(kept, traces, strict=True)
+        for a, b in zip(one, other, strict=True)
+    )

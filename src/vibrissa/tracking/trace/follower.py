@@ -14,20 +14,19 @@ turns at once: the last feature states whether it meets one.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.io import Frame
-from vibrissa.numerics import Array, kernel
+from vibrissa.numerics import Array
 from vibrissa.tracking.trace.clutter import NOTHING, Clutter
 from vibrissa.tracking.trace.ends import OUTSIDE, grey_flanks, traced
 from vibrissa.tracking.trace.ridge import FEWEST, march, measure, middle, noise_level, smooth
-from vibrissa.tracking.trace.trace import STEP, Trace, TraceOptions, aligned, overlap
+from vibrissa.tracking.trace.trace import STEP, Trace, TraceOptions, aligned, distances, overlap
 
 # Points of a trace over which darkness and direction are averaged.
 _DARK = ((5, 25), (25, 50), (50, 80))
@@ -239,12 +238,12 @@ class Follower:
         expected, last = self.expected, self.last
         if expected is None or last is None or not self.long_enough(trace):
             return self.long_enough(trace)
-        away = _distances(expected[4:_PROXIMAL], trace.line[: 2 * _PROXIMAL])
+        away = distances(expected[4:_PROXIMAL], trace.line[: 2 * _PROXIMAL])
         if float(np.median(away)) <= self.reach:
             return True
         # It may have turned about its base by more if all of it, and nothing else, is seen.
         share = self.length_of(trace) / max(self.usual, 1.0)
-        base = _distances(last[:1], trace.line[:_PROXIMAL])[0]
+        base = distances(last[:1], trace.line[:_PROXIMAL])[0]
         whole = _WANTED <= share <= 1.0 / _WANTED and aligned(last, trace.line) > _TURNED
         return bool(whole and base <= self.options.jump)
 
@@ -405,25 +404,7 @@ def _repeats(line: Array, other: Array) -> bool:
 def _alike(line: Array, other: Array) -> bool:
     """Whether two lines begin in the same way."""
     n = min(len(line), len(other), 2 * _PROXIMAL)
-    return bool(np.median(_distances(line[n // 3 : n], other[: n + 5])) < 2.0)
-
-
-def _distances(line: Array, other: Array) -> Array:
-    """Distance of each point of a line from the nearest one of another, pixels."""
-    away = np.empty(len(line))
-    nearest_distances(np.ascontiguousarray(line), np.ascontiguousarray(other), away)
-    return away
-
-
-@kernel
-def nearest_distances(line: Any, other: Any, away: Any) -> None:
-    """Distance of each point of a line from the nearest one of another."""
-    for i in range(line.shape[0]):
-        least = np.inf
-        for k in range(other.shape[0]):
-            dx, dy = other[k, 0] - line[i, 0], other[k, 1] - line[i, 1]
-            least = min(least, dx * dx + dy * dy)
-        away[i] = math.sqrt(least)
+    return bool(np.median(distances(line[n // 3 : n], other[: n + 5])) < 2.0)
 
 
 def start_at(base: ArrayLike, options: TraceOptions | None = None) -> Follower:

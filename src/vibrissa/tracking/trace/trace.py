@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -225,6 +226,24 @@ def count_near(line: Any, other: Any, near: float) -> int:
                 last = max(j - 2, 0)
                 break
     return count
+
+
+def distances(line: Array, other: Array) -> Array:
+    """Distance of each point of a line from the nearest one of another, pixels."""
+    away = np.empty(len(line))
+    nearest_distances(np.ascontiguousarray(line), np.ascontiguousarray(other), away)
+    return away
+
+
+@kernel
+def nearest_distances(line: Any, other: Any, away: Any) -> None:
+    """Distance of each point of a line from the nearest one of another."""
+    for i in range(line.shape[0]):
+        least = np.inf
+        for k in range(other.shape[0]):
+            dx, dy = other[k, 0] - line[i, 0], other[k, 1] - line[i, 1]
+            least = min(least, dx * dx + dy * dy)
+        away[i] = math.sqrt(least)
 
 
 def correlated(misses: Sequence[Array]) -> float:

@@ -23,8 +23,9 @@ from vibrissa.io import (
     video_info,
     without_part,
 )
-from vibrissa.numerics import Mask, without_blas_threads
+from vibrissa.numerics import Array, Mask, without_blas_threads
 from vibrissa.tracking.trace.clutter import between_whiskers
+from vibrissa.tracking.trace.crossings import settle_crossings
 from vibrissa.tracking.trace.curves import find_whiskers
 from vibrissa.tracking.trace.follower import Follower, features_of, start_at
 from vibrissa.tracking.trace.identity import Seen, decided
@@ -159,12 +160,23 @@ def trace_video(
         if progress is not None:
             progress(i + 1)
     if len(followers) > 1 and done < len(traces[0]):
-        for i, way in enumerate(decided(seen, starts)):
-            for row, c in zip(traces, way, strict=False):
-                row[i] = seen[i].lines[c] if c >= 0 else Trace.lost()
+        for row, new in zip(traces, _over_all_frames(seen, starts, options), strict=False):
+            row[:] = new
     for row in traces if steady is not None else ():
         row[:] = [t._replace(shift=shift) for t, shift in zip(row, shifts, strict=True)]
     return traces
+
+
+def _over_all_frames(
+    seen: Sequence[Seen], bases: Array, options: TraceOptions
+) -> list[list[Trace]]:
+    """Traces of all whiskers, their lines and far ends decided over all frames."""
+    ways = list(zip(seen, decided(seen, bases), strict=True))
+    rows = [
+        [one.lines[way[k]] if way[k] >= 0 else Trace.lost() for one, way in ways]
+        for k in range(len(bases))
+    ]
+    return settle_crossings(rows, [one.fixed for one in seen], options)
 
 
 def _of_one_size(frames: Iterable[Frame]) -> Iterator[Frame]:

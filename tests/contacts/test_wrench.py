@@ -23,11 +23,12 @@ WHISKERS = {
 }
 
 
-def frictional_load(whisker, n, rng, most=0.5):
+def frictional_load(whisker, n, rng, most=0.5, least=0.1):
     """Loads up to those that slip off, with friction coefficients up to ``most`` either way."""
     chart = stable_set(whisker)
     place = np.stack(
-        [rng.uniform(0, 1, n), rng.uniform(-np.pi, np.pi, n), rng.uniform(0.1, 0.99, n)], axis=1
+        [rng.uniform(0, 1, n), rng.uniform(-np.pi, np.pi, n), rng.uniform(least, 0.99, n)],
+        axis=1,
     )
     s, fy, fz = contacts_at(chart.fold, place).T
     fx = rng.uniform(-most, most, n) * np.hypot(fy, fz)
@@ -137,6 +138,25 @@ def test_small_deflections_are_flagged(rng):
     assert (ratios[linear] < 1.25).all(), ratios[linear]
     assert (np.abs(np.log(ratios[linear])) < np.log(1.25)).mean() > 0.9, ratios[linear]
     assert (ratios[~linear] < 1.25).mean() > 0.9, ratios[~linear]
+
+
+def test_regions_of_contacts_near_a_thin_tip_hold_the_truth(rng):
+    """Long steps left the floor of the valley: 1.9 % of errors were beyond three sigma."""
+    whisker = vb.Whisker.from_curvature(
+        0.027,
+        lambda s: np.stack([-8.0 + 0 * s, 0 * s, 10.0 + 1000.0 * s], -1),
+        base_radius=90e-6,
+        tip_radius=4e-6,
+    )
+    bent = vb.deflect(whisker, frictional_load(whisker, 600, rng, most=0.0, least=0.7))
+    noisy = np.concatenate([bent.force, bent.moment], axis=1) + SIGMA * rng.normal(size=(600, 6))
+    found = vb.estimate_from_wrench(whisker, noisy[:, :3], noisy[:, 3:], noise=np.diag(SIGMA**2))
+    unique = found.status == vb.Status.UNIQUE
+    assert unique.mean() > 0.7
+    away = (found.point - bent.contact_point)[unique]
+    along = np.linalg.solve(found.covariance[unique], away[..., None])[..., 0]
+    squares = (away * along).sum(axis=1)
+    assert (squares > 14.156).mean() < 0.012
 
 
 def test_forces_nearly_along_the_whisker_are_flagged():

@@ -3,8 +3,9 @@
 A wrench determines the force well, but hardly the position of a contact near a thin tip: χ² has
 long, bent valleys, which no expansion about the minimum describes. So a valley is followed from
 the minimum both ways along the arc length s, until χ² has risen enough or the whisker ends. At each
-s a Gauss-Newton step leads to the force of minimum χ², of covariance C_f to first order. With a
-uniform prior of contact points p and friction angles φ, the density of s is
+s a Gauss-Newton step leads to the force of minimum χ², of covariance C_f to first order; where it
+is long, s changes by less. With a uniform prior of contact points p and friction angles φ, the
+density of s is
 
     exp(-χ²/2) |∂(p, φ)/∂(s, f)| √det C_f;
 
@@ -43,9 +44,10 @@ from vibrissa.numerics import (
 )
 from vibrissa.rod import BUFFER_SIZE, Discretization, Rod, integrate, set_lane
 
-# Steps each way; the first one in standard deviations of s, and its limits over L. Equal steps of
-# one standard deviation integrate a normal distribution to 1e-7.
-_STEPS = 8
+# Largest numbers of steps each way, and of steps that are tried; the first one in standard
+# deviations of s, and its limits over L. Equal steps of one standard deviation integrate a normal
+# distribution to 1e-7.
+_STEPS, _TRIED = 16, 28
 _FIRST, _SHORTEST, _LONGEST = 1.0, 1e-9, 0.05
 # Height of χ² above the minimum to which a valley is followed, and from which it counts as closed,
 # so that the covariance may be valid.
@@ -53,6 +55,11 @@ HIGH, CLOSED = 30.0, 9.0
 # Factor of the next step's length, by the rise of χ² on the last step; for a normal distribution
 # all steps are equal.
 _PACE = ((0.4, 2.0), (0.8, 1.3), (12.0, 1.0), (math.inf, 0.6))
+# Largest rise of χ² on a step before the valley is closed (7 for a normal distribution), and
+# largest fall of χ² from the end of a step to the floor, which grows with the fourth power of the
+# step. A longer step has left the valley, as near a thin tip, and is tried again, shorter; if this
+# has not helped so many times, the valley turns back in s, and the longer step is taken.
+_MOST_RISE, _MOST_FALL, _SHORTER, _REFUSED = 12.0, 4.0, 0.35, 4
 _LARGEST_CHANGE = 0.5  # largest change of the force's moment in a step, as a share of it
 # Largest factor by which a covariance is widened, and bisections to find it.
 _WIDEST, _BISECTIONS = 8.0, 8
@@ -87,10 +94,11 @@ def _node(
     nodes: Nodes,
     i: int,
     along: Array,
-) -> float:
-    """Fill a node at the arc length of x, moved to minimum χ²; return the variance of s alone.
+) -> tuple[float, float]:
+    """Fill a node at the arc length of x, moved to minimum χ².
 
-    ``along`` becomes ∂f/∂s of the valley. The variance is negative if χ² has no minimum.
+    Return the variance of s alone, which is negative if χ² has no minimum, and the fall of χ².
+    ``along`` becomes ∂f/∂s of the valley.
     """
     s, misfits, logs, points, spreads = nodes
     k = codes.shape[0]
@@ -109,14 +117,15 @@ def _node(
             for m in range(k):
                 normal[a, c] += j[m, 1 + a] * j[m, 1 + c]
     if not (chi < np.inf and cholesky(normal, root)):
-        return -1.0
+        return -1.0, np.inf
     for m in range(k):
         steep += j[m, 0] * j[m, 0]
     copy(along, column)
     steep -= mahalanobis(root, column)
     solve_root(root, along)
     copy(down, column)
-    chi -= mahalanobis(root, column)
+    fall = mahalanobis(root, column)
+    chi -= fall
     solve_root(root, down)
     s[i], misfits[i] = x[0], chi
     across = np.empty((3, 3))
@@ -140,7 +149,7 @@ def _node(
     logs[i, 0] = logs[i, 1] + math.log(abs(solve(whole, np.zeros(4))) + 1e-300)
     for a in range(3):
         x[1 + a] += down[a]
-    return 1.0 / steep if steep > 0.0 else np.inf
+    return 1.0 / steep if steep > 0.0 else np.inf, fall
 
 
 @inlined
@@ -183,19 +192,21 @@ def _followed(
     """Fill the nodes of a valley, the contact in the middle; return the range of their indices."""
     misfits = nodes[1]
     at, to, along = np.empty((2, 4)), np.empty((2, 4)), np.empty((2, 3))
-    third, t, v = np.empty((6, 3)), np.zeros((6, 4)), np.empty(6)
+    third, t, v, known = np.empty((6, 3)), np.zeros((6, 4)), np.empty(6), np.empty(3)
     steps, active, number = np.empty(2), np.ones(2, np.bool_), np.zeros(2, np.int64)
+    refused = np.zeros(2, np.int64)
     copy(x, at[0])
-    variance = _node(at[0], value, tangents, codes, target, weights, nodes, _STEPS, along[0])
+    variance, _ = _node(at[0], value, tangents, codes, target, weights, nodes, _STEPS, along[0])
     if variance < 0.0:
         return 0, 0
     copy(at[0], at[1])
     copy(along[0], along[1])
     steps[0] = min(max(_FIRST * math.sqrt(variance), _SHORTEST), _LONGEST)
     steps[1] = -steps[0]
-    for _ in range(_STEPS):
+    for _ in range(_TRIED):
         for way in range(2):
             active[way] = active[way] and (at[way, 0] < 1.0 if way == 0 else at[way, 0] > least)
+            active[way] = active[way] and number[way] < _STEPS
             _ahead(at[way], along[way], steps[way], least, to[way])
             c = to[way] if active[way] else x
             for lane in range(2 * way, 2 * way + 2):
@@ -209,14 +220,24 @@ def _followed(
             i = _STEPS + (1 - 2 * way) * (number[way] + 1)
             before = misfits[_STEPS + (1 - 2 * way) * number[way]]
             lane_contact(b, 2 * way, True, v, t, third)
-            left = _node(to[way], v, t, codes, target, weights, nodes, i, along[way])
+            copy(along[way], known)
+            left, fall = _node(to[way], v, t, codes, target, weights, nodes, i, along[way])
+            rise = misfits[i] - before
+            far = rise > _MOST_RISE or fall > _MOST_FALL
+            if far and refused[way] <= _REFUSED and before < misfits[_STEPS] + CLOSED:
+                refused[way] += 1
+                by = _SHORTER if refused[way] <= _REFUSED else _SHORTER**-_REFUSED
+                steps[way] = by * (to[way, 0] - at[way, 0])
+                copy(known, along[way])
+                continue
+            refused[way] = 0
             if left < 0.0:
                 active[way] = False
                 continue
             number[way] += 1
             copy(to[way], at[way])
             active[way] = misfits[i] < misfits[_STEPS] + HIGH
-            steps[way] *= pace(misfits[i] - before)
+            steps[way] *= min(pace(rise), (0.5 * _MOST_FALL / max(fall, 1e-300)) ** 0.25)
     return _STEPS - number[1], _STEPS + number[0] + 1
 
 

@@ -342,6 +342,35 @@ def test_stiffness_is_found_as_surely_as_said(wire, touched):
     assert found.whisker.base_bending_stiffness == pytest.approx(found.stiffness, rel=1e-12)
 
 
+def test_errors_of_contact_points_are_part_of_the_uncertainty(wire, touched):
+    """Points are known to 1 mm; taken as exact, the mean χ² of the stiffness is above 3."""
+    sensor = Sensor(noise=np.repeat([1e-3, 1e-4], 3))
+    readings = sensor.read(np.arange(60.0), wrench_of(touched))
+    rng = np.random.default_rng(4)
+    sigma = np.full(60, 1e-3)
+    sigma[::3] = 0.2e-3
+    away, misfit = [], []
+    for rows in rng.permuted(np.tile(np.arange(60), (12, 1)), axis=1)[:, :20]:
+        points = touched.contact_point[rows] + sigma[rows, None] * rng.normal(size=(20, 3))
+        found = fit_stiffness(wire, points, readings[rows], sensor, point_sigma=sigma[rows, None])
+        away.append(np.log(found.stiffness / wire.base_bending_stiffness) / found.stiffness_sigma)
+        misfit.append(found.misfit)
+    assert 0.4 < np.mean(np.square(away)) < 2.0
+    assert np.mean(misfit) == pytest.approx(1.0, abs=0.2)
+    for wrong in (-1e-3, np.full(20, 1e-3), np.nan):
+        with pytest.raises(ValueError, match="point_sigma"):
+            fit_stiffness(wire, points, readings[rows], sensor, point_sigma=wrong)
+
+
+def test_an_exact_stiffness_has_an_uncertainty_too(wire, touched):
+    """Differences relative to the unknown, the logarithm of 1, would vanish."""
+    found = fit_stiffness(
+        wire, touched.contact_point[:8], wrench_of(touched)[:8], point_sigma=1e-5, radius_sigma=0.0
+    )
+    assert found.stiffness == pytest.approx(wire.base_bending_stiffness, rel=1e-9)
+    assert 1e-6 < found.stiffness_sigma < 1e-3
+
+
 def test_prior_uncertainty_decides_what_moves(wire, touched):
     bent = vb.deflect(
         wire.with_properties(youngs_modulus=1.1 * wire.youngs_modulus),

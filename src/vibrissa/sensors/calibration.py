@@ -20,6 +20,15 @@ Given prior uncertainties of both, Bayes' rule updates log E and log r subject t
 
 If contacts are at several positions along the whisker, loads also determine how the stiffness
 decreases toward the tip, so that the taper can be fitted too.
+
+Measured contact points have errors, e of covariance Σ_p. With the wrench w(p) of a contact and its
+derivative G = ∂w/∂p, readings deviate from H w by noise and by H G e, so that their covariance is
+
+    S = N + H G Σ_p Gᵀ Hᵀ
+
+for each contact. S is proportional to EI² in its second part, and is minimised over together with
+the residuals' size; with S fixed, the fitted stiffness would be too small, as in any regression on
+a quantity with errors.
 """
 
 from __future__ import annotations
@@ -27,6 +36,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -34,7 +44,7 @@ from numpy.typing import ArrayLike
 
 from vibrissa.deferred import optimize
 from vibrissa.numerics import Array, Mask, cross_matrix, numbers, rotation_matrices
-from vibrissa.rod import PointContact, deflect
+from vibrissa.rod import Deflection, PointContact, deflect, discretize, solve_forces
 from vibrissa.sensors.frame import SensorFrame
 from vibrissa.sensors.regression import Solution, solve, warn_of_misfit, warn_of_surprise
 from vibrissa.sensors.sensor import COMPONENTS, GRAVITY, Sensor, with_offset
@@ -165,6 +175,11 @@ def _loaded(wrenches: Array) -> Array:
 
 def wrenches_of_contacts(whisker: Whisker, points: ArrayLike) -> Array:
     """Wrenches (n, 6) at the base of frictionless contacts at known points (n, 3)."""
+    return _wrenches(_touched(whisker, points))
+
+
+def _touched(whisker: Whisker, points: ArrayLike) -> Deflection:
+    """Deflections by contacts at known points (n, 3), all of which must be possible."""
     contacts = numbers("points", points)
     if contacts.ndim != 2 or contacts.shape[1] != 3:
         raise ValueError(f"contact points are (n, 3), m; got {contacts.shape}")
@@ -173,7 +188,21 @@ def wrenches_of_contacts(whisker: Whisker, points: ArrayLike) -> Array:
     if bad.any():
         reasons = "; ".join(f"{n} × {text}" for text, n in describe(bent.status[bad]).items())
         raise ValueError(f"{bad.sum()} of {bad.size} contacts are not possible: {reasons}")
+    return bent
+
+
+def _wrenches(bent: Deflection) -> Array:
     return np.concatenate([bent.force, bent.moment], axis=-1)
+
+
+def _wrench_slopes(bent: Deflection) -> Array:
+    """Derivatives (n, 6, 3) of the wrench at the base with respect to the contact point."""
+    d = discretize(bent.whisker, bent.steps)
+    contacts = np.column_stack([bent.arc_length / d.length, bent.contact_force / d.force])
+    tangents = solve_forces(d, contacts, tangents=True)[1]
+    by_point = tangents[:, :3] @ np.linalg.inv(tangents[:, 3:]) * (d.force / d.length)
+    turning = cross_matrix(bent.contact_point) @ by_point - cross_matrix(bent.force)
+    return np.concatenate([by_point, turning], axis=1)
 
 
 def calibrate_on_contacts(
@@ -426,6 +455,7 @@ _SLIM, _WIDE = 0.01, 2.0  # bounds of a fitted taper
 # Bounds of the fitted stiffness of a base, in units of EI/L; a stiffer base is rigid in effect.
 _SOFT, _STIFF = 1.0, 1e4
 _SPRING = 30.0  # initial stiffness of a base in the fit, in units of EI/L
+_DIFFERENCE = 1e-4  # of logarithms, in finite differences
 _TYPICAL_NOISE = 0.01  # noise of channels without stated noise, relative to their readings
 
 
@@ -480,6 +510,7 @@ def fit_stiffness(
     readings: ArrayLike,
     sensor: Sensor | None = None,
     *,
+    point_sigma: ArrayLike = 0.0,
     modulus_sigma: float = np.inf,
     radius_sigma: float = 0.02,
     taper: bool = False,
@@ -499,6 +530,10 @@ def fit_stiffness(
         Sensor with mixing and noise; by default (F, M) at the base with the default noise. It must
         not have been calibrated on contacts of this whisker, as its mixing then absorbs errors of
         the stiffness.
+    point_sigma : array_like
+        Standard deviation of the points' coordinates, m: one number, or an array that broadcasts to
+        (n, 3). Errors are independent; one that all points share, such as that of the position of
+        the base, is not included.
     modulus_sigma, radius_sigma : float
         Prior relative standard deviations of the whisker's modulus and radius: ``inf`` for unknown,
         0 for exact. At least one must be finite.
@@ -536,18 +571,23 @@ def fit_stiffness(
             f"got {modulus_sigma} and {radius_sigma}"
         )
     known = np.isfinite(y).all(axis=1) & np.isfinite(contacts).all(axis=1)
+    blur = _spread_of_points(point_sigma, contacts)[known]
     y, contacts = y[known], contacts[known]
     noise = np.sqrt(np.diag(sensor.covariance()))
     size = np.sqrt((y**2).mean(axis=0)) if len(y) else noise
     noise = np.where(noise > 0.0, noise, _TYPICAL_NOISE * np.where(size > 0.0, size, 1.0))
 
-    def modelled(ratio: float, spring: float | None = None) -> Array:
-        held = _on_spring(_tapered(whisker, ratio), spring)
-        return wrenches_of_contacts(held, contacts) @ sensor.base_mixing.T / noise
+    response = sensor.base_mixing / noise[:, None]
+
+    @lru_cache(maxsize=4)
+    def modelled(ratio: float, spring: float | None) -> tuple[Array, Array | None]:
+        bent = _touched(_on_spring(_tapered(whisker, ratio), spring), contacts)
+        errors = response @ _wrench_slopes(bent) * blur[:, None] if blur.any() else None
+        return _wrenches(bent) @ response.T, errors
 
     ratio = whisker.tip_radius / whisker.base_radius
     scaled = y / noise
-    if not len(y) or not (modelled(ratio) * scaled).sum() > 0.0:
+    if not len(y) or not (modelled(ratio, None)[0] * scaled).sum() > 0.0:
         raise ValueError(
             "the readings do not increase with the loads: check the sensor's axes, sign "
             "(`reaction`) and offset, and whether the channels respond at all"
@@ -557,19 +597,11 @@ def fit_stiffness(
     misfit = float((left**2).sum() / max(degrees, 1))
     warn_of_misfit(
         misfit,
-        "contact points, shape and taper (which end is the base?), the sensor's frame, "
-        "offset and weight",
+        "contact points (and their `point_sigma`), shape and taper (which end is the base?), the "
+        "sensor's frame, offset and weight",
     )
     spread = spread * max(1.0, misfit)
-    if base and np.sqrt(spread[-1, -1]) > _OPEN:
-        raise ValueError(
-            "the contacts do not determine the stiffness of the base: it is too stiff to matter, "
-            "or they are too few or too alike"
-        )
-    if taper and np.sqrt(spread[1, 1]) > _OPEN:
-        raise ValueError(
-            "the contacts do not determine the taper: touch the whisker nearer to the tip as well"
-        )
+    _check_determined(spread, taper, base)
     sigma = float(np.sqrt(spread[0, 0]))
     _warn_of_units(factor)
     shift, covariance = _separated(np.log(factor), sigma, modulus_sigma, radius_sigma)
@@ -593,6 +625,33 @@ def fit_stiffness(
         base_stiffness=held,
         compliance_sigma=float(np.sqrt(spread[-1, -1])) / held if base else 0.0,
     )
+
+
+def _check_determined(spread: Array, taper: bool, base: bool) -> None:
+    """Raise ValueError if the contacts do not determine the taper or the base's stiffness."""
+    if base and np.sqrt(spread[-1, -1]) > _OPEN:
+        raise ValueError(
+            "the contacts do not determine the stiffness of the base: it is too stiff to matter, "
+            "or they are too few or too alike"
+        )
+    if taper and np.sqrt(spread[1, 1]) > _OPEN:
+        raise ValueError(
+            "the contacts do not determine the taper: touch the whisker nearer to the tip as well"
+        )
+
+
+def _spread_of_points(point_sigma: ArrayLike, contacts: Array) -> Array:
+    """Standard deviations (n, 3) of contact points; raise ValueError if they are not valid."""
+    sigma = numbers("point_sigma", point_sigma)
+    try:
+        spread = np.broadcast_to(sigma, contacts.shape)
+    except ValueError as fault:
+        raise ValueError(
+            f"point_sigma is one number or broadcasts to {contacts.shape}; got {sigma.shape}"
+        ) from fault
+    if not (np.isfinite(spread) & (spread >= 0.0)).all():
+        raise ValueError(f"point_sigma must be finite and not negative, m; got {sigma.tolist()}")
+    return spread
 
 
 def _warn_of_units(factor: float) -> None:
@@ -624,16 +683,21 @@ def _tapered(whisker: Whisker, ratio: float) -> Whisker:
 
 
 def _fitted(
-    modelled: Callable[..., Array], scaled: Array, ratio: float, taper: bool, base: bool
+    modelled: Callable[..., tuple[Array, Array | None]],
+    scaled: Array,
+    ratio: float,
+    taper: bool,
+    base: bool,
 ) -> tuple[float, float, float | None, Array, Array]:
     """Fit taper, stiffness factor and base spring; return these, a covariance and residuals.
 
     The covariance is that of the logarithms of factor, taper and spring in this order, as far as
-    they are fitted.
+    they are fitted. The model is that of the readings, and of errors (n, k, 3) due to those of the
+    points if there are any, all relative to the noise.
     """
-    model = modelled(ratio, _SPRING if base else None)
+    model, errors = modelled(ratio, _SPRING if base else None)
     factor = float((model * scaled).sum() / (model**2).sum())
-    if not (taper or base):
+    if not (taper or base) and errors is None:
         spread = np.full((1, 1), 1.0 / (factor**2 * (model**2).sum()))
         return ratio, factor, None, spread, scaled - factor * model
 
@@ -641,8 +705,20 @@ def _fitted(
         values = iter(np.exp(unknowns[1:]).tolist())
         return (next(values) if taper else ratio), (next(values) if base else None)
 
-    def residuals(unknowns: Array) -> Array:
-        return np.asarray((np.exp(unknowns[0]) * modelled(*parts(unknowns)) - scaled).ravel())
+    def residuals(change: Array) -> Array:
+        factor = np.exp(start[0] + change[0])
+        model, errors = modelled(*parts(start + change))
+        wrong = factor * model - scaled
+        if errors is not None:
+            spread = np.eye(wrong.shape[1]) + factor**2 * errors @ errors.swapaxes(1, 2)
+            wrong = np.linalg.solve(np.linalg.cholesky(spread), wrong[:, :, None])
+        return np.asarray(wrong.ravel())
+
+    def slopes(change: Array) -> Array:
+        # SciPy's differences are relative to the unknowns, and useless for one near zero.
+        here = residuals(change)
+        there = [residuals(change + step) for step in _DIFFERENCE * np.eye(len(start))]
+        return np.asarray((np.stack(there, axis=1) - here[:, None]) / _DIFFERENCE)
 
     unknowns = [(factor, 0.0, np.inf)]
     unknowns += [(ratio, _SLIM, _WIDE)] if taper else []
@@ -650,12 +726,13 @@ def _fitted(
     with np.errstate(divide="ignore"):
         start, low, high = np.log(np.array(unknowns)).T
     found = optimize.least_squares(
-        residuals, start, bounds=(low, high), diff_step=[1e-4] * len(start)
+        residuals, np.zeros(len(start)), slopes, bounds=(low - start, high - start)
     )
     jacobian = np.asarray(found.jac, dtype=np.float64)
     inverse = np.asarray(np.linalg.pinv(jacobian.T @ jacobian), dtype=np.float64)
-    ratio, spring = parts(found.x)
-    return ratio, float(np.exp(found.x[0])), spring, inverse, found.fun
+    logarithms = start + found.x
+    ratio, spring = parts(logarithms)
+    return ratio, float(np.exp(logarithms[0])), spring, inverse, found.fun
 
 
 def _separated(

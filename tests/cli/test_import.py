@@ -331,6 +331,10 @@ def test_a_table_of_anipose_to_a_recording(trial, tmp_path):
     whisker = Recording(load_recording(out)).whiskers[0]
     published = vb.Whisker.straight(whisker.length, rat="C5")
     assert whisker.base_radius == pytest.approx(published.base_radius, rel=1e-3)
+    with h5py.File(out, "r+") as file:
+        file["base_position"][:] += 1000.0
+    with pytest.raises(ValueError, match="lengths of the whisker from the base"):
+        run("info", out)
 
 
 def test_the_frame_rate_is_asked_for_and_views_are_matched_by_name(trial, tmp_path):

@@ -99,6 +99,15 @@ def test_labelled_images_and_ensembles(tmp_path, rng):
     assert tracks.attrs["source_software"] == "LightningPose"
 
 
+def test_rows_of_deeplabcut_that_are_written_twice_keep_their_number(tmp_path, rng):
+    """So that they are noticed where frames are compared."""
+    path = tmp_path / "video.csv"
+    deeplabcut(rng)[0].to_csv(path)
+    text = path.read_text()
+    path.write_text(text + text.splitlines()[-1] + "\n")
+    assert load_tracks(path)["frame"].values.tolist() == [0, 1, 2, 3, 4, 4]
+
+
 def test_bad_deeplabcut(tmp_path, rng):
     path = tmp_path / "video.csv"
     deeplabcut(rng)[0].to_csv(path)

@@ -58,6 +58,14 @@ def test_labels_are_put_on():
     assert tracks["time"].attrs["units"] == "frame"
 
 
+def test_gaps_in_time_are_gaps_in_frames():
+    """A movie from which frames were cut is not shorter; irregular times leave the order."""
+    time = np.array([0.0, 2.0, 4.0, 10.0, 12.1, 14.0]) * 1e-3
+    assert labelled(flat(time=time), "a", view="top")["frame"].values.tolist() == [0, 1, 2, 5, 6, 7]
+    time[1] = 1e-5
+    assert labelled(flat(time=time), "a", view="top")["frame"].values.tolist() == list(range(6))
+
+
 def test_missing_is_nan_and_never_zero():
     image, sure = IMAGE.copy(), SURE[:, :, None].copy()
     image[1, 0, 0, 2] = 0.0

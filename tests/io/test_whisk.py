@@ -169,3 +169,13 @@ def test_no_map_is_a_file_of_whisk_and_it_is_said_what_takes_it(tmp_path):
     measurements_file(tmp_path / "b.measurements")
     with pytest.raises(ValueError, match=r"b.measurements contains measurements .*vibrissa import"):
         ContactMap.load(tmp_path / "b.measurements")
+
+
+def test_curvatures_survive_the_joining_of_views(tmp_path):
+    """Without them two points, follicle and tip, are all that is left of a whisker."""
+    path = measurements_file(tmp_path / "a.measurements")
+    views = [load_tracks(path, fps=500.0, view=view) for view in ("top", "front")]
+    joined = join_views(*views)
+    assert joined["trace_curvature"].sizes["view"] == 2
+    own = views[1]["trace_curvature"].isel(view=0)
+    np.testing.assert_array_equal(joined["trace_curvature"].isel(view=1), own)

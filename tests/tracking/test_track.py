@@ -16,6 +16,7 @@ from vibrissa.recording import Recording
 from vibrissa.status import Status
 from vibrissa.tracking import (
     FitOptions,
+    RestShape,
     TrackOptions,
     base_pose,
     rest_shape,
@@ -547,6 +548,16 @@ def test_noisy_points_of_a_whisker_in_contact_most_of_the_time():
     shape = rest_shape(np.einsum("tij,tnj->tni", held, shapes) + noise)
     assert shape.free[push == 0.0].all()
     assert not shape.free[push > 0.2].any()
+
+
+def test_noisy_points_do_not_straighten_a_whisker():
+    """Errors of separate points are averaged over the frames, unlike those of traces."""
+    s = np.linspace(0.0, 32e-3, 33)
+    points = np.stack([s, 5.0 * s**2, 0.0 * s], axis=-1)
+    points += 18e-6 * np.random.default_rng(0).normal(size=points.shape)
+    free = np.ones(40, dtype=bool)
+    shape = RestShape(points, free, np.full(40, 70e-6), 70e-6, sparse=True)
+    assert whisker_at_rest(shape).curvature(10e-3)[2] == pytest.approx(9.85, rel=0.1)
 
 
 def test_the_rest_shape_ignores_where_hairs_let_a_trace_begin():

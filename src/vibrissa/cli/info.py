@@ -197,7 +197,8 @@ def _summarised(path: Path) -> xr.DataTree:
     with vb.io.opened(path, "a recording") as file:
         groups = [name for name in ("truth", "signals", "estimates", "contour") if name in file]
         objects = [f"objects/{name}" for name in file["objects"]] if "objects" in file else []
-    needed = ["in_contact", "status", "force", "moment", *vb.pipeline.EVENTS]
+    # Bases are compared with the centreline, which shows a wrong unit of theirs.
+    needed = ["in_contact", "status", "force", "moment", "centerline", *vb.pipeline.EVENTS]
     pose = ["time", "whisker", "base_position", "base_rotation"]
     parts = {"/": vb.io.read_dataset(path, None, [*pose, *needed])}
     for group in (*groups, *objects):

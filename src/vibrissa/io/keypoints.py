@@ -188,7 +188,9 @@ def _frames(path: Path, index: list[str], count: int) -> NDArray[np.int64]:
     if not index or any(number is None for number in numbers):
         return np.arange(count)
     frames = np.array([int(number[1]) for number in numbers if number is not None])
-    return frames if len(np.unique(frames)) == count else np.arange(count)
+    # Images of several videos may have the same numbers; rows that are only numbered may not.
+    plain = all(re.fullmatch(r"\d+(\.0)?", cell) for cell in index)
+    return frames if plain or len(np.unique(frames)) == count else np.arange(count)
 
 
 def pandas_tables(file: h5py.File) -> Iterator[tuple[str, h5py.Group]]:

@@ -202,7 +202,7 @@ def _clock(raw: RawTracks, path: Path, fps: float | None) -> dict[str, Any]:
     """Coordinates ``time`` and ``frame``."""
     array = raw.image if raw.image is not None else raw.space
     assert array is not None
-    frames = np.arange(len(array)) if raw.frames is None else np.asarray(raw.frames)
+    frames = _counted_frames(raw.time, len(array)) if raw.frames is None else raw.frames
     if fps is not None and not (np.isfinite(fps) and fps > 0.0):
         raise ValueError(f"fps is {fps!r}; it must be positive")
     if raw.fps is not None and fps is not None and abs(fps / raw.fps - 1.0) > 1e-3:
@@ -225,6 +225,19 @@ def _clock(raw: RawTracks, path: Path, fps: float | None) -> dict[str, Any]:
         "time": xr.Variable("time", time, about),
         "frame": xr.Variable("time", frames.astype(np.int64), number),
     }
+
+
+def _counted_frames(time: Array | None, count: int) -> NDArray[np.integer[Any]]:
+    """Numbers of frames from 0, with gaps where the time has some."""
+    plain = np.arange(count)
+    if time is None or count < 3:
+        return plain
+    step = float(np.median(np.diff(time)))
+    if not (np.isfinite(step) and step > 0.0):
+        return plain
+    frames = np.round((np.asarray(time) - time[0]) / step)
+    # Times that are too irregular to number frames leave them in their order.
+    return frames.astype(np.int64) if (np.diff(frames) >= 1.0).all() else plain
 
 
 def join_views(*tracks: xr.Dataset) -> xr.Dataset:
@@ -256,7 +269,10 @@ def join_views(*tracks: xr.Dataset) -> xr.Dataset:
     if len(units) != 1:
         raise ValueError("some tracks have times in seconds and some do not: give fps to all")
     parts = [one.swap_dims(time="frame") for one in tracks]
-    points = [_with_nodes(part[["trace", "confidence"]].drop_vars("time")) for part in parts]
+    # Of two points, follicle and tip, the curvature gives the line between them.
+    wanted = ["trace", "confidence"]
+    wanted += ["trace_curvature"] if all("trace_curvature" in one for one in tracks) else []
+    points = [_with_nodes(part[wanted].drop_vars("time")) for part in parts]
     for dim in ("whisker", "node"):
         if not set.intersection(*(set(one.indexes[dim]) for one in points)):
             listed = "; ".join(", ".join(map(str, one.indexes[dim])) for one in points)

@@ -495,13 +495,14 @@ def track_whisker(
     head = head or HeadPose.still(count)
     on_head = head.seen_from(points)
     tips: Mask = np.all(series.ends[:, :, 1] > 0.5, axis=1)
-    shape, whisker = _at_rest(on_head, options, name, tips, flat=len(cameras) == 1)
+    sparse = any(trace.sparse for view in traces for trace in view)
+    shape, whisker = _at_rest(on_head, options, name, tips, len(cameras) == 1, sparse)
     if len(cameras) > 1:
         shape = replace(shape, free=shape.free & ~rolled_over(on_head, shape, whisker))
     report(f"contact of {name}", 1, 2)
     touching = np.isfinite(points).all(axis=(1, 2)) & ~shape.free
     smoothness = options.fit
-    if any(trace.sparse for view in traces for trace in view):
+    if sparse:
         smoothness = replace(smoothness, sharpest=max(smoothness.sharpest, 1.0))
     tapers = bool(options.properties.keys() & {"tip_radius", "radius"})
     further = None
@@ -543,7 +544,7 @@ def _silent(stage: str, done: int, total: int) -> None:
 
 
 def _at_rest(
-    curves: Array, options: TrackOptions, name: str, tips: Mask, flat: bool
+    curves: Array, options: TrackOptions, name: str, tips: Mask, flat: bool, sparse: bool
 ) -> tuple[RestShape, Whisker]:
     """Rest shape from the frames, or of the known whisker."""
     if options.whisker is not None:
@@ -551,7 +552,7 @@ def _at_rest(
         if flat:
             return _known_flat(curves, whisker, options.free)
         return known_rest(curves, whisker, options.free), whisker
-    shape = rest_shape(curves, options.free, tips)
+    shape = replace(rest_shape(curves, options.free, tips), sparse=sparse)
     return shape, whisker_at_rest(shape, name, **options.at_base)
 
 

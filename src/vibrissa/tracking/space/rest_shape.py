@@ -57,8 +57,8 @@ _STILL = 0.01  # usual deviation of free frames at most, as a share of a known w
 _FADES = 0.02
 _ENDS = 3  # number of frames at rest that show the tip, from which the length is computed
 # Factor of the noise of a shape: errors of neighbouring points are correlated, so that they seem
-# smoother than they are right.
-_SMOOTH = 4.0
+# smoother than they are right. Errors of separate points are also averaged over the frames.
+_SMOOTH, _SEPARATE = 4.0, 1.0
 # Share of its length by which a shape may begin elsewhere on the whisker than the others do, and
 # what keeps that of a straight line, m²: none.
 _SLIDES, _TINY = 0.02, 1e-30
@@ -95,6 +95,7 @@ class RestShape:
     noise: float  # usual deviation of the free frames, m
     whole: bool = True  # whether it ends at the whisker's tip
     ringing: Mask | None = None  # (time,): bent by its own mass; None: no frame is
+    sparse: bool = False  # whether its curves are lines between few points, with separate errors
 
     @property
     def still(self) -> Mask:
@@ -330,7 +331,7 @@ def whisker_at_rest(
     shape: RestShape, name: str = "tracked", hidden: float = 0.0, **properties: float
 ) -> Whisker:
     """Whisker with the rest shape, whose base radii are those before a hidden part."""
-    noise = _SMOOTH * shape.noise
+    noise = (_SEPARATE if shape.sparse else _SMOOTH) * shape.noise
     whisker = Whisker.from_points(shape.points, noise=noise, name=name, **properties)  # type: ignore[arg-type]
     if hidden == 0.0:
         return whisker

@@ -40,6 +40,19 @@ def test_the_noise_of_a_rat_s_whisker_is_questioned_for_a_rod(tmp_path, gamma_ma
         assert questioned == (scale > 1.0 and not noise)
 
 
+@pytest.mark.parametrize("density", [None, 1240.0])
+def test_a_neglected_weight_is_stated(tmp_path, density):
+    rod = vb.Whisker.straight(0.25, base_radius=2e-3, tip_radius=0.8e-3, youngs_modulus=2.3e9)
+    rod = rod.with_properties(density=density)
+    vb.ContactMap.simulate(rod, grid=False).save(tmp_path / "rod.nc")
+    (tmp_path / "one.csv").write_text("Fx,Fy,Fz,Mx,My,Mz\n-.003,.05,0,0,0,.008\n")
+    words = ["estimate", str(tmp_path / "one.csv"), "--map", str(tmp_path / "rod.nc")]
+    noise = ["--force-noise", "3000", "--moment-noise", "50"]
+    done = CliRunner().invoke(app, [*words, *noise, "-o", str(tmp_path / "out.csv")])
+    assert done.exit_code == 0, done.exception
+    assert ("weight of the whisker is neglected" in " ".join(done.output.split())) == bool(density)
+
+
 def test_the_same_shape_in_another_material(tmp_path):
     path = tmp_path / "map.nc"
     assert run("--base-radius", 0.15, "--modulus", 2, "-o", path).exit_code == 0

@@ -147,8 +147,10 @@ class MeasurementOptions:
         """Create the estimator of a whisker."""
         if sensor is not None and self.tare:
             sensor = sensor.with_new_offset(self.tare)
+        contact_map = self.contact_map(name)
+        self.weight.doubt(contact_map.whisker)
         return estimator_of(
-            self.contact_map(name),
+            contact_map,
             sensor,
             self.using or "Fx,MB,MD",
             self.noise,

@@ -409,5 +409,15 @@ def test_whiskers_without_identity_are_followed_from_their_base():
     np.testing.assert_allclose(rows, [100.0, 300.0], atol=1e-6)
     with pytest.raises(ValueError, match="there is no whisker 7"):
         tracker_traces(tracks, pixel_size=6e-5, names=["7"])
+    # A second view whose numbers are unrelated.
+    image = np.concatenate([image, image[:, ::-1] + [0.0, 20.0]], axis=2)
+    views = [camera.name for camera in CAMERAS]
+    raw = RawTracks("whisk", ["0", "1"], views=views, image=image, fps=500.0, about=about)
+    tracks = labelled(raw, "a")
+    found = tracker_traces(tracks, CAMERAS)
+    for view, base in zip(found.traces, (100.0, 120.0), strict=True):
+        assert [trace.line[0, 1] for trace in view[0]] == pytest.approx([base] * 30)
+    with pytest.raises(ValueError, match="in each view anew"):
+        tracker_traces(tracks, CAMERAS, names=["0"])
     with pytest.raises(ValueError, match="size of a pixel"):
         tracker_traces(tracks)

@@ -17,7 +17,7 @@ import xarray as xr
 
 from vibrissa.cameras import Camera, orthogonal_views
 from vibrissa.deferred import interpolate, optimize
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, IntArray
 from vibrissa.tracking.refine.rods import NODES
 from vibrissa.tracking.trace.trace import STEP, Trace, arc_lengths, given
 
@@ -70,8 +70,11 @@ def tracker_traces(
         views = _views(points, tracks, cameras, pixel_size, notes)
     else:
         raise ValueError("the tracks hold neither a trace nor a centreline")
-    points, known = _identified(tracks, points, notes)
-    kept = _wanted(known, points, names, tracks.attrs.get("identity") == "per frame", notes)
+    known = [str(name) for name in tracks["whisker"].values]
+    if tracks.attrs.get("identity") == "per frame":
+        either = tracks.attrs.get("direction") == "either"
+        points, known = _identified(points, known, names, either, notes)
+    kept = _wanted(known, points, names)
     known, points = [known[k] for k in kept], points[:, kept]
     if views is None:
         points, views, sigma = _in_two_views(points, sigma, notes)
@@ -235,13 +238,33 @@ def _views(
     return orthogonal_views(pixel_size, (int(size[0]), int(size[1])))[:count]
 
 
-def _identified(tracks: xr.Dataset, points: Array, notes: list[str]) -> tuple[Array, list[str]]:
-    """Points of whiskers with a constant identity, from base to tip, and their names."""
-    names = [str(name) for name in tracks["whisker"].values]
-    if tracks.attrs.get("identity") != "per frame":
-        return points, names
+def _identified(
+    points: Array, names: list[str], asked: Sequence[str] | None, either: bool, notes: list[str]
+) -> tuple[Array, list[str]]:
+    """Points of whiskers with a constant identity, from base to tip, and their names.
+
+    The tracker numbered them in each frame and view anew. Those asked for are returned, or else the
+    longest of each view.
+    """
+    if asked is not None and min(points.shape[1:3]) > 1:
+        raise ValueError(
+            f"the tracker numbered {len(names)} whiskers in each view anew, so that it is unknown "
+            "which of one view is which of the other: name none, for the longest of each, or "
+            "identify them in the tracker (by the state of Whisk's measurements)"
+        )
     notes.append("the tracker did not identify whiskers over time: each is followed by its ends")
-    either = tracks.attrs.get("direction") == "either"
+    views = [_followed(points[:, :, [v]], either) for v in range(points.shape[2])]
+    if either:
+        notes.append("the end that moves less is taken for the base of each whisker")
+    if asked is not None:
+        return np.concatenate(views, axis=2), names
+    longest = [_longest(names, view, notes) for view in views]
+    one = [view[:, [k]] for view, k in zip(views, longest, strict=True)]
+    return np.concatenate(one, axis=2), [names[longest[0]]]
+
+
+def _followed(points: Array, either: bool) -> Array:
+    """Points (time, whisker, 1, node, axis) of one view, in the order of whiskers' first frames."""
     ends = _ends(points)
     out = np.full_like(points, np.nan)
     last = ends[0].copy()
@@ -263,15 +286,14 @@ def _identified(tracks: xr.Dataset, points: Array, notes: list[str]) -> tuple[Ar
             out[i, row] = _turned(points[i, column]) if swap else points[i, column]
             last[row] = ends[i, column, ::-1] if swap else ends[i, column]
     if either:
-        notes.append("the end that moves less is taken for the base of each whisker")
         spread = np.nanstd(_ends(out), axis=0).sum(axis=-1)
         for k in np.flatnonzero(spread[:, 0] > spread[:, 1]):
             out[:, k] = [_turned(one) for one in out[:, k]]
-    return out, names
+    return out
 
 
 def _ends(points: Array) -> Array:
-    """First and last known points (time, whisker, 2, axis) of the first view."""
+    """First and last known points (time, whisker, 2, axis) of a single view."""
     first = points[:, :, 0]
     known = np.asarray(np.isfinite(first).all(axis=-1))
     number = known.shape[-1]
@@ -292,18 +314,17 @@ def _turned(points: Array) -> Array:
     return out
 
 
-def _wanted(
-    names: list[str],
-    points: Array,
-    asked: Sequence[str] | None,
-    per_frame: bool,
-    notes: list[str],
-) -> list[int]:
+def _wanted(names: list[str], points: Array, asked: Sequence[str] | None) -> list[int]:
     """Indices of the whiskers to track."""
     if asked is not None:
         if unknown := sorted(set(asked) - set(names)):
             raise ValueError(f"there is no whisker {', '.join(unknown)}; these are {names}")
         return [names.index(name) for name in asked]
+    return [int(k) for k in _often(names, points)]
+
+
+def _often(names: list[str], points: Array) -> IntArray:
+    """Indices of the whiskers that are seen in half of the frames."""
     known = np.isfinite(points).all(axis=-1)
     seen = (known.sum(axis=-1) >= _FEWEST).reshape(len(points), len(names), -1).all(axis=-1)
     share = seen.mean(axis=0)
@@ -314,18 +335,22 @@ def _wanted(
             f"{names[int(np.argmax(share))]} has them in {100.0 * share.max():.0f} % (points whose "
             f"confidence is below {_CONFIDENT:g} are dropped)"
         )
-    if not per_frame:
-        return [int(k) for k in often]
-    first = points if points.ndim == 4 else points[:, :, 0]
-    steps = np.linalg.norm(np.diff(first, axis=2), axis=-1)
+    return often
+
+
+def _longest(names: list[str], points: Array, notes: list[str]) -> int:
+    """Index of the longest whisker of those often seen in a view (time, whisker, 1, node, axis)."""
+    often = _often(names, points)
+    steps = np.linalg.norm(np.diff(points[:, :, 0], axis=2), axis=-1)
     length = np.nanmedian(np.nansum(steps, axis=-1), axis=0)
     longest = int(often[np.argmax(length[often])])
-    notes.append(
-        f"{often.size} whiskers are seen in half of the frames; the longest, {names[longest]}, is "
-        f"taken: name others ({', '.join(names[k] for k in often[:_SHOWN])}"
-        f"{', …' if often.size > _SHOWN else ''})"
-    )
-    return [longest]
+    if often.size > 1:
+        notes.append(
+            f"{often.size} whiskers are seen in half of the frames; the longest, {names[longest]}, "
+            f"is taken: name others ({', '.join(names[k] for k in often[:_SHOWN])}"
+            f"{', …' if often.size > _SHOWN else ''})"
+        )
+    return longest
 
 
 def _order_faults(points: Array, name: str, views: Sequence[str], nodes: list[str]) -> list[str]:

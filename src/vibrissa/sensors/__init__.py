@@ -2,12 +2,10 @@
 
 from vibrissa.sensors.calibration import (
     MixingCalibration,
-    StiffnessFit,
     WeightCalibration,
     calibrate_mixing,
     calibrate_on_contacts,
     calibrate_weight,
-    fit_stiffness,
     tare,
 )
 from vibrissa.sensors.files import (
@@ -29,6 +27,7 @@ from vibrissa.sensors.sensor import (
     Sensor,
     component_noise as component_noise,
 )
+from vibrissa.sensors.stiffness import StiffnessFit, fit_stiffness
 from vibrissa.sensors.suspended import SuspendedWhisker, Touches as Touches
 from vibrissa.sensors.suspension import SuspensionCalibration, calibrate_suspension
 from vibrissa.sensors.swept import SweptContacts, follow_sweep

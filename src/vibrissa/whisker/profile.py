@@ -220,15 +220,23 @@ def _locate_singularity(function: Function, start: float, end: float) -> float:
     return 0.5 * (start + end)
 
 
-_CHECKS = np.cos(np.pi * (np.arange(33) + 0.5) / 33.0)
+def _chebyshev(n: int) -> Array:
+    """Chebyshev points (n,) in (-1, 1)."""
+    points: Array = np.cos(np.pi * (np.arange(n) + 0.5) / n)
+    return points
+
+
+_NODES = {d: _chebyshev(d + 1) for d in DEGREES}
+_FITS = {d: np.linalg.inv(np.vander(nodes, increasing=True)) for d, nodes in _NODES.items()}
+_CHECKS = _chebyshev(33)
+_POWERS = np.vander(_CHECKS, max(DEGREES) + 1, increasing=True)
 
 
 def _best_polynomial(
     function: Function, start: float, end: float, scale: float
 ) -> tuple[Array, float, float]:
     """Coefficients of the lowest sufficient degree on an interval, their error, and largest |f|."""
-    nodes = {d: np.cos(np.pi * (np.arange(d + 1) + 0.5) / (d + 1)) for d in DEGREES}
-    tau = np.concatenate([*nodes.values(), _CHECKS])
+    tau = np.concatenate([*_NODES.values(), _CHECKS])
     values = function(0.5 * (start + end) + 0.5 * (end - start) * tau)
     checks = values[-_CHECKS.size :]
     largest = float(np.abs(values).max())
@@ -236,8 +244,8 @@ def _best_polynomial(
     for degree in DEGREES:
         at_nodes = values[first : first + degree + 1].reshape(degree + 1, -1)
         first += degree + 1
-        flat = np.linalg.solve(np.vander(nodes[degree], increasing=True), at_nodes)
-        found = np.vander(_CHECKS, degree + 1, increasing=True) @ flat
+        flat = _FITS[degree] @ at_nodes
+        found = _POWERS[:, : degree + 1] @ flat
         error = float(np.abs(found.reshape(checks.shape) - checks).max())
         if error <= 1e-2 * TOLERANCE * max(scale, largest):
             break

@@ -20,7 +20,6 @@ from vibrissa.plots import style
 from vibrissa.plots.verdicts import triplet_label
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import DIRECTIONS, SIGNALS
-from vibrissa.signals import within_turn
 
 _MAGNIFICATIONS = (1, 2, 3, 5, 10, 20, 50, 100)
 _WIDE = 0.02  # drawn width at the base, as a share of the whisker's extent, that is aimed at
@@ -524,9 +523,12 @@ def _power(value: float) -> str:
 
 def _difference(witness: xr.Dataset, triplet: tuple[str, ...]) -> float:
     """Largest relative difference of the signals that are the same; of directions, in rad."""
-    gaps = []
+    worst = 0.0
     for name in triplet:
-        values = witness[name].values
-        size = 1.0 if name in DIRECTIONS else max(np.abs(values).max(), 1e-300)
-        gaps.append(np.abs(within_turn(np.diff(values), name in DIRECTIONS)).item() / size)
-    return float(max(gaps))
+        one, other = (float(v) for v in witness[name].values)
+        if name in DIRECTIONS:
+            gap = abs(np.angle(np.exp(1j * (one - other))))
+        else:
+            gap = abs(one - other) / max(abs(one), abs(other), 1e-300)
+        worst = max(worst, float(gap))
+    return worst

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
@@ -22,7 +23,7 @@ _TAGS = 10_000  # size reserved for the names and tags of movies, bytes
 
 
 # Title, sections, script and figures of a page.
-_Content = tuple[str, list[vb.report.Section], str, Mapping[str, Draw]]
+_Content: TypeAlias = "tuple[str, list[vb.report.Section], str, Mapping[str, Draw]]"
 
 
 @with_options("the page, .html")

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from os import PathLike
@@ -17,21 +16,10 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from vibrissa import samples
+from vibrissa import evaluation, samples, simulation
 from vibrissa._version import __version__
 from vibrissa.contacts import ContactMap
 from vibrissa.contour import CylinderFit, shape_from_dataset
-from vibrissa.evaluation import (
-    Scores,
-    SignalRow,
-    TrackingScores,
-    contact_errors,
-    score,
-    signal_errors,
-    tracking_scores,
-    truth_of,
-    with_truth,
-)
 from vibrissa.io import load_recording, replacing, save_contacts, save_recording
 from vibrissa.objects import Peg
 from vibrissa.pipeline import (
@@ -46,15 +34,6 @@ from vibrissa.pipeline import (
 )
 from vibrissa.recording import Recording
 from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE
-from vibrissa.simulation import (
-    facing_peg,
-    film,
-    measure,
-    simulate,
-    sweep_past,
-    views_of,
-    with_true_traces,
-)
 from vibrissa.tracking import TrackOptions, partial_traces, trace_file, track
 from vibrissa.whisker import Whisker
 
@@ -90,8 +69,8 @@ class Located:
     contacts: xr.Dataset
     errors: xr.Dataset
     fit: CylinderFit
-    scores: Scores
-    signals: tuple[SignalRow, ...]
+    scores: evaluation.Scores
+    signals: tuple[evaluation.SignalRow, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +89,7 @@ class DemoResult:
     contact_map: ContactMap
     sensed: Located
     seen: Located | None
-    tracking: TrackingScores | None
+    tracking: evaluation.TrackingScores | None
     files: tuple[Path, ...]
 
 
@@ -134,14 +113,17 @@ def run_demo(
     """
     tell = progress or (lambda stage, done, total: None)
     whisker = samples.gamma() if whisker is None else whisker
-    with _folder(output) as folder:
+    with tempfile.TemporaryDirectory() if output is None else nullcontext(output) as place:
+        folder = Path(place)
         begin(folder, whisker, seed=seed, noise=noise, duration=duration, rate=rate, video=video)
         trial = _simulated(whisker, seed, noise, duration, rate, tell)
         held, scores, seen = trial, None, None
         if video:
             trial = _filmed(trial, folder, seed, tell)
-            held = with_truth(_tracked(trial, folder, tell), trial)
-            scores = tracking_scores(held.to_dataset().isel(_DIM), truth_of(held)[0])
+            held = evaluation.with_truth(_tracked(trial, folder, tell), trial)
+            scores = evaluation.tracking_scores(
+                held.to_dataset().isel(_DIM), evaluation.truth_of(held)[0]
+            )
         tell("map of all contacts", 0, 1)
         contact_map = ContactMap.simulate(Recording(held).whisker(), grid=False)
         tell("map of all contacts", 1, 1)
@@ -155,17 +137,8 @@ def run_demo(
         files: tuple[Path, ...] = ()
         if output is not None:
             files = _written(folder, sensed, seen, contact_map, tell)
-        return DemoResult(whisker, _peg(trial), trial, contact_map, sensed, seen, scores, files)
-
-
-@contextmanager
-def _folder(output: str | PathLike[str] | None) -> Iterator[Path]:
-    """Context with the requested folder, or with a temporary one."""
-    if output is not None:
-        yield Path(output)
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        yield Path(folder)
+        (peg,) = Recording(trial).pegs
+        return DemoResult(whisker, peg, trial, contact_map, sensed, seen, scores, files)
 
 
 def begin(folder: Path, whisker: Whisker, **settings: object) -> None:
@@ -201,12 +174,12 @@ def _simulated(
 ) -> xr.DataTree:
     """Simulated trial, with the readings of a sensor at the whisker's base."""
     force_noise, moment_noise = (FORCE_NOISE, MOMENT_NOISE) if noise else (0.0, 0.0)
-    peg = facing_peg(whisker)
+    peg = simulation.facing_peg(whisker)
     tell("how far to whisk", 0, 1)
-    motion = sweep_past(whisker, peg, duration, rate, seed=seed)
+    motion = simulation.sweep_past(whisker, peg, duration, rate, seed=seed)
     tell("how far to whisk", 1, 1)
-    trial = simulate(whisker, motion, peg, progress=partial(tell, "whisking trial"))
-    return measure(trial, force_noise, moment_noise, seed)
+    trial = simulation.simulate(whisker, motion, peg, progress=partial(tell, "whisking trial"))
+    return simulation.measure(trial, force_noise, moment_noise, seed)
 
 
 def _filmed(trial: xr.DataTree, folder: Path, seed: int, tell: Progress) -> xr.DataTree:
@@ -214,13 +187,13 @@ def _filmed(trial: xr.DataTree, folder: Path, seed: int, tell: Progress) -> xr.D
     path = folder / SIMULATED
     if path.exists():
         return load_recording(path)
-    cameras = views_of(trial)
+    cameras = simulation.views_of(trial)
     for view, (camera, file) in enumerate(zip(cameras, video_files(folder), strict=True)):
         # An existing video is complete.
         if not file.exists():
             report = partial(tell, f"filming, {camera.name}")
-            film(trial, {camera.name: file}, [camera], seed=seed + view, progress=report)
-    done = with_true_traces(trial, cameras)
+            simulation.film(trial, {camera.name: file}, [camera], seed=seed + view, progress=report)
+    done = simulation.with_true_traces(trial, cameras)
     save_recording(path, done)
     return done
 
@@ -245,28 +218,24 @@ def _tracked(trial: xr.DataTree, folder: Path, tell: Progress) -> xr.DataTree:
     return found
 
 
-def _peg(recording: xr.DataTree) -> Peg:
-    (peg,) = Recording(recording).pegs
-    return peg
-
-
 def _located(recording: xr.DataTree, contact_map: ContactMap, seed: int) -> Located:
     """Estimate contacts from a recording's signals, fit the peg, and compare with the truth."""
     recording = with_contour(with_estimates(recording, contact_maps=[contact_map]))
+    (peg,) = Recording(recording).pegs
     contacts = recording["estimates"].to_dataset().isel(_DIM)
     fit = shape_from_dataset(recording["contour"].to_dataset())
     assert isinstance(fit, CylinderFit)
-    truth, whisker = truth_of(recording)
+    truth, whisker = evaluation.truth_of(recording)
     radii = whisker_radii(recording["truth"].to_dataset(), [whisker])[:, 0]
-    errors = contact_errors(contacts, truth, whisker, seed)
+    errors = evaluation.contact_errors(contacts, truth, whisker, seed)
     signals = recording["signals"].to_dataset().isel(_DIM)
     return Located(
         recording=recording,
         contacts=contacts,
         errors=errors,
         fit=fit,
-        scores=score(contacts, truth, errors, fit, _peg(recording), radii),
-        signals=signal_errors(signals, truth, errors["deflection_angle"].values),
+        scores=evaluation.score(contacts, truth, errors, fit, peg, radii),
+        signals=evaluation.signal_errors(signals, truth, errors["deflection_angle"].values),
     )
 
 

@@ -75,24 +75,23 @@ def views(marks: Sequence[Mark]) -> str:
             pixels = centre + (flat - middle) * scale * [1.0, -1.0]
             parts.append(_mark_svg(mark, pixels))
         parts.append(_text(left + 2.0, 11.0, f"x–{'xyz'[j]}"))
-    parts.append(_bar(extent, scale, height))
-    width = 2.0 * _PANEL + _GAP
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height + 16:.0f}" '
-        f'viewBox="0 0 {width:.0f} {height + 16:.0f}" role="img" '
-        f'style="max-width:100%;height:auto">'
-        f"{''.join(parts)}</svg>{_legend(marks)}"
-    )
-
-
-def _legend(marks: Sequence[Mark]) -> str:
-    """Labels of the visible marks in their colours."""
+    # A scale bar of round length, below the left panel.
+    length, x, y = round_step(extent / 3.0), _MARGIN, height + 6.0
+    line = f'<path d="M{x} {y}h{length * scale:.1f}" stroke="currentColor" stroke-width="2"/>'
+    parts += [line, _text(x + length * scale + 5.0, y + 4.0, f"{length * 1e3:g} mm")]
     labels = [
         f'<span style="color:{mark.colour}">{"●" if mark.dots else "━"}</span> {escape(mark.label)}'
         for mark in marks
         if mark.label and np.isfinite(np.asarray(mark.places, dtype=float)).any()
     ]
-    return f"<br><small>{' &emsp; '.join(labels)}</small>" if labels else ""
+    legend = f"<br><small>{' &emsp; '.join(labels)}</small>" if labels else ""
+    width = 2.0 * _PANEL + _GAP
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height + 16:.0f}" '
+        f'viewBox="0 0 {width:.0f} {height + 16:.0f}" role="img" '
+        f'style="max-width:100%;height:auto">'
+        f"{''.join(parts)}</svg>{legend}"
+    )
 
 
 def _mark_svg(mark: Mark, pixels: Array) -> str:
@@ -126,14 +125,6 @@ def round_step(size: float) -> float:
     size *= 1.0 + 1e-9  # so that a third of 300 mm is a round length despite rounding
     power = 10.0 ** np.floor(np.log10(size))
     return float(max(f for f in (1.0, 2.0, 5.0) if f * power <= size) * power)
-
-
-def _bar(extent: float, scale: float, height: float) -> str:
-    """Scale bar of round length, below the left panel."""
-    length = round_step(extent / 3.0)
-    y, x = height + 6.0, _MARGIN
-    line = f'<path d="M{x} {y}h{length * scale:.1f}" stroke="currentColor" stroke-width="2"/>'
-    return line + _text(x + length * scale + 5.0, y + 4.0, f"{length * 1e3:g} mm")
 
 
 def _text(x: float, y: float, text: str) -> str:
@@ -226,7 +217,8 @@ def progress(console: Console | None = None) -> Iterator[Callable[..., None]]:
     """
     stages: dict[str, Any] = {}
 
-    if console is None and _in_notebook():
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    if console is None and shell is not None and hasattr(shell, "kernel"):
         notebook: Any = importlib.import_module("IPython.display")
         handle = notebook.display(notebook.HTML(""), display_id=True)
 
@@ -263,9 +255,3 @@ def _report(*report: Any) -> tuple[str, int, int]:
     """Stage, which not all computations name, number done, and total."""
     *stage, done, total = report
     return (stage[0] if stage else "done"), done, total
-
-
-def _in_notebook() -> bool:
-    """Whether the code runs in a notebook's kernel."""
-    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
-    return shell is not None and hasattr(shell, "kernel")

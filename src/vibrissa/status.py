@@ -1,4 +1,4 @@
-"""Statuses of loads and estimates, as sentences with advice.
+"""Statuses of loads and estimates; `status.csv` has their sentences and advice, a row for each.
 
 A load without equilibrium, or signals that no contact explains, result in a row with a status, so
 that one bad case does not stop a grid. The numbers are stored in datasets as CF flags and never
@@ -7,8 +7,10 @@ change their meaning: 0-9 for a load with a solution, 10-19 for a load without, 
 
 from __future__ import annotations
 
+import csv
 import enum
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -44,108 +46,34 @@ class Status(enum.IntEnum):
     advice: str
     ok: bool
 
-    OK = 0, "The object touches the side of the whisker."
-    TIP_CONTACT = (
-        1,
-        "The object touches the very tip of the whisker, and the force is normal to the object.",
-    )
-    NO_CONTACT = 2, "The object does not reach the whisker, so force and moment are zero."
-    BEYOND_FOLD = (
-        10,
-        "The whisker has slipped off: the load lies beyond the fold that ends the stable branch.",
-        "Move the object back toward the resting whisker; without friction a whisker of this "
-        "shape and taper holds no contact there.",
-    )
-    BEYOND_TIP = (
-        11,
-        "The load lies beyond the tip: the whisker is too short for this contact.",
-        "Move the object toward the base, or check the whisker's length and the unit of the "
-        "points.",
-    )
-    TOO_PROXIMAL = (
-        12,
-        "The contact would lie closer to the base than the smallest arc length that is considered.",
-        "Lower the smallest arc length (0.3 of the whisker's length by default), or move the "
-        "object toward the tip.",
-    )
-    NOT_CONVERGED = (
-        13,
-        "The solver did not converge; nothing is known about this load.",
-        "This is a defect of vibrissa: please report it with the whisker and the load.",
-    )
-    MISSING = (
-        14,
-        "The input of this row is missing or not finite.",
-        "Check the row for NaN, for example frames in which the whisker was not tracked.",
-    )
-    TOO_STRONG = (
-        15,
-        "The force is so strong that it winds the whisker up in waves too short to compute.",
-        "Check the force's unit (N), and the whisker's radius: forces scale with its fourth power.",
-    )
-    UNIQUE = 20, "Exactly one contact of this whisker explains the signals."
-    AMBIGUOUS = (
-        21,
-        "Several contacts of this whisker explain the signals, or are probable with their noise.",
-        "The candidates are listed, with noise by their probability: add a signal, or choose by "
-        "continuity with the frames around.",
-    )
-    NOT_FRICTIONLESS = (
-        22,
-        "No frictionless contact on the side of this whisker explains the signals.",
-        "Check the whisker's shape, taper and stiffness and the sensor's offset; with friction, "
-        "estimate from all six signals.",
-    )
-    OUTSIDE_MAP = (
-        23,
-        "The signals lie outside the map.",
-        "Simulate the map over a wider domain, or check the unit and frame of the signals.",
-    )
-    DEGENERATE = (
-        24,
-        "The signals do not determine a contact: force and moment are too small, or on this "
-        "whisker contacts can move without changing these signals.",
-        "Leave the row out, or choose other signals.",
-    )
-    NOT_ONE_CONTACT = (
-        25,
-        "No single contact of this whisker explains force and moment together.",
-        "Check the whisker's shape, taper and stiffness and the sensor's offset and noise; perhaps "
-        "more than one object touches.",
-    )
-    APPROXIMATE = (
-        26,
-        "A look-up table or network gave this contact, and cannot show whether others explain the "
-        "signals too.",
-    )
-    UNDERDETERMINED = (
-        27,
-        "Fewer than three signals: a whole curve or surface of contacts explains them.",
-        "The candidates are samples of it, and the covariance spans it: add a signal, or filter "
-        "over time while the base moves.",
-    )
-
-    NOT_FELT = (
-        28,
-        "No contact is measured: force and moment are within their noise, so that nothing touches "
-        "the whisker, or too lightly to be distinguished from nothing.",
-    )
-    OUTSIDE_PRIOR = (
-        29,
-        "Contacts of this whisker explain the signals, but none of those that are possible "
-        "according to the prior.",
-        "Widen the prior's region or limits of force, or check the sensor's axes and offset.",
-    )
-
-    def __new__(cls, code: int, explanation: str = "", advice: str = "") -> Status:
-        """Create a member; the defaults let type checkers see that ``Status(code)`` is a lookup."""
-        member = int.__new__(cls, code)
-        member._value_ = code
-        member.explanation, member.advice, member.ok = explanation, advice, not advice
-        return member
+    OK = 0
+    TIP_CONTACT = 1
+    NO_CONTACT = 2
+    BEYOND_FOLD = 10
+    BEYOND_TIP = 11
+    TOO_PROXIMAL = 12
+    NOT_CONVERGED = 13
+    MISSING = 14
+    TOO_STRONG = 15
+    UNIQUE = 20
+    AMBIGUOUS = 21
+    NOT_FRICTIONLESS = 22
+    OUTSIDE_MAP = 23
+    DEGENERATE = 24
+    NOT_ONE_CONTACT = 25
+    APPROXIMATE = 26
+    UNDERDETERMINED = 27
+    NOT_FELT = 28
+    OUTSIDE_PRIOR = 29
 
     def __str__(self) -> str:
         return f"{self.explanation} {self.advice}".rstrip()
+
+
+for _row in csv.DictReader(Path(__file__).with_suffix(".csv").read_text("utf-8").splitlines()):
+    _status = Status[_row["name"]]
+    _status.explanation, _status.advice = _row["explanation"], _row["advice"]
+    _status.ok = not _status.advice
 
 
 class Event(enum.IntEnum):

@@ -275,7 +275,7 @@ def test_what_was_done_is_not_done_again(from_video, folder, monkeypatch):
     def never(*args, **options):
         raise AssertionError("done again")
 
-    monkeypatch.setattr(filming, "film", never)
+    monkeypatch.setattr("vibrissa.simulation.film", never)
     monkeypatch.setattr(filming, "trace_file", never)
     again = run_demo(output=folder, **FILMED)
     np.testing.assert_array_equal(again.sensed.fit.origin, from_video.sensed.fit.origin)
@@ -284,7 +284,7 @@ def test_what_was_done_is_not_done_again(from_video, folder, monkeypatch):
 
 
 def test_stopped_while_filming_it_goes_on_with_the_next_view(tmp_path, monkeypatch):
-    film, filmed = filming.film, []
+    film, filmed = vb.simulation.film, []
 
     def stopping(trial, files, *args, **options):
         filmed.extend(files)
@@ -292,7 +292,7 @@ def test_stopped_while_filming_it_goes_on_with_the_next_view(tmp_path, monkeypat
             raise KeyboardInterrupt
         return film(trial, files, *args, **options)
 
-    monkeypatch.setattr(filming, "film", stopping)
+    monkeypatch.setattr("vibrissa.simulation.film", stopping)
     short = {"duration": 0.1, "rate": 100.0, "output": tmp_path}
     for _ in range(2):
         with pytest.raises((KeyboardInterrupt, ValueError)):

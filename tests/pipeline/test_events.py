@@ -5,7 +5,7 @@ import pytest
 
 import vibrissa as vb
 from vibrissa.io import events_in, load_contacts, save_contacts, save_predictors
-from vibrissa.pipeline import contact_columns, contact_events, predictors, summarise
+from vibrissa.pipeline import TrialSummary, contact_columns, contact_events, predictors
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def test_events_are_those_of_the_truth(located):
     np.testing.assert_allclose(losses, time[steps == -1], atol=4e-3)
     contacts = contact_events(located["estimates"].to_dataset())
     assert set(onsets[:, 0]) <= set(contacts["onset"].values)
-    counted = summarise(located).events
+    counted = TrialSummary(located).events
     assert counted["onset"] == len(onsets)
     assert counted["slip"] == contacts["slips"].sum()
 

@@ -187,7 +187,7 @@ def test_frames_that_tracking_lost_do_not_divide_a_contact(trial, tmp_path):
     )
     root["in_contact"].attrs = trial["in_contact"].attrs
     tree = recording_tree(root, [vb.samples.gamma()] * 2, "made by hand")
-    assert vb.pipeline.summarise(tree).contacts == 2
+    assert vb.pipeline.TrialSummary(tree).contacts == 2
     # The command reads only what a summary needs.
     vb.io.save_recording(tmp_path / "t.nc", tree)
     shown = CliRunner().invoke(app, ["info", str(tmp_path / "t.nc")]).output

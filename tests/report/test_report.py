@@ -133,13 +133,13 @@ def map_page(folder):
     )
     vb.identifiability.save_uniqueness(verdicts, folder / "uniqueness.nc")
     words = (folder / "map.nc", "--uniqueness", folder / "uniqueness.nc")
-    drawn = reporting.drawn
+    drawn = reporting.figures.drawn
 
     def few(drawings, tell):
         return drawn(dict(list(drawings.items())[::5]), tell)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(reporting, "drawn", few)
+        patch.setattr(reporting.figures, "drawn", few)
         patch.setenv("SOURCE_DATE_EPOCH", "1700000000")
         patch.setattr(plots, "png", partial(plots.png, dots=40.0))
         patch.setattr("vibrissa.scene.solids._SHAPE", (12, 24, 8))
@@ -384,7 +384,7 @@ def test_the_same_command_gives_the_same_page(map_page):
 def test_a_page_is_replaced_only_if_asked_and_its_date_is_a_number(map_page, folder, monkeypatch):
     path, words = map_page
     assert "is there already" in fault("report", *words, "-o", path)
-    monkeypatch.setattr(reporting, "drawn", lambda drawings, tell: [])
+    monkeypatch.setattr(reporting.figures, "drawn", lambda drawings, tell: [])
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "yesterday")
     text = fault("report", folder / "map.nc", "-o", folder / "same.html")
     assert "'yesterday'" in text
@@ -442,7 +442,7 @@ def test_what_is_missing_is_named_with_the_verb_that_makes_it(folder):
 
 def test_without_the_drawing_library_the_picture_in_space_is_left_out(folder, monkeypatch):
     monkeypatch.setattr("vibrissa.report.space.find_spec", lambda name: None)
-    monkeypatch.setattr(reporting, "drawn", lambda drawings, tell: [])
+    monkeypatch.setattr(reporting.figures, "drawn", lambda drawings, tell: [])
     text = run("report", folder / "map.nc", "-o", folder / "flat.html")
     assert "vibrissa[report]" in text
     page = Page((folder / "flat.html").read_text(encoding="utf-8"))
@@ -491,7 +491,7 @@ def test_movies_are_made_and_put_into_the_page(folder, tmp_path, monkeypatch):
         for data in [group.to_dataset(inherit=False)]
     }
     save_recording(tmp_path / "short.nc", xr.DataTree.from_dict(groups))
-    monkeypatch.setattr(reporting, "drawn", lambda drawings, tell: [])
+    monkeypatch.setattr(reporting.figures, "drawn", lambda drawings, tell: [])
     words = ("report", tmp_path / "short.nc", "--map", folder / "map.nc", "--make-movies")
     run(*words, "-o", tmp_path / "short.html")
     page = Page((tmp_path / "short.html").read_text(encoding="utf-8"))

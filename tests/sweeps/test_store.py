@@ -154,7 +154,7 @@ def test_records_that_are_damaged_are_noticed_and_done_again(study, path, whole,
     assert np.isnan(shown["map_slip_force"].values[status != 1]).all()
     if damage is overwrite:
         assert list(status) == [1, 3, 1]
-        assert "damaged (`vibrissa sweep` does them again)" in sweep_summary(shown)
+        assert "damaged (`vibrissa sweep` does them again)" in "\n".join(sweep_summary(shown))
     outcome = run_sweep(study, path, workers=0)
     assert outcome.done == (status != 1).sum()
     assert outcome.damaged == (status == 3).sum()
@@ -291,7 +291,7 @@ def test_where_there_is_no_fcntl_the_other_lock_is_used(study, tmp_path, monkeyp
         if len(asked) > 1:
             raise PermissionError(errno.EACCES, "locked")
 
-    monkeypatch.setattr("vibrissa.sweeps.store.sys", SimpleNamespace(platform="win32"))
+    monkeypatch.setattr("vibrissa.io.paths.sys", SimpleNamespace(platform="win32"))
     monkeypatch.setitem(sys.modules, "msvcrt", SimpleNamespace(locking=locking, LK_NBLCK=2))
     monkeypatch.setitem(sys.modules, "fcntl", None)
     with Store(tmp_path / "s", study), pytest.raises(Busy), Store(tmp_path / "s", study):
@@ -324,7 +324,7 @@ def test_a_store_of_another_version_is_refused_or_keeps_what_is_whose(
     found = open_sweep(path)
     assert list(found["origin"].values[:, 0]) == [0, 1, 1]
     assert found.attrs["origins"][1] == libraries
-    assert f"2 cells by {libraries}" in sweep_summary(found)
+    assert f"2 cells by {libraries}" in "\n".join(sweep_summary(found))
     # Other libraries are not another version: it is kept, not refused.
     monkeypatch.setattr("vibrissa.sweeps.store.origin", lambda: libraries + "1")
     assert run_sweep(study, path, workers=0).skipped == 3

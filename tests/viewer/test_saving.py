@@ -3,55 +3,26 @@
 from types import SimpleNamespace
 
 import numpy as np
-import xarray as xr
 
 import vibrissa as vb
-from vibrissa.io import load_recording, read_video, video_info
-from vibrissa.viewer.save import (
-    deflection_dataset,
-    map_netcdf,
-    movie,
-    netcdf,
-    on_paper,
-    png,
-    recording_netcdf,
-    whisker_csv,
-    whisker_netcdf,
-)
+from vibrissa.io import load_recording, read_video, save_recording, video_info
+from vibrissa.viewer.save import deflection_dataset, movie, on_paper, png, written
 from vibrissa.viewer.state import begin
 
 
-def test_a_whisker_comes_back(tmp_path):
-    whisker = vb.samples.gamma()
-    (tmp_path / "a.csv").write_bytes(whisker_csv(whisker))
-    back = vb.load_whisker(tmp_path / "a.csv")
-    np.testing.assert_allclose(back.length, whisker.length, rtol=1e-4)
-    (tmp_path / "a.nc").write_bytes(whisker_netcdf(whisker))
-    with xr.open_dataset(tmp_path / "a.nc", engine="h5netcdf") as data:
-        same = vb.Whisker.from_dataset(data.load())
-    np.testing.assert_array_equal(same.centerline(), whisker.centerline())
-
-
-def test_a_bent_whisker_is_a_labelled_dataset(tmp_path):
+def test_a_bent_whisker_is_a_labelled_dataset():
     bent = begin(vb.samples.gamma()).deflection
-    (tmp_path / "bent.nc").write_bytes(netcdf(deflection_dataset(bent)))
-    with xr.open_dataset(tmp_path / "bent.nc", engine="h5netcdf") as data:
-        np.testing.assert_array_equal(data["force"], bent.force)
-        signals = vb.base_signals(bent.force, bent.moment)
-        assert float(data["MB"]) == float(signals.MB)
-        assert all(v.attrs.get("units") for v in data.data_vars.values())
-        assert all(v.attrs.get("long_name") for v in data.data_vars.values())
-
-
-def test_a_map_comes_back(tmp_path):
-    contact_map = vb.ContactMap.simulate(vb.samples.curved(), grid=False, cells=(8, 16, 8))
-    (tmp_path / "map.nc").write_bytes(map_netcdf(contact_map))
-    back = vb.ContactMap.load(tmp_path / "map.nc")
-    np.testing.assert_array_equal(back.chart.values, contact_map.chart.values)
+    data = deflection_dataset(bent)
+    np.testing.assert_array_equal(data["force"], bent.force)
+    signals = vb.base_signals(bent.force, bent.moment)
+    assert float(data["MB"]) == float(signals.MB)
+    assert all(v.attrs.get("units") for v in data.data_vars.values())
+    assert all(v.attrs.get("long_name") for v in data.data_vars.values())
 
 
 def test_a_trial_comes_back(tmp_path, recording):
-    (tmp_path / "trial.nc").write_bytes(recording_netcdf(recording))
+    content = written("trial.nc", lambda path: save_recording(path, recording))
+    (tmp_path / "trial.nc").write_bytes(content)
     back = load_recording(tmp_path / "trial.nc")
     assert set(back.children) == set(recording.children)
     np.testing.assert_array_equal(back["force"], recording["force"])

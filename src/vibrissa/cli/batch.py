@@ -116,7 +116,7 @@ def _one(
     if tree is not None and made:
         vb.io.save_recording(path, tree)
     try:
-        found = None if tree is None else vb.pipeline.summarise(tree)
+        found = None if tree is None else vb.pipeline.TrialSummary(tree)
     except ValueError as error:  # of groups that were edited
         fault = fault or " ".join(str(error).split())
     return found, fault

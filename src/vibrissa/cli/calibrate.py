@@ -115,9 +115,7 @@ def _cameras(
     if frames is not None and frames < 2:
         raise ValueError(f"--frames is {frames}; a few dozen are needed")
     check_new(target, (".toml",), force)
-    if not any(
-        vb.io.recognise(vb.io.check_readable(image)) == vb.io.Kind.VIDEO for image in images
-    ):
+    if vb.io.Kind.VIDEO not in map(vb.io.recognise, images):
         refuse({"--frames": frames}, "it is of videos, and these are images")
     cameras, error = vb.cameras.calibrate(
         vb.io.load_series(images, frames or _FRAMES), corners, 1e-3 * square

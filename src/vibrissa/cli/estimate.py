@@ -9,25 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import vibrissa as vb
-from vibrissa.cli.inputs import (
-    RECORDING,
-    AssumptionOptions,
-    NoiseOptions,
-    WhiskerOptions,
-    check_one_whisker,
-    estimator_of,
-    free_beside,
-    kind_in,
-    map_of,
-    maps_from,
-    objects_from,
-    print_notes,
-    print_statuses,
-    print_written,
-    recording_from,
-    smallest_arc,
-    wrench_from,
-)
+from vibrissa.cli import inputs
 from vibrissa.cli.options import Method, numbers, refuse, with_options
 from vibrissa.cli.signals import SourceOptions, described
 from vibrissa.cli.terminal import Tell, progress_bars, remark, shown
@@ -157,9 +139,9 @@ class EstimateOptions:
     friction_sigma: float = 0.0
     second_contacts: float = 0.0
     compliance_sigma: float = 0.0
-    noise: NoiseOptions
-    assumed: AssumptionOptions
-    own: WhiskerOptions
+    noise: inputs.NoiseOptions
+    assumed: inputs.AssumptionOptions
+    own: inputs.WhiskerOptions
 
     def __post_init__(self) -> None:
         names = self.names or vb.signals.TRIPLET
@@ -210,10 +192,10 @@ class EstimateOptions:
         return any(map(bool, (*stated, self.proximal is not None, self.assumed.described())))
 
     @property
-    def known(self) -> WhiskerOptions:
+    def known(self) -> inputs.WhiskerOptions:
         """Options of the stated whisker, which may be that of a map."""
         one = self.map is not None and len(self.map) == 1
-        return WhiskerOptions(self.map[0]) if self.map and one else self.own
+        return inputs.WhiskerOptions(self.map[0]) if self.map and one else self.own
 
     def keywords(self) -> dict[str, Any]:
         """Keyword arguments shared by all estimates."""
@@ -280,13 +262,13 @@ def estimate(
     """
     if how.noise.covariance is not None:
         how.noise.matrix()
-    recorded = kind_in(vb.io.check_readable(signals)) == RECORDING
+    recorded = inputs.kind_in(vb.io.check_readable(signals)) == inputs.RECORDING
     added = recorded and known.around is None
     target = target or (signals if added else Path("contacts.csv"))
     swept = sensor is not None and vb.io.is_netcdf(sensor)
     both = (*vb.io.NETCDF, *vb.io.CSV)
     vb.io.check_writable(target, both if added or swept else vb.io.CSV)
-    free_beside(signals, [target], force)
+    inputs.free_beside(signals, [target], force)
     if known.around is not None:
         known.check(how, weight)
         if sensor is not None:
@@ -348,14 +330,16 @@ def _from_lines(
     weight.check(how)
     with progress_bars() as tell:
         if how.map:
-            contact_map = maps_from(how.map, 1, False)[0]
+            contact_map = inputs.maps_from(how.map, 1, False)[0]
         else:
             known = weight.of(how.own.read())
             remark(f"no map given; simulating that of {known!r}")
-            contact_map = map_of(known, tell, grid=False, proximal=smallest_arc(how.proximal))
+            contact_map = inputs.map_of(
+                known, tell, grid=False, proximal=inputs.smallest_arc(how.proximal)
+            )
         names = None if sensor is None else tuple(sensor.channels)
         used = names or how.names or vb.signals.TRIPLET
-        estimator = estimator_of(
+        estimator = inputs.estimator_of(
             contact_map, sensor, used, how.noise, how.assumed, weight.known, vb.signals.DETECTED
         )
         rows = itertools.count()
@@ -381,21 +365,21 @@ def _from_lines(
         remark(sentence)
     friction = vb.contacts.friction_assumed(estimator.friction)
     remark(f"signals ({', '.join(used)}){how.assumed.described()}; {friction}{weight.described()}")
-    print_statuses(np.array(statuses))
-    print_written(target)
+    inputs.print_statuses(np.array(statuses))
+    inputs.print_written(target)
 
 
 def _from_table(signals: Path, target: Path, how: EstimateOptions, weight: GravityOptions) -> None:
     """Estimate contacts for a table of signals, whisker frame."""
     weight.check(how)
     noise = how.noise.matrix()
-    wrench = wrench_from(signals)
+    wrench = inputs.wrench_from(signals)
     for note in wrench.attrs.get("notes", ()):
         remark(f"{signals}: {note}")
-    maps = maps_from(how.map, 1, how.grid) if how.map else []
+    maps = inputs.maps_from(how.map, 1, how.grid) if how.map else []
     known = maps[0].whisker if maps else weight.of(how.own.read())
     gravity = weight.known
-    print_notes(known)
+    inputs.print_notes(known)
     with vb.io.in_file(signals):
         vb.io.check_scale(wrench, known)
     how.noise.doubt(known)
@@ -404,7 +388,11 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions, weight: Gravi
     with progress_bars() as tell:
         if not maps and not how.whole:
             remark(f"no map given; simulating that of {known!r}")
-            maps = [map_of(known, tell, grid=how.grid, proximal=smallest_arc(how.proximal))]
+            maps = [
+                inputs.map_of(
+                    known, tell, grid=how.grid, proximal=inputs.smallest_arc(how.proximal)
+                )
+            ]
         tell("contact points", 0, 1)
         if how.whole:
             named = how.keywords()
@@ -421,8 +409,8 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions, weight: Gravi
     used = WRENCH if how.whole else found.attrs["triplet"]
     about = how.noise.described() + weight.described()
     remark(how.described(used, found.attrs["friction"], about, found.attrs["felt_above"]))
-    print_statuses(found["status"].values)
-    print_written(target)
+    inputs.print_statuses(found["status"].values)
+    inputs.print_written(target)
 
 
 # Signals proposed if the requested ones do not determine contacts, fewest first.
@@ -445,11 +433,11 @@ def _around(signals: Path, target: Path, how: EstimateOptions, known: AroundOpti
     """Estimate contacts with known objects, at several points or along an arc, for a table."""
     assert known.around is not None
     assert known.position_sigma is not None
-    objects, noise = objects_from(known.around), how.noise.matrix()
+    objects, noise = inputs.objects_from(known.around), how.noise.matrix()
     about = how.noise.described()
-    if kind_in(signals) == RECORDING:
-        tree = recording_from(signals)
-        check_one_whisker(tree, signals)
+    if inputs.kind_in(signals) == inputs.RECORDING:
+        tree = inputs.recording_from(signals)
+        inputs.check_one_whisker(tree, signals)
         tree = _with_signals(tree, how)
         wrench, whisker = (
             tree["signals"].to_dataset().isel(whisker=0),
@@ -461,9 +449,9 @@ def _around(signals: Path, target: Path, how: EstimateOptions, known: AroundOpti
         if wrench.attrs.get("source") == "sensor" and "density" not in wrench.attrs:
             wrench = wrench.drop_vars("in_contact")
     else:
-        wrench, whisker = wrench_from(signals), how.own.read()
+        wrench, whisker = inputs.wrench_from(signals), how.own.read()
         how.noise.doubt(whisker)
-    print_notes(whisker)
+    inputs.print_notes(whisker)
     with vb.io.in_file(signals):
         vb.io.check_scale(wrench, whisker)
     with progress_bars() as tell:
@@ -482,8 +470,8 @@ def _around(signals: Path, target: Path, how: EstimateOptions, known: AroundOpti
         f"to {known.position_sigma:g} mm; no friction assumed; {about}; contacts are measured "
         f"where M_B exceeds {shown('MB', found.attrs['felt_above'])}"
     )
-    print_statuses(found["status"].values)
-    print_written(target)
+    inputs.print_statuses(found["status"].values)
+    inputs.print_written(target)
 
 
 def _doubt_axes(
@@ -505,7 +493,7 @@ def _from_sweep(table: Path, target: Path, path: Path) -> None:
     )
     if target.suffix.lower() in vb.io.NETCDF:
         vb.io.save_recording(target, vb.pipeline.swept_recording(sensor, sweep, found))
-        print_written(target)
+        inputs.print_written(target)
         return
     sigma = found.covariance.diagonal(axis1=1, axis2=2) ** 0.5
     header = [a + b for a in ("", "normal_", "sigma_") for b in "xyz"]
@@ -516,27 +504,27 @@ def _from_sweep(table: Path, target: Path, path: Path) -> None:
         for i, on in enumerate(found.in_contact)
     ]
     vb.io.write_table(target, names, rows)
-    print_written(target)
+    inputs.print_written(target)
 
 
 def _from_recording(
     signals: Path, target: Path, how: EstimateOptions, weight: GravityOptions
 ) -> None:
     """Estimate contacts for a recording, and add them to it or write a table."""
-    tree = recording_from(signals)
+    tree = inputs.recording_from(signals)
     table = target.suffix.lower() in vb.io.CSV
     if table:
-        check_one_whisker(tree, signals)
+        inputs.check_one_whisker(tree, signals)
     with progress_bars() as tell:
         done, used = estimated(_with_signals(tree, how), how, tell, str(signals), weight)
     remark(f"{described(done)}; {used}")
     found = done["estimates"].to_dataset()
-    print_statuses(found["status"].values)
+    inputs.print_statuses(found["status"].values)
     if table:
         vb.io.save_contacts(target, vb.pipeline.contact_columns(found.isel(whisker=0)))
     else:
         vb.io.save_recording(target, done)
-    print_written(target, signals, "estimates")
+    inputs.print_written(target, signals, "estimates")
 
 
 def _with_signals(tree: xr.DataTree, how: EstimateOptions) -> xr.DataTree:
@@ -559,12 +547,12 @@ def estimated(
     source = signals.attrs.get("source")
     # A sensor without stated noise is assumed to have the default noise.
     noisy = how.noise.given or (source == "sensor" and vb.pipeline.sensor_noise(signals) is None)
-    maps = maps_from(how.map, tree.sizes["whisker"], how.grid) if how.map else []
+    maps = inputs.maps_from(how.map, tree.sizes["whisker"], how.grid) if how.map else []
     weight = weight or GravityOptions()
     weight.check(how)
     whiskers = [one.whisker for one in maps] if maps else how.own.in_recording(tree)
     whiskers = [weight.of(one) for one in whiskers]
-    print_notes(*whiskers)
+    inputs.print_notes(*whiskers)
     for k, whisker in enumerate(whiskers):
         with vb.io.in_file(name):
             vb.io.check_scale(signals.isel(whisker=k), whisker)
@@ -581,7 +569,7 @@ def estimated(
         tree,
         WRENCH if whole else how.names,
         noise=how.noise.matrix() if noisy else None,
-        proximal=smallest_arc(how.proximal),
+        proximal=inputs.smallest_arc(how.proximal),
         progress=tell,
         gravity=weight.known,
         **how.keywords(),

@@ -75,12 +75,18 @@ def sights_of(
         )
     sights = []
     for number, camera in enumerate(cameras[:_VIEWS]):
-        images: Iterable[Any] = repeat(_backdrop(trial, camera, course)) if not videos else ()
+        images: Iterable[Any]
         if videos:
             frames = rows if course.frames is None else course.frames[rows, number]
             listed = [int(frame) for frame in frames]
             _check_video(videos[number], camera, listed)
             images = vb.io.video_frames(videos[number], listed)
+        else:  # the objects on a uniform background
+            things = list(vb.recording.Recording(trial).objects)
+            middle = np.nanmean(course.position, axis=0)
+            covered = vb.simulation.silhouette(camera, things, middle, 0.7)
+            image = np.asarray(_LIGHT * (1.0 - covered) + _DARK * covered, dtype=np.uint8)
+            images = repeat(image)
         sights.append(vb.plots.Sight(camera, images))
     return sights
 
@@ -103,15 +109,6 @@ def _check_video(video: Path, camera: vb.cameras.Camera, frames: Sequence[int]) 
         )
     if 0 < info.frames <= max(frames):
         raise ValueError(f"{video} has {info.frames} frames; frame {max(frames)} is needed")
-
-
-def _backdrop(trial: xr.DataTree, camera: vb.cameras.Camera, course: vb.scene.Course) -> Any:
-    """Image of the objects in a camera's view, on a uniform background."""
-    middle = np.nanmean(course.position, axis=0)
-    covered = vb.simulation.silhouette(
-        camera, list(vb.recording.Recording(trial).objects), middle, 0.7
-    )
-    return np.asarray(_LIGHT * (1.0 - covered) + _DARK * covered, dtype=np.uint8)
 
 
 def fits_of(trial: xr.DataTree) -> list[vb.contour.FittedShape]:
@@ -189,34 +186,37 @@ def trial_drawings(
     """Figures of a trial; missing stages are printed, with the verb that computes them."""
     given = given.of(trial)
     course = vb.scene.course_of(trial, given.whisker)
-    for reason in _lacking(course, trial, path):
+    for _, reason in lacking_of(course, trial, path):
         say(f"{path} has {reason}")
     whisker = vb.recording.Recording(trial).whisker(given.whisker)
     drawings = {"whisker": _whisker_drawing(whisker, width)}
     drawings |= _contact_drawings(trial, course, whisker, given.whisker, width, colour)
-    if course.signals is not None:
-        drawings |= _signal_drawings(trial, course, whisker, width, given, tell)
-    return drawings
-
-
-def _lacking(course: vb.scene.Course, trial: xr.DataTree, path: Path) -> Iterator[str]:
     if course.signals is None:
-        yield f"no signals: `vibrissa signals {path}` makes them"
+        return drawings
+    samples = given.contact_map(trial, tell).to_dataset()
+    rows = vb.plots.key_frames(course)
+    if width == "single":
+        rows = rows[-1:]
+    sights = sights_of(trial, course, given.videos or (), rows)
+    line, signals = whisker.centerline(NODES), trial["signals"].to_dataset()
+    return drawings | {
+        "trial": lambda: vb.plots.trial_overview(course, samples, line, sights, rows, width=width),
+        "signals": lambda: vb.plots.signals_over_time(signals, whisker=given.whisker, width=width),
+    }
+
+
+def lacking_of(
+    course: vb.scene.Course, trial: xr.DataTree, path: Path
+) -> Iterator[tuple[str, str]]:
+    """Yield what a trial lacks, with the verb that computes it, by the picture that needs it."""
+    if course.signals is None:
+        yield "signals", f"no signals: `vibrissa signals {path}` makes them"
     if course.estimated is None and "estimates" in trial.children:
-        yield "no estimated contacts of this whisker"
+        yield "estimates", "no estimated contacts of this whisker"
     elif course.estimated is None:
-        yield f"no estimated contacts: `vibrissa estimate {path}` makes them"
+        yield "estimates", f"no estimated contacts: `vibrissa estimate {path}` makes them"
     if course.places is None:
-        yield f"no contact points: `vibrissa reconstruct {path}` makes them"
-
-
-def _radii(
-    trial: xr.DataTree, course: vb.scene.Course, whisker: vb.Whisker, number: int
-) -> NDArray[np.float64] | None:
-    """Radius of the whisker at the drawn contact points; None if unknown."""
-    group = {"estimated": "estimates", "true": "truth"}.get(course.places_as, "")
-    known = vb.recording.Recording(trial).known("arc_length", [group])
-    return None if known is None else np.asarray(whisker.radius(known[:, number]))
+        yield "contour", f"no contact points: `vibrissa reconstruct {path}` makes them"
 
 
 def _contact_drawings(
@@ -233,6 +233,8 @@ def _contact_drawings(
     angles = vb.scene.deflection_angles(course, line)
     bodies, fits = list(vb.recording.Recording(trial).objects), fits_of(trial)
     points, known, estimated = course.places, course.known, course.estimated
+    group = {"estimated": "estimates", "true": "truth"}.get(course.places_as, "")
+    arc = vb.recording.Recording(trial).known("arc_length", [group])
     drawings: dict[str, Draw] = {}
     if points is not None:
         drawings["contact_places"] = lambda: vb.plots.contact_places(
@@ -243,7 +245,7 @@ def _contact_drawings(
             next(iter(bodies), None),
             next(iter(fits), None),
             colour=angles,
-            whisker_radius=_radii(trial, course, whisker, number),
+            whisker_radius=None if arc is None else whisker.radius(arc[:, number]),
             width=width,
         )
     if known is not None and estimated is not None:
@@ -255,28 +257,6 @@ def _contact_drawings(
             known_as=course.known_as,
         )
     return drawings
-
-
-def _signal_drawings(
-    trial: xr.DataTree,
-    course: vb.scene.Course,
-    whisker: vb.Whisker,
-    width: Any,
-    given: TrialOptions,
-    tell: Tell,
-) -> dict[str, Draw]:
-    """Figures of signals."""
-    samples = given.contact_map(trial, tell).to_dataset()
-    rows = vb.plots.key_frames(course)
-    if width == "single":
-        rows = rows[-1:]
-    sights = sights_of(trial, course, given.videos or (), rows)
-    line = whisker.centerline(NODES)
-    signals = trial["signals"].to_dataset()
-    return {
-        "trial": lambda: vb.plots.trial_overview(course, samples, line, sights, rows, width=width),
-        "signals": lambda: vb.plots.signals_over_time(signals, whisker=given.whisker, width=width),
-    }
 
 
 @with_options("figures, in a folder")

@@ -128,12 +128,14 @@ def _file(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
         yield from _calibration(path)
     elif path.suffix == ".toml":
         yield from _settings(path)
-    elif kind == vb.io.Kind.UNKNOWN and not _is_text(path):
-        known = "; ".join(
-            [*vb.io.READERS, vb.io.Kind.TRACKS, vb.io.Kind.RECORDING, "tables as text"]
-        )
-        raise ValueError(f"{path} is not of a known kind. Known are: {known}")
     else:
+        try:
+            vb.io.read_text(path)
+        except ValueError:
+            kinds = [*vb.io.READERS, vb.io.Kind.TRACKS, vb.io.Kind.RECORDING, "tables as text"]
+            raise ValueError(
+                f"{path} is not of a known kind. Known are: {'; '.join(kinds)}"
+            ) from None
         yield from _table(path)
 
 
@@ -143,7 +145,7 @@ def _recording(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
         tree = _summarised(path)
         vb.io.check_units(tree)
         vb.pipeline.check_recording(tree)
-        found = vb.pipeline.summarise(tree)
+        found = vb.pipeline.TrialSummary(tree)
     one = len(found.whiskers) == 1
     names = ", ".join(found.whiskers[:_SHOWN]) + (", …" if len(found.whiskers) > _SHOWN else "")
     yield (
@@ -279,14 +281,6 @@ def _calibration(path: Path) -> Iterator[tuple[str, str]]:
     for camera in vb.cameras.load_cameras(path):
         yield camera.name, f"{camera.size[0]} × {camera.size[1]} pixels, {camera.projection}"
     yield from _follows("calibration", path)
-
-
-def _is_text(path: Path) -> bool:
-    try:
-        vb.io.read_text(path)
-    except ValueError:
-        return False
-    return True
 
 
 def _tracks(path: Path, kind: str) -> Iterator[tuple[str, str]]:
@@ -512,26 +506,16 @@ def _table(path: Path) -> Iterator[tuple[str, str]]:
         if kind != "whisker" or not vb.whisker.length_faults(data.length):
             yield from _follows(kind, path)
         return
-    columns = {re.split(r"[ _/(\[]", cell)[0] for cell in _header_cells(path)}
+    cells = next(vb.io.table_rows(vb.io.read_text(path)), (0, []))[1]
+    columns = {re.split(r"[ _/(\[]", cell)[0] for cell in cells}
     used = [name for name in vb.signals.SIGNALS if name in columns]
     if len(used) >= 3:
         yield "kind", f"table of the signals {', '.join(used)}"
         yield "next", f"vibrissa {_NEXT['signals']}".format(f"{path} --using {','.join(used)}")
         return
-    raise ValueError(
-        f"{path} is not a table of a known kind: {_header(path)}. Known are\n{_TABLES}"
-    )
-
-
-def _header(path: Path) -> str:
-    """Quote the first line of a table."""
-    cells = _header_cells(path)
-    shown = ", ".join(cells[:_SHOWN]) + (", …" if len(cells) > _SHOWN else "")
-    return f"its first line is {shown}" if cells else "it has no lines"
-
-
-def _header_cells(path: Path) -> list[str]:
-    return next(vb.io.table_rows(vb.io.read_text(path)), (0, []))[1]
+    first = ", ".join(cells[:_SHOWN]) + (", …" if len(cells) > _SHOWN else "")
+    header = f"its first line is {first}" if cells else "it has no lines"
+    raise ValueError(f"{path} is not a table of a known kind: {header}. Known are\n{_TABLES}")
 
 
 def _rows(kind: str, data: Any) -> Iterator[tuple[str, str]]:

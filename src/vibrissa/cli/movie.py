@@ -12,7 +12,7 @@ import typer
 from numpy.typing import NDArray
 
 import vibrissa as vb
-from vibrissa.cli.figures import NODES, TrialOptions, fits_of, sights_of
+from vibrissa.cli.figures import NODES, TrialOptions, fits_of, lacking_of, sights_of
 from vibrissa.cli.inputs import recording_from
 from vibrissa.cli.options import free, refuse, with_options
 from vibrissa.cli.terminal import Tell, progress_bars, say, stoppable
@@ -86,7 +86,15 @@ def make_movies(
     of_trial = of_trial.of(trial)
     course = vb.scene.course_of(trial, of_trial.whisker)
     rows = frames.rows(course.time)
-    possible = _possible(kinds, course, rows, path)
+    lacking = dict(lacking_of(course, trial, path))
+    if course.places is not None and not np.isfinite(course.places[rows[0] : rows[-1] + 1]).any():
+        lacking["contour"] = "no contact points at these times"
+    reasons = [f"{path} has {lacking[name]}" for name in kinds if name in lacking]
+    possible = [name for name in kinds if name not in lacking]
+    if not possible:
+        raise ValueError("; ".join(dict.fromkeys(reasons)))
+    for reason in reasons:
+        say(f"{reason}; left out")
     with progress_bars() as tell, stoppable() as stopped:
         for name in possible:
             images = _frames(name, trial, course, rows, of_trial, tell)
@@ -106,27 +114,6 @@ def _files(target: Path, trial: Path, kinds: Sequence[str]) -> dict[str, Path]:
         return {kinds[0]: target}
     vb.io.check_folder(target)
     return {name: target / f"{trial.stem}-{name}.mp4" for name in kinds}
-
-
-def _possible(
-    kinds: Sequence[str], course: vb.scene.Course, rows: NDArray[np.intp], path: Path
-) -> list[str]:
-    """Kinds of movies for which the trial has the data; report what others lack."""
-    lacking = {}
-    if course.signals is None:
-        lacking["signals"] = f"no signals: `vibrissa signals {path}` makes them"
-    span = slice(rows[0], rows[-1] + 1)
-    if course.places is None:
-        lacking["contour"] = f"no contact points: `vibrissa reconstruct {path}` makes them"
-    elif not np.isfinite(course.places[span]).any():
-        lacking["contour"] = "no contact points at these times"
-    reasons = [f"{path} has {lacking[name]}" for name in kinds if name in lacking]
-    possible = [name for name in kinds if name not in lacking]
-    if not possible:
-        raise ValueError("; ".join(dict.fromkeys(reasons)))
-    for reason in reasons:
-        say(f"{reason}; left out")
-    return possible
 
 
 def _frames(

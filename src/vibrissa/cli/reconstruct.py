@@ -11,16 +11,8 @@ from typing import Any, Literal
 import numpy as np
 
 import vibrissa as vb
+from vibrissa.cli import inputs
 from vibrissa.cli.estimate import EstimateOptions, estimated
-from vibrissa.cli.inputs import (
-    WhiskerOptions,
-    free_beside,
-    objects_from,
-    print_statuses,
-    print_written,
-    recording_from,
-    refuse_tracks,
-)
 from vibrissa.cli.options import numbers, with_options
 from vibrissa.cli.signals import SourceOptions, described
 from vibrissa.cli.terminal import Tell, fixed, print_table, progress_bars, remark, say
@@ -74,15 +66,17 @@ def reconstruct(
     The contacts are compared with --objects, by default those of the recording.
     Example: `vibrissa reconstruct trial.nc --shape cylinder`
     """
-    refuse_tracks(recording)
+    inputs.refuse_tracks(recording)
     target = target or recording
     points = target.with_name(f"{target.stem}_contour.csv") if csv is None else csv
     vb.io.check_writable(target, vb.io.NETCDF)
     vb.io.check_writable(points, vb.io.CSV)
-    tree = vb.pipeline.without_faulty_stages(recording_from(recording))
+    tree = vb.pipeline.without_faulty_stages(inputs.recording_from(recording))
     own = not force and _of_contour(points, tree, how.own)
-    free_beside(recording, [target] if own else [target, points], force)
-    known = vb.recording.Recording(tree).objects if objects is None else objects_from(objects)
+    inputs.free_beside(recording, [target] if own else [target, points], force)
+    known = (
+        vb.recording.Recording(tree).objects if objects is None else inputs.objects_from(objects)
+    )
     with progress_bars() as tell:
         made = []
         try:
@@ -98,8 +92,8 @@ def reconstruct(
     _report(tree, known, whiskers, wanted)
     vb.io.save_recording(target, tree)
     vb.io.save_contour(points, vb.pipeline.contour_points(tree, whiskers))
-    print_written(target, recording, "contour")
-    print_written(points)
+    inputs.print_written(target, recording, "contour")
+    inputs.print_written(points)
 
 
 def stages(
@@ -142,7 +136,7 @@ def stages(
     tell(wanted.shape, 1, 1)
 
 
-def _of_contour(points: Path, tree: xr.DataTree, own: WhiskerOptions) -> bool:
+def _of_contour(points: Path, tree: xr.DataTree, own: inputs.WhiskerOptions) -> bool:
     """Whether a table contains the contour of the recording, so that replacing it loses nothing."""
     if not points.is_file() or not {"estimates", "contour"} <= set(tree.children):
         return False
@@ -163,7 +157,7 @@ def _report(
     shapes, fit = None, vb.contour.shape_from_dataset(contour)
     if wanted.shape != "free" and fit.misfit > _SUSPECT:
         shapes = vb.pipeline.compare_shapes(estimates, whiskers, **wanted.keywords())
-    print_statuses(estimates["status"].values)
+    inputs.print_statuses(estimates["status"].values)
     _print_object(fit, contour, known)
     for line in (_agreement(fit, contour), *_judgement(fit, shapes)):
         say(line)

@@ -5,21 +5,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import TypeAlias
 
 import numpy as np
 
 import vibrissa as vb
-from vibrissa.cli.figures import (
-    NODES,
-    Draw,
-    TrialOptions,
-    array_drawings,
-    dataset_with,
-    drawn,
-    map_drawings,
-    trial_drawings,
-)
+from vibrissa.cli import figures
+from vibrissa.cli.figures import Draw, TrialOptions
 from vibrissa.cli.inputs import MAP, RECORDING, kind_in, recording_from
 from vibrissa.cli.movie import FrameOptions, make_movies
 from vibrissa.cli.options import check_new, refuse, with_options
@@ -30,13 +22,8 @@ _LARGEST = 15_000_000  # size of a page up to which movies are embedded, bytes
 _TAGS = 10_000  # size reserved for the names and tags of movies, bytes
 
 
-class _Content(NamedTuple):
-    """Title, sections, script and figures of a page."""
-
-    title: str
-    sections: list[vb.report.Section]
-    script: str
-    drawings: Mapping[str, Draw]
+# Title, sections, script and figures of a page.
+_Content: TypeAlias = "tuple[str, list[vb.report.Section], str, Mapping[str, Draw]]"
 
 
 @with_options("the page, .html")
@@ -72,13 +59,14 @@ def report(
             refuse({"--uniqueness": uniqueness}, f"{path} is a recording")
             trial = vb.pipeline.without_faulty_stages(recording_from(path))
             of_trial = of_trial.of(trial)
-            content = _of_trial(path, trial, of_trial, seed or 0, tell)
+            title, sections, script, drawings = _of_trial(path, trial, of_trial, seed or 0, tell)
         else:
             unused = of_trial.given() | {"--make-movies": make, "--seed": seed}
             refuse(unused, f"{path} is a map")
-            content = _of_map(path, uniqueness)
-        pictures = {name: vb.plots.png(one) for name, one in drawn(content.drawings, tell)}
-        content.sections.extend(vb.report.figure_sections(pictures))
+            title, sections, script, drawings = _of_map(path, uniqueness)
+        drawn = figures.drawn(drawings, tell)
+        pictures = {name: vb.plots.png(one) for name, one in drawn}
+        sections.extend(vb.report.figure_sections(pictures))
     if make:
         kinds = ("signals", "contour")
         how = (kinds, of_trial, FrameOptions(), force)
@@ -88,14 +76,13 @@ def report(
     origin = vb.report.provenance_section(command, given, (seed or 0) if is_trial else None)
     about = "From the forces and moments at a whisker's base to the object that it touched."
 
-    def page(sections: list[vb.report.Section]) -> str:
-        return vb.report.document(content.title, about, [*sections, origin], content.script)
-
+    page = vb.report.document(title, about, [*sections, origin], script)
     if movies:
-        room = _LARGEST - len(page(content.sections).encode("utf-8")) - _TAGS
-        content.sections.append(vb.report.movies_section(movies, target.parent, room))
+        room = _LARGEST - len(page.encode("utf-8")) - _TAGS
+        sections.append(vb.report.movies_section(movies, target.parent, room))
+        page = vb.report.document(title, about, [*sections, origin], script)
     with vb.io.replacing(target) as part:
-        part.write_text(page(content.sections), encoding="utf-8")
+        part.write_text(page, encoding="utf-8")
     say(f"wrote {target}, {target.stat().st_size / 1e6:.1f} MB")
 
 
@@ -116,38 +103,37 @@ def _of_trial(
     """Contents of the page of a trial."""
     course = vb.scene.course_of(trial, of_trial.whisker)
     sections, script = vb.report.trial_sections(trial, of_trial.whisker, seed), ""
-    drawings = array_drawings(trial, "double")
-    drawings |= trial_drawings(path, trial, "double", of_trial, tell)
-    if course.places is not None and np.isfinite(course.places).any() and _can_draw():
+    drawings = figures.array_drawings(trial, "double")
+    drawings |= figures.trial_drawings(path, trial, "double", of_trial, tell)
+    if course.places is not None and np.isfinite(course.places).any():
         shown = ["Contact points in the laboratory"]
         shown += ["the known object"] if "objects" in trial.children else []
         shown += ["the fitted shape"] if "contour" in trial.children else []
-        picture = vb.report.trial_in_space(trial, course)
-        section, script = vb.report.space_section(picture, f"{', '.join(shown)}, and the whisker.")
-        sections = [*sections, section]
+        about = f"{', '.join(shown)}, and the whisker."
+        script = _add_space(sections, about, lambda: vb.report.trial_in_space(trial, course))
     title = f"Trial: {path.name}"
     if trial.sizes["whisker"] > 1:
         title += f", whisker {vb.recording.Recording(trial).whisker(of_trial.whisker).name}"
-    return _Content(title, sections, script, drawings)
+    return title, sections, script, drawings
 
 
 def _of_map(path: Path, uniqueness: Path | None) -> _Content:
     """Contents of the page of a map."""
     contact_map = vb.ContactMap.load(path)
-    verdicts = None if uniqueness is None else dataset_with(uniqueness, "verdict")
-    sections, script = vb.report.chart_sections(contact_map, verdicts), ""
-    drawings = dict(map_drawings(contact_map, "double", verdicts, None))
-    if _can_draw():
-        picture = vb.report.reachable_space(
-            contact_map.to_dataset(), contact_map.whisker.centerline(NODES)
-        )
-        section, script = vb.report.space_section(picture, "All stable contacts of the whisker.")
-        sections = [*sections, section]
-    return _Content(f"Map of contacts: {path.name}", sections, script, drawings)
+    verdicts = None if uniqueness is None else figures.dataset_with(uniqueness, "verdict")
+    sections = vb.report.chart_sections(contact_map, verdicts)
+    drawings = dict(figures.map_drawings(contact_map, "double", verdicts, None))
+    script = _add_space(
+        sections, "All stable contacts of the whisker.", lambda: vb.in_space(contact_map)
+    )
+    return f"Map of contacts: {path.name}", sections, script, drawings
 
 
-def _can_draw() -> bool:
-    """Whether a 3D figure can be drawn; report if not."""
+def _add_space(sections: list[vb.report.Section], about: str, draw: Draw) -> str:
+    """Add a section with a 3D figure, if it can be drawn, and return its script."""
     if not vb.report.can_draw():
         say(vb.report.NO_SPACE)
-    return vb.report.can_draw()
+        return ""
+    section, script = vb.report.space_section(draw(), about)
+    sections.append(section)
+    return script

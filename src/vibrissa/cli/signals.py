@@ -9,27 +9,10 @@ from typing import Any, Literal
 import numpy as np
 
 import vibrissa as vb
-from vibrissa.cli.inputs import (
-    WhiskerOptions,
-    check_one_whisker,
-    free_beside,
-    print_notes,
-    print_statuses,
-    print_written,
-    recording_from,
-    refuse_tracks,
-    smallest_arc,
-)
+from vibrissa.cli import inputs
 from vibrissa.cli.options import Source, refuse, with_options
 from vibrissa.cli.terminal import progress_bars, remark, say, shown
 from vibrissa.deferred import xr
-
-
-def _usual_cutoff(recording: xr.DataTree) -> float | None:
-    """Cut-off that a recording is filtered with by default, Hz."""
-    time = recording.to_dataset()["time"].values
-    rate = 1.0 / float(np.median(np.diff(time))) if len(time) > 1 else np.inf
-    return vb.tracking.usual_cutoff(rate)
 
 
 @dataclass(frozen=True)
@@ -82,7 +65,7 @@ class SourceOptions:
         )
 
     def as_keywords(
-        self, recording: xr.DataTree, own: WhiskerOptions, proximal: float | None = None
+        self, recording: xr.DataTree, own: inputs.WhiskerOptions, proximal: float | None = None
     ) -> dict[str, Any]:
         """Keyword arguments of `signals_of`."""
         source = (
@@ -94,11 +77,14 @@ class SourceOptions:
             refuse({"--cutoff": self.cutoff}, f"signals of the {source} have a pose of their own")
             whiskers = own.in_recording(recording) if self.inertia else None
             return {"source": source, "whiskers": whiskers, "dynamics": self.dynamics}
+        time = recording.to_dataset()["time"].values
+        rate = 1.0 / float(np.median(np.diff(time))) if len(time) > 1 else np.inf
+        usual = vb.tracking.usual_cutoff(rate)
         return {
             "source": source,
-            "cutoff": _usual_cutoff(recording) if self.cutoff is None else self.cutoff or None,
+            "cutoff": usual if self.cutoff is None else self.cutoff or None,
             "whiskers": own.in_recording(recording),
-            "proximal": smallest_arc(proximal),
+            "proximal": inputs.smallest_arc(proximal),
             "dynamics": self.dynamics,
         }
 
@@ -110,7 +96,7 @@ class SourceOptions:
 def signals(
     recording: Path,
     how: SourceOptions,
-    own: WhiskerOptions,
+    own: inputs.WhiskerOptions,
     proximal: float | None = None,
     events: Path | None = None,
     target: Path | None = None,
@@ -122,16 +108,16 @@ def signals(
     and a contour computed from earlier signals.
     Example: `vibrissa signals trial.nc`
     """
-    refuse_tracks(recording)
+    inputs.refuse_tracks(recording)
     target = target or recording
     vb.io.check_writable(target, (*vb.io.NETCDF, *vb.io.CSV))
     if events is not None:
         vb.io.check_writable(events, vb.io.CSV)
-    free_beside(recording, [target, *([] if events is None else [events])], force)
-    tree = recording_from(recording)
+    inputs.free_beside(recording, [target, *([] if events is None else [events])], force)
+    tree = inputs.recording_from(recording)
     table = target.suffix.lower() in vb.io.CSV
     if table:
-        check_one_whisker(tree, recording)
+        inputs.check_one_whisker(tree, recording)
     with progress_bars() as tell:
         tell("signals", 0, 1)
         keywords = how.as_keywords(tree, own, proximal)
@@ -141,22 +127,22 @@ def signals(
         with vb.io.in_file(recording):
             done = vb.pipeline.with_signals(tree, **keywords)
         tell("signals", 1, 1)
-    print_notes(*(keywords["whiskers"] or ()))
+    inputs.print_notes(*(keywords["whiskers"] or ()))
     remark(described(done))
     found = done["signals"].to_dataset()
-    print_statuses(found["status"].values)
+    inputs.print_statuses(found["status"].values)
     _print_largest(found)
     if events is not None:
         contacts = vb.pipeline.contact_events(found)
         names = [str(name) for name in contacts]
         columns = (contacts[name].values for name in names)
         vb.io.write_table(events, names, zip(*columns, strict=True))
-        print_written(events)
+        inputs.print_written(events)
     if table:
         vb.io.save_signals(target, found.isel(whisker=0)[["force", "moment"]])
     else:
         vb.io.save_recording(target, done)
-    print_written(target, recording, "signals")
+    inputs.print_written(target, recording, "signals")
 
 
 def described(tree: xr.DataTree) -> str:

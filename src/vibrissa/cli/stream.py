@@ -17,15 +17,8 @@ from typing import TYPE_CHECKING
 import typer
 
 import vibrissa as vb
+from vibrissa.cli import inputs
 from vibrissa.cli.estimate import GravityOptions
-from vibrissa.cli.inputs import (
-    AssumptionOptions,
-    NoiseOptions,
-    WhiskerOptions,
-    estimator_of,
-    print_notes,
-    smallest_arc,
-)
 from vibrissa.cli.options import numbers, refuse, with_options
 from vibrissa.cli.terminal import Ended, ending_in_order, remark
 
@@ -93,11 +86,11 @@ class MeasurementOptions:
 
     map: list[str] | None = None
     proximal: float | None = None
-    own: WhiskerOptions
+    own: inputs.WhiskerOptions
     sensor: list[str] | None = None
     using: str | None = None
-    noise: NoiseOptions
-    assumed: AssumptionOptions
+    noise: inputs.NoiseOptions
+    assumed: inputs.AssumptionOptions
     weight: GravityOptions
     threshold: float = 5.0
     tare: int | None = None
@@ -133,9 +126,11 @@ class MeasurementOptions:
         if self.map:
             return vb.ContactMap.load(Path(_named(self.map, "--map")[name]), grid=False)
         whisker = self.weight.of(self.own.read())
-        print_notes(whisker)
+        inputs.print_notes(whisker)
         remark(f"no map given; simulating that of {whisker!r}")
-        return vb.ContactMap.simulate(whisker, grid=False, proximal=smallest_arc(self.proximal))
+        return vb.ContactMap.simulate(
+            whisker, grid=False, proximal=inputs.smallest_arc(self.proximal)
+        )
 
     def described(self, name: str) -> vb.sensors.Sensor | None:
         """Read the sensor of a whisker: its own, or the common one."""
@@ -149,7 +144,7 @@ class MeasurementOptions:
             sensor = sensor.with_new_offset(self.tare)
         contact_map = self.contact_map(name)
         self.weight.doubt(contact_map.whisker)
-        return estimator_of(
+        return inputs.estimator_of(
             contact_map,
             sensor,
             self.using or "Fx,MB,MD",
@@ -247,7 +242,12 @@ def stream(
                 vb.io.ContactBag(bag, frame=frame, whiskers=measured.whiskers)
             )
         sent = None if answers is None else opened.enter_context(vb.streaming.Answers(answers))
-        heard = None if source.udp is None else _socket(source.udp, opened)
+        heard = None
+        if source.udp is not None:
+            # Opened before the map is computed, so that no datagram is lost.
+            address = vb.streaming.udp_address(source.udp)
+            heard = opened.enter_context(vb.streaming.udp_socket(*address))
+            remark("listening at {}:{}".format(*heard.getsockname()[:2]))
         lines: Iterable[str] = source.lines(heard)
         running = vb.streaming.ContactStreams(
             [
@@ -318,14 +318,6 @@ def _report(running: vb.streaming.ContactStream, lost: str, follow: bool) -> Non
 def _advise(running: vb.streaming.ContactStream) -> None:
     for sentence in vb.streaming.advice(running):
         remark(f"{running.whisker}: {sentence}" if running.whisker else sentence)
-
-
-def _socket(udp: str, opened: ExitStack) -> socket.socket:
-    """Open the UDP socket before the map is computed, so that no datagram is lost."""
-    heard = opened.enter_context(vb.streaming.udp_socket(*vb.streaming.udp_address(udp)))
-    host, port = heard.getsockname()[:2]
-    remark(f"listening at {host}:{port}")
-    return heard
 
 
 class _Losses:

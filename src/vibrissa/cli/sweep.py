@@ -91,7 +91,7 @@ def _run(plan: vb.sweeps.Study, path: Path, **how: Any) -> None:
     for line in outcome.faults:
         remark(line)
     say(text)
-    say(vb.sweeps.sweep_summary(vb.sweeps.open_sweep(path)))
+    say("\n".join(vb.sweeps.sweep_summary(vb.sweeps.open_sweep(path))))
     faults = vb.sweeps.failures(path)
     _print_failures(faults)
     say(f"results are in {path}")
@@ -113,7 +113,7 @@ def _show(store: Path | None, folder: Path, force: bool) -> None:
     if store is None:
         raise ValueError("state what to show: vibrissa sweep show STORE")
     found = vb.sweeps.open_sweep(store).load()
-    say(vb.sweeps.sweep_summary(found))
+    say("\n".join(vb.sweeps.sweep_summary(found)))
     _print_failures(vb.sweeps.failures(store))
     folder.mkdir(parents=True, exist_ok=True)
     names = {task: folder / f"{store.resolve().stem}-{task}" for task in vb.plots.drawable(found)}

@@ -13,13 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import vibrissa as vb
-from vibrissa.cli.inputs import (
-    TrackedOptions,
-    cameras_from,
-    objects_from,
-    print_notes,
-    refuse_tracks,
-)
+from vibrissa.cli import inputs
 from vibrissa.cli.options import free, numbers, refuse, with_options
 from vibrissa.cli.terminal import progress_bars, say, shown
 from vibrissa.deferred import xr
@@ -256,11 +250,20 @@ class KnownOptions:
             raise ValueError("--contact and --objects both state where the contact is; give one")
         known: dict[str, Any] = {}
         if self.head is not None:
-            known["head"] = _head(self.head, video, rate)
+            # Read the pose of the head, and check in advance that it is known in all frames.
+            if self.head.suffix.lower() in vb.io.NETCDF:
+                head = vb.load_recording(self.head).to_dataset()
+                if "head_rotation" not in head:
+                    raise ValueError(f"{self.head} is a recording without the pose of a head")
+            else:
+                head = vb.io.load_head(self.head)
+            if frames := vb.io.video_info(video).frames:
+                vb.tracking.HeadPose.of(head, np.arange(frames), rate)
+            known["head"] = head
         if self.contact is not None:
             known["contacts"] = vb.io.load_contact_points(self.contact)
         if self.objects is not None:
-            known["objects"] = objects_from(self.objects)
+            known["objects"] = inputs.objects_from(self.objects)
         return known
 
 
@@ -271,7 +274,7 @@ def track(
     filmed: FilmOptions,
     traced: TraceStatements,
     known: KnownOptions,
-    own: TrackedOptions,
+    own: inputs.TrackedOptions,
     base_radius: float | None = None,
     tip_radius: float | None = None,
     length: float | None = None,
@@ -292,7 +295,7 @@ def track(
     """
     videos = filmed.split(videos)
     for video in videos:
-        refuse_tracks(video)
+        inputs.refuse_tracks(video)
     views = filmed.seen_by(videos)
     trials = _trials(videos, len(views), target, {**known.alone(), "--pick": traced.pick})
     free(trials, force)
@@ -455,7 +458,7 @@ def _where_unexplained(result: xr.DataTree) -> list[int] | None:
 
 def _calibrated(path: Path, videos: Sequence[Path]) -> tuple[vb.cameras.Camera, ...]:
     """Read calibrated cameras, and check them against the sizes of the videos."""
-    cameras = cameras_from(path)
+    cameras = inputs.cameras_from(path)
     if len(videos) % len(cameras):
         raise ValueError(f"{path} contains {len(cameras)} cameras; there are {len(videos)} videos")
     for i, video in enumerate(videos):
@@ -493,19 +496,6 @@ def _trials(
             names = ", ".join(map(str, trial))
             raise ValueError(f"{names}: a video is given twice; each view needs its own")
     return dict(zip(files, trials, strict=True))
-
-
-def _head(path: Path, video: Path, rate: float) -> xr.Dataset:
-    """Read the pose of the head, and check in advance that it is known in all frames."""
-    if path.suffix.lower() in vb.io.NETCDF:
-        head = vb.load_recording(path).to_dataset()
-        if "head_rotation" not in head:
-            raise ValueError(f"{path} is a recording without the pose of a head")
-    else:
-        head = vb.io.load_head(path)
-    if frames := vb.io.video_info(video).frames:
-        vb.tracking.HeadPose.of(head, np.arange(frames), rate)
-    return head
 
 
 def _compare_lengths(videos: Sequence[Path], traces: Sequence[Sequence[Any]], used: int) -> None:
@@ -584,7 +574,9 @@ def print_tracked(result: xr.DataTree, path: Path) -> None:
             )
         for line in compared_contacts(result, k):
             say(f"  {line}")
-    print_notes(*(vb.recording.Recording(result).whisker(k) for k in range(data.sizes["whisker"])))
+    inputs.print_notes(
+        *(vb.recording.Recording(result).whisker(k) for k in range(data.sizes["whisker"]))
+    )
     for line in result.attrs.get("remarks", "").splitlines():
         say(f"note: {line}")
     say(f"wrote {path}")

@@ -41,8 +41,17 @@ def view(
     else:
         viewed = WhiskerOptions(path, rat, any_length).read()
         print_notes(viewed)
+    served: vb.viewer.Served
     try:
-        with _served(viewed, videos or (), live, host, port) as viewer:
+        if live is None:
+            served = vb.viewer.view(viewed, videos=videos or (), host=host, port=port)
+        else:
+            refuse({"--video": videos or None}, "a stream has none")
+            whisker = viewed.whisker if isinstance(viewed, vb.ContactMap) else viewed
+            if not isinstance(whisker, vb.Whisker):
+                raise ValueError("--stream needs a whisker or its map, and this is a recording")
+            served = vb.viewer.view_stream(whisker, live, host=host, port=port)
+        with served as viewer:
             say(f"{viewer.url}   Ctrl-C ends it")
             if browser:
                 import webbrowser
@@ -51,19 +60,3 @@ def view(
             viewer.wait()
     except KeyboardInterrupt:
         say("stopped")
-
-
-def _served(
-    viewed: vb.Whisker | vb.ContactMap | xr.DataTree,
-    videos: list[Path] | tuple[()],
-    live: str | None,
-    host: str,
-    port: int | None,
-) -> vb.viewer.Served:
-    if live is None:
-        return vb.viewer.view(viewed, videos=videos, host=host, port=port)
-    refuse({"--video": videos or None}, "a stream has none")
-    whisker = viewed.whisker if isinstance(viewed, vb.ContactMap) else viewed
-    if not isinstance(whisker, vb.Whisker):
-        raise ValueError("--stream needs a whisker or its map, and this is a recording")
-    return vb.viewer.view_stream(whisker, live, host=host, port=port)

@@ -46,6 +46,7 @@ from vibrissa.io.paths import (
     check_folder as check_folder,
     check_readable as check_readable,
     check_writable as check_writable,
+    held as held,
     refuse_whisk as refuse_whisk,
     replacing as replacing,
     without_part as without_part,

@@ -70,24 +70,14 @@ def read_over_time(path: str | PathLike[str]) -> tuple[str, dict[str, Array]]:
         )
     key = keys[0]
     moments = columns[key]
-    if not np.isfinite(moments).all():
-        raise ValueError(f"{path}: {key} is missing in row {_first(~np.isfinite(moments))}")
-    wrong = (moments != np.round(moments)) | (moments < 0.0)
-    if key == "frame" and wrong.any():
-        row = _first(wrong)
-        raise ValueError(f"{path}: frame {moments[row - 1]:g} in row {row}; 0, 1, … are frames")
+    missing = np.flatnonzero(~np.isfinite(moments))
+    if missing.size:
+        raise ValueError(f"{path}: {key} is missing in row {missing[0] + 1}")
+    wrong = np.flatnonzero((moments != np.round(moments)) | (moments < 0.0))
+    if key == "frame" and wrong.size:
+        found = f"frame {moments[wrong[0]]:g} in row {wrong[0] + 1}"
+        raise ValueError(f"{path}: {found}; 0, 1, … are frames")
     return key, columns
-
-
-def check_rising(path: str | PathLike[str], key: str, moments: Array) -> None:
-    """Raise ValueError if times or frames do not increase from row to row."""
-    back = np.flatnonzero(np.diff(moments) <= 0.0)
-    if back.size:
-        i = int(back[0])
-        raise ValueError(
-            f"{path}: {key} does not increase: {moments[i]:g} is followed by {moments[i + 1]:g} "
-            f"(rows {i + 1} and {i + 2}, and {back.size - 1} more times)"
-        )
 
 
 def moments_coordinate(key: str, moments: Array) -> xr.Variable:
@@ -102,11 +92,6 @@ def few(numbers: NDArray[np.int64]) -> str:
     """Format the first of some numbers for a message."""
     text = ", ".join(str(int(n)) for n in numbers[:_SHOWN])
     return text + (f" and {len(numbers) - _SHOWN} more" if len(numbers) > _SHOWN else "")
-
-
-def _first(mask: NDArray[np.bool_]) -> int:
-    """Row of the first true value, counted from 1."""
-    return int(np.flatnonzero(mask)[0]) + 1
 
 
 def load_contact_points(path: str | PathLike[str]) -> xr.Dataset:
@@ -201,7 +186,14 @@ def load_head(path: str | PathLike[str]) -> xr.Dataset:
             f"{', '.join(QUATERNION)}, or r11, r12, …, r33, or {', '.join(ANGLES)}"
         )
     way = ways[0]
-    check_rising(path, key, columns[key])
+    moments = columns[key]
+    back = np.flatnonzero(np.diff(moments) <= 0.0)
+    if back.size:
+        i = int(back[0])
+        raise ValueError(
+            f"{path}: {key} does not increase: {moments[i]:g} is followed by {moments[i + 1]:g} "
+            f"(rows {i + 1} and {i + 2}, and {back.size - 1} more times)"
+        )
     place = np.stack([columns[name] for name in PLACE], axis=1)
     values = np.stack([columns[name] for name in way], axis=1)
     holes = np.flatnonzero(~np.isfinite(np.column_stack([place, values])).all(axis=1))
@@ -210,9 +202,7 @@ def load_head(path: str | PathLike[str]) -> xr.Dataset:
             f"{path}: numbers are missing in rows {few(holes + 1)}; the head's pose is needed in "
             "every row: omit such rows (in a table by time, poses are interpolated)"
         )
-    turn = {QUATERNION: _of_quaternions, MATRIX: _of_matrices, ANGLES: _of_angles}[way](
-        path, values
-    )
+    turn = _rotations(path, way, values).as_matrix()
     return xr.Dataset(
         {
             "head_position": (
@@ -222,36 +212,26 @@ def load_head(path: str | PathLike[str]) -> xr.Dataset:
             ),
             "head_rotation": ((key, "space", "head_axis"), turn, attributes("head_rotation")),
         },
-        {key: moments_coordinate(key, columns[key]), "space": list("xyz")},
+        {key: moments_coordinate(key, moments), "space": list("xyz")},
     )
 
 
-def _of_quaternions(path: Path, values: Array) -> Array:
-    size = np.linalg.norm(values, axis=1)
-    _refuse(path, np.abs(size - 1.0) > _ROUNDED, "quaternions are not of unit length", size)
-    return transform.Rotation.from_quat(values[:, [1, 2, 3, 0]]).as_matrix()
-
-
-def _of_matrices(path: Path, values: Array) -> Array:
-    matrix = values.reshape(-1, 3, 3)
-    off = np.abs(np.swapaxes(matrix, 1, 2) @ matrix - np.eye(3)).max(axis=(1, 2))
-    _refuse(path, off > _ROUNDED, "matrices are not orthogonal, RᵀR − 1", off)
-    sign = np.linalg.det(matrix)
-    _refuse(path, sign < 0.0, "matrices mirror, determinant", sign)
-    return transform.Rotation.from_matrix(matrix).as_matrix()
-
-
-def _of_angles(path: Path, values: Array) -> Array:
-    steep = np.abs(values[:, 1])
-    _refuse(
-        path,
-        steep > 0.5 * np.pi + 1e-9,
-        "elevations are above π/2; angles are in rad",
-        values[:, 1],
-    )
-    azimuth, elevation, roll = values.T
-    turns = transform.Rotation.from_euler("ZYX", np.stack([azimuth, -elevation, roll], axis=1))
-    return turns.as_matrix()
+def _rotations(path: Path, way: tuple[str, ...], values: Array) -> transform.Rotation:
+    """Rotations in one of the three forms; raise ValueError for invalid ones."""
+    if way == QUATERNION:
+        size = np.linalg.norm(values, axis=1)
+        _refuse(path, np.abs(size - 1.0) > _ROUNDED, "quaternions are not of unit length", size)
+        return transform.Rotation.from_quat(values[:, [1, 2, 3, 0]])
+    if way == MATRIX:
+        matrix = values.reshape(-1, 3, 3)
+        off = np.abs(np.swapaxes(matrix, 1, 2) @ matrix - np.eye(3)).max(axis=(1, 2))
+        _refuse(path, off > _ROUNDED, "matrices are not orthogonal, RᵀR − 1", off)
+        sign = np.linalg.det(matrix)
+        _refuse(path, sign < 0.0, "matrices mirror, determinant", sign)
+        return transform.Rotation.from_matrix(matrix)
+    steep = np.abs(values[:, 1]) > 0.5 * np.pi + 1e-9
+    _refuse(path, steep, "elevations are above π/2; angles are in rad", values[:, 1])
+    return transform.Rotation.from_euler("ZYX", values * [1.0, -1.0, 1.0])
 
 
 def _refuse(path: Path, wrong: NDArray[np.bool_], what: str, value: Array) -> None:

@@ -176,9 +176,14 @@ def _header(path: Path, rows: Iterator[tuple[int, list[str]]]) -> dict[str, list
 def _hdf5(path: Path) -> tuple[Names, Array, list[str]]:
     with opened(path, "a table of DeepLabCut") as file:
         for _, group in pandas_tables(file):
-            names, values, index = read_pandas(group)
+            # Read the column names, values and index of one table of pandas.
+            table = _as_str(group.attrs["pandas_type"]) == "frame_table"
+            names, values, index = _appendable(group) if table else _fixed(group)
+            if sum(block.shape[1] for block in values) != len(names):
+                raise ValueError(f"the columns of the table {group.name} are not named by text")
             if names and names[0][-1] in "xyz":
-                return [_four_levels(path, name) for name in names], values, index
+                named = [_four_levels(path, name) for name in names]
+                return named, np.concatenate(values, axis=1), index
     raise ValueError(f"{path} is not a table of DeepLabCut. {_NEEDED}")
 
 
@@ -201,15 +206,6 @@ def pandas_tables(file: h5py.File) -> Iterator[tuple[str, h5py.Group]]:
             "frame_table",
         ):
             yield name, group
-
-
-def read_pandas(group: h5py.Group) -> tuple[Names, Array, list[str]]:
-    """Read the column names, values and index of one table of pandas."""
-    table = _as_str(group.attrs["pandas_type"]) == "frame_table"
-    names, values, index = _appendable(group) if table else _fixed(group)
-    if sum(block.shape[1] for block in values) != len(names):
-        raise ValueError(f"the columns of the table {group.name} are not named by text")
-    return names, np.concatenate(values, axis=1), index
 
 
 def _appendable(group: h5py.Group) -> tuple[Names, list[Array], list[str]]:

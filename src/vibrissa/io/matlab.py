@@ -184,7 +184,11 @@ def _numbers(time: list[float], who: list[float] | None) -> list[int]:
 
 
 def _tracks(path: Path, name: str, found: _Frames) -> RawTracks:
-    points = [_without_padding(one) for one in found.points]
+    points = []
+    for one in found.points:  # zeros and NaN after the last point are padding
+        one = np.asarray(one, dtype=np.float64)
+        there = np.flatnonzero((np.nan_to_num(one) != 0.0).any(axis=1))
+        points.append(one[: there[-1] + 1 if there.size else 0])
     if not any(len(one) for one in points):
         raise ValueError(f"{path}: {name} has no points in any frame")
     at = np.arange(len(points), dtype=np.float64) if found.frames is None else found.frames
@@ -205,13 +209,6 @@ def _tracks(path: Path, name: str, found: _Frames) -> RawTracks:
         time=None if whole else moments,
         about={"variable": name},
     )
-
-
-def _without_padding(points: Array) -> Array:
-    """Remove zeros and NaN after the last point."""
-    points = np.asarray(points, dtype=np.float64)
-    there = np.flatnonzero((np.nan_to_num(points) != 0.0).any(axis=1))
-    return points[: there[-1] + 1 if there.size else 0]
 
 
 # Known types of elements in version 5: integers, floats, matrices, compressed data, text.

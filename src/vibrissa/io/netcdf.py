@@ -146,7 +146,10 @@ def _check_items(file: h5py.File, size: int, soft_links: bool) -> None:
                 raise ValueError(f"{name} has {item.ndim} dimensions, and scales of others")
         if isinstance(item, h5py.Dataset):
             claimed += _checked_size(name, item)
-            if not (soft_links or _is_plain(item)):
+            text = h5py.check_string_dtype(item.dtype) is not None
+            if not (
+                soft_links or ((item.dtype.kind in "biufSU" or text) and item.shape is not None)
+            ):
                 raise ValueError(f"{name} is neither numbers nor text")
         if claimed > max(ALWAYS_ALLOWED, _DENSEST * size):
             raise ValueError(
@@ -167,12 +170,6 @@ def _checked_size(name: str, data: h5py.Dataset) -> int:
 
 def _bytes(shape: tuple[int, ...] | None, kind: h5t.TypeID) -> int:
     return math.prod(shape or ()) * int(kind.get_size())
-
-
-def _is_plain(data: h5py.Dataset) -> bool:
-    """Whether a variable of NetCDF-4 contains real numbers or text."""
-    plain = data.dtype.kind in "biufSU" or h5py.check_string_dtype(data.dtype) is not None
-    return plain and data.shape is not None
 
 
 def _as_text(value: str | bytes) -> str:
@@ -243,14 +240,7 @@ def _group(group: h5py.Group, full: bool) -> Group:
     known = dict(group.items()) if full else {}
     data = {name: item for name, item in known.items() if isinstance(item, h5py.Dataset)}
     numbers = {name: item[()] for name, item in data.items() if item.dtype.kind in "fiu"}
-    return Group(numbers, {name: _plain(value) for name, value in group.attrs.items()})
-
-
-def _plain(value: Any) -> Any:
-    """Convert an attribute to text or, if it is an array of one element, to a number."""
-    if isinstance(value, str | bytes):
-        return _as_text(value)
-    return value.item() if getattr(value, "size", 0) == 1 else value
+    return Group(numbers, _attributes(group))
 
 
 def read_tree(path: str | PathLike[str], kind: str, what: str) -> xr.DataTree:

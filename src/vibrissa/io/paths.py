@@ -98,7 +98,7 @@ def _check_folder(folder: Path) -> None:
 
 
 _MARK = ".vibrissa-part-"
-_LOCKS = sys.platform != "win32"
+_LOCKS = sys.platform != "win32"  # where open files cannot be renamed
 _PART = re.compile(rf"\..+{re.escape(_MARK)}[a-z0-9_]{{8}}(\.[^.]*)?")
 
 
@@ -113,8 +113,9 @@ def replacing(path: str | PathLike[str]) -> Iterator[Path]:
             prefix=f".{path.stem}{_MARK}", suffix=path.suffix, dir=path.parent
         )
     part = Path(name)
-    _held(handle)
-    if not _LOCKS:  # and what is open cannot be renamed
+    if _LOCKS:
+        held(handle)
+    else:
         os.close(handle)
     try:
         with _failing(path):
@@ -150,14 +151,17 @@ def _finish(part: Path) -> None:
     part.chmod(0o666 & ~mask)
 
 
-def _held(handle: int) -> bool:
-    """Acquire the lock of a temporary file; False if it is held, or locks are not supported."""
-    if not _LOCKS:
-        return False
-    import fcntl
-
+def held(handle: int) -> bool:
+    """Acquire the lock of an open file, which ends with the process; False if this fails."""
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if sys.platform == "win32":
+            import msvcrt
+
+            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
         return False
     return True
@@ -165,11 +169,11 @@ def _held(handle: int) -> bool:
 
 def _remove_left(folder: Path) -> None:
     """Remove temporary files that killed processes left in a folder; others are locked."""
-    for part in [one for one in folder.iterdir() if _PART.fullmatch(one.name)]:
+    for part in [one for one in folder.iterdir() if _LOCKS and _PART.fullmatch(one.name)]:
         with contextlib.suppress(OSError):
             handle = os.open(part, os.O_RDWR)
             try:
-                if _held(handle):
+                if held(handle):
                     part.unlink()
             finally:
                 os.close(handle)

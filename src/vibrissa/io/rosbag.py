@@ -81,7 +81,13 @@ def _opened(path: str | PathLike[str]) -> Iterator[Any]:
     if not path.exists():
         raise FileNotFoundError(f"there is no bag {path}")
     with _readable(path):
-        _finish(path)
+        # Let SQLite roll back the unfinished transaction of a killed process. The library opens
+        # databases as immutable and would not do so.
+        files = [path] if path.is_file() else path.glob("*.db3")
+        for file in files:
+            if Path(f"{file}-journal").exists():
+                with closing(sqlite3.connect(file)) as database:
+                    database.execute("SELECT count(*) FROM sqlite_master").fetchone()
         reader = rosbags.reader([path], default_typestore=rosbags.types)
         reader.open()
     try:
@@ -154,18 +160,6 @@ def _readable(path: Path) -> Iterator[None]:
     except Exception as error:
         reason = " ".join(str(error).split())[:300] or type(error).__name__
         raise ValueError(f"{path} is not a bag that can be read: {reason}") from error
-
-
-def _finish(path: Path) -> None:
-    """Let SQLite roll back the unfinished transaction of a killed process.
-
-    The library opens databases as immutable and would not do so.
-    """
-    files = [path] if path.is_file() else path.glob("*.db3")
-    for file in files:
-        if Path(f"{file}-journal").exists():
-            with closing(sqlite3.connect(file)) as database:
-                database.execute("SELECT count(*) FROM sqlite_master").fetchone()
 
 
 def _which_topic(connections: Any, there: list[str], topic: str | None, named: str) -> str:

@@ -93,10 +93,23 @@ def load_signals(path: str | PathLike[str]) -> xr.Dataset:
     notes = time_notes(table[:, 0])
     if np.isnan(table[:, 0]).all():
         table[:, 0], notes = np.arange(len(table)), [NUMBERED]
-    _check_time(path, table[:, 0])
+    late = np.flatnonzero(np.abs(table[:, 0]) > _LATEST)
+    if late.size:
+        raise ValueError(
+            f"{path}: time is {table[late[0], 0]:.6g} s in row {late[0] + 1}, more than any date "
+            "in seconds: if it is in ms, µs or ns, call the column time_ms, time_us or time_ns"
+        )
     _check_magnitudes(path, table)
     _check_lever_arm(path, table)
-    return _dataset(table).assign_attrs(notes=notes)
+    frame = {"reference_frame": "whisker"}
+    return xr.Dataset(
+        {
+            "force": (("time", "space"), table[:, 1:4], {**attributes("force"), **frame}),
+            "moment": (("time", "space"), table[:, 4:7], {**attributes("moment"), **frame}),
+        },
+        {"time": ("time", table[:, 0], attributes("time")), "space": list("xyz")},
+        {"notes": notes},
+    )
 
 
 def time_notes(time: Array) -> list[str]:
@@ -245,15 +258,6 @@ def _in_si(path: Path, variable: xr.DataArray) -> Array:
     return np.asarray(variable.values, dtype=np.float64) * factor
 
 
-def _check_time(path: Path, time: Array) -> None:
-    late = np.flatnonzero(np.abs(time) > _LATEST)
-    if late.size:
-        raise ValueError(
-            f"{path}: time is {time[late[0]]:.6g} s in row {late[0] + 1}, more than any date in "
-            "seconds: if it is in ms, µs or ns, call the column time_ms, time_us or time_ns"
-        )
-
-
 def _check_magnitudes(path: Path, table: Array) -> None:
     faults = []
     for i, name in enumerate(COLUMNS[1:], start=1):
@@ -294,20 +298,6 @@ def _check_lever_arm(path: Path, table: Array) -> None:
         f"{path}: force and moment are inconsistent: |M| / |F|, at most the distance of the "
         f"contact, is {arm:.2g} m, and {least:g} to {most:g} m is possible. The {advice}; the "
         "table must be in N and N·m"
-    )
-
-
-def _dataset(table: Array) -> xr.Dataset:
-    frame = {"reference_frame": "whisker"}
-    return xr.Dataset(
-        {
-            "force": (("time", "space"), table[:, 1:4], {**attributes("force"), **frame}),
-            "moment": (("time", "space"), table[:, 4:7], {**attributes("moment"), **frame}),
-        },
-        {
-            "time": xr.Variable("time", table[:, 0], attributes("time")),
-            "space": list("xyz"),
-        },
     )
 
 
@@ -448,20 +438,20 @@ def save_contour(path: str | PathLike[str], contour: xr.Dataset) -> None:
     ValueError
         If a needed variable is not there, or one has another dim.
     """
-    text = _contour_text(contour)
+    content = _contour_content(contour)
     with replacing(path) as part:
-        part.write_bytes(text.encode("utf-8"))
+        part.write_bytes(content)
 
 
 def holds_contour(path: str | PathLike[str], contour: xr.Dataset) -> bool:
     """Whether a file is identical to what `save_contour` would write."""
-    return Path(path).read_bytes() == _contour_text(contour).encode("utf-8")
+    return Path(path).read_bytes() == _contour_content(contour)
 
 
-def _contour_text(contour: xr.Dataset) -> str:
+def _contour_content(contour: xr.Dataset) -> bytes:
     columns = _columns(contour, "contour points", CONTOUR, "contact")
     plain = [(one.astype(int) if one.dtype == bool else one).tolist() for one in columns]
-    return table_text(CONTOUR, zip(*plain, strict=True))
+    return table_text(CONTOUR, zip(*plain, strict=True)).encode()
 
 
 def save_predictors(path: str | PathLike[str], table: xr.Dataset) -> None:

@@ -272,7 +272,12 @@ def join_views(*tracks: xr.Dataset) -> xr.Dataset:
     # Of two points, follicle and tip, the curvature gives the line between them.
     wanted = ["trace", "confidence"]
     wanted += ["trace_curvature"] if all("trace_curvature" in one for one in tracks) else []
-    points = [_with_nodes(part[wanted].drop_vars("time")) for part in parts]
+    points = [part[wanted].drop_vars("time") for part in parts]
+    # Nodes without names are matched by their numbers.
+    points = [
+        one if "node" in one.coords else one.assign_coords(node=np.arange(one.sizes["node"]))
+        for one in points
+    ]
     for dim in ("whisker", "node"):
         if not set.intersection(*(set(one.indexes[dim]) for one in points)):
             listed = "; ".join(", ".join(map(str, one.indexes[dim])) for one in points)
@@ -311,13 +316,6 @@ def join_views(*tracks: xr.Dataset) -> xr.Dataset:
     joined = joined.assign_coords(time=("time", moments, tracks[0]["time"].attrs)).transpose(*IMAGE)
     joined.attrs["source"] = ", ".join(str(one.attrs.get("source", "")) for one in tracks)
     return joined
-
-
-def _with_nodes(tracks: xr.Dataset) -> xr.Dataset:
-    """Name nodes without names by their numbers, so that they can be matched."""
-    if "node" in tracks.coords:
-        return tracks
-    return tracks.assign_coords(node=np.arange(tracks.sizes["node"]))
 
 
 _LABELS = ("whisker", "view", "node")
@@ -389,7 +387,10 @@ def read_tracks_table(path: str | PathLike[str]) -> RawTracks:
     labels = {name: table.text(name) for name in _LABELS if name in table.names}
     whisker, who = _ordered(labels.get("whisker", ["whisker"] * len(row)))
     view, seen = _ordered(labels.get("view", [""] * len(row)))
-    node, part = _ordered(_numbered(labels.get("node")) or _counted(row, who, seen))
+    names: Sequence[Any] = labels.get("node") or _counted(row, who, seen)
+    if "node" in labels and all(name.isdecimal() for name in names):
+        names = [int(name) for name in names]  # numbers are sorted
+    node, part = _ordered(names)
     place = (row, who, seen, part)
     if len(np.unique(np.stack(place), axis=1).T) != len(row):
         raise ValueError(f"{path} has the same point of a whisker twice in one frame")
@@ -428,12 +429,6 @@ def _coordinates(path: Path, names: Sequence[str]) -> tuple[list[str], str]:
         f"{path} has the columns {', '.join(names)}; column, row or x_px, y_px (pixels), or x, y, "
         f"z (m; also x_mm and so on: {', '.join(UNITS)}) are needed"
     )
-
-
-def _numbered(names: Sequence[str] | None) -> Sequence[Any] | None:
-    """Names as integers if all are whole numbers, otherwise unchanged."""
-    whole = names is not None and all(name.isdecimal() for name in names)
-    return [int(name) for name in names] if names is not None and whole else names
 
 
 def _ordered(names: Sequence[Any]) -> tuple[list[str], NDArray[np.int64]]:

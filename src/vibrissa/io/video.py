@@ -379,7 +379,6 @@ def _of_images(files: Sequence[Path]) -> dict[str, list[Frame]]:
     }
 
 
-CODECS = {".mkv": "ffv1", ".mp4": "h264"}  # codec of a video by the ending of its file
 # Constant rate factor of H.264: 0 is lossless, 23 the usual default; 16 preserves faint tips.
 QUALITY = 16
 _MOVIE_QUALITY = 20  # constant rate factor of H.264 sufficient for thin lines
@@ -403,26 +402,22 @@ def write_video(
     import av
 
     path = Path(path)
-    codec = CODECS.get(path.suffix.lower())
-    if codec is None:
-        raise ValueError(f"{path} ends in {path.suffix!r}; one of {', '.join(CODECS)} is needed")
+    kind = path.suffix.lower()
     # With FFV1 every frame is a key frame, so that frames can be read independently.
     options = {"level": "3", "slices": "4", "g": "1"}
-    if codec == "h264":
+    if kind == ".mp4":
         options = {"crf": str(quality), "preset": "ultrafast"}
-
-    def start(container: Any, shape: tuple[int, ...]) -> Any:
-        name = "libx264" if codec == "h264" else codec
-        stream = _stream(container, name, shape, rate, options, "gray")
-        stream.codec_context.color_range = _FULL
-        return stream
+    elif kind != ".mkv":
+        raise ValueError(f"{path} ends in {path.suffix!r}; one of .mkv, .mp4 is needed")
 
     def coded(frame: Frame) -> Any:
         image = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="gray")
         image.color_range = _FULL
         return image
 
-    return _write(path, {"ffv1": "matroska", "h264": "mp4"}[codec], frames, start, coded)
+    container, codec = ("mp4", "libx264") if kind == ".mp4" else ("matroska", "ffv1")
+    about = {"color_range": _FULL}
+    return _write(path, container, frames, coded, rate, codec, "gray", options, about)
 
 
 def write_movie(path: str | PathLike[str], frames: Iterable[Frame], rate: float = 25.0) -> int:
@@ -450,6 +445,8 @@ def write_movie(path: str | PathLike[str], frames: Iterable[Frame], rate: float 
         If the ending is another, the rate is not positive, there is no frame, or frames differ in
         size or type or have an odd size.
     """
+    import av
+
     path = Path(path)
     if path.suffix.lower() != ".mp4":
         raise ValueError(f"{path} ends in {path.suffix!r}; a movie must end in .mp4")
@@ -458,74 +455,61 @@ def write_movie(path: str | PathLike[str], frames: Iterable[Frame], rate: float 
     # A key frame every two seconds allows quick seeking.
     options = {"crf": str(_MOVIE_QUALITY), "preset": "veryfast", "g": str(max(1, round(2 * rate)))}
 
-    def start(container: Any, shape: tuple[int, ...]) -> Any:
+    def coded(frame: Frame) -> Any:
+        shape = frame.shape
         if len(shape) != 3 or shape[2] not in (3, 4) or shape[0] % 2 or shape[1] % 2:
             raise ValueError(
                 f"frames are {shape}; an even height and width and 3 or 4 colours are needed"
             )
-        stream = _stream(container, "libx264", shape, rate, options, "yuv420p")
-        context = stream.codec_context
-        context.color_range = _TELEVISION
-        context.colorspace = context.color_primaries = context.color_trc = _HD
-        return stream
+        kind = "rgb24" if shape[2] == 3 else "rgba"
+        image = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format=kind)
+        return image.reformat(
+            format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG", interpolation="AREA"
+        )
 
-    # The index comes first, so that playback can start before the whole file is read.
-    return _write(path, "mp4", frames, start, _coloured, {"movflags": "+faststart"})
-
-
-def _coloured(frame: Frame) -> Any:
-    """Convert a frame to the brightness and colours that players expect."""
-    import av
-
-    kind = "rgb24" if frame.shape[2] == 3 else "rgba"
-    image = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format=kind)
-    return image.reformat(
-        format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG", interpolation="AREA"
-    )
-
-
-def _stream(
-    container: Any,
-    codec: str,
-    shape: tuple[int, ...],
-    rate: float,
-    options: Mapping[str, str],
-    pixels: str,
-) -> Any:
-    limited = Fraction(rate).limit_denominator(1000)
-    stream = container.add_stream(codec, rate=limited, options=dict(options))
-    stream.height, stream.width = shape[:2]
-    stream.pix_fmt = pixels
-    return stream
+    about = dict.fromkeys(("colorspace", "color_primaries", "color_trc"), _HD)
+    about["color_range"] = _TELEVISION
+    return _write(path, "mp4", frames, coded, rate, "libx264", "yuv420p", options, about)
 
 
 def _write(
     path: Path,
     container_format: str,
     frames: Iterable[Frame],
-    start: Callable[[Any, tuple[int, ...]], Any],
     coded: Callable[[Frame], Any],
-    options: Mapping[str, str] | None = None,
+    rate: float,
+    codec: str,
+    pixels: str,
+    options: Mapping[str, str],
+    about: Mapping[str, int],
 ) -> int:
-    """Encode frames of one shape; ``start`` adds the stream, ``coded`` converts a frame."""
+    """Encode frames of one shape; ``coded`` converts a frame, ``about`` has codes of colours."""
     import av
 
     count = 0
     shape: tuple[int, ...] = ()
     stream: Any = None
+    # The index of MP4 comes first, so that playback can start before the whole file is read.
+    first = {"movflags": "+faststart"} if pixels != "gray" else {}
     with (
         replacing(path) as part,
-        av.open(part, "w", format=container_format, options=dict(options or {})) as container,
+        av.open(part, "w", format=container_format, options=first) as container,
     ):
         for frame in frames:
-            if stream is None:
-                shape = frame.shape
-                stream = start(container, shape)
+            shape = shape or frame.shape
             if frame.shape != shape or frame.dtype != np.uint8:
                 raise ValueError(
                     f"frame {count} is {frame.shape} of {frame.dtype}; {shape} of uint8 is needed"
                 )
-            container.mux(stream.encode(coded(frame)))
+            image = coded(frame)
+            if stream is None:
+                limited = Fraction(rate).limit_denominator(1000)
+                stream = container.add_stream(codec, rate=limited, options=dict(options))
+                stream.height, stream.width = shape[:2]
+                stream.pix_fmt = pixels
+                for name, value in about.items():
+                    setattr(stream.codec_context, name, value)
+            container.mux(stream.encode(image))
             count += 1
         if stream is None:
             raise ValueError(f"{path}: there are no frames to write")

@@ -212,11 +212,6 @@ def check_slender(radius: float, length: float) -> None:
         )
 
 
-def states_radius(path: str | PathLike[str]) -> bool:
-    """Whether a table of a centreline has a column of radii."""
-    return _table(Path(path)).radii is not None
-
-
 def save_centerline(path: str | PathLike[str], points: ArrayLike) -> None:
     """Write a centreline as CSV in mm, with a resolution of 1 nm.
 
@@ -365,7 +360,9 @@ def load_array(
     if path.is_dir():
         return _folder(path, base, noise)
     if is_netcdf(path):
-        return _netcdf(path)
+        tree = read_tree(path, WhiskerArray.kind, "an array of whiskers")
+        with naming(path, "an array of whiskers"):
+            return WhiskerArray.from_tree(separate_whiskers(tree))
     return _array(path, whiskers_from_table(path))
 
 
@@ -387,17 +384,10 @@ def save_array(path: str | PathLike[str], array: WhiskerArray) -> None:
     ValueError
         If a table is to be written and a whisker has another shape.
     """
-    path = Path(path)
-    if path.suffix.lower() != ".csv":
+    if Path(path).suffix.lower() == ".csv":
+        write_table(path, *_as_table(array))
+    else:
         write_netcdf(path, stacked_whiskers(array.to_tree()))
-        return
-    write_table(path, *_as_table(array))
-
-
-def _netcdf(path: Path) -> WhiskerArray:
-    tree = read_tree(path, WhiskerArray.kind, "an array of whiskers")
-    with naming(path, "an array of whiskers"):
-        return WhiskerArray.from_tree(separate_whiskers(tree))
 
 
 def _folder(path: Path, base: Any, noise: float | None) -> WhiskerArray:
@@ -413,7 +403,7 @@ def _folder(path: Path, base: Any, noise: float | None) -> WhiskerArray:
         except ValueError as fault:
             faults.append(f"{file.name}: {fault}")
             continue
-        if not states_radius(file):
+        if _table(file).radii is None:
             whisker = whisker.with_properties(rat=identity.name)
         whiskers.append(whisker)
     if faults:

@@ -25,7 +25,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, TypeAlias
+from typing import Literal, TypeAlias
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -153,7 +153,13 @@ class LookupTable:
         span = np.where(circular, 2.0 * np.pi, np.ptp(signals, axis=0))
         _check_ranges(contact_map, names, span)
         points, values = _close_circle((signals - low) / span, values, circular)
-        return cls(names, low, span, components, _make_interpolation(points, values, interpolation))
+        found: Callable[..., Array]
+        if callable(interpolation):
+            found = interpolation(points, values)
+        else:
+            found = NaturalNeighbour(points, values, scale=np.ones(3))
+            found = found if interpolation is None else partial(found, method=interpolation)
+        return cls(names, low, span, components, found)
 
     def points(self, signals: Array) -> Array:
         """Convert signals to the table's coordinates.
@@ -183,16 +189,6 @@ def cartesian(spheres: Array) -> Array:
     r, theta, phi = np.moveaxis(spheres, -1, 0)
     across = r * np.cos(phi)
     return np.stack([across * np.cos(theta), across * np.sin(theta), r * np.sin(phi)], axis=-1)
-
-
-def _make_interpolation(
-    points: Array, values: Array, interpolation: Interpolation | None
-) -> Callable[..., Array]:
-    """Interpolation of values at points."""
-    if callable(interpolation):
-        return interpolation(points, values)
-    natural: Any = NaturalNeighbour(points, values, scale=np.ones(3))
-    return natural if interpolation is None else partial(natural, method=interpolation)
 
 
 def _close_circle(points: Array, values: Array, circular: Array) -> tuple[Array, Array]:
@@ -460,13 +456,7 @@ def signal_slice(
     return out
 
 
-def error_solid(
-    contact_map: ContactMap,
-    using: str | tuple[str, ...] = ("Fx", "MB", "MD"),
-    *,
-    stride: int = 3,
-    interpolation: Interpolation = "natural",
-) -> xr.Dataset:
+def error_solid(contact_map: ContactMap, stride: int = 3) -> xr.Dataset:
     """Errors of the look-up midway between contacts of the paper's grid, where they are largest."""
     if contact_map.grid is None:
         raise ValueError("the map has no grid to interpolate: simulate it with grid=True")
@@ -474,8 +464,8 @@ def error_solid(
     r, theta, phi = (0.5 * (a[1:] + a[:-1]) for a in axes)
     between = np.meshgrid(r, theta[::stride], phi[::stride], indexing="ij")
     points = cartesian(np.stack(between, axis=-1)).reshape(-1, 3)
-    out = sensitivity(contact_map, using, points)
-    return out.assign(error_distance=interpolation_errors(contact_map, out, using, interpolation))
+    out = sensitivity(contact_map, ("Fx", "MB", "MD"), points)
+    return out.assign(error_distance=interpolation_errors(contact_map, out))
 
 
 def interpolation_errors(

@@ -137,7 +137,7 @@ class _Prediction:
         rows = np.flatnonzero(np.isfinite(signals).all(axis=1))
         if rows.size:
             features = (_features(signals[rows], self.circular) - self.mean) / self.deviation
-            near = _nearest_distance(self.known, features) <= self.reach
+            near = np.asarray(self.known.query(features)[0]) <= self.reach
             if near.any():
                 out[rows[near]] = self.centre + self.size * self.network.predict(features[near])
         return out
@@ -197,7 +197,7 @@ def train_network(
     network = _fit_network(features, (trained.point - centre) / size, seed)
     known = cKDTree(features)
     test = (_features(tested.signals[:, which], circular) - mean) / deviation
-    reach = _MARGIN * float(_nearest_distance(known, test).max())
+    reach = _MARGIN * float(np.max(known.query(test)[0]))
     predict = _Prediction(circular, mean, deviation, centre, size, network, known, reach)
     errors = np.linalg.norm(predict(tested.signals[:, which]) - tested.point, axis=1)
     return NetworkSolver(names, tested, errors, predict)
@@ -233,6 +233,7 @@ def with_network_errors(
         the errors on held-out contacts of each region outside the cone. A large error is evidence
         that the triplet is not unique.
     """
+    whisker, d = contact_map.whisker, contact_map.chart.discretization
     errors = []
     for triplet in verdicts["triplet"].to_numpy().tolist():
         solver = train_network(
@@ -242,8 +243,18 @@ def with_network_errors(
             held_out=held_out,
             seed=int(verdicts.attrs["seed"]),
         )
-        counted = _contacts_in_regions(contact_map, solver.held_out, verdicts)
-        errors.append([solver.error_quantiles(QUANTILES, keep) for keep in counted])
+        drawn = solver.held_out
+        inside = cone_angle(whisker, drawn.point) > verdicts.attrs["cone"]
+        if verdicts.attrs["domain"] == "paper":
+            inside &= within_paper_bounds(whisker, drawn.point)
+        force = d.force * np.insert(drawn.contacts[:, 1:], 0, 0.0, axis=1)
+        places = drawn.point, d.length * drawn.contacts[:, 0], force
+        errors.append(
+            [
+                solver.error_quantiles(QUANTILES, inside & Prior(region).allows(whisker, *places))
+                for region in verdicts["region"].to_numpy().tolist()
+            ]
+        )
         if progress is not None:
             progress(len(errors), verdicts.sizes["triplet"])
     about = {
@@ -255,33 +266,12 @@ def with_network_errors(
     )
 
 
-def _contacts_in_regions(
-    contact_map: ContactMap, drawn: DrawnContacts, verdicts: xr.Dataset
-) -> list[AnyArray]:
-    """Select the contacts in each region of verdicts, outside the cone."""
-    whisker, d = contact_map.whisker, contact_map.chart.discretization
-    inside = cone_angle(whisker, drawn.point) > verdicts.attrs["cone"]
-    if verdicts.attrs["domain"] == "paper":
-        inside &= within_paper_bounds(whisker, drawn.point)
-    arc_length = d.length * drawn.contacts[:, 0]
-    force = d.force * np.insert(drawn.contacts[:, 1:], 0, 0.0, axis=1)
-    return [
-        inside & Prior(region).allows(whisker, drawn.point, arc_length, force)
-        for region in verdicts["region"].to_numpy().tolist()
-    ]
-
-
 def _features(signals: Array, circular: AnyArray) -> Array:
     """Inputs of the network (n, k) from signals (n, 3)."""
     columns = []
     for column, turned in zip(signals.T, circular, strict=True):
         columns += [np.cos(column), np.sin(column)] if turned else [np.cbrt(column)]
     return np.stack(columns, axis=1)
-
-
-def _nearest_distance(known: cKDTree, features: Array) -> Array:
-    """Distances (n,) from the nearest point in a tree."""
-    return np.asarray(known.query(features)[0])
 
 
 def _fit_network(features: Array, targets: Array, seed: int) -> Any:

@@ -68,7 +68,10 @@ def central_differences(
     table = LookupTable.of(contact_map, names, near_rest=True, interpolation=interpolation)
     in_sphere = _differences(table, values.reshape(-1, 3), step)
     point = out["contact_point"].transpose(*dims, "space").to_numpy().reshape(-1, 3)
-    by_signal = _inverse(spherical_derivatives(point)) @ in_sphere
+    turned = spherical_derivatives(point)
+    known = np.isfinite(turned).all(axis=(1, 2))
+    turned[known], turned[~known] = np.linalg.inv(turned[known]), np.nan
+    by_signal = turned @ in_sphere
     shape = values.shape[:-1]
     for name, matrix in (("sensitivity", in_sphere), ("point_sensitivity", by_signal)):
         exact = out[name].transpose(*dims, ...)
@@ -91,14 +94,6 @@ def _differences(table: LookupTable, signals: Array, step: float) -> Array:
             np.asarray(table.interpolation(points[rows] + side)) for side in (aside, -aside)
         )
         out[rows, :, k] = (more - less) / (2.0 * step * table.span[k])
-    return out
-
-
-def _inverse(matrices: Array) -> Array:
-    """Inverses of matrices (n, 3, 3); NaN where they contain NaN."""
-    out = np.full_like(matrices, np.nan)
-    known = np.isfinite(matrices).all(axis=(1, 2))
-    out[known] = np.linalg.inv(matrices[known])
     return out
 
 
@@ -160,7 +155,8 @@ def sensitivity_findings(data: xr.Dataset, region: xr.DataArray | None = None) -
     flat = {n: data[n].to_numpy().ravel() for n in ("r", "theta", "phi", *names)}
     sorted_by = [n for n in names if n not in ("FD", "MD")]
     backward = data["concave_backward"].to_numpy().ravel()
-    ranges = {n: _range(flat[n], weight) for n in flat}
+    ends = np.array([0.5 - 0.5 * RANGE, 0.5 + 0.5 * RANGE])
+    ranges = {n: float(np.diff(weighted_quantile(v, weight, ends))[0]) for n, v in flat.items()}
     scale = np.array([[ranges[s] / ranges[c] for s in names] for c in ("r", "theta", "phi")])
     median = _medians(size, weight)
     both = ("coordinate", "signal")
@@ -197,12 +193,6 @@ def sensitivity_findings(data: xr.Dataset, region: xr.DataArray | None = None) -
 def _stack_tables(tables: list[Array]) -> Array:
     """Stack tables along a last axis."""
     return np.stack(tables, axis=-1) if tables else np.empty((3, 3, 0))
-
-
-def _range(values: Array, weight: Array) -> float:
-    """Central range of values, by weighted quantiles."""
-    low, high = weighted_quantile(values, weight, np.array([0.5 - 0.5 * RANGE, 0.5 + 0.5 * RANGE]))
-    return float(high - low)
 
 
 def _medians(size: Array, weight: Array) -> Array:

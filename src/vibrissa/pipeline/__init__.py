@@ -49,7 +49,6 @@ from vibrissa.pipeline.stages import (
     STAGES as STAGES,
     TrialSummary as TrialSummary,
     due_stages as due_stages,
-    summarise as summarise,
     with_contour,
     with_estimates,
     with_group as with_group,

@@ -23,7 +23,7 @@ where c are the signals used for the estimate, J = ∂c/∂x, and K is J⁻¹ fo
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -60,25 +60,6 @@ from vibrissa.whisker import Whisker
 _FRICTION = 0.3
 _OF_ROD = ("stiffness_sigma", "compliance_sigma")  # errors of the whisker and its base
 _WHISKER = {"reference_frame": "whisker"}
-
-
-class _Candidates(NamedTuple):
-    """Candidates (rows, candidates, ...) of frames in contact, padded with NaN, SI units."""
-
-    points: Array
-    arc_lengths: Array
-    forces: Array
-    contact_forces: Array
-    number: NDArray[np.int64]
-    status: NDArray[np.int64]
-    valid: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, found: Contacts) -> Self:
-        """Candidates of estimated contacts."""
-        one = found.candidates
-        arrays = (one.point, one.arc_length, one.force, one.contact_force)
-        return cls(*arrays, found.n_candidates, found.status, found.covariance_valid)
 
 
 def locate(
@@ -161,7 +142,7 @@ def locate(
         found = estimate(contact_map, signals, names, method=method, prior=prior)
     stated = found.candidates.covariance if method == "exact" else None
     whisker = measured.at_rest(contact_map.whisker, gravity)
-    out = _located(whisker, names, measured, _Candidates.of(found), stated, friction)
+    out = _located(whisker, names, measured, found, stated, friction)
     return _mark_second_contacts(out, whisker, measured, errors, friction, second_contacts)
 
 
@@ -176,9 +157,7 @@ def without_contact(
     measured = _Measured.of(wrench, noise)
     if measured.rows.any():
         return None
-    points, numbers = np.empty((0, 1, 3)), np.empty(0, dtype=np.int64)
-    none = _Candidates(points, points[..., 0], points, points, numbers, numbers, numbers > 0)
-    return _located(whisker, selection(triplet), measured, none)
+    return _located(whisker, selection(triplet), measured, None)
 
 
 def locate_from_wrench(
@@ -235,7 +214,7 @@ def locate_from_wrench(
         )
     stated = found.candidates.covariance
     rest = measured.at_rest(whisker, gravity)
-    out = _located(rest, WRENCH, measured, _Candidates.of(found), stated)
+    out = _located(rest, WRENCH, measured, found, stated)
     return _mark_second_contacts(out, rest, measured, errors, _FRICTION, second_contacts)
 
 
@@ -484,18 +463,28 @@ def _located(
     whisker: Whisker,
     names: tuple[str, ...],
     measured: _Measured,
-    found: _Candidates,
+    found: Contacts | None,
     stated: Array | None = None,
     friction: float = 0.0,
 ) -> xr.Dataset:
-    """Dataset of all frames from the candidates of those with a contact.
+    """Dataset of all frames from the candidates of those with a contact, None if there are none.
 
     Covariances are of first order, unless all frames have the same noise: then the covariances
     ``stated`` (n, candidates, 3, 3) by the estimate, which remain valid up to slip-off, are used.
     """
     rows = measured.rows
-    shape = found.arc_lengths.shape
-    flat = (found.arc_lengths.reshape(-1), found.contact_forces.reshape(-1, 3))
+    points = forces = contact_forces = np.empty((0, 1, 3))
+    arc_lengths = points[..., 0]
+    status = np.where(measured.known, int(Status.NOT_FELT), int(Status.MISSING)).astype(np.int8)
+    status[measured.free] = int(Status.NO_CONTACT)
+    number, valid = np.zeros(rows.size, dtype=np.int64), np.zeros(rows.size, dtype=np.bool_)
+    if found is not None:
+        one = found.candidates
+        points, arc_lengths, forces = one.point, one.arc_length, one.force
+        contact_forces, status[rows] = one.contact_force, found.status
+        number[rows], valid[rows] = found.n_candidates, found.covariance_valid
+    shape = arc_lengths.shape
+    flat = (arc_lengths.reshape(-1), contact_forces.reshape(-1, 3))
     gain = gains(whisker, names, *flat, measured.typical, measured.errors, friction)
     gain = gain.reshape(*shape, 6, 6)
     normals = contact_normals(whisker, *flat).reshape(*shape, 3)
@@ -508,16 +497,11 @@ def _located(
     elif stated is not None:
         first = spread[:, : stated.shape[1]]
         first[:] = np.where(np.isfinite(stated), stated, first)
-    status = np.where(measured.known, int(Status.NOT_FELT), int(Status.MISSING)).astype(np.int8)
-    status[measured.free] = int(Status.NO_CONTACT)
-    status[rows] = found.status
-    number = np.zeros(rows.size, dtype=np.int64)
-    number[rows] = found.number
     columns = {
-        "points": ("contact_point_whisker", found.points),
+        "points": ("contact_point_whisker", points),
         "covariance": ("covariance", spread),
-        "arc_length": ("arc_length", found.arc_lengths),
-        "force": ("force", found.forces),
+        "arc_length": ("arc_length", arc_lengths),
+        "force": ("force", forces),
     }
     data: dict[str, Any] = {}
     for short, (name, values) in columns.items():
@@ -536,9 +520,8 @@ def _located(
         {"units": "(m, 1)/(N, N m)", "long_name": "contact point and normal by force and moment"},
     )
     if names == WRENCH or friction > 0.0:
-        angle = np.arctan2(
-            found.contact_forces[:, 0, 0], np.linalg.norm(found.contact_forces[:, 0, 1:], axis=-1)
-        )
+        along, across = contact_forces[:, 0, 0], contact_forces[:, 0, 1:]
+        angle = np.arctan2(along, np.linalg.norm(across, axis=-1))
         data["friction_angle"] = ("time", _everywhere(rows, angle), attributes("friction_angle"))
     data["wrench_covariance"] = (
         ("time", "component", "component_"),
@@ -547,8 +530,6 @@ def _located(
     )
     data["candidates"] = ("time", number, attributes("candidates"))
     data["in_contact"] = ("time", rows, attributes("in_contact"))
-    valid = np.zeros(rows.size, dtype=np.bool_)
-    valid[rows] = found.valid
     data["covariance_valid"] = ("time", valid, attributes("covariance_valid"))
     data["excess"] = (("time", "reading"), measured.excess)
     data["status"] = ("time", status, {**attributes("status"), **flag_attributes()})

@@ -87,7 +87,9 @@ def predictors(recording: xr.DataTree) -> xr.Dataset:
     columns |= {name: signals[name].values for name in ("FT", "FD", "MB", "MD")}
     rotation = record.known("base_rotation", _GROUPS)
     if rotation is not None:
-        angles = _angles(rotation)
+        angles = np.full(rotation.shape[:-1], np.nan)
+        posed = np.isfinite(rotation).all(axis=(-2, -1))
+        angles[posed] = angles_of(rotation[posed])
         columns |= {name: angles[..., i] for i, name in enumerate(_ANGLES)}
     time = record.root.data["time"].values
     rates = {
@@ -128,14 +130,6 @@ def predictors(recording: xr.DataTree) -> xr.Dataset:
     unseen = _UNSEEN if ONE_VIEW in recording.attrs.get("remarks", "") else ()
     there = [n for n in PREDICTORS if n in data and n.removesuffix(_RATE) not in unseen]
     return xr.Dataset(data, coordinates, {"predictors": " ".join(there)})
-
-
-def _angles(rotation: Array) -> Array:
-    """Azimuth, elevation and roll (time, whisker, 3); NaN where the pose is missing."""
-    out = np.full(rotation.shape[:-1], np.nan)
-    known = np.isfinite(rotation).all(axis=(-2, -1))
-    out[known] = angles_of(rotation[known])
-    return out
 
 
 def _rate(values: Array, time: Array) -> Array:

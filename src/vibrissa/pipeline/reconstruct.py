@@ -99,8 +99,7 @@ def reconstruct(
     ValueError
         If there are no estimates or too few, or they do not determine the object.
     """
-    if shape not in get_args(Shape):
-        raise ValueError(f"shape is {shape!r}; one of {', '.join(get_args(Shape))} is needed")
+    _check_shape(shape)
     estimates = estimates_in(recording)
     whiskers = Recording(recording).whiskers if whiskers is None else whiskers
     known = Recording(recording).objects if objects is None else tuple(objects)
@@ -119,6 +118,11 @@ def reconstruct(
     if known:
         out = out.assign(_compared(fit, estimates, whiskers, known))
     return out
+
+
+def _check_shape(shape: str) -> None:
+    if shape not in get_args(Shape):
+        raise ValueError(f"shape is {shape!r}; one of {', '.join(get_args(Shape))} is needed")
 
 
 def scores_of(fit: FittedShape, estimates: xr.Dataset) -> Array:
@@ -248,8 +252,7 @@ def fit_contacts(
     ValueError
         If there are too few contacts, or they do not determine the shape.
     """
-    if shape not in get_args(Shape):
-        raise ValueError(f"shape is {shape!r}; one of {', '.join(get_args(Shape))} is needed")
+    _check_shape(shape)
     if axis is not None and shape != "cylinder":
         raise ValueError(f"an axis is given for the shape {shape!r}; only a cylinder has one")
     count = estimates.sizes["whisker"]

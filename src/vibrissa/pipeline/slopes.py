@@ -5,8 +5,6 @@ The unknowns of a contact are x = (s, f_x, f_y, f_z), as in `vibrissa.pipeline.l
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,14 +28,6 @@ _STEP = 1e-5  # relative step of finite differences
 _SINGULAR = 1e-10
 
 
-class _Touch(NamedTuple):
-    """(F, p) (n, 6), ∂(F, p)/∂x (n, 6, 4) and, for the normal n, ∂n/∂x (n, 3, 4)."""
-
-    values: Array
-    value_slopes: Array
-    normal_slopes: Array
-
-
 def gains(
     whisker: Whisker,
     signals: tuple[str, ...],
@@ -58,20 +48,25 @@ def gains(
     out = np.full((len(rows), 6, 6), np.nan)
     if not rows.any():
         return out
-    touch = _touch(d, x)
+    values, value_slopes, normal_slopes = _touch(d, x)
     free = [0, 1, 2, 3] if rubbing else _FREE
     three = len(signals) == 3 and not friction > 0.0
     channels = Channels(signals, signals) if three or signals == WRENCH else Channels.of(signals)
-    slopes = channel_derivatives(touch.values, touch.value_slopes[..., free], channels.names)
-    by_wrench = channel_gradients(touch.values, channels.names)
+    slopes = channel_derivatives(values, value_slopes[..., free], channels.names)
+    by_wrench = channel_gradients(values, channels.names)
     if not three:
-        weights = _weights(d, channels, touch.values, weighing, errors)
+        # Whitening matrices of the channels at contacts with given values (F, p).
+        sensor = None
+        if weighing is not None:
+            sensor = SensorNoise(None, weighing, np.zeros((0, 6, 7)) if errors is None else errors)
+        measured = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))
+        weights = whitening(channels.covariance(sensor, measured, values, d))
         slopes, by_wrench = weights @ slopes, weights @ by_wrench
     if friction > 0.0:  # the prior acts as one more measurement, independent of the wrench
         prior = ratio_derivatives(x)[:, None] / friction
         slopes = np.concatenate([slopes, prior], axis=1)
         by_wrench = np.concatenate([by_wrench, np.zeros_like(by_wrench[:, :1])], axis=1)
-    moved = np.concatenate([touch.value_slopes[:, 3:], touch.normal_slopes], axis=1)[..., free]
+    moved = np.concatenate([value_slopes[:, 3:], normal_slopes], axis=1)[..., free]
     inner = np.repeat([d.length, 1.0], 3)[:, None] / np.repeat([d.force, d.moment], 3)
     out[rows] = moved @ _inverse(slopes) @ by_wrench * inner
     return out
@@ -90,8 +85,11 @@ def wrench_slopes(whisker: Whisker, arc_length: Array, contact_force: Array) -> 
     return out
 
 
-def _touch(d: Discretization, x: Array) -> _Touch:
-    """Values and derivatives of contacts x (n, 4), scaled, partly by central differences."""
+def _touch(d: Discretization, x: Array) -> tuple[Array, Array, Array]:
+    """(F, p) (n, 6), ∂(F, p)/∂x (n, 6, 4) and, for the normal n, ∂n/∂x (n, 3, 4), scaled.
+
+    Contacts are x (n, 4); derivatives are computed partly by central differences.
+    """
     values, exact = solve_forces(d, x, tangents=True)
     tangent = contact_tangents(d, x)
     slopes, turning = np.empty((len(x), 6, 4)), np.empty((len(x), 3, 4))
@@ -121,7 +119,7 @@ def _touch(d: Discretization, x: Array) -> _Touch:
     change -= tangent[:, :, None] * grown[:, None, :]
     flat = np.eye(3) - normal[:, :, None] * normal[:, None, :]
     with np.errstate(divide="ignore", invalid="ignore"):
-        return _Touch(values, slopes, flat @ change / length[..., None])
+        return values, slopes, flat @ change / length[..., None]
 
 
 def contact_normals(whisker: Whisker, arc_length: Array, contact_force: Array) -> Array:
@@ -144,21 +142,6 @@ def _unknowns(
     x = np.concatenate([arc_length[:, None] / d.length, contact_force / d.force], axis=1)
     rows = np.isfinite(x).all(axis=1)
     return d, x[rows], rows
-
-
-def _weights(
-    d: Discretization,
-    channels: Channels,
-    values: Array,
-    weighing: Array | None,
-    errors: Array | None,
-) -> Array:
-    """Whitening matrices of the channels at contacts with given values (F, p)."""
-    sensor = None
-    if weighing is not None:
-        sensor = SensorNoise(None, weighing, np.zeros((0, 6, 7)) if errors is None else errors)
-    measured = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))
-    return whitening(channels.covariance(sensor, measured, values, d))
 
 
 def _inverse(slopes: Array) -> Array:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import warnings
 from collections import Counter
 from collections.abc import Collection
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -162,7 +161,6 @@ def with_contour(
 _BEFORE = ("signals", "", "truth")  # groups searched for contacts, in this order
 
 
-@dataclass(frozen=True)
 class TrialSummary:
     """Summary of a recording in words and numbers, SI units.
 
@@ -174,79 +172,47 @@ class TrialSummary:
     distance of contacts from the fitted shape.
     """
 
-    origin: str
-    whiskers: list[str]
-    frames: int
-    duration: float
-    extent: float
-    in_contact: int | None
-    contacts: int | None
-    largest_force: float
-    largest_moment: float
-    estimated: int
-    assumption: str
-    events: Counter[str]
-    stages: tuple[str, ...]
-    fitted: str
-    shape: FittedShape | None
-    known: str
-    distance: float
-
-
-def summarise(recording: xr.DataTree) -> TrialSummary:
-    """Summarise a recording."""
-    record = Recording(recording)
-    time = record.root.data["time"].values
-    step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-    touching = record.known("in_contact", _BEFORE)
-    contacts = None
-    if touching is not None:
-        status = record.known("status", _BEFORE)
-        seen = np.ones_like(touching) if status is None else status != Status.MISSING
-        contacts = sum(len(contacts_in(*one)) for one in zip(touching.T, seen.T, strict=True))
-    largest = {
-        name: _largest(record.known(name, _BEFORE), touching) for name in ("force", "moment")
-    }
-    extent = np.nan
-    if (place := record.known("base_position", _BEFORE)) is not None:
-        extent = float(
-            np.linalg.norm(np.nanmax(place, axis=0) - np.nanmin(place, axis=0), axis=-1).max()
+    def __init__(self, recording: xr.DataTree) -> None:
+        record = Recording(recording)
+        self.origin = str(recording.attrs.get("origin", "its origin is not stated"))
+        self.whiskers = record.names
+        self.stages = tuple(stage for stage in STAGES if stage in recording.children)
+        self.known = "; ".join(known.in_words() for known in record.objects)
+        time = record.root.data["time"].values
+        self.frames = len(time)
+        self.duration = self.frames * float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+        touching = record.known("in_contact", _BEFORE)
+        self.in_contact = None if touching is None else int(touching.any(axis=1).sum())
+        self.contacts = None
+        if touching is not None:
+            status = record.known("status", _BEFORE)
+            seen = np.ones_like(touching) if status is None else status != Status.MISSING
+            each = zip(touching.T, seen.T, strict=True)
+            self.contacts = sum(len(contacts_in(*one)) for one in each)
+        self.largest_force, self.largest_moment = (
+            _largest(record.known(name, _BEFORE), touching) for name in ("force", "moment")
         )
-    estimated, assumption, events = 0, "", Counter[str]()
-    if (estimates := record.find("estimates")) and "in_contact" in estimates:
-        estimated = int(estimates["in_contact"].sum())
-        if "friction" in (about := estimates.data.attrs):
-            assumption = friction_assumed(float(about["friction"]))
-        events = Counter(event for _, _, event, _ in events_in(estimates.data))
-    fitted, shape, distance = "", None, np.nan
-    if "contour" in recording.children:
-        contour = recording["contour"].to_dataset()
-        shape = shape_from_dataset(contour)
-        fitted = repr(shape).strip("<>")
-        if "surface_distance" in contour:
-            away = np.abs(contour["surface_distance"].values)
-            if "inlier" in contour:  # as in `FittedShape.median`
-                away = away[contour["inlier"].values > 0]
-            distance = float(np.nanmedian(away)) if np.isfinite(away).any() else np.nan
-    return TrialSummary(
-        origin=str(recording.attrs.get("origin", "its origin is not stated")),
-        whiskers=record.names,
-        frames=len(time),
-        duration=step * len(time),
-        extent=extent,
-        in_contact=None if touching is None else int(touching.any(axis=1).sum()),
-        contacts=contacts,
-        largest_force=largest["force"],
-        largest_moment=largest["moment"],
-        estimated=estimated,
-        assumption=assumption,
-        events=events,
-        stages=tuple(stage for stage in STAGES if stage in recording.children),
-        fitted=fitted,
-        shape=shape,
-        known="; ".join(known.in_words() for known in record.objects),
-        distance=distance,
-    )
+        self.extent = np.nan
+        if (place := record.known("base_position", _BEFORE)) is not None:
+            span = np.nanmax(place, axis=0) - np.nanmin(place, axis=0)
+            self.extent = float(np.linalg.norm(span, axis=-1).max())
+        self.estimated, self.assumption, self.events = 0, "", Counter[str]()
+        if (estimates := record.find("estimates")) and "in_contact" in estimates:
+            self.estimated = int(estimates["in_contact"].sum())
+            if "friction" in (about := estimates.data.attrs):
+                self.assumption = friction_assumed(float(about["friction"]))
+            self.events = Counter(event for _, _, event, _ in events_in(estimates.data))
+        self.fitted, self.distance = "", np.nan
+        self.shape: FittedShape | None = None
+        if "contour" in recording.children:
+            contour = recording["contour"].to_dataset()
+            self.shape = shape_from_dataset(contour)
+            self.fitted = repr(self.shape).strip("<>")
+            if "surface_distance" in contour:
+                away = np.abs(contour["surface_distance"].values)
+                if "inlier" in contour:  # as in `FittedShape.median`
+                    away = away[contour["inlier"].values > 0]
+                self.distance = float(np.nanmedian(away)) if np.isfinite(away).any() else np.nan
 
 
 def _largest(values: np.ndarray | None, touching: np.ndarray | None) -> float:

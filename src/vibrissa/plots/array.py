@@ -20,22 +20,8 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
 from vibrissa.numerics import Array, Mask
+from vibrissa.plots import style
 from vibrissa.plots.space import paint, space_axes
-from vibrissa.plots.style import (
-    INK,
-    LARGE,
-    MUTED,
-    Box,
-    Width,
-    box_axes,
-    conclude,
-    corner_title,
-    head,
-    looking,
-    new_figure,
-    page_width,
-    sentence,
-)
 from vibrissa.quantities import axis_label, to_display
 from vibrissa.recording import Group
 from vibrissa.scene import head_surfaces, is_bounded, object_surface
@@ -79,7 +65,7 @@ class _Scene:
 
     def rows(self, names: list[str]) -> list[str]:
         """Known rows of some whiskers."""
-        return sorted({Identity.of(name).row for name in names if _colour(name) != INK})
+        return sorted({Identity.of(name).row for name in names if _colour(name) != style.INK})
 
     @property
     def limits(self) -> Array:
@@ -100,7 +86,7 @@ def array_views(
     *,
     frame: int | None = None,
     contacts: str = "truth",
-    width: Width = "double",
+    width: style.Width = "double",
 ) -> Figure:
     """Draw the whiskers of a face and the objects, in three views and in space.
 
@@ -130,39 +116,39 @@ def array_views(
         If there are no centrelines, no such frame, or no such group.
     """
     scene = _scene(tree, frame, contacts)
-    with looking():
+    with style.looking():
         if scene is None:
-            return sentence("no whisker", width)
+            return style.sentence("no whisker", width)
         return _drawn(scene, width)
 
 
 _SIDEWAYS = 0.5  # cosine between x and the animal's right from which on left and right are written
 
 
-def _drawn(scene: _Scene, width: Width) -> Figure:
-    limits, page = scene.limits, page_width(width)
+def _drawn(scene: _Scene, width: style.Width) -> Figure:
+    limits, page = scene.limits, style.page_width(width)
     x, y, z = np.ptp(limits, axis=1)
     scale = (page - _LEFT - _GAP - _RIGHT) / (x + y)  # mm on paper per mm
     height = _BOTTOM + scale * (z + y) + _GAP + _TOP
-    figure = new_figure(width, height, None)
+    figure = style.new_figure(width, height, None)
     above, aside = _BOTTOM + scale * z + _GAP, _LEFT + scale * x + _GAP
     places = {"a": (_LEFT, above), "c": (_LEFT, _BOTTOM), "d": (aside, _BOTTOM)}
     for letter, title, view, sense, toward in _PANELS:
         (i, j), (left, bottom) = view, places[letter]
         size = scale * np.ptp(limits, axis=1)
-        axes = box_axes(
+        axes = style.box_axes(
             figure, (left, bottom, size[i], size[j]), xlim=limits[i][:: int(sense)], ylim=limits[j]
         )
         axes.set(xlabel=axis_label("xyz"[i]), ylabel=axis_label("xyz"[j]))
-        head(axes, letter, title)
+        style.head(axes, letter, title)
         _panel(axes, scene, limits, view, toward)
         if letter == "a":
             _legend(axes, scene)
     room = scale * float(y)
     box = (aside - 6.0, above - 6.0, room + 8.0, room + 10.0)
     _space(figure, box, scene, limits)
-    corner_title(figure, (aside - 6.0, above, room, scale * y + _TOP - 1.5), "b", "in space")
-    conclude(figure, _finding(scene))
+    style.corner_title(figure, (aside - 6.0, above, room, scale * y + _TOP - 1.5), "b", "in space")
+    style.conclude(figure, _finding(scene))
     return figure
 
 
@@ -189,10 +175,12 @@ def _panel(axes: Axes, scene: _Scene, limits: Array, view: tuple[int, int], towa
         sides = ("L", "R") if right > 0.0 else ("R", "L")
         for x, side in zip((0.03, 0.97), sides, strict=True):
             words: dict[str, Any] = {"transform": axes.transAxes, "ha": "center", "va": "top"}
-            axes.text(x, 0.97, side, fontsize=LARGE, fontweight="bold", color=MUTED, **words)
+            axes.text(
+                x, 0.97, side, fontsize=style.LARGE, fontweight="bold", color=style.MUTED, **words
+            )
     if toward != 1:
         near = eyes[eyes[..., toward].mean(axis=1) > skull[..., toward].mean()]
-        _flat(axes, near[..., view], INK, INK, 2.2)
+        _flat(axes, near[..., view], style.INK, style.INK, 2.2)
     for line, colour, touching in zip(scene.lines, scene.colours, scene.touching, strict=True):
         # Whiskers on the far side are drawn behind the head, all others in front of it.
         behind = toward == 0 and line[0, 0] < middle[0]
@@ -201,7 +189,7 @@ def _panel(axes: Axes, scene: _Scene, limits: Array, view: tuple[int, int], towa
     for dots, colour in zip(scene.points, scene.colours, strict=True):
         axes.plot(*dots[:, view].T, ".", color=colour, markersize=1.6, zorder=3.5, alpha=0.6)
     now = scene.now[scene.touching]
-    axes.plot(*now[:, view].T, "o", color=INK, markersize=3.2, fillstyle="none", zorder=4.0)
+    axes.plot(*now[:, view].T, "o", color=style.INK, markersize=3.2, fillstyle="none", zorder=4.0)
 
 
 def _flat(axes: Axes, triangles: Array, colour: str, edge: str, order: float) -> None:
@@ -217,7 +205,7 @@ def _triangles(thing: xr.Dataset, limits: Array) -> Array:
     return vertices[faces]
 
 
-def _space(figure: Figure, box: Box, scene: _Scene, limits: Array) -> None:
+def _space(figure: Figure, box: style.Box, scene: _Scene, limits: Array) -> None:
     """Draw all objects in space, farther ones first."""
     view = _AT_REST if not scene.moment else _IN_A_TRIAL
     axes = space_axes(figure, box, limits, view, zoom=1.3, frame=False)
@@ -232,7 +220,7 @@ def _space(figure: Figure, box: Box, scene: _Scene, limits: Array) -> None:
     def skull(order: float) -> None:
         triangles, eyes = sketch
         solid(triangles, _HEAD, order)
-        solid(eyes[(eyes @ eye).mean(axis=1) > (triangles @ eye).mean()], INK, order + 0.5)
+        solid(eyes[(eyes @ eye).mean(axis=1) > (triangles @ eye).mean()], style.INK, order + 0.5)
 
     def whisker(i: int, order: float) -> None:
         look: dict[str, Any] = {"color": scene.colours[i], "zorder": order}
@@ -249,7 +237,7 @@ def _space(figure: Figure, box: Box, scene: _Scene, limits: Array) -> None:
     for order, (_, draw) in enumerate(sorted(items, key=lambda item: item[0])):
         draw(order)
     now = scene.now[scene.touching]
-    axes.plot(*now.T, "o", color=INK, markersize=3.2, fillstyle="none", zorder=len(items))
+    axes.plot(*now.T, "o", color=style.INK, markersize=3.2, fillstyle="none", zorder=len(items))
 
 
 def _legend(axes: Axes, scene: _Scene) -> None:
@@ -263,7 +251,7 @@ def _legend(axes: Axes, scene: _Scene) -> None:
             xycoords="axes fraction",
             xytext=(-8.0 * (len(rows) - 1 - i) - (2.0 if i == 0 else 0.0), 4.0),
             textcoords="offset points",
-            color=ROW_COLOURS.get(row, INK),
+            color=ROW_COLOURS.get(row, style.INK),
             **look,
         )
 
@@ -272,7 +260,7 @@ def _colour(name: str) -> str:
     try:
         return ROW_COLOURS[Identity.of(name).row]
     except ValueError:
-        return INK
+        return style.INK
 
 
 def _scene(tree: xr.DataTree, frame: int | None, contacts: str) -> _Scene | None:

@@ -9,7 +9,7 @@ and the moment as components M_B cos M_D, M_B sin M_D.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -23,19 +23,7 @@ from numpy.typing import ArrayLike
 
 from vibrissa import scene
 from vibrissa.numerics import Array
-from vibrissa.plots import style
-from vibrissa.plots.space import (
-    bounds,
-    contact_points,
-    name_axes,
-    paint,
-    painted,
-    signal_axes,
-    signal_limits,
-    signal_rows,
-    space_axes,
-    square,
-)
+from vibrissa.plots import space, style
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import robust_limits
 
@@ -46,12 +34,7 @@ _PAPER = {"r": (11.0, 15.0, 24.0), "theta": (-25.0, 5.0, 35.0), "phi": (-25.0, 5
 _OPEN = (np.pi, 2.5 * np.pi)
 
 
-class _Panel(NamedTuple):
-    """One of the nine panels."""
-
-    letter: str
-    title: str
-    box: style.Box
+_Panel = tuple[str, str, style.Box]  # letter, title and position
 
 
 def contact_surfaces(
@@ -89,9 +72,9 @@ def contact_surfaces(
     outside = scene.column("deflection")
     body = scene.solid_surface(opened, False, outside)
     line = to_display("centerline", centerline)
-    contacts = bounds(np.concatenate([contact_points(body).reshape(-1, 3), line]))
+    contacts = space.bounds(np.concatenate([space.contact_points(body).reshape(-1, 3), line]))
     shell = scene.solid_surface(whole, True, outside)
-    signals = signal_limits(signal_rows(shell))
+    signals = space.signal_limits(space.signal_rows(shell))
     with style.looking():
         height, panels, rails = _sheet(width)
         figure = style.new_figure(width, height, None)
@@ -100,19 +83,25 @@ def contact_surfaces(
             values = to_display(name, scene.values_of(name, shell))
             if values.min() < min(_PAPER[name]) and max(_PAPER[name]) < values.max():
                 marks = list(_PAPER[name])
-            among, into, inside = panels[3 * i : 3 * i + 3]
-            axes = _contact_axes(figure, among, contacts)
+            among, into, inside = (box for *_, box in panels[3 * i : 3 * i + 3])
+            for letter, title, box in panels[3 * i : 3 * i + 3]:
+                style.corner_title(figure, box, letter, title)
+            left, bottom, side, _ = space.square(among)
+            box, zoom = (left - 2.0, bottom + 1.5, side, side), 0.87 if side > 50.0 else 0.82
+            axes = space.space_axes(figure, box, contacts, zoom=zoom)
+            space.name_axes(axes, (-8.0, -9.0, -10.5))
             surface, hues = _level_sets(whole, name, norm, marks)
-            paint(axes, contact_points(surface), hues)
+            space.paint(axes, space.contact_points(surface), hues)
             axes.plot(*line.T, color="black", linewidth=1.2, zorder=10)
-            _write_values(figure, among.box, name, norm, marks)
-            axes = _cylinder(figure, into, signals)
+            _write_values(figure, among, name, norm, marks)
+            axes = space.signal_axes(figure, into, signals)
             if name == "r":  # its surfaces enclose one another
                 surface, hues = _level_sets(opened, name, norm, marks)
-            paint(axes, signal_rows(surface), hues)
-            axes = _cylinder(figure, inside, signals)
+            space.paint(axes, space.signal_rows(surface), hues)
+            axes = space.signal_axes(figure, inside, signals)
             values = to_display(name, scene.values_of(name, body))
-            paint(axes, signal_rows(body), painted(values, norm, style.sequential()), flat=0.8)
+            hues = space.painted(values, norm, style.sequential())
+            space.paint(axes, space.signal_rows(body), hues, flat=0.8)
             coordinate_bar(figure, rails[i], name, norm, marks)
         style.conclude(
             figure,
@@ -178,7 +167,7 @@ def _sheet(width: style.Width) -> tuple[float, list[_Panel], list[style.Box]]:
         cells = [(row, k) if k < 2 else (3 + row // 2, row % 2) for row, k in cells]
     order = sorted(cells)
     panels = [
-        _Panel(
+        (
             "abcdefghi"[order.index((row, side))],
             title,
             (wide * side, height - 1.0 - tall * (row + 1), wide, tall),
@@ -186,20 +175,6 @@ def _sheet(width: style.Width) -> tuple[float, list[_Panel], list[style.Box]]:
         for (row, side), title in zip(cells, titles, strict=True)
     ]
     return height, panels, rails
-
-
-def _contact_axes(figure: Figure, panel: _Panel, limits: Array) -> Any:
-    style.corner_title(figure, panel.box, panel.letter, panel.title)
-    left, bottom, width, height = square(panel.box)
-    zoom = 0.87 if width > 50.0 else 0.82
-    axes = space_axes(figure, (left - 2.0, bottom + 1.5, width, height), limits, zoom=zoom)
-    name_axes(axes, (-8.0, -9.0, -10.5))
-    return axes
-
-
-def _cylinder(figure: Figure, panel: _Panel, limits: Array) -> Any:
-    style.corner_title(figure, panel.box, panel.letter, panel.title)
-    return signal_axes(figure, panel.box, limits)
 
 
 def coordinate_bar(
@@ -240,15 +215,18 @@ def solid_panels(
     nodes = scene.sample_contacts(samples, centerline)
     within: list[int] = []
     if np.isfinite(measured).all(axis=1).any():
-        gentle = _gentle(nodes, measured)
-        within = [nodes.shape[-1] + i for i in range(gentle.shape[-1])]
-        nodes = np.concatenate([nodes, gentle], axis=-1)
+        # Margins of signals within 1.5 times those of the trial; negative beyond.
+        force, moment = _ROOM * np.nanmax(np.abs(measured[:, :2]), axis=0)
+        tension = 1.0 - np.abs(scene.values_of("Fx", nodes)) / max(force, 1e-12)
+        bending = 1.0 - scene.values_of("MB", nodes) / max(moment, 1e-15)
+        within = [nodes.shape[-1], nodes.shape[-1] + 1]
+        nodes = np.concatenate([nodes, np.stack([tension, bending], axis=-1)], axis=-1)
     body = scene.solid_surface(nodes, True, scene.column("deflection"), *within)
-    places = signal_rows(body)
-    limits = signal_limits(places)
-    solids = [signal_axes(figure, panel, limits) for panel in panels]
+    places = space.signal_rows(body)
+    limits = space.signal_limits(places)
+    solids = [space.signal_axes(figure, panel, limits) for panel in panels]
     for axes in solids:
-        paint(axes, places, _SKIN, opacity=_OPACITY, flat=0.6)
+        space.paint(axes, places, _SKIN, opacity=_OPACITY, flat=0.6)
     return solids, limits
 
 
@@ -266,14 +244,6 @@ def course_scales(
         coordinate_bar(figure, rail, name, norm, marks)
         scales.append((values, norm))
     return scales
-
-
-def _gentle(nodes: Array, measured: Array) -> Array:
-    """Margin of signals within 1.5 times those of a trial; negative beyond."""
-    force, moment = _ROOM * np.nanmax(np.abs(measured[:, :2]), axis=0)
-    tension = 1.0 - np.abs(scene.values_of("Fx", nodes)) / max(force, 1e-12)
-    bending = 1.0 - scene.values_of("MB", nodes) / max(moment, 1e-15)
-    return np.stack([tension, bending], axis=-1)
 
 
 # Directions, the size that belongs to each, and the components that both make.
@@ -465,7 +435,13 @@ def _solid(figure: Figure | SubFigure, solid: xr.Dataset, plane: xr.Dataset) -> 
         depthshade=False,
         rasterized=True,
     )
-    _frame(axes, (across, along, upward))
+    axes.patch.set_visible(False)
+    axes.view_init(16.0, -25.0)
+    axes.set_box_aspect((1.0, 1.0, 1.1), zoom=1.1)
+    space.plain_frame(axes)
+    space.name_axes(axes, (-8.0, -8.0, -1.0), (across, along, upward))
+    axes.tick_params(pad=-3.0)
+    axes.tick_params(axis="z", pad=0.0)
     place = {"ax": axes, "shrink": 0.7, "aspect": 28, "pad": 0.08}
     bar = style.colour_bar(figure, dots, orientation="horizontal", extend="both", **place)
     _error_bar(bar)
@@ -482,19 +458,3 @@ def _error_bar(bar: Colorbar) -> None:
     bar.set_ticks(ticks, labels=[f"{t:g}" for t in ticks])
     bar.minorticks_off()
     bar.ax.tick_params(length=2.0, pad=1.5)
-
-
-def _frame(axes: Any, names: tuple[str, str, str]) -> None:
-    axes.patch.set_visible(False)
-    axes.view_init(16.0, -25.0)
-    axes.set_box_aspect((1.0, 1.0, 1.1), zoom=1.1)
-    for name, letter, pad in zip(names, "xyz", (-8.0, -8.0, -1.0), strict=True):
-        axis = getattr(axes, f"{letter}axis")
-        axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
-        axis.line.set(color=style.MUTED, linewidth=0.5)
-        axis._axinfo["grid"].update(color="#e2e2e2", linewidth=0.4)
-        axis.set_label_text(axis_label(name))
-        axis.labelpad = pad
-    axes.tick_params(pad=-3.0)
-    axes.tick_params(axis="z", pad=0.0)
-    axes.locator_params(nbins=4)

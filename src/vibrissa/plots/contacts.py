@@ -14,17 +14,6 @@ from numpy.typing import ArrayLike
 from vibrissa.numerics import Array
 from vibrissa.plots import style
 from vibrissa.plots.space import Body, draw_body, draw_head, head_of, one_scale
-from vibrissa.plots.style import (
-    MUTED,
-    SMALL,
-    conclude,
-    head,
-    looking,
-    new_figure,
-    say,
-    shading,
-    usable_rows,
-)
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import COORDINATES, Course, deflection_angles, robust_limits
 
@@ -238,19 +227,19 @@ def estimated_against_true(
     true, estimated, seconds, shade = _usable(true_spherical, estimated_spherical, time, shades)
     seconds = None if seconds is None else to_display("time", seconds)
     shade = None if shade is None else to_display(name, shade)
-    with looking():
-        figure = new_figure("double", 58.0 if seconds is None else 125.0, "constrained")
+    with style.looking():
+        figure = style.new_figure("double", 58.0 if seconds is None else 125.0, "constrained")
         if len(true) == 0:
-            say(figure, "no contacts")
+            style.say(figure, "no contacts")
             return figure
         rows = 1 if seconds is None else 3
         ratios = [2.1, 1.0, 1.0][:rows]
         panels = figure.subplots(rows, 3, squeeze=False, height_ratios=ratios)
-        look = shading(shade)
+        look = style.shading(shade)
         for i, axis in enumerate(COORDINATES):
             pair = to_display(axis, true[:, i]), to_display(axis, estimated[:, i])
             dots = against(panels[0, i], axis, pair, look, known_as)
-            head(panels[0, i], "abc"[i], quantity(axis).long_name)
+            style.head(panels[0, i], "abc"[i], quantity(axis).long_name)
             if seconds is not None:
                 _course(panels[1, i], axis, seconds, pair, look)
                 _errors(panels[2, i], axis, seconds, pair, look)
@@ -263,7 +252,7 @@ def estimated_against_true(
             }
             style.colour_bar(figure, dots, ax=panels, label=axis_label(name), pad=0.01, **place)
         figure.align_ylabels(panels[:, 0])
-        conclude(figure, f"{len(true)} contacts: {error_words(true, estimated, known_as)}")
+        style.conclude(figure, f"{len(true)} contacts: {error_words(true, estimated, known_as)}")
         return figure
 
 
@@ -289,7 +278,7 @@ def _usable(
     n = points[0].shape[:1]
     named = zip(("true_spherical", "estimated_spherical"), points, strict=True)
     shapes = {name: (values, (*n, 3)) for name, values in named}
-    rows = usable_rows(times[1], shapes | {"time": (times[0], n), "colour": (times[1], n)})
+    rows = style.usable_rows(times[1], shapes | {"time": (times[0], n), "colour": (times[1], n)})
     seconds, shades = (None if values is None else values[rows] for values in times)
     return points[0][rows], points[1][rows], seconds, shades
 
@@ -316,7 +305,7 @@ def against(
     """Draw an estimated coordinate against the true one."""
     true, estimated = pair
     limits = _range(*pair)
-    axes.plot(limits, limits, color=MUTED, linewidth=0.6, zorder=1)
+    axes.plot(limits, limits, color=style.MUTED, linewidth=0.6, zorder=1)
     dots = axes.scatter(true, estimated, s=4.0, zorder=2, **look)
     axes.set(xlim=limits, ylim=limits, aspect="equal")
     axes.set(xlabel=f"{known_as} {axis_label(name)}", ylabel=f"estimated {axis_label(name)}")
@@ -330,7 +319,7 @@ def _course(
     axes: Axes, name: str, time: Array, pair: tuple[Array, Array], look: dict[str, Any]
 ) -> None:
     axes.scatter(time, pair[1], s=3.0, zorder=2, **look)
-    axes.plot(*_broken(time, pair[0]), color=MUTED, linewidth=1.4, zorder=1)
+    axes.plot(*_broken(time, pair[0]), color=style.MUTED, linewidth=1.4, zorder=1)
     axes.set_ylim(*_range(*pair))
     axes.set_ylabel(axis_label(name))
     axes.tick_params(labelbottom=False)
@@ -340,7 +329,7 @@ def _errors(
     axes: Axes, name: str, time: Array, pair: tuple[Array, Array], look: dict[str, Any]
 ) -> None:
     error = _difference(name, *pair)
-    axes.axhline(0.0, color=MUTED, linewidth=0.6, zorder=1)
+    axes.axhline(0.0, color=style.MUTED, linewidth=0.6, zorder=1)
     axes.scatter(time, error, s=3.0, zorder=2, **look)
     axes.set_ylim(*1.1 * robust_limits(error, share=0.9, symmetric=True))
     axes.set(xlabel=axis_label("time"), ylabel=axis_label(f"error_{name}"))
@@ -353,7 +342,7 @@ def _errors(
 
 def _remark(axes: Axes, words: str) -> None:
     """Write a text above the upper right corner of a panel."""
-    axes.set_title(words, loc="right", fontsize=SMALL, color=MUTED, pad=3.0)
+    axes.set_title(words, loc="right", fontsize=style.SMALL, color=style.MUTED, pad=3.0)
 
 
 def _broken(time: Array, values: Array) -> tuple[Array, Array]:

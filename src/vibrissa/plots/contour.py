@@ -21,17 +21,7 @@ from matplotlib.patches import Polygon
 from numpy.typing import ArrayLike
 
 from vibrissa.numerics import Array
-from vibrissa.plots import style
-from vibrissa.plots.space import (
-    BAND,
-    Body,
-    draw_body,
-    draw_section,
-    has_band,
-    is_cylinder,
-    lies_flat,
-    outline,
-)
+from vibrissa.plots import space, style
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import robust_limits
 
@@ -46,8 +36,8 @@ _LEFT, _GAP, _BAR, _BOTTOM, _TOP = 12.0, 12.0, 15.0, 8.5, 11.0
 
 def contour_views(
     points: ArrayLike,
-    known: Body | None = None,
-    fitted: Body | None = None,
+    known: space.Body | None = None,
+    fitted: space.Body | None = None,
     *,
     colour: ArrayLike | None = None,
     colour_name: str = "deflection_angle",
@@ -115,13 +105,23 @@ def contour_views(
             across, up = places[:, view].T
             size = 5.0 if view == (0, 1) else 2.5
             dots = axes.scatter(across, up, size, zorder=3, **style.shading(shade))
-        _note_outside(panels[0], places, limits)
+        flat = places[:, :2]
+        if outside := int(((flat < limits[:2, 0]) | (flat > limits[:2, 1])).any(axis=1).sum()):
+            look_of: dict[str, Any] = {"fontsize": style.SMALL, "color": style.MUTED}
+            panels[0].set_title(f"{outside} outside", loc="right", **look_of)
         _legend(figure, panels, known, fitted, spread is not None)
         if bodies and hasattr(bodies[-1][0], "signed_distance"):
             radius = np.zeros(n) if whisker_radius is None else np.broadcast_to(whisker_radius, n)
             away = bodies[-1][0].signed_distance(np.asarray(points, dtype=np.float64)[rows])
             thing = "whisker's centreline" if whisker_radius is None else "whisker"
-            _conclude(figure, away - radius[rows], thing, bodies[-1][1])
+            median = np.nanmedian(np.abs(to_display("r", away - radius[rows])))
+            # A nanometre is rounding, of contacts that are the truth.
+            where = f"within {median:.2g} mm of" if median > 1e-6 else "on"
+            style.conclude(
+                figure,
+                f"{len(away)} contact points: in half of them the {thing} is {where} the "
+                f"{bodies[-1][1]} surface",
+            )
         if shade is not None:
             page, height = 25.4 * figure.get_size_inches()
             box = page - _BAR + 2.0, _BOTTOM, 2.0, 0.6 * (height - _BOTTOM - _TOP)
@@ -130,32 +130,21 @@ def contour_views(
         return figure
 
 
-def _conclude(figure: Figure, away: Array, thing: str, look: str) -> None:
-    """Describe the distances of contacts from the fitted or known surface."""
-    median = np.nanmedian(np.abs(to_display("r", away)))
-    # A nanometre is rounding, of contacts that are the truth.
-    where = f"within {median:.2g} mm of" if median > 1e-6 else "on"
-    style.conclude(
-        figure,
-        f"{len(away)} contact points: in half of them the {thing} is {where} the {look} surface",
-    )
-
-
 def _draw(
-    axes: Axes, body: Body, look: str, view: tuple[int, int], places: Array, limits: Array
+    axes: Axes, body: space.Body, look: str, view: tuple[int, int], places: Array, limits: Array
 ) -> None:
     """Draw an object in one view, except for fitted surfaces that face the view."""
     middle = np.median(places, axis=0)
-    if is_cylinder(body):
-        shown = outline(body, view, float(middle[2]), limits)
+    if space.is_cylinder(body):
+        shown = space.outline(body, view, float(middle[2]), limits)
         axes.add_patch(Polygon(shown, closed=True, **_LOOKS[look]))
     elif look == "true" and view != (0, 1):
-        draw_body(axes, body, view, limits, look)
-    elif look == "true" or not lies_flat(body, view, places):
+        space.draw_body(axes, body, view, limits, look)
+    elif look == "true" or not space.lies_flat(body, view, places):
         if hasattr(body, "radius"):  # a sphere's outline is its section through the centre
             middle = to_display("object_position", getattr(body, "origin"))  # noqa: B009
         depth = float(middle[3 - sum(view)])
-        draw_section(axes, body, view, depth, limits, look)
+        space.draw_section(axes, body, view, depth, limits, look)
     axes.set(xlim=limits[view[0]], ylim=limits[view[1]])
 
 
@@ -175,7 +164,7 @@ _FITTED: dict[str, Any] = {
 _LOOKS = {"true": _PEG, "fitted": _FITTED}
 
 
-def _limits(places: Array, body: Body | None) -> Array:
+def _limits(places: Array, body: space.Body | None) -> Array:
     """Limits (3, 2), mm, equally wide along x and y, and suitable for round objects."""
     limits = np.array([robust_limits(c) for c in places.T])
     radius = float(to_display("object_radius", getattr(body, "radius", np.nan)))
@@ -241,29 +230,22 @@ def _ellipses(axes: Axes, places: Array, spread: Array, view: tuple[int, int]) -
     )
 
 
-def _note_outside(axes: Axes, places: Array, limits: Array) -> None:
-    flat = places[:, :2]
-    outside = int(((flat < limits[:2, 0]) | (flat > limits[:2, 1])).any(axis=1).sum())
-    if outside:
-        axes.set_title(f"{outside} outside", loc="right", fontsize=style.SMALL, color=style.MUTED)
-
-
 def _legend(
     figure: Figure,
     panels: list[Axes],
-    known: Body | None,
-    fitted: Body | None,
+    known: space.Body | None,
+    fitted: space.Body | None,
     spread: bool,
 ) -> None:
     handles: list[Line2D | Polygon] = []
     corner = np.zeros((1, 2))
     if known is not None:
-        name = "peg" if is_cylinder(known) else "object"
+        name = "peg" if space.is_cylinder(known) else "object"
         handles.append(Polygon(corner, label=f"{name}{_across(known)}", **_PEG))
     if fitted is not None:
         handles.append(Polygon(corner, label=f"fitted{_across(fitted)}", **_FITTED))
-        if has_band(fitted):
-            handles.append(Polygon(corner, label="95 % band", **BAND))
+        if space.has_band(fitted):
+            handles.append(Polygon(corner, label="95 % band", **space.BAND))
     if spread:
         look: dict[str, Any] = {"marker": "o", "markerfacecolor": "none", "linestyle": "none"}
         handles.append(Line2D([], [], color=style.MUTED, label="95 % ellipses", **look))
@@ -278,7 +260,7 @@ def _legend(
         )
 
 
-def _across(body: Body) -> str:
+def _across(body: space.Body) -> str:
     """Diameter of a shape, if it has one."""
     radius = getattr(body, "radius", None)
     return "" if radius is None else f", {2.0 * float(to_display('object_radius', radius)):.2f} mm"

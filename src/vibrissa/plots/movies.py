@@ -23,29 +23,8 @@ from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.numerics import Array, spherical
-from vibrissa.plots import style
+from vibrissa.plots import overview, space, style
 from vibrissa.plots.contact_surfaces import course_scales, solid_panels
-from vibrissa.plots.overview import (
-    Sight,
-    Window,
-    curve_legend,
-    curves_over_time,
-    part_of,
-    scale_bar,
-    seen,
-    sight_axes,
-)
-from vibrissa.plots.space import (
-    Body,
-    bounds,
-    coloured_segments,
-    name_axes,
-    one_scale,
-    outline_segments,
-    room_for,
-    signal_places,
-    space_axes,
-)
 from vibrissa.quantities import axis_label, to_display
 from vibrissa.scene import TRIPLET, Course
 
@@ -206,10 +185,10 @@ class _Sight(NamedTuple):
 def contour_frames(
     course: Course,
     centerline: ArrayLike,
-    sights: Sequence[Sight],
+    sights: Sequence[overview.Sight],
     rows: ArrayLike,
-    bodies: Sequence[Body] = (),
-    fitted: Sequence[Body] = (),
+    bodies: Sequence[space.Body] = (),
+    fitted: Sequence[space.Body] = (),
 ) -> Iterator[Picture]:
     """Draw the frames of a movie: camera views, and a contour that grows contact by contact.
 
@@ -257,9 +236,9 @@ def _contour_frames(
     course: Course,
     places: Array,
     centerline: ArrayLike,
-    sights: Sequence[Sight],
+    sights: Sequence[overview.Sight],
     rows: Any,
-    bodies: tuple[Sequence[Body], Sequence[Body]],
+    bodies: tuple[Sequence[space.Body], Sequence[space.Body]],
 ) -> Iterator[Picture]:
     first, last = int(rows[0]), int(rows[-1])
     span = slice(first, last + 1)
@@ -275,10 +254,15 @@ def _contour_frames(
             parts.append(part)
             clouds.append(cloud)
             outlines += [(outline, cloud.places) for outline in lines_of]
-        _bar(figure, norm)
+        rail = style.box_axes(figure, _RAIL)
+        style.colour_bar(figure, ScalarMappable(norm, style.sequential()), cax=rail)
+        rail.set_title(axis_label("time"), pad=4.0)
+        rail.tick_params(length=2.0, pad=1.5)
         clock = figure.text(0.0125, 0.985, "", va="top", fontsize=style.LARGE, animated=True)
         screen = Screen(figure)
-    windows = [Window(low, high, size, screen.pixels(axes)) for axes, low, high, size in panels]
+    windows = [
+        overview.Window(low, high, size, screen.pixels(axes)) for axes, low, high, size in panels
+    ]
     streams = [iter(sight.images) for sight in sights]
     colours = style.sequential()(norm(time))
     before = first - 1
@@ -311,17 +295,17 @@ def _contour_frames(
 
 
 def _views(
-    figure: Figure, course: Course, sights: Sequence[Sight], span: slice
+    figure: Figure, course: Course, sights: Sequence[overview.Sight], span: slice
 ) -> tuple[list[_Sight], list[_Part]]:
     """Create panels for the camera views."""
     panels, parts = [], []
     views = [sight.view for sight in sights]
     for number, (view, box) in enumerate(zip(views, _SIGHT_BOXES, strict=False)):
-        lines, dots = seen(course, views, number)
-        low, high = part_of(lines[span], box[2:], view.size)
-        axes = sight_axes(figure, box, low, high)
+        lines, dots = overview.seen(course, views, number)
+        low, high = overview.part_of(lines[span], box[2:], view.size)
+        axes = overview.sight_axes(figure, box, low, high)
         axes.set_title(view.name, loc="right", pad=2.0)
-        scale_bar(axes, course, view)
+        overview.scale_bar(axes, course, view)
         line = moving_line(axes, **style.TRACE)
         dot = moving_line(axes, **_CONTACT)
         panels.append(_Sight(axes, low, high, view.size))
@@ -340,8 +324,8 @@ def _about_whisker(
     if course.centerline is not None:
         lines = to_display("centerline", course.at_base(course.centerline))
     shown = [rest, points[span].reshape(-1, 3), lines[span][course.touching[span]].reshape(-1, 3)]
-    axes = space_axes(figure, _SPACE_BOX, bounds(np.concatenate(shown)), zoom=0.9)
-    name_axes(axes, (-7.0, -8.0, -9.0))
+    axes = space.space_axes(figure, _SPACE_BOX, space.bounds(np.concatenate(shown)), zoom=0.9)
+    space.name_axes(axes, (-7.0, -8.0, -9.0))
     axes.plot(*rest.T, color="black", linewidth=1.2)
     figure.text(0.72, 0.958, "contacts about the resting whisker", va="top")
     cloud = CircleCollection(
@@ -361,19 +345,19 @@ def _sides(
     figure: Figure,
     course: Course,
     places: Array,
-    bodies: tuple[Sequence[Body], Sequence[Body]],
+    bodies: tuple[Sequence[space.Body], Sequence[space.Body]],
     span: slice,
 ) -> Iterator[tuple[_Part, _Cloud, list[_Outline]]]:
     """Draw contacts in the laboratory from three sides; yield panels with hidden outlines."""
     points = to_display("contact_point", places)
     known = points[span][np.isfinite(points[span]).all(axis=1)]
-    limits = room_for(known, [*bodies[0], *bodies[1]])
+    limits = space.room_for(known, [*bodies[0], *bodies[1]])
     sizes = [box[2:] for box in _SIDE_BOXES]
     count = len(course.time)
     line = np.full((count, 2, 3), np.nan)
     if course.centerline is not None:
         line = to_display("centerline", course.centerline)
-    ends = one_scale(limits, _SIDES, sizes)
+    ends = space.one_scale(limits, _SIDES, sizes)
     for view, both, box, title in zip(
         _SIDES, ends, _SIDE_BOXES, ("from above", "from the front", "from the side"), strict=True
     ):
@@ -385,7 +369,7 @@ def _sides(
         window[list(view)] = both
         reach = _REVEALED * float(np.ptp(both[0]))
         outlines = [
-            _Outline(axes, outline_segments(body, view, window), reach, look)
+            _Outline(axes, space.outline_segments(body, view, window), reach, look)
             for group, look in zip(bodies, _OUTLINES, strict=True)
             for body in group
         ]
@@ -406,13 +390,6 @@ def _sides(
 def _dot_size(count: int) -> float:
     """Area of the markers for a number of contacts, square points."""
     return float(np.clip(7.0 * (300.0 / max(count, 1)) ** 0.7, 1.5, 7.0))
-
-
-def _bar(figure: Figure, norm: Normalize) -> None:
-    rail = style.box_axes(figure, _RAIL)
-    style.colour_bar(figure, ScalarMappable(norm, style.sequential()), cax=rail)
-    rail.set_title(axis_label("time"), pad=4.0)
-    rail.tick_params(length=2.0, pad=1.5)
 
 
 _TRAIL = 0.05  # duration of the path behind the dot that is drawn bold, s
@@ -474,20 +451,20 @@ def _signal_frames(
         measured[~course.touching] = np.nan
         span = slice(first, last + 1)
         solids, _ = solid_panels(figure, samples, centerline, panels, measured[span])
-        places = signal_places(*measured.T)
+        places = space.signal_places(*measured.T)
         ways = [flattened(axes, places) for axes in solids]
         points = course.known if course.estimated is None else course.estimated
         coordinates = np.full(places.shape, np.nan) if points is None else spherical(points)
         scales = course_scales(figure, rails, coordinates[span])
         for axes, way, (shade, norm) in zip(solids, ways, scales, strict=True):
-            segments, means = coloured_segments(way[span], shade)
+            segments, means = space.coloured_segments(way[span], shade)
             path = LineCollection(
                 list(segments), cmap=style.sequential(), norm=norm, linewidths=1.0
             )
             path.set(array=means, transform=axes.transData, clip_on=False)
             figure.add_artist(path)
-        curves = curves_over_time(figure, _BOXES, course, signals, span)
-        curve_legend(figure, course, (1.0 - 2.0 / WIDTH, 48.0 / HEIGHT))
+        curves = overview.curves_over_time(figure, _BOXES, course, signals, span)
+        overview.curve_legend(figure, course, (1.0 - 2.0 / WIDTH, 48.0 / HEIGHT))
         dot_look = {"marker": "o", "color": style.ORANGE}
         cursors = [
             curve.axes.axvline(time[first], color=style.ORANGE, linewidth=0.8, animated=True)

@@ -167,7 +167,10 @@ def _panel(axes: Axes, contacts: _Contacts, coordinate: str, name: str, *, small
     x, y = contacts.signals[name][kept], contacts.derivatives[coordinate, name][kept]
     weight, backward = contacts.weight[kept], contacts.backward[kept]
     direction = name in DIRECTIONS
-    limits = np.array([-180.0, 180.0]) if direction else _limits(x, weight)
+    central = np.array([0.5 - SHARE / 2, 0.5 + SHARE / 2])
+    limits = np.array([-180.0, 180.0])
+    if not direction:
+        limits = robust_limits(weighted_quantile(x, weight, central), 1.0)  # never equal
     bend = _bend(x, weight, direction)
     axes.axhline(0.0, color=style.MUTED, linewidth=0.5, zorder=0)
     edges = _edges(limits, bend)
@@ -183,16 +186,14 @@ def _panel(axes: Axes, contacts: _Contacts, coordinate: str, name: str, *, small
     heights = robust_limits(np.concatenate(bands, axis=1), 1.0)
     style.scale_near_zero(axes, "x", limits, bend)
     axes.set_ylim(*heights)
-    _ticks(axes, direction, bend, small)
+    if direction:
+        axes.set_xticks([-180.0, 0.0, 180.0] if small else [-180.0, -90.0, 0.0, 90.0, 180.0])
+    elif bend is None:
+        axes.xaxis.set_major_locator(MaxNLocator(3 if small else 5))
+    axes.yaxis.set_major_locator(MaxNLocator(4 if small else 5))
     axes.set_ylabel(
         derivative_label(coordinate, name), labelpad=1.0, fontsize=6.0 if small else 7.0
     )
-
-
-def _limits(values: Array, weight: Array) -> Array:
-    """Limits of the central share of the values; never equal."""
-    ends = weighted_quantile(values, weight, np.array([0.5 - SHARE / 2, 0.5 + SHARE / 2]))
-    return robust_limits(ends, 1.0)
 
 
 def _bend(x: Array, weight: Array, direction: bool) -> float | None:
@@ -226,11 +227,3 @@ def _spread(x: Array, y: Array, weight: Array, edges: Array) -> tuple[Array, Arr
             middle[k] = np.median(x[rows])
             curves[:, k] = weighted_quantile(y[rows], weight[rows], _SHARES)
     return middle, curves
-
-
-def _ticks(axes: Axes, direction: bool, bend: float | None, small: bool) -> None:
-    if direction:
-        axes.set_xticks([-180.0, 0.0, 180.0] if small else [-180.0, -90.0, 0.0, 90.0, 180.0])
-    elif bend is None:
-        axes.xaxis.set_major_locator(MaxNLocator(3 if small else 5))
-    axes.yaxis.set_major_locator(MaxNLocator(4 if small else 5))

@@ -27,7 +27,6 @@ from vibrissa.plots.space import (
     painted,
     space_axes,
 )
-from vibrissa.plots.style import BLUE, INK, SHADE, Width, conclude, head, looking, new_figure, say
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.recording import Group
 from vibrissa.scene import DIRECTIONS
@@ -41,7 +40,7 @@ def signals_over_time(
     truth: xr.Dataset | None = None,
     *,
     whisker: int = 0,
-    width: Width = "double",
+    width: style.Width = "double",
 ) -> Figure:
     """Draw the six signals over time, forces on the left and moments on the right."""
     names = [name for column in _COLUMNS for name in column]
@@ -62,19 +61,19 @@ def signals_over_time(
         touching = signals["in_contact"].to_numpy().astype(np.float64)
         contact = np.asarray(np.nan_to_num(touching) > 0.5)
         spans = intervals(time, contact, seen)
-    with looking():
+    with style.looking():
         layout: tuple[int, int, float] = (3, 2, 92.0) if width == "double" else (6, 1, 130.0)
-        figure = new_figure(width, layout[2], "constrained")
+        figure = style.new_figure(width, layout[2], "constrained")
         if time.size == 0:
-            say(figure, "no signals")
+            style.say(figure, "no signals")
             return figure
         panels = figure.subplots(*layout[:2], sharex=True, squeeze=False)
         # Forces in the left column and moments in the right one; or one below the other.
         for axes, name, letter in zip(panels.T.flat, names, "abcdef", strict=True):
             _panel(axes, name, signals, truth, contact)
             for begin, end in spans:
-                axes.axvspan(begin, end, color=SHADE, linewidth=0.0, zorder=0)
-            head(axes, letter, quantity(name).long_name)
+                axes.axvspan(begin, end, color=style.SHADE, linewidth=0.0, zorder=0)
+            style.head(axes, letter, quantity(name).long_name)
         for axes in panels[-1]:
             axes.set_xlabel(axis_label("time"))
             axes.set_xlim(time.min(), time.max() if time.size > 1 else time.min() + 1.0)
@@ -91,7 +90,7 @@ def signals_over_time(
             "" if contact is None else f" in {len(spans)} contact{'' if len(spans) == 1 else 's'}"
         )
         if largest:
-            conclude(figure, f"{' and '.join(largest)}{count}")
+            style.conclude(figure, f"{' and '.join(largest)}{count}")
         return figure
 
 
@@ -118,12 +117,12 @@ def _panel(
         {"marker": ".", "markersize": 1.6, "linestyle": "none"} if name in DIRECTIONS else {}
     )
     if name in signals:
-        axes.plot(time, _drawn(name, signals, contact), color=BLUE, zorder=2, **look)
+        axes.plot(time, _drawn(name, signals, contact), color=style.BLUE, zorder=2, **look)
     if truth is not None and name in truth:
         look["markersize"] = 0.8
         line = {"linewidth": 0.4} if name not in DIRECTIONS else look
         values = _drawn(name, truth, contact)
-        axes.plot(time, values, color=INK, zorder=3, **line)
+        axes.plot(time, values, color=style.INK, zorder=3, **line)
     axes.set_ylabel(axis_label(name))
     if name in DIRECTIONS:
         axes.set_ylim(-190.0, 190.0)
@@ -141,20 +140,16 @@ def _drawn(name: str, data: xr.Dataset, contact: Mask | None) -> Array:
 def _legend(figure: Figure, truth: bool, contact: bool) -> None:
     handles: list[Line2D | Patch] = []
     if truth:
-        handles += [Line2D([], [], color=BLUE, label="measured")]
-        handles += [Line2D([], [], color=INK, linewidth=0.4, label="true")]
+        handles += [Line2D([], [], color=style.BLUE, label="measured")]
+        handles += [Line2D([], [], color=style.INK, linewidth=0.4, label="true")]
     if contact:
-        handles += [Patch(facecolor=SHADE, label="in contact")]
+        handles += [Patch(facecolor=style.SHADE, label="in contact")]
     if handles:
         figure.legend(handles=handles, loc="outside upper right", ncols=len(handles))
 
 
-_SKIN = (
-    0.80,
-    0.85,
-    0.90,
-    1.0,
-)  # colour of the reachable space where it does not represent a signal
+# Colour of the reachable space where it does not represent a signal.
+_SKIN = (0.80, 0.85, 0.90, 1.0)
 _TITLES = {"FD": "direction of $F_T$", "MD": "direction of $M_B$"}
 
 
@@ -213,7 +208,10 @@ def signal_clouds(
     ValueError
         If the dataset lacks something, or if there is no such width.
     """
-    nodes = scene.sample_contacts(samples, centerline, _kept(elevation, azimuth))
+    # The bearings that remain when the quarter facing the viewer is removed.
+    toward = float(np.arctan2(np.sign(elevation), np.sign(np.sin(np.radians(azimuth)))))
+    kept = toward + np.pi / 4.0, toward + 7.0 * np.pi / 4.0
+    nodes = scene.sample_contacts(samples, centerline, kept)
     whole = scene.sample_contacts(samples, centerline)
     outside = scene.column("deflection")
     triangles = scene.solid_surface(nodes, False, outside)
@@ -228,20 +226,29 @@ def signal_clouds(
             style.corner_title(
                 figure, cell, "cdefgh"[i], _TITLES.get(name, quantity(name).long_name)
             )
-            norm, colours, ends = _scale(name, to_display(name, scene.values_of(name, whole)))
-            axes = space_axes(figure, _square(cell), limits, view, zoom=0.97, frame=False)
-            body = (
-                scene.subdivide(triangles, _turning(name, triangles))
-                if name in scene.DIRECTIONS
-                else triangles
-            )
+            every = to_display(name, scene.values_of(name, whole))
+            norm, colours = style.scale_of(name, every)
+            # 3D axes are square and reach beyond their panel.
+            left, bottom, side = cell[0] - 0.07 * cell[2], cell[1] + 0.5 * cell[3], 1.1 * cell[2]
+            square = left, bottom - 0.5 * side, side, side
+            axes = space_axes(figure, square, limits, view, zoom=0.97, frame=False)
+            body = triangles
+            if name in scene.DIRECTIONS:
+                # Where a force reverses, directions differ much within a triangle.
+                turn = scene.values_of(name, triangles)
+                gap = np.abs(np.angle(np.exp(1j * (turn - np.roll(turn, 1, axis=1)))))
+                body = scene.subdivide(triangles, gap.max(axis=1) > np.pi / 4.0)
             shown = to_display(name, scene.values_of(name, body))
-            if name == "Mx" and _vanishes(whole):
-                _body(axes, triangles, np.array(_SKIN), line)
-                _say_zero(figure, cell)
+            bending = np.abs(scene.values_of("MB", whole)).max()
+            if name == "Mx" and np.abs(scene.values_of("Mx", whole)).max() < 1e-9 * bending:
+                _body(axes, triangles, np.array(_SKIN), line)  # as of a straight whisker
+                wide, tall = 25.4 * figure.get_size_inches()
+                x, y = (cell[0] + 0.5 * cell[2]) / wide, (cell[1] + 6.0) / tall
+                figure.text(x, y, "$M_x = 0$ everywhere", ha="center", va="center")
                 continue
             _body(axes, body, _mean(name, shown, norm, colours), line)
-            _bar(figure, cell, norm, colours, ends, name)
+            ends = 2 * (every.min() < (norm.vmin or 0.0)) + (every.max() > (norm.vmax or 0.0))
+            _bar(figure, cell, norm, colours, ("neither", "max", "min", "both")[ends], name)
         _pulled(figure, sheet.signals[0], nodes, line, view)
         style.conclude(figure, _finding(whole))
         return figure
@@ -257,19 +264,6 @@ def _finding(nodes: Array) -> str:
         f"Contacts {near} to {far} mm from the base have $F_x$ from {push} to {pull} µN and $M_B$ "
         f"up to {bend} µN·m (98 % of the samples)"
     ).replace("-", "−")
-
-
-def _kept(elevation: float, azimuth: float) -> tuple[float, float]:
-    """Bearings that remain when the quarter facing the viewer is removed."""
-    toward = np.arctan2(np.sign(elevation), np.sign(np.sin(np.radians(azimuth))))
-    return float(toward + np.pi / 4.0), float(toward + 7.0 * np.pi / 4.0)
-
-
-def _turning(name: str, triangles: Array) -> Mask:
-    """Whether a direction differs by more than 45° within a triangle, as where a force reverses."""
-    turn = scene.values_of(name, triangles)
-    gap = np.abs(np.angle(np.exp(1j * (turn - np.roll(turn, 1, axis=1)))))
-    return np.asarray(gap.max(axis=1) > np.pi / 4.0)
 
 
 def _mean(name: str, values: Array, norm: Normalize, colours: Colormap) -> Array:
@@ -303,39 +297,22 @@ def _reach(
     front = space_axes(figure, box, limits, (0.0, 0.0), zoom=1.35, frame=False)
     front.set_proj_type("ortho")
     _body(front, triangles, colours, line, 0.55)
-    _cross(front, limits)
+    # Bars of 5 mm along y and z at the lower left of the view from the tip.
+    corner = np.array([limits[0, 1], limits[1, 0] - 1.0, limits[2, 0]])
+    for i, name in ((1, "y"), (2, "z")):
+        end = corner.copy()
+        end[i] += 5.0
+        front.plot(*np.stack([corner, end]).T, color=style.INK, linewidth=0.8, zorder=11)
+        end[i] += 1.6
+        front.text(*end, f"${name}$", fontsize=style.SMALL, ha="center", va="center")
+    corner += np.array([0.0, 2.0, -2.6])
+    front.text(*corner, "5 mm", fontsize=style.SMALL, ha="center", va="center")
     style.corner_title(figure, sheet.front, "b", "from the tip")
 
 
 def _body(axes: Any, triangles: Array, colours: Array, line: Array, flat: float = 0.75) -> None:
     paint(axes, contact_points(triangles), colours, flat=flat)
     axes.plot(*line.T, color="black", linewidth=1.2, zorder=10, solid_capstyle="round")
-
-
-def _cross(axes: Any, limits: Array) -> None:
-    """Bars of 5 mm along y and z at the lower left of the view from the tip."""
-    corner = np.array([limits[0, 1], limits[1, 0] - 1.0, limits[2, 0]])
-    for i, name in ((1, "y"), (2, "z")):
-        end = corner.copy()
-        end[i] += 5.0
-        axes.plot(*np.stack([corner, end]).T, color=style.INK, linewidth=0.8, zorder=11)
-        end[i] += 1.6
-        axes.text(*end, f"${name}$", fontsize=style.SMALL, ha="center", va="center")
-    corner += np.array([0.0, 2.0, -2.6])
-    axes.text(*corner, "5 mm", fontsize=style.SMALL, ha="center", va="center")
-
-
-def _vanishes(nodes: Array) -> bool:
-    """Whether there is no twisting moment, as for a straight whisker."""
-    twist, bend = (np.abs(scene.values_of(name, nodes)).max() for name in ("Mx", "MB"))
-    return bool(twist < 1e-9 * bend)
-
-
-def _say_zero(figure: Figure, cell: style.Box) -> None:
-    wide, tall = 25.4 * figure.get_size_inches()
-    left, bottom, width, _ = cell
-    place = (left + 0.5 * width) / wide, (bottom + 6.0) / tall
-    figure.text(*place, "$M_x = 0$ everywhere", ha="center", va="center")
 
 
 def _pulled(
@@ -365,21 +342,6 @@ def _pulled(
     rail.xaxis.set_ticks_position("top")
     bar.set_ticks([0.0, values.max()], labels=["$F_x$ > 0", f"{values.max():.2g} µN"])
     rail.tick_params(length=0.0, pad=1.0)
-
-
-def _scale(name: str, values: Array) -> tuple[Normalize, Colormap, str]:
-    """Limits and colormap of a signal, and the ends of the map that are exceeded."""
-    norm, colours = style.scale_of(name, values)
-    low, high = norm.vmin or 0.0, norm.vmax or 0.0
-    ends = ("neither", "max", "min", "both")[2 * (values.min() < low) + (values.max() > high)]
-    return norm, colours, ends
-
-
-def _square(cell: style.Box) -> style.Box:
-    """The room of a panel for its 3D axes, which are square and reach beyond it."""
-    left, bottom, width, height = cell
-    side = 1.1 * width
-    return left - 0.07 * width, bottom + 0.50 * height - 0.5 * side, side, side
 
 
 def _bar(

@@ -54,21 +54,26 @@ def space_axes(
     if not frame:
         axes.set_axis_off()
         return axes
+    plain_frame(axes)
+    axes.tick_params(pad=-4.0)
+    return axes
+
+
+def plain_frame(axes: Any) -> None:
+    """Draw the frame of three-dimensional axes with thin lines and few ticks."""
     for name in "xyz":
         axis = getattr(axes, f"{name}axis")
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
         axis.line.set(color=INK, linewidth=0.5)
         axis._axinfo["grid"].update(color="#e2e2e2", linewidth=0.4)
         axis._axinfo["tick"].update(inward_factor=0.0, outward_factor=0.25)
-    axes.tick_params(pad=-4.0)
     axes.locator_params(nbins=4)
-    return axes
 
 
-def name_axes(axes: Any, pads: Sequence[float] = (-9.0, -10.0, -11.0)) -> None:
-    """Label the axes x, y and z."""
-    for name, pad in zip("xyz", pads, strict=True):
-        axis = getattr(axes, f"{name}axis")
+def name_axes(axes: Any, pads: Sequence[float], names: Sequence[str] = "xyz") -> None:
+    """Label the axes."""
+    for letter, name, pad in zip("xyz", names, pads, strict=True):
+        axis = getattr(axes, f"{letter}axis")
         axis.set_label_text(axis_label(name))
         axis.labelpad = pad
 
@@ -103,7 +108,10 @@ def paint(
     normal = np.cross(sized[:, 1] - sized[:, 0], sized[:, 2] - sized[:, 0])
     length = np.linalg.norm(normal, axis=1)
     kept = length > 1e-12 * length.max(initial=1e-300)
-    lit = np.abs(normal[kept] @ _light(axes.elev, axes.azim)) / length[kept]
+    # The light comes from above the viewer's left shoulder.
+    e, a = np.radians(axes.elev + 25.0), np.radians(axes.azim - 30.0)
+    light = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    lit = np.abs(normal[kept] @ light) / length[kept]
     rgba = np.broadcast_to(np.asarray(colours, dtype=np.float64), (len(triangles), 4))[kept].copy()
     rgba[:, :3] *= (flat + (1.0 - flat) * lit)[:, None]
     rgba[:, 3] = opacity
@@ -116,12 +124,6 @@ def paint(
         rasterized=True,
     )
     axes.add_collection3d(surface, autolim=False)
-
-
-def _light(elevation: float, azimuth: float) -> Array:
-    """Direction of the light, from above the viewer's left shoulder."""
-    e, a = np.radians(elevation + 25.0), np.radians(azimuth - 30.0)
-    return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
 
 
 _VIEW = (16.0, -152.0)

@@ -354,15 +354,6 @@ _RGB_FROM_LMS = np.array(
 )
 
 
-def _srgb(lab: Array) -> Array:
-    """SRGB (..., 3) in [0, 1] of OKLab (..., 3)."""
-    linear = np.clip((lab @ _LMS_FROM_LAB.T) ** 3 @ _RGB_FROM_LMS.T, 0.0, 1.0)
-    encoded: Array = np.where(
-        linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055
-    )
-    return encoded
-
-
 def cyclic() -> Colormap:
     """Create a cyclic colormap for directions from −π to π."""
     quarters = np.arange(len(_QUARTERS) + 1)
@@ -373,7 +364,10 @@ def cyclic() -> Colormap:
     # Equal steps of colour within each quarter, so that the four directions keep their colours.
     share = np.interp(along, np.interp(quarters, fine, along), quarters)
     turns = np.linspace(0.0, quarters[-1], 512, endpoint=False)
-    return ListedColormap(_srgb(curve(np.interp(turns, share, fine))), name="vibrissa_cyclic")
+    lab = curve(np.interp(turns, share, fine))
+    linear = np.clip((lab @ _LMS_FROM_LAB.T) ** 3 @ _RGB_FROM_LMS.T, 0.0, 1.0)
+    srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
+    return ListedColormap(srgb, name="vibrissa_cyclic")
 
 
 def sequential() -> Colormap:

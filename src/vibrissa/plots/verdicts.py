@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Wedge
 from matplotlib.ticker import NullLocator
-from numpy.typing import NDArray
 
 from vibrissa.numerics import Array
 from vibrissa.plots import style
@@ -419,7 +418,9 @@ def critical_cones(cones: xr.Dataset, *, width: style.Width = "double") -> Figur
             aspect=35,
             pad=0.03,
         )
-        bar.set_label(_cone_label(degrees))
+        dots = "; dots: none" if (degrees == 0.0).any() else ""
+        hatched = "" if np.isfinite(degrees).all() else "; hatched: not computed"
+        bar.set_label(f"critical cone (°){dots}{hatched}")
         bar.ax.axvline(PAPERS_CONE, color=style.INK, linewidth=0.9)
         return figure
 
@@ -460,29 +461,16 @@ def _contours(axes: Axes, x: Array, y: Array, degrees: Array, high: float) -> No
     if not levels:
         return
     widths = [1.1 if level == PAPERS_CONE else 0.5 for level in levels]
-    shown = np.ma.masked_array(degrees, ~np.isfinite(degrees) | _exceptional(degrees))
-    lines = axes.contour(x, y, shown, levels=levels, colors=style.INK, linewidths=widths)
-    axes.clabel(lines, fmt=lambda value: f"{value:g}°", fontsize=style.SMALL, inline_spacing=2)
-
-
-def _exceptional(degrees: Array) -> NDArray[np.bool_]:
-    """Whether the cone of a whisker is far above a neighbour's, as of straight ones and cylinders.
-
-    There a triplet loses a dimension abruptly, so that contours are not drawn there.
-    """
-    out = np.zeros(degrees.shape, dtype=bool)
-    for grid, marks in ((degrees, out), (degrees.T, out.T)):
+    # The cones of straight whiskers and of cylinders are far above those of their neighbours: a
+    # triplet loses a dimension abruptly there, and contours are not drawn.
+    exceptional = np.zeros(degrees.shape, dtype=bool)
+    for grid, marks in ((degrees, exceptional), (degrees.T, exceptional.T)):
         rise = np.diff(grid, axis=0)
         marks[1:] |= rise > _JUMP
         marks[:-1] |= -rise > _JUMP
-    return out
-
-
-def _cone_label(degrees: Array) -> str:
-    label = "critical cone (°)"
-    if (degrees == 0.0).any():
-        label += "; dots: none"
-    return label if np.isfinite(degrees).all() else f"{label}; hatched: not computed"
+    shown = np.ma.masked_array(degrees, ~np.isfinite(degrees) | exceptional)
+    lines = axes.contour(x, y, shown, levels=levels, colors=style.INK, linewidths=widths)
+    axes.clabel(lines, fmt=lambda value: f"{value:g}°", fontsize=style.SMALL, inline_spacing=2)
 
 
 def _edges(centres: Array) -> Array:

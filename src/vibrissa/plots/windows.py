@@ -10,14 +10,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from matplotlib.backend_bases import Event, KeyEvent, MouseEvent
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.io import Clicks, ViewClicks
+from vibrissa.io import Clicks, FrameReader, ViewClicks
 from vibrissa.numerics import Array
 from vibrissa.plots.style import BLUE, GREEN, ORANGE, RED
 
@@ -33,14 +33,43 @@ HELP = (
 _SAME = 2.0  # clicks nearer than this to another point are double clicks, pixels
 
 
-class Frames(Protocol):
-    """Frames by number, such as a list or `vibrissa.io.FrameReader`."""
-
-    def __getitem__(self, number: int, /) -> NDArray[np.uint8]:
-        """Give a frame; an ``IndexError`` where there is none."""
+Frames = FrameReader | Sequence[NDArray[np.uint8]]  # by number; an ``IndexError`` beyond the last
 
 
-class Correction:
+class _Window:
+    """Figure with images in which clicks and keys are handled; a base class."""
+
+    figure: Figure
+
+    def _listen(self) -> None:
+        self.figure.canvas.mpl_connect("button_press_event", self._clicked)
+        self.figure.canvas.mpl_connect("key_press_event", self._key)
+
+    def _clicked(self, event: Event) -> None:
+        assert isinstance(event, MouseEvent)
+        toolbar = getattr(self.figure.canvas, "toolbar", None)
+        if event.inaxes is None or (toolbar is not None and toolbar.mode):
+            return
+        assert event.xdata is not None
+        assert event.ydata is not None
+        image = self.figure.axes.index(event.inaxes)
+        self._click(image, float(event.xdata), float(event.ydata), int(event.button or 0))
+
+    def _key(self, event: Event) -> None:
+        assert isinstance(event, KeyEvent)
+        self._pressed(event.key or "")
+
+    def _click(self, image: int, x: float, y: float, button: int) -> None:
+        """Handle a click in an image."""
+
+    def _pressed(self, key: str) -> None:
+        """Handle a key."""
+
+    def close(self, event: Any = None) -> None:
+        """Save unsaved changes; to be called when the window is closed."""
+
+
+class Correction(_Window):
     """Corrected points of one view, and the figure for editing them."""
 
     def __init__(
@@ -72,8 +101,7 @@ class Correction:
         (self._line,) = self._axes.plot([], [], "o-", color=ORANGE, ms=4, lw=0.8, mfc="none")
         (self._base,) = self._axes.plot([], [], "o", color=GREEN, ms=5)
         self.figure.text(0.5, 0.03, HELP, ha="center", va="center", fontsize=7)
-        self.figure.canvas.mpl_connect("button_press_event", self._clicked)
-        self.figure.canvas.mpl_connect("key_press_event", self._pressed)
+        self._listen()
         self._draw()
 
     @property
@@ -185,21 +213,13 @@ class Correction:
         self._said = ""
         self.figure.canvas.draw_idle()
 
-    def _clicked(self, event: Event) -> None:
-        assert isinstance(event, MouseEvent)
-        toolbar = getattr(self.figure.canvas, "toolbar", None)
-        if event.inaxes is not self._axes or (toolbar is not None and toolbar.mode):
-            return
-        assert event.xdata is not None
-        assert event.ydata is not None
-        if event.button == 1:
-            self.add(float(event.xdata), float(event.ydata))
-        elif event.button == 3:
-            self.remove(float(event.xdata), float(event.ydata))
+    def _click(self, image: int, x: float, y: float, button: int) -> None:
+        if button == 1:
+            self.add(x, y)
+        elif button == 3:
+            self.remove(x, y)
 
-    def _pressed(self, event: Event) -> None:
-        assert isinstance(event, KeyEvent)
-        key = event.key or ""
+    def _pressed(self, key: str) -> None:
         if key.isdigit():
             self.choose(int(key))
         elif key in _STEPS:
@@ -208,7 +228,7 @@ class Correction:
             getattr(self, _KEYS[key])()
 
     def close(self, event: Any = None) -> None:
-        """Save unsaved changes; to be called when the window is closed."""
+        """Save unsaved changes."""
         if self.changed:
             self.save()
 
@@ -231,11 +251,6 @@ _KEYS: Mapping[str, str] = MappingProxyType(
         "escape": "discard",
     }
 )
-
-
-class _Window(Protocol):
-    def close(self, event: Any = None) -> None:
-        """Save unsaved changes."""
 
 
 W = TypeVar("W", bound=_Window)
@@ -358,8 +373,8 @@ class Picks:
 
 
 @dataclass(eq=False)
-class Picking:
-    """Window with images side by side, in which clicks and keys are handled."""
+class Picking(_Window):
+    """Window with images side by side, in which bases, areas and a length are marked."""
 
     images: Sequence[NDArray[np.uint8]]
     names: Sequence[str]
@@ -379,22 +394,14 @@ class Picking:
             axes.set_title(name, fontsize=9)
         self.figure.text(0.5, 0.03, _PICKING_HELP, ha="center", va="center", fontsize=7)
         self._state = self.figure.text(0.5, 0.97, "", ha="center", va="center", fontsize=9)
-        self.figure.canvas.mpl_connect("button_press_event", self._clicked)
-        self.figure.canvas.mpl_connect("key_press_event", self._pressed)
+        self._listen()
         self._draw()
 
-    def _clicked(self, event: Event) -> None:
-        assert isinstance(event, MouseEvent)
-        toolbar = getattr(self.figure.canvas, "toolbar", None)
-        inside = [view for view, axes in enumerate(self._axes) if event.inaxes is axes]
-        if event.button == 1 and inside and not (toolbar is not None and toolbar.mode):
-            assert event.xdata is not None
-            assert event.ydata is not None
-            self._go(self.picks.clicked(inside[0], event.xdata, event.ydata))
+    def _click(self, image: int, x: float, y: float, button: int) -> None:
+        if button == 1:
+            self._go(self.picks.clicked(image, x, y))
 
-    def _pressed(self, event: Event) -> None:
-        assert isinstance(event, KeyEvent)
-        key = event.key or ""
+    def _pressed(self, key: str) -> None:
         if key in ("u", "ctrl+z") and self._before:
             self.picks = self._before.pop()
             self._draw()
@@ -412,7 +419,7 @@ class Picking:
             self._draw()
 
     def close(self, event: Any = None) -> None:
-        """Save unsaved changes; to be called when the window is closed."""
+        """Save unsaved changes."""
         if self.picks.clicks != self.saved:
             self.saved = self.picks.clicks
             self.save(self.saved)

@@ -208,7 +208,10 @@ def movies_section(movies: Sequence[Path], folder: Path, room: int) -> Section:
         # Base64 takes four characters for three bytes.
         size = 4 * (path.stat().st_size // 3 + 1)
         if size > room:
-            parts.append(_link(path, folder))
+            where = quote(Path(os.path.relpath(path, folder)).as_posix())
+            text = f"{path.stat().st_size / 1e6:.1f} MB: too large for the page; the file is next"
+            parts.append(f'<p><a href="{escape(where)}">{name}</a></p>')
+            parts.append(paragraph(f"{text} to it.", "note"))
             continue
         room -= size
         data = b64encode(path.read_bytes()).decode("ascii")
@@ -217,14 +220,6 @@ def movies_section(movies: Sequence[Path], folder: Path, room: int) -> Section:
             f'src="data:video/mp4;base64,{data}"></video><figcaption>{name}</figcaption></figure>'
         )
     return Section("movies", "Movies", "\n".join(parts))
-
-
-def _link(path: Path, folder: Path) -> str:
-    """HTML of a link to a movie that is too large to be embedded."""
-    where = Path(os.path.relpath(path, folder)).as_posix()
-    size = f"{path.stat().st_size / 1e6:.1f} MB"
-    marked_up = paragraph(f"{size}: too large for the page; the file is next to it.", "note")
-    return f'<p><a href="{escape(quote(where))}">{escape(path.name)}</a></p>{marked_up}'
 
 
 _LEAST = 1e-5  # smallest value shown, in the display unit

@@ -6,7 +6,7 @@ Missing stages are named with the command that computes them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
@@ -63,8 +63,18 @@ def trial_sections(recording: xr.DataTree, whisker: int = 0, seed: int = 0) -> l
     root = groups[""]
     if "measured" in recording.children and root is not None and "in_contact" in root:
         parts.append(Section("tracked", "Tracking", tracked_table(root)))
-    if truth is not None:
-        parts += _against_truth(recording, groups, truth, true_whisker, seed)
+    if truth is not None and root is not None:  # stages that can be compared with the truth
+        if "measured" in recording.children:
+            text = _lacking(_TRACKED, root, truth) or tracking_tables(root, truth)
+            parts.append(Section("tracking", "Tracking, against the truth", text))
+        if (signals := groups["signals"]) is not None:
+            text = _lacking(_FELT, signals, truth, also_true=("contact_point_whisker",))
+            text = text or _signal_errors(signals, truth, true_whisker)
+            parts.append(Section("signals", "Signals", text))
+        if (estimates := groups["estimates"]) is not None:
+            text = _lacking(_FOUND, estimates, truth, also_found=_SPREADS)
+            text = text or _contact_errors(estimates, truth, true_whisker, seed)
+            parts.append(Section("estimates", "Estimated contacts", text))
     if "contour" in recording.children:
         parts.append(Section("contour", "Contour", _contour(recording, seed)))
     happened = _events(recording)
@@ -171,8 +181,12 @@ def _shown_setting(name: object, value: object) -> str:
         return _SIGNAL_NAMES.get(str(value), ", ".join(str(value).split()))
     if name == "noise" and isinstance(value, np.ndarray | list | tuple) and len(value) == 6:
         force, moment = np.split(np.asarray(value, dtype=np.float64), 2)
-        sizes = (("force", force), ("moment", moment))
-        return "; ".join(f"{each} {_one_or_all(each, sigma)}" for each, sigma in sizes)
+        texts = []
+        for each, sigma in (("force", force), ("moment", moment)):
+            sizes = [shown_value(each, float(component)) for component in sigma]
+            one = f"{sizes[0]} each" if len(set(sizes)) == 1 else ", ".join(sizes)
+            texts.append(f"{each} {one}")
+        return "; ".join(texts)
     if name == "friction":
         return friction_assumed(float(str(value)))
     if name == "cutoff":
@@ -182,43 +196,30 @@ def _shown_setting(name: object, value: object) -> str:
     return f"{value:.3g}" if isinstance(value, float | np.floating) else str(value)
 
 
-def _one_or_all(name: str, sigma: Array) -> str:
-    """Format the standard deviations of three components, as one value if they are equal."""
-    text = [shown_value(name, float(each)) for each in sigma]
-    return f"{text[0]} each" if len(set(text)) == 1 else ", ".join(text)
-
-
-def _against_truth(
-    recording: xr.DataTree,
-    groups: dict[str, xr.Dataset | None],
-    truth: xr.Dataset,
-    whisker: Whisker,
-    seed: int,
-) -> Iterator[Section]:
-    """Yield sections on stages that can be compared with the truth."""
-    root, signals, estimates = groups.values()
-    assert root is not None
-    if "measured" in recording.children:
-        lacking = _lacking(_TRACKED, root, truth)
-        yield Section(
-            "tracking", "Tracking, against the truth", lacking or tracking_tables(root, truth)
-        )
-    if signals is not None:
-        lacking = _lacking(_FELT, signals, truth, also_true=("contact_point_whisker",))
-        yield Section("signals", "Signals", lacking or _signal_errors(signals, truth, whisker))
-    if estimates is not None:
-        lacking = _lacking(_FOUND, estimates, truth, also_found=_SPREADS)
-        text = lacking or _contact_errors(estimates, truth, whisker, seed)
-        yield Section("estimates", "Estimated contacts", text)
-
-
 def _contact_errors(estimates: xr.Dataset, truth: xr.Dataset, whisker: Whisker, seed: int) -> str:
-    """Tables of detected contacts and of their errors."""
-    text = _detected(estimates, truth)
+    """Tables of detected contacts, their candidates and their errors."""
+    detected = estimates["in_contact"].values.astype(bool)
+    touching = truth["in_contact"].values.astype(bool)
+    status = estimates["status"].values[detected]
+    without = estimates["candidates"].values[detected] == 0
+    rows = [
+        ("frames in contact", str(int(touching.sum()))),
+        ("contacts detected", str(int(detected.sum()))),
+        ("false detections", str(int((detected & ~touching).sum()))),
+        ("without an answer", str(int(without.sum()))),
+        ("unique", str(int((status == Status.UNIQUE).sum()))),
+        ("ambiguous", str(int((status == Status.AMBIGUOUS).sum()))),
+    ]
+    text = table(rows, caption="Contacts")
     if np.isfinite(estimates["contact_point"].values).any():
-        text += _errors(
-            *evaluation.error_rows(evaluation.contact_errors(estimates, truth, whisker, seed))
-        )
+        errors = evaluation.contact_errors(estimates, truth, whisker, seed)
+        of_all, by_angle = evaluation.error_rows(errors)
+        names = ("contacts", *_SPREAD, "largest", *(f"{name}*" for name in _SPREAD))
+        note = "* what the estimates' own covariance predicts"
+        all_rows = [(quantity(row.quantity).long_name, *_cells(row)) for row in of_all]
+        text += table(all_rows, ("of", *names), "Error of the contact point", note)
+        class_rows, title = [(row.label, *_cells(row)) for row in by_angle], "Error in space by "
+        text += table(class_rows, ("deflection angle", *names), f"{title}deflection angle", note)
     else:
         text += paragraph(_NOTHING)
     warned = evaluation.caution(estimates.attrs.get("source"))
@@ -337,38 +338,6 @@ def signal_rows(signals: xr.Dataset, truth: xr.Dataset, whisker: Whisker) -> lis
         cells = (f"{100 * shares[i]:.3g} %" for i in (0, 2, 1, 3))
         rows.append((row.label, str(row.contacts), *cells))
     return rows
-
-
-def _detected(estimates: xr.Dataset, truth: xr.Dataset) -> str:
-    """Numbers of detected contacts and of their candidates."""
-    detected = estimates["in_contact"].values.astype(bool)
-    touching = truth["in_contact"].values.astype(bool)
-    status = estimates["status"].values[detected]
-    without = estimates["candidates"].values[detected] == 0
-    rows = [
-        ("frames in contact", str(int(touching.sum()))),
-        ("contacts detected", str(int(detected.sum()))),
-        ("false detections", str(int((detected & ~touching).sum()))),
-        ("without an answer", str(int(without.sum()))),
-        ("unique", str(int((status == Status.UNIQUE).sum()))),
-        ("ambiguous", str(int((status == Status.AMBIGUOUS).sum()))),
-    ]
-    return table(rows, caption="Contacts")
-
-
-def _errors(of_all: Sequence[evaluation.ErrorRow], by_angle: Sequence[evaluation.ErrorRow]) -> str:
-    """Table of the errors of estimated contacts, actual and predicted by their covariance."""
-    names = (*_SPREAD, "largest", *(f"{name}*" for name in _SPREAD))
-    note = "* what the estimates' own covariance predicts"
-    all_rows = [(quantity(row.quantity).long_name, *_cells(row)) for row in of_all]
-    class_rows = [(row.label, *_cells(row)) for row in by_angle]
-    text = table(all_rows, ("of", "contacts", *names), "Error of the contact point", note)
-    return text + table(
-        class_rows,
-        ("deflection angle", "contacts", *names),
-        "Error in space by deflection angle",
-        note,
-    )
 
 
 def _cells(row: evaluation.ErrorRow) -> list[str]:

@@ -19,7 +19,7 @@ from vibrissa.numerics import Array
 from vibrissa.quantities import quantity, shown_unit
 from vibrissa.report.page import Section, paragraph
 from vibrissa.rod import Deflection
-from vibrissa.scene import Course, Ints, course_of, object_surface
+from vibrissa.scene import Course, course_of, object_surface
 from vibrissa.sketch import BENT, REST, thinned
 from vibrissa.whisker import Whisker
 
@@ -103,25 +103,17 @@ def trial_in_space(trial: xr.DataTree, course: Course) -> Any:
     room = _ROOM * max(float((high - low).max()), 1.0)
     limits = np.stack([low - room, high + room], axis=1)
     for thing in trial["objects"].children.values() if "objects" in trial.children else ():
-        surface = object_surface(thing.to_dataset(), limits)
-        drawn.append(_triangles(*surface, f"{thing.attrs['kind']}, known"))
+        vertices, faces = object_surface(thing.to_dataset(), limits)
+        corners = dict(zip("xyz", vertices.T, strict=True)) | dict(zip("ijk", faces.T, strict=True))
+        look = {"color": REST, "opacity": 0.35, "showlegend": True}
+        drawn.append(go.Mesh3d(**corners, **look, name=f"{thing.attrs['kind']}, known"))
     if "contour" in trial.children:
         fit = shape_from_dataset(trial["contour"].to_dataset())
         grid = 1e3 * surface_grid(fit, places[known])["surface_grid_point"].values
-        x, y, z = np.moveaxis(grid, -1, 0)
-        colours = [[0.0, BENT], [1.0, BENT]]
-        drawn.append(
-            go.Surface(
-                x=x,
-                y=y,
-                z=z,
-                opacity=0.4,
-                showscale=False,
-                colorscale=colours,
-                name=f"{fit.kind}, fitted",
-                showlegend=True,
-            )
-        )
+        places_of = dict(zip("xyz", np.moveaxis(grid, -1, 0), strict=True))
+        colours = {"colorscale": [[0.0, BENT], [1.0, BENT]], "showscale": False, "opacity": 0.4}
+        name = f"{fit.kind}, fitted"
+        drawn.append(go.Surface(**places_of, **colours, name=name, showlegend=True))
     if course.centerline is not None:
         drawn += _whiskers(course.centerline[known])
     return _framed(drawn, "laboratory")
@@ -184,38 +176,17 @@ def _points(points: Array, name: str, values: Array, label: str) -> Any:
     return go.Scatter3d(x=x, y=y, z=z, mode="markers", marker={**look, "colorbar": bar}, name=label)
 
 
-def _triangles(vertices: Array, faces: Ints, label: str) -> Any:
-    """Triangulated surface, mm."""
-    import plotly.graph_objects as go
-
-    (x, y, z), (i, j, k) = vertices.T, faces.T
-    return go.Mesh3d(
-        x=x, y=y, z=z, i=i, j=j, k=k, color=REST, opacity=0.35, name=label, showlegend=True
-    )
-
-
 def _whiskers(lines: Array, label: str = "whisker", colour: str = "#a0522d") -> list[Any]:
     """Lines of some of the whiskers (n, k, 3), m."""
     import plotly.graph_objects as go
 
     some = thinned(lines[np.isfinite(lines).all(axis=(1, 2))], _SHAPES)
     drawn = []
+    look = {"mode": "lines", "line": {"color": colour, "width": 3}, "hoverinfo": "skip"}
     for count, line in enumerate(some):
         x, y, z = 1e3 * line.T
-        look = {"color": colour, "width": 3}
-        drawn.append(
-            go.Scatter3d(
-                x=x,
-                y=y,
-                z=z,
-                mode="lines",
-                line=look,
-                name=label,
-                legendgroup=label,
-                showlegend=count == 0,
-                hoverinfo="skip",
-            )
-        )
+        legend = {"name": label, "legendgroup": label, "showlegend": count == 0}
+        drawn.append(go.Scatter3d(x=x, y=y, z=z, **look, **legend))
     return drawn
 
 

@@ -93,8 +93,12 @@ def open_sweep(path: str | PathLike[str]) -> xr.Dataset:
         {"study": kept["name"], "origins": kept["origins"]},
     )
     for task, data in found.items():
-        data = data.rename({name: f"{task}_{name}" for name in data.data_vars})
-        out = out.merge(data.rename(_differing(out, data, task)), combine_attrs="override")
+        renamed = {name: f"{task}_{name}" for name in data.data_vars}
+        # Dimensions along which the coordinates differ from those of earlier tasks.
+        for dim in {*out.dims} & {*data.dims} - {"whisker"}:
+            if not out[dim].equals(data[dim]):
+                renamed[dim] = f"{task}_{dim}"
+        out = out.merge(data.rename(renamed), combine_attrs="override")
     return out
 
 
@@ -185,15 +189,6 @@ def _results(cells: Cells) -> xr.Dataset:
     return xr.Dataset(data, coords)
 
 
-def _differing(out: xr.Dataset, found: xr.Dataset, task: str) -> dict[str, str]:
-    """New names for dimensions along which a task's coordinates differ from earlier ones."""
-    return {
-        str(dim): f"{task}_{dim}"
-        for dim in found.dims
-        if dim in out.dims and dim != "whisker" and not out[dim].equals(found[dim])
-    }
-
-
 def failures(path: str | PathLike[str]) -> dict[str, str]:
     """Read the failed cells and their errors.
 
@@ -222,12 +217,8 @@ def failures(path: str | PathLike[str]) -> dict[str, str]:
     }
 
 
-def sweep_summary(found: xr.Dataset) -> str:
-    """Summary of the progress and the results of a study, as text."""
-    return "\n".join(_lines(found))
-
-
-def _lines(found: xr.Dataset) -> Iterator[str]:
+def sweep_summary(found: xr.Dataset) -> Iterator[str]:
+    """Yield the lines of a summary of the progress and the results of a study."""
     yield f"study {found.attrs.get('study', '')!r}: {found.sizes['whisker']} whiskers"
     for number, code in enumerate(np.atleast_1d(found.attrs["origins"])):
         yield f"  {int((found['origin'] == number).sum())} cells by {code}"
@@ -327,7 +318,13 @@ def answers_by_processes(cells: Iterable[Cell], workers: int) -> Answers:
                     died = worker.cell
                     if not worker.ready:
                         stillborn += 1
-                        _check_start(stillborn, worker)
+                        if stillborn >= _STARTS:
+                            raise OSError(
+                                f"{stillborn} processes died before they were ready, the last with "
+                                f"exit code {worker.process.exitcode}. A script that calls this "
+                                'must do so under if __name__ == "__main__"; workers=0 does '
+                                "without processes"
+                            ) from None
                         again.append(died)
                         continue
                     deaths[died.task, died.index] += 1
@@ -385,15 +382,6 @@ def _dismiss(worker: _Worker) -> None:
     worker.process.kill()
     worker.process.join()
     worker.pipe.close()
-
-
-def _check_start(count: int, worker: _Worker) -> None:
-    if count >= _STARTS:
-        raise OSError(
-            f"{count} processes died before they were ready, the last with exit code "
-            f"{worker.process.exitcode}. A script that calls this must do so under "
-            'if __name__ == "__main__"; workers=0 does without processes'
-        )
 
 
 def _work(pipe: Connection) -> None:

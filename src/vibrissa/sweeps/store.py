@@ -14,12 +14,10 @@ cell is computed again. Descriptions are written to a temporary file and renamed
 from __future__ import annotations
 
 import contextlib
-import errno
 import hashlib
 import json
 import re
 import shutil
-import sys
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -34,6 +32,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa._version import __version__
+from vibrissa.io import held
 from vibrissa.sweeps.study import Cell, Study
 
 NOT_ASKED, TO_DO, DONE, FAILED, DAMAGED = -1, 0, 1, 2, 3  # statuses of cells
@@ -228,10 +227,10 @@ class Store:
         if self.path.exists() and any(self.path.iterdir()) and not (self.path / _LOCK).exists():
             raise ValueError(f"{self.path} is a folder with other contents, not a store")
         self.path.mkdir(parents=True, exist_ok=True)
-        try:
-            self._lock = _hold(self.path / _LOCK)
-        except BlockingIOError:
-            raise Busy(f"another run is writing to {self.path}; wait until it has ended") from None
+        self._lock = (self.path / _LOCK).open("a", encoding="utf-8")
+        if not held(self._lock.fileno()):
+            self.__exit__()
+            raise Busy(f"another run is writing to {self.path}; wait until it has ended")
         try:
             self._begin()
         except BaseException:
@@ -475,27 +474,6 @@ def _naming(path: Path) -> Iterator[None]:
             f"{fault.strerror or fault}: {path} cannot be written. All written results are intact; "
             "the same call continues from them",
         ) from fault
-
-
-def _hold(path: Path) -> IO[str]:
-    """Acquire a lock that the system releases when the process ends for any reason."""
-    file = path.open("a", encoding="utf-8")
-    try:
-        if sys.platform == "win32":
-            import msvcrt
-
-            file.seek(0)
-            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
-        else:
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as fault:
-        file.close()
-        if fault.errno in (errno.EAGAIN, errno.EACCES):
-            raise BlockingIOError(fault.errno, f"{path} is locked") from fault
-        raise
-    return file
 
 
 def _plain(attributes: Mapping[Any, Any]) -> dict[str, Any]:

@@ -165,7 +165,7 @@ def read_study(text: str, folder: Path) -> Study:
             )
         tasks[name] = (kind, settings)
         if "groups" in table:
-            groups[name] = _groups(table["groups"], where)
+            groups[name] = tuple(_words(f"{where}: groups", table["groups"], empty=False))
     specimens = tuple(population(tables["whiskers"], folder, seed))
     known_groups = {specimen.group for specimen in specimens}
     for name, some in groups.items():
@@ -177,12 +177,6 @@ def read_study(text: str, folder: Path) -> Study:
     return Study(str(content.get("name", "study")), seed, specimens, tasks, groups)
 
 
-def _groups(value: Any, where: str) -> tuple[str, ...]:
-    if not isinstance(value, list) or not value or not all(isinstance(one, str) for one in value):
-        raise ValueError(f"{where}: groups is {value!r}; a list of names is needed")
-    return tuple(value)
-
-
 def answer(cell: Cell) -> dict[str, Any]:
     """Compute one cell in the current process."""
     started = time.process_time()
@@ -191,7 +185,16 @@ def answer(cell: Cell) -> dict[str, Any]:
         # The number of threads in linear algebra would affect the last digits.
         with threadpool_limits(1):
             result = TASKS[cell.kind].run(whisker, cell.settings, cell.seed).load()
-        described = _described(whisker)
+        tangent = whisker.frame(np.linspace(0.0, whisker.length, 401))[:, :, 0]
+        chord = np.linalg.norm(np.diff(tangent, axis=0), axis=1)
+        described = {
+            "length": whisker.length,
+            "base_radius": whisker.base_radius,
+            "tip_radius": whisker.tip_radius,
+            "taper_ratio": whisker.base_radius / whisker.tip_radius,
+            "youngs_modulus": whisker.youngs_modulus,
+            "turn": float(2.0 * np.arcsin(np.minimum(chord / 2.0, 1.0)).sum()),
+        }
     except Exception:
         return {"failure": traceback.format_exc(), "seconds": time.process_time() - started}
     finally:
@@ -201,19 +204,6 @@ def answer(cell: Cell) -> dict[str, Any]:
         "result": result,
         "whisker": described,
         "seconds": time.process_time() - started,
-    }
-
-
-def _described(whisker: Whisker) -> dict[str, float]:
-    tangent = whisker.frame(np.linspace(0.0, whisker.length, 401))[:, :, 0]
-    chord = np.linalg.norm(np.diff(tangent, axis=0), axis=1)
-    return {
-        "length": whisker.length,
-        "base_radius": whisker.base_radius,
-        "tip_radius": whisker.tip_radius,
-        "taper_ratio": whisker.base_radius / whisker.tip_radius,
-        "youngs_modulus": whisker.youngs_modulus,
-        "turn": float(2.0 * np.arcsin(np.minimum(chord / 2.0, 1.0)).sum()),
     }
 
 
@@ -417,10 +407,11 @@ def _check_count(count: int) -> None:
         raise ValueError(f"these are {count:.3g} whiskers; a study can have {_MOST:g}")
 
 
-def _words(name: str, value: Any) -> list[str]:
-    if not isinstance(value, list) or not all(isinstance(one, str) for one in value):
+def _words(name: str, value: Any, empty: bool = True) -> list[str]:
+    words = isinstance(value, list) and all(isinstance(one, str) for one in value)
+    if not words or not (value or empty):
         raise ValueError(f"{name} is {value!r}; a list of words is needed")
-    return value
+    return list(value)
 
 
 def _numbers(name: str, value: Any) -> list[float]:

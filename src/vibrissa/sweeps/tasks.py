@@ -311,12 +311,6 @@ _READ: Mapping[str, Callable[[Settings], object]] = {
 }
 
 
-def _uniqueness_seconds(settings: Settings) -> float:
-    # Measured with one core, 512 to 4096 samples: cheap compared with the search for twins.
-    each = 0.6 + (1.0 if settings["resolution"] else 0.0)
-    return 0.7 + each * len(_triplets(settings)) * math.sqrt(len(settings["regions"]))
-
-
 _SENSOR = {"force_noise": FORCE_NOISE / _MICRO, "moment_noise": MOMENT_NOISE / _MICRO}
 
 TASKS: Mapping[str, Task] = MappingProxyType(
@@ -331,7 +325,13 @@ TASKS: Mapping[str, Task] = MappingProxyType(
                 "samples": 1024,
                 "resolution": True,
             },
-            _uniqueness_seconds,
+            # Measured with one core, 512 to 4096 samples.
+            lambda settings: (
+                0.7
+                + (1.6 if settings["resolution"] else 0.6)
+                * len(_triplets(settings))
+                * math.sqrt(len(settings["regions"]))
+            ),
             lambda settings: (
                 (8 if settings["resolution"] else 4)
                 * len(_triplets(settings))

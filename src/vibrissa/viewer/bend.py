@@ -11,19 +11,8 @@ from vibrissa import scene
 from vibrissa.numerics import Array
 from vibrissa.quantities import quantity, to_display
 from vibrissa.sketch import round_step
-from vibrissa.viewer import state
+from vibrissa.viewer import readout, state
 from vibrissa.viewer.page import EXAGGERATION, Mode, Page, asked, put, show
-from vibrissa.viewer.readout import (
-    CONTACT,
-    FORCE,
-    GHOST,
-    OBJECT,
-    REST,
-    WHISKER,
-    number,
-    numbers,
-    sentence,
-)
 from vibrissa.viewer.stage import triple
 from vibrissa.whisker import Whisker
 
@@ -38,7 +27,7 @@ def whisker_body(
     whisker: Whisker,
     line: Array,
     exaggeration: float,
-    colour: scene.Colour = WHISKER,
+    colour: scene.Colour = readout.WHISKER,
     opacity: float | None = None,
 ) -> scene.Body:
     """Body of a whisker along a centreline (n, 3), m, with its thickness exaggerated."""
@@ -75,7 +64,7 @@ def ruler(start: Array, length: float, view: float) -> dict[str, scene.Mark]:
     at = start + ticks[:, None] * np.array([1.0, 0.0, 0.0])
     down = np.array([0.0, 0.0, -0.02 * view])
     pieces = np.concatenate([np.stack([at, at + down], axis=1), [[at[0], at[-1]]]])
-    out: dict[str, scene.Mark] = {"ruler": scene.Line(pieces, REST, 1.5)}
+    out: dict[str, scene.Mark] = {"ruler": scene.Line(pieces, readout.REST, 1.5)}
     for place, tick in zip(at[1:], ticks[1:], strict=True):
         unit = " mm" if tick == ticks[-1] else ""
         out[f"tick {tick:g}"] = scene.Label(place + 6.0 * down, f"{tick:g}{unit}")
@@ -89,11 +78,11 @@ def force_arrow(whisker: Whisker, force: Array, at: Array) -> dict[str, scene.Ma
         return {}
     reach = _ARROW * whisker.length * np.sqrt(size / state.force_scale(whisker))
     start = at - reach * force / size
-    colours = np.array([FORCE], dtype=np.uint8)
+    colours = np.array([readout.FORCE], dtype=np.uint8)
     thickness = _size(0.006 * whisker.length)
     return {
         "force": scene.Arrows(mm(start)[None], mm(at)[None], colours, thickness),
-        "force size": scene.Label(mm(start), number("force", size, 3)),
+        "force size": scene.Label(mm(start), readout.number("force", size, 3)),
     }
 
 
@@ -106,10 +95,13 @@ def bend_drawing(bend: state.Bend, exaggeration: float) -> scene.Drawing:
         out["whisker"] = whisker_body(whisker, line, exaggeration)
         out |= force_arrow(whisker, np.asarray(held.force), np.asarray(held.contact_point))
     else:
-        out["ghost"] = whisker_body(whisker, line, exaggeration, GHOST, 0.4)
+        out["ghost"] = whisker_body(whisker, line, exaggeration, readout.GHOST, 0.4)
         out |= _missed(bend)
     if bend.kind == "peg":
-        out["peg"] = _peg(bend)
+        # A line is drawn with a visible thickness.
+        radius = max(bend.radius, 0.004 * whisker.length)
+        peg = mm(bend.origin), bend.axis, _size(radius), _size(0.8 * whisker.length)
+        out["peg"] = scene.Body(*scene.cylinder(*peg), readout.OBJECT, 0.8)
     elif ok:
         at = triple(mm(held.contact_point))
         out["contact"] = replace(_ball(whisker, exaggeration), position=at)
@@ -122,16 +114,10 @@ def resting(whisker: Whisker, exaggeration: float) -> dict[str, scene.Mark]:
     return {
         "follicle": follicle(whisker, exaggeration),
         **axes(whisker),
-        "rest": whisker_body(whisker, whisker.centerline(NODES), 0.7 * exaggeration, REST, 0.35),
+        "rest": whisker_body(
+            whisker, whisker.centerline(NODES), 0.7 * exaggeration, readout.REST, 0.35
+        ),
     }
-
-
-def _peg(bend: state.Bend) -> scene.Body:
-    """Body of the peg; a line is drawn with a visible thickness."""
-    length = bend.whisker.length
-    radius = max(bend.radius, 0.004 * length)
-    vertices, faces = scene.cylinder(mm(bend.origin), bend.axis, _size(radius), _size(0.8 * length))
-    return scene.Body(vertices, faces, OBJECT, 0.8)
 
 
 @lru_cache(maxsize=4)
@@ -140,7 +126,7 @@ def _ball(whisker: Whisker, exaggeration: float) -> scene.Body:
     own = float(whisker.radius(0.5 * whisker.length))
     radius = max(1.7 * exaggeration * own, 0.006 * whisker.length)
     vertices, faces = scene.ellipsoid(np.zeros(3), _size(radius) * np.eye(3), 12)
-    return scene.Body(vertices, faces, CONTACT)
+    return scene.Body(vertices, faces, readout.CONTACT)
 
 
 def _missed(bend: state.Bend) -> dict[str, scene.Mark]:
@@ -148,7 +134,7 @@ def _missed(bend: state.Bend) -> dict[str, scene.Mark]:
     last = np.asarray(bend.held.contact_point)
     out: dict[str, scene.Mark] = {}
     if np.isfinite(last).all() and bend.kind == "point":
-        out["missed"] = scene.Line(mm(np.stack([last, bend.point])[None]), GHOST)
+        out["missed"] = scene.Line(mm(np.stack([last, bend.point])[None]), readout.GHOST)
     words = bend.status.explanation.split(":")[0].rstrip(".")
     lift = np.array([0.0, 0.0, 0.05 * bend.whisker.length])
     return {**out, "reason": scene.Label(mm(bend.target + lift), words)}
@@ -240,8 +226,8 @@ class BendMode(Mode):
     def write(self, brief: bool = False) -> None:
         """Show signals, contact and position of the load."""
         bend = self._page.bend
-        show(self._state, sentence(bend.status, _HELD if bend.kind == "force" else None))
-        show(self._numbers, numbers(bend.deflection))
+        show(self._state, readout.sentence(bend.status, _HELD if bend.kind == "force" else None))
+        show(self._numbers, readout.numbers(bend.deflection))
         if brief:
             return
         self._target.visible = bend.kind != "force"

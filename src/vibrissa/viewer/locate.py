@@ -16,20 +16,10 @@ from vibrissa.quantities import quantity, to_display
 from vibrissa.rod import PointContact, deflect
 from vibrissa.signals import SIGNALS, TRIPLETS, base_signals
 from vibrissa.status import Status
+from vibrissa.viewer import readout
 from vibrissa.viewer.bend import NODES, bend_drawing, mm, whisker_body
 from vibrissa.viewer.page import Mode, Page, asked, put
-from vibrissa.viewer.readout import (
-    FIT,
-    GHOST,
-    Legend,
-    counted,
-    note,
-    number,
-    sentence,
-    shaded,
-    table,
-)
-from vibrissa.viewer.state import Bend, Chart, coloured_solid, numbers_in, words_of
+from vibrissa.viewer.state import Bend, Chart, coloured_solid, loaded, numbers_in, words_of
 from vibrissa.whisker import Whisker
 
 _RAT = (1.5e-4, 6e-6)  # EI/L², N, and EI/L, N·m, of a rat's whisker
@@ -103,35 +93,28 @@ def located(chart: Chart, bend: Bend, sensor: Sensor) -> Located | None:
     return Located(sensor, signals, np.asarray(bent.contact_point), estimate, lines)
 
 
-def coloured(chart: Chart, what: str, sensor: Sensor) -> tuple[scene.Bytes, Legend]:
+def coloured(chart: Chart, what: str, sensor: Sensor) -> tuple[scene.Bytes, readout.Legend]:
     """Colours (n, 3) of the cloud: number of contacts with the same signals, or their distance."""
     if what in SIGNALS:
-        return shaded(what, chart.signals[what])
+        return readout.shaded(what, chart.signals[what])
     if what == "sensitivity":
-        return shaded("predicted_error", _predicted_error(chart, sensor))
+        error = np.full(len(chart.points), np.nan)
+        if (noise := sensor.covariance) is not None:
+            found = sensitivity(chart.contact_map, sensor.triplet, chart.points, noise=noise)
+            error = found["predicted_error"].to_numpy()
+        return readout.shaded("predicted_error", error)
     signals = {name: chart.signals[name] for name in sensor.triplet}
     estimate = chart.contact_map.estimate(signals, sensor.triplet)
     if what == "uniqueness":
-        return counted(estimate.n_candidates)
+        return readout.counted(estimate.n_candidates)
     if what == "ambiguity":
-        return shaded("separation", _separation(estimate, chart.points))
+        # The distance of the farthest other candidate; NaN without candidates.
+        away = np.linalg.norm(estimate.candidates.point - chart.points[:, None], axis=-1)
+        farthest = np.nanmax(np.nan_to_num(away), axis=1)
+        farthest[farthest < 1e-9] = 0.0  # the contact itself
+        farthest[estimate.status == Status.DEGENERATE] = np.nan
+        return readout.shaded("separation", farthest)
     raise ValueError(f"colours are one of {', '.join(COLOURS)}; got {what!r}")
-
-
-def _predicted_error(chart: Chart, sensor: Sensor) -> Array:
-    """RMS 3D error (n,), m, of the contacts of the cloud."""
-    if sensor.covariance is None:
-        return np.full(len(chart.points), np.nan)
-    found = sensitivity(chart.contact_map, sensor.triplet, chart.points, noise=sensor.covariance)
-    return np.asarray(found["predicted_error"].to_numpy(), dtype=np.float64)
-
-
-def _separation(estimate: Contacts, points: Array) -> Array:
-    """Distance (n,), m, of the farthest other candidate of each contact; NaN without candidates."""
-    away = np.linalg.norm(estimate.candidates.point - points[:, None], axis=-1)
-    farthest = np.nanmax(np.nan_to_num(away), axis=1)
-    farthest[farthest < 1e-9] = 0.0  # the contact itself
-    return np.where(estimate.status == Status.DEGENERATE, np.nan, farthest)
 
 
 SIGMAS = 2.0  # standard deviations of the ellipsoids
@@ -146,40 +129,49 @@ def locate_drawing(whisker: Whisker, found: Located, exaggeration: float) -> sce
     others = set(found.others(whisker.length).tolist())
     for i, point in enumerate(found.points):
         if i in others:
-            out[f"ghost {i}"] = whisker_body(whisker, found.lines[i], exaggeration, GHOST, 0.55)
+            out[f"ghost {i}"] = whisker_body(
+                whisker, found.lines[i], exaggeration, readout.GHOST, 0.55
+            )
             radius = float(to_display("length", 0.008 * whisker.length))
             ball = scene.ellipsoid(mm(point), radius * np.eye(3))
-            out[f"ball {i}"] = scene.Body(*ball, GHOST)
-            apart = number("separation", float(found.distances[i]), 3)
+            out[f"ball {i}"] = scene.Body(*ball, readout.GHOST)
+            apart = readout.number("separation", float(found.distances[i]), 3)
             out[f"apart {i}"] = scene.Label(mm(point), f"same signals, {apart} away")
         if np.isfinite(covariances[i]).all():
             most = MOST * whisker.length
             vertices, faces = scene.error_ellipsoid(point, covariances[i], SIGMAS, most)
-            out[f"error {i}"] = scene.Body(mm(vertices), faces, FIT, 0.45)
+            out[f"error {i}"] = scene.Body(mm(vertices), faces, readout.FIT, 0.45)
     return out
 
 
 def of_located(whisker: Whisker, found: Located | None, status: Status) -> str:
     """Describe the number of contacts with the same signals, their distances and errors."""
     if found is None:
-        return sentence(status)
+        return readout.sentence(status)
     names = found.sensor.triplet
     signals = {name: float(found.signals[name]) for name in SIGNALS}
     chosen = {name: signals[name] for name in names}
-    parts = [sentence(Status(int(found.estimate.status))), table(chosen, "Measured")]
+    parts = [
+        readout.sentence(Status(int(found.estimate.status))),
+        readout.table(chosen, "Measured"),
+    ]
     others = found.others(whisker.length)
     if others.size:
-        farthest = number("separation", float(found.distances[others].max()), 3)
-        parts.append(note(f"The farthest contact with the same signals is {farthest} away."))
+        farthest = readout.number("separation", float(found.distances[others].max()), 3)
+        parts.append(
+            readout.note(f"The farthest contact with the same signals is {farthest} away.")
+        )
     own = int(np.argmin(found.distances)) if found.points.size else -1
     if own >= 0 and np.isfinite(found.estimate.candidates.covariance[own]).all():
         spread = np.sqrt(np.diagonal(found.estimate.candidates.covariance[own]))
         errors = dict(zip(("sigma_x", "sigma_y", "sigma_z"), spread.tolist(), strict=True))
-        parts.append(table(errors, f"Error of the contact point ({SIGMAS:.0f}σ drawn)"))
+        parts.append(readout.table(errors, f"Error of the contact point ({SIGMAS:.0f}σ drawn)"))
         if SIGMAS * spread.max() > MOST * whisker.length:
-            parts.append(note("The ellipsoid is truncated: along it the position is undetermined."))
+            parts.append(
+                readout.note("The ellipsoid is truncated: along it the position is undetermined.")
+            )
     rest = {name: value for name, value in signals.items() if name not in names}
-    parts.append(table(rest, "Not used"))
+    parts.append(readout.table(rest, "Not used"))
     return "".join(parts)
 
 
@@ -228,7 +220,7 @@ class LocateMode(Mode):
         self._page.face_whisker()
         self._drawn = None
         if self._page.bend.kind != "point":
-            self._page.bend = self._page.bend_by_point()
+            self._page.bend = loaded(self._page.bend, "point")
 
     def redraw(self) -> None:
         """Draw whisker, candidates and errors; colour the cloud of contacts if it has changed."""
@@ -242,13 +234,28 @@ class LocateMode(Mode):
         found = self.found
         drawing = {} if found is None else locate_drawing(bend.whisker, found, page.exaggeration)
         page.stage.show("candidates", drawing)
-        self._paint(chart)
+        key = (chart, self._sensor, self._what)
+        if self._drawn == key:
+            return
+        self._drawn = key  # the cloud is coloured in the background
+
+        def ready(colours: scene.Bytes, legend: readout.Legend) -> None:
+            if self._drawn == key:
+                self._legend.content = legend.html()
+                self._cloud = (chart, colours)
+                self._show_cloud()
+
+        def job() -> None:
+            colours, legend = coloured(chart, key[2], key[1])
+            page.work.put("colours", lambda: ready(colours, legend))
+
+        page.slow_work.put("colours", job)
 
     def write(self, brief: bool = False) -> None:
         """Show the contacts that follow from the three signals."""
         bend = self._page.bend
         if self._page.chart is None:
-            self._words.content = note("Sampling all contacts of this whisker …")
+            self._words.content = readout.note("Sampling all contacts of this whisker …")
         else:
             self._words.content = of_located(bend.whisker, self.found, bend.status)
 
@@ -269,26 +276,6 @@ class LocateMode(Mode):
         if (colours := asked.get("colours", "")) in COLOURS:
             put(self._colours, colours)
             self._colour(colours)
-
-    def _paint(self, chart: Chart) -> None:
-        """Colour the cloud in the background."""
-        key = (chart, self._sensor, self._what)
-        if self._drawn == key:
-            return
-        self._drawn = key
-        sensor, what = self._sensor, self._what
-
-        def ready(colours: scene.Bytes, legend: Legend) -> None:
-            if self._drawn == key:
-                self._legend.content = legend.html()
-                self._cloud = (chart, colours)
-                self._show_cloud()
-
-        def job() -> None:
-            colours, legend = coloured(chart, what, sensor)
-            self._page.work.put("colours", lambda: ready(colours, legend))
-
-        self._page.slow_work.put("colours", job)
 
     def _show_cloud(self) -> None:
         if self._cloud is None or self._page.mode is not self:

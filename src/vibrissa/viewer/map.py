@@ -20,19 +20,10 @@ from vibrissa.quantities import to_display
 from vibrissa.rod import PointContact, deflect
 from vibrissa.signals import SIGNALS
 from vibrissa.status import Status
+from vibrissa.viewer import readout
 from vibrissa.viewer.bend import NODES, follicle, whisker_body
 from vibrissa.viewer.page import Mode, Page, asked
-from vibrissa.viewer.readout import (
-    CONTACT,
-    REST,
-    WHISKER,
-    Legend,
-    note,
-    number,
-    of_deflection,
-    shaded,
-    table,
-)
+from vibrissa.viewer.readout import number
 from vibrissa.viewer.state import Chart
 
 # Quantities that can be held fixed in a slice.
@@ -154,7 +145,7 @@ def frame_drawing(solids: Solids, exaggeration: float) -> scene.Drawing:
     here = solids.place(None)
     line = whisker.centerline(NODES)
     out: dict[str, scene.Mark] = {
-        "rest": _moved(whisker_body(whisker, line, exaggeration, REST), here),
+        "rest": _moved(whisker_body(whisker, line, exaggeration, readout.REST), here),
         "follicle": _moved(follicle(whisker, exaggeration), here),
         "title": scene.Label(here + length * np.array([0.05, 0.0, 0.62]), "contacts"),
     }
@@ -197,12 +188,12 @@ def _moved(body: scene.Body, by: Array) -> scene.Body:
 
 def solids_drawing(
     solids: Solids, triangles: Array, by: str
-) -> tuple[dict[str, scene.Painted], dict[str, Legend]]:
+) -> tuple[dict[str, scene.Painted], dict[str, readout.Legend]]:
     """Draw contacts, coloured by a coordinate, in space and in the space of signals."""
     painted: dict[str, scene.Painted] = {}
-    legends: dict[str, Legend] = {}
+    legends: dict[str, readout.Legend] = {}
     for i, name in enumerate(scene.COORDINATES):
-        colours, legends[name] = shaded(name, scene.values_of(name, triangles))
+        colours, legends[name] = readout.shaded(name, scene.values_of(name, triangles))
         painted[name] = scene.Painted(solids.seen(triangles, i), colours)
         if name == by:
             painted["contacts"] = scene.Painted(solids.seen(triangles, None), colours)
@@ -216,22 +207,22 @@ def picked_drawing(solids: Solids, row: Array, exaggeration: float) -> tuple[sce
     out: dict[str, scene.Mark] = {}
     for space in (None, 0, 1, 2):
         vertices, faces = scene.ellipsoid(solids.seen(row, space), radius * np.eye(3))
-        out[f"mark {space}"] = scene.Body(vertices, faces, CONTACT)
+        out[f"mark {space}"] = scene.Body(vertices, faces, readout.CONTACT)
     # On the surface a whisker is about to slip off; a little inside it holds.
     inside = np.asarray(whisker.position(scene.values_of("arc_length", row))) - row[:3]
     for share in (0.0, 0.01, 0.05):
         bent = deflect(whisker, PointContact(row[:3] + share * inside))
         if Status(int(bent.status)).ok:
             line = np.asarray(bent.centerline(NODES))
-            body = whisker_body(whisker, line, exaggeration, WHISKER)
+            body = whisker_body(whisker, line, exaggeration, readout.WHISKER)
             out["bent"] = _moved(body, solids.place(None))
             if share == 0.0:
-                return out, of_deflection(bent)
+                return out, readout.of_deflection(bent)
             break
     measured = {name: float(scene.values_of(name, row)) for name in SIGNALS}
     where = {name: float(scene.values_of(name, row)) for name in ("arc_length", *scene.COORDINATES)}
-    edge = note("On the edge of what the whisker can reach: it is about to slip off.")
-    return out, edge + table(measured, "At the base") + table(where, "Contact")
+    edge = readout.note("On the edge of what the whisker can reach: it is about to slip off.")
+    return out, edge + readout.table(measured, "At the base") + readout.table(where, "Contact")
 
 
 _WHOLE = "none"
@@ -261,7 +252,7 @@ class MapMode(Mode):
             self._share = gui.add_slider("At", 0.0, 1.0, 0.01, 0.5, visible=False)
             self._value = gui.add_html("")
             self._legends = gui.add_html("")
-            self._words = gui.add_html(note(_HINT))
+            self._words = gui.add_html(readout.note(_HINT))
         shown: Any = (
             page.server.scene
         )  # its type does not allow coroutines, which run one after the other
@@ -286,7 +277,7 @@ class MapMode(Mode):
         """Draw the solids if they have not been drawn."""
         page, chart = self._page, self._page.chart
         if chart is None:
-            self._words.content = note("Charting all contacts of this whisker …")
+            self._words.content = readout.note("Charting all contacts of this whisker …")
             return
         cut = bool(self._cut.value)
         if self._solids is None or (self._solids.chart, self._solids.cut) != (chart, cut):
@@ -310,7 +301,7 @@ class MapMode(Mode):
         else:
             self._triangles = found.slice(what, share)
             value = number(what, found.value(what, share))
-            self._value.content = note(f"Contacts with {what} = {value}")
+            self._value.content = readout.note(f"Contacts with {what} = {value}")
         painted, legends = solids_drawing(found, self._triangles, by)
         if not len(self._triangles):
             painted = {}
@@ -340,7 +331,7 @@ class MapMode(Mode):
             return
         if self.row is None:
             self._page.stage.show("picked", {})
-            self._words.content = note(_HINT)
+            self._words.content = readout.note(_HINT)
             return
         drawing, words = picked_drawing(self._solids, self.row, self._page.exaggeration)
         self._page.stage.show("picked", drawing)

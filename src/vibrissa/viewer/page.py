@@ -35,7 +35,6 @@ from vibrissa.viewer.state import (
     begin,
     charted,
     link_of,
-    loaded,
     moved,
     numbers_in,
     restored,
@@ -117,10 +116,12 @@ class Page:
         self.closing: list[Callable[[], None]] = []
         self.linked: viser.GuiHtmlHandle | None = None
         self._written = 0.0
-        self.grip = Grip(server, float(to_display("length", 0.2 * whisker.length)), self._dragged)
-
-    def _dragged(self, place: Array, turn: Array) -> None:
-        self.change("drag", lambda bend: moved(bend, place, turn[:, 2]), dragging=True)
+        size = float(to_display("length", 0.2 * whisker.length))
+        self.grip = Grip(
+            server,
+            size,
+            lambda place, turn: self.change("drag", lambda b: moved(b, place, turn[:, 2]), True),
+        )
 
     def change(self, topic: str, transition: Transition, dragging: bool = False) -> None:
         """Schedule a change of the load; a newer change replaces an older one."""
@@ -169,10 +170,6 @@ class Page:
     def settle(self, timeout: float = 60.0) -> bool:
         """Wait up to ``timeout`` s until all work is done; return whether it is."""
         return self.work.wait(timeout) and self.slow_work.wait(timeout) and self.work.wait(timeout)
-
-    def bend_by_point(self) -> Bend:
-        """State with a point load at the current contact."""
-        return loaded(self.bend, "point")
 
     def thicken(self, factor: float) -> None:
         """Set the factor by which the drawn thickness of the whisker is exaggerated."""
@@ -567,17 +564,15 @@ class Latest:
         if threading.current_thread() is not self._thread:
             self._thread.join(timeout=5.0)
 
-    def _pause(self) -> float:
-        """Time until the next job is due, s."""
-        first = min((due for due, _ in self._jobs.values()), default=inf)
-        return first - time.monotonic()
-
     def _run(self) -> None:
         while True:
             with self._wake:
                 self._busy = False
                 self._wake.notify_all()
-                while not self._closed and (pause := self._pause()) > 0.0:
+                while not self._closed:
+                    first = min((due for due, _ in self._jobs.values()), default=inf)
+                    if (pause := first - time.monotonic()) <= 0.0:
+                        break
                     self._wake.wait(None if pause == inf else pause)
                 if self._closed:
                     return
@@ -634,8 +629,6 @@ class Player:
                 before = now
 
 
-Rehearsal = Callable[[], object]
-
 _done = threading.Event()  # set once all jobs have run in this process, whose kernels remain
 
 
@@ -649,13 +642,13 @@ class CompileNotice(event.Listener):
         self._running = self._reported = self._closed = False
         event.register("numba:compile", self)
 
-    def start(self, jobs: Sequence[Rehearsal]) -> None:
+    def start(self, jobs: Sequence[Callable[[], object]]) -> None:
         """Run jobs, once per process, ignoring errors, which occur again when a job is needed."""
         if not _done.is_set():
             self._running = True
             threading.Thread(target=self._run, args=(jobs,), name="warming", daemon=True).start()
 
-    def _run(self, jobs: Sequence[Rehearsal]) -> None:
+    def _run(self, jobs: Sequence[Callable[[], object]]) -> None:
         try:
             for job in jobs:
                 if self._closed:

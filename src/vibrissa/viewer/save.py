@@ -18,44 +18,17 @@ import numpy as np
 import viser
 import xarray as xr
 
-from vibrissa.contacts import ContactMap
 from vibrissa.io import netcdf_image, save_centerline, save_recording, write_movie
 from vibrissa.quantities import attributes
 from vibrissa.rod import Deflection
 from vibrissa.signals import base_signals
 from vibrissa.viewer.page import Page
 from vibrissa.viewer.trial import TrialMode
-from vibrissa.whisker import Whisker
 
 Picture = np.ndarray[Any, np.dtype[np.uint8]]
 
 NODES = 200
 _MARGIN = 24  # white around a picture, pixels
-
-
-def whisker_csv(whisker: Whisker) -> bytes:
-    """CSV file of the resting centreline, for `vibrissa.load_whisker`."""
-    return _written("whisker.csv", lambda path: save_centerline(path, whisker.centerline(NODES)))
-
-
-def whisker_netcdf(whisker: Whisker) -> bytes:
-    """NetCDF file of the whisker, without loss."""
-    return netcdf(whisker.to_dataset())
-
-
-def map_netcdf(contact_map: ContactMap) -> bytes:
-    """NetCDF file of a map, without loss, for `ContactMap.load`."""
-    return _written("map.nc", contact_map.save)
-
-
-def recording_netcdf(recording: xr.DataTree) -> bytes:
-    """NetCDF file of a recording with all groups."""
-    return _written("trial.nc", lambda path: save_recording(path, recording))
-
-
-def netcdf(data: xr.Dataset) -> bytes:
-    """NetCDF file of a dataset."""
-    return bytes(netcdf_image(data))
 
 
 def deflection_dataset(bent: Deflection) -> xr.Dataset:
@@ -90,7 +63,7 @@ def on_paper(image: Picture) -> Picture:
     return out[top : rows.max() + _MARGIN + 1, left : columns.max() + _MARGIN + 1]
 
 
-def _written(name: str, write: Callable[[Path], object]) -> bytes:
+def written(name: str, write: Callable[[Path], object]) -> bytes:
     """Contents of the file written by a function."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
@@ -126,7 +99,7 @@ def movie(
             # Encoders need even sizes.
             yield paper[: paper.shape[0] // 2 * 2, : paper.shape[1] // 2 * 2]
 
-    return _written("trial.mp4", lambda path: write_movie(path, frames(), 25.0))
+    return written("trial.mp4", lambda path: write_movie(path, frames(), 25.0))
 
 
 class SaveControls:
@@ -147,25 +120,33 @@ class SaveControls:
         files.on_click(self._whisker)
         picture.on_click(self._picture)
         movie.on_click(self._movie)
-        data.on_click(lambda event: self._send(event, *self._data()))
+        data.on_click(self._data)
 
     def _whisker(self, event: viser.GuiEvent[Any]) -> None:
         whisker = self._page.bend.whisker
         if event.target.value == "CSV":
-            self._send(event, "whisker.csv", lambda: whisker_csv(whisker))
+            self._written(
+                event, "whisker.csv", lambda path: save_centerline(path, whisker.centerline(NODES))
+            )
         else:
-            self._send(event, "whisker.nc", lambda: whisker_netcdf(whisker))
+            self._send(event, "whisker.nc", lambda: bytes(netcdf_image(whisker.to_dataset())))
 
-    def _data(self) -> tuple[str, Callable[[], bytes]]:
-        page, recording = self._page, self._recording
+    def _data(self, event: viser.GuiEvent[Any]) -> None:
+        page, recording, chart = self._page, self._recording, self._page.chart
         mode = "" if page.mode is None else page.mode.name
         if mode == "Trial" and recording is not None:
-            return "trial.nc", lambda: recording_netcdf(recording)
-        chart = page.chart
-        if mode == "Map" and chart is not None:
-            return "map.nc", lambda: map_netcdf(chart.contact_map)
-        bent = page.bend.deflection
-        return "bent.nc", lambda: netcdf(deflection_dataset(bent))
+            self._written(event, "trial.nc", lambda path: save_recording(path, recording))
+        elif mode == "Map" and chart is not None:
+            self._written(event, "map.nc", chart.contact_map.save)
+        else:
+            bent = page.bend.deflection
+            self._send(event, "bent.nc", lambda: bytes(netcdf_image(deflection_dataset(bent))))
+
+    def _written(
+        self, event: viser.GuiEvent[Any], name: str, write: Callable[[Path], object]
+    ) -> None:
+        """Send the file that a function writes."""
+        self._send(event, name, lambda: written(name, write))
 
     def _picture(self, event: viser.GuiEvent[Any]) -> None:
         """Send a picture of the requesting browser's view, without the panel."""

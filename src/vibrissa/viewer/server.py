@@ -55,7 +55,6 @@ from vibrissa.viewer.page import (
     Framing,
     Mode,
     Page,
-    Rehearsal,
     whole,
 )
 from vibrissa.viewer.readout import CLOUD, CONTACT, note, sentence, table
@@ -216,9 +215,13 @@ def view(
         the port is taken or not on this machine.
     """
     if isinstance(shown, xr.DataTree):
-        recording = _once(recording, shown, "recording")
+        if recording is not None:
+            raise ValueError("got two recordings; give one")
+        recording = shown
     elif isinstance(shown, ContactMap):
-        contact_map = _once(contact_map, shown, "map")
+        if contact_map is not None:
+            raise ValueError("got two maps; give one")
+        contact_map = shown
     elif not isinstance(shown, Whisker):
         raise ValueError(
             "what is shown is a Whisker, a ContactMap or a recording (DataTree); got "
@@ -249,13 +252,6 @@ def view(
         _furnished(page, recording, trial, footage)
         opened.pop_all()
     return viewer
-
-
-def _once(given: Any, shown: Any, name: str) -> Any:
-    """Return the object to show; raise ValueError if it is given twice."""
-    if given is not None:
-        raise ValueError(f"got two {name}s; give one")
-    return shown
 
 
 def _of_one(contact_map: ContactMap, whisker: Whisker) -> Whisker:
@@ -305,7 +301,7 @@ def _furnished(
     warming.start(rehearsal(page))
 
 
-def rehearsal(page: Page) -> list[Rehearsal]:
+def rehearsal(page: Page) -> list[Callable[[], object]]:
     """Jobs that run typical requests of a page without changing it, to compile kernels."""
     bend = page.bend
 
@@ -313,7 +309,7 @@ def rehearsal(page: Page) -> list[Rehearsal]:
         page.settle(600.0)
         if (chart := page.chart) is not None:
             sensor = usual_sensor(chart.whisker)
-            located(chart, page.bend_by_point(), sensor)
+            located(chart, loaded(page.bend, "point"), sensor)
             coloured(chart, "sensitivity", sensor)
 
     return [

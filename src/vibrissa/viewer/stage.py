@@ -181,7 +181,11 @@ def glb(
     side: Side = "double",
 ) -> bytes:
     """Write triangles with coloured corners as a GLB file."""
-    shades = np.repeat(_shade(triangles), 3)
+    # The brightness of each triangle is the same from both sides.
+    across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    size = np.linalg.norm(across, axis=1)
+    facing = np.abs(across @ _TO_LIGHT) / np.where(size > 0.0, size, 1.0)
+    shades = np.repeat(_SHADE + (1.0 - _SHADE) * facing, 3)
     vertices, first, which = _welded(triangles.reshape(-1, 3))
     shade = np.bincount(which, shades) / np.bincount(which)
     seen = colours.reshape(-1, 3)[first] * (shade[:, None] / 255.0)
@@ -207,14 +211,6 @@ def before_tone_mapping(light: Array) -> Array:
     a, b, c = 1.0 - 0.983729 * y, 0.0245786 - 0.432951 * y, -(0.000090537 + 0.238081 * y)
     curve = (-b + np.sqrt(np.maximum(b * b - 4.0 * a * c, 0.0))) / (2.0 * a)
     return np.asarray(np.maximum(curve @ np.linalg.inv(_IN).T, 0.0) / _EXPOSURE)
-
-
-def _shade(triangles: Array) -> Array:
-    """Brightness of each triangle (n,), the same from both sides."""
-    across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    size = np.linalg.norm(across, axis=1)
-    facing = np.abs(across @ _TO_LIGHT) / np.where(size > 0.0, size, 1.0)
-    return np.asarray(_SHADE + (1.0 - _SHADE) * facing)
 
 
 def _welded(corners: Array) -> tuple[Array, Ints, Ints]:

@@ -237,17 +237,14 @@ def shape_in(word: str) -> Shape | None:
     return Shape(length / _MM, float(np.deg2rad(turn)), taper, modulus / _GPA)
 
 
-def whole_turn(whisker: Whisker) -> float:
-    """Angle by which a whisker turns from base to tip, ∫|κ| ds, rad."""
-    s = (np.arange(400) + 0.5) / 400.0 * whisker.length
-    bending = np.linalg.norm(whisker.curvature(s)[:, 1:], axis=1)
-    return float(bending.mean() * whisker.length)
-
-
 def shape_of(whisker: Whisker) -> Shape:
     """Shape parameters of a whisker."""
     taper = whisker.base_radius / whisker.tip_radius
-    return Shape(whisker.length, whole_turn(whisker), taper, whisker.youngs_modulus)
+    # The angle by which it turns from base to tip, ∫|κ| ds.
+    s = (np.arange(400) + 0.5) / 400.0 * whisker.length
+    bending = np.linalg.norm(whisker.curvature(s)[:, 1:], axis=1)
+    turn = float(bending.mean() * whisker.length)
+    return Shape(whisker.length, turn, taper, whisker.youngs_modulus)
 
 
 def shaped(whisker: Whisker, asked: Shape) -> Whisker:

@@ -8,6 +8,7 @@ from scipy.linalg import eigh
 from scipy.ndimage import gaussian_filter1d
 
 import vibrissa as vb
+from vibrissa.numerics import exponential
 from vibrissa.objects import Peg
 from vibrissa.rod import follow_surfaces
 from vibrissa.simulation import Dynamics, Motion, resonances, simulate, whisking
@@ -93,7 +94,8 @@ def chain_state(theta, chain):
     m = chain.joints.size
     frames, pivots, turns = np.empty((m + 1, 3, 3)), np.empty((m, 3)), np.empty((m, 3, 3))
     base = np.array([1e-3, 2e-3, 3e-3])
-    configure(theta, chain.joints, base_rotation(0.3, 0.2, 0.1), base, frames, pivots, turns)
+    rotation = base_rotation(0.3, 0.2, 0.1)
+    configure(*exponential(theta), chain.joints, rotation, base, frames, pivots, turns)
     return frames, pivots, turns, base
 
 

@@ -225,11 +225,6 @@ def orthogonal_views(
     front : Camera
         View with x to the right and z upward: the view from +y, mirrored so that both images have
         the same x in the same column.
-
-    Raises
-    ------
-    ValueError
-        If the pixel size is not positive.
     """
     if not (np.isfinite(pixel_size) and pixel_size > 0.0):
         raise ValueError(f"pixel_size is {pixel_size!r}; it must be positive, in m")
@@ -412,13 +407,6 @@ def load_cameras(path: str | PathLike[str], unit: float = 1e-3) -> tuple[Camera,
     -------
     tuple of Camera
         Cameras in the file's order.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is not a calibration, or has faults.
     """
     cameras = []
     for table in read_calibration(path):
@@ -449,11 +437,6 @@ def save_cameras(path: str | PathLike[str], cameras: Sequence[Camera], unit: flo
         Cameras of the views.
     unit : float
         Unit of the file's lengths, m.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the folder does not exist.
     """
     tables = []
     for camera in cameras:
@@ -489,18 +472,13 @@ def cameras_dataset(cameras: Sequence[Camera]) -> xr.Dataset:
 
 def cameras_from_dataset(dataset: xr.Dataset) -> tuple[Camera, ...]:
     """Restore cameras from the dataset of `cameras_dataset`."""
-    return tuple(
-        Camera(
-            matrix=row["camera_matrix"].values,
-            rotation=row["camera_rotation"].values,
-            translation=row["camera_translation"].values,
-            distortion=row["camera_distortion"].values,
-            size=(int(row["image_size"][0]), int(row["image_size"][1])),
-            projection=str(row["projection"].values),  # type: ignore[arg-type]
-            name=str(row["view"].values),
-        )
-        for row in (dataset.isel(view=i) for i in range(dataset.sizes["view"]))
-    )
+    views = [dataset.isel(view=i) for i in range(dataset.sizes["view"])]
+    known: list[dict[str, Any]] = [
+        {part: row[name].values for name, (part, _) in _VARIABLES.items()}
+        | {"projection": str(row["projection"].values), "name": str(row["view"].values)}
+        for row in views
+    ]
+    return tuple(Camera(**values) for values in known)
 
 
 Image = NDArray[np.uint8]

@@ -20,7 +20,7 @@ from vibrissa.numerics import Array
 from vibrissa.objects import Peg
 from vibrissa.pipeline import ANGLE_CLASSES
 from vibrissa.recording import Group, Recording
-from vibrissa.signals import nearest_on_rest, spherical, within_turn
+from vibrissa.signals import cone_angle, spherical, within_turn
 from vibrissa.whisker import Whisker
 
 __all__ = [
@@ -158,8 +158,7 @@ def deflection_angle(truth: xr.Dataset, whisker: Whisker) -> Array:
     array (time,)
         Angles, rad; NaN without contact.
     """
-    distance, arc_length = nearest_on_rest(whisker, truth["contact_point_whisker"].values)
-    return np.asarray(np.arctan2(distance, arc_length))
+    return cone_angle(whisker, truth["contact_point_whisker"].values)
 
 
 def _errors(estimated: Array, true: Array) -> Array:

@@ -153,7 +153,7 @@ class TestMotion:
     def test_faults(self):
         with pytest.raises(ValueError, match=r"protraction is 0\.8"):
             whisking(protraction=0.8)
-        with pytest.raises(ValueError, match="not a rotation matrix"):
+        with pytest.raises(ValueError, match="rotation is not a rotation"):
             whisking(0.1).on_head(2.0 * np.eye(3), np.zeros(3))
         with pytest.raises(ValueError, match="already includes a motion"):
             whisking(0.1).on_head(np.eye(3), np.zeros(3)).on_head(np.eye(3), np.zeros(3))

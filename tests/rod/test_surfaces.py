@@ -134,7 +134,9 @@ def test_pegs_agree_with_the_solver_of_pegs(whisker):
         Peg([0.85 * LENGTH, 0.0, 0.0], [-0.1, 0.1, 1.0], 0.2e-3),
     ):
         found = follow_surfaces(whisker, [peg], motion.base_rotation, motion.base_position).bent
-        origins, axes = peg.in_whisker_frame(motion.base_rotation, motion.base_position)
+        turn = motion.base_rotation
+        origins = np.einsum("tji,tj->ti", turn, peg.origin - motion.base_position)
+        axes = peg.axis @ turn
         last = None
         for i, (origin, axis) in enumerate(zip(origins, axes, strict=True)):
             load = vb.PegContact(origin, axis, peg.radius, start=last)
@@ -243,8 +245,9 @@ def test_a_whisker_begins_outside_on_the_nearest_side():
     rotation = base_rotation(-0.26, 0.0, 0.0)[None]
     found = follow_surfaces(WHISKER, [OBJECTS["peg"]], rotation, np.zeros((1, 3)))
     assert touching(found).all()
-    origin, axis = OBJECTS["peg"].in_whisker_frame(rotation[0], np.zeros(3))
-    bent = vb.deflect(WHISKER, vb.PegContact(origin, axis, OBJECTS["peg"].radius))
+    peg = OBJECTS["peg"]
+    load = vb.PegContact(peg.origin @ rotation[0], peg.axis @ rotation[0], peg.radius)
+    bent = vb.deflect(WHISKER, load)
     np.testing.assert_allclose(found.bent.force[0], bent.force, rtol=1e-7)
 
 

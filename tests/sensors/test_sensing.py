@@ -192,13 +192,11 @@ def test_mixing_and_offset_are_found_as_surely_as_said(wire, touched, rng):
         noise=[2e-3, 3e-3],
         bias=[0.5, -1.0],
     )
-    which = [1, 2, 4, 5]
+    which, components = [1, 2, 4, 5], ("Fy", "Fz", "My", "Mz")
     errors = []
     for seed in range(40):
         readings = true.read(np.arange(60.0), wrench_of(touched), seed)
-        found = calibrate_on_contacts(
-            wire, touched.contact_point, readings, components=("Fy", "Fz", "My", "Mz")
-        )
+        found = calibrate_mixing(readings, wrench_of(touched), components=components)
         away = np.column_stack(
             [found.sensor.mixing[:, which] - true.mixing[:, which], found.sensor.bias - true.bias]
         )
@@ -207,6 +205,8 @@ def test_mixing_and_offset_are_found_as_surely_as_said(wire, touched, rng):
         )
     assert np.mean(errors) == pytest.approx(5.0, rel=0.2)
     np.testing.assert_allclose(found.sensor.noise, true.noise, rtol=0.3)
+    same = calibrate_on_contacts(wire, touched.contact_point, readings, components=components)
+    np.testing.assert_allclose(same.sensor.mixing, found.sensor.mixing, rtol=0, atol=1e-5)
 
 
 def test_mixing_that_contacts_do_not_tell_is_refused(wire, touched, rng):

@@ -9,7 +9,6 @@ from vibrissa.rod import discretize, solve_forces
 from vibrissa.signals import (
     SIGNALS,
     TRIPLETS,
-    base_signals,
     concave_backward,
     measured,
     nearest_on_rest,
@@ -53,16 +52,6 @@ def test_dimensions_follow_the_input():
     assert vb.base_signals(labelled, labelled).sizes == {"time": 5}
     with pytest.raises(ValueError, match=r"same shape .* got \(3,\) and \(2, 3\)"):
         vb.base_signals(np.ones(3), np.ones((2, 3)))
-
-
-def test_masked_values_are_missing_and_components_are_in_order():
-    force = np.ma.array([[1e-4, 2e-4, 3e-4]] * 2, mask=[[False] * 3, [True] * 3])
-    signals = base_signals(force, 1e-2 * force)
-    for name in SIGNALS:
-        assert np.isfinite(signals[name]).values.tolist() == [True, False]
-    turned = xr.DataArray(np.ones((2, 3)), dims=("time", "space"), coords={"space": list("zyx")})
-    with pytest.raises(ValueError, match="force has columns z, y, x"):
-        base_signals(turned, 1e-2 * turned)
 
 
 def test_there_are_twenty_triplets():

@@ -8,6 +8,7 @@ from scipy.linalg import eigh
 from scipy.ndimage import gaussian_filter1d
 
 import vibrissa as vb
+from vibrissa.numerics import exponential
 from vibrissa.objects import Peg
 from vibrissa.rod import follow_surfaces
 from vibrissa.simulation import Dynamics, Motion, resonances, simulate, whisking
@@ -93,7 +94,8 @@ def chain_state(theta, chain):
     m = chain.joints.size
     frames, pivots, turns = np.empty((m + 1, 3, 3)), np.empty((m, 3)), np.empty((m, 3, 3))
     base = np.array([1e-3, 2e-3, 3e-3])
-    configure(theta, chain.joints, base_rotation(0.3, 0.2, 0.1), base, frames, pivots, turns)
+    rotation = base_rotation(0.3, 0.2, 0.1)
+    configure(*exponential(theta), chain.joints, rotation, base, frames, pivots, turns)
     return frames, pivots, turns, base
 
 
@@ -129,7 +131,8 @@ def test_at_rest_it_is_static():
     expected = follow_surfaces(WHISKER, [peg], motion.base_rotation, motion.base_position).bent
     errors = []
     for segments in (8, 16):
-        moments = move_dynamically(WHISKER, [peg], motion, Dynamics(segments=segments))
+        dynamics = Dynamics(segments=segments, step=2e-4)
+        moments = move_dynamically(WHISKER, [peg], motion, dynamics)
         force, moment = felt(motion, moments)
         errors.append(
             max(
@@ -185,7 +188,7 @@ def test_finer_steps_agree():
     motion = whisking(0.1, 1000.0, amplitude=0.6, elevation_drift=0.0, position_drift=0.0)
     felt_at = [
         felt(motion, move_dynamically(WHISKER, [], motion, Dynamics(segments=8, step=step)))[1]
-        for step in (2e-4, 1e-4, 5e-5)
+        for step in (5e-4, 2.5e-4, 1.25e-4)
     ]
     coarse, fine = (np.abs(a - b)[20:].max() for a, b in pairwise(felt_at))
     assert coarse / fine > 3.0

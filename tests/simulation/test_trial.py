@@ -185,13 +185,6 @@ def test_the_sensor_adds_its_noise_and_no_more(trial):
         measure(trial, force_noise=-1.0)
 
 
-def test_progress_is_told():
-    told = []
-    motion = whisking(duration=0.01, rate=1000.0, set_point=1.5)
-    simulate(WHISKER, motion, PEG, progress=lambda done, total: told.append((done, total)))
-    assert told == [(i + 1, 10) for i in range(10)]
-
-
 @pytest.mark.parametrize("whisker", [samples.straight(), WHISKER.scaled(0.15), WHISKER.scaled(1.5)])
 def test_whiskers_of_other_lengths_slip_past_too(whisker):
     peg = facing_peg(whisker)

@@ -18,7 +18,7 @@ from vibrissa.simulation import (
     simulate,
     sweep_past,
 )
-from vibrissa.simulation.vibration import Modes, _Free, _Model
+from vibrissa.simulation.vibration import _Free, _Model
 
 NOISE = component_noise(FORCE_NOISE, MOMENT_NOISE)
 
@@ -136,11 +136,7 @@ def test_what_is_not_determined_is_stated(whisker, in_air):
 
 def test_a_contact_begins_where_the_whisker_deviates_from_free_vibration(whisker):
     vibration = Vibration.of(whisker)
-    reach = np.linalg.norm(vibration.places, axis=1).max()
-    gains = vibration.base_wrench(vibration.shapes)
-    loss = vibration.damping * vibration.rates
-    modes = Modes(vibration.rates, loss, gains, vibration.shapes[:, -1] / reach)
-    model = _Model.of(modes, 1e-3, NOISE, np.zeros(6))
+    model = _Model.of(vibration, 1e-3, NOISE, np.zeros(6))
     size = 2 * len(vibration.rates) + 1
     free = _Free(np.zeros(1, int), np.zeros((1, size)), 0.1 * np.eye(size)[None], np.zeros(1))
     free.state[0, :4] = 60.0, 10.0, -40.0, 30.0

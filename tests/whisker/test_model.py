@@ -456,7 +456,7 @@ def test_bad_poses():
         Pose(2 * np.eye(3), [0.0, np.nan, 0.0])
     with pytest.raises(ValueError, match="reflection"):
         Pose(-np.eye(3))
-    with pytest.raises(ValueError, match="last axis"):
+    with pytest.raises(ValueError, match="must have shape"):
         Pose().to_source([1.0, 2.0])
 
 

@@ -71,15 +71,11 @@ def enclose_conditions(
 ) -> tuple[Array, Array]:
     """Enclose all conditions over boxes; also return relative widths, as `conditions_on`."""
     alike = np.lexsort(boxes[..., 0].T[::-1])  # neighbouring boxes need similar steps
-    ordered, bound = np.ascontiguousarray(boxes[alike]), force.packed()
+    ordered = np.ascontiguousarray(boxes[alike])
     found = np.empty((len(boxes), len(tables.conditions), tables.unknowns + 3))
     widths = np.empty((len(boxes), tables.unknowns))
-    share_out(
-        len(boxes),
-        lambda first, end: conditions_on(
-            tables, rod, bound, ordered, _ORDER, tolerance, found, widths, first, end
-        ),
-    )
+    given = tables, rod, force.packed(), ordered, _ORDER, tolerance, found, widths
+    share_out(len(boxes), conditions_on, *given)
     back = np.argsort(alike)
     return found[back], widths[back]
 
@@ -151,7 +147,6 @@ class Certificate:
     _tables: dict[str, Conditions] = field(default_factory=dict, compare=False)
 
     def __repr__(self) -> str:
-        """Summary of what is proved, instead of the boxes."""
         return f"<{self.summary()}>"
 
     @property

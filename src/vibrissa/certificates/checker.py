@@ -72,22 +72,18 @@ class Form:
         return np.asarray((np.abs(self.centre) + self.reach) * (1.0 + _LOST))
 
     def __add__(self, other: Form) -> Form:
-        """Sum."""
         lost = _LOST * (self.size + other.size)
         return Form(
             self.centre + other.centre, self.slope + other.slope, self.rest + other.rest + lost
         )
 
     def __neg__(self) -> Form:
-        """Negative."""
         return Form(-self.centre, -self.slope, self.rest)
 
     def __sub__(self, other: Form) -> Form:
-        """Difference."""
         return self + (-other)
 
     def __mul__(self, other: Form | float) -> Form:
-        """Product."""
         if not isinstance(other, Form):
             rest = abs(other) * self.rest + _LOST * abs(other) * self.size
             return Form(other * self.centre, other * self.slope, rest)
@@ -127,7 +123,6 @@ class Series:
         self.forms.append(form)
 
     def __getitem__(self, k: int) -> Form:
-        """Coefficient k."""
         return self.forms[k]
 
     def times(self, other: Series, k: int) -> Form:

@@ -47,9 +47,6 @@ from vibrissa.numerics import Array, IntArray, inlined_rigorous, rigorous
 #: Conditions for a straight whisker: f_max > 0; μ > 0; ∂ ln M/∂s < 0; ∂(M, R)/∂(s, f) < 0;
 #: ∂R/∂f > 0, which is required on the faces only.
 PLANAR = ("load", "moment", "moment along s", "determinant", "ratio along the load")
-#: Conditions beyond the fold: x_s(η + 2Fη_F) - 2F x_F η_s < 0, the determinant of the contact point
-#: in the plane; η > 0, with which it is also that in space.
-PLANAR_FOLD = ("determinant of the point", "deflection")
 #: Conditions for any whisker: f_min > 0; f_ℓ > 0; ∂g₁/∂s < 0; ∂(g₁, g₂)/∂(s, φ) < 0; the sign of
 #: the determinant; ∂g₂/∂φ > 0; the sign of ∂(g₂, g₃)/∂(φ, ℓ). The last two apply to the faces.
 SPATIAL = (
@@ -61,11 +58,6 @@ SPATIAL = (
     "direction",
     "direction and force",
 )
-#: Condition beyond the fold: det ∂p/∂(s, f_y, f_z) < 0.
-SPATIAL_FOLD = ("determinant of the point",)
-#: Condition near rest: f_min |∂p/∂f| < ``room`` · s, so that less force leaves the contact in the
-#: cone.
-SPATIAL_REST = ("deflection",)
 # Number of coefficients of each polynomial P.
 DEGREES = 6
 _GIVEN_VARIABLES = ("one", "s", "level", "cos", "sin", "inverse", "alpha")
@@ -126,8 +118,8 @@ def _assemble(
     conditions: tuple[str, ...],
     unknowns: int,
 ) -> Conditions:
-    at = out.names.index
     """Complete a table with the indices of its inputs and outputs."""
+    at = out.names.index
     first = np.full(equations.groups.size, -1)
     for i, name in start.items():
         first[i] = at(name)
@@ -137,7 +129,11 @@ def _assemble(
 
 
 def planar_conditions(fold: bool = False) -> Conditions:
-    """Conditions `PLANAR` of a straight whisker, or with ``fold`` `PLANAR_FOLD`."""
+    """Conditions `PLANAR` of a straight whisker, or with ``fold`` those beyond the fold.
+
+    These are x_s(η + 2Fη_F) - 2F x_F η_s < 0, the determinant of the contact point in the plane,
+    and η > 0, with which it is also that in space.
+    """
     out = _force_bounds((1,))
     out.add(ALGEBRAIC, "limit", "b1 b1")
     out.add(ALGEBRAIC, "F", "limit level")
@@ -215,7 +211,10 @@ def spatial_conditions(sign: float) -> Conditions:
 
 
 def spatial_point_conditions(kind: str) -> Conditions:
-    """Conditions `SPATIAL_REST` near rest (``"rest"``), or `SPATIAL_FOLD` (``"fold"``).
+    """Conditions of any whisker near rest (``"rest"``) or beyond the fold (``"fold"``).
+
+    Near rest f_min |∂p/∂f| < ``room`` · s, so that less force leaves the contact in the cone;
+    beyond the fold det ∂p/∂(s, f_y, f_z) < 0.
 
     For a ``"contact"``, with the force as near rest: det ∂p/∂(s, f_y, f_z), which is positive if
     the contact is stable; then F, M and p, and the derivatives of each by s, φ and ℓ.

@@ -94,11 +94,11 @@ class Poly(NamedTuple):
         return np.asarray(self.coef[0] - (np.abs(self.coef[1:]).sum(axis=0) + self.rest) * _UP)
 
 
-def _constant(value: Array | float, number: int, spread: float = 0.0) -> Poly:
-    """Constant polynomial with a radius."""
+def _constant(value: Array | float, number: int) -> Poly:
+    """Constant polynomial."""
     coef = np.zeros((len(_ROWS), number))
     coef[0] = value
-    return Poly(coef, np.full(number, spread))
+    return Poly(coef, np.zeros(number))
 
 
 def _function(axis: int, half: Array, derivatives: list[Array], beyond: Array) -> Poly:

@@ -16,7 +16,7 @@ forms is a sum of at most 8 products of coefficients; one of a sum of m such pro
 together are at most t_x t_y, so that the error of all coefficients together is at most
 (8 m + 6) u Σ t_x t_y (1 + 10⁻¹²). The omitted products of degrees above q are bounded by
 t_x t_y - Σ_d (C_d - C_{d-1})(x) C_{q-d}(y), remainders included, with an error of at most
-20 u t_x t_y per term. ``ROUNDING`` is 1080 u: enough for m ≤ `TERMS` = 128, also where a bound on t
+20 u t_x t_y per term. ``ROUNDING`` is 1080 u: enough for m ≤ 128, also where a bound on t
 has itself been rounded. Underflow is covered by ``TINY``. Sizes are rounded up by ``UP``, which
 covers sums of up to 80 terms.
 """
@@ -35,8 +35,6 @@ from vibrissa.numerics import Array, inlined_rigorous
 
 LANES = 8
 DEGREE = 3
-#: Largest number of terms of a sum of products.
-TERMS = 128
 ROUNDING = 1.2e-13
 UP = 1.0 + 2e-14
 TINY = 1e-290

@@ -59,7 +59,6 @@ class Witness(NamedTuple):
         Lower bound of the distance of the two contact points, over L.
     doubt : str
         Statement that could not be proved; empty if all were.
-        Statement that could not be shown; empty if all was.
     """
 
     proved: bool

@@ -60,11 +60,6 @@ def compare_with(
         ``surface_distance``, m, positive outside, and with a covariance
         ``surface_distance_predicted``: ``REPLICATES`` samples of the distances expected if the
         covariance were the only error.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not match.
     """
     p = numbers("points", points)
     if p.ndim != len(dims) + 1 or p.shape[-1] != 3:
@@ -131,11 +126,6 @@ def distances_by(
         Dataset with the dimension class and its label: ``lower``, ``upper``, the number of
         ``contacts``, ``median`` and ``largest_95`` (95 % quantile) of the absolute distance, and
         both as predicted, m. Classes without contacts are included, with NaN.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not match, the quantity is unknown, or the edges do not increase.
     """
     if quantity not in QUANTITIES:
         raise ValueError(f"{quantity!r} is not a known quantity")
@@ -153,7 +143,7 @@ def distances_by(
     for low, high in itertools.pairwise(limits):
         within = known & (v >= low) & ((v < high) | ((high == limits[-1]) & (v == high)))
         rows["contacts"].append(int(within.sum()))
-        sums = (*_median_and_95(size[within]), *_median_over_replicates(drawn, within))
+        sums = (*_median_and_95(size[None], within), *_median_and_95(drawn, within))
         for name, number in zip(_SUMS, sums, strict=True):
             rows[name].append(number)
     data: dict[str, Any] = {
@@ -184,16 +174,8 @@ def _edges(values: Array) -> Array:
     return edges if edges.size > 1 else np.array([edges[0], np.nextafter(edges[0], np.inf)])
 
 
-def _median_and_95(size: Array) -> tuple[float, float]:
-    """Median and 95 % quantile; NaN without values."""
-    if size.size == 0:
-        return float("nan"), float("nan")
-    median, most = np.quantile(size, [0.5, 0.95])
-    return float(median), float(most)
-
-
-def _median_over_replicates(drawn: Array | None, within: Any) -> tuple[float, float]:
-    """Median and 95 % quantile of samples, as medians over the replicates."""
+def _median_and_95(drawn: Array | None, within: Any) -> tuple[float, float]:
+    """Median and 95 % quantile, as medians over the replicates; NaN without values."""
     if drawn is None:
         return float("nan"), float("nan")
     rows = drawn[:, within]

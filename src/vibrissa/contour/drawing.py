@@ -37,11 +37,6 @@ def surface_grid(shape: FittedShape, points: ArrayLike, count: int = 41) -> xr.D
     xarray.Dataset
         Dataset of dimensions u, v, space: ``surface_grid_point`` and its standard deviation
         ``surface_sigma`` normal to the surface, m.
-
-    Raises
-    ------
-    ValueError
-        If there are no points, or the grid has fewer than two points in a direction.
     """
     if count < 2:
         raise ValueError(f"count is {count}; at least 2 are needed")
@@ -163,11 +158,6 @@ def ellipsoids(covariance: ArrayLike, share: float = 0.95) -> Ellipsoids:
     -------
     Ellipsoids
         Semiaxes and their directions.
-
-    Raises
-    ------
-    ValueError
-        If the shape is wrong, or the share is not between 0 and 1.
 
     Examples
     --------

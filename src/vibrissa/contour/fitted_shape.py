@@ -205,11 +205,6 @@ def continuing_candidates(candidates: ArrayLike, frames: ArrayLike) -> NDArray[n
         Index of the selected candidate: 0 if the run has no frame with a single candidate, -1 if
         there is no candidate.
 
-    Raises
-    ------
-    ValueError
-        If shapes do not match.
-
     Examples
     --------
     >>> near, far = [0.0, 0.0, 0.0], [9.0, 0.0, 0.0]

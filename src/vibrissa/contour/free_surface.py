@@ -289,11 +289,6 @@ def shape_from_dataset(dataset: xr.Dataset) -> FittedShape:
     -------
     CylinderFit, SphereFit, PlaneFit or FreeFit
         Restored shape, with flattened residuals and inliers.
-
-    Raises
-    ------
-    ValueError
-        If its kind is unknown, or a variable is missing.
     """
     kinds: dict[str, type[FittedShape]] = {**SHAPES, FreeFit.kind: FreeFit}
     kind = dataset.attrs.get("shape")

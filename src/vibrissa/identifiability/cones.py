@@ -63,11 +63,6 @@ def critical_cones(
     Dataset
         ``critical_cone`` (rad) over ``triplet``, ``taper_ratio`` and ``curvature``; 0 where no
         witness was found.
-
-    Raises
-    ------
-    ValueError
-        If a curvature is negative or not finite, or a ratio below 1.
     """
     curved = np.atleast_1d(np.asarray(curvatures, dtype=np.float64))
     ratios = np.atleast_1d(np.asarray(taper_ratios, dtype=np.float64))

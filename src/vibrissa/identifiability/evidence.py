@@ -220,10 +220,7 @@ def gather_evidence(problem: Problem, names: tuple[str, ...], resolution: bool) 
     )
     on_surface: tuple[Pairs, int] | None = None
     if lost is not None:
-        tried = _outside_cone(problem, samples.contacts)
-        followed = np.union1d(tried, _farthest_from_rest(problem, samples.contacts))
-        start = samples.rows(followed)
-        pool = fibres(problem.contact_map, names, lost, start.chart, start.contacts, problem.domain)
+        pool, followed, tried = _fibres(problem, names, lost, samples)
         own = pool._replace(sample=followed[pool.sample])
     else:
         tried = np.arange(len(samples.chart))
@@ -375,21 +372,26 @@ def _confirm_on_finer_rod(
     return nothing, 0.0
 
 
-def _outside_cone(problem: Problem, contacts: ContactSet) -> AnyArray:
-    """A few contacts outside the cone, from every region."""
-    outside = np.flatnonzero(contacts.angle > problem.cone)
-    return _first_of_regions(problem, contacts, outside)
+def _fibres(
+    problem: Problem, names: tuple[str, ...], steps: int, samples: Samples
+) -> tuple[Pairs, AnyArray, AnyArray]:
+    """Pairs on the fibres through a few samples, and the indices of these.
 
-
-def _farthest_from_rest(problem: Problem, contacts: ContactSet) -> AnyArray:
-    """The contacts farthest from rest, from every region."""
-    return _first_of_regions(problem, contacts, np.argsort(-contacts.angle, kind="stable"))
-
-
-def _first_of_regions(problem: Problem, contacts: ContactSet, order: AnyArray) -> AnyArray:
-    """First ``_FOLLOWED`` contacts of every region in a given order."""
-    chosen = [order[contacts.members(region)[order]][:_FOLLOWED] for region in problem.regions]
-    return np.unique(np.concatenate(chosen))
+    The samples are the first outside the cone, and those farthest from rest, of every region; last
+    returned are the indices of the former.
+    """
+    contacts = samples.contacts
+    outside, followed = (
+        np.unique(np.concatenate([o[contacts.members(r)[o]][:_FOLLOWED] for r in problem.regions]))
+        for o in (
+            np.flatnonzero(contacts.angle > problem.cone),
+            np.argsort(-contacts.angle, kind="stable"),
+        )
+    )
+    followed = np.union1d(outside, followed)
+    start = samples.rows(followed)
+    found = fibres(problem.contact_map, names, steps, start.chart, start.contacts, problem.domain)
+    return found, followed, outside
 
 
 def _pairs_in_plane(
@@ -402,11 +404,7 @@ def _pairs_in_plane(
     lost = deficient(problem.contact_map, names, plane.contacts.xi, span)
     if lost is None:
         return None
-    followed = np.union1d(
-        _outside_cone(problem, plane.contacts), _farthest_from_rest(problem, plane.contacts)
-    )
-    start = plane.rows(followed)
-    found = fibres(problem.contact_map, names, lost, start.chart, start.contacts, problem.domain)
+    found, _, _ = _fibres(problem, names, lost, plane)
     return found.rows(found.apart >= problem.separation), lost
 
 

@@ -41,7 +41,7 @@ from vibrissa.signals import (
     TRIPLETS,
     base_signals,
     concave_backward,
-    nearest_on_rest,
+    cone_angle,
     selection,
     spherical,
     within_cone,
@@ -86,11 +86,6 @@ def sensitivity(
         of its ellipsoid (one standard deviation, longest first), and ``predicted_error``, the RMS
         3D error.
 
-    Raises
-    ------
-    ValueError
-        If the triplet, the contacts or the noise do not fit.
-
     Examples
     --------
     >>> import vibrissa as vb
@@ -126,10 +121,9 @@ def _contact_variables(contact_map: ContactMap, chosen: ChosenContacts) -> xr.Da
     d, whisker = contact_map.chart.discretization, contact_map.whisker
     force, point = chosen.values[:, :3] * d.force, chosen.values[:, 3:] * d.length
     known = np.isfinite(point).all(axis=1)
-    away, arc_length = nearest_on_rest(whisker, point)
     columns: dict[str, tuple[Any, dict[str, Any]]] = {
         "arc_length": (chosen.contacts[:, 0] * d.length, attributes("arc_length")),
-        "deflection_angle": (np.arctan2(away, arc_length), attributes("deflection_angle")),
+        "deflection_angle": (cone_angle(whisker, point), attributes("deflection_angle")),
         "small_deflection": (within_cone(whisker, point), _flag("within 2° of rest")),
         "concave_backward": (known & concave_backward(whisker, point), _flag("CB, not CF")),
         "large_deflection": (
@@ -218,11 +212,6 @@ def best_triplet(
         ``median_error_where_best``. Shares are of the volume of contact points where contacts
         sample space, else of the number of contacts. In addition the variables that describe
         contacts, as from :func:`~vibrissa.sensitivity`.
-
-    Raises
-    ------
-    ValueError
-        If triplets, contacts or noise do not fit.
     """
     chosen_names = [selection(triplet, exactly=3) for triplet in triplets]
     if not chosen_names:

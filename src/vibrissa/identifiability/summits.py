@@ -200,14 +200,13 @@ class _Objective:
         """Scale of a change of contacts (n, 2, 3)."""
         return units(self.search.contact_map, xi.reshape(-1, 3)).reshape(xi.shape)
 
+    # A pair that diverges has no signals, and so no merit.
+    @np.errstate(divide="ignore", invalid="ignore")
     def at(self, xi: Array, signs: Array) -> _State:
-        """Pairs with equal triplets closest to contacts (n, 2, 3), for signs (n, 2) of regions."""
-        # A pair that diverges has no signals, and so no merit.
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return self._at(xi, signs)
+        """Pairs with equal triplets closest to contacts (n, 2, 3), for signs (n, 2) of regions.
 
-    def _at(self, xi: Array, signs: Array) -> _State:
-        """Return to the set by Newton's method, and evaluate."""
+        They are found by Newton's method.
+        """
         unit = self.units(xi)
         for step in range(_CORRECTIONS + 1):
             values, away, slope, by_point = self._equations(xi, unit)

@@ -417,6 +417,13 @@ def correct(
     return xi, values, np.where(np.isfinite(misfit), misfit, np.inf)
 
 
+def signals_and_points(d: Discretization, names: tuple[str, ...], xi: Array) -> tuple[Array, Array]:
+    """Named signals (n, k) and contact points (n, 3) of contacts ξ."""
+    values, _ = solve_forces(d, with_normal_force(xi))
+    force, point = values[:, :3], values[:, 3:]
+    return signals_of(force, cross(point, force))[:, signal_columns(names)], point
+
+
 def resolve_on_finer_rod(
     contact_map: ContactMap, names: tuple[str, ...], first: Array, second: Array, steps: int
 ) -> tuple[Array, Array]:
@@ -427,10 +434,8 @@ def resolve_on_finer_rod(
     """
     coarse = discretize(contact_map.whisker, steps)
     finer = discretize(contact_map.whisker, FINER * steps)
-    at_first, _ = solve_forces(finer, with_normal_force(first))
+    target, point = signals_and_points(finer, names, first)
     before, _ = solve_forces(coarse, with_normal_force(second))
-    force, point = at_first[:, :3], at_first[:, 3:]
-    target = signals_of(force, cross(point, force))[:, signal_columns(names)]
     _, values, misfit = correct(finer, names, second, target, units(contact_map, second))
     points = np.stack([point, values[:, 3:]], axis=1)
     points[~(misfit <= AGREEMENT)] = np.nan

@@ -43,15 +43,15 @@ from vibrissa.identifiability.twins import (
     correct,
     equations,
     resolve_on_finer_rod,
-    signal_columns,
+    signals_and_points,
     sizes,
     units,
 )
 from vibrissa.io import check_writable, replacing, write_netcdf
-from vibrissa.numerics import AnyArray, Array, cross, threads
+from vibrissa.numerics import AnyArray, Array, threads
 from vibrissa.quantities import attributes
-from vibrissa.rod import Discretization, discretize, solve_forces, with_normal_force
-from vibrissa.signals import CONE, REGIONS, SIGNALS, TRIPLETS, selection, signal_scales, signals_of
+from vibrissa.rod import discretize
+from vibrissa.signals import CONE, REGIONS, SIGNALS, TRIPLETS, selection, signal_scales
 
 # Regions contained in each region.
 _SUBREGIONS = {
@@ -390,11 +390,6 @@ def uniqueness(
         (``certificate_possible``), and outside which cone the determinant keeps its sign
         (``determinant_cone``, rad).
 
-    Raises
-    ------
-    ValueError
-        If a triplet or region is unknown, or a number is out of range.
-
     Examples
     --------
     >>> import vibrissa as vb
@@ -550,15 +545,6 @@ def _evidence(
     return np.asarray(out)
 
 
-def _signals_and_points(
-    d: Discretization, triplet: tuple[str, ...], xi: Array
-) -> tuple[Array, Array]:
-    """Signals of a triplet (n, 3) and contact points (n, 3) of contacts ξ."""
-    values, _ = solve_forces(d, with_normal_force(xi))
-    force, point = values[:, :3], values[:, 3:]
-    return signals_of(force, cross(point, force))[:, signal_columns(triplet)], point
-
-
 def _surface(problem: Problem) -> str:
     """Describe the surface off which a triplet of a planar whisker may be unique."""
     y, z = problem.normal[1:]
@@ -600,13 +586,13 @@ def _witness(
     contact_map = problem.contact_map
     d, finest = (discretize(contact_map.whisker, n * FINER * steps) for n in (1, 2))
     first, unit = pairs.first.xi, units(contact_map, pairs.second.xi)
-    signals, point = _signals_and_points(d, triplet, first)
+    signals, point = signals_and_points(d, triplet, first)
     second, values, _ = correct(d, triplet, pairs.second.xi, signals, unit)
     both = np.stack([first, second], axis=1)
     point = d.length * np.stack([point, values[:, 3:]], axis=1)
     _, moved = resolve_on_finer_rod(contact_map, triplet, first, pairs.second.xi, steps)
     away, _, values = equations(
-        finest, triplet, second, _signals_and_points(finest, triplet, first)[0]
+        finest, triplet, second, signals_and_points(finest, triplet, first)[0]
     )
     difference = np.abs(away / sizes(values, triplet)).max(axis=1)
     return {

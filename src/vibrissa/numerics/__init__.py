@@ -19,6 +19,7 @@ from vibrissa.numerics.arrays import (
     contacts_in as contacts_in,
     cross as cross,
     cross_matrix as cross_matrix,
+    exponential as exponential,
     numbers as numbers,
     relative as relative,
     rotation_matrices as rotation_matrices,

@@ -11,7 +11,7 @@ import reprlib
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from typing import Any, ParamSpec, TypeAlias, TypeVar, cast
 
 import numpy as np
@@ -34,7 +34,7 @@ SKEW = 1e-5
 
 
 def contacts_in(touching: Mask, known: Mask | None = None) -> list[tuple[int, int]]:
-    """First frame of each contact, and the frame after its last.
+    """First frame of each contact, or other run of true values, and the frame after its last.
 
     Frames that are not ``known``, between two frames in contact, count as contact: a frame lost by
     tracking does not end a contact.
@@ -69,6 +69,32 @@ def cross_matrix(a: Array) -> Array:
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -z, y, -x
     out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = z, -y, x
     return out
+
+
+def exponential(w: Array) -> tuple[Array, Array]:
+    """Rotations exp [w]ₓ (..., 3, 3) of rotation vectors, and ∫ exp [t w]ₓ dt over t from 0 to 1.
+
+    Below 0.1 rad the coefficients are computed from their series, which are exact to rounding,
+    unlike (θ − sin θ)/θ³.
+    """
+    x = np.sum(w * w, axis=-1)[..., np.newaxis, np.newaxis]
+    small = x < 1e-2
+    theta = np.sqrt(np.where(small, 1.0, x))
+    a = np.where(small, _series(x, 1.0, (6, 20, 42, 72)), np.sin(theta) / theta)
+    b = np.where(small, _series(x, 1 / 2, (12, 30, 56, 90)), (1.0 - np.cos(theta)) / theta**2)
+    c = np.where(small, _series(x, 1 / 6, (20, 42, 72, 110)), (theta - np.sin(theta)) / theta**3)
+    k = cross_matrix(w)
+    k2 = k @ k
+    return np.eye(3) + a * k + b * k2, np.eye(3) + b * k + c * k2
+
+
+def _series(x: Array, first: float, ratios: tuple[int, ...]) -> Array:
+    """Power series with given first term and ratios of denominators."""
+    total, term = np.full_like(x, first), np.full_like(x, first)
+    for ratio in ratios:
+        term = -term * x / ratio
+        total = total + term
+    return total
 
 
 def numbers(name: str, value: object, order: Sequence[str] = ("x", "y", "z")) -> Array:
@@ -255,12 +281,13 @@ def threads() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def share_out(rows: int, work: Callable[[int, int], object]) -> None:
-    """Call ``work(first, last)`` on parts that cover all rows, on all cores."""
+def share_out(rows: int, work: Callable[..., object], *given: object) -> None:
+    """Call ``work(*given, first, last)`` on parts that cover all rows, on all cores."""
     if rows <= _SERIAL or threads() == 1:
         if rows:
-            work(0, rows)
+            work(*given, 0, rows)
         return
     pieces = min(threads() * _PIECES_PER_THREAD, -(-rows // (_SERIAL // 2)))
     edges = np.linspace(0, rows, pieces + 1).astype(int)
-    list(_pool(os.getpid()).map(work, edges[:-1].tolist(), edges[1:].tolist()))
+    parts = edges[:-1].tolist(), edges[1:].tolist()
+    list(_pool(os.getpid()).map(partial(work, *given), *parts))

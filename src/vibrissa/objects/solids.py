@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from vibrissa.deferred import xr
 from vibrissa.numerics import Array, numbers
@@ -116,11 +115,6 @@ class Peg(Surface):
     stiffness : float
         Force over indentation, N/m; infinite if rigid.
 
-    Raises
-    ------
-    ValueError
-        If a value is missing, the axis is zero, or radius or stiffness are not positive.
-
     Examples
     --------
     >>> Peg(origin=[25e-3, 0.0, 0.0], axis=[0.0, 0.0, 1.0], radius=1.35e-3)
@@ -149,28 +143,6 @@ class Peg(Surface):
         flat = np.eye(3) - np.outer(self.axis, self.axis) - np.outer(normal, normal)
         return size - self.radius, normal, flat / size
 
-    def in_whisker_frame(
-        self, base_rotation: ArrayLike, base_position: ArrayLike
-    ) -> tuple[Array, Array]:
-        """Transform the peg's axis into the whisker frame.
-
-        Parameters
-        ----------
-        base_rotation : array_like (..., 3, 3)
-            Rotation from the whisker's to the laboratory frame.
-        base_position : array_like (..., 3)
-            Position of the base in the laboratory frame, m.
-
-        Returns
-        -------
-        tuple of arrays (..., 3)
-            Point on the axis, m, and its unit direction, in the whisker frame.
-        """
-        rotation = np.asarray(base_rotation, dtype=np.float64)
-        away = self.origin - np.asarray(base_position, dtype=np.float64)
-        origin = np.einsum("...ji,...j->...i", rotation, away)
-        return origin, np.einsum("...ji,j->...i", rotation, self.axis)
-
     def __repr__(self) -> str:
         return (
             f"Peg(origin={_mm(self.origin)}, axis={_direction(self.axis)}, diameter "
@@ -190,11 +162,6 @@ class Sphere(Surface):
         Radius of the surface, m.
     stiffness : float
         Force over indentation, N/m; infinite if rigid.
-
-    Raises
-    ------
-    ValueError
-        If a value is missing, or radius or stiffness are not positive.
 
     Examples
     --------
@@ -238,11 +205,6 @@ class Plane(Surface):
         Outward normal, toward the free side, of any nonzero length; stored as a unit vector.
     stiffness : float
         Force over indentation, N/m; infinite if rigid.
-
-    Raises
-    ------
-    ValueError
-        If a value is missing, the normal is zero, or the stiffness is not positive.
 
     Examples
     --------
@@ -356,32 +318,15 @@ class Box(Surface):
         )
 
 
-_FIELDS: dict[str, tuple[type, dict[str, str]]] = {
-    "peg": (
-        Peg,
-        {"origin": "object_position", "axis": "object_axis", "radius": "object_radius"},
-    ),
-    "sphere": (Sphere, {"origin": "object_position", "radius": "object_radius"}),
-    "plane": (Plane, {"origin": "object_position", "normal": "object_axis"}),
-    "box": (
-        Box,
-        {
-            "origin": "object_position",
-            "size": "object_size",
-            "rotation": "object_rotation",
-            "edge_radius": "object_edge_radius",
-        },
-    ),
-    "mesh": (
-        Mesh,
-        {
-            "vertices": "object_vertices",
-            "faces": "object_faces",
-            "resolution": "object_resolution",
-        },
-    ),
+# Fields of each kind of object, and names of their variables unless these are object_<field>.
+_FIELDS: dict[str, tuple[type, str]] = {
+    "peg": (Peg, "origin axis radius stiffness"),
+    "sphere": (Sphere, "origin radius stiffness"),
+    "plane": (Plane, "origin normal stiffness"),
+    "box": (Box, "origin size rotation edge_radius stiffness"),
+    "mesh": (Mesh, "vertices faces resolution stiffness"),
 }
-_STIFFNESS = {"stiffness": "object_stiffness"}
+_NAMES = {"origin": "object_position", "normal": "object_axis"}
 _DIMS: dict[str, tuple[str, ...]] = {
     "object_position": ("space",),
     "object_axis": ("space",),
@@ -405,7 +350,7 @@ def _to_dataset(thing: Surface) -> xr.Dataset:
                 name: xr.Variable(
                     _DIMS.get(name, ()), np.asarray(getattr(thing, field)), attributes(name)
                 )
-                for field, name in (fields | _STIFFNESS).items()
+                for field, name in _variables(fields)
             }
             about = {"kind": kind, "reference_frame": "laboratory"}
             return xr.Dataset(rows, {"space": list("xyz")}, about)
@@ -418,9 +363,13 @@ def object_from_dataset(dataset: xr.Dataset) -> Surface:
     if kind not in _FIELDS:
         raise ValueError(f"the object is of kind {kind!r}; it must be one of {', '.join(_FIELDS)}")
     known, fields = _FIELDS[kind]
-    missing = sorted({*fields.values(), *_STIFFNESS.values()} - set(dataset.data_vars))
+    missing = sorted({name for _, name in _variables(fields)} - set(dataset.data_vars))
     if missing:
         raise ValueError(f"a {kind} in a file lacks {', '.join(missing)}")
-    values = {field: dataset[name].values for field, name in (fields | _STIFFNESS).items()}
-    restored: Surface = known(**values)
+    restored: Surface = known(**{field: dataset[n].values for field, n in _variables(fields)})
     return restored
+
+
+def _variables(fields: str) -> list[tuple[str, str]]:
+    """Fields of an object, and the names of their variables."""
+    return [(field, _NAMES.get(field, f"object_{field}")) for field in fields.split()]

@@ -67,6 +67,8 @@ from vibrissa.rod.kernels import (
 from vibrissa.rod.newton import (
     ROUNDING,
     TOLERANCE,
+    Group as Group,
+    group_room as group_room,
     newton_group,
     point_determinant as point_determinant,
     stable,

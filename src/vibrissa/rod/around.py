@@ -123,7 +123,6 @@ class ObstacleDeflection:
         return lines
 
     def __repr__(self) -> str:
-        """Number of placements and the count of each status."""
         return f"<ObstacleDeflection at {self.status.size} placements: {counted(self.status)}>"
 
 
@@ -155,11 +154,6 @@ def deflect_around(
     -------
     ObstacleDeflection
         Force and moment at the base, and all contacts of each placement.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not match or an object is not rigid.
 
     Notes
     -----
@@ -249,18 +243,14 @@ class NearObjects:
             found = solve_with_moving_nodes(self._whisker, obstacles, *begin)
         else:
             found = solve_at_nodes(obstacles, *begin)
-        if found is None or not found.contacts()[0].size or found.farthest(start) > _JUMP:
-            return None
-        return found
+        return _continued(found, start)
 
     def refined(self, place: Placement, shift: Array, start: Equilibrium) -> Equilibrium | None:
         """Equilibrium on this object's grid, continued from ``start`` on another grid."""
         obstacles = Obstacles(self._surfaces, self._shifted(place, shift), self._length)
         strain, pressing = transfer_strain(start, self._grid), start.pressing_on(self._grid)
         found = solve_with_moving_nodes(self._whisker, obstacles, self._grid, strain, pressing)
-        if found is None or not found.contacts()[0].size or found.farthest(start) > _JUMP:
-            return None
-        return found
+        return _continued(found, start)
 
     def _shifted(self, place: Placement, shift: Array) -> Placement:
         return Placement(place.rotation, place.position - shift * self._length)
@@ -324,6 +314,12 @@ def _has_contact(status: IntArray) -> Mask:
     return np.isin(status, (Status.OK, Status.TIP_CONTACT))
 
 
+def _continued(found: Equilibrium | None, before: Equilibrium) -> Equilibrium | None:
+    """An equilibrium with contacts that is near an earlier one; else None."""
+    near = found is not None and found.contacts()[0].size and found.farthest(before) <= _JUMP
+    return found if near else None
+
+
 def _solve_several_contacts(
     whisker: Whisker,
     surfaces: Sequence[Surface],
@@ -345,11 +341,8 @@ def _solve_several_contacts(
         one = None
         if last is not None:
             obstacles = Obstacles(surfaces, place, whisker.length)
-            one = solve_with_moving_nodes(
-                whisker, obstacles, grid, transfer_strain(last, grid), last.pressing_on(grid)
-            )
-            if one is None or not one.contacts()[0].size or one.farthest(last) > _JUMP:
-                one = None
+            start = transfer_strain(last, grid), last.pressing_on(grid)
+            one = _continued(solve_with_moving_nodes(whisker, obstacles, grid, *start), last)
         if one is None and touching[i]:
             one = _solve_from_one_contact(whisker, surfaces, place, found, i, grid)
         last = one

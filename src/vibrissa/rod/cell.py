@@ -214,7 +214,7 @@ def turned_difference(tree: SearchTree, q: int, target: float, base: float) -> f
 @inlined
 def set_target(tree: SearchTree, target: Array, b: Array) -> None:
     """Write the target's length and direction, which polar cells need, into the buffer."""
-    length, direction = tree.roles[0], tree.roles[1]
+    length, direction = tree.vector.roles[0], tree.vector.roles[1]
     b[_TARGET] = b[_TARGET + 1] = b[_TARGET + 3] = 0.0
     if direction >= 0:
         b[_TARGET], b[_TARGET + 1] = np.cos(target[direction]), np.sin(target[direction])
@@ -242,10 +242,10 @@ def set_target(tree: SearchTree, target: Array, b: Array) -> None:
 @inlined
 def _set_polar_target(tree: SearchTree, row: int, target: Array, b: Array) -> None:
     """Write the target relative to a polar cell's base into the buffer."""
-    frame = tree.polar_frame[row]
+    frame = tree.vector.frame[row]
     b[_RELATIVE], b[_RELATIVE + 1] = -frame[0], -frame[1]
     for n in range(2):
-        q = tree.roles[2 + n]
+        q = tree.vector.roles[2 + n]
         b[_RELATIVE + 2 + n] = (
             turned_difference(tree, q, target[q], frame[2 + n]) if q >= 0 else 0.0
         )
@@ -259,7 +259,7 @@ def _locate_polar(tree: SearchTree, row: int, b: Array, work: Array, x: Array) -
     E T = E target. T is a linear function of x plus a remainder within bounds, so a solution is
     within bounds of that of the linear part.
     """
-    linear = tree.polar_linear[row]
+    linear = tree.vector.linear[row]
     cos, sin, length = b[_TARGET], b[_TARGET + 1], b[_TARGET + 2]
     x[0] = x[1] = x[2] = 0.5
     if cos == 0.0 and sin == 0.0:
@@ -299,7 +299,7 @@ def _polar_care(tree: SearchTree, row: int, b: Array) -> int:
     if cos == 0.0 and sin == 0.0:
         return 2
     least, most = np.inf, 0.0
-    volumes = tree.polar_volumes[row]
+    volumes = tree.vector.volumes[row]
     for k in range(8):
         volume = volumes[k, 0]
         if length < 0.0:
@@ -543,10 +543,10 @@ def load_cell(
         _set_polar_target(tree, row, target, b)
         if not _locate_polar(tree, row, b, work, x):
             return -1
-        careful, edge = _polar_care(tree, row, b), tree.polar_edges[row]
-        b[_TARGET + 3], b[_ROOT] = tree.polar_frame[row, 7], 1.0
+        careful, edge = _polar_care(tree, row, b), tree.vector.edges[row]
+        b[_TARGET + 3], b[_ROOT] = tree.vector.frame[row, 7], 1.0
         for a in range(3):
-            half[a] = tree.polar_frame[row, 4 + a]
+            half[a] = tree.vector.frame[row, 4 + a]
     else:
         if not _locate(tree, cell, target, b, x):
             return -1

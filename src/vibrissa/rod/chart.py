@@ -158,7 +158,9 @@ def _nodes_of(
 ) -> tuple[Array, Array]:
     """Contacts at the nodes, and their derivatives by (η, ψ, ρ)."""
     s, psi, rho = np.meshgrid(stations, bearings, np.maximum(loads, LEAST_LOAD), indexing="ij")
-    f, f_eta, f_psi = (a[..., None] for a in _fold_and_derivatives(log_fold))
+    log, by_eta, by_psi, _ = np.moveaxis(log_fold[:, :, None], -1, 0)
+    f = np.exp(log)
+    f_eta, f_psi = f * by_eta, f * by_psi
     cos, sin = np.cos(psi), np.sin(psi)
     contacts = np.stack([s, rho**2 * f * cos, rho**2 * f * sin], axis=-1)
     zero = np.zeros_like(s)
@@ -310,12 +312,6 @@ def _slopes(x: Array, values: Array, periodic: bool = False) -> Array:
         system[end, [end, next_]] = far, near + far
         right[end] = far * (2.0 + share) * secants[end] + near * share * secants[next_]
     return np.asarray(np.linalg.solve(system, right))
-
-
-def _fold_and_derivatives(log_fold: Array) -> tuple[Array, Array, Array]:
-    """Fold force f* and its derivatives by η and ψ."""
-    f = np.exp(log_fold[..., 0])
-    return f, f * log_fold[..., 1], f * log_fold[..., 2]
 
 
 def contacts_at(fold: Fold, chart: Array) -> Array:

@@ -23,6 +23,8 @@ The equations of each kind of contact have three unknowns x and seven parameters
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vibrissa.numerics import Array, IntArray, copy, inlined, kernel, norm3, solve3
@@ -34,6 +36,7 @@ from vibrissa.rod.kernels import (
     LANES,
     lane_tangents,
     lane_value,
+    normal_plane,
     set_lane,
     whisker_radius,
 )
@@ -118,20 +121,9 @@ def _by_unknowns(kind: int, x: Array, t: Array) -> None:
 @inlined
 def _across(p: Array, e: Array) -> None:
     """Fill e (3, 3) with two unit vectors normal to the peg's axis, and the axis itself."""
-    ax, ay, az = p[3], p[4], p[5]
-    if abs(ax) <= abs(ay) and abs(ax) <= abs(az):
-        n = 1.0 / np.sqrt(ay * ay + az * az)
-        e[0, 0], e[0, 1], e[0, 2] = 0.0, az * n, -ay * n
-    elif abs(ay) <= abs(az):
-        n = 1.0 / np.sqrt(ax * ax + az * az)
-        e[0, 0], e[0, 1], e[0, 2] = -az * n, 0.0, ax * n
-    else:
-        n = 1.0 / np.sqrt(ax * ax + ay * ay)
-        e[0, 0], e[0, 1], e[0, 2] = ay * n, -ax * n, 0.0
-    e[1, 0] = ay * e[0, 2] - az * e[0, 1]
-    e[1, 1] = az * e[0, 0] - ax * e[0, 2]
-    e[1, 2] = ax * e[0, 1] - ay * e[0, 0]
-    e[2, 0], e[2, 1], e[2, 2] = ax, ay, az
+    first, second = normal_plane((p[3], p[4], p[5]))
+    for i in range(3):
+        e[0, i], e[1, i], e[2, i] = first[i], second[i], p[3 + i]
 
 
 @inlined
@@ -281,29 +273,31 @@ def _status_at_end(kind: int, s: float, proximal: float) -> int:
     return _AT_TIP if kind == TIP else _OK
 
 
+class _Lanes(NamedTuple):
+    """Problems that are followed side by side."""
+
+    row: IntArray  # (4,), index of each lane's problem, -1 for none
+    paths: Array  # (4, 12), states of the paths
+    # (4, 3) Unknowns: present, of the last solution, and the best at the end of the path.
+    x: Array
+    x_ok: Array
+    x_best: Array
+
+
 @inlined
 def _load_lanes(
-    b: Array,
-    waiting: int,
-    last: int,
-    running: int,
-    row: IntArray,
-    kinds: IntArray,
-    unknowns: Array,
-    paths: Array,
-    x: Array,
-    x_ok: Array,
-    contact: Array,
+    b: Array, waiting: int, last: int, running: int, lanes: _Lanes, kinds: IntArray, unknowns: Array
 ) -> tuple[int, int]:
     """Load all lanes; a lane whose path has ended takes the next problem."""
+    row, x, contact = lanes.row, lanes.x, np.empty(4)
     for i in range(LANES):
         if row[i] < 0 and waiting < last:
             row[i] = waiting
             waiting += 1
             running += 1
             copy(unknowns[row[i]], x[i])
-            copy(x[i], x_ok[i])
-            _initialize(paths[i])
+            copy(x[i], lanes.x_ok[i])
+            _initialize(lanes.paths[i])
         if row[i] >= 0:
             _contact_of(kinds[row[i]], x[i], contact)
             tip = kinds[row[i]] == TIP
@@ -326,19 +320,18 @@ def _outcome(misfit: float, size: float, relative: float) -> int:
 @inlined
 def _next_step(
     kind: int,
-    path: Array,
     progress: float,
     relative: float,
     outcome: int,
     size: float,
     step: Array,
-    x: Array,
-    x_ok: Array,
-    x_best: Array,
+    lanes: _Lanes,
+    i: int,
     arc: float,
     proximal: float,
 ) -> tuple[int, int]:
     """Choose the action after a round of Newton's method; return status and kind of contact."""
+    path, x, x_ok = lanes.paths[i], lanes.x[i], lanes.x_ok[i]
     smallest = _SMALLEST_POINT_STEP if kind == POINT else _SMALLEST_STEP
     may_switch = path[_SWITCHES] < _MOST_SWITCHES
     if outcome == _SOLVED:
@@ -364,7 +357,7 @@ def _next_step(
         copy(x_ok, x)
         return _RUNNING, kind
     if path[_BEST] <= _AT_FOLD:
-        copy(x_best, x_ok)
+        copy(lanes.x_best[i], x_ok)
         return _status_at_end(kind, arc, proximal), kind
     if kind == SIDE and path[_PAST_TIP] > 0.0 and may_switch:
         return _RUNNING, _switch(kind, path, min(0.01, 1.0 - path[_DONE]), x, x_ok)
@@ -391,14 +384,12 @@ def follow(
     """Follow problems from ``begins`` to ``ends``, four at a time; see the module docstring."""
     b = np.zeros(BUFFER_SIZE)
     value, t, g, p = np.empty(6), np.empty((6, 3)), np.empty(3), np.empty(7)
-    jacobian, step, contact = np.empty((3, 3)), np.empty(3), np.empty(4)
-    row, paths = np.full(LANES, -1), np.zeros((LANES, _COLUMNS))
-    x, x_ok, x_best = np.empty((LANES, 3)), np.empty((LANES, 3)), np.empty((LANES, 3))
+    jacobian, step, row = np.empty((3, 3)), np.empty(3), np.full(LANES, -1)
+    paths, x, x_ok = np.zeros((LANES, _COLUMNS)), np.empty((LANES, 3)), np.empty((LANES, 3))
+    lanes = _Lanes(row, paths, x, x_ok, np.empty((LANES, 3)))
     waiting, running = first, 0
     while True:
-        waiting, running = _load_lanes(
-            b, waiting, last, running, row, kinds, unknowns, paths, x, x_ok, contact
-        )
+        waiting, running = _load_lanes(b, waiting, last, running, lanes, kinds, unknowns)
         if running == 0:
             return
         integrate(rod, b, 3)
@@ -424,20 +415,9 @@ def follow(
                 path[_BEST] = misfits[m] = misfit
                 _contact_of(kind, x[i], contacts[m])
                 copy(value, values[m])
-                copy(x[i], x_best[i])
+                copy(x[i], lanes.x_best[i])
             status, kinds[m] = _next_step(
-                kind,
-                path,
-                progress,
-                relative,
-                outcome,
-                size,
-                step,
-                x[i],
-                x_ok[i],
-                x_best[i],
-                contacts[m, 0],
-                proximal,
+                kind, progress, relative, outcome, size, step, lanes, i, contacts[m, 0], proximal
             )
             if status != _RUNNING and not (outcome == _SOLVED or path[_BEST] <= _AT_FOLD):
                 misfits[m] = misfit

@@ -146,11 +146,6 @@ class PointContact:
     ----------
     points : array_like
         Contact points in the whisker frame, m, shape (..., 3); NaN or masked means missing.
-
-    Raises
-    ------
-    ValueError
-        If the shape is wrong, or a coordinate is infinite or not a number.
     """
 
     points: Any
@@ -387,7 +382,6 @@ class Deflection:
         return places
 
     def __repr__(self) -> str:
-        """Number of loads, and the count of each status."""
         return f"<{self._title()}: {counted(self.status)}>"
 
     def _repr_html_(self) -> str:
@@ -404,7 +398,6 @@ class Deflection:
         return card(self._title(), self._rows(), picture)
 
     def __str__(self) -> str:
-        """Status, contact, force and moment."""
         return lines(self._title(), self._rows())
 
     def _title(self) -> str:

@@ -31,8 +31,6 @@ from vibrissa.rod.weight import STATES, evaluate_weighted, trace_weighted
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
-#: Standard gravity, m/s².
-STANDARD = 9.80665
 _MOST = 1e4  # largest gravity accepted, m/s²; accelerations of whisking are below 50 g
 # Number of increments in which the weight is applied, and how often a failed one may be halved.
 _STEPS, _HALVINGS = 8, 6
@@ -348,9 +346,7 @@ def evaluated(
     d: Discretization, contacts: Array, leans: Array | None = None, tangents: bool = False
 ) -> Weighted:
     """Evaluate a rod with weight at contacts (s, f) (n, 4), and solve for their ``leans``."""
-    rod, n = d.rod, len(contacts)
-    weight = rod.weight
-    assert weight is not None
+    n = len(contacts)
     out = Weighted(
         np.empty((n, STATES + 1)),
         np.empty((n if tangents else 0, STATES, 4)),
@@ -358,20 +354,8 @@ def evaluated(
         np.full((n, 3), np.nan) if leans is None else np.array(leans, dtype=np.float64),
     )
     kept = np.ascontiguousarray(contacts, dtype=np.float64)
-    share_out(
-        n,
-        lambda first, last: evaluate_weighted(
-            rod,
-            weight,
-            kept,
-            out.leans,
-            out.states,
-            out.tangents,
-            out.directions,
-            first,
-            last,
-        ),
-    )
+    filled = out.leans, out.states, out.tangents, out.directions
+    share_out(n, evaluate_weighted, d.rod, d.rod.weight, kept, *filled)
     return out
 
 

@@ -138,10 +138,7 @@ def contact_tangents(discretization: Discretization, contacts: Array) -> Array:
     """
     contacts = np.ascontiguousarray(contacts, dtype=np.float64)
     tangents = np.empty((len(contacts), 3))
-    rod = discretization.rod
-    share_out(
-        len(contacts), lambda first, last: carry_tangents(rod, contacts, tangents, first, last)
-    )
+    share_out(len(contacts), carry_tangents, discretization.rod, contacts, tangents)
     return tangents
 
 
@@ -158,10 +155,7 @@ def share_rows(
     its inputs and fills its outputs, each (n, ...). A rod with weight requires the device "cpu".
     """
     if device == "cpu":
-        share_out(
-            len(inputs[0]),
-            lambda first, last: kernel(*tables, *inputs, *outputs, first, last),
-        )
+        share_out(len(inputs[0]), kernel, *tables, *inputs, *outputs)
         return
     check_device(device)
     _one_lane().run(kernel, tables, inputs, outputs)

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.numerics import Array, inlined, vectorised
+from vibrissa.numerics import Array, Vector, inlined, vectorised
 from vibrissa.rod.chart import Fold, StableSet, along, log_fold_force
 from vibrissa.rod.discretization import Rod
 
@@ -78,25 +78,17 @@ def _add_values(b: Array, n: int, v: float, x: float, y: float, z: float) -> Non
 def _add_slopes(
     b: Array,
     n: int,
-    v_x: float,
-    v_y: float,
-    v_z: float,
-    x_x: float,
-    x_y: float,
-    x_z: float,
-    y_x: float,
-    y_y: float,
-    y_z: float,
-    z_x: float,
-    z_y: float,
-    z_z: float,
+    by_v: Vector,
+    by_x: Vector,
+    by_y: Vector,
+    by_z: Vector,
 ) -> None:
     """Add the corner in the buffer to the n sums of slopes, with the derivatives of the weights."""
     for q in range(n):
         v, x, y, z = b[q], b[_PADDED + q], b[2 * _PADDED + q], b[3 * _PADDED + q]
-        b[_SUMS + _PADDED + q] += v_x * v + x_x * x + y_x * y + z_x * z
-        b[_SUMS + 2 * _PADDED + q] += v_y * v + x_y * x + y_y * y + z_y * z
-        b[_SUMS + 3 * _PADDED + q] += v_z * v + x_z * x + y_z * y + z_z * z
+        b[_SUMS + _PADDED + q] += by_v[0] * v + by_x[0] * x + by_y[0] * y + by_z[0] * z
+        b[_SUMS + 2 * _PADDED + q] += by_v[1] * v + by_x[1] * x + by_y[1] * y + by_z[1] * z
+        b[_SUMS + 3 * _PADDED + q] += by_v[2] * v + by_x[2] * x + by_y[2] * y + by_z[2] * z
 
 
 @inlined
@@ -126,22 +118,15 @@ def _blend(nodes: Array, x: float, y: float, z: float, b: Array, slopes: bool) -
                     lx * ly * cz,
                 )
                 if slopes:
-                    _add_slopes(
-                        b,
-                        size // 4,
+                    by_v = (
                         (dlx + dgx) * ly * lz + dlx * (gy * lz + ly * gz),
                         (dly + dgy) * lx * lz + dly * (gx * lz + lx * gz),
                         (dlz + dgz) * lx * ly + dlz * (gx * ly + lx * gy),
-                        dcx * ly * lz,
-                        cx * dly * lz,
-                        cx * ly * dlz,
-                        dlx * cy * lz,
-                        lx * dcy * lz,
-                        lx * cy * dlz,
-                        dlx * ly * cz,
-                        lx * dly * cz,
-                        lx * ly * dcz,
                     )
+                    by_x = (dcx * ly * lz, cx * dly * lz, cx * ly * dlz)
+                    by_y = (dlx * cy * lz, lx * dcy * lz, lx * cy * dlz)
+                    by_z = (dlx * ly * cz, lx * dly * cz, lx * ly * dcz)
+                    _add_slopes(b, size // 4, by_v, by_x, by_y, by_z)
 
 
 @vectorised

@@ -80,6 +80,22 @@ def add(a: Vector, b: Vector) -> Vector:
 
 
 @inlined
+def normal_plane(n: Vector) -> Pair:
+    """Two unit vectors such that they and the unit vector n are right-handed: e₁ × e₂ = n."""
+    x, y, z = n
+    if abs(x) <= abs(y) and abs(x) <= abs(z):
+        size = 1.0 / np.sqrt(y * y + z * z)
+        first = (0.0, z * size, -y * size)
+    elif abs(y) <= abs(z):
+        size = 1.0 / np.sqrt(x * x + z * z)
+        first = (-z * size, 0.0, x * size)
+    else:
+        size = 1.0 / np.sqrt(x * x + y * y)
+        first = (y * size, -x * size, 0.0)
+    return first, cross(n, first)
+
+
+@inlined
 def _axpy(y: Step, a: float, x: Step) -> Step:
     if len(y) == 6:  # resolved at compile time
         return (

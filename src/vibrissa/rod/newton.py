@@ -17,7 +17,7 @@ from base force and contact point, and returns the residual's norm in units in w
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -50,6 +50,32 @@ _NEAR_FOLD = 0.97
 ABOVE_FOLD = 1.01
 
 
+class Group(NamedTuple):
+    """Up to four problems that are solved side by side; see :func:`group_room`."""
+
+    targets: Array  # (4, n), targets of the equation
+    charts: Array  # (4, 3), chart coordinates of the seeds
+    inverses: Array  # (4, 3, 3), their derivatives by the residual, NaN where they are not known
+    xi: Array  # (4, 3), contacts: at first where to start, at last the solutions
+    values: Array  # (4, 6), base force and contact point (F, p)
+    misfits: Array  # (4,), norms of the residuals
+    signs: Array  # (4,), det ∂p/∂ξ, or 1 where it need not be evaluated
+
+
+@inlined
+def group_room(targets: Array) -> Group:
+    """Allocate a group with an array for its targets."""
+    return Group(
+        targets,
+        np.empty((LANES, 3)),
+        np.empty((LANES, 3, 3)),
+        np.empty((LANES, 3)),
+        np.empty((LANES, 6)),
+        np.empty(LANES),
+        np.empty(LANES),
+    )
+
+
 @inlined
 def limited_step(fold: Fold, xi: Array, step: Array) -> None:
     """Take a step of ξ = (s, f_y, f_z), shortened to where the linearisation can be trusted."""
@@ -63,19 +89,10 @@ def limited_step(fold: Fold, xi: Array, step: Array) -> None:
 
 @inlined
 def _chord_rounds(
-    equation: Callable[..., Any],
-    rod: Rod,
-    fold: Fold,
-    b: Array,
-    count: int,
-    targets: Array,
-    charts: Array,
-    inverses: Array,
-    xi: Array,
-    values: Array,
-    misfits: Array,
+    equation: Callable[..., Any], rod: Rod, fold: Fold, b: Array, count: int, group: Group
 ) -> None:
     """Take chord steps for the rows with finite ``inverses``; see :func:`newton_group`."""
+    targets, charts, inverses, xi, values, misfits = group[:6]
     value, residual = np.empty(6), np.empty(3)
     tangents, jacobian = np.empty((6, 3)), np.empty((3, 3))
     active = np.zeros(LANES, np.bool_)
@@ -146,20 +163,11 @@ def _row_tangents(b: Array, i: int, alone: bool, tangents: Array) -> None:
 
 @inlined
 def newton_group(
-    equation: Callable[..., Any],
-    rod: Rod,
-    fold: Fold,
-    b: Array,
-    count: int,
-    targets: Array,
-    charts: Array,
-    inverses: Array,
-    xi: Array,
-    values: Array,
-    misfits: Array,
-    signs: Array,
+    equation: Callable[..., Any], rod: Rod, fold: Fold, b: Array, count: int, group: Group
 ) -> None:
     """Solve up to four problems in parallel, in place; the first ``count`` rows are used."""
+    targets, charts, xi, values = group.targets, group.charts, group.xi, group.values
+    misfits, signs = group.misfits, group.signs
     value, tangents = np.empty(6), np.empty((6, 3))
     residual, step = np.empty(3), np.empty(3)
     jacobians = np.empty((LANES, 3, 3))
@@ -167,7 +175,7 @@ def newton_group(
     hard, failures = np.zeros(LANES, np.bool_), np.zeros(LANES, np.int64)
     for i in range(count):
         misfits[i] = np.inf
-    _chord_rounds(equation, rod, fold, b, count, targets, charts, inverses, xi, values, misfits)
+    _chord_rounds(equation, rod, fold, b, count, group)
     busy = False
     for i in range(count):
         signs[i] = 1.0

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from vibrissa.deferred import interpolate, linalg, optimize
-from vibrissa.numerics import Array, IntArray, Mask
+from vibrissa.numerics import Array, IntArray, Mask, contacts_in, exponential
 from vibrissa.objects import Placement, Surface
 from vibrissa.rod.chart import LEAST_ARC
 
@@ -138,29 +138,13 @@ class Shape(NamedTuple):
     turned: Array
 
 
-def _rotation(w: Array) -> tuple[Array, Array]:
-    """Matrices (..., 3, 3) exp [w], and ∫ exp [w t] dt over t from 0 to 1."""
-    cross = np.zeros((*w.shape, 3))
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        cross[..., k, j], cross[..., j, k] = w[..., i], -w[..., i]
-    angle = np.linalg.norm(w, axis=-1)[..., None, None]
-    small = angle < 1e-3
-    safe = np.where(small, 1.0, angle)
-    first = np.sinc(angle / np.pi)
-    second = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
-    third = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (1.0 - first) / safe**2)
-    square = cross @ cross
-    unit = np.eye(3)
-    return unit + first * cross + second * square, unit + second * cross + third * square
-
-
 def bend(grid: Grid, strain: Array) -> Shape:
     """Integrate the resting curvature plus ``strain`` (n, 2, 3) from base to tip."""
     u = grid.rest + strain
     h = grid.width[:, None]
     turn = 0.5 * h * (u[:, 0] + u[:, 1]) + _ROOT / 12.0 * h**2 * np.cross(u[:, 0], u[:, 1])
-    whole, mean = _rotation(turn)
-    half, _ = _rotation(0.5 * turn)
+    whole, mean = exponential(turn)
+    half, _ = exponential(0.5 * turn)
     frames = np.empty((len(h) + 1, 3, 3))
     frames[0] = np.eye(3)
     for i, step in enumerate(whole):
@@ -170,7 +154,7 @@ def bend(grid: Grid, strain: Array) -> Shape:
     step = mean[:, :, 0] - np.einsum("kij,kj->ki", half, bow)
     step = (h * grid.extent[:, None]) * np.einsum("kij,kj->ki", frames[:-1], step)
     nodes = np.concatenate([np.zeros((1, 3)), np.cumsum(step, axis=0)])
-    part, mean = _rotation(np.einsum("pq,kqi->kpi", _STAGES, u) * h[:, None])
+    part, mean = exponential(np.einsum("pq,kqi->kpi", _STAGES, u) * h[:, None])
     away = (h * grid.extent[:, None] * _GAUSS)[..., None] * mean[..., 0]
     stations = nodes[:-1, None] + np.einsum("kij,kpj->kpi", frames[:-1], away)
     turned = frames[:-1, None] @ part
@@ -381,8 +365,7 @@ def _nodes_at_contacts(found: Equilibrium, obstacles: Obstacles) -> Array:
     grid, nodes = found.grid, found.grid.s.copy()
     last = nodes.size - 1
     for i, pressed in enumerate(found.pressing > 0.0):
-        ends = np.flatnonzero(np.diff(np.r_[False, pressed, False].astype(int)))
-        for first, stop in ends.reshape(-1, 2).tolist():
+        for first, stop in contacts_in(pressed):
             if stop - first > 2:
                 continue
             around = np.arange(max(first - 1, 1), min(stop, last) + 1)
@@ -417,12 +400,12 @@ def strain_under_force(grid: Grid, arc: float, force: Array, point: Array) -> Ar
     for i, (h, extent) in enumerate(zip(grid.width, grid.extent, strict=True)):
         for k in range(2):
             for _ in range(2):
-                part, mean = _rotation(_GAUSS[k] * h * (grid.rest[i, k] + strain[i, k]))
+                part, mean = exponential(_GAUSS[k] * h * (grid.rest[i, k] + strain[i, k]))
                 at = place + extent * _GAUSS[k] * h * (frame @ mean @ e)
                 loaded = extent == 0.0 or grid.stations[i, k] < arc
                 moment = np.cross(point - at, force) if loaded else np.zeros(3)
                 strain[i, k] = (frame @ part).T @ moment / grid.stiffness[i, k]
-        part, mean = _rotation(h * (grid.rest[i] + strain[i]).mean(axis=0))
+        part, mean = exponential(h * (grid.rest[i] + strain[i]).mean(axis=0))
         place = place + extent * h * (frame @ mean @ e)
         frame = frame @ part
     return strain

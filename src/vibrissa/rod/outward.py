@@ -251,8 +251,7 @@ def shapes(discretization: Discretization, values: Array, arc: Array, s: Array) 
     rows = np.flatnonzero(np.isfinite(values).all(axis=1) & np.isfinite(arc))
     kept, where = np.ascontiguousarray(values[rows]), np.ascontiguousarray(arc[rows])
     found = np.empty((rows.size, s.size, 3))
-    rod, s = discretization.rod, np.ascontiguousarray(s)
-    share_out(rows.size, lambda first, last: _shapes(rod, kept, where, s, found, first, last))
+    share_out(rows.size, _shapes, discretization.rod, kept, where, np.ascontiguousarray(s), found)
     places[rows] = found
     return places
 
@@ -276,9 +275,6 @@ def vanishing_moments(
     """
     count = np.zeros(len(wrenches), np.int64)
     contacts = np.full((len(wrenches), MOST_PLACES, 4), np.nan)
-    rod, wrenches = discretization.rod, np.ascontiguousarray(wrenches)
-    share_out(
-        len(wrenches),
-        lambda first, last: _vanishing_moments(rod, wrenches, least, count, contacts, first, last),
-    )
+    given = discretization.rod, np.ascontiguousarray(wrenches), least, count, contacts
+    share_out(len(wrenches), _vanishing_moments, *given)
     return count, contacts

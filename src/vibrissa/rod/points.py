@@ -33,7 +33,14 @@ from vibrissa.rod.continuation import POINT, follow
 from vibrissa.rod.discretization import Bendable, Rod
 from vibrissa.rod.integration import share_rows, solve_forces
 from vibrissa.rod.kernels import BUFFER_SIZE, LANES
-from vibrissa.rod.newton import ABOVE_FOLD, TOLERANCE, newton_group, stable, start_from
+from vibrissa.rod.newton import (
+    ABOVE_FOLD,
+    TOLERANCE,
+    group_room,
+    newton_group,
+    stable,
+    start_from,
+)
 from vibrissa.rod.search import MOST_SEEDS, seed_room, seeds
 from vibrissa.rod.tree import SearchTree, search_tree
 from vibrissa.status import Status
@@ -233,23 +240,22 @@ def _solve_points(
     b = np.zeros(BUFFER_SIZE)
     room = seed_room()
     found, slopes, quality = room.found, room.inverses, room.quality
-    charts, inverses = np.empty((LANES, 3)), np.empty((LANES, 3, 3))
-    rows, targets, group = np.empty(LANES, np.int64), np.empty((LANES, 3)), np.empty((LANES, 3))
-    group_values, group_misfits = np.empty((LANES, 6)), np.empty(LANES)
-    signs, doubt = np.empty(LANES), np.zeros(LANES, np.bool_)
+    group = group_room(np.empty((LANES, 3)))
+    charts, inverses = group.charts, group.inverses
+    rows, doubt = np.empty(LANES, np.int64), np.zeros(LANES, np.bool_)
     count = 0
     for row in range(first, last):
         rows[count], doubt[count] = row, False
-        copy(points[row], targets[count])
+        copy(points[row], group.targets[count])
         touch = _light_touch(resting, points[row])
         n = 0 if touch > 0.0 else seeds(tree, points[row], room)
         if touch > 0.0:
-            group[count, 0], group[count, 1], group[count, 2] = touch, 0.0, 0.0
+            group.xi[count, 0], group.xi[count, 1], group.xi[count, 2] = touch, 0.0, 0.0
             charts[count, 2], inverses[count, 0, 0] = 0.0, np.nan
         elif n > 0:
             best = _best_seed(found, quality, n)
             doubt[count] = _is_ambiguous(fold, resting, points[row], found, n, best)
-            chart_to_contact(fold, found[best], group[count])
+            chart_to_contact(fold, found[best], group.xi[count])
             start_from(found[best], slopes[best], quality[best], charts[count], inverses[count])
         if touch > 0.0 or n > 0:
             solved[row] = -1
@@ -257,26 +263,14 @@ def _solve_points(
         else:
             solved[row] = -1 if _near_rest(resting, points[row]) else 0
         if count == LANES or (row == last - 1 and count > 0):
-            newton_group(
-                _point_equation,
-                rod,
-                fold,
-                b,
-                count,
-                targets,
-                charts,
-                inverses,
-                group,
-                group_values,
-                group_misfits,
-                signs,
-            )
+            newton_group(_point_equation, rod, fold, b, count, group)
             for i in range(count):
-                if group_misfits[i] <= TOLERANCE and stable(fold, proximal, group[i], signs[i]):
+                reached = group.misfits[i] <= TOLERANCE
+                if reached and stable(fold, proximal, group.xi[i], group.signs[i]):
                     solved[rows[i]] = 2 if doubt[i] else 1
-                    copy(group[i], xi[rows[i]])
-                    copy(group_values[i], values[rows[i]])
-                    misfits[rows[i]] = group_misfits[i]
+                    copy(group.xi[i], xi[rows[i]])
+                    copy(group.values[i], values[rows[i]])
+                    misfits[rows[i]] = group.misfits[i]
             count = 0
 
 
@@ -331,11 +325,8 @@ class PointSolver:
         least = np.hypot(out.contacts[rows, 2], out.contacts[rows, 3])
         least[np.isnan(least)] = np.inf
         starts = np.empty((rows.size, _STARTS, 3))
-        fold, tree, resting = self.chart.fold, self._tree, self._resting
-        share_out(
-            rows.size,
-            lambda first, last: _find_starts(fold, tree, resting, points, starts, first, last),
-        )
+        tables = self.chart.fold, self._tree, self._resting
+        share_out(rows.size, _find_starts, *tables, points, starts)
         for start in np.moveaxis(starts, 1, 0):
             which = np.flatnonzero(np.hypot(start[:, 1], start[:, 2]) < least)
             solved = self._follow(start[which], points[which])
@@ -410,25 +401,9 @@ def follow_all(
     chart: StableSet, begins: Array, ends: Array, kinds: IntArray, unknowns: Array
 ) -> Solutions:
     """Run :func:`~vibrissa.rod.continuation.follow` over all rows, updating the unknowns."""
-    n = len(begins)
-    out = Solutions.empty(n)
-    discretization = chart.discretization
-    share_out(
-        n,
-        lambda first, last: follow(
-            discretization.rod,
-            chart.fold,
-            discretization.radius,
-            chart.proximal,
-            begins,
-            ends,
-            kinds,
-            unknowns,
-            *out,
-            first,
-            last,
-        ),
-    )
+    out, d = Solutions.empty(len(begins)), chart.discretization
+    tables = d.rod, chart.fold, d.radius, chart.proximal
+    share_out(len(begins), follow, *tables, begins, ends, kinds, unknowns, *out)
     return out
 
 

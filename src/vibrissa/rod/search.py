@@ -42,15 +42,12 @@ def _add_seed(
     tree: SearchTree,
     cell: int,
     x: Array,
-    b: Array,
-    work: Array,
     solved: int,
-    found: Array,
-    inverses: Array,
-    quality: IntArray,
+    room: SeedRoom,
     count: int,
 ) -> int:
     """Add a seed unless a neighbour found the same; a solved one replaces an unsolved one."""
+    found, inverses, quality, b, work = room.found, room.inverses, room.quality, room.b, room.work
     grid, place = tree.grid, tree.place[cell]
     det = 0.0
     if solved == 2 and not is_polar(b):
@@ -202,7 +199,7 @@ def seeds(tree: SearchTree, target: Array, room: SeedRoom) -> int:
     Ω, each of them has dozens of solutions near a light target, which must not crowd out others.
     """
     cells = tree.boxes[tree.offsets[-2] :]
-    found, inverses, quality, stack, listed, near, slack, aim = room[:8]
+    stack, listed, near, slack, aim = room[3:8]
     x, nearest, work, b, half, sides = room[8:]
     stack[0, 0] = stack[0, 1] = 0
     listed[0], count = 1, 0
@@ -228,27 +225,14 @@ def seeds(tree: SearchTree, target: Array, room: SeedRoom) -> int:
                     least = work[5, 0]
                     copy(x, nearest)
                 if solved > 0 and not points_opposite(b):
-                    count = _add_seed(
-                        tree, child, x, b, work, solved, found, inverses, quality, count
-                    )
+                    count = _add_seed(tree, child, x, solved, room, count)
                 if solved == 2 and careful < 2:
                     break
             if not missed or least > _LARGEST_MISS:
                 continue
             if fold_sides(b, half, nearest, work, sides):
                 for side in range(2):
-                    count = _add_seed(
-                        tree,
-                        child,
-                        sides[side],
-                        b,
-                        work,
-                        0,
-                        found,
-                        inverses,
-                        quality,
-                        count,
-                    )
+                    count = _add_seed(tree, child, sides[side], 0, room, count)
     return count
 
 

@@ -270,22 +270,13 @@ def _solve_peg(
         return solve_from_rest(whisker, pegs, side, proximal, steps)
     if start.whisker is not (whisker.whisker if isinstance(whisker, Resting) else whisker):
         raise ValueError("start is a deflection of another whisker")
-    shape = load.shape
-    contacts = np.concatenate(
-        [
-            np.broadcast_to(start.arc_length / d.length, shape).reshape(-1, 1),
-            np.broadcast_to(start.contact_force / d.force, (*shape, 3)).reshape(-1, 3),
-        ],
-        axis=1,
-    )
-    status: AnyArray = np.broadcast_to(start.status, shape).reshape(-1)
     assert isinstance(start.load, PegContact)  # checked when the load was created
-    earlier = PegContact(
-        np.broadcast_to(start.load.origin, (*shape, 3)),
-        np.broadcast_to(start.load.axis, (*shape, 3)),
-        np.broadcast_to(start.load.radius, shape),
-    )
-    before = _pegs_of(earlier, d.length)
+    number = np.arange(start.status.size).reshape(start.status.shape)
+    each = np.broadcast_to(number, load.shape).reshape(-1)  # earlier deflection of each load
+    arc, force = start.arc_length / d.length, start.contact_force / d.force
+    contacts = np.column_stack([arc.reshape(-1), force.reshape(-1, 3)])[each]
+    status: AnyArray = start.status.reshape(-1)[each]
+    before = _pegs_of(start.load, d.length).rows(each)
     touching = np.isin(status, (Status.OK, Status.TIP_CONTACT))
     out = Solutions.empty(status.size)
     rows = np.flatnonzero(touching)

@@ -18,10 +18,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vibrissa.deferred import interpolate
 from vibrissa.numerics import Array, IntArray
 from vibrissa.objects import Placement, Surface, between
 from vibrissa.rod.chart import LEAST_ARC
@@ -68,12 +69,6 @@ class SurfaceDeflection:
     sliding: np.ndarray  # (n,), whether the contact slides rather than sticks
 
 
-class _Ended(NamedTuple):
-    """Status of a contact that has ended; `Status.NO_CONTACT` if it was released."""
-
-    reason: Status
-
-
 def follow_surfaces(
     whisker: Whisker,
     surfaces: Sequence[Surface],
@@ -81,44 +76,33 @@ def follow_surfaces(
     positions: Array,
     *,
     friction: float = 0.0,
-    proximal: float = LEAST_ARC,
-    steps: int = STEPS,
     progress: Progress | None = None,
 ) -> SurfaceDeflection:
     """Move a whisker past surfaces, quasi-statically, through n placements in order."""
     if not (np.isfinite(friction) and friction >= 0.0):
         raise ValueError(f"friction is {friction!r}; it must be a finite coefficient, 0 or more")
-    follower = _Follower(whisker, surfaces, friction, steps)
+    follower = _Follower(whisker, surfaces, friction)
     n = len(positions)
-    solved = Solutions.empty(n)
-    out = SurfaceDeflection(
-        bent=None,  # type: ignore[arg-type]
-        surface=np.full(n, -1),
-        normal=np.full((n, 3), np.nan),
-        surface_point=np.full((n, 3), np.nan),
-        sliding=np.zeros(n, dtype=bool),
-    )
+    solved, surface, sliding = Solutions.empty(n), np.full(n, -1), np.zeros(n, dtype=bool)
+    normal, surface_point = np.full((2, n, 3), np.nan)
     for i in range(n):
         found = follower.move_to(Placement(rotations[i], positions[i]))
-        if isinstance(found, Touch) and found.contact[0] < proximal:
-            found = _Ended(Status.TOO_PROXIMAL)
         if isinstance(found, Touch):
             solved.contacts[i], solved.values[i] = found.contact, found.state[:6]
             solved.misfits[i] = found.misfit
             solved.statuses[i] = int(Status.TIP_CONTACT if found.tip else Status.OK)
-            out.surface[i], out.normal[i] = found.surface, found.normal
-            out.surface_point[i] = found.point - found.distance * found.normal
-            out.sliding[i] = found.sliding
+            surface[i], normal[i], sliding[i] = found.surface, found.normal, found.sliding
+            surface_point[i] = found.point - found.distance * found.normal
         else:
-            solved.statuses[i] = int(found.reason)
-            if found.reason == Status.NO_CONTACT:
+            solved.statuses[i] = int(found)
+            if found == Status.NO_CONTACT:
                 solved.contacts[i, 1:] = solved.values[i, :3] = solved.misfits[i] = 0.0
         if progress is not None:
             progress(i + 1, n)
     d = follower.discretization
     load = PointForce(solved.contacts[:, 0] * d.length, components=solved.contacts[:, 1:] * d.force)
-    bent = dimensional(whisker, load, solved, steps)
-    return SurfaceDeflection(bent, out.surface, out.normal, out.surface_point, out.sliding)
+    bent = dimensional(whisker, load, solved, STEPS)
+    return SurfaceDeflection(bent, surface, normal, surface_point, sliding)
 
 
 class _Resting:
@@ -131,24 +115,17 @@ class _Resting:
         self.s: Array = rest.s[every]
         self.place: Array = rest.position[every] * whisker.length
         self.radius: Array = rest.radius[every] * whisker.length
-        self._slope: Array = rest.frame[every, :, 0] * whisker.length
+        self._tangent = rest.frame[every, :, 0]
+        slope = self._tangent * whisker.length
+        self._line = interpolate.CubicHermiteSpline(self.s, self.place, slope)
 
     def at(self, s: Array) -> tuple[Array, Array]:
         """Positions (n, 3) and radii (n,) at s/L, m, by cubic interpolation of the samples."""
-        i = np.clip(np.searchsorted(self.s, s) - 1, 0, self.s.size - 2)
-        h = self.s[i + 1] - self.s[i]
-        t = (s - self.s[i]) / h
-        radius = (1.0 - t) * self.radius[i] + t * self.radius[i + 1]
-        t, h = t[:, None], h[:, None]
-        u = 1.0 - t
-        start = u * u * ((1.0 + 2.0 * t) * self.place[i] + t * h * self._slope[i])
-        end = t * t * ((3.0 - 2.0 * t) * self.place[i + 1] - u * h * self._slope[i + 1])
-        return start + end, radius
+        return self._line(s), np.interp(s, self.s, self.radius)
 
     def direction(self, s: float) -> Array:
         """Unit tangent (3,) near s/L."""
-        slope = self._slope[int(np.argmin(np.abs(self.s - s)))]
-        return np.asarray(slope / np.linalg.norm(slope))
+        return np.asarray(self._tangent[int(np.argmin(np.abs(self.s - s)))])
 
     def gap(self, surface: int, place: Placement) -> tuple[float, float]:
         """Smallest distance between resting whisker and surface, m, and its s/L."""
@@ -244,21 +221,20 @@ class _Resting:
 
 
 class _Follower:
-    """Present placement and contact of the whisker, and its motion to the next placement."""
+    """Present placement and contact of the whisker, and its motion to the next placement.
 
-    def __init__(
-        self, whisker: Whisker, surfaces: Sequence[Surface], friction: float, steps: int
-    ) -> None:
-        self.discretization = discretize(whisker, steps)
-        self._whisker, self._steps = whisker, steps
-        self._surfaces = surfaces
-        self._friction = friction
+    Where there is no contact, a status states why: `Status.NO_CONTACT` if it was released.
+    """
+
+    def __init__(self, whisker: Whisker, surfaces: Sequence[Surface], friction: float) -> None:
+        self.discretization = discretize(whisker)
+        self._whisker, self._surfaces, self._friction = whisker, surfaces, friction
         self._solver = TouchSolver(self.discretization, surfaces)
         self._rest = _Resting(whisker, surfaces)
         self._placement: Placement | None = None
-        self._found: Touch | _Ended = _Ended(Status.NOT_CONVERGED)
+        self._found: Touch | Status = Status.NOT_CONVERGED
 
-    def move_to(self, now: Placement) -> Touch | _Ended:
+    def move_to(self, now: Placement) -> Touch | Status:
         """Move to a placement; return the contact or why there is none."""
         before, self._placement = self._placement, now
         found = self._found
@@ -266,18 +242,18 @@ class _Follower:
             assert before is not None
             found = self._follow(found, before, now, self._friction)
             before = None  # the whisker was not free there
-        elif found.reason != Status.NO_CONTACT:
+        elif found != Status.NO_CONTACT:
             before = None
-        if isinstance(found, _Ended):
+        if isinstance(found, Status):
             found = self._from_rest(before, now)
         self._found = found
         return found
 
     # Onset of contact
 
-    def _from_rest(self, before: Placement | None, now: Placement) -> Touch | _Ended:
+    def _from_rest(self, before: Placement | None, now: Placement) -> Touch | Status:
         """Solve a whisker that was free at ``before``, or was not (None)."""
-        ended = _Ended(Status.NO_CONTACT)
+        ended = Status.NO_CONTACT
         if before is not None:
             meeting = self._rest.first_meeting(before, now)
             if meeting is None:
@@ -292,22 +268,22 @@ class _Follower:
                 break
             outside = self._rest.outside(surface, now)
             if outside is None:
-                found = _Ended(Status.NOT_CONVERGED)
+                found = Status.NOT_CONVERGED
             else:
                 found = self._enter(surface, outside, now, now, 0.0)
             if isinstance(found, Touch):
                 return found
-            if ended.reason == Status.NO_CONTACT:
+            if ended == Status.NO_CONTACT:
                 ended = found
         return ended
 
     def _enter(
         self, surface: int, touching: Placement, after: Placement, now: Placement, friction: float
-    ) -> Touch | _Ended:
+    ) -> Touch | Status:
         """Bend a whisker from first contact, through a penetrating placement, to ``now``."""
         _, s = self._rest.gap(surface, touching)
         if s < LEAST_ARC:
-            return _Ended(Status.TOO_PROXIMAL)
+            return Status.TOO_PROXIMAL
         touch = self._solver.start(surface, touching, np.array([s, 0.0, 0.0, 0.0]))
         found = self._follow(touch, touching, after, friction)
         if isinstance(found, Touch) and after is not now:
@@ -323,7 +299,7 @@ class _Follower:
         now: Placement,
         friction: float,
         others: int = _MOST_OTHERS,
-    ) -> Touch | _Ended:
+    ) -> Touch | Status:
         """Follow a contact between placements; if it ends, go on with another one."""
         done, stride, largest = 0.0, 1.0, 0.0
         while done < 1.0:
@@ -335,7 +311,7 @@ class _Follower:
                 if found is not None or stride < _SMALLEST_STEP:
                     reason = Status.NO_CONTACT if found else _status_at_end(touch, largest)
                     here = between(before, now, done)
-                    return self._pass_on(touch, here, now, friction, others) or _Ended(reason)
+                    return self._pass_on(touch, here, now, friction, others) or reason
                 continue
             touch, done, stride = found, share, 2.0 * stride
             largest = min(largest, found.determinant)
@@ -356,7 +332,7 @@ class _Follower:
     def _other_touch(self, touch: Touch, place: Placement) -> Touch | None:
         """Another contact of the whisker, as bent by one contact, with any of the surfaces."""
         d = self.discretization
-        solver = point_solver(self._whisker, LEAST_ARC, self._steps)
+        solver = point_solver(self._whisker, LEAST_ARC, STEPS)
         for surface, solid in enumerate(self._surfaces):
             allowed = np.abs(self._rest.s - touch.contact[0]) > _ELSEWHERE
             allowed |= surface != touch.surface

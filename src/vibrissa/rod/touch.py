@@ -36,7 +36,7 @@ from vibrissa.objects import Placement, Surface
 from vibrissa.rod.chart import LEAST_ARC
 from vibrissa.rod.discretization import Discretization
 from vibrissa.rod.integration import relative_radius
-from vibrissa.rod.kernels import contact_state
+from vibrissa.rod.kernels import contact_state, normal_plane
 
 EITHER, STICKING, SLIDING = 0, 1, 2
 # Number of state variables (F, p, t).
@@ -52,21 +52,6 @@ _LONGEST = (0.15, 0.15, 0.4, 0.5)
 _MOST_TURNED = 0.5  # cosine of the largest rotation of the normal in one step of the path
 # Component of the tangent along the normal above which a tip contact becomes one of the side.
 _OUTWARD = 1e-10
-
-
-@inlined
-def _tangent_plane(n: Array, e: Array) -> None:
-    """Fill e (2, 3) with two unit vectors such that n, e₁, e₂ are right-handed."""
-    least = 0
-    for i in range(1, 3):
-        if abs(n[i]) < abs(n[least]):
-            least = i
-    a, b = (least + 1) % 3, (least + 2) % 3
-    size = 1.0 / np.sqrt(n[a] * n[a] + n[b] * n[b])
-    e[0, least], e[0, a], e[0, b] = 0.0, n[b] * size, -n[a] * size
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        e[1, i] = n[j] * e[0, k] - n[k] * e[0, j]
 
 
 @inlined
@@ -111,7 +96,7 @@ def _surface_equations(
     slides, and whether this agrees with the friction cone.
     """
     n, e = geometry[1:4], np.empty((2, 3))
-    _tangent_plane(n, e)
+    e[0], e[1] = normal_plane((n[0], n[1], n[2]))
     pressing, along, away = 0.0, 0.0, contact[0] - earlier[6]
     for i in range(3):
         pressing += (n[i] + lean[i]) * state[i, 0]

@@ -77,14 +77,8 @@ class SearchTree(NamedTuple):
     edges: Array  # (n, 160), coefficients of the cells' interpolants
     # (n,) Starts needed by a cell: 0 one, 1 several until one is solved, 2 all of them.
     care: IntArray
-    polar: IntArray  # (n,), row of a polar cell in the arrays below, -1 for other cells
-    polar_edges: Array  # (p, 160), coefficients of the polar cells' interpolants
-    polar_frame: Array  # (p, 8), base values, and the sizes used as the cell's extent
-    polar_linear: Array  # (p, 4, 5), mean slopes, and middle and half width of the remainder
-    # (p, 8, 2) Volumes spanned by the slopes at the corners, for each component of the vector.
-    polar_volumes: Array
-    # (4,) Indices of length, direction and the others among the quantities; -1 for none.
-    roles: IntArray
+    polar: IntArray  # (n,), row of a polar cell among the polar ones, -1 for other cells
+    vector: Polar  # polar cells
 
 
 class PlaneVector(NamedTuple):
@@ -149,12 +143,12 @@ def search_tree(
     care = _starts_needed(blown.slope, in_blown)
     if powers.any():  # equations of quantities that are not of one sign are far from linear at rest
         care[(pivot == 0) & (place[:, 2] == 0) & (care == 0)] = 1
-    polar = _Polar.none()
+    polar = Polar.none()
     if plane is not None:
         slopes = chart.charted(plane.derivatives) * size
         vector = _Cells.of(place, plane.values, slopes, np.zeros(2, dtype=bool))
         extent = 0.5 * np.subtract(*cells.extent()[::-1])
-        polar = _Polar.of(cells, vector, plane.length, plane.direction, extent)
+        polar = Polar.of(cells, vector, plane.length, plane.direction, extent)
         if plane.length >= 0:
             low[polar.rows, plane.length] = 0.0
             high[polar.rows, plane.length] = polar.frame[:, 7]
@@ -181,11 +175,7 @@ def search_tree(
         _edge_coefficients(interpolated),
         care,
         row,
-        polar.edges,
-        polar.frame,
-        polar.linear,
-        polar.volumes,
-        polar.roles,
+        polar,
     )
 
 
@@ -248,25 +238,27 @@ class _Cells(NamedTuple):
         return np.concatenate([slopes, rest], axis=-1)
 
 
-class _Polar(NamedTuple):
-    """Polar cells: their indices ``rows`` (n,), and arrays as in `SearchTree`."""
+class Polar(NamedTuple):
+    """Polar cells and the values of the vector and the other quantities in them."""
 
-    rows: IntArray
-    edges: Array
-    frame: Array
-    linear: Array
+    rows: IntArray  # (p,), their indices among all cells
+    edges: Array  # (p, 160), coefficients of their interpolants
+    frame: Array  # (p, 8), base values, and the sizes used as the cell's extent
+    linear: Array  # (p, 4, 5), mean slopes, and middle and half width of the remainder
+    # (p, 8, 2) Volumes spanned by the slopes at the corners, for each component of the vector.
     volumes: Array
+    # (4,) Indices of length, direction and the others among the quantities; -1 for none.
     roles: IntArray
 
     @classmethod
-    def none(cls) -> _Polar:
+    def none(cls) -> Polar:
         """Return an instance without polar cells."""
         edges, frame = np.empty((0, 160)), np.empty((0, 8))
         linear, volumes = np.empty((0, 4, 5)), np.empty((0, 8, 2))
         return cls(np.empty(0, int), edges, frame, linear, volumes, np.full(4, -1))
 
     @classmethod
-    def of(cls, cells: _Cells, vector: _Cells, length: int, direction: int, half: Array) -> _Polar:
+    def of(cls, cells: _Cells, vector: _Cells, length: int, direction: int, half: Array) -> Polar:
         """Find the cells in which a vector may vanish; half (cells, 3): extents of quantities."""
         y, z = np.moveaxis(vector.points() + vector.base, -1, 0)
         size = np.sqrt(y * y + z * z)
@@ -304,7 +296,7 @@ class _Polar(NamedTuple):
 
 
 def _spanned_volumes(slope: Array, others: int) -> Array:
-    """Volumes of `SearchTree.polar_volumes`, relative to the slopes' lengths."""
+    """Volumes of `Polar.volumes`, relative to the slopes' lengths."""
     slope = np.moveaxis(slope.reshape(8, *slope.shape[3:]), 0, 1)
     out = np.zeros((len(slope), 8, 2))
     size = np.linalg.norm(slope[..., 2:, :], axis=-1).prod(axis=-1)

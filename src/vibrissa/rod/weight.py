@@ -41,6 +41,7 @@ from vibrissa.rod.kernels import (
     add,
     cross,
     get,
+    normal_plane,
     piece_of,
     put,
     runge_kutta_step,
@@ -261,22 +262,6 @@ def _held_step(rod: Rod, weight: Weight, h: Array, k: int, slopes: int) -> None:
             _put_six(h, _MOVING + _SIX, i, y)
         for i in range(2 * _SIX):
             h[row + i] = h[_MOVING + i]
-
-
-@inlined
-def normal_plane(n: Vector) -> Pair:
-    """Two unit vectors such that they and the unit vector n are right-handed: e₁ × e₂ = n."""
-    x, y, z = n
-    if abs(x) <= abs(y) and abs(x) <= abs(z):
-        size = 1.0 / np.sqrt(y * y + z * z)
-        first = (0.0, z * size, -y * size)
-    elif abs(y) <= abs(z):
-        size = 1.0 / np.sqrt(x * x + z * z)
-        first = (-z * size, 0.0, x * size)
-    else:
-        size = 1.0 / np.sqrt(x * x + y * y)
-        first = (y * size, -x * size, 0.0)
-    return first, cross(n, first)
 
 
 @inlined

@@ -102,11 +102,6 @@ def course_of(trial: xr.DataTree, whisker: int = 0) -> Course:
     -------
     Course
         Data of that whisker.
-
-    Raises
-    ------
-    ValueError
-        If there is no such whisker, or the recording lacks times or the pose of the base.
     """
     lacking = [n for n in ("time", "base_position", "base_rotation") if n not in trial.variables]
     if lacking:

@@ -31,7 +31,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.deferred import interpolate, spatial
-from vibrissa.numerics import Array, Mask
+from vibrissa.numerics import Array, Mask, spherical
 from vibrissa.quantities import to_display
 
 SIGNALS = ("Fx", "FT", "FD", "Mx", "MB", "MD")
@@ -125,12 +125,8 @@ def _refine(
 def _complete_rows(nodes: Array, line: Array) -> Array:
     """Add the columns that follow from contact points (the first three columns)."""
     point = nodes[..., :3]
-    x, y, z = np.moveaxis(point, -1, 0)
-    ball = np.stack(
-        [np.linalg.norm(point, axis=-1), np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))], axis=-1
-    )
-    outside = outside_cone(point.reshape(-1, 3), line).reshape(x.shape)
-    return np.concatenate([point, ball, nodes[..., 3:], outside[..., None]], axis=-1)
+    outside = outside_cone(point.reshape(-1, 3), line).reshape(point.shape[:-1])
+    return np.concatenate([point, spherical(point), nodes[..., 3:], outside[..., None]], axis=-1)
 
 
 def outside_cone(points: Array, centerline: Array) -> Array:

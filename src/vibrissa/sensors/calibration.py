@@ -335,11 +335,6 @@ def tare(
     -------
     Sensor
         Sensor with the new offset.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not match, a required rotation is missing, or no reading is complete.
     """
     free = np.atleast_2d(sensor.compensated(readings, rotations, gravity))
     free = free[np.isfinite(free).all(axis=1)]

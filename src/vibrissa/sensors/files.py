@@ -1,68 +1,13 @@
 """Files of sensors, and descriptions of tables from a positioning stage.
 
-**Sensors** are described in TOML files, in SI units.
+Sensors are described in TOML files, in SI units (docs: Robot whiskers, The sensor). Only channels
+and noise are required. A matrix that seems to have the wrong name, ``mixing`` or ``calibration``,
+is an error: for a sensor that is small compared with a metre, readings per N·m are larger than
+those per N.
 
-    channels = ["Fx", "My", "Mz"]
-    mixing = [[1, 0, 0, 0, 0, 0], …]   # a row per channel: weights of Fx, Fy, Fz, Mx, My, Mz
-    noise = [1e-6, 2e-8, 2e-8]         # standard deviations; or one number for all
-    bias = 0.0
-    gain_error = 0.01                  # relative standard deviation, the same error in all readings
-    mixing_error = 0.01                # or a matrix of standard deviations, shaped like mixing
-    mixing_covariance = [[[1e-6, …], …], …]   # per channel: 7 × 7, of its mixing and offset
-
-    [frame]
-    axes = ["x", "-z", "y"]            # or a 3 × 3 matrix, the sensor's axes in its columns
-    position = [0, 0, -0.004]          # m
-    reaction = false
-
-    [weight]
-    mass = 0.002                       # kg
-    moment = [0, 0, 0]                 # kg·m
-
-A manufacturer's calibration matrix, from the channels to Fx, Fy, Fz, Mx, My, Mz, may be given as
-``calibration`` (6 rows, one number per channel) instead of ``mixing``. A matrix that seems to have
-the wrong name is an error: for a sensor that is small compared with a metre, readings per N·m are
-larger than those per N.
-
-Only channels and noise are required. Channels that are components in other units need one number
-as mixing: ``mixing = 1e3`` for mN and mN·m (= N·mm). Noise, bias and the largest reading are in
-the units of the channels.
-
-**Tables of a positioning stage**: touches at known points, the resting shape, sweeps.
-
-    unit = "mm"                              # of all lengths in the tables and below
-    readings = ["sx", "sy", "sz"]            # columns of the channels
-    position = ["px", "py", "pz"]            # columns of the stage
-
-    [touches]                                # a probe on the stage touches the whisker
-    file = "touches.csv"
-    origin = [64.3, 98.1, 16.1]              # position of the stage with the probe at the base
-    axes = ["x", "y", "z"]                   # sensor axes along those of the stage, or 3 × 3 matrix
-    farthest = 40                            # contacts farther from the base are ignored
-    rest = [0, 0, 0]                         # readings of the untouched whisker; by default those
-                                             # of rows with the probe at the base
-    drift = [15, 40, 40]                     # change from one recording to the next; by default
-                                             # that of these rows from the stated rest
-
-    [[shape]]                                # points along the whisker at rest, from base to tip
-    file = "shape_y.csv"
-    columns = {x = "px", y = "py"}           # coordinates in the sensor's frame
-    [[shape]]                                # supplies coordinates that the first table lacks
-    file = "shape_x.csv"
-    columns = {x = "px", z = "pz"}
-    leave_out = [7]                          # rows to ignore, counted from 0
-
-    [whisker]                                # apart from forces, only the ratio matters
-    base_radius = 0.1
-    tip_radius = 0.1
-
-    [sweep]                                  # the sensor moves, or the object that it touches
-    moves = "sensor"
-    origin = [60.4, 86.9, 47.0]
-    axes = ["-x", "-y", "z"]
-
-Files are relative to the description's folder. A calibrated sensor is a NetCDF file that includes
-the description.
+Tables of a positioning stage (touches at known points, the resting shape, sweeps) have a
+description in TOML as well (docs: Robot whiskers, A Hall sensor), which a calibrated sensor's
+NetCDF file includes. Files are relative to the description's folder.
 """
 
 from __future__ import annotations
@@ -124,13 +69,6 @@ def load_sensor(path: str | PathLike[str]) -> Sensor:
     -------
     Sensor
         Sensor that the file describes.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is not TOML, has unknown keys, or does not describe a sensor.
     """
     path = Path(path)
     table = read_toml(path)

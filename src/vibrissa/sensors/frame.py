@@ -44,11 +44,6 @@ class SensorFrame:
         Whether the sensor reports the force that it exerts on the whisker instead of that on
         itself: all six components then have the opposite sign.
 
-    Raises
-    ------
-    ValueError
-        If the axes are not orthonormal, or a number is not finite.
-
     Examples
     --------
     >>> SensorFrame(("x", "-y", "z")).handedness

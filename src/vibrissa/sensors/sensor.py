@@ -100,11 +100,6 @@ class Sensor:
     mass_moment : array_like (3,)
         First moment of that mass, mass times centre, whisker frame, kg·m.
 
-    Raises
-    ------
-    ValueError
-        If shapes do not match, or a number is negative or not finite.
-
     Examples
     --------
     >>> Sensor(channels=("Fx", "My", "Mz"), resolution=[1e-6, 1e-8, 1e-8]).mixing.shape
@@ -138,8 +133,9 @@ class Sensor:
         values: dict[str, Any] = {"channels": names, "mixing": mixing}
         values |= _checked_numbers(self, mixing, len(names), faults)
         values["mixing_error"] = numbers("mixing_error", self.mixing_error, COMPONENTS)
-        values["mixing_covariance"], fault = _checked_covariance(self.mixing_covariance, len(names))
-        faults += fault
+        values["mixing_covariance"] = _checked_covariance(
+            self.mixing_covariance, len(names), faults
+        )
         error, moment = values["mixing_error"], numbers("mass_moment", self.mass_moment)
         if error.shape not in ((), (len(names), 6)):
             faults.append(
@@ -147,9 +143,12 @@ class Sensor:
             )
         elif not (np.isfinite(error) & (error >= 0.0)).all():
             faults.append(f"mixing_error is {error.tolist()}; it must be finite and not negative")
-        for name in ("relative_noise", "gain_error", *(["mixing_error"] if not error.ndim else [])):
-            if np.any(np.asarray(getattr(self, name), dtype=np.float64) > 1.0):
-                faults.append(f"{name} is {getattr(self, name)!r}; it is a share: 5 % is 0.05")
+        shares = ("relative_noise", "gain_error", *(["mixing_error"] if not error.ndim else []))
+        faults += [
+            f"{name} is {getattr(self, name)!r}; it is a share: 5 % is 0.05"
+            for name in shares
+            if np.any(np.asarray(getattr(self, name), dtype=np.float64) > 1.0)
+        ]
         for name in ("relative_noise", "mass"):
             number = getattr(self, name)
             if not (np.isfinite(number) and number >= 0.0):
@@ -276,11 +275,6 @@ class Sensor:
         -------
         array (..., k)
             Readings in the units of the channels; NaN if saturated.
-
-        Raises
-        ------
-        ValueError
-            If the number of channels differs, or a required rotation is missing.
         """
         values = numbers("readings", readings, self.channels)
         if values.shape[-1:] != (len(self.channels),):
@@ -365,12 +359,6 @@ class Sensor:
         -------
         array (n, k)
             Readings of the channels.
-
-        Raises
-        ------
-        ValueError
-            If shapes do not match, time decreases or is not finite, or a required rotation is
-            missing.
         """
         at, true = numbers("time", time), numbers("wrench", wrench, COMPONENTS)
         if at.ndim != 1 or true.shape != (at.size, 6):
@@ -500,22 +488,18 @@ def with_offset(covariance: Array, variance: Array) -> Array:
     return out
 
 
-def _checked_covariance(value: Any, channels: int) -> tuple[Array, list[str]]:
-    """Covariance (k, 7, 7) of mixing and offset, and its faults."""
+def _checked_covariance(value: Any, channels: int, faults: list[str]) -> Array:
+    """Covariance (k, 7, 7) of mixing and offset; errors are appended to ``faults``."""
     shape = (channels, 7, 7)
-    if value is None:
-        return np.zeros(shape), []
-    covariance = numbers("mixing_covariance", value)
+    covariance = numbers("mixing_covariance", np.zeros(shape) if value is None else value)
     if covariance.shape != shape or not np.isfinite(covariance).all():
-        return covariance, [
-            f"mixing_covariance has shape {covariance.shape}; finite {shape} is needed"
-        ]
+        faults.append(f"mixing_covariance has shape {covariance.shape}; finite {shape} is needed")
+        return covariance
     variances = np.diagonal(covariance, axis1=1, axis2=2)
     size = np.sqrt(np.where(variances > 0.0, variances, 1.0))
     correlation = covariance / (size[:, :, None] * size[:, None, :])
     if not np.allclose(correlation, np.swapaxes(correlation, 1, 2), rtol=0.0, atol=_INDEFINITE):
-        return covariance, ["mixing_covariance is not symmetric"]
-    least = float(np.linalg.eigvalsh(correlation).min(initial=0.0))
-    if (variances < 0.0).any() or least < -_INDEFINITE:
-        return covariance, ["mixing_covariance has negative eigenvalues, so it is not a covariance"]
-    return covariance, []
+        faults.append("mixing_covariance is not symmetric")
+    elif (variances < 0.0).any() or np.linalg.eigvalsh(correlation).min() < -_INDEFINITE:
+        faults.append("mixing_covariance has negative eigenvalues, so it is not a covariance")
+    return covariance

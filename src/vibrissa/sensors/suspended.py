@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.deferred import transform
-from vibrissa.numerics import AnyArray, Array, cross_matrix, numbers
+from vibrissa.numerics import AnyArray, Array, cross_matrix, exponential, numbers
 from vibrissa.rod import discretize, solve_forces
 from vibrissa.sensors.regression import ThinPlate
 from vibrissa.status import Status
@@ -48,8 +48,7 @@ _STEPS, _ROUNDS, _LAST_ROUNDS = 16, 4, 12
 _SOLVED = 1e-8  # largest distance from the point, in units of L, of a solved contact
 _MOST_ARC, _MOST_FORCE = 0.1, 3.0  # largest Newton steps of s, in L, and of the force, in EI/L²
 _LEAST_ARC = 0.01  # smallest arc length of a contact, in units of L
-# Step of finite differences, and squared angle below which series replace quotients.
-_SMALL = 1e-6
+_SMALL = 1e-6  # step of finite differences
 
 
 class Touches(NamedTuple):
@@ -93,11 +92,6 @@ class SuspendedWhisker:
         Correction of the readings as a function of the contact point, m, sensor frame.
     drift : float or array_like (k,)
         Standard deviation of the change of readings from one recording to the next.
-
-    Raises
-    ------
-    ValueError
-        If a compliance is negative, or shapes do not match.
     """
 
     whisker: Whisker
@@ -156,10 +150,8 @@ class SuspendedWhisker:
         d_force, d_arm = turn @ slope[:, :3], turn @ slope[:, 3:]
         angle = rotation * np.cross(arm, force)
         d_angle = rotation * (cross_matrix(arm) @ d_force - cross_matrix(force) @ d_arm)
-        turned, spin = (
-            transform.Rotation.from_rotvec(angle).as_matrix(),
-            _right_jacobian(angle) @ d_angle,
-        )
+        turned, mean = exponential(angle)
+        spin = np.swapaxes(mean, 1, 2) @ d_angle
         pull = (turned @ force[:, :, None])[:, :, 0]
         d_pull = turned @ (d_force - cross_matrix(force) @ spin)
         base = self.whisker.pose.origin / d.length + pivot
@@ -301,15 +293,3 @@ class SuspendedWhisker:
         if seed is not None:
             values = values + np.random.default_rng(seed).normal(size=values.shape) * self.noise
         return np.where((statuses == int(Status.OK))[:, None], values, np.nan), statuses
-
-
-def _right_jacobian(angle: Array) -> Array:
-    """Right Jacobians (n, 3, 3) of the rotation vectors (n, 3)."""
-    square = np.sum(angle * angle, axis=-1)[:, None, None]
-    small = square < _SMALL
-    x = np.where(small, 1.0, square)
-    size = np.sqrt(x)
-    first = np.where(small, 0.5 - square / 24.0, (1.0 - np.cos(size)) / x)
-    second = np.where(small, 1.0 / 6.0 - square / 120.0, (size - np.sin(size)) / (x * size))
-    matrix = cross_matrix(angle)
-    return np.asarray(np.eye(3) - first * matrix + second * (matrix @ matrix))

@@ -197,7 +197,7 @@ def _chosen(whisker: Whisker, points: Array, readings: Array, unknowns: tuple[Un
     points, readings = points[kept], readings[kept]
     region = kmeans2(points / np.abs(points).max(), _REGIONS, seed=0, minit="++")[1]
     spread = readings.std(axis=0)
-    start = _Problem(whisker, points, readings, unknowns[: CHOICES[0]]).minimise()[0].values
+    start = _Problem(whisker, points, readings, unknowns[: CHOICES[0]]).minimise().values
     misses = []
     for number in CHOICES:
         miss = np.ones_like(readings)  # without a prediction, the error is that of the mean
@@ -302,8 +302,8 @@ class _Problem:
             out.append(((change - q @ (q.T @ change)) / self.noise).ravel())
         return np.array(out).T
 
-    def minimise(self, starts: Sequence[Any] = _STARTS) -> tuple[_State, Array]:
-        """Minimise the cost from the best initial compliances; also return the derivatives."""
+    def minimise(self, starts: Sequence[Any] = _STARTS) -> _State:
+        """Minimise the cost from the best initial compliances."""
         p = len(self.unknowns)
         begin = [np.append(pair, np.zeros(p - 2)) for pair in starts]
         at = min((self.state(x, None) for x in begin), key=lambda one: one.cost)
@@ -335,7 +335,7 @@ class _Problem:
             at = self.state(new.values, new.contacts)
             if settled:
                 break
-        return at, self.slopes(at)
+        return at
 
     def check(self, at: _State) -> None:
         """Raise ValueError if the whisker reaches too few of the touches."""
@@ -361,7 +361,7 @@ class _Problem:
 
     def outliers(self) -> AnyArray:
         """Mask (n,) of touches with a reading far from the model."""
-        at, _ = self.minimise()
+        at = self.minimise()
         size = np.abs(self.misses(at))
         usual = 1.4826 * np.median(size, axis=0)
         most = np.maximum(_OUTLYING * usual, _LEAST_OUTLYING * np.ptp(self.readings, axis=0))
@@ -377,7 +377,8 @@ class _Problem:
         starts: Sequence[Any] = _STARTS,
     ) -> SuspensionCalibration:
         """Fit the model and return the calibration."""
-        at, jacobian = self.minimise(starts)
+        at = self.minimise(starts)
+        jacobian = self.slopes(at)
         noise, spread = self.left(at), np.diag(1.0 / self.sigma**2)
         covariance = np.linalg.inv(jacobian.T @ jacobian + spread)
         sigma = np.sqrt(np.diag(covariance))

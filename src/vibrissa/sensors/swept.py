@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.deferred import linalg, sparse_linalg
-from vibrissa.numerics import AnyArray, Array, numbers, rotation_matrices
+from vibrissa.numerics import AnyArray, Array, contacts_in, numbers, rotation_matrices
 from vibrissa.sensors.suspended import SuspendedWhisker, Touches
 
 # Standard deviations of the error that varies from sample to sample and of the slowly varying one,
@@ -112,11 +112,6 @@ def follow_sweep(
     -------
     SweptContacts
         Contact points with covariance, and the surface normal there.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not match.
     """
     y, base = numbers("readings", readings, sensor.channels), numbers("position", position)
     k = len(sensor.channels)
@@ -128,7 +123,7 @@ def follow_sweep(
         )
     turn = np.broadcast_to(turn, (len(y), 3, 3))
     change = y - (y[0] if rest is None else numbers("rest", rest))
-    touching = (np.abs(change) > threshold * sensor.uncertainty).any(axis=1)
+    touching = np.any(np.abs(change) > threshold * sensor.uncertainty, axis=1)
     n = len(y)
     out = SweptContacts(
         np.full((n, 3), np.nan),
@@ -139,8 +134,7 @@ def follow_sweep(
         np.full((n, k), np.nan),
         np.zeros((0, n, 3)),
     )
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], touching, [False]]).astype(int)))
-    for first, last in edges.reshape(-1, 2):
+    for first, last in contacts_in(touching):
         if last - first < _FEWEST:
             continue
         rows = slice(first, last)

@@ -77,11 +77,6 @@ def base_signals(force: ArrayLike | xr.DataArray, moment: ArrayLike | xr.DataArr
         ``Fx``, ``FT`` (N), ``FD`` (rad), ``Mx``, ``MB`` (N·m), ``MD`` (rad), each of shape (...).
         A direction is 0 where its vector is zero.
 
-    Raises
-    ------
-    ValueError
-        If the last dimension is not of size 3, or the shapes differ.
-
     Warns
     -----
     UserWarning
@@ -220,11 +215,6 @@ def measured(
         Names of the leading dimensions.
     coords : dict
         Coordinates along them.
-
-    Raises
-    ------
-    ValueError
-        If a signal is missing or shapes do not broadcast.
     """
     if not hasattr(signals, "keys"):
         raise ValueError(

@@ -115,7 +115,8 @@ def _nodes(whisker: Whisker, segments: int) -> Array:
 
 @kernel
 def configure(
-    theta: Array,
+    exp: Array,
+    left: Array,
     joints: Array,
     rotation: Array,
     base: Array,
@@ -123,12 +124,11 @@ def configure(
     pivots: Array,
     turns: Array,
 ) -> None:
-    """Compute the pose of the links from the joint rotations θ (m, 3) and the pose of the base.
+    """Compute the pose of the links from exp θ and its left Jacobian, and the pose of the base.
 
     Fills ``frames`` (m + 1, 3, 3), the rotations of the links; ``pivots`` (m, 3), the positions of
     the joints; and ``turns`` (m, 3, 3), the matrices A of the module.
     """
-    exp, left = np.empty((3, 3)), np.empty((3, 3))
     for a in range(3):
         for b in range(3):
             frames[0, a, b] = rotation[a, b]
@@ -137,38 +137,14 @@ def configure(
         for a in range(3):
             start = pivots[j - 1, a] if j > 0 else base[a]
             pivots[j, a] = start + length * frames[j, a, 0]
-        _exponential(theta[j], exp, left)
         for a in range(3):
             for b in range(3):
                 turned, moved = 0.0, 0.0
                 for c in range(3):
-                    turned += frames[j, a, c] * exp[c, b]
-                    moved += frames[j, a, c] * left[c, b]
+                    turned += frames[j, a, c] * exp[j, c, b]
+                    moved += frames[j, a, c] * left[j, c, b]
                 frames[j + 1, a, b] = turned
                 turns[j, a, b] = moved
-
-
-@kernel
-def _exponential(v: Array, exp: Array, left: Array) -> None:
-    """Rotation exp [v]× and its left Jacobian."""
-    square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
-    if square < 1e-8:
-        a, b, c = 1.0 - square / 6.0, 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
-    else:
-        angle = np.sqrt(square)
-        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / square
-        c = (1.0 - a) / square
-    for i in range(3):
-        for k in range(3):
-            outer = v[i] * v[k] - (square if i == k else 0.0)
-            exp[i, k] = b * outer + (1.0 if i == k else 0.0)
-            left[i, k] = c * outer + (1.0 if i == k else 0.0)
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        exp[k, j] += a * v[i]
-        exp[j, k] -= a * v[i]
-        left[k, j] += b * v[i]
-        left[j, k] -= b * v[i]
 
 
 @kernel

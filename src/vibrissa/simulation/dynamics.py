@@ -35,7 +35,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vibrissa.deferred import interpolate, linalg, transform
-from vibrissa.numerics import AnyArray, Array, IntArray
+from vibrissa.numerics import AnyArray, Array, IntArray, exponential
 from vibrissa.objects import Surface
 from vibrissa.simulation.chain import Chain, bezier, configure, inertia, jacobian
 from vibrissa.simulation.motion import Motion
@@ -76,11 +76,6 @@ class Dynamics:
         Longest time step, s.
     contact_stiffness : float
         Stiffness of rigid objects, N/m; the default allows indentations of micrometres.
-
-    Raises
-    ------
-    ValueError
-        If a number is not positive, or the damping ratio is outside [0, 2].
     """
 
     density: tuple[float, float] = DENSITY
@@ -259,7 +254,7 @@ class State:
         """Set the joint rotations θ (m, 3) and the pose of the base."""
         chain = self.chain
         configure(
-            theta,
+            *exponential(theta),
             chain.joints,
             np.ascontiguousarray(rotation),
             np.ascontiguousarray(base),

@@ -42,76 +42,7 @@ from vibrissa.whisker import Whisker, WhiskerArray, base_rotation, whisker_array
 
 _MOST_FRAMES = 10_000_000  # largest number of frames of a trial
 # Every key of a script, with its default.
-EXAMPLE = """\
-# A trial for `vibrissa simulate`: lengths in mm, angles in degrees, forces in µN, moments in µN·m.
-# Every key is optional; defaults are the values shown, unless stated otherwise.
-
-duration = 3.5          # s
-rate = 1000.0           # frames per second
-friction = 0.0          # Coulomb's coefficient between whisker and objects
-seed = 0                # seed of drifts and noise
-
-# [dynamics]            # inertia and damping; without it the whisker moves quasi-statically
-# density = [1220.0, 1632.0]  # at base and tip, kg/m³
-# damping_ratio = 0.14  # of the first vibration mode
-# segments = 32
-# step = 0.1            # ms
-
-# [whisker]
-# file = "C1.csv"       # its centreline; by default a built-in γ whisker
-
-# [array]               # all whiskers of a face instead of one, in the head frame: snout at the
-#                       # origin, x to the right, y forward, z up; they whisk about their rest pose
-# file = "rat7.csv"     # a table or a folder of centrelines; by default those of an average rat
-# side = "both"         # or left, right
-# rows = "ABCDE"
-# columns = [0, 1, 2, 3, 4, 5, 6]   # 0 stands for the Greek whiskers
-# whiskers = ["C2", "gamma"]        # instead of rows and columns
-
-# Objects; by default one peg within reach. For several objects, repeat [[object]].
-[[object]]
-kind = "peg"            # or sphere, plane, box, mesh
-position = [26.0, 0.0, 0.0]
-axis = [0.0, 0.0, 1.0]
-diameter = 2.7
-# stiffness = 10.0      # N/m; rigid by default
-# A sphere has position and diameter; a plane position and normal (toward the free side); a box
-# position, size = [x, y, z], angles = [azimuth, elevation, roll] and edge_radius; a mesh file,
-# unit (length of one unit of the file, mm) and resolution.
-
-[motion]
-kind = "past"           # past the first object and back; or "whisking", or "table"
-row = "C"               # row of the array, which sets how elevation and roll follow the azimuth
-frequency = 5.0         # whisks per second
-protraction = 0.5       # share of a whisk that goes forward, 0.3 to 0.7
-variation = 0.05        # drift of amplitude and set point, as a share of the amplitude
-elevation = 0.0         # at the set point
-elevation_drift = 4.0
-# position_drift = 1.2  # by default 3 % of the whisker's length
-# amplitude = 30.0      # half the range of a sweep; "past" chooses it so that the whisker slips
-# set_point = 0.0
-# file = "motion.csv"   # for kind "table": time, azimuth, elevation, roll, x, y, z (s, rad, m)
-
-# [head]                # moves everything but the objects
-# position = [0.0, 0.0, 0.0]
-# angles = [0.0, 0.0, 0.0]  # azimuth, elevation, roll
-# to_position, to_angles    # final pose, reached smoothly
-# file = "head.csv"     # instead: a table with the columns of a motion
-
-[sensor]
-# channels = ["Fx", "My", "Mz"]     # all six by default
-# mixing = [[1, 0, 0, 0, 0, 0], …]  # weights of Fx, Fy, Fz (N), Mx, My, Mz (N·m) in each channel
-force_noise = 1.0       # standard deviation of white noise
-moment_noise = 0.02
-force_bias = 0.0
-moment_bias = 0.0
-force_drift = 0.0       # standard deviation of a random walk after one second
-moment_drift = 0.0
-force_resolution = 0.0
-moment_resolution = 0.0
-relative_noise = 0.0
-gain_error = 0.0
-"""
+EXAMPLE = Path(__file__).with_name("example.toml").read_text(encoding="utf-8")
 _MICRO = 1e-6
 _TOP = {"duration", "rate", "friction", "seed"}
 _TOP |= {"whisker", "array", "object", "motion", "head", "sensor", "dynamics"}

@@ -88,11 +88,6 @@ def simulate(
     xarray.DataTree
         Recording (`vibrissa.recording`) with the noise-free force and moment at the base, the pose
         of the base, and all other variables in the group ``truth``.
-
-    Raises
-    ------
-    ValueError
-        If the friction is negative, or whiskers and motions do not match.
     """
     pairs = _pairs(whisker, motion)
     solids = list(objects) if isinstance(objects, Sequence) else [objects]
@@ -186,7 +181,7 @@ def _pairs(whisker: Whiskers, motion: Motions) -> list[tuple[Whisker, Motion]]:
     first = motions[0]
     for name, other in zip(names, motions, strict=True):
         for what in ("time", "head_rotation", "head_position"):
-            if not _same(getattr(first, what), getattr(other, what)):
+            if not np.array_equal(getattr(first, what), getattr(other, what)):
                 raise ValueError(f"the motions of {names[0]} and {name} differ in {what}")
     return list(zip(whiskers, motions, strict=True))
 
@@ -194,11 +189,6 @@ def _pairs(whisker: Whiskers, motion: Motions) -> list[tuple[Whisker, Motion]]:
 def _listed(things: Sequence[T] | Mapping[str, T]) -> list[T]:
     """List of the items of a sequence or the values of a mapping."""
     return list(things.values() if isinstance(things, Mapping) else things)
-
-
-def _same(a: Array | None, b: Array | None) -> bool:
-    """Whether two arrays are equal, or both are None."""
-    return a is b if a is None or b is None else np.array_equal(a, b)
 
 
 def _truth(
@@ -312,11 +302,6 @@ def measure(
         New recording whose ``force`` and ``moment`` in the root are the sensor's readings, with
         their noise in the attribute ``noise``. Missing frames stay missing. For a sensor with other
         channels, ``reading`` and ``mixing`` replace them.
-
-    Raises
-    ------
-    ValueError
-        If a noise is negative, or the recording has no true wrench.
     """
     for name, value in (("force_noise", force_noise), ("moment_noise", moment_noise)):
         if not (np.isfinite(value) and value >= 0.0):

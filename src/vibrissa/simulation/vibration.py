@@ -43,7 +43,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vibrissa.deferred import interpolate, linalg, optimize, signal, special
-from vibrissa.numerics import AnyArray, Array, IntArray
+from vibrissa.numerics import AnyArray, Array, IntArray, contacts_in
 from vibrissa.simulation.chain import Chain, jacobian
 from vibrissa.simulation.dynamics import Dynamics, at_rest, slowest
 from vibrissa.whisker import Whisker
@@ -111,19 +111,8 @@ class Vibration:
         """Length of a window in which free vibration is fitted, s."""
         return float(_PERIODS * 2.0 * np.pi / self.rates[0])
 
-    def base_wrench(self, accelerations: Array) -> Array:
-        """Wrench at the base due to accelerations of the point masses.
-
-        Parameters
-        ----------
-        accelerations : (..., m, 3) array
-            Accelerations of the point masses, whisker frame, m/s².
-
-        Returns
-        -------
-        (..., 6) array
-            Force, N, and moment, N·m.
-        """
+    def _base_wrench(self, accelerations: Array) -> Array:
+        """Wrench (..., 6) at the base due to accelerations (..., m, 3) of the point masses, SI."""
         pull = -self.mass[:, None] * accelerations
         moment = np.cross(self.places, pull).sum(axis=-2)
         return np.concatenate([pull.sum(axis=-2), moment], axis=-1)
@@ -156,29 +145,17 @@ class Vibration:
             still = [load[0] / rate**2, 0.0]
             mode: Any = signal.StateSpace(a, [[0.0], [1.0]], c, [[1.0]])
             bent[:, k] = signal.lsim(mode, load, time - time[0], still)[1]
-        return self.base_wrench(carried + np.einsum("tk,kma->tma", bent, self.shapes))
+        return self._base_wrench(carried + np.einsum("tk,kma->tma", bent, self.shapes))
 
-    def free_moments(self, scale: float, step: float, width: int) -> Array:
-        """Basis of the moments of free vibrations.
+    def _free_moments(self, step: float, width: int) -> Array:
+        """Basis (2 width, 2 k) of the moments of free vibrations over frames ``step`` apart, s.
 
-        Parameters
-        ----------
-        scale : float
-            Factor applied to all frequencies.
-        step : float
-            Time between frames, s.
-        width : int
-            Number of frames.
-
-        Returns
-        -------
-        (2 width, 2 k) array
-            M_y of all frames, then M_z, of two independent free vibrations in each mode.
+        Rows are M_y of all frames, then M_z; columns two independent vibrations in each mode.
         """
-        gains = self.base_wrench(self.shapes)[:, 4:]
+        gains = self._base_wrench(self.shapes)[:, 4:]
         time = step * np.arange(width)
         columns = []
-        for rate, gain in zip(scale * self.rates, gains, strict=True):
+        for rate, gain in zip(self.rates, gains, strict=True):
             root = np.emath.sqrt((0.5 * self.damping * rate**2) ** 2 - rate**2 + 0.0j)
             wave = np.exp((-0.5 * self.damping * rate**2 + root) * time)
             columns += [np.concatenate([g * part for g in gain]) for part in (wave.real, wave.imag)]
@@ -208,14 +185,7 @@ class Vibration:
         """
         air = self.in_air(time, rotation, position)
         step = float(np.diff(time).mean())
-        reach = np.linalg.norm(self.places, axis=1).max()
-        modes = Modes(
-            self.rates,
-            self.damping * self.rates,
-            self.base_wrench(self.shapes),
-            self.shapes[:, -1] / reach,
-        )
-        return contact_probability(modes, step, wrench - air, air, noise) > 0.5
+        return contact_probability(self, step, wrench - air, air, noise) > 0.5
 
 
 _LEAST_KNOWN = 0.3  # largest relative standard deviation of a quantity that counts as determined
@@ -314,7 +284,7 @@ def fit_dynamics(
         vibration = _scaled(first, *np.exp(factors))
         moments = (wrench - vibration.in_air(time, rotation, position))[:, 4:]
         windows = np.stack([moments[i : i + width].T.ravel() for i in starts])
-        basis = np.linalg.qr(vibration.free_moments(1.0, step, width)).Q
+        basis = np.linalg.qr(vibration._free_moments(step, width)).Q
         away = (windows - (windows @ basis) @ basis.T) / spread[:, None]
         return np.append(away, (factors[0] + 2.0 * factors[1]) / stiffness_sigma)
 
@@ -372,10 +342,12 @@ def _scaled(vibration: Vibration, mass: float, rate: float, damping: float) -> V
 def _windows(free: AnyArray, step: float, vibration: Vibration) -> tuple[AnyArray, int]:
     """First frames of the windows without contact, and their width in frames."""
     width = max(round(vibration.window / step), len(vibration.rates) + 1)
-    edges = np.flatnonzero(np.diff(free.astype(int), prepend=0, append=0))
-    # The end of a contact is uncertain by about two frames.
-    runs = zip(edges[::2] + 2, edges[1::2] - 2, strict=True)
-    starts = [i for first, end in runs for i in range(first, end - width + 1, width)]
+    starts = [
+        i
+        for first, end in contacts_in(free)
+        # The end of a contact is uncertain by about two frames.
+        for i in range(first + 2, end - 2 - width + 1, width)
+    ]
     return np.array(starts, dtype=int), width
 
 
@@ -405,19 +377,6 @@ _LOST, _MOST = 60.0, 64
 _FINEST = 1e-4  # smallest noise, relative to the largest wrench
 
 
-class Modes(NamedTuple):
-    """Modes of free vibration: angular frequencies ω (k,), rad/s, and damping η ω (k,).
-
-    Also the wrench at the base (k, 6) per unit modal acceleration, and the displacement of the tip
-    (k, 3) relative to the whisker's reach.
-    """
-
-    rates: Array
-    loss: Array
-    wrench: Array
-    tip: Array
-
-
 class _Model(NamedTuple):
     """Linear state-space model of k modes in units of the noise, with d = 2 k + 1 state variables.
 
@@ -435,18 +394,20 @@ class _Model(NamedTuple):
     correlation: Array
 
     @classmethod
-    def of(cls, modes: Modes, step: float, noise: Array, largest: Array) -> _Model:
+    def of(cls, vibration: Vibration, step: float, noise: Array, largest: Array) -> _Model:
         """Model for frames ``step`` apart; ``largest`` (6,) is the largest wrench measured."""
         square = noise[np.ix_(_CHANNELS, _CHANNELS)]
         sigma = np.maximum(np.sqrt(np.diag(square)), _FINEST * largest[_CHANNELS])
         correlation = square / np.outer(sigma, sigma)
         np.fill_diagonal(correlation, 1.0)
-        rates, loss = modes.rates, modes.loss
-        gains = modes.wrench[:, _CHANNELS] / sigma
+        rates, loss = vibration.rates, vibration.damping * vibration.rates
+        gains = vibration._base_wrench(vibration.shapes)[:, _CHANNELS] / sigma
         size = np.linalg.norm(gains[:, _MOMENTS], axis=1)
         # The state of a mode is (q, q̇ / ω) ω² size, so that q̈ = -(1, η ω) · state / size.
         wrench = -np.stack([gains.T / size, gains.T * loss / size], axis=2)
-        tip = np.stack([modes.tip.T / (rates**2 * size), np.zeros((3, len(rates)))], axis=2)
+        reach = np.linalg.norm(vibration.places, axis=1).max()
+        tip = vibration.shapes[:, -1].T / (reach * rates**2 * size)
+        tip = np.stack([tip, np.zeros((3, len(rates)))], axis=2)
         turns = [
             linalg.expm(step * w * np.array([[0.0, 1.0], [-1.0, -eta]]))
             for w, eta in zip(rates, loss, strict=True)
@@ -471,9 +432,7 @@ class _Free(NamedTuple):
 
     def kept(self, which: IntArray) -> _Free:
         """Subset of the hypotheses."""
-        return _Free(
-            self.since[which], self.state[which], self.covariance[which], self.weight[which]
-        )
+        return _Free._make(each[which] for each in self)
 
     def predicted(self, model: _Model) -> _Free:
         """Predict the state one frame later; errors of the frequencies increase its covariance."""
@@ -549,7 +508,9 @@ def _touching(measured: Array, correlation: Array) -> Array:
     return np.asarray(found - 0.5 * np.linalg.slogdet(correlation)[1])
 
 
-def contact_probability(modes: Modes, step: float, left: Array, air: Array, noise: Array) -> Array:
+def contact_probability(
+    vibration: Vibration, step: float, left: Array, air: Array, noise: Array
+) -> Array:
     """Probability (n,) that a whisker is in contact in each frame, given all frames.
 
     ``left`` (n, 6) is the measured wrench minus that in air, ``air`` (n, 6) the wrench in air,
@@ -559,8 +520,7 @@ def contact_probability(modes: Modes, step: float, left: Array, air: Array, nois
 
     def evaluate(number: int) -> tuple[float, Array]:
         """Log posterior of a step of the frequencies' factor, and probabilities of contact."""
-        factor = np.exp(_STEP * number)
-        now = modes._replace(rates=factor * modes.rates, loss=factor * modes.loss)
+        now = replace(vibration, rates=np.exp(_STEP * number) * vibration.rates)
         log, probability = _switching(now, step, left, air, noise)
         return log - 0.5 * (_STEP * number / _FREQUENCY) ** 2, probability
 
@@ -574,10 +534,10 @@ def contact_probability(modes: Modes, step: float, left: Array, air: Array, nois
 
 
 def _switching(
-    modes: Modes, step: float, left: Array, air: Array, noise: Array
+    vibration: Vibration, step: float, left: Array, air: Array, noise: Array
 ) -> tuple[float, Array]:
     """Log likelihood of all frames, and the probability (n,) of contact in each."""
-    model = _Model.of(modes, step, noise, np.abs(left).max(axis=0))
+    model = _Model.of(vibration, step, noise, np.abs(left).max(axis=0))
     measured, driven = (part[:, _CHANNELS] / model.noise for part in (left, air))
     contact = _touching(measured, model.correlation)
     size = np.linalg.norm(measured[:, _MOMENTS], axis=1)

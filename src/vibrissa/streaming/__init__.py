@@ -1,7 +1,7 @@
 """Estimation of contacts from streams of signals, line by line."""
 
+from vibrissa.sensors import COMPONENTS
 from vibrissa.streaming.contacts import (
-    COMPONENTS,
     ContactStream,
     ContactStreams,
     advice as advice,

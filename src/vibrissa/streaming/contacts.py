@@ -22,7 +22,7 @@ from vibrissa.contacts import (
 )
 from vibrissa.numerics import Array
 from vibrissa.rod import PointForce, deflect
-from vibrissa.sensors import GRAVITY
+from vibrissa.sensors import COMPONENTS, GRAVITY
 from vibrissa.signals import SIGNALS, signals_of
 from vibrissa.status import Event
 from vibrissa.streaming.lines import FRAME, LineKind, Lines, Poses, Sample
@@ -32,9 +32,6 @@ _SLOW = 0.9  # interval of samples from which the unit of time is probably small
 # Statuses that state neither contact nor its absence.
 _SILENT = ("missing", "tare", "degenerate")
 _MESSAGE = 400  # largest length of a message about an unreadable line, which may quote the line
-
-COMPONENTS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
-"""Components of force and moment that signals are computed from."""
 
 
 class ContactStream:
@@ -196,11 +193,6 @@ class ContactStream:
         -------
         dict
             Record for JSON.
-
-        Raises
-        ------
-        ValueError
-            If the estimator or the filter rejects the sample.
         """
         self.untimed += sample.time is None
         time = self._clock() if sample.time is None else sample.time

@@ -40,6 +40,7 @@ from vibrissa.io import (
     with_point,
 )
 from vibrissa.numerics import Array, rotation_matrices
+from vibrissa.sensors import COMPONENTS
 from vibrissa.signals import SIGNALS
 
 POSITION = ("base_x", "base_y", "base_z")  # columns with the position of the base
@@ -52,7 +53,7 @@ RECORDED = "recorded_ns"  # column with the time at which ROS recorded it, ns
 FRAME = "frame_id"  # column with the name of the frame that ROS gives it
 LONGEST = 65536  # largest number of characters of a line, which exceeds the size of a datagram
 # Columns for which a header may use other names or units.
-_SIGNALS = ("time", "Fx", "Fy", "Fz", "Mx", "My", "Mz", *SIGNALS)
+_SIGNALS = ("time", *COMPONENTS, *SIGNALS)
 _UNIT = 0.01  # largest deviation of a rounded quaternion from unit length
 _LATEST = 1e11  # largest plausible time since any epoch, s
 _FARTHEST = 1e9  # largest plausible coordinate of a base, m

@@ -22,7 +22,8 @@ from typing import Any, TextIO
 import numpy as np
 
 from vibrissa.io import BagMessage, ContactBag, bag_poses, bag_wrenches
-from vibrissa.streaming.contacts import COMPONENTS, ContactStreams
+from vibrissa.sensors import COMPONENTS
+from vibrissa.streaming.contacts import ContactStreams
 from vibrissa.streaming.lines import (
     FRAME,
     LONGEST,
@@ -178,7 +179,6 @@ class NewestLines:
         self._opened, self._kind = opened, kind
 
     def __iter__(self) -> Iterator[str]:
-        """Yield lines as they arrive."""
         while True:
             *before, newest = self._waiting(self._opened.recv(_LARGEST))
             yield from self._latest_poses([line for data in before for line in self._needed(data)])

@@ -24,6 +24,8 @@ from vibrissa.whisker.pose import Pose, angles_of, base_rotation, mirrored
 from vibrissa.whisker.section import Properties
 
 BOTH: tuple[Side, Side] = ("left", "right")  # sides of an animal
+NODES = 33  # points of the stored centrelines
+_OF_HEAD = "In the head's frame: origin at the snout, x to the animal's right, y forward, z up."
 
 
 class WhiskerArray(Mapping[str, Whisker]):
@@ -64,7 +66,6 @@ class WhiskerArray(Mapping[str, Whisker]):
         self._whiskers = {whisker.name: whisker for _, whisker in found}
 
     def __getitem__(self, name: str) -> Whisker:
-        """Return a whisker by any of its names."""
         return self._whiskers[self._key(name)]
 
     def __iter__(self) -> Iterator[str]:
@@ -80,8 +81,7 @@ class WhiskerArray(Mapping[str, Whisker]):
             identity = Identity.of(name)
         except ValueError as fault:
             raise KeyError(str(fault)) from None
-        sides: Sequence[Side] = (identity.side,) if identity.side else ("left", "right")
-        keys = [k for k in (identity.on(side).name for side in sides) if k in self._whiskers]
+        keys = [one.name for one in _on_sides([identity], BOTH) if one.name in self._whiskers]
         if len(keys) != 1:
             why = f"it may be {' or '.join(keys)}" if keys else "there is no such whisker"
             raise KeyError(f"{name!r}: {why}; this array has {', '.join(self)}")
@@ -126,11 +126,6 @@ class WhiskerArray(Mapping[str, Whisker]):
         -------
         WhiskerArray
             Array of these only.
-
-        Raises
-        ------
-        ValueError
-            If no whisker is left, or a name is not in the array.
         """
         keep = None if rows is None else {row.upper() for row in rows}
         which = None if columns is None else set(columns)
@@ -143,7 +138,7 @@ class WhiskerArray(Mapping[str, Whisker]):
         ]
         if names is not None:
             wanted = [Identity.of(name) for name in names]
-            meant = {one.on(s).name for one in wanted for s in ((one.side,) if one.side else BOTH)}
+            meant = {one.name for one in _on_sides(wanted, BOTH)}
             kept = [name for name in kept if name in meant]
             for one in wanted:
                 if not any(name.endswith(one.name) for name in kept):
@@ -175,7 +170,40 @@ class WhiskerArray(Mapping[str, Whisker]):
             and centreline, head's frame. In the groups ``whiskers/0``, … each whisker's own
             dataset.
         """
-        return array_tree(self.values(), self._identities.values())
+        them, which = list(self.values()), list(self._identities.values())
+        rotation = np.stack([w.pose.rotation for w in them])
+        angles = angles_of(rotation)
+        framed: dict[str, tuple[tuple[str, ...], Any]] = {
+            "base_position": (("whisker", "space"), np.stack([w.pose.origin for w in them])),
+            "base_rotation": (("whisker", "space", "whisker_axis"), rotation),
+            "base_azimuth": (("whisker",), angles[:, 0]),
+            "base_elevation": (("whisker",), angles[:, 1]),
+            "base_roll": (("whisker",), angles[:, 2]),
+            "centerline": (("whisker", "node", "space"), self.centerlines(NODES)),
+        }
+        variables = {
+            name: xr.Variable(
+                dims,
+                values,
+                attributes(name) | {"description": _OF_HEAD, "reference_frame": "head"},
+            )
+            for name, (dims, values) in framed.items()
+        }
+        for name in ("length", "base_radius", "tip_radius"):
+            values = np.array([getattr(w, name) for w in them])
+            variables[name] = xr.Variable("whisker", values, attributes(name))
+        labels = {
+            "whisker": [w.name for w in them],
+            "side": ("whisker", [one.side for one in which]),
+            "row": ("whisker", [one.row for one in which]),
+            "column": ("whisker", [one.column for one in which]),
+            "space": list("xyz"),
+            "whisker_axis": list("xyz"),
+        }
+        groups: dict[str, xr.Dataset] = {"/": xr.Dataset(variables, labels, {"kind": self.kind})}
+        for i, whisker in enumerate(them):
+            groups[f"/whiskers/{i}"] = whisker.to_dataset().drop_dims("node")
+        return xr.DataTree.from_dict(groups)
 
     @classmethod
     def from_tree(cls, tree: xr.DataTree) -> WhiskerArray:
@@ -189,11 +217,6 @@ class WhiskerArray(Mapping[str, Whisker]):
         Returns
         -------
         WhiskerArray
-
-        Raises
-        ------
-        ValueError
-            If the tree does not hold a whisker array.
         """
         kind = tree.attrs.get("kind")
         if kind != cls.kind or "whiskers" not in tree.children:
@@ -235,6 +258,11 @@ def sides(side: str) -> tuple[Side, ...]:
     return meant
 
 
+def _on_sides(identities: Iterable[Identity], on: Sequence[Side]) -> list[Identity]:
+    """Identities on the given sides, or on their own side where they state one."""
+    return [one.on(s) for one in identities for s in ((one.side,) if one.side else on)]
+
+
 def _with_identity(whisker: Whisker) -> tuple[Identity, Whisker]:
     """Identify a whisker, with its side, and give it the standard name."""
     identity = Identity.of(whisker.name)
@@ -249,49 +277,6 @@ def _with_identity(whisker: Whisker) -> tuple[Identity, Whisker]:
         )
     same = whisker.name == identity.name
     return identity, whisker if same else replace(whisker, name=identity.name)
-
-
-NODES = 33  # points of the stored centrelines
-_OF_HEAD = "In the head's frame: origin at the snout, x to the animal's right, y forward, z up."
-
-
-def array_tree(whiskers: Iterable[Whisker], identities: Iterable[Identity]) -> xr.DataTree:
-    """Tree of the datasets of an array of whiskers."""
-    them, which = list(whiskers), list(identities)
-    rotation = np.stack([w.pose.rotation for w in them])
-    angles = angles_of(rotation)
-    line = np.stack([w.pose.to_source(w.centerline(NODES)) for w in them])
-    framed: dict[str, tuple[tuple[str, ...], Any]] = {
-        "base_position": (("whisker", "space"), np.stack([w.pose.origin for w in them])),
-        "base_rotation": (("whisker", "space", "whisker_axis"), rotation),
-        "base_azimuth": (("whisker",), angles[:, 0]),
-        "base_elevation": (("whisker",), angles[:, 1]),
-        "base_roll": (("whisker",), angles[:, 2]),
-        "centerline": (("whisker", "node", "space"), line),
-    }
-    variables = {
-        name: xr.Variable(
-            dims, values, attributes(name) | {"description": _OF_HEAD, "reference_frame": "head"}
-        )
-        for name, (dims, values) in framed.items()
-    }
-    for name in ("length", "base_radius", "tip_radius"):
-        values = np.array([getattr(w, name) for w in them])
-        variables[name] = xr.Variable("whisker", values, attributes(name))
-    labels = {
-        "whisker": [w.name for w in them],
-        "side": ("whisker", [one.side for one in which]),
-        "row": ("whisker", [one.row for one in which]),
-        "column": ("whisker", [one.column for one in which]),
-        "space": list("xyz"),
-        "whisker_axis": list("xyz"),
-    }
-    groups: dict[str, xr.Dataset] = {
-        "/": xr.Dataset(variables, labels, {"kind": WhiskerArray.kind})
-    }
-    for i, whisker in enumerate(them):
-        groups[f"/whiskers/{i}"] = whisker.to_dataset().drop_dims("node")
-    return xr.DataTree.from_dict(groups)
 
 
 def whisker_array(
@@ -353,9 +338,7 @@ def whisker_array(
             raise ValueError(f"{', '.join(away)} are not on the requested {side} side")
         if set(rows) != set("ABCDE") or set(columns) != set(range(7)):
             raise ValueError("names and rows or columns were both given; give one of them")
-        wanted = [
-            one.on(s) for one in identities for s in ((one.side,) if one.side else sides(side))
-        ]
+        wanted = _on_sides(identities, sides(side))
     else:
         wanted = [
             Identity(row.upper(), int(column), s)

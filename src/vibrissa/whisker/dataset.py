@@ -15,11 +15,13 @@ from typing import Any, Protocol
 import numpy as np
 
 from vibrissa.deferred import xr
+from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
 from vibrissa.whisker.pose import Pose
 from vibrissa.whisker.profile import Profile
 
 NODES = 101  # points of the stored centreline
+_PROFILE = ("knots", "coefficients", "error")  # variables of a profile
 
 
 def whisker_dataset(whisker: Any) -> xr.Dataset:
@@ -71,6 +73,12 @@ def _profile_parts(name: str, profile: Profile) -> dict[str, tuple[tuple[str, ..
     }
 
 
+def _profile(value: Mapping[str, Array], name: str) -> Profile:
+    """Profile from its variables."""
+    knots, coefficients, error = (value[f"{name}_{part}"] for part in _PROFILE)
+    return Profile(knots, coefficients, float(error))
+
+
 class Stored(Protocol):
     """Contents of a whisker's file: a dataset, or an object with plain arrays."""
 
@@ -111,10 +119,9 @@ _TOLERANCE = 1e-6
 
 def whisker_fields(dataset: Stored) -> dict[str, Any]:
     """Read the fields of a `Whisker` from a dataset that `whisker_dataset` wrote."""
-    needed = {"length", "youngs_modulus", "poisson_ratio", "breaks"}
+    needed = {"length", "youngs_modulus", "poisson_ratio", "breaks", "pose_rotation", "pose_origin"}
     needed |= {"base_bending_stiffness", "base_twist_stiffness"}
-    needed |= {"pose_rotation", "pose_origin", "curvature_knots", "curvature_coefficients"}
-    needed |= {"section_knots", "section_coefficients", "curvature_error", "section_error"}
+    needed |= {f"{name}_{part}" for name in ("curvature", "section") for part in _PROFILE}
     if not dataset.variables.keys().isdisjoint(_REDUNDANT):  # files of many whiskers omit them
         needed |= set(_REDUNDANT)
     missing = sorted(needed - set(dataset.variables))
@@ -124,14 +131,8 @@ def whisker_fields(dataset: Stored) -> dict[str, Any]:
     stiffness = float(value["base_bending_stiffness"]), float(value["base_twist_stiffness"])
     return {
         "length": float(value["length"]),
-        "intrinsic_curvature": Profile(
-            value["curvature_knots"],
-            value["curvature_coefficients"],
-            float(value["curvature_error"]),
-        ),
-        "section_radius": Profile(
-            value["section_knots"], value["section_coefficients"], float(value["section_error"])
-        ),
+        "intrinsic_curvature": _profile(value, "curvature"),
+        "section_radius": _profile(value, "section"),
         "youngs_modulus": float(value["youngs_modulus"]),
         "poisson_ratio": float(value["poisson_ratio"]),
         "density": (

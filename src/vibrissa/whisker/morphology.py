@@ -1,7 +1,6 @@
 """Morphology of an average rat's whiskers from published equations, by row and column.
 
-Rows are counted from 1 (A) to 5 (E) and columns from 0 (Greek) to 6; each function converts these
-to the numbers of its source. All results are in SI units.
+Rows are counted from 1 (A) to 5 (E) and columns from 0 (Greek) to 6. All results are in SI units.
 
 **The head's frame** is that of Towal et al. (2011): origin at the tip of the snout, x to the
 animal's right, y forward along the midline, z up; the rows of whiskers lie parallel to the x–y
@@ -56,7 +55,6 @@ MEASURED = {"A": range(5), "B": range(6), "C": range(7), "D": range(7), "E": ran
 # Largest ratio of base to tip radius: the largest of the means in the literature (28 to 36).
 MOST_TAPER = 36.0
 _TOWAL_GREEK = 1  # column number of the Greek whiskers in Towal et al.
-_BELLI_GREEK = 0  # column number of the Greek whiskers in Belli et al.
 # Ellipsoid of the right cheek: m, and angles about z, y, x, rad, the last rotation applied first.
 _CENTER = 1e-3 * np.array([1.9128, -7.6549, -5.4439])
 _RADII = 1e-3 * np.array([9.5304, 5.5393, 6.9745])
@@ -138,8 +136,8 @@ def base_radius(row: ArrayLike, column: ArrayLike, length: ArrayLike) -> Array:
 
     Its diameter is 0.041 + 0.002 S + 0.011 row − 0.0039 column, mm, with the length S in mm.
     """
-    row, column = _belli_numbers(row, column)
-    s = 1e3 * np.asarray(length, dtype=np.float64)
+    row, column, length = (np.asarray(one, dtype=np.float64) for one in (row, column, length))
+    s = 1e3 * length
     return np.asarray(0.5e-3 * (0.041 + 0.002 * s + 0.011 * row - 0.0039 * column))
 
 
@@ -148,7 +146,7 @@ def radius_slope(row: ArrayLike, column: ArrayLike) -> Array:
 
     0.0012 + 0.00017 row − 0.000066 column + 0.00011 column².
     """
-    row, column = _belli_numbers(row, column)
+    row, column = np.asarray(row, np.float64), np.asarray(column, np.float64)
     return np.asarray(0.0012 + 0.00017 * row - 0.000066 * column + 0.00011 * column**2)
 
 
@@ -166,11 +164,6 @@ def tip_radius(row: ArrayLike, column: ArrayLike, length: ArrayLike) -> Array:
 def _towal_numbers(row: ArrayLike, column: ArrayLike) -> tuple[Array, Array]:
     """Row and column as Towal et al. count them."""
     return np.asarray(row, np.float64), np.asarray(column, np.float64) + _TOWAL_GREEK
-
-
-def _belli_numbers(row: ArrayLike, column: ArrayLike) -> tuple[Array, Array]:
-    """Row and column as Belli et al. count them."""
-    return np.asarray(row, np.float64), np.asarray(column, np.float64) + _BELLI_GREEK
 
 
 ANY = "any"  # name of a whisker of unknown row and column
@@ -233,11 +226,6 @@ class Identity:
         0 for the Greek whiskers, then 1 to 6 (in some animals 9) from the back to the front.
     side : {"left", "right"} or None
         Side of the animal; None if not stated.
-
-    Raises
-    ------
-    ValueError
-        If there is no such row, column or side.
     """
 
     row: str
@@ -269,11 +257,6 @@ class Identity:
         Returns
         -------
         Identity
-
-        Raises
-        ------
-        ValueError
-            If ``name`` is not the name of a whisker.
 
         Examples
         --------

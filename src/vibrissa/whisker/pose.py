@@ -26,7 +26,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.numerics import Array, numbers
+from vibrissa.numerics import Array, vectors as as_vectors
 
 ORTHOGONALITY = 1e-6  # largest entry of RᵀR − 1 for a rotation, in float32 too
 
@@ -41,11 +41,6 @@ class Pose:
         Columns are the whisker's x, y and z axis in the source frame.
     origin : array (3,)
         Base point of the whisker in the source frame, m.
-
-    Raises
-    ------
-    ValueError
-        If `rotation` is not a proper rotation or `origin` is not a finite point.
 
     Examples
     --------
@@ -104,7 +99,7 @@ class Pose:
         array (..., 3)
             Points, m, whisker frame.
         """
-        return self.vectors_to_whisker(_triples(points) - self.origin)
+        return self.vectors_to_whisker(as_vectors("points", points) - self.origin)
 
     def vectors_to_source(self, vectors: ArrayLike) -> Array:
         """Rotate vectors from the whisker frame to the source frame.
@@ -119,7 +114,7 @@ class Pose:
         array (..., 3)
             The same vectors, source frame.
         """
-        return _triples(vectors) @ self.rotation.T
+        return as_vectors("vectors", vectors) @ self.rotation.T
 
     def vectors_to_whisker(self, vectors: ArrayLike) -> Array:
         """Rotate vectors from the source frame to the whisker frame.
@@ -134,21 +129,13 @@ class Pose:
         array (..., 3)
             The same vectors, whisker frame.
         """
-        return _triples(vectors) @ self.rotation
+        return as_vectors("vectors", vectors) @ self.rotation
 
     def __repr__(self) -> str:
         cosine = np.clip((np.trace(self.rotation) - 1.0) / 2.0, -1.0, 1.0)
         x, y, z = self.origin * 1e3
         angle = np.degrees(np.arccos(cosine))
         return f"Pose(origin=({x:z.3f}, {y:z.3f}, {z:z.3f}) mm, turned by {angle:.1f}°)"
-
-
-def _triples(values: ArrayLike) -> Array:
-    """Return float64 (..., 3), or raise a ValueError."""
-    array = numbers("the points", values)
-    if array.ndim == 0 or array.shape[-1] != 3:
-        raise ValueError(f"got an array of shape {array.shape}; the last axis must be x, y, z")
-    return array
 
 
 def roll(angle: float) -> Array:

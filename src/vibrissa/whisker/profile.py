@@ -57,7 +57,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.deferred import interpolate
-from vibrissa.numerics import Array, cross_matrix
+from vibrissa.numerics import Array, exponential
 
 Function = Callable[[Array], Array]
 Side = Literal["right", "left"]
@@ -477,34 +477,6 @@ TURN = 0.04  # largest rotation per step, rad, at which the method's error is cl
 _GAUSS = 0.5 + np.sqrt(15.0) / 10.0 * np.array([-1.0, 0.0, 1.0])
 
 
-def exponential(w: Array, v: Array) -> tuple[Array, Array]:
-    """Rotation (..., 3, 3) and translation (..., 3) of the motions exp(w, v).
-
-    Below 0.1 rad the coefficients are computed from their series, which are exact to rounding,
-    unlike (θ − sin θ)/θ³.
-    """
-    x = np.sum(w * w, axis=-1)[..., np.newaxis, np.newaxis]
-    small = x < 1e-2
-    theta = np.sqrt(np.where(small, 1.0, x))
-    a = np.where(small, _series(x, 1.0, (6, 20, 42, 72)), np.sin(theta) / theta)
-    b = np.where(small, _series(x, 1 / 2, (12, 30, 56, 90)), (1.0 - np.cos(theta)) / theta**2)
-    c = np.where(small, _series(x, 1 / 6, (20, 42, 72, 110)), (theta - np.sin(theta)) / theta**3)
-    k = cross_matrix(w)
-    k2 = k @ k
-    rotation = np.eye(3) + a * k + b * k2
-    translation = ((np.eye(3) + b * k + c * k2) @ v[..., np.newaxis])[..., 0]
-    return rotation, translation
-
-
-def _series(x: Array, first: float, ratios: tuple[int, ...]) -> Array:
-    """Power series with given first term and ratios of denominators."""
-    total, term = np.full_like(x, first), np.full_like(x, first)
-    for ratio in ratios:
-        term = -term * x / ratio
-        total = total + term
-    return total
-
-
 Screw = tuple[Array, Array]
 
 
@@ -533,7 +505,9 @@ def advance(rate: Rate, start: Array, step: Array, direction: Array) -> tuple[Ar
     c1 = _bracket(a1, a2)
     c2 = _bracket(a1, _combine((-1 / 30, a3), (-1 / 60, c1)))
     outer = _bracket(_combine((-20.0, a1), (-1.0, a3), (1.0, c1)), _combine((1.0, a2), (1.0, c2)))
-    return exponential(*_combine((1.0, a1), (1 / 12, a3), (1 / 240, outer)))
+    w, v = _combine((1.0, a1), (1 / 12, a3), (1 / 240, outer))
+    rotation, mean = exponential(w)
+    return rotation, (mean @ v[..., np.newaxis])[..., 0]
 
 
 @dataclass(frozen=True, eq=False)

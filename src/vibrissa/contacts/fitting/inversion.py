@@ -33,6 +33,7 @@ from vibrissa.rod import (
     TOLERANCE,
     Balance,
     Fold,
+    Group,
     PlaneVector,
     Rod,
     SearchTree,
@@ -40,6 +41,7 @@ from vibrissa.rod import (
     balance_rows,
     balanced,
     chart_to_contact,
+    group_room,
     integrate,
     lane_value,
     lanes_tangents,
@@ -362,10 +364,8 @@ def invert_rows(
     b = np.zeros(BUFFER_SIZE)
     room = seed_room()
     found, slopes, quality = room.found, room.inverses, room.quality
-    charts, inverses = np.empty((LANES, 3)), np.empty((LANES, 3, 3))
-    rows, group_targets = np.empty(LANES, np.int64), np.empty((LANES, 11))
-    group, group_values = np.empty((LANES, 3)), np.empty((LANES, 6))
-    misfits, signs = np.empty(LANES), np.empty(LANES)
+    rows, group = np.empty(LANES, np.int64), group_room(np.empty((LANES, 11)))
+    charts, inverses, group_targets = group.charts, group.inverses, group.targets
     waiting = 0
     for row in range(first, last + 1):
         n = 0
@@ -379,34 +379,22 @@ def invert_rows(
                 copy(room.aim, group_targets[waiting, :3])
                 copy(targets[row, 3:], group_targets[waiting, 3:6])
                 copy(tree.balance.weights, group_targets[waiting, 6:])
-                chart_to_contact(fold, found[seed], group[waiting])
+                chart_to_contact(fold, found[seed], group.xi[waiting])
                 start_from(
                     found[seed], slopes[seed], quality[seed], charts[waiting], inverses[waiting]
                 )
                 waiting += 1
             if waiting < LANES and row < last:
                 continue
-            newton_group(
-                _match,
-                rod,
-                fold,
-                b,
-                waiting,
-                group_targets,
-                charts,
-                inverses,
-                group,
-                group_values,
-                misfits,
-                signs,
-            )
+            newton_group(_match, rod, fold, b, waiting, group)
             for i in range(waiting):
-                if not (misfits[i] <= _ERROR and stable(fold, proximal, group[i], signs[i])):
+                xi, misfit = group.xi[i], group.misfits[i]
+                if not (misfit <= _ERROR and stable(fold, proximal, xi, group.signs[i])):
                     continue
-                if not _certain(inverses[i], group_values[i], group_targets[i]):
-                    loose[rows[i]] |= not _determined(rod, b, group[i], group_targets[i])
-                if misfits[i] <= TOLERANCE:
-                    _add(rows[i], group[i], group_values[i], number, contacts, values)
+                if not _certain(inverses[i], group.values[i], group_targets[i]):
+                    loose[rows[i]] |= not _determined(rod, b, xi, group_targets[i])
+                if misfit <= TOLERANCE:
+                    _add(rows[i], xi, group.values[i], number, contacts, values)
             waiting = 0
 
 
@@ -427,12 +415,7 @@ def polish_rows(
     charts, inverses = np.zeros((LANES, 3)), np.full((LANES, 3, 3), np.nan)
     for row in range(first, last, LANES):
         end = min(row + LANES, last)
-        newton_group(
-            _match,
-            rod,
-            fold,
-            b,
-            end - row,
+        group = Group(
             targets[row:end],
             charts,
             inverses,
@@ -441,6 +424,7 @@ def polish_rows(
             misfits[row:end],
             signs[row:end],
         )
+        newton_group(_match, rod, fold, b, end - row, group)
 
 
 @lru_cache(maxsize=64)

@@ -27,13 +27,14 @@ UNIT = np.tile([1.0, np.pi, 1.0], 2)
 
 def searched(contact_map, names, seed):
     """Charts (k, 6) of pairs, the farthest from rest in different parts of the chart."""
-    question = evidence.ask(contact_map, ("all",), APART, np.deg2rad(2.0), "reachable", 1024, seed)
-    samples = question.samples
+    cone = np.deg2rad(2.0)
+    problem = evidence.prepare(contact_map, ("all",), APART, cone, "reachable", 1024, seed)
+    samples = problem.samples
     found = twins.twins(contact_map, names, samples.chart, samples.contacts, "reachable")
     rng = np.random.default_rng(seed)
     search = twins.Search(contact_map, names, APART, "reachable")
     more = twins.better_twins(search, found, ("all",), rng)
-    pairs = twins.joined([found, more])
+    pairs = twins.concatenate([found, more])
     pairs = pairs.rows(pairs.apart >= APART)
     order = np.argsort(-pairs.angle)
     part = np.floor(pairs.chart[order] * [6.0, 6.0 / np.pi, 6.0])

@@ -1,4 +1,4 @@
-"""What the first pages tell to type can be typed, and pictures stay small."""
+"""What pages tell to type can be typed, scripts use names that exist, and pictures stay small."""
 
 import ast
 import importlib
@@ -21,6 +21,11 @@ DOCS = ROOT / "docs"
 # Pages in different folders have the same name.
 FOUND = (ROOT / "README.md", *sorted(DOCS.rglob("*.md")))
 PAGES = {page.relative_to(ROOT).as_posix().removeprefix("docs/"): page for page in FOUND}
+# Scripts that no other test runs
+FOUND_SCRIPTS = (
+    p for folder in ("studies", "benchmarks", "docs") for p in (ROOT / folder).rglob("*.py")
+)
+SCRIPTS = {path.relative_to(ROOT).as_posix(): path for path in sorted(FOUND_SCRIPTS)}
 LARGEST = 300_000
 
 
@@ -83,17 +88,29 @@ def inside(node, modules):
     return getattr(within, node.attr)
 
 
+def check_names(code):
+    """Raise unless all that the code names of vibrissa exists."""
+    modules = {"vb": vb}
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.ImportFrom) and node.module.partition(".")[0] == "vibrissa":
+            module = importlib.import_module(node.module)
+            for one in node.names:
+                # A module that its package does not show
+                if not hasattr(module, one.name):
+                    importlib.import_module(f"{node.module}.{one.name}")
+                modules[one.asname or one.name] = getattr(module, one.name)
+        inside(node, modules)
+
+
 @pytest.mark.parametrize("name", PAGES)
 def test_names_that_pages_use_exist(name):
-    modules = {"vb": vb}
-    for node in (
-        node for code in blocks(PAGES[name], "python") for node in ast.walk(ast.parse(code))
-    ):
-        if isinstance(node, ast.ImportFrom):
-            module = importlib.import_module(node.module)
-            assert [one.name for one in node.names if not hasattr(module, one.name)] == []
-            modules |= {one.asname or one.name: getattr(module, one.name) for one in node.names}
-        inside(node, modules)
+    for code in blocks(PAGES[name], "python"):
+        check_names(code)
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_names_that_scripts_use_exist(name):
+    check_names(SCRIPTS[name].read_text(encoding="utf-8"))
 
 
 @pytest.mark.parametrize("name", ["README.md", "tutorial.md"])

@@ -52,7 +52,12 @@ from vibrissa.contacts.fitting.fit_within import fit_within
 from vibrissa.contacts.fitting.least_squares import channel_equations, same_contact, settled, whiten
 from vibrissa.contacts.sensing.noise import INDISTINCT
 from vibrissa.contacts.sensing.weighing import Weighing, sharpness, weigh_any
-from vibrissa.contacts.uncertainty.basins import deviations, starts_of_basins
+from vibrissa.contacts.uncertainty.basins import (
+    BasinsRoom,
+    basins_room,
+    deviations,
+    starts_of_basins,
+)
 from vibrissa.contacts.uncertainty.flat_valleys import follow_valley
 from vibrissa.contacts.uncertainty.nodes import (
     PARTS,
@@ -62,7 +67,7 @@ from vibrissa.contacts.uncertainty.nodes import (
     outside_share,
     probable_nodes,
 )
-from vibrissa.contacts.uncertainty.posterior import CERTAIN, judge, rank
+from vibrissa.contacts.uncertainty.posterior import CERTAIN, judge, judge_room, rank
 from vibrissa.numerics import (
     AnyArray,
     Array,
@@ -85,6 +90,42 @@ _APART, _FAR_APART = 2.0, 4.0
 _AT_ONCE = 128
 # Logarithm of the integral of a three-dimensional normal density with a peak of one.
 _LOG_NORMAL = 1.5 * math.log(2.0 * math.pi)
+
+
+class _Work(NamedTuple):
+    """Working memory of `complete_rows`, of m candidates and k channels.
+
+    (F, p) (m, 6), derivatives of one with respect to x (6, 4), χ² (m,), residuals (k,) and their
+    slopes (k, 4); deviations (3,), starting contacts (n, 4), one of them, and the nearest nodes.
+    """
+
+    values: Array
+    tangents: Array
+    misfits: Array
+    residual: Array
+    jacobian: Array
+    sigma: Array
+    starts: Array
+    start: Array
+    nodes: IntArray
+    basins: BasinsRoom
+
+
+@inlined
+def _work(k: int) -> _Work:
+    """Allocate the working memory of `complete_rows`."""
+    return _Work(
+        np.empty((MOST_CANDIDATES, 6)),
+        np.zeros((6, 4)),
+        np.empty(MOST_CANDIDATES),
+        np.empty(k),
+        np.empty((k, 4)),
+        np.empty(3),
+        np.empty((MOST_STARTS, 4)),
+        np.empty(4),
+        np.empty(PARTS, np.int64),
+        basins_room(),
+    )
 
 
 @kernel
@@ -180,19 +221,20 @@ def complete(
     residuals: Array,
     jacobians: Array,
     loose: Array,
+    room: _Work,
 ) -> tuple[int, bool]:
     """Add contacts of Ω that noise has hidden, given residuals and slopes of the known candidates.
 
     Fill ``loose`` with χ² and coordinates (n, 4) of further contacts that explain the measurement
     as well. Return the number of candidates, and whether other contacts may be probable.
     """
-    sigma, starts = np.empty(3), np.empty((MOST_STARTS, 4))
-    start, nodes, least = np.zeros(4), np.full(PARTS, -1), np.inf
-    loose[:] = np.inf
+    sigma, starts, start, nodes = room.sigma, room.starts, room.start, room.nodes
+    least, loose[:] = np.inf, np.inf
     for c in range(number):
         least = min(least, misfits[c])
     lost = not least <= limit
     if lost:
+        nodes[:] = -1
         nearest_of(of, how.mixing, target, nodes)
         node = 0
         while node < PARTS - 1 and nodes[node] < 0:
@@ -203,7 +245,16 @@ def complete(
     worth = limit if lost else min(limit, least + INDISTINCT)
     apart = _FAR_APART if lost else _APART
     n, others = starts_of_basins(
-        of, apart, sigma, measured, x, residuals, jacobians, 0 if lost else number, starts
+        of,
+        apart,
+        sigma,
+        measured,
+        x,
+        residuals,
+        jacobians,
+        0 if lost else number,
+        starts,
+        room.basins,
     )
     for i in range(n):
         number, other = _try(
@@ -222,7 +273,7 @@ def complete(
     for i in range(PARTS if lost else 0):
         if nodes[i] >= 0:
             contact = of.contacts[nodes[i]]
-            start[0], start[2], start[3] = contact[0], contact[1], contact[2]
+            start[0], start[1], start[2], start[3] = contact[0], 0.0, contact[1], contact[2]
             number, other = _try(
                 of, how, passes, worth, target, measured, start, number, x, values, misfits, loose
             )
@@ -262,17 +313,6 @@ def _kept(limit: float, number: int, x: Array, values: Array, misfits: Array) ->
     return kept
 
 
-class _Weighed(NamedTuple):
-    """Working memory of `complete_rows`.
-
-    (F, p) (m, 6), their derivatives with respect to x (m, 6, 4), χ² (m,).
-    """
-
-    values: Array
-    tangents: Array
-    misfits: Array
-
-
 @kernel
 def _weighed(
     of: Searched,
@@ -283,7 +323,7 @@ def _weighed(
     values: Array,
     first: int,
     n: int,
-    room: _Weighed,
+    room: _Work,
     described: tuple[Array, Array, Array, Array],
 ) -> None:
     """Fill χ² and the description of n candidates: weights, ∂(F, p)/∂ξ, residuals and slopes.
@@ -291,8 +331,7 @@ def _weighed(
     For the candidates before ``first``, ∂(F, p)/∂ξ is already there.
     """
     weights, third, residuals, jacobians = described
-    k = how.codes.shape[0]
-    residual, jacobian = np.empty(k), np.empty((k, 4))
+    k, residual, jacobian = how.codes.shape[0], room.residual, room.jacobian
     if first < n:
         evaluate(of.charted.rod, x, room.values, third, first, n)
     for c in range(n):
@@ -320,7 +359,7 @@ def complete_rows(
     """Complete and describe the candidates of noisy measurements."""
     of, how, problem, out = task.of, task.how, task.problem, in_memory(number, flat, valid)
     known = np.empty((MOST_CANDIDATES, 4))
-    room = _Weighed(np.empty((MOST_CANDIDATES, 6)), np.zeros((6, 4)), np.empty(MOST_CANDIDATES))
+    room = _work(how.codes.shape[0])
     lanes, forces, tangents = np.zeros((LANES, 4)), np.empty((LANES, 6)), np.empty((LANES, 6, 3))
     for row in range(first, last):
         target, seen, i, before = targets[row], measured[row], row - first, number[row]
@@ -358,6 +397,7 @@ def complete_rows(
             residuals,
             jacobians,
             about.loose[i],
+            room,
         )
         changed = n > before
         for c in range(n):
@@ -501,7 +541,7 @@ def judge_rows(
 ) -> None:
     """Judge the candidates left by `complete_rows`, and rank them by probability."""
     of, how, limit, out = task.of, task.how, task.problem.limit, in_memory(number, flat, valid)
-    room = _judging(MOST_CANDIDATES)
+    room, judging = _judging(MOST_CANDIDATES), judge_room(how.codes.shape[0])
     weight, fine = room.weight, room.fine
     for row in range(first, last):
         target, i, n, chi = targets[row], row - first, number[row], out.chi_squared[row]
@@ -525,6 +565,7 @@ def judge_rows(
             fine,
             room.described,
             n,
+            judging,
         )
         sound = True
         for c in range(n):

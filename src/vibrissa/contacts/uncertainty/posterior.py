@@ -389,23 +389,47 @@ def _second_order(
     return bent, missed, short
 
 
+class JudgeRoom(NamedTuple):
+    """Working memory of `judge`.
+
+    A buffer of the rod's, slopes of residuals (k, 3) and of the point (3, 3), zeros (3,), the
+    expansion and the nodes.
+    """
+
+    buffer: Array
+    j: Array
+    slopes: Array
+    nothing: Array
+    model: Expansion
+    rays: Rays
+
+
+@inlined
+def judge_room(k: int) -> JudgeRoom:
+    """Allocate the working memory for k channels, once for many measurements."""
+    return JudgeRoom(
+        np.zeros(BUFFER_SIZE),
+        np.empty((k, 3)),
+        np.empty((3, 3)),
+        np.zeros(3),
+        empty_expansion(k),
+        empty_rays(),
+    )
+
+
 @kernel
 def _judge_one(
     rod: Charted,
-    b: Array,
     proximal: float,
     codes: IntArray,
     target: Array,
     weights: Array,
     x: Array,
-    slopes: Array,
-    j: Array,
-    model: Expansion,
-    rays: Rays,
-    nothing: Array,
+    room: JudgeRoom,
     covariance: Array,
 ) -> tuple[float, bool, bool]:
     """Fill the covariance of a candidate; log weight, validity, whether channels are described."""
+    b, j, slopes, nothing, model, rays = room
     bent, missed, short = _second_order(rod, b, codes, target, weights, x, slopes, j, model)
     if bent != bent:
         return -np.inf, False, False
@@ -452,6 +476,7 @@ def judge(
     valid: AnyArray,
     described: AnyArray,
     n: int,
+    room: JudgeRoom,
 ) -> None:
     """Judge the candidates of a measurement; see the module.
 
@@ -459,33 +484,24 @@ def judge(
     (n, k, 4) are those of each candidate. Fill covariances of contact points, log weights, whether
     covariances are valid, and whether the second order describes the channels at least roughly.
     """
-    k = codes.shape[0]
-    b, j, model = np.zeros(BUFFER_SIZE), np.empty((k, 3)), empty_expansion(k)
-    rays, slopes, nothing = empty_rays(), np.empty((3, 3)), np.zeros(3)
     for row in range(n):
         for a in range(3):
             for c in range(3):
                 covariances[row, a, c] = np.nan
         weight[row], valid[row], described[row] = -np.inf, False, False
-        without_friction(jacobians[row], j)
-        if principal_axes(contacts[row], j, model.axes):
-            for a in range(k):
-                model.r0[a] = residuals[row, a]
+        without_friction(jacobians[row], room.j)
+        if principal_axes(contacts[row], room.j, room.model.axes):
+            copy(residuals[row], room.model.r0)
             for a in range(3):
-                copy(tangents[row, 3 + a], slopes[a])
+                copy(tangents[row, 3 + a], room.slopes[a])
             weight[row], valid[row], described[row] = _judge_one(
                 rod,
-                b,
                 proximal,
                 codes,
                 target,
                 weights[row],
                 contacts[row],
-                slopes,
-                j,
-                model,
-                rays,
-                nothing,
+                room,
                 covariances[row],
             )
 

@@ -41,7 +41,6 @@ from vibrissa.contacts.uncertainty.expansion import (
     without_friction,
 )
 from vibrissa.numerics import (
-    AnyArray,
     Array,
     IntArray,
     cholesky,
@@ -418,18 +417,35 @@ def judge_room(k: int) -> JudgeRoom:
 
 
 @kernel
-def _judge_one(
+def judge(
     rod: Charted,
     proximal: float,
     codes: IntArray,
     target: Array,
     weights: Array,
     x: Array,
-    room: JudgeRoom,
+    tangents: Array,
+    residuals: Array,
+    jacobian: Array,
     covariance: Array,
+    room: JudgeRoom,
 ) -> tuple[float, bool, bool]:
-    """Fill the covariance of a candidate; log weight, validity, whether channels are described."""
+    """Judge a candidate of a measurement; see the module.
+
+    Weights, x (4,), ∂(F, p)/∂ξ (6, 3), residuals and their slopes with respect to x (k, 4) are the
+    candidate's. Fill the covariance of its contact point; return its log weight, whether the
+    covariance is valid, and whether the second order describes the channels at least roughly.
+    """
     b, j, slopes, nothing, model, rays = room
+    for a in range(3):
+        for c in range(3):
+            covariance[a, c] = np.nan
+    without_friction(jacobian, j)
+    if not principal_axes(x, j, model.axes):
+        return -np.inf, False, False
+    copy(residuals, model.r0)
+    for a in range(3):
+        copy(tangents[3 + a], slopes[a])
     bent, missed, short = _second_order(rod, b, codes, target, weights, x, slopes, j, model)
     if bent != bent:
         return -np.inf, False, False
@@ -458,52 +474,6 @@ def _judge_one(
         density = first_order
     weight = math.log(density) - 0.5 * misfit if density > 0.0 else -np.inf
     return weight, missed < _MISSED and fair, missed < _BENT
-
-
-@kernel
-def judge(
-    rod: Charted,
-    proximal: float,
-    codes: IntArray,
-    target: Array,
-    weights: Array,
-    contacts: Array,
-    tangents: Array,
-    residuals: Array,
-    jacobians: Array,
-    covariances: Array,
-    weight: Array,
-    valid: AnyArray,
-    described: AnyArray,
-    n: int,
-    room: JudgeRoom,
-) -> None:
-    """Judge the candidates of a measurement; see the module.
-
-    Weights, x (n, 4), ∂(F, p)/∂ξ (n, 6, 3), residuals and their slopes with respect to x
-    (n, k, 4) are those of each candidate. Fill covariances of contact points, log weights, whether
-    covariances are valid, and whether the second order describes the channels at least roughly.
-    """
-    for row in range(n):
-        for a in range(3):
-            for c in range(3):
-                covariances[row, a, c] = np.nan
-        weight[row], valid[row], described[row] = -np.inf, False, False
-        without_friction(jacobians[row], room.j)
-        if principal_axes(contacts[row], room.j, room.model.axes):
-            copy(residuals[row], room.model.r0)
-            for a in range(3):
-                copy(tangents[row, 3 + a], room.slopes[a])
-            weight[row], valid[row], described[row] = _judge_one(
-                rod,
-                proximal,
-                codes,
-                target,
-                weights[row],
-                contacts[row],
-                room,
-                covariances[row],
-            )
 
 
 @kernel

@@ -262,3 +262,17 @@ def test_bad_input_says_what_is_allowed():
         vb.estimate_from_wrench(whisker, f, m, noise=np.eye(3))
     with pytest.raises(ValueError, match="no negative eigenvalue"):
         vb.estimate_from_wrench(whisker, f, m, noise=np.ones((6, 6)) - 0.5 * np.eye(6))
+
+
+def test_a_minimum_with_friction_does_not_hide_a_contact_without():
+    """Its valley leads to the true contact, and another one's minimum has hardly any friction."""
+    length = 12.45e-3
+    whisker = vb.Whisker.from_curvature(
+        length,
+        lambda s: np.stack([0 * s, -3.0 + 0 * s, 158.0 - 91.1 * s / length], -1),
+        base_radius=47.5e-6,
+        tip_radius=2.425e-6,
+    )
+    force, moment = [-0.8499e-6, -12.501e-6, -0.9542e-6], [-3.097e-9, -5.312e-9, -99.48e-9]
+    found = vb.estimate_from_wrench(whisker, force, moment, noise=np.diag(SIGMA**2))
+    assert found.status == vb.Status.AMBIGUOUS

@@ -28,6 +28,7 @@ from vibrissa.contacts.joint.joint_fit import Joint, JointFit, check_compliance
 from vibrissa.contacts.sensing.channels import WRENCH, Channels, friction_angle
 from vibrissa.contacts.sensing.noise import Noise, SensorNoise, explained, sensor_noise
 from vibrissa.contacts.uncertainty.posterior import ranked
+from vibrissa.contacts.uncertainty.valleys import LIKELY_FRICTION
 from vibrissa.contacts.wrench import PROXIMAL, by_probability, chosen, estimate_components
 from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray
@@ -50,9 +51,6 @@ _NEAR = 0.01
 _MOST = 8
 # Difference of arc lengths, over L, within which two contacts are the same.
 _SAME = 0.03
-# Standard deviation of friction angles: of contacts that explain a wrench equally well, those with
-# less friction come first.
-_LIKELY = np.deg2rad(20.0)
 _NO_ERRORS = np.zeros((0, 6, 7))
 _WEIGHTLESS = 1e-9  # gravity, m/s², below which the base is in free fall
 # Of three signals with all of these unknown, regions hold half to two thirds of the contacts.
@@ -263,7 +261,7 @@ class JointEstimate:
         limit = _EXACT if exact else explained(degrees)
         doubt = np.linalg.norm(fits.contacts[:, 1:], axis=1)
         if fitting.friction:
-            doubt = fits.misfits + (friction_angle(fits.contacts) / _LIKELY) ** 2
+            doubt = fits.misfits + (friction_angle(fits.contacts) / LIKELY_FRICTION) ** 2
         kept = chosen(n, row, fits, doubt, limit, _MOST)
         found = Candidates.room(n, _MOST)._replace(
             number=kept.number,
@@ -297,7 +295,7 @@ class JointEstimate:
         found.covariances[row, place], found.valid[row, place] = covariance, valid
         log = 0.5 * np.linalg.slogdet(covariance)[1] - 0.5 * fits.misfits
         if self._fit.friction:
-            log -= 0.5 * (friction_angle(fits.contacts) / _LIKELY) ** 2
+            log -= 0.5 * (friction_angle(fits.contacts) / LIKELY_FRICTION) ** 2
         weight = np.full(found.chi_squared.shape, -np.inf)
         weight[row, place] = np.where(np.isfinite(log), log, -np.inf)
         probability, order = ranked(weight, found.number)

@@ -44,7 +44,7 @@ from vibrissa.contacts.sensing.noise import (
     whitening,
 )
 from vibrissa.contacts.uncertainty.posterior import CERTAIN, ranked
-from vibrissa.contacts.uncertainty.valleys import Valleys, valleys
+from vibrissa.contacts.uncertainty.valleys import LIKELY_FRICTION, Valleys, valleys
 from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod import Discretization, discretize, solve_forces, vanishing_moments
@@ -59,12 +59,10 @@ PROXIMAL = 0.05
 _COARSE = 36
 _UNKNOWNS = 4
 _MOST = 4
-# Standard deviation of friction angles, by which contacts that explain a wrench equally well are
-# ordered: those with less friction come first.
-_LIKELY = np.deg2rad(20.0)
 # Friction angle above which a covariance is not valid: valleys end in such contacts.
-_STEEP = 2.0 * _LIKELY
-# Arc lengths to start from if the integration outward gives no contact.
+_STEEP = 2.0 * LIKELY_FRICTION
+# Arc lengths to start from if the integration outward gives no contact, or only one that may hide
+# another, as where the valley of χ² through it is long.
 _ELSEWHERE = (0.25, 0.5, 0.75, 0.95)
 # Lever arm, over L, above which force and moment are swapped, or in other units.
 _LONGEST_ARM = 10.0
@@ -237,14 +235,25 @@ def _located(
         degrees = rank(_covariance(sensor) / np.outer(scale, scale)) - _UNKNOWNS
     limit = explained(degrees)
     coarse = discretize(whisker, _COARSE)
-    solved = _solve(coarse, d, wrenches[rows], weights, limit)
-    found, lost = _candidates(solved), np.zeros(rows.size, np.bool_)
-    if prior is not None:
-        allowed = possible_candidates(prior, whisker, d, found)
-        found = found.allowed_first(allowed)
-        solved = solved.allowed_first(allowed)
-    if sensor is not None:
-        found, lost = _judged(coarse, d, solved, found, wrenches[rows], weights)
+
+    def answers(which: IntArray, everywhere: bool) -> tuple[Candidates, AnyArray]:
+        given = wrenches[rows[which]], weights[which]
+        solved = _solve(coarse, d, *given, limit, everywhere)
+        found = _candidates(solved)
+        if prior is not None:
+            allowed = possible_candidates(prior, whisker, d, found)
+            found, solved = found.allowed_first(allowed), solved.allowed_first(allowed)
+        if sensor is None:
+            return found, np.zeros(which.size, np.bool_)
+        return _judged(coarse, d, solved, found, *given)
+
+    found, lost = answers(np.arange(rows.size), False)
+    doubtful = (found.probability[:, 0] > CERTAIN) & ~found.valid[:, 0] & ~lost
+    again = np.flatnonzero(doubtful)
+    if again.size:
+        more, lost[again] = answers(again, True)
+        for mine, theirs in zip(found, more, strict=True):
+            mine[again] = theirs
     status = np.where(known, int(Status.DEGENERATE), int(Status.MISSING))
     status[rows] = np.where(lost, int(Status.DEGENERATE), _statuses(found, limit))
     whole = found.spread_out(rows, len(wrenches))
@@ -295,15 +304,23 @@ def rubbing_misfits(
     x = contacts[row, place]
     chi = misfits[row, place] if fitted else _misfits(coarse, wrenches, weights, row, x) ** 2
     with np.errstate(invalid="ignore"):
-        doubt = chi + (friction_angle(x) / _LIKELY) ** 2
+        doubt = chi + (friction_angle(x) / LIKELY_FRICTION) ** 2
     np.fmin.at(least, rows[row], doubt)
     return least
 
 
 def _solve(
-    coarse: Discretization, fine: Discretization, wrenches: Array, weights: Array, limit: float
+    coarse: Discretization,
+    fine: Discretization,
+    wrenches: Array,
+    weights: Array,
+    limit: float,
+    everywhere: bool = False,
 ) -> Fitted:
-    """Contacts that explain wrenches, or the one that comes nearest."""
+    """Contacts that explain wrenches, or the one that comes nearest.
+
+    Fits start also elsewhere on the whisker if none explains the wrench, or if so requested.
+    """
     number, places = vanishing_moments(coarse, wrenches, PROXIMAL)
     row, place = np.nonzero(np.arange(places.shape[1]) < number[:, None])
     near = _promising(coarse, wrenches, weights, row, places[row, place])
@@ -311,12 +328,12 @@ def _solve(
     found = _fit(coarse, wrenches, weights, row[near], seeds, limit)
     best = np.full(len(wrenches), np.inf)
     np.minimum.at(best, row[near], found.misfits)
-    again = np.flatnonzero(~(best <= limit))
+    again = np.flatnonzero(everywhere | ~(best <= limit))
     if again.size:
         starts = np.array(_ELSEWHERE)
         more = np.repeat(again, starts.size)
         seeds = np.column_stack([np.tile(starts, again.size), wrenches[more, :3]])
-        left = np.isin(row, again)
+        left = np.isin(row, again) & ~near
         more = np.concatenate([more, row[left]])
         seeds = np.concatenate([seeds, places[row[left], place[left]]])
         others = _fit(coarse, wrenches, weights, more, seeds, limit)
@@ -324,7 +341,7 @@ def _solve(
         near = np.concatenate([row[near], more])
     else:
         near = row[near]
-    doubt = found.misfits + (friction_angle(found.contacts) / _LIKELY) ** 2
+    doubt = found.misfits + (friction_angle(found.contacts) / LIKELY_FRICTION) ** 2
     kept = chosen(len(wrenches), near, found, doubt, limit, _MOST)
     row, place = np.nonzero(np.arange(kept.contacts.shape[1]) < kept.number[:, None])
     final = _fit(fine, wrenches, weights, row, kept.contacts[row, place], limit)
@@ -418,7 +435,7 @@ def _judged(
     spread = unknowns_covariance(WRENCH, values, tangents, weights[row], friction=True)
     size = np.einsum("nai,nij,naj->n", tangents[:, 3:], spread, tangents[:, 3:])
     weight, far = np.full((n, most), -np.inf), np.full((n, most), np.nan)
-    weight[row, place] = valley.weight - 0.5 * (friction_angle(x) / _LIKELY) ** 2
+    weight[row, place] = valley.weight
     far[row, place] = size
     found.covariances[row, place] = valley.covariances
     found.valid[row, place] = valley.valid & (np.abs(friction_angle(x)) < _STEEP)

@@ -111,8 +111,9 @@ class _Compact(_Whole):
         }
         own = [f for f in self._final_module.functions if not (f.is_declaration or f.name in fast)]
         for function in own if _ATTRIBUTES and len(own) > _LARGE else ():
-            if not any(name in function.name for name in _VECTORISED):
-                function.add_function_attribute("optsize")
+            # Inlined into a function optimised for size, loops would not be vectorised.
+            loops = any(name in function.name for name in _VECTORISED)
+            function.add_function_attribute("noinline" if loops else "optsize")
         super()._optimize_final_module()  # type: ignore[no-untyped-call]
 
 

@@ -48,11 +48,16 @@ from vibrissa.contacts.engine.task import (
     type_of_description,
     type_of_task,
 )
-from vibrissa.contacts.fitting.fit_within import fit_within
+from vibrissa.contacts.fitting.fit_within import FitRoom, fit_room, fit_within
 from vibrissa.contacts.fitting.least_squares import channel_equations, same_contact, settled, whiten
 from vibrissa.contacts.sensing.noise import INDISTINCT
 from vibrissa.contacts.sensing.weighing import Weighing, sharpness, weigh_any
-from vibrissa.contacts.uncertainty.basins import deviations, starts_of_basins
+from vibrissa.contacts.uncertainty.basins import (
+    BasinsRoom,
+    basins_room,
+    deviations,
+    starts_of_basins,
+)
 from vibrissa.contacts.uncertainty.flat_valleys import follow_valley
 from vibrissa.contacts.uncertainty.nodes import (
     PARTS,
@@ -62,7 +67,7 @@ from vibrissa.contacts.uncertainty.nodes import (
     outside_share,
     probable_nodes,
 )
-from vibrissa.contacts.uncertainty.posterior import CERTAIN, judge, rank
+from vibrissa.contacts.uncertainty.posterior import CERTAIN, judge, judge_room, rank
 from vibrissa.numerics import (
     AnyArray,
     Array,
@@ -87,6 +92,58 @@ _AT_ONCE = 128
 _LOG_NORMAL = 1.5 * math.log(2.0 * math.pi)
 
 
+class _Work(NamedTuple):
+    """Working memory of `complete_rows`, of m candidates and k channels.
+
+    (F, p) (m, 6), derivatives of one with respect to x (6, 4), χ² (m,), residuals (k,) and their
+    slopes (k, 4); deviations (3,), starting contacts (n, 4), one of them, and the nearest nodes.
+    """
+
+    values: Array
+    tangents: Array
+    misfits: Array
+    residual: Array
+    jacobian: Array
+    sigma: Array
+    starts: Array
+    start: Array
+    nodes: IntArray
+    basins: BasinsRoom
+    fit: FitRoom
+
+
+class _Row(NamedTuple):
+    """A measurement: target (k,), measured values, x (m, 4), (F, p) and χ² of its candidates.
+
+    ``loose`` (n, 4) is for χ² and points of further contacts that explain it as well.
+    """
+
+    target: Array
+    measured: Array
+    x: Array
+    values: Array
+    misfits: Array
+    loose: Array
+
+
+@inlined
+def _work(k: int) -> _Work:
+    """Allocate the working memory of `complete_rows`."""
+    return _Work(
+        np.empty((MOST_CANDIDATES, 6)),
+        np.zeros((6, 4)),
+        np.empty(MOST_CANDIDATES),
+        np.empty(k),
+        np.empty((k, 4)),
+        np.empty(3),
+        np.empty((MOST_STARTS, 4)),
+        np.empty(4),
+        np.empty(PARTS, np.int64),
+        basins_room(),
+        fit_room(k),
+    )
+
+
 @kernel
 def chi_squared_of(how: Weighing, x: Array, value: Array, target: Array, measured: Array) -> float:
     """χ² of a contact; NaN if its weights cannot be computed."""
@@ -104,20 +161,17 @@ def _try(
     how: Weighing,
     passes: int,
     worth: float,
-    target: Array,
-    measured: Array,
+    row: _Row,
     start: Array,
     number: int,
-    x: Array,
-    values: Array,
-    misfits: Array,
-    loose: Array,
+    room: FitRoom,
 ) -> tuple[int, bool]:
     """Fit from a starting contact, and add the result if it is a new minimum of at most ``worth``.
 
     Return the number of minima, and whether the fit ended at a contact that is not one of them
-    although its χ² is small; χ² and that contact are then appended to ``loose`` (n, 4).
+    although its χ² is small, a loose one.
     """
+    target, measured, x, values, misfits, loose = row
     if number == MOST_CANDIDATES:
         return number, True
     at, misfit, known, least = start.copy(), np.inf, False, False
@@ -131,6 +185,8 @@ def _try(
             of.charted,
             of.proximal,
             how,
+            how.codes,
+            False,
             target,
             measured,
             at,
@@ -139,6 +195,7 @@ def _try(
             most,
             x[:number],
             misfits,
+            room,
         )
         for c in range(number):
             known = known or same_contact(at, x[c])
@@ -169,30 +226,26 @@ def _try(
 def complete(
     of: Searched,
     how: Weighing,
-    passes: int,
-    limit: float,
-    target: Array,
-    measured: Array,
+    problem: Problem,
+    row: _Row,
     number: int,
-    x: Array,
-    values: Array,
-    misfits: Array,
     residuals: Array,
     jacobians: Array,
-    loose: Array,
+    room: _Work,
 ) -> tuple[int, bool]:
     """Add contacts of Ω that noise has hidden, given residuals and slopes of the known candidates.
 
-    Fill ``loose`` with χ² and coordinates (n, 4) of further contacts that explain the measurement
-    as well. Return the number of candidates, and whether other contacts may be probable.
+    Return the number of candidates, and whether other contacts may be probable.
     """
-    sigma, starts = np.empty(3), np.empty((MOST_STARTS, 4))
-    start, nodes, least = np.zeros(4), np.full(PARTS, -1), np.inf
-    loose[:] = np.inf
+    target, measured, x, values, misfits, loose = row
+    passes, limit = problem.passes, problem.limit
+    sigma, starts, start, nodes = room.sigma, room.starts, room.start, room.nodes
+    least, loose[:] = np.inf, np.inf
     for c in range(number):
         least = min(least, misfits[c])
     lost = not least <= limit
     if lost:
+        nodes[:] = -1
         nearest_of(of, how.mixing, target, nodes)
         node = 0
         while node < PARTS - 1 and nodes[node] < 0:
@@ -203,29 +256,32 @@ def complete(
     worth = limit if lost else min(limit, least + INDISTINCT)
     apart = _FAR_APART if lost else _APART
     n, others = starts_of_basins(
-        of, apart, sigma, measured, x, residuals, jacobians, 0 if lost else number, starts
+        of,
+        apart,
+        sigma,
+        measured,
+        x,
+        residuals,
+        jacobians,
+        0 if lost else number,
+        starts,
+        room.basins,
     )
     for i in range(n):
-        number, other = _try(
-            of, how, passes, worth, target, measured, starts[i], number, x, values, misfits, loose
-        )
+        number, other = _try(of, how, passes, worth, row, starts[i], number, room.fit)
         others = others or other
     for c in range(number if _mirrored(how) else 0):
         copy(x[c], start)
         start[3] = -start[3]  # high above a narrow valley's floor; not abandoned early
-        number, other = _try(
-            of, how, passes, np.inf, target, measured, start, number, x, values, misfits, loose
-        )
+        number, other = _try(of, how, passes, np.inf, row, start, number, room.fit)
         others = others or other
     for c in range(number):
         lost = lost and not misfits[c] <= limit
     for i in range(PARTS if lost else 0):
         if nodes[i] >= 0:
             contact = of.contacts[nodes[i]]
-            start[0], start[2], start[3] = contact[0], contact[1], contact[2]
-            number, other = _try(
-                of, how, passes, worth, target, measured, start, number, x, values, misfits, loose
-            )
+            start[0], start[1], start[2], start[3] = contact[0], 0.0, contact[1], contact[2]
+            number, other = _try(of, how, passes, worth, row, start, number, room.fit)
             others = others or other
     return _kept(limit, number, x, values, misfits), others
 
@@ -262,37 +318,23 @@ def _kept(limit: float, number: int, x: Array, values: Array, misfits: Array) ->
     return kept
 
 
-class _Weighed(NamedTuple):
-    """Working memory of `complete_rows`.
-
-    (F, p) (m, 6), their derivatives with respect to x (m, 6, 4), χ² (m,).
-    """
-
-    values: Array
-    tangents: Array
-    misfits: Array
-
-
 @kernel
 def _weighed(
     of: Searched,
     how: Weighing,
-    target: Array,
-    measured: Array,
-    x: Array,
-    values: Array,
+    row: _Row,
     first: int,
     n: int,
-    room: _Weighed,
+    room: _Work,
     described: tuple[Array, Array, Array, Array],
 ) -> None:
     """Fill χ² and the description of n candidates: weights, ∂(F, p)/∂ξ, residuals and slopes.
 
     For the candidates before ``first``, ∂(F, p)/∂ξ is already there.
     """
+    target, measured, x, values, _, _ = row
     weights, third, residuals, jacobians = described
-    k = how.codes.shape[0]
-    residual, jacobian = np.empty(k), np.empty((k, 4))
+    k, residual, jacobian = how.codes.shape[0], room.residual, room.jacobian
     if first < n:
         evaluate(of.charted.rod, x, room.values, third, first, n)
     for c in range(n):
@@ -320,10 +362,10 @@ def complete_rows(
     """Complete and describe the candidates of noisy measurements."""
     of, how, problem, out = task.of, task.how, task.problem, in_memory(number, flat, valid)
     known = np.empty((MOST_CANDIDATES, 4))
-    room = _Weighed(np.empty((MOST_CANDIDATES, 6)), np.zeros((6, 4)), np.empty(MOST_CANDIDATES))
+    room = _work(how.codes.shape[0])
     lanes, forces, tangents = np.zeros((LANES, 4)), np.empty((LANES, 6)), np.empty((LANES, 6, 3))
     for row in range(first, last):
-        target, seen, i, before = targets[row], measured[row], row - first, number[row]
+        target, i, before = targets[row], row - first, number[row]
         lane = i % LANES
         if lane == 0:  # evaluate the first candidates of the next rows together, in SIMD lanes
             side = min(LANES, last - row)
@@ -337,33 +379,20 @@ def complete_rows(
         x, values, chi = out.x[row], out.values[row], out.chi_squared[row]
         residuals, jacobians = about.residuals[i], about.jacobians[i]
         described = about.weights[i], about.third[i], residuals, jacobians
+        one = _Row(target, measured[row], x, values, chi, about.loose[i])
         for a in range(6):
             copy(tangents[lane, a], about.third[i, 0, a])
         if before > 0:
-            _weighed(of, how, target, seen, x, values, 1, before, room, described)
+            _weighed(of, how, one, 1, before, room, described)
         for c in range(before):
             chi[c] = room.misfits[c]
             copy(x[c], known[c])
-        n, about.others[i] = complete(
-            of,
-            how,
-            problem.passes,
-            problem.limit,
-            target,
-            seen,
-            before,
-            x,
-            values,
-            chi,
-            residuals,
-            jacobians,
-            about.loose[i],
-        )
+        n, about.others[i] = complete(of, how, problem, one, before, residuals, jacobians, room)
         changed = n > before
         for c in range(n):
             changed = changed or x[c, 0] != known[c, 0] or x[c, 2] != known[c, 2]
         if changed:
-            _weighed(of, how, target, seen, x, values, 0, n, room, described)
+            _weighed(of, how, one, 0, n, room, described)
         number[row] = n
 
 
@@ -501,7 +530,7 @@ def judge_rows(
 ) -> None:
     """Judge the candidates left by `complete_rows`, and rank them by probability."""
     of, how, limit, out = task.of, task.how, task.problem.limit, in_memory(number, flat, valid)
-    room = _judging(MOST_CANDIDATES)
+    room, judging = _judging(MOST_CANDIDATES), judge_room(how.codes.shape[0])
     weight, fine = room.weight, room.fine
     for row in range(first, last):
         target, i, n, chi = targets[row], row - first, number[row], out.chi_squared[row]
@@ -510,24 +539,21 @@ def judge_rows(
         status[row] = UNEXPLAINED
         if n == 0:
             continue
-        judge(
-            of.charted,
-            of.proximal,
-            how.codes,
-            target,
-            about.weights[i],
-            out.x[row],
-            about.third[i],
-            about.residuals[i],
-            about.jacobians[i],
-            room.spread,
-            weight[1],
-            fine,
-            room.described,
-            n,
-        )
         sound = True
         for c in range(n):
+            weight[1, c], fine[c], room.described[c] = judge(
+                of.charted,
+                of.proximal,
+                how.codes,
+                target,
+                about.weights[i, c],
+                out.x[row, c],
+                about.third[i, c],
+                about.residuals[i, c],
+                about.jacobians[i, c],
+                room.spread[c],
+                judging,
+            )
             sound = sound and fine[c]
             sharp = sharpness(about.weights[i, c])
             room.misfits[c] = chi[c] - 2.0 * sharp

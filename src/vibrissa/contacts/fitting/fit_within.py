@@ -227,7 +227,7 @@ def by_slopes(x: Array, r: Array, j: Array, other: Array) -> float:
     return total
 
 
-class _Room(NamedTuple):
+class FitRoom(NamedTuple):
     """Working memory of a fit.
 
     The rod's buffer; weights (k, k); a contact (4,) with (F, p) and ∂(F, p)/∂x (6, 4); residuals
@@ -256,9 +256,9 @@ class _Room(NamedTuple):
 
 
 @inlined
-def _room(k: int) -> _Room:
+def fit_room(k: int) -> FitRoom:
     """Allocate memory for fits of k channels."""
-    return _Room(
+    return FitRoom(
         np.zeros(BUFFER_SIZE),
         np.empty((k, k)),
         np.empty(4),
@@ -281,7 +281,7 @@ def _room(k: int) -> _Room:
 
 
 @shared
-def _descend(
+def fit_within(
     rod: Charted,
     proximal: float,
     how: Weighing,
@@ -295,13 +295,15 @@ def _descend(
     worth: float,
     known: Array,
     misfits: Array,
-    room: _Room,
+    room: FitRoom,
 ) -> tuple[float, bool]:
-    """Find the contact of minimum χ² in Ω, as `fit_within` does, for some of the channels.
+    """Descend from a contact to the minimum of χ² in Ω, for some of the channels.
 
     If they are ``weighed`` the room contains their weights; else those of a measurement at the
-    start are used. The room's arrays are allocated by the caller, so that Numba does not count
-    references to them.
+    start are used. The fit is abandoned if it ends above ``worth``, and x becomes a known contact,
+    with χ² in ``misfits``, if the descent leads to one that is worth it. Return χ², and whether it
+    is a minimum. If ``worth`` is finite, contacts are interpolated up to the end, where the rod is
+    integrated.
     """
     b, weights, to, v, t, residual, jacobian, r, j, r_there, j_there = room[:11]
     frame, second, normal, bent, root, gradient, step = room[11:]
@@ -370,46 +372,6 @@ def _descend(
 
 
 @kernel
-def fit_within(
-    rod: Charted,
-    proximal: float,
-    how: Weighing,
-    target: Array,
-    measured: Array,
-    x: Array,
-    value: Array,
-    tangents: Array,
-    worth: float,
-    known: Array,
-    misfits: Array,
-) -> tuple[float, bool]:
-    """Descend from a contact to the minimum of χ² in Ω, with the weights of the starting contact.
-
-    The fit is abandoned if it ends above ``worth``, and x becomes a known contact, with χ² in
-    ``misfits``, if the descent leads to one that is worth it. Return χ², and whether it is a
-    minimum. If ``worth`` is finite, contacts are interpolated up to the end, where the rod is
-    integrated.
-    """
-    codes, room = how.codes, _room(how.codes.shape[0])
-    return _descend(
-        rod,
-        proximal,
-        how,
-        codes,
-        False,
-        target,
-        measured,
-        x,
-        value,
-        tangents,
-        worth,
-        known,
-        misfits,
-        room,
-    )
-
-
-@kernel
 def fit_rows_within(
     rod: Charted,
     proximal: float,
@@ -425,7 +387,7 @@ def fit_rows_within(
     First in SIMD lanes, where most remain in Ω; those that leave it start anew, one by one.
     """
     start, known, misfits = fits.contacts.copy(), np.zeros((0, 4)), np.zeros(0)
-    room = _room(codes.shape[0])
+    room = fit_room(codes.shape[0])
     fit_rows(rod.rod, False, proximal, codes, targets, weights, fits, 0, len(targets))
     for row in range(len(targets)):
         x, value, tangents = fits.contacts[row], fits.values[row], fits.tangents[row]
@@ -438,7 +400,7 @@ def fit_rows_within(
         copy(start[row], x)
         for i in range(codes.shape[0]):
             copy(weights[row, i], room.weights[i])
-        fits.misfits[row], _ = _descend(
+        fits.misfits[row], _ = fit_within(
             rod,
             proximal,
             how,

@@ -14,6 +14,7 @@ the smallest arc length considered) only the force is free. All quantities are n
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -382,52 +383,29 @@ def fit(
     least: float,
     worth: float = np.inf,
 ) -> Fits:
-    """Fit contacts to measured channels."""
-    out = _once(discretization, channels, targets, weights, contacts, friction, least)
+    """Fit contacts to measured channels; slow fits continue, unless their χ² exceeds ``worth``."""
+    rod, codes = discretization.rod, np.array([FITTED.index(name) for name in channels])
+
+    def fitted(which: IntArray, contacts: Array) -> Fits:
+        n = len(which)
+        out = Fits(
+            np.array(contacts, dtype=np.float64),
+            np.full((n, 6), np.nan),
+            np.zeros((n, 6, 4)),
+            np.full(n, np.inf),
+            np.zeros(n, np.bool_),
+        )
+        aims, own = np.ascontiguousarray(targets[which]), np.ascontiguousarray(weights[which])
+        share_out(n, partial(fit_rows, rod, friction, least, codes, aims, own, out))
+        return out
+
+    out = fitted(np.arange(len(targets)), contacts)
     for _ in range(TIMES):
         slow = np.flatnonzero(~out.converged & (out.misfits <= worth))
         if not slow.size:
             break
-        further = _once(
-            discretization,
-            channels,
-            targets[slow],
-            weights[slow],
-            out.contacts[slow],
-            friction,
-            least,
-        )
-        for mine, theirs in zip(out, further, strict=True):
+        for mine, theirs in zip(out, fitted(slow, out.contacts[slow]), strict=True):
             mine[slow] = theirs
-    return out
-
-
-def _once(
-    discretization: Discretization,
-    channels: tuple[str, ...],
-    targets: Array,
-    weights: Array,
-    contacts: Array,
-    friction: bool,
-    least: float,
-) -> Fits:
-    n = len(targets)
-    out = Fits(
-        np.array(contacts, dtype=np.float64),
-        np.full((n, 6), np.nan),
-        np.zeros((n, 6, 4)),
-        np.full(n, np.inf),
-        np.zeros(n, np.bool_),
-    )
-    codes = np.array([FITTED.index(name) for name in channels])
-    rod = discretization.rod
-    targets, weights = np.ascontiguousarray(targets), np.ascontiguousarray(weights)
-    share_out(
-        n,
-        lambda first, last: fit_rows(
-            rod, friction, least, codes, targets, weights, out, first, last
-        ),
-    )
     return out
 
 

@@ -145,8 +145,8 @@ def _basins(
                 parent[mine] = theirs
 
 
-class _Room(NamedTuple):
-    """Working memory.
+class BasinsRoom(NamedTuple):
+    """Working memory of `starts_of_basins`.
 
     Target and slack (3,), known contacts in the chart (n, 3); for each cell its number, the nearest
     position in the chart (n, 3), the distance by which it misses, its rank and its basin.
@@ -162,6 +162,21 @@ class _Room(NamedTuple):
     parent: IntArray
 
 
+@inlined
+def basins_room() -> BasinsRoom:
+    """Allocate the working memory, once for many measurements."""
+    return BasinsRoom(
+        np.empty(3),
+        np.empty(3),
+        np.empty((MOST_CANDIDATES, 3)),
+        np.empty(MOST_CELLS, np.int64),
+        np.empty((MOST_CELLS, 3)),
+        np.empty(MOST_CELLS),
+        np.empty(MOST_CELLS, np.int64),
+        np.empty(MOST_CELLS, np.int64),
+    )
+
+
 @kernel
 def starts_of_basins(
     of: Searched,
@@ -173,38 +188,12 @@ def starts_of_basins(
     jacobians: Array,
     number: int,
     starts: Array,
+    room: BasinsRoom,
 ) -> tuple[int, bool]:
     """Fill one starting contact for each basin that the known contacts x do not explain.
 
     Return their number, and whether there are more.
     """
-    room = _Room(
-        np.empty(3),
-        np.empty(3),
-        np.empty((MOST_CANDIDATES, 3)),
-        np.empty(MOST_CELLS, np.int64),
-        np.empty((MOST_CELLS, 3)),
-        np.empty(MOST_CELLS),
-        np.empty(MOST_CELLS, np.int64),
-        np.empty(MOST_CELLS, np.int64),
-    )
-    return _starts(of, apart, sigma, measured, x, residuals, jacobians, number, starts, room)
-
-
-@kernel
-def _starts(
-    of: Searched,
-    apart: float,
-    sigma: Array,
-    measured: Array,
-    x: Array,
-    residuals: Array,
-    jacobians: Array,
-    number: int,
-    starts: Array,
-    room: _Room,
-) -> tuple[int, bool]:
-    """Fill starting contacts; kernels do not count references to arrays that a caller allocates."""
     target, slack, known, cells, spots, away, order, parent = room
     kept, count = 0, 0
     for q in range(3):

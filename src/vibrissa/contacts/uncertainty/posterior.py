@@ -41,7 +41,6 @@ from vibrissa.contacts.uncertainty.expansion import (
     without_friction,
 )
 from vibrissa.numerics import (
-    AnyArray,
     Array,
     IntArray,
     cholesky,
@@ -389,23 +388,64 @@ def _second_order(
     return bent, missed, short
 
 
+class JudgeRoom(NamedTuple):
+    """Working memory of `judge`.
+
+    A buffer of the rod's, slopes of residuals (k, 3) and of the point (3, 3), zeros (3,), the
+    expansion and the nodes.
+    """
+
+    buffer: Array
+    j: Array
+    slopes: Array
+    nothing: Array
+    model: Expansion
+    rays: Rays
+
+
+@inlined
+def judge_room(k: int) -> JudgeRoom:
+    """Allocate the working memory for k channels, once for many measurements."""
+    return JudgeRoom(
+        np.zeros(BUFFER_SIZE),
+        np.empty((k, 3)),
+        np.empty((3, 3)),
+        np.zeros(3),
+        empty_expansion(k),
+        empty_rays(),
+    )
+
+
 @kernel
-def _judge_one(
+def judge(
     rod: Charted,
-    b: Array,
     proximal: float,
     codes: IntArray,
     target: Array,
     weights: Array,
     x: Array,
-    slopes: Array,
-    j: Array,
-    model: Expansion,
-    rays: Rays,
-    nothing: Array,
+    tangents: Array,
+    residuals: Array,
+    jacobian: Array,
     covariance: Array,
+    room: JudgeRoom,
 ) -> tuple[float, bool, bool]:
-    """Fill the covariance of a candidate; log weight, validity, whether channels are described."""
+    """Judge a candidate of a measurement; see the module.
+
+    Weights, x (4,), ∂(F, p)/∂ξ (6, 3), residuals and their slopes with respect to x (k, 4) are the
+    candidate's. Fill the covariance of its contact point; return its log weight, whether the
+    covariance is valid, and whether the second order describes the channels at least roughly.
+    """
+    b, j, slopes, nothing, model, rays = room
+    for a in range(3):
+        for c in range(3):
+            covariance[a, c] = np.nan
+    without_friction(jacobian, j)
+    if not principal_axes(x, j, model.axes):
+        return -np.inf, False, False
+    copy(residuals, model.r0)
+    for a in range(3):
+        copy(tangents[3 + a], slopes[a])
     bent, missed, short = _second_order(rod, b, codes, target, weights, x, slopes, j, model)
     if bent != bent:
         return -np.inf, False, False
@@ -434,60 +474,6 @@ def _judge_one(
         density = first_order
     weight = math.log(density) - 0.5 * misfit if density > 0.0 else -np.inf
     return weight, missed < _MISSED and fair, missed < _BENT
-
-
-@kernel
-def judge(
-    rod: Charted,
-    proximal: float,
-    codes: IntArray,
-    target: Array,
-    weights: Array,
-    contacts: Array,
-    tangents: Array,
-    residuals: Array,
-    jacobians: Array,
-    covariances: Array,
-    weight: Array,
-    valid: AnyArray,
-    described: AnyArray,
-    n: int,
-) -> None:
-    """Judge the candidates of a measurement; see the module.
-
-    Weights, x (n, 4), ∂(F, p)/∂ξ (n, 6, 3), residuals and their slopes with respect to x
-    (n, k, 4) are those of each candidate. Fill covariances of contact points, log weights, whether
-    covariances are valid, and whether the second order describes the channels at least roughly.
-    """
-    k = codes.shape[0]
-    b, j, model = np.zeros(BUFFER_SIZE), np.empty((k, 3)), empty_expansion(k)
-    rays, slopes, nothing = empty_rays(), np.empty((3, 3)), np.zeros(3)
-    for row in range(n):
-        for a in range(3):
-            for c in range(3):
-                covariances[row, a, c] = np.nan
-        weight[row], valid[row], described[row] = -np.inf, False, False
-        without_friction(jacobians[row], j)
-        if principal_axes(contacts[row], j, model.axes):
-            for a in range(k):
-                model.r0[a] = residuals[row, a]
-            for a in range(3):
-                copy(tangents[row, 3 + a], slopes[a])
-            weight[row], valid[row], described[row] = _judge_one(
-                rod,
-                b,
-                proximal,
-                codes,
-                target,
-                weights[row],
-                contacts[row],
-                slopes,
-                j,
-                model,
-                rays,
-                nothing,
-                covariances[row],
-            )
 
 
 @kernel

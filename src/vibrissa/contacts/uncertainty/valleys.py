@@ -9,7 +9,9 @@ density of s is
 
     exp(-χ²/2) |∂(p, φ)/∂(s, f)| √det C_f;
 
-with a uniform prior of s and f it is that without the second factor. The mean of both is used.
+with a uniform prior of s and f it is that without the second factor. The mean of both is used. The
+weight of a valley is the integral of the first with a normal prior of friction angles: the minimum
+of χ² may have much friction, but a contact farther along the valley none.
 Contact points are a mixture of normal distributions along the valley. The covariance is their
 second moment about the contact, widened until the share of the mixture beyond three standard
 deviations is the nominal one. The squared distance of each part is approximated by a shifted χ²
@@ -63,6 +65,8 @@ _MOST_RISE, _MOST_FALL, _SHORTER, _REFUSED = 12.0, 4.0, 0.35, 4
 _LARGEST_CHANGE = 0.5  # largest change of the force's moment in a step, as a share of it
 # Largest factor by which a covariance is widened, and bisections to find it.
 _WIDEST, _BISECTIONS = 8.0, 8
+#: Standard deviation of friction angles, by which valleys are weighed.
+LIKELY_FRICTION = math.radians(20.0)
 _NOTHING = 1e-6  # negligible variances, relative to that of the whole mixture
 
 
@@ -79,7 +83,8 @@ class Valleys(NamedTuple):
         return cls(np.full((n, 3, 3), np.nan), np.full(n, -np.inf), np.zeros(n, np.bool_))
 
 
-# Row of a node along a valley: s, χ², logs of both densities (2), point (3), its covariance (3, 3).
+# Row of a node along a valley: s, χ², logs of densities (with volumes, without, and here one with
+# volumes and the prior of friction), point (3), its covariance (3, 3).
 Nodes = tuple[Array, Array, Array, Array, Array]
 
 
@@ -149,6 +154,8 @@ def _node(
     logs[i, 0] = logs[i, 1] + math.log(abs(solve(whole, np.zeros(4))) + 1e-300)
     for a in range(3):
         x[1 + a] += down[a]
+    angle = math.atan2(x[1], math.hypot(x[2], x[3])) / LIKELY_FRICTION
+    logs[i, 2] = logs[i, 0] - 0.5 * angle * angle
     return 1.0 / steep if steep > 0.0 else np.inf, fall
 
 
@@ -242,8 +249,8 @@ def _followed(
 
 
 @inlined
-def shares_of(nodes: Nodes, first: int, last: int, shares: Array) -> float:
-    """Fill the probabilities of nodes; return the log integral of the density with volumes."""
+def shares_of(nodes: Nodes, first: int, last: int, shares: Array) -> None:
+    """Fill the probabilities of nodes."""
     s, logs = nodes[0], nodes[2]
     middle = s.shape[0] // 2
     mass = np.zeros(2)
@@ -255,7 +262,17 @@ def shares_of(nodes: Nodes, first: int, last: int, shares: Array) -> float:
         step, shares[i] = 0.5 * (s[min(i + 1, last - 1)] - s[max(i - 1, first)]), 0.0
         for d in range(2):
             shares[i] += 0.5 * step * math.exp(logs[i, d] - logs[middle, d]) / mass[d]
-    return float(math.log(mass[0]) + logs[middle, 0])
+
+
+@inlined
+def _weight(nodes: Nodes, first: int, last: int) -> float:
+    """Log integral of the density with the prior of friction."""
+    s, logs, mass = nodes[0], nodes[2], 0.0
+    middle = s.shape[0] // 2
+    for i in range(first, last):
+        step = 0.5 * (s[min(i + 1, last - 1)] - s[max(i - 1, first)])
+        mass += step * math.exp(logs[i, 2] - logs[middle, 0])
+    return float(math.log(mass + 1e-300) + logs[middle, 0])
 
 
 @inlined
@@ -343,7 +360,7 @@ def _valley_rows(
     nodes = (
         np.empty(most),
         np.empty(most),
-        np.empty((most, 2)),
+        np.empty((most, 3)),
         np.empty((most, 3)),
         np.empty((most, 3, 3)),
     )
@@ -363,7 +380,8 @@ def _valley_rows(
         )
         if end - begin < 2:
             continue
-        weight[row] = shares_of(nodes, begin, end, shares)
+        weight[row] = _weight(nodes, begin, end)
+        shares_of(nodes, begin, end, shares)
         fair = mixture(nodes, begin, end, shares, values[row, 3:], covariances[row])
         enough = nodes[1][_STEPS] + CLOSED
         closed = nodes[1][begin] > enough and nodes[1][end - 1] > enough

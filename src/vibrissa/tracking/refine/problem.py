@@ -38,6 +38,7 @@ REST = np.array([0.5, 0.0, 0.0, 0.0])
 _RUBBING = 1e-4
 _ROLLED = np.radians(3.0)  # standard deviation of the roll before its variation is known, rad
 _WILD = 1e6  # slopes of points of a rod, in units of L, above which it is not in equilibrium
+_ELSE = 3.0  # misfit, over the usual one, from which the traces of a frame are on something else
 _HOLD = 1e5  # inverse standard deviation of an arc length that is held, in units of L
 _ALONG = np.eye(UNKNOWNS)[6]  # the arc length among the unknowns
 # Error of a trace, as a share of the second difference of its positions, if the exposure may be any
@@ -89,7 +90,11 @@ class Linear(NamedTuple):
         return float(self.costs.sum())
 
     def left(self, rows: Mask) -> list[Array]:
-        """Means over some frames of the residuals of each view, pixels."""
+        """Means over some frames of the residuals of each view, pixels.
+
+        Frames that fit far worse than usual are on something else, and left out.
+        """
+        rows = rows & (self.misfit < _ELSE * np.median(self.misfit))
         found = []
         for misses, weight in zip(self.misses, self.weights, strict=True):
             sharp = weight[rows, :-2]

@@ -31,12 +31,12 @@ from vibrissa.tracking.refine.rods import LIMITS, State
 
 # First step of a profile to each side, in standard deviations of the linearised equations; share by
 # which its rise there differs from a parabola's from which it is computed; its steps then.
-_FIRST, _ALIKE = 2.0, 0.3
+_FIRST, _ALIKE = 2.0, 0.5
 _STEPS = (1.0, 2.0, 3.0, 4.5, 7.0, 11.0, 17.0, 26.0)
 _ENOUGH = 12.0  # rise of the cost up to which the profile is computed
 _LOWER = 0.5  # decrease of the cost that shows another, lower minimum
 _MARGIN = 3  # number of frames before and after a contact that are fitted with it
-_ROUNDS = 5  # number of Gauss-Newton steps at each step of a profile
+_ROUNDS = 3  # number of Gauss-Newton steps at each step of a profile
 _FINE = 801  # number of values between which the profile is integrated
 
 

@@ -212,26 +212,45 @@ def test_traces_are_trusted_as_far_as_their_residuals_allow():
     for k in range(1, 48):
         noise[:, k] = share * noise[:, k - 1] + np.sqrt(1.0 - share**2) * noise[:, k]
     together = (1.0 + share) / (1.0 - share)
-    (found,) = trace_variance([2.0 * noise], np.zeros(200), 0.04)
+    none, still = [np.zeros((200, 48, 1))], np.zeros((200, 1, 1))
+    (found,) = trace_variance([2.0 * noise], none, still, 0.04)
     assert np.median(found) == pytest.approx(4.0 * together, rel=0.25)
     noise[7] *= 10.0
-    (worse,) = trace_variance([2.0 * noise], np.zeros(200), 0.04)
+    (worse,) = trace_variance([2.0 * noise], none, still, 0.04)
     assert (worse[7] > 10.0 * np.median(found)).all()
     # Where they are smaller than was claimed, that counts as well, to a limit.
-    (finer,) = trace_variance([0.3 * noise[:7]], np.zeros(7), 0.04)
+    (finer,) = trace_variance([0.3 * noise[8:]], [none[0][8:]], still[8:], 0.04)
     assert np.median(finer) == pytest.approx(0.09 * together, rel=0.25)
-    assert (trace_variance([0.01 * noise[:5]], np.zeros(5), 0.04)[0] > 1e-3).all()
+    (least,) = trace_variance([0.01 * noise[:5]], [none[0][:5]], still[:5], 0.04)
+    assert (least > 1e-3).all()
+
+
+def test_errors_that_the_fit_follows_count_too():
+    """Errors that are alike over a tenth of the whisker; the fit follows most of them."""
+    generator, share = np.random.default_rng(1), np.exp(-1.0 / 4.0)
+    noise = generator.normal(size=(200, 48))
+    for k in range(1, 48):
+        noise[:, k] = share * noise[:, k - 1] + np.sqrt(1.0 - share**2) * noise[:, k]
+    basis = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, 48), 7))[0]
+    left = noise - noise @ basis @ basis.T
+    designs, covariance = (
+        np.broadcast_to(basis, (200, 48, 7)),
+        np.broadcast_to(np.eye(7), (200, 7, 7)),
+    )
+    (found,) = trace_variance([left], [designs], covariance, 0.04, even=True)
+    assert np.median(found) == pytest.approx((1.0 + share) / (1.0 - share), rel=0.3)
 
 
 def test_parts_of_a_whisker_are_trusted_as_far_as_their_residuals_allow():
     """The last quarter of one view scatters three times as much as all else."""
     noise = np.random.default_rng(0).normal(size=(2, 100, 48))
     noise[1, :, 36:] *= 3.0
-    first, second = trace_variance(list(noise), np.zeros(100), 0.04)
+    none, still = [np.zeros((100, 48, 1))] * 2, np.zeros((100, 1, 1))
+    first, second = trace_variance(list(noise), none, still, 0.04)
     for view, points, expected in ((first, slice(0, 48), 1.0), (second, slice(0, 34), 1.0)):
         assert np.median(view[:, points]) == pytest.approx(expected, rel=0.25)
     assert np.median(second[:, 38:48]) == pytest.approx(9.0, rel=0.25)
-    same = trace_variance(list(noise), np.zeros(100), 0.04, even=True)
+    same = trace_variance(list(noise), none, still, 0.04, even=True)
     assert all(np.ptp(view, axis=1).max() == 0.0 for view in same)
 
 

@@ -195,12 +195,44 @@ def test_light_contacts_begin_near_those_of_the_frames_before_and_after():
     assert np.abs(found[:, 0] - contact[:, 0]).max() < 0.1
 
 
+def test_a_lower_minimum_along_the_whisker_is_found():
+    """The fit is stopped where the contact is a millimetre from the one that was pressed."""
+    from vibrissa.tracking.refine.profile import profiled
+
+    whisker = Whisker.parabola(length=30e-3, coefficient=10.0)
+    fitter, pose, _, s = pressed(whisker)
+    problem, state, _ = fitter._problem(whisker, pose).trusted()
+    away = state.contact + np.array([1e-3 / whisker.length, 0.0, 0.0, 0.0])
+    stopped = replace(problem, begun=replace(state, contact=away))
+    before, linear = replace(stopped, options=FitOptions(rounds=0)).solved()
+    assert (before.contact == away).all()
+    after, _, covariance = profiled(problem, before, linear)
+    np.testing.assert_allclose(after.contact[:, 0] * whisker.length, s, atol=100e-6)
+    assert (np.linalg.eigvalsh(covariance) > 0.0).all()
+
+
+def test_a_slip_makes_the_frame_before_it_uncertain():
+    """While that frame is exposed the whisker may be on both sides of the slip."""
+    whisker = Whisker.parabola(length=30e-3, coefficient=10.0)
+    fitter, pose, _, _ = pressed(whisker)
+    free = whisker.centerline(101)
+    for view, camera in enumerate(fitter.cameras):
+        fitter.traces.line[5:, view] = camera.project(free)
+    fitter.curves[5:] = free
+    fitter.touching[5:] = False
+    found = fitter.fit(whisker, pose, 65)
+    spread = np.sqrt(found.contact_covariance[:, 1, 1])
+    away = np.linalg.norm(found.contact_point[4] - free, axis=1).min()
+    assert spread[4] > 0.03 * away
+    assert (spread[1:4] < 0.015 * away).all()
+
+
 def test_a_step_to_a_contact_that_no_rod_withstands_is_not_taken():
     from vibrissa import samples
     from vibrissa.cameras import orthogonal_views
     from vibrissa.rod import discretize
     from vibrissa.tracking import FitOptions, HeadPose, Trace, TraceSeries
-    from vibrissa.tracking.refine.fit import Problem
+    from vibrissa.tracking.refine.problem import Problem
     from vibrissa.tracking.refine.rods import State
     from vibrissa.tracking.trace.trace import even
 

@@ -28,8 +28,9 @@ from vibrissa.tracking.recording import (
     tracked_recording,
 )
 from vibrissa.tracking.refine.continuation import continued
-from vibrissa.tracking.refine.fit import FitOptions, Fitter, RodFit
+from vibrissa.tracking.refine.fit import Fitter, RodFit
 from vibrissa.tracking.refine.optics import Optics, rough_optics, stated_lenses
+from vibrissa.tracking.refine.problem import FitOptions
 from vibrissa.tracking.refine.rods import TraceSeries, rolled
 from vibrissa.tracking.remarks import (
     remarks_on,
@@ -599,7 +600,6 @@ def tapered_as_it_bends(
     if some is None:
         return whisker, length
     at_base, at_tip = whisker.radius(np.array([0.0, whisker.length]))
-    cost = some.costs(min(length.shown, whisker.length))
 
     def thicker(share: float) -> Whisker:
         return whisker.with_properties(
@@ -607,12 +607,16 @@ def tapered_as_it_bends(
         )
 
     thinnest = (1.0 - at_tip / at_base) / (1.0 - 1.0 / morphology.MOST_TAPER) - 1.0
-    share, sigma = likeliest_taper(
-        length.sigma / length.value,
-        float(thinnest),
-        lambda share: cost(thicker(share), pose),
-        length.shown / length.value,
-    )
+
+    def cost(share: float) -> Callable[[float], float]:
+        # The first whisker sets the variance of the traces; a wrong taper would enlarge it.
+        of = some.costs(min(length.shown, whisker.length))
+        of(thicker(share), pose)
+        return lambda other: of(thicker(other), pose)
+
+    usual, shown = length.sigma / length.value, length.shown / length.value
+    share, _ = likeliest_taper(usual, float(thinnest), cost(0.0), shown)
+    share, sigma = likeliest_taper(usual, float(thinnest), cost(share), shown)
     found = thicker(share)
     tip = 100.0 * float(found.radius(whisker.length) / at_base)
     either = 100.0 * sigma * float(1.0 - at_tip / at_base) / (1.0 + share) ** 2

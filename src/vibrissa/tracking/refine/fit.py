@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +22,12 @@ from vibrissa.cameras import Camera
 from vibrissa.deferred import transform
 from vibrissa.numerics import Array, Mask
 from vibrissa.objects import Surface
-from vibrissa.rod import Discretization, discretize, solve_forces
-from vibrissa.tracking.refine.least_squares import Smoother, trace_variance
+from vibrissa.rod import discretize, solve_forces
+from vibrissa.tracking.refine.problem import REST, FitOptions, Linear, Problem
+from vibrissa.tracking.refine.profile import profiled
 from vibrissa.tracking.refine.rods import (
-    FAR,
-    UNKNOWNS,
     State,
     TraceSeries,
-    bent,
     contact_slopes,
     first_contacts,
     rods,
@@ -40,16 +37,6 @@ from vibrissa.tracking.space.rest_shape import Length
 from vibrissa.tracking.trace.trace import correlated
 from vibrissa.whisker import Whisker
 
-# Levenberg's damping: initial, smallest, and that at which the fit ends.
-_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-8, 1e6
-_SMALL = 1e-4  # relative decrease of the cost for another iteration
-_HELD = 1e8  # weight with which frames without contact keep the contact at rest
-# Unknowns across the plane z = 0: a shift, turns about two axes; the force across it.
-_ACROSS = (slice(2, 5), slice(9, 10))
-# Contact of a free frame: no force, half-way along the whisker.
-_REST = np.array([0.5, 0.0, 0.0, 0.0])
-# Standard deviation of the force along the whisker if there is none across, in units of EI/L².
-_RUBBING = 1e-4
 _WAVES = 8  # number of waves along the whisker for common errors of a view's traces
 # Standard deviation of the shift by light from the side at the base, pixels, less where the whisker
 # is thinner, if its profile shows no more; that shift over the profile's third cumulant, in radii,
@@ -72,37 +59,9 @@ _PROXIMAL = 0.7  # share of the whisker that determines the roll of its frame
 _ENDS = (3.5, 1.0)
 # Unknowns of a contact without friction: arc length and the force across the whisker.
 _FREE = [0, 2, 3]
-_ROLLED = np.radians(3.0)  # standard deviation of the roll before its variation is known, rad
-_WILD = 1e6  # slopes of points of a rod, in units of L, above which it is not in equilibrium
 # Change of the inverse length, as a share, up to which its effects are linear, and the largest.
 _LINEAR, _MOST_UNSURE = 0.04, 0.6
 _CURVED = 0.05  # distance of points that show the curvature at a contact, as a share of the length
-_HALVED = 6  # largest number of times that initial forces without equilibrium are halved
-
-
-@dataclass(frozen=True)
-class FitOptions:
-    """Smoothness of motion and contact over time, and the end of the fit.
-
-    Standard deviations of second differences are those at 1,000 frames/s; at other rates they scale
-    with the square of the time between frames.
-    """
-
-    turning: float = 2e-3  # standard deviation of second differences of the base's orientation, rad
-    moving: float = 2e-5  # standard deviation of second differences of the base's position, m
-    sliding: float = 2e-4  # standard deviation of second differences of the contact's arc length, m
-    # Standard deviation of second differences of the contact force, in units of EI/L² at the base.
-    pressing: float = 0.05
-    # Standard deviation of the force along the whisker, as a share of that across it; 0 is a
-    # contact without friction.
-    friction: float = 0.1
-    # Smallest standard deviation of the roll about what it is expected to be, rad.
-    roll: float = np.radians(0.5)
-    surface: float = 3e-5  # standard deviation of the distance of contacts from known objects, m
-    # Smallest standard deviation of traces that residuals may show, as a share of the stated one;
-    # at least 1 where a trace is a line between few points (`Trace.sparse`).
-    sharpest: float = 0.2
-    rounds: int = 12  # largest number of Gauss–Newton steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,8 +108,9 @@ class Fitter:
     ) -> RodFit:
         """Fit a whisker of approximate pose, whose length may be uncertain."""
         problem, state, linear = self._problem(whisker, pose).trusted()
+        state, linear, spread = profiled(problem, state, linear)
         length = length or Length(whisker.length, 0.0)
-        found = _answer(problem, state, linear, nodes, length)
+        found = _answer(problem, state, linear, spread, nodes, length)
         return _whole(_in_laboratory(found, problem.head), problem.frames, len(self.curves))
 
     def misfits(self, whisker: Whisker, pose: BasePose) -> Array:
@@ -199,7 +159,7 @@ class Fitter:
         start = State(
             pose.rotation[frames], pose.position[frames] / d.length, np.zeros((len(frames), 4))
         )
-        start.contact[:, 0] = _REST[0]
+        start.contact[:, 0] = REST[0]
         if begun is None:
             start.contact[touching] = first_contacts(d, start, self.curves[frames], touching)
         return Problem(
@@ -218,215 +178,7 @@ class Fitter:
         )
 
 
-class _Linear(NamedTuple):
-    """Normal equations at a state, and their ingredients."""
-
-    smoother: Smoother
-    cost: float
-    misfit: Array
-    wild: Mask
-    data: Array
-    misses: list[Array]
-    ends: list[Array]
-    designs: list[Array]
-    weights: list[Array]
-
-    def left(self, rows: Mask) -> list[Array]:
-        """Means over some frames of the residuals of each view, pixels."""
-        found = []
-        for misses, weight in zip(self.misses, self.weights, strict=True):
-            sharp = weight[rows, :-2]
-            pixels = np.divide(misses[rows], sharp, out=np.zeros(sharp.shape), where=sharp > 0.0)
-            found.append(pixels.sum(axis=0) / np.maximum((sharp > 0.0).sum(axis=0), 1))
-        return found
-
-
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """Equations of a fit: traces, motion over time, and the initial state."""
-
-    whisker: Whisker
-    d: Discretization
-    cameras: Sequence[Camera]
-    traces: TraceSeries
-    touching: Mask
-    frames: NDArray[np.intp]
-    start: State
-    rate: float
-    options: FitOptions
-    head: HeadPose
-    objects: Sequence[Surface] = ()
-    begun: State | None = None
-    variance: list[Array] | None = None
-    shown: float = 1.0
-
-    def trusted(self, even: bool = False) -> tuple[Problem, State, _Linear]:
-        """The problem with traces weighted by their residuals, and its solution."""
-        loose = replace(self.options, roll=max(self.options.roll, _ROLLED))
-        state, fit = replace(self, options=loose).solved()
-        covariance = fit.smoother.covariances()
-        fitted = np.einsum("tij,tji->t", covariance, fit.data)
-        variance = trace_variance(fit.misses, fitted, self.options.sharpest**2, even)
-        options = replace(loose, roll=self._unexpected(state, covariance, loose.roll))
-        problem = replace(self, begun=state, variance=variance, options=options)
-        return (problem, *problem.solved())
-
-    def _unexpected(self, state: State, covariance: Array, loose: float) -> float:
-        """Standard deviation of the roll in contact from that expected by free frames, rad.
-
-        Contact moves a whisker to where no free frame shows its roll. Bent rods with a nearly free
-        roll show it, each with its own uncertainty.
-        """
-        axis = state.rotation[:, :, 0]
-        known = np.einsum("ti,tij,tj->t", axis, covariance[:, 3:6, 3:6], axis) / loose**2
-        share = 1.0 - known
-        rows = self.touching & (share > 0.5)
-        if not rows.any():
-            return loose
-        rolled, share = (self._turned(state) * axis).sum(axis=1)[rows], share[rows]
-        square = float(np.mean((rolled / share) ** 2 - loose**2 * known[rows] / share))
-        return min(float(np.sqrt(max(square, self.options.roll**2))), loose)
-
-    def _turned(self, state: State) -> Array:
-        """Rotation of the base since the start (time, 3), rad, in the head's axes."""
-        turn = state.rotation @ np.swapaxes(self.start.rotation, 1, 2)
-        return np.asarray(transform.Rotation.from_matrix(turn).as_rotvec())
-
-    def solved(self) -> tuple[State, _Linear]:
-        """Gauss-Newton iteration with Levenberg's damping."""
-        state, damping = self.begun or self.start, _DAMPING
-        fit = self.linear(state)
-        for _ in range(_HALVED):
-            if not fit.wild.any():
-                break
-            # A force that another rod withstands may exceed the limit of this one.
-            factor = np.where(fit.wild[:, None], [1.0, 0.5, 0.5, 0.5], 1.0)
-            state = replace(state, contact=state.contact * factor)
-            fit = self.linear(state)
-        for _ in range(self.options.rounds):
-            step = fit.smoother.solved(damping)
-            trial = state.moved(step)
-            tried = self.linear(trial)
-            if tried.wild.any():
-                # A contact near the thin tip easily gets a force without an equilibrium.
-                contact = np.where(tried.wild[:, None], state.contact, trial.contact)
-                trial = replace(trial, contact=contact)
-                tried = self.linear(trial)
-            if tried.cost < fit.cost:
-                small = fit.cost - tried.cost < _SMALL * fit.cost
-                state, fit = trial, tried
-                damping = max(damping / 5.0, _LEAST_DAMPING)
-                if small:
-                    break
-            else:
-                damping *= 10.0
-                if damping > _MOST_DAMPING:
-                    break
-        return state, fit
-
-    def linear(self, state: State) -> _Linear:
-        """Linearise at a state; rods without equilibrium count as infinitely far away."""
-        points, slopes = bent(self.d, state, self.touching, self.shown)
-        wild = ~(np.abs(slopes).max(axis=(1, 2, 3)) < _WILD)
-        points[wild], slopes[wild] = state.position[wild, None], 0.0
-        points = self.head.put_in(points * self.d.length)
-        slopes = np.einsum("tij,tnjk->tnik", self.head.rotation, slopes)
-        with_ends = np.concatenate([slopes, slopes[:, [0, -1]]], axis=1)
-        hessian = np.zeros((len(points), UNKNOWNS, UNKNOWNS))
-        gradient = np.zeros((len(points), UNKNOWNS))
-        total, count, weighted = np.zeros((3, len(points)))
-        along, ends, designs, weights = [], [], [], []
-        for view, camera in enumerate(self.cameras):
-            pixels, by_point = camera.project_with_slopes(points)
-            rows, misses, sharp = self.traces.equations(view, pixels, by_point * self.d.length)
-            design = np.einsum("tni,tnij->tnj", rows, with_ends)
-            weight = np.ones(misses.shape) if self.variance is None else 1.0 / self.variance[view]
-            trusted = design * weight[..., None]
-            hessian += np.einsum("tni,tnj->tij", trusted, design)
-            gradient += np.einsum("tni,tn->ti", trusted, misses)
-            weighted += (weight * misses**2).sum(axis=1)
-            total += (misses**2).sum(axis=1)
-            count += (misses != 0.0).sum(axis=1)
-            # The last two are errors of the ends along the trace.
-            along.append(np.where(wild[:, None], 0.0, misses[:, :-2]))
-            ends.append(misses[:, -2:])
-            designs.append(trusted)
-            weights.append(sharp)
-        misfit = np.sqrt(total / np.maximum(count, 1.0))
-        weighted[wild] = np.inf
-        smoother = Smoother(hessian, gradient)
-        cost = float(weighted.sum()) + self._priors(smoother, state)
-        cost += self._touched(smoother, state)
-        return _Linear(smoother, cost, misfit, wild, hessian, along, ends, designs, weights)
-
-    def _touched(self, smoother: Smoother, state: State) -> float:
-        """Pull contacts to the surfaces of known objects; return the cost."""
-        cost = 0.0
-        if not self.objects:
-            return cost
-        points, slopes, _ = contact_slopes(self.d, state)
-        points = self.head.put_in((points + state.position) * self.d.length)
-        radius = self.whisker.radius(state.contact[:, 0] * self.d.length)
-        for i in np.flatnonzero(self.touching):
-            found = [thing.local_geometry(points[i]) for thing in self.objects]
-            distance, normal, _ = min(found, key=lambda one: abs(one[0]))
-            # A contact far from all objects touches something else.
-            gap = (distance - radius[i]) / self.options.surface
-            weight = 1.0 / np.sqrt(max(abs(gap) / FAR, 1.0))
-            row = (
-                normal
-                @ self.head.rotation[i]
-                @ slopes[i]
-                * (weight * self.d.length / self.options.surface)
-            )
-            cost += smoother.add_row(int(i), row, weight * gap)
-        return cost
-
-    def _priors(self, smoother: Smoother, state: State) -> float:
-        o = self.options
-        slower = (1000.0 / self.rate) ** 2
-        turn = self._turned(state)
-        place = np.concatenate([state.position, turn, state.contact], axis=1)
-        # Second differences of the whole motion, of which the start is a part.
-        begun = _turning(self.start.rotation)
-        held = np.where(self.touching, 0.0, _HELD)[:, None]
-        cost = smoother.add_at(place[:, 6:], held, 6, _REST)
-        if len(self.cameras) == 1:
-            # One view shows what happens in its plane: no lift, no tilt, no force across it.
-            for unknowns in _ACROSS:
-                level = np.zeros(unknowns.stop - unknowns.start)
-                cost += smoother.add_at(
-                    place[:, unknowns], np.array([[_HELD]]), unknowns.start, level
-                )
-        across = np.linalg.norm(state.contact[:, 2:], axis=1)
-        rubbing = 1.0 / (o.friction * across + _RUBBING) ** 2
-        cost += smoother.add_at(place[:, 7:8], rubbing[:, None], 7, np.zeros(1))
-        axis = state.rotation[:, :, 0]
-        rolled = (turn * axis).sum(axis=1)
-        cost += smoother.add_along(axis, rolled, 3, 1.0 / o.roll)
-        together = np.diff(self.frames) == 1
-        pose = (1.0 / (o.moving / self.d.length), 1.0 / o.turning)
-        contact = (1.0 / (o.sliding / self.d.length), *[1.0 / o.pressing] * 3)
-        weight = np.array([pose[0]] * 3 + [pose[1]] * 3 + list(contact)) / slower
-        for i in range(1, len(place) - 1):
-            if not (together[i - 1] and together[i]):
-                continue
-            second = place[i - 1] - 2.0 * place[i] + place[i + 1]
-            second[3:6] += begun[i] - begun[i - 1]
-            scale = weight.copy()
-            if not self.touching[i - 1 : i + 2].all():
-                scale[6:] = 0.0
-            cost += smoother.add_second(i, second, scale)
-        return cost
-
-
-def _turning(rotation: Array) -> Array:
-    """Rotation vectors (t − 1, 3) from each frame to the next, laboratory axes."""
-    step = rotation[1:] @ np.swapaxes(rotation[:-1], 1, 2)
-    return np.asarray(transform.Rotation.from_matrix(step).as_rotvec())
-
-
-def _shared(problem: Problem, fit: _Linear) -> Array:
+def _shared(problem: Problem, fit: Linear) -> Array:
     """Changes (error, time, unknown) due to errors of traces that all frames share, one sigma each.
 
     Light from the side, a halo of compression or fur over the base shift a trace equally in many
@@ -492,7 +244,7 @@ def _scales(problem: Problem) -> list[float]:
     return [float(np.linalg.norm(slope, axis=1).max()) for slope in slopes]
 
 
-def _drawn(fit: _Linear) -> list[float]:
+def _drawn(fit: Linear) -> list[float]:
     """Largest residual of each view at the base that all frames share, pixels."""
     return [
         float(np.abs(left[: round(2.0 * _AT_BASE * len(left))]).max())
@@ -500,7 +252,7 @@ def _drawn(fit: _Linear) -> list[float]:
     ]
 
 
-def _frame_errors(problem: Problem, fit: _Linear) -> Array:
+def _frame_errors(problem: Problem, fit: Linear) -> Array:
     """Shifts and turns (2, 2, 3) of the whisker's frame, in its axes, due to its shape at the base.
 
     The shape follows the traces there, and the rod the shape: errors of the base, of its tangent
@@ -597,11 +349,13 @@ def _off_tangent(line: Array, share: Array, spread: Array) -> Array:
     return np.asarray(3.0 * aside[:, :, None] * aside[:, None])
 
 
-def _answer(problem: Problem, state: State, fit: _Linear, nodes: int, length: Length) -> RodFit:
+def _answer(
+    problem: Problem, state: State, fit: Linear, spread: Array, nodes: int, length: Length
+) -> RodFit:
     """Results in SI units, relative to the head."""
     d, touching = problem.d, problem.touching
     shared, misfit = _shared(problem, fit), fit.misfit
-    covariance = fit.smoother.covariances() + np.einsum("kti,ktj->tij", shared, shared)
+    covariance = spread + np.einsum("kti,ktj->tij", shared, shared)
     turned, slopes, slope = contact_slopes(d, state)
     point, wrench = _contacts(problem, state)
     force = wrench[:, :3] / d.force

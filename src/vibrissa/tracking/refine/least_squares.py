@@ -5,15 +5,20 @@ block banded, with two blocks on each side; they are solved by a banded Cholesky
 the covariance of each frame follows from a forward and a backward recursion over pairs of frames.
 
 The standard deviations of a trace come from the noise of its image. They do not contain the effects
-of compression, blur or a pattern of the background, and the residuals are correlated from point to
-point, since traces are smooth. So the variance of traces, relative to the stated one, is computed
-from the residuals m of the fit,
+of compression, blur or a pattern of the background, whose errors are alike in neighbouring points.
+Such errors look like a slightly different rod, so the fit follows most of them, and neither size
+nor correlation of the residuals r are those of the errors e. With derivatives D and covariance C of
+the unknowns,
 
-    v = τ Σ m² / (N − τ p),    τ = 1 + 2 Σ ρ_k,
+    r = R e,   R = 1 − D C Dᵀ,   ⟨r rᵀ⟩ = σ² R V Rᵀ,   V_jk = exp(−|j − k|/ℓ)  in each view.
 
-with N residuals and p fitted parameters; τ, the sum of their correlations over the points of the
-rod, is the number of neighbours that count as one. A frame that fits worse than usual is trusted
-less, and so is such a part of the whisker.
+The length ℓ is the one with which the diagonals of R V Rᵀ are in the same proportions as those of
+the residuals, and the variance of traces, relative to the stated one, is
+
+    v = τ Σ r² / tr(R V Rᵀ),    τ = coth(1/2ℓ),
+
+with τ the number of neighbouring points that count as one. A frame that fits worse than usual is
+trusted less, and so is such a part of the whisker.
 """
 
 from __future__ import annotations
@@ -21,14 +26,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vibrissa.deferred import linalg
 from vibrissa.numerics import Array
-from vibrissa.tracking.trace.trace import correlated
 
 # Share of the largest element that is added to diagonals, so that they can be factorised.
 _REGULAR = 1e-12
-_FREE = 0.25  # smallest share of the residuals that are free, however many numbers are fitted
+_FREE = 0.1  # smallest share of the errors that residuals show, however many numbers are fitted
+# Lengths over which errors are correlated that are tried, and largest lag compared, points; number
+# of frames for which it is computed what the fit follows.
+_LENGTHS, _LAGS, _FRAMES = (0.1, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 8.0), 12, 24
+_ODD = 4.0  # mean square of a frame's residuals, over the usual one, above which it is scaled down
 _NEAR = 2  # number of points to each side over which the variance along a trace is averaged
 
 
@@ -41,12 +50,12 @@ class Smoother:
         self.second = np.zeros_like(hessian)
         self.gradient = gradient.copy()
 
-    def add_at(self, values: Array, weight: Array, begin: int, target: Array) -> float:
-        """Pull unknowns, from index ``begin`` on, to a target; return the cost."""
+    def add_at(self, values: Array, weight: Array, begin: int, target: Array) -> Array:
+        """Pull unknowns, from index ``begin`` on, to a target; return the cost of each frame."""
         places = np.arange(begin, begin + values.shape[1])
         self.diagonal[:, places, places] += weight
         self.gradient[:, places] += weight * (target - values)
-        return float((weight * (values - target) ** 2).sum())
+        return np.asarray((weight * (values - target) ** 2).sum(axis=1))
 
     def add_row(self, i: int, row: Array, value: float) -> float:
         """Pull a combination of a frame's unknowns to zero; return the cost."""
@@ -54,12 +63,12 @@ class Smoother:
         self.gradient[i] -= row * value
         return value**2
 
-    def add_along(self, axis: Array, value: Array, begin: int, weight: float) -> float:
-        """Pull one direction of three unknowns to zero; return the cost."""
+    def add_along(self, axis: Array, value: Array, begin: int, weight: float) -> Array:
+        """Pull one direction of three unknowns to zero; return the cost of each frame."""
         part = slice(begin, begin + 3)
         self.diagonal[:, part, part] += weight**2 * axis[:, :, None] * axis[:, None, :]
         self.gradient[:, part] -= weight**2 * axis * value[:, None]
-        return float(((weight * value) ** 2).sum())
+        return np.asarray((weight * value) ** 2)
 
     def add_second(self, i: int, value: Array, weight: Array) -> float:
         """Pull the second difference at a frame to zero; return the cost."""
@@ -127,14 +136,18 @@ class Smoother:
 
 
 def trace_variance(
-    misses: Sequence[Array], fitted: Array, least: float, even: bool = False
+    misses: Sequence[Array],
+    designs: Sequence[Array],
+    covariance: Array,
+    least: float,
+    even: bool = False,
 ) -> list[Array]:
     """Variances (time, point) of each view's traces, relative to the stated ones.
 
-    ``misses`` are the residuals (time, point) of each view and ``fitted`` is the number of those
-    that each frame's unknowns follow; no variance is below ``least``. The variance varies along the
-    whisker, since a tip is often less accurate than stated, unless it is to be ``even``. Two
-    further points are the ends.
+    ``misses`` are the residuals (time, point) of each view, ``designs`` their derivatives (time,
+    point, unknown) and ``covariance`` that of each frame's unknowns; no variance is below
+    ``least``. The variance varies along the whisker, since a tip is often less accurate than
+    stated, unless it is to be ``even``. Two further points are the ends.
     """
     known = [one != 0.0 for one in misses]
     square = np.sum([(one**2).sum(axis=1) for one in misses], axis=0)
@@ -150,10 +163,44 @@ def trace_variance(
         for share, one, at in zip(along, misses, known, strict=True):
             total, number = _neighbours((one**2).T @ (1.0 / each)), _neighbours(at.sum(axis=0))
             np.divide(total, number, out=share, where=total > 0.0)
-    together = correlated([one / np.sqrt(share) for one, share in zip(misses, along, strict=True)])
-    spent = together * float(fitted[shown].sum()) / float(count[shown].sum())
-    variance = together * each / max(1.0 - spent, _FREE)
+    miss, design = (np.concatenate(parts, axis=1) for parts in (misses, designs))
+    size = np.sqrt(np.concatenate(along))
+    some = np.flatnonzero(shown)
+    some = some[np.linspace(0, len(some) - 1, min(_FRAMES, len(some))).astype(int)]
+    follows = design[some] @ covariance[some] @ np.swapaxes(design[some], 1, 2)
+    odd = np.sqrt(np.maximum(each / (_ODD * usual), 1.0))[:, None]
+    follows = follows * size / size[:, None]
+    together, left = _correlation(miss / (odd * size), some, follows, len(misses))
+    variance = together * each / left
     return [np.maximum(np.outer(variance, [*share, 1.0, 1.0]), least) for share in along]
+
+
+def _correlation(
+    miss: Array, some: NDArray[np.intp], follows: Array, views: int
+) -> tuple[float, float]:
+    """Number of neighbouring errors that count as one, and the share of them in the residuals.
+
+    The fit ``follows`` errors (some, point, point) of some of the frames.
+    """
+    n = miss.shape[1] // views
+    known = (miss[some] != 0.0).astype(np.float64)
+    remains = known[:, :, None] * (np.eye(views * n) - follows) * known[:, None]
+    lags = range(min(_LAGS, n // 2) + 1)
+
+    def diagonals(moments: Array) -> Array:
+        within = np.einsum("vivj->ij", moments.reshape(views, n, views, n))
+        return np.array([np.trace(within, offset=lag) for lag in lags])
+
+    shown = diagonals(miss.T @ miss)
+    apart = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    best = (np.inf, 1.0, 1.0)
+    for length in _LENGTHS:
+        errors = np.kron(np.eye(views), np.exp(-apart / length))
+        moments = diagonals((remains @ errors @ np.swapaxes(remains, 1, 2)).sum(axis=0))
+        differs = float(((shown / shown[0] - moments / moments[0]) ** 2).sum())
+        left = float(moments[0] / known.sum())
+        best = min(best, (differs, 1.0 / float(np.tanh(0.5 / length)), max(left, _FREE)))
+    return best[1:]
 
 
 def _neighbours(numbers: Array) -> Array:

@@ -120,7 +120,7 @@ _STARTS = np.array([0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])
 # common; how far contacts usually slide from frame to frame, in units of L; and the distance of a
 # rod that is not in balance.
 _UNLIKE, _SLIDES, _WORST = 4.0, 0.05, 1e6
-_LIMITS = (0.1, 0.995)  # smallest and largest arc length of a contact, in units of L
+LIMITS = (0.1, 0.995)  # smallest and largest arc length of a contact, in units of L
 # Steps of differences by arc length and force, in units of L and EI/L².
 _STEPS = (1e-5, 1e-4, 1e-4, 1e-4)
 _FRAMES, _TURNS = 9, 24  # numbers of frames and of rolls from which that of a bent whisker is found
@@ -138,8 +138,27 @@ class State:
         """Change by (t, 10): shift, turn about the axes in which it is held, contact."""
         turn = transform.Rotation.from_rotvec(step[:, 3:6]).as_matrix()
         contact = self.contact + step[:, 6:]
-        contact[:, 0] = np.clip(contact[:, 0], *_LIMITS)
+        contact[:, 0] = np.clip(contact[:, 0], *LIMITS)
         return State(turn @ self.rotation, self.position + step[:, :3], contact)
+
+    def rows(self, rows: NDArray[np.intp]) -> State:
+        """Select frames."""
+        return State(self.rotation[rows], self.position[rows], self.contact[rows])
+
+    def put(self, rows: NDArray[np.intp], other: State) -> State:
+        """The same with some frames of another state."""
+        new = {name: array.copy() for name, array in vars(self).items()}
+        for name, array in vars(other).items():
+            new[name][rows] = array
+        return State(**new)
+
+    def step_to(self, other: State) -> Array:
+        """Step (t, 10) that moves here to another state; see `moved`."""
+        turn = other.rotation @ np.swapaxes(self.rotation, 1, 2)
+        about = transform.Rotation.from_matrix(turn).as_rotvec()
+        return np.concatenate(
+            [other.position - self.position, about, other.contact - self.contact], axis=1
+        )
 
     def scaled(self, ratio: float) -> State:
         """The same in units of another length; the ratio is the old one over the new."""

@@ -76,6 +76,7 @@ def test_a_cylinder_is_not_proved():
     assert sum(part.evaluated for part in found.parts.values()) == 0
 
 
+@pytest.mark.slow
 def test_a_curved_whisker_with_wrong_signs_is_refuted_at_once(steep):
     found = certify(steep, np.deg2rad(3.0))
     assert not found.proved
@@ -85,6 +86,7 @@ def test_a_curved_whisker_with_wrong_signs_is_refuted_at_once(steep):
     assert "is certainly wrong" in certain.refuted
 
 
+@pytest.mark.slow
 def test_the_smallest_cone_of_a_grid_is_that_from_where_on_no_sign_is_wrong(steep):
     cone = smallest_cone(steep)
     # Its determinant changes sign at 5.23°; forces begin a little within the cone.

@@ -25,6 +25,7 @@ def own(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_simulated_looked_into_and_drawn(own, tmp_path):
     trial = tmp_path / "face.nc"
     quick = ("--duration", 0.1, "--rate", 250, "--no-noise")

@@ -263,6 +263,7 @@ def test_lines_between_few_points_are_not_trusted_beyond_their_noise(trial):
     assert spread[0] > 4.0 * spread[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("write", "program"),
     [(nwb, "NWB"), pytest.param(labels, "SLEAP", marks=pytest.mark.slow)],
@@ -296,6 +297,7 @@ def test_two_views_to_the_contour(trial, tmp_path, write, program):
     assert "pose_covariance" in run("info", out, "--all")
 
 
+@pytest.mark.slow
 def test_points_in_space_and_one_view_of_a_plane(trial, tmp_path):
     truth, line = trial
     noise = np.random.default_rng(2).normal(0.0, 5e-6, line.shape)
@@ -314,6 +316,7 @@ def test_points_in_space_and_one_view_of_a_plane(trial, tmp_path):
     assert np.median(np.abs(arcs)) < 3e-4
 
 
+@pytest.mark.slow
 def test_a_table_of_anipose_to_a_recording(trial, tmp_path):
     truth, line = trial
     points = 1e3 * line[:, 0] + np.random.default_rng(2).normal(0.0, 5e-3, line[:, 0].shape)

@@ -65,6 +65,7 @@ def test_the_whole_map(chart):
     assert f"wrote {out}" in text
 
 
+@pytest.mark.slow
 def test_twins_are_beside_the_advice(chart, monkeypatch, capsys):
     verdicts = chart.with_name("uniqueness.nc")
     asked = {"regions": ["all"], "samples": 64, "resolution": False}

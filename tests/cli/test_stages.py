@@ -118,6 +118,7 @@ def test_one_command_does_all_by_defaults_that_it_says(folder, tmp_path):
     assert set(load_recording(folder / "tracked.nc").children) == {"whiskers"}
 
 
+@pytest.mark.slow
 def test_the_table_of_a_contour_goes_along_with_it_and_nothing_else_does(work, tmp_path):
     """A second shape needs no --force, for what the table held is what the recording held."""
     table = tmp_path / "t_contour.csv"
@@ -149,6 +150,7 @@ def test_what_is_asked_for_is_made_anew(work):
     assert "estimates" not in load_recording(work).children
 
 
+@pytest.mark.slow
 def test_contacts_near_the_base_can_be_left_out(work):
     """As with `estimate`; the map is simulated, and the contacts are estimated anew."""
     result = run("reconstruct", work, "--proximal", 0.6, "--force")
@@ -170,6 +172,7 @@ def test_a_shape_that_does_not_fit_is_said(whole, work):
     assert "A cylinder fits them better" in text
 
 
+@pytest.mark.slow
 def test_another_whisker_makes_signals_and_contacts_anew(folder, tmp_path):
     work = tmp_path / "t.nc"
     done("signals", folder / "tracked.nc", "--cutoff", 60, "-o", work)
@@ -237,6 +240,7 @@ def test_what_does_not_fit_is_said(folder, monkeypatch, words, said):
     assert {p.name: p.read_bytes() for p in folder.iterdir()} == before
 
 
+@pytest.mark.slow
 def test_a_whisker_that_is_missing_can_be_given(folder, tmp_path):
     out = tmp_path / "given.nc"
     done("signals", folder / "bare.nc", "--whisker", folder / "map.nc", "-o", out)

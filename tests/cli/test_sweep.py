@@ -71,6 +71,7 @@ def test_a_failed_cell_shows_in_the_exit_status(tmp_path):
         assert "map: 1 done, 1 failed" in result.output
 
 
+@pytest.mark.slow
 def test_done_shown_and_not_done_again(study, tmp_path):
     store = tmp_path / "s.zarr"
     said = done("sweep", study, "-o", store, "--workers", 0)

@@ -124,6 +124,7 @@ def test_clicks_are_saved_and_used_again(videos, tmp_path, monkeypatch):
     assert "is used: bases of 1 whiskers, 2 masks and regions, a pixel of 0.06 mm" in line
 
 
+@pytest.mark.slow
 def test_a_mask_hides_what_is_in_it_and_a_region_what_is_not(videos, tmp_path):
     """The whisker's half beyond a column is masked: no part of it is seen there."""
     cameras = ["--cameras", videos / "cameras.toml"]
@@ -143,6 +144,7 @@ def test_a_mask_hides_what_is_in_it_and_a_region_what_is_not(videos, tmp_path):
     assert "with a view from 0 to 1" in str(done.exception)
 
 
+@pytest.mark.slow
 def test_the_stated_radius_is_that_of_the_base_inside_the_fur(videos, tmp_path):
     """The whisker is thinner where the fur ends; the error of all forces is one number."""
     out = tmp_path / "t.nc"
@@ -162,6 +164,7 @@ def test_the_stated_radius_is_that_of_the_base_inside_the_fur(videos, tmp_path):
     assert "cut it there" in str(done.exception)
 
 
+@pytest.mark.slow
 def test_several_trials_go_to_a_folder(videos, tmp_path):
     (tmp_path / "second_top.mkv").write_bytes((videos / "top.mkv").read_bytes())
     words = [videos / "top.mkv", videos / "front.mkv", tmp_path / "second_top.mkv"]
@@ -199,6 +202,7 @@ def test_what_is_traced_is_not_traced_again(videos, tmp_path, monkeypatch):
     assert out.exists()
 
 
+@pytest.mark.slow
 def test_what_is_known_besides_the_videos_is_used(videos, tmp_path):
     out, head = tmp_path / "trial.nc", tmp_path / "head.csv"
     names = "frame,x,y,z,azimuth,elevation,roll"
@@ -284,6 +288,7 @@ def test_traces_are_kept_for_their_own_video_only(tmp_path):
     assert load_traces(tmp_path / "t.npz", "this") is None
 
 
+@pytest.mark.slow
 def test_one_video_is_tracked_in_its_plane_and_reconstructed(videos, tmp_path):
     out = tmp_path / "side.nc"
     words = ["track", videos / "top.mkv", "--pixel-size", 0.058, "-o", out]
@@ -320,6 +325,7 @@ def test_a_mirror_gives_two_views_in_one_video(videos, tmp_path):
     np.testing.assert_array_equal(two, files)
 
 
+@pytest.mark.slow
 def test_frames_that_the_rod_does_not_explain_are_in_doubt_and_swapped_names_noted(
     videos, tmp_path, monkeypatch
 ):

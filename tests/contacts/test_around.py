@@ -12,6 +12,7 @@ PIPE = Peg([0.055, 0.138, 0.0], [0.3, 0.0, 1.0], 0.14)
 NAMES = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 
 
+@pytest.mark.slow
 def test_an_arc_is_found_with_the_object():
     d = discretize(WIRE)
     scale = np.repeat([d.force, d.moment], 3)
@@ -52,6 +53,7 @@ def test_an_arc_is_found_with_the_object():
     assert int(wrong.status) == vb.Status.NOT_FRICTIONLESS
 
 
+@pytest.mark.slow
 def test_regions_hold_a_contact_between_coarse_nodes():
     """Against a wall the γ whisker's first contact is known to 10 µm across it."""
     whisker = vb.samples.gamma()

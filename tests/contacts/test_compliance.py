@@ -62,6 +62,7 @@ def test_true_contacts_are_in_the_regions(gamma_map, sigma, using):
         assert (found.status == vb.Status.UNIQUE).mean() > 0.95
 
 
+@pytest.mark.slow
 def test_friction_and_an_uncertain_base_are_found_together(gamma_map, sigma):
     whisker, rng = gamma_map.whisker, np.random.default_rng(9)
     unit, truth, wrenches = whisker.base_bending_stiffness / whisker.length**2, [], []

@@ -68,6 +68,7 @@ def held(known, points, probable, length):
     return probable @ (squares < 7.81), probable @ (squares < 14.16)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("s", "force"), [(0.7, 0.03), pytest.param(0.85, 0.04, marks=pytest.mark.slow)]
 )
@@ -86,6 +87,7 @@ def test_a_light_contact_that_begins_is_known_as_its_posterior_states(gamma_map,
     assert nearly_all > 0.99
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, pytest.param(0.2, marks=pytest.mark.slow), 1.0])
 def test_contacts_lighter_than_the_noise_are_as_unknown_as_their_posterior(gamma_map, share):
     """Ten samples, also of a contact without any force: only where it is not is then known."""

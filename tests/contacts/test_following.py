@@ -111,6 +111,7 @@ def test_two_moments_and_a_moving_base_locate_a_contact(wire):
     assert 1.0 < np.mean(squares) < 5.0
 
 
+@pytest.mark.slow
 def test_an_uncertain_stiffness_is_not_averaged_away(wire):
     """A whisker 3 % stiffer than its map, or softer: the same error in all samples."""
     time, point = np.arange(0.0, 0.2, 0.005), np.array([0.18, 0.03, 0.01])

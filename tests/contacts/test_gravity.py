@@ -130,6 +130,7 @@ def test_regions_of_light_contacts_hold_what_they_state(nitinol):
     assert np.nanmin(found.candidates.arc_length) > 0.3 * whisker.length - 1e-9
 
 
+@pytest.mark.slow
 def test_uncertain_direction_and_density_are_in_the_covariance(nitinol):
     whisker, rng = nitinol.whisker, np.random.default_rng(3)
     level = np.array([0.0, 0.0, -G])
@@ -505,6 +506,7 @@ def test_a_free_whisker_on_a_moving_base_reads_what_an_independent_integration_r
     np.testing.assert_allclose(read / scale, (known - known[0]) / scale, atol=3e-8)
 
 
+@pytest.mark.slow
 def test_contacts_of_a_moving_base_are_those_of_an_independent_integration(nitinol):
     """Tared free in a pose that no grid of directions holds, then touched in another."""
     rows = [line.split(",") for line in REFERENCE.read_text().splitlines()[1:]]

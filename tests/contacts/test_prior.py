@@ -155,6 +155,7 @@ def test_samples_of_a_curve_are_those_that_are_possible(gamma_map, bent):
     assert partly > 5
 
 
+@pytest.mark.slow
 def test_a_filter_begins_where_contacts_are_possible(gamma_map, bent):
     i = int(np.flatnonzero(concave_backward(gamma_map.whisker, bent[2]))[0])
     signals = vb.base_signals(bent[0][i], bent[1][i])

@@ -164,6 +164,7 @@ def test_a_calibration_from_data_is_as_sure_as_it_says(gamma_map, bent, wrench, 
     assert np.mean(narrow) > 10.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [1, 30])
 def test_a_filter_does_not_average_an_error_of_gain_away(gamma_map, bent, wrench, number):
     """After many samples of a contact that stands still the covariance holds the error."""

@@ -94,6 +94,7 @@ def whisker():
     return vb.Whisker.parabola(length=40e-3, coefficient=8.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("friction", "rubbing"), [(0.0, 0.0), (0.3, 0.2)])
 def test_false_alarms_are_as_rare_as_stated(whisker, friction, rubbing):
     force, moment, line = touched(whisker, 0.0, rubbing)

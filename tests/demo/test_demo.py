@@ -188,6 +188,7 @@ def test_from_video_the_peg_is_found(from_video):
         assert abs(one.scores.diameter_error) < 0.2e-3
 
 
+@pytest.mark.slow
 def test_a_report_of_the_trial_has_the_same_errors(from_video, folder, sections):
     """Its whisker is the one that was tracked, not quite of the shape of the one that whisked."""
     for name, one in (("trial.nc", from_video.sensed), ("seen.nc", from_video.seen)):
@@ -283,6 +284,7 @@ def test_what_was_done_is_not_done_again(from_video, folder, monkeypatch):
         run_demo(output=folder, **{**FILMED, "seed": 3})
 
 
+@pytest.mark.slow
 def test_stopped_while_filming_it_goes_on_with_the_next_view(tmp_path, monkeypatch):
     film, filmed = vb.simulation.film, []
 

@@ -77,6 +77,7 @@ def test_a_straight_cylinder_is_not():
     assert float(first.Fx) == pytest.approx(-(float(first.MB) ** 2) / (2 * stiffness), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_straight_whisker_never_twists(straight):
     with_twist = [" ".join(t) for t in TRIPLETS if "Mx" in t]
     found = vb.uniqueness(straight, with_twist, ["all", "ELD CB"], samples=64, resolution=False)
@@ -178,6 +179,7 @@ def test_the_known_pair_of_a_strongly_curved_whisker(strongly_curved):
     np.testing.assert_allclose(pairs.second.xi[0], [0.645, 0.440, 0.0], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_cone_of_a_strongly_curved_whisker(strongly_curved):
     found = vb.uniqueness(strongly_curved, ["Fx MB MD"], samples=512, resolution=False)
     cell = found.sel(triplet="Fx MB MD", region="all")
@@ -226,6 +228,7 @@ def test_critical_cones_do_not_depend_on_the_seed(gamma_map):
     assert one[1, 0] > 31.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, pytest.param(3, marks=pytest.mark.slow)])
 def test_climbs_begin_beyond_folds_and_end_on_a_rod_that_has_converged(gamma_map, seed):
     asked = ["Fx FD MB", "FD MB MD"]
@@ -238,6 +241,7 @@ def test_climbs_begin_beyond_folds_and_end_on_a_rod_that_has_converged(gamma_map
     assert cone[1, 1] == pytest.approx(34.721, abs=5e-3)
 
 
+@pytest.mark.slow
 def test_twins_of_a_whisker_of_slight_taper_are_climbed_to_their_summit():
     """F_x and M_B are nearly dependent there: determinants are small, yet signals fix contacts."""
     slight = charted(vb.Whisker.parabola(39.4e-3, 0.2 / 39.4e-3, tip_radius=100e-6 / 1.5))
@@ -272,6 +276,7 @@ def test_verdicts_do_not_hang_on_stiffness_or_size(of_curved):
     assert np.abs(found.critical_cone - expected.critical_cone).max() < np.deg2rad(0.5)
 
 
+@pytest.mark.slow
 def test_trimming_the_tip_only_shrinks_the_region(curved):
     whole = curved.whisker
     trimmed = whole.trimmed(0.8 * whole.length)
@@ -295,6 +300,7 @@ def test_shares_grow_with_the_tolerance(of_curved):
     assert float(total.sel(region="CF") + total.sel(region="CB")) == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_resolution_is_what_a_dense_search_finds(straight):
     found = vb.uniqueness(straight, ["Fx MB MD"], ["all"], samples=256)
     share = float(found.ambiguous_share.sel(signal_tolerance=1e-2).squeeze())
@@ -416,6 +422,7 @@ def test_wrong_questions_are_answered_with_what_is_allowed(straight, arguments, 
         vb.uniqueness(straight, **arguments)
 
 
+@pytest.mark.slow
 def test_what_only_coarse_steps_make_equal_is_no_witness():
     # Near the base few steps are left: there the rod errs by more than twins' signals differ.
     whisker = vb.Whisker.parabola(40e-3, 10.0)
@@ -448,6 +455,7 @@ def test_the_plane_of_a_whisker_may_be_turned(of_curved):
     assert f"{np.rad2deg(turn):.4g}°" in surface
 
 
+@pytest.mark.slow
 def test_nothing_outside_the_cone(curved):
     found = vb.uniqueness(curved, ["Fx MB MD"], cone=1.55, samples=64)
     assert (found.verdict == "no contacts").all()

@@ -144,6 +144,7 @@ def check(rows, folder):
         assert left == [name]
 
 
+@pytest.mark.slow
 def test_every_writer_leaves_what_was_there(tmp_path, trial):
     check(run(WRITERS, tmp_path, 1000, trial), tmp_path)
 

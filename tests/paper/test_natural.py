@@ -34,6 +34,7 @@ SCATTERED = np.random.default_rng(1).uniform(size=(150, 3))
 INNER = np.random.default_rng(2).uniform(0.3, 0.7, (12, 3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("points", "queries"),
     [

@@ -75,6 +75,7 @@ def test_estimates_by_network(gamma_map, trained, monkeypatch):
     assert np.isnan(far.point).all()
 
 
+@pytest.mark.slow
 def test_a_network_is_evidence_on_verdicts(tmp_path):
     # A small one, so that it is quick: it errs far more where contacts have the same signals.
     curved = vb.ContactMap.simulate(vb.samples.curved(), grid=False)

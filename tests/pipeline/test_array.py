@@ -18,6 +18,7 @@ def motions():
     return array_whisking(SOME, 0.24, 250.0, head_rotation=turn, head_position=place)
 
 
+@pytest.mark.slow
 def test_a_sphere_from_all_whiskers(motions):
     ball = within_reach(SOME, "sphere")
     trial = measure(simulate(SOME, motions, ball), 0.0, 0.0)
@@ -38,6 +39,7 @@ def test_a_sphere_from_all_whiskers(motions):
     assert abs(float(contour["diameter_error"])) < 40e-6
 
 
+@pytest.mark.slow
 def test_a_mesh_is_touched_like_what_it_is_made_of(motions):
     trimesh = pytest.importorskip("trimesh")
     ball = within_reach(SOME, "sphere")

@@ -211,6 +211,7 @@ def test_a_peg_is_found_with_noise(trial):
     assert (np.abs(contour["axis_offset"].values[:2]) < 5 * sigma[:2]).all()
 
 
+@pytest.mark.slow
 def test_a_peg_that_rubs_is_found_where_normals_may_lean():
     whisker = samples.gamma()
     peg = facing_peg(whisker)

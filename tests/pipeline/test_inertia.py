@@ -37,6 +37,7 @@ def settled(touching):
     return np.array([touching[max(i - 8, 0) : i + 3].all() and i > 8 for i in range(len(touching))])
 
 
+@pytest.mark.slow
 def test_what_is_left_is_the_wrench_of_a_rod_without_mass(trial, truth):
     touching = truth.in_contact.values.astype(bool)
     root = trial.to_dataset().isel(whisker=0)
@@ -59,6 +60,7 @@ def test_what_is_left_is_the_wrench_of_a_rod_without_mass(trial, truth):
         assert np.nanmedian(left) < 0.25 * np.nanmedian(away)
 
 
+@pytest.mark.slow
 def test_contacts_are_as_near_as_stated_with_a_wrong_mass(trial, truth):
     measured = measure(trial, 0.3e-6, 6e-9, seed=5)
     errors, stated = [], []

@@ -198,6 +198,7 @@ def run(*arguments):
     return CliRunner().invoke(app, ["movie", *map(str, arguments)])
 
 
+@pytest.mark.slow
 def test_the_verb_makes_both_movies(trial, tmp_path, coarse):
     done = run(trial, "-o", tmp_path / "new", "--step", 2)
     assert done.exit_code == 0, done.output

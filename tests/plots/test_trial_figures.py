@@ -225,6 +225,7 @@ def run(*arguments):
     return CliRunner().invoke(app, ["figures", *map(str, arguments)])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("coarse")
 def test_the_verb_draws_a_trial(known, tmp_path):
     path = tmp_path / "trial.nc"

@@ -190,6 +190,7 @@ def test_friction_opposes_sliding(friction):
     np.testing.assert_allclose(work[moving], -lost[moving], rtol=0.02)
 
 
+@pytest.mark.slow
 def test_strong_friction_holds_the_material_on_a_thin_peg():
     peg = Peg([0.62 * LENGTH, 0.0, 0.0], [0.0, 0.0, 1.0], 20e-6)
     turn = np.linspace(-0.6, 0.1, 141)

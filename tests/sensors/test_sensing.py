@@ -401,6 +401,7 @@ def test_taper_is_found_where_contacts_lie_at_several_places(wire, touched):
     assert blind.misfit > 3.0
 
 
+@pytest.mark.slow
 def test_the_base_is_found_where_contacts_are_known(wire, touched):
     sensor = Sensor(noise=np.repeat([1e-3, 1e-4], 3))
     unit = wire.base_bending_stiffness / wire.length

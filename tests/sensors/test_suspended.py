@@ -161,6 +161,7 @@ def test_what_touches_do_not_determine_is_named():
     assert "base x / L" in found.undetermined
 
 
+@pytest.mark.slow
 def test_a_touch_that_is_far_from_all_others_is_left_out():
     at = points(60)
     readings, status = TRUE.read(at, seed=3)
@@ -323,6 +324,7 @@ def test_an_error_that_all_readings_share_moves_contacts_as_their_shared_errors_
     assert not found.shared[:, ~found.in_contact].any()
 
 
+@pytest.mark.slow
 def test_with_many_touches_a_process_takes_what_the_rod_leaves():
     at = points(110)
     readings = TRUE.read(at, seed=3)[0]
@@ -405,6 +407,7 @@ def test_a_channel_that_saturates_is_said_and_can_be_left_out(tmp_path):
         Stage(text.replace(", 1e9]", "]"), tmp_path).touches()
 
 
+@pytest.mark.slow
 def test_the_command_line_names_touches_that_are_left_out(tmp_path):
     at = points(36)
     readings, status = TRUE.read(at, seed=4)

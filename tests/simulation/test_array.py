@@ -177,6 +177,7 @@ def test_sensors_of_all_whiskers_have_noise_of_their_own(trial, tmp_path):
     np.testing.assert_array_equal(again["force"].values, measured["force"].values)
 
 
+@pytest.mark.slow
 def test_whiskers_with_inertia():
     names = ["LC1", "RC1"]
     some = ARRAY.select(names=names)

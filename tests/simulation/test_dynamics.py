@@ -125,6 +125,7 @@ def test_derivatives_of_the_chain():
     np.testing.assert_allclose(matrix, expected, rtol=0, atol=1e-8 * expected.max())
 
 
+@pytest.mark.slow
 def test_at_rest_it_is_static():
     peg = Peg([0.62 * WHISKER.length, 0.0, 0.0], [0.0, 0.0, 1.0], 1.35e-3, stiffness=200.0)
     motion = settled(-0.1, 0.15)
@@ -184,6 +185,7 @@ def test_the_base_accelerates_the_mass():
     assert chain.mass.sum() == pytest.approx(mass, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_finer_steps_agree():
     motion = whisking(0.1, 1000.0, amplitude=0.6, elevation_drift=0.0, position_drift=0.0)
     felt_at = [

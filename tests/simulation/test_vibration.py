@@ -67,6 +67,7 @@ def test_whisking_in_air_is_predicted(whisker, in_air):
         assert np.median(left) < 0.1 * np.median(np.linalg.norm(known, axis=1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("assumed", [pytest.param(1.0, marks=pytest.mark.slow), 1.3])
 def test_contact_is_distinguished_from_inertia_with_a_wrong_mass(whisker, past_peg, assumed):
     trial = past_peg
@@ -126,6 +127,7 @@ def test_a_recording_states_its_own_dynamics_and_its_contacts(past_peg, tmp_path
     np.testing.assert_allclose(found, known, atol=3.1e-3)
 
 
+@pytest.mark.slow
 def test_what_is_not_determined_is_stated(whisker, in_air):
     air = [x[25:] for x in measured(measure(in_air, seed=1))]
     with pytest.raises(ValueError, match="damping"):

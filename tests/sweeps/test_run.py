@@ -185,6 +185,7 @@ def alive(pid: int) -> bool:
         return False
 
 
+@pytest.mark.slow
 def test_tasks_with_other_triplets_keep_their_own_and_words_not_known_yet_are_empty(tmp_path):
     text = QUICK.replace("[5, 15, 30]", "[15]").replace(
         'kind = "map"',

@@ -35,6 +35,7 @@ def row(length=(100.0, 160.0), darkness=(0.3, 0.5)):
     return seen
 
 
+@pytest.mark.slow
 def test_a_mix_up_that_was_followed_is_put_right():
     """From frame 12 on each was taken for the other."""
     seen = row()

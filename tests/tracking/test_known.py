@@ -87,6 +87,7 @@ def test_the_contact_nearest_to_the_object_agrees(nodding, recording):
     assert isinstance(Recording(recording).objects[0], Peg)
 
 
+@pytest.mark.slow
 def test_contacts_of_poor_traces_are_on_a_known_object(nodding, traces):
     """Traces that waver by more than a pixel: without the object contacts are somewhere near it."""
     random = np.random.default_rng(4)
@@ -112,6 +113,7 @@ def test_contacts_of_poor_traces_are_on_a_known_object(nodding, traces):
     assert errors[1] < errors[0]
 
 
+@pytest.mark.slow
 def test_contact_points_of_a_table_are_compared(nodding, traces, recording):
     """Truth as a table, in space by time and in pixels by frame, comes out as it went in."""
     true = nodding.truth["contact_point"].values

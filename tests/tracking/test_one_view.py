@@ -70,6 +70,7 @@ def test_a_whisker_that_moves_in_the_plane_is_measured(flat):
     assert "out of the image by" not in found.attrs["remarks"]
 
 
+@pytest.mark.slow
 def test_a_peg_along_the_line_of_sight_is_reconstructed(flat, tmp_path):
     save_recording(tmp_path / "one.nc", flat[1])
     done = testing.CliRunner().invoke(app, ["reconstruct", str(tmp_path / "one.nc")])
@@ -81,6 +82,7 @@ def test_a_peg_along_the_line_of_sight_is_reconstructed(flat, tmp_path):
     assert fit.radius == pytest.approx(PEG.radius, rel=0.15)
 
 
+@pytest.mark.slow
 def test_a_whisker_that_bends_the_other_way_is_measured():
     """Its roll is half a turn, of which noise makes either sign."""
     peg = Peg([6e-3, -1.2e-3, 0.0], [0.0, 0.0, 1.0], 0.5e-3)

@@ -82,6 +82,7 @@ def test_a_stated_distance_is_used():
         np.testing.assert_allclose(view.project(lines), pinhole(lines, axes, 0.4), atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distance", [None, 0.4])
 def test_a_front_view_that_is_not_mirrored_is_seen_from_its_other_side(distance):
     """Its image is that of the mirrored one, but what is nearer to the lens is farther."""
@@ -96,6 +97,7 @@ def test_a_front_view_that_is_not_mirrored_is_seen_from_its_other_side(distance)
     assert (np.linalg.norm(away, axis=-1) < 3.0 * moved + 2e-5).all()
 
 
+@pytest.mark.slow
 def test_frames_in_contact_are_no_evidence_of_lenses():
     """Half of the frames are bent as in contact, by less than wrong lenses would bend them."""
     lines = sweep(60)

@@ -99,6 +99,7 @@ def test_a_wall_that_hides_the_tip_from_one_view_is_no_reason_for_doubt(films):
     assert not start.doubts
 
 
+@pytest.mark.slow
 def test_views_of_different_whiskers_are_in_doubt(films):
     """Each view shows a whisker, at other columns and in other frames than the other one."""
     one, other = films(200), films(201)
@@ -119,6 +120,7 @@ def test_bright_whiskers_begin_where_dark_ones_do(films):
         np.testing.assert_allclose(a, b, atol=1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [241, pytest.param(242, marks=pytest.mark.slow)])
 def test_before_grey_fur_a_whisker_is_found_along_the_lines_of_sight_of_the_other_view(films, seed):
     """Grey fur behind it in the front view hides where it begins: only the top view shows that."""

@@ -271,6 +271,7 @@ def test_the_covariance_of_the_contact_is_of_the_size_of_its_errors(filmed, foun
     assert 0.1 < np.median(squares) < 30.0
 
 
+@pytest.mark.slow
 def test_light_from_the_side_is_in_the_covariances_where_profiles_show_it(
     filmed, traces, found, both
 ):
@@ -406,6 +407,7 @@ def test_the_far_end_of_a_bent_whisker_is_given_back(filmed, traces):
         assert found[0][0][i] is mine[0][i]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("views", [1, 2])
 def test_frames_that_no_rod_explains_are_left_out_if_two_views_contradict_each_other(
     filmed, traces, monkeypatch, views

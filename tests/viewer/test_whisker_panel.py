@@ -7,6 +7,7 @@ import vibrissa as vb
 pytest.importorskip("viser", reason="viser is not installed", exc_type=ImportError)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("base", "tip", "modulus"),
     [(1e-3, 2e-3, 3e9), (1e-3, 1e-3, 1e5), (0.5e-3, 5e-6, 200e9)],

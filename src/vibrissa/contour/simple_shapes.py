@@ -156,20 +156,8 @@ class RoundShape(SimpleShape):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class CylinderFit(RoundShape):
-    """A fitted cylinder, in the frame of the points.
-
-    Attributes
-    ----------
-    origin : array (3,)
-        Point on the axis at the height of the points' mean, m.
-    axis : array (3,)
-        Unit vector along the axis; its largest component is positive.
-    radius : float
-        Radius of the surface, m.
-    covariance : array (7, 7)
-        Covariance of (origin, axis, radius), m and 1; of rank 5, or 3 if the axis was given.
-    """
+class Cylinder(RoundShape):
+    """A cylinder."""
 
     axis: Array
 
@@ -270,18 +258,8 @@ class CylinderFit(RoundShape):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class SphereFit(RoundShape):
-    """A fitted sphere, in the frame of the points.
-
-    Attributes
-    ----------
-    origin : array (3,)
-        Centre, m.
-    radius : float
-        Radius of the surface, m.
-    covariance : array (4, 4)
-        Covariance of (origin, radius), m².
-    """
+class Sphere(RoundShape):
+    """A sphere."""
 
     kind: ClassVar[str] = "sphere"
     fields: ClassVar[dict[str, str]] = {"origin": "object_position", "radius": "object_radius"}
@@ -344,18 +322,8 @@ class SphereFit(RoundShape):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class PlaneFit(SimpleShape):
-    """A fitted plane, in the frame of the points.
-
-    Attributes
-    ----------
-    origin : array (3,)
-        Point of the plane closest to the points' mean, m.
-    normal : array (3,)
-        Outward unit vector, toward the whisker.
-    covariance : array (6, 6)
-        Covariance of (origin, normal), m and 1; of rank 3.
-    """
+class Plane(SimpleShape):
+    """A plane."""
 
     normal: Array
 
@@ -425,6 +393,53 @@ class PlaneFit(SimpleShape):
 
     def _slopes(self, points: Array) -> Array:
         return np.concatenate([-self._normals(points), points - self.origin], axis=-1)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class CylinderFit(Cylinder):
+    """A fitted cylinder, in the frame of the points.
+
+    Attributes
+    ----------
+    origin : array (3,)
+        Point on the axis at the height of the points' mean, m.
+    axis : array (3,)
+        Unit vector along the axis; its largest component is positive.
+    radius : float
+        Radius of the surface, m.
+    covariance : array (7, 7)
+        Covariance of (origin, axis, radius), m and 1; of rank 5, or 3 if the axis was given.
+    """
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class SphereFit(Sphere):
+    """A fitted sphere, in the frame of the points.
+
+    Attributes
+    ----------
+    origin : array (3,)
+        Centre, m.
+    radius : float
+        Radius of the surface, m.
+    covariance : array (4, 4)
+        Covariance of (origin, radius), m².
+    """
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class PlaneFit(Plane):
+    """A fitted plane, in the frame of the points.
+
+    Attributes
+    ----------
+    origin : array (3,)
+        Point of the plane closest to the points' mean, m.
+    normal : array (3,)
+        Outward unit vector, toward the whisker.
+    covariance : array (6, 6)
+        Covariance of (origin, normal), m and 1; of rank 3.
+    """
 
 
 # Shapes by kind, simpler ones first.

@@ -8,6 +8,11 @@ loads, or those computed for contacts of the whisker.
     y = b + H (m g, μ × g),
 
 linear in the offset b, the mass m and its moment μ = m c, with g in the frame of the base.
+
+If the wrenches have errors of known covariances W, least squares would make the mixing too small
+(attenuation). A channel with weights a and noise σ then minimises Σ r² / (σ² + aᵀ W a) over a, with
+the residuals r = y − aᵀ w − b; the sum equals the number of degrees of freedom at the fitted σ
+(Fuller, *Measurement error models*, 1987).
 """
 
 from __future__ import annotations
@@ -20,14 +25,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vibrissa.deferred import optimize
 from vibrissa.numerics import Array, Mask, cross_matrix, numbers, rotation_matrices
 from vibrissa.sensors.frame import SensorFrame
 from vibrissa.sensors.regression import Solution, solve, warn_of_misfit
 from vibrissa.sensors.sensor import COMPONENTS, GRAVITY, Sensor, with_offset
-from vibrissa.sensors.stiffness import deflections_to, wrenches_of
+from vibrissa.sensors.stiffness import (
+    deflections_to,
+    spread_of_points,
+    wrench_slopes,
+    wrenches_of,
+)
 from vibrissa.whisker import Whisker
 
 _ROUNDING = 1e-6  # relative size below which components of a force or moment are set to zero
+_ROUNDS = 50  # largest number of rounds in which mixing and noise are fitted in turn
+_SETTLED = 1e-6  # relative change of the variance of the noise at which these end
 _ADVICE = (
     "touch the whisker at other points and in other directions, or restrict `components` to those "
     "that the channels read"
@@ -63,6 +76,8 @@ def calibrate_mixing(
     *,
     channels: Sequence[str] | None = None,
     components: Sequence[str] = COMPONENTS,
+    wrench_covariances: ArrayLike = 0.0,
+    noise: ArrayLike = 0.0,
     resolution: ArrayLike = 0.0,
     largest: ArrayLike = np.inf,
 ) -> MixingCalibration:
@@ -74,12 +89,18 @@ def calibrate_mixing(
         Readings of the channels; rows with NaN are ignored.
     wrenches : array_like (n, 6)
         Wrenches (F, M) at the whisker's base, whisker frame, N and N·m, of known loads or of
-        contacts at known points. They are treated as exact.
+        contacts at known points.
     channels : sequence of str, optional
         Names of the k channels.
     components : sequence of str
         Components that a channel may read; the mixing of the others is zero. The wrenches of
         frictionless contacts span only a small part of all wrenches; in most, Mx is nearly zero.
+    wrench_covariances : array_like
+        Covariances of the errors of the wrenches, which broadcast to (n, 6, 6); by default they are
+        exact. Errors are independent of each other.
+    noise : array_like (k,)
+        Smallest standard deviation of the channels' noise, such as that of readings at rest. If
+        errors of the wrenches are larger than the noise, residuals hardly determine it.
     resolution, largest : array_like (k,)
         Resolution and largest reading of the channels, as in `Sensor`. Rows with a saturated
         reading are ignored, and the fitted noise excludes rounding.
@@ -93,6 +114,11 @@ def calibrate_mixing(
     ------
     ValueError
         If shapes do not match or the wrenches do not separate the components.
+
+    Warns
+    -----
+    UserWarning
+        If errors of the wrenches hide the noise.
     """
     y, w = numbers("readings", readings, channels or ()), numbers("wrenches", wrenches, components)
     if y.ndim != 2 or w.shape != (len(y), 6):
@@ -113,31 +139,131 @@ def calibrate_mixing(
             f"least {len(which) + 2} are needed"
         )
     design = np.column_stack([_loaded(w[known])[:, which], np.ones(known.sum())])
-    fit = solve(design, y[known], (*components, "the offset"), _ADVICE)
-    free = known.sum() - design.shape[1]
-    if free < 1:
+    if known.sum() == design.shape[1]:
         raise ValueError(
             f"{known.sum()} contacts are too few for {design.shape[1]} unknowns and the noise: "
             "add some"
         )
-    variance = (fit.residuals**2).sum(axis=0) / free
+    errors = np.zeros((len(design), len(which) + 1, len(which) + 1))
+    errors[:, :-1, :-1] = _checked_errors(wrench_covariances, w)[known][:, which][:, :, which]
+    rounding = np.asarray(resolution) ** 2 / 12.0
+    least = np.broadcast_to(numbers("noise", noise, names) ** 2 + rounding, y.shape[1:])
+    unknowns, covariance, variance = _fit_channels(
+        design, y[known], errors, least, (*components, "the offset")
+    )
     mixing = np.zeros((y.shape[1], 6))
-    mixing[:, which] = fit.unknowns[:-1].T
-    covariance = variance[:, None, None] * fit.spread
+    mixing[:, which] = unknowns[:-1].T
     whole = np.zeros((y.shape[1], 7, 7))
     whole[np.ix_(range(y.shape[1]), [*which, 6], [*which, 6])] = covariance
     sensor = Sensor(
         names,
         mixing,
-        np.sqrt(np.maximum(variance - np.asarray(resolution) ** 2 / 12.0, 0.0)),
-        fit.unknowns[-1],
+        np.sqrt(np.maximum(variance - rounding, 0.0)),
+        unknowns[-1],
         resolution=resolution,
         largest=largest,
         frame=SensorFrame(),
         mixing_covariance=whole,
     )
-    residual = np.sqrt((fit.residuals**2).mean(axis=0))
+    residual = np.sqrt(((y[known] - design @ unknowns) ** 2).mean(axis=0))
     return MixingCalibration(sensor, tuple(components), covariance, residual)
+
+
+def _checked_errors(covariances: ArrayLike, wrenches: Array) -> Array:
+    """Covariances (n, 6, 6) of the wrenches' errors; raise ValueError if they are not valid."""
+    given = numbers("wrench_covariances", covariances)
+    try:
+        errors = np.broadcast_to(given, (len(wrenches), 6, 6))
+    except ValueError as fault:
+        raise ValueError(
+            f"wrench_covariances broadcast to ({len(wrenches)}, 6, 6); got {given.shape}"
+        ) from fault
+    known = errors[np.isfinite(wrenches).all(axis=1)]
+    size = np.sqrt(np.diagonal(known, axis1=1, axis2=2))
+    if not (np.isfinite(known).all() and np.isfinite(size).all()):
+        raise ValueError("wrench_covariances must be finite, with variances that are not negative")
+    return errors
+
+
+def _fit_channels(
+    design: Array, y: Array, errors: Array, least: Array, names: tuple[str, ...]
+) -> tuple[Array, Array, Array]:
+    """Fit readings (n, k) to loads (n, p) with error covariances (n, p, p).
+
+    Return weights (p, k), their covariances (k, p, p), and the variances (k,) of the noise, which
+    are at least ``least``.
+    """
+    fit = solve(design, y, names, _ADVICE)
+    n, p = design.shape
+    variance = np.maximum((fit.residuals**2).sum(axis=0) / (n - p), least)
+    if not errors.any():
+        return fit.unknowns, variance[:, None, None] * fit.spread, variance
+    size = np.abs(design).max(axis=0)
+    found = [
+        _fit_with_errors(design / size, reading, errors / (size[:, None] * size), *start)
+        for reading, *start in zip(y.T, fit.unknowns.T * size, variance, least, strict=True)
+    ]
+    weights, spread, variance, doubtful = (np.array(part) for part in zip(*found, strict=True))
+    if (doubtful & (least == 0.0)).any():
+        warnings.warn(
+            "the stated errors of the points or loads explain most of the residuals, which "
+            "therefore do not determine the sensor's noise: state it as `noise`, from readings at "
+            "rest",
+            stacklevel=3,
+        )
+    return (weights / size).T, spread / (size[:, None] * size), variance
+
+
+def _fit_with_errors(
+    design: Array, y: Array, errors: Array, weights: Array, variance: float, least: float
+) -> tuple[Array, Array, float, bool]:
+    """Fit a channel: return weights, covariance, variance of the noise and whether it is doubtful.
+
+    The covariance is that of estimating equations (a sandwich), in which the loads, cleared of that
+    part of their errors which the residuals show, stand for the true ones.
+    """
+
+    def residuals(weights: Array, variance: float) -> Array:
+        return np.asarray((y - design @ weights) / np.sqrt(variance + _blur(weights, errors)))
+
+    for _ in range(_ROUNDS):
+        found = optimize.least_squares(residuals, weights, args=(variance,))
+        weights, before = np.asarray(found.x), variance
+        left, blur = y - design @ weights, _blur(weights, errors)
+        variance = _remaining(left**2, blur, len(y) - len(weights), least)
+        if abs(variance - before) <= _SETTLED * before:
+            break
+    total = variance + blur
+    shown = errors @ weights / total[:, None]
+    cleared = design + shown * left[:, None]
+    hidden = errors - shown[:, :, None] * shown[:, None, :] * total[:, None, None]
+    outer = cleared.T / total @ cleared
+    slope = outer - (hidden / total[:, None, None]).sum(axis=0)
+    if np.linalg.eigvalsh(slope)[0] <= 0.0:
+        raise ValueError(
+            "the loads differ by no more than their stated errors, so they do not determine the "
+            f"mixing: {_ADVICE}"
+        )
+    inverse = np.linalg.inv(slope)
+    doubtful = variance < np.sqrt(2.0 / (total**-2.0).sum())
+    return weights, inverse @ outer @ inverse, variance, bool(doubtful)
+
+
+def _blur(weights: Array, errors: Array) -> Array:
+    """Variances (n,) of a channel due to errors of the loads."""
+    return np.asarray(np.einsum("p,npq,q->n", weights, errors, weights))
+
+
+def _remaining(squared: Array, blur: Array, degrees: int, least: float) -> float:
+    """Variance σ² with which Σ r² / (σ² + blur) is the number of degrees of freedom, if any."""
+    floor = max(least, _SETTLED * float(squared.mean()))
+
+    def excess(variance: float) -> float:
+        return float((squared / (variance + blur)).sum()) - degrees
+
+    if excess(floor) <= 0.0:
+        return floor
+    return float(optimize.brentq(excess, floor, squared.sum() / degrees + floor))
 
 
 def _loaded(wrenches: Array) -> Array:
@@ -150,7 +276,12 @@ def _loaded(wrenches: Array) -> Array:
 
 
 def calibrate_on_contacts(
-    whisker: Whisker, points: ArrayLike, readings: ArrayLike, **options: Any
+    whisker: Whisker,
+    points: ArrayLike,
+    readings: ArrayLike,
+    *,
+    point_sigma: ArrayLike = 0.0,
+    **options: Any,
 ) -> MixingCalibration:
     """Fit mixing, offset and noise of a sensor to readings of contacts at known points.
 
@@ -166,6 +297,9 @@ def calibrate_on_contacts(
         Frictionless contact points on its centreline, whisker frame, m.
     readings : array_like (n, k)
         Readings of the channels at these contacts; rows with NaN in either are ignored.
+    point_sigma : array_like
+        Standard deviation of the points' coordinates, m, as in `fit_stiffness`. If points with
+        errors are taken as exact, the mixing is too small and its uncertainty too.
     **options
         Names of channels, components, resolution and largest reading, as in `calibrate_mixing`.
 
@@ -177,9 +311,19 @@ def calibrate_on_contacts(
     Raises
     ------
     ValueError
-        If a contact is not possible, or the contacts do not separate the components.
+        If more than half of the contacts are not possible, or they do not separate the components.
+
+    Warns
+    -----
+    UserWarning
+        If contacts are not possible, which are left out, or if errors of the points hide the noise.
     """
-    return calibrate_mixing(readings, wrenches_of(deflections_to(whisker, points)), **options)
+    bent = deflections_to(whisker, points)
+    sigma = spread_of_points(point_sigma, np.asarray(points, dtype=np.float64))
+    if sigma.any():
+        slopes = wrench_slopes(bent) * sigma[:, None]
+        options["wrench_covariances"] = slopes @ slopes.swapaxes(1, 2)
+    return calibrate_mixing(readings, wrenches_of(bent), **options)
 
 
 _HEAVY = 5.0  # mass above which the user is warned, kg

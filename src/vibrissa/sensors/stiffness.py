@@ -33,13 +33,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.deferred import optimize
-from vibrissa.numerics import Array, cross_matrix, numbers
+from vibrissa.numerics import AnyArray, Array, cross_matrix, numbers
 from vibrissa.rod import Deflection, PointContact, deflect, discretize, solve_forces
 from vibrissa.sensors.regression import warn_of_misfit, warn_of_surprise
 from vibrissa.sensors.sensor import Sensor
-from vibrissa.status import describe, is_ok
+from vibrissa.status import Status, describe, is_ok
 from vibrissa.whisker import Whisker
 
+_MOST_NAMED = 10  # largest number of impossible contacts that are listed
 _OPEN = 2.0  # standard deviation of a logarithm above which a quantity is not determined
 _SLIM, _WIDE = 0.01, 2.0  # bounds of a fitted taper
 # Bounds of the fitted stiffness of a base, in units of EI/L; a stiffer base is rigid in effect.
@@ -50,17 +51,34 @@ _TYPICAL_NOISE = 0.01  # noise of channels without stated noise, relative to the
 _IN_OTHER_UNITS = 300.0  # factor of the stated stiffness above which units are in question
 
 
+# Taper, stiffness factor, base spring, covariance and residuals.
+_Fit = tuple[float, float, float | None, Array, Array]
+
+
 def deflections_to(whisker: Whisker, points: ArrayLike) -> Deflection:
-    """Deflections by contacts at known points (n, 3), all of which must be possible."""
+    """Deflections by contacts at known points (n, 3); NaN, and named in a warning, if impossible.
+
+    Raise ValueError if more than half of them are impossible.
+    """
     contacts = numbers("points", points)
     if contacts.ndim != 2 or contacts.shape[1] != 3:
         raise ValueError(f"contact points are (n, 3), m; got {contacts.shape}")
     bent = deflect(whisker, PointContact(contacts))
-    bad = ~is_ok(bent.status) & np.isfinite(contacts).all(axis=1)
-    if bad.any():
-        reasons = "; ".join(f"{n} × {text}" for text, n in describe(bent.status[bad]).items())
-        raise ValueError(f"{bad.sum()} of {bad.size} contacts are not possible: {reasons}")
+    _report_impossible(bent.status)
     return bent
+
+
+def _report_impossible(statuses: AnyArray) -> None:
+    """Warn of contacts that are not possible; raise ValueError if they are more than half."""
+    rows = np.flatnonzero(~is_ok(statuses) & (statuses != int(Status.MISSING)))
+    if not rows.size:
+        return
+    reasons = "; ".join(f"{n} × {text}" for text, n in describe(statuses[rows]).items())
+    which = f"{rows.size} of {statuses.size} contacts are not possible: {reasons}"
+    if 2 * rows.size > statuses.size:
+        raise ValueError(which)
+    named = ", ".join(map(str, rows[:_MOST_NAMED])) + ", …" * (rows.size > _MOST_NAMED)
+    warnings.warn(f"{which}; left out: {named} (of the rows, from 0)", stacklevel=4)
 
 
 def wrenches_of(bent: Deflection) -> Array:
@@ -68,14 +86,17 @@ def wrenches_of(bent: Deflection) -> Array:
     return np.concatenate([bent.force, bent.moment], axis=-1)
 
 
-def _wrench_slopes(bent: Deflection) -> Array:
-    """Derivatives (n, 6, 3) of the wrench at the base with respect to the contact point."""
+def wrench_slopes(bent: Deflection) -> Array:
+    """Derivatives (n, 6, 3) of the wrench at the base by the contact point; NaN if impossible."""
     d = discretize(bent.whisker, bent.steps)
-    contacts = np.column_stack([bent.arc_length / d.length, bent.contact_force / d.force])
+    known = np.asarray(is_ok(bent.status))
+    contacts = np.column_stack([bent.arc_length / d.length, bent.contact_force / d.force])[known]
     tangents = solve_forces(d, contacts, tangents=True)[1]
     by_point = tangents[:, :3] @ np.linalg.inv(tangents[:, 3:]) * (d.force / d.length)
-    turning = cross_matrix(bent.contact_point) @ by_point - cross_matrix(bent.force)
-    return np.concatenate([by_point, turning], axis=1)
+    turning = cross_matrix(bent.contact_point[known]) @ by_point - cross_matrix(bent.force[known])
+    slopes = np.full((known.size, 6, 3), np.nan)
+    slopes[known] = np.concatenate([by_point, turning], axis=1)
+    return slopes
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,14 +190,14 @@ def fit_stiffness(
     Raises
     ------
     ValueError
-        If shapes do not match, the readings do not follow the loads, or the contacts do not
-        determine the taper or base stiffness to be fitted.
+        If shapes do not match, more than half of the contacts are not possible, the readings do not
+        follow the loads, or the contacts do not determine the taper or base stiffness to be fitted.
 
     Warns
     -----
     UserWarning
-        If residuals are more than five times the noise, or E r⁴ is more than five standard
-        deviations from its prior value.
+        If contacts are not possible, which are left out; if residuals are more than five times the
+        noise, or E r⁴ is more than five standard deviations from its prior value.
     """
     sensor = sensor or Sensor()
     y = numbers("readings", readings)
@@ -190,29 +211,18 @@ def fit_stiffness(
             f"got {modulus_sigma} and {radius_sigma}"
         )
     known = np.isfinite(y).all(axis=1) & np.isfinite(contacts).all(axis=1)
-    blur = _spread_of_points(point_sigma, contacts)[known]
+    blur = spread_of_points(point_sigma, contacts)[known]
     y, contacts = y[known], contacts[known]
     noise = np.sqrt(np.diag(sensor.covariance()))
     size = np.sqrt((y**2).mean(axis=0)) if len(y) else noise
     noise = np.where(noise > 0.0, noise, _TYPICAL_NOISE * np.where(size > 0.0, size, 1.0))
-
     response = sensor.base_mixing / noise[:, None]
-
-    @lru_cache(maxsize=4)
-    def modelled(ratio: float, spring: float | None) -> tuple[Array, Array | None]:
-        bent = deflections_to(_on_spring(_tapered(whisker, ratio), spring), contacts)
-        errors = response @ _wrench_slopes(bent) * blur[:, None] if blur.any() else None
-        return wrenches_of(bent) @ response.T, errors
-
-    ratio = whisker.tip_radius / whisker.base_radius
-    scaled = y / noise
-    if not len(y) or not (modelled(ratio, None)[0] * scaled).sum() > 0.0:
-        raise ValueError(
-            "the readings do not increase with the loads: check the sensor's axes, sign "
-            "(`reaction`) and offset, and whether the channels respond at all"
-        )
-    ratio, factor, spring, spread, left = _fitted(modelled, scaled, ratio, taper, base)
-    degrees = y.size - 1 - taper - base
+    fit, statuses = _fitted_to_possible(whisker, contacts, blur, response, y / noise, taper, base)
+    ratio, factor, spring, spread, left = fit
+    numbered = np.full(known.shape, int(Status.MISSING))
+    numbered[known] = statuses
+    _report_impossible(numbered)
+    degrees = int(np.sum(is_ok(statuses))) * y.shape[1] - 1 - taper - base
     misfit = float((left**2).sum() / max(degrees, 1))
     warn_of_misfit(
         misfit,
@@ -246,6 +256,46 @@ def fit_stiffness(
     )
 
 
+def _fitted_to_possible(
+    whisker: Whisker,
+    contacts: Array,
+    blur: Array,
+    response: Array,
+    scaled: Array,
+    taper: bool,
+    base: bool,
+) -> tuple[_Fit, AnyArray]:
+    """Fit of readings relative to their noise, without contacts that are not possible; statuses."""
+    statuses = np.full(len(contacts), int(Status.OK))
+
+    @lru_cache(maxsize=4)
+    def modelled(ratio: float, spring: float | None) -> tuple[Array, Array | None]:
+        bent = deflect(_on_spring(_tapered(whisker, ratio), spring), PointContact(contacts))
+        statuses[:] = np.where(is_ok(statuses), bent.status, statuses)
+        model, errors = wrenches_of(bent) @ response.T, None
+        if blur.any():
+            errors = response @ wrench_slopes(bent) * blur[:, None]
+            errors[~is_ok(statuses)] = 0.0
+        model[~is_ok(statuses)] = 0.0
+        return model, errors
+
+    ratio = whisker.tip_radius / whisker.base_radius
+    if not (modelled(ratio, _SPRING if base else None)[0] * scaled).sum() > 0.0:
+        _report_impossible(statuses)
+        raise ValueError(
+            "the readings do not increase with the loads: check the sensor's axes, sign "
+            "(`reaction`) and offset, and whether the channels respond at all"
+        )
+    while True:
+        # Contacts that a trial value makes impossible are left out, and the fit is done again.
+        modelled.cache_clear()
+        used = is_ok(statuses)
+        readings = np.where(used[:, None], scaled, 0.0)
+        fit = _fitted(modelled, readings, ratio, taper, base)
+        if is_ok(statuses)[used].all():
+            return fit, statuses
+
+
 def _check_determined(spread: Array, taper: bool, base: bool) -> None:
     """Raise ValueError if the contacts do not determine the taper or the base's stiffness."""
     if base and np.sqrt(spread[-1, -1]) > _OPEN:
@@ -259,7 +309,7 @@ def _check_determined(spread: Array, taper: bool, base: bool) -> None:
         )
 
 
-def _spread_of_points(point_sigma: ArrayLike, contacts: Array) -> Array:
+def spread_of_points(point_sigma: ArrayLike, contacts: Array) -> Array:
     """Standard deviations (n, 3) of contact points; raise ValueError if they are not valid."""
     sigma = numbers("point_sigma", point_sigma)
     try:
@@ -307,7 +357,7 @@ def _fitted(
     ratio: float,
     taper: bool,
     base: bool,
-) -> tuple[float, float, float | None, Array, Array]:
+) -> _Fit:
     """Fit taper, stiffness factor and base spring; return these, a covariance and residuals.
 
     The covariance is that of the logarithms of factor, taper and spring in this order, as far as

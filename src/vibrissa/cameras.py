@@ -159,11 +159,11 @@ class Camera:
         flat = seen[..., :2] / depth
         bent, jacobian = _distort(flat, self.distortion)
         pixels = bent @ self.matrix[:2, :2].T + self.matrix[:2, 2]
-        along = np.concatenate(
-            [np.broadcast_to(np.eye(2), (*flat.shape, 2)), -flat[..., None]], axis=-1
-        )
-        slopes = (self.matrix[:2, :2] @ jacobian @ along) @ self.rotation / depth[..., None]
-        return pixels, slopes
+        jacobian = jacobian / depth[..., None]
+        ahead = -(jacobian * flat[..., None, :]).sum(axis=-1, keepdims=True)
+        by_seen = np.concatenate([jacobian, ahead], axis=-1)
+        slopes = (by_seen.reshape(-1, 3) @ self.rotation).reshape(by_seen.shape)
+        return pixels, self.matrix[:2, :2] @ slopes
 
     def rays(self, pixels: ArrayLike) -> tuple[Array, Array]:
         """Compute the lines of sight of pixels.
@@ -340,7 +340,8 @@ def triangulate(
             gradient += (np.swapaxes(scaled, -1, -2) @ miss[..., None])[..., 0]
         step = np.linalg.solve(_regularise(hessian), gradient[..., None])[..., 0]
         points = points + step
-        if not np.nanmax(np.abs(step), initial=0.0) > 1e-12:
+        # The next step would be smaller by orders of magnitude.
+        if not np.nanmax(np.abs(step), initial=0.0) > 1e-9:
             break
     return points, np.asarray(np.linalg.inv(_regularise(hessian)), dtype=np.float64)
 

@@ -512,9 +512,9 @@ def test_the_smoother_solves_its_equations():
         dense[i * n : (i + 1) * n, i * n : (i + 1) * n] = hessian[i]
     right = gradient.reshape(-1).copy()
     value, weight = generator.normal(size=(count, n)), np.array([1.0, 2.0, 0.5, 0.0])
-    for i in range(1, count - 1):
-        second = value[i - 1] - 2.0 * value[i] + value[i + 1]
-        smoother.add_second(i, second, weight)
+    at, seconds = np.arange(1, count - 1), np.diff(value, n=2, axis=0)
+    smoother.add_second(at, seconds, np.tile(weight, (len(at), 1)))
+    for i, second in zip(at, seconds, strict=True):
         rows = np.zeros((n, count * n))
         for j, factor in ((i - 1, 1.0), (i, -2.0), (i + 1, 1.0)):
             rows[:, j * n : (j + 1) * n] += factor * np.diag(weight)

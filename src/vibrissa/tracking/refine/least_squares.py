@@ -70,17 +70,18 @@ class Smoother:
         self.gradient[:, part] -= weight**2 * axis * value[:, None]
         return np.asarray((weight * value) ** 2)
 
-    def add_second(self, i: int, value: Array, weight: Array) -> float:
-        """Pull the second difference at a frame to zero; return the cost."""
+    def add_second(self, at: NDArray[np.intp], values: Array, weight: Array) -> Array:
+        """Pull second differences (n, unknown) at some frames to zero; return the cost of each."""
         square = weight**2
-        n = np.arange(len(square))
-        pull = square * value
-        for j, factor in ((i - 1, 1.0), (i, -2.0), (i + 1, 1.0)):
-            self.diagonal[j, n, n] += factor**2 * square
-            self.gradient[j] -= factor * pull
-        self.first[i - 1 : i + 1, n, n] -= 2.0 * square
-        self.second[i - 1, n, n] += square
-        return float((pull * value).sum())
+        n = np.arange(square.shape[1])
+        pull = square * values
+        for shift, factor in ((-1, 1.0), (0, -2.0), (1, 1.0)):
+            self.diagonal[(at + shift)[:, None], n, n] += factor**2 * square
+            self.gradient[at + shift] -= factor * pull
+        for before in (at - 1, at):
+            self.first[before[:, None], n, n] -= 2.0 * square
+        self.second[(at - 1)[:, None], n, n] += square
+        return np.asarray((pull * values).sum(axis=1))
 
     def solved(self, damping: float = 0.0) -> Array:
         """Solve for the step (time, unknown)."""
@@ -89,16 +90,15 @@ class Smoother:
     def responses(self, pulls: Array, damping: float = 0.0) -> Array:
         """Steps (pull, time, unknown) in response to pulls on the unknowns."""
         count, n, _ = self.diagonal.shape
-        band = np.zeros((3 * n, count * n))
+        band = np.zeros((3 * n, count, n))
         rows, columns = np.indices((n, n))
         lower = rows >= columns
-        for i in range(count):
-            start = i * n
-            band[(rows - columns)[lower], start + columns[lower]] = self.diagonal[i][lower]
-            if i + 1 < count:
-                band[n + rows - columns, start + columns] = self.first[i].T
-            if i + 2 < count:
-                band[2 * n + rows - columns, start + columns] = self.second[i].T
+        row, column = rows[lower], columns[lower]
+        band[row - column, :, column] = self.diagonal[:, row, column].T
+        for ahead, tie in ((1, self.first), (2, self.second)):
+            each = np.moveaxis(tie[: count - ahead], 0, -1)  # (column, row, time)
+            band[ahead * n + rows - columns, : count - ahead, columns] = np.swapaxes(each, 0, 1)
+        band = band.reshape(3 * n, count * n)
         band[0] += damping * band[0] + _REGULAR * band[0].max()
         step = linalg.solveh_banded(band, pulls.reshape(len(pulls), -1).T, lower=True)
         return np.asarray(step.T).reshape(len(pulls), count, n)

@@ -206,7 +206,7 @@ class Problem:
         wild = ~(np.abs(slopes).max(axis=(1, 2, 3)) < _WILD)
         points[wild], slopes[wild] = state.position[wild, None], 0.0
         points = self.head.put_in(points * self.d.length)
-        slopes = np.einsum("tij,tnjk->tnik", self.head.rotation, slopes)
+        slopes = self.head.rotation[:, None] @ slopes
         with_ends = np.concatenate([slopes, slopes[:, [0, -1]]], axis=1)
         hessian = np.zeros((len(points), UNKNOWNS, UNKNOWNS))
         gradient = np.zeros((len(points), UNKNOWNS))
@@ -215,11 +215,11 @@ class Problem:
         for view, camera in enumerate(self.cameras):
             pixels, by_point = camera.project_with_slopes(points)
             rows, misses, sharp = self.traces.equations(view, pixels, by_point * self.d.length)
-            design = np.einsum("tni,tnij->tnj", rows, with_ends)
+            design = (rows[:, :, None] @ with_ends)[:, :, 0]
             weight = np.ones(misses.shape) if self.variance is None else 1.0 / self.variance[view]
             trusted = design * weight[..., None]
-            hessian += np.einsum("tni,tnj->tij", trusted, design)
-            gradient += np.einsum("tni,tn->ti", trusted, misses)
+            hessian += np.swapaxes(trusted, 1, 2) @ design
+            gradient += (misses[:, None] @ trusted)[:, 0]
             weighted += (weight * misses**2).sum(axis=1)
             total += (misses**2).sum(axis=1)
             count += (misses != 0.0).sum(axis=1)
@@ -307,15 +307,12 @@ class Problem:
         pose = (1.0 / (o.moving / self.d.length), 1.0 / o.turning)
         contact = (1.0 / (o.sliding / self.d.length), *[1.0 / o.pressing] * 3)
         weight = np.array([pose[0]] * 3 + [pose[1]] * 3 + list(contact)) / slower
-        for i in range(1, len(place) - 1):
-            if not (together[i - 1] and together[i]):
-                continue
-            second = place[i - 1] - 2.0 * place[i] + place[i + 1]
-            second[3:6] += begun[i] - begun[i - 1]
-            scale = weight.copy()
-            if not self.touching[i - 1 : i + 2].all():
-                scale[6:] = 0.0
-            costs[i] += smoother.add_second(i, second, scale)
+        at = np.flatnonzero(together[1:] & together[:-1]) + 1
+        second = place[at - 1] - 2.0 * place[at] + place[at + 1]
+        second[:, 3:6] += begun[at] - begun[at - 1]
+        scale = np.tile(weight, (len(at), 1))
+        scale[~(self.touching[at - 1] & self.touching[at] & self.touching[at + 1]), 6:] = 0.0
+        costs[at] += smoother.add_second(at, second, scale)
         return costs
 
 

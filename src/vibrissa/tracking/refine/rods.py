@@ -9,7 +9,8 @@ They are compared with the traces of one whisker over a trial, stored as arrays 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,16 +68,20 @@ class TraceSeries:
 
     def rows(self, frames: NDArray[np.intp]) -> TraceSeries:
         """Select frames."""
-        return TraceSeries(*(getattr(self, name)[frames] for name in vars(self)))
+        return TraceSeries(*(getattr(self, each.name)[frames] for each in fields(self)))
+
+    @cached_property
+    def tangent(self) -> Array:
+        """Directions (time, view, NODES, 2) of the traces."""
+        tangent = np.gradient(self.line, axis=2)
+        return np.asarray(tangent / np.linalg.norm(tangent, axis=3, keepdims=True))
 
     def equations(self, view: int, pixels: Array, slopes: Array) -> tuple[Array, Array, Array]:
         """Distances of points from the traces of a view, and their derivatives."""
-        line, sigma = self.line[:, view], self.sigma[:, view]
-        tangent = np.gradient(line, axis=1)
-        tangent /= np.linalg.norm(tangent, axis=2, keepdims=True)
+        line, sigma, tangent = self.line[:, view], self.sigma[:, view], self.tangent[:, view]
         # All values of a lost trace are NaN, so any index will do.
-        square = (line**2).sum(2)[:, None, :] - 2.0 * pixels @ np.swapaxes(line, 1, 2)
-        near = np.argmin(square, axis=2)
+        half = 0.5 * (line**2).sum(2)[:, None, :] - pixels @ np.swapaxes(line, 1, 2)
+        near = np.argmin(half, axis=2)
         row = np.arange(len(line))[:, None]
         t, away = tangent[row, near], line[row, near] - pixels
         spacing = np.linalg.norm(line[:, 1] - line[:, 0], axis=1)
@@ -95,7 +100,8 @@ class TraceSeries:
         # An error far above the usual shows that something else is wrong.
         scaled = np.abs(miss) * weight
         weight = weight / np.sqrt(np.maximum(scaled / FAR, 1.0))
-        rows = (across[..., None, :] @ slopes)[..., 0, :] * weight[..., None]
+        across *= weight[..., None]
+        rows = across[..., :1] * slopes[..., 0, :] + across[..., 1:] * slopes[..., 1, :]
         misses = miss * weight
         ends, gaps, shown = [], [], []
         for end in (0, -1):
@@ -171,12 +177,12 @@ def bent(
 ) -> tuple[Array, Array]:
     """Points of the visible share of the bent rods, and their derivatives."""
     s = np.linspace(0.0, shown, _SAMPLES)
-    turned = np.einsum("tij,tnj->tni", state.rotation, rods(d, state.contact, s))
+    turned = rods(d, state.contact, s) @ np.swapaxes(state.rotation, 1, 2)
     slopes = np.zeros((*turned.shape, UNKNOWNS))
     slopes[..., :6] = pose_slopes(turned)
     rows = np.flatnonzero(touching)
     change = _differences(lambda contact: rods(d, contact, s), state.contact[rows])
-    slopes[rows, ..., 6:] = np.einsum("tij,tnjk->tnik", state.rotation[rows], change)
+    slopes[rows, ..., 6:] = state.rotation[rows, None] @ change
     return turned + state.position[:, None], slopes
 
 

@@ -91,7 +91,7 @@ def merge(cameras: Sequence[Camera], traces: Sequence[Trace]) -> SpaceCurve:
     """
     if not cameras or len(cameras) != len(traces):
         raise ValueError(f"{len(cameras)} cameras and {len(traces)} traces: one each is needed")
-    if any(len(trace.line) < 8 or not trace.base_seen for trace in traces):
+    if not all(map(_usable, traces)):
         return SpaceCurve.none()
     start = _matched(cameras, traces)
     if len(start) < 8 or not np.isfinite(start).all():
@@ -110,24 +110,28 @@ def begun_together(
     """
     if len(cameras) != 2:
         return [list(view) for view in traces]
-    pairs = [_cut(cameras, both) for both in zip(*traces, strict=True)]
+    pairs = list(zip(*traces, strict=True))
+    whole = [i for i, both in enumerate(pairs) if all(map(_usable, both))]
+    bases = np.array([[pairs[i][view].line[0] for i in whole] for view in (0, 1)])
+    for i, gap in zip(whole, base_gap(cameras, bases.reshape(2, -1, 2)), strict=True):
+        if not gap < _APART:
+            pairs[i] = _cut(cameras, pairs[i], gap)
     return [list(view) for view in zip(*pairs, strict=True)]
 
 
-def _cut(cameras: Sequence[Camera], both: tuple[Trace, ...]) -> tuple[Trace, ...]:
-    """Both traces of a frame, the one that begins earlier cut."""
-    if any(len(trace.line) < 8 or not trace.base_seen for trace in both):
-        return both
-    best, place = base_gap(cameras, np.stack([trace.line[:1] for trace in both]))[0], (0, 0)
-    if best < _APART:
-        return both
-    best = min(_NEARER * best, 2.0 * _APART)
+def _usable(trace: Trace) -> bool:
+    return len(trace.line) >= 8 and trace.base_seen
+
+
+def _cut(cameras: Sequence[Camera], both: tuple[Trace, ...], gap: float) -> tuple[Trace, ...]:
+    """Both traces of a frame, whose bases are a gap apart, the one that begins earlier cut."""
+    best, place = min(_NEARER * gap, 2.0 * _APART), (0, 0)
     for view, other in ((0, 1), (1, 0)):
         line = both[view].line[: int(_CUT * len(both[view].line))]
         base = np.broadcast_to(both[other].line[0], line.shape)
-        gap = base_gap(cameras, np.stack([line, base] if view == 0 else [base, line]))
-        if len(gap) and gap.min() < best:
-            best, place = gap.min(), (view, int(np.argmin(gap)))
+        gaps = base_gap(cameras, np.stack([line, base] if view == 0 else [base, line]))
+        if len(gaps) and gaps.min() < best:
+            best, place = gaps.min(), (view, int(np.argmin(gaps)))
     view, first = place
     one = both[view]
     cut = one._replace(line=one.line[first:], sigma=one.sigma[first:], seen=one.seen[first:])
@@ -243,8 +247,10 @@ def _fitted(cameras: Sequence[Camera], traces: Sequence[Trace], start: Array) ->
     # Weak: the continuation of the whisker matters only where nothing is seen.
     stiff = np.kron(_THIRD.T @ _THIRD, np.eye(3)) / (_LOOSE * size) ** 2
     hessian, misfit = stiff, np.nan
+    tangents = [np.gradient(trace.line, axis=0) for trace in traces]
+    tangents = [each / np.linalg.norm(each, axis=1, keepdims=True) for each in tangents]
     for _ in range(_ROUNDS):
-        node, rows, misses = _equations(cameras, traces, basis @ control)
+        node, rows, misses = _equations(cameras, traces, tangents, basis @ control)
         design = (basis[node][:, :, None] * rows[:, None, :]).reshape(len(rows), -1)
         hessian = design.T @ design + stiff
         gradient = design.T @ misses - stiff @ control.reshape(-1)
@@ -255,15 +261,16 @@ def _fitted(cameras: Sequence[Camera], traces: Sequence[Trace], start: Array) ->
             break
     spread = np.linalg.inv(hessian).reshape(_CONTROLS, 3, _CONTROLS, 3)
     basis = _basis(NODES)
-    covariance = np.einsum("ik,kalb,il->iab", basis, spread, basis) * max(1.0, misfit**2)
-    dense = interpolate.BSpline(_KNOTS, control, 3)(np.linspace(0.0, 1.0, 8 * NODES))
+    half = np.tensordot(basis, spread, axes=1)  # (node, 3, control, 3)
+    covariance = np.einsum("ialb,il->iab", half, basis) * max(1.0, misfit**2)
+    dense = _basis(8 * NODES) @ control
     if len(cameras) == 1:
         dense[:, 2] = 0.0
     return SpaceCurve(_evenly_spaced(dense, NODES), covariance, misfit)
 
 
 def _equations(
-    cameras: Sequence[Camera], traces: Sequence[Trace], points: Array
+    cameras: Sequence[Camera], traces: Sequence[Trace], tangents: Sequence[Array], points: Array
 ) -> tuple[NDArray[np.int64], Array, Array]:
     """Node (r,), gradient (r, 3) and residuals (r,) of all equations, in standard deviations."""
     along = np.gradient(points, axis=0)
@@ -276,11 +283,9 @@ def _equations(
         nodes.append(np.arange(_SAMPLES))
         rows.append(np.tile([0.0, 0.0, 1.0 / _LEVEL], (_SAMPLES, 1)))
         misses.append(-points[:, 2] / _LEVEL)
-    for camera, trace in zip(cameras, traces, strict=True):
+    for camera, trace, tangent in zip(cameras, traces, tangents, strict=True):
         pixels, slopes = camera.project_with_slopes(points)
         line = trace.line
-        tangent = np.gradient(line, axis=0)
-        tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
         near = np.argmin((line**2).sum(axis=1) - 2.0 * pixels @ line.T, axis=1)
         t, away = tangent[near], line[near] - pixels
         across = np.stack([-t[:, 1], t[:, 0]], axis=1)

@@ -47,6 +47,11 @@ def arguments(videos, *more):
     return ["track", videos / "top.mkv", videos / "front.mkv", *more]
 
 
+def stated_bases():
+    bases = [f"{x:.0f},{y:.0f}" for x, y in (c.project(np.zeros(3)) for c in CAMERAS)]
+    return [word for base in bases for word in ("--base", base)]
+
+
 @pytest.fixture(scope="module")
 def tracked(videos, tmp_path_factory):
     """Folder with the recording of both videos, and what was printed."""
@@ -192,7 +197,7 @@ def test_what_is_traced_is_not_traced_again(videos, tmp_path, monkeypatch):
         return follow(*what)
 
     monkeypatch.setattr(view, "follow_all", stopping)
-    words = arguments(videos, "--cameras", videos / "cameras.toml", "-o", out)
+    words = arguments(videos, "--cameras", videos / "cameras.toml", "-o", out, *stated_bases())
     run(*words)
     assert len(calls) == 20
     assert not out.exists()
@@ -355,9 +360,7 @@ def test_a_whisker_that_is_often_lost_is_in_doubt_with_a_picture(videos, tmp_pat
     shown = [light if i % 3 == 2 else frame for i, frame in enumerate(frames)]
     write_video(tmp_path / "front.mkv", shown)
     words = ["track", videos / "top.mkv", tmp_path / "front.mkv", "-o", tmp_path / "t.nc"]
-    bases = [f"{x:.0f},{y:.0f}" for x, y in (c.project(np.zeros(3)) for c in CAMERAS)]
-    given = [word for base in bases for word in ("--base", base)]
-    done = run(*words, "--cameras", videos / "cameras.toml", *given)
+    done = run(*words, "--cameras", videos / "cameras.toml", *stated_bases())
     assert done.exit_code == 0, done.exception
     line = " ".join(done.stdout.split())
     assert "not sure: in 5 of 16 frames front loses whisker 0" in line

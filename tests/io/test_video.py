@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vibrissa.io import read_video, video_info, write_video
+from vibrissa.io import interlaced, read_video, video_info, write_video
 
 
 def frames(count=5, shape=(48, 64)):
@@ -63,3 +63,31 @@ def test_frames_must_be_of_one_kind(tmp_path):
         write_video(tmp_path / "a.mkv", [])
     with pytest.raises(ValueError, match=r"\.mkv, \.mp4"):
         write_video(tmp_path / "a.gif", frames())
+
+
+def thin_line(moment, slope, shape=(90, 120)):
+    """A line less than two rows thick that moves up and down."""
+    row, column = np.mgrid[: shape[0], : shape[1]]
+    away = row - slope * (column - 60.0) - 45.0 - 20.0 * np.sin(0.8 * moment)
+    return 180.0 - 120.0 * np.exp(-0.5 * (away / 0.7) ** 2)
+
+
+@pytest.mark.parametrize("slope", [0.1, 1.0])
+def test_interlaced_frames_are_told_from_thin_lines_and_noise(slope):
+    """Odd rows of interlaced frames show the line half a frame later than even ones."""
+    generator = np.random.default_rng(3)
+    whole, woven = [], []
+    for moment in range(12):
+        frame = thin_line(moment, slope)
+        later = np.where(np.arange(90)[:, None] % 2, thin_line(moment + 0.5, slope), frame)
+        grain = generator.normal(0.0, 2.0, frame.shape)
+        whole.append(np.rint(frame + grain).astype(np.uint8))
+        woven.append(np.rint(later + grain).astype(np.uint8))
+    assert interlaced(woven)
+    assert not interlaced(whole)
+    assert not interlaced([frame.T for frame in whole])
+    # Stripes that do not move, as those of a cloth.
+    assert not interlaced(
+        [frame - (40 * (np.arange(90) % 2)[:, None]).astype(np.uint8) for frame in whole]
+    )
+    assert not interlaced(whole[:1])

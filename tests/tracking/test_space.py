@@ -10,6 +10,7 @@ from vibrissa.cameras import Camera, orthogonal_views
 from vibrissa.tracking import Trace, low_pass, merge, paired_frames, usual_cutoff
 from vibrissa.tracking.space.curve import begun_together
 from vibrissa.tracking.space.exchange import Known, exchanged
+from vibrissa.tracking.space.frame_pairs import better_offset
 from vibrissa.tracking.space.pose import base_pose, rolled_over
 from vibrissa.tracking.space.rest_shape import RestShape, whisker_at_rest
 from vibrissa.tracking.trace.start import base_gap
@@ -145,6 +146,21 @@ def test_the_offset_between_cameras_and_dropped_frames_are_found(pair):
     assert len(pairs) > 100
     # Where the whisker turns back, frames before and after a gap look alike.
     assert wrong.mean() < 0.05
+
+
+@pytest.mark.parametrize("pair", PAIRS.values(), ids=PAIRS.keys())
+def test_an_offset_is_found_of_views_that_show_the_whisker_along_itself(pair):
+    """Where it ends is seen with errors along it, by which lines of sight pass each other."""
+    generator = np.random.default_rng(1)
+    first, second, numbers = moving(pair, late=7)
+    for trace in (*first, *second):
+        for end, step in ((0, 1), (-1, -1)):
+            ahead = trace.line[end + step] - trace.line[end]
+            trace.line[end] += generator.normal(0.0, 4.0) * ahead / np.linalg.norm(ahead)
+    pairs = paired_frames(pair, [first, second], None)
+    assert np.mean(pairs[:, 0] != np.array(numbers)[pairs[:, 1]]) < 0.05
+    assert better_offset(*pair, first, second, 0).tolist() == [-7]
+    assert not better_offset(*pair, first, second, -7).size
 
 
 def test_a_given_offset_is_used():

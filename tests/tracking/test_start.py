@@ -242,6 +242,16 @@ def test_parts_of_one_line_are_joined_and_parallel_lines_are_not(angle):
     assert len(joined(beside, bodies)) == 2
 
 
+def test_the_first_frame_that_shows_the_whisker_is_reported(films):
+    film = films(200)
+    frames = [[np.max(view, axis=0)] * 5 + list(view[5:]) for view in film.frames]
+    start = find_start(film.cameras, frames)
+    assert start.begins >= 5
+    true = [view[start.begins][0] for view in film.curves]
+    for base, at in zip(start.bases, true, strict=True):
+        assert np.linalg.norm(base - at) < 25.0
+
+
 def test_flickering_light_moves_nothing(films):
     film = films(200)
     lamp = 0.75 + 0.25 * np.cos(np.arange(SMALL["frames"]))

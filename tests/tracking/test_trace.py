@@ -140,6 +140,37 @@ def test_corrected_frames_are_taken_and_followed_both_ways():
         assert np.median(np.abs(trace.line[:, 1] - expected)) < 0.1
 
 
+def test_a_whisker_that_enters_later_is_followed_from_there_both_ways():
+    """Next to one whose base is not stated, in a film whose first frames show the wall alone."""
+    shifts = np.linspace(0.0, 22.0, 12)
+    frames = [two_lines(shift, seed=i)[0] for i, shift in enumerate(shifts)]
+    for frame in frames[:3]:
+        frame[:, 20:] = 190
+    base = (20.0, 62.0 + shifts[6])
+    (row,) = trace_video(frames, [base], TraceOptions(shortest=30.0), begins=6)
+    assert [len(trace.line) > 0 for trace in row] == [False] * 3 + [True] * 9
+    for i in range(3, 12):
+        expected = np.interp(row[i].line[:, 0], np.arange(200), two_lines(shifts[i])[1][0])
+        assert np.median(np.abs(row[i].line[:, 1] - expected)) < 0.1
+    begun = [[Trace.lost()] * 4]
+    (again,) = trace_video(frames, [base], TraceOptions(shortest=30.0), begins=6, begun=begun)
+    np.testing.assert_array_equal(again[3].line, row[3].line)
+
+
+@pytest.mark.parametrize("fur", [25.0, 70.0])
+def test_a_bright_whisker_begins_where_fur_in_line_with_it_ends(fur):
+    """Seen from its tip, the whisker brightens too, but not at once."""
+    generator = np.random.default_rng(2)
+    y, x = np.mgrid[:120, :300]
+    away = np.exp(-0.5 * ((y - 50.0 - 0.05 * x) / 1.2) ** 2)
+    streak = fur * (1.0 + 0.4 * np.sin(x / 3.0)) * (x > 50)
+    height = np.where(x < 100, streak, np.linspace(200.0, 10.0, 300)) * (x < 280)
+    image = 40.0 + away * height + generator.normal(0.0, 2.0, away.shape)
+    dark = np.asarray(255 - np.rint(image).astype(np.uint8))
+    best = find_curves(dark, Scene.of([dark], 1.0), TraceOptions(bright=True))[0]
+    np.testing.assert_allclose(best.line[[0, -1], 0], [100.0, 279.0], atol=4.0)
+
+
 def test_what_is_done_is_gone_on_with_as_if_it_never_stopped(filmed):
     """Stopped after 15 frames, of which one showed nothing; then with whiskers never seen."""
     frames = [frame.copy() for frame in filmed.frames[0][:25]]

@@ -33,6 +33,11 @@ _LONGEST_FUR = 20.0  # longest part of a whisker that fur hides, mm
 _HALF = 127  # grey value above which a pixel of a mask image is bright
 # Reason for showing a frame in which the whisker may have been lost.
 _LOST = "here a whisker is lost, has a hook, or differs much in length from the frame before"
+_INTERLACED = (
+    "not sure: {} is interlaced, its odd and even rows show different moments, and what moves is "
+    "seen twice. Separate them first (ffmpeg -i VIDEO -vf bwdif=send_field NEW), which doubles "
+    "--rate"
+)
 _UNEXPLAINED = "here the bent rod explains the traces worst: one of them may be on something else"
 
 
@@ -363,8 +368,13 @@ class _Job:
             recording.with_name(f"{'' if alone else f'{recording.stem}.'}{kind}.png")
             for kind in ("start", "doubt")
         )
+        numbers, frames = vb.tracking.start_frames(videos, self.how.offset or 0)
+        combed = [v.name for v, some in zip(videos, frames, strict=True) if vb.io.interlaced(some)]
+        if combed:
+            say(_INTERLACED.format(" and ".join(combed)))
+        begins = 0
         if self.bases[0] is None:
-            bases, options = self._found(videos, start)
+            bases, begins, options = self._found(videos, numbers, frames, start)
         else:
             firsts = [next(vb.io.video_frames(video, [0])) for video in videos]
             bright = vb.tracking.is_bright(firsts, self.bases, self.options)
@@ -379,6 +389,7 @@ class _Job:
                     options,
                     corrections=self.corrections.get(view, {}),
                     mask=self.masks[view],
+                    begins=begins + (self.how.offset or 0) * (view > 0),
                     progress=partial(tell, f"trace {path.name}"),
                 )
                 for view, path in enumerate(videos)
@@ -389,9 +400,9 @@ class _Job:
             result = vb.tracking.track(
                 self.cameras, traces, self.rate, self.how, progress=tell, **self.known
             )
-        frames = None if lost is not None else _where_unexplained(result)
-        if frames is not None:
-            self._show_doubt(videos, traces, frames, _UNEXPLAINED, doubt)
+        unexplained = None if lost is not None else _where_unexplained(result)
+        if unexplained is not None:
+            self._show_doubt(videos, traces, unexplained, _UNEXPLAINED, doubt)
         _compare_lengths(videos, traces, result.sizes["time"])
         vb.io.save_recording(recording, result)
         for file in kept:
@@ -399,10 +410,13 @@ class _Job:
         print_tracked(result, recording)
 
     def _found(
-        self, videos: Sequence[Path], picture: Path
-    ) -> tuple[Sequence[Any], vb.tracking.TraceOptions]:
-        """Find the start of the whiskers, and save an image of it before tracing."""
-        numbers, frames = vb.tracking.start_frames(videos, self.how.offset or 0)
+        self,
+        videos: Sequence[Path],
+        numbers: Sequence[int],
+        frames: Sequence[Sequence[vb.io.Frame]],
+        picture: Path,
+    ) -> tuple[Sequence[Any], int, vb.tracking.TraceOptions]:
+        """Find the start of the whiskers and the first frame that shows them; save an image."""
         start = vb.tracking.find_start(self.cameras, frames, self.options, self.masks)
         names = [camera.name for camera in self.cameras]
         images = [view[start.frame] for view in frames]
@@ -420,7 +434,8 @@ class _Job:
                 + " (or click it: --pick)"
             )
         _report_start(start, names, picture)
-        return [[base.tolist()] for base in start.bases], replace(self.options, bright=start.bright)
+        options = replace(self.options, bright=start.bright)
+        return [[base.tolist()] for base in start.bases], numbers[start.begins], options
 
     def _show_doubt(
         self, videos: Sequence[Path], traces: _Traces, at: Sequence[int], why: str, picture: Path

@@ -115,6 +115,7 @@ from vibrissa.io.video import (
     Frame as Frame,
     FrameReader as FrameReader,
     VideoInfo as VideoInfo,
+    interlaced as interlaced,
     load_series as load_series,
     read_video,
     video_frames as video_frames,

@@ -217,6 +217,30 @@ def grey_frame(frame: Any) -> Frame:
     return np.asarray(frame.to_ndarray(format="gray"), dtype=np.uint8)
 
 
+# Contrast of alternate rows, grey values; their smallest number a frame; and how much more frequent
+# they must be than alternate columns.
+_ALTERNATE, _COMBED, _RATHER = 8, 20, 10
+
+
+def interlaced(frames: Sequence[Frame]) -> bool:
+    """Whether odd and even rows show different moments: rows alternate where something moves."""
+    pairs = list(pairwise(frame.astype(np.int16) for frame in frames))
+    rows = sum(_combed(after, after - before) for before, after in pairs)
+    columns = sum(_combed(after.T, (after - before).T) for before, after in pairs)
+    return rows > max(_COMBED * len(pairs), _RATHER * columns)
+
+
+def _combed(*images: NDArray[np.int16]) -> int:
+    """Number of pixels from which on four in a column are dark and bright in turn in all images."""
+    least = np.full(images[0][3:].shape, np.iinfo(np.int16).max)
+    for image in images:
+        steps = np.diff(image, axis=0)
+        steps[1::2] *= -1
+        turns = np.stack([steps[:-2], steps[1:-1], steps[2:]])
+        least = np.minimum(least, np.maximum(turns.min(axis=0), -turns.max(axis=0)))
+    return int((least > _ALTERNATE).sum())
+
+
 AHEAD = 60  # number of frames up to which decoding in sequence is preferred to seeking
 
 

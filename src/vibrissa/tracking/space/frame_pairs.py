@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from vibrissa.cameras import Camera, triangulate
@@ -23,7 +24,7 @@ _LARGEST = 30  # largest offset, frames
 _SHIFTS = np.arange(-_LARGEST, _LARGEST + 1)
 
 _SWITCH = 40.0  # cost of a change of the offset
-_WORST = 6.0  # largest cost of a frame: square of the distance at which lines pass, pixels²
+_WORST = 6.0  # largest cost of a frame: square of the distance at which lines pass over its scatter
 _CLEARLY = 20.0  # cost by which another offset must fit better than the given one
 # Largest share of the cost of the given offset that remains with one that explains the misfit.
 _LEFT = 0.65
@@ -93,21 +94,16 @@ def better_offset(
         passing[~np.isin(np.arange(len(a)), rows)] = np.nan
         partner = np.arange(len(a))[:, None] + _SHIFTS
         passing[~np.isin(partner, other)] = np.nan
+        passing /= _scatter(passing)
         if np.isfinite(passing[:, offset + _LARGEST]).sum() >= _KNOWN:
             ends.append(passing)
     if not ends:
         return np.empty(0, dtype=np.int64)
-    blank = np.sum([np.where(np.isfinite(one), 0.0, 0.5 * _WORST) for one in ends], axis=0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # for offsets without any frame
-        usual = [np.nan_to_num(np.nanmedian(one, axis=0)) for one in ends]
-    fits = _costs(ends, usual)
-    # Without synchrony the usual distance contains the lag; that of the best offset does not.
-    best = int(np.argmin((fits + blank).sum(axis=0)))
-    cost = _costs(ends, [one[best] for one in usual])
+    away, fits, blank = _compared(ends)
+    cost = _costs(away)
     path = _cheapest(cost + blank)
-    if (np.abs(_SHIFTS[path]) == _LARGEST).any() or (np.abs(np.diff(path)) > _DROPPED).any():
-        # No minimum, as it is at the end of what is considered, or no camera that drops frames.
+    if (np.abs(_SHIFTS[path]) == _LARGEST).any():
+        # No minimum, as it is at the end of what is considered.
         return np.empty(0, dtype=np.int64)
     switched = np.concatenate([[True], np.diff(path) != 0])
     changed = _SWITCH * int(switched[1:].sum()) + _CLEARLY
@@ -117,10 +113,7 @@ def better_offset(
         return np.empty(0, dtype=np.int64)
     left, given = cost[row, path][both].sum(), fits[both, column].sum()
     # A base that begins at another hair for a while is one error, not one in each frame.
-    away = [
-        np.nan_to_num(one[row, path] - middle[best])
-        for one, middle in zip(ends, usual, strict=True)
-    ]
+    away = [np.nan_to_num(one[row, path]) for one in away]
     power = float(np.mean([(one**2).mean() for one in away]))
     alike = 1.0 + (correlated([one[None] for one in away]) - 1.0) * power / (power + _LOCATED**2)
     # With wrong optics some offset always explains a little; a true one leaves only noise.
@@ -129,10 +122,39 @@ def better_offset(
     return np.asarray(_SHIFTS[path[switched]])
 
 
-def _costs(ends: Sequence[Array], usual: Sequence[Array]) -> Array:
+def _medians(passing: Array) -> Array:
+    """Usual distance by offset; 0 for offsets without any frame."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return np.asarray(np.nan_to_num(np.nanmedian(passing, axis=0)))
+
+
+def _scatter(passing: Array) -> float:
+    """Standard deviation of distances with the best offset, a pixel at least.
+
+    Where both cameras show the whisker along itself, as those of a top and a front view may, it is
+    that of where its ends are seen to be, along it.
+    """
+    enough = 2 * np.isfinite(passing).sum(axis=0) > len(passing)
+    away = 1.4826 * _medians(np.abs(passing - _medians(passing)))
+    return max(1.0, float(away[enough].min(initial=np.inf))) if enough.any() else 1.0
+
+
+def _compared(ends: Sequence[Array]) -> tuple[list[Array], Array, Array]:
+    """Distances beyond the usual one with the best offset; costs of all offsets, also of blanks.
+
+    Without synchrony the usual distance contains the lag; that of the best offset does not.
+    """
+    blank = np.sum([np.where(np.isfinite(one), 0.0, 0.5 * _WORST) for one in ends], axis=0)
+    usual = [_medians(one) for one in ends]
+    fits = _costs([one - middle for one, middle in zip(ends, usual, strict=True)])
+    best = int(np.argmin((fits + blank).sum(axis=0)))
+    return [one - middle[best] for one, middle in zip(ends, usual, strict=True)], fits, blank
+
+
+def _costs(away: Sequence[Array]) -> Array:
     """Costs (frame, offset) of distances beyond the usual one; 0 where unknown."""
-    away = [np.nan_to_num(one - middle) for one, middle in zip(ends, usual, strict=True)]
-    return np.asarray(sum(np.minimum(one**2, _WORST) for one in away))
+    return np.asarray(sum(np.minimum(np.nan_to_num(one) ** 2, _WORST) for one in away))
 
 
 def _shown(traces: Sequence[Trace], end: int) -> NDArray[np.intp]:
@@ -146,15 +168,11 @@ def _shifts(first: Camera, second: Camera, a: Sequence[Trace], b: Sequence[Trace
     few = "the whisker is seen in too few frames to find the cameras' offset"
     if not all(any(len(trace.line) for trace in row) for row in (a, b)):
         raise ValueError(few)
-    cost, seen = np.full((len(a), len(_SHIFTS)), _WORST), 0
-    for end in (0, -1):
-        passing = _passing(first, second, a, b, end)
-        known = np.isfinite(passing)
-        seen += int(known.sum())
-        cost[known] += np.minimum(passing[known] ** 2, _WORST) - 0.5 * _WORST
-    if seen < _KNOWN * len(_SHIFTS):
+    ends = [_passing(first, second, a, b, end) for end in (0, -1)]
+    if sum(np.isfinite(one).sum() for one in ends) < _KNOWN * len(_SHIFTS):
         raise ValueError(few)
-    return _SHIFTS[_cheapest(cost)]
+    away, _, blank = _compared([one / _scatter(one) for one in ends])
+    return _SHIFTS[_cheapest(_costs(away) + blank)]
 
 
 def _passing(
@@ -182,11 +200,13 @@ def _passing(
 
 
 def _cheapest(cost: Array) -> NDArray[np.intp]:
-    """Path through (time, offset) that seldom changes its offset."""
+    """Path through (time, offset) that changes its offset seldom, and by few frames."""
     count, width = cost.shape
     total, came = cost[0].copy(), np.zeros(cost.shape, dtype=np.intp)
+    window = 2 * _DROPPED + 1
     for i in range(1, count):
-        best = int(np.argmin(total))
+        around = sliding_window_view(np.pad(total, _DROPPED, constant_values=np.inf), window)
+        best = np.arange(width) - _DROPPED + around.argmin(axis=1)
         jump = total[best] + _SWITCH
         came[i] = np.where(total <= jump, np.arange(width), best)
         total = np.minimum(total, jump) + cost[i]

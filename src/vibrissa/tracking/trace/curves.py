@@ -257,6 +257,7 @@ _ACROSS, _SKIPPED = 6, 5
 _TURNING = 2.0  # largest turn of a whisker, rad
 # Standard deviation of the direction about a smooth one that halves the score of a curve, rad.
 _RAGGED = 0.35
+_FAINT = 0.7  # darkness, as a share of that of the rest, below which a line's beginning is fur
 _EVEN = 6.0  # distance of the points between which the direction is measured, pixels
 
 
@@ -287,7 +288,8 @@ def find_curves(
         if len(chain.points) >= _DIRECTION and length >= options.shortest:
             moved = scene.moved(frame, chain.points, gain)
             dark = chain._replace(strength=_darkness(difference, chain.points, options.scale))
-            both = (_begun(part, bodies, length, moved) for part in (dark, dark.reversed))
+            ends = [_bare(one) if options.bright else one for one in (dark, dark.reversed)]
+            both = (_begun(part, bodies, length, moved) for part in ends)
             curves += [curve for curve in both if curve is not None]
     return sorted(curves, key=lambda curve: -curve.score)
 
@@ -424,6 +426,25 @@ def _darkness(difference: Image, line: Array, scale: float) -> Array:
     grey = difference[points[..., 1].clip(0, rows - 1), points[..., 0].clip(0, columns - 1)]
     around = np.minimum(grey[:, 0], grey[:, -1])[:, None]
     return np.asarray(np.maximum((grey - around).sum(axis=1), 1.0), dtype=np.float64)
+
+
+def _bare(chain: Segment) -> Segment:
+    """Line without streaks of the fur before it.
+
+    A bright whisker is at least as clear before dark fur, which then is not a body, as elsewhere.
+    """
+    near = chain.strength[: len(chain.strength) // 2]
+    count = np.arange(1, len(near))
+    before = np.cumsum(near)[:-1] / count
+    after = (near.sum() - before * count) / (len(near) - count)
+    # Where two constants describe the darkness best; the taper of a tip is better described by a
+    # straight line.
+    explained = count * (len(near) - count) * (after - before) ** 2 / len(near) ** 2
+    first = int(np.argmax(explained)) + 1
+    line = np.cov(np.arange(len(near)), near)
+    step = explained[first - 1] > line[0, 1] ** 2 / line[0, 0]
+    first *= int(step and before[first - 1] < _FAINT * after[first - 1])
+    return Segment(chain.points[first:], chain.strength[first:])
 
 
 def _begun(chain: Segment, bodies: Bodies, length: float, moved: float) -> Curve | None:

@@ -12,7 +12,7 @@ animal itself, it does not show where the whisker begins; the other views do.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import NamedTuple
 
@@ -88,13 +88,15 @@ class Start:
     Parameters
     ----------
     bases : list of array (2,), or None
-        Column and row of its base in each view, in the first frame that shows it; None if views
-        show no line in common.
+        Column and row of its base in each view, in the first frame that shows it clearly; None if
+        views show no line in common.
     lines : list of array (n, 2)
         Lines that are taken for the whisker, view by view, in the frame in which it is seen best;
         without points where there is nothing.
     frame : int
         Number of that frame.
+    begins : int
+        Number of the first frame that shows it.
     bright : bool
         Whether whiskers are bright on a dark background.
     confidence : float
@@ -110,6 +112,7 @@ class Start:
     bases: list[Array] | None
     lines: list[Array]
     frame: int
+    begins: int
     bright: bool
     confidence: float
     agreed: tuple[int, int]
@@ -218,7 +221,7 @@ def find_start(
     search, bright = _Search.of(cameras, frames, options, masks), bool(options.bright)
     if options.bright is not False:
         inverted = [[negative(f) for f in view] for view in frames]
-        other = _Search.of(cameras, inverted, options, masks)
+        other = _Search.of(cameras, inverted, replace(options, bright=True), masks)
         few = search.moments(_POLARITY)
         bright = bright or other.worth(few) > _BETTER * search.worth(few)
         search = other if bright else search
@@ -434,7 +437,7 @@ def _start(search: _Search, vote: _Vote, bright: bool) -> Start:
             if missing
             else "the views show no line that could be one whisker in space"
         )
-        return Start(None, alone, moment, bright, 0.0, vote.agreed, (why,))
+        return Start(None, alone, moment, 0, bright, 0.0, vote.agreed, (why,))
     best = max(vote.winners, key=lambda one: one.worth)
     confidence, doubts = vote.confidence, []
     if not vote.moves:
@@ -456,10 +459,17 @@ def _start(search: _Search, vote: _Vote, bright: bool) -> Start:
     if together < _SELDOM:
         doubts.append(f"views show its tip at one place in {100.0 * together:.0f} % of frames only")
     clear = [one for one in vote.winners if one.worth > 0.5 * best.worth]
-    bases = list(min(clear, key=lambda one: one.frame).bases)
-    lines = [curve.line for curve in best.curves]
-    others = _others(vote, best, confidence)
-    return Start(bases, lines, best.frame, bright, confidence, vote.agreed, tuple(doubts), others)
+    return Start(
+        list(min(clear, key=lambda one: one.frame).bases),
+        [curve.line for curve in best.curves],
+        best.frame,
+        min(one.frame for one in vote.winners),
+        bright,
+        confidence,
+        vote.agreed,
+        tuple(doubts),
+        _others(vote, best, confidence),
+    )
 
 
 def _others(vote: _Vote, best: _Combination, confidence: float) -> tuple[Candidate, ...]:

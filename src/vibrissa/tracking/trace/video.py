@@ -58,6 +58,7 @@ def trace_video(
     kept: list[list[Trace]] | None = None,
     sample: Sequence[Frame] | None = None,
     mask: Mask | None = None,
+    begins: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> list[list[Trace]]:
     """Trace whiskers from frame to frame.
@@ -67,7 +68,7 @@ def trace_video(
     frames : iterable of array (height, width)
         Grey values.
     bases : sequence of array_like (2,), optional
-        Column and row where each whisker leaves the face in the first frame, to about 10 pixels.
+        Column and row where each whisker leaves the face in frame ``begins``, to about 10 pixels.
         By default one whisker, the one that is best seen.
     options : TraceOptions, optional
         Settings of tracing.
@@ -84,6 +85,8 @@ def trace_video(
         of ``frames`` if they are a sequence, else the first 30.
     mask : array (height, width) of bool, optional
         Pixels in which no whisker is measured.
+    begins : int
+        Number of the first frame that shows them. From there they are followed backward, too.
     progress : callable, optional
         Function that is called after every frame with the number of frames done.
 
@@ -101,8 +104,11 @@ def trace_video(
     options = options or TraceOptions()
     corrections = corrections or {}
     traces: list[list[Trace]] = [] if kept is None else kept
+    begins = min([begins, *(frame for frame, _ in corrections)])
     done = len(begun[0]) if begun else 0
-    recent: deque[Frame] = deque(maxlen=_BACK)
+    if done <= begins:
+        begun, done = (), 0
+    recent: deque[Frame] = deque(maxlen=max(_BACK, begins))
     seen: list[Seen] = []
     source = iter(frames)
     first = list(islice(source, FRAMES))
@@ -114,7 +120,7 @@ def trace_video(
             sample = [frames[i] for i in _spread(len(frames))]
     bright, shape = is_bright(first[:1], [bases], options), first[0].shape
     start = negative(first[0]) if bright else first[0]
-    followers = _begun(start, bases, begun if done else (), options)
+    followers = _begun(start, bases, begun, options)
     starts = np.array([f.base for f in followers] if bases is None else bases, dtype=np.float64)
     alike = [negative(f) if bright else f for f in sample if f.shape == shape]
     scene = Scene.of(alike, options.scale, mask).with_still(starts, alike)
@@ -144,17 +150,20 @@ def trace_video(
         frame, shift = steady.moved_back(frame) if steady is not None else (frame, _STEADY)
         shifts.append(shift)
         frame = scene.without_still(frame)
-        if i < done:
+        if i < max(done, begins):
             recent.append(frame)
+            before = [row[i] for row in traces] if done else [Trace.lost()] * len(followers)
             if len(followers) > 1:
-                seen.append(_seen_before(frame, [row[i] for row in traces], followers))
+                seen.append(_seen_before(frame, before, followers))
+            for row, trace in zip(() if done else traces, before, strict=False):
+                row.append(trace)
             continue
         known = {k: np.asarray(at) - shift[:2] for (j, k), at in corrections.items() if j == i}
         found = follow_all(followers, frame, known, seen, scene)
         for trace, row in zip(found, traces, strict=False):
             row.append(trace)
         for k in range(len(traces)):
-            if k in known:
+            if (k in known or i == begins) and len(traces[k][i].line):
                 _backward(traces[k], recent, followers[k], k, corrections, seen)
         recent.append(frame)
         if progress is not None:
@@ -344,6 +353,7 @@ def trace_file(
     *,
     corrections: Corrections | None = None,
     mask: Mask | None = None,
+    begins: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[list[Trace]]:
     """Trace the whiskers of a video file, or resume an interrupted run.
@@ -364,6 +374,8 @@ def trace_file(
         Points along whiskers, as in `trace_video`.
     mask : array (height, width) of bool, optional
         Pixels in which no whisker is measured.
+    begins : int
+        Number of the first frame that shows them, as in `trace_video`.
     progress : callable, optional
         Function that is called as ``progress(done, total)`` with numbers of frames.
 
@@ -375,7 +387,9 @@ def trace_file(
     video, partial = Path(video), Path(partial)
     about = without_part(video)[0].stat()
     fixed = sorted((key, np.asarray(at).tolist()) for key, at in (corrections or {}).items())
-    key = f"{video.resolve()} {about.st_size} {about.st_mtime_ns} {bases} {fixed} {options}"
+    key = (
+        f"{video.resolve()} {about.st_size} {about.st_mtime_ns} {bases} {begins} {fixed} {options}"
+    )
     key += "" if mask is None else f" {zlib.crc32(np.packbits(mask).tobytes())}"
     begun = [[Trace(*row) for row in whisker] for whisker in load_traces(partial, key) or []]
     kept: list[list[Trace]] = []
@@ -395,6 +409,7 @@ def trace_file(
             kept=kept,
             sample=start_frames([video])[1][0],
             mask=mask,
+            begins=begins,
             progress=report,
         )
     finally:

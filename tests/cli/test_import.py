@@ -200,6 +200,19 @@ def test_points_are_ordered_and_separated_by_their_names(trial):
     assert len(tracker_traces(numbered, CAMERAS).names) == 1
 
 
+def test_points_in_the_order_of_a_spreadsheet_are_sorted_by_their_numbers(trial):
+    image = np.stack([camera.project(trial[1]) for camera in CAMERAS], axis=2)
+    raw = RawTracks("test", ["w"], image=image, views=[c.name for c in CAMERAS], fps=1000.0)
+    names = [f"C1_{i}" for i in (1, 2, 3, 4, 5, 6, 7, 8, 10)]
+    plain = labelled(replace(raw, nodes=names), "a")
+    found = tracker_traces(plain, CAMERAS)
+    again = tracker_traces(plain.sel(node=sorted(names)), CAMERAS)  # C1_1, C1_10, C1_2
+    assert "sorted by their numbers" in again.notes[0]
+    np.testing.assert_array_equal(again.traces[0][0][5].line, found.traces[0][0][5].line)
+    downward = plain.isel(node=slice(None, None, -1))
+    assert not any("sorted" in note for note in tracker_traces(downward, CAMERAS).notes)
+
+
 def test_points_that_mislead_are_noticed(trial):
     """Exchanged in frames, from tip to base, few, without a base, or of other names in a view."""
     image = np.stack([camera.project(trial[1]) for camera in CAMERAS], axis=2)

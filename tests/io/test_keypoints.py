@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 import xarray as xr
 
-from vibrissa.io import Kind, load_tracks
+from vibrissa.io import Kind, load_tracks, recognise
 
 PARTS = ("base", "low", "high", "tip")
 
@@ -106,6 +106,25 @@ def test_rows_of_deeplabcut_that_are_written_twice_keep_their_number(tmp_path, r
     text = path.read_text()
     path.write_text(text + text.splitlines()[-1] + "\n")
     assert load_tracks(path)["frame"].values.tolist() == [0, 1, 2, 3, 4, 4]
+
+
+def test_deeplabcut_saved_by_a_spreadsheet(tmp_path, rng):
+    """Semicolons and decimal commas, UTF-16, empty columns to the right, words for missing."""
+    table, points, _ = deeplabcut(rng)
+    path = tmp_path / "t.csv"
+    table.to_csv(path, na_rep="NA")
+    plain = path.read_text().splitlines()
+    european = "\r\n".join(line.replace(",", ";").replace(".", ",") for line in plain)
+    contents = (
+        "\n".join(f"{line},," for line in plain).encode(),
+        european.encode("utf-8-sig"),
+        european.replace(";", "\t").encode("utf-16"),
+    )
+    for content in contents:
+        path.write_bytes(content)
+        tracks = load_tracks(path)
+        np.testing.assert_allclose(tracks["trace"][:, :, 0], points)
+        assert recognise(path) == Kind.DEEPLABCUT
 
 
 def test_bad_deeplabcut(tmp_path, rng):

@@ -83,6 +83,14 @@ def test_info_of_tracks(tmp_path):
     said = info(anipose(tmp_path / "trial.csv"))
     for part in ("table of Anipose", "frames 2, numbered 0 to 1", "unit not stated", "100.0 %"):
         assert part in said
+    names = [f"w{i}_{what}" for i in range(2) for what in ("x", "y", "z", "ncams")]
+    for scale, unit in ((30.0, "mm"), (0.03, "m"), (30e3, "um")):
+        row = f"0,0,0,2,{scale},0,0,2"
+        (tmp_path / "line.csv").write_text(f"{','.join(names)}\n{row}\n{row}\n")
+        said = info(tmp_path / "line.csv")
+        assert f"--unit {unit} " in said
+        assert "also cameras" in said
+        assert "confidence" not in said
     image = np.ones((4, 2, 1, 3, 2))
     image[2:, 1] = np.nan
     raw = RawTracks("test", ["C1", "C2"], image=image, nodes=["base", "middle", "tip"])

@@ -187,6 +187,20 @@ def test_somebody_elses_table(tmp_path):
     assert np.isnan(line[1, 1]).all()
 
 
+def test_units_of_time_and_points_in_the_header(tmp_path):
+    path = tmp_path / "points.csv"
+    path.write_text("Time (ms),x (mm),y (mm),z [mm]\n0,0,0,0\n0,9,0,0\n2,0,0,0\n2,9,1,0\n")
+    tracks = load_tracks(path)
+    np.testing.assert_allclose(tracks["time"], [0.0, 2e-3])
+    np.testing.assert_allclose(tracks["centerline"][1, 0, 1], [9e-3, 1e-3, 0.0])
+    path.write_text(path.read_text().replace("(mm)", "(um)").replace("[mm]", "[um]"))
+    with pytest.raises(ValueError, match="least that is possible"):
+        load_tracks(path)
+    path.write_text("frame,x_mm,y_mm,z_mm\n0,0,0,0\n,9,0,0\n")
+    with pytest.raises(ValueError, match="line 3"):
+        load_tracks(path)
+
+
 def test_rows_come_in_any_order_where_nodes_are_numbers(tmp_path):
     path = tmp_path / "points.csv"
     path.write_text("frame,node,column,row\r\n0,10,3,0\r\n0,2,2,0\r\n1,0,4,0\r\n0,0,1,0\r\n")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -286,12 +287,12 @@ def _calibration(path: Path) -> Iterator[tuple[str, str]]:
 def _tracks(path: Path, kind: str) -> Iterator[tuple[str, str]]:
     """Describe sizes, times and missing points of tracks, whose unit may be unknown."""
     yield "kind", kind
-    note = ""
+    unstated = ""
     if kind == vb.io.Kind.TRACKS:
         tracks = vb.load_tracks(path)
     else:
         raw = vb.io.READERS[vb.io.Kind(kind)](path)
-        tracks, note = _without_unit(raw, path)
+        tracks, unstated = _without_unit(raw, path)
     for name in ("source_software", "scorer", "identity", "direction", "variable"):
         if tracks.attrs.get(name):
             yield name.replace("_", " "), str(tracks.attrs[name])
@@ -308,19 +309,26 @@ def _tracks(path: Path, kind: str) -> Iterator[tuple[str, str]]:
             found = tracks[name]
             there = 100.0 * float(found.notnull().all(str(found.dims[-1])).mean())
             where = found.attrs.get("reference_frame", "")
-            units = note if name == "centerline" and note else found.attrs["units"]
+            units = found.attrs["units"]
+            if name == "centerline" and unstated:
+                units = f"unit not stated (plausible: {unstated})"
             yield name, f"{units}{f', {where} frame' if where else ''}; {there:.1f} % of points"
-    others = [str(name) for name in tracks.data_vars if name not in ("trace", "centerline")]
-    yield "also", ", ".join(others)
-    yield "next", _import(path, tracks, stated=not note)
+    others = [
+        str(name)
+        for name, values in tracks.data_vars.items()
+        if name not in ("trace", "centerline") and values.notnull().any()
+    ]
+    if others:
+        yield "also", ", ".join(others)
+    yield "next", _import(path, tracks, unstated)
 
 
-def _import(path: Path, tracks: xr.Dataset, *, stated: bool) -> str:
+def _import(path: Path, tracks: xr.Dataset, unstated: str) -> str:
     """Command that converts tracks to a recording."""
     words = ["vibrissa import", str(path)]
     hint = ""
     if "centerline" in tracks:
-        words += [] if stated else ["--unit mm"]
+        words += [f"--unit {unstated}"] if unstated else []
     elif tracks.sizes["view"] > 2:
         words += ["--cameras CAMERAS.toml"]
     else:
@@ -334,11 +342,13 @@ def _import(path: Path, tracks: xr.Dataset, *, stated: bool) -> str:
 
 
 def _without_unit(raw: vb.io.RawTracks, path: Path) -> tuple[xr.Dataset, str]:
-    """Label tracks even if the unit of their points is not stated, with a note on it."""
+    """Label tracks; if the unit of their points is not stated, with the first plausible unit."""
     if raw.space is None or raw.unit:
         return vb.io.labelled(raw, path), ""
-    # With the smallest unit, tracks pass all checks; no coordinates are shown.
-    return vb.io.labelled(raw, path, unit="um"), "unit not stated: give it when reading"
+    for unit in ("mm", "m"):
+        with suppress(ValueError):
+            return vb.io.labelled(raw, path, unit=unit), unit
+    return vb.io.labelled(raw, path, unit="um"), "um"
 
 
 def _listed(tracks: xr.Dataset, dim: str) -> str:

@@ -242,7 +242,7 @@ def _agreement(fit: vb.contour.FittedShape, contour: xr.Dataset) -> str:
             f"{fixed('surface_distance', fit.rms, 1)} root mean square"
         )
     if found > used:
-        text += f"; {found - used} more are too uncertain to be used"
+        text += f"; too uncertain to be used: {found - used}"
     together = float(contour.attrs["frames_together"])
     if together > 1.5:
         text += f"; sigma allows for errors that about {together:.0f} successive frames share"

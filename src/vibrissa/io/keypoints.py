@@ -62,6 +62,7 @@ from vibrissa.io.netcdf import is_netcdf, naming, opened, read_dataset
 from vibrissa.io.paths import check_readable, replacing
 from vibrissa.io.table import (
     in_file,
+    number,
     number_array,
     quoted,
     read_numbers,
@@ -136,7 +137,7 @@ def _csv(path: Path) -> tuple[Names, Array, list[str]]:
                 "be read separately"
             )
         try:
-            numbers = [float(cell) if cell else np.nan for cell in cells[first:]]
+            numbers = [number(cell) for cell in cells[first:]]
         except ValueError:
             raise ValueError(f"{path}: line {line} has cells that are not numbers") from None
         if len(numbers) != len(names):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import re
 from collections.abc import Callable, Mapping
 from enum import StrEnum
@@ -92,7 +93,7 @@ def recognise(path: str | PathLike[str]) -> Kind:
     # Matroska, MP4 and QuickTime, AVI.
     if head.startswith(b"\x1aE\xdf\xa3") or head[4:8] == b"ftyp" or head[8:12] == b"AVI ":
         return Kind.VIDEO
-    if b"\0" in head:
+    if b"\0" in head and not head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return Kind.UNKNOWN
     return _of_text(path)
 

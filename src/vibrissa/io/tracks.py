@@ -26,6 +26,7 @@ video and the settings.
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike
@@ -39,7 +40,7 @@ from numpy.typing import NDArray
 from vibrissa.deferred import xr
 from vibrissa.io.netcdf import COMPRESSED, kind_of, read_dataset, write_netcdf
 from vibrissa.io.paths import CSV, NETCDF, check_writable, replacing
-from vibrissa.io.table import Table, table_text
+from vibrissa.io.table import Table, signal_columns, table_text
 from vibrissa.numerics import Array
 from vibrissa.quantities import attributes
 
@@ -48,7 +49,8 @@ KIND = "vibrissa tracks"
 
 # Units of length that can be stated, and their size, m.
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6}
-LONGEST = 1.0  # largest plausible extent of a whisker, m
+# Smallest and largest plausible extent of a whisker, m.
+SHORTEST, LONGEST = 0.5e-3, 1.0
 IMAGE = ("time", "whisker", "view", "node", "image_axis")
 SPACE = ("time", "whisker", "node", "space")
 
@@ -184,6 +186,11 @@ def _factor(path: Path, unit: str, points: Array) -> float:
         raise ValueError(
             f"{path}: in {unit} its whiskers reach across {span:.3g} m, and {LONGEST:g} m is the "
             "most that is possible; are these millimetres or micrometres?"
+        )
+    if 0.0 < span < SHORTEST:
+        raise ValueError(
+            f"{path}: in {unit} its whiskers reach across {1e3 * span:.3g} mm, and "
+            f"{1e3 * SHORTEST:g} mm is the least that is possible; are these metres or millimetres?"
         )
     return UNITS[unit]
 
@@ -372,17 +379,21 @@ def read_tracks_table(path: str | PathLike[str]) -> RawTracks:
     """Read a table of points as raw tracks."""
     path = Path(path)
     table = Table(path)
-    table.names = [name.lower() for name in table.names]
+    # Units may be in parentheses or brackets: x (mm), time [ms].
+    table.names = [re.sub(r"\s*[(\[](.*)[)\]]", r"_\1", name.lower()) for name in table.names]
     axes, unit = _coordinates(path, table.names)
 
     def numbers(name: str) -> Array | None:
         return table.numbers(name) if name in table.names else None
 
-    frame, time = numbers("frame"), numbers("time")
-    if frame is None and time is None:
-        raise ValueError(f"{path} has neither a column frame nor time")
+    frame, time = numbers("frame"), None
+    if found := signal_columns(table.names, ["time"])[0]:
+        column, factor = found["time"]
+        time = factor * table.numbers(table.names[column])
     clock = frame if frame is not None else time
-    assert clock is not None
+    if clock is None:
+        raise ValueError(f"{path} has neither a column frame nor time (s; also time_ms)")
+    table.refuse(np.isnan(clock), "a point without a frame or time")
     moments, first, row = np.unique(clock, return_index=True, return_inverse=True)
     labels = {name: table.text(name) for name in _LABELS if name in table.names}
     whisker, who = _ordered(labels.get("whisker", ["whisker"] * len(row)))

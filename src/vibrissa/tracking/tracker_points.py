@@ -152,8 +152,19 @@ def _groups(pairs: list[list[str]]) -> dict[str, tuple[list[int], list[str]]] | 
 
 
 def _from_base(tracks: xr.Dataset, notes: list[str]) -> xr.Dataset:
-    """Reverse points that run from tip to base, by their names."""
+    """Sort points whose names differ by numbers, and reverse those that run from tip to base."""
     names = [name.lower() for name in _node_names(tracks)]
+    # The last number of a name counts: C1_1, C1_10, C1_2.
+    parts = [re.fullmatch(r"(.*?)(\d+)(\D*)", name) for name in names]
+    numbers = [int(part[2]) for part in parts if part]
+    numbered = len({part and (part[1], part[3]) for part in parts}) == 1
+    # Numbers that decrease may be intended; spreadsheets sort names: w1, w10, w2.
+    if numbered and sorted(numbers) not in (numbers, numbers[::-1]):
+        notes.append(
+            f"the points are in the order {', '.join(names)} in the file: they were sorted by "
+            "their numbers, as nodes run from base to tip"
+        )
+        return tracks.isel(node=np.argsort(numbers, kind="stable"))
     if not names or "tip" not in names[0] or not any(base in names[-1] for base in _BASES):
         return tracks
     notes.append(

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.contour.fitted_shape import DIRECTION, FLOOR, Checked, FittedShape, Touches
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, cross
 
 # Smallest initial radius, over that of the surface on which the points are.
 _SMALLEST = 1e-3
@@ -455,7 +455,7 @@ def frame_across(direction: Array, toward: Array | None = None) -> Array:
     along = (toward * direction).sum(axis=-1, keepdims=True)
     first = toward - along * direction
     first = first / np.linalg.norm(first, axis=-1, keepdims=True)
-    return np.stack([first, np.cross(direction, first)], axis=-2)
+    return np.stack([first, cross(direction, first)], axis=-2)
 
 
 def _upward(direction: Array) -> Array:

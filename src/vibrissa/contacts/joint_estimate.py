@@ -28,7 +28,7 @@ from vibrissa.contacts.joint.friction import along_curves, check_ratio, or_witho
 from vibrissa.contacts.joint.joint_fit import Joint, JointFit, check_compliance
 from vibrissa.contacts.sensing.channels import WRENCH, Channels, channels_of, friction_angle
 from vibrissa.contacts.sensing.noise import Noise, SensorNoise, explained, sensor_noise
-from vibrissa.contacts.uncertainty.posterior import ranked
+from vibrissa.contacts.uncertainty.posterior import THREE_SIGMA, ranked
 from vibrissa.contacts.uncertainty.valleys import LIKELY_FRICTION
 from vibrissa.contacts.wrench import PROXIMAL, by_probability, chosen, estimate_components
 from vibrissa.deferred import xr
@@ -58,29 +58,35 @@ _WEIGHTLESS = 1e-9  # gravity, m/s², below which the base is in free fall
 _SEPARATE = 4
 # Displacement of a contact, of its arc length (over L) and of its force (over its size), within
 # which it continues the one before; and that since the last search, above which others may have
-# become possible.
-_CONTINUES, _SINCE_SEARCH = (0.02, 0.1), (0.05, 0.3)
+# become possible. Noise may move it farther.
+_NEAR_ARC, _NEAR_FORCE = np.array([0.02, 0.05]), np.array([0.1, 0.3])
 # Displacement of the tip, over L, due to a turn of the base within which one resting shape proposes
 # contacts; and the least and the largest such turn, rad.
-_AS_BENT, _LEAST_TURN, _LARGEST_TURN = 0.005, 0.2, 1.0
-_STATIONS = 64  # number of sections of the whisker for its sag
+_AS_BENT, _LEAST_TURN, _LARGEST_TURN = 0.01, 0.2, 1.0
 
 
 class _Path(NamedTuple):
-    """Last contact x (4,) of a sequence, the one last searched for, and the shape that proposed."""
+    """Last contact of a sequence and the one last searched for, and the shape that proposed them.
+
+    x (2, 4) and contact points (2, 3), over L.
+    """
 
     x: Array
-    searched: Array
+    points: Array
     shape: tuple[float, float, float] | None
 
-    def continues(self, x: Array) -> bool:
-        """Whether a contact (4,) is near both."""
-        return _within(x, self.x, *_CONTINUES) and _within(x, self.searched, *_SINCE_SEARCH)
-
-
-def _within(x: Array, other: Array, arc: float, force: float) -> bool:
-    away = np.linalg.norm(x[1:] - other[1:])
-    return bool(abs(x[0] - other[0]) <= arc and away <= force * np.linalg.norm(other[1:]))
+    def onward(self, found: Candidates) -> _Path | None:
+        """Path on to the first candidate of a measurement; None if it is far from both contacts."""
+        x, point, covariance = found.x[0, 0], found.values[0, 0, 3:], found.covariances[0, 0]
+        away, apart = np.abs(x - self.x), point - self.points
+        near = np.linalg.norm(away[:, 1:], axis=1) <= np.linalg.norm(x[1:]) * _NEAR_FORCE
+        near &= away[:, 0] <= _NEAR_ARC
+        if np.isfinite(covariance).all():
+            back = np.linalg.pinv(covariance, hermitian=True)
+            near |= (apart @ back * apart).sum(axis=1) <= 2.0 * THREE_SIGMA
+        if not near.all():
+            return None
+        return self._replace(x=np.stack([x, self.x[1]]), points=np.stack([point, self.points[1]]))
 
 
 class JointEstimate:
@@ -164,14 +170,15 @@ class JointEstimate:
         if path is not None and path.shape == self._proposing and self.forward.weighted:
             flat = values / self.scale
             targets = self.channels.targets(flat)
-            start = np.zeros(1, np.int64), path.x[None], _NO_STATUS
+            start = np.zeros(1, np.int64), path.x[:1], _NO_STATUS
             found, status = self._possible(*self._fitted(flat, targets, *start))
-            if status[0] == Status.UNIQUE and path.continues(found.x[0, 0]):
-                self._path = path._replace(x=found.x[0, 0])
+            self._path = path.onward(found) if status[0] == Status.UNIQUE else None
+            if self._path is not None:
                 return found, status
         found, status = self(values)
         if self.forward.weighted and self._rubbing is None and status[0] == Status.UNIQUE:
-            self._path = _Path(found.x[0, 0], found.x[0, 0], self._proposing)
+            both = found.x[0, [0, 0]], found.values[0, [0, 0], 3:]
+            self._path = _Path(*both, self._proposing)
         return found, status
 
     def forget(self) -> None:
@@ -251,15 +258,10 @@ class JointEstimate:
         """Turn of the base, rad, up to which a resting shape proposes contacts."""
         assert self._lab is not None
         assert self.whisker.density is not None
-        length, size = self.whisker.length, float(np.linalg.norm(self._lab.acceleration))
-        step = length / _STATIONS
-        s = step * (np.arange(_STATIONS) + 0.5)
-        area = np.pi * self.whisker.radius(s) ** 2
-        moment = self.whisker.density * size * area
-        for _ in range(2):  # force, then moment of what is distal to s
-            moment = step * np.cumsum(moment[::-1])[::-1]
-        stiffness = self.whisker.youngs_modulus * area**2 / (4.0 * np.pi)
-        sag = float((moment * (length - s) / stiffness).sum()) * step / length
+        # Sag of the tip, over L, of a level cylinder; it is about half as large with a taper.
+        load = self.whisker.density * float(np.linalg.norm(self._lab.acceleration))
+        stiffness = self.whisker.youngs_modulus * self.whisker.base_radius**2
+        sag = 0.5 * load * self.whisker.length**3 / stiffness
         return float(np.clip(_AS_BENT / max(sag, 1e-300), _LEAST_TURN, _LARGEST_TURN))
 
     def untared(self, values: Array) -> Array:

@@ -1,5 +1,6 @@
 """Maps of wires from the command line: any length, thickness and material."""
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -92,3 +93,34 @@ def test_density_and_base_go_with_the_map_and_bend_it(tmp_path):
 )
 def test_what_does_not_go_together_is_refused(tmp_path, words, message):
     assert message in str(run(*words, "-o", tmp_path / "map.nc").exception)
+
+
+def test_a_linear_sensor_is_calibrated_by_a_table_of_touches(tmp_path):
+    wire = vb.Whisker.straight(0.1, base_radius=0.4e-3, tip_radius=0.2e-3, youngs_modulus=2e11)
+    vb.ContactMap.simulate(wire, grid=False, cells=(2, 4, 2)).save(tmp_path / "wire.nc")
+    rng = np.random.default_rng(4)
+    angle = rng.uniform(-np.pi, np.pi, 30)
+    bent = vb.deflect(wire, vb.PointForce(rng.uniform(0.04, 0.09, 30), 0.05, angle))
+    mixing, noise = np.array([[21.0, 1.5], [-0.8, 19.0], [7.0, 7.0]]), 1e-4
+    readings = bent.moment[:, 1:] @ mixing.T + [0.3, -0.1, 0.2]
+    points = np.vstack([1e3 * bent.contact_point, np.full((20, 3), np.nan)])
+    readings = np.vstack([readings, np.tile([0.3, -0.1, 0.2], (20, 1))])
+    readings += noise * rng.normal(size=readings.shape)
+    rows = [
+        ",".join("" if np.isnan(value) else f"{value:.12g}" for value in row)
+        for row in np.column_stack([points, readings])
+    ]
+    (tmp_path / "touches.csv").write_text("\n".join(["x,y,z,a,b,c", *rows]))
+    target = tmp_path / "sensor.toml"
+    how = ["calibrate", str(tmp_path / "touches.csv"), "-o", str(target)]
+    own = ["--whisker", str(tmp_path / "wire.nc"), "--components", "My,Mz"]
+    for words, fault in (([], "--whisker is needed"), ([*own, "--square", "5"], "cannot be used")):
+        assert fault in str(CliRunner().invoke(app, [*how, *words]).exception)
+    done = CliRunner().invoke(app, [*how, *own])
+    assert done.exit_code == 0, done.exception
+    sensor = vb.sensors.load_sensor(target)
+    assert sensor.channels == ("a", "b", "c")
+    sigma = np.sqrt(np.diagonal(sensor.mixing_covariance, axis1=1, axis2=2)[:, 4:6])
+    away = np.abs(sensor.mixing[:, 4:] - mixing)
+    assert (away < np.minimum(4.0 * sigma, 0.01 * mixing.max())).all()
+    np.testing.assert_allclose(sensor.noise, noise, rtol=0.5)

@@ -18,8 +18,10 @@ from typer.testing import CliRunner
 import vibrissa as vb
 from vibrissa.cli.app import app
 from vibrissa.contacts import Gravity, read_at_rest
+from vibrissa.contacts.joint_estimate import JointEstimate
 from vibrissa.rod import resting
 from vibrissa.sensors import Sensor
+from vibrissa.signals import signals_of
 from vibrissa.streaming import COMPONENTS, ContactStream, Poses, advice
 from vibrissa.streaming.lines import ACCELERATION, POSITION, QUATERNION
 
@@ -356,6 +358,37 @@ def test_a_stream_that_is_warm_counts_the_sensor_as_tared_in_its_first_pose(niti
     (found,) = running.records(lines_of([(point, *wrench, pose)]))
     away = np.array([found[axis] for axis in "xyz"]) - point
     assert np.linalg.norm(away) < 1e-5 * whisker.length
+
+
+@pytest.mark.parametrize("jump", [False, True])
+def test_a_contact_that_moves_on_is_that_of_a_search(nitinol, monkeypatch, jump):
+    """A robot's arm turns the whisker while the contact slides, or is suddenly elsewhere."""
+    whisker, level = nitinol.whisker, np.array([0.0, 0.0, -G])
+    turns = Rotation.from_rotvec(np.linspace(0.0, 0.15, 12)[:, None] * [0.3, 1.0, -0.2])
+    first, searches, proposed = turns[0].inv().apply(level), [], JointEstimate._proposed
+    search, follow = (vb.Estimator(nitinol, SIX, covariance(whisker), gravity=level) for _ in "ab")
+
+    def counted(self, targets):
+        searches.append(i)
+        return proposed(self, targets)
+
+    for i, turn in enumerate(turns.as_matrix()):
+        there = jump and i >= 6
+        arc, angle = (0.45, 2.5) if there else (0.7 + 0.002 * i, 0.2 + 0.01 * i)
+        load = unit(whisker) * np.array([0.0, np.cos(angle), np.sin(angle)])
+        touch = vb.PointForce(arc * whisker.length, components=load)
+        point, *wrench = read_since(whisker, first, turn.T @ level, touch)
+        search.reset()
+        searched = search(signals_of(*wrench), turn)
+        with monkeypatch.context() as patch:
+            patch.setattr(JointEstimate, "_proposed", counted)
+            followed = follow(signals_of(*wrench), turn)
+        assert followed.status is searched.status is vb.Status.UNIQUE
+        for found in (followed, searched):
+            np.testing.assert_allclose(found.point, point, atol=1e-5 * whisker.length)
+        away = np.abs(followed.covariance - searched.covariance).max()
+        assert away < 0.05 * np.trace(searched.covariance)
+    assert searches == ([0, 6] if jump else [0])
 
 
 def test_what_does_not_fit_is_refused(nitinol):

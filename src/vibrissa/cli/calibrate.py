@@ -1,4 +1,4 @@
-"""`vibrissa calibrate`: calibration of cameras by a checkerboard, and of suspended whiskers."""
+"""`vibrissa calibrate`: cameras by a checkerboard; sensors and suspended whiskers by touches."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 import vibrissa as vb
+from vibrissa.cli.inputs import WhiskerOptions
 from vibrissa.cli.options import check_new, refuse, with_options
 from vibrissa.cli.terminal import remark, say
 
@@ -18,35 +19,94 @@ _MOST_NAMED = 5  # largest number of touches listed
 _POOR = 1.0  # reprojection error above which the user is warned, pixels
 _SMALLEST, _LARGEST = 0.05, 200.0  # plausible sides of squares, mm; smaller ones may be in m
 _FRAMES = 40  # default number of frames used from a video
+_AT_REST = 3  # smallest number of readings at rest that show the noise
 
 
-@with_options("the cameras, TOML of Anipose; or the sensor, NetCDF (.nc)")
+@with_options("cameras, TOML of Anipose; sensor, TOML; or suspended whisker, NetCDF (.nc)")
 def calibrate(
     images: list[Path],
     target: Path,
+    own: WhiskerOptions,
     pattern: str | None = None,
     square: float | None = None,
     frames: int | None = None,
+    components: str | None = None,
+    touch_sigma: float | None = None,
     force: bool = False,
 ) -> None:
-    """Calibrate cameras by a checkerboard, or a suspended whisker by touches at known points.
+    """Calibrate cameras by a checkerboard, or a sensor or suspended whisker by touches.
 
     All cameras must record the board at the same times (requires the extra "cameras"); the board is
     rotated and moved between images. The result is for `vibrissa track --cameras`; its laboratory
     frame is that of the board in the first images in which all cameras see it. For a suspended
     whisker, the description of a stage (vibrissa.sensors.Stage) names tables of touches and of the
-    resting whisker; the calibrated sensor is for `vibrissa estimate --sensor`.
+    resting whisker; the calibrated sensor is for `vibrissa estimate --sensor`. A linear sensor, of
+    any number of channels, is calibrated by a table of touches of a --whisker (.csv): the points x,
+    y, z, mm, in the whisker's frame, and a column of readings for each channel. Rows without a
+    point are readings at rest, which show the noise. It is for `vibrissa stream --sensor`.
     Example: `vibrissa calibrate --pattern 9x6 --square 5 top_*.png front_*.png -o cameras.toml`;
-    `vibrissa calibrate stage.toml -o sensor.nc`
+    `vibrissa calibrate stage.toml -o sensor.nc`;
+    `vibrissa calibrate touches.csv --whisker wire.nc --components My,Mz -o sensor.toml`
     """
-    if len(images) == 1 and images[0].suffix == ".toml":
-        boards = {"--pattern": pattern, "--square": square, "--frames": frames}
-        refuse(boards, "it is of a checkerboard, and this is the description of a stage")
+    boards = {"--pattern": pattern, "--square": square, "--frames": frames}
+    touches = {
+        "--whisker": own.whisker,
+        "--components": components,
+        "--touch-sigma": touch_sigma,
+    }
+    kind = images[0].suffix if len(images) == 1 else ""
+    if kind in (".toml", ".csv"):
+        refuse(boards, f"it is of a checkerboard, and {images[0]} is of touches")
+        if kind == ".csv":
+            _linear(images[0], target, own, components, touch_sigma, force)
+            return
+    refuse(touches, "it is of touches in a table (.csv)")
+    if kind == ".toml":
         _suspended(images[0], target, force)
         return
     if pattern is None or square is None:
         raise ValueError("--pattern and --square of the checkerboard are needed, as 9x6 and 5")
     _cameras(images, pattern, square, target, frames, force)
+
+
+def _linear(
+    table: Path,
+    target: Path,
+    own: WhiskerOptions,
+    components: str | None,
+    touch_sigma: float | None,
+    force: bool,
+) -> None:
+    """Calibrate a linear sensor."""
+    check_new(target, (".toml",), force)
+    if own.whisker is None:
+        raise ValueError("--whisker is needed: the touches are of it")
+    names, values = vb.io.read_numbers(table)
+    lacking = [axis for axis in "xyz" if axis not in names]
+    if lacking:
+        raise ValueError(f"{table} lacks {', '.join(lacking)}; its columns are {', '.join(names)}")
+    channels = [name for name in names if name not in ("x", "y", "z", "time", "")]
+    points = 1e-3 * values[:, [names.index(axis) for axis in "xyz"]]
+    readings = values[:, [names.index(name) for name in channels]]
+    rest = readings[np.isnan(points).all(axis=1) & np.isfinite(readings).all(axis=1)]
+    _check_saturation(channels, readings)
+    found = vb.sensors.calibrate_on_contacts(
+        own.read(),
+        points,
+        readings,
+        point_sigma=1e-3 * (touch_sigma or 0.0),
+        channels=channels,
+        components=components.split(",") if components else vb.sensors.COMPONENTS,
+        noise=rest.std(axis=0, ddof=1) if len(rest) >= _AT_REST else 0.0,
+    )
+    vb.sensors.save_sensor(target, found.sensor)
+    where = [vb.sensors.COMPONENTS.index(name) for name in found.components]
+    for k, name in enumerate(channels):
+        sigma = np.sqrt(found.covariance[k].diagonal())
+        fits = zip(found.components, found.sensor.mixing[k, where], sigma[:-1], strict=True)
+        text = ", ".join(f"{one} {value:.4g} ± {error:.2g}" for one, value, error in fits)
+        say(f"{name}: {text} per N or N·m; noise {found.sensor.noise[k]:.3g}")
+    say(f"wrote {target}")
 
 
 def _suspended(description: Path, target: Path, force: bool) -> None:
@@ -101,7 +161,7 @@ def _check_saturation(channels: Sequence[str], readings: vb.numerics.Array) -> N
             if count >= _AGAIN and np.ptp(values) > 0.0:
                 remark(
                     f"{name} reads {end:g}, and nothing beyond, at {count} touches: does it "
-                    "saturate? `largest` in [touches] leaves such touches out"
+                    "saturate? Leave such touches out (of a stage: `largest` in [touches])"
                 )
 
 

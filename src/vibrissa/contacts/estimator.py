@@ -262,6 +262,8 @@ class Estimator:
     def reset(self) -> None:
         """Discard the measurement before, as when contact has been lost."""
         self._last = None
+        if self._joint is not None:
+            self._joint.forget()
 
     def restart(self) -> None:
         """Discard all measurements: the sensor counts as tared in the next pose."""
@@ -340,12 +342,12 @@ class Estimator:
         d = self.contact_map.chart.discretization
         nothing = self.nothing_in(measurement)
         if nothing is not None:
-            self._last = None
+            self.reset()
             return nowhere(nothing, math.nan, d)
         if self._search is None:
             return self._sampled(measurement)
         if self._joint is not None:
-            found, codes = self._joint(measurement.measured[None] * self._joint.scale)
+            found, codes = self._joint.following(measurement.measured[None] * self._joint.scale)
             status, chi_squared = STATUSES[int(codes[0])], float(found.chi_squared[0, 0])
         else:
             found, status, chi_squared = self._search.one(measurement)
@@ -407,9 +409,10 @@ class Estimator:
         """
         assert self._joint is not None
         if self.nothing_in(measurement) is not None:
+            self.reset()
             return measurement
         names = self._joint.channels.names
-        found, _ = self._joint(measurement.measured[None] * self._joint.scale)
+        found, _ = self._joint.following(measurement.measured[None] * self._joint.scale)
         d, target = self._joint.d, np.full(len(names), np.nan)
         if found.number[0]:
             there = PointContact(found.values[0, 0, 3:] * d.length)

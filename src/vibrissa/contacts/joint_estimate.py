@@ -11,7 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,27 +20,26 @@ from numpy.typing import ArrayLike
 from vibrissa.contacts.charted_whisker import ChartedWhisker
 from vibrissa.contacts.contacts import Candidates, Contacts, contacts_of
 from vibrissa.contacts.engine.prior import Prior, possible_candidates, refuse_tip
-from vibrissa.contacts.engine.readout import check_signals
-from vibrissa.contacts.engine.search import estimate
+from vibrissa.contacts.engine.readout import Named, check_signals
+from vibrissa.contacts.engine.search import Search, estimate
 from vibrissa.contacts.fitting.least_squares import Fits
 from vibrissa.contacts.joint.forward import Forward, Gravity, finite
 from vibrissa.contacts.joint.friction import along_curves, check_ratio, or_without
 from vibrissa.contacts.joint.joint_fit import Joint, JointFit, check_compliance
-from vibrissa.contacts.sensing.channels import WRENCH, Channels, friction_angle
+from vibrissa.contacts.sensing.channels import WRENCH, Channels, channels_of, friction_angle
 from vibrissa.contacts.sensing.noise import Noise, SensorNoise, explained, sensor_noise
-from vibrissa.contacts.uncertainty.posterior import ranked
+from vibrissa.contacts.uncertainty.posterior import THREE_SIGMA, ranked
 from vibrissa.contacts.uncertainty.valleys import LIKELY_FRICTION
 from vibrissa.contacts.wrench import PROXIMAL, by_probability, chosen, estimate_components
 from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray
-from vibrissa.rod import Discretization, PointForce, Resting, deflect
+from vibrissa.rod import Discretization, Resting, solve_forces
 from vibrissa.signals import (
     SIGNALS,
     labelled_wrench,
     measured,
     selection,
     signal_scales,
-    signals_of,
 )
 from vibrissa.status import Status
 from vibrissa.whisker import Whisker
@@ -52,9 +52,41 @@ _MOST = 8
 # Difference of arc lengths, over L, within which two contacts are the same.
 _SAME = 0.03
 _NO_ERRORS = np.zeros((0, 6, 7))
+_NO_STATUS = np.array([int(Status.NOT_FRICTIONLESS)])
 _WEIGHTLESS = 1e-9  # gravity, m/s², below which the base is in free fall
 # Of three signals with all of these unknown, regions hold half to two thirds of the contacts.
 _SEPARATE = 4
+# Displacement of a contact, of its arc length (over L) and of its force (over its size), within
+# which it continues the one before; and that since the last search, above which others may have
+# become possible. Noise may move it farther.
+_NEAR_ARC, _NEAR_FORCE = np.array([0.02, 0.05]), np.array([0.1, 0.3])
+# Displacement of the tip, over L, due to a turn of the base within which one resting shape proposes
+# contacts; and the least and the largest such turn, rad.
+_AS_BENT, _LEAST_TURN, _LARGEST_TURN = 0.01, 0.2, 1.0
+
+
+class _Path(NamedTuple):
+    """Last contact of a sequence and the one last searched for, and the shape that proposed them.
+
+    x (2, 4) and contact points (2, 3), over L.
+    """
+
+    x: Array
+    points: Array
+    shape: tuple[float, float, float] | None
+
+    def onward(self, found: Candidates) -> _Path | None:
+        """Path on to the first candidate of a measurement; None if it is far from both contacts."""
+        x, point, covariance = found.x[0, 0], found.values[0, 0, 3:], found.covariances[0, 0]
+        away, apart = np.abs(x - self.x), point - self.points
+        near = np.linalg.norm(away[:, 1:], axis=1) <= np.linalg.norm(x[1:]) * _NEAR_FORCE
+        near &= away[:, 0] <= _NEAR_ARC
+        if np.isfinite(covariance).all():
+            back = np.linalg.pinv(covariance, hermitian=True)
+            near |= (apart @ back * apart).sum(axis=1) <= 2.0 * THREE_SIGMA
+        if not near.all():
+            return None
+        return self._replace(x=np.stack([x, self.x[1]]), points=np.stack([point, self.points[1]]))
 
 
 class JointEstimate:
@@ -94,6 +126,8 @@ class JointEstimate:
             "stiffness_sigma": stiffness_sigma,
         }
         self._lab, self._proposing = gravity, None if gravity is None else gravity.acceleration
+        self._path: _Path | None = None
+        self._search: tuple[tuple[float, float, float] | None, Search | None] | None = None
         self.forward = Forward.of(whisker, gravity, compliance_sigma, stiffness_sigma)
         self.d, whole = self.forward.d, names == WRENCH
         self.channels = Channels(WRENCH, WRENCH) if whole else Channels.of(names)
@@ -124,17 +158,45 @@ class JointEstimate:
             degrees = len(self.names) - len(self._rubbing.free) + 1
             far = found.chi_squared[:, 0] > explained(degrees)
             status[some & far] = int(Status.NOT_ONE_CONTACT)
-        if self.prior is not None:
-            some = found.number > 0
-            found = found.allowed_first(
-                possible_candidates(self.prior, self.whisker, self.d, found)
-            )
-            with np.errstate(invalid="ignore"):
-                found.probability[:] /= np.nansum(found.probability, axis=1, keepdims=True)
-            explained_now = np.isin(status, (int(Status.UNIQUE), int(Status.AMBIGUOUS)))
-            left = some & (found.number > 0) & explained_now
-            status[left] = by_probability(found)[left]
-            status[some & (found.number == 0)] = int(Status.OUTSIDE_PRIOR)
+        return self._possible(found, status)
+
+    def following(self, values: Array) -> tuple[Candidates, IntArray]:
+        """The same for one measurement (1, k) after another.
+
+        If the contact before was certain, and one near it explains the measurement, others are not
+        searched for until the contact has moved, or the base has turned, by more than a little.
+        """
+        path, self._path = self._path, None
+        if path is not None and path.shape == self._proposing and self.forward.weighted:
+            flat = values / self.scale
+            targets = self.channels.targets(flat)
+            start = np.zeros(1, np.int64), path.x[:1], _NO_STATUS
+            found, status = self._possible(*self._fitted(flat, targets, *start))
+            self._path = path.onward(found) if status[0] == Status.UNIQUE else None
+            if self._path is not None:
+                return found, status
+        found, status = self(values)
+        if self.forward.weighted and self._rubbing is None and status[0] == Status.UNIQUE:
+            both = found.x[0, [0, 0]], found.values[0, [0, 0], 3:]
+            self._path = _Path(*both, self._proposing)
+        return found, status
+
+    def forget(self) -> None:
+        """Search for the next contact everywhere, as when this one has been lost."""
+        self._path = None
+
+    def _possible(self, found: Candidates, status: IntArray) -> tuple[Candidates, IntArray]:
+        """Candidates that the prior allows, and the statuses."""
+        if self.prior is None:
+            return found, status
+        some = found.number > 0
+        found = found.allowed_first(possible_candidates(self.prior, self.whisker, self.d, found))
+        with np.errstate(invalid="ignore"):
+            found.probability[:] /= np.nansum(found.probability, axis=1, keepdims=True)
+        explained_now = np.isin(status, (int(Status.UNIQUE), int(Status.AMBIGUOUS)))
+        left = some & (found.number > 0) & explained_now
+        status[left] = by_probability(found)[left]
+        status[some & (found.number == 0)] = int(Status.OUTSIDE_PRIOR)
         return found, status
 
     @property
@@ -182,9 +244,25 @@ class JointEstimate:
         # Contacts are proposed by resting shapes under gravity of the stated size, which are few.
         now = max(float(np.linalg.norm(weight.acceleration)), _WEIGHTLESS)
         out._proposing = weight.nearly(float(np.linalg.norm(stated.acceleration)) / now)
+        if self._proposing is not None and self._path is not None:
+            turn = np.linalg.norm(np.subtract(out._proposing, self._proposing))
+            if turn < self._turn * np.linalg.norm(stated.acceleration):
+                out._proposing = self._proposing
         out._lab = replace(stated, tare=weight.tare)
-        out._step = self._step
+        out._step, out._turn = self._step, self._turn
+        out._path, out._search = self._path, self._search
         return out
+
+    @cached_property
+    def _turn(self) -> float:
+        """Turn of the base, rad, up to which a resting shape proposes contacts."""
+        assert self._lab is not None
+        assert self.whisker.density is not None
+        # Sag of the tip, over L, of a level cylinder; it is about half as large with a taper.
+        load = self.whisker.density * float(np.linalg.norm(self._lab.acceleration))
+        stiffness = self.whisker.youngs_modulus * self.whisker.base_radius**2
+        sag = 0.5 * load * self.whisker.length**3 / stiffness
+        return float(np.clip(_AS_BENT / max(sag, 1e-300), _LEAST_TURN, _LARGEST_TURN))
 
     def untared(self, values: Array) -> Array:
         """Measurements (n, k), SI units, as if the sensor had been tared in this pose."""
@@ -213,7 +291,7 @@ class JointEstimate:
     ) -> tuple[Candidates, IntArray]:
         """Candidates without friction, except for the wrench."""
         if self.forward.weighted or self.contact_map is None:
-            return self._fitted(flat, targets, self._proposed(targets))
+            return self._fitted(flat, targets, *self._proposed(targets))
         errors = _NO_ERRORS if self.sensor is None else self.sensor.errors
         signals = dict(zip(self.names, values.T, strict=True))
         one = estimate(self.contact_map, signals, self.names, self._noise, errors, None)
@@ -230,8 +308,10 @@ class JointEstimate:
             found, status, _ = self._fit.allow(flat, targets, found, status)
         return found, status
 
-    def _proposed(self, targets: Array) -> list[Contacts]:
+    def _proposed(self, targets: Array) -> tuple[IntArray, Array, IntArray]:
         """Contacts of the weightless whisker of the sagged shape: near ones and exact ones.
+
+        Rows and contacts x (m, 4) to start from, and statuses of rows (n,) without any.
 
         Signals just beyond those of its map have no exact contact; light contacts are found from
         the near ones.
@@ -241,20 +321,25 @@ class JointEstimate:
         if names == WRENCH or self.contact_map is None:
             rod = self.forward.rod
             shape = rod.shape() if isinstance(rod, Resting) else rod
-            return [estimate_components(shape, exact, None, _NO_ERRORS, None)]
-        sagged = self.sagged
-        near = {name: _NEAR * size for name, size in zip(names, self.scale, strict=True)}
-        return [estimate(sagged, exact, names, noise, _NO_ERRORS, None) for noise in (near, None)]
-
-    def _fitted(
-        self, flat: Array, targets: Array, proposed: list[Contacts]
-    ) -> tuple[Candidates, IntArray]:
-        """Candidates in order, and statuses."""
-        d, n, fitting = self.d, len(flat), self._fit
+            proposed = [estimate_components(shape, exact, None, _NO_ERRORS, None)]
+        else:
+            near = {name: _NEAR * size for name, size in zip(names, self.scale, strict=True)}
+            proposed = [
+                estimate(self.sagged, exact, names, noise, _NO_ERRORS, None)
+                for noise in (near, None)
+            ]
         arc = np.concatenate([one.candidates.arc_length for one in proposed], axis=1)
         force = np.concatenate([one.candidates.contact_force for one in proposed], axis=1)
         row, place = np.nonzero(np.isfinite(arc))
+        d = self.d
         seeds = np.column_stack([arc[row, place] / d.length, force[row, place] / d.force])
+        return row, seeds, np.asarray(proposed[0].status)
+
+    def _fitted(
+        self, flat: Array, targets: Array, row: IntArray, seeds: Array, reasons: IntArray
+    ) -> tuple[Candidates, IntArray]:
+        """Candidates in order, and statuses, from starts of rows; reasons for rows without any."""
+        n, fitting = len(flat), self._fit
         fits = fitting.fit(flat[row], targets[row], seeds)
         degrees = fitting.degrees(flat[row], fits.values)
         exact = self.sensor is None and degrees == 0
@@ -278,7 +363,7 @@ class JointEstimate:
         unexplained = Status.NOT_ONE_CONTACT if fitting.friction else Status.NOT_FRICTIONLESS
         status[~(found.chi_squared[:, 0] <= limit)] = int(unexplained)
         none = found.number == 0
-        status[none] = np.asarray(proposed[0].status)[none]
+        status[none] = reasons[none]
         if exact:
             lost = status == int(unexplained)
             found = found.allowed_first(np.isfinite(found.chi_squared) & ~lost[:, None])
@@ -308,24 +393,31 @@ class JointEstimate:
 
         Light contacts have long, bent valleys, which are followed only without weight.
         """
-        sagged, d = self.sagged, self.d
-        load = PointForce(fits.contacts[:, 0] * d.length, components=fits.contacts[:, 1:] * d.force)
-        bent = deflect(sagged.whisker, load)
-        six = signals_of(bent.force, bent.moment)
-        signals = {name: six[:, SIGNALS.index(name)] for name in self.names}
-        errors = _NO_ERRORS if self.sensor is None else self.sensor.errors
-        found = estimate(sagged, signals, self.names, self._noise, errors, None).candidates
-        away = np.abs(found.arc_length - bent.arc_length[:, None])
-        place = np.where(np.isfinite(away), away, np.inf).argmin(axis=1)[:, None]
-        own = np.take_along_axis(found.covariance, place[..., None, None], axis=1)[:, 0]
-        own = own / d.length**2
-        known = np.isfinite(own).all(axis=(1, 2))
-        known &= np.take_along_axis(away, place, axis=1)[:, 0] < _SAME * d.length
+        search = self._search_sagged()
+        if search is None:
+            return covariance, np.zeros_like(valid)
+        rod = search.contact_map.chart.discretization
+        signals = channels_of(solve_forces(rod, fits.contacts)[0])
+        flat = signals[:, [SIGNALS.index(name) for name in self.names]]
+        found, _, _ = search.batch(flat, self.channels.targets(flat))
+        away = np.abs(found.x[..., 0] - fits.contacts[:, :1])
+        away[np.arange(away.shape[1]) >= found.number[:, None]] = np.inf
+        each, place = np.arange(len(away)), np.where(np.isfinite(away), away, np.inf).argmin(axis=1)
+        own, linear = found.covariances[each, place], found.valid[each, place]
+        known = np.isfinite(own).all(axis=(1, 2)) & (away[each, place] < _SAME)
         shared = joint.covariance() - self._fit.alone(joint).covariance()
         own = np.where(known[:, None, None], own + shared, covariance)
         larger = np.trace(own, axis1=1, axis2=2) > np.trace(covariance, axis1=1, axis2=2)
-        linear = np.take_along_axis(found.covariance_valid, place, axis=1)[:, 0]
         return np.where(larger[:, None, None], own, covariance), valid & known & linear
+
+    def _search_sagged(self) -> Search | None:
+        """Search on the sagged whisker; None if the signals do not determine its contacts."""
+        if self._search is None or self._search[0] != self._proposing:
+            sagged = self.sagged
+            readout = Named(sagged, self.names, self.sensor)
+            found = Search(sagged, readout) if sagged.determines(self.names) else None
+            self._search = self._proposing, found
+        return self._search[1]
 
 
 def _least_noise(sensor: SensorNoise | None, names: tuple[str, ...], d: Discretization) -> float:

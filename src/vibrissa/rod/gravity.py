@@ -274,7 +274,10 @@ def _with_weight(whisker: Resting, steps: int) -> Discretization:
         loaded = _rod_with_weight(whisker, steps, 1.0, near)
         solved = evaluated(loaded, _REST, leans=near[None], tangents=True)
         if _is_stable(loaded, solved):
-            return _rod_with_weight(whisker, steps, 1.0, solved.leans[0])
+            weight = loaded.rod.weight
+            assert weight is not None
+            weight = weight._replace(at_tip=solved.leans[0])
+            return replace(loaded, rod=loaded.rod._replace(weight=weight))
     return _rod_with_weight(whisker, steps, 1.0, _lean_by_increments(whisker, steps))
 
 

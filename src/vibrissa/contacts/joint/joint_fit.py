@@ -20,6 +20,7 @@ det ∂p/∂x, and widened for tails as in :mod:`~vibrissa.contacts.uncertainty.
 
 from __future__ import annotations
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -133,10 +134,14 @@ class JointFit:
             values = self.forward.values(x)
         elif not self.forward.errors:
             rounds = 1
+        spread = np.empty(0)
         for _ in range(rounds):
-            weights = np.zeros((len(x), len(names), len(names)))
+            before, weights = spread, np.zeros((len(x), len(names), len(names)))
             own, change, _ = self._errors(flat, x, values)
-            weights[:, :k, :k] = whitening(own + change @ np.swapaxes(change, 1, 2))
+            spread = own + change @ np.swapaxes(change, 1, 2)
+            if np.array_equal(spread, before):
+                break  # the noise does not depend on the contact
+            weights[:, :k, :k] = whitening(spread)
             for i, sigma in enumerate(more.values()):
                 weights[:, k + i, k + i] = 1.0 / sigma
             fits = self.forward.fit(
@@ -235,42 +240,44 @@ class JointFit:
         residuals (n, m, a, a) and points (n, 3, a, a); and the error of these for the channels
         (n,).
         """
-        x, k = fits.contacts, len(self.names)
+        x, k = fits.contacts[:, None], len(self.names)
         along = axes[:, : len(self.free)]
-        seen, slopes = self._slopes(joint, fits.values, fits.tangents, x)
-        changes, bent, missed = [slopes[:, :-k]], [], np.zeros(len(x))
-        for i in range(axes.shape[2]):
-            axis = along[..., i]
-            with np.errstate(divide="ignore", invalid="ignore"):
-                room = np.array([1.0 - x[:, 0], x[:, 0] - self.least]) / np.abs(axis[:, 0])
-            up, down = np.fmin(np.where(axis[:, 0] < 0.0, room[::-1], room), _REACH)
-            step = np.where(up >= down, up, -down)
-            there = x.copy()
-            there[:, self.free] += step[:, None] * axis
-            other, steeper = self._slopes(joint, *self.forward.near(there), there)
-            change = (steeper - slopes) / step[:, None, None]
-            second = change @ along
-            mean = (slopes + 0.5 * step[:, None, None] * change)[:, -k:] @ axis[..., None]
-            turned = within_turn(other - seen, self._turned)
-            off = (joint.weights @ turned[..., None])[..., 0] - step[:, None] * mean[..., 0]
-            far = np.linalg.norm(off, axis=1) * (_REACH / np.abs(step)) ** 3
-            missed = np.fmax(missed, np.where(np.isfinite(far), far, np.inf))
-            changes.append(np.nan_to_num(change[:, :-k]))
-            bent.append(np.nan_to_num(second))
-        second = np.stack(bent, axis=2)
+        n, m = len(along), along.shape[2]
+        seen, slopes = self._slopes(joint.weights, fits.values, fits.tangents, fits.contacts)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            room = np.array([1.0 - x[..., 0], x[..., 0] - self.least])[:, :, 0, None]
+            room = room / np.abs(along[:, 0])
+        up, down = np.fmin(np.where(along[:, 0] < 0.0, room[::-1], room), _REACH)
+        step = np.where(up >= down, up, -down)
+        there = np.repeat(x, m, axis=1)
+        there[..., self.free] += step[..., None] * np.swapaxes(along, 1, 2)
+        there = there.reshape(n * m, 4)
+        weights = np.repeat(joint.weights, m, axis=0)
+        other, steeper = self._slopes(weights, *self.forward.near(there), there)
+        change = (steeper.reshape(n, m, *slopes.shape[1:]) - slopes[:, None]) / step[
+            ..., None, None
+        ]
+        mean = (slopes[:, None] + 0.5 * step[..., None, None] * change)[:, :, -k:]
+        mean = np.einsum("namf,nfa->nam", mean, along)
+        turned = within_turn(other.reshape(n, m, k) - seen[:, None], self._turned)
+        off = (joint.weights[:, None] @ turned[..., None])[..., 0] - step[..., None] * mean
+        far = np.linalg.norm(off, axis=2) * (_REACH / np.abs(step)) ** 3
+        missed = np.where(np.isfinite(far), far, np.inf).max(axis=1, initial=0.0)
+        second = np.swapaxes(np.nan_to_num(change @ along[:, None]), 1, 2)
         second = 0.5 * (second + np.swapaxes(second, 2, 3))
-        residuals = np.zeros((len(x), joint.design.shape[1], *second.shape[2:]))
+        residuals = np.zeros((n, joint.design.shape[1], m, m))
         residuals[:, :k] = second[:, -k:]
-        return np.stack(changes, axis=1), residuals, second[:, :3], missed
+        changes = np.concatenate([slopes[:, None], np.nan_to_num(change)], axis=1)[:, :, :-k]
+        return changes, residuals, second[:, :3], missed
 
     def _slopes(
-        self, joint: Joint, values: Array, tangents: Array, x: Array
+        self, weights: Array, values: Array, tangents: Array, x: Array
     ) -> tuple[Array, Array]:
         """Channels (n, k); derivatives with respect to x of points, friction angle, channels."""
         rows = [tangents[:, 3:6]]
         if self.friction:
             rows.append(friction_angle_derivatives(x)[:, None])
-        rows.append(joint.weights @ channel_derivatives(values, tangents, self.names))
+        rows.append(weights @ channel_derivatives(values, tangents, self.names))
         return channels_of(values)[:, self._which], np.concatenate(rows, axis=1)[..., self.free]
 
     def allow(
@@ -294,6 +301,7 @@ class JointFit:
         return out, np.where(better, known, status), first.copy()
 
 
+@cache
 def normal_cloud(dimension: int) -> Array:
     """Symmetric points (n, dimension) with the covariance of a normal distribution."""
     half = np.random.default_rng(0).standard_normal((_CLOUD // 2, dimension))

@@ -34,6 +34,7 @@ CIRCULAR = (*CIRCULAR_SIGNALS, False, False, False, False)
 WRENCH = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 # Components of (F, M), which are the last channels.
 _COMPONENTS = (1, 2, 4, 5)
+_NEXT, _LAST = [1, 2, 0], [2, 0, 1]  # components of a cross product
 _PAIRS = {("FT", "FD"): ("Fy", "Fz"), ("MB", "MD"): ("My", "Mz")}
 
 
@@ -166,10 +167,15 @@ class Channels:
 
 def wrenches_of(values: Array) -> Array:
     """(F, M) (..., 6) from (F, p) (..., 6), or from (F, p, μ) with the weight's moment μ."""
-    moment = np.cross(values[..., 3:6], values[..., :3])
+    moment = _cross(values[..., 3:6], values[..., :3])
     if values.shape[-1] > len(WRENCH):
         moment = moment + values[..., 6:]
     return np.concatenate([values[..., :3], moment], axis=-1)
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Cross products, which for few vectors take a fifth of the time of NumPy's."""
+    return np.asarray(a[..., _NEXT] * b[..., _LAST] - a[..., _LAST] * b[..., _NEXT])
 
 
 def channels_of(values: Array) -> Array:
@@ -197,10 +203,12 @@ def channel_derivatives(values: Array, tangents: Array, names: tuple[str, ...]) 
 def wrench_tangents(values: Array, tangents: Array) -> Array:
     """Derivatives of (F, M), (..., 6, u), from those of (F, p) or (F, p, μ)."""
     d_force, d_point = tangents[..., :3, :], tangents[..., 3:6, :]
-    d_moment = np.cross(d_point, values[..., :3, None], axis=-2)
-    d_moment += np.cross(values[..., 3:6, None], d_force, axis=-2)
+    across = np.swapaxes(d_point, -1, -2), np.swapaxes(d_force, -1, -2)
+    d_moment = _cross(across[0], values[..., None, :3])
+    d_moment += _cross(values[..., None, 3:6], across[1])
+    d_moment = np.swapaxes(d_moment, -1, -2)
     if values.shape[-1] > len(WRENCH):
-        d_moment += tangents[..., 6:, :]
+        d_moment = d_moment + tangents[..., 6:, :]
     return np.concatenate([d_force, d_moment], axis=-2)
 
 

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from vibrissa.cameras import Camera, orthogonal_views
 from vibrissa.tracking import Trace, low_pass, merge, paired_frames, usual_cutoff
+from vibrissa.tracking.remarks import remarks_on_time
 from vibrissa.tracking.space.curve import begun_together
 from vibrissa.tracking.space.exchange import Known, exchanged
 from vibrissa.tracking.space.frame_pairs import better_offset
@@ -159,6 +160,8 @@ def test_an_offset_is_found_of_views_that_show_the_whisker_along_itself(pair):
             trace.line[end] += generator.normal(0.0, 4.0) * ahead / np.linalg.norm(ahead)
     pairs = paired_frames(pair, [first, second], None)
     assert np.mean(pairs[:, 0] != np.array(numbers)[pairs[:, 1]]) < 0.05
+    (said,) = remarks_on_time(pair, [first, second], None, pairs)
+    assert "found is -7 frames" in said
     assert better_offset(*pair, first, second, 0).tolist() == [-7]
     assert not better_offset(*pair, first, second, -7).size
 

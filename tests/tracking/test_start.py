@@ -252,6 +252,14 @@ def test_the_first_frame_that_shows_the_whisker_is_reported(films):
         assert np.linalg.norm(base - at) < 25.0
 
 
+def test_a_base_outside_of_the_image_is_in_doubt(films):
+    film = films(200)
+    begin, *_, end = film.curves[0][0][:, 0].astype(int)
+    part = slice(begin + 15, None) if end > begin else slice(None, begin - 15)
+    start = find_start(film.cameras, [[frame[:, part] for frame in view] for view in film.frames])
+    assert any("cuts off its base" in why for why in start.doubts)
+
+
 def test_flickering_light_moves_nothing(films):
     film = films(200)
     lamp = 0.75 + 0.25 * np.cos(np.arange(SMALL["frames"]))

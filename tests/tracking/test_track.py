@@ -534,6 +534,13 @@ def test_without_any_contact_there_is_none(filmed, traces):
     assert (data["force"].values == 0.0).all()
 
 
+def test_a_base_that_the_border_of_the_image_cuts_off_is_stated(filmed, traces):
+    cut = [[[t._replace(base_seen=False) for t in row] for row in traces[0]], traces[1]]
+    shown = "which is shown by top in 0 of 40 frames, front in 40 of 40 frames"
+    with pytest.raises(ValueError, match=shown):
+        track(filmed.cameras, cut, 1000.0)
+
+
 def test_angles_of_an_orientation():
     angles = np.random.default_rng(0).uniform(-1.2, 1.2, (50, 3))
     np.testing.assert_allclose(angles_of(base_rotation(*angles.T)), angles, atol=1e-12)

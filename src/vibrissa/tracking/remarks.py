@@ -16,7 +16,7 @@ from vibrissa.numerics import Array, Mask
 from vibrissa.tracking.recording import Tracked
 from vibrissa.tracking.refine.optics import Optics
 from vibrissa.tracking.refine.rods import TraceSeries
-from vibrissa.tracking.space.frame_pairs import better_offset
+from vibrissa.tracking.space.frame_pairs import Pairs, better_offset
 from vibrissa.tracking.space.rest_shape import Length
 from vibrissa.tracking.trace.start import base_gap
 from vibrissa.tracking.trace.steady import slow_motion
@@ -250,11 +250,18 @@ def remarks_on_plane(one: Tracked, name: str) -> list[str]:
 
 
 def remarks_on_time(
-    cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]], offset: int | None
+    cameras: Sequence[Camera],
+    traces: Sequence[Sequence[Trace]],
+    offset: int | None,
+    pairs: Pairs,
 ) -> list[str]:
-    """Report cameras that do not seem to be synchronous."""
+    """Report cameras that do not seem to be synchronous, and offsets that were found."""
     if offset is None:
-        return []
+        shifts = pairs[:, 1:] - pairs[:, :1]
+        listed = ", ".join(" and ".join(map(str, row)) for row in dict.fromkeys(map(tuple, shifts)))
+        return [
+            f"the offset that was found is {listed} frames; if it cannot be, state it (--offset)."
+        ]
     found = []
     for camera, row in zip(cameras[1:], traces[1:], strict=True):
         shifts = better_offset(cameras[0], camera, traces[0], row, offset)

@@ -83,6 +83,7 @@ _WELL, _WORSE = 1.0, 3.0
 # Share of the frames of a whisker in a row that the rod must explain before others are left out.
 _EXPLAINED = 0.1
 _FAR = 10.0  # distance between the bases of several views above which they differ, pixels
+_FEWEST = 3  # smallest number of frames that show the whisker from its base on
 _SHARE = 0.03  # the same as a share of the whisker's length
 
 
@@ -207,7 +208,7 @@ def track(
     if options.rough and len(cameras) > 1:
         optics, cameras, doubts = _corrected(cameras, timed, pairs, options.distance)
     moving = None if head is None else HeadPose.of(head, pairs[:, 0], rate)
-    found, remarks = [], doubts + remarks_on_time(cameras, timed, options.offset)
+    found, remarks = [], doubts + remarks_on_time(cameras, timed, options.offset, pairs)
     remarks += remarks_on_shaking(cameras, timed)
     if len(cameras) == 1:
         remarks.append(ONE_VIEW)
@@ -651,7 +652,16 @@ def _alike(_: float) -> float:
 
 
 def _check_views(cameras: Sequence[Camera], series: TraceSeries, name: str) -> None:
-    """Check that the views show one and the same whisker."""
+    """Check that the views show one and the same whisker, from its base on."""
+    seen = np.isfinite(series.line[:, :, 0, 0])
+    whole = seen & (series.ends[:, :, 0] > 0.5)
+    if seen.all(axis=1).sum() >= _FEWEST > whole.all(axis=1).sum():
+        rows = zip(cameras, seen.sum(axis=0), whole.sum(axis=0), strict=True)
+        listed = ", ".join(f"{c.name} in {base} of {all_} frames" for c, all_, base in rows)
+        raise ValueError(
+            f"the border of the image cuts off the base of {name}, which is shown by {listed}: "
+            "film it from its base on, or use a larger part of the image (--views)"
+        )
     gap = usual_gap(cameras, series)
     lengths = np.linalg.norm(np.diff(series.line, axis=2), axis=3).sum(axis=2)
     allowed = max(_FAR, _SHARE * float(np.nanmax(lengths, initial=0.0)))

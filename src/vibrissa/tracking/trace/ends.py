@@ -88,11 +88,11 @@ def traced(
     if last - first < FEWEST:
         return Trace.lost(), False
     # An image without noise was smoothed, as by compression, which removes faint lines.
-    tip_seen = noise > _SMOOTHED and _inside(frame, line[last - 1])
+    tip_seen = noise > _SMOOTHED and inside(frame, line[last - 1])
     tip_seen = tip_seen and _stops(frame, line, along, last)
     line, along = line[first:last], along.part(slice(first, last))
     trusted = min(1.0, float(along.seen.sum() / max(along.open.sum(), 1)))
-    base_seen = _inside(frame, line[0])
+    base_seen = inside(frame, line[0])
     skew = _skew(frame, line, options.scale, clutter)
     return Trace(line, along.sigma, along.seen, trusted, base_seen, tip_seen, skew), from_face
 
@@ -227,7 +227,7 @@ def _stops(frame: Frame, line: Array, along: Measured, count: int) -> bool:
     return bool(along.amplitude[before][shown[before]].mean() > _CLEAR * sigma)
 
 
-def _inside(frame: Frame, point: Array) -> bool:
+def inside(frame: Frame, point: Array) -> bool:
     """Whether a point is away from the border of the image."""
     far = np.array(frame.shape[::-1]) - 1.0 - _BORDER
     return bool((point > _BORDER).all() and (point < far).all())

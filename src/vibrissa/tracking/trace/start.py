@@ -24,6 +24,7 @@ from vibrissa.io import Frame
 from vibrissa.numerics import Array, Mask
 from vibrissa.tracking.trace.clutter import Bits, Clutter
 from vibrissa.tracking.trace.curves import Curve, find_curves
+from vibrissa.tracking.trace.ends import inside
 from vibrissa.tracking.trace.epipolar import seen_along
 from vibrissa.tracking.trace.follower import start_at
 from vibrissa.tracking.trace.ridge import noise_level
@@ -459,8 +460,15 @@ def _start(search: _Search, vote: _Vote, bright: bool) -> Start:
     if together < _SELDOM:
         doubts.append(f"views show its tip at one place in {100.0 * together:.0f} % of frames only")
     clear = [one for one in vote.winners if one.worth > 0.5 * best.worth]
+    bases = list(min(clear, key=lambda one: one.frame).bases)
+    views = zip(search.cameras, search.frames, bases, strict=True)
+    if cut := [camera.name for camera, view, base in views if not inside(view[0], base)]:
+        doubts.append(
+            f"the border of the image of {' and '.join(cut)} cuts off its base, without which no "
+            "contact is found"
+        )
     return Start(
-        list(min(clear, key=lambda one: one.frame).bases),
+        bases,
         [curve.line for curve in best.curves],
         best.frame,
         min(one.frame for one in vote.winners),

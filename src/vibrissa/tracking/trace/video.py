@@ -105,29 +105,23 @@ def trace_video(
     corrections = corrections or {}
     traces: list[list[Trace]] = [] if kept is None else kept
     begins = min([begins, *(frame for frame, _ in corrections)])
+    begun = begun if begun and len(begun[0]) > begins else ()
     done = len(begun[0]) if begun else 0
-    if done <= begins:
-        begun, done = (), 0
     recent: deque[Frame] = deque(maxlen=max(_BACK, begins))
-    seen: list[Seen] = []
+    seen, shifts = list[Seen](), list[tuple[float, float, float, float]]()
     source = iter(frames)
     first = list(islice(source, FRAMES))
     if not first:
         return traces
     if sample is None:
-        sample = first
-        if isinstance(frames, Sequence):
-            sample = [frames[i] for i in _spread(len(frames))]
+        whole = frames if isinstance(frames, Sequence) else first
+        sample = [whole[i] for i in _spread(len(whole))]
     bright, shape = is_bright(first[:1], [bases], options), first[0].shape
     start = negative(first[0]) if bright else first[0]
     followers = _begun(start, bases, begun, options)
     starts = np.array([f.base for f in followers] if bases is None else bases, dtype=np.float64)
     alike = [negative(f) if bright else f for f in sample if f.shape == shape]
-    scene = Scene.of(alike, options.scale, mask).with_still(starts, alike)
-    steady, shifts = Steady.of(scene, alike), []
-    if steady is not None and steady.at.size:
-        alike = [steady.moved_back(f)[0] for f in alike]
-        scene = Scene.of(alike, options.scale, mask).with_still(starts, alike)
+    scene, steady, alike = _surroundings(alike, starts, options, mask)
     (still,) = between_whiskers([None], scene.bits, start.shape)
     for follower in followers:
         follower.clutter = still.still_only
@@ -174,6 +168,18 @@ def trace_video(
     for row in traces if steady is not None else ():
         row[:] = [t._replace(shift=shift) for t, shift in zip(row, shifts, strict=True)]
     return traces
+
+
+def _surroundings(
+    frames: list[Frame], starts: Array, options: TraceOptions, mask: Mask | None
+) -> tuple[Scene, Steady | None, list[Frame]]:
+    """What never moves, how the camera does, and the frames as by a camera that does not."""
+    scene = Scene.of(frames, options.scale, mask).with_still(starts, frames)
+    steady = Steady.of(scene, frames)
+    if steady is not None and steady.at.size:
+        frames = [steady.moved_back(f)[0] for f in frames]
+        scene = Scene.of(frames, options.scale, mask).with_still(starts, frames)
+    return scene, steady, frames
 
 
 def _over_all_frames(

@@ -91,6 +91,12 @@ def test_links_and_groups_that_were_edited_stop_nothing(tmp_path):
     assert (tmp_path / "summary.csv").read_text() == "my,own\n"
 
 
+def test_hidden_files_are_not_recordings(tmp_path):
+    (tmp_path / "._touch.nc").write_bytes(b"\0\5\x16\7 attributes of a file")
+    with pytest.raises(ValueError, match="contains no recordings"):
+        run("batch", tmp_path)
+
+
 def test_a_table_of_each_recording(tmp_path):
     peg = Peg([9e-3, 2.6e-3, 0.0], [0.0, 0.0, 1.0], 0.5e-3)
     files = [tmp_path / "a.nc", tmp_path / "b.nc"]

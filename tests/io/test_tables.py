@@ -278,3 +278,13 @@ def test_bad_contacts(tmp_path):
         path.write_text(spoilt)
         with pytest.raises(ValueError, match=message):
             load_contacts(path)
+
+
+def test_signals_of_several_whiskers_are_not_those_of_one(tmp_path):
+    path = tmp_path / "signals.csv"
+    head, row = "time,whisker,Fx,Fy,Fz,Mx,My,Mz", "-1e-5,2e-5,0,0,0,4e-7"
+    path.write_text(f"{head}\n0,C1,{row}\n1,C1,{row}\n")
+    assert load_signals(path).sizes["time"] == 2
+    path.write_text(f"{head}\n0,C1,{row}\n0,C2,{row}\n")
+    with pytest.raises(ValueError, match="2 whiskers, C1, C2"):
+        load_signals(path)

@@ -49,7 +49,8 @@ def batch(
     if not folder.is_dir():
         raise ValueError(f"{folder} is not a folder; one with recordings is needed")
     files = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".nc")
-    paths = [path for path in files if _is_recording(path)]
+    # Names with a dot in front are of other systems' attributes of files, not of recordings.
+    paths = [path for path in files if path.name[0] != "." and _is_recording(path)]
     if not paths:
         raise ValueError(
             f"{folder} contains no recordings; `vibrissa track` and `vibrissa import` create them"

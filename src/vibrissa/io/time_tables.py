@@ -199,6 +199,13 @@ def _csv(path: Path) -> Array:
     if later and not any(is_number(cell) for cell in later[0][1]):
         names = [f"{name} ({unit})" for name, unit in zip_longest(names, later[0][1], fillvalue="")]
         del later[0]
+    if "whisker" in names:
+        at = names.index("whisker")
+        if len(several := dict.fromkeys(row[at] for _, row in later if at < len(row))) > 1:
+            raise ValueError(
+                f"{path} has the signals of {len(several)} whiskers, {', '.join(several)}; one "
+                "table each is needed, or the recording"
+            )
     columns, factors = _signal_places(path, names)
     values = read_rows(path, iter(later), len(names), columns)
     if not len(values):

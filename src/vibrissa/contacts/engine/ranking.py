@@ -508,7 +508,7 @@ def _leave_room(
     seen, unit = measured if white else target, _units(of, how, value)
     points, likely = probable_nodes(of, white, weights, unit, seen, value[3:], chi)
     bent = not room.described[best] or (_mirrored(how) and not out.valid[row, 0])
-    if not described_by_nodes(points, likely[0], spread) and bent:
+    if bent and not described_by_nodes(points, likely, spread):
         follow_valley(of.charted, of.proximal, how, target, measured, out.x[row, 0], spread)
     log_mass = room.weight[1, best] - sharpness(weights) + _LOG_NORMAL
     share = outside_share(points, likely, value[3:], chi, log_mass, spread, loose)

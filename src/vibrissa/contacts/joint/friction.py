@@ -38,7 +38,7 @@ from vibrissa.contacts.sensing.channels import (
     ratio_of,
 )
 from vibrissa.contacts.sensing.noise import SensorNoise
-from vibrissa.contacts.uncertainty.posterior import NORMAL_KURTOSIS, ranked
+from vibrissa.contacts.uncertainty.posterior import ranked
 from vibrissa.numerics import AnyArray, Array, IntArray
 
 _UNKNOWNS = 4
@@ -57,6 +57,7 @@ _PARTS = 8  # number of parts of each step for the moments
 _TOGETHER = 1000  # number of measurements whose curves are traced together, in some tens of MB
 # Largest kurtosis of a valid covariance, relative to a normal distribution's.
 _TAILED = 3.0
+_NORMAL_KURTOSIS = 15.0  # fourth moment of the distance of three normally distributed coordinates
 
 
 class _Nodes(NamedTuple):
@@ -294,7 +295,7 @@ def _stated(nodes: _Nodes, row: IntArray, n: int) -> Candidates:
     usable = total > 0.0
     known = np.where(usable[:, None, None], second, np.eye(3))
     root = np.asarray(np.linalg.inv(np.linalg.cholesky(known)), dtype=np.float64)
-    tails = mean(_fourth(root[of], y, part.spread)) / NORMAL_KURTOSIS
+    tails = mean(_fourth(root[of], y, part.spread)) / _NORMAL_KURTOSIS
     second *= (np.maximum(tails, 1.0) ** 0.75)[:, None, None]
     turned = part.angle - friction_angle(nodes.x[lead])[of]
     angle_sigma = np.sqrt(mean(turned**2 + part.angle_spread))
@@ -363,7 +364,7 @@ def or_without(found: Candidates, without: Candidates, sigma: float) -> Candidat
     second = (both[..., None, None] * (spreads + y[..., :, None] * y[..., None, :])).sum(axis=0)
     root = np.asarray(np.linalg.inv(np.linalg.cholesky(second)), dtype=np.float64)
     fourth = [_fourth(root, *one) for one in zip(y, spreads, strict=True)]
-    tails = (both * fourth).sum(axis=0) / NORMAL_KURTOSIS
+    tails = (both * fourth).sum(axis=0) / _NORMAL_KURTOSIS
     second *= (np.maximum(tails, 1.0) ** 0.75)[:, None, None]
     variance = (1.0 - weight) * turned**2 + np.where(likelier, 1.0 - weight, weight) * angle**2
     out.covariances[row, place], out.angle_sigma[row, place] = second, np.sqrt(variance)

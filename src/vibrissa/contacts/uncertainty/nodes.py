@@ -15,7 +15,8 @@ import numpy as np
 
 from vibrissa.contacts.sensing.channels import CHANNELS, CIRCULAR, channels_of
 from vibrissa.contacts.uncertainty.posterior import (
-    NORMAL_KURTOSIS,
+    LEFT,
+    THREE_SIGMA,
     second_moment,
     squared_distances,
 )
@@ -29,8 +30,8 @@ _PARTS_BY_AXIS = (4, 4, 1)
 _BLOCKS = (4, 8, 4)
 # Effective number of nodes from which their moments replace those about one contact.
 _MANY = 30.0
-# Squared Mahalanobis distance of three standard deviations of a point in space (99.73 %).
-_OUTSIDE_REGION = 14.16
+# Largest factor by which a covariance is widened, and bisections to find it.
+_WIDEST, _BISECTIONS = 8.0, 8
 _MOST_LOG = 700.0
 # Nodes whose χ² exceeds that of the best candidate by more are neglected: ten thousand of them
 # together have a ten thousandth of the candidate's likelihood.
@@ -298,24 +299,36 @@ def probable_nodes(
 
 
 @vectorised
-def described_by_nodes(points: Array, density: Array, covariance: Array) -> bool:
+def described_by_nodes(points: Array, likely: Array, covariance: Array) -> bool:
     """Replace a covariance by the second moment of the posterior over the nodes, if enough count.
 
-    This applies where the posterior is too wide for an expansion about one contact.
+    This applies where the posterior is too wide for an expansion about one contact. The moment is
+    that of the mean of the densities with volumes and without, widened until no more is beyond
+    three standard deviations than stated.
     """
-    n, total, squares, fourth = density.shape[0], 0.0, 0.0, 0.0
+    n, with_volumes, without, squares = likely.shape[1], 0.0, 0.0, 0.0
+    root, far, density = np.zeros((3, 3)), np.empty(n), np.empty(n)
     for k in range(n):
-        total += density[k]
+        with_volumes += likely[0, k]
+        without += likely[1, k]
+    for k in range(n):
+        density[k] = 0.5 * (likely[0, k] / with_volumes + likely[1, k] / without)
         squares += density[k] * density[k]
-    if not total * total > _MANY * squares:
+    if not 0.0 < _MANY * squares < 1.0:  # there may be no probable nodes at all
         return False
-    root, far = np.zeros((3, 3)), np.empty(n)
-    second_moment(points, density, total, covariance)
+    second_moment(points, density, 1.0, covariance)
     if cholesky(covariance, root):
         squared_distances(root, points, far)
-        for k in range(n):
-            fourth += density[k] * far[k] * far[k]
-        covariance *= max(fourth / (total * NORMAL_KURTOSIS), 1.0) ** 0.75
+        wider, most = 1.0, _WIDEST
+        for _ in range(_BISECTIONS):
+            limit, beyond = math.sqrt(wider * most), 0.0
+            for k in range(n):
+                beyond += density[k] if far[k] > limit * THREE_SIGMA else 0.0
+            if beyond > LEFT:
+                wider = limit
+            else:
+                most = limit
+        covariance *= wider
     return True
 
 
@@ -342,7 +355,7 @@ def outside_share(
     squared_distances(root, points, far)
     mass, mass_out, like, like_out = 0.0, 0.0, 0.0, 0.0
     for k in range(n):
-        if far[k] > _OUTSIDE_REGION:
+        if far[k] > THREE_SIGMA:
             mass_out += density[k]
             like_out += min(likelihood[k], 1.0)
         else:
@@ -351,7 +364,7 @@ def outside_share(
     for k in range(others.shape[0]):
         for a in range(3):
             away[a] = others[k, 1 + a] - point[a]
-        if others[k, 0] < np.inf and mahalanobis(root, away) > _OUTSIDE_REGION:
+        if others[k, 0] < np.inf and mahalanobis(root, away) > THREE_SIGMA:
             like_out += quick_exp(min(0.5 * (chi - others[k, 0]), 0.0))
     # The nodes may be too far apart to sample the candidate's own peak.
     mass = max(mass, math.exp(min(log_mass + 0.5 * chi, _MOST_LOG)), 1e-300)

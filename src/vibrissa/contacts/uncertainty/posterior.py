@@ -62,7 +62,6 @@ LEFT, THREE_SIGMA, HELD = 0.0033, 14.156, 7.815
 # Error of the second order above which a candidate is weighed to first order; and the most by which
 # a node's log density may exceed that of the first order.
 _BROKEN, _MOST_GAIN = 0.3, 3.0
-_BENT = 1.0  # error above which the second order does not describe channels even roughly
 TOO_FEW = 0.2  # smallest share of the nodes from which moments are meaningful
 # Number of steps by which a covariance is widened; and a negligible probability.
 _TRIALS, _NOTHING = 4, 1e-12
@@ -73,8 +72,6 @@ STRAIGHT = 0.06
 # themselves uncertain by a few hundredths: between these shares of the limit the rod is integrated.
 _NEARLY_STRAIGHT, _SURE, _DOUBTFUL = 0.03, 0.6, 0.4
 _RADII = 5  # nodes on each ray, one standard deviation apart
-#: Fourth moment of the distance of three normally distributed coordinates.
-NORMAL_KURTOSIS = 15.0
 
 
 def _within(radius: float) -> tuple[float, float]:
@@ -328,6 +325,8 @@ def _moments(
     for m in range(2 * half):
         mean += WEIGHTS[m % half] * density[m]
         fits += WEIGHTS[m % half] * likely[m]
+    if not mean < np.inf:  # contacts two standard deviations away are not in equilibrium
+        return first_order, False
     centre = 0.5 * (1.0 / fits + first_order / mean)
     squares = middle * centre * centre
     for m in range(2 * half):
@@ -434,7 +433,7 @@ def judge(
 
     Weights, x (4,), ∂(F, p)/∂ξ (6, 3), residuals and their slopes with respect to x (k, 4) are the
     candidate's. Fill the covariance of its contact point; return its log weight, whether the
-    covariance is valid, and whether the second order describes the channels at least roughly.
+    covariance is valid, and whether the second order describes the channels.
     """
     b, j, slopes, nothing, model, rays = room
     for a in range(3):
@@ -473,7 +472,7 @@ def judge(
     if straight or (missed > _BROKEN and first_order > 0.0 and not short):
         density = first_order
     weight = math.log(density) - 0.5 * misfit if density > 0.0 else -np.inf
-    return weight, missed < _MISSED and fair, missed < _BENT
+    return weight, missed < _MISSED and fair, missed < _MISSED
 
 
 @kernel

@@ -71,6 +71,33 @@ def test_regions_hold_a_contact_between_coarse_nodes():
     assert np.linalg.eigvalsh(spread)[1] < (20e-6) ** 2
 
 
+def test_it_is_known_how_far_along_the_whisker_a_thin_peg_may_be():
+    """Nodes follow its contact; held where they were, the shift seemed ten times as certain."""
+    whisker = vb.samples.gamma()
+    d = discretize(whisker)
+    peg = Peg(whisker.position(25e-3) - [0.0, 1.45e-3, 0.0], [0.0, 0.0, 1.0], 1.35e-3)
+    near, place = NearObjects(whisker, peg, 96), Placement(np.eye(3), np.array([0, -1.5e-3, 0]))
+    true = near.from_outside(place, np.zeros(3))
+    scale = np.repeat([d.force, d.moment], 3)
+    wrench, noise = true.wrench() * scale, np.repeat([1e-6, 2e-8], 3)
+    found = vb.estimate_around(
+        whisker,
+        wrench[:3],
+        wrench[3:],
+        peg,
+        noise=dict(zip(NAMES, noise, strict=True)),
+        position_sigma=0.5e-3,
+        base_position=place.position,
+    )
+    assert found.status == vb.Status.OK
+    step = 0.1e-3
+    ways = [near.moved(place, way * step / d.length, true) for way in (*np.eye(3), *-np.eye(3))]
+    wrenches = np.array([one.wrench() for one in ways]) * scale / noise
+    slopes = (wrenches[:3] - wrenches[3:]) / (2.0 * step)
+    expected = np.linalg.inv(slopes @ slopes.T + np.eye(3) / 0.5e-3**2)
+    np.testing.assert_allclose(np.diag(found.object_shift_covariance), np.diag(expected), rtol=0.2)
+
+
 def test_bad_input_is_refused():
     noise = dict.fromkeys(NAMES, 1e-6)
     force = np.zeros((2, 3))

@@ -31,7 +31,7 @@ from vibrissa.status import Status, flag_attributes
 from vibrissa.whisker import Whisker
 
 # Iterations, longest step (over L), and step of the finite differences.
-_ROUNDS, _LONGEST, _STEP = 30, 0.05, 1e-5
+_ROUNDS, _LONGEST, _STEP = 30, 0.05, 3e-4
 _DONE = 1e-2  # step, in standard deviations, below which it is the last
 # Elements in the last iterations, fine enough that nodes do not shift contacts beyond their error.
 _FINE = 96
@@ -162,17 +162,32 @@ def _fitted(
 ) -> _Fit | None:
     """Equilibrium and shift (3,) of minimum χ², derivatives (9, 3) of its residuals, and χ²."""
     coarse, fine = grids
-    shift = coarse.reaching(place)
-    found = None if shift is None else coarse.from_outside(place, shift)
-    if shift is None or found is None:
-        return None
-    fit = _descended(coarse, place, measured, weights, sigma, found, shift)
-    if fit is None:
-        return None
-    start = fine.refined(place, fit[1], fit[0])
-    if start is None:
-        return None
-    return _descended(fine, place, measured, weights, sigma, start, fit[1])
+    best: _Fit | None = None
+    # The resting whisker may be on the other side of an object that it was swept past.
+    for start in (_under_wrench, _from_rest):
+        begun = start(coarse, place, measured)
+        fit = begun and _descended(coarse, place, measured, weights, sigma, *begun)
+        nodes = fit and fine.refined(place, fit[1], fit[0])
+        fit = fit and nodes and _descended(fine, place, measured, weights, sigma, nodes, fit[1])
+        if fit and (best is None or fit[3] < best[3]):
+            best = fit
+        if best and best[3] <= explained(3):
+            break
+    return best
+
+
+def _under_wrench(
+    near: NearObjects, place: Placement, measured: Array
+) -> tuple[Equilibrium, Array] | None:
+    return near.under_wrench(place, measured)
+
+
+def _from_rest(
+    near: NearObjects, place: Placement, measured: Array
+) -> tuple[Equilibrium, Array] | None:
+    shift = near.reaching(place)
+    found = near.from_outside(place, shift)
+    return None if found is None else (found, shift)
 
 
 def _descended(
@@ -193,7 +208,7 @@ def _descended(
     for _ in range(_ROUNDS):
         slopes = np.empty((9, 3))
         for k, step in enumerate(_STEP * np.eye(3)):
-            moved = near.moved(place, shift + step, found, settle=False)
+            moved = near.moved(place, shift + step, found)
             if moved is None:
                 return None
             slopes[:, k] = (residual(moved, shift + step) - left) / _STEP

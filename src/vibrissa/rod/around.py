@@ -23,7 +23,7 @@ from vibrissa.rod.obstacles import (
     Equilibrium,
     Grid,
     Obstacles,
-    solve_at_nodes,
+    bend,
     solve_with_moving_nodes,
     strain_under_force,
     transfer_strain,
@@ -213,7 +213,7 @@ class NearObjects:
         self._whisker, self._surfaces = whisker, _rigid(objects)
         self._grid, self._length = Grid.of(whisker, elements), whisker.length
 
-    def reaching(self, place: Placement) -> Array | None:
+    def reaching(self, place: Placement) -> Array:
         """Shift (3,) that brings objects into contact with the resting whisker; zero if in it."""
         s = np.linspace(0.0, 1.0, _SAMPLES) * self._length
         line, radius = place.outside(self._whisker.position(s)), self._whisker.radius(s)
@@ -233,17 +233,40 @@ class NearObjects:
             return None
         return _solve_from_one_contact(self._whisker, self._surfaces, there, found, 0, self._grid)
 
-    def moved(
-        self, place: Placement, shift: Array, start: Equilibrium, settle: bool = True
-    ) -> Equilibrium | None:
-        """Equilibrium continued from ``start``; if ``settle``, nodes move to the contacts."""
+    def under_wrench(self, place: Placement, wrench: Array) -> tuple[Equilibrium, Array] | None:
+        """Equilibrium and shift at which objects touch a whisker where one force bends it.
+
+        The wrench (6,) at the base is non-dimensional. One force is where the moment vanishes on
+        the rod that is integrated from the base; several that act together are near it.
+        """
+        force, moment, grid = wrench[:3], wrench[3:], self._grid
+        size = float(np.linalg.norm(force))
+        if size == 0.0:
+            return None
+        on_line = np.cross(force, moment) / size**2
+        nodes = bend(grid, strain_under_force(grid, 1.0, force, on_line)).nodes
+        left = np.cross(on_line - nodes, force) @ moment
+        beyond = np.flatnonzero((left <= 0.0) & (grid.s >= grid.first))
+        node = int(beyond[0]) if beyond.size else grid.s.size - 1
+        strain = strain_under_force(grid, float(grid.s[node]), force, on_line)
+        point = place.outside(bend(grid, strain).nodes[node] * self._length)
+        gaps = [
+            one.signed_distance(point) - grid.radius[node] * self._length for one in self._surfaces
+        ]
+        which = int(np.argmin(np.abs(gaps)))
+        normal = self._surfaces[which].local_geometry(point)[1]
+        shift = np.asarray(normal * (gaps[which] / self._length))
+        pressing = np.zeros((len(self._surfaces), grid.s.size))
+        pressing[which, node] = size
+        obstacles = Obstacles(self._surfaces, self._shifted(place, shift), self._length)
+        found = solve_with_moving_nodes(self._whisker, obstacles, grid, strain, pressing)
+        return None if found is None or not found.contacts()[0].size else (found, shift)
+
+    def moved(self, place: Placement, shift: Array, start: Equilibrium) -> Equilibrium | None:
+        """Equilibrium continued from ``start``, with its nodes where they are but at contacts."""
         obstacles = Obstacles(self._surfaces, self._shifted(place, shift), self._length)
         begin = start.grid, start.strain, start.pressing
-        if settle:
-            found = solve_with_moving_nodes(self._whisker, obstacles, *begin)
-        else:
-            found = solve_at_nodes(obstacles, *begin)
-        return _continued(found, start)
+        return _continued(solve_with_moving_nodes(self._whisker, obstacles, *begin), start)
 
     def refined(self, place: Placement, shift: Array, start: Equilibrium) -> Equilibrium | None:
         """Equilibrium on this object's grid, continued from ``start`` on another grid."""

@@ -13,7 +13,7 @@ freedom to test whether the object explains the measurement.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -163,10 +163,8 @@ def _fitted(
     """Equilibrium and shift (3,) of minimum χ², derivatives (9, 3) of its residuals, and χ²."""
     coarse, fine = grids
     best: _Fit | None = None
-    # The resting whisker may be on the other side of an object that it was swept past.
-    for start in (_under_wrench, _from_rest):
-        begun = start(coarse, place, measured)
-        fit = begun and _descended(coarse, place, measured, weights, sigma, *begun)
+    for begun in _starts(coarse, place, measured):
+        fit = _descended(coarse, place, measured, weights, sigma, *begun)
         nodes = fit and fine.refined(place, fit[1], fit[0])
         fit = fit and nodes and _descended(fine, place, measured, weights, sigma, nodes, fit[1])
         if fit and (best is None or fit[3] < best[3]):
@@ -176,18 +174,18 @@ def _fitted(
     return best
 
 
-def _under_wrench(
+def _starts(
     near: NearObjects, place: Placement, measured: Array
-) -> tuple[Equilibrium, Array] | None:
-    return near.under_wrench(place, measured)
-
-
-def _from_rest(
-    near: NearObjects, place: Placement, measured: Array
-) -> tuple[Equilibrium, Array] | None:
+) -> Iterator[tuple[Equilibrium, Array]]:
+    """Equilibria and shifts from which a fit may begin, the likeliest first."""
+    found = near.under_wrench(place, measured)
+    if found is not None:
+        yield found
+    # The resting whisker may be on the other side of an object that it was swept past.
     shift = near.reaching(place)
-    found = near.from_outside(place, shift)
-    return None if found is None else (found, shift)
+    resting = near.from_outside(place, shift)
+    if resting is not None:
+        yield resting, shift
 
 
 def _descended(

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from vibrissa import samples
 from vibrissa.cli.app import app
 from vibrissa.io import (
+    COMPRESSED,
     kind_of,
     load_recording,
     load_signals,
@@ -219,7 +220,7 @@ def test_what_compresses_well_is_read(tmp_path, monkeypatch):
     monkeypatch.setattr(netcdf, "ALWAYS_ALLOWED", 1 << 20)
     path = tmp_path / "zeros.nc"
     data = xr.Dataset({"zeros": (("time", "node"), np.zeros((4_000, 1000)))})
-    encoding = {"zeros": {"zlib": True, "complevel": 9, "shuffle": True}}
+    encoding = {"zeros": {**COMPRESSED, "compression_opts": 9}}
     write_netcdf(path, data, {"/": encoding})
     assert data.nbytes > netcdf.ALWAYS_ALLOWED > 10 * path.stat().st_size
     assert data.nbytes > 400 * path.stat().st_size
@@ -250,6 +251,7 @@ def test_trees_are_read_as_xarray_reads_them(tmp_path, trial):
             "flag": ("name", [True, False, True]),
             "whole": ("name", np.arange(3, dtype=np.int8)),
             "holes": (("name", "free"), np.array([[np.nan, 1.0]] * 3)),
+            "nothing": (("name", "zero"), np.zeros((3, 0))),
             "alone": 2.5,
             "word": "µN",
         },

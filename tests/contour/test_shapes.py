@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from vibrissa.contour import (
     axis_offset,
@@ -159,6 +160,30 @@ def test_a_plane_faces_the_free_side():
     assert fit_shape("plane", points).normal[2] > 0.0
     below = fit_shape("plane", points, outside=CENTER - normal[0], whisker_radius=whisker)
     assert below.normal @ normal[0] < -0.99
+
+
+@pytest.mark.parametrize("kind", ["cylinder", "sphere", "plane"])
+def test_a_fit_to_similar_points_leads_to_the_same_shape(kind, joint_errors):
+    points, known = noisy(kind, joint_errors, np.random.default_rng(2), 60)
+    start = fit_shape(kind, points + np.array([0.3e-3, -0.2e-3, 0.1e-3]), **known)
+    searched, fit = fit_shape(kind, points, **known), fit_shape(kind, points, **known, start=start)
+    for name in (*fit.fields, "covariance"):
+        np.testing.assert_allclose(getattr(fit, name), getattr(searched, name), 1e-4, 1e-9)
+    other = "plane" if kind == "sphere" else "sphere"
+    with pytest.raises(ValueError, match=f"start is a {kind}"):
+        fit_shape(other, points, start=start)
+
+
+@pytest.mark.parametrize("kind", ["cylinder", "sphere"])
+def test_outliers_weigh_the_same_in_every_frame(kind, joint_errors):
+    points, known = noisy(kind, joint_errors, np.random.default_rng(2), 60)
+    points[::7] += 1e-3
+    turn = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
+    turned = {"whisker_radius": known.pop("whisker_radius"), "normals": known["normals"] @ turn.T}
+    fit = fit_shape(kind, points, whisker_radius=turned["whisker_radius"], **known)
+    turned |= {name: turn @ each @ turn.T for name, each in known.items() if name != "normals"}
+    again = fit_shape(kind, points @ turn.T, **turned)
+    assert again.radius == pytest.approx(fit.radius, abs=1e-3 * fit.sigma["radius"])
 
 
 @pytest.mark.parametrize("kind", ["cylinder", "sphere", "plane"])

@@ -36,7 +36,8 @@ def surface_grid(shape: FittedShape, points: ArrayLike, count: int = 41) -> xr.D
     -------
     xarray.Dataset
         Dataset of dimensions u, v, space: ``surface_grid_point`` and its standard deviation
-        ``surface_sigma`` normal to the surface, m.
+        ``surface_sigma`` normal to the surface, m; infinite where the surface is not known because
+        the deviation from the simple shape would pass through its centre.
     """
     if count < 2:
         raise ValueError(f"count is {count}; at least 2 are needed")
@@ -46,14 +47,17 @@ def surface_grid(shape: FittedShape, points: ArrayLike, count: int = 41) -> xr.D
         raise ValueError("no grid: no points")
     base = shape.base if isinstance(shape, FreeFit) else shape
     grid = _base_grid(base, p, count)
+    beyond = np.zeros(grid.shape[:-1], dtype=bool)
     if isinstance(shape, FreeFit):
         added, _ = shape.deviation(grid)
         # Far from all contacts the surface must not pass through the centre of the base.
-        added = np.minimum(added, _INWARD * getattr(base, "radius", np.inf))
+        deepest = _INWARD * getattr(base, "radius", np.inf)
+        beyond, added = added > deepest, np.minimum(added, deepest)
         grid = grid - added[..., None] * base.outward_normals(grid)
+    sigma = np.where(beyond, np.inf, shape.distance_sigma(grid))
     data = {
         "surface_grid_point": (("u", "v", "space"), grid, attributes("surface_grid_point")),
-        "surface_sigma": (("u", "v"), shape.distance_sigma(grid), attributes("surface_sigma")),
+        "surface_sigma": (("u", "v"), sigma, attributes("surface_sigma")),
     }
     return xr.Dataset(data, {"space": list("xyz")}, {"shape": shape.kind})
 

@@ -29,14 +29,22 @@ curvature, and their weights depend on their own errors.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.contour.fitted_shape import FLOOR, Checked, Touches, check_contacts, excess_of, whiten
+from vibrissa.contour.fitted_shape import (
+    FLOOR,
+    Checked,
+    FittedShape,
+    Touches,
+    check_contacts,
+    excess_of,
+    whiten,
+)
 from vibrissa.contour.simple_shapes import (
     SHAPES,
     CylinderFit,
@@ -88,6 +96,7 @@ def fit_shape(
     *,
     axis: ArrayLike | None = None,
     outside: ArrayLike | None = None,
+    start: FittedShape | None = None,
 ) -> SimpleShape:
     """Fit a simple shape to contact points on parts of its surface.
 
@@ -119,6 +128,9 @@ def fit_shape(
     outside : array_like (3,), optional
         Point on the free side of a plane, such as the whisker's base, if normals are unknown. By
         default the largest component of the normal is positive.
+    start : CylinderFit, SphereFit or PlaneFit, optional
+        Fit to similar points, of the same kind and with the same ``axis``. The best shape is then
+        not searched for, but found from this one, in a fraction of the time.
 
     Returns
     -------
@@ -150,6 +162,11 @@ def fit_shape(
         normal_covariance=normal_covariance,
         point_normal_covariance=point_normal_covariance,
     )
+    if start is not None:
+        if not isinstance(start, declared):
+            raise ValueError(f"start is a {start.kind}, and the shape is {kind!r}")
+        near = start.scaled(given)
+        return _fit([_SteppedShape(near, frame_across(near.direction), count)], given)
     starts = declared.starts(given, outside if axis is None else axis)
     return _fit([_SteppedShape.at(shape, toward, count) for shape, toward in starts], given)
 
@@ -270,16 +287,16 @@ def _minimise(
     start: _SteppedShape, touches: Touches, tolerance: float = 1e-8, most: int = 50
 ) -> optimize.OptimizeResult:
     """Minimise the robust misfit of a shape."""
+    return _least_squares(start, lambda at: _softened(at.misses(touches)), tolerance, most)
 
-    def misses(step: Array) -> Array:
-        return start.moved(step).misses(touches).reshape(-1)
 
+def _least_squares(
+    start: _SteppedShape, misses: Callable[[_SteppedShape], Array], tolerance: float, most: int
+) -> optimize.OptimizeResult:
     return optimize.least_squares(
-        misses,
+        lambda step: misses(start.moved(step)).reshape(-1),
         np.zeros(start.count),
         jac="2-point" if tolerance > _PRECISE else "3-point",
-        loss="soft_l1",
-        f_scale=_SOFT,
         x_scale="jac",
         xtol=tolerance,
         ftol=tolerance,
@@ -288,25 +305,43 @@ def _minimise(
     )
 
 
+def _excess(misses: Array) -> Array:
+    """Square (n, 1) of each contact's residuals (n, m), over that from which it is downweighted."""
+    return np.asarray((misses**2).sum(axis=1, keepdims=True) / _SOFT**2)
+
+
+def _softened(misses: Array) -> Array:
+    """Scale residuals (n, m) so that their squares are a robust misfit (smooth L1).
+
+    All residuals of a contact are scaled alike: the misfit does not depend on the frame.
+    """
+    return np.asarray(misses * np.sqrt(2.0 / (1.0 + np.sqrt(1.0 + _excess(misses)))))
+
+
 def _fit_best(starts: Sequence[_SteppedShape], touches: Touches) -> _SteppedShape:
     """Fit roughly from every start, and refine the best one of finite size."""
-    best, least = None, np.inf
+    found: list[tuple[bool, float, _SteppedShape]] = []
     for start in starts:
         solved = _minimise(start, touches, 1e-2, 10)
         moved = start.moved(solved.x)
-        if 0.0 < moved.shape.size < _LARGEST and solved.cost < least:
-            best, least = moved, float(solved.cost)
-    if best is None:
+        if abs(moved.shape.size) < _LARGEST:
+            found.append((moved.shape.size <= 0.0, float(solved.cost), moved))
+    if not found:
         raise ValueError(f"no {starts[0].shape.kind}: none of finite size fits the points")
+    # The size of a thin object may be fitted as negative; a positive one is preferred.
+    *_, best = min(found, key=lambda each: each[:2])
     return best.moved(_minimise(best, touches).x)
 
 
 def _uncertainty(best: _SteppedShape, touches: Touches) -> tuple[Array, float, Array, int]:
     """Covariance of the parameters, excess of the scatter over the stated noise, and residuals."""
-    solved = _minimise(best, touches, most=1)
-    design, z = np.asarray(solved.jac), np.asarray(solved.fun)
+    solved = _least_squares(best, lambda at: at.misses(touches), 1e-8, 1)
+    misses = np.asarray(solved.fun).reshape(len(touches.position), -1)
+    squares, equations = (misses**2).sum(axis=1), misses.shape[1]
+    weights = 1.0 / np.sqrt(1.0 + _excess(misses)[:, 0])
+    design = np.asarray(solved.jac) * np.sqrt(weights).repeat(equations)[:, None]
     size = np.linalg.norm(design, axis=0)
-    determined = bool((size > 0.0).all())
+    determined = bool(size.min() > _SINGULAR * size.max())
     if determined:
         values = np.linalg.svd(design / size, compute_uv=False)
         determined = bool(values[-1] > _SINGULAR * values[0])
@@ -315,12 +350,9 @@ def _uncertainty(best: _SteppedShape, touches: Touches) -> tuple[Array, float, A
             f"no {best.shape.kind}: the points do not determine one; touch it at more positions or "
             "on other sides"
         )
-    free = max(z.size - best.count, 1)
-    misses = z.reshape(len(touches.position), -1)
-    squares, equations = (misses**2).sum(axis=1), misses.shape[1]
     # Scatter beyond the stated noise makes the fit less certain: slightly if due to a few outliers,
     # fully if due to most points, as for an object of another shape.
-    soft = float((z**2 / np.sqrt(1.0 + (z / _SOFT) ** 2)).sum()) / free
+    soft = float(weights @ squares) / max(misses.size - best.count, 1)
     excess = max(1.0, soft, excess_of(squares, equations))
     slopes = best.shape.step_slopes(best.frame)[:, : best.count]
     return slopes @ np.linalg.inv(design.T @ design) @ slopes.T, excess, squares, equations

@@ -100,15 +100,24 @@ class SimpleShape(FittedShape):
         points = touches.position
         return self._normals(points), self._curvature(points, touches.whisker_radius)
 
+    def scaled(self, given: Checked) -> Self:
+        """The same shape in the frame and unit in which the points are fitted."""
+        shift = replace(self, origin=self.origin - given.mean)
+        return replace(shift, **shift._lengths(1.0 / given.extent))
+
     def in_metres(self, given: Checked, **statistics: Any) -> Self:
         """The same shape in the frame and unit of the points, with the statistics of its fit."""
-        lengths = {
-            name: given.extent * getattr(self, name)
+        lengths = self._lengths(given.extent)
+        lengths["origin"] = given.mean + lengths["origin"]
+        return replace(self, **lengths, **statistics)
+
+    def _lengths(self, factor: float) -> dict[str, Any]:
+        """Lengths among the fields, multiplied by a factor."""
+        return {
+            name: factor * getattr(self, name)
             for name, quantity in self.fields.items()
             if quantity != DIRECTION
         }
-        lengths["origin"] = given.mean + lengths["origin"]
-        return replace(self, **lengths, **statistics)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)

@@ -108,7 +108,8 @@ def reconstruct(
     fit = _widened(fit, together)
     if not isinstance(fit, FreeFit):
         moved = _moved_together(recording, estimates)
-        others = [fit_contacts(one, whiskers, shape, axis=axis, lean=lean) for one in moved]
+        options: dict[str, Any] = {"axis": axis, "lean": lean, "start": fit}
+        others = [fit_contacts(one, whiskers, shape, **options) for one in moved]
         fit = _with_shared_errors(fit, others)
     each = {n: estimates[n].variable for n in EACH if n in estimates.coords}
     out = fit.to_dataset(EACH, tuple(estimates.sizes[n] for n in EACH), each)
@@ -223,6 +224,7 @@ def fit_contacts(
     *,
     axis: ArrayLike | None = None,
     lean: float | None = None,
+    start: FittedShape | None = None,
 ) -> FittedShape:
     """Fit a shape to contacts in the laboratory frame.
 
@@ -240,6 +242,8 @@ def fit_contacts(
         Standard deviation of the angle between the surface normal and the force across the
         whisker, rad; by default `LEAN` for contacts from the full wrench, which allows for
         friction, and 0 for others, which assume no friction.
+    start : CylinderFit, SphereFit or PlaneFit, optional
+        Fit to similar contacts; see `vibrissa.contour.fit_shape`.
 
     Returns
     -------
@@ -282,7 +286,7 @@ def fit_contacts(
     try:
         if shape == "free":
             return fit_free(points, **known)
-        return fit_shape(shape, points, axis=axis, **known)
+        return fit_shape(shape, points, axis=axis, start=start, **known)
     except ValueError as fault:
         found = np.isfinite(points).all(axis=1)
         codes = estimates["status"].values.reshape(-1)

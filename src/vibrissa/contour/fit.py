@@ -231,7 +231,7 @@ def _fit(starts: Sequence[_SteppedShape], given: Checked) -> SimpleShape:
         if narrow.sum() >= _ENOUGH:
             used = narrow
             best = _fit_best([best], touches.rows(used))
-    best = best.moved(_minimise(best, touches.rows(used), 1e-15).x)
+    best = best.moved(_minimise(best, touches.rows(used), 1e-11).x)
     if not best.shape.size > 0.0:
         best = _with_positive_size(best, touches.rows(used))
     best = _SteppedShape.at(best.shape.arranged(), best.frame[0], best.count)
@@ -293,8 +293,11 @@ def _minimise(
 def _least_squares(
     start: _SteppedShape, misses: Callable[[_SteppedShape], Array], tolerance: float, most: int
 ) -> optimize.OptimizeResult:
+    def residuals(step: Array) -> Array:
+        return misses(start.moved(step)).reshape(-1)
+
     return optimize.least_squares(
-        lambda step: misses(start.moved(step)).reshape(-1),
+        residuals,
         np.zeros(start.count),
         jac="2-point" if tolerance > _PRECISE else "3-point",
         x_scale="jac",

@@ -68,6 +68,11 @@ def test_a_straight_tapered_whisker_is_located_by_fx_mb_md(theorem):
     assert set(found.parts) == {"interior", "proximal", "distal", "fold"}
 
 
+@pytest.mark.parametrize("ratio", [60.0, 1.05])
+def test_uniqueness_on_straight_whiskers_of_any_taper(ratio):
+    assert certify(straight(ratio), seconds=60.0).proved
+
+
 def test_a_cylinder_is_not_proved():
     # F_x = -M_B²/2EI for a cylinder: the determinant is zero everywhere.
     found = certify(straight(1.0), seconds=5.0)

@@ -106,11 +106,15 @@ def test_a_linear_sensor_is_calibrated_by_a_table_of_touches(tmp_path):
     points = np.vstack([1e3 * bent.contact_point, np.full((20, 3), np.nan)])
     readings = np.vstack([readings, np.tile([0.3, -0.1, 0.2], (20, 1))])
     readings += noise * rng.normal(size=readings.shape)
-    rows = [
-        ",".join("" if np.isnan(value) else f"{value:.12g}" for value in row)
-        for row in np.column_stack([points, readings])
-    ]
-    (tmp_path / "touches.csv").write_text("\n".join(["x,y,z,a,b,c", *rows]))
+
+    def write(header, points):
+        rows = [
+            ",".join("" if np.isnan(value) else f"{value:.12g}" for value in row)
+            for row in np.column_stack([points, readings])
+        ]
+        (tmp_path / "touches.csv").write_text("\n".join([header, *rows]))
+
+    write("x,y,z,a,b,c", points)
     target = tmp_path / "sensor.toml"
     how = ["calibrate", str(tmp_path / "touches.csv"), "-o", str(target)]
     own = ["--whisker", str(tmp_path / "wire.nc"), "--components", "My,Mz"]
@@ -124,3 +128,14 @@ def test_a_linear_sensor_is_calibrated_by_a_table_of_touches(tmp_path):
     away = np.abs(sensor.mixing[:, 4:] - mixing)
     assert (away < np.minimum(4.0 * sigma, 0.01 * mixing.max())).all()
     np.testing.assert_allclose(sensor.noise, noise, rtol=0.5)
+    again = [*how, *own, "--force"]
+    write("x_m,y (mm),z,a,b,c", points * [1e-3, 1.0, 1.0])
+    assert CliRunner().invoke(app, again).exit_code == 0
+    same = vb.sensors.load_sensor(target)
+    np.testing.assert_allclose(same.mixing, sensor.mixing, atol=1e-6 * mixing.max())
+    write("x,y,z,a,b,c", 1e-3 * points)
+    fault = str(CliRunner().invoke(app, again).exception)
+    assert "mm from the base of this whisker of 100 mm: are their unit" in fault
+    points[:30] = points[29::-1]
+    write("x,y,z,a,b,c", points)
+    assert "much noise of a, b, c" in CliRunner().invoke(app, again).output

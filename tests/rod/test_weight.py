@@ -7,6 +7,7 @@ from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
 import vibrissa as vb
+from vibrissa.rod import STEPS, discretize, gravity
 
 G = 9.81
 LEVEL, UPRIGHT, OBLIQUE = (0.0, 0.0, -G), (-G, 0.0, 0.0), (-0.5 * G, 0.5 * G, -0.7 * G)
@@ -162,3 +163,12 @@ def test_an_upright_cylinder_stands_as_high_as_greenhill_found():
     with pytest.raises(ValueError, match="topples in gravity"):
         vb.resting(tall, UPRIGHT)
     vb.resting(tall, (G, 0.0, 0.0))
+
+
+def test_a_rod_under_weight_is_solved_once(monkeypatch):
+    """With or without the default number of steps, and for an accelerometer's noisy sizes."""
+    bent = gravity.resting(RODS["curved"], LEVEL)
+    assert discretize(bent) is discretize(bent, STEPS)
+    monkeypatch.setattr(gravity, "_lean_by_increments", None)
+    for scale in (1.001, 0.999, 1.0 + 1e-15):
+        gravity.resting(RODS["curved"], scale * np.array(LEVEL))

@@ -11,6 +11,8 @@ import vibrissa as vb
 from vibrissa.cli.inputs import WhiskerOptions
 from vibrissa.cli.options import check_new, refuse, with_options
 from vibrissa.cli.terminal import remark, say
+from vibrissa.io import unit_factor
+from vibrissa.numerics import Array
 
 # Noise relative to the range of the readings above which the user is warned.
 _UNEXPLAINED = 0.05
@@ -81,13 +83,7 @@ def _linear(
     check_new(target, (".toml",), force)
     if own.whisker is None:
         raise ValueError("--whisker is needed: the touches are of it")
-    names, values = vb.io.read_numbers(table)
-    lacking = [axis for axis in "xyz" if axis not in names]
-    if lacking:
-        raise ValueError(f"{table} lacks {', '.join(lacking)}; its columns are {', '.join(names)}")
-    channels = [name for name in names if name not in ("x", "y", "z", "time", "")]
-    points = 1e-3 * values[:, [names.index(axis) for axis in "xyz"]]
-    readings = values[:, [names.index(name) for name in channels]]
+    channels, points, readings = _touches(table)
     rest = readings[np.isnan(points).all(axis=1) & np.isfinite(readings).all(axis=1)]
     _check_saturation(channels, readings)
     found = vb.sensors.calibrate_on_contacts(
@@ -96,7 +92,7 @@ def _linear(
         readings,
         point_sigma=1e-3 * (touch_sigma or 0.0),
         channels=channels,
-        components=components.split(",") if components else vb.sensors.COMPONENTS,
+        components=components.replace(" ", "").split(",") if components else vb.sensors.COMPONENTS,
         noise=rest.std(axis=0, ddof=1) if len(rest) >= _AT_REST else 0.0,
     )
     vb.sensors.save_sensor(target, found.sensor)
@@ -106,7 +102,30 @@ def _linear(
         fits = zip(found.components, found.sensor.mixing[k, where], sigma[:-1], strict=True)
         text = ", ".join(f"{one} {value:.4g} ± {error:.2g}" for one, value, error in fits)
         say(f"{name}: {text} per N or N·m; noise {found.sensor.noise[k]:.3g}")
+    _question_noise(found.sensor, readings, "unit, axes, origin and order of the touches")
     say(f"wrote {target}")
+
+
+def _touches(table: Path) -> tuple[list[str], Array, Array]:
+    """Channels of a table of touches, points (n, 3), m, and readings (n, k)."""
+    names, values = vb.io.read_numbers(table)
+    # Units of columns that state none are those of the command line.
+    units = {
+        name: unit_factor(name[1:], "length") if name[1:] else 1e-3
+        for name in names
+        if name[:1] in tuple("xyz") and not name[1:2].isalnum()
+    }
+    axes = sorted(name for name, unit in units.items() if unit)
+    if [name[0] for name in axes] != list("xyz"):
+        raise ValueError(
+            f"{table}: columns x, y, z (mm; also x_m and so on) are needed; its columns are "
+            f"{', '.join(names)}"
+        )
+    channels = [name for name in names if name not in (*axes, "time", "")]
+    if not channels:
+        raise ValueError(f"{table} has no column of readings in addition to {', '.join(names)}")
+    points = values[:, [names.index(axis) for axis in axes]] * [units[axis] or 1.0 for axis in axes]
+    return channels, points, values[:, [names.index(name) for name in channels]]
 
 
 def _suspended(description: Path, target: Path, force: bool) -> None:
@@ -143,17 +162,26 @@ def _suspended(description: Path, target: Path, force: bool) -> None:
             f"{name}: noise {sensor.noise[k]:.3g}, {100 * sensor.noise[k] / scale:.2g} % of the "
             f"largest reading; the rod leaves {found.residual[k]:.3g}; drift {sensor.drift[k]:.3g}"
         )
-    poor = sensor.noise > _UNEXPLAINED * np.ptp(readings, axis=0)
-    if poor.any():
-        names = ", ".join(name for name, much in zip(sensor.channels, poor, strict=True) if much)
-        say(
-            f"  That is much noise of {names}: are origin and axes of the touches, the readings at "
-            "rest and the order of the shape's points (from the base) right?"
-        )
+    _question_noise(
+        sensor,
+        readings,
+        "origin and axes of the touches, the readings at rest and the order of the shape's points "
+        "(from the base)",
+    )
     say(f"wrote {target}")
 
 
-def _check_saturation(channels: Sequence[str], readings: vb.numerics.Array) -> None:
+def _question_noise(
+    sensor: vb.sensors.Sensor | vb.sensors.SuspendedWhisker, readings: Array, what: str
+) -> None:
+    """Warn of channels with noise that is large compared with their readings."""
+    poor = sensor.noise > _UNEXPLAINED * np.ptp(readings, axis=0)
+    if poor.any():
+        names = ", ".join(name for name, much in zip(sensor.channels, poor, strict=True) if much)
+        say(f"  That is much noise of {names}: are {what} right?")
+
+
+def _check_saturation(channels: Sequence[str], readings: Array) -> None:
     """Warn of channels that repeatedly read their largest or smallest value."""
     for name, values in zip(channels, readings.T, strict=True):
         for end in (values.min(initial=np.inf), values.max(initial=-np.inf)):

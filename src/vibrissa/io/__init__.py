@@ -85,6 +85,7 @@ from vibrissa.io.table import (
     subtable as subtable,
     table_rows as table_rows,
     three_numbers as three_numbers,
+    unit_factor as unit_factor,
     with_point as with_point,
     write_table as write_table,
 )

@@ -35,7 +35,7 @@ _MOST = 1e4  # largest gravity accepted, m/s²; accelerations of whisking are be
 # Number of increments in which the weight is applied, and how often a failed one may be halved.
 _STEPS, _HALVINGS = 8, 6
 _NUDGE = 1e-5  # rotation of gravity in the finite differences of the stability test, rad
-_DIRECTION_SPACING = 0.05  # of the directions of gravity with cached resting shapes, rad
+_SPACING = 0.05  # of directions, rad, and log sizes of gravity with cached resting shapes
 _REST = np.array([[1.0, 0.0, 0.0, 0.0]])  # zero contact force: (s, f)
 _NODES = 257  # number of nodes of the sagged curvature
 
@@ -263,12 +263,17 @@ def near_direction(vector: Array, step: float) -> Array:
 
 
 @discretized.register(Resting)
+@lru_cache(maxsize=64)  # for calls with and without a number of steps
 def _with_weight(whisker: Resting, steps: int) -> Discretization:
     """Discretize a whisker with its weight."""
     gravity = np.array(whisker.gravity)
     if not gravity.any():
         return discretize(whisker.whisker, steps)
-    x, y, z = near_direction(gravity, _DIRECTION_SPACING).tolist()
+    # An accelerometer's readings have noise: sizes are rounded too, last digits included.
+    size = float(np.linalg.norm(gravity))
+    toward = np.round(gravity / size / _SPACING)
+    toward *= np.exp(_SPACING * np.round(np.log(size) / _SPACING)) / np.linalg.norm(toward)
+    x, y, z = toward.tolist()
     near = _cached_lean(Resting(whisker.whisker, (x, y, z)), steps)
     if near is not None:
         loaded = _rod_with_weight(whisker, steps, 1.0, near)

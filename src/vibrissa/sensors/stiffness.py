@@ -64,11 +64,11 @@ def deflections_to(whisker: Whisker, points: ArrayLike) -> Deflection:
     if contacts.ndim != 2 or contacts.shape[1] != 3:
         raise ValueError(f"contact points are (n, 3), m; got {contacts.shape}")
     bent = deflect(whisker, PointContact(contacts))
-    _report_impossible(bent.status)
+    _report_impossible(bent.status, contacts, whisker.length)
     return bent
 
 
-def _report_impossible(statuses: AnyArray) -> None:
+def _report_impossible(statuses: AnyArray, points: Array, length: float) -> None:
     """Warn of contacts that are not possible; raise ValueError if they are more than half."""
     rows = np.flatnonzero(~is_ok(statuses) & (statuses != int(Status.MISSING)))
     if not rows.size:
@@ -76,7 +76,12 @@ def _report_impossible(statuses: AnyArray) -> None:
     reasons = "; ".join(f"{n} × {text}" for text, n in describe(statuses[rows]).items())
     which = f"{rows.size} of {statuses.size} contacts are not possible: {reasons}"
     if 2 * rows.size > statuses.size:
-        raise ValueError(which)
+        near, far = 1e3 * np.nanquantile(np.linalg.norm(points, axis=1), (0.1, 0.9))
+        raise ValueError(
+            f"{which} Most points are {near:.3g} to {far:.3g} mm from the base of this whisker of "
+            f"{1e3 * length:.3g} mm: are their unit, their axes (x is along the whisker at its "
+            "base) and their origin right?"
+        )
     named = ", ".join(map(str, rows[:_MOST_NAMED])) + ", …" * (rows.size > _MOST_NAMED)
     warnings.warn(f"{which}; left out: {named} (of the rows, from 0)", stacklevel=4)
 
@@ -221,7 +226,7 @@ def fit_stiffness(
     ratio, factor, spring, spread, left = fit
     numbered = np.full(known.shape, int(Status.MISSING))
     numbered[known] = statuses
-    _report_impossible(numbered)
+    _report_impossible(numbered, contacts, whisker.length)
     degrees = int(np.sum(is_ok(statuses))) * y.shape[1] - 1 - taper - base
     misfit = float((left**2).sum() / max(degrees, 1))
     warn_of_misfit(
@@ -281,7 +286,7 @@ def _fitted_to_possible(
 
     ratio = whisker.tip_radius / whisker.base_radius
     if not (modelled(ratio, _SPRING if base else None)[0] * scaled).sum() > 0.0:
-        _report_impossible(statuses)
+        _report_impossible(statuses, contacts, whisker.length)
         raise ValueError(
             "the readings do not increase with the loads: check the sensor's axes, sign "
             "(`reaction`) and offset, and whether the channels respond at all"

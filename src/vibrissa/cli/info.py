@@ -261,7 +261,8 @@ def _sensor(path: Path) -> Iterator[tuple[str, str]]:
     for name, mixing, noise, bias, largest in numbers:
         parts = [f"{a:g} {c}" for a, c in zip(mixing, vb.sensors.COMPONENTS, strict=True) if a]
         ends = f", saturates at ±{largest:g}" if np.isfinite(largest) else ""
-        yield name, f"{' + '.join(parts)} + {bias:.4g}, noise {noise:.3g}{ends}"
+        formula = " + ".join([*parts, f"{bias:.4g}"]).replace("+ -", "- ")
+        yield name, f"{formula}, noise {noise:.3g}{ends}"
     x, y, z = 1e3 * sensor.frame.position
     hand = "right" if sensor.frame.handedness > 0 else "left"
     counts = ", measures the reaction" if sensor.frame.reaction else ""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from vibrissa.numerics import Array
 from vibrissa.plots import scale_of
-from vibrissa.quantities import quantity, to_display
+from vibrissa.quantities import quantity, shown_unit, to_display
 from vibrissa.rod import Deflection
 from vibrissa.scene import Bytes, Colour, Ints
 from vibrissa.signals import SIGNALS, signals_of, spherical
@@ -36,19 +36,19 @@ def symbol(name: str) -> str:
 
 
 def number(name: str, value: float, digits: int = 4) -> str:
-    """Format an SI value in its display unit; a dash if it is missing.
+    """Format an SI value in its most readable unit; a dash if it is missing.
 
     Angles have two decimals, other numbers so many digits but at most four decimals.
     """
     if not np.isfinite(value):
         return "–"
-    q = quantity(name)
-    shown = value * q.display_factor
+    factor, unit = shown_unit(name, value)
+    shown = value * factor
     whole = np.floor(np.log10(abs(shown))) if shown else 0.0
-    decimals = 2 if q.display_unit == "°" else int(np.clip(digits - 1 - whole, 0, 4))
+    decimals = 2 if unit == "°" else int(np.clip(digits - 1 - whole, 0, 4))
     # Adding zero turns −0 into 0.
     text = f"{round(shown, decimals) + 0.0:.{decimals}f}".replace("-", "−")
-    return f"{text}{'' if q.display_unit in ('', '°') else ' '}{q.display_unit}"
+    return f"{text}{'' if unit in ('', '°') else ' '}{unit}"
 
 
 def table(rows: Mapping[str, float], heading: str = "") -> str:

@@ -464,7 +464,7 @@ class Recording:
         groups = self._whisker_groups()
         if not 0 <= index < len(groups):
             raise ValueError(
-                f"whisker {index} was asked for; the recording carries {len(groups)} of them"
+                f"the recording has the shapes of {len(groups)} whiskers, not of whisker {index}"
             )
         return Whisker.from_dataset(groups[index].to_dataset(inherit=False))
 

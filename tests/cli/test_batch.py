@@ -1,6 +1,7 @@
 """A folder of recordings in one command: one fault stops nothing, and done is done."""
 
 import csv
+import errno
 
 import numpy as np
 import pytest
@@ -89,6 +90,31 @@ def test_links_and_groups_that_were_edited_stop_nothing(tmp_path):
     with pytest.raises(ValueError, match=r"summary.csv is not a table of this command"):
         run("batch", tmp_path)
     assert (tmp_path / "summary.csv").read_text() == "my,own\n"
+
+
+def test_recordings_that_cannot_be_saved_do_not_stop_the_others(tmp_path, monkeypatch):
+    """A full disk, or a folder of another user behind a link."""
+    for name in ("a.nc", "b.nc"):
+        trial(tmp_path / name, Peg([90e-3, 2.6e-3, 0.0], [0.0, 0.0, 1.0], 0.5e-3))
+    table, wrote = tmp_path / "summary.csv", vb.io.write_table
+
+    def full(path, *_):
+        raise OSError(errno.ENOSPC, f"{path} cannot be written: No space left on device")
+
+    def once(path, header, rows):
+        if len(rows) == 1:
+            full(path)
+        wrote(path, header, rows)
+
+    monkeypatch.setattr(vb.io, "save_recording", full)
+    monkeypatch.setattr(vb.io, "write_table", once)
+    result = CliRunner().invoke(app, ["batch", str(tmp_path)])
+    assert "2 recordings, 2 with a fault" in result.output
+    with table.open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["file"] for row in rows] == ["a.nc", "b.nc"]
+    assert all("cannot be written: No space left" in row["fault"] for row in rows)
+    assert all(row["frames"] == "40" for row in rows)
 
 
 def test_hidden_files_are_not_recordings(tmp_path):

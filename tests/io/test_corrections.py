@@ -23,6 +23,9 @@ def test_points_are_gathered_by_view_frame_and_whisker(tmp_path):
         (HEADER + "0,5,0,1.5\n", "line 2"),
         (HEADER + "0,5,0,1.5,nan\n", "no point of a trace"),
         (HEADER + "0,5,0,1.5,2\n", "has one point"),
+        # Rows that were pasted twice, and those of a table that was sorted by column x.
+        (HEADER + 2 * "0,5,0,1,2\n0,5,0,30,9\n", "line 4 .*there already"),
+        (HEADER + "0,5,0,1,2\n0,6,0,2,2\n0,5,0,9,3\n0,6,0,11,3\n", "line 4 .*ended further up"),
     ],
 )
 def test_what_is_no_correction_says_why(tmp_path, text, said):

@@ -310,6 +310,8 @@ SPOILT = (
     (instead("confidence", np.array([b"ab"] * 40)), "numbers are needed"),
     (instead("confidence", np.zeros(3)), "confidence of another size"),
     (lambda series: series["data"].attrs.__setitem__("conversion", "mm"), "not a number"),
+    (lambda series: series["data"].attrs.__setitem__("unit", "feet"), "has nodes in feet and in"),
+    (instead("timestamps", 1.0 + np.arange(40)), "times that differ from those of"),
 )
 
 

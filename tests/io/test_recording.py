@@ -32,6 +32,17 @@ def test_nothing_is_lost(tmp_path, recording):
     assert kind_of(path) == "vibrissa recording"
 
 
+def test_dimensions_are_in_the_usual_order_whatever_the_file(tmp_path, recording):
+    """As after editing with other programs; readers take arrays by position."""
+    edited = recording.copy()
+    for group in (edited, edited["truth"]):
+        data = group.to_dataset(inherit=False)
+        group.dataset = data.transpose(*list(data.sizes)[::-1])
+    assert edited["force"].dims != recording["force"].dims
+    save_recording(tmp_path / "trial.nc", edited)
+    xr.testing.assert_identical(load_recording(tmp_path / "trial.nc"), recording)
+
+
 def test_the_file_is_replaced_whole_or_not_at_all(tmp_path, recording):
     path = tmp_path / "trial.nc"
     save_recording(path, recording)

@@ -198,3 +198,23 @@ def test_frames_that_tracking_lost_do_not_divide_a_contact(trial, tmp_path):
     save_nwb(tmp_path / "t.nwb", tree, Session(datetime(2026, 3, 1, tzinfo=UTC)))
     with h5py.File(tmp_path / "t.nwb") as file:
         assert file["intervals/contacts/start_time"][:].tolist() == [TIME[20]] * 2
+
+
+def test_info_describes_exported_tables(trial, tmp_path):
+    """They are neither signals nor files of trackers, and equal tables are equal files."""
+    from vibrissa.io import recognise, save_contour
+
+    table = predictors(trial)
+    for name in ("a.csv", "a.mat", "b.mat"):
+        save_predictors(tmp_path / name, table)
+    assert (tmp_path / "a.mat").read_bytes() == (tmp_path / "b.mat").read_bytes()
+    points = {name: ("contact", [0.0, 1.0]) for name in ("time", "x", "y", "z")}
+    save_contour(tmp_path / "a_contour.csv", xr.Dataset(points))
+    save_nwb(tmp_path / "a.nwb", trial, Session(datetime.now(UTC)), predictors=table)
+    for name, verb in (("a.csv", "export"), ("a.mat", "export"), ("a_contour.csv", "reconstruct")):
+        assert recognise(tmp_path / name).endswith(f"as vibrissa {verb} writes it")
+        said = CliRunner().invoke(app, ["info", str(tmp_path / name)]).output
+        assert "commands take the recording" in said or "no command takes the table" in said
+    said = " ".join(CliRunner().invoke(app, ["info", str(tmp_path / "a.nwb")]).output.split())
+    assert "writes it: base_position, base_rotation, force, moment" in said
+    assert "`vibrissa import` the tracked points, if any" in said

@@ -91,7 +91,7 @@ def test_what_is_missing_is_named(trial):
         recording["signals"]
     with pytest.raises(ValueError, match="whisker 3 was asked for"):
         recording.root.whisker(3)
-    with pytest.raises(ValueError, match="the recording carries 1"):
+    with pytest.raises(ValueError, match="the shapes of 1 whiskers, not of"):
         recording.whisker(1)
     with pytest.raises(ValueError, match="no cameras"):
         _ = recording.cameras

@@ -362,6 +362,8 @@ def test_progress_and_faults():
         trace_video(frames, [(20.0, 62.0)], corrections={(0, 1): [[0, 0], [1, 1]]})
     with pytest.raises(ValueError, match="n ≥ 2, are needed"):
         trace_video(frames, [(20.0, 62.0)], corrections={(0, 0): [[0, 0]]})
+    with pytest.raises(ValueError, match=r"turns back at \(40.0, 60.0\)"):
+        trace_video(frames, [(20.0, 62.0)], corrections={(0, 0): [[20, 62], [40, 60], [30, 61]]})
 
 
 @pytest.mark.parametrize("sigma", [1.0, 2.5, 6.0])

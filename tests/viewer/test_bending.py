@@ -177,5 +177,6 @@ def test_numbers_have_units_and_symbols_indices():
     assert number("MD", np.pi / 2) == "90.00°"
     assert number("Fx", -0.0) == "0.000 µN"
     assert number("Fx", np.nan) == "–"
+    assert number("force", 71.76e-3) == "71.76 mN"  # of a robot's wire
     assert symbol("Fx") == "F<sub>x</sub>"
     assert symbol("theta") == "θ"

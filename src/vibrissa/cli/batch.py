@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import typer
@@ -60,6 +62,7 @@ def batch(
         raise ValueError(
             f"{table} is not a table of this command, which would replace it: rename it"
         )
+    vb.io.check_writable(table)
     known = None if objects is None else objects_from(objects)
     rows, lines = [], []
     with progress_bars() as tell:
@@ -69,18 +72,20 @@ def batch(
             rows.append(_cells(path, found, fault))
             lines.append(_shown(path, found, fault))
             # The table is complete up to here even if the next recording is interrupted.
-            vb.io.write_table(table, _COLUMNS, rows)
+            with suppress(OSError):
+                vb.io.write_table(table, _COLUMNS, rows)
         tell("recordings", len(paths), len(paths))
+    for row in rows:
+        say(f"{row[0]}: {row[-1] or row[-2]}")
     failed = sum(bool(row[-1]) for row in rows)
     about = f"{len(rows)} recordings, {failed} with a fault"
+    say(about)
+    vb.io.write_table(table, _COLUMNS, rows)
     section = vb.report.Section("recordings", "Recordings", vb.report.table(lines, _HEADING))
     with vb.io.replacing(folder / PAGE) as part:
         part.write_text(
             vb.report.document(folder.resolve().name, about, [section]), encoding="utf-8"
         )
-    for row in rows:
-        say(f"{row[0]}: {row[-1] or row[-2]}")
-    say(about)
     say(f"wrote {table}\nwrote {folder / PAGE}")
     if failed:
         raise typer.Exit(1)
@@ -103,24 +108,33 @@ def _one(
     again: bool,
     tell: Tell,
 ) -> tuple[vb.pipeline.TrialSummary | None, str]:
-    """Reconstruct the object of one recording; return a summary (or None) and the fault."""
-    fault, found, tree, made = "", None, None, False
-    try:
+    """Reconstruct the object of one recording; return a summary (or None) and the faults."""
+    faults: list[str] = []
+    found, tree, made = None, None, False
+    with _noted(faults):
         tree = vb.pipeline.without_faulty_stages(recording_from(path))
         if again or "contour" not in tree.children or vb.pipeline.edited(tree):
             known = vb.recording.Recording(tree).objects if objects is None else objects
             for stage, after in stages(tree, wanted, source, how, known, tell, str(path)):
                 tree, made = after, True
                 tell(f"{path.name}: {stage}", 1, 1)
-    except (ValueError, OSError) as error:
-        fault = " ".join(str(error).split())
-    if tree is not None and made:
-        vb.io.save_recording(path, tree)
+    if tree is not None:
+        with _noted(faults):
+            if made:
+                vb.io.save_recording(path, tree)
+        with _noted(faults):  # groups may have been edited
+            found = vb.pipeline.TrialSummary(tree)
+    return found, "; ".join(dict.fromkeys(faults))
+
+
+@contextmanager
+def _noted(faults: list[str]) -> Iterator[None]:
+    """Context that adds the text of an error to faults instead of raising it."""
     try:
-        found = None if tree is None else vb.pipeline.TrialSummary(tree)
-    except ValueError as error:  # of groups that were edited
-        fault = fault or " ".join(str(error).split())
-    return found, fault
+        yield
+    except (ValueError, OSError) as error:
+        text = error.strerror if isinstance(error, OSError) else None
+        faults.append(" ".join((text or str(error)).split()))
 
 
 def _cells(path: Path, found: vb.pipeline.TrialSummary | None, fault: str) -> list[object]:

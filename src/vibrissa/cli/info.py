@@ -44,6 +44,15 @@ _NEXT = {
     "corrections": "track VIDEO VIDEO --corrections {} -o trial.nc",
     "signals": "estimate {}  # the whisker: --whisker or --map FILE",
 }
+# What results for other programs are used for.
+_RESULTS = {
+    vb.io.Kind.CONTOUR: "no command takes the table; the points are also in the recording, which "
+    "`vibrissa report`, `figures` and `view` show",
+    vb.io.Kind.NWB: "in programs for NWB, and in Python by vibrissa.io.load_nwb_series; commands "
+    "take the recording that was exported, and `vibrissa import` the tracked points, if any",
+    vb.io.Kind.PREDICTORS: "in pandas, MATLAB and others; commands take the recording that was "
+    "exported, and `vibrissa estimate` the signals of a table that is .csv",
+}
 _PACKAGES = ("numpy", "scipy", "numba", "xarray", "h5netcdf", "matplotlib")
 
 
@@ -117,7 +126,10 @@ def _file(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
     if _is_sensor(path):
         yield from _sensor(path)
         return
-    if kind in (vb.io.Kind.ARRAY, vb.io.Kind.ARRAY_TABLE):
+    if about := _exported(path, kind):
+        yield "kind", about
+        yield "use", _RESULTS[kind]
+    elif kind in (vb.io.Kind.ARRAY, vb.io.Kind.ARRAY_TABLE):
         yield from _array(path, kind)
     elif kind == vb.io.Kind.NETCDF:
         yield from _groups(path, whole)
@@ -138,6 +150,17 @@ def _file(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
                 f"{path} is not of a known kind. Known are: {'; '.join(kinds)}"
             ) from None
         yield from _table(path)
+
+
+def _exported(path: Path, kind: vb.io.Kind) -> str:
+    """Description of a result for other programs; empty for other files."""
+    if kind != vb.io.Kind.NWB:
+        return kind if kind in _RESULTS else ""
+    try:
+        series = ", ".join(map(str, vb.io.load_nwb_series(path)))
+    except ValueError:
+        return ""
+    return f"{kind}, as vibrissa export writes it: {series}"
 
 
 def _recording(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
@@ -238,7 +261,8 @@ def _sensor(path: Path) -> Iterator[tuple[str, str]]:
     for name, mixing, noise, bias, largest in numbers:
         parts = [f"{a:g} {c}" for a, c in zip(mixing, vb.sensors.COMPONENTS, strict=True) if a]
         ends = f", saturates at ±{largest:g}" if np.isfinite(largest) else ""
-        yield name, f"{' + '.join(parts)} + {bias:.4g}, noise {noise:.3g}{ends}"
+        formula = " + ".join([*parts, f"{bias:.4g}"]).replace("+ -", "- ")
+        yield name, f"{formula}, noise {noise:.3g}{ends}"
     x, y, z = 1e3 * sensor.frame.position
     hand = "right" if sensor.frame.handedness > 0 else "left"
     counts = ", measures the reaction" if sensor.frame.reaction else ""

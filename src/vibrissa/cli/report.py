@@ -59,11 +59,13 @@ def report(
             refuse({"--uniqueness": uniqueness}, f"{path} is a recording")
             trial = vb.pipeline.without_faulty_stages(recording_from(path))
             of_trial = of_trial.of(trial)
-            title, sections, script, drawings = _of_trial(path, trial, of_trial, seed or 0, tell)
+            with vb.io.in_file(path):
+                content = _of_trial(path, trial, of_trial, seed or 0, tell)
         else:
             unused = of_trial.given() | {"--make-movies": make, "--seed": seed}
             refuse(unused, f"{path} is a map")
-            title, sections, script, drawings = _of_map(path, uniqueness)
+            content = _of_map(path, uniqueness)
+        title, sections, script, drawings = content
         drawn = figures.drawn(drawings, tell)
         pictures = {name: vb.plots.png(one) for name, one in drawn}
         sections.extend(vb.report.figure_sections(pictures))

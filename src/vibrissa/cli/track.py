@@ -247,6 +247,11 @@ class KnownOptions:
             raise ValueError(
                 f"{self.corrections} corrects view {unknown[0]}; views are counted from 0"
             )
+        for view, each in fixed.items():
+            for (frame, whisker), points in each.items():
+                about = f"{self.corrections}, view {view}, frame {frame}, whisker {whisker}"
+                with vb.io.in_file(about):
+                    vb.tracking.given(points)
         return fixed
 
     def read(self, video: Path, rate: float) -> dict[str, Any]:

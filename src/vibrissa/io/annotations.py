@@ -255,12 +255,25 @@ def load_corrections(path: str | PathLike[str]) -> dict[int, dict[tuple[int, int
     -------
     dict
         Points (n, 2) from base to tip, column and row, by view and then by frame and whisker.
+
+    Raises
+    ------
+    ValueError
+        If a row is not a point of a trace or is repeated, or the rows of a trace are apart, as in
+        a table that was sorted by another column.
     """
     table = Table(path, CORRECTION_COLUMNS)
     values = np.stack([table.numbers(name) for name in CORRECTION_COLUMNS], axis=1)
     numbers = values[:, :3]
     wrong = ~np.isfinite(values).all(axis=1) | (numbers < 0.0).any(axis=1)
     table.refuse(wrong | (numbers != np.round(numbers)).any(axis=1), "no point of a trace")
+    table.refuse(_repeated(values), "there already")
+    begins = (np.diff(numbers, axis=0, prepend=np.nan) != 0.0).any(axis=1)
+    again = np.flatnonzero(begins)[_repeated(numbers[begins])]
+    table.refuse(
+        np.isin(np.arange(len(values)), again),
+        "of a trace that ended further up; the rows of a trace follow each other, from base to tip",
+    )
     points: dict[int, dict[tuple[int, int], list[Array]]] = {}
     for (view, frame, whisker), place in zip(
         numbers.astype(int).tolist(), values[:, 3:], strict=True
@@ -274,6 +287,13 @@ def load_corrections(path: str | PathLike[str]) -> dict[int, dict[tuple[int, int
             "to tip at least two are needed"
         )
     return {view: {key: np.array(p) for key, p in each.items()} for view, each in points.items()}
+
+
+def _repeated(rows: Array) -> NDArray[np.bool_]:
+    """Rows that are identical to one before."""
+    repeated = np.ones(len(rows), dtype=bool)
+    repeated[np.unique(rows, axis=0, return_index=True)[1]] = False
+    return repeated
 
 
 def save_corrections(

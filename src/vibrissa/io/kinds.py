@@ -28,6 +28,7 @@ from vibrissa.io.netcdf import kind_of, opened
 from vibrissa.io.nwb import read_nwb
 from vibrissa.io.paths import check_readable, without_part
 from vibrissa.io.table import read_text, signal_column, table_rows
+from vibrissa.io.time_tables import CONTOUR, MATLAB_PREDICTORS
 from vibrissa.io.tracks import Labels, RawTracks, labelled, load_own_tracks, read_tracks_table
 from vibrissa.io.whisk import MEASUREMENTS, WHISKERS, read_measurements, read_whiskers
 
@@ -51,6 +52,8 @@ class Kind(StrEnum):
     NETCDF = "NetCDF file"
     SIGNALS = "table of signals"
     CONTACTS = "table of contacts"
+    CONTOUR = "table of contour points, as vibrissa reconstruct writes it"
+    PREDICTORS = "table of predictors, as vibrissa export writes it"
     HEAD = "table of the head's pose"
     CORRECTIONS = "table of corrections"
     ARRAY_TABLE = "table of whiskers"
@@ -87,7 +90,7 @@ def recognise(path: str | PathLike[str]) -> Kind:
         if head.startswith(magic):
             return kind
     if head.startswith(b"MATLAB"):
-        return Kind.MATLAB
+        return Kind.PREDICTORS if head.startswith(MATLAB_PREDICTORS) else Kind.MATLAB
     if head.startswith(b"\x89HDF\r\n\x1a\n"):
         return _of_hdf5(path)
     # Matroska, MP4 and QuickTime, AVI.
@@ -137,6 +140,10 @@ def _of_text(path: Path) -> Kind:
         return Kind.DEEPLABCUT
     if any(name.endswith("_ncams") for name in names):
         return Kind.ANIPOSE
+    if {"Fx", "Fx_rate"} <= set(first[1]):
+        return Kind.PREDICTORS
+    if set(CONTOUR) <= set(names):
+        return Kind.CONTOUR
     if {"Fx", "Mx"} <= {signal_column(name)[0] for name in first[1]}:
         return Kind.SIGNALS
     if {"theta", "phi", "status"} <= set(names):

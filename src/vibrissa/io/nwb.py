@@ -160,8 +160,10 @@ def _series(group: h5py.Group) -> _Series | None:
     points, sure = [], []
     for name in nodes:
         values = _points(children[name])
-        if len(values) != time.size:
-            raise ValueError(f"{group.name} has nodes at different times")
+        if len(values) != time.size or not np.array_equal(series_time(children[name]), time):
+            raise ValueError(
+                f"{children[name].name} has times that differ from those of {nodes[0]}"
+            )
         points.append(values)
         known = "confidence" in children[name]
         sure.append(
@@ -173,7 +175,11 @@ def _series(group: h5py.Group) -> _Series | None:
             )
     if len({one.shape[1] for one in points}) != 1:
         raise ValueError(f"{group.name} has nodes in the plane and others in space")
-    unit = str(first["data"].attrs.get("unit", "")).lower()
+    units = {str(children[name]["data"].attrs.get("unit", "")).lower() for name in nodes}
+    if len(units) > 1:
+        stated = " and in ".join(sorted(unit or "no stated unit" for unit in units))
+        raise ValueError(f"{group.name} has nodes in {stated}")
+    (unit,) = units
     flat = points[0].shape[1] == 2
     if unit and unit not in (_PIXELS if flat else _LENGTHS):
         raise ValueError(f"{group.name} has positions in {unit}; pixels or a length is needed")

@@ -32,6 +32,12 @@ GROUP = "whiskers"
 
 RECORDING_KIND = "vibrissa recording"  # value of the attribute ``kind`` of a recording
 _SMALLEST = 1000
+# Order of dimensions of variables over frames, and groups that have none of these.
+_DIMS = (
+    *("time", "whisker", "error", "view", "channel", "pose", "node", "component", "pose_", ...),
+    *("space", "image_axis", "component_", "whisker_axis", "head_axis", "space_", "space_2"),
+)
+_WITHOUT_FRAMES = {GROUP, "cameras", "objects"}
 
 
 def save_recording(path: str | PathLike[str], recording: xr.DataTree) -> None:
@@ -80,7 +86,7 @@ def load_recording(path: str | PathLike[str]) -> xr.DataTree:
     Returns
     -------
     xarray.DataTree
-        Recording, in memory.
+        Recording, in memory; dimensions are in the usual order, whatever their order in the file.
     """
     path = Path(path)
     tree = read_tree(path, RECORDING_KIND, "a recording")
@@ -89,7 +95,18 @@ def load_recording(path: str | PathLike[str]) -> xr.DataTree:
         for group in tree.children[GROUP].children.values() if GROUP in tree.children else ():
             Whisker.from_dataset(group.to_dataset(inherit=False))
         check_units(tree)
+    for node in (tree, *tree.children.values()):
+        if node.name not in _WITHOUT_FRAMES:
+            data = node.to_dataset(inherit=False)
+            node.dataset = data.map(_in_order, keep_attrs=True)
     return tree
+
+
+def _in_order(variable: xr.DataArray) -> xr.DataArray:
+    """Variable with its dimensions in the usual order."""
+    return variable.transpose(
+        *sorted(variable.dims, key=lambda dim: _DIMS.index(dim if dim in _DIMS else ...))
+    )
 
 
 def check_units(tree: xr.DataTree) -> None:

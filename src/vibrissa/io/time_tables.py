@@ -429,6 +429,9 @@ CONTOUR = (
 )
 
 
+MATLAB_PREDICTORS = b"MATLAB 5.0 MAT-file, table of predictors by vibrissa"
+
+
 def save_contour(path: str | PathLike[str], contour: xr.Dataset) -> None:
     """Write contour points as CSV, with full precision.
 
@@ -515,3 +518,6 @@ def _write_matlab(path: PathLike[str], table: xr.Dataset, columns: dict[str, xr.
         **{name: one.values for name, one in columns.items()},
     }
     savemat(path, content, appendmat=False, long_field_names=True, oned_as="column")
+    # The text at the start is free. SciPy writes the time there, and equal tables would differ.
+    with Path(path).open("r+b") as file:
+        file.write(MATLAB_PREDICTORS.ljust(116))

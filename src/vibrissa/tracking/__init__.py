@@ -33,6 +33,7 @@ from vibrissa.tracking.trace.trace import (
     Trace,
     TraceOptions,
     doubtful_frames as doubtful_frames,
+    given as given,
 )
 from vibrissa.tracking.trace.video import (
     partial_traces as partial_traces,

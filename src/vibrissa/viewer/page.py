@@ -408,7 +408,7 @@ PANEL = 0.52
 PHONE, LOW = 0.65, 0.55
 # Named directions of view; in the first two, x points to the right.
 VIEWS = {"Top": (0.0, -1e-3, 1.0), "Front": (0.0, -1.0, 0.0), "Side": (1.0, 0.0, 0.0)}
-_WIDTH = 1.25  # width of the region shown, over the distance of the camera
+_WIDTH = 1.35  # width of the region shown, over the distance of the camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -445,7 +445,7 @@ def whole(whisker: Whisker) -> Shot:
     """View of the whole whisker."""
     length = float(to_display("length", whisker.length))
     middle = np.array([0.45, 0.1, 0.0]) * length
-    return Shot(middle, 0.95 * length, np.array([0.15, -0.8, 0.6]))
+    return Shot(middle, 0.95 * length, np.array([0.15, -0.8, 0.6]), height=1.7)
 
 
 class Framing:
@@ -482,7 +482,7 @@ class Framing:
                 self._turn(client, goal)
 
     def _came(self, client: viser.ClientHandle) -> None:
-        start = np.array(client.camera.position)
+        starts = [np.array(c.position) for c in (client.camera, self._server.initial_camera)]
         with self._lock:
             if self._goal is not None:
                 self._turn(client, self._goal)
@@ -490,12 +490,12 @@ class Framing:
         @client.camera.on_update
         async def _(camera: viser.CameraHandle) -> None:
             # When a window is resized, views that the user has turned are kept. A window that has
-            # just opened may have missed its camera position, and reports its initial one.
+            # just opened may have missed its camera position, and reports an initial one.
             with self._lock:
                 wide, tall, place = self._placed.get(client.client_id, (0, 0, np.zeros(3)))
                 resized = (camera.image_width, camera.image_height) != (wide, tall)
                 here = np.allclose(camera.position, place, atol=0.1)
-                unturned = here or np.allclose(camera.position, start, atol=0.1)
+                unturned = here or any(np.allclose(camera.position, p, atol=0.1) for p in starts)
                 goal = self._goal
                 if goal is not None and unturned and (resized or not here):
                     self._turn(client, goal)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from vibrissa.numerics import Array
 from vibrissa.plots import scale_of
-from vibrissa.quantities import quantity, to_display
+from vibrissa.quantities import quantity, shown_unit, to_display
 from vibrissa.rod import Deflection
 from vibrissa.scene import Bytes, Colour, Ints
 from vibrissa.signals import SIGNALS, signals_of, spherical
@@ -36,19 +36,19 @@ def symbol(name: str) -> str:
 
 
 def number(name: str, value: float, digits: int = 4) -> str:
-    """Format an SI value in its display unit; a dash if it is missing.
+    """Format an SI value in its most readable unit; a dash if it is missing.
 
     Angles have two decimals, other numbers so many digits but at most four decimals.
     """
     if not np.isfinite(value):
         return "–"
-    q = quantity(name)
-    shown = value * q.display_factor
+    factor, unit = shown_unit(name, value)
+    shown = value * factor
     whole = np.floor(np.log10(abs(shown))) if shown else 0.0
-    decimals = 2 if q.display_unit == "°" else int(np.clip(digits - 1 - whole, 0, 4))
+    decimals = 2 if unit == "°" else int(np.clip(digits - 1 - whole, 0, 4))
     # Adding zero turns −0 into 0.
     text = f"{round(shown, decimals) + 0.0:.{decimals}f}".replace("-", "−")
-    return f"{text}{'' if q.display_unit in ('', '°') else ' '}{q.display_unit}"
+    return f"{text}{'' if unit in ('', '°') else ' '}{unit}"
 
 
 def table(rows: Mapping[str, float], heading: str = "") -> str:
@@ -69,18 +69,30 @@ def table(rows: Mapping[str, float], heading: str = "") -> str:
     )
 
 
+def _by_mode(what: str, light: str, dark: str) -> str:
+    """CSS of a colour in light and dark mode; browsers without modes use the light one."""
+    return f"{what}:{light};{what}:light-dark({light},{dark});"
+
+
+# Background and text by success.
+_BY_SUCCESS = {
+    True: (_by_mode("background", "#e6f4ee", "#0f3d30"), _by_mode("color", "#00614a", "#9fe3cb")),
+    False: (_by_mode("background", "#fdece3", "#4a2713"), _by_mode("color", "#9c3d00", "#ffc9a3")),
+}
+
+
 def sentence(status: Status, good: str | None = None) -> str:
     """HTML of the status of a load or an estimate, coloured by success.
 
     A valid status may be stated in other words.
     """
     words = good if good and status.ok else status.explanation
-    colour = ("#e6f4ee", "#00614a") if status.ok else ("#fdece3", "#9c3d00")
+    paper, ink = _BY_SUCCESS[bool(status.ok)]
     advice = f'<div style="margin-top:3px;opacity:.85">{plain(status.advice)}</div>'
     return (
         f'<div data-status="{status.name}" style="margin:0 12px 8px;padding:6px 9px;'
-        f"border-radius:6px;font-size:13px;line-height:1.35;background:{colour[0]};"
-        f'color:{colour[1]}">{plain(words)}{advice if status.advice else ""}</div>'
+        f"border-radius:6px;font-size:13px;line-height:1.35;{paper}{ink}"
+        f'">{plain(words)}{advice if status.advice else ""}</div>'
     )
 
 

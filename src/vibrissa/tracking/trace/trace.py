@@ -24,6 +24,7 @@ _JUMPS, _OFTEN = 0.3, 0.05
 _HOOKED = 0.7
 _SHARPEST = 0.05  # lower limit of the standard deviation of a point in `clearness`, pixels
 _GIVEN = 0.5  # standard deviation of points marked by a person, pixels
+_BACKWARD = -0.5  # cosine of the angle between segments from which points are out of order
 _UNLIKE = 0.05  # correlation that counts as none
 
 
@@ -155,6 +156,12 @@ def given(points: ArrayLike) -> Trace:
     s = arc_lengths(array)
     if not (np.diff(s) > 0.0).all():
         raise ValueError("two points of a trace are the same")
+    step = np.diff(array, axis=0) / np.diff(s)[:, None]
+    if (back := np.flatnonzero((step[1:] * step[:-1]).sum(axis=1) < _BACKWARD)).size:
+        x, y = array[back[0] + 1]
+        raise ValueError(
+            f"the trace turns back at ({x:.1f}, {y:.1f}); points from base to tip are needed"
+        )
     spline = interpolate.make_interp_spline(s, array, k=min(3, len(array) - 1))
     line = even(np.asarray(spline(np.linspace(0.0, s[-1], int(s[-1]) + 2))))
     return Trace(line, np.full(len(line), _GIVEN), np.ones(len(line), dtype=bool), 1.0)

@@ -16,7 +16,7 @@ from vibrissa.tracking import (
 )
 from vibrissa.tracking.refine.least_squares import trace_variance
 from vibrissa.tracking.remarks import remarks_on
-from vibrissa.tracking.space.frame_pairs import better_offset
+from vibrissa.tracking.space.frame_pairs import clear_offsets
 from vibrissa.tracking.space.rest_shape import (
     Length,
     RestShape,
@@ -267,9 +267,8 @@ def test_frames_that_the_rod_does_not_explain_are_noted(filmed):
 
 def test_cameras_out_of_step_are_noticed(filmed, traced):
     rows = [view[0] for view in traced]
-    in_step = better_offset(*filmed.cameras, rows[0], rows[1], 0)
-    assert not in_step.size
-    assert better_offset(*filmed.cameras, rows[0], rows[1][3:], 0).tolist() == [-3]
+    assert not clear_offsets(*filmed.cameras, *rows).shifts.any()
+    assert (clear_offsets(*filmed.cameras, rows[0], rows[1][3:], 0).shifts == -3).all()
 
 
 def test_a_base_that_begins_elsewhere_for_a_while_is_no_offset(filmed):
@@ -282,7 +281,7 @@ def test_a_base_that_begins_elsewhere_for_a_while_is_no_offset(filmed):
         lines = [np.column_stack([c + np.arange(5.0), np.full(5, 90.0)]) for c in column]
         shape = np.full(5, 0.1), np.ones(5, dtype=bool)
         rows.append([Trace(line, *shape, 1.0, tip_seen=False) for line in lines])
-    assert not better_offset(*filmed.cameras, *rows, 0).size
+    assert not clear_offsets(*filmed.cameras, *rows, 0).shifts.any()
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from vibrissa.cameras import orthogonal_views, triangulate
 from vibrissa.tracking import Trace
 from vibrissa.tracking.refine.optics import rough_optics, stated_lenses
-from vibrissa.tracking.space.frame_pairs import better_offset
+from vibrissa.tracking.space.frame_pairs import clear_offsets
 
 PIXEL = 150e-6
 STATED = orthogonal_views(PIXEL, (400, 400))
@@ -141,7 +141,7 @@ def test_no_offset_is_noted_where_none_explains_the_misfit():
     """Lenses and angles that were not stated make lines of sight pass each other."""
     lines = sweep(100)
     wrong = traces(lines, [TOP, turned(FRONT, np.radians(10.0))], 0.3)
-    assert not better_offset(*STATED, *wrong, 0).size
+    assert not clear_offsets(*STATED, *wrong, 0).shifts.any()
 
 
 def test_no_offset_is_noted_for_a_base_that_hairs_displace():
@@ -150,7 +150,7 @@ def test_no_offset_is_noted_for_a_base_that_hairs_displace():
     seen = traces(sweep(2)[:1] + moved, [TOP, FRONT], 1e6)
     for i, trace in enumerate(seen[1]):
         trace.line[0, 0] += 3.0 if i < 50 else -3.0
-    assert not better_offset(*STATED, *seen, 0).size
+    assert not clear_offsets(*STATED, *seen, 0).shifts.any()
 
 
 @pytest.mark.parametrize("late", [1, 3])
@@ -158,5 +158,5 @@ def test_an_offset_is_noted_in_a_short_film(late):
     """The second of two telecentric cameras, otherwise as stated, began later."""
     lines = sweep(40)
     seen = traces(lines, [TOP, FRONT], 1e6)
-    assert better_offset(*STATED, seen[0], seen[1][late:], 0).tolist() == [-late]
-    assert not better_offset(*STATED, *seen, 0).size
+    assert (clear_offsets(*STATED, seen[0], seen[1][late:], 0).shifts == -late).all()
+    assert not clear_offsets(*STATED, *seen, 0).shifts.any()

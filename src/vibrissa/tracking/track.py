@@ -208,7 +208,7 @@ def track(
     if options.rough and len(cameras) > 1:
         optics, cameras, doubts = _corrected(cameras, timed, pairs, options.distance)
     moving = None if head is None else HeadPose.of(head, pairs[:, 0], rate)
-    found, remarks = [], doubts + remarks_on_time(cameras, timed, options.offset, pairs)
+    found, remarks = [], doubts + remarks_on_time(cameras, timed, options.offset)
     remarks += remarks_on_shaking(cameras, timed)
     if len(cameras) == 1:
         remarks.append(ONE_VIEW)

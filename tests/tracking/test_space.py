@@ -186,6 +186,7 @@ def test_a_given_offset_is_used():
     np.testing.assert_array_equal(pairs, np.stack([np.arange(17), np.arange(3, 20)], axis=1))
     with pytest.raises(ValueError, match="no frames belong together"):
         paired_frames(pair, [first, second], 50)
+    assert not remarks_on_time(pair, [first, second], 50)
     pairs = paired_frames(pair, [[first[0]] + [Trace.lost()] * 19, second], None)
     assert (pairs[:, 0] == pairs[:, 1]).all()
 

@@ -97,9 +97,9 @@ def clear_offsets(
     that last, as where hairs cover the base, count once for as long as they last.
     """
     column = given + _LARGEST
-    ends = _passing_ends(first, second, a, b)
+    ends = _passing_ends(first, second, a, b) if abs(given) <= _LARGEST else []
     ends = [one for one in ends if np.isfinite(one[:, column]).sum() >= _KNOWN]
-    if abs(given) > _LARGEST or not ends:
+    if not ends:
         return Offsets(np.full(len(a), given), False)
     usual = np.array([_medians(one) for one in ends])[:, None]
     alone = np.array(ends) - usual

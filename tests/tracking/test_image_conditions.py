@@ -27,6 +27,7 @@ from vibrissa.tracking.space.rest_shape import (
 )
 from vibrissa.tracking.trace.scene import Scene
 from vibrissa.tracking.trace.steady import Steady
+from vibrissa.tracking.trace.trace import given
 
 
 def image(begin, end, fade=0.0, noise=2.0, seed=0, size=(120, 200)):
@@ -371,3 +372,23 @@ def test_a_camera_that_was_moved_may_have_been_calibrated_before_or_after(filmed
     assert (chi < 7.8).mean() > 0.9
     alone = spread[rows] - np.einsum("tei,tej->tij", shared[rows], shared[rows])
     assert (np.linalg.eigvalsh(alone) > -1e-15).all()
+
+
+def test_a_trace_ends_where_it_goes_on_along_a_static_edge():
+    """The edge of a thick rod; a whisker that crosses it, or that rests all the time, is kept."""
+    row, column = np.mgrid[:200, :300]
+    rod = (row > 90) & (row < 125) & (column > 100)
+    rest = np.abs(row - 150) < 2
+    frame = np.where(rod, 60, np.where(rest, 90, 180)).astype(np.uint8)
+    scene = Scene.of([frame] * 8)
+
+    def left(points):
+        return len(scene.before_edge(given(points)).line)
+
+    along = [[20.0, 40.0], [110.0, 88.0], [125.0, 90.0], [290.0, 90.0]]
+    assert 30 < left(along) < 65
+    across = given([[20.0, 40.0], [290.0, 184.0]])
+    assert left(across.line) == len(across.line)
+    resting = given([[10.0, 150.0], [290.0, 150.0]])
+    assert left(resting.line) == len(resting.line)
+    assert not scene.before_edge(given(along)).tip_seen

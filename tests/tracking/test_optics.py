@@ -124,6 +124,16 @@ def test_orthographic_views_are_explained_by_what_was_stated():
     assert found.before < 0.05
 
 
+def test_cameras_that_explain_the_views_are_not_known_worse_than_before():
+    """Other optics explain them as well, but far from what was stated."""
+    lines = sweep()
+    still = np.repeat(lines[:1], 20, axis=0) + 1e-5 * np.arange(20)[:, None, None]
+    found = rough_optics(STATED, traces(still, [TOP, FRONT], 1e6))
+    far = replace(found, values=found.stated + 3.0 * found.prior)
+    more = (far.as_stated().covariance - found.covariance) / np.outer(found.prior, found.prior)
+    assert np.linalg.eigvalsh(more)[-1] == pytest.approx(1.0)
+
+
 def test_what_is_not_known_of_lenses_moves_points_away_from_the_middle():
     lines = sweep()
     # A whisker that hardly moves does not show how far the lenses are.

@@ -165,6 +165,8 @@ def trace_video(
     if len(followers) > 1 and done < len(traces[0]):
         for row, new in zip(traces, _over_all_frames(seen, starts, options), strict=False):
             row[:] = new
+    for k, row in enumerate(traces):
+        row[:] = [t if (i, k) in corrections else scene.before_edge(t) for i, t in enumerate(row)]
     for row in traces if steady is not None else ():
         row[:] = [t._replace(shift=shift) for t, shift in zip(row, shifts, strict=True)]
     return traces

@@ -16,7 +16,7 @@ from vibrissa.tracking import (
 )
 from vibrissa.tracking.refine.least_squares import trace_variance
 from vibrissa.tracking.remarks import remarks_on
-from vibrissa.tracking.space.frame_pairs import better_offset
+from vibrissa.tracking.space.frame_pairs import clear_offsets
 from vibrissa.tracking.space.rest_shape import (
     Length,
     RestShape,
@@ -27,6 +27,7 @@ from vibrissa.tracking.space.rest_shape import (
 )
 from vibrissa.tracking.trace.scene import Scene
 from vibrissa.tracking.trace.steady import Steady
+from vibrissa.tracking.trace.trace import given
 
 
 def image(begin, end, fade=0.0, noise=2.0, seed=0, size=(120, 200)):
@@ -267,9 +268,8 @@ def test_frames_that_the_rod_does_not_explain_are_noted(filmed):
 
 def test_cameras_out_of_step_are_noticed(filmed, traced):
     rows = [view[0] for view in traced]
-    in_step = better_offset(*filmed.cameras, rows[0], rows[1], 0)
-    assert not in_step.size
-    assert better_offset(*filmed.cameras, rows[0], rows[1][3:], 0).tolist() == [-3]
+    assert not clear_offsets(*filmed.cameras, *rows).shifts.any()
+    assert (clear_offsets(*filmed.cameras, rows[0], rows[1][3:], 0).shifts == -3).all()
 
 
 def test_a_base_that_begins_elsewhere_for_a_while_is_no_offset(filmed):
@@ -282,7 +282,7 @@ def test_a_base_that_begins_elsewhere_for_a_while_is_no_offset(filmed):
         lines = [np.column_stack([c + np.arange(5.0), np.full(5, 90.0)]) for c in column]
         shape = np.full(5, 0.1), np.ones(5, dtype=bool)
         rows.append([Trace(line, *shape, 1.0, tip_seen=False) for line in lines])
-    assert not better_offset(*filmed.cameras, *rows, 0).size
+    assert not clear_offsets(*filmed.cameras, *rows, 0).shifts.any()
 
 
 @pytest.fixture(scope="module")
@@ -372,3 +372,23 @@ def test_a_camera_that_was_moved_may_have_been_calibrated_before_or_after(filmed
     assert (chi < 7.8).mean() > 0.9
     alone = spread[rows] - np.einsum("tei,tej->tij", shared[rows], shared[rows])
     assert (np.linalg.eigvalsh(alone) > -1e-15).all()
+
+
+def test_a_trace_ends_where_it_goes_on_along_a_static_edge():
+    """The edge of a thick rod; a whisker that crosses it, or that rests all the time, is kept."""
+    row, column = np.mgrid[:200, :300]
+    rod = (row > 90) & (row < 125) & (column > 100)
+    rest = np.abs(row - 150) < 2
+    frame = np.where(rod, 60, np.where(rest, 90, 180)).astype(np.uint8)
+    scene = Scene.of([frame] * 8)
+
+    def left(points):
+        return len(scene.before_edge(given(points)).line)
+
+    along = [[20.0, 40.0], [110.0, 88.0], [125.0, 90.0], [290.0, 90.0]]
+    assert 30 < left(along) < 65
+    across = given([[20.0, 40.0], [290.0, 184.0]])
+    assert left(across.line) == len(across.line)
+    resting = given([[10.0, 150.0], [290.0, 150.0]])
+    assert left(resting.line) == len(resting.line)
+    assert not scene.before_edge(given(along)).tip_seen

@@ -11,7 +11,7 @@ from vibrissa.tracking import Trace, low_pass, merge, paired_frames, usual_cutof
 from vibrissa.tracking.remarks import remarks_on_time
 from vibrissa.tracking.space.curve import begun_together
 from vibrissa.tracking.space.exchange import Known, exchanged
-from vibrissa.tracking.space.frame_pairs import better_offset
+from vibrissa.tracking.space.frame_pairs import clear_offsets
 from vibrissa.tracking.space.pose import base_pose, rolled_over
 from vibrissa.tracking.space.rest_shape import RestShape, whisker_at_rest
 from vibrissa.tracking.trace.start import base_gap
@@ -160,10 +160,38 @@ def test_an_offset_is_found_of_views_that_show_the_whisker_along_itself(pair):
             trace.line[end] += generator.normal(0.0, 4.0) * ahead / np.linalg.norm(ahead)
     pairs = paired_frames(pair, [first, second], None)
     assert np.mean(pairs[:, 0] != np.array(numbers)[pairs[:, 1]]) < 0.05
-    (said,) = remarks_on_time(pair, [first, second], None, pairs)
+    (said,) = remarks_on_time(pair, [first, second], None)
     assert "found is -7 frames" in said
-    assert better_offset(*pair, first, second, 0).tolist() == [-7]
-    assert not better_offset(*pair, first, second, -7).size
+    assert (clear_offsets(*pair, first, second, 0).shifts == -7).all()
+    assert (clear_offsets(*pair, first, second, -7).shifts == -7).all()
+
+
+def test_errors_that_follow_the_motion_are_no_offset():
+    """Fur that moves with the whisker covers its base, and the tips are not seen."""
+    pair = PAIRS["orthogonal"]
+    rows = [[t._replace(tip_seen=False) for t in row] for row in moving(pair)[:2]]
+    for i, trace in enumerate(rows[1]):
+        trace.line[0] += 3.0 * np.cos(2.0 * np.pi * i / 70.0 + 0.5)
+    pairs = paired_frames(pair, rows, None)
+    assert (pairs[:, 0] == pairs[:, 1]).all()
+    (said,) = remarks_on_time(pair, rows, None)
+    assert "do not determine their offset, and 0 is kept" in said
+    assert remarks_on_time(pair, rows, 0) == []
+
+
+@pytest.mark.parametrize(("faint", "left"), [(range(0, 20, 4), 15), (range(20), 0)])
+def test_ends_that_are_not_one_point_are_not_the_tip(faint, left):
+    """The second view shows the whisker only as far as its thin part, in some or all frames."""
+    from vibrissa.tracking.track import _with_one_tip
+
+    pair = PAIRS["orthogonal"]
+    rows = list(moving(pair, count=20)[:2])
+    for i in faint:
+        n = len(rows[1][i].line) - (30 if i != 7 else 0)
+        first = rows[1][i]
+        rows[1][i] = first._replace(line=first.line[:n], sigma=first.sigma[:n], seen=first.seen[:n])
+    found = _with_one_tip(pair, rows)
+    assert [sum(t.tip_seen for t in view) for view in found] == [left, left]
 
 
 def test_a_given_offset_is_used():
@@ -173,8 +201,9 @@ def test_a_given_offset_is_used():
     np.testing.assert_array_equal(pairs, np.stack([np.arange(17), np.arange(3, 20)], axis=1))
     with pytest.raises(ValueError, match="no frames belong together"):
         paired_frames(pair, [first, second], 50)
-    with pytest.raises(ValueError, match="too few frames"):
-        paired_frames(pair, [[first[0]] + [Trace.lost()] * 19, second], None)
+    assert not remarks_on_time(pair, [first, second], 50)
+    pairs = paired_frames(pair, [[first[0]] + [Trace.lost()] * 19, second], None)
+    assert (pairs[:, 0] == pairs[:, 1]).all()
 
 
 def test_the_filter_shifts_nothing_and_stops_what_is_fast():

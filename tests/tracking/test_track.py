@@ -211,6 +211,26 @@ def test_a_lower_minimum_along_the_whisker_is_found():
     assert (np.linalg.eigvalsh(covariance) > 0.0).all()
 
 
+def test_a_profile_ends_where_no_rod_is_in_equilibrium(monkeypatch):
+    from vibrissa.tracking.refine.problem import Problem
+    from vibrissa.tracking.refine.profile import profiled
+
+    whisker = Whisker.parabola(length=30e-3, coefficient=10.0)
+    fitter, pose, _, _ = pressed(whisker)
+    problem, state, linear = fitter._problem(whisker, pose).trusted()
+    arcs, solved = [], Problem.solved
+
+    def withstood(self):
+        found, fit = solved(self)
+        arcs.extend(arc for _, arc in self.held)
+        if arcs and arcs[-1] > arcs[0]:
+            fit = fit._replace(costs=np.full_like(fit.costs, np.inf))
+        return found, fit
+
+    monkeypatch.setattr(Problem, "solved", withstood)
+    assert np.isfinite(profiled(problem, state, linear)[2]).all()
+
+
 def test_a_slip_makes_the_frame_before_it_uncertain():
     """While that frame is exposed the whisker may be on both sides of the slip."""
     whisker = Whisker.parabola(length=30e-3, coefficient=10.0)

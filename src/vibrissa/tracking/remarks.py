@@ -8,6 +8,7 @@ seen, a whisker that leaves the plane.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import groupby
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from vibrissa.numerics import Array, Mask
 from vibrissa.tracking.recording import Tracked
 from vibrissa.tracking.refine.optics import Optics
 from vibrissa.tracking.refine.rods import TraceSeries
-from vibrissa.tracking.space.frame_pairs import Pairs, better_offset
+from vibrissa.tracking.space.frame_pairs import NEAR, clear_offsets
 from vibrissa.tracking.space.rest_shape import Length
 from vibrissa.tracking.trace.start import base_gap
 from vibrissa.tracking.trace.steady import slow_motion
@@ -250,25 +251,27 @@ def remarks_on_plane(one: Tracked, name: str) -> list[str]:
 
 
 def remarks_on_time(
-    cameras: Sequence[Camera],
-    traces: Sequence[Sequence[Trace]],
-    offset: int | None,
-    pairs: Pairs,
+    cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]], offset: int | None
 ) -> list[str]:
     """Report cameras that do not seem to be synchronous, and offsets that were found."""
-    if offset is None:
-        shifts = pairs[:, 1:] - pairs[:, :1]
-        listed = ", ".join(" and ".join(map(str, row)) for row in dict.fromkeys(map(tuple, shifts)))
-        return [
-            f"the offset that was found is {listed} frames; if it cannot be, state it (--offset)."
-        ]
     found = []
     for camera, row in zip(cameras[1:], traces[1:], strict=True):
-        shifts = better_offset(cameras[0], camera, traces[0], row, offset)
-        if shifts.size:
-            listed = ", ".join(map(str, shifts))
+        shifts, determined = clear_offsets(cameras[0], camera, traces[0], row, offset or 0)
+        runs = [shift for shift, _ in groupby(shifts.tolist())]
+        listed, names = ", ".join(map(str, runs)), f"{cameras[0].name} and {camera.name}"
+        if offset is None and determined:
             found.append(
-                f"{cameras[0].name} and {camera.name} are out of step: with an offset of {listed} "
+                f"{names}: the offset that was found is {listed} frames (to within {NEAR}); if it "
+                "cannot be, state it (--offset)."
+            )
+        elif offset is None:
+            found.append(
+                f"{names}: the views do not determine their offset, and 0 is kept; if they did not "
+                "start together, state it (--offset)."
+            )
+        elif runs != [offset]:
+            found.append(
+                f"{names} are out of step: with an offset of {listed} "
                 f"frames instead of {offset} they agree better. Track with --offset auto; in files "
                 "of other trackers, correct the numbers of the frames."
             )

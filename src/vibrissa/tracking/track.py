@@ -65,6 +65,7 @@ from vibrissa.tracking.space.rest_shape import (
     unseen_part,
     whisker_at_rest,
 )
+from vibrissa.tracking.trace.start import base_gap
 from vibrissa.tracking.trace.steady import slow_motion
 from vibrissa.tracking.trace.trace import Trace
 from vibrissa.whisker import Pose, Whisker, morphology
@@ -85,6 +86,7 @@ _EXPLAINED = 0.1
 _FAR = 10.0  # distance between the bases of several views above which they differ, pixels
 _FEWEST = 3  # smallest number of frames that show the whisker from its base on
 _SHARE = 0.03  # the same as a share of the whisker's length
+_APART = 8.0  # distance of the ends of several views from one point from which they are not the tip
 
 
 @dataclass(frozen=True)
@@ -208,7 +210,7 @@ def track(
     if options.rough and len(cameras) > 1:
         optics, cameras, doubts = _corrected(cameras, timed, pairs, options.distance)
     moving = None if head is None else HeadPose.of(head, pairs[:, 0], rate)
-    found, remarks = [], doubts + remarks_on_time(cameras, timed, options.offset, pairs)
+    found, remarks = [], doubts + remarks_on_time(cameras, timed, options.offset)
     remarks += remarks_on_shaking(cameras, timed)
     if len(cameras) == 1:
         remarks.append(ONE_VIEW)
@@ -486,6 +488,7 @@ def track_whisker(
     """
     report = progress or _silent
     count = len(traces[0])
+    traces = _with_one_tip(cameras, traces)
     series = TraceSeries.of(traces)
     _check_views(cameras, series, name)
     curves = []
@@ -649,6 +652,30 @@ def _length(fitter: Fitter, shape: RestShape, options: TrackOptions) -> Length:
 
 def _alike(_: float) -> float:
     return 0.0
+
+
+def _with_one_tip(
+    cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]]
+) -> Sequence[Sequence[Trace]]:
+    """Traces of which those that end apart in the views do not end at the tip.
+
+    Where most do, as compression erases thin parts, none does: others agree by chance.
+    """
+    frames = [i for i, one in enumerate(zip(*traces, strict=True)) if _all_end(one)]
+    if len(cameras) == 1 or len(frames) < _FEWEST:
+        return traces
+    apart = base_gap(cameras, np.array([[view[i].line[-1] for i in frames] for view in traces]))
+    wrong = {i for i, gap in zip(frames, apart, strict=True) if gap > _APART}
+    if 2 * len(wrong) > len(frames):
+        wrong = set(range(len(traces[0])))
+    return [
+        [t._replace(tip_seen=t.tip_seen and i not in wrong) for i, t in enumerate(view)]
+        for view in traces
+    ]
+
+
+def _all_end(views: Sequence[Trace]) -> bool:
+    return all(len(trace.line) > 0 and trace.tip_seen for trace in views)
 
 
 def _check_views(cameras: Sequence[Camera], series: TraceSeries, name: str) -> None:

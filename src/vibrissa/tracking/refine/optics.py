@@ -78,6 +78,7 @@ class Optics:
     values: Array
     covariance: Array  # (value, value)
     stated: Array  # values of the cameras as they were stated
+    prior: Array  # standard deviations of these
     before: float  # distance of the rigid whisker from the traces with stated cameras, pixels
     after: float  # and with these
     distance: float | None = None  # of the lenses, as it was stated, m
@@ -95,8 +96,12 @@ class Optics:
         return bool(self.before > _VISIBLE and explains and apart.max() > _CERTAIN)
 
     def as_stated(self) -> Optics:
-        """The stated cameras, with their uncertainty and their difference from these optics."""
+        """The stated cameras, with their uncertainty and their difference from these optics.
+
+        As both explain the views, it is not known better than by the prior how far they are apart.
+        """
         apart = self.values - self.stated
+        apart /= max(1.0, float(np.linalg.norm(apart / self.prior)))
         return replace(
             self,
             values=self.stated,
@@ -236,6 +241,7 @@ def estimated_optics(
         stated + fitted.q * size,
         fitted.covariance * np.outer(size, size),
         stated,
+        size,
         before.mean_miss,
         fitted.mean_miss,
         distance,

@@ -144,6 +144,8 @@ def _profile(problem: Problem, state: State, contact: _Contact) -> _Profile | No
             cost, before = found[arc]
             if cost - lowest > _ENOUGH or arc in LIMITS:
                 break
-    arcs = sorted(found)
+    arcs = sorted(arc for arc, (cost, _) in found.items() if np.isfinite(cost))
+    if len(arcs) < 2 or middle not in arcs:
+        return None
     costs = np.array([found[arc][0] for arc in arcs]) - lowest
     return _Profile(np.array(arcs), costs, [found[arc][1].rows(inside) for arc in arcs])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -23,14 +24,22 @@ Pairs = NDArray[np.int64]
 _LARGEST = 30  # largest offset, frames
 _SHIFTS = np.arange(-_LARGEST, _LARGEST + 1)
 
-_SWITCH = 40.0  # cost of a change of the offset
-_WORST = 6.0  # largest cost of a frame: square of the distance at which lines pass over its scatter
-_CLEARLY = 20.0  # cost by which another offset must fit better than the given one
-# Largest share of the cost of the given offset that remains with one that explains the misfit.
-_LEFT = 0.65
+# Logarithm of the likelihood ratio by which an offset, or a change of it, must explain the views
+# better; errors of the ends are assumed to have a Cauchy distribution.
+_EVIDENCE = 15.0
+_BLANK = np.log(3.0)  # cost of an end that is not seen in both frames: that of 1.4 scatters
 _DROPPED = 10  # largest number of frames in a row that a camera drops unnoticed
 _KNOWN = 10  # number of frames that must show an end of the whisker
 _LOCATED = 0.3  # error with which an end is located in each frame by itself, pixels
+_POWERS = (1.0, 0.5, 0.0)  # of the weights of frames whose errors are alike, for paths to compare
+NEAR = 3  # offsets that differ by so many frames are not distinguished when one is confirmed
+
+
+class Offsets(NamedTuple):
+    """Offset of each frame of the first view (time,), and whether no other fits about as well."""
+
+    shifts: Pairs
+    determined: bool
 
 
 def paired_frames(
@@ -48,7 +57,8 @@ def paired_frames(
         Traces of one whisker, view by view, frame by frame.
     offset : int, optional
         Number of frames by which the other videos began earlier than the first: its frame 0 is
-        their frame ``offset``. None: it is found, and dropped frames too.
+        their frame ``offset``. None: it is found, and dropped frames too, where they explain the
+        views clearly better than none.
 
     Returns
     -------
@@ -58,14 +68,14 @@ def paired_frames(
     Raises
     ------
     ValueError
-        If no frames belong together, or the whisker is seen in too few to find the offset.
+        If no frames belong together.
     """
     columns = [np.arange(len(traces[0]))]
     for camera, row in zip(cameras[1:], traces[1:], strict=True):
         if offset is not None:
             shift = np.full(len(traces[0]), offset)
         else:
-            shift = _shifts(cameras[0], camera, traces[0], row)
+            shift = clear_offsets(cameras[0], camera, traces[0], row).shifts
         columns.append(columns[0] + shift)
     pairs = np.stack(columns, axis=1)
     # A frame that one camera dropped has no partner; of those that share one the first keeps it.
@@ -78,48 +88,58 @@ def paired_frames(
     return pairs[usable]
 
 
-def better_offset(
-    first: Camera, second: Camera, a: Sequence[Trace], b: Sequence[Trace], offset: int
-) -> Pairs:
-    """Offsets with which two videos fit clearly better, by run; empty if there are none.
+def clear_offsets(
+    first: Camera, second: Camera, a: Sequence[Trace], b: Sequence[Trace], given: int = 0
+) -> Offsets:
+    """Offsets with which two videos agree clearly better than with the given one, or that one.
 
-    An error of the calibration is common to all offsets, and does not count.
+    An error of the calibration is common to all offsets, and does not count. Errors of the ends
+    that last, as where hairs cover the base, count once for as long as they last.
     """
+    column = given + _LARGEST
+    ends = _passing_ends(first, second, a, b) if abs(given) <= _LARGEST else []
+    ends = [one for one in ends if np.isfinite(one[:, column]).sum() >= _KNOWN]
+    if not ends:
+        return Offsets(np.full(len(a), given), False)
+    usual = np.array([_medians(one) for one in ends])[:, None]
+    alone = np.array(ends) - usual
+    weights = np.array([1.0 / _alike(one[:, _costs(one).sum(axis=0).argmin()]) for one in alone])
+    best = int(np.tensordot(weights, _costs(alone), axes=1).sum(axis=0).argmin())
+    # Without synchrony the usual distance contains the lag; that of the best offset does not.
+    away = np.array(ends) - usual[:, :, [best]]
+    known = np.isfinite(alone[:, :, column]).any(axis=0).sum()
+    chosen, before, row = alone[:, :, column], 0, np.arange(len(a))
+    shifts = np.full(len(a), given)
+    # No offset fits a film with dropped frames throughout, so that its errors seem to last longer.
+    for power in _POWERS:
+        path = _cheapest(np.tensordot(weights**power, _costs(away), axes=1))
+        changed, changes = away[:, row, path], int((np.diff(path, prepend=column) != 0).sum())
+        both = (np.isfinite(changed) & np.isfinite(chosen)).any(axis=0).sum()
+        # At the end of what is considered there need not be a minimum.
+        possible = np.abs(_SHIFTS[path]).max() < _LARGEST and 2 * both >= known
+        needed = _EVIDENCE * (changes - before)
+        if possible and needed > 0.0 and _gained(chosen, changed) > needed:
+            chosen, before, shifts = changed, changes, _SHIFTS[path]
+    if before:
+        return Offsets(shifts, True)
+    others = np.moveaxis(alone[:, :, np.abs(_SHIFTS - given) > NEAR], 2, 0)
+    return Offsets(shifts, all(_gained(other, chosen) > _EVIDENCE for other in others))
+
+
+def _passing_ends(
+    first: Camera, second: Camera, a: Sequence[Trace], b: Sequence[Trace]
+) -> list[Array]:
+    """Distances (frame, offset) of lines to base and to tip, over their scatter; NaN if unseen."""
     ends = []
     for end in (0, -1):
-        rows, other = (_shown(row, end) for row in (a, b))
-        if min(len(rows), len(other)) < _KNOWN or abs(offset) > _LARGEST:
+        rows, others = (_shown(row, end) for row in (a, b))
+        if min(len(rows), len(others)) < _KNOWN:
             continue
         passing = _passing(first, second, a, b, end)
         passing[~np.isin(np.arange(len(a)), rows)] = np.nan
-        partner = np.arange(len(a))[:, None] + _SHIFTS
-        passing[~np.isin(partner, other)] = np.nan
-        passing /= _scatter(passing)
-        if np.isfinite(passing[:, offset + _LARGEST]).sum() >= _KNOWN:
-            ends.append(passing)
-    if not ends:
-        return np.empty(0, dtype=np.int64)
-    away, fits, blank = _compared(ends)
-    cost = _costs(away)
-    path = _cheapest(cost + blank)
-    if (np.abs(_SHIFTS[path]) == _LARGEST).any():
-        # No minimum, as it is at the end of what is considered.
-        return np.empty(0, dtype=np.int64)
-    switched = np.concatenate([[True], np.diff(path) != 0])
-    changed = _SWITCH * int(switched[1:].sum()) + _CLEARLY
-    row, column = np.arange(len(a)), offset + _LARGEST
-    both = (blank[row, path] == 0.0) & (blank[:, column] == 0.0)
-    if 2 * both.sum() < (blank[:, column] == 0.0).sum():
-        return np.empty(0, dtype=np.int64)
-    left, given = cost[row, path][both].sum(), fits[both, column].sum()
-    # A base that begins at another hair for a while is one error, not one in each frame.
-    away = [np.nan_to_num(one[row, path]) for one in away]
-    power = float(np.mean([(one**2).mean() for one in away]))
-    alike = 1.0 + (correlated([one[None] for one in away]) - 1.0) * power / (power + _LOCATED**2)
-    # With wrong optics some offset always explains a little; a true one leaves only noise.
-    if left + alike * changed >= given or left > _LEFT * given:
-        return np.empty(0, dtype=np.int64)
-    return np.asarray(_SHIFTS[path[switched]])
+        passing[~np.isin(np.arange(len(a))[:, None] + _SHIFTS, others)] = np.nan
+        ends.append(passing / _scatter(passing))
+    return ends
 
 
 def _medians(passing: Array) -> Array:
@@ -140,39 +160,35 @@ def _scatter(passing: Array) -> float:
     return max(1.0, float(away[enough].min(initial=np.inf))) if enough.any() else 1.0
 
 
-def _compared(ends: Sequence[Array]) -> tuple[list[Array], Array, Array]:
-    """Distances beyond the usual one with the best offset; costs of all offsets, also of blanks.
-
-    Without synchrony the usual distance contains the lag; that of the best offset does not.
-    """
-    blank = np.sum([np.where(np.isfinite(one), 0.0, 0.5 * _WORST) for one in ends], axis=0)
-    usual = [_medians(one) for one in ends]
-    fits = _costs([one - middle for one, middle in zip(ends, usual, strict=True)])
-    best = int(np.argmin((fits + blank).sum(axis=0)))
-    return [one - middle[best] for one, middle in zip(ends, usual, strict=True)], fits, blank
+def _costs(away: Array) -> Array:
+    """Costs of distances beyond the usual ones, in units of their scatter."""
+    return np.where(np.isfinite(away), np.log1p(away**2), _BLANK)
 
 
-def _costs(away: Sequence[Array]) -> Array:
-    """Costs (frame, offset) of distances beyond the usual one; 0 where unknown."""
-    return np.asarray(sum(np.minimum(np.nan_to_num(one) ** 2, _WORST) for one in away))
+def _alike(away: Array) -> float:
+    """Number of frames in a row in which an end is displaced alike."""
+    # Those displaced far count as in the cost.
+    pulls = away / np.hypot(1.0, away)
+    power = float(np.nanmean(pulls**2))
+    # Each end is located anew in each frame, even if it is always at the same error.
+    share = power / (power + _LOCATED**2)
+    return 1.0 + (correlated([np.nan_to_num(pulls)[None]]) - 1.0) * share
+
+
+def _gained(stay: Array, changed: Array) -> float:
+    """Logarithm of the likelihood ratio of other distances (end, frame), where both are known."""
+    gained = 0.0
+    for one, other in zip(stay, changed, strict=True):
+        both = np.isfinite(one) & np.isfinite(other)
+        if both.any():
+            gained += float((_costs(one) - _costs(other))[both].sum() / _alike(other))
+    return gained
 
 
 def _shown(traces: Sequence[Trace], end: int) -> NDArray[np.intp]:
     """Frames in which an end of the whisker is seen."""
     seen = [len(t.line) > 0 and (t.base_seen, t.tip_seen)[end] for t in traces]
     return np.flatnonzero(seen)
-
-
-def _shifts(first: Camera, second: Camera, a: Sequence[Trace], b: Sequence[Trace]) -> Pairs:
-    """Offset of each frame of the first view, by the cheapest path through all offsets."""
-    few = "the whisker is seen in too few frames to find the cameras' offset"
-    if not all(any(len(trace.line) for trace in row) for row in (a, b)):
-        raise ValueError(few)
-    ends = [_passing(first, second, a, b, end) for end in (0, -1)]
-    if sum(np.isfinite(one).sum() for one in ends) < _KNOWN * len(_SHIFTS):
-        raise ValueError(few)
-    away, _, blank = _compared([one / _scatter(one) for one in ends])
-    return _SHIFTS[_cheapest(_costs(away) + blank)]
 
 
 def _passing(
@@ -207,7 +223,7 @@ def _cheapest(cost: Array) -> NDArray[np.intp]:
     for i in range(1, count):
         around = sliding_window_view(np.pad(total, _DROPPED, constant_values=np.inf), window)
         best = np.arange(width) - _DROPPED + around.argmin(axis=1)
-        jump = total[best] + _SWITCH
+        jump = total[best] + _EVIDENCE
         came[i] = np.where(total <= jump, np.arange(width), best)
         total = np.minimum(total, jump) + cost[i]
     path = np.empty(count, dtype=np.intp)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from vibrissa.io import Frame
 from vibrissa.numerics import kernel
 from vibrissa.tracking.trace.clutter import EDGE, STILL, Bits
 from vibrissa.tracking.trace.ridge import noise_level
+from vibrissa.tracking.trace.trace import Trace
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -67,6 +69,12 @@ _AT_BASE, _CLOSE = 25.0, 6.0
 _RIM, _ONE_SIDE = 4, 0.8
 # Distance within which a body covers such a share of all around a base that is before it.
 _DEEP, _COVERED = 45.0, 0.98
+# Change of brightness by pixel across a line, as a share of the light, from which something static
+# ends there; how far from the line, pixels; and number of points along it from which the line
+# follows that edge, and of those after it at most, if it ends there.
+_SHARP, _WITHIN, _FOLLOWS, _AFTER = 0.026, 2, 25, 5
+# Share of the points before on such edges from which the line is one itself: a whisker at rest.
+_AT_REST = 0.3
 # Differences that count, grey values: what is darker or brighter counts as these.
 _RANGE = (-20.0, 80.0)
 
@@ -182,6 +190,41 @@ class Scene:
             return bits
         masked = STILL * self.mask.astype(np.uint32)
         return masked if bits is None else bits | masked
+
+    def before_edge(self, trace: Trace) -> Trace:
+        """The part of a trace before it follows the edge of something static to its end."""
+        n = len(trace.line)
+        if self._slopes is None or n < _FOLLOWS:
+            return trace
+        normal = np.gradient(trace.line, axis=0)[:, ::-1] * [-1.0, 1.0]
+        normal /= np.hypot(*normal.T)[:, None]
+        away = np.arange(-_WITHIN, _WITHIN + 1)[:, None, None]
+        near = np.rint(trace.line + away * normal).astype(np.intp)
+        rows, columns = self._slopes.shape[1:]
+        column, row = near[..., 0].clip(0, columns - 1), near[..., 1].clip(0, rows - 1)
+        across = np.abs(np.einsum("kwn,nk->wn", self._slopes[:, row, column], normal))
+        on = across.max(axis=0) > _SHARP
+        last = int(np.flatnonzero(on)[-1]) + 1 if on.any() else 0
+        off = np.flatnonzero(~on[:last])
+        first = int(off[-1]) + 1 if off.size else 0
+        if (
+            last < n - _AFTER
+            or last - first < _FOLLOWS
+            or not first
+            or on[:first].mean() > _AT_REST
+        ):
+            return trace
+        part = slice(0, first)
+        return trace._replace(
+            line=trace.line[part], sigma=trace.sigma[part], seen=trace.seen[part], tip_seen=False
+        )
+
+    @cached_property
+    def _slopes(self) -> Array | None:
+        """Change of the background's brightness (2, rows, columns), along columns and rows."""
+        if self.background is None:
+            return None
+        return np.stack(np.gradient(blurred(self.background, _EDGE) / self.light)[::-1])
 
     def without_still(self, frame: Frame) -> Frame:
         """A frame without static objects, if these are known."""

@@ -259,7 +259,7 @@ def correlated(misses: Sequence[Array]) -> float:
     size = sum(float((one**2).mean()) for one in misses)
     for lag in range(1, most):
         both = sum(float((one[:, lag:] * one[:, :-lag]).mean()) for one in misses)
-        if both < _UNLIKE * size:
+        if both <= _UNLIKE * size:
             break
         total += 2.0 * both / size
     return total

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain, islice
 from os import PathLike
@@ -73,9 +73,8 @@ def trace_video(
     options : TraceOptions, optional
         Settings of tracing.
     corrections : mapping, optional
-        Points (n, 2) along whiskers that are right in some frames, by frame and whisker: taken as
-        they are, and followed from there forward, and backward as far as that changes anything, at
-        most 64 frames.
+        Points (n, 2) along whiskers in some frames, by frame and whisker: taken as they are, and
+        followed forward, and backward as far as that changes anything, at most 64 frames.
     begun : sequence of sequence of Trace
         Traces of the first frames, made before: taken as they are.
     kept : list, optional
@@ -98,8 +97,7 @@ def trace_video(
     Raises
     ------
     ValueError
-        If no whisker is found in the first frame, frames differ in size, or a correction is for
-        none of the whiskers.
+        If none is found in the first frame, frames differ in size, or a correction is for none.
     """
     options = options or TraceOptions()
     corrections = corrections or {}
@@ -165,9 +163,21 @@ def trace_video(
     if len(followers) > 1 and done < len(traces[0]):
         for row, new in zip(traces, _over_all_frames(seen, starts, options), strict=False):
             row[:] = new
-    for row in traces if steady is not None else ():
-        row[:] = [t._replace(shift=shift) for t, shift in zip(row, shifts, strict=True)]
+    _finish(traces, scene, corrections, shifts if steady is not None else ())
     return traces
+
+
+def _finish(
+    traces: list[list[Trace]],
+    scene: Scene,
+    corrections: Container[tuple[int, int]],
+    shifts: Sequence[tuple[float, float, float, float]],
+) -> None:
+    """Cut traces that end along static edges, if no person gave them; add the camera's shifts."""
+    for k, row in enumerate(traces):
+        row[:] = [t if (i, k) in corrections else scene.before_edge(t) for i, t in enumerate(row)]
+        if shifts:
+            row[:] = [t._replace(shift=shift) for t, shift in zip(row, shifts, strict=True)]
 
 
 def _surroundings(

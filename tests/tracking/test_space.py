@@ -179,7 +179,7 @@ def test_errors_that_follow_the_motion_are_no_offset():
     assert remarks_on_time(pair, rows, 0) == []
 
 
-@pytest.mark.parametrize(("faint", "left"), [(range(0, 20, 4), 15), (range(20), 0)])
+@pytest.mark.parametrize(("faint", "left"), [(range(0, 20, 4), 20), (range(20), 0)])
 def test_ends_that_are_not_one_point_are_not_the_tip(faint, left):
     """The second view shows the whisker only as far as its thin part, in some or all frames."""
     from vibrissa.tracking.track import _with_one_tip

@@ -657,21 +657,17 @@ def _alike(_: float) -> float:
 def _with_one_tip(
     cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]]
 ) -> Sequence[Sequence[Trace]]:
-    """Traces of which those that end apart in the views do not end at the tip.
+    """Traces of which none ends at the tip if most end apart in the views.
 
-    Where most do, as compression erases thin parts, none does: others agree by chance.
+    So it is where compression erases thin parts: the other ends agree by chance.
     """
     frames = [i for i, one in enumerate(zip(*traces, strict=True)) if _all_end(one)]
     if len(cameras) == 1 or len(frames) < _FEWEST:
         return traces
     apart = base_gap(cameras, np.array([[view[i].line[-1] for i in frames] for view in traces]))
-    wrong = {i for i, gap in zip(frames, apart, strict=True) if gap > _APART}
-    if 2 * len(wrong) > len(frames):
-        wrong = set(range(len(traces[0])))
-    return [
-        [t._replace(tip_seen=t.tip_seen and i not in wrong) for i, t in enumerate(view)]
-        for view in traces
-    ]
+    if 2 * np.count_nonzero(apart > _APART) <= len(frames):
+        return traces
+    return [[t._replace(tip_seen=False) for t in view] for view in traces]
 
 
 def _all_end(views: Sequence[Trace]) -> bool:

@@ -257,7 +257,7 @@ def test_what_is_missing_is_said(tracked, trial):
     with pytest.raises(ValueError, match="lacks the dimensions time, whisker"):
         signals_of(xr.DataTree(xr.Dataset()))
     without = xr.DataTree.from_dict({"/": tracked.to_dataset()})
-    with pytest.raises(ValueError, match="carries 0 of them"):
+    with pytest.raises(ValueError, match="shapes of 0 whiskers"):
         with_signals(without)
     with pytest.raises(ValueError, match="below half of"):
         signals_of(tracked, "contact point", 200.0)

@@ -168,7 +168,7 @@ def test_whisker_and_peg_ride_along(trial):
     np.testing.assert_array_equal(whisker.centerline(7), WHISKER.centerline(7))
     (peg,) = Recording(trial).pegs
     np.testing.assert_array_equal(peg.origin, PEG.origin)
-    with pytest.raises(ValueError, match="carries 1"):
+    with pytest.raises(ValueError, match="shapes of 1 whiskers"):
         Recording(trial).whisker(1)
 
 

@@ -146,3 +146,42 @@ def test_a_first_sample_near_slip_off_is_known_as_well_as_stated(gamma_map, name
             squares.append(away @ np.linalg.solve(known.covariance, away))
     assert len(squares) >= 15
     assert np.mean(np.array(squares) > 14.16) < 0.05  # 0.27 % in theory
+
+
+def test_a_contact_that_jumps_is_followed_at_once(gamma_map):
+    """Most of the probability is where the first sample after the jump locates the contact."""
+    d, names, sigma = gamma_map.chart.discretization, "Fx MB MD", np.repeat([1e-6, 2e-8], 3)
+    rng = np.random.default_rng(3)
+    follow = vb.ContactFilter(vb.Estimator(gamma_map, names, np.diag(sigma**2)))
+    near = []
+    for place in range(12):
+        bearing, force = rng.uniform(-np.pi, np.pi), rng.uniform(0.05, 0.2)
+        x = [rng.uniform(0.4, 0.8), 0.0, force * np.cos(bearing), force * np.sin(bearing)]
+        values, _ = solve_forces(d, np.array([x]))
+        wrench = np.concatenate([values[0, :3] * d.force, wrenches(values)[0, 3:] * d.moment])
+        for i in range(5):
+            seen = wrench + sigma * rng.normal(size=6)
+            six = signals_of(seen[:3], seen[3:])
+            known = follow(2e-3 * (5 * place + i), six[[0, 4, 5]])
+            if i == 0 and place:
+                away, spread = known.points - known.located.point, 10.0 * known.located.covariance
+                far = (away * np.linalg.solve(spread, away.T).T).sum(axis=1)
+                near.append(known.probabilities[far < 1.0].sum())
+    assert np.mean(np.array(near) > 0.9) > 0.6
+
+
+def test_samples_of_a_bent_valley_do_not_shorten_it(gamma_map):
+    """A light contact near the base: its arc length remains nearly as unknown as by one sample."""
+    d, sigma = gamma_map.chart.discretization, 0.01
+    values, _ = solve_forces(d, np.array([[0.4, 0.0, 0.03, 0.03]]))
+    noise = np.diag((sigma * np.repeat([d.force, d.moment], 3)) ** 2)
+    squares = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        follow = vb.ContactFilter(vb.Estimator(gamma_map, NAMES, noise), speed=1e-3 * d.length)
+        for i in range(12):
+            seen = wrenches(values)[0] + sigma * rng.normal(size=6)
+            known = follow(2e-3 * i, measured(seen, d))
+        away = known.point - values[0, 3:] * d.length
+        squares.append(away @ np.linalg.solve(known.covariance, away))
+    assert np.mean(squares) < 6.0

@@ -12,7 +12,7 @@ how well they predicted it (:mod:`~vibrissa.contacts.following.mixture`). A samp
 moves p only across the curve of contacts that explains it
 (:mod:`~vibrissa.contacts.engine.ambiguity`); as the base moves, the curves of successive samples
 intersect at the contact. A candidate that no hypothesis accounts for starts a new one, with the
-probability of a new contact.
+prior probability of a new contact and the evidence for it, compared with that for the others.
 """
 
 from __future__ import annotations
@@ -236,12 +236,14 @@ class ContactFilter:
         if located is not None and located.status in (Status.UNIQUE, Status.AMBIGUOUS):
             x, values = self._beginning.exact(located)
         first = not len(self._mixture.weight)
-        explains = not first and self._update(measurement, x, values, turn, base)
+        explains, evidence = False, -math.inf
+        if not first:
+            explains, evidence = self._update(measurement, x, values, turn, base)
         if not three and not explains:
             located = self.estimator.locate(measurement)
         lost = not len(self._mixture.weight)
         reach = self._reach(turn, base) if first else _ANYWHERE
-        prior = 0.0 if lost else self._birth
+        prior = 0.0 if lost else self._birth - evidence
         if three and lost:
             assert located is not None
             found = self._beginning.all_that_may_be(measurement, located, reach)
@@ -261,8 +263,8 @@ class ContactFilter:
 
     def _update(
         self, measurement: Measurement, x: Array, values: Array, turn: Array, base: Array
-    ) -> bool:
-        """Update all hypotheses; whether any of them explains the measurement."""
+    ) -> tuple[bool, float]:
+        """Update all hypotheses; whether any explains the measurement, and its log evidence."""
         chart, readout = self.estimator.contact_map.chart, self.estimator.readout
         most = len(self._mixture.weight) * (1 + len(x))
         out, misfits = room(most, self._errors), np.empty(most)
@@ -283,8 +285,9 @@ class ContactFilter:
             misfits,
         )
         explains = bool((misfits[:n] < self._limit).any())
+        evidence = float(np.logaddexp.reduce(out.weight[:n]))
         self._mixture = _tidied(out, n)
-        return explains
+        return explains, evidence
 
     def _unaccounted(self, values: Array, located: Contact, turn: Array, base: Array) -> AnyArray:
         """Which candidates (n,) no hypothesis accounts for."""

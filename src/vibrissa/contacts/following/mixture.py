@@ -346,6 +346,33 @@ def _known(x: Array, out: Mixture, first: int, found: int) -> bool:
     return known
 
 
+@inlined
+def _widen(least: Array, covariance: Array) -> None:
+    """Widen a covariance (3, 3) in directions in which another is wider.
+
+    A Gaussian that contains a bent valley is wide across it, and at its ends not on it. The product
+    with the next valley is thus shorter, sample by sample, although neither shows where along the
+    valley the contact is. The first order does not become shorter.
+    """
+    low, other = np.empty((3, 3)), np.empty((3, 3))
+    if not cholesky(covariance, low):
+        return
+    for _ in range(2):
+        for c in range(3):
+            column = least[:, c].copy()
+            forward(low, column)
+            for a in range(3):
+                other[c, a] = column[a]
+        least = other.copy()
+    values, axes = np.linalg.eigh(least)
+    for i in range(3):
+        if values[i] > 1.0:
+            wide = np.sqrt(values[i] - 1.0) * (np.tril(low) @ np.ascontiguousarray(axes[:, i]))
+            for a in range(3):
+                for c in range(3):
+                    covariance[a, c] += wide[a] * wide[c]
+
+
 @kernel
 def _moved(
     rod: Charted,
@@ -376,6 +403,7 @@ def _moved(
     mass = moments(
         rod, proximal, onset, codes, target, weights, x, v, t, False, shift, after, by_channels
     )
+    _widen(by_channels @ by_channels.T, after)
     inverse = root.T @ root
     weight = np.log(mass) if mass > 0.0 else -np.inf
     weight -= 0.5 * (_log_determinant(before) + chi)

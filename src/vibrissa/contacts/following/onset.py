@@ -77,6 +77,7 @@ _STATION, _POINT = FITTED.index("s"), [FITTED.index(name) for name in ("px", "py
 # Displacement along each axis of a covariance at which its linearisation is checked, in standard
 # deviations, and its largest relative error there.
 _REACH, _BENT = 2.0, 0.25
+_LOG_TURN = math.log(2.0 * math.pi)
 _FLAT = 1e-12  # smallest variance of a contact point, relative to that in all directions
 
 
@@ -180,16 +181,17 @@ class Beginning:
         some = np.linspace(0, number - 1, min(number, _MOST)).astype(int)
         x, values = (part[some] for part in self.exact(located))
         _, slope = solve_forces(self._chart.discretization, x, tangents=True)
-        across, by_errors = self._across(measurement, values, slope)
+        w = self._weights(self._quiet, measurement, values)
+        across, by_errors = self._across(w, values, slope)
         covariance = across + _gaps_between(values[:, 3:]) + _FINEST**2 * np.eye(3)
         points = values[:, 3:]
         likely = self._log_prior(x, points, reach) - 0.5 * located.chi_squared
-        weights = likely + 0.5 * np.linalg.slogdet(covariance)[1]
+        likely += self._log_determinants(w)
+        weights = likely + 0.5 * np.linalg.slogdet(covariance)[1] + 1.5 * _LOG_TURN
         return Gaussians(x, values, points, covariance, by_errors, weights, likely)
 
-    def _across(self, measurement: Measurement, values: Array, slope: Array) -> tuple[Array, Array]:
+    def _across(self, w: Array, values: Array, slope: Array) -> tuple[Array, Array]:
         """Covariances across a curve or surface, and the effects of shared errors."""
-        w = self._weights(self._quiet, measurement, values)
         force = np.linalg.norm(values[:, :3], axis=1)
         unit = slope * np.stack([np.ones_like(force), force, force], axis=1)[:, None]
         back = np.linalg.pinv(w @ channel_derivatives(values, unit, self._names), rcond=1e-9)
@@ -232,6 +234,11 @@ class Beginning:
         i, j, load = (np.concatenate(part) for part in zip(*place, strict=True))
         return self._nodes[i, j, load], self._values[i, j, load], i
 
+    def _log_determinants(self, weights: Array) -> Array:
+        """Half the log determinants (n,) of the weights (n, k, k) of what is measured."""
+        q = len(self._readout.how.mixing)
+        return np.array([log_weights(one, q) for one in weights])
+
     def _weights(self, how: Weighing, measurement: Measurement, values: Array) -> Array:
         k = len(self._names)
         out = np.zeros((len(values), k, k))
@@ -271,7 +278,7 @@ class Beginning:
         windows: IntArray | None = None,
     ) -> Gaussians:
         """Means, covariances and weights of contacts, from their χ² and windows, if any."""
-        n, k, q = len(fits.contacts), len(self._names), len(self._readout.how.mixing)
+        n, k = len(fits.contacts), len(self._names)
         chart, x = self._chart, fits.contacts
         w = self._weights(self._quiet, measurement, fits.values)
         codes = np.concatenate([self._readout.how.codes, [_STATION], _POINT])
@@ -290,11 +297,11 @@ class Beginning:
         covariance[~known] = _VAGUE**2 * np.eye(3)
         covariance += _FINEST**2 * np.eye(3)
         by_errors = by_channels[:, :, :k] @ w @ self._wrong(fits.values)
-        likely = np.array([log_weights(one, q) for one in w]) - 0.5 * fits.misfits
+        likely = self._log_determinants(w) - 0.5 * fits.misfits
         likely += self._log_prior(x, fits.values[:, 3:], reach)
-        total = likely + np.log(np.where(known, mass, 1.0)) + 1.5 * math.log(2.0 * math.pi)
+        total = likely + np.log(np.where(known, mass, 1.0)) + 1.5 * _LOG_TURN
         if windows is not None:
-            total -= 0.5 * math.log(2.0 * math.pi)
+            total -= 0.5 * _LOG_TURN
         total[~known] = -np.inf
         points = fits.values[:, 3:] + shift
         return Gaussians(x, fits.values, points, covariance, by_errors, total, likely)

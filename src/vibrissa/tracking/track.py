@@ -77,14 +77,13 @@ Progress = Callable[[str, int, int], None]
 _FLAT = 0.02
 # Standard deviation of a roll that is determined by bent shapes only, rad.
 _ANY_ROLL = np.radians(10.0)
-# Smallest and largest number of frames in contact from which a length is estimated.
-_FEWEST, _FRAMES = 8, 24
+# Smallest number of frames of a kind that are used, and largest in contact to estimate a length.
+_FEWEST, _FRAMES = 3, 24
 # Misfit, absolute and relative to the usual one, below which the traces of a row are its whiskers'.
 _WELL, _WORSE = 1.0, 3.0
 # Share of the frames of a whisker in a row that the rod must explain before others are left out.
 _EXPLAINED = 0.1
 _FAR = 10.0  # distance between the bases of several views above which they differ, pixels
-_FEWEST = 3  # smallest number of frames that show the whisker from its base on
 _SHARE = 0.03  # the same as a share of the whisker's length
 _APART = 8.0  # distance of the ends of several views from one point from which they are not the tip
 

@@ -2,6 +2,7 @@
 
 import os
 
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
@@ -75,6 +76,14 @@ def test_what_is_no_recording(tmp_path, recording):
     xr.Dataset({"a": 1.0}).to_netcdf(path, engine="h5netcdf")
     with pytest.raises(ValueError, match="another kind"):
         load_recording(path)
+
+
+def test_a_recording_whose_time_was_deleted_is_said_to_be_incomplete(tmp_path, recording):
+    save_recording(tmp_path / "trial.nc", recording)
+    with h5py.File(tmp_path / "trial.nc", "r+") as file:
+        del file["time"]
+    with pytest.raises(ValueError, match=r"trial\.nc is incomplete .* deleted"):
+        load_recording(tmp_path / "trial.nc")
 
 
 def test_damaged_files(tmp_path, recording):

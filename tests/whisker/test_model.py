@@ -162,6 +162,7 @@ def test_curvature_functions_of_every_kind_agree():
         arrays,
         lambda s: (0.0, 100 * float(s), 5 + 400 * float(s)),
         lambda s: np.array([0 * s, 100 * s, 5 + 400 * s]),
+        lambda s: np.column_stack([np.zeros(len(s)), 100 * s, 5 + 400 * s]),  # arrays only
     ]
     s = np.linspace(0, LENGTH, 7)
     for kind in kinds:

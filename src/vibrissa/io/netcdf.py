@@ -78,6 +78,11 @@ def naming(path: Path, what: str) -> Iterator[None]:
         if str(path) in str(error):
             raise
         raise ValueError(f"{path}: {_line(error)}") from error
+    except KeyError as error:
+        raise ValueError(
+            f"{path} is incomplete or damaged: something that it refers to is missing, for example "
+            f"a dimension such as `time` that has been deleted ({error})"
+        ) from error
     except Exception as error:  # The libraries' errors for damaged files are not documented.
         raise ValueError(f"{path} is not {what} in a known form, or damaged: {error!r}") from error
 

@@ -51,8 +51,13 @@ def test_swapped_arguments_get_a_hint(bent):
             vb.estimate_from_wrench(bent.whisker, force, moment)
         with pytest.raises(ValueError, match="force, N, comes before moment"):
             vb.second_contact(bent.whisker, force, moment, noise=1e-12 * np.eye(6))
-    with pytest.raises(ValueError, match=r"ContactMap.simulate\(whisker\)"):
-        vb.uniqueness(bent.whisker)
+    for needs_a_map in (vb.uniqueness, vb.sensitivity, vb.Estimator):
+        with pytest.raises(ValueError, match=r"ContactMap.simulate\(whisker\)"):
+            needs_a_map(bent.whisker)
+    with pytest.raises(ValueError, match="needs an Estimator"):
+        vb.ContactFilter(bent.whisker)
+    with pytest.raises(ValueError, match=r"objects are .* got <?Whisker"):
+        vb.deflect_around(bent.whisker, bent.whisker)
     for other in ("whisker.toml", bent.contact_point):
         with pytest.raises(ValueError, match=f"a Whisker is needed; got {type(other).__name__}"):
             vb.deflect(other, bent.load)

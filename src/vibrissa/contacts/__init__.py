@@ -1,6 +1,7 @@
 """From base signals to contacts: the map of all contacts and its inversion."""
 
 from vibrissa.contacts.around import estimate_around
+from vibrissa.contacts.charted_whisker import need_map as need_map
 from vibrissa.contacts.chosen_contacts import (
     At,
     ChosenContacts as ChosenContacts,

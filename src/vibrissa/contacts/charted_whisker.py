@@ -34,3 +34,11 @@ class ChartedWhisker(Protocol):
 
     def __hash__(self) -> int:
         """Hash by identity, so that results are cached per map."""
+
+
+def need_map(contact_map: object) -> None:
+    """Raise a ValueError for what is not a contact map, for example the whisker itself."""
+    if not hasattr(contact_map, "chart"):
+        raise ValueError(
+            f"a ContactMap is needed, such as ContactMap.simulate(whisker); got {contact_map!r}"
+        )

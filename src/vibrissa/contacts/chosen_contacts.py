@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vibrissa.contacts.charted_whisker import need_map
 from vibrissa.contacts.contact_map import ContactMap, node_coordinates
 from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray, vectors
@@ -46,6 +47,7 @@ def chosen_contacts(
     contact_map: ContactMap, at: At = None, triplet: tuple[str, ...] = ("Fx", "MB", "MD")
 ) -> ChosenContacts:
     """Contacts at the chosen points, solved with derivatives."""
+    need_map(contact_map)
     if at is None:
         return _nodes(contact_map)
     if isinstance(at, str):

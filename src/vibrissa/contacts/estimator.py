@@ -14,7 +14,7 @@ from functools import cached_property, partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.contacts.charted_whisker import ChartedWhisker
+from vibrissa.contacts.charted_whisker import ChartedWhisker, need_map
 from vibrissa.contacts.contacts import Candidates, Contact, contact_of, nowhere
 from vibrissa.contacts.engine.ambiguity import Ambiguity
 from vibrissa.contacts.engine.prior import Prior, among_allowed, possible_candidates, refuse_tip
@@ -98,6 +98,7 @@ class Estimator:
         friction: float = 0.0,
         gravity: Gravity | ArrayLike | None = None,
     ) -> None:
+        need_map(contact_map)
         names = selection(using, least=1)
         given = using.replace(",", " ").split() if isinstance(using, str) else using
         order = [selection([name], least=1)[0] for name in given]

@@ -24,7 +24,7 @@ import numpy as np
 import xarray as xr
 
 from vibrissa.certificates import TRIPLET, Certificate, outlook
-from vibrissa.contacts import ContactMap, Domain, Progress
+from vibrissa.contacts import ContactMap, Domain, Progress, need_map
 from vibrissa.identifiability.evidence import (
     EMPTY,
     NOT_UNIQUE,
@@ -398,10 +398,7 @@ def uniqueness(
     >>> str(found.verdict.sel(triplet="Fx MB MD", region="all").item())
     'unique'
     """
-    if not hasattr(contact_map, "chart"):
-        raise ValueError(
-            f"a ContactMap is needed, such as ContactMap.simulate(whisker); got {contact_map!r}"
-        )
+    need_map(contact_map)
     names = (
         TRIPLETS if isinstance(triplets, str) and triplets == "all" else _parse_triplets(triplets)
     )

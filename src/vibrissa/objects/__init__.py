@@ -9,7 +9,12 @@ from vibrissa.objects.solids import (
     object_from_dataset as object_from_dataset,
     objects_datasets as objects_datasets,
 )
-from vibrissa.objects.surface import Placement as Placement, Surface, between as between
+from vibrissa.objects.surface import (
+    Placement as Placement,
+    Surface,
+    between as between,
+    listed_objects as listed_objects,
+)
 
 __all__ = [
     "Box",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -97,3 +98,14 @@ def between(before: Placement, now: Placement, share: float) -> Placement:
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     rotation = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
     return Placement(before.rotation @ rotation, position)
+
+
+def listed_objects(objects: Surface | Sequence[Surface]) -> list[Surface]:
+    """Return one or several objects as a list; raise a ValueError for anything else."""
+    solids = list(objects) if isinstance(objects, Sequence) else [objects]
+    for one in solids:
+        if not isinstance(one, Surface):
+            raise ValueError(
+                f"objects are Peg, Sphere, Box, Plane or Mesh of vibrissa.objects; got {one!r}"
+            )
+    return solids

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.numerics import Array, IntArray, Mask, rotation_matrices, without_blas_threads
-from vibrissa.objects import Placement, Surface
+from vibrissa.objects import Placement, Surface, listed_objects
 from vibrissa.rod.deflection import Deflection, finite_vectors
 from vibrissa.rod.discretization import discretize
 from vibrissa.rod.obstacles import (
@@ -194,7 +194,7 @@ def deflect_around(
 
 def _rigid(objects: Surface | Sequence[Surface]) -> list[Surface]:
     """Return the objects as a list; raise a ValueError if one is compliant."""
-    solids = list(objects) if isinstance(objects, Sequence) else [objects]
+    solids = listed_objects(objects)
     soft = [repr(solid) for solid in solids if np.isfinite(solid.stiffness)]
     if soft:
         raise ValueError(f"several contacts are solved with rigid objects only; got {soft[0]}")

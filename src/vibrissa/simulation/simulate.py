@@ -29,7 +29,7 @@ import numpy as np
 import xarray as xr
 
 from vibrissa.numerics import Array
-from vibrissa.objects import Surface
+from vibrissa.objects import Surface, listed_objects
 from vibrissa.recording import Recording, coordinates, recorded, recording_tree
 from vibrissa.rod import SurfaceDeflection, around, check_objects, follow_surfaces
 from vibrissa.sensors import COMPONENTS, FORCE_NOISE, MOMENT_NOISE, Sensor
@@ -90,7 +90,7 @@ def simulate(
         of the base, and all other variables in the group ``truth``.
     """
     pairs = _pairs(whisker, motion)
-    solids = list(objects) if isinstance(objects, Sequence) else [objects]
+    solids = listed_objects(objects)
     if not 0.0 <= friction <= _ROUGHEST:
         raise ValueError(
             f"friction is {friction!r}; a coefficient from 0 to {_ROUGHEST:g} is needed"

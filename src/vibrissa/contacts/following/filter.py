@@ -144,6 +144,10 @@ class ContactFilter:
         birth: float = 1e-4,
         memory: float = math.inf,
     ) -> None:
+        if not isinstance(estimator, Estimator):
+            raise ValueError(
+                f"a filter needs an Estimator(contact_map, noise=...); got {estimator!r}"
+            )
         self._length = estimator.contact_map.whisker.length
         speed = 0.25 * self._length if speed is None else speed
         if not (speed > 0.0 and persistence > 0.0 and pose_sigma >= 0.0 and 0.0 < birth < 1.0):

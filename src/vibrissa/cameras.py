@@ -568,9 +568,18 @@ def _calibrate_one(
     cv2 = _opencv()
     usable = [i for i, points in enumerate(rows) if points is not None]
     size = (shape[1], shape[0])
-    _, matrix, distortion, turns, shifts = cv2.calibrateCamera(
-        [board] * len(usable), [rows[i] for i in usable], size, None, None
-    )
+    seen = [rows[i] for i in usable]
+    number = 2 * len(board) * len(usable)
+    # No more coefficients of the lens than the corners show (Bayesian information criterion):
+    # others would be arbitrary, and distort the parts of the image that the board never covered.
+    fixed = (cv2.CALIB_FIX_K1, cv2.CALIB_FIX_K2, cv2.CALIB_ZERO_TANGENT_DIST, cv2.CALIB_FIX_K3)
+    fits = []
+    for i, free in enumerate((0, 1, 2, 4, 5)):
+        fit = cv2.calibrateCamera(
+            [board] * len(usable), seen, size, None, None, flags=sum(fixed[i:])
+        )
+        fits.append((number * np.log(fit[0] ** 2) + free * np.log(number), i, fit))
+    _, matrix, distortion, turns, shifts = min(fits)[-1]
     k = usable.index(first)
     return Camera(
         matrix=matrix,

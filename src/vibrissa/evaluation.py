@@ -27,7 +27,6 @@ __all__ = [
     "Scores",
     "TrackingScores",
     "contact_errors",
-    "deflection_angle",
     "signal_errors",
     "spread",
     "tracking_scores",
@@ -139,26 +138,9 @@ def contact_errors(
     predicted = {
         f"{name}_predicted": (("replicate", "time"), drawn[..., i]) for i, name in enumerate(ERRORS)
     }
-    angles = {"deflection_angle": ("time", deflection_angle(truth, whisker))}
+    angle = cone_angle(whisker, truth["contact_point_whisker"].values)
+    angles = {"deflection_angle": ("time", angle)}
     return xr.Dataset({**data, **predicted, **angles}, {"time": contacts["time"]})
-
-
-def deflection_angle(truth: xr.Dataset, whisker: Whisker) -> Array:
-    """Angle at the base between the true contact and the resting whisker.
-
-    Parameters
-    ----------
-    truth : xarray.Dataset
-        Truth of one whisker, dimension time: ``contact_point_whisker``.
-    whisker : Whisker
-        True whisker; the angles of the tracked shape differ.
-
-    Returns
-    -------
-    array (time,)
-        Angles, rad; NaN without contact.
-    """
-    return cone_angle(whisker, truth["contact_point_whisker"].values)
 
 
 def _errors(estimated: Array, true: Array) -> Array:

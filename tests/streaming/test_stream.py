@@ -753,6 +753,12 @@ def test_bags_that_hold_something_else(wrench, tmp_path):
     with pytest.raises(ValueError, match="no '/up' with WrenchStamped; name one of those"):
         list(bag_wrenches(tmp_path / "two", "/up"))
     assert len(list(bag_wrenches(tmp_path / "two", "/right"))) == 1
+    write_wrenches(tmp_path / "both", {"/wrench": wrench[:2], "/rod/contact_force": wrench[:3]})
+    assert len(list(bag_wrenches(tmp_path / "both"))) == 2
+    write_wrenches(tmp_path / "answers", {"/contact_force": wrench[:3]})
+    with pytest.raises(ValueError, match=r"only /contact_force \(estimated forces at contacts\)"):
+        list(bag_wrenches(tmp_path / "answers"))
+    assert len(list(bag_wrenches(tmp_path / "answers", "/contact_force"))) == 3
     write_wrenches(tmp_path / "empty", {"/wrench": wrench[:0]})
     assert list(bag_wrenches(tmp_path / "empty")) == []
     write_wrenches(tmp_path / "nothing", {})

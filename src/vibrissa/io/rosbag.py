@@ -133,9 +133,12 @@ def _messages(
     with _opened(path) as reader:
         fitting = [c for c in reader.connections if c.msgtype in kinds]
         there = sorted({c.topic for c in fitting})
-        if topic is None and len(there) == 1:
-            topic = there[0]
+        # A sensor's readings are not the forces at contacts that were estimated from them.
+        measured = [name for name in there if not name.endswith(_TOPICS[_WRENCH])]
+        if topic is None and len(measured) == 1:
+            topic = measured[0]
         if topic not in there:
+            there = there if topic else measured
             raise ValueError(f"{path}: {_which_topic(reader.connections, there, topic, named)}")
         messages = iter(reader.messages(connections=[c for c in fitting if c.topic == topic]))
         while True:
@@ -167,7 +170,10 @@ def _which_topic(connections: Any, there: list[str], topic: str | None, named: s
     if there:
         lacks = "" if topic is None else f"there is no {topic!r} with {named}; "
         return f"{lacks}name one of those with {named} messages: {', '.join(there)}"
-    others = sorted({f"{c.topic} ({c.msgtype})" for c in connections})
+    others = sorted(
+        f"{name} (estimated forces at contacts)" if kind == _WRENCH else f"{name} ({kind})"
+        for name, kind in {(c.topic, c.msgtype) for c in connections}
+    )
     return f"it has no topic with {named} messages, only {', '.join(others) or 'none at all'}"
 
 

@@ -23,7 +23,7 @@ from vibrissa.pipeline import compare_contacts, distances_by_class
 from vibrissa.quantities import QUANTITIES, quantity, shown_unit, to_display
 from vibrissa.recording import Recording
 from vibrissa.report.page import Section, Tile, paragraph, shown_value, table, tiles, with_sigma
-from vibrissa.signals import CIRCULAR, SIGNALS, base_signals, within_turn
+from vibrissa.signals import CIRCULAR, SIGNALS, base_signals, cone_angle, within_turn
 from vibrissa.status import Status, describe
 from vibrissa.whisker import Whisker
 
@@ -331,7 +331,7 @@ def six_rows(signals: xr.Dataset, truth: xr.Dataset) -> list[tuple[str, ...]]:
 
 def signal_rows(signals: xr.Dataset, truth: xr.Dataset, whisker: Whisker) -> list[tuple[str, ...]]:
     """Rows of a table of the errors of force and moment by deflection angle."""
-    angle = evaluation.deflection_angle(truth, whisker)
+    angle = cone_angle(whisker, truth["contact_point_whisker"].values)
     rows = []
     for row in evaluation.signal_errors(signals, truth, angle):
         shares = [*row.force, *row.moment]

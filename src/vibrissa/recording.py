@@ -37,11 +37,7 @@ from vibrissa.quantities import attributes, unit_fault
 from vibrissa.status import Event, Status, flag_attributes
 from vibrissa.whisker import Whisker
 
-__all__ = [
-    "VARIABLES",
-    "Group",
-    "Recording",
-]
+__all__ = ["VARIABLES", "Group", "Recording"]
 __dir__ = __all__.copy
 
 
@@ -344,11 +340,6 @@ class Group:
         -------
         Group
             Group without that dimension; the same group if it has none.
-
-        Raises
-        ------
-        ValueError
-            If there is no such whisker.
         """
         count = self.data.sizes.get("whisker", 1)
         if not 0 <= index < count:
@@ -455,11 +446,6 @@ class Recording:
         -------
         Whisker
             Whisker as it was recorded.
-
-        Raises
-        ------
-        ValueError
-            If the recording does not contain this whisker.
         """
         groups = self._whisker_groups()
         if not 0 <= index < len(groups):

@@ -259,10 +259,7 @@ def best_triplet(
 
 
 def _predicted_errors(
-    contact_map: ContactMap,
-    chosen: ChosenContacts,
-    names: tuple[str, ...],
-    sensor: SensorNoise,
+    contact_map: ContactMap, chosen: ChosenContacts, names: tuple[str, ...], sensor: SensorNoise
 ) -> Array:
     """Predicted RMS 3D errors (n,), m; NaN where the triplet does not determine the contact."""
     d = contact_map.chart.discretization

@@ -198,10 +198,7 @@ def _file(session: Session) -> NWBFile:
 
 
 def _fill(
-    file: NWBFile,
-    data: xr.Dataset,
-    cameras: xr.Dataset | None,
-    predictors: xr.Dataset | None,
+    file: NWBFile, data: xr.Dataset, cameras: xr.Dataset | None, predictors: xr.Dataset | None
 ) -> None:
     from ndx_pose import Skeletons
 

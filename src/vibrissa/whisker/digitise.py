@@ -76,10 +76,7 @@ class Digitized:
 
 
 def digitize(
-    points: ArrayLike,
-    noise: float | None,
-    base: str | ArrayLike | None,
-    any_length: bool = False,
+    points: ArrayLike, noise: float | None, base: str | ArrayLike | None, any_length: bool = False
 ) -> Digitized:
     """Determine length, intrinsic curvature and pose from digitised points."""
     array = checked_points(points, noise, any_length)

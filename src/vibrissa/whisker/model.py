@@ -262,10 +262,7 @@ class Whisker:
 
     @classmethod
     def from_curvature(
-        cls,
-        length: float,
-        curvature: Callable[..., object],
-        **properties: Unpack[Properties],
+        cls, length: float, curvature: Callable[..., object], **properties: Unpack[Properties]
     ) -> Whisker:
         """Create a whisker from its intrinsic curvature.
 
@@ -581,11 +578,6 @@ class Whisker:
         Returns
         -------
         Whisker
-
-        Raises
-        ------
-        ValueError
-            If a part is missing, or has been modified so that parts contradict each other.
         """
         whisker = cls(**whisker_fields(dataset))
         check_centerline(dataset, whisker)

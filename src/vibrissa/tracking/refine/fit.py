@@ -25,13 +25,7 @@ from vibrissa.objects import Surface
 from vibrissa.rod import discretize, solve_forces
 from vibrissa.tracking.refine.problem import REST, FitOptions, Linear, Problem
 from vibrissa.tracking.refine.profile import profiled
-from vibrissa.tracking.refine.rods import (
-    State,
-    TraceSeries,
-    contact_slopes,
-    first_contacts,
-    rods,
-)
+from vibrissa.tracking.refine.rods import State, TraceSeries, contact_slopes, first_contacts, rods
 from vibrissa.tracking.space.pose import BasePose, HeadPose
 from vibrissa.tracking.space.rest_shape import Length
 from vibrissa.tracking.trace.trace import correlated

@@ -352,12 +352,7 @@ class Follower:
         return trace.support * float(np.exp(-0.5 * away**2)) / max(longer, 1.0) ** 2
 
     def _march(
-        self,
-        frame: Frame,
-        noise: float,
-        start: Array,
-        bend: Array,
-        manner: str,
+        self, frame: Frame, noise: float, start: Array, bend: Array, manner: str
     ) -> tuple[Array, Array]:
         """Line and support of a march."""
         spread, drift = _SPREADS[manner]

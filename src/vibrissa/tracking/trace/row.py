@@ -137,10 +137,7 @@ def follow_row(
 
 
 def _part(
-    followers: Sequence[Follower],
-    lines: Mapping[int, Array],
-    frame: Frame,
-    scene: Scene | None,
+    followers: Sequence[Follower], lines: Mapping[int, Array], frame: Frame, scene: Scene | None
 ) -> None:
     """Exclude from measurement the parts where whiskers overlap, on known or expected lines."""
     every = [lines.get(k, follower.expected) for k, follower in enumerate(followers)]

@@ -116,10 +116,7 @@ class Scene:
 
     @classmethod
     def of(
-        cls,
-        frames: Sequence[Frame],
-        scale: float = 1.0,
-        mask: NDArray[np.bool_] | None = None,
+        cls, frames: Sequence[Frame], scale: float = 1.0, mask: NDArray[np.bool_] | None = None
     ) -> Scene:
         """Scene from frames of one view; masked pixels contain no whisker."""
         if mask is not None and mask.shape != frames[0].shape:

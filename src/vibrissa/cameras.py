@@ -40,7 +40,6 @@ __all__ = [
 ]
 __dir__ = __all__.copy
 
-
 PIXEL_SIZE = 58e-6
 """Size of a pixel of the paper's cameras in object space, m."""
 
@@ -355,8 +354,7 @@ def _in_plane(camera: Camera, pixels: Array, sigma: ArrayLike) -> tuple[Array, A
 def _regularise(hessian: Array) -> Array:
     """Regularise Hessians, so that parallel rays have a finite, huge uncertainty; NaN is kept."""
     scale = np.trace(hessian, axis1=-2, axis2=-1)[..., None, None]
-    floored: Array = hessian + 1e-12 * scale * np.eye(3)
-    return floored
+    return np.asarray(hessian + 1e-12 * scale * np.eye(3))
 
 
 def _nearest_to_rays(cameras: Sequence[Camera], pixels: Array) -> Array:

@@ -418,7 +418,6 @@ CONTOUR = (
     *("surface_distance", "inlier"),
 )
 
-
 MATLAB_PREDICTORS = b"MATLAB 5.0 MAT-file, table of predictors by vibrissa"
 
 

@@ -194,7 +194,6 @@ def _write_message(sentence: str) -> None:
 
 event.register("numba:compile", _FirstCompilation())
 
-
 # The helper gets this process's search path, so that it imports the same sources.
 _HELPER = (
     "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "

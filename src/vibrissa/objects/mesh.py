@@ -149,8 +149,7 @@ class Mesh(Surface):
     @property
     def origin(self) -> Array:
         """Centre of the bounding box, m."""
-        middle: Array = 0.5 * (self.vertices.min(axis=0) + self.vertices.max(axis=0))
-        return middle
+        return np.asarray(0.5 * (self.vertices.min(axis=0) + self.vertices.max(axis=0)))
 
     def _distance(self, points: Array) -> Array:
         at = (points - self._low) / self._step

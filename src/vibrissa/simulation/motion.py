@@ -427,8 +427,7 @@ def _drifts(time: Array, count: int, seed: int) -> Array:
     """Slow random functions (count, n) of time (n,), s, with values within ±1."""
     phases = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, (count, _DRIFT.size))
     angles = 2.0 * np.pi * _DRIFT[:, None] * time + phases[..., None]
-    values: Array = np.sin(angles).mean(axis=1)
-    return values
+    return np.asarray(np.sin(angles).mean(axis=1))
 
 
 PEG_RADIUS = 1.35e-3  # half the diameter of the paper's peg, m

@@ -217,7 +217,6 @@ PARAMETERS: Mapping[str, tuple[float, float, float]] = {
     "trim": (1.0, 1.0, 0.0),
 }
 
-
 _MOST = 10_000_000  # largest number of whiskers, each of which takes 2.5 kB of memory
 
 

@@ -165,8 +165,7 @@ def _partners(cost: Array) -> Array:
     count = cheapest_path(np.ascontiguousarray(cost), rows, columns)
     total = np.bincount(rows[:count], columns[:count], cost.shape[0])
     number = np.bincount(rows[:count], minlength=cost.shape[0])
-    mean: Array = np.where(number > 0, total / np.maximum(number, 1), np.nan)
-    return mean
+    return np.asarray(np.where(number > 0, total / np.maximum(number, 1), np.nan))
 
 
 @kernel

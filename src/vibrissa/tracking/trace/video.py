@@ -1,4 +1,11 @@
-"""Traces of one video: whiskers followed from frame to frame, with interruption and resumption."""
+"""Traces of one video: whiskers followed from frame to frame, with interruption and resumption.
+
+Neighbours of the requested whiskers are followed too, so that none takes their lines. In some
+frames, lines that move and leave the face are found, and the motion of the face between these
+frames from their beginnings. Lines that begin at one position on the face belong to one hair or
+whisker; a whisker is sometimes as long as others. A hair may be joined to the end of a whisker that
+it crosses: in some of the frames all are begun together, which assigns that end to the whisker.
+"""
 
 from __future__ import annotations
 

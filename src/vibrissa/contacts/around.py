@@ -225,11 +225,7 @@ def _descended(
 
 
 def _spread(
-    near: NearObjects,
-    place: Placement,
-    found: Equilibrium,
-    shift: Array,
-    covariance: Array,
+    near: NearObjects, place: Placement, found: Equilibrium, shift: Array, covariance: Array
 ) -> Array:
     """Second moment of the first contact about its estimate, to second order in the shift.
 

@@ -385,19 +385,7 @@ def load_contacts(path: str | PathLike[str]) -> xr.Dataset:
 
 
 def events_in(contacts: xr.Dataset) -> Iterator[tuple[float, str, str, float]]:
-    """List the events of contacts, frame by frame.
-
-    Parameters
-    ----------
-    contacts : xarray.Dataset
-        Group ``estimates`` of a recording, or predictors.
-
-    Yields
-    ------
-    (float, str, str, float)
-        Time, s, name of the whisker, ``onset``, ``loss`` or ``slip``, and the standard deviation of
-        an onset, s, NaN if unknown.
-    """
+    """Yield time, s, whisker, event and an onset's standard deviation, s, of events, in order."""
     names = ("event", "onset_time", "onset_sigma")
     if not set(names) <= set(contacts):
         return

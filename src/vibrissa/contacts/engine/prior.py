@@ -86,11 +86,7 @@ class Prior:
                 raise ValueError(f"{name} is an angle in rad; got {limits!r}, as of degrees")
 
     def allows(
-        self,
-        whisker: Whisker,
-        points: Array,
-        arc_lengths: Array,
-        contact_forces: Array,
+        self, whisker: Whisker, points: Array, arc_lengths: Array, contact_forces: Array
     ) -> AnyArray:
         """Say which contacts are possible.
 

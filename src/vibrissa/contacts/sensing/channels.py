@@ -23,13 +23,7 @@ import numpy as np
 from vibrissa.contacts.charted_whisker import ChartedWhisker
 from vibrissa.contacts.sensing.noise import SensorNoise, common_covariance, scaled_errors, trusted
 from vibrissa.numerics import Array, cross
-from vibrissa.rod import (
-    Discretization,
-    discretize,
-    fold_forces,
-    solve_forces,
-    with_normal_force,
-)
+from vibrissa.rod import Discretization, discretize, fold_forces, solve_forces, with_normal_force
 from vibrissa.signals import (
     CIRCULAR as CIRCULAR_SIGNALS,
     SIGNALS,

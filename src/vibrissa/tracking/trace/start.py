@@ -262,22 +262,11 @@ def is_bright(
     bases: Sequence[Sequence[ArrayLike] | None] | None = None,
     options: TraceOptions | None = None,
 ) -> bool:
-    """Whether whiskers are bright on a dark background.
+    """Whether whiskers are bright on a dark background: seen clearly better in inverted frames.
 
-    Parameters
-    ----------
-    frames : sequence of array (height, width)
-        Frame of each view. All of them together decide: before a body, or next to an object with
-        stripes, one view may show lines of either kind.
-    bases : sequence of (sequence of array_like (2,), or None), optional
-        Column and row where whiskers begin, view by view.
-    options : TraceOptions, optional
-        Settings of tracing; ``bright``, unless None, is the result.
-
-    Returns
-    -------
-    bool
-        Whether lines are seen clearly better in the inverted frames.
+    The frames of all views decide together: before a body, or next to an object with stripes, one
+    view may show lines of either kind. ``bases`` are columns and rows where whiskers begin, view by
+    view.
     """
     options = options or TraceOptions()
     if options.bright is not None:

@@ -56,13 +56,7 @@ if TYPE_CHECKING:
     )
     from vibrissa.display import show
     from vibrissa.identifiability import best_triplet, critical_cones, sensitivity, uniqueness
-    from vibrissa.io import (
-        load_array,
-        load_recording,
-        load_signals,
-        load_tracks,
-        load_whisker,
-    )
+    from vibrissa.io import load_array, load_recording, load_signals, load_tracks, load_whisker
     from vibrissa.paper import sensitivity_findings
     from vibrissa.report import in_space
     from vibrissa.rod import (

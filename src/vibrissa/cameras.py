@@ -40,7 +40,6 @@ __all__ = [
 ]
 __dir__ = __all__.copy
 
-
 PIXEL_SIZE = 58e-6
 """Size of a pixel of the paper's cameras in object space, m."""
 
@@ -73,12 +72,6 @@ class Camera:
         Type of projection.
     name : str
         Name of the view.
-
-    Raises
-    ------
-    ValueError
-        If a shape is wrong, a number is not finite, a focal length is zero, the last row of K is
-        not (0, 0, 1), or R is not a rotation.
     """
 
     matrix: Array
@@ -310,11 +303,6 @@ def triangulate(
         Points with least squared pixel errors, weighted by sigma, m.
     covariance : array (..., 3, 3)
         Covariance of the points, m².
-
-    Raises
-    ------
-    ValueError
-        If shapes do not match, or a single camera looks along the plane z = 0.
     """
     pixels = numbers("pixels", pixels)
     if not cameras or pixels.ndim < 2 or pixels.shape[0] != len(cameras):
@@ -366,8 +354,7 @@ def _in_plane(camera: Camera, pixels: Array, sigma: ArrayLike) -> tuple[Array, A
 def _regularise(hessian: Array) -> Array:
     """Regularise Hessians, so that parallel rays have a finite, huge uncertainty; NaN is kept."""
     scale = np.trace(hessian, axis1=-2, axis2=-1)[..., None, None]
-    floored: Array = hessian + 1e-12 * scale * np.eye(3)
-    return floored
+    return np.asarray(hessian + 1e-12 * scale * np.eye(3))
 
 
 def _nearest_to_rays(cameras: Sequence[Camera], pixels: Array) -> Array:

@@ -34,7 +34,6 @@ __all__ = [
 ]
 __dir__ = __all__.copy
 
-
 ERRORS = ("error_r", "error_theta", "error_phi", "error_distance")
 """Names of the errors in r, θ, φ, and of the distance in space."""
 

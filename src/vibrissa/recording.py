@@ -1,6 +1,7 @@
 """Data model of a recording (all data of a trial), and accessors to its variables.
 
-Each variable is declared once, with its dimensions, frame, type and the groups that may contain it.
+Each variable is a row of ``recording.csv``: its dimensions, frame, type and the groups that may
+contain it, of which ``/`` is the root.
 
     /            measured or tracked variables of the trial, and the pose of the base
     /truth       true values of these and other variables (simulated trials only)
@@ -19,10 +20,12 @@ points are estimates. Units and long names are those of :mod:`vibrissa.quantitie
 
 from __future__ import annotations
 
+import csv
 import sys
 import warnings
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -37,11 +40,7 @@ from vibrissa.quantities import attributes, unit_fault
 from vibrissa.status import Event, Status, flag_attributes
 from vibrissa.whisker import Whisker
 
-__all__ = [
-    "VARIABLES",
-    "Group",
-    "Recording",
-]
+__all__ = ["VARIABLES", "Group", "Recording"]
 __dir__ = __all__.copy
 
 
@@ -60,86 +59,20 @@ class RecordedVariable:
     kind: str = "float"
 
 
-_EACH = ("time", "whisker")
-_VECTOR = (*_EACH, "space")
-_POINTS = (*_EACH, "node", "space")
-_TURN = (*_VECTOR, "whisker_axis")
-_SQUARE = (*_VECTOR, "space_")
-_IMAGE = (*_EACH, "view", "node", "image_axis")
-_ANGLES = ("base_azimuth", "base_elevation", "base_roll")
-
-_ANYWHERE = ("", "truth", "measured", "signals", "estimates")
-_POSED = ("", "truth", "measured", "signals")
-_FORCED = ("", "truth", "signals", "estimates")
-_TOP, _TRUTH, _MEASURED = ("",), ("truth",), ("measured",)
-_SIGNALS, _ESTIMATES = ("signals",), ("estimates",)
-_SEEN = ("", "truth")
-_LAB, _WHISKER, _HEAD = "laboratory", "whisker", "head"
+_TABLE = Path(__file__).with_suffix(".csv").read_text("utf-8")
+_VECTOR = ("time", "whisker", "space")
 
 VARIABLES: Mapping[str, RecordedVariable] = MappingProxyType(
     {
-        # Pose of the base and of the head
-        "base_position": RecordedVariable(_VECTOR, _POSED, _LAB),
-        "base_rotation": RecordedVariable(_TURN, _POSED),
-        **{name: RecordedVariable(_EACH, ("", "measured")) for name in _ANGLES},
-        "base_position_head": RecordedVariable(_VECTOR, _TOP, _HEAD),
-        "head_position": RecordedVariable(("time", "space"), _TOP, _LAB),
-        "head_rotation": RecordedVariable(("time", "space", "head_axis"), _TOP),
-        "pose_covariance": RecordedVariable((*_EACH, "pose", "pose_"), ("", "signals")),
-        "pose_shared": RecordedVariable((*_EACH, "error", "pose"), _TOP),
-        "unfiltered_base_position": RecordedVariable(_VECTOR, _MEASURED, _LAB),
-        **{f"unfiltered_{name}": RecordedVariable(_EACH, _MEASURED) for name in _ANGLES},
-        # Position of the whisker
-        "centerline": RecordedVariable(_POINTS, ("", "truth", "measured"), _LAB),
-        "centerline_sigma": RecordedVariable(_POINTS, _MEASURED),
-        "deviation": RecordedVariable(_EACH, _MEASURED),
-        "frame": RecordedVariable(("time", "view"), _TOP, kind="int"),
-        "trace": RecordedVariable(_IMAGE, _SEEN),
-        "trace_sigma": RecordedVariable(_IMAGE[:-1], _TOP),
-        "trace_visible": RecordedVariable(_IMAGE[:-1], _SEEN, kind="bool"),
-        "trace_confidence": RecordedVariable(_IMAGE[:-2], _TOP),
-        "trace_misfit": RecordedVariable(_EACH, _TOP),
-        # Contacts
-        "contact_point": RecordedVariable(_VECTOR, ("", "truth", "measured", "estimates"), _LAB),
-        "contact_point_whisker": RecordedVariable(_VECTOR, ("", "truth", "estimates"), _WHISKER),
-        "contact_covariance": RecordedVariable(_SQUARE, ("", "estimates"), _LAB),
-        "contact_shared": RecordedVariable((*_EACH, "error", "space"), ("", "estimates"), _LAB),
-        "covariance": RecordedVariable(_SQUARE, _ESTIMATES, _WHISKER),
-        "contact_normal": RecordedVariable(_VECTOR, _ESTIMATES, _LAB),
-        "normal_covariance": RecordedVariable(_SQUARE, _ESTIMATES, _LAB),
-        "point_normal_covariance": RecordedVariable(_SQUARE, _ESTIMATES, _LAB),
-        "arc_length": RecordedVariable(_EACH, ("", "truth", "measured", "estimates")),
-        "contact_difference": RecordedVariable(_EACH, _MEASURED),
-        "contact_force": RecordedVariable(_VECTOR, _TRUTH, _LAB),
-        "contact_object": RecordedVariable(_EACH, _TRUTH, kind="int"),
-        "surface_point": RecordedVariable(_VECTOR, _TRUTH, _LAB),
-        "surface_normal": RecordedVariable(_VECTOR, _TRUTH, _LAB),
-        "sliding": RecordedVariable(_EACH, _TRUTH, kind="bool"),
-        "overlap": RecordedVariable(_EACH, _TRUTH),
-        "second_contact": RecordedVariable(_EACH, _TRUTH, kind="bool"),
-        "friction_angle": RecordedVariable(_EACH, _ESTIMATES),
-        "one_contact": RecordedVariable(_EACH, _ESTIMATES),
-        "made_from": RecordedVariable(_EACH, ("signals", "estimates", "contour"), kind="int"),
-        "candidates": RecordedVariable(_EACH, _ESTIMATES, kind="int"),
-        "in_contact": RecordedVariable(_EACH, _ANYWHERE, kind="bool"),
-        "event": RecordedVariable(_EACH, _ESTIMATES, kind="int"),
-        "onset_time": RecordedVariable(_EACH, _ESTIMATES),
-        "onset_sigma": RecordedVariable(_EACH, _ESTIMATES),
-        "confidence": RecordedVariable(_EACH, ("", "truth")),
-        "status": RecordedVariable(_EACH, _ANYWHERE, kind="int"),
-        # Force, moment and signals at the base
-        "force": RecordedVariable(_VECTOR, _FORCED, _WHISKER),
-        "moment": RecordedVariable(_VECTOR, _FORCED, _WHISKER),
-        **{
-            name: RecordedVariable(_EACH, _SIGNALS) for name in ("Fx", "FT", "FD", "Mx", "MB", "MD")
-        },
-        "wrench_covariance": RecordedVariable(
-            (*_EACH, "component", "component_"), ("", "signals"), _WHISKER
-        ),
-        "wrench_shared": RecordedVariable((*_EACH, "error", "component"), _TOP, _WHISKER),
-        "pose_wrench_covariance": RecordedVariable((*_EACH, "pose", "component_"), ("", "signals")),
-        "reading": RecordedVariable((*_EACH, "channel"), _TOP),
-        "mixing": RecordedVariable(("channel", "component"), _TOP),
+        row["name"]: RecordedVariable(
+            tuple(row["dims"].split()),
+            tuple(group.strip("/") for group in row["groups"].split()),
+            row["frame"],
+            row["kind"],
+        )
+        for row in csv.DictReader(
+            Path(__file__).with_suffix(".csv").read_text("utf-8").splitlines()
+        )
     }
 )
 """Declarations of all variables over the frames of a recording, by name."""
@@ -344,11 +277,6 @@ class Group:
         -------
         Group
             Group without that dimension; the same group if it has none.
-
-        Raises
-        ------
-        ValueError
-            If there is no such whisker.
         """
         count = self.data.sizes.get("whisker", 1)
         if not 0 <= index < count:
@@ -455,11 +383,6 @@ class Recording:
         -------
         Whisker
             Whisker as it was recorded.
-
-        Raises
-        ------
-        ValueError
-            If the recording does not contain this whisker.
         """
         groups = self._whisker_groups()
         if not 0 <= index < len(groups):

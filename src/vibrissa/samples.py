@@ -13,13 +13,7 @@ from numpy.typing import NDArray
 
 from vibrissa.whisker import Whisker, parabola_curvature
 
-__all__ = [
-    "curved",
-    "curved_cylinder",
-    "gamma",
-    "straight",
-    "straight_cylinder",
-]
+__all__ = ["curved", "curved_cylinder", "gamma", "straight", "straight_cylinder"]
 __dir__ = __all__.copy
 
 LENGTH = 40e-3

@@ -15,15 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = [
-    "Event",
-    "Status",
-    "counted",
-    "describe",
-    "flag_attributes",
-    "is_ok",
-    "names",
-]
+__all__ = ["Event", "Status", "counted", "describe", "flag_attributes", "is_ok", "names"]
 __dir__ = __all__.copy
 
 
@@ -117,11 +109,6 @@ def describe(codes: ArrayLike) -> Counter[str]:
     collections.Counter
         Number of occurrences of each status, by its sentence.
 
-    Raises
-    ------
-    ValueError
-        If a number is not a status.
-
     Examples
     --------
     >>> for sentence, count in describe([0, 0, 2]).most_common():
@@ -154,11 +141,6 @@ def names(codes: ArrayLike) -> NDArray[np.str_]:
     -------
     array of str, same shape
         Name of each status.
-
-    Raises
-    ------
-    ValueError
-        If a number is not a status.
 
     Examples
     --------

@@ -14,7 +14,7 @@ from vibrissa.certificates import (
     check_certificate,
     checker,
     curved_checker,
-    grid,
+    domain,
     load_certificate,
     outlook,
     prove_witness,
@@ -376,7 +376,7 @@ def test_enclosures_are_a_few_times_as_wide_as_the_ranges(curved):
     found, _ = certificate.evaluate("interior", boxes, list(range(7)))
     inside = rng.random((24, 64, 3))
     at = boxes[:, None, :, 0] + np.diff(boxes)[:, None, :, 0] * inside
-    true = grid._conditions(curved, certificate.bounds, *np.moveaxis(at, -1, 0))
+    true = domain._conditions(curved, certificate.bounds, *np.moveaxis(at, -1, 0))
     known = np.isfinite(found).all(axis=(1, 2)) & ~np.isin(0.5, boxes[:, 0])
     centre, reach = found[..., 0].T[..., None], found[..., 1:].sum(axis=-1).T[..., None]
     assert known.sum() > 12

@@ -31,9 +31,9 @@ def run(tmp_path):
             import sys
             sys.path.insert(0, {str(tmp_path)!r})
             from apart import thrice, twice
-            from vibrissa.numerics import together
+            from vibrissa.numerics import kernel_cache
             {before}
-            together.compile_together([(twice, (1.0,))], [(thrice, (1.0,))])
+            kernel_cache.compile_together([(twice, (1.0,))], [(thrice, (1.0,))])
             assert (twice(2.0), thrice(2.0)) == (4.0, 6.0)
             for kernel in (twice, thrice):
                 print(kernel.py_func.__name__, sum(kernel.stats.cache_hits.values()))
@@ -58,14 +58,14 @@ def run(tmp_path):
 def test_a_helper_compiles_what_is_found_on_disk_here(run):
     assert run() == ["twice 0", "thrice 1"]
     # Another process finds both, and asks nobody.
-    nobody = "together.subprocess.Popen = None"
+    nobody = "kernel_cache.subprocess.Popen = None"
     assert run(nobody) == ["twice 1", "thrice 1"]
 
 
 @pytest.mark.parametrize(
     "why",
     [
-        pytest.param("together.threads = lambda: 1", id="one core"),
+        pytest.param("kernel_cache.threads = lambda: 1", id="one core"),
         pytest.param("sys.frozen = True", id="a frozen program", marks=pytest.mark.slow),
         pytest.param(
             "sys.executable = '/usr/bin/matlab'", id="embedded in a program", marks=pytest.mark.slow
@@ -75,7 +75,7 @@ def test_a_helper_compiles_what_is_found_on_disk_here(run):
     ],
 )
 def test_nobody_is_asked_where_that_gains_nothing(run, why):
-    assert run(f"together.subprocess.Popen = None; {why}") == ["twice 0", "thrice 0"]
+    assert run(f"kernel_cache.subprocess.Popen = None; {why}") == ["twice 0", "thrice 0"]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="the stand-ins for Python are shell scripts")
@@ -91,7 +91,7 @@ def test_a_helper_that_fails_or_hangs_is_done_without(run, tmp_path, does):
     helper = tmp_path / "python"
     helper.write_text(f"#!/bin/sh\n{does}\n")
     helper.chmod(0o755)
-    impatient = "together._PATIENCE = together._AT_LEAST = 0.01"
+    impatient = "kernel_cache._PATIENCE = kernel_cache._AT_LEAST = 0.01"
     assert run(f"sys.executable = {str(helper)!r}; {impatient}") == ["twice 0", "thrice 0"]
 
 
@@ -106,7 +106,7 @@ def test_no_folder_can_be_written_to(run):
         [
             "from numba.core.caching import NullCache",
             "thrice._cache = NullCache()",
-            "together.subprocess.Popen = None",
+            "kernel_cache.subprocess.Popen = None",
         ]
     )
     assert run(nowhere) == ["twice 0", "thrice 0"]

@@ -272,7 +272,7 @@ def test_contacts_do_not_depend_on_where_the_search_starts(monkeypatch):
     readings = readings + on[:, None] * np.array([1.0, -1.0, 1.0])
     found = []
     for start in (0.45, 0.85):
-        monkeypatch.setattr("vibrissa.sensors.swept._STARTS", (start,))
+        monkeypatch.setattr("vibrissa.sensors.suspended._STARTS", (start,))
         found.append(follow_sweep(off, readings, base, rest=np.zeros(3)).points)
     assert np.nanmax(np.abs(found[0] - found[1])) < 1e-7
 

@@ -5,11 +5,10 @@ import pytest
 from rows import RowFilm, scored
 
 from vibrissa.tracking import Trace, trace_video
-from vibrissa.tracking.trace.clutter import between_whiskers
-from vibrissa.tracking.trace.neighbours import neighbours
 from vibrissa.tracking.trace.ridge import measured, noise_level
 from vibrissa.tracking.trace.scene import Scene
-from vibrissa.tracking.trace.trace import TraceOptions
+from vibrissa.tracking.trace.trace import TraceOptions, between_whiskers
+from vibrissa.tracking.trace.video import neighbours
 
 
 @pytest.fixture(scope="module")

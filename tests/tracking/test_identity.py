@@ -6,9 +6,15 @@ import numpy as np
 import pytest
 
 from vibrissa.tracking import Trace
-from vibrissa.tracking.trace.crossings import settle_crossings
 from vibrissa.tracking.trace.follower import FEATURES, Appearance, features_of
-from vibrissa.tracking.trace.identity import LOST, Assignment, Seen, decided, sideways
+from vibrissa.tracking.trace.identity import (
+    LOST,
+    Assignment,
+    Seen,
+    decided,
+    settle_crossings,
+    sideways,
+)
 from vibrissa.tracking.trace.trace import TraceOptions, overlap
 
 BASES = np.array([[20.0, 60.0], [20.0, 72.0]])

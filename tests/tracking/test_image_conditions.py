@@ -14,8 +14,8 @@ from vibrissa.tracking import (
     trace_video,
     track,
 )
+from vibrissa.tracking.recording import remarks_on
 from vibrissa.tracking.refine.least_squares import trace_variance
-from vibrissa.tracking.remarks import remarks_on
 from vibrissa.tracking.space.frame_pairs import clear_offsets
 from vibrissa.tracking.space.rest_shape import (
     Length,

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from vibrissa.cameras import Camera, orthogonal_views
 from vibrissa.tracking import Trace, low_pass, merge, paired_frames, usual_cutoff
-from vibrissa.tracking.remarks import remarks_on_time
+from vibrissa.tracking.recording import remarks_on_time
 from vibrissa.tracking.space.curve import begun_together
 from vibrissa.tracking.space.exchange import Known, exchanged
 from vibrissa.tracking.space.frame_pairs import clear_offsets

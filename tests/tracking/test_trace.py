@@ -7,11 +7,10 @@ from scipy.ndimage import gaussian_filter
 from vibrissa.status import Status
 from vibrissa.tracking import Trace, TraceOptions, find_whiskers, trace_video
 from vibrissa.tracking.trace import ridge
-from vibrissa.tracking.trace.clutter import Clutter
 from vibrissa.tracking.trace.curves import find_curves
 from vibrissa.tracking.trace.ends import traced
 from vibrissa.tracking.trace.scene import Scene
-from vibrissa.tracking.trace.trace import doubtful_frames, given
+from vibrissa.tracking.trace.trace import Clutter, doubtful_frames, given
 
 
 @pytest.fixture(scope="module")

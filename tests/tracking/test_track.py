@@ -197,7 +197,7 @@ def test_light_contacts_begin_near_those_of_the_frames_before_and_after():
 
 def test_a_lower_minimum_along_the_whisker_is_found():
     """The fit is stopped where the contact is a millimetre from the one that was pressed."""
-    from vibrissa.tracking.refine.profile import profiled
+    from vibrissa.tracking.refine.fit import profiled
 
     whisker = Whisker.parabola(length=30e-3, coefficient=10.0)
     fitter, pose, _, s = pressed(whisker)
@@ -212,8 +212,8 @@ def test_a_lower_minimum_along_the_whisker_is_found():
 
 
 def test_a_profile_ends_where_no_rod_is_in_equilibrium(monkeypatch):
+    from vibrissa.tracking.refine.fit import profiled
     from vibrissa.tracking.refine.problem import Problem
-    from vibrissa.tracking.refine.profile import profiled
 
     whisker = Whisker.parabola(length=30e-3, coefficient=10.0)
     fitter, pose, _, _ = pressed(whisker)

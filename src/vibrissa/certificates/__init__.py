@@ -2,7 +2,7 @@
 
 from vibrissa.certificates.certificate import KIND, TRIPLET, Certificate, certify, load_certificate
 from vibrissa.certificates.checker import Checked, check_certificate
-from vibrissa.certificates.grid import Outlook, outlook, smallest_cone
+from vibrissa.certificates.domain import Outlook, outlook, smallest_cone
 from vibrissa.certificates.witness import Witness, prove_witness
 
 __all__ = [

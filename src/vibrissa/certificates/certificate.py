@@ -36,9 +36,8 @@ from vibrissa.certificates.conditions import (
     spatial_conditions,
     spatial_point_conditions,
 )
-from vibrissa.certificates.domain import Bounds, bounds_of, is_planar, room_within
+from vibrissa.certificates.domain import Bounds, bounds_of, is_planar, objection, room_within
 from vibrissa.certificates.equations import ExactRod, exact_rod
-from vibrissa.certificates.grid import objection
 from vibrissa.certificates.search import bounds, cover, volume
 from vibrissa.io import read_dataset, write_netcdf
 from vibrissa.numerics import Array, IntArray, share_out
@@ -372,11 +371,6 @@ class Certificate:
         -------
         Certificate
             Certificate that was converted.
-
-        Raises
-        ------
-        ValueError
-            If the dataset is not a certificate, or its numbers have been modified.
         """
         if data.attrs.get("kind") != KIND:
             raise ValueError(

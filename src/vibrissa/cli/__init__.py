@@ -11,7 +11,5 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from vibrissa.cli.app import main
 
-__all__ = [
-    "main",
-]
+__all__ = ["main"]
 __dir__ = __all__.copy

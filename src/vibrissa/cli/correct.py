@@ -17,12 +17,7 @@ _ENDLESS = 1 << 31  # assumed number of frames of a video that does not state it
 
 
 @with_options("corrections, .csv, which are added to those that it holds already")
-def correct(
-    video: Path,
-    target: Path,
-    trace: Path | None = None,
-    view: int = 0,
-) -> None:
+def correct(video: Path, target: Path, trace: Path | None = None, view: int = 0) -> None:
     """Click the correct trace of a whisker in some frames, for `vibrissa track --corrections`.
 
     Click points from base to tip; the arrow keys change the frame, s saves, q saves and closes; the

@@ -144,10 +144,7 @@ def _print_signals(sensed: Located, seen: Located) -> None:
 
 
 def _print_errors(
-    title: str,
-    first: str,
-    rows: Sequence[vb.evaluation.ErrorRow],
-    noise: bool,
+    title: str, first: str, rows: Sequence[vb.evaluation.ErrorRow], noise: bool
 ) -> None:
     """Print actual errors and, with noise, predicted ones."""
     cells: list[Row] = []

@@ -57,10 +57,7 @@ _PACKAGES = ("numpy", "scipy", "numba", "xarray", "h5netcdf", "matplotlib")
 
 
 @with_options()
-def info(
-    path: Path | None = None,
-    all_: bool = False,
-) -> None:
+def info(path: Path | None = None, all_: bool = False) -> None:
     """List versions and settings of this installation, or describe the contents of a file.
 
     For a recording these are its origin, duration, contacts, stages and object. With --all, groups

@@ -21,7 +21,6 @@ from vibrissa.deferred import xr
 _LARGEST = 15_000_000  # size of a page up to which movies are embedded, bytes
 _TAGS = 10_000  # size reserved for the names and tags of movies, bytes
 
-
 # Title, sections, script and figures of a page.
 _Content: TypeAlias = "tuple[str, list[vb.report.Section], str, Mapping[str, Draw]]"
 

@@ -211,10 +211,7 @@ def clicks_of(recording: Path) -> Path:
 
 
 def _picked(
-    videos: Sequence[Path],
-    names: Sequence[str],
-    file: Path,
-    clicks: vb.io.Clicks | None,
+    videos: Sequence[Path], names: Sequence[str], file: Path, clicks: vb.io.Clicks | None
 ) -> vb.io.Clicks:
     """Open a window with the first frames, and save the clicks."""
     images = [next(iter(vb.io.read_video(video))) for video in videos]

@@ -43,16 +43,14 @@ from vibrissa.contacts.following.filter import ContactFilter, Followed as Follow
 from vibrissa.contacts.joint.forward import Gravity, read_at_rest as read_at_rest
 from vibrissa.contacts.joint_estimate import estimate_jointly as estimate_jointly
 from vibrissa.contacts.sensing.channels import (
+    RANK,
     WRENCH,
     Channels,
     channel_derivatives as channel_derivatives,
     channel_gradients as channel_gradients,
-    ratio_derivatives as ratio_derivatives,
-)
-from vibrissa.contacts.sensing.jacobian import (
-    RANK,
     contact_signal_derivatives as contact_signal_derivatives,
     deficient as deficient,
+    ratio_derivatives as ratio_derivatives,
     spherical_derivatives as spherical_derivatives,
 )
 from vibrissa.contacts.sensing.noise import (

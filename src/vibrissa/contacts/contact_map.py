@@ -24,7 +24,7 @@ from vibrissa.contacts.engine.search import estimate
 from vibrissa.contacts.fitting.inversion import triplet_tree
 from vibrissa.contacts.joint.forward import Gravity
 from vibrissa.contacts.joint_estimate import estimate_jointly
-from vibrissa.contacts.sensing.jacobian import determining
+from vibrissa.contacts.sensing.channels import determining
 from vibrissa.contacts.sensing.noise import common_errors
 from vibrissa.contacts.wrench import estimate_components
 from vibrissa.deferred import xr

@@ -34,13 +34,7 @@ from vibrissa.contacts.wrench import PROXIMAL, by_probability, chosen, estimate_
 from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod import Discretization, Resting, solve_forces
-from vibrissa.signals import (
-    SIGNALS,
-    labelled_wrench,
-    measured,
-    selection,
-    signal_scales,
-)
+from vibrissa.signals import SIGNALS, labelled_wrench, measured, selection, signal_scales
 from vibrissa.status import Status
 from vibrissa.whisker import Whisker
 

@@ -101,10 +101,7 @@ def _draw_distances(
 
 
 def distances_by(
-    compared: xr.Dataset,
-    quantity: str,
-    values: ArrayLike,
-    edges: ArrayLike | None = None,
+    compared: xr.Dataset, quantity: str, values: ArrayLike, edges: ArrayLike | None = None
 ) -> xr.Dataset:
     """Summarise absolute distances by classes of another quantity.
 

@@ -2,7 +2,7 @@
 
 Three signals T locate the contact point p, so ∂p/∂T is the effect of a small change of a signal on
 the estimate: noise of covariance Σ gives p the covariance ∂p/∂T Σ (∂p/∂T)ᵀ, an ellipsoid. The
-derivatives are exact (:mod:`vibrissa.contacts.sensing.jacobian`); for those of Huet, Emnett &
+derivatives are exact (:mod:`vibrissa.contacts.sensing.channels`); for those of Huet, Emnett &
 Hartmann (2022) on an interpolated table see :func:`vibrissa.paper.central_differences`.
 
 Toward rest, where force and moment vanish and directions become undefined, the derivatives diverge.
@@ -259,10 +259,7 @@ def best_triplet(
 
 
 def _predicted_errors(
-    contact_map: ContactMap,
-    chosen: ChosenContacts,
-    names: tuple[str, ...],
-    sensor: SensorNoise,
+    contact_map: ContactMap, chosen: ChosenContacts, names: tuple[str, ...], sensor: SensorNoise
 ) -> Array:
     """Predicted RMS 3D errors (n,), m; NaN where the triplet does not determine the contact."""
     d = contact_map.chart.discretization

@@ -276,11 +276,7 @@ def triplet_derivatives(values: Array, tangents: Array, names: tuple[str, ...]) 
 
 
 def twins(
-    contact_map: ContactMap,
-    names: tuple[str, ...],
-    chart: Array,
-    first: ContactSet,
-    domain: Domain,
+    contact_map: ContactMap, names: tuple[str, ...], chart: Array, first: ContactSet, domain: Domain
 ) -> Pairs:
     """Find all twins of contacts ``first`` at chart coordinates (n, 3)."""
     targets = first.signals[:, signal_columns(names)]
@@ -530,11 +526,6 @@ def witness_pairs(
     xarray.Dataset
         Dims pair, node, space: ``rest`` and ``centerline`` of both whiskers, ``contact_point``,
         ``force``, ``arc_length`` and the six signals.
-
-    Raises
-    ------
-    ValueError
-        If the verdicts belong to another whisker.
     """
     if not set(verdicts.data_vars) >= _NEEDED:
         return

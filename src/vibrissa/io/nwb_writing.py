@@ -58,7 +58,6 @@ _NOT_OF = "As recorded; that of the {0} is the series with {0} before its name"
 # Fields of the subject that validators require, with values that stand for unknown.
 _NOBODY = {"subject_id": "unknown", "sex": "U", "age": "P0D/", "description": "not stated"}
 
-
 _VECTORS = 2  # number of dimensions of vectors over time
 
 
@@ -198,10 +197,7 @@ def _file(session: Session) -> NWBFile:
 
 
 def _fill(
-    file: NWBFile,
-    data: xr.Dataset,
-    cameras: xr.Dataset | None,
-    predictors: xr.Dataset | None,
+    file: NWBFile, data: xr.Dataset, cameras: xr.Dataset | None, predictors: xr.Dataset | None
 ) -> None:
     from ndx_pose import Skeletons
 

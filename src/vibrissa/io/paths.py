@@ -25,10 +25,8 @@ NETCDF = (".nc", ".nc4", ".netcdf", ".cdf", ".h5", ".hdf5")  # endings of NetCDF
 CSV = (".csv",)  # endings of tables as text
 NWB = (".nwb",)  # endings of Neurodata Without Borders files
 
-
 # First bytes of whisk's binary files, and the names of these files.
 _WHISK = {b"bwhiskbin": "traces of whisk (.whiskers)", b"measv": "measurements of whisk"}
-
 
 _VIDEO_PART = re.compile(r"^(?P<file>.+)#(?P<part>\d+,\d+,\d+,\d+(?::[a-z]+)*)$", re.DOTALL)
 

@@ -212,10 +212,7 @@ class ContactBag:
     """
 
     def __init__(
-        self,
-        path: str | PathLike[str],
-        frame: str = "whisker",
-        whiskers: Sequence[str] = ("",),
+        self, path: str | PathLike[str], frame: str = "whisker", whiskers: Sequence[str] = ("",)
     ) -> None:
         self._types = _library().types
         self._path = Path(path)

@@ -171,11 +171,6 @@ def save_signals(path: str | PathLike[str], signals: xr.Dataset) -> None:
         Path of the table; an existing file is replaced.
     signals : xarray.Dataset
         Dims time, space: ``force`` and ``moment``.
-
-    Raises
-    ------
-    ValueError
-        If the dataset has other dims or lacks a variable.
     """
     missing = [name for name in ("time", "force", "moment") if name not in signals.variables]
     if missing:
@@ -329,11 +324,6 @@ def save_contacts(
     contacts : xarray.Dataset, or mapping of name to array (n,)
         Dim time; a variable for each column. Columns that it lacks are written as missing, but
         ``time``, ``x``, ``y``, ``z`` and ``status`` must be there.
-
-    Raises
-    ------
-    ValueError
-        If a needed variable is not there, or one has another dim.
     """
     numbers = (*NUMBERS, *(name for name in _OPTIONAL if name in contacts))
     flags = (*(name for name in _FLAGS if name in contacts), "status")
@@ -395,19 +385,7 @@ def load_contacts(path: str | PathLike[str]) -> xr.Dataset:
 
 
 def events_in(contacts: xr.Dataset) -> Iterator[tuple[float, str, str, float]]:
-    """List the events of contacts, frame by frame.
-
-    Parameters
-    ----------
-    contacts : xarray.Dataset
-        Group ``estimates`` of a recording, or predictors.
-
-    Yields
-    ------
-    (float, str, str, float)
-        Time, s, name of the whisker, ``onset``, ``loss`` or ``slip``, and the standard deviation of
-        an onset, s, NaN if unknown.
-    """
+    """Yield time, s, whisker, event and an onset's standard deviation, s, of events, in order."""
     names = ("event", "onset_time", "onset_sigma")
     if not set(names) <= set(contacts):
         return
@@ -428,7 +406,6 @@ CONTOUR = (
     *("surface_distance", "inlier"),
 )
 
-
 MATLAB_PREDICTORS = b"MATLAB 5.0 MAT-file, table of predictors by vibrissa"
 
 
@@ -442,11 +419,6 @@ def save_contour(path: str | PathLike[str], contour: xr.Dataset) -> None:
     contour : xarray.Dataset
         Dim contact; a variable for each column. Those that it lacks are written as missing, but
         ``time``, ``x``, ``y`` and ``z`` must be there.
-
-    Raises
-    ------
-    ValueError
-        If a needed variable is not there, or one has another dim.
     """
     content = _contour_content(contour)
     with replacing(path) as part:

@@ -412,10 +412,7 @@ _FULL, _TELEVISION, _HD = 2, 1, 1
 
 
 def write_video(
-    path: str | PathLike[str],
-    frames: Iterable[Frame],
-    rate: float = 50.0,
-    quality: int = QUALITY,
+    path: str | PathLike[str], frames: Iterable[Frame], rate: float = 50.0, quality: int = QUALITY
 ) -> int:
     """Write a grey video, and return the number of frames.
 
@@ -460,14 +457,6 @@ def write_movie(path: str | PathLike[str], frames: Iterable[Frame], rate: float 
     -------
     int
         Number of frames written.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the folder does not exist.
-    ValueError
-        If the ending is another, the rate is not positive, there is no frame, or frames differ in
-        size or type or have an odd size.
     """
     import av
 

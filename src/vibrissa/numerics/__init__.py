@@ -55,7 +55,7 @@ if TYPE_CHECKING:
         vectorised as vectorised,
     )
     from vibrissa.numerics.device import Translation as Translation, check_device as check_device
-    from vibrissa.numerics.together import compile_together as compile_together
+    from vibrissa.numerics.kernel_cache import compile_together as compile_together
 
 __all__ = [
     "AnyArray",
@@ -77,6 +77,6 @@ __getattr__ = names_from(
         ),
         "compiled": "copy inlined inlined_rigorous kernel rigorous shared specialised vectorised",
         "device": "Translation check_device",
-        "together": "compile_together",
+        "kernel_cache": "compile_together",
     },
 )

@@ -42,7 +42,6 @@ _OPTIONS: dict[str, Any] = {
     "fastmath": _FASTMATH,
 }
 
-
 #: Whether llvmlite supports function attributes; older versions attach them to return values, which
 #: LLVM rejects.
 _ATTRIBUTES = tuple(map(int, llvmlite.__version__.split(".")[:2])) >= (0, 48)

@@ -16,12 +16,5 @@ from vibrissa.objects.surface import (
     listed_objects as listed_objects,
 )
 
-__all__ = [
-    "Box",
-    "Mesh",
-    "Peg",
-    "Plane",
-    "Sphere",
-    "Surface",
-]
+__all__ = ["Box", "Mesh", "Peg", "Plane", "Sphere", "Surface"]
 __dir__ = __all__.copy

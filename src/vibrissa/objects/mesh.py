@@ -54,11 +54,6 @@ class Mesh(Surface):
     stiffness : float
         Force over indentation, N/m; infinite if rigid.
 
-    Raises
-    ------
-    ValueError
-        If values are missing, the mesh is not closed, or the resolution needs too large a grid.
-
     Examples
     --------
     >>> corners = [[0, 0, 0], [4e-3, 0, 0], [0, 4e-3, 0], [0, 0, 4e-3]]
@@ -154,8 +149,7 @@ class Mesh(Surface):
     @property
     def origin(self) -> Array:
         """Centre of the bounding box, m."""
-        middle: Array = 0.5 * (self.vertices.min(axis=0) + self.vertices.max(axis=0))
-        return middle
+        return np.asarray(0.5 * (self.vertices.min(axis=0) + self.vertices.max(axis=0)))
 
     def _distance(self, points: Array) -> Array:
         at = (points - self._low) / self._step

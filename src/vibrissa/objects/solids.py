@@ -177,8 +177,7 @@ class Sphere(Surface):
         _set_fields(self, _Faults("sphere"))
 
     def _distance(self, points: Array) -> Array:
-        distance: Array = np.linalg.norm(points - self.origin, axis=-1) - self.radius
-        return distance
+        return np.asarray(np.linalg.norm(points - self.origin, axis=-1) - self.radius)
 
     def _geometry(self, point: Array) -> tuple[float, Array, Array]:
         away = point - self.origin
@@ -220,8 +219,7 @@ class Plane(Surface):
         _set_fields(self, _Faults("plane"))
 
     def _distance(self, points: Array) -> Array:
-        distance: Array = (points - self.origin) @ self.normal
-        return distance
+        return np.asarray((points - self.origin) @ self.normal)
 
     def _geometry(self, point: Array) -> tuple[float, Array, Array]:
         return float((point - self.origin) @ self.normal), self.normal, np.zeros((3, 3))
@@ -251,12 +249,6 @@ class Box(Surface):
     stiffness : float
         Force over indentation, N/m; infinite if rigid. A compliant box needs an edge radius larger
         than its indentation, because a sharp edge has no normal inside.
-
-    Raises
-    ------
-    ValueError
-        If a value is missing, the rotation is invalid, an edge or the stiffness is not positive, or
-        the edge radius is more than half of an edge.
 
     Examples
     --------
@@ -291,8 +283,7 @@ class Box(Surface):
         beyond = np.abs((points - self.origin) @ self.rotation)
         beyond = beyond - (0.5 * self.size - self.edge_radius)
         outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1)
-        distance: Array = outside + np.minimum(beyond.max(axis=-1), 0.0) - self.edge_radius
-        return distance
+        return np.asarray(outside + np.minimum(beyond.max(axis=-1), 0.0) - self.edge_radius)
 
     def _geometry(self, point: Array) -> tuple[float, Array, Array]:
         local = (point - self.origin) @ self.rotation

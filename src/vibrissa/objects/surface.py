@@ -79,8 +79,7 @@ class Placement(NamedTuple):
 
     def outside(self, points: Array) -> Array:
         """Transform points from the whisker's to the surfaces' frame."""
-        moved: Array = points @ self.rotation.T + self.position
-        return moved
+        return np.asarray(points @ self.rotation.T + self.position)
 
 
 def between(before: Placement, now: Placement, share: float) -> Placement:

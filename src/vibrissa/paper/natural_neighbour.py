@@ -199,13 +199,7 @@ def _slot_of(v: int, found: Found, count: IntArray) -> int:
 
 @kernel
 def sibson_weights(
-    mesh: Mesh,
-    query: Array,
-    start: int,
-    mark: int,
-    marks: IntArray,
-    cavity: IntArray,
-    found: Found,
+    mesh: Mesh, query: Array, start: int, mark: int, marks: IntArray, cavity: IntArray, found: Found
 ) -> int:
     """Compute the weights of the query's neighbours; return their number.
 

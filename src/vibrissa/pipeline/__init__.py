@@ -19,11 +19,7 @@ from vibrissa.pipeline.estimates import (
     swept_recording as swept_recording,
     with_events as with_events,
 )
-from vibrissa.pipeline.locate import (
-    locate,
-    locate_around,
-    locate_from_wrench,
-)
+from vibrissa.pipeline.locate import locate, locate_around, locate_from_wrench
 from vibrissa.pipeline.predictors import PREDICTORS as PREDICTORS, predictors
 from vibrissa.pipeline.reconstruct import (
     AGREES as AGREES,

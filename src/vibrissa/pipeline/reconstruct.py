@@ -250,11 +250,6 @@ def fit_contacts(
     CylinderFit, SphereFit, PlaneFit or FreeFit
         Fitted shape. Contacts are weighted by their covariance, where known, and the direction of
         the force serves as the surface normal. Rows are frames × whiskers.
-
-    Raises
-    ------
-    ValueError
-        If there are too few contacts, or they do not determine the shape.
     """
     _check_shape(shape)
     if axis is not None and shape != "cylinder":
@@ -328,10 +323,7 @@ def _rows(variable: xr.DataArray) -> Array:
 
 
 def _compared(
-    fit: FittedShape,
-    estimates: xr.Dataset,
-    whiskers: Sequence[Whisker],
-    objects: Sequence[Surface],
+    fit: FittedShape, estimates: xr.Dataset, whiskers: Sequence[Whisker], objects: Sequence[Surface]
 ) -> dict[str, Any]:
     """Variables that compare contacts and fit with the known object nearest to the contacts."""
     number = nearest_object(estimates, whiskers, objects)
@@ -466,11 +458,6 @@ def compare_contacts(
         ``surface_distance_predicted`` (`vibrissa.contour.compare_with`); ``deflection_angle`` and
         ``r`` of each contact and, if there are signals, ``MB``. The attribute ``object`` is the
         index of the object.
-
-    Raises
-    ------
-    ValueError
-        If there are no estimates, no contacts or no objects.
     """
     estimates = estimates_in(recording)
     trial, contacts = Recording(recording), Group(estimates)

@@ -302,11 +302,6 @@ def placed_by(signals: xr.Dataset, recording: xr.DataTree) -> xr.Dataset:
         Signals at the times and with the whisker names of the tracked recording, with its
         ``base_position``, ``base_rotation`` and, if known, ``pose_covariance``. Each frame has the
         signals nearest in time, or none if these are more than half a sampling interval away.
-
-    Raises
-    ------
-    ValueError
-        If the numbers of whiskers differ, or there is no pose.
     """
     check_recording(recording)
     root = recording.to_dataset()
@@ -419,11 +414,7 @@ def _pose_covariance(own: Group, rotation: Array, position: Array) -> Array:
 
 
 def signals_by_point(
-    one: Group,
-    given: Array | None,
-    pose: Pose,
-    whisker: Whisker,
-    proximal: float,
+    one: Group, given: Array | None, pose: Pose, whisker: Whisker, proximal: float
 ) -> xr.Dataset:
     """Signals of the frictionless rod through the tracked or tabulated contact points."""
     rotation, position = pose.rotation, pose.position

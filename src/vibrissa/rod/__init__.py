@@ -10,24 +10,23 @@ from vibrissa.rod.around import (
     around as around,
     deflect_around,
 )
-from vibrissa.rod.balance import (
-    Balance as Balance,
-    balance_rows as balance_rows,
-    balanced as balanced,
-)
 from vibrissa.rod.chart import (
     CELLS,
     LEAST_ARC,
     PROXIMAL,
+    Charted as Charted,
     Fold as Fold,
     StableSet as StableSet,
     along,
     chart_of as chart_of,
     chart_to_contact as chart_to_contact,
+    charted_rod as charted_rod,
     contacts_at,
     determinant as determinant,
     fold_force,
     fold_forces,
+    interpolant as interpolant,
+    interpolate as interpolate,
     stable_set,
     with_normal_force as with_normal_force,
 )
@@ -47,12 +46,6 @@ from vibrissa.rod.gravity import (
     resting,
 )
 from vibrissa.rod.integration import contact_tangents, evaluate, integrate, solve_forces
-from vibrissa.rod.interpolation import (
-    Charted as Charted,
-    charted_rod as charted_rod,
-    interpolant as interpolant,
-    interpolate as interpolate,
-)
 from vibrissa.rod.kernels import (
     BUFFER_SIZE,
     LANES,
@@ -93,7 +86,14 @@ from vibrissa.rod.surfaces import (
     SurfaceDeflection as SurfaceDeflection,
     follow_surfaces as follow_surfaces,
 )
-from vibrissa.rod.tree import PlaneVector as PlaneVector, SearchTree as SearchTree, search_tree
+from vibrissa.rod.tree import (
+    Balance as Balance,
+    PlaneVector as PlaneVector,
+    SearchTree as SearchTree,
+    balance_rows as balance_rows,
+    balanced as balanced,
+    search_tree,
+)
 
 __all__ = [
     "BUFFER_SIZE",

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 
 from vibrissa.numerics import Array, IntArray, copy, inlined, vectorised, wrapped
-from vibrissa.rod.balance import balanced
 from vibrissa.rod.cell import (
     CELL_BUFFER,
     fold_sides,
@@ -25,7 +24,7 @@ from vibrissa.rod.cell import (
     set_target,
     turned_difference,
 )
-from vibrissa.rod.tree import SearchTree
+from vibrissa.rod.tree import SearchTree, balanced
 
 #: Largest number of contacts found for one target.
 MOST_SEEDS = 64

@@ -28,9 +28,13 @@ from vibrissa.sensors.sensor import (
     component_noise as component_noise,
 )
 from vibrissa.sensors.stiffness import StiffnessFit, fit_stiffness
-from vibrissa.sensors.suspended import SuspendedWhisker, Touches as Touches
+from vibrissa.sensors.suspended import (
+    SuspendedWhisker,
+    SweptContacts,
+    Touches as Touches,
+    follow_sweep,
+)
 from vibrissa.sensors.suspension import SuspensionCalibration, calibrate_suspension
-from vibrissa.sensors.swept import SweptContacts, follow_sweep
 
 __all__ = [
     "COMPONENTS",

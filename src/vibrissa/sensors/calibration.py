@@ -30,12 +30,7 @@ from vibrissa.numerics import Array, Mask, cross_matrix, numbers, rotation_matri
 from vibrissa.sensors.frame import SensorFrame
 from vibrissa.sensors.regression import Solution, solve, warn_of_misfit
 from vibrissa.sensors.sensor import COMPONENTS, GRAVITY, Sensor, with_offset
-from vibrissa.sensors.stiffness import (
-    deflections_to,
-    spread_of_points,
-    wrench_slopes,
-    wrenches_of,
-)
+from vibrissa.sensors.stiffness import deflections_to, spread_of_points, wrench_slopes, wrenches_of
 from vibrissa.whisker import Whisker
 
 _ROUNDING = 1e-6  # relative size below which components of a force or moment are set to zero

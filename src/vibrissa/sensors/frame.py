@@ -159,11 +159,7 @@ class FrameCalibration:
 
 
 def calibrate_frame(
-    readings: ArrayLike,
-    wrenches: ArrayLike,
-    *,
-    force_noise: float,
-    moment_noise: float,
+    readings: ArrayLike, wrenches: ArrayLike, *, force_noise: float, moment_noise: float
 ) -> FrameCalibration:
     """Fit the frame of a six-component sensor to known loads.
 

@@ -254,10 +254,7 @@ class Sensor:
         return np.concatenate([self.mass * g, np.cross(self.mass_moment, g)], axis=-1)
 
     def compensated(
-        self,
-        readings: ArrayLike,
-        rotation: ArrayLike | None = None,
-        gravity: ArrayLike = GRAVITY,
+        self, readings: ArrayLike, rotation: ArrayLike | None = None, gravity: ArrayLike = GRAVITY
     ) -> Array:
         """Remove offset and weight from readings, which leaves H (F, M) of the contact and noise.
 
@@ -293,10 +290,7 @@ class Sensor:
         return np.asarray(values - self.weight(rotation, gravity) @ self.base_mixing.T)
 
     def to_wrench(
-        self,
-        readings: ArrayLike,
-        rotation: ArrayLike | None = None,
-        gravity: ArrayLike = GRAVITY,
+        self, readings: ArrayLike, rotation: ArrayLike | None = None, gravity: ArrayLike = GRAVITY
     ) -> tuple[Array, Array]:
         """Estimate force and moment at the whisker's base by weighted least squares.
 
@@ -335,11 +329,7 @@ class Sensor:
         return np.asarray(wrench), np.asarray(back @ self.covariance() @ back.T)
 
     def read(
-        self,
-        time: ArrayLike,
-        wrench: ArrayLike,
-        seed: int = 0,
-        rotation: ArrayLike | None = None,
+        self, time: ArrayLike, wrench: ArrayLike, seed: int = 0, rotation: ArrayLike | None = None
     ) -> Array:
         """Simulate readings of a wrench over time.
 

@@ -50,7 +50,6 @@ _DIFFERENCE = 1e-4  # of logarithms, in finite differences
 _TYPICAL_NOISE = 0.01  # noise of channels without stated noise, relative to their readings
 _IN_OTHER_UNITS = 300.0  # factor of the stated stiffness above which units are in question
 
-
 # Taper, stiffness factor, base spring, covariance and residuals.
 _Fit = tuple[float, float, float | None, Array, Array]
 

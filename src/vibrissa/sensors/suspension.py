@@ -154,11 +154,6 @@ def calibrate_suspension(
     -------
     SuspensionCalibration
         Calibrated sensor, with covariances.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not match, or there are too few touches or no signal.
     """
     p, y = numbers("points", points), numbers("readings", readings, channels or ())
     if p.ndim != 2 or p.shape[1] != 3 or y.ndim != 2 or len(y) != len(p):
@@ -370,11 +365,7 @@ class _Problem:
         return out
 
     def solved(
-        self,
-        names: tuple[str, ...],
-        rest: Array,
-        known: AnyArray,
-        starts: Sequence[Any] = _STARTS,
+        self, names: tuple[str, ...], rest: Array, known: AnyArray, starts: Sequence[Any] = _STARTS
     ) -> SuspensionCalibration:
         """Fit the model and return the calibration."""
         at = self.minimise(starts)

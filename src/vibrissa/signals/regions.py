@@ -18,11 +18,55 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vibrissa.numerics import AnyArray, Array, vectors
-from vibrissa.whisker import nearest_on_chords
+from vibrissa.numerics import AnyArray, Array, inlined, kernel, vectors
 
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
+
+
+@inlined
+def _squared_distance(
+    nodes: Array, a: int, b: int, x: float, y: float, z: float
+) -> tuple[float, float]:
+    """Squared distance of a point from the chord between two nodes, and position on the chord."""
+    cx, cy, cz = nodes[b, 0] - nodes[a, 0], nodes[b, 1] - nodes[a, 1], nodes[b, 2] - nodes[a, 2]
+    x, y, z = x - nodes[a, 0], y - nodes[a, 1], z - nodes[a, 2]
+    t = min(max((cx * x + cy * y + cz * z) / (cx * cx + cy * cy + cz * cz), 0.0), 1.0)
+    x, y, z = x - t * cx, y - t * cy, z - t * cz
+    return x * x + y * y + z * z, t
+
+
+@kernel
+def _nearest_on_chords(
+    nodes: Array, bulge: Array, points: Array, distance: Array, position: Array
+) -> None:
+    """Compute distances (n,) of points (n, 3) from the polyline, and positions along it.
+
+    Positions are in units of nodes. ``bulge`` (m,) bounds the distance of the chords in each of m
+    equal blocks from the block's own chord, so that most blocks need not be searched.
+    """
+    blocks = bulge.shape[0]
+    size = (nodes.shape[0] - 1) // blocks
+    squares = np.empty(blocks)
+    for row in range(points.shape[0]):
+        x, y, z = points[row, 0], points[row, 1], points[row, 2]
+        least, first = np.inf, 0
+        for k in range(blocks):
+            squares[k] = _squared_distance(nodes, k * size, (k + 1) * size, x, y, z)[0]
+            if squares[k] < least:
+                least, first = squares[k], k
+        best, away, at = np.inf, np.inf, np.nan
+        for n in range(-1, blocks if least < np.inf else -1):  # first the nearest block, then all
+            k = first if n < 0 else n
+            if n == first or squares[k] > (away + bulge[k]) ** 2:
+                continue
+            for j in range(k * size, (k + 1) * size):
+                square, t = _squared_distance(nodes, j, j + 1, x, y, z)
+                if square < best:
+                    best, at = square, j + t
+            away = np.sqrt(best)
+        distance[row], position[row] = away if best < np.inf else np.nan, at
+
 
 #: Half angle of the cone that the paper excludes, rad.
 CONE = np.deg2rad(2.0)
@@ -79,7 +123,7 @@ def nearest_on_rest(whisker: Whisker, points: Array) -> tuple[Array, Array]:
     s, points_at_rest, bulge, _ = resting(whisker)
     distance, position = np.empty(points.shape[:-1]), np.empty(points.shape[:-1])
     flat = np.ascontiguousarray(points.reshape(-1, 3))
-    nearest_on_chords(points_at_rest, bulge, flat, distance.reshape(-1), position.reshape(-1))
+    _nearest_on_chords(points_at_rest, bulge, flat, distance.reshape(-1), position.reshape(-1))
     return distance, position * s[1]
 
 

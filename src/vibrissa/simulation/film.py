@@ -185,11 +185,6 @@ def film(
     xarray.DataTree
         New recording with the cameras in the group ``cameras``, and in ``truth`` the variables
         ``trace`` and ``trace_visible``.
-
-    Raises
-    ------
-    ValueError
-        If the recording has no true centrelines, or the names of cameras and paths differ.
     """
     cameras = views_of(recording) if cameras is None else tuple(cameras)
     names = [camera.name for camera in cameras]
@@ -541,13 +536,7 @@ def collect(covered: Any, total: Any, line: Any, reach: float, sign: float) -> N
 
 @kernel
 def expose(
-    light: Any,
-    total: Any,
-    noise: Any,
-    starts: Any,
-    gain: float,
-    read_noise: float,
-    frame: Any,
+    light: Any, total: Any, noise: Any, starts: Any, gain: float, read_noise: float, frame: Any
 ) -> None:
     """Convert light into grey values with shot and read noise."""
     rows, columns = frame.shape

@@ -37,13 +37,7 @@ from vibrissa.numerics import Array, numbers, rotation_matrices
 from vibrissa.objects import Box, Peg, Plane, Sphere, Surface
 from vibrissa.rod import follow_surfaces
 from vibrissa.status import Status
-from vibrissa.whisker import (
-    Whisker,
-    WhiskerArray,
-    angles_of,
-    base_rotation,
-    mirrored,
-)
+from vibrissa.whisker import Whisker, WhiskerArray, angles_of, base_rotation, mirrored
 
 # Change of elevation per azimuth by row (Knutsen et al. 2008).
 ELEVATION_PER_AZIMUTH: Mapping[str, float] = MappingProxyType(
@@ -433,8 +427,7 @@ def _drifts(time: Array, count: int, seed: int) -> Array:
     """Slow random functions (count, n) of time (n,), s, with values within ±1."""
     phases = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, (count, _DRIFT.size))
     angles = 2.0 * np.pi * _DRIFT[:, None] * time + phases[..., None]
-    values: Array = np.sin(angles).mean(axis=1)
-    return values
+    return np.asarray(np.sin(angles).mean(axis=1))
 
 
 PEG_RADIUS = 1.35e-3  # half the diameter of the paper's peg, m
@@ -460,11 +453,6 @@ def facing_peg(whisker: Whisker, distance: float = 0.65, radius: float = PEG_RAD
     -------
     Peg
         Peg whose axis crosses the x axis of the laboratory frame.
-
-    Raises
-    ------
-    ValueError
-        If the distance is not in (0, 1), or the base would be too close to the peg.
     """
     if not 0.0 < distance < 1.0:
         raise ValueError(f"distance is {distance!r}; a share of the reach, in (0, 1), is needed")

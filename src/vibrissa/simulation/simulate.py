@@ -45,7 +45,6 @@ NODES = 33  # number of points of the recorded centrelines
 Progress = Callable[[int, int], None]
 """Function called with the number of frames done and the total number."""
 
-
 T = TypeVar("T")
 Whiskers = Whisker | Sequence[Whisker] | Mapping[str, Whisker]
 Motions = Motion | Sequence[Motion] | Mapping[str, Motion]

@@ -28,11 +28,5 @@ from vibrissa.streaming.sources import (
     udp_socket as udp_socket,
 )
 
-__all__ = [
-    "COMPONENTS",
-    "ContactStream",
-    "ContactStreams",
-    "Pose",
-    "Poses",
-]
+__all__ = ["COMPONENTS", "ContactStream", "ContactStreams", "Pose", "Poses"]
 __dir__ = __all__.copy

@@ -24,15 +24,7 @@ import numpy as np
 from vibrissa.io import BagMessage, ContactBag, bag_poses, bag_wrenches
 from vibrissa.sensors import COMPONENTS
 from vibrissa.streaming.contacts import ContactStreams
-from vibrissa.streaming.lines import (
-    FRAME,
-    LONGEST,
-    POSITION,
-    QUATERNION,
-    RECORDED,
-    STAMP,
-    LineKind,
-)
+from vibrissa.streaming.lines import FRAME, LONGEST, POSITION, QUATERNION, RECORDED, STAMP, LineKind
 
 _LARGEST = 65535  # largest size of a datagram, bytes
 _WAITING = 1 << 22  # requested size of the receive buffer, bytes

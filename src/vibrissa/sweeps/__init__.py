@@ -10,10 +10,5 @@ from vibrissa.sweeps.run import (
 from vibrissa.sweeps.store import Busy as Busy, Store as Store
 from vibrissa.sweeps.study import EXAMPLE as EXAMPLE, Cell as Cell, Study as Study, read_study
 
-__all__ = [
-    "failures",
-    "open_sweep",
-    "read_study",
-    "run_sweep",
-]
+__all__ = ["failures", "open_sweep", "read_study", "run_sweep"]
 __dir__ = __all__.copy

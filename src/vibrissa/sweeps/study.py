@@ -134,11 +134,6 @@ def read_study(text: str, folder: Path) -> Study:
     -------
     Study
         Validated study.
-
-    Raises
-    ------
-    ValueError
-        If the text is not TOML, or has unknown keys or values out of range.
     """
     content = parsed_toml(text)
     check_keys(content, {"name", "seed", "whiskers", "tasks"}, "the study")
@@ -221,7 +216,6 @@ PARAMETERS: Mapping[str, tuple[float, float, float]] = {
     "youngs_modulus": (3.0, 1e9, 0.0),
     "trim": (1.0, 1.0, 0.0),
 }
-
 
 _MOST = 10_000_000  # largest number of whiskers, each of which takes 2.5 kB of memory
 

@@ -310,7 +310,6 @@ _READ: Mapping[str, Callable[[Settings], object]] = {
     "friction": lambda settings: _several(settings, "friction"),
 }
 
-
 _SENSOR = {"force_noise": FORCE_NOISE / _MICRO, "moment_noise": MOMENT_NOISE / _MICRO}
 
 TASKS: Mapping[str, Task] = MappingProxyType(

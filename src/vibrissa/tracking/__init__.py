@@ -1,10 +1,9 @@
 """Tracking: from two videos to a whisker's 3D shape, pose, contact and wrench in every frame."""
 
-from vibrissa.tracking.recording import Tracked
+from vibrissa.tracking.recording import Tracked, unexplained_frames as unexplained_frames
 from vibrissa.tracking.refine.fit import RodFit as RodFit
 from vibrissa.tracking.refine.problem import FitOptions as FitOptions
 from vibrissa.tracking.refine.rods import TraceSeries as TraceSeries
-from vibrissa.tracking.remarks import unexplained_frames as unexplained_frames
 from vibrissa.tracking.space.curve import SpaceCurve as SpaceCurve, merge
 from vibrissa.tracking.space.frame_pairs import paired_frames
 from vibrissa.tracking.space.pose import (

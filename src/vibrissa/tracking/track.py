@@ -1,6 +1,6 @@
 """From traces in one or more views to a recording: shape, pose, contact and wrench in every frame.
 
-Remarks state what to know before the results are believed (`vibrissa.tracking.remarks`).
+Remarks state what to know before the results are believed (`vibrissa.tracking.recording`).
 """
 
 from __future__ import annotations
@@ -25,14 +25,6 @@ from vibrissa.tracking.recording import (
     contacts_at,
     given_contacts,
     outside_video,
-    tracked_recording,
-)
-from vibrissa.tracking.refine.continuation import continued
-from vibrissa.tracking.refine.fit import Fitter, RodFit
-from vibrissa.tracking.refine.optics import Optics, rough_optics, stated_lenses
-from vibrissa.tracking.refine.problem import FitOptions
-from vibrissa.tracking.refine.rods import TraceSeries, rolled
-from vibrissa.tracking.remarks import (
     remarks_on,
     remarks_on_bases,
     remarks_on_following,
@@ -44,9 +36,15 @@ from vibrissa.tracking.remarks import (
     remarks_on_shaking,
     remarks_on_time,
     remarks_on_unseen_contacts,
+    tracked_recording,
     unexplained_frames,
     usual_gap,
 )
+from vibrissa.tracking.refine.continuation import continued
+from vibrissa.tracking.refine.fit import Fitter, RodFit
+from vibrissa.tracking.refine.optics import Optics, rough_optics, stated_lenses
+from vibrissa.tracking.refine.problem import FitOptions
+from vibrissa.tracking.refine.rods import TraceSeries, rolled
 from vibrissa.tracking.space.curve import begun_together, merge
 from vibrissa.tracking.space.exchange import Known, exchanged
 from vibrissa.tracking.space.frame_pairs import paired_frames
@@ -392,14 +390,19 @@ def _corrected(
 def _with_optics_unsure(fit: RodFit, optics: Optics) -> RodFit:
     """Add the uncertainty of the cameras to the covariances of points."""
     moved = [optics.displacements(points) for points in (fit.contact_point, fit.position)]
-    contact, base = moved
-    shared = np.pad(np.concatenate(moved, axis=2), ((0, 0), (0, 0), (0, 9)))
+    contact, base = (np.einsum("vti,vtj->tij", points, points) for points in moved)
+    return _widened(fit, contact, base, np.moveaxis(np.concatenate(moved, axis=2), 0, 1))
+
+
+def _widened(fit: RodFit, contact: Array, base: Array, shared: Array) -> RodFit:
+    """Add covariances (t, 3, 3) of contact and base, and errors (t, e, 6) that frames share."""
     pose = fit.pose_covariance.copy()
-    pose[:, :3, :3] += np.einsum("vti,vtj->tij", base, base)
+    pose[:, :3, :3] += base
+    shared = np.pad(shared, ((0, 0), (0, 0), (0, 9)))
     return replace(
         fit,
-        contact_covariance=fit.contact_covariance + np.einsum("vti,vtj->tij", contact, contact),
-        shared=np.append(fit.shared, np.moveaxis(shared, 0, 1), axis=1),
+        contact_covariance=fit.contact_covariance + contact,
+        shared=np.append(fit.shared, shared, axis=1),
         pose_covariance=pose,
     )
 
@@ -426,15 +429,7 @@ def _with_shift_unsure(cameras: Sequence[Camera], fit: RodFit, shift: Array) -> 
         np.einsum("tij,tj,tkj->tik", one, sigma**2 + common**2, one) for one in (contact, base)
     ]
     shared = np.swapaxes(np.concatenate([contact, base], axis=1) * common, 1, 2)
-    shared = np.pad(shared[:, common > 0.0], ((0, 0), (0, 0), (0, 9)))
-    pose = fit.pose_covariance.copy()
-    pose[:, :3, :3] += spread[1]
-    return replace(
-        fit,
-        contact_covariance=fit.contact_covariance + spread[0],
-        shared=np.append(fit.shared, shared, axis=1),
-        pose_covariance=pose,
-    )
+    return _widened(fit, spread[0], spread[1], shared[:, common > 0.0])
 
 
 def _best_seen(traces: Sequence[Sequence[Sequence[Trace]]]) -> list[Sequence[Trace]]:
@@ -485,7 +480,7 @@ def track_whisker(
     ValueError
         If it is seen in too few frames, or the views show different whiskers.
     """
-    report = progress or _silent
+    report = progress or (lambda stage, done, total: None)
     count = len(traces[0])
     traces = _with_one_tip(cameras, traces)
     series = TraceSeries.of(traces)
@@ -541,10 +536,6 @@ def track_whisker(
     return Tracked(
         whisker, series, points, covariance, shape, pose, unfiltered, touching, fit, head, length
     )
-
-
-def _silent(stage: str, done: int, total: int) -> None:
-    pass
 
 
 def _at_rest(

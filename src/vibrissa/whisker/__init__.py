@@ -1,8 +1,5 @@
 """Whiskers: shape, cross-section, material and pose, and the whisker array of a rat."""
 
-from typing import TYPE_CHECKING
-
-from vibrissa.deferred import names_from
 from vibrissa.whisker import morphology
 from vibrissa.whisker.array import WhiskerArray, whisker_array
 from vibrissa.whisker.model import Whisker
@@ -29,9 +26,6 @@ from vibrissa.whisker.section import (
     length_faults as length_faults,
 )
 
-if TYPE_CHECKING:
-    from vibrissa.whisker.nearest import nearest_on_chords as nearest_on_chords
-
 __all__ = [
     "Identity",
     "Pose",
@@ -43,5 +37,3 @@ __all__ = [
     "whisker_array",
 ]
 __dir__ = __all__.copy
-
-__getattr__ = names_from(__name__, {"nearest": "nearest_on_chords"})  # compiled on first use

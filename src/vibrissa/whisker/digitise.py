@@ -76,10 +76,7 @@ class Digitized:
 
 
 def digitize(
-    points: ArrayLike,
-    noise: float | None,
-    base: str | ArrayLike | None,
-    any_length: bool = False,
+    points: ArrayLike, noise: float | None, base: str | ArrayLike | None, any_length: bool = False
 ) -> Digitized:
     """Determine length, intrinsic curvature and pose from digitised points."""
     array = checked_points(points, noise, any_length)
@@ -275,8 +272,7 @@ def _chord_lengths(points: Array) -> Array:
 
 
 def _unit_interval(t: Array) -> Array:
-    unit: Array = (t - t.min()) / np.ptp(t)
-    return unit
+    return np.asarray((t - t.min()) / np.ptp(t))
 
 
 def _require_curve(curve: interpolate.BSpline, found: float, stated: float | None) -> None:
@@ -326,8 +322,7 @@ def _from_curve(curve: interpolate.BSpline, start: float, end: float, noise: flo
         t = arc.parameter(s)
         velocity, acceleration = np.asarray(first(t)), np.asarray(second(t))
         speed = np.linalg.norm(velocity, axis=-1, keepdims=True)
-        rate: Array = np.cross(velocity, acceleration) / speed**3
-        return rate
+        return np.asarray(np.cross(velocity, acceleration) / speed**3)
 
     spin = approximate(rotation_rate, arc.ends, tolerance=1e-11)
     turning = _total_turning(spin)
@@ -383,14 +378,12 @@ class ArcLength:
     def _segment_lengths(self, start: Array, end: Array) -> Array:
         half = 0.5 * (end - start)
         t = 0.5 * (start + end)[..., np.newaxis] + half[..., np.newaxis] * _POINTS
-        lengths: Array = half * (self._speed(t) @ _WEIGHTS)
-        return lengths
+        return np.asarray(half * (self._speed(t) @ _WEIGHTS))
 
     def length(self, t: Array) -> Array:
         """Arc lengths (...) at parameters (...)."""
         k = np.clip(np.searchsorted(self._knots, t, side="right") - 1, 0, self._knots.size - 2)
-        lengths: Array = self.ends[k] + self._segment_lengths(self._knots[k], t)
-        return lengths
+        return np.asarray(self.ends[k] + self._segment_lengths(self._knots[k], t))
 
     def parameter(self, s: Array) -> Array:
         """Parameters (...) at arc lengths (...)."""

@@ -262,10 +262,7 @@ class Whisker:
 
     @classmethod
     def from_curvature(
-        cls,
-        length: float,
-        curvature: Callable[..., object],
-        **properties: Unpack[Properties],
+        cls, length: float, curvature: Callable[..., object], **properties: Unpack[Properties]
     ) -> Whisker:
         """Create a whisker from its intrinsic curvature.
 
@@ -442,8 +439,7 @@ class Whisker:
                 f"arc lengths from {np.nanmin(s):.6g} to {np.nanmax(s):.6g} m were asked for; the "
                 f"whisker reaches from 0 to {self.length:.6g} m"
             )
-        inside: Array = np.clip(s, 0.0, self.length)
-        return inside
+        return np.asarray(np.clip(s, 0.0, self.length))
 
     def _proximal_roll(self) -> float:
         """Roll that aligns the proximal part with the x–y plane."""
@@ -581,11 +577,6 @@ class Whisker:
         Returns
         -------
         Whisker
-
-        Raises
-        ------
-        ValueError
-            If a part is missing, or has been modified so that parts contradict each other.
         """
         whisker = cls(**whisker_fields(dataset))
         check_centerline(dataset, whisker)

@@ -119,8 +119,7 @@ def projection_angles(row: ArrayLike, column: ArrayLike) -> Array:
         18.5149 * column + 49.3499 * row - 50.5406,
         18.7700 * column - 11.3485 * row - 4.9844,
     ]
-    angles: Array = np.radians(np.stack(np.broadcast_arrays(*degrees), axis=-1))
-    return angles
+    return np.asarray(np.radians(np.stack(np.broadcast_arrays(*degrees), axis=-1)))
 
 
 def emergence_angles(row: ArrayLike, column: ArrayLike) -> Array:

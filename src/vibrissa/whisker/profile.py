@@ -70,7 +70,6 @@ TOLERANCE = 1e-12
 FINEST = 512  # number of parts of the domain beyond which intervals are not halved
 UNRESOLVED = 1e-7  # relative error above which a function counts as not resolved
 
-
 MOST_SEARCHED = 64  # largest number of unresolved intervals in which jumps and kinks are located
 # Smallest changes of value, and of slope times length, that count as a jump and as a kink, relative
 # to the largest value.
@@ -135,8 +134,7 @@ class Profile:
         end = (power * self.coefficients).sum(axis=0) / half
         slope = (start[1:] - end[:-1]) * (self.knots[-1] - self.knots[0])
         rough = (np.abs(value) > JUMP * largest) | (np.abs(slope) > KINK * largest)
-        found: Array = self.knots[1:-1][rough.any(axis=tuple(range(1, rough.ndim)))]
-        return found
+        return np.asarray(self.knots[1:-1][rough.any(axis=tuple(range(1, rough.ndim)))])
 
     def trimmed(self, length: float) -> Profile:
         """Drop the intervals that start at or beyond a length."""
@@ -222,8 +220,7 @@ def _locate_singularity(function: Function, start: float, end: float) -> float:
 
 def _chebyshev(n: int) -> Array:
     """Chebyshev points (n,) in (-1, 1)."""
-    points: Array = np.cos(np.pi * (np.arange(n) + 0.5) / n)
-    return points
+    return np.asarray(np.cos(np.pi * (np.arange(n) + 0.5) / n))
 
 
 _NODES = {d: _chebyshev(d + 1) for d in DEGREES}
@@ -368,8 +365,7 @@ def _stated_jumps(s: Array, r: Array) -> NDArray[np.intp]:
     close = (h <= _CLOSE * around) & (np.abs(np.diff(r)) > _NEGLIGIBLE * r[1:])
     close &= np.isfinite(around)  # two samples are the ends of a cone
     # Randomly spaced points have some close pairs as well: those are tested like all others.
-    found: NDArray[np.intp] = np.flatnonzero((h == 0.0) | (close & (close.mean() > _PAIRED)))
-    return found
+    return np.asarray(np.flatnonzero((h == 0.0) | (close & (close.mean() > _PAIRED))))
 
 
 def _detect_jumps(s: Array, r: Array) -> NDArray[np.intp]:
@@ -396,8 +392,7 @@ def _detect_jumps(s: Array, r: Array) -> NDArray[np.intp]:
 def _noise_of_differences(differences: Array, r: Array) -> Array:
     """Standard deviations of differences, most of which may be jumps, at radii r (n,)."""
     same, share = np.quantile(np.abs([differences, differences / r]), 0.25, axis=1) / _QUARTILE
-    noise: Array = np.maximum(same, share * r)
-    return noise
+    return np.asarray(np.maximum(same, share * r))
 
 
 def _split_at_jumps(
@@ -479,7 +474,6 @@ STEPS = 96
 
 TURN = 0.04  # largest rotation per step, rad, at which the method's error is close to rounding
 _GAUSS = 0.5 + np.sqrt(15.0) / 10.0 * np.array([-1.0, 0.0, 1.0])
-
 
 Screw = tuple[Array, Array]
 

@@ -46,11 +46,6 @@ class Prior:
         the object and not to the whisker; 0, the default: contacts of the side only. It is for
         three signals or more with noise; the wrench shows such contacts by itself.
 
-    Raises
-    ------
-    ValueError
-        If a region is not known, or limits are not in order.
-
     Examples
     --------
     >>> Prior("CB", greatest_force=1e-4).region
@@ -91,11 +86,7 @@ class Prior:
                 raise ValueError(f"{name} is an angle in rad; got {limits!r}, as of degrees")
 
     def allows(
-        self,
-        whisker: Whisker,
-        points: Array,
-        arc_lengths: Array,
-        contact_forces: Array,
+        self, whisker: Whisker, points: Array, arc_lengths: Array, contact_forces: Array
     ) -> AnyArray:
         """Say which contacts are possible.
 

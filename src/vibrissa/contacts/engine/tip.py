@@ -134,17 +134,7 @@ def _nodes(contact_map: ChartedWhisker) -> _Nodes:
 
 
 class TipContacts:
-    """Adds contacts of the tip to those of the side.
-
-    Parameters
-    ----------
-    contact_map : ContactMap
-        Map of the whisker's contacts.
-    readout : Named
-        Signals and their noise.
-    probability : float
-        Probability beforehand that a contact is one of the tip.
-    """
+    """Adds contacts of the tip, touched with a ``probability`` beforehand, to those of the side."""
 
     def __init__(
         self, contact_map: ChartedWhisker, readout: Named | Mixed, probability: float
@@ -176,11 +166,7 @@ class TipContacts:
         return np.concatenate([np.cos(turned), np.sin(turned), rest], axis=1)
 
     def allow(
-        self,
-        measured: tuple[Array, Array],
-        found: Candidates,
-        status: IntArray,
-        chi_squared: Array,
+        self, measured: tuple[Array, Array], found: Candidates, status: IntArray, chi_squared: Array
     ) -> tuple[Candidates, IntArray, Array]:
         """Candidates of measurements including the tip's, with statuses and first χ².
 

@@ -1,7 +1,7 @@
 """All stable contacts that have three given signals.
 
 The subdivision tree of the chart for the triplet supplies a seed for each contact; Newton's method
-on T(ξ) = T_measured, with H (:mod:`vibrissa.rod.balance`) instead of F_x, makes it exact. Residuals
+on T(ξ) = T_measured, with H (:mod:`vibrissa.rod.tree`) instead of F_x, makes it exact. Residuals
 are relative: forces to |F|, moments to |M|, angles in rad. Where small errors of the signals would
 move a contact far, the signals do not determine it.
 """

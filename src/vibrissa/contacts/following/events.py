@@ -81,16 +81,9 @@ class Place(NamedTuple):
 class ContactEvents:
     """Onset, loss and slip of a contact, sample by sample, beginning with a free whisker.
 
-    Parameters
-    ----------
-    slip_speed : float
-        Speed of a contact point from which it slips, m/s.
-
-    Attributes
-    ----------
-    onset : (float, float)
-        Time at which the present contact began and its standard deviation, s: that of the first
-        sample, and NaN, where readings do not show it; both are NaN without contact.
+    A contact point faster than ``slip_speed``, m/s, slips. ``onset`` is the time at which the
+    present contact began and its standard deviation, s: that of the first sample, and NaN, where
+    readings do not show it; both are NaN without contact.
     """
 
     def __init__(self, slip_speed: float) -> None:
@@ -113,30 +106,13 @@ class ContactEvents:
         self._readings: deque[Array] = deque(maxlen=_BEFORE + _AFTER)
 
     def __call__(
-        self,
-        time: float,
-        touching: bool | None,
-        reading: Array,
-        place: Place | None,
+        self, time: float, touching: bool | None, reading: Array, place: Place | None
     ) -> Event:
-        """Process a sample.
+        """Process a sample; ``touching`` is None where it does not show whether there is a contact.
 
-        Parameters
-        ----------
-        time : float
-            Time of the sample, s.
-        touching : bool or None
-            Whether there is a contact; None: the sample does not show it.
-        reading : (k,) array
-            Reading in standard deviations of the noise, zero on the average where the whisker is
-            free; empty if it is not known.
-        place : Place or None
-            Place of the contact; None where several are possible.
-
-        Returns
-        -------
-        Event
-            What happened.
+        ``reading`` (k,) is in standard deviations of the noise, zero on the average where the
+        whisker is free, and empty if unknown; ``place`` is None where several contacts are
+        possible.
         """
         if touching is None:
             return Event.NONE
@@ -199,17 +175,8 @@ class ContactEvents:
 def dated_onset(time: Array, reading: Array) -> tuple[float, float]:
     """Time at which readings begin to grow from zero, and its standard deviation, s.
 
-    Parameters
-    ----------
-    time : (n,) array
-        Times of two samples or more, s.
-    reading : (n, k) array
-        Readings in standard deviations of the noise, the last ones in contact.
-
-    Returns
-    -------
-    (float, float)
-        Mean and standard deviation of the onset, as of the module.
+    Readings (n, k) at two times (n,) or more, s, are in standard deviations of the noise; the last
+    ones are in contact.
     """
     t = time - time[-1]
     weight = 1.0 / (1.0 + _UNEVEN**2 * (reading**2).sum(axis=1))

@@ -195,14 +195,9 @@ class Solved(NamedTuple):
 class Forward:
     """Rod with its uncertain parameters, which all measurements share; constructed by :meth:`of`.
 
-    Attributes
-    ----------
-    d : Discretization
-        Rod, with its units.
-    shift : (6,) array
-        Reading in addition to (F, M) due to the pose at the tare, non-dimensional.
-    errors : list of (Forward, float)
-        Rod that differs in one parameter, and its standard deviation in units of that difference.
+    ``shift`` (6,) is the reading in addition to (F, M) due to the pose at the tare,
+    non-dimensional; ``errors`` are rods that differ in one parameter, each with the standard
+    deviation of that parameter in units of the difference.
     """
 
     def __init__(self, rod: Whisker | Resting, steps: int, before: Resting | None = None) -> None:

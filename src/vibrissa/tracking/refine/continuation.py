@@ -154,11 +154,7 @@ def _fitted(posed: _Posed, shape: RestShape, total: float) -> tuple[RestShape, A
 
 
 def _posed(
-    shape: RestShape,
-    curves: Array,
-    cameras: Sequence[Camera],
-    traces: TraceSeries,
-    head: HeadPose,
+    shape: RestShape, curves: Array, cameras: Sequence[Camera], traces: TraceSeries, head: HeadPose
 ) -> _Posed | None:
     """Free frames that show enough of the whisker, and their poses; None if they are few."""
     frames = np.flatnonzero(shape.still & np.isfinite(curves).all(axis=(1, 2)))

@@ -288,11 +288,7 @@ class _Problem:
 
     @classmethod
     def of(
-        cls,
-        cameras: Sequence[Camera],
-        traces: TraceSeries,
-        curves: Array,
-        distance: float | None,
+        cls, cameras: Sequence[Camera], traces: TraceSeries, curves: Array, distance: float | None
     ) -> _Problem:
         _, shapes = aligned_lengths(curves)
         known = np.isfinite(shapes[:, :, 0]).sum(axis=1)

@@ -15,14 +15,7 @@ from vibrissa.numerics import Array, Mask
 from vibrissa.objects import Surface
 from vibrissa.rod import Discretization
 from vibrissa.tracking.refine.least_squares import Smoother, trace_variance
-from vibrissa.tracking.refine.rods import (
-    FAR,
-    UNKNOWNS,
-    State,
-    TraceSeries,
-    bent,
-    contact_slopes,
-)
+from vibrissa.tracking.refine.rods import FAR, UNKNOWNS, State, TraceSeries, bent, contact_slopes
 from vibrissa.tracking.space.pose import HeadPose
 from vibrissa.whisker import Whisker
 

@@ -83,11 +83,6 @@ def merge(cameras: Sequence[Camera], traces: Sequence[Trace]) -> SpaceCurve:
     -------
     SpaceCurve
         The whisker; NaN if a trace is missing, or does not show the whisker's base.
-
-    Raises
-    ------
-    ValueError
-        If there is not a trace for each camera.
     """
     if not cameras or len(cameras) != len(traces):
         raise ValueError(f"{len(cameras)} cameras and {len(traces)} traces: one each is needed")
@@ -170,8 +165,7 @@ def _partners(cost: Array) -> Array:
     count = cheapest_path(np.ascontiguousarray(cost), rows, columns)
     total = np.bincount(rows[:count], columns[:count], cost.shape[0])
     number = np.bincount(rows[:count], minlength=cost.shape[0])
-    mean: Array = np.where(number > 0, total / np.maximum(number, 1), np.nan)
-    return mean
+    return np.asarray(np.where(number > 0, total / np.maximum(number, 1), np.nan))
 
 
 @kernel

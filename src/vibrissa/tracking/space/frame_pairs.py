@@ -43,9 +43,7 @@ class Offsets(NamedTuple):
 
 
 def paired_frames(
-    cameras: Sequence[Camera],
-    traces: Sequence[Sequence[Trace]],
-    offset: int | None = 0,
+    cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]], offset: int | None = 0
 ) -> Pairs:
     """Find the simultaneous frames of two or more videos.
 
@@ -64,11 +62,6 @@ def paired_frames(
     -------
     array (time, view)
         Frame numbers that belong together.
-
-    Raises
-    ------
-    ValueError
-        If no frames belong together.
     """
     columns = [np.arange(len(traces[0]))]
     for camera, row in zip(cameras[1:], traces[1:], strict=True):

@@ -523,21 +523,10 @@ def likeliest_taper(
 ) -> tuple[float, float]:
     """Find the length of a cone beyond the seen one, as a share of this, from its bending.
 
-    Parameters
-    ----------
-    usual : float
-        Standard deviation of that share before it is known how the whisker bends.
-    thinnest : float
-        Smallest share, below which the tip would have no thickness.
-    cost : callable
-        Misfit of the rod and the traces at a share.
-    seen : float
-        Share of the whisker's length that is seen.
-
-    Returns
-    -------
-    float, float
-        Share and its standard deviation, from what bending shows, which errs, and what is usual.
+    ``usual`` is the share's standard deviation before it is known how the whisker bends; below the
+    share ``thinnest`` the tip would have no thickness; ``cost`` is the misfit of the rod and the
+    traces at a share. The standard deviation that is also returned is due to what bending shows,
+    which errs, and what is usual.
     """
     shares, costs = [0.0], [cost(0.0)]
     while costs[-1] <= min(costs) + _HARDLY and shares[-1] + _TAPERS <= _STOUTEST:

@@ -24,13 +24,7 @@ from vibrissa.numerics import Mask, inlined, kernel
 from vibrissa.tracking.trace.ends import traced
 from vibrissa.tracking.trace.ridge import noise_level
 from vibrissa.tracking.trace.scene import Bodies, Image, Scene, blurred
-from vibrissa.tracking.trace.trace import (
-    Trace,
-    TraceOptions,
-    arc_lengths,
-    interpolated,
-    overlap,
-)
+from vibrissa.tracking.trace.trace import Trace, TraceOptions, arc_lengths, interpolated, overlap
 
 Array = NDArray[np.float64]
 
@@ -186,14 +180,7 @@ def link(points: Any, index: Any, order: Any, shortest: int, member: Any, first:
 
 @kernel
 def _walk(
-    points: Any,
-    index: Any,
-    used: Any,
-    seed: int,
-    angle: float,
-    way: Any,
-    at: int,
-    step: int,
+    points: Any, index: Any, used: Any, seed: int, angle: float, way: Any, at: int, step: int
 ) -> int:
     """Walk from point to point in one direction; return the index in ``way`` of the last."""
     rows, columns = index.shape
@@ -272,10 +259,7 @@ class Curve(NamedTuple):
 
 
 def find_curves(
-    frame: Frame,
-    scene: Scene,
-    options: TraceOptions,
-    begins: Array | None = None,
+    frame: Frame, scene: Scene, options: TraceOptions, begins: Array | None = None
 ) -> list[Curve]:
     """Find candidate whiskers in a frame; some begin on the face at points ``begins`` (n, 2)."""
     bodies, gain = scene.bodies(frame), scene.gain(frame)

@@ -13,7 +13,6 @@ import numpy as np
 
 from vibrissa.io import Frame
 from vibrissa.numerics import Array, Mask
-from vibrissa.tracking.trace.clutter import NOTHING, Clutter
 from vibrissa.tracking.trace.ridge import (
     DEPTH_VARIANCE,
     FEWEST,
@@ -24,7 +23,7 @@ from vibrissa.tracking.trace.ridge import (
     measured,
     middle,
 )
-from vibrissa.tracking.trace.trace import STEP, Trace, TraceOptions, even
+from vibrissa.tracking.trace.trace import NOTHING, STEP, Clutter, Trace, TraceOptions, even
 
 OUTSIDE = 12.0  # how far inside the face the base is searched, pixels
 _FUR = 3  # number of points next to the face that are not measured, since fur is dark too

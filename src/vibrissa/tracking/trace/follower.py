@@ -23,10 +23,18 @@ from numpy.typing import ArrayLike
 
 from vibrissa.io import Frame
 from vibrissa.numerics import Array
-from vibrissa.tracking.trace.clutter import NOTHING, Clutter
 from vibrissa.tracking.trace.ends import OUTSIDE, grey_flanks, traced
 from vibrissa.tracking.trace.ridge import FEWEST, march, measure, middle, noise_level, smooth
-from vibrissa.tracking.trace.trace import STEP, Trace, TraceOptions, aligned, distances, overlap
+from vibrissa.tracking.trace.trace import (
+    NOTHING,
+    STEP,
+    Clutter,
+    Trace,
+    TraceOptions,
+    aligned,
+    distances,
+    overlap,
+)
 
 # Points of a trace over which darkness and direction are averaged.
 _DARK = ((5, 25), (25, 50), (50, 80))
@@ -352,12 +360,7 @@ class Follower:
         return trace.support * float(np.exp(-0.5 * away**2)) / max(longer, 1.0) ** 2
 
     def _march(
-        self,
-        frame: Frame,
-        noise: float,
-        start: Array,
-        bend: Array,
-        manner: str,
+        self, frame: Frame, noise: float, start: Array, bend: Array, manner: str
     ) -> tuple[Array, Array]:
         """Line and support of a march."""
         spread, drift = _SPREADS[manner]

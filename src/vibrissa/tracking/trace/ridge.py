@@ -23,8 +23,7 @@ from scipy.linalg.lapack import dpbsv
 
 from vibrissa.io import Frame
 from vibrissa.numerics import inlined, kernel
-from vibrissa.tracking.trace.clutter import NOTHING, Clutter, in_the_way
-from vibrissa.tracking.trace.trace import STEP, TraceOptions
+from vibrissa.tracking.trace.trace import NOTHING, STEP, Clutter, TraceOptions, in_the_way
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

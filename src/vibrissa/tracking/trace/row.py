@@ -22,7 +22,6 @@ from numpy.typing import ArrayLike
 from vibrissa.deferred import optimize, spatial
 from vibrissa.io import Frame
 from vibrissa.numerics import Array, Mask
-from vibrissa.tracking.trace.clutter import NEAR, between_whiskers
 from vibrissa.tracking.trace.curves import Curve, find_curves
 from vibrissa.tracking.trace.ends import prolonged, traced
 from vibrissa.tracking.trace.follower import FEATURES, Follower, features_of
@@ -39,7 +38,17 @@ from vibrissa.tracking.trace.identity import (
 )
 from vibrissa.tracking.trace.ridge import measure_ends, noise_level
 from vibrissa.tracking.trace.scene import Scene
-from vibrissa.tracking.trace.trace import STEP, Trace, aligned, arc_lengths, even, given, overlap
+from vibrissa.tracking.trace.trace import (
+    NEAR,
+    STEP,
+    Trace,
+    aligned,
+    arc_lengths,
+    between_whiskers,
+    even,
+    given,
+    overlap,
+)
 
 _DOUBT = 0.6  # least difference to a way that gives a whisker another line
 _WAYS = 256  # largest number of ways to give lines to whiskers that are compared
@@ -137,10 +146,7 @@ def follow_row(
 
 
 def _part(
-    followers: Sequence[Follower],
-    lines: Mapping[int, Array],
-    frame: Frame,
-    scene: Scene | None,
+    followers: Sequence[Follower], lines: Mapping[int, Array], frame: Frame, scene: Scene | None
 ) -> None:
     """Exclude from measurement the parts where whiskers overlap, on known or expected lines."""
     every = [lines.get(k, follower.expected) for k, follower in enumerate(followers)]

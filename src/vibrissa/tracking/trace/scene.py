@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from vibrissa.deferred import ndimage
 from vibrissa.io import Frame
 from vibrissa.numerics import kernel
-from vibrissa.tracking.trace.clutter import EDGE, STILL, Bits
 from vibrissa.tracking.trace.ridge import noise_level
-from vibrissa.tracking.trace.trace import Trace
+from vibrissa.tracking.trace.trace import EDGE, STILL, Bits, Trace
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -116,10 +115,7 @@ class Scene:
 
     @classmethod
     def of(
-        cls,
-        frames: Sequence[Frame],
-        scale: float = 1.0,
-        mask: NDArray[np.bool_] | None = None,
+        cls, frames: Sequence[Frame], scale: float = 1.0, mask: NDArray[np.bool_] | None = None
     ) -> Scene:
         """Scene from frames of one view; masked pixels contain no whisker."""
         if mask is not None and mask.shape != frames[0].shape:

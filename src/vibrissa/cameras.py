@@ -72,6 +72,12 @@ class Camera:
         Type of projection.
     name : str
         Name of the view.
+
+    Raises
+    ------
+    ValueError
+        If a shape is wrong, a number is not finite, a focal length is zero, the last row of K is
+        not (0, 0, 1), or R is not a rotation.
     """
 
     matrix: Array
@@ -303,6 +309,11 @@ def triangulate(
         Points with least squared pixel errors, weighted by sigma, m.
     covariance : array (..., 3, 3)
         Covariance of the points, m².
+
+    Raises
+    ------
+    ValueError
+        If shapes do not match, or a single camera looks along the plane z = 0.
     """
     pixels = numbers("pixels", pixels)
     if not cameras or pixels.ndim < 2 or pixels.shape[0] != len(cameras):

@@ -46,6 +46,11 @@ def show(result: Any) -> Shown:
     -------
     Shown
         Small picture and table with units; in a terminal, the table.
+
+    Raises
+    ------
+    ValueError
+        If ``result`` is none of these.
     """
     if isinstance(result, xr.Dataset) and "verdict" in result and "critical_cone" in result:
         rows, notes = verdict_rows(result)

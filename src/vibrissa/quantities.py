@@ -124,6 +124,11 @@ def quantity(name: str) -> Quantity:
     -------
     Quantity
         Row of the table for this name.
+
+    Raises
+    ------
+    ValueError
+        If the table has no such name; the message lists similar names.
     """
     if name not in QUANTITIES:
         allowed = difflib.get_close_matches(name, QUANTITIES) or list(QUANTITIES)

@@ -277,6 +277,11 @@ class Group:
         -------
         Group
             Group without that dimension; the same group if it has none.
+
+        Raises
+        ------
+        ValueError
+            If there is no such whisker.
         """
         count = self.data.sizes.get("whisker", 1)
         if not 0 <= index < count:
@@ -383,6 +388,11 @@ class Recording:
         -------
         Whisker
             Whisker as it was recorded.
+
+        Raises
+        ------
+        ValueError
+            If the recording does not contain this whisker.
         """
         groups = self._whisker_groups()
         if not 0 <= index < len(groups):

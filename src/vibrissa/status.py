@@ -109,6 +109,11 @@ def describe(codes: ArrayLike) -> Counter[str]:
     collections.Counter
         Number of occurrences of each status, by its sentence.
 
+    Raises
+    ------
+    ValueError
+        If a number is not a status.
+
     Examples
     --------
     >>> for sentence, count in describe([0, 0, 2]).most_common():
@@ -141,6 +146,11 @@ def names(codes: ArrayLike) -> NDArray[np.str_]:
     -------
     array of str, same shape
         Name of each status.
+
+    Raises
+    ------
+    ValueError
+        If a number is not a status.
 
     Examples
     --------

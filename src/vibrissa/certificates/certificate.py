@@ -371,6 +371,11 @@ class Certificate:
         -------
         Certificate
             Certificate that was converted.
+
+        Raises
+        ------
+        ValueError
+            If the dataset is not a certificate, or its numbers have been modified.
         """
         if data.attrs.get("kind") != KIND:
             raise ValueError(

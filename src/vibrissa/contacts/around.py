@@ -85,6 +85,11 @@ def estimate_around(
         how many nodes touch (more than two next to each other are an arc, whose ends are known to
         the distance of nodes, a hundredth of the length); ``chi_squared`` and ``status``:
         `Status.NOT_FRICTIONLESS` where it is above 16.3, by chance in 0.1 %.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not match, ``position_sigma`` is not positive, or an object is not rigid.
     """
     if not 0.0 < position_sigma < np.inf:
         raise ValueError(f"position_sigma is positive, m; got {position_sigma!r}")

@@ -232,6 +232,11 @@ def second_contact(
         ``second_contact``, whether it is below ``false_alarms``; ``chi_squared`` and its
         ``degrees`` of freedom; ``contact_point_whisker`` of the one contact that explains all best.
         Where force and moment are zero or missing the probability is NaN.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, or a standard deviation is not positive.
     """
     if not (0.0 <= friction <= LARGEST_FRICTION and 0.0 < false_alarms < 1.0):
         raise ValueError(

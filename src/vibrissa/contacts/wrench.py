@@ -149,6 +149,11 @@ def estimate_from_wrench(
     Contacts
         Contact for each wrench, its force and friction angle, and their uncertainty.
 
+    Raises
+    ------
+    ValueError
+        If shapes, coordinates or the noise do not fit.
+
     Examples
     --------
     >>> import vibrissa as vb

@@ -526,6 +526,11 @@ def witness_pairs(
     xarray.Dataset
         Dims pair, node, space: ``rest`` and ``centerline`` of both whiskers, ``contact_point``,
         ``force``, ``arc_length`` and the six signals.
+
+    Raises
+    ------
+    ValueError
+        If the verdicts belong to another whisker.
     """
     if not set(verdicts.data_vars) >= _NEEDED:
         return

@@ -50,6 +50,13 @@ def save_recording(path: str | PathLike[str], recording: xr.DataTree) -> None:
         complete.
     recording : xarray.DataTree
         Recording, with the attribute ``kind``.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the folder does not exist.
+    ValueError
+        If the tree is not a recording.
     """
     if recording.attrs.get("kind") != RECORDING_KIND:
         kind = recording.attrs.get("kind", "nothing")

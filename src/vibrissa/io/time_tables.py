@@ -171,6 +171,11 @@ def save_signals(path: str | PathLike[str], signals: xr.Dataset) -> None:
         Path of the table; an existing file is replaced.
     signals : xarray.Dataset
         Dims time, space: ``force`` and ``moment``.
+
+    Raises
+    ------
+    ValueError
+        If the dataset has other dims or lacks a variable.
     """
     missing = [name for name in ("time", "force", "moment") if name not in signals.variables]
     if missing:
@@ -324,6 +329,11 @@ def save_contacts(
     contacts : xarray.Dataset, or mapping of name to array (n,)
         Dim time; a variable for each column. Columns that it lacks are written as missing, but
         ``time``, ``x``, ``y``, ``z`` and ``status`` must be there.
+
+    Raises
+    ------
+    ValueError
+        If a needed variable is not there, or one has another dim.
     """
     numbers = (*NUMBERS, *(name for name in _OPTIONAL if name in contacts))
     flags = (*(name for name in _FLAGS if name in contacts), "status")
@@ -419,6 +429,11 @@ def save_contour(path: str | PathLike[str], contour: xr.Dataset) -> None:
     contour : xarray.Dataset
         Dim contact; a variable for each column. Those that it lacks are written as missing, but
         ``time``, ``x``, ``y`` and ``z`` must be there.
+
+    Raises
+    ------
+    ValueError
+        If a needed variable is not there, or one has another dim.
     """
     content = _contour_content(contour)
     with replacing(path) as part:

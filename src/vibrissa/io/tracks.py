@@ -260,6 +260,12 @@ def join_views(*tracks: xr.Dataset) -> xr.Dataset:
     -------
     xarray.Dataset
         Tracks of all views.
+
+    Raises
+    ------
+    ValueError
+        If there is no trace, views share a name, times do not agree, or views have no whisker or
+        node in common.
     """
     if not tracks or any("trace" not in one for one in tracks):
         raise ValueError("each of the tracks to join needs a trace, and there must be some")
@@ -334,6 +340,13 @@ def save_tracks(path: str | PathLike[str], tracks: xr.Dataset) -> None:
     tracks : xarray.Dataset
         Tracks as a reader returned them. A table holds the points and their confidence, either
         those in the image or those in space.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the folder does not exist.
+    ValueError
+        If these are not tracks, or tracks with both are to be written as a table.
     """
     path = check_writable(path, (*NETCDF, *CSV))
     if tracks.attrs.get("kind") != KIND:

@@ -457,6 +457,14 @@ def write_movie(path: str | PathLike[str], frames: Iterable[Frame], rate: float 
     -------
     int
         Number of frames written.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the folder does not exist.
+    ValueError
+        If the ending is another, the rate is not positive, there is no frame, or frames differ in
+        size or type or have an odd size.
     """
     import av
 

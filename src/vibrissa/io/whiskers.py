@@ -376,6 +376,13 @@ def save_array(path: str | PathLike[str], array: WhiskerArray) -> None:
         that are parabolas with a linear taper, such as those of an average rat.
     array : WhiskerArray
         Array to write.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the folder does not exist.
+    ValueError
+        If a table is to be written and a whisker has another shape.
     """
     if Path(path).suffix.lower() == ".csv":
         write_table(path, *_as_table(array))

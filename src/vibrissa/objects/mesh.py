@@ -54,6 +54,11 @@ class Mesh(Surface):
     stiffness : float
         Force over indentation, N/m; infinite if rigid.
 
+    Raises
+    ------
+    ValueError
+        If values are missing, the mesh is not closed, or the resolution needs too large a grid.
+
     Examples
     --------
     >>> corners = [[0, 0, 0], [4e-3, 0, 0], [0, 4e-3, 0], [0, 0, 4e-3]]

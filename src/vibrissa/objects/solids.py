@@ -250,6 +250,12 @@ class Box(Surface):
         Force over indentation, N/m; infinite if rigid. A compliant box needs an edge radius larger
         than its indentation, because a sharp edge has no normal inside.
 
+    Raises
+    ------
+    ValueError
+        If a value is missing, the rotation is invalid, an edge or the stiffness is not positive, or
+        the edge radius is more than half of an edge.
+
     Examples
     --------
     >>> Box(origin=[25e-3, 0.0, 0.0], size=[5e-3, 5e-3, 40e-3])

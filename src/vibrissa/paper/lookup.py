@@ -130,6 +130,11 @@ class LookupTable:
         -------
         LookupTable
             Table of the reachable contacts.
+
+        Raises
+        ------
+        ValueError
+            If the map has no grid, or a signal is practically zero everywhere.
         """
         if contact_map.grid is None:
             raise ValueError("the map has no grid to look up in: simulate it with grid=True")
@@ -266,6 +271,12 @@ def estimate(
         neither table nor network shows ambiguity; ``OUTSIDE_MAP`` outside the table;
         ``OUTSIDE_PRIOR``; or ``MISSING``. ``chi_squared`` is the largest difference between the
         signals of the estimated contact and those measured, in shares of their ranges.
+
+    Raises
+    ------
+    ValueError
+        If the method is unknown, there are not three signals, the map has no grid, or signals or
+        noise are invalid.
     """
     if method not in METHODS:
         known = ", ".join(repr(name) for name in METHODS)
@@ -393,6 +404,11 @@ def signal_slice(
         ``linear_width`` of the coordinate, then logarithmically): the contact point, ``r``,
         ``theta`` and ``phi``, the three signals, ``n_candidates`` and ``small_deflection``, NaN
         outside the solid; and ``error_distance`` of the paper's look-up, if the map has its grid.
+
+    Raises
+    ------
+    ValueError
+        If other than one signal of the triplet is held, or there are too few points.
     """
     names = selection(using, exactly=3)
     fixed = {"MD": -0.5 * np.pi} if fixed is None else fixed

@@ -171,6 +171,11 @@ def train_network(
     -------
     NetworkSolver
         Network with held-out contacts and errors.
+
+    Raises
+    ------
+    ValueError
+        If there are not three signals, fewer than 100 training contacts, or no test contact.
     """
     if samples < 100 or held_out < 1:
         raise ValueError(

@@ -54,6 +54,11 @@ def central_differences(
     Dataset
         Variables of :func:`vibrissa.sensitivity`; NaN where a step leaves the table, and everywhere
         if one of the signals is practically zero throughout.
+
+    Raises
+    ------
+    ValueError
+        If the map has no grid, or signals, contacts, noise or step are invalid.
     """
     if not 0.0 < step < 1.0:
         raise ValueError(f"the step is a share of the range, above 0 and below 1; got {step}")

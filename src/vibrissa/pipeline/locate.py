@@ -116,6 +116,11 @@ def locate(
         needs. Covariances are those of the exact method whatever the method. Frames without a
         detected contact are NaN, with the status ``NOT_FELT``, or ``NO_CONTACT`` where force and
         moment are zero or ``in_contact`` is false.
+
+    Raises
+    ------
+    ValueError
+        If the shape of the noise is wrong.
     """
     names = selection(triplet)
     measured = _Measured.of(wrench, noise, errors, contact_map.whisker, gravity)
@@ -245,6 +250,11 @@ def locate_around(
         Contacts nearest to the base, as returned by `locate` but without candidates and
         derivatives; ``last_arc_length`` of the contact farthest from the base; and the estimated
         shift of the objects, ``shift_x``, ``shift_y`` and ``shift_z``.
+
+    Raises
+    ------
+    ValueError
+        If the noise is unknown, or `estimate_around` raises it.
     """
     measured, known = _Measured.of(wrench, noise), Group(wrench)
     pose: dict[str, Any] = {}

@@ -60,6 +60,11 @@ def predictors(recording: xr.DataTree) -> xr.Dataset:
         predictors of spike models, or for a trial filmed by one camera the 8 that it measures.
         Missing values are NaN.
 
+    Raises
+    ------
+    ValueError
+        If force and moment are unknown.
+
     Warns
     -----
     UserWarning

@@ -250,6 +250,11 @@ def fit_contacts(
     CylinderFit, SphereFit, PlaneFit or FreeFit
         Fitted shape. Contacts are weighted by their covariance, where known, and the direction of
         the force serves as the surface normal. Rows are frames × whiskers.
+
+    Raises
+    ------
+    ValueError
+        If there are too few contacts, or they do not determine the shape.
     """
     _check_shape(shape)
     if axis is not None and shape != "cylinder":
@@ -458,6 +463,11 @@ def compare_contacts(
         ``surface_distance_predicted`` (`vibrissa.contour.compare_with`); ``deflection_angle`` and
         ``r`` of each contact and, if there are signals, ``MB``. The attribute ``object`` is the
         index of the object.
+
+    Raises
+    ------
+    ValueError
+        If there are no estimates, no contacts or no objects.
     """
     estimates = estimates_in(recording)
     trial, contacts = Recording(recording), Group(estimates)

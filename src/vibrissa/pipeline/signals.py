@@ -302,6 +302,11 @@ def placed_by(signals: xr.Dataset, recording: xr.DataTree) -> xr.Dataset:
         Signals at the times and with the whisker names of the tracked recording, with its
         ``base_position``, ``base_rotation`` and, if known, ``pose_covariance``. Each frame has the
         signals nearest in time, or none if these are more than half a sampling interval away.
+
+    Raises
+    ------
+    ValueError
+        If the numbers of whiskers differ, or there is no pose.
     """
     check_recording(recording)
     root = recording.to_dataset()

@@ -120,6 +120,11 @@ def stable_set(
     -------
     StableSet
         Contacts at the nodes, with base force, contact point and derivatives.
+
+    Raises
+    ------
+    ValueError
+        If ``proximal`` is below 0.05 or not below 1.
     """
     if not 0.05 <= proximal < 1.0:
         raise ValueError(

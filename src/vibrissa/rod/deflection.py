@@ -86,6 +86,12 @@ class PointForce:
     components : tuple of array_like or array_like, optional
         Force (fx, fy, fz) in that frame instead, N, a tuple of three or shape (..., 3); fx along
         the tangent.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not broadcast, if arc lengths are not positive, or if neither or both ways of
+        giving the force are used.
     """
 
     arc_length: Any

@@ -154,6 +154,11 @@ def calibrate_suspension(
     -------
     SuspensionCalibration
         Calibrated sensor, with covariances.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not match, or there are too few touches or no signal.
     """
     p, y = numbers("points", points), numbers("readings", readings, channels or ())
     if p.ndim != 2 or p.shape[1] != 3 or y.ndim != 2 or len(y) != len(p):

@@ -185,6 +185,11 @@ def film(
     xarray.DataTree
         New recording with the cameras in the group ``cameras``, and in ``truth`` the variables
         ``trace`` and ``trace_visible``.
+
+    Raises
+    ------
+    ValueError
+        If the recording has no true centrelines, or the names of cameras and paths differ.
     """
     cameras = views_of(recording) if cameras is None else tuple(cameras)
     names = [camera.name for camera in cameras]

@@ -453,6 +453,11 @@ def facing_peg(whisker: Whisker, distance: float = 0.65, radius: float = PEG_RAD
     -------
     Peg
         Peg whose axis crosses the x axis of the laboratory frame.
+
+    Raises
+    ------
+    ValueError
+        If the distance is not in (0, 1), or the base would be too close to the peg.
     """
     if not 0.0 < distance < 1.0:
         raise ValueError(f"distance is {distance!r}; a share of the reach, in (0, 1), is needed")

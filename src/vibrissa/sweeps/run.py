@@ -72,6 +72,11 @@ def open_sweep(path: str | PathLike[str]) -> xr.Dataset:
         ``task``, ``seconds``, ``status`` (0 not done, 1 done, 2 failed, 3 damaged, −1 not
         requested) and ``origin``, the index in the attribute ``origins`` of the code that computed
         the result. Missing values are NaN or empty words.
+
+    Raises
+    ------
+    ValueError
+        If it is not a store, or too damaged to be read.
     """
     path = Path(path)
     kept = described(path, (LAYOUT, *OLD_LAYOUTS))

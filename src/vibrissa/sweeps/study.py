@@ -134,6 +134,11 @@ def read_study(text: str, folder: Path) -> Study:
     -------
     Study
         Validated study.
+
+    Raises
+    ------
+    ValueError
+        If the text is not TOML, or has unknown keys or values out of range.
     """
     content = parsed_toml(text)
     check_keys(content, {"name", "seed", "whiskers", "tasks"}, "the study")

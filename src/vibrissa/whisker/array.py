@@ -40,6 +40,12 @@ class WhiskerArray(Mapping[str, Whisker]):
     whiskers : iterable of Whisker
         Whiskers, identified by their names; where a name has no side, that of its base is used.
 
+    Raises
+    ------
+    ValueError
+        If there are none, two have the same name, a name is not that of a whisker, or a base is on
+        another side than the name states.
+
     Examples
     --------
     >>> whisker_array(side="right")["gamma"].length
@@ -304,6 +310,11 @@ def whisker_array(
     WhiskerArray
         Whiskers with poses in the head's frame: origin at the tip of the snout, x to the animal's
         right, y forward, z up.
+
+    Raises
+    ------
+    ValueError
+        If there is no such side, row, column or whisker, or no whisker is left.
 
     Warns
     -----

@@ -577,6 +577,11 @@ class Whisker:
         Returns
         -------
         Whisker
+
+        Raises
+        ------
+        ValueError
+            If a part is missing, or has been modified so that parts contradict each other.
         """
         whisker = cls(**whisker_fields(dataset))
         check_centerline(dataset, whisker)

@@ -46,6 +46,11 @@ class Prior:
         the object and not to the whisker; 0, the default: contacts of the side only. It is for
         three signals or more with noise; the wrench shows such contacts by itself.
 
+    Raises
+    ------
+    ValueError
+        If a region is not known, or limits are not in order.
+
     Examples
     --------
     >>> Prior("CB", greatest_force=1e-4).region

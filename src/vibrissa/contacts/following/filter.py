@@ -127,6 +127,11 @@ class ContactFilter:
         Correlation time, s, of the errors that samples share, those of the stiffness and of the
         sensor's gain and mixing: first-order Gauss-Markov processes. By default infinite, so that
         these errors are constant.
+
+    Raises
+    ------
+    ValueError
+        If the estimator has no noise, or a number is out of range.
     """
 
     def __init__(

@@ -82,6 +82,11 @@ class SensorNoise:
         -------
         SensorNoise
             The noise.
+
+        Raises
+        ------
+        ValueError
+            If a signal's noise is missing, or numbers are not those of noise.
         """
         if isinstance(noise, Mapping):
             missing = [name for name in names if name not in noise]

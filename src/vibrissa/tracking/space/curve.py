@@ -83,6 +83,11 @@ def merge(cameras: Sequence[Camera], traces: Sequence[Trace]) -> SpaceCurve:
     -------
     SpaceCurve
         The whisker; NaN if a trace is missing, or does not show the whisker's base.
+
+    Raises
+    ------
+    ValueError
+        If there is not a trace for each camera.
     """
     if not cameras or len(cameras) != len(traces):
         raise ValueError(f"{len(cameras)} cameras and {len(traces)} traces: one each is needed")

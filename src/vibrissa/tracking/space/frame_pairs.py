@@ -62,6 +62,11 @@ def paired_frames(
     -------
     array (time, view)
         Frame numbers that belong together.
+
+    Raises
+    ------
+    ValueError
+        If no frames belong together.
     """
     columns = [np.arange(len(traces[0]))]
     for camera, row in zip(cameras[1:], traces[1:], strict=True):

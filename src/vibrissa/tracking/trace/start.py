@@ -314,6 +314,11 @@ def find_start(
     -------
     Start
         Bases and lines that were found, with their confidence and what there is to doubt.
+
+    Raises
+    ------
+    ValueError
+        If views and cameras do not fit, or there is no frame.
     """
     options = options or TraceOptions()
     counts = {len(view) for view in frames}

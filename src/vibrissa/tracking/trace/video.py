@@ -174,6 +174,11 @@ def trace_video(
     -------
     list of list of Trace
         Traces of each whisker, frame by frame; empty ones where it was not found.
+
+    Raises
+    ------
+    ValueError
+        If none is found in the first frame, frames differ in size, or a correction is for none.
     """
     options = options or TraceOptions()
     corrections = corrections or {}
@@ -415,6 +420,11 @@ def start_frames(
         Numbers of the frames in the first video.
     frames : list of list of array (height, width)
         Frames of the same moments, view by view.
+
+    Raises
+    ------
+    ValueError
+        If a video has no frames of these moments.
     """
     firsts = [max(-offset, 0), *(max(offset, 0) for _ in videos[1:])]
     pairs = list(zip(videos, firsts, strict=True))

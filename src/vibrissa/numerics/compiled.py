@@ -29,7 +29,7 @@ from numba.core.lowering import Lower
 from numba.core.registry import CPUDispatcher
 from numba.core.runtime.context import NRTContext
 from numba.core.typed_passes import NativeLowering
-from numba.core.typing import Context
+from numba.core.typing.context import Context
 
 from vibrissa.numerics.kernel_cache import Called, PackageCache
 

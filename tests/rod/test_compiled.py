@@ -116,6 +116,8 @@ def test_the_type_of_an_operation_is_determined_once():
         before = len(compiled._Typing.known)
         assert second(2.0, np.ones(3)) == 4.0
         assert len(compiled._Typing.known) == before > 0
+        compiled.rigorous(second.py_func)(2.0, np.ones(3))  # other options, other code
+        assert len(compiled._Typing.known) > before
         """
     )
 

@@ -28,6 +28,7 @@ from numba.core.cpu import CPUContext
 from numba.core.lowering import Lower
 from numba.core.registry import CPUDispatcher
 from numba.core.runtime.context import NRTContext
+from numba.core.targetconfig import ConfigStack
 from numba.core.typed_passes import NativeLowering
 from numba.core.typing.context import Context
 
@@ -242,7 +243,8 @@ class _Typing(Context):
     Numba tries dozens of rules for each operation, which takes a fifth of the compilation.
     """
 
-    #: Signatures by operation and types of its arguments.
+    #: Signatures by operation, types of its arguments, and options of compilation: by these some
+    #: operations choose their code, which must not be that of a function rounded differently.
     known: ClassVar[dict[Any, Any]] = {}
 
     def resolve_function_type(self, func: Any, args: Any, kws: Any) -> Any:
@@ -250,7 +252,7 @@ class _Typing(Context):
         function = func if isinstance(func, types.Type) else self._lookup_global(func)  # type: ignore[no-untyped-call]
         if kws or type(function) is not types.Function or not all(map(_is_plain, args)):
             return super().resolve_function_type(func, args, kws)  # type: ignore[no-untyped-call]
-        key = function, tuple(args)
+        key = function, tuple(args), ConfigStack.top_or_none()
         if self.known.get(key) is None:
             self.known[key] = super().resolve_function_type(func, args, kws)  # type: ignore[no-untyped-call]
         return self.known[key]

@@ -81,14 +81,43 @@ def test_a_kernel_is_compiled_within_those_that_call_it():
         def inner(x, n):
             return square(x) + n
 
+        @inlined
+        def both(x):
+            return inner(x, 1) + inner(x, 2)
+
         @kernel
         def outer(x):
-            return inner(x, 1) + inner(x, 2)
+            return both(x)
 
         assert outer(3.0) == 21.0
         assert not inner.overloads
-        assert len(inner.part.overloads) == 1  # for both constants
+        (part,) = inner.part.overloads.values()  # for both constants
+        assert not part.fndesc.inline  # by force, as its caller is
         assert inner(3.0, 1) == 10.0
+        """
+    )
+
+
+def test_the_type_of_an_operation_is_determined_once():
+    run(
+        """
+        import numpy as np
+        from vibrissa.numerics import compiled
+
+        @compiled.kernel
+        def first(x, rows):
+            return x * x + rows[0]
+
+        @compiled.kernel
+        def second(x, rows):
+            return rows[0] * (x + x)
+
+        assert first(2.0, np.ones(3)) == 5.0
+        before = len(compiled._Typing.known)
+        assert second(2.0, np.ones(3)) == 4.0
+        assert len(compiled._Typing.known) == before > 0
+        compiled.rigorous(second.py_func)(2.0, np.ones(3))  # other options, other code
+        assert len(compiled._Typing.known) > before
         """
     )
 

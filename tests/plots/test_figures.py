@@ -52,7 +52,7 @@ def contacts(n: int = 50) -> np.ndarray:
 def test_whisker_is_drawn_in_mm_with_its_taper() -> None:
     figure = whisker_views(LINE, RADIUS, name="gamma", magnification=4.0)
     assert {axis_label(n) for n in "xyz"} <= texts(figure)
-    assert {"gamma", "width × 4"} <= texts(figure)
+    assert {"gamma", "width × 4\n43.9 mm long, radius 100 to 7 µm"} <= texts(figure)
     box = figure.axes[0].patches[0].get_path().get_extents()
     assert box.x0 == pytest.approx(-0.4, abs=1e-3)  # a disc of four times 0.1 mm about the base
     assert box.x1 == pytest.approx(40.0 + 4 * 7e-3, abs=1e-3)

@@ -409,6 +409,7 @@ class TrialMode(Mode):
             )
             self._now_line = gui.add_html("")
         self._timeline.float(x=16.0, y=-16.0, width=520.0, height=112.0)
+        self._timeline.expand()  # on a phone panels are closed otherwise
         self._play.on_click(lambda _: self.toggle())
         jump.on_click(lambda _: self.jump())
 

@@ -1,5 +1,6 @@
 """What the figures say: labels, units, the data they show, and what they do without data."""
 
+import re
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -144,7 +145,8 @@ def test_contours_state_the_distance_of_the_whisker_from_the_surface() -> None:
         texts(contour_views(points, peg))
     )
     figure = contour_views(points + 1e-6, peg, whisker_radius=np.full(50, whisker))
-    assert "the whisker is within 0.00" in "".join(texts(figure))
+    assert re.search("the whisker is within [0-9.]+ µm of", "".join(texts(figure)))
+    assert "the whisker is within 0.00" not in "".join(texts(figure))
     figure = contour_views(points, peg, whisker_radius=np.full(50, whisker))
     assert "the whisker is on the" in "".join(texts(figure))  # not within 4e-15 mm
 

@@ -178,9 +178,9 @@ def frame_drawing(solids: Solids, exaggeration: float) -> scene.Drawing:
     for text, at in {
         "Fx": centre - np.array([0.0, 0.0, floor]) + apart,  # above 0, which may be at the top
         "0": centre + np.array([0.0, 0.0, solids.axis_height()]),
-        least: bottom - np.array([0.72 * length, 0.0, 0.0]),
+        least: bottom - np.array([0.85 * length, 0.0, 0.0]),
         "MD = 0°": bottom + edge + apart,
-        f"MB = {largest}": bottom - edge - apart,
+        f"MB = {largest}": bottom - edge - 3.0 * apart,
     }.items():
         out[f"axes {text}"] = scene.Label(at, text)
     return out

@@ -197,7 +197,7 @@ def _panels(
         axes = style.box_axes(figure, box, xlim=limits[view[0]], ylim=limits[view[1]])
         axes.set(xlabel=axis_label(_NAMES[view[0]]), ylabel=axis_label(_NAMES[view[1]]))
         style.head(axes, "abc"[i], title)
-        few = 3 if wide > 15.0 else 2
+        few = 3 if wide > 10.0 else 1
         axes.locator_params(axis="x", nbins=5 if i == 0 else few, integer=True)
         panels.append(axes)
         left += wide + _GAP

@@ -179,9 +179,10 @@ def signal_axes(figure: Figure, panel: Box, limits: Array) -> Any:
         axes.plot(*places, floor, **_FLOOR)
         near = 1.0 if ring < rings[-1] else 1.28
         size, unit = quantity("MB").symbol, quantity("MB").display_unit
-        scale = "√" if small else "√ scale"
-        label = f"{ring:g}" if ring < rings[-1] else f"${size}$ = {ring:g} {unit} ({scale})"
-        _write(axes, _FRONT, np.sqrt(ring) * near, floor, label, ha="left", va="top", color=MUTED)
+        scale = "" if small else " (√ scale)"
+        label = f"{ring:g}" if ring < rings[-1] else f"${size}$ = {ring:g} {unit}{scale}"
+        look = {"ha": "center" if small else "left", "va": "top", "color": MUTED}
+        _write(axes, _FRONT, np.sqrt(ring) * near, floor, label, **look)
     for angle in (0, 90, 180, -90):
         axes.plot(*np.outer(_toward(angle), [0.0, reach]), floor, **_FLOOR)
         if angle == 0:
@@ -192,12 +193,12 @@ def signal_axes(figure: Figure, panel: Box, limits: Array) -> Any:
         far = {"ha": "right"} if angle in (90, 180) else {}
         far_out = 1.3 if angle == -90 else 1.17  # clear of the solid's corner
         _write(axes, angle, far_out * reach, floor, label.replace("-", "−"), **far)
-    _height_axis(axes, limits, 0.2 if small else 0.15)
+    _height_axis(axes, limits, small)
     return axes
 
 
-def _height_axis(axes: Any, limits: Array, above: float) -> None:
-    """Draw the axis of F_x, vertical at the left, with its name so far above it."""
+def _height_axis(axes: Any, limits: Array, small: bool) -> None:
+    """Draw the axis of F_x, vertical at the left; in small panels for both scales."""
     reach, (floor, top) = limits[0, 1], limits[2]
     left = _VIEW[1] - 90.0
     place = _AXIS * reach * _toward(left)
@@ -208,7 +209,8 @@ def _height_axis(axes: Any, limits: Array, above: float) -> None:
         axes.plot(*tick, height, color=INK, linewidth=0.5)
         label = f"{mark:g}".replace("-", "−")
         _write(axes, left, 1.49 * reach, height, label, ha="right")
-    for up, text in ((above, axis_label("Fx")), (0.045, "√ scale")):
+    named = (0.2, axis_label("Fx")) if small else (0.15, axis_label("Fx"))
+    for up, text in (named, (0.045, "√ scales" if small else "√ scale")):
         height = top + up * (top - floor)
         _write(axes, left, 1.4 * reach, height, text, fontsize=PLAIN if up > 0.1 else SMALL)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gzip
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -81,6 +82,7 @@ _TIMEOUT = 60.0  # of a picture that the browser draws, s
 _FRAMES = 100  # most frames of a movie
 # Pixels of a picture, and of a movie, per pixel of the browser, and longest side of either, pixels.
 _STILL, _MOVING, _LONGEST = 3.0, 2.0, 4000.0
+_SLOW = 1.0  # time to draw a frame of a movie from which on it is drawn coarsely, s
 
 
 def _render(client: viser.ClientHandle, fine: float) -> Picture:
@@ -100,11 +102,16 @@ def movie(
     count = min(mode.trial.frames, _FRAMES)
     rows = np.linspace(0, mode.trial.frames - 1, count).round().astype(int)
 
-    drawn, filled = [], np.zeros((), dtype=bool)
+    drawn, filled, fine = [], np.zeros((), dtype=bool), _MOVING
     for done, row in enumerate(rows):
         progress(done, count)
         mode.show(int(row))
-        paper = _on_white(_render(client, _MOVING))
+        began = time.monotonic()
+        image = _render(client, fine)
+        if done == 0 and time.monotonic() - began > _SLOW:
+            fine = 1.0
+            image = _render(client, fine)
+        paper = _on_white(image)
         drawn.append(png(paper))
         filled = filled | (paper != 255).any(axis=-1)
     part = _part(filled)

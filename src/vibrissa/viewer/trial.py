@@ -462,7 +462,7 @@ class TrialMode(Mode):
 
     def link(self) -> dict[str, str]:
         """Parameter of a link with the time, as a share of the trial."""
-        return {"t": f"{self._share:.4f}"}
+        return {"t": f"{self._share:.6f}"}
 
     def restore(self, asked: Mapping[str, str]) -> None:
         """Go to a time."""
@@ -471,7 +471,8 @@ class TrialMode(Mode):
         except ValueError:
             return
         if 0.0 <= share <= 1.0:
-            self.go(float(self.trial.time[0] + share * np.ptp(self.trial.time)))
+            away = self.trial.time - self.trial.time[0] - share * np.ptp(self.trial.time)
+            self.go(float(self.trial.time[np.abs(away).argmin()]))
 
     def go(self, time: float) -> None:
         """Show the frame at a time, s."""

@@ -164,7 +164,7 @@ _REST = "#c4c4c4"
 _ARROW = 0.2  # length of the longest arrow, as a share of the whiskers' extent
 _BENT_GAP = 10.0  # room around and between the views, mm on paper
 _ROW = 4.0  # room of a row of the legend, mm
-_FORCES = 18.0  # room below the side view from which on forces are drawn there, mm
+_FORCES = 25.0  # room below the side view from which on forces are drawn there, mm
 _BENT_NARROWEST = 0.11  # smallest half of an axis, as a share of the whiskers' extent
 
 

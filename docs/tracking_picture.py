@@ -12,6 +12,7 @@ import vibrissa as vb
 from vibrissa.cameras import orthogonal_views
 from vibrissa.io import read_video
 from vibrissa.numerics import Array
+from vibrissa.plots.overview import size_bar
 from vibrissa.plots.style import (
     MUTED,
     ORANGE,
@@ -31,6 +32,9 @@ from vibrissa.tracking import TrackOptions, trace_video, track
 RATE, DURATION = 500.0, 0.2
 HEIGHT = 92.0
 TALL = 38.0
+PIXEL = 58e-6
+"""Size of a pixel in space, m."""
+
 DETAIL = 14
 """Half of the detail's width, pixels."""
 
@@ -40,7 +44,7 @@ def tracking_picture() -> Figure:
     whisker = vb.samples.gamma()
     peg = facing_peg(whisker)
     trial = simulate(whisker, sweep_past(whisker, peg, DURATION, RATE, seed=1), peg)
-    cameras = orthogonal_views(58e-6, (760, 620), center=[18e-3, 0.0, 0.0])
+    cameras = orthogonal_views(PIXEL, (760, 620), center=[18e-3, 0.0, 0.0])
     truth = with_true_traces(trial, cameras)["truth"].to_dataset().isel(whisker=0)
     with tempfile.TemporaryDirectory() as folder:
         files = {camera.name: Path(folder) / f"{camera.name}.mp4" for camera in cameras}
@@ -69,6 +73,7 @@ def sights(figure: Figure, images: list[Array], found: xr.Dataset, row: int) -> 
     for i, (image, trace, there) in enumerate(zip(images, traces, seen, strict=True)):
         axes = picture(figure, (1.0 + i * (wide + 2.0), HEIGHT - TALL - 6.0, wide, TALL), image)
         axes.plot(*trace[there].T, **TRACE)
+        size_bar(axes, 5e-3 / PIXEL / image.shape[1], "5 mm")
         head(axes, "ab"[i], ("from the top, and the trace", "from the front")[i])
     middle = traces[0][np.flatnonzero(seen[0])[int(0.35 * seen[0].sum())]].round()
     box = (2.0 * (wide + 2.0) + 1.0, HEIGHT - TALL - 6.0, 178.0 - 2.0 * (wide + 2.0) - 2.0, TALL)
@@ -77,7 +82,8 @@ def sights(figure: Figure, images: list[Array], found: xr.Dataset, row: int) -> 
     (left, top), (right, bottom) = middle - half, middle + half
     axes.set(xlim=(left, right), ylim=(bottom, top))
     axes.plot(*traces[0].T, "o-", color=RED, linewidth=0.9, markersize=2.0)
-    head(axes, "c", "its points, in pixels")
+    size_bar(axes, 0.5e-3 / PIXEL / (right - left), "0.5 mm")
+    head(axes, "c", "points of the trace on pixels of the image")
 
 
 def picture(figure: Figure, box: tuple[float, float, float, float], image: Array) -> Axes:

@@ -1,5 +1,6 @@
 """What the figures say: labels, units, the data they show, and what they do without data."""
 
+import re
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -52,7 +53,7 @@ def contacts(n: int = 50) -> np.ndarray:
 def test_whisker_is_drawn_in_mm_with_its_taper() -> None:
     figure = whisker_views(LINE, RADIUS, name="gamma", magnification=4.0)
     assert {axis_label(n) for n in "xyz"} <= texts(figure)
-    assert {"gamma", "width × 4"} <= texts(figure)
+    assert {"gamma", "width × 4\n43.9 mm long, radius 100 to 7 µm"} <= texts(figure)
     box = figure.axes[0].patches[0].get_path().get_extents()
     assert box.x0 == pytest.approx(-0.4, abs=1e-3)  # a disc of four times 0.1 mm about the base
     assert box.x1 == pytest.approx(40.0 + 4 * 7e-3, abs=1e-3)
@@ -144,7 +145,8 @@ def test_contours_state_the_distance_of_the_whisker_from_the_surface() -> None:
         texts(contour_views(points, peg))
     )
     figure = contour_views(points + 1e-6, peg, whisker_radius=np.full(50, whisker))
-    assert "the whisker is within 0.00" in "".join(texts(figure))
+    assert re.search("the whisker is within [0-9.]+ µm of", "".join(texts(figure)))
+    assert "the whisker is within 0.00" not in "".join(texts(figure))
     figure = contour_views(points, peg, whisker_radius=np.full(50, whisker))
     assert "the whisker is on the" in "".join(texts(figure))  # not within 4e-15 mm
 

@@ -352,7 +352,7 @@ def test_numbers_are_in_units_that_can_be_read():
     assert shown_value("force", 2e-6) == "2 µN"
     assert shown_value("force", 4.0) == "4000 mN"
     assert shown_value("force", 40.0) == "40 N"
-    assert shown_value("moment", -3e-15) == "below 1e-05 µN·m"
+    assert shown_value("moment", -3e-15) == "below 0.00001 µN·m"
     assert shown_value("r", np.nan) == "–"
     noise = {"noise": [1e-6, 1e-6, 1e-6, 1e-8, 2e-8, 2e-8]}
     said = _settings(two_whiskers(signals=xr.Dataset(attrs=noise)))
@@ -407,6 +407,9 @@ def test_a_map_with_verdicts(map_page, folder):
         apart = float(verdicts["witness_separation"].sel(triplet=row[0]).max())
         assert number(row[2]) == pytest.approx(1e3 * apart, abs=1e-3)
     samples = contact_map.to_dataset()
+    assert page.sections[0] == "results"
+    unique = int((verdicts["verdict"].sel(region="all") == "unique").sum())
+    assert f"<b>{unique} of {verdicts.sizes['triplet']}</b>" in map_page[0].read_text("utf-8")
     ranges = {row[0]: row[1:] for row in page.tables["Ranges over all contacts of the map"]}
     most = number(ranges["bending moment (µN·m)"][1])
     assert most == pytest.approx(1e6 * float(samples["MB"].max()), rel=1e-3)

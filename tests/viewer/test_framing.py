@@ -100,6 +100,14 @@ def test_a_window_that_missed_its_camera_gets_it_again_and_one_that_was_turned_k
         _finish(heard[0](sight))
         np.testing.assert_allclose(sight.position, framed(shot, 390, 844, FOV)[0])
         assert framing.turned is None
+    # Nor is it turned if it reports the camera of an earlier view after a new one was shown.
+    earlier = sight.position
+    server.get_clients()[0] = window
+    framing.show(Shot(np.zeros(3), 50.0, np.array([0.0, -1.0, 0.3])))
+    newest, sight.position = sight.position, earlier
+    _finish(heard[0](sight))
+    assert sight.position == newest
+    assert framing.turned is None
     sight.position = (1.0, 2.0, 3.0)
     _finish(heard[0](sight))
     assert sight.position == (1.0, 2.0, 3.0)

@@ -156,7 +156,9 @@ def _finding(scene: _Scene) -> str:
     """Describe the number of whiskers, and of those in contact."""
     touching = [name for name, points in zip(scene.names, scene.points, strict=True) if len(points)]
     if not touching:
-        return f"{len(scene.names)} whiskers at rest"
+        lengths = np.linalg.norm(np.diff(scene.lines, axis=1), axis=2).sum(axis=1)
+        range_ = f"{np.nanmin(lengths):.0f} to {np.nanmax(lengths):.0f} mm"
+        return f"{len(scene.names)} whiskers at rest, {range_} long"
     rows = ", ".join(scene.rows(touching))
     ever = f"Contact points of {len(touching)} of {len(scene.names)} whiskers"
     ever += f" (rows {rows})" if rows else ""

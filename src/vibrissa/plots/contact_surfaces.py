@@ -9,6 +9,7 @@ and the moment as components M_B cos M_D, M_B sin M_D.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colorbar import Colorbar
-from matplotlib.colors import LogNorm, Normalize
+from matplotlib.colors import FuncNorm, LogNorm, Normalize
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
@@ -83,6 +84,7 @@ def contact_surfaces(
             values = to_display(name, scene.values_of(name, shell))
             if values.min() < min(_PAPER[name]) and max(_PAPER[name]) < values.max():
                 marks = list(_PAPER[name])
+            norm = _spread(norm, marks)
             among, into, inside = (box for *_, box in panels[3 * i : 3 * i + 3])
             for letter, title, box in panels[3 * i : 3 * i + 3]:
                 style.corner_title(figure, box, letter, title)
@@ -92,6 +94,8 @@ def contact_surfaces(
             space.name_axes(axes, (-8.0, -9.0, -10.5))
             surface, hues = _level_sets(whole, name, norm, marks)
             space.paint(axes, space.contact_points(surface), hues)
+            if name == "r":
+                finding = _finding(surface, marks)
             axes.plot(*line.T, color="black", linewidth=1.2, zorder=10)
             _write_values(figure, among, name, norm, marks)
             axes = space.signal_axes(figure, into, signals)
@@ -103,11 +107,27 @@ def contact_surfaces(
             hues = space.painted(values, norm, style.sequential())
             space.paint(axes, space.signal_rows(body), hues, flat=0.8)
             coordinate_bar(figure, rails[i], name, norm, marks)
-        style.conclude(
-            figure,
-            "Surfaces of equal r, θ and φ, and their signals in the space of ($F_x$, $M_B$, $M_D$)",
-        )
+        style.conclude(figure, finding)
         return figure
+
+
+def _spread(norm: Normalize, marks: Sequence[float]) -> Normalize:
+    """Limits of colours between which the surfaces are equally far apart."""
+    ends = [norm.vmin, *marks, norm.vmax]
+    shares = np.linspace(0.0, 1.0, len(ends))
+    ways = partial(np.interp, xp=ends, fp=shares), partial(np.interp, xp=shares, fp=ends)
+    return FuncNorm(ways, vmin=norm.vmin, vmax=norm.vmax)
+
+
+def _finding(surface: Array, marks: Sequence[float]) -> str:
+    """State the largest bending moments of the surfaces of equal r, triangles (n, 3, columns)."""
+    r = to_display("r", scene.values_of("r", surface)).mean(axis=1)
+    moment = to_display("MB", scene.values_of("MB", surface)).max(axis=1)
+    which = np.abs(r[:, None] - np.asarray(marks)).argmin(axis=1)
+    there = [i for i in range(len(marks)) if (which == i).any()]
+    at = ", ".join(f"{marks[i]:g}" for i in there)
+    largest = ", ".join(f"{moment[which == i].max():.2g}" for i in there)
+    return f"Contacts at $r$ = {at} mm have $M_B$ up to {largest} µN·m"
 
 
 def _level_sets(
@@ -134,7 +154,7 @@ def _write_values(
     unit = quantity(name).display_unit
     for i, mark in enumerate(marks):
         text = f"{mark:g}{'' if unit == '°' else ' '}{unit}".replace("-", "−")
-        place = (box[0] + 5.5 + 9.5 * i) / wide, (box[1] + box[3] - 3.6) / tall
+        place = (box[0] + 5.5 + 12.0 * i) / wide, (box[1] + box[3] - 3.6) / tall
         look: dict[str, Any] = {"fontsize": style.SMALL, "fontweight": "bold", "va": "top"}
         figure.text(*place, text, color=style.sequential()(norm(mark)), **look)
 

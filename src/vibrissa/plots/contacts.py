@@ -243,6 +243,7 @@ def estimated_against_true(
             if seconds is not None:
                 _course(panels[1, i], axis, seconds, pair, look)
                 _errors(panels[2, i], axis, seconds, pair, look)
+                _remark(panels[1, i], f"dots: estimated; line: {known_as}" if i == 0 else "")
         if shade is not None:
             # As tall as the panels of the first row, to their right.
             place: dict[str, Any] = {

@@ -116,7 +116,8 @@ def contour_views(
             thing = "whisker's centreline" if whisker_radius is None else "whisker"
             median = np.nanmedian(np.abs(to_display("r", away - radius[rows])))
             # A nanometre is rounding, of contacts that are the truth.
-            where = f"within {median:.2g} mm of" if median > 1e-6 else "on"
+            nearby = f"{median:.2g} mm" if median >= 0.01 else f"{1e3 * median:.2g} µm"
+            where = f"within {nearby} of" if median > 1e-6 else "on"
             style.conclude(
                 figure,
                 f"{len(away)} contact points: in half of them the {thing} is {where} the "
@@ -196,7 +197,8 @@ def _panels(
         axes = style.box_axes(figure, box, xlim=limits[view[0]], ylim=limits[view[1]])
         axes.set(xlabel=axis_label(_NAMES[view[0]]), ylabel=axis_label(_NAMES[view[1]]))
         style.head(axes, "abc"[i], title)
-        axes.locator_params(axis="x", nbins=5 if i == 0 else 3, integer=True)
+        few = 3 if wide > 10.0 else 1
+        axes.locator_params(axis="x", nbins=5 if i == 0 else few, integer=True)
         panels.append(axes)
         left += wide + _GAP
     return figure, panels

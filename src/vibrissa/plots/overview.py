@@ -120,12 +120,16 @@ def scale_bar(axes: Axes, course: Course, view: Camera) -> None:
     pixels = 5.0 * float(np.linalg.norm(ends[:3] - ends[3:], axis=1).max())
     left, right = axes.get_xlim()
     share = pixels / (right - left)
-    if not 0.0 < share < 1.0:
-        return
+    if 0.0 < share < 1.0:
+        size_bar(axes, share, "5 mm")
+
+
+def size_bar(axes: Axes, share: float, words: str) -> None:
+    """Draw a bar over a share of the width below the right end of an image."""
     place: dict[str, Any] = {"transform": axes.transAxes, "clip_on": False}
     axes.plot([1.0 - share, 1.0], [-0.035, -0.035], color=style.INK, linewidth=1.2, **place)
     axes.annotate(
-        "5 mm",
+        words,
         (1.0 - share, -0.035),
         xycoords="axes fraction",
         xytext=(-3.0, 0.0),
@@ -314,7 +318,7 @@ def _sheet(width: style.Width, images: int, compared: bool) -> _Sheet:
         bottom = 56.0 if compared else 0.0
         scatter = tuple((14.0 + 55.0 * i, 10.0, 38.0, 38.0) for i in range(3)) if compared else ()
         solids = tuple((59.0 * i, bottom, 56.0, 46.5) for i in range(3))
-        rails = tuple((59.0 * i + 52.5, bottom + 10.5, 1.6, 22.0) for i in range(3))
+        rails = tuple((59.0 * i + 50.8, bottom + 10.5, 1.6, 22.0) for i in range(3))
         low = bottom + 59.0
         curves = tuple(
             (left, low + 16.5 * (2 - i), 74.0, 14.0) for left in (12.0, 102.0) for i in range(3)
@@ -354,12 +358,15 @@ def _images(
             part = Window(low, high, view.size, panel).of(next(stream))
             extent = (low[0], high[0], high[1], low[1])
             axes.imshow(part, cmap="gray", vmin=0, vmax=255, extent=extent, aspect="auto")
-            axes.plot(*lines[row].T, **style.TRACE)
-            axes.scatter(dots[row, 0], dots[row, 1], 9.0, zorder=5, **_CONTACT)
+            axes.plot(*lines[row].T, **style.TRACE, label="whisker")
+            axes.scatter(dots[row, 0], dots[row, 1], 9.0, zorder=5, **_CONTACT, label="contact")
             when = f"{to_display('time', course.time[row]):.3f} s"
             axes.set_title(f"{view.name}, {when}", loc="right", pad=2.0)
             if count == 0:
                 scale_bar(axes, course, view)
+            if count == number == 0:
+                look: dict[str, Any] = {"borderpad": 0.0, "columnspacing": 1.0}
+                axes.legend(loc="center left", bbox_to_anchor=(0.0, -0.035), ncols=2, **look)
 
 
 def _trajectory(

@@ -166,7 +166,8 @@ def signal_axes(figure: Figure, panel: Box, limits: Array) -> Any:
     """Add axes for the cylinder: rings of equal M_B and rays of equal M_D on its floor."""
     left, bottom, side, _ = square(panel)
     box = left + 3.5, bottom + 0.5, side, side
-    zoom = 0.98 if side > 50.0 else 0.86  # lettering does not shrink with the panel
+    small = side < 50.0  # lettering does not shrink with the panel
+    zoom = 0.86 if small else 0.98
     axes = space_axes(
         figure, box, limits, _VIEW, zoom=zoom, frame=False, aspect=_ASPECT, parallel=True
     )
@@ -178,8 +179,10 @@ def signal_axes(figure: Figure, panel: Box, limits: Array) -> Any:
         axes.plot(*places, floor, **_FLOOR)
         near = 1.0 if ring < rings[-1] else 1.28
         size, unit = quantity("MB").symbol, quantity("MB").display_unit
-        label = f"{ring:g}" if ring < rings[-1] else f"${size}$ = {ring:g} {unit} (√ scale)"
-        _write(axes, _FRONT, np.sqrt(ring) * near, floor, label, ha="left", va="top", color=MUTED)
+        scale = "" if small else " (√ scale)"
+        label = f"{ring:g}" if ring < rings[-1] else f"${size}$ = {ring:g} {unit}{scale}"
+        look = {"ha": "center" if small else "left", "va": "top", "color": MUTED}
+        _write(axes, _FRONT, np.sqrt(ring) * near, floor, label, **look)
     for angle in (0, 90, 180, -90):
         axes.plot(*np.outer(_toward(angle), [0.0, reach]), floor, **_FLOOR)
         if angle == 0:
@@ -190,12 +193,12 @@ def signal_axes(figure: Figure, panel: Box, limits: Array) -> Any:
         far = {"ha": "right"} if angle in (90, 180) else {}
         far_out = 1.3 if angle == -90 else 1.17  # clear of the solid's corner
         _write(axes, angle, far_out * reach, floor, label.replace("-", "−"), **far)
-    _height_axis(axes, limits)
+    _height_axis(axes, limits, small)
     return axes
 
 
-def _height_axis(axes: Any, limits: Array) -> None:
-    """Draw the axis of F_x, vertical at the left."""
+def _height_axis(axes: Any, limits: Array, small: bool) -> None:
+    """Draw the axis of F_x, vertical at the left; in small panels for both scales."""
     reach, (floor, top) = limits[0, 1], limits[2]
     left = _VIEW[1] - 90.0
     place = _AXIS * reach * _toward(left)
@@ -206,7 +209,8 @@ def _height_axis(axes: Any, limits: Array) -> None:
         axes.plot(*tick, height, color=INK, linewidth=0.5)
         label = f"{mark:g}".replace("-", "−")
         _write(axes, left, 1.49 * reach, height, label, ha="right")
-    for up, text in ((0.15, axis_label("Fx")), (0.045, "√ scale")):
+    named = (0.2, axis_label("Fx")) if small else (0.15, axis_label("Fx"))
+    for up, text in (named, (0.045, "√ scales" if small else "√ scale")):
         height = top + up * (top - floor)
         _write(axes, left, 1.4 * reach, height, text, fontsize=PLAIN if up > 0.1 else SMALL)
 

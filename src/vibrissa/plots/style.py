@@ -185,7 +185,7 @@ def conclude(figure: Figure, finding: str) -> None:
     for word in finding.split(" "):
         longer = f"{lines[-1]} {word}".lstrip()
         seen = longer.translate(_UNSEEN)
-        lines = [*lines[:-1], longer] if len(seen) <= wide / _LETTER else [*lines, word]
+        lines = [*lines[:-1], longer] if len(seen) <= (wide - 4.0) / _LETTER else [*lines, word]
     figure.above = 2.5 + 3.6 * len(lines)
     figure.text(
         1.5 / wide, 1.0 + 1.0 / tall, "\n".join(lines), fontsize=LARGE, ha="left", va="bottom"

@@ -215,7 +215,7 @@ def _evidence(axes: Axes, verdict: xr.Dataset, left: float, y: float) -> None:
         cell = verdict.sel(region="all")
         twins = 100.0 * float(cell["twin_share"])
         rare = "rare" if str(cell["verdict"].values) == "not unique" else "none"
-        share = f"{twins:.{2 + (twins > 99.0)}g} %" if twins > 0.0 else rare
+        share = f"{twins:#.{2 + (twins > 99.0)}g}".rstrip(".") + " %" if twins > 0.0 else rare
         axes.text(left + 20.5, y, share if np.isfinite(twins) else "", ha="right", **look)
     if "ambiguous_share" in verdict:
         alike = verdict["ambiguous_share"].sel(region="all")
@@ -470,7 +470,7 @@ def _contours(axes: Axes, x: Array, y: Array, degrees: Array, high: float) -> No
         marks[:-1] |= -rise > _JUMP
     shown = np.ma.masked_array(degrees, ~np.isfinite(degrees) | exceptional)
     lines = axes.contour(x, y, shown, levels=levels, colors=style.INK, linewidths=widths)
-    axes.clabel(lines, fmt=lambda value: f"{value:g}°", fontsize=style.SMALL, inline_spacing=2)
+    axes.clabel(lines, fmt=lambda value: f"{value:g}°", fontsize=style.SMALL, inline_spacing=5)
 
 
 def _edges(centres: Array) -> Array:

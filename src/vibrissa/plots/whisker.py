@@ -81,7 +81,9 @@ def whisker_views(
         if len(points) < 2:
             return style.sentence("no whisker", width)
         figure, axes, magnification = _views(points, radii, magnification, width)
-        _caption(axes, name, magnification, assumed)
+        length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+        size = f"{length:.3g} mm long, radius {1e3 * radii[0]:.3g} to {1e3 * radii[-1]:.3g} µm"
+        _caption(axes, name, (size, *(f"assumed: {one}" for one in assumed)), magnification)
         return figure
 
 
@@ -142,11 +144,10 @@ def _tube(places: Array, radii: Array) -> Path:
     return Path.make_compound_path(*(Path(loop, closed=True) for loop in corners), *discs)
 
 
-def _caption(axes: Axes, name: str | None, magnification: float, assumed: Sequence[str]) -> None:
-    """Write the whisker's name, the magnification of its width, and what is assumed."""
+def _caption(axes: Axes, name: str | None, words: Sequence[str], magnification: float) -> None:
+    """Write the whisker's name, its size and what is assumed, and the drawn width."""
     axes.set_title(name or "whisker", loc="left", fontsize=style.LARGE)
-    lines = [f"width × {magnification:g}" if magnification != 1 else "true width"]
-    lines += [f"assumed: {one}" for one in assumed]
+    lines = [f"width × {magnification:g}" if magnification != 1 else "true width", *words]
     axes.text(
         0.02,
         0.97,
@@ -496,6 +497,8 @@ def _table(
         axes.text(0.02, y, f"{symbol}  ({quantity(name).display_unit})", **look)
         for x, value in zip((0.62, 0.97), to_display(name, values), strict=True):
             text = f"{value:#.{7 if same else 4}g}".rstrip(".").replace("-", "−")
+            if "e" in text:
+                text = _power(value, 3)
             axes.text(x, y, text, ha="right", color=style.INK if same else style.MUTED, **look)
     axes.axhline(9.2, color=style.INK, linewidth=0.5)
     for line, text in enumerate(_sentences(witness, triplet)):
@@ -514,10 +517,10 @@ def _sentences(witness: xr.Dataset, triplet: tuple[str, ...]) -> list[str]:
     ]
 
 
-def _power(value: float) -> str:
+def _power(value: float, decimals: int = 0) -> str:
     if value == 0.0:
         return "0"
-    digits, power = f"{value:.0e}".split("e")
+    digits, power = f"{value:.{decimals}e}".split("e")
     return rf"${digits} \cdot 10^{{{int(power)}}}$"
 
 

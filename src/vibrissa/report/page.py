@@ -233,7 +233,7 @@ def shown_value(name: str, value: float, digits: int = 3) -> str:
     number = value * factor
     # Smaller values are due to rounding.
     if 0.0 < abs(number) < _LEAST:
-        return f"below {_LEAST:g}{'' if unit in ('', '°') else ' '}{unit}"
+        return f"below {_LEAST:.5f}{'' if unit in ('', '°') else ' '}{unit}"
     text = f"{number:.0f}" if abs(number) >= 10.0**digits else f"{number:.{digits}g}"
     return f"{text.replace('-', '−')}{'' if unit in ('', '°') else ' '}{unit}"
 

@@ -39,6 +39,7 @@ _DISTANCES = ("median", "largest_95", "median_predicted", "largest_95_predicted"
 _NOTHING = "None of this whisker's true contacts was detected, so there is nothing to compare."
 _SIGNAL_NAMES = {"wrench": "all components of force and moment"}
 _MOST_EVENTS = 60
+_FARTHEST = 0.1  # largest distance from an object that is stated, m
 _SUSPECT = 1.5  # misfit above which another shape may fit better
 
 
@@ -410,7 +411,7 @@ def _distances(recording: xr.DataTree, seed: int) -> str:
             (
                 str(row["label"].item()),
                 str(int(row["contacts"])),
-                *(shown_value("surface_distance", float(row[column])) for column in _DISTANCES),
+                *(_distance(float(row[column])) for column in _DISTANCES),
             )
             for row in (sums.isel({"class": i}) for i in range(sums.sizes["class"]))
         ]
@@ -418,6 +419,11 @@ def _distances(recording: xr.DataTree, seed: int) -> str:
         caption = f"Distance of contacts from the known object, by {known.long_name}"
         parts.append(table(rows, heading, caption))
     return "".join(parts) + paragraph("* what the covariance of the contacts predicts", "note")
+
+
+def _distance(value: float) -> str:
+    """Write a distance; the lightest contacts' predictions have no upper limit."""
+    return "over 100 mm" if value > _FARTHEST else shown_value("surface_distance", value)
 
 
 def _events(recording: xr.DataTree) -> str:
@@ -463,7 +469,7 @@ def whiskers_table(recording: xr.DataTree, chosen: int) -> str:
             largest = float(np.max(size, initial=0.0, where=np.isfinite(size)))
         rows.append((names[k], str(k), str(touching[k]), shown_value("force", largest)))
     text = paragraph(
-        f"Signals and estimated contacts below are of whisker {names[chosen]}, number {chosen}; "
+        f"Signals and estimated contacts are those of whisker {names[chosen]}, number {chosen}; "
         "`--which` chooses another. The contour is of all."
     )
     if not rows:
@@ -507,15 +513,36 @@ def tracked_table(root: xr.Dataset) -> str:
 
 def chart_sections(contact_map: ContactMap, verdicts: xr.Dataset | None = None) -> list[Section]:
     """Sections on a contact map and on the signals that locate its contacts."""
-    about = Section("map", "The map", contact_map._repr_html_() + _ranges(contact_map.to_dataset()))
+    samples = contact_map.to_dataset()
+    about = Section("map", "The map", contact_map._repr_html_() + _ranges(samples))
+    results = Section("results", "Results", _map_results(samples, verdicts))
     if verdicts is None:
         advice = paragraph(
             "Uniqueness has not been tested: `vibrissa uniqueness MAP -o FILE.nc` tests it, and "
             "`--uniqueness FILE.nc` shows the verdicts here."
         )
-        return [about, Section("verdicts", "Verdicts", advice)]
+        return [results, about, Section("verdicts", "Verdicts", advice)]
     body = _verdicts(verdicts) + _witnesses(verdicts)
-    return [about, Section("verdicts", "Which triplets are unique", body)]
+    return [results, about, Section("verdicts", "Which triplets are unique", body)]
+
+
+def _map_results(samples: xr.Dataset, verdicts: xr.Dataset | None) -> str:
+    """Main numbers of a map: the triplet to use, and what contacts have at most."""
+    triplet = Tile("–", "triplet of signals to use: not tested")
+    number = Tile("–", "triplets that locate all contacts: not tested")
+    if verdicts is not None and "region" in verdicts.dims:
+        all_of = verdicts["verdict"].isel(region=0).values
+        region = str(verdicts["region"].values[0])
+        unique = int((all_of == "unique").sum())
+        number = Tile(f"{unique} of {all_of.size}", f"triplets unique for region: {region}")
+        chosen = str(verdicts.attrs.get("chosen_triplet", ""))
+        triplet = Tile(chosen or "none", "triplet of signals to use, as far as was searched")
+    nearest, farthest = (
+        f"{end:.3g}" for end in np.nanquantile(to_display("r", samples["r"]), [0, 1])
+    )
+    reach = Tile(f"{nearest} to {farthest} mm", "distance of the contacts from the base")
+    moment = shown_value("MB", float(samples["MB"].max()))
+    return tiles([triplet, number, reach, Tile(moment, "largest bending moment")])
 
 
 def _ranges(samples: xr.Dataset) -> str:
@@ -524,7 +551,10 @@ def _ranges(samples: xr.Dataset) -> str:
     for name in (*SIGNALS, "r", "theta", "phi"):
         factor, unit = shown_unit(name, samples[name].values)
         values = factor * samples[name].values
-        ends = (f"{end:.4g}".replace("-", "−") for end in (np.nanmin(values), np.nanmax(values)))
+        ends = (
+            (f"{end:.4g}" if abs(end) >= 1e-4 else f"{end:.6f}").replace("-", "−")
+            for end in (np.nanmin(values), np.nanmax(values))
+        )
         rows.append((f"{quantity(name).long_name} ({unit})", *ends))
     ranges = table(rows, ("quantity", "smallest", "largest"), "Ranges over all contacts of the map")
     counts = describe(samples["status"].values).most_common()

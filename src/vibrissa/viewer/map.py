@@ -167,18 +167,22 @@ def frame_drawing(solids: Solids, exaggeration: float) -> scene.Drawing:
         out[f"floor {name}"] = scene.Line(np.concatenate(rings), (205, 209, 214), 1.0)
         pole = np.array([[0.0, 0.0, floor], [0.0, 0.0, -floor]]) + centre
         out[f"axis {name}"] = scene.Line(scene.pieces(pole), (120, 126, 134), 1.0)
-        above = np.array([0.0, 0.0, 0.07 * length])  # where Fx is never positive, 0 is at the top
-        out[f"axis {name} name"] = scene.Label(pole[1] + above, "Fx")
-        out[f"zero {name}"] = scene.Label(centre + np.array([0.0, 0.0, solids.axis_height()]), "0")
-        edge = 0.5 * length * np.array([np.cos(TURN), np.sin(TURN), 0.0])
-        # The labels have different heights, so that none hides another on a small screen.
-        apart = np.array([0.0, 0.0, 0.06 * length])
-        out[f"rim {name}"] = scene.Label(bottom + edge + apart, "MD = 0°")
-        out[f"ring {name}"] = scene.Label(bottom - edge - apart, f"MB = {largest}")
-        out[f"lowest {name}"] = scene.Label(bottom + 4.0 * apart, least)
         out[f"title {name}"] = scene.Label(
             centre + length * np.array([-0.45, 0.0, 0.62]), f"signals, coloured by {_NAMES[name]}"
         )
+    # The axes of all three are the same. No label hides another on a small screen.
+    centre = solids.place(0)
+    edge = 0.5 * length * np.array([np.cos(TURN), np.sin(TURN), 0.0])
+    apart = np.array([0.0, 0.0, 0.06 * length])
+    bottom = centre + np.array([0.0, 0.0, floor])
+    for text, at in {
+        "Fx": centre - np.array([0.0, 0.0, floor]) + apart,  # above 0, which may be at the top
+        "0": centre + np.array([0.0, 0.0, solids.axis_height()]),
+        least: bottom - np.array([0.85 * length, 0.0, 0.0]),
+        "MD = 0°": bottom + edge + apart,
+        f"MB = {largest}": bottom - edge - 3.0 * apart,
+    }.items():
+        out[f"axes {text}"] = scene.Label(at, text)
     return out
 
 

@@ -63,7 +63,9 @@
   setInterval(() => {
     const drawn = document.querySelector("canvas"), page = document.documentElement;
     if (drawn) {
-      page.classList.toggle("narrow", drawn.clientWidth < 0.65 * drawn.clientHeight);
+      const narrow = drawn.clientWidth < 0.65 * drawn.clientHeight;
+      page.classList.toggle("narrow", narrow);
+      page.classList.toggle("tight", !narrow && drawn.clientWidth < 960);
       page.style.setProperty("--drawn", `${drawn.clientWidth}px`);
     }
     const strip = document.querySelector("svg[data-timeline]");

@@ -460,6 +460,7 @@ class Framing:
         self.turned: Array | None = None
         """Camera position and target (6,) of the view changed last, mm."""
         self._placed: dict[int, tuple[int, int, Array]] = {}
+        self._given: dict[int, list[Array]] = {}  # positions that each window was given
         self._lock = threading.RLock()  # a window may connect while all are being moved
         server.on_client_connect(self._came)
 
@@ -482,20 +483,22 @@ class Framing:
                 self._turn(client, goal)
 
     def _came(self, client: viser.ClientHandle) -> None:
-        starts = [np.array(c.position) for c in (client.camera, self._server.initial_camera)]
+        cameras = client.camera, self._server.initial_camera
         with self._lock:
+            given = self._given.setdefault(client.client_id, [])
+            given += [np.array(camera.position) for camera in cameras]
             if self._goal is not None:
                 self._turn(client, self._goal)
 
         @client.camera.on_update
         async def _(camera: viser.CameraHandle) -> None:
-            # When a window is resized, views that the user has turned are kept. A window that has
-            # just opened may have missed its camera position, and reports an initial one.
+            # When a window is resized, views that the user has turned are kept. A window may have
+            # missed its newest camera position, and report an earlier or initial one.
             with self._lock:
                 wide, tall, place = self._placed.get(client.client_id, (0, 0, np.zeros(3)))
                 resized = (camera.image_width, camera.image_height) != (wide, tall)
                 here = np.allclose(camera.position, place, atol=0.1)
-                unturned = here or any(np.allclose(camera.position, p, atol=0.1) for p in starts)
+                unturned = any(np.allclose(camera.position, p, atol=0.1) for p in given)
                 goal = self._goal
                 if goal is not None and unturned and (resized or not here):
                     self._turn(client, goal)
@@ -510,6 +513,7 @@ class Framing:
         wide, tall = camera.image_width, camera.image_height
         place, target = self._wanted(goal, wide, tall, camera.fov)
         self._placed[client.client_id] = wide, tall, place
+        self._given.setdefault(client.client_id, []).append(place)
         with client.atomic():
             camera.position, camera.look_at = triple(place), triple(target)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gzip
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -19,6 +20,7 @@ import viser
 import xarray as xr
 
 from vibrissa.io import netcdf_image, save_centerline, save_recording, write_movie
+from vibrissa.numerics import Mask
 from vibrissa.quantities import attributes
 from vibrissa.rod import Deflection
 from vibrissa.signals import base_signals
@@ -56,11 +58,16 @@ def _on_white(image: Picture) -> Picture:
 def on_paper(image: Picture) -> Picture:
     """Blend a picture (height, width, 4) with white and crop its empty margins (h, w, 3)."""
     out = _on_white(image)
-    rows, columns = np.nonzero((out != 255).any(axis=-1))
-    if not rows.size:
-        return out
-    top, left = (max(int(at.min()) - _MARGIN, 0) for at in (rows, columns))
-    return out[top : rows.max() + _MARGIN + 1, left : columns.max() + _MARGIN + 1]
+    return out[_part((out != 255).any(axis=-1))]
+
+
+def _part(filled: Mask) -> tuple[slice, slice]:
+    """Rows and columns of the filled part of a picture (height, width), with a margin."""
+    at = np.nonzero(filled)
+    if not at[0].size:
+        return slice(None), slice(None)
+    top, left = (slice(max(int(k.min()) - _MARGIN, 0), int(k.max()) + _MARGIN + 1) for k in at)
+    return top, left
 
 
 def written(name: str, write: Callable[[Path], object]) -> bytes:
@@ -73,31 +80,47 @@ def written(name: str, write: Callable[[Path], object]) -> bytes:
 
 _TIMEOUT = 60.0  # of a picture that the browser draws, s
 _FRAMES = 100  # most frames of a movie
+# Pixels of a picture, and of a movie, per pixel of the browser, and longest side of either, pixels.
+_STILL, _MOVING, _LONGEST = 3.0, 2.0, 4000.0
+_SLOW = 1.0  # time to draw a frame of a movie from which on it is drawn coarsely, s
 
 
-def _render(client: viser.ClientHandle) -> Picture:
+def _render(client: viser.ClientHandle, fine: float) -> Picture:
     """Render the scene of a browser, without the panels."""
-    camera = client.camera
-    return client.get_render(
-        camera.image_height, camera.image_width, transport_format="png", timeout=_TIMEOUT
-    )
+    size = np.array([client.camera.image_height, client.camera.image_width])
+    height, width = (max(1.0, min(fine, _LONGEST / size.max())) * size).astype(int).tolist()
+    return client.get_render(height, width, transport_format="png", timeout=_TIMEOUT)
 
 
 def movie(
     client: viser.ClientHandle, mode: TrialMode, progress: Callable[[int, int], None]
 ) -> bytes:
-    """MP4 movie of a trial in the view of a browser, on white."""
+    """MP4 movie of a trial in the view of a browser, on white, without empty margins."""
+    import imageio.v3 as imageio
+
     mode.pause()
     count = min(mode.trial.frames, _FRAMES)
     rows = np.linspace(0, mode.trial.frames - 1, count).round().astype(int)
 
+    drawn, filled, fine = [], np.zeros((), dtype=bool), _MOVING
+    for done, row in enumerate(rows):
+        progress(done, count)
+        mode.show(int(row))
+        began = time.monotonic()
+        image = _render(client, fine)
+        if done == 0 and time.monotonic() - began > _SLOW:
+            fine = 1.0
+            image = _render(client, fine)
+        paper = _on_white(image)
+        drawn.append(png(paper))
+        filled = filled | (paper != 255).any(axis=-1)
+    part = _part(filled)
+
     def frames() -> Iterator[Picture]:
-        for done, row in enumerate(rows):
-            progress(done, count)
-            mode.show(int(row))
-            paper = _on_white(_render(client))
+        for each in drawn:
+            frame = imageio.imread(each, extension=".png")[part]
             # Encoders need even sizes.
-            yield paper[: paper.shape[0] // 2 * 2, : paper.shape[1] // 2 * 2]
+            yield frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]
 
     return written("trial.mp4", lambda path: write_movie(path, frames(), 25.0))
 
@@ -157,7 +180,7 @@ class SaveControls:
         def drawn() -> bytes:
             self._page.grip.show(None)
             try:
-                return png(on_paper(_render(client)))
+                return png(on_paper(_render(client, _STILL)))
             finally:
                 self._page.place_grip()
 

@@ -409,6 +409,7 @@ class TrialMode(Mode):
             )
             self._now_line = gui.add_html("")
         self._timeline.float(x=16.0, y=-16.0, width=520.0, height=112.0)
+        self._timeline.expand()  # on a phone panels are closed otherwise
         self._play.on_click(lambda _: self.toggle())
         jump.on_click(lambda _: self.jump())
 
@@ -461,7 +462,7 @@ class TrialMode(Mode):
 
     def link(self) -> dict[str, str]:
         """Parameter of a link with the time, as a share of the trial."""
-        return {"t": f"{self._share:.4f}"}
+        return {"t": f"{self._share:.6f}"}
 
     def restore(self, asked: Mapping[str, str]) -> None:
         """Go to a time."""
@@ -470,7 +471,8 @@ class TrialMode(Mode):
         except ValueError:
             return
         if 0.0 <= share <= 1.0:
-            self.go(float(self.trial.time[0] + share * np.ptp(self.trial.time)))
+            away = self.trial.time - self.trial.time[0] - share * np.ptp(self.trial.time)
+            self.go(float(self.trial.time[np.abs(away).argmin()]))
 
     def go(self, time: float) -> None:
         """Show the frame at a time, s."""

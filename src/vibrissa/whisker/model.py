@@ -608,7 +608,7 @@ class Whisker:
         rows = [(quantity(name).long_name, shown(name, getattr(self, name))) for name in names]
         rows += [("note", note) for note in self.notes]
         picture = views([Mark(self.centerline(81), BENT, width=2.0)])
-        return card(f"Whisker {self.name!r}", rows, picture)
+        return card(f"Whisker: {self.name}", rows, picture)
 
 
 def _break_faults(breaks: Sequence[float], length: float) -> list[str]:

@@ -86,7 +86,7 @@ def picture() -> Figure:
         nodes, worst, _ = theirs["force"]
         conclude(
             figure,
-            f"36 steps of vibrissa are exact to {power(ours[:, STEPS.index(36)].max())}, "
+            f"36 steps of vibrissa are accurate to {power(ours[:, STEPS.index(36)].max())}, "
             f"{data[nodes][-1]} nodes of Elastica3D to {power(worst[-1])}",
         )
         return figure

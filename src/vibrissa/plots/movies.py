@@ -427,7 +427,7 @@ def signal_frames(
         If the trial has no signals, or there are no rows.
     """
     if course.signals is None:
-        raise ValueError("the trial has no signals: F_x, M_B and M_D are needed")
+        raise ValueError("the trial has no signals: compute them first, by pipeline.with_signals")
     chosen = np.asarray(rows, dtype=np.intp)
     if chosen.size == 0:
         raise ValueError("no frames of the trial are chosen")

@@ -118,7 +118,7 @@ class AroundOptions:
             "--gravity": weight.gravity,
         }
         others |= {f"--{name.replace('_', '-')}": v for name, v in how.assumed.errors.items()}
-        refuse(others, "--around uses force and moment whole, of a --whisker without friction or weight")
+        refuse(others, "--around uses all of force and moment, of a --whisker without weight")
         if how.assumed.prior is not None:
             raise ValueError("--around takes no prior of contacts: its objects are the prior")
 

@@ -330,8 +330,7 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function for calls from Python; it is cached on disk and releases the GIL."""
     compiled = _compile_cached(function, pipeline_class=_CompactCompiler)
     compiled.__class__ = _Kernel
-    # Stated, because Numba would else inline it by force if a function that is calls it first.
-    compiled.part = _compile_part(function, forceinline=False)
+    compiled.part = _compile_part(function, forceinline=False)  # otherwise that of its first caller
     return cast("Callable[P, R]", compiled)
 
 

@@ -98,30 +98,6 @@ def test_a_kernel_is_compiled_within_those_that_call_it():
     )
 
 
-def test_the_type_of_an_operation_is_determined_once():
-    run(
-        """
-        import numpy as np
-        from vibrissa.numerics import compiled
-
-        @compiled.kernel
-        def first(x, rows):
-            return x * x + rows[0]
-
-        @compiled.kernel
-        def second(x, rows):
-            return rows[0] * (x + x)
-
-        assert first(2.0, np.ones(3)) == 5.0
-        before = len(compiled._Typing.known)
-        assert second(2.0, np.ones(3)) == 4.0
-        assert len(compiled._Typing.known) == before > 0
-        compiled.rigorous(second.py_func)(2.0, np.ones(3))  # other options, other code
-        assert len(compiled._Typing.known) > before
-        """
-    )
-
-
 def test_only_arrays_that_a_kernel_creates_or_returns_are_counted():
     run(
         """

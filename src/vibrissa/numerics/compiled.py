@@ -12,9 +12,7 @@ from __future__ import annotations
 import gc
 from collections.abc import Callable
 from contextlib import suppress
-from copy import copy as copy_of
-from functools import cache
-from typing import Any, ClassVar, ParamSpec, TypeVar, cast
+from typing import Any, ParamSpec, TypeVar, cast
 
 import llvmlite
 import numba
@@ -28,9 +26,7 @@ from numba.core.cpu import CPUContext
 from numba.core.lowering import Lower
 from numba.core.registry import CPUDispatcher
 from numba.core.runtime.context import NRTContext
-from numba.core.targetconfig import ConfigStack
 from numba.core.typed_passes import NativeLowering
-from numba.core.typing.context import Context
 
 from vibrissa.numerics.kernel_cache import Called, PackageCache
 
@@ -236,40 +232,6 @@ class _SharedFlags(_Flags):
         return "shared"
 
 
-class _Typing(Context):
-    """Numba's rules of types, applied once to the same operation on the same types.
-
-    Numba tries dozens of rules for each operation, which takes a fifth of the compilation.
-    """
-
-    #: Signatures by operation, types of its arguments, and options of compilation: by these some
-    #: operations choose their code, which must not be that of a function rounded differently.
-    known: ClassVar[dict[Any, Any]] = {}
-
-    def resolve_function_type(self, func: Any, args: Any, kws: Any) -> Any:
-        """Return the signature of an operation; those on numbers, arrays and tuples are kept."""
-        function = func if isinstance(func, types.Type) else self._lookup_global(func)  # type: ignore[no-untyped-call]
-        if kws or type(function) is not types.Function or not all(map(_is_plain, args)):
-            return super().resolve_function_type(func, args, kws)  # type: ignore[no-untyped-call]
-        key = function, tuple(args), ConfigStack.top_or_none()
-        if self.known.get(key) is None:
-            self.known[key] = super().resolve_function_type(func, args, kws)  # type: ignore[no-untyped-call]
-        return self.known[key]
-
-
-def _is_plain(kind: Any) -> bool:
-    """Whether a type is one of numbers, arrays or tuples."""
-    return isinstance(kind, types.Number | types.Boolean | types.Array | types.BaseTuple)
-
-
-@cache
-def _typing(context: Any) -> Any:
-    """Numba's types with such rules; everything else is shared."""
-    ours = copy_of(context)
-    ours.__class__ = _Typing
-    return ours
-
-
 class _WholeCompiler(Compiler):
     """Numba's compiler with such a library."""
 
@@ -281,7 +243,6 @@ class _WholeCompiler(Compiler):
         library.enable_object_caching()
         args, returned, flags, types_of_locals = rest
         flags = self.flags_type(flags)
-        typing = _typing(typing)
         super().__init__(typing, target, library, args, returned, flags, types_of_locals)  # type: ignore[no-untyped-call]
 
     def compile_extra(self, func: Any) -> Any:
@@ -368,8 +329,7 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function for calls from Python; it is cached on disk and releases the GIL."""
     compiled = _compile_cached(function, pipeline_class=_CompactCompiler)
     compiled.__class__ = _Kernel
-    # Stated, because Numba would else inline it by force if a function that is calls it first.
-    compiled.part = _compile_part(function, forceinline=False)
+    compiled.part = _compile_part(function, forceinline=False)  # otherwise that of its first caller
     return cast("Callable[P, R]", compiled)
 
 

@@ -117,6 +117,23 @@ def test_the_page_loads_in_silence_and_asks_nobody_else(looking):
     assert all(url.startswith((looking.viewer.url, "blob:")) for url in looking.requests)
 
 
+def test_a_saved_picture_of_a_dark_page_is_that_of_a_light_one(browser, looking):
+    from vibrissa.viewer.save import _render
+
+    assert looking.viewer.page.settle()
+    light = looking.viewer.page.server.get_clients()
+    dark = browser.new_page(viewport=SIZE, color_scheme="dark")
+    dark.goto(looking.viewer.url)
+    dark.wait_for_function("document.querySelector('canvas') !== null")
+    clients = looking.viewer.page.server.get_clients
+    looking.wait_until(lambda: len(clients()) == len(light) + 1)
+    night = next(client for key, client in clients().items() if key not in light)
+    day = next(iter(light.values()))
+    # The first pictures may lack what the page has not loaded yet.
+    assert any(np.array_equal(_render(day, 1.0), _render(night, 1.0)) for _ in range(20))
+    dark.close()
+
+
 def test_a_drag_shows_what_deflect_says(looking):
     before = looking.text("MB")
     start = looking.viewer.page.bend.point

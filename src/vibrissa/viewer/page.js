@@ -13,13 +13,6 @@
     history.replaceState(null, "", "?" + asked + location.hash);
   };
   if (dark.matches) matched();
-  // Labels in space are black on white boxes, in any page.
-  const compiled = WebGL2RenderingContext.prototype.shaderSource;
-  if (dark.matches) WebGL2RenderingContext.prototype.shaderSource = function (shader, source) {
-    compiled.call(this, shader, source
-      .replace(/vec4\(1\.0, 1\.0, 1\.0, 0\.85 \* vAlpha\)/, "vec4(0.08, 0.08, 0.08, 0.7 * vAlpha)")
-      .replace(/vec4\(0\.0, 0\.0, 0\.0, a\)/, "vec4(0.9, 0.9, 0.9, a)"));
-  };
   dark.addEventListener("change", () => { matched(); location.reload(); });
 
   // Keys press buttons; a click in a plot over time sets the time.
@@ -130,6 +123,20 @@
     page.scene.traverse((thing) => {
       if (thing.material === page.backgroundMaterial) thing.visible = false;
     });
+    // Labels in space are black on white boxes, in any page; a saved picture is on white.
+    const night = { value: 0 };
+    if (dark.matches) page.scene.onBeforeRender = () => {
+      night.value = page.getRenderRequestState === "capture" ? 0 : 1;
+      page.scene.traverse(({ material }) => {
+        if (!material?.uniforms?.uLabelData || material.fragmentShader.includes("night")) return;
+        material.uniforms.night = night;
+        material.fragmentShader = "uniform float night;\n" + material.fragmentShader
+          .replace("vec4(1.0, 1.0, 1.0, 0.85 * vAlpha)",
+            "vec4(vec3(1.0 - 0.92 * night), (0.85 - 0.15 * night) * vAlpha)")
+          .replace("vec4(0.0, 0.0, 0.0, a)", "vec4(vec3(0.9 * night), a)");
+        material.needsUpdate = true;
+      });
+    };
     // A mouse that drags, and whatever changes, asks for frames for a quarter of a second. Where
     // each takes its time they would keep that from being drawn which they wait for.
     if (!slow) return;

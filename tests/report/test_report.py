@@ -441,6 +441,10 @@ def test_what_is_missing_is_named_with_the_verb_that_makes_it(folder):
         "statuses",
     ]
     assert "no ground truth" in sections[2].body
+    assert "tests tracking" not in sections[3].body
+    blind["/contour"] = blind["/contour"].assign_attrs(source="contact point")
+    tracked = {part.name: part.body for part in trial_sections(xr.DataTree.from_dict(blind))}
+    assert "this tests tracking and inversion" in tracked["contour"]
 
 
 def test_without_the_drawing_library_the_picture_in_space_is_left_out(folder, monkeypatch):
@@ -543,7 +547,11 @@ def test_it_shows_itself_in_a_browser(written, browser):
     box = page.locator("#space-picture .gl-container").first.bounding_box()
     assert box is not None
     assert box["width"] > 300
-    assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+    for width in (1280, 390):  # on a phone, too
+        page.set_viewport_size({"width": width, "height": 800})
+        assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+        shown = "[...document.images].every((image) => image.getBoundingClientRect().right <= "
+        assert page.evaluate(f"{shown}window.innerWidth)")
     page.close()
 
 

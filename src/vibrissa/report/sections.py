@@ -223,8 +223,12 @@ def _contact_errors(estimates: xr.Dataset, truth: xr.Dataset, whisker: Whisker, 
         text += table(class_rows, ("deflection angle", *names), f"{title}deflection angle", note)
     else:
         text += paragraph(_NOTHING)
-    warned = evaluation.caution(estimates.attrs.get("source"))
-    return text + (paragraph(warned, "note") if warned else "")
+    return text + _caution(estimates)
+
+
+def _caution(found: xr.Dataset) -> str:
+    warned = evaluation.caution(found.attrs.get("source"))
+    return paragraph(warned, "note") if warned else ""
 
 
 def _signal_errors(signals: xr.Dataset, truth: xr.Dataset, whisker: Whisker) -> str:
@@ -369,6 +373,7 @@ def _contour(recording: xr.DataTree, seed: int) -> str:
         f"Misfit {float(f'{fit.misfit:.3g}'):,g}: χ² per degree of freedom, about 1 where the "
         "shape and the stated noise are right.",
     )
+    text += _caution(data)
     if fit.kind != "free" and fit.misfit > _SUSPECT:
         text += paragraph(
             "Contacts are farther from it than their covariance allows: the object may have "

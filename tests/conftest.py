@@ -14,8 +14,6 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 # on the spot, would only take the cores from each other. They are counted when NumPy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-if "PYTEST_XDIST_WORKER" in os.environ:
-    os.environ.setdefault("VIBRISSA_THREADS", "1")  # nor does a helper compile on another's core
 # Tests start many interpreters, workers too; each would compile the package's sources anew.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 

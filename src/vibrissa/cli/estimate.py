@@ -118,7 +118,7 @@ class AroundOptions:
             "--gravity": weight.gravity,
         }
         others |= {f"--{name.replace('_', '-')}": v for name, v in how.assumed.errors.items()}
-        refuse(others, "--around uses all of force and moment, of a --whisker without weight")
+        refuse(others, "--around takes a --whisker and its wrench, without friction or weight")
         if how.assumed.prior is not None:
             raise ValueError("--around takes no prior of contacts: its objects are the prior")
 

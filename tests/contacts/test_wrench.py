@@ -276,3 +276,22 @@ def test_a_minimum_with_friction_does_not_hide_a_contact_without():
     force, moment = [-0.8499e-6, -12.501e-6, -0.9542e-6], [-3.097e-9, -5.312e-9, -99.48e-9]
     found = vb.estimate_from_wrench(whisker, force, moment, noise=np.diag(SIGMA**2))
     assert found.status == vb.Status.AMBIGUOUS
+
+
+def test_covariances_beside_another_probable_contact_are_not_valid(rng):
+    """Near slip-off a contact with more friction was the more probable one in 1 % of the cases.
+
+    Valid covariances are those of answers that leave other contacts less than three sigma do.
+    """
+    whisker = vb.Whisker.straight(0.022, base_radius=59e-6, tip_radius=27e-6)
+    bent = vb.deflect(whisker, frictional_load(whisker, 2000, rng, most=0.0, least=0.7))
+    noisy = np.concatenate([bent.force, bent.moment], axis=1) + SIGMA * rng.normal(size=(2000, 6))
+    found = vb.estimate_from_wrench(whisker, noisy[:, :3], noisy[:, 3:], noise=np.diag(SIGMA**2))
+    others = 1.0 - found.probability
+    doubtful = (found.status == vb.Status.UNIQUE) & (others > 0.0033)
+    assert doubtful.any()
+    assert not found.covariance_valid[doubtful].any()
+    away = found.point - bent.contact_point
+    squares = (away * np.linalg.solve(found.covariance, away[..., None])[..., 0]).sum(axis=1)
+    assert found.covariance_valid.mean() > 0.5
+    assert (squares[found.covariance_valid] > 14.156).mean() < 0.004

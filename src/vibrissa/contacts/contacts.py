@@ -18,6 +18,8 @@ from vibrissa.status import Status, counted, describe, flag_attributes, names
 
 #: Largest number of candidates for one measurement.
 MOST_CANDIDATES = 8
+#: Posterior probability that three standard deviations of a valid covariance may leave out.
+LEFT = 0.0033
 _LISTED = 5  # contacts in the table of a display
 _CERTAIN = (Status.UNIQUE, Status.TIP_CONTACT)
 _SPACE = ["x", "y", "z"]
@@ -178,9 +180,10 @@ class Contacts(_Located):
         first order where the contact moves with the signals as derivatives say, and widened where
         it does not, as near slip-off and where the deflection is small; NaN without ``noise``.
     covariance_valid : (...) bool array
-        Whether regions stated from the covariance hold what they state: the status is ``UNIQUE``
-        and the second-order change of the contact point is small in the metric of the covariance.
-        Of a candidate it is the latter alone. False without ``noise``.
+        Whether regions stated from the covariance hold what they state: the status is ``UNIQUE``,
+        other candidates together are at most 0.33 % probable, and the second-order change of the
+        contact point is small in the metric of the covariance. Of a candidate it is the last alone.
+        False without ``noise``.
     chi_squared : (...) array
         χ² of the contact: sum of squares of the part of the signals that it leaves unexplained, in
         standard deviations. Without ``noise``, components of force and moment count as known to
@@ -422,7 +425,9 @@ def contacts_of(
     return Contacts(
         point=every.point[..., 0, :],
         covariance=every.covariance[..., 0, :, :],
-        covariance_valid=every.covariance_valid[first] & np.isin(whole(status), _CERTAIN),
+        covariance_valid=every.covariance_valid[first]
+        & np.isin(whole(status), _CERTAIN)
+        & ~(every.probability[first] < 1.0 - LEFT),
         chi_squared=whole(chi_squared),
         probability=every.probability[first],
         status=whole(status),
@@ -592,12 +597,13 @@ def contact_of(
     values, x = found.values[0, first], found.x[0, first] * force
     if covariance is None:
         covariance = found.covariances[0, first] * length**2
+    probability = float(found.probability[0, first])
     return Contact(
         values[3:] * length,
         covariance,
-        bool(found.valid[0, first]) and status in _CERTAIN,
+        bool(found.valid[0, first]) and status in _CERTAIN and not probability < 1.0 - LEFT,
         chi_squared,
-        float(found.probability[0, first]),
+        probability,
         status,
         float(found.x[0, first, 0] * length),
         values[:3] * force,

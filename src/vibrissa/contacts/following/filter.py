@@ -23,14 +23,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.contacts.contacts import Contact
+from vibrissa.contacts.contacts import LEFT, Contact
 from vibrissa.contacts.engine.prior import Prior, refuse_tip
 from vibrissa.contacts.engine.readout import Measurement
 from vibrissa.contacts.estimator import Estimator
 from vibrissa.contacts.following.mixture import Mixture, learn, predict, room, tidy, unaccounted
 from vibrissa.contacts.following.onset import Beginning, Gaussians, groups
 from vibrissa.contacts.sensing.noise import explained
-from vibrissa.contacts.uncertainty.posterior import LEFT, THREE_SIGMA
+from vibrissa.contacts.uncertainty.posterior import THREE_SIGMA
 from vibrissa.deferred import special
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.rod import charted_rod

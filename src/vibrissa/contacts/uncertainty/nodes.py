@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vibrissa.contacts.contacts import LEFT
 from vibrissa.contacts.sensing.channels import CHANNELS, CIRCULAR, channels_of
 from vibrissa.contacts.uncertainty.posterior import (
-    LEFT,
     THREE_SIGMA,
     second_moment,
     squared_distances,

@@ -27,6 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vibrissa.contacts.contacts import LEFT
 from vibrissa.contacts.uncertainty.expansion import (
     Expansion,
     all_determined,
@@ -57,8 +58,8 @@ CERTAIN = 0.95
 # Limits of a valid covariance: error of the second order, in standard deviations of the channels;
 # share in ellipsoids of 95 %; and factor by which variances were widened.
 _MISSED, _LEAST_HELD, _MOST_HELD, _MOST_WIDENED = 0.09, 0.93, 0.98, 1.7
-#: Share that may be outside three standard deviations; squared radii of these and of 95 % regions.
-LEFT, THREE_SIGMA, HELD = 0.0033, 14.156, 7.815
+#: Squared radii of regions of three standard deviations and of 95 %.
+THREE_SIGMA, HELD = 14.156, 7.815
 # Error of the second order above which a candidate is weighed to first order; and the most by which
 # a node's log density may exceed that of the first order.
 _BROKEN, _MOST_GAIN = 0.3, 3.0

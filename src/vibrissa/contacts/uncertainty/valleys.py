@@ -28,9 +28,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vibrissa.contacts.contacts import LEFT
 from vibrissa.contacts.fitting.least_squares import channel_equations, lane_contact, whiten
 from vibrissa.contacts.sensing.channels import FITTED
-from vibrissa.contacts.uncertainty.posterior import HELD, LEFT, THREE_SIGMA, holds
+from vibrissa.contacts.uncertainty.posterior import HELD, THREE_SIGMA, holds
 from vibrissa.numerics import (
     AnyArray,
     Array,

@@ -192,7 +192,7 @@ class SaveControls:
         if client is None:
             return
         if not isinstance(mode, TrialMode):
-            self._page.say("Not saved", "a movie is of a trial: choose the mode Trial", "red")
+            self._page.say("Not saved", "movies show trials: choose the mode Trial", "red")
             return
         note = client.add_notification("Movie", "drawn by this browser", loading=True)
 

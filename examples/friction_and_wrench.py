@@ -39,13 +39,14 @@ three = contact_map.estimate(signals, ("Fx", "MB", "MD"))
 six = vb.estimate_from_wrench(whisker, read_force, read_moment, noise=noise)
 for i, mu in enumerate(friction):
     true = bent.contact_point[i]
-    off = [1e3 * np.linalg.norm(found.point[i] - true) for found in (three, six)]
+    error = [1e3 * np.linalg.norm(found.point[i] - true) for found in (three, six)]
     predicted = 1e3 * np.sqrt(np.trace(six.covariance[i]))
     angle, spread = np.degrees([six.friction_angle[i], six.friction_angle_sigma[i]])
     print(
-        f"friction {mu:+.1f}: three signals {off[0]:5.2f} mm off, wrench {off[1]:.2f} mm", end=" "
+        f"friction {mu:+.1f}: error of three signals {error[0]:5.2f} mm, wrench {error[1]:.2f} mm",
+        end=" ",
     )
-    print(f"(± {predicted:.2f}); angle {angle:.1f}° ± {spread:.1f}°, truly", end=" ")
+    print(f"(± {predicted:.2f}); angle {angle:.1f}° ± {spread:.1f}°, true:", end=" ")
     print(f"{np.degrees(np.arctan(mu)):.1f}°")
 
 # %% The three bent whiskers with the forces on them: friction is a small part of the shape

@@ -117,7 +117,7 @@ def test_ctrl_c_stops_and_says_how_to_go_on(study, tmp_path):
         os.killpg(client.pid, signal.SIGINT)
         _, said = client.communicate(timeout=60)
     assert client.returncode == 130
-    assert "the same command goes on from it" in " ".join(said.split())
+    assert "the same command continues" in " ".join(said.split())
     assert "Traceback" not in said
     assert (open_sweep(store)["status"] == 1).any()
 

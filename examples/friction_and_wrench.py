@@ -61,7 +61,12 @@ figure = plots.bent_views(
     bent.contact_point,
     bent.force,
     labels=names,
-    finding="With friction three signals misplace the contact by up to {:.1f} mm, force and "
-    "moment by {:.2f} mm".format(*distance),
+    finding="With friction contacts from three signals (×) have errors of up to {:.1f} mm, "
+    "those of force and moment (+) of {:.2f} mm".format(*distance),
 )
+lines, _ = figure.axes[0].get_legend_handles_labels()
+for axes, side in zip(figure.axes, (1, 2), strict=False):
+    for found, mark in ((three, "x"), (six, "+")):
+        for point, line in zip(1e3 * found.point, lines, strict=True):
+            axes.plot(point[0], point[side], mark, color=line.get_color(), markersize=7, zorder=5)
 plots.save(figure, folder / "friction_and_wrench", ["png"])

@@ -972,7 +972,7 @@ def test_a_bag_may_hold_the_pose_of_what_carries_the_base(map_file, wrench, tmp_
         (["x", "--udp", "127.0.0.1:0"], "either a source or --udp"),
         (["--sensor", "none.toml"], r"none\.toml"),
         (["--udp", "127.0.0.1:0", "--speed", 1.0], "add --filter"),
-        (["--every"], "only of what comes by --udp"),
+        (["--every"], "samples are dropped only with --udp"),
         (["--reconnect"], "neither a named pipe nor a device"),
         ([__file__, "--reconnect"], "for named pipes and devices"),
     ],

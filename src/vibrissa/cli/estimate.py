@@ -221,7 +221,7 @@ class EstimateOptions:
         return (
             f"{'force and moment whole' if names == WRENCH else used}{self.assumed.described()}; "
             f"{vb.contacts.friction_assumed(friction)}; "
-            f"{noise}; a contact counts where M_B exceeds {shown('MB', least)}"
+            f"{noise}; a contact is detected where M_B exceeds {shown('MB', least)}"
         )
 
 
@@ -275,8 +275,12 @@ def estimate(
             raise ValueError("--around takes force and moment, not the channels of a --sensor")
         _around(signals, target, how, known)
     elif sensor is not None and not swept:
-        if recorded or how.using or how.noise.given or how.special:
-            raise ValueError(f"{sensor} is for tables, and has its own channels and noise")
+        if recorded:
+            raise ValueError(f"{sensor} is for tables of its channels, and {signals} is a recording")
+        if how.using or how.noise.given or how.special:
+            raise ValueError(
+                f"{sensor} states channels and noise: omit --using, --method and options of noise"
+            )
         _from_lines(signals, target, how, weight, vb.sensors.load_sensor(sensor))
     elif sensor is not None:
         if recorded or how.given or weight.gravity is not None:

@@ -370,9 +370,9 @@ def remarks_on_optics(one: Tracked, optics: Optics, name: str) -> list[str]:
     state = "State the distance of the lenses (--distance, in m; inf for telecentric ones), or c"
     state = "C" if optics.distance is not None else state
     return [
-        f"{name}: the cameras are not calibrated, by which contact points are uncertain by "
-        f"{1e6 * np.nanmedian(moved):.0f} µm (median; in the covariances, but an object fitted to "
-        f"them errs as a whole). {state}alibrate them (vibrissa calibrate, --cameras)."
+        f"{name}: the cameras are not calibrated, so that contact points are uncertain by "
+        f"{1e6 * np.nanmedian(moved):.0f} µm (median; their covariances include this, that of an "
+        f"object fitted to them does not). {state}alibrate them (vibrissa calibrate, --cameras)."
     ]
 
 

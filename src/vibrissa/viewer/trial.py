@@ -157,7 +157,7 @@ Frame = NDArray[np.uint8]
 
 WIDTH = 420  # width of a picture, pixels
 _MARGIN = 40.0
-_TRACE, _CONTACT = (255, 96, 0), (0, 150, 255)
+_TRACE = (0, 150, 255)
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +214,7 @@ def picture(view: View, trial: Watched, frame: int, image: Frame | None = None) 
     if touching.size:
         seen = trial.cameras[view.number].project(touching)
         for at in np.round((seen - [left, top]) * view.scale):
-            draw.ellipse([*(at - 3.0), *(at + 3.0)], _CONTACT)
+            draw.ellipse([*(at - 3.0), *(at + 3.0)], CONTACT)
     return np.asarray(out)
 
 

@@ -276,7 +276,9 @@ def estimate(
         _around(signals, target, how, known)
     elif sensor is not None and not swept:
         if recorded:
-            raise ValueError(f"{sensor} is for tables of its channels, and {signals} is a recording")
+            raise ValueError(
+                f"{sensor} is for tables of its channels, and {signals} is a recording"
+            )
         if how.using or how.noise.given or how.special:
             raise ValueError(
                 f"{sensor} states channels and noise: omit --using, --method and options of noise"

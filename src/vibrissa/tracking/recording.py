@@ -539,7 +539,7 @@ def remarks_on_plane(one: Tracked, name: str) -> list[str]:
     return [
         f"{seen}frames that show its tip), as if it turned out of the image by up to "
         f"{np.degrees(turned):.0f}°. Contact is then not distinguished from turning, and forces "
-        "and contact points of such frames are not to be believed. A second view (or a mirror, "
+        "and contact points of such frames are unreliable. A second view (or a mirror, "
         "--views) shows it."
     ]
 

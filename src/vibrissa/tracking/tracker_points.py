@@ -358,7 +358,7 @@ def _longest(names: list[str], points: Array, notes: list[str]) -> int:
     if often.size > 1:
         notes.append(
             f"{often.size} whiskers are seen in half of the frames; the longest, {names[longest]}, "
-            f"is used: name others ({', '.join(names[k] for k in often[:_SHOWN])}"
+            f"is used: choose others with --names ({', '.join(names[k] for k in often[:_SHOWN])}"
             f"{', …' if often.size > _SHOWN else ''})"
         )
     return longest

@@ -12,7 +12,7 @@ import vibrissa as vb
 from vibrissa.contour import fit_free, fit_shape
 from vibrissa.io import Footage, write_video
 from vibrissa.recording import Recording
-from vibrissa.viewer.readout import chart, cursor
+from vibrissa.viewer.readout import CONTACT, chart, cursor
 from vibrissa.viewer.trial import (
     LAYERS,
     fitted_body,
@@ -168,14 +168,14 @@ def test_pictures_show_the_trace_where_the_camera_sees_the_whisker(trial, record
     frame = trial.onset_from(0)
     for view in shown:
         image = picture(view, trial, frame)
-        orange = (image == [255, 96, 0]).all(axis=-1)
+        blue = (image == [0, 150, 255]).all(axis=-1)
         places = trial.traces[frame, 0, view.number]
         inside = np.round((places - view.box[:2]) * view.scale).astype(int)
-        height, width = orange.shape
+        height, width = blue.shape
         for x, y in inside[3:-3]:
-            near = orange[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
-            blue = image[min(y, height - 1), min(x, width - 1), 2] == 255  # the contact covers it
-            assert near.any() or blue
+            near = blue[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
+            over = image[min(y, height - 1), min(x, width - 1)]  # the contact covers it
+            assert near.any() or (over == CONTACT).all()
         dark = np.full(recording["cameras"]["image_size"].values[view.number][::-1], 9, np.uint8)
         assert (picture(view, trial, frame, dark) == 9).any()
 

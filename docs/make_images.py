@@ -53,8 +53,6 @@ LEVELS = {
     "contour": 48,
     "contour_free": 48,
     "contact_places": 48,
-    "reachable_space": 48,
-    "signals_to_contacts": 48,
 }
 """Of red, green and blue in figures for which 256 colours are too few."""
 

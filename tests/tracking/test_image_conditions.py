@@ -364,7 +364,7 @@ def test_a_camera_that_was_moved_may_have_been_calibrated_before_or_after(filmed
             ]
         )
     found = track(filmed.cameras, moved, 1000.0)
-    assert "Part of it is slow, or a step, of 1.0 pixels" in found.attrs["remarks"]
+    assert "Part of this is slow, or a step, of 1.0 pixels" in found.attrs["remarks"]
     away = found["contact_point"].values[:, 0] - filmed.truth["contact_point"].values
     spread, shared = (found[f"contact_{name}"].values[:, 0] for name in ("covariance", "shared"))
     rows = np.isfinite(away).all(axis=1) & np.isfinite(spread).all(axis=(1, 2))

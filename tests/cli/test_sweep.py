@@ -87,7 +87,7 @@ def test_done_shown_and_not_done_again(study, tmp_path):
     figure = tmp_path / "figures" / "s-uniqueness.png"
     assert figure.stat().st_size > 10_000
     figure.write_text("kept")
-    assert "is left as it is" in done("sweep", "show", store, "-o", tmp_path / "figures")
+    assert "was not changed" in done("sweep", "show", store, "-o", tmp_path / "figures")
     assert figure.read_text() == "kept"
     status = open_sweep(store)["status"]
     assert status.sel(task="uniqueness").values.tolist() == [-1, -1, 1]

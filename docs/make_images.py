@@ -50,6 +50,9 @@ LEVELS = {
     "trial": 32,
     "movie_signals": 64,
     "movie_contour": 64,
+    "contour": 48,
+    "contour_free": 48,
+    "contact_places": 48,
 }
 """Of red, green and blue in figures for which 256 colours are too few."""
 

@@ -40,7 +40,9 @@ for true, guess, covariance, n in zip(
     if n:
         sigma = np.sqrt(np.trace(covariance))
         error = np.linalg.norm(guess - true)
-        print(f"{n} candidate(s), {error * 1e9:.3f} nm off, ± {sigma * 1e3:.2f} mm with the sensor")
+        print(
+            f"{n} candidate(s), error {error * 1e9:.3f} nm, ± {sigma * 1e3:.2f} mm with the sensor"
+        )
 
 # %% The bent whiskers with the forces on them; the contact that slipped off is not drawn
 names = [f"{1e6 * np.linalg.norm(force):.1f} µN" for force in bent.force]

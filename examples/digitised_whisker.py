@@ -36,7 +36,7 @@ print(whisker)
 tangent = whisker.pose.rotation[:, 0]
 off = np.degrees(np.arccos(tangent @ turn.as_matrix()[:, 0]))
 rms = np.sqrt(np.mean(np.sum((whisker.centerline(200) - true.centerline(200)) ** 2, axis=1)))
-print(f"Length {1e3 * whisker.length:.2f} mm, truly {1e3 * true.length:.2f} mm.")
+print(f"Length {1e3 * whisker.length:.2f} mm (true: {1e3 * true.length:.2f} mm).")
 print(f"Error of the direction at the base {off:.2f}°, of the shape {1e6 * rms:.0f} µm.")
 
 # %% The effect on the signals: both whiskers are pushed to the same point
@@ -45,9 +45,9 @@ bent, expected = vb.deflect(whisker, touch), vb.deflect(true, touch)
 for name in ("force", "moment"):
     found, right = getattr(bent, name), getattr(expected, name)
     error = np.linalg.norm(found - right) / np.linalg.norm(right)
-    print(f"{name}: {100 * error:.1f} % off")
+    print(f"{name}: error {100 * error:.1f} %")
 
-# %% How it looks
+# %% The whisker in three views
 s = np.linspace(0.0, whisker.length, 201)
 name = f"From points with 20 µm of noise: a shape with an error of {1e6 * rms:.0f} µm"
 figure = plots.whisker_views(whisker.centerline(201), whisker.radius(s), name=name, width="double")

@@ -39,13 +39,14 @@ three = contact_map.estimate(signals, ("Fx", "MB", "MD"))
 six = vb.estimate_from_wrench(whisker, read_force, read_moment, noise=noise)
 for i, mu in enumerate(friction):
     true = bent.contact_point[i]
-    off = [1e3 * np.linalg.norm(found.point[i] - true) for found in (three, six)]
+    error = [1e3 * np.linalg.norm(found.point[i] - true) for found in (three, six)]
     predicted = 1e3 * np.sqrt(np.trace(six.covariance[i]))
     angle, spread = np.degrees([six.friction_angle[i], six.friction_angle_sigma[i]])
     print(
-        f"friction {mu:+.1f}: three signals {off[0]:5.2f} mm off, wrench {off[1]:.2f} mm", end=" "
+        f"friction {mu:+.1f}: error of three signals {error[0]:5.2f} mm, wrench {error[1]:.2f} mm",
+        end=" ",
     )
-    print(f"(± {predicted:.2f}); angle {angle:.1f}° ± {spread:.1f}°, truly", end=" ")
+    print(f"(± {predicted:.2f}); angle {angle:.1f}° ± {spread:.1f}°, true:", end=" ")
     print(f"{np.degrees(np.arctan(mu)):.1f}°")
 
 # %% The three bent whiskers with the forces on them: friction is a small part of the shape
@@ -60,7 +61,12 @@ figure = plots.bent_views(
     bent.contact_point,
     bent.force,
     labels=names,
-    finding="With friction three signals misplace the contact by up to {:.1f} mm, force and "
-    "moment by {:.2f} mm".format(*distance),
+    finding="With friction contacts from three signals (×) have errors of up to {:.1f} mm, "
+    "those of force and moment (+) of {:.2f} mm".format(*distance),
 )
+lines, _ = figure.axes[0].get_legend_handles_labels()
+for axes, side in zip(figure.axes, (1, 2), strict=False):
+    for found, mark in ((three, "x"), (six, "+")):
+        for point, line in zip(1e3 * found.point, lines, strict=True):
+            axes.plot(point[0], point[side], mark, color=line.get_color(), markersize=7, zorder=5)
 plots.save(figure, folder / "friction_and_wrench", ["png"])

@@ -48,7 +48,7 @@ points = contour_points(trial)
 places = np.stack([points[name].values for name in "xyz"], axis=1)
 skin = np.stack([points[f"surface_{name}"].values for name in "xyz"], axis=1)
 apart = stone.signed_distance(skin)
-print(f"{len(places)} contacts, {1e3 * np.median(np.abs(apart)):.2f} mm off the stone (median)")
+print(f"{len(places)} contacts, {1e3 * np.median(np.abs(apart)):.2f} mm from the stone (median)")
 
 # %% Its uncertainty: at the contacts, and 4 mm above the highest of them
 beyond = np.vstack([places[:1], places[[np.argmax(places[:, 2])]] + [0.0, 0.0, 4e-3]])

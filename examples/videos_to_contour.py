@@ -44,13 +44,13 @@ both = (truth["in_contact"].values & one["in_contact"].values).astype(bool)
 away = np.linalg.norm(one["contact_point"].values - truth["contact_point"].values, axis=1)[both]
 force = np.linalg.norm(one["force"].values, axis=1)[both]
 print(f"{one.sizes['time']} frames, {both.sum()} in contact; ", end="")
-print(f"contact {1e6 * np.median(away):.0f} µm off (median), ", end="")
+print(f"error of the contact {1e6 * np.median(away):.0f} µm (median), ", end="")
 print(f"force up to {1e6 * force.max():.0f} µN")
 
 # %% Signals, contact points and the peg, one command: vibrissa reconstruct trial.nc
 contour = with_contour(tracked)
 fit = shape_from_dataset(contour["contour"].to_dataset())
-print(f"peg: diameter {2e3 * fit.radius:.2f} mm, truly {2e3 * peg.radius:.2f} mm")
+print(f"peg: diameter {2e3 * fit.radius:.2f} mm (true: {2e3 * peg.radius:.2f} mm)")
 
 # %% What the cameras saw, and where the contacts are
 course = course_of(contour)

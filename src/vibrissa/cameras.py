@@ -349,8 +349,8 @@ def _in_plane(camera: Camera, pixels: Array, sigma: ArrayLike) -> tuple[Array, A
     """Points (..., 3) in the plane z = 0, and their covariance, which is zero normal to it."""
     if abs(camera.rotation[2, 2]) < _STEEP:
         raise ValueError(
-            f"camera {camera.name!r} looks along the plane z = 0 of the laboratory, in which what "
-            "a single camera sees is taken to be; one is needed that looks down on it"
+            f"camera {camera.name!r} looks along the plane z = 0 of the laboratory, in which a "
+            "whisker seen by one camera is assumed to be; the camera must look onto this plane"
         )
     origin, direction = camera.rays(pixels)
     points = origin - direction * (origin[..., 2:] / direction[..., 2:])
@@ -533,7 +533,7 @@ def calibrate(
     if len(shared) < _FEWEST:
         raise ValueError(
             f"the board is seen by all cameras in {len(shared)} images; {_FEWEST} are needed, with "
-            "the board turned and at different places"
+            "the board rotated and moved between them"
         )
     cameras = tuple(
         _calibrate_one(name, rows, board, images[name][0].shape, shared[0])

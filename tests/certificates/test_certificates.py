@@ -86,6 +86,7 @@ def test_a_curved_whisker_with_wrong_signs_is_refuted_at_once(steep):
     found = certify(steep, np.deg2rad(3.0))
     assert not found.proved
     assert "outside 7.2" in found.refuted
+    assert "try a cone of 8.7°" in found.refuted
     certain = prepare_certificate(steep, np.deg2rad(1.0))
     certain.probe()
     assert "is certainly wrong" in certain.refuted

@@ -86,7 +86,7 @@ def test_objects_of_a_recording_are_where_its_poses_see_them(tmp_path):
         ("--around wall.toml", "--around and --position-sigma belong together"),
         ("--position-sigma 1", "--around and --position-sigma belong together"),
         ("--around wall.toml --position-sigma 1 --using Fx,MB,MD", "--using cannot be used"),
-        ("--around wall.toml --position-sigma 1 --tip 5", "takes no prior of contacts"),
+        ("--around wall.toml --position-sigma 1 --tip 5", "takes no other prior"),
         ("--around wall.toml --position-sigma 0", "position_sigma is positive, m; got 0.0"),
     ],
 )

@@ -44,13 +44,13 @@ def folder(tmp_path_factory):
         ("signals t.nc --whisker map.nc", "--whisker cannot be used: signals of the sensor"),
         (
             "estimate t.nc --using wrench --proximal 0.2",
-            "--proximal cannot be used: it is of a map",
+            "--proximal cannot be used: --using wrench needs no map",
         ),
         ("estimate t.nc --covariance noise.csv --force-noise 2", "--force-noise cannot be used"),
         ("reconstruct t.nc --using wrench --proximal 0.2", "--proximal cannot be used"),
         ("reconstruct t.nc --cutoff 60", "--cutoff cannot be used"),
         ("signals t.nc --density 1200", "--density cannot be used: without --inertia"),
-        ("deflect --point 25,12,1 --axis 0,0,1", "--axis cannot be used: they are of a --peg"),
+        ("deflect --point 25,12,1 --axis 0,0,1", "--axis cannot be used: they need a --peg"),
         ("deflect --point 25,12,1 --push 0,1,0", "--push cannot be used"),
         (
             "track top.mkv front.mkv --cameras cameras.toml --pixel-size 0.058 -o o.nc",

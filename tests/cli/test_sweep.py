@@ -87,7 +87,7 @@ def test_done_shown_and_not_done_again(study, tmp_path):
     figure = tmp_path / "figures" / "s-uniqueness.png"
     assert figure.stat().st_size > 10_000
     figure.write_text("kept")
-    assert "is left as it is" in done("sweep", "show", store, "-o", tmp_path / "figures")
+    assert "was not changed" in done("sweep", "show", store, "-o", tmp_path / "figures")
     assert figure.read_text() == "kept"
     status = open_sweep(store)["status"]
     assert status.sel(task="uniqueness").values.tolist() == [-1, -1, 1]
@@ -117,7 +117,7 @@ def test_ctrl_c_stops_and_says_how_to_go_on(study, tmp_path):
         os.killpg(client.pid, signal.SIGINT)
         _, said = client.communicate(timeout=60)
     assert client.returncode == 130
-    assert "the same command goes on from it" in " ".join(said.split())
+    assert "the same command continues" in " ".join(said.split())
     assert "Traceback" not in said
     assert (open_sweep(store)["status"] == 1).any()
 

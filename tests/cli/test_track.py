@@ -250,9 +250,9 @@ def test_what_is_known_besides_the_videos_is_used(videos, tmp_path):
         (("--rate", "0"), "--rate is 0"),
         (("--rate", "170", "--cutoff", "85"), "below half of 170 frames/s"),
         (("--base-radius", "-1"), "--base-radius is -1"),
-        (("--rat", "C2", "--base-radius", "0.1"), "--rat gives the radii"),
+        (("--rat", "C2", "--base-radius", "0.1"), "--rat determines the radii"),
         (("--rat", "Z9"), "Z9"),
-        (("--any-length",), "about a --whisker"),
+        (("--any-length",), "needs a --whisker"),
         (("--base", "20,30", "--base", "20,192"), "outside of view 1, 192 × 192 pixels"),
     ],
 )
@@ -341,7 +341,7 @@ def test_frames_that_the_rod_does_not_explain_are_in_doubt_and_swapped_names_not
     done = run(*words)
     assert done.exit_code == 0, done.exception
     line = " ".join(done.stdout.split())
-    assert "front.mkv is taken for the top view and top.mkv for the front view" in line
+    assert "front.mkv is used as the top view and top.mkv as the front view" in line
     assert "not sure that what is followed" in line
     assert (tmp_path / "doubt.png").exists()
 

@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 from matplotlib.text import Text
 
-from vibrissa.plots import sensitivity_panels, solid_slices
+from vibrissa.plots import sensitivity_panels, solid_slices, style
 from vibrissa.plots.sensitivity import derivative_label
 from vibrissa.quantities import axis_label
 
@@ -68,6 +68,29 @@ def test_bands_hold_half_and_four_fifths_of_the_contacts(derivatives):
     unit = 1e3 * np.pi / 180.0  # mm per degree
     np.testing.assert_allclose(np.array(heights) / unit, [1.6, 1.0], rtol=0.35)
     assert panel.get_ylim()[1] == pytest.approx(0.8 * unit, rel=0.15)
+
+
+def test_medians_of_bunched_signals_do_not_zigzag(derivatives):
+    """As on the paper's grid, whose radii contribute in turn."""
+    rng = np.random.default_rng(7)
+    bunch = rng.integers(0, 25, 4000)
+    moment = 0.8 * bunch + rng.uniform(0.3, 0.5, 4000)
+    slope = moment + (-1.0) ** bunch + rng.normal(size=4000)
+    shown = derivatives.sensitivity.copy()
+    shown.loc[{"coordinate": "r", "signal": "MB"}] = slope
+    bunched = derivatives.assign(MB=("contact", moment * 1e-6), sensitivity=shown)
+    for line in sensitivity_panels(bunched).axes[1].lines[1:]:
+        median = line.get_ydata()
+        median = median[np.isfinite(median)]
+        assert np.abs(np.diff(median)).sum() < 1.1 * np.ptp(median)
+
+
+def test_a_conclusion_breaks_where_its_line_is_full():
+    """Commands of formulas are as wide as the letters that they print."""
+    figure = style.new_figure("double", 50.0, None)
+    words = " ".join([r"$\partial r$"] * 12)
+    style.conclude(figure, words)
+    assert figure.texts[-1].get_text() == words
 
 
 def plane(scale=1.0):

@@ -320,7 +320,7 @@ def test_what_is_not_known_of_shaking_is_in_covariances(filmed, shaken, known):
     found = track(filmed.cameras, traces, 1000.0)
     assert "top shakes by 0.2" in found.attrs["remarks"]
     assert ("front shakes by 0.3" in found.attrs["remarks"]) is known
-    assert ("nothing shows whether front shakes" in found.attrs["remarks"]) is not known
+    assert ("it is unknown whether front shakes" in found.attrs["remarks"]) is not known
     away = found["contact_point"].values[:, 0] - filmed.truth["contact_point"].values
     spread = found["contact_covariance"].values[:, 0]
     rows = np.isfinite(away).all(axis=1) & np.isfinite(spread).all(axis=(1, 2))
@@ -364,7 +364,7 @@ def test_a_camera_that_was_moved_may_have_been_calibrated_before_or_after(filmed
             ]
         )
     found = track(filmed.cameras, moved, 1000.0)
-    assert "Part of it is slow, or a step, of 1.0 pixels" in found.attrs["remarks"]
+    assert "Part of this is slow, or a step, of 1.0 pixels" in found.attrs["remarks"]
     away = found["contact_point"].values[:, 0] - filmed.truth["contact_point"].values
     spread, shared = (found[f"contact_{name}"].values[:, 0] for name in ("covariance", "shared"))
     rows = np.isfinite(away).all(axis=1) & np.isfinite(spread).all(axis=(1, 2))

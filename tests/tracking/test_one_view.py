@@ -76,7 +76,7 @@ def test_a_peg_along_the_line_of_sight_is_reconstructed(flat, tmp_path):
     done = testing.CliRunner().invoke(app, ["reconstruct", str(tmp_path / "one.nc")])
     assert done.exit_code == 0, done.exception
     assert "One view shows the section of the object" in done.stdout
-    assert "Fz, Mx and My are taken for 0" in done.output
+    assert "Fz, Mx and My are taken as 0" in done.output
     fit = shape_from_dataset(load_recording(tmp_path / "one.nc")["contour"].to_dataset())
     assert np.abs(fit.axis[2]) > 0.9999
     assert fit.radius == pytest.approx(PEG.radius, rel=0.15)

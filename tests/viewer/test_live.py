@@ -70,7 +70,7 @@ def test_answers_without_a_point_and_of_other_whiskers():
     drawn = live.drawing(1.0)
     assert "contact" not in drawn
     assert len(drawn["points"].points) == 1
-    assert "2 answers" in live.html()
+    assert "2 results" in live.html()
 
 
 def test_a_page_follows_a_stream():
@@ -84,4 +84,4 @@ def test_a_page_follows_a_stream():
         while page._stage.node("live", "contact") is None and time.monotonic() < end:
             time.sleep(0.05)
         assert page._stage.node("live", "contact") is not None
-        assert "answers" in page._text.content
+        assert "results" in page._text.content

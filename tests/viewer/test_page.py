@@ -189,8 +189,8 @@ def test_a_trial_plays(browser, recording):
     with view(Recording(recording).whisker(), recording=recording) as viewer:
         person = Looking(browser, viewer)
         trial = viewer.page.modes["Trial"]
-        person.page.get_by_role("button", name="Next contact").click()
-        start = float(trial.trial.time[trial.trial.next_contact(0)])
+        person.page.get_by_role("button", name="contact ▶").click()
+        start = float(trial.trial.time[trial.trial.onset_from(0)])
         share = start / float(np.ptp(trial.trial.time))
         person.wait_for(f'[data-cursor="{share:.4f}"]')
         trial.hurry("1 : 50")  # so that it is still playing when a busy machine looks
@@ -223,7 +223,11 @@ def test_keys_clicks_and_links_lead_through_a_trial(browser, recording):
         person.page.keyboard.press(",")
         person.wait_until(lambda: trial.frame == first)
         person.page.keyboard.press("n")
-        person.wait_until(lambda: trial.frame == trial.trial.next_contact(first))
+        onset = trial.trial.onset_from(first)
+        person.wait_until(lambda: trial.frame == onset)
+        for key, frame in (("End", last), ("p", trial.trial.onsets()[-1]), ("Home", 0)):
+            person.page.keyboard.press(key)
+            person.wait_until(lambda frame=frame: trial.frame == frame)
         (client,) = viewer.page.server.get_clients().values()
 
         def height():
@@ -235,6 +239,13 @@ def test_keys_clicks_and_links_lead_through_a_trial(browser, recording):
         person.wait_until(lambda: height() > 0.999)
         person.page.keyboard.press("a")
         person.wait_until(lambda: height() < 0.9)
+        # A click on a contact point goes to its time.
+        touched = np.flatnonzero(trial.trial.touching[:, 0])
+        trial.show(int(touched[-1]))
+        point, away = trial.trial.contacts[touched[0], 0], np.array([0.03, -0.06, 0.04])
+        wanted = trial.trial.contact_at(int(touched[-1]), point + away, -away)
+        trial.pick((point + away) * 1e3, -away)
+        person.wait_until(lambda: trial.frame == wanted)
         # What is at the bottom of the window covers plots that have been scrolled there.
         on_top = """plot => {
           const box = plot.getBoundingClientRect();
@@ -245,8 +256,14 @@ def test_keys_clicks_and_links_lead_through_a_trial(browser, recording):
         plot = next(one for one in plots if one.evaluate(on_top))
         box, left = plot.bounding_box(), float(plot.get_attribute("data-seek"))
         middle = (left + 0.5 * (1.0 - left)) * (box["width"] - 8)
-        person.page.mouse.click(box["x"] + middle, box["y"] + 0.5 * box["height"])
+        person.page.mouse.move(box["x"] + box["width"] - 30, box["y"] + 0.5 * box["height"])
+        person.page.mouse.down()
+        person.wait_until(lambda: trial.frame > 0.8 * last)
+        person.page.mouse.move(box["x"] + middle, box["y"] + 0.5 * box["height"], steps=3)
+        person.page.wait_for_timeout(60)
+        person.page.mouse.move(box["x"] + middle + 1, box["y"] + 0.5 * box["height"])
         person.wait_until(lambda: abs(trial.frame - 0.5 * last) < 0.05 * last)
+        person.page.mouse.up()
         there = trial.frame
         person.page.wait_for_function("/t=0[.][45]/.test(location.hash)")
         link = person.page.evaluate("location.href")

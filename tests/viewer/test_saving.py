@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 import vibrissa as vb
 from vibrissa.io import load_recording, read_video, save_recording, video_info
@@ -43,7 +44,8 @@ def test_a_picture_is_a_png():
     assert png(image).startswith(b"\x89PNG")
 
 
-def test_a_movie_shows_all_of_a_trial_on_white(tmp_path):
+@pytest.mark.parametrize(("fine", "height"), [(1, 120), (2, 242)])
+def test_a_movie_shows_all_of_a_trial_on_white(tmp_path, fine, height):
     """Frames of odd size, of which the left is drawn as dark as far as the trial has gone."""
     frames, seen = 130, []
 
@@ -60,12 +62,12 @@ def test_a_movie_shows_all_of_a_trial_on_white(tmp_path):
     mode = SimpleNamespace(trial=trial, pause=lambda: None, show=seen.append)
     path = tmp_path / "trial.mp4"
     told = []
-    path.write_bytes(movie(client, mode, lambda *progress: told.append(progress)))
+    path.write_bytes(movie(client, mode, fine, lambda *progress: told.append(progress)))
     assert told == [(done, 100) for done in range(100)]
     assert (seen[0], seen[-1], len(seen)) == (0, frames - 1, 100)
     found = video_info(path)
-    # Two pixels for each of the browser's, without the empty margin at the right.
-    assert (found.width, found.height, found.rate) == (172, 242, 25.0)
+    # Without the empty margin at the right, and of even size.
+    assert (found.width, found.height, found.rate) == (172, height, 25.0)
     grey = np.stack([frame.copy() for frame in read_video(path)]).astype(float)
     assert len(grey) == 100
     np.testing.assert_allclose(grey[:, 20:100, 170], 255.0, atol=6.0)

@@ -12,7 +12,7 @@ import vibrissa as vb
 from vibrissa.contour import fit_free, fit_shape
 from vibrissa.io import Footage, write_video
 from vibrissa.recording import Recording
-from vibrissa.viewer.readout import chart, cursor
+from vibrissa.viewer.readout import CONTACT, chart, cursor
 from vibrissa.viewer.trial import (
     LAYERS,
     fitted_body,
@@ -72,7 +72,7 @@ def test_poses_alone_are_enough(recording):
     assert touched(trial, trial.frames - 1) == {}
     assert "whisker 0" in moment_drawing(trial, 3, 5.0)
     assert views(trial) == ()
-    assert trial.next_contact(5) == 5
+    assert trial.onset_from(5) == trial.onset_from(5, ahead=False) == 5
 
 
 def test_contacts_appear_one_by_one(trial):
@@ -83,12 +83,29 @@ def test_contacts_appear_one_by_one(trial):
     np.testing.assert_array_equal(counts, np.cumsum(trial.touching[:, 0]))
 
 
-def test_the_next_contact_is_an_onset(trial):
-    frame = trial.next_contact(0)
-    assert trial.touching[frame, 0]
-    assert not trial.touching[frame - 1, 0]
-    onsets = trial.onsets()
-    assert trial.next_contact(int(onsets[-1])) == onsets[0]
+def test_onsets_are_reached_in_either_direction(trial):
+    onsets = trial.onsets().tolist()
+    assert len(onsets) > 1
+    for frame, following in zip(onsets, onsets[1:] + onsets[:1], strict=True):
+        assert trial.touching[frame, 0]
+        assert not trial.touching[frame - 1, 0]
+        assert trial.onset_from(frame) == following
+        assert trial.onset_from(following, ahead=False) == frame
+        assert trial.onset_from(frame + 1, ahead=False) == frame
+
+
+def test_a_click_finds_the_contact_that_is_seen_there(trial):
+    last = trial.frames - 1
+    frames = np.flatnonzero(trial.touching[:, 0])
+    point = trial.contacts[frames[0], 0]
+    eye = point + np.array([0.02, -0.06, 0.05])
+    size = 0.02 * trial.whiskers[0].length
+    found = trial.contact_at(last, eye, 3.0 * (point - eye))
+    assert np.linalg.norm(trial.contacts[found, 0] - point) < 3.0 * size
+    assert trial.contact_at(int(frames[0]), eye, point - eye) == frames[0]
+    assert trial.contact_at(int(frames[0]) - 1, eye, point - eye) is None  # not there yet
+    assert trial.contact_at(last, eye, eye - point) is None  # behind the eye
+    assert trial.contact_at(last, eye, np.array([1.0, 0.0, 0.0])) is None
 
 
 def test_a_moment_shows_whisker_contact_and_force(trial):
@@ -148,17 +165,17 @@ def test_contacts_can_be_hidden(trial):
 def test_pictures_show_the_trace_where_the_camera_sees_the_whisker(trial, recording):
     shown = views(trial)
     assert [view.name for view in shown] == ["top", "front"]
-    frame = trial.next_contact(0)
+    frame = trial.onset_from(0)
     for view in shown:
         image = picture(view, trial, frame)
-        orange = (image == [255, 96, 0]).all(axis=-1)
+        blue = (image == [0, 150, 255]).all(axis=-1)
         places = trial.traces[frame, 0, view.number]
         inside = np.round((places - view.box[:2]) * view.scale).astype(int)
-        height, width = orange.shape
+        height, width = blue.shape
         for x, y in inside[3:-3]:
-            near = orange[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
-            blue = image[min(y, height - 1), min(x, width - 1), 2] == 255  # the contact covers it
-            assert near.any() or blue
+            near = blue[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
+            over = image[min(y, height - 1), min(x, width - 1)]  # the contact covers it
+            assert near.any() or (over == CONTACT).all()
         dark = np.full(recording["cameras"]["image_size"].values[view.number][::-1], 9, np.uint8)
         assert (picture(view, trial, frame, dark) == 9).any()
 
@@ -224,7 +241,7 @@ def test_several_whiskers_are_drawn_each_in_its_colour(recording):
         [False, True] | (trial.time > np.median(trial.time[trial.touching[:, 0]]))[:, None]
     )
     assert replace(trial, touching=late).busiest == 1
-    frame = trial.next_contact(0) + 3
+    frame = trial.onset_from(0) + 3
     drawn = moment_drawing(trial, frame, 5.0)
     assert {"whisker 0", "whisker 1", "contact 0", "contact 1"} <= drawn.keys()
     cloud = touched(trial, frame)["contacts"]

@@ -194,7 +194,7 @@ class Certificate:
         shares = ", ".join(
             f"{n} {100.0 * p.share:.3f} %{self._left(p)}" for n, p in self.parts.items()
         )
-        return f"Certificate{where} not finished: certain by now {shares}; run again to continue."
+        return f"Certificate{where} not finished: proved so far {shares}; run again to continue."
 
     def _left(self, part: Part) -> str:
         """Describe where boxes of a part are undecided, by ranges of the unknowns."""

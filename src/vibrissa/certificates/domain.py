@@ -250,8 +250,10 @@ def objection(contact_map: ContactMap, cone: float) -> str:
     if not wrong:
         return ""
     angle = float(np.rad2deg(smallest_cone(contact_map)))
-    fault = f"in floats the sign of the {wrong[0]} is wrong on a grid"
-    return fault + (f"; outside {angle:.3g}° all are right" if np.isfinite(angle) else "")
+    fault = f"the sign of the {wrong[0]} is wrong at some contacts of a grid"
+    if not np.isfinite(angle):
+        return fault
+    return f"{fault}; all signs are right outside {angle:.3g}°: try a cone of {1.2 * angle:.2g}°"
 
 
 def _failing_shares(

@@ -58,11 +58,11 @@ def calibrate(
     }
     kind = images[0].suffix if len(images) == 1 else ""
     if kind in (".toml", ".csv"):
-        refuse(boards, f"it is of a checkerboard, and {images[0]} is of touches")
+        refuse(boards, f"only a checkerboard needs it, and {images[0]} describes touches")
         if kind == ".csv":
             _linear(images[0], target, own, components, touch_sigma, force)
             return
-    refuse(touches, "it is of touches in a table (.csv)")
+    refuse(touches, "only a table of touches (.csv) needs it")
     if kind == ".toml":
         _suspended(images[0], target, force)
         return
@@ -82,7 +82,7 @@ def _linear(
     """Calibrate a linear sensor."""
     check_new(target, (".toml",), force)
     if own.whisker is None:
-        raise ValueError("--whisker is needed: the touches are of it")
+        raise ValueError("--whisker is needed: state which whisker was touched")
     channels, points, readings = _touches(table)
     rest = readings[np.isnan(points).all(axis=1) & np.isfinite(readings).all(axis=1)]
     _check_saturation(channels, readings)
@@ -204,7 +204,7 @@ def _cameras(
         raise ValueError(f"--frames is {frames}; a few dozen are needed")
     check_new(target, (".toml",), force)
     if vb.io.Kind.VIDEO not in map(vb.io.recognise, images):
-        refuse({"--frames": frames}, "it is of videos, and these are images")
+        refuse({"--frames": frames}, "only videos need it, and these are images")
     cameras, error = vb.cameras.calibrate(
         vb.io.load_series(images, frames or _FRAMES), corners, 1e-3 * square
     )
@@ -217,8 +217,8 @@ def _cameras(
     say(f"reprojection error {error:.3f} pixels (root mean square)")
     if error > _POOR:
         say(
-            "  That is much: perhaps the images do not belong together, are blurred, or the "
-            "pattern has other corners."
+            "  This error is large: perhaps the images were not taken at the same times, are "
+            "blurred, or the pattern has other corners."
         )
     say(f"wrote {target}")
 

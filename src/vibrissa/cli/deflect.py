@@ -42,7 +42,7 @@ def deflect(
     """
     load = _load(point, point_force, peg, axis, push)
     if point_force is not None:
-        refuse({"--proximal": proximal}, "a --point-force acts where it is stated")
+        refuse({"--proximal": proximal}, "a --point-force acts at the stated position")
     if gravity is None:
         refuse({"--density": density}, "without --gravity the whisker has no weight")
     whisker = own.read()
@@ -89,7 +89,7 @@ def _load(
         got = " and ".join(given) or "none of them"
         raise ValueError(f"one of --point, --point-force and --peg is needed; got {got}")
     if peg is None:
-        refuse({"--axis": axis, "--push": push}, "they are of a --peg")
+        refuse({"--axis": axis, "--push": push}, "they need a --peg")
     if point is not None:
         return vb.PointContact([x * _MM for x in numbers(point, _XYZ, "--point")])
     if force is not None:

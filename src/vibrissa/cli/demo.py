@@ -85,14 +85,14 @@ def _report(result: DemoResult, noise: bool) -> None:
     away = shown("peg_position", float((scores.offset**2).sum() ** 0.5), 2)
     say()
     used = ", ".join(sensed.contacts.attrs["signals"].split())
-    say(f"From ({used}) alone the peg is found {away} from where it is.")
+    say(f"From ({used}) alone the peg is located with an error of {away}.")
     say(
         f"{scores.touching} of {sensed.contacts.sizes['time']} frames are in contact; in "
         f"{scores.detected} a contact was measured (M_B over {least}), {scores.false} of them false"
     )
     say(
         f"{one} of these ({100 * scores.share_with_one:.1f} %) have exactly one candidate, {none} "
-        f"none, {several} several: the one that continues the neighbouring frames is taken"
+        f"none, {several} several: the one that continues the neighbouring frames is chosen"
     )
     say()
     if result.tracking is not None:

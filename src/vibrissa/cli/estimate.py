@@ -61,9 +61,9 @@ class GravityOptions:
     def check(self, how: EstimateOptions) -> None:
         """Raise ValueError if gravity is incompatible with the options of the estimate."""
         if how.method != "exact":
-            refuse({"--gravity": self.gravity}, f"--method {how.method} has no weight")
+            refuse({"--gravity": self.gravity}, f"--method {how.method} neglects weight")
         if how.map:
-            refuse({"--density": self.density}, "a map states that of its whisker")
+            refuse({"--density": self.density}, "the map has that of its whisker")
 
     def of(self, whisker: vb.Whisker) -> vb.Whisker:
         """Whisker with the stated density."""
@@ -120,7 +120,7 @@ class AroundOptions:
         others |= {f"--{name.replace('_', '-')}": v for name, v in how.assumed.errors.items()}
         refuse(others, "--around takes a --whisker and its wrench, without friction or weight")
         if how.assumed.prior is not None:
-            raise ValueError("--around takes no prior of contacts: its objects are the prior")
+            raise ValueError("--around takes no other prior than its objects")
 
 
 _SHOWN = 5  # largest number of faults of a table that are reported
@@ -153,15 +153,15 @@ class EstimateOptions:
             )
         rubbing = {"--friction-sigma": self.friction_sigma or None}
         if self.whole:
-            refuse(rubbing, "--using wrench finds the friction itself")
+            refuse(rubbing, "--using wrench estimates the friction")
         if self.method != "exact":
-            refuse(rubbing, f"--method {self.method} presumes that there is no friction")
+            refuse(rubbing, f"--method {self.method} assumes that there is no friction")
         if self.map and self.own.whisker is not None:
             raise ValueError("give either --map or --whisker: a map already has its whisker")
         if self.whole:
-            refuse({"--proximal": self.proximal}, "it is of a map, and --using wrench needs none")
+            refuse({"--proximal": self.proximal}, "--using wrench needs no map")
         if self.map:
-            refuse({"--proximal": self.proximal}, "it is of maps that are simulated")
+            refuse({"--proximal": self.proximal}, "the --map has a proximal limit")
         _ = self.assumed.prior
 
     @property
@@ -221,7 +221,7 @@ class EstimateOptions:
         return (
             f"{'force and moment whole' if names == WRENCH else used}{self.assumed.described()}; "
             f"{vb.contacts.friction_assumed(friction)}; "
-            f"{noise}; a contact counts where M_B exceeds {shown('MB', least)}"
+            f"{noise}; a contact is detected where M_B exceeds {shown('MB', least)}"
         )
 
 
@@ -275,12 +275,20 @@ def estimate(
             raise ValueError("--around takes force and moment, not the channels of a --sensor")
         _around(signals, target, how, known)
     elif sensor is not None and not swept:
-        if recorded or how.using or how.noise.given or how.special:
-            raise ValueError(f"{sensor} is for tables, and has its own channels and noise")
+        if recorded:
+            raise ValueError(
+                f"{sensor} is for tables of its channels, and {signals} is a recording"
+            )
+        if how.using or how.noise.given or how.special:
+            raise ValueError(
+                f"{sensor} states channels and noise: omit --using, --method and options of noise"
+            )
         _from_lines(signals, target, how, weight, vb.sensors.load_sensor(sensor))
     elif sensor is not None:
         if recorded or how.given or weight.gravity is not None:
-            raise ValueError("--sensor is of tables, and has its own whisker, channels and noise")
+            raise ValueError(
+                "--sensor of a suspended whisker is for a table; it contains whisker and noise"
+            )
         _from_sweep(signals, target, sensor)
     elif recorded:
         _from_recording(signals, target, how, weight)

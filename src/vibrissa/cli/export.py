@@ -35,9 +35,12 @@ def export(
     ending = f".{to}"
     if to != "nwb":
         about = {"--session-start": session_start, "--subject": subject, "--species": species}
-        refuse(about, "only NWB states it")
+        refuse(about, "only NWB files contain it")
     if len(recordings) > 1:
-        refuse({"--output": target}, "each recording has its table next to it")
+        refuse(
+            {"--output": target},
+            "each table is written next to its recording",
+        )
         refuse({"--session-start": session_start}, "recordings did not begin at the same time")
     targets = [one.with_suffix(ending) if target is None else target for one in recordings]
     for path in targets:
@@ -52,7 +55,7 @@ def _export(recording: Path, target: Path, subject: dict[str, Any], start: str |
     """Write the table of one recording."""
     tree = recording_from(recording)
     if "signals" not in tree.children:
-        remark("the recording has no signals yet: they are made as `vibrissa signals` makes them")
+        remark("the recording has no signals yet: they are computed as by `vibrissa signals`")
         with vb.io.in_file(recording):
             tree = vb.pipeline.with_signals(tree)
     table = vb.pipeline.predictors(tree)

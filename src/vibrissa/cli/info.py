@@ -251,7 +251,7 @@ def _is_sensor(path: Path) -> bool:
 def _sensor(path: Path) -> Iterator[tuple[str, str]]:
     """Describe a sensor, one line per channel."""
     sensor = vb.sensors.load_sensor(path)
-    yield "kind", "sensor"
+    yield "kind", "sensor; channels, in their own units, of components in N and N·m"
     numbers = zip(
         sensor.channels, sensor.mixing, sensor.noise, sensor.bias, sensor.largest, strict=True
     )

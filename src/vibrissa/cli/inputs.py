@@ -34,7 +34,7 @@ class WhiskerOptions:
     def check(self, given: bool) -> None:
         """Raise ValueError for options about a whisker if none is given."""
         if (self.rat is not None or self.any_length) and not given:
-            raise ValueError("--rat and --any-length are about a --whisker, and none is given")
+            raise ValueError("--rat and --any-length need a --whisker")
 
     def read(self, path: Path | None = None) -> vb.Whisker:
         """Read the whisker, or that of another file; by default the built-in γ whisker."""
@@ -69,7 +69,7 @@ class TrackedOptions(WhiskerOptions):
 
     def __post_init__(self) -> None:
         if self.any_length and self.whisker is None:
-            raise ValueError("--any-length is about a --whisker, and none is given")
+            raise ValueError("--any-length needs a --whisker")
 
     def tracked_length(self, length: float | None) -> float | None:
         """Stated length of the whisker, m."""
@@ -94,7 +94,7 @@ class TrackedOptions(WhiskerOptions):
         if self.whisker is not None:
             return {"whisker": self.read().with_properties(**properties)}
         if self.rat is not None:
-            refuse(stated, "--rat gives the radii")
+            refuse(stated, "--rat determines the radii")
             vb.Whisker.straight(0.03, rat=self.rat)  # rejects unknown names early
             properties["rat"] = self.rat
         return {"properties": properties}
@@ -114,7 +114,7 @@ class NoiseOptions:
     def __post_init__(self) -> None:
         if self.covariance is not None:
             components = {name: v for name, v in self.stated.items() if name != "--covariance"}
-            refuse(components, "--covariance holds the noise")
+            refuse(components, "--covariance states the noise")
 
     @property
     def stated(self) -> dict[str, object]:
@@ -400,8 +400,8 @@ def check_one_whisker(recording: xr.DataTree, path: Path) -> None:
     count = recording.sizes["whisker"]
     if count != 1:
         raise ValueError(
-            f"{path} is a recording of {count} whiskers; a table has room for one: give an "
-            "--output that ends in .nc"
+            f"{path} is a recording of {count} whiskers; a table can contain only one: "
+            "give an --output that ends in .nc"
         )
 
 

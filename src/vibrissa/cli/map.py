@@ -30,7 +30,7 @@ class MadeOptions(WhiskerOptions):
             raise ValueError("give either --whisker or the --length of a straight one")
         if self.rat is not None:
             radii = {"--base-radius": self.base_radius, "--tip-radius": self.tip_radius}
-            refuse(radii, "--rat gives the radii")
+            refuse(radii, "--rat determines the radii")
 
     def read(self, path: Path | None = None) -> vb.Whisker:
         """Read or construct the whisker with the stated thickness and material."""

@@ -64,9 +64,9 @@ def movie(
     Example: `vibrissa movie trial.nc --video top.mp4 --video front.mp4 -o movies`
     """
     if kind == "contour":
-        refuse({"--map": of_trial.map}, "the movie of the contour shows no map")
+        refuse({"--map": of_trial.map}, "the movie of the contour does not show a map")
     if kind == "signals":
-        refuse({"--video": of_trial.videos}, "the movie of the signals shows no video")
+        refuse({"--video": of_trial.videos}, "the movie of the signals does not show videos")
     kinds = _KINDS if kind == "both" else (kind,)
     make_movies(path, recording_from(path), target, kinds, of_trial, frames, force)
 
@@ -159,7 +159,7 @@ def _write(
     part = path.with_name(f"{path.stem}-part.mp4")
     count = vb.io.write_movie(part, counted(), fps)
     if count < total:
-        say(f"stopped after {count} of {total} frames: {part} holds these")
+        say(f"stopped after {count} of {total} frames: {part} contains these")
         return
     part.replace(path)
     say(f"wrote {path}, {count} frames, {count / fps:.1f} s")

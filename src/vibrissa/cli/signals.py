@@ -29,7 +29,7 @@ class SourceOptions:
     def __post_init__(self) -> None:
         about = {"--density": self.density, "--damping": self.damping}
         if self.fit_dynamics:
-            refuse(about, "--fit-dynamics finds them")
+            refuse(about, "--fit-dynamics determines them")
         if not self.inertia:
             about["--fit-dynamics"] = self.fit_dynamics or None
             refuse(about, "without --inertia the whisker has no mass")
@@ -148,7 +148,7 @@ def signals(
 def described(tree: xr.DataTree) -> str:
     """Description of the source of the signals of a recording."""
     planar = vb.recording.Recording(tree).planar
-    return _origin(tree) + "; one view: depth, Fz, Mx and My are taken for 0" * planar
+    return _origin(tree) + "; one view: depth, Fz, Mx and My are taken as 0" * planar
 
 
 def _origin(tree: xr.DataTree) -> str:

@@ -115,8 +115,8 @@ def _report(trial: xr.DataTree) -> None:
         say(f"in {solved} frames a whisker has several contacts, all of them in the forces")
     if missing := int((several & overlap).sum()):
         say(
-            f"in {missing} frames a whisker would touch elsewhere too (second_contact), which is "
-            "not in the forces"
+            f"in {missing} frames a whisker would have a second contact (second_contact), which "
+            "the forces do not include"
         )
 
 

@@ -49,9 +49,9 @@ class LineOptions:
             vb.io.refuse_whisk(self.source)
         if not self.bag:
             topics = {"--topic": self.topic, "--pose-topic": self.pose_topic}
-            refuse(topics, "it is of a ROS bag, and the source is not one")
+            refuse(topics, "it applies to ROS bags, and the source is not one")
         if self.udp is None:
-            refuse({"--every": self.every}, "only of what comes by --udp are samples dropped")
+            refuse({"--every": self.every}, "samples are dropped only with --udp")
         if self.source is None or self.bag:
             refuse(
                 {"--reconnect": self.reconnect}, "the source is neither a named pipe nor a device"
@@ -67,7 +67,7 @@ class LineOptions:
         if heard is not None:
             return vb.streaming.udp_lines(heard)
         if self.source is None or str(self.source) == "-":
-            refuse({"--reconnect": self.reconnect}, "standard input does not open again")
+            refuse({"--reconnect": self.reconnect}, "standard input cannot be reopened")
             if isinstance(sys.stdin, TextIOWrapper):  # noise on a serial line must not end a stream
                 sys.stdin.reconfigure(errors="replace")
             return vb.streaming.bounded_lines(sys.stdin)
@@ -99,8 +99,11 @@ class MeasurementOptions:
         if self.map:
             if self.own.whisker is not None:
                 raise ValueError("give either --map or --whisker: a map already has its whisker")
-            refuse({"--proximal": self.proximal}, "it is of a map that is simulated")
-            refuse({"--density": self.weight.density}, "a map states that of its whisker")
+            refuse(
+                {"--proximal": self.proximal},
+                "the --map has a proximal limit",
+            )
+            refuse({"--density": self.weight.density}, "the map has that of its whisker")
         sensors = _named(self.sensor, "--sensor")
         if set(sensors) - {"", *self.whiskers}:
             raise ValueError(
@@ -166,7 +169,7 @@ class FollowOptions:
 
     def __post_init__(self) -> None:
         if not self.filter:
-            refuse({"--speed": self.speed}, "it is of the filter: add --filter")
+            refuse({"--speed": self.speed}, "only the filter uses it: add --filter")
 
     def poses(self, name: str) -> vb.streaming.Poses:
         """Create the poses of the carrier on which a whisker is mounted."""
@@ -303,7 +306,7 @@ def _without_long_collections() -> Iterator[Callable[[], None]]:
 
 def _report(running: vb.streaming.ContactStream, lost: str, follow: bool) -> None:
     if follow and not running.poses.number:
-        remark("no pose came: the base was taken to stand still")
+        remark("no pose was received: the base was assumed to be at rest")
     whose = f"{running.whisker}: " if running.whisker else ""
     friction = vb.contacts.friction_assumed(running.friction)
     unread = f"{running.faults} lines that could not be read{lost}"

@@ -74,7 +74,7 @@ def _run(plan: vb.sweeps.Study, path: Path, **how: Any) -> None:
                 plan, path, **how, progress=lambda done, total: tell("cells", done, total)
             )
     except KeyboardInterrupt:
-        remark(f"stopped; what is in {path} is whole, and the same command goes on from it")
+        remark(f"stopped; the results in {path} are complete, and the same command continues")
         raise typer.Exit(130) from None
     except OSError as fault:
         if fault.errno is None or str(path) in str(fault):
@@ -119,7 +119,7 @@ def _show(store: Path | None, folder: Path, force: bool) -> None:
     names = {task: folder / f"{store.resolve().stem}-{task}" for task in vb.plots.drawable(found)}
     for task, name in names.items():
         if (there := name.with_name(f"{name.name}.png")).exists() and not force:
-            remark(f"{there} was there before and is left as it is; --force draws it anew")
+            remark(f"{there} existed before and was not changed; --force replaces it")
             continue
         for file in vb.plots.save(vb.plots.sweep_overview(found, task=task), name, ("png",)):
             say(f"wrote {file}")

@@ -140,7 +140,7 @@ class TraceStatements:
         if len(found.views) != count:
             raise ValueError(f"{file} has {len(found.views)} views; there are {count}")
         if self.clicks is None and found.videos != names:
-            say(f"{file} is not used: it is of {', '.join(found.videos)}")
+            say(f"{file} is not used: it belongs to {', '.join(found.videos)}")
             return None
         bases = len(found.views[0].base)
         areas = sum(len(view.mask) + len(view.region) for view in found.views)
@@ -496,7 +496,7 @@ def _trials(
     trials = [videos[i : i + count] for i in range(0, len(videos), count)]
     files = [recording]
     if len(trials) > 1:
-        refuse(alone, "it is for one trial; track that by itself")
+        refuse(alone, "it applies to one trial: track this trial alone")
         if recording.suffix and not recording.is_dir():
             raise ValueError(
                 f"--output is {recording}; {len(videos)} videos, {count} per trial, are "
@@ -545,9 +545,9 @@ def _report_swapped(videos: Sequence[Path], filmed: FilmOptions) -> None:
     stems = [re.split(r"[\W_]+", path.stem.lower()) for path in videos[:2]]
     if names[1] in stems[0] and names[0] in stems[1]:
         say(
-            f"note: {videos[0].name} is taken for the {names[0]} view and {videos[1].name} for the "
-            f"{names[1]} view. If it is the other way round, results are those of a mirror image, "
-            "which fits the videos as well: nothing but their order decides"
+            f"note: {videos[0].name} is used as the {names[0]} view and {videos[1].name} as the "
+            f"{names[1]} view. If it is the opposite, results are those of a mirror image, "
+            "which fits the videos equally well: only their order decides"
         )
 
 

@@ -57,9 +57,7 @@ def uniqueness(
                 )
             except KeyboardInterrupt:
                 if certify.exists():  # not where it was still being set up
-                    remark(
-                        f"{certify} holds what is certain by now; the same command goes on from it"
-                    )
+                    remark(f"{certify} contains the proof so far; the same command continues it")
                 raise
         tell("verdicts", 0, 1)
         found = vb.uniqueness(

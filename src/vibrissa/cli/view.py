@@ -35,7 +35,7 @@ def view(
     if path is not None and kind in (MAP, RECORDING):
         if rat is not None or any_length:
             raise ValueError(
-                f"--rat and --any-length are about a whisker, and {path} is not its file"
+                f"--rat and --any-length need a file of a whisker, and {path} is not one"
             )
         viewed = vb.ContactMap.load(path, live is None) if kind == MAP else recording_from(path)
     else:
@@ -46,7 +46,7 @@ def view(
         if live is None:
             served = vb.viewer.view(viewed, videos=videos or (), host=host, port=port)
         else:
-            refuse({"--video": videos or None}, "a stream has none")
+            refuse({"--video": videos or None}, "a stream has no videos")
             whisker = viewed.whisker if isinstance(viewed, vb.ContactMap) else viewed
             if not isinstance(whisker, vb.Whisker):
                 raise ValueError("--stream needs a whisker or its map, and this is a recording")

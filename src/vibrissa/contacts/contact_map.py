@@ -216,7 +216,7 @@ class ContactMap:
         errors = common_errors(stiffness_sigma, gain_sigma, mixing_sigma)
         weight = Gravity.of(gravity)
         if base_rotation is not None and gravity is None:
-            raise ValueError("base_rotation turns gravity, and none is given")
+            raise ValueError("base_rotation is given without gravity, which it rotates")
         if weight is None and (using == "wrench" or friction == 0.0):
             plain = (signals, noise, errors, prior, compliance_sigma)
             if using == "wrench":
@@ -546,7 +546,7 @@ def _load(path: Path, grid: bool) -> ContactMap:
     what = recognise(path)
     if what not in (Kind.NETCDF, Kind.UNKNOWN):
         raise ValueError(
-            f"{path} is not a contact map, as `vibrissa map` writes it; what it holds: {what}"
+            f"{path} is not a contact map, as `vibrissa map` writes it; it contains: {what}"
         )
     groups = read_groups(path, ("/", "whisker", "chart", "grid"), {"grid"})
     kind = groups["/"].attrs.get("kind", "")

@@ -208,7 +208,7 @@ def _certificate_note(verdicts: xr.Dataset) -> list[str]:
         return [f"{signs} right{keeps}."]
     where = "no proof of this kind can exist"
     if 0.0 < angle < np.inf:
-        where = f"a proof is possible outside {max(angle, cone):.2f}° at best"
+        where = f"no proof can exclude a cone smaller than {max(angle, cone):.2f}°"
     return [f"{signs} wrong; {where}."]
 
 

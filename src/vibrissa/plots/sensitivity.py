@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,7 @@ from vibrissa.plots import style
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import COORDINATES, DIRECTIONS, robust_limits
 
-BINS = 25
+STATIONS = 25
 SHARE = 0.99
 _PAPER = ("MD", "MB", "Fx")
 # Quantiles that are drawn, which of them is the median, and which bound the two bands.
@@ -29,7 +30,10 @@ _HEIGHTS = {"single": 104.0, "double": 125.0}
 # Signals that reach so many times their lowest tenth get an axis that is wider near zero.
 _SKEWED = 30.0
 _FIFTHS = np.array([0.2, 0.8])
-_LEAST = 0.01  # share of the contacts of a side that a bin needs for its median to be drawn
+_LEAST = 0.01  # share of the contacts of a side that a station needs for its median to be drawn
+# Half width of a window, in distances of stations. Signals of the paper's grid are bunched, as its
+# radii are 2 mm apart: medians of narrower windows would zigzag.
+_HALF = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +58,10 @@ def sensitivity_panels(data: xr.Dataset, *, width: style.Width = "double") -> Fi
 
     The nine panels have a row per coordinate and a column per signal. Each shows the derivative
     over the signal, for concave forward and concave backward contacts (weighted by the volume that
-    they represent, if known): the median in 25 bins, and bands that contain 50 % and 80 % of the
-    contacts. Axes include the central 99 % of the signals; contacts within 2° of rest are left out.
-    The axis of a signal with most values near zero is linear there and logarithmic beyond.
+    they represent, if known): running medians, and bands that contain 50 % and 80 % of the
+    contacts, in windows whose weights decrease from the middle to the ends. Axes include the
+    central 99 % of the signals; contacts within 2° of rest are left out. The axis of a signal with
+    most values near zero is linear there and logarithmic beyond.
 
     Parameters
     ----------
@@ -173,10 +178,13 @@ def _panel(axes: Axes, contacts: _Contacts, coordinate: str, name: str, *, small
         limits = robust_limits(weighted_quantile(x, weight, central), 1.0)  # never equal
     bend = _bend(x, weight, direction)
     axes.axhline(0.0, color=style.MUTED, linewidth=0.5, zorder=0)
-    edges = _edges(limits, bend)
+    on_axis, of_axis = _scales(bend)
+    low, high = on_axis(limits).tolist()
+    edges = np.linspace(low, high, STATIONS + 1)
     bands = []
     for side, colour in ((~backward, style.BLUE), (backward, style.ORANGE)):
-        middle, curves = _spread(x[side], y[side], weight[side], edges)
+        middle, curves = _spread(on_axis(x[side]), y[side], weight[side], edges)
+        middle = of_axis(middle)
         bands.append(curves)
         for (low, high), opacity in zip(_BANDS, (0.15, 0.3), strict=True):
             axes.fill_between(
@@ -204,11 +212,11 @@ def _bend(x: Array, weight: Array, direction: bool) -> float | None:
     return float(low) if 0.0 < low * _SKEWED < high else None
 
 
-def _edges(limits: Array, bend: float | None) -> Array:
-    """Edges of bins that look equally wide on the axis."""
-    low, high = limits if bend is None else np.arcsinh(limits / bend)
-    edges = np.linspace(float(low), float(high), BINS + 1)
-    return edges if bend is None else np.asarray(bend * np.sinh(edges))
+def _scales(bend: float | None) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
+    """Functions from a signal to its position on the axis, and back."""
+    if bend is None:
+        return np.asarray, np.asarray
+    return (lambda x: np.arcsinh(x / bend)), (lambda at: bend * np.sinh(at))
 
 
 def _darker(colour: str) -> str:
@@ -217,13 +225,14 @@ def _darker(colour: str) -> str:
 
 
 def _spread(x: Array, y: Array, weight: Array, edges: Array) -> tuple[Array, Array]:
-    """Middles of bins of x and weighted quantiles of y in them; NaN in bins with few."""
+    """Means of x and weighted quantiles of y in windows about stations; NaN at those with few."""
+    step = edges[1] - edges[0]
     middle = np.full(edges.size - 1, np.nan)
     curves = np.full((len(_SHARES), edges.size - 1), np.nan)
-    place = np.digitize(x, edges) - 1
-    for k in range(edges.size - 1):
-        rows = np.flatnonzero(place == k)
-        if weight[rows].sum() > _LEAST * weight.sum():
-            middle[k] = np.median(x[rows])
-            curves[:, k] = weighted_quantile(y[rows], weight[rows], _SHARES)
+    for k, station in enumerate(edges[:-1] + 0.5 * step):
+        away = np.abs(x - station) / step
+        if weight[away < 0.5].sum() > _LEAST * weight.sum():
+            near = weight * (1.0 - np.minimum(away / _HALF, 1.0) ** 3) ** 3
+            middle[k] = np.average(x, weights=near)
+            curves[:, k] = weighted_quantile(y, near, _SHARES)
     return middle, curves

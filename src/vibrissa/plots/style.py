@@ -12,6 +12,7 @@ who do not distinguish green from red, and no colour is too pale for white paper
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from io import BytesIO
@@ -43,7 +44,7 @@ Box = tuple[float, float, float, float]
 # Widths of figures, mm.
 WIDTHS: Mapping[str, float] = MappingProxyType({"single": 85.0, "double": 178.0})
 _LETTER = 1.5  # mean width of a letter of 8 points, mm
-_UNSEEN = str.maketrans("", "", "$_{}\\")  # marks of formulas
+_MARKS = re.compile(r"[$_{}]|(?<=\\)[A-Za-z]+")  # marks of formulas; a command leaves a letter
 # Sizes of type, points: findings and the letters of panels; titles and axes; all else.
 LARGE, PLAIN, SMALL = 8.0, 7.0, 6.0
 # Colours of text, secondary items, shaded areas, three kinds of lines, and a traced whisker.
@@ -184,7 +185,7 @@ def conclude(figure: Figure, finding: str) -> None:
     lines = [""]
     for word in finding.split(" "):
         longer = f"{lines[-1]} {word}".lstrip()
-        seen = longer.translate(_UNSEEN)
+        seen = _MARKS.sub("", longer)
         lines = [*lines[:-1], longer] if len(seen) <= (wide - 4.0) / _LETTER else [*lines, word]
     figure.above = 2.5 + 3.6 * len(lines)
     figure.text(

@@ -439,7 +439,7 @@ def advice(stream: ContactStream) -> list[str]:
         larger = (
             "are larger than any that this whisker can give"
             if counts["outside_map"] > unexplained / 2
-            else "are of no contact without friction that this whisker can have"
+            else "are explained by no frictionless contact of this whisker"
         )
         out.append(
             f"{unexplained} of {touching} samples with signals {larger}: are they in N and N·m (or "

@@ -343,20 +343,20 @@ def remarks_on_shaking(cameras: Sequence[Camera], traces: Sequence[Sequence[Trac
         if size.any():
             found.append(
                 f"{camera.name} shakes by {size[0]:.2f} pixels along columns and {size[1]:.2f} "
-                "along rows (standard deviations), as what never moves in its images shows; traces "
-                f"are moved back by that, which is known to {left[0]:.2f} and {left[1]:.2f} pixels."
+                "along rows (standard deviations), as static edges in its images show; traces are "
+                f"shifted back, with errors of {left[0]:.2f} and {left[1]:.2f} pixels."
             )
             slow = float(slow_motion(shift[:, None, :2]).max())
             if slow > max(_SLOW, _MOSTLY * float(size.max())):
                 found[-1] += (
-                    f" Part of it is slow, or a step, of {2.0 * slow:.1f} pixels: at which moment "
-                    "the camera was where it was calibrated is not known, by which all contact "
-                    "points may be shifted together (in their covariances)."
+                    f" Part of this is slow, or a step, of {2.0 * slow:.1f} pixels: it is unknown "
+                    "at which moment the camera had its calibrated position, so that all contact "
+                    "points may be shifted together (which their covariances include)."
                 )
         elif np.isnan(left).any() and any(other[:, :2].any() for other in shifts):
             found.append(
-                f"nothing shows whether {camera.name} shakes, too: it is taken to do so as much as "
-                "the other, in the covariances only."
+                f"it is unknown whether {camera.name} shakes, too: the covariances assume that it "
+                "shakes as much as the other camera."
             )
     return found
 
@@ -370,9 +370,9 @@ def remarks_on_optics(one: Tracked, optics: Optics, name: str) -> list[str]:
     state = "State the distance of the lenses (--distance, in m; inf for telecentric ones), or c"
     state = "C" if optics.distance is not None else state
     return [
-        f"{name}: the cameras are not calibrated, by which contact points are uncertain by "
-        f"{1e6 * np.nanmedian(moved):.0f} µm (median; in the covariances, but an object fitted to "
-        f"them errs as a whole). {state}alibrate them (vibrissa calibrate, --cameras)."
+        f"{name}: the cameras are not calibrated, so that contact points are uncertain by "
+        f"{1e6 * np.nanmedian(moved):.0f} µm (median; their covariances include this, that of an "
+        f"object fitted to them does not). {state}alibrate them (vibrissa calibrate, --cameras)."
     ]
 
 
@@ -403,20 +403,20 @@ def remarks_on(
     if strange:
         found.append(
             f"{name}: in {strange} frames the bent rod does not explain the traces (trace_misfit "
-            f"above {_STRANGE:g}): they are on something else, or its own inertia or a second "
-            "contact bends it. The results of these frames are not to be believed."
+            f"above {_STRANGE:g}): they are on something else, or the whisker is bent by its "
+            "inertia or by a second contact. Results of these frames are unreliable."
         )
     if np.isnan(length.sigma):
         found.append(
-            f"{name}: its tip is not seen, nor is it bent enough to show its length; it is "
-            f"{1e3 * length.value:.1f} mm at least. Its true length is needed to find contacts: "
-            "give --length."
+            f"{name}: its tip is not visible, and it is not bent enough to show its length; it is "
+            f"at least {1e3 * length.value:.1f} mm long. Contacts need its true length: state it "
+            "(--length)."
         )
     elif length.sigma > 0.0 and not length.seen:
         found.append(
-            f"{name}: its tip is too faint to be seen, or outside of the image; as it bends it is "
-            f"{1e3 * length.value:.1f} ± {1e3 * length.sigma:.1f} mm long, which is counted in all "
-            "covariances."
+            f"{name}: its tip is too faint to be seen, or outside of the image; its bending shows "
+            f"that it is {1e3 * length.value:.1f} ± {1e3 * length.sigma:.1f} mm long, which all "
+            "covariances include."
         )
     return found
 
@@ -456,7 +456,7 @@ def remarks_on_row(exchanges: int, left_out: int, name: str) -> list[str]:
     if exchanges:
         found.append(
             f"{name}: in {exchanges} frames its trace was exchanged with a neighbour's, as its "
-            "shape and base in both views then are those of the other frames."
+            "shape and base in both views then agree with the other frames."
         )
     if left_out:
         found.append(
@@ -493,8 +493,8 @@ def remarks_on_bases(
         cut = [a.length - b.length for a, b in zip(before, after, strict=True) if len(a.line)]
         if cut and np.median(cut) > _APART:
             found.append(
-                f"{name}: {camera.name} shows it from {np.median(cut):.0f} pixels nearer to its "
-                "base on than the other view (median); it is taken to begin where both show it."
+                f"{name}: {camera.name} shows {np.median(cut):.0f} pixels more of it near its base "
+                "than the other view (median); the first point that both show is used as base."
             )
     return found
 
@@ -539,7 +539,7 @@ def remarks_on_plane(one: Tracked, name: str) -> list[str]:
     return [
         f"{seen}frames that show its tip), as if it turned out of the image by up to "
         f"{np.degrees(turned):.0f}°. Contact is then not distinguished from turning, and forces "
-        "and contact points of such frames are not to be believed. A second view (or a mirror, "
+        "and contact points of such frames are unreliable. A second view (or a mirror, "
         "--views) shows it."
     ]
 
@@ -555,8 +555,8 @@ def remarks_on_time(
         listed, names = ", ".join(map(str, runs)), f"{cameras[0].name} and {camera.name}"
         if offset is None and determined:
             found.append(
-                f"{names}: the offset that was found is {listed} frames (to within {NEAR}); if it "
-                "cannot be, state it (--offset)."
+                f"{names}: an offset of {listed} frames was found (to within {NEAR}); if this is "
+                "impossible, state the right one (--offset)."
             )
         elif offset is None:
             found.append(

@@ -87,8 +87,8 @@ def tracker_traces(
             if between > scatter:
                 notes.append(
                     f"{name}: its points in {view} are so far apart that the line between them has "
-                    f"an error of some {between:.1f} pixels, which is in no covariance: track more "
-                    "points along the whisker"
+                    f"an error of some {between:.1f} pixels, which no covariance includes: track "
+                    "more points along the whisker"
                 )
     if tip and nodes and "tip" not in nodes[-1].lower():
         notes.append(
@@ -168,8 +168,8 @@ def _from_base(tracks: xr.Dataset, notes: list[str]) -> xr.Dataset:
     if not names or "tip" not in names[0] or not any(base in names[-1] for base in _BASES):
         return tracks
     notes.append(
-        f"the points run from {names[0]} to {names[-1]} by their names: they were turned round, as "
-        "nodes run from base to tip"
+        f"the points run from {names[0]} to {names[-1]} by their names: their order was reversed, "
+        "as nodes run from base to tip"
     )
     return tracks.isel(node=slice(None, None, -1))
 
@@ -204,8 +204,8 @@ def _arcs(tracks: xr.Dataset, notes: list[str]) -> xr.Dataset:
         middle + share[..., None] * chord[..., None, :] + bulge[..., None] * across[..., None, :]
     )
     notes.append(
-        "the file holds follicle, tip and mean curvature: the whisker between them is taken for an "
-        "arc; the shape itself is in the .whiskers file of the same name"
+        "the file contains follicle, tip and mean curvature: the whisker is approximated by an arc "
+        "between them; its shape is in the .whiskers file of the same name"
     )
     kept = tracks.drop_dims("node")
     return kept.assign(trace=(tracks["trace"].dims, points)).assign_attrs(tracks.attrs)
@@ -236,7 +236,7 @@ def _views(
             return tuple(each[0] for each in fitting)
         pairs = zip(shown, cameras, strict=True)
         listed = ", ".join(f"{name} is {camera.name}" for name, camera in pairs)
-        notes.append(f"views are not named after cameras and are taken in their order: {listed}")
+        notes.append(f"views are not named after cameras and are assigned in order: {listed}")
         return tuple(cameras)
     if count > 2:
         raise ValueError(f"{count} views need calibrated cameras")
@@ -260,13 +260,13 @@ def _identified(
     if asked is not None and min(points.shape[1:3]) > 1:
         raise ValueError(
             f"the tracker numbered {len(names)} whiskers in each view anew, so that it is unknown "
-            "which of one view is which of the other: name none, for the longest of each, or "
+            "which belong together: omit --names, for the longest in each view, or "
             "identify them in the tracker (by the state of Whisk's measurements)"
         )
     notes.append("the tracker did not identify whiskers over time: each is followed by its ends")
     views = [_followed(points[:, :, [v]], either) for v in range(points.shape[2])]
     if either:
-        notes.append("the end that moves less is taken for the base of each whisker")
+        notes.append("the end of each whisker that moves less is used as its base")
     if asked is not None:
         return np.concatenate(views, axis=2), names
     longest = [_longest(names, view, notes) for view in views]
@@ -358,7 +358,7 @@ def _longest(names: list[str], points: Array, notes: list[str]) -> int:
     if often.size > 1:
         notes.append(
             f"{often.size} whiskers are seen in half of the frames; the longest, {names[longest]}, "
-            f"is taken: name others ({', '.join(names[k] for k in often[:_SHOWN])}"
+            f"is used: choose others with --names ({', '.join(names[k] for k in often[:_SHOWN])}"
             f"{', …' if often.size > _SHOWN else ''})"
         )
     return longest
@@ -385,7 +385,7 @@ def _order_faults(points: Array, name: str, views: Sequence[str], nodes: list[st
             listed = ", ".join(nodes[k] if nodes else f"point {k}" for k in gaps)
             notes.append(
                 f"{name}: {listed} is never known in {view}, where the line between its neighbours "
-                "is taken instead"
+                "is used instead"
             )
         folds = [_folded(one) for one in each]
         if not (often := [fold for fold in folds if fold is not None]):

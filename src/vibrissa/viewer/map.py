@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import viser
 
 from vibrissa import scene
 from vibrissa.numerics import Array
@@ -257,10 +256,6 @@ class MapMode(Mode):
             self._value = gui.add_html("")
             self._legends = gui.add_html("")
             self._words = gui.add_html(readout.note(_HINT))
-        shown: Any = (
-            page.server.scene
-        )  # its type does not allow coroutines, which run one after the other
-        shown.on_click()(self._clicked)
         for control in (self._by, self._cut, self._slice, self._share):
             asked(control, lambda _: page.work.put("map", self.redraw))
 
@@ -281,7 +276,7 @@ class MapMode(Mode):
         """Draw the solids if they have not been drawn."""
         page, chart = self._page, self._page.chart
         if chart is None:
-            self._words.content = readout.note("Charting all contacts of this whisker …")
+            self._words.content = readout.note("Sampling all contacts of this whisker …")
             return
         cut = bool(self._cut.value)
         if self._solids is None or (self._solids.chart, self._solids.cut) != (chart, cut):
@@ -311,12 +306,6 @@ class MapMode(Mode):
             painted = {}
         self._page.stage.show("solids", painted)
         self._legends.content = "".join(legends[name].html() for name in scene.COORDINATES)
-
-    async def _clicked(self, event: viser.SceneClickEvent) -> None:
-        """Pick where a solid is clicked."""
-        origin = np.asarray(event.ray_origin, dtype=np.float64)
-        direction = np.asarray(event.ray_direction, dtype=np.float64)
-        self._page.work.put("pick", lambda: self.pick(origin, direction))
 
     def pick(self, origin: Array, direction: Array) -> None:
         """Mark the contact that a ray, mm, meets first in any space."""

@@ -15,7 +15,7 @@
   if (dark.matches) matched();
   dark.addEventListener("change", () => { matched(); location.reload(); });
 
-  // Keys press buttons; a click in a plot over time sets the time.
+  // Keys press buttons; the mouse in a plot over time sets the time.
   const button = (...texts) => [...document.querySelectorAll("button")].find(
     (each) => each.offsetParent && texts.includes(each.textContent.trim()));
   const setTime = (share) => {
@@ -31,25 +31,44 @@
     Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set.call(input, value);
     input.dispatchEvent(new Event("input", { bubbles: true }));
     input.dispatchEvent(new Event("blur", { bubbles: true }));
+    setTimeout(() => input.blur());  // else keys would be typed into it
   };
   const keys = {
-    ",": ["◀ frame"], ".": ["frame ▶"], "n": ["Next contact"], "a": ["All"], " ": ["Play", "Pause"],
+    ",": ["◀ frame"], ".": ["frame ▶"], "p": ["◀ contact"], "n": ["contact ▶"],
+    "a": ["All"], " ": ["Play", "Pause"],
   };
+  const ends = { "Home": 0, "End": 1 };
   addEventListener("keydown", (event) => {
     // The space bar presses the button that was clicked last.
     const typing = (event.key === " " ? /^(INPUT|TEXTAREA|BUTTON)$/ : /^(INPUT|TEXTAREA)$/)
       .test(event.target.tagName);
-    if (typing || event.ctrlKey || event.metaKey || event.altKey || !keys[event.key]) return;
-    const found = button(...keys[event.key]);
+    if (typing || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.key in ends && document.querySelector("svg[data-timeline]")) {
+      event.preventDefault();
+      setTime(ends[event.key]);
+    }
+    const found = keys[event.key] && button(...keys[event.key]);
     if (found) { event.preventDefault(); found.click(); }
   });
-  addEventListener("click", (event) => {
+  // A plot is drawn anew as its time changes: what counts is where it was.
+  let held = null, moved = 0;
+  const seek = (event) => {
+    const share = ((event.clientX - held.x) / (held.width - 8) - held.left) / (1 - held.left);
+    if (share >= 0 || event.type === "pointermove") setTime(Math.min(Math.max(share, 0), 1));
+  };
+  addEventListener("pointerdown", (event) => {
     const plot = event.target.closest?.("svg[data-seek]");
     if (!plot) return;
-    const box = plot.getBoundingClientRect(), left = Number(plot.dataset.seek);
-    const share = ((event.clientX - box.left) / (box.width - 8) - left) / (1 - left);
-    if (share >= 0 && share <= 1) setTime(share);
+    const { x, width } = plot.getBoundingClientRect();
+    held = { x, width, left: Number(plot.dataset.seek) };
+    seek(event);
   });
+  addEventListener("pointermove", (event) => {
+    if (!held || event.timeStamp < moved + 50) return;
+    moved = event.timeStamp;
+    seek(event);
+  });
+  for (const end of ["pointerup", "pointercancel"]) addEventListener(end, () => { held = null; });
 
   // The address keeps what is seen, so that a link leads back to it. What is drawn counts as
   // narrow where the server's `framed` centres it above the panel.

@@ -82,6 +82,9 @@ class Mode:
     def write(self, brief: bool = False) -> None:
         """Update the texts of the panel; if ``brief``, only those read while dragging."""
 
+    def pick(self, origin: Array, direction: Array) -> None:
+        """Handle a click on the scene, at a ray, mm."""
+
     def link(self) -> dict[str, str]:
         """Parameters of a link that restore the state of the mode."""
         return {}
@@ -122,6 +125,17 @@ class Page:
             size,
             lambda place, turn: self.change("drag", lambda b: moved(b, place, turn[:, 2]), True),
         )
+        shown: Any = server.scene  # its type does not allow coroutines, which run in order
+        shown.on_click()(self._clicked)
+
+    async def _clicked(self, event: viser.SceneClickEvent) -> None:
+        """Schedule the handling of a click on the scene by the mode."""
+        origin, direction = (
+            np.asarray(of, dtype=np.float64) for of in (event.ray_origin, event.ray_direction)
+        )
+        mode = self.mode
+        if mode is not None:
+            self.work.put("pick", lambda: mode.pick(origin, direction))
 
     def change(self, topic: str, transition: Transition, dragging: bool = False) -> None:
         """Schedule a change of the load; a newer change replaces an older one."""

@@ -104,6 +104,31 @@ def note(text: str) -> str:
     )
 
 
+_HELP = {
+    "drag": "rotate the view; with the right button: shift it",
+    "wheel": "zoom",
+    "a": "show everything",
+}
+_TRIAL_HELP = {
+    "space": "play or pause",
+    ", and .": "one frame back or ahead",
+    "p and n": "previous or next onset of a contact",
+    "Home, End": "first or last frame",
+    "timeline, signals": "click or drag: go to a time",
+    "contact point": "click: go to its time",
+}
+
+
+def instructions(trial: bool) -> str:
+    """HTML table of what mouse and keys do, with or without a trial."""
+    rows = "".join(
+        f'<tr><td style="white-space:nowrap;padding-right:10px;vertical-align:top">{key}</td>'
+        f"<td>{does}</td></tr>"
+        for key, does in (_HELP | _TRIAL_HELP if trial else _HELP).items()
+    )
+    return f'<table style="margin:0 12px 8px;font-size:13px;line-height:1.35">{rows}</table>'
+
+
 def of_deflection(bent: Deflection) -> str:
     """HTML with status of the load, signals at the base, and contact point."""
     return sentence(Status(int(bent.status))) + numbers(bent)
@@ -173,11 +198,11 @@ def timeline(time: Array, touching: NDArray[np.bool_], onsets: NDArray[np.int64]
 
 
 def _svg(body: str, tall: float, mark: str = "") -> str:
-    """SVG over time, in which the page's script handles clicks."""
+    """SVG over time, in which the page's script handles the mouse."""
     return (
         f'<svg{mark} data-seek="{LEFT / WIDTH:.4f}" viewBox="0 0 {WIDTH:.0f} {tall:.0f}" '
         f'style="display:block;width:100%;padding-right:{PAD}px;box-sizing:border-box;'
-        f'cursor:pointer" font-family="sans-serif" '
+        f'cursor:pointer;touch-action:pan-y;user-select:none" font-family="sans-serif" '
         f'font-size="8.5">{body}</svg>'
     )
 

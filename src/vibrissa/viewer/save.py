@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import gzip
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -80,9 +79,9 @@ def written(name: str, write: Callable[[Path], object]) -> bytes:
 
 _TIMEOUT = 60.0  # of a picture that the browser draws, s
 _FRAMES = 100  # most frames of a movie
-# Pixels of a picture, and of a movie, per pixel of the browser, and longest side of either, pixels.
-_STILL, _MOVING, _LONGEST = 3.0, 2.0, 4000.0
-_SLOW = 1.0  # time to draw a frame of a movie from which on it is drawn coarsely, s
+# Pixels of a picture per pixel of the browser, and longest side of a picture or movie, pixels.
+_STILL, _LONGEST = 3.0, 4000.0
+_SIZES = {"MP4": 2.0, "MP4, small": 1.0}  # the same for movies
 
 
 def _render(client: viser.ClientHandle, fine: float) -> Picture:
@@ -93,25 +92,23 @@ def _render(client: viser.ClientHandle, fine: float) -> Picture:
 
 
 def movie(
-    client: viser.ClientHandle, mode: TrialMode, progress: Callable[[int, int], None]
+    client: viser.ClientHandle, mode: TrialMode, fine: float, progress: Callable[[int, int], None]
 ) -> bytes:
-    """MP4 movie of a trial in the view of a browser, on white, without empty margins."""
+    """MP4 movie of a trial in the view of a browser, on white, without empty margins.
+
+    ``fine`` is the number of its pixels per pixel of the browser.
+    """
     import imageio.v3 as imageio
 
     mode.pause()
     count = min(mode.trial.frames, _FRAMES)
     rows = np.linspace(0, mode.trial.frames - 1, count).round().astype(int)
 
-    drawn, filled, fine = [], np.zeros((), dtype=bool), _MOVING
+    drawn, filled = [], np.zeros((), dtype=bool)
     for done, row in enumerate(rows):
         progress(done, count)
         mode.show(int(row))
-        began = time.monotonic()
-        image = _render(client, fine)
-        if done == 0 and time.monotonic() - began > _SLOW:
-            fine = 1.0
-            image = _render(client, fine)
-        paper = _on_white(image)
+        paper = _on_white(_render(client, fine))
         drawn.append(png(paper))
         filled = filled | (paper != 255).any(axis=-1)
     part = _part(filled)
@@ -136,7 +133,11 @@ class SaveControls:
         with self.folder:
             files = gui.add_button_group("Whisker", ("CSV", "NetCDF"))
             picture = gui.add_button_group("Picture", ("PNG",))
-            movie = gui.add_button_group("Movie", ("MP4",), hint="The trial in the current view")
+            movie = gui.add_button_group(
+                "Movie",
+                tuple(_SIZES),
+                hint="The trial in the current view; small: as large as the window, faster to draw",
+            )
             data = gui.add_button_group(
                 "Data", ("NetCDF",), hint="The bent whisker, the map or the trial that is shown"
             )
@@ -192,7 +193,7 @@ class SaveControls:
         if client is None:
             return
         if not isinstance(mode, TrialMode):
-            self._page.say("Not saved", "a movie is of a trial: choose the mode Trial", "red")
+            self._page.say("Not saved", "movies show trials: choose the mode Trial", "red")
             return
         note = client.add_notification("Movie", "drawn by this browser", loading=True)
 
@@ -200,7 +201,8 @@ class SaveControls:
             note.body = f"frame {done + 1} of {total}"
 
         try:
-            self._send(event, "trial.mp4", lambda: movie(client, mode, tell))
+            fine = _SIZES[event.target.value]
+            self._send(event, "trial.mp4", lambda: movie(client, mode, fine, tell))
         finally:
             note.remove()
 

@@ -57,7 +57,7 @@ from vibrissa.viewer.page import (
     Page,
     whole,
 )
-from vibrissa.viewer.readout import CLOUD, CONTACT, note, sentence, table
+from vibrissa.viewer.readout import CLOUD, CONTACT, instructions, note, sentence, table
 from vibrissa.viewer.save import SaveControls, amended
 from vibrissa.viewer.stage import Stage, lit
 from vibrissa.viewer.state import loaded, moved, with_radius
@@ -262,7 +262,7 @@ def _of_one(contact_map: ContactMap, whisker: Whisker) -> Whisker:
     if not (same and np.allclose(own.centerline(20), whisker.centerline(20), atol=1e-9)):
         raise ValueError(
             f"the map is that of another whisker ({1e3 * own.length:.3f} mm long, this one "
-            f"{1e3 * whisker.length:.3f} mm); leave it out to have one made"
+            f"{1e3 * whisker.length:.3f} mm); omit it to have one computed"
         )
     return own
 
@@ -288,6 +288,8 @@ def _furnished(
     page.modes = {mode.name: mode for mode in modes}
     page.whisker_controls = WhiskerControls(page).folder
     SaveControls(page, recording)
+    with page.server.gui.add_folder("Help", expand_by_default=False):
+        page.server.gui.add_html(instructions(trial is not None))
     page.linked = page.server.gui.add_html("")
     page.choose("Trial" if trial is not None else "Map" if page.has_map else "Bend")
     page.work.wait()  # kernels are compiled one at a time, those of the first view before others
@@ -343,7 +345,7 @@ def _served(
     if port is None:
         port = free_port(host)
     elif not is_free(host, port):  # viser would silently use another one
-        raise ValueError(f"port {port} of {host} is taken; leave it out for one that is free")
+        raise ValueError(f"port {port} of {host} is in use; omit it for a free one")
     with guarded(host, restore), contextlib.redirect_stdout(io.StringIO()):  # viser prints its URL
         server = viser.ViserServer(host=host, port=port, label="vibrissa", verbose=False)
     opened.callback(server.stop)
@@ -507,16 +509,17 @@ class Live:
         """HTML with status, point and force of the newest result, and the number of results."""
         answer = self.newest
         if not answer:
-            return note("Waiting for answers of `vibrissa stream --send`.")
+            return note("Waiting for results of `vibrissa stream --send`.")
         status = answer["status"]
         rows = {
             name: answer[name]
             for name in ("r", "theta", "phi", "arc_length")
             if isinstance(answer.get(name), float)
         }
-        faults = f", {self.faults} lines that are none" if self.faults else ""
-        heading = note("Free whisker: the offset is taken.") if status is None else sentence(status)
-        return heading + (table(rows) if rows else "") + note(f"{self.number} answers{faults}")
+        faults = f", {self.faults} unreadable lines" if self.faults else ""
+        free = "The whisker is free; the sensor's offset is being determined."
+        heading = note(free) if status is None else sentence(status)
+        return heading + (table(rows) if rows else "") + note(f"{self.number} results{faults}")
 
 
 class LivePage:

@@ -71,18 +71,32 @@ class Watched:
         before = np.concatenate([np.zeros((1, self.touching.shape[1]), bool), self.touching[:-1]])
         return np.flatnonzero((self.touching & ~before).any(axis=1))
 
-    def next_contact(self, frame: int) -> int:
-        """Frame of the next onset; after the last that of the first, or the same without onsets."""
+    def onset_from(self, frame: int, ahead: bool = True) -> int:
+        """Frame of the next or previous onset, in a circle; the same without onsets."""
         onsets = self.onsets()
-        after = onsets[onsets > frame]
-        return int(after[0] if after.size else onsets[0] if onsets.size else frame)
+        if not onsets.size:
+            return frame
+        after = np.searchsorted(onsets, frame, "right" if ahead else "left")
+        return int(onsets[(after if ahead else after - 1) % onsets.size])
+
+    def contact_at(self, frame: int, origin: Array, direction: Array) -> int | None:
+        """Frame of the contact, up to a frame, that a ray, m, meets first; None without one."""
+        away = self.contacts[: frame + 1] - origin
+        direction = direction / np.linalg.norm(direction)
+        depth = away @ direction
+        aside = np.linalg.norm(away - depth[..., None] * direction, axis=-1)
+        hit = (aside < _NEAR * self.whiskers[0].length) & (depth > 0.0)
+        near = np.where(hit, depth, np.nan)
+        if np.isnan(near).all():
+            return None
+        return int(np.unravel_index(np.nanargmin(near), near.shape)[0])
 
 
 def watched(recording: xr.DataTree) -> Watched:
     """Extract the data to be drawn from a recording."""
     root = recording.to_dataset()
     if not root.sizes.get("time") or not root.sizes.get("whisker"):
-        raise ValueError("the recording has no frames of a whisker to look at")
+        raise ValueError("the recording has no frames with a whisker")
     trial = Recording(recording)
     shape = (root.sizes["time"], root.sizes["whisker"])
     whiskers = tuple(trial.whiskers)
@@ -143,7 +157,7 @@ Frame = NDArray[np.uint8]
 
 WIDTH = 420  # width of a picture, pixels
 _MARGIN = 40.0
-_TRACE, _CONTACT = (255, 96, 0), (0, 150, 255)
+_TRACE = (0, 150, 255)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +214,7 @@ def picture(view: View, trial: Watched, frame: int, image: Frame | None = None) 
     if touching.size:
         seen = trial.cameras[view.number].project(touching)
         for at in np.round((seen - [left, top]) * view.scale):
-            draw.ellipse([*(at - 3.0), *(at + 3.0)], _CONTACT)
+            draw.ellipse([*(at - 3.0), *(at + 3.0)], CONTACT)
     return np.asarray(out)
 
 
@@ -220,6 +234,7 @@ def extent(trial: Watched) -> tuple[Array, float]:
 # Layers that can be switched.
 LAYERS = ("Whiskers", "Forces", "Contacts", "Uncertainty", "Objects", "Fitted shape", "Scale")
 _SIGMAS = 2.0  # size of the ellipsoid of a contact, standard deviations
+_NEAR = 0.02  # distance from a click at which a contact is hit, over the whisker's length
 _SHARP = 0.3e-3  # standard deviation, m, from which on contacts are paler
 # Colour of the least certain contacts, as faint on white as on black.
 _PALE: scene.Colour = (150, 152, 155)
@@ -343,6 +358,7 @@ _MS = 1e3
 SPEEDS = {"real time": 1.0, "1 : 2": 0.5, "1 : 5": 0.2, "1 : 10": 0.1, "1 : 50": 0.02}
 _USUAL = "1 : 10"
 BACK, AHEAD = "◀ frame", "frame ▶"
+EARLIER, LATER = "◀ contact", "contact ▶"
 
 
 class TrialMode(Mode):
@@ -373,8 +389,9 @@ class TrialMode(Mode):
         with self._folder:
             self._time = gui.add_slider("Time (ms)", 0.0, max(end, step), step, 0.0)
             self._play = gui.add_button("Play", color="blue")
-            jump = gui.add_button("Next contact", color="blue", hint="Key n")
+            jump = gui.add_button_group("Onset", (EARLIER, LATER), hint="Keys p and n")
             step_by = gui.add_button_group("Step", (BACK, AHEAD), hint="Keys , and .")
+            self._again = gui.add_checkbox("Repeat", False)
             speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value=_USUAL)
             if len(trial.names) > 1:
                 which = gui.add_dropdown(
@@ -411,7 +428,7 @@ class TrialMode(Mode):
         self._timeline.float(x=16.0, y=-16.0, width=520.0, height=112.0)
         self._timeline.expand()  # on a phone panels are closed otherwise
         self._play.on_click(lambda _: self.toggle())
-        jump.on_click(lambda _: self.jump())
+        jump.on_click(lambda event: self.jump(event.target.value == LATER))
 
     def enter(self) -> None:
         """Show the controls, and point the cameras at the whiskers."""
@@ -504,9 +521,16 @@ class TrialMode(Mode):
         """Play at one of :data:`SPEEDS`."""
         self._speed = SPEEDS[words]
 
-    def jump(self) -> None:
-        """Go to the next onset of a contact."""
-        self.go(float(self.trial.time[self.trial.next_contact(self.frame)]))
+    def jump(self, ahead: bool = True) -> None:
+        """Go to the next or previous onset of a contact."""
+        self.go(float(self.trial.time[self.trial.onset_from(self.frame, ahead)]))
+
+    def pick(self, origin: Array, direction: Array) -> None:
+        """Go to the frame of the contact at a ray, mm."""
+        frame = self.trial.contact_at(self.frame, origin / to_display("length", 1.0), direction)
+        if frame is not None and "Contacts" in self._visible:
+            self.pause()
+            self.go(float(self.trial.time[frame]))
 
     def show(self, frame: int) -> None:
         """Show a frame, and wait until it is drawn."""
@@ -521,7 +545,9 @@ class TrialMode(Mode):
 
     def _tick(self, passed: float) -> None:
         time = self._now + self._speed * passed
-        if time >= self.trial.time[-1]:
+        if time >= self.trial.time[-1] and self._again.value:
+            time = float(self.trial.time[0])
+        elif time >= self.trial.time[-1]:
             self.pause()
         self._now = time
         self.go(time)

@@ -220,9 +220,7 @@ class Mixed:
         sizes = np.repeat([d.force, d.moment], 3)
         size, axes = np.linalg.eigh(covariance)
         if not size[0] > 0.0:
-            raise ValueError(
-                "a mix of force and moment can only be weighed with noise in all of it"
-            )
+            raise ValueError("channels that mix force and moment need noise in all six components")
         whiten = axes.T / np.sqrt(size)[:, None]
         wrenches = wrenches_of(chart.values.reshape(-1, 6))
         typical = np.sqrt((wrenches**2).mean(axis=0))

@@ -159,12 +159,12 @@ class ContactFilter:
             raise ValueError(f"memory is a time, positive, s; got {memory!r}")
         if estimator.softened:
             raise ValueError(
-                "a filter takes no estimator with friction, compliance_sigma, or uncertain gravity"
+                "a filter does not support friction, compliance_sigma, or uncertain gravity"
             )
         refuse_tip(estimator.prior, "a filter takes contacts of the side")
         if not estimator.noisy:
             raise ValueError(
-                "a filter weighs what it knows against the noise: give its estimator's"
+                "a filter needs an estimator with noise: Estimator(contact_map, noise=...)"
             )
         # With weight, contacts are those of a weightless whisker with the sagged shape, for
         # measurements corrected by the effect of the weight.
@@ -209,7 +209,7 @@ class ContactFilter:
         if not math.isfinite(time):
             raise ValueError(f"time is a finite number, s; got {time!r}")
         if self._time is not None and not time > self._time:
-            raise ValueError(f"time goes on; got {time} s after {self._time} s")
+            raise ValueError(f"times must increase; got {time} s after {self._time} s")
         if self._weighted is None:
             measurement = self.estimator.measurement(signals, rotation, gravity)
         else:

@@ -550,12 +550,12 @@ def _start(search: _Search, vote: _Vote, bright: bool) -> Start:
     best = max(vote.winners, key=lambda one: one.worth)
     confidence, doubts = vote.confidence, []
     if not vote.moves:
-        doubts.append("nothing that moves is like a whisker; this does not move")
+        doubts.append("nothing that moves resembles a whisker; this line does not move")
     if vote.hidden and confidence < _SURE:
         doubts.append(f"{vote.hidden} hardly shows it along the lines of sight of the other view")
     if confidence < _SURE:
         first, count = vote.agreed
-        why = "or others are nearly so, or it is as short as hairs are"
+        why = "or others are nearly as likely, or it is as short as a hair"
         doubts.append(f"it is the likeliest in {first} of {count} frames, {why}")
     gap = float(np.median([one.gap for one in vote.winners]))
     if gap > 0.5 * _GAP:
@@ -566,7 +566,9 @@ def _start(search: _Search, vote: _Vote, bright: bool) -> Start:
         tips = open_ if len(open_) > _ENDING * len(tips) else [0.0]
     together = float(np.mean(np.array(tips) < _TOGETHER))
     if together < _SELDOM:
-        doubts.append(f"views show its tip at one place in {100.0 * together:.0f} % of frames only")
+        doubts.append(
+            f"its tips in the views are one point in only {100.0 * together:.0f} % of the frames"
+        )
     clear = [one for one in vote.winners if one.worth > 0.5 * best.worth]
     bases = list(min(clear, key=lambda one: one.frame).bases)
     views = zip(search.cameras, search.frames, bases, strict=True)

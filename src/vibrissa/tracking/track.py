@@ -208,9 +208,7 @@ def track(
         optics, cameras, doubts = _corrected(cameras, timed, pairs, options.distance)
     moving = None if head is None else HeadPose.of(head, pairs[:, 0], rate)
     found, remarks = [], doubts + remarks_on_time(cameras, timed, options.offset)
-    remarks += remarks_on_shaking(cameras, timed)
-    if len(cameras) == 1:
-        remarks.append(ONE_VIEW)
+    remarks += remarks_on_shaking(cameras, timed) + [ONE_VIEW] * (len(cameras) == 1)
     count = counts.pop()
     called = [f"whisker {k}" for k in range(count)] if names is None else list(names)
     timed_rows = [[[row[i] for i in pairs[:, v]] for row in view] for v, view in enumerate(traces)]

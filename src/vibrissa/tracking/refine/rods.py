@@ -214,8 +214,9 @@ class Bent(NamedTuple):
     def of(cls, d: Discretization, state: State, touching: Mask, shown: float = 1.0) -> Bent:
         """Bend the visible share of rods."""
         s, at = np.linspace(0.0, shown, _SAMPLES), np.flatnonzero(touching)
-        points = rods(d, state.contact, s)
-        ahead = rods(d, _ahead(state.contact[at]), s).reshape(4, len(at), _SAMPLES, 3)
+        every = rods(d, np.concatenate([state.contact, _ahead(state.contact[at])]), s)
+        points, ahead = np.split(every, [len(touching)])
+        ahead = ahead.reshape(4, len(at), _SAMPLES, 3)
         rows = np.where(touching, np.cumsum(touching) - 1, -1)
         turned = points @ np.swapaxes(state.rotation, 1, 2)
         return cls(turned, rows, (ahead - points[at]) / _STEP, state.rotation)

@@ -148,21 +148,24 @@ class Camera:
         slopes : array (..., 2, 3)
             Derivatives of the pixels by the points, pixels per m.
         """
-        seen = vectors("points", points) @ self.rotation.T + self.translation
+        points = vectors("points", points)
+        # By coordinates: long arrays, of which each operation takes little.
+        seen = self.rotation @ points.reshape(-1, 3).T + self.translation[:, None]
+        focal, slopes = self.matrix[:2, :2], np.empty((*points.shape[:-1], 2, 3))
         if self.projection == "orthographic":
-            slopes = np.broadcast_to(
-                self.matrix[:2, :2] @ self.rotation[:2], (*seen.shape[:-1], 2, 3)
-            )
-            return seen[..., :2] @ self.matrix[:2, :2].T + self.matrix[:2, 2], slopes
-        depth = np.where(seen[..., 2:] > 0.0, seen[..., 2:], np.nan)
-        flat = seen[..., :2] / depth
-        bent, jacobian = _distort(flat, self.distortion)
-        pixels = bent @ self.matrix[:2, :2].T + self.matrix[:2, 2]
-        jacobian = jacobian / depth[..., None]
-        ahead = -(jacobian * flat[..., None, :]).sum(axis=-1, keepdims=True)
-        by_seen = np.concatenate([jacobian, ahead], axis=-1)
-        slopes = (by_seen.reshape(-1, 3) @ self.rotation).reshape(by_seen.shape)
-        return pixels, self.matrix[:2, :2] @ slopes
+            slopes[:] = focal @ self.rotation[:2]
+            bent = seen[:2]
+        else:
+            nearness = 1.0 / np.where(seen[2] > 0.0, seen[2], np.nan)
+            flat = seen[:2] * nearness
+            bent, jacobian = _distort(flat, self.distortion)
+            for row, by_bent in zip(np.moveaxis(slopes, -2, 0), focal, strict=True):
+                by_seen = np.empty_like(seen)
+                np.einsum("i,ijn->jn", by_bent, jacobian * nearness, out=by_seen[:2])
+                by_seen[2] = -(by_seen[:2] * flat).sum(axis=0)
+                row[...] = (by_seen.T @ self.rotation).reshape(points.shape)
+        pixels = focal @ bent + self.matrix[:2, 2:]
+        return np.ascontiguousarray(pixels.T).reshape(*points.shape[:-1], 2), slopes
 
     def rays(self, pixels: ArrayLike) -> tuple[Array, Array]:
         """Compute the lines of sight of pixels.
@@ -183,7 +186,7 @@ class Camera:
             start = np.concatenate([flat, np.zeros_like(flat[..., :1])], axis=-1)
             origin = (start - self.translation) @ self.rotation
             return origin, np.broadcast_to(self.rotation[2], origin.shape).copy()
-        flat = _undistort(flat, self.distortion)
+        flat = np.moveaxis(_undistort(np.moveaxis(flat, -1, 0), self.distortion), 0, -1)
         ahead = np.concatenate([flat, np.ones_like(flat[..., :1])], axis=-1) @ self.rotation
         center = np.broadcast_to(-self.translation @ self.rotation, ahead.shape).copy()
         return center, ahead / np.linalg.norm(ahead, axis=-1, keepdims=True)
@@ -242,26 +245,26 @@ def orthogonal_views(
 
 
 def _distort(flat: Array, k: Array) -> tuple[Array, Array]:
-    """Apply OpenCV's distortion to points (..., 2); also return derivatives (..., 2, 2)."""
-    x, y = flat[..., 0], flat[..., 1]
+    """Apply OpenCV's distortion to points (2, ...); also return derivatives (2, 2, ...)."""
+    x, y = flat
+    slopes = np.zeros((2, *flat.shape))
+    if not k.any():
+        slopes[0, 0] = slopes[1, 1] = 1.0
+        return flat, slopes
     r2 = x * x + y * y
-    top = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
     below = 1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))
-    radial = top / below
-    change = (k[0] + r2 * (2.0 * k[1] + 3.0 * r2 * k[4])) / below
-    change = change - radial * (k[5] + r2 * (2.0 * k[6] + 3.0 * r2 * k[7])) / below
+    radial = (1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))) / below
+    change = k[0] + r2 * (2.0 * k[1] + 3.0 * r2 * k[4])
+    change = (change - radial * (k[5] + r2 * (2.0 * k[6] + 3.0 * r2 * k[7]))) / below
     bent = np.stack(
         [
             x * radial + 2.0 * k[2] * x * y + k[3] * (r2 + 2.0 * x * x),
             y * radial + k[2] * (r2 + 2.0 * y * y) + 2.0 * k[3] * x * y,
-        ],
-        axis=-1,
+        ]
     )
-    cross = 2.0 * x * y * change + 2.0 * k[2] * x + 2.0 * k[3] * y
-    slopes = np.empty((*flat.shape, 2))
-    slopes[..., 0, 0] = radial + 2.0 * x * x * change + 2.0 * k[2] * y + 6.0 * k[3] * x
-    slopes[..., 1, 1] = radial + 2.0 * y * y * change + 6.0 * k[2] * y + 2.0 * k[3] * x
-    slopes[..., 0, 1] = slopes[..., 1, 0] = cross
+    slopes[0, 0] = radial + 2.0 * x * x * change + 2.0 * k[2] * y + 6.0 * k[3] * x
+    slopes[1, 1] = radial + 2.0 * y * y * change + 6.0 * k[2] * y + 2.0 * k[3] * x
+    slopes[0, 1] = slopes[1, 0] = 2.0 * x * y * change + 2.0 * k[2] * x + 2.0 * k[3] * y
     return bent, slopes
 
 
@@ -271,14 +274,9 @@ def _undistort(bent: Array, k: Array) -> Array:
     if not k.any():
         return flat
     for _ in range(_ROUNDS):
-        found, slopes = _distort(flat, k)
+        found, ((a, b), (c, d)) = _distort(flat, k)
         miss = bent - found
-        a, b = slopes[..., 0, 0], slopes[..., 0, 1]
-        c, d = slopes[..., 1, 0], slopes[..., 1, 1]
-        across = np.stack(
-            [d * miss[..., 0] - b * miss[..., 1], a * miss[..., 1] - c * miss[..., 0]], axis=-1
-        )
-        step = across / (a * d - b * c)[..., None]
+        step = np.stack([d * miss[0] - b * miss[1], a * miss[1] - c * miss[0]]) / (a * d - b * c)
         flat = flat + step
         if not np.nanmax(np.abs(step), initial=0.0) > 1e-14:
             break

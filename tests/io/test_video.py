@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from vibrissa.io import interlaced, read_video, video_info, write_video
+from vibrissa.io.video import grey_frame
 
 
 def frames(count=5, shape=(48, 64)):
@@ -28,6 +29,15 @@ def test_mp4_keeps_the_range_of_greys(tmp_path):
     assert got.shape == sent.shape
     assert np.abs(got - sent).mean() < 3.0
     np.testing.assert_allclose(got.mean(axis=(0, 1)), sent.mean(axis=(0, 1)), atol=2.0)
+
+
+def test_luminances_become_the_grey_values_of_ffmpeg():
+    av = pytest.importorskip("av")
+    ramp = np.tile(np.arange(256, dtype=np.uint8), (4, 1))
+    frame = av.VideoFrame.from_ndarray(np.concatenate([ramp, ramp[:2]]), format="yuv420p")
+    np.testing.assert_array_equal(grey_frame(frame), frame.to_ndarray(format="gray"))
+    frame.color_range = 2
+    np.testing.assert_array_equal(grey_frame(frame), ramp)
 
 
 def test_a_video_says_what_it_holds(tmp_path):

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from vibrissa.cameras import Camera, orthogonal_views
 from vibrissa.tracking import Trace, low_pass, merge, paired_frames, usual_cutoff
 from vibrissa.tracking.recording import remarks_on_time
-from vibrissa.tracking.space.curve import begun_together
+from vibrissa.tracking.space.curve import begun_together, merged
 from vibrissa.tracking.space.exchange import Known, exchanged
 from vibrissa.tracking.space.frame_pairs import clear_offsets
 from vibrissa.tracking.space.pose import base_pose, rolled_over
@@ -120,6 +120,15 @@ def test_a_view_that_ends_early_ends_the_curve():
     assert found.length == pytest.approx(
         merge(pair, [traced(c, points[:150]) for c in pair]).length, rel=0.01
     )
+
+
+def test_many_frames_are_merged_as_one_by_one():
+    pair = PAIRS["any"]
+    frames = [[traced(c, curve(a, count=n)) for c in pair] for a, n in ((0.2, 200), (0.5, 90))]
+    frames.insert(1, [Trace.lost(), frames[0][1]])
+    for found, views in zip(merged(pair, frames), frames, strict=True):
+        for one, other in zip(found, merge(pair, views), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-9)
 
 
 def test_without_a_trace_there_is_no_curve():

@@ -231,6 +231,51 @@ def test_a_profile_ends_where_no_rod_is_in_equilibrium(monkeypatch):
     assert np.isfinite(profiled(problem, state, linear)[2]).all()
 
 
+def test_the_equations_hold_the_derivatives_of_the_residuals():
+    whisker = Whisker.parabola(length=30e-3, coefficient=10.0)
+    fitter, pose, _, _ = pressed(whisker)
+    problem, state, _ = fitter._problem(whisker, pose).trusted()
+    problem = replace(problem, touching=np.arange(9) != 4, variance=None)
+    state = replace(state, position=state.position + 1e-4)
+    here, size = problem.linear(state).data, 1e-6
+    for unknown in range(10):
+        step = np.zeros((9, 10))
+        step[:, unknown] = size
+        there = problem.linear(state.moved(step)).data
+        for view in range(2):
+            change = (here.misses[view] - there.misses[view]) / size
+            stated = here.designs[view][:, :-2, unknown]
+            if unknown > 5:
+                assert not stated[4].any()
+                stated, change = np.delete(stated, 4, axis=0), np.delete(change, 4, axis=0)
+            # Where another point of a trace becomes the nearest, a difference is not a derivative.
+            assert np.quantile(np.abs(change - stated), 0.95) <= 0.02 * np.abs(stated).max()
+    design = np.concatenate(here.designs, axis=1)
+    np.testing.assert_allclose(here.hessian, np.swapaxes(design, 1, 2) @ design, atol=1e-6)
+
+
+def test_a_frame_that_becomes_worse_does_not_stop_the_others(monkeypatch):
+    from vibrissa.tracking.refine.problem import Problem
+
+    whisker = Whisker.parabola(length=30e-3, coefficient=10.0)
+    fitter, pose, _, s = pressed(whisker)
+    problem, state, _ = fitter._problem(whisker, pose).trusted()
+    begun = replace(state, contact=state.contact + np.array([0.02, 0.0, 0.0, 0.0]))
+    compared = Problem._compared
+
+    def stuck(self, state):
+        data = compared(self, state)
+        if state.contact[4, 0] != begun.contact[4, 0]:
+            data.squares[4] = np.inf
+        return data
+
+    monkeypatch.setattr(Problem, "_compared", stuck)
+    apart = replace(problem, begun=begun, frames=2 * problem.frames)
+    found = apart.solved()[0].contact[:, 0] * whisker.length
+    assert found[4] == begun.contact[4, 0] * whisker.length
+    np.testing.assert_allclose(np.delete(found - s, 4), 0.0, atol=200e-6)
+
+
 def test_a_slip_makes_the_frame_before_it_uncertain():
     """While that frame is exposed the whisker may be on both sides of the slip."""
     whisker = Whisker.parabola(length=30e-3, coefficient=10.0)
@@ -279,7 +324,7 @@ def test_a_step_to_a_contact_that_no_rod_withstands_is_not_taken():
         still,
     )
     fit = problem.linear(state)
-    assert fit.wild.tolist() == [False, True]
+    assert fit.data.wild.tolist() == [False, True]
     assert fit.cost == np.inf
     assert np.isfinite(fit.smoother.solved(1.0)).all()
 

@@ -45,7 +45,7 @@ from vibrissa.tracking.refine.fit import Fitter, RodFit
 from vibrissa.tracking.refine.optics import Optics, rough_optics, stated_lenses
 from vibrissa.tracking.refine.problem import FitOptions
 from vibrissa.tracking.refine.rods import TraceSeries, rolled
-from vibrissa.tracking.space.curve import begun_together, merge
+from vibrissa.tracking.space.curve import begun_together, merged
 from vibrissa.tracking.space.exchange import Known, exchanged
 from vibrissa.tracking.space.frame_pairs import paired_frames
 from vibrissa.tracking.space.pose import CUTOFF, BasePose, HeadPose, base_pose, rolled_over
@@ -208,9 +208,7 @@ def track(
         optics, cameras, doubts = _corrected(cameras, timed, pairs, options.distance)
     moving = None if head is None else HeadPose.of(head, pairs[:, 0], rate)
     found, remarks = [], doubts + remarks_on_time(cameras, timed, options.offset)
-    remarks += remarks_on_shaking(cameras, timed)
-    if len(cameras) == 1:
-        remarks.append(ONE_VIEW)
+    remarks += remarks_on_shaking(cameras, timed) + [ONE_VIEW] * (len(cameras) == 1)
     count = counts.pop()
     called = [f"whisker {k}" for k in range(count)] if names is None else list(names)
     timed_rows = [[[row[i] for i in pairs[:, v]] for row in view] for v, view in enumerate(traces)]
@@ -220,10 +218,11 @@ def track(
         return track_whisker(cameras, used, rate, options, called[k], progress, moving, objects)
 
     known = partial(known_of, cameras, rate=rate, options=options.fit)
-    together, before, changes = _sorted_out(cameras, rows, tracked, known)
+    begun = [begun_together(cameras, row) for row in rows]
+    together, before, changes = _sorted_out(cameras, begun, tracked, known)
     for k, name in enumerate(called):
         remarks += remarks_on_following(cameras, rows[k], name)
-        remarks += remarks_on_bases(cameras, rows[k], begun_together(cameras, rows[k]), name)
+        remarks += remarks_on_bases(cameras, rows[k], begun[k], name)
         try:
             one = before[k] if k in before else tracked(k, together[k])
             if count > 1 and len(cameras) > 1:
@@ -261,18 +260,17 @@ def track(
 
 def _sorted_out(
     cameras: Sequence[Camera],
-    rows: Sequence[Sequence[Sequence[Trace]]],
+    begun: Sequence[list[list[Trace]]],
     tracked: Callable[[int, Sequence[Sequence[Trace]]], Tracked],
     known_by: Callable[[Tracked], Known],
 ) -> tuple[list[list[list[Trace]]], dict[int, Tracked], dict[int, tuple[int, int]]]:
-    """Traces that begin together, exchanged where in doubt; whiskers that keep theirs; changes.
+    """Traces, exchanged where in doubt; whiskers that keep theirs; and changes.
 
     Changes are, for each whisker, the numbers of frames with exchanged traces and without any.
     """
-    begun = [begun_together(cameras, row) for row in rows]
     first, known = dict[int, Tracked](), list[Known | None]()
-    if len(rows) == 1 or len(cameras) == 1:
-        return begun, first, dict.fromkeys(range(len(rows)), (0, 0))
+    if len(begun) == 1 or len(cameras) == 1:
+        return list(begun), first, dict.fromkeys(range(len(begun)), (0, 0))
     for k, row in enumerate(begun):
         with suppress(Exception):  # it is tried again, and its fault stated then
             first[k] = tracked(k, row)
@@ -333,7 +331,7 @@ def _misfits_bent(
     ]
     head = one.head.rows(np.repeat(np.asarray(frames, dtype=np.intp), 2))
     curves = head.seen_from(
-        np.array([merge(cameras, views).points for views in zip(*apart, strict=True)])
+        np.array([curve.points for curve in merged(cameras, zip(*apart, strict=True))])
     )
     none = np.zeros(len(curves), dtype=bool)
     shape = replace(
@@ -486,8 +484,8 @@ def track_whisker(
     series = TraceSeries.of(traces)
     _check_views(cameras, series, name)
     curves = []
-    for i, views in enumerate(zip(*traces, strict=True)):
-        curves.append(merge(cameras, views))
+    for i, curve in enumerate(merged(cameras, zip(*traces, strict=True))):
+        curves.append(curve)
         report(f"{name} in space", i + 1, count)
     points = np.array([curve.points for curve in curves])
     report(f"contact of {name}", 0, 2)

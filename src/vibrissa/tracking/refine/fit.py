@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.cameras import Camera
-from vibrissa.deferred import interpolate, transform
+from vibrissa.deferred import interpolate
 from vibrissa.numerics import Array, Mask
 from vibrissa.objects import Surface
 from vibrissa.rod import discretize, solve_forces
@@ -47,6 +47,7 @@ from vibrissa.tracking.refine.rods import (
     contact_slopes,
     first_contacts,
     rods,
+    turns,
 )
 from vibrissa.tracking.space.pose import BasePose, HeadPose
 from vibrissa.tracking.space.rest_shape import Length
@@ -61,6 +62,7 @@ _ENOUGH = 12.0  # rise of the cost up to which the profile is computed
 _LOWER = 0.5  # decrease of the cost that shows another, lower minimum
 _MARGIN = 3  # number of frames before and after a contact that are fitted with it
 _ROUNDS = 3  # number of Gauss-Newton steps at each step of a profile
+_SETTLED = 0.1  # expected decrease of the cost there below which a step is the last
 _FINE = 801  # number of values between which the profile is integrated
 
 
@@ -146,7 +148,7 @@ def _profile(problem: Problem, state: State, contact: _Contact) -> _Profile | No
 
     def at(arc: float, before: State) -> tuple[float, State]:
         ahead = contact.slope[near] * (arc - before.contact[row, 0])
-        held = replace(part, begun=before.moved(ahead), held=((row, arc),))
+        held = replace(part, begun=before.moved(ahead), held=((row, arc),), enough=_SETTLED)
         found, fit = held.solved()
         return fit.cost, found
 
@@ -257,7 +259,7 @@ class Fitter:
         found = np.full(len(self.curves), np.inf)
         if len(problem.frames):
             _, linear = problem.solved()
-            found[problem.frames] = np.where(linear.wild, np.inf, linear.misfit)
+            found[problem.frames] = np.where(linear.data.wild, np.inf, linear.data.misfit)
         return found
 
     def costs(self, shown: float) -> Callable[[Whisker, BasePose], float]:
@@ -327,12 +329,12 @@ def _shared(problem: Problem, fit: Linear) -> Array:
     """
     pulls = []
     parts = [fit.left(rows) for rows in (problem.touching, ~problem.touching)]
-    trusted = problem.variance or [np.ones((1, 3)) for _ in fit.misses]
+    trusted = problem.variance or [np.ones((1, 3)) for _ in fit.data.misses]
     together = correlated(
-        [m / np.sqrt(v[:, :-2]) for m, v in zip(fit.misses, trusted, strict=True)]
+        [m / np.sqrt(v[:, :-2]) for m, v in zip(fit.data.misses, trusted, strict=True)]
     )
     for view, (design, weight, ends) in enumerate(
-        zip(fit.designs, fit.weights, fit.ends, strict=True)
+        zip(fit.data.designs, fit.data.weights, fit.data.ends, strict=True)
     ):
         n = design.shape[1] - 2
         s = np.linspace(0.0, 1.0, n)
@@ -386,7 +388,7 @@ def _drawn(fit: Linear) -> list[float]:
     """Largest residual of each view at the base that all frames share, pixels."""
     return [
         float(np.abs(left[: round(2.0 * _AT_BASE * len(left))]).max())
-        for left in fit.left(np.ones(len(fit.misfit), dtype=bool))
+        for left in fit.left(np.ones(len(fit.data.misfit), dtype=bool))
     ]
 
 
@@ -403,7 +405,7 @@ def _frame_errors(problem: Problem, fit: Linear) -> Array:
     aside = _FOLLOWED * float((drawn / scales).max())
     hook = float((np.hypot(_HOOKED, _HOOK * drawn) / scales).max())
     lean = hook / (_AT_BASE * whisker.length)
-    share = np.linspace(0.0, _PROXIMAL, fit.misses[0].shape[1])
+    share = np.linspace(0.0, _PROXIMAL, fit.data.misses[0].shape[1])
     x, y, _ = whisker.position(share * whisker.length).T
     roll = min(lean * abs(x @ y) / max(y @ y, lean**2 * (x @ x)), 1.0)
     return np.array([[[0.0, aside, 0.0], [0.0, 0.0, lean]], [[0.0, 0.0, aside], [roll, lean, 0.0]]])
@@ -438,9 +440,7 @@ def _by_length(
         altered = replace(problem, whisker=other, d=discretize(other), begun=state)
         after = altered.solved()[0]
         moved, changed = _contacts(altered, after)
-        turn = transform.Rotation.from_matrix(
-            after.rotation @ np.swapaxes(state.rotation, 1, 2)
-        ).as_rotvec()
+        turn = turns(after.rotation @ np.swapaxes(state.rotation, 1, 2))
         shift = (after.position - state.position) * length
         contact = np.einsum("tij,tj->ti", after.rotation, moved) + shift
         contact -= np.einsum("tij,tj->ti", state.rotation, point)
@@ -492,7 +492,7 @@ def _answer(
 ) -> RodFit:
     """Results in SI units, relative to the head."""
     d, touching = problem.d, problem.touching
-    shared, misfit = _shared(problem, fit), fit.misfit
+    shared, misfit = _shared(problem, fit), fit.data.misfit
     covariance = spread + np.einsum("kti,ktj->tij", shared, shared)
     turned, slopes, slope = contact_slopes(d, state)
     point, wrench = _contacts(problem, state)

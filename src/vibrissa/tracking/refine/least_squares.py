@@ -83,11 +83,11 @@ class Smoother:
         self.second[(at - 1)[:, None], n, n] += square
         return np.asarray((pull * values).sum(axis=1))
 
-    def solved(self, damping: float = 0.0) -> Array:
-        """Solve for the step (time, unknown)."""
+    def solved(self, damping: float | Array = 0.0) -> Array:
+        """Solve for the step (time, unknown), damped by a share (time,) of the diagonal."""
         return np.asarray(self.responses(self.gradient[None], damping)[0])
 
-    def responses(self, pulls: Array, damping: float = 0.0) -> Array:
+    def responses(self, pulls: Array, damping: float | Array = 0.0) -> Array:
         """Steps (pull, time, unknown) in response to pulls on the unknowns."""
         count, n, _ = self.diagonal.shape
         band = np.zeros((3 * n, count, n))
@@ -99,7 +99,8 @@ class Smoother:
             each = np.moveaxis(tie[: count - ahead], 0, -1)  # (column, row, time)
             band[ahead * n + rows - columns, : count - ahead, columns] = np.swapaxes(each, 0, 1)
         band = band.reshape(3 * n, count * n)
-        band[0] += damping * band[0] + _REGULAR * band[0].max()
+        damped = np.repeat(np.broadcast_to(damping, count), n)
+        band[0] += damped * band[0] + _REGULAR * band[0].max()
         step = linalg.solveh_banded(band, pulls.reshape(len(pulls), -1).T, lower=True)
         return np.asarray(step.T).reshape(len(pulls), count, n)
 

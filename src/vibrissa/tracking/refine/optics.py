@@ -24,7 +24,7 @@ from vibrissa.cameras import Camera, triangulate
 from vibrissa.deferred import transform
 from vibrissa.numerics import Array
 from vibrissa.tracking.refine.rods import TraceSeries
-from vibrissa.tracking.space.curve import merge
+from vibrissa.tracking.space.curve import merged
 from vibrissa.tracking.space.rest_shape import RestShape, aligned_lengths, motions, rest_shape
 from vibrissa.tracking.trace.trace import Trace, arc_lengths, interpolated
 
@@ -155,7 +155,7 @@ def rough_optics(
     rows = np.linspace(0, count - 1, min(_SAMPLE, count)).astype(int)
     some = [[view[i] for i in rows] for view in traces]
     stated = stated_lenses(cameras, distance)
-    curves = np.array([merge(stated, views).points for views in zip(*some, strict=True)])
+    curves = np.array([curve.points for curve in merged(stated, zip(*some, strict=True))])
     try:
         shape = rest_shape(curves)
     except ValueError:

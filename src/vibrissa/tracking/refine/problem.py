@@ -3,25 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.cameras import Camera
-from vibrissa.deferred import transform
 from vibrissa.numerics import Array, Mask
 from vibrissa.objects import Surface
 from vibrissa.rod import Discretization
 from vibrissa.tracking.refine.least_squares import Smoother, trace_variance
-from vibrissa.tracking.refine.rods import FAR, UNKNOWNS, State, TraceSeries, bent, contact_slopes
+from vibrissa.tracking.refine.rods import (
+    FAR,
+    UNKNOWNS,
+    Bent,
+    State,
+    TraceSeries,
+    contact_slopes,
+    placed,
+    turns,
+)
 from vibrissa.tracking.space.pose import HeadPose
 from vibrissa.whisker import Whisker
 
 # Levenberg's damping: initial, smallest, and that at which the fit ends.
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-8, 1e6
-_SMALL = 1e-4  # relative decrease of the cost for another iteration
+_SMALL = 2e-5  # relative decrease of the cost for another iteration
 _HELD = 1e8  # weight with which frames without contact keep the contact at rest
 # Unknowns across the plane z = 0: a shift, turns about two axes; the force across it.
 _ACROSS = (slice(2, 5), slice(9, 10))
@@ -30,7 +39,6 @@ REST = np.array([0.5, 0.0, 0.0, 0.0])
 # Standard deviation of the force along the whisker if there is none across, in units of EI/L².
 _RUBBING = 1e-4
 _ROLLED = np.radians(3.0)  # standard deviation of the roll before its variation is known, rad
-_WILD = 1e6  # slopes of points of a rod, in units of L, above which it is not in equilibrium
 _ELSE = 3.0  # misfit, over the usual one, from which the traces of a frame are on something else
 _HOLD = 1e5  # inverse standard deviation of an arc length that is held, in units of L
 _ALONG = np.eye(UNKNOWNS)[6]  # the arc length among the unknowns
@@ -62,20 +70,41 @@ class FitOptions:
     # Smallest standard deviation of traces that residuals may show, as a share of the stated one;
     # at least 1 where a trace is a line between few points (`Trace.sparse`).
     sharpest: float = 0.2
-    rounds: int = 12  # largest number of Gauss–Newton steps
+    rounds: int = 20  # largest number of Gauss–Newton steps
 
 
-class Linear(NamedTuple):
-    """Normal equations at a state, and their ingredients."""
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """Rods compared with the traces of their frames: normal equations, and their ingredients."""
 
-    smoother: Smoother
-    costs: Array  # (time,)
+    hessian: Array
+    gradient: Array
+    squares: Array  # (time,): sums of squared residuals
     misfit: Array
     wild: Mask
     misses: list[Array]
     ends: list[Array]
     designs: list[Array]
     weights: list[Array]
+
+    def put(self, rows: Mask, other: Compared) -> Compared:
+        """The same with some frames of another state."""
+
+        def chosen(own: Any, new: Any) -> Any:
+            if isinstance(own, list):
+                return [chosen(*each) for each in zip(own, new, strict=True)]
+            return np.where(rows.reshape(-1, *[1] * (own.ndim - 1)), new, own)
+
+        names = [each.name for each in fields(Compared)]
+        return Compared(*(chosen(getattr(self, name), getattr(other, name)) for name in names))
+
+
+class Linear(NamedTuple):
+    """Normal equations at a state."""
+
+    smoother: Smoother
+    costs: Array  # (time,)
+    data: Compared
 
     @property
     def cost(self) -> float:
@@ -87,9 +116,9 @@ class Linear(NamedTuple):
 
         Frames that fit far worse than usual are on something else, and left out.
         """
-        rows = rows & (self.misfit < _ELSE * np.median(self.misfit))
+        rows = rows & (self.data.misfit < _ELSE * np.median(self.data.misfit))
         found = []
-        for misses, weight in zip(self.misses, self.weights, strict=True):
+        for misses, weight in zip(self.data.misses, self.data.weights, strict=True):
             sharp = weight[rows, :-2]
             pixels = np.divide(misses[rows], sharp, out=np.zeros(sharp.shape), where=sharp > 0.0)
             found.append(pixels.sum(axis=0) / np.maximum((sharp > 0.0).sum(axis=0), 1))
@@ -115,6 +144,7 @@ class Problem:
     variance: list[Array] | None = None
     shown: float = 1.0
     held: Sequence[tuple[int, float]] = ()  # rows whose contact's arc length is held, and that
+    enough: float = 0.0  # expected decrease of the cost below which a step is the last
 
     def rows(self, rows: NDArray[np.intp], begun: State) -> Problem:
         """The problem restricted to some frames, which begins there."""
@@ -134,8 +164,10 @@ class Problem:
         loose = replace(self.options, roll=max(self.options.roll, _ROLLED))
         state, fit = replace(self, options=loose).solved()
         covariance = fit.smoother.covariances()
-        designs = [design[:, :-2] for design in fit.designs]
-        variance = trace_variance(fit.misses, designs, covariance, self.options.sharpest**2, even)
+        designs = [design[:, :-2] for design in fit.data.designs]
+        variance = trace_variance(
+            fit.data.misses, designs, covariance, self.options.sharpest**2, even
+        )
         options = replace(loose, roll=self._unexpected(state, covariance, loose.roll))
         problem = replace(self, begun=state, variance=variance, options=options)
         return (problem, *problem.solved())
@@ -158,49 +190,66 @@ class Problem:
 
     def _turned(self, state: State) -> Array:
         """Rotation of the base since the start (time, 3), rad, in the head's axes."""
-        turn = state.rotation @ np.swapaxes(self.start.rotation, 1, 2)
-        return np.asarray(transform.Rotation.from_matrix(turn).as_rotvec())
+        return turns(state.rotation @ np.swapaxes(self.start.rotation, 1, 2))
+
+    @cached_property
+    def _turning(self) -> Array:
+        """Rotation vectors (t − 1, 3) of the start from each frame to the next, laboratory axes."""
+        return turns(self.start.rotation[1:] @ np.swapaxes(self.start.rotation[:-1], 1, 2))
 
     def solved(self) -> tuple[State, Linear]:
-        """Gauss-Newton iteration with Levenberg's damping."""
-        state, damping = self.begun or self.start, _DAMPING
+        """Gauss-Newton iteration with Levenberg's damping, by frame."""
+        state, damping = self.begun or self.start, np.full(len(self.frames), _DAMPING)
         fit = self.linear(state)
         for _ in range(_HALVED):
-            if not fit.wild.any():
+            if not fit.data.wild.any():
                 break
             # A force that another rod withstands may exceed the limit of this one.
-            factor = np.where(fit.wild[:, None], [1.0, 0.5, 0.5, 0.5], 1.0)
+            factor = np.where(fit.data.wild[:, None], [1.0, 0.5, 0.5, 0.5], 1.0)
             state = replace(state, contact=state.contact * factor)
             fit = self.linear(state)
         for _ in range(self.options.rounds):
             step = fit.smoother.solved(damping)
-            trial = state.moved(step)
+            trial, decrease = state.moved(step), (fit.smoother.gradient * step).sum(axis=1)
+            if decrease.sum() < self.enough:
+                return trial, fit._replace(costs=fit.costs - decrease)
             tried = self.linear(trial)
-            if tried.wild.any():
-                # A contact near the thin tip easily gets a force without an equilibrium.
-                contact = np.where(tried.wild[:, None], state.contact, trial.contact)
-                trial = replace(trial, contact=contact)
-                tried = self.linear(trial)
+            worse = tried.data.squares > fit.data.squares
+            if not tried.cost < fit.cost:
+                # Frames depend little on each other: those that become worse stay as they are.
+                rows = np.flatnonzero(worse)
+                trial = trial.put(rows, state.rows(rows))
+                tried = self._linear(trial, tried.data.put(worse, fit.data))
             if tried.cost < fit.cost:
                 small = fit.cost - tried.cost < _SMALL * fit.cost
                 state, fit = trial, tried
-                damping = max(damping / 5.0, _LEAST_DAMPING)
+                damping = np.where(worse, 10.0 * damping, np.maximum(damping / 5.0, _LEAST_DAMPING))
                 if small:
                     break
             else:
-                damping *= 10.0
-                if damping > _MOST_DAMPING:
+                damping = 10.0 * damping
+                if damping.min() > _MOST_DAMPING:
                     break
         return state, fit
 
     def linear(self, state: State) -> Linear:
-        """Linearise at a state; rods without equilibrium count as infinitely far away."""
-        points, slopes = bent(self.d, state, self.touching, self.shown)
-        wild = ~(np.abs(slopes).max(axis=(1, 2, 3)) < _WILD)
-        points[wild], slopes[wild] = state.position[wild, None], 0.0
-        points = self.head.put_in(points * self.d.length)
-        slopes = self.head.rotation[:, None] @ slopes
-        with_ends = np.concatenate([slopes, slopes[:, [0, -1]]], axis=1)
+        """Linearise at a state."""
+        return self._linear(state, self._compared(state))
+
+    def _linear(self, state: State, data: Compared) -> Linear:
+        """Linearise at a state whose rods were compared with the traces."""
+        smoother = Smoother(data.hessian, data.gradient)
+        costs = data.squares + self._priors(smoother, state) + self._touched(smoother, state)
+        for i, arc in self.held:
+            smoother.add_row(i, _HOLD * _ALONG, _HOLD * (state.contact[i, 0] - arc))
+        return Linear(smoother, costs, data)
+
+    def _compared(self, state: State) -> Compared:
+        """Compare with the traces; rods without equilibrium are infinitely far away."""
+        rods = Bent.of(self.d, state, self.touching, self.shown)
+        wild = rods.wild
+        rods.turned[wild], rods.change[:, rods.rows[wild & self.touching]] = 0.0, 0.0
+        points = self.head.put_in((rods.turned + state.position[:, None]) * self.d.length)
         hessian = np.zeros((len(points), UNKNOWNS, UNKNOWNS))
         gradient = np.zeros((len(points), UNKNOWNS))
         total, count, weighted = np.zeros((3, len(points)))
@@ -208,11 +257,9 @@ class Problem:
         for view, camera in enumerate(self.cameras):
             pixels, by_point = camera.project_with_slopes(points)
             rows, misses, sharp = self.traces.equations(view, pixels, by_point * self.d.length)
-            design = (rows[:, :, None] @ with_ends)[:, :, 0]
+            rows[wild] = 0.0
             weight = np.ones(misses.shape) if self.variance is None else 1.0 / self.variance[view]
-            trusted = design * weight[..., None]
-            hessian += np.swapaxes(trusted, 1, 2) @ design
-            gradient += (misses[:, None] @ trusted)[:, 0]
+            trusted = rods.normal(self.head.rotation, rows, misses, weight, hessian, gradient)
             weighted += (weight * misses**2).sum(axis=1)
             total += (misses**2).sum(axis=1)
             count += (misses != 0.0).sum(axis=1)
@@ -223,11 +270,7 @@ class Problem:
             weights.append(sharp)
         misfit = np.sqrt(total / np.maximum(count, 1.0))
         weighted[wild] = np.inf
-        smoother = Smoother(hessian, gradient)
-        costs = weighted + self._priors(smoother, state) + self._touched(smoother, state)
-        for i, arc in self.held:
-            smoother.add_row(i, _HOLD * _ALONG, _HOLD * (state.contact[i, 0] - arc))
-        return Linear(smoother, costs, misfit, wild, along, ends, designs, weights)
+        return Compared(hessian, gradient, weighted, misfit, wild, along, ends, designs, weights)
 
     def blurred(self, state: State, fit: Linear, covariance: Array) -> Array:
         """Steps (time, unknown) due to motion that is uneven while a frame is exposed.
@@ -236,14 +279,13 @@ class Problem:
         of it when it hits an object or slips off: then it errs by a share of the second difference
         of its positions.
         """
-        points = bent(self.d, state, self.touching, self.shown)[0]
-        points = self.head.put_in(points * self.d.length)
+        points = self.head.put_in(placed(self.d, state, self.shown) * self.d.length)
         even = np.diff(self.frames) == 1
         uneven = np.zeros_like(points)
         middle = np.flatnonzero(even[1:] & even[:-1]) + 1
         uneven[middle] = points[middle - 1] - 2.0 * points[middle] + points[middle + 1]
         pull = np.zeros((len(points), UNKNOWNS))
-        for view, (camera, design) in enumerate(zip(self.cameras, fit.designs, strict=True)):
+        for view, (camera, design) in enumerate(zip(self.cameras, fit.data.designs, strict=True)):
             pixels, slopes = camera.project_with_slopes(points)
             moved = camera.project(points + _EXPOSED * uneven)
             misses = [self.traces.equations(view, at, slopes)[1][:, :-2] for at in (pixels, moved)]
@@ -279,8 +321,6 @@ class Problem:
         slower = (1000.0 / self.rate) ** 2
         turn = self._turned(state)
         place = np.concatenate([state.position, turn, state.contact], axis=1)
-        # Second differences of the whole motion, of which the start is a part.
-        begun = _turning(self.start.rotation)
         held = np.where(self.touching, 0.0, _HELD)[:, None]
         costs = smoother.add_at(place[:, 6:], held, 6, REST)
         if len(self.cameras) == 1:
@@ -302,14 +342,9 @@ class Problem:
         weight = np.array([pose[0]] * 3 + [pose[1]] * 3 + list(contact)) / slower
         at = np.flatnonzero(together[1:] & together[:-1]) + 1
         second = place[at - 1] - 2.0 * place[at] + place[at + 1]
-        second[:, 3:6] += begun[at] - begun[at - 1]
+        # Second differences of the whole motion, of which the start is a part.
+        second[:, 3:6] += self._turning[at] - self._turning[at - 1]
         scale = np.tile(weight, (len(at), 1))
         scale[~(self.touching[at - 1] & self.touching[at] & self.touching[at + 1]), 6:] = 0.0
         costs[at] += smoother.add_second(at, second, scale)
         return costs
-
-
-def _turning(rotation: Array) -> Array:
-    """Rotation vectors (t − 1, 3) from each frame to the next, laboratory axes."""
-    step = rotation[1:] @ np.swapaxes(rotation[:-1], 1, 2)
-    return np.asarray(transform.Rotation.from_matrix(step).as_rotvec())

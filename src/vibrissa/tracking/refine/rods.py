@@ -8,18 +8,19 @@ They are compared with the traces of one whisker over a trial, stored as arrays 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.deferred import transform
-from vibrissa.numerics import Array, Mask
+from vibrissa.numerics import Array, Mask, exponential, kernel
 from vibrissa.rod import Discretization, discretize, shapes, solve_forces
 from vibrissa.tracking.space.pose import BasePose
-from vibrissa.tracking.trace.trace import Trace, arc_lengths, interpolated
+from vibrissa.tracking.trace.trace import Trace, arc_lengths, interpolated, nearest
 from vibrissa.whisker import Whisker
 
 NODES = 101  # number of points of a stored trace
@@ -76,46 +77,66 @@ class TraceSeries:
         tangent = np.gradient(self.line, axis=2)
         return np.asarray(tangent / np.linalg.norm(tangent, axis=3, keepdims=True))
 
+    @cached_property
+    def longest(self) -> Array:
+        """Largest distance (time, view) of neighbouring points of the traces, pixels."""
+        return np.asarray(np.linalg.norm(np.diff(self.line, axis=2), axis=3).max(axis=2))
+
     def equations(self, view: int, pixels: Array, slopes: Array) -> tuple[Array, Array, Array]:
-        """Distances of points from the traces of a view, and their derivatives."""
-        line, sigma, tangent = self.line[:, view], self.sigma[:, view], self.tangent[:, view]
-        # All values of a lost trace are NaN, so any index will do.
-        half = 0.5 * (line**2).sum(2)[:, None, :] - pixels @ np.swapaxes(line, 1, 2)
-        near = np.argmin(half, axis=2)
-        row = np.arange(len(line))[:, None]
-        t, away = tangent[row, near], line[row, near] - pixels
-        spacing = np.linalg.norm(line[:, 1] - line[:, 0], axis=1)
-        along = (away * t).sum(axis=2)
-        # Between two points of the trace its direction changes a little.
-        other = np.clip(near - np.sign(along).astype(int), 0, NODES - 1)
-        share = np.clip(np.abs(along) / spacing[:, None], 0.0, 1.0)[..., None]
-        t = (1.0 - share) * t + share * tangent[row, other]
-        t /= np.linalg.norm(t, axis=2, keepdims=True)
-        chord = (1.0 - share) * line[row, near] + share * line[row, other] - pixels
-        across = np.stack([-t[..., 1], t[..., 0]], axis=-1)
-        miss = (chord * across).sum(axis=2)
-        deviation = np.sqrt(sigma[row, near] ** 2 + _FLOOR**2)
-        beyond = (np.abs(along) > 1.5 * spacing[:, None] + 1.0) | ~np.isfinite(miss)
-        weight = np.where(beyond, 0.0, 1.0 / deviation)
-        # An error far above the usual shows that something else is wrong.
-        scaled = np.abs(miss) * weight
-        weight = weight / np.sqrt(np.maximum(scaled / FAR, 1.0))
-        across *= weight[..., None]
-        rows = across[..., :1] * slopes[..., 0, :] + across[..., 1:] * slopes[..., 1, :]
-        misses = miss * weight
-        ends, gaps, shown = [], [], []
-        for end in (0, -1):
-            gap = ((line[:, end] - pixels[:, end]) * tangent[:, end]).sum(axis=1)
-            counts = np.isfinite(gap) & (self.ends[:, view, end] > 0.5)
-            counts &= (end == 0) | (np.abs(gap) < FAR)
-            pull = np.einsum("ti,tij->tj", tangent[:, end], slopes[:, end]) / _END
-            ends.append(np.where(counts[:, None], pull, 0.0))
-            gaps.append(np.where(counts, gap / _END, 0.0))
-            shown.append(np.where(counts, 1.0 / _END, 0.0))
-        rows = np.concatenate([rows, np.stack(ends, axis=1)], axis=1)
-        misses = np.concatenate([misses, np.stack(gaps, axis=1)], axis=1)
-        weight = np.concatenate([weight, np.stack(shown, axis=1)], axis=1)
-        return np.nan_to_num(rows), np.nan_to_num(misses), np.nan_to_num(weight)
+        """Distances of points from the traces of a view, their derivatives, and their weights.
+
+        They are in standard deviations. The last two are distances of the ends along the trace.
+        """
+        count, n, _, unknowns = slopes.shape
+        rows = np.zeros((count, n + 2, unknowns))
+        misses, weights = np.zeros((2, count, n + 2))
+        traces = self.line, self.sigma, self.tangent, self.ends, self.longest
+        compare(traces, view, pixels, np.ascontiguousarray(slopes), (rows, misses, weights))
+        return rows, misses, weights
+
+
+@kernel
+def compare(traces: Any, view: int, pixels: Any, slopes: Any, found: Any) -> None:
+    """Compare points with the traces of a view; all remains 0 where a trace is lost."""
+    line, sigma, tangent, ends, longest = traces
+    rows, misses, weights = found
+    n, nodes = pixels.shape[1], line.shape[2]
+    for t in range(pixels.shape[0]):
+        path, way = line[t, view], tangent[t, view]
+        spacing, near = math.hypot(path[1, 0] - path[0, 0], path[1, 1] - path[0, 1]), 0
+        if not spacing > 0.0:
+            continue
+        for j in range(n):
+            x, y = pixels[t, j, 0], pixels[t, j, 1]
+            near = nearest(path, 0, nodes, x, y, longest[t, view], near)
+            along = (path[near, 0] - x) * way[near, 0] + (path[near, 1] - y) * way[near, 1]
+            if not abs(along) <= 1.5 * spacing + 1.0:
+                continue
+            # Between two points of the trace its direction changes a little.
+            other = min(max(near + (1 if along < 0.0 else -1), 0), nodes - 1)
+            share = min(abs(along) / spacing, 1.0)
+            tx = (1.0 - share) * way[near, 0] + share * way[other, 0]
+            ty = (1.0 - share) * way[near, 1] + share * way[other, 1]
+            size = math.sqrt(tx * tx + ty * ty)
+            dx = (1.0 - share) * path[near, 0] + share * path[other, 0] - x
+            dy = (1.0 - share) * path[near, 1] + share * path[other, 1] - y
+            miss = (dy * tx - dx * ty) / size
+            weight = 1.0 / math.sqrt(sigma[t, view, near] ** 2 + _FLOOR**2)
+            # An error far above the usual shows that something else is wrong.
+            weight /= math.sqrt(max(abs(miss) * weight / FAR, 1.0))
+            misses[t, j], weights[t, j] = miss * weight, weight
+            for k in range(slopes.shape[3]):
+                pull = tx * slopes[t, j, 1, k] - ty * slopes[t, j, 0, k]
+                rows[t, j, k] = pull / size * weight
+        for end in range(2):
+            j, i = (0, 0) if end == 0 else (n - 1, nodes - 1)
+            tx, ty = way[i, 0], way[i, 1]
+            gap = (path[i, 0] - pixels[t, j, 0]) * tx + (path[i, 1] - pixels[t, j, 1]) * ty
+            if ends[t, view, end] > 0.5 and abs(gap) < (np.inf if end == 0 else FAR):
+                misses[t, n + end], weights[t, n + end] = gap / _END, 1.0 / _END
+                for k in range(slopes.shape[3]):
+                    pull = tx * slopes[t, j, 0, k] + ty * slopes[t, j, 1, k]
+                    rows[t, n + end, k] = pull / _END
 
 
 UNKNOWNS = 10  # number of a frame's unknowns: shift (3), turn (3), s_c, f_x, f_y, f_z
@@ -127,8 +148,9 @@ _STARTS = np.array([0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])
 # rod that is not in balance.
 _UNLIKE, _SLIDES, _WORST = 4.0, 0.05, 1e6
 LIMITS = (0.1, 0.995)  # smallest and largest arc length of a contact, in units of L
-# Steps of differences by arc length and force, in units of L and EI/L².
-_STEPS = (1e-5, 1e-4, 1e-4, 1e-4)
+_STEP = 1e-6  # step of differences by arc length and force, in units of L and EI/L²
+_WILD = 1e6  # slopes of points of a rod, in units of L, above which it is not in equilibrium
+_TINY = 1e-12  # sine of a turn below which its angle is the same
 _FRAMES, _TURNS = 9, 24  # numbers of frames and of rolls from which that of a bent whisker is found
 
 
@@ -142,7 +164,7 @@ class State:
 
     def moved(self, step: Array) -> State:
         """Change by (t, 10): shift, turn about the axes in which it is held, contact."""
-        turn = transform.Rotation.from_rotvec(step[:, 3:6]).as_matrix()
+        turn = exponential(step[:, 3:6])[0]
         contact = self.contact + step[:, 6:]
         contact[:, 0] = np.clip(contact[:, 0], *LIMITS)
         return State(turn @ self.rotation, self.position + step[:, :3], contact)
@@ -160,8 +182,7 @@ class State:
 
     def step_to(self, other: State) -> Array:
         """Step (t, 10) that moves here to another state; see `moved`."""
-        turn = other.rotation @ np.swapaxes(self.rotation, 1, 2)
-        about = transform.Rotation.from_matrix(turn).as_rotvec()
+        about = turns(other.rotation @ np.swapaxes(self.rotation, 1, 2))
         return np.concatenate(
             [other.position - self.position, about, other.contact - self.contact], axis=1
         )
@@ -172,18 +193,96 @@ class State:
         return State(self.rotation, ratio * self.position, contact)
 
 
-def bent(
-    d: Discretization, state: State, touching: Mask, shown: float = 1.0
-) -> tuple[Array, Array]:
-    """Points of the visible share of the bent rods, and their derivatives."""
-    s = np.linspace(0.0, shown, _SAMPLES)
-    turned = rods(d, state.contact, s) @ np.swapaxes(state.rotation, 1, 2)
-    slopes = np.zeros((*turned.shape, UNKNOWNS))
-    slopes[..., :6] = pose_slopes(turned)
-    rows = np.flatnonzero(touching)
-    change = _differences(lambda contact: rods(d, contact, s), state.contact[rows])
-    slopes[rows, ..., 6:] = state.rotation[rows, None] @ change
-    return turned + state.position[:, None], slopes
+def turns(rotation: Array) -> Array:
+    """Rotation vectors (t, 3) of rotations (t, 3, 3) by less than half a turn."""
+    (_, xy, xz), (yx, _, yz), (zx, zy, _) = np.moveaxis(rotation, 0, -1)
+    sine = 0.5 * np.stack([zy - yz, xz - zx, yx - xy], axis=1)
+    size = np.maximum(np.sqrt((sine**2).sum(axis=1)), _TINY)
+    angle = np.arctan2(size, 0.5 * (np.trace(rotation, axis1=1, axis2=2) - 1.0))
+    return np.asarray(sine * (angle / size)[:, None])
+
+
+class Bent(NamedTuple):
+    """Points of bent rods relative to their bases, and how they move with their contacts."""
+
+    turned: Array  # (t, n, 3), turned as the base is, units of L
+    rows: NDArray[np.intp]  # (t,): where `change` has a frame; −1 without contact
+    change: Array  # (4, n touching, n, 3): derivatives by the contact, whisker's frame
+    rotation: Array  # (t, 3, 3) of the base
+
+    @classmethod
+    def of(cls, d: Discretization, state: State, touching: Mask, shown: float = 1.0) -> Bent:
+        """Bend the visible share of rods."""
+        s, at = np.linspace(0.0, shown, _SAMPLES), np.flatnonzero(touching)
+        every = rods(d, np.concatenate([state.contact, _ahead(state.contact[at])]), s)
+        points, ahead = np.split(every, [len(touching)])
+        ahead = ahead.reshape(4, len(at), _SAMPLES, 3)
+        rows = np.where(touching, np.cumsum(touching) - 1, -1)
+        turned = points @ np.swapaxes(state.rotation, 1, 2)
+        return cls(turned, rows, (ahead - points[at]) / _STEP, state.rotation)
+
+    @property
+    def wild(self) -> Mask:
+        """Rods (t,) that are not in equilibrium."""
+        wild: Mask = np.asarray(~np.isfinite(self.turned).all(axis=(1, 2)))
+        wild[self.rows >= 0] |= ~(np.abs(self.change).max(axis=(0, 2, 3)) < _WILD)
+        return wild
+
+    def normal(
+        self, head: Array, rows: Array, misses: Array, weight: Array, hessian: Array, pull: Array
+    ) -> Array:
+        """Add weighted equations to normal equations; return the derivatives (t, n + 2, unknown).
+
+        Rows (t, n + 2, 3) are derivatives by points, laboratory frame, in units of L, and ``head``
+        the rotation (t, 3, 3) of the head.
+        """
+        design = np.empty((*misses.shape, UNKNOWNS))
+        given = rows, misses, weight
+        add_normal(self, np.ascontiguousarray(head), given, (design, hessian, pull))
+        return design
+
+
+@kernel
+def add_normal(bent: Any, head: Any, equations: Any, normal: Any) -> None:
+    """Add weighted equations to normal equations, and fill in their derivatives."""
+    turned, at, change, rotation = bent
+    rows, misses, weight = equations
+    design, hessian, pull = normal
+    n = turned.shape[1]
+    row = np.empty(UNKNOWNS)
+    for t in range(turned.shape[0]):
+        for j in range(n + 2):
+            i = j if j < n else (0 if j == n else n - 1)
+            for a in range(3):
+                row[a] = 0.0
+                for b in range(3):
+                    row[a] += rows[t, j, b] * head[t, b, a]
+            x, y, z = turned[t, i, 0], turned[t, i, 1], turned[t, i, 2]
+            row[3] = y * row[2] - z * row[1]
+            row[4] = z * row[0] - x * row[2]
+            row[5] = x * row[1] - y * row[0]
+            for k in range(4):
+                row[6 + k] = 0.0
+            for b in range(3 if at[t] >= 0 else 0):
+                own = (
+                    row[0] * rotation[t, 0, b]
+                    + row[1] * rotation[t, 1, b]
+                    + row[2] * rotation[t, 2, b]
+                )
+                for k in range(4):
+                    row[6 + k] += own * change[k, at[t], i, b]
+            for a in range(UNKNOWNS):
+                left = row[a] * weight[t, j]
+                design[t, j, a] = left
+                pull[t, a] += left * misses[t, j]
+                for b in range(UNKNOWNS):
+                    hessian[t, a, b] += left * row[b]
+
+
+def placed(d: Discretization, state: State, shown: float = 1.0) -> Array:
+    """Points (t, n, 3) of the visible share of the bent rods, units of L."""
+    points = rods(d, state.contact, np.linspace(0.0, shown, _SAMPLES))
+    return np.asarray(points @ np.swapaxes(state.rotation, 1, 2) + state.position[:, None])
 
 
 def pose_slopes(turned: Array) -> Array:
@@ -197,13 +296,9 @@ def pose_slopes(turned: Array) -> Array:
     return slopes
 
 
-def _differences(values: Callable[[Array], Array], contact: Array) -> Array:
-    """Central differences of values (t, ...) by the contact (t, 4); (t, ..., 4)."""
-    columns = []
-    for step, axis in zip(_STEPS, np.eye(4), strict=True):
-        ahead, back = values(contact + step * axis), values(contact - step * axis)
-        columns.append((ahead - back) / (2.0 * step))
-    return np.stack(columns, axis=-1)
+def _ahead(contact: Array) -> Array:
+    """Contacts (4 t, 4) of which one value after the other is larger by a step."""
+    return np.asarray((contact + _STEP * np.eye(4)[:, None]).reshape(-1, 4))
 
 
 def rods(d: Discretization, contact: Array, s: Array) -> Array:
@@ -217,8 +312,9 @@ def contact_slopes(d: Discretization, state: State) -> tuple[Array, Array, Array
 
     And those (t, 6, 4) of force and contact point, in the whisker's frame, by the contact.
     """
-    point = solve_forces(d, state.contact)[0][:, 3:]
-    slope = _differences(lambda each: solve_forces(d, each)[0], state.contact)
+    value = solve_forces(d, state.contact)[0]
+    ahead = solve_forces(d, _ahead(state.contact))[0].reshape(4, *value.shape)
+    point, slope = value[:, 3:], np.moveaxis((ahead - value) / _STEP, 0, -1)
     turned = np.einsum("tij,tj->ti", state.rotation, point)
     both = np.concatenate([pose_slopes(turned), state.rotation @ slope[:, 3:]], axis=-1)
     return turned, both, slope

@@ -11,8 +11,9 @@ assumed to be in the laboratory's plane z = 0.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
+from itertools import islice, pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,9 +21,9 @@ from numpy.typing import NDArray
 
 from vibrissa.cameras import Camera, triangulate
 from vibrissa.deferred import interpolate
-from vibrissa.numerics import kernel
+from vibrissa.numerics import Mask, kernel
 from vibrissa.tracking.trace.start import base_gap
-from vibrissa.tracking.trace.trace import Trace, arc_lengths, interpolated
+from vibrissa.tracking.trace.trace import Trace, arc_lengths, interpolated, nearest
 
 Array = NDArray[np.float64]
 
@@ -30,7 +31,11 @@ NODES = 101  # number of points of a whisker in space, equally spaced
 _SAMPLES = 51  # number of points of the spline that are compared with the traces
 _CONTROLS = 14  # number of the spline's control points
 _ROUNDS = 5  # largest number of Gauss–Newton steps
+_SMALL = 1e-8  # largest motion of control points, m, after which there are no more steps
+_TOGETHER = 64  # number of frames that are fitted together
 _SPARSE = 2  # distance of the points of traces that are matched, in points
+_ALONE = 0.05  # cost of a step along one of the two traces alone, in the matching, pixels²
+_BESIDE = 2.0  # distance along a trace from its nearest point above which a point is beyond its end
 _FARTHEST = 30.0  # distance from an epipolar line at which the cost saturates, pixels
 # Smallest standard deviation of a trace, pixels: calibration and the spline's freedom.
 _FLOOR = 0.05
@@ -91,12 +96,24 @@ def merge(cameras: Sequence[Camera], traces: Sequence[Trace]) -> SpaceCurve:
     """
     if not cameras or len(cameras) != len(traces):
         raise ValueError(f"{len(cameras)} cameras and {len(traces)} traces: one each is needed")
-    if not all(map(_usable, traces)):
-        return SpaceCurve.none()
-    start = _matched(cameras, traces)
-    if len(start) < 8 or not np.isfinite(start).all():
-        return SpaceCurve.none()
-    return _fitted(cameras, traces, _evenly_spaced(start, _SAMPLES))
+    return next(merged(cameras, [traces]))
+
+
+def merged(cameras: Sequence[Camera], frames: Iterable[Sequence[Trace]]) -> Iterator[SpaceCurve]:
+    """Merge the traces, view by view, of many frames."""
+    source = iter(frames)
+    while rows := list(islice(source, _TOGETHER)):
+        curves = [SpaceCurve.none()] * len(rows)
+        shown = [i for i, views in enumerate(rows) if all(map(_usable, views))]
+        starts = _matched(cameras, [rows[i] for i in shown]) if shown else []
+        whole = [k for k, one in enumerate(starts) if len(one) >= 8 and np.isfinite(one).all()]
+        if whole:
+            shown = [shown[k] for k in whole]
+            even = np.array([_evenly_spaced(starts[k], _SAMPLES) for k in whole])
+            fits = _fitted(cameras, [rows[i] for i in shown], even)
+            for i, curve in zip(shown, fits, strict=True):
+                curves[i] = curve
+        yield from curves
 
 
 def begun_together(
@@ -113,9 +130,24 @@ def begun_together(
     pairs = list(zip(*traces, strict=True))
     whole = [i for i, both in enumerate(pairs) if all(map(_usable, both))]
     bases = np.array([[pairs[i][view].line[0] for i in whole] for view in (0, 1)])
-    for i, gap in zip(whole, base_gap(cameras, bases.reshape(2, -1, 2)), strict=True):
-        if not gap < _APART:
-            pairs[i] = _cut(cameras, pairs[i], gap)
+    gaps = zip(whole, base_gap(cameras, bases.reshape(2, -1, 2)), strict=True)
+    best = {i: (min(_NEARER * gap, 2.0 * _APART), 0, 0) for i, gap in gaps if not gap < _APART}
+    tried = [(i, view, len(pairs[i][view].line)) for i in best for view in (0, 1)]
+    parts = [(i, view, pairs[i][view].line[: int(_CUT * n)]) for i, view, n in tried]
+    if not parts:
+        return [list(view) for view in traces]
+    pixels = [
+        np.concatenate([p if v == view else 0.0 * p + pairs[i][v].line[0] for i, view, p in parts])
+        for v in (0, 1)
+    ]
+    away = np.split(base_gap(cameras, np.stack(pixels)), np.cumsum([len(p) for *_, p in parts]))
+    for (i, view, part), gap in zip(parts, away[:-1], strict=True):
+        if len(part) and gap.min() < best[i][0]:
+            best[i] = gap.min(), view, int(np.argmin(gap))
+    for i, (_, view, first) in best.items():
+        one = pairs[i][view]
+        one = one._replace(line=one.line[first:], sigma=one.sigma[first:], seen=one.seen[first:])
+        pairs[i] = (one, pairs[i][1]) if view == 0 else (pairs[i][0], one)
     return [list(view) for view in zip(*pairs, strict=True)]
 
 
@@ -123,60 +155,44 @@ def _usable(trace: Trace) -> bool:
     return len(trace.line) >= 8 and trace.base_seen
 
 
-def _cut(cameras: Sequence[Camera], both: tuple[Trace, ...], gap: float) -> tuple[Trace, ...]:
-    """Both traces of a frame, whose bases are a gap apart, the one that begins earlier cut."""
-    best, place = min(_NEARER * gap, 2.0 * _APART), (0, 0)
-    for view, other in ((0, 1), (1, 0)):
-        line = both[view].line[: int(_CUT * len(both[view].line))]
-        base = np.broadcast_to(both[other].line[0], line.shape)
-        gaps = base_gap(cameras, np.stack([line, base] if view == 0 else [base, line]))
-        if len(gaps) and gaps.min() < best:
-            best, place = gaps.min(), (view, int(np.argmin(gaps)))
-    view, first = place
-    one = both[view]
-    cut = one._replace(line=one.line[first:], sigma=one.sigma[first:], seen=one.seen[first:])
-    return (cut, both[1]) if view == 0 else (both[0], cut)
-
-
-def _matched(cameras: Sequence[Camera], traces: Sequence[Trace]) -> Array:
-    """Points (n, 3) by matching the first trace with the others."""
-    first = traces[0].line[::_SPARSE]
-    partners = [np.zeros(len(first))]
-    base = triangulate(cameras, np.stack([trace.line[0] for trace in traces]))[0]
+def _matched(cameras: Sequence[Camera], frames: Sequence[Sequence[Trace]]) -> list[Array]:
+    """Points (n, 3) of each frame by matching the first trace with the others."""
+    base = triangulate(
+        cameras, np.array([[views[v].line[0] for views in frames] for v in range(len(cameras))])
+    )[0]
+    lines = [views[0].line[::_SPARSE] for views in frames]
+    bounds = np.cumsum([0, *map(len, lines)])
+    first, of = np.concatenate(lines), np.repeat(np.arange(len(frames)), np.diff(bounds))
     origin, direction = cameras[0].rays(first)
     # Two points of each ray near the base: their images make the epipolar line.
-    depth = ((base - origin) * direction).sum(axis=1)
-    scale = 1.0 / np.linalg.norm(cameras[0].project_with_slopes(base)[1], axis=0).max()
+    depth = ((base[of] - origin) * direction).sum(axis=1)
+    slopes = cameras[0].project_with_slopes(base)[1]
+    scale = 1.0 / np.linalg.norm(slopes, axis=1).max(axis=1)[of]
     ends = [origin + (depth + 100.0 * sign * scale)[:, None] * direction for sign in (-1.0, 1.0)]
-    for camera, trace in zip(cameras[1:], traces[1:], strict=True):
+    pixels = [first]
+    for v, camera in enumerate(cameras[1:], start=1):
         a, b = (camera.project(end) for end in ends)
         normal = np.stack([a[:, 1] - b[:, 1], b[:, 0] - a[:, 0]], axis=1)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        other = trace.line[::_SPARSE]
-        miss = np.abs(other @ normal.T - (a * normal).sum(axis=1)).T
-        partners.append(_partners(np.minimum(miss, _FARTHEST) ** 2))
-    known = np.all([np.isfinite(p) for p in partners], axis=0)
-    pixels = [first[known]]
-    for p, trace in zip(partners[1:], traces[1:], strict=True):
-        other = trace.line[::_SPARSE]
-        pixels.append(interpolated(p[known], np.arange(len(other)), other))
-    return triangulate(cameras, np.stack(pixels))[0]
-
-
-def _partners(cost: Array) -> Array:
-    """Mean column of the cheapest monotone path for each row; NaN after its end."""
-    rows = np.empty(sum(cost.shape), np.int64)
-    columns = np.empty_like(rows)
-    count = cheapest_path(np.ascontiguousarray(cost), rows, columns)
-    total = np.bincount(rows[:count], columns[:count], cost.shape[0])
-    number = np.bincount(rows[:count], minlength=cost.shape[0])
-    return np.asarray(np.where(number > 0, total / np.maximum(number, 1), np.nan))
+        offset, partner = (a * normal).sum(axis=1), np.empty_like(first)
+        for views, i, j in zip(frames, bounds[:-1], bounds[1:], strict=True):
+            other, place = np.ascontiguousarray(views[v].line[::_SPARSE]), np.empty(j - i)
+            match(normal[i:j], offset[i:j], other, place)
+            partner[i:j] = interpolated(place, np.arange(len(other)), other)
+        pixels.append(partner)
+    points = triangulate(cameras, np.stack(pixels))[0]
+    known: Mask = np.asarray(np.isfinite(pixels).all(axis=(0, 2)))
+    return [points[i:j][known[i:j]] for i, j in pairwise(bounds)]
 
 
 @kernel
-def cheapest_path(cost: Any, rows: Any, columns: Any) -> int:
-    """Cheapest monotone path from the first corner to the last row or column."""
-    n, m = cost.shape
+def match(normal: Any, offset: Any, other: Any, place: Any) -> None:
+    """Mean index, for each epipolar line, of the points matched with it; NaN after the last.
+
+    Both are matched in order, along the cheapest monotone path from the first corner of all
+    distances to the last row or column.
+    """
+    n, m = normal.shape[0], other.shape[0]
     total = np.empty((n, m))
     for i in range(n):
         for j in range(m):
@@ -185,10 +201,13 @@ def cheapest_path(cost: Any, rows: Any, columns: Any) -> int:
             if i > 0 and j > 0:
                 best = min(best, total[i - 1, j - 1])
             if i > 0:
-                best = min(best, total[i - 1, j] + 0.05)
+                best = min(best, total[i - 1, j] + _ALONE)
             if j > 0:
-                best = min(best, total[i, j - 1] + 0.05)
-            total[i, j] = best + cost[i, j]
+                best = min(best, total[i, j - 1] + _ALONE)
+            miss = normal[i, 0] * other[j, 0] + normal[i, 1] * other[j, 1] - offset[i]
+            miss = min(abs(miss), _FARTHEST)
+            total[i, j] = best + miss * miss
+        place[i] = np.nan
     i, j, least = n - 1, m - 1, np.inf
     # Per step of the path, so that a short one has no advantage.
     for k in range(m):
@@ -199,24 +218,20 @@ def cheapest_path(cost: Any, rows: Any, columns: Any) -> int:
         mean = total[k, m - 1] / (m + k)
         if mean <= least:
             i, j, least = k, m - 1, mean
-    count = 0
-    while True:
-        rows[count], columns[count] = i, j
-        count += 1
-        if i == 0 and j == 0:
-            return count
-        if i == 0:
+    high = j
+    while i > 0 or j > 0:
+        both = total[i - 1, j - 1] if i > 0 and j > 0 else np.inf
+        up = total[i - 1, j] + _ALONE if i > 0 else np.inf
+        back = total[i, j - 1] + _ALONE if j > 0 else np.inf
+        if back < both and back < up:
             j -= 1
-        elif j == 0:
-            i -= 1
-        else:
-            a, b, c = total[i - 1, j - 1], total[i - 1, j] + 0.05, total[i, j - 1] + 0.05
-            if a <= b and a <= c:
-                i, j = i - 1, j - 1
-            elif b <= c:
-                i -= 1
-            else:
-                j -= 1
+            continue
+        place[i] = 0.5 * (j + high)
+        i -= 1
+        if both <= up:
+            j -= 1
+        high = j
+    place[0] = 0.5 * high
 
 
 def _evenly_spaced(points: Array, count: int) -> Array:
@@ -238,67 +253,126 @@ def _basis(count: int) -> Array:
     return np.asarray(interpolate.BSpline.design_matrix(places, _KNOTS, 3).toarray())
 
 
-def _fitted(cameras: Sequence[Camera], traces: Sequence[Trace], start: Array) -> SpaceCurve:
-    """Gauss-Newton fit to the distances of the spline's images from the traces."""
-    basis = _basis(_SAMPLES)
-    control = np.linalg.lstsq(basis, start)[0]
-    size = float(np.linalg.norm(np.diff(start, axis=0), axis=1).sum())
+@cache
+def _pairs(count: int) -> Array:
+    """Products (count, _CONTROLS²) of each two functions of that basis."""
+    basis = _basis(count)
+    return np.asarray((basis[:, :, None] * basis[:, None]).reshape(count, -1))
+
+
+def _fitted(
+    cameras: Sequence[Camera], frames: Sequence[Sequence[Trace]], starts: Array
+) -> list[SpaceCurve]:
+    """Gauss-Newton fit to the distances of the splines' images from the traces."""
+    basis, count = _basis(_SAMPLES), len(frames)
+    control = np.linalg.pinv(basis) @ starts
+    size = np.linalg.norm(np.diff(starts, axis=1), axis=2).sum(axis=1)
     # Weak: the continuation of the whisker matters only where nothing is seen.
-    stiff = np.kron(_THIRD.T @ _THIRD, np.eye(3)) / (_LOOSE * size) ** 2
-    hessian, misfit = stiff, np.nan
-    tangents = [np.gradient(trace.line, axis=0) for trace in traces]
-    tangents = [each / np.linalg.norm(each, axis=1, keepdims=True) for each in tangents]
+    stiff = np.kron(_THIRD.T @ _THIRD, np.eye(3)) / (_LOOSE * size[:, None, None]) ** 2
+    hessian, misfit = stiff.copy(), np.full(count, np.nan)
+    rows, traces = np.arange(count), [_Lines.of(view) for view in zip(*frames, strict=True)]
     for _ in range(_ROUNDS):
-        node, rows, misses = _equations(cameras, traces, tangents, basis @ control)
-        design = (basis[node][:, :, None] * rows[:, None, :]).reshape(len(rows), -1)
-        hessian = design.T @ design + stiff
-        gradient = design.T @ misses - stiff @ control.reshape(-1)
-        step = np.linalg.solve(hessian, gradient).reshape(-1, 3)
-        control = control + step
-        misfit = float(np.sqrt(np.mean((misses - design @ step.reshape(-1)) ** 2)))
-        if np.abs(step).max() < 1e-8:
+        points = basis @ control[rows]
+        # Points may slide along the curve by a fraction of their spacing per iteration.
+        along = np.gradient(points, axis=1)
+        spacing = np.linalg.norm(along, axis=2, keepdims=True)
+        along /= spacing * _SLIDING * spacing.mean(axis=1, keepdims=True)
+        square, pull = along[..., None] * along[..., None, :], np.zeros_like(points)
+        sums = np.tile([0.0, _SAMPLES], (len(rows), 1))
+        if len(cameras) == 1:
+            square[..., 2, 2] += _LEVEL**-2.0
+            pull[..., 2] = -points[..., 2] * _LEVEL**-2.0
+            sums[:, 0] = (points[..., 2] ** 2).sum(axis=1) * _LEVEL**-2.0
+            sums[:, 1] += _SAMPLES
+        for camera, lines in zip(cameras, traces, strict=True):
+            pixels, slopes = camera.project_with_slopes(points)
+            compare(pixels, slopes, lines, rows, (square, pull, sums))
+        data = _pairs(_SAMPLES).T @ square.reshape(len(rows), _SAMPLES, 9)
+        data = data.reshape(-1, _CONTROLS, _CONTROLS, 3, 3).swapaxes(2, 3)
+        data = data.reshape(len(rows), *stiff.shape[1:])
+        right = (basis.T @ pull).reshape(len(rows), -1, 1)
+        hessian[rows] = data + stiff[rows]
+        gradient = right - stiff[rows] @ control[rows].reshape(len(rows), -1, 1)
+        step = np.linalg.solve(hessian[rows], gradient)
+        control[rows] += step.reshape(-1, *control.shape[1:])
+        left = sums[:, 0] + (step * (data @ step - 2.0 * right)).sum(axis=(1, 2))
+        misfit[rows] = np.sqrt(np.maximum(left, 0.0) / sums[:, 1])
+        rows = rows[np.abs(step).max(axis=(1, 2)) >= _SMALL]
+        if not rows.size:
             break
-    spread = np.linalg.inv(hessian).reshape(_CONTROLS, 3, _CONTROLS, 3)
-    basis = _basis(NODES)
-    half = np.tensordot(basis, spread, axes=1)  # (node, 3, control, 3)
-    covariance = np.einsum("ialb,il->iab", half, basis) * max(1.0, misfit**2)
+    spread = np.linalg.inv(hessian).reshape(-1, _CONTROLS, 3, _CONTROLS, 3)
+    covariance = _pairs(NODES) @ spread.swapaxes(2, 3).reshape(count, -1, 9)
+    covariance = (
+        covariance.reshape(-1, NODES, 3, 3) * np.maximum(1.0, misfit**2)[:, None, None, None]
+    )
     dense = _basis(8 * NODES) @ control
     if len(cameras) == 1:
-        dense[:, 2] = 0.0
-    return SpaceCurve(_evenly_spaced(dense, NODES), covariance, misfit)
+        dense[..., 2] = 0.0
+    even = (_evenly_spaced(line, NODES) for line in dense)
+    return list(map(SpaceCurve, even, covariance, misfit.tolist()))
 
 
-def _equations(
-    cameras: Sequence[Camera], traces: Sequence[Trace], tangents: Sequence[Array], points: Array
-) -> tuple[NDArray[np.int64], Array, Array]:
-    """Node (r,), gradient (r, 3) and residuals (r,) of all equations, in standard deviations."""
-    along = np.gradient(points, axis=0)
-    spacing = np.linalg.norm(along, axis=1, keepdims=True)
-    # Points may slide along the curve by a fraction of their spacing per iteration.
-    nodes = [np.arange(_SAMPLES)]
-    rows = [along / spacing / (_SLIDING * spacing.mean())]
-    misses = [np.zeros(_SAMPLES)]
-    if len(cameras) == 1:
-        nodes.append(np.arange(_SAMPLES))
-        rows.append(np.tile([0.0, 0.0, 1.0 / _LEVEL], (_SAMPLES, 1)))
-        misses.append(-points[:, 2] / _LEVEL)
-    for camera, trace, tangent in zip(cameras, traces, tangents, strict=True):
-        pixels, slopes = camera.project_with_slopes(points)
-        line = trace.line
-        near = np.argmin((line**2).sum(axis=1) - 2.0 * pixels @ line.T, axis=1)
-        t, away = tangent[near], line[near] - pixels
-        across = np.stack([-t[:, 1], t[:, 0]], axis=1)
-        beyond = np.abs((away * t).sum(axis=1)) > 2.0
-        sigma = np.sqrt(trace.sigma[near] ** 2 + _FLOOR**2)
-        used = np.flatnonzero(~beyond)
-        nodes.append(used)
-        rows.append((across[:, None] @ slopes)[used, 0] / sigma[used, None])
-        misses.append(((away * across).sum(axis=1) / sigma)[used])
-        for node, end in ((0, 0), (_SAMPLES - 1, -1)):
-            gap = float((line[end] - pixels[node]) @ tangent[end])
-            # The whisker may continue in another view where this one no longer shows it.
-            if node == 0 or (trace.tip_seen and abs(gap) < _BEYOND):
-                nodes.append(np.array([node]))
-                rows.append(tangent[end][None, :] @ slopes[node] / _END)
-                misses.append(np.array([gap / _END]))
-    return np.concatenate(nodes), np.concatenate(rows), np.concatenate(misses)
+class _Lines(NamedTuple):
+    """Traces of one view in several frames, one after the other."""
+
+    bounds: NDArray[np.intp]  # (frame + 1,)
+    line: Array
+    tangent: Array
+    sigma: Array
+    tips: Mask  # (frame,): whether they are seen to end there
+    step: float  # largest distance of two points
+
+    @classmethod
+    def of(cls, traces: Sequence[Trace]) -> _Lines:
+        """Join traces."""
+        tangents = [np.gradient(trace.line, axis=0) for trace in traces]
+        tangent = np.concatenate(tangents)
+        steps = [np.linalg.norm(np.diff(t.line, axis=0), axis=1).max() for t in traces]
+        return cls(
+            np.cumsum([0, *(len(trace.line) for trace in traces)]),
+            np.concatenate([trace.line for trace in traces]),
+            tangent / np.linalg.norm(tangent, axis=1, keepdims=True),
+            np.sqrt(np.concatenate([trace.sigma for trace in traces]) ** 2 + _FLOOR**2),
+            np.array([trace.tip_seen for trace in traces]),
+            float(max(steps)),
+        )
+
+
+@kernel
+def compare(pixels: Any, slopes: Any, lines: Any, rows: Any, found: Any) -> None:
+    """Add the distances of points' images from a view's traces, in standard deviations.
+
+    Those found are the normal equations of each point, and the sum of squares and the number of
+    distances of each frame.
+    """
+    bounds, line, tangent, sigma, tips, step = lines
+    square, pull, sums = found
+    last = pixels.shape[1] - 1
+    for f in range(rows.shape[0]):
+        begin, end = bounds[rows[f]], bounds[rows[f] + 1]
+        near = begin
+        for j in range(last + 1):
+            x, y = pixels[f, j, 0], pixels[f, j, 1]
+            near = nearest(line, begin, end, x, y, step, near)
+            for k in range(2):
+                # The distance across, then that along, of an end of the trace.
+                at = near if k == 0 else (begin if j == 0 else end - 1)
+                dx, dy = line[at, 0] - x, line[at, 1] - y
+                tx, ty = tangent[at, 0], tangent[at, 1]
+                gap, weight = dx * tx + dy * ty, 1.0 / _END
+                if k == 0:
+                    if not abs(gap) <= _BESIDE:
+                        continue
+                    tx, ty, gap, weight = -ty, tx, dy * tx - dx * ty, 1.0 / sigma[at]
+                # The whisker may continue in another view where this one no longer shows it.
+                elif j != 0 and not (j == last and tips[rows[f]] and abs(gap) < _BEYOND):
+                    continue
+                for a in range(3):
+                    left = weight * weight * (tx * slopes[f, j, 0, a] + ty * slopes[f, j, 1, a])
+                    pull[f, j, a] += left * gap
+                    for b in range(3):
+                        square[f, j, a, b] += left * (
+                            tx * slopes[f, j, 0, b] + ty * slopes[f, j, 1, b]
+                        )
+                sums[f, 0] += (weight * gap) ** 2
+                sums[f, 1] += 1.0

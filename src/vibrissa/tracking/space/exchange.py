@@ -17,7 +17,7 @@ import numpy as np
 
 from vibrissa.cameras import Camera, triangulate
 from vibrissa.numerics import Array, Mask
-from vibrissa.tracking.space.curve import merge
+from vibrissa.tracking.space.curve import merged
 from vibrissa.tracking.space.rest_shape import motions
 from vibrissa.tracking.trace.start import base_gap
 from vibrissa.tracking.trace.trace import Trace, arc_lengths, interpolated
@@ -166,7 +166,8 @@ def _pairs(
                     line for line in lines[v] if line.parts[0] == one.parts[0] and line is not one
                 ]
                 pairs += [(*whole[:v], line, *whole[v + 1 :]) for line in other]
-            every += [(merge(cameras, [one.trace for one in pair]).points, pair) for pair in pairs]
+            curves = merged(cameras, ([one.trace for one in pair] for pair in pairs))
+            every += [(curve.points, pair) for curve, pair in zip(curves, pairs, strict=True)]
     return every
 
 

@@ -183,11 +183,13 @@ class Follower:
             least = _BETTER * length * belongs
             cold = max(self.from_base(frame, noise, least), key=self._worth, default=Trace.lost())
             if cold.support > least:
-                best = cold
-        return self.accept(best) if self._belongs(best) else self.lose()
+                best, belongs = cold, self._belongs(cold)
+        return self.accept(best) if belongs else self.lose()
 
     def length_of(self, trace: Trace) -> float:
         """Length that is seen or hidden by clutter, pixels."""
+        if trace.seen.all():
+            return trace.support
         hidden = self.clutter.hides(trace.line) & ~trace.seen
         return trace.support + STEP * float(hidden.sum())
 
@@ -247,7 +249,7 @@ class Follower:
         if expected is None or last is None or not self.long_enough(trace):
             return self.long_enough(trace)
         away = distances(expected[4:_PROXIMAL], trace.line[: 2 * _PROXIMAL])
-        if float(np.median(away)) <= self.reach:
+        if middle(away) <= self.reach:
             return True
         # It may have turned about its base by more if all of it, and nothing else, is seen.
         share = self.length_of(trace) / max(self.usual, 1.0)

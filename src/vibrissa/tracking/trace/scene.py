@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from vibrissa.deferred import ndimage
 from vibrissa.io import Frame
 from vibrissa.numerics import kernel
-from vibrissa.tracking.trace.ridge import noise_level
+from vibrissa.tracking.trace.ridge import middle, noise_level
 from vibrissa.tracking.trace.trace import EDGE, STILL, Bits, Trace
 
 Array = NDArray[np.float64]
@@ -364,7 +364,7 @@ def _begins(away: Array) -> bool:
 
 def _gain(sparse: Any, usual: Any) -> float:
     # With one grey value more, so that what is black in both is as bright.
-    return float(np.median((sparse + np.float32(1.0)) / (usual + np.float32(1.0))))
+    return middle(((sparse + np.float32(1.0)) / (usual + np.float32(1.0))).ravel())
 
 
 def _halved(image: Any) -> Image:

@@ -259,6 +259,23 @@ def nearest_distances(line: Any, other: Any, away: Any) -> None:
         away[i] = math.sqrt(least)
 
 
+@inlined
+def nearest(line: Any, first: int, last: int, x: float, y: float, step: float, near: int) -> int:
+    """Index, from ``first`` to before ``last``, of the point of a line nearest to another one.
+
+    Its points are at most ``step`` apart: those that cannot be nearer than the nearest one so far,
+    at first a guess, are skipped.
+    """
+    least = math.sqrt((line[near, 0] - x) ** 2 + (line[near, 1] - y) ** 2)
+    i = first if least < np.inf else last
+    while i < last:
+        away = math.sqrt((line[i, 0] - x) ** 2 + (line[i, 1] - y) ** 2)
+        if away < least or (away == least and i < near):
+            least, near = away, i
+        i += max(1, int((away - least) / step))
+    return near
+
+
 def correlated(misses: Sequence[Array]) -> float:
     """Number of neighbouring residuals that count as one."""
     total, most = 1.0, min(one.shape[1] for one in misses) // 2

@@ -228,33 +228,8 @@ def locate_around(
 ) -> xr.Dataset:
     """Locate contacts with known objects at one point, at several points or along an arc.
 
-    Parameters
-    ----------
-    whisker : Whisker
-        Whisker in contact; weight and friction are neglected.
-    wrench : xarray.Dataset
-        Measured wrench, as for `locate`. If it has ``base_rotation`` and ``base_position``, objects
-        are in the laboratory frame, otherwise in the whisker frame.
-    noise : array_like (6, 6) or (time, 6, 6)
-        Covariance of (F, M), as for `locate`.
-    objects : sequence of Peg, Sphere, Plane, Box or Mesh
-        Rigid objects at their presumed positions.
-    position_sigma : float
-        Standard deviation of these positions along each axis, as for `estimate_around`, m.
-    progress : callable, optional
-        Function called before each contact with the numbers of contacts done and in total.
-
-    Returns
-    -------
-    xarray.Dataset
-        Contacts nearest to the base, as returned by `locate` but without candidates and
-        derivatives; ``last_arc_length`` of the contact farthest from the base; and the estimated
-        shift of the objects, ``shift_x``, ``shift_y`` and ``shift_z``.
-
-    Raises
-    ------
-    ValueError
-        If the noise is unknown, or `estimate_around` raises it.
+    Arguments and result are those of `locate` and `estimate_around`; with ``base_rotation`` and
+    ``base_position`` in ``wrench`` the objects are in the laboratory frame.
     """
     measured, known = _Measured.of(wrench, noise), Group(wrench)
     pose: dict[str, Any] = {}

@@ -29,9 +29,7 @@ __all__ = [
     "attributes",
     "axis_label",
     "quantity",
-    "shown_unit",
     "to_display",
-    "unit_fault",
 ]
 __dir__ = __all__.copy
 
@@ -170,20 +168,7 @@ _UNITS = MappingProxyType(
 
 
 def unit_fault(name: str, unit: object) -> str:
-    """Describe the fault of a unit other than that of a quantity.
-
-    Parameters
-    ----------
-    name : str
-        Name in :data:`QUANTITIES`, which ``unfiltered_`` may precede.
-    unit : object
-        Stated unit.
-
-    Returns
-    -------
-    str
-        Fault, as part of a message; empty if the unit is that of the quantity.
-    """
+    """Describe the fault of a unit other than that of a quantity; empty if it is the same."""
     wanted = attributes(name.removeprefix("unfiltered_"))["units"]
     if _plain_unit(str(unit)) == _plain_unit(wanted):
         return ""
@@ -221,26 +206,9 @@ _LARGER = {"µN": "mN", "mN": "N", "µN·m": "mN·m", "mN·m": "N·m"}
 
 
 def shown_unit(name: str, values: ArrayLike) -> tuple[float, str]:
-    """Choose the most readable unit for given values.
+    """Factor from SI units, and the most readable unit for given values.
 
-    Parameters
-    ----------
-    name : str
-        Name in :data:`QUANTITIES`.
-    values : array_like, any shape
-        Values in the quantity's SI unit; NaN is ignored.
-
-    Returns
-    -------
-    factor : float
-        Factor from the SI unit to the chosen unit.
-    unit : str
-        Display unit or, for forces and moments far larger than a rat's, a larger one.
-
-    Examples
-    --------
-    >>> shown_unit("Fx", [-4.3, 0.2])
-    (1000.0, 'mN')
+    For forces and moments far larger than a rat's, it is larger than the display unit.
     """
     known = quantity(name)
     factor, unit = known.display_factor, known.display_unit

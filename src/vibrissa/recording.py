@@ -59,7 +59,7 @@ class RecordedVariable:
     kind: str = "float"
 
 
-_TABLE = Path(__file__).with_suffix(".csv").read_text("utf-8")
+_TABLE = csv.DictReader(Path(__file__).with_suffix(".csv").read_text("utf-8").splitlines())
 _VECTOR = ("time", "whisker", "space")
 
 VARIABLES: Mapping[str, RecordedVariable] = MappingProxyType(
@@ -70,9 +70,7 @@ VARIABLES: Mapping[str, RecordedVariable] = MappingProxyType(
             row["frame"],
             row["kind"],
         )
-        for row in csv.DictReader(
-            Path(__file__).with_suffix(".csv").read_text("utf-8").splitlines()
-        )
+        for row in _TABLE
     }
 )
 """Declarations of all variables over the frames of a recording, by name."""

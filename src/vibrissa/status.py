@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["Event", "Status", "counted", "describe", "flag_attributes", "is_ok", "names"]
+__all__ = ["Event", "Status", "counted", "describe", "names"]
 __dir__ = __all__.copy
 
 
@@ -81,18 +81,7 @@ _OK_CODES = np.array([status for status in Status if status.ok], dtype=np.int8)
 
 
 def is_ok(codes: ArrayLike) -> NDArray[np.bool_]:
-    """Determine which rows can be used as they are.
-
-    Parameters
-    ----------
-    codes : array_like of int, any shape
-        Numbers of :class:`Status`.
-
-    Returns
-    -------
-    ndarray of bool, the shape of ``codes``
-        True where :attr:`Status.ok` is true.
-    """
+    """Determine which rows can be used as they are, by their numbers of :class:`Status`."""
     return np.isin(np.asarray(codes), _OK_CODES)
 
 
@@ -167,18 +156,7 @@ def names(codes: ArrayLike) -> NDArray[np.str_]:
 
 
 def flag_attributes(kind: type[enum.IntEnum] = Status) -> dict[str, NDArray[np.int8] | str]:
-    """Return the dataset attributes that describe the numbers of :class:`Status`, as CF flags.
-
-    Parameters
-    ----------
-    kind : type
-        :class:`Status`, or :class:`Event`.
-
-    Returns
-    -------
-    dict
-        ``flag_values`` (int8) and ``flag_meanings`` (words separated by spaces, in the same order).
-    """
+    """Dataset attributes that describe the numbers of a status or an event, as CF flags."""
     return {
         "flag_values": np.array([int(one) for one in kind], dtype=np.int8),
         "flag_meanings": " ".join(one.name.lower() for one in kind),

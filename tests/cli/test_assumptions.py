@@ -63,7 +63,14 @@ def estimated(folder, tmp_path, *words):
     return load_contacts(path)
 
 
-@pytest.mark.parametrize("how", [("--using", "Fx,MB,MD"), ("--using", "Fx,FT,MB,MD"), ()])
+@pytest.mark.parametrize(
+    "how",
+    [
+        ("--using", "Fx,MB,MD"),
+        pytest.param(("--using", "Fx,FT,MB,MD"), marks=pytest.mark.slow),
+        (),
+    ],
+)
 def test_stated_errors_are_in_what_estimate_writes(folder, tmp_path, bent, how):
     """The same covariances as in Python, of three signals, of four and of the whole wrench."""
     given = how or ("--using", "wrench")

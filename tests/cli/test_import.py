@@ -147,7 +147,7 @@ def errors(path, truth):
     [
         tables,
         pytest.param(labels, marks=pytest.mark.slow),
-        analysis,
+        pytest.param(analysis, marks=pytest.mark.slow),
         pytest.param(movement, marks=pytest.mark.slow),
     ],
 )

@@ -85,17 +85,16 @@ def test_a_file_of_another_kind_is_refused(tmp_path):
         vb.ContactMap.load(trial)
 
 
-@pytest.mark.parametrize(
-    "lost", ["chart", "whisker", "chart/fold", "chart/values", "whisker/radius"]
-)
-def test_a_map_without_a_part_of_it_is_refused(tmp_path, gamma_map, lost):
-    path = tmp_path / "map.nc"
-    gamma_map.save(path)
-    with h5py.File(path, "r+") as file:
-        del file[lost]
-    with pytest.raises(ValueError, match=lost.rpartition("/")[2]) as caught:
-        vb.ContactMap.load(path)
-    assert str(path) in str(caught.value)
+def test_a_map_without_a_part_of_it_is_refused(tmp_path, gamma_map):
+    whole, path = tmp_path / "whole.nc", tmp_path / "map.nc"
+    gamma_map.save(whole)
+    for lost in ("chart", "whisker", "chart/fold", "chart/values", "whisker/radius"):
+        path.write_bytes(whole.read_bytes())
+        with h5py.File(path, "r+") as file:
+            del file[lost]
+        with pytest.raises(ValueError, match=lost.rpartition("/")[2]) as caught:
+            vb.ContactMap.load(path)
+        assert str(path) in str(caught.value)
 
 
 def test_the_papers_grid(tmp_path):
@@ -197,18 +196,17 @@ def _misses(found, point):
 
 
 @pytest.mark.parametrize(("curvature", "taper"), [(0.1, 1.0), (0.1, 1.02), (0.6, 1.3), (0.0, 1.05)])
-@pytest.mark.parametrize("light", [False, True])
-def test_contacts_of_wires_are_right_or_called_undetermined(rng, curvature, taper, light):
+def test_contacts_of_wires_are_right_or_called_undetermined(rng, curvature, taper):
     """F_x of a uniform wire nearly follows from its moment; what remains locates the contact."""
     contact_map = vb.ContactMap.simulate(_wire(curvature, taper), grid=False)
-    low, high = (0.01, 0.2) if light else (0.2, 0.95)
-    charted = rng.uniform([0.02, -np.pi, low], [0.98, np.pi, high], (500, 3))
-    signals, point = _signals_of_contacts(contact_map, charted)
-    found = contact_map.estimate(signals, "Fx MB MD")
-    undetermined = found.status == vb.Status.DEGENERATE
-    assert _misses(found, point).mean() < 0.01
-    assert undetermined.mean() <= (0.4 if taper == 1.0 else 0.0)
-    assert not (undetermined & np.isfinite(found.point[:, 0])).any()
+    for low, high in ((0.2, 0.95), (0.01, 0.2)):
+        charted = rng.uniform([0.02, -np.pi, low], [0.98, np.pi, high], (500, 3))
+        signals, point = _signals_of_contacts(contact_map, charted)
+        found = contact_map.estimate(signals, "Fx MB MD")
+        undetermined = found.status == vb.Status.DEGENERATE
+        assert _misses(found, point).mean() < 0.01
+        assert undetermined.mean() <= (0.4 if taper == 1.0 else 0.0)
+        assert not (undetermined & np.isfinite(found.point[:, 0])).any()
 
 
 def test_contacts_in_the_plane_of_a_uniform_wire_are_undetermined(rng):

@@ -54,8 +54,15 @@ def reference(prior, whisker, points, forces):
 
 
 @pytest.mark.parametrize("prior", PRIORS, ids=str)
-@pytest.mark.parametrize("noise", [None, NOISE], ids=["exact", "noise"])
-@pytest.mark.parametrize("names", ["FT FD MB", "Fx FT MB"])
+@pytest.mark.parametrize(
+    ("names", "noise"),
+    [
+        ("FT FD MB", None),
+        ("Fx FT MB", NOISE),
+        pytest.param("FT FD MB", NOISE, marks=pytest.mark.slow),
+    ],
+    ids=["exact", "noise", "noise, another triplet"],
+)
 def test_candidates_are_those_that_are_possible(gamma_map, bent, names, noise, prior):
     """The same as without a prior, but for those that it excludes; and one at a time alike."""
     signals = vb.base_signals(*bent[:2])

@@ -338,7 +338,9 @@ def fault(read, path):
     return None
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize(
+    "seed", [*range(4), *(pytest.param(i, marks=pytest.mark.slow) for i in range(4, 10))]
+)
 @pytest.mark.parametrize("name", ["trial.nc", "poses.nc"])
 def test_damage_ends_in_one_line(tmp_path, content, name, seed):
     """Or the file can be read all the same; thousands more are tried by hand."""

@@ -46,8 +46,7 @@ def cameras():
     )
 
 
-@pytest.fixture
-def recording():
+def made():
     rng = np.random.default_rng(0)
     n, w, k = 40, 2, 5
     image = rng.uniform(1, 900, (n, w, 2, k, 2))
@@ -74,6 +73,19 @@ def recording():
     data["in_contact"] = (("time", "whisker"), touching, attributes("in_contact"))
     data.attrs = {"kind": "vibrissa recording"}
     return xr.DataTree.from_dict({"/": data, "cameras": cameras()})
+
+
+@pytest.fixture
+def recording():
+    return made()
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory):
+    """The bytes of its file, for tests that spoil it."""
+    path = tmp_path_factory.mktemp("nwb") / "trial.nwb"
+    save_nwb(path, made(), SESSION)
+    return path.read_bytes()
 
 
 def test_written_and_read_again(tmp_path, recording):
@@ -156,7 +168,11 @@ def test_what_another_program_finds(tmp_path, recording):
     np.testing.assert_allclose(contacts["stop_time"], [0.004, 0.020, 0.040])
 
 
-@pytest.mark.parametrize("session", [SESSION, Session(START)], ids=["told", "untold"])
+@pytest.mark.parametrize(
+    "session",
+    [SESSION, pytest.param(Session(START), marks=pytest.mark.slow)],
+    ids=["told", "untold"],
+)
 def test_nwbinspector_finds_nothing_critical(tmp_path, recording, session):
     nwbinspector = pytest.importorskip("nwbinspector")
     path = tmp_path / "trial.nwb"
@@ -266,15 +282,13 @@ def test_poses_of_others(tmp_path):
         load_tracks(path)
 
 
-def test_bad_files(tmp_path, recording):
+def test_bad_files(tmp_path, stored):
     path = tmp_path / "bad.nwb"
     with pynwb.NWBHDF5IO(str(path), "w") as io:
         io.write(pynwb.NWBFile("session", "id", START))
     with pytest.raises(ValueError, match=r"bad.nwb has no poses"):
         load_tracks(path)
-    save_nwb(path, recording, SESSION)
-    content = path.read_bytes()
-    path.write_bytes(content[: len(content) // 2])
+    path.write_bytes(stored[: len(stored) // 2])
     with pytest.raises(ValueError, match=r"bad.nwb cannot be read as an? "):
         load_tracks(path)
     with h5py.File(path, "w") as file:
@@ -316,9 +330,9 @@ SPOILT = (
 
 
 @pytest.mark.parametrize(("spoil", "said"), SPOILT)
-def test_what_is_wrong_with_a_series_is_said(tmp_path, recording, spoil, said):
+def test_what_is_wrong_with_a_series_is_said(tmp_path, stored, spoil, said):
     path = tmp_path / "bad.nwb"
-    save_nwb(path, recording, SESSION)
+    path.write_bytes(stored)
     with h5py.File(path, "r+") as file:
         found = []
         file.visititems(
@@ -335,9 +349,9 @@ def test_what_is_wrong_with_a_series_is_said(tmp_path, recording, spoil, said):
     assert "Error(" not in str(caught.value)
 
 
-def test_what_is_wrong_with_forces_is_said(tmp_path, recording):
+def test_what_is_wrong_with_forces_is_said(tmp_path, stored):
     path = tmp_path / "bad.nwb"
-    save_nwb(path, recording, SESSION)
+    path.write_bytes(stored)
     for values, said in ((np.zeros((40, 2)), r"shape \(40, 2\)"), ([b"a"] * 40, "numbers are")):
         with h5py.File(path, "r+") as file:
             instead("data", values)(file["processing/behavior/force_C1"])

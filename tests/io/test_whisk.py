@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from vibrissa.contacts import ContactMap
-from vibrissa.io import Kind, join_views, load_tracks, load_whiskers
+from vibrissa.io import Kind, join_views, load_tracks
 
 REAL = Path(__file__).parents[3] / "shared" / "formats" / "test.measurements"
 
@@ -55,7 +55,7 @@ def measurements_file(path, states=STATES):
 
 
 def test_traces_alone(tmp_path):
-    tracks = load_whiskers(whiskers_file(tmp_path / "a.whiskers"), fps=500.0, view="top")
+    tracks = load_tracks(whiskers_file(tmp_path / "a.whiskers"), fps=500.0, view="top")
     assert tracks.attrs["identity"] == "per frame"
     assert tracks["trace"].shape == (3, 3, 1, 31, 2)
     np.testing.assert_allclose(tracks["time"], [0.02, 0.022, 0.024])
@@ -81,14 +81,8 @@ def test_measurements_give_identity_and_direction(tmp_path):
         points = points if points[0, 0] < points[-1, 0] else points[::-1]
         found = tracks["trace"].isel(time=frame - 10, whisker=state, view=0)
         np.testing.assert_array_equal(found[: len(points)], points[:, :2])
-    even = load_whiskers(path, nodes=7)["trace"].isel(time=0, whisker=0, view=0).values
-    np.testing.assert_allclose(even[[0, -1]], SEGMENTS[10, 0][[0, -1], :2])
-    steps = np.linalg.norm(np.diff(even, axis=0), axis=1)
-    np.testing.assert_allclose(steps, steps.mean(), rtol=1e-3)
-    both = join_views(
-        load_whiskers(path, nodes=7, view="top"), load_whiskers(path, nodes=7, view="front")
-    )
-    assert both["trace"].shape == (3, 2, 2, 7, 2)
+    both = join_views(load_tracks(path, view="top"), load_tracks(path, view="front"))
+    assert both["trace"].shape == (3, 2, 2, *tracks["trace"].shape[3:])
 
 
 def test_measurements_alone(tmp_path):
@@ -115,9 +109,9 @@ def test_without_classification_the_state_is_no_identity(tmp_path):
 def test_files_that_do_not_belong_together(tmp_path):
     whiskers = {key: points for key, points in SEGMENTS.items() if key[0] != 12}
     path = whiskers_file(tmp_path / "a.whiskers", whiskers)
-    other = measurements_file(tmp_path / "b.measurements")
-    with pytest.raises(ValueError, match=r"b.measurements does not belong to .*a.whiskers"):
-        load_whiskers(path, other)
+    measurements_file(tmp_path / "a.measurements")
+    with pytest.raises(ValueError, match=r"a.measurements does not belong to .*a.whiskers"):
+        load_tracks(path)
 
 
 def test_whole_or_refused(tmp_path):
@@ -142,11 +136,9 @@ def test_whole_or_refused(tmp_path):
         cut.write_bytes(b"something else, long enough to be one")
         with pytest.raises(ValueError, match="is no"):
             load_tracks(cut, kind)
-    with pytest.raises(ValueError, match="nodes is 1"):
-        load_whiskers(whiskers_file(tmp_path / "whole"), nodes=1)
     nothing = whiskers_file(tmp_path / "nothing", {})
     with pytest.raises(ValueError, match="contains no whiskers"):
-        load_whiskers(nothing)
+        load_tracks(nothing)
 
 
 @pytest.mark.skipif(not REAL.is_file(), reason="the real file is not part of the project")

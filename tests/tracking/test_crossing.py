@@ -17,8 +17,11 @@ def crossing():
     return RowFilm(1, 3, frames=12)
 
 
-@pytest.mark.parametrize("view", [0, 1], ids=["top", "front"])
-@pytest.mark.parametrize("inside", [0.0, 25.0], ids=["at the base", "inside the fur"])
+@pytest.mark.parametrize(
+    ("view", "inside"),
+    [(0, 0.0), (1, 25.0), pytest.param(0, 25.0, marks=pytest.mark.slow)],
+    ids=["top, at the base", "front, inside the fur", "top, inside the fur"],
+)
 def test_crossing_whiskers_stay_themselves(crossing, view, inside):
     truth = crossing.truth[view]
     ahead = truth[0, :, 2] - truth[0, :, 0]
@@ -43,7 +46,9 @@ def test_neighbours_that_nobody_asked_for_keep_their_ends(crossing, asked):
     assert (score[np.isfinite(score)] == 1.0).mean() > 0.97
 
 
-@pytest.mark.parametrize("asked", [0, 1, 2])
+@pytest.mark.parametrize(
+    "asked", [1, *(pytest.param(outer, marks=pytest.mark.slow) for outer in (0, 2))]
+)
 def test_a_single_click_in_a_row_keeps_its_whisker(crossing, asked):
     """By itself it goes on as another one where they cross, in half of the images and more."""
     truth = crossing.truth[0]

@@ -15,7 +15,7 @@ from vibrissa.tracking import (
     track,
 )
 from vibrissa.tracking.recording import remarks_on
-from vibrissa.tracking.refine.least_squares import trace_variance
+from vibrissa.tracking.refine.problem import trace_variance
 from vibrissa.tracking.space.frame_pairs import clear_offsets
 from vibrissa.tracking.space.rest_shape import (
     Length,

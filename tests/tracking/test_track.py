@@ -24,7 +24,7 @@ from vibrissa.tracking import (
     track,
     whisker_at_rest,
 )
-from vibrissa.tracking.refine.least_squares import Smoother
+from vibrissa.tracking.refine.problem import Smoother
 from vibrissa.tracking.space.exchange import exchanged
 from vibrissa.tracking.space.rest_shape import Length
 from vibrissa.tracking.trace.trace import STEP

@@ -383,9 +383,13 @@ def test_pickled_it_is_the_same():
     assert again.base_stiffness == whisker.base_stiffness
 
 
-@pytest.mark.parametrize("stiffness", [None, (1e-3, 2e-3)])
 @pytest.mark.parametrize(
-    "make", [samples.gamma, samples.straight, lambda: Whisker.parabola(0.03, -9)]
+    ("make", "stiffness"),
+    [
+        (samples.gamma, (1e-3, 2e-3)),
+        (samples.straight, None),
+        (lambda: Whisker.parabola(0.03, -9), (1e-3, 2e-3)),
+    ],
 )
 def test_stored_it_is_the_same(make, stiffness, tmp_path):
     whisker = replace(make(), base_stiffness=stiffness, notes=("a note", "über µm"))

@@ -56,7 +56,6 @@ _TO = [
     np.array([_ROWS.index(tuple(np.add(a, b))) for b in _ROWS[:m]])
     for a, m in zip(_ROWS, _MATES, strict=True)
 ]
-_UNKNOWN = [_ROWS.index(tuple(row)) for row in np.eye(3, dtype=int).tolist()]
 
 
 class Poly(NamedTuple):

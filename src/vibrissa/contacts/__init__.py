@@ -19,7 +19,7 @@ from vibrissa.contacts.contacts import (
     Contact,
     Contacts,
     contacts_of as contacts_of,
-    friction_assumed,
+    friction_assumed as friction_assumed,
 )
 from vibrissa.contacts.engine.prior import Prior
 from vibrissa.contacts.engine.readout import (
@@ -43,9 +43,9 @@ from vibrissa.contacts.following.filter import ContactFilter, Followed as Follow
 from vibrissa.contacts.joint.forward import Gravity, read_at_rest as read_at_rest
 from vibrissa.contacts.joint_estimate import estimate_jointly as estimate_jointly
 from vibrissa.contacts.sensing.channels import (
-    RANK,
+    RANK as RANK,
     WRENCH,
-    Channels,
+    Channels as Channels,
     channel_derivatives as channel_derivatives,
     channel_gradients as channel_gradients,
     contact_signal_derivatives as contact_signal_derivatives,
@@ -55,7 +55,7 @@ from vibrissa.contacts.sensing.channels import (
 )
 from vibrissa.contacts.sensing.noise import (
     Noise,
-    SensorNoise,
+    SensorNoise as SensorNoise,
     common_covariance as common_covariance,
     common_errors as common_errors,
     ellipsoids,
@@ -66,10 +66,8 @@ from vibrissa.contacts.two_contacts import bent_by_forces as bent_by_forces, sec
 from vibrissa.contacts.wrench import estimate_from_wrench, rubbing_misfits as rubbing_misfits
 
 __all__ = [
-    "RANK",
     "WRENCH",
     "At",
-    "Channels",
     "Contact",
     "ContactFilter",
     "ContactMap",
@@ -80,11 +78,9 @@ __all__ = [
     "Noise",
     "Prior",
     "Progress",
-    "SensorNoise",
     "ellipsoids",
     "estimate_around",
     "estimate_from_wrench",
-    "friction_assumed",
     "second_contact",
 ]
 __dir__ = __all__.copy

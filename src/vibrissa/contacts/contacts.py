@@ -117,19 +117,7 @@ def candidates_within(number: IntArray, flat: Array, valid: AnyArray) -> Candida
 
 
 def friction_assumed(friction: float) -> str:
-    """Sentence on the friction that an estimate assumes.
-
-    Parameters
-    ----------
-    friction : float
-        Standard deviation of the ratio of the force along the whisker to that across it, as of
-        `Contacts.friction`.
-
-    Returns
-    -------
-    str
-        End of a sentence.
-    """
+    """End of a sentence on the friction that an estimate assumes, as of `Contacts.friction`."""
     if not friction:
         return "no friction assumed"
     if np.isinf(friction):

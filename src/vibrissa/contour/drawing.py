@@ -111,7 +111,7 @@ def _covered_angles(angles: Array, count: int) -> Array:
 
 
 class Ellipsoids(NamedTuple):
-    """Ellipsoids centred at points.
+    """Ellipsoids about points.
 
     Attributes
     ----------
@@ -123,29 +123,6 @@ class Ellipsoids(NamedTuple):
 
     semiaxes: Array
     directions: Array
-
-    def surface(self, points: ArrayLike, count: int = 21) -> Array:
-        """Compute grids over the ellipsoids.
-
-        Parameters
-        ----------
-        points : array_like (..., 3)
-            Centres of the ellipsoids, m.
-        count : int
-            Number of grid points along each of the two directions.
-
-        Returns
-        -------
-        array (..., count, count, 3)
-            Points of the ellipsoids, m.
-        """
-        u, v = np.meshgrid(
-            np.linspace(0.0, 2.0 * np.pi, count), np.linspace(0.0, np.pi, count), indexing="ij"
-        )
-        ball = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
-        stretched = self.semiaxes[..., :, None] * self.directions
-        away = np.einsum("uvk,...ki->...uvi", ball, stretched)
-        return np.asarray(np.asarray(points, dtype=np.float64)[..., None, None, :] + away)
 
 
 def ellipsoids(covariance: ArrayLike, share: float = 0.95) -> Ellipsoids:

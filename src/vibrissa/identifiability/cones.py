@@ -33,7 +33,6 @@ def critical_cones(
     taper_ratios: ArrayLike = TAPER_RATIOS,
     triplets: Sequence[str] = PAPER,
     *,
-    min_separation: float = SEPARATION,
     samples: int = 1024,
     progress: Callable[[int, int], None] | None = None,
 ) -> xr.Dataset:
@@ -51,8 +50,6 @@ def critical_cones(
         Ratios of base radius to tip radius.
     triplets : sequence of str
         Triplets, such as ``"Fx MB MD"``.
-    min_separation : float
-        Distance, as a share of the length, below which two contacts are considered the same.
     samples : int
         Number of contacts of each whisker that are sampled.
     progress : callable, optional
@@ -81,7 +78,7 @@ def critical_cones(
             )
             contact_map = ContactMap.simulate(whisker, grid=False)
             for i, triplet in enumerate(triplets):
-                cone[i, j, k] = _critical_cone(contact_map, triplet, min_separation, samples)
+                cone[i, j, k] = _critical_cone(contact_map, triplet, samples)
             if progress is not None:
                 progress(j * curved.size + k + 1, cone[0].size)
     about = {"units": "rad", "long_name": "smallest cone without witnesses outside it"}
@@ -92,13 +89,11 @@ def critical_cones(
             "taper_ratio": ("taper_ratio", ratios, {"units": "1", "long_name": "taper ratio"}),
             "curvature": ("curvature", curved, {"units": "1", "long_name": "A·L of y = A x²"}),
         },
-        {"kind": "vibrissa critical cones", "min_separation": min_separation, "samples": samples},
+        {"kind": "vibrissa critical cones", "min_separation": SEPARATION, "samples": samples},
     )
 
 
-def _critical_cone(
-    contact_map: ContactMap, triplet: str, min_separation: float, samples: int
-) -> float:
+def _critical_cone(contact_map: ContactMap, triplet: str, samples: int) -> float:
     """Critical cone of one triplet from a search, and further searches outside the cone found."""
     cone = 0.0
     for seed in range(_ROUNDS):
@@ -106,7 +101,6 @@ def _critical_cone(
             contact_map,
             [triplet],
             ["all"],
-            min_separation=min_separation,
             cone=cone,
             samples=samples,
             resolution=False,

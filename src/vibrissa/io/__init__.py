@@ -124,7 +124,6 @@ from vibrissa.io.video import (
     write_movie,
     write_video as write_video,
 )
-from vibrissa.io.whisk import load_whiskers
 from vibrissa.io.whiskers import (
     load_array,
     load_centerline,
@@ -149,7 +148,6 @@ __all__ = [
     "load_signals",
     "load_tracks",
     "load_whisker",
-    "load_whiskers",
     "read_video",
     "recognise",
     "save_array",

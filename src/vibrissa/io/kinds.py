@@ -186,7 +186,7 @@ def load_tracks(
 
     Supported are files of whisk, DeepLabCut, LightningPose, SLEAP, Anipose, movement, NWB
     (ndx-pose) and MATLAB, tables of points, and vibrissa's own tracks and recordings.
-    `load_whiskers` and `load_matlab` have more options.
+    `load_matlab` chooses among several variables.
 
     Parameters
     ----------

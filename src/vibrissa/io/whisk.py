@@ -16,14 +16,14 @@ from __future__ import annotations
 import struct
 from os import PathLike
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.deferred import xr
 from vibrissa.io.paths import check_readable
-from vibrissa.io.tracks import Labels, RawTracks, labelled
+from vibrissa.io.tracks import RawTracks
 from vibrissa.numerics import Array
 
 Numbers = NDArray[np.int64]
@@ -37,62 +37,25 @@ _MOST_BYTES = 2**31
 _MOST_FRAMES = 10_000_000
 
 
-def load_whiskers(
-    path: str | PathLike[str],
-    measurements: str | PathLike[str] | None = None,
-    *,
-    nodes: int | None = None,
-    **labels: Unpack[Labels],
-) -> xr.Dataset:
-    """Read the traces of a whiskers file.
+def read_whiskers(path: str | PathLike[str]) -> RawTracks:
+    """Read a whiskers file as raw tracks, with thickness in pixels and the tracker's score.
 
-    Parameters
-    ----------
-    path : str or path
-        Path of the ``.whiskers`` file.
-    measurements : str or path, optional
-        Path of the ``.measurements`` file of the same video, by default that of the same name in
-        the same folder, if it exists. It states which end is the follicle and, if classified, the
-        whisker of each segment. Without it, whisker i is the i-th segment of each frame, which is
-        not an identity, and the direction of the points is unchanged.
-    nodes : int, optional
-        Number of points per whisker, resampled at equal distances; by default all traced points,
-        padded with NaN to the length of the longest trace.
-    **labels
-        Metadata fps and view; see `Labels`.
-
-    Returns
-    -------
-    xarray.Dataset
-        Tracks with a ``trace``; with ``thickness`` in pixels and the tracker's ``score``.
+    A measurements file of the same name in the same folder states which end is the follicle and, if
+    classified, the whisker of each segment. Without it, whisker i is the i-th segment of each
+    frame, which is not an identity, and the direction of the points is unchanged.
     """
-    return labelled(read_whiskers(path, measurements, nodes), path, **labels)
-
-
-def read_whiskers(
-    path: str | PathLike[str],
-    measurements: str | PathLike[str] | None = None,
-    nodes: int | None = None,
-) -> RawTracks:
-    """Read a whiskers file as raw tracks; see `load_whiskers`."""
     path = check_readable(path)
-    if nodes is not None and nodes < 2:
-        raise ValueError(f"nodes is {nodes}; 2 or more are needed")
     frames, ids, segments = _segments(path)
-    neighbour = path.with_suffix(".measurements")
-    if measurements is None and neighbour.is_file():
-        measurements = neighbour
+    measurements = path.with_suffix(".measurements")
     identity = ids
     about: dict[str, Any] = {"identity": "per frame", "direction": "either"}
-    if measurements is not None:
-        rows = _rows(Path(measurements))
-        segments, identity = _matched(path, Path(measurements), frames, ids, segments, rows)
+    if measurements.is_file():
+        rows = _rows(measurements)
+        segments, identity = _matched(path, measurements, frames, ids, segments, rows)
         about = {"identity": _identity(rows)[1], "direction": "from the follicle"}
     kept = identity >= 0
     frames, identity = frames[kept], identity[kept]
     chosen = [segment for segment, keep in zip(segments, kept, strict=True) if keep]
-    if nodes is not None:
-        chosen = [_resampled(segment, nodes) for segment in chosen]
     filled, whiskers, number = _table(path, frames, identity, chosen)
     measured = ("time", "whisker", "view", "node")
     return RawTracks(
@@ -258,17 +221,6 @@ def _matched(
             "the whiskers file does not have"
         )
     return turned, who
-
-
-def _resampled(points: Array, nodes: int) -> Array:
-    """Points (nodes, 4) at equal distances along a segment."""
-    if len(points) < 2:
-        return np.full((nodes, 4), np.nan)
-    along = np.concatenate(
-        [[0.0], np.cumsum(np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1))]
-    )
-    at = np.linspace(0.0, along[-1], nodes)
-    return np.column_stack([np.interp(at, along, column) for column in points.T])
 
 
 def _places(

@@ -27,7 +27,7 @@ from vibrissa.numerics.arrays import (
     spherical as spherical,
     threads as threads,
     vectors as vectors,
-    weighted_quantile,
+    weighted_quantile as weighted_quantile,
     without_blas_threads as without_blas_threads,
 )
 
@@ -65,7 +65,6 @@ __all__ = [
     "cholesky",
     "copy",
     "solve",
-    "weighted_quantile",
 ]
 __dir__ = __all__.copy
 

@@ -214,22 +214,7 @@ def contact_weights(data: xr.Dataset, region: xr.DataArray | None = None) -> Arr
 
 
 def weighted_quantile(values: AnyArray, weight: Array, shares: float | AnyArray = 0.5) -> Array:
-    """Weighted quantiles of the finite values.
-
-    Parameters
-    ----------
-    values : (n,) array
-        Values of any unit.
-    weight : (n,) array
-        Weights, non-negative.
-    shares : float or array
-        Shares of the total weight, from 0 to 1.
-
-    Returns
-    -------
-    array
-        Quantiles, of the shape of ``shares``; NaN where no value has weight.
-    """
+    """Weighted quantiles of the finite values; NaN where no value has weight."""
     shares = np.asarray(shares, dtype=np.float64)
     kept = np.isfinite(values) & (weight > 0.0)
     if not kept.any():

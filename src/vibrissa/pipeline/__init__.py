@@ -19,7 +19,7 @@ from vibrissa.pipeline.estimates import (
     swept_recording as swept_recording,
     with_events as with_events,
 )
-from vibrissa.pipeline.locate import locate, locate_around, locate_from_wrench
+from vibrissa.pipeline.locate import locate, locate_around as locate_around, locate_from_wrench
 from vibrissa.pipeline.predictors import PREDICTORS as PREDICTORS, predictors
 from vibrissa.pipeline.reconstruct import (
     AGREES as AGREES,
@@ -27,7 +27,7 @@ from vibrissa.pipeline.reconstruct import (
     SOLVED_TO as SOLVED_TO,
     STRONG as STRONG,
     Shape as Shape,
-    compare_contacts,
+    compare_contacts as compare_contacts,
     compare_shapes,
     contour_points as contour_points,
     distances_by_class as distances_by_class,
@@ -53,13 +53,11 @@ from vibrissa.pipeline.stages import (
 )
 
 __all__ = [
-    "compare_contacts",
     "compare_shapes",
     "contact_events",
     "estimates_of",
     "fit_contacts",
     "locate",
-    "locate_around",
     "locate_from_wrench",
     "placed_by",
     "predictors",

@@ -443,31 +443,9 @@ def compare_contacts(
     whiskers: Sequence[Whisker] | None = None,
     seed: int = 0,
 ) -> xr.Dataset:
-    """Compare the contacts of a recording with the known object nearest to them.
+    """Compare the contacts of a recording with the known object nearest to them, ``object``.
 
-    Parameters
-    ----------
-    recording : xarray.DataTree
-        Recording with a group ``estimates``.
-    objects : sequence of Surface, optional
-        Objects in the laboratory frame; by default those of the recording.
-    whiskers : sequence of Whisker, optional
-        Whiskers; by default those of the recording.
-    seed : int
-        Seed of the random draws from the covariances.
-
-    Returns
-    -------
-    xarray.Dataset
-        Dataset of dimensions time, whisker: ``surface_distance`` and, over ``replicate`` too,
-        ``surface_distance_predicted`` (`vibrissa.contour.compare_with`); ``deflection_angle`` and
-        ``r`` of each contact and, if there are signals, ``MB``. The attribute ``object`` is the
-        index of the object.
-
-    Raises
-    ------
-    ValueError
-        If there are no estimates, no contacts or no objects.
+    Distances are those of `vibrissa.contour.compare_with`.
     """
     estimates = estimates_in(recording)
     trial, contacts = Recording(recording), Group(estimates)

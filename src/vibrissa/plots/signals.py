@@ -171,12 +171,7 @@ def _sheet(width: style.Width) -> _Sheet:
 
 
 def signal_clouds(
-    samples: xr.Dataset,
-    centerline: ArrayLike,
-    *,
-    width: style.Width = "double",
-    elevation: float = ELEVATION,
-    azimuth: float = AZIMUTH,
+    samples: xr.Dataset, centerline: ArrayLike, *, width: style.Width = "double"
 ) -> Figure:
     """Draw the reachable space of a whisker, and the six signals over it.
 
@@ -195,8 +190,6 @@ def signal_clouds(
         Resting whisker from base to tip, whisker frame, m; drawn in black.
     width : {"single", "double"}
         Columns of the page.
-    elevation, azimuth : float
-        Direction of view, degrees.
 
     Returns
     -------
@@ -209,7 +202,7 @@ def signal_clouds(
         If the dataset lacks something, or if there is no such width.
     """
     # The bearings that remain when the quarter facing the viewer is removed.
-    toward = float(np.arctan2(np.sign(elevation), np.sign(np.sin(np.radians(azimuth)))))
+    toward = float(np.arctan2(np.sign(ELEVATION), np.sign(np.sin(np.radians(AZIMUTH)))))
     kept = toward + np.pi / 4.0, toward + 7.0 * np.pi / 4.0
     nodes = scene.sample_contacts(samples, centerline, kept)
     whole = scene.sample_contacts(samples, centerline)
@@ -217,7 +210,7 @@ def signal_clouds(
     triangles = scene.solid_surface(nodes, False, outside)
     line = to_display("centerline", centerline)
     limits = bounds(np.concatenate([contact_points(triangles).reshape(-1, 3), line]))
-    view = elevation, azimuth
+    view = ELEVATION, AZIMUTH
     sheet = _sheet(width)
     with style.looking():
         figure = style.new_figure(width, sheet.height, None)

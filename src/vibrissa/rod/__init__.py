@@ -11,23 +11,23 @@ from vibrissa.rod.around import (
     deflect_around,
 )
 from vibrissa.rod.chart import (
-    CELLS,
-    LEAST_ARC,
+    CELLS as CELLS,
+    LEAST_ARC as LEAST_ARC,
     PROXIMAL,
     Charted as Charted,
     Fold as Fold,
     StableSet as StableSet,
-    along,
+    along as along,
     chart_of as chart_of,
     chart_to_contact as chart_to_contact,
     charted_rod as charted_rod,
-    contacts_at,
+    contacts_at as contacts_at,
     determinant as determinant,
-    fold_force,
-    fold_forces,
+    fold_force as fold_force,
+    fold_forces as fold_forces,
     interpolant as interpolant,
     interpolate as interpolate,
-    stable_set,
+    stable_set as stable_set,
     with_normal_force as with_normal_force,
 )
 from vibrissa.rod.deflection import Deflection, Load, PegContact, PointContact, PointForce
@@ -40,15 +40,20 @@ from vibrissa.rod.discretization import (
 )
 from vibrissa.rod.gravity import (
     Resting,
-    Weighted,
+    Weighted as Weighted,
     evaluated as evaluated,
     near_direction as near_direction,
     resting,
 )
-from vibrissa.rod.integration import contact_tangents, evaluate, integrate, solve_forces
+from vibrissa.rod.integration import (
+    contact_tangents as contact_tangents,
+    evaluate as evaluate,
+    integrate as integrate,
+    solve_forces,
+)
 from vibrissa.rod.kernels import (
-    BUFFER_SIZE,
-    LANES,
+    BUFFER_SIZE as BUFFER_SIZE,
+    LANES as LANES,
     contact_state as contact_state,
     lane_slopes as lane_slopes,
     lane_tangents as lane_tangents,
@@ -58,13 +63,13 @@ from vibrissa.rod.kernels import (
     set_lane as set_lane,
 )
 from vibrissa.rod.newton import (
-    ROUNDING,
-    TOLERANCE,
+    ROUNDING as ROUNDING,
+    TOLERANCE as TOLERANCE,
     Group as Group,
     group_room as group_room,
-    newton_group,
+    newton_group as newton_group,
     point_determinant as point_determinant,
-    stable,
+    stable as stable,
     start_from as start_from,
 )
 from vibrissa.rod.obstacles import Equilibrium as Equilibrium
@@ -75,11 +80,11 @@ from vibrissa.rod.outward import (
 )
 from vibrissa.rod.points import PointSolver as PointSolver, point_solver as point_solver
 from vibrissa.rod.search import (
-    MOST_CELLS,
-    MOST_SEEDS,
+    MOST_CELLS as MOST_CELLS,
+    MOST_SEEDS as MOST_SEEDS,
     cells_around as cells_around,
     seed_room as seed_room,
-    seeds,
+    seeds as seeds,
 )
 from vibrissa.rod.statics import check_objects as check_objects, deflect
 from vibrissa.rod.surfaces import (
@@ -92,20 +97,12 @@ from vibrissa.rod.tree import (
     SearchTree as SearchTree,
     balance_rows as balance_rows,
     balanced as balanced,
-    search_tree,
+    search_tree as search_tree,
 )
 
 __all__ = [
-    "BUFFER_SIZE",
-    "CELLS",
-    "LANES",
-    "LEAST_ARC",
-    "MOST_CELLS",
-    "MOST_SEEDS",
     "PROXIMAL",
-    "ROUNDING",
     "STEPS",
-    "TOLERANCE",
     "Deflection",
     "Discretization",
     "Load",
@@ -114,23 +111,10 @@ __all__ = [
     "PointContact",
     "PointForce",
     "Resting",
-    "Weighted",
-    "along",
-    "contact_tangents",
-    "contacts_at",
     "deflect",
     "deflect_around",
     "discretize",
-    "evaluate",
-    "fold_force",
-    "fold_forces",
-    "integrate",
-    "newton_group",
     "resting",
-    "search_tree",
-    "seeds",
     "solve_forces",
-    "stable",
-    "stable_set",
 ]
 __dir__ = __all__.copy

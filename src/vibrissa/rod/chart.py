@@ -105,26 +105,8 @@ def stable_set(
 ) -> StableSet:
     """Compute the chart of a whisker's stable contacts; cached.
 
-    Parameters
-    ----------
-    whisker : Bendable
-        Whisker, with or without weight.
-    proximal : float
-        Smallest arc length of a contact, over L.
-    cells : tuple of int
-        Number of cells along (η, ψ, ρ).
-    steps : int
-        Number of integration steps along the whisker.
-
-    Returns
-    -------
-    StableSet
-        Contacts at the nodes, with base force, contact point and derivatives.
-
-    Raises
-    ------
-    ValueError
-        If ``proximal`` is below 0.05 or not below 1.
+    ``proximal`` is the smallest arc length of a contact, over L, and ``cells`` the number of cells
+    along (η, ψ, ρ).
     """
     if not 0.05 <= proximal < 1.0:
         raise ValueError(
@@ -327,20 +309,7 @@ def _slopes(x: Array, values: Array, periodic: bool = False) -> Array:
 
 
 def contacts_at(fold: Fold, chart: Array) -> Array:
-    """Convert chart coordinates into contacts.
-
-    Parameters
-    ----------
-    fold : Fold
-        Fold force over the chart.
-    chart : (n, 3) array
-        Coordinates (η, ψ, ρ).
-
-    Returns
-    -------
-    (n, 3) array
-        Contacts ξ.
-    """
+    """Convert chart coordinates (η, ψ, ρ) (n, 3) into contacts ξ (n, 3)."""
     contacts = np.empty((len(chart), 3))
     _contacts_at(fold, np.ascontiguousarray(chart), contacts)
     return contacts
@@ -431,20 +400,7 @@ def chart_of(fold: Fold, contacts: Array) -> Array:
 
 
 def fold_forces(fold: Fold, contacts: Array) -> Array:
-    """Fold force at the arc length and bearing of each contact.
-
-    Parameters
-    ----------
-    fold : Fold
-        Fold force over the chart.
-    contacts : (n, 3) array
-        Contacts ξ.
-
-    Returns
-    -------
-    (n,) array
-        Forces, over EI/L².
-    """
+    """Fold force (n,), over EI/L², at the arc length and bearing of each contact ξ (n, 3)."""
     forces = np.empty(len(contacts))
     _fold_forces_at(fold, np.ascontiguousarray(contacts), forces)
     return forces

@@ -49,25 +49,14 @@ class Traced(NamedTuple):
 
 
 class Weighted(NamedTuple):
-    """Solved contacts of a rod with weight, non-dimensional.
+    """Solved contacts of a rod with weight, non-dimensional; derivatives only if requested."""
 
-    Attributes
-    ----------
-    states : (n, 13) array
-        Force F and contact point p, direction of weight ĝ, moment of the weight μ at the base, and
-        a number that vanishes where the whisker topples under its weight.
-    tangents : (n, 12, 4) array
-        Derivatives of the first 12 by (s, f_x, f_y, f_z); no rows unless requested.
-    directions : (n, 12, 3) array
-        Derivatives of the first 12 by the direction of weight; no rows unless requested.
-    leans : (n, 3) array
-        Directions of weight in the material frame at the tip.
-    """
-
+    # (n, 13): force F, contact point p, direction of weight ĝ, moment of the weight μ at the base,
+    # and a number that vanishes where the whisker topples under its weight
     states: Array
-    tangents: Array
-    directions: Array
-    leans: Array
+    tangents: Array  # (n, 12, 4), derivatives of the first 12 by (s, f_x, f_y, f_z)
+    directions: Array  # (n, 12, 3), derivatives of the first 12 by the direction of weight
+    leans: Array  # (n, 3), directions of weight in the material frame at the tip
 
 
 @dataclass(frozen=True)

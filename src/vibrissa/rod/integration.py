@@ -122,20 +122,7 @@ def solve_forces(
 
 
 def contact_tangents(discretization: Discretization, contacts: Array) -> Array:
-    """Compute unit tangents of the deflected whisker at its contacts.
-
-    Parameters
-    ----------
-    discretization : Discretization
-        Rod.
-    contacts : (n, 4) array
-        Arc length and force in the material frame there, (s, f_x, f_y, f_z).
-
-    Returns
-    -------
-    (n, 3) array
-        Tangents in the whisker frame.
-    """
+    """Unit tangents (n, 3) of the deflected whisker at contacts (n, 4), in its own frame."""
     contacts = np.ascontiguousarray(contacts, dtype=np.float64)
     tangents = np.empty((len(contacts), 3))
     share_out(len(contacts), carry_tangents, discretization.rod, contacts, tangents)

@@ -174,27 +174,10 @@ def search_tree(
 ) -> SearchTree:
     """Build the tree for the search for contacts with given values of three quantities.
 
-    Parameters
-    ----------
-    chart : StableSet
-        Chart at whose nodes the quantities are known.
-    values : (i, j, k, 3) array
-        Three quantities at the nodes, of any unit.
-    derivatives : (i, j, k, 3, 3) array
-        Derivatives of the values by ξ there.
-    angles : tuple of bool
-        Whether each of them is an angle, compared on the circle.
-    plane : PlaneVector, optional
-        Vector whose length, direction, or both are among the quantities.
-    vanishing : tuple of bool
-        Whether each of them vanishes at rest.
-    balance : Balance, optional
-        Balance of force and moment, if F_x is among them.
-
-    Returns
-    -------
-    SearchTree
-        Arrays for the kernels.
+    ``values`` (i, j, k, 3) are those at the chart's nodes, ``derivatives`` (i, j, k, 3, 3) theirs
+    by ξ. ``plane`` is the vector whose length, direction, or both are among the quantities, and
+    ``balance`` that of force and moment, if F_x is. Flags state which are angles, and which
+    vanish at rest.
     """
     size = np.array([1.0, 2.0 * np.pi, 1.0]) / (np.array(values.shape[:3]) - 1)
     circular = np.array(angles)

@@ -7,7 +7,7 @@ from vibrissa.scene.course import (
     TRIPLET as TRIPLET,
     Course,
     course_of,
-    deflection_angles,
+    deflection_angles as deflection_angles,
 )
 from vibrissa.scene.solids import (
     COORDINATES as COORDINATES,
@@ -50,6 +50,5 @@ from vibrissa.scene.solids import (
 __all__ = [
     "Course",
     "course_of",
-    "deflection_angles",
 ]
 __dir__ = __all__.copy

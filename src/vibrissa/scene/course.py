@@ -174,20 +174,9 @@ def _traces(root: Group, truth: Group) -> tuple[Array, ...]:
 
 
 def deflection_angles(course: Course, centerline: ArrayLike) -> Array:
-    """Compute the angle at the base between contacts and the resting whisker.
+    """Angles (n,) at the base between contacts and a resting whisker (k, 3), m; NaN if free.
 
-    Parameters
-    ----------
-    course : Course
-        Whisker of a trial.
-    centerline : array_like (k, 3)
-        Resting whisker, whisker frame, m.
-
-    Returns
-    -------
-    array (n,)
-        Angle in each frame, rad; its tangent is the distance of the contact from the resting
-        whisker over the arc length of the closest point; NaN without contact.
+    The tangent is the distance from the resting whisker over the arc length of its closest point.
     """
     angles = np.full(len(course.time), np.nan)
     if course.places is None:

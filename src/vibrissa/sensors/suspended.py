@@ -332,6 +332,7 @@ GRAIN = 0.3e-3  # motion of the base below which samples share their error, m
 NORMAL, SLIDING, STRETCH = 0.017, 0.2, 5e-3
 _LEAST_STEP = 1e-6  # smallest motion of the base between two samples, in units of L
 _FEWEST = 5
+_TOUCHED = 4.0  # change of a reading in contact, in standard deviations of noise and drift
 _STARTS = (0.45, 0.65, 0.85)
 # Largest number of steps, and relative gain at which they end: at 1e-4 the error is up to 0.4 mm.
 _SWEEP_ROUNDS, _ENOUGH = 100, 1e-6
@@ -380,7 +381,6 @@ def follow_sweep(
     rotation: ArrayLike | None = None,
     *,
     rest: ArrayLike | None = None,
-    threshold: float = 4.0,
 ) -> SweptContacts:
     """Estimate the contacts during a sweep, with their onset and loss.
 
@@ -397,8 +397,6 @@ def follow_sweep(
     rest : array_like (k,) or (n, k), optional
         Readings of the untouched whisker, of each sample if they drift during the sweep; by
         default those of the first sample.
-    threshold : float
-        Change of a reading above which there is contact, in standard deviations of noise and drift.
 
     Returns
     -------
@@ -415,7 +413,7 @@ def follow_sweep(
         )
     turn = np.broadcast_to(turn, (len(y), 3, 3))
     change = y - (y[0] if rest is None else numbers("rest", rest))
-    touching = np.any(np.abs(change) > threshold * sensor.uncertainty, axis=1)
+    touching = np.any(np.abs(change) > _TOUCHED * sensor.uncertainty, axis=1)
     n = len(y)
     out = SweptContacts(
         np.full((n, 3), np.nan),

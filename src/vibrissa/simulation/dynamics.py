@@ -58,6 +58,7 @@ _PARTS = 4  # number of samples of the distance from objects on each segment
 _NEAR = 1e-4  # gap below which a minimum of the distance is refined, m
 _ZOOM = np.linspace(-1.0, 1.0, 9) / _PARTS  # offsets at which a minimum is refined, in segments
 _CREEP = 1e-3  # speed below which friction is regularised, m/s
+_RIGID = 200.0  # stiffness of rigid objects, which are indented by micrometres, N/m
 
 
 @dataclass(frozen=True)
@@ -74,22 +75,18 @@ class Dynamics:
         Number of segments of the whisker, more than three.
     step : float
         Longest time step, s.
-    contact_stiffness : float
-        Stiffness of rigid objects, N/m; the default allows indentations of micrometres.
     """
 
     density: tuple[float, float] = DENSITY
     damping_ratio: float = DAMPING_RATIO
     segments: int = 32
     step: float = 1e-4
-    contact_stiffness: float = 200.0
 
     def __post_init__(self) -> None:
         numbers = {
             "density": min(self.density) if np.shape(self.density) == (2,) else np.nan,
             "segments": self.segments - 3,
             "step": self.step,
-            "contact_stiffness": self.contact_stiffness,
         }
         faults = [
             f"{name} is {getattr(self, name)!r}; it must be positive"
@@ -132,7 +129,7 @@ def move_dynamically(
         chain,
         surfaces,
         damping_time(chain, dynamics.damping_ratio),
-        [s.stiffness if np.isfinite(s.stiffness) else dynamics.contact_stiffness for s in surfaces],
+        [s.stiffness if np.isfinite(s.stiffness) else _RIGID for s in surfaces],
         friction,
         frame / parts,
     )

@@ -1,11 +1,11 @@
 """Tracking: from two videos to a whisker's 3D shape, pose, contact and wrench in every frame."""
 
-from vibrissa.tracking.recording import Tracked, unexplained_frames as unexplained_frames
+from vibrissa.tracking.recording import Tracked as Tracked, unexplained_frames as unexplained_frames
 from vibrissa.tracking.refine.fit import RodFit as RodFit
 from vibrissa.tracking.refine.problem import FitOptions as FitOptions
 from vibrissa.tracking.refine.rods import TraceSeries as TraceSeries
 from vibrissa.tracking.space.curve import SpaceCurve as SpaceCurve, merge
-from vibrissa.tracking.space.frame_pairs import paired_frames
+from vibrissa.tracking.space.frame_pairs import paired_frames as paired_frames
 from vibrissa.tracking.space.pose import (
     CUTOFF,
     BasePose as BasePose,
@@ -20,7 +20,7 @@ from vibrissa.tracking.space.rest_shape import (
     rest_shape,
     whisker_at_rest as whisker_at_rest,
 )
-from vibrissa.tracking.trace.curves import Found, find_whiskers as find_whiskers
+from vibrissa.tracking.trace.curves import Found as Found, find_whiskers as find_whiskers
 from vibrissa.tracking.trace.start import (
     FRAMES,
     Candidate,
@@ -36,11 +36,11 @@ from vibrissa.tracking.trace.trace import (
 )
 from vibrissa.tracking.trace.video import (
     partial_traces as partial_traces,
-    start_frames,
-    trace_file,
+    start_frames as start_frames,
+    trace_file as trace_file,
     trace_video,
 )
-from vibrissa.tracking.track import TrackOptions, track, track_whisker
+from vibrissa.tracking.track import TrackOptions, track, track_whisker as track_whisker
 from vibrissa.tracking.tracker_points import (
     TrackerTraces as TrackerTraces,
     tracker_traces as tracker_traces,
@@ -50,21 +50,15 @@ __all__ = [
     "CUTOFF",
     "FRAMES",
     "Candidate",
-    "Found",
     "Start",
     "Trace",
     "TraceOptions",
     "TrackOptions",
-    "Tracked",
     "base_pose",
     "find_start",
     "merge",
-    "paired_frames",
     "rest_shape",
-    "start_frames",
-    "trace_file",
     "trace_video",
     "track",
-    "track_whisker",
 ]
 __dir__ = __all__.copy

@@ -160,48 +160,20 @@ def _compared(points: Array, rod: RodFit, source: str) -> ContactPoints:
 
 @dataclass(frozen=True, eq=False)
 class Tracked:
-    """One whisker, tracked.
+    """One whisker, tracked."""
 
-    Parameters
-    ----------
-    whisker : Whisker
-        Whisker at rest.
-    traces : TraceSeries
-        Traces of it in the views.
-    curves : array (time, node, 3)
-        Points merged from the views, laboratory frame, m.
-    covariance : array (time, node, 3, 3)
-        Covariance of the curves, m².
-    shape : RestShape
-        Shape from which the whisker was taken.
-    pose : BasePose
-        Pose of the base relative to the head, filtered, by the paper's method.
-    unfiltered : BasePose
-        Pose before filtering.
-    touching : array (time,)
-        Whether the whisker is in contact in each frame.
-    fit : RodFit
-        Rod that fits the traces.
-    head : HeadPose
-        Pose of the head in these frames.
-    length : Length
-        Length of the whisker; its standard deviation is 0 where it is given.
-    contacts : ContactPoints, optional
-        Contact points that do not come from the rod.
-    """
-
-    whisker: Whisker
+    whisker: Whisker  # at rest
     traces: TraceSeries
-    curves: Array
-    covariance: Array
-    shape: RestShape
-    pose: BasePose
-    unfiltered: BasePose
-    touching: Mask
+    curves: Array  # (time, node, 3), merged from the views, laboratory frame, m
+    covariance: Array  # (time, node, 3, 3), of the curves, m²
+    shape: RestShape  # from which the whisker was taken
+    pose: BasePose  # of the base relative to the head, filtered, by the paper's method
+    unfiltered: BasePose  # pose before filtering
+    touching: Mask  # (time,), whether the whisker is in contact
     fit: RodFit
-    head: HeadPose
-    length: Length
-    contacts: ContactPoints | None = None
+    head: HeadPose  # its pose in these frames
+    length: Length  # with a standard deviation of 0 where it is given
+    contacts: ContactPoints | None = None  # those that do not come from the rod
 
 
 def tracked_recording(

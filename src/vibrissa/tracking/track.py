@@ -447,37 +447,7 @@ def track_whisker(
     head: HeadPose | None = None,
     objects: Sequence[Surface] = (),
 ) -> Tracked:
-    """Track one whisker in space.
-
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        Cameras of the views.
-    traces : sequence of sequence of Trace
-        Traces view by view, frame by frame, of frames that belong together.
-    rate : float
-        Frames per second.
-    options : TrackOptions
-        Settings of tracking.
-    name : str
-        Name of the whisker.
-    progress : callable, optional
-        Function that is called as ``progress(stage, done, total)``.
-    head : HeadPose, optional
-        Pose of the head in these frames; by default it does not move.
-    objects : sequence of Surface, optional
-        Known objects, on which contacts are.
-
-    Returns
-    -------
-    Tracked
-        Whisker with its pose, contact and wrench.
-
-    Raises
-    ------
-    ValueError
-        If it is seen in too few frames, or the views show different whiskers.
-    """
+    """Track one whisker in space, from traces of frames that belong together, view by view."""
     report = progress or (lambda stage, done, total: None)
     count = len(traces[0])
     traces = _with_one_tip(cameras, traces)

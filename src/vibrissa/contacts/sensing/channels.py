@@ -51,33 +51,15 @@ _PAIRS = {("FT", "FD"): ("Fy", "Fz"), ("MB", "MD"): ("My", "Mz")}
 
 @dataclass(frozen=True)
 class Channels:
-    """Channels that a set of signals is fitted to.
+    """Channels that a set of signals is fitted to."""
 
-    Attributes
-    ----------
-    signals : tuple of str
-        Signals, in canonical order.
-    names : tuple of str
-        Channel of each: itself, or a component where size and direction are both there.
-    """
-
-    signals: tuple[str, ...]
+    signals: tuple[str, ...]  # in canonical order
+    # channel of each: itself, or a component where size and direction are both there
     names: tuple[str, ...]
 
     @classmethod
     def of(cls, signals: tuple[str, ...]) -> Channels:
-        """Choose the channels for signals in canonical order.
-
-        Parameters
-        ----------
-        signals : tuple of str
-            Signals.
-
-        Returns
-        -------
-        Channels
-            Channels of the signals.
-        """
+        """Choose the channels for signals in canonical order."""
         names = list(signals)
         for pair, components in _PAIRS.items():
             if set(pair) <= set(names):
@@ -86,13 +68,7 @@ class Channels:
         return cls(signals, tuple(names))
 
     def pairs(self) -> list[int]:
-        """Indices of the sizes that are followed by their direction as components of one vector.
-
-        Returns
-        -------
-        list of int
-            Index of each size.
-        """
+        """Indices of the sizes that are followed by their direction as components of one vector."""
         return [
             i
             for i, name in enumerate(self.names)
@@ -100,18 +76,7 @@ class Channels:
         ]
 
     def targets(self, measured: Array) -> Array:
-        """Convert measured signals to channels.
-
-        Parameters
-        ----------
-        measured : (n, k) array
-            Measured signals, non-dimensional.
-
-        Returns
-        -------
-        (n, k) array
-            Channels.
-        """
+        """Convert measured signals (n, k) to channels (n, k), non-dimensional."""
         out = measured.copy()
         for i in self.pairs():
             size, angle = measured[:, i], measured[:, i + 1]
@@ -125,24 +90,10 @@ class Channels:
         values: Array,
         discretization: Discretization,
     ) -> Array:
-        """Covariance of the channels.
+        """Covariances (n, k, k) of the channels of measured signals (n, k), non-dimensional.
 
-        Parameters
-        ----------
-        sensor : SensorNoise or None
-            Noise; without it components count as known to a share of force and moment.
-        measured : (n, k) array
-            Measured signals, non-dimensional.
-        values : (n, 6 or 9) array
-            Base force and contact point of the contacts, non-dimensional, and what the moment of
-            the weight has changed by.
-        discretization : Discretization
-            Rod, with its units.
-
-        Returns
-        -------
-        (n, k, k) array
-            Covariances, non-dimensional.
+        ``values`` (n, 6 or 9) are base force and contact point, and what the moment of the weight
+        has changed by. Without a sensor components count as known to a share of force and moment.
         """
         if sensor is not None and sensor.deviations is not None:
             own = self._by_deviations(sensor.deviations, measured, discretization)

@@ -49,45 +49,15 @@ _NONE = np.zeros((0, 6, 7))
 
 @dataclass(frozen=True, eq=False)
 class SensorNoise:
-    """Noise of a sensor; made by :meth:`of`.
+    """Noise of a sensor; made by :meth:`of`."""
 
-    Attributes
-    ----------
-    deviations : dict or None
-        Standard deviation of each signal, SI units.
-    wrench : (6, 6) array or None
-        Covariance of (F, M), SI units; the one of the two that is known.
-    errors : (n, 6, 7) array
-        Errors that all measurements share, as of `common_errors`.
-    """
-
-    deviations: dict[str, float] | None
-    wrench: Array | None
-    errors: Array = field(default_factory=_NONE.copy)
+    deviations: dict[str, float] | None  # standard deviation of each signal, SI units; or
+    wrench: Array | None  # (6, 6), covariance of (F, M), SI units
+    errors: Array = field(default_factory=_NONE.copy)  # (n, 6, 7), as of `common_errors`
 
     @classmethod
     def of(cls, noise: Noise, names: tuple[str, ...], errors: Array = _NONE) -> SensorNoise:
-        """Read and check the stated noise.
-
-        Parameters
-        ----------
-        noise : mapping or (6, 6) array_like
-            Standard deviation of each signal, or covariance of (F, M), SI units.
-        names : tuple of str
-            Signals that it is needed for.
-        errors : (n, 6, 7) array
-            Errors that all measurements share.
-
-        Returns
-        -------
-        SensorNoise
-            The noise.
-
-        Raises
-        ------
-        ValueError
-            If a signal's noise is missing, or numbers are not those of noise.
-        """
+        """Read and check the noise of signals, and errors (n, 6, 7) that all measurements share."""
         if isinstance(noise, Mapping):
             missing = [name for name in names if name not in noise]
             if missing:
@@ -128,19 +98,9 @@ class SensorNoise:
         return cls(None, wrench, errors)
 
     def covariance(self, names: tuple[str, ...], force: Array, moment: Array) -> Array:
-        """Covariance of signals.
+        """Covariances (n, k, k) of signals of force and moment (n, 3), SI units.
 
-        Parameters
-        ----------
-        names : tuple of str
-            Signals.
-        force, moment : (n, 3) arrays
-            Base force and moment, N and N·m.
-
-        Returns
-        -------
-        (n, k, k) array
-            Covariances, SI units; NaN where a direction has no meaning.
+        They are NaN where a direction has no meaning.
         """
         if self.wrench is None:
             assert self.deviations is not None

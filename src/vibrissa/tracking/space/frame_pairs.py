@@ -45,28 +45,10 @@ class Offsets(NamedTuple):
 def paired_frames(
     cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]], offset: int | None = 0
 ) -> Pairs:
-    """Find the simultaneous frames of two or more videos.
+    """Find the simultaneous frames (time, view) of two or more videos.
 
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        Cameras of the views.
-    traces : sequence of sequence of Trace
-        Traces of one whisker, view by view, frame by frame.
-    offset : int, optional
-        Number of frames by which the other videos began earlier than the first: its frame 0 is
-        their frame ``offset``. None: it is found, and dropped frames too, where they explain the
-        views clearly better than none.
-
-    Returns
-    -------
-    array (time, view)
-        Frame numbers that belong together.
-
-    Raises
-    ------
-    ValueError
-        If no frames belong together.
+    Frame 0 of the first video is frame ``offset`` of the others. If it is None, it is found, and
+    dropped frames too, where they explain the views clearly better than none.
     """
     columns = [np.arange(len(traces[0]))]
     for camera, row in zip(cameras[1:], traces[1:], strict=True):

@@ -469,18 +469,10 @@ def _body_before(line: Array, bodies: Bodies) -> tuple[Array, int]:
 
 
 class Found(NamedTuple):
-    """Whisker in one frame.
+    """Whisker in one frame."""
 
-    Attributes
-    ----------
-    trace : Trace
-        Trace from base to tip.
-    from_face : bool
-        Whether it begins at something dark.
-    """
-
-    trace: Trace
-    from_face: bool
+    trace: Trace  # from base to tip
+    from_face: bool  # whether it begins at something dark
 
 
 def find_whiskers(frame: Frame, options: TraceOptions | None = None) -> list[Found]:

@@ -405,26 +405,9 @@ def partial_traces(recording: str | PathLike[str], view: int) -> Path:
 def start_frames(
     videos: Sequence[str | PathLike[str]], offset: int = 0
 ) -> tuple[list[int], list[list[Frame]]]:
-    """Read frames of the beginning of a film, from which its whisker can be found.
+    """Read frames of the beginning of a film, view by view, from which its whisker can be found.
 
-    Parameters
-    ----------
-    videos : sequence of str or path
-        Video of each view.
-    offset : int
-        Number of frames by which the other cameras began before the first.
-
-    Returns
-    -------
-    numbers : list of int
-        Numbers of the frames in the first video.
-    frames : list of list of array (height, width)
-        Frames of the same moments, view by view.
-
-    Raises
-    ------
-    ValueError
-        If a video has no frames of these moments.
+    Their numbers in the first video are returned too; the others began ``offset`` frames earlier.
     """
     firsts = [max(-offset, 0), *(max(offset, 0) for _ in videos[1:])]
     pairs = list(zip(videos, firsts, strict=True))
@@ -453,33 +436,11 @@ def trace_file(
     begins: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[list[Trace]]:
-    """Trace the whiskers of a video file, or resume an interrupted run.
+    """Trace the whiskers of a video file, or resume an interrupted run; as `trace_video` otherwise.
 
-    Parameters
-    ----------
-    video : str or path
-        File of the video.
-    partial : str or path
-        File that keeps the traces, also when the work is stopped by an exception such as
-        ``KeyboardInterrupt``; the caller removes it at the end. Traces of another video, or made
-        with other settings, are not used.
-    bases : sequence of (column, row), optional
-        Column and row where each whisker begins, as in `trace_video`.
-    options : TraceOptions, optional
-        Settings of tracing.
-    corrections : mapping, optional
-        Points along whiskers, as in `trace_video`.
-    mask : array (height, width) of bool, optional
-        Pixels in which no whisker is measured.
-    begins : int
-        Number of the first frame that shows them, as in `trace_video`.
-    progress : callable, optional
-        Function that is called as ``progress(done, total)`` with numbers of frames.
-
-    Returns
-    -------
-    list of list of Trace
-        Traces of each whisker, frame by frame.
+    Traces are kept in the file ``partial``, also when the work is stopped by an exception such as
+    ``KeyboardInterrupt``; the caller removes it at the end. Traces of another video, or of other
+    settings, are not used.
     """
     video, partial = Path(video), Path(partial)
     about = without_part(video)[0].stat()

@@ -180,7 +180,8 @@ def _recording(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
     yield "duration", f"{found.duration:g} s, {found.frames} frames{rate}{moves}"
     yield "contacts", _contacts(found)
     if found.events:
-        yield "events", ", ".join(f"{name}: {n}" for name, n in found.events.items())
+        events = ", ".join(f"{name}: {n}" for name, n in found.events.items())
+        yield "events", f"{events} (of the estimates)"
     missing = [stage for stage in vb.pipeline.STAGES if stage not in found.stages]
     lacking = ", ".join(missing)
     there = ", ".join(found.stages) or "none"

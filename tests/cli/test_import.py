@@ -382,7 +382,7 @@ def test_the_frame_rate_is_asked_for_and_views_are_matched_by_name(trial, tmp_pa
         raw = RawTracks("test", ["w"], image=image, views=views, fps=500.0)
         found = tracker_traces(labelled(raw, "a"), CAMERAS)
         assert [camera.name for camera in found.cameras] == [CAMERAS[i].name for i in order]
-        assert any("in their order" in note for note in found.notes) == guessed
+        assert any("in order" in note for note in found.notes) == guessed
 
 
 def test_ends_and_curvature_make_an_arc():

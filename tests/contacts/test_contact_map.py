@@ -81,7 +81,7 @@ def test_a_file_of_another_kind_is_refused(tmp_path):
     xr.Dataset(coords={"whisker": ["a"]}, attrs={"kind": "vibrissa recording"}).to_netcdf(
         trial, engine="h5netcdf"
     )
-    with pytest.raises(ValueError, match="what it holds: vibrissa recording"):
+    with pytest.raises(ValueError, match="it contains: vibrissa recording"):
         vb.ContactMap.load(trial)
 
 

@@ -170,7 +170,7 @@ def test_an_offset_is_found_of_views_that_show_the_whisker_along_itself(pair):
     pairs = paired_frames(pair, [first, second], None)
     assert np.mean(pairs[:, 0] != np.array(numbers)[pairs[:, 1]]) < 0.05
     (said,) = remarks_on_time(pair, [first, second], None)
-    assert "found is -7 frames" in said
+    assert "-7 frames" in said
     assert (clear_offsets(*pair, first, second, 0).shifts == -7).all()
     assert (clear_offsets(*pair, first, second, -7).shifts == -7).all()
 

@@ -62,7 +62,7 @@ def test_pages_from_elsewhere_are_refused(capsys):
         assert answer(viewer, viewer.url) == 101
         assert answer(viewer, None) == 101
         port = viewer.page.server.get_port()
-        with pytest.raises(ValueError, match=f"port {port} of 127.0.0.1 is taken"):
+        with pytest.raises(ValueError, match=f"port {port} of 127.0.0.1 is in use"):
             view(vb.samples.gamma(), port=port)
 
 

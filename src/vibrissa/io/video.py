@@ -207,18 +207,20 @@ def opened_video(path: str | PathLike[str]) -> InputContainer:
     return container
 
 
-# Grey values of luminances that range from 16 to 235; FFmpeg's number of the range 0 to 255.
+# Formats with a plane of luminance; grey values of luminances that range from 16 to 235; FFmpeg's
+# number of the range 0 to 255.
+_VIDEO = ("yuv420p", "yuv422p", "yuv444p")
+_WHOLE = ("gray", "yuvj420p", "yuvj422p", "yuvj444p")
 _LIMITED, _FULL = bytes(min(max((510 * y - 7941) // 438, 0), 255) for y in range(256)), 2
 
 
 def grey_frame(frame: Any) -> Frame:
     """Luminance of a frame over the full range 0 to 255, whatever the video's format."""
     name = frame.format.name
-    full = name in ("gray", "yuvj420p", "yuvj422p", "yuvj444p")
-    if not full and (name not in ("yuv420p", "yuv422p", "yuv444p") or frame.color_range == _FULL):
+    if name not in _VIDEO + _WHOLE:
         return np.asarray(frame.to_ndarray(format="gray"), dtype=np.uint8)
-    plane = frame.planes[0]
-    grey = np.frombuffer(plane if full else bytes(plane).translate(_LIMITED), dtype=np.uint8)
+    plane, limited = frame.planes[0], name in _VIDEO and frame.color_range != _FULL
+    grey = np.frombuffer(bytes(plane).translate(_LIMITED) if limited else plane, dtype=np.uint8)
     # A copy, contiguous and writable as other images: kernels are compiled for one layout.
     return grey.reshape(-1, plane.line_size)[: frame.height, : frame.width].copy()
 

@@ -262,6 +262,10 @@ def test_shapes_are_told_apart(felt, contact_map):
     assert compare_shapes(unknown, whiskers)["evidence"].isnull().all()
     with pytest.raises(ValueError, match="have no covariance"):
         fit_contacts(unknown, whiskers, lean=0.1)
+    # Normals that were moved by their errors are no longer of unit length.
+    moved = felt.assign(contact_normal=1.001 * felt["contact_normal"])
+    leaning, same = (fit_contacts(one, whiskers, lean=0.1) for one in (moved, felt))
+    np.testing.assert_allclose(leaning.origin, same.origin, atol=1e-9)
 
 
 def test_what_stages_add_is_kept_in_a_file(trial, tmp_path):

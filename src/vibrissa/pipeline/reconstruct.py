@@ -281,7 +281,8 @@ def fit_contacts(
         known["covariance"] = spread + SOLVED_TO**2 * np.eye(3)
         for name in ("normal_covariance", "point_normal_covariance"):
             known[name] = _rows(estimates[name])
-        across = np.eye(3) - known["normals"][:, :, None] * known["normals"][:, None, :]
+        normals = known["normals"] / np.linalg.norm(known["normals"], axis=1, keepdims=True)
+        across = np.eye(3) - normals[:, :, None] * normals[:, None, :]
         known["normal_covariance"] = known["normal_covariance"] + lean**2 * across
     try:
         if shape == "free":

@@ -7,8 +7,8 @@ import pytest
 
 pytest.importorskip("viser", reason="viser is not installed", exc_type=ImportError)
 
-from vibrissa.viewer import page
-from vibrissa.viewer.page import CompileNotice
+from vibrissa.viewer import server
+from vibrissa.viewer.server import CompileNotice
 
 
 def compiling(module):
@@ -20,7 +20,7 @@ def compiling(module):
 @pytest.fixture
 def ahead(monkeypatch):
     """One that has not yet warmed up, and what it has reports."""
-    monkeypatch.setattr(page, "_done", threading.Event())
+    monkeypatch.setattr(server, "_done", threading.Event())
     reports = []
     made = CompileNotice(reports.append)
     yield made, reports
@@ -49,7 +49,7 @@ def test_it_is_over_when_all_jobs_are_and_not_between_them(ahead):
         seen.append(list(reports))
 
     made.start([job, job])
-    assert page._done.wait(10.0)
+    assert server._done.wait(10.0)
     for thread in threading.enumerate():
         if thread.name == "warming":
             thread.join(10.0)
@@ -66,4 +66,4 @@ def test_a_job_that_fails_ends_the_matter(ahead):
         if thread.name == "warming":
             thread.join(10.0)
     assert reports == []
-    assert not page._done.is_set()
+    assert not server._done.is_set()

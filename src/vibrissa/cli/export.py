@@ -37,10 +37,7 @@ def export(
         about = {"--session-start": session_start, "--subject": subject, "--species": species}
         refuse(about, "only NWB files contain it")
     if len(recordings) > 1:
-        refuse(
-            {"--output": target},
-            "each table is written next to its recording",
-        )
+        refuse({"--output": target}, "each table is written next to its recording")
         refuse({"--session-start": session_start}, "recordings did not begin at the same time")
     targets = [one.with_suffix(ending) if target is None else target for one in recordings]
     for path in targets:

@@ -99,10 +99,7 @@ class MeasurementOptions:
         if self.map:
             if self.own.whisker is not None:
                 raise ValueError("give either --map or --whisker: a map already has its whisker")
-            refuse(
-                {"--proximal": self.proximal},
-                "the --map has a proximal limit",
-            )
+            refuse({"--proximal": self.proximal}, "the --map has a proximal limit")
             refuse({"--density": self.weight.density}, "the map has that of its whisker")
         sensors = _named(self.sensor, "--sensor")
         if set(sensors) - {"", *self.whiskers}:

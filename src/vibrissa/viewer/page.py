@@ -1,8 +1,8 @@
 """Page of the viewer: one scene, one panel, and several modes.
 
 All events of the page are handled by one thread (:class:`~vibrissa.viewer.page.Latest`), which
-changes and draws the state, so that the state is never changed concurrently. Other threads are the
-clock of a trial, and one that compiles kernels in advance.
+changes and draws the state, so that the state is never changed concurrently. Another thread is the
+clock of a trial.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from urllib.parse import urlencode
 
 import numpy as np
 import viser
-from numba.core import event
 from numpy.typing import ArrayLike
 from viser import transforms
 
@@ -645,65 +644,3 @@ class Player:
                 now = time.monotonic()
                 self._tick(now - before)
                 before = now
-
-
-_done = threading.Event()  # set once all jobs have run in this process, whose kernels remain
-
-
-class CompileNotice(event.Listener):
-    """Runner of jobs in a thread, which reports when kernels are being compiled."""
-
-    def __init__(self, report: Callable[[bool], None]) -> None:
-        self._report = report
-        self._lock = threading.Lock()
-        self._depth = 0
-        self._running = self._reported = self._closed = False
-        event.register("numba:compile", self)
-
-    def start(self, jobs: Sequence[Callable[[], object]]) -> None:
-        """Run jobs, once per process, ignoring errors, which occur again when a job is needed."""
-        if not _done.is_set():
-            self._running = True
-            threading.Thread(target=self._run, args=(jobs,), name="warming", daemon=True).start()
-
-    def _run(self, jobs: Sequence[Callable[[], object]]) -> None:
-        try:
-            for job in jobs:
-                if self._closed:
-                    return
-                job()
-            _done.set()
-        except Exception:
-            return
-        finally:
-            self._running = False
-            self._count(0)
-
-    def on_start(self, event: event.Event) -> None:
-        """Handle the start of a compilation by Numba."""
-        if _ours(event):
-            self._count(+1)
-
-    def on_end(self, event: event.Event) -> None:
-        """Handle the end of a compilation by Numba."""
-        if _ours(event):
-            self._count(-1)
-
-    def _count(self, step: int) -> None:
-        with self._lock:
-            self._depth += step
-            busy = self._depth > 0 or (self._reported and self._running)
-            if busy != self._reported and not self._closed:
-                self._reported = busy
-                self._report(busy)
-
-    def close(self) -> None:
-        """Start no more jobs and stop reporting."""
-        self._closed = True
-        event.unregister("numba:compile", self)
-
-
-def _ours(event: event.Event) -> bool:
-    dispatcher = (event.data or {}).get("dispatcher")
-    function = getattr(dispatcher, "py_func", None)
-    return (getattr(function, "__module__", "") or "").startswith("vibrissa.")

@@ -18,20 +18,17 @@
   // Keys press buttons; the mouse in a plot over time sets the time.
   const button = (...texts) => [...document.querySelectorAll("button")].find(
     (each) => each.offsetParent && texts.includes(each.textContent.trim()));
-  const setTime = (share) => {
-    const label = [...document.querySelectorAll("label")].find(
-      (each) => each.textContent.trim() === "Time (ms)");
-    let box = label;
-    const number = "input[type=text], input:not([type])";
-    while (box && !box.querySelector(number)) box = box.parentElement;
-    const input = box?.querySelector(number);
-    const slider = box?.querySelector("[role=slider]");
-    if (!input || !slider) return;
-    const value = String(Number(slider.getAttribute("aria-valuemax")) * share);
-    Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set.call(input, value);
-    input.dispatchEvent(new Event("input", { bubbles: true }));
-    input.dispatchEvent(new Event("blur", { bubbles: true }));
-    setTimeout(() => input.blur());  // else keys would be typed into it
+  let wanted = null, asking = false;
+  const setTime = async (share) => {
+    wanted = share;
+    if (asking) return;  // requests could overtake each other
+    asking = true;
+    while (wanted !== null) {
+      const asked = wanted;
+      wanted = null;
+      await fetch("restore?t=" + asked).catch(() => {});
+    }
+    asking = false;
   };
   const keys = {
     ",": ["◀ frame"], ".": ["frame ▶"], "p": ["◀ contact"], "n": ["contact ▶"],

@@ -101,7 +101,6 @@ class Page:
         self.server = server
         self.stage = Stage(server)
         self.work = Latest(self._fault)
-        self._framing = Framing(server, self._viewed)
         self._all = whole(whisker)
         self.slow_work = Latest(self._fault)
         self.original = whisker
@@ -118,6 +117,7 @@ class Page:
         self.closing: list[Callable[[], None]] = []
         self.linked: viser.GuiHtmlHandle | None = None
         self._written = 0.0
+        self._framing = Framing(server, self._viewed)  # calls as soon as a browser is there
         size = float(to_display("length", 0.2 * whisker.length))
         self.grip = Grip(
             server,
@@ -256,8 +256,15 @@ class Page:
         show(self.linked, f'<i hidden data-link="{escape(urlencode(state))}"></i>')
 
     def restore(self, asked: Mapping[str, str]) -> None:
-        """Restore the state in the parameters of a link, as far as they are valid."""
-        mode = self.modes.get(asked.get("mode", ""))
+        """Restore the state in the parameters of a link, as far as they are valid.
+
+        Parameters without a mode are for the current one.
+        """
+        if "mode" not in asked:
+            if self.mode is not None:
+                self.mode.restore(asked)
+            return
+        mode = self.modes.get(asked["mode"])
         if mode is None:
             return
         self.choose(mode.name)

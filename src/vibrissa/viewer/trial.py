@@ -484,7 +484,7 @@ class TrialMode(Mode):
     def restore(self, asked: Mapping[str, str]) -> None:
         """Go to a time."""
         try:
-            share = float(asked.get("t", "0"))
+            share = float(asked.get("t", ""))
         except ValueError:
             return
         if 0.0 <= share <= 1.0:

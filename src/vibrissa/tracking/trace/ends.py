@@ -23,7 +23,15 @@ from vibrissa.tracking.trace.ridge import (
     measured,
     middle,
 )
-from vibrissa.tracking.trace.trace import NOTHING, STEP, Clutter, Trace, TraceOptions, even
+from vibrissa.tracking.trace.trace import (
+    NOTHING,
+    STEP,
+    Clutter,
+    Trace,
+    TraceOptions,
+    even,
+    tangents,
+)
 
 OUTSIDE = 12.0  # how far inside the face the base is searched, pixels
 _FUR = 3  # number of points next to the face that are not measured, since fur is dark too
@@ -40,7 +48,8 @@ _SMOOTHED = 0.6
 _LAST = 10  # number of points before the end, and twice that of points beyond, that decide this
 # Distances from a line at which its profile is taken, and smallest variance of that, samples.
 _ACROSS, _NARROWEST = np.arange(6.0), 0.3
-_FLANKS = (4.0, 7.0)  # distances from the whisker at which the face's edge is searched, pixels
+# Distances from the whisker at which the face's edge is searched, pixels.
+_FLANKS = np.array([4.0, 7.0])
 # Smallest darkness of a whisker next to its base, in standard deviations of the fur's streaks.
 _CLEARER = 1.5
 _STREAKS = 40  # number of points of a line's beginning next to which fur may look like it
@@ -109,7 +118,7 @@ def _above_texture(
     if n < FEWEST:
         return along, sigma
     points, amplitude, flank, support = np.empty((n, 2)), np.empty(n), np.empty(n), np.empty(n)
-    tangent = np.gradient(part, axis=0)
+    tangent = tangents(part)
     across = tangent[:, ::-1] * [-1.0, 1.0] / np.maximum(np.hypot(*tangent.T), 1e-9)[:, None]
     for away in (-_FLANKS[1], _FLANKS[1]):
         other = np.ascontiguousarray(part + away * options.scale * across)
@@ -132,11 +141,11 @@ def _skew(frame: Frame, line: Array, scale: float, clutter: Clutter) -> float:
     a skew: b u + c u g + h (u³ − 3 u) g.
     """
     half = line[len(line) // 8 : len(line) // 2]
-    sides = np.stack([grey_flanks(frame, half, away * scale, clutter) for away in _ACROSS])
-    sides = sides[:, np.isfinite(sides).all(axis=(0, 2))]
-    if not sides.shape[1]:
+    sides = grey_flanks(frame, half, scale * _ACROSS, clutter)
+    sides = sides[..., np.isfinite(sides).all(axis=(0, 1))]
+    if not sides.shape[2]:
         return np.nan
-    left, right = sides.mean(axis=1).T
+    left, right = sides.mean(axis=2).T
     dark = 0.5 * (left[-1] + right[-1]) - 0.5 * (left + right)
     # Distances occur on both sides, the middle once.
     count = np.where(_ACROSS > 0.0, 2.0, 1.0)
@@ -145,14 +154,16 @@ def _skew(frame: Frame, line: Array, scale: float, clutter: Clutter) -> float:
     u = _ACROSS / width
     g = np.exp(-0.5 * u**2)
     depth = float(count * dark @ g) / float(count @ g**2)
-    odd = np.linalg.lstsq(np.stack([u, u * g, (u**3 - 3.0 * u) * g], axis=1), 0.5 * (right - left))
-    return float(6.0 * odd[0][2] / depth * (width * scale) ** 3) if depth > 0.0 else np.nan
+    basis = np.array([u, u * g, (u**3 - 3.0 * u) * g])
+    odd = np.linalg.solve(basis @ basis.T, basis @ (0.5 * (right - left)))
+    return float(6.0 * odd[2] / depth * (width * scale) ** 3) if depth > 0.0 else np.nan
 
 
 def _with_base(frame: Frame, line: Array, before: float, clutter: Clutter) -> tuple[Array, bool]:
     """Line that begins where the whisker leaves the face."""
     longer = even(line, -before)
-    near, far = (_edge(frame, longer[:40], distance, clutter) for distance in _FLANKS)
+    levels = grey_flanks(frame, longer[:40], _FLANKS, clutter)
+    near, far = map(_edge, levels)
     if near is None:
         return line, False
     at = near
@@ -163,10 +174,10 @@ def _with_base(frame: Frame, line: Array, before: float, clutter: Clutter) -> tu
     return even(longer, max(at, 0.0) * STEP), True
 
 
-def _edge(frame: Frame, line: Array, distance: float, clutter: Clutter) -> float | None:
-    """Index of the point at which both sides of a line leave the dark, on average."""
-    numbers, points = [], np.arange(len(line))
-    for level in grey_flanks(frame, line, distance, clutter).T:
+def _edge(sides: Array) -> float | None:
+    """Index of the point at which both sides (2, n) of a line leave the dark, on average."""
+    numbers, points = [], np.arange(sides.shape[1])
+    for level in sides:
         known = np.isfinite(level)
         if 2 * known.sum() < len(level):
             return None
@@ -180,10 +191,10 @@ def _edge(frame: Frame, line: Array, distance: float, clutter: Clutter) -> float
     return float(np.mean(numbers))
 
 
-def grey_flanks(frame: Frame, line: Array, distance: float, clutter: Clutter = NOTHING) -> Array:
-    """Grey values (n, 2) at a distance to the left and to the right of a line, pixels."""
-    levels = np.empty((len(line), 2))
-    flanks(frame, np.ascontiguousarray(line), distance, *clutter, levels)
+def grey_flanks(frame: Frame, line: Array, away: Array, clutter: Clutter = NOTHING) -> Array:
+    """Grey values (k, 2, n) at distances (k,) to the left and right of a line, pixels."""
+    levels = np.empty((len(away), 2, len(line)))
+    flanks(frame, np.ascontiguousarray(line), away, *clutter, levels)
     return levels
 
 
@@ -219,7 +230,8 @@ def _stops(frame: Frame, line: Array, along: Measured, count: int) -> bool:
     shown = along.open
     if not shown[after].any() or min(shown[before].mean(), shown[after].mean()) < 0.5:
         return False
-    if np.median(grey_flanks(frame, line[before], _FLANKS[0])) >= np.iinfo(frame.dtype).max:
+    around = grey_flanks(frame, line[before], _FLANKS[:1])
+    if middle(around.ravel()) >= np.iinfo(frame.dtype).max:
         # Where the image is saturated, faint lines are invisible.
         return False
     sigma = along.noise * np.sqrt(DEPTH_VARIANCE)

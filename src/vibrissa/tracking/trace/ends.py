@@ -155,7 +155,7 @@ def _skew(frame: Frame, line: Array, scale: float, clutter: Clutter) -> float:
     g = np.exp(-0.5 * u**2)
     depth = float(count * dark @ g) / float(count @ g**2)
     basis = np.array([u, u * g, (u**3 - 3.0 * u) * g])
-    odd = np.linalg.solve(basis @ basis.T, basis @ (0.5 * (right - left)))
+    odd = np.linalg.lstsq(basis.T, 0.5 * (right - left))[0]
     return float(6.0 * odd[2] / depth * (width * scale) ** 3) if depth > 0.0 else np.nan
 
 

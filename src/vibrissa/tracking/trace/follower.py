@@ -373,19 +373,9 @@ class Follower:
         spread, drift = _SPREADS[manner]
         line, support = np.empty((len(bend) + 1, 2)), np.empty(len(bend) + 1)
         o = self.options
+        held = self.clutter
         count = march(
-            frame,
-            start,
-            bend,
-            spread,
-            drift,
-            STEP,
-            o.bridge,
-            noise,
-            o.scale,
-            *self.clutter,
-            line,
-            support,
+            frame, start, bend, spread, drift, STEP, o.bridge, noise, o.scale, *held, line, support
         )
         return line[:count], support[:count]
 

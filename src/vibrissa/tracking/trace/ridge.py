@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dpbsv
 
 from vibrissa.io import Frame
 from vibrissa.numerics import inlined, kernel
@@ -433,59 +434,28 @@ def middle(values: Array) -> float:
 
 def _distance_to_seen(seen: Mask) -> Array:
     """Number of points to the nearest seen one; 1000 if there is none."""
-    known, points = np.flatnonzero(seen), np.arange(len(seen))
-    if not known.size:
+    if not seen.any():
         return np.full(len(seen), 1e3)
-    after = np.clip(np.searchsorted(known, points), 0, len(known) - 1)
-    before = np.maximum(after - 1, 0)
-    nearest = np.minimum(np.abs(known[after] - points), np.abs(points - known[before]))
-    return np.asarray(nearest, dtype=np.float64)
+    points = np.arange(float(len(seen)))
+    before = np.maximum.accumulate(np.where(seen, points, -np.inf))
+    after = np.minimum.accumulate(np.where(seen, points, np.inf)[::-1])[::-1]
+    return np.minimum(points - before, after - points)
 
 
 def smooth(line: Array, weight: Array, stiffness: float) -> Array:
     """Smooth a line (n, 2): weighted least squares with a penalty on third differences."""
-    line, better = np.ascontiguousarray(line), np.empty((len(line), 2))
+    band = _third_differences(len(line), stiffness).copy("K")
     # A weak pull to the first point, so that lines without any measurement have a solution.
-    solve_bands(_third_differences(len(line)), stiffness, line, weight, 1e-6, better)
-    return better
-
-
-@kernel
-def solve_bands(
-    band: Any, stiffness: float, line: Any, weight: Any, pull: float, better: Any
-) -> None:
-    """Smooth a line by L δ Lᵀ x = W b, where L is triangular with three bands.
-
-    Here b are the points relative to the first one, and L δ Lᵀ = W + pull + stiffness Dᵀ D.
-    """
-    n = line.shape[0]
-    # Zero before the first and after the last point, so that all rows are alike.
-    low, inverse, x = np.zeros((n + 6, 3)), np.zeros(n + 6), np.zeros((n + 6, 2))
-    for i in range(n):
-        j = i + 3
-        c = stiffness * band[i, 3]
-        b = stiffness * band[i, 2] - c * low[j - 2, 0]
-        a = stiffness * band[i, 1] - c * low[j - 1, 1] - b * low[j - 1, 0]
-        p, q, r = a * inverse[j - 1], b * inverse[j - 2], c * inverse[j - 3]
-        low[j, 0], low[j, 1], low[j, 2] = p, q, r
-        inverse[j] = 1.0 / (stiffness * band[i, 0] + weight[i] + pull - a * p - b * q - c * r)
-        for k in range(2):
-            known = weight[i] * (line[i, k] - line[0, k])
-            x[j, k] = known - p * x[j - 1, k] - q * x[j - 2, k] - r * x[j - 3, k]
-    for j in range(n + 2, 2, -1):
-        for k in range(2):
-            known = low[j + 1, 0] * x[j + 1, k] + low[j + 2, 1] * x[j + 2, k]
-            x[j, k] = x[j, k] * inverse[j] - known - low[j + 3, 2] * x[j + 3, k]
-            better[j - 3, k] = line[0, k] + x[j, k]
+    band[0] += weight + 1e-6
+    # solveh_banded is avoided, since its checks take longer than the solution.
+    right = weight[:, None] * (line - line[0])
+    return np.asarray(dpbsv(band, right, lower=1, overwrite_ab=1, overwrite_b=1)[1] + line[0])
 
 
 @cache
-def _third_differences(n: int) -> Array:
-    """Lower bands (n, 4) of Dᵀ D, where D takes the third differences of n numbers.
-
-    The rows are those of the matrix, from its diagonal to the left.
-    """
-    row, band = np.array([-1.0, 3.0, -3.0, 1.0]), np.zeros((n, 4))
+def _third_differences(n: int, stiffness: float) -> Array:
+    """Lower bands (4, n) of stiffness Dᵀ D, where D takes the third differences of n numbers."""
+    row, band = np.array([-1.0, 3.0, -3.0, 1.0]), np.zeros((4, n), order="F")
     for k in range(4):
-        band[k:, k] = np.convolve(np.ones(n - 3), row[: 4 - k] * row[k:])
-    return band
+        band[k, : n - k] = np.convolve(np.ones(n - 3), row[: 4 - k] * row[k:])
+    return np.asarray(stiffness * band)

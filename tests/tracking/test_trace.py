@@ -18,7 +18,7 @@ from vibrissa.tracking.trace.trace import (
     even,
     given,
     interpolated,
-    tangents,
+    tangent,
 )
 
 
@@ -411,4 +411,4 @@ def test_points_a_step_apart_are_those_of_linear_interpolation(start):
     straight = np.outer(np.arange(0.0, 30.1, 0.1), [0.6, 0.8])
     assert len(even(straight)) == 16
     np.testing.assert_array_equal(even(line[:1]), line[:1])
-    np.testing.assert_allclose(tangents(line), np.gradient(line, axis=0), atol=1e-14)
+    np.testing.assert_allclose(tangent(line), np.gradient(line, axis=0), atol=1e-14)

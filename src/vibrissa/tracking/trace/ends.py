@@ -23,15 +23,7 @@ from vibrissa.tracking.trace.ridge import (
     measured,
     middle,
 )
-from vibrissa.tracking.trace.trace import (
-    NOTHING,
-    STEP,
-    Clutter,
-    Trace,
-    TraceOptions,
-    even,
-    tangents,
-)
+from vibrissa.tracking.trace.trace import NOTHING, STEP, Clutter, Trace, TraceOptions, even, tangent
 
 OUTSIDE = 12.0  # how far inside the face the base is searched, pixels
 _FUR = 3  # number of points next to the face that are not measured, since fur is dark too
@@ -72,7 +64,7 @@ def traced(
     """Trace a whisker near a line, and find its ends; whether it begins at the face."""
     line = prolonged(even(line), _BENDING, _BEYOND)
     for gate in (3, 2):
-        line = even(fitted(frame, line, gate, noise, options, clutter).line)
+        line = even(fitted(frame, line, gate, noise, options, clutter)[0])
         if len(line) < FEWEST:
             # Where nothing is seen, nothing determines the line.
             return Trace.lost(), False
@@ -80,7 +72,7 @@ def traced(
     if before > OUTSIDE and len(line) >= FEWEST:
         # Extrapolated parts are measured before they count.
         fur = _FUR if from_face else 0
-        line = even(fitted(frame, line, 3, noise, options, clutter, fur).line)
+        line = even(fitted(frame, line, 3, noise, options, clutter, fur)[0])
     if len(line) < FEWEST:
         return Trace.lost(), False
     if not from_face:
@@ -118,8 +110,8 @@ def _above_texture(
     if n < FEWEST:
         return along, sigma
     points, amplitude, flank, support = np.empty((n, 2)), np.empty(n), np.empty(n), np.empty(n)
-    tangent = tangents(part)
-    across = tangent[:, ::-1] * [-1.0, 1.0] / np.maximum(np.hypot(*tangent.T), 1e-9)[:, None]
+    ahead = tangent(part)
+    across = ahead[:, ::-1] * [-1.0, 1.0] / np.maximum(np.hypot(*ahead.T), 1e-9)[:, None]
     for away in (-_FLANKS[1], _FLANKS[1]):
         other = np.ascontiguousarray(part + away * options.scale * across)
         measure(frame, other, 1, 1.0, options.scale, *clutter, points, amplitude, flank, support)

@@ -35,7 +35,7 @@ from vibrissa.tracking.trace.trace import (
     aligned,
     distances,
     overlap,
-    tangents,
+    tangent,
 )
 
 # Points of a trace over which darkness and direction are averaged.
@@ -230,7 +230,7 @@ class Follower:
         before, last = self._before.line, self._last.line
         n = min(len(before), len(last))
         # Across only: the start of the visible part varies along the whisker without any motion.
-        across = tangents(last[:n])[:, ::-1] * [-1.0 / STEP, 1.0 / STEP]
+        across = tangent(last[:n])[:, ::-1] * [-1.0 / STEP, 1.0 / STEP]
         velocity = ((last[:n] - before[:n]) * across).sum(axis=1, keepdims=True) * across
         beyond = np.repeat(velocity[-1:], len(last) - n, axis=0)
         return np.asarray(last + np.concatenate([velocity, beyond]))

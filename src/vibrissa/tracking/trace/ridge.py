@@ -365,17 +365,6 @@ class Measured(NamedTuple):
         )
 
 
-class Fitted(NamedTuple):
-    """Smooth line through measurements across another one, with uncertainties."""
-
-    line: Array
-    amplitude: Array
-    flank: Array
-    seen: Mask
-    weight: Array
-    excess: float
-
-
 def fitted(
     frame: Frame,
     line: Array,
@@ -384,8 +373,8 @@ def fitted(
     options: TraceOptions,
     clutter: Clutter,
     skipped: int = 0,
-) -> Fitted:
-    """Measure across a line and smooth it."""
+) -> tuple[Array, Array, Array, Mask, Array, float]:
+    """Measure across a line and smooth it: line, amplitude, flank, seen, weight, and excess."""
     n, line = len(line), np.ascontiguousarray(line)
     points, amplitude, flank, support = np.empty((n, 2)), np.empty(n), np.empty(n), np.empty(n)
     measure(frame, line, gate, noise, options.scale, *clutter, points, amplitude, flank, support)
@@ -400,7 +389,7 @@ def fitted(
     excess = max(1.0, middle(miss[seen]) / _MEDIAN) if seen.any() else 1.0
     weight *= 9.0 / np.maximum(miss / excess, 9.0) / excess
     better = smooth(points, weight, options.stiffness)
-    return Fitted(better, amplitude, flank, seen, weight, excess)
+    return better, amplitude, flank, seen, weight, excess
 
 
 def measured(
@@ -413,15 +402,16 @@ def measured(
     clutter: Clutter = NOTHING,
 ) -> tuple[Array, Measured]:
     """Measure across a line, smooth it, and state the uncertainty of each point."""
-    fit = fitted(frame, line, gate, noise, options, clutter, skipped)
-    information = np.convolve(fit.weight, np.ones(min(9, len(line))), mode="same")
+    better, amplitude, flank, seen, weight, excess = fitted(
+        frame, line, gate, noise, options, clutter, skipped
+    )
+    information = np.convolve(weight, np.ones(min(9, len(line))), mode="same")
     sigma = 1.0 / np.sqrt(np.maximum(information, 1.0))
-    sigma += 0.05 * (0.1 * STEP * _distance_to_seen(fit.seen)) ** 1.5
+    sigma += 0.05 * (0.1 * STEP * _distance_to_seen(seen)) ** 1.5
     sigma = np.hypot(sigma, np.where(clutter.disturbs(line), _DISTURBED, 0.0))
     shown = ~clutter.hides(line)
-    open_ = shown & (fit.flank > 0.6 * middle(fit.flank[shown] if shown.any() else fit.flank))
-    noise *= float(np.sqrt(fit.excess))
-    return fit.line, Measured(fit.amplitude, sigma, fit.seen, open_, noise)
+    open_ = shown & (flank > 0.6 * middle(flank[shown] if shown.any() else flank))
+    return better, Measured(amplitude, sigma, seen, open_, noise * math.sqrt(excess))
 
 
 def middle(values: Array) -> float:
@@ -439,7 +429,7 @@ def _distance_to_seen(seen: Mask) -> Array:
     points = np.arange(float(len(seen)))
     before = np.maximum.accumulate(np.where(seen, points, -np.inf))
     after = np.minimum.accumulate(np.where(seen, points, np.inf)[::-1])[::-1]
-    return np.minimum(points - before, after - points)
+    return np.asarray(np.minimum(points - before, after - points))
 
 
 def smooth(line: Array, weight: Array, stiffness: float) -> Array:

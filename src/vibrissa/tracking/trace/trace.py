@@ -149,7 +149,7 @@ def _turn(line: Array) -> float:
     """Largest turn of a line within a fifth of its length, rad."""
     if len(line) < 3:
         return 0.0
-    angle = np.unwrap(np.arctan2(*tangents(line).T[::-1]))
+    angle = np.unwrap(np.arctan2(*tangent(line).T[::-1]))
     n = max(len(line) // 5, 1)
     return float(np.abs(angle[n:] - angle[:-n]).max())
 
@@ -223,8 +223,8 @@ def space_evenly(line: Any, start: float, step: float, points: Any) -> int:
     return count
 
 
-def tangents(line: Array) -> Array:
-    """Changes (n, 2) from point to point along a line: `numpy.gradient`, which takes longer."""
+def tangent(line: Array) -> Array:
+    """Change (n, 2) from point to point along a line: `numpy.gradient`, which takes longer."""
     along = np.empty_like(line)
     along[1:-1] = 0.5 * (line[2:] - line[:-2])
     along[0], along[-1] = line[1] - line[0], line[-1] - line[-2]

@@ -154,8 +154,7 @@ def _skew(frame: Frame, line: Array, scale: float, clutter: Clutter) -> float:
 def _with_base(frame: Frame, line: Array, before: float, clutter: Clutter) -> tuple[Array, bool]:
     """Line that begins where the whisker leaves the face."""
     longer = even(line, -before)
-    levels = grey_flanks(frame, longer[:40], _FLANKS, clutter)
-    near, far = map(_edge, levels)
+    near, far = map(_edge, grey_flanks(frame, longer[:40], _FLANKS, clutter))
     if near is None:
         return line, False
     at = near
@@ -222,8 +221,7 @@ def _stops(frame: Frame, line: Array, along: Measured, count: int) -> bool:
     shown = along.open
     if not shown[after].any() or min(shown[before].mean(), shown[after].mean()) < 0.5:
         return False
-    around = grey_flanks(frame, line[before], _FLANKS[:1])
-    if middle(around.ravel()) >= np.iinfo(frame.dtype).max:
+    if middle(grey_flanks(frame, line[before], _FLANKS[:1]).ravel()) >= np.iinfo(frame.dtype).max:
         # Where the image is saturated, faint lines are invisible.
         return False
     sigma = along.noise * np.sqrt(DEPTH_VARIANCE)

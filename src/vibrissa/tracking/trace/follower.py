@@ -191,10 +191,9 @@ class Follower:
 
     def length_of(self, trace: Trace) -> float:
         """Length that is seen or hidden by clutter, pixels."""
-        seen = trace.seen
-        if seen.all():
+        if trace.seen.all():
             return trace.support
-        return trace.support + STEP * float(self.clutter.hides(trace.line[~seen]).sum())
+        return trace.support + STEP * float(self.clutter.hides(trace.line[~trace.seen]).sum())
 
     @property
     def usual(self) -> float:
@@ -322,8 +321,8 @@ class Follower:
         turn = angle[1:] - angle[:-1]
         bend = (turn - 2.0 * np.pi * np.rint(turn / (2.0 * np.pi))) / STEP
         wide = min(9, len(bend) | 1)
-        ends = np.full(wide // 2, bend[0]), np.full(wide // 2, bend[-1])
-        padded = np.concatenate([ends[0], bend, ends[1]])
+        half = wide // 2
+        padded = np.concatenate([bend[:1].repeat(half), bend, bend[-1:].repeat(half)])
         bend = np.convolve(padded, np.full(wide, 1.0 / wide), mode="valid")
         extra = int(self.options.bridge / STEP) + 20
         bend = np.concatenate([bend, np.full(extra, bend[-20:].mean())])
@@ -370,12 +369,10 @@ class Follower:
         self, frame: Frame, noise: float, start: Array, bend: Array, manner: str
     ) -> tuple[Array, Array]:
         """Line and support of a march."""
-        spread, drift = _SPREADS[manner]
         line, support = np.empty((len(bend) + 1, 2)), np.empty(len(bend) + 1)
-        o = self.options
-        held = self.clutter
+        o, how, clutter = self.options, _SPREADS[manner], self.clutter
         count = march(
-            frame, start, bend, spread, drift, STEP, o.bridge, noise, o.scale, *held, line, support
+            frame, start, bend, *how, STEP, o.bridge, noise, o.scale, *clutter, line, support
         )
         return line[:count], support[:count]
 

@@ -10,7 +10,16 @@ from vibrissa.tracking.trace import ridge
 from vibrissa.tracking.trace.curves import find_curves
 from vibrissa.tracking.trace.ends import traced
 from vibrissa.tracking.trace.scene import Scene
-from vibrissa.tracking.trace.trace import Clutter, doubtful_frames, given
+from vibrissa.tracking.trace.trace import (
+    STEP,
+    Clutter,
+    arc_lengths,
+    doubtful_frames,
+    even,
+    given,
+    interpolated,
+    tangent,
+)
 
 
 @pytest.fixture(scope="module")
@@ -388,3 +397,18 @@ def test_smoothing_keeps_parabolas_and_bridges_gaps():
     matrix = np.diag(weight + 1e-6) + 1e4 * dense.T @ dense
     expected = np.linalg.solve(matrix, weight[:, None] * (noisy - noisy[0])) + noisy[0]
     np.testing.assert_allclose(ridge.smooth(noisy, weight, 1e4), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("start", [0.0, -7.0, 3.3])
+def test_points_a_step_apart_are_those_of_linear_interpolation(start):
+    line = np.cumsum(np.random.default_rng(1).normal(1.0, 0.6, (40, 2)), axis=0)
+    s = arc_lengths(line)
+    at = np.arange(start, s[-1], STEP)
+    first = line[0] + np.outer(at, line[4] - line[0]) / s[4]
+    expected = np.where(at[:, None] < 0.0, first, interpolated(at, s, line))
+    np.testing.assert_allclose(even(line, start), expected, atol=1e-12)
+    # A line of whole steps keeps its last point, despite rounding.
+    straight = np.outer(np.arange(0.0, 30.1, 0.1), [0.6, 0.8])
+    assert len(even(straight)) == 16
+    np.testing.assert_array_equal(even(line[:1]), line[:1])
+    np.testing.assert_allclose(tangent(line), np.gradient(line, axis=0), atol=1e-14)

@@ -390,6 +390,7 @@ class _Job:
                     bases[view],
                     options,
                     corrections=self.corrections.get(view, {}),
+                    sample=frames[view],
                     mask=self.masks[view],
                     begins=begins + (self.how.offset or 0) * (view > 0),
                     progress=partial(tell, f"trace {path.name}"),

@@ -220,9 +220,10 @@ def grey_frame(frame: Any) -> Frame:
     if name not in _VIDEO + _WHOLE:
         return np.asarray(frame.to_ndarray(format="gray"), dtype=np.uint8)
     plane, limited = frame.planes[0], name in _VIDEO and frame.color_range != _FULL
-    grey = np.frombuffer(bytes(plane).translate(_LIMITED) if limited else plane, dtype=np.uint8)
-    # A copy, contiguous and writable as other images: kernels are compiled for one layout.
-    return grey.reshape(-1, plane.line_size)[: frame.height, : frame.width].copy()
+    copied = bytearray(plane)  # writable, and translated in half the time that bytes take
+    grey = np.frombuffer(copied.translate(_LIMITED) if limited else copied, dtype=np.uint8)
+    # Contiguous as other images: kernels are compiled for one layout.
+    return np.ascontiguousarray(grey.reshape(-1, plane.line_size)[: frame.height, : frame.width])
 
 
 # Contrast of alternate rows, grey values; their smallest number a frame; and how much more frequent
@@ -240,13 +241,12 @@ def interlaced(frames: Sequence[Frame]) -> bool:
 
 def _combed(*images: NDArray[np.int16]) -> int:
     """Number of pixels from which on four in a column are dark and bright in turn in all images."""
-    least = np.full(images[0][3:].shape, np.iinfo(np.int16).max)
+    alternates = np.ones(images[0][3:].shape, dtype=bool)
     for image in images:
-        steps = np.diff(image, axis=0)
-        steps[1::2] *= -1
-        turns = np.stack([steps[:-2], steps[1:-1], steps[2:]])
-        least = np.minimum(least, np.maximum(turns.min(axis=0), -turns.max(axis=0)))
-    return int((least > _ALTERNATE).sum())
+        steps = image[1:] - image[:-1]
+        up, down = steps > _ALTERNATE, steps < -_ALTERNATE
+        alternates &= up[:-2] & down[1:-1] & up[2:] | down[:-2] & up[1:-1] & down[2:]
+    return int(alternates.sum())
 
 
 AHEAD = 60  # number of frames up to which decoding in sequence is preferred to seeking

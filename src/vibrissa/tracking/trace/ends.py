@@ -23,7 +23,7 @@ from vibrissa.tracking.trace.ridge import (
     measured,
     middle,
 )
-from vibrissa.tracking.trace.trace import NOTHING, STEP, Clutter, Trace, TraceOptions, even
+from vibrissa.tracking.trace.trace import NOTHING, STEP, Clutter, Trace, TraceOptions, even, tangent
 
 OUTSIDE = 12.0  # how far inside the face the base is searched, pixels
 _FUR = 3  # number of points next to the face that are not measured, since fur is dark too
@@ -40,7 +40,8 @@ _SMOOTHED = 0.6
 _LAST = 10  # number of points before the end, and twice that of points beyond, that decide this
 # Distances from a line at which its profile is taken, and smallest variance of that, samples.
 _ACROSS, _NARROWEST = np.arange(6.0), 0.3
-_FLANKS = (4.0, 7.0)  # distances from the whisker at which the face's edge is searched, pixels
+# Distances from the whisker at which the face's edge is searched, pixels.
+_FLANKS = np.array([4.0, 7.0])
 # Smallest darkness of a whisker next to its base, in standard deviations of the fur's streaks.
 _CLEARER = 1.5
 _STREAKS = 40  # number of points of a line's beginning next to which fur may look like it
@@ -63,7 +64,7 @@ def traced(
     """Trace a whisker near a line, and find its ends; whether it begins at the face."""
     line = prolonged(even(line), _BENDING, _BEYOND)
     for gate in (3, 2):
-        line = even(fitted(frame, line, gate, noise, options, clutter).line)
+        line = even(fitted(frame, line, gate, noise, options, clutter)[0])
         if len(line) < FEWEST:
             # Where nothing is seen, nothing determines the line.
             return Trace.lost(), False
@@ -71,7 +72,7 @@ def traced(
     if before > OUTSIDE and len(line) >= FEWEST:
         # Extrapolated parts are measured before they count.
         fur = _FUR if from_face else 0
-        line = even(fitted(frame, line, 3, noise, options, clutter, fur).line)
+        line = even(fitted(frame, line, 3, noise, options, clutter, fur)[0])
     if len(line) < FEWEST:
         return Trace.lost(), False
     if not from_face:
@@ -109,8 +110,8 @@ def _above_texture(
     if n < FEWEST:
         return along, sigma
     points, amplitude, flank, support = np.empty((n, 2)), np.empty(n), np.empty(n), np.empty(n)
-    tangent = np.gradient(part, axis=0)
-    across = tangent[:, ::-1] * [-1.0, 1.0] / np.maximum(np.hypot(*tangent.T), 1e-9)[:, None]
+    ahead = tangent(part)
+    across = ahead[:, ::-1] * [-1.0, 1.0] / np.maximum(np.hypot(*ahead.T), 1e-9)[:, None]
     for away in (-_FLANKS[1], _FLANKS[1]):
         other = np.ascontiguousarray(part + away * options.scale * across)
         measure(frame, other, 1, 1.0, options.scale, *clutter, points, amplitude, flank, support)
@@ -132,11 +133,11 @@ def _skew(frame: Frame, line: Array, scale: float, clutter: Clutter) -> float:
     a skew: b u + c u g + h (u³ − 3 u) g.
     """
     half = line[len(line) // 8 : len(line) // 2]
-    sides = np.stack([grey_flanks(frame, half, away * scale, clutter) for away in _ACROSS])
-    sides = sides[:, np.isfinite(sides).all(axis=(0, 2))]
-    if not sides.shape[1]:
+    sides = grey_flanks(frame, half, scale * _ACROSS, clutter)
+    sides = sides[..., np.isfinite(sides).all(axis=(0, 1))]
+    if not sides.shape[2]:
         return np.nan
-    left, right = sides.mean(axis=1).T
+    left, right = sides.mean(axis=2).T
     dark = 0.5 * (left[-1] + right[-1]) - 0.5 * (left + right)
     # Distances occur on both sides, the middle once.
     count = np.where(_ACROSS > 0.0, 2.0, 1.0)
@@ -145,14 +146,15 @@ def _skew(frame: Frame, line: Array, scale: float, clutter: Clutter) -> float:
     u = _ACROSS / width
     g = np.exp(-0.5 * u**2)
     depth = float(count * dark @ g) / float(count @ g**2)
-    odd = np.linalg.lstsq(np.stack([u, u * g, (u**3 - 3.0 * u) * g], axis=1), 0.5 * (right - left))
-    return float(6.0 * odd[0][2] / depth * (width * scale) ** 3) if depth > 0.0 else np.nan
+    basis = np.array([u, u * g, (u**3 - 3.0 * u) * g])
+    odd = np.linalg.lstsq(basis.T, 0.5 * (right - left))[0]
+    return float(6.0 * odd[2] / depth * (width * scale) ** 3) if depth > 0.0 else np.nan
 
 
 def _with_base(frame: Frame, line: Array, before: float, clutter: Clutter) -> tuple[Array, bool]:
     """Line that begins where the whisker leaves the face."""
     longer = even(line, -before)
-    near, far = (_edge(frame, longer[:40], distance, clutter) for distance in _FLANKS)
+    near, far = map(_edge, grey_flanks(frame, longer[:40], _FLANKS, clutter))
     if near is None:
         return line, False
     at = near
@@ -163,10 +165,10 @@ def _with_base(frame: Frame, line: Array, before: float, clutter: Clutter) -> tu
     return even(longer, max(at, 0.0) * STEP), True
 
 
-def _edge(frame: Frame, line: Array, distance: float, clutter: Clutter) -> float | None:
-    """Index of the point at which both sides of a line leave the dark, on average."""
-    numbers, points = [], np.arange(len(line))
-    for level in grey_flanks(frame, line, distance, clutter).T:
+def _edge(sides: Array) -> float | None:
+    """Index of the point at which both sides (2, n) of a line leave the dark, on average."""
+    numbers, points = [], np.arange(sides.shape[1])
+    for level in sides:
         known = np.isfinite(level)
         if 2 * known.sum() < len(level):
             return None
@@ -180,10 +182,10 @@ def _edge(frame: Frame, line: Array, distance: float, clutter: Clutter) -> float
     return float(np.mean(numbers))
 
 
-def grey_flanks(frame: Frame, line: Array, distance: float, clutter: Clutter = NOTHING) -> Array:
-    """Grey values (n, 2) at a distance to the left and to the right of a line, pixels."""
-    levels = np.empty((len(line), 2))
-    flanks(frame, np.ascontiguousarray(line), distance, *clutter, levels)
+def grey_flanks(frame: Frame, line: Array, away: Array, clutter: Clutter = NOTHING) -> Array:
+    """Grey values (k, 2, n) at distances (k,) to the left and right of a line, pixels."""
+    levels = np.empty((len(away), 2, len(line)))
+    flanks(frame, np.ascontiguousarray(line), away, *clutter, levels)
     return levels
 
 
@@ -219,7 +221,7 @@ def _stops(frame: Frame, line: Array, along: Measured, count: int) -> bool:
     shown = along.open
     if not shown[after].any() or min(shown[before].mean(), shown[after].mean()) < 0.5:
         return False
-    if np.median(grey_flanks(frame, line[before], _FLANKS[0])) >= np.iinfo(frame.dtype).max:
+    if middle(grey_flanks(frame, line[before], _FLANKS[:1]).ravel()) >= np.iinfo(frame.dtype).max:
         # Where the image is saturated, faint lines are invisible.
         return False
     sigma = along.noise * np.sqrt(DEPTH_VARIANCE)

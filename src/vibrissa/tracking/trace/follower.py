@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from statistics import median
 from typing import NamedTuple
 
 import numpy as np
@@ -34,6 +35,7 @@ from vibrissa.tracking.trace.trace import (
     aligned,
     distances,
     overlap,
+    tangent,
 )
 
 # Points of a trace over which darkness and direction are averaged.
@@ -66,6 +68,7 @@ _REPEATED = 0.5  # largest distance of two marches along the same path, pixels
 _CLICK = 20.0  # standard deviation of a click from the base of its whisker, pixels
 # Smallest brightness on both sides of a whisker, relative to the bright parts of the image.
 _BRIGHT = 0.35
+_ASIDE = np.array([8.0])  # distance from a whisker at which its surroundings are measured, pixels
 # Depth inside the face within which the base is searched after a click, pixels.
 _AROUND = 36.0
 # Standard deviations of offset, direction and curvature at the start, and drift of the last.
@@ -190,18 +193,17 @@ class Follower:
         """Length that is seen or hidden by clutter, pixels."""
         if trace.seen.all():
             return trace.support
-        hidden = self.clutter.hides(trace.line) & ~trace.seen
-        return trace.support + STEP * float(hidden.sum())
+        return trace.support + STEP * float(self.clutter.hides(trace.line[~trace.seen]).sum())
 
     @property
     def usual(self) -> float:
         """Length that is usually seen, pixels; 0 at first."""
-        return middle(np.array(self._supports)) if self._supports else 0.0
+        return median(self._supports) if self._supports else 0.0
 
     @property
     def _lately(self) -> float:
         """Length seen recently, pixels; it decreases as the whisker turns to the camera."""
-        return middle(np.array(self._supports[-3:])) if self._supports else 0.0
+        return median(self._supports[-3:]) if self._supports else 0.0
 
     @property
     def wanted(self) -> float:
@@ -227,7 +229,7 @@ class Follower:
         before, last = self._before.line, self._last.line
         n = min(len(before), len(last))
         # Across only: the start of the visible part varies along the whisker without any motion.
-        across = np.gradient(last[:n], axis=0)[:, ::-1] * [-1.0, 1.0] / STEP
+        across = tangent(last[:n])[:, ::-1] * [-1.0 / STEP, 1.0 / STEP]
         velocity = ((last[:n] - before[:n]) * across).sum(axis=1, keepdims=True) * across
         beyond = np.repeat(velocity[-1:], len(last) - n, axis=0)
         return np.asarray(last + np.concatenate([velocity, beyond]))
@@ -315,11 +317,13 @@ class Follower:
         self, frame: Frame, noise: float, guess: Array, manner: str
     ) -> tuple[Array, Array]:
         """Line and support of a march along an expected curve."""
-        tangent = np.arctan2(*np.diff(guess, axis=0).T[::-1])
-        bend = np.diff(np.unwrap(tangent)) / STEP
+        angle = np.arctan2(*(guess[1:] - guess[:-1]).T[::-1])
+        turn = angle[1:] - angle[:-1]
+        bend = (turn - 2.0 * np.pi * np.rint(turn / (2.0 * np.pi))) / STEP
         wide = min(9, len(bend) | 1)
-        padded = np.pad(bend, wide // 2, mode="edge")
-        bend = np.convolve(padded, np.ones(wide) / wide, mode="valid")
+        half = wide // 2
+        padded = np.concatenate([bend[:1].repeat(half), bend, bend[-1:].repeat(half)])
+        bend = np.convolve(padded, np.full(wide, 1.0 / wide), mode="valid")
         extra = int(self.options.bridge / STEP) + 20
         bend = np.concatenate([bend, np.full(extra, bend[-20:].mean())])
         chord = guess[min(6, len(guess) - 1)] - guess[0]
@@ -351,7 +355,7 @@ class Follower:
             kept.append(line)
             trace = self._finished(frame, noise, line, support, _AROUND)
             part = trace.line[3:23]
-            if len(part) and float(np.median(grey_flanks(frame, part, 8.0))) > bright:
+            if len(part) and middle(grey_flanks(frame, part, _ASIDE).ravel()) > bright:
                 found.append(trace)
         return found
 
@@ -365,22 +369,10 @@ class Follower:
         self, frame: Frame, noise: float, start: Array, bend: Array, manner: str
     ) -> tuple[Array, Array]:
         """Line and support of a march."""
-        spread, drift = _SPREADS[manner]
         line, support = np.empty((len(bend) + 1, 2)), np.empty(len(bend) + 1)
-        o = self.options
+        o, how, clutter = self.options, _SPREADS[manner], self.clutter
         count = march(
-            frame,
-            start,
-            bend,
-            spread,
-            drift,
-            STEP,
-            o.bridge,
-            noise,
-            o.scale,
-            *self.clutter,
-            line,
-            support,
+            frame, start, bend, *how, STEP, o.bridge, noise, o.scale, *clutter, line, support
         )
         return line[:count], support[:count]
 

@@ -326,17 +326,19 @@ def measure_ends(
 
 
 @kernel
-def flanks(frame: Any, line: Any, distance: float, bits: Any, which: int, out: Any) -> None:
-    """Grey values at a distance from a curve, to its left (−dy, dx) and to its right.
+def flanks(frame: Any, line: Any, distances: Any, bits: Any, which: int, out: Any) -> None:
+    """Grey values at distances from a curve, to its left (−dy, dx) and to its right.
 
     NaN where there is clutter.
     """
     for k in range(line.shape[0]):
         nx, ny = normal(line, k)
-        for side in range(2):
-            away = distance * (1 - 2 * side)
-            x, y = line[k, 0] + away * nx, line[k, 1] + away * ny
-            out[k, side] = np.nan if in_the_way(bits, which, x, y) else sample(frame, x, y)
+        for i in range(distances.shape[0]):
+            for side in range(2):
+                away = distances[i] * (1 - 2 * side)
+                x, y = line[k, 0] + away * nx, line[k, 1] + away * ny
+                hidden = in_the_way(bits, which, x, y)
+                out[i, side, k] = np.nan if hidden else sample(frame, x, y)
 
 
 # Depth above which a point of an approximately known line is supported, standard deviations.
@@ -363,17 +365,6 @@ class Measured(NamedTuple):
         )
 
 
-class Fitted(NamedTuple):
-    """Smooth line through measurements across another one, with uncertainties."""
-
-    line: Array
-    amplitude: Array
-    flank: Array
-    seen: Mask
-    weight: Array
-    excess: float
-
-
 def fitted(
     frame: Frame,
     line: Array,
@@ -382,8 +373,8 @@ def fitted(
     options: TraceOptions,
     clutter: Clutter,
     skipped: int = 0,
-) -> Fitted:
-    """Measure across a line and smooth it."""
+) -> tuple[Array, Array, Array, Mask, Array, float]:
+    """Measure across a line and smooth it: line, amplitude, flank, seen, weight, and excess."""
     n, line = len(line), np.ascontiguousarray(line)
     points, amplitude, flank, support = np.empty((n, 2)), np.empty(n), np.empty(n), np.empty(n)
     measure(frame, line, gate, noise, options.scale, *clutter, points, amplitude, flank, support)
@@ -398,7 +389,7 @@ def fitted(
     excess = max(1.0, middle(miss[seen]) / _MEDIAN) if seen.any() else 1.0
     weight *= 9.0 / np.maximum(miss / excess, 9.0) / excess
     better = smooth(points, weight, options.stiffness)
-    return Fitted(better, amplitude, flank, seen, weight, excess)
+    return better, amplitude, flank, seen, weight, excess
 
 
 def measured(
@@ -411,15 +402,16 @@ def measured(
     clutter: Clutter = NOTHING,
 ) -> tuple[Array, Measured]:
     """Measure across a line, smooth it, and state the uncertainty of each point."""
-    fit = fitted(frame, line, gate, noise, options, clutter, skipped)
-    information = np.convolve(fit.weight, np.ones(min(9, len(line))), mode="same")
+    better, amplitude, flank, seen, weight, excess = fitted(
+        frame, line, gate, noise, options, clutter, skipped
+    )
+    information = np.convolve(weight, np.ones(min(9, len(line))), mode="same")
     sigma = 1.0 / np.sqrt(np.maximum(information, 1.0))
-    sigma += 0.05 * (0.1 * STEP * _distance_to_seen(fit.seen)) ** 1.5
+    sigma += 0.05 * (0.1 * STEP * _distance_to_seen(seen)) ** 1.5
     sigma = np.hypot(sigma, np.where(clutter.disturbs(line), _DISTURBED, 0.0))
     shown = ~clutter.hides(line)
-    open_ = shown & (fit.flank > 0.6 * middle(fit.flank[shown] if shown.any() else fit.flank))
-    noise *= float(np.sqrt(fit.excess))
-    return fit.line, Measured(fit.amplitude, sigma, fit.seen, open_, noise)
+    open_ = shown & (flank > 0.6 * middle(flank[shown] if shown.any() else flank))
+    return better, Measured(amplitude, sigma, seen, open_, noise * math.sqrt(excess))
 
 
 def middle(values: Array) -> float:
@@ -432,28 +424,28 @@ def middle(values: Array) -> float:
 
 def _distance_to_seen(seen: Mask) -> Array:
     """Number of points to the nearest seen one; 1000 if there is none."""
-    known, points = np.flatnonzero(seen), np.arange(len(seen))
-    if not known.size:
+    if not seen.any():
         return np.full(len(seen), 1e3)
-    after = np.clip(np.searchsorted(known, points), 0, len(known) - 1)
-    before = np.maximum(after - 1, 0)
-    nearest = np.minimum(np.abs(known[after] - points), np.abs(points - known[before]))
-    return np.asarray(nearest, dtype=np.float64)
+    points = np.arange(float(len(seen)))
+    before = np.maximum.accumulate(np.where(seen, points, -np.inf))
+    after = np.minimum.accumulate(np.where(seen, points, np.inf)[::-1])[::-1]
+    return np.asarray(np.minimum(points - before, after - points))
 
 
 def smooth(line: Array, weight: Array, stiffness: float) -> Array:
     """Smooth a line (n, 2): weighted least squares with a penalty on third differences."""
-    band = stiffness * _third_differences(len(line))
+    band = _third_differences(len(line), stiffness).copy("K")
     # A weak pull to the first point, so that lines without any measurement have a solution.
     band[0] += weight + 1e-6
     # solveh_banded is avoided, since its checks take longer than the solution.
-    return np.asarray(dpbsv(band, weight[:, None] * (line - line[0]), lower=1)[1] + line[0])
+    right = weight[:, None] * (line - line[0])
+    return np.asarray(dpbsv(band, right, lower=1, overwrite_ab=1, overwrite_b=1)[1] + line[0])
 
 
 @cache
-def _third_differences(n: int) -> Array:
-    """Lower bands (4, n) of Dᵀ D, where D takes the third differences of n numbers."""
-    row, band = np.array([-1.0, 3.0, -3.0, 1.0]), np.zeros((4, n))
+def _third_differences(n: int, stiffness: float) -> Array:
+    """Lower bands (4, n) of stiffness Dᵀ D, where D takes the third differences of n numbers."""
+    row, band = np.array([-1.0, 3.0, -3.0, 1.0]), np.zeros((4, n), order="F")
     for k in range(4):
         band[k, : n - k] = np.convolve(np.ones(n - 3), row[: 4 - k] * row[k:])
-    return band
+    return np.asarray(stiffness * band)

@@ -20,7 +20,7 @@ from vibrissa.deferred import ndimage
 from vibrissa.io import Frame
 from vibrissa.numerics import kernel
 from vibrissa.tracking.trace.ridge import middle, noise_level
-from vibrissa.tracking.trace.trace import EDGE, STILL, Bits, Trace
+from vibrissa.tracking.trace.trace import EDGE, STILL, Bits, Trace, tangent
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -192,7 +192,7 @@ class Scene:
         n = len(trace.line)
         if self._slopes is None or n < _FOLLOWS:
             return trace
-        normal = np.gradient(trace.line, axis=0)[:, ::-1] * [-1.0, 1.0]
+        normal = tangent(trace.line)[:, ::-1] * [-1.0, 1.0]
         normal /= np.hypot(*normal.T)[:, None]
         away = np.arange(-_WITHIN, _WITHIN + 1)[:, None, None]
         near = np.rint(trace.line + away * normal).astype(np.intp)

@@ -149,7 +149,7 @@ def _turn(line: Array) -> float:
     """Largest turn of a line within a fifth of its length, rad."""
     if len(line) < 3:
         return 0.0
-    angle = np.unwrap(np.arctan2(*np.gradient(line, axis=0).T[::-1]))
+    angle = np.unwrap(np.arctan2(*tangent(line).T[::-1]))
     n = max(len(line) // 5, 1)
     return float(np.abs(angle[n:] - angle[:-n]).max())
 
@@ -188,14 +188,47 @@ def interpolated(
 
 def even(line: Array, start: float = 0.0) -> Array:
     """Points `STEP` apart along a line (n, 2), from an arc length on, which may be negative."""
-    s = arc_lengths(line)
-    wanted = np.arange(start, s[-1] + 1e-9, STEP)
-    if start < 0.0:
-        ahead = min(_DIRECTION, len(line) - 1)
-        direction = (line[ahead] - line[0]) / s[ahead]
-        s = np.concatenate([[start], s])
-        line = np.concatenate([[line[0] + start * direction], line])
-    return interpolated(wanted, s, line)
+    line = np.ascontiguousarray(line)
+    # No polyline is longer than its sides along the axes together.
+    most = np.abs(line[1:] - line[:-1]).sum()
+    points = np.empty((max(int((most - start) / STEP) + 2, 0), 2))
+    return points[: space_evenly(line, start, STEP, points)]
+
+
+@kernel
+def space_evenly(line: Any, start: float, step: float, points: Any) -> int:
+    """Find points a step apart along a line, before it in its first direction; their number."""
+    last, before, count, at = line.shape[0] - 1, 0.0, 0, start
+    ahead, away = min(_DIRECTION, last), 0.0
+    for i in range(ahead):
+        away += math.hypot(line[i + 1, 0] - line[i, 0], line[i + 1, 1] - line[i, 1])
+    while at < 0.0 and ahead > 0:
+        for k in range(2):
+            points[count, k] = line[0, k] + at / away * (line[ahead, k] - line[0, k])
+        count += 1
+        at = start + count * step
+    for i in range(last):
+        size = math.hypot(line[i + 1, 0] - line[i, 0], line[i + 1, 1] - line[i, 1])
+        while at < before + size:
+            for k in range(2):
+                slope = (line[i + 1, k] - line[i, k]) / size
+                points[count, k] = line[i, k] + slope * (at - before)
+            count += 1
+            at = start + count * step
+        before += size
+    # Rounding may put a point that is on the line's end beyond it.
+    if at < before + 1e-9:
+        points[count] = line[last]
+        count += 1
+    return count
+
+
+def tangent(line: Array) -> Array:
+    """Change (n, 2) from point to point along a line: `numpy.gradient`, which takes longer."""
+    along = np.empty_like(line)
+    along[1:-1] = 0.5 * (line[2:] - line[:-2])
+    along[0], along[-1] = line[1] - line[0], line[-1] - line[-2]
+    return along
 
 
 def aligned(line: Array, other: Array, points: int = 30) -> float:
@@ -313,10 +346,9 @@ class Clutter(NamedTuple):
         return self._at(points, int(EDGE))
 
     def _at(self, points: Array, which: int) -> Mask:
-        rows, columns = self.bits.shape
         column, row = np.rint(points).astype(np.intp).T
-        found = self.bits[row.clip(0, rows - 1), column.clip(0, columns - 1)]
-        return np.asarray((found & np.uint32(which)) != 0)
+        at = np.ravel_multi_index((row, column), self.bits.shape, mode="clip")
+        return np.asarray((self.bits.take(at) & np.uint32(which)) != 0)
 
     @property
     def still_only(self) -> Clutter:

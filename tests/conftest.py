@@ -1,6 +1,7 @@
 """How every test runs: figures without a window, one thread of BLAS, random inputs without a
 deadline, one browser, and on several cores in an order that keeps them all busy."""
 
+import functools
 import gc
 import importlib
 import os
@@ -19,12 +20,16 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import numpy as np
 import pytest
+import typer.main
 from hypothesis import settings
 
 import vibrissa as vb
 
 # Garbage is looked for less often: figures are many small objects, and it was a sixth of drawing.
 gc.set_threshold(20_000, 20, 20)
+
+# Typer makes the command line anew, with all verbs, whenever it is called.
+typer.main.get_command = functools.cache(typer.main.get_command)
 
 # Where all that the extra test names is installed, a test skipped for want of it hides a fault.
 if os.environ.get("REQUIRE_EXTRAS"):

@@ -69,9 +69,11 @@ def test_round_trip_on_the_default_whisker(gamma_map, rng):
 @pytest.mark.parametrize(
     "whisker",
     [
-        vb.Whisker.straight(0.03),
+        pytest.param(vb.Whisker.straight(0.03), marks=pytest.mark.slow),
         vb.Whisker.parabola(0.02, 41.0),
-        vb.Whisker.parabola(0.05, 6.0, tip_radius=100e-6 / 40),
+        pytest.param(
+            vb.Whisker.parabola(0.05, 6.0, tip_radius=100e-6 / 40), marks=pytest.mark.slow
+        ),
         vb.Whisker.from_curvature(
             0.25,
             lambda s: np.stack([0 * s, -2.0 + 0 * s, 3.0 + 0 * s], -1),

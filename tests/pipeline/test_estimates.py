@@ -183,7 +183,10 @@ def test_a_peg_is_found_from_a_recording_alone(quiet):
     assert set(quiet.children) == set(done.children) - {"signals", "estimates", "contour"}
 
 
-@pytest.mark.parametrize("shape", ["plane", "free", pytest.param("sphere", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "shape",
+    ["free", *(pytest.param(shape, marks=pytest.mark.slow) for shape in ("plane", "sphere"))],
+)
 def test_other_shapes_are_fitted_and_come_back_from_a_file(quiet, tmp_path, shape):
     done = with_contour(quiet, shape)
     save_recording(tmp_path / "t.nc", done)

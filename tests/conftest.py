@@ -24,6 +24,7 @@ import typer.main
 from hypothesis import settings
 
 import vibrissa as vb
+from vibrissa.contacts import contact_map
 
 # Garbage is looked for less often: figures are many small objects, and it was a sixth of drawing.
 gc.set_threshold(20_000, 20, 20)
@@ -149,8 +150,11 @@ def gamma_map() -> vb.ContactMap:
 
 @pytest.fixture(scope="session")
 def gridded_map(gamma_map) -> vb.ContactMap:
-    """The default whisker's map with the paper's grid."""
-    return replace(gamma_map, grid=vb.ContactMap.simulate(gamma_map.whisker).grid)
+    """The default whisker's map with every third azimuth and elevation of the paper's grid."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("GRID_AZIMUTHS", "GRID_ELEVATIONS"):
+            patch.setattr(contact_map, name, getattr(contact_map, name)[::3])
+        return replace(gamma_map, grid=vb.ContactMap.simulate(gamma_map.whisker).grid)
 
 
 @pytest.fixture

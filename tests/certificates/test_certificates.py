@@ -339,7 +339,7 @@ def conditions(certificate, whisker, at):
     )
 
 
-@pytest.mark.parametrize("kind", ["straight", "curved"])
+@pytest.mark.parametrize("kind", ["straight", pytest.param("curved", marks=pytest.mark.slow)])
 def test_enclosures_over_boxes_never_miss_a_point(curved, kind, monkeypatch):
     """Those of the search, and those of the check of curved whiskers."""
     contact_map = curved if kind == "curved" else straight(15.0)

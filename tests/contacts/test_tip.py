@@ -99,6 +99,7 @@ def test_regions_hold_the_tip(rod, touched, using):
     assert found.covariance_valid[tip].mean() > 0.9
 
 
+@pytest.mark.slow
 def test_regions_of_a_slender_tip_are_as_wide_as_what_it_can_touch():
     """The γ whisker's tip is so soft that noise leaves open much of what it holds."""
     contact_map = vb.ContactMap.simulate(vb.samples.gamma(), grid=False)

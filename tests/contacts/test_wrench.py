@@ -144,6 +144,7 @@ def test_small_deflections_are_flagged(rng):
     assert (ratios[~linear] < 1.25).mean() > 0.9, ratios[~linear]
 
 
+@pytest.mark.slow
 def test_regions_of_contacts_near_a_thin_tip_hold_the_truth(rng):
     """Long steps left the floor of the valley: 1.9 % of errors were beyond three sigma."""
     whisker = vb.Whisker.from_curvature(

@@ -443,6 +443,7 @@ def test_contacts_are_as_far_from_the_known_object_as_predicted(trial):
         compare_contacts(nothing)
 
 
+@pytest.mark.slow
 def test_an_unknown_length_of_the_whisker_is_in_contacts_by_a_sensor(trial, quiet, contact_map):
     """Forces of a whisker that is 1 % longer than it is taken to be move contacts as stated."""
     truth = quiet["truth"].to_dataset().isel(whisker=0)

@@ -80,13 +80,14 @@ def test_nobody_is_asked_where_that_gains_nothing(run, why):
     assert run(f"kernel_cache.subprocess.Popen = None; {why}") == ["twice 0", "thrice 0"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="the stand-ins for Python are shell scripts")
 @pytest.mark.parametrize(
     "does",
     [
-        pytest.param("exit 3", marks=pytest.mark.slow),
+        "exit 3",
         "exec sleep 1000",
-        pytest.param("head -c 1; kill -9 $$", marks=pytest.mark.slow),
+        "head -c 1; kill -9 $$",
     ],
 )
 def test_a_helper_that_fails_or_hangs_is_done_without(run, tmp_path, does):

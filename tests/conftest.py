@@ -38,7 +38,9 @@ if os.environ.get("REQUIRE_EXTRAS"):
 
 # The first example of a law may compile a kernel, which takes seconds. In continuous integration
 # the examples are the same in every run, so that a change fails by its own fault only.
-settings.register_profile("vibrissa", deadline=None, derandomize=bool(os.environ.get("CI")))
+settings.register_profile(
+    "vibrissa", deadline=None, max_examples=40, derandomize=bool(os.environ.get("CI"))
+)
 settings.load_profile("vibrissa")
 
 # Where files are shared out to workers, these come first, in this order. The first

@@ -1,6 +1,7 @@
 """How every test runs: figures without a window, one thread of BLAS, random inputs without a
 deadline, one browser, and on several cores in an order that keeps them all busy."""
 
+import functools
 import gc
 import importlib
 import os
@@ -19,12 +20,17 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import numpy as np
 import pytest
+import typer.main
 from hypothesis import settings
 
 import vibrissa as vb
+from vibrissa.contacts import contact_map
 
 # Garbage is looked for less often: figures are many small objects, and it was a sixth of drawing.
 gc.set_threshold(20_000, 20, 20)
+
+# Typer makes the command line anew, with all verbs, whenever it is called.
+typer.main.get_command = functools.cache(typer.main.get_command)
 
 # Where all that the extra test names is installed, a test skipped for want of it hides a fault.
 if os.environ.get("REQUIRE_EXTRAS"):
@@ -32,7 +38,9 @@ if os.environ.get("REQUIRE_EXTRAS"):
 
 # The first example of a law may compile a kernel, which takes seconds. In continuous integration
 # the examples are the same in every run, so that a change fails by its own fault only.
-settings.register_profile("vibrissa", deadline=None, derandomize=bool(os.environ.get("CI")))
+settings.register_profile(
+    "vibrissa", deadline=None, max_examples=40, derandomize=bool(os.environ.get("CI"))
+)
 settings.load_profile("vibrissa")
 
 # Where files are shared out to workers, these come first, in this order. The first
@@ -144,8 +152,11 @@ def gamma_map() -> vb.ContactMap:
 
 @pytest.fixture(scope="session")
 def gridded_map(gamma_map) -> vb.ContactMap:
-    """The default whisker's map with the paper's grid."""
-    return replace(gamma_map, grid=vb.ContactMap.simulate(gamma_map.whisker).grid)
+    """The default whisker's map with every third azimuth and elevation of the paper's grid."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("GRID_AZIMUTHS", "GRID_ELEVATIONS"):
+            patch.setattr(contact_map, name, getattr(contact_map, name)[::3])
+        return replace(gamma_map, grid=vb.ContactMap.simulate(gamma_map.whisker).grid)
 
 
 @pytest.fixture

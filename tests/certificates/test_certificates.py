@@ -235,7 +235,7 @@ def test_witnesses_are_proved_and_other_pairs_are_not(curved):
         (15.0, "FT MB MD", 0.3),
         pytest.param(15.0, "Mx MB MD", 0.3, marks=pytest.mark.slow),
         pytest.param(15.0, "Fx FT MB", 2.0, marks=pytest.mark.slow),
-        (1.0, "Fx MB MD", 0),
+        pytest.param(1.0, "Fx MB MD", 0, marks=pytest.mark.slow),
     ],
 )
 def test_witnesses_in_one_plane_are_proved(ratio, triplet, turn):
@@ -339,7 +339,7 @@ def conditions(certificate, whisker, at):
     )
 
 
-@pytest.mark.parametrize("kind", ["straight", "curved"])
+@pytest.mark.parametrize("kind", ["straight", pytest.param("curved", marks=pytest.mark.slow)])
 def test_enclosures_over_boxes_never_miss_a_point(curved, kind, monkeypatch):
     """Those of the search, and those of the check of curved whiskers."""
     contact_map = curved if kind == "curved" else straight(15.0)

@@ -9,9 +9,6 @@ import time
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("zarr", reason="zarr (extra sweeps) is not installed")
-
 from typer.testing import CliRunner
 
 from vibrissa.cli.app import app
@@ -35,6 +32,11 @@ triplets = ["Fx MB MD"]
 samples = 64
 resolution = false
 """
+
+
+@pytest.fixture(autouse=True, scope="module")
+def zarr():
+    pytest.importorskip("zarr", reason="zarr (extra sweeps) is not installed")
 
 
 def done(*words):

@@ -39,22 +39,26 @@ def test_videos_need_a_trial(tmp_path):
         view(vb.samples.gamma(), videos=[tmp_path / "top.mp4"])
 
 
-def test_edited_recordings_are_checked(tmp_path):
+def test_edited_recordings_are_checked(tmp_path, monkeypatch, capsys):
     """As by the other verbs."""
     import numpy as np
     import xarray as xr
 
     import vibrissa as vb
+    from vibrissa.cli import main
     from vibrissa.recording import coordinates, recorded, recording_tree
 
     turns = recorded("base_rotation", 2.0 * np.tile(np.eye(3), (2, 1, 1, 1)))
     root = xr.Dataset({"base_rotation": turns}, coordinates([0.0, 1.0], ["w"]))
     tree = recording_tree(root, [vb.samples.gamma()], "test")
     vb.io.save_recording(tmp_path / "trial.nc", tree)
-    command = [*COMMAND, tmp_path / "trial.nc"]
-    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=100)
-    assert done.returncode == 2
-    assert "base_rotation is not a rotation" in done.stderr
+    monkeypatch.setattr(
+        sys, "argv", ["vibrissa", "view", "--no-browser", str(tmp_path / "trial.nc")]
+    )
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 2
+    assert "base_rotation is not a rotation" in capsys.readouterr().err
 
 
 def test_a_taken_port_is_passed_over():

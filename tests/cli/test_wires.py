@@ -24,7 +24,7 @@ def test_a_map_of_a_steel_wire(tmp_path):
     assert "100 mm" in wire._repr_html_()  # the bar in its picture: a third of it
 
 
-@pytest.mark.parametrize("scale", [1.0, 20.0])
+@pytest.mark.parametrize("scale", [pytest.param(1.0, marks=pytest.mark.slow), 20.0])
 def test_the_noise_of_a_rat_s_whisker_is_questioned_for_a_rod(tmp_path, gamma_map, scale):
     """A rod of the same shape: its contacts would be stated far too exactly."""
     stiff = gamma_map.whisker.scaled(radius_factor=scale)
@@ -41,7 +41,7 @@ def test_the_noise_of_a_rat_s_whisker_is_questioned_for_a_rod(tmp_path, gamma_ma
         assert questioned == (scale > 1.0 and not noise)
 
 
-@pytest.mark.parametrize("density", [None, 1240.0])
+@pytest.mark.parametrize("density", [pytest.param(None, marks=pytest.mark.slow), 1240.0])
 def test_a_neglected_weight_is_stated(tmp_path, density):
     rod = vb.Whisker.straight(0.25, base_radius=2e-3, tip_radius=0.8e-3, youngs_modulus=2.3e9)
     rod = rod.with_properties(density=density)

@@ -48,7 +48,10 @@ def sigma(gamma_map):
     return whisker.length / (30.0 * whisker.base_bending_stiffness)
 
 
-@pytest.mark.parametrize("using", SETS)
+@pytest.mark.parametrize(
+    "using",
+    [SETS[0], *(pytest.param(names, marks=pytest.mark.slow) for names in SETS[1:3]), SETS[3]],
+)
 def test_true_contacts_are_in_the_regions(gamma_map, sigma, using):
     rng = np.random.default_rng(6)
     bases = np.abs(rng.normal(size=COUNT)) * sigma

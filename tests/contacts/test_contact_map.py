@@ -156,7 +156,14 @@ def test_the_lightest_contacts_are_found(gamma_map, rng, straight, triplet):
     assert _share_found(gamma_map, triplet, charted) > 0.99
 
 
-@pytest.mark.parametrize("triplet", [("FT", "FD", "Mx"), ("Fx", "FT", "MB"), ("FD", "Mx", "MD")])
+@pytest.mark.parametrize(
+    "triplet",
+    [
+        ("FT", "FD", "Mx"),
+        ("Fx", "FT", "MB"),
+        pytest.param(("FD", "Mx", "MD"), marks=pytest.mark.slow),
+    ],
+)
 def test_light_contacts_near_the_plane_of_a_planar_whisker_are_found(gamma_map, rng, triplet):
     """Signals that do not change to first order across the plane have a fold on faces of cells.
 
@@ -219,6 +226,7 @@ def test_contacts_in_the_plane_of_a_uniform_wire_are_undetermined(rng):
     assert not (found.status == vb.Status.UNIQUE).any()
 
 
+@pytest.mark.slow
 def test_light_contacts_of_a_wire_that_is_a_full_circle_are_found(rng):
     """Dozens of cells nearly contain a light target there, and must not crowd out the right one."""
     contact_map = vb.ContactMap.simulate(_wire(2.0 * np.pi), grid=False)

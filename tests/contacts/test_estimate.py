@@ -58,7 +58,7 @@ def found_again(contacts, triplet, touched):
 
 
 def test_round_trip_on_the_default_whisker(gamma_map, rng):
-    hit, cone, found, *_ = recovered(gamma_map, CANONICAL, 10_000, rng)
+    hit, cone, found, *_ = recovered(gamma_map, CANONICAL, 4000, rng)
     outside = ~cone
     assert outside.mean() > 0.9
     assert hit[outside].mean() >= 0.9999
@@ -69,9 +69,11 @@ def test_round_trip_on_the_default_whisker(gamma_map, rng):
 @pytest.mark.parametrize(
     "whisker",
     [
-        vb.Whisker.straight(0.03),
+        pytest.param(vb.Whisker.straight(0.03), marks=pytest.mark.slow),
         vb.Whisker.parabola(0.02, 41.0),
-        vb.Whisker.parabola(0.05, 6.0, tip_radius=100e-6 / 40),
+        pytest.param(
+            vb.Whisker.parabola(0.05, 6.0, tip_radius=100e-6 / 40), marks=pytest.mark.slow
+        ),
         vb.Whisker.from_curvature(
             0.25,
             lambda s: np.stack([0 * s, -2.0 + 0 * s, 3.0 + 0 * s], -1),
@@ -124,7 +126,7 @@ def test_contacts_next_to_a_fold_of_the_triplet_are_found(gamma_map, sample, tri
     rng = np.random.default_rng(1)
     straight = vb.samples.straight()
     contacts = gamma_map if sample == "gamma" else vb.ContactMap.simulate(straight, grid=False)
-    chart, n = contacts.chart, 4000
+    chart, n = contacts.chart, 2000
     eta, psi, rho = rng.uniform(0, 1, n), rng.uniform(0, 2 * np.pi, n), rng.uniform(0.5, 0.999, n)
     xi = contacts_at(chart.fold, np.stack([eta, psi, rho], axis=-1))
     values, _ = solve_forces(chart.discretization, np.insert(xi, 1, 0.0, axis=1))

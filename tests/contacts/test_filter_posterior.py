@@ -121,7 +121,7 @@ def test_a_contact_near_slip_off_is_not_lost_for_another(gamma_map):
     assert max(squares) < 40.0
 
 
-@pytest.mark.parametrize("names", ["Fx MB MD", "FT FD MB"])
+@pytest.mark.parametrize("names", ["Fx MB MD", pytest.param("FT FD MB", marks=pytest.mark.slow)])
 def test_a_first_sample_near_slip_off_is_known_as_well_as_stated(gamma_map, names):
     """No twin is certain only by its volume, and regions are not flat."""
     d, length, rng = (

@@ -39,7 +39,9 @@ def missed(found, truth):
     return np.median(np.linalg.norm(found.point - truth, axis=1))
 
 
-@pytest.mark.parametrize("using", ["Fx FT MB MD", "Fx FT FD Mx MB MD"])
+@pytest.mark.parametrize(
+    "using", ["Fx FT MB MD", pytest.param("Fx FT FD Mx MB MD", marks=pytest.mark.slow)]
+)
 def test_with_the_transverse_force_friction_is_found(gamma_map, using):
     truth, angle, signals = rubbed(gamma_map, 0.4)
     found = gamma_map.estimate(signals, using, NOISE, friction=0.3)

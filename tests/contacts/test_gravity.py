@@ -215,7 +215,7 @@ def turned(angles):
 def swung(nitinol):
     """One contact point of the laboratory, touched by a whisker that turns under its weight."""
     whisker, lab = nitinol.whisker, np.array([0.0, 0.0, -G])
-    rotations = turned(np.linspace(-0.05, 0.12, 6))
+    rotations = turned(np.linspace(-0.05, 0.12, 3))
     rest = vb.resting(whisker, rotations[0].T @ lab)
     load = vb.PointForce(0.7 * whisker.length, 0.5 * unit(whisker), 1.2)
     held = rotations[2] @ vb.deflect(whisker, load, gravity=rotations[2].T @ lab).contact_point

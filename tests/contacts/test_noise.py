@@ -83,7 +83,7 @@ def test_mirror_images_are_found_and_flat_valleys_held(gamma_map, rng):
     assert (squares <= HELD).mean() > 0.9
 
 
-@pytest.mark.parametrize("using", ["Fx FD MD", "Fx Mx MD"])
+@pytest.mark.parametrize("using", ["Fx FD MD", pytest.param("Fx Mx MD", marks=pytest.mark.slow)])
 def test_directions_are_the_less_certain_the_smaller_what_they_are_of(gamma_map, rng, using):
     """Their sizes are not measured, and valleys of χ² are bent: about 3 % were beyond."""
     force, moment, point = contacts_of(gamma_map, 0.0, 1.0, 1500, rng)
@@ -262,6 +262,7 @@ def test_what_is_seen_at_nodes_is_within_the_bounds_of_their_block(gamma_map):
     assert np.median(of.extent[1], axis=1).max() < 0.5
 
 
+@pytest.mark.slow
 def test_probabilities_are_how_often_candidates_are_true(gamma_map, rng):
     """Calibration: of candidates called 5-35 and 35-65 % probable as many are the truth."""
     force, moment, point = contacts_of(gamma_map, 0.05, 0.9, 2000, rng)
@@ -294,7 +295,9 @@ def test_what_is_unique_is_the_truth(gamma_map, rng):
     assert (distances(found, point, rows) > BEYOND).mean() < 0.012
 
 
-@pytest.mark.parametrize("using", ["Fx MB MD", "Fx FT MB", "Fx FT MB MD"])
+@pytest.mark.parametrize(
+    "using", ["Fx MB MD", "Fx FT MB", pytest.param("Fx FT MB MD", marks=pytest.mark.slow)]
+)
 def test_a_stream_answers_as_a_batch_beside_the_map(gamma_map, beside_slip_off, using):
     signals = vb.base_signals(beside_slip_off[0], beside_slip_off[1])
     batch = gamma_map.estimate(signals, using, np.diag(SIGMA**2))

@@ -155,6 +155,7 @@ def test_covariances_along_bent_valleys_hold_what_they_state(gamma_map):
     assert (squares > 14.16).mean() < 0.006
 
 
+@pytest.mark.slow
 def test_a_calibration_from_data_is_as_sure_as_it_says(gamma_map, bent, wrench, rng, tmp_path):
     """Each trial calibrates anew by a few known loads, by way of a file; then a contact is felt."""
     mixing = gauges(rng, 6)

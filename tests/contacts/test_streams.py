@@ -165,8 +165,15 @@ def test_a_mix_that_tells_two_numbers_only_says_so(gamma_map, bent):
     assert found.status == vb.Status.UNDERDETERMINED
 
 
-@pytest.mark.parametrize("names", ["Fx MB MD", " ".join(SIGNALS)])
-@pytest.mark.parametrize("given", ["covariance", "deviations"])
+@pytest.mark.parametrize(
+    ("names", "given"),
+    [
+        ("Fx MB MD", "deviations"),
+        (" ".join(SIGNALS), "covariance"),
+        pytest.param("Fx MB MD", "covariance", marks=pytest.mark.slow),
+        pytest.param(" ".join(SIGNALS), "deviations", marks=pytest.mark.slow),
+    ],
+)
 def test_uncertain_stiffness_is_in_the_covariance(gamma_map, bent, names, given):
     """Whiskers 5 % stiffer or softer than the map's give contacts that scatter as stated."""
     rng = np.random.default_rng(6)

@@ -79,7 +79,9 @@ def test_an_oblique_force_at_the_tip_is_found(rod, touched, using):
     np.testing.assert_allclose(one.point, found.point[0], atol=1e-12)
 
 
-@pytest.mark.parametrize("using", SETS)
+@pytest.mark.parametrize(
+    "using", [SETS[0], *(pytest.param(s, marks=pytest.mark.slow) for s in SETS[1:])]
+)
 def test_regions_hold_the_tip(rod, touched, using):
     """Of 10 draws of noise each; chi-square of three degrees of freedom is 3 in the mean."""
     wrench, points = (np.repeat(part, 10, axis=0) for part in touched)
@@ -97,6 +99,7 @@ def test_regions_hold_the_tip(rod, touched, using):
     assert found.covariance_valid[tip].mean() > 0.9
 
 
+@pytest.mark.slow
 def test_regions_of_a_slender_tip_are_as_wide_as_what_it_can_touch():
     """The γ whisker's tip is so soft that noise leaves open much of what it holds."""
     contact_map = vb.ContactMap.simulate(vb.samples.gamma(), grid=False)

@@ -94,7 +94,11 @@ def test_peg_with_friction_at_the_tip():
 
 @pytest.mark.parametrize(
     ("place", "force"),
-    [(0.5, (0.0, 1e-4, 3e-5)), (0.6, (2e-5, 1e-4, -4e-5)), (0.4, (-5e-5, -2e-4, 1e-5))],
+    [
+        pytest.param(0.5, (0.0, 1e-4, 3e-5), marks=pytest.mark.slow),
+        (0.6, (2e-5, 1e-4, -4e-5)),
+        pytest.param(0.4, (-5e-5, -2e-4, 1e-5), marks=pytest.mark.slow),
+    ],
 )
 def test_covariance_predicts_the_scatter(place, force, rng):
     whisker = WHISKERS["gamma"]
@@ -140,6 +144,7 @@ def test_small_deflections_are_flagged(rng):
     assert (ratios[~linear] < 1.25).mean() > 0.9, ratios[~linear]
 
 
+@pytest.mark.slow
 def test_regions_of_contacts_near_a_thin_tip_hold_the_truth(rng):
     """Long steps left the floor of the valley: 1.9 % of errors were beyond three sigma."""
     whisker = vb.Whisker.from_curvature(

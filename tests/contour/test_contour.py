@@ -45,7 +45,7 @@ def drawn(generator, covariance):
     return np.einsum("nij,nj->ni", root, generator.normal(size=covariance.shape[:2]))
 
 
-@settings(max_examples=10)
+@settings(max_examples=6)
 @given(seed=st.integers(0, 10_000), normals=st.booleans(), known=st.booleans())
 def test_exact_points_give_the_cylinder_back(seed, normals, known):
     generator = np.random.default_rng(seed)
@@ -170,7 +170,7 @@ def test_offset_and_tilt():
     assert tilt == pytest.approx(1e-8)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2, 4])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_normals_that_contradict_the_points_give_no_hollow_cylinder(seed):
     generator = np.random.default_rng(seed)
     n = 100
@@ -186,7 +186,7 @@ def test_normals_that_contradict_the_points_give_no_hollow_cylinder(seed):
 def test_a_thin_cylinder_has_a_positive_radius():
     """Contacts with noise on a short arc fit radii below zero as often as above; none is hollow."""
     true, sigma, n = 20e-6, 2e-4, 60
-    for seed in range(10):
+    for seed in range(4):
         generator = np.random.default_rng(seed)
         angle = generator.uniform(-0.5, 0.5, n)
         normal = np.stack([np.cos(angle), np.sin(angle), np.zeros(n)], axis=1)

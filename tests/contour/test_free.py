@@ -78,6 +78,7 @@ def test_far_from_contacts_it_says_that_it_does_not_know(contacts):
     assert plane.distance_sigma([15e-3, 0.0, 0.0]) > 0.2e-3
 
 
+@pytest.mark.slow
 def test_more_contacts_than_wanted_are_merged(contacts):
     points, known = contacts(2, 900)
     fit = fit_free(points, base="sphere", most=100, **known)

@@ -85,7 +85,9 @@ def test_no_bias_and_an_honest_spread(kind, joint_errors):
     assert abs((np.abs(z) < 1.96).mean() - 0.95) < 3.0 * np.sqrt(0.05 * 0.95 / (30 * k))
 
 
-@pytest.mark.parametrize("kind", ["cylinder", "sphere", "plane"])
+@pytest.mark.parametrize(
+    "kind", ["cylinder", pytest.param("sphere", marks=pytest.mark.slow), "plane"]
+)
 def test_a_wrong_shape_is_told_by_its_misfit_and_is_unsure(kind, joint_errors):
     points, known = noisy(kind, joint_errors, np.random.default_rng(4), 150)
     right = fit_shape(kind, points, **known)
@@ -107,15 +109,11 @@ def test_without_noise_there_is_no_misfit():
 
 
 def test_normals_with_their_covariance_tell_the_axis(joint_errors):
-    for seed in range(3):
-        points, known = noisy("cylinder", joint_errors, np.random.default_rng(seed), 150)
-        exact = {name: known[name] for name in ("covariance", "whisker_radius", "normals")}
-        sigma, coarse = (
-            fit_shape("cylinder", points, **known).sigma,
-            fit_shape("cylinder", points, **exact).sigma,
-        )
-        assert sigma["axis_x"] < 0.7 * coarse["axis_x"]
-        assert sigma["radius"] < coarse["radius"]
+    points, known = noisy("cylinder", joint_errors, np.random.default_rng(0), 150)
+    exact = {name: known[name] for name in ("covariance", "whisker_radius", "normals")}
+    sigma, coarse = (fit_shape("cylinder", points, **how).sigma for how in (known, exact))
+    assert sigma["axis_x"] < 0.7 * coarse["axis_x"]
+    assert sigma["radius"] < coarse["radius"]
 
 
 @pytest.mark.parametrize("kind", ["cylinder", "sphere", "plane"])

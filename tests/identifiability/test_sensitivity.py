@@ -1,7 +1,5 @@
 """Derivatives of the contact point against inversion itself, and what is made of them."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import xarray as xr
@@ -11,13 +9,6 @@ from vibrissa.numerics import weighted_quantile
 from vibrissa.signals import TRIPLETS, spherical
 
 NOISE = np.diag(np.repeat([1e-12, 4e-16], 3))
-
-
-@pytest.fixture(scope="module")
-def coarse(gridded_map):
-    """The map with every third azimuth and elevation of the paper's grid."""
-    grid = gridded_map.grid.isel(theta=slice(None, None, 3), phi=slice(1, None, 3))
-    return replace(gridded_map, grid=grid)
 
 
 @pytest.fixture(scope="module")
@@ -156,21 +147,21 @@ def test_ellipsoids_are_those_of_the_covariance_of_estimates(gamma_map, nodes, r
     np.testing.assert_allclose(diagonal.predicted_error, np.sqrt((by**2).sum(("space", "signal"))))
 
 
-def test_regions_and_volume(coarse, nodes, rng):
+def test_regions_and_volume(gridded_map, nodes, rng):
     at = some(nodes, rng, 40)
     bent = vb.deflect(
-        coarse.whisker,
+        gridded_map.whisker,
         vb.PointContact(at.contact_point.transpose("contact", "space").to_numpy()),
     )
     line = bent.centerline(2001)
-    node = np.rint(bent.arc_length / coarse.whisker.length * 2000).astype(int)
+    node = np.rint(bent.arc_length / gridded_map.whisker.length * 2000).astype(int)
     rows = np.arange(40)
     ahead = line[rows, node] - line[rows, node - 1]
     slope = ahead[:, 0] / np.linalg.norm(ahead, axis=1)
     clear = np.abs(slope) > 0.01
     np.testing.assert_array_equal(at.large_deflection.to_numpy()[clear], slope[clear] < 0.0)
     # The volume of the contacts within the paper's bounds, by the map's nodes and by its grid.
-    grid = vb.sensitivity(coarse, at="grid")
+    grid = vb.sensitivity(gridded_map, at="grid")
     ends = np.isclose(grid.r, grid.r.min()) | np.isclose(grid.r, grid.r.max())
     by_grid = float((grid.volume * np.where(ends, 0.5, 1.0)).sum())
     by_nodes = float(nodes.volume.where(nodes.within_paper_bounds).sum())

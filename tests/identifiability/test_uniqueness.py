@@ -253,6 +253,7 @@ def test_twins_of_a_whisker_of_slight_taper_are_climbed_to_their_summit():
         assert np.degrees(found.critical_cone.item()) == pytest.approx(2.1125, abs=2e-4)
 
 
+@pytest.mark.slow
 def test_a_rare_pair_within_one_region_is_found(gamma_map):
     """One contact in 300 has its twin in the same region; among few samples there may be none."""
     found = vb.uniqueness(gamma_map, ["Fx FT FD"], ["CB"], resolution=False)

@@ -37,6 +37,7 @@ def test_it_learns_a_triplet_that_locates_contacts(gamma_map, trained):
     np.testing.assert_allclose(np.linalg.norm(again, axis=1), trained.errors)
 
 
+@pytest.mark.slow
 def test_it_cannot_learn_a_triplet_that_does_not(trained):
     """Without axial signals a cylinder's tip and its middle feel alike."""
     cylinder = vb.ContactMap.simulate(vb.samples.straight_cylinder(), grid=False)
@@ -51,6 +52,7 @@ def test_quantiles_of_a_part(trained):
     assert trained.error_quantiles(0.5, keep) == trained.errors[7]
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_network(gamma_map):
     first, again, other = (
         train_network(gamma_map, "Fx MB MD", samples=500, held_out=50, seed=seed).errors

@@ -12,13 +12,6 @@ from vibrissa.signals import spherical, within_turn
 
 
 @pytest.fixture(scope="module")
-def coarse(gridded_map):
-    """The map with every third azimuth and elevation of the paper's grid."""
-    grid = gridded_map.grid.isel(theta=slice(None, None, 3), phi=slice(1, None, 3))
-    return replace(gridded_map, grid=grid)
-
-
-@pytest.fixture(scope="module")
 def nodes(gamma_map):
     return vb.sensitivity(gamma_map)
 
@@ -42,10 +35,10 @@ def nearest(estimate, points):
     return estimate.candidates.point[np.arange(len(points)), np.argmin(away, axis=1)]
 
 
-def test_differences_on_an_exact_table_are_the_derivatives(coarse, some_points):
+def test_differences_on_an_exact_table_are_the_derivatives(gridded_map, some_points):
     points = some_points[:15]
-    exact = vb.sensitivity(coarse, at=points)
-    grid = coarse.grid
+    exact = vb.sensitivity(gridded_map, at=points)
+    grid = gridded_map.grid
     reached = (grid.status == vb.Status.OK).to_numpy()
     span = [np.ptp(grid[n].to_numpy()[reached]) for n in ("Fx", "MB")]
     low = [grid[n].to_numpy()[reached].min() for n in ("Fx", "MB")]
@@ -57,26 +50,26 @@ def test_differences_on_an_exact_table_are_the_derivatives(coarse, some_points):
                 "MB": low[1] + wanted[:, 1] * span[1],
                 "MD": -np.pi + wanted[:, 2] * 2.0 * np.pi,
             }
-            return spherical(nearest(coarse.estimate(signals), points))
+            return spherical(nearest(gridded_map.estimate(signals), points))
 
         return look_up
 
-    found = central_differences(coarse, at=points, interpolation=inversion, step=1e-7)
+    found = central_differences(gridded_map, at=points, interpolation=inversion, step=1e-7)
     for name in ("sensitivity", "point_sensitivity"):
         got, wanted = found[name].to_numpy(), exact[name].to_numpy()
         scale = np.linalg.norm(wanted, axis=1, keepdims=True)
         assert np.nanmedian(np.abs(got - wanted) / scale) < 1e-4
 
 
-def test_differences_come_nearer_on_a_finer_table(coarse, some_points):
+def test_differences_come_nearer_on_a_finer_table(gridded_map, some_points):
     points = some_points
-    exact = vb.sensitivity(coarse, at=points).sensitivity
+    exact = vb.sensitivity(gridded_map, at=points).sensitivity
     thinned = replace(
-        coarse,
-        grid=coarse.grid.isel(theta=slice(None, None, 3), phi=slice(None, None, 3)),
+        gridded_map,
+        grid=gridded_map.grid.isel(theta=slice(None, None, 3), phi=slice(None, None, 3)),
     )
     errors = []
-    for contacts in (thinned, coarse):
+    for contacts in (thinned, gridded_map):
         found = central_differences(contacts, at=points, interpolation="linear")
         away = np.abs(found.sensitivity - exact) / np.abs(exact)
         errors.append(np.nanmedian(away))
@@ -84,16 +77,16 @@ def test_differences_come_nearer_on_a_finer_table(coarse, some_points):
     assert errors[1] < 0.85 * errors[0]
 
 
-def test_differences_have_ellipsoids_and_need_a_grid(coarse, gamma_map, some_points):
+def test_differences_have_ellipsoids_and_need_a_grid(gridded_map, gamma_map, some_points):
     noise = np.diag(np.repeat([1e-12, 4e-16], 3))
-    found = central_differences(coarse, at=some_points, noise=noise, interpolation="linear")
-    exact = vb.sensitivity(coarse, at=some_points, noise=noise)
+    found = central_differences(gridded_map, at=some_points, noise=noise, interpolation="linear")
+    exact = vb.sensitivity(gridded_map, at=some_points, noise=noise)
     assert found.predicted_error.dims == exact.predicted_error.dims
     assert 0.7 < float((found.predicted_error / exact.predicted_error).median()) < 1.4
     with pytest.raises(ValueError, match="has no grid"):
         central_differences(gamma_map)
     with pytest.raises(ValueError, match="step"):
-        central_differences(coarse, step=0.0)
+        central_differences(gridded_map, step=0.0)
 
 
 def test_findings_of_a_straight_whisker_follow_from_its_symmetry():
@@ -126,12 +119,12 @@ def test_findings_ask_only_the_region(nodes):
     assert contact_weights(nodes, region).sum() == pytest.approx(volume.sum())
 
 
-def test_a_slice_holds_one_signal_and_is_exact(coarse):
-    found = signal_slice(coarse, points=24)
+def test_a_slice_holds_one_signal_and_is_exact(gridded_map):
+    found = signal_slice(gridded_map, points=24)
     there = np.isfinite(found.r.to_numpy())
     assert 0.2 < there.mean() < 0.95
     points = found.contact_point.to_numpy()[there]
-    bent = vb.deflect(coarse.whisker, vb.PointContact(points))
+    bent = vb.deflect(gridded_map.whisker, vb.PointContact(points))
     signals = vb.base_signals(bent.force, bent.moment)
     fx, mb = np.meshgrid(found.Fx, found.MB, indexing="ij")
     assert found.r.dims == ("Fx", "MB")
@@ -143,24 +136,28 @@ def test_a_slice_holds_one_signal_and_is_exact(coarse):
     error = found.error_distance.to_numpy()[there]
     assert 0.0 < np.nanmedian(error) < 2e-3
     with pytest.raises(ValueError, match="to be fixed"):
-        signal_slice(coarse, {"Mx": 0.0})
+        signal_slice(gridded_map, {"Mx": 0.0})
 
 
-def test_contacts_between_the_grid_have_errors(coarse):
-    found = error_solid(coarse, stride=6)
+def test_contacts_between_the_grid_have_errors(gridded_map):
+    found = error_solid(gridded_map, stride=6)
     assert np.isfinite(found.error_distance).sum() > 50
     # On the grid itself there is none.
-    on_grid = vb.sensitivity(coarse, at="grid").isel(contact=slice(None, None, 97))
-    assert np.nanmedian(interpolation_errors(coarse, on_grid, interpolation="linear")) < 1e-8
+    on_grid = vb.sensitivity(gridded_map, at="grid").isel(contact=slice(None, None, 97))
+    assert np.nanmedian(interpolation_errors(gridded_map, on_grid, interpolation="linear")) < 1e-8
     assert np.nanmedian(found.error_distance) > 1e-5
 
 
-def test_directions_a_turn_away_are_looked_up_at_the_same_place(coarse):
-    at = coarse.to_dataset("paper").isel(station=slice(None, None, 3), bearing=slice(None, None, 4))
+def test_directions_a_turn_away_are_looked_up_at_the_same_place(gridded_map):
+    at = gridded_map.to_dataset("paper").isel(
+        station=slice(None, None, 3), bearing=slice(None, None, 4)
+    )
     turned = at.assign(MD=at["MD"] + 2.0 * np.pi)
-    errors = interpolation_errors(coarse, at, interpolation="linear")
+    errors = interpolation_errors(gridded_map, at, interpolation="linear")
     assert np.isfinite(errors).sum() > 50
-    np.testing.assert_allclose(interpolation_errors(coarse, turned, interpolation="linear"), errors)
+    np.testing.assert_allclose(
+        interpolation_errors(gridded_map, turned, interpolation="linear"), errors
+    )
     directions = np.array([[1.5 * np.pi, 5.0], [-np.pi, -5.0], [np.pi, 0.0]])
     wanted = [[-0.5 * np.pi, 5.0], [np.pi, -5.0], [np.pi, 0.0]]
     np.testing.assert_allclose(within_turn(directions, np.array([True, False])), wanted)

@@ -183,7 +183,10 @@ def test_a_peg_is_found_from_a_recording_alone(quiet):
     assert set(quiet.children) == set(done.children) - {"signals", "estimates", "contour"}
 
 
-@pytest.mark.parametrize("shape", ["plane", "free", pytest.param("sphere", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "shape",
+    ["free", *(pytest.param(shape, marks=pytest.mark.slow) for shape in ("plane", "sphere"))],
+)
 def test_other_shapes_are_fitted_and_come_back_from_a_file(quiet, tmp_path, shape):
     done = with_contour(quiet, shape)
     save_recording(tmp_path / "t.nc", done)
@@ -440,6 +443,7 @@ def test_contacts_are_as_far_from_the_known_object_as_predicted(trial):
         compare_contacts(nothing)
 
 
+@pytest.mark.slow
 def test_an_unknown_length_of_the_whisker_is_in_contacts_by_a_sensor(trial, quiet, contact_map):
     """Forces of a whisker that is 1 % longer than it is taken to be move contacts as stated."""
     truth = quiet["truth"].to_dataset().isel(whisker=0)

@@ -81,6 +81,7 @@ def test_plain_numbers_in_other_units_are_noted(trial):
     assert [str(note.message)[:2] for note in notes] == ["C1", "C2"]
 
 
+@pytest.mark.slow
 def test_nwb_holds_what_other_formats_hold(trial, tmp_path):
     """Estimates and signals are not called as what was tracked, and onsets may have no sigma."""
     h5py = pytest.importorskip("h5py")

@@ -244,6 +244,7 @@ def repeat_frames(grey, count):
     return [np.full((300, 300), grey + k, np.uint8) for k in range(count)]
 
 
+@pytest.mark.slow
 def test_stopped_it_leaves_what_was_done(trial, tmp_path, monkeypatch):
     made = movie_module._frames
 

@@ -38,7 +38,7 @@ def derivatives():
     )
 
 
-@pytest.mark.parametrize("width", ["single", "double"])
+@pytest.mark.parametrize("width", [pytest.param("single", marks=pytest.mark.slow), "double"])
 def test_panels_are_in_the_papers_order_and_in_display_units(derivatives, width):
     figure = sensitivity_panels(derivatives, width=width)
     said = texts(figure)

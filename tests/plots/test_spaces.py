@@ -166,7 +166,7 @@ def test_no_twist_is_said_and_not_coloured(coarse) -> None:
     assert axis_label("Mx") not in written
 
 
-@pytest.mark.parametrize("width", ["single", "double"])
+@pytest.mark.parametrize("width", ["single", pytest.param("double", marks=pytest.mark.slow)])
 def test_surfaces_are_labelled_in_mm_and_degrees(width, coarse, tmp_path) -> None:
     figure = contact_surfaces(chart(), LINE, width=width)
     written = texts(figure)

@@ -45,7 +45,9 @@ def dots(axes) -> np.ndarray:
     return np.asarray(found[-1].get_offsets())
 
 
-@pytest.mark.parametrize(("width", "images"), [("double", 4), ("single", 2)])
+@pytest.mark.parametrize(
+    ("width", "images"), [("double", 4), pytest.param("single", 2, marks=pytest.mark.slow)]
+)
 def test_an_overview_shows_whisker_signals_and_contacts(known, samples, width, images):
     course = course_of(known.recording())
     rows = key_frames(course)

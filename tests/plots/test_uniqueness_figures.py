@@ -97,7 +97,7 @@ def test_each_verdict_has_its_symbol(width) -> None:
     assert written.count("$F_x$  $M_B$  $M_D$") == 1
 
 
-@pytest.mark.parametrize("width", ["single", "double"])
+@pytest.mark.parametrize("width", [pytest.param("single", marks=pytest.mark.slow), "double"])
 def test_what_is_proved_has_a_symbol_of_its_own(width) -> None:
     data = verdicts()
     evidence = np.where(data.verdict == "unique", "proved", "witness")

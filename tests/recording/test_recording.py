@@ -175,7 +175,17 @@ def test_faults_of_the_truth_are_named():
         vb.pipeline.check_recording(tree)
 
 
-@pytest.mark.parametrize("place", ["base_position", "time", "whiskers/0/length", "objects/0"])
+@pytest.mark.parametrize(
+    "place",
+    [
+        "time",
+        "objects/0",
+        *(
+            pytest.param(at, marks=pytest.mark.slow)
+            for at in ("base_position", "whiskers/0/length")
+        ),
+    ],
+)
 def test_units_that_a_file_does_not_state_are_named(place, tmp_path):
     tree = _two_whiskers()
     tree["objects/0"] = _ball()

@@ -7,7 +7,7 @@ from hypothesis import given, settings, strategies as st
 import vibrissa as vb
 from vibrissa.rod import discretize, shapes, solve_forces
 
-few = settings(max_examples=15)
+few = settings(max_examples=8)
 
 
 def sizes(v):
@@ -116,7 +116,7 @@ def test_what_lies_beyond_the_contact_does_not_matter(gamma, loads, data, kept):
 
 
 @pytest.mark.parametrize("base", [None, (2e-6, 3e-6)], ids=["rigid", "compliant"])
-@few
+@settings(max_examples=5)
 @given(data=st.data())
 def test_tangents_are_derivatives(gamma, loads, data, base):
     """∂(F, p)/∂(s, f_y, f_z) against central differences, clamped or on a soft base."""

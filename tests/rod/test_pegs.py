@@ -7,7 +7,7 @@ from hypothesis import given, settings, strategies as st
 import vibrissa as vb
 from vibrissa.rod import contact_tangents, discretize, fold_forces, solve_forces, stable_set
 
-few = settings(max_examples=15)
+few = settings(max_examples=8)
 OK, TIP, FREE = vb.Status.OK, vb.Status.TIP_CONTACT, vb.Status.NO_CONTACT
 Z = np.array([0.0, 0.0, 1.0])
 

@@ -8,7 +8,7 @@ from scipy.interpolate import CubicSpline
 import vibrissa as vb
 from vibrissa.rod import discretize, fold_forces, solve_forces, stable_set
 
-few = settings(max_examples=15)
+few = settings(max_examples=8)
 
 
 def sizes(v):

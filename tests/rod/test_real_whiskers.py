@@ -26,12 +26,13 @@ def acceptance():
     del sys.modules[spec.name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
         "1LC01",
-        pytest.param("1LA05", marks=pytest.mark.slow),
-        pytest.param("1LD02", marks=pytest.mark.slow),
+        "1LA05",
+        "1LD02",
     ],
 )
 @pytest.mark.parametrize("crowded", [False, True], ids=["up to the fold", "near the fold"])

@@ -140,7 +140,7 @@ def test_a_bend_in_the_curvature_that_was_not_stated():
     assert worst(whisker, curvature, whisker.radius, [corner]) <= 2e-6
 
 
-@pytest.mark.parametrize("count", [120, 250])
+@pytest.mark.parametrize("count", [120, pytest.param(250, marks=pytest.mark.slow)])
 def test_noise_of_measured_radii_averages_out(count):
     """Noise of 1 % makes no breaks, and its mean, not a few samples of it, is what bends."""
     s = np.linspace(0.0, LENGTH, count)

@@ -71,20 +71,23 @@ def test_a_helper_compiles_what_is_found_on_disk_here(run):
             "sys.executable = '/usr/bin/matlab'", id="embedded in a program", marks=pytest.mark.slow
         ),
         pytest.param("sys.executable = None", id="no executable", marks=pytest.mark.slow),
-        pytest.param("thrice.py_func.__module__ = '__main__'", id="not in a module"),
+        pytest.param(
+            "thrice.py_func.__module__ = '__main__'", id="not in a module", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_nobody_is_asked_where_that_gains_nothing(run, why):
     assert run(f"kernel_cache.subprocess.Popen = None; {why}") == ["twice 0", "thrice 0"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="the stand-ins for Python are shell scripts")
 @pytest.mark.parametrize(
     "does",
     [
-        pytest.param("exit 3", marks=pytest.mark.slow),
+        "exit 3",
         "exec sleep 1000",
-        pytest.param("head -c 1; kill -9 $$", marks=pytest.mark.slow),
+        "head -c 1; kill -9 $$",
     ],
 )
 def test_a_helper_that_fails_or_hangs_is_done_without(run, tmp_path, does):
@@ -95,11 +98,13 @@ def test_a_helper_that_fails_or_hangs_is_done_without(run, tmp_path, does):
     assert run(f"sys.executable = {str(helper)!r}; {impatient}") == ["twice 0", "thrice 0"]
 
 
+@pytest.mark.slow
 def test_no_process_can_be_started(run, tmp_path):
     missing = str(tmp_path / "python-that-is-not-there")
     assert run(f"sys.executable = {missing!r}") == ["twice 0", "thrice 0"]
 
 
+@pytest.mark.slow
 def test_no_folder_can_be_written_to(run):
     """A helper could hand nothing over, and none is started."""
     nowhere = "; ".join(

@@ -123,6 +123,7 @@ def test_a_thin_plate_passes_through_its_data_and_fills_the_gaps():
     assert np.sqrt(np.mean((found(between)[0] - np.sin(60.0 * between)) ** 2)) < 0.05
 
 
+@pytest.mark.slow
 def test_two_compliances_are_found_where_the_pivot_is_the_base():
     plain, at = replace(TRUE, pivot=np.zeros(3)), points(60)
     found = calibrate_suspension(WIRE, at, plain.read(at, seed=3)[0], free=2)

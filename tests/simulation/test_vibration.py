@@ -54,6 +54,7 @@ def past_peg(whisker):
     return measure(simulate(whisker, motion, peg, dynamics=TRUE, nodes=9), seed=5)
 
 
+@pytest.mark.slow
 def test_whisking_in_air_is_predicted(whisker, in_air):
     trial, dynamics = in_air, Dynamics()
     truth = trial["truth"].to_dataset().isel(whisker=0)

@@ -11,11 +11,6 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("zarr", reason="zarr (extra sweeps) is not installed")
-pytest.importorskip("distributed", reason="dask[distributed] (extra cluster) is not installed")
-
-import dask
 import xarray as xr
 
 from vibrissa.sweeps import Study, failures, open_sweep, read_study, run_sweep
@@ -28,6 +23,12 @@ curvature = 0.4
 [[tasks]]
 kind = "map"
 """
+
+
+@pytest.fixture(autouse=True, scope="module")
+def dask():
+    pytest.importorskip("distributed", reason="dask[distributed] (extra cluster) is not installed")
+    return pytest.importorskip("dask")
 
 
 @pytest.fixture
@@ -84,7 +85,7 @@ def scheduler(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_local_cluster_gives_the_same_and_a_cell_that_kills_fails_alone(study, tmp_path):
+def test_a_local_cluster_gives_the_same_and_a_cell_that_kills_fails_alone(study, tmp_path, dask):
     run_sweep(study, tmp_path / "here", workers=0)
     bad = Specimen("bad", {}, "bad", partial(signal.raise_signal, signal.SIGKILL))
     spoilt = Study("spoilt", 0, (*study.specimens, bad), study.tasks)

@@ -16,8 +16,6 @@ import numpy as np
 import pytest
 import xarray as xr
 
-pytest.importorskip("zarr", reason="zarr (extra sweeps) is not installed")
-
 from vibrissa import Whisker
 from vibrissa.certificates import load_certificate
 from vibrissa.sweeps import Study, failures, open_sweep, read_study, run_sweep

@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 import xarray as xr
 
-pytest.importorskip("zarr", reason="zarr (extra sweeps) is not installed")
-
 from vibrissa.sweeps import Busy, Store, failures, open_sweep, read_study, run_sweep, sweep_summary
 from vibrissa.sweeps.study import answer
 

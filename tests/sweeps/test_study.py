@@ -5,8 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("zarr", reason="zarr (extra sweeps) is not installed")
-
 from vibrissa import Whisker
 from vibrissa.sweeps import EXAMPLE, read_study
 

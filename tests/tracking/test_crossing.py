@@ -32,7 +32,9 @@ def test_crossing_whiskers_stay_themselves(crossing, view, inside):
     assert (score[np.isfinite(score)] == 1.0).mean() > 0.97
 
 
-@pytest.mark.parametrize("asked", [(0, 1), (0, 2)], ids=["two above", "both outer"])
+@pytest.mark.parametrize(
+    "asked", [(0, 1), pytest.param((0, 2), marks=pytest.mark.slow)], ids=["two above", "both outer"]
+)
 def test_neighbours_that_nobody_asked_for_keep_their_ends(crossing, asked):
     """If the third is not followed, one of the two goes on as it in a third of the images."""
     truth = crossing.truth[1]

@@ -311,7 +311,7 @@ def test_a_camera_that_shakes_is_held_still(filmed, traced, shaken):
     assert not any(any(trace.shift[:2]) for (row,) in traced for trace in row)
 
 
-@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("known", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_what_is_not_known_of_shaking_is_in_covariances(filmed, shaken, known):
     traces = shaken[0]
     if not known:

@@ -58,6 +58,7 @@ def test_the_pose_is_given_relative_to_the_head(nodding, recording):
     assert found["base_position_head"].attrs["reference_frame"] == "head"
 
 
+@pytest.mark.slow
 def test_what_the_head_does_is_not_taken_for_whisking(nodding, traces, recording):
     """Filtered relative to the head, the pose keeps the head's fast motion; filtered alone not."""
     options = TrackOptions(cutoff=40.0)

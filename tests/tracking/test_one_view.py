@@ -92,6 +92,7 @@ def test_a_whisker_that_bends_the_other_way_is_measured():
     np.testing.assert_allclose(np.abs(of(found, "base_roll")), np.pi, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_whisker_that_leaves_the_plane_is_noted_with_numbers():
     trial, traces = film(elevation=0.8, peg=Peg([0.05, 0.05, 0.0], [0.0, 0.0, 1.0], 1e-3))
     found = track(CAMERA, traces, 1000.0)

@@ -109,6 +109,7 @@ def test_frames_in_contact_are_no_evidence_of_lenses():
     assert (np.abs(found.values) < 3.0 * found.sigma + 1e-3).all()
 
 
+@pytest.mark.slow
 def test_turns_that_are_not_known_are_in_the_displacements():
     """A whisker that hardly moves leaves a turn of the front view about its columns unknown."""
     lines = sweep()
@@ -124,6 +125,7 @@ def test_orthographic_views_are_explained_by_what_was_stated():
     assert found.before < 0.05
 
 
+@pytest.mark.slow
 def test_cameras_that_explain_the_views_are_not_known_worse_than_before():
     """Other optics explain them as well, but far from what was stated."""
     lines = sweep()
@@ -134,6 +136,7 @@ def test_cameras_that_explain_the_views_are_not_known_worse_than_before():
     assert np.linalg.eigvalsh(more)[-1] == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_what_is_not_known_of_lenses_moves_points_away_from_the_middle():
     lines = sweep()
     # A whisker that hardly moves does not show how far the lenses are.

@@ -82,6 +82,7 @@ def test_nobody_is_taken_for_another(row):
     assert (found == -2).mean() < 0.02
 
 
+@pytest.mark.slow
 def test_a_frame_without_whiskers_mixes_nobody_up(row):
     """Three frames are missing, in which the row moves by more than its spacing."""
     frames, truth = row

@@ -41,7 +41,7 @@ def misses(film, start):
         pytest.param(202, {"crf": 28}, marks=pytest.mark.slow),
         pytest.param(206, {"noise": 8.0}, marks=pytest.mark.slow),
         pytest.param(203, {"bright": True}, marks=pytest.mark.slow),
-        (207, {"still": True}),
+        pytest.param(207, {"still": True}, marks=pytest.mark.slow),
     ],
     ids=["left", "another", "compressed", "noisy", "bright", "at rest"],
 )
@@ -57,6 +57,7 @@ def test_the_whisker_is_found_among_fur_glint_and_wires(films, seed, setup):
         assert np.median(away.min(axis=1)) < 1.5
 
 
+@pytest.mark.slow
 def test_followed_from_there_no_frame_is_lost():
     film = Film(Setup(seed=200, **{**SMALL, "frames": 24, "rate": 500.0}))
     start = find_start(film.cameras, [view[::3] for view in film.frames])
@@ -80,6 +81,7 @@ def test_a_click_inside_the_fur_is_for_the_whisker_that_leaves_it(films, inside)
         assert row[0].support > 0.7 * np.linalg.norm(np.diff(true, axis=0), axis=1).sum()
 
 
+@pytest.mark.slow
 def test_films_without_a_whisker_are_in_doubt(films):
     film = films(205, whisker=False)
     start = find_start(film.cameras, film.frames)

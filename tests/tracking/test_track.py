@@ -423,7 +423,7 @@ def test_views_of_different_whiskers_are_refused(filmed, traces):
         track(filmed.cameras, [traces[0], [moved]], 1000.0)
 
 
-@pytest.mark.parametrize("spoilt", ["views", "lost"])
+@pytest.mark.parametrize("spoilt", ["views", pytest.param("lost", marks=pytest.mark.slow)])
 def test_a_whisker_that_cannot_be_tracked_does_not_cost_the_others(
     filmed, traces, recording, spoilt
 ):

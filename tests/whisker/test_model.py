@@ -269,6 +269,7 @@ def test_radius_profiles():
     assert default.base_bending_stiffness == pytest.approx(3e9 * np.pi * 1e-16 / 4)
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(st.integers(8, 300), st.floats(0.5, 1.3), st.sampled_from([0.0, 1e-3, 0.02]), st.data())
 def test_a_tapered_radius_with_noise_has_no_breaks(count, power, noise, data):

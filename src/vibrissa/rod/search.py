@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.numerics import Array, IntArray, copy, inlined, vectorised, wrapped
+from vibrissa.numerics import Array, IntArray, copy, inlined, shared, vectorised, wrapped
 from vibrissa.rod.cell import (
     CELL_BUFFER,
     fold_sides,
@@ -190,7 +190,7 @@ def _list_cells(
     return first, last
 
 
-@vectorised
+@shared
 def seeds(tree: SearchTree, target: Array, room: SeedRoom) -> int:
     """Fill all contacts that may have the target's values; return their number.
 

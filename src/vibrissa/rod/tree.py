@@ -422,6 +422,9 @@ def _blown_up(
 
     These are regular at rest. Return which one it is, see `SearchTree.pivot`.
     """
+    if not powers.any():
+        whole = cells._replace(corner=cells.corner - cells.corner[0, 0, 0])
+        return whole, np.zeros(len(cells.base), np.int64)
     value, slope = interpolated.corner[..., :3], interpolated.slope[..., :3, :]
     sign = np.sign(value[0, 0, 0])
     with np.errstate(divide="ignore", invalid="ignore"):

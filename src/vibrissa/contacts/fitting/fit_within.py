@@ -303,8 +303,7 @@ def fit_within(
     start are used. The fit is abandoned if it ends above ``worth``, and x becomes a known contact,
     with χ² in ``misfits``, if the descent leads to one that is worth it. Return χ², and whether it
     is a minimum. If ``worth`` is finite, contacts are interpolated up to the end, where the rod is
-    integrated, and a fit that starts at the fold leaves it only from the minimum on it: the fold
-    may have a minimum of its own, which a descent from elsewhere on it would miss.
+    integrated, and a fit from the fold leaves it only from the minimum on it, which may be one.
     """
     b, weights, to, v, t, residual, jacobian, r, j, r_there, j_there = room[:11]
     frame, second, normal, bent, root, gradient, step = room[11:]

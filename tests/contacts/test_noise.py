@@ -41,7 +41,7 @@ def noisy_wrenches(force, moment, rng, sigma=SIGMA):
 def distances(found, point, rows):
     """Squared distances of true contact points, in standard deviations of the estimates."""
     away = (found.point - point)[rows]
-    return (away * np.linalg.solve(found.covariance[rows], away[..., None])[..., 0]).sum(axis=1)
+    return (away * np.linalg.solve(found.covariance[rows], away[..., None])[..., 0]).sum(axis=-1)
 
 
 @pytest.fixture(scope="module")
@@ -392,6 +392,57 @@ def test_near_another_contact_the_fold_is_counted(gamma_map):
     far = away * gamma_map.whisker.length > 4.0 * deviation
     assert sure.sum() > 20
     assert (sure & far).sum() <= 1
+
+
+@pytest.mark.parametrize(
+    ("using", "force", "moment", "point"),
+    [
+        (
+            "FT MB MD",
+            (-417.158, -73.801, -69.545),
+            (1199.513, -2700.669, -4290.484),
+            (19.183, -6.954, 9.628),
+        ),
+        (
+            "FT FD MD",
+            (-1984.633, -98.508, 1199.818),
+            (-4029.745, 12094.481, -5705.729),
+            (7.404, -2.511, -10.578),
+        ),
+    ],
+)
+def test_a_minimum_at_the_fold_is_found_from_anywhere_on_it(gamma_map, using, force, moment, point):
+    """Steps from the fold led to the contact inside that explains the signals exactly.
+
+    Between it and the fold, where the true contact is, χ² is 26 and 420.
+    """
+    wrench = 1e-6 * np.array(force), 1e-9 * np.array(moment)
+    found = gamma_map.estimate(vb.base_signals(*wrench), using, np.diag(SIGMA**2))
+    assert found.status == vb.Status.AMBIGUOUS
+    true = distances(found.candidates, 1e-3 * np.array(point), slice(int(found.n_candidates)))
+    assert true.min() < HELD < BEYOND < true.max()
+
+
+@pytest.mark.parametrize(
+    ("force", "moment", "point"),
+    [
+        (
+            (-1154.806, 252.094, 55.715),
+            (-314.302, 801.463, -10576.929),
+            (12.371, -11.842, -1.276),
+        ),
+        ((1.853, -0.789, 0.545), (-14.524, 0.347, 19.232), (35.167, 12.614, 1.0)),
+    ],
+)
+def test_misfits_are_those_with_the_noise_at_the_contact(gamma_map, force, moment, point):
+    """A direction is uncertain where its vector nearly vanishes; fits from there stated small χ².
+
+    They ended at contacts whose directions are 140° from those measured, with valid covariances.
+    """
+    wrench = 1e-6 * np.array(force), 1e-9 * np.array(moment)
+    found = gamma_map.estimate(vb.base_signals(*wrench), "FD Mx MD", np.diag(SIGMA**2))
+    assert found.status == vb.Status.UNIQUE
+    assert distances(found, 1e-3 * np.array(point), ()) < HELD
 
 
 def test_a_light_contact_is_one_candidate(gamma_map):

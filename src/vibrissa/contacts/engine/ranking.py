@@ -55,7 +55,7 @@ from vibrissa.contacts.sensing.weighing import Weighing, sharpness, weigh_any
 from vibrissa.contacts.uncertainty.basins import (
     BasinsRoom,
     basins_room,
-    deviations,
+    slacks,
     starts_of_basins,
 )
 from vibrissa.contacts.uncertainty.flat_valleys import follow_valley
@@ -86,6 +86,8 @@ _UNIQUE, _AMBIGUOUS = int(Status.UNIQUE), int(Status.AMBIGUOUS)
 # Distance, in standard deviations, within which the tree lists cells: normally, and if no known
 # candidate explains the measurement.
 _APART, _FAR_APART = 2.0, 4.0
+# Change of χ² with the weights at the contact below which a fit is a minimum with these weights.
+_SAME_WEIGHTS = 0.1
 # Rows that pass from kernel to kernel together; the description of each takes about 4 kB.
 _AT_ONCE = 128
 # Logarithm of the integral of a three-dimensional normal density with a peak of one.
@@ -96,7 +98,7 @@ class _Work(NamedTuple):
     """Working memory of `complete_rows`, of m candidates and k channels.
 
     (F, p) (m, 6), derivatives of one with respect to x (6, 4), χ² (m,), residuals (k,) and their
-    slopes (k, 4); deviations (3,), starting contacts (n, 4), one of them, and the nearest nodes.
+    slopes (k, 4); starting contacts (n, 4), one of them, and the nearest nodes.
     """
 
     values: Array
@@ -104,7 +106,6 @@ class _Work(NamedTuple):
     misfits: Array
     residual: Array
     jacobian: Array
-    sigma: Array
     starts: Array
     start: Array
     nodes: IntArray
@@ -135,7 +136,6 @@ def _work(k: int) -> _Work:
         np.empty(MOST_CANDIDATES),
         np.empty(k),
         np.empty((k, 4)),
-        np.empty(3),
         np.empty((MOST_STARTS, 4)),
         np.empty(4),
         np.empty(PARTS, np.int64),
@@ -201,15 +201,18 @@ def _try(
             known = known or same_contact(at, x[c])
         if known or not misfit < np.inf or settled(before, at):
             break
-    if not misfit < np.inf:
+    if passes > 1 and misfit < np.inf:  # with weights at the contact before
+        old, misfit = misfit, chi_squared_of(how, at, value, target, measured)
+        least = least and abs(misfit - old) < _SAME_WEIGHTS
+    if known or not misfit < np.inf:
         return number, False
     if lost and (number == 0 or misfit < misfits[0]):  # the best so far, whatever its χ²
         copy(at, x[0])
         copy(value, values[0])
         misfits[0] = misfit
         return max(number, 1), misfit <= worth and not least
-    if known or not (least and misfit <= worth):
-        other = not known and misfit <= worth
+    if not (least and misfit <= worth):
+        other = misfit <= worth
         for i in range(loose.shape[0] if other else 0):
             if loose[i, 0] == np.inf:
                 loose[i, 0] = misfit
@@ -239,7 +242,7 @@ def complete(
     """
     target, measured, x, values, misfits, loose = row
     passes, limit = problem.passes, problem.limit
-    sigma, starts, start, nodes = room.sigma, room.starts, room.start, room.nodes
+    starts, start, nodes, slack = room.starts, room.start, room.nodes, room.basins.slack
     least, loose[:] = np.inf, np.inf
     for c in range(number):
         least = min(least, misfits[c])
@@ -250,23 +253,11 @@ def complete(
         node = 0
         while node < PARTS - 1 and nodes[node] < 0:
             node += 1
-        deviations(of, how, of.values[max(nodes[node], 0)], measured, sigma)
+        slacks(of, how, _FAR_APART, of.values[max(nodes[node], 0)], measured, slack)
     else:
-        deviations(of, how, values[0], measured, sigma)
-    worth = limit if lost else min(limit, least + INDISTINCT)
-    apart = _FAR_APART if lost else _APART
-    n, others = starts_of_basins(
-        of,
-        apart,
-        sigma,
-        measured,
-        x,
-        residuals,
-        jacobians,
-        0 if lost else number,
-        starts,
-        room.basins,
-    )
+        slacks(of, how, _APART, values[0], measured, slack)
+    worth, known = (limit, 0) if lost else (min(limit, least + INDISTINCT), number)
+    n, others = starts_of_basins(of, measured, x, residuals, jacobians, known, starts, room.basins)
     for i in range(n):
         number, other = _try(of, how, passes, worth, row, starts[i], number, room.fit)
         others = others or other

@@ -303,16 +303,17 @@ def fit_within(
     start are used. The fit is abandoned if it ends above ``worth``, and x becomes a known contact,
     with χ² in ``misfits``, if the descent leads to one that is worth it. Return χ², and whether it
     is a minimum. If ``worth`` is finite, contacts are interpolated up to the end, where the rod is
-    integrated.
+    integrated, and a fit from the fold leaves it only from the minimum on it, which may be one.
     """
     b, weights, to, v, t, residual, jacobian, r, j, r_there, j_there = room[:11]
     frame, second, normal, bent, root, gradient, step = room[11:]
     fold, k = rod.fold, codes.shape[0]
     copy(x, to)
     second[:], best, damping, promised, folded = 0.0, np.inf, 0.0, 0.0, False
-    ends, near, begun = (False, False, False), worth < np.inf, False
+    ends, near, begun, held = (False, False, False), worth < np.inf, False, False
     for n in range(_ROUNDS):
         folded_there = _confine(fold, proximal, to)
+        held = (near and folded_there) if n == 0 else held
         contact_equations(rod, b, near, to, v, t)
         if not (begun or weighed or weigh_any(how, v, measured, weights)):
             break
@@ -335,7 +336,7 @@ def fit_within(
                 copy(j_there[i], j[i])
             for c in range(known.shape[0]):
                 left = math.sqrt(by_slopes(x, r, j, known[c])) + math.sqrt(misfits[c])
-                sure = misfits[c] <= worth < np.inf
+                sure = misfits[c] <= worth < np.inf and not held
                 sure = sure and left * left < min(_FORESEEN, _DOWNHILL * (best - misfits[c]))
                 if sure or same_contact(x, known[c]):
                     copy(known[c], x)
@@ -347,7 +348,7 @@ def fit_within(
         else:
             damping = max(4.0 * damping, 1e-2)
         _normal_equations(r, j, second, frame, gradient, normal, bent)
-        ends = (x[0] <= proximal, x[0] >= 1.0, folded and gradient[2] >= 0.0)
+        ends = (x[0] <= proximal, x[0] >= 1.0, folded and (held or gradient[2] >= 0.0))
         slope, curve = _step_within(gradient, normal, bent, damping, ends, root, step)
         while slope > 0.0 and damping <= _MOST_DAMPING:
             damping = max(4.0 * damping, 1e-3)
@@ -357,7 +358,8 @@ def fit_within(
         slow = n >= _PATIENCE and (damping == 0.0 or n >= _LATE) and gain < _SLOW * (best - worth)
         if near and (idle or slow or damping > _MOST_DAMPING):
             copy(x, to)
-            second[:], best, damping, promised, near, begun = 0.0, np.inf, 0.0, 0.0, False, False
+            second[:], best, damping, promised, begun = 0.0, np.inf, 0.0, 0.0, False
+            near, held = held, False
             continue
         if idle or damping > _MOST_DAMPING:
             return best, _level(gradient, normal, ends)

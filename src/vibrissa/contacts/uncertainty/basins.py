@@ -21,8 +21,9 @@ from vibrissa.contacts.sensing.weighing import Weighing, channel_covariance
 from vibrissa.contacts.uncertainty.nodes import Searched
 from vibrissa.numerics import Array, IntArray, copy, inlined, kernel
 from vibrissa.rod import MOST_CELLS, along, cells_around, chart_to_contact, fold_force
-from vibrissa.signals import FY, MY
+from vibrissa.signals import FD, FY, MD, MY
 
+_LIGHT = 0.5  # least ρ of a starting contact, in cells
 _WIDEST = 1e3  # largest distance searched for in one quantity; more than half a turn
 # Height of a sill between two basins: by how much more its cells miss, relative to the slack.
 _SILL = 0.5
@@ -32,24 +33,30 @@ _LINEAR = 25.0
 
 
 @inlined
-def deviations(of: Searched, how: Weighing, value: Array, measured: Array, out: Array) -> None:
-    """Standard deviations of the three quantities by which the tree is searched, near (F, p)."""
+def slacks(
+    of: Searched, how: Weighing, apart: float, value: Array, measured: Array, out: Array
+) -> None:
+    """Fill how far the three quantities searched for may be ``apart`` standard deviations away.
+
+    The noise is that at (F, p). A direction may be any if its vector is not larger than its noise.
+    """
     k = how.codes.shape[0]
     if how.own[0, 0] > 0.0:  # mixed components, white
         for q in range(3):
-            out[q] = 1.0
+            out[q] = apart
         return
     sigma = np.empty((k, k))
     channel_covariance(how, value, measured, sigma)
     for q in range(3):
         i = of.where[q]
         code = how.codes[i]
-        out[q] = sigma[i, i]
+        out[q], turns = sigma[i, i], code in (FD, MD)
         if code >= FY:  # components instead of a size (first) and its direction
             first = i if code in (FY, MY) else i - 1
             angle = measured[first + 1]
             along_y, along_z = math.cos(angle), math.sin(angle)
-            if i > first:
+            turns = i > first
+            if turns:
                 size = max(measured[first], 1e-300)
                 along_y, along_z = -along_z / size, along_y / size
             out[q] = (
@@ -57,7 +64,9 @@ def deviations(of: Searched, how: Weighing, value: Array, measured: Array, out: 
                 + 2.0 * along_y * along_z * sigma[first, first + 1]
                 + along_z * along_z * sigma[first + 1, first + 1]
             )
-        out[q] = math.sqrt(out[q])
+        out[q] = min(apart * math.sqrt(out[q]), _WIDEST)
+        if turns:
+            out[q] = math.asin(out[q]) if out[q] < 1.0 else _WIDEST
 
 
 @inlined
@@ -148,7 +157,7 @@ def _basins(
 class BasinsRoom(NamedTuple):
     """Working memory of `starts_of_basins`.
 
-    Target and slack (3,), known contacts in the chart (n, 3); for each cell its number, the nearest
+    Target and slacks (3,), known contacts in the chart (n, 3); for each cell its number, nearest
     position in the chart (n, 3), the distance by which it misses, its rank and its basin.
     """
 
@@ -180,8 +189,6 @@ def basins_room() -> BasinsRoom:
 @kernel
 def starts_of_basins(
     of: Searched,
-    apart: float,
-    sigma: Array,
     measured: Array,
     x: Array,
     residuals: Array,
@@ -192,19 +199,19 @@ def starts_of_basins(
 ) -> tuple[int, bool]:
     """Fill one starting contact for each basin that the known contacts x do not explain.
 
+    The room contains the slacks. Starting contacts at rest would not have a direction.
     Return their number, and whether there are more.
     """
     target, slack, known, cells, spots, away, order, parent = room
     kept, count = 0, 0
     for q in range(3):
-        target[q], slack[q] = measured[of.where[q]], min(apart * sigma[q], _WIDEST)
+        target[q] = measured[of.where[q]]
     n = cells_around(of.tree, target, slack, cells, spots, away)
     for c in range(number):
         _chart_of(of, x[c], known[c])
     for i in range(n):
         start, new, folded = starts[0], True, _at_fold(of, cells[i])
-        if folded:
-            spots[i, 2] = 1.0
+        spots[i, 2] = 1.0 if folded else max(spots[i, 2], _LIGHT * of.tree.grid[1, 2])
         _start_at(of, spots[i], start)
         for c in range(number):
             new = new and (folded or not _holds(of, cells[i], known[c]))

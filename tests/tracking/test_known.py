@@ -8,9 +8,11 @@ from scipy.spatial.transform import Rotation
 from vibrissa import Whisker
 from vibrissa.objects import Peg
 from vibrissa.recording import Recording
+from vibrissa.rod import discretize
 from vibrissa.simulation import Motion, simulate
 from vibrissa.tracking import HeadPose, TrackOptions, trace_video, track
 from vibrissa.tracking.recording import outside_video
+from vibrissa.tracking.refine.rods import Bent, State
 
 FRAMES = 30
 RATE = 1000.0
@@ -86,6 +88,52 @@ def test_the_contact_nearest_to_the_object_agrees(nodding, recording):
     assert np.isnan(measured["contact_point"].values[found["in_contact"].values == 0]).all()
     assert measured["contact_point"].attrs["source"] == "nearest to the object"
     assert isinstance(Recording(recording).objects[0], Peg)
+
+
+def test_whiskers_are_tangent_to_a_known_object(nodding, traces):
+    """Even if traces waver in other frames, which then seem to be in contact."""
+    random = np.random.default_rng(3)
+    touching = nodding.truth["in_contact"].values > 0
+    wrong = random.choice(np.flatnonzero(~touching), 5, replace=False)
+
+    def wavering(trace):
+        share = np.linspace(0.0, 1.0, len(trace.line))[:, None]
+        wave = np.cos(3.0 * np.pi * share + random.uniform(0.0, 3.0)) * random.normal(0.0, 6.0, 2)
+        return trace._replace(line=trace.line + share**2 * wave)
+
+    poor = [
+        [[wavering(one) if i in wrong else one for i, one in enumerate(row)] for row in view]
+        for view in traces
+    ]
+    head = nodding.recording.to_dataset()[["head_position", "head_rotation"]]
+    things = Recording(nodding.recording).objects
+    found = track(nodding.cameras, poor, RATE, head=head, objects=things)
+    data = found.to_dataset().isel(whisker=0)
+    assert data["in_contact"].values[wrong].sum() > 2
+    away = data["contact_point"].values - nodding.truth["contact_point"].values
+    errors = np.linalg.norm(away[touching & (data["in_contact"].values > 0)], axis=1)
+    assert np.median(errors) < 5e-6
+    assert np.percentile(errors, 95.0) < 15e-6
+
+
+def test_derivatives_of_tangents_are_those_of_differences():
+    random = np.random.default_rng(1)
+    turn = Rotation.random(4, random_state=1).as_matrix()
+    contact = np.column_stack([random.uniform(0.4, 0.9, 4), random.normal(0.0, 0.5, (4, 3))])
+    state = State(turn, random.normal(size=(4, 3)), contact)
+    rod = discretize(Whisker.parabola(length=10e-3, coefficient=15.0))
+    touching = np.array([True, False, True, True])
+
+    def tangents(state):
+        return Bent.of(rod, state, touching).tangents(state.contact[:, 0])
+
+    slopes = tangents(state)[1]
+    for unknown in range(10):
+        step = np.zeros((4, 10))
+        step[touching, unknown] = 1e-4
+        ahead, back = (tangents(state.moved(one))[0] for one in (step, -step))
+        difference = ((ahead - back) / 2e-4)[touching]
+        np.testing.assert_allclose(slopes[touching, :, unknown], difference, atol=2e-3)
 
 
 @pytest.mark.slow

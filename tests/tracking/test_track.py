@@ -322,6 +322,8 @@ def test_a_step_to_a_contact_that_no_rod_withstands_is_not_taken():
         1000.0,
         FitOptions(),
         still,
+        (),
+        ~touching,
     )
     fit = problem.linear(state)
     assert fit.data.wild.tolist() == [False, True]

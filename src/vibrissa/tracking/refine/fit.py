@@ -51,9 +51,12 @@ from vibrissa.tracking.refine.rods import (
 )
 from vibrissa.tracking.space.pose import BasePose, HeadPose
 from vibrissa.tracking.space.rest_shape import Length
-from vibrissa.tracking.trace.trace import correlated
+from vibrissa.tracking.trace.trace import arc_lengths, correlated
 from vibrissa.whisker import Whisker
 
+# Distance from an object, over the length, within which contacts are on it; and what is not seen of
+# the whisker, which it may hide.
+_REACH = 0.1
 # First step of a profile to each side, in standard deviations of the linearised equations; share by
 # which its rise there differs from a parabola's from which it is computed; its steps then.
 _FIRST, _ALIKE = 2.0, 0.5
@@ -296,12 +299,18 @@ class Fitter:
         known = np.isfinite(pose.rotation).all(axis=(1, 2))
         frames = np.flatnonzero(known & np.isfinite(self.curves).all(axis=(1, 2)))
         touching = self.touching[frames]
+        near, arcs = self._nearest(frames)
         start = State(
             pose.rotation[frames], pose.position[frames] / d.length, np.zeros((len(frames), 4))
         )
         start.contact[:, 0] = REST[0]
         if begun is None:
             start.contact[touching] = first_contacts(d, start, self.curves[frames], touching)
+            rows = near & touching
+            moved = np.clip(arcs[rows] / d.length, *LIMITS)
+            # The same bend at the base, approximately.
+            start.contact[rows, 1:] *= ((start.contact[rows, 0] / moved) ** 2)[:, None]
+            start.contact[rows, 0] = moved
         return Problem(
             whisker,
             d,
@@ -314,8 +323,24 @@ class Fitter:
             self.options,
             self.head.rows(frames),
             self.objects,
+            near,
             begun,
         )
+
+    def _nearest(self, frames: NDArray[np.intp]) -> tuple[Mask, Array]:
+        """Frames in which the whisker, as far as it is seen, is next to a known object.
+
+        And the arc lengths at which it is nearest, m.
+        """
+        if not self.objects:
+            return np.zeros(len(frames), dtype=bool), np.zeros(len(frames))
+        curves = self.head.rows(frames).put_in(self.curves[frames])
+        away = np.min([thing.signed_distance(curves) for thing in self.objects], axis=0)
+        at = away.argmin(axis=1)
+        arcs = np.array([arc_lengths(curve) for curve in curves])
+        whole = arcs[:, -1].max()
+        near = away.min(axis=1) < _REACH * whole + whole - arcs[:, -1]
+        return near, arcs[np.arange(len(at)), at]
 
 
 def _shared(problem: Problem, fit: Linear) -> Array:

@@ -81,6 +81,12 @@ class Smoother:
         self.gradient[i] -= row * value
         return value**2
 
+    def add_within(self, i: int, row: Array, value: float) -> tuple[float, float]:
+        """Pull so if that is possible; return the cost, which is limited, and the weight."""
+        weight = 1.0 / (1.0 + (value / FAR) ** 2)
+        self.add_row(i, weight * row, weight * value)
+        return weight * value**2, weight
+
     def add_along(self, axis: Array, value: Array, begin: int, weight: float) -> Array:
         """Pull one direction of three unknowns to zero; return the cost of each frame."""
         part = slice(begin, begin + 3)
@@ -244,6 +250,12 @@ _ALONG = np.eye(UNKNOWNS)[6]  # the arc length among the unknowns
 # Error of a trace, as a share of the second difference of its positions, if the exposure may be any
 # part of a frame: an eighth if it is all, and the speed changes in the middle.
 _EXPOSED = 0.05
+# Standard deviation of the angle at which a whisker meets a surface, rad; and the arc length, in
+# units of L, from which its tip may touch at any angle.
+_TILTED, _TIP = 0.02, 0.97
+# Factor of the standard deviation of the distance from objects, at first: contacts are found from
+# farther away.
+_SOFT = 10.0
 _HALVED = 6  # largest number of times that initial forces without equilibrium are halved
 
 
@@ -338,7 +350,8 @@ class Problem:
     rate: float
     options: FitOptions
     head: HeadPose
-    objects: Sequence[Surface] = ()
+    objects: Sequence[Surface]
+    near: Mask  # (time,): where one of them is within reach
     begun: State | None = None
     variance: list[Array] | None = None
     shown: float = 1.0
@@ -351,6 +364,7 @@ class Problem:
             self,
             traces=self.traces.rows(rows),
             touching=self.touching[rows],
+            near=self.near[rows],
             frames=self.frames[rows],
             start=self.start.rows(rows),
             head=self.head.rows(rows),
@@ -361,7 +375,8 @@ class Problem:
     def trusted(self, even: bool = False) -> tuple[Problem, State, Linear]:
         """The problem with traces weighted by their residuals, and its solution."""
         loose = replace(self.options, roll=max(self.options.roll, _ROLLED))
-        state, fit = replace(self, options=loose).solved()
+        begin = replace(loose, surface=_SOFT * loose.surface)
+        state, fit = replace(self, options=begin).solved()
         covariance = fit.smoother.covariances()
         designs = [design[:, :-2] for design in fit.data.designs]
         variance = trace_variance(
@@ -493,26 +508,35 @@ class Problem:
         return np.asarray(np.einsum("tij,tj->ti", covariance, pull))
 
     def _touched(self, smoother: Smoother, state: State) -> Array:
-        """Pull contacts to the surfaces of known objects; return the costs."""
+        """Pull contacts to the surfaces of known objects, and make them tangent; return the costs.
+
+        Distances hardly change along a whisker that touches an object, but the normal does: only
+        that of the contact is normal to the whisker.
+        """
         costs = np.zeros(len(self.frames))
         if not self.objects:
             return costs
+        length, surface = self.d.length, self.options.surface
         points, slopes, _ = contact_slopes(self.d, state)
-        points = self.head.put_in((points + state.position) * self.d.length)
-        radius = self.whisker.radius(state.contact[:, 0] * self.d.length)
-        for i in np.flatnonzero(self.touching):
+        points = self.head.put_in((points + state.position) * length)
+        tangents, turning = Bent.of(self.d, state, self.touching).tangents(state.contact[:, 0])
+        radius = self.whisker.radius(state.contact[:, 0] * length)
+        for i in np.flatnonzero(self.touching & self.near):
             found = [thing.local_geometry(points[i]) for thing in self.objects]
-            distance, normal, _ = min(found, key=lambda one: abs(one[0]))
-            # A contact far from all objects touches something else.
-            gap = (distance - radius[i]) / self.options.surface
-            weight = 1.0 / np.sqrt(max(abs(gap) / FAR, 1.0))
-            row = (
-                normal
-                @ self.head.rotation[i]
-                @ slopes[i]
-                * (weight * self.d.length / self.options.surface)
-            )
-            costs[i] = smoother.add_row(int(i), row, weight * gap)
+            distance, normal, curvature = min(found, key=lambda one: abs(one[0]))
+            turn = self.head.rotation[i]
+            normal, curvature = normal @ turn, turn.T @ curvature @ turn
+            row = normal @ slopes[i] * (length / surface)
+            gap = (distance - radius[i]) / surface
+            costs[i], share = smoother.add_within(int(i), row, gap)
+            if state.contact[i, 0] > _TIP:
+                continue
+            across = curvature @ tangents[i]
+            sigma = np.hypot(_TILTED, surface * np.linalg.norm(across))
+            row = (normal @ turning[i] + length * across @ slopes[i]) / sigma
+            costs[i] += smoother.add_within(
+                int(i), share * row, share * (normal @ tangents[i]) / sigma
+            )[0]
         return costs
 
     def _priors(self, smoother: Smoother, state: State) -> Array:

@@ -228,6 +228,36 @@ class Bent(NamedTuple):
         wild[self.rows >= 0] |= ~(np.abs(self.change).max(axis=(0, 2, 3)) < _WILD)
         return wild
 
+    def tangents(self, arcs: Array) -> tuple[Array, Array]:
+        """Tangents (t, 3) of whole rods at arc lengths (t,), and derivatives (t, 3, unknown).
+
+        The arc lengths are those of the contacts. Without contact the latter are zero.
+        """
+        ends = np.clip(arcs[:, None] * (_SAMPLES - 1) + [-1.0, 1.0], 0.0, _SAMPLES - 1.0)
+        low = np.minimum(ends.astype(int), _SAMPLES - 2)
+        share = (ends - low)[..., None]
+
+        def chords(points: Array, rows: NDArray[np.intp]) -> Array:
+            t = np.arange(len(rows))[:, None]
+            before, after = points[t, low[rows]], points[t, low[rows] + 1]
+            return np.asarray(np.diff((1.0 - share[rows]) * before + share[rows] * after, axis=1))
+
+        every, touching = np.arange(len(arcs)), np.flatnonzero(self.rows >= 0)
+        chord = chords(self.turned, every)[:, 0]
+        size = np.linalg.norm(chord, axis=1)
+        tangent = chord / size[:, None]
+        slopes = np.zeros((len(arcs), 3, UNKNOWNS))
+        slopes[..., 3:6] = pose_slopes(tangent)[..., 3:]
+        own = np.stack([chords(one, touching)[:, 0] for one in self.change], axis=-1)
+        own = self.rotation[touching] @ own
+        t = touching[:, None]
+        ahead = self.turned[t, low[touching] + 1] - self.turned[t, low[touching]]
+        own[..., 0] += (ahead[:, 1] - ahead[:, 0]) * (_SAMPLES - 1)
+        along = tangent[touching]
+        own -= along[:, :, None] * (along[:, None] @ own)
+        slopes[touching, :, 6:] = own / size[touching, None, None]
+        return tangent, slopes
+
     def normal(
         self, head: Array, rows: Array, misses: Array, weight: Array, hessian: Array, pull: Array
     ) -> Array:

@@ -401,11 +401,11 @@ def remarks_on_unseen_contacts(one: Tracked, name: str) -> list[str]:
     count, unseen = int(np.isfinite(arcs).sum()), int((arcs > shown + far).sum())
     if not unseen:
         return []
-    remedy = "" if one.length.seen else ", or give its length (--length)"
+    length = "" if one.length.seen else "its length (--length) or "
     return [
         f"not sure where {name} touches: in {unseen} of {count} frames in contact that is beyond "
         "what both views show of it, and follows from how the part before it bends. Film more of "
-        f"the whisker{remedy}."
+        f"the whisker, or state {length}what it touches (--objects)."
     ]
 
 

@@ -240,7 +240,9 @@ def track(
             found.append(one)
             remarks += remarks_on_fur(one, options.fur, name)
             remarks += remarks_on(cameras, one.traces, one.length, one.fit.misfit, name)
-            remarks += remarks_on_unseen_contacts(one, name) + remarks_on_rest(one, name)
+            # Known objects locate contacts that are not seen.
+            remarks += [] if objects else remarks_on_unseen_contacts(one, name)
+            remarks += remarks_on_rest(one, name)
             if len(cameras) == 1:
                 remarks += remarks_on_plane(one, name)
         except Exception as fault:  # no error of one whisker may discard the others

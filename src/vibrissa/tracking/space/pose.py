@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.deferred import linalg, ndimage, transform
+from vibrissa.deferred import ndimage, signal, transform
 from vibrissa.numerics import Array, Mask
 from vibrissa.tracking.space.rest_shape import RestShape, aligned_lengths, motions
 from vibrissa.tracking.trace.trace import interpolated
@@ -25,6 +25,7 @@ from vibrissa.whisker import Whisker, angles_of, base_rotation
 CUTOFF = 85.0
 """The paper's cut-off, Hz."""
 
+_ORDER = 2  # order of the Butterworth filter, which is applied forward and backward
 _LATE = 1e-6  # fraction of a frame by which a table of times may be too short
 _SMALL = 0.05  # share of the times between frames that may be smaller than the usual small one
 # Share of the whisker over which the tangent at the base is fitted, largest one of what is seen,
@@ -80,32 +81,16 @@ def _filtered(array: Array, at: Array, rate: float, cutoff: float) -> Array:
     """Filter frames at these numbers, between which and at NaN values are interpolated."""
     flat = array.reshape(len(array), -1)
     known = np.isfinite(flat)
+    sections = signal.butter(_ORDER, cutoff, fs=rate, output="sos")
     frames = np.arange(np.ceil(at[-1] - _LATE) + 1.0)
     pad = min(len(frames) - 1, round(3.0 * rate / cutoff))
-    shown = np.flatnonzero(known.sum(axis=0) >= 2)
-    if not shown.size:
-        return array
-    whole = [np.interp(frames, at[known[:, k]], flat[known[:, k], k]) for k in shown]
-    for k, filtered in zip(shown, _both_ways(np.array(whole).T, cutoff / rate, pad).T, strict=True):
-        flat[:, k] = np.where(known[:, k], np.interp(at, frames, filtered), np.nan)
+    for k in range(flat.shape[1]):
+        if known[:, k].sum() < 2:
+            continue
+        whole = np.interp(frames, at[known[:, k]], flat[known[:, k], k])
+        filtered = np.interp(at, frames, signal.sosfiltfilt(sections, whole, padlen=pad))
+        flat[:, k] = np.where(known[:, k], filtered, np.nan)
     return flat.reshape(array.shape)
-
-
-def _both_ways(values: Array, cutoff: float, pad: int) -> Array:
-    """Butterworth filter of second order, forward and backward, of each column (time, k).
-
-    The cut-off is relative to the rate. Both ends are continued by point reflection, and before its
-    first value each column was constant. To import such filters from SciPy takes half a second.
-    """
-    w = np.tan(np.pi * cutoff)
-    poles = [1.0 + np.sqrt(2.0) * w + w**2, 2.0 * w**2 - 2.0, 1.0 - np.sqrt(2.0) * w + w**2]
-    longer = np.pad(values, ((pad, pad), (0, 0)), "reflect", reflect_type="odd")
-    bands = np.repeat(np.array(poles)[:, None], len(longer), axis=1)
-    for _ in range(2):
-        change = np.pad(longer - longer[0], ((2, 0), (0, 0)))
-        load = w**2 * (change[2:] + 2.0 * change[1:-1] + change[:-2])
-        longer = (longer[0] + linalg.solve_banded((2, 0), bands, load))[::-1]
-    return longer[pad : len(longer) - pad]
 
 
 @dataclass(frozen=True, eq=False)

@@ -53,10 +53,14 @@ def beside_slip_off(gamma_map):
 
 @pytest.mark.parametrize(
     ("using", "share"),
-    [("Fx MB MD", 0.92), ("Fx FT MB MD", 0.87), (EVERY, 0.85), ("wrench", 0.75)],
+    [("Fx MB MD", 0.96), ("Fx FT MB MD", 0.95), (EVERY, 0.95), ("wrench", 0.75)],
 )
 def test_regions_hold_what_they_state_up_to_slip_off(gamma_map, beside_slip_off, using, share):
-    """Of 1,500 contacts, to three binomial standard deviations of 93 to 97 %, and of 0.4 %."""
+    """Of 1,500 contacts, to three binomial standard deviations of 93 to 97 %, and of 0.4 %.
+
+    Ellipsoids with the axes of the second moment held either the tails of bent sheets or 95 %, so
+    that 87 to 93 % of all were valid.
+    """
     force, moment, point = beside_slip_off
     covariance = np.diag(SIGMA**2)
     if using == "wrench":

@@ -164,13 +164,14 @@ class Contacts(_Located):
     point : (..., 3) array
         Contact point, m; NaN where there is none.
     covariance : (..., 3, 3) array
-        Covariance of the contact point, m²: second moment of the posterior probability about it, to
-        first order where the contact moves with the signals as derivatives say, and widened where
-        it does not, as near slip-off and where the deflection is small; NaN without ``noise``.
+        Covariance of the contact point, m², to first order where the contact moves with the signals
+        as derivatives say; elsewhere, as near slip-off and where the deflection is small, that of
+        the posterior probability, widened to contain its distant contacts; NaN without ``noise``.
     covariance_valid : (...) bool array
         Whether regions stated from the covariance hold what they state: the status is ``UNIQUE``,
-        other candidates together are at most 0.33 % probable, and the second-order change of the
-        contact point is small in the metric of the covariance. Of a candidate it is the last alone.
+        other candidates together are at most 0.33 % probable, and the 95 % ellipsoid of the widened
+        covariance contains about 95 % of the contact's posterior. Of a candidate it is the last
+        alone.
         False without ``noise``.
     chi_squared : (...) array
         χ² of the contact: sum of squares of the part of the signals that it leaves unexplained, in

@@ -13,10 +13,14 @@ sooner. Near slip-off the volumes nearly vanish although contacts occur there, s
 that of the mean of this density and of the one without volumes.
 
 To first order the covariance of p is A Aᵀ. Near a fold of p this degenerates to a sheet, from which
-contacts curve away; the second moment about p̂ does not. It is widened until the ellipsoid of three
-standard deviations contains the share that it states: on each ray the position of the ellipsoid's
-surface and the probability beyond it are known. A covariance is valid if the 95 % ellipsoid
-then contains about 95 %, and if the channels at both ends of each axis agree with the second order.
+contacts curve away; the second moment about p̂ does not. But where the sheet is bent, an ellipsoid
+with the axes of the second moment contains distant contacts only if it is so large that it contains
+98 % instead of 95 % of all. So contacts are weighted by their squared distance in the metric of the
+second moment, E[d² (p - p̂)(p - p̂)ᵀ], which for normal distributions is that up to a factor. This
+covariance is widened until the ellipsoid of three standard deviations contains the share that it
+states: on each ray the position of the ellipsoid's surface and the probability beyond it are known.
+A covariance is valid if the 95 % ellipsoid then contains about 95 %, and if the channels at both
+ends of each axis agree with the second order.
 """
 
 from __future__ import annotations
@@ -55,9 +59,11 @@ from vibrissa.rod import BUFFER_SIZE, Charted
 
 #: Posterior probability above which a candidate is unique.
 CERTAIN = 0.95
-# Limits of a valid covariance: error of the second order, in standard deviations of the channels;
-# share in ellipsoids of 95 %; and factor by which variances were widened.
-_MISSED, _LEAST_HELD, _MOST_HELD, _MOST_WIDENED = 0.09, 0.93, 0.98, 1.7
+# Limits of a valid covariance: share in ellipsoids of 95 %; factor by which variances were widened;
+# error of the second order, in standard deviations of the channels. Where variances are widened by
+# more than the fourth number, distant contacts matter, of which the second order shows less.
+_LEAST_HELD, _MOST_HELD, _MOST_WIDENED, _WIDENED = 0.93, 0.975, 2.5, 1.3
+_MISSED, _MISSED_FAR = 0.1, 0.03
 #: Squared radii of regions of three standard deviations and of 95 %.
 THREE_SIGMA, HELD = 14.156, 7.815
 # Error of the second order above which a candidate is weighed to first order; and the most by which
@@ -243,12 +249,6 @@ def second_moment(points: Array, density: Array, total: float, covariance: Array
 
 
 @inlined
-def holds(held: float, wider: float) -> bool:
-    """Whether a covariance is valid, by the share in its 95 % region and the factor of widening."""
-    return _LEAST_HELD < held < _MOST_HELD and wider < _MOST_WIDENED
-
-
-@inlined
 def _reaches(far: Array, density: Array, centre: float, logs: Array) -> None:
     """Make squared distances (rays, radii) monotonic; fill logs of the probability beyond.
 
@@ -305,10 +305,11 @@ def _moments(
     proximal: float,
     turn: float,
     first_order: float,
+    missed: float,
     covariance: Array,
     rays: Rays,
 ) -> tuple[float, bool]:
-    """Fill the widened second moment about the point; mean density, and whether it is usable."""
+    """Fill the widened covariance; mean density, and whether the covariance is valid."""
     half, pairs = NODES.shape[1], _SHARES.shape[0]
     points, density, likely, root, far, logs = (
         rays.points,
@@ -345,13 +346,23 @@ def _moments(
     if not cholesky(covariance, root):
         return mean, False
     squared_distances(root, points, far)
+    if missed < _MISSED:
+        total = 0.0
+        for m in range(2 * half):
+            density[m] *= far[m]
+            total += density[m] * far[m]
+        second_moment(points, density, total / 3.0, covariance)
+        if not cholesky(covariance, root):
+            return mean, False
+        squared_distances(root, points, far)
     reach = far.reshape(2 * pairs, _RADII)
     _reaches(reach, likely.reshape(2 * pairs, _RADII), centre, logs)
     wider, held = _fitting(reach, logs)
     for a in range(3):
         for c in range(3):
             covariance[a, c] *= wider
-    return mean, holds(held, wider)
+    fair = _LEAST_HELD < held < _MOST_HELD and wider < _MOST_WIDENED
+    return mean, fair and missed < (_MISSED if wider < _WIDENED else _MISSED_FAR)
 
 
 @inlined
@@ -469,7 +480,7 @@ def judge(
         for a in range(3):
             copy(model.axes[a], slopes[a])
         turn = math.copysign(1.0, solve(slopes, nothing))
-        density, fair = _moments(model, x[0], proximal, turn, first_order, covariance, rays)
+        density, fair = _moments(model, x[0], proximal, turn, first_order, missed, covariance, rays)
     if straight or (missed > _BROKEN and first_order > 0.0 and not short):
         density = first_order
     weight = math.log(density) - 0.5 * misfit if density > 0.0 else -np.inf

@@ -31,7 +31,7 @@ import numpy as np
 from vibrissa.contacts.contacts import LEFT
 from vibrissa.contacts.fitting.least_squares import channel_equations, lane_contact, whiten
 from vibrissa.contacts.sensing.channels import FITTED
-from vibrissa.contacts.uncertainty.posterior import HELD, THREE_SIGMA, holds
+from vibrissa.contacts.uncertainty.posterior import HELD, THREE_SIGMA
 from vibrissa.numerics import (
     AnyArray,
     Array,
@@ -66,6 +66,8 @@ _MOST_RISE, _MOST_FALL, _SHORTER, _REFUSED = 12.0, 4.0, 0.35, 4
 _LARGEST_CHANGE = 0.5  # largest change of the force's moment in a step, as a share of it
 # Largest factor by which a covariance is widened, and bisections to find it.
 _WIDEST, _BISECTIONS = 8.0, 8
+# Limits of a valid covariance: share in ellipsoids of 95 %, and the factor of widening.
+_LEAST_HELD, _MOST_HELD, _MOST_WIDENED = 0.93, 0.98, 1.7
 #: Standard deviation of friction angles, by which valleys are weighed.
 LIKELY_FRICTION = math.radians(20.0)
 _NOTHING = 1e-6  # negligible variances, relative to that of the whole mixture
@@ -339,7 +341,7 @@ def mixture(
         wider = most
     covariance *= wider
     held = 1.0 - _beyond(cumulants, shares, first, last, wider * HELD)
-    return holds(held, wider)
+    return _LEAST_HELD < held < _MOST_HELD and wider < _MOST_WIDENED
 
 
 @kernel

@@ -2,6 +2,7 @@
 
 from vibrissa.sensors import COMPONENTS
 from vibrissa.streaming.contacts import (
+    OFF_ZERO as OFF_ZERO,
     ContactStream,
     ContactStreams,
     advice as advice,

@@ -4,8 +4,10 @@ import json
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import vibrissa as vb
+from vibrissa.cli.app import app
 from vibrissa.contacts import Estimator
 from vibrissa.sensors import Sensor
 from vibrissa.streaming import ContactStream, advice
@@ -93,6 +95,20 @@ def test_a_drift_that_is_not_stated_is_noticed(gamma_map, touches):
     assert any("state (a larger) drift" in sentence for sentence in advice(running))
     quiet, _ = answered(gamma_map, drifted(touches[0][:1000], "linear"), 0.0)
     assert not advice(quiet)
+
+
+@pytest.mark.parametrize("off", [0.0, pytest.param(2.5, marks=pytest.mark.slow)])
+def test_a_table_off_zero_is_questioned(gamma_map, touches, tmp_path, off):
+    gamma_map.save(tmp_path / "map.nc")
+    noise = NOISE * (off + np.random.default_rng(3).normal(size=(400, 3)))
+    table = tmp_path / "table.csv"
+    rows = np.zeros((400, 6))
+    rows[:, [0, 4, 5]] = touches[0][:400] + noise
+    np.savetxt(table, rows, delimiter=",", header="Fx,Fy,Fz,Mx,My,Mz", comments="")
+    command = ["estimate", str(table), "--map", str(tmp_path / "map.nc")]
+    done = CliRunner().invoke(app, [*command, "-o", str(tmp_path / "out.csv")])
+    assert done.exit_code == 0, done.output
+    assert ("not zero on average" in done.output) == (off > 0.0)
 
 
 def test_a_contact_that_grows_within_a_second_is_no_drift():

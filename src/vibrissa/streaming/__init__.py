@@ -2,7 +2,6 @@
 
 from vibrissa.sensors import COMPONENTS
 from vibrissa.streaming.contacts import (
-    OFF_ZERO as OFF_ZERO,
     ContactStream,
     ContactStreams,
     advice as advice,
@@ -16,6 +15,7 @@ from vibrissa.streaming.lines import (
     Sample as Sample,
     rotation_of as rotation_of,
 )
+from vibrissa.streaming.offset import OFF_ZERO as OFF_ZERO, Zero as Zero
 from vibrissa.streaming.sources import (
     Answers as Answers,
     ContactRecorder as ContactRecorder,

@@ -26,7 +26,7 @@ from vibrissa.sensors import COMPONENTS, GRAVITY
 from vibrissa.signals import SIGNALS, signals_of
 from vibrissa.status import Event
 from vibrissa.streaming.lines import FRAME, LineKind, Lines, Poses, Sample
-from vibrissa.streaming.offset import Offset, Zero
+from vibrissa.streaming.offset import OFF_ZERO, Offset, Zero
 
 _ANEW = 1.0  # decrease of time above which the sender has restarted, s
 _SLOW = 0.9  # interval of samples from which the unit of time is probably smaller than s
@@ -89,7 +89,8 @@ class ContactStream:
         slip_speed: float | None = None,
         clock: Callable[[], float] | None = None,
     ) -> None:
-        self._offset, self._zero = Offset(estimator.sensor, tare), Zero()
+        self._offset = Offset(estimator.sensor, tare)
+        self._zero = Zero(self._offset.follows)
         by_name = estimator.announced
         self._announced = by_name
         choices = (names,) if names else (by_name, _components(by_name))
@@ -290,7 +291,7 @@ class ContactStream:
     @property
     def off_zero(self) -> bool:
         """Whether the signals of the free whisker have been far from zero on average."""
-        return self._zero.farthest > (_OFF_ZERO_FOLLOWED if self._offset.follows else _OFF_ZERO)
+        return self._zero.off
 
 
 class ContactStreams:
@@ -430,17 +431,7 @@ _NEARLY_ALL = 0.9  # share of samples above which a wrong unit of time is suspec
 # Share of samples with signals that no contact explains, and their number, from which a general
 # error is suspected: noise alone leaves one in a thousand unexplained.
 _MANY, _SEVERAL = 0.2, 5
-# Mean of free signals, in standard deviations, from which a drift is suspected, or one that is
-# faster than the sensor's file states.
-_OFF_ZERO, _OFF_ZERO_FOLLOWED = 1.5, 3.0
 _FAST = 0.02  # share of poses at an implausible speed above which their unit is questioned
-
-
-OFF_ZERO = (
-    "Samples without contact were not zero on average, as after a drift of the offset: tare again, "
-    "or state (a larger) drift in the sensor's file. Otherwise they will be taken for contacts, "
-    "and the covariances of contacts are too small."
-)
 
 
 def advice(stream: ContactStream) -> list[str]:

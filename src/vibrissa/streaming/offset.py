@@ -23,6 +23,14 @@ _LAG = 1.0  # longest time after which a reading without contact is used, s
 _RECENT = 2.0  # time that the threshold of detection allows for a drift, s
 _GUARD = 0.02  # time before an onset and after a loss in which readings are not used, s
 _SAMPLES = 200  # number of samples over which free readings are averaged, to notice a drift
+# Mean of free readings, in standard deviations, from which a drift is suspected, or one that is
+# faster than the sensor's file states.
+_OFF, _OFF_FOLLOWED = 1.5, 3.0
+OFF_ZERO = (
+    "Samples without contact were not zero on average, as after a drift of the offset: tare again, "
+    "or state (a larger) drift in the sensor's file. Otherwise they will be taken for contacts, "
+    "and the covariances of contacts are too small."
+)
 
 
 class Offset:
@@ -110,14 +118,20 @@ class Offset:
 class Zero:
     """Mean of the signals of a free whisker, in standard deviations of the noise.
 
+    Parameters
+    ----------
+    followed : bool
+        Whether a drift of the offset is followed.
+
     Attributes
     ----------
-    farthest : float
-        Largest size so far of a component of the mean over the last samples.
+    off : bool
+        Whether a component of the mean over the last samples has been suspiciously large.
     """
 
-    def __init__(self) -> None:
-        self.farthest, self._number, self._mean = 0.0, 0, np.zeros(0)
+    def __init__(self, followed: bool = False) -> None:
+        self.off, self._number, self._mean = False, 0, np.zeros(0)
+        self._most = _OFF_FOLLOWED if followed else _OFF
 
     def put(self, excess: Array) -> None:
         """Add the signals (k,) of a sample without contact."""
@@ -128,4 +142,4 @@ class Zero:
         self._number += 1
         self._mean += (excess - self._mean) / min(self._number, _SAMPLES)
         if self._number >= _SAMPLES:
-            self.farthest = max(self.farthest, float(np.abs(self._mean).max()))
+            self.off |= bool((np.abs(self._mean) > self._most).any())

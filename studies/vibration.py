@@ -2,7 +2,9 @@
 
 `python studies/vibration.py [--page]`: trials of 0.6 s past a peg, with the density and damping of
 a rat's whisker assumed and others true. On the first three
-numbers were set, on the others not.
+numbers were set, on the others not. Fresh trials have random whiskers, pegs and speeds; on those of
+`TUNED` and those of the tables by trial the probability above which a frame counts as in contact
+was chosen, not on the others.
 """
 
 import argparse
@@ -50,6 +52,11 @@ WRONG_MASSES = {
     "parabola of 28 mm, 7 Hz, + 20 %": (BENT_28, 0.55, 1e-3, 7.0, 86, 1.2, 0.16),
     "γ, 5 Hz, + 20 %, ⅓ noise": (GAMMA, 0.65, 0.7e-3, 5.0, 87, 1.2, 0.13, 1.0 / 3.0),
 }
+MASSES = (0.8, 1.2, 0.8, 1.2, 0.9, 1.1, 0.8, 1.2)
+"""Masses of fresh trials, relative to the assumed one, by seed."""
+TUNED, FRESH = range(8), (*range(20, 36), *range(40, 56))
+HEAD_FRESH = ("mass", "trials", "in contact", "false, %", "untouched since the last, %", "found, %")
+HEAD_FRESH = (*HEAD_FRESH, "97 % found", "1 % false", "both")
 HEAD = ("trial", "in contact", "M_B > 5σ: false, %", "false, %", "untouched since the last, %")
 HEAD = (*HEAD, "found, %", "onset late, ms")
 BY_AGE = {"all": (0, 999), "0–8 ms": (0, 8), "8–20 ms": (8, 20), "later": (20, 999)}
@@ -75,14 +82,69 @@ def simulated(whisker, distance, radius, frequency, seed, mass, damping, noise=1
     return trial, trial["truth"].to_dataset().isel(whisker=0), np.array(lately)
 
 
-def shares(name, whisker, trial, truth, lately, noise=1.0):
-    """Shares of untouched frames called contact, and of contact frames found."""
+def fresh(seed):
+    """Whisker and conditions of a fresh trial."""
+    rng = np.random.default_rng(1000 + seed)
+    length, slenderness = rng.uniform(24e-3, 42e-3), rng.uniform(2.2e-3, 2.8e-3)
+    thickness = {"base_radius": length * slenderness}
+    kind = rng.integers(3)
+    if kind == 0:
+        modulus = rng.uniform(2.5e9, 4e9)
+        whisker = vb.Whisker.straight(length, youngs_modulus=modulus, **thickness)
+    elif kind == 1:
+        whisker = vb.Whisker.parabola(length, rng.uniform(6, 20), **thickness)
+    else:
+        whisker = GAMMA
+    where = rng.uniform(0.5, 0.68), rng.uniform(0.6e-3, 1.5e-3), rng.uniform(4.5, 9.0)
+    damping, noise = rng.uniform(0.11, 0.17), float(rng.choice([1.0 / 3.0, 1.0, 1.0, 3.0]))
+    return whisker, *where, 500 + seed, MASSES[seed % 8], damping, noise
+
+
+def detected(seed):
+    """Frames in contact, frames untouched since the last, and frames called contact."""
+    whisker, *how = fresh(seed)
+    trial, truth, lately = simulated(whisker, *how)
+    found = called_contact(whisker, trial, how[-1])[0]
+    return truth.in_contact.values.astype(bool), ~lately, found
+
+
+def fresh_rows(seeds):
+    """Rows of the table of fresh trials, by the error of the mass, and of all."""
+    done = {seed: detected(seed) for seed in seeds}
+    rows = []
+    for mass in (0.8, 0.9, 1.1, 1.2, None):
+        some = [one for seed, one in done.items() if mass in (None, MASSES[seed % 8])]
+        hits = np.array([found[touching].mean() for touching, _, found in some])
+        wrong = np.array([found[untouched].mean() for _, untouched, found in some])
+        touching, untouched, found = (np.concatenate(each) for each in zip(*some, strict=True))
+        parts = (found[~touching], found[untouched], found[touching])
+        right, clean = hits >= 0.97, wrong <= 0.01
+        rows.append(
+            [
+                "all"
+                if mass is None
+                else f"{'−' if mass < 1 else '+'} {100 * abs(mass - 1):.0f} %",
+                *(str(number) for number in (len(some), touching.sum())),
+                *(f"{100 * one.mean():.1f}" for one in parts),
+                *(str(one.sum()) for one in (right, clean, right & clean)),
+            ]
+        )
+    return rows
+
+
+def called_contact(whisker, trial, noise):
+    """Frames called contact, and the wrench."""
     data = trial.to_dataset().isel(whisker=0)
-    touching = truth.in_contact.values.astype(bool)
     wrench = np.concatenate([data.force.values, data.moment.values], axis=1)
     pose = (data.base_rotation.values, data.base_position.values)
     vibration = Vibration.of(whisker)
-    found = vibration.in_contact(data.time.values, wrench, *pose, noise**2 * NOISE)
+    return vibration.in_contact(data.time.values, wrench, *pose, noise**2 * NOISE), wrench
+
+
+def shares(name, whisker, trial, truth, lately, noise=1.0):
+    """Shares of untouched frames called contact, and of contact frames found."""
+    touching = truth.in_contact.values.astype(bool)
+    found, wrench = called_contact(whisker, trial, noise)
     bare = np.hypot(wrench[:, 4], wrench[:, 5]) > 5.0 * noise * MOMENT_NOISE
     # Onsets after some quiet: how long until the frame is called contact.
     onsets = [i for i in np.flatnonzero(np.diff(touching.astype(int)) == 1) + 1 if i > 5]
@@ -140,6 +202,7 @@ if __name__ == "__main__":
     ]
     blocks = {"vibration": table(HEAD, contact), "inertia in contact": table(HEAD_ERRORS, away, 2)}
     blocks["wrong mass"] = table(HEAD, wrong)
+    blocks["fresh"] = table(HEAD_FRESH, fresh_rows(FRESH))
     print("\n\n".join(blocks.values()))
     if page:
         put(Path(__file__).parents[1] / "docs" / "validation-inertia.md", blocks)

@@ -11,7 +11,15 @@ import vibrissa as vb
 from vibrissa.numerics import exponential
 from vibrissa.objects import Peg
 from vibrissa.rod import follow_surfaces
-from vibrissa.simulation import Dynamics, Motion, resonances, simulate, whisking
+from vibrissa.simulation import (
+    Dynamics,
+    Motion,
+    facing_peg,
+    resonances,
+    simulate,
+    sweep_past,
+    whisking,
+)
 from vibrissa.simulation.chain import Chain, configure, inertia, jacobian
 from vibrissa.simulation.dynamics import move_dynamically
 from vibrissa.status import Status
@@ -228,3 +236,16 @@ def test_faults():
         Dynamics(segments=3)
     with pytest.raises(ValueError, match="damping_ratio is -1"):
         Dynamics(damping_ratio=-1.0)
+
+
+def test_the_force_vanishes_when_a_whisker_slips_off():
+    # In one step the tip is in the object without a force, and far from it with one.
+    peg = facing_peg(WHISKER, 0.65)
+    whole = sweep_past(WHISKER, peg, 0.6, 5000.0, seed=0, frequency=5.0)
+    names = ("time", "azimuth", "elevation", "roll", "base_position")
+    motion = Motion(*(getattr(whole, name)[450:930] for name in names))
+    moments = move_dynamically(WHISKER, [peg], motion, Dynamics(step=2e-4))
+    force = np.array([np.linalg.norm(one.contact_force) for one in moments])
+    last = np.flatnonzero(np.isfinite(force))[-1]
+    assert last > 450
+    assert force[last] < 0.1 * force[last - 50]

@@ -413,6 +413,7 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions, weight: Gravi
                 maps[0], wrench, names, noise=noise, gravity=gravity, **others
             )
         tell("contact points", 1, 1)
+    _doubt_zero(wrench, noise, found, weight)
     vb.io.save_contacts(target, vb.pipeline.contact_columns(found))
     used = WRENCH if how.whole else found.attrs["triplet"]
     about = how.noise.described() + weight.described()
@@ -488,6 +489,24 @@ def _doubt_axes(
     """Warn of apparently wrong axes of the sensor; not with gravity, whose effects are similar."""
     if weight.gravity is None and (doubt := vb.pipeline.doubted_axes(whisker, wrench, noise)):
         remark(f"note: {doubt}")
+
+
+def _doubt_zero(
+    wrench: xr.Dataset, noise: vb.numerics.Array, found: xr.Dataset, weight: GravityOptions
+) -> None:
+    """Warn of signals that are not zero without contact; not with gravity, which changes them."""
+    import numpy as np
+
+    if weight.gravity is not None:
+        return
+    free = found["status"].values == vb.Status.NOT_FELT
+    readings = np.concatenate([wrench[name].values for name in ("force", "moment")], axis=1)
+    known = np.isfinite(readings).any(axis=0)
+    zero = vb.streaming.Zero()
+    for reading in (readings / np.sqrt(np.diag(noise)))[free][:, known]:
+        zero.put(reading)
+    if zero.off:
+        remark(f"note: {vb.streaming.OFF_ZERO}")
 
 
 def _from_sweep(table: Path, target: Path, path: Path) -> None:

@@ -317,7 +317,11 @@ def _report(running: vb.streaming.ContactStream, lost: str, follow: bool) -> Non
 
 def _advise(running: vb.streaming.ContactStream) -> None:
     for sentence in vb.streaming.advice(running):
-        remark(f"{running.whisker}: {sentence}" if running.whisker else sentence)
+        remark(_of(running, sentence))
+
+
+def _of(running: vb.streaming.ContactStream, sentence: str) -> str:
+    return f"{running.whisker}: {sentence}" if running.whisker else sentence
 
 
 class _Losses:
@@ -360,6 +364,7 @@ def _write(
     sent: vb.streaming.Answers | None,
 ) -> None:
     """Print each record immediately; stop quietly if the output is closed."""
+    drifted: set[str] = set()
     try:
         for record in running.records(lines):
             # The bag is written first, so that it has all printed results after any signal.
@@ -376,9 +381,12 @@ def _write(
                     sent = None
             if losses is not None:
                 losses.report()
-            if running.samples == _SOON:
-                for one in running.streams:
+            for one in running.streams:
+                if running.samples == _SOON:
                     _advise(one)
+                if one.off_zero and one.whisker not in drifted:
+                    drifted.add(one.whisker)
+                    remark(_of(one, vb.streaming.OFF_ZERO))
     except BrokenPipeError:
         # Flushing at exit must not fail again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -164,8 +164,8 @@ class Estimator:
         stiffness_sigma : float
             Relative standard deviation of the whisker's bending stiffness.
         felt_above : float
-            Number of standard deviations within which readings count as zero, ``NOT_FELT``; 0
-            locates all.
+            Number of standard deviations, of noise and drift, within which readings count as zero,
+            ``NOT_FELT``; 0 locates all.
         prior : Prior, optional
             Possible contacts.
         gravity : Gravity or (3,) array_like, optional
@@ -190,10 +190,12 @@ class Estimator:
             raise ValueError(f"readings are weighed by their noise; {', '.join(silent)} has none")
         if not h.any():
             raise ValueError("the sensor's channels read nothing of force and moment")
-        errors = np.concatenate([by_stiffness(h, stiffness_sigma), sensor.common_errors])
+        shared = by_stiffness(h, stiffness_sigma), sensor.common_errors, sensor.drift_errors
+        errors = np.concatenate(shared)
         readout = readout_of(contact_map, h, covariance, errors)
         out._order = None
-        out._start(contact_map, readout, len(sensor.channels), felt_above, prior)
+        above = felt_above * sensor.unsteadiness
+        out._start(contact_map, readout, len(sensor.channels), above, prior)
         out._sensor = sensor
         stated = (stiffness_sigma, felt_above, prior)
         out._again = partial(_on_map, Estimator.of_sensor, sensor, *stated)

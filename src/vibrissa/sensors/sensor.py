@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vibrissa.numerics import Array, numbers, rotation_matrices
+from vibrissa.numerics import Array, Mask, numbers, rotation_matrices
 from vibrissa.sensors.frame import SensorFrame
 
 FORCE_NOISE = 1e-6
@@ -53,6 +53,7 @@ _UNREAD = 1e-9  # relative size below which a combination of components is not m
 _ROUNDING = 1e-12  # size below which eigenvalues of a correlation matrix are due to rounding
 # Size above which asymmetries and negative eigenvalues of a correlation matrix are errors.
 _INDEFINITE = 1e-9
+_DRIFTED = 2.0  # time for which an offset has drifted since it was measured, as in streams, s
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +76,8 @@ class Sensor:
     bias : array_like
         Constant offset.
     drift : array_like
-        Standard deviation, after one second, of a random walk that starts at zero.
+        Standard deviation, after one second, of a random walk that starts at zero. Streams follow
+        it while the whisker is free; contacts have the uncertainty of the walk of two seconds.
     resolution : array_like
         Resolution to whose multiples readings are rounded; 0 for no rounding.
     largest : array_like
@@ -212,6 +214,22 @@ class Sensor:
         if len(own):
             own[..., :6] = own[..., :6] @ self.frame.from_base()
         return own
+
+    @property
+    def drift_errors(self) -> Array:
+        """Errors (n, k, 7) of the offset as in `common_errors`, those of a drift of two seconds."""
+        errors = np.zeros((len(self.channels), len(self.channels), 7))
+        errors[..., 6] = np.diag(np.sqrt(_DRIFTED) * self.drift)
+        drifts: Mask = self.drift > 0.0
+        return errors[drifts]
+
+    @property
+    def unsteadiness(self) -> float:
+        """Largest deviation by noise and a drift of two seconds, relative to that of the noise."""
+        noise = np.diag(self.covariance())
+        some = noise > 0.0
+        ratio = _DRIFTED * self.drift[some] ** 2 / noise[some]
+        return float(np.sqrt(1.0 + ratio.max(initial=0.0)))
 
     def with_new_offset(self, readings: int, bias: ArrayLike | None = None) -> Sensor:
         """Copy of the sensor with an offset determined as the mean of readings.

@@ -370,6 +370,7 @@ class Walk:
         spring = chain.stiffness * (1.0 + self._damping * rate)
         pull = np.zeros_like(state.masses)
         touching: list[tuple[Contact, Array, bool]] = []
+        lost = regained = False
         for rounds in range(self.rounds):
             state.move(theta, rotation, base)
             speed = self._masses.rate_of(state.masses, h)
@@ -382,12 +383,17 @@ class Walk:
             matrix[np.diag_indices_from(matrix)] += spring.ravel()
             # Near sticking, Newton's method overshoots; the secant of friction does not.
             eager = rounds < _EAGER
+            before = bool(touching)
             touching = [
                 self._push(contact, residual, matrix, eager) for contact in self._contacts()
             ]
+            # Where a contact slides off, full steps may alternate between too much force and none.
+            lost |= before and not touching
+            regained |= lost and bool(touching)
             change = np.linalg.solve(matrix, residual).reshape(theta.shape)
             largest = float(np.abs(change).max())
-            theta -= change * min(1.0, _MOST_TURNED / max(largest, 1e-300))
+            share = 0.5 if regained and touching else 1.0
+            theta -= change * min(share, _MOST_TURNED / max(largest, 1e-300))
             if largest < self.turned:
                 break
         self._theta = self._theta.then(theta, h)

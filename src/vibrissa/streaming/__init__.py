@@ -15,6 +15,7 @@ from vibrissa.streaming.lines import (
     Sample as Sample,
     rotation_of as rotation_of,
 )
+from vibrissa.streaming.offset import OFF_ZERO as OFF_ZERO, Zero as Zero
 from vibrissa.streaming.sources import (
     Answers as Answers,
     ContactRecorder as ContactRecorder,

@@ -26,6 +26,7 @@ from vibrissa.sensors import COMPONENTS, GRAVITY
 from vibrissa.signals import SIGNALS, signals_of
 from vibrissa.status import Event
 from vibrissa.streaming.lines import FRAME, LineKind, Lines, Poses, Sample
+from vibrissa.streaming.offset import OFF_ZERO, Offset, Zero
 
 _ANEW = 1.0  # decrease of time above which the sender has restarted, s
 _SLOW = 0.9  # interval of samples from which the unit of time is probably smaller than s
@@ -88,8 +89,8 @@ class ContactStream:
         slip_speed: float | None = None,
         clock: Callable[[], float] | None = None,
     ) -> None:
-        if tare and estimator.sensor is None:
-            raise ValueError("tare needs a sensor, to whose channels the offset belongs")
+        self._offset = Offset(estimator.sensor, tare)
+        self._zero = Zero(self._offset.follows)
         by_name = estimator.announced
         self._announced = by_name
         choices = (names,) if names else (by_name, _components(by_name))
@@ -110,9 +111,6 @@ class ContactStream:
         self.poses = poses or Poses()
         self.laboratory = ""
         self.slow, self.untimed, self.unused = 0, 0, False
-        self._tare = tare
-        self._free: list[Array] = []
-        self._offset: Array | float = 0.0
 
     def records(self, lines: Iterable[str]) -> Iterator[dict[str, Any]]:
         """Convert lines to records, one per sample and one per unreadable line.
@@ -157,6 +155,7 @@ class ContactStream:
         self._time = -math.inf
         self._events.forget()
         self.poses.forget()
+        self._offset.forget()
         (self._follow or self._estimator).reset()
 
     def warm_up(self) -> None:
@@ -219,9 +218,17 @@ class ContactStream:
         known = {"time": time, **sample.passed}
         if self.whisker:
             known["whisker"] = self.whisker
-        if len(self._free) < self._tare:
-            return known | {"status": self._tared(sample.values, rotation, gravity)}
-        values = sample.values - self._offset
+        if self._offset.wanted:
+            reading = self._compensated(sample.values, rotation, gravity)
+            if not np.isfinite(reading).all():
+                return known | {"status": "missing"}
+            self._offset.tare(time, reading)
+            return known | {"status": "tare"}
+        values = sample.values - self._offset.value
+        if self._offset.follows:
+            left = self._compensated(values, rotation, gravity)
+            if self._offset.hides(time, left, self._estimator.felt_above):
+                values = values - left
         if gravity is not None and not np.isfinite(gravity).all():
             values = np.full_like(values, np.nan)
         if self._which and sample.names != self._announced:
@@ -243,15 +250,21 @@ class ContactStream:
             known |= followed_record(followed, rotation)
             place, spread, reliable = followed.point, followed.covariance, True
         status = known["status"]
+        excess = self._estimator.readout.excess(measurement) / self._offset.unsteadiness
         event = self._events(
             time,
             None if status in _SILENT else status != "not_felt",
-            self._estimator.readout.excess(measurement),
+            excess,
             Place(place, spread, reliable, rotation, position) if status == "unique" else None,
         )
         if event != Event.NONE:
             known["event"] = event.name.lower()
         begun, sigma = self._events.onset
+        if status == "not_felt":
+            self._zero.put(excess)
+        if self._offset.follows and status not in _SILENT:
+            reading = self._compensated(sample.values, rotation, gravity)
+            self._offset.follow(time, status == "not_felt", begun, reading)
         return known | ({"onset_time": begun, "onset_sigma": sigma} if begun == begun else {})
 
     def _put(self, sample: Sample) -> None:
@@ -269,18 +282,16 @@ class ContactStream:
             return self.poses.put(time, rotation, position)
         return self.poses.at(time) or (rotation, position)
 
-    def _tared(self, values: Array, rotation: Array | None, gravity: Array | None) -> str:
-        """Use one sample without contact to measure the offset."""
+    def _compensated(self, values: Array, rotation: Array | None, gravity: Array | None) -> Array:
+        """Readings without the sensor's stated offset and the weight that it carries."""
         sensor = self._estimator.sensor
         assert sensor is not None
-        pull = GRAVITY if gravity is None else gravity
-        reading = sensor.compensated(values, rotation, pull)
-        if not np.isfinite(reading).all():
-            return "missing"
-        self._free.append(reading)
-        if len(self._free) == self._tare:
-            self._offset = np.mean(self._free, axis=0)
-        return "tare"
+        return sensor.compensated(values, rotation, GRAVITY if gravity is None else gravity)
+
+    @property
+    def off_zero(self) -> bool:
+        """Whether the signals of the free whisker have been far from zero on average."""
+        return self._zero.off
 
 
 class ContactStreams:
@@ -457,6 +468,8 @@ def advice(stream: ContactStream) -> list[str]:
             "All samples are incomplete: a number or the pose at that time is missing, or readings "
             "have reached the sensor's largest reading."
         )
+    if stream.off_zero:
+        out.append(OFF_ZERO)
     if stream.slow > _NEARLY_ALL * max(total - 1, 1):
         out.append("Samples are a second or more apart: is their time in s?")
     if stream.poses.too_fast > _FAST * stream.poses.number > 0:

@@ -32,6 +32,7 @@ from typing import Any, BinaryIO, cast
 
 from numba.core import event, types
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
+from numba.core.runtime.nrt import rtsys
 
 from vibrissa.numerics.arrays import Call, threads
 
@@ -139,9 +140,13 @@ class PackageCache(FunctionCache):
         return files.holds(self._index_key(sig, codegen))
 
     def load_overload(self, sig: object, target_context: object) -> Any:
-        """Load a compiled function; None if there is no usable one."""
+        """Load a compiled function; None if there is no usable one.
+
+        Numba would first import all that it can compile, which takes longer than loading.
+        """
         try:
-            return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+            rtsys.initialize(target_context)
+            return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         except Exception:
             return None
 

@@ -139,10 +139,14 @@ def peg_errors(recording, peg):
     return f"{error} ± {sigma}", f"{offset} ± {about}"
 
 
+def sample_of(frames):
+    """Frames of each view spread over the film."""
+    return [[view[i] for i in np.linspace(0, FRAMES - 1, 30).astype(int)] for view in frames]
+
+
 def start_of(cameras, frames, truth):
     """Distance of the base that is found without a click, in the worse view, and confidence."""
-    some = np.linspace(0, FRAMES - 1, 30).astype(int)
-    start = find_start(cameras, [[view[i] for i in some] for view in frames])
+    start = find_start(cameras, sample_of(frames))
     if start.bases is None:
         return "refused"
     # The base is that of the first of these frames that shows it: any of them will do.
@@ -187,7 +191,7 @@ def one_film(name, look, seed):
     spent = np.mean([clock.each for clock in clocks])
     touching = truth["in_contact"] > 0
     lost, wrong, near = traces_against(traces, lenses, truth, touching)
-    recording = track(cameras, traces, RATE, TrackOptions())
+    recording = track(cameras, traces, RATE, TrackOptions(), sample=sample_of(frames))
     data = recording.to_dataset()
     stated = data["in_contact"].values[:, 0] > 0
     both = touching & stated
@@ -238,8 +242,7 @@ def way_films():
         name, look = list(KINDS.items())[(seed - 61) % len(KINDS)]
         trial, _, lenses, frames, cameras, truth = filmed(name, look, seed)
         clicked = [lens(trial["base_position"].values[0, 0]) for lens in lenses]
-        some = np.linspace(0, FRAMES - 1, 30).astype(int)
-        found = find_start(cameras, [[view[i] for i in some] for view in frames]).bases
+        found = find_start(cameras, sample_of(frames)).bases
         ways = {"clicked": (frames, clicked), "without clicks": (frames, found)}
         with tempfile.TemporaryDirectory() as folder:
             # The second view is left of the first, as a mirror shows it.
@@ -265,7 +268,8 @@ def one_way(frames, bases, lenses, cameras, truth):
     traces = [trace_video(v, [base]) for v, base in zip(frames, bases, strict=True)]
     touching = truth["in_contact"] > 0
     lost, wrong, _ = traces_against(traces, lenses[:count], truth, touching)
-    data = track(cameras[:count], traces, RATE, TrackOptions()).to_dataset()
+    some = sample_of(frames)
+    data = track(cameras[:count], traces, RATE, TrackOptions(), sample=some).to_dataset()
     stated = data["in_contact"].values[:, 0] > 0
     both, axes = touching & stated, slice(0, 1 + count)
     away = (data["contact_point"].values[:, 0] - truth["contact_point"])[both, axes]

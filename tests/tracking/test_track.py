@@ -323,6 +323,7 @@ def test_a_step_to_a_contact_that_no_rod_withstands_is_not_taken():
         FitOptions(),
         still,
         (),
+        None,
         ~touching,
     )
     fit = problem.linear(state)
@@ -587,7 +588,8 @@ def test_the_smoother_solves_its_equations():
             rows[:, j * n : (j + 1) * n] += factor * np.diag(weight)
         dense += rows.T @ rows
         right -= rows.T @ (weight * second)
-    np.testing.assert_allclose(smoother.solved().reshape(-1), np.linalg.solve(dense, right))
+    step, _ = smoother.solved()
+    np.testing.assert_allclose(step.reshape(-1), np.linalg.solve(dense, right))
     inverse = np.linalg.inv(dense)
     blocks = [inverse[i * n : (i + 1) * n, i * n : (i + 1) * n] for i in range(count)]
     np.testing.assert_allclose(smoother.covariances(), blocks, rtol=1e-6, atol=1e-9)

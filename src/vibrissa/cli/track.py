@@ -232,6 +232,7 @@ class KnownOptions:
     head: Path | None = None
     contact: Path | None = None
     objects: Path | None = None
+    find_peg: bool = True
 
     def alone(self) -> dict[str, Path | None]:
         """Options that apply to a single trial only."""
@@ -339,6 +340,7 @@ def track(
         options=traced.trace_options(),
         how=how,
         known=known.read(videos[0], rate),
+        find_peg=known.find_peg,
     )
     _report_assumed(filmed, clicks)
     _report_swapped(videos, filmed)
@@ -363,6 +365,7 @@ class _Job:
     options: vb.tracking.TraceOptions
     how: vb.tracking.TrackOptions
     known: Mapping[str, Any]
+    find_peg: bool
 
     def track(self, videos: Sequence[Path], recording: Path, alone: bool) -> None:
         """Track one trial and report the results; images of a single trial have short names."""
@@ -401,7 +404,13 @@ class _Job:
             if lost is not None:
                 self._show_doubt(videos, traces, [lost] * len(videos), _LOST, doubt)
             result = vb.tracking.track(
-                self.cameras, traces, self.rate, self.how, progress=tell, **self.known
+                self.cameras,
+                traces,
+                self.rate,
+                self.how,
+                sample=frames if self.find_peg else (),
+                progress=tell,
+                **self.known,
             )
         unexplained = None if lost is not None else _where_unexplained(result)
         if unexplained is not None:

@@ -28,6 +28,7 @@ from vibrissa.recording import coordinates, recorded, recording_tree
 from vibrissa.status import Status
 from vibrissa.tracking.refine.fit import RodFit
 from vibrissa.tracking.refine.optics import Optics
+from vibrissa.tracking.refine.peg import UncertainPeg
 from vibrissa.tracking.refine.rods import TraceSeries
 from vibrissa.tracking.space.frame_pairs import NEAR, clear_offsets
 from vibrissa.tracking.space.pose import CUTOFF, BasePose, HeadPose
@@ -173,6 +174,7 @@ class Tracked:
     fit: RodFit
     head: HeadPose  # its pose in these frames
     length: Length  # with a standard deviation of 0 where it is given
+    peg: UncertainPeg | None = None  # that it touches, found in the images
     contacts: ContactPoints | None = None  # those that do not come from the rod
 
 
@@ -406,6 +408,20 @@ def remarks_on_unseen_contacts(one: Tracked, name: str) -> list[str]:
         f"not sure where {name} touches: in {unseen} of {count} frames in contact that is beyond "
         "what both views show of it, and follows from how the part before it bends. Film more of "
         f"the whisker, or state {length}what it touches (--objects)."
+    ]
+
+
+def remarks_on_peg(one: Tracked, name: str) -> list[str]:
+    """Report the peg that was found in the images, as it would be stated."""
+    if one.peg is None:
+        return []
+    peg = one.peg.expected
+    vectors = 1e3 * peg.origin, peg.axis
+    position, axis = (", ".join(f"{x:z.3f}" for x in vector) for vector in vectors)
+    return [
+        f"{name} touches a peg that all views show, and its contacts are fitted on it: diameter "
+        f"{2e3 * peg.radius:.3f} ± {2e3 * one.peg.radius_sigma:.3f} mm, position [{position}] mm, "
+        f"axis [{axis}]. If they touch something else, state it (--objects), or --no-find-peg."
     ]
 
 

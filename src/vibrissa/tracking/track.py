@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from vibrissa.cameras import Camera
 from vibrissa.deferred import transform
+from vibrissa.io import Frame
 from vibrissa.numerics import Array, Mask, without_blas_threads
 from vibrissa.objects import Surface
 from vibrissa.recording import ONE_VIEW
@@ -30,6 +31,7 @@ from vibrissa.tracking.recording import (
     remarks_on_following,
     remarks_on_fur,
     remarks_on_optics,
+    remarks_on_peg,
     remarks_on_plane,
     remarks_on_rest,
     remarks_on_row,
@@ -43,8 +45,10 @@ from vibrissa.tracking.recording import (
 from vibrissa.tracking.refine.continuation import continued
 from vibrissa.tracking.refine.fit import Fitter, RodFit
 from vibrissa.tracking.refine.optics import Optics, rough_optics, stated_lenses
+from vibrissa.tracking.refine.peg import UncertainPeg
 from vibrissa.tracking.refine.problem import FitOptions
 from vibrissa.tracking.refine.rods import TraceSeries, rolled
+from vibrissa.tracking.refine.silhouette import explains, peg_in_images
 from vibrissa.tracking.space.curve import begun_together, merged
 from vibrissa.tracking.space.exchange import Known, exchanged
 from vibrissa.tracking.space.frame_pairs import paired_frames
@@ -81,6 +85,8 @@ _FEWEST, _FRAMES = 3, 24
 _WELL, _WORSE = 1.0, 3.0
 # Share of the frames of a whisker in a row that the rod must explain before others are left out.
 _EXPLAINED = 0.1
+# Errors of traces that vary with the pose only, pixels: by light, fur, lenses and what is behind.
+_ASTRAY = 0.1
 _FAR = 10.0  # distance between the bases of several views above which they differ, pixels
 _SHARE = 0.03  # the same as a share of the whisker's length
 _APART = 8.0  # distance of the ends of several views from one point from which they are not the tip
@@ -146,6 +152,7 @@ def track(
     head: xr.Dataset | None = None,
     contacts: xr.Dataset | None = None,
     objects: Sequence[Surface] = (),
+    sample: Sequence[Sequence[Frame]] = (),
     progress: Progress | None = None,
 ) -> xr.DataTree:
     """Make a recording of the traces of one or more whiskers.
@@ -170,6 +177,11 @@ def track(
     objects : sequence of Surface, optional
         Objects in the laboratory frame, on which contacts of the fitted rod are. Without
         ``contacts``, the point of the measured whisker nearest to any of them is compared with it.
+    sample : sequence of sequence of array (height, width), optional
+        Frames of each view spread over the film, in which a peg that a whisker touches is looked
+        for if there are no ``objects``. One whose outline is an edge in both views, and that
+        explains the contacts, is fitted with them: its place, direction and radius are what images
+        and contacts together show.
     progress : callable, optional
         Function that is called as ``progress(stage, done, total)``.
 
@@ -215,7 +227,8 @@ def track(
     rows = [list(row) for row in zip(*timed_rows, strict=True)]
 
     def tracked(k: int, used: Sequence[Sequence[Trace]]) -> Tracked:
-        return track_whisker(cameras, used, rate, options, called[k], progress, moving, objects)
+        given = moving, objects, sample
+        return track_whisker(cameras, used, rate, options, called[k], progress, *given)
 
     known = partial(known_of, cameras, rate=rate, options=options.fit)
     begun = [begun_together(cameras, row) for row in rows]
@@ -241,7 +254,9 @@ def track(
             remarks += remarks_on_fur(one, options.fur, name)
             remarks += remarks_on(cameras, one.traces, one.length, one.fit.misfit, name)
             # Known objects locate contacts that are not seen.
-            remarks += [] if objects else remarks_on_unseen_contacts(one, name)
+            if not objects and one.peg is None:
+                remarks += remarks_on_unseen_contacts(one, name)
+            remarks += remarks_on_peg(one, name)
             remarks += remarks_on_rest(one, name)
             if len(cameras) == 1:
                 remarks += remarks_on_plane(one, name)
@@ -448,6 +463,7 @@ def track_whisker(
     progress: Progress | None = None,
     head: HeadPose | None = None,
     objects: Sequence[Surface] = (),
+    sample: Sequence[Sequence[Frame]] = (),
 ) -> Tracked:
     """Track one whisker in space, from traces of frames that belong together, view by view."""
     report = progress or (lambda stage, done, total: None)
@@ -465,7 +481,8 @@ def track_whisker(
     on_head = head.seen_from(points)
     tips: Mask = np.all(series.ends[:, :, 1] > 0.5, axis=1)
     sparse = any(trace.sparse for view in traces for trace in view)
-    shape, whisker = _at_rest(on_head, options, name, tips, len(cameras) == 1, sparse)
+    scale = _pixel_at(cameras, on_head)
+    shape, whisker = _at_rest(on_head, options, name, tips, len(cameras) == 1, sparse, scale)
     if len(cameras) > 1:
         shape = replace(shape, free=shape.free & ~rolled_over(on_head, shape, whisker))
     report(f"contact of {name}", 1, 2)
@@ -484,32 +501,96 @@ def track_whisker(
         # Only the bent shapes determine the roll.
         smoothness = replace(smoothness, roll=max(smoothness.roll, _ANY_ROLL))
     fitter = Fitter(cameras, series, touching, on_head, rate, smoothness, head, objects)
+    begun = _Begun(shape, whisker, further and further[1], tips, tapers)
+    found = None
+    if sample and not objects:
+        found = _on_peg(fitter, begun, options, sample)
+    found = found or _bent(fitter, begun, options)
+    report(f"contact of {name}", 2, 2)
+    covariance = np.array([curve.covariance for curve in curves])
+    return Tracked(
+        whisker=found.whisker,
+        traces=series,
+        curves=points,
+        covariance=covariance,
+        shape=found.shape,
+        pose=found.pose,
+        unfiltered=found.unfiltered,
+        touching=touching,
+        fit=found.fit,
+        head=head,
+        length=found.length,
+        peg=found.peg,
+    )
+
+
+class _Begun(NamedTuple):
+    """A whisker at rest before it is known how it bends."""
+
+    shape: RestShape
+    whisker: Whisker
+    continued: Length | None  # where one view shows more of it than all
+    tips: Mask
+    tapers: bool  # whether its taper is stated
+
+
+class _Bent(NamedTuple):
+    """A whisker and its length by how it bends, and its fit."""
+
+    whisker: Whisker
+    shape: RestShape
+    length: Length
+    pose: BasePose
+    unfiltered: BasePose
+    fit: RodFit
+    peg: UncertainPeg | None  # that it touches, where that was unknown
+
+
+def _on_peg(
+    fitter: Fitter, begun: _Begun, options: TrackOptions, sample: Sequence[Sequence[Frame]]
+) -> _Bent | None:
+    """The same with a peg that images show; None if there is none that explains the contacts."""
+    shape, whisker = begun.shape, begun.whisker
+    touches, misfit = fitter.touches(whisker, _poses(fitter, shape, whisker, options)[1])
+    peg = peg_in_images(fitter.cameras, sample, touches)
+    if peg is None:
+        return None
+    found = _bent(replace(fitter, peg=peg), begun, options)
+    return found if explains(found.peg, misfit, found.fit, found.whisker) else None
+
+
+def _bent(fitter: Fitter, begun: _Begun, options: TrackOptions) -> _Bent:
+    """Length or taper of a whisker, its pose, and the fit of the rod."""
+    shape, whisker, further, tips, tapers = begun
     length = Length(whisker.length, 0.0)
     if options.whisker is None and options.length is not None:
         length = unseen_part(shape, stated_length(shape, options.length, tapers))
     elif options.whisker is None and shape.whole:
-        lengths = np.linalg.norm(np.diff(on_head[shape.free & tips], axis=1), axis=2).sum(axis=1)
-        length = further[1] if further else seen_length(lengths, series.line, tapers)
+        steps = np.diff(fitter.curves[shape.free & tips], axis=1)
+        lengths = np.linalg.norm(steps, axis=2).sum(axis=1)
+        length = further or seen_length(lengths, fitter.traces.line, tapers)
     elif options.whisker is None:
         length = unseen_part(shape, _length(fitter, shape, options))
     if further is not None:
-        length = length._replace(shown=further[1].shown, bending=further[1].bending)
+        length = length._replace(shown=further.shown, bending=further.bending)
     if length.value > length.shown:
         shape = lengthened(shape, length.value)
-        whisker = whisker_at_rest(shape, name, **options.at_base)
+        whisker = whisker_at_rest(shape, whisker.name, **options.at_base)
     unfiltered, pose = _poses(fitter, shape, whisker, options)
     if length.seen and not tapers:
         whisker, length = tapered_as_it_bends(fitter, whisker, length, pose)
-    fit = fitter.fit(whisker, pose, on_head.shape[1], length)
-    report(f"contact of {name}", 2, 2)
-    covariance = np.array([curve.covariance for curve in curves])
-    return Tracked(
-        whisker, series, points, covariance, shape, pose, unfiltered, touching, fit, head, length
-    )
+    fit, peg = fitter.fit_with_peg(whisker, pose, fitter.curves.shape[1], length)
+    return _Bent(whisker, shape, length, pose, unfiltered, fit, peg)
 
 
 def _at_rest(
-    curves: Array, options: TrackOptions, name: str, tips: Mask, flat: bool, sparse: bool
+    curves: Array,
+    options: TrackOptions,
+    name: str,
+    tips: Mask,
+    flat: bool,
+    sparse: bool,
+    pixel: float,
 ) -> tuple[RestShape, Whisker]:
     """Rest shape from the frames, or of the known whisker."""
     if options.whisker is not None:
@@ -517,8 +598,18 @@ def _at_rest(
         if flat:
             return _known_flat(curves, whisker, options.free)
         return known_rest(curves, whisker, options.free), whisker
-    shape = replace(rest_shape(curves, options.free, tips), sparse=sparse)
+    shape = replace(rest_shape(curves, options.free, tips, _ASTRAY * pixel), sparse=sparse)
     return shape, whisker_at_rest(shape, name, **options.at_base)
+
+
+def _pixel_at(cameras: Sequence[Camera], curves: Array) -> float:
+    """Size of a pixel at a whisker, m, in the coarsest view."""
+    seen = curves[np.isfinite(curves).all(axis=(1, 2))]
+    if not len(seen):
+        return 0.0
+    base = np.median(seen[:, 0], axis=0)[None]
+    scales = [np.linalg.norm(c.project_with_slopes(base)[1], axis=-1).max() for c in cameras]
+    return float(1.0 / min(scales))
 
 
 def _known_flat(curves: Array, whisker: Whisker, free: float) -> tuple[RestShape, Whisker]:

@@ -39,9 +39,11 @@ from vibrissa.deferred import interpolate
 from vibrissa.numerics import Array, Mask
 from vibrissa.objects import Surface
 from vibrissa.rod import discretize, solve_forces
+from vibrissa.tracking.refine.peg import UncertainPeg
 from vibrissa.tracking.refine.problem import REST, FitOptions, Linear, Problem
 from vibrissa.tracking.refine.rods import (
     LIMITS,
+    Bent,
     State,
     TraceSeries,
     contact_slopes,
@@ -137,7 +139,7 @@ def _with_margins(problem: Problem, fit: Linear, covariance: Array) -> list[_Con
     best = [int(rows[covariance[rows, 6, 6].argmin()]) for rows in runs]
     pulls = np.zeros((len(runs), *fit.smoother.gradient.shape))
     pulls[np.arange(len(runs)), best, 6] = 1.0
-    responses = fit.smoother.responses(pulls)
+    responses = fit.smoother.alone(pulls)
     return [_Contact(*each) for each in zip(runs, best, responses, strict=True)]
 
 
@@ -145,7 +147,8 @@ def _profile(problem: Problem, state: State, contact: _Contact) -> _Profile | No
     """Costs along a contact's arc length, relative to the state's; None if it is a parabola."""
     first, last = contact.rows[0] - _MARGIN, contact.rows[-1] + _MARGIN
     near = np.arange(max(first, 0), min(last + 1, len(problem.frames)))
-    part = replace(problem.rows(near, state), options=replace(problem.options, rounds=_ROUNDS))
+    part = problem.rows(near, state).with_known_peg(state)
+    part = replace(part, options=replace(problem.options, rounds=_ROUNDS))
     row, inside = contact.best - near[0], contact.rows - near[0]
     middle = float(state.contact[contact.best, 0])
 
@@ -204,6 +207,9 @@ _ENDS = (3.5, 1.0)
 _FREE = [0, 2, 3]
 # Change of the inverse length, as a share, up to which its effects are linear, and the largest.
 _LINEAR, _MOST_UNSURE = 0.04, 0.6
+# Force, over the usual one, from which its direction shows the normal; and standard deviation of
+# contacts along the whisker, over its length, by a taper that is only assumed.
+_STRONG, _UNSURE = 0.3, 0.03
 _CURVED = 0.05  # distance of points that show the curvature at a contact, as a share of the length
 
 
@@ -233,6 +239,16 @@ class RodFit:
     misfit: Array  # (time,), root mean square distance from the traces in their deviations
 
 
+class Touches(NamedTuple):
+    """Contacts (n, 3), m, with unit normals of what is touched and unit tangents of the whisker."""
+
+    points: Array
+    normals: Array
+    tangents: Array
+    radius: Array  # (n,) of the whisker, m
+    sigma: float  # standard deviation of points along the whisker, m
+
+
 @dataclass(frozen=True, eq=False)
 class Fitter:
     """Traces, and tables common to all rods fitted to them."""
@@ -245,16 +261,53 @@ class Fitter:
     options: FitOptions
     head: HeadPose
     objects: Sequence[Surface] = ()
+    peg: UncertainPeg | None = None
 
     def fit(
         self, whisker: Whisker, pose: BasePose, nodes: int, length: Length | None = None
     ) -> RodFit:
         """Fit a whisker of approximate pose, whose length may be uncertain."""
+        return self.fit_with_peg(whisker, pose, nodes, length)[0]
+
+    def fit_with_peg(
+        self, whisker: Whisker, pose: BasePose, nodes: int, length: Length | None = None
+    ) -> tuple[RodFit, UncertainPeg | None]:
+        """The same with the peg as the contacts show it."""
         problem, state, linear = self._problem(whisker, pose).trusted()
         state, linear, spread = profiled(problem, state, linear)
         length = length or Length(whisker.length, 0.0)
         found = _answer(problem, state, linear, spread, nodes, length)
-        return _whole(_in_laboratory(found, problem.head), problem.frames, len(self.curves))
+        whole = _whole(_in_laboratory(found, problem.head), problem.frames, len(self.curves))
+        if self.peg is None or not linear.smoother.crossed.any():
+            return whole, None
+        return whole, UncertainPeg(self.peg.at(state.peg), linear.smoother.shared_covariance)
+
+    def touches(self, whisker: Whisker, pose: BasePose) -> tuple[Touches, Array]:
+        """Contacts of a whisker of approximate pose, laboratory frame, and misfits (time,)."""
+        problem = self._problem(whisker, pose)
+        problem, state, linear = problem.trusted()
+        misfit = np.full(len(self.curves), np.nan)
+        misfit[problem.frames] = linear.data.misfit
+        point, wrench = _contacts(problem, state)
+        force = np.einsum("tij,tj->ti", state.rotation, wrench[:, :3])
+        size = np.linalg.norm(force, axis=1)
+        rows = problem.touching & ~linear.data.wild & (size > 0.0)
+        if rows.any():
+            rows &= size > _STRONG * np.median(size[rows])
+        tangent = Bent.of(problem.d, state, problem.touching).tangents(state.contact[:, 0])[0]
+        normal = force - (force * tangent).sum(axis=1, keepdims=True) * tangent
+        turn, length = problem.head.rotation, whisker.length
+        at = np.einsum("tij,tj->ti", state.rotation, point) + state.position * length
+        along = np.sqrt(np.median(linear.smoother.covariances()[rows, 6, 6])) if rows.any() else 0.0
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+        found = Touches(
+            problem.head.put_in(at)[rows],
+            np.einsum("tij,tj->ti", turn, normal)[rows],
+            np.einsum("tij,tj->ti", turn, tangent)[rows],
+            whisker.radius(state.contact[rows, 0] * length),
+            float(np.hypot(along, _UNSURE) * length),
+        )
+        return found, misfit
 
     def misfits(self, whisker: Whisker, pose: BasePose) -> Array:
         """Misfits of a rod (time,), in stated deviations; infinite where there are no traces."""
@@ -323,6 +376,7 @@ class Fitter:
             self.options,
             self.head.rows(frames),
             self.objects,
+            self.peg,
             near,
             begun,
         )
@@ -332,10 +386,11 @@ class Fitter:
 
         And the arc lengths at which it is nearest, m.
         """
-        if not self.objects:
+        things = self.objects if self.peg is None else [self.peg.expected]
+        if not things:
             return np.zeros(len(frames), dtype=bool), np.zeros(len(frames))
         curves = self.head.rows(frames).put_in(self.curves[frames])
-        away = np.min([thing.signed_distance(curves) for thing in self.objects], axis=0)
+        away = np.min([thing.signed_distance(curves) for thing in things], axis=0)
         at = away.argmin(axis=1)
         arcs = np.array([arc_lengths(curve) for curve in curves])
         whole = arcs[:, -1].max()
@@ -379,7 +434,7 @@ def _shared(problem: Problem, fit: Linear) -> Array:
             miss = ends[weight[:, end - 2] > 0.0, end]
             size = np.hypot(miss.mean(), more * miss.std()) if miss.size else 0.0
             pulls.append(design[:, end - 2] * size)
-    return fit.smoother.responses(np.array(pulls))
+    return np.concatenate([fit.smoother.responses(np.array(pulls)), fit.smoother.by_shared()])
 
 
 def _lit(problem: Problem, view: int) -> float:

@@ -36,6 +36,7 @@ from vibrissa.deferred import linalg
 from vibrissa.numerics import Array, Mask
 from vibrissa.objects import Surface
 from vibrissa.rod import Discretization
+from vibrissa.tracking.refine.peg import PEG_UNKNOWNS, UncertainPeg
 from vibrissa.tracking.refine.rods import (
     FAR,
     UNKNOWNS,
@@ -67,6 +68,10 @@ class Smoother:
         self.first = np.zeros_like(hessian)  # frame i with i + 1; all couplings are diagonal
         self.second = np.zeros_like(hessian)
         self.gradient = gradient.copy()
+        # Of unknowns that all frames share, with those of the frames and with each other.
+        self.crossed = np.zeros((*gradient.shape, PEG_UNKNOWNS))
+        self.shared = np.zeros((PEG_UNKNOWNS, PEG_UNKNOWNS))
+        self.pull = np.zeros(PEG_UNKNOWNS)
 
     def add_at(self, values: Array, weight: Array, begin: int, target: Array) -> Array:
         """Pull unknowns, from index ``begin`` on, to a target; return the cost of each frame."""
@@ -75,17 +80,31 @@ class Smoother:
         self.gradient[:, places] += weight * (target - values)
         return np.asarray((weight * (values - target) ** 2).sum(axis=1))
 
-    def add_row(self, i: int, row: Array, value: float) -> float:
-        """Pull a combination of a frame's unknowns to zero; return the cost."""
-        self.diagonal[i] += np.outer(row, row)
-        self.gradient[i] -= row * value
-        return value**2
+    def add_prior(self, information: Array, values: Array) -> float:
+        """Pull the shared unknowns to zero; return the cost."""
+        self.shared += information
+        self.pull -= information @ values
+        return float(values @ information @ values)
 
-    def add_within(self, i: int, row: Array, value: float) -> tuple[float, float]:
-        """Pull so if that is possible; return the cost, which is limited, and the weight."""
-        weight = 1.0 / (1.0 + (value / FAR) ** 2)
-        self.add_row(i, weight * row, weight * value)
-        return weight * value**2, weight
+    def add_rows(
+        self, at: NDArray[np.intp], rows: Array, values: Array, common: Array | None = None
+    ) -> None:
+        """Pull a combination of unknowns of some frames, and of shared ones, to zero."""
+        self.diagonal[at] += rows[:, :, None] * rows[:, None]
+        self.gradient[at] -= rows * values[:, None]
+        if common is not None:
+            self.crossed[at] += rows[:, :, None] * common[:, None]
+            self.shared += common.T @ common
+            self.pull -= values @ common
+
+    def add_within(
+        self, at: NDArray[np.intp], rows: Array, values: Array, common: Array | None = None
+    ) -> tuple[Array, Array]:
+        """Pull so where that is possible; return the costs, which are limited, and weights."""
+        weight = 1.0 / (1.0 + (values / FAR) ** 2)
+        each = weight[:, None]
+        self.add_rows(at, each * rows, weight * values, None if common is None else each * common)
+        return weight * values**2, weight
 
     def add_along(self, axis: Array, value: Array, begin: int, weight: float) -> Array:
         """Pull one direction of three unknowns to zero; return the cost of each frame."""
@@ -107,12 +126,54 @@ class Smoother:
         self.second[(at - 1)[:, None], n, n] += square
         return np.asarray((pull * values).sum(axis=1))
 
-    def solved(self, damping: float | Array = 0.0) -> Array:
-        """Solve for the step (time, unknown), damped by a share (time,) of the diagonal."""
-        return np.asarray(self.responses(self.gradient[None], damping)[0])
+    def solved(self, damping: float | Array = 0.0) -> tuple[Array, Array]:
+        """Solve for the step (time, unknown), damped by a share (time,) of the diagonal.
 
-    def responses(self, pulls: Array, damping: float | Array = 0.0) -> Array:
+        And for that of the shared unknowns.
+        """
+        pulls = np.concatenate([self.gradient[None], np.moveaxis(self.crossed, 2, 0)])
+        if not self.crossed.any():
+            return self.alone(pulls[:1], damping)[0], np.zeros(PEG_UNKNOWNS)
+        step, *by = self.alone(pulls, damping)
+        shared = np.linalg.solve(
+            self._left(np.array(by)), self.pull - np.einsum("tuk,tu->k", self.crossed, step)
+        )
+        return step - np.einsum("ktu,k->tu", by, shared), shared
+
+    def responses(self, pulls: Array) -> Array:
         """Steps (pull, time, unknown) in response to pulls on the unknowns."""
+        steps = self.alone(pulls)
+        if not self.crossed.any():
+            return steps
+        by, spread = self._by_shared
+        drawn = np.einsum("ptu,tuk,kl->pl", steps, self.crossed, spread)
+        return np.asarray(steps + np.einsum("pk,ktu->ptu", drawn, by))
+
+    def by_shared(self) -> Array:
+        """Changes (k, time, unknown) due to errors of the shared unknowns, one sigma each."""
+        if not self.crossed.any():
+            return np.zeros((0, *self.gradient.shape))
+        by, spread = self._by_shared
+        return np.asarray(np.einsum("ktu,kl->ltu", by, np.linalg.cholesky(spread)))
+
+    @property
+    def shared_covariance(self) -> Array:
+        """Covariance (k, k) of the shared unknowns."""
+        return self._by_shared[1]
+
+    @cached_property
+    def _by_shared(self) -> tuple[Array, Array]:
+        """Steps (k, time, unknown) against shared unknowns, and covariance (k, k) of these."""
+        by = self.alone(np.moveaxis(self.crossed, 2, 0))
+        return by, np.asarray(np.linalg.inv(self._left(by)))
+
+    def _left(self, by: Array) -> Array:
+        """Normal equations of the shared unknowns, the others of which are solved for."""
+        left = self.shared - np.einsum("tuk,ltu->kl", self.crossed, by)
+        return np.asarray(0.5 * (left + left.T))
+
+    def alone(self, pulls: Array, damping: float | Array = 0.0) -> Array:
+        """Steps (pull, time, unknown) in response to pulls if shared unknowns are known."""
         count, n, _ = self.diagonal.shape
         band = np.zeros((3 * n, count, n))
         rows, columns = np.indices((n, n))
@@ -129,7 +190,10 @@ class Smoother:
         return np.asarray(step.T).reshape(len(pulls), count, n)
 
     def covariances(self) -> Array:
-        """Blocks (time, unknown, unknown) on the diagonal of the inverse."""
+        """Blocks (time, unknown, unknown) on the diagonal of the inverse.
+
+        Shared unknowns are taken as known: see `by_shared`.
+        """
         count, n, _ = self.diagonal.shape
         pairs = (count + 1) // 2
         size = 2 * n
@@ -351,6 +415,7 @@ class Problem:
     options: FitOptions
     head: HeadPose
     objects: Sequence[Surface]
+    peg: UncertainPeg | None  # instead of them
     near: Mask  # (time,): where one of them is within reach
     begun: State | None = None
     variance: list[Array] | None = None
@@ -371,6 +436,12 @@ class Problem:
             begun=begun.rows(rows),
             variance=self.variance and [each[rows] for each in self.variance],
         )
+
+    def with_known_peg(self, state: State) -> Problem:
+        """The problem with the peg that a state has found."""
+        if self.peg is None:
+            return self
+        return replace(self, objects=[self.peg.at(state.peg)], peg=None)
 
     def trusted(self, even: bool = False) -> tuple[Problem, State, Linear]:
         """The problem with traces weighted by their residuals, and its solution."""
@@ -423,8 +494,9 @@ class Problem:
             state = replace(state, contact=state.contact * factor)
             fit = self.linear(state)
         for _ in range(self.options.rounds):
-            step = fit.smoother.solved(damping)
-            trial, decrease = state.moved(step), (fit.smoother.gradient * step).sum(axis=1)
+            step, shared = fit.smoother.solved(damping)
+            trial = state.moved(step, shared)
+            decrease = (fit.smoother.gradient * step).sum(axis=1)
             if decrease.sum() < self.enough:
                 return trial, fit._replace(costs=fit.costs - decrease)
             tried = self.linear(trial)
@@ -454,8 +526,11 @@ class Problem:
         """Linearise at a state whose rods were compared with the traces."""
         smoother = Smoother(data.hessian, data.gradient)
         costs = data.squares + self._priors(smoother, state) + self._touched(smoother, state)
+        if self.peg is not None and len(costs):
+            costs += smoother.add_prior(self.peg.information, state.peg) / len(costs)
         for i, arc in self.held:
-            smoother.add_row(i, _HOLD * _ALONG, _HOLD * (state.contact[i, 0] - arc))
+            away = _HOLD * (state.contact[[i], 0] - arc)
+            smoother.add_rows(np.array([i]), _HOLD * _ALONG[None], away)
         return Linear(smoother, costs, data)
 
     def _compared(self, state: State) -> Compared:
@@ -514,29 +589,46 @@ class Problem:
         that of the contact is normal to the whisker.
         """
         costs = np.zeros(len(self.frames))
-        if not self.objects:
+        if not self.objects and self.peg is None:
             return costs
         length, surface = self.d.length, self.options.surface
-        points, slopes, _ = contact_slopes(self.d, state)
-        points = self.head.put_in((points + state.position) * length)
-        tangents, turning = Bent.of(self.d, state, self.touching).tangents(state.contact[:, 0])
-        radius = self.whisker.radius(state.contact[:, 0] * length)
-        for i in np.flatnonzero(self.touching & self.near):
-            found = [thing.local_geometry(points[i]) for thing in self.objects]
-            distance, normal, curvature = min(found, key=lambda one: abs(one[0]))
-            turn = self.head.rotation[i]
-            normal, curvature = normal @ turn, turn.T @ curvature @ turn
-            row = normal @ slopes[i] * (length / surface)
-            gap = (distance - radius[i]) / surface
-            costs[i], share = smoother.add_within(int(i), row, gap)
-            if state.contact[i, 0] > _TIP:
-                continue
-            across = curvature @ tangents[i]
-            sigma = np.hypot(_TILTED, surface * np.linalg.norm(across))
-            row = (normal @ turning[i] + length * across @ slopes[i]) / sigma
-            costs[i] += smoother.add_within(
-                int(i), share * row, share * (normal @ tangents[i]) / sigma
-            )[0]
+        at = np.flatnonzero(self.touching & self.near)
+        part, turn = state.rows(at), self.head.rotation[at]
+        points, slopes, _ = contact_slopes(self.d, part)
+        points = self.head.rows(at).put_in((points + part.position) * length)
+        bent = Bent.of(self.d, part, np.ones(len(at), dtype=bool))
+        tangents, turning = bent.tangents(part.contact[:, 0])
+        radius = self.whisker.radius(part.contact[:, 0] * length)
+        nearer = tilted = None
+        if self.peg is None:
+            found = [
+                min((t.local_geometry(p) for t in self.objects), key=lambda one: abs(one[0]))
+                for p in points
+            ]
+            distance, normal, curvature = (
+                np.array([one[k] for one in found]).reshape(len(at), *shape)
+                for k, shape in enumerate(((), (3,), (3, 3)))
+            )
+        else:
+            across = np.einsum("tij,tj->ti", turn, tangents)
+            (distance, normal, curvature), nearer, tilted = self.peg.geometry(
+                state.peg, points, across
+            )
+            nearer /= surface
+        normal = np.einsum("ti,tij->tj", normal, turn)
+        curvature = np.swapaxes(turn, 1, 2) @ curvature @ turn
+        row = np.einsum("ti,tij->tj", normal, slopes) * (length / surface)
+        gap = (distance - radius) / surface
+        costs[at], share = smoother.add_within(at, row, gap, nearer)
+        # Of the tip, only the distance is known.
+        share = np.where(part.contact[:, 0] > _TIP, 0.0, share)
+        across = np.einsum("tij,tj->ti", curvature, tangents)
+        share /= np.hypot(_TILTED, surface * np.linalg.norm(across, axis=1))
+        row = np.einsum("ti,tij->tj", normal, turning)
+        row += length * np.einsum("ti,tij->tj", across, slopes)
+        angle = share * (normal * tangents).sum(axis=1)
+        tilted = None if tilted is None else share[:, None] * tilted
+        costs[at] += smoother.add_within(at, share[:, None] * row, angle, tilted)[0]
         return costs
 
     def _priors(self, smoother: Smoother, state: State) -> Array:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from vibrissa.numerics import Array, Mask, exponential, kernel
 from vibrissa.rod import Discretization, discretize, shapes, solve_forces
+from vibrissa.tracking.refine.peg import PEG_UNKNOWNS
 from vibrissa.tracking.space.pose import BasePose
 from vibrissa.tracking.trace.trace import Trace, arc_lengths, interpolated, nearest
 from vibrissa.whisker import Whisker
@@ -161,24 +162,26 @@ class State:
     rotation: Array
     position: Array
     contact: Array
+    peg: Array = field(default_factory=lambda: np.zeros(PEG_UNKNOWNS))  # see `UncertainPeg`
 
-    def moved(self, step: Array) -> State:
+    def moved(self, step: Array, peg: Array | float = 0.0) -> State:
         """Change by (t, 10): shift, turn about the axes in which it is held, contact."""
         turn = exponential(step[:, 3:6])[0]
         contact = self.contact + step[:, 6:]
         contact[:, 0] = np.clip(contact[:, 0], *LIMITS)
-        return State(turn @ self.rotation, self.position + step[:, :3], contact)
+        position = self.position + step[:, :3]
+        return State(turn @ self.rotation, position, contact, self.peg + peg)
 
     def rows(self, rows: NDArray[np.intp]) -> State:
         """Select frames."""
-        return State(self.rotation[rows], self.position[rows], self.contact[rows])
+        return State(self.rotation[rows], self.position[rows], self.contact[rows], self.peg)
 
     def put(self, rows: NDArray[np.intp], other: State) -> State:
         """The same with some frames of another state."""
-        new = {name: array.copy() for name, array in vars(self).items()}
-        for name, array in vars(other).items():
-            new[name][rows] = array
-        return State(**new)
+        new = self.rotation.copy(), self.position.copy(), self.contact.copy()
+        for own, array in zip(new, (other.rotation, other.position, other.contact), strict=True):
+            own[rows] = array
+        return State(*new, self.peg)
 
     def step_to(self, other: State) -> Array:
         """Step (t, 10) that moves here to another state; see `moved`."""
@@ -190,7 +193,7 @@ class State:
     def scaled(self, ratio: float) -> State:
         """The same in units of another length; the ratio is the old one over the new."""
         contact = self.contact * [ratio, *[ratio**-2] * 3]
-        return State(self.rotation, ratio * self.position, contact)
+        return State(self.rotation, ratio * self.position, contact, self.peg)
 
 
 def turns(rotation: Array) -> Array:

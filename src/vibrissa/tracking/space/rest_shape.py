@@ -118,7 +118,9 @@ class RestShape:
         return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
 
 
-def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> RestShape:
+def rest_shape(
+    curves: Array, least: float = 0.1, tips: Mask | None = None, astray: float = 0.0
+) -> RestShape:
     """Find the rest shape among the shapes of a trial.
 
     Parameters
@@ -129,6 +131,9 @@ def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> R
         Smallest share of the frames that are free of contact.
     tips : array (time,), optional
         Whether the curve ends at the whisker's tip in each frame; by default in all.
+    astray : float
+        Errors of the curves that vary with the pose only, m: how much more than by noise a
+        whisker surely is bent.
 
     Returns
     -------
@@ -170,7 +175,7 @@ def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> R
         usual = _weighted_median(deviation[whole][near], moves[near])
         within = _limit(usual, _noise(away, near))
         near = deviation[whole] < max(within, _EXACT * length)
-    within = _limit(_weighted_median(deviation[whole][near], moves[near]), _noise(away, near))
+    spread, white = _weighted_median(deviation[whole][near], moves[near]), _noise(away, near)
     quiet, ringing = near, None
     # A ringing whisker also looks as if it began elsewhere.
     rings = _deviations(part, mean, slides=0.0)
@@ -196,9 +201,25 @@ def rest_shape(curves: Array, least: float = 0.1, tips: Mask | None = None) -> R
     noise = float(np.median(deviation[whole][quiet]))
     out = np.full(len(curves), np.nan)
     out[seen] = np.where(np.isfinite(deviation), deviation, np.nan)
-    with np.errstate(invalid="ignore"):
-        free = out < max(within, _EXACT * length)
+    within = max(_limit(spread, white), _EXACT * length)
+    free = _free(out, within, float(np.hypot(within, astray)))
     return RestShape(points, free, out, noise, ends, ringing)
+
+
+def _free(deviation: Array, within: float, sure: float) -> Mask:
+    """Frames that are free of contact, by their deviations (time,) and the limits of these.
+
+    Some errors of curves vary with the pose of the whisker, and exceed the usual limit in some
+    poses. Contacts that are not sure are therefore only the beginnings and ends of sure ones,
+    toward which the deviations rise from frame to frame.
+    """
+    known = np.nan_to_num(deviation, nan=0.0)
+    touching = known >= sure
+    for _ in range(2):
+        for i in range(1, len(known)):
+            touching[i] |= touching[i - 1] and within <= known[i] < known[i - 1]
+        known, touching = known[::-1], touching[::-1]
+    return np.asarray(np.isfinite(deviation) & ~touching)
 
 
 def _limit(usual: float, white: float) -> float:

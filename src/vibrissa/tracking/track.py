@@ -202,6 +202,8 @@ def track(
         If views and whiskers do not fit together, or no whisker can be tracked.
     """
     options = options or TrackOptions()
+    if sample and len(sample) != len(cameras):
+        raise ValueError(f"sample has frames of {len(sample)} views; there are {len(cameras)}")
     counts = {len(view) for view in traces}
     if len(traces) != len(cameras) or len(counts) != 1 or 0 in counts:
         raise ValueError(
@@ -251,15 +253,7 @@ def track(
                 one = replace(one, fit=_with_optics_unsure(one.fit, optics))
                 remarks += remarks_on_optics(one, optics, name)
             found.append(one)
-            remarks += remarks_on_fur(one, options.fur, name)
-            remarks += remarks_on(cameras, one.traces, one.length, one.fit.misfit, name)
-            # Known objects locate contacts that are not seen.
-            if not objects and one.peg is None:
-                remarks += remarks_on_unseen_contacts(one, name)
-            remarks += remarks_on_peg(one, name)
-            remarks += remarks_on_rest(one, name)
-            if len(cameras) == 1:
-                remarks += remarks_on_plane(one, name)
+            remarks += _remarks_on_one(cameras, one, options.fur, name, bool(objects))
         except Exception as fault:  # no error of one whisker may discard the others
             if count == 1:
                 raise
@@ -273,6 +267,19 @@ def track(
     if remarks:
         recording.attrs["remarks"] = "\n".join(remarks)
     return recording
+
+
+def _remarks_on_one(
+    cameras: Sequence[Camera], one: Tracked, fur: float, name: str, stated: bool
+) -> list[str]:
+    """Report what is to be known of one whisker; whether it touches stated objects is given."""
+    remarks = remarks_on_fur(one, fur, name)
+    remarks += remarks_on(cameras, one.traces, one.length, one.fit.misfit, name)
+    # Known objects locate contacts that are not seen.
+    if not stated and one.peg is None:
+        remarks += remarks_on_unseen_contacts(one, name)
+    remarks += remarks_on_peg(one, name) + remarks_on_rest(one, name)
+    return remarks + (remarks_on_plane(one, name) if len(cameras) == 1 else [])
 
 
 def _sorted_out(

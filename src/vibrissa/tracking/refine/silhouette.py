@@ -92,7 +92,7 @@ def explains(peg: UncertainPeg | None, misfit: Array, fit: RodFit, whisker: Whis
     gap = peg.expected.signed_distance(fit.contact_point[known])
     gap -= whisker.radius(fit.arc_length[known])
     before, after, free = (
-        np.nanmedian(part) if len(part) else 0.0
+        float(np.median(part[np.isfinite(part)])) if np.isfinite(part).any() else 0.0
         for part in (misfit[known], fit.misfit[known], fit.misfit[~known])
     )
     touches = np.mean(np.abs(gap) < _ON_PEG) >= _SEEN

@@ -2,11 +2,13 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from vibrissa import Whisker
 from vibrissa.cameras import Camera, orthogonal_views
 from vibrissa.objects import Peg
 from vibrissa.recording import Recording
@@ -14,7 +16,7 @@ from vibrissa.tracking import TrackOptions, track
 from vibrissa.tracking.refine.fit import Touches
 from vibrissa.tracking.refine.peg import PEG_UNKNOWNS, UNITS, UncertainPeg
 from vibrissa.tracking.refine.problem import Smoother
-from vibrissa.tracking.refine.silhouette import peg_in_images
+from vibrissa.tracking.refine.silhouette import explains, peg_in_images
 from vibrissa.tracking.space.rest_shape import _free
 
 SIZE, PIXEL, HALF = 260, 100e-6, 20e-3
@@ -119,6 +121,35 @@ def test_what_is_not_a_peg_is_not_taken_for_one():
     assert peg_in_images(cameras[:1], right[:1], touches_of(peg)) is None
     few = Touches(*(part[:3] for part in touches_of(peg)[:4]), 1e-3)
     assert peg_in_images(cameras, right, few) is None
+
+
+def test_a_peg_that_contacts_contradict_is_not_taken():
+    peg = Peg([1e-3, 2e-3, 0.5e-3], [0.1, 0.2, 1.0], 1.1e-3)
+    seen = UncertainPeg(peg, 1e-4 * np.eye(PEG_UNKNOWNS))
+    whisker = Whisker.straight(20e-3)
+    arcs, ones = np.linspace(8e-3, 12e-3, 12), np.ones(14)
+    normals = touches_of(peg).normals
+    on = peg.origin + (peg.radius + whisker.radius(arcs))[:, None] * normals
+
+    def explained(points, misfit=1.0, found=seen):
+        free = np.full((2, 3), np.nan)
+        fit = SimpleNamespace(
+            contact_point=np.concatenate([points, free]),
+            arc_length=np.append(arcs, [np.nan, np.nan]),
+            misfit=np.append(np.full(12, misfit), [1.0, 1.0]),
+        )
+        return explains(seen, found, ones, fit, whisker)
+
+    assert explained(on)
+    assert explained(on, 1.1)
+    assert not explained(on, 1.5)
+    assert not explained(on + 0.3e-3 * normals)
+    assert not explained(on, found=None)
+    # It is 0.2 mm from where it is seen, 20 standard deviations.
+    other = replace(seen, expected=seen.at(np.array([0.2, 0.0, 0.0, 0.0, 0.0])))
+    np.testing.assert_allclose(seen.differs(other.expected), 400.0, rtol=1e-6)
+    moved = on + (other.expected.origin - peg.origin)
+    assert not explained(moved, found=other)
 
 
 def test_derivatives_by_the_peg():

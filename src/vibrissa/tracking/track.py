@@ -563,7 +563,7 @@ def _on_peg(
     if peg is None:
         return None
     found = _bent(replace(fitter, peg=peg), begun, options)
-    return found if explains(found.peg, misfit, found.fit, found.whisker) else None
+    return found if explains(peg, found.peg, misfit, found.fit, found.whisker) else None
 
 
 def _bent(fitter: Fitter, begun: _Begun, options: TrackOptions) -> _Bent:

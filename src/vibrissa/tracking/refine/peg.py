@@ -49,6 +49,13 @@ class UncertainPeg:
         """Standard deviation of the radius, m."""
         return float(UNITS[4] * np.sqrt(self.covariance[4, 4]))
 
+    def differs(self, other: Peg) -> float:
+        """χ² of the difference of another peg, whose origin is at the same height."""
+        shift, lean = other.origin - self.expected.origin, other.axis - self.expected.axis
+        thicker = [other.radius - self.expected.radius]
+        change = np.concatenate([self._frame @ shift, self._frame @ lean, thicker]) / UNITS
+        return float(change @ self.information @ change)
+
     def at(self, unknowns: Array) -> Peg:
         """Peg with these unknowns (5,)."""
         change, expected = UNITS * unknowns, self.expected

@@ -62,7 +62,7 @@ _ARC = 21  # number of points of the contour of an end
 _POINTS = 65  # number of points of a line of the outline
 _WINDOWS = (4.0, 3.0, 2.0, 2.0, 1.5, 1.5)  # largest distances of edges, pixels, step by step
 _OFF = 0.7  # distance of an edge from the outline that makes it doubtful, pixels
-_EDGE = 0.15  # standard deviation of where an edge is along all of an outline, pixels
+_EDGE = 0.1  # standard deviation of where an edge is along all of an outline, pixels
 _FEWEST, _MOST_CONTACTS = 5, 25  # smallest number of contacts, and of those that are compared
 _PRIOR = 3.0  # standard deviation of all unknowns before, in their units
 _THINNEST = 0.1e-3  # smallest radius, m
@@ -73,20 +73,25 @@ _ALONG_SIGHT = 1e-9  # smallest distance of an axis from a line of sight along i
 _STEP, _HEIGHT = 1e-3, 1e-2  # step of differences; unit of the heights of ends, m
 _LONG = 15.0  # extent, pixels, by which a line determines one number more
 _FINE, _UPHILL = 0.25, 8  # distance of points across an outline, pixels; and of a top, in these
-_RIGHT = 1.0  # root mean square distance of edges above which it is not a cylinder, pixels
+_RIGHT = 0.5  # root mean square distance of edges above which it is not a cylinder, pixels
 
 
+# χ² of the difference of a peg with its contacts from that in the images, above which they are not
+# on it; errors that contacts share make it up to 100.
+_ELSEWHERE = 250.0
 # Distance of contacts from the peg that they touch, m; and misfit of traces with it, over that
 # without it, from which they touch something else.
 _ON_PEG, _WORSE = 1e-4, 1.3
 
 
-def explains(peg: UncertainPeg | None, misfit: Array, fit: RodFit, whisker: Whisker) -> bool:
-    """Whether contacts are on a peg, and traces are explained nearly as well as without it.
+def explains(
+    seen: UncertainPeg, peg: UncertainPeg | None, misfit: Array, fit: RodFit, whisker: Whisker
+) -> bool:
+    """Whether contacts are on a peg, where it is seen, and traces are explained as without it.
 
-    Their misfits (time,) without it are given.
+    Misfits (time,) of the traces without it are given.
     """
-    if peg is None:
+    if peg is None or seen.differs(peg.expected) > _ELSEWHERE:
         return False
     known = np.isfinite(fit.contact_point).all(axis=1)
     gap = peg.expected.signed_distance(fit.contact_point[known])

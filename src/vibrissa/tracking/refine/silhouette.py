@@ -64,7 +64,8 @@ _WINDOWS = (4.0, 3.0, 2.0, 2.0, 1.5, 1.5)  # largest distances of edges, pixels,
 _OFF = 0.7  # distance of an edge from the outline that makes it doubtful, pixels
 _EDGE = 0.1  # standard deviation of where an edge is along all of an outline, pixels
 _FEWEST, _MOST_CONTACTS = 5, 25  # smallest number of contacts, and of those that are compared
-_PRIOR = 3.0  # standard deviation of all unknowns before, in their units
+# Standard deviation of all unknowns before, in their units; and if one view alone shows the peg.
+_PRIOR, _NEARBY = 3.0, 0.5
 _THINNEST = 0.1e-3  # smallest radius, m
 _SMALLEST = 8  # smallest side of a part of an image, pixels
 _INSIDE = 0.2  # share of an outline that must be in the image
@@ -279,7 +280,7 @@ def peg_in_images(
         if found is not None:
             return found
     others = [view for i, view in enumerate(seen) if i != least]
-    broad = _measured(others, peg)
+    broad = _measured(others, peg, prior=_NEARBY)
     if broad is None:
         return None
     for tried, ends in _with_ends(seen[least], others[0], broad.peg, touches):
@@ -379,7 +380,11 @@ class _Measured(NamedTuple):
 
 
 def _measured(
-    views: Sequence[_View], start: Peg, ends: Array | None = None, along: _View | None = None
+    views: Sequence[_View],
+    start: Peg,
+    ends: Array | None = None,
+    along: _View | None = None,
+    prior: float = _PRIOR,
 ) -> _Measured | None:
     """Fit a cylinder to the edges at its outline, and to its ends in a view along it."""
     peg, ends = start, np.zeros(0) if ends is None else ends
@@ -390,7 +395,7 @@ def _measured(
             for part in _edges(view, peg, ends, window, with_ends=view is along)
         ]
         count = PEG_UNKNOWNS + len(ends)
-        information, pull = np.eye(count) / _PRIOR**2, np.zeros(count)
+        information, pull = np.eye(count) / prior**2, np.zeros(count)
         for part in parts:
             information += part.by.T @ (part.weight[:, None] * part.by)
             pull += part.by.T @ (part.weight * part.miss)

@@ -121,6 +121,7 @@ def test_what_is_not_a_peg_is_not_taken_for_one():
     assert peg_in_images(cameras[:1], right[:1], touches_of(peg)) is None
     few = Touches(*(part[:3] for part in touches_of(peg)[:4]), 1e-3)
     assert peg_in_images(cameras, right, few) is None
+    assert peg_in_images(cameras, right, touches_of(peg)._replace(sigma=np.nan)) is None
 
 
 def test_a_peg_that_contacts_contradict_is_not_taken():

@@ -260,7 +260,7 @@ def peg_in_images(
 
     None if no cylinder has an outline in both.
     """
-    if len(touches.points) < _FEWEST:
+    if len(touches.points) < _FEWEST or not all(np.isfinite(part).all() for part in touches):
         return None
     away = np.linalg.norm(touches.points - np.median(touches.points, axis=0), axis=1)
     middle = int(away.argmin())

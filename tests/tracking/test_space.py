@@ -191,7 +191,7 @@ def test_errors_that_follow_the_motion_are_no_offset():
 @pytest.mark.parametrize(("faint", "left"), [(range(0, 20, 4), 20), (range(20), 0)])
 def test_ends_that_are_not_one_point_are_not_the_tip(faint, left):
     """The second view shows the whisker only as far as its thin part, in some or all frames."""
-    from vibrissa.tracking.track import _with_one_tip
+    from vibrissa.tracking.space.curve import with_one_tip
 
     pair = PAIRS["orthogonal"]
     rows = list(moving(pair, count=20)[:2])
@@ -199,7 +199,7 @@ def test_ends_that_are_not_one_point_are_not_the_tip(faint, left):
         n = len(rows[1][i].line) - (30 if i != 7 else 0)
         first = rows[1][i]
         rows[1][i] = first._replace(line=first.line[:n], sigma=first.sigma[:n], seen=first.seen[:n])
-    found = _with_one_tip(pair, rows)
+    found = with_one_tip(pair, rows)
     assert [sum(t.tip_seen for t in view) for view in found] == [left, left]
 
 

@@ -146,7 +146,7 @@ def test_friction_is_found_in_the_shape(share):
     """A rod bent by a known force with friction, seen without noise: the force comes out."""
     whisker = Whisker.parabola(length=30e-3, coefficient=10.0)
     fitter, pose, bent, s = pressed(whisker, share)
-    found = fitter.fit(whisker, pose, 65, Length(whisker.length, 0.5e-3))
+    found, _ = fitter.fit(whisker, pose, 65, Length(whisker.length, 0.5e-3))
     np.testing.assert_allclose(found.arc_length, s, atol=100e-6)
     if share == 0.0:
         # A whisker that is longer by that is thicker: it pushes back more at the same points.
@@ -171,7 +171,7 @@ def test_contacts_do_not_follow_a_roll_that_free_frames_do_not_show():
     whisker = Whisker.parabola(length=30e-3, coefficient=10.0)
     fitter, pose, bent, _ = pressed(whisker)
     for roll in np.radians([-4.0, 4.0]):
-        found = fitter.fit(whisker, replace(pose, roll=pose.roll + roll), 65)
+        found, _ = fitter.fit(whisker, replace(pose, roll=pose.roll + roll), 65)
         away = np.linalg.norm(found.contact_point - bent.contact_point, axis=1)
         assert away.max() < 25e-6
 
@@ -285,7 +285,7 @@ def test_a_slip_makes_the_frame_before_it_uncertain():
         fitter.traces.line[5:, view] = camera.project(free)
     fitter.curves[5:] = free
     fitter.touching[5:] = False
-    found = fitter.fit(whisker, pose, 65)
+    found, _ = fitter.fit(whisker, pose, 65)
     spread = np.sqrt(found.contact_covariance[:, 1, 1])
     away = np.linalg.norm(found.contact_point[4] - free, axis=1).min()
     assert spread[4] > 0.03 * away

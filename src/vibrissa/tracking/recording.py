@@ -419,9 +419,9 @@ def remarks_on_peg(one: Tracked, name: str) -> list[str]:
     vectors = 1e3 * peg.origin, peg.axis
     position, axis = (", ".join(f"{x:z.3f}" for x in vector) for vector in vectors)
     return [
-        f"{name} touches a peg that all views show, and its contacts are fitted on it: diameter "
+        f"{name} touches a peg that both views show, and its contacts are fitted on it: diameter "
         f"{2e3 * peg.radius:.3f} ± {2e3 * one.peg.radius_sigma:.3f} mm, position [{position}] mm, "
-        f"axis [{axis}]. If they touch something else, state it (--objects), or --no-find-peg."
+        f"axis [{axis}]. If it touches something else, state that (--objects), or --no-find-peg."
     ]
 
 

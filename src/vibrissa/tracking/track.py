@@ -44,12 +44,18 @@ from vibrissa.tracking.recording import (
 )
 from vibrissa.tracking.refine.continuation import continued
 from vibrissa.tracking.refine.fit import Fitter, RodFit
-from vibrissa.tracking.refine.optics import Optics, rough_optics, stated_lenses
+from vibrissa.tracking.refine.optics import (
+    Optics,
+    rough_optics,
+    stated_lenses,
+    with_optics_unsure,
+    with_shift_unsure,
+)
 from vibrissa.tracking.refine.peg import UncertainPeg
 from vibrissa.tracking.refine.problem import FitOptions
 from vibrissa.tracking.refine.rods import TraceSeries, rolled
 from vibrissa.tracking.refine.silhouette import explains, peg_in_images
-from vibrissa.tracking.space.curve import begun_together, merged
+from vibrissa.tracking.space.curve import begun_together, merged, with_one_tip
 from vibrissa.tracking.space.exchange import Known, exchanged
 from vibrissa.tracking.space.frame_pairs import paired_frames
 from vibrissa.tracking.space.pose import CUTOFF, BasePose, HeadPose, base_pose, rolled_over
@@ -67,8 +73,6 @@ from vibrissa.tracking.space.rest_shape import (
     unseen_part,
     whisker_at_rest,
 )
-from vibrissa.tracking.trace.start import base_gap
-from vibrissa.tracking.trace.steady import slow_motion
 from vibrissa.tracking.trace.trace import Trace
 from vibrissa.whisker import Pose, Whisker, morphology
 
@@ -89,7 +93,6 @@ _EXPLAINED = 0.1
 _ASTRAY = 0.1
 _FAR = 10.0  # distance between the bases of several views above which they differ, pixels
 _SHARE = 0.03  # the same as a share of the whisker's length
-_APART = 8.0  # distance of the ends of several views from one point from which they are not the tip
 
 
 @dataclass(frozen=True)
@@ -248,9 +251,9 @@ def track(
                 one = replace(one, contacts=other)
             elif objects:
                 one = replace(one, contacts=contacts_at(objects, one.curves, one.touching, one.fit))
-            one = replace(one, fit=_with_shift_unsure(cameras, one.fit, one.traces.shift))
+            one = replace(one, fit=with_shift_unsure(cameras, one.fit, one.traces.shift))
             if optics is not None:
-                one = replace(one, fit=_with_optics_unsure(one.fit, optics))
+                one = replace(one, fit=with_optics_unsure(one.fit, optics))
                 remarks += remarks_on_optics(one, optics, name)
             found.append(one)
             remarks += _remarks_on_one(cameras, one, options.fur, name, bool(objects))
@@ -409,51 +412,6 @@ def _corrected(
     )
 
 
-def _with_optics_unsure(fit: RodFit, optics: Optics) -> RodFit:
-    """Add the uncertainty of the cameras to the covariances of points."""
-    moved = [optics.displacements(points) for points in (fit.contact_point, fit.position)]
-    contact, base = (np.einsum("vti,vtj->tij", points, points) for points in moved)
-    return _widened(fit, contact, base, np.moveaxis(np.concatenate(moved, axis=2), 0, 1))
-
-
-def _widened(fit: RodFit, contact: Array, base: Array, shared: Array) -> RodFit:
-    """Add covariances (t, 3, 3) of contact and base, and errors (t, e, 6) that frames share."""
-    pose = fit.pose_covariance.copy()
-    pose[:, :3, :3] += base
-    shared = np.pad(shared, ((0, 0), (0, 0), (0, 9)))
-    return replace(
-        fit,
-        contact_covariance=fit.contact_covariance + contact,
-        shared=np.append(fit.shared, shared, axis=1),
-        pose_covariance=pose,
-    )
-
-
-def _with_shift_unsure(cameras: Sequence[Camera], fit: RodFit, shift: Array) -> RodFit:
-    """Add the uncertainty of the cameras' shaking to the covariances of points."""
-    seen = np.ptp(shift[..., :2], axis=0).any(axis=1)
-    # A camera for which nothing shows it may shake as much as one that shakes.
-    size = float(shift[:, seen, :2].std(axis=0).max(initial=0.0))
-    sigma = np.nan_to_num(shift[..., 2:], nan=size).reshape(len(shift), -1)
-    if not sigma.any():
-        return fit
-    common = slow_motion(shift[..., :2]).ravel()
-
-    def moved(points: Array) -> Array:
-        known = np.isfinite(points)
-        slopes = [camera.project_with_slopes(np.where(known, points, 0.0))[1] for camera in cameras]
-        back = np.asarray(np.linalg.pinv(np.concatenate(slopes, axis=1)))
-        back[~np.all(known, axis=1)] = np.nan
-        return back
-
-    contact, base = (moved(points) for points in (fit.contact_point, fit.position))
-    spread = [
-        np.einsum("tij,tj,tkj->tik", one, sigma**2 + common**2, one) for one in (contact, base)
-    ]
-    shared = np.swapaxes(np.concatenate([contact, base], axis=1) * common, 1, 2)
-    return _widened(fit, spread[0], spread[1], shared[:, common > 0.0])
-
-
 def _best_seen(traces: Sequence[Sequence[Sequence[Trace]]]) -> list[Sequence[Trace]]:
     """Traces, by view, of the whisker that is lost least often."""
     seen = [[sum(len(trace.line) > 0 for trace in row) for row in view] for view in traces]
@@ -475,7 +433,7 @@ def track_whisker(
     """Track one whisker in space, from traces of frames that belong together, view by view."""
     report = progress or (lambda stage, done, total: None)
     count = len(traces[0])
-    traces = _with_one_tip(cameras, traces)
+    traces = with_one_tip(cameras, traces)
     series = TraceSeries.of(traces)
     _check_views(cameras, series, name)
     curves = []
@@ -586,7 +544,7 @@ def _bent(fitter: Fitter, begun: _Begun, options: TrackOptions) -> _Bent:
     unfiltered, pose = _poses(fitter, shape, whisker, options)
     if length.seen and not tapers:
         whisker, length = tapered_as_it_bends(fitter, whisker, length, pose)
-    fit, peg = fitter.fit_with_peg(whisker, pose, fitter.curves.shape[1], length)
+    fit, peg = fitter.fit(whisker, pose, fitter.curves.shape[1], length)
     return _Bent(whisker, shape, length, pose, unfiltered, fit, peg)
 
 
@@ -710,26 +668,6 @@ def _length(fitter: Fitter, shape: RestShape, options: TrackOptions) -> Length:
 
 def _alike(_: float) -> float:
     return 0.0
-
-
-def _with_one_tip(
-    cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]]
-) -> Sequence[Sequence[Trace]]:
-    """Traces of which none ends at the tip if most end apart in the views.
-
-    So it is where compression erases thin parts: the other ends agree by chance.
-    """
-    frames = [i for i, one in enumerate(zip(*traces, strict=True)) if _all_end(one)]
-    if len(cameras) == 1 or len(frames) < _FEWEST:
-        return traces
-    apart = base_gap(cameras, np.array([[view[i].line[-1] for i in frames] for view in traces]))
-    if 2 * np.count_nonzero(apart > _APART) <= len(frames):
-        return traces
-    return [[t._replace(tip_seen=False) for t in view] for view in traces]
-
-
-def _all_end(views: Sequence[Trace]) -> bool:
-    return all(len(trace.line) > 0 and trace.tip_seen for trace in views)
 
 
 def _check_views(cameras: Sequence[Camera], series: TraceSeries, name: str) -> None:

@@ -265,14 +265,8 @@ class Fitter:
 
     def fit(
         self, whisker: Whisker, pose: BasePose, nodes: int, length: Length | None = None
-    ) -> RodFit:
-        """Fit a whisker of approximate pose, whose length may be uncertain."""
-        return self.fit_with_peg(whisker, pose, nodes, length)[0]
-
-    def fit_with_peg(
-        self, whisker: Whisker, pose: BasePose, nodes: int, length: Length | None = None
     ) -> tuple[RodFit, UncertainPeg | None]:
-        """The same with the peg as the contacts show it."""
+        """Fit a whisker of approximate pose, whose length may be uncertain, and the peg."""
         problem, state, linear = self._problem(whisker, pose).trusted()
         state, linear, spread = profiled(problem, state, linear)
         length = length or Length(whisker.length, 0.0)

@@ -23,9 +23,11 @@ from numpy.typing import NDArray
 from vibrissa.cameras import Camera, triangulate
 from vibrissa.deferred import transform
 from vibrissa.numerics import Array
+from vibrissa.tracking.refine.fit import RodFit
 from vibrissa.tracking.refine.rods import TraceSeries
 from vibrissa.tracking.space.curve import merged
 from vibrissa.tracking.space.rest_shape import RestShape, aligned_lengths, motions, rest_shape
+from vibrissa.tracking.trace.steady import slow_motion
 from vibrissa.tracking.trace.trace import Trace, arc_lengths, interpolated
 
 # Standard deviation of the inverse of a distance that is not stated, 1/m: lenses at 0.5 m.
@@ -465,3 +467,48 @@ class _Problem:
             else:
                 damping *= 10.0
         return best
+
+
+def with_optics_unsure(fit: RodFit, optics: Optics) -> RodFit:
+    """Add the uncertainty of the cameras to the covariances of points."""
+    moved = [optics.displacements(points) for points in (fit.contact_point, fit.position)]
+    contact, base = (np.einsum("vti,vtj->tij", points, points) for points in moved)
+    return _widened(fit, contact, base, np.moveaxis(np.concatenate(moved, axis=2), 0, 1))
+
+
+def _widened(fit: RodFit, contact: Array, base: Array, shared: Array) -> RodFit:
+    """Add covariances (t, 3, 3) of contact and base, and errors (t, e, 6) that frames share."""
+    pose = fit.pose_covariance.copy()
+    pose[:, :3, :3] += base
+    shared = np.pad(shared, ((0, 0), (0, 0), (0, 9)))
+    return replace(
+        fit,
+        contact_covariance=fit.contact_covariance + contact,
+        shared=np.append(fit.shared, shared, axis=1),
+        pose_covariance=pose,
+    )
+
+
+def with_shift_unsure(cameras: Sequence[Camera], fit: RodFit, shift: Array) -> RodFit:
+    """Add the uncertainty of the cameras' shaking to the covariances of points."""
+    seen = np.ptp(shift[..., :2], axis=0).any(axis=1)
+    # A camera for which nothing shows it may shake as much as one that shakes.
+    size = float(shift[:, seen, :2].std(axis=0).max(initial=0.0))
+    sigma = np.nan_to_num(shift[..., 2:], nan=size).reshape(len(shift), -1)
+    if not sigma.any():
+        return fit
+    common = slow_motion(shift[..., :2]).ravel()
+
+    def moved(points: Array) -> Array:
+        known = np.isfinite(points)
+        slopes = [camera.project_with_slopes(np.where(known, points, 0.0))[1] for camera in cameras]
+        back = np.asarray(np.linalg.pinv(np.concatenate(slopes, axis=1)))
+        back[~np.all(known, axis=1)] = np.nan
+        return back
+
+    contact, base = (moved(points) for points in (fit.contact_point, fit.position))
+    spread = [
+        np.einsum("tij,tj,tkj->tik", one, sigma**2 + common**2, one) for one in (contact, base)
+    ]
+    shared = np.swapaxes(np.concatenate([contact, base], axis=1) * common, 1, 2)
+    return _widened(fit, spread[0], spread[1], shared[:, common > 0.0])

@@ -1,4 +1,4 @@
-"""The peg that a whisker touches, found by its silhouette in images without whiskers.
+"""The peg that a whisker touches, found by its outline in images without whiskers.
 
 The rod that was fitted to the traces shows where a whisker touches, but hardly how far along it:
 by up to a millimetre. Across it the contact is known well, and the force is normal to the surface.

@@ -24,6 +24,7 @@ class RowFilm:
     frames: int = 200
     size: tuple[int, int] = (640, 480)
     conditions: ImageConditions = FUR
+    apart: tuple[float, float] = (1.5e-3, 1.3e-3)
     cameras: tuple = field(init=False)
     images: list = field(init=False)
     truth: list = field(init=False)
@@ -53,7 +54,7 @@ class RowFilm:
         length = random.uniform(19e-3, 26e-3)
         bend = random.uniform(3.0, 11.0) * random.choice([-1.0, 1.0])
         whisker = Whisker.parabola(length=length, coefficient=bend, name=f"w{k}")
-        at = place * np.array([1.5e-3, 1.3e-3])
+        at = place * np.array(self.apart)
         back = FACE[0] * (1.0 - np.sqrt(1.0 - (at**2 / np.square(FACE[1:])).sum()))
         base = np.tile([-back, *at], (self.frames, 1))
         return whisker, Motion(t, azimuth, elevation, 0.2 * azimuth, base)

@@ -400,6 +400,20 @@ class _Job:
                 )
                 for view, path in enumerate(videos)
             ]
+            traces, anew = vb.tracking.retraced(
+                self.cameras,
+                [partial(vb.io.read_video, path) for path in videos],
+                bases,
+                traces,
+                options,
+                offset=self.how.offset,
+                corrections=self.corrections,
+                samples=frames,
+                masks=self.masks,
+                progress=lambda view, done: tell(
+                    f"trace {videos[view].name} anew", done, len(traces[view][0])
+                ),
+            )
             lost = _where_lost(traces)
             if lost is not None:
                 self._show_doubt(videos, traces, [lost] * len(videos), _LOST, doubt)
@@ -412,6 +426,9 @@ class _Job:
                 progress=tell,
                 **self.known,
             )
+        if anew:
+            remarks = [*anew, result.attrs.get("remarks", "")]
+            result.attrs["remarks"] = "\n".join(remarks).strip()
         unexplained = None if lost is not None else _where_unexplained(result)
         if unexplained is not None:
             self._show_doubt(videos, traces, unexplained, _UNEXPLAINED, doubt)

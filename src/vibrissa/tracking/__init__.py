@@ -20,6 +20,7 @@ from vibrissa.tracking.space.rest_shape import (
     rest_shape,
     whisker_at_rest as whisker_at_rest,
 )
+from vibrissa.tracking.space.retrace import retraced
 from vibrissa.tracking.trace.curves import Found as Found, find_whiskers as find_whiskers
 from vibrissa.tracking.trace.start import (
     FRAMES,
@@ -58,6 +59,7 @@ __all__ = [
     "find_start",
     "merge",
     "rest_shape",
+    "retraced",
     "trace_video",
     "track",
 ]

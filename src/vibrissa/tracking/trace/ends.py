@@ -60,15 +60,19 @@ def traced(
     options: TraceOptions,
     before: float = OUTSIDE,
     clutter: Clutter = NOTHING,
+    begins: bool = False,
 ) -> tuple[Trace, bool]:
-    """Trace a whisker near a line, and find its ends; whether it begins at the face."""
+    """Trace a whisker near a line, and find its ends; whether it begins at the face.
+
+    With ``begins`` the whisker begins where the line does.
+    """
     line = prolonged(even(line), _BENDING, _BEYOND)
     for gate in (3, 2):
         line = even(fitted(frame, line, gate, noise, options, clutter)[0])
         if len(line) < FEWEST:
             # Where nothing is seen, nothing determines the line.
             return Trace.lost(), False
-    line, from_face = _with_base(frame, line, before, clutter)
+    line, from_face = (line, True) if begins else _with_base(frame, line, before, clutter)
     if before > OUTSIDE and len(line) >= FEWEST:
         # Extrapolated parts are measured before they count.
         fur = _FUR if from_face else 0

@@ -174,7 +174,7 @@ def clashes(lines: Sequence[Array]) -> Mask:
     return clash
 
 
-class _Step(NamedTuple):
+class Step(NamedTuple):
     """The cheapest assignments of a frame."""
 
     ways: Ways  # (way, whisker), −1 if lost
@@ -203,14 +203,14 @@ def decided(frames: Sequence[Seen], bases: Array) -> list[list[int]]:
             _step(seen, problem, known, fixed)
             for seen, problem, fixed in zip(frames, problems, settled, strict=True)
         ]
-        before, chosen = chosen, _cheapest(frames, settled, steps, motions)
+        before, chosen = chosen, cheapest_sequence(frames, settled, steps, motions)
         certain = list(zip(frames, chosen, strict=True))
         if chosen == before:
             break
     return chosen
 
 
-def _step(seen: Seen, problem: Assignment, known: Sequence[Appearance], settled: set[int]) -> _Step:
+def _step(seen: Seen, problem: Assignment, known: Sequence[Appearance], settled: set[int]) -> Step:
     """The cheapest assignments of one frame."""
     features = np.array(seen.features).reshape(-1, FEATURES)
     price = np.array([each.unlikeness(features) for each in known])
@@ -223,13 +223,13 @@ def _step(seen: Seen, problem: Assignment, known: Sequence[Appearance], settled:
             price[k, c] = 0.0
     cost, ways = problem.ways(price, lost, settled=frozenset(settled))
     near = cost <= cost[0] + _DEARER
-    return _Step(ways[near], cost[near])
+    return Step(ways[near], cost[near])
 
 
-def _cheapest(
+def cheapest_sequence(
     frames: Sequence[Seen],
     settled: Sequence[set[int]],
-    steps: Sequence[_Step],
+    steps: Sequence[Step],
     motions: Sequence[Array],
 ) -> list[list[int]]:
     """The cheapest sequence of assignments, without whiskers in doubt."""

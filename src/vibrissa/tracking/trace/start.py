@@ -64,7 +64,7 @@ def seen_along(
     """Find a moving line along a curve that another camera sees; None if that is out of view."""
     s = arc_lengths(curve.line)
     wanted = np.linspace(0.0, s[-1], max(int(s[-1] / _SPACING), 2) + 1)
-    start, along = _epipolar_lines(interpolated(wanted, s, curve.line), known, camera)
+    start, along = epipolar_lines(interpolated(wanted, s, curve.line), known, camera)
     far = int(np.hypot(*camera.size))
     points = start[:, None] + np.arange(-far, far + 1)[:, None] * along[:, None]
     within = (points > 0.0) & (points < np.array(camera.size) - 1.0)
@@ -97,7 +97,7 @@ def seen_along(
     return Curve(line, length, from_face=False, score=length * clear, moved=1.0)
 
 
-def _epipolar_lines(pixels: Array, known: Camera, camera: Camera) -> tuple[Array, Array]:
+def epipolar_lines(pixels: Array, known: Camera, camera: Camera) -> tuple[Array, Array]:
     """Points (n, 2) in a view for points of another one, and directions of epipolar lines."""
     middle = np.broadcast_to(0.5 * (np.array(camera.size) - 1.0), pixels.shape)
     point, _ = triangulate([known, camera], np.stack([pixels, middle]))

@@ -12,7 +12,7 @@ from __future__ import annotations
 import zlib
 from collections import deque
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import chain, islice
 from os import PathLike
 from pathlib import Path
@@ -124,8 +124,75 @@ _AGREES = 0.9  # share of a line along another one above which both are the same
 # Factor of the jump of a single whisker before grey fur, where its base is less certain.
 _FAINT = 2.4
 _LOOKED = 9  # number of frames after the first in which neighbours are searched
-_STEADY = (0.0, 0.0, 0.0, 0.0)  # shift of a steady camera
 _SPAN = 400  # number of frames at the beginning of a film from which those for its start are taken
+
+
+Shift = tuple[float, float, float, float]
+"""Shift of an image by a camera that shakes, as in `Trace`."""
+
+_STEADY: Shift = (0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What is around whiskers in a video, and frames without it.
+
+    Parameters
+    ----------
+    bright : bool
+        Whether whiskers are bright on dark.
+    scene : Scene
+        Parts of the image that never move.
+    steady : Steady, optional
+        Shaking of the camera, if that is known.
+    sample : list of array (height, width)
+        Frames spread over the video, with dark whiskers, as by a camera that does not shake.
+    """
+
+    bright: bool
+    scene: Scene
+    steady: Steady | None
+    sample: list[Frame]
+
+    @classmethod
+    def of(
+        cls,
+        frames: Sequence[Frame],
+        starts: Array,
+        options: TraceOptions,
+        mask: Mask | None,
+        bright: bool,
+    ) -> Surroundings:
+        """Surroundings of whiskers that begin somewhere, (n, 2), by frames spread over a video."""
+        sample = [negative(f) if bright else f for f in frames]
+        scene = Scene.of(sample, options.scale, mask).with_still(starts, sample)
+        steady = Steady.of(scene, sample)
+        if steady is not None and steady.at.size:
+            sample = [steady.moved_back(f)[0] for f in sample]
+            scene = Scene.of(sample, options.scale, mask).with_still(starts, sample)
+        return cls(bright, scene, steady, sample)
+
+    def clear(self, frame: Frame) -> tuple[Frame, Shift]:
+        """Dark whiskers of a frame without what never moves, and by how much it was shifted."""
+        frame = negative(frame) if self.bright else frame
+        shift = _STEADY
+        if self.steady is not None:
+            frame, shift = self.steady.moved_back(frame)
+        return self.scene.without_still(frame), shift
+
+    def finish(
+        self,
+        traces: list[list[Trace]],
+        corrections: Container[tuple[int, int]],
+        shifts: Sequence[Shift],
+    ) -> None:
+        """Cut traces along static edges, if no person gave them; add the camera's shifts."""
+        for k, row in enumerate(traces):
+            row[:] = [
+                t if (i, k) in corrections else self.scene.before_edge(t) for i, t in enumerate(row)
+            ]
+            if self.steady is not None:
+                row[:] = [t._replace(shift=s) for t, s in zip(row, shifts, strict=True)]
 
 
 @without_blas_threads
@@ -187,7 +254,7 @@ def trace_video(
     begun = begun if begun and len(begun[0]) > begins else ()
     done = len(begun[0]) if begun else 0
     recent: deque[Frame] = deque(maxlen=max(_BACK, begins))
-    seen, shifts = list[Seen](), list[tuple[float, float, float, float]]()
+    seen, shifts = list[Seen](), list[Shift]()
     source = iter(frames)
     first = list(islice(source, FRAMES))
     if not first:
@@ -199,8 +266,9 @@ def trace_video(
     start = negative(first[0]) if bright else first[0]
     followers = _begun(start, bases, begun, options)
     starts = np.array([f.base for f in followers] if bases is None else bases, dtype=np.float64)
-    alike = [negative(f) if bright else f for f in sample if f.shape == shape]
-    scene, steady, alike = _surroundings(alike, starts, options, mask)
+    alike = [f for f in sample if f.shape == shape]
+    around = Surroundings.of(alike, starts, options, mask, bright)
+    scene = around.scene
     (still,) = between_whiskers([None], scene.bits, start.shape)
     for follower in followers:
         follower.clutter = still.still_only
@@ -214,15 +282,14 @@ def trace_video(
     if not done and (len(followers) > 1 or not corrections):
         # Neighbours are followed too, so that their lines are not taken, but not returned. A person
         # may correct which of the lines is the only whisker.
-        clear = [scene.without_still(f) for f in (start, *alike[:: max(len(alike) // _LOOKED, 1)])]
+        some = around.sample[:: max(len(alike) // _LOOKED, 1)]
+        clear = [scene.without_still(f) for f in (start, *some)]
         for base in neighbours(clear, starts, scene, options):
             followers.append(replace(start_at(base, options), clutter=still.still_only))
             starts = np.concatenate([starts, base[None]])
     for i, frame in enumerate(_of_one_size(chain(first, source))):
-        frame = negative(frame) if bright else frame
-        frame, shift = steady.moved_back(frame) if steady is not None else (frame, _STEADY)
+        frame, shift = around.clear(frame)
         shifts.append(shift)
-        frame = scene.without_still(frame)
         if i < max(done, begins):
             recent.append(frame)
             before = [row[i] for row in traces] if done else [Trace.lost()] * len(followers)
@@ -244,33 +311,8 @@ def trace_video(
     if len(followers) > 1 and done < len(traces[0]):
         for row, new in zip(traces, _over_all_frames(seen, starts, options), strict=False):
             row[:] = new
-    _finish(traces, scene, corrections, shifts if steady is not None else ())
+    around.finish(traces, corrections, shifts)
     return traces
-
-
-def _finish(
-    traces: list[list[Trace]],
-    scene: Scene,
-    corrections: Container[tuple[int, int]],
-    shifts: Sequence[tuple[float, float, float, float]],
-) -> None:
-    """Cut traces that end along static edges, if no person gave them; add the camera's shifts."""
-    for k, row in enumerate(traces):
-        row[:] = [t if (i, k) in corrections else scene.before_edge(t) for i, t in enumerate(row)]
-        if shifts:
-            row[:] = [t._replace(shift=shift) for t, shift in zip(row, shifts, strict=True)]
-
-
-def _surroundings(
-    frames: list[Frame], starts: Array, options: TraceOptions, mask: Mask | None
-) -> tuple[Scene, Steady | None, list[Frame]]:
-    """What never moves, how the camera does, and the frames as by a camera that does not."""
-    scene = Scene.of(frames, options.scale, mask).with_still(starts, frames)
-    steady = Steady.of(scene, frames)
-    if steady is not None and steady.at.size:
-        frames = [steady.moved_back(f)[0] for f in frames]
-        scene = Scene.of(frames, options.scale, mask).with_still(starts, frames)
-    return scene, steady, frames
 
 
 def _over_all_frames(

@@ -508,7 +508,7 @@ def calibrate(
 
     Raises
     ------
-    ImportError
+    ModuleNotFoundError
         If OpenCV is not installed.
     ValueError
         If the cameras have different numbers of images, or too few show the board.
@@ -553,7 +553,9 @@ def _opencv() -> Any:
     try:
         import cv2
     except ImportError as error:
-        raise ImportError("calibrating needs OpenCV: pip install 'vibrissa[cameras]'") from error
+        raise ModuleNotFoundError(
+            "calibrating needs OpenCV: pip install 'vibrissa[cameras]'"
+        ) from error
     return cv2
 
 

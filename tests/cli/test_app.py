@@ -7,8 +7,10 @@ import sys
 from collections import defaultdict
 from typing import get_args, get_type_hints
 
+import numpy as np
 import pytest
 import typer
+from matplotlib.image import imsave
 from typer.testing import CliRunner
 
 import vibrissa as vb
@@ -163,3 +165,35 @@ def test_a_warning_is_a_note(tmp_path):
     )
     assert done.stderr.startswith("note: a force of 1 N causes the same reading")
     assert "Warning" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("module", "arguments", "extra"),
+    [
+        ("numba_cuda", "deflect --point-force 20,10,0 --device cuda", "gpu"),
+        ("cv2", "calibrate --pattern 9x6 --square 5 a_1.png b_1.png -o c.toml", "cameras"),
+        ("trimesh", "simulate mesh.toml -o trial.nc", "mesh"),
+    ],
+)
+def test_an_extra_that_is_not_installed_is_named(tmp_path, module, arguments, extra):
+    """In one line, without a traceback."""
+    (tmp_path / "mesh.toml").write_text('[[object]]\nkind = "mesh"\nfile = "m.stl"\n')
+    (tmp_path / "m.stl").write_bytes(b"x")
+    for name in ("a_1.png", "b_1.png"):
+        imsave(tmp_path / name, np.zeros((8, 8)))
+    program = (
+        "import sys, importlib.util as util\n"
+        f"sys.modules[{module!r}] = None; find = util.find_spec\n"
+        f"util.find_spec = lambda name, *rest: None if name == {module!r} else find(name, *rest)\n"
+        "from vibrissa.cli import main; main()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, *arguments.split()],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    assert f"vibrissa[{extra}]" in done.stderr

@@ -108,6 +108,12 @@ def test_the_thicker_end_is_the_base(tmp_path):
     said = load_whisker(around, noise=0.0, base="first")
     np.testing.assert_allclose(said.pose.origin, POINTS[-1], rtol=0, atol=1e-9)
     assert "last point" not in " ".join(said.notes)
+    # Radii from elsewhere leave the base where the file shows it.
+    for elsewhere in ({"rat": "C2"}, {"base_radius": 50e-6}):
+        other = load_whisker(around, noise=0.0, **elsewhere)
+        np.testing.assert_allclose(other.pose.origin, POINTS[0], rtol=0, atol=1e-9)
+        assert other.base_radius < 90e-6
+        assert "last point of the file" in other.notes[-1]
 
 
 @pytest.mark.parametrize(
@@ -124,6 +130,8 @@ def test_radii_tell_the_base_of_rods_with_little_taper(tmp_path, radii, turned):
     whisker = load_whisker(rod, noise=0.0)
     np.testing.assert_allclose(whisker.pose.origin, POINTS[-1 if turned else 0], atol=1e-9)
     assert ("last point of the file" in " ".join(whisker.notes)) == turned
+    shown = abs(radii[-1] - radii[0]) > 4.0
+    assert ("first point of the file was taken" in " ".join(whisker.notes)) != shown
 
 
 def test_a_point_in_two_rows_states_a_jump(tmp_path):

@@ -80,6 +80,7 @@ _COORDINATE = re.compile(r"([xyz])(?![a-z0-9])(.*)", re.IGNORECASE)
 _THICKNESS = re.compile(r"(radius|diameter)(?![a-z0-9])(.*)", re.IGNORECASE)
 _THINNEST, _THICKEST = 1e-5, 0.1
 _TAPERED = 0.01
+_STATED = ("radius", "base_radius", "tip_radius", "rat")  # properties that determine the radii
 # Columns that name the whisker to which a point belongs.
 _NAMING = frozenset({"whisker", "whisker_id", "name", "label", "id"})
 _FEWEST = 3  # smallest mean number of points per whisker in a table of several whiskers
@@ -138,6 +139,8 @@ def _table(path: Path) -> _Centreline:
         notes.append(f"no column radius or diameter was found, and not read: {', '.join(others)}")
     unit = next(name for name, length in LENGTHS.items() if length == factor)
     radii = array[:, -1] * thickness[0][1] if thickness else None
+    if radii is not None and not np.isfinite(radii).any():
+        radii = None
     return _Centreline(points, radii, unit, tuple(notes))
 
 
@@ -249,7 +252,8 @@ def load_whisker(
         End that is the base: by name, or a point near it, m. By default the thicker end if the file
         has radii that differ, otherwise the first point.
     **properties
-        Radius and material; see `Whisker`. They take precedence over the radii in the file.
+        Radius and material; see `Whisker`. They take precedence over the radii in the file, which
+        then determine the base only.
 
     Returns
     -------
@@ -258,13 +262,8 @@ def load_whisker(
     """
     points, radii, unit, notes = _table(Path(path))
     properties.setdefault("name", Path(path).stem)
-    stated = {
-        name
-        for name in ("radius", "base_radius", "tip_radius", "rat")
-        if properties.get(name) is not None
-    }
     try:
-        if radii is None or stated:
+        if radii is None:
             whisker = Whisker.from_points(points, noise=noise, base=base, **properties)
             notes = (_FIRST, *notes) if base is None else notes
         else:
@@ -284,26 +283,32 @@ def _tapered(
     base: str | ArrayLike | None,
     properties: Properties,
 ) -> Whisker:
-    """Whisker with radii measured along it; by default the thicker end is the base."""
+    """Whisker with radii measured along it; by default the thicker end is the base.
+
+    Radii among the properties replace the measured ones, which then determine the base only.
+    """
     known = np.isfinite(radii)
-    if not known.any():
-        return Whisker.from_points(points, noise=noise, base=base, **properties)
+    replaced = any(properties.get(name) is not None for name in _STATED)
     faults = [f"{radii[i] * 1e6:g} µm at point {i + 1}" for i in np.flatnonzero(radii <= 0.0)]
-    if faults:
+    if faults and not replaced:
         raise ValueError(
             f"the radius must be positive; it is {'; '.join(faults[:5])} (leave the cell empty "
             "where it was too thin to be measured)"
         )
     notes: tuple[str, ...] = ()
-    if base is None and _thickens(radii[known]):
-        base = "last"
-        notes = ("its thicker end, the last point of the file, was taken as the base",)
+    if base is None:
+        thicker = _thicker_end(radii[known])
+        if thicker == "last":
+            notes = ("its thicker end, the last point of the file, was taken as the base",)
+        base, notes = thicker, notes if thicker else (_FIRST,)
     # A point in two rows may have two radii; rows that also repeat the radius raise an error later.
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     jump = (steps == 0.0) & (np.diff(radii) != 0.0)
     whisker = Whisker.from_points(
         points[np.append(True, ~jump)], noise=noise, base=base, **properties
     )
+    if replaced:
+        return replace(whisker, notes=(*whisker.notes, *notes))
     s = np.append(0.0, np.cumsum(steps)) / steps.sum() * whisker.length
     first, last = (np.linalg.norm(points[end] - whisker.pose.origin) for end in (0, -1))
     if last < first:
@@ -318,15 +323,17 @@ def _tapered(
     return replace(whisker, notes=(*whisker.notes, *notes))
 
 
-def _thickens(radii: Array) -> bool:
-    """Whether the whisker is significantly thicker at its last point than at its first."""
+def _thicker_end(radii: Array) -> str | None:
+    """The end, "first" or "last", at which the whisker is significantly thicker."""
     if radii.size < 2:
-        return False
+        return None
     x = np.linspace(-0.5, 0.5, radii.size)
     slope = x @ radii / (x @ x)
     rest = radii - radii.mean() - slope * x
     error = np.sqrt(rest @ rest / max(radii.size - 2, 1) / (x @ x))
-    return bool(slope > max(_TAPERED * radii.mean(), _SURE * error))
+    if abs(slope) <= max(_TAPERED * radii.mean(), _SURE * error):
+        return None
+    return "last" if slope > 0.0 else "first"
 
 
 def load_array(

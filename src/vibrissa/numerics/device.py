@@ -38,9 +38,9 @@ def check_device(device: str) -> None:
     from numba import cuda
 
     if not _is_simulated() and find_spec("numba_cuda") is None:
-        raise ImportError("a GPU needs numba-cuda: pip install 'vibrissa[gpu]'")
+        raise ModuleNotFoundError("a GPU needs numba-cuda: pip install 'vibrissa[gpu]'")
     if not cuda.is_available():
-        raise RuntimeError("no NVIDIA GPU with a driver was found; use device 'cpu'")
+        raise ValueError("device is 'cuda', but no NVIDIA GPU with a driver was found; use 'cpu'")
 
 
 def _is_simulated() -> bool:

@@ -133,7 +133,7 @@ class Mesh(Surface):
         ------
         FileNotFoundError
             If there is no such file.
-        ImportError
+        ModuleNotFoundError
             If trimesh is not installed.
         ValueError
             If the file does not contain a closed mesh.
@@ -143,7 +143,9 @@ class Mesh(Surface):
         try:
             import trimesh
         except ImportError as error:
-            raise ImportError("meshes are read by trimesh: pip install 'vibrissa[mesh]'") from error
+            raise ModuleNotFoundError(
+                "meshes are read by trimesh: pip install 'vibrissa[mesh]'"
+            ) from error
         body = trimesh.load_mesh(Path(path))
         if not isinstance(body, trimesh.Trimesh):
             raise ValueError(f"{path} holds no mesh of triangles")

@@ -12,6 +12,10 @@ Z = (0.0, 0.0, 1.0)
     ("arguments", "said"),
     [
         ({"arc_length": 0.02}, "either magnitude and direction, or components"),
+        (
+            {"arc_length": 0.02, "magnitude": 1e-6, "direction": [0.0, -90.0]},
+            "direction is an angle in rad; got 90, which looks like degrees",
+        ),
         ({"arc_length": 0.02, "magnitude": 1e-6}, "either magnitude and direction, or components"),
         (
             {"arc_length": 0.02, "magnitude": 1e-6, "direction": 0.0, "components": (0, 0, 0)},

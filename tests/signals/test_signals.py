@@ -74,6 +74,24 @@ def test_missing_signals_are_named():
         measured({"Fx": 1.0}, ("Fx", "MB", "MD"))
 
 
+def test_components_and_signals_state_the_same():
+    """As of a table of six components, or of six signals for the wrench; in rad."""
+    force, moment = np.random.default_rng(4).normal(size=(2, 5, 3))
+    components = dict(zip(("Fx", "Fy", "Fz", "Mx", "My", "Mz"), [*force.T, *moment.T], strict=True))
+    six = {name: values.values for name, values in vb.base_signals(force, moment).items()}
+    for given, wanted in ((components, six), (six, components)):
+        found, _, _ = measured(given, tuple(wanted))
+        np.testing.assert_allclose(found, np.stack(list(wanted.values()), axis=-1), atol=1e-14)
+    labelled = xr.Dataset({name: ("time", value) for name, value in components.items()})
+    values, dims, _ = measured(labelled, ("Fx", "MB", "MD"))
+    np.testing.assert_allclose(values[:, 1], six["MB"])
+    assert dims == ("time",)
+    with pytest.raises(ValueError, match="MD is an angle in rad; got"):
+        measured({**six, "MD": np.degrees(six["MD"])}, tuple(components))
+    with pytest.raises(ValueError, match="lack MB, MD; they have Fx, My"):
+        measured({"Fx": 1.0, "My": 1.0}, ("Fx", "MB", "MD"))
+
+
 def test_derivatives_agree_with_differences():
     rng = np.random.default_rng(1)
     wrench = rng.normal(size=(50, 6))

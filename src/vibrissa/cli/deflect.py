@@ -94,7 +94,7 @@ def _load(
         return vb.PointContact([x * _MM for x in numbers(point, _XYZ, "--point")])
     if force is not None:
         s, size, angle = numbers(force, ("S", "F", "ANGLE"), "--point-force")
-        return vb.PointForce(s * _MM, size * _MICRO, math.radians(angle))
+        return vb.PointForce(s * _MM, size * _MICRO, math.radians(angle % 360.0))
     *origin, diameter = numbers(peg or "", (*_XYZ, "D"), "--peg")
     direction = numbers(axis or "0,0,1", _XYZ, "--axis")
     side = None if push is None else numbers(push, _XYZ, "--push")

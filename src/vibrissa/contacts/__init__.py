@@ -23,7 +23,6 @@ from vibrissa.contacts.contacts import (
 )
 from vibrissa.contacts.engine.prior import Prior
 from vibrissa.contacts.engine.readout import (
-    check_signals as check_signals,
     searched_by_name as searched_by_name,
 )
 from vibrissa.contacts.engine.search import signals_at_nodes as signals_at_nodes

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from vibrissa.contacts.charted_whisker import ChartedWhisker
 from vibrissa.contacts.contacts import Candidates, Contacts, contacts_of
 from vibrissa.contacts.engine.prior import Prior, possible_candidates, refuse_tip
-from vibrissa.contacts.engine.readout import Named, check_signals
+from vibrissa.contacts.engine.readout import Named
 from vibrissa.contacts.engine.search import Search, estimate
 from vibrissa.contacts.fitting.least_squares import Fits
 from vibrissa.contacts.joint.forward import Forward, Gravity, finite
@@ -34,7 +34,14 @@ from vibrissa.contacts.wrench import PROXIMAL, by_probability, chosen, estimate_
 from vibrissa.deferred import xr
 from vibrissa.numerics import AnyArray, Array, IntArray
 from vibrissa.rod import Discretization, Resting, solve_forces
-from vibrissa.signals import SIGNALS, labelled_wrench, measured, selection, signal_scales
+from vibrissa.signals import (
+    SIGNALS,
+    check_signals,
+    labelled_wrench,
+    measured,
+    selection,
+    signal_scales,
+)
 from vibrissa.status import Status
 from vibrissa.whisker import Whisker
 

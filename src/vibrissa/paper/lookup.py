@@ -39,7 +39,6 @@ from vibrissa.contacts import (
     Domain,
     Prior,
     SensorNoise,
-    check_signals,
     contacts_of,
     within_paper_bounds,
 )
@@ -52,6 +51,7 @@ from vibrissa.rod import PointContact, deflect
 from vibrissa.signals import (
     CIRCULAR,
     SIGNALS,
+    check_signals,
     circular_among,
     measured,
     selection,

@@ -32,6 +32,8 @@ from vibrissa.status import Status, counted, describe, flag_attributes
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
+_MOST_TURNS = 4.0 * np.pi  # largest plausible direction, rad
+
 
 def finite_vectors(name: str, value: ArrayLike) -> Array:
     """Return ``value`` as float64 (..., 3); raise a ValueError that states what is wrong."""
@@ -90,8 +92,8 @@ class PointForce:
     Raises
     ------
     ValueError
-        If shapes do not broadcast, if arc lengths are not positive, or if neither or both ways of
-        giving the force are used.
+        If shapes do not broadcast, if arc lengths are not positive, if a direction is more than two
+        turns, or if neither or both ways of giving the force are used.
     """
 
     arc_length: Any
@@ -111,6 +113,11 @@ class PointForce:
         if polar:
             size = _numbers("magnitude", self.magnitude, vector=False)
             angle = _numbers("direction", self.direction, vector=False)
+            if (np.abs(angle) > _MOST_TURNS).any():
+                raise ValueError(
+                    f"direction is an angle in rad; got {np.nanmax(np.abs(angle)):g}, which looks "
+                    "like degrees"
+                )
             _broadcast(arc_length=s.shape, magnitude=size.shape, direction=angle.shape)
             across = size * np.cos(angle), size * np.sin(angle)
             force = np.stack(np.broadcast_arrays(0.0 * across[0], *across), axis=-1)

@@ -19,6 +19,7 @@ from vibrissa.signals.base import (
     TRIPLETS,
     Coordinates,
     base_signals,
+    check_signals as check_signals,
     circular_among as circular_among,
     labelled_wrench as labelled_wrench,
     measured,

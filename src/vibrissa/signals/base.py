@@ -202,8 +202,9 @@ def measured(
     Parameters
     ----------
     signals : Dataset or mapping
-        Signals in SI units, at least the named ones, or ``force`` and ``moment``, from which they
-        are computed; shapes must broadcast. DataArrays are matched by dimension names.
+        Signals in SI units: the named ones, or ``force`` and ``moment`` or components such as
+        ``Fy`` and ``Fz``, from which they are computed, or components are computed from sizes and
+        directions; shapes must broadcast. DataArrays are matched by dimension names.
     names : tuple of str
         Names of the signals.
 
@@ -221,14 +222,15 @@ def measured(
             f"signals must be a dataset or mapping with {', '.join(names)}, as load_signals reads "
             f"it; got {signals!r}"
         )
-    missing = [name for name in names if name not in signals]
-    if missing and {"force", "moment"} <= set(map(str, signals)):
-        signals, missing = base_signals(signals["force"], signals["moment"]), []
+    if {"force", "moment"} <= set(map(str, signals)) and any(n not in signals for n in names):
+        signals = base_signals(signals["force"], signals["moment"])
+    found = _completed(signals, names)
+    missing = [name for name in names if name not in found]
     if missing:
         raise ValueError(
             f"signals lack {', '.join(missing)}; they have {', '.join(map(str, signals)) or 'none'}"
         )
-    given = [signals[name] for name in names]
+    given = [found[name] for name in names]
     if any(isinstance(a, xr.DataArray) and a.dims for a in given):
         # A value without dimensions applies to all.
         labels = [a if isinstance(a, xr.DataArray) else _as_scalar(a, names, given) for a in given]
@@ -243,6 +245,42 @@ def measured(
         shapes = ", ".join(f"{name} {a.shape}" for name, a in zip(names, plain, strict=True))
         raise ValueError(f"signals of different shapes: {shapes}") from error
     return values, leading_dims(values.shape[:-1]), {}
+
+
+def check_signals(values: Array, names: tuple[str, ...]) -> None:
+    """Refuse signals that no sensor in SI units can have measured."""
+    for k, name in enumerate(names):
+        if name in ("FT", "MB") and (values[..., k] < 0.0).any():
+            raise ValueError(
+                f"{name} is a size and cannot be negative; got {np.nanmin(values[..., k])}"
+            )
+        if name in ("FD", "MD") and (np.abs(values[..., k]) > 2.0 * np.pi).any():
+            largest = np.nanmax(np.abs(values[..., k]))
+            raise ValueError(
+                f"{name} is an angle in rad; got {largest:g}, which looks like degrees"
+            )
+
+
+def _completed(
+    signals: xr.Dataset | Mapping[str, ArrayLike], names: tuple[str, ...]
+) -> dict[str, ArrayLike]:
+    """The named signals, computed from others where those have the same content."""
+    found = {name: signals[name] for name in names if name in signals}
+    for y, z, size, angle in (("Fy", "Fz", "FT", "FD"), ("My", "Mz", "MB", "MD")):
+        if {y, z, size, angle}.intersection(names) <= found.keys():
+            continue
+        if y in signals and z in signals:
+            other = signals[y], signals[z]
+            computed = {size: np.hypot(*other), angle: np.arctan2(*other[::-1])}
+        elif size in signals and angle in signals:
+            for name in (size, angle):
+                check_signals(numbers(name, signals[name])[..., None], (name,))
+            other = signals[size], signals[angle]
+            computed = {y: other[0] * np.cos(other[1]), z: other[0] * np.sin(other[1])}
+        else:
+            continue
+        found |= {name: value for name, value in computed.items() if name in names}
+    return found
 
 
 def _as_scalar(value: ArrayLike, names: tuple[str, ...], given: list[ArrayLike]) -> xr.DataArray:

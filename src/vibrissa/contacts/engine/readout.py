@@ -30,7 +30,7 @@ from vibrissa.contacts.uncertainty.nodes import Searched, at_nodes, searched
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.rod import search_tree
 from vibrissa.sensors import COMPONENTS
-from vibrissa.signals import CIRCULAR, SIGNALS, signal_scales, signals_of
+from vibrissa.signals import CIRCULAR, SIGNALS, check_signals, signal_scales, signals_of
 
 # Ratio to the noise and to the other directions below which the contacts of the map vary too little
 # along a direction of the readings for it to carry information.
@@ -74,20 +74,6 @@ class Bounds(NamedTuple):
     def most(self) -> list[tuple[int, float]]:
         """Largest possible value of each signal."""
         return list(zip(self.sizes, (_FAR_BEYOND * self.largest).tolist(), strict=True))
-
-
-def check_signals(values: Array, names: tuple[str, ...]) -> None:
-    """Refuse signals that no sensor in SI units can have measured."""
-    for k, name in enumerate(names):
-        if name in ("FT", "MB") and (values[..., k] < 0.0).any():
-            raise ValueError(
-                f"{name} is a size and cannot be negative; got {np.nanmin(values[..., k])}"
-            )
-        if CIRCULAR[SIGNALS.index(name)] and (np.abs(values[..., k]) > 2.0 * np.pi).any():
-            largest = np.nanmax(np.abs(values[..., k]))
-            raise ValueError(
-                f"{name} is an angle in rad; got {largest:g}, which looks like degrees"
-            )
 
 
 @lru_cache(maxsize=16)

@@ -31,7 +31,6 @@ from vibrissa.contacts.engine.readout import (
     Measurement,
     Mixed,
     Named,
-    check_signals,
     independent,
 )
 from vibrissa.contacts.engine.task import Problem, task
@@ -43,6 +42,7 @@ from vibrissa.numerics import AnyArray, Array, IntArray, share_out
 from vibrissa.rod import TOLERANCE
 from vibrissa.signals import (
     SIGNALS,
+    check_signals,
     circular_among,
     measured,
     selection,

@@ -136,6 +136,13 @@ def test_signals_that_cannot_locate_contacts_are_named_with_better_ones(folder):
     assert "--using FT,MB,MD" in text
     text = run("estimate", path, "--map", wire, "--using", "FT,MB,MD", "-o", out, "--force")
     assert "do not determine" not in text
+    few = folder / "six.csv"
+    few.write_text("# of today\nFx_uN,FT_uN,MB_uNm,MD_deg\n" + 12 * "-100,50,2,45\n")
+    text = run("estimate", few, "--map", wire, "-o", folder / "cylinder-six.csv")
+    assert "--using FT,MB,MD" in text
+    assert "noise 1 µN and 0.02 µN·m" in text
+    assert "numbered from 0" in text
+    assert "apart" not in text
     found = load_contacts(out)
     assert found["time"].item() == 1700000000.25
     assert found["x"].item() == pytest.approx(30e-3, abs=1e-6)

@@ -74,6 +74,35 @@ def test_a_sensor_finds_contacts_as_its_noise_allows(felt, trial, contact_map, s
     assert estimates.attrs["signals"] == " ".join(signals.split())
 
 
+@pytest.mark.parametrize("signals", ["Fx MB MD", "Fx FT MB MD"])
+def test_covariances_are_the_same_in_both_frames(felt, trial, contact_map, signals):
+    """Also of light contacts, for which those of first order are too narrow, or without end."""
+    one = estimates_of(felt, signals, contact_maps=[contact_map]).isel(whisker=0)
+    rotation = trial["base_rotation"].values[:, 0]
+    turned = rotation @ one["covariance"].values @ np.swapaxes(rotation, 1, 2)
+    known = np.isfinite(turned).all(axis=(1, 2))
+    light = known & (np.linalg.norm(trial["moment"].values[:, 0], axis=1) < 1e-6)
+    assert 5 < light.sum() < known.sum()
+    here = one["contact_covariance"].values
+    scale = np.trace(turned[known], axis1=1, axis2=2)[:, None, None]
+    np.testing.assert_allclose(here[known] / scale, turned[known] / scale, atol=1e-6)
+    both = one["point_normal_covariance"].values
+    joint = np.block([[here, both], [np.swapaxes(both, 1, 2), one["normal_covariance"].values]])
+    least = np.linalg.eigvalsh(joint[known])
+    assert (least[:, 0] > -1e-9 * least[:, -1]).all()
+
+
+@pytest.mark.parametrize("first", range(0, 50, 10))
+def test_a_peg_is_found_by_few_contacts_as_they_say(felt, trial, contact_map, first):
+    """Light ones among them: their narrow covariances would move the peg by tens of its sigma."""
+    estimates = estimates_of(felt, contact_maps=[contact_map])
+    touched = np.flatnonzero(np.isfinite(estimates["contact_point"].values).all(axis=(1, 2)))
+    few = estimates.isel(time=touched[first : first + 16])
+    fit = fit_contacts(few, Recording(trial).whiskers, "cylinder")
+    assert fit.misfit < 3.0
+    assert abs(fit.radius - 1.35e-3) < 4.0 * np.sqrt(fit.covariance[-1, -1])
+
+
 def test_point_and_normal_err_together_as_they_say(felt, trial, contact_map):
     """Half a diameter back along the normal the axis is found: its error needs all covariances."""
     truth, one = errors(estimates_of(felt, contact_maps=[contact_map]), trial)

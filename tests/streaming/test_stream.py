@@ -222,6 +222,36 @@ def test_a_header_that_names_a_column_twice_is_refused():
         lines("0,1,2,3,4,5,6,7")
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "time,Fx,MB,MD\nms,mN,mN·mm,deg\n{rows}",
+        "# of 2026\ntime_ms,Fx_mN,MB (mN mm),MD [deg]\n{rows}\n,,,\n",
+        "sep=;\ntime;Fx;MB;MD\nms;mN;mNmm;°\n{rows}",
+        "time,note,Fx,MB,MD\nms,,mN,Nmm,deg\n{noted}",
+    ],
+)
+def test_lines_of_spreadsheets(text):
+    """A line of units, of the separator, a comment, and rows without any number."""
+    rows = "1,2,3,-90\n2,,,"
+    if "sep" in text:
+        rows = rows.replace(",", ";")
+    noted = "1,first,2,3e-3,-90\n2,,,,"
+    lines = Lines(("Fx", "MB", "MD"))
+    samples = [lines(line) for line in text.format(rows=rows, noted=noted).splitlines()]
+    first, second = (sample for sample in samples if sample is not None)
+    assert (first.time, second.time) == (1e-3, 2e-3)
+    np.testing.assert_allclose(first.values, [2e-3, 3e-6, -np.pi / 2])
+    assert np.isnan(second.values).all()
+
+
+def test_a_line_that_states_no_units_is_an_error():
+    lines = Lines(("Fx", "MB", "MD"))
+    assert lines("time,Fx,MB,MD") is None
+    with pytest.raises(ValueError, match="the header lacks Fx"):
+        lines("s,apples,Nm,rad")
+
+
 def test_rows_are_not_read_under_a_header_that_was_refused(gamma_map, wrench):
     """A sensor's channels have no units: a header that gives some cannot be used."""
     sensor = Sensor(noise=NOISE)

@@ -303,7 +303,8 @@ def _named_signals(table: Path, how: EstimateOptions) -> bool:
     if how.whole or how.special:
         return False
     names = how.names or vb.signals.TRIPLET
-    first = next((line for line in vb.io.read_text(table).splitlines() if line.strip()), "")
+    _, cells = next(vb.io.table_rows(vb.io.read_text(table)), (0, []))
+    first = ",".join(cells)
     if not first or _is_header(first, vb.streaming.COMPONENTS):
         return False
     if _is_header(first, names):
@@ -346,7 +347,11 @@ def _from_lines(
                 known, tell, grid=False, proximal=inputs.smallest_arc(how.proximal)
             )
         names = None if sensor is None else tuple(sensor.channels)
+        inputs.print_notes(contact_map.whisker)
+        weight.doubt(contact_map.whisker)
         used = names or how.names or vb.signals.TRIPLET
+        if sensor is None:
+            _doubt_names(contact_map, used)
         estimator = inputs.estimator_of(
             contact_map, sensor, used, how.noise, how.assumed, weight.known, vb.signals.DETECTED
         )
@@ -360,8 +365,9 @@ def _from_lines(
     if running.untimed:
         columns["time"] = [float(row) for row in range(len(records))]
         remark(f"{signals}: {vb.io.NUMBERED}")
-    for note in vb.io.time_notes(np.array(columns["time"])):
-        remark(f"{signals}: {note}")
+    else:
+        for note in vb.io.time_notes(np.array(columns["time"])):
+            remark(f"{signals}: {note}")
     statuses = [int(vb.Status[one["status"].upper()]) for one in records]
     columns["friction"] = [estimator.friction] * len(records)
     happened = [vb.status.Event[one.get("event", "none").upper()] for one in records]
@@ -372,7 +378,9 @@ def _from_lines(
     for sentence in vb.streaming.advice(running):
         remark(sentence)
     friction = vb.contacts.friction_assumed(estimator.friction)
-    remark(f"signals ({', '.join(used)}){how.assumed.described()}; {friction}{weight.described()}")
+    noise = f"; {how.noise.described()}" if sensor is None else ""
+    about = f"{how.assumed.described()}; {friction}{noise}{weight.described()}"
+    remark(f"signals ({', '.join(used)}){about}")
     inputs.print_statuses(np.array(statuses))
     inputs.print_written(target)
 

@@ -322,6 +322,8 @@ def in_laboratory(
         None if pose_covariance is None else np.asarray(pose_covariance),
         None if pose_wrench_covariance is None else np.asarray(pose_wrench_covariance),
     )
+    wider = _chosen(contacts["candidate_widening"], chosen).values
+    spread[:, :3, :3] += rotation @ wider @ np.swapaxes(rotation, 1, 2)
     squares = {
         "contact_covariance": spread[:, :3, :3],
         "normal_covariance": spread[:, 3:, 3:],

@@ -115,11 +115,12 @@ def locate(
         ``covariance``, ``arc_length``, the modelled ``force`` at the base; the same of all
         candidates (``candidate_points``, ``candidate_covariance``, ...) and their number
         ``candidates``; ``in_contact`` (detected) and ``status``; ``candidate_gain``, the
-        derivatives of the candidates with respect to the wrench; ``wrench_covariance``, the
-        covariance of the wrench from noise and common errors; and the variables that `with_events`
-        needs. Covariances are those of the exact method whatever the method. Frames without a
-        detected contact are NaN, with the status ``NOT_FELT``, or ``NO_CONTACT`` where force and
-        moment are zero or ``in_contact`` is false.
+        derivatives of the candidates with respect to the wrench, reduced where an error of first
+        order is larger than the estimate states, and ``candidate_widening``, the covariance in
+        addition to it; ``wrench_covariance``, the covariance of the wrench from noise and common
+        errors; and the variables that `with_events` needs. Covariances are those of the exact
+        method whatever the method. Frames without a detected contact are NaN, with the status
+        ``NOT_FELT``, or ``NO_CONTACT`` where force and moment are zero or ``in_contact`` is false.
 
     Raises
     ------
@@ -449,7 +450,8 @@ def _located(
     """Dataset of all frames from the candidates of those with a contact, None if there are none.
 
     Covariances are of first order, unless all frames have the same noise: then the covariances
-    ``stated`` (n, candidates, 3, 3) by the estimate, which remain valid up to slip-off, are used.
+    ``stated`` (n, candidates, 3, 3) by the estimate, which remain valid up to slip-off, are used:
+    ``candidate_gain`` with the addition ``candidate_widening`` gives them.
     """
     rows = measured.rows
     points = forces = contact_forces = np.empty((0, 1, 3))
@@ -469,16 +471,20 @@ def _located(
     normals = contact_normals(whisker, *flat).reshape(*shape, 3)
     point_gain = gain[..., :3, :]
     spread = point_gain @ measured.covariance[rows][:, None] @ np.swapaxes(point_gain, -1, -2)
+    widening = np.zeros_like(spread)
     if not measured.steady:
         # Second-order term: errors follow an arc whose radius is of the order of the length.
         size = np.einsum("ncii->nc", spread) / whisker.length
         spread = spread + size[..., None, None] ** 2 * np.eye(3)
     elif stated is not None:
-        first = spread[:, : stated.shape[1]]
-        first[:] = np.where(np.isfinite(stated), stated, first)
+        k = stated.shape[1]
+        factor, wider = _as_stated(spread[:, :k], stated)
+        point_gain[:, :k], widening[:, :k] = factor @ point_gain[:, :k], wider
+        spread[:, :k] = np.where(np.isfinite(stated), stated, spread[:, :k])
     columns = {
         "points": ("contact_point_whisker", points),
         "covariance": ("covariance", spread),
+        "widening": ("covariance", widening),
         "arc_length": ("arc_length", arc_lengths),
         "force": ("force", forces),
     }
@@ -486,7 +492,8 @@ def _located(
     for short, (name, values) in columns.items():
         dims = ("time", "candidate", "space", "space_2")[: values.ndim]
         everywhere = _everywhere(rows, values)
-        data[name] = ((dims[0], *dims[2:]), everywhere[:, 0], attributes(name))
+        if short != "widening":
+            data[name] = ((dims[0], *dims[2:]), everywhere[:, 0], attributes(name))
         data[f"candidate_{short}"] = (dims, everywhere, attributes(name))
     data["candidate_normal"] = (
         ("time", "candidate", "space"),
@@ -518,6 +525,25 @@ def _located(
     return xr.Dataset(data, {"time": measured.time, "space": list("xyz")}, about)
 
 
+def _as_stated(first: Array, stated: Array) -> tuple[Array, Array]:
+    """Change covariances of first order (..., 3, 3) to stated ones: factors A and covariances E.
+
+    A first Aᵀ + E = stated: in the axes in which both are diagonal, errors larger than stated are
+    reduced, and independent errors are added to smaller ones. Unknown covariances are not changed.
+    """
+    known = np.asarray(np.isfinite(first + stated).all(axis=(-2, -1)))
+    size, axes = np.linalg.eigh(np.where(known[..., None, None], first, np.eye(3)))
+    known &= size[..., -1] > 0.0
+    root = np.sqrt(np.maximum(size, _FLAT * np.maximum(size[..., -1:], _FLAT)))[..., None, :]
+    root, back = axes * root, np.swapaxes(axes / root, -1, -2)
+    whole = np.where(known[..., None, None], stated, root @ np.swapaxes(root, -1, -2))
+    ratio, turn = np.linalg.eigh(back @ whole @ np.swapaxes(back, -1, -2))
+    root, back, ratio = root @ turn, np.swapaxes(turn, -1, -2) @ back, ratio[..., None, :]
+    factor = (root * np.sqrt(np.clip(ratio, 0.0, 1.0))) @ back
+    wider = (root * np.maximum(ratio - 1.0, 0.0)) @ np.swapaxes(root, -1, -2)
+    return factor, wider
+
+
 def _everywhere(rows: NDArray[np.bool_], values: Array) -> Array:
     """Expand values (n, ...) of the marked rows to all rows, with NaN elsewhere."""
     out = np.full((rows.size, *values.shape[1:]), np.nan)
@@ -525,6 +551,7 @@ def _everywhere(rows: NDArray[np.bool_], values: Array) -> Array:
     return out
 
 
+_FLAT = 1e-15  # least ratio of variances of a covariance of first order
 _FREE = [0, 2, 3]  # unknowns of x without friction
 _STEP = 1e-5  # relative step of finite differences
 # Smallest singular value of invertible derivatives whose columns are scaled to length one.

@@ -9,7 +9,8 @@ the laboratory frame; and the readings of an accelerometer there, ``imu_ax``, ``
 only. Fields of ROS are passed on unchanged: ``stamp_ns`` and ``recorded_ns`` (whole numbers) and
 ``frame_id``.
 
-Rows refer to the last header. After an invalid header, rows are errors until the next header.
+Rows refer to the last header, or to it and to a line of units that follows it. After an invalid
+header, rows are errors until the next header.
 
 Poses of the base may arrive at another rate and are interpolated to the time of each sample.
 """
@@ -57,6 +58,7 @@ _SIGNALS = ("time", *COMPONENTS, *SIGNALS)
 _UNIT = 0.01  # largest deviation of a rounded quaternion from unit length
 _LATEST = 1e11  # largest plausible time since any epoch, s
 _FARTHEST = 1e9  # largest plausible coordinate of a base, m
+_SEPARATORS = frozenset({"sep=,", "sep=;", "sep=\t", "sep="})
 _DIGITS = frozenset("0123456789+-.")  # characters with which a number in a table may begin
 
 
@@ -100,6 +102,7 @@ class Lines:
         self._prefix = f"{whisker}." if whisker else ""
         self.number, self.headers = 0, 0
         self._header: list[str] | None = None
+        self._heading: list[str] = []  # cells of a header that no line has followed yet
         self._delimiter = ","
         self._factors: dict[str, float] = {}
         self._refused = 0
@@ -110,7 +113,8 @@ class Lines:
         if len(line) > LONGEST:
             raise ValueError(f"a line of more than {LONGEST} characters")
         text = line.strip().lstrip("\ufeff")
-        if not text or text.startswith("#"):
+        # Spreadsheets state the separator in a line of its own.
+        if not text or text.startswith("#") or text.lower() in _SEPARATORS:
             return None
         known = self._object(text) if text.startswith("{") else self._row(text)
         if known is None or (self._prefix and self._of_others(known)):
@@ -158,13 +162,16 @@ class Lines:
             raise ValueError(f"no CSV: {error}") from None
         # An empty first cell is either an index without a name, or a missing number.
         named = self._header is None if cells[0] == "" else not is_number(cells[0])
-        if named and self._heads(text):
+        heading, self._heading = self._heading, []
+        if named and (self._units(heading, cells) or self._heads(text)):
             return None
         if self._header is None:
             refused = f": that of line {self._refused} was refused" if self._refused else ""
             raise ValueError(f"a row without a header that names its columns{refused}")
         if len(cells) > len(self._header) and not any(cells[len(self._header) :]):
             cells = cells[: len(self._header)]
+        if "time" in self._header and not any(cells):  # as spreadsheets end tables
+            return None
         if len(cells) != len(self._header):
             raise ValueError(f"{len(cells)} cells; the header has {len(self._header)}")
         if self._delimiter != "," and not any("." in cell for cell in cells):
@@ -194,8 +201,20 @@ class Lines:
         if not self.raw:
             check_one_column_each(cells, [name for name in _SIGNALS if name in used])
         self._header, self._factors, self._delimiter = names, factors, delimiter
-        self._refused = 0
+        self._refused, self._heading = 0, [] if self.raw else cells_of(text, delimiter)
         self.headers += 1
+        return True
+
+    def _units(self, heading: list[str], units: list[str]) -> bool:
+        """Whether a line states the units of the columns of a header, which are then used."""
+        if len(heading) != len(units) or any(is_number(unit) for unit in units if unit):
+            return False
+        cells = [f"{name} ({unit})" for name, unit in zip(heading, units, strict=True)]
+        strange = signal_columns([self._own(cell) for cell in cells], _SIGNALS)[1]
+        names, factors = self._named(cells)
+        if strange or not any(set(choice) <= set(names) for choice in self.names):
+            return False
+        self._header, self._factors = names, factors
         return True
 
     def _like_header(self, cells: list[str]) -> bool:

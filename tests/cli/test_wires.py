@@ -1,5 +1,7 @@
 """Maps of wires from the command line: any length, thickness and material."""
 
+import re
+
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -133,6 +135,13 @@ def test_a_linear_sensor_is_calibrated_by_a_table_of_touches(tmp_path):
     assert CliRunner().invoke(app, again).exit_code == 0
     same = vb.sensors.load_sensor(target)
     np.testing.assert_allclose(same.mixing, sensor.mixing, atol=1e-6 * mixing.max())
+    write("x,y,z,a,b,c", points + [0.0, 0.1, 0.0])
+    said = " ".join(CliRunner().invoke(app, again).output.split())
+    assert re.search(r"residuals of .*b, c up to [0-9.e+]+ times the noise at rest", said)
+    write("X (mm),Y (mm),Z (mm),a,b,c", points)
+    done = CliRunner().invoke(app, again)
+    assert done.exit_code == 0
+    assert "times the noise" not in done.output
     write("x,y,z,a,b,c", 1e-3 * points)
     fault = str(CliRunner().invoke(app, again).exception)
     assert "mm from the base of this whisker of 100 mm: are their unit" in fault

@@ -16,6 +16,7 @@ from vibrissa.numerics import Array
 
 # Noise relative to the range of the readings above which the user is warned.
 _UNEXPLAINED = 0.05
+_LOUD = 5.0  # ratio of residuals and noise at rest above which the user is warned
 _AGAIN = 4  # number of touches with the same extreme reading that suggests saturation
 _MOST_NAMED = 5  # largest number of touches listed
 _POOR = 1.0  # reprojection error above which the user is warned, pixels
@@ -86,6 +87,7 @@ def _linear(
     channels, points, readings = _touches(table)
     rest = readings[np.isnan(points).all(axis=1) & np.isfinite(readings).all(axis=1)]
     _check_saturation(channels, readings)
+    quiet = rest.std(axis=0, ddof=1) if len(rest) >= _AT_REST else np.zeros(len(channels))
     found = vb.sensors.calibrate_on_contacts(
         own.read(),
         points,
@@ -93,7 +95,7 @@ def _linear(
         point_sigma=1e-3 * (touch_sigma or 0.0),
         channels=channels,
         components=components.replace(" ", "").split(",") if components else vb.sensors.COMPONENTS,
-        noise=rest.std(axis=0, ddof=1) if len(rest) >= _AT_REST else 0.0,
+        noise=quiet,
     )
     vb.sensors.save_sensor(target, found.sensor)
     where = [vb.sensors.COMPONENTS.index(name) for name in found.components]
@@ -102,7 +104,15 @@ def _linear(
         fits = zip(found.components, found.sensor.mixing[k, where], sigma[:-1], strict=True)
         text = ", ".join(f"{one} {value:.4g} ± {error:.2g}" for one, value, error in fits)
         say(f"{name}: {text} per N or N·m; noise {found.sensor.noise[k]:.3g}")
-    _question_noise(found.sensor, readings, "unit, axes, origin and order of the touches")
+    what = "unit, axes, origin and order of the touches"
+    _question_noise(found.sensor, readings, what)
+    ratio = np.divide(found.sensor.noise, quiet, out=np.zeros(len(channels)), where=quiet > 0.0)
+    if ratio.max() > _LOUD:
+        names = ", ".join(np.array(channels)[ratio > _LOUD])
+        say(
+            f"  The touches leave residuals of {names} up to {ratio.max():.2g} times the noise at "
+            f"rest: are {what} right, and the errors of their points stated (--touch-sigma)?"
+        )
     say(f"wrote {target}")
 
 
@@ -113,10 +123,10 @@ def _touches(table: Path) -> tuple[list[str], Array, Array]:
     units = {
         name: unit_factor(name[1:], "length") if name[1:] else 1e-3
         for name in names
-        if name[:1] in tuple("xyz") and not name[1:2].isalnum()
+        if name[:1].lower() in tuple("xyz") and not name[1:2].isalnum()
     }
-    axes = sorted(name for name, unit in units.items() if unit)
-    if [name[0] for name in axes] != list("xyz"):
+    axes = sorted((name for name, unit in units.items() if unit), key=str.lower)
+    if [name[0].lower() for name in axes] != list("xyz"):
         raise ValueError(
             f"{table}: columns x, y, z (mm; also x_m and so on) are needed; its columns are "
             f"{', '.join(names)}"

@@ -73,6 +73,18 @@ def test_a_folder_is_done_once_and_summarised(tmp_path):
     assert (tmp_path / "touch.nc").stat().st_mtime_ns == before
 
 
+def test_contours_of_other_options_are_kept_and_said(tmp_path):
+    """And a shape that contacts do not fit is called so in the table."""
+    trial(tmp_path / "touch.nc", Peg([9e-3, 2.6e-3, 0.0], [0.0, 0.0, 1.0], 0.5e-3))
+    first = " ".join(run("batch", tmp_path, "--shape", "plane").split())
+    assert "had a contour" not in first
+    again = " ".join(run("batch", tmp_path, "--axis", "0,0,1").split())
+    assert "plane fitted" in again
+    assert "1 had a contour, which is unchanged; --force computes it again" in again
+    for text in (first, (tmp_path / "summary.csv").read_text(encoding="utf-8")):
+        assert "the contacts do not fit it (χ² per degree of freedom" in text
+
+
 def test_links_and_groups_that_were_edited_stop_nothing(tmp_path):
     trial(tmp_path / "miss.nc", Peg([90e-3, 2.6e-3, 0.0], [0.0, 0.0, 1.0], 0.5e-3))
     tree = load_recording(tmp_path / "miss.nc")

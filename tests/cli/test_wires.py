@@ -135,7 +135,7 @@ def test_a_linear_sensor_is_calibrated_by_a_table_of_touches(tmp_path):
     assert CliRunner().invoke(app, again).exit_code == 0
     same = vb.sensors.load_sensor(target)
     np.testing.assert_allclose(same.mixing, sensor.mixing, atol=1e-6 * mixing.max())
-    write("x,y,z,a,b,c", points + [0.0, 0.1, 0.0])
+    write("x,y,z,a,b,c", points + np.array([0.0, 0.1, 0.0]))
     said = " ".join(CliRunner().invoke(app, again).output.split())
     assert re.search(r"residuals of .*b, c up to [0-9.e+]+ times the noise at rest", said)
     write("X (mm),Y (mm),Z (mm),a,b,c", points)

@@ -289,6 +289,8 @@ def test_what_is_lacking_is_said_with_the_verb_that_makes_it(
         monkeypatch, capsys, *nowhere, *("--kind", "contour", "--video", video, "--video", video)
     )
     assert "20 × 20 pixels, the camera 'top' has 300 × 300" in said
+    # Before the first movie is drawn, if there are two.
+    assert "give one --video for each" in fault(monkeypatch, capsys, *nowhere, "--video", video)
     assert not (tmp_path / "none").exists()
 
 

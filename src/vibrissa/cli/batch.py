@@ -64,11 +64,12 @@ def batch(
         )
     vb.io.check_writable(table)
     known = None if objects is None else objects_from(objects)
-    rows, lines = [], []
+    rows, lines, kept = [], [], 0
     with progress_bars() as tell:
         for number, path in enumerate(paths):
             tell("recordings", number, len(paths))
-            found, fault = _one(path, wanted, source, how, known, force, tell)
+            found, fault, made = _one(path, wanted, source, how, known, force, tell)
+            kept += not (made or fault)
             rows.append(_cells(path, found, fault))
             lines.append(_shown(path, found, fault))
             # The table is complete up to here even if the next recording is interrupted.
@@ -80,6 +81,8 @@ def batch(
     failed = sum(bool(row[-1]) for row in rows)
     about = f"{len(rows)} recordings, {failed} with a fault"
     say(about)
+    if kept:
+        say(f"{kept} had a contour, which is unchanged; --force computes it again, as stated now")
     vb.io.write_table(table, _COLUMNS, rows)
     section = vb.report.Section("recordings", "Recordings", vb.report.table(lines, _HEADING))
     with vb.io.replacing(folder / PAGE) as part:
@@ -107,8 +110,11 @@ def _one(
     objects: tuple[vb.objects.Surface, ...] | None,
     again: bool,
     tell: Tell,
-) -> tuple[vb.pipeline.TrialSummary | None, str]:
-    """Reconstruct the object of one recording; return a summary (or None) and the faults."""
+) -> tuple[vb.pipeline.TrialSummary | None, str, bool]:
+    """Reconstruct the object of one recording.
+
+    Return a summary (or None), the faults, and whether a contour was missing or outdated.
+    """
     faults: list[str] = []
     found, tree, made = None, None, False
     with _noted(faults):
@@ -124,7 +130,7 @@ def _one(
                 vb.io.save_recording(path, tree)
         with _noted(faults):  # groups may have been edited
             found = vb.pipeline.TrialSummary(tree)
-    return found, "; ".join(dict.fromkeys(faults))
+    return found, "; ".join(dict.fromkeys(faults)), made
 
 
 @contextmanager

@@ -96,10 +96,11 @@ def make_movies(
     for reason in reasons:
         say(f"{reason}; left out")
     with progress_bars() as tell, stoppable() as stopped:
+        # Maps and videos are read before the first movie is drawn.
+        images = {n: _frames(n, trial, course, rows, of_trial, tell) for n in possible}
         for name in possible:
-            images = _frames(name, trial, course, rows, of_trial, tell)
             files[name].parent.mkdir(parents=True, exist_ok=True)
-            _write(files[name], images, (name, len(rows)), frames.fps, tell, stopped)
+            _write(files[name], images[name], (name, len(rows)), frames.fps, tell, stopped)
             if stopped():
                 raise typer.Exit(130)
     return [files[name] for name in possible]

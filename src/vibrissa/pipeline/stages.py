@@ -27,7 +27,7 @@ from vibrissa.pipeline.checks import (
     signals_in,
 )
 from vibrissa.pipeline.estimates import Progress, estimates_of, largest_of
-from vibrissa.pipeline.reconstruct import reconstruct
+from vibrissa.pipeline.reconstruct import AGREES, reconstruct
 from vibrissa.pipeline.signals import signals_of
 from vibrissa.recording import Recording
 from vibrissa.status import Status
@@ -208,6 +208,11 @@ class TrialSummary:
             contour = recording["contour"].to_dataset()
             self.shape = shape_from_dataset(contour)
             self.fitted = repr(self.shape).strip("<>")
+            if self.shape.misfit > AGREES:
+                self.fitted += (
+                    "; the contacts do not fit it (χ² per degree of freedom "
+                    f"{self.shape.misfit:.3g})"
+                )
             if "surface_distance" in contour:
                 away = np.abs(contour["surface_distance"].values)
                 if "inlier" in contour:  # as in `FittedShape.median`

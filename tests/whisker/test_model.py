@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -87,6 +88,7 @@ def test_signs_of_curvature():
     assert down[1] == 0.0
 
 
+@pytest.mark.filterwarnings("ignore:the coefficient of the parabola")
 @given(st.floats(0.0, 60.0), st.floats(5e-3, 80e-3))
 def test_parabola_lies_on_its_parabola(coefficient, length):
     whisker = Whisker.parabola(length, coefficient)
@@ -328,6 +330,16 @@ def test_two_samples_of_a_radius_are_a_cone():
 def test_radii_that_contradict_each_other_or_the_length(properties, message):
     with pytest.raises(ValueError, match=message):
         Whisker.straight(0.04, **properties)
+
+
+def test_a_coefficient_per_millimetre_is_questioned():
+    """As publications state it: 0.0233 per mm is 23.3 per m."""
+    with pytest.warns(UserWarning, match="is it per mm, as in the literature"):
+        Whisker.parabola(35e-3, 0.0233)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for coefficient in (0.0, 0.5, 23.3):
+            Whisker.parabola(35e-3, coefficient)
 
 
 def test_tip_thicker_than_base_is_noted():

@@ -279,7 +279,7 @@ def _require_curve(curve: interpolate.BSpline, found: float, stated: float | Non
     """Raise a ValueError if points are far from any smooth curve, or the curve is too long."""
     if found > SCATTER and (stated is None or found > 2.0 * stated):
         raise ValueError(
-            f"no whisker in these points: they scatter by {100.0 * found:.0f} % of their extent "
+            f"no whisker in these points: they scatter by {100.0 * found:.3g} % of their extent "
             f"about a smooth curve, more than the {100.0 * SCATTER:.0f} % allowed; they must be in "
             "order from base to tip"
         )

@@ -12,6 +12,7 @@ whisker lies as close as possible to the x–y plane and bends toward +y.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -57,6 +58,7 @@ from vibrissa.whisker.section import (
 ROUNDING = 1e-9
 """Largest distance, over the length, of an arc length outside the whisker that is clipped."""
 
+_SLIGHT = 2.5e-3  # coefficient of a parabola times length below which it may be per mm
 STRAIGHT = 1e-9  # curvature times length below which a whisker counts as straight
 
 PROXIMAL = 0.7
@@ -228,12 +230,24 @@ class Whisker:
         Returns
         -------
         Whisker
+
+        Warns
+        -----
+        UserWarning
+            If the curve is so slight that the coefficient may be in 1/mm.
         """
         faults = length_faults(length, properties.get("any_length"))
         if not np.isfinite(coefficient):
             faults.append(f"coefficient is {coefficient!r}; it must be a finite number, in 1/m")
         if faults:
             raise ValueError("no parabola: " + "; ".join(faults))
+        if 0.0 < abs(coefficient) * length < _SLIGHT:
+            warnings.warn(
+                f"the coefficient of the parabola is {coefficient:g} per m, which bends a whisker "
+                f"of {1e3 * length:.4g} mm by {np.degrees(2.0 * abs(coefficient) * length):.2g}°: "
+                "is it per mm, as in the literature (multiply by 1000)?",
+                stacklevel=2,
+            )
         curvature = parabola_curvature(length, abs(float(coefficient)))
         pose = Pose(np.diag([1.0, -1.0, -1.0])) if coefficient < 0.0 else Pose()
         properties.setdefault("name", "parabola")

@@ -57,7 +57,7 @@ def followed(contacts, trial, names, sigma, seed):
     rows = np.stack([signals[name] for name in names.split()], axis=-1)
     estimator = vb.Estimator(contacts, names, np.diag(sigma**2), felt_above=5.0)
     length = contacts.whisker.length
-    follow = vb.ContactFilter(estimator, speed=2.5 * length, persistence=0.01)
+    follow = vb.ContactFilter(estimator)
     out = []
     for i in range(len(time)):
         known = follow(time[i], rows[i], turn[i], base[i])

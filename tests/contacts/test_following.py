@@ -22,7 +22,7 @@ def curved():
     return vb.ContactMap.simulate(whisker, grid=False), trial
 
 
-def followed(contacts, trial, names, seed):
+def followed(contacts, trial, names, seed, **how):
     """Errors, their χ², and how often the first and the filter's candidate are the right one."""
     truth, top = trial["truth"].to_dataset(), trial.to_dataset()
     force, moment, point = (
@@ -35,7 +35,7 @@ def followed(contacts, trial, names, seed):
     signals = vb.base_signals(wrench[:, :3], wrench[:, 3:])
     rows = np.stack([signals[name] for name in names.split()], axis=-1)
     estimator = vb.Estimator(contacts, names, np.diag(SIGMA**2), felt_above=5.0)
-    follow = vb.ContactFilter(estimator, speed=0.1, persistence=0.01)
+    follow = vb.ContactFilter(estimator, **(how or {"speed": 0.1, "persistence": 0.01}))
     squares, first, ours, surely_wrong, seen = [], [], [], 0, 0
     for i, time in enumerate(top.time.values):
         known = follow(time, rows[i], turn[i], base[i])
@@ -70,6 +70,15 @@ def test_the_right_one_of_several_contacts_is_followed_as_surely_as_said(curved,
     assert 1.5 < squares.mean() < 4.5
     assert np.mean(squares > 7.81) < 0.12  # 5 % in theory
     assert np.mean([run[3] for run in runs]) < 0.01
+
+
+@pytest.mark.parametrize("names", ["Fx MB MD", "FT FD MB"])
+def test_a_contact_that_slides_is_followed_as_surely_as_stated_by_default(curved, names):
+    """The peg is at rest, but without friction the contact slides along it at 2 L/s."""
+    squares = np.concatenate([followed(*curved, names, s, persistence=0.05)[0] for s in range(3)])
+    assert len(squares) > 180
+    assert 1.8 < squares.mean() < 4.2
+    assert np.mean(squares > 7.81) < 0.12  # 5 % in theory
 
 
 @pytest.fixture(scope="module")
@@ -109,6 +118,27 @@ def test_two_moments_and_a_moving_base_locate_a_contact(wire):
         last.append(errors[-1])
     assert max(last) < 0.012
     assert 1.0 < np.mean(squares) < 5.0
+
+
+def test_a_contact_at_rest_is_averaged_by_default(wire):
+    """A filter that finds the speed is as exact as one for which contacts hardly move."""
+    time, point = np.arange(0.0, 0.3, 0.005), np.array([0.18, 0.03, 0.01])
+    turn, base, wrench = swaying(wire.whisker, point, time)
+    noise = np.repeat([1e-3, 1e-4], 3)
+    rng = np.random.default_rng(0)
+    errors = {None: [], 0.015: [], 1.25: []}
+    seen = wrench + noise * rng.normal(size=wrench.shape)
+    estimator = vb.Estimator.of_sensor(wire, Sensor(noise=noise), felt_above=5.0)
+    for how, out in errors.items():
+        follow = vb.ContactFilter(estimator, speed=how)
+        for i in range(len(time)):
+            known = follow(time[i], seen[i], turn[i], base[i])
+            out.append(np.linalg.norm(known.point - point))
+            assert known.probability > 0.99 or i < 3
+            assert len(known.points) < 5  # what differs only in speed is one contact
+    late = {how: np.median(out[20:]) for how, out in errors.items()}
+    assert late[None] < 1.3 * late[0.015]
+    assert late[None] < 0.7 * late[1.25]
 
 
 @pytest.mark.slow

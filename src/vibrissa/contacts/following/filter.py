@@ -6,6 +6,10 @@ follows an Ornstein-Uhlenbeck process:
 
     dp = v dt,    dv = -v dt / τ + σ √(2 / τ) dW.
 
+A contact that is held is slow, and one that slides along an object without friction a hundred times
+as fast. So the speed σ of each hypothesis is one of a few, from which it may change to another at
+any time ("interacting multiple models", Blom and Bar-Shalom 1988).
+
 The likelihood of a contact's first sample is split into Gaussians
 (:mod:`~vibrissa.contacts.following.onset`). Each further sample moves them and reweights them by
 how well they predicted it (:mod:`~vibrissa.contacts.following.mixture`). A sample of two signals
@@ -27,7 +31,15 @@ from vibrissa.contacts.contacts import LEFT, Contact
 from vibrissa.contacts.engine.prior import Prior, refuse_tip
 from vibrissa.contacts.engine.readout import Measurement
 from vibrissa.contacts.estimator import Estimator
-from vibrissa.contacts.following.mixture import Mixture, learn, predict, room, tidy, unaccounted
+from vibrissa.contacts.following.mixture import (
+    Mixture,
+    learn,
+    predict,
+    room,
+    switch,
+    tidy,
+    unaccounted,
+)
 from vibrissa.contacts.following.onset import Beginning, Gaussians, groups
 from vibrissa.contacts.sensing.noise import explained
 from vibrissa.contacts.uncertainty.posterior import THREE_SIGMA
@@ -39,10 +51,10 @@ from vibrissa.status import Status
 _UNKNOWNS = 3
 _LEVEL, _ORIGIN = np.eye(3), np.zeros(3)  # pose of a base at rest in the laboratory frame
 _LEAST = 1e-6  # probability relative to the best hypothesis below which one is dropped
-_MOST = 24  # largest number of hypotheses
+_MOST = 24  # largest number of hypotheses of one speed
 # Squared Mahalanobis distance, by the sum of both covariances, below which two hypotheses are
 # merged.
-_ONE = 0.1
+_ONE = 0.3
 _NEW = 16.0  # the same distance from every hypothesis above which a candidate is a new one
 # Largest deflection (over L) before contact is detected: if the onset is unknown, and at least.
 _ANYWHERE = 0.3
@@ -50,8 +62,15 @@ _LEAST_REACH = 0.01
 # Distance (over L) that a contact may have moved in a gap, and RMS error of the hypotheses, above
 # which the filter starts anew.
 _GAP, _FORGOTTEN = 0.1, 0.5
-
-
+# Speeds of contact points, over L per second, their prior probabilities, and the rate at which a
+# contact takes a speed anew, 1/s. A contact that moves little has the first; one that slides along
+# an object the others; one just before it slips off, or whose base's motion is unknown, the last.
+_SPEEDS, _SHARES = np.array([0.05, 0.25, 1.25, 6.25]), np.array([0.3, 0.4, 0.2, 0.1])
+_RATE = 2.0
+# Squared Mahalanobis distance, by the sum of both covariances, below which a hypothesis that takes
+# another speed joins one that has it.
+_JOINED = 4.0
+_APPROACH = 0.25  # speed, over L per second, at which objects may approach the whisker
 _SURE = 0.99  # probability above which a contact is no longer ambiguous
 # Trial factors of a covariance, and a negligible probability.
 _FACTORS, _NOTHING = np.linspace(1.0, 4.0, 31), 1e-12
@@ -84,25 +103,20 @@ class Followed(NamedTuple):
 
 
 class Drift:
-    """Law of motion of (p, v)."""
+    """Laws of motion of (p, v), which differ in speed, with their probabilities."""
 
-    def __init__(self, speed: float, persistence: float) -> None:
-        self.speed, self._tau = speed, persistence
+    def __init__(self, speeds: Array, shares: Array, persistence: float) -> None:
+        self.speeds, self.shares, self._tau = speeds, shares, persistence
 
     def over(self, step: float) -> tuple[float, float, Array]:
-        """Coefficients of the motion over a time step."""
-        tau, speed = self._tau, self.speed
+        """Coefficients of the motion over a time step; growth (n, 3) for n laws."""
+        tau, speed = self._tau, self.speeds
         x = step / tau
         a = math.exp(-x)
         # 2x - 3 + 4a - a² suffers from cancellation if x is small.
         walked = 2.0 * x - 3.0 + 4.0 * a - a * a if x > 0.01 else x**3 * (2.0 / 3.0 - 0.5 * x)
-        grown = np.array(
-            [
-                (speed * tau) ** 2 * walked,
-                speed**2 * tau * (1.0 - a) ** 2,
-                speed**2 * (1.0 - a * a),
-            ]
-        )
+        unit = np.array([tau**2 * walked, tau * (1.0 - a) ** 2, 1.0 - a * a])
+        grown = speed[:, None] ** 2 * unit
         return tau * (1.0 - a), a, grown
 
 
@@ -114,8 +128,9 @@ class ContactFilter:
     estimator : Estimator
         Estimator of single samples, with noise.
     speed : float, optional
-        Standard deviation of a component of the contact point's velocity in the laboratory, m/s; by
-        default a quarter of the whisker's length per second.
+        Standard deviation of a component of the contact point's velocity in the laboratory, m/s. By
+        default it is unknown, and found sample by sample between 0.05 and 6 lengths of the whisker
+        per second.
     persistence : float
         Correlation time τ of the velocity, s.
     pose_sigma : float
@@ -149,8 +164,8 @@ class ContactFilter:
                 f"a filter needs an Estimator(contact_map, noise=...); got {estimator!r}"
             )
         self._length = estimator.contact_map.whisker.length
-        speed = 0.25 * self._length if speed is None else speed
-        if not (speed > 0.0 and persistence > 0.0 and pose_sigma >= 0.0 and 0.0 < birth < 1.0):
+        approach = _APPROACH if speed is None else speed / self._length
+        if not (approach > 0.0 and persistence > 0.0 and pose_sigma >= 0.0 and 0.0 < birth < 1.0):
             raise ValueError(
                 "speed and persistence are positive, pose_sigma is not negative and birth between "
                 f"0 and 1; got {speed}, {persistence}, {pose_sigma} and {birth}"
@@ -171,7 +186,11 @@ class ContactFilter:
         self._weighted = estimator if estimator.weighted else None
         estimator = estimator.sagged() if self._weighted else estimator
         self.estimator = estimator
-        self._drift = Drift(speed / self._length, persistence)
+        if speed is None:
+            self._drift = Drift(_SPEEDS, _SHARES, persistence)
+        else:
+            self._drift = Drift(np.array([approach]), np.ones(1), persistence)
+        self._approach = approach
         self._memory = memory
         self._pose = (pose_sigma / self._length) ** 2
         self._birth = math.log(birth)
@@ -290,7 +309,7 @@ class ContactFilter:
         )
         explains = bool((misfits[:n] < self._limit).any())
         evidence = float(np.logaddexp.reduce(out.weight[:n]))
-        self._mixture = _tidied(out, n)
+        self._mixture = self._tidied(out, n)
         return explains, evidence
 
     def _unaccounted(self, values: Array, located: Contact, turn: Array, base: Array) -> AnyArray:
@@ -310,7 +329,7 @@ class ContactFilter:
             return _ANYWHERE
         time, *pose = self._free
         moved = self._beginning.moved(turn, base, (pose[0], pose[1]))
-        moved += 3.0 * self._drift.speed * (self._time - time)
+        moved += 3.0 * self._approach * (self._time - time)
         return min(max(moved, _LEAST_REACH), _ANYWHERE)
 
     def _add(self, found: Gaussians, turn: Array, base: Array, log_prior: float) -> None:
@@ -318,16 +337,20 @@ class ContactFilter:
         if self.estimator.prior is not None:
             found = self._possible(self.estimator.prior, found)
         n, old = len(found.weights), len(self._mixture.weight)
-        out = room(old + n, self._errors)
+        out = room(old + n * len(self._drift.speeds), self._errors)
         for mine, before in zip(out, self._mixture, strict=True):
             mine[:old] = before
-        out.mean[old:, :3] = found.points @ turn.T + base
-        out.spread[old:, :3, :3] = turn @ found.covariances @ turn.T + self._pose * np.eye(3)
-        out.spread[old:, 3:, 3:] = self._drift.speed**2 * np.eye(3)
-        out.by_errors[old:, :3] = turn @ found.by_errors
-        out.contact[old:], out.value[old:] = found.contacts, found.values
-        out.weight[old:] = found.weights + log_prior
-        self._mixture = _tidied(out, old + n)
+        laws = zip(self._drift.speeds, self._drift.shares, strict=True)
+        for law, (speed, share) in enumerate(laws):
+            new = slice(old + law * n, old + (law + 1) * n)
+            out.mean[new, :3] = found.points @ turn.T + base
+            out.spread[new, :3, :3] = turn @ found.covariances @ turn.T + self._pose * np.eye(3)
+            out.spread[new, 3:, 3:] = speed**2 * np.eye(3)
+            out.by_errors[new, :3] = turn @ found.by_errors
+            out.contact[new], out.value[new] = found.contacts, found.values
+            out.weight[new] = found.weights + log_prior + math.log(share)
+            out.law[new] = law
+        self._mixture = self._tidied(out, len(out.weight))
 
     def _possible(self, prior: Prior, found: Gaussians) -> Gaussians:
         d, whisker = (
@@ -341,10 +364,15 @@ class ContactFilter:
     def _predict(self, step: float) -> None:
         if not len(self._mixture.weight):
             return
+        if len(self._drift.speeds) > 1:
+            out = room(len(self._mixture.weight) * len(self._drift.speeds), self._errors)
+            gone = -math.expm1(-step * _RATE)
+            n = switch(self._mixture, gone, self._drift.shares, _JOINED, out)
+            self._mixture = self._tidied(out, n)
         predict(self._mixture, *self._drift.over(step))
         if self._memory < math.inf:
             self._forget(math.exp(-step / self._memory))
-        if step * self._drift.speed < _GAP:
+        if step * self._drift.speeds[-1] < _GAP:
             return
         variance = np.trace(self._mixture.spread[:, :3, :3], axis1=1, axis2=2)
         if (variance > _FORGOTTEN**2).all():
@@ -360,13 +388,17 @@ class ContactFilter:
         spread += (1.0 - kept**2) * by @ np.swapaxes(by, 1, 2)
         by *= kept
 
+    def _tidied(self, mixture: Mixture, number: int) -> Mixture:
+        kept = tidy(mixture, number, _LEAST, _MOST * len(self._drift.speeds), _ONE)
+        return Mixture._make(part[:kept] for part in mixture)
+
     def _known(self, status: Status, located: Contact | None, turn: Array, base: Array) -> Followed:
-        return combined(self._mixture, status, located, turn, base, self._length)
-
-
-def _tidied(mixture: Mixture, number: int) -> Mixture:
-    kept = tidy(mixture, number, _LEAST, _MOST, _ONE)
-    return Mixture(*(part[:kept] for part in mixture))
+        whole = self._mixture
+        if whole.law.any():  # what differs only in speed is one contact
+            whole = Mixture._make(part.copy() for part in whole)
+            whole.law[:] = 0
+            whole = self._tidied(whole, len(whole.weight))
+        return combined(whole, status, located, turn, base, self._length)
 
 
 def nothing_known(status: Status, located: Contact | None) -> Followed:

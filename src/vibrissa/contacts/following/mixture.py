@@ -51,7 +51,10 @@ _PLACE = 11  # codes of px, py and pz among the channels
 
 
 class Mixture(NamedTuple):
-    """Hypotheses: Gaussians over (p, v) in the laboratory, in L and L/s, with log weights."""
+    """Hypotheses: Gaussians over (p, v) in the laboratory, in L and L/s, with log weights.
+
+    Each moves by one of several laws, which differ in speed.
+    """
 
     mean: Array
     spread: Array
@@ -59,17 +62,19 @@ class Mixture(NamedTuple):
     contact: Array
     value: Array
     weight: Array
+    law: IntArray
 
 
 @kernel
 def predict(mixture: Mixture, moved: float, kept: float, grown: Array) -> None:
     """Predict the mixture after a time step.
 
-    p changes by ``moved`` v, v keeps a share ``kept``, and ``grown`` (pp, pv, vv) is added to the
-    covariance.
+    p changes by ``moved`` v, v keeps a share ``kept``, and ``grown`` (pp, pv, vv), of the law of
+    each, is added to the covariance.
     """
     for i in range(mixture.mean.shape[0]):
         m, s, b = mixture.mean[i], mixture.spread[i], mixture.by_errors[i]
+        added = grown[mixture.law[i]]
         for a in range(3):
             m[a] += moved * m[3 + a]
             m[3 + a] *= kept
@@ -84,10 +89,10 @@ def predict(mixture: Mixture, moved: float, kept: float, grown: Array) -> None:
                 s[3 + a, c] = kept * (vp + moved * vv)
                 s[3 + a, 3 + c] = kept * kept * vv
         for a in range(3):
-            s[a, a] += grown[0]
-            s[a, 3 + a] += grown[1]
-            s[3 + a, a] += grown[1]
-            s[3 + a, 3 + a] += grown[2]
+            s[a, a] += added[0]
+            s[a, 3 + a] += added[1]
+            s[3 + a, a] += added[1]
+            s[3 + a, 3 + a] += added[2]
 
 
 def room(n: int, errors: int) -> Mixture:
@@ -99,57 +104,110 @@ def room(n: int, errors: int) -> Mixture:
         np.zeros((n, 4)),
         np.zeros((n, 6)),
         np.zeros(n),
+        np.zeros(n, np.int64),
     )
+
+
+@inlined
+def _merge(mixture: Mixture, j: int, mean: Array, spread: Array, by: Array, weight: float) -> None:
+    """Merge another Gaussian into row j, with the mean and covariance of both together."""
+    top = mixture.weight[j]
+    share = np.exp(weight - top) / (1.0 + np.exp(weight - top))
+    apart = mean - mixture.mean[j]
+    for a in range(6):
+        mixture.mean[j, a] += share * apart[a]
+        for e in range(by.shape[1]):
+            old = mixture.by_errors[j, a, e]
+            mixture.by_errors[j, a, e] = old + share * (by[a, e] - old)
+        for b in range(6):
+            old = mixture.spread[j, a, b]
+            moved = share * (spread[a, b] - old) + share * (1.0 - share) * apart[a] * apart[b]
+            mixture.spread[j, a, b] = old + moved
+    mixture.weight[j] = top + np.log1p(np.exp(weight - top))
+
+
+@inlined
+def _put(mixture: Mixture, i: int, out: Mixture, row: int) -> None:
+    """Copy hypothesis i to a row of ``out``."""
+    copy(mixture.mean[i], out.mean[row])
+    for a in range(6):
+        copy(mixture.spread[i, a], out.spread[row, a])
+        copy(mixture.by_errors[i, a], out.by_errors[row, a])
+    copy(mixture.contact[i], out.contact[row])
+    copy(mixture.value[i], out.value[row])
+    out.weight[row], out.law[row] = mixture.weight[i], mixture.law[i]
+
+
+@inlined
+def _apart(mixture: Mixture, i: int, out: Mixture, j: int) -> float:
+    """Squared Mahalanobis distance of two contact points, by the sum of both covariances."""
+    both, away = np.empty((3, 3)), np.empty(3)
+    for a in range(3):
+        away[a] = mixture.mean[i, a] - out.mean[j, a]
+        for b in range(3):
+            both[a, b] = mixture.spread[i, a, b] + out.spread[j, a, b]
+    return mahalanobis(both, away) if cholesky(both, both) else np.inf
+
+
+@kernel
+def switch(mixture: Mixture, gone: float, shares: Array, near: float, out: Mixture) -> int:
+    """Fill ``out`` with hypotheses of which a share ``gone`` has taken a law anew; their number.
+
+    What changes to a law joins the nearest hypothesis of that law, if one is near, as in the filter
+    of interacting multiple models.
+    """
+    rows = len(mixture.weight)
+    for i in range(rows):
+        _put(mixture, i, out, i)
+        out.weight[i] += np.log1p(-gone * (1.0 - shares[mixture.law[i]]))
+    for i in range(len(mixture.weight)):
+        for law in range(len(shares)):
+            if law == mixture.law[i]:
+                continue
+            twin, least = -1, near
+            for j in range(rows):
+                if out.law[j] == law:
+                    far = _apart(mixture, i, out, j)
+                    if far < least:
+                        twin, least = j, far
+            weight = mixture.weight[i] + np.log(gone * shares[law])
+            if twin >= 0:
+                mean, spread, by = mixture.mean[i], mixture.spread[i], mixture.by_errors[i]
+                _merge(out, twin, mean, spread, by, weight)
+            else:
+                _put(mixture, i, out, rows)
+                out.weight[rows], out.law[rows] = weight, law
+                rows += 1
+    return rows
 
 
 @kernel
 def tidy(mixture: Mixture, number: int, least: float, most: int, near: float) -> int:
     """Sort and normalise hypotheses, drop improbable ones, and merge those that coincide."""
-    order, both, away = order_of(-mixture.weight[:number]), np.empty((3, 3)), np.empty(3)
-    mean, spread = mixture.mean[order], mixture.spread[order]
-    by, contact = mixture.by_errors[order], mixture.contact[order]
-    value, weight = mixture.value[order], mixture.weight[order]
+    order = order_of(-mixture.weight[:number])
+    old = Mixture(
+        mixture.mean[order],
+        mixture.spread[order],
+        mixture.by_errors[order],
+        mixture.contact[order],
+        mixture.value[order],
+        mixture.weight[order],
+        mixture.law[order],
+    )
     kept = 0
     for i in range(number):
-        if weight[i] < weight[0] + np.log(least) or not np.isfinite(weight[i]):
+        if old.weight[i] < old.weight[0] + np.log(least) or not np.isfinite(old.weight[i]):
             break
         twin = -1
         for j in range(kept):
-            for a in range(3):
-                away[a] = mean[i, a] - mixture.mean[j, a]
-                for b in range(3):
-                    both[a, b] = spread[i, a, b] + mixture.spread[j, a, b]
-            if cholesky(both, both) and mahalanobis(both, away) < near:
+            if old.law[i] == mixture.law[j] and _apart(old, i, mixture, j) < near:
                 twin = j
                 break
         if twin >= 0:
-            top = mixture.weight[twin]
-            share = np.exp(weight[i] - top) / (1.0 + np.exp(weight[i] - top))
-            apart = mean[i] - mixture.mean[twin]
-            for a in range(6):
-                mixture.mean[twin, a] += share * apart[a]
-                for e in range(by.shape[2]):
-                    old = mixture.by_errors[twin, a, e]
-                    mixture.by_errors[twin, a, e] = old + share * (by[i, a, e] - old)
-                for b in range(6):
-                    old = mixture.spread[twin, a, b]
-                    mixture.spread[twin, a, b] = (
-                        old
-                        + share * (spread[i, a, b] - old)
-                        + share * (1.0 - share) * apart[a] * apart[b]
-                    )
-            mixture.weight[twin] = top + np.log1p(np.exp(weight[i] - top))
-            continue
-        if kept == most:
-            continue
-        copy(mean[i], mixture.mean[kept])
-        for a in range(6):
-            copy(spread[i, a], mixture.spread[kept, a])
-            copy(by[i, a], mixture.by_errors[kept, a])
-        copy(contact[i], mixture.contact[kept])
-        copy(value[i], mixture.value[kept])
-        mixture.weight[kept] = weight[i]
-        kept += 1
+            _merge(mixture, twin, old.mean[i], old.spread[i], old.by_errors[i], old.weight[i])
+        elif kept < most:
+            _put(old, i, mixture, kept)
+            kept += 1
     if kept:
         top = mixture.weight[:kept].max()
         total = top + np.log(np.exp(mixture.weight[:kept] - top).sum())
@@ -439,7 +497,7 @@ def _moved(
         for e in range(6):
             out.spread[row, a, e] = 0.5 * (whole[a, e] + whole[e, a])
     copy(x, out.contact[row])
-    out.weight[row] = mixture.weight[i] + weight
+    out.weight[row], out.law[row] = mixture.weight[i] + weight, mixture.law[i]
     return True
 
 

@@ -236,6 +236,7 @@ def test_info(folder, table, chart):
         ),
         (("deflect", "--point", "1,2"), "X,Y,Z are needed"),
         (("deflect", "--whisker", "none.csv", "--point", "1,2,3"), "there is no file none.csv"),
+        (("deflect", "--whisker", "C2", "--point", "1,2,3"), "no file C2; built-in whiskers are"),
         (("estimate", "none.csv"), "there is no file none.csv"),
         (("estimate", "none.csv", "--using", "Fx MB"), "at least 3 different signals"),
         (("estimate", "none.csv", "--method", "guess"), "is not one of"),
@@ -254,6 +255,15 @@ def test_info(folder, table, chart):
 )
 def test_a_fault_is_one_message_and_status_2(monkeypatch, capsys, arguments, message):
     assert message in fault(monkeypatch, capsys, *arguments)
+
+
+def test_built_in_whiskers_have_names(folder, table, chart):
+    """All verbs read --whisker in one way; a file of that name comes first."""
+    targets = [folder / name for name in ("named.csv", "mapped.csv")]
+    run("estimate", table[0], "--whisker", "gamma", "-o", targets[0])
+    run("estimate", table[0], "--map", chart, "-o", targets[1])
+    assert targets[0].read_text() == targets[1].read_text()
+    assert "touches the side" in run("deflect", "--whisker", "straight", "--point", "24,8,1")
 
 
 def test_files_of_the_wrong_kind(monkeypatch, capsys, folder, table, chart):

@@ -41,7 +41,7 @@ def test_a_few_odd_samples_stop_no_table(bent, contact_map):
     assert (found.status == vb.Status.UNIQUE).sum() == 28
 
 
-def test_swapped_arguments_get_a_hint(bent):
+def test_swapped_arguments_get_a_hint(bent, contact_map):
     with pytest.raises(ValueError, match="whisker comes first"):
         vb.deflect(bent.load, bent.whisker)
     with pytest.raises(ValueError, match="whisker comes first"):
@@ -54,6 +54,14 @@ def test_swapped_arguments_get_a_hint(bent):
     for needs_a_map in (vb.uniqueness, vb.sensitivity, vb.Estimator):
         with pytest.raises(ValueError, match=r"ContactMap.simulate\(whisker\)"):
             needs_a_map(bent.whisker)
+    sensor = vb.sensors.Sensor(("My", "Mz"), noise=2e-8)
+    for using, noise in ((sensor, None), ("Fx MB MD", sensor)):
+        with pytest.raises(ValueError, match=r"Estimator.of_sensor\(contact_map, sensor\)"):
+            vb.Estimator(contact_map, using, noise)
+    with pytest.raises(ValueError, match="a Sensor is needed"):
+        vb.Estimator.of_sensor(contact_map, "Fx MB MD")
+    with pytest.raises(ValueError, match=r"3 different signals of .* got <Sensor"):
+        contact_map.estimate(vb.base_signals(bent.force, bent.moment), sensor)
     with pytest.raises(ValueError, match="needs an Estimator"):
         vb.ContactFilter(bent.whisker)
     with pytest.raises(ValueError, match=r"objects are .* got <?Whisker"):

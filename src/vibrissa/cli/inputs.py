@@ -42,12 +42,22 @@ class WhiskerOptions:
         if path is None:
             return vb.samples.gamma()
         if not path.exists():
-            raise FileNotFoundError(f"there is no file {path}")
+            return self._built_in(path)
         if not vb.io.is_netcdf(path):
             if vb.io.recognise(path) == vb.io.Kind.VIDEO:
                 raise ValueError(f"{path} is a video; a whisker, map or recording is needed")
             return vb.load_whisker(path, rat=self.rat, any_length=self.any_length)
         whisker = _whisker_in(path)
+        return whisker if self.rat is None else whisker.with_properties(rat=self.rat)
+
+    def _built_in(self, path: Path) -> vb.Whisker:
+        """Whisker of `vibrissa.samples` by its name, where there is no such file."""
+        names = vb.samples.__all__
+        if str(path) not in names:
+            raise FileNotFoundError(
+                f"there is no file {path}; built-in whiskers are {', '.join(names)}"
+            )
+        whisker: vb.Whisker = getattr(vb.samples, str(path))()
         return whisker if self.rat is None else whisker.with_properties(rat=self.rat)
 
     def in_recording(self, recording: xr.DataTree) -> list[vb.Whisker]:

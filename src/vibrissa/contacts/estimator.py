@@ -99,6 +99,10 @@ class Estimator:
         gravity: Gravity | ArrayLike | None = None,
     ) -> None:
         need_map(contact_map)
+        if isinstance(using, Sensor) or isinstance(noise, Sensor):
+            raise ValueError(
+                "readings of a Sensor are located by Estimator.of_sensor(contact_map, sensor)"
+            )
         names = selection(using, least=1)
         given = using.replace(",", " ").split() if isinstance(using, str) else using
         order = [selection([name], least=1)[0] for name in given]
@@ -182,6 +186,11 @@ class Estimator:
         ValueError
             If a channel has no noise, or channels do not tell anything.
         """
+        if not isinstance(sensor, Sensor):
+            raise ValueError(
+                "a Sensor is needed; signals by name and their noise are stated by "
+                f"Estimator(contact_map, using, noise); got {sensor!r}"
+            )
         out = cls.__new__(cls)
         h, covariance = sensor.base_mixing, sensor.covariance()
         noise = np.diag(covariance)

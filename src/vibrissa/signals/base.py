@@ -13,9 +13,9 @@ Directions are angles in (-π, π]; differences of them are taken modulo 2π.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from itertools import combinations
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -45,8 +45,8 @@ def selection(
     signals: str | Sequence[str] | None, least: int = 3, exactly: int | None = None
 ) -> tuple[str, ...]:
     """Parse a choice of signals into their names, in canonical order."""
-    given = signals.replace(",", " ").split() if isinstance(signals, str) else signals
-    given = [] if given is None else list(given)
+    given: Any = signals.replace(",", " ").split() if isinstance(signals, str) else signals
+    given = [] if given is None else list(given) if isinstance(given, Iterable) else [given]
     spelt = {name.lower(): name for name in SIGNALS}
     names = [spelt.get(str(name).lower(), name) for name in given]
     unknown = [name for name in names if name not in SIGNALS]

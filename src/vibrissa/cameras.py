@@ -131,7 +131,14 @@ class Camera:
         array (..., 2)
             Column and row, pixels, inside the image or not; NaN behind a perspective camera.
         """
-        return self.project_with_slopes(points)[0]
+        points = vectors("points", points)
+        seen = self._seen(points)
+        if self.projection == "orthographic":
+            return self._in_image(seen[:2], points)
+        flat = seen[:2] / np.where(seen[2] > 0.0, seen[2], np.nan)
+        # Most of the time would be spent on derivatives.
+        bent = _distort(flat, self.distortion)[0] if self.distortion.any() else flat
+        return self._in_image(bent, points)
 
     def project_with_slopes(self, points: ArrayLike) -> tuple[Array, Array]:
         """Project points into the image, with derivatives.
@@ -149,8 +156,7 @@ class Camera:
             Derivatives of the pixels by the points, pixels per m.
         """
         points = vectors("points", points)
-        # By coordinates: long arrays, of which each operation takes little.
-        seen = self.rotation @ points.reshape(-1, 3).T + self.translation[:, None]
+        seen = self._seen(points)
         focal, slopes = self.matrix[:2, :2], np.empty((*points.shape[:-1], 2, 3))
         if self.projection == "orthographic":
             slopes[:] = focal @ self.rotation[:2]
@@ -164,8 +170,16 @@ class Camera:
                 np.einsum("i,ijn->jn", by_bent, jacobian * nearness, out=by_seen[:2])
                 by_seen[2] = -(by_seen[:2] * flat).sum(axis=0)
                 row[...] = (by_seen.T @ self.rotation).reshape(points.shape)
-        pixels = focal @ bent + self.matrix[:2, 2:]
-        return np.ascontiguousarray(pixels.T).reshape(*points.shape[:-1], 2), slopes
+        return self._in_image(bent, points), slopes
+
+    def _seen(self, points: Array) -> Array:
+        """Points in the camera's frame, by coordinates: long arrays of which each takes little."""
+        return np.asarray(self.rotation @ points.reshape(-1, 3).T + self.translation[:, None])
+
+    def _in_image(self, bent: Array, points: Array) -> Array:
+        """Column and row (..., 2) of points (..., 3) in directions (2, n)."""
+        pixels = self.matrix[:2, :2] @ bent + self.matrix[:2, 2:]
+        return np.ascontiguousarray(pixels.T).reshape(*points.shape[:-1], 2)
 
     def rays(self, pixels: ArrayLike) -> tuple[Array, Array]:
         """Compute the lines of sight of pixels.

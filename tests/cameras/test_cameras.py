@@ -68,6 +68,14 @@ def test_projection_with_distortion_is_opencv_s():
         np.testing.assert_allclose(camera.project(point), [5000 * u + 500, 5100 * v + 400])
 
 
+def test_pixels_are_the_same_with_and_without_slopes(pair):
+    points = np.random.default_rng(3).uniform(-0.02, 0.02, (7, 2, 3))
+    for camera in (*pair, *orthogonal_views()):
+        np.testing.assert_allclose(
+            camera.project(points), camera.project_with_slopes(points)[0], rtol=1e-13
+        )
+
+
 def test_slopes_are_derivatives(pair):
     for camera in pair:
         _, slopes = camera.project_with_slopes(POINTS)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, maximum_filter
 
 from vibrissa import Whisker
 from vibrissa.cameras import Camera, orthogonal_views
@@ -16,10 +16,26 @@ from vibrissa.tracking import TrackOptions, track
 from vibrissa.tracking.refine.fit import Touches
 from vibrissa.tracking.refine.peg import PEG_UNKNOWNS, UNITS, UncertainPeg
 from vibrissa.tracking.refine.problem import Smoother
-from vibrissa.tracking.refine.silhouette import explains, peg_in_images
+from vibrissa.tracking.refine.silhouette import (
+    _largest_near,
+    _median,
+    explains,
+    peg_in_images,
+)
 from vibrissa.tracking.space.rest_shape import _free
 
 SIZE, PIXEL, HALF = 260, 100e-6, 20e-3
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 30])
+def test_medians_of_images_are_those_of_numpy(count):
+    frames = np.random.default_rng(count).integers(0, 256, (count, 9, 12)).astype(np.uint8)
+    np.testing.assert_array_equal(_median(list(frames)), np.median(frames, axis=0))
+
+
+def test_largest_values_nearby_are_those_of_scipy():
+    values = np.random.default_rng(0).normal(size=(9, 12))
+    np.testing.assert_array_equal(_largest_near(values), maximum_filter(values, 5))
 
 
 def lenses():
@@ -237,6 +253,14 @@ def test_contacts_are_fitted_on_a_peg_that_images_show(filmed, traced):
     for share in (50, 95):
         assert np.percentile(errors[1], share) < 0.7 * np.percentile(errors[0], share)
     assert np.abs(peg.signed_distance(points)).max() < 60e-6
+
+
+@pytest.mark.parametrize("count", [5, 12])
+def test_without_contacts_no_peg_is_looked_for(filmed, traced, count):
+    free = np.flatnonzero(filmed.truth["in_contact"].values == 0)[:count]
+    some = [[[row[i] for i in free] for row in view] for view in traced]
+    found = track(filmed.cameras, some, 1000.0, sample=filmed.frames)
+    assert not found["in_contact"].values.any()
 
 
 def _without_tip(trace):

@@ -15,7 +15,7 @@ from vibrissa.tracking import (
     track,
 )
 from vibrissa.tracking.recording import remarks_on
-from vibrissa.tracking.refine.problem import trace_variance
+from vibrissa.tracking.refine.problem import _LENGTHS, _correlation, trace_variance
 from vibrissa.tracking.space.frame_pairs import clear_offsets
 from vibrissa.tracking.space.rest_shape import (
     Length,
@@ -240,6 +240,35 @@ def test_errors_that_the_fit_follows_count_too():
     )
     (found,) = trace_variance([left], [designs], covariance, 0.04, even=True)
     assert np.median(found) == pytest.approx((1.0 + share) / (1.0 - share), rel=0.3)
+
+
+def test_what_the_fit_leaves_is_that_of_the_whole_matrices():
+    """The length of correlation whose R V Rᵀ, written out, is most like the residuals."""
+    generator = np.random.default_rng(2)
+    designs, miss = generator.normal(size=(2, 30, 24, 6)), generator.normal(size=(30, 48))
+    miss[generator.random(miss.shape) < 0.1] = 0.0
+    design = np.concatenate(designs, axis=1) * (miss != 0.0)[:, :, None]
+    covariance = np.linalg.inv(np.swapaxes(design, 1, 2) @ design)
+    found = _correlation(miss, np.arange(30), (design @ covariance, design), 2)
+    known = (miss != 0.0)[:, :, None] * np.eye(48)
+    remains = known - design @ covariance @ np.swapaxes(design, 1, 2)
+    apart = np.abs(np.subtract.outer(np.arange(24), np.arange(24)))
+
+    def lagged(moments):
+        return np.array(
+            [
+                sum(np.trace(moments[v : v + 24, v : v + 24], lag) for v in (0, 24))
+                for lag in range(13)
+            ]
+        )
+
+    shown, best = lagged(miss.T @ miss), []
+    for length in _LENGTHS:
+        errors = np.kron(np.eye(2), np.exp(-apart / length))
+        moments = lagged((remains @ errors @ np.swapaxes(remains, 1, 2)).sum(axis=0))
+        differs = ((shown / shown[0] - moments / moments[0]) ** 2).sum()
+        best.append((differs, 1.0 / np.tanh(0.5 / length), moments[0] / (miss != 0.0).sum()))
+    assert found == pytest.approx(min(best)[1:], rel=1e-12)
 
 
 def test_parts_of_a_whisker_are_trusted_as_far_as_their_residuals_allow():

@@ -245,9 +245,9 @@ def test_the_equations_hold_the_derivatives_of_the_residuals():
         for view in range(2):
             change = (here.misses[view] - there.misses[view]) / size
             stated = here.designs[view][:, :-2, unknown]
-            if unknown > 5:
-                assert not stated[4].any()
-                stated, change = np.delete(stated, 4, axis=0), np.delete(change, 4, axis=0)
+            # The rod of the frame without contact is as at rest, far from its trace.
+            assert unknown < 6 or not stated[4].any()
+            stated, change = np.delete(stated, 4, axis=0), np.delete(change, 4, axis=0)
             # Where another point of a trace becomes the nearest, a difference is not a derivative.
             assert np.quantile(np.abs(change - stated), 0.95) <= 0.02 * np.abs(stated).max()
     design = np.concatenate(here.designs, axis=1)

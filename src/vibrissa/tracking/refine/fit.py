@@ -35,14 +35,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.cameras import Camera
-from vibrissa.deferred import interpolate
+from vibrissa.deferred import interpolate, ndimage
 from vibrissa.numerics import Array, Mask
 from vibrissa.objects import Surface
 from vibrissa.rod import discretize, solve_forces
 from vibrissa.tracking.refine.peg import UncertainPeg
-from vibrissa.tracking.refine.problem import REST, FitOptions, Linear, Problem
+from vibrissa.tracking.refine.problem import NEARLY, FitOptions, Linear, Problem
 from vibrissa.tracking.refine.rods import (
     LIMITS,
+    REST,
     Bent,
     State,
     TraceSeries,
@@ -53,7 +54,7 @@ from vibrissa.tracking.refine.rods import (
 )
 from vibrissa.tracking.space.pose import BasePose, HeadPose
 from vibrissa.tracking.space.rest_shape import Length
-from vibrissa.tracking.trace.trace import arc_lengths, correlated
+from vibrissa.tracking.trace.trace import correlated
 from vibrissa.whisker import Whisker
 
 # Distance from an object, over the length, within which contacts are on it; and what is not seen of
@@ -67,7 +68,6 @@ _ENOUGH = 12.0  # rise of the cost up to which the profile is computed
 _LOWER = 0.5  # decrease of the cost that shows another, lower minimum
 _MARGIN = 3  # number of frames before and after a contact that are fitted with it
 _ROUNDS = 3  # number of Gauss-Newton steps at each step of a profile
-_SETTLED = 0.1  # expected decrease of the cost there below which a step is the last
 _FINE = 801  # number of values between which the profile is integrated
 
 
@@ -147,14 +147,14 @@ def _profile(problem: Problem, state: State, contact: _Contact) -> _Profile | No
     """Costs along a contact's arc length, relative to the state's; None if it is a parabola."""
     first, last = contact.rows[0] - _MARGIN, contact.rows[-1] + _MARGIN
     near = np.arange(max(first, 0), min(last + 1, len(problem.frames)))
-    part = problem.rows(near, state).with_known_peg(state)
-    part = replace(part, options=replace(problem.options, rounds=_ROUNDS))
+    short = replace(problem.options, rounds=_ROUNDS)
+    part = replace(problem.rows(near, state), fixed=True, options=short, enough=NEARLY)
     row, inside = contact.best - near[0], contact.rows - near[0]
     middle = float(state.contact[contact.best, 0])
 
     def at(arc: float, before: State) -> tuple[float, State]:
         ahead = contact.slope[near] * (arc - before.contact[row, 0])
-        held = replace(part, begun=before.moved(ahead), held=((row, arc),), enough=_SETTLED)
+        held = replace(part, begun=before.moved(ahead), held=((row, arc),))
         found, fit = held.solved()
         return fit.cost, found
 
@@ -277,9 +277,15 @@ class Fitter:
         return whole, UncertainPeg(self.peg.at(state.peg), linear.smoother.shared_covariance)
 
     def touches(self, whisker: Whisker, pose: BasePose) -> tuple[Touches, Array]:
-        """Contacts of a whisker of approximate pose, laboratory frame, and misfits (time,)."""
-        problem = self._problem(whisker, pose)
-        problem, state, linear = problem.trusted()
+        """Contacts of a whisker of approximate pose, laboratory frame, and misfits (time,).
+
+        Only frames in contact, and a few before and after, are fitted.
+        """
+        posed = np.isfinite(pose.rotation).all(axis=(1, 2))
+        near = ndimage.binary_dilation(self.touching & posed, iterations=_MARGIN)
+        near |= not near.any()
+        curves = np.where(near[:, None, None], self.curves, np.nan)
+        problem, state, linear = replace(self, curves=curves)._problem(whisker, pose).trusted()
         misfit = np.full(len(self.curves), np.nan)
         misfit[problem.frames] = linear.data.misfit
         point, wrench = _contacts(problem, state)
@@ -326,7 +332,7 @@ class Fitter:
             share = min(shown / whisker.length, 1.0)
             begun = before and before[1].scaled(before[0].d.length / whisker.length)
             problem = replace(self, traces=traces)._problem(whisker, pose, begun)
-            problem = replace(problem, shown=share)
+            problem = replace(problem, shown=share, enough=NEARLY)
             if before is None:
                 # The first whisker sets the variance of the traces, but not where it is large: the
                 # residuals of a wrong length are largest where it matters.
@@ -386,7 +392,8 @@ class Fitter:
         curves = self.head.rows(frames).put_in(self.curves[frames])
         away = np.min([thing.signed_distance(curves) for thing in things], axis=0)
         at = away.argmin(axis=1)
-        arcs = np.array([arc_lengths(curve) for curve in curves])
+        steps = np.linalg.norm(np.diff(curves, axis=1), axis=2)
+        arcs = np.pad(np.cumsum(steps, axis=1), ((0, 0), (1, 0)))
         whole = arcs[:, -1].max()
         near = away.min(axis=1) < _REACH * whole + whole - arcs[:, -1]
         return near, arcs[np.arange(len(at)), at]
@@ -511,7 +518,7 @@ def _by_length(
     for sign in signs:
         share = 1.0 - sign * min(unsure / length, _MOST_UNSURE)
         other = whisker.with_properties(radius=partial(_tapered, whisker, share))
-        altered = replace(problem, whisker=other, d=discretize(other), begun=state)
+        altered = replace(problem, whisker=other, d=discretize(other), begun=state, enough=NEARLY)
         after = altered.solved()[0]
         moved, changed = _contacts(altered, after)
         turn = turns(after.rotation @ np.swapaxes(state.rotation, 1, 2))

@@ -39,6 +39,7 @@ from vibrissa.rod import Discretization
 from vibrissa.tracking.refine.peg import PEG_UNKNOWNS, UncertainPeg
 from vibrissa.tracking.refine.rods import (
     FAR,
+    REST,
     UNKNOWNS,
     Bent,
     State,
@@ -256,24 +257,26 @@ def trace_variance(
     size = np.sqrt(np.concatenate(along))
     some = np.flatnonzero(shown)
     some = some[np.linspace(0, len(some) - 1, min(_FRAMES, len(some))).astype(int)]
-    follows = design[some] @ covariance[some] @ np.swapaxes(design[some], 1, 2)
     odd = np.sqrt(np.maximum(each / (_ODD * usual), 1.0))[:, None]
-    follows = follows * size / size[:, None]
+    # The fit follows errors e as far as D C Dᵀ e.
+    follows = (design[some] / size[:, None]) @ covariance[some], design[some] * size[:, None]
     together, left = _correlation(miss / (odd * size), some, follows, len(misses))
     variance = together * each / left
     return [np.maximum(np.outer(variance, [*share, 1.0, 1.0]), least) for share in along]
 
 
 def _correlation(
-    miss: Array, some: NDArray[np.intp], follows: Array, views: int
+    miss: Array, some: NDArray[np.intp], follows: tuple[Array, Array], views: int
 ) -> tuple[float, float]:
     """Number of neighbouring errors that count as one, and the share of them in the residuals.
 
-    The fit ``follows`` errors (some, point, point) of some of the frames.
+    What the fit ``follows`` of the errors of some of the frames is the product P Qᵀ of two matrices
+    (some, point, unknown): with R = 1 − P Qᵀ, R V Rᵀ = V − (H Pᵀ + P Hᵀ), H = V Q − ½ P Qᵀ V Q.
     """
     n = miss.shape[1] // views
     known = (miss[some] != 0.0).astype(np.float64)
-    remains = known[:, :, None] * (np.eye(views * n) - follows) * known[:, None]
+    mask, numbers = known[:, :, None], known.T @ known
+    p, q = (part * mask for part in follows)
     lags = range(min(_LAGS, n // 2) + 1)
 
     def diagonals(moments: Array) -> Array:
@@ -285,7 +288,10 @@ def _correlation(
     best = (np.inf, 1.0, 1.0)
     for length in _LENGTHS:
         errors = np.kron(np.eye(views), np.exp(-apart / length))
-        moments = diagonals((remains @ errors @ np.swapaxes(remains, 1, 2)).sum(axis=0))
+        h = mask * (errors @ q)
+        h -= 0.5 * p @ (np.swapaxes(q, 1, 2) @ h)
+        cross = np.tensordot(h, p, ((0, 2), (0, 2)))
+        moments = diagonals(errors * numbers - cross - cross.T)
         differs = float(((shown / shown[0] - moments / moments[0]) ** 2).sum())
         left = float(moments[0] / known.sum())
         best = min(best, (differs, 1.0 / float(np.tanh(0.5 / length)), max(left, _FREE)))
@@ -299,12 +305,12 @@ def _neighbours(numbers: Array) -> Array:
 
 # Levenberg's damping: initial, smallest, and that at which the fit ends.
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-8, 1e6
-_SMALL = 2e-5  # relative decrease of the cost for another iteration
+# Expected decrease of the cost below which a step is the last, and the same for fits of which only
+# costs, variances of traces or changes are used.
+_SETTLED, NEARLY = 0.1, 0.2
 _HELD = 1e8  # weight with which frames without contact keep the contact at rest
 # Unknowns across the plane z = 0: a shift, turns about two axes; the force across it.
 _ACROSS = (slice(2, 5), slice(9, 10))
-# Contact of a free frame: no force, half-way along the whisker.
-REST = np.array([0.5, 0.0, 0.0, 0.0])
 # Standard deviation of the force along the whisker if there is none across, in units of EI/L².
 _RUBBING = 1e-4
 _ROLLED = np.radians(3.0)  # standard deviation of the roll before its variation is known, rad
@@ -361,6 +367,7 @@ class Compared:
     ends: list[Array]
     designs: list[Array]
     weights: list[Array]
+    tangents: list[Array]  # at contacts, if they touch known objects; see `Bent.tangents`
 
     def put(self, rows: Mask, other: Compared) -> Compared:
         """The same with some frames of another state."""
@@ -421,7 +428,8 @@ class Problem:
     variance: list[Array] | None = None
     shown: float = 1.0
     held: Sequence[tuple[int, float]] = ()  # rows whose contact's arc length is held, and that
-    enough: float = 0.0  # expected decrease of the cost below which a step is the last
+    fixed: bool = False  # whether the peg is as it is in the state that the fit begins with
+    enough: float = _SETTLED  # expected decrease of the cost below which a step is the last
 
     def rows(self, rows: NDArray[np.intp], begun: State) -> Problem:
         """The problem restricted to some frames, which begins there."""
@@ -437,17 +445,11 @@ class Problem:
             variance=self.variance and [each[rows] for each in self.variance],
         )
 
-    def with_known_peg(self, state: State) -> Problem:
-        """The problem with the peg that a state has found."""
-        if self.peg is None:
-            return self
-        return replace(self, objects=[self.peg.at(state.peg)], peg=None)
-
     def trusted(self, even: bool = False) -> tuple[Problem, State, Linear]:
         """The problem with traces weighted by their residuals, and its solution."""
         loose = replace(self.options, roll=max(self.options.roll, _ROLLED))
         begin = replace(loose, surface=_SOFT * loose.surface)
-        state, fit = replace(self, options=begin).solved()
+        state, fit = replace(self, options=begin, enough=NEARLY).solved()
         covariance = fit.smoother.covariances()
         designs = [design[:, :-2] for design in fit.data.designs]
         variance = trace_variance(
@@ -493,25 +495,28 @@ class Problem:
             factor = np.where(fit.data.wild[:, None], [1.0, 0.5, 0.5, 0.5], 1.0)
             state = replace(state, contact=state.contact * factor)
             fit = self.linear(state)
+        stuck = np.zeros(len(self.frames), dtype=bool)
         for _ in range(self.options.rounds):
             step, shared = fit.smoother.solved(damping)
             trial = state.moved(step, shared)
             decrease = (fit.smoother.gradient * step).sum(axis=1)
+            decrease += fit.smoother.pull @ shared / len(decrease)
             if decrease.sum() < self.enough:
-                return trial, fit._replace(costs=fit.costs - decrease)
+                costs = fit.costs - np.where(stuck, 0.0, decrease)
+                rows = np.flatnonzero(stuck)
+                return trial.put(rows, state.rows(rows)), fit._replace(costs=costs)
             tried = self.linear(trial)
             worse = tried.data.squares > fit.data.squares
+            stuck = np.zeros_like(worse)
             if not tried.cost < fit.cost:
                 # Frames depend little on each other: those that become worse stay as they are.
-                rows = np.flatnonzero(worse)
+                stuck = worse
+                rows = np.flatnonzero(stuck)
                 trial = trial.put(rows, state.rows(rows))
                 tried = self._linear(trial, tried.data.put(worse, fit.data))
             if tried.cost < fit.cost:
-                small = fit.cost - tried.cost < _SMALL * fit.cost
                 state, fit = trial, tried
                 damping = np.where(worse, 10.0 * damping, np.maximum(damping / 5.0, _LEAST_DAMPING))
-                if small:
-                    break
             else:
                 damping = 10.0 * damping
                 if damping.min() > _MOST_DAMPING:
@@ -525,8 +530,12 @@ class Problem:
     def _linear(self, state: State, data: Compared) -> Linear:
         """Linearise at a state whose rods were compared with the traces."""
         smoother = Smoother(data.hessian, data.gradient)
-        costs = data.squares + self._priors(smoother, state) + self._touched(smoother, state)
-        if self.peg is not None and len(costs):
+        costs = (
+            data.squares
+            + self._priors(smoother, state)
+            + self._touched(smoother, state, data.tangents)
+        )
+        if self.peg is not None and not self.fixed and len(costs):
             costs += smoother.add_prior(self.peg.information, state.peg) / len(costs)
         for i, arc in self.held:
             away = _HOLD * (state.contact[[i], 0] - arc)
@@ -536,6 +545,10 @@ class Problem:
     def _compared(self, state: State) -> Compared:
         """Compare with the traces; rods without equilibrium are infinitely far away."""
         rods = Bent.of(self.d, state, self.touching, self.shown)
+        tangents = list[Array]()
+        if self.objects or self.peg is not None:
+            whole = rods if self.shown == 1.0 else Bent.of(self.d, state, self.touching)
+            tangents = list(whole.tangents(state.contact[:, 0]))
         wild = rods.wild
         rods.turned[wild], rods.change[:, rods.rows[wild & self.touching]] = 0.0, 0.0
         points = self.head.put_in((rods.turned + state.position[:, None]) * self.d.length)
@@ -559,7 +572,9 @@ class Problem:
             weights.append(sharp)
         misfit = np.sqrt(total / np.maximum(count, 1.0))
         weighted[wild] = np.inf
-        return Compared(hessian, gradient, weighted, misfit, wild, along, ends, designs, weights)
+        return Compared(
+            hessian, gradient, weighted, misfit, wild, along, ends, designs, weights, tangents
+        )
 
     def blurred(self, state: State, fit: Linear, covariance: Array) -> Array:
         """Steps (time, unknown) due to motion that is uneven while a frame is exposed.
@@ -582,22 +597,21 @@ class Problem:
             pull += np.einsum("tni,tn->ti", design[:, :-2], shift)
         return np.asarray(np.einsum("tij,tj->ti", covariance, pull))
 
-    def _touched(self, smoother: Smoother, state: State) -> Array:
+    def _touched(self, smoother: Smoother, state: State, tangents: Sequence[Array]) -> Array:
         """Pull contacts to the surfaces of known objects, and make them tangent; return the costs.
 
         Distances hardly change along a whisker that touches an object, but the normal does: only
         that of the contact is normal to the whisker.
         """
         costs = np.zeros(len(self.frames))
-        if not self.objects and self.peg is None:
+        if not tangents:
             return costs
         length, surface = self.d.length, self.options.surface
         at = np.flatnonzero(self.touching & self.near)
         part, turn = state.rows(at), self.head.rotation[at]
         points, slopes, _ = contact_slopes(self.d, part)
         points = self.head.rows(at).put_in((points + part.position) * length)
-        bent = Bent.of(self.d, part, np.ones(len(at), dtype=bool))
-        tangents, turning = bent.tangents(part.contact[:, 0])
+        tangent, turning = (values[at] for values in tangents)
         radius = self.whisker.radius(part.contact[:, 0] * length)
         nearer = tilted = None
         if self.peg is None:
@@ -610,11 +624,10 @@ class Problem:
                 for k, shape in enumerate(((), (3,), (3, 3)))
             )
         else:
-            across = np.einsum("tij,tj->ti", turn, tangents)
-            (distance, normal, curvature), nearer, tilted = self.peg.geometry(
-                state.peg, points, across
-            )
-            nearer /= surface
+            across = np.einsum("tij,tj->ti", turn, tangent)
+            local, nearer, tilted = self.peg.geometry(state.peg, points, across)
+            distance, normal, curvature = local
+            nearer, tilted = (None, None) if self.fixed else (nearer / surface, tilted)
         normal = np.einsum("ti,tij->tj", normal, turn)
         curvature = np.swapaxes(turn, 1, 2) @ curvature @ turn
         row = np.einsum("ti,tij->tj", normal, slopes) * (length / surface)
@@ -622,11 +635,11 @@ class Problem:
         costs[at], share = smoother.add_within(at, row, gap, nearer)
         # Of the tip, only the distance is known.
         share = np.where(part.contact[:, 0] > _TIP, 0.0, share)
-        across = np.einsum("tij,tj->ti", curvature, tangents)
+        across = np.einsum("tij,tj->ti", curvature, tangent)
         share /= np.hypot(_TILTED, surface * np.linalg.norm(across, axis=1))
         row = np.einsum("ti,tij->tj", normal, turning)
         row += length * np.einsum("ti,tij->tj", across, slopes)
-        angle = share * (normal * tangents).sum(axis=1)
+        angle = share * (normal * tangent).sum(axis=1)
         tilted = None if tilted is None else share[:, None] * tilted
         costs[at] += smoother.add_within(at, share[:, None] * row, angle, tilted)[0]
         return costs

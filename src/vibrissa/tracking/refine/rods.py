@@ -104,12 +104,14 @@ def compare(traces: Any, view: int, pixels: Any, slopes: Any, found: Any) -> Non
     n, nodes = pixels.shape[1], line.shape[2]
     for t in range(pixels.shape[0]):
         path, way = line[t, view], tangent[t, view]
-        spacing, near = math.hypot(path[1, 0] - path[0, 0], path[1, 1] - path[0, 1]), 0
+        spacing = math.hypot(path[1, 0] - path[0, 0], path[1, 1] - path[0, 1])
+        near = before = 0
         if not spacing > 0.0:
             continue
         for j in range(n):
             x, y = pixels[t, j, 0], pixels[t, j, 1]
-            near = nearest(path, 0, nodes, x, y, longest[t, view], near)
+            guess = min(max(2 * near - before, 0), nodes - 1)
+            before, near = near, nearest(path, 0, nodes, x, y, longest[t, view], guess)
             along = (path[near, 0] - x) * way[near, 0] + (path[near, 1] - y) * way[near, 1]
             if not abs(along) <= 1.5 * spacing + 1.0:
                 continue
@@ -142,12 +144,15 @@ def compare(traces: Any, view: int, pixels: Any, slopes: Any, found: Any) -> Non
 
 UNKNOWNS = 10  # number of a frame's unknowns: shift (3), turn (3), s_c, f_x, f_y, f_z
 _SAMPLES = 48  # number of points of a rod that are compared with the traces
+# Contact of a free frame: no force, half-way along the whisker.
+REST = np.array([0.5, 0.0, 0.0, 0.0])
 # Arc lengths of contacts from which the fit may start, in units of L.
 _STARTS = np.array([0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])
 # Weight of distances from the curves, in units of the usual one, as neighbours have errors in
 # common; how far contacts usually slide from frame to frame, in units of L; and the distance of a
 # rod that is not in balance.
 _UNLIKE, _SLIDES, _WORST = 4.0, 0.05, 1e6
+_CLOSE = 0.01  # step of forces, as a share of the largest one, after which there are no more
 LIMITS = (0.1, 0.995)  # smallest and largest arc length of a contact, in units of L
 _STEP = 1e-6  # step of differences by arc length and force, in units of L and EI/L²
 _WILD = 1e6  # slopes of points of a rod, in units of L, above which it is not in equilibrium
@@ -216,13 +221,16 @@ class Bent(NamedTuple):
     @classmethod
     def of(cls, d: Discretization, state: State, touching: Mask, shown: float = 1.0) -> Bent:
         """Bend the visible share of rods."""
-        s, at = np.linspace(0.0, shown, _SAMPLES), np.flatnonzero(touching)
-        every = rods(d, np.concatenate([state.contact, _ahead(state.contact[at])]), s)
-        points, ahead = np.split(every, [len(touching)])
-        ahead = ahead.reshape(4, len(at), _SAMPLES, 3)
+        loaded = state.contact[touching]
+        # All rods without contact have the shape at rest.
+        every = np.concatenate([REST[None], loaded, _ahead(loaded)])
+        points, ahead = np.split(
+            rods(d, every, np.linspace(0.0, shown, _SAMPLES)), [1 + len(loaded)]
+        )
+        ahead = ahead.reshape(4, len(loaded), _SAMPLES, 3)
         rows = np.where(touching, np.cumsum(touching) - 1, -1)
-        turned = points @ np.swapaxes(state.rotation, 1, 2)
-        return cls(turned, rows, (ahead - points[at]) / _STEP, state.rotation)
+        turned = points[1 + rows] @ np.swapaxes(state.rotation, 1, 2)
+        return cls(turned, rows, (ahead - points[1:]) / _STEP, state.rotation)
 
     @property
     def wild(self) -> Mask:
@@ -392,20 +400,23 @@ def _contacts_at(
     for place in _STARTS:
         contact = np.zeros((len(rows), 4))
         contact[:, 0] = place
+        limit, tried = 2.0 / place**2, contact[:1]  # before the first step all are alike
         for _ in range(5):
-            now = rods(d, contact, s).reshape(len(rows), -1) * known
+            now = rods(d, tried, s).reshape(len(tried), -1) * known
             columns = []
             for k in (2, 3):
-                ahead = contact.copy()
+                ahead = tried.copy()
                 ahead[:, k] += 1e-4
-                columns.append((rods(d, ahead, s).reshape(len(rows), -1) * known - now) / 1e-4)
+                columns.append((rods(d, ahead, s).reshape(len(tried), -1) * known - now) / 1e-4)
             design = np.stack(columns, axis=-1)
             square = np.swapaxes(design, 1, 2) @ design
             right = (np.swapaxes(design, 1, 2) @ (wanted - now)[..., None])[..., 0]
             step = np.linalg.solve(square + 1e-9 * np.eye(2), right[..., None])[..., 0]
             size = np.linalg.norm(step, axis=1, keepdims=True)
-            limit = 2.0 / place**2
             contact[:, 2:] += step * np.minimum(1.0, limit / np.maximum(size, 1e-12))
+            if size.max() < _CLOSE * limit:
+                break
+            tried = contact
         missed = rods(d, contact, s).reshape(len(rows), -1) * known - wanted
         contacts.append(contact)
         costs.append((missed**2).sum(axis=1))

@@ -10,6 +10,7 @@ roll at all; then its y axis is assumed to be level.
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -138,13 +139,18 @@ class HeadPose:
 
     def seen_from(self, points: Array) -> Array:
         """Transform points from the laboratory's frame to the head's."""
-        away = points - self.position.reshape(-1, *[1] * (points.ndim - 2), 3)
-        return np.asarray(np.einsum("tji,t...j->t...i", self.rotation, away))
+        away = _by_frame(points) - self.position[:, None]
+        return np.asarray(away @ self.rotation).reshape(points.shape)
 
     def put_in(self, points: Array) -> Array:
         """Transform points from the head's frame to the laboratory's."""
-        turned = np.einsum("tij,t...j->t...i", self.rotation, points)
-        return np.asarray(turned + self.position.reshape(-1, *[1] * (points.ndim - 2), 3))
+        flat = _by_frame(points) @ np.swapaxes(self.rotation, 1, 2)
+        return np.asarray(flat + self.position[:, None]).reshape(points.shape)
+
+
+def _by_frame(points: Array) -> Array:
+    """Points (time, ..., 3) as a list in each frame, (time, n, 3)."""
+    return points.reshape(len(points), math.prod(points.shape[1:-1]), 3)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import vibrissa
@@ -110,6 +111,29 @@ def test_finding_a_contact_loads_neither_xarray_nor_splines(tmp_path, gamma_map)
         [sys.executable, "-c", code], check=True, capture_output=True, text=True
     ).stdout
     assert loaded.strip() == "[]"
+
+
+def test_contacts_of_a_table_are_found_without_xarray(tmp_path, gamma_map):
+    """Nor tracking, and a table is shown without the compiler."""
+    gamma_map.save(tmp_path / "a.nc")
+    points = [25e-3, 12e-3, 1e-3] + 1e-3 * np.arange(8)[:, None]
+    bent = vibrissa.deflect(gamma_map.whisker, vibrissa.PointContact(points))
+    rows = np.column_stack([np.arange(8.0), bent.force, bent.moment]).tolist()
+    vibrissa.io.write_table(tmp_path / "a.csv", ["time", "Fx", "Fy", "Fz", "Mx", "My", "Mz"], rows)
+    loaded = {}
+    for verb in ("info a.csv", "estimate a.csv --map a.nc"):
+        code = (
+            "import sys; from vibrissa.cli.app import app\n"
+            f"app({verb.split()}, standalone_mode=False)\n"
+            "slow = {'xarray', 'pandas', 'vibrissa.tracking', 'numba'}\n"
+            "print(*sorted(slow & set(sys.modules)))"
+        )
+        said = subprocess.run(
+            [sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd=tmp_path
+        )
+        loaded[verb] = said.stdout.splitlines()[-1]
+    assert loaded == {"info a.csv": "", "estimate a.csv --map a.nc": "numba"}
+    assert len(vibrissa.io.load_contacts(tmp_path / "contacts.csv").time) == 8
 
 
 def test_kernels_are_at_hand_without_linear_algebra_of_scipy():

@@ -21,10 +21,9 @@ from os import PathLike
 from typing import Any, Literal
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.deferred import transform
+from vibrissa.deferred import transform, xr
 from vibrissa.io import in_file, read_calibration, write_calibration
 from vibrissa.numerics import Array, numbers, vectors
 from vibrissa.quantities import attributes

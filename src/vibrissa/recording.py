@@ -30,10 +30,10 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.cameras import Camera, cameras_dataset, cameras_from_dataset
+from vibrissa.deferred import xr
 from vibrissa.io import RECORDING_KIND
 from vibrissa.objects import Peg, Surface, object_from_dataset, objects_datasets
 from vibrissa.quantities import attributes, unit_fault

@@ -208,12 +208,13 @@ def test_units_that_do_not_belong_together(tmp_path, force, moment, message):
 def test_signals_too_large_for_the_whisker(tmp_path):
     whisker = samples.gamma()
     signals = bent_signals(whisker).isel(time=slice(19, None))
-    check_scale(signals, whisker)
-    check_scale(signals * np.nan, whisker)
-    check_scale(signals.isel(time=slice(0)), whisker)
+    wrench = np.array([signals["force"], signals["moment"]])
+    check_scale(*wrench, whisker)
+    check_scale(*(wrench * np.nan), whisker)
+    check_scale(*wrench[:, :0], whisker)
     with pytest.raises(ValueError, match=r"force reaches .* N, .* moment reaches .* 1e-3"):
-        check_scale(signals * 1e3, whisker)
-    check_scale(signals * 1e3, Whisker.straight(length=0.15, base_radius=1e-3))
+        check_scale(*(wrench * 1e3), whisker)
+    check_scale(*(wrench * 1e3), Whisker.straight(length=0.15, base_radius=1e-3))
 
 
 def test_a_column_that_is_there_twice_is_refused(tmp_path):

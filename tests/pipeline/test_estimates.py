@@ -26,8 +26,8 @@ from vibrissa.pipeline import (
     with_group,
     with_signals,
 )
-from vibrissa.pipeline.locate import without_contact
-from vibrissa.pipeline.reconstruct import frames_together
+from vibrissa.pipeline.location import without_contact
+from vibrissa.pipeline.reconstruction import frames_together
 from vibrissa.recording import Recording, recorded
 from vibrissa.sensors import component_noise
 from vibrissa.simulation import facing_peg, measure, simulate, sweep_past

@@ -366,6 +366,21 @@ def test_importing_the_package_loads_no_compiler():
     assert said.stdout.strip() == "[]"
 
 
+def test_loading_a_kernel_imports_nothing_that_only_compiling_needs(tmp_path):
+    """Not even the modules of NumPy's functions that are inlined into it."""
+    code = """
+        import sys
+        import numpy as np
+        from vibrissa.contacts.following.mixture import log_weights
+
+        print(log_weights(np.eye(3), 2), "numba.np.arrayobj" in sys.modules)
+        """
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    compiled, loaded = (run(code, **environment).stdout.split() for _ in range(2))
+    assert compiled == ["0.0", "True"]
+    assert loaded == ["0.0", "False"]
+
+
 def test_what_is_inlined_cannot_be_called_from_python():
     """It has no wrapper for that; without this guard the interpreter would crash."""
     with pytest.raises(TypeError, match="copy can be called by kernels only"):

@@ -8,12 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import vibrissa as vb
 from vibrissa.cli import inputs
 from vibrissa.cli.options import Method, numbers, refuse, with_options
 from vibrissa.cli.signals import SourceOptions, described
 from vibrissa.cli.terminal import Tell, progress_bars, remark, shown
 from vibrissa.deferred import xr
+from vibrissa.numerics import Array
 
 WRENCH = "wrench"
 _XYZ = ("X", "Y", "Z")
@@ -334,8 +337,6 @@ def _from_lines(
     sensor: vb.sensors.Sensor | None,
 ) -> None:
     """Estimate contacts for a table whose lines are those of a stream."""
-    import numpy as np
-
     weight.check(how)
     with progress_bars() as tell:
         if how.map:
@@ -389,15 +390,16 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions, weight: Gravi
     """Estimate contacts for a table of signals, whisker frame."""
     weight.check(how)
     noise = how.noise.matrix()
-    wrench = inputs.wrench_from(signals)
-    for note in wrench.attrs.get("notes", ()):
+    frames = inputs.frames_from(signals)
+    wrench = (frames["force"], frames["moment"])
+    for note in frames.attrs["notes"]:
         remark(f"{signals}: {note}")
     maps = inputs.maps_from(how.map, 1, how.grid) if how.map else []
     known = maps[0].whisker if maps else weight.of(how.own.read())
     gravity = weight.known
     inputs.print_notes(known)
     with vb.io.in_file(signals):
-        vb.io.check_scale(wrench, known)
+        vb.io.check_scale(*wrench, known)
     how.noise.doubt(known)
     weight.doubt(known)
     _doubt_axes(known, wrench, noise, weight)
@@ -413,12 +415,12 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions, weight: Gravi
         if how.whole:
             named = how.keywords()
             others = {n: named[n] for n in ("errors", "prior", "second_contacts")}
-            found = vb.pipeline.locate_from_wrench(known, wrench, noise, gravity=gravity, **others)
+            found = vb.pipeline.locate_from_wrench(known, frames, noise, gravity=gravity, **others)
         else:
             names, others = how.names or vb.signals.TRIPLET, how.keywords()
             _doubt_names(maps[0], names)
             found = vb.pipeline.locate(
-                maps[0], wrench, names, noise=noise, gravity=gravity, **others
+                maps[0], frames, names, noise=noise, gravity=gravity, **others
             )
         tell("contact points", 1, 1)
     _doubt_zero(wrench, noise, found, weight)
@@ -426,7 +428,7 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions, weight: Gravi
     used = WRENCH if how.whole else found.attrs["triplet"]
     about = how.noise.described() + weight.described()
     remark(how.described(used, found.attrs["friction"], about, found.attrs["felt_above"]))
-    inputs.print_statuses(found["status"].values)
+    inputs.print_statuses(found["status"])
     inputs.print_written(target)
 
 
@@ -470,7 +472,7 @@ def _around(signals: Path, target: Path, how: EstimateOptions, known: AroundOpti
         how.noise.doubt(whisker)
     inputs.print_notes(whisker)
     with vb.io.in_file(signals):
-        vb.io.check_scale(wrench, whisker)
+        vb.io.check_scale(wrench["force"].values, wrench["moment"].values, whisker)
     with progress_bars() as tell:
         found = vb.pipeline.locate_around(
             whisker,
@@ -492,26 +494,28 @@ def _around(signals: Path, target: Path, how: EstimateOptions, known: AroundOpti
 
 
 def _doubt_axes(
-    whisker: vb.Whisker, wrench: xr.Dataset, noise: vb.numerics.Array, weight: GravityOptions
+    whisker: vb.Whisker, wrench: tuple[Array, Array], noise: Array, weight: GravityOptions
 ) -> None:
     """Warn of apparently wrong axes of the sensor; not with gravity, whose effects are similar."""
-    if weight.gravity is None and (doubt := vb.pipeline.doubted_axes(whisker, wrench, noise)):
+    if weight.gravity is None and (doubt := vb.pipeline.doubted_axes(whisker, *wrench, noise)):
         remark(f"note: {doubt}")
 
 
 def _doubt_zero(
-    wrench: xr.Dataset, noise: vb.numerics.Array, found: xr.Dataset, weight: GravityOptions
+    wrench: tuple[Array, Array], noise: Array, found: vb.pipeline.Frames, weight: GravityOptions
 ) -> None:
-    """Warn of signals that are not zero without contact; not with gravity, which changes them."""
-    import numpy as np
+    """Warn of signals that are not zero without contact, compared with their noise.
 
-    if weight.gravity is not None:
+    Gravity changes them too, and is not warned of.
+    """
+    sigma = np.sqrt(np.diag(noise))
+    if weight.gravity is not None or not sigma.all():
         return
-    free = found["status"].values == vb.Status.NOT_FELT
-    readings = np.concatenate([wrench[name].values for name in ("force", "moment")], axis=1)
+    free = found["status"] == vb.Status.NOT_FELT
+    readings = np.concatenate(wrench, axis=1)
     known = np.isfinite(readings).any(axis=0)
     zero = vb.streaming.Zero()
-    for reading in (readings / np.sqrt(np.diag(noise)))[free][:, known]:
+    for reading in (readings / sigma)[free][:, known]:
         zero.put(reading)
     if zero.off:
         remark(f"note: {vb.streaming.OFF_ZERO}")
@@ -590,16 +594,18 @@ def estimated(
     inputs.print_notes(*whiskers)
     for k, whisker in enumerate(whiskers):
         with vb.io.in_file(name):
-            vb.io.check_scale(signals.isel(whisker=k), whisker)
+            one = vb.recording.Group(signals).whisker(k)
+            wrench = (one["force"], one["moment"])
+            vb.io.check_scale(*wrench, whisker)
         weight.doubt(whisker)
         if source == "sensor":
-            _doubt_axes(whisker, signals.isel(whisker=k), how.noise.matrix(), weight)
+            _doubt_axes(whisker, wrench, how.noise.matrix(), weight)
     by_default = how.using is None and how.method == "exact" and not how.friction_sigma
     whole = how.whole or (by_default and source == "rod")
     if not maps and not whole:
-        one = f"no map given; simulating that of {whiskers[0]!r}"
+        single = f"no map given; simulating that of {whiskers[0]!r}"
         several = "no maps given; simulating those of the whiskers that have a contact"
-        remark(one if len(whiskers) == 1 else several)
+        remark(single if len(whiskers) == 1 else several)
     done = vb.pipeline.with_estimates(
         tree,
         WRENCH if whole else how.names,

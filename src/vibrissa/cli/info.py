@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 import vibrissa as vb
-from vibrissa.cli.inputs import MAP
+from vibrissa.cli.inputs import MAP, frames_from
 from vibrissa.cli.options import with_options
 from vibrissa.cli.terminal import print_properties, shown
 from vibrissa.cli.track import compared_contacts
@@ -517,7 +517,7 @@ def _table(path: Path) -> Iterator[tuple[str, str]]:
     # Centrelines are tried last, as other tables have columns x, y and z too.
     readers: tuple[tuple[str, vb.io.Kind | None, Callable[[Path], Any]], ...] = (
         ("contacts", vb.io.Kind.CONTACTS, vb.io.load_contacts),
-        ("signals", vb.io.Kind.SIGNALS, vb.load_signals),
+        ("signals", vb.io.Kind.SIGNALS, frames_from),
         ("the head's pose", vb.io.Kind.HEAD, vb.io.load_head),
         ("contact points", None, vb.io.load_contact_points),
         ("corrections", vb.io.Kind.CORRECTIONS, vb.io.load_corrections),
@@ -563,11 +563,11 @@ def _rows(kind: str, data: Any) -> Iterator[tuple[str, str]]:
     elif kind == "corrections":
         for view, each in data.items():
             yield f"view {view}", f"{len(each)} corrected traces"
-    elif "frame" in data.dims:
+    elif "frame" in data:
         first, last = data["frame"].values.min(), data["frame"].values.max()
         yield "rows", f"{data.sizes['frame']}, from frame {first} to {last}"
     else:
-        time = data["time"].values
+        time = np.asarray(data["time"])
         known = time[np.isfinite(time)]
         notes = data.attrs.get("notes", ())
         span = (
@@ -576,7 +576,7 @@ def _rows(kind: str, data: Any) -> Iterator[tuple[str, str]]:
         yield "rows", f"{time.size}" if vb.io.NUMBERED in notes else f"{time.size}, {span}"
         yield from (("note", note) for note in notes)
         if kind == "signals":
-            sizes = {n: np.linalg.norm(data[n].values, axis=-1) for n in ("force", "moment")}
+            sizes = {n: np.linalg.norm(data[n], axis=-1) for n in ("force", "moment")}
             most = [shown(n, float(np.nanmax(v, initial=0.0)), 3) for n, v in sizes.items()]
             yield "largest", f"force {most[0]}, moment {most[1]}"
         if kind == "contacts":

@@ -366,6 +366,13 @@ def wrench_from(path: Path) -> xr.Dataset:
     return wrench.isel(whisker=0)
 
 
+def frames_from(table: Path) -> vb.pipeline.Frames:
+    """Read force and moment over time from a table of signals."""
+    time, force, moment, notes = vb.io.read_signals(table)
+    each = {"force": (("time", "space"), force), "moment": (("time", "space"), moment)}
+    return vb.pipeline.Frames({"time": ("time", time), **each}, {"notes": notes})
+
+
 def cameras_from(path: Path) -> tuple[vb.cameras.Camera, ...]:
     """Read calibrated cameras from a recording, or from TOML of Anipose."""
     if path.suffix.lower() in vb.io.NETCDF:

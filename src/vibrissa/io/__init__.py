@@ -96,6 +96,7 @@ from vibrissa.io.time_tables import (
     holds_contour as holds_contour,
     load_contacts,
     load_signals,
+    read_signals as read_signals,
     save_contacts,
     save_contour,
     save_predictors as save_predictors,

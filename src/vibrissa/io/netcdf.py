@@ -58,7 +58,9 @@ def opened(path: str | PathLike[str], what: str, *, soft_links: bool = True) -> 
     # A file changed again within the resolution of its times may have the same time.
     version = about.st_dev, about.st_ino, changed, now if abs(now - changed) < _TICK else 0
     with naming(path, what):
-        _check(path.absolute(), about.st_size, soft_links, version)
+        faults = _check(path.absolute(), about.st_size, version)
+        if faults and not soft_links:
+            raise ValueError(faults[0])
         with h5py.File(path, "r") as file:
             yield file
 
@@ -108,8 +110,11 @@ def _check_heaps(path: Path) -> None:
             start = content.find(_HEAP, start + 4)
 
 
-def _items(file: h5py.File, soft_links: bool) -> Iterator[tuple[str, h5py.HLObject]]:
-    """Yield all objects of a file once; raise ValueError for external links and cycles."""
+def _items(file: h5py.File, faults: list[str]) -> Iterator[tuple[str, h5py.HLObject]]:
+    """Yield all objects of a file once, except soft links, which are appended to ``faults``.
+
+    ValueError is raised for external links and cycles.
+    """
     groups: list[tuple[str, h5py.Group]] = [("", file)]
     while groups:
         above, group = groups.pop()
@@ -119,11 +124,11 @@ def _items(file: h5py.File, soft_links: bool) -> Iterator[tuple[str, h5py.HLObje
         for key in group:
             name = f"{above}/{key}"
             link = group.id.links.get_info(key.encode("utf-8", "surrogateescape")).type
-            if link == h5l.TYPE_SOFT and soft_links:
+            if link == h5l.TYPE_SOFT:
+                faults.append(f"{name} is a soft link, which is not followed")
                 continue
             if link != h5l.TYPE_HARD:
-                what = "soft link" if link == h5l.TYPE_SOFT else "link out of the file"
-                raise ValueError(f"{name} is a {what}, which is not followed")
+                raise ValueError(f"{name} is a link out of the file, which is not followed")
             item = group[key]
             if isinstance(item, h5py.Group):
                 groups.append((name, item))
@@ -132,17 +137,23 @@ def _items(file: h5py.File, soft_links: bool) -> Iterator[tuple[str, h5py.HLObje
 
 
 @lru_cache(maxsize=64)
-def _check(path: Path, size: int, soft_links: bool, version: tuple[int, ...]) -> None:
-    """Raise ValueError for harmful files; ``version`` marks changes, as results are cached."""
+def _check(path: Path, size: int, version: tuple[int, ...]) -> list[str]:
+    """Raise ValueError for harmful files; ``version`` marks changes, as results are cached.
+
+    Return what NetCDF-4 files do not have.
+    """
     _check_heaps(path)
     with h5py.File(path, "r") as file:
-        _check_items(file, size, soft_links)
+        return _check_items(file, size)
 
 
-def _check_items(file: h5py.File, size: int, soft_links: bool) -> None:
-    """Raise ValueError for external data, or more data than ``size`` bytes can contain."""
-    claimed = 0
-    for name, item in _items(file, soft_links):
+def _check_items(file: h5py.File, size: int) -> list[str]:
+    """Raise ValueError for external data, or more data than ``size`` bytes can contain.
+
+    Return soft links, and data other than numbers and text.
+    """
+    claimed, faults = 0, list[str]()
+    for name, item in _items(file, faults):
         for key in item.attrs:
             attribute = item.attrs.get_id(key)
             _check_type(f"the attribute {key} of {name}", attribute.get_type())
@@ -153,15 +164,14 @@ def _check_items(file: h5py.File, size: int, soft_links: bool) -> None:
         if isinstance(item, h5py.Dataset):
             claimed += _checked_size(name, item)
             text = h5py.check_string_dtype(item.dtype) is not None
-            if not (
-                soft_links or ((item.dtype.kind in "biufSU" or text) and item.shape is not None)
-            ):
-                raise ValueError(f"{name} is neither numbers nor text")
+            if item.shape is None or not (item.dtype.kind in "biufSU" or text):
+                faults.append(f"{name} is neither numbers nor text")
         if claimed > max(ALWAYS_ALLOWED, _DENSEST * size):
             raise ValueError(
                 f"{name} and what comes before it claim to hold {claimed / 1e9:.3g} GB, more than "
                 f"a file of {size / 1e3:.3g} kB can: it is damaged, or made to fill the memory"
             )
+    return faults
 
 
 def _checked_size(name: str, data: h5py.Dataset) -> int:

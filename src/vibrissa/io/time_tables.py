@@ -88,7 +88,20 @@ def load_signals(path: str | PathLike[str]) -> xr.Dataset:
         whisker frame. Without a time column, rows are numbered from 0. The attribute ``notes``, if
         present, states this, or where time does not increase.
     """
-    path = Path(path)
+    time, force, moment, notes = read_signals(Path(path))
+    frame = {"reference_frame": "whisker"}
+    return xr.Dataset(
+        {
+            "force": (("time", "space"), force, {**attributes("force"), **frame}),
+            "moment": (("time", "space"), moment, {**attributes("moment"), **frame}),
+        },
+        {"time": ("time", time, attributes("time")), "space": list("xyz")},
+        {"notes": notes},
+    )
+
+
+def read_signals(path: Path) -> tuple[Array, Array, Array, list[str]]:
+    """Time (n,), force and moment (n, 3), and notes of a table of base signals."""
     table = _netcdf(path) if is_netcdf(path) else _csv(path)
     notes = time_notes(table[:, 0])
     if np.isnan(table[:, 0]).all():
@@ -101,15 +114,7 @@ def load_signals(path: str | PathLike[str]) -> xr.Dataset:
         )
     _check_magnitudes(path, table)
     _check_lever_arm(path, table)
-    frame = {"reference_frame": "whisker"}
-    return xr.Dataset(
-        {
-            "force": (("time", "space"), table[:, 1:4], {**attributes("force"), **frame}),
-            "moment": (("time", "space"), table[:, 4:7], {**attributes("moment"), **frame}),
-        },
-        {"time": ("time", table[:, 0], attributes("time")), "space": list("xyz")},
-        {"notes": notes},
-    )
+    return table[:, 0], table[:, 1:4], table[:, 4:7], notes
 
 
 def time_notes(time: Array) -> list[str]:
@@ -140,13 +145,16 @@ def slow_steps(time: Array) -> float:
     return usual if usual >= _SLOW else 0.0
 
 
-def check_scale(wrench: xr.Dataset, whisker: Whisker) -> None:
+def check_scale(force: ArrayLike, moment: ArrayLike, whisker: Whisker) -> None:
     """Raise ValueError for forces and moments far too large for this whisker."""
     stiffness = whisker.base_bending_stiffness
-    scales = {"force": stiffness / whisker.length**2, "moment": stiffness / whisker.length}
+    scales = {
+        "force": (force, stiffness / whisker.length**2),
+        "moment": (moment, stiffness / whisker.length),
+    }
     faults = []
-    for name, scale in scales.items():
-        size = np.linalg.norm(wrench[name].values, axis=-1)
+    for name, (values, scale) in scales.items():
+        size = np.linalg.norm(values, axis=-1)
         size = size[np.isfinite(size)]
         typical = float(np.quantile(size, 0.95)) if size.size else 0.0
         if typical > _LARGEST_SCALES * scale:

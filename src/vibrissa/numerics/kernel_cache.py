@@ -107,8 +107,14 @@ class _Linked(CompileResultCacheImpl):
     """Form in which compiled functions are kept: together with what they call."""
 
     def reduce(self, cres: Any) -> object:
-        """Return what can be pickled."""
-        return cres.library.calls, super().reduce(cres)  # type: ignore[no-untyped-call]
+        """Return what can be pickled.
+
+        Environments of inlined functions are omitted if they hold no objects, as those of compiled
+        code without Python objects do: loading one would import the module of its function.
+        """
+        *kept, environments = super().reduce(cres)  # type: ignore[no-untyped-call]
+        held = tuple(environment for environment in environments if environment.consts)
+        return cres.library.calls, (*kept, held)
 
     def rebuild(self, target_context: object, payload: tuple[Any, Any]) -> object:
         """Load a function after those it calls."""

@@ -1,56 +1,71 @@
 """Processing stages of a recording: signals, contact estimates and the object's contour.
 
-Each stage is a function that takes a recording and returns a new dataset.
+Each stage is a function that takes a recording and returns a new dataset. Names are imported on
+first use, as contacts of a table need neither tracking nor xarray.
 """
 
-from vibrissa.pipeline.checks import (
-    check_recording as check_recording,
-    doubted_axes as doubted_axes,
-    edited as edited,
-    whisker_radii as whisker_radii,
-)
-from vibrissa.pipeline.estimates import (
-    EVENTS as EVENTS,
-    Progress as Progress,
-    contact_columns as contact_columns,
-    contact_events,
-    estimates_of,
-    in_laboratory as in_laboratory,
-    swept_recording as swept_recording,
-    with_events as with_events,
-)
-from vibrissa.pipeline.locate import locate, locate_around as locate_around, locate_from_wrench
-from vibrissa.pipeline.predictors import PREDICTORS as PREDICTORS, predictors
-from vibrissa.pipeline.reconstruct import (
-    AGREES as AGREES,
-    ANGLE_CLASSES as ANGLE_CLASSES,
-    SOLVED_TO as SOLVED_TO,
-    STRONG as STRONG,
-    Shape as Shape,
-    compare_contacts as compare_contacts,
-    compare_shapes,
-    contour_points as contour_points,
-    distances_by_class as distances_by_class,
-    fit_contacts,
-    reconstruct,
-)
-from vibrissa.pipeline.signals import (
-    Source as Source,
-    default_source as default_source,
-    placed_by,
-    sensor_noise as sensor_noise,
-    signals_of,
-)
-from vibrissa.pipeline.stages import (
-    STAGES as STAGES,
-    TrialSummary as TrialSummary,
-    due_stages as due_stages,
-    with_contour,
-    with_estimates,
-    with_group as with_group,
-    with_signals,
-    without_faulty_stages as without_faulty_stages,
-)
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from vibrissa.deferred import names_from
+
+if TYPE_CHECKING:
+    from vibrissa.pipeline.checks import (
+        check_recording as check_recording,
+        doubted_axes as doubted_axes,
+        edited as edited,
+        whisker_radii as whisker_radii,
+    )
+    from vibrissa.pipeline.estimates import (
+        Progress as Progress,
+        contact_events,
+        estimates_of,
+        in_laboratory as in_laboratory,
+        swept_recording as swept_recording,
+    )
+    from vibrissa.pipeline.events import (
+        EVENTS as EVENTS,
+        contact_columns as contact_columns,
+        with_events as with_events,
+    )
+    from vibrissa.pipeline.frames import Frames as Frames
+    from vibrissa.pipeline.location import (
+        locate,
+        locate_around as locate_around,
+        locate_from_wrench,
+    )
+    from vibrissa.pipeline.predictor_table import PREDICTORS as PREDICTORS, predictors
+    from vibrissa.pipeline.reconstruction import (
+        AGREES as AGREES,
+        ANGLE_CLASSES as ANGLE_CLASSES,
+        SOLVED_TO as SOLVED_TO,
+        STRONG as STRONG,
+        Shape as Shape,
+        compare_contacts as compare_contacts,
+        compare_shapes,
+        contour_points as contour_points,
+        distances_by_class as distances_by_class,
+        fit_contacts,
+        reconstruct,
+    )
+    from vibrissa.pipeline.signals import (
+        Source as Source,
+        default_source as default_source,
+        placed_by,
+        sensor_noise as sensor_noise,
+        signals_of,
+    )
+    from vibrissa.pipeline.stages import (
+        STAGES as STAGES,
+        TrialSummary as TrialSummary,
+        due_stages as due_stages,
+        with_contour,
+        with_estimates,
+        with_group as with_group,
+        with_signals,
+        without_faulty_stages as without_faulty_stages,
+    )
 
 __all__ = [
     "compare_shapes",
@@ -68,3 +83,20 @@ __all__ = [
     "with_signals",
 ]
 __dir__ = __all__.copy
+
+__getattr__ = names_from(
+    __name__,
+    {
+        "checks": "check_recording doubted_axes edited whisker_radii",
+        "estimates": "Progress contact_events estimates_of in_laboratory swept_recording",
+        "events": "EVENTS contact_columns with_events",
+        "frames": "Frames",
+        "location": "locate locate_around locate_from_wrench",
+        "predictor_table": "PREDICTORS predictors",
+        "reconstruction": "AGREES ANGLE_CLASSES SOLVED_TO STRONG Shape compare_contacts "
+        "compare_shapes contour_points distances_by_class fit_contacts reconstruct",
+        "signals": "Source default_source placed_by sensor_noise signals_of",
+        "stages": "STAGES TrialSummary due_stages with_contour with_estimates with_group "
+        "with_signals without_faulty_stages",
+    },
+)

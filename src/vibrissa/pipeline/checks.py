@@ -19,10 +19,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.contacts import rubbing_misfits
+from vibrissa.deferred import xr
 from vibrissa.io import slow_steps
 from vibrissa.numerics import Array
 from vibrissa.quantities import unit_fault
@@ -268,14 +268,13 @@ _DOUBTED, _BELIEVED, _BETTER, _EQUAL = 0.5, 0.9, 0.25, 0.05
 _OBLIQUE = 0.2
 
 
-def doubted_axes(whisker: Whisker, wrench: xr.Dataset, noise: Array) -> str:
+def doubted_axes(whisker: Whisker, force: Array, moment: Array, noise: Array) -> str:
     """Describe which axes of force and moment seem to be exchanged or to have the wrong sign.
 
-    ``wrench`` has ``force`` and ``moment`` over (time, space) in the whisker frame, and ``noise``
-    (6, 6) is the covariance of (F, M), SI units. The whisker's weight is neglected. The text is
-    empty if the stated axes explain most contacts, or no other axes explain them.
+    ``force`` and ``moment`` (n, 3) are in the whisker frame, and ``noise`` (6, 6) is the covariance
+    of (F, M), SI units. The whisker's weight is neglected. The text is empty if the stated axes
+    explain most contacts, or no other axes explain them.
     """
-    force, moment = (Group(wrench)[name] for name in ("force", "moment"))
     size = np.linalg.norm(moment, axis=1)
     noisy = np.sqrt(np.trace(noise[3:, 3:]))
     with np.errstate(invalid="ignore"):

@@ -14,18 +14,19 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from vibrissa.contacts import SLIPPING, ContactEvents, ContactMap, Gravity, Place, Prior, in_order
+from vibrissa.contacts import ContactMap, Gravity, Prior
 from vibrissa.contour import continuing_candidates, to_laboratory
 from vibrissa.numerics import Array, contacts_in, cross_matrix
 from vibrissa.pipeline.checks import signals_in
-from vibrissa.pipeline.locate import locate, locate_from_wrench, without_contact
+from vibrissa.pipeline.events import EVENTS, with_events
+from vibrissa.pipeline.location import locate, locate_from_wrench, without_contact
 from vibrissa.pipeline.signals import sensor_noise
 from vibrissa.quantities import attributes
 from vibrissa.recording import Group, Recording, coordinates, recorded, recording_tree
 from vibrissa.rod import PROXIMAL
 from vibrissa.sensors import StageSweep, SuspendedWhisker, SweptContacts
-from vibrissa.signals import TRIPLET, selection, spherical
-from vibrissa.status import Event, Status, flag_attributes, is_ok
+from vibrissa.signals import TRIPLET, selection
+from vibrissa.status import Event, Status, is_ok
 from vibrissa.whisker import Whisker
 
 Progress = Callable[[str, int, int], None]
@@ -37,8 +38,6 @@ NORMAL_SIGMA = 0.1
 _OTHER = 0.01  # largest relative difference between the whiskers of a map and of a recording
 _LABORATORY = {"reference_frame": "laboratory"}
 _SQUARE = ("time", "space", "space_2")
-_UNIQUE = (Status.OK, Status.UNIQUE)
-EVENTS = ("event", "onset_time", "onset_sigma")  # variables that `with_events` adds
 
 _KEPT = (
     "contact_point",
@@ -407,60 +406,6 @@ def _chosen(candidates: xr.DataArray, chosen: NDArray[np.int64]) -> xr.DataArray
     """Chosen candidate of each frame; NaN where the index is -1."""
     which = xr.DataArray(np.maximum(chosen, 0), dims="time")
     return candidates.isel(candidate=which).where(xr.DataArray(chosen >= 0, dims="time"))
-
-
-def contact_columns(contacts: xr.Dataset) -> xr.Dataset:
-    """Columns of a table of contacts, whisker frame."""
-    point = contacts["contact_point_whisker"].values
-    variance = np.einsum("tii->ti", contacts["covariance"].values)
-    values = np.concatenate([point, spherical(point), np.sqrt(variance)], axis=1)
-    names = ("x", "y", "z", "r", "theta", "phi", "sigma_x", "sigma_y", "sigma_z")
-    columns = {name: ("time", values[:, i], attributes(name)) for i, name in enumerate(names)}
-    assumed = np.full(len(values), contacts.attrs["friction"])
-    columns["friction"] = ("time", assumed, attributes("friction"))
-    table = xr.Dataset(columns, {"time": contacts["time"]}, contacts.attrs)
-    if "event" not in contacts:
-        contacts = with_events(contacts, "contact_point_whisker", "covariance")
-    around = ("arc_length", "last_arc_length", "shift_x", "shift_y", "shift_z")
-    kept = ("one_contact", "status", *EVENTS, *(around if "shift_x" in contacts else ()))
-    return table.assign({name: contacts[name] for name in kept if name in contacts})
-
-
-def with_events(
-    located: xr.Dataset, point: str, covariance: str, pose: tuple[Array, Array] | None = None
-) -> xr.Dataset:
-    """Add onset, loss and slip (variables `EVENTS`) to the contacts of one whisker from `locate`.
-
-    ``point`` and ``covariance`` name the variables with the contact point and its covariance;
-    ``pose`` are the rotations (n, 3, 3) and positions (n, 3) of the base if the point is in the
-    laboratory frame. A contact that includes the first frame has no onset, and slips are detected
-    only where covariances are known. If contact is detected from the sensor's readings, these also
-    give the onset time; otherwise it is that of the first frame, without a standard deviation.
-    """
-    time, touching = located["time"].values, located["in_contact"].values
-    known = located["status"].values != Status.MISSING
-    events = ContactEvents(SLIPPING * float(located.attrs["length"]))
-    points, spreads = located[point].values, located[covariance].values
-    unique = np.isin(located["status"].values, _UNIQUE) & np.isfinite(spreads).all(axis=(1, 2))
-    readings, valid = located["excess"].values, located["covariance_valid"].values
-    happened, onsets = [], []
-    for i, moment in enumerate(time.tolist()):
-        held = () if pose is None else (pose[0][i], pose[1][i])
-        place = Place(points[i], spreads[i], bool(valid[i]), *held) if unique[i] else None
-        on = bool(touching[i]) if known[i] else None
-        happened.append(events(moment, on, readings[i], place))
-        onsets.append(events.onset)
-    if known.any() and touching[first := int(known.argmax())]:
-        happened[first] = Event.NONE
-    codes, begun = in_order(time, happened, onsets)
-    values = (codes.astype(np.int8), begun[:, 0], begun[:, 1])
-    about = {"event": flag_attributes(Event)}
-    return located.assign(
-        {
-            name: ("time", each, {**attributes(name), **about.get(name, {})})
-            for name, each in zip(EVENTS, values, strict=True)
-        }
-    )
 
 
 def contact_events(contacts: xr.Dataset) -> xr.Dataset:

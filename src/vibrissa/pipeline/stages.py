@@ -27,7 +27,7 @@ from vibrissa.pipeline.checks import (
     signals_in,
 )
 from vibrissa.pipeline.estimates import Progress, estimates_of, largest_of
-from vibrissa.pipeline.reconstruct import AGREES, reconstruct
+from vibrissa.pipeline.reconstruction import AGREES, reconstruct
 from vibrissa.pipeline.signals import signals_of
 from vibrissa.recording import Recording
 from vibrissa.status import Status

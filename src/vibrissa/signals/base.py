@@ -12,10 +12,11 @@ Directions are angles in (-π, π]; differences of them are taken modulo 2π.
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from itertools import combinations
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -109,8 +110,8 @@ def labelled_wrench(
     force: ArrayLike | xr.DataArray, moment: ArrayLike | xr.DataArray
 ) -> tuple[Array, Array, tuple[str, ...], Coordinates]:
     """Force and moment as arrays of one shape, with names and coordinates of leading dimensions."""
-    given = [_space_last(a) if isinstance(a, xr.DataArray) else a for a in (force, moment)]
-    labels = [a for a in given if isinstance(a, xr.DataArray)]
+    given = [_space_last(a) if _is_labelled(a) else a for a in (force, moment)]
+    labels = [a for a in given if _is_labelled(a)]
     if len(labels) == 2:
         together = xr.broadcast(*_align(*labels), exclude=("space",))
         labels = [a.transpose(..., "space") for a in together]
@@ -124,6 +125,11 @@ def labelled_wrench(
         return f, m, leading_dims(f.shape[:-1]), {}
     dims = tuple(str(d) for d in labels[0].dims[:-1])
     return f, m, dims, coordinates(labels[0], dims)
+
+
+def _is_labelled(array: ArrayLike | xr.DataArray) -> TypeGuard[xr.DataArray]:
+    """Whether an array is a DataArray, determined without importing xarray."""
+    return "xarray" in sys.modules and isinstance(array, xr.DataArray)
 
 
 def _space_last(array: xr.DataArray) -> xr.DataArray:
@@ -223,6 +229,11 @@ def measured(
             f"it; got {signals!r}"
         )
     if {"force", "moment"} <= set(map(str, signals)) and any(n not in signals for n in names):
+        if all(name in SIGNALS for name in names):
+            force, moment, dims, coords = labelled_wrench(signals["force"], signals["moment"])
+            _check_arms(force, moment)
+            which = [SIGNALS.index(name) for name in names]
+            return signals_of(force, moment).take(which, axis=-1), dims, coords
         signals = base_signals(signals["force"], signals["moment"])
     found = _completed(signals, names)
     missing = [name for name in names if name not in found]
@@ -231,9 +242,9 @@ def measured(
             f"signals lack {', '.join(missing)}; they have {', '.join(map(str, signals)) or 'none'}"
         )
     given = [found[name] for name in names]
-    if any(isinstance(a, xr.DataArray) and a.dims for a in given):
+    if any(_is_labelled(a) and a.dims for a in given):
         # A value without dimensions applies to all.
-        labels = [a if isinstance(a, xr.DataArray) else _as_scalar(a, names, given) for a in given]
+        labels = [a if _is_labelled(a) else _as_scalar(a, names, given) for a in given]
         arrays = xr.broadcast(*_align(*labels))
         dims = tuple(str(d) for d in arrays[0].dims)
         values = np.stack([a.to_numpy().astype(np.float64) for a in arrays], axis=-1)
@@ -286,7 +297,7 @@ def _completed(
 def _as_scalar(value: ArrayLike, names: tuple[str, ...], given: list[ArrayLike]) -> xr.DataArray:
     """Convert a plain number to a DataArray; plain arrays cannot be matched to dimensions."""
     if np.ndim(value):
-        labelled = [n for n, a in zip(names, given, strict=True) if isinstance(a, xr.DataArray)]
+        labelled = [n for n, a in zip(names, given, strict=True) if _is_labelled(a)]
         raise ValueError(
             f"{', '.join(labelled)} have named dimensions, so the other signals must have them too"
         )

@@ -16,7 +16,7 @@ import xarray as xr
 from vibrissa.contacts import friction_assumed
 from vibrissa.io import check_scale
 from vibrissa.numerics import Array
-from vibrissa.pipeline.estimates import EVENTS
+from vibrissa.pipeline.events import EVENTS
 from vibrissa.quantities import attributes
 from vibrissa.recording import ONE_VIEW, Recording
 from vibrissa.signals import base_signals
@@ -75,9 +75,8 @@ def predictors(recording: xr.DataTree) -> xr.Dataset:
     if force is None or moment is None:
         raise ValueError("the recording has no force and moment yet: run `vibrissa signals` first")
     for k, whisker in enumerate(record.whiskers if "whiskers" in record else ()):
-        each = (("force", force), ("moment", moment))
         try:
-            check_scale(xr.Dataset({n: (("time", "space"), v[:, k]) for n, v in each}), whisker)
+            check_scale(force[:, k], moment[:, k], whisker)
         except ValueError as fault:
             warnings.warn(f"{record.names[k]}: {fault}", UserWarning, stacklevel=2)
     columns = dict(

@@ -26,7 +26,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.contacts import (
@@ -49,13 +48,15 @@ from vibrissa.contacts import (
     second_contact,
     whitening,
 )
+from vibrissa.deferred import xr
 from vibrissa.numerics import Array
 from vibrissa.objects import Surface
+from vibrissa.pipeline.frames import Frames, Labelled
 from vibrissa.quantities import attributes
 from vibrissa.recording import Group
 from vibrissa.rod import Discretization, contact_tangents, discretize, resting, solve_forces
 from vibrissa.sensors import component_noise
-from vibrissa.signals import DETECTED, TRIPLET, base_signals, selection, signals_of
+from vibrissa.signals import DETECTED, TRIPLET, selection, signals_of
 from vibrissa.status import Status, flag_attributes
 from vibrissa.whisker import Whisker
 
@@ -68,7 +69,7 @@ _WHISKER = {"reference_frame": "whisker"}
 
 def locate(
     contact_map: ContactMap,
-    wrench: xr.Dataset,
+    wrench: Labelled,
     triplet: tuple[str, ...] = TRIPLET,
     *,
     noise: ArrayLike | None,
@@ -78,7 +79,7 @@ def locate(
     friction: float = 0.0,
     gravity: Gravity | None = None,
     second_contacts: float = 0.0,
-) -> xr.Dataset:
+) -> Labelled:
     """Estimate the contact point in every frame with a contact.
 
     Parameters
@@ -129,7 +130,7 @@ def locate(
     """
     names = selection(triplet)
     measured = _Measured.of(wrench, noise, errors, contact_map.whisker, gravity)
-    signals = base_signals(measured.force[measured.rows], measured.moment[measured.rows])
+    signals = {n: getattr(measured, n)[measured.rows] for n in ("force", "moment")}
     if method == "exact":
         found = contact_map.estimate(
             signals,
@@ -148,7 +149,9 @@ def locate(
     stated = found.candidates.covariance if method == "exact" else None
     whisker = measured.at_rest(contact_map.whisker, gravity)
     out = _located(whisker, names, measured, found, stated, friction)
-    return _mark_second_contacts(out, whisker, measured, errors, friction, second_contacts)
+    out = _mark_second_contacts(out, whisker, measured, errors, friction, second_contacts)
+    labelled: Labelled = _like(wrench, out)
+    return labelled
 
 
 def without_contact(
@@ -162,18 +165,18 @@ def without_contact(
     measured = _Measured.of(wrench, noise)
     if measured.rows.any():
         return None
-    return _located(whisker, selection(triplet), measured, None)
+    return _located(whisker, selection(triplet), measured, None).to_dataset()
 
 
 def locate_from_wrench(
     whisker: Whisker,
-    wrench: xr.Dataset,
+    wrench: Labelled,
     noise: ArrayLike | None,
     errors: Mapping[str, Any] | None = None,
     prior: Prior | None = None,
     gravity: Gravity | None = None,
     second_contacts: float = 0.0,
-) -> xr.Dataset:
+) -> Labelled:
     """Locate contacts, with or without friction, from all six components of the wrench.
 
     Parameters
@@ -220,7 +223,9 @@ def locate_from_wrench(
     stated = found.candidates.covariance
     rest = measured.at_rest(whisker, gravity)
     out = _located(rest, WRENCH, measured, found, stated)
-    return _mark_second_contacts(out, rest, measured, errors, _FRICTION, second_contacts)
+    out = _mark_second_contacts(out, rest, measured, errors, _FRICTION, second_contacts)
+    labelled: Labelled = _like(wrench, out)
+    return labelled
 
 
 def locate_around(
@@ -278,7 +283,17 @@ def locate_around(
     data["excess"] = (("time", "reading"), measured.excess)
     data["status"] = ("time", status, {**attributes("status"), **flag_attributes()})
     about = {"felt_above": measured.above, "friction": 0.0, "length": whisker.length}
-    return xr.Dataset(data, {"time": measured.time, "space": list("xyz")}, about)
+    return Frames({"time": measured.time, **data}, about).to_dataset()
+
+
+def _arrays(wrench: xr.Dataset | Frames) -> Group | Frames:
+    """Access to the variables of a wrench as arrays."""
+    return wrench if isinstance(wrench, Frames) else Group(wrench)
+
+
+def _like(wrench: object, found: Frames) -> Any:
+    """Contacts as a dataset unless the wrench is plain."""
+    return found if isinstance(wrench, Frames) else found.to_dataset()
 
 
 def _of_wrench(errors: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -287,13 +302,13 @@ def _of_wrench(errors: Mapping[str, Any] | None) -> dict[str, Any]:
 
 
 def _mark_second_contacts(
-    found: xr.Dataset,
+    found: Frames,
     whisker: Whisker,
     measured: _Measured,
     errors: Mapping[str, Any] | None,
     friction: float,
     rate: float,
-) -> xr.Dataset:
+) -> Frames:
     """Mark the frames that one contact does not explain, at a false-alarm rate; 0 marks none."""
     if not rate > 0.0:
         return found
@@ -310,14 +325,16 @@ def _mark_second_contacts(
         false_alarms=rate,
         **_of_wrench(errors),
     )
-    status = found["status"].values.copy()
+    status = found["status"].copy()
     status[np.flatnonzero(rows)[test["second_contact"].values]] = int(Status.NOT_ONE_CONTACT)
     alone = _everywhere(rows, test["one_contact"].values)
-    data = {
-        "one_contact": ("time", alone, attributes("one_contact")),
-        "status": found["status"].copy(data=status),
-    }
-    return found.assign(data)
+    about = found.variables["status"][2]
+    return found.assign(
+        {
+            "one_contact": ("time", alone, attributes("one_contact")),
+            "status": ("time", status, about),
+        }
+    )
 
 
 class _Measured(NamedTuple):
@@ -333,7 +350,7 @@ class _Measured(NamedTuple):
     and if known.
     """
 
-    time: xr.Variable
+    time: tuple[str, Array, Mapping[str, Any]]
     force: Array
     moment: Array
     covariance: Array
@@ -350,20 +367,21 @@ class _Measured(NamedTuple):
     @classmethod
     def of(
         cls,
-        wrench: xr.Dataset,
+        wrench: xr.Dataset | Frames,
         noise: ArrayLike | None,
         errors: Mapping[str, Any] | None = None,
         whisker: Whisker | None = None,
         gravity: Gravity | None = None,
     ) -> _Measured:
-        """Measurement of a wrench dataset."""
-        force, moment = (Group(wrench)[name] for name in ("force", "moment"))
+        """Measurement of a wrench."""
+        given = _arrays(wrench)
+        force, moment = (given[name] for name in ("force", "moment"))
         n = len(force)
         covariance = _noise_of_frames(noise, n)
         known = np.isfinite(force.sum(axis=1) + moment.sum(axis=1))
         excess, rotation = np.concatenate([force, moment], axis=1), None
         if gravity is not None and whisker is not None:
-            rotation = Group(wrench)["base_rotation"] if "base_rotation" in wrench else None
+            rotation = given.get("base_rotation")
             excess = excess - read_at_rest(whisker, gravity, rotation, n)
         size = np.hypot(excess[:, 4], excess[:, 5])
         least = 0.0 * size
@@ -373,8 +391,8 @@ class _Measured(NamedTuple):
         with np.errstate(invalid="ignore"):
             rows = known & (size > least)
         free = known & ~force.any(axis=1) & ~moment.any(axis=1)
-        if "in_contact" in wrench:
-            touching = Group(wrench)["in_contact"]
+        if "in_contact" in given:
+            touching = given["in_contact"]
             # If inertia was removed, `in_contact` already is the result of a detection.
             rows = known & touching if "density" in wrench.attrs else rows & touching
             free |= known & ~touching
@@ -384,13 +402,14 @@ class _Measured(NamedTuple):
         typical, steady = None, bool((covariance == covariance[:1]).all())
         if noise is not None:
             typical = covariance[0] if steady else _typical(covariance[rows])
-        by_size = typical is not None and "in_contact" not in wrench
+        by_size = typical is not None and "in_contact" not in given
         excess = excess @ whitening(typical).T if by_size and typical is not None else excess[:, :0]
         shared = common_errors(**_of_wrench(errors))
         if len(shared):
             whole = np.concatenate([force, moment], axis=1)
             covariance = covariance + common_covariance(shared, np.eye(6), whole)
-        time = wrench["time"].variable
+        about = {} if isinstance(wrench, Frames) else wrench["time"].attrs
+        time = ("time", np.asarray(wrench["time"]), about)
         if rotation is not None:
             rotation = rotation[rows]
         return cls(
@@ -446,8 +465,8 @@ def _located(
     found: Contacts | None,
     stated: Array | None = None,
     friction: float = 0.0,
-) -> xr.Dataset:
-    """Dataset of all frames from the candidates of those with a contact, None if there are none.
+) -> Frames:
+    """Contacts of all frames from the candidates of those with a contact, None if there are none.
 
     Covariances are of first order, unless all frames have the same noise: then the covariances
     ``stated`` (n, candidates, 3, 3) by the estimate, which remain valid up to slip-off, are used:
@@ -522,7 +541,7 @@ def _located(
     assumed = np.inf if names == WRENCH else friction
     about = {"triplet": " ".join(names), "felt_above": measured.above, "friction": assumed}
     about["length"] = whisker.length
-    return xr.Dataset(data, {"time": measured.time, "space": list("xyz")}, about)
+    return Frames({"time": measured.time, **data}, about)
 
 
 def _as_stated(first: Array, stated: Array) -> tuple[Array, Array]:

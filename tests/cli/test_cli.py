@@ -121,6 +121,14 @@ def test_map_and_estimate(folder, chart, table):
     assert np.isnan(contacts["x"].values[2:]).all()
 
 
+def test_signals_without_noise_are_not_compared_with_it(folder, chart, table):
+    """A division by it would warn."""
+    out = folder / "noiseless.csv"
+    run("estimate", table[0], "--map", chart, "-o", out, "--force-noise", 0, "--moment-noise", 0)
+    contacts = load_contacts(out)
+    np.testing.assert_allclose(contacts["x"].values[:2], table[1][:2, 0], atol=1e-9)
+
+
 def test_signals_that_cannot_locate_contacts_are_named_with_better_ones(folder):
     """As (Fx, MB, MD) of a wire of constant thickness."""
     wire = folder / "cylinder.nc"

@@ -5,7 +5,7 @@ import pytest
 
 import vibrissa as vb
 from vibrissa.contacts import WRENCH
-from vibrissa.pipeline.location import contact_normals, gains, wrench_slopes
+from vibrissa.pipeline.touch_gains import contact_normals, gains, wrench_slopes
 from vibrissa.signals import base_signals
 
 WHISKER = vb.samples.gamma()

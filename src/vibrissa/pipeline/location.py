@@ -3,21 +3,7 @@
 A contact is detected where the bending moment M_B exceeds five standard deviations of its noise.
 If several contacts explain the signals, the one with the least force is listed first; continuity in
 the laboratory frame selects among them later (`vibrissa.pipeline.estimates`).
-
-A contact is x = (s, f_x, f_y, f_z): the arc length and the force in the material frame there. It
-determines the base force and contact point (F, p), the wrench w = (F, p × F) and the direction
-
-    n = g / |g|,    g = F − (F · t) t,
-
-of the force across the whisker, where t is the whisker's tangent at the contact. At a contact on
-the whisker's side, the tangent lies in the tangent plane of the surface, so that n is the surface
-normal even with friction along the whisker; without friction n is the direction of the force. To
-first order an error δw of the measured wrench causes errors δ(p, n) = G δw with the gain
-
-    G = ∂(p, n)/∂x · K · ∂c/∂w,
-
-where c are the signals used for the estimate, J = ∂c/∂x, and K is J⁻¹ for three signals or
-(JᵀWᵀWJ)⁻¹JᵀWᵀW, with weights W, for more.
+Errors of contact points and normals follow from derivatives (`vibrissa.pipeline.touch_gains`).
 """
 
 from __future__ import annotations
@@ -30,20 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.contacts import (
     WRENCH,
-    Channels,
     ContactMap,
     Contacts,
     Gravity,
     Prior,
-    SensorNoise,
-    channel_derivatives,
-    channel_gradients,
     common_covariance,
     common_errors,
     estimate_around,
     estimate_from_wrench,
     estimate_jointly,
-    ratio_derivatives,
     read_at_rest,
     second_contact,
     whitening,
@@ -52,11 +33,12 @@ from vibrissa.deferred import xr
 from vibrissa.numerics import Array
 from vibrissa.objects import Surface
 from vibrissa.pipeline.frames import Frames, Labelled
+from vibrissa.pipeline.touch_gains import contact_normals, gains
 from vibrissa.quantities import attributes
 from vibrissa.recording import Group
-from vibrissa.rod import Discretization, contact_tangents, discretize, resting, solve_forces
+from vibrissa.rod import resting
 from vibrissa.sensors import component_noise
-from vibrissa.signals import DETECTED, TRIPLET, selection, signals_of
+from vibrissa.signals import DETECTED, TRIPLET, selection
 from vibrissa.status import Status, flag_attributes
 from vibrissa.whisker import Whisker
 
@@ -65,6 +47,7 @@ from vibrissa.whisker import Whisker
 _FRICTION = 0.3
 _OF_ROD = ("stiffness_sigma", "compliance_sigma")  # errors of the whisker and its base
 _WHISKER = {"reference_frame": "whisker"}
+_FLAT = 1e-15  # least ratio of variances of a covariance of first order
 
 
 def locate(
@@ -568,140 +551,3 @@ def _everywhere(rows: NDArray[np.bool_], values: Array) -> Array:
     out = np.full((rows.size, *values.shape[1:]), np.nan)
     out[rows] = values
     return out
-
-
-_FLAT = 1e-15  # least ratio of variances of a covariance of first order
-_FREE = [0, 2, 3]  # unknowns of x without friction
-_STEP = 1e-5  # relative step of finite differences
-# Smallest singular value of invertible derivatives whose columns are scaled to length one.
-_SINGULAR = 1e-10
-
-
-def gains(
-    whisker: Whisker,
-    signals: tuple[str, ...],
-    arc_length: Array,
-    contact_force: Array,
-    weighing: Array | None = None,
-    errors: Array | None = None,
-    friction: float = 0.0,
-) -> Array:
-    """Derivatives (n, 6, 6) of contact points and normals with respect to the measured wrench.
-
-    With more than three signals, these are weighted by the noise ``weighing`` (6, 6) of the wrench
-    and the common ``errors`` (k, 6, 7). ``friction`` is the standard deviation of the ratio of
-    forces along and across the whisker.
-    """
-    rubbing = signals == WRENCH or friction > 0.0
-    d, x, rows = _unknowns(whisker, arc_length, contact_force)
-    out = np.full((len(rows), 6, 6), np.nan)
-    if not rows.any():
-        return out
-    values, value_slopes, normal_slopes = _touch(d, x)
-    free = [0, 1, 2, 3] if rubbing else _FREE
-    three = len(signals) == 3 and not friction > 0.0
-    channels = Channels(signals, signals) if three or signals == WRENCH else Channels.of(signals)
-    slopes = channel_derivatives(values, value_slopes[..., free], channels.names)
-    by_wrench = channel_gradients(values, channels.names)
-    if not three:
-        # Whitening matrices of the channels at contacts with given values (F, p).
-        sensor = None
-        if weighing is not None:
-            sensor = SensorNoise(None, weighing, np.zeros((0, 6, 7)) if errors is None else errors)
-        measured = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))
-        weights = whitening(channels.covariance(sensor, measured, values, d))
-        slopes, by_wrench = weights @ slopes, weights @ by_wrench
-    if friction > 0.0:  # the prior acts as one more measurement, independent of the wrench
-        prior = ratio_derivatives(x)[:, None] / friction
-        slopes = np.concatenate([slopes, prior], axis=1)
-        by_wrench = np.concatenate([by_wrench, np.zeros_like(by_wrench[:, :1])], axis=1)
-    moved = np.concatenate([value_slopes[:, 3:], normal_slopes], axis=1)[..., free]
-    inner = np.repeat([d.length, 1.0], 3)[:, None] / np.repeat([d.force, d.moment], 3)
-    out[rows] = moved @ _inverse(slopes) @ by_wrench * inner
-    return out
-
-
-def wrench_slopes(whisker: Whisker, arc_length: Array, contact_force: Array) -> Array:
-    """Derivatives (n, 6, 3) of the wrench of frictionless contacts with respect to their points."""
-    d, x, rows = _unknowns(whisker, arc_length, contact_force)
-    out = np.full((len(rows), 6, 3), np.nan)
-    if not rows.any():
-        return out
-    values, tangents = solve_forces(d, x, tangents=True)
-    by_x = channel_derivatives(values, tangents, WRENCH)
-    scale = np.repeat([d.force, d.moment], 3)[:, None] / d.length
-    out[rows] = by_x @ _inverse(tangents[:, 3:]) * scale
-    return out
-
-
-def _touch(d: Discretization, x: Array) -> tuple[Array, Array, Array]:
-    """(F, p) (n, 6), ∂(F, p)/∂x (n, 6, 4) and, for the normal n, ∂n/∂x (n, 3, 4), scaled.
-
-    Contacts are x (n, 4); derivatives are computed partly by central differences.
-    """
-    values, exact = solve_forces(d, x, tangents=True)
-    tangent = contact_tangents(d, x)
-    slopes, turning = np.empty((len(x), 6, 4)), np.empty((len(x), 3, 4))
-    size = np.maximum(np.linalg.norm(x[:, 1:], axis=1), _STEP)
-    for k in range(4):
-        step = _STEP * (np.ones(len(x)) if k == 0 else size)
-        ahead, back = x.copy(), x.copy()
-        ahead[:, k] += step
-        back[:, k] -= step
-        if k == 0:
-            # The whisker ends at the tip, s = 1.
-            ahead[:, 0] = np.minimum(ahead[:, 0], np.maximum(1.0, x[:, 0]))
-        width = (ahead[:, k] - back[:, k])[:, None]
-        turning[..., k] = (contact_tangents(d, ahead) - contact_tangents(d, back)) / width
-        if k == 1:
-            slopes[..., 1] = (solve_forces(d, ahead)[0] - solve_forces(d, back)[0]) / width
-    slopes[..., _FREE] = exact
-    force = values[:, :3]
-    along = (force * tangent).sum(axis=1)[:, None]
-    across = force - along * tangent
-    length = np.linalg.norm(across, axis=1, keepdims=True)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        normal = across / length
-    change = slopes[:, :3] - along[..., None] * turning
-    grown = np.einsum("ni,nik->nk", tangent, slopes[:, :3])
-    grown += np.einsum("ni,nik->nk", force, turning)
-    change -= tangent[:, :, None] * grown[:, None, :]
-    flat = np.eye(3) - normal[:, :, None] * normal[:, None, :]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return values, slopes, flat @ change / length[..., None]
-
-
-def contact_normals(whisker: Whisker, arc_length: Array, contact_force: Array) -> Array:
-    """Unit vectors (n, 3) of the contact forces across the whisker."""
-    d, x, rows = _unknowns(whisker, arc_length, contact_force)
-    out = np.full((len(rows), 3), np.nan)
-    if rows.any():
-        force, tangent = solve_forces(d, x)[0][:, :3], contact_tangents(d, x)
-        across = force - (force * tangent).sum(axis=1)[:, None] * tangent
-        with np.errstate(divide="ignore", invalid="ignore"):
-            out[rows] = across / np.linalg.norm(across, axis=1, keepdims=True)
-    return out
-
-
-def _unknowns(
-    whisker: Whisker, arc_length: Array, contact_force: Array
-) -> tuple[Discretization, Array, NDArray[np.bool_]]:
-    """Scaled unknowns x (m, 4) of the finite contacts, and a mask (n,) of these."""
-    d = discretize(whisker)
-    x = np.concatenate([arc_length[:, None] / d.length, contact_force / d.force], axis=1)
-    rows = np.isfinite(x).all(axis=1)
-    return d, x[rows], rows
-
-
-def _inverse(slopes: Array) -> Array:
-    """Pseudo-inverses (n, m, k) of slopes (n, k, m); NaN for those not of full rank."""
-    usable = np.asarray(np.isfinite(slopes).all(axis=(1, 2)))
-    whole = np.where(usable[:, None, None], slopes, 0.0)
-    size = np.linalg.norm(whole, axis=1)
-    usable &= (size > 0.0).all(axis=1)
-    u, s, vt = np.linalg.svd(whole / np.where(size > 0.0, size, 1.0)[:, None], full_matrices=False)
-    usable &= s[:, -1] > _SINGULAR
-    with np.errstate(divide="ignore", invalid="ignore"):
-        root = np.swapaxes(vt, 1, 2) / s[:, None, :]
-        out = root @ np.swapaxes(u, 1, 2) / size[:, :, None]
-    return np.where(usable[:, None, None], out, np.nan)

@@ -44,7 +44,8 @@ from vibrissa.pipeline.checks import (
     one_whisker,
     with_coordinates,
 )
-from vibrissa.pipeline.location import locate_from_wrench, wrench_slopes
+from vibrissa.pipeline.location import locate_from_wrench
+from vibrissa.pipeline.touch_gains import wrench_slopes
 from vibrissa.recording import Group, Recording, recorded
 from vibrissa.rod import PROXIMAL, PointContact, deflect
 from vibrissa.sensors import FORCE_NOISE, MOMENT_NOISE, Sensor, component_noise

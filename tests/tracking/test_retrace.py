@@ -5,7 +5,7 @@ import pytest
 from rows import RowFilm, curve, scored
 
 from vibrissa.tracking import Trace, retraced, trace_video
-from vibrissa.tracking.trace.guided import trace_guided
+from vibrissa.tracking.trace import guided
 
 FRAMES = 16
 
@@ -97,12 +97,19 @@ def test_corrections_stay_as_they_are(flat):
 def test_a_whisker_that_the_other_view_loses_is_lost(flat):
     known = [list(row) for row in flat.traces[0]]
     known[1][4] = Trace.lost()
-    traces = trace_guided(
+    traces = guided.trace_guided(
         flat.frames(1), flat.bases[1], flat.film.cameras, known, sample=flat.film.images[1]
     )
     assert not len(traces[1][4].line)
     assert len(traces[1][5].line)
     assert len(traces[0][4].line)
+
+
+def test_long_films_are_decided_in_blocks(flat, monkeypatch):
+    monkeypatch.setattr(guided, "_BLOCK", FRAMES // 2)
+    traces, _ = flat.retraced()
+    assert [len(row) for row in traces[1]] == [FRAMES] * 3
+    assert flat.right(traces, 1) > 0.93
 
 
 def test_a_single_whisker_is_not_traced_anew(flat):

@@ -72,6 +72,7 @@ _KEPT = 64  # number of combinations of a frame that are kept
 # whisker from its usual one, at least, pixels; standard deviations at which this saturates.
 _MIDDLE, _TIP, _BEND, _MOST = 4.0, 6.0, 3.0, 3.0
 _ROUNDS = 3  # number of rounds in which bends are learned
+_BLOCK = 1000  # number of frames that are decided together, which limits memory
 _BENDING = 60  # number of last points of a trace by which it is continued to its usual length
 _USUAL = 75.0  # percentile of a whisker's length where its tip is seen that is its usual one
 _MERGED = 0.8  # share of a line on others from which it cannot be measured apart from them
@@ -147,12 +148,12 @@ def trace_guided(
     around = Surroundings.of(sample, starts, options, mask, bright)
     guides = [_guides(cameras, row) for row in known]
     moved = 0.0  # the row of bases, along the epipolar lines
-    choices, shifts = list[_Choice](), list[Shift]()
+    choices, chosen, shifts = list[_Choice](), list[list[Array]](), list[Shift]()
     for i, image in enumerate(frames()):
         frame, shift = around.clear(image)
         shifts.append(shift)
         scene = around.scene
-        smooth, factors = smoothed(scene.difference(frame), scene.bodies(frame))
+        darkness, factors = smoothed(scene.difference(frame), scene.bodies(frame))
         lines = []
         for k, row in enumerate(guides):
             guide = row[i] if i < len(row) else None
@@ -162,11 +163,14 @@ def trace_guided(
             elif guide is None:
                 lines.append([])
             else:
-                lines.append(_candidates(guide, guide.at(starts[k]) + moved, smooth, factors[0]))
+                lines.append(_candidates(guide, guide.at(starts[k]) + moved, darkness, factors[0]))
         choices.append(_combined(lines))
         moved += choices[-1].begins
+        if len(choices) == _BLOCK:
+            chosen += _over_all_frames(choices)
+            choices.clear()
         report(i + 1)
-    chosen = _over_all_frames(choices)
+    chosen += _over_all_frames(choices)
     rows: list[list[Trace]] = [[] for _ in guides]
     for i, image in enumerate(frames()):
         frame, shift = around.clear(image)
@@ -200,7 +204,7 @@ def _guides(cameras: tuple[Camera, Camera], row: Sequence[Trace]) -> list[_Guide
     return guides
 
 
-def _candidates(guide: _Guide, expected: float, smooth: Image, factor: float) -> list[_Candidate]:
+def _candidates(guide: _Guide, expected: float, darkness: Image, factor: float) -> list[_Candidate]:
     """Smooth dark lines along the epipolar lines, the most probable first."""
     count = len(guide.points)
     length = _SPACING * (count - 1)
@@ -208,7 +212,7 @@ def _candidates(guide: _Guide, expected: float, smooth: Image, factor: float) ->
     tips = np.arange(-_TIP_MOST * length, _TIP_MOST * length, _FAR_STEP)
     bends = np.arange(-_BEND_MOST * length, _BEND_MOST * length + 0.1, _FAR_STEP)
     gains = np.empty((len(begins), len(tips), len(bends)))
-    try_parabolas(smooth, factor, guide.points, guide.along, expected, begins, tips, bends, gains)
+    try_parabolas(darkness, factor, guide.points, guide.along, expected, begins, tips, bends, gains)
     total = _WORTH * gains - 0.5 * (begins[:, None, None] / np.hypot(_BASE, _ROW)) ** 2
     best = total.max(axis=0)
     middles, found = 0.5 * tips[:, None] + bends, list[_Candidate]()
@@ -222,45 +226,45 @@ def _candidates(guide: _Guide, expected: float, smooth: Image, factor: float) ->
         t = begin + (tips[i] - begin) * u + 4.0 * bends[j] * u * (1.0 - u)
         line = guide.line(expected + t)
         place = np.array([begin, t[count // 2], tips[i]])
-        cost = _goes_on(line, smooth, factor) if guide.ends else 0.0
-        strength = strengths(line, smooth, factor)
+        cost = _goes_on(line, darkness, factor) if guide.ends else 0.0
+        strength = strengths(line, darkness, factor)
         found.append(_Candidate(line, strength, cost - _WORTH * float(gains[k, i, j]), place))
         near = (np.abs(tips - tips[i]) < _DISTINCT)[:, None]
         best[near & (np.abs(middles - middles[i, j]) < _DISTINCT)] = -np.inf
     return found
 
 
-def _goes_on(line: Array, smooth: Image, factor: float) -> float:
+def _goes_on(line: Array, darkness: Image, factor: float) -> float:
     """Cost of a line that is seen to go on beyond the whisker's tip."""
     ahead = line[-1] - line[-1 - _LAST]
     ahead = ahead / max(float(np.hypot(*ahead)), 1e-9)
     further = line[-1] + (_BEYOND + _LONGER * _SPACING * len(line))[:, None] * ahead
     across = ahead[::-1] * [-1.0, 1.0]
-    seen = [strengths(further + a * across, smooth, factor) - _NOTHING for a in _ASIDE]
+    seen = [strengths(further + a * across, darkness, factor) - _NOTHING for a in _ASIDE]
     return min(_GOES_ON * max(float(one.clip(0.0).sum()) for one in seen), _CLEAR)
 
 
-def strengths(line: Array, smooth: Image, factor: float) -> Array:
+def strengths(line: Array, darkness: Image, factor: float) -> Array:
     """Strength of the image along a line (n, 2), at each of its points."""
     found, ahead = np.empty(len(line)), tangent(line)
-    strengths_at(smooth, factor, np.ascontiguousarray(line), np.ascontiguousarray(ahead), found)
+    strengths_at(darkness, factor, np.ascontiguousarray(line), np.ascontiguousarray(ahead), found)
     return found
 
 
 @kernel
-def strengths_at(smooth: Any, factor: float, line: Any, ahead: Any, found: Any) -> None:
+def strengths_at(darkness: Any, factor: float, line: Any, ahead: Any, found: Any) -> None:
     """Strength of a smoothed image of darkness along a line; outside, that of bright ground."""
     for j in range(len(line)):
-        found[j] = strength_at(smooth, factor, line[j, 0], line[j, 1], ahead[j, 0], ahead[j, 1])
+        found[j] = strength_at(darkness, factor, line[j, 0], line[j, 1], ahead[j, 0], ahead[j, 1])
 
 
 @inlined
-def strength_at(smooth: Any, factor: float, x: float, y: float, dx: float, dy: float) -> float:
+def strength_at(darkness: Any, factor: float, x: float, y: float, dx: float, dy: float) -> float:
     """Curvature of a smoothed image across a line, in units of its noise."""
     column, row = int(x + 0.5), int(y + 0.5)
-    if x < 1.0 or y < 1.0 or column > smooth.shape[1] - 2 or row > smooth.shape[0] - 2:
+    if x < 1.0 or y < 1.0 or column > darkness.shape[1] - 2 or row > darkness.shape[0] - 2:
         return -_BRIGHTEST
-    p = smooth[row - 1 : row + 2, column - 1 : column + 2]
+    p = darkness[row - 1 : row + 2, column - 1 : column + 2]
     xx = p[1, 0] + p[1, 2] - 2.0 * p[1, 1]
     yy = p[0, 1] + p[2, 1] - 2.0 * p[1, 1]
     xy = 0.25 * (p[0, 0] + p[2, 2] - p[0, 2] - p[2, 0])
@@ -271,7 +275,7 @@ def strength_at(smooth: Any, factor: float, x: float, y: float, dx: float, dy: f
 
 @kernel
 def try_parabolas(
-    smooth: Any,
+    darkness: Any,
     factor: float,
     points: Any,
     along: Any,
@@ -290,6 +294,7 @@ def try_parabolas(
     low, width = math.floor(expected - far), int(2.0 * far) + 2
     table = np.zeros((count, width, 3), np.float32)
     steps = np.zeros((count, 2))
+    last_row, last_column = darkness.shape[0] - 2, darkness.shape[1] - 2
     for j in range(1, count):
         gx, gy = points[j, 0] - points[j - 1, 0], points[j, 1] - points[j - 1, 1]
         ax, ay = along[j, 0], along[j, 1]
@@ -297,13 +302,13 @@ def try_parabolas(
         for i in range(width):
             column = int(points[j, 0] + (low + i) * ax + 0.5)
             row = int(points[j, 1] + (low + i) * ay + 0.5)
-            if min(row, column) < 1 or row > smooth.shape[0] - 2 or column > smooth.shape[1] - 2:
+            if min(row, column) < 1 or row > last_row or column > last_column:
                 # Bright ground.
                 table[j, i, 0] = -_BRIGHTEST * steps[j, 0]
                 table[j, i, 1] = -_BRIGHTEST * steps[j, 1]
                 table[j, i, 2] = -_BRIGHTEST
                 continue
-            p = smooth[row - 1 : row + 2, column - 1 : column + 2]
+            p = darkness[row - 1 : row + 2, column - 1 : column + 2]
             xx = -factor * (p[1, 0] + p[1, 2] - 2.0 * p[1, 1])
             yy = -factor * (p[0, 1] + p[2, 1] - 2.0 * p[1, 1])
             xy = -factor * 0.25 * (p[0, 0] + p[2, 2] - p[0, 2] - p[2, 0])
@@ -392,6 +397,8 @@ def shown_twice(line: Any, strength: Any, other: Any, also: Any, near: float) ->
 
 def _over_all_frames(choices: Sequence[_Choice]) -> list[list[Array]]:
     """Lines of all whiskers in each frame, empty if lost or in doubt."""
+    if not choices:
+        return []
     places = [
         np.array([one.place for one in c.lines] + [np.full(3, np.nan)]) for c in choices
     ]  # the last of them is that of lost whiskers, −1

@@ -75,7 +75,9 @@ _ROUNDS = 3  # number of rounds in which bends are learned
 _BLOCK = 1000  # number of frames that are decided together, which limits memory
 _BENDING = 60  # number of last points of a trace by which it is continued to its usual length
 _USUAL = 75.0  # percentile of a whisker's length where its tip is seen that is its usual one
-_MERGED = 0.8  # share of a line on others from which it cannot be measured apart from them
+# Share of a line on others from which it cannot be measured apart from them, and the standard
+# deviation that is added then, pixels.
+_MERGED, _SHARED = 0.8, 1.5
 
 
 class _Guide(NamedTuple):
@@ -464,6 +466,8 @@ def _measured(
             clutter = clutter if apart else clutter.still_only
             trace = traced(frame, noise, line, options, clutter=clutter, begins=True)[0]
             trace = _begun(trace, line[0], options)
+            if not apart:
+                trace = trace._replace(sigma=np.hypot(trace.sigma, _SHARED))
         traces.append(trace if trace.support >= 0.5 * options.shortest else Trace.lost())
     return traces
 

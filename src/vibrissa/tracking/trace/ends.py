@@ -60,19 +60,19 @@ def traced(
     options: TraceOptions,
     before: float = OUTSIDE,
     clutter: Clutter = NOTHING,
-    begins: bool = False,
+    held: float = 0.0,
 ) -> tuple[Trace, bool]:
     """Trace a whisker near a line, and find its ends; whether it begins at the face.
 
-    With ``begins`` the whisker begins where the line does.
+    If points that are not seen are held at the line, the whisker begins where it does.
     """
     line = prolonged(even(line), _BENDING, _BEYOND)
     for gate in (3, 2):
-        line = even(fitted(frame, line, gate, noise, options, clutter)[0])
+        line = even(fitted(frame, line, gate, noise, options, clutter, held=held)[0])
         if len(line) < FEWEST:
             # Where nothing is seen, nothing determines the line.
             return Trace.lost(), False
-    line, from_face = (line, True) if begins else _with_base(frame, line, before, clutter)
+    line, from_face = (line, True) if held else _with_base(frame, line, before, clutter)
     if before > OUTSIDE and len(line) >= FEWEST:
         # Extrapolated parts are measured before they count.
         fur = _FUR if from_face else 0
@@ -82,7 +82,8 @@ def traced(
     if not from_face:
         # Without a face the whisker begins, as it ends, where the line does.
         line = prolonged(line[::-1], _BENDING, _BEYOND)[::-1]
-    line, along = measured(frame, line, 1, noise, options, _FUR if from_face else 0, clutter)
+    fur = _FUR if from_face else 0
+    line, along = measured(frame, line, 1, noise, options, fur, clutter, held)
     first = 0
     if not from_face:
         bare, texture = _above_texture(frame, line, along, options, clutter)

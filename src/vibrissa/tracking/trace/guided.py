@@ -31,7 +31,7 @@ from vibrissa.numerics import Array, Mask, inlined, kernel, without_blas_threads
 from vibrissa.tracking.trace.curves import smoothed
 from vibrissa.tracking.trace.ends import prolonged, traced
 from vibrissa.tracking.trace.identity import Seen, Step, Ways, cheapest_sequence
-from vibrissa.tracking.trace.ridge import noise_level, smooth
+from vibrissa.tracking.trace.ridge import noise_level
 from vibrissa.tracking.trace.scene import Image, Scene
 from vibrissa.tracking.trace.start import epipolar_lines, is_bright
 from vibrissa.tracking.trace.trace import (
@@ -59,6 +59,8 @@ _DISTINCT = 7.0  # difference of tip or middle from which candidates are differe
 # Standard deviations of a base from its click, compared with the mean of the row, and of that mean
 # from its expected motion, pixels.
 _BASE, _ROW = 2.0, 4.0
+# Weight of a point of a chosen line where others hide the whisker, 1/pixel².
+_HELD = 0.02
 _ASTRAY = 3.0  # standard deviations of a base from which a trace is on something else
 # Beyond a tip: distances at which a line would go on, pixels, and the share of the length by which
 # they are larger; distances to the side; strength that counts as none; cost of a unit of strength
@@ -75,9 +77,9 @@ _ROUNDS = 3  # number of rounds in which bends are learned
 _BLOCK = 1000  # number of frames that are decided together, which limits memory
 _BENDING = 60  # number of last points of a trace by which it is continued to its usual length
 _USUAL = 75.0  # percentile of a whisker's length where its tip is seen that is its usual one
-# Share of a line on others from which it cannot be measured apart from them, and the standard
-# deviation that is added then, pixels.
-_MERGED, _SHARED = 0.8, 1.5
+# Share of a line on others from which it cannot be measured apart from them; standard deviations
+# that are added then, and where others hide a whisker, pixels.
+_MERGED, _SHARED, _HIDDEN = 0.8, 1.5, 1.0
 
 
 class _Guide(NamedTuple):
@@ -464,28 +466,18 @@ def _measured(
         if len(line):
             apart = clutter.hides(line).mean() < _MERGED
             clutter = clutter if apart else clutter.still_only
-            trace = traced(frame, noise, line, options, clutter=clutter, begins=True)[0]
-            trace = _begun(trace, line[0], options)
-            if not apart:
-                trace = trace._replace(sigma=np.hypot(trace.sigma, _SHARED))
+            trace = traced(frame, noise, line, options, clutter=clutter, held=_HELD)[0]
+            if len(trace.line) and np.hypot(*(trace.line[0] - line[0])) > _ASTRAY * _BASE:
+                trace = Trace.lost()
+            unsure = np.where(clutter.hides(trace.line) & ~trace.seen, _HIDDEN, 0.0)
+            unsure = unsure if apart else np.full(len(unsure), _SHARED)
+            trace = trace._replace(sigma=np.hypot(trace.sigma, unsure))
         traces.append(trace if trace.support >= 0.5 * options.shortest else Trace.lost())
     return traces
-
-
-def _begun(trace: Trace, base: Array, options: TraceOptions) -> Trace:
-    """Trace that begins near a base, if other whiskers hide its own; lost if it is far from it."""
-    if not len(trace.line):
-        return trace
-    if not trace.seen[0]:
-        line, weights = trace.line.copy(), trace.seen / trace.sigma**2
-        line[0], weights[0] = base, 1.0 / _BASE**2
-        trace = trace._replace(line=smooth(line, weights, options.stiffness))
-    far = float(np.hypot(*(trace.line[0] - base))) > _ASTRAY * _BASE
-    return Trace.lost() if far else trace
 
 
 def _confident(row: Sequence[Trace]) -> list[Trace]:
     """Traces that are less confident the shorter they are compared with the whisker's others."""
     lengths = [trace.support for trace in row if len(trace.line)]
-    usual = float(np.median(lengths)) if lengths else 1.0
+    usual = max(float(np.median(lengths)), 1.0) if lengths else 1.0
     return [t._replace(confidence=t.confidence * min(1.0, t.support / usual)) for t in row]

@@ -373,8 +373,12 @@ def fitted(
     options: TraceOptions,
     clutter: Clutter,
     skipped: int = 0,
+    held: float = 0.0,
 ) -> tuple[Array, Array, Array, Mask, Array, float]:
-    """Measure across a line and smooth it: line, amplitude, flank, seen, weight, and excess."""
+    """Measure across a line and smooth it: line, amplitude, flank, seen, weight, and excess.
+
+    Points that are not seen are held at the line by a weight.
+    """
     n, line = len(line), np.ascontiguousarray(line)
     points, amplitude, flank, support = np.empty((n, 2)), np.empty(n), np.empty(n), np.empty(n)
     measure(frame, line, gate, noise, options.scale, *clutter, points, amplitude, flank, support)
@@ -382,13 +386,13 @@ def fitted(
     seen[:skipped] = False
     variance = SLOPE_VARIANCE * (noise * options.scale / np.maximum(amplitude, 1e-3)) ** 2
     weight = seen / (variance + 0.03**2)
-    better = smooth(points, weight, options.stiffness)
+    better = smooth(points, weight + held * ~seen, options.stiffness)
     # Points far from their neighbours are weighted down in the second pass.
     miss = ((points - better) ** 2).sum(axis=1) * weight
     # Compression removes noise from flat regions, and adds it near edges.
     excess = max(1.0, middle(miss[seen]) / _MEDIAN) if seen.any() else 1.0
     weight *= 9.0 / np.maximum(miss / excess, 9.0) / excess
-    better = smooth(points, weight, options.stiffness)
+    better = smooth(points, weight + held * ~seen, options.stiffness)
     return better, amplitude, flank, seen, weight, excess
 
 
@@ -400,10 +404,11 @@ def measured(
     options: TraceOptions,
     skipped: int = 0,
     clutter: Clutter = NOTHING,
+    held: float = 0.0,
 ) -> tuple[Array, Measured]:
     """Measure across a line, smooth it, and state the uncertainty of each point."""
     better, amplitude, flank, seen, weight, excess = fitted(
-        frame, line, gate, noise, options, clutter, skipped
+        frame, line, gate, noise, options, clutter, skipped, held
     )
     information = np.convolve(weight, np.ones(min(9, len(line))), mode="same")
     sigma = 1.0 / np.sqrt(np.maximum(information, 1.0))

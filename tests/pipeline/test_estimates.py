@@ -237,7 +237,10 @@ def test_other_shapes_are_fitted_and_come_back_from_a_file(quiet, tmp_path, shap
 
 
 def test_a_peg_is_found_with_noise(trial):
-    contour = with_contour(trial)["contour"].to_dataset()
+    done = with_contour(trial)
+    contour = done["contour"].to_dataset()
+    for name in ("surface_distance", "inlier", "chi_squared", "object_distance"):
+        np.testing.assert_array_equal(Recording(done)["contour"][name], contour[name])
     assert np.linalg.norm(contour["axis_offset"]) < 0.2e-3
     sigma = np.sqrt(np.diag(contour["parameter_covariance"]))
     assert (np.abs(contour["axis_offset"].values[:2]) < 5 * sigma[:2]).all()

@@ -202,3 +202,10 @@ def test_a_whole_wrench_knows_a_prior_too(gamma_map, bent):
 def test_what_is_no_prior_is_refused(given, message):
     with pytest.raises(ValueError, match=message):
         vb.Prior(**given)
+
+
+def test_a_region_in_mm_is_refused(gamma_map, bent):
+    """No contact is there: all answers would be outside of the prior."""
+    signals = vb.base_signals(*bent[:2])
+    with pytest.raises(ValueError, match="no contact of a whisker"):
+        gamma_map.estimate(signals, noise=NOISE, prior=vb.Prior({"r": (5.0, 30.0)}))

@@ -110,6 +110,11 @@ class Prior:
         -------
         (n,) bool array
             True for those.
+
+        Raises
+        ------
+        ValueError
+            If the region is farther away than the whisker is long, as if it were in mm.
         """
         size = np.linalg.norm(contact_forces, axis=1)
         allowed = (size >= self.least_force) & (size <= self.greatest_force)
@@ -121,6 +126,12 @@ class Prior:
             large = contact_tangents(d, x)[:, 0] < 0.0
             return np.asarray(
                 allowed & in_region(self.region, concave_backward(whisker, points), large)
+            )
+        nearest, farthest = self.region.get("r", (0.0, np.inf))
+        if nearest > whisker.length:
+            raise ValueError(
+                f"a region has r between {nearest:g} and {farthest:g} m; no contact of a whisker "
+                f"of {whisker.length:g} m is there"
             )
         for name, value in zip(_COORDINATES, spherical(points).T, strict=True):
             if name in self.region:

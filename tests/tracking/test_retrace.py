@@ -119,3 +119,20 @@ def test_a_single_whisker_is_not_traced_anew(flat):
     traces, remarks = retraced(flat.film.cameras, videos, bases, one, samples=flat.film.images)
     assert not remarks
     assert traces[1][0][3] is one[1][0][3]
+
+
+def test_the_lines_of_many_whiskers_can_be_combined():
+    """With fewer candidates of each, as the number of combinations grows with that of whiskers."""
+    line = np.stack([np.arange(0.0, 80.0, 4.0), np.zeros(20)], axis=1)
+    rows = [
+        [
+            guided._Candidate(
+                line + np.array([0, 30 * k + 7 * c]), np.ones(20), c - 5.0, np.zeros(3)
+            )
+            for c in range(3)
+        ]
+        for k in range(20)
+    ]
+    choice = guided._combined(rows)
+    assert choice.cost[0] == pytest.approx(20 * -5.0)
+    assert (choice.ways[0] >= 0).all()

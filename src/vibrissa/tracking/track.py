@@ -57,7 +57,7 @@ from vibrissa.tracking.refine.rods import TraceSeries, rolled
 from vibrissa.tracking.refine.silhouette import explains, peg_in_images
 from vibrissa.tracking.space.curve import begun_together, merged, with_one_tip
 from vibrissa.tracking.space.exchange import Known, exchanged
-from vibrissa.tracking.space.frame_pairs import paired_frames
+from vibrissa.tracking.space.frame_pairs import best_seen, paired_frames
 from vibrissa.tracking.space.pose import CUTOFF, BasePose, HeadPose, base_pose, rolled_over
 from vibrissa.tracking.space.rest_shape import (
     LEAST_SEEN,
@@ -215,7 +215,7 @@ def track(
         )
     if not (np.isfinite(rate) and rate > 0.0):
         raise ValueError(f"rate is {rate!r}; it must be positive, in frames per second")
-    timed = _best_seen(traces)
+    timed = best_seen(traces)
     pairs = paired_frames(cameras, timed, options.offset)
     if head is not None and len(cameras) == 1:
         raise ValueError("the head moves in space, which one view does not show: leave it out")
@@ -410,13 +410,6 @@ def _corrected(
             f"used: {optics}. Calibrated cameras (vibrissa calibrate, --cameras) are better."
         ],
     )
-
-
-def _best_seen(traces: Sequence[Sequence[Sequence[Trace]]]) -> list[Sequence[Trace]]:
-    """Traces, by view, of the whisker that is lost least often."""
-    seen = [[sum(len(trace.line) > 0 for trace in row) for row in view] for view in traces]
-    best = int(np.argmax(np.min(seen, axis=0)))
-    return [view[best] for view in traces]
 
 
 def track_whisker(

@@ -68,6 +68,13 @@ def paired_frames(
     return pairs[usable]
 
 
+def best_seen(traces: Sequence[Sequence[Sequence[Trace]]]) -> list[Sequence[Trace]]:
+    """Traces, by view, of the whisker that is lost least often."""
+    seen = [[sum(len(trace.line) > 0 for trace in row) for row in view] for view in traces]
+    best = int(np.argmax(np.min(seen, axis=0)))
+    return [view[best] for view in traces]
+
+
 def clear_offsets(
     first: Camera, second: Camera, a: Sequence[Trace], b: Sequence[Trace], given: int = 0
 ) -> Offsets:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from vibrissa.cameras import Camera
 from vibrissa.io import Frame
 from vibrissa.numerics import Array, Mask
-from vibrissa.tracking.space.frame_pairs import paired_frames
+from vibrissa.tracking.space.frame_pairs import best_seen, paired_frames
 from vibrissa.tracking.trace.guided import Frames, trace_guided
 from vibrissa.tracking.trace.start import base_gap
 from vibrissa.tracking.trace.trace import Trace, TraceOptions
@@ -27,6 +27,7 @@ _BASES, _TIPS, _FADING = 8.0, 0.1, 0.4
 # Share of the frames in which the views show one whisker, from which nothing is traced anew; and
 # change of a whisker's length from its usual one, as a share, up to which it is traced steadily.
 _AGREES, _STEADY = 0.9, 0.2
+_LARGEST = 20  # number of whiskers of a row up to which lines can be combined
 
 Traces = Sequence[Sequence[Sequence[Trace]]]
 """Traces by view, whisker and frame."""
@@ -79,10 +80,10 @@ def retraced(
         Views that were traced anew, and how well they agreed before and agree now.
     """
     found, remarks = [[list(row) for row in view] for view in traces], list[str]()
-    if len(cameras) < 2 or len(found[0]) < 2:
+    if len(cameras) < 2 or not 2 <= len(found[0]) <= _LARGEST:
         return found, remarks
     guide = int(np.argmax([_steadiness(view) for view in found]))
-    pairs = paired_frames(cameras, _best(found), offset)
+    pairs = paired_frames(cameras, best_seen(found), offset)
     for v, camera in enumerate(cameras):
         both = [guide, v]
         rows = [_in_pairs(found[view], pairs[:, view]) for view in both]
@@ -110,13 +111,6 @@ def retraced(
                 f"{100.0 * before:.0f} % of the frames, now in {100.0 * after:.0f} %."
             )
     return found, remarks
-
-
-def _best(traces: Traces) -> list[Sequence[Trace]]:
-    """Traces, view by view, of the whisker that is lost least often."""
-    seen = [[sum(len(trace.line) > 0 for trace in row) for row in view] for view in traces]
-    best = int(np.argmax(np.min(seen, axis=0)))
-    return [view[best] for view in traces]
 
 
 def _steadiness(view: Sequence[Sequence[Trace]]) -> float:

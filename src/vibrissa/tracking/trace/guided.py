@@ -343,7 +343,7 @@ def try_parabolas(
 def _combined(lines: Sequence[Sequence[_Candidate]]) -> _Choice:
     """The cheapest combinations of candidates of all whiskers."""
     count = len(lines)
-    most = max(2, int(_COMBINED ** (1.0 / count)) - 1)
+    most = max(1, int(_COMBINED ** (1.0 / count)) - 1)
     some = [row[:most] for row in lines]
     # The last choice of each is that the whisker is lost, if no person gave its line.
     sizes = [len(row) + 1 for row in some]
@@ -409,20 +409,18 @@ def _over_all_frames(choices: Sequence[_Choice]) -> list[list[Array]]:
     motions = [_motion(a, b) for a, b in pairwise(places)]
     frames = [Seen([_as_trace(one.line) for one in c.lines], [], []) for c in choices]
     settled = [set[int]() for _ in choices]
-    costs = [c.cost for c in choices]
+    bends, costs = [_bends(place) for place in places], [c.cost for c in choices]
     chosen: list[list[int]] = []
     for _ in range(_ROUNDS):
         steps = [Step(c.ways, cost) for c, cost in zip(choices, costs, strict=True)]
         chosen = cheapest_sequence(frames, settled, steps, motions)
-        bends = [_bends(place) for place in places]
         own = np.array([bend[way] for bend, way in zip(bends, chosen, strict=True)])
         usual = _median(own)
         spread = np.maximum(1.4826 * _median(np.abs(own - usual)), _BEND)
+        away = [(bend[c.ways] - usual) / spread for c, bend in zip(choices, bends, strict=True)]
         costs = [
-            c.cost
-            + 0.5
-            * np.minimum(np.nan_to_num((bend[c.ways] - usual) / spread) ** 2, _MOST**2).sum(axis=1)
-            for c, bend in zip(choices, bends, strict=True)
+            c.cost + 0.5 * np.minimum(np.nan_to_num(one) ** 2, _MOST**2).sum(axis=1)
+            for c, one in zip(choices, away, strict=True)
         ]
     return [
         [c.lines[n].line if n >= 0 else np.empty((0, 2)) for n in way]

@@ -117,6 +117,28 @@ def test_a_peg_is_measured_by_its_outline(axis):
     assert abs(middle @ frame) / 1e-3**2 < 4.0 * np.sqrt(found.covariance[0, 0])
 
 
+def test_a_reflection_on_a_peg_is_no_outline():
+    """It leaves a dark band to each side of it, with edges as a thinner peg would have."""
+    peg = Peg([1e-3, 2e-3, 0.5e-3], [0.15, 0.25, 1.0], 1.35e-3)
+    core, cameras = within(Peg(peg.origin, peg.axis, 0.6 * peg.radius)), lenses()
+    sample = []
+    for camera in cameras:
+        image = drawn(camera, within(peg))
+        image[drawn(camera, core) < 115] = 130
+        sample.append([image] * 3)
+    found = peg_in_images(cameras, sample, touches_of(peg))
+    assert found is not None
+    assert abs(found.expected.radius - peg.radius) < 20e-6
+
+
+@pytest.mark.parametrize("radius", [0.06e-3, 0.15e-3])
+def test_a_line_is_no_peg(radius):
+    """Any two lines in two views meet in space."""
+    wire, cameras = Peg([1e-3, 2e-3, 0.5e-3], [0.15, 0.25, 1.0], radius), lenses()
+    sample = [[drawn(camera, within(wire))] * 3 for camera in cameras]
+    assert peg_in_images(cameras, sample, touches_of(wire)) is None
+
+
 def test_what_is_not_a_peg_is_not_taken_for_one():
     cameras = lenses()
     peg = Peg([1e-3, 2e-3, 0.5e-3], [0.1, 0.2, 1.0], 1.1e-3)

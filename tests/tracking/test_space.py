@@ -288,8 +288,9 @@ def test_contact_that_makes_a_whisker_look_rolled_leaves_its_roll():
     )
 
 
-def test_far_ends_that_were_exchanged_in_one_view_are_put_right():
-    """Two whiskers cross in the front view: in frames 3 and 4 each goes on as the other there."""
+@pytest.fixture(scope="module")
+def two_known():
+    """Two whiskers in six frames that cross in the front view, the last three of them in doubt."""
     cameras, frames, bases = PAIRS["orthogonal"], 6, ([0.0, -1e-3, -5e-4], [0.0, 1e-3, 2e-3])
     shapes = [
         [curve(azimuth + 0.02 * i, bend) + base for i in range(frames)]
@@ -301,13 +302,19 @@ def test_far_ends_that_were_exchanged_in_one_view_are_put_right():
         np.array([merge(cameras, both).points for both in zip(*r, strict=True)]) for r in right
     ]
     known = [Known(points, points[0], doubtful, doubtful) for points in curves]
+    return cameras, right, known
+
+
+def test_far_ends_that_were_exchanged_in_one_view_are_put_right(two_known):
+    """In frames 3 and 4 each of two whiskers that cross goes on as the other in the front view."""
+    cameras, right, known = two_known
     swapped = [[list(view) for view in row] for row in right]
     for i in (3, 4):
         (a, one), (b, other) = cut_at_crossing(right[0][1][i], right[1][1][i])
         swapped[0][1][i] = joined(one, a, other, b)
         swapped[1][1][i] = joined(other, b, one, a)
     # In frame 5 whisker 0 is on something that is no whisker of this row.
-    swapped[0][1][5] = traced(cameras[1], curve(0.2, -25.0) + bases[0])
+    swapped[0][1][5] = traced(cameras[1], curve(0.2, -25.0) + np.array([0.0, -1e-3, -5e-4]))
     found = exchanged(cameras, swapped, known)
     for k, row in enumerate(found):
         for i in range(5):
@@ -316,6 +323,17 @@ def test_far_ends_that_were_exchanged_in_one_view_are_put_right():
             np.testing.assert_array_equal(row[0][i].line, right[k][0][i].line)
     assert [len(found[0][v][5].line) for v in range(2)] == [0, 0]
     np.testing.assert_array_equal(found[1][1][5].line, right[1][1][5].line)
+
+
+def test_a_whisker_that_a_view_lost_is_given_no_line_of_another(two_known):
+    """In frame 4 of the front view the first whisker is lost, and the second near where it is."""
+    cameras, right, known = two_known
+    rows = [[list(view) for view in row] for row in right]
+    rows[0][1][4], rows[1][1][4] = Trace.lost(), right[0][1][4]
+    found = exchanged(cameras, rows, known)
+    assert [len(found[0][v][4].line) for v in range(2)] == [0, 0]
+    for i in (3, 5):
+        np.testing.assert_array_equal(found[0][1][i].line, right[0][1][i].line)
 
 
 def cut_at_crossing(one, other):

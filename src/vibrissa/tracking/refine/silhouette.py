@@ -12,8 +12,10 @@ line of sight: with e the unit vector from the axis to the lens, w its length, a
     n = (R/w) e ± √(1 − (R/w)²) f.
 
 At both of its lines a body is darker than what is around it, or at both brighter: else the two
-could be the same edge. A view nearly along the axis shows hardly more than the ends of the peg,
-whose contours are arcs from line to line; their heights are further unknowns.
+could be the same edge. Of cylinders with such outlines the thickest is preferred, as thinner ones
+are between an edge and a reflection. Dark lines, of which any two in two views meet in space, are
+no cylinders. A view nearly along the axis shows hardly more than the ends of the peg, whose
+contours are arcs from line to line; their heights are further unknowns.
 """
 
 from __future__ import annotations
@@ -49,6 +51,7 @@ _LEAN = 0.15  # range of the angle between axis and surface, due to errors of th
 _SLIDE, _SLIDES, _FARTHEST = 0.35e-3, 3e-3, 6e-3
 _GAP = 1.5e-4  # distance of contacts from a cylinder that is as bad as an outline without edge, m
 _GAPS = 0.6  # weight of that
+_THICKER = 0.15  # weight of twice the radius, as a share of an outline
 _SEEN = 0.6  # share of each outline that must be an edge
 # Length of the outline's lines in an image, in radii, from which ends are not needed.
 _BROAD = 1.5
@@ -67,7 +70,8 @@ _TOGETHER = 256  # number of cylinders that are compared at once, the likeliest 
 _FEWEST, _MOST_CONTACTS = 5, 25  # smallest number of contacts, and of those that are compared
 # Standard deviation of all unknowns before, in their units; and if one view alone shows the peg.
 _PRIOR, _NEARBY = 3.0, 0.5
-_THINNEST = 0.1e-3  # smallest radius, m
+# Smallest radius, pixels: both edges of a thinner peg are smoothed into those of a line.
+_THINNEST = 2.5
 _SMALLEST = 8  # smallest side of a part of an image, pixels
 _INSIDE = 0.2  # share of an outline that must be in the image
 _OUTWARD = 1e-5  # distance by which a point is moved to see what is outward, m
@@ -169,6 +173,10 @@ class _View:
         """Columns and rows in the part, of points (..., 3)."""
         at = self.camera.project(points.reshape(-1, 3)) - self.corner
         return np.asarray(at.reshape(*points.shape[:-1], 2))
+
+    def scale(self, point: Array) -> float:
+        """Pixels per metre at a point (3,)."""
+        return float(np.linalg.norm(self.camera.project_with_slopes(point[None])[1][0], 2))
 
     def sight(self, points: Array) -> Array:
         """Vectors from points (n, 3) to the lens, or vectors toward it if it is far away."""
@@ -300,7 +308,7 @@ def peg_in_images(
     shown = [float(np.linalg.norm(np.cross(peg.axis, s)) / np.linalg.norm(s)) for s in sights]
     least = int(np.argmin(shown))
     if 2.0 * _HALF * shown[least] > _BROAD * peg.radius:
-        found = _accepted(_measured(seen, peg))
+        found = _accepted(_measured(seen, peg), seen)
         if found is not None:
             return found
     others = [view for i, view in enumerate(seen) if i != least]
@@ -308,7 +316,7 @@ def peg_in_images(
     if broad is None:
         return None
     for tried, ends in _with_ends(seen[least], others[0], broad.peg, touches):
-        found = _accepted(_measured(seen, tried, ends, seen[least]))
+        found = _accepted(_measured(seen, tried, ends, seen[least]), seen)
         if found is not None:
             return found
     return None
@@ -329,6 +337,7 @@ def _likeliest(views: Sequence[_View], touches: Touches, middle: int) -> Peg | N
         across *= ((radius + touches.radius[middle]) / np.linalg.norm(across, axis=1))[:, None]
         tried = _Cylinders(center + slide[:, None] * along - across, axis, radius)
         part = _sides(views[0], tried, heights) - _gaps(tried, touches, slide)
+        part += _THICKER * np.log2(radius / _RADII[0])
         score = np.full(len(part), -np.inf)
         for some in np.array_split(np.argsort(-part), -(-len(part) // _TOGETHER)):
             # The other view adds at most 1.
@@ -438,9 +447,11 @@ def _measured(
     return _Measured(peg, covariance[:PEG_UNKNOWNS, :PEG_UNKNOWNS], parts)
 
 
-def _accepted(found: _Measured | None) -> UncertainPeg | None:
-    """The peg, if all parts of its outline are edges."""
-    if found is None or found.peg.radius < _THINNEST:
+def _accepted(found: _Measured | None, views: Sequence[_View]) -> UncertainPeg | None:
+    """The peg, if all parts of its outline are edges, and it is thicker than a line."""
+    if found is None:
+        return None
+    if found.peg.radius * min(view.scale(found.peg.origin) for view in views) < _THINNEST:
         return None
     miss = np.concatenate([part.miss for part in found.parts])
     if min(part.share for part in found.parts) < _SEEN or np.mean(miss**2) > _RIGHT**2:

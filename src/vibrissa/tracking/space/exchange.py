@@ -4,7 +4,8 @@ Where two whiskers cross in one view, tracing may continue each along the other.
 disagrees, and the whisker in space has an impossible shape. Its true shape and the path of its base
 are known from other frames. In a frame in doubt, lines are therefore exchanged in each view, as a
 whole or from the crossing on: the pair of lines is chosen that has the whisker's shape and base, if
-it fits far better than any other pair. Otherwise the whisker is lost in that frame.
+it fits far better than any other pair. Otherwise the whisker is lost in that frame. So is a whisker
+that was not traced in a view: of what is left, a neighbour's line fits best.
 """
 
 from __future__ import annotations
@@ -67,7 +68,9 @@ def exchanged(
     ]
     offers: list[list[tuple[float, int, Pair]]] = [[] for _ in range(count)]
     for k, look in looks.items():
-        for i, (unlike, pair) in _offers(cameras, look, [k in one for one in free], lines).items():
+        traced = [all(len(view[i].line) for view in rows[k]) for i in range(count)]
+        doubtful = [k in one and shown for one, shown in zip(free, traced, strict=True)]
+        for i, (unlike, pair) in _offers(cameras, look, doubtful, lines).items():
             offers[i].append((unlike, k, pair))
     for i in range(count):
         taken: set[tuple[int, int, int]] = set()

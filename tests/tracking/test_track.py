@@ -682,6 +682,21 @@ def test_the_rest_shape_ignores_where_hairs_let_a_trace_begin():
     np.testing.assert_array_equal(rest_shape(curves).free, ~touched)
 
 
+@pytest.mark.parametrize(
+    ("bend", "frames", "touches"), [(0.4, 1, False), (0.4, 2, True), (1.2, 1, True)]
+)
+def test_a_contact_of_a_single_frame_bends_it_more(bend, frames, touches):
+    """Next to a crossing a trace may be wrong for a single frame."""
+    rng, s = np.random.default_rng(4), np.linspace(0.0, 20e-3, 101)
+    touched = (np.arange(60) >= 30) & (np.arange(60) < 30 + frames)
+    shapes = np.stack(np.broadcast_arrays(s, (8.0 + bend * touched[:, None]) * s**2, 0.0), axis=-1)
+    held = base_rotation(0.8 * np.sin(np.linspace(0.0, 9.0, 60)), np.zeros(60), np.zeros(60))
+    waves = np.cos(np.pi * np.outer(s / 20e-3, np.arange(40)))
+    noise = 0.7e-6 * np.einsum("nk,tki->tni", waves, rng.normal(size=(60, 40, 3)))
+    curves = np.einsum("tij,tnj->tni", held, shapes) + noise
+    np.testing.assert_array_equal(rest_shape(curves).free, ~touched if touches else True)
+
+
 def test_a_whisker_that_rests_for_long_and_then_whisks_is_not_touched():
     """Errors of traces repeat while it rests; as it moves, they differ from frame to frame."""
     rng, s, rest = np.random.default_rng(3), np.linspace(0.0, 20e-3, 101), np.arange(150) < 100

@@ -221,8 +221,8 @@ def _free(deviation: Array, within: float, sure: float) -> Mask:
         for i in range(1, len(known)):
             touching[i] |= touching[i - 1] and within <= known[i] < known[i - 1]
         known, touching = known[::-1], touching[::-1]
-    beside = np.isfinite(deviation) & ~touching
-    alone = np.append(False, beside[:-1]) & np.append(beside[1:], False)
+    apart = np.isfinite(deviation) & ~touching
+    alone = np.append(False, apart[:-1]) & np.append(apart[1:], False)
     touching &= ~alone | (known >= _ALONE * sure)
     return np.asarray(np.isfinite(deviation) & ~touching)
 

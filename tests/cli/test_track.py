@@ -9,6 +9,7 @@ import vibrissa as vb
 from vibrissa import Whisker
 from vibrissa.cameras import orthogonal_views, save_cameras
 from vibrissa.cli.app import app
+from vibrissa.cli.track import TraceStatements
 from vibrissa.io import (
     load_recording,
     load_traces,
@@ -236,10 +237,22 @@ def test_what_is_known_besides_the_videos_is_used(videos, tmp_path):
     assert "give one" in str(done.exception)
 
 
+@pytest.mark.parametrize("by_whisker", [True, False])
+def test_bases_are_stated_by_whisker_or_by_view(capsys, by_whisker):
+    """By view they are easily stated in the other order, so that it is said what was read."""
+    by_view = ["10,11", "20,21", "30,31", "40,41"]
+    stated = ["10,11,30,31", "20,21,40,41"] if by_whisker else by_view
+    found = TraceStatements(base=stated).bases(CAMERAS, None)
+    assert found == [[[10, 11], [20, 21]], [[30, 31], [40, 41]]]
+    said = " ".join(capsys.readouterr().err.split())
+    assert ("the first 2 are taken for those of the first view" in said) is not by_whisker
+
+
 @pytest.mark.parametrize(
     ("more", "said"),
     [
         (("--base", "20,30"), "all views need as many"),
+        (("--base", "20,30,40"), "x of view 0,y of view 0,x of view 1,y of view 1 are needed"),
         (("--offset", "some"), "a number of frames or auto"),
         (("--pixel-size", "0"), "--pixel-size is 0 mm"),
         (("--base-width", "nan"), "--base-width is nan"),

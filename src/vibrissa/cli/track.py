@@ -15,7 +15,7 @@ import numpy as np
 import vibrissa as vb
 from vibrissa.cli import inputs
 from vibrissa.cli.options import free, numbers, refuse, with_options
-from vibrissa.cli.terminal import progress_bars, say, shown
+from vibrissa.cli.terminal import progress_bars, remark, say, shown
 from vibrissa.deferred import xr
 
 if TYPE_CHECKING:
@@ -152,13 +152,24 @@ class TraceStatements:
         self, cameras: Sequence[vb.cameras.Camera], clicks: vb.io.Clicks | None
     ) -> list[list[list[float]] | None]:
         """Bases in each view; None if they have to be found."""
-        views = len(cameras)
-        points = [numbers(text, ("x", "y"), "--base") for text in self.base or ()]
+        views, stated = len(cameras), self.base or []
+        whole = views > 1 and any(text.count(",") > 1 for text in stated)
+        names = [f"{axis} of view {v}" for v in range(views) for axis in "xy"]
+        rows = [numbers(text, names if whole else ["x", "y"], "--base") for text in stated]
+        if whole:
+            points = [row[2 * v : 2 * v + 2] for v in range(views) for row in rows]
+        else:
+            points = rows
         if len(points) % views:
             raise ValueError(
                 f"there are {len(points)} --base for {views} views; all views need as many"
             )
         each = len(points) // views
+        if not whole and min(views, each) > 1:
+            remark(
+                f"--base: the first {each} are taken for those of the first view. A whisker in all "
+                f"views is --base {','.join(['x,y'] * views)}"
+            )
         found = [points[v * each : (v + 1) * each] for v in range(views)]
         if not points and clicks is not None:
             found = [[list(point) for point in view.base] for view in clicks.views]

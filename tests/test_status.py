@@ -84,3 +84,9 @@ def test_kernels_can_use_the_members():
     codes = np.empty(2, dtype=np.int8)
     judge(np.array([1.0, -1.0]), codes)
     assert codes.tolist() == [Status.OK, Status.BEYOND_FOLD]
+
+
+@pytest.mark.parametrize("codes", [np.array([20, 0]), [0, 2]])
+def test_an_array_is_referred_to_the_functions_for_arrays(codes):
+    with pytest.raises(TypeError, match=r"one number, not an array of shape \(2,\).*names"):
+        Status(codes)

@@ -11,6 +11,7 @@ import csv
 import enum
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,7 +20,19 @@ __all__ = ["Event", "Status", "counted", "describe", "names"]
 __dir__ = __all__.copy
 
 
-class Status(enum.IntEnum):
+class _OneCode(enum.EnumMeta):
+    """Class of an enumeration that names the functions for arrays if it is called with one."""
+
+    def __call__(cls, value: Any, *rest: Any, **options: Any) -> Any:
+        if np.ndim(value):
+            raise TypeError(
+                f"{cls.__name__}() takes one number, not an array of shape {np.shape(value)}; "
+                "vibrissa.status.names and describe take arrays"
+            )
+        return super().__call__(value, *rest, **options)
+
+
+class Status(enum.IntEnum, metaclass=_OneCode):
     """Outcome of one load or one estimate.
 
     ``str(status)`` is a sentence of explanation, followed by one of advice if there is any.

@@ -197,3 +197,25 @@ def test_an_extra_that_is_not_installed_is_named(tmp_path, module, arguments, ex
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
     assert f"vibrissa[{extra}]" in done.stderr
+
+
+def test_an_interrupt_that_python_ignores_is_repeated(interruptible):
+    """As in a callback of the compiler, or where the last reference to an object ends."""
+    code = """
+import signal, sys, time
+from vibrissa.cli.terminal import repeat_lost_interrupts
+class Last:
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+        time.sleep(0)
+repeat_lost_interrupts()
+try:
+    Last()
+    time.sleep(20.0)
+    print("lost")
+except KeyboardInterrupt:
+    print("stopped")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "stopped\n"
+    assert not done.stderr

@@ -6,7 +6,7 @@ import pytest
 import vibrissa as vb
 from vibrissa import samples
 from vibrissa.cli.app import app
-from vibrissa.io import load_recording, save_centerline, save_recording
+from vibrissa.io import load_centerline, load_recording, save_centerline, save_recording
 from vibrissa.objects import Peg
 from vibrissa.recording import Recording
 from vibrissa.simulation import Motion, measure, simulate
@@ -83,6 +83,21 @@ def test_published_radii_on_the_command_line(centerline):
     assert "need a --whisker" in str(refused.exception)
 
 
+def test_the_end_that_is_the_base_is_an_option(centerline):
+    points = load_centerline(centerline)
+    save_centerline(centerline.with_name("back.csv"), points[::-1])
+    words = ("deflect", "--point", "25,12,1", "--whisker")
+    given = ran(*words, centerline).output
+    turned = ran(*words, centerline.with_name("back.csv"), "--base-end", "last").output
+    table = given.index("┌"), turned.index("┌")
+    assert given[table[0] : given.index("└")] == turned[table[1] : turned.index("└")]
+    assert "--base-end last" in " ".join(given.split())
+    assert "taken as the base" not in " ".join(turned.split())
+    for whisker, reason in (((), "need a --whisker"), (("--whisker", "gamma"), "built-in")):
+        refused = ran("deflect", "--point", "25,12,1", *whisker, "--base-end", "last")
+        assert reason in str(refused.exception)
+
+
 def test_a_rod_longer_than_any_whisker_is_confirmed(tmp_path):
     x = np.linspace(0.0, 0.9, 12)
     save_centerline(tmp_path / "rod.csv", np.column_stack([x, 0.1 * x**2, 0 * x]))
@@ -107,6 +122,7 @@ def test_every_verb_that_reads_a_whisker_has_the_options_that_messages_name():
             readers += 1
             assert "--rat" in text, verb.name
             assert "--any-length" in text, verb.name
+            assert "--base-end" in text, verb.name
     assert readers > 6
 
 

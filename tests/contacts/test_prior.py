@@ -209,3 +209,13 @@ def test_a_region_in_mm_is_refused(gamma_map, bent):
     signals = vb.base_signals(*bent[:2])
     with pytest.raises(ValueError, match="no contact of a whisker"):
         gamma_map.estimate(signals, noise=NOISE, prior=vb.Prior({"r": (5.0, 30.0)}))
+
+
+@pytest.mark.parametrize(
+    "given", [{"least_force": 5.0}, {"least_force": 1e-9}, {"greatest_force": 50.0}], ids=str
+)
+def test_forces_in_other_units_are_refused(gamma_map, bent, given):
+    """They would leave out all contacts, or none."""
+    signals = vb.base_signals(*bent[:2])
+    with pytest.raises(ValueError, match=f"{next(iter(given))} is .* N: is it in N"):
+        gamma_map.estimate(signals, noise=NOISE, prior=vb.Prior(**given))

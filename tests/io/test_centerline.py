@@ -188,6 +188,22 @@ def test_published_radii_where_the_caller_asks(tmp_path):
         load_whisker(path, rat="F9")
 
 
+@pytest.mark.parametrize(
+    ("name", "length", "beyond"),
+    [
+        ("C2", 43e-3, ""),
+        ("C2", 12e-3, "12 mm is far from the 35 mm"),
+        ("any", 70e-3, "70 mm is far from the 3.3 to 53 mm"),
+        ("any", 4e-3, ""),
+        ("A6", 10e-3, "in row A were measured for columns 0 to 4"),
+    ],
+)
+def test_published_radii_beyond_their_data_are_noted(name, length, beyond):
+    (note,) = Whisker.straight(length, rat=name).notes
+    assert beyond in note
+    assert ("extrapolated" in note) == bool(beyond)
+
+
 def test_radii_and_points_that_are_missing(tmp_path):
     radii = np.where(RADII < 20e-6, np.nan, RADII)
     gap = np.full((2, 4), np.nan)

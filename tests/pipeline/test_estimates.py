@@ -340,6 +340,9 @@ def test_where_nothing_is_felt_no_map_is_needed(trial, contact_map):
     assert without.attrs == found.attrs
     felt = trial.to_dataset().isel(whisker=0)[["force", "moment"]]
     assert without_contact(contact_map.whisker, felt, noise=noise) is None
+    zeros = without_contact(contact_map.whisker, 0.0 * wrench, noise=noise)
+    assert zeros is not None
+    assert zeros.attrs["felt_above"] == found.attrs["felt_above"] > 0.0
 
 
 def test_two_whiskers_touch_one_peg(quiet):

@@ -119,7 +119,7 @@ def written(folder):
         patch.setenv("SOURCE_DATE_EPOCH", "1700000000")
         patch.setattr(plots, "png", partial(plots.png, dots=40.0))
         patch.setattr("vibrissa.scene.solids._SHAPE", (12, 24, 8))
-        words = (folder / "trial.nc", "--map", folder / "map.nc", "-o", folder / "trial.html")
+        words = (folder / "trial.nc", "--map", folder / "map.nc")
         assert "wrote" in run("report", *words, "--seed", 3)
     return folder / "trial.html"
 

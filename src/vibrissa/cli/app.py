@@ -30,7 +30,7 @@ from vibrissa.cli.signals import signals
 from vibrissa.cli.simulate import simulate
 from vibrissa.cli.stream import stream
 from vibrissa.cli.sweep import sweep
-from vibrissa.cli.terminal import errors, output, remark, spell_out
+from vibrissa.cli.terminal import errors, output, remark, repeat_lost_interrupts, spell_out
 from vibrissa.cli.track import track
 from vibrissa.cli.uniqueness import uniqueness
 from vibrissa.cli.view import view
@@ -96,6 +96,7 @@ def main() -> None:
     """Run the command line; an error of the input gives one message and exit status 2."""
     usual = warnings.showwarning
     spell_out()
+    repeat_lost_interrupts()
 
     def note(
         message: Warning | str,

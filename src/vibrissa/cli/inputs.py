@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import vibrissa as vb
 from vibrissa.cli.options import free, refuse
@@ -27,14 +27,15 @@ class WhiskerOptions:
     whisker: Path | None = None
     rat: str | None = None
     any_length: bool = False
+    base_end: Literal["first", "last"] | None = None
 
     def __post_init__(self) -> None:
         self.check(self.whisker is not None)
 
     def check(self, given: bool) -> None:
         """Raise ValueError for options about a whisker if none is given."""
-        if (self.rat is not None or self.any_length) and not given:
-            raise ValueError("--rat and --any-length need a --whisker")
+        if (self.rat is not None or self.any_length or self.base_end) and not given:
+            raise ValueError("--rat, --any-length and --base-end need a --whisker")
 
     def read(self, path: Path | None = None) -> vb.Whisker:
         """Read the whisker, or that of another file; by default the built-in γ whisker."""
@@ -46,7 +47,9 @@ class WhiskerOptions:
         if not vb.io.is_netcdf(path):
             if vb.io.recognise(path) == vb.io.Kind.VIDEO:
                 raise ValueError(f"{path} is a video; a whisker, map or recording is needed")
-            return vb.load_whisker(path, rat=self.rat, any_length=self.any_length)
+            how: Any = {"rat": self.rat, "any_length": self.any_length}
+            return vb.load_whisker(path, base=self.base_end, **how)
+        refuse({"--base-end": self.base_end}, f"the base of the whisker in {path} is known")
         whisker = _whisker_in(path)
         return whisker if self.rat is None else whisker.with_properties(rat=self.rat)
 
@@ -57,6 +60,7 @@ class WhiskerOptions:
             raise FileNotFoundError(
                 f"there is no file {path}; built-in whiskers are {', '.join(names)}"
             )
+        refuse({"--base-end": self.base_end}, f"{path} is a built-in whisker")
         whisker: vb.Whisker = getattr(vb.samples, str(path))()
         return whisker if self.rat is None else whisker.with_properties(rat=self.rat)
 
@@ -78,8 +82,8 @@ class TrackedOptions(WhiskerOptions):
     """Options for a tracked whisker, whose shape is that in the frames unless a file is given."""
 
     def __post_init__(self) -> None:
-        if self.any_length and self.whisker is None:
-            raise ValueError("--any-length needs a --whisker")
+        if (self.any_length or self.base_end) and self.whisker is None:
+            raise ValueError("--any-length and --base-end need a --whisker")
 
     def tracked_length(self, length: float | None) -> float | None:
         """Stated length of the whisker, m."""

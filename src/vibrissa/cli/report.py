@@ -25,11 +25,11 @@ _TAGS = 10_000  # size reserved for the names and tags of movies, bytes
 _Content: TypeAlias = "tuple[str, list[vb.report.Section], str, Mapping[str, Draw]]"
 
 
-@with_options("the page, .html")
+@with_options("the page, .html, by default next to its source and named after it")
 def report(
     path: Path,
     of_trial: TrialOptions,
-    target: Path = Path("report.html"),
+    target: Path | None = None,
     uniqueness: Path | None = None,
     movie: list[Path] | None = None,
     make: bool = False,
@@ -41,8 +41,9 @@ def report(
     It shows the whisker longest in contact, unless --which selects another. The seed is that of the
     random draws for predicted errors. If SOURCE_DATE_EPOCH is set, the same command gives the same
     page.
-    Example: `vibrissa report trial.nc --video top.mp4 --video front.mp4 -o report.html`
+    Example: `vibrissa report trial.nc --video top.mp4 --video front.mp4`
     """
+    target = path.with_suffix(".html") if target is None else target
     check_new(target, (".html", ".htm"), force)
     movies = list(movie or [])
     files = [file for file in (path, uniqueness, of_trial.map) if file]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _thread
 import codecs
 import io
 import signal
@@ -22,6 +23,7 @@ from vibrissa.sketch import progress
 output = Console(markup=False, emoji=False)
 # Console for progress and messages, so that results can be piped.
 errors = Console(stderr=True, markup=False, emoji=False)
+_LATER = 0.01  # time after which an interrupt that was lost is repeated, s
 # Function called with the current stage, the steps done and the total steps.
 Tell = Callable[[str, int, int], None]
 
@@ -92,6 +94,25 @@ def stoppable() -> Iterator[Callable[[], bool]]:
     finally:
         if before is not None:
             signal.signal(signal.SIGINT, before)
+
+
+def repeat_lost_interrupts() -> None:
+    """Raise KeyboardInterrupt again where Python only prints it.
+
+    In callbacks, as those of the compiler or at the end of an import, Python ignores exceptions, so
+    that Ctrl-C would have no effect.
+    """
+    usual = sys.unraisablehook
+
+    def hook(lost: sys.UnraisableHookArgs) -> None:
+        if not issubclass(lost.exc_type, KeyboardInterrupt):
+            usual(lost)
+            return
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        # Later, as an exception raised here would be ignored too.
+        threading.Timer(_LATER, _thread.interrupt_main).start()
+
+    sys.unraisablehook = hook
 
 
 # Signals that do not end a process by default, cannot be handled, or are faults of the process.

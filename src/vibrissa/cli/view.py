@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import vibrissa as vb
 from vibrissa.cli.inputs import MAP, RECORDING, WhiskerOptions, kind_in, print_notes, recording_from
@@ -20,6 +21,7 @@ def view(
     browser: bool = True,
     rat: str | None = None,
     any_length: bool = False,
+    base_end: Literal["first", "last"] | None = None,
     live: str | None = None,
 ) -> None:
     """Bend a whisker with the mouse and view its signals, or view a map or a trial.
@@ -33,13 +35,11 @@ def view(
     kind = "" if path is None else kind_in(path)
     viewed: vb.Whisker | vb.ContactMap | xr.DataTree
     if path is not None and kind in (MAP, RECORDING):
-        if rat is not None or any_length:
-            raise ValueError(
-                f"--rat and --any-length need a file of a whisker, and {path} is not one"
-            )
+        options = {"--rat": rat, "--any-length": any_length, "--base-end": base_end}
+        refuse(options, f"{path} is not the file of a whisker")
         viewed = vb.ContactMap.load(path, live is None) if kind == MAP else recording_from(path)
     else:
-        viewed = WhiskerOptions(path, rat, any_length).read()
+        viewed = WhiskerOptions(path, rat, any_length, base_end).read()
         print_notes(viewed)
     served: vb.viewer.Served
     try:

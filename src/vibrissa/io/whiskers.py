@@ -87,7 +87,8 @@ _FEWEST = 3  # smallest mean number of points per whisker in a table of several 
 _SURE = 4.0  # smallest difference of thickness that determines the base, in standard errors
 _PLANAR = "the file has no column z: the whisker was taken to be planar"
 _FIRST = (
-    "the first point of the file was taken as the base; base='last' (Python) takes the other end"
+    "the first point of the file was taken as the base; base='last' (Python) or --base-end last "
+    "takes the other end"
 )
 
 
@@ -476,7 +477,7 @@ def _whisker(
     stated: Any = published | radii
     whisker = Whisker.parabola(length, coefficient, name=name, **stated)
     if len(radii) < len(published):
-        whisker = replace(whisker, notes=(*whisker.notes, published_note(name)))
+        whisker = replace(whisker, notes=(*whisker.notes, published_note(name, length)))
     for radius in radii.values():
         check_slender(radius, length)
     bound = float(morphology.curvature_bound(length))

@@ -380,7 +380,7 @@ class _Measured(NamedTuple):
             rows = known & touching if "density" in wrench.attrs else rows & touching
             free |= known & ~touching
         # If no contact is detected, the threshold is that of the frames that could have had one.
-        possible = rows if rows.any() else known & ~free
+        possible = next((few for few in (rows, known & ~free, known) if few.any()), known)
         above = float(np.median(least[possible])) if possible.any() else 0.0
         typical, steady = None, bool((covariance == covariance[:1]).all())
         if noise is not None:

@@ -383,13 +383,7 @@ def average_whisker(identity: Identity, **properties: Unpack[Properties]) -> Whi
 
 def _range_notes(identity: Identity, length: float, coefficient: float) -> list[str]:
     """Notes on what lies outside the range of the equations."""
-    notes = []
-    if identity.column not in morphology.MEASURED[identity.row]:
-        known = morphology.MEASURED[identity.row]
-        notes.append(
-            f"outside the range of the equations, which in row {identity.row} were measured for "
-            f"columns {known[0]} to {known[-1]}"
-        )
+    notes = [note] if (note := morphology.beyond_columns(identity)) else []
     bound = float(morphology.curvature_bound(length))
     if coefficient > bound:
         notes.append(

@@ -167,6 +167,8 @@ def _towal_numbers(row: ArrayLike, column: ArrayLike) -> tuple[Array, Array]:
 
 ANY = "any"  # name of a whisker of unknown row and column
 _SIMILAR_LENGTH = 5e-3  # scale of the weights by length, m: about half a column
+# Largest difference of a whisker's length from the published one, m: 9 mm among 27 of one rat.
+_OTHER_LENGTH = 10e-3
 
 
 def published_radii(name: str, length: float) -> tuple[float, float]:
@@ -191,13 +193,37 @@ def published_radii(name: str, length: float) -> tuple[float, float]:
     return float(base), float(tip)
 
 
-def published_note(name: str) -> str:
-    """State the source of published radii."""
+def published_note(name: str, length: float) -> str:
+    """State the source of published radii, and whether the regressions are extrapolated."""
+    beyond = ""
     if name == ANY:
         which = "its length, of a rat's whisker of unknown row and column"
+        known = [arc_length(1 + i, c) for i, row in enumerate(ROWS) for c in MEASURED[row]]
+        shortest, longest = float(min(known)), float(max(known))
     else:
-        which = f"its length, of a rat's whisker {Identity.of(name).name}"
-    return f"radius by published regressions (Belli et al. 2017) from {which}; not measured"
+        identity = Identity.of(name)
+        which = f"its length, of a rat's whisker {identity.name}"
+        shortest = longest = float(arc_length(identity.row_number, identity.column))
+        beyond = beyond_columns(identity)
+    if not beyond and not shortest - _OTHER_LENGTH <= length <= longest + _OTHER_LENGTH:
+        usual = f"{shortest * 1e3:.2g} to " if name == ANY else ""
+        beyond = (
+            f"{length * 1e3:.3g} mm is far from the {usual}{longest * 1e3:.2g} mm that such "
+            "whiskers are long (Towal et al. 2011)"
+        )
+    beyond = f"; extrapolated: {beyond}" if beyond else ""
+    return f"radius by published regressions (Belli et al. 2017) from {which}; not measured{beyond}"
+
+
+def beyond_columns(identity: Identity) -> str:
+    """State the columns for which the equations were measured if a whisker's is another."""
+    known = MEASURED[identity.row]
+    if identity.column in known:
+        return ""
+    return (
+        f"outside the range of the equations, which in row {identity.row} were measured for "
+        f"columns {known[0]} to {known[-1]}"
+    )
 
 
 Side = Literal["left", "right"]

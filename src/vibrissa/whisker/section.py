@@ -174,7 +174,7 @@ def radius_notes(length: float, section: Profile, stated: Section) -> tuple[str,
     notes = []
     rat = stated.get("rat")
     if rat is not None:
-        notes.append(published_note(rat))
+        notes.append(published_note(rat, length))
     if section(length, "left") > section(0.0) * (1.0 + 1e-9):
         notes.append("the tip is thicker than the base")
     if section.error > UNRESOLVED:

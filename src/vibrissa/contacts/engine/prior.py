@@ -26,6 +26,9 @@ from vibrissa.whisker import Whisker
 
 _COORDINATES = ("r", "theta", "phi")
 _TURN = 2.0 * np.pi
+# Forces in units of EI/L² beyond which a limit leaves out either no contact or all: one at 3 % of
+# the length that bends the whisker by 1 rad has 3,000, one that bends it by 0.002° at the tip 1e-4.
+_FAINTEST, _STRONGEST = 1e-4, 3e3
 
 
 @dataclass(frozen=True)
@@ -114,8 +117,10 @@ class Prior:
         Raises
         ------
         ValueError
-            If the region is farther away than the whisker is long, as if it were in mm.
+            If the region is farther away than the whisker is long, as if it were in mm, or a force
+            is not of the order of those that bend the whisker.
         """
+        self._check_forces(whisker)
         size = np.linalg.norm(contact_forces, axis=1)
         allowed = (size >= self.least_force) & (size <= self.greatest_force)
         if isinstance(self.region, str):
@@ -137,6 +142,17 @@ class Prior:
             if name in self.region:
                 allowed &= _between(name, value, *self.region[name])
         return np.asarray(allowed)
+
+    def _check_forces(self, whisker: Whisker) -> None:
+        """Raise ValueError for forces that leave out all contacts of a whisker, or none."""
+        unit = whisker.base_bending_stiffness / whisker.length**2
+        for name in ("least_force", "greatest_force"):
+            force = getattr(self, name)
+            if 0.0 < force < np.inf and not _FAINTEST <= force / unit <= _STRONGEST:
+                raise ValueError(
+                    f"{name} is {force:g} N; contacts bend this whisker with the order of "
+                    f"EI/L² = {unit:.2g} N: is it in N (on the command line µN)?"
+                )
 
 
 def possible_candidates(

@@ -5,7 +5,11 @@ import subprocess
 import sys
 import textwrap
 
+import numba
 import pytest
+
+import vibrissa as vb
+from vibrissa.rod import discretize, search
 
 KERNELS = """
 from vibrissa.numerics import kernel
@@ -115,3 +119,17 @@ def test_no_folder_can_be_written_to(run):
         ]
     )
     assert run(nowhere) == ["twice 0", "thrice 0"]
+
+
+def test_the_search_is_compiled_ahead_for_the_types_of_its_callers(gamma):
+    """Otherwise what the helper compiles would not be used."""
+    vb.deflect(gamma, vb.PointContact([25e-3, 12e-3, 1e-3]))
+    calls = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(search, "compile_together", lambda here, there: calls.extend(here + there))
+        patch.setattr(search.seeds, "overloads", {}, raising=False)
+        search.compile_seeds(discretize(gamma).rod)
+    assert calls[-1][0] is search.seeds
+    for kernel, arguments in calls:
+        assert tuple(map(numba.typeof, arguments)) in kernel.overloads
+    assert len(search.seeds.overloads) == 1

@@ -50,6 +50,7 @@ from vibrissa.rod import (
     SearchTree,
     StableSet,
     check_whisker,
+    compile_seeds,
     contact_tangents,
     deflect,
     discretize,
@@ -144,6 +145,7 @@ class ContactMap:
         if numbers.shape != (3,) or numbers.dtype.kind != "i" or (numbers < 1).any():
             raise ValueError(f"cells is {cells!r}; three whole numbers from 1 are needed")
         along, around, loads = numbers.tolist()
+        compile_seeds(discretize(whisker, steps).rod)
         chart = stable_set(whisker, proximal=proximal, cells=(along, around, loads), steps=steps)
         solved = _solve_grid(whisker, proximal, steps, progress) if grid else None
         return cls(whisker, chart, steps, solved)

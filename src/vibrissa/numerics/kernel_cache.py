@@ -225,7 +225,8 @@ def compile_together(here: list[Call], there: list[Call]) -> None:
     if any(kernel.overloads for kernel, _ in there):  # type: ignore[attr-defined]
         return
     with _lock:
-        mine, others = _not_cached(here), _not_cached(there)
+        others = _not_cached(there)
+        mine = _not_cached(here) if others else []
         if not (mine and others and threads() > 1 and _runs_python()):
             return
         if any(_name(kernel) is None for kernel, _ in others):

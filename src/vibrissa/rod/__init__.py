@@ -83,6 +83,7 @@ from vibrissa.rod.search import (
     MOST_CELLS as MOST_CELLS,
     MOST_SEEDS as MOST_SEEDS,
     cells_around as cells_around,
+    compile_seeds as compile_seeds,
     seed_room as seed_room,
     seeds as seeds,
 )

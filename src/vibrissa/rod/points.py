@@ -30,7 +30,7 @@ from vibrissa.rod.chart import (
     with_normal_force,
 )
 from vibrissa.rod.continuation import POINT, follow
-from vibrissa.rod.discretization import Bendable, Rod
+from vibrissa.rod.discretization import Bendable, Rod, discretize
 from vibrissa.rod.integration import share_rows, solve_forces
 from vibrissa.rod.kernels import BUFFER_SIZE, LANES
 from vibrissa.rod.newton import (
@@ -41,7 +41,7 @@ from vibrissa.rod.newton import (
     stable,
     start_from,
 )
-from vibrissa.rod.search import MOST_SEEDS, seed_room, seeds
+from vibrissa.rod.search import MOST_SEEDS, compile_seeds, seed_room, seeds
 from vibrissa.rod.tree import SearchTree, search_tree
 from vibrissa.status import Status
 
@@ -410,4 +410,5 @@ def follow_all(
 @lru_cache(maxsize=16)
 def point_solver(whisker: Bendable, proximal: float, steps: int) -> PointSolver:
     """Return the point solver of a whisker; cached."""
+    compile_seeds(discretize(whisker, steps).rod)
     return PointSolver(stable_set(whisker, proximal=proximal, steps=steps))

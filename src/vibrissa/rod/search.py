@@ -11,7 +11,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.numerics import Array, IntArray, copy, inlined, shared, vectorised, wrapped
+from vibrissa.numerics import (
+    Array,
+    Call,
+    IntArray,
+    compile_together,
+    copy,
+    inlined,
+    shared,
+    vectorised,
+    wrapped,
+)
 from vibrissa.rod.cell import (
     CELL_BUFFER,
     fold_sides,
@@ -24,7 +34,9 @@ from vibrissa.rod.cell import (
     set_target,
     turned_difference,
 )
-from vibrissa.rod.tree import SearchTree, balanced
+from vibrissa.rod.discretization import Rod
+from vibrissa.rod.integration import evaluate
+from vibrissa.rod.tree import Balance, SearchTree, balance_rows, balanced
 
 #: Largest number of contacts found for one target.
 MOST_SEEDS = 64
@@ -233,6 +245,20 @@ def seeds(tree: SearchTree, target: Array, room: SeedRoom) -> int:
                 for side in range(2):
                     count = _add_seed(tree, child, sides[side], 0, room, count)
     return count
+
+
+def compile_seeds(rod: Rod) -> None:
+    """Compile :func:`seeds` in another process, while this one compiles what its trees need.
+
+    For callers that build a chart and then search in it. Does nothing if it is cached.
+    """
+    if not seeds.overloads:  # type: ignore[attr-defined]
+        rows, slopes = np.empty((0, 3)), np.empty((0, 3, 3))
+        values = np.empty((0, 4)), np.empty((0, 6)), np.empty((0, 6, 3))
+        room = seed_room.py_func()  # type: ignore[attr-defined]
+        here: list[Call] = [(evaluate, (rod, *values, 0, 0))]
+        here.append((balance_rows, (Balance.none(), rows, slopes)))
+        compile_together(here, [(seeds, (SearchTree.none(), np.empty(3), room))])
 
 
 @inlined

@@ -152,6 +152,14 @@ class SearchTree(NamedTuple):
     polar: IntArray  # (n,), row of a polar cell among the polar ones, -1 for other cells
     vector: Polar  # polar cells
 
+    @classmethod
+    def none(cls) -> SearchTree:
+        """Return a tree without cells, as an example of the types."""
+        one, two, three = (np.empty((0,) * n) for n in (1, 2, 3))
+        count, place = np.empty(0, np.int64), np.empty((0, 3), np.int64)
+        cells = count, one, place, three, three, count, two, count, count, Polar.none()
+        return cls(Fold(one, three), two, one, count, three, Balance.none(), *cells)
+
 
 class PlaneVector(NamedTuple):
     """A vector of the plane whose length, direction, or both are among the quantities."""

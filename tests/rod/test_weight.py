@@ -148,6 +148,8 @@ def test_what_is_wrong_is_said():
         vb.deflect(RODS["PLA"], load, gravity=np.zeros((4, 3)) + 1.0).force  # noqa: B018
     with pytest.raises(ValueError, match="m/s²"):
         vb.resting(RODS["PLA"], (0.0, 9.81))
+    with pytest.raises(ValueError, match="in mm/s²"):
+        vb.deflect(RODS["PLA"], load, gravity=1e3 * np.array(LEVEL)).force  # noqa: B018
 
 
 def test_an_upright_cylinder_stands_as_high_as_greenhill_found():

@@ -31,7 +31,7 @@ from vibrissa.rod.weight import STATES, evaluate_weighted, trace_weighted
 if TYPE_CHECKING:
     from vibrissa.whisker import Whisker
 
-_MOST = 1e4  # largest gravity accepted, m/s²; accelerations of whisking are below 50 g
+_MOST = 5e3  # largest gravity accepted, m/s²; accelerations of whisking are below 50 g
 # Number of increments in which the weight is applied, and how often a failed one may be halved.
 _STEPS, _HALVINGS = 8, 6
 _NUDGE = 1e-5  # rotation of gravity in the finite differences of the stability test, rad
@@ -231,7 +231,7 @@ def resting(whisker: Whisker, gravity: ArrayLike) -> Resting:
     if np.linalg.norm(values) > _MOST:
         raise ValueError(
             f"gravity is {np.linalg.norm(values):.4g} m/s²; at most {_MOST:g} is allowed "
-            "(on earth it is 9.81)"
+            "(on earth it is 9.81): is it in mm/s²?"
         )
     if whisker.density is None:
         raise ValueError(

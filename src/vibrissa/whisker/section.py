@@ -32,8 +32,9 @@ TAPER = 15.0
 YOUNGS_MODULUS = 3e9
 POISSON_RATIO = 0.38
 
-# Young's moduli from a soft gel to diamond, Pa; values outside are assumed to be in another unit.
-_SOFTEST, _HARDEST = 1e3, 1e13
+# Young's moduli from a gel that can hold a rod to diamond, Pa; values outside are assumed to be in
+# another unit: 3000 MPa is usual.
+_SOFTEST, _HARDEST = 1e4, 1e13
 # Densities from a foam to osmium, kg/m³.
 _LIGHTEST, _HEAVIEST = 10.0, 23000.0
 SHORTEST, LONGEST = 0.5e-3, 0.5
@@ -215,7 +216,7 @@ def material_faults(
     elif not _SOFTEST <= youngs_modulus <= _HARDEST:
         faults.append(
             f"youngs_modulus is {youngs_modulus:.4g} Pa; materials from gels to diamond are "
-            f"between {_SOFTEST:.0e} and {_HARDEST:.0e}: is it in Pa? 1 GPa is 1e9"
+            f"between {_SOFTEST:.0e} and {_HARDEST:.0e}: is it in Pa? 1 MPa is 1e6, 1 GPa 1e9"
         )
     if density is not None and not (np.isfinite(density) and density > 0.0):
         faults.append(f"density is {density!r} kg/m³; it must be positive, or None if not known")

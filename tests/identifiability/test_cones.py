@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from vibrissa import samples
 from vibrissa.identifiability import critical_cones
 
 
@@ -19,7 +20,12 @@ def test_taper_and_straightness_narrow_the_cone():
 
 
 @pytest.mark.parametrize(
-    ("curvatures", "ratios", "message"), [([-0.1], [2.0], "≥ 0"), ([0.1], [0.5], "≥ 1")]
+    ("curvatures", "ratios", "message"),
+    [
+        ([-0.1], [2.0], "≥ 0"),
+        ([0.1], [0.5], "≥ 1"),
+        (samples.straight(), [2.0], "curvatures must be numbers; got"),
+    ],
 )
 def test_impossible_whiskers_are_refused(curvatures, ratios, message):
     with pytest.raises(ValueError, match=message):

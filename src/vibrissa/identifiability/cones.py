@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from vibrissa.certificates import TRIPLET, Certificate, prove_witness
 from vibrissa.contacts import ContactMap
 from vibrissa.identifiability.verdicts import SAMPLES, SEPARATION, uniqueness
+from vibrissa.numerics import numbers
 from vibrissa.signals import cone_angle
 from vibrissa.whisker import Whisker
 
@@ -61,8 +62,8 @@ def critical_cones(
         ``critical_cone`` (rad) over ``triplet``, ``taper_ratio`` and ``curvature``; 0 where no
         witness was found.
     """
-    curved = np.atleast_1d(np.asarray(curvatures, dtype=np.float64))
-    ratios = np.atleast_1d(np.asarray(taper_ratios, dtype=np.float64))
+    curved = np.atleast_1d(numbers("curvatures", curvatures))
+    ratios = np.atleast_1d(numbers("taper_ratios", taper_ratios))
     if not (np.isfinite(curved).all() and (curved >= 0.0).all()):
         raise ValueError(f"curvatures A·L must be finite and ≥ 0; got {curved}")
     if not (np.isfinite(ratios).all() and (ratios >= 1.0).all()):

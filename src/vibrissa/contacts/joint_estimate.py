@@ -9,6 +9,7 @@ are traced from there (:mod:`~vibrissa.contacts.joint.friction`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -21,7 +22,7 @@ from vibrissa.contacts.charted_whisker import ChartedWhisker
 from vibrissa.contacts.contacts import Candidates, Contacts, contacts_of
 from vibrissa.contacts.engine.prior import Prior, possible_candidates, refuse_tip
 from vibrissa.contacts.engine.readout import Named
-from vibrissa.contacts.engine.search import Search, estimate
+from vibrissa.contacts.engine.search import Search, check_scale, estimate
 from vibrissa.contacts.fitting.least_squares import Fits
 from vibrissa.contacts.joint.forward import Forward, Gravity, finite
 from vibrissa.contacts.joint.friction import along_curves, check_ratio, or_without
@@ -60,7 +61,7 @@ _SEPARATE = 4
 # Displacement of a contact, of its arc length (over L) and of its force (over its size), within
 # which it continues the one before; and that since the last search, above which others may have
 # become possible. Noise may move it farther.
-_NEAR_ARC, _NEAR_FORCE = np.array([0.02, 0.05]), np.array([0.1, 0.3])
+_NEAR_ARC, _NEAR_FORCE = (0.02, 0.05), (0.1, 0.3)
 # Displacement of the tip, over L, due to a turn of the base within which one resting shape proposes
 # contacts; and the least and the largest such turn, rad.
 _AS_BENT, _LEAST_TURN, _LARGEST_TURN = 0.01, 0.2, 1.0
@@ -79,15 +80,28 @@ class _Path(NamedTuple):
     def onward(self, found: Candidates) -> _Path | None:
         """Path on to the first candidate of a measurement; None if it is far from both contacts."""
         x, point, covariance = found.x[0, 0], found.values[0, 0, 3:], found.covariances[0, 0]
-        away, apart = np.abs(x - self.x), point - self.points
-        near = np.linalg.norm(away[:, 1:], axis=1) <= np.linalg.norm(x[1:]) * _NEAR_FORCE
-        near &= away[:, 0] <= _NEAR_ARC
-        if np.isfinite(covariance).all():
+        size, near = math.hypot(*x[1:].tolist()), np.zeros(2, np.bool_)
+        for i, (arc, *force) in enumerate((x - self.x).tolist()):
+            near[i] = abs(arc) <= _NEAR_ARC[i] and math.hypot(*force) <= size * _NEAR_FORCE[i]
+        if not near.all() and np.isfinite(covariance).all():
+            apart = point - self.points
             back = np.linalg.pinv(covariance, hermitian=True)
             near |= (apart @ back * apart).sum(axis=1) <= 2.0 * THREE_SIGMA
         if not near.all():
             return None
         return self._replace(x=np.stack([x, self.x[1]]), points=np.stack([point, self.points[1]]))
+
+
+class _Searches(NamedTuple):
+    """Searches for contacts of the weightless whisker with a sagged shape.
+
+    For signals without noise, near and exact ones; and for the stated noise. Empty and None if the
+    signals do not determine contacts.
+    """
+
+    shape: tuple[float, float, float] | None
+    exact: list[Search]
+    noisy: Search | None
 
 
 class JointEstimate:
@@ -128,7 +142,7 @@ class JointEstimate:
         }
         self._lab, self._proposing = gravity, None if gravity is None else gravity.acceleration
         self._path: _Path | None = None
-        self._search: tuple[tuple[float, float, float] | None, Search | None] | None = None
+        self._searches: _Searches | None = None
         self.forward = Forward.of(whisker, gravity, compliance_sigma, stiffness_sigma)
         self.d, whole = self.forward.d, names == WRENCH
         self.channels = Channels(WRENCH, WRENCH) if whole else Channels.of(names)
@@ -251,7 +265,7 @@ class JointEstimate:
                 out._proposing = self._proposing
         out._lab = replace(stated, tare=weight.tare)
         out._step, out._turn = self._step, self._turn
-        out._path, out._search = self._path, self._search
+        out._path, out._searches = self._path, self._searches
         return out
 
     @cached_property
@@ -318,23 +332,32 @@ class JointEstimate:
         the near ones.
         """
         values, names = self.signals_of(targets), self.channels.signals
-        exact = dict(zip(names, values.T, strict=True))
         if names == WRENCH or self.contact_map is None:
-            rod = self.forward.rod
+            rod, signals = self.forward.rod, dict(zip(names, values.T, strict=True))
             shape = rod.shape() if isinstance(rod, Resting) else rod
-            proposed = [estimate_components(shape, exact, None, _NO_ERRORS, None)]
+            one = estimate_components(shape, signals, None, _NO_ERRORS, None)
+            d, own = self.d, one.candidates
+            x = np.concatenate(
+                [own.arc_length[..., None] / d.length, own.contact_force / d.force], axis=-1
+            )
+            status = np.asarray(one.status)
         else:
-            near = {name: _NEAR * size for name, size in zip(names, self.scale, strict=True)}
-            proposed = [
-                estimate(self.sagged, exact, names, noise, _NO_ERRORS, None)
-                for noise in (near, None)
-            ]
-        arc = np.concatenate([one.candidates.arc_length for one in proposed], axis=1)
-        force = np.concatenate([one.candidates.contact_force for one in proposed], axis=1)
-        row, place = np.nonzero(np.isfinite(arc))
-        d = self.d
-        seeds = np.column_stack([arc[row, place] / d.length, force[row, place] / d.force])
-        return row, seeds, np.asarray(proposed[0].status)
+            x, status = self._exact(values)
+        row, place = np.nonzero(np.isfinite(x[..., 0]))
+        return row, x[row, place], status
+
+    def _exact(self, values: Array) -> tuple[Array, IntArray]:
+        """Contacts (n, m, 4) of the sagged whisker for signals without noise, and statuses (n,)."""
+        flat = values / self.scale
+        check_scale(flat, self.names)
+        known = np.isfinite(flat).all(axis=1)
+        status = np.where(known, int(Status.DEGENERATE), int(Status.MISSING))
+        x = [np.full((len(flat), 1, 4), np.nan)]
+        for search in self._sagged_searches().exact:
+            found, reason, _ = search.batch(flat, self.channels.targets(flat))
+            status = reason if len(x) == 1 else status
+            x.append(found.x)
+        return np.concatenate(x, axis=1), status
 
     def _fitted(
         self, flat: Array, targets: Array, row: IntArray, seeds: Array, reasons: IntArray
@@ -394,7 +417,7 @@ class JointEstimate:
 
         Light contacts have long, bent valleys, which are followed only without weight.
         """
-        search = self._search_sagged()
+        search = self._sagged_searches().noisy
         if search is None:
             return covariance, np.zeros_like(valid)
         rod = search.contact_map.chart.discretization
@@ -406,19 +429,24 @@ class JointEstimate:
         each, place = np.arange(len(away)), np.where(np.isfinite(away), away, np.inf).argmin(axis=1)
         own, linear = found.covariances[each, place], found.valid[each, place]
         known = np.isfinite(own).all(axis=(1, 2)) & (away[each, place] < _SAME)
-        shared = joint.covariance() - self._fit.alone(joint).covariance()
-        own = np.where(known[:, None, None], own + shared, covariance)
+        own = np.where(known[:, None, None], own + self._fit.shared(joint), covariance)
         larger = np.trace(own, axis1=1, axis2=2) > np.trace(covariance, axis1=1, axis2=2)
         return np.where(larger[:, None, None], own, covariance), valid & known & linear
 
-    def _search_sagged(self) -> Search | None:
-        """Search on the sagged whisker; None if the signals do not determine its contacts."""
-        if self._search is None or self._search[0] != self._proposing:
-            sagged = self.sagged
-            readout = Named(sagged, self.names, self.sensor)
-            found = Search(sagged, readout) if sagged.determines(self.names) else None
-            self._search = self._proposing, found
-        return self._search[1]
+    def _sagged_searches(self) -> _Searches:
+        """Searches on the sagged whisker, kept as long as its shape proposes contacts."""
+        if self._searches is None or self._searches.shape != self._proposing:
+            sagged, own, exact = self.sagged, None, []
+            if sagged.determines(self.names):
+                near = dict(zip(self.names, (_NEAR * self.scale).tolist(), strict=True))
+                exact = [
+                    Search(sagged, Named(sagged, self.names, sensor))
+                    for sensor in (SensorNoise.of(near, self.names), None)
+                ]
+                if self.sensor is not None:
+                    own = Search(sagged, Named(sagged, self.names, self.sensor))
+            self._searches = _Searches(self._proposing, exact, own)
+        return self._searches
 
 
 def _least_noise(sensor: SensorNoise | None, names: tuple[str, ...], d: Discretization) -> float:

@@ -35,6 +35,7 @@ from vibrissa.rod.discretization import (
     STEPS,
     Discretization,
     Rod as Rod,
+    Weight as Weight,
     check_whisker as check_whisker,
     discretize,
 )
@@ -100,6 +101,7 @@ from vibrissa.rod.tree import (
     balanced as balanced,
     search_tree as search_tree,
 )
+from vibrissa.rod.weight import evaluate_weighted as evaluate_weighted
 
 __all__ = [
     "PROXIMAL",

@@ -17,15 +17,14 @@ import numpy as np
 from vibrissa.contacts.charted_whisker import ChartedWhisker
 from vibrissa.contacts.fitting.inversion import seeding_triplet
 from vibrissa.contacts.sensing.channels import (
-    CHANNELS,
     FITTED,
     WRENCH,
     Channels,
     wrench_tangents,
     wrenches_of,
 )
-from vibrissa.contacts.sensing.noise import TRUSTED, SensorNoise, rank, scaled_errors
-from vibrissa.contacts.sensing.weighing import Weighing
+from vibrissa.contacts.sensing.noise import SensorNoise, rank
+from vibrissa.contacts.sensing.weighing import Weighing, weighing_of
 from vibrissa.contacts.uncertainty.nodes import Searched, at_nodes, searched
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.rod import search_tree
@@ -127,7 +126,7 @@ class Named:
         self.bounds, found = searched_by_name(contact_map, names)
         self._most = self.bounds.most()
         self._straight = [i for i, turns in enumerate(self._circular) if not turns]
-        self.how = _weighing(self.channels, sensor, d.force, d.moment, self.scale)
+        self.how = weighing_of(self.channels, sensor, d.force, d.moment, self.scale)
         self.passes = 1 if constant_weights(self.channels, sensor) else _passes(self.how)
         self.rank = len(names)
         self._noise = [] if sensor is None else self._deviations(sensor)
@@ -278,27 +277,6 @@ class Mixed:
 def _passes(how: Weighing) -> int:
     """Largest number of fits, each with the weights at the contact before."""
     return _WITH_ERRORS if how.errors.shape[0] else _BY_DIRECTION
-
-
-def _weighing(
-    channels: Channels, sensor: SensorNoise | None, force: float, moment: float, scale: Array
-) -> Weighing:
-    k = len(channels.names)
-    sizes = np.repeat([force, moment], 3)
-    components, deviations = np.zeros((6, 6)), np.full(k, np.nan)
-    if sensor is not None and sensor.wrench is not None:
-        components = sensor.wrench / np.outer(sizes, sizes)
-    elif sensor is not None and sensor.deviations is not None:
-        deviations = np.array([sensor.deviations[name] for name in channels.signals]) / scale
-    return Weighing(
-        np.array([CHANNELS.index(name) for name in channels.names]),
-        np.eye(k),
-        np.zeros((k, k)),
-        np.ascontiguousarray(components, dtype=np.float64),
-        TRUSTED if sensor is None else 0.0,
-        deviations,
-        np.zeros((0, 6, 7)) if sensor is None else scaled_errors(sensor.errors, force, moment),
-    )
 
 
 def independent(contact_map: ChartedWhisker, readout: Named | Mixed) -> int:

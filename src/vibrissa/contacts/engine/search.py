@@ -210,7 +210,7 @@ def estimate(
     check_signals(values, names)
     d = contact_map.chart.discretization
     flat = values.reshape(-1, len(names)) / signal_scales(names, d.force, d.moment)
-    _check_scale(flat, names)
+    check_scale(flat, names)
     if contact_map.determines(names):
         readout = Named(contact_map, names, sensor)
         search = Search(contact_map, readout)
@@ -233,7 +233,7 @@ def estimate(
     return contacts_of(found, status, chi_squared, d, names, values.shape[:-1], dims, coords)
 
 
-def _check_scale(flat: Array, names: tuple[str, ...]) -> None:
+def check_scale(flat: Array, names: tuple[str, ...]) -> None:
     """Refuse forces and moments far too large to have bent the whisker, as in other units."""
     for values, name, turned in zip(flat.T, names, circular_among(names), strict=True):
         size = np.abs(values[np.isfinite(values)])

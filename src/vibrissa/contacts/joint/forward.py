@@ -23,17 +23,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vibrissa.contacts.fitting.least_squares import Fits, fit
+from vibrissa.contacts.joint.weighted_fit import Aim, fit_weighted
 from vibrissa.contacts.sensing.channels import (
-    CHANNELS,
-    CIRCULAR,
-    channel_derivatives,
-    channels_of,
-    ratio_derivatives,
-    ratio_of,
+    FITTED,
     wrenches_of,
 )
 from vibrissa.deferred import transform
-from vibrissa.numerics import AnyArray, Array, relative
+from vibrissa.numerics import AnyArray, Array, relative, share_out
 from vibrissa.rod import (
     STEPS,
     Resting,
@@ -43,15 +39,8 @@ from vibrissa.rod import (
     resting,
     solve_forces,
 )
-from vibrissa.signals import within_turn
 from vibrissa.whisker import Whisker
 
-# Iterations of a fit, and the longest step of each: of arc length (over L) and of force (over its
-# own size, and over EI/L²).
-_ROUNDS = 30
-_LONGEST, _STRONGER, _LEAST_FORCE = 0.1, 0.5, 0.05
-# A fit has ended when its step is this small, or the damping this large.
-_SETTLED, _MOST_DAMPING = 1e-8, 1e8
 _NUDGE = 1e-4  # turn of gravity (rad) and relative change of density for derivatives
 _RIGID = 1e9  # stiffness of a rigid base, relative to the whisker
 _AHEAD = 1e-5  # relative step of the force along the whisker for its derivatives
@@ -311,81 +300,29 @@ class Forward:
         targets: Array,
         weights: Array,
         x: Array,
+        known: Solved | None = None,
         *,
         friction: bool,
         least: float,
-    ) -> Fits:
+    ) -> tuple[Fits, Solved | None]:
         """Fit contacts to channels from starts x (n, 4), as :func:`~.least_squares.fit` does.
 
-        The names end with ``ratio`` and ``s`` if these are held.
+        The names end with ``ratio`` and ``s`` if these are held. With weight, starts that are
+        ``known`` are not solved again, and the fitted contacts are returned in this form too.
         """
         if not self.weighted:
-            return fit(self.d, names, targets, weights, x, friction=friction, least=least)
-        free = [0, 1, 2, 3] if friction else [0, 2, 3]
-        x = x if friction else x * [1.0, 0.0, 1.0, 1.0]
-        aim, now = _Aim(names, free), self.solved(x)
-        misfit = aim.misfit(now, targets, weights)
-        damping, busy = np.zeros(len(x)), np.isfinite(misfit)
-        for _ in range(_ROUNDS):
-            which = np.flatnonzero(busy)
-            if not which.size:
-                break
-            part = Solved(*(values[which] for values in now))
-            tried = part.x.copy()
-            tried[:, free] += aim.step(part, targets[which], weights[which], damping[which])
-            tried[:, 0] = np.clip(tried[:, 0], least, 1.0)
-            new = self.solved(tried, part.leans)
-            other = aim.misfit(new, targets[which], weights[which])
-            better = other <= misfit[which] * (1.0 + 1e-12) + 1e-24
-            small = np.abs(tried - part.x).max(axis=1) < _SETTLED
-            good = which[better]
-            misfit[good] = other[better]
-            for mine, theirs in zip(now, new, strict=True):
-                mine[good] = theirs[better]
-            damping[which] = np.where(better, 0.1 * damping[which], 10.0 * damping[which] + 1e-4)
-            busy[which] = ~small & (damping[which] < _MOST_DAMPING)
-        return Fits(now.x, now.values, now.tangents, misfit, np.isfinite(misfit))
-
-
-class _Aim:
-    """Channels that contacts are fitted to by damped Gauss-Newton steps."""
-
-    def __init__(self, names: tuple[str, ...], free: list[int]) -> None:
-        self.names, self.free = tuple(n for n in names if n in CHANNELS), free
-        self.held = names[len(self.names) :]
-        self._which = [CHANNELS.index(name) for name in self.names]
-        self._turned = np.array([CIRCULAR[i] for i in self._which] + [False] * len(self.held))
-
-    def _away(self, at: Solved, targets: Array) -> Array:
-        held = {"ratio": ratio_of(at.x), "s": at.x[:, 0]}
-        own = channels_of(at.values)[:, self._which]
-        whole = np.column_stack([own, *(held[name] for name in self.held)])
-        return within_turn(targets - whole, self._turned)
-
-    def misfit(self, at: Solved, targets: Array, weights: Array) -> Array:
-        """χ² (n,)."""
-        with np.errstate(invalid="ignore"):
-            off = np.einsum("nij,nj->ni", weights, self._away(at, targets))
-            out = np.asarray((off**2).sum(axis=1))
-        return np.where(np.isfinite(out), out, np.inf)
-
-    def step(self, at: Solved, targets: Array, weights: Array, damping: Array) -> Array:
-        """Damped steps (n, free) of limited length."""
-        held = {"ratio": ratio_derivatives(at.x), "s": np.tile(np.eye(4)[0], (len(at.x), 1))}
-        rows = [channel_derivatives(at.values, at.tangents, self.names)]
-        rows += [held[name][:, None] for name in self.held]
-        a = np.nan_to_num(weights @ np.concatenate(rows, axis=1)[..., self.free])
-        b = np.nan_to_num(np.einsum("nij,nj->ni", weights, self._away(at, targets)))
-        size = np.linalg.norm(a, axis=1)
-        size = np.where(size > 0.0, size, 1.0)
-        a /= size[:, None, :]
-        ridge = (damping[:, None, None] + 1e-14) * np.eye(len(self.free))
-        normal = np.swapaxes(a, 1, 2) @ a + ridge
-        step = np.linalg.solve(normal, np.einsum("nij,ni->nj", a, b)[..., None])[..., 0] / size
-        force = np.linalg.norm(at.x[:, 1:], axis=1)
-        most = np.abs(step[:, 0]) / _LONGEST
-        stronger = np.linalg.norm(step[:, 1:], axis=1) / (_STRONGER * force + _LEAST_FORCE)
-        return np.asarray(step / np.maximum(1.0, np.maximum(most, stronger))[:, None])
+            fits = fit(self.d, names, targets, weights, x, friction=friction, least=least)
+            return fits, None
+        if known is None:
+            known = self.solved(x if friction else x * [1.0, 0.0, 1.0, 1.0])
+        rod, misfit = self.d.rod, np.empty(len(x))
+        assert rod.weight is not None
+        codes = np.array([FITTED.index(name) for name in names])
+        aim = Aim(codes, self._rest, friction, float(least))
+        out = Solved(*(np.array(part, order="C") for part in known))
+        whole = np.ascontiguousarray(targets), np.ascontiguousarray(weights)
+        share_out(len(x), fit_weighted, rod, rod.weight, aim, *whole, *out, misfit)
+        return Fits(*out[:3], misfit, np.isfinite(misfit)), out
 
 
 def finite(values: Array) -> AnyArray:

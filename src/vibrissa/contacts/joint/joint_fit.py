@@ -28,40 +28,27 @@ import numpy as np
 from vibrissa.contacts.contacts import Candidates
 from vibrissa.contacts.fitting.least_squares import Fits
 from vibrissa.contacts.joint.forward import Forward
-from vibrissa.contacts.sensing.channels import (
-    CHANNELS,
-    CIRCULAR,
-    Channels,
-    channel_derivatives,
-    channel_gradients,
-    channels_of,
-    friction_angle_derivatives,
-    ratio_derivatives,
-    ratio_of,
+from vibrissa.contacts.joint.second_order import (
+    SINGULAR,
+    Unknowns,
+    cloud_rows,
+    displace_rows,
+    join_rows,
 )
-from vibrissa.contacts.sensing.noise import SensorNoise, explained, rank, whitening
+from vibrissa.contacts.joint.weighted_fit import weigh_rows
+from vibrissa.contacts.sensing.channels import Channels
+from vibrissa.contacts.sensing.noise import SensorNoise, explained
+from vibrissa.contacts.sensing.weighing import weighing_of
 from vibrissa.contacts.uncertainty.posterior import CERTAIN
 from vibrissa.numerics import AnyArray, Array, IntArray
-from vibrissa.signals import within_turn
+from vibrissa.signals import signal_scales
 from vibrissa.status import Status
 from vibrissa.whisker import Whisker
 
 HELD = 1e-5  # tolerance for a held arc length
 # Iterations in which the effects of shared unknowns, or the noise, are recomputed at the contact.
 _ROUNDS, _STEADY = 3, 2
-# Displacement along each axis for the second order, in standard deviations. Limits of a valid
-# covariance: difference of the channels there from the second order, in standard deviations;
-# kurtosis relative to a normal distribution's; and effective share of the cloud. Below the last
-# share the covariance is that of the first order.
-_REACH = 2.0
-_MISSED, _TAILED, _COUNTING, _TOO_FEW = 0.03, 1.8, 0.3, 0.1
-# Longest axis of the arc length, over L (and of the force, 1), and largest curvature of the log
-# density along an axis.
-_LONGEST, _SHARP = 0.25, 2.0
-# Largest gain of the cloud's log density over that of a normal distribution.
-_MOST_GAIN = 3.0
 _CLOUD = 128
-_SINGULAR = 1e-9
 _MISFITS = (int(Status.NOT_FRICTIONLESS), int(Status.NOT_ONE_CONTACT))
 
 
@@ -82,12 +69,26 @@ class Joint(NamedTuple):
 
     def spread(self, first: int = 0) -> Array:
         """Covariances (n, u, u) of the unknowns from ``first`` on, the others being held."""
-        back = np.linalg.pinv(np.nan_to_num(self.design[..., first:]), rcond=_SINGULAR)
+        back = np.linalg.pinv(np.nan_to_num(self.design[..., first:]), rcond=SINGULAR)
         return np.asarray(back @ np.swapaxes(back, 1, 2))
 
     def covariance(self) -> Array:
         """Covariances (n, 3, 3) of the contact points."""
         return np.asarray(self.moved @ self.spread() @ np.swapaxes(self.moved, 1, 2))
+
+
+class _Effects(NamedTuple):
+    """Effects of shared unknowns on (F, p) (n, 6, m), and the noise of the channels.
+
+    The sensor's weights (n, k, k), effects on channels (n, k, m), the covariance with these, and
+    its weights.
+    """
+
+    moved: Array
+    own: Array
+    change: Array
+    spread: Array
+    whole: Array
 
 
 class JointFit:
@@ -106,14 +107,24 @@ class JointFit:
         self.least, self.friction, self.ratio_sigma = least, friction, ratio_sigma
         self.d, self.names = forward.d, channels.names
         self.free = [0, 1, 2, 3] if friction else [0, 2, 3]
-        self._which = [CHANNELS.index(name) for name in self.names]
-        self._turned = np.array([CIRCULAR[i] for i in self._which])
+        d = self.d
+        scale = signal_scales(channels.signals, d.force, d.moment)
+        self._how = weighing_of(channels, sensor, d.force, d.moment, scale)
+        free = np.array(self.free)
+        self._unknowns = Unknowns(self._how.codes, free, float(least), float(ratio_sigma))
 
-    def _errors(self, flat: Array, x: Array, values: Array) -> tuple[Array, Array, Array]:
-        """Covariance of the channels, and the effects of c on them and on (F, p)."""
-        own = self.channels.covariance(self.sensor, flat, values, self.d)
+    def _weighed(self, flat: Array, values: Array, wrench: Array) -> tuple[Array, ...]:
+        """Weights, effects, covariance and its weights as of `_Effects`, for effects on (F, M)."""
+        n, k, m = len(values), len(self.names), wrench.shape[2]
+        out = tuple(np.empty((n, k, a)) for a in (k, m, k, k))
+        values, flat = np.ascontiguousarray(values), np.ascontiguousarray(flat)
+        weigh_rows(self._how, values, flat, wrench, *out)
+        return out
+
+    def _noise(self, flat: Array, x: Array, values: Array) -> _Effects:
+        """Noise of the channels, and the effects of c on them and on (F, p)."""
         wrench, moved = self.forward.by_errors(x, values)
-        return own, channel_gradients(values, self.names) @ wrench, moved
+        return _Effects(moved, *self._weighed(flat, values, wrench))
 
     def fit(
         self, flat: Array, targets: Array, x: Array, values: Array | None = None, held: bool = False
@@ -129,156 +140,96 @@ class JointFit:
         whole = np.column_stack([targets, np.zeros((len(x), len(more)))])
         if held:
             whole[:, -1] = x[:, 0]
-        rounds = _ROUNDS if self.forward.errors else _STEADY
-        if values is None:
+        rounds, known = _ROUNDS if self.forward.errors else _STEADY, None
+        if values is None and self.forward.weighted:
+            known = self.forward.solved(x if self.friction else x * [1.0, 0.0, 1.0, 1.0])
+            values = known.values
+        elif values is None:
             values = self.forward.values(x)
         elif not self.forward.errors:
             rounds = 1
         spread = np.empty(0)
         for _ in range(rounds):
-            before, weights = spread, np.zeros((len(x), len(names), len(names)))
-            own, change, _ = self._errors(flat, x, values)
-            spread = own + change @ np.swapaxes(change, 1, 2)
+            before, noise = spread, self._noise(flat, x, values)
+            spread = noise.spread
             if np.array_equal(spread, before):
                 break  # the noise does not depend on the contact
-            weights[:, :k, :k] = whitening(spread)
+            weights = np.zeros((len(x), len(names), len(names)))
+            weights[:, :k, :k] = noise.whole
             for i, sigma in enumerate(more.values()):
                 weights[:, k + i, k + i] = 1.0 / sigma
-            fits = self.forward.fit(
-                names, whole, weights, x, friction=self.friction, least=self.least
+            fits, known = self.forward.fit(
+                names, whole, weights, x, known, friction=self.friction, least=self.least
             )
             x, values = fits.contacts, fits.values
         return fits
 
     def joint(self, flat: Array, targets: Array, fits: Fits) -> Joint:
         """Shared unknowns of fitted contacts, and the effects of all unknowns."""
-        x, values = fits.contacts, fits.values
-        own, change, moved = self._errors(flat, x, values)
-        weights, n, m = whitening(own), len(self.free), change.shape[2]
-        by_x = channel_derivatives(values, fits.tangents, self.names)[..., self.free]
-        rows = [weights @ np.concatenate([by_x, change], axis=2), np.zeros((len(x), m, n + m))]
-        rows[1][:, :, n:] = np.eye(m)
-        if self.ratio_sigma < np.inf:
-            rows.append(np.zeros((len(x), 1, n + m)))
-            rows[2][:, 0, :n] = ratio_derivatives(x) / self.ratio_sigma
-        away = within_turn(targets - channels_of(values)[:, self._which], self._turned)
-        whole = whitening(own + change @ np.swapaxes(change, 1, 2)) if m else weights
-        residual = (whole @ away[..., None])[..., 0]
-        c = np.swapaxes(whole @ change, 1, 2) @ residual[..., None]
-        left = [-(weights @ (away[..., None] - change @ c))[..., 0], c[..., 0]]
-        if self.ratio_sigma < np.inf:
-            left.append(ratio_of(x)[:, None] / self.ratio_sigma)
-        moved = np.nan_to_num(moved)
-        values = values.copy()
-        values[:, :6] += (moved @ np.nan_to_num(c))[..., 0]
-        point = np.concatenate([fits.tangents[:, 3:6][..., self.free], moved[:, 3:]], axis=2)
-        return Joint(
-            (residual**2).sum(axis=1),
-            np.concatenate(left, axis=1),
+        x, values = np.ascontiguousarray(fits.contacts), np.array(fits.values, order="C")
+        noise = self._noise(flat, x, values)
+        n, k, m = len(x), len(self.names), noise.moved.shape[2]
+        u, r = len(self.free) + m, k + m + (self.ratio_sigma < np.inf)
+        out = Joint(
+            np.empty(n),
+            np.empty((n, r)),
             values,
-            np.concatenate(rows, axis=1),
-            point,
-            weights,
+            np.empty((n, r, u)),
+            np.empty((n, 3, u)),
+            noise.own,
         )
+        join_rows(
+            self._unknowns,
+            np.ascontiguousarray(targets),
+            x,
+            values,
+            np.ascontiguousarray(fits.tangents),
+            (noise.own, noise.change, noise.whole),
+            noise.moved,
+            out.misfit,
+            out.residuals,
+            out.design,
+            out.moved,
+        )
+        return out
 
-    def alone(self, joint: Joint) -> Joint:
-        """The same contacts without shared unknowns and without the prior of friction."""
+    def shared(self, joint: Joint) -> Array:
+        """Part of the covariances (n, 3, 3) that is due to shared unknowns and to friction."""
         n, k = len(self.free), len(self.names)
-        return joint._replace(design=joint.design[:, :k, :n], moved=joint.moved[..., :n])
+        if joint.design.shape[1:] == (k, n):
+            return np.zeros((len(joint.design), 3, 3))
+        alone = joint._replace(design=joint.design[:, :k, :n], moved=joint.moved[..., :n])
+        return joint.covariance() - alone.covariance()
 
     def degrees(self, flat: Array, values: Array) -> int:
         """Number of independent channels minus that of the unknowns."""
         if self.sensor is None or not len(flat):
             return len(self.names) - len(self.free)
-        own = self.channels.covariance(self.sensor, flat[:1], values[:1], self.d)
-        return rank(own[0]) - len(self.free)
+        own = self._weighed(flat[:1], values[:1], np.zeros((1, 6, 0)))[0]
+        return int(np.abs(own[0]).max(axis=1).astype(bool).sum()) - len(self.free)
 
     def to_second_order(self, joint: Joint, fits: Fits) -> tuple[Array, AnyArray]:
         """Covariances (n, 3, 3) of contact points, and whether they are valid."""
-        _, singular, v = np.linalg.svd(np.nan_to_num(joint.design), full_matrices=False)
-        known = singular[:, -1] > _SINGULAR * singular[:, 0]
-        axes = np.swapaxes(v, 1, 2) / np.where(known[:, None], singular, np.inf)[:, None, :]
-        force = np.linalg.norm(fits.contacts[:, None, 1:], axis=2)
-        stronger = np.linalg.norm(axes[:, 1 : len(self.free)], axis=1) / force
-        longest = np.maximum(np.abs(axes[:, 0]) / _LONGEST, stronger)
-        axes /= np.maximum(1.0, longest)[:, None]
-        by_r, by_p = np.nan_to_num(joint.design) @ axes, joint.moved @ axes
-        slopes, bent_r, bent_p, missed = self._second_order(joint, fits, axes)
-        each = np.arange(axes.shape[2])
-        bent = bent_r[..., each, each]
-        level = (by_r**2).sum(axis=1) + np.einsum("nm,nmi->ni", joint.residuals, bent)
-        level = np.maximum(level, np.linalg.norm(bent, axis=1))
-        node = normal_cloud(each.size)
-        u = node * np.where(level > _SHARP, np.maximum(level, _SHARP) ** -0.5, 1.0)[:, None]
-        pairs = (0.5 * u[..., :, None] * u[..., None, :]).reshape(*u.shape[:2], -1)
-
-        def moved(first: Array, second: Array) -> Array:
-            bent = second.reshape(*second.shape[:2], -1)
-            return np.asarray(u @ np.swapaxes(first, 1, 2) + pairs @ np.swapaxes(bent, 1, 2))
-
-        away = moved(by_r, bent_r) + joint.residuals[:, None]
-        log = (joint.residuals**2).sum(axis=1)[:, None] - (away**2).sum(axis=2)
-        log += (node**2).sum(axis=1)
-        det = np.linalg.det(slopes[:, :1] + np.einsum("nki,niab->nkab", u, slopes[:, 1:]))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            det /= np.linalg.det(slopes[:, :1])
-        arc = fits.contacts[:, :1] + np.einsum("nki,ni->nk", u, axes[:, 0])
-        density = np.abs(det) if self.friction else np.maximum(det, 0.0)
-        density *= np.exp(np.clip(0.5 * log, -700.0, _MOST_GAIN))
-        density[(arc < self.least) | (arc > 1.0) | ~np.isfinite(density)] = 0.0
-        linear = u @ np.swapaxes(by_p, 1, 2)
-        covariance, fair = _moments(joint.covariance(), linear, moved(by_p, bent_p), density)
-        return covariance, known & fair & (missed < _MISSED)
-
-    def _second_order(
-        self, joint: Joint, fits: Fits, axes: Array
-    ) -> tuple[Array, Array, Array, Array]:
-        """Changes of derivatives for displacements along axes (n, u, a).
-
-        Derivatives of the point, and with friction of its angle, with respect to x, and their
-        changes for a unit of each axis (n, 1 + a, f, f); second derivatives along the axes of
-        residuals (n, m, a, a) and points (n, 3, a, a); and the error of these for the channels
-        (n,).
-        """
-        x, k = fits.contacts[:, None], len(self.names)
-        along = axes[:, : len(self.free)]
-        n, m = len(along), along.shape[2]
-        seen, slopes = self._slopes(joint.weights, fits.values, fits.tangents, fits.contacts)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            room = np.array([1.0 - x[..., 0], x[..., 0] - self.least])[:, :, 0, None]
-            room = room / np.abs(along[:, 0])
-        up, down = np.fmin(np.where(along[:, 0] < 0.0, room[::-1], room), _REACH)
-        step = np.where(up >= down, up, -down)
-        there = np.repeat(x, m, axis=1)
-        there[..., self.free] += step[..., None] * np.swapaxes(along, 1, 2)
-        there = there.reshape(n * m, 4)
-        weights = np.repeat(joint.weights, m, axis=0)
-        other, steeper = self._slopes(weights, *self.forward.near(there), there)
-        change = (steeper.reshape(n, m, *slopes.shape[1:]) - slopes[:, None]) / step[
-            ..., None, None
-        ]
-        mean = (slopes[:, None] + 0.5 * step[..., None, None] * change)[:, :, -k:]
-        mean = np.einsum("namf,nfa->nam", mean, along)
-        turned = within_turn(other.reshape(n, m, k) - seen[:, None], self._turned)
-        off = (joint.weights[:, None] @ turned[..., None])[..., 0] - step[..., None] * mean
-        far = np.linalg.norm(off, axis=2) * (_REACH / np.abs(step)) ** 3
-        missed = np.where(np.isfinite(far), far, np.inf).max(axis=1, initial=0.0)
-        second = np.swapaxes(np.nan_to_num(change @ along[:, None]), 1, 2)
-        second = 0.5 * (second + np.swapaxes(second, 2, 3))
-        residuals = np.zeros((n, joint.design.shape[1], m, m))
-        residuals[:, :k] = second[:, -k:]
-        changes = np.concatenate([slopes[:, None], np.nan_to_num(change)], axis=1)[:, :, :-k]
-        return changes, residuals, second[:, :3], missed
-
-    def _slopes(
-        self, weights: Array, values: Array, tangents: Array, x: Array
-    ) -> tuple[Array, Array]:
-        """Channels (n, k); derivatives with respect to x of points, friction angle, channels."""
-        rows = [tangents[:, 3:6]]
-        if self.friction:
-            rows.append(friction_angle_derivatives(x)[:, None])
-        rows.append(weights @ channel_derivatives(values, tangents, self.names))
-        return channels_of(values)[:, self._which], np.concatenate(rows, axis=1)[..., self.free]
+        (n, _, u), x = joint.design.shape, np.ascontiguousarray(fits.contacts)
+        axes, steps, there = np.empty((n, u, u)), np.empty((n, u)), np.empty((n, u, 4))
+        first, valid = np.empty((n, 3, 3)), np.empty(n, np.bool_)
+        shape = joint.design, joint.moved, axes, steps, there, first, valid
+        displace_rows(self._unknowns, x, *shape)
+        values, tangents = self.forward.near(there.reshape(n * u, 4))
+        covariance = np.empty((n, 3, 3))
+        cloud_rows(
+            self._unknowns,
+            joint.weights,
+            (np.ascontiguousarray(fits.values), np.ascontiguousarray(fits.tangents), x),
+            (values.reshape(n, u, -1), tangents.reshape(n, u, -1, 4), there),
+            (joint.residuals, joint.design, joint.moved),
+            (axes, steps),
+            normal_cloud(u),
+            first,
+            covariance,
+            valid,
+        )
+        return covariance, valid
 
     def allow(
         self, flat: Array, targets: Array, found: Candidates, status: IntArray
@@ -291,7 +242,7 @@ class JointFit:
             fits = self.fit(flat[row], targets[row], out.x[row, place])
             joint = self.joint(flat[row], targets[row], fits)
             out.x[row, place], out.values[row, place] = fits.contacts, joint.values[:, :6]
-            out.covariances[row, place] += joint.covariance() - self.alone(joint).covariance()
+            out.covariances[row, place] += self.shared(joint)
             out.chi_squared[row, place] = joint.misfit
             degrees = self.degrees(flat[row], fits.values)
         first = out.chi_squared[:, 0]
@@ -308,29 +259,6 @@ def normal_cloud(dimension: int) -> Array:
     points = np.concatenate([half, -half])
     root = np.linalg.cholesky(points.T @ points / _CLOUD)
     return np.asarray(points @ np.linalg.inv(root).T)
-
-
-def _moments(first: Array, linear: Array, points: Array, density: Array) -> tuple[Array, AnyArray]:
-    """Covariances (n, 3, 3) of a cloud (n, c, 3) with density (n, c), and which are usable.
-
-    Tails are relative to those of its linear part, whose covariances are ``first``.
-    """
-    total = np.maximum(density.sum(axis=1), 1e-300)
-    counting = total**2 / (_CLOUD * np.maximum((density**2).sum(axis=1), 1e-300))
-    share = density / total[:, None]
-    second = np.einsum("nk,nki,nkj->nij", share, points, points)
-    few = counting <= _TOO_FEW
-
-    def fourth(cloud: Array, covariance: Array) -> Array:
-        inverse = np.asarray(np.linalg.pinv(covariance, 1e-12, hermitian=True))
-        return np.asarray((cloud @ inverse * cloud).sum(axis=2) ** 2)
-
-    own = np.where(few[:, None, None], first, second)
-    tailed = (share * fourth(points, own)).sum(axis=1)
-    tailed /= np.maximum(fourth(linear, first).mean(axis=1), 1e-300)
-    wider = np.maximum(tailed, 1.0) ** 0.75 / np.maximum(counting, _TOO_FEW)
-    out = np.where(few[:, None, None], first + second, second * wider[:, None, None])
-    return out, (tailed < _TAILED) & (counting > _COUNTING)
 
 
 def check_compliance(sigma: float, sensor: SensorNoise | None) -> None:

@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vibrissa.contacts.sensing.channels import CHANNELS, WRENCH, Channels
+from vibrissa.contacts.sensing.noise import TRUSTED, SensorNoise, scaled_errors
 from vibrissa.numerics import Array, IntArray, copy, inlined, kernel
 from vibrissa.signals import FT, FX, FY, FZ, MB, MX, MY, MZ
 
@@ -28,6 +30,32 @@ class Weighing(NamedTuple):
     share: float
     deviations: Array
     errors: Array
+
+
+def weighing_of(
+    channels: Channels, sensor: SensorNoise | None, force: float, moment: float, scale: Array
+) -> Weighing:
+    """Weighing of channels for the noise of a sensor, with the units of their signals."""
+    k = len(channels.names)
+    sizes = np.repeat([force, moment], 3)
+    components, deviations = np.zeros((6, 6)), np.full(k, np.nan)
+    if sensor is not None and sensor.wrench is not None:
+        components = sensor.wrench / np.outer(sizes, sizes)
+    elif sensor is not None and sensor.deviations is not None:
+        sigma = np.array([sensor.deviations[name] for name in channels.signals]) / scale
+        if channels.signals == WRENCH:  # components, not sizes with their directions
+            components = np.diag(sigma**2)
+        else:
+            deviations = sigma
+    return Weighing(
+        np.array([CHANNELS.index(name) for name in channels.names]),
+        np.eye(k),
+        np.zeros((k, k)),
+        np.ascontiguousarray(components, dtype=np.float64),
+        TRUSTED if sensor is None else 0.0,
+        deviations,
+        np.zeros((0, 6, 7)) if sensor is None else scaled_errors(sensor.errors, force, moment),
+    )
 
 
 @inlined
@@ -63,16 +91,13 @@ def wrong_by(error: Array, force: Array, moment: Array, out: Array) -> None:
 
 
 @inlined
-def channel_covariance(how: Weighing, value: Array, measured: Array, sigma: Array) -> None:
-    """Covariance (k, k) of the channels at a contact with (F, p)."""
+def wrench_covariance(
+    how: Weighing, force: Array, moment: Array, measured: Array, sigma: Array
+) -> None:
+    """Covariance (k, k) of the channels of a force and moment."""
     codes, deviations = how.codes, how.deviations
     k = codes.shape[0]
-    force, moment, g = np.empty(3), np.empty(3), np.empty((k, 6))
-    copy(value[:3], force)
-    px, py, pz = value[3], value[4], value[5]
-    moment[0] = py * force[2] - pz * force[1]
-    moment[1] = pz * force[0] - px * force[2]
-    moment[2] = px * force[1] - py * force[0]
+    g = np.empty((k, 6))
     gradients(codes, force, moment, g)
     f2 = force[0] ** 2 + force[1] ** 2 + force[2] ** 2
     m2 = moment[0] ** 2 + moment[1] ** 2 + moment[2] ** 2
@@ -104,6 +129,18 @@ def channel_covariance(how: Weighing, value: Array, measured: Array, sigma: Arra
             sigma[i + 1, i] += cos * sin * (along - across)
         elif w not in (FZ, MZ):
             sigma[i, i] += deviations[i] ** 2
+
+
+@inlined
+def channel_covariance(how: Weighing, value: Array, measured: Array, sigma: Array) -> None:
+    """Covariance (k, k) of the channels at a contact with (F, p)."""
+    force, moment = np.empty(3), np.empty(3)
+    copy(value[:3], force)
+    px, py, pz = value[3], value[4], value[5]
+    moment[0] = py * force[2] - pz * force[1]
+    moment[1] = pz * force[0] - px * force[2]
+    moment[2] = px * force[1] - py * force[0]
+    wrench_covariance(how, force, moment, measured, sigma)
 
 
 @kernel
@@ -142,15 +179,14 @@ def weigh(how: Weighing, value: Array, measured: Array, out: Array) -> bool:
     return True
 
 
-@kernel
-def weigh_any(how: Weighing, value: Array, measured: Array, out: Array) -> bool:
-    """Fill weights W (k, k) as `weigh` does, also for singular noise; False if there are none."""
-    if weigh(how, value, measured, out):
-        return True
-    k = how.codes.shape[0]
-    sigma, size = np.empty((k, k)), np.empty(k)
-    channel_covariance(how, value, measured, sigma)
-    typical, noisy = 0.0, 0
+@inlined
+def whitened(sigma: Array, out: Array) -> bool:
+    """Fill weights W (k, k) for a covariance, possibly singular, as `noise.whitening` does.
+
+    The covariance becomes that of the correlations. False where it is not finite.
+    """
+    k = sigma.shape[0]
+    size, typical, noisy = np.empty(k), 0.0, 0
     for i in range(k):
         for j in range(k):
             if not abs(sigma[i, j]) < np.inf:
@@ -171,6 +207,16 @@ def weigh_any(how: Weighing, value: Array, measured: Array, out: Array) -> bool:
         for j in range(k):
             out[i, j] = root * vectors[j, i] / size[j]
     return True
+
+
+@kernel
+def weigh_any(how: Weighing, value: Array, measured: Array, out: Array) -> bool:
+    """Fill weights W (k, k) as `weigh` does, also for singular noise; False if there are none."""
+    if weigh(how, value, measured, out):
+        return True
+    sigma = np.empty((how.codes.shape[0], how.codes.shape[0]))
+    channel_covariance(how, value, measured, sigma)
+    return whitened(sigma, out)
 
 
 @inlined

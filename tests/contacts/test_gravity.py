@@ -360,6 +360,20 @@ def test_a_stream_that_is_warm_counts_the_sensor_as_tared_in_its_first_pose(niti
     assert np.linalg.norm(away) < 1e-5 * whisker.length
 
 
+def test_a_stream_that_is_warm_has_the_map_that_its_first_line_needs(nitinol, monkeypatch):
+    whisker, oblique = nitinol.whisker, np.array([3.0, -5.0, -7.9])
+    touch = vb.PointForce(0.7 * whisker.length, components=(0.0, unit(whisker), 0.0))
+    point, *wrench = read_since(whisker, oblique, oblique, touch)
+    running = ContactStream(vb.Estimator(nitinol, SIX, covariance(whisker), gravity=oblique))
+    running.warm_up()
+    maps, simulate = [], vb.ContactMap.simulate
+    counted = classmethod(lambda cls, *args, **named: maps.append(1) or simulate(*args, **named))
+    monkeypatch.setattr(vb.ContactMap, "simulate", counted)
+    (found,) = running.records(lines_of([(point, *wrench, {})]))
+    assert not maps
+    assert np.linalg.norm([found[axis] for axis in "xyz"] - point) < 1e-5 * whisker.length
+
+
 @pytest.mark.parametrize("jump", [False, True])
 def test_a_contact_that_moves_on_is_that_of_a_search(nitinol, monkeypatch, jump):
     """A robot's arm turns the whisker while the contact slides, or is suddenly elsewhere."""

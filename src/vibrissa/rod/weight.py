@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.numerics import Array, Vector, inlined, kernel
+from vibrissa.numerics import Array, Vector, inlined, kernel, shared
 from vibrissa.rod.discretization import Rod, Weight
 from vibrissa.rod.kernels import (
     ARC,
@@ -420,7 +420,7 @@ def _stability(weight: Weight, h: Array) -> float:
     return float(toward[0] * turned[0] + toward[1] * turned[1] + toward[2] * turned[2])
 
 
-@kernel
+@shared
 def evaluate_weighted(
     rod: Rod,
     weight: Weight,

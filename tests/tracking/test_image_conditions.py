@@ -1,9 +1,12 @@
 """Videos that look otherwise: bright whiskers, no face, tips not seen, views that differ."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy import ndimage
 
+from vibrissa import Whisker
 from vibrissa.simulation import ImageConditions, film_frames
 from vibrissa.tracking import (
     Trace,
@@ -15,6 +18,7 @@ from vibrissa.tracking import (
     track,
 )
 from vibrissa.tracking.recording import remarks_on
+from vibrissa.tracking.refine.fit import _lit
 from vibrissa.tracking.refine.problem import _LENGTHS, _correlation, trace_variance
 from vibrissa.tracking.space.frame_pairs import clear_offsets
 from vibrissa.tracking.space.rest_shape import (
@@ -141,6 +145,18 @@ def test_a_lit_flank_is_seen(filmed, side):
     error = [np.median(filmed.errors(one.line, i, 0)[0]) for i, one in enumerate(row)]
     skew = abs(np.median([one.skew for one in row]))
     assert (skew > 0.2 and np.median(error) > 0.1) if side else skew < 0.05
+    # A flank that is lit in the image beyond the whisker shifts its thin outer part as well.
+    outer = [filmed.errors(one.line[-20:], i, 0)[0] for i, one in enumerate(row)]
+    problem = SimpleNamespace(
+        traces=SimpleNamespace(skew=np.array([[one.skew] for one in row])),
+        whisker=Whisker.parabola(length=10e-3, coefficient=15.0),
+        head=SimpleNamespace(put_in=lambda points: points),
+        start=SimpleNamespace(position=np.zeros((1, 3))),
+        d=SimpleNamespace(length=10e-3),
+        cameras=filmed.cameras,
+    )
+    halo = _lit(problem, 0)[1]
+    assert (np.median(outer) < 2.5 * halo < 4.0 * np.median(outer)) if side else halo == 0.0
 
 
 def test_frames_of_another_size_are_refused():

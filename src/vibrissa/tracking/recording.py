@@ -478,11 +478,19 @@ def remarks_on_bases(
     """Report views in which a whisker is seen from closer to its base than in the other view."""
     found = []
     for camera, before, after in zip(cameras, shown, used, strict=True):
-        cut = [a.length - b.length for a, b in zip(before, after, strict=True) if len(a.line)]
-        if cut and np.median(cut) > _APART:
+        both = [(a.length, b.length) for a, b in zip(before, after, strict=True) if len(a.line)]
+        if not both:
+            continue
+        cut = float(np.median([a - b for a, b in both]))
+        whole = float(np.median([a for a, _ in both]))
+        if cut > _APART:
+            # Forces scale with the fourth power of the radius.
+            percent = 100.0 * ((whole / max(whole - cut, 1.0)) ** 4 - 1.0)
             found.append(
-                f"{name}: {camera.name} shows {np.median(cut):.0f} pixels more of it near its base "
-                "than the other view (median); the first point that both show is used as base."
+                f"{name}: {camera.name} shows {cut:.0f} pixels more of it near its base than the "
+                "other view (median); the first point that both show is used as base. If the "
+                f"stated radius is the one where {camera.name} first shows it, forces and moments "
+                f"are up to {percent:.0f} % too large."
             )
     return found
 

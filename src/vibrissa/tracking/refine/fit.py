@@ -189,6 +189,9 @@ _WAVES = 8  # number of waves along the whisker for common errors of a view's tr
 # for a flank of 0.65 radii that is lit by half; where on the whisker that is taken; and the largest
 # shift, in radii, which is that by a flank as bright as the background.
 _LIT, _SHIFTED, _NEARER, _MOST_LIT = 0.1, 3.2, 0.25, 0.5
+# Shift by a halo over the cube root of the third cumulant, for one a third as bright as the whisker
+# is dark; and number of standard deviations by which a cumulant must exceed that of a lit flank.
+_HALO, _SURE = 0.25, 3.0
 # Standard deviation of other shifts of a view's traces, largest at the base, pixels.
 _UNSEEN = 0.02
 _MEDIAN = 1.86  # standard deviation of a median of n normal numbers, over their median size and √n
@@ -425,7 +428,8 @@ def _shared(problem: Problem, fit: Linear) -> Array:
         square = sum(float(np.median(part[view][beyond] ** 2)) for part in parts) / _SQUARE
         sigma = np.sqrt(2.0 * together / n * square)
         waves = [sigma * np.cos(k * np.pi * s) for k in range(_WAVES)]
-        waves.append(_lit(problem, view) * (1.0 - s))
+        lit, halo = _lit(problem, view)
+        waves += [lit * (1.0 - s), np.full(n, halo)]
         waves.append(_FOLLOWED * _drawn(fit)[view] * np.exp(-s / _AT_BASE))
         across = design[:, :-2] * weight[:, :-2, None]
         pulls += [np.einsum("tni,n->ti", across, wave) for wave in waves]
@@ -438,16 +442,18 @@ def _shared(problem: Problem, fit: Linear) -> Array:
     return np.concatenate([fit.smoother.responses(np.array(pulls)), fit.smoother.by_shared()])
 
 
-def _lit(problem: Problem, view: int) -> float:
-    """Root mean square shift of a view's traces at the base due to light from the side, pixels.
+def _lit(problem: Problem, view: int) -> tuple[float, float]:
+    """Root mean square shifts of a view's traces due to light from the side, pixels.
 
-    Such light makes the profile of a whisker skew. The measured skewness, with its uncertainty, is
-    combined with a prior.
+    Such light makes the profile of a whisker skew. On the whisker itself it shifts the trace at the
+    base, and less where the whisker is thinner; the measured skewness, with its uncertainty, is
+    combined with a prior. A bright halo next to the whisker, as wide as the blur of the image,
+    shifts all of the trace; profiles that are more skew than any flank makes them show it.
     """
     skew = problem.traces.skew[:, view]
     skew = skew[np.isfinite(skew)]
     if not skew.size:
-        return _LIT
+        return _LIT, 0.0
     usual = float(np.median(skew))
     sigma = _MEDIAN * float(np.median(np.abs(skew - usual))) / np.sqrt(len(skew))
     at_base, nearer = problem.whisker.radius(problem.whisker.length * np.array([0.0, _NEARER]))
@@ -455,7 +461,9 @@ def _lit(problem: Problem, view: int) -> float:
     size = float(at_base * nearer**-3.0) * _SHIFTED / scale**2
     known = _LIT**2 / (_LIT**2 + (size * sigma) ** 2)
     lit = float(np.hypot(known * size * usual, np.sqrt(known) * size * sigma))
-    return float(np.hypot(min(lit, _MOST_LIT * float(at_base) * scale), _UNSEEN))
+    most = _MOST_LIT * float(at_base) * scale
+    beyond = max(abs(usual) - _SURE * sigma - most / size, 0.0)
+    return float(np.hypot(min(lit, most), _UNSEEN)), float(_HALO * np.cbrt(beyond))
 
 
 def _scales(problem: Problem) -> list[float]:

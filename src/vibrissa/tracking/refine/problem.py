@@ -530,11 +530,7 @@ class Problem:
     def _linear(self, state: State, data: Compared) -> Linear:
         """Linearise at a state whose rods were compared with the traces."""
         smoother = Smoother(data.hessian, data.gradient)
-        costs = (
-            data.squares
-            + self._priors(smoother, state)
-            + self._touched(smoother, state, data.tangents)
-        )
+        costs = data.squares + self._priors(smoother, state) + self._touched(smoother, state, data)
         if self.peg is not None and not self.fixed and len(costs):
             costs += smoother.add_prior(self.peg.information, state.peg) / len(costs)
         for i, arc in self.held:
@@ -597,21 +593,21 @@ class Problem:
             pull += np.einsum("tni,tn->ti", design[:, :-2], shift)
         return np.asarray(np.einsum("tij,tj->ti", covariance, pull))
 
-    def _touched(self, smoother: Smoother, state: State, tangents: Sequence[Array]) -> Array:
+    def _touched(self, smoother: Smoother, state: State, data: Compared) -> Array:
         """Pull contacts to the surfaces of known objects, and make them tangent; return the costs.
 
         Distances hardly change along a whisker that touches an object, but the normal does: only
         that of the contact is normal to the whisker.
         """
         costs = np.zeros(len(self.frames))
-        if not tangents:
+        if not data.tangents:
             return costs
         length, surface = self.d.length, self.options.surface
-        at = np.flatnonzero(self.touching & self.near)
+        at = np.flatnonzero(self.touching & self.near & ~data.wild)
         part, turn = state.rows(at), self.head.rotation[at]
         points, slopes, _ = contact_slopes(self.d, part)
         points = self.head.rows(at).put_in((points + part.position) * length)
-        tangent, turning = (values[at] for values in tangents)
+        tangent, turning = (values[at] for values in data.tangents)
         radius = self.whisker.radius(part.contact[:, 0] * length)
         nearer = tilted = None
         if self.peg is None:

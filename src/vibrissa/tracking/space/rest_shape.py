@@ -38,6 +38,8 @@ from vibrissa.whisker import Whisker
 Counts = NDArray[np.intp]
 
 _COMMON = 0.85  # share of the usual length over which shapes are compared: tips are uncertain
+# Share of the length at the base that is not compared: fur draws it aside, in some poses more.
+_FURRED = 0.06
 _LEAST = 0.4  # visible share of that needed to decide whether the whisker is bent
 _FEWEST = 3  # smallest number of frames that give a shape
 # Largest deviation of a free frame in units of the usual one, and if that is white noise.
@@ -147,9 +149,10 @@ def rest_shape(
         If the whisker is seen in less than three frames.
     """
     seen = _seen(curves)
+    furred = round(_FURRED * (curves.shape[1] - 1))
     _, shapes, known, compared = _compared(curves[seen])
     whole = _whole(known, compared)
-    part = shapes[whole, :compared]
+    part = shapes[whole, furred:compared]
     best, near = _largest_group(part, least)
     group = np.flatnonzero(seen)[whole][near]
     lengths = np.linalg.norm(np.diff(curves[group], axis=1), axis=2).sum(axis=1)
@@ -161,9 +164,9 @@ def rest_shape(
     near = np.isin(np.flatnonzero(seen)[whole], group)
     if not near.any():
         raise ValueError("no frame free of contact shows nearly the whole length of the whisker")
-    part = shapes[whole, :compared]
+    part = shapes[whole, furred:compared]
     # The first frame may show less of the length than is compared now.
-    mean = shapes[first, :compared] if whole[first] else part[near][0]
+    mean = shapes[first, furred:compared] if whole[first] else part[near][0]
     deviation = np.full(len(shapes), np.inf)
     # While it rests, its traces have the same errors in all frames, and hardly deviate.
     pace = _pace(part)
@@ -198,7 +201,7 @@ def rest_shape(
     # If less of the whisker is seen, the visible part shows whether it is bent.
     for i in np.flatnonzero(~whole & (known >= _LEAST * compared)):
         n = min(int(known[i]), len(points))
-        deviation[i] = _deviations(shapes[i : i + 1, :n], points[:n])[0]
+        deviation[i] = _deviations(shapes[i : i + 1, furred:n], points[furred:n])[0]
     noise = float(np.median(deviation[whole][quiet]))
     out = np.full(len(curves), np.nan)
     out[seen] = np.where(np.isfinite(deviation), deviation, np.nan)

@@ -26,7 +26,7 @@ from vibrissa.tracking import (
 )
 from vibrissa.tracking.refine.problem import Smoother
 from vibrissa.tracking.space.exchange import exchanged
-from vibrissa.tracking.space.rest_shape import Length
+from vibrissa.tracking.space.rest_shape import Length, length_shown
 from vibrissa.tracking.trace.trace import STEP
 from vibrissa.tracking.track import known_of, tapered_as_it_bends, track_whisker
 from vibrissa.whisker import angles_of, base_rotation
@@ -697,6 +697,14 @@ def test_a_contact_of_a_single_frame_bends_it_more(bend, frames, touches):
     noise = 0.7e-6 * np.einsum("nk,tki->tni", waves, rng.normal(size=(60, 40, 3)))
     curves = np.einsum("tij,tnj->tni", held, shapes) + noise
     np.testing.assert_array_equal(rest_shape(curves).free, ~touched if touches else True)
+
+
+@pytest.mark.parametrize(("share", "whole"), [(0.45, True), (0.3, False)])
+def test_ends_that_scatter_are_tips_if_they_are_seen_often(share, whole):
+    lengths = np.random.default_rng(0).normal(24e-3, 0.5e-3, 200)
+    found, ends = length_shown(lengths, np.arange(200) < 200 * share)
+    assert ends == whole
+    assert found == pytest.approx(24.3e-3, rel=0.02)
 
 
 def test_fur_that_draws_a_base_aside_is_no_contact():

@@ -56,8 +56,8 @@ _RINGS = 2e-5
 _DEEP = 10.0
 _LONGER = 1.1  # length over which a known whisker may be seen, in units of its own
 _STILL = 0.01  # usual deviation of free frames at most, as a share of a known whisker's length
-# Spread of lengths, 16 to 84 %, above which ends in a minority of frames are not tips.
-_FADES = 0.02
+# Spread of lengths, 16 to 84 %, above which ends in less than this share of frames are not tips.
+_FADES, _OFTEN = 0.02, 0.4
 _ENDS = 3  # number of frames at rest that show the tip, from which the length is computed
 # Factor of the noise of a shape: errors of neighbouring points are correlated, so that they seem
 # smoother than they are right. Errors of separate points are also averaged over the frames.
@@ -269,7 +269,7 @@ def length_shown(lengths: Array, tips: Mask | None) -> tuple[float, bool]:
     """Length of the whisker, by those that are seen, m, and whether its tip is seen."""
     ends = np.ones(len(lengths), dtype=bool) if tips is None else tips
     whole = bool(ends.sum() >= _ENDS)
-    if whole and 2 * ends.sum() < len(ends):
+    if whole and ends.mean() < _OFTEN:
         # Where a whisker usually fades, some lines seem to end, but at random positions.
         low, high = np.percentile(lengths[ends], [16.0, 84.0])
         whole = bool(high - low < _FADES * high)

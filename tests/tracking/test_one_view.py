@@ -102,6 +102,15 @@ def test_a_whisker_that_leaves_the_plane_is_noted_with_numbers():
     assert turned == pytest.approx(np.percentile(elevation, 95.0), abs=8.0)
 
 
+@pytest.mark.parametrize("elevation", [0.3, 0.6])
+def test_turning_out_of_the_plane_is_not_contact(elevation):
+    """By up to 15° or 29°; the projected whisker is more curved, but up to its tip."""
+    trial, traces = film(elevation=elevation)
+    found = track(CAMERA, traces, 1000.0)
+    touched = of(trial, "truth/in_contact") > 0
+    assert np.mean(touched == (of(found, "in_contact") > 0)) > 0.95
+
+
 def test_a_known_whisker_is_laid_into_the_plane():
     trial, traces = film()
     found = track(CAMERA, traces, 1000.0, TrackOptions(whisker=WHISKER))

@@ -65,6 +65,8 @@ _SMOOTH, _SEPARATE = 4.0, 1.0
 # Share of its length by which a shape may begin elsewhere on the whisker than the others do, and
 # what keeps that of a straight line, m²: none.
 _SLIDES, _TINY = 0.02, 1e-30
+# Largest relative change of the curvature seen by one view as the whisker leaves its plane.
+_TURNED = 0.2
 # Roll about the whisker's chord from which a rigid motion is not one that an animal makes.
 _OVER = np.deg2rad(120.0)
 _RESTS = 0.25  # share of the root mean square speed of the base below which a whisker rests
@@ -308,10 +310,19 @@ def known_rest(curves: Array, whisker: Whisker, least: float = 0.1) -> RestShape
 def _deviations(
     shapes: Array, target: Array, rolled: bool = False, slides: float = _SLIDES
 ) -> Array:
-    """Root mean square distances from a target to which shapes are fitted, rolled over or not.
+    """Root mean square distances from a target to which shapes are fitted; see `differences`."""
+    away, _ = differences(shapes, target, rolled, slides)
+    return np.asarray(np.sqrt((away**2).sum(axis=1) / len(target)))
+
+
+def differences(
+    shapes: Array, target: Array, rolled: bool = False, slides: float = _SLIDES
+) -> tuple[Array, Array]:
+    """Differences (t, 3 n) from a target to which shapes are fitted, rolled over or not.
 
     Shapes may begin slightly earlier or later on the whisker than the target, depending on the
-    hairs in front of it.
+    hairs in front of it. One view shows them more or less bent where the whisker leaves the plane
+    of the image: by how much, as a share (t,) of the curvature, is the second result.
     """
     rotation, _ = motions(shapes, target)
     chord = shapes[:, -1] - shapes[:, 0]
@@ -322,20 +333,43 @@ def _deviations(
     rotation[over] = swing[over]
     shift = target.mean(axis=0) - np.einsum("tij,tj->ti", rotation, shapes.mean(axis=1))
     away = (_moved(shapes, rotation, shift) - target).reshape(len(shapes), -1)
-    slide = _slide(target)
-    share = np.clip(away @ slide / (slide @ slide + _TINY), -slides, slides)
-    square = ((away - np.outer(share, slide)) ** 2).sum(axis=1)
-    return np.asarray(np.sqrt(square / len(target)))
+    changes = [(_slide(target), slides)]
+    if not (np.ptp(shapes[..., 2]) or np.ptp(target[:, 2])):
+        changes = [*changes, (_turn(target), _TURNED)] * 2
+    # Each in turn, as both are limited; none at first.
+    shares = np.zeros((2 + len(changes), len(shapes)))
+    for k, (change, most) in enumerate(changes):
+        left = away + np.outer(shares[k], change)
+        shares[k + 2] = np.clip(left @ change / (change @ change + _TINY), -most, most)
+        away = left - np.outer(shares[k + 2], change)
+    return away, shares[-1] * (len(changes) > 1)
 
 
 def _slide(shape: Array) -> Array:
     """Change (3 n,) of a shape that begins later by its length, up to rigid motion."""
+    return _but_rigid(shape, np.gradient(shape, axis=0) * (len(shape) - 1))
+
+
+def _turn(shape: Array) -> Array:
+    """Change (3 n,) of a plane shape whose curvature becomes twice as large, up to rigid motion.
+
+    A whisker that leaves the plane of the image looks shorter, or rolled to the side. Either
+    changes what is seen of its curvature by nearly the same factor everywhere, unlike a contact,
+    beyond which a whisker is not bent.
+    """
+    step = np.gradient(shape[:, :2], axis=0)
+    angle = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
+    across = np.column_stack([-step[:, 1], step[:, 0], 0.0 * angle])
+    return _but_rigid(shape, np.cumsum((angle - angle.mean())[:, None] * across, axis=0))
+
+
+def _but_rigid(shape: Array, change: Array) -> Array:
+    """Change (n, 3) of a shape without the part that is a rigid motion, (3 n,)."""
     away = shape - shape.mean(axis=0)
     turns = np.cross(np.eye(3)[:, None], away)
     shifts = np.broadcast_to(np.eye(3)[:, None], turns.shape)
     rigid = np.concatenate([shifts, turns]).reshape(6, -1).T
-    along = (np.gradient(shape, axis=0) * (len(shape) - 1)).reshape(-1)
-    return np.asarray(along - rigid @ np.linalg.lstsq(rigid, along)[0])
+    return np.asarray(change.reshape(-1) - rigid @ np.linalg.lstsq(rigid, change.reshape(-1))[0])
 
 
 def _depth(shape: Array) -> float:

@@ -175,6 +175,7 @@ class Tracked:
     head: HeadPose  # its pose in these frames
     length: Length  # with a standard deviation of 0 where it is given
     peg: UncertainPeg | None = None  # that it touches, found in the images
+    turned: float = 0.0  # by how much its curvature shows that it leaves the only view's plane, rad
     contacts: ContactPoints | None = None  # those that do not come from the rod
 
 
@@ -292,8 +293,7 @@ def _pose(one: Tracked, pose: BasePose) -> dict[str, Array]:
     }
 
 
-# Relative variation of the seen length above which a whisker leaves the plane of a single view.
-_SHORTENED = 0.04
+_TURNED = np.radians(16.0)  # turn from which a whisker leaves the plane of a single view
 # Misfit that is unusual, and the share of such frames above which there is a remark.
 _STRANGE, _OFTEN = 2.0, 0.05
 # Share of the uncertainty of contact points due to the cameras above which there is a remark.
@@ -406,7 +406,7 @@ def remarks_on_unseen_contacts(one: Tracked, name: str) -> list[str]:
     length = "" if one.length.seen else "its length (--length) or "
     return [
         f"not sure where {name} touches: in {unseen} of {count} frames in contact that is beyond "
-        "what both views show of it, and follows from how the part before it bends. Film more of "
+        "what is seen of it, and follows from how the part before it bends. Film more of "
         f"the whisker, or state {length}what it touches (--objects)."
     ]
 
@@ -518,25 +518,29 @@ def remarks_on_fur(one: Tracked, fur: float, name: str) -> list[str]:
 def remarks_on_plane(one: Tracked, name: str) -> list[str]:
     """Report how far a whisker may leave the plane of the only view, and the effect on contacts."""
     tips = one.traces.ends.all(axis=(1, 2)) & np.isfinite(one.curves).all(axis=(1, 2))
-    if tips.sum() < _FEWEST:
+    seen, turned = f"{name}: ", one.turned
+    if tips.sum() >= _FEWEST:
+        lengths = np.linalg.norm(np.diff(one.curves[tips], axis=1), axis=2).sum(axis=1)
+        short, long = np.percentile(lengths, [5.0, 95.0])
+        seen += f"it is seen {1e3 * short:.1f} to {1e3 * long:.1f} mm long (5 and 95 % of the "
+        seen += "frames that show its tip), and "
+        turned = max(turned, float(np.arccos(short / long)))
+    elif turned == 0.0:
         return [f"{name}: too few frames show its tip to see whether it leaves the plane."]
-    lengths = np.linalg.norm(np.diff(one.curves[tips], axis=1), axis=2).sum(axis=1)
-    short, long = np.percentile(lengths, [5.0, 95.0])
-    turned = float(np.arccos(short / long))
-    seen = f"{name}: it is seen {1e3 * short:.1f} to {1e3 * long:.1f} mm long (5 and 95 % of the "
-    if short > (1.0 - _SHORTENED) * long:
+    seen += "its curvature without contact "
+    if turned < _TURNED:
         away = np.linalg.norm(one.fit.contact_point - one.fit.position, axis=1)
         deep = np.sin(turned) * float(np.nan_to_num(away).max())
         return [
-            f"{seen}frames that show its tip), which does not exclude that it leaves the plane by "
+            f"{seen}hardly changes, which does not exclude that it leaves the plane by "
             f"{np.degrees(turned):.0f}°: contact points may be {1e3 * deep:.1f} mm nearer to the "
             "camera or farther from it, which is in no covariance."
         ]
     return [
-        f"{seen}frames that show its tip), as if it turned out of the image by up to "
-        f"{np.degrees(turned):.0f}°. Contact is then not distinguished from turning, and forces "
-        "and contact points of such frames are unreliable. A second view (or a mirror, "
-        "--views) shows it."
+        f"{seen}changes, as if it turned out of the image by up to {np.degrees(turned):.0f}°. "
+        "Contact is where it bends as no turn does: the lightest contacts are missed, and contact "
+        "points and forces assume that it turns in contact as it does without. How deep they are "
+        "is unknown. A second view (or a mirror, --views) shows it."
     ]
 
 

@@ -48,6 +48,7 @@ from vibrissa.tracking.refine.optics import (
     Optics,
     rough_optics,
     stated_lenses,
+    with_depth_unsure,
     with_optics_unsure,
     with_shift_unsure,
 )
@@ -55,6 +56,7 @@ from vibrissa.tracking.refine.peg import UncertainPeg
 from vibrissa.tracking.refine.problem import FitOptions
 from vibrissa.tracking.refine.rods import TraceSeries, rolled
 from vibrissa.tracking.refine.silhouette import explains, peg_in_images
+from vibrissa.tracking.refine.tilt import Plane, plane_of, projected, unturned
 from vibrissa.tracking.space.curve import begun_together, merged, with_one_tip
 from vibrissa.tracking.space.exchange import Known, exchanged
 from vibrissa.tracking.space.frame_pairs import best_seen, paired_frames
@@ -251,7 +253,8 @@ def track(
                 one = replace(one, contacts=other)
             elif objects:
                 one = replace(one, contacts=contacts_at(objects, one.curves, one.touching, one.fit))
-            one = replace(one, fit=with_shift_unsure(cameras, one.fit, one.traces.shift))
+            fit = with_shift_unsure(cameras, one.fit, one.traces.shift)
+            one = replace(one, fit=with_depth_unsure(cameras, fit, options.rough, options.distance))
             if optics is not None:
                 one = replace(one, fit=with_optics_unsure(one.fit, optics))
                 remarks += remarks_on_optics(one, optics, name)
@@ -440,10 +443,16 @@ def track_whisker(
     tips: Mask = np.all(series.ends[:, :, 1] > 0.5, axis=1)
     sparse = any(trace.sparse for view in traces for trace in view)
     scale = _pixel_at(cameras, on_head)
-    shape, whisker = _at_rest(on_head, options, name, tips, len(cameras) == 1, sparse, scale)
+    flat = len(cameras) == 1
+    shape, whisker = _at_rest(on_head, options, name, tips, flat, sparse, scale)
+    plane = plane_of(on_head, shape, tips) if flat else Plane(None, np.zeros(count))
+    if plane.head is not None:
+        on_head = unturned(on_head, plane.head)
+        shape, whisker = _at_rest(on_head, options, name, tips, flat, sparse, scale)
     if len(cameras) > 1:
         shape = replace(shape, free=shape.free & ~rolled_over(on_head, shape, whisker))
     report(f"contact of {name}", 1, 2)
+    within = plane.head or head  # frame of the rod
     touching = np.isfinite(points).all(axis=(1, 2)) & ~shape.free
     smoothness = options.fit
     if sparse:
@@ -451,14 +460,16 @@ def track_whisker(
     tapers = bool(options.properties.keys() & {"tip_radius", "radius"})
     further = None
     if options.whisker is None:
-        further = continued(shape, on_head, cameras, series, head, tapers)
+        further = continued(shape, on_head, cameras, series, within, tapers)
     if further is not None:
         shape = further[0]
         whisker = whisker_at_rest(shape, name, **options.at_base)
     if not shape.free.any():
         # Only the bent shapes determine the roll.
         smoothness = replace(smoothness, roll=max(smoothness.roll, _ANY_ROLL))
-    fitter = Fitter(cameras, series, touching, on_head, rate, smoothness, head, objects)
+    fitter = Fitter(
+        cameras, series, touching, on_head, rate, smoothness, within, objects, unsure=plane.unsure
+    )
     begun = _Begun(shape, whisker, further and further[1], tips, tapers)
     found = None
     if sample and not objects:
@@ -475,10 +486,11 @@ def track_whisker(
         pose=found.pose,
         unfiltered=found.unfiltered,
         touching=touching,
-        fit=found.fit,
+        fit=found.fit if plane.head is None else projected(found.fit, plane.head),
         head=head,
         length=found.length,
         peg=found.peg,
+        turned=plane.turned,
     )
 
 

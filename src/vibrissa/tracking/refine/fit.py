@@ -53,7 +53,7 @@ from vibrissa.tracking.refine.rods import (
     turns,
 )
 from vibrissa.tracking.space.pose import BasePose, HeadPose
-from vibrissa.tracking.space.rest_shape import Length
+from vibrissa.tracking.space.rest_shape import Length, turned_change
 from vibrissa.tracking.trace.trace import correlated
 from vibrissa.whisker import Whisker
 
@@ -265,6 +265,8 @@ class Fitter:
     head: HeadPose
     objects: Sequence[Surface] = ()
     peg: UncertainPeg | None = None
+    # (time,) Standard deviation of the logarithm of the curvature that one view shows.
+    unsure: Array | None = None
 
     def fit(
         self, whisker: Whisker, pose: BasePose, nodes: int, length: Length | None = None
@@ -273,7 +275,8 @@ class Fitter:
         problem, state, linear = self._problem(whisker, pose).trusted()
         state, linear, spread = profiled(problem, state, linear)
         length = length or Length(whisker.length, 0.0)
-        found = _answer(problem, state, linear, spread, nodes, length)
+        unsure = np.zeros(0) if self.unsure is None else self.unsure[problem.frames]
+        found = _answer(problem, state, linear, spread, nodes, length, unsure)
         whole = _whole(_in_laboratory(found, problem.head), problem.frames, len(self.curves))
         if self.peg is None or not linear.smoother.crossed.any():
             return whole, None
@@ -402,7 +405,7 @@ class Fitter:
         return near, arcs[np.arange(len(at)), at]
 
 
-def _shared(problem: Problem, fit: Linear) -> Array:
+def _shared(problem: Problem, fit: Linear, unsure: Array) -> Array:
     """Changes (error, time, unknown) due to errors of traces that all frames share, one sigma each.
 
     Light from the side, a halo of compression or fur over the base shift a trace equally in many
@@ -439,6 +442,11 @@ def _shared(problem: Problem, fit: Linear) -> Array:
             miss = ends[weight[:, end - 2] > 0.0, end]
             size = np.hypot(miss.mean(), more * miss.std()) if miss.size else 0.0
             pulls.append(design[:, end - 2] * size)
+    if unsure.any():
+        # A whisker that one view shows more or less bent, as it leaves the plane of the image.
+        points = problem.whisker.position(s * problem.whisker.length)
+        curved = turned_change(points)[:, 1] * _scales(problem)[0]
+        pulls.append(np.einsum("tni,n,t->ti", across, curved, unsure * problem.touching))
     return np.concatenate([fit.smoother.responses(np.array(pulls)), fit.smoother.by_shared()])
 
 
@@ -577,11 +585,17 @@ def _off_tangent(line: Array, share: Array, spread: Array) -> Array:
 
 
 def _answer(
-    problem: Problem, state: State, fit: Linear, spread: Array, nodes: int, length: Length
+    problem: Problem,
+    state: State,
+    fit: Linear,
+    spread: Array,
+    nodes: int,
+    length: Length,
+    unsure: Array,
 ) -> RodFit:
     """Results in SI units, relative to the head."""
     d, touching = problem.d, problem.touching
-    shared, misfit = _shared(problem, fit), fit.data.misfit
+    shared, misfit = _shared(problem, fit, unsure), fit.data.misfit
     covariance = spread + np.einsum("kti,ktj->tij", shared, shared)
     turned, slopes, slope = contact_slopes(d, state)
     point, wrench = _contacts(problem, state)

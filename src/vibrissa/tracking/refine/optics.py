@@ -38,6 +38,7 @@ _FLAT, _STRONGEST = 1e-6, 20.0
 _BEHIND = np.diag([-1.0, 1.0, -1.0])  # axes of a camera on the opposite side
 # Standard deviations of a turn of a view, rad, of its scale, and of its shift, pixels.
 _TURN, _SCALE, _SHIFT = np.radians(3.0), 0.03, 10.0
+_LEAVES = np.radians(10.0)  # the same of how far a whisker leaves the plane of a single view
 # Number of points of the shape, and the share of the usual length that they cover.
 _NODES, _LENGTH = 33, 0.9
 _FRAMES, _FEWEST = 60, 8  # largest and smallest number of free frames that are used
@@ -474,6 +475,28 @@ def with_optics_unsure(fit: RodFit, optics: Optics) -> RodFit:
     moved = [optics.displacements(points) for points in (fit.contact_point, fit.position)]
     contact, base = (np.einsum("vti,vtj->tij", points, points) for points in moved)
     return _widened(fit, contact, base, np.moveaxis(np.concatenate(moved, axis=2), 0, 1))
+
+
+def with_depth_unsure(
+    cameras: Sequence[Camera], fit: RodFit, rough: bool, distance: float | None
+) -> RodFit:
+    """Add what the unknown depth of contacts does to points in the only view, that of a lens.
+
+    The size of a pixel is that at the base; nearer to the lens, all looks larger.
+    """
+    if len(cameras) > 1 or not rough:
+        return fit
+    (camera,) = cameras
+    strength = _STRENGTH if distance is None else 1.0 / distance
+    depth = np.sin(_LEAVES) * np.linalg.norm(fit.contact_point - fit.position, axis=1)
+    middle = 0.5 * (np.asarray(camera.size or (0, 0)) - 1.0)
+    origin, direction = (ray[0] for ray in camera.rays(middle[None]))
+    away = fit.contact_point - origin
+    away -= (away @ direction)[:, None] * direction
+    shift = strength * depth[:, None] * away
+    spread = shift[:, :, None] * shift[:, None]
+    shared = np.concatenate([shift, np.zeros_like(shift)], axis=1)[:, None]
+    return _widened(fit, spread, np.zeros_like(spread), shared)
 
 
 def _widened(fit: RodFit, contact: Array, base: Array, shared: Array) -> RodFit:

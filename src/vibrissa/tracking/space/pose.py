@@ -199,7 +199,7 @@ def base_pose(curves: Array, shape: RestShape, whisker: Whisker) -> BasePose:
     BasePose
         Pose before it is filtered.
     """
-    seen, spacing, shapes = _seen_shapes(curves, shape)
+    seen, spacing, shapes = seen_shapes(curves, shape)
     rotation, position = _put_on(curves, seen, shapes, shape, whisker)
     free = shape.still[seen]
     angles = _emergence(rotation, seen, free)
@@ -211,7 +211,7 @@ def base_pose(curves: Array, shape: RestShape, whisker: Whisker) -> BasePose:
     if touching.size and not free.any():
         angles[seen], position[seen] = _always_bent(shapes, spacing, angles[seen], shape, whisker)
     elif touching.size:
-        local, start = _tangents(shapes, spacing, whisker.length)
+        local, start = tangents(shapes, spacing, whisker.length)
         # The fitted tangent differs from the whisker's as it does without contact.
         bias = np.median(np.einsum("tji,tj->ti", rotation[seen][free], local[free]), axis=0)
         offset = np.median(
@@ -220,7 +220,7 @@ def base_pose(curves: Array, shape: RestShape, whisker: Whisker) -> BasePose:
         guess = angles.copy()
         direction = local[~free]
         for _ in range(3):
-            guess[touching, 2] = _roll_like(angles, guess, shape.still)[touching]
+            guess[touching, 2] = roll_like(angles, guess, shape.still)[touching]
             turned = base_rotation(*guess[touching].T)
             corrected = direction - (turned @ bias - turned[:, :, 0])
             guess[touching, :2] = _azimuth_elevation(corrected)
@@ -237,17 +237,17 @@ def rolled_over(curves: Array, shape: RestShape, whisker: Whisker) -> Mask:
     alike = shape.still.copy()
     if whisker.is_straight or not alike.any():
         return np.zeros(len(alike), dtype=np.bool_)
-    seen, _, shapes = _seen_shapes(curves, shape)
+    seen, _, shapes = seen_shapes(curves, shape)
     rotation, _ = _put_on(curves, seen, shapes, shape, whisker)
     angles = _emergence(rotation, seen, alike[seen])
     for _ in range(_ROUNDS):
-        away = np.abs(angles[:, 2] - _roll_like(angles, angles, alike, 2 * _SLOW + 1))
+        away = np.abs(angles[:, 2] - roll_like(angles, angles, alike, 2 * _SLOW + 1))
         usual = float(np.median(away[alike])) / _MEDIAN
         alike = shape.still & (away < max(_UNUSUAL * usual, _ROLLED))
     return np.asarray(shape.free & (away >= max(_UNUSUAL * usual, _ROLLED)))
 
 
-def _seen_shapes(curves: Array, shape: RestShape) -> tuple[Mask, float, Array]:
+def seen_shapes(curves: Array, shape: RestShape) -> tuple[Mask, float, Array]:
     """Frames that show the whisker, and spacing and points of their shapes at equal lengths."""
     seen: Mask = np.all(np.isfinite(curves), axis=(1, 2))
     return seen, *aligned_lengths(curves[seen], shape.spacing)
@@ -281,9 +281,9 @@ def _always_bent(
     shapes: Array, spacing: float, angles: Array, shape: RestShape, whisker: Whisker
 ) -> tuple[Array, Array]:
     """Angles (time, 3) and base points (time, 3) if no frame is free; the roll is constant."""
-    local, start = _tangents(shapes, spacing, whisker.length)
+    local, start = tangents(shapes, spacing, whisker.length)
     # The known shape gives the difference of the fitted tangent and its start from the whisker's.
-    unit, begin = _tangents(shape.points[None], spacing, whisker.length)
+    unit, begin = tangents(shape.points[None], spacing, whisker.length)
     upright = whisker.pose.rotation.T
     angles = angles.copy()
     for _ in range(3):
@@ -300,7 +300,7 @@ def _azimuth_elevation(direction: Array) -> Array:
     return np.stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))], axis=1)
 
 
-def _tangents(shapes: Array, spacing: float, length: float) -> tuple[Array, Array]:
+def tangents(shapes: Array, spacing: float, length: float) -> tuple[Array, Array]:
     """Unit tangents (time, 3) and points (time, 3) at the base, from a cubic over its beginning."""
     # A whisker may be much longer than what all views show of it, in some frames.
     shown = np.quantile(np.isfinite(shapes[:, :, 0]).sum(axis=1), _HIDDEN)
@@ -313,7 +313,7 @@ def _tangents(shapes: Array, spacing: float, length: float) -> tuple[Array, Arra
     return unit, coefficients[:, 0]
 
 
-def _roll_like(known: Array, guess: Array, free: Mask, slow: int = _SLOW) -> Array:
+def roll_like(known: Array, guess: Array, free: Mask, slow: int = _SLOW) -> Array:
     """Roll as a linear function of azimuth and elevation, as without contact, plus slow changes."""
     usable = free & np.isfinite(known).all(axis=1)
     design = np.column_stack([np.ones(usable.sum()), known[usable, :2]])

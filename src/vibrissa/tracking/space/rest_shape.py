@@ -333,9 +333,9 @@ def differences(
     rotation[over] = swing[over]
     shift = target.mean(axis=0) - np.einsum("tij,tj->ti", rotation, shapes.mean(axis=1))
     away = (_moved(shapes, rotation, shift) - target).reshape(len(shapes), -1)
-    changes = [(_slide(target), slides)]
+    changes = [(_slide(target).reshape(-1), slides)]
     if not (np.ptp(shapes[..., 2]) or np.ptp(target[:, 2])):
-        changes = [*changes, (_turn(target), _TURNED)] * 2
+        changes = [*changes, (turned_change(target).reshape(-1), _TURNED)] * 2
     # Each in turn, as both are limited; none at first.
     shares = np.zeros((2 + len(changes), len(shapes)))
     for k, (change, most) in enumerate(changes):
@@ -346,12 +346,12 @@ def differences(
 
 
 def _slide(shape: Array) -> Array:
-    """Change (3 n,) of a shape that begins later by its length, up to rigid motion."""
+    """Change (n, 3) of a shape that begins later by its length, up to rigid motion."""
     return _but_rigid(shape, np.gradient(shape, axis=0) * (len(shape) - 1))
 
 
-def _turn(shape: Array) -> Array:
-    """Change (3 n,) of a plane shape whose curvature becomes twice as large, up to rigid motion.
+def turned_change(shape: Array) -> Array:
+    """Change (n, 3) of a plane shape whose curvature becomes twice as large, up to rigid motion.
 
     A whisker that leaves the plane of the image looks shorter, or rolled to the side. Either
     changes what is seen of its curvature by nearly the same factor everywhere, unlike a contact,
@@ -364,12 +364,13 @@ def _turn(shape: Array) -> Array:
 
 
 def _but_rigid(shape: Array, change: Array) -> Array:
-    """Change (n, 3) of a shape without the part that is a rigid motion, (3 n,)."""
+    """Change (n, 3) of a shape without the part that is a rigid motion."""
     away = shape - shape.mean(axis=0)
     turns = np.cross(np.eye(3)[:, None], away)
     shifts = np.broadcast_to(np.eye(3)[:, None], turns.shape)
     rigid = np.concatenate([shifts, turns]).reshape(6, -1).T
-    return np.asarray(change.reshape(-1) - rigid @ np.linalg.lstsq(rigid, change.reshape(-1))[0])
+    along = change.reshape(-1)
+    return np.asarray(along - rigid @ np.linalg.lstsq(rigid, along)[0]).reshape(change.shape)
 
 
 def _depth(shape: Array) -> float:

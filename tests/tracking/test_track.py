@@ -685,7 +685,7 @@ def test_the_rest_shape_ignores_where_hairs_let_a_trace_begin():
 
 
 @pytest.mark.parametrize(
-    ("bend", "frames", "touches"), [(0.4, 1, False), (0.4, 2, True), (1.2, 1, True)]
+    ("bend", "frames", "touches"), [(0.6, 1, False), (0.6, 2, True), (1.4, 1, True)]
 )
 def test_a_contact_of_a_single_frame_bends_it_more(bend, frames, touches):
     """Next to a crossing a trace may be wrong for a single frame."""

@@ -80,7 +80,7 @@ def test_published_radii_on_the_command_line(centerline):
     assert "published regressions" in text
     assert "radius assumed" not in text
     refused = ran("deflect", "--point", "25,12,1", "--rat", "C2")
-    assert "need a --whisker" in str(refused.exception)
+    assert "needs a --whisker" in str(refused.exception)
 
 
 def test_the_end_that_is_the_base_is_an_option(centerline):
@@ -93,7 +93,7 @@ def test_the_end_that_is_the_base_is_an_option(centerline):
     assert given[table[0] : given.index("└")] == turned[table[1] : turned.index("└")]
     assert "--base-end last" in " ".join(given.split())
     assert "taken as the base" not in " ".join(turned.split())
-    for whisker, reason in (((), "need a --whisker"), (("--whisker", "gamma"), "built-in")):
+    for whisker, reason in (((), "needs a --whisker"), (("--whisker", "gamma"), "built-in")):
         refused = ran("deflect", "--point", "25,12,1", *whisker, "--base-end", "last")
         assert reason in str(refused.exception)
 

@@ -28,7 +28,8 @@ def test_the_page_is_served_until_interrupted():
         rest, complaints = serving.communicate(timeout=30)
     assert serving.returncode == 0
     assert rest.strip() == "stopped"
-    assert complaints == ""
+    # Kernels are compiled meanwhile, unless that was done before.
+    assert [line for line in complaints.splitlines() if "compiling kernels" not in line] == []
 
 
 def test_videos_need_a_trial(tmp_path):

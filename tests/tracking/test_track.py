@@ -450,6 +450,19 @@ def test_a_whisker_that_cannot_be_tracked_does_not_cost_the_others(
         track(filmed.cameras, [[row, row] for row in bad], 1000.0, names=["bad", "worse"])
 
 
+@pytest.mark.parametrize("row", [False, True])
+def test_a_trace_next_to_a_crossing_is_no_contact_in_a_row(filmed, traces, row):
+    """In the front view it is drawn aside by up to 0.5 pixels in a frame that is free."""
+    mine = [list(view[0]) for view in traces]
+    free = np.flatnonzero(~track_whisker(filmed.cameras, mine, 1000.0, TrackOptions()).touching)
+    i = int(free[len(free) // 2])
+    bump = np.exp(-(np.linspace(-3.0, 3.0, len(mine[1][i].line)) ** 2))
+    aside = mine[1][i].line + 0.5 * bump[:, None] * [0.0, 1.0]
+    mine[1][i] = mine[1][i]._replace(line=aside)
+    found = track_whisker(filmed.cameras, mine, 1000.0, TrackOptions(), row=row)
+    assert found.touching[i] == (not row)
+
+
 def test_the_far_end_of_a_bent_whisker_is_given_back(filmed, traces):
     """In the front view a line crosses the whisker that an object bends, and has its far end."""
     mine = [list(view[0]) for view in traces]
@@ -682,21 +695,6 @@ def test_the_rest_shape_ignores_where_hairs_let_a_trace_begin():
     held = base_rotation(0.8 * np.sin(np.linspace(0.0, np.pi, 90)), np.zeros(90), np.zeros(90))
     curves = np.einsum("tij,tnj->tni", held, shapes) + rng.normal(0.0, 2e-6, shapes.shape)
     np.testing.assert_array_equal(rest_shape(curves).free, ~touched)
-
-
-@pytest.mark.parametrize(
-    ("bend", "frames", "touches"), [(0.6, 1, False), (0.6, 2, True), (1.4, 1, True)]
-)
-def test_a_contact_of_a_single_frame_bends_it_more(bend, frames, touches):
-    """Next to a crossing a trace may be wrong for a single frame."""
-    rng, s = np.random.default_rng(4), np.linspace(0.0, 20e-3, 101)
-    touched = (np.arange(60) >= 30) & (np.arange(60) < 30 + frames)
-    shapes = np.stack(np.broadcast_arrays(s, (8.0 + bend * touched[:, None]) * s**2, 0.0), axis=-1)
-    held = base_rotation(0.8 * np.sin(np.linspace(0.0, 9.0, 60)), np.zeros(60), np.zeros(60))
-    waves = np.cos(np.pi * np.outer(s / 20e-3, np.arange(40)))
-    noise = 0.7e-6 * np.einsum("nk,tki->tni", waves, rng.normal(size=(60, 40, 3)))
-    curves = np.einsum("tij,tnj->tni", held, shapes) + noise
-    np.testing.assert_array_equal(rest_shape(curves).free, ~touched if touches else True)
 
 
 @pytest.mark.parametrize(("share", "whole"), [(0.45, True), (0.3, False)])

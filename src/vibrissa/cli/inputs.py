@@ -35,7 +35,7 @@ class WhiskerOptions:
     def check(self, given: bool) -> None:
         """Raise ValueError for options about a whisker if none is given."""
         if (self.rat is not None or self.any_length or self.base_end) and not given:
-            raise ValueError("--rat, --any-length and --base-end need a --whisker")
+            raise ValueError("each of --rat, --any-length and --base-end needs a --whisker")
 
     def read(self, path: Path | None = None) -> vb.Whisker:
         """Read the whisker, or that of another file; by default the built-in γ whisker."""
@@ -83,7 +83,7 @@ class TrackedOptions(WhiskerOptions):
 
     def __post_init__(self) -> None:
         if (self.any_length or self.base_end) and self.whisker is None:
-            raise ValueError("--any-length and --base-end need a --whisker")
+            raise ValueError("each of --any-length and --base-end needs a --whisker")
 
     def tracked_length(self, length: float | None) -> float | None:
         """Stated length of the whisker, m."""

@@ -91,8 +91,9 @@ _FEWEST, _FRAMES = 3, 24
 _WELL, _WORSE = 1.0, 3.0
 # Share of the frames of a whisker in a row that the rod must explain before others are left out.
 _EXPLAINED = 0.1
-# Errors of traces that vary with the pose only, pixels: by light, fur, lenses and what is behind.
-_ASTRAY = 0.1
+# Errors of traces that vary with the pose only, pixels: by light, fur, lenses and what is behind;
+# and in a row, where they are next to crossings.
+_ASTRAY, _CROSSED = 0.1, 0.4
 _FAR = 10.0  # distance between the bases of several views above which they differ, pixels
 _SHARE = 0.03  # the same as a share of the whisker's length
 
@@ -234,7 +235,7 @@ def track(
     rows = [list(row) for row in zip(*timed_rows, strict=True)]
 
     def tracked(k: int, used: Sequence[Sequence[Trace]]) -> Tracked:
-        given = moving, objects, sample
+        given = moving, objects, sample, count > 1
         return track_whisker(cameras, used, rate, options, called[k], progress, *given)
 
     known = partial(known_of, cameras, rate=rate, options=options.fit)
@@ -425,8 +426,9 @@ def track_whisker(
     head: HeadPose | None = None,
     objects: Sequence[Surface] = (),
     sample: Sequence[Sequence[Frame]] = (),
+    row: bool = False,
 ) -> Tracked:
-    """Track one whisker in space, from traces of frames that belong together, view by view."""
+    """Track one whisker, or one of a row, from traces of frames that belong together, by view."""
     report = progress or (lambda stage, done, total: None)
     count = len(traces[0])
     traces = with_one_tip(cameras, traces)
@@ -442,13 +444,13 @@ def track_whisker(
     on_head = head.seen_from(points)
     tips: Mask = np.all(series.ends[:, :, 1] > 0.5, axis=1)
     sparse = any(trace.sparse for view in traces for trace in view)
-    scale = _pixel_at(cameras, on_head)
+    astray = (_CROSSED if row and not sparse else _ASTRAY) * _pixel_at(cameras, on_head)
     flat = len(cameras) == 1
-    shape, whisker = _at_rest(on_head, options, name, tips, flat, sparse, scale)
+    shape, whisker = _at_rest(on_head, options, name, tips, flat, sparse, astray)
     plane = plane_of(on_head, shape, tips) if flat else Plane(None, np.zeros(count))
     if plane.head is not None:
         on_head = unturned(on_head, plane.head)
-        shape, whisker = _at_rest(on_head, options, name, tips, flat, sparse, scale)
+        shape, whisker = _at_rest(on_head, options, name, tips, flat, sparse, astray)
     if len(cameras) > 1:
         shape = replace(shape, free=shape.free & ~rolled_over(on_head, shape, whisker))
     report(f"contact of {name}", 1, 2)
@@ -560,7 +562,7 @@ def _at_rest(
     tips: Mask,
     flat: bool,
     sparse: bool,
-    pixel: float,
+    astray: float,
 ) -> tuple[RestShape, Whisker]:
     """Rest shape from the frames, or of the known whisker."""
     if options.whisker is not None:
@@ -568,7 +570,7 @@ def _at_rest(
         if flat:
             return _known_flat(curves, whisker, options.free)
         return known_rest(curves, whisker, options.free), whisker
-    shape = replace(rest_shape(curves, options.free, tips, _ASTRAY * pixel), sparse=sparse)
+    shape = replace(rest_shape(curves, options.free, tips, astray), sparse=sparse)
     return shape, whisker_at_rest(shape, name, **options.at_base)
 
 

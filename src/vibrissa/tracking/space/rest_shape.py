@@ -44,7 +44,6 @@ _LEAST = 0.4  # visible share of that needed to decide whether the whisker is be
 _FEWEST = 3  # smallest number of frames that give a shape
 # Largest deviation of a free frame in units of the usual one, and if that is white noise.
 _NEAR, _OF_NOISE = 4.0, 2.0
-_ALONE = 2.0  # factor of the limit for a contact of a single frame
 _EXACT = 1e-5  # deviation, over the length, below which a frame is always free
 # A whisker rings where free frames usually deviate by so many times what this share of them does;
 # then still ones deviate by at most so many times that.
@@ -217,8 +216,7 @@ def _free(deviation: Array, within: float, sure: float) -> Mask:
 
     Some errors of curves vary with the pose of the whisker, and exceed the usual limit in some
     poses. Contacts that are not sure are therefore only the beginnings and ends of sure ones,
-    toward which the deviations rise from frame to frame. Those of a single frame are surer, as
-    errors next to a crossing may last as short a time.
+    toward which the deviations rise from frame to frame.
     """
     known = np.nan_to_num(deviation, nan=0.0)
     touching = known >= sure
@@ -226,9 +224,6 @@ def _free(deviation: Array, within: float, sure: float) -> Mask:
         for i in range(1, len(known)):
             touching[i] |= touching[i - 1] and within <= known[i] < known[i - 1]
         known, touching = known[::-1], touching[::-1]
-    apart = np.isfinite(deviation) & ~touching
-    alone = np.append(False, apart[:-1]) & np.append(apart[1:], False)
-    touching &= ~alone | (known >= _ALONE * sure)
     return np.asarray(np.isfinite(deviation) & ~touching)
 
 

@@ -12,6 +12,7 @@ from vibrissa.objects import Peg
 from vibrissa.recording import ONE_VIEW, Recording
 from vibrissa.simulation import Motion, film_frames, simulate
 from vibrissa.tracking import TrackOptions, trace_video, track
+from vibrissa.tracking.refine.optics import stated_lenses
 
 testing = pytest.importorskip("typer.testing")
 
@@ -115,6 +116,25 @@ def test_turning_out_of_the_plane_is_not_contact(elevation):
     for name in ("contact_point", "centerline"):
         assert np.nanmax(np.abs(of(found, name)[..., 2])) == 0.0
     assert np.abs(of(found, "force")[:, 2]).max() == np.abs(of(found, "moment")[:, :2]).max() == 0.0
+
+
+def test_a_lens_moves_contacts_at_unknown_depths():
+    """A known lens does so as one whose distance is stated; a telecentric one does not."""
+    _, traces = film()
+    lens = stated_lenses(CAMERA, 0.05)
+    ways = [
+        (CAMERA, TrackOptions()),
+        (CAMERA, TrackOptions(rough=True, distance=0.05)),
+        (lens, TrackOptions()),
+    ]
+    spread = []
+    for cameras, options in ways:
+        found = track(cameras, traces, 1000.0, options)
+        covariance = of(found, "contact_covariance")[of(found, "in_contact") > 0]
+        spread.append(np.median(covariance[:, 0, 0]))
+    assert lens[0].projection == "perspective"
+    assert spread[2] == pytest.approx(spread[1], rel=0.2)
+    assert spread[1] > 1.3 * spread[0]
 
 
 def test_a_known_whisker_is_laid_into_the_plane():

@@ -484,16 +484,21 @@ def with_depth_unsure(
 
     The size of a pixel is that at the base; nearer to the lens, all looks larger.
     """
-    if len(cameras) > 1 or not rough:
+    lens = cameras[0].projection == "perspective"
+    if len(cameras) > 1 or not (rough or lens):
         return fit
     (camera,) = cameras
-    strength = _STRENGTH if distance is None else 1.0 / distance
     depth = np.sin(_LEAVES) * np.linalg.norm(fit.contact_point - fit.position, axis=1)
     middle = 0.5 * (np.asarray(camera.size or (0, 0)) - 1.0)
     origin, direction = (ray[0] for ray in camera.rays(middle[None]))
     away = fit.contact_point - origin
-    away -= (away @ direction)[:, None] * direction
-    shift = strength * depth[:, None] * away
+    along = away @ direction
+    away -= along[:, None] * direction
+    if lens:
+        depth /= along
+    else:
+        depth *= _STRENGTH if distance is None else 1.0 / distance
+    shift = depth[:, None] * away
     spread = shift[:, :, None] * shift[:, None]
     shared = np.concatenate([shift, np.zeros_like(shift)], axis=1)[:, None]
     return _widened(fit, spread, np.zeros_like(spread), shared)

@@ -199,23 +199,32 @@ def test_an_extra_that_is_not_installed_is_named(tmp_path, module, arguments, ex
     assert f"vibrissa[{extra}]" in done.stderr
 
 
-def test_an_interrupt_that_python_ignores_is_repeated(interruptible):
-    """As in a callback of the compiler, or where the last reference to an object ends."""
-    code = """
-import signal, sys, time
-from vibrissa.cli.terminal import repeat_lost_interrupts
+@pytest.mark.parametrize(
+    ("within", "error"), [("nullcontext", "KeyboardInterrupt"), ("ending_in_order", "Ended")]
+)
+def test_an_interrupt_that_python_ignores_is_repeated(interruptible, within, error):
+    """As in a callback of the compiler, or where the last reference to an object ends.
+
+    It ends waiting, here for what nobody writes.
+    """
+    code = f"""
+import os, signal, time
+from contextlib import nullcontext
+from vibrissa.cli.terminal import Ended, ending_in_order, repeat_lost_interrupts
 class Last:
     def __del__(self):
         signal.raise_signal(signal.SIGINT)
         time.sleep(0)
 repeat_lost_interrupts()
 try:
-    Last()
-    time.sleep(20.0)
-    print("lost")
-except KeyboardInterrupt:
-    print("stopped")
+    with {within}():
+        Last()
+        os.read(os.pipe()[0], 1)
+except KeyboardInterrupt as stopped:
+    print(type(stopped).__name__)
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "stopped\n"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=100.0
+    )
+    assert done.stdout == f"{error}\n"
     assert not done.stderr

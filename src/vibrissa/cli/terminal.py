@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import _thread
 import codecs
 import io
 import signal
@@ -105,12 +104,19 @@ def repeat_lost_interrupts() -> None:
     usual = sys.unraisablehook
 
     def hook(lost: sys.UnraisableHookArgs) -> None:
-        if not issubclass(lost.exc_type, KeyboardInterrupt):
+        error = lost.exc_value
+        if not isinstance(error, KeyboardInterrupt):
             usual(lost)
             return
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        # Later, as an exception raised here would be ignored too.
-        threading.Timer(_LATER, _thread.interrupt_main).start()
+
+        def again(number: int, frame: object) -> None:
+            signal.signal(number, before)
+            raise error
+
+        before = signal.signal(signal.SIGINT, again)
+        # Later, as an exception raised here would be ignored too; as a signal, which ends waiting.
+        main = threading.main_thread().ident
+        threading.Timer(_LATER, signal.pthread_kill, (main, signal.SIGINT)).start()
 
     sys.unraisablehook = hook
 

@@ -26,7 +26,7 @@ from vibrissa.tracking import (
 )
 from vibrissa.tracking.refine.problem import Smoother
 from vibrissa.tracking.space.exchange import exchanged
-from vibrissa.tracking.space.rest_shape import Length, length_shown
+from vibrissa.tracking.space.rest_shape import Length, known_rest, length_shown
 from vibrissa.tracking.trace.trace import STEP
 from vibrissa.tracking.track import known_of, tapered_as_it_bends, track_whisker
 from vibrissa.whisker import angles_of, base_rotation
@@ -705,7 +705,8 @@ def test_ends_that_scatter_are_tips_if_they_are_seen_often(share, whole):
     assert found == pytest.approx(24.3e-3, rel=0.02)
 
 
-def test_fur_that_draws_a_base_aside_is_no_contact():
+@pytest.mark.parametrize("known", [False, True])
+def test_fur_that_draws_a_base_aside_is_no_contact(known):
     """By up to 80 µm, over a few per cent of the length, as the whisker turns toward the fur."""
     rng, s = np.random.default_rng(5), np.linspace(0.0, 20e-3, 101)
     azimuth = 0.6 * np.sin(np.linspace(0.0, 4.0 * np.pi, 120))
@@ -714,7 +715,9 @@ def test_fur_that_draws_a_base_aside_is_no_contact():
     shapes[..., 1] += 80e-6 * np.maximum(azimuth, 0.0)[:, None] / 0.6 * np.exp(-s / 0.3e-3)
     curves = np.einsum("tij,tnj->tni", base_rotation(azimuth, *np.zeros((2, 120))), shapes)
     curves += rng.normal(0.0, 1e-6, shapes.shape)
-    np.testing.assert_array_equal(rest_shape(curves).free, ~touched)
+    whisker = Whisker.from_points(np.column_stack([s, 8.0 * s**2, 0.0 * s]), noise=0.0)
+    found = known_rest(curves, whisker) if known else rest_shape(curves)
+    np.testing.assert_array_equal(found.free, ~touched)
 
 
 def test_a_whisker_that_rests_for_long_and_then_whisks_is_not_touched():

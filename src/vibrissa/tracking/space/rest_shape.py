@@ -150,7 +150,7 @@ def rest_shape(
         If the whisker is seen in less than three frames.
     """
     seen = _seen(curves)
-    furred = round(_FURRED * (curves.shape[1] - 1))
+    furred = _furred(curves)
     _, shapes, known, compared = _compared(curves[seen])
     whole = _whole(known, compared)
     part = shapes[whole, furred:compared]
@@ -254,6 +254,12 @@ def _compared(curves: Array, spacing: float | None = None) -> tuple[float, Array
     return spacing, shapes, known, int(_COMMON * (curves.shape[1] - 1)) + 1
 
 
+def _furred(curves: Array) -> int:
+    """Number of points at the base that are not compared."""
+    count: int = round(_FURRED * (curves.shape[1] - 1))
+    return count
+
+
 def _whole(known: Counts, compared: int) -> Mask:
     """Shapes that show all points compared."""
     whole: Mask = np.asarray(known >= compared, dtype=np.bool_)
@@ -284,7 +290,7 @@ def known_rest(curves: Array, whisker: Whisker, least: float = 0.1) -> RestShape
             f"the whisker is seen over {shown * 1e3:.1f} mm, but the known one is "
             f"{whisker.length * 1e3:.1f} mm long: it is another, or the scale is wrong"
         )
-    s = np.arange(int(whisker.length / spacing) + 1) * spacing
+    s, furred = np.arange(int(whisker.length / spacing) + 1) * spacing, _furred(curves)
     points = whisker.pose.to_source(whisker.position(np.minimum(s, whisker.length)))
     if not np.ptp(curves[seen][..., 2]):
         points[:, 2] = 0.0
@@ -292,7 +298,7 @@ def known_rest(curves: Array, whisker: Whisker, least: float = 0.1) -> RestShape
     for row, shape, count in zip(np.flatnonzero(seen), shapes, known, strict=True):
         n = min(int(count), len(points), compared)
         if n >= _LEAST * compared:
-            out[row] = _deviations(shape[None, :n], points[:n], rolled=True)[0]
+            out[row] = _deviations(shape[None, furred:n], points[furred:n], rolled=True)[0]
     lowest = np.sort(out[np.isfinite(out)])
     noise = float(np.median(lowest[: max(_FEWEST, round(least * len(lowest)))]))
     free = np.zeros(len(curves), dtype=bool)

@@ -203,6 +203,7 @@ def test_curvature_keeps_the_frame_it_was_stated_in_until_aligned():
         ({"youngs_modulus": 0.0}, "youngs_modulus is 0.0 Pa"),
         ({"youngs_modulus": 3.0}, "is it in Pa"),
         ({"youngs_modulus": 3000.0}, "1 MPa is 1e6"),
+        ({"youngs_modulus": 3000e9}, "1 MPa is 1e6"),
         ({"base_radius": 0.1}, "millimetres given as metres"),
         ({"poisson_ratio": -1.0}, r"\(-1, 0.5\]"),
         ({"poisson_ratio": 0.51}, r"\(-1, 0.5\]"),

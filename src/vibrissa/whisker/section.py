@@ -33,8 +33,8 @@ YOUNGS_MODULUS = 3e9
 POISSON_RATIO = 0.38
 
 # Young's moduli from a gel that can hold a rod to diamond, Pa; values outside are assumed to be in
-# another unit: 3000 MPa is usual.
-_SOFTEST, _HARDEST = 1e4, 1e13
+# another unit: 3000 MPa is usual, stated as Pa or as GPa.
+_SOFTEST, _HARDEST = 1e4, 2e12
 # Densities from a foam to osmium, kg/m³.
 _LIGHTEST, _HEAVIEST = 10.0, 23000.0
 SHORTEST, LONGEST = 0.5e-3, 0.5

@@ -27,7 +27,7 @@ from vibrissa.whisker import Whisker
 _COORDINATES = ("r", "theta", "phi")
 _TURN = 2.0 * np.pi
 # Forces in units of EI/L² beyond which a limit leaves out either no contact or all: one at 3 % of
-# the length that bends the whisker by 1 rad has 3,000, one that bends it by 0.002° at the tip 1e-4.
+# the length that bends the whisker by 1 rad has 2,000, one that bends it by 0.003° at the tip 1e-4.
 _FAINTEST, _STRONGEST = 1e-4, 3e3
 
 

@@ -13,6 +13,9 @@ from vibrissa.recording import ONE_VIEW, Recording
 from vibrissa.simulation import Motion, film_frames, simulate
 from vibrissa.tracking import TrackOptions, trace_video, track
 from vibrissa.tracking.refine.optics import stated_lenses
+from vibrissa.tracking.refine.tilt import plane_of
+from vibrissa.tracking.space.rest_shape import rest_shape
+from vibrissa.whisker import base_rotation
 
 testing = pytest.importorskip("typer.testing")
 
@@ -135,6 +138,20 @@ def test_a_lens_moves_contacts_at_unknown_depths():
     assert lens[0].projection == "perspective"
     assert spread[2] == pytest.approx(spread[1], rel=0.2)
     assert spread[1] > 1.3 * spread[0]
+
+
+@pytest.mark.parametrize(("bend", "turns"), [(0.0, 0.0), (0.5, 0.0), (8.0, 0.0), (8.0, 0.5)])
+def test_errors_of_traces_of_a_nearly_straight_whisker_are_no_turn(bend, turns):
+    """They change its apparent curvature as much as a turn by tens of degrees would."""
+    rng, s, frames = np.random.default_rng(0), np.linspace(0.0, 20e-3, 101), 80
+    turn = turns * np.abs(np.sin(np.linspace(0.0, 9.0, frames)))[:, None]
+    shapes = np.stack(np.broadcast_arrays(np.cos(turn) * s, bend * s**2, 0.0), axis=-1)
+    waves = np.cos(np.pi * np.outer(s / s[-1], np.arange(12)))
+    shapes[..., :2] += 0.4e-6 * np.einsum("nk,tki->tni", waves, rng.normal(size=(frames, 12, 2)))
+    azimuth = 0.8 * np.sin(np.linspace(0.0, 9.0, frames))
+    curves = np.einsum("tij,tnj->tni", base_rotation(azimuth, 0.0 * azimuth, 0.0 * azimuth), shapes)
+    plane = plane_of(curves, rest_shape(curves), np.ones(frames, dtype=bool))
+    assert plane.turned == pytest.approx(turns, abs=0.1)
 
 
 def test_a_known_whisker_is_laid_into_the_plane():

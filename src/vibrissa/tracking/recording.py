@@ -518,29 +518,34 @@ def remarks_on_fur(one: Tracked, fur: float, name: str) -> list[str]:
 def remarks_on_plane(one: Tracked, name: str) -> list[str]:
     """Report how far a whisker may leave the plane of the only view, and the effect on contacts."""
     tips = one.traces.ends.all(axis=(1, 2)) & np.isfinite(one.curves).all(axis=(1, 2))
-    seen, turned = f"{name}: ", one.turned
+    signs, turned = [], one.turned
     if tips.sum() >= _FEWEST:
         lengths = np.linalg.norm(np.diff(one.curves[tips], axis=1), axis=2).sum(axis=1)
         short, long = np.percentile(lengths, [5.0, 95.0])
-        seen += f"it is seen {1e3 * short:.1f} to {1e3 * long:.1f} mm long (5 and 95 % of the "
-        seen += "frames that show its tip), and "
+        signs.append(
+            f"it is seen {1e3 * short:.1f} to {1e3 * long:.1f} mm long (5 and 95 % of the frames "
+            "that show its tip)"
+        )
         turned = max(turned, float(np.arccos(short / long)))
-    elif turned == 0.0:
+    if one.turned:
+        signs.append("its curvature without contact changes")
+    if not signs:
         return [f"{name}: too few frames show its tip to see whether it leaves the plane."]
-    seen += "its curvature without contact "
+    seen = f"{name}: {', and '.join(signs)}, "
     if turned < _TURNED:
         away = np.linalg.norm(one.fit.contact_point - one.fit.position, axis=1)
         deep = np.sin(turned) * float(np.nan_to_num(away).max())
         return [
-            f"{seen}hardly changes, which does not exclude that it leaves the plane by "
+            f"{seen}which does not exclude that it leaves the plane by "
             f"{np.degrees(turned):.0f}°: contact points may be {1e3 * deep:.1f} mm nearer to the "
             "camera or farther from it, which is in no covariance."
         ]
+    assumed = "turns in contact as it does without" if one.turned else "stays in the plane"
     return [
-        f"{seen}changes, as if it turned out of the image by up to {np.degrees(turned):.0f}°. "
+        f"{seen}as if it turned out of the image by up to {np.degrees(turned):.0f}°. "
         "Contact is where it bends as no turn does: the lightest contacts are missed, and contact "
-        "points and forces assume that it turns in contact as it does without. How deep they are "
-        "is unknown. A second view (or a mirror, --views) shows it."
+        f"points and forces assume that it {assumed}. How deep they are is unknown. A second view "
+        "(or a mirror, --views) shows it."
     ]
 
 

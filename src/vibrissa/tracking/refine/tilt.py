@@ -22,12 +22,14 @@ from vibrissa.deferred import transform
 from vibrissa.numerics import Array, Mask
 from vibrissa.tracking.refine.fit import RodFit
 from vibrissa.tracking.space.pose import HeadPose, roll_like, seen_shapes, tangents
-from vibrissa.tracking.space.rest_shape import RestShape, differences
+from vibrissa.tracking.space.rest_shape import RestShape, differences, turned_change
 
 # Share of the rest shape that a frame must show, and number of such frames from which turns follow.
 _SHOWN, _FEWEST = 0.85, 8
-# Smallest range of the apparent curvature that is a turn, and percentiles that are left out of it.
-_VISIBLE, _TAILS = 0.03, 2.0
+# Smallest range of the apparent curvature that is a turn, smallest change of the shape by it, in
+# usual deviations from the rest shape, and percentiles that are left out of the range. Of a nearly
+# straight whisker errors of the traces change the curvature most.
+_VISIBLE, _CLEAR, _TAILS = 0.03, 2.0, 2.0
 # Change of the logarithm of the length with that of the curvature below which a whisker rises,
 # where it is −1/2, and does not roll, where it is 0.
 _RISES = -0.2
@@ -71,7 +73,8 @@ def plane_of(curves: Array, shape: RestShape, tips: Mask) -> Plane:
     usual = np.median(curvature[free])
     unsure = np.hypot(_UNSURE, _ASTRAY * np.nan_to_num(curvature - usual))
     low, high = np.percentile(curvature[seen], [_TAILS, 100.0 - _TAILS])
-    if high - low < _VISIBLE:
+    moves = (high - low) * np.linalg.norm(turned_change(shape.points[:n])) / n**0.5
+    if high - low < _VISIBLE or moves < _CLEAR * shape.noise:
         return Plane(None, unsure)
     lengths = np.linalg.norm(np.diff(curves, axis=1), axis=2).sum(axis=1)
     ends = free & tips

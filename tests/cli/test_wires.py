@@ -90,6 +90,7 @@ def test_density_and_base_go_with_the_map_and_bend_it(tmp_path):
     ("words", "message"),
     [
         (("--whisker", "a.csv", "--length", 30), "either --whisker or the --length"),
+        (("--length", 30, "--base-end", "last"), "--base-end cannot be used"),
         (("--base-radius", 500), "--base-radius is 500 mm; more than 0 and less than 10"),
     ],
 )

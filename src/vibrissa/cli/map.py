@@ -28,6 +28,8 @@ class MadeOptions(WhiskerOptions):
         self.check(self.whisker is not None or self.length is not None)
         if self.length is not None and self.whisker is not None:
             raise ValueError("give either --whisker or the --length of a straight one")
+        if self.whisker is None:
+            refuse({"--base-end": self.base_end}, "--length states a straight whisker")
         if self.rat is not None:
             radii = {"--base-radius": self.base_radius, "--tip-radius": self.tip_radius}
             refuse(radii, "--rat determines the radii")

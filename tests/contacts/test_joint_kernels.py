@@ -6,9 +6,10 @@ import pytest
 import vibrissa as vb
 from vibrissa.contacts.joint.forward import Forward, Gravity
 from vibrissa.contacts.joint.joint_fit import JointFit
-from vibrissa.contacts.joint.weighted_fit import channel_slopes
 from vibrissa.contacts.sensing.channels import CHANNELS, WRENCH, Channels, channels_of
 from vibrissa.contacts.sensing.noise import SensorNoise, common_errors
+from vibrissa.numerics import kernel
+from vibrissa.signals import signal_equations
 
 SETS = [("Fx", "MB", "MD"), ("FT", "FD", "MB"), ("Fx", "FT", "FD", "Mx", "MB", "MD"), WRENCH]
 PULL = Gravity((3.0, -6.0, -28.0), direction_sigma=0.01, density_sigma=0.05)
@@ -44,14 +45,17 @@ def fitting(forward: Forward, names: tuple[str, ...], noise: object, **more: obj
     return JointFit(forward, channels(names), sensor, 0.05, friction=whole, **more)
 
 
+@kernel
+def channels_at(value, t, codes, channel, slope):
+    signal_equations(0.0, value, t, True, codes, channel, slope)
+
+
 def test_channels_and_their_derivatives_include_the_moment_of_the_weight(forward: Forward) -> None:
     codes, step = np.arange(len(CHANNELS)), 1e-6
     for x in contacts(5):
         value, slope = np.empty(len(codes)), np.empty((len(codes), 4))
         solved = forward.solved(x[None])
-        channel_slopes(
-            codes, solved.values[0], np.ascontiguousarray(solved.tangents[0]), value, slope
-        )
+        channels_at(solved.values[0], solved.tangents[0], codes, value, slope)
         assert np.abs(solved.values[0, 6:]).max() > 1e-4
         np.testing.assert_allclose(value, channels_of(solved.values)[0], rtol=1e-12, atol=1e-12)
         both = [channels_of(forward.values(x + way * step * np.eye(4))) for way in (1.0, -1.0)]

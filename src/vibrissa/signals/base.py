@@ -354,12 +354,16 @@ def signal_equations(
     """Compute channels of a contact and, if ``wanted``, their derivatives by the unknowns.
 
     Channels 0 to 5 are the six signals, 6 to 9 (F_y, F_z, M_y, M_z), 10 the arc length s (the first
-    unknown), 11 to 13 the contact point. ``value`` is (F, p) and ``tangents`` its derivatives, both
-    non-dimensional. Fills ``signal`` (k,) and ``jacobian`` (k, unknowns).
+    unknown), 11 to 13 the contact point. ``value`` is (F, p), or (F, p, μ) with the moment μ of the
+    weight, and ``tangents`` its derivatives, both non-dimensional. Fills ``signal`` (k,) and
+    ``jacobian`` (k, unknowns).
     """
     fx, fy, fz = value[0], value[1], value[2]
     px, py, pz = value[3], value[4], value[5]
     mx, my, mz = py * fz - pz * fy, pz * fx - px * fz, px * fy - py * fx
+    weighted = value.shape[0] > 6
+    if weighted:
+        mx, my, mz = mx + value[6], my + value[7], mz + value[8]
     ft, mb = np.sqrt(fy * fy + fz * fz), np.sqrt(my * my + mz * mz)
     for k in range(which.shape[0]):
         w = which[k]
@@ -381,6 +385,8 @@ def signal_equations(
         dmx = dpy * fz + py * dfz - dpz * fy - pz * dfy
         dmy = dpz * fx + pz * dfx - dpx * fz - px * dfz
         dmz = dpx * fy + px * dfy - dpy * fx - py * dfx
+        if weighted:
+            dmx, dmy, dmz = dmx + tangents[6, c], dmy + tangents[7, c], dmz + tangents[8, c]
         ds = 1.0 if c == 0 else 0.0
         for k in range(which.shape[0]):
             w = which[k]

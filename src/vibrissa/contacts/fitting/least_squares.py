@@ -86,6 +86,15 @@ class Fits(NamedTuple):
 
 
 @inlined
+def ratio_slopes(x: Array, by: Array) -> float:
+    """Ratio of the force along the whisker to that across it; fill its derivatives (4,)."""
+    normal = np.sqrt(x[2] * x[2] + x[3] * x[3])
+    by[0], by[1] = 0.0, 1.0 / normal
+    by[2], by[3] = -x[1] * x[2] / normal**3, -x[1] * x[3] / normal**3
+    return float(x[1] / normal)
+
+
+@inlined
 def channel_equations(
     x: Array,
     v: Array,
@@ -95,14 +104,11 @@ def channel_equations(
     residual: Array,
     jacobian: Array,
 ) -> None:
-    """Fill channels of x and (F, p) minus targets (k,), and their derivatives (k, 4) in x."""
+    """Fill channels of x and (F, p), or (F, p, μ), minus targets (k,); derivatives (k, 4) in x."""
     signal_equations(x[0], v, t, True, codes, residual, jacobian)
     for k in range(codes.shape[0]):
         if codes[k] == RATIO:
-            normal = np.sqrt(x[2] * x[2] + x[3] * x[3])
-            residual[k] = x[1] / normal
-            jacobian[k, 0], jacobian[k, 1] = 0.0, 1.0 / normal
-            jacobian[k, 2], jacobian[k, 3] = -x[1] * x[2] / normal**3, -x[1] * x[3] / normal**3
+            residual[k] = ratio_slopes(x, jacobian[k])
         residual[k] -= targets[k]
         if codes[k] in (FD, MD):
             residual[k] = wrapped(residual[k])

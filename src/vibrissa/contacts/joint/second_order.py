@@ -11,9 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.joint.weighted_fit import channel_slopes, finite_or_zero, ratio_slopes
+from vibrissa.contacts.fitting.least_squares import ratio_slopes
+from vibrissa.contacts.joint.weighted_fit import finite_or_zero
 from vibrissa.numerics import AnyArray, Array, IntArray, inlined, kernel, solve, wrapped
-from vibrissa.signals import FD, MD
+from vibrissa.signals import FD, MD, signal_equations
 
 # Displacement along each axis for the second order, in standard deviations. Limits of a valid
 # covariance: difference of the channels there from the second order, in standard deviations;
@@ -74,7 +75,7 @@ def join_rows(
     channel, slope, away = np.empty(k), np.empty((k, 4)), np.empty(k)
     residual, left, c, by_ratio = np.empty(k), np.empty(k), np.empty(m), np.empty(4)
     for row in range(x.shape[0]):
-        channel_slopes(codes, values[row], tangents[row], channel, slope)
+        signal_equations(0.0, values[row], tangents[row], True, codes, channel, slope)
         for i in range(k):
             away[i] = targets[row, i] - channel[i]
             if codes[i] in (FD, MD):
@@ -188,7 +189,7 @@ def _slopes(
     k, free = how.codes.shape[0], how.free
     n = free.shape[0]
     slope, by = np.empty((k, 4)), np.empty(4)
-    channel_slopes(how.codes, value, t, channel, slope)
+    signal_equations(0.0, value, t, True, how.codes, channel, slope)
     first = out.shape[0] - k
     for p in range(n):
         for a in range(3):

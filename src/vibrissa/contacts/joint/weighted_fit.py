@@ -12,16 +12,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibrissa.contacts.sensing.channels import CHANNELS, RATIO
+from vibrissa.contacts.fitting.least_squares import channel_equations, whiten
 from vibrissa.contacts.sensing.weighing import (
     Weighing,
     gradients,
     whitened,
     wrench_covariance,
 )
-from vibrissa.numerics import Array, IntArray, copy, inlined, kernel, solve, wrapped
+from vibrissa.numerics import Array, IntArray, copy, inlined, kernel, solve
 from vibrissa.rod import Rod, Weight, evaluate_weighted
-from vibrissa.signals import FD, FT, FX, FY, FZ, MB, MD, MX, MY
 
 # Iterations of a fit, and the longest step of each: of arc length (over L) and of force (over its
 # own size, and over EI/L²).
@@ -29,7 +28,6 @@ _ROUNDS = 30
 _LONGEST, _STRONGER, _LEAST_FORCE = 0.1, 0.5, 0.05
 # A fit has ended when its step is this small, or the damping this large.
 _SETTLED, _MOST_DAMPING = 1e-8, 1e8
-_NUMBER = len(CHANNELS)
 
 
 class Aim(NamedTuple):
@@ -52,15 +50,6 @@ def finite_or_zero(value: float) -> float:
 
 
 @inlined
-def ratio_slopes(x: Array, by: Array) -> float:
-    """Ratio of the force along the whisker to that across it; fill its derivatives (4,)."""
-    normal = np.sqrt(x[2] * x[2] + x[3] * x[3])
-    by[0], by[1] = 0.0, 1.0 / normal
-    by[2], by[3] = -x[1] * x[2] / normal**3, -x[1] * x[3] / normal**3
-    return float(x[1] / normal)
-
-
-@inlined
 def moment_of(value: Array, moment: Array) -> None:
     """Fill the moment (3,) for (F, p) or (F, p, μ)."""
     fx, fy, fz, px, py, pz = value[0], value[1], value[2], value[3], value[4], value[5]
@@ -70,44 +59,6 @@ def moment_of(value: Array, moment: Array) -> None:
     if value.shape[0] > 6:
         for a in range(3):
             moment[a] += value[6 + a]
-
-
-@inlined
-def _channel(code: int, force: Array, moment: Array) -> float:
-    """One channel of force and moment."""
-    if code in (FX, MX):
-        out = force[0] if code == FX else moment[0]
-    elif code in (FY, FZ):
-        out = force[1 + code - FY]
-    elif code > FZ:
-        out = moment[1 + code - MY]
-    else:
-        y, z = (force[1], force[2]) if code < MX else (moment[1], moment[2])
-        out = np.sqrt(y * y + z * z) if code in (FT, MB) else np.arctan2(z, y)
-    return float(out)
-
-
-@kernel
-def channel_slopes(codes: IntArray, value: Array, t: Array, channel: Array, slope: Array) -> None:
-    """Fill channels (k,) of (F, p) or (F, p, μ), and their derivatives (k, 4) in x."""
-    k = codes.shape[0]
-    moment, g, by = np.empty(3), np.empty((k, 6)), np.empty(6)
-    moment_of(value, moment)
-    gradients(codes, value[:3], moment, g)
-    for i in range(k):
-        channel[i] = _channel(codes[i], value[:3], moment)
-    for c in range(4):
-        for a in range(3):
-            b, d = (a + 1) % 3, (a + 2) % 3
-            by[a] = t[a, c]
-            by[3 + a] = t[3 + b, c] * value[d] - t[3 + d, c] * value[b]
-            by[3 + a] += value[3 + b] * t[d, c] - value[3 + d] * t[b, c]
-            if value.shape[0] > 6:
-                by[3 + a] += t[6 + a, c]
-        for i in range(k):
-            slope[i, c] = 0.0
-            for a in range(6):
-                slope[i, c] += g[i, a] * by[a]
 
 
 @inlined
@@ -166,31 +117,12 @@ def _misfit(
     aim: Aim, x: Array, value: Array, t: Array, target: Array, w: Array, r: Array, j: Array
 ) -> float:
     """Fill weighted differences (k,) from a target and derivatives (k, 4); return χ²."""
-    k, held = aim.codes.shape[0], 0
-    for code in aim.codes:
-        held += code >= _NUMBER
-    away, slope = np.empty(k), np.zeros((k, 4))
-    channel_slopes(aim.codes[: k - held], value, t, away, slope)
-    for i in range(k - held, k):
-        if aim.codes[i] == RATIO:
-            away[i] = ratio_slopes(x, slope[i])
-        else:
-            away[i], slope[i, 0] = x[0], 1.0
+    k = aim.codes.shape[0]
+    away, slope = np.empty(k), np.empty((k, 4))
+    channel_equations(x, value, t, aim.codes, target, away, slope)
+    total = whiten(w, away, slope, k, r, j)
     for i in range(k):
-        away[i] = target[i] - away[i]
-        if aim.codes[i] in (FD, MD):
-            away[i] = wrapped(away[i])
-    total = 0.0
-    for i in range(k):
-        off = 0.0
-        for c in range(4):
-            j[i, c] = 0.0
-        for b in range(k):
-            off += w[i, b] * away[b]
-            for c in range(4):
-                j[i, c] += w[i, b] * slope[b, c]
-        total += off * off
-        r[i] = finite_or_zero(off)
+        r[i] = finite_or_zero(r[i])
         for c in range(4):
             j[i, c] = finite_or_zero(j[i, c])
     return total if abs(total) < np.inf else np.inf
@@ -209,7 +141,7 @@ def _step(x: Array, r: Array, j: Array, damping: float, free: IntArray, step: Ar
     for p in range(n):
         b[p] = 0.0
         for i in range(k):
-            b[p] += j[i, free[p]] / size[p] * r[i]
+            b[p] -= j[i, free[p]] / size[p] * r[i]
         for q in range(n):
             normal[p, q] = damping + 1e-14 if p == q else 0.0
             for i in range(k):

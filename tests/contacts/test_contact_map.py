@@ -264,3 +264,9 @@ def _share_found(contact_map, triplet, charted):
 def test_cells_are_three_whole_numbers(cells):
     with pytest.raises(ValueError, match="three whole numbers"):
         vb.ContactMap.simulate(vb.samples.gamma(), grid=False, cells=cells)
+
+
+def test_a_coarse_map_states_which_signals_determine_contacts():
+    """It has fewer contacts than are tried by default."""
+    coarse = vb.ContactMap.simulate(vb.samples.gamma(), grid=False, cells=(4, 8, 4))
+    assert coarse.determines(("Fx", "MB", "MD"))

@@ -253,7 +253,8 @@ def spherical_derivatives(points: Array) -> Array:
 def determining(contact_map: ChartedWhisker, names: tuple[str, ...]) -> bool:
     """Whether signals determine contacts almost everywhere."""
     chart = contact_map.chart
-    nodes = np.random.default_rng(0).choice(chart.values[..., 0].size, _TRIED, replace=False)
+    size = chart.values[..., 0].size
+    nodes = np.random.default_rng(0).choice(size, min(size, _TRIED), replace=False)
     xi, values = chart.contacts.reshape(-1, 3)[nodes], chart.values.reshape(-1, 6)[nodes]
     signals = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))
     which = [SIGNALS.index(name) for name in names]

@@ -101,6 +101,8 @@ def repeat_lost_interrupts() -> None:
     In callbacks, as those of the compiler or at the end of an import, Python ignores exceptions, so
     that Ctrl-C would have no effect.
     """
+    if not hasattr(signal, "pthread_kill"):  # Windows
+        return
     usual = sys.unraisablehook
 
     def hook(lost: sys.UnraisableHookArgs) -> None:

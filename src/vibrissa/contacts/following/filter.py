@@ -51,10 +51,10 @@ from vibrissa.status import Status
 _UNKNOWNS = 3
 _LEVEL, _ORIGIN = np.eye(3), np.zeros(3)  # pose of a base at rest in the laboratory frame
 _LEAST = 1e-6  # probability relative to the best hypothesis below which one is dropped
-_MOST = 24  # largest number of hypotheses of one speed
-# Squared Mahalanobis distance, by the sum of both covariances, below which two hypotheses are
-# merged.
-_ONE = 0.3
+# Largest number of hypotheses of one speed, and squared Mahalanobis distance, by the sum of both
+# covariances, below which two are merged: if one sample determines a contact, and if it leaves a
+# curve, which Gaussians describe only if they are short.
+_MOST, _ONE = (24, 200), (0.3, 0.1)
 _NEW = 16.0  # the same distance from every hypothesis above which a candidate is a new one
 # Largest deflection (over L) before contact is detected: if the onset is unknown, and at least.
 _ANYWHERE = 0.3
@@ -63,9 +63,12 @@ _LEAST_REACH = 0.01
 # which the filter starts anew.
 _GAP, _FORGOTTEN = 0.1, 0.5
 # Speeds of contact points, over L per second, their prior probabilities, and the rate at which a
-# contact takes a speed anew, 1/s. A contact that moves little has the first; one that slides along
-# an object the others; one just before it slips off, or whose base's motion is unknown, the last.
-_SPEEDS, _SHARES = np.array([0.05, 0.25, 1.25, 6.25]), np.array([0.3, 0.4, 0.2, 0.1])
+# contact takes a speed anew, 1/s. A contact that is held has the first; one that moves along an
+# object the others; one just before it slips off, or whose base's motion is unknown, the last. With
+# two signals all speeds above the true one are evidence for contacts too near the tip, where motion
+# changes the signals least.
+_SPEEDS = np.array([0.001, 0.05, 0.25, 1.25, 6.25])
+_SHARES = np.array([0.3, 0.15, 0.3, 0.15, 0.1])
 _RATE = 2.0
 # Squared Mahalanobis distance, by the sum of both covariances, below which a hypothesis that takes
 # another speed joins one that has it.
@@ -90,7 +93,9 @@ class Followed(NamedTuple):
     velocity: Array  # (3,), velocity of the contact point in the laboratory, m/s
     # Probability of that group of hypotheses; 0 if there is none.
     probability: float
-    # ``UNIQUE`` if that is above 0.99, else ``AMBIGUOUS``. ``MISSING``, ``NOT_FRICTIONLESS`` and
+    # ``UNIQUE`` if that is above 0.99, else ``AMBIGUOUS``; ``UNDERDETERMINED`` for fewer than three
+    # signals as long as no pose of the base has been stated: there is nothing with which the curves
+    # of contacts of successive samples could intersect. ``MISSING``, ``NOT_FRICTIONLESS`` and
     # other reasons are those of this sample if neither a hypothesis nor any contact explains it:
     # the point is then predicted from earlier samples.
     status: Status
@@ -129,7 +134,7 @@ class ContactFilter:
         Estimator of single samples, with noise.
     speed : float, optional
         Standard deviation of a component of the contact point's velocity in the laboratory, m/s. By
-        default it is unknown, and found sample by sample between 0.05 and 6 lengths of the whisker
+        default it is unknown, and found sample by sample between 0.001 and 6 lengths of the whisker
         per second.
     persistence : float
         Correlation time τ of the velocity, s.
@@ -207,6 +212,7 @@ class ContactFilter:
         """Discard all hypotheses, as when contact has been lost."""
         self._mixture = room(0, self._errors)
         self._time: float | None = None
+        self._posed = False  # whether any pose of the base has been stated
         self._free: tuple[float, Array, Array] | None = (
             None  # time and pose of the last sample without contact
         )
@@ -221,6 +227,7 @@ class ContactFilter:
         gravity: ArrayLike | None = None,
     ) -> Followed:
         """Update the filter by one sample."""
+        self._posed = self._posed or rotation is not None or position is not None
         turn = np.ascontiguousarray(_LEVEL if rotation is None else rotation, dtype=np.float64)
         base = np.asarray(_ORIGIN if position is None else position, dtype=np.float64)
         if turn.shape != (3, 3) or base.shape != (3,):
@@ -389,7 +396,9 @@ class ContactFilter:
         by *= kept
 
     def _tidied(self, mixture: Mixture, number: int) -> Mixture:
-        kept = tidy(mixture, number, _LEAST, _MOST * len(self._drift.speeds), _ONE)
+        vague = self.estimator.readout.rank < _UNKNOWNS
+        most = _MOST[vague] * len(self._drift.speeds)
+        kept = tidy(mixture, number, _LEAST, most, _ONE[vague])
         return Mixture._make(part[:kept] for part in mixture)
 
     def _known(self, status: Status, located: Contact | None, turn: Array, base: Array) -> Followed:
@@ -398,7 +407,11 @@ class ContactFilter:
             whole = Mixture._make(part.copy() for part in whole)
             whole.law[:] = 0
             whole = self._tidied(whole, len(whole.weight))
-        return combined(whole, status, located, turn, base, self._length)
+        known = combined(whole, status, located, turn, base, self._length)
+        vague = self.estimator.readout.rank < _UNKNOWNS and not self._posed
+        if vague and known.status in (Status.UNIQUE, Status.AMBIGUOUS):
+            return known._replace(status=Status.UNDERDETERMINED)
+        return known
 
 
 def nothing_known(status: Status, located: Contact | None) -> Followed:

@@ -62,7 +62,9 @@ _WORSE = 30.0  # excess of χ² over the best component above which one is dropp
 # Standard deviation of arc length, in windows, below which a candidate may remain whole; its parts
 # are the Gaussians within this squared Mahalanobis distance, by the sum of both covariances.
 _SHARP, _PART = 0.5, 9.0
-_MOST = 24  # largest number of samples of a curve or surface from which hypotheses start
+_MOST = 24  # largest number of samples of a surface from which hypotheses start
+_BETWEEN = 16  # parts into which a curve is divided between two sections of the whisker
+_HELD = 1e4  # weight of the arc length (over L) of a point of a curve that is searched for
 _VAGUE = 0.2  # standard deviation, over L, of what a measurement does not determine
 # Smallest standard deviation of a starting hypothesis, over L, so that matrices stay regular.
 _FINEST = 1e-7
@@ -133,7 +135,7 @@ class Beginning:
         nearest = np.abs(exact[:, :1] - self._stations).argmin(axis=1)
         x = np.concatenate([np.insert(nodes, 1, 0.0, axis=1), exact])
         values, window = np.concatenate([values, there]), np.concatenate([window, nearest])
-        fits = self._fitted(measurement, x, values, window)
+        fits = self._fitted(measurement, x, values, self._stations[window], 1.0 / self._width)
         worst = fits.misfits.min(initial=np.inf) + _WORSE
         good = np.isfinite(fits.misfits) & (fits.misfits <= worst)
         rows = _distinct(fits.contacts, window, np.flatnonzero(good))
@@ -177,9 +179,12 @@ class Beginning:
 
     def samples(self, measurement: Measurement, located: Contact, reach: float) -> Gaussians:
         """Gaussians about samples of a curve or surface of contacts, without gaps."""
-        number = located.n_candidates
-        some = np.linspace(0, number - 1, min(number, _MOST)).astype(int)
-        x, values = (part[some] for part in self.exact(located))
+        x, values = self.exact(located)
+        if self._readout.rank == 2:
+            x, values = self._denser(measurement, x, values)
+        else:
+            some = np.linspace(0, len(x) - 1, min(len(x), _MOST)).astype(int)
+            x, values = x[some], values[some]
         _, slope = solve_forces(self._chart.discretization, x, tangents=True)
         w = self._weights(self._quiet, measurement, values)
         across, by_errors = self._across(w, values, slope)
@@ -189,6 +194,28 @@ class Beginning:
         likely += self._log_determinants(w)
         weights = likely + 0.5 * np.linalg.slogdet(covariance)[1] + 1.5 * _LOG_TURN
         return Gaussians(x, values, points, covariance, by_errors, weights, likely)
+
+    def _denser(self, measurement: Measurement, x: Array, values: Array) -> tuple[Array, Array]:
+        """Samples of a curve, and points of it between those that are nearest to each other.
+
+        A curve is far more precise across than along it. A Gaussian as long as the distance of the
+        sections departs from it by many standard deviations, and where it intersects the curve of
+        the next sample states nothing of the contact.
+        """
+        section = np.unique(np.round(x[:, 0], 6), return_inverse=True)[1]
+        far = np.linalg.norm(values[:, None, 3:] - values[None, :, 3:], axis=2)
+        far[section[:, None] + 1 != section] = np.inf
+        after = far.argmin(axis=1)
+        mutual = (far.argmin(axis=0)[after] == np.arange(len(x))) & np.isfinite(far.min(axis=1))
+        share = np.arange(1, _BETWEEN)[:, None] / _BETWEEN
+        ends = zip(x[mutual], x[after[mutual]], strict=True)
+        new = np.array([(1.0 - share) * a + share * b for a, b in ends]).reshape(-1, 4)
+        there, _ = solve_forces(self._chart.discretization, new)
+        fits = self._fitted(measurement, new, there, new[:, 0], _HELD)
+        good = fits.misfits < 1.0
+        return np.append(x, fits.contacts[good], axis=0), np.append(
+            values, fits.values[good], axis=0
+        )
 
     def _across(self, w: Array, values: Array, slope: Array) -> tuple[Array, Array]:
         """Covariances across a curve or surface, and the effects of shared errors."""
@@ -247,17 +274,22 @@ class Beginning:
                 one[:] = 0.0
         return out
 
-    def _fitted(self, measurement: Measurement, x: Array, values: Array, windows: IntArray) -> Fits:
-        """Contacts in Ω of minimum χ² of a measurement and windows; infinite if there is none."""
+    def _fitted(
+        self, measurement: Measurement, x: Array, values: Array, stations: AnyArray, held: float
+    ) -> Fits:
+        """Contacts in Ω of minimum χ² of a measurement and stations; infinite if there is none.
+
+        Arc lengths are those of the stations (n,), with the weight ``held``.
+        """
         chart, how, k = self._chart, self._readout.how, len(self._names)
         n = len(x)
         fits = Fits(
             np.array(x), np.array(values), np.zeros((n, 6, 4)), np.zeros(n), np.zeros(n, np.bool_)
         )
         targets = np.tile(np.append(measurement.target, 0.0), (n, 1))
-        targets[:, k] = self._stations[windows]
+        targets[:, k] = stations
         weights = np.zeros((n, k + 1, k + 1))
-        weights[:, k, k] = 1.0 / self._width
+        weights[:, k, k] = held
         rod, measured = charted_rod(chart), measurement.measured
         codes, before = np.append(how.codes, _STATION), fits.contacts.copy()
         for _ in range(self._readout.passes):

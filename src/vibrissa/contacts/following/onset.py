@@ -180,10 +180,10 @@ class Beginning:
     def samples(self, measurement: Measurement, located: Contact, reach: float) -> Gaussians:
         """Gaussians about samples of a curve or surface of contacts, without gaps."""
         x, values = self.exact(located)
-        if self._readout.rank == 2:
+        if self._readout.rank == 2 and len(x) > 1:
             x, values = self._denser(measurement, x, values)
-        else:
-            some = np.linspace(0, len(x) - 1, min(len(x), _MOST)).astype(int)
+        elif len(x) > _MOST:
+            some = np.linspace(0, len(x) - 1, _MOST).astype(int)
             x, values = x[some], values[some]
         _, slope = solve_forces(self._chart.discretization, x, tangents=True)
         w = self._weights(self._quiet, measurement, values)

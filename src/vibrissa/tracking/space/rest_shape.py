@@ -54,7 +54,7 @@ _RINGS = 2e-5
 # alike where it turns back, too.
 _DEEP = 10.0
 _LONGER = 1.1  # length over which a known whisker may be seen, in units of its own
-_STILL = 0.01  # usual deviation of free frames at most, as a share of a known whisker's length
+_STILL = 0.008  # usual deviation of free frames at most, as a share of a known whisker's length
 # Spread of lengths, 16 to 84 %, above which ends in less than this share of frames are not tips.
 _FADES, _OFTEN = 0.02, 0.4
 _ENDS = 3  # number of frames at rest that show the tip, from which the length is computed

@@ -160,7 +160,8 @@ def rough_optics(
     stated = stated_lenses(cameras, distance)
     curves = np.array([curve.points for curve in merged(stated, zip(*some, strict=True))])
     try:
-        shape = rest_shape(curves)
+        # All of a whisker that is bent by wrong optics is needed to show these.
+        shape = rest_shape(curves, fur=0.0)
     except ValueError:
         return None
     return estimated_optics(cameras, TraceSeries.of(some), curves, shape, distance)

@@ -123,7 +123,12 @@ class RestShape:
 
 
 def rest_shape(
-    curves: Array, least: float = 0.1, tips: Mask | None = None, astray: float = 0.0
+    curves: Array,
+    least: float = 0.1,
+    tips: Mask | None = None,
+    astray: float = 0.0,
+    *,
+    fur: float = _FURRED,
 ) -> RestShape:
     """Find the rest shape among the shapes of a trial.
 
@@ -138,6 +143,8 @@ def rest_shape(
     astray : float
         Errors of the curves that vary with the pose only, m: how much more than by noise a
         whisker surely is bent.
+    fur : float
+        Share of the curves at the base in which fur may draw them aside, and which is not compared.
 
     Returns
     -------
@@ -150,7 +157,7 @@ def rest_shape(
         If the whisker is seen in less than three frames.
     """
     seen = _seen(curves)
-    furred = _furred(curves)
+    furred = _furred(curves, fur)
     _, shapes, known, compared = _compared(curves[seen])
     whole = _whole(known, compared)
     part = shapes[whole, furred:compared]
@@ -254,9 +261,9 @@ def _compared(curves: Array, spacing: float | None = None) -> tuple[float, Array
     return spacing, shapes, known, int(_COMMON * (curves.shape[1] - 1)) + 1
 
 
-def _furred(curves: Array) -> int:
+def _furred(curves: Array, fur: float = _FURRED) -> int:
     """Number of points at the base that are not compared."""
-    count: int = round(_FURRED * (curves.shape[1] - 1))
+    count: int = round(fur * (curves.shape[1] - 1))
     return count
 
 

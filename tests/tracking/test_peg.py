@@ -7,12 +7,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, maximum_filter
+from scipy.stats import norm
 
 from vibrissa import Whisker
 from vibrissa.cameras import Camera, orthogonal_views
 from vibrissa.objects import Peg
 from vibrissa.recording import Recording
 from vibrissa.tracking import TrackOptions, track
+from vibrissa.tracking.refine.edge import OFFSETS, place_of_outline
 from vibrissa.tracking.refine.fit import Touches
 from vibrissa.tracking.refine.peg import PEG_UNKNOWNS, UNITS, UncertainPeg
 from vibrissa.tracking.refine.problem import Smoother
@@ -129,6 +131,55 @@ def test_a_reflection_on_a_peg_is_no_outline():
     found = peg_in_images(cameras, sample, touches_of(peg))
     assert found is not None
     assert abs(found.expected.radius - peg.radius) < 20e-6
+
+
+def lit(camera, peg, light):
+    """Image of a peg on a dark ground, bright where its surface faces the light."""
+    rows, columns = np.mgrid[:SIZE, :SIZE].reshape(2, -1)
+    lens = -camera.rotation.T @ camera.translation
+    pixels = np.stack([columns, rows, np.ones(len(rows))], axis=1)
+    ways = pixels @ np.linalg.inv(camera.matrix).T @ camera.rotation
+    flat = ways - (ways @ peg.axis)[:, None] * peg.axis
+    away = lens - peg.origin
+    away -= (away @ peg.axis) * peg.axis
+    square, pull = (flat**2).sum(axis=1), flat @ away
+    hit = pull**2 - square * (away @ away - peg.radius**2)
+    far = (-pull - np.sqrt(np.maximum(hit, 0.0))) / square
+    normal = (away + far[:, None] * flat) / peg.radius
+    shade = 40.0 + 60.0 * np.clip(normal @ (light / np.linalg.norm(light)), 0.0, None)
+    image = np.where(hit > 0.0, shade, 28.0).reshape(SIZE, SIZE)
+    noise = np.random.default_rng(0).normal(0.0, 1.5, image.shape)
+    return np.clip(gaussian_filter(image, 0.8) + noise, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("light", [[0.3, -0.5, 0.8], [-0.6, 0.1, 0.4]])
+def test_the_steepest_point_of_a_lit_peg_is_not_its_outline(light):
+    """It is up to a pixel inside of it, where the surface turns toward the light."""
+    peg = Peg([1e-3, 2e-3, 0.5e-3], LEANING[0], 1.1e-3)
+    cameras = lenses()
+    sample = [[lit(camera, peg, np.array(light))] * 3 for camera in cameras]
+    found = peg_in_images(cameras, sample, touches_of(peg))
+    assert found is not None
+    error = abs(found.expected.radius - peg.radius)
+    assert error < 3.0 * found.radius_sigma
+    assert error < 25e-6
+
+
+def test_an_outline_that_shading_hides_is_uncertain():
+    off = OFFSETS - 0.4
+    sharp = 100.0 * norm.cdf(-off / 0.8)
+    soft = 100.0 * np.clip(-off, 0.0, None) / 4.0
+    noise = np.random.default_rng(0).normal(0.0, 0.5, (40, len(off)))
+    place, sigma = place_of_outline(sharp + noise, 12.0)
+    assert abs(place - 0.4) < min(3.0 * sigma, 0.1)
+    place, unsure = place_of_outline(soft + noise, 12.0)
+    assert unsure > 2.0 * sigma
+    assert abs(place - 0.4) < 3.0 * unsure
+
+
+def test_too_few_points_do_not_show_an_outline():
+    assert place_of_outline(np.zeros((3, len(OFFSETS))), 12.0) == (0.0, np.inf)
+    assert place_of_outline(np.zeros((30, len(OFFSETS))), 12.0) == (0.0, np.inf)
 
 
 @pytest.mark.parametrize("radius", [0.06e-3, 0.15e-3])

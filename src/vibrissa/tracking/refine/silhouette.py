@@ -32,6 +32,7 @@ from vibrissa.deferred import ndimage
 from vibrissa.io import Frame
 from vibrissa.numerics import Array
 from vibrissa.objects import Peg
+from vibrissa.tracking.refine.edge import OFFSETS, place_of_outline
 from vibrissa.tracking.refine.fit import RodFit, Touches
 from vibrissa.tracking.refine.peg import PEG_UNKNOWNS, UncertainPeg
 from vibrissa.whisker import Whisker
@@ -64,6 +65,7 @@ _FAR_END = 0.5  # weight of the end that does not face the lens, which may be hi
 _ARC = 21  # number of points of the contour of an end
 _POINTS = 65  # number of points of a line of the outline
 _WINDOWS = (4.0, 3.0, 2.0, 2.0, 1.5, 1.5)  # largest distances of edges, pixels, step by step
+_SHADED = (2.0, 2.0, 2.0)  # the same, where the shading of the peg is considered
 _OFF = 0.7  # distance of an edge from the outline that makes it doubtful, pixels
 _EDGE = 0.1  # standard deviation of where an edge is along all of an outline, pixels
 _TOGETHER = 256  # number of cylinders that are compared at once, the likeliest first
@@ -139,7 +141,8 @@ class _View:
     """Edges in the part of an image around the contacts."""
 
     camera: Camera
-    slopes: Array  # (2, row, column): relative change of brightness along columns and rows
+    bright: Array  # (row, column): brightness, as a share of the light
+    slopes: Array  # (2, row, column): change of that, smoothed, along columns and rows
     near: Array  # (direction, row, column): 1 where it is brighter toward it nearby, to 0
     corner: Array  # column and row of the first pixel
 
@@ -156,13 +159,13 @@ class _View:
         # The median shows no whisker that moves.
         cut = [frame[low[1] : high[1], low[0] : high[0]] for frame in frames]
         part = _median(cut)
-        light = max(float(np.quantile(part, 0.9)), 1.0)
-        down, right = np.gradient(ndimage.gaussian_filter(part / light, _SMOOTH))
+        part /= max(float(np.quantile(part, 0.9)), 1.0)
+        down, right = np.gradient(ndimage.gaussian_filter(part, _SMOOTH))
         near = []
         for angle in np.arange(_DIRECTIONS) * 2.0 * np.pi / _DIRECTIONS:
             toward = np.cos(angle) * right + np.sin(angle) * down
             near.append(np.clip((_largest_near(toward) - _LEAST) / (_CLEAR - _LEAST), 0.0, 1.0))
-        return cls(camera, np.stack([right, down]), np.array(near), low)
+        return cls(camera, part, np.stack([right, down]), np.array(near), low)
 
     @property
     def size(self) -> Array:
@@ -427,21 +430,23 @@ def _measured(
 ) -> _Measured | None:
     """Fit a cylinder to the edges at its outline, and to its ends in a view along it."""
     peg, ends = start, np.zeros(0) if ends is None else ends
-    for window in _WINDOWS:
+    for step, window in enumerate(_WINDOWS + _SHADED):
         parts = [
             part
             for view in views
             for part in _edges(view, peg, ends, window, with_ends=view is along)
         ]
+        if step >= len(_WINDOWS):
+            parts = [part.shaded() for part in parts]
         count = PEG_UNKNOWNS + len(ends)
         information, pull = np.eye(count) / prior**2, np.zeros(count)
         for part in parts:
             information += part.by.T @ (part.weight[:, None] * part.by)
             pull += part.by.T @ (part.weight * part.miss)
         covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
-        step = covariance @ pull
-        peg = UncertainPeg(peg, np.eye(PEG_UNKNOWNS)).at(step[:PEG_UNKNOWNS])
-        ends = ends + _HEIGHT * step[PEG_UNKNOWNS:]
+        change = covariance @ pull
+        peg = UncertainPeg(peg, np.eye(PEG_UNKNOWNS)).at(change[:PEG_UNKNOWNS])
+        ends = ends + _HEIGHT * change[PEG_UNKNOWNS:]
     if not any(len(part.miss) for part in parts):
         return None
     return _Measured(peg, covariance[:PEG_UNKNOWNS, :PEG_UNKNOWNS], parts)
@@ -453,7 +458,7 @@ def _accepted(found: _Measured | None, views: Sequence[_View]) -> UncertainPeg |
         return None
     if found.peg.radius * min(view.scale(found.peg.origin) for view in views) < _THINNEST:
         return None
-    miss = np.concatenate([part.miss for part in found.parts])
+    miss = np.concatenate([part.miss * (_EDGE / part.sigma) for part in found.parts])
     if min(part.share for part in found.parts) < _SEEN or np.mean(miss**2) > _RIGHT**2:
         return None
     return UncertainPeg(found.peg, found.covariance)
@@ -464,8 +469,26 @@ class _Part(NamedTuple):
 
     miss: Array
     by: Array
-    weight: Array
+    certain: float  # number of numbers that it determines
     share: float  # of it that is an edge
+    bright: Array  # (n, offset): brightness across it
+    radius: float  # of the peg, pixels
+    place: float = 0.0  # where all of it is, by the brightness across it, pixels
+    sigma: float = _EDGE  # standard deviation of that, pixels
+
+    @property
+    def weight(self) -> Array:
+        """Weights (n,) of the distances, which are all together as certain as the line."""
+        alike = self.certain / (self.sigma**2 * max(len(self.miss), 1))
+        return np.asarray(alike / (1.0 + ((self.miss - self.place) / _OFF) ** 2) ** 2)
+
+    def shaded(self) -> _Part:
+        """The part where the brightness across it shows that it is, instead of its steepest."""
+        place, sigma = place_of_outline(self.bright, self.radius)
+        if not np.isfinite(sigma):
+            return self
+        moved = self.miss + place - np.median(self.miss)
+        return self._replace(miss=moved, place=place, sigma=float(np.hypot(sigma, _EDGE)))
 
 
 def _edges(view: _View, peg: Peg, ends: Array, window: float, with_ends: bool) -> list[_Part]:
@@ -494,9 +517,11 @@ def _edges(view: _View, peg: Peg, ends: Array, window: float, with_ends: bool) -
         # A long line determines two numbers, its place and its direction; a short one hardly one.
         extent = float(np.linalg.norm(np.ptp(at[found], axis=0))) if found.any() else 0.0
         certain = min(2.0, 0.2 + extent / _LONG)
-        weight = certain / (_EDGE**2 * max(found.sum(), 1)) / (1.0 + (miss[found] / _OFF) ** 2) ** 2
         share = found.sum() / inside.sum() if inside.sum() > _INSIDE * len(at) else 1.0
-        parts.append(_Part(miss[found], by, weight, float(share)))
+        across = at[found, None] + OFFSETS[:, None] * normal[found, None]
+        bright = ndimage.map_coordinates(view.bright, [across[..., 1], across[..., 0]], order=3)
+        pixels = peg.radius * view.scale(peg.origin)
+        parts.append(_Part(miss[found], by, certain, float(share), bright, pixels))
     return parts
 
 

@@ -57,6 +57,19 @@ def test_the_whisker_is_found_among_fur_glint_and_wires(films, seed, setup):
         assert np.median(away.min(axis=1)) < 1.5
 
 
+def test_a_lit_whisker_in_a_dark_field_begins_at_the_lit_face(films):
+    """All grey values are below 100, as in films with little light that comes from in front."""
+    film = films(202)
+    lit = [
+        [(26.0 + 0.5 * np.clip(170.0 - frame, 0.0, None)).astype(np.uint8) for frame in view]
+        for view in film.frames
+    ]
+    start = find_start(film.cameras, lit)
+    assert start.bright
+    assert start.confidence > 0.8
+    assert max(misses(film, start)) < 5.0
+
+
 @pytest.mark.slow
 def test_followed_from_there_no_frame_is_lost():
     film = Film(Setup(seed=200, **{**SMALL, "frames": 24, "rate": 500.0}))

@@ -180,6 +180,9 @@ _CLEARLY = 0.5
 _SHOWN, _ALIKE = 4, 0.5
 _FAINTEST = 0.05  # confidence from which another candidate is shown
 _POLARITY = 3  # number of frames in which bright and dark whiskers are compared
+# Distance of the pixels from which the brightest bodies are known, the share that is less bright,
+# how much brighter than that the brightest are, and brightness at least, relative to the median.
+_SPARSE, _BRIGHTEST, _BRIGHTER, _OPEN = 8, 0.99, 1.1, 3.0
 _SURE, _GUESS = 0.5, 0.2  # confidence below which there is doubt, and below which nothing is found
 
 
@@ -252,9 +255,20 @@ class _Combination(NamedTuple):
     curves: tuple[Curve, ...]
 
 
-def negative(frame: Frame) -> Frame:
-    """Invert the brightness."""
-    return np.asarray(np.iinfo(frame.dtype).max - frame, dtype=frame.dtype)
+def negative(frame: Frame, white: float = np.inf) -> Frame:
+    """Invert the brightness; what is as bright as ``white``, or brighter, becomes black."""
+    most = frame.dtype.type(min(np.iinfo(frame.dtype).max, white))
+    return np.asarray(most - np.minimum(frame, most), dtype=frame.dtype)
+
+
+def _white(frames: Sequence[Frame]) -> float:
+    """Brightness of the brightest bodies where the ground is dark.
+
+    In the negative they are as dark then, compared with the ground, as a face on bright ground is.
+    """
+    some = np.stack([frame[::_SPARSE, ::_SPARSE] for frame in frames])
+    bodies = _BRIGHTER * float(np.quantile(some, _BRIGHTEST))
+    return max(bodies, _OPEN * float(np.median(some)))
 
 
 def is_bright(
@@ -329,7 +343,11 @@ def find_start(
         )
     search, bright = _Search.of(cameras, frames, options, masks), bool(options.bright)
     if options.bright is not False:
-        inverted = [[negative(f) for f in view] for view in frames]
+        whites = [_white(view) for view in frames]
+        inverted = [
+            [negative(frame, white) for frame in view]
+            for view, white in zip(frames, whites, strict=True)
+        ]
         other = _Search.of(cameras, inverted, replace(options, bright=True), masks)
         few = search.moments(_POLARITY)
         bright = bright or other.worth(few) > _BETTER * search.worth(few)

@@ -1,5 +1,7 @@
 """What is known besides the videos: the head, the whisker, the contact."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -11,7 +13,7 @@ from vibrissa.recording import Recording
 from vibrissa.rod import discretize
 from vibrissa.simulation import Motion, simulate
 from vibrissa.tracking import HeadPose, TrackOptions, trace_video, track
-from vibrissa.tracking.recording import outside_video
+from vibrissa.tracking.recording import force_scale, outside_video, remarks_on_fur
 from vibrissa.tracking.refine.rods import Bent, State
 
 FRAMES = 30
@@ -255,3 +257,39 @@ def test_contact_points_outside_of_the_videos_are_stated():
     assert outside_video(table.isel(frame=slice(6)), pairs, 1000.0) == []
     timed = xr.Dataset(coords={"time": np.arange(-2, 8) / 1000.0})
     assert outside_video(timed, pairs, 1000.0)[0].startswith("2 of the 10")
+
+
+@pytest.mark.parametrize("hidden", [0.2e-3, 1e-3])
+def test_forces_scale_with_the_radius_before_the_base(hidden):
+    """The rod that begins in the fur is the same cone, and is stiffer at its base."""
+    seen = Whisker.straight(25e-3, base_radius=80e-6, tip_radius=8e-6)
+    slope = (80e-6 - 8e-6) / 25e-3
+    stiffer = ((80e-6 + slope * hidden) / 80e-6) ** 4
+    assert force_scale(seen, hidden) == pytest.approx(stiffer, rel=1e-12)
+
+
+def test_what_fur_may_do_to_forces_is_said_where_the_radius_is_stated():
+    whisker = Whisker.straight(25e-3, base_radius=80e-6, tip_radius=8e-6)
+    one = SimpleNamespace(whisker=whisker)
+    percent = 100.0 * (force_scale(whisker, 1e-3) - 1.0)
+    (said,) = remarks_on_fur(one, 0.0, stated=True, name="C2")
+    assert f"{percent:.0f} % too large" in said
+    assert "--fur" in said
+    assert not remarks_on_fur(one, 0.0, stated=False, name="C2")
+    (said,) = remarks_on_fur(one, 0.8e-3, stated=True, name="C2")
+    assert "taken to be hidden by fur" in said
+
+
+@pytest.mark.parametrize(
+    ("options", "stated"),
+    [
+        (TrackOptions(), False),
+        (TrackOptions(properties={"base_radius": 80e-6}), True),
+        (TrackOptions(properties={"rat": "C2"}), True),
+        (TrackOptions(properties={"tip_radius": 5e-6}), False),
+        (TrackOptions(whisker=Whisker.straight(25e-3, base_radius=80e-6)), False),
+    ],
+    ids=["nothing", "radius", "rat", "tip", "whisker"],
+)
+def test_a_radius_of_the_base_is_stated_by_itself_or_by_a_rat(options, stated):
+    assert options.states_radius == stated

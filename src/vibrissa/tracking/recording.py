@@ -495,18 +495,27 @@ def remarks_on_bases(
     return found
 
 
-def force_scale_sigma(whisker: Whisker, fur: float) -> float:
-    """Common relative error of all forces due to fur of unknown length over the base."""
+def force_scale(whisker: Whisker, hidden: float) -> float:
+    """Factor of all forces if the whisker's radius is that at this distance before its base, m."""
     at_edge, at_tip = whisker.radius(np.array([0.0, whisker.length]))
     # Forces scale with the fourth power of the radius, which decreases linearly along the whisker.
-    return float(4.0 * (1.0 - at_tip / at_edge) / whisker.length * _FUR_KNOWN * fur)
+    return float((1.0 + (1.0 - at_tip / at_edge) * hidden / whisker.length) ** 4)
 
 
-def remarks_on_fur(one: Tracked, fur: float, name: str) -> list[str]:
-    """Report the common error of all forces due to fur of unknown length over the base."""
+def remarks_on_fur(one: Tracked, fur: float, stated: bool, name: str) -> list[str]:
+    """Report the common error of all forces due to fur of unknown length over the base.
+
+    Fur matters where the radius is ``stated``, as that of the hidden base.
+    """
     if fur == 0.0:
-        return []
-    percent = 100.0 * force_scale_sigma(one.whisker, fur)
+        percent = 100.0 * (force_scale(one.whisker, 1e-3) - 1.0)
+        return [
+            f"{name}: its radius is taken to be stated where its base is first seen. If it is that "
+            f"where the whisker leaves the skin, all forces and moments are {percent:.0f} % too "
+            "large for each millimetre that fur hides, which is in no covariance: state how much "
+            "that is (--fur)."
+        ] * stated
+    percent = 100.0 * np.log(force_scale(one.whisker, _FUR_KNOWN * fur))
     hidden = f"{1e3 * fur:g} ± {1e3 * _FUR_KNOWN * fur:.2g} mm"
     return [
         f"{name}: {hidden} of its base are taken to be hidden by fur; what is not known of that is "

@@ -272,24 +272,11 @@ def test_what_fur_may_do_to_forces_is_said_where_the_radius_is_stated():
     whisker = Whisker.straight(25e-3, base_radius=80e-6, tip_radius=8e-6)
     one = SimpleNamespace(whisker=whisker)
     percent = 100.0 * (force_scale(whisker, 1e-3) - 1.0)
-    (said,) = remarks_on_fur(one, 0.0, stated=True, name="C2")
-    assert f"{percent:.0f} % too large" in said
-    assert "--fur" in said
-    assert not remarks_on_fur(one, 0.0, stated=False, name="C2")
-    (said,) = remarks_on_fur(one, 0.8e-3, stated=True, name="C2")
+    for stated in ({"base_radius": 80e-6}, {"rat": "C2"}):
+        (said,) = remarks_on_fur(one, TrackOptions(properties=stated).at_base, "C2")
+        assert f"{percent:.0f} % too large" in said
+        assert "--fur" in said
+    for other in ({}, {"tip_radius": 5e-6}):
+        assert not remarks_on_fur(one, TrackOptions(properties=other).at_base, "C2")
+    (said,) = remarks_on_fur(one, TrackOptions(fur=0.8e-3).at_base, "C2")
     assert "taken to be hidden by fur" in said
-
-
-@pytest.mark.parametrize(
-    ("options", "stated"),
-    [
-        (TrackOptions(), False),
-        (TrackOptions(properties={"base_radius": 80e-6}), True),
-        (TrackOptions(properties={"rat": "C2"}), True),
-        (TrackOptions(properties={"tip_radius": 5e-6}), False),
-        (TrackOptions(whisker=Whisker.straight(25e-3, base_radius=80e-6)), False),
-    ],
-    ids=["nothing", "radius", "rat", "tip", "whisker"],
-)
-def test_a_radius_of_the_base_is_stated_by_itself_or_by_a_rat(options, stated):
-    assert options.states_radius == stated

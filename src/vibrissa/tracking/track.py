@@ -94,7 +94,6 @@ _EXPLAINED = 0.1
 # Errors of traces that vary with the pose only, pixels: by light, fur, lenses and what is behind;
 # and in a row, where they are next to crossings.
 _ASTRAY, _CROSSED = 0.1, 0.4
-_RADII = frozenset(["base_radius", "rat"])  # properties that state the radius of the base
 _FAR = 10.0  # distance between the bases of several views above which they differ, pixels
 _SHARE = 0.03  # the same as a share of the whisker's length
 
@@ -146,11 +145,6 @@ class TrackOptions:
     def at_base(self) -> dict[str, Any]:
         """Radius, material and hidden length of the whisker, as arguments of `whisker_at_rest`."""
         return {**self.properties, "hidden": self.fur}
-
-    @property
-    def states_radius(self) -> bool:
-        """Whether the radius of the base is stated, but not by a whisker that begins there."""
-        return self.whisker is None and not self.properties.keys().isdisjoint(_RADII)
 
 
 @without_blas_threads
@@ -266,7 +260,7 @@ def track(
                 one = replace(one, fit=with_optics_unsure(one.fit, optics))
                 remarks += remarks_on_optics(one, optics, name)
             found.append(one)
-            remarks += remarks_on_fur(one, options.fur, options.states_radius, name)
+            remarks += remarks_on_fur(one, options.at_base, name)
             remarks += _remarks_on_one(cameras, one, name, bool(objects))
         except Exception as fault:  # no error of one whisker may discard the others
             if count == 1:
@@ -283,9 +277,7 @@ def track(
     return recording
 
 
-def _remarks_on_one(
-    cameras: Sequence[Camera], one: Tracked, name: str, stated: bool
-) -> list[str]:
+def _remarks_on_one(cameras: Sequence[Camera], one: Tracked, name: str, stated: bool) -> list[str]:
     """Report what is to be known of one whisker; whether it touches stated objects is given."""
     remarks = remarks_on(cameras, one.traces, one.length, one.fit.misfit, name)
     # Known objects locate contacts that are not seen.

@@ -260,8 +260,7 @@ def track(
                 one = replace(one, fit=with_optics_unsure(one.fit, optics))
                 remarks += remarks_on_optics(one, optics, name)
             found.append(one)
-            remarks += remarks_on_fur(one, options.at_base, name)
-            remarks += _remarks_on_one(cameras, one, name, bool(objects))
+            remarks += _remarks_on_one(cameras, one, options.at_base, name, bool(objects))
         except Exception as fault:  # no error of one whisker may discard the others
             if count == 1:
                 raise
@@ -277,9 +276,12 @@ def track(
     return recording
 
 
-def _remarks_on_one(cameras: Sequence[Camera], one: Tracked, name: str, stated: bool) -> list[str]:
+def _remarks_on_one(
+    cameras: Sequence[Camera], one: Tracked, known: Mapping[str, Any], name: str, stated: bool
+) -> list[str]:
     """Report what is to be known of one whisker; whether it touches stated objects is given."""
-    remarks = remarks_on(cameras, one.traces, one.length, one.fit.misfit, name)
+    remarks = remarks_on_fur(one, known, name)
+    remarks += remarks_on(cameras, one.traces, one.length, one.fit.misfit, name)
     # Known objects locate contacts that are not seen.
     if not stated and one.peg is None:
         remarks += remarks_on_unseen_contacts(one, name)

@@ -34,8 +34,9 @@ from vibrissa.identifiability.twins import (
     twins_near,
     units,
 )
-from vibrissa.numerics import AnyArray, Array, cross, kernel, solve
+from vibrissa.numerics import AnyArray, Array, IntArray, cross, inlined, kernel, norm3, solve
 from vibrissa.rod import chart_of, discretize, solve_forces, with_normal_force
+from vibrissa.signals import FD, FX, MD, MX, SIGNALS
 
 # Factor by which an iteration reduces the complementarity, share of the distance to the faces that
 # a step may take, and complementarity at which the iteration ends.
@@ -112,6 +113,59 @@ def steepest(levels: Array, slopes: Array, within: Array, cost: float, steps: Ar
                 dual[k] += other * target[k]
         for a in range(3):
             steps[row, a] = x[a] * within[row]
+
+
+@inlined
+def _vector(signal: int, value: Array, tangents: Array, vector: Array, slopes: Array) -> None:
+    """Force or moment at the base, whichever a signal is a component of, and its derivatives."""
+    for i in range(3):
+        vector[i] = value[i]
+        for c in range(3):
+            slopes[i, c] = tangents[i, c]
+    for i in range(3 if signal >= MX else 0):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        vector[i] = value[3 + j] * value[k] - value[3 + k] * value[j]
+        for c in range(3):
+            slopes[i, c] = value[3 + j] * tangents[k, c] - value[3 + k] * tangents[j, c]
+            slopes[i, c] += tangents[3 + j, c] * value[k] - tangents[3 + k, c] * value[j]
+
+
+@kernel
+def equate(values: Array, tangents: Array, which: IntArray, away: Array, slope: Array) -> None:
+    """Evaluate the equations of pairs; see the module.
+
+    ``values`` (n, 2, 6) are (F, p) of both contacts, ``tangents`` (n, 2, 6, 3) their derivatives by
+    each contact's unknowns. Fills ``away`` (n, 3) and its derivatives ``slope`` (n, 3, 2, 3).
+    """
+    vectors, slopes, normals = np.empty((2, 3)), np.empty((2, 3, 3)), np.empty((2, 3))
+    a, b = vectors[0], vectors[1]
+    for row in range(values.shape[0]):
+        for n in range(3):
+            signal = which[n]
+            for p in range(2):
+                _vector(signal, values[row, p], tangents[row, p], vectors[p], slopes[p])
+            size = np.sqrt(norm3(a) * norm3(b))
+            for i in range(3):
+                a[i] /= size
+                b[i] /= size
+            normals[:] = 0.0
+            if signal in (FX, MX):
+                away[row, n] = a[0] - b[0]
+                normals[0, 0], normals[1, 0] = 1.0, -1.0
+            elif signal in (FD, MD):
+                away[row, n] = a[1] * b[2] - a[2] * b[1]
+                normals[0, 1], normals[0, 2] = b[2], -b[1]
+                normals[1, 1], normals[1, 2] = -a[2], a[1]
+            else:
+                away[row, n] = 0.5 * (a[1] * a[1] + a[2] * a[2] - b[1] * b[1] - b[2] * b[2])
+                for i in range(1, 3):
+                    normals[0, i], normals[1, i] = a[i], -b[i]
+            for p in range(2):
+                for c in range(3):
+                    total = 0.0
+                    for i in range(3):
+                        total += normals[p, i] * slopes[p, i, c]
+                    slope[row, n, p, c] = total / size
 
 
 class _Round(NamedTuple):
@@ -232,32 +286,12 @@ class _Objective:
         d = self.search.contact_map.chart.discretization
         values, tangents = solve_forces(d, with_normal_force(xi.reshape(-1, 3)), tangents=True)
         by_xi = tangents * unit.reshape(-1, 1, 3)
-        vectors = {"F": (values[:, :3], by_xi[:, :3])}
-        if any(name[0] == "M" for name in self.search.names):
-            force, point = values[:, :3], values[:, 3:]
-            turned = cross(by_xi[:, 3:].swapaxes(1, 2), force[:, None])
-            turned += cross(point[:, None], by_xi[:, :3].swapaxes(1, 2))
-            vectors["M"] = cross(point, force), turned.swapaxes(1, 2)
-        away, slope = np.empty((len(xi), 3)), np.empty((len(xi), 3, 2, 3))
-        for k, name in enumerate(self.search.names):
-            vector, by = (v.reshape(len(xi), 2, *v.shape[1:]) for v in vectors[name[0]])
-            size = np.einsum("npi,npi->np", vector, vector).prod(axis=1)[:, None, None] ** 0.25
-            vector = vector / size
-            (a_x, a_y, a_z), (b_x, b_y, b_z) = vector.transpose(1, 2, 0)
-            normals = np.zeros((len(xi), 2, 3))
-            if name[1] == "x":
-                away[:, k] = a_x - b_x
-                normals[:, 0, 0], normals[:, 1, 0] = 1.0, -1.0
-            elif name[1] == "D":
-                away[:, k] = a_y * b_z - a_z * b_y
-                normals[:, 0, 1], normals[:, 0, 2] = b_z, -b_y
-                normals[:, 1, 1], normals[:, 1, 2] = -a_z, a_y
-            else:
-                away[:, k] = 0.5 * (a_y * a_y + a_z * a_z - b_y * b_y - b_z * b_z)
-                normals[:, 0, 1:], normals[:, 1, 1:] = vector[:, 0, 1:], -vector[:, 1, 1:]
-            slope[:, k] = np.einsum("npi,npix->npx", normals / size, by)
-        by_point = by_xi[:, 3:].reshape(-1, 2, 3, 3)
-        return values.reshape(-1, 2, 6), away, slope.reshape(-1, 3, 6), by_point
+        pairs = len(xi)
+        values, by_xi = values.reshape(pairs, 2, 6), by_xi.reshape(pairs, 2, 6, 3)
+        away, slope = np.empty((pairs, 3)), np.empty((pairs, 3, 2, 3))
+        which = np.array([SIGNALS.index(name) for name in self.search.names])
+        equate(values, by_xi, which, away, slope)
+        return values, away, slope.reshape(pairs, 3, 6), by_xi[:, :, 3:]
 
     def levels(
         self, xi: Array, values: Array, distinct: Array, signs: Array

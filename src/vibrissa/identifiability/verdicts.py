@@ -14,8 +14,9 @@ determine the triplet to use.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -48,7 +49,7 @@ from vibrissa.identifiability.twins import (
     units,
 )
 from vibrissa.io import check_writable, replacing, write_netcdf
-from vibrissa.numerics import AnyArray, Array, threads
+from vibrissa.numerics import AnyArray, Array, on_one_core, threads
 from vibrissa.quantities import attributes
 from vibrissa.rod import discretize
 from vibrissa.signals import CONE, REGIONS, SIGNALS, TRIPLETS, selection, signal_scales
@@ -65,6 +66,8 @@ _SUBREGIONS = {
 _MARKS = {UNIQUE: "unique", OFF_SURFACE: "unique*", NOT_UNIQUE: "–"}
 #: Suffixes of files to which verdicts can be written.
 ENDINGS = (".nc", ".csv")
+# Number of triplets per core above which each has one core, instead of sharing all of them.
+_PER_CORE = 4
 # Tolerance at which ambiguous shares decide between triplets that are unique in the same region.
 _DECIDING = 1e-3
 
@@ -414,12 +417,15 @@ def uniqueness(
     if samples < 16:
         raise ValueError(f"at least 16 samples are needed; got {samples}")
     problem = prepare(contact_map, wanted, min_separation, cone, domain, samples, seed)
+    gather: Callable[[tuple[str, ...]], Evidence] = partial(
+        gather_evidence, problem, resolution=resolution
+    )
+    if len(names) >= _PER_CORE * threads():
+        gather = on_one_core(gather)
     results = []
     with ThreadPoolExecutor(threads()) as pool:  # kernels, half of the time, release the GIL
         try:
-            for found in pool.map(
-                lambda triplet: gather_evidence(problem, triplet, resolution), names
-            ):
+            for found in pool.map(gather, names):
                 results.append(found)
                 if progress is not None:
                     progress(len(results), len(names))

@@ -21,6 +21,7 @@ from vibrissa.numerics.arrays import (
     cross_matrix as cross_matrix,
     exponential as exponential,
     numbers as numbers,
+    on_one_core as on_one_core,
     relative as relative,
     rotation_matrices as rotation_matrices,
     share_out as share_out,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import reprlib
+import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -242,6 +243,27 @@ def without_blas_threads(function: Callable[P, R]) -> Callable[P, R]:
     return alone
 
 
+_of_thread = threading.local()
+
+
+def on_one_core(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorator: keep all rows in the thread that calls a function.
+
+    For one of several tasks that are distributed over all cores: threads that hand over parts of
+    rows mostly wait for each other.
+    """
+
+    @wraps(function)
+    def alone(*args: P.args, **kwargs: P.kwargs) -> R:
+        before, _of_thread.alone = getattr(_of_thread, "alone", False), True
+        try:
+            return function(*args, **kwargs)
+        finally:
+            _of_thread.alone = before
+
+    return alone
+
+
 # Number of rows below which starting a thread costs more than it saves.
 _SERIAL = 256
 _PIECES_PER_THREAD = 4
@@ -268,7 +290,7 @@ def threads() -> int:
 
 def share_out(rows: int, work: Callable[..., object], *given: object) -> None:
     """Call ``work(*given, first, last)`` on parts that cover all rows, on all cores."""
-    if rows <= _SERIAL or threads() == 1:
+    if rows <= _SERIAL or threads() == 1 or getattr(_of_thread, "alone", False):
         if rows:
             work(*given, 0, rows)
         return

@@ -264,6 +264,12 @@ def _locate_polar(tree: SearchTree, row: int, b: Array, work: Array, x: Array) -
     x[0] = x[1] = x[2] = 0.5
     if cos == 0.0 and sin == 0.0:
         return True
+    if tree.vector.lever.shape[0] > 0:
+        lever = tree.vector.lever[row]
+        moment = b[_RELATIVE + 2] + tree.vector.frame[row, 2]
+        off = abs(length * (lever[0] * sin - lever[1] * cos) - moment)
+        if off > length * (lever[2] * abs(sin) + lever[3] * abs(cos)) + 1e-12:
+            return False
     matrix, right, slack = work[:3], work[3], work[4]
     for a in range(3):
         n = a + 1

@@ -177,7 +177,9 @@ def _nodes_of(
 
 def with_normal_force(contacts: Array) -> Array:
     """Convert ξ = (s, f_y, f_z) into (s, 0, f_y, f_z): frictionless forces are normal."""
-    return np.insert(contacts, 1, 0.0, axis=-1)
+    out = np.empty((*contacts.shape[:-1], 4))
+    out[..., 0], out[..., 1], out[..., 2:] = contacts[..., 0], 0.0, contacts[..., 1:]
+    return out
 
 
 def determinant(tangents: Array) -> Array:

@@ -394,12 +394,18 @@ def lane_slopes(b: Array, i: int, tangents: Array) -> None:
 
 
 @inlined
-def integrate_weightless(rod: Rod, b: Array, tangents: int) -> None:
-    """Integrate every lane from its contact to the base; see :func:`vibrissa.rod.integrate`."""
-    start = rod.start
+def _farthest(b: Array) -> float:
+    """Arc length of the contact that is farthest from the base."""
     farthest = b[ARC]
     for i in range(1, LANES):
         farthest = max(farthest, b[ARC + i])
+    return farthest
+
+
+@inlined
+def integrate_weightless(rod: Rod, b: Array, tangents: int) -> None:
+    """Integrate every lane from its contact to the base; see :func:`vibrissa.rod.integrate`."""
+    start, farthest = rod.start, _farthest(b)
     for k in range(start.shape[0] - 1, -1, -1):
         if start[k] < farthest:
             if tangents > 0:
@@ -419,9 +425,11 @@ def carry_tangents(rod: Rod, contacts: Array, tangents: Array, first: int, last:
             j = min(row + i, last - 1)
             set_lane(b, i, contacts[j, 0], contacts[j, 1], contacts[j, 2], contacts[j, 3], True)
             put(b, TANGENT, i, (1.0, 0.0, 0.0))
+        farthest = _farthest(b)
         for k in range(rod.start.shape[0] - 1, -1, -1):
-            _value_step(rod, b, k, True)
-            _carry_step(b, TANGENT)
+            if rod.start[k] < farthest:
+                _value_step(rod, b, k, True)
+                _carry_step(b, TANGENT)
         for i in range(min(LANES, last - row)):
             for j in range(3):
                 tangents[row + i, j] = b[TANGENT + j * LANES + i]

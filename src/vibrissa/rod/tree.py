@@ -169,6 +169,9 @@ class PlaneVector(NamedTuple):
     # Index of its length and of its direction among the quantities, -1 if it is not one of them.
     length: int
     direction: int
+    # Components of its lever, if the other quantity is its moment about the axis, and their
+    # derivatives by ξ.
+    lever: tuple[Array, Array] | None = None
 
 
 def search_tree(
@@ -218,6 +221,12 @@ def search_tree(
         if plane.direction >= 0:
             low[polar.rows, plane.direction] = -np.pi
             high[polar.rows, plane.direction] = np.pi
+        if plane.lever is not None:
+            slopes = chart.charted(plane.lever[1]) * size
+            lever = _Cells.of(place[polar.rows], plane.lever[0], slopes, np.zeros(2, dtype=bool))
+            least, most = lever.extent()
+            wide = (0.5 + _MARGIN) * (most - least)
+            polar = polar._replace(lever=np.concatenate([0.5 * (least + most), wide], axis=1))
         care[polar.rows] = 2
     offsets, boxes = _bounding_boxes(low, high, circular)
     row = np.full(len(place), -1)
@@ -312,13 +321,16 @@ class Polar(NamedTuple):
     volumes: Array
     # (4,) Indices of length, direction and the others among the quantities; -1 for none.
     roles: IntArray
+    # (p, 4) Middle and half width of the lever (y, z) of the vector in each cell, if the third
+    # quantity is the moment of the vector, which vanishes with it; else without rows.
+    lever: Array
 
     @classmethod
     def none(cls) -> Polar:
         """Return an instance without polar cells."""
-        edges, frame = np.empty((0, 160)), np.empty((0, 8))
+        edges, frame, lever = np.empty((0, 160)), np.empty((0, 8)), np.empty((0, 4))
         linear, volumes = np.empty((0, 4, 5)), np.empty((0, 8, 2))
-        return cls(np.empty(0, int), edges, frame, linear, volumes, np.full(4, -1))
+        return cls(np.empty(0, int), edges, frame, linear, volumes, np.full(4, -1), lever)
 
     @classmethod
     def of(cls, cells: _Cells, vector: _Cells, length: int, direction: int, half: Array) -> Polar:
@@ -355,6 +367,7 @@ class Polar(NamedTuple):
             linear,
             _spanned_volumes(both.slope, len(others)),
             roles,
+            np.empty((0, 4)),
         )
 
 

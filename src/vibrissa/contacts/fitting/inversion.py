@@ -123,7 +123,10 @@ def _plane(chart: StableSet, triplet: tuple[str, ...]) -> PlaneVector | None:
             slopes = np.cross(d_point, force[..., None], axis=-2)
             slopes = slopes + np.cross(point[..., None], d_force, axis=-2)
         places = [triplet.index(name) if name in triplet else -1 for name in (size, direction)]
-        return PlaneVector(vector[..., 1:], slopes[..., 1:, :], *places)
+        lever = None
+        if triplet == ("FT", "FD", "Mx"):
+            lever = point[..., 1:], d_point[..., 1:, :]
+        return PlaneVector(vector[..., 1:], slopes[..., 1:, :], *places, lever)
     return None
 
 

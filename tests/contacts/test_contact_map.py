@@ -8,7 +8,16 @@ import xarray as xr
 import vibrissa as vb
 from vibrissa.contacts import within_paper_bounds
 from vibrissa.contacts.fitting.inversion import invert
-from vibrissa.rod import CELLS, MOST_CELLS, cells_around, contacts_at, solve_forces
+from vibrissa.rod import (
+    CELLS,
+    MOST_CELLS,
+    cells_around,
+    contacts_at,
+    seed_room,
+    seeds,
+    solve_forces,
+    with_normal_force,
+)
 from vibrissa.signals import SIGNALS, signals_of, spherical
 
 
@@ -258,6 +267,25 @@ def _share_found(contact_map, triplet, charted):
     away[..., 1:] /= np.linalg.norm(contacts[:, None, 1:], axis=-1, keepdims=True)
     away = away.max(axis=-1)
     return (np.nanmin(np.where(np.isnan(away), 1.0, away), axis=1) < 1e-4).mean()
+
+
+def test_cells_in_which_a_force_vanishes_are_told_apart_by_its_lever(gamma_map, rng):
+    """Its moment about the axis vanishes there as well, so that dozens of cells have both."""
+    names, chart = ("FT", "FD", "Mx"), gamma_map.chart
+    tree = gamma_map.tree(names)
+    without = tree._replace(vector=tree.vector._replace(lever=np.empty((0, 4))))
+    charted = rng.uniform([0.0, 0.0, 0.1], [1.0, 2.0 * np.pi, 0.99], (500, 3))
+    values, _ = solve_forces(
+        chart.discretization, with_normal_force(contacts_at(chart.fold, charted))
+    )
+    signals = signals_of(values[:, :3], np.cross(values[:, 3:], values[:, :3]))
+    aims = np.ascontiguousarray(signals[:, [SIGNALS.index(name) for name in names]])
+    found, expected = (invert(chart, each, names, aims) for each in (tree, without))
+    np.testing.assert_array_equal(found.number, expected.number)
+    np.testing.assert_allclose(found.values, expected.values, rtol=1e-9, atol=1e-9)
+    room = seed_room.py_func()
+    started, before = (sum(seeds(each, aim, room) for aim in aims) for each in (tree, without))
+    assert started < 0.7 * before
 
 
 @pytest.mark.parametrize("cells", [8, (8, 16), None, (8.0, 16.0, 8.0), (8, 0, 8)])

@@ -6,10 +6,18 @@ import xarray as xr
 
 import vibrissa as vb
 from vibrissa.identifiability import save_uniqueness, verdict_table
+from vibrissa.identifiability.summits import equate
 from vibrissa.identifiability.twins import contact_set, sample, spread, twins
 from vibrissa.identifiability.verdicts import choice, notation
-from vibrissa.rod import chart_of, contact_tangents, discretize, solve_forces, with_normal_force
-from vibrissa.signals import REGIONS, TRIPLETS
+from vibrissa.rod import (
+    chart_of,
+    contact_tangents,
+    contacts_at,
+    discretize,
+    solve_forces,
+    with_normal_force,
+)
+from vibrissa.signals import REGIONS, SIGNALS, TRIPLETS
 
 PAPER = ("Fx MB MD", "Mx MB MD", "Fx FD MD")
 
@@ -424,6 +432,31 @@ def test_wrong_questions_are_answered_with_what_is_allowed(straight, arguments, 
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("names", [("Fx", "FT", "FD"), ("Mx", "MB", "MD")])
+def test_the_equations_of_equal_contacts_have_these_derivatives(gamma_map, rng, names):
+    chart, step = gamma_map.chart, 1e-6
+    charted = rng.uniform([0.1, 0.0, 0.3], [0.9, 2.0 * np.pi, 0.9], (20, 3))
+    xi = np.repeat(contacts_at(chart.fold, charted)[:, None], 2, axis=1)
+    which = np.array([SIGNALS.index(name) for name in names])
+
+    def equated(xi):
+        rows = with_normal_force(xi.reshape(-1, 3))
+        values, tangents = solve_forces(chart.discretization, rows, tangents=True)
+        away, slope = np.empty((20, 3)), np.empty((20, 3, 2, 3))
+        equate(values.reshape(20, 2, 6), tangents.reshape(20, 2, 6, 3), which, away, slope)
+        return away, slope
+
+    away, slope = equated(xi)
+    np.testing.assert_allclose(away, 0.0, atol=1e-14)
+    for p in range(2):
+        for c in range(3):
+            move = np.zeros((2, 3))
+            move[p, c] = step
+            change = (equated(xi + move)[0] - equated(xi - move)[0]) / (2.0 * step)
+            scale = np.abs(slope[..., c]).max(axis=(1, 2))[:, None]
+            np.testing.assert_allclose(change / scale, slope[:, :, p, c] / scale, atol=1e-6)
+
+
 def test_what_only_coarse_steps_make_equal_is_no_witness():
     # Near the base few steps are left: there the rod errs by more than twins' signals differ.
     whisker = vb.Whisker.parabola(40e-3, 10.0)

@@ -1,10 +1,13 @@
 """Laws that every deflection by a known force obeys."""
 
+from threading import get_ident
+
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
 import vibrissa as vb
+from vibrissa.numerics import on_one_core, share_out
 from vibrissa.rod import discretize, shapes, solve_forces
 
 few = settings(max_examples=8)
@@ -228,6 +231,16 @@ def test_one_thread_and_many_agree_to_the_bit(gamma, monkeypatch):
     for other in results[1:]:
         for ours, theirs in zip(results[0], other, strict=True):
             np.testing.assert_array_equal(ours, theirs)
+
+
+def test_a_task_on_one_core_stays_in_its_thread(monkeypatch):
+    monkeypatch.setenv("VIBRISSA_THREADS", "2")
+    parts = []
+    note = on_one_core(lambda: share_out(1000, lambda *part: parts.append((*part, get_ident()))))
+    note()
+    assert parts == [(0, 1000, get_ident())]
+    share_out(1000, lambda *part: parts.append(part))
+    assert len(parts) > 2
 
 
 def test_a_load_does_not_depend_on_its_company(gamma):

@@ -30,7 +30,7 @@ def run(tmp_path):
     (tmp_path / "apart.py").write_text(KERNELS)
     (tmp_path / "kept").mkdir()
 
-    def call(before="", after="", **environment):
+    def call(before="", after="", between="", **environment):
         script = f"""
             import sys
             sys.path.insert(0, {str(tmp_path)!r})
@@ -38,6 +38,7 @@ def run(tmp_path):
             from vibrissa.numerics import kernel_cache
             {before}
             kernel_cache.compile_together([(twice, (1.0,))], [(thrice, (1.0,))])
+            {between}
             assert (twice(2.0), thrice(2.0)) == (4.0, 6.0)
             for kernel in (twice, thrice):
                 print(kernel.py_func.__name__, sum(kernel.stats.cache_hits.values()))
@@ -64,6 +65,11 @@ def test_a_helper_compiles_what_is_found_on_disk_here(run):
     # Another process finds both, and asks nobody.
     nobody = "kernel_cache.subprocess.Popen = None"
     assert run(nobody) == ["twice 1", "thrice 1"]
+
+
+def test_a_helper_is_waited_for_when_its_kernel_is_called(run):
+    asked = "assert [key[1] for key in kernel_cache._asked] == ['thrice']"
+    assert run(between=asked, after="assert not kernel_cache._asked") == ["twice 0", "thrice 1"]
 
 
 @pytest.mark.parametrize(

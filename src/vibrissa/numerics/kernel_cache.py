@@ -11,20 +11,24 @@ as on a full disk, kernels are compiled in each run.
 
 Compilation is mostly Python code, which uses one core. If several kernels that do not call each
 other are needed and not cached, another interpreter compiles some of them into the cache, from
-which this process loads them (`compile_together`). The helper has no other effects; kernels that it
-does not finish are compiled here when they are called.
+which this process loads them when it needs them (`compile_together`). The helper has no other
+effects; kernels that it does not finish are compiled here.
 """
 
 from __future__ import annotations
 
+import atexit
+import gc
 import hashlib
 import io
+import os
 import pickle
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -151,10 +155,24 @@ class PackageCache(FunctionCache):
         Numba would first import all that it can compile, which takes longer than loading.
         """
         try:
+            self._await_helper(sig, target_context)
             rtsys.initialize(target_context)
             return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         except Exception:
             return None
+
+    def _await_helper(self, sig: object, target_context: Any) -> None:
+        """Wait for a helper that compiles this, within limits."""
+        function = self._py_func
+        asked, helper = _asked.pop((function.__module__, function.__name__, sig), (0.0, None))
+        if helper is None:
+            return
+        now, codegen = time.monotonic(), target_context.codegen()
+        until = now + _PATIENCE * (now - asked) + _AT_LEAST
+        while helper.poll() is None and not self.holds(sig, codegen):
+            if time.monotonic() > until:
+                _end(helper)
+            time.sleep(_INTERVAL)
 
     def save_overload(self, sig: object, data: object) -> None:
         """Save a compiled function if possible; warn once if not."""
@@ -205,22 +223,27 @@ def _write_message(sentence: str) -> None:
 
 event.register("numba:compile", _FirstCompilation())
 
-# The helper gets this process's search path, so that it imports the same sources.
+# The helper gets this process's search path, so that it imports the same sources. It ends at once:
+# freeing its memory piece by piece would take half a second.
 _HELPER = (
-    "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "
-    "from vibrissa.numerics.kernel_cache import compile_listed; compile_listed(sys.stdin.buffer)"
+    "import os, pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "
+    "from vibrissa.numerics.kernel_cache import compile_listed; compile_listed(sys.stdin.buffer); "
+    "os._exit(0)"
 )
-# Longest wait for the helper, whose share is about as large: this many times the duration of this
-# process's own share, plus this many seconds.
-_PATIENCE, _AT_LEAST = 2.0, 10.0
+# Longest wait for a helper: this many times the time since it was asked, plus this many seconds;
+# and the interval at which its results are looked for, s.
+_PATIENCE, _AT_LEAST, _INTERVAL = 1.0, 10.0, 0.01
+#: What helpers compile (module, name, types of the arguments): when they were asked, and which.
+_asked: dict[tuple[object, ...], tuple[float, subprocess.Popen[bytes]]] = {}
 _lock = threading.Lock()
 
 
 def compile_together(here: list[Call], there: list[Call]) -> None:
     """Compile kernels that will be called, ``here`` in this process and ``there`` in a helper.
 
-    Does nothing if there is nothing to gain: kernels have been used or are cached, there is one
-    core, or the helper could not hand over its results.
+    Does not wait for the helper: who calls a kernel does. Does nothing if there is nothing to gain:
+    kernels have been used or are cached, there is one core, or the helper could not hand over its
+    results.
     """
     if any(kernel.overloads for kernel, _ in there):  # type: ignore[attr-defined]
         return
@@ -229,28 +252,44 @@ def compile_together(here: list[Call], there: list[Call]) -> None:
         mine = _not_cached(here) if others else []
         if not (mine and others and threads() > 1 and _runs_python()):
             return
-        if any(_name(kernel) is None for kernel, _ in others):
+        names = [_name(kernel) for kernel, _ in others]
+        if any(name is None for name in names):
             return
         helper = _start_helper(others)
-        begun = time.monotonic()
-        try:
+        if helper is None:
+            return
+        atexit.register(_end, helper)
+        for name, (_, signature) in zip(names, others, strict=True):
+            _asked[*cast("tuple[str, str]", name), signature] = time.monotonic(), helper
+        with _without_collection():
             for kernel, signature in mine:
                 kernel.compile(signature)
-            if helper is not None:
-                helper.wait(_PATIENCE * (time.monotonic() - begun) + _AT_LEAST)
-        except subprocess.TimeoutExpired:
-            pass
-        finally:
-            if helper is not None:
-                helper.kill()
-                helper.wait()
+
+
+@contextmanager
+def _without_collection() -> Iterator[None]:
+    """Collect no garbage, which takes a tenth of the time of compilation."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+def _end(helper: subprocess.Popen[bytes]) -> None:
+    """End a helper."""
+    helper.kill()
+    helper.wait()
 
 
 def compile_listed(file: BinaryIO) -> None:
     """Compile the kernels listed in a file into the cache; run by the helper."""
-    for module, name in pickle.load(file):
-        kernel = getattr(import_module(module), name)
-        kernel.compile(pickle.load(file))
+    with _without_collection():
+        for module, name in pickle.load(file):
+            kernel = getattr(import_module(module), name)
+            kernel.compile(pickle.load(file))
 
 
 def _not_cached(calls: list[Call]) -> list[tuple[Any, tuple[types.Type, ...]]]:
@@ -295,6 +334,8 @@ def _start_helper(
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
+            # Numba composes messages, which nobody reads, also where it tries something in vain.
+            env=os.environ | {"NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"},
             creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),  # no window on Windows
         )
     except (OSError, pickle.PicklingError):

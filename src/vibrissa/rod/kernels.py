@@ -399,7 +399,7 @@ def _farthest(b: Array) -> float:
     farthest = b[ARC]
     for i in range(1, LANES):
         farthest = max(farthest, b[ARC + i])
-    return farthest
+    return float(farthest)
 
 
 @inlined

@@ -476,36 +476,6 @@ def _put_in_order(row: int, n: int, out: Candidates, room: _Judged) -> None:
             copy(room.spread[old, a], out.covariances[row, c, a])
 
 
-@inlined
-def _leave_room(
-    of: Searched,
-    how: Weighing,
-    target: Array,
-    measured: Array,
-    row: int,
-    best: int,
-    weights: Array,
-    loose: Array,
-    out: Candidates,
-    room: _Judged,
-) -> None:
-    """Lower the probability of the first candidate by the posterior outside its region.
-
-    Its covariance may be widened. ``best`` is its index before the candidates were ordered, to
-    which ``weights`` and ``loose`` refer.
-    """
-    white, spread = how.own[0, 0] > 0.0, out.covariances[row, 0]
-    value, chi = out.values[row, 0], out.chi_squared[row, 0]
-    seen, unit = measured if white else target, _units(of, how, value)
-    points, likely = probable_nodes(of, white, weights, unit, seen, value[3:], chi)
-    bent = not room.described[best] or (_mirrored(how) and not out.valid[row, 0])
-    if bent and not described_by_nodes(points, likely, spread):
-        follow_valley(of.charted, of.proximal, how, target, measured, out.x[row, 0], spread)
-    log_mass = room.weight[1, best] - sharpness(weights) + _LOG_NORMAL
-    share = outside_share(points, likely, value[3:], chi, log_mass, spread, loose)
-    out.probability[row, 0] *= 1.0 - share
-
-
 @kernel
 def judge_rows(
     task: Task,
@@ -554,11 +524,52 @@ def judge_rows(
         rank(weight, number[row : row + 1], room.chance, room.order)
         _put_in_order(row, n, out, room)
         best = room.order[0, 0]
-        weights, loose = about.weights[i, best], about.loose[i]
-        if out.probability[row, 0] > CERTAIN and (about.others[i] or not out.valid[row, 0]):
-            _leave_room(of, how, target, measured[row], row, best, weights, loose, out, room)
+        about.best[i, 0], about.best[i, 1] = best, weight[1, best]
+        about.best[i, 2] = 1.0 if room.described[best] else 0.0
         if chi[0] <= limit:
             status[row] = _UNIQUE if out.probability[row, 0] > CERTAIN else _AMBIGUOUS
+
+
+@kernel
+def leave_rows(
+    task: Task,
+    targets: Array,
+    measured: Array,
+    number: IntArray,
+    flat: Array,
+    valid: AnyArray,
+    status: IntArray,
+    about: Description,
+    first: int,
+    last: int,
+) -> None:
+    """Lower the probability of first candidates by the posterior outside their regions.
+
+    For those that `judge_rows` found certain although more than their covariance may be probable.
+    Covariances may be widened.
+    """
+    of, how, out = task.of, task.how, in_memory(number, flat, valid)
+    white = how.own[0, 0] > 0.0
+    for row in range(first, last):
+        target, i = targets[row], row - first
+        if not finite(target) or number[row] == 0 or not out.probability[row, 0] > CERTAIN:
+            continue
+        if not about.others[i] and out.valid[row, 0]:
+            continue
+        best, described = int(about.best[i, 0]), about.best[i, 2] > 0.0
+        weights, spread = about.weights[i, best], out.covariances[row, 0]
+        value, chi = out.values[row, 0], out.chi_squared[row, 0]
+        seen, unit = measured[row] if white else target, _units(of, how, value)
+        points, likely = probable_nodes(of, white, weights, unit, seen, value[3:], chi)
+        bent = not described or (_mirrored(how) and not out.valid[row, 0])
+        if bent and not described_by_nodes(points, likely, spread):
+            x = out.x[row, 0]
+            follow_valley(of.charted, of.proximal, how, target, measured[row], x, spread)
+        log_mass = about.best[i, 1] - sharpness(weights) + _LOG_NORMAL
+        share = outside_share(points, likely, value[3:], chi, log_mass, spread, about.loose[i])
+        out.probability[row, 0] *= 1.0 - share
+        if status[row] == _UNIQUE and not out.probability[row, 0] > CERTAIN:
+            status[row] = _AMBIGUOUS
 
 
 def stages(of: Searched, how: Weighing, problem: Problem) -> tuple[list[Call], list[Call]]:
@@ -572,9 +583,11 @@ def stages(of: Searched, how: Weighing, problem: Problem) -> tuple[list[Call], l
     find: Call = (solve_rows, (*given, status, 0, 0))
     if not problem.exact:
         find = (explain_rows, (*given, status, False, 0, 0))
-    here: list[Call] = [(task, (of, how, problem)), find]
-    here.append((complete_rows, (*given, about, 0, 0)))
-    return here, [(judge_rows, (*given, status, about, 0, 0)), (description, (0, 0))]
+    judged = *given, status, about, 0, 0
+    # What they have in common is translated once: the weights at a contact, and nodes.
+    here: list[Call] = [(task, (of, how, problem)), (complete_rows, (*given, about, 0, 0))]
+    here.append((leave_rows, judged))
+    return here, [(judge_rows, judged), (description, (0, 0)), find]
 
 
 def compile_stages(of: Searched, how: Weighing, problem: Problem) -> None:
@@ -610,5 +623,6 @@ def estimate_rows(
         end = min(start + _AT_ONCE, last)
         complete_rows(task, *given, about, start, end)
         judge_rows(task, *given, status, about, start, end)
+        leave_rows(task, *given, status, about, start, end)
     if not problem.exact and (status[first:last] == UNEXPLAINED).any():
         explain_rows(task, *given, status, True, first, last)

@@ -78,7 +78,8 @@ class Description(structref.StructRefProxy):
 
     Weights (n, m, k, k), ∂(F, p)/∂ξ (n, m, 6, 3), residuals (n, m, k) and their slopes
     (n, m, k, 4) in standard deviations; χ² and coordinates (n, l, 4) of contacts that are not
-    candidates, and whether further ones may be probable (n,).
+    candidates, and whether further ones may be probable (n,); index and logarithmic weight of the
+    most probable candidate, and 1 if the second order describes its channels, else 0 (n, 3).
     """
 
     weights: Array
@@ -87,16 +88,17 @@ class Description(structref.StructRefProxy):
     jacobians: Array
     loose: Array
     others: AnyArray
+    best: Array
 
 
-_DESCRIBED = ("weights", "third", "residuals", "jacobians", "loose", "others")
+_DESCRIBED = ("weights", "third", "residuals", "jacobians", "loose", "others", "best")
 structref.define_proxy(Description, _DescriptionType, _DESCRIBED)
 
 
 def type_of_description() -> types.Type:
     """Numba type of the reference that `description` returns."""
-    three, four = (types.Array(types.float64, n, "C") for n in (3, 4))
-    kinds = four, four, three, four, three, types.Array(types.boolean, 1, "C")
+    two, three, four = (types.Array(types.float64, n, "C") for n in (2, 3, 4))
+    kinds = four, four, three, four, three, types.Array(types.boolean, 1, "C"), two
     return _DescriptionType(tuple(zip(_DESCRIBED, kinds, strict=True)))  # type: ignore[no-untyped-call]
 
 
@@ -111,6 +113,7 @@ def description(n: int, k: int) -> Description:
         np.empty((n, most, k, 4)),
         np.empty((n, MOST_STARTS, 4)),
         np.empty(n, np.bool_),
+        np.empty((n, 3)),
     )
 
 

@@ -122,11 +122,11 @@ def _plane(chart: StableSet, triplet: tuple[str, ...]) -> PlaneVector | None:
             vector = np.cross(point, force)
             slopes = np.cross(d_point, force[..., None], axis=-2)
             slopes = slopes + np.cross(point[..., None], d_force, axis=-2)
-        places = [triplet.index(name) if name in triplet else -1 for name in (size, direction)]
+        length, turn = (triplet.index(n) if n in triplet else -1 for n in (size, direction))
         lever = None
         if triplet == ("FT", "FD", "Mx"):
             lever = point[..., 1:], d_point[..., 1:, :]
-        return PlaneVector(vector[..., 1:], slopes[..., 1:, :], *places, lever)
+        return PlaneVector(vector[..., 1:], slopes[..., 1:, :], length, turn, lever)
     return None
 
 

@@ -12,6 +12,7 @@ from vibrissa.contacts import ContactMap
 from vibrissa.contour import axis_offset, fit_shape
 from vibrissa.evaluation import REPLICATES
 from vibrissa.pipeline import (
+    CHANGE,
     SOLVED_TO,
     fit_contacts,
     in_laboratory,
@@ -125,7 +126,7 @@ def located(method: str, wrench: xr.Dataset, contact_map: ContactMap) -> xr.Data
     noise = NOISE
     if "wrench_covariance" in wrench:
         noise = wrench["wrench_covariance"].values
-        wrench = wrench[["force", "moment", "in_contact"]]
+        wrench = wrench[["force", "moment", "in_contact", *CHANGE]]
     else:
         wrench = wrench[["force", "moment"]]
     if method != WRENCH:

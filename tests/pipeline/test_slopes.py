@@ -34,8 +34,9 @@ def differences(bent, found):
     return out
 
 
-def point_and_normal(arc_length, contact_force, point):
-    return np.concatenate([point, contact_normals(WHISKER, arc_length, contact_force)], axis=1)
+def point_and_normal(arc_length, contact_force, point, change=0.0):
+    normal, _ = contact_normals(WHISKER, arc_length, contact_force, change)
+    return np.concatenate([point, normal], axis=1)
 
 
 @pytest.mark.parametrize(
@@ -59,15 +60,16 @@ def test_contacts_move_with_the_wrench_as_the_gain_says(names):
         np.testing.assert_allclose(gain[:, :, i], expected[:, :, i], atol=3e-3 * size)
 
 
-def test_contacts_that_rub_move_as_the_gain_says():
+@pytest.mark.parametrize("change", [0.0, np.array([[3e-6, -9e-6, 1e-5], [2e-6, 1e-6, 1e-6]])])
+def test_contacts_that_rub_move_as_the_gain_says(change):
     bent = vb.deflect(WHISKER, RUBBING)
     noise = np.diag(np.repeat([1e-12, 4e-16], 3))
 
     def found(force, moment):
         e = vb.estimate_from_wrench(WHISKER, force, moment, noise=noise)
-        return point_and_normal(e.arc_length, e.contact_force, e.point)
+        return point_and_normal(e.arc_length, e.contact_force, e.point, change)
 
-    gain = gains(WHISKER, WRENCH, bent.arc_length, bent.contact_force, noise)
+    gain = gains(WHISKER, WRENCH, bent.arc_length, bent.contact_force, noise, change=change)
     expected = differences(bent, found)
     for i in range(6):
         size = np.abs(gain[:, :, i]).max()
@@ -114,16 +116,28 @@ def test_the_wrench_moves_with_the_point_as_its_slopes_say():
 
 def test_normals_are_across_the_whisker():
     bent = vb.deflect(WHISKER, LOAD)
-    normal = contact_normals(WHISKER, bent.arc_length, bent.contact_force)
+    normal, _ = contact_normals(WHISKER, bent.arc_length, bent.contact_force)
     size = np.linalg.norm(bent.force, axis=1, keepdims=True)
     np.testing.assert_allclose(normal, bent.force / size, atol=1e-12)
     rubbing = vb.deflect(WHISKER, RUBBING)
-    along = contact_normals(WHISKER, rubbing.arc_length, rubbing.contact_force)
+    along, _ = contact_normals(WHISKER, rubbing.arc_length, rubbing.contact_force)
     share = (along * rubbing.force).sum(axis=1) / np.linalg.norm(rubbing.force, axis=1)
     angle = np.arctan2(
         np.abs(rubbing.contact_force[:, 0]), np.linalg.norm(rubbing.contact_force[:, 1:], axis=1)
     )
     np.testing.assert_allclose(share, np.cos(angle), rtol=1e-9)
+
+
+def test_normals_are_as_uncertain_as_the_change_of_the_force():
+    bent = vb.deflect(WHISKER, LOAD)
+    rng = np.random.default_rng(3)
+    root = 1e-7 * rng.normal(size=(3, 3, 3))
+    args = WHISKER, bent.arc_length, bent.contact_force
+    _, covariance = contact_normals(*args, 0.0, root @ np.swapaxes(root, 1, 2))
+    draws = np.einsum("nij,knj->kni", root, rng.normal(size=(4000, 3, 3)))
+    normals = np.array([contact_normals(*args, draw)[0] for draw in draws])
+    for row, many in zip(covariance, np.swapaxes(normals, 0, 1), strict=True):
+        np.testing.assert_allclose(np.cov(many.T), row, atol=0.1 * np.abs(row).max())
 
 
 def test_without_a_contact_there_is_nothing():

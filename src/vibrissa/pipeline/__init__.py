@@ -29,7 +29,7 @@ if TYPE_CHECKING:
         contact_columns as contact_columns,
         with_events as with_events,
     )
-    from vibrissa.pipeline.frames import Frames as Frames
+    from vibrissa.pipeline.frames import CHANGE as CHANGE, Frames as Frames
     from vibrissa.pipeline.location import (
         locate,
         locate_around as locate_around,
@@ -90,7 +90,7 @@ __getattr__ = names_from(
         "checks": "check_recording doubted_axes edited whisker_radii",
         "estimates": "Progress contact_events estimates_of in_laboratory swept_recording",
         "events": "EVENTS contact_columns with_events",
-        "frames": "Frames",
+        "frames": "CHANGE Frames",
         "location": "locate locate_around locate_from_wrench",
         "predictor_table": "PREDICTORS predictors",
         "reconstruction": "AGREES ANGLE_CLASSES SOLVED_TO STRONG Shape compare_contacts "

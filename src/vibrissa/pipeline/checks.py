@@ -25,6 +25,7 @@ from vibrissa.contacts import rubbing_misfits
 from vibrissa.deferred import xr
 from vibrissa.io import slow_steps
 from vibrissa.numerics import Array
+from vibrissa.pipeline.frames import CHANGE
 from vibrissa.quantities import unit_fault
 from vibrissa.recording import VARIABLES, Group, Recording, faults_in, recorded
 from vibrissa.signals import base_signals
@@ -220,7 +221,7 @@ _INPUTS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "": (*_WRENCH, "reading", *_POINT[:2], *_POSE, "head_position", "head_rotation"),
         "measured": ("contact_point", *_ANGLES),
     },
-    "estimates": {"signals": (*_WRENCH, *_POSE, "status", "pose_wrench_covariance")},
+    "estimates": {"signals": (*_WRENCH, *_POSE, "status", "pose_wrench_covariance", *CHANGE)},
     "contour": {"estimates": (*_POINT, "contact_normal", "normal_covariance", "arc_length")},
 }
 

@@ -19,6 +19,7 @@ from vibrissa.contour import continuing_candidates, to_laboratory
 from vibrissa.numerics import Array, contacts_in, cross_matrix
 from vibrissa.pipeline.checks import signals_in
 from vibrissa.pipeline.events import EVENTS, with_events
+from vibrissa.pipeline.frames import CHANGE
 from vibrissa.pipeline.location import locate, locate_from_wrench, without_contact
 from vibrissa.pipeline.signals import sensor_noise
 from vibrissa.quantities import attributes
@@ -161,7 +162,7 @@ def estimates_of(
         report("contact points", k, count)
         one = Group(data).whisker(k).data
         sigma = sensor_noise(one) if noise is None else np.asarray(noise, dtype=np.float64)
-        wrench = one[["force", "moment"]]
+        wrench = one[["force", "moment", *(n for n in CHANGE if n in one)]]
         if data.attrs.get("source") != "sensor" or "density" in data.attrs:
             wrench = wrench.assign(in_contact=one["in_contact"])
         if gravity is not None:
@@ -321,8 +322,9 @@ def in_laboratory(
         None if pose_covariance is None else np.asarray(pose_covariance),
         None if pose_wrench_covariance is None else np.asarray(pose_wrench_covariance),
     )
-    wider = _chosen(contacts["candidate_widening"], chosen).values
-    spread[:, :3, :3] += rotation @ wider @ np.swapaxes(rotation, 1, 2)
+    for part, name in ((slice(3), "widening"), (slice(3, 6), "normal_widening")):
+        wider = _chosen(contacts[f"candidate_{name}"], chosen).values
+        spread[:, part, part] += rotation @ wider @ np.swapaxes(rotation, 1, 2)
     squares = {
         "contact_covariance": spread[:, :3, :3],
         "normal_covariance": spread[:, 3:, 3:],

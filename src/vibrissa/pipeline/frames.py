@@ -14,6 +14,9 @@ from vibrissa.numerics import AnyArray
 if TYPE_CHECKING:
     import xarray
 
+# Change of the contact force by inertia that was removed from signals, and its covariance.
+CHANGE = ("contact_force_change", "contact_force_change_covariance")
+
 
 @dataclass(frozen=True)
 class Frames:

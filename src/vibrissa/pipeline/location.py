@@ -32,7 +32,7 @@ from vibrissa.contacts import (
 from vibrissa.deferred import xr
 from vibrissa.numerics import Array
 from vibrissa.objects import Surface
-from vibrissa.pipeline.frames import Frames, Labelled
+from vibrissa.pipeline.frames import CHANGE, Frames, Labelled
 from vibrissa.pipeline.touch_gains import contact_normals, gains
 from vibrissa.quantities import attributes
 from vibrissa.recording import Group
@@ -47,6 +47,7 @@ from vibrissa.whisker import Whisker
 _FRICTION = 0.3
 _OF_ROD = ("stiffness_sigma", "compliance_sigma")  # errors of the whisker and its base
 _WHISKER = {"reference_frame": "whisker"}
+_ANYWHERE = 1.0 / 12.0  # variance of a contact anywhere on the whisker, over L²
 _FLAT = 1e-15  # least ratio of variances of a covariance of first order
 
 
@@ -71,7 +72,8 @@ def locate(
         Contact map of the whisker.
     wrench : xarray.Dataset
         Measured ``force`` and ``moment``, whisker frame, N and N·m, dimensions time, space. If it
-        has a variable ``in_contact``, frames where this is false are without contact.
+        has a variable ``in_contact``, frames where this is false are without contact. If it has
+        ``contact_force_change`` with its covariance, this is added to the forces for the normals.
     triplet : tuple of str
         Signals to estimate from, three or more.
     noise : array_like (6, 6) or (time, 6, 6), optional
@@ -100,8 +102,9 @@ def locate(
         candidates (``candidate_points``, ``candidate_covariance``, ...) and their number
         ``candidates``; ``in_contact`` (detected) and ``status``; ``candidate_gain``, the
         derivatives of the candidates with respect to the wrench, reduced where an error of first
-        order is larger than the estimate states, and ``candidate_widening``, the covariance in
-        addition to it; ``wrench_covariance``, the covariance of the wrench from noise and common
+        order is larger than the estimate states, and ``candidate_widening`` and
+        ``candidate_normal_widening``, the covariances in addition to it; ``wrench_covariance``,
+        the covariance of the wrench from noise and common
         errors; and the variables that `with_events` needs. Covariances are those of the exact
         method whatever the method. Frames without a detected contact are NaN, with the status
         ``NOT_FELT``, or ``NO_CONTACT`` where force and moment are zero or ``in_contact`` is false.
@@ -325,12 +328,14 @@ class _Measured(NamedTuple):
 
     ``force`` and ``moment`` are (n, 3), and ``covariance`` is (n, 6, 6), NaN if unknown. ``known``,
     ``rows`` and ``free`` (n,) mark the frames in which the wrench is known, a contact is detected,
-    and there is no contact. ``excess`` (n, 6) is the whitened difference from the wrench of a free
-    whisker, or (n, 0) if contact is not detected from it. ``typical`` (6, 6) is the typical noise
-    of the frames, if known; ``errors`` (k, 6, 7) are the errors that all frames share; ``above`` is
-    the M_B above which contacts are detected, N·m; ``steady`` is true if all frames have the same
-    noise; ``rotation`` (rows, 3, 3) is that of the base in the frames with a contact, under gravity
-    and if known.
+    and there is no contact; ``clear`` (n,) those in which M_B is above the threshold. ``excess``
+    (n, 6) is the whitened difference from the wrench of a free whisker, or (n, 0) if contact is not
+    detected from it. ``typical`` (6, 6) is the typical noise of the frames, if known; ``errors``
+    (k, 6, 7) are the errors that all frames share; ``above`` is the M_B above which contacts are
+    detected, N·m; ``steady`` is true if all frames have the same noise; ``rotation`` (rows, 3, 3)
+    is that of the base in the frames with a contact, under gravity and if known. ``change`` (n, 3)
+    and ``change_covariance`` (n, 3, 3) are those of the contact force by inertia that was removed,
+    or zero.
     """
 
     time: tuple[str, Array, Mapping[str, Any]]
@@ -340,12 +345,15 @@ class _Measured(NamedTuple):
     known: NDArray[np.bool_]
     rows: NDArray[np.bool_]
     free: NDArray[np.bool_]
+    clear: NDArray[np.bool_]
     excess: Array
     typical: Array | None
     errors: Array
     above: float
     steady: bool
-    rotation: Array | None = None
+    rotation: Array | None
+    change: Array
+    change_covariance: Array
 
     @classmethod
     def of(
@@ -372,7 +380,7 @@ class _Measured(NamedTuple):
             least = DETECTED * np.sqrt(0.5 * (covariance[:, 4, 4] + covariance[:, 5, 5]))
             least = np.nan_to_num(least)
         with np.errstate(invalid="ignore"):
-            rows = known & (size > least)
+            rows = clear = known & (size > least)
         free = known & ~force.any(axis=1) & ~moment.any(axis=1)
         if "in_contact" in given:
             touching = given["in_contact"]
@@ -403,12 +411,17 @@ class _Measured(NamedTuple):
             known,
             rows,
             free,
+            clear,
             excess,
             typical,
             shared,
             above,
             steady,
             rotation,
+            *(
+                given[name] if name in given else np.zeros((n, *shape))
+                for name, shape in zip(CHANGE, ((3,), (3, 3)), strict=True)
+            ),
         )
 
     def at_rest(self, whisker: Whisker, gravity: Gravity | None) -> Whisker:
@@ -468,16 +481,25 @@ def _located(
         number[rows], valid[rows] = found.n_candidates, found.covariance_valid
     shape = arc_lengths.shape
     flat = (arc_lengths.reshape(-1), contact_forces.reshape(-1, 3))
-    gain = gains(whisker, names, *flat, measured.typical, measured.errors, friction)
+    change, doubt = (
+        np.repeat(of[rows], shape[1], axis=0)
+        for of in (measured.change, measured.change_covariance)
+    )
+    gain = gains(whisker, names, *flat, measured.typical, measured.errors, friction, change)
     gain = gain.reshape(*shape, 6, 6)
-    normals = contact_normals(whisker, *flat).reshape(*shape, 3)
-    point_gain = gain[..., :3, :]
-    spread = point_gain @ measured.covariance[rows][:, None] @ np.swapaxes(point_gain, -1, -2)
+    normals, turning = contact_normals(whisker, *flat, change, doubt)
+    first = gain @ measured.covariance[rows][:, None] @ np.swapaxes(gain, -1, -2)
+    point_gain, spread = gain[..., :3, :], first[..., :3, :3]
     widening = np.zeros_like(spread)
+    # Second-order terms: normals turn, and errors of points follow an arc whose radius is of the
+    # order of the length. Unclear contacts may be anywhere.
+    unclear = np.where(measured.clear[rows], 0.0, 1.0)[:, None, None, None] * np.eye(3)
+    turning = turning.reshape(*shape, 3, 3) + unclear
+    turning += 0.5 * np.einsum("ncii->nc", first[..., 3:, 3:])[..., None, None] ** 2 * np.eye(3)
     if not measured.steady:
-        # Second-order term: errors follow an arc whose radius is of the order of the length.
         size = np.einsum("ncii->nc", spread) / whisker.length
-        spread = spread + size[..., None, None] ** 2 * np.eye(3)
+        widening = size[..., None, None] ** 2 * np.eye(3) + _ANYWHERE * whisker.length**2 * unclear
+        spread = spread + widening
     elif stated is not None:
         k = stated.shape[1]
         factor, wider = _as_stated(spread[:, :k], stated)
@@ -499,8 +521,13 @@ def _located(
         data[f"candidate_{short}"] = (dims, everywhere, attributes(name))
     data["candidate_normal"] = (
         ("time", "candidate", "space"),
-        _everywhere(rows, normals),
+        _everywhere(rows, normals.reshape(*shape, 3)),
         attributes("contact_normal") | _WHISKER,
+    )
+    data["candidate_normal_widening"] = (
+        ("time", "candidate", "space", "space_2"),
+        _everywhere(rows, turning),
+        attributes("normal_covariance") | _WHISKER,
     )
     data["candidate_gain"] = (
         ("time", "candidate", "contact_component", "component"),

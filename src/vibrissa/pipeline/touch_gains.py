@@ -7,8 +7,9 @@ determines the base force and contact point (F, p), the wrench w = (F, p × F) a
 
 of the force across the whisker, where t is the whisker's tangent at the contact. At a contact on
 the whisker's side, the tangent lies in the tangent plane of the surface, so that n is the surface
-normal even with friction along the whisker; without friction n is the direction of the force. To
-first order an error δw of the measured wrench causes errors δ(p, n) = G δw with the gain
+normal even with friction along the whisker; without friction n is the direction of the force. Where
+inertia was removed from the wrench, the known change ΔF of the contact force by inertia is added to
+F in g. To first order an error δw of the measured wrench causes errors δ(p, n) = G δw with the gain
 
     G = ∂(p, n)/∂x · K · ∂c/∂w,
 
@@ -49,19 +50,21 @@ def gains(
     weighing: Array | None = None,
     errors: Array | None = None,
     friction: float = 0.0,
+    change: Array | float = 0.0,
 ) -> Array:
     """Derivatives (n, 6, 6) of contact points and normals with respect to the measured wrench.
 
     With more than three signals, these are weighted by the noise ``weighing`` (6, 6) of the wrench
     and the common ``errors`` (k, 6, 7). ``friction`` is the standard deviation of the ratio of
-    forces along and across the whisker.
+    forces along and across the whisker. ``change`` (n, 3) is that of the contact force by inertia,
+    whisker frame.
     """
     rubbing = signals == WRENCH or friction > 0.0
     d, x, rows = _unknowns(whisker, arc_length, contact_force)
     out = np.full((len(rows), 6, 6), np.nan)
     if not rows.any():
         return out
-    values, value_slopes, normal_slopes = _touch(d, x)
+    values, value_slopes, normal_slopes = _touch(d, x, _scaled(d, change, rows))
     free = [0, 1, 2, 3] if rubbing else _FREE
     three = len(signals) == 3 and not friction > 0.0
     channels = Channels(signals, signals) if three or signals == WRENCH else Channels.of(signals)
@@ -98,10 +101,11 @@ def wrench_slopes(whisker: Whisker, arc_length: Array, contact_force: Array) -> 
     return out
 
 
-def _touch(d: Discretization, x: Array) -> tuple[Array, Array, Array]:
+def _touch(d: Discretization, x: Array, change: Array | float) -> tuple[Array, Array, Array]:
     """(F, p) (n, 6), ∂(F, p)/∂x (n, 6, 4) and, for the normal n, ∂n/∂x (n, 3, 4), scaled.
 
-    Contacts are x (n, 4); derivatives are computed partly by central differences.
+    Contacts are x (n, 4), and ``change`` (n, 3) is added to their forces; derivatives are computed
+    partly by central differences.
     """
     values, exact = solve_forces(d, x, tangents=True)
     tangent = contact_tangents(d, x)
@@ -120,7 +124,7 @@ def _touch(d: Discretization, x: Array) -> tuple[Array, Array, Array]:
         if k == 1:
             slopes[..., 1] = (solve_forces(d, ahead)[0] - solve_forces(d, back)[0]) / width
     slopes[..., _FREE] = exact
-    force = values[:, :3]
+    force = values[:, :3] + change
     along = (force * tangent).sum(axis=1)[:, None]
     across = force - along * tangent
     length = np.linalg.norm(across, axis=1, keepdims=True)
@@ -135,16 +139,37 @@ def _touch(d: Discretization, x: Array) -> tuple[Array, Array, Array]:
         return values, slopes, flat @ change / length[..., None]
 
 
-def contact_normals(whisker: Whisker, arc_length: Array, contact_force: Array) -> Array:
-    """Unit vectors (n, 3) of the contact forces across the whisker."""
+def contact_normals(
+    whisker: Whisker,
+    arc_length: Array,
+    contact_force: Array,
+    change: Array | float = 0.0,
+    covariance: Array | float = 0.0,
+) -> tuple[Array, Array]:
+    """Unit vectors (n, 3) of the contact forces across the whisker, and their covariances.
+
+    ``change`` (n, 3) is that of the forces by inertia, whisker frame, and ``covariance`` (n, 3, 3)
+    its covariance, from which that of the normals follows.
+    """
     d, x, rows = _unknowns(whisker, arc_length, contact_force)
-    out = np.full((len(rows), 3), np.nan)
+    out, spread = np.full((len(rows), 3), np.nan), np.full((len(rows), 3, 3), np.nan)
     if rows.any():
-        force, tangent = solve_forces(d, x)[0][:, :3], contact_tangents(d, x)
+        force = solve_forces(d, x)[0][:, :3] + _scaled(d, change, rows)
+        tangent = contact_tangents(d, x)
         across = force - (force * tangent).sum(axis=1)[:, None] * tangent
+        length = np.linalg.norm(across, axis=1, keepdims=True)
         with np.errstate(divide="ignore", invalid="ignore"):
-            out[rows] = across / np.linalg.norm(across, axis=1, keepdims=True)
-    return out
+            out[rows] = normal = across / length
+            flat = np.eye(3) - sum(v[:, :, None] * v[:, None, :] for v in (normal, tangent))
+            flat /= length[..., None]
+        change_spread = np.broadcast_to(covariance, spread.shape)[rows] / d.force**2
+        spread[rows] = flat @ change_spread @ flat
+    return out, spread
+
+
+def _scaled(d: Discretization, change: Array | float, rows: NDArray[np.bool_]) -> Array:
+    """Changes (m, 3) of the contact forces of some rows, scaled."""
+    return np.broadcast_to(change, (len(rows), 3))[rows] / d.force
 
 
 def _unknowns(

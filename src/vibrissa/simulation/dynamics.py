@@ -35,7 +35,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vibrissa.deferred import interpolate, linalg, transform
-from vibrissa.numerics import AnyArray, Array, IntArray, exponential
+from vibrissa.numerics import AnyArray, Array, IntArray, contacts_in, exponential
 from vibrissa.objects import Surface
 from vibrissa.simulation.chain import Chain, bezier, configure, inertia, jacobian
 from vibrissa.simulation.motion import Motion
@@ -516,13 +516,14 @@ def inertial_wrench(
     points: Array,
     arc_length: Array,
     most: float = np.inf,
-) -> Array:
-    """Part of the wrench (n, 6) at the base that is due to inertia and damping, SI units.
+) -> tuple[Array, Array]:
+    """Parts of the wrench (n, 6) and the contact force (n, 3) due to inertia, base frame, SI units.
 
-    The centreline is constrained to pass through ``points`` (n, 3), laboratory frame, NaN without
-    contact; of ``arc_length`` (n,) only the value in the first frame of a contact is used. Where
-    the massless chain would need a force above ``most``, the point is replaced by that of the
-    nearest other frame; if this does not suffice, the contact ends there.
+    Both include damping. The contact force is zero without contact. The centreline is constrained
+    to pass through ``points`` (n, 3), laboratory frame, NaN without contact; of ``arc_length`` (n,)
+    only the value in the first frame of a contact is used. Where the massless chain would need a
+    force above ``most``, the point is replaced by that of the nearest other frame; if this does not
+    suffice, the contact ends there.
     """
     frame = float(time[-1] - time[0]) / (len(time) - 1)
     chain = Chain.of(whisker, dynamics.density, _SEGMENTS)
@@ -532,12 +533,13 @@ def inertial_wrench(
     still = Path(time, rotation, position, frame)
     for instead in (_nearest, _until, None):
         resting, force = _Held(whisker, light, 0.0, frame).wrench(still, points, arc_length)
-        if instead is None or not (force > most).any():
+        wrong = np.linalg.norm(force, axis=1) > most
+        if instead is None or not wrong.any():
             break
-        points = instead(points, force > most)
+        points = instead(points, wrong)
     path = Path(time, rotation, position, frame / parts)
-    moving, _ = _Held(whisker, chain, damping, path.step).wrench(path, points, arc_length)
-    return moving - resting
+    moving, pushed = _Held(whisker, chain, damping, path.step).wrench(path, points, arc_length)
+    return moving - resting, pushed - force
 
 
 def _nearest(points: Array, wrong: AnyArray) -> Array:
@@ -574,30 +576,31 @@ class _Held(Walk):
         self._at = 0.0
 
     def wrench(self, path: Path, points: Array, arc_length: Array) -> tuple[Array, Array]:
-        """Wrench (n, 6), base frame, and size of the constraint force (n,) in every frame."""
+        """Wrench (n, 6) and constraint force (n, 3) in every frame, base frame."""
         parts = (path.count - 1) // (len(points) - 1)
         turns, places = path.at(np.arange(path.count))
-        # Between frames the point is interpolated; it is NaN unless both frames have a point.
+        # Between frames of one contact the point is interpolated.
         time = np.arange(path.count) / parts
-        first = time.astype(int)
-        share = (time - first)[:, None]
-        held = np.where(
-            share > 0.0,
-            (1.0 - share) * points[first] + share * points[np.minimum(first + 1, len(points) - 1)],
-            points[first],
-        )
+        first, share = time.astype(int), np.arange(path.count) % parts
+        held = np.full((path.count, 3), np.nan)
+        for begun, end in contacts_in(~np.isnan(points[:, 0])):
+            steps = slice(parts * begun, parts * (end - 1) + 1)
+            held[steps] = points[begun]
+            if end - begun > 1:
+                frames = np.arange(begun, end)
+                held[steps] = interpolate.CubicSpline(frames, points[begun:end])(time[steps])
         self.begin(turns[:4], places[:4])
-        out, force = np.empty((len(points), 6)), np.zeros(len(points))
+        out, force = np.empty((len(points), 6)), np.zeros((len(points), 3))
         for number, (turn, place, point) in enumerate(zip(turns, places, held, strict=True)):
             there = bool(np.isfinite(point).all())
             if there and self._point is None:
                 self._at = float(arc_length[first[number]])
             self._point = point if there else None
             moment = self.step(turn, place)
-            if share[number, 0] == 0.0:
+            if share[number] == 0:
                 out[first[number]] = np.concatenate([moment.force @ turn, moment.moment @ turn])
-                gaps = [contact.gap for contact in moment.contacts]
-                force[first[number]] = self._stiffness[0] * np.linalg.norm(gaps)
+                for contact in moment.contacts:
+                    force[first[number]] -= self._stiffness[0] * contact.gap * contact.normal @ turn
         return out, force
 
     def _contacts(self) -> list[Contact]:

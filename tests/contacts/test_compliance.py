@@ -101,6 +101,20 @@ def test_one_standard_deviation_is_one(gamma_map, sigma):
     np.testing.assert_allclose(np.median(size / np.sqrt(values[:, 2])), 1.0, atol=0.15)
 
 
+def test_contacts_on_an_arc_are_in_the_regions():
+    """With little noise three signals leave contacts of all compliances, which are on an arc."""
+    rod = vb.Whisker.straight(40e-3, base_radius=3.2e-4, tip_radius=1.4e-4, youngs_modulus=2.3e9)
+    unit = rod.base_bending_stiffness / rod.length
+    sigma = 1.0 / (30.0 * unit)
+    noise = 1e-4 * unit * np.diag(np.repeat([1.0 / rod.length, 1.0], 3))
+    truth, wrenches = touched(rod, np.full(30, sigma), noise**2)
+    contact_map = vb.ContactMap.simulate(rod, grid=False)
+    found = contact_map.estimate(
+        signals_of(wrenches, "Fx MB MD"), "Fx MB MD", noise**2, compliance_sigma=sigma
+    )
+    assert distance(found, truth).max() < 7.81
+
+
 def test_one_at_a_time_is_the_batch(gamma_map, sigma):
     _, wrenches = touched(gamma_map.whisker, [0.0, sigma], NOISE)
     signals = signals_of(wrenches, "Fx FT MB MD")

@@ -21,7 +21,7 @@ det ∂p/∂x, and widened for tails as in :mod:`~vibrissa.contacts.uncertainty.
 from __future__ import annotations
 
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -49,6 +49,7 @@ HELD = 1e-5  # tolerance for a held arc length
 # Iterations in which the effects of shared unknowns, or the noise, are recomputed at the contact.
 _ROUNDS, _STEADY = 3, 2
 _CLOUD = 128
+_SOLVED = 1e-5  # χ² below which as many signals as unknowns are solved
 _MISFITS = (int(Status.NOT_FRICTIONLESS), int(Status.NOT_ONE_CONTACT))
 
 
@@ -201,6 +202,24 @@ class JointFit:
         alone = joint._replace(design=joint.design[:, :k, :n], moved=joint.moved[..., :n])
         return joint.covariance() - alone.covariance()
 
+    def _curved(self, targets: Array, fits: Fits, joint: Joint) -> Array:
+        """Second-order part of the covariances (n, 3, 3) due to shared unknowns.
+
+        Signals that determine no more than the contact leave the unknowns at their full width,
+        over which the contact follows an arc: p(c) = p + b c + a c², with E c⁴ = 3.
+        """
+        n, k = len(self.free), len(self.names)
+        by_unknown = -np.linalg.pinv(joint.design[:, :k, :n]) @ joint.design[:, :k, n:]
+        slopes = joint.moved[..., n:] + joint.moved[..., :n] @ by_unknown
+        out = np.zeros((len(targets), 3, 3))
+        for i, (other, share) in enumerate(self.forward.errors):
+            how: Any = {"friction": self.friction, "least": self.least}
+            moved, _ = other.fit(self.names, targets, joint.weights, fits.contacts, **how)
+            arc = share * (moved.values - fits.values)[:, 3:6] - slopes[..., i]
+            arc[~(moved.misfits < _SOLVED)] = 0.0
+            out += 3.0 * arc[:, :, None] * arc[:, None, :]
+        return out
+
     def degrees(self, flat: Array, values: Array) -> int:
         """Number of independent channels minus that of the unknowns."""
         if self.sensor is None or not len(flat):
@@ -243,6 +262,8 @@ class JointFit:
             joint = self.joint(flat[row], targets[row], fits)
             out.x[row, place], out.values[row, place] = fits.contacts, joint.values[:, :6]
             out.covariances[row, place] += self.shared(joint)
+            if joint.design.shape[1:] == (len(self.names) + len(self.forward.errors),) * 2:
+                out.covariances[row, place] += self._curved(targets[row], fits, joint)
             out.chi_squared[row, place] = joint.misfit
             degrees = self.degrees(flat[row], fits.values)
         first = out.chi_squared[:, 0]

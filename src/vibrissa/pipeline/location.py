@@ -479,32 +479,9 @@ def _located(
         points, arc_lengths, forces = one.point, one.arc_length, one.force
         contact_forces, status[rows] = one.contact_force, found.status
         number[rows], valid[rows] = found.n_candidates, found.covariance_valid
-    shape = arc_lengths.shape
-    flat = (arc_lengths.reshape(-1), contact_forces.reshape(-1, 3))
-    change, doubt = (
-        np.repeat(of[rows], shape[1], axis=0)
-        for of in (measured.change, measured.change_covariance)
+    gain, spread, widening, normals, turning = _errors(
+        whisker, names, measured, arc_lengths, contact_forces, stated, friction
     )
-    gain = gains(whisker, names, *flat, measured.typical, measured.errors, friction, change)
-    gain = gain.reshape(*shape, 6, 6)
-    normals, turning = contact_normals(whisker, *flat, change, doubt)
-    first = gain @ measured.covariance[rows][:, None] @ np.swapaxes(gain, -1, -2)
-    point_gain, spread = gain[..., :3, :], first[..., :3, :3]
-    widening = np.zeros_like(spread)
-    # Second-order terms: normals turn, and errors of points follow an arc whose radius is of the
-    # order of the length. Unclear contacts may be anywhere.
-    unclear = np.where(measured.clear[rows], 0.0, 1.0)[:, None, None, None] * np.eye(3)
-    turning = turning.reshape(*shape, 3, 3) + unclear
-    turning += 0.5 * np.einsum("ncii->nc", first[..., 3:, 3:])[..., None, None] ** 2 * np.eye(3)
-    if not measured.steady:
-        size = np.einsum("ncii->nc", spread) / whisker.length
-        widening = size[..., None, None] ** 2 * np.eye(3) + _ANYWHERE * whisker.length**2 * unclear
-        spread = spread + widening
-    elif stated is not None:
-        k = stated.shape[1]
-        factor, wider = _as_stated(spread[:, :k], stated)
-        point_gain[:, :k], widening[:, :k] = factor @ point_gain[:, :k], wider
-        spread[:, :k] = np.where(np.isfinite(stated), stated, spread[:, :k])
     columns = {
         "points": ("contact_point_whisker", points),
         "covariance": ("covariance", spread),
@@ -521,7 +498,7 @@ def _located(
         data[f"candidate_{short}"] = (dims, everywhere, attributes(name))
     data["candidate_normal"] = (
         ("time", "candidate", "space"),
-        _everywhere(rows, normals.reshape(*shape, 3)),
+        _everywhere(rows, normals),
         attributes("contact_normal") | _WHISKER,
     )
     data["candidate_normal_widening"] = (
@@ -552,6 +529,50 @@ def _located(
     about = {"triplet": " ".join(names), "felt_above": measured.above, "friction": assumed}
     about["length"] = whisker.length
     return Frames({"time": measured.time, **data}, about)
+
+
+def _errors(
+    whisker: Whisker,
+    names: tuple[str, ...],
+    measured: _Measured,
+    arc_lengths: Array,
+    contact_forces: Array,
+    stated: Array | None,
+    friction: float,
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Gains, covariances and normals of candidates.
+
+    The third and last results are the parts of the covariances of points and normals that are not
+    due to the gains.
+    """
+    rows = measured.rows
+    shape = arc_lengths.shape
+    flat = (arc_lengths.reshape(-1), contact_forces.reshape(-1, 3))
+    change, doubt = (
+        np.repeat(of[rows], shape[1], axis=0)
+        for of in (measured.change, measured.change_covariance)
+    )
+    gain = gains(whisker, names, *flat, measured.typical, measured.errors, friction, change)
+    gain = gain.reshape(*shape, 6, 6)
+    normals, turning = contact_normals(whisker, *flat, change, doubt)
+    first = gain @ measured.covariance[rows][:, None] @ np.swapaxes(gain, -1, -2)
+    point_gain, spread = gain[..., :3, :], first[..., :3, :3]
+    widening = np.zeros_like(spread)
+    # Second-order terms: normals turn, and errors of points follow an arc whose radius is of the
+    # order of the length. Unclear contacts may be anywhere.
+    unclear = np.where(measured.clear[rows], 0.0, 1.0)[:, None, None, None] * np.eye(3)
+    turning = turning.reshape(*shape, 3, 3) + unclear
+    turning += 0.5 * np.einsum("ncii->nc", first[..., 3:, 3:])[..., None, None] ** 2 * np.eye(3)
+    if not measured.steady:
+        size = np.einsum("ncii->nc", spread) / whisker.length
+        widening = size[..., None, None] ** 2 * np.eye(3) + _ANYWHERE * whisker.length**2 * unclear
+        spread = spread + widening
+    elif stated is not None:
+        k = stated.shape[1]
+        factor, wider = _as_stated(spread[:, :k], stated)
+        point_gain[:, :k], widening[:, :k] = factor @ point_gain[:, :k], wider
+        spread[:, :k] = np.where(np.isfinite(stated), stated, spread[:, :k])
+    return gain, spread, widening, normals.reshape(*shape, 3), turning
 
 
 def _as_stated(first: Array, stated: Array) -> tuple[Array, Array]:

@@ -71,6 +71,31 @@ def test_what_is_there_stays(folder, monkeypatch, verb):
         there.unlink()
 
 
+READ = {
+    "estimate": (("signals.csv", "-o", "signals.csv"), "signals.csv"),
+    "estimate ": (("in.nc", "--map", "map.nc", "-o", "map.nc", "--force"), "map.nc"),
+    "uniqueness": (("map.nc", "-o", "./map.nc", "--force"), "map.nc"),
+    "track": (("top.mkv", "front.mkv", "--cameras", "in.nc", "-o", "in.nc", "--force"), "in.nc"),
+    "export": (("in.csv", "-o", "in.csv", "--force"), "in.csv"),
+    "signals": (("in.nc", "--events", "in.nc", "--force"), "in.nc"),
+}
+
+
+@pytest.mark.parametrize("verb", READ)
+def test_what_is_read_is_not_replaced_even_with_force(folder, monkeypatch, verb):
+    """Measurements were replaced by the contacts that were estimated from them."""
+    words, name = READ[verb]
+    monkeypatch.chdir(folder)
+    path = folder / name
+    if not path.exists():
+        path.write_bytes((folder / "signals.csv").read_bytes())
+    before = path.read_bytes()
+    done = run(verb.strip(), *words)
+    assert isinstance(done.exception, ValueError), done.exception
+    assert "is read, and would be replaced" in str(done.exception)
+    assert path.read_bytes() == before
+
+
 def test_every_verb_that_writes_is_asked(folder):
     """The demo, a study and a batch go on with what they made; `stream` and `correct` add to it."""
     with_force = [

@@ -485,3 +485,23 @@ def test_kernels_are_compiled_beforehand_for_what_they_are_called_with(
                 each if isinstance(each, Type) else kernel.typeof_pyval(each) for each in arguments
             )
             assert tuple(types) in kernel.overloads, kernel.py_func.__name__
+
+
+@pytest.mark.parametrize(
+    ("noise", "message"),
+    [
+        ({"Fx": 1e-12, "MB": 4e-16, "MD": 1e-4}, "noise of Fx, 1e-12 N, is smaller"),
+        (np.diag(SIGMA), "noise of MB, 0.00014 N·m, is larger"),
+        ({"Fx": 1.0, "MB": 0.02, "MD": 0.01}, "noise of Fx, 1 N, is larger"),
+    ],
+    ids=["variances", "deviations", "µN"],
+)
+def test_noise_squared_or_in_other_units_is_questioned(gamma_map, noise, message):
+    using = ("Fx", "MB", "MD")
+    with pytest.warns(UserWarning, match=message):
+        vb.Estimator(gamma_map, using, noise)
+    signals = vb.base_signals([-65e-6, 28e-6, 15e-6], [0.14e-6, -0.5e-6, 1.52e-6])
+    with pytest.warns(UserWarning, match=message):
+        gamma_map.estimate(signals, using, noise)
+    with pytest.warns(UserWarning, match=message):
+        vb.sensitivity(gamma_map, noise=noise)

@@ -77,6 +77,8 @@ def test_what_can_be_read(tmp_path):
         check_readable(path)
     with pytest.raises(ValueError, match="is a folder"):
         check_readable(tmp_path)
+    with pytest.raises(ValueError, match="is a pipe or device"):
+        check_readable(os.devnull)
     for content, message in (
         (b"time,Fx\n\xff\xfe\x00", "a.csv is not a text table in UTF-8: byte 8 is 0xff"),
         (b"time,Fx\n\0", "a.csv is not a text table: byte 8 is zero"),

@@ -79,3 +79,18 @@ def test_a_file_is_as_open_as_any_other_new_one(tmp_path):
         part.write_text("")
     modes = {(tmp_path / name).stat().st_mode for name in ("plain", "ours")}
     assert len(modes) == 1
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links and permissions of POSIX")
+def test_a_link_and_permissions_are_kept(tmp_path):
+    """The link was replaced, and its file left as it was; private files became readable by all."""
+    file, link = tmp_path / "archive" / "trial.csv", tmp_path / "trial.csv"
+    file.parent.mkdir()
+    file.write_text("old")
+    file.chmod(0o600)
+    link.symlink_to(file)
+    with replacing(link) as part:
+        part.write_text("new")
+    assert link.is_symlink()
+    assert file.read_text() == "new"
+    assert file.stat().st_mode & 0o777 == 0o600

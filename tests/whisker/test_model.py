@@ -334,6 +334,28 @@ def test_radii_that_contradict_each_other_or_the_length(properties, message):
         Whisker.straight(0.04, **properties)
 
 
+@pytest.mark.parametrize(
+    ("properties", "message"),
+    [
+        ({"youngs_modulus": 200e3, "poisson_ratio": 0.29}, "is it in MPa"),
+        ({"base_stiffness": (177.0, 177.0)}, "so that the base is rigid: is it in µN·m"),
+    ],
+)
+def test_properties_of_possible_size_in_other_units_are_questioned(properties, message):
+    """Steel in MPa would be as soft as silicone, and a base in µN·m would be rigid."""
+    with pytest.warns(UserWarning, match=message):
+        Whisker.straight(0.04, **properties)
+    with pytest.warns(UserWarning, match=message) as caught:
+        other = Whisker.straight(0.04).with_properties(**properties)
+    assert caught[0].filename == __file__
+    other.with_properties(name="as before")
+
+
+def test_soft_silicone_and_a_compliant_base_are_not_questioned():
+    Whisker.straight(0.04, youngs_modulus=200e3, poisson_ratio=0.49)
+    Whisker.straight(0.04, base_stiffness=(177e-6, 177e-6))
+
+
 def test_a_coefficient_per_millimetre_is_questioned():
     """As publications state it: 0.0233 per mm is 23.3 per m."""
     with pytest.warns(UserWarning, match="is it per mm, as in the literature"):

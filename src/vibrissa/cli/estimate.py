@@ -12,7 +12,7 @@ import numpy as np
 
 import vibrissa as vb
 from vibrissa.cli import inputs
-from vibrissa.cli.options import Method, numbers, refuse, with_options
+from vibrissa.cli.options import Method, free, numbers, refuse, with_options
 from vibrissa.cli.signals import SourceOptions, described
 from vibrissa.cli.terminal import Tell, progress_bars, remark, shown
 from vibrissa.deferred import xr
@@ -271,7 +271,10 @@ def estimate(
     swept = sensor is not None and vb.io.is_netcdf(sensor)
     both = (*vb.io.NETCDF, *vb.io.CSV)
     vb.io.check_writable(target, both if added or swept else vb.io.CSV)
-    inputs.free_beside(signals, [target], force)
+    if added:
+        inputs.free_beside(signals, [target], force)
+    else:
+        free([target], force)
     if known.around is not None:
         known.check(how, weight)
         if sensor is not None:

@@ -93,6 +93,7 @@ def with_options(output: str = "") -> Callable[[Verb], Verb]:
 
         @wraps(verb)
         def called(**values: Any) -> None:
+            _spare_inputs(values)
             verb(**_filled({one.name: hints[one.name] for one in given}, values))
 
         called.__annotations__ = {one.name: one.annotation for one in flat}
@@ -157,6 +158,27 @@ def numbers(text: str, names: Sequence[str], option: str) -> list[float]:
     if len(values) != len(names) or not all(map(math.isfinite, values)):
         raise ValueError(f"{option} is {text!r}; {','.join(names)} are needed")
     return values
+
+
+# Options that name files to write, and arguments to which some verbs add a stage.
+_WRITTEN, _EXTENDED = ("target", "csv", "events"), ("recording", "signals")
+
+
+def _spare_inputs(values: Mapping[str, Any]) -> None:
+    """Raise ValueError if a result would replace a file that is read, also with --force."""
+    for name in _WRITTEN:
+        path = values.get(name)
+        if path is None or not path.is_file():
+            continue
+        for other, value in values.items():
+            read = value if isinstance(value, list | tuple) else [value]
+            files = [one for one in read if isinstance(one, Path) and one.is_file()]
+            extended = name == "target" and other in _EXTENDED and vb.io.is_netcdf(path)
+            if other in _WRITTEN or extended or not any(path.samefile(one) for one in files):
+                continue
+            raise ValueError(
+                f"{path} is read, and would be replaced by the result: state another file"
+            )
 
 
 def free(files: Iterable[Path], force: bool) -> None:

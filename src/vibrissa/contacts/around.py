@@ -109,7 +109,7 @@ def estimate_around(
     wrench = np.concatenate([f, m], axis=-1).reshape(-1, 6)
     n, d = len(wrench), discretize(whisker)
     flat = wrench / np.repeat([d.force, d.moment], 3)
-    sensor = SensorNoise.of(noise, WRENCH)
+    sensor = SensorNoise.of(noise, WRENCH, whisker=whisker)
     out = {
         "object_shift": np.full((n, 3), np.nan),
         "object_shift_covariance": np.full((n, 3, 3), np.nan),

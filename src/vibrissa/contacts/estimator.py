@@ -107,7 +107,7 @@ class Estimator:
         given = using.replace(",", " ").split() if isinstance(using, str) else using
         order = [selection([name], least=1)[0] for name in given]
         errors = common_errors(stiffness_sigma, gain_sigma, mixing_sigma)
-        sensor = sensor_noise(noise, names, errors)
+        sensor = sensor_noise(noise, names, errors, contact_map.whisker)
         places = [order.index(name) for name in names]
         self._order: list[int] | None = places if places != sorted(places) else None
         if felt_above > 0.0 and sensor is None:

@@ -494,7 +494,7 @@ def estimate_jointly(
     With rotations of the base (..., 3, 3), gravity is that of the laboratory frame.
     """
     names = WRENCH if using == "wrench" else selection(using)
-    sensor = sensor_noise(noise, names, errors)
+    sensor = sensor_noise(noise, names, errors, whisker)
     if names == WRENCH and "force" in signals and "moment" in signals:
         force, moment, dims, coords = labelled_wrench(signals["force"], signals["moment"])
         values = np.concatenate([force, moment], axis=-1)

@@ -247,7 +247,7 @@ def second_contact(
         raise ValueError("centerline_sigma is of a centerline, and none is given")
     f, m, dims, coords = wrench_on(whisker, force, moment)
     errors = common_errors(stiffness_sigma, gain_sigma, mixing_sigma)
-    sensor = SensorNoise.of(noise, WRENCH, errors)
+    sensor = SensorNoise.of(noise, WRENCH, errors, whisker)
     test = _Test(whisker, sensor, friction)
     wrench = np.concatenate([f, m], axis=-1).reshape(-1, 6)
     rows = np.flatnonzero(np.isfinite(wrench).all(axis=1) & wrench.any(axis=1))

@@ -217,7 +217,7 @@ def _located(
     compliance_sigma: float,
 ) -> Contacts:
     refuse_tip(prior, "the wrench shows forces of any direction at the tip by itself")
-    sensor = sensor_noise(noise, WRENCH, errors)
+    sensor = sensor_noise(noise, WRENCH, errors, whisker)
     channels = Channels(WRENCH, WRENCH)
     base = soft_base(whisker, steps, channels, sensor, compliance_sigma, friction=True)
     f, m, dims, coords = labelled

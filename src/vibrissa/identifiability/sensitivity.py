@@ -95,8 +95,9 @@ def sensitivity(
     'm/(N m)'
     """
     names = selection(triplet, exactly=3)
-    sensor = None if noise is None else SensorNoise.of(noise, names)
     chosen = chosen_contacts(contact_map, at, names)
+    whisker = contact_map.whisker
+    sensor = None if noise is None else SensorNoise.of(noise, names, whisker=whisker)
     d = contact_map.chart.discretization
     out = _contact_variables(contact_map, chosen)
     point = chosen.values[:, 3:] * d.length
@@ -216,8 +217,9 @@ def best_triplet(
     chosen_names = [selection(triplet, exactly=3) for triplet in triplets]
     if not chosen_names:
         raise ValueError("at least one triplet is needed; got none")
-    sensor = SensorNoise.of(noise, tuple(dict.fromkeys(n for t in chosen_names for n in t)))
     chosen = chosen_contacts(contact_map, at)
+    names = tuple(dict.fromkeys(n for t in chosen_names for n in t))
+    sensor = SensorNoise.of(noise, names, whisker=contact_map.whisker)
     errors = np.stack(
         [_predicted_errors(contact_map, chosen, names, sensor) for names in chosen_names]
     )

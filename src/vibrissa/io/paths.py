@@ -60,6 +60,8 @@ def check_readable(path: str | PathLike[str]) -> Path:
         raise FileNotFoundError(f"there is no file {file}")
     if file.is_dir():
         raise ValueError(f"{file} is a folder; the name of a file is needed")
+    if not file.is_file():
+        raise ValueError(f"{file} is a pipe or device; save its contents to a file first")
     if file.stat().st_size == 0:
         raise ValueError(f"{file} is empty")
     return Path(path)
@@ -102,8 +104,13 @@ _PART = re.compile(rf"\..+{re.escape(_MARK)}[a-z0-9_]{{8}}(\.[^.]*)?")
 
 @contextmanager
 def replacing(path: str | PathLike[str]) -> Iterator[Path]:
-    """Context with a temporary path, which replaces the file at the end."""
+    """Context with a temporary path, which replaces the file at the end.
+
+    A link still leads to the file that is replaced.
+    """
     path = check_writable(path)
+    if path.is_symlink():
+        path = path.resolve()
     _remove_left(path.parent)
     with _failing(path):
         # Some writers depend on the ending.
@@ -118,7 +125,7 @@ def replacing(path: str | PathLike[str]) -> Iterator[Path]:
     try:
         with _failing(path):
             yield part
-            _finish(part)
+            _finish(part, path)
             part.replace(path)
     finally:
         if _LOCKS:
@@ -139,14 +146,17 @@ def _failing(path: Path) -> Iterator[None]:
         raise OSError(error.errno, f"{path} cannot be written: {reason}{left}") from error
 
 
-def _finish(part: Path) -> None:
-    """Flush the file to disk, which shows a lack of space, and set the default permissions."""
+def _finish(part: Path, path: Path) -> None:
+    """Flush the file to disk, which shows a lack of space, and set its permissions.
+
+    They are those of the file that it replaces, or else the default.
+    """
     with part.open("r+b") as file:
         os.fsync(file.fileno())
     # A temporary file is readable by its owner only.
     mask = os.umask(0)
     os.umask(mask)
-    part.chmod(0o666 & ~mask)
+    part.chmod(path.stat().st_mode & 0o777 if path.exists() else 0o666 & ~mask)
 
 
 def held(handle: int) -> bool:

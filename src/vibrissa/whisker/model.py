@@ -13,7 +13,7 @@ whisker lies as close as possible to the x–y plane and bends toward +y.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Unpack
@@ -45,6 +45,7 @@ from vibrissa.whisker.section import (
     YOUNGS_MODULUS,
     Properties,
     assumptions,
+    doubtful_units,
     kept_notes,
     length_faults,
     material_faults,
@@ -511,7 +512,16 @@ class Whisker:
             notes = renewed_notes(kept_notes(self.notes, properties), self.length, section)
             notes += radius_notes(self.length, section, stated)
             whisker = replace(whisker, section_radius=section, breaks=breaks, notes=notes)
-        return replace(whisker, notes=kept_notes(whisker.notes, holding), **holding)
+        whisker = replace(whisker, notes=kept_notes(whisker.notes, holding), **holding)
+        return whisker._questioned(holding, stacklevel=3)
+
+    def _questioned(self, stated: Container[str], stacklevel: int) -> Whisker:
+        """Return this whisker after a warning of properties that seem to be in other units."""
+        bending = self.base_bending_stiffness / self.length
+        properties = self.youngs_modulus, self.poisson_ratio, self.base_stiffness
+        for doubt in doubtful_units(stated, *properties, bending):
+            warnings.warn(doubt, stacklevel=stacklevel)
+        return self
 
     def trimmed(self, length: float) -> Whisker:
         """Cut off the tip, without a change of shape or radius of the rest.
@@ -658,6 +668,7 @@ def _assemble(
         raise ValueError("no whisker: " + "; ".join(faults))
     section, holding, remarks = parse_properties(length, properties)
     breaks = _merge_breaks(stated, [*curvature.breaks(), *section.breaks()], length)
-    return Whisker(
+    whisker = Whisker(
         length, curvature, section, pose=pose, breaks=breaks, notes=notes + remarks, **holding
     )
+    return whisker._questioned(holding, stacklevel=4)

@@ -8,7 +8,7 @@ By default r decreases linearly from base to tip. Sampled radii are interpolated
 between the jumps and kinks found in them (`vibrissa.whisker.profile`).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from typing import TypedDict, cast
 
 import numpy as np
@@ -93,6 +93,9 @@ _BEYOND = 10.0  # samples up to this many lengths may belong to a whisker before
 # Ending of a note on an assumed property.
 ASSUMED = " assumed, not measured"
 _RADIUS_ASSUMED = f"radius{ASSUMED}"
+# A modulus, Pa, below which materials are nearly incompressible, and their least Poisson's ratio;
+# stiffness of a base, relative to EI/L, that no whisker turns noticeably.
+_GEL, _INCOMPRESSIBLE, _RIGID = 1e6, 0.45, 1e6
 _NOTED = {"youngs_modulus": "Young's modulus", "poisson_ratio": "Poisson's ratio"}
 
 
@@ -120,6 +123,32 @@ def parse_properties(
     if faults:
         raise ValueError("no whisker: " + "; ".join(faults))
     return section, holding, radius_notes(length, section, stated)
+
+
+def doubtful_units(
+    stated: Container[str],
+    youngs_modulus: float,
+    poisson_ratio: float,
+    base_stiffness: tuple[float, float] | None,
+    bending: float,
+) -> list[str]:
+    """Doubts about a modulus and a base stiffness that are possible, but are rather in other units.
+
+    The base stiffness is compared with EI/L, `bending`.
+    """
+    doubts = []
+    if "youngs_modulus" in stated and youngs_modulus < _GEL and poisson_ratio < _INCOMPRESSIBLE:
+        doubts.append(
+            f"youngs_modulus is {youngs_modulus:.4g} Pa, as of a gel or soft silicone, which have "
+            f"a poisson_ratio above {_INCOMPRESSIBLE:g}: is it in MPa? Steel has 200e9 Pa"
+        )
+    least = 0.0 if base_stiffness is None else min(base_stiffness)
+    if "base_stiffness" in stated and least > _RIGID * bending:
+        doubts.append(
+            f"base_stiffness is {least:.4g} N·m/rad, {least / bending:.0e} times that of the "
+            "whisker, so that the base is rigid: is it in µN·m?"
+        )
+    return doubts
 
 
 def assumptions(length: float, section: Profile, properties: Properties) -> tuple[str, ...]:

@@ -205,7 +205,7 @@ def estimate(
 ) -> Contacts:
     """Find all frictionless contacts of a whisker that explain measured signals."""
     names = selection(using)
-    sensor = sensor_noise(noise, names, errors)
+    sensor = sensor_noise(noise, names, errors, contact_map.whisker)
     values, dims, coords = measured(signals, names)
     check_signals(values, names)
     d = contact_map.chart.discretization

@@ -18,6 +18,8 @@ too has rank five.
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -32,6 +34,7 @@ from vibrissa.numerics import Array, numbers, relative
 from vibrissa.quantities import attributes
 from vibrissa.sensors import Sensor
 from vibrissa.signals import SIGNALS, wrench_derivatives
+from vibrissa.whisker import Whisker
 
 #: Relative error of force and moment components, as a share of |F| and |M|, if no noise is stated.
 TRUSTED = 0.01
@@ -44,6 +47,9 @@ INDISTINCT = NormalDist().inv_cdf(1.0 - 0.5 * _RARE) ** 2
 Noise: TypeAlias = Mapping[str, float] | ArrayLike
 
 
+# Force and moment, in EI/L² and EI/L, that stable contacts beyond 0.3 L do not reach; and noise, in
+# the same units, below that of any sensor.
+_LARGEST, _FAINTEST = {"F": 100.0, "M": 10.0}, 1e-8
 _NONE = np.zeros((0, 6, 7))
 
 
@@ -56,8 +62,24 @@ class SensorNoise:
     errors: Array = field(default_factory=_NONE.copy)  # (n, 6, 7), as of `common_errors`
 
     @classmethod
-    def of(cls, noise: Noise, names: tuple[str, ...], errors: Array = _NONE) -> SensorNoise:
-        """Read and check the noise of signals, and errors (n, 6, 7) that all measurements share."""
+    def of(
+        cls,
+        noise: Noise,
+        names: tuple[str, ...],
+        errors: Array = _NONE,
+        whisker: Whisker | None = None,
+    ) -> SensorNoise:
+        """Read and check the noise of signals, and errors (n, 6, 7) that all measurements share.
+
+        If the whisker is stated, noise that is far too large or small for it is questioned.
+        """
+        out = cls._read(noise, names, errors)
+        if whisker is not None:
+            _question(out, names, whisker)
+        return out
+
+    @classmethod
+    def _read(cls, noise: Noise, names: tuple[str, ...], errors: Array) -> SensorNoise:
         if isinstance(noise, Mapping):
             missing = [name for name in names if name not in noise]
             if missing:
@@ -161,16 +183,42 @@ def common_covariance(errors: Array, gradients: Array, wrenches: Array) -> Array
 
 
 def sensor_noise(
-    noise: Noise | None, names: tuple[str, ...], errors: Array = _NONE
+    noise: Noise | None, names: tuple[str, ...], errors: Array, whisker: Whisker
 ) -> SensorNoise | None:
-    """Read the noise, if any is stated."""
+    """Read the noise of measurements of a whisker, if any is stated."""
     if noise is not None:
-        return SensorNoise.of(noise, names, errors)
+        return SensorNoise.of(noise, names, errors, whisker)
     if len(errors):
         raise ValueError(
             "the uncertainty of stiffness, gain and mixing adds to that of a sensor: give its noise"
         )
     return None
+
+
+def _question(sensor: SensorNoise, names: tuple[str, ...], whisker: Whisker) -> None:
+    """Warn of noise above all signals of this whisker, or below that of any sensor."""
+    length, stiffness = whisker.length, whisker.base_bending_stiffness
+    for name in names:
+        kind, axes = name[0], {"T": "yz", "B": "yz", "D": ""}.get(name[1], name[1])
+        if sensor.deviations is not None:
+            sigma = sensor.deviations[name] if axes else 0.0
+        else:
+            assert sensor.wrench is not None
+            rows = [3 * "FM".index(kind) + "xyz".index(axis) for axis in axes]
+            sigma = math.sqrt(max(np.diag(sensor.wrench)[rows], default=0.0))
+        natural = stiffness / length ** (2 if kind == "F" else 1)
+        if sigma > _LARGEST[kind] * natural:
+            fault = "larger than all signals of this whisker"
+        elif 0.0 < sigma < _FAINTEST * natural:
+            fault = "smaller than any sensor's"
+        else:
+            continue
+        warnings.warn(
+            f"the noise of {name}, {sigma:.2g} {'N' if kind == 'F' else 'N·m'}, is {fault}: is it "
+            "a standard deviation in N and N·m, or a covariance in N² and (N·m)²?",
+            stacklevel=5,
+        )
+        return
 
 
 def ellipsoids(covariance: Array, dims: tuple[str, ...], shape: tuple[int, ...]) -> xr.Dataset:

@@ -166,6 +166,7 @@ def soft(whisker, factor):
     return whisker.with_properties(base_stiffness=(stiffness, 0.7 * stiffness))
 
 
+@pytest.mark.filterwarnings("ignore:base_stiffness is")
 @few
 @given(data=st.data())
 def test_a_stiffer_base_comes_ever_nearer_to_a_clamp(gamma, loads, data):

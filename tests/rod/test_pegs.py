@@ -325,6 +325,7 @@ def test_a_missing_peg_stops_nobody(parabola):
     assert (next_frame.status[[0, 2]] != vb.Status.MISSING).all()
 
 
+@pytest.mark.filterwarnings("ignore:base_stiffness is")
 def test_a_compliant_base_gives_way_to_a_peg(parabola):
     stiffness = parabola.base_bending_stiffness / parabola.length
     peg = vb.PegContact([0.025, 0.0065, 0], Z, 1e-3, side=[0, 1, 0])

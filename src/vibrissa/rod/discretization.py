@@ -35,6 +35,9 @@ _TURN_PER_STEP = 0.08
 _TAPER_EXPONENT = 0.4
 # Least number of steps, of STEPS, over which the radius falls by a factor e.
 _STEPS_PER_CHANGE = 6.0
+# Radius beyond a point over that at it, above which it is a hinge; and mean excess compliance of
+# hinges, over that of the rod beyond them, at which they take half of the turning.
+_HINGE, _SPREAD = 1.25, 0.3
 # Steps of a compliant base, for each unit of its compliance in L/EI; a soft one turns by up to π.
 _JOINT_STEPS, _LEAST_JOINT_STEPS, _MOST_JOINT_STEPS = 40, 4, 16
 _ORDER = 4
@@ -197,14 +200,17 @@ def _nodes(whisker: Whisker, steps: int) -> Array:
     middle = 0.5 * (s[1:] + s[:-1]) * whisker.length
     turning = np.linalg.norm(whisker.curvature(middle), axis=-1) * whisker.length
     steps = max(steps, int(np.ceil(turning.mean() / _TURN_PER_STEP)))
-    density = (whisker.radius(middle) / whisker.base_radius) ** -_TAPER_EXPONENT
+    radius = whisker.radius(middle)
+    density = (radius / whisker.base_radius) ** -_TAPER_EXPONENT
+    steep = np.abs(np.diff(np.log(radius)))
+    ends = np.array([0.0, *(np.array(whisker.breaks) / whisker.length), 1.0])
+    steep[np.searchsorted(middle, ends[1:-1] * whisker.length) - 1] = 0.0  # possible jumps
+    hinged = _hinged(radius, np.append(steep, 0.0))
+    steps, density = int(np.ceil(steps * (1.0 + hinged.sum()))), density / density.sum() + hinged
     cumulated = np.concatenate([[0.0], np.cumsum(density)])
     cumulated /= cumulated[-1]
-    ends = np.array([0.0, *(np.array(whisker.breaks) / whisker.length), 1.0])
     edges = np.interp(ends, s, cumulated)
     # A short, steep piece of a rod with kinks would otherwise have too few steps.
-    steep = np.abs(np.diff(np.log(density))) / _TAPER_EXPONENT
-    steep[np.searchsorted(middle, ends[1:-1] * whisker.length) - 1] = 0.0  # possible jumps
     changes = np.diff(np.interp(ends * whisker.length, middle[1:], np.cumsum(steep)))
     shares = np.maximum(np.diff(edges), changes * _STEPS_PER_CHANGE / STEPS)
     counts = np.maximum(1, np.ceil(shares * steps - 1e-9)).astype(int)
@@ -216,6 +222,20 @@ def _nodes(whisker: Whisker, steps: int) -> Array:
     for piece, kink in zip(pieces[1:], whisker.breaks, strict=True):
         piece[0] = kink / whisker.length
     return np.concatenate([*pieces, [1.0]])
+
+
+def _hinged(radius: Array, steep: Array) -> Array:
+    """Additional steps, over those of a rod without, where a rod is thinner than beyond.
+
+    A strong load turns such a hinge as far as it would turn the whole rod.
+    """
+    beyond = np.maximum.accumulate(radius[::-1])[::-1]
+    slack: Array = np.maximum((beyond / radius / _HINGE) ** 4 - 1.0, 0.0)
+    if slack.any():
+        turns = slack.mean() / (slack.mean() + _SPREAD)
+        changes = np.where(slack > 0.0, steep, 0.0) * (_STEPS_PER_CHANGE / STEPS)
+        slack = turns * slack / slack.sum() + changes
+    return slack
 
 
 def _scaled(whisker: Whisker, s: Array) -> Array:

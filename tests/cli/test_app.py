@@ -228,3 +228,21 @@ except KeyboardInterrupt as stopped:
     )
     assert done.stdout == f"{error}\n"
     assert not done.stderr
+
+
+def test_ctrl_c_while_modules_are_imported_ends_without_a_traceback():
+    start = """
+import importlib.abc, sys
+class Interrupt(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name == "vibrissa.cli.app":
+            raise KeyboardInterrupt
+sys.meta_path.insert(0, Interrupt())
+from vibrissa.cli import main
+main()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", start], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 130
+    assert done.stderr == ""

@@ -255,6 +255,24 @@ def test_contacts_come_back(tmp_path):
         assert "units" in again[name].attrs
 
 
+def test_estimates_are_written_as_they_are(gamma_map, tmp_path):
+    """They had to be taken apart into columns, and the messages did not help with it."""
+    path = tmp_path / "contacts.csv"
+    signals = {"Fx": [-65e-6, -60e-6], "MB": [1.6e-6, 1.5e-6], "MD": [1.88, 1.9]}
+    noise = {"Fx": 1e-6, "MB": 2e-8, "MD": 0.01}
+    found = gamma_map.estimate(signals, noise=noise)
+    for written in (found, found.to_dataset()):
+        save_contacts(path, written)
+        again = load_contacts(path)
+        np.testing.assert_array_equal(np.column_stack([again[n] for n in "xyz"]), found.point)
+        np.testing.assert_allclose(again["sigma_y"], np.sqrt(found.covariance[:, 1, 1]))
+        np.testing.assert_array_equal(again["status"], found.status)
+        np.testing.assert_array_equal(again["time"], [0.0, 1.0])
+    one = gamma_map.estimate({name: values[0] for name, values in signals.items()})
+    with pytest.raises(ValueError, match="one contact in each row"):
+        save_contacts(path, one)
+
+
 def test_columns_that_are_not_known_are_missing(tmp_path):
     path = tmp_path / "contacts.csv"
     save_contacts(path, contacts().drop_vars(["sigma_x", "r"]))

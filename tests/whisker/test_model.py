@@ -40,6 +40,7 @@ def integrated(curvature, s):
     return found.y[:3].T, found.y[3:].T.reshape(-1, 3, 3)
 
 
+@pytest.mark.filterwarnings("ignore:the curvature is")
 @given(st.floats(-200.0, 200.0), st.floats(1e-3, 0.3))
 def test_constant_curvature_is_a_circle(kappa, length):
     whisker = Whisker.from_curvature(length, lambda s: (0.0, 0.0, kappa))
@@ -332,6 +333,18 @@ def test_two_samples_of_a_radius_are_a_cone():
 def test_radii_that_contradict_each_other_or_the_length(properties, message):
     with pytest.raises(ValueError, match=message):
         Whisker.straight(0.04, **properties)
+
+
+def test_a_curvature_per_mm_is_questioned():
+    with pytest.warns(UserWarning, match=r"by less than 0.046°: is it per mm"):
+        Whisker.from_curvature(0.04, lambda s: np.array([0.0, 0.0, 0.02]))
+
+
+def test_a_material_of_several_numbers_is_refused_with_its_name():
+    with pytest.raises(ValueError, match=r"youngs_modulus is \[.*\]; one number is needed"):
+        Whisker.straight(0.04, youngs_modulus=[3e9, 2e9])
+    with pytest.raises(ValueError, match=r"poisson_ratio is '0\.3'; one number is needed"):
+        Whisker.straight(0.04, poisson_ratio="0.3")
 
 
 @pytest.mark.parametrize(

@@ -4,12 +4,21 @@ Options and printed values are in mm, µN, µN·m and degrees; files are in SI u
 """
 
 import os
+import sys
 
 # Set before NumPy is loaded: for small matrices, threads of linear algebra mostly wait, and take
 # cores from the threads over which rows are distributed.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from vibrissa.cli.app import main
+
+def main() -> None:
+    """Run the command line."""
+    try:
+        from vibrissa.cli.app import main as run
+    except KeyboardInterrupt:  # while modules are imported
+        sys.exit(130)
+    run()
+
 
 __all__ = ["main"]
 __dir__ = __all__.copy

@@ -32,6 +32,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import zip_longest
 from os import PathLike
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -325,8 +326,16 @@ _OPTIONAL = (*_AROUND, "one_contact", "friction", "onset_time", "onset_sigma")
 _FLAGS: dict[str, type[Status | Event]] = {"event": Event}
 
 
+@runtime_checkable
+class Estimated(Protocol):
+    """Estimated contacts, `Contacts`."""
+
+    def to_dataset(self) -> xr.Dataset:
+        """Contacts with all their variables."""
+
+
 def save_contacts(
-    path: str | PathLike[str], contacts: xr.Dataset | Mapping[str, ArrayLike]
+    path: str | PathLike[str], contacts: xr.Dataset | Mapping[str, ArrayLike] | Estimated
 ) -> None:
     """Write contact points as CSV, with full precision.
 
@@ -334,8 +343,9 @@ def save_contacts(
     ----------
     path : str or path
         Path of the table; an existing file is replaced.
-    contacts : xarray.Dataset, or mapping of name to array (n,)
-        Dim time; a variable for each column. Columns that it lacks are written as missing, but
+    contacts : Contacts, xarray.Dataset, or mapping of name to array (n,)
+        Estimated contacts of measurements in a row, numbered from 0 where they have no time; or
+        a variable for each column, dim time. Columns that it lacks are written as missing, but
         ``time``, ``x``, ``y``, ``z`` and ``status`` must be there.
 
     Raises
@@ -343,6 +353,10 @@ def save_contacts(
     ValueError
         If a needed variable is not there, or one has another dim.
     """
+    if isinstance(contacts, Estimated):
+        contacts = contacts.to_dataset()
+    if isinstance(contacts, xr.Dataset) and "contact_point" in contacts and "x" not in contacts:
+        contacts = _of_estimates(contacts)
     numbers = (*NUMBERS, *(name for name in _OPTIONAL if name in contacts))
     flags = (*(name for name in _FLAGS if name in contacts), "status")
     columns = _columns(contacts, "contacts", (*numbers, *flags), "time", ("status",))
@@ -353,6 +367,22 @@ def save_contacts(
     ]
     rows = ([*row, *word] for row, *word in zip(table, *words, strict=True))
     write_table(path, (*numbers, *flags), rows)
+
+
+def _of_estimates(contacts: xr.Dataset) -> dict[str, ArrayLike]:
+    """Columns of estimated contacts (`Contacts.to_dataset`), whisker frame."""
+    point = contacts["contact_point"]
+    if point.ndim != 2:
+        raise ValueError(
+            f"a table has one contact in each row; got contacts of shape {point.shape[:-1]}"
+        )
+    variance = np.diagonal(contacts["covariance"].values, axis1=-2, axis2=-1)
+    out = dict(zip("xyz", point.values.T, strict=True))
+    out |= {f"sigma_{axis}": np.sqrt(v) for axis, v in zip("xyz", variance.T, strict=True)}
+    time = contacts["time"].values if "time" in contacts else np.arange(float(len(point)))
+    kept = {name: contacts[name].values for name in ("r", "theta", "phi", "status")}
+    friction = np.full(len(point), float(contacts.attrs["friction"]))
+    return {"time": time, **out, **kept, "friction": friction}
 
 
 def _columns(

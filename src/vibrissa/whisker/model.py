@@ -314,6 +314,14 @@ class Whisker:
                 "it has kinks or jumps that should be stated as breaks",
             )
         whisker = _assemble(length, profile, Pose(), properties, notes)
+        most = np.abs(whisker.curvature(np.linspace(0.0, length, 101))).max()
+        if STRAIGHT < most * length < 2.0 * _SLIGHT:
+            warnings.warn(
+                f"the curvature is {most:.3g} per m at most, which bends a whisker of "
+                f"{1e3 * length:.4g} mm by less than {np.degrees(most * length):.2g}°: is it per "
+                "mm (multiply by 1000)?",
+                stacklevel=2,
+            )
         if not whisker.is_straight and abs(whisker._proximal_roll()) > np.pi / 2:
             note = "its proximal part bends toward −y in the frame its curvature was stated in"
             whisker = replace(whisker, notes=(*whisker.notes, note))

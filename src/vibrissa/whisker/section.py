@@ -239,7 +239,14 @@ def material_faults(
     density: float | None,
 ) -> list[str]:
     """List the faults of a material and of the base stiffness."""
-    faults = []
+    given = {"youngs_modulus": youngs_modulus, "poisson_ratio": poisson_ratio, "density": density}
+    faults = [
+        f"{name} is {value!r}; one number is needed"
+        for name, value in given.items()
+        if value is not None and not (np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf")
+    ]
+    if faults:
+        return faults
     if not (np.isfinite(youngs_modulus) and youngs_modulus > 0.0):
         faults.append(f"youngs_modulus is {youngs_modulus!r} Pa; it must be positive")
     elif not _SOFTEST <= youngs_modulus <= _HARDEST:

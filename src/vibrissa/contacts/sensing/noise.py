@@ -215,7 +215,8 @@ def _question(sensor: SensorNoise, names: tuple[str, ...], whisker: Whisker) -> 
             continue
         warnings.warn(
             f"the noise of {name}, {sigma:.2g} {'N' if kind == 'F' else 'N·m'}, is {fault}: is it "
-            "a standard deviation in N and N·m, or a covariance in N² and (N·m)²?",
+            "in another unit (N and N·m in Python, µN and µN·m on the command line), or a variance "
+            "in place of a standard deviation or the reverse?",
             stacklevel=5,
         )
         return

@@ -355,7 +355,8 @@ def save_contacts(
     """
     if isinstance(contacts, Estimated):
         contacts = contacts.to_dataset()
-    if isinstance(contacts, xr.Dataset) and "contact_point" in contacts and "x" not in contacts:
+    # Columns in a mapping need no xarray, which takes long to import.
+    if "x" not in contacts and isinstance(contacts, xr.Dataset) and "contact_point" in contacts:
         contacts = _of_estimates(contacts)
     numbers = (*NUMBERS, *(name for name in _OPTIONAL if name in contacts))
     flags = (*(name for name in _FLAGS if name in contacts), "status")

@@ -141,6 +141,18 @@ def test_a_whisker_that_goes_on_as_a_hair_before_its_base_is_taken_and_not_the_n
     assert trace.line[-1, 0] > 150.0
 
 
+def test_a_wire_that_begins_at_the_base_is_not_the_whisker(row):
+    """It is longer than the whisker, and as near to the click."""
+    frames, truth = row
+    base = truth[0, 5, 0]
+    y, x = np.mgrid[: frames[0].shape[0], : frames[0].shape[1]]
+    away = (y - base[1] + 4.0 + 0.8 * (x - base[0])) / np.hypot(1.0, 0.8)
+    wire = np.where(x > 54, 1.0 - 0.25 * np.exp(-0.5 * (away / 1.2) ** 2), 1.0)
+    shown = [(frame * wire).astype(np.uint8) for frame in frames]
+    (traces,) = trace_video(shown, [base + np.array([1.5, -2.5])])
+    assert (names([traces], truth) == 5).all()
+
+
 def test_nothing_is_found_in_nothing():
     frame = np.clip(np.random.default_rng(0).normal(180.0, 3.0, (90, 120)), 0, 255)
     followers = [start_at((20.0, 30.0)), start_at((20.0, 40.0))]

@@ -17,7 +17,6 @@ motion of the whole row, and keep their bend. Costs are negative log-likelihoods
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import combinations, pairwise
 from typing import Any, NamedTuple
@@ -27,7 +26,7 @@ from numpy.typing import ArrayLike
 
 from vibrissa.cameras import Camera
 from vibrissa.io import Frame
-from vibrissa.numerics import Array, Mask, inlined, kernel, without_blas_threads
+from vibrissa.numerics import Array, Mask, inlined, kernel, vectorised, without_blas_threads
 from vibrissa.tracking.trace.curves import smoothed
 from vibrissa.tracking.trace.ends import prolonged, traced
 from vibrissa.tracking.trace.identity import Seen, Step, Ways, cheapest_sequence
@@ -54,7 +53,7 @@ _BASE_MOST, _TIP_MOST, _BEND_MOST = 6.0, 1.0, 0.2
 _STRONGEST, _BRIGHTEST = 5.0, 1.0  # strengths at which darkness and brightness saturate
 _WORTH = 0.1  # likelihood that is gained by a point, for each unit of strength
 _CANDIDATES, _COMBINED = 6, 2e5  # largest number for a whisker, and of their combinations
-_LIKE = 0.5  # smallest mean strength of a candidate
+_SHOWN = 0.8  # smallest mean strength of a candidate
 _DISTINCT = 7.0  # difference of tip or middle from which candidates are different, pixels
 # Standard deviations of a base from its click, compared with the mean of the row, and of that mean
 # from its expected motion, pixels.
@@ -193,19 +192,21 @@ def _guides(cameras: tuple[Camera, Camera], row: Sequence[Trace]) -> list[_Guide
     """
     whole = [len(trace.line) for trace in row if len(trace.line) and trace.tip_seen]
     usual = int(np.percentile(whole, _USUAL)) if whole else 0
-    guides: list[_Guide | None] = []
+    lines, ends = list[Array](), list[bool]()
     for trace in row:
-        if len(trace.line) < 2:
-            guides.append(None)
-            continue
         line = trace.line
-        if not trace.tip_seen and usual > len(line):
-            line = prolonged(line, _BENDING, usual - len(line))
-        s = arc_lengths(line)
-        wanted = np.linspace(0.0, s[-1], max(int(s[-1] / _SPACING), 2 * _LAST) + 1)
-        points, along = epipolar_lines(interpolated(wanted, s, line), *cameras)
-        guides.append(_Guide(points, along, trace.tip_seen))
-    return guides
+        if len(line) > 1:
+            if not trace.tip_seen and usual > len(line):
+                line = prolonged(line, _BENDING, usual - len(line))
+            s = arc_lengths(line)
+            wanted = np.linspace(0.0, s[-1], max(int(s[-1] / _SPACING), 2 * _LAST) + 1)
+            line = interpolated(wanted, s, line)
+        lines.append(line)
+        ends.append(trace.tip_seen)
+    points, along = epipolar_lines(np.concatenate([*lines, np.empty((0, 2))]), *cameras)
+    parts = np.cumsum([len(line) for line in lines])[:-1]
+    each = zip(np.split(points, parts), np.split(along, parts), ends, strict=True)
+    return [_Guide(*one) if len(one[0]) > 1 else None for one in each]
 
 
 def _candidates(guide: _Guide, expected: float, darkness: Image, factor: float) -> list[_Candidate]:
@@ -222,7 +223,7 @@ def _candidates(guide: _Guide, expected: float, darkness: Image, factor: float) 
     middles, found = 0.5 * tips[:, None] + bends, list[_Candidate]()
     while len(found) < _CANDIDATES:
         i, j = (int(n) for n in np.unravel_index(np.argmax(best), best.shape))
-        if best[i, j] < _WORTH * _LIKE * count:
+        if best[i, j] < _WORTH * _SHOWN * (count - 1):
             break
         k = int(np.argmax(total[:, i, j]))
         begin = begins[k]
@@ -277,7 +278,7 @@ def strength_at(darkness: Any, factor: float, x: float, y: float, dx: float, dy:
     return float(min(max(value, -_BRIGHTEST), _STRONGEST))
 
 
-@kernel
+@vectorised
 def try_parabolas(
     darkness: Any,
     factor: float,
@@ -291,25 +292,96 @@ def try_parabolas(
 ) -> None:
     """Sums of strengths along parabolas t(u), for all t at the base and the tip, and all bends.
 
-    The normal of a line is linear in the change Δt from one point to the next, so that the
-    curvature of the image across it is a parabola of Δt. Its coefficients are tabulated by t.
+    They are −∞ where a first part, of a third or more, shows nothing.
     """
-    count, far = len(points), bends[-1] + max(-tips[0], tips[-1]) + begins[-1] + 2.0
-    low, width = math.floor(expected - far), int(2.0 * far) + 2
-    table = np.zeros((count, width, 3), np.float32)
-    steps = np.zeros((count, 2))
+    count = len(points)
+    third, shares = count // 3 + 1, np.linspace(0.0, 1.0, count)
+    far = begins[-1] + max(-tips[0], tips[-1]) * shares + 2.0
+    far += 4.0 * bends[-1] * shares * (1.0 - shares)
+    table, squares = tabulated(darkness, factor, points, along, expected, far)
+    origin = 0.5 * table.shape[1]
+    # Of each parabola: t, the t before, the sum, what `add_strengths` uses, its ends and its bend.
+    work, place = np.empty((10, gains.size), np.float32), np.empty(gains.size, np.int32)
+    begin, tip, bend, number = work[7], work[8], work[9], np.empty(gains.size, np.intp)
+    left, several = 0, len(bends)
+    for a in range(len(begins)):
+        for b in range(len(tips)):
+            first = left
+            own, at = work[:, first : first + several], place[first : first + several]
+            for c in range(several):
+                own[1, c], own[2, c], own[9, c] = begins[a], 0.0, bends[c]
+            for j in range(1, third + 1):
+                u = shares[j]
+                chord, arch = begins[a] + (tips[b] - begins[a]) * u, 4.0 * u * (1.0 - u)
+                for c in range(several):
+                    own[0, c] = chord + arch * bends[c]
+                add_strengths(table[j], squares[j], origin, own, at)
+            for c in range(several):
+                if own[2, c] >= _SHOWN * third:
+                    work[:3, left] = own[:3, c]
+                    begin[left], tip[left], bend[left] = begins[a], tips[b], bends[c]
+                    number[left] = (a * len(tips) + b) * several + c
+                    left += 1
+    some, at = work[:, :left], place[:left]
+    for j in range(third + 1, count):
+        u = shares[j]
+        for c in range(left):
+            some[0, c] = begin[c] + (tip[c] - begin[c]) * u + 4.0 * u * (1.0 - u) * bend[c]
+        add_strengths(table[j], squares[j], origin, some, at)
+        for c in range(left):
+            some[2, c] = some[2, c] if some[2, c] >= _SHOWN * j else -np.inf
+    gains[:] = -np.inf
+    every = gains.reshape(-1)
+    for c in range(left):
+        every[number[c]] = some[2, c]
+
+
+@inlined
+def add_strengths(table: Any, squares: Any, origin: float, work: Any, place: Any) -> None:
+    """Add the strengths at one point, for many parabolas; loops are apart to be vectorised."""
+    t, before, total, step = work[0], work[1], work[2], work[3]
+    zero, one, two = work[4], work[5], work[6]
+    least, most = np.float32(-_BRIGHTEST), np.float32(_STRONGEST)
+    start, square, slope = np.float32(origin + 0.5), squares[0], squares[1]
+    for c in range(len(place)):
+        step[c] = t[c] - before[c]
+        place[c] = np.int32(t[c] + start)
+        before[c] = t[c]
+    for c in range(len(place)):
+        row = table[np.uint32(place[c])]
+        zero[c], one[c], two[c] = row[0], row[1], row[2]
+    for c in range(len(place)):
+        value = zero[c] + step[c] * (one[c] + step[c] * two[c])
+        value /= square + step[c] * (slope + step[c]) + np.float32(1e-9)
+        total[c] += min(max(value, least), most)
+
+
+@inlined
+def tabulated(
+    darkness: Any, factor: float, points: Any, along: Any, expected: float, far: Any
+) -> tuple[Any, Any]:
+    """Strength of the image on the epipolar lines of all points, by t and its change Δt.
+
+    The normal of a line is linear in the change from one point to the next, so that the curvature
+    of the image across it is a parabola of Δt, and so is the square of that normal. Coefficients
+    are (point, t, 3), for t up to ``far`` (point,) from the expected one, which is in the middle,
+    and (point, 2).
+    """
+    middle = int(far.max()) + 1
+    table = np.empty((len(points), 2 * middle, 4), np.float32)
+    squares = np.zeros((len(points), 2), np.float32)
     last_row, last_column = darkness.shape[0] - 2, darkness.shape[1] - 2
-    for j in range(1, count):
+    for j in range(1, len(points)):
         gx, gy = points[j, 0] - points[j - 1, 0], points[j, 1] - points[j - 1, 1]
         ax, ay = along[j, 0], along[j, 1]
-        steps[j, 0], steps[j, 1] = gx * gx + gy * gy, 2.0 * (gx * ax + gy * ay)
-        for i in range(width):
-            column = int(points[j, 0] + (low + i) * ax + 0.5)
-            row = int(points[j, 1] + (low + i) * ay + 0.5)
+        square, slope = gx * gx + gy * gy, 2.0 * (gx * ax + gy * ay)
+        squares[j, 0], squares[j, 1] = square, slope
+        for i in range(middle - int(far[j]), middle + int(far[j]) + 1):
+            t = expected + i - middle
+            column, row = int(points[j, 0] + t * ax + 0.5), int(points[j, 1] + t * ay + 0.5)
             if min(row, column) < 1 or row > last_row or column > last_column:
                 # Bright ground.
-                table[j, i, 0] = -_BRIGHTEST * steps[j, 0]
-                table[j, i, 1] = -_BRIGHTEST * steps[j, 1]
+                table[j, i, 0], table[j, i, 1] = -_BRIGHTEST * square, -_BRIGHTEST * slope
                 table[j, i, 2] = -_BRIGHTEST
                 continue
             p = darkness[row - 1 : row + 2, column - 1 : column + 2]
@@ -319,25 +391,7 @@ def try_parabolas(
             table[j, i, 0] = gy * gy * xx - 2.0 * gx * gy * xy + gx * gx * yy
             table[j, i, 1] = 2.0 * (gy * ay * xx - (gx * ay + gy * ax) * xy + gx * ax * yy)
             table[j, i, 2] = ay * ay * xx - 2.0 * ax * ay * xy + ax * ax * yy
-    share = 1.0 / (count - 1)
-    for a in range(len(begins)):
-        for b in range(len(tips)):
-            for c in range(len(bends)):
-                total, before = 0.0, begins[a]
-                for j in range(1, count):
-                    u = j * share
-                    t = begins[a] + (tips[b] - begins[a]) * u + 4.0 * bends[c] * u * (1.0 - u)
-                    step = t - before
-                    row = table[j, int(t + expected - low + 0.5)]
-                    value = row[0] + step * (row[1] + step * row[2])
-                    value /= steps[j, 0] + step * (steps[j, 1] + step) + 1e-9
-                    total += min(max(value, -_BRIGHTEST), _STRONGEST)
-                    # If the first third shows nothing the rest does not matter.
-                    if 3 * j > count and total < 0.8 * j:
-                        total = -math.inf
-                        break
-                    before = t
-                gains[a, b, c] = total
+    return table, squares
 
 
 def _combined(lines: Sequence[Sequence[_Candidate]]) -> _Choice:
@@ -359,13 +413,15 @@ def _combined(lines: Sequence[Sequence[_Candidate]]) -> _Choice:
                 shown = one.line, one.strength, other.line, other.strength
                 both[a, b] = _WORTH * shown_twice(*shown, _SAME)
         total += np.expand_dims(both, [m for m in range(count) if m not in (j, k)])
-    best = np.argsort(total, axis=None)[:_KEPT]
-    best = best[np.isfinite(total.ravel()[best])]
+    flat = total.ravel()
+    best = np.argpartition(flat, min(_KEPT, flat.size) - 1)[:_KEPT]
+    best = best[np.argsort(flat[best])]
+    best = best[np.isfinite(flat[best])]
     ways = np.stack(np.unravel_index(best, sizes), axis=1)
     first = np.cumsum([0, *(len(row) for row in some[:-1])])
     lost = ways == np.array(sizes) - 1
     every = [one for row in some for one in row]
-    return _Choice(every, np.where(lost, -1, ways + first), total.ravel()[best])
+    return _Choice(every, np.where(lost, -1, ways + first), flat[best])
 
 
 def _cost_of_bases(lines: Sequence[Sequence[_Candidate]]) -> Array:

@@ -54,6 +54,9 @@ _DOUBT = 0.6  # least difference to a way that gives a whisker another line
 _WAYS = 256  # largest number of ways to give lines to whiskers that are compared
 _ROUNDS = 3  # number of rounds in which whiskers are kept apart where they cross
 _SHORT = 3.0  # cost of a line that is hardly seen
+# Share of a line that moves from which it may be a whisker, and cost of one that does not, such as
+# a wire: less than that of a lost whisker, as one may rest throughout.
+_MOVES, _STANDS = 0.4, 3.0
 # Turn, rad, and shift, pixels, of the whole row in a frame that cost as much as a lost whisker.
 _ROW_TURN, _ROW_SHIFT = 0.1, 5.0
 _UNLIKE = 3.0  # unlikeness above which a whisker's own line is in doubt
@@ -358,7 +361,8 @@ def _kink(trace: Trace) -> float:
 def _price(click: Array, curve: Curve, half: float) -> float:
     """Cost of assigning a curve to the whisker that was clicked."""
     away = min(from_click(click, curve.line), _passed(click, curve.line)[0])
-    return LOST * (away / min(CLICK, half)) ** 2 + _SHORT / (1.0 + curve.score / _LIKELY)
+    stands = 0.0 if curve.moved > _MOVES else _STANDS
+    return LOST * (away / min(CLICK, half)) ** 2 + _SHORT / (1.0 + curve.score / _LIKELY) + stands
 
 
 def _passed(click: Array, line: Array) -> tuple[float, int]:

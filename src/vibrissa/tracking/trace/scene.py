@@ -193,7 +193,7 @@ class Scene:
         if self._slopes is None or n < _FOLLOWS:
             return trace
         normal = tangent(trace.line)[:, ::-1] * [-1.0, 1.0]
-        normal /= np.hypot(*normal.T)[:, None]
+        normal /= np.maximum(np.hypot(*normal.T), 1e-9)[:, None]
         away = np.arange(-_WITHIN, _WITHIN + 1)[:, None, None]
         near = np.rint(trace.line + away * normal).astype(np.intp)
         rows, columns = self._slopes.shape[1:]

@@ -74,6 +74,25 @@ def test_a_whisker_that_moves_in_the_plane_is_measured(flat):
     assert "out of the image by" not in found.attrs["remarks"]
 
 
+def test_a_line_that_no_rod_follows_is_no_contact_in_a_row():
+    """In three free frames the second whisker's trace goes on along something straight."""
+    trial, (rows,) = film()
+    odd = list(rows[0])
+    free, contact = slice(2, 5), of(trial, "truth/in_contact") > 0
+    for i in range(2, 5):
+        line = odd[i].line.copy()
+        half = len(line) // 2
+        line[half:, 1] += 0.3 * np.arange(len(line) - half)
+        odd[i] = odd[i]._replace(line=line)
+    found = track(CAMERA, [[rows[0], odd]], 1000.0)
+    assert not contact[free].any()
+    assert not (found["in_contact"].values[free] > 0).any()
+    assert np.isfinite(found["centerline"].values[free, 0]).all()
+    assert np.isnan(found["centerline"].values[free, 1]).all()
+    assert np.mean((found["in_contact"].values[5:, 1] > 0) == contact[5:]) > 0.95
+    assert "whisker 1: in 3 frames the bent rod does not explain" in found.attrs["remarks"]
+
+
 @pytest.mark.slow
 def test_a_peg_along_the_line_of_sight_is_reconstructed(flat, tmp_path):
     save_recording(tmp_path / "one.nc", flat[1])

@@ -222,8 +222,7 @@ def track(
     pairs = paired_frames(cameras, timed, options.offset)
     if head is not None and len(cameras) == 1:
         raise ValueError("the head moves in space, which one view does not show: leave it out")
-    optics: Optics | None = None
-    doubts: list[str] = []
+    optics, doubts = None, list[str]()
     if options.rough and len(cameras) > 1:
         optics, cameras, doubts = _corrected(cameras, timed, pairs, options.distance)
     moving = None if head is None else HeadPose.of(head, pairs[:, 0], rate)
@@ -246,8 +245,8 @@ def track(
         remarks += remarks_on_bases(cameras, rows[k], begun[k], name)
         try:
             one = before[k] if k in before else tracked(k, together[k])
-            if count > 1 and len(cameras) > 1:
-                one, left_out = _without_contradictions(one)
+            if count > 1:
+                one, left_out = _without_contradictions(one, len(cameras) == 1)
                 remarks += remarks_on_row(changes[k][0], changes[k][1] + left_out, name)
             if contacts is not None:
                 other = given_contacts(contacts, cameras, pairs, rate, k, one.fit)
@@ -377,9 +376,10 @@ def _misfits_bent(
     return fitter.misfits(one.whisker, pose)[::2]
 
 
-def _without_contradictions(one: Tracked) -> tuple[Tracked, int]:
+def _without_contradictions(one: Tracked, flat: bool) -> tuple[Tracked, int]:
     """Whisker of a row without the frames that the rod does not explain, and their number."""
-    strange = _contradicted(one.fit.misfit)
+    # One view does not show all of its motion; contacts there may be a neighbour's line.
+    strange = _contradicted(one.fit.misfit) & (one.touching | (not flat))
     if not strange.any():
         return one, 0
     values = {name: array.copy() for name, array in vars(one.fit).items()}

@@ -9,7 +9,7 @@ from vibrissa import Whisker
 from vibrissa.cameras import orthogonal_views
 from vibrissa.simulation import ImageConditions, Motion, film_frames, simulate, with_true_traces
 from vibrissa.tracking import Trace, trace_video
-from vibrissa.tracking.trace import ridge
+from vibrissa.tracking.trace import ridge, video
 from vibrissa.tracking.trace.follower import start_at
 from vibrissa.tracking.trace.row import follow_row
 
@@ -111,6 +111,25 @@ def test_a_whisker_that_is_gone_is_lost_and_not_its_neighbour(row):
     others = [k for k in range(COUNT) if k != 2]
     assert (found[4:, others] == others).mean() > 0.97
     assert not np.isin(found[5:, 2], others).any()
+
+
+def test_a_row_at_rest_is_not_renamed_for_a_hidden_whisker(row, monkeypatch):
+    """Its neighbours' lines, and the next one, which nobody clicked, would give each a line."""
+    monkeypatch.setattr(video, "neighbours", lambda *given: [])
+    frames, truth = row
+    order = np.argsort(truth[0, :, 0, 1])
+    asked, hidden = order[:4], order[1]
+    painted = frames[0].copy()
+    for x, y in curve(truth[0, hidden]).astype(int):
+        painted[y - 3 : y + 4, x - 2 : x + 3] = painted[y - 4 : y - 3, x - 2 : x + 3]
+    at_rest = 12
+    generator = np.random.default_rng(1)
+    noise = generator.normal(size=(at_rest, *painted.shape))
+    resting = [np.clip(painted + one, 0, 255).astype(np.uint8) for one in noise]
+    traces = trace_video([*resting, *frames], truth[0, asked, 0], sample=frames)
+    found = names(traces, np.concatenate([np.repeat(truth[:1], at_rest, axis=0), truth]))
+    assert (found[:at_rest] == [order[0], -2, *order[2:4]]).mean() > 0.95
+    assert (found[at_rest:, [0, 2, 3]] == order[[0, 2, 3]]).mean() > 0.9
 
 
 def test_what_is_given_is_nobody_elses(row):

@@ -48,6 +48,8 @@ _ROUNDS = 3  # number of rounds in which the appearance of whiskers is learned
 _SHIFT, _TURN = 4.0, 0.06
 _ROW = 3.0  # standard deviation of the row's motion as a whole, in units of these
 _MOVED = 3.0  # standard deviations at which the cost of a motion saturates, since whiskers do jump
+# Largest shift, pixels, and turn, rad, of a whisker at rest from one frame to the next.
+_STAYS, _STAYS_TURN = 1.5, 0.04
 # Largest number of ways of a frame, and the cost by which they may exceed the cheapest.
 _KEPT, _DEARER = 48, 14.0
 
@@ -188,11 +190,12 @@ def decided(frames: Sequence[Seen], bases: Array) -> list[list[int]]:
     everyone = set(range(len(bases)))
     strangers = {k for k in everyone if sum(seen.chosen[k] >= 0 for seen in frames) < ENOUGH}
     settled = [everyone, *(strangers | seen.fixed for seen in frames[1:])]
+    rest = _at_rest(frames, motions)
+    settled[1 : 1 + rest] = [everyone] * rest
     # The appearance of whiskers is learned where their identity is certain, and that depends on
     # the appearance. At first it is certain until it gets difficult.
-    certain: list[tuple[Seen, Sequence[int]]] = [
-        (s, s.chosen) for s in (frames[0], *takewhile(lambda s: s.clear, frames[1:]))
-    ]
+    easy = (*frames[: 1 + rest], *takewhile(lambda seen: seen.clear, frames[1 + rest :]))
+    certain: list[tuple[Seen, Sequence[int]]] = [(seen, seen.chosen) for seen in easy]
     chosen: list[list[int]] = []
     for _ in range(_ROUNDS):
         known = [
@@ -208,6 +211,19 @@ def decided(frames: Sequence[Seen], bases: Array) -> list[list[int]]:
         if chosen == before:
             break
     return chosen
+
+
+def _at_rest(frames: Sequence[Seen], motions: Sequence[Array]) -> int:
+    """Number of frames after the first to which all whiskers that are seen have stayed in place.
+
+    Up to there each is where it was clicked. Else a row could be renamed for one that is hidden.
+    """
+    for i, (one, other, motion) in enumerate(zip(frames, frames[1:], motions, strict=False)):
+        both = zip(one.chosen, other.chosen, strict=True)
+        moved = np.array([motion[c + 1, d + 1] for c, d in both if c >= 0]).reshape(-1, 2)
+        if not (np.abs(moved * [_SHIFT, _TURN]) < [_STAYS, _STAYS_TURN]).all():
+            return i
+    return len(motions)
 
 
 def _step(seen: Seen, problem: Assignment, known: Sequence[Appearance], settled: set[int]) -> Step:

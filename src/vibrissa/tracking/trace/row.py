@@ -336,7 +336,7 @@ def _straightened(
     found = _through_crossings(followers, starts, known, frame, noise, scene)
     better = {}
     for k, trace in found.items():
-        longer = followers[k].length_of(trace) / followers[k].length_of(before[k])
+        longer = followers[k].length_of(trace) / max(followers[k].length_of(before[k]), STEP)
         straight = _kink(trace) < _STRAIGHTER * _kink(before[k])
         if straight and longer < 1.0 / _LONGER:
             # What is straight as it stops at an object, which may have bent it, is no better.

@@ -49,7 +49,7 @@ _STRAYS, _FARTHEST = 4.0, 25.0
 # Distance from a base up to which a line begins at it, across: it may do so farther along itself.
 _OTHER = 6.0
 _TOGETHER = 0.5  # share of those that are asked for with which a neighbour is seen together
-_BEGUN = 3  # number of frames in which all are begun together; most of them show a neighbour
+_BEGUN = 3  # number of frames in which it is begun with them; most of them show a neighbour
 
 
 def neighbours(
@@ -68,31 +68,46 @@ def neighbours(
         for shift, curves in zip(shifts, moves, strict=True)
     ]
     length = np.zeros((len(frames), len(places)))
-    away = np.full((len(clicks), len(places)), np.inf)
+    away = np.full((len(frames), len(clicks), len(places)), np.inf)
     for i, curves in enumerate(moves):
         for place, curve in zip(whose[i], curves, strict=True):
             length[i, place] = max(length[i, place], curve.length)
             far = [from_click(click, curve.line - shifts[i]) for click in clicks]
-            away[:, place] = np.minimum(away[:, place], far)
-    asked = [int(np.argmin(row)) for row in away if row.min(initial=np.inf) < 2.0 * CLICK]
+            away[i, :, place] = np.minimum(away[i, :, place], far)
+    nearest = away.min(axis=0)
+    asked = [int(np.argmin(row)) for row in nearest if row.min(initial=np.inf) < 2.0 * CLICK]
     if len(set(asked)) < len(clicks):
         return []
     often = (length > 0.0).mean(axis=0) >= _OFTEN
     longest = length.max(axis=0)
-    often &= (longest > _HAIR) & (away.min(axis=0) > _OTHER)
+    # In a single frame the face may have moved otherwise than was found.
+    usual = np.array(
+        [
+            np.median(row[seen]) if seen.any() else 0.0
+            for row, seen in zip(away.min(axis=1).T, length.T > 0.0, strict=True)
+        ]
+    )
+    often &= (longest > _HAIR) & (usual > _OTHER)
     others = [k for k in np.flatnonzero(often) if k not in asked]
     if not others:
         return []
     # What is joined to a whisker's end, or is that whisker elsewhere, is not seen together with it.
     least = np.full(len(asked) + len(others), max(_HAIR, _COMPARABLE * longest[asked].max()))
     least[: len(asked)] = np.minimum(_HAIR, 0.5 * longest[asked])
-    shown = np.zeros(len(others))
-    for i in np.linspace(0, len(frames) - 1, _BEGUN).astype(int):
-        every = [start_at(at + shifts[i], options) for at in (*clicks, *places[others])]
-        seen = [trace.support for trace in follow_row(every, frames[i], {}, scene=scene)]
-        long = np.array(seen) > least
-        shown += long[len(asked) :] & (long[: len(asked)].mean() >= _TOGETHER)
-    return [places[k] for k, count in zip(others, shown, strict=True) if 2 * count > _BEGUN]
+    found = list[Array]()
+    for k in others:
+        # Where it is farthest from the others these are least likely to be taken for it.
+        some = np.argsort(-np.where(length[:, k] > 0.0, away[:, :, k].min(axis=1), -np.inf))
+        next_to, shown = int(nearest[:, k].argmin()), 0
+        for i in some[:_BEGUN]:
+            every = [start_at(at + shifts[i], options) for at in (*clicks, *found, places[k])]
+            seen = [trace.support for trace in follow_row(every, frames[i], {}, scene=scene)]
+            long = np.array(seen) > least[: len(seen)]
+            together = long[: len(asked)].mean() >= _TOGETHER
+            shown += bool(long[-1] and long[next_to] and together)
+        if 2 * shown > _BEGUN:
+            found.append(places[k])
+    return found
 
 
 def _on_face(moves: Sequence[Sequence[Curve]]) -> tuple[list[Array], Array]:

@@ -55,8 +55,8 @@ _WAYS = 256  # largest number of ways to give lines to whiskers that are compare
 _ROUNDS = 3  # number of rounds in which whiskers are kept apart where they cross
 _SHORT = 3.0  # cost of a line that is hardly seen
 # Share of a line that moves from which it may be a whisker, and cost of one that does not, such as
-# a wire: less than that of a lost whisker, as one may rest throughout.
-_MOVES, _STANDS = 0.4, 3.0
+# a wire, at a click where another one does that has such a share of its length.
+_MOVES, _STANDS, _COMPARABLE = 0.4, 3.0, 0.4
 # Turn, rad, and shift, pixels, of the whole row in a frame that cost as much as a lost whisker.
 _ROW_TURN, _ROW_SHIFT = 0.1, 5.0
 _UNLIKE = 3.0  # unlikeness above which a whisker's own line is in doubt
@@ -188,6 +188,11 @@ def _begun(
             for click, half in zip(clicked, 0.5 * apart, strict=True)
         ]
     ).reshape(len(free), len(every))
+    moves = np.array([curve.moved > _MOVES for curve in every], dtype=bool)
+    length = np.array([curve.length for curve in every])
+    for row in price:
+        longest = length[moves & (row < 2.0 * LOST)].max(initial=0.0)
+        row[~moves & (_COMPARABLE * length < longest)] += _STANDS
     rows, columns = optimize.linear_sum_assignment(np.minimum(price, 2.0 * LOST))
     lines = [one.line for one in every]
     starts = {
@@ -361,8 +366,7 @@ def _kink(trace: Trace) -> float:
 def _price(click: Array, curve: Curve, half: float) -> float:
     """Cost of assigning a curve to the whisker that was clicked."""
     away = min(from_click(click, curve.line), _passed(click, curve.line)[0])
-    stands = 0.0 if curve.moved > _MOVES else _STANDS
-    return LOST * (away / min(CLICK, half)) ** 2 + _SHORT / (1.0 + curve.score / _LIKELY) + stands
+    return LOST * (away / min(CLICK, half)) ** 2 + _SHORT / (1.0 + curve.score / _LIKELY)
 
 
 def _passed(click: Array, line: Array) -> tuple[float, int]:

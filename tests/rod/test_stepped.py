@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import vibrissa as vb
+from vibrissa.rod import discretize
 
 LENGTH = 40e-3
 E, NU = 3e9, 0.38
@@ -155,6 +156,16 @@ def test_contacts_of_a_rod_that_turns_in_a_hinge(radius, breaks):
     np.testing.assert_allclose(bent.arc_length, arc_length, rtol=2e-6)
     error = np.linalg.norm(bent.force - force, axis=1) / np.linalg.norm(force, axis=1)
     assert error.max() <= 2e-6
+
+
+def test_noise_of_radii_is_not_taken_for_hinges():
+    """Its changes counted twice: 2,170 steps, where 300 resolve them."""
+    s = np.linspace(0.0, LENGTH, 200)
+    radius = 1e-4 * (1.0 - 0.9 * s / LENGTH) * np.random.default_rng(1).normal(1.0, 0.2, len(s))
+    radius = np.maximum(radius, 5e-6)
+    whisker = vb.Whisker.straight(LENGTH, radius=np.column_stack([s, radius]))
+    changes = np.abs(np.diff(np.log(radius))).sum()
+    assert len(discretize(whisker).rod.start) < 8.0 * changes
 
 
 def test_a_bend_in_the_curvature_that_was_not_stated():

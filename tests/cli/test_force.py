@@ -74,6 +74,7 @@ def test_what_is_there_stays(folder, monkeypatch, verb):
 READ = {
     "estimate": (("signals.csv", "-o", "signals.csv"), "signals.csv"),
     "estimate ": (("in.nc", "--map", "map.nc", "-o", "map.nc", "--force"), "map.nc"),
+    "estimate  ": (("contacts.csv", "--map", "map.nc", "--force"), "contacts.csv"),
     "uniqueness": (("map.nc", "-o", "./map.nc", "--force"), "map.nc"),
     "track": (("top.mkv", "front.mkv", "--cameras", "in.nc", "-o", "in.nc", "--force"), "in.nc"),
     "export": (("in.csv", "-o", "in.csv", "--force"), "in.csv"),
@@ -94,6 +95,14 @@ def test_what_is_read_is_not_replaced_even_with_force(folder, monkeypatch, verb)
     assert isinstance(done.exception, ValueError), done.exception
     assert "is read, and would be replaced" in str(done.exception)
     assert path.read_bytes() == before
+
+
+def test_a_stage_is_added_to_a_recording_that_also_states_the_object(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    (folder / "own.nc").write_bytes((folder / "in.nc").read_bytes())
+    done = run("reconstruct", "own.nc", "--objects", "own.nc", "-o", "own.nc")
+    assert "is read" not in str(done.exception)
+    assert "contour" in load_recording(folder / "own.nc").children
 
 
 def test_every_verb_that_writes_is_asked(folder):

@@ -12,7 +12,7 @@ import numpy as np
 
 import vibrissa as vb
 from vibrissa.cli import inputs
-from vibrissa.cli.options import Method, free, numbers, refuse, with_options
+from vibrissa.cli.options import Method, free, numbers, refuse, spare, with_options
 from vibrissa.cli.signals import SourceOptions, described
 from vibrissa.cli.terminal import Tell, progress_bars, remark, shown
 from vibrissa.deferred import xr
@@ -274,6 +274,7 @@ def estimate(
     if added:
         inputs.free_beside(signals, [target], force)
     else:
+        spare(target, signals)
         free([target], force)
     if known.around is not None:
         known.check(how, weight)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import vibrissa as vb
-from vibrissa.cli.options import free, refuse
+from vibrissa.cli.options import free, refuse, same_file
 from vibrissa.cli.terminal import Tell, remark, say
 from vibrissa.deferred import xr
 
@@ -403,16 +403,12 @@ def print_statuses(codes: object, each: str = "") -> None:
 
 def free_beside(recording: Path, files: Iterable[Path], force: bool) -> None:
     """Raise an error if files other than the recording exist and must not be replaced."""
-    free([file for file in files if not _same(file, recording)], force)
-
-
-def _same(path: Path, other: Path) -> bool:
-    return path.resolve() == other.resolve()
+    free([file for file in files if not same_file(file, recording)], force)
 
 
 def print_written(path: Path, recording: Path | None = None, stage: str = "") -> None:
     """Report that a file was written, or that a stage was added to a recording."""
-    added = recording is not None and _same(path, recording)
+    added = recording is not None and same_file(path, recording)
     say(f"added {stage} to {path}" if added else f"wrote {path}")
 
 

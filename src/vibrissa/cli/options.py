@@ -168,17 +168,32 @@ def _spare_inputs(values: Mapping[str, Any]) -> None:
     """Raise ValueError if a result would replace a file that is read, also with --force."""
     for name in _WRITTEN:
         path = values.get(name)
-        if path is None or not path.is_file():
+        if path is None:
             continue
-        for other, value in values.items():
-            read = value if isinstance(value, list | tuple) else [value]
-            files = [one for one in read if isinstance(one, Path) and one.is_file()]
-            extended = name == "target" and other in _EXTENDED and vb.io.is_netcdf(path)
-            if other in _WRITTEN or extended or not any(path.samefile(one) for one in files):
-                continue
-            raise ValueError(
-                f"{path} is read, and would be replaced by the result: state another file"
-            )
+        read = {
+            other: [one for one in _listed(value) if isinstance(one, Path)]
+            for other, value in values.items()
+            if other not in _WRITTEN
+        }
+        added = name == "target" and vb.io.is_netcdf(path)
+        if not (added and any(same_file(path, *read.get(other, ())) for other in _EXTENDED)):
+            spare(path, *(one for files in read.values() for one in files))
+
+
+def _listed(value: Any) -> Sequence[Any]:
+    """The value if it is a list, else a list with it."""
+    return value if isinstance(value, list | tuple) else [value]
+
+
+def same_file(path: Path, *others: Path) -> bool:
+    """Whether a path leads to one of some other files."""
+    return path.is_file() and any(one.is_file() and path.samefile(one) for one in others)
+
+
+def spare(path: Path, *read: Path) -> None:
+    """Raise ValueError if a result would replace one of the files that are read."""
+    if same_file(path, *read):
+        raise ValueError(f"{path} is read, and would be replaced by the result: state another file")
 
 
 def free(files: Iterable[Path], force: bool) -> None:

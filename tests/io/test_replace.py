@@ -94,3 +94,7 @@ def test_a_link_and_permissions_are_kept(tmp_path):
     assert link.is_symlink()
     assert file.read_text() == "new"
     assert file.stat().st_mode & 0o777 == 0o600
+    file.unlink()
+    file.parent.rmdir()
+    with pytest.raises(FileNotFoundError, match="does not exist; make it first"), replacing(link):
+        pass

@@ -268,6 +268,9 @@ def test_estimates_are_written_as_they_are(gamma_map, tmp_path):
         np.testing.assert_allclose(again["sigma_y"], np.sqrt(found.covariance[:, 1, 1]))
         np.testing.assert_array_equal(again["status"], found.status)
         np.testing.assert_array_equal(again["time"], [0.0, 1.0])
+    recorded = found.to_dataset().rename(covariance="contact_covariance")
+    with pytest.raises(ValueError, match="contacts lack time, x, y, z"):
+        save_contacts(path, recorded)
     one = gamma_map.estimate({name: values[0] for name, values in signals.items()})
     with pytest.raises(ValueError, match="one contact in each row"):
         save_contacts(path, one)

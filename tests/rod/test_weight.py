@@ -169,3 +169,10 @@ def test_a_rod_under_weight_is_solved_once(monkeypatch):
     monkeypatch.setattr(gravity, "_lean_by_increments", None)
     for scale in (1.001, 0.999, 1.0 + 1e-15):
         gravity.resting(RODS["curved"], scale * np.array(LEVEL))
+
+
+def test_a_light_whisker_that_hardly_sags_is_not_questioned():
+    """Its curvature would be small for a shape that was stated."""
+    light = vb.Whisker.straight(5e-3, base_radius=25e-6, tip_radius=2e-6, density=1300.0)
+    sagged = gravity.resting(light, LEVEL).shape()
+    assert 0.0 < np.abs(sagged.curvature(0.0)[1:]).max() < 0.1

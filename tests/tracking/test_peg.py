@@ -19,8 +19,10 @@ from vibrissa.tracking.refine.fit import Touches
 from vibrissa.tracking.refine.peg import PEG_UNKNOWNS, UNITS, UncertainPeg
 from vibrissa.tracking.refine.problem import Smoother
 from vibrissa.tracking.refine.silhouette import (
+    _edges,
     _largest_near,
     _median,
+    _View,
     explains,
     peg_in_images,
 )
@@ -175,6 +177,19 @@ def test_an_outline_that_shading_hides_is_uncertain():
     place, unsure = place_of_outline(soft + noise, 12.0)
     assert unsure > 2.0 * sigma
     assert abs(place - 0.4) < 3.0 * unsure
+
+
+def test_what_is_beyond_an_image_is_not_black():
+    """Three pixels beyond the outline the image ends."""
+    peg = Peg([0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 1.1e-3)
+    camera = lenses()[0]
+    frames = [drawn(camera, within(peg))]
+    whole = _View.of(camera, frames, peg.origin)
+    end = int(whole.project(peg.radius * np.array([1.0, 0.0, 0.0]))[0]) + 4
+    parts = {name: getattr(whole, name)[..., :end] for name in ("bright", "slopes", "near")}
+    edges = _edges(replace(whole, **parts), peg, np.zeros(0), 2.0, with_ends=False)
+    assert all(len(part.miss) > 20 for part in edges)
+    assert min(part.bright.min() for part in edges) > 0.15
 
 
 def test_too_few_points_do_not_show_an_outline():

@@ -108,9 +108,8 @@ def replacing(path: str | PathLike[str]) -> Iterator[Path]:
 
     A link still leads to the file that is replaced.
     """
-    path = check_writable(path)
-    if path.is_symlink():
-        path = path.resolve()
+    path = Path(path)
+    path = check_writable(path.resolve() if path.is_symlink() else path)
     _remove_left(path.parent)
     with _failing(path):
         # Some writers depend on the ending.

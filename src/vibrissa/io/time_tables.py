@@ -323,6 +323,7 @@ NUMBERS = ("time", "x", "y", "z", "r", "theta", "phi", "sigma_x", "sigma_y", "si
 _AROUND = ("arc_length", "last_arc_length", "shift_x", "shift_y", "shift_z")
 _OPTIONAL = (*_AROUND, "one_contact", "friction", "onset_time", "onset_sigma")
 # Columns of names before the status, with their enumerations, also written only if present.
+_ESTIMATED = {"contact_point", "covariance", "r", "theta", "phi", "status"}
 _FLAGS: dict[str, type[Status | Event]] = {"event": Event}
 
 
@@ -356,7 +357,7 @@ def save_contacts(
     if isinstance(contacts, Estimated):
         contacts = contacts.to_dataset()
     # Columns in a mapping need no xarray, which takes long to import.
-    if "x" not in contacts and isinstance(contacts, xr.Dataset) and "contact_point" in contacts:
+    if not _ESTIMATED - set(contacts) and isinstance(contacts, xr.Dataset):
         contacts = _of_estimates(contacts)
     numbers = (*NUMBERS, *(name for name in _OPTIONAL if name in contacts))
     flags = (*(name for name in _FLAGS if name in contacts), "status")
@@ -382,7 +383,7 @@ def _of_estimates(contacts: xr.Dataset) -> dict[str, ArrayLike]:
     out |= {f"sigma_{axis}": np.sqrt(v) for axis, v in zip("xyz", variance.T, strict=True)}
     time = contacts["time"].values if "time" in contacts else np.arange(float(len(point)))
     kept = {name: contacts[name].values for name in ("r", "theta", "phi", "status")}
-    friction = np.full(len(point), float(contacts.attrs["friction"]))
+    friction = np.full(len(point), contacts.attrs.get("friction", np.nan))
     return {"time": time, **out, **kept, "friction": friction}
 
 

@@ -452,10 +452,10 @@ def _reshaped(whisker: Whisker, first: Array, second: Array, taper: float) -> Wh
             length,
             interpolate.CubicSpline(s, curvature),
             radius=whisker.radius(s) * (1.0 - taper * s / length),
-            youngs_modulus=whisker.youngs_modulus,
-            poisson_ratio=whisker.poisson_ratio,
             any_length=True,
         ),
+        youngs_modulus=whisker.youngs_modulus,
+        poisson_ratio=whisker.poisson_ratio,
         pose=whisker.pose,
         name=whisker.name,
     )

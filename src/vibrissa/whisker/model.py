@@ -116,7 +116,7 @@ class Whisker:
         known: radii by published regressions (Belli et al. 2017), instead of all other radii.
     any_length : bool
         Whether to accept a length below 0.5 mm or above 0.5 m, as of rods of robots; by default it
-        is rejected as a likely error of units.
+        is rejected as a likely error of units. A slight curvature is not questioned then either.
     breaks : sequence of float
         Arc lengths, m, at which curvature or radius has a kink or a jump. Those of sampled radii
         and, as far as they exceed the noise, of functions are detected.
@@ -315,7 +315,7 @@ class Whisker:
             )
         whisker = _assemble(length, profile, Pose(), properties, notes)
         most = np.abs(whisker.curvature(np.linspace(0.0, length, 101))).max()
-        if STRAIGHT < most * length < 2.0 * _SLIGHT:
+        if STRAIGHT < most * length < 2.0 * _SLIGHT and not properties.get("any_length"):
             warnings.warn(
                 f"the curvature is {most:.3g} per m at most, which bends a whisker of "
                 f"{1e3 * length:.4g} mm by less than {np.degrees(most * length):.2g}°: is it per "

@@ -238,7 +238,7 @@ class Forward:
             stiff = _RIGID * whisker.base_bending_stiffness / whisker.length
             soft = 1.0 / np.array(whisker.base_stiffness or (stiff, stiff))
             for bending, twist in 1.0 / (soft + compliance_sigma * np.eye(2)):
-                base = whisker.with_properties(base_stiffness=(float(bending), float(twist)))
+                base = replace(whisker, base_stiffness=(float(bending), float(twist)))
                 out.errors.append((bent(base), 1.0))
         return out
 

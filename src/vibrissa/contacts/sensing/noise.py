@@ -216,7 +216,8 @@ def _question(sensor: SensorNoise, names: tuple[str, ...], whisker: Whisker) -> 
         warnings.warn(
             f"the noise of {name}, {sigma:.2g} {'N' if kind == 'F' else 'N·m'}, is {fault}: is it "
             "in another unit (N and N·m in Python, µN and µN·m on the command line), or a variance "
-            "in place of a standard deviation or the reverse?",
+            "in place of a standard deviation or the reverse? A signal that is not measured is "
+            "better left out.",
             stacklevel=5,
         )
         return

@@ -141,8 +141,8 @@ class _View:
     """Edges in the part of an image around the contacts."""
 
     camera: Camera
-    bright: Array  # (row, column): brightness, as a share of the light
-    slopes: Array  # (2, row, column): change of that, smoothed, along columns and rows
+    bright: Array  # (row, column): cubic splines of the brightness, as a share of the light
+    slopes: Array  # (2, row, column): change of brightness, smoothed, along columns and rows
     near: Array  # (direction, row, column): 1 where it is brighter toward it nearby, to 0
     corner: Array  # column and row of the first pixel
 
@@ -165,7 +165,8 @@ class _View:
         for angle in np.arange(_DIRECTIONS) * 2.0 * np.pi / _DIRECTIONS:
             toward = np.cos(angle) * right + np.sin(angle) * down
             near.append(np.clip((_largest_near(toward) - _LEAST) / (_CLEAR - _LEAST), 0.0, 1.0))
-        return cls(camera, part, np.stack([right, down]), np.array(near), low)
+        bright, slopes = ndimage.spline_filter(part), np.stack([right, down])
+        return cls(camera, bright, slopes, np.array(near), low)
 
     @property
     def size(self) -> Array:
@@ -518,8 +519,10 @@ def _edges(view: _View, peg: Peg, ends: Array, window: float, with_ends: bool) -
         extent = float(np.linalg.norm(np.ptp(at[found], axis=0))) if found.any() else 0.0
         certain = min(2.0, 0.2 + extent / _LONG)
         share = found.sum() / inside.sum() if inside.sum() > _INSIDE * len(at) else 1.0
-        across = at[found, None] + OFFSETS[:, None] * normal[found, None]
-        bright = ndimage.map_coordinates(view.bright, [across[..., 1], across[..., 0]], order=3)
+        across = (at[found, None] + OFFSETS[:, None] * normal[found, None])[..., ::-1]
+        bright = ndimage.map_coordinates(
+            view.bright, np.moveaxis(across, -1, 0), mode="nearest", prefilter=False
+        )
         pixels = peg.radius * view.scale(peg.origin)
         parts.append(_Part(miss[found], by, certain, float(share), bright, pixels))
     return parts

@@ -125,18 +125,24 @@ def _touch(d: Discretization, x: Array, change: Array | float) -> tuple[Array, A
             slopes[..., 1] = (solve_forces(d, ahead)[0] - solve_forces(d, back)[0]) / width
     slopes[..., _FREE] = exact
     force = values[:, :3] + change
-    along = (force * tangent).sum(axis=1)[:, None]
-    across = force - along * tangent
+    along = (force * tangent).sum(axis=1)
+    moved = slopes[:, :3] - along[:, None, None] * turning
+    grown = np.einsum("ni,nik->nk", tangent, slopes[:, :3])
+    grown += np.einsum("ni,nik->nk", force, turning)
+    return (
+        values,
+        slopes,
+        _across(force, tangent)[1] @ (moved - tangent[:, :, None] * grown[:, None, :]),
+    )
+
+
+def _across(force: Array, tangent: Array) -> tuple[Array, Array]:
+    """Unit vectors n (n, 3) of the parts g of forces across the whisker, and ∂n/∂g (n, 3, 3)."""
+    across = force - (force * tangent).sum(axis=1)[:, None] * tangent
     length = np.linalg.norm(across, axis=1, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
         normal = across / length
-    change = slopes[:, :3] - along[..., None] * turning
-    grown = np.einsum("ni,nik->nk", tangent, slopes[:, :3])
-    grown += np.einsum("ni,nik->nk", force, turning)
-    change -= tangent[:, :, None] * grown[:, None, :]
-    flat = np.eye(3) - normal[:, :, None] * normal[:, None, :]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return values, slopes, flat @ change / length[..., None]
+        return normal, (np.eye(3) - normal[:, :, None] * normal[:, None, :]) / length[..., None]
 
 
 def contact_normals(
@@ -156,14 +162,10 @@ def contact_normals(
     if rows.any():
         force = solve_forces(d, x)[0][:, :3] + _scaled(d, change, rows)
         tangent = contact_tangents(d, x)
-        across = force - (force * tangent).sum(axis=1)[:, None] * tangent
-        length = np.linalg.norm(across, axis=1, keepdims=True)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            out[rows] = normal = across / length
-            flat = np.eye(3) - sum(v[:, :, None] * v[:, None, :] for v in (normal, tangent))
-            flat /= length[..., None]
+        out[rows], toward = _across(force, tangent)
+        toward = toward @ (np.eye(3) - tangent[:, :, None] * tangent[:, None, :])
         change_spread = np.broadcast_to(covariance, spread.shape)[rows] / d.force**2
-        spread[rows] = flat @ change_spread @ flat
+        spread[rows] = toward @ change_spread @ np.swapaxes(toward, 1, 2)
     return out, spread
 
 

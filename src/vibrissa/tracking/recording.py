@@ -508,6 +508,8 @@ def remarks_on_fur(one: Tracked, known: Mapping[str, Any], name: str) -> list[st
     What is known of the base is that of `TrackOptions`; without a radius there is no such error.
     """
     fur = known["hidden"]
+    if fur == 0.0 and not {"base_radius", "rat"} & known.keys():
+        return []
     if fur == 0.0:
         percent = 100.0 * (force_scale(one.whisker, 1e-3) - 1.0)
         return [
@@ -515,7 +517,7 @@ def remarks_on_fur(one: Tracked, known: Mapping[str, Any], name: str) -> list[st
             f"where the whisker leaves the skin, all forces and moments are {percent:.0f} % too "
             "large for each millimetre that fur hides, which is in no covariance: state how much "
             "that is (--fur)."
-        ] * bool({"base_radius", "rat"} & known.keys())
+        ]
     percent = 100.0 * np.log(force_scale(one.whisker, _FUR_KNOWN * fur))
     hidden = f"{1e3 * fur:g} ± {1e3 * _FUR_KNOWN * fur:.2g} mm"
     return [

@@ -261,14 +261,12 @@ def negative(frame: Frame, white: float = np.inf) -> Frame:
     return np.asarray(most - np.minimum(frame, most), dtype=frame.dtype)
 
 
-def _white(frames: Sequence[Frame]) -> float:
-    """Brightness of the brightest bodies where the ground is dark.
-
-    In the negative they are as dark then, compared with the ground, as a face on bright ground is.
-    """
+def _negatives(frames: Sequence[Frame]) -> list[Frame]:
+    """Negatives in which the brightest bodies on a dark ground are black, as a face would be."""
     some = np.stack([frame[::_SPARSE, ::_SPARSE] for frame in frames])
     bodies = _BRIGHTER * float(np.quantile(some, _BRIGHTEST))
-    return max(bodies, _OPEN * float(np.median(some)))
+    white = max(bodies, _OPEN * float(np.median(some)))
+    return [negative(frame, white) for frame in frames]
 
 
 def is_bright(
@@ -343,11 +341,7 @@ def find_start(
         )
     search, bright = _Search.of(cameras, frames, options, masks), bool(options.bright)
     if options.bright is not False:
-        whites = [_white(view) for view in frames]
-        inverted = [
-            [negative(frame, white) for frame in view]
-            for view, white in zip(frames, whites, strict=True)
-        ]
+        inverted = [_negatives(view) for view in frames]
         other = _Search.of(cameras, inverted, replace(options, bright=True), masks)
         few = search.moments(_POLARITY)
         bright = bright or other.worth(few) > _BETTER * search.worth(few)

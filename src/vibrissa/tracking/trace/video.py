@@ -49,7 +49,7 @@ _STRAYS, _FARTHEST = 4.0, 25.0
 # Distance from a base up to which a line begins at it, across: it may do so farther along itself.
 _OTHER = 6.0
 _TOGETHER = 0.5  # share of those that are asked for with which a neighbour is seen together
-_BEGUN = 3  # number of frames in which it is begun with them; most of them show a neighbour
+_BEGUN = 3  # number of frames in which a neighbour is looked for; most of them must show it
 
 
 def neighbours(
@@ -81,13 +81,8 @@ def neighbours(
     often = (length > 0.0).mean(axis=0) >= _OFTEN
     longest = length.max(axis=0)
     # In a single frame the face may have moved otherwise than was found.
-    usual = np.array(
-        [
-            np.median(row[seen]) if seen.any() else 0.0
-            for row, seen in zip(away.min(axis=1).T, length.T > 0.0, strict=True)
-        ]
-    )
-    often &= (longest > _HAIR) & (usual > _OTHER)
+    apart = np.ma.masked_invalid(away.min(axis=1))
+    often &= (longest > _HAIR) & (np.ma.median(apart, axis=0).filled(0.0) > _OTHER)
     others = [k for k in np.flatnonzero(often) if k not in asked]
     if not others:
         return []
@@ -97,7 +92,7 @@ def neighbours(
     found = list[Array]()
     for k in others:
         # Where it is farthest from the others these are least likely to be taken for it.
-        some = np.argsort(-np.where(length[:, k] > 0.0, away[:, :, k].min(axis=1), -np.inf))
+        some = np.argsort(-apart[:, k].filled(-np.inf))
         next_to, shown = int(nearest[:, k].argmin()), 0
         for i in some[:_BEGUN]:
             every = [start_at(at + shifts[i], options) for at in (*clicks, *found, places[k])]

@@ -323,8 +323,9 @@ NUMBERS = ("time", "x", "y", "z", "r", "theta", "phi", "sigma_x", "sigma_y", "si
 _AROUND = ("arc_length", "last_arc_length", "shift_x", "shift_y", "shift_z")
 _OPTIONAL = (*_AROUND, "one_contact", "friction", "onset_time", "onset_sigma")
 # Columns of names before the status, with their enumerations, also written only if present.
-_ESTIMATED = {"contact_point", "covariance", "r", "theta", "phi", "status"}
 _FLAGS: dict[str, type[Status | Event]] = {"event": Event}
+# Variables of estimated contacts from which columns are made.
+_ESTIMATED = {"contact_point", "covariance", "r", "theta", "phi", "status"}
 
 
 @runtime_checkable

@@ -297,7 +297,7 @@ def try_parabolas(
     count = len(points)
     third, shares = count // 3 + 1, np.linspace(0.0, 1.0, count)
     far = begins[-1] + max(-tips[0], tips[-1]) * shares + 2.0
-    far += 4.0 * bends[-1] * shares * (1.0 - shares)
+    far += 4.0 * max(-bends[0], bends[-1]) * shares * (1.0 - shares)
     table, squares = tabulated(darkness, factor, points, along, expected, far)
     origin = 0.5 * table.shape[1]
     # Of each parabola: t, the t before, the sum, what `add_strengths` uses, its ends and its bend.

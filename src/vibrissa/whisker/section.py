@@ -139,8 +139,8 @@ def doubtful_units(
     doubts = []
     if "youngs_modulus" in stated and youngs_modulus < _GEL and poisson_ratio < _INCOMPRESSIBLE:
         doubts.append(
-            f"youngs_modulus is {youngs_modulus:.4g} Pa, as of a gel or soft silicone, which have "
-            f"a poisson_ratio above {_INCOMPRESSIBLE:g}: is it in MPa? Steel has 200e9 Pa"
+            f"youngs_modulus is {youngs_modulus:.4g} Pa, as of a gel or soft silicone (then state "
+            f"its poisson_ratio, above {_INCOMPRESSIBLE:g}): is it in MPa? Steel has 200e9 Pa"
         )
     least = 0.0 if base_stiffness is None else min(base_stiffness)
     if "base_stiffness" in stated and least > _RIGID * bending:

@@ -21,7 +21,7 @@ det ∂p/∂x, and widened for tails as in :mod:`~vibrissa.contacts.uncertainty.
 from __future__ import annotations
 
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -213,8 +213,10 @@ class JointFit:
         slopes = joint.moved[..., n:] + joint.moved[..., :n] @ by_unknown
         out = np.zeros((len(targets), 3, 3))
         for i, (other, share) in enumerate(self.forward.errors):
-            how: Any = {"friction": self.friction, "least": self.least}
-            moved, _ = other.fit(self.names, targets, joint.weights, fits.contacts, **how)
+            by, x = joint.weights, fits.contacts
+            moved, _ = other.fit(
+                self.names, targets, by, x, friction=self.friction, least=self.least
+            )
             arc = share * (moved.values - fits.values)[:, 3:6] - slopes[..., i]
             arc[~(moved.misfits < _SOLVED)] = 0.0
             out += 3.0 * arc[:, :, None] * arc[:, None, :]

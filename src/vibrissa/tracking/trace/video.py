@@ -82,7 +82,8 @@ def neighbours(
     longest = length.max(axis=0)
     # In a single frame the face may have moved otherwise than was found.
     apart = np.ma.masked_invalid(away.min(axis=1))
-    often &= (longest > _HAIR) & (np.ma.median(apart, axis=0).filled(0.0) > _OTHER)
+    usual = np.ma.median(apart, axis=0).filled(0.0)  # type: ignore[no-untyped-call]
+    often &= (longest > _HAIR) & (usual > _OTHER)
     others = [k for k in np.flatnonzero(often) if k not in asked]
     if not others:
         return []

@@ -165,3 +165,12 @@ def test_a_gain_that_forgets_itself(gamma_map):
     assert 1.0 < np.mean(sizes) < 6.0  # 3 if stated rightly
     with pytest.raises(ValueError, match="memory"):
         vb.ContactFilter(locate, memory=0.0)
+
+
+def test_a_base_that_hardly_gives_way_is_not_questioned(gamma_map):
+    """It is stiffer than one that a user would state."""
+    truth, wrenches = touched(gamma_map.whisker, [0.0], NOISE)
+    signals = signals_of(wrenches, "Fx MB MD")
+    unit = gamma_map.whisker.base_bending_stiffness / gamma_map.whisker.length
+    found = gamma_map.estimate(signals, "Fx MB MD", NOISE, compliance_sigma=1e-8 / unit)
+    assert distance(found, truth).max() < 16.3

@@ -256,6 +256,38 @@ def test_a_wide_whisker_that_hardly_moves_is_not_divided_out(turn):
         assert shown_along(trace, angle)[0] < 0.25
 
 
+def with_stub(aside, turn, seed):
+    """A whisker at a face, and another one next to it, at another angle, that was cut."""
+    frame = tapered(0.05, length=170.0, wide=1.3, seed=seed, size=260).astype(float)
+    y, x = np.mgrid[:260, :260].astype(float)
+    along = (x - 60.0) * np.cos(turn) + (y - 100.0 - aside) * np.sin(turn)
+    across = (y - 100.0 - aside) * np.cos(turn) - (x - 60.0) * np.sin(turn)
+    stub = 130.0 * ((along > -5.0) & (along < 34.0)) * np.exp(-0.5 * (across / 1.4) ** 2)
+    frame = np.where(x < 60.0, frame, np.maximum(frame - stub, 40.0))
+    return np.rint(frame).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("aside", "turn"), [(-6.0, 0.05), (6.0, 0.05), (7.0, -0.1), (-7.0, 0.12), (9.0, -0.15)]
+)
+def test_a_whisker_begins_neither_on_a_cut_one_nor_where_that_ends(aside, turn):
+    """From a line that begins on the cut one as from its own."""
+    x = np.arange(60.0, 230.0, 2.0)
+    own = np.stack([x, 100.0 + 0.05 * (x - 60.0)], axis=1)
+    other = own.copy()
+    other[:17, 1] += aside + (turn - 0.05) * (x[:17] - 60.0)
+    other[17:25, 1] = np.linspace(other[16, 1], own[25, 1], 10)[1:-1]
+    for seed in range(3):
+        frame = with_stub(aside, turn, seed)
+        for line in (own, other):
+            trace, from_face = traced(frame, ridge.noise_level(frame), line, TraceOptions())
+            away, first, last = shown_along(trace, 0.05)
+            assert from_face
+            assert away < 1.5
+            assert abs(first) < 2.0
+            assert last > 130.0
+
+
 def still(dark, seed, count=20):
     """A frame of a film, without what stands still in it and makes the ground darker."""
     noise = np.random.default_rng(seed)

@@ -19,11 +19,21 @@ from vibrissa.tracking.trace.ridge import (
     Measured,
     fitted,
     flanks,
+    march,
     measure,
     measured,
     middle,
 )
-from vibrissa.tracking.trace.trace import NOTHING, STEP, Clutter, Trace, TraceOptions, even, tangent
+from vibrissa.tracking.trace.trace import (
+    NOTHING,
+    STEP,
+    Clutter,
+    Trace,
+    TraceOptions,
+    distances,
+    even,
+    tangent,
+)
 
 OUTSIDE = 12.0  # how far inside the face the base is searched, pixels
 _FUR = 3  # number of points next to the face that are not measured, since fur is dark too
@@ -42,6 +52,9 @@ _LAST = 10  # number of points before the end, and twice that of points beyond, 
 _ACROSS, _NARROWEST = np.arange(6.0), 0.3
 # Distances from the whisker at which the face's edge is searched, pixels.
 _FLANKS = np.array([4.0, 7.0])
+# Distances that distinguish it from a hair, and difference of edges from which there may be one,
+# points.
+_WIDER, _UNEVEN = np.array([4.0, 7.0, 10.0, 13.0]), 2.0
 # Smallest darkness of a whisker next to its base, in standard deviations of the fur's streaks.
 _CLEARER = 1.5
 _STREAKS = 40  # number of points of a line's beginning next to which fur may look like it
@@ -51,6 +64,14 @@ _TAPERED, _EVEN = 0.6, 0.9
 # Number of hidden points from which a line may go on anywhere behind them, by a pixel or more (with
 # the usual stiffness): what follows then belongs to it only if it is a line itself.
 _ASTRAY = 23
+# Share of a line before the point from which it is followed inward; share of the points on the way
+# that must be seen; and distance from the line from which that may begin on something else, pixels.
+_NEARER, _ENOUGH, _ASIDE = 0.55, 0.45, 1.5
+# Standard deviations of offset, direction and curvature at that point, and drift of the last: less
+# than when it is followed outward, so that what crosses it does not draw it away.
+_INWARD = np.array([1.0, 0.03, 3e-4]), 2e-5
+# Degree of the polynomials of a smooth curve, and share of a kink that may be left.
+_SMOOTH, _STRAIGHTER = 4, 0.8
 
 
 def traced(
@@ -72,6 +93,8 @@ def traced(
         if len(line) < FEWEST:
             # Where nothing is seen, nothing determines the line.
             return Trace.lost(), False
+    if not held:
+        line = _beginning(frame, noise, line, options, clutter)
     line, from_face = (line, True) if held else _with_base(frame, line, before, clutter)
     if before > OUTSIDE and len(line) >= FEWEST:
         # Extrapolated parts are measured before they count.
@@ -100,6 +123,47 @@ def traced(
     base_seen = inside(frame, line[0])
     skew = _skew(frame, line, options.scale, clutter)
     return Trace(line, along.sigma, along.seen, trusted, base_seen, tip_seen, skew), from_face
+
+
+def _beginning(
+    frame: Frame, noise: float, line: Array, options: TraceOptions, clutter: Clutter
+) -> Array:
+    """Line that begins along the smooth continuation of its outer part.
+
+    What is followed outward may begin on a hair or on a whisker that was cut, and leave it at a
+    kink. Followed inward from beyond, the whisker passes by them.
+    """
+    count = int(_NEARER * len(line))
+    if min(count, len(line) - count) < FEWEST:
+        return line
+    angle = np.unwrap(np.arctan2(*-np.diff(line[count : count + _BENDING], axis=0).T[::-1]))
+    s = STEP * (np.arange(len(angle)) + 0.5)
+    bend = -float((s - s.mean()) @ angle / ((s - s.mean()) ** 2).sum())
+    start = np.array([*line[count], angle.mean() + bend * s.mean()])
+    path, support = np.empty((count + 1, 2)), np.empty(count + 1)
+    scale, bridge = options.scale, options.bridge
+    bends = np.full(count, bend)
+    found = march(
+        frame, start, bends, *_INWARD, STEP, bridge, noise, scale, *clutter, path, support
+    )
+    if (support[:found] > 0.0).sum() < _ENOUGH * count:
+        return line
+    path = path[:found][::-1]
+    away = distances(path, line[: count + FEWEST])[~clutter.hides(path)]
+    if away.max(initial=0.0) < _ASIDE:
+        return line
+    better = np.concatenate([path, line[count + 1 :]])
+    if _kink(better[: len(path) + _BENDING]) > _STRAIGHTER * _kink(line[: count + _BENDING]):
+        return line
+    # A wider search would find what is next to it again.
+    return even(fitted(frame, even(better), 1, noise, options, clutter)[0])
+
+
+def _kink(points: Array) -> float:
+    """Root mean square distance of a line from a smooth curve, pixels."""
+    basis = np.vander(np.linspace(-1.0, 1.0, len(points)), _SMOOTH + 1)
+    left = points - basis @ np.linalg.lstsq(basis, points)[0]
+    return float(np.sqrt((left**2).sum(axis=1).mean()))
 
 
 def _above_texture(
@@ -162,12 +226,29 @@ def _with_base(frame: Frame, line: Array, before: float, clutter: Clutter) -> tu
     near, far = map(_edge, grey_flanks(frame, longer[:40], _FLANKS, clutter))
     if near is None:
         return line, False
+    if far is not None and abs(far - near) >= _UNEVEN:
+        bare = _without_lines(grey_flanks(frame, longer[:40], _WIDER, clutter))
+        closer, far = map(_edge, bare[: len(_FLANKS)])
+        near = near if closer is None else closer
     at = near
-    if far is not None and abs(far - near) < 2.0:
+    if far is not None and abs(far - near) < _UNEVEN:
         # The face is round: its edge on the whisker itself, to second order in the distance.
         a, b = _FLANKS
         at = near + (near - far) * a * a / (b * b - a * a)
     return even(longer, max(at, 0.0) * STEP), True
+
+
+def _without_lines(sides: Array) -> Array:
+    """Grey values (k, 2, n) next to a line without what is dark at one or two distances only.
+
+    Hairs and whiskers that were cut are as dark as the face that they leave.
+    """
+    across = np.concatenate([sides[::-1, 0], sides[:, 1]])
+    for most, fill in ((np.fmax, -np.inf), (np.fmin, np.inf)):
+        padded = np.pad(across, ((1, 1), (0, 0)), constant_values=fill)
+        across = most(most(padded[:-2], padded[1:-1]), padded[2:])
+    k = len(sides)
+    return np.stack([across[:k][::-1], across[k:]], axis=1)
 
 
 def _edge(sides: Array) -> float | None:

@@ -10,6 +10,7 @@ from vibrissa.contour import (
     fit_shape,
     shape_from_dataset,
 )
+from vibrissa.contour.fitted_shape import whiten
 from vibrissa.objects import Peg
 
 CENTER = np.array([25e-3, 1e-3, -2e-3])
@@ -165,8 +166,10 @@ def test_a_fit_to_similar_points_leads_to_the_same_shape(kind, joint_errors):
     points, known = noisy(kind, joint_errors, np.random.default_rng(2), 60)
     start = fit_shape(kind, points + np.array([0.3e-3, -0.2e-3, 0.1e-3]), **known)
     searched, fit = fit_shape(kind, points, **known), fit_shape(kind, points, **known, start=start)
-    for name in (*fit.fields, "covariance"):
+    for name in fit.fields:
         np.testing.assert_allclose(getattr(fit, name), getattr(searched, name), 1e-4, 1e-9)
+    sigma, known_sigma = (np.sqrt(np.diag(one.covariance)) for one in (fit, searched))
+    np.testing.assert_allclose(sigma, known_sigma, 1e-3, 1e-9)
     other = "plane" if kind == "sphere" else "sphere"
     with pytest.raises(ValueError, match=f"start is a {kind}"):
         fit_shape(other, points, start=start)
@@ -270,3 +273,50 @@ def test_a_cylinder_of_few_points_does_not_end_in_another_one():
         found = fit_shape("cylinder", points, np.tile(sigma**2 * np.eye(3), (8, 1, 1)))
         gaps = np.linalg.norm(points - (points @ axis)[:, None] * axis, axis=1) - radius
         assert found.chi_squared.sum() < ((gaps / sigma) ** 2).sum() + 0.5
+
+
+def test_errors_that_contacts_share_are_weighted_as_their_covariance_says():
+    generator = np.random.default_rng(3)
+    n, m, k = 7, 3, 2
+    misses, shared = generator.normal(size=(n, m)), generator.normal(size=(n, m, k))
+    root = generator.normal(size=(n, m, m))
+    covariance = root @ np.swapaxes(root, 1, 2)
+    whole = np.zeros((n, m, n, m))
+    whole[np.arange(n), :, np.arange(n)] = covariance
+    whole = whole.reshape(n * m, n * m)
+    by_error = shared.reshape(n * m, k)
+    whole += by_error @ by_error.T
+    expected = misses.reshape(-1) @ np.linalg.solve(whole, misses.reshape(-1))
+    assert (whiten(misses, covariance, shared) ** 2).sum() == pytest.approx(expected, rel=1e-6)
+    none = whiten(misses, covariance, shared[..., :0])
+    np.testing.assert_array_equal(none, whiten(misses, covariance))
+
+
+def test_a_cylinder_is_as_near_as_stated_where_all_normals_are_turned_alike(joint_errors):
+    """As by friction along it: normals turn about the tangents of the whisker."""
+    generator = np.random.default_rng(11)
+    squares = {True: [], False: []}
+    for _ in range(20):
+        points, known = noisy("cylinder", joint_errors, generator, 60)
+        tangent = np.cross(np.array([0.0, 0.0, 1.0]), known["normals"])
+        tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+        each = 0.1 * np.stack([np.ones(60), known["normals"][:, 0]], axis=1)
+        turns = Rotation.from_rotvec((each @ generator.normal(size=2))[:, None] * tangent)
+        known["normals"] = turns.apply(known["normals"])
+        turned = turns.as_matrix()
+        known["normal_covariance"] = turned @ known["normal_covariance"] @ np.swapaxes(turned, 1, 2)
+        known["point_normal_covariance"] = known["point_normal_covariance"] @ np.swapaxes(
+            turned, 1, 2
+        )
+        shared = np.zeros((60, 2, 6))
+        shared[:, :, 3:] = each[:, :, None] * np.cross(tangent, known["normals"])[:, None]
+        for stated in squares:
+            more = {"shared": shared} if stated else {}
+            fit = fit_shape("cylinder", points, **known, **more)
+            size = np.sqrt(np.diag(fit.covariance)[[3, 4, 6]])
+            squares[stated].append(((fit.axis[0], fit.axis[1], fit.radius - RADIUS) / size) ** 2)
+    score = {stated: np.sqrt(np.mean(values, axis=0)) for stated, values in squares.items()}
+    assert (score[True] < 1.5).all()
+    assert score[False][:2].max() > 5.0
+    with pytest.raises(ValueError, match="shared is given without"):
+        fit_shape("cylinder", points, shared=shared)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from vibrissa import ContactMap, PointContact, deflect, samples
+from vibrissa import ContactMap, PointContact, Whisker, deflect, samples
 from vibrissa.contour import shape_from_dataset
 from vibrissa.io import load_recording, save_recording
-from vibrissa.objects import Sphere
+from vibrissa.objects import Peg, Sphere
 from vibrissa.pipeline import (
     AGREES,
     STRONG,
@@ -246,20 +246,51 @@ def test_a_peg_is_found_with_noise(trial):
     assert (np.abs(contour["axis_offset"].values[:2]) < 5 * sigma[:2]).all()
 
 
-@pytest.mark.slow
-def test_a_peg_that_rubs_is_found_where_normals_may_lean():
-    whisker = samples.gamma()
-    peg = facing_peg(whisker)
-    rubbed = simulate(whisker, sweep_past(whisker, peg, 0.5, 400.0, seed=2), peg, friction=0.3)
-    felt = with_estimates(measure(rubbed, seed=3), "wrench")
-    offsets = {
-        lean: np.linalg.norm(with_contour(felt, lean=lean)["contour/axis_offset"])
-        for lean in (None, 0.0)
-    }
-    assert offsets[None] < 0.15e-3
-    assert offsets[None] < 0.5 * offsets[0.0]
+def scores(contour, peg):
+    """Errors of a fitted peg in standard deviations: axis (2), direction (2) and radius."""
+    covariance = contour["parameter_covariance"].values
+    axis, origin = contour["object_axis"].values, contour["object_position"].values
+    true = peg.axis * np.sign(axis @ peg.axis)
+    across = np.linalg.svd(true[None])[2][1:]
+    errors = np.concatenate(
+        [
+            across @ (origin - peg.origin),
+            across @ (axis - true),
+            [contour["object_radius"] - peg.radius],
+        ]
+    )
+    by = np.zeros((5, 7))
+    by[:2, :3] = by[2:4, 3:6] = across
+    by[4, 6] = 1.0
+    spread = by @ covariance @ by.T
+    parts = slice(0, 2), slice(2, 4), slice(4, 5)
+    squares = [errors[p] @ np.linalg.solve(spread[p, p], errors[p]) for p in parts]
+    return np.sqrt(np.divide(squares, (2, 2, 1)))
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.1, 0.3])
+def test_a_peg_that_rubs_is_as_near_as_stated(friction):
+    """Friction across the whisker turns the forces of all contacts alike."""
+    whisker = Whisker.straight(45e-3, base_radius=77e-6, tip_radius=9e-6, youngs_modulus=3.3e9)
+    axis = np.array([0.15, 0.2, 1.0])
+    peg = Peg(facing_peg(whisker, 0.5, 1.2e-3).origin, axis / np.linalg.norm(axis), 1.2e-3)
+    moved = sweep_past(whisker, peg, 0.25, 300.0, row="A", seed=2)
+    rubbed = with_signals(measure(simulate(whisker, moved, peg, friction=friction), seed=3))
+    felt = with_estimates(rubbed, "wrench")
+    done = with_contour(felt)["contour"].to_dataset()
+    assert (scores(done, peg) < 3.0).all()
+    assert np.linalg.norm(done["axis_offset"]) < 0.05e-3
+    exact = with_contour(felt, lean=0.0)["contour"].to_dataset()
+    assert (scores(exact, peg)[1] > 10.0) == (friction > 0.0)
     with pytest.raises(ValueError, match="lean"):
         with_contour(felt, lean=-0.1)
+    # Three signals and the assumption of friction: normals are as uncertain as the points.
+    truth = rubbed["truth"].to_dataset().isel(whisker=0)
+    found = with_estimates(rubbed, friction=0.3)["estimates"].to_dataset().isel(whisker=0)
+    along = found["contact_tangent"].values
+    away = np.einsum("ti,ti->t", truth["surface_normal"].values, along)
+    spread = np.einsum("ti,tij,tj->t", along, found["normal_covariance"].values, along)
+    assert np.nanmedian(np.abs(away) / np.sqrt(spread)) < 1.5
 
 
 def test_what_is_below_the_noise_is_not_felt_and_what_is_zero_is_no_contact(

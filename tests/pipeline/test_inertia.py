@@ -107,6 +107,16 @@ def test_normals_and_the_peg_are_as_near_as_stated(trial, truth):
     offset, tilt = axis_offset(fit.object_position, fit.object_axis, peg.origin, peg.axis)
     assert np.linalg.norm(offset) < 0.1e-3
     assert np.degrees(tilt) < 2.0
+    # Mass and damping are wrong in all frames alike.
+    covariance = fit.parameter_covariance.values
+    away = fit.object_axis.values - peg.axis * np.sign(fit.object_axis.values @ peg.axis)
+    across = np.linalg.svd(peg.axis[None])[2][1:]
+    spread = across @ covariance[3:6, 3:6] @ across.T
+    assert across @ away @ np.linalg.solve(spread, across @ away) < 12.0
+    assert abs(fit.object_radius - peg.radius) < 3.0 * np.sqrt(covariance[6, 6])
+    shared = found.contact_inertia.values[rows][:, :, :3]
+    own = found.contact_covariance.values[rows] - np.einsum("tei,tej->tij", shared, shared)
+    assert (np.linalg.eigvalsh(own)[:, 0] > -1e-16).all()
 
 
 @pytest.mark.slow

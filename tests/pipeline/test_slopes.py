@@ -35,7 +35,7 @@ def differences(bent, found):
 
 
 def point_and_normal(arc_length, contact_force, point, change=0.0):
-    normal, _ = contact_normals(WHISKER, arc_length, contact_force, change)
+    normal, _, _ = contact_normals(WHISKER, arc_length, contact_force, change)
     return np.concatenate([point, normal], axis=1)
 
 
@@ -53,7 +53,7 @@ def test_contacts_move_with_the_wrench_as_the_gain_says(names):
             e.candidates.arc_length[:, 0], e.candidates.contact_force[:, 0], e.point
         )
 
-    gain = gains(WHISKER, names, bent.arc_length, bent.contact_force, noise)
+    gain, _ = gains(WHISKER, names, bent.arc_length, bent.contact_force, noise)
     expected = differences(bent, found)
     for i in range(6):
         size = np.abs(gain[:, :, i]).max()
@@ -69,7 +69,7 @@ def test_contacts_that_rub_move_as_the_gain_says(change):
         e = vb.estimate_from_wrench(WHISKER, force, moment, noise=noise)
         return point_and_normal(e.arc_length, e.contact_force, e.point, change)
 
-    gain = gains(WHISKER, WRENCH, bent.arc_length, bent.contact_force, noise, change=change)
+    gain, _ = gains(WHISKER, WRENCH, bent.arc_length, bent.contact_force, noise, change=change)
     expected = differences(bent, found)
     for i in range(6):
         size = np.abs(gain[:, :, i]).max()
@@ -89,12 +89,12 @@ def test_the_covariance_is_that_of_the_map():
             found.candidates.arc_length[:, 0],
             found.candidates.contact_force[:, 0],
             noise,
-        )[:, :3]
+        )[0][:, :3]
         np.testing.assert_allclose(
             gain @ noise @ np.swapaxes(gain, 1, 2), found.covariance, rtol=1e-6
         )
     found = vb.estimate_from_wrench(WHISKER, bent.force, bent.moment, noise=noise)
-    gain = gains(WHISKER, WRENCH, found.arc_length, found.contact_force, noise)[:, :3]
+    gain = gains(WHISKER, WRENCH, found.arc_length, found.contact_force, noise)[0][:, :3]
     scale = np.abs(found.covariance).max(axis=(1, 2), keepdims=True)
     got = gain @ noise @ np.swapaxes(gain, 1, 2)
     np.testing.assert_allclose(got / scale, found.covariance / scale, atol=1e-5)
@@ -116,11 +116,11 @@ def test_the_wrench_moves_with_the_point_as_its_slopes_say():
 
 def test_normals_are_across_the_whisker():
     bent = vb.deflect(WHISKER, LOAD)
-    normal, _ = contact_normals(WHISKER, bent.arc_length, bent.contact_force)
+    normal, _, _ = contact_normals(WHISKER, bent.arc_length, bent.contact_force)
     size = np.linalg.norm(bent.force, axis=1, keepdims=True)
     np.testing.assert_allclose(normal, bent.force / size, atol=1e-12)
     rubbing = vb.deflect(WHISKER, RUBBING)
-    along, _ = contact_normals(WHISKER, rubbing.arc_length, rubbing.contact_force)
+    along, _, _ = contact_normals(WHISKER, rubbing.arc_length, rubbing.contact_force)
     share = (along * rubbing.force).sum(axis=1) / np.linalg.norm(rubbing.force, axis=1)
     angle = np.arctan2(
         np.abs(rubbing.contact_force[:, 0]), np.linalg.norm(rubbing.contact_force[:, 1:], axis=1)
@@ -133,7 +133,7 @@ def test_normals_are_as_uncertain_as_the_change_of_the_force():
     rng = np.random.default_rng(3)
     root = 1e-7 * rng.normal(size=(3, 3, 3))
     args = WHISKER, bent.arc_length, bent.contact_force
-    _, covariance = contact_normals(*args, 0.0, root @ np.swapaxes(root, 1, 2))
+    _, covariance, _ = contact_normals(*args, 0.0, root @ np.swapaxes(root, 1, 2))
     draws = np.einsum("nij,knj->kni", root, rng.normal(size=(4000, 3, 3)))
     normals = np.array([contact_normals(*args, draw)[0] for draw in draws])
     for row, many in zip(covariance, np.swapaxes(normals, 0, 1), strict=True):
@@ -141,7 +141,7 @@ def test_normals_are_as_uncertain_as_the_change_of_the_force():
 
 
 def test_without_a_contact_there_is_nothing():
-    nothing = gains(WHISKER, ("Fx", "MB", "MD"), np.full(2, np.nan), np.full((2, 3), np.nan))
+    nothing, _ = gains(WHISKER, ("Fx", "MB", "MD"), np.full(2, np.nan), np.full((2, 3), np.nan))
     assert np.isnan(nothing).all()
     assert nothing.shape == (2, 6, 6)
     assert np.isnan(wrench_slopes(WHISKER, np.array([np.nan]), np.full((1, 3), np.nan))).all()

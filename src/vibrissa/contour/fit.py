@@ -93,6 +93,7 @@ def fit_shape(
     normals: ArrayLike | None = None,
     normal_covariance: ArrayLike | None = None,
     point_normal_covariance: ArrayLike | None = None,
+    shared: ArrayLike | None = None,
     *,
     axis: ArrayLike | None = None,
     outside: ArrayLike | None = None,
@@ -123,6 +124,10 @@ def fit_shape(
         Covariance of each point (rows) with its unit normal (columns), m; zero by default. Where
         both come from the same few signals their errors are correlated (0.9 and more), and this
         matters.
+    shared : array_like (n, k, 6), optional
+        Changes of each point and unit normal by one standard deviation of k errors that contacts
+        share, in addition to their own covariance: unlike these, they do not become smaller with
+        the number of contacts.
     axis : array_like (3,), optional
         Known direction of a cylinder's axis.
     outside : array_like (3,), optional
@@ -161,6 +166,7 @@ def fit_shape(
         normals=normals,
         normal_covariance=normal_covariance,
         point_normal_covariance=point_normal_covariance,
+        shared=shared,
     )
     if start is not None:
         if not isinstance(start, declared):
@@ -204,7 +210,9 @@ class _SteppedShape:
         assert spread is not None
         if touches.normal is not None:
             miss, by = self.shape.misses(touches, self.frame)
-            return whiten(miss, by @ spread @ np.swapaxes(by, 1, 2))
+            shared = touches.shared
+            moved = None if shared is None else by @ np.swapaxes(shared, 1, 2)
+            return whiten(miss, by @ spread @ np.swapaxes(by, 1, 2), moved)
         normal, curvature = self.shape.local(touches)
         bent = curvature @ spread
         shift = 0.5 * np.trace(bent, axis1=1, axis2=2)

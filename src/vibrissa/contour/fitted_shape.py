@@ -29,18 +29,20 @@ _NEGATIVE = 1e-8
 
 
 class Touches(NamedTuple):
-    """Contacts in units of their extent, with normals and covariances if known."""
+    """Contacts in units of their extent, with normals, covariances and shared errors if known."""
 
     position: Array
     whisker_radius: Array
     normal: Array | None
     covariance: Array | None
+    shared: Array | None = None
 
     def rows(self, which: Mask) -> Touches:
         """Select contacts."""
         normal = None if self.normal is None else self.normal[which]
         spread = None if self.covariance is None else self.covariance[which]
-        return Touches(self.position[which], self.whisker_radius[which], normal, spread)
+        shared = None if self.shared is None else self.shared[which]
+        return Touches(self.position[which], self.whisker_radius[which], normal, spread, shared)
 
     @property
     def joint(self) -> bool:
@@ -78,6 +80,7 @@ class ContactArrays(TypedDict, total=False):
     normals: ArrayLike | None
     normal_covariance: ArrayLike | None
     point_normal_covariance: ArrayLike | None
+    shared: ArrayLike | None
 
 
 def check_contacts(
@@ -98,6 +101,8 @@ def check_contacts(
     arrays, faults = {}, []
     for name, values in given.items():
         arrays[name] = numbers(name, values)
+        if name == "shared":
+            allowed[name] = [(n, *arrays[name].shape[1:2], 6)]
         shapes = allowed.get(name, [(n, 3, 3)])
         if arrays[name].shape not in shapes:
             wanted = " or ".join(map(str, shapes))
@@ -105,6 +110,7 @@ def check_contacts(
     needs = {
         "normal_covariance": ("normals", "covariance"),
         "point_normal_covariance": ("normal_covariance",),
+        "shared": ("normal_covariance",),
     }
     for name, others in needs.items():
         lacking = [other for other in others if other not in arrays]
@@ -145,7 +151,8 @@ def _scale_contacts(what: str, arrays: dict[str, Array], n: int, least: int) -> 
         raise ValueError(f"no {what}: all points are on a line, or the same")
     normal = kept["normals"] / length[usable][:, None] if "normals" in kept else None
     spread = _covariance(what, kept, np.flatnonzero(usable), extent)
-    touches = Touches(centered / extent, kept["whisker_radius"] / extent, normal, spread)
+    shared = kept["shared"] / np.repeat([extent, 1.0], 3) if "shared" in kept else None
+    touches = Touches(centered / extent, kept["whisker_radius"] / extent, normal, spread, shared)
     return Checked(usable, touches, mean, extent)
 
 
@@ -169,13 +176,26 @@ def _covariance(
     return np.asarray(out)
 
 
-def whiten(misses: Array, covariance: Array) -> Array:
-    """Express residuals (n, m) in standard deviations, uncorrelated."""
+def whiten(misses: Array, covariance: Array, shared: Array | None = None) -> Array:
+    """Express residuals (n, m) in standard deviations, uncorrelated.
+
+    Their covariance is block diagonal, ``covariance`` (n, m, m), plus G Gᵀ for their changes
+    ``shared`` (n, m, k) by one standard deviation of each error that all of them share. In units of
+    the blocks it is I + G Gᵀ, whose inverse square root is I − G f(GᵀG) Gᵀ with
+    f(x) = 1 / (1 + x + √(1 + x)): residuals of a contact remain those of this contact.
+    """
     m = misses.shape[1]
     # Rounding must not make the least noisy combination appear exact.
     floor = FLOOR**2 + _FINE * np.trace(covariance, axis1=1, axis2=2)
     root = np.linalg.cholesky(covariance + floor[:, None, None] * np.eye(m))
-    return np.asarray(np.linalg.solve(root, misses[..., None])[..., 0])
+    out = np.asarray(np.linalg.solve(root, misses[..., None])[..., 0])
+    if shared is None:
+        return out
+    g = np.linalg.solve(root, shared).reshape(out.size, shared.shape[2])
+    size, turn = np.linalg.eigh(g.T @ g)
+    size = 1.0 + np.maximum(size, 0.0)
+    known = turn @ ((turn.T @ (g.T @ out.reshape(-1))) / (size + np.sqrt(size)))
+    return np.asarray(out - (g @ known).reshape(out.shape))
 
 
 def to_laboratory(points: ArrayLike, base_rotation: ArrayLike, base_position: ArrayLike) -> Array:

@@ -239,7 +239,11 @@ class Cylinder(RoundShape):
             return q - far * normal, np.broadcast_to(frame, (n, 2, 3))
         by = np.zeros((n, 3, 6))
         by[:, :2, :3] = frame
-        by[:, :2, 3:] = -far[..., None] * frame
+        # A turned normal moves along the chord of an arc, whose radial component is half of that of
+        # the arc's tangent.
+        along = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        chord = np.eye(2) - 0.5 * along[:, :, None] * along[:, None, :]
+        by[:, :2, 3:] = -far[..., None] * (chord @ frame)
         by[:, 2, 3:] = self.axis
         return np.column_stack([q - far * normal, touches.normal @ self.axis]), by
 

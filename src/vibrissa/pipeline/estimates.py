@@ -19,7 +19,7 @@ from vibrissa.contour import continuing_candidates, to_laboratory
 from vibrissa.numerics import Array, contacts_in, cross_matrix
 from vibrissa.pipeline.checks import signals_in
 from vibrissa.pipeline.events import EVENTS, with_events
-from vibrissa.pipeline.frames import CHANGE
+from vibrissa.pipeline.frames import CHANGE, INERTIA
 from vibrissa.pipeline.location import locate, locate_from_wrench, without_contact
 from vibrissa.pipeline.signals import sensor_noise
 from vibrissa.quantities import attributes
@@ -47,6 +47,8 @@ _KEPT = (
     "contact_normal",
     "normal_covariance",
     "point_normal_covariance",
+    "contact_tangent",
+    "contact_inertia",
     "contact_point_whisker",
     "covariance",
     "arc_length",
@@ -121,9 +123,10 @@ def estimates_of(
     xarray.Dataset
         Group ``estimates`` of a recording, dimensions time, whisker, space. In the laboratory
         frame: ``contact_point`` with ``contact_covariance``, ``contact_normal`` with
-        ``normal_covariance``, and ``point_normal_covariance``. In the whisker frame:
-        ``contact_point_whisker`` with ``covariance``, ``arc_length`` and ``force``. Also the number
-        of ``candidates``, of which the one most continuous in time is selected; ``in_contact``
+        ``normal_covariance``, ``point_normal_covariance``, and ``contact_tangent``, the direction
+        of the whisker. In the whisker frame: ``contact_point_whisker`` with ``covariance``,
+        ``arc_length`` and ``force``. Also the number of ``candidates``, of which the one most
+        continuous in time is selected; ``in_contact``
         (detected) and ``status``; ``event`` (onset, loss or slip) and the time of each contact's
         onset, ``onset_time`` with ``onset_sigma``, s. Attributes: ``signals``, ``source``,
         ``felt_above``, the M_B from which contacts are detected, N·m, and ``friction``, as in
@@ -262,6 +265,8 @@ def _one_whisker(
         pose.pop("pose_wrench_covariance", None)
     held = known["base_rotation"], known["base_position"]
     placed = in_laboratory(found, *held, **pose, wrench_shared=shared)
+    if INERTIA[0] in known:
+        placed = placed.assign(contact_inertia=_by_inertia(placed, known))
     own = known["status"]
     status = np.where(is_ok(own), placed["status"].values, own).astype(np.int8)
     placed["status"] = placed["status"].copy(data=status)
@@ -301,8 +306,10 @@ def in_laboratory(
     rows = np.flatnonzero(chosen >= 0)
     placed = np.full((len(points), 3), np.nan)
     placed[rows] = lab[rows, chosen[rows]]
-    normal = _chosen(contacts["candidate_normal"], chosen).values
-    normal = np.einsum("tij,tj->ti", rotation, normal)
+    normal, tangent = (
+        np.einsum("tij,tj->ti", rotation, _chosen(contacts[f"candidate_{name}"], chosen).values)
+        for name in ("normal", "tangent")
+    )
     gain = _chosen(contacts["candidate_gain"], chosen).values
     wrench = contacts["wrench_covariance"].values
     if wrench_shared is not None:
@@ -322,19 +329,37 @@ def in_laboratory(
         None if pose_covariance is None else np.asarray(pose_covariance),
         None if pose_wrench_covariance is None else np.asarray(pose_wrench_covariance),
     )
-    for part, name in ((slice(3), "widening"), (slice(3, 6), "normal_widening")):
-        wider = _chosen(contacts[f"candidate_{name}"], chosen).values
-        spread[:, part, part] += rotation @ wider @ np.swapaxes(rotation, 1, 2)
+    wider = _chosen(contacts["candidate_widening"], chosen).values
+    for i in (slice(3), slice(3, 6)):
+        for k in (slice(3), slice(3, 6)):
+            spread[:, i, k] += rotation @ wider[:, i, k] @ np.swapaxes(rotation, 1, 2)
     squares = {
         "contact_covariance": spread[:, :3, :3],
         "normal_covariance": spread[:, 3:, 3:],
         "point_normal_covariance": spread[:, :3, 3:],
     }
-    vectors = {"contact_point": placed, "contact_normal": normal}
+    turned = np.einsum("tij,tajk->taik", rotation, gain.reshape(-1, 2, 3, 6)).reshape(gain.shape)
+    kept["gain"] = xr.DataArray(turned, dims=("time", "contact_component", "component"))
+    vectors = {"contact_point": placed, "contact_normal": normal, "contact_tangent": tangent}
     return contacts.assign(kept).assign(
         {name: (_SQUARE, v, attributes(name) | _LABORATORY) for name, v in squares.items()}
         | {name: (_SQUARE[:2], v, attributes(name) | _LABORATORY) for name, v in vectors.items()}
     )
+
+
+def _by_inertia(contacts: xr.Dataset, signals: Group) -> xr.DataArray:
+    """Changes of contact points and normals by errors that all corrections for inertia share."""
+    rotation, (wrench, change) = signals["base_rotation"], (signals[name] for name in INERTIA)
+    # The removed wrench is subtracted, and the change of the contact force is added.
+    moved = -np.einsum("tij,tej->tei", contacts["gain"].values, wrench)
+    force = contacts["force"].values + signals[CHANGE[0]]
+    force, change = (np.einsum("tij,t...j->t...i", rotation, v) for v in (force, change))
+    normal, tangent = contacts["contact_normal"].values, contacts["contact_tangent"].values
+    turned = np.cross(tangent, normal)
+    share = np.einsum("ti,tei->te", turned, change) / (force * normal).sum(axis=1)[:, None]
+    moved[..., 3:] += share[..., None] * turned[:, None]
+    dims = ("time", "inertia_error", "contact_component")
+    return xr.DataArray(moved, dims=dims, attrs=attributes("contact_inertia") | _LABORATORY)
 
 
 def _laboratory_covariance(

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 # Change of the contact force by inertia that was removed from signals, and its covariance.
 CHANGE = ("contact_force_change", "contact_force_change_covariance")
+# Changes of the wrench and of the contact force by errors of that correction in all frames.
+INERTIA = ("wrench_inertia", "contact_force_inertia")
 
 
 @dataclass(frozen=True)

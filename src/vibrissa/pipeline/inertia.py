@@ -27,7 +27,7 @@ from vibrissa.contour import to_laboratory
 from vibrissa.deferred import ndimage, signal
 from vibrissa.numerics import Array, contacts_in
 from vibrissa.pipeline.checks import one_whisker
-from vibrissa.pipeline.frames import CHANGE
+from vibrissa.pipeline.frames import CHANGE, INERTIA
 from vibrissa.pipeline.location import locate_from_wrench
 from vibrissa.recording import Group, recorded
 from vibrissa.simulation import Dynamics, Vibration, fit_dynamics, inertial_wrench
@@ -99,6 +99,7 @@ def without_inertia(
     of_wrench, of_change = _uncertainties(trial, removed, vibration)
     more = {"wrench_covariance": trial.noise + of_wrench}
     more |= dict(zip(CHANGE, (removed.change, of_change), strict=True))
+    more |= dict(zip(INERTIA, removed.shared(), strict=True))
     about = {"density": dynamics.density, "damping_ratio": dynamics.damping_ratio}
     return (
         one_whisker(values, status)
@@ -145,6 +146,18 @@ class _Removed(NamedTuple):
     change: Array
     unsettled: Array
     failed: NDArray[np.bool_]
+
+    def shared(self) -> tuple[Array, Array]:
+        """Changes (n, 2, 6) of the wrench and (n, 2, 3) of the contact force by shared errors.
+
+        These are one standard deviation of mass and damping, and of the difference between the
+        models; both are part of the covariances.
+        """
+        known = _KNOWN_TO * self.wrench, _KNOWN_TO * self.change
+        return (
+            np.stack([known[0], _APART * self.apart], axis=1),
+            np.stack([known[1], np.zeros_like(known[1])], axis=1),
+        )
 
 
 def _removed(trial: _Trial, dynamics: Dynamics, vibration: Vibration) -> _Removed:

@@ -479,13 +479,12 @@ def _located(
         points, arc_lengths, forces = one.point, one.arc_length, one.force
         contact_forces, status[rows] = one.contact_force, found.status
         number[rows], valid[rows] = found.n_candidates, found.covariance_valid
-    gain, spread, widening, normals, turning = _errors(
+    gain, spread, widening, normals, tangents = _errors(
         whisker, names, measured, arc_lengths, contact_forces, stated, friction
     )
     columns = {
         "points": ("contact_point_whisker", points),
         "covariance": ("covariance", spread),
-        "widening": ("covariance", widening),
         "arc_length": ("arc_length", arc_lengths),
         "force": ("force", forces),
     }
@@ -493,18 +492,25 @@ def _located(
     for short, (name, values) in columns.items():
         dims = ("time", "candidate", "space", "space_2")[: values.ndim]
         everywhere = _everywhere(rows, values)
-        if short != "widening":
-            data[name] = ((dims[0], *dims[2:]), everywhere[:, 0], attributes(name))
+        data[name] = ((dims[0], *dims[2:]), everywhere[:, 0], attributes(name))
         data[f"candidate_{short}"] = (dims, everywhere, attributes(name))
     data["candidate_normal"] = (
         ("time", "candidate", "space"),
         _everywhere(rows, normals),
         attributes("contact_normal") | _WHISKER,
     )
-    data["candidate_normal_widening"] = (
-        ("time", "candidate", "space", "space_2"),
-        _everywhere(rows, turning),
-        attributes("normal_covariance") | _WHISKER,
+    data["candidate_tangent"] = (
+        ("time", "candidate", "space"),
+        _everywhere(rows, tangents),
+        attributes("contact_tangent") | _WHISKER,
+    )
+    data["candidate_widening"] = (
+        ("time", "candidate", "contact_component", "contact_component_"),
+        _everywhere(rows, widening),
+        {
+            "units": "(m, 1)^2",
+            "long_name": "covariance of contact point and normal by other errors",
+        },
     )
     data["candidate_gain"] = (
         ("time", "candidate", "contact_component", "component"),
@@ -540,10 +546,10 @@ def _errors(
     stated: Array | None,
     friction: float,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Gains, covariances and normals of candidates.
+    """Gains, covariances of points, normals and the whisker's tangents of candidates.
 
-    The third and last results are the parts of the covariances of points and normals that are not
-    due to the gains.
+    The third result is the part of the covariances of points and normals that is not due to the
+    gains.
     """
     rows = measured.rows
     shape = arc_lengths.shape
@@ -552,12 +558,13 @@ def _errors(
         np.repeat(of[rows], shape[1], axis=0)
         for of in (measured.change, measured.change_covariance)
     )
-    gain = gains(whisker, names, *flat, measured.typical, measured.errors, friction, change)
-    gain = gain.reshape(*shape, 6, 6)
-    normals, turning = contact_normals(whisker, *flat, change, doubt)
+    gain, rubbed = gains(whisker, names, *flat, measured.typical, measured.errors, friction, change)
+    gain, rubbed = gain.reshape(*shape, 6, 6), rubbed.reshape(*shape, 6)
+    normals, turning, tangents = contact_normals(whisker, *flat, change, doubt)
     first = gain @ measured.covariance[rows][:, None] @ np.swapaxes(gain, -1, -2)
+    first += rubbed[..., :, None] * rubbed[..., None, :]
     point_gain, spread = gain[..., :3, :], first[..., :3, :3]
-    widening = np.zeros_like(spread)
+    wider = np.zeros_like(spread)
     # Second-order terms: normals turn, and errors of points follow an arc whose radius is of the
     # order of the length. Unclear contacts may be anywhere.
     unclear = np.where(measured.clear[rows], 0.0, 1.0)[:, None, None, None] * np.eye(3)
@@ -565,14 +572,18 @@ def _errors(
     turning += 0.5 * np.einsum("ncii->nc", first[..., 3:, 3:])[..., None, None] ** 2 * np.eye(3)
     if not measured.steady:
         size = np.einsum("ncii->nc", spread) / whisker.length
-        widening = size[..., None, None] ** 2 * np.eye(3) + _ANYWHERE * whisker.length**2 * unclear
-        spread = spread + widening
+        wider = size[..., None, None] ** 2 * np.eye(3) + _ANYWHERE * whisker.length**2 * unclear
+        spread = spread + wider
     elif stated is not None:
         k = stated.shape[1]
-        factor, wider = _as_stated(spread[:, :k], stated)
-        point_gain[:, :k], widening[:, :k] = factor @ point_gain[:, :k], wider
+        factor, wider[:, :k] = _as_stated(spread[:, :k], stated)
+        point_gain[:, :k] = factor @ point_gain[:, :k]
+        rubbed[:, :k, :3] = np.einsum("ncij,ncj->nci", factor, rubbed[:, :k, :3])
         spread[:, :k] = np.where(np.isfinite(stated), stated, spread[:, :k])
-    return gain, spread, widening, normals.reshape(*shape, 3), turning
+    widening = rubbed[..., :, None] * rubbed[..., None, :]
+    widening[..., :3, :3] += wider
+    widening[..., 3:, 3:] += turning
+    return gain, spread, widening, normals.reshape(*shape, 3), tangents.reshape(*shape, 3)
 
 
 def _as_stated(first: Array, stated: Array) -> tuple[Array, Array]:

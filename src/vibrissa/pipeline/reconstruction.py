@@ -45,11 +45,10 @@ Shape = Literal["cylinder", "sphere", "plane", "free"]  # shapes that can be fit
 SOLVED_TO = 1e-6
 # Share of the variance of shared errors that may be neglected in their effect on the object.
 _LEFT_OUT = 1e-4
-# Standard deviation of the angle between the normal and the force across the whisker, rad, for
-# contacts with friction. Friction along the whisker is measured by the wrench and removed; friction
-# along the object, across the whisker, is not. Pegs are reconstructed best with 0.05 to 0.3 at any
-# coefficient of friction up to 0.5, and hardly worse without friction (docs/validation.md).
-LEAN = 0.1
+# Share of the variance of friction across the whisker that contacts do not share.
+_ALONE = 0.2
+# Quantile of the measured friction ratios that is taken for the coefficient, and its range.
+_STEADY, _SMOOTHEST, _ROUGHEST = 0.9, 0.01, 0.3
 
 
 def reconstruct(
@@ -146,18 +145,22 @@ def _widened(fit: FittedShape, together: float) -> FittedShape:
 
 
 def _moved_together(recording: xr.DataTree, estimates: xr.Dataset) -> Iterator[xr.Dataset]:
-    """Yield estimates displaced by the errors that all frames of a tracked recording share.
+    """Yield estimates displaced by the errors that all frames of a recording share.
 
     A tracked contact moves with the trace, and a contact from sensor signals with the pose that
-    transforms it to the laboratory frame; an error of the pose rotates normals. The errors are
-    replaced by the few independent combinations that account for nearly all of their variance.
+    transforms it to the laboratory frame; an error of the pose rotates normals. Errors of the
+    inertia that was removed displace contacts and rotate normals. The errors are replaced by the
+    few independent combinations that account for nearly all of their variance.
     """
     root, found = Recording(recording).root, Group(estimates)
     point, normal = found["contact_point"], found["contact_normal"]
-    moves = np.zeros((root.data.sizes.get("error", 0), 2, *point.shape))
+    inertia, count = found.get("contact_inertia"), root.data.sizes.get("error", 0)
+    inertia = np.zeros((0, *point.shape[:2], 6)) if inertia is None else np.moveaxis(inertia, 2, 0)
+    moves = np.zeros((count + len(inertia), 2, *point.shape))
     if not len(moves):
         return
-    for k, (moved, turned) in enumerate(moves):
+    moves[count:] = np.stack(np.split(inertia, 2, axis=-1), axis=1)
+    for k, (moved, turned) in enumerate(moves[:count]):
         # NaN where the contact was not tracked: its displacement is unknown and set to zero below.
         moved[:] = root["contact_shared"][:, :, k]
         if "pose_shared" in root:
@@ -240,8 +243,9 @@ def fit_contacts(
         Direction of a cylinder's axis where it is known.
     lean : float, optional
         Standard deviation of the angle between the surface normal and the force across the
-        whisker, rad; by default `LEAN` for contacts from the full wrench, which allows for
-        friction, and 0 for others, which assume no friction.
+        whisker, rad, which friction along the object causes. By default it follows from the
+        friction along the whisker for contacts from the full wrench, which measures it, and is the
+        assumed ``friction`` for others.
     start : CylinderFit, SphereFit or PlaneFit, optional
         Fit to similar contacts; see `vibrissa.contour.fit_shape`.
 
@@ -269,7 +273,7 @@ def fit_contacts(
             "estimate them with the noise of the signals"
         )
     if lean is None:
-        lean = LEAN if estimates.attrs.get("signals") == WHOLE else 0.0
+        lean = _expected_lean(estimates)
     if not (np.isfinite(lean) and lean >= 0.0):
         raise ValueError(f"lean is {lean!r}; an angle from 0 is needed, rad")
     points = _rows(estimates["contact_point"])
@@ -281,9 +285,9 @@ def fit_contacts(
         known["covariance"] = spread + SOLVED_TO**2 * np.eye(3)
         for name in ("normal_covariance", "point_normal_covariance"):
             known[name] = _rows(estimates[name])
-        normals = known["normals"] / np.linalg.norm(known["normals"], axis=1, keepdims=True)
-        across = np.eye(3) - normals[:, :, None] * normals[:, None, :]
-        known["normal_covariance"] = known["normal_covariance"] + lean**2 * across
+        if lean:
+            own, known["shared"] = _by_friction(estimates, lean, alone=shape == "free")
+            known["normal_covariance"] = known["normal_covariance"] + own
     try:
         if shape == "free":
             return fit_free(points, **known)
@@ -299,6 +303,48 @@ def fit_contacts(
         raise ValueError(
             f"{fault} (contacts were estimated in {found.sum()} of {len(points)} frames{others})"
         ) from None
+
+
+def _expected_lean(estimates: xr.Dataset) -> float:
+    """Standard deviation of the angle between normals and forces, rad, that friction causes.
+
+    The wrench measures the friction along the whisker; that across it has the same coefficient. For
+    other signals it is the friction that was assumed.
+    """
+    if estimates.attrs.get("signals") != WHOLE:
+        return float(estimates.attrs.get("friction", 0.0))
+    spread = np.einsum("nii->n", _rows(estimates["normal_covariance"]))
+    ratio = np.abs(np.tan(_rows(estimates["friction_angle"])))
+    known = np.isfinite(spread + ratio)
+    if not known.any():
+        return _ROUGHEST
+    # Noise increases the ratio where contacts are light.
+    best = known & (spread <= np.median(spread[known]))
+    return float(np.clip(np.quantile(ratio[best], _STEADY), _SMOOTHEST, _ROUGHEST))
+
+
+def _by_friction(estimates: xr.Dataset, lean: float, *, alone: bool) -> tuple[Array, Array]:
+    """Errors of normals by friction across the whisker, along the object.
+
+    Such friction rotates the force about the whisker's tangent t, and the normal n by φ t × n. It
+    is opposite to the motion along the object, which is similar for similar contacts: φ is mostly a
+    linear function of the normal, with coefficients that all contacts share.
+
+    The results are the covariance (n, 3, 3) of each normal and changes (n, 4, 6) of points and
+    normals by one standard deviation of each coefficient. If ``alone``, or if the tangents are not
+    known, each contact has its own error only.
+    """
+    normal = _rows(estimates["contact_normal"])
+    normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    if "contact_tangent" not in estimates:  # the error is in an unknown direction
+        across = np.eye(3) - normal[:, :, None] * normal[:, None, :]
+        return lean**2 * across, np.zeros((len(normal), 0, 6))
+    turned = lean * np.cross(_rows(estimates["contact_tangent"]), normal)
+    own = 1.0 if alone else _ALONE
+    each = np.concatenate([np.ones((len(normal), 1)), normal], axis=1)
+    shared = np.zeros((len(normal), 4, 6))
+    shared[:, :, 3:] = np.sqrt(0.5 * (1.0 - own)) * each[:, :, None] * turned[:, None]
+    return own * turned[:, :, None] * turned[:, None, :], shared
 
 
 def contour_points(recording: xr.DataTree, whiskers: Sequence[Whisker] | None = None) -> xr.Dataset:

@@ -51,8 +51,10 @@ def gains(
     errors: Array | None = None,
     friction: float = 0.0,
     change: Array | float = 0.0,
-) -> Array:
+) -> tuple[Array, Array]:
     """Derivatives (n, 6, 6) of contact points and normals with respect to the measured wrench.
+
+    The second result (n, 6) is their change by one standard deviation of the assumed friction.
 
     With more than three signals, these are weighted by the noise ``weighing`` (6, 6) of the wrench
     and the common ``errors`` (k, 6, 7). ``friction`` is the standard deviation of the ratio of
@@ -61,9 +63,9 @@ def gains(
     """
     rubbing = signals == WRENCH or friction > 0.0
     d, x, rows = _unknowns(whisker, arc_length, contact_force)
-    out = np.full((len(rows), 6, 6), np.nan)
+    out, by_friction = np.full((len(rows), 6, 6), np.nan), np.zeros((len(rows), 6))
     if not rows.any():
-        return out
+        return out, by_friction
     values, value_slopes, normal_slopes = _touch(d, x, _scaled(d, change, rows))
     free = [0, 1, 2, 3] if rubbing else _FREE
     three = len(signals) == 3 and not friction > 0.0
@@ -83,9 +85,11 @@ def gains(
         slopes = np.concatenate([slopes, prior], axis=1)
         by_wrench = np.concatenate([by_wrench, np.zeros_like(by_wrench[:, :1])], axis=1)
     moved = np.concatenate([value_slopes[:, 3:], normal_slopes], axis=1)[..., free]
-    inner = np.repeat([d.length, 1.0], 3)[:, None] / np.repeat([d.force, d.moment], 3)
-    out[rows] = moved @ _inverse(slopes) @ by_wrench * inner
-    return out
+    solved = moved @ _inverse(slopes) * np.repeat([d.length, 1.0], 3)[:, None]
+    out[rows] = solved @ by_wrench / np.repeat([d.force, d.moment], 3)
+    if friction > 0.0:
+        by_friction[rows] = solved[..., -1]
+    return out, by_friction
 
 
 def wrench_slopes(whisker: Whisker, arc_length: Array, contact_force: Array) -> Array:
@@ -151,22 +155,23 @@ def contact_normals(
     contact_force: Array,
     change: Array | float = 0.0,
     covariance: Array | float = 0.0,
-) -> tuple[Array, Array]:
-    """Unit vectors (n, 3) of the contact forces across the whisker, and their covariances.
+) -> tuple[Array, Array, Array]:
+    """Unit vectors (n, 3) of the contact forces across the whisker, covariances, and tangents.
 
     ``change`` (n, 3) is that of the forces by inertia, whisker frame, and ``covariance`` (n, 3, 3)
-    its covariance, from which that of the normals follows.
+    its covariance, from which that of the normals follows. The tangents are the whisker's.
     """
     d, x, rows = _unknowns(whisker, arc_length, contact_force)
-    out, spread = np.full((len(rows), 3), np.nan), np.full((len(rows), 3, 3), np.nan)
+    out, tangents = np.full((2, len(rows), 3), np.nan)
+    spread = np.full((len(rows), 3, 3), np.nan)
     if rows.any():
         force = solve_forces(d, x)[0][:, :3] + _scaled(d, change, rows)
-        tangent = contact_tangents(d, x)
+        tangents[rows] = tangent = contact_tangents(d, x)
         out[rows], toward = _across(force, tangent)
         toward = toward @ (np.eye(3) - tangent[:, :, None] * tangent[:, None, :])
         change_spread = np.broadcast_to(covariance, spread.shape)[rows] / d.force**2
         spread[rows] = toward @ change_spread @ np.swapaxes(toward, 1, 2)
-    return out, spread
+    return out, spread, tangents
 
 
 def _scaled(d: Discretization, change: Array | float, rows: NDArray[np.bool_]) -> Array:

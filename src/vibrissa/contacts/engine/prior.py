@@ -47,7 +47,9 @@ class Prior:
     tip : float
         Prior probability that an object touches the tip itself, so that the force is normal to
         the object and not to the whisker; 0, the default: contacts of the side only. It is for
-        three signals or more with noise; the wrench shows such contacts by itself.
+        three signals or more with noise; the wrench shows such contacts by itself. A tip that is
+        pulled outward, by friction or a hook, has the same three signals as a contact of the side,
+        and is taken for one; the wrench finds it.
 
     Raises
     ------

@@ -206,13 +206,13 @@ def _nodes(whisker: Whisker, steps: int) -> Array:
     ends = np.array([0.0, *(np.array(whisker.breaks) / whisker.length), 1.0])
     steep[np.searchsorted(middle, ends[1:-1] * whisker.length) - 1] = 0.0  # possible jumps
     hinged = _hinged(radius, np.append(steep, 0.0))
-    density = steps * (density / density.sum() + hinged)
-    cumulated = np.concatenate([[0.0], np.cumsum(density)])
+    cumulated = np.concatenate([[0.0], np.cumsum(density + density.sum() * hinged)])
+    cumulated /= cumulated[-1]
     edges = np.interp(ends, s, cumulated)
     # A short, steep piece of a rod with kinks would otherwise have too few steps.
     changes = np.diff(np.interp(ends * whisker.length, middle[1:], np.cumsum(steep)))
-    shares = np.maximum(np.diff(edges), changes * _STEPS_PER_CHANGE / STEPS * steps)
-    counts = np.maximum(1, np.ceil(shares - 1e-9)).astype(int)
+    shares = np.maximum(np.diff(edges) * (1.0 + hinged.sum()), changes * _STEPS_PER_CHANGE / STEPS)
+    counts = np.maximum(1, np.ceil(shares * steps - 1e-9)).astype(int)
     pieces = [
         np.interp(np.linspace(a, b, n + 1)[:-1], cumulated, s)
         for a, b, n in zip(edges[:-1], edges[1:], counts, strict=True)

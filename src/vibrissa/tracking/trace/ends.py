@@ -153,15 +153,17 @@ def _beginning(
     if away.max(initial=0.0) < _ASIDE:
         return line
     better = np.concatenate([path, line[count + 1 :]])
-    if _kink(better[: len(path) + _BENDING]) > _STRAIGHTER * _kink(line[: count + _BENDING]):
+    if kink(better[: len(path) + _BENDING]) > _STRAIGHTER * kink(line[: count + _BENDING]):
         return line
     # A wider search would find what is next to it again.
     return even(fitted(frame, even(better), 1, noise, options, clutter)[0])
 
 
-def _kink(points: Array) -> float:
-    """Root mean square distance of a line from a smooth curve, pixels."""
-    basis = np.vander(np.linspace(-1.0, 1.0, len(points)), _SMOOTH + 1)
+def kink(line: Array, seen: Mask | None = None) -> float:
+    """Root mean square distance of what is seen of a line from a smooth curve, pixels."""
+    t = np.linspace(-1.0, 1.0, len(line))
+    points, t = (line, t) if seen is None else (line[seen], t[seen])
+    basis = np.vander(t, _SMOOTH + 1)
     left = points - basis @ np.linalg.lstsq(basis, points)[0]
     return float(np.sqrt((left**2).sum(axis=1).mean()))
 

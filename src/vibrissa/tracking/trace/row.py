@@ -23,7 +23,7 @@ from vibrissa.deferred import optimize, spatial
 from vibrissa.io import Frame
 from vibrissa.numerics import Array, Mask
 from vibrissa.tracking.trace.curves import Curve, find_curves
-from vibrissa.tracking.trace.ends import prolonged, traced
+from vibrissa.tracking.trace.ends import kink, prolonged, traced
 from vibrissa.tracking.trace.follower import FEATURES, Follower, features_of
 from vibrissa.tracking.trace.identity import (
     LOST,
@@ -84,9 +84,9 @@ _WIDEST, _FAN, _FAR = 3.0, 25, 40
 _WORTH, _SUPPORTED = 0.1, 2.5
 # Largest number of ends of a whisker that are considered, and of ways to give them to all.
 _ENDS, _COMBINED = 6, 2e4
-# Distance of a whisker from a smooth curve from which it may have a kink, pixels, the degree of
-# that curve's polynomials, and the share of a kink that may be left.
-_KINKED, _SMOOTH, _STRAIGHTER = 0.25, 4, 0.7
+# Distance of a whisker from a smooth curve from which it may have a kink, pixels, and the share of
+# a kink that may be left.
+_KINKED, _STRAIGHTER = 0.25, 0.7
 # Number of points before another whisker at which one may have been stopped by it, and by what
 # factor it must be longer without, or may be shorter if it is straighter.
 _STOPPED, _LONGER = 5, 1.1
@@ -354,13 +354,7 @@ def _straightened(
 
 def _kink(trace: Trace) -> float:
     """Root mean square distance of the seen part of a whisker from a smooth curve, pixels."""
-    points = trace.line[trace.seen]
-    if len(points) < _FEWEST:
-        return 0.0
-    t = np.linspace(-1.0, 1.0, len(trace.line))[trace.seen]
-    basis = np.vander(t, _SMOOTH + 1)
-    left = points - basis @ np.linalg.lstsq(basis, points)[0]
-    return float(np.sqrt((left**2).sum(axis=1).mean()))
+    return 0.0 if trace.seen.sum() < _FEWEST else kink(trace.line, trace.seen)
 
 
 def _price(click: Array, curve: Curve, half: float) -> float:

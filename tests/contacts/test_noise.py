@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 import vibrissa as vb
 from vibrissa.contacts.engine import search
-from vibrissa.contacts.engine.ranking import stages
+from vibrissa.contacts.engine.ranking import stages, stages_ahead
 from vibrissa.contacts.uncertainty.posterior import ranked
 from vibrissa.identifiability.twins import sample
 from vibrissa.numerics import quick_exp
@@ -479,12 +479,13 @@ def test_kernels_are_compiled_beforehand_for_what_they_are_called_with(
     locate(np.full(len(noise), 1e-6))
     gamma_map.estimate({name: np.full(3, 1e-6) for name in noise}, using, noise)
     one = locate._search
-    for half in stages(one.readout.searched, one.readout.how, one._problem):
-        for kernel, arguments in half:
-            types = (
-                each if isinstance(each, Type) else kernel.typeof_pyval(each) for each in arguments
-            )
-            assert tuple(types) in kernel.overloads, kernel.py_func.__name__
+    here, there = stages(one.readout.searched, one.readout.how, one._problem)
+    ahead = stages_ahead(gamma_map.chart.discretization.rod) if len(noise) == 3 else []
+    for kernel, arguments in here + there + ahead:
+        types = (
+            each if isinstance(each, Type) else kernel.typeof_pyval(each) for each in arguments
+        )
+        assert tuple(types) in kernel.overloads, kernel.py_func.__name__
 
 
 @pytest.mark.parametrize(

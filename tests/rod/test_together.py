@@ -21,6 +21,10 @@ def twice(x):
 @kernel
 def thrice(x):
     return 3.0 * x
+
+@kernel
+def half_of(x):
+    return 0.5 * x
 """
 
 
@@ -34,7 +38,7 @@ def run(tmp_path):
         script = f"""
             import sys
             sys.path.insert(0, {str(tmp_path)!r})
-            from apart import thrice, twice
+            from apart import half_of, thrice, twice
             from vibrissa.numerics import kernel_cache
             {before}
             kernel_cache.compile_together([(twice, (1.0,))], [(thrice, (1.0,))])
@@ -70,6 +74,17 @@ def test_a_helper_compiles_what_is_found_on_disk_here(run):
 def test_a_helper_is_waited_for_when_its_kernel_is_called(run):
     asked = "assert [key[1] for key in kernel_cache._asked] == ['thrice']"
     assert run(between=asked, after="assert not kernel_cache._asked") == ["twice 0", "thrice 1"]
+
+
+def test_what_a_helper_was_asked_for_is_not_asked_for_again(run):
+    """The rest is compiled meanwhile, not only when it is called."""
+    again = """
+            kernel_cache.subprocess.Popen = None
+            half = [(half_of, (1.0,)), (thrice, (1.0,))]
+            kernel_cache.compile_together(half, [(thrice, (1.0,))])
+            assert half_of.overloads and not thrice.overloads
+    """
+    assert run(between=again.strip()) == ["twice 0", "thrice 1"]
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from vibrissa.contacts.contacts import Contacts
 from vibrissa.contacts.engine.prior import Prior
+from vibrissa.contacts.engine.ranking import stages_ahead
 from vibrissa.contacts.engine.search import estimate
 from vibrissa.contacts.fitting.inversion import triplet_tree
 from vibrissa.contacts.joint.forward import Gravity
@@ -145,7 +146,8 @@ class ContactMap:
         if numbers.shape != (3,) or numbers.dtype.kind != "i" or (numbers < 1).any():
             raise ValueError(f"cells is {cells!r}; three whole numbers from 1 are needed")
         along, around, loads = numbers.tolist()
-        compile_seeds(discretize(whisker, steps).rod)
+        rod = discretize(whisker, steps).rod
+        compile_seeds(rod, *stages_ahead(rod))
         chart = stable_set(whisker, proximal=proximal, cells=(along, around, loads), steps=steps)
         solved = _solve_grid(whisker, proximal, steps, progress) if grid else None
         return cls(whisker, chart, steps, solved)

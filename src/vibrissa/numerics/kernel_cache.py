@@ -248,22 +248,25 @@ def compile_together(here: list[Call], there: list[Call]) -> None:
     if any(kernel.overloads for kernel, _ in there):  # type: ignore[attr-defined]
         return
     with _lock:
-        others = _not_cached(there)
-        mine = _not_cached(here) if others else []
-        if not (mine and others and threads() > 1 and _runs_python()):
-            return
-        names = [_name(kernel) for kernel, _ in others]
-        if any(name is None for name in names):
-            return
-        helper = _start_helper(others)
-        if helper is None:
-            return
-        atexit.register(_end, helper)
-        for name, (_, signature) in zip(names, others, strict=True):
-            _asked[*cast("tuple[str, str]", name), signature] = time.monotonic(), helper
-        with _without_collection():
-            for kernel, signature in mine:
-                kernel.compile(signature)
+        others, mine = _not_cached(there), _not_cached(here)
+        if mine and (_leave(others) if others else _asked):
+            with _without_collection():
+                for kernel, signature in mine:
+                    kernel.compile(signature)
+
+
+def _leave(calls: list[tuple[Any, tuple[types.Type, ...]]]) -> bool:
+    """Leave kernels to a helper, if there can be one."""
+    names = [_name(kernel) for kernel, _ in calls]
+    if threads() < 2 or not _runs_python() or any(name is None for name in names):
+        return False
+    helper = _start_helper(calls)
+    if helper is None:
+        return False
+    atexit.register(_end, helper)
+    for name, (_, signature) in zip(names, calls, strict=True):
+        _asked[*cast("tuple[str, str]", name), signature] = time.monotonic(), helper
+    return True
 
 
 @contextmanager
@@ -293,7 +296,7 @@ def compile_listed(file: BinaryIO) -> None:
 
 
 def _not_cached(calls: list[Call]) -> list[tuple[Any, tuple[types.Type, ...]]]:
-    """Kernels that are not cached, with the types of their arguments."""
+    """Kernels neither cached nor left to a helper, with the types of their arguments."""
     found = []
     for call, arguments in calls:
         kernel: Any = call
@@ -302,7 +305,8 @@ def _not_cached(calls: list[Call]) -> list[tuple[Any, tuple[types.Type, ...]]]:
         )
         cache, codegen = kernel._cache, kernel.targetctx.codegen()
         # Without a writable folder numba uses another kind of cache.
-        if isinstance(cache, PackageCache) and not cache.holds(signature, codegen):
+        left = (*(_name(kernel) or ()), signature) in _asked
+        if isinstance(cache, PackageCache) and not (left or cache.holds(signature, codegen)):
             found.append((kernel, signature))
     return found
 

@@ -247,10 +247,11 @@ def seeds(tree: SearchTree, target: Array, room: SeedRoom) -> int:
     return count
 
 
-def compile_seeds(rod: Rod) -> None:
+def compile_seeds(rod: Rod, *later: Call) -> None:
     """Compile :func:`seeds` in another process, while this one compiles what its trees need.
 
-    For callers that build a chart and then search in it. Does nothing if it is cached.
+    For callers that build a chart and then search in it. ``later`` are kernels that are then
+    probably called; the other process compiles them next. Does nothing if ``seeds`` is cached.
     """
     if not seeds.overloads:  # type: ignore[attr-defined]
         rows, slopes = np.empty((0, 3)), np.empty((0, 3, 3))
@@ -258,7 +259,7 @@ def compile_seeds(rod: Rod) -> None:
         room = seed_room.py_func()  # type: ignore[attr-defined]
         here: list[Call] = [(evaluate, (rod, *values, 0, 0))]
         here.append((balance_rows, (Balance.none(), rows, slopes)))
-        compile_together(here, [(seeds, (SearchTree.none(), np.empty(3), room))])
+        compile_together(here, [(seeds, (SearchTree.none(), np.empty(3), room)), *later])
 
 
 @inlined

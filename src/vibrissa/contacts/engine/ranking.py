@@ -50,8 +50,9 @@ from vibrissa.contacts.engine.task import (
 )
 from vibrissa.contacts.fitting.fit_within import FitRoom, fit_room, fit_within
 from vibrissa.contacts.fitting.least_squares import channel_equations, same_contact, settled, whiten
+from vibrissa.contacts.sensing.channels import Channels
 from vibrissa.contacts.sensing.noise import INDISTINCT
-from vibrissa.contacts.sensing.weighing import Weighing, sharpness, weigh_any
+from vibrissa.contacts.sensing.weighing import Weighing, sharpness, weigh_any, weighing_of
 from vibrissa.contacts.uncertainty.basins import (
     BasinsRoom,
     basins_room,
@@ -78,8 +79,8 @@ from vibrissa.numerics import (
     inlined,
     kernel,
 )
-from vibrissa.rod import LANES, evaluate
-from vibrissa.signals import FT, FX, MB, MD
+from vibrissa.rod import LANES, Rod, evaluate
+from vibrissa.signals import FT, FX, MB, MD, SIGNALS
 from vibrissa.status import Status
 
 _UNIQUE, _AMBIGUOUS = int(Status.UNIQUE), int(Status.AMBIGUOUS)
@@ -588,6 +589,14 @@ def stages(of: Searched, how: Weighing, problem: Problem) -> tuple[list[Call], l
     here: list[Call] = [(task, (of, how, problem)), (complete_rows, (*given, about, 0, 0))]
     here.append((leave_rows, judged))
     return here, [(judge_rows, judged), (description, (0, 0)), find]
+
+
+def stages_ahead(rod: Rod) -> list[Call]:
+    """Kernels for noise of three signals that another process compiles while a chart is made."""
+    of, problem = Searched.none(rod), Problem(exact=True, noisy=True, passes=1, limit=0.0)
+    how = weighing_of(Channels.of(SIGNALS[:3]), None, 1.0, 1.0, np.ones(3))
+    here, there = stages(of, how, problem)
+    return [*there, here[-1]]
 
 
 def compile_stages(of: Searched, how: Weighing, problem: Problem) -> None:

@@ -21,7 +21,7 @@ from vibrissa.contacts.uncertainty.posterior import (
     squared_distances,
 )
 from vibrissa.numerics import Array, IntArray, cholesky, inlined, mahalanobis, quick_exp, vectorised
-from vibrissa.rod import Charted, SearchTree, StableSet, charted_rod
+from vibrissa.rod import Charted, Rod, SearchTree, StableSet, charted_rod
 
 #: Parts of the chart; the nearest node of each is a starting point.
 PARTS = 16
@@ -61,6 +61,15 @@ class Searched(NamedTuple):
     volume: Array
     blocks: IntArray
     extent: Array
+
+    @classmethod
+    def none(cls, rod: Rod) -> Searched:
+        """Return an instance without nodes, as an example of the types."""
+        one, two, three = (np.empty((0,) * n) for n in (1, 2, 3))
+        count, tree = np.empty(0, np.int64), SearchTree.none()
+        charted = Charted(rod, tree.fold, np.empty((0, 0, 0, 0)))
+        nodes = one, two, two, two, two, one, count, count, one, count, three
+        return cls(charted, 0.0, tree, count, *nodes)
 
 
 def searched(

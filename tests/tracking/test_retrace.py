@@ -105,6 +105,20 @@ def test_a_whisker_that_the_other_view_loses_is_lost(flat):
     assert len(traces[0][4].line)
 
 
+def test_a_whisker_that_the_other_view_hardly_shows_guides_nothing_far_away(flat):
+    """Two points, as beside an object, were continued by a parabola to 700,000 pixels."""
+    row = Row(2, (1.5e-3, 1e-4))
+    row.traces[0][1] = list(row.traces[0][1])
+    for i in (3, 4):
+        trace = row.traces[0][1][i]
+        line, few = trace.line[:2] + [[0.3, 0.0], [0.0, -0.9]], slice(2)
+        row.traces[0][1][i] = trace._replace(
+            line=line, sigma=trace.sigma[few], seen=trace.seen[few], tip_seen=False
+        )
+    traces, _ = row.retraced()
+    assert flat.right(traces, 1) > 0.9
+
+
 def test_long_films_are_decided_in_blocks(flat, monkeypatch):
     monkeypatch.setattr(guided, "_BLOCK", FRAMES // 2)
     traces, _ = flat.retraced()

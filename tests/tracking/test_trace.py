@@ -338,6 +338,20 @@ def test_a_speck_far_behind_an_object_is_not_the_whisker(dash, end):
     assert trace.line[-1, 0] == pytest.approx(end, abs=5.0)
 
 
+def test_what_shows_nothing_of_a_whisker_is_lost():
+    """Behind something static, and in noise before it: it had become a line of one point."""
+    noise = 2.0
+    for seed, last, hidden in ((534, 96.0, slice(84, 175)), (627, 142.0, slice(106, 133))):
+        rng = np.random.default_rng(seed)
+        frame = np.clip(150.0 + rng.normal(0.0, noise, (80, 200)), 0, 255).astype(np.uint8)
+        bits = np.zeros(frame.shape, np.uint32)
+        bits[:, hidden] = 1
+        x = np.arange(40.0, last + 1.0, 2.0)
+        guess = np.stack([x, np.full(len(x), 40.0)], axis=1)
+        trace, _ = traced(frame, noise, guess, TraceOptions(), clutter=Clutter(bits, 1))
+        assert not len(trace.line)
+
+
 def test_a_whisker_that_rests_is_not_divided_out():
     frames = [tapered(0.1, seed=i) for i in range(20)]
     (row,) = trace_video(frames, [(60.0, 100.0)])

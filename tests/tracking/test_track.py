@@ -490,6 +490,17 @@ def test_the_far_end_of_a_bent_whisker_is_given_back(filmed, traces):
         assert found[0][0][i] is mine[0][i]
 
 
+@pytest.mark.parametrize("usual", [0.8, 2.3])
+def test_frames_are_contradicted_if_they_differ_from_the_others(usual):
+    """In a compressed video, whose traces are all less well explained, none was left."""
+    misfit = usual * np.random.default_rng(0).uniform(0.7, 1.3, 200)
+    misfit[:5] = np.nan
+    wrong = np.arange(200) % 9 == 0
+    contradicted = sys.modules["vibrissa.tracking.track"]._contradicted
+    assert not contradicted(misfit).any()
+    np.testing.assert_array_equal(contradicted(np.where(wrong, 9.0, misfit)), wrong)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("views", [1, 2])
 def test_frames_that_no_rod_explains_are_left_out_if_two_views_contradict_each_other(

@@ -449,8 +449,9 @@ def remarks_on_row(exchanges: int, left_out: int, name: str) -> list[str]:
     if left_out:
         found.append(
             f"{name}: in {left_out} frames the bent rod does not explain the traces (a misfit "
-            f"above {_STRANGE:g}), as where one of them is a neighbour's: they are left out "
-            "(confidence 0, status MISSING). Compare traces and video (vibrissa correct)."
+            f"above {_STRANGE:g} and far above its usual one), as where one of them is a "
+            "neighbour's: they are left out (confidence 0, status MISSING). Compare traces and "
+            "video (vibrissa correct)."
         )
     return found
 

@@ -89,8 +89,8 @@ _ANY_ROLL = np.radians(10.0)
 _FEWEST, _FRAMES = 3, 24
 # Misfit, absolute and relative to the usual one, below which the traces of a row are its whiskers'.
 _WELL, _WORSE = 1.0, 3.0
-# Share of the frames of a whisker in a row that the rod must explain before others are left out.
-_EXPLAINED = 0.1
+# Misfit over the usual one above which frames of a row are left out, and share that must remain.
+_MORE, _EXPLAINED = 2.0, 0.1
 # Errors of traces that vary with the pose only, pixels: by light, fur, lenses and what is behind;
 # and in a row, where they are next to crossings.
 _ASTRAY, _CROSSED = 0.1, 0.4
@@ -320,10 +320,11 @@ def _sorted_out(
 
 
 def _contradicted(misfit: Array) -> Mask:
-    """Frames that the rod does not explain; none if it explains hardly any, and is itself wrong."""
-    strange = unexplained_frames(misfit)
-    most = (1.0 - _EXPLAINED) * np.isfinite(misfit).sum()
-    return np.asarray(strange & (strange.sum() < most))
+    """Frames explained far worse than usual; none if the rod, itself wrong, explains hardly any."""
+    known = misfit[np.isfinite(misfit)]
+    usual = float(np.median(known)) if known.size else 0.0
+    strange = unexplained_frames(misfit) & (misfit > _MORE * usual)
+    return np.asarray(strange & (strange.sum() < (1.0 - _EXPLAINED) * known.size))
 
 
 def known_of(cameras: Sequence[Camera], one: Tracked, rate: float, options: FitOptions) -> Known:

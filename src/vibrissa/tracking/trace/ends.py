@@ -113,7 +113,7 @@ def traced(
         inward = bare.part(slice(None, None, -1))
         first = len(line) - _tip(inward, _EVEN, _CLEARER * texture)
     last = _connected(along.seen[: _tip(along)])
-    if last - first < FEWEST:
+    if last - first < FEWEST or not along.seen[first:last].any():
         return Trace.lost(), False
     # An image without noise was smoothed, as by compression, which removes faint lines.
     tip_seen = noise > _SMOOTHED and inside(frame, line[last - 1])
@@ -330,7 +330,10 @@ def prolonged(line: Array, used: int, ahead: int) -> Array:
 
 @cache
 def _onward(used: int, ahead: int) -> Array:
-    """Matrix (ahead, used) that extrapolates a parabola through some points to the next ones."""
+    """Matrix (ahead, used) that extrapolates a parabola through some points to the next ones.
+
+    Two points are extrapolated by a straight line, one by itself.
+    """
     t = np.arange(used + ahead) / max(used - 1, 1) - 0.5
-    powers = np.vander(t, 3)
+    powers = np.vander(t, min(used, 3))
     return np.asarray(powers[used:] @ np.linalg.pinv(powers[:used]))

@@ -1,5 +1,7 @@
 """Rows that lie on one another in one view are traced by where the other view shows them."""
 
+import sys
+
 import numpy as np
 import pytest
 from rows import RowFilm, curve, scored
@@ -97,7 +99,7 @@ def test_corrections_stay_as_they_are(flat):
 def test_a_whisker_that_the_other_view_loses_is_lost(flat):
     known = [list(row) for row in flat.traces[0]]
     known[1][4] = Trace.lost()
-    traces = guided.trace_guided(
+    traces, _ = guided.trace_guided(
         flat.frames(1), flat.bases[1], flat.film.cameras, known, sample=flat.film.images[1]
     )
     assert not len(traces[1][4].line)
@@ -111,12 +113,24 @@ def test_a_whisker_that_the_other_view_hardly_shows_guides_nothing_far_away(flat
     row.traces[0][1] = list(row.traces[0][1])
     for i in (3, 4):
         trace = row.traces[0][1][i]
-        line, few = trace.line[:2] + [[0.3, 0.0], [0.0, -0.9]], slice(2)
+        line, few = np.add(trace.line[:2], [[0.3, 0.0], [0.0, -0.9]]), slice(2)
         row.traces[0][1][i] = trace._replace(
             line=line, sigma=trace.sigma[few], seen=trace.seen[few], tip_seen=False
         )
     traces, _ = row.retraced()
     assert flat.right(traces, 1) > 0.9
+
+
+def test_whiskers_whose_lines_are_as_likely_those_of_others_are_named(flat, monkeypatch):
+    """Two lines of a whisker and one of another, 20 pixels apart: what does the choice gain?"""
+    place = np.array([[0.0, 0.0], [20.0, 20.0], [0.0, 1.0], [np.nan, np.nan]])
+    ways = np.array([[0, 2], [1, 2], [1, -1], [0, -1]])
+    margins = guided._margins(ways, np.array([-9.0, -8.0, -3.0, -2.0]), place, [0, 2])
+    np.testing.assert_allclose(margins, [1.0, 6.0])
+    assert np.isnan(guided._margins(ways[1:], np.array([0.0, 1.0, 2.0]), place, [0, 2])).all()
+    monkeypatch.setattr(sys.modules["vibrissa.tracking.space.retrace"], "_SURE", np.inf)
+    remark = flat.retraced()[1][1]
+    assert remark.startswith("not sure which lines in front are those of whisker 0, whisker 1, wh")
 
 
 def test_long_films_are_decided_in_blocks(flat, monkeypatch):

@@ -27,6 +27,9 @@ _BASES, _TIPS, _FADING = 8.0, 0.1, 0.4
 # Share of the frames in which the views show one whisker, from which nothing is traced anew; and
 # change of a whisker's length from its usual one, as a share, up to which it is traced steadily.
 _AGREES, _STEADY = 0.9, 0.2
+# Log likelihood by which a whisker's line is to be more probable than others in the median frame:
+# below zero, most frames by themselves show another one, and only motion and bend decide.
+_SURE = 0.0
 _LARGEST = 20  # number of whiskers of a row up to which lines can be combined
 
 Traces = Sequence[Sequence[Sequence[Trace]]]
@@ -91,7 +94,7 @@ def retraced(
         if v == guide or before >= _AGREES:
             continue
         known = [_as_seen_by(row, pairs[:, v], len(found[v][0])) for row in rows[0]]
-        new = trace_guided(
+        new, margins = trace_guided(
             videos[v],
             bases[v],
             (cameras[guide], camera),
@@ -110,6 +113,14 @@ def retraced(
                 f"{cameras[guide].name} shows them. Before, both views showed one whisker in "
                 f"{100.0 * before:.0f} % of the frames, now in {100.0 * after:.0f} %."
             )
+            seen = [any(len(trace.line) for trace in row) for row in new]
+            unsure = np.flatnonzero(seen & (margins < _SURE))
+            if unsure.size:
+                remarks.append(
+                    f"not sure which lines in {camera.name} are those of "
+                    f"{', '.join(f'whisker {k}' for k in unsure)}: most frames by themselves "
+                    "show other ones. Compare traces and video (vibrissa correct)."
+                )
     return found, remarks
 
 

@@ -137,12 +137,13 @@ def trace_guided(
     sample: Sequence[Frame],
     mask: Mask | None = None,
     progress: Callable[[int], None] | None = None,
-) -> list[list[Trace]]:
+) -> tuple[list[list[Trace]], Array]:
     """Trace the whiskers of a row where another view shows them.
 
     ``cameras`` are those of the other view and of this one, ``known`` the traces of the other view
-    in the frames of this one, whisker by whisker, empty where they are lost. Other arguments and
-    the result are those of `trace_video`.
+    in the frames of this one, whisker by whisker, empty where they are lost. Other arguments are
+    those of `trace_video`, and so are the traces returned. With them comes by how much, in the
+    median, the log likelihood of the row falls if a whisker's line is another one (whisker,).
     """
     options, corrections = options or TraceOptions(), corrections or {}
     report = progress or (lambda done: None)
@@ -152,6 +153,7 @@ def trace_guided(
     guides = [_guides(cameras, row) for row in known]
     moved = 0.0  # the row of bases, along the epipolar lines
     choices, chosen, shifts = list[_Choice](), list[list[Array]](), list[Shift]()
+    margins = list[Array]()
     for i, image in enumerate(frames()):
         frame, shift = around.clear(image)
         shifts.append(shift)
@@ -170,10 +172,10 @@ def trace_guided(
         choices.append(_combined(lines))
         moved += choices[-1].begins
         if len(choices) == _BLOCK:
-            chosen += _over_all_frames(choices)
+            chosen += _over_all_frames(choices, margins)
             choices.clear()
         report(i + 1)
-    chosen += _over_all_frames(choices)
+    chosen += _over_all_frames(choices, margins)
     rows: list[list[Trace]] = [[] for _ in guides]
     for i, image in enumerate(frames()):
         frame, shift = around.clear(image)
@@ -182,7 +184,7 @@ def trace_guided(
             stated = corrections.get((i, k))
             own.append(trace if stated is None else given(np.asarray(stated) - shift[:2]))
     around.finish(rows, corrections, shifts)
-    return [_confident(row) for row in rows]
+    return [_confident(row) for row in rows], _median(np.array(margins))
 
 
 def _guides(cameras: tuple[Camera, Camera], row: Sequence[Trace]) -> list[_Guide | None]:
@@ -455,8 +457,8 @@ def shown_twice(line: Any, strength: Any, other: Any, also: Any, near: float) ->
     return total
 
 
-def _over_all_frames(choices: Sequence[_Choice]) -> list[list[Array]]:
-    """Lines of all whiskers in each frame, empty if lost or in doubt."""
+def _over_all_frames(choices: Sequence[_Choice], margins: list[Array]) -> list[list[Array]]:
+    """Lines of all whiskers in each frame, empty if lost; their margins are added to a list."""
     if not choices:
         return []
     places = [
@@ -478,10 +480,24 @@ def _over_all_frames(choices: Sequence[_Choice]) -> list[list[Array]]:
             c.cost + 0.5 * np.minimum(np.nan_to_num(one) ** 2, _MOST**2).sum(axis=1)
             for c, one in zip(choices, away, strict=True)
         ]
+    every = zip(choices, costs, places, chosen, strict=True)
+    margins += [_margins(c.ways, cost, place[:, 1:], way) for c, cost, place, way in every]
     return [
         [c.lines[n].line if n >= 0 else np.empty((0, 2)) for n in way]
         for c, way in zip(choices, chosen, strict=True)
     ]
+
+
+def _margins(ways: Ways, cost: Array, place: Array, way: Sequence[int]) -> Array:
+    """Cost of giving each whisker another line than in a way, or none (whisker,).
+
+    NaN for lost whiskers, and for a way that is not among the cheapest ones.
+    """
+    away = np.abs(place[ways] - place[list(way)]).max(axis=2)
+    other = np.where(~(away <= 2.0 * _DISTINCT), cost[:, None], cost.max())
+    own = cost[(ways == way).all(axis=1)]
+    known = (np.array(way) >= 0) & (len(own) > 0)
+    return np.where(known, other.min(axis=0) - own.sum(), np.nan)
 
 
 def _motion(one: Array, other: Array) -> Array:

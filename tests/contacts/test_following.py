@@ -233,3 +233,25 @@ def test_a_filter_forgets_a_contact_that_is_lost_and_waits_for_what_is_missing(w
         vb.ContactFilter(vb.Estimator(wire))
     with pytest.raises(ValueError, match="between 0 and 1"):
         vb.ContactFilter(estimator, birth=2.0)
+
+
+def test_times_in_ms_and_positions_in_mm_are_questioned(wire):
+    time, point = np.arange(0.0, 0.05, 0.005), np.array([0.18, 0.03, 0.01])
+    turn, base, wrench = swaying(wire.whisker, point, time)
+    estimator = vb.Estimator.of_sensor(
+        wire, Sensor(noise=np.repeat([1e-3, 1e-4], 3)), felt_above=5.0
+    )
+
+    def follow(times, bases):
+        filtered = vb.ContactFilter(estimator)
+        for each in zip(times, wrench, turn, bases, strict=True):
+            filtered(*each)
+
+    follow(time, base)  # in s and m, without a warning
+    with pytest.warns(UserWarning, match="are their times in ms"):
+        follow(1e3 * time, base)
+    with pytest.warns(UserWarning, match="is its position in mm"):
+        follow(time, 1e3 * base)
+    for name, value in {"speed": 50.0, "pose_sigma": 0.1, "persistence": 50.0}.items():
+        with pytest.warns(UserWarning, match=f"{name} is .*: is it in m"):
+            vb.ContactFilter(estimator, **{name: value})

@@ -41,6 +41,7 @@ from vibrissa.contacts.following.mixture import (
     unaccounted,
 )
 from vibrissa.contacts.following.onset import Beginning, Gaussians, groups
+from vibrissa.contacts.following.units import Course, question_parameters
 from vibrissa.contacts.sensing.noise import explained
 from vibrissa.contacts.uncertainty.posterior import THREE_SIGMA
 from vibrissa.deferred import special
@@ -152,6 +153,11 @@ class ContactFilter:
     ------
     ValueError
         If the estimator has no noise, or a number is out of range.
+
+    Warns
+    -----
+    UserWarning
+        If times, positions or parameters suggest that they are in ms or mm.
     """
 
     def __init__(
@@ -175,6 +181,7 @@ class ContactFilter:
                 "speed and persistence are positive, pose_sigma is not negative and birth between "
                 f"0 and 1; got {speed}, {persistence}, {pose_sigma} and {birth}"
             )
+        question_parameters(self._length, speed, persistence, pose_sigma)
         if not memory > 0.0:
             raise ValueError(f"memory is a time, positive, s; got {memory!r}")
         if estimator.softened:
@@ -203,6 +210,7 @@ class ContactFilter:
         how = estimator.readout.how
         self._errors = len(how.errors)
         self._limit = explained(len(how.own))
+        self._course = Course()
         self.reset()
 
     def __repr__(self) -> str:
@@ -236,6 +244,7 @@ class ContactFilter:
             raise ValueError(f"time is a finite number, s; got {time!r}")
         if self._time is not None and not time > self._time:
             raise ValueError(f"times must increase; got {time} s after {self._time} s")
+        self._course.question(time, base)
         if self._weighted is None:
             measurement = self.estimator.measurement(signals, rotation, gravity)
         else:

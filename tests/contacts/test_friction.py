@@ -52,6 +52,25 @@ def test_with_the_transverse_force_friction_is_found(gamma_map, using):
     assert (np.abs(found.friction_angle - angle) < 3.0 * found.friction_angle_sigma).mean() > 0.9
 
 
+@pytest.mark.parametrize(("ratio", "absent"), [(0.05, 0.0), (0.0, 1.0)])
+def test_whether_one_object_has_friction_is_one_question(gamma_map, ratio, absent):
+    """Alone, most measurements deny weak friction, and their errors have the same sign."""
+    truth, angle, signals = rubbed(gamma_map, ratio, seed=4)
+    how = {"using": "Fx FT FD Mx MB MD", "noise": NOISE, "friction": 0.3}
+    found = gamma_map.estimate(signals, **how, same_friction=True)
+    alone = gamma_map.estimate(signals, **how)
+    assert 0.1 < (alone.friction_angle == 0.0).mean() < 0.9
+    assert (found.friction_angle == 0.0).mean() == absent
+    assert held(found, truth) > 0.9
+    clear = found.friction_angle_sigma < 0.05
+    if ratio:
+        slopes = [(one.friction_angle * angle)[clear].sum() for one in (alone, found)]
+        before, now = np.array(slopes) / (angle[clear] ** 2).sum()
+        assert before < 0.7 < now < 1.2
+    else:
+        assert missed(found, truth) < 0.8 * missed(alone, truth)
+
+
 @pytest.mark.parametrize("using", ["Fx FT MB MD", "Fx FT FD Mx MB MD"])
 def test_a_prior_of_friction_costs_little_where_there_is_none(gamma_map, using):
     """Half of it is that there is none, which signals that determine friction then decide."""

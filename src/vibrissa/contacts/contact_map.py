@@ -165,6 +165,7 @@ class ContactMap:
         friction: float = 0.0,
         gravity: Gravity | ArrayLike | None = None,
         base_rotation: ArrayLike | None = None,
+        same_friction: bool = False,
     ) -> Contacts:
         """Find the contacts that explain measured signals.
 
@@ -210,6 +211,10 @@ class ContactMap:
         base_rotation : (..., 3, 3) array_like, optional
             Rotation of the base for each measurement or all, from whisker's to laboratory frame:
             gravity and tare are then those of the laboratory and of the first pose.
+        same_friction : bool
+            Whether friction is absent from all measurements or from none, as when they are of one
+            object (with gravity: of those in one pose). By default each decides for itself, with
+            four signals or more, and weak friction is missed in most.
 
         Returns
         -------
@@ -238,6 +243,7 @@ class ContactMap:
             friction=0.0 if using == "wrench" else friction,
             compliance_sigma=compliance_sigma,
             stiffness_sigma=stiffness_sigma,
+            same_friction=same_friction,
             rotation=None
             if base_rotation is None
             else rotation_matrices("base_rotation", base_rotation),

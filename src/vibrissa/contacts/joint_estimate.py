@@ -119,6 +119,7 @@ class JointEstimate:
         friction: float = 0.0,
         compliance_sigma: float = 0.0,
         stiffness_sigma: float = 0.0,
+        same_friction: bool = False,
     ) -> None:
         refuse_tip(prior, "friction, weight or an uncertain base is stated")
         if sensor is None and gravity is not None and gravity.uncertain:
@@ -139,6 +140,7 @@ class JointEstimate:
             "friction": friction,
             "compliance_sigma": compliance_sigma,
             "stiffness_sigma": stiffness_sigma,
+            "same_friction": same_friction,
         }
         self._lab, self._proposing = gravity, None if gravity is None else gravity.acceleration
         self._path: _Path | None = None
@@ -167,7 +169,8 @@ class JointEstimate:
             known[some] = self.forward.values(x[some])
             without, found = found, along_curves(self._rubbing, flat, targets, x, known)
             if len(self.names) >= _SEPARATE:
-                found = or_without(found, without, self._rubbing.ratio_sigma)
+                alike = self._how["same_friction"]
+                found = or_without(found, without, self._rubbing.ratio_sigma, alike)
             some = found.number > 0
             status[some] = by_probability(found)[some]
             degrees = len(self.names) - len(self._rubbing.free) + 1
@@ -487,6 +490,7 @@ def estimate_jointly(
     friction: float = 0.0,
     compliance_sigma: float = 0.0,
     stiffness_sigma: float = 0.0,
+    same_friction: bool = False,
     rotation: Array | None = None,
 ) -> Contacts:
     """Estimate contacts with weight, friction and uncertain parameters; see `ContactMap.estimate`.
@@ -512,6 +516,7 @@ def estimate_jointly(
         friction=friction,
         compliance_sigma=compliance_sigma,
         stiffness_sigma=stiffness_sigma,
+        same_friction=same_friction,
     )
     flat, shape = values.reshape(-1, len(names)), values.shape[:-1]
     if rotation is None or gravity is None:

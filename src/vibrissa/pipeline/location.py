@@ -124,6 +124,7 @@ def locate(
             measured.typical,
             prior=prior,
             friction=friction,
+            same_friction=True,
             gravity=gravity,
             base_rotation=measured.rotation,
             **(errors or {}),

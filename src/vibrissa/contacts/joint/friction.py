@@ -19,7 +19,9 @@ candidates.
 If four or more signals determine µ_x, the prior probability that there is no friction is one half:
 the prior of µ_x is (δ(µ_x) + N(0, σ²)) / 2. With the density p(0) of µ_x at zero on the curve, the
 odds of no friction are p(0) √(2π) σ (the Savage-Dickey ratio). The more probable of the two is the
-answer, and the covariance contains both.
+answer, and the covariance contains both. Decided for each measurement alone, weak friction is
+missed in most of them, with errors of one sign. For measurements of one object it is one question:
+the ratios are then N(0, τ²) with either τ = 0 or the same unknown τ up to σ for all of them.
 """
 
 from __future__ import annotations
@@ -53,6 +55,10 @@ _FINE, _REACH = 17, 4.0
 # Log density below the highest peak at which another one is dropped; and depth of the valley below
 # two peaks from which they are separate candidates.
 _LOW, _VALLEY = 15.0, 3.0
+# Number of values of the standard deviation τ of several ratios. Largest log odds of friction that
+# one of them contributes, as one with another error must not decide for all; and of all together.
+_SCALES = 9
+_TELLING, _CERTAIN = 4.0, 30.0
 _PARTS = 8  # number of parts of each step for the moments
 _TOGETHER = 1000  # number of measurements whose curves are traced together, in some tens of MB
 # Largest kurtosis of a valid covariance, relative to a normal distribution's.
@@ -341,8 +347,13 @@ def _found(curves: _Curves, x: Array, values: Array) -> Candidates:
     return _stated(*curves.finer(rows, nodes, starts), len(curves.flat))
 
 
-def or_without(found: Candidates, without: Candidates, sigma: float) -> Candidates:
-    """Combine candidates with friction of this prior and the nearest one without friction."""
+def or_without(
+    found: Candidates, without: Candidates, sigma: float, alike: bool = False
+) -> Candidates:
+    """Combine candidates with friction of this prior and the nearest one without friction.
+
+    If measurements are ``alike``, friction is absent from all of them or from none.
+    """
     row = np.flatnonzero(
         (found.number > 0) & np.isfinite(without.covariances[:, 0]).all(axis=(1, 2))
     )
@@ -355,6 +366,8 @@ def or_without(found: Candidates, without: Candidates, sigma: float) -> Candidat
     turned = out.angle_sigma[row, place]
     share = out.probability[row, place]
     odds = share * sigma / turned * np.exp(-0.5 * (angle / turned) ** 2)
+    if alike:
+        odds = np.full_like(odds, _odds_of_all(angle, turned, sigma))
     weight = odds / (share + odds)
     likelier = weight > 0.5
     points = np.stack([values0[:, 3:6], out.values[row, place, 3:6]])
@@ -378,6 +391,21 @@ def or_without(found: Candidates, without: Candidates, sigma: float) -> Candidat
     order = np.argsort(-np.nan_to_num(out.probability, nan=-1.0), axis=1, kind="stable")
     line = np.arange(len(order))[:, None]
     return Candidates(out.number, *(part[line, order] for part in out[1:]))
+
+
+def _odds_of_all(ratio: Array, spread: Array, sigma: float) -> float:
+    """Odds that there is no friction in any of several measurements.
+
+    Their ratios (n,) have standard deviations ``spread`` (n,), which include the prior σ.
+    """
+    information = 1.0 / spread**2 - 1.0 / sigma**2
+    known = information > 0.0
+    variance = 1.0 / information[known]
+    square = (ratio[known] / spread[known] ** 2) ** 2 * variance
+    share = variance / (variance + np.geomspace(_LEAST, sigma, _SCALES)[:, None] ** 2)
+    each = np.clip(0.5 * (np.log(share) + square * (1.0 - share)), -_TELLING, _TELLING)
+    evidence = np.logaddexp.reduce(each.sum(axis=1)) - np.log(_SCALES)
+    return float(np.exp(np.clip(-evidence, -_CERTAIN, _CERTAIN)))
 
 
 def check_ratio(spread: float, sensor: SensorNoise | None) -> None:

@@ -5,6 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 import vibrissa as vb
+from vibrissa.contacts.joint.friction import _Nodes, _stated
 
 NOISE = np.diag([1e-6**2] * 3 + [2e-8**2] * 3)
 COUNT = 60
@@ -132,3 +133,17 @@ def test_every_result_states_what_it_assumes_of_friction(gamma_map):
         assert found.friction == found.candidates.friction == friction
         assert found.to_dataset().attrs["friction"] == friction
         assert text in " ".join(str(found).split())
+
+
+def test_improbable_contacts_with_indefinite_covariances_are_left_out():
+    """Rounding makes them so near slip-off, and one ended the estimates of a whole recording."""
+    curve, s = np.repeat([0, 1], 3), np.tile([0.5, 0.51, 0.52], 2)
+    x = np.column_stack([s, np.zeros(6), np.ones(6), np.zeros(6)])
+    values = np.column_stack([np.zeros((6, 3)), s, np.zeros((6, 2))])
+    spread = np.where(curve[:, None, None] > 0, -1.0, 1.0) * 1e-3 * np.eye(3)
+    log = np.array([-1.0, 0.0, -1.0, -3001.0, -3000.0, -3001.0])
+    nodes = _Nodes(curve, x, values, log, spread, np.full(6, 1e-4), np.where(curve, 6e3, 0.1))
+    found = _stated(nodes, np.zeros(2, int), 1)
+    assert found.number.tolist() == [1]
+    assert found.x[0, 0, 0] == 0.51
+    assert np.linalg.eigvalsh(found.covariances[0, 0])[0] > 0.0

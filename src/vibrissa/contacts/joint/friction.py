@@ -298,7 +298,12 @@ def _stated(nodes: _Nodes, row: IntArray, n: int) -> Candidates:
     lead = order[np.flatnonzero(np.diff(own[order], prepend=-1))]
     y = part.point - nodes.values[lead, 3:6][of]
     second = mean(part.spread + y[:, :, None] * y[:, None, :])
-    usable = total > 0.0
+    of_row = row[nodes.curve[lead]]
+    weight, best = np.full(m, -np.inf), np.full(n, -np.inf)
+    weight[total > 0.0] = np.log(total[total > 0.0]) + top[total > 0.0]
+    np.maximum.at(best, of_row, weight)
+    # Improbable contacts near slip-off may have covariances that rounding makes indefinite.
+    usable = weight > best[of_row] - _LOW
     known = np.where(usable[:, None, None], second, np.eye(3))
     root = np.asarray(np.linalg.inv(np.linalg.cholesky(known)), dtype=np.float64)
     tails = mean(_fourth(root[of], y, part.spread)) / _NORMAL_KURTOSIS
@@ -310,12 +315,11 @@ def _stated(nodes: _Nodes, row: IntArray, n: int) -> Candidates:
 
     out = Candidates.room(n)
     rank = np.full((n, MOST_CANDIDATES), -np.inf)
-    weight = np.full(m, -np.inf)
-    weight[usable] = np.log(total[usable]) + top[usable]
-    for one in np.argsort(-weight):
-        i = row[nodes.curve[lead[one]]]
+    order = np.argsort(-weight)
+    for one in order[usable[order]]:
+        i = of_row[one]
         j = out.number[i]
-        if j == MOST_CANDIDATES or not weight[one] > rank[i, 0] - _LOW:
+        if j == MOST_CANDIDATES:
             continue
         out.number[i], rank[i, j] = j + 1, weight[one]
         out.x[i, j], out.values[i, j] = nodes.x[lead[one]], nodes.values[lead[one], :6]

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 import vibrissa as vb
-from vibrissa.contacts.joint.friction import _Nodes, _stated
+from vibrissa.contacts.joint.friction import _Nodes, _odds_of_all, _stated
 
 NOISE = np.diag([1e-6**2] * 3 + [2e-8**2] * 3)
 COUNT = 60
@@ -147,3 +147,10 @@ def test_improbable_contacts_with_indefinite_covariances_are_left_out():
     assert found.number.tolist() == [1]
     assert found.x[0, 0, 0] == 0.51
     assert np.linalg.eigvalsh(found.covariances[0, 0])[0] > 0.0
+
+
+def test_equal_ratios_that_no_single_measurement_shows_are_friction():
+    rng, spread = np.random.default_rng(4), np.full(70, 0.024)
+    odds = [_odds_of_all(mean + 0.025 * rng.normal(size=70), spread, 0.3) for mean in (0.0, 0.02)]
+    assert odds[0] > 2.0
+    assert odds[1] < 1e-3

@@ -21,7 +21,7 @@ the prior of µ_x is (δ(µ_x) + N(0, σ²)) / 2. With the density p(0) of µ_x 
 odds of no friction are p(0) √(2π) σ (the Savage-Dickey ratio). The more probable of the two is the
 answer, and the covariance contains both. Decided for each measurement alone, weak friction is
 missed in most of them, with errors of one sign. For measurements of one object it is one question:
-the ratios are then N(0, τ²) with either τ = 0 or the same unknown τ up to σ for all of them.
+the ratios are all zero, or they are N(0, τ²) with the same unknown τ up to σ, or equal.
 """
 
 from __future__ import annotations
@@ -408,7 +408,13 @@ def _odds_of_all(ratio: Array, spread: Array, sigma: float) -> float:
     square = (ratio[known] / spread[known] ** 2) ** 2 * variance
     share = variance / (variance + np.geomspace(_LEAST, sigma, _SCALES)[:, None] ** 2)
     each = np.clip(0.5 * (np.log(share) + square * (1.0 - share)), -_TELLING, _TELLING)
-    evidence = np.logaddexp.reduce(each.sum(axis=1)) - np.log(_SCALES)
+    scattered = np.logaddexp.reduce(each.sum(axis=1)) - np.log(_SCALES)
+    # Equal ratios may be too small to be seen in any one measurement.
+    z = np.sign(ratio[known]) * np.sqrt(np.minimum(square, 2.0 * _TELLING))
+    alone = 1.0 / (1.0 + sigma**2 * (1.0 / variance).sum())
+    mean = (z / np.sqrt(variance)).sum() ** 2 / max((1.0 / variance).sum(), 1.0)
+    equal = 0.5 * (np.log(alone) + mean * (1.0 - alone))
+    evidence = np.logaddexp(scattered, equal) - np.log(2.0)
     return float(np.exp(np.clip(-evidence, -_CERTAIN, _CERTAIN)))
 
 

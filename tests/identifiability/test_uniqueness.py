@@ -92,8 +92,17 @@ def test_a_straight_whisker_never_twists(straight):
     assert len(with_twist) == 10
     assert (found.verdict == "not unique").all()
     # M_x says nothing, so that every contact lies on a curve of equals.
-    assert (found.twin_share.sel(region="all") > 0.9).all()
+    assert (found.twin_share.sel(region="all") > 0.99).all()
     assert found.minority_share.isnull().all()
+
+
+def test_the_share_of_twins_includes_all_parts_of_a_fibre(straight):
+    """Contacts at which the whisker turns back have their twins where it does not.
+
+    Between them F_T is zero and F_D jumps: whether Newton's method came across was rounding.
+    """
+    found = vb.uniqueness(straight, ["Fx FD Mx"], ["all"], samples=64, resolution=False)
+    assert found.twin_share.item() == pytest.approx(1.0)
 
 
 def test_symmetry_takes_more_from_a_straight_whisker(straight):

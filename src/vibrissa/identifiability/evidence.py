@@ -390,7 +390,16 @@ def _fibres(
     )
     followed = np.union1d(outside, followed)
     start = samples.rows(followed)
-    found = fibres(problem.contact_map, names, steps, start.chart, start.contacts, problem.domain)
+    found = fibres(
+        problem.contact_map,
+        names,
+        steps,
+        start.chart,
+        start.contacts,
+        problem.wide.contacts,
+        problem.separation,
+        problem.domain,
+    )
     return found, followed, outside
 
 

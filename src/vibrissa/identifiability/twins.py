@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from vibrissa.contacts import RANK, ContactMap, Domain, invert, polish, within_paper_bounds
 from vibrissa.deferred import stats
-from vibrissa.numerics import AnyArray, Array, cross
+from vibrissa.numerics import AnyArray, Array, IntArray, cross
 from vibrissa.rod import (
     STEPS,
     Deflection,
@@ -207,6 +207,8 @@ _KEPT = 16
 # Length of a step along a fibre, in units in which the chart is about one wide; steps each way.
 _STRIDE = 0.02
 _STRIDES = 60
+# Number of contacts from which other parts of a fibre are solved.
+_SIMILAR = 16
 # Number of Gauss-Newton steps in a correction, and relative cutoff of singular values.
 _CORRECTIONS = 5
 _RCOND = 1e-6
@@ -402,13 +404,14 @@ def correct(
     discretization: Discretization, names: tuple[str, ...], xi: Array, targets: Array, unit: Array
 ) -> tuple[Array, Array, Array]:
     """Move contacts the least distance to where they have given signals, by Gauss-Newton steps."""
-    for _ in range(_CORRECTIONS):
-        away, slope, _ = equations(discretization, names, xi, targets)
-        inverse = np.linalg.pinv(slope * unit[:, None, :], rcond=_RCOND)
-        xi = xi - np.einsum("nij,nj->ni", inverse, away) * unit
-    away, _, values = equations(discretization, names, xi, targets)
-    # Where a fibre ends at rest the scale vanishes, and the misfit is set to infinity.
+    # Where steps diverge, or where a fibre ends at rest and the scale vanishes, the misfit is set to
+    # infinity.
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        for _ in range(_CORRECTIONS):
+            away, slope, _ = equations(discretization, names, xi, targets)
+            inverse = np.linalg.pinv(slope * unit[:, None, :], rcond=_RCOND)
+            xi = xi - np.einsum("nij,nj->ni", inverse, away) * unit
+        away, _, values = equations(discretization, names, xi, targets)
         misfit = np.abs(away / sizes(values, names)).max(axis=1)
     return xi, values, np.where(np.isfinite(misfit), misfit, np.inf)
 
@@ -456,15 +459,23 @@ def fibres(
     steps: int,
     chart: Array,
     first: ContactSet,
+    others: ContactSet,
+    separation: float,
     domain: Domain,
 ) -> Pairs:
-    """Follow curves of equal triplets through contacts at which a dimension has been lost."""
+    """Follow curves of equal triplets through contacts at which a dimension has been lost.
+
+    A curve can have several parts: where the contact's normal passes the axis of the base, F_T is
+    zero and F_D jumps by π. For contacts whose part is shorter than ``separation``, contacts of
+    other parts are solved from the most similar of the contacts ``others``.
+    """
     d = discretize(contact_map.whisker, steps)
     values, _ = solve_forces(d, with_normal_force(first.xi))
     first = contact_set(contact_map, first.xi, values, domain)
     targets = first.signals[:, signal_columns(names)]
     unit = units(contact_map, first.xi)
     rows, found = [], []
+    alone = np.ones(len(chart), dtype=bool)
     for sense in (1.0, -1.0):
         running, xi = np.arange(len(chart)), first.xi
         direction = np.full(xi.shape, np.nan)
@@ -479,11 +490,34 @@ def fibres(
                 break
             rows.append(running)
             found.append(np.concatenate([xi, values[stays]], axis=1))
-    row = np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
-    both = np.concatenate(found) if found else np.zeros((0, 9))
+            apart = np.linalg.norm(values[stays, 3:] - first.values[running, 3:], axis=1)
+            alone[running[apart >= separation]] = False
+    running, xi = _similar(names, np.flatnonzero(alone), first, others, separation)
+    xi, values, misfit = correct(d, names, xi, targets[running], units(contact_map, xi))
+    stays = (misfit <= AGREEMENT) & stable(contact_map, xi)
+    row = np.concatenate([*rows, running[stays]])
+    both = np.concatenate([*found, np.concatenate([xi, values], axis=1)[stays]])
     second = contact_set(contact_map, both[:, :3], both[:, 3:], domain)
     apart = np.linalg.norm(second.values[:, 3:] - first.values[row, 3:], axis=1)
     return Pairs(chart[row], row, first.rows(row), second, apart)
+
+
+def _similar(
+    names: tuple[str, ...], rows: IntArray, first: ContactSet, others: ContactSet, separation: float
+) -> tuple[IntArray, Array]:
+    """Distant contacts ξ with the most similar signals, and the rows to which they belong."""
+    columns = signal_columns(names)
+    signals = others.signals[:, columns]
+    span = np.ptp(signals, axis=0)
+    weight = np.where(span > RANK, 1.0 / np.maximum(span, RANK), 0.0)
+    running, xi = [], []
+    for row in rows:
+        away = within_turn(signals - first.signals[row, columns], circular_among(names)) * weight
+        near = np.linalg.norm(others.values[:, 3:] - first.values[row, 3:], axis=1) < separation
+        chosen = np.argsort(np.where(near, np.inf, np.linalg.norm(away, axis=1)))[:_SIMILAR]
+        running.append(np.full(len(chosen), row))
+        xi.append(others.xi[chosen])
+    return np.concatenate([rows[:0], *running]), np.concatenate([first.xi[:0], *xi])
 
 
 def _null_direction(slope: Array, before: Array, sense: float) -> Array:

@@ -1,5 +1,6 @@
 """Enclosures never miss, and the straight tapered whisker is a theorem."""
 
+import copy
 from fractions import Fraction
 
 import numpy as np
@@ -54,6 +55,12 @@ def theorem(tmp_path_factory):
     contact_map = straight(15.0)
     stopped = certify(contact_map, path=path, seconds=0.0)
     return path, stopped, certify(contact_map, path=path)
+
+
+def write_forged(path, data):
+    """Write a certificate that was changed, with the hash of its new contents."""
+    data.attrs["identity"] = checker.identity(data)
+    write_netcdf(path, data)
 
 
 def test_a_straight_tapered_whisker_is_located_by_fx_mb_md(theorem):
@@ -121,6 +128,27 @@ def test_a_certificate_with_a_hole_or_a_wrong_whisker_is_noticed(theorem):
         certify(straight(8.0), path=path)
 
 
+def test_a_certificate_of_which_anything_was_changed_is_refused(theorem):
+    _, _, found = theorem
+    for name, value in found.to_dataset().attrs.items():
+        data = found.to_dataset()
+        data.attrs[name] = value + " " if isinstance(value, str) else np.multiply(value, 1.5) + 1
+        with pytest.raises(ValueError, match="has been modified|not a certificate"):
+            type(found).from_dataset(data)
+    data = found.to_dataset().isel(interior_certified_box=slice(1))
+    data["interior_certified"] *= 0  # one box for the whole
+    with pytest.raises(ValueError, match="has been modified"):
+        type(found).from_dataset(data)
+
+
+def test_an_unfinished_certificate_does_not_state_100_percent(theorem):
+    certificate = copy.deepcopy(theorem[2])
+    interior = certificate.parts["interior"]
+    interior.undecided, interior.certified = np.array([[[12, 5], [12, 7]]]), interior.certified[:-1]
+    assert "interior 99.999 % (undecided: s " in certificate.summary()
+    assert "fold 100 %" in certificate.summary()
+
+
 @pytest.mark.slow
 def test_an_independent_check_confirms_boxes_and_no_others(theorem, tmp_path, monkeypatch):
     path, _, found = theorem
@@ -137,7 +165,7 @@ def test_an_independent_check_confirms_boxes_and_no_others(theorem, tmp_path, mo
     assert check_certificate(forged, 1, seed, parts=["fold"])[1:] == (1, 0)
     data = found.to_dataset()
     data["distal_domain"][0, 0] = 0.5
-    write_netcdf(forged, data)
+    write_forged(forged, data)
     assert not check_certificate(forged, 1, parts=["distal"]).covers
     data = found.to_dataset()
     data["factors"] = data["factors"] * 1.1
@@ -169,7 +197,7 @@ def test_an_independent_check_of_a_curved_whisker(curved, tmp_path, monkeypatch)
     assert not covers(np.delete(boxes, 5, axis=0))
     data = certificate.to_dataset()
     data.attrs["cone"] *= 0.99  # contacts that are left out are not within this one
-    write_netcdf(path, data)
+    write_forged(path, data)
     assert not check_certificate(path, 0).covers
     monkeypatch.setattr(checker, "_ROUNDS", 1)
     small, large = np.array([[[10, 600], [7, 30], [6, 30]]]), np.array([[[4, 9], [1, 0], [1, 0]]])
@@ -177,7 +205,7 @@ def test_an_independent_check_of_a_curved_whisker(curved, tmp_path, monkeypatch)
         certificate.parts["interior"].certified = box
         data = certificate.to_dataset()
         data.attrs["sign"] *= sign
-        write_netcdf(path, data)
+        write_forged(path, data)
         assert check_certificate(path, parts=["interior"]).confirmed == confirmed
 
 

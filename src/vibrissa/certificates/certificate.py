@@ -15,7 +15,6 @@ all of them because M_B is not zero.
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -26,7 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from vibrissa.certificates.checker import covers
+from vibrissa.certificates.checker import covers, identity
 from vibrissa.certificates.conditions import (
     PLANAR,
     SPATIAL,
@@ -166,12 +165,8 @@ class Certificate:
 
     @property
     def identity(self) -> str:
-        """Hash of the whisker and the domain."""
-        digest = hashlib.sha256()
-        domain = self.parts["interior"].domain
-        for array in (*self.rod, self.bounds.packed(), self.stations, domain):
-            digest.update(np.ascontiguousarray(array, dtype=np.float64).tobytes())
-        return digest.hexdigest()[:16]
+        """Hash of all that the certificate states."""
+        return identity(self.to_dataset())
 
     def summary(self) -> str:
         """State in words what is proved and what is not.
@@ -192,7 +187,7 @@ class Certificate:
         if self.refuted:
             return f"No certificate{where}: {self.refuted}."
         shares = ", ".join(
-            f"{n} {100.0 * p.share:.3f} %{self._left(p)}" for n, p in self.parts.items()
+            f"{n} {_percent(p)} %{self._left(p)}" for n, p in self.parts.items()
         )
         return f"Certificate{where} not finished: proved so far {shares}; run again to continue."
 
@@ -277,6 +272,8 @@ class Certificate:
                 sign = f"the sign of the {names[which[column]]} {what}"
                 self.refuted = f"{sign} at {unknowns} = ({where})"
                 return
+        if not self.straight and not self.turns:
+            self.refuted = "M_D cannot be shown to turn once while the direction of the force does"
 
     def pursue(self, name: str, most: int) -> None:
         """Decide more boxes of a part.
@@ -342,7 +339,6 @@ class Certificate:
             "kind": KIND,
             "triplet": TRIPLET,
             "whisker": self.whisker,
-            "identity": self.identity,
             "proved": int(self.proved),
             "share": self.share,
             "refuted": self.refuted,
@@ -356,6 +352,7 @@ class Certificate:
             "seconds": self.seconds,
             "evaluated": [part.evaluated for part in self.parts.values()],
         }
+        out.attrs["identity"] = identity(out)
         return out
 
     @classmethod
@@ -375,11 +372,15 @@ class Certificate:
         Raises
         ------
         ValueError
-            If the dataset is not a certificate, or its numbers have been modified.
+            If the dataset is not a certificate, or has been modified.
         """
         if data.attrs.get("kind") != KIND:
             raise ValueError(
                 f"not a certificate: its kind is {data.attrs.get('kind', 'missing')!r}"
+            )
+        if identity(data) != data.attrs.get("identity"):
+            raise ValueError(
+                "the certificate has been modified since it was written, or is of another version"
             )
         evaluated = np.atleast_1d(data.attrs["evaluated"])
         parts = {
@@ -407,8 +408,6 @@ class Certificate:
             str(attrs["refuted"]),
             float(attrs["seconds"]),
         )
-        if out.identity != data.attrs["identity"]:
-            raise ValueError("the certificate's numbers have been modified since it was written")
         return out
 
     def save(self, path: str | PathLike[str]) -> None:
@@ -436,6 +435,11 @@ def load_certificate(path: str | PathLike[str]) -> Certificate:
         Certificate in the file.
     """
     return Certificate.from_dataset(read_dataset(Path(path)))
+
+
+def _percent(part: Part) -> str:
+    """Certified share of a part, in percent; 100 only if nothing is left."""
+    return "100" if part.complete else f"{np.floor(1e5 * part.share) / 1e3:.3f}"
 
 
 def _dims(name: str, array: Array) -> tuple[str, ...]:

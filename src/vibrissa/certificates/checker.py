@@ -187,8 +187,8 @@ def check_certificate(
     data = read_dataset(Path(path)).load()
     if data.attrs.get("kind") != "vibrissa certificate":
         raise ValueError(f"{path} is not a certificate")
-    if _identity(data) != data.attrs["identity"]:
-        raise ValueError(f"{path} has been modified since it was written")
+    if identity(data) != data.attrs.get("identity"):
+        raise ValueError(f"{path} has been modified since it was written, or is of another version")
     if whisker is not None and not is_certificate_of(data, whisker):
         raise ValueError(f"{path} is a certificate of another whisker")
     straight = bool(data.attrs["straight"])
@@ -210,14 +210,17 @@ def check_certificate(
     return Checked(whole, tried, held)
 
 
-def _identity(data: xr.Dataset) -> str:
-    """Hash of the whisker, the bounds on the force and the domain."""
-    names = ("rod_edges", "rod_local", "rod_coefficients", "rod_twist")
-    bounds = [[data.attrs["alpha"]], data["factors"].values, [data.attrs["room"]]]
-    arrays = [*(data[name].values for name in names), *bounds]
-    arrays += [data["stations"].values, data["interior_domain"].values]
-    flat = (np.asarray(one, dtype=np.float64).tobytes() for one in arrays)
-    return hashlib.sha256(b"".join(flat)).hexdigest()[:16]
+def identity(data: xr.Dataset) -> str:
+    """Hash of all that a certificate's file states, except of the hash itself."""
+    digest = hashlib.sha256()
+    for name in sorted(map(str, data.variables)):
+        values = np.asarray(data[name].values, dtype=np.float64)
+        digest.update(f"{name} {values.shape} ".encode() + values.tobytes())
+    for name, value in sorted(data.attrs.items()):
+        if name != "identity":
+            stated = value if isinstance(value, str) else np.ravel(value).tolist()
+            digest.update(f"{name} {stated} ".encode())
+    return digest.hexdigest()[:16]
 
 
 def _domains_match(data: xr.Dataset) -> bool:

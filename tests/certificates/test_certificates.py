@@ -133,7 +133,7 @@ def test_a_certificate_of_which_anything_was_changed_is_refused(theorem):
     for name, value in found.to_dataset().attrs.items():
         data = found.to_dataset()
         data.attrs[name] = value + " " if isinstance(value, str) else np.multiply(value, 1.5) + 1
-        with pytest.raises(ValueError, match="has been modified|not a certificate"):
+        with pytest.raises(ValueError, match=r"has been modified|not a certificate"):
             type(found).from_dataset(data)
     data = found.to_dataset().isel(interior_certified_box=slice(1))
     data["interior_certified"] *= 0  # one box for the whole

@@ -13,7 +13,7 @@ from vibrissa import samples
 from vibrissa.cli.app import app, main
 from vibrissa.cli.options import numbers
 from vibrissa.cli.terminal import fixed, print_table, say, shown
-from vibrissa.io import load_contacts, save_centerline, save_signals
+from vibrissa.io import load_contacts, save_centerline, save_signals, write_table
 
 
 def run(*arguments):
@@ -119,6 +119,33 @@ def test_map_and_estimate(folder, chart, table):
         np.testing.assert_allclose(contacts[axis].values[:2], points[:2, i], atol=1e-9)
         assert (contacts[f"sigma_{axis}"].values[:2] > 0.0).all()
     assert np.isnan(contacts["x"].values[2:]).all()
+
+
+def test_the_candidates_of_ambiguous_rows_are_in_a_second_table(folder, chart):
+    there = np.array([0.0333006, 0.0003273, -0.0043394])
+    bent = vb.deflect(samples.gamma(), vb.PointContact(there))
+    signals = vb.base_signals(bent.force, bent.moment)
+    names = ("FT", "FD", "MB")
+    of_signals, of_wrench, out = (folder / f"{n}.csv" for n in ("triplet", "wrench", "several"))
+    write_table(of_signals, ["time", *names], [[0.5, *(signals[n].item() for n in names)]])
+    components = ["time", "Fx", "Fy", "Fz", "Mx", "My", "Mz"]
+    write_table(of_wrench, components, [[0.5, *bent.force, *bent.moment]])
+    for path in (of_signals, of_wrench):
+        text = run(
+            "estimate", path, "--map", chart, "--using", ",".join(names), "-o", out, "--force"
+        )
+        assert "several_candidates.csv" in text
+        (time, number, *points) = np.loadtxt(
+            folder / "several_candidates.csv", delimiter=",", skiprows=1
+        ).T
+        assert len(time) > 1
+        assert (time == 0.5).all()
+        assert number.tolist() == list(range(len(time)))
+        away = np.linalg.norm(np.transpose(points) - there, axis=1)
+        assert away.min() < 1e-6
+        assert away.max() > 1e-3
+    run("estimate", of_wrench, "--map", chart, "-o", out, "--force")  # all are unique now
+    assert not (folder / "several_candidates.csv").exists()
 
 
 def test_signals_without_noise_are_not_compared_with_it(folder, chart, table):

@@ -186,9 +186,7 @@ class Certificate:
             )
         if self.refuted:
             return f"No certificate{where}: {self.refuted}."
-        shares = ", ".join(
-            f"{n} {_percent(p)} %{self._left(p)}" for n, p in self.parts.items()
-        )
+        shares = ", ".join(f"{n} {_percent(p)} %{self._left(p)}" for n, p in self.parts.items())
         return f"Certificate{where} not finished: proved so far {shares}; run again to continue."
 
     def _left(self, part: Part) -> str:
@@ -395,7 +393,7 @@ class Certificate:
             )
         }
         attrs = data.attrs
-        out = cls(
+        return cls(
             ExactRod(*(data[f"rod_{name}"].values for name in ExactRod._fields)),
             Bounds(float(attrs["alpha"]), data["factors"].values, float(attrs["room"])),
             data["stations"].values,
@@ -408,7 +406,6 @@ class Certificate:
             str(attrs["refuted"]),
             float(attrs["seconds"]),
         )
-        return out
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the certificate as NetCDF.

@@ -247,7 +247,8 @@ def estimate(
     squares. --using wrench allows for friction. If M_B is within five standard deviations of zero,
     the status is not_felt.
 
-    The results for a table are written to a table. For a recording they are added as the group
+    The results for a table are written to a table, and the candidates of rows that have several to
+    a second one, NAME_candidates.csv. For a recording they are added as the group
     `estimates`, also in the laboratory frame, where continuity selects among several contacts;
     missing signals are computed first (see `vibrissa signals`), and a contour of earlier contacts
     is removed.
@@ -275,7 +276,7 @@ def estimate(
         inputs.free_beside(signals, [target], force)
     else:
         spare(target, signals)
-        free([target], force)
+        free([target, _candidates_beside(target)], force)
     if known.around is not None:
         known.check(how, weight)
         if sensor is not None:
@@ -380,6 +381,7 @@ def _from_lines(
     events, onsets = vb.contacts.in_order(np.array(columns["time"]), happened, begun)
     begun_at = dict(zip(_ONSET, onsets.T, strict=True))
     vb.io.save_contacts(target, {**columns, **begun_at, "event": events, "status": statuses})
+    _write_candidates(target, columns["time"], [one.get("candidates", []) for one in records])
     for sentence in vb.streaming.advice(running):
         remark(sentence)
     friction = vb.contacts.friction_assumed(estimator.friction)
@@ -429,11 +431,35 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions, weight: Gravi
         tell("contact points", 1, 1)
     _doubt_zero(wrench, noise, found, weight)
     vb.io.save_contacts(target, vb.pipeline.contact_columns(found))
+    points = np.asarray(found["candidate_points"])
+    several = [one[np.isfinite(one).all(axis=1)].tolist() for one in points]
+    _write_candidates(target, np.asarray(found["time"]).tolist(), several)
     used = WRENCH if how.whole else found.attrs["triplet"]
     about = how.noise.described() + weight.described()
     remark(how.described(used, found.attrs["friction"], about, found.attrs["felt_above"]))
     inputs.print_statuses(found["status"])
     inputs.print_written(target)
+
+
+def _candidates_beside(target: Path) -> Path:
+    """Path of the table of candidates next to that of the contacts."""
+    return target.with_name(f"{target.stem}_candidates.csv")
+
+
+def _write_candidates(target: Path, times: list[float], points: list[list[list[float]]]) -> None:
+    """Write the candidates of samples that have several, if there are any; whisker frame."""
+    rows = [
+        [time, number, *point]
+        for time, several in zip(times, points, strict=True)
+        for number, point in enumerate(several)
+        if len(several) > 1
+    ]
+    path = _candidates_beside(target)
+    if rows:
+        vb.io.write_table(path, ["time", "candidate", "x", "y", "z"], rows)
+        inputs.print_written(path)
+    else:
+        path.unlink(missing_ok=True)  # that of former contacts, which are replaced
 
 
 # Signals proposed if the requested ones do not determine contacts, fewest first.

@@ -404,8 +404,7 @@ def correct(
     discretization: Discretization, names: tuple[str, ...], xi: Array, targets: Array, unit: Array
 ) -> tuple[Array, Array, Array]:
     """Move contacts the least distance to where they have given signals, by Gauss-Newton steps."""
-    # Where steps diverge, or where a fibre ends at rest and the scale vanishes, the misfit is set to
-    # infinity.
+    # Where steps diverge, or a fibre ends at rest and the scale vanishes, the misfit is infinite.
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         for _ in range(_CORRECTIONS):
             away, slope, _ = equations(discretization, names, xi, targets)

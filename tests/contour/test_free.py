@@ -170,3 +170,10 @@ def test_what_is_no_surface_is_refused(contacts):
         fit_free(np.linspace(0, 1, 20)[:, None] * [1e-3, 2e-3, 3e-3])
     with pytest.raises(ValueError, match=r"covariance has shape \(3, 3\)"):
         fit_free(points, **(known | {"covariance": np.eye(3)}))
+
+
+def test_contacts_are_in_the_order_of_those_of_a_shape(contacts):
+    points, known = contacts(3, 60)
+    alike = fit_free(points, known["covariance"], known["whisker_radius"])
+    named = fit_free(points, covariance=known["covariance"], whisker_radius=known["whisker_radius"])
+    np.testing.assert_array_equal(alike.residuals, named.residuals)

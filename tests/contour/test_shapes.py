@@ -320,3 +320,23 @@ def test_a_cylinder_is_as_near_as_stated_where_all_normals_are_turned_alike(join
     assert score[False][:2].max() > 5.0
     with pytest.raises(ValueError, match="shared is given without"):
         fit_shape("cylinder", points, shared=shared)
+
+
+def test_a_point_far_away_does_not_set_the_scale_of_the_others(joint_errors):
+    points, known = noisy("cylinder", joint_errors, np.random.default_rng(4), 100)
+    points[7] = [1.0, -2.0, 0.5]
+    fit = fit_shape("cylinder", points, **known)
+    assert abs(fit.radius - RADIUS) < 4.0 * fit.sigma["radius"] < 0.1e-3
+    assert not fit.inliers[7]
+
+
+def test_standard_deviations_and_millimetres_are_not_taken_for_what_is_needed(joint_errors):
+    points, known = noisy("cylinder", joint_errors, np.random.default_rng(4), 100)
+    alike = np.broadcast_to(4e-5 * np.eye(3), (100, 3, 3))  # m, not m²
+    with (
+        pytest.warns(UserWarning, match="must be in m²"),
+        pytest.raises(ValueError, match="hollow"),
+    ):
+        fit_shape("cylinder", points, alike, known["whisker_radius"])
+    with pytest.raises(ValueError, match="larger than the extent of the contacts"):
+        fit_shape("cylinder", points, known["covariance"], 1e3 * known["whisker_radius"])

@@ -7,6 +7,7 @@ in time is chosen.
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -22,6 +23,10 @@ from vibrissa.quantities import QUANTITIES, attributes
 
 # Smallest standard deviation, over the points' extent, which replaces zero noise.
 FLOOR = 1e-7
+# Distance from the middle of the contacts, over its median, above which a contact is ignored.
+_ASTRAY = 100.0
+# Median standard deviation of contacts, over their extent, above which it is doubted.
+_VAGUE = 0.5
 # Smallest variance of a combination, over that of the point or normal.
 _FINE = 1e-10
 # Largest negative eigenvalue of a covariance that is attributed to rounding, over the largest.
@@ -140,17 +145,37 @@ def _scale_contacts(what: str, arrays: dict[str, Array], n: int, least: int) -> 
     if "normals" in arrays:
         length = np.linalg.norm(arrays["normals"], axis=1)
         usable &= length > 0.0
+    if usable.any():  # one point that is wildly wrong would set the scale of all others
+        middle = np.median(arrays["points"][usable], axis=0)
+        away = np.linalg.norm(arrays["points"] - middle, axis=1)
+        reach = _ASTRAY * np.median(away[usable])
+        usable &= (away <= reach) | (reach == 0.0)
     if usable.sum() < least:
         raise ValueError(f"no {what}: {usable.sum()} usable points; at least {least} are needed")
     kept = {name: values[usable] for name, values in arrays.items()}
     mean = kept["points"].mean(axis=0)
     centered = kept["points"] - mean
     extent = float(np.sqrt((centered**2).sum(axis=1).mean()))
+    radius = float(np.median(kept["whisker_radius"]))
+    if radius > extent:
+        raise ValueError(
+            f"no {what}: whisker_radius, {radius:.3g} m, is larger than the extent of the "
+            f"contacts, {extent:.3g} m; both must be in m"
+        )
     size = np.linalg.svd(centered, compute_uv=False)
     if not size[1] > FLOOR * size[0]:
         raise ValueError(f"no {what}: all points are on a line, or the same")
     normal = kept["normals"] / length[usable][:, None] if "normals" in kept else None
     spread = _covariance(what, kept, np.flatnonzero(usable), extent)
+    if spread is not None:
+        variance = np.trace(spread[:, :3, :3], axis1=1, axis2=2) / 3.0
+        if (sigma := float(np.sqrt(np.median(variance)))) > _VAGUE:
+            warnings.warn(
+                f"the median standard deviation of the contacts, {1e3 * sigma * extent:.2g} mm, is "
+                f"{sigma:.2g} of their extent: the covariance must be in m²",
+                UserWarning,
+                stacklevel=4,
+            )
     shared = kept["shared"] / np.repeat([extent, 1.0], 3) if "shared" in kept else None
     touches = Touches(centered / extent, kept["whisker_radius"] / extent, normal, spread, shared)
     return Checked(usable, touches, mean, extent)

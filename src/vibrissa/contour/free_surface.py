@@ -51,7 +51,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, NamedTuple, Self, Unpack
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 import xarray as xr
@@ -60,7 +60,6 @@ from numpy.typing import ArrayLike, NDArray
 from vibrissa.contour.fit import TO_SIGMA, fit_shape
 from vibrissa.contour.fitted_shape import (
     FLOOR,
-    ContactArrays,
     FittedShape,
     check_complete,
     check_contacts,
@@ -328,7 +327,13 @@ _TINY = 1e-12  # smallest standard deviation of a distance, m
 
 
 def fit_free(
-    points: ArrayLike, base: str | None = None, most: int = 600, **contacts: Unpack[ContactArrays]
+    points: ArrayLike,
+    covariance: ArrayLike | None = None,
+    whisker_radius: ArrayLike | None = None,
+    *,
+    base: str | None = None,
+    most: int = 600,
+    **contacts: Any,
 ) -> FreeFit:
     """Fit a smooth surface of arbitrary shape to contact points on parts of it.
 
@@ -337,6 +342,10 @@ def fit_free(
     points : array_like (n, 3)
         Contact points on the whisker's centreline, m, in any common frame; rows with NaN are
         ignored.
+    covariance : array_like (n, 3, 3), optional
+        Covariance of each point, m².
+    whisker_radius : array_like (n,) or float, optional
+        Radius of the whisker at each contact, m; 0 by default.
     base : {"plane", "sphere", "cylinder"}, optional
         Simple shape from which the surface deviates; by default the simplest from which less simple
         ones do not fit much better.
@@ -344,8 +353,8 @@ def fit_free(
         Largest number of positions to which the points are merged; the time grows with its third
         power.
     **contacts
-        Further properties of the contacts: covariance, whisker_radius, normals, normal_covariance
-        and point_normal_covariance, as for `fit_shape`.
+        Further properties of the contacts: normals, normal_covariance and point_normal_covariance,
+        as for `fit_shape`.
 
     Returns
     -------
@@ -362,6 +371,7 @@ def fit_free(
         raise ValueError(f"base is {base!r}; it must be one of {', '.join(SHAPES)}")
     if most < 6:
         raise ValueError(f"most is {most}; at least 6 positions are needed")
+    contacts["covariance"], contacts["whisker_radius"] = covariance, whisker_radius
     given = check_contacts("surface", points, least=6, **contacts)
     # Rows that cannot be used for the base cannot be used for the deviation either.
     rows = np.flatnonzero(given.usable)

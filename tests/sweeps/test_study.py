@@ -149,6 +149,10 @@ def test_a_cell_is_the_same_in_any_study_that_has_it():
         (WHISKERS + 'kind = "array"\nrows = "A"\nnames = ["C2"]\n' + TASKS, "rows or columns"),
         (WHISKERS + '[[tasks]]\nkind = "friction"\ncontacts = 1e12\n', "from 1 to 1e"),
         (WHISKERS + '[[tasks]]\nkind = "sensitivity"\nforce_noise = nan\n', "a number from 0"),
+        (
+            WHISKERS + '[[tasks]]\nkind = "sensitivity"\nforce_noise = 1e-6\n',
+            "smaller than any sensor",
+        ),
         (WHISKERS + "kind = []\n" + TASKS, r"kind is \[\]; one of grid"),
         (WHISKERS + "kind = {a = 1}\n" + TASKS, "kind is .*; one of grid"),
         (WHISKERS + 'kind = "array"\nrows = [true]\n' + TASKS, "a list of words"),

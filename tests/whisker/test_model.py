@@ -543,3 +543,10 @@ def test_a_base_radius_is_still_assumed_if_only_the_tip_s_is_stated():
     (note,) = [each for each in notes if each.startswith("radius assumed")]
     assert "100 µm at the base, 12 µm at the tip" in note
     assert not any("radius assumed" in n for n in whisker.with_properties(base_radius=5e-5).notes)
+
+
+@pytest.mark.parametrize("radius", [0.1e-6, 1e-10])
+def test_a_radius_in_another_unit_is_not_that_of_a_hair(radius):
+    with pytest.raises(ValueError, match="millimetres given as micrometres"):
+        Whisker.straight(length=20e-3, base_radius=radius)
+    Whisker.straight(length=0.1, base_radius=3.5e-6)  # a carbon fibre

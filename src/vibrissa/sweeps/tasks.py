@@ -292,6 +292,8 @@ def _check_number(settings: Settings, name: str, least: float, most: float = np.
     if not number or not (least <= value <= most and value < np.inf):
         upto = f" to {most:g}" if most < np.inf else ""
         raise ValueError(f"{name} is {value!r}; a number from {least:g}{upto} is needed")
+    if name in _SENSOR and 0.0 < value < _FAINT * _SENSOR[name]:
+        raise ValueError(f"{name} is {value!r}, smaller than any sensor's: it is in µN or µN·m")
 
 
 # Smallest and largest values of numbers.
@@ -310,6 +312,8 @@ _READ: Mapping[str, Callable[[Settings], object]] = {
     "friction": lambda settings: _several(settings, "friction"),
 }
 
+# Noise of a sensor, µN and µN·m, and the share of it below which it is probably in other units.
+_FAINT = 1e-4
 _SENSOR = {"force_noise": FORCE_NOISE / _MICRO, "moment_noise": MOMENT_NOISE / _MICRO}
 
 TASKS: Mapping[str, Task] = MappingProxyType(

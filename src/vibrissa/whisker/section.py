@@ -42,7 +42,8 @@ SHORTEST, LONGEST = 0.5e-3, 0.5
 
 # Ways to confirm other lengths.
 CONFIRMATION = "any_length=True (Python) or --any-length (command line)"
-_STOUT = 0.1  # largest radius of a rod, over its length
+# Bounds of the largest radius of a rod, over its length; that of a carbon fibre of 10 cm is 3e-5.
+_THIN, _STOUT = 1e-5, 0.1
 
 # Scatter of samples, as a share of the radius, above which there is a note; and error of the base
 # signals of a rod through samples that scatter, in units of the scatter.
@@ -119,6 +120,12 @@ def parse_properties(
         faults.append(
             f"the radius is up to {thickest:.4g} m at a length of {length:.4g} m, more than a "
             "tenth of it: these look like millimetres given as metres; multiply by 1e-3"
+        )
+    elif thickest < _THIN * length:
+        faults.append(
+            f"the radius is at most {thickest:.4g} m at a length of {length:.4g} m, less than "
+            f"{_THIN:.0e} of it: these look like millimetres given as micrometres, or converted "
+            "once too often; multiply by 1e3"
         )
     if faults:
         raise ValueError("no whisker: " + "; ".join(faults))

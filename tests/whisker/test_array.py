@@ -1,5 +1,6 @@
 """An average rat's whiskers are those of the published equations and sit on a face."""
 
+import re
 import warnings
 from dataclasses import replace
 
@@ -283,3 +284,35 @@ def test_datasets_without_loss():
     assert again["LC2"].notes == ARRAY["LC2"].notes
     with pytest.raises(ValueError, match="not an array"):
         vb.WhiskerArray.from_tree(tree["whiskers"])
+
+
+def test_one_name_or_column_may_be_given_alone_and_others_are_no_names():
+    assert list(ARRAY.select(names="C1")) == ["LC1", "RC1"]
+    assert list(ARRAY.select(side="left", rows="C", columns=2)) == ["LC2"]
+    assert list(vb.whisker_array("left", rows="C", columns=2)) == ["LC2"]
+    assert list(vb.whisker_array("left", names="gamma")) == ["Lγ"]
+    for other in (3, None, slice(2)):
+        with pytest.raises(KeyError, match="not a whisker's name"):
+            ARRAY[other]
+
+
+@pytest.mark.parametrize(
+    ("column", "factor", "doubt"),
+    [
+        ("x_mm", 1e3, "m apart"),
+        ("[xyz]_mm", 1e-3, "overlap"),
+        ("(azimuth|elevation|roll)_deg", np.pi / 180.0, "as if they were in radians"),
+        ("roll_deg", 1e3, "more than two turns"),
+    ],
+)
+def test_poses_in_other_units_are_questioned(tmp_path, column, factor, doubt):
+    vb.io.save_array(tmp_path / "rat.csv", ARRAY)
+    header, *rows = [line.split(",") for line in (tmp_path / "rat.csv").read_text().splitlines()]
+    for row in rows:
+        for i, name in enumerate(header):
+            if re.fullmatch(column, name):
+                row[i] = str(factor * float(row[i]))
+    vb.io.write_table(tmp_path / "other.csv", header, rows)
+    with pytest.warns(UserWarning, match=doubt):
+        vb.load_array(tmp_path / "other.csv")
+    vb.load_array(tmp_path / "rat.csv")  # without a warning

@@ -34,7 +34,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -439,6 +439,10 @@ def _array(path: Path, whiskers: Sequence[Whisker]) -> WhiskerArray:
 _ANGLES = ("azimuth", "elevation", "roll")
 _ROTATION = tuple(f"r{i}{j}" for i in "123" for j in "123")
 _TURNS = {"_deg": np.pi / 180.0, "_rad": 1.0}
+_DEG = {"_deg": 1.0}
+# Largest numbers of degrees that are probably radians, and of angles; and largest distance of
+# bases, over the longest whisker.
+_RADIANS, _TWO_TURNS, _FAR_APART = 6.3, 720.0, 20.0
 _CURVATURES = {"_per_mm": 1e3, "_per_m": 1.0}
 _PLAIN = {"": 1.0}
 _RADII = ("base_radius", "tip_radius")
@@ -466,7 +470,31 @@ def whiskers_from_table(path: Path) -> list[Whisker]:
         except ValueError as fault:
             columns.faults.append(f"line {columns.lines[i]}: {fault}")
     columns.tell()
+    for doubt in _doubted_poses(columns, whiskers):
+        warnings.warn(f"{path}: {doubt}", UserWarning, stacklevel=3)
     return whiskers
+
+
+def _doubted_poses(columns: _Columns, whiskers: Sequence[Whisker]) -> Iterator[str]:
+    """Reasons why angles or positions of bases are probably in another unit."""
+    stated = [columns.values(f"{name}_deg", _PLAIN) for name in _ANGLES if columns.has(name, _DEG)]
+    if len(whiskers) > 1 and stated and 0.0 < np.abs(stated).max() <= _RADIANS:
+        yield "all angles are below 6.3 degrees, as if they were in radians; name columns _rad then"
+    if stated and np.abs(stated).max() > _TWO_TURNS:
+        yield f"an angle is {np.abs(stated).max():.4g} degrees, more than two turns"
+    bases = np.array([one.pose.origin for one in whiskers])
+    apart = np.linalg.norm(bases[:, None] - bases, axis=2)
+    longest = max(one.length for one in whiskers)
+    if apart.max() > _FAR_APART * longest:
+        yield (
+            f"bases are {apart.max():.3g} m apart, and the longest whisker is {longest:.3g} m: are "
+            "their positions in the unit of their columns?"
+        )
+    thick = np.array([one.base_radius for one in whiskers])
+    close = (apart < thick[:, None] + thick) & ~np.eye(len(bases), dtype=bool)
+    if close.any():
+        one, other = (whiskers[i].name for i in np.argwhere(close)[0])
+        yield f"the bases of {one} and {other} overlap: are positions in the unit of their columns?"
 
 
 def _whisker(

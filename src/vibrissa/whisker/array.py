@@ -75,6 +75,8 @@ class WhiskerArray(Mapping[str, Whisker]):
         return len(self._whiskers)
 
     def _key(self, name: str) -> str:
+        if not isinstance(name, str):
+            raise KeyError(f"{name!r} is not a whisker's name; this array has {', '.join(self)}")
         if name in self._whiskers:
             return name
         try:
@@ -127,6 +129,7 @@ class WhiskerArray(Mapping[str, Whisker]):
         WhiskerArray
             Array of these only.
         """
+        columns, names = _several(columns, int), _several(names, str)
         keep = None if rows is None else {row.upper() for row in rows}
         which = None if columns is None else set(columns)
         kept = [
@@ -331,6 +334,7 @@ def whisker_array(
     >>> len(whisker_array()), list(whisker_array("left", rows="C", columns=[0, 1]))
     (62, ['LC1', 'Lγ'])
     """
+    columns, names = _several(columns, int), _several(names, str)
     if names is not None:
         identities = [Identity.of(name) for name in names]
         away = [one.name for one in identities if one.side not in (None, *sides(side))]
@@ -348,6 +352,11 @@ def whisker_array(
         ]
         wanted = [one for one in wanted if one.column in morphology.MEASURED[one.row]]
     return WhiskerArray([average_whisker(one, **properties) for one in wanted])
+
+
+def _several(given: Any, kind: type) -> Any:
+    """Several columns or names, of which one may be given alone."""
+    return [given] if isinstance(given, kind) else given
 
 
 def average_whisker(identity: Identity, **properties: Unpack[Properties]) -> Whisker:

@@ -101,6 +101,13 @@ def test_selected_frames_and_whiskers_were_not_edited(stages, tmp_path):
     check_recording(_changed(stages, "estimates", "contact_point"))
 
 
+def test_a_selection_without_frames_or_of_one_whisker_is_named(stages):
+    with pytest.raises(ValueError, match="it has 0 frames of 2 whiskers"):
+        due_stages(stages.isel(time=slice(0)), "contour")
+    with pytest.raises(ValueError, match=r"isel\(whisker=\[0\]\)"):
+        due_stages(stages.isel(whisker=0), "contour")
+
+
 def test_other_stages_are_refused():
     with pytest.raises(ValueError, match="one of signals, estimates, contour"):
         due_stages(xr.DataTree(), "tracks")

@@ -50,8 +50,8 @@ ESTIMATED = (
 )
 
 
-def check_recording(recording: xr.DataTree) -> None:
-    """Raise ValueError unless a recording has frames and whiskers, and variables of valid shape."""
+def check_frames(recording: xr.DataTree) -> None:
+    """Raise ValueError unless a recording has frames and whiskers."""
     root = recording.to_dataset(inherit=False)
     missing = [name for name in ("time", "whisker") if name not in root.dims]
     if missing:
@@ -60,15 +60,24 @@ def check_recording(recording: xr.DataTree) -> None:
             f"the recording lacks the dimensions {', '.join(missing)}; it has {got}: a tracked, "
             "simulated or measured recording is needed (one whisker: isel(whisker=[0]))"
         )
+    if not root.sizes["time"] or not root.sizes["whisker"]:
+        raise ValueError(
+            f"the recording cannot be used: it has {root.sizes['time']} frames of "
+            f"{root.sizes['whisker']} whiskers"
+        )
+
+
+def check_recording(recording: xr.DataTree) -> None:
+    """Raise ValueError unless a recording has frames and whiskers, and variables of valid shape."""
+    check_frames(recording)
+    root = recording.to_dataset(inherit=False)
     faults = [*faults_in(root), *_label_faults(root)]
     for name in ("truth", "measured"):  # later groups are computed anew
         group = recording.children.get(name)
         found = [] if group is None else faults_in(group.to_dataset())
         faults += [f"in the group {name}, {fault}" for fault in found]
     time = np.asarray(root["time"].values)
-    if time.size == 0 or root.sizes["whisker"] == 0:
-        faults.append(f"it has {time.size} frames of {root.sizes['whisker']} whiskers")
-    elif time.dtype.kind not in "fiu":
+    if time.dtype.kind not in "fiu":
         faults.append(f"its time is {time.dtype}; numbers are needed, in seconds")
     elif not np.isfinite(time).all() or (np.diff(time) <= 0).any():
         faults.append("its time does not increase from frame to frame, or is missing in some")
@@ -228,6 +237,7 @@ _INPUTS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
 
 def made_from(recording: xr.DataTree, stage: str) -> xr.Variable:
     """Checksums (time, whisker) of the values from which a stage is computed."""
+    check_frames(recording)
     record = Recording(recording)
     shape = tuple(record.root.data.sizes[dim] for dim in ("time", "whisker"))
     parts = [np.zeros((*shape, 1))]

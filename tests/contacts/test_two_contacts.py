@@ -170,3 +170,31 @@ def test_the_command_line_marks_second_contacts(whisker, tmp_path):
     softer = vb.io.load_contacts(tmp_path / "contacts.csv")
     stated = softer["sigma_x"].values[:40] / table["sigma_x"][:40]
     assert np.nanmedian(stated) > 1.001
+
+
+def test_shapes_and_forces_in_other_units_or_frames_are_not_two_contacts():
+    whisker = vb.samples.gamma()
+    bent = vb.deflect(whisker, vb.PointContact([24e-3, 13e-3, 2e-3]))
+    line = bent.centerline(25)
+    noise = np.diag([1e-12] * 3 + [4e-16] * 3)
+
+    def found(scale=1.0, points=line, sigma=20e-6):
+        return vb.second_contact(
+            whisker,
+            scale * bent.force,
+            scale * bent.moment,
+            noise=noise,
+            centerline=points,
+            centerline_sigma=sigma,
+        )
+
+    assert not found().second_contact
+    for points in (1e3 * line, line + [0.1, 0.2, 0.0]):
+        with pytest.raises(ValueError, match="from the base of a whisker of 0.04 m"):
+            found(points=points)
+    with pytest.raises(ValueError, match="from the base to the tip"):
+        found(points=line[::-1])
+    with pytest.raises(ValueError, match="centerline_sigma is 20 m"):
+        found(sigma=20.0)
+    with pytest.raises(ValueError, match="are these mN, µN"):
+        found(scale=1e6)

@@ -52,6 +52,9 @@ _STEP, _ROUNDS = 1e-4, 10
 _LONGEST = 0.1
 # Residual of a meaningless model, such as a force that winds the whisker up.
 _LOST = 1e6
+# Median load, over EI/L² and EI/L, above which it is in other units; and largest distance of points
+# from the base, and of the last one if it is at the base, over the length.
+_LARGEST_LOAD, _STRETCHED, _AT_BASE = 1000.0, 1.1, 0.1
 _SOME = np.array([0.5, 0.0, 0.1, 0.0])
 
 
@@ -246,6 +249,7 @@ def second_contact(
     if centerline is None and np.any(centerline_sigma):
         raise ValueError("centerline_sigma is of a centerline, and none is given")
     f, m, dims, coords = wrench_on(whisker, force, moment)
+    _check_scale(whisker, f, m)
     errors = common_errors(stiffness_sigma, gain_sigma, mixing_sigma)
     sensor = SensorNoise.of(noise, WRENCH, errors, whisker)
     test = _Test(whisker, sensor, friction)
@@ -253,7 +257,7 @@ def second_contact(
     rows = np.flatnonzero(np.isfinite(wrench).all(axis=1) & wrench.any(axis=1))
     lines = None
     if centerline is not None:
-        lines = _checked(centerline, centerline_sigma, f.shape[:-1])
+        lines = _checked(whisker, centerline, centerline_sigma, f.shape[:-1])
         rows = rows[np.isfinite(lines[0][rows]).all(axis=(1, 2))]
         lines = lines[0][rows] / whisker.length, lines[1] / whisker.length
     chi_squared, degrees = np.full(len(wrench), np.nan), np.zeros(len(wrench), np.int64)
@@ -282,8 +286,20 @@ def second_contact(
     return xr.Dataset(data, {**coords, "space": list("xyz")})
 
 
+def _check_scale(whisker: Whisker, force: Array, moment: Array) -> None:
+    """Raise ValueError for force and moment far too large for this whisker, as in other units."""
+    stiff, length = whisker.base_bending_stiffness, whisker.length
+    sizes = np.linalg.norm([force * length**2, moment * length], axis=-1).reshape(2, -1) / stiff
+    known = sizes[:, np.isfinite(sizes).all(axis=0)]
+    if known.size and (typical := float(np.median(known, axis=1).min())) > _LARGEST_LOAD:
+        raise ValueError(
+            f"force and moment are typically {typical:.2g} times what is natural to this whisker, "
+            "EI/L² and EI/L: N and N·m are needed; are these mN, µN, mN·m or µN·m?"
+        )
+
+
 def _checked(
-    line: ArrayLike, sigma: float | ArrayLike, shape: tuple[int, ...]
+    whisker: Whisker, line: ArrayLike, sigma: float | ArrayLike, shape: tuple[int, ...]
 ) -> tuple[Array, Array]:
     """Centrelines (n, j, 3) and standard deviations (j,)."""
     points = numbers("centerline", line)
@@ -295,6 +311,22 @@ def _checked(
     deviations = np.broadcast_to(np.asarray(sigma, dtype=np.float64), points.shape[-2:-1])
     if not ((deviations > 0.0) & np.isfinite(deviations)).all():
         raise ValueError(f"centerline_sigma is positive, m; got {sigma!r}")
+    length = whisker.length
+    if deviations.min() > length:
+        raise ValueError(
+            f"centerline_sigma is {deviations.min():.3g} m on a whisker of {length:.3g} m; it is in m"
+        )
+    reach = np.linalg.norm(points, axis=-1)
+    reach = reach[np.isfinite(reach).all(axis=-1)].reshape(-1, points.shape[-2])
+    if reach.size:
+        first, last, most = np.median([reach[:, 0], reach[:, -1], reach.max(axis=1)], axis=1)
+        if most > _STRETCHED * length:
+            raise ValueError(
+                f"the centerline reaches {most:.3g} m from the base of a whisker of {length:.3g} m: "
+                "points in the whisker frame, in m, are needed"
+            )
+        if last < first and last < _AT_BASE * length:
+            raise ValueError("the centerline ends at the base; points go from the base to the tip")
     return points.reshape(-1, *points.shape[-2:]), deviations
 
 

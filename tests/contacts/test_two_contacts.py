@@ -189,8 +189,8 @@ def test_shapes_and_forces_in_other_units_or_frames_are_not_two_contacts():
         )
 
     assert not found().second_contact
-    for points in (1e3 * line, line + [0.1, 0.2, 0.0]):
-        with pytest.raises(ValueError, match="from the base of a whisker of 0.04 m"):
+    for points in (1e3 * line, line + np.array([0.1, 0.2, 0.0])):
+        with pytest.raises(ValueError, match=r"from the base of a whisker of 0\.04"):
             found(points=points)
     with pytest.raises(ValueError, match="from the base to the tip"):
         found(points=line[::-1])

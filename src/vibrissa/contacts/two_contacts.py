@@ -314,7 +314,8 @@ def _checked(
     length = whisker.length
     if deviations.min() > length:
         raise ValueError(
-            f"centerline_sigma is {deviations.min():.3g} m on a whisker of {length:.3g} m; it is in m"
+            f"centerline_sigma is {deviations.min():.3g} m on a whisker of {length:.3g} m: it has "
+            "to be in m"
         )
     reach = np.linalg.norm(points, axis=-1)
     reach = reach[np.isfinite(reach).all(axis=-1)].reshape(-1, points.shape[-2])
@@ -322,8 +323,8 @@ def _checked(
         first, last, most = np.median([reach[:, 0], reach[:, -1], reach.max(axis=1)], axis=1)
         if most > _STRETCHED * length:
             raise ValueError(
-                f"the centerline reaches {most:.3g} m from the base of a whisker of {length:.3g} m: "
-                "points in the whisker frame, in m, are needed"
+                f"the centerline reaches {most:.3g} m from the base of a whisker of {length:.3g} "
+                "m: points in the whisker frame, in m, are needed"
             )
         if last < first and last < _AT_BASE * length:
             raise ValueError("the centerline ends at the base; points go from the base to the tip")

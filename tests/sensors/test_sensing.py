@@ -244,6 +244,20 @@ def test_loads_that_differ_by_their_errors_only_are_refused(wire, touched):
         calibrate_mixing(readings, wrenches, wrench_covariances=1e-3 * errors, **options)
 
 
+def test_channels_that_the_loads_do_not_explain_are_named(rng):
+    """As where rows are shifted, a reading is wild, or a channel is not connected."""
+    wrenches = rng.normal(size=(60, 6)) * np.repeat([5e-5, 1e-6], 3)
+    readings = wrenches @ np.diag([1e4] * 3 + [1e6] * 3) + 1e-3 * rng.normal(size=(60, 6))
+    for wrong in (np.roll(readings, 1, axis=0), np.where(readings == readings[3], 1e3, readings)):
+        with pytest.warns(UserWarning, match="the loads explain little of the readings"):
+            calibrate_mixing(wrong, wrenches)
+    dead = np.where(np.arange(6) == 4, 0.3, readings)
+    with pytest.raises(ValueError, match="channel 5 always read the same"):
+        calibrate_mixing(dead, wrenches)
+    with pytest.raises(ValueError, match="must not be negative"):
+        calibrate_mixing(readings, wrenches, noise=-1.0)
+
+
 def test_mixing_that_contacts_do_not_tell_is_refused(wire, touched, rng):
     """A straight whisker never twists; contacts in one plane leave the other open."""
     readings = rng.normal(size=(60, 2))

@@ -25,8 +25,8 @@ from vibrissa.quantities import QUANTITIES, attributes
 FLOOR = 1e-7
 # Distance from the middle of the contacts, over its median, above which a contact is ignored.
 _ASTRAY = 100.0
-# Median standard deviation of contacts, over their extent, above which it is doubted.
-_VAGUE = 0.5
+# Median standard deviation of contacts, m, above which it is doubted if it exceeds their extent.
+_VAGUE = 2e-3
 # Smallest variance of a combination, over that of the point or normal.
 _FINE = 1e-10
 # Largest negative eigenvalue of a covariance that is attributed to rounding, over the largest.
@@ -169,10 +169,10 @@ def _scale_contacts(what: str, arrays: dict[str, Array], n: int, least: int) -> 
     spread = _covariance(what, kept, np.flatnonzero(usable), extent)
     if spread is not None:
         variance = np.trace(spread[:, :3, :3], axis1=1, axis2=2) / 3.0
-        if (sigma := float(np.sqrt(np.median(variance)))) > _VAGUE:
+        if (sigma := extent * float(np.sqrt(np.median(variance)))) > max(_VAGUE, extent):
             warnings.warn(
-                f"the median standard deviation of the contacts, {1e3 * sigma * extent:.2g} mm, is "
-                f"{sigma:.2g} of their extent: the covariance must be in m²",
+                f"the median standard deviation of the contacts, {1e3 * sigma:.2g} mm, is larger "
+                f"than their extent, {1e3 * extent:.2g} mm: the covariance must be in m²",
                 UserWarning,
                 stacklevel=4,
             )

@@ -36,6 +36,7 @@ from vibrissa.whisker import Whisker
 _ROUNDING = 1e-6  # relative size below which components of a force or moment are set to zero
 _ROUNDS = 50  # largest number of rounds in which mixing and noise are fitted in turn
 _SETTLED = 1e-6  # relative change of the variance of the noise at which these end
+_UNEXPLAINED = 0.5  # residual, over the spread of readings, above which the user is warned
 _ADVICE = (
     "touch the whisker at other points and in other directions, or restrict `components` to those "
     "that the channels read"
@@ -139,10 +140,20 @@ def calibrate_mixing(
             f"{known.sum()} contacts are too few for {design.shape[1]} unknowns and the noise: "
             "add some"
         )
+    dead = [
+        name for name, spread in zip(names, np.ptp(y[known], axis=0), strict=True) if not spread
+    ]
+    if dead:
+        raise ValueError(
+            f"{', '.join(dead)} always read the same: omit channels that are not connected"
+        )
     errors = np.zeros((len(design), len(which) + 1, len(which) + 1))
     errors[:, :-1, :-1] = _checked_errors(wrench_covariances, w)[known][:, which][:, :, which]
     rounding = np.asarray(resolution) ** 2 / 12.0
-    least = np.broadcast_to(numbers("noise", noise, names) ** 2 + rounding, y.shape[1:])
+    floor = numbers("noise", noise, names)
+    if (floor < 0.0).any():
+        raise ValueError(f"noise is {floor.tolist()}; it must not be negative")
+    least = np.broadcast_to(floor**2 + rounding, y.shape[1:])
     unknowns, covariance, variance = _fit_channels(
         design, y[known], errors, least, (*components, "the offset")
     )
@@ -161,7 +172,24 @@ def calibrate_mixing(
         mixing_covariance=whole,
     )
     residual = np.sqrt(((y[known] - design @ unknowns) ** 2).mean(axis=0))
+    _doubt_channels(names, y[known].std(axis=0), residual)
     return MixingCalibration(sensor, tuple(components), covariance, residual)
+
+
+def _doubt_channels(names: Sequence[str], spread: Array, residual: Array) -> None:
+    """Warn of channels whose readings the loads hardly explain."""
+    loose = [
+        f"{name} ({1.0 - (left / of) ** 2:.0%})"
+        for name, of, left in zip(names, spread, residual, strict=True)
+        if left > _UNEXPLAINED * of
+    ]
+    if loose:
+        warnings.warn(
+            f"the loads explain little of the readings of {', '.join(loose)}: do the rows of both "
+            "belong together, are there outliers, or do the channels read other components too?",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
 def _checked_errors(covariances: ArrayLike, wrenches: Array) -> Array:

@@ -140,13 +140,6 @@ def calibrate_mixing(
             f"{known.sum()} contacts are too few for {design.shape[1]} unknowns and the noise: "
             "add some"
         )
-    dead = [
-        name for name, spread in zip(names, np.ptp(y[known], axis=0), strict=True) if not spread
-    ]
-    if dead:
-        raise ValueError(
-            f"{', '.join(dead)} always read the same: omit channels that are not connected"
-        )
     errors = np.zeros((len(design), len(which) + 1, len(which) + 1))
     errors[:, :-1, :-1] = _checked_errors(wrench_covariances, w)[known][:, which][:, :, which]
     rounding = np.asarray(resolution) ** 2 / 12.0
@@ -172,12 +165,18 @@ def calibrate_mixing(
         mixing_covariance=whole,
     )
     residual = np.sqrt(((y[known] - design @ unknowns) ** 2).mean(axis=0))
-    _doubt_channels(names, y[known].std(axis=0), residual)
+    read = y[known]
+    spread = np.where(np.ptp(read, axis=0) > 0.0, read.std(axis=0), 0.0)
+    _doubt_channels(names, spread, residual)
     return MixingCalibration(sensor, tuple(components), covariance, residual)
 
 
 def _doubt_channels(names: Sequence[str], spread: Array, residual: Array) -> None:
-    """Warn of channels whose readings the loads hardly explain."""
+    """Warn of channels whose readings the loads hardly explain; raise if readings are constant."""
+    if dead := [name for name, of in zip(names, spread, strict=True) if of == 0.0]:
+        raise ValueError(
+            f"{', '.join(dead)} always read the same: omit channels that are not connected"
+        )
     loose = [
         f"{name} ({1.0 - (left / of) ** 2:.0%})"
         for name, of, left in zip(names, spread, residual, strict=True)

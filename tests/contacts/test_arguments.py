@@ -27,6 +27,17 @@ def test_a_table_of_signals_is_estimated_as_it_is_loaded(bent, contact_map, tmp_
     assert vb.status.names(found.status).tolist() == ["UNIQUE", "UNIQUE"]
 
 
+def test_columns_of_other_rows_are_refused(bent, contact_map):
+    pandas = pytest.importorskip("pandas")
+    signals = vb.base_signals(bent.force, bent.moment)
+    columns = {name: pandas.Series(signals[name].values) for name in ("Fx", "MB", "MD")}
+    found = contact_map.estimate(columns)
+    np.testing.assert_allclose(found.point, bent.contact_point, atol=1e-6)
+    columns["MB"] = columns["MB"][::-1]
+    with pytest.raises(ValueError, match="different indices"):
+        contact_map.estimate(columns)
+
+
 def test_signals_in_other_units_get_a_hint(bent, contact_map):
     force, moment = (np.tile(1e6 * part, (10, 1)) for part in (bent.force, bent.moment))
     signals = vb.base_signals(force, moment)

@@ -494,8 +494,9 @@ def test_kernels_are_compiled_beforehand_for_what_they_are_called_with(
         ({"Fx": 1e-12, "MB": 4e-16, "MD": 1e-4}, "noise of Fx, 1e-12 N, is smaller"),
         (np.diag(SIGMA), "noise of MB, 0.00014 N·m, is larger"),
         ({"Fx": 1.0, "MB": 0.02, "MD": 0.01}, "noise of Fx, 1 N, is larger"),
+        ({"Fx": 1e-6, "MB": 2e-8, "MD": 5.0}, "noise of MD, an angle in rad, is 5"),
     ],
-    ids=["variances", "deviations", "µN"],
+    ids=["variances", "deviations", "µN", "degrees"],
 )
 def test_noise_squared_or_in_other_units_is_questioned(gamma_map, noise, message):
     using = ("Fx", "MB", "MD")

@@ -249,6 +249,12 @@ def measured(
         dims = tuple(str(d) for d in arrays[0].dims)
         values = np.stack([a.to_numpy().astype(np.float64) for a in arrays], axis=-1)
         return values, dims, coordinates(arrays[0], dims)
+    series: list[Any] = [a for a in given if hasattr(a, "to_numpy") and hasattr(a, "index")]
+    if not all(a.index.equals(series[0].index) for a in series):
+        raise ValueError(
+            f"the columns {', '.join(names)} have different indices: their rows do not belong "
+            "together, or have another order; put them into one table, or pass plain arrays"
+        )
     plain = [numbers(name, a) for name, a in zip(names, given, strict=True)]
     try:
         values = np.stack(np.broadcast_arrays(*plain), axis=-1)

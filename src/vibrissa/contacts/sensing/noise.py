@@ -50,6 +50,7 @@ Noise: TypeAlias = Mapping[str, float] | ArrayLike
 # Force and moment, in EI/L² and EI/L, that stable contacts beyond 0.3 L do not reach; and noise, in
 # the same units, below that of any sensor.
 _LARGEST, _FAINTEST = {"F": 100.0, "M": 10.0}, 1e-8
+_WIDEST = 1.0  # largest plausible standard deviation of a direction, rad
 _NONE = np.zeros((0, 6, 7))
 
 
@@ -201,7 +202,13 @@ def _question(sensor: SensorNoise, names: tuple[str, ...], whisker: Whisker) -> 
     for name in names:
         kind, axes = name[0], {"T": "yz", "B": "yz", "D": ""}.get(name[1], name[1])
         if sensor.deviations is not None:
-            sigma = sensor.deviations[name] if axes else 0.0
+            sigma = sensor.deviations[name]
+            if not axes and sigma > _WIDEST:
+                warnings.warn(
+                    f"the noise of {name}, an angle in rad, is {sigma:.2g}: is it in degrees?",
+                    stacklevel=5,
+                )
+            sigma = sigma if axes else 0.0
         else:
             assert sensor.wrench is not None
             rows = [3 * "FM".index(kind) + "xyz".index(axis) for axis in axes]

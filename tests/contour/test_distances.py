@@ -106,3 +106,15 @@ def test_ellipsoids_hold_the_share_that_they_should():
         ellipsoids(covariance, 1.0)
     with pytest.raises(ValueError, match="covariance has shape"):
         ellipsoids(np.ones(3))
+
+
+def test_negative_variances_and_other_things_than_objects_are_refused():
+    points = np.random.default_rng(0).normal(size=(5, 3)) * 1e-3
+    wrong = np.broadcast_to(-1e-9 * np.eye(3), (5, 3, 3))
+    ball = Sphere([0.0, 0.0, 0.0], 1e-3)
+    with pytest.raises(ValueError, match="a variance is negative"):
+        compare_with(ball, points, wrong)
+    with pytest.raises(ValueError, match="a variance is negative"):
+        ellipsoids(wrong)
+    with pytest.raises(ValueError, match="an object or a fitted shape is needed"):
+        compare_with("sphere", points)

@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from vibrissa.contour.fitted_shape import Body
+from vibrissa.contour.fitted_shape import Body, check_variances
 from vibrissa.numerics import Array, numbers
 from vibrissa.quantities import QUANTITIES, attributes, to_display
 
@@ -61,6 +61,8 @@ def compare_with(
         ``surface_distance_predicted``: ``REPLICATES`` samples of the distances expected if the
         covariance were the only error.
     """
+    if not hasattr(body, "signed_distance"):
+        raise ValueError(f"an object or a fitted shape is needed; got {body!r}")
     p = numbers("points", points)
     if p.ndim != len(dims) + 1 or p.shape[-1] != 3:
         raise ValueError(f"points have shape {p.shape}; {(*dims, 3)} is needed")
@@ -76,6 +78,7 @@ def compare_with(
         if spread.shape != (*p.shape, 3):
             raise ValueError(f"covariance has shape {spread.shape}; {(*p.shape, 3)} is needed")
         known = known & np.isfinite(spread).all(axis=(-2, -1))
+        check_variances(np.linalg.eigvalsh(spread[known]))
         drawn = np.full((REPLICATES, *gap.shape), np.nan)
         drawn[:, known] = _draw_distances(
             body, p[known], spread[known], gap[known], radius[known], seed

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from vibrissa.contour.fitted_shape import FittedShape
+from vibrissa.contour.fitted_shape import FittedShape, check_variances
 from vibrissa.contour.free_surface import FreeFit
 from vibrissa.contour.simple_shapes import CylinderFit, PlaneFit, SphereFit, frame_across
 from vibrissa.deferred import special
@@ -152,6 +152,7 @@ def ellipsoids(covariance: ArrayLike, share: float = 0.95) -> Ellipsoids:
         raise ValueError(f"share is {share!r}; it must be between 0 and 1")
     known = np.asarray(np.isfinite(s).all(axis=(-2, -1)))
     size, direction = np.linalg.eigh(np.where(known[..., None, None], s, np.eye(3)))
+    check_variances(size)
     axes = np.swapaxes(direction, -1, -2)[..., ::-1, :]
     axes = np.concatenate(
         [axes[..., :2, :], np.cross(axes[..., :1, :], axes[..., 1:2, :])], axis=-2

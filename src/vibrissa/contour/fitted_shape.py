@@ -18,7 +18,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.deferred import special
-from vibrissa.numerics import Array, Mask, numbers
+from vibrissa.numerics import AnyArray, Array, Mask, numbers
 from vibrissa.quantities import QUANTITIES, attributes
 
 # Smallest standard deviation, over the points' extent, which replaces zero noise.
@@ -127,6 +127,12 @@ def check_contacts(
         raise ValueError(f"no {what}: " + "; ".join(faults))
     arrays["whisker_radius"] = np.broadcast_to(arrays["whisker_radius"], (n,))
     return _scale_contacts(what, arrays, n, least)
+
+
+def check_variances(values: AnyArray) -> None:
+    """Raise ValueError if eigenvalues (..., 3) of covariances, in ascending order, are negative."""
+    if (values[..., 0] < -_NEGATIVE * np.abs(values).max(axis=-1)).any():
+        raise ValueError("the covariance is invalid: a variance is negative")
 
 
 def _number(what: str, points: ArrayLike) -> int:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from vibrissa.io import interlaced, read_video, video_info, write_video
 from vibrissa.io.video import grey_frame
@@ -82,6 +83,14 @@ def thin_line(moment, slope, shape=(90, 120)):
     row, column = np.mgrid[: shape[0], : shape[1]]
     away = row - slope * (column - 60.0) - 45.0 - 20.0 * np.sin(0.8 * moment)
     return 180.0 - 120.0 * np.exp(-0.5 * (away / 0.7) ** 2)
+
+
+def test_hairs_that_move_are_not_interlaced():
+    """Hairs along the rows of a face that moves up and down alternate in all frames."""
+    hairs = np.random.default_rng(5).normal(0.0, 30.0, (130, 120))
+    hairs = 90.0 + ndimage.gaussian_filter(hairs, (0.4, 4.0)) * 3.0
+    frames = [hairs[20 + k : 110 + k] for k in (0, 2, 5, 7, 6, 3, 1, -3, -6, -4)]
+    assert not interlaced([np.rint(f).clip(0, 255).astype(np.uint8) for f in frames])
 
 
 @pytest.mark.parametrize("slope", [0.1, 1.0])

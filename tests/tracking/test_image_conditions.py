@@ -79,6 +79,24 @@ def test_a_base_that_is_seen_now_here_now_there_loses_no_whisker():
         assert trace.line[0] == pytest.approx([begin, 50.0 + 0.1 * begin + 3 * i], abs=2.0)
 
 
+def test_nothing_is_traced_without_light():
+    """In frames 8 and 9 the lamp is off; the whisker is found again after them."""
+    frames = [image(30, 170, seed=i) for i in range(20)]
+    for i in (8, 9):
+        frames[i] = np.asarray(frames[i] * 0.1 + 2.0, dtype=np.uint8)
+    (row,) = trace_video(frames, [(30.0, 53.0)], TraceOptions(shortest=30.0))
+    assert [i for i, trace in enumerate(row) if not len(trace.line)] == [8, 9]
+
+
+def test_overexposed_ground_may_be_searched_for_bright_whiskers():
+    """Its negative is black, by which nothing can be divided."""
+    frames = [image(30 + i, 170, seed=i) for i in range(20)]
+    frames = [np.where(frame > 140, 0, 255 - frame).astype(np.uint8) for frame in frames]
+    scene = Scene.of(frames).with_still(np.array([[30.0, 53.0]]), frames)
+    assert np.median(scene.background) == 0.0
+    assert np.isfinite(scene.still.factor).all()
+
+
 def test_bright_whiskers_are_traced_as_dark_ones(filmed):
     frames = filmed.frames[0][:2]
     negative = [np.asarray(255 - frame) for frame in frames]

@@ -121,6 +121,20 @@ def test_a_peg_is_measured_by_its_outline(axis):
     assert abs(middle @ frame) / 1e-3**2 < 4.0 * np.sqrt(found.covariance[0, 0])
 
 
+@pytest.mark.parametrize("response", [lambda x: x**0.45, lambda x: np.clip(2.2 * x - 0.6, 0, 1)])
+def test_a_peg_is_as_thick_as_is_stated_to_cameras_that_are_not_linear(response):
+    """Where grey values change fastest is not where half of the light is."""
+    peg = Peg([1e-3, 2e-3, 0.5e-3], [0.15, 0.25, 1.0], 1.1e-3)
+    cameras = lenses()
+    sample = []
+    for camera in cameras:
+        image = 255.0 * response(drawn(camera, within(peg)) / 255.0)
+        sample.append([image.astype(np.uint8)] * 3)
+    found = peg_in_images(cameras, sample, touches_of(peg))
+    assert found is not None
+    assert abs(found.expected.radius - peg.radius) < 2.5 * found.radius_sigma
+
+
 def test_a_reflection_on_a_peg_is_no_outline():
     """It leaves a dark band to each side of it, with edges as a thinner peg would have."""
     peg = Peg([1e-3, 2e-3, 0.5e-3], [0.15, 0.25, 1.0], 1.35e-3)

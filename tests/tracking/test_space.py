@@ -11,7 +11,7 @@ from vibrissa.tracking import Trace, low_pass, merge, paired_frames, usual_cutof
 from vibrissa.tracking.recording import remarks_on_time
 from vibrissa.tracking.space.curve import begun_together, merged
 from vibrissa.tracking.space.exchange import Known, exchanged
-from vibrissa.tracking.space.frame_pairs import clear_offsets
+from vibrissa.tracking.space.frame_pairs import clear_offsets, repeated_frames, without_repeats
 from vibrissa.tracking.space.pose import base_pose, rolled_over
 from vibrissa.tracking.space.rest_shape import RestShape, whisker_at_rest
 from vibrissa.tracking.trace.start import base_gap
@@ -186,6 +186,37 @@ def test_errors_that_follow_the_motion_are_no_offset():
     (said,) = remarks_on_time(pair, rows, None)
     assert "do not determine their offset, and 0 is kept" in said
     assert remarks_on_time(pair, rows, 0) == []
+
+
+def test_frames_that_repeat_the_one_before_are_left_out():
+    """Frames that were dropped and filled, one, and three in a row."""
+    generator = np.random.default_rng(4)
+    pair = PAIRS["orthogonal"]
+    azimuth = 0.6 * np.sin(2.0 * np.pi * np.arange(70) / 70.0)
+    rows = [[traced(camera, curve(a), generator) for a in azimuth] for camera in pair]
+    assert without_repeats(pair, [rows]) == ([rows], [])
+    for i in (30, 40, 41, 42):
+        rows[0][i] = rows[0][i - 1]._replace(line=rows[0][i - 1].line + 0.02)
+    ((first, second),), (remark,) = without_repeats(pair, [rows])
+    assert [i for i, trace in enumerate(first) if not len(trace.line)] == [30, 40, 41, 42]
+    assert second == rows[1]
+    assert f"{pair[0].name}: 4 of 70 frames repeat the one before (30, 40, 41, 42)" in remark
+
+
+def test_a_repeated_frame_in_which_an_object_lets_go_is_found():
+    """The farther half was held back; the nearer one moves evenly."""
+    azimuth, camera = 0.02 * np.arange(20), PAIRS["orthogonal"][0]
+    free, share = [curve(a) for a in azimuth], np.linspace(0.0, 1.0, 200)[:, None] ** 2
+    held = [shape + share * (free[8] - shape) for shape in free]
+    row = [traced(camera, one) for one in free[:8] + held[8:13] + held[12:13] + free[14:]]
+    assert repeated_frames(row) == {13}
+
+
+@pytest.mark.parametrize("steps", [(0, 0, 0, 4, 4), (4, 4, 0, 0, 0), (4, 2, 0, -2, -4), (9, 9, 40)])
+def test_sudden_stops_and_starts_are_no_repeated_frames(steps):
+    azimuth = 0.01 * np.cumsum(np.repeat(steps, 2))
+    camera = PAIRS["orthogonal"][0]
+    assert repeated_frames([traced(camera, curve(a)) for a in azimuth]) == set()
 
 
 @pytest.mark.parametrize(("faint", "left"), [(range(0, 20, 4), 20), (range(20), 0)])

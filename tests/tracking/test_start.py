@@ -285,3 +285,23 @@ def test_flickering_light_moves_nothing(films):
     start = find_start(film.cameras, dim)
     assert max(misses(film, start)) < 5.0
     assert not start.doubts
+
+
+def test_a_lamp_that_is_off_at_first_hides_no_whisker(films):
+    """Divided by their brightness, dark frames are noise, which is no background."""
+    film, generator = films(200), np.random.default_rng(0)
+    lamp = np.where(np.arange(SMALL["frames"]) < 0.2 * SMALL["frames"], 0.05, 1.0)
+    dim = [
+        [
+            np.asarray(
+                np.rint(f * s + generator.integers(0, 5, f.shape) * (s < 1.0)), dtype=np.uint8
+            )
+            for f, s in zip(view, lamp, strict=True)
+        ]
+        for view in film.frames
+    ]
+    start = find_start(film.cameras, dim)
+    assert lamp[start.begins] == 1.0
+    true = [view[start.begins][0] for view in film.curves]
+    for base, at in zip(start.bases, true, strict=True):
+        assert np.linalg.norm(base - at) < 5.0

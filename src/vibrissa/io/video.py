@@ -226,9 +226,10 @@ def grey_frame(frame: Any) -> Frame:
     return np.ascontiguousarray(grey.reshape(-1, plane.line_size)[: frame.height, : frame.width])
 
 
-# Contrast of alternate rows, grey values; their smallest number a frame; and how much more frequent
-# they must be than alternate columns.
-_ALTERNATE, _COMBED, _RATHER = 8, 20, 10
+# Contrast of alternate rows, grey values; their smallest number a frame; how much more frequent
+# they must be than alternate columns; and the share of all alternate rows that motion must explain:
+# the hairs of a face that moves alternate where they do not move, too.
+_ALTERNATE, _COMBED, _RATHER, _BY_MOTION = 8, 20, 10, 0.6
 
 
 def interlaced(frames: Sequence[Frame]) -> bool:
@@ -236,7 +237,8 @@ def interlaced(frames: Sequence[Frame]) -> bool:
     pairs = list(pairwise(frame.astype(np.int16) for frame in frames))
     rows = sum(_combed(after, after - before) for before, after in pairs)
     columns = sum(_combed(after.T, (after - before).T) for before, after in pairs)
-    return rows > max(_COMBED * len(pairs), _RATHER * columns)
+    every = sum(_combed(after) for _, after in pairs)
+    return rows > max(_COMBED * len(pairs), _RATHER * columns, _BY_MOTION * every)
 
 
 def _combed(*images: NDArray[np.int16]) -> int:

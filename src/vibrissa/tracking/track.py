@@ -59,7 +59,7 @@ from vibrissa.tracking.refine.silhouette import explains, peg_in_images
 from vibrissa.tracking.refine.tilt import Plane, plane_of, projected, unturned
 from vibrissa.tracking.space.curve import begun_together, merged, with_one_tip
 from vibrissa.tracking.space.exchange import Known, exchanged
-from vibrissa.tracking.space.frame_pairs import best_seen, paired_frames
+from vibrissa.tracking.space.frame_pairs import best_seen, paired_frames, without_repeats
 from vibrissa.tracking.space.pose import CUTOFF, BasePose, HeadPose, base_pose, rolled_over
 from vibrissa.tracking.space.rest_shape import (
     LEAST_SEEN,
@@ -227,7 +227,6 @@ def track(
         optics, cameras, doubts = _corrected(cameras, timed, pairs, options.distance)
     moving = None if head is None else HeadPose.of(head, pairs[:, 0], rate)
     found, remarks = [], doubts + remarks_on_time(cameras, timed, options.offset)
-    remarks += remarks_on_shaking(cameras, timed) + [ONE_VIEW] * (len(cameras) == 1)
     count = counts.pop()
     called = [f"whisker {k}" for k in range(count)] if names is None else list(names)
     timed_rows = [[[row[i] for i in pairs[:, v]] for row in view] for v, view in enumerate(traces)]
@@ -238,11 +237,13 @@ def track(
         return track_whisker(cameras, used, rate, options, called[k], progress, *given)
 
     known = partial(known_of, cameras, rate=rate, options=options.fit)
-    begun = [begun_together(cameras, row) for row in rows]
+    kept, repeats = without_repeats(cameras, rows)
+    begun = [begun_together(cameras, row) for row in kept]
+    remarks += repeats + remarks_on_shaking(cameras, timed) + [ONE_VIEW] * (len(cameras) == 1)
     together, before, changes = _sorted_out(cameras, begun, tracked, known)
     for k, name in enumerate(called):
         remarks += remarks_on_following(cameras, rows[k], name)
-        remarks += remarks_on_bases(cameras, rows[k], begun[k], name)
+        remarks += remarks_on_bases(cameras, kept[k], begun[k], name)
         try:
             one = before[k] if k in before else tracked(k, together[k])
             if count > 1:

@@ -34,7 +34,7 @@ from vibrissa.numerics import Array
 from vibrissa.objects import Peg
 from vibrissa.tracking.refine.edge import OFFSETS, place_of_outline
 from vibrissa.tracking.refine.fit import RodFit, Touches
-from vibrissa.tracking.refine.peg import PEG_UNKNOWNS, UncertainPeg
+from vibrissa.tracking.refine.peg import PEG_UNKNOWNS, UNITS, UncertainPeg
 from vibrissa.whisker import Whisker
 
 _HALF = 8e-3  # length of the outline to each side of the contact that is compared, m
@@ -68,6 +68,9 @@ _WINDOWS = (4.0, 3.0, 2.0, 2.0, 1.5, 1.5)  # largest distances of edges, pixels,
 _SHADED = (2.0, 2.0, 2.0)  # the same, where the shading of the peg is considered
 _OFF = 0.7  # distance of an edge from the outline that makes it doubtful, pixels
 _EDGE = 0.1  # standard deviation of where an edge is along all of an outline, pixels
+# Standard deviation of the distance by which all outlines seem farther out, or all farther in, as a
+# camera that does not respond to light linearly, or saturates, shows them, pixels.
+_RESPONSE = 0.07
 _TOGETHER = 256  # number of cylinders that are compared at once, the likeliest first
 _FEWEST, _MOST_CONTACTS = 5, 25  # smallest number of contacts, and of those that are compared
 # Standard deviation of all unknowns before, in their units; and if one view alone shows the peg.
@@ -462,7 +465,10 @@ def _accepted(found: _Measured | None, views: Sequence[_View]) -> UncertainPeg |
     miss = np.concatenate([part.miss * (_EDGE / part.sigma) for part in found.parts])
     if min(part.share for part in found.parts) < _SEEN or np.mean(miss**2) > _RIGHT**2:
         return None
-    return UncertainPeg(found.peg, found.covariance)
+    covariance = found.covariance.copy()
+    scale = np.mean([view.scale(found.peg.origin) for view in views])
+    covariance[-1, -1] += (_RESPONSE / scale / UNITS[-1]) ** 2
+    return UncertainPeg(found.peg, covariance)
 
 
 class _Part(NamedTuple):

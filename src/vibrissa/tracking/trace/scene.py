@@ -33,6 +33,7 @@ _SOFT, _EDGE = 4.0, 0.75
 _SPARSE = 8  # distance of the pixels from which the brightness of a frame is taken
 _RANK = 0.15  # share of the frames in which a pixel is brighter than its background
 _FEWEST = 6  # number of frames from which a background is computed
+_UNLIT = 0.3  # brightness of a frame, relative to the usual, below which its lamp is off
 # Largest brightness of bodies, in the mean and at their edges, relative to the light.
 _DARK, _LIT = 0.75, 0.85
 _EVEN = 0.01  # weight of the light being even, relative to that of the pixels
@@ -127,14 +128,16 @@ class Scene:
         usual = np.median(sparse, axis=0)
         thin = 2 * int(np.ceil(0.5 * _THIN * scale)) - 1
         background = None
-        if len(frames) >= _FEWEST:
-            gains = np.array([_gain(one, usual) for one in sparse], dtype=np.float32)
+        gains = np.array([_gain(one, usual) for one in sparse], dtype=np.float32)
+        lit = [frame for frame, gain in zip(frames, gains, strict=True) if gain > _UNLIT]
+        if len(lit) >= _FEWEST:
             background = np.empty(frames[0].shape, dtype=np.float32)
-            rank = max(1, int(_RANK * len(frames)))
-            nth_largest(np.stack(frames), gains, rank, background)
+            rank = max(1, int(_RANK * len(lit)))
+            nth_largest(np.stack(lit), gains[gains > _UNLIT], rank, background)
             background -= np.median(background[::_SPARSE, ::_SPARSE] - usual)
         still = _closed(_halved(frames[0] if background is None else background), thin + 2)
-        light = _doubled(blurred(still, _SOFT), frames[0].shape)
+        # Black ground, as that of negatives of overexposed images, divides as one grey value.
+        light = np.maximum(_doubled(blurred(still, _SOFT), frames[0].shape), np.float32(1.0))
         ground, share = _ground(still)
         usual = np.asarray(usual, dtype=np.float32)
         return cls(light, share * ground, background, usual, thin, ground, len(frames), mask)
@@ -161,6 +164,10 @@ class Scene:
             label_ = np.where(masked & (label_ == 0), np.int32(count + 1), label_)
             face = np.append(face, False)
         return Bodies(label_, face)
+
+    def lit(self, frame: Frame) -> bool:
+        """Whether there is light on a frame: divided by its brightness, a dark one is noise."""
+        return self.gain(frame) > _UNLIT
 
     def difference(self, frame: Frame) -> Image:
         """Darkness of a frame compared with the light, by pixel."""

@@ -432,8 +432,9 @@ class _Search:
     def _found(self, view: int, moment: int) -> list[Curve]:
         key = view, moment
         if key not in self.known:
-            frame = self.frames[view][moment]
-            self.known[key] = find_curves(frame, self.scenes[view], self.options)
+            frame, scene = self.frames[view][moment], self.scenes[view]
+            lit = scene.lit(frame)
+            self.known[key] = find_curves(frame, scene, self.options) if lit else []
         return self.known[key]
 
     def _shown(self, view: int, moments: Sequence[int]) -> bool:

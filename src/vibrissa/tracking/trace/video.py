@@ -184,9 +184,14 @@ class Surroundings:
         return cls(bright, scene, steady, sample)
 
     def clear(self, frame: Frame) -> tuple[Frame, Shift]:
-        """Dark whiskers of a frame without what never moves, and by how much it was shifted."""
+        """Dark whiskers of a frame without what never moves, and by how much it was shifted.
+
+        None are left where the lamp is off.
+        """
         frame = negative(frame) if self.bright else frame
         shift = _STEADY
+        if not self.scene.lit(frame):
+            return np.full_like(frame, np.iinfo(frame.dtype).max), shift
         if self.steady is not None:
             frame, shift = self.steady.moved_back(frame)
         return self.scene.without_still(frame), shift

@@ -15,7 +15,7 @@ from vibrissa.objects import Peg
 from vibrissa.recording import Recording
 from vibrissa.tracking import TrackOptions, track
 from vibrissa.tracking.refine.edge import OFFSETS, place_of_outline
-from vibrissa.tracking.refine.fit import Touches
+from vibrissa.tracking.refine.fit import RodFit, Touches
 from vibrissa.tracking.refine.peg import PEG_UNKNOWNS, UNITS, UncertainPeg
 from vibrissa.tracking.refine.problem import Smoother
 from vibrissa.tracking.refine.silhouette import (
@@ -24,6 +24,7 @@ from vibrissa.tracking.refine.silhouette import (
     _median,
     _View,
     explains,
+    on_peg,
     peg_in_images,
 )
 from vibrissa.tracking.space.rest_shape import _free
@@ -269,6 +270,30 @@ def test_a_peg_that_contacts_contradict_is_not_taken():
     np.testing.assert_allclose(seen.differs(other.expected), 400.0, rtol=1e-6)
     moved = on + (other.expected.origin - peg.origin)
     assert not explained(moved, found=other)
+
+
+def test_only_a_certain_force_is_that_of_something_else_than_the_peg():
+    """Contacts on the peg, off it with a force of 1 and of 4 deviations, and a free frame."""
+    peg, whisker = Peg([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], 1e-3), Whisker.straight(20e-3)
+    arc = np.array([10e-3, 10e-3, 10e-3, np.nan])
+    away = 1e-3 + whisker.radius(10e-3) + np.array([0.0, 2e-3, 2e-3, np.nan])
+    size = 1e-6 * np.array([1.0, 1.0, 4.0, 0.0])[:, None]
+    points = away[:, None] * [1.0, 0.0, 0.0]
+    spread = np.tile(1e-12 * np.eye(6), (4, 1, 1))
+    known = np.isfinite(arc)[:, None, None] * np.ones((4, 2, 15))
+    fit = RodFit(
+        np.tile(np.eye(3), (4, 1, 1)), points, arc, points, points, spread[:, :3, :3], known,
+        size * [0.0, 1.0, 0.0], size * [0.0, 0.0, 1e-2], spread, spread, spread,
+        np.zeros((4, 5, 3)), np.ones(4),
+    )  # fmt: skip
+    new = on_peg(UncertainPeg(peg, np.eye(PEG_UNKNOWNS)), fit, whisker)
+    assert ((new.force != 0.0).any(axis=1) == [True, False, True, False]).all()
+    assert (np.isfinite(new.arc_length) == [True, False, True, False]).all()
+    assert np.isnan(new.shared[1, :, [0, 2, 9, 14]]).all()
+    assert np.isfinite(new.shared[1, :, 3:9]).all()
+    for name, value in vars(fit).items():
+        np.testing.assert_array_equal(getattr(new, name)[[0, 2, 3]], value[[0, 2, 3]])
+    assert np.isfinite(fit.contact_point[1]).all()
 
 
 def test_derivatives_by_the_peg():

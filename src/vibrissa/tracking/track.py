@@ -55,7 +55,7 @@ from vibrissa.tracking.refine.optics import (
 from vibrissa.tracking.refine.peg import UncertainPeg
 from vibrissa.tracking.refine.problem import FitOptions
 from vibrissa.tracking.refine.rods import TraceSeries, rolled
-from vibrissa.tracking.refine.silhouette import explains, peg_in_images
+from vibrissa.tracking.refine.silhouette import explains, on_peg, peg_in_images
 from vibrissa.tracking.refine.tilt import Plane, plane_of, projected, unturned
 from vibrissa.tracking.space.curve import begun_together, merged, with_one_tip
 from vibrissa.tracking.space.exchange import Known, exchanged
@@ -475,9 +475,7 @@ def track_whisker(
         cameras, series, touching, on_head, rate, smoothness, within, objects, unsure=plane.unsure
     )
     begun = _Begun(shape, whisker, further and further[1], tips, tapers)
-    found = None
-    if sample and not objects:
-        found = _on_peg(fitter, begun, options, sample)
+    found = _on_peg(fitter, begun, options, sample) if sample and not objects else None
     found = found or _bent(fitter, begun, options)
     report(f"contact of {name}", 2, 2)
     covariance = np.array([curve.covariance for curve in curves])
@@ -489,7 +487,7 @@ def track_whisker(
         shape=found.shape,
         pose=found.pose,
         unfiltered=found.unfiltered,
-        touching=touching,
+        touching=touching & (found.fit.force != 0.0).any(axis=1),
         fit=found.fit if plane.head is None else projected(found.fit, plane.head),
         head=head,
         length=found.length,
@@ -530,7 +528,9 @@ def _on_peg(
     if peg is None:
         return None
     found = _bent(replace(fitter, peg=peg), begun, options)
-    return found if explains(peg, found.peg, misfit, found.fit, found.whisker) else None
+    if found.peg is None or not explains(peg, found.peg, misfit, found.fit, found.whisker):
+        return None
+    return found._replace(fit=on_peg(found.peg, found.fit, found.whisker))
 
 
 def _bent(fitter: Fitter, begun: _Begun, options: TrackOptions) -> _Bent:

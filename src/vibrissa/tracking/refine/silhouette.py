@@ -93,6 +93,7 @@ _ELSEWHERE = 250.0
 # Distance of contacts from the peg that they touch, m; and misfit of traces with it, over that
 # without it, from which they touch something else.
 _ON_PEG, _WORSE = 1e-4, 1.3
+_CERTAIN = 2.0  # force over its standard deviation from which a contact off the peg is one
 
 
 def explains(
@@ -113,6 +114,24 @@ def explains(
     )
     touches = np.mean(np.abs(gap) < _ON_PEG) >= _SEEN
     return bool(touches and after < _WORSE * max(before, free))
+
+
+def on_peg(peg: UncertainPeg, fit: RodFit, whisker: Whisker) -> RodFit:
+    """A fit without contacts that are off the peg, and whose forces might as well be zero.
+
+    Errors of traces that vary with the motion, as by its blur, bend a whisker in air.
+    """
+    gap = peg.expected.signed_distance(fit.contact_point) - whisker.radius(fit.arc_length)
+    size = np.linalg.norm(fit.force, axis=1)
+    spread = np.einsum("ti,tij,tj->t", fit.force, fit.wrench_covariance[:, :3, :3], fit.force)
+    air = (gap > _ON_PEG) & (size**2 < _CERTAIN * np.sqrt(np.maximum(spread, 0.0)))
+    values = {name: array.copy() for name, array in vars(fit).items()}
+    for name in ("force", "moment", "wrench_covariance", "pose_wrench_covariance"):
+        values[name][air] = 0.0
+    for name in ("arc_length", "contact_point_whisker", "contact_point", "contact_covariance"):
+        values[name][air] = np.nan
+    values["shared"][air, :, :3] = values["shared"][air, :, 9:] = np.nan
+    return RodFit(**values)
 
 
 class _Cylinders(NamedTuple):

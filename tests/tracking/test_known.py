@@ -13,7 +13,12 @@ from vibrissa.recording import Recording
 from vibrissa.rod import discretize
 from vibrissa.simulation import Motion, simulate
 from vibrissa.tracking import HeadPose, TrackOptions, trace_video, track
-from vibrissa.tracking.recording import force_scale, outside_video, remarks_on_fur
+from vibrissa.tracking.recording import (
+    force_scale,
+    outside_video,
+    remarks_on_fur,
+    scale_sigma,
+)
 from vibrissa.tracking.refine.rods import Bent, State
 
 FRAMES = 30
@@ -270,13 +275,34 @@ def test_forces_scale_with_the_radius_before_the_base(hidden):
 
 def test_what_fur_may_do_to_forces_is_said_where_the_radius_is_stated():
     whisker = Whisker.straight(25e-3, base_radius=80e-6, tip_radius=8e-6)
-    one = SimpleNamespace(whisker=whisker)
     percent = 100.0 * (force_scale(whisker, 1e-3) - 1.0)
-    for stated in ({"base_radius": 80e-6}, {"rat": "C2"}):
-        (said,) = remarks_on_fur(one, TrackOptions(properties=stated).at_base, "C2")
-        assert f"{percent:.0f} % too large" in said
-        assert "--fur" in said
-    for other in ({}, {"tip_radius": 5e-6}):
-        assert not remarks_on_fur(one, TrackOptions(properties=other).at_base, "C2")
-    (said,) = remarks_on_fur(one, TrackOptions(fur=0.8e-3).at_base, "C2")
+    one = SimpleNamespace(whisker=whisker, scale=scale_sigma(whisker, 0.0, 0.0))
+    (said,) = remarks_on_fur(one, 0.0, "C2")
+    assert f"{percent:.0f} % too large" in said
+    assert f"{100.0 * one.scale:.1f} % (standard deviation)" in said
+    assert "--fur" in said
+    assert not remarks_on_fur(SimpleNamespace(whisker=whisker, scale=np.nan), 0.0, "C2")
+    stated = SimpleNamespace(whisker=whisker, scale=scale_sigma(whisker, 0.8e-3, 0.0))
+    assert stated.scale == pytest.approx(np.log(force_scale(whisker, 0.2e-3)), rel=1e-12)
+    assert stated.scale < scale_sigma(whisker, 0.8e-3, 1e-3) < one.scale
+    (said,) = remarks_on_fur(stated, 0.8e-3, "C2")
     assert "taken to be hidden by fur" in said
+
+
+def test_the_scale_of_forces_that_fur_leaves_open_is_one_number(filmed, traced):
+    """A radius is stated; one view shows 24 pixels of the base less than the other."""
+    later = [
+        t._replace(line=t.line[12:], sigma=t.sigma[12:], seen=t.seen[12:]) for t in traced[0][0]
+    ]
+    found = []
+    for properties, rows in (({}, traced[0]), ({"base_radius": 50e-6}, [later])):
+        options = TrackOptions(properties=properties, length=10e-3)
+        found.append(track(filmed.cameras, [rows, traced[1]], 1000.0, options))
+    none, data = (tree.to_dataset()["wrench_scale_sigma"].values for tree in found)
+    assert none.shape == data.shape == (1,)
+    assert np.isnan(none).all()
+    whisker = Recording(found[1]).whisker()
+    more = 24.0 * 10e-3 / 172.0
+    assert whisker.radius(0.0) == pytest.approx(50e-6 - 45e-6 * more / 10e-3, rel=0.05)
+    assert data[0] == pytest.approx(scale_sigma(whisker, 0.0, more), rel=0.05)
+    assert "before which front shows the stated radius" in found[1].attrs["remarks"]

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from vibrissa.cameras import Camera, orthogonal_views
 from vibrissa.tracking import Trace, low_pass, merge, paired_frames, usual_cutoff
 from vibrissa.tracking.recording import remarks_on_time
-from vibrissa.tracking.space.curve import begun_together, merged
+from vibrissa.tracking.space.curve import begun_together, merged, shown_by_one
 from vibrissa.tracking.space.exchange import Known, exchanged
 from vibrissa.tracking.space.frame_pairs import clear_offsets, repeated_frames, without_repeats
 from vibrissa.tracking.space.pose import base_pose, rolled_over
@@ -45,17 +45,24 @@ def traced(camera, points, generator=None, noise=0.03):
     return Trace(line, np.full(n, noise), np.ones(n, dtype=bool), 1.0)
 
 
-def test_views_begin_where_both_show_the_whisker():
-    """Hairs hide 30 pixels of the base in one view; the other shows it from its true base."""
+@pytest.mark.parametrize("points", [15, 40])
+def test_views_begin_where_both_show_the_whisker(points):
+    """Hairs hide the base in one view, two pixels a point; the other shows it from there."""
     cameras = PAIRS["orthogonal"]
     rows = [[traced(camera, curve(0.1 * i)) for i in range(3)] for camera in cameras]
     hidden = [
-        Trace(t.line[15:], t.sigma[15:], t.seen[15:], t.confidence, t.base_seen) for t in rows[0]
+        Trace(t.line[points:], t.sigma[points:], t.seen[points:], t.confidence) for t in rows[0]
     ]
     for shown in (begun_together(cameras, [hidden, rows[1]]), begun_together(cameras, rows)):
         for both in zip(*shown, strict=True):
             assert base_gap(cameras, np.stack([trace.line[0] for trace in both])) < 2.0
     assert all(a is b for a, b in zip(rows[1], shown[1], strict=True))
+    true = [curve.length for curve in merged(cameras, zip(*rows, strict=True))]
+    begun = begun_together(cameras, [hidden, rows[1]])
+    left = [curve.length for curve in merged(cameras, zip(*begun, strict=True))]
+    more = shown_by_one(cameras, [hidden, rows[1]], begun)
+    assert more == pytest.approx(float(np.median(np.subtract(true, left))), abs=1e-4)
+    assert shown_by_one(cameras, rows, rows) == 0.0
     other = [traced(cameras[1], curve(0.1 * i) + np.array([0.0, 0.0, 8e-3])) for i in range(3)]
     elsewhere = begun_together(cameras, [rows[0], [farther(trace) for trace in other]])
     assert [len(trace.line) for trace in elsewhere[0]] == [len(trace.line) for trace in rows[0]]

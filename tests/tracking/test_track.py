@@ -25,10 +25,11 @@ from vibrissa.tracking import (
     whisker_at_rest,
 )
 from vibrissa.tracking.refine.problem import Smoother
+from vibrissa.tracking.refine.taper import tapered_as_it_bends
 from vibrissa.tracking.space.exchange import exchanged
 from vibrissa.tracking.space.rest_shape import Length, known_rest, length_shown
 from vibrissa.tracking.trace.trace import STEP
-from vibrissa.tracking.track import known_of, tapered_as_it_bends, track_whisker
+from vibrissa.tracking.track import known_of, track_whisker
 from vibrissa.whisker import angles_of, base_rotation
 
 

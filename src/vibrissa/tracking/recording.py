@@ -27,6 +27,7 @@ from vibrissa.objects import Surface
 from vibrissa.recording import coordinates, recorded, recording_tree
 from vibrissa.status import Status
 from vibrissa.tracking.refine.fit import RodFit
+from vibrissa.tracking.refine.hook import Hook
 from vibrissa.tracking.refine.optics import Optics
 from vibrissa.tracking.refine.peg import UncertainPeg
 from vibrissa.tracking.refine.rods import TraceSeries
@@ -175,6 +176,8 @@ class Tracked:
     head: HeadPose  # its pose in these frames
     length: Length  # with a standard deviation of 0 where it is given
     peg: UncertainPeg | None = None  # that it touches, found in the images
+    scale: float = np.nan  # standard deviation of the logarithm of all forces; see `scale_sigma`
+    hook: Hook | None = None  # of its traces at the base
     turned: float = 0.0  # by how much its curvature shows that it leaves the only view's plane, rad
     contacts: ContactPoints | None = None  # those that do not come from the rod
 
@@ -250,6 +253,7 @@ def _variables(one: Tracked, errors: int) -> xr.Dataset:
         "pose_covariance": fit.pose_covariance,
         "pose_wrench_covariance": fit.pose_wrench_covariance,
         "trace_misfit": fit.misfit,
+        "wrench_scale_sigma": one.scale,
         "trace": traces.line,
         "trace_sigma": traces.sigma,
         "trace_visible": traces.seen,
@@ -298,7 +302,8 @@ _TURNED = np.radians(16.0)  # turn from which a whisker leaves the plane of a si
 _STRANGE, _OFTEN = 2.0, 0.05
 # Share of the uncertainty of contact points due to the cameras above which there is a remark.
 _MOST = 0.7
-_FUR_KNOWN = 0.25  # relative standard deviation of a stated length of fur
+# Relative standard deviation of a stated length of fur, and that of one not stated, m.
+_FUR_KNOWN, _FUR_USUAL = 0.25, 0.8e-3
 _APART = 2.0  # unusual distance between the bases of several views, pixels
 # Slow motion of a camera above which there is a remark, pixels, and as a share of its shaking.
 _SLOW, _MOSTLY = 0.25, 0.8
@@ -335,8 +340,10 @@ def remarks_on_shaking(cameras: Sequence[Camera], traces: Sequence[Sequence[Trac
     return found
 
 
-def remarks_on_optics(one: Tracked, optics: Optics, name: str) -> list[str]:
+def remarks_on_optics(one: Tracked, optics: Optics | None, name: str) -> list[str]:
     """Report displacements of contact points due to unknown optics, if these dominate the error."""
+    if optics is None:
+        return []
     moved = np.linalg.norm(optics.displacements(one.fit.contact_point), axis=(0, 2))
     spread = np.sqrt(np.trace(one.fit.contact_covariance, axis1=1, axis2=2))
     if not np.isfinite(moved).any() or np.nanmedian(moved / spread) < _MOST:
@@ -474,26 +481,40 @@ def remarks_on_bases(
     cameras: Sequence[Camera],
     shown: Sequence[Sequence[Trace]],
     used: Sequence[Sequence[Trace]],
+    scaled: bool,
     name: str,
 ) -> list[str]:
-    """Report views in which a whisker is seen from closer to its base than in the other view."""
+    """Report views in which a whisker is seen from closer to its base than in the other view.
+
+    Whether its radius at the base is stated is given.
+    """
     found = []
     for camera, before, after in zip(cameras, shown, used, strict=True):
         both = [(a.length, b.length) for a, b in zip(before, after, strict=True) if len(a.line)]
         if not both:
             continue
         cut = float(np.median([a - b for a, b in both]))
-        whole = float(np.median([a for a, _ in both]))
         if cut > _APART:
-            # Forces scale with the fourth power of the radius.
-            percent = 100.0 * ((whole / max(whole - cut, 1.0)) ** 4 - 1.0)
+            stated = f", before which {camera.name} shows the stated radius" if scaled else ""
             found.append(
                 f"{name}: {camera.name} shows {cut:.0f} pixels more of it near its base than the "
-                "other view (median); the first point that both show is used as base. If the "
-                f"stated radius is the one where {camera.name} first shows it, forces and moments "
-                f"are up to {percent:.0f} % too large."
+                f"other view (median); the first point that both show is used as base{stated}."
             )
     return found
+
+
+def remarks_on_hook(one: Tracked, name: str) -> list[str]:
+    """Report a part at the base over which traces are not on the whisker."""
+    if one.hook is None:
+        return []
+    over = 1e3 * one.hook.share * one.shape.length
+    largest = float(np.linalg.norm(one.hook.aside, axis=1).max())
+    return [
+        f"{name}: over {over:.1f} mm next to its base its traces are on something else in all "
+        "frames, such as fur, a hair or a neighbour that was cut, up to "
+        f"{1e6 * largest:.0f} µm beside it: it is taken to go on there as smoothly as beyond, and "
+        f"its base to be known to {1e6 * one.hook.sigma:.0f} µm."
+    ]
 
 
 def force_scale(whisker: Whisker, hidden: float) -> float:
@@ -503,28 +524,39 @@ def force_scale(whisker: Whisker, hidden: float) -> float:
     return float((1.0 + (1.0 - at_tip / at_edge) * hidden / whisker.length) ** 4)
 
 
-def remarks_on_fur(one: Tracked, known: Mapping[str, Any], name: str) -> list[str]:
-    """Report the common error of all forces due to fur of unknown length over the base.
+def scale_sigma(whisker: Whisker, fur: float, more: float) -> float:
+    """Standard deviation of the logarithm of the scale that all forces of a whisker share.
 
-    What is known of the base is that of `TrackOptions`; without a radius there is no such error.
+    Fur hides a length before the view that shows most of it, m, or one that is not stated (0), and
+    one view hides more.
     """
-    fur = known["hidden"]
-    if fur == 0.0 and not {"base_radius", "rat"} & known.keys():
+    unknown = _FUR_KNOWN * fur if fur > 0.0 else _FUR_USUAL
+    return float(np.log(force_scale(whisker, float(np.hypot(unknown, _FUR_KNOWN * more)))))
+
+
+def remarks_on_fur(one: Tracked, fur: float, name: str) -> list[str]:
+    """Report the common error of all forces due to fur over the base, of a stated length or none.
+
+    Without a stated radius there is no such error.
+    """
+    if not np.isfinite(one.scale):
         return []
+    error = (
+        f"one error of all its forces and moments, {100.0 * one.scale:.1f} % (standard deviation), "
+        "which is in no covariance (wrench_scale_sigma)"
+    )
     if fur == 0.0:
         percent = 100.0 * (force_scale(one.whisker, 1e-3) - 1.0)
         return [
-            f"{name}: its radius is taken to be stated where its base is first seen. If it is that "
-            f"where the whisker leaves the skin, all forces and moments are {percent:.0f} % too "
-            "large for each millimetre that fur hides, which is in no covariance: state how much "
-            "that is (--fur)."
+            f"{name}: its radius is taken to be stated where it is first seen. If it is that where "
+            f"the whisker leaves the skin, all forces and moments are {percent:.0f} % too large "
+            "for each millimetre that fur hides: state how much that is (--fur). Unstated, it is "
+            f"{error}."
         ]
-    percent = 100.0 * np.log(force_scale(one.whisker, _FUR_KNOWN * fur))
     hidden = f"{1e3 * fur:g} ± {1e3 * _FUR_KNOWN * fur:.2g} mm"
     return [
         f"{name}: {hidden} of its base are taken to be hidden by fur; what is not known of that is "
-        f"one error of all its forces and moments, {percent:.1f} % (standard deviation), which is "
-        "in no covariance. They are those where the fur ends."
+        f"{error}. They are those where the fur ends."
     ]
 
 

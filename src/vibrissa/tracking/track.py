@@ -30,6 +30,7 @@ from vibrissa.tracking.recording import (
     remarks_on_bases,
     remarks_on_following,
     remarks_on_fur,
+    remarks_on_hook,
     remarks_on_optics,
     remarks_on_peg,
     remarks_on_plane,
@@ -38,12 +39,14 @@ from vibrissa.tracking.recording import (
     remarks_on_shaking,
     remarks_on_time,
     remarks_on_unseen_contacts,
+    scale_sigma,
     tracked_recording,
     unexplained_frames,
     usual_gap,
 )
 from vibrissa.tracking.refine.continuation import continued
 from vibrissa.tracking.refine.fit import Fitter, RodFit
+from vibrissa.tracking.refine.hook import hook_of, off_hook, straightened
 from vibrissa.tracking.refine.optics import (
     Optics,
     rough_optics,
@@ -56,8 +59,9 @@ from vibrissa.tracking.refine.peg import UncertainPeg
 from vibrissa.tracking.refine.problem import FitOptions
 from vibrissa.tracking.refine.rods import TraceSeries, rolled
 from vibrissa.tracking.refine.silhouette import explains, on_peg, peg_in_images
+from vibrissa.tracking.refine.taper import some_in_contact, tapered_as_it_bends
 from vibrissa.tracking.refine.tilt import Plane, plane_of, projected, unturned
-from vibrissa.tracking.space.curve import begun_together, merged, with_one_tip
+from vibrissa.tracking.space.curve import begun_together, merged, shown_by_one, with_one_tip
 from vibrissa.tracking.space.exchange import Known, exchanged
 from vibrissa.tracking.space.frame_pairs import best_seen, paired_frames, without_repeats
 from vibrissa.tracking.space.pose import CUTOFF, BasePose, HeadPose, base_pose, rolled_over
@@ -68,7 +72,6 @@ from vibrissa.tracking.space.rest_shape import (
     known_rest,
     lengthened,
     likeliest_length,
-    likeliest_taper,
     rest_shape,
     seen_length,
     stated_length,
@@ -76,7 +79,7 @@ from vibrissa.tracking.space.rest_shape import (
     whisker_at_rest,
 )
 from vibrissa.tracking.trace.trace import Trace
-from vibrissa.whisker import Pose, Whisker, morphology
+from vibrissa.whisker import Pose, Whisker
 
 Progress = Callable[[str, int, int], None]
 """Function that is called with the name of a stage, and how much of how much is done."""
@@ -85,8 +88,7 @@ Progress = Callable[[str, int, int], None]
 _FLAT = 0.02
 # Standard deviation of a roll that is determined by bent shapes only, rad.
 _ANY_ROLL = np.radians(10.0)
-# Smallest number of frames of a kind that are used, and largest in contact to estimate a length.
-_FEWEST, _FRAMES = 3, 24
+_FEWEST = 3  # smallest number of frames of a kind that are used
 # Misfit, absolute and relative to the usual one, below which the traces of a row are its whiskers'.
 _WELL, _WORSE = 1.0, 3.0
 # Misfit over the usual one above which frames of a row are left out, and share that must remain.
@@ -122,7 +124,8 @@ class TrackOptions:
         Length of the whisker from where it leaves the face, m, where it is known but for its shape.
         By default it is seen, or inferred from how the whisker bends.
     fur : float
-        Length of the whisker that fur hides, m: stated radii at the base are those before it.
+        Length of the whisker that fur hides in the view that shows most of it, m: stated radii at
+        the base are those before it.
     rough : bool
         Whether the cameras, orthographic ones, are not calibrated: what the views show of a free
         whisker then corrects them, where they cannot explain it.
@@ -140,6 +143,15 @@ class TrackOptions:
     fur: float = 0.0
     rough: bool = False
     distance: float | None = None
+
+    @property
+    def scaled(self) -> bool:
+        """Whether forces have the scale of a radius at the base, which is stated."""
+        return bool({"base_radius", "rat"} & self.properties.keys())
+
+    def hidden_by(self, more: float) -> TrackOptions:
+        """Options of a whisker of which so much more, m, is hidden in one of the views."""
+        return replace(self, fur=self.fur + more * self.scaled)
 
     @property
     def at_base(self) -> dict[str, Any]:
@@ -234,16 +246,20 @@ def track(
 
     def tracked(k: int, used: Sequence[Sequence[Trace]]) -> Tracked:
         given = moving, objects, sample, count > 1
-        return track_whisker(cameras, used, rate, options, called[k], progress, *given)
+        own = options.hidden_by(hidden[k])
+        one = track_whisker(cameras, used, rate, own, called[k], progress, *given)
+        scale = scale_sigma(one.whisker, options.fur, hidden[k]) if options.scaled else np.nan
+        return replace(one, scale=scale)
 
     known = partial(known_of, cameras, rate=rate, options=options.fit)
     kept, repeats = without_repeats(cameras, rows)
     begun = [begun_together(cameras, row) for row in kept]
+    hidden = [shown_by_one(cameras, *both) for both in zip(kept, begun, strict=True)]
     remarks += repeats + remarks_on_shaking(cameras, timed) + [ONE_VIEW] * (len(cameras) == 1)
     together, before, changes = _sorted_out(cameras, begun, tracked, known)
     for k, name in enumerate(called):
         remarks += remarks_on_following(cameras, rows[k], name)
-        remarks += remarks_on_bases(cameras, kept[k], begun[k], name)
+        remarks += remarks_on_bases(cameras, kept[k], begun[k], options.scaled, name)
         try:
             one = before[k] if k in before else tracked(k, together[k])
             if count > 1:
@@ -254,13 +270,10 @@ def track(
                 one = replace(one, contacts=other)
             elif objects:
                 one = replace(one, contacts=contacts_at(objects, one.curves, one.touching, one.fit))
-            fit = with_shift_unsure(cameras, one.fit, one.traces.shift)
-            one = replace(one, fit=with_depth_unsure(cameras, fit, options.rough, options.distance))
-            if optics is not None:
-                one = replace(one, fit=with_optics_unsure(one.fit, optics))
-                remarks += remarks_on_optics(one, optics, name)
+            one = _with_cameras_unsure(cameras, one, options, optics)
+            remarks += remarks_on_optics(one, optics, name)
             found.append(one)
-            remarks += _remarks_on_one(cameras, one, options.at_base, name, bool(objects))
+            remarks += _remarks_on_one(cameras, one, options.fur, name, bool(objects))
         except Exception as fault:  # no error of one whisker may discard the others
             if count == 1:
                 raise
@@ -276,11 +289,20 @@ def track(
     return recording
 
 
+def _with_cameras_unsure(
+    cameras: Sequence[Camera], one: Tracked, options: TrackOptions, optics: Optics | None
+) -> Tracked:
+    """Whisker with what is not known of the cameras in its covariances."""
+    fit = with_shift_unsure(cameras, one.fit, one.traces.shift)
+    fit = with_depth_unsure(cameras, fit, options.rough, options.distance)
+    return replace(one, fit=fit if optics is None else with_optics_unsure(fit, optics))
+
+
 def _remarks_on_one(
-    cameras: Sequence[Camera], one: Tracked, known: Mapping[str, Any], name: str, stated: bool
+    cameras: Sequence[Camera], one: Tracked, fur: float, name: str, stated: bool
 ) -> list[str]:
     """Report what is to be known of one whisker; whether it touches stated objects is given."""
-    remarks = remarks_on_fur(one, known, name)
+    remarks = remarks_on_fur(one, fur, name) + remarks_on_hook(one, name)
     remarks += remarks_on(cameras, one.traces, one.length, one.fit.misfit, name)
     # Known objects locate contacts that are not seen.
     if not stated and one.peg is None:
@@ -446,21 +468,26 @@ def track_whisker(
     on_head = head.seen_from(points)
     tips: Mask = np.all(series.ends[:, :, 1] > 0.5, axis=1)
     sparse = any(trace.sparse for view in traces for trace in view)
-    astray = (_CROSSED if row and not sparse else _ASTRAY) * _pixel_at(cameras, on_head)
-    flat = len(cameras) == 1
-    shape, whisker = _at_rest(on_head, options, name, tips, flat, sparse, astray)
+    pixel, flat = _pixel_at(cameras, on_head), len(cameras) == 1
+    astray = (_CROSSED if row and not sparse else _ASTRAY) * pixel
+    rest = partial(_at_rest, options, name, tips, flat, sparse, astray)
+    shape, whisker = rest(on_head)
     plane = plane_of(on_head, shape, tips) if flat else Plane(None, np.zeros(count))
     if plane.head is not None:
         on_head = unturned(on_head, plane.head)
-        shape, whisker = _at_rest(on_head, options, name, tips, flat, sparse, astray)
+        shape, whisker = rest(on_head)
+    marked = row or sparse or options.whisker is not None
+    hook = None if marked else hook_of(shape, pixel)
+    if hook is not None:
+        on_head = straightened(on_head, shape, whisker, base_pose(on_head, shape, whisker), hook)
+        shape, whisker = rest(on_head, hook.share)
+    series, used = off_hook(cameras, series, points, hook)
     if len(cameras) > 1:
         shape = replace(shape, free=shape.free & ~rolled_over(on_head, shape, whisker))
     report(f"contact of {name}", 1, 2)
-    within = plane.head or head  # frame of the rod
     touching = np.isfinite(points).all(axis=(1, 2)) & ~shape.free
-    smoothness = options.fit
-    if sparse:
-        smoothness = replace(smoothness, sharpest=max(smoothness.sharpest, 1.0))
+    sharpest = max(options.fit.sharpest, 1.0) if sparse else options.fit.sharpest
+    smoothness, within = replace(options.fit, sharpest=sharpest), plane.head or head
     tapers = bool(options.properties.keys() & {"tip_radius", "radius"})
     further = None
     if options.whisker is None:
@@ -471,19 +498,17 @@ def track_whisker(
     if not shape.free.any():
         # Only the bent shapes determine the roll.
         smoothness = replace(smoothness, roll=max(smoothness.roll, _ANY_ROLL))
-    fitter = Fitter(
-        cameras, series, touching, on_head, rate, smoothness, within, objects, unsure=plane.unsure
-    )
+    fitter = Fitter(cameras, used, touching, on_head, rate, smoothness, within, objects)
+    fitter = replace(fitter, unsure=plane.unsure, hook=hook)
     begun = _Begun(shape, whisker, further and further[1], tips, tapers)
     found = _on_peg(fitter, begun, options, sample) if sample and not objects else None
     found = found or _bent(fitter, begun, options)
     report(f"contact of {name}", 2, 2)
-    covariance = np.array([curve.covariance for curve in curves])
     return Tracked(
         whisker=found.whisker,
         traces=series,
         curves=points,
-        covariance=covariance,
+        covariance=np.array([curve.covariance for curve in curves]),
         shape=found.shape,
         pose=found.pose,
         unfiltered=found.unfiltered,
@@ -492,6 +517,7 @@ def track_whisker(
         head=head,
         length=found.length,
         peg=found.peg,
+        hook=hook,
         turned=plane.turned,
     )
 
@@ -558,21 +584,22 @@ def _bent(fitter: Fitter, begun: _Begun, options: TrackOptions) -> _Bent:
 
 
 def _at_rest(
-    curves: Array,
     options: TrackOptions,
     name: str,
     tips: Mask,
     flat: bool,
     sparse: bool,
     astray: float,
+    curves: Array,
+    hidden: float = 0.0,
 ) -> tuple[RestShape, Whisker]:
-    """Rest shape from the frames, or of the known whisker."""
+    """Rest shape from the frames, without a share at the base, or of the known whisker."""
     if options.whisker is not None:
         whisker = options.whisker.with_properties(name=name)
         if flat:
             return _known_flat(curves, whisker, options.free)
         return known_rest(curves, whisker, options.free), whisker
-    shape = replace(rest_shape(curves, options.free, tips, astray), sparse=sparse)
+    shape = replace(rest_shape(curves, options.free, tips, astray, hidden), sparse=sparse)
     return shape, whisker_at_rest(shape, name, **options.at_base)
 
 
@@ -610,57 +637,13 @@ def _poses(
     return unfiltered, pose if shape.free.any() else rolled(pose, fitter.curves, whisker)
 
 
-def _in_contact(fitter: Fitter) -> Fitter | None:
-    """The same fit restricted to some of the frames in contact, if there are enough."""
-    rows = np.flatnonzero(fitter.touching)
-    if len(rows) < _FEWEST:
-        return None
-    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _FRAMES)).astype(int)]
-    curves = np.full_like(fitter.curves, np.nan)
-    curves[rows] = fitter.curves[rows]
-    return replace(fitter, curves=curves)
-
-
-def tapered_as_it_bends(
-    fitter: Fitter, whisker: Whisker, length: Length, pose: BasePose
-) -> tuple[Whisker, Length]:
-    """Whisker with the taper inferred from its bending, and the uncertainty of its length."""
-    some = _in_contact(fitter)
-    if some is None:
-        return whisker, length
-    at_base, at_tip = whisker.radius(np.array([0.0, whisker.length]))
-
-    def thicker(share: float) -> Whisker:
-        return whisker.with_properties(
-            tip_radius=float(at_base - (at_base - at_tip) / (1.0 + share))
-        )
-
-    thinnest = (1.0 - at_tip / at_base) / (1.0 - 1.0 / morphology.MOST_TAPER) - 1.0
-
-    def cost(share: float) -> Callable[[float], float]:
-        # The first whisker sets the variance of the traces; a wrong taper would enlarge it.
-        of = some.costs(min(length.shown, whisker.length))
-        of(thicker(share), pose)
-        return lambda other: of(thicker(other), pose)
-
-    usual, shown = length.sigma / length.value, length.shown / length.value
-    share, _ = likeliest_taper(usual, float(thinnest), cost(0.0), shown)
-    share, sigma = likeliest_taper(usual, float(thinnest), cost(share), shown)
-    found = thicker(share)
-    tip = 100.0 * float(found.radius(whisker.length) / at_base)
-    either = 100.0 * sigma * float(1.0 - at_tip / at_base) / (1.0 + share) ** 2
-    note = f"radius of the tip: {tip:.1f} ± {either:.1f} % of the base's, from how it bends"
-    found = replace(found, notes=(*found.notes, note))
-    return found, length._replace(sigma=sigma * length.value)
-
-
 def _length(fitter: Fitter, shape: RestShape, options: TrackOptions) -> Length:
     """Length of a whisker with an unseen tip, from some of the frames in contact."""
     # All lengths are compared by the same frames: short traces have no pose for the longest.
     longest = lengthened(shape, shape.length / LEAST_SEEN)
     pose = _poses(fitter, longest, whisker_at_rest(longest, **options.at_base), options)[1]
     posed = np.isfinite(pose.rotation).all(axis=(1, 2))
-    some = _in_contact(replace(fitter, touching=fitter.touching & posed))
+    some = some_in_contact(replace(fitter, touching=fitter.touching & posed))
     if some is None:
         # Few bent frames do not show it, so that it is only known what is usual.
         touched = bool(fitter.touching.any())

@@ -39,6 +39,7 @@ from vibrissa.deferred import interpolate, ndimage
 from vibrissa.numerics import Array, Mask
 from vibrissa.objects import Surface
 from vibrissa.rod import discretize, solve_forces
+from vibrissa.tracking.refine.hook import Hook
 from vibrissa.tracking.refine.peg import UncertainPeg
 from vibrissa.tracking.refine.problem import NEARLY, FitOptions, Linear, Problem
 from vibrissa.tracking.refine.rods import (
@@ -267,6 +268,7 @@ class Fitter:
     peg: UncertainPeg | None = None
     # (time,) Standard deviation of the logarithm of the curvature that one view shows.
     unsure: Array | None = None
+    hook: Hook | None = None  # at the base, which is not on the whisker
 
     def fit(
         self, whisker: Whisker, pose: BasePose, nodes: int, length: Length | None = None
@@ -276,7 +278,7 @@ class Fitter:
         state, linear, spread = profiled(problem, state, linear)
         length = length or Length(whisker.length, 0.0)
         unsure = np.zeros(0) if self.unsure is None else self.unsure[problem.frames]
-        found = _answer(problem, state, linear, spread, nodes, length, unsure)
+        found = _answer(problem, state, linear, spread, nodes, length, unsure, self.hook)
         whole = _whole(_in_laboratory(found, problem.head), problem.frames, len(self.curves))
         if self.peg is None or not linear.smoother.crossed.any():
             return whole, None
@@ -489,7 +491,7 @@ def _drawn(fit: Linear) -> list[float]:
     ]
 
 
-def _frame_errors(problem: Problem, fit: Linear) -> Array:
+def _frame_errors(problem: Problem, fit: Linear, bent: Hook | None) -> Array:
     """Shifts and turns (2, 2, 3) of the whisker's frame, in its axes, due to its shape at the base.
 
     The shape follows the traces there, and the rod the shape: errors of the base, of its tangent
@@ -502,6 +504,8 @@ def _frame_errors(problem: Problem, fit: Linear) -> Array:
     aside = _FOLLOWED * float((drawn / scales).max())
     hook = float((np.hypot(_HOOKED, _HOOK * drawn) / scales).max())
     lean = hook / (_AT_BASE * whisker.length)
+    if bent is not None:
+        aside, lean = float(np.hypot(aside, bent.sigma)), float(np.hypot(lean, bent.lean))
     share = np.linspace(0.0, _PROXIMAL, fit.data.misses[0].shape[1])
     x, y, _ = whisker.position(share * whisker.length).T
     roll = min(lean * abs(x @ y) / max(y @ y, lean**2 * (x @ x)), 1.0)
@@ -592,6 +596,7 @@ def _answer(
     nodes: int,
     length: Length,
     unsure: Array,
+    hook: Hook | None,
 ) -> RodFit:
     """Results in SI units, relative to the head."""
     d, touching = problem.d, problem.touching
@@ -612,7 +617,7 @@ def _answer(
     moved = np.concatenate([moved, shared.swapaxes(0, 1)[..., :6] * size], axis=2)
     moved = np.pad(moved, ((0, 0), (0, 0), (0, 6)))
     # An error of the whisker's frame turns force and moment in it in the opposite sense.
-    errors = _frame_errors(problem, fit)
+    errors = _frame_errors(problem, fit, hook)
     framed = np.einsum("tij,kpj->tkpi", state.rotation, errors).reshape(-1, 2, 6)
     framed = np.pad(framed, ((0, 0), (0, 0), (3, 6)))
     against = [np.cross(part[:, None], errors[:, 1]) for part in (wrench[:, :3], wrench[:, 3:])]

@@ -47,9 +47,12 @@ _LOOSE = 0.05
 _END = 1.0  # standard deviation of a trace's ends along it, pixels
 _BEYOND = 6.0  # distance of a tip from the end of a trace above which it is not the same, pixels
 # Distance of lines of sight at the base, pixels, from which views may begin at different points of
-# the whisker; share of it, and of twice that, left at most where they begin together; and share of
-# a trace within which that is.
-_APART, _NEARER, _CUT = 2.0, 0.4, 0.08
+# the whisker; share of it, and of twice that, left at most where they begin together; and shares of
+# a trace within which that is, if they also end together, and if not.
+_APART, _NEARER, _CUTS = 2.0, 0.4, (0.25, 0.08)
+# Number of frames by which the part is measured that only one view shows; share of the whisker, as
+# its inverse, whose direction that has; and smallest length of its image, pixels.
+_SOME, _NEAR_BASE, _TINY = 9, 10, 1.0
 # Standard deviation of the distance from the plane in which a single view's whisker is, m.
 _LEVEL = 1e-7
 # Standard deviation of a point's motion along the curve in a round, in units of their distance.
@@ -132,11 +135,16 @@ def begun_together(
         return [list(view) for view in traces]
     pairs = list(zip(*traces, strict=True))
     whole = [i for i, both in enumerate(pairs) if all(map(_usable, both))]
-    bases = np.array([[pairs[i][view].line[0] for i in whole] for view in (0, 1)])
-    gaps = zip(whole, base_gap(cameras, bases.reshape(2, -1, 2)), strict=True)
-    best = {i: (min(_NEARER * gap, 2.0 * _APART), 0, 0) for i, gap in gaps if not gap < _APART}
-    tried = [(i, view, len(pairs[i][view].line)) for i in best for view in (0, 1)]
-    parts = [(i, view, pairs[i][view].line[: int(_CUT * n)]) for i, view, n in tried]
+    ends = np.array([[[pairs[i][v].line[k] for i in whole] for v in (0, 1)] for k in (0, -1)])
+    gaps = [base_gap(cameras, end) for end in ends.reshape(2, 2, -1, 2)]
+    best, parts = dict[int, tuple[float, int, int]](), list[tuple[int, int, Array]]()
+    for i, gap, at_tip in zip(whole, *gaps, strict=True):
+        if gap < _APART:
+            continue
+        best[i] = (min(_NEARER * gap, 2.0 * _APART), 0, 0)
+        for view in (0, 1):
+            line = pairs[i][view].line
+            parts.append((i, view, line[: int(_CUTS[int(at_tip > _ENDS_APART)] * len(line))]))
     if not parts:
         return [list(view) for view in traces]
     pixels = [
@@ -152,6 +160,30 @@ def begun_together(
         one = one._replace(line=one.line[first:], sigma=one.sigma[first:], seen=one.seen[first:])
         pairs[i] = (one, pairs[i][1]) if view == 0 else (pairs[i][0], one)
     return [list(view) for view in zip(*pairs, strict=True)]
+
+
+def shown_by_one(
+    cameras: Sequence[Camera],
+    traces: Sequence[Sequence[Trace]],
+    begun: Sequence[Sequence[Trace]],
+) -> float:
+    """Length of a whisker, m, that only one view shows before where both do; see `begun_together`.
+
+    It is the median over some of the frames, in the view in which that is longest.
+    """
+    whole = [both for both in zip(*traces, *begun, strict=True) if all(map(_usable, both))]
+    if len(cameras) == 1 or not whole:
+        return 0.0
+    lengths = []
+    some = [whole[i] for i in np.unique(np.linspace(0, len(whole) - 1, _SOME).astype(int))]
+    for both, curve in zip(some, merged(cameras, [b[len(cameras) :] for b in some]), strict=True):
+        near = curve.points[: NODES // _NEAR_BASE]
+        images = [camera.project(near) for camera in cameras]
+        seen = np.linalg.norm(np.diff(images, axis=1), axis=2).sum(axis=1)
+        cut = [both[v].length - both[v + len(cameras)].length for v in range(len(cameras))]
+        lengths.append(np.array(cut) * arc_lengths(near)[-1] / np.maximum(seen, _TINY))
+    known = np.isfinite(lengths).all(axis=1)
+    return float(np.median(np.array(lengths)[known], axis=0).max()) if known.any() else 0.0
 
 
 def _usable(trace: Trace) -> bool:

@@ -127,6 +127,7 @@ def rest_shape(
     least: float = 0.1,
     tips: Mask | None = None,
     astray: float = 0.0,
+    hidden: float = 0.0,
     *,
     fur: float = _FURRED,
 ) -> RestShape:
@@ -143,6 +144,8 @@ def rest_shape(
     astray : float
         Errors of the curves that vary with the pose only, m: how much more than by noise a
         whisker surely is bent.
+    hidden : float
+        Share of the curves at the base in which they are not on the whisker, and not compared.
     fur : float
         Share of the curves at the base in which fur may draw them aside, and which is not compared.
 
@@ -157,7 +160,7 @@ def rest_shape(
         If the whisker is seen in less than three frames.
     """
     seen = _seen(curves)
-    furred = _furred(curves, fur)
+    furred = _furred(curves, max(fur, hidden))
     _, shapes, known, compared = _compared(curves[seen])
     whole = _whole(known, compared)
     part = shapes[whole, furred:compared]

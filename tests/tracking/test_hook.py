@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from vibrissa import Whisker
 from vibrissa.tracking import RestShape, track
 from vibrissa.tracking.refine.hook import hook_of
 
@@ -49,6 +50,13 @@ def test_a_smooth_whisker_has_no_hook(more):
         for size in (0.0, 0.01e-3):
             shape = shape_of(curved(bend, more) + beside(size, 0.06), 0.5e-6)
             assert hook_of(shape, PIXEL) is None
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.2e-6, 3e-6])
+@pytest.mark.parametrize("slope", [0.2, 1.4, 2.4])
+def test_a_strongly_curved_whisker_has_no_hook(slope, noise):
+    whisker = Whisker.parabola(length=40e-3, coefficient=0.5 * slope / 40e-3)
+    assert hook_of(shape_of(whisker.position(40e-3 * S), noise), PIXEL) is None
 
 
 def drawn_aside(camera_traces, size, count):

@@ -5,8 +5,9 @@ traces aside there, or they follow it. As it moves with the whisker, the shape a
 hook, which no whisker has: the curvature of a whisker changes slowly along it. Beyond the hook the
 shape is a polynomial of low degree in the arc length, and the whisker goes on as this does.
 
-The hook ends where polynomials that begin farther out fit hardly better. It counts if it is larger
-than what traces err by anyhow; traces show nothing of the whisker there.
+There is a hook if polynomials of higher degree, which strongly curved whiskers are, do not fit all
+of the shape. It ends where those that begin farther out fit hardly better, and counts if it is
+larger than what traces err by anyhow; traces show nothing of the whisker there.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ _ENDS, _TIP = (0.0, 0.03, 0.06, 0.09, 0.12, 0.16, 0.2, 0.24, 0.28, 0.32, 0.36), 
 # Degrees of the polynomials; residuals, over those of the best one, with which one is good enough,
 # and below which all are, pixels.
 _DEGREES, _ALIKE, _SMALL = (3, 4, 5), 1.5, 0.01
+# Degree of a polynomial that all of a smooth shape is, and its residual over the same.
+_WHOLE, _AS_WELL = 7, 2.0
 # Size of a hook from which it counts, pixels and in standard deviations.
 _LARGE, _SURE = 0.3, 2.0
 # Standard deviation of where a whisker goes on: in that of the fit, as long waves of the errors are
@@ -61,7 +64,7 @@ def hook_of(shape: RestShape, pixel: float) -> Hook | None:
     least = max(_ALIKE * sizes[-1], _SMALL * pixel)
     degree = next(d for d, size in zip(_DEGREES, sizes, strict=True) if size <= least)
     enough = max(_ALIKE * sizes[_DEGREES.index(degree)], _SMALL * pixel)
-    if min(_Smooth.of(points[:last], other).rms for other in _DEGREES) <= enough:
+    if _Smooth.of(points[:last], _WHOLE).rms <= max(_AS_WELL * sizes[-1], _SMALL * pixel):
         return None
     fits = ((n, _Smooth.of(points[n:last], degree)) for n in first)
     count, smooth = next((n, fit) for n, fit in fits if fit.rms <= enough or n == first[-1])

@@ -90,3 +90,17 @@ def test_a_base_is_on_the_whisker_and_not_on_a_hair(filmed, traced):
     assert away[1] < away[0] + 50e-6
     assert lost[0] < 0.1 < 0.9 < lost[1]
     assert said == [False, True]
+
+
+def test_a_base_that_one_view_hides_in_some_frames_is_one_point(filmed, traced):
+    """There it is shown from 24 pixels farther out only, and where it ends shows where it is."""
+    true = filmed.recording.to_dataset().isel(whisker=0)["base_position"].values
+    some = np.arange(len(true)) // 8 % 2 == 1
+    later = [
+        t._replace(line=t.line[12:], sigma=t.sigma[12:], seen=t.seen[12:]) if hidden else t
+        for t, hidden in zip(traced[0][0], some, strict=True)
+    ]
+    data = track(filmed.cameras, [[later], traced[1]], 1000.0).to_dataset().isel(whisker=0)
+    away = np.linalg.norm(data["base_position"].values - true, axis=1)
+    assert np.nanmedian(away[some]) < 0.3e-3
+    assert np.nanmedian(away[~some]) < 0.3e-3

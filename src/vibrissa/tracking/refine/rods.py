@@ -30,6 +30,8 @@ _END = 1.0  # standard deviation of a trace's ends along it, pixels
 # Distance, in pixels, from which the end of a trace is not the tip, and in standard deviations,
 # from which an error shows that something else is wrong and is weighted down.
 FAR = 6.0
+# The same in standard deviations of where a trace begins.
+_SPREAD = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +45,7 @@ class TraceSeries:
     ends: Array  # (time, view, 2): 1 where the whisker is seen to begin and to end there, else 0
     skew: Array  # (time, view): third cumulant of its darkness across it, pixels³
     shift: Array  # (time, view, 4): by how much a shaking camera moved the image; see `Trace`
+    begin: Array  # (time, view): standard deviation of where it begins along it, pixels
 
     @classmethod
     def of(cls, traces: Sequence[Sequence[Trace]]) -> TraceSeries:
@@ -51,6 +54,7 @@ class TraceSeries:
         line, sigma, seen = np.full((*shape, 2), np.nan), np.full(shape, np.nan), np.zeros(shape)
         confidence, ends = np.zeros(shape[:2]), np.zeros((*shape[:2], 2))
         skew, shift = np.full(shape[:2], np.nan), np.zeros((*shape[:2], 4))
+        begin = np.full(shape[:2], _END)
         for view, row in enumerate(traces):
             for i, trace in enumerate(row):
                 n = len(trace.line)
@@ -66,7 +70,8 @@ class TraceSeries:
                 )
                 confidence[i, view], skew[i, view] = trace.confidence, trace.skew
                 ends[i, view] = trace.base_seen, trace.tip_seen
-        return cls(line, sigma, seen, confidence, ends, skew, shift)
+                begin[i, view] = max(trace.begin_sigma, _END)
+        return cls(line, sigma, seen, confidence, ends, skew, shift, begin)
 
     def rows(self, frames: NDArray[np.intp]) -> TraceSeries:
         """Select frames."""
@@ -91,7 +96,7 @@ class TraceSeries:
         count, n, _, unknowns = slopes.shape
         rows = np.zeros((count, n + 2, unknowns))
         misses, weights = np.zeros((2, count, n + 2))
-        traces = self.line, self.sigma, self.tangent, self.ends, self.longest
+        traces = self.line, self.sigma, self.tangent, self.ends, self.longest, self.begin
         compare(traces, view, pixels, np.ascontiguousarray(slopes), (rows, misses, weights))
         return rows, misses, weights
 
@@ -99,7 +104,7 @@ class TraceSeries:
 @kernel
 def compare(traces: Any, view: int, pixels: Any, slopes: Any, found: Any) -> None:
     """Compare points with the traces of a view; all remains 0 where a trace is lost."""
-    line, sigma, tangent, ends, longest = traces
+    line, sigma, tangent, ends, longest, begin = traces
     rows, misses, weights = found
     n, nodes = pixels.shape[1], line.shape[2]
     for t in range(pixels.shape[0]):
@@ -135,11 +140,14 @@ def compare(traces: Any, view: int, pixels: Any, slopes: Any, found: Any) -> Non
             j, i = (0, 0) if end == 0 else (n - 1, nodes - 1)
             tx, ty = way[i, 0], way[i, 1]
             gap = (path[i, 0] - pixels[t, j, 0]) * tx + (path[i, 1] - pixels[t, j, 1]) * ty
-            if ends[t, view, end] > 0.5 and abs(gap) < (np.inf if end == 0 else FAR):
-                misses[t, n + end], weights[t, n + end] = gap / _END, 1.0 / _END
+            # Where the whisker is taken to begin elsewhere at first, it also ends there.
+            most = np.inf if end == 0 else max(FAR, _SPREAD * begin[t, view])
+            if ends[t, view, end] > 0.5 and abs(gap) < most:
+                sure = 1.0 / (begin[t, view] if end == 0 else _END)
+                misses[t, n + end], weights[t, n + end] = gap * sure, sure
                 for k in range(slopes.shape[3]):
                     pull = tx * slopes[t, j, 0, k] + ty * slopes[t, j, 1, k]
-                    rows[t, n + end, k] = pull / _END
+                    rows[t, n + end, k] = pull * sure
 
 
 UNKNOWNS = 10  # number of a frame's unknowns: shift (3), turn (3), s_c, f_x, f_y, f_z

@@ -23,7 +23,7 @@ from vibrissa.cameras import Camera, triangulate
 from vibrissa.deferred import interpolate
 from vibrissa.numerics import Mask, kernel
 from vibrissa.tracking.trace.start import base_gap
-from vibrissa.tracking.trace.trace import Trace, arc_lengths, interpolated, nearest
+from vibrissa.tracking.trace.trace import STEP, Trace, arc_lengths, interpolated, nearest
 
 Array = NDArray[np.float64]
 
@@ -51,8 +51,9 @@ _BEYOND = 6.0  # distance of a tip from the end of a trace above which it is not
 # a trace within which that is, if they also end together, and if not.
 _APART, _NEARER, _CUTS = 2.0, 0.4, (0.25, 0.08)
 # Number of frames by which the part is measured that only one view shows; share of the whisker, as
-# its inverse, whose direction that has; and smallest length of its image, pixels.
-_SOME, _NEAR_BASE, _TINY = 9, 10, 1.0
+# its inverse, whose direction that has; smallest length of its image, pixels; and percentile of
+# lengths that is the whisker's.
+_SOME, _NEAR_BASE, _TINY, _USUAL = 32, 10, 1.0, 75.0
 # Standard deviation of the distance from the plane in which a single view's whisker is, m.
 _LEVEL = 1e-7
 # Standard deviation of a point's motion along the curve in a round, in units of their distance.
@@ -155,10 +156,15 @@ def begun_together(
     for (i, view, part), gap in zip(parts, away[:-1], strict=True):
         if len(part) and gap.min() < best[i][0]:
             best[i] = gap.min(), view, int(np.argmin(gap))
+    more = np.zeros(len(pairs))
     for i, (_, view, first) in best.items():
         one = pairs[i][view]
+        more[i] = STEP * first * (1 - 2 * view)
         one = one._replace(line=one.line[first:], sigma=one.sigma[first:], seen=one.seen[first:])
         pairs[i] = (one, pairs[i][1]) if view == 0 else (pairs[i][0], one)
+    # Where one view shows more in some frames only, both begin elsewhere on the whisker in these.
+    sigma = max(0.5 * float(np.ptp(np.percentile(more[whole], [16.0, 84.0]))), 1.0)
+    pairs = [tuple(trace._replace(begin_sigma=sigma) for trace in both) for both in pairs]
     return [list(view) for view in zip(*pairs, strict=True)]
 
 
@@ -169,7 +175,7 @@ def shown_by_one(
 ) -> float:
     """Length of a whisker, m, that only one view shows before where both do; see `begun_together`.
 
-    It is the median over some of the frames, in the view in which that is longest.
+    It is that of the frames that show most of the whisker, in all views and in one.
     """
     whole = [both for both in zip(*traces, *begun, strict=True) if all(map(_usable, both))]
     if len(cameras) == 1 or not whole:
@@ -181,9 +187,11 @@ def shown_by_one(
         images = [camera.project(near) for camera in cameras]
         seen = np.linalg.norm(np.diff(images, axis=1), axis=2).sum(axis=1)
         cut = [both[v].length - both[v + len(cameras)].length for v in range(len(cameras))]
-        lengths.append(np.array(cut) * arc_lengths(near)[-1] / np.maximum(seen, _TINY))
+        more = np.max(np.array(cut) * arc_lengths(near)[-1] / np.maximum(seen, _TINY))
+        lengths.append((curve.length, curve.length + more))
     known = np.isfinite(lengths).all(axis=1)
-    return float(np.median(np.array(lengths)[known], axis=0).max()) if known.any() else 0.0
+    shown = np.percentile(np.array(lengths)[known], _USUAL, axis=0) if known.any() else np.zeros(2)
+    return float(shown[1] - shown[0])
 
 
 def _usable(trace: Trace) -> bool:

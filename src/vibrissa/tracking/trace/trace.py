@@ -93,6 +93,8 @@ class Trace(NamedTuple):
         Shift of the image along columns and rows by a camera that shakes, which is taken out of
         the line, and the standard deviations of what is left of both, pixels; NaN if nothing
         shows whether it shakes.
+    begin_sigma : float
+        Standard deviation, along it, of where on the whisker it begins, pixels.
     """
 
     line: Array
@@ -104,6 +106,7 @@ class Trace(NamedTuple):
     skew: float = np.nan
     sparse: bool = False
     shift: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    begin_sigma: float = 1.0
 
     @classmethod
     def lost(cls) -> Trace:

@@ -320,7 +320,7 @@ def test_parts_of_a_whisker_are_trusted_as_far_as_their_residuals_allow():
 
 def test_frames_that_the_rod_does_not_explain_are_noted(filmed):
     nothing = np.full((20, 2, 101, 2), np.nan)
-    numbers = (np.zeros((20, *shape)) for shape in ((2,), (2, 2), (2,), (2, 4)))
+    numbers = (np.zeros((20, *shape)) for shape in ((2,), (2, 2), (2,), (2, 4), (2,)))
     series = TraceSeries(nothing, *[nothing[..., 0]] * 2, *numbers)
     misfit = np.where(np.arange(20) < 3, 5.0, 0.3)
     length = Length(10e-3, 0.0)

@@ -512,7 +512,7 @@ def remarks_on_hook(one: Tracked, name: str) -> list[str]:
     return [
         f"{name}: over {over:.1f} mm next to its base its traces are on something else in all "
         "frames, such as fur, a hair or a neighbour that was cut, up to "
-        f"{1e6 * largest:.0f} µm beside it: it is taken to go on there as smoothly as beyond, and "
+        f"{1e6 * largest:.0f} µm from it: it is taken to go on there as smoothly as beyond, and "
         f"its base to be known to {1e6 * one.hook.sigma:.0f} µm."
     ]
 

@@ -36,7 +36,8 @@ _WHOLE, _AS_WELL = 7, 2.0
 # Size of a hook from which it counts, pixels and in standard deviations.
 _LARGE, _SURE = 0.3, 2.0
 # Standard deviation of where a whisker goes on: in that of the fit, as long waves of the errors are
-# like polynomials; share of the difference made by another degree; and the smallest one, pixels.
+# like polynomials; share of the difference made by another degree; and the smallest one, pixels, by
+# which a shape must be aside for its traces not to count.
 _WAVES, _OTHER, _LEAST = 3.0, 0.5, 0.1
 
 
@@ -45,6 +46,7 @@ class Hook:
     """Part of a shape at rest that is not on the whisker."""
 
     count: int  # number of its points
+    apart: int  # number of the points of which traces show something else
     aside: Array  # (n, 3): by how much all points of the shape are aside, m; 0 beyond
     sigma: float  # standard deviation of the base where the whisker goes on smoothly, m
     lean: float  # the same of the tangent there, rad
@@ -74,9 +76,11 @@ def hook_of(shape: RestShape, pixel: float) -> Hook | None:
     differs = _OTHER * np.linalg.norm(other.begin(count) - smooth.begin(count), axis=1)
     usual = _LEAST * pixel * np.array([1.0, 1.0 / max(count, 1)])
     sigma, lean = np.sqrt((_WAVES * smooth.errors(count)) ** 2 + differs**2 + usual**2)
-    if np.linalg.norm(aside, axis=1).max() < max(_LARGE * pixel, _SURE * sigma):
+    size = np.linalg.norm(aside, axis=1)
+    if size.max() < max(_LARGE * pixel, _SURE * sigma):
         return None
-    return Hook(count, aside, float(sigma), float(lean / shape.spacing))
+    apart = int(np.flatnonzero(size > _LEAST * pixel)[-1]) + 1
+    return Hook(count, apart, aside, float(sigma), float(lean / shape.spacing))
 
 
 class _Smooth(NamedTuple):
@@ -147,7 +151,7 @@ def straightened(
 def off_hook(
     cameras: Sequence[Camera], traces: TraceSeries, curves: Array, hook: Hook | None
 ) -> tuple[TraceSeries, TraceSeries]:
-    """Traces that do not show the whisker up to the end of a hook, and those for its fit.
+    """Traces that do not show the whisker where a hook is, and those for its fit.
 
     Curves (time, n, 3) are in the laboratory. The fit does not compare that part.
     """
@@ -155,7 +159,7 @@ def off_hook(
         return traces, traces
     hooked = np.zeros(traces.seen.shape, dtype=bool)
     known = np.isfinite(curves).all(axis=(1, 2))
-    ends, numbers = curves[known][:, hook.count], np.arange(traces.line.shape[2])
+    ends, numbers = curves[known][:, hook.apart], np.arange(traces.line.shape[2])
     for view, camera in enumerate(cameras):
         away = np.linalg.norm(traces.line[known, view] - camera.project(ends)[:, None], axis=2)
         hooked[known, view] = numbers <= np.argmin(away, axis=1)[:, None]

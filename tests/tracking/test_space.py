@@ -208,6 +208,10 @@ def test_frames_that_repeat_the_one_before_are_left_out():
     assert [i for i, trace in enumerate(first) if not len(trace.line)] == [30, 40, 41, 42]
     assert second == rows[1]
     assert f"{pair[0].name}: 4 of 70 frames repeat the one before (30, 40, 41, 42)" in remark
+    # A whisker of a row that stops alone does so by itself.
+    moving = [[traced(camera, curve(a), generator) for a in azimuth] for camera in pair]
+    assert without_repeats(pair, [rows, moving])[1] == []
+    assert len(without_repeats(pair, [rows, rows, moving])[1]) == 1
 
 
 def test_a_repeated_frame_in_which_an_object_lets_go_is_found():

@@ -149,10 +149,6 @@ class TrackOptions:
         """Whether forces have the scale of a radius at the base, which is stated."""
         return bool({"base_radius", "rat"} & self.properties.keys())
 
-    def hidden_by(self, more: float) -> TrackOptions:
-        """Options of a whisker of which so much more, m, is hidden in one of the views."""
-        return replace(self, fur=self.fur + more * self.scaled)
-
     @property
     def at_base(self) -> dict[str, Any]:
         """Radius, material and hidden length of the whisker, as arguments of `whisker_at_rest`."""
@@ -220,14 +216,9 @@ def track(
         If views and whiskers do not fit together, or no whisker can be tracked.
     """
     options = options or TrackOptions()
+    count = _whiskers_in(traces, len(cameras))
     if sample and len(sample) != len(cameras):
         raise ValueError(f"sample has frames of {len(sample)} views; there are {len(cameras)}")
-    counts = {len(view) for view in traces}
-    if len(traces) != len(cameras) or len(counts) != 1 or 0 in counts:
-        raise ValueError(
-            f"{len(cameras)} cameras and {[len(view) for view in traces]} whiskers in the views do "
-            "not fit: every view needs all whiskers"
-        )
     if not (np.isfinite(rate) and rate > 0.0):
         raise ValueError(f"rate is {rate!r}; it must be positive, in frames per second")
     timed = best_seen(traces)
@@ -238,18 +229,17 @@ def track(
     if options.rough and len(cameras) > 1:
         optics, cameras, doubts = _corrected(cameras, timed, pairs, options.distance)
     moving = None if head is None else HeadPose.of(head, pairs[:, 0], rate)
-    found, remarks = [], doubts + remarks_on_time(cameras, timed, options.offset)
-    count = counts.pop()
+    found, remarks = list[Tracked](), doubts + remarks_on_time(cameras, timed, options.offset)
     called = [f"whisker {k}" for k in range(count)] if names is None else list(names)
     timed_rows = [[[row[i] for i in pairs[:, v]] for row in view] for v, view in enumerate(traces)]
     rows = [list(row) for row in zip(*timed_rows, strict=True)]
 
     def tracked(k: int, used: Sequence[Sequence[Trace]]) -> Tracked:
-        given = moving, objects, sample, count > 1
-        own = options.hidden_by(hidden[k])
-        one = track_whisker(cameras, used, rate, own, called[k], progress, *given)
-        scale = scale_sigma(one.whisker, options.fur, hidden[k]) if options.scaled else np.nan
-        return replace(one, scale=scale)
+        own = replace(options, fur=options.fur + hidden[k] * options.scaled)
+        given = called[k], progress, moving, objects, sample, count > 1
+        one = track_whisker(cameras, used, rate, own, *given)
+        scale = scale_sigma(one.whisker, options.fur, hidden[k])
+        return replace(one, scale=scale if options.scaled else np.nan)
 
     known = partial(known_of, cameras, rate=rate, options=options.fit)
     kept, repeats = without_repeats(cameras, rows)
@@ -296,6 +286,17 @@ def _with_cameras_unsure(
     fit = with_shift_unsure(cameras, one.fit, one.traces.shift)
     fit = with_depth_unsure(cameras, fit, options.rough, options.distance)
     return replace(one, fit=fit if optics is None else with_optics_unsure(fit, optics))
+
+
+def _whiskers_in(traces: Sequence[Sequence[Sequence[Trace]]], views: int) -> int:
+    """Number of whiskers; raise a ValueError if the views do not all have them."""
+    counts = [len(view) for view in traces]
+    if len(counts) != views or len(set(counts)) != 1 or 0 in counts:
+        raise ValueError(
+            f"{views} cameras and {counts} whiskers in the views do not fit: every view needs all "
+            "whiskers"
+        )
+    return counts[0]
 
 
 def _remarks_on_one(

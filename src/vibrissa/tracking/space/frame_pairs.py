@@ -40,6 +40,7 @@ _POWERS = (1.0, 0.5, 0.0)  # of the weights of frames whose errors are alike, fo
 # them, pixels; their own steps, as a share of that and at most, pixels; and the least of the step
 # before them, as a share of the even one.
 _RUN, _MOVES, _STOPS, _SAME, _EVENLY = 3, 0.35, 0.3, 0.25, 0.4
+_SEVERAL = 3  # number of such frames of a video from which the recorder repeats frames
 _ALONG = np.linspace(0.1, 0.9, 9)  # shares of a trace at which its step is measured
 NEAR = 3  # offsets that differ by so many frames are not distinguished when one is confirmed
 
@@ -83,18 +84,22 @@ def without_repeats(
     """Traces by whisker, view and frame without those of repeated frames, and remarks on these."""
     kept, remarks = [[list(row) for row in one] for one in rows], []
     for v, camera in enumerate(cameras):
-        repeats = sorted(set().union(*(repeated_frames(one[v]) for one in rows)))
+        stops = [repeated_frames(one[v]) for one in rows]
+        # A camera that repeats a frame stops all whiskers, of which some may be lost or rest.
+        most = len(stops) // 2
+        every = sorted(set[int]().union(*stops))
+        repeats = [i for i in every if sum(i in own for own in stops) > most]
+        if len(repeats) < _SEVERAL:
+            continue
         for one in kept:
             for i in repeats:
                 one[v][i] = Trace.lost()
-        if repeats:
-            listed = ", ".join(map(str, repeats[:5])) + ", …" * (len(repeats) > 5)
-            remarks.append(
-                f"{camera.name}: {len(repeats)} of {len(kept[0][v])} frames repeat the one before "
-                f"({listed}), as where frames were dropped or the frame rate was converted; "
-                "whiskers move on in the next. They are left out: record or convert every frame "
-                "once."
-            )
+        listed = ", ".join(map(str, repeats[:5])) + ", …" * (len(repeats) > 5)
+        remarks.append(
+            f"{camera.name}: {len(repeats)} of {len(kept[0][v])} frames repeat the one before "
+            f"({listed}), as where frames were dropped or the frame rate was converted; whiskers "
+            "move on in the next. They are left out: record or convert every frame once."
+        )
     return kept, remarks
 
 

@@ -287,6 +287,18 @@ def test_flickering_light_moves_nothing(films):
     assert not start.doubts
 
 
+def test_saturated_ground_shows_no_tip(films):
+    """Thin tips are not seen there, at different lengths in the views."""
+    film = films(200)
+    bright = [
+        [np.clip(2.0 * frame, 0, 255).astype(np.uint8) for frame in view] for view in film.frames
+    ]
+    assert min((view[0] == 255).mean() for view in bright) > 0.3
+    start = find_start(film.cameras, bright)
+    assert max(misses(film, start)) < 5.0
+    assert not start.doubts
+
+
 def test_a_lamp_that_is_off_at_first_hides_no_whisker(films):
     """Divided by their brightness, dark frames are noise, which is no background."""
     film, generator = films(200), np.random.default_rng(0)

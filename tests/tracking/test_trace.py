@@ -338,6 +338,16 @@ def test_a_speck_far_behind_an_object_is_not_the_whisker(dash, end):
     assert trace.line[-1, 0] == pytest.approx(end, abs=5.0)
 
 
+def test_saturated_ground_hides_the_noise():
+    """A fifth of an image shows it, as bodies, whiskers and wires do."""
+    rng = np.random.default_rng(0)
+    image = np.full((200, 300), 290.0)
+    image[:, :60] = 120.0
+    frame = np.clip(image + rng.normal(0.0, 4.0, image.shape), 0, 255).astype(np.uint8)
+    assert ridge.noise_level(frame) == pytest.approx(4.0, rel=0.1)
+    assert ridge.noise_level(frame[:, 70:]) < 0.5
+
+
 def test_what_shows_nothing_of_a_whisker_is_lost():
     """Behind something static, and in noise before it: it had become a line of one point."""
     noise = 2.0

@@ -110,19 +110,32 @@ def middle_of(histogram: Any, count: int, width: int) -> Any:
     return 0.0
 
 
+#: Share of pixels that are not saturated from which they show the noise.
+_UNSATURATED = 0.05
+
+
 @kernel
 def noise_level(frame: Any) -> float:
     """Standard deviation of the noise, from second differences on a sparse grid.
 
     Compression removes fine noise and leaves coarse noise: the larger of that of single pixels and
-    of the differences used by `depth` counts.
+    of the differences used by `depth` counts. Saturated pixels show no noise, but what is seen
+    before them has it; they do not count unless there is hardly anything else.
     """
     rows, columns = frame.shape
     fine, coarse = np.zeros(4096, np.int64), np.zeros(4096, np.int64)
+    part = frame[3 : rows - 3 : 9, 5 : columns - 5 : 7]
+    darkest, lightest, clipped = part.min(), part.max(), 0
+    for row in range(part.shape[0]):
+        for column in range(part.shape[1]):
+            clipped += part[row, column] == darkest or part[row, column] == lightest
+    every = part.size - clipped < _UNSATURATED * part.size
     count = 0
     for row in range(3, rows - 3, 9):
         for column in range(5, columns - 5, 7):
             p = frame[row, column - 5 : column + 6]
+            if not every and (p[5] == darkest or p[5] == lightest):
+                continue
             d = abs(2 * int(p[5]) - int(p[3]) - int(p[7]))
             left = int(p[0]) + int(p[1]) + int(p[2])
             right = int(p[8]) + int(p[9]) + int(p[10])

@@ -483,16 +483,21 @@ class _Search:
         return not any(self._cut(view, curve) for view, curve in enumerate(one.curves))
 
     def _cut(self, view: int, curve: Curve) -> bool:
-        """Whether something static, or the image's border, may cut a line."""
+        """Whether something static or the image's border may cut a line, or saturated ground."""
         if view not in self.still:
             base, frames = curve.line[:1], self.frames[view]
             self.still[view] = self.scenes[view].with_still(base, frames).bits
         bits, (before, last) = self.still[view], curve.line[[-_LAST, -1]]
         ahead = np.linspace(0.0, _CUT, 9)[:, None] * (last - before)
         ahead = last + ahead / max(float(np.hypot(*(last - before))), 1e-9)
-        size = np.array(self.frames[view][0].shape[::-1]) - 1.0
-        outside = bool(((ahead < 0.0) | (ahead > size)).any())
-        return outside or (bits is not None and bool(Clutter(bits, 0).disturbs(ahead).any()))
+        frame = self.frames[view][0]
+        size = np.array(frame.shape[::-1]) - 1.0
+        if ((ahead < 0.0) | (ahead > size)).any():
+            return True
+        column, row = np.rint(ahead).astype(np.intp).T
+        if np.median(frame[row, column]) >= np.iinfo(frame.dtype).max:
+            return True
+        return bits is not None and bool(Clutter(bits, 0).disturbs(ahead).any())
 
     def worth(self, moments: Sequence[int]) -> float:
         """Evidence of whiskers in some frames."""

@@ -237,8 +237,10 @@ class Bent(NamedTuple):
         )
         ahead = ahead.reshape(4, len(loaded), _SAMPLES, 3)
         rows = np.where(touching, np.cumsum(touching) - 1, -1)
-        turned = points[1 + rows] @ np.swapaxes(state.rotation, 1, 2)
-        return cls(turned, rows, (ahead - points[1:]) / _STEP, state.rotation)
+        with np.errstate(invalid="ignore"):  # rods without equilibrium, which are `wild`
+            turned = points[1 + rows] @ np.swapaxes(state.rotation, 1, 2)
+            change = (ahead - points[1:]) / _STEP
+        return cls(turned, rows, change, state.rotation)
 
     @property
     def wild(self) -> Mask:

@@ -72,6 +72,15 @@ def test_whether_one_object_has_friction_is_one_question(gamma_map, ratio, absen
         assert missed(found, truth) < 0.8 * missed(alone, truth)
 
 
+def test_one_measurement_of_an_object_decides_by_itself(gamma_map):
+    """Evidence that each of several contributes is bounded, which would widen its covariance."""
+    _, _, signals = rubbed(gamma_map, 0.3, seed=4)
+    how = {"using": "Fx FT FD Mx MB MD", "noise": NOISE, "friction": 0.3}
+    one = {name: values[:1] for name, values in signals.items()}
+    alone, found = (gamma_map.estimate(one, **how, same_friction=same) for same in (False, True))
+    np.testing.assert_array_equal(found.covariance, alone.covariance)
+
+
 @pytest.mark.parametrize("using", ["Fx FT MB MD", "Fx FT FD Mx MB MD"])
 def test_a_prior_of_friction_costs_little_where_there_is_none(gamma_map, using):
     """Half of it is that there is none, which signals that determine friction then decide."""

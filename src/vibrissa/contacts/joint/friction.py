@@ -370,7 +370,7 @@ def or_without(
     turned = out.angle_sigma[row, place]
     share = out.probability[row, place]
     odds = share * sigma / turned * np.exp(-0.5 * (angle / turned) ** 2)
-    if alike:
+    if alike and len(row) > 1:
         odds = np.full_like(odds, _odds_of_all(angle, turned, sigma))
     weight = odds / (share + odds)
     likelier = weight > 0.5

@@ -146,6 +146,9 @@ def test_the_candidates_of_ambiguous_rows_are_in_a_second_table(folder, chart):
         assert away.max() > 1e-3
     run("estimate", of_wrench, "--map", chart, "-o", out, "--force")  # all are unique now
     assert not (folder / "several_candidates.csv").exists()
+    read = of_wrench.rename(folder / "several_candidates.csv")
+    with pytest.raises(ValueError, match="is read, and would be replaced"):
+        run("estimate", read, "--map", chart, "-o", out, "--force")
 
 
 def test_signals_without_noise_are_not_compared_with_it(folder, chart, table):

@@ -275,8 +275,10 @@ def estimate(
     if added:
         inputs.free_beside(signals, [target], force)
     else:
-        spare(target, signals)
-        free([target, _candidates_beside(target)], force)
+        written = target, _candidates_beside(target)
+        for path in written:
+            spare(path, signals)
+        free(written, force)
     if known.around is not None:
         known.check(how, weight)
         if sensor is not None:

@@ -330,13 +330,29 @@ def test_a_point_far_away_does_not_set_the_scale_of_the_others(joint_errors):
     assert not fit.inliers[7]
 
 
+def test_contacts_count_where_most_of_them_are_at_one_point(joint_errors):
+    """An object was touched for long at one point, and then elsewhere."""
+    points, known = noisy("cylinder", joint_errors, np.random.default_rng(4), 100)
+    rows = np.r_[np.zeros(200, dtype=int), np.arange(100)]
+    points, known = points[rows], {name: values[rows] for name, values in known.items()}
+    points[:200] += 1e-7 * np.random.default_rng(5).normal(size=(200, 3))
+    assert fit_shape("cylinder", points, **known).inliers[200:].mean() > 0.9
+
+
 def test_standard_deviations_and_millimetres_are_not_taken_for_what_is_needed(joint_errors):
     points, known = noisy("cylinder", joint_errors, np.random.default_rng(4), 100)
     alike = np.broadcast_to(4e-5 * np.eye(3), (100, 3, 3))  # m, not m²
     with (
-        pytest.warns(UserWarning, match="must be in m²"),
+        pytest.warns(UserWarning, match="covariance is not in m²"),
         pytest.raises(ValueError, match="hollow"),
     ):
         fit_shape("cylinder", points, alike, known["whisker_radius"])
     with pytest.raises(ValueError, match="larger than the extent of the contacts"):
         fit_shape("cylinder", points, known["covariance"], 1e3 * known["whisker_radius"])
+
+
+def test_a_stout_rod_may_touch_a_small_part_of_a_plane():
+    """A robot's whisker of 1 mm radius, whose contacts are within half a millimetre."""
+    points = np.random.default_rng(4).normal(size=(40, 3)) * [4e-4, 4e-4, 1e-6]
+    fit = fit_shape("plane", points, np.tile(1e-12 * np.eye(3), (40, 1, 1)), 1e-3)
+    assert abs(fit.normal[2]) > 0.999

@@ -23,10 +23,12 @@ from vibrissa.quantities import QUANTITIES, attributes
 
 # Smallest standard deviation, over the points' extent, which replaces zero noise.
 FLOOR = 1e-7
-# Distance from the middle of the contacts, over its median, above which a contact is ignored.
-_ASTRAY = 100.0
-# Median standard deviation of contacts, m, above which it is doubted if it exceeds their extent.
-_VAGUE = 2e-3
+# Distance from the middle of the contacts, over the largest without the farthest contacts, above
+# which these are ignored; and how many they are at most, as a share.
+_ASTRAY, _FARTHEST = 100.0, 0.02
+# Median standard deviation of contacts, and radius of the whisker, m, above which they are in other
+# units if they exceed the extent of the contacts.
+_VAGUE, _STOUT = 2e-3, 5e-3
 # Smallest variance of a combination, over that of the point or normal.
 _FINE = 1e-10
 # Largest negative eigenvalue of a covariance that is attributed to rounding, over the largest.
@@ -151,10 +153,12 @@ def _scale_contacts(what: str, arrays: dict[str, Array], n: int, least: int) -> 
     if "normals" in arrays:
         length = np.linalg.norm(arrays["normals"], axis=1)
         usable &= length > 0.0
-    if usable.any():  # one point that is wildly wrong would set the scale of all others
+    if usable.sum() >= least:  # one that is wildly wrong would set the scale of all others
         middle = np.median(arrays["points"][usable], axis=0)
         away = np.linalg.norm(arrays["points"] - middle, axis=1)
-        reach = _ASTRAY * np.median(away[usable])
+        # Most contacts may be at one point, where an object was touched for long.
+        most = max(1, int(_FARTHEST * usable.sum()))
+        reach = _ASTRAY * np.sort(away[usable])[-1 - most]
         usable &= (away <= reach) | (reach == 0.0)
     if usable.sum() < least:
         raise ValueError(f"no {what}: {usable.sum()} usable points; at least {least} are needed")
@@ -163,7 +167,7 @@ def _scale_contacts(what: str, arrays: dict[str, Array], n: int, least: int) -> 
     centered = kept["points"] - mean
     extent = float(np.sqrt((centered**2).sum(axis=1).mean()))
     radius = float(np.median(kept["whisker_radius"]))
-    if radius > extent:
+    if radius > max(_STOUT, extent):
         raise ValueError(
             f"no {what}: whisker_radius, {radius:.3g} m, is larger than the extent of the "
             f"contacts, {extent:.3g} m; both must be in m"
@@ -178,7 +182,8 @@ def _scale_contacts(what: str, arrays: dict[str, Array], n: int, least: int) -> 
         if (sigma := extent * float(np.sqrt(np.median(variance)))) > max(_VAGUE, extent):
             warnings.warn(
                 f"the median standard deviation of the contacts, {1e3 * sigma:.2g} mm, is larger "
-                f"than their extent, {1e3 * extent:.2g} mm: the covariance must be in m²",
+                f"than their extent, {1e3 * extent:.2g} mm: they hardly show a shape, or the "
+                "covariance is not in m²",
                 UserWarning,
                 stacklevel=4,
             )

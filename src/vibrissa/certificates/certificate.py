@@ -38,7 +38,7 @@ from vibrissa.certificates.conditions import (
 from vibrissa.certificates.domain import Bounds, bounds_of, is_planar, objection, room_within
 from vibrissa.certificates.equations import ExactRod, exact_rod
 from vibrissa.certificates.search import bounds, cover, volume
-from vibrissa.io import read_dataset, write_netcdf
+from vibrissa.io import in_file, read_dataset, write_netcdf
 from vibrissa.numerics import Array, IntArray, share_out
 from vibrissa.signals import CONE
 
@@ -378,7 +378,8 @@ class Certificate:
             )
         if identity(data) != data.attrs.get("identity"):
             raise ValueError(
-                "the certificate has been modified since it was written, or is of another version"
+                "the certificate has been modified since it was written, or is of another version: "
+                "compute a new one, in another file"
             )
         evaluated = np.atleast_1d(data.attrs["evaluated"])
         parts = {
@@ -431,7 +432,8 @@ def load_certificate(path: str | PathLike[str]) -> Certificate:
     Certificate
         Certificate in the file.
     """
-    return Certificate.from_dataset(read_dataset(Path(path)))
+    with in_file(path):
+        return Certificate.from_dataset(read_dataset(Path(path)))
 
 
 def _percent(part: Part) -> str:

@@ -654,6 +654,9 @@ def test_a_whisker_that_is_never_free_or_seen_says_so(filmed, traces):
         track(filmed.cameras, [traces[0], []], 1000.0)
     with pytest.raises(ValueError, match="rate is 0"):
         track(filmed.cameras, traces, 0.0, TrackOptions())
+    few = track(filmed.cameras, [[row[:3] for row in view] for view in traces], 1000.0)
+    assert not few["in_contact"].any()
+    assert np.isfinite(few["base_position"]).all()
 
 
 def test_the_rest_shape_ignores_how_it_is_held():

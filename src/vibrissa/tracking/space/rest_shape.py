@@ -465,7 +465,7 @@ def _largest_group(shapes: Array, least: float) -> tuple[int, Mask]:
 def _noise(values: Array, near: Mask | None = None) -> float:
     """Norm of what is independent from frame to frame in values (time, n), or in some frames."""
     change = np.linalg.norm(np.diff(values, 4, axis=0), axis=1) / 70.0**0.5
-    if near is not None:
+    if near is not None and change.size:
         change = change[np.lib.stride_tricks.sliding_window_view(near, 5).all(axis=1)]
     return float(np.median(change)) if change.size else 0.0
 

@@ -255,3 +255,4 @@ def test_times_in_ms_and_positions_in_mm_are_questioned(wire):
     for name, value in {"speed": 50.0, "pose_sigma": 0.1, "persistence": 50.0}.items():
         with pytest.warns(UserWarning, match=f"{name} is .*: is it in m"):
             vb.ContactFilter(estimator, **{name: value})
+    vb.ContactFilter(estimator, persistence=np.inf)  # a steady velocity, without a warning

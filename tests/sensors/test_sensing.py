@@ -249,7 +249,7 @@ def test_channels_that_the_loads_do_not_explain_are_named(rng):
     wrenches = rng.normal(size=(60, 6)) * np.repeat([5e-5, 1e-6], 3)
     readings = wrenches @ np.diag([1e4] * 3 + [1e6] * 3) + 1e-3 * rng.normal(size=(60, 6))
     for wrong in (np.roll(readings, 1, axis=0), np.where(readings == readings[3], 1e3, readings)):
-        with pytest.warns(UserWarning, match="the loads explain little of the readings"):
+        with pytest.warns(UserWarning, match="the loads explain only a part of the readings"):
             calibrate_mixing(wrong, wrenches)
     dead = np.where(np.arange(6) == 4, 0.3, readings)
     with pytest.raises(ValueError, match="channel 5 always read the same"):

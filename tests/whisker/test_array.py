@@ -291,6 +291,7 @@ def test_one_name_or_column_may_be_given_alone_and_others_are_no_names():
     assert list(ARRAY.select(side="left", rows="C", columns=2)) == ["LC2"]
     assert list(vb.whisker_array("left", rows="C", columns=2)) == ["LC2"]
     assert list(vb.whisker_array("left", names="gamma")) == ["Lγ"]
+    assert list(vb.whisker_array("left", rows="C", columns=np.arange(3)[2])) == ["LC2"]
     for other in (3, None, slice(2)):
         with pytest.raises(KeyError, match="not a whisker's name"):
             ARRAY[other]

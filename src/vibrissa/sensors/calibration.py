@@ -178,14 +178,15 @@ def _doubt_channels(names: Sequence[str], spread: Array, residual: Array) -> Non
             f"{', '.join(dead)} always read the same: omit channels that are not connected"
         )
     loose = [
-        f"{name} ({1.0 - (left / of) ** 2:.0%})"
+        f"{name} ({max(1.0 - (left / of) ** 2, 0.0):.0%})"
         for name, of, left in zip(names, spread, residual, strict=True)
         if left > _UNEXPLAINED * of
     ]
     if loose:
         warnings.warn(
-            f"the loads explain little of the readings of {', '.join(loose)}: do the rows of both "
-            "belong together, are there outliers, or do the channels read other components too?",
+            f"the loads explain only a part of the readings of {', '.join(loose)}: do the rows of "
+            "both belong together, are there outliers or much noise, or do the channels read other "
+            "components too?",
             UserWarning,
             stacklevel=3,
         )

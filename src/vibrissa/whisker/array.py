@@ -9,6 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from numbers import Integral
 from typing import Any, Literal, Unpack
 
 import numpy as np
@@ -129,7 +130,7 @@ class WhiskerArray(Mapping[str, Whisker]):
         WhiskerArray
             Array of these only.
         """
-        columns, names = _several(columns, int), _several(names, str)
+        columns, names = _several(columns), _several(names)
         keep = None if rows is None else {row.upper() for row in rows}
         which = None if columns is None else set(columns)
         kept = [
@@ -334,7 +335,7 @@ def whisker_array(
     >>> len(whisker_array()), list(whisker_array("left", rows="C", columns=[0, 1]))
     (62, ['LC1', 'Lγ'])
     """
-    columns, names = _several(columns, int), _several(names, str)
+    columns, names = _several(columns), _several(names)
     if names is not None:
         identities = [Identity.of(name) for name in names]
         away = [one.name for one in identities if one.side not in (None, *sides(side))]
@@ -354,9 +355,9 @@ def whisker_array(
     return WhiskerArray([average_whisker(one, **properties) for one in wanted])
 
 
-def _several(given: Any, kind: type) -> Any:
+def _several(given: Any) -> Any:
     """Several columns or names, of which one may be given alone."""
-    return [given] if isinstance(given, kind) else given
+    return [given] if isinstance(given, (str, Integral)) else given
 
 
 def average_whisker(identity: Identity, **properties: Unpack[Properties]) -> Whisker:

@@ -30,7 +30,7 @@ def question_parameters(
             f"speed is {speed:g} m/s, {speed / length:.3g} lengths of the whisker per second: is "
             "it in mm/s?"
         )
-    if persistence > _LASTING:
+    if _LASTING < persistence < np.inf:
         faults.append(f"persistence is {persistence:g} s: is it in ms?")
     if pose_sigma > _LOOSE * length:
         faults.append(

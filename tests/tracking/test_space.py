@@ -1,5 +1,7 @@
 """From two views to space: matching, uncertainty, timing, filtering."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
@@ -9,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from vibrissa.cameras import Camera, orthogonal_views
 from vibrissa.tracking import Trace, low_pass, merge, paired_frames, usual_cutoff
 from vibrissa.tracking.recording import remarks_on_time
+from vibrissa.tracking.refine import continuation
 from vibrissa.tracking.space.curve import begun_together, merged, shown_by_one
 from vibrissa.tracking.space.exchange import Known, exchanged
 from vibrissa.tracking.space.frame_pairs import clear_offsets, repeated_frames, without_repeats
@@ -387,3 +390,17 @@ def cut_at_crossing(one, other):
 def joined(one, a, other, b):
     line = np.concatenate([one.line[:a], other.line[b:]])
     return Trace(line, np.full(len(line), 0.03), np.ones(len(line), dtype=bool), 1.0)
+
+
+def test_a_whisker_is_not_continued_beyond_the_tip_that_is_shown(monkeypatch):
+    """Where its tip is not shown, its trace seems to go on along a neighbour."""
+    points, pair = curve(0.0), PAIRS["orthogonal"]
+    shape = RestShape(points, np.ones(16, dtype=bool), np.zeros(16), 1e-6)
+    tip = np.arange(16) < 7
+    posed = SimpleNamespace(
+        longer=lambda *_: np.where(tip, 0.0, 50.0),
+        reached=lambda view, points, pixels: 6e-5 * pixels,
+        traces=SimpleNamespace(ends=np.repeat(tip, 4).reshape(16, 2, 2)),
+    )
+    monkeypatch.setattr(continuation, "_posed", lambda *_: posed)
+    assert continuation.continued(shape, None, pair, None, None, False) is None

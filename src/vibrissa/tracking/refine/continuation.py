@@ -102,6 +102,8 @@ def continued(
     more, bending = first, np.zeros((3, 3))
     for _ in range(_ROUNDS):
         total, whole = length_shown(shape.length + more, at_tip)
+        if not total > shape.length:  # frames that show the tip show no more
+            return None
         longer, bending = _fitted(posed, shape, total)
         outer = longer.points[len(shape.points) - 1 :]
         more = posed.reached(view, outer, pixels[view])[known]

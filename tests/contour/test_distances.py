@@ -118,3 +118,7 @@ def test_negative_variances_and_other_things_than_objects_are_refused():
         ellipsoids(wrong)
     with pytest.raises(ValueError, match="an object or a fitted shape is needed"):
         compare_with("sphere", points)
+    axis = np.random.default_rng(1).normal(size=(50, 3, 1))
+    single = np.float32(1e-4 * axis @ np.swapaxes(axis, 1, 2))  # rounding makes some indefinite
+    assert np.linalg.eigvalsh(single.astype(float)).min() < 0.0
+    ellipsoids(single)

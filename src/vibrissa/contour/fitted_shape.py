@@ -33,6 +33,7 @@ _VAGUE, _STOUT = 2e-3, 5e-3
 _FINE = 1e-10
 # Largest negative eigenvalue of a covariance that is attributed to rounding, over the largest.
 _NEGATIVE = 1e-8
+_SINGLE = 1e-5  # the same for covariances of single precision, which are only drawn
 
 
 class Touches(NamedTuple):
@@ -133,7 +134,7 @@ def check_contacts(
 
 def check_variances(values: AnyArray) -> None:
     """Raise ValueError if eigenvalues (..., 3) of covariances, in ascending order, are negative."""
-    if (values[..., 0] < -_NEGATIVE * np.abs(values).max(axis=-1)).any():
+    if (values[..., 0] < -_SINGLE * np.abs(values).max(axis=-1)).any():
         raise ValueError("the covariance is invalid: a variance is negative")
 
 

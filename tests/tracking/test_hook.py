@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from vibrissa import Whisker
-from vibrissa.tracking import RestShape, track
+from vibrissa.recording import Recording
+from vibrissa.tracking import RestShape, TrackOptions, track
 from vibrissa.tracking.refine.hook import hook_of
 
 PIXEL = 1e-4
@@ -104,3 +105,32 @@ def test_a_base_that_one_view_hides_in_some_frames_is_one_point(filmed, traced):
     away = np.linalg.norm(data["base_position"].values - true, axis=1)
     assert np.nanmedian(away[some]) < 0.3e-3
     assert np.nanmedian(away[~some]) < 0.3e-3
+
+
+def test_a_radius_is_stated_where_most_of_a_base_is_shown(filmed, traced):
+    """In free frames one view shows it from 24 pixels farther out only, as does the rest shape."""
+    free = (filmed.truth["force"].values == 0.0).all(axis=1)
+    later = [
+        t._replace(line=t.line[12:], sigma=t.sigma[12:], seen=t.seen[12:]) if hidden else t
+        for t, hidden in zip(traced[0][0], free, strict=True)
+    ]
+    options = TrackOptions(properties={"base_radius": 50e-6})
+    radii = []
+    for rows in (traced[0], [later]):
+        whisker = Recording(track(filmed.cameras, [rows, traced[1]], 1000.0, options)).whisker()
+        at = 1.0 - (50e-6 - whisker.radius(0.0)) / (50e-6 - whisker.radius(whisker.length))
+        radii.append((at, whisker.length))
+    assert radii[0][0] > 0.98
+    assert radii[1][0] == pytest.approx(radii[1][1] / radii[0][1], abs=0.05)
+    assert radii[1][0] < 0.95
+
+
+def test_a_whisker_of_which_a_view_shows_a_stub_is_not_located(filmed, traced):
+    """It follows a neighbour that was cut at a fifth of the length that the other view shows."""
+    short = []
+    for trace in traced[0][0]:
+        n = len(trace.line) // 5
+        part = {name: getattr(trace, name)[:n] for name in ("line", "sigma", "seen")}
+        short.append(trace._replace(**part))
+    with pytest.raises(ValueError, match="too little of one whisker to locate it: top over"):
+        track(filmed.cameras, [[short], traced[1]], 1000.0)

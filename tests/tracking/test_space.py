@@ -64,8 +64,8 @@ def test_views_begin_where_both_show_the_whisker(points):
     begun = begun_together(cameras, [hidden, rows[1]])
     left = [curve.length for curve in merged(cameras, zip(*begun, strict=True))]
     more = shown_by_one(cameras, [hidden, rows[1]], begun)
-    assert more == pytest.approx(float(np.median(np.subtract(true, left))), abs=1e-4)
-    assert shown_by_one(cameras, rows, rows) == 0.0
+    assert more.more == pytest.approx(float(np.median(np.subtract(true, left))), abs=1e-4)
+    assert shown_by_one(cameras, rows, rows).before(0.0) == 0.0
     other = [traced(cameras[1], curve(0.1 * i) + np.array([0.0, 0.0, 8e-3])) for i in range(3)]
     elsewhere = begun_together(cameras, [rows[0], [farther(trace) for trace in other]])
     assert [len(trace.line) for trace in elsewhere[0]] == [len(trace.line) for trace in rows[0]]

@@ -101,8 +101,11 @@ def test_force_and_moment_are_those_of_the_rod(filmed, found, both):
     assert np.isnan(found["contact_point"].values[free]).all()
 
 
-def pressed(whisker, share=0.0):
-    """What fits rods to traces without noise of one bent by a known force with friction."""
+def pressed(whisker, share=0.0, hidden=0, begin_sigma=1.0):
+    """What fits rods to traces without noise of one bent by a known force with friction.
+
+    They lack some points at its base.
+    """
     from vibrissa import PointForce
     from vibrissa.cameras import orthogonal_views
     from vibrissa.tracking import BasePose, HeadPose, Trace, TraceSeries
@@ -117,10 +120,11 @@ def pressed(whisker, share=0.0):
     pair = orthogonal_views(center=(0.012, 0.005, 0.0))
     traces = []
     for camera in pair:
-        lines = [even(camera.project(curve)) for curve in curves]
-        traces.append(
-            [Trace(line, np.full(len(line), 0.02), np.ones(len(line), bool), 1.0) for line in lines]
-        )
+        lines = [even(camera.project(curve))[hidden:] for curve in curves]
+        whole = [
+            Trace(line, np.full(len(line), 0.02), np.ones(len(line), bool), 1.0) for line in lines
+        ]
+        traces.append([trace._replace(begin_sigma=begin_sigma) for trace in whole])
     still = np.zeros(9)
     pose = BasePose(np.zeros((9, 3)), still, still, still)
     touching = np.ones(9, dtype=bool)
@@ -140,6 +144,20 @@ def test_bending_shows_how_a_whisker_tapers(stated):
     assert abs(tips[2] - tips[0]) < 0.2 * abs(tips[1] - tips[0])
     assert length.sigma < 0.4 * usual.sigma
     assert found.notes[-1].startswith("radius of the tip: 1")
+
+
+def test_a_taper_is_no_surer_than_where_the_base_is():
+    """All frames in contact hide 16 pixels of a base that other frames show."""
+    true = Whisker.parabola(length=30e-3, coefficient=10.0, tip_radius=100e-6 / 9.0)
+    usual = Length(true.length, 0.04 * true.length, seen=True)
+    found, sigmas = [], []
+    for hidden, begin_sigma in ((0, 1.0), (8, 6.0)):
+        fitter, pose, _, _ = pressed(true, 0.0, hidden, begin_sigma)
+        whisker, length = tapered_as_it_bends(fitter, true, usual, pose)
+        found.append(whisker.radius(true.length) / whisker.radius(0.0))
+        sigmas.append(length.sigma)
+    assert abs(found[1] - 1.0 / 9.0) < 0.01
+    assert sigmas[1] > 1.2 * sigmas[0]
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3])

@@ -61,7 +61,13 @@ from vibrissa.tracking.refine.rods import TraceSeries, rolled
 from vibrissa.tracking.refine.silhouette import explains, on_peg, peg_in_images
 from vibrissa.tracking.refine.taper import some_in_contact, tapered_as_it_bends
 from vibrissa.tracking.refine.tilt import Plane, plane_of, projected, unturned
-from vibrissa.tracking.space.curve import begun_together, merged, shown_by_one, with_one_tip
+from vibrissa.tracking.space.curve import (
+    HiddenPart,
+    begun_together,
+    merged,
+    shown_by_one,
+    with_one_tip,
+)
 from vibrissa.tracking.space.exchange import Known, exchanged
 from vibrissa.tracking.space.frame_pairs import best_seen, paired_frames, without_repeats
 from vibrissa.tracking.space.pose import CUTOFF, BasePose, HeadPose, base_pose, rolled_over
@@ -235,11 +241,8 @@ def track(
     rows = [list(row) for row in zip(*timed_rows, strict=True)]
 
     def tracked(k: int, used: Sequence[Sequence[Trace]]) -> Tracked:
-        own = replace(options, fur=options.fur + hidden[k] * options.scaled)
-        given = called[k], progress, moving, objects, sample, count > 1
-        one = track_whisker(cameras, used, rate, own, *given)
-        scale = scale_sigma(one.whisker, options.fur, hidden[k])
-        return replace(one, scale=scale if options.scaled else np.nan)
+        given = called[k], progress, moving, objects, sample, count > 1, hidden[k]
+        return track_whisker(cameras, used, rate, options, *given)
 
     known = partial(known_of, cameras, rate=rate, options=options.fit)
     kept, repeats = without_repeats(cameras, rows)
@@ -441,6 +444,9 @@ def _corrected(
     )
 
 
+_NOTHING = HiddenPart()
+
+
 def track_whisker(
     cameras: Sequence[Camera],
     traces: Sequence[Sequence[Trace]],
@@ -452,6 +458,7 @@ def track_whisker(
     objects: Sequence[Surface] = (),
     sample: Sequence[Sequence[Frame]] = (),
     row: bool = False,
+    hidden: HiddenPart = _NOTHING,
 ) -> Tracked:
     """Track one whisker, or one of a row, from traces of frames that belong together, by view."""
     report = progress or (lambda stage, done, total: None)
@@ -490,8 +497,11 @@ def track_whisker(
     sharpest = max(options.fit.sharpest, 1.0) if sparse else options.fit.sharpest
     smoothness, within = replace(options.fit, sharpest=sharpest), plane.head or head
     tapers = bool(options.properties.keys() & {"tip_radius", "radius"})
+    fur, more = options.fur, hidden.before(shape.length) * options.scaled
+    options = replace(options, fur=fur + more)
     further = None
     if options.whisker is None:
+        whisker = whisker_at_rest(shape, name, **options.at_base)
         further = continued(shape, on_head, cameras, series, within, tapers)
     if further is not None:
         shape = further[0]
@@ -517,6 +527,7 @@ def track_whisker(
         fit=found.fit if plane.head is None else projected(found.fit, plane.head),
         head=head,
         length=found.length,
+        scale=scale_sigma(found.whisker, fur, more) if options.scaled else np.nan,
         peg=found.peg,
         hook=hook,
         turned=plane.turned,

@@ -23,6 +23,7 @@ from vibrissa.numerics import Array, Mask
 from vibrissa.tracking.refine.rods import TraceSeries
 from vibrissa.tracking.space.pose import HeadPose
 from vibrissa.tracking.space.rest_shape import (
+    LEAST_SEEN,
     Length,
     RestShape,
     aligned_lengths,
@@ -87,7 +88,10 @@ def continued(
     head: HeadPose,
     tapers: bool,
 ) -> tuple[RestShape, Length] | None:
-    """Continue a shape at rest as far as one of the views shows it; None if none shows more."""
+    """Continue a shape at rest as far as one of the views shows it; None if none shows more.
+
+    A whisker of which the other view shows a small share at most is not known in space.
+    """
     posed = _posed(shape, curves, cameras, traces, head)
     if posed is None or len(cameras) == 1:
         return None
@@ -104,6 +108,8 @@ def continued(
         total, whole = length_shown(shape.length + more, at_tip)
         if not total > shape.length:  # frames that show the tip show no more
             return None
+        if shape.length < LEAST_SEEN * total:
+            raise ValueError(_too_short(posed, view))
         longer, bending = _fitted(posed, shape, total)
         outer = longer.points[len(shape.points) - 1 :]
         more = posed.reached(view, outer, pixels[view])[known]
@@ -112,6 +118,21 @@ def continued(
     )
     length = length._replace(value=longer.length, shown=shape.length, bending=bending)
     return replace(longer, whole=whole), length
+
+
+def _too_short(posed: _Posed, view: int) -> str:
+    """Say that only one view shows most of a whisker."""
+    steps = np.linalg.norm(np.diff(posed.traces.line, axis=2), axis=3)
+    pixels = np.nanmedian(steps.sum(axis=2), axis=0)
+    shown = ", ".join(
+        f"{camera.name} over {size:.0f}" for camera, size in zip(posed.cameras, pixels, strict=True)
+    )
+    return (
+        f"the views show too little of one whisker to locate it: {shown} pixels (median), and what "
+        f"{posed.cameras[view].name} shows goes on far beyond. Either another view follows "
+        "something else, such as a whisker that was cut, or it hides most of it: look at the "
+        "traces, and give where it begins in each view (--base)"
+    )
 
 
 def _fitted(posed: _Posed, shape: RestShape, total: float) -> tuple[RestShape, Array]:

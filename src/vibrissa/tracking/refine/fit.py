@@ -326,14 +326,17 @@ class Fitter:
             found[problem.frames] = np.where(linear.data.wild, np.inf, linear.data.misfit)
         return found
 
-    def costs(self, shown: float) -> Callable[[Whisker, BasePose], float]:
+    def costs(
+        self, shown: float, ends: tuple[float, float] = (1.0, 0.0)
+    ) -> Callable[[Whisker, BasePose], float]:
         """Function that compares whiskers by how well they explain the traces.
 
         Whiskers of all lengths are compared with the same part of the traces, up to the arc length
         ``shown``, m: a longer one would also have to explain the uncertain ends of longer traces.
+        Those of equal length are also compared with these, which count by ``ends``.
         """
         before: tuple[Problem, State] | None = None
-        traces = replace(self.traces, ends=self.traces.ends * [1.0, 0.0])
+        traces = replace(self.traces, ends=self.traces.ends * ends)
 
         def cost(whisker: Whisker, pose: BasePose) -> float:
             nonlocal before

@@ -42,7 +42,9 @@ class TraceSeries:
     sigma: Array  # (time, view, NODES): standard deviation across, pixels
     seen: Array  # (time, view, NODES): 1 where the whisker is seen, 0 where it is bridged
     confidence: Array  # (time, view), between 0 and 1
-    ends: Array  # (time, view, 2): 1 where the whisker is seen to begin and to end there, else 0
+    # (time, view, 2): 1 where the whisker is seen to begin and to end there, less if that counts
+    # less, else 0.
+    ends: Array
     skew: Array  # (time, view): third cumulant of its darkness across it, pixels³
     shift: Array  # (time, view, 4): by how much a shaking camera moved the image; see `Trace`
     begin: Array  # (time, view): standard deviation of where it begins along it, pixels
@@ -82,6 +84,11 @@ class TraceSeries:
         """Directions (time, view, NODES, 2) of the traces."""
         tangent = np.gradient(self.line, axis=2)
         return np.asarray(tangent / np.linalg.norm(tangent, axis=3, keepdims=True))
+
+    @property
+    def begun_apart(self) -> bool:
+        """Whether views disagree in some frames about where the whisker begins."""
+        return bool((self.begin > _END).any())
 
     @cached_property
     def longest(self) -> Array:
@@ -142,8 +149,9 @@ def compare(traces: Any, view: int, pixels: Any, slopes: Any, found: Any) -> Non
             gap = (path[i, 0] - pixels[t, j, 0]) * tx + (path[i, 1] - pixels[t, j, 1]) * ty
             # Where the whisker is taken to begin elsewhere at first, it also ends there.
             most = np.inf if end == 0 else max(FAR, _SPREAD * begin[t, view])
-            if ends[t, view, end] > 0.5 and abs(gap) < most:
-                sure = 1.0 / (begin[t, view] if end == 0 else _END)
+            counts = ends[t, view, end]
+            if counts > 0.0 and abs(gap) * counts < most:
+                sure = counts / (begin[t, view] if end == 0 else _END)
                 misses[t, n + end], weights[t, n + end] = gap * sure, sure
                 for k in range(slopes.shape[3]):
                     pull = tx * slopes[t, j, 0, k] + ty * slopes[t, j, 1, k]

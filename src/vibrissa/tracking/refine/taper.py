@@ -14,6 +14,8 @@ from vibrissa.whisker import Whisker, morphology
 
 # Smallest number of frames in contact that show a taper or a length, and largest that is used.
 _FEWEST, _FRAMES = 3, 24
+# Standard deviation, along it, of where a whisker ends that frames in contact share, pixels.
+_ENDED = 1.5
 
 
 def some_in_contact(fitter: Fitter) -> Fitter | None:
@@ -43,15 +45,20 @@ def tapered_as_it_bends(
 
     thinnest = (1.0 - at_tip / at_base) / (1.0 - 1.0 / morphology.MOST_TAPER) - 1.0
 
+    # A part of the base that views hide is that in all frames of a contact, so that errors of where
+    # they show it to begin are one error; then the tip shows where it is.
+    apart, count = some.traces.begun_apart, np.isfinite(some.curves[:, 0, 0]).sum()
+    ends = np.array([1.0, 1.0 / _ENDED]) / np.sqrt(count) if apart else np.array([1.0, 0.0])
+
     def cost(share: float) -> Callable[[float], float]:
         # The first whisker sets the variance of the traces; a wrong taper would enlarge it.
-        of = some.costs(min(length.shown, whisker.length))
+        of = some.costs(min(length.shown, whisker.length), (ends[0], ends[1]))
         of(thicker(share), pose)
         return lambda other: of(thicker(other), pose)
 
     usual, shown = length.sigma / length.value, length.shown / length.value
-    share, _ = likeliest_taper(usual, float(thinnest), cost(0.0), shown)
-    share, sigma = likeliest_taper(usual, float(thinnest), cost(share), shown)
+    share, _ = likeliest_taper(usual, float(thinnest), cost(0.0), shown, apart)
+    share, sigma = likeliest_taper(usual, float(thinnest), cost(share), shown, apart)
     found = thicker(share)
     tip = 100.0 * float(found.radius(whisker.length) / at_base)
     either = 100.0 * sigma * float(1.0 - at_tip / at_base) / (1.0 + share) ** 2

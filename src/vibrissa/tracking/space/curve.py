@@ -168,18 +168,29 @@ def begun_together(
     return [list(view) for view in zip(*pairs, strict=True)]
 
 
+class HiddenPart(NamedTuple):
+    """Part of a whisker before the first point that both views show."""
+
+    more: float = 0.0  # length that one view shows, m
+    longest: float = 0.0  # length of the whisker with it; 0 if all frames begin at one point
+
+    def before(self, length: float) -> float:
+        """Length before a shape at rest of a length, whose frames may show less or more."""
+        return max(self.longest - length, 0.0) if self.longest else self.more
+
+
 def shown_by_one(
     cameras: Sequence[Camera],
     traces: Sequence[Sequence[Trace]],
     begun: Sequence[Sequence[Trace]],
-) -> float:
-    """Length of a whisker, m, that only one view shows before where both do; see `begun_together`.
+) -> HiddenPart:
+    """What only one view shows of a whisker before where both do; see `begun_together`.
 
     It is that of the frames that show most of the whisker, in all views and in one.
     """
     whole = [both for both in zip(*traces, *begun, strict=True) if all(map(_usable, both))]
     if len(cameras) == 1 or not whole:
-        return 0.0
+        return HiddenPart()
     lengths = []
     some = [whole[i] for i in np.unique(np.linspace(0, len(whole) - 1, _SOME).astype(int))]
     for both, curve in zip(some, merged(cameras, [b[len(cameras) :] for b in some]), strict=True):
@@ -191,7 +202,8 @@ def shown_by_one(
         lengths.append((curve.length, curve.length + more))
     known = np.isfinite(lengths).all(axis=1)
     shown = np.percentile(np.array(lengths)[known], _USUAL, axis=0) if known.any() else np.zeros(2)
-    return float(shown[1] - shown[0])
+    apart = any(trace.begin_sigma > 1.0 for view in begun for trace in view)
+    return HiddenPart(float(shown[1] - shown[0]), float(shown[1]) if apart else 0.0)
 
 
 def _usable(trace: Trace) -> bool:

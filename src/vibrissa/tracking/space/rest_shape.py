@@ -594,14 +594,19 @@ def likeliest_length(seen: float, cost: Callable[[float], float]) -> Length:
 
 
 def likeliest_taper(
-    usual: float, thinnest: float, cost: Callable[[float], float], seen: float = 1.0
+    usual: float,
+    thinnest: float,
+    cost: Callable[[float], float],
+    seen: float = 1.0,
+    apart: bool = False,
 ) -> tuple[float, float]:
     """Find the length of a cone beyond the seen one, as a share of this, from its bending.
 
     ``usual`` is the share's standard deviation before it is known how the whisker bends; below the
     share ``thinnest`` the tip would have no thickness; ``cost`` is the misfit of the rod and the
     traces at a share. The standard deviation that is also returned is due to what bending shows,
-    which errs, and what is usual.
+    which errs, and what is usual; it errs more if only a share is ``seen``, and if views disagree
+    about where the whisker begins (``apart``).
     """
     shares, costs = [0.0], [cost(0.0)]
     while costs[-1] <= min(costs) + _HARDLY and shares[-1] + _TAPERS <= _STOUTEST:
@@ -610,7 +615,7 @@ def likeliest_taper(
     while costs[0] <= min(costs) + _HARDLY and shares[0] - _TAPERS >= thinnest:
         shares.insert(0, shares[0] - _TAPERS)
         costs.insert(0, cost(shares[0]))
-    errs = _BENDS if seen >= 1.0 else _CERTAIN / seen
+    errs = _CERTAIN / min(seen, 1.0) if apart or seen < 1.0 else _BENDS
     fine, shown = _likelihood(shares, costs, 3.0 * errs)
     blurred = np.exp(-0.5 * ((fine[:, None] - fine) / errs) ** 2)
     blurred /= blurred.sum(axis=1, keepdims=True)

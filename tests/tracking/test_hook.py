@@ -60,6 +60,21 @@ def test_a_strongly_curved_whisker_has_no_hook(slope, noise):
     assert hook_of(shape_of(whisker.position(40e-3 * S), noise), PIXEL) is None
 
 
+@pytest.mark.parametrize("turn", [1.0, 1.5])
+@pytest.mark.parametrize("along", [lambda s: (1.0 - s) ** 2, lambda s: np.exp(-5.0 * s)])
+def test_a_whisker_that_is_curved_near_its_base_has_no_hook(turn, along):
+    """Its curvature falls along it as that of no polynomial of low degree."""
+    curvature = turn * along(S) / np.trapezoid(along(S), S)
+    angle = np.cumsum(curvature) / NODES
+    points = (
+        30e-3
+        / NODES
+        * np.cumsum(np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1), axis=0)
+    )
+    for seed in range(4):
+        assert hook_of(shape_of(points, 0.2e-6, seed), PIXEL) is None
+
+
 def drawn_aside(camera_traces, size, count):
     """Traces of one whisker in one view that begin on a hair, so many pixels from it."""
     found = []

@@ -70,6 +70,8 @@ def hook_of(shape: RestShape, pixel: float) -> Hook | None:
         return None
     fits = ((n, _Smooth.of(points[n:last], degree)) for n in first)
     count, smooth = next((n, fit) for n, fit in fits if fit.rms <= enough or n == first[-1])
+    if count == first[-1]:  # it goes on: the whisker is strongly curved there
+        return None
     aside = np.zeros_like(points)
     aside[:count] = points[:count] - smooth.before(count)
     other = _Smooth.of(points[count:last], degree + 1)

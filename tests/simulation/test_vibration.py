@@ -140,10 +140,10 @@ def test_what_is_not_determined_is_stated(whisker, in_air):
 def test_a_contact_begins_where_the_whisker_deviates_from_free_vibration(whisker):
     vibration = Vibration.of(whisker)
     model = _Model.of(vibration, 1e-3, NOISE, np.zeros(6))
-    size = 2 * len(vibration.rates) + 1
+    size = len(model.step)
     free = _Free(np.zeros(1, int), np.zeros((1, size)), 0.1 * np.eye(size)[None], np.zeros(1))
     free.state[0, :4] = 60.0, 10.0, -40.0, 30.0
-    expected = model.wrench @ free.state[0, :-1]
+    expected = model.wrench @ free.state[0, : model.wrench.shape[1]]
     likelihoods = []
     for deviation in (0.0, 100.0):
         measured = expected + deviation * np.eye(5)[4]
@@ -151,3 +151,35 @@ def test_a_contact_begins_where_the_whisker_deviates_from_free_vibration(whisker
         likelihoods.append(float((begins - still)[0]))
     assert likelihoods[0] < -3.0
     assert likelihoods[1] > 1.0
+
+
+def test_a_model_error_is_expected_to_persist(whisker):
+    model = _Model.of(Vibration.of(whisker), 1e-3, NOISE, np.zeros(6))
+    size = len(model.step)
+    free = _Free(np.zeros(1, int), np.zeros((1, size)), np.zeros((1, size, size)), np.zeros(1))
+    free.state[0, :4] = 60.0, 10.0, -40.0, 30.0
+    deviation = np.array([20.0, 0.0, 0.0, 0.0, 0.0])
+    found = []
+    for _ in range(3):
+        free = free.predicted(model)
+        expected = model.wrench @ free.state[0, : model.wrench.shape[1]]
+        free, likelihood, _ = free.observed(model, expected + deviation, np.zeros(5))
+        found.append(likelihood[0])
+    assert found[1] > found[0] + 0.5
+    assert found[2] > found[0] + 0.5
+
+
+@pytest.mark.slow
+def test_strong_vibration_of_a_slow_whisker_is_not_contact():
+    shape = {"base_radius": 115e-6, "tip_radius": 29e-6, "youngs_modulus": 2.5e9}
+    slow = vb.Whisker.parabola(43e-3, 9.0, **shape)
+    peg = facing_peg(slow, 0.74, 0.36e-3)
+    motion = sweep_past(slow, peg, 0.3, 1000.0, seed=5, frequency=9.2)
+    density = tuple(1.2 * value for value in Dynamics().density)
+    dynamics = Dynamics(density=density, damping_ratio=0.103, step=2e-4)
+    trial = measure(simulate(slow, motion, peg, dynamics=dynamics, nodes=9), 3e-6, 6e-8, seed=5)
+    touching = trial["truth"].to_dataset().isel(whisker=0).in_contact.values.astype(bool)
+    found = Vibration.of(slow).in_contact(*measured(trial), 9.0 * NOISE)
+    about = np.convolve(touching, np.ones(5), "same") > 0
+    assert np.mean(found[~about]) < 0.1
+    assert np.mean(found[touching]) > 0.7

@@ -20,24 +20,23 @@ mass, of frequency and of the time constant of the damping.
 **Contact** is detected by a hidden Markov model with forward and backward recursions. The whisker
 is either in contact, or free since some frame. Each frame of release is a separate hypothesis with
 a Kalman filter, whose state consists of the amplitude and velocity of each free mode, in units of
-the noise of the moment they cause, and of the relative error of the wrench in air, which is that of
-the mass. The covariance of the remaining wrench decides between hypotheses: it includes the
-sensor's noise, the covariance of the state, and nonlinear shares of the vibration that grow with
-the deflection. A recent release has a large covariance of the state and therefore explains larger
-wrenches. An error of mass or stiffness scales all frequencies by one factor and causes a growing
-error of phase; the factor is chosen by maximum likelihood over all frames, in steps of 10 %.
+the noise of the moment they cause, of the relative error of the wrench in air, which is that of
+the mass, and of the model error of the wrench: nonlinear shares of the vibration that grow with the
+deflection. That error is an autoregressive process, since it changes with the vibration. If it were
+independent in each frame, the wrench of a slow whisker that vibrates strongly would be better
+predicted by a contact, in which it changes little. The covariance of the remaining wrench, which
+includes the sensor's noise, decides between hypotheses. A recent release has a large covariance of
+the state and therefore explains larger wrenches. An error of mass or stiffness scales all
+frequencies by one factor and causes a growing error of phase; the factor is chosen by maximum
+likelihood over all frames, in steps of 10 %.
 
 In contact the change of the wrench from frame to frame has a heavy-tailed (Student) distribution,
-whose width is given by the noise and the previous change. A contact begins with a deviation from
+whose width is given by the noise and the previous change, or, less often, the change of that change
+has. A contact begins with a deviation from
 what the free whisker is predicted to do, which also has a Student distribution, wider than that of
 a free whisker. It must not be the change since the previous frame: where a vibration turns round,
 changes are small, and frames before an impact would count as contact. All likelihoods are those of
 (F, M_y, M_z).
-
-The force vanishes gradually before a whisker slips off, so that releases are put early and the
-probabilities of the last frames in contact are too small: of frames with a probability of 0.25 to
-0.5, in simulated trials two thirds are in contact, and nine tenths have been since the previous
-frame. They count as contact.
 """
 
 from __future__ import annotations
@@ -185,13 +184,12 @@ class Vibration:
         Returns
         -------
         (n,) array
-            True where contact has a probability above 0.25, given all frames: in such a frame the
-            whisker probably touches or has touched something since the previous frame
+            True where contact has a probability above one half, given all frames
             (:mod:`vibrissa.simulation.vibration`).
         """
         air = self.in_air(time, rotation, position)
         step = float(np.diff(time).mean())
-        return contact_probability(self, step, wrench - air, air, noise) > _TOUCHED
+        return contact_probability(self, step, wrench - air, air, noise) > 0.5
 
 
 _LEAST_KNOWN = 0.3  # largest relative standard deviation of a quantity that counts as determined
@@ -360,6 +358,8 @@ def _windows(free: AnyArray, step: float, vibration: Vibration) -> tuple[AnyArra
 # Components F_x, F_y, F_z, M_y, M_z of the wrench; vibration hardly contributes to M_x.
 _CHANNELS = [0, 1, 2, 4, 5]
 _FORCES, _MOMENTS = slice(1, 3), slice(3, 5)  # channels across the whisker
+# State variables after the modal ones: relative error of the wrench in air, and model errors.
+_AIR, _ERRORS = -6, slice(-5, None)
 _RATE = 3.0  # rate of onsets, and of releases, 1/s
 _MASS = 0.2  # relative standard deviation of the mass
 # Logarithm of the frequencies' factor: step, standard deviation, and largest number of steps.
@@ -367,7 +367,8 @@ _STEP, _FREQUENCY, _FARTHEST = 0.1, 0.1, 4
 _TURN = 0.12  # relative error of frequencies: unknown share of a vibration after one radian
 # Relative model error of the vibration across the whisker, and size of the axial force relative to
 # the force across it.
-_MODELLED, _AXIAL = 0.1, 0.4
+_MODELLED, _AXIAL = 0.06, 0.4
+_FADES = 0.9  # rate at which model errors lose correlation, relative to that of the first mode
 _BEND = 0.2  # additional relative model error if the tip is deflected by the whisker's length
 # Degrees of freedom of the Student distributions of a free whisker and of one in contact.
 _FREEDOM, _FREEDOM_IN_CONTACT = 4.0, 1.0
@@ -375,25 +376,28 @@ _FREEDOM, _FREEDOM_IN_CONTACT = 4.0, 1.0
 # to the previous change; and that of the first frame in contact, in units of the uncertainty of a
 # free whisker.
 _CHANGE, _AS_BEFORE, _ONSET = 1.5, 0.6, 3.0
+# Probability that a frame in contact continues the change, and the width for that, as _CHANGE.
+_STEADY, _CHANGE_OF_CHANGE = 0.1, 2.6
 # Standard deviation of modal amplitudes at a release: smallest value, in units of the noise, and
 # relative to the moment, to which all modes contribute with unknown phases.
 _START, _RELEASED = 5.0, 0.35
 # Difference of log likelihood from the best at which hypotheses are dropped, and largest number.
 _LOST, _MOST = 60.0, 64
-_TOUCHED = 0.25  # probability above which a frame counts as in contact
 _FINEST = 1e-4  # smallest noise, relative to the largest wrench
 
 
 class _Model(NamedTuple):
-    """Linear state-space model of k modes in units of the noise, with d = 2 k + 1 state variables.
+    """Linear state-space model of k modes in units of the noise, with d = 2 k + 6 state variables.
 
-    The last variable is the relative error of the wrench in air, the others are modal. ``step``
-    (d, d) is the transition matrix; ``wrench`` (5, 2 k) and ``tip`` (3, 2 k) map the modal state to
-    the wrench and to the displacement of the tip over L; ``wrong`` (k,) is the error of each mode
-    per step; ``noise`` (5,) and ``correlation`` (5, 5) are those of the sensor.
+    The variables are modal, then the relative error of the wrench in air and the model errors (5,).
+    ``step`` (d, d) is the transition matrix and ``fading`` the factor of the model errors in it;
+    ``wrench`` (5, 2 k) and ``tip`` (3, 2 k) map the modal state to the wrench and to the
+    displacement of the tip over L; ``wrong`` (k,) is the error of each mode per step; ``noise``
+    (5,) and ``correlation`` (5, 5) are those of the sensor.
     """
 
     step: Array
+    fading: float
     wrench: Array
     tip: Array
     wrong: Array
@@ -419,8 +423,10 @@ class _Model(NamedTuple):
             linalg.expm(step * w * np.array([[0.0, 1.0], [-1.0, -eta]]))
             for w, eta in zip(rates, loss, strict=True)
         ]
+        fading = float(np.exp(-_FADES * rates[0] * step))
         return cls(
-            np.asarray(linalg.block_diag(*turns, np.eye(1)), np.float64),
+            np.asarray(linalg.block_diag(*turns, np.eye(1), fading * np.eye(5)), np.float64),
+            fading,
             wrench.reshape(len(sigma), -1),
             tip.reshape(3, -1),
             _TURN * np.minimum(rates * step, 1.0),
@@ -445,8 +451,8 @@ class _Free(NamedTuple):
         """Predict the state one frame later; errors of the frequencies increase its covariance."""
         state = self.state @ model.step.T
         covariance = model.step @ self.covariance @ model.step.T
-        number = np.arange(state.shape[1] - 1)
-        square = state[:, :-1] ** 2 + covariance[:, number, number]
+        number = np.arange(model.wrench.shape[1])
+        square = state[:, number] ** 2 + covariance[:, number, number]
         energy = square[:, ::2] + square[:, 1::2]
         covariance[:, number, number] += np.repeat(energy * model.wrong**2, 2, axis=1)
         return self._replace(state=state, covariance=covariance)
@@ -454,7 +460,8 @@ class _Free(NamedTuple):
     def with_release(self, frame: int, size: float, weight: float) -> _Free:
         """Add the hypothesis of a release in ``frame``, where the moment has the given size."""
         covariance = np.diag(np.full(self.state.shape[1], (_RELEASED * size + _START) ** 2))
-        covariance[-1, -1] = _MASS**2
+        covariance[_AIR, _AIR] = _MASS**2
+        covariance[_ERRORS, _ERRORS] = 0.0
         return _Free(
             np.append(self.since, frame),
             np.concatenate([self.state, np.zeros_like(covariance[:1])]),
@@ -467,33 +474,43 @@ class _Free(NamedTuple):
 
         Also return its log likelihoods (n,) if the whisker is free, and if a contact begins.
         """
-        slopes = np.column_stack([model.wrench, air])
-        spread = slopes @ self.covariance @ slopes.T + model.correlation
-        vibration = self.covariance[:, :-1, :-1]
-        mean = self.state[:, :-1] @ model.wrench.T
-        square = mean**2 + np.einsum("ij,njk,ik->ni", model.wrench, vibration, model.wrench)
-        bent = ((self.state[:, :-1] @ model.tip.T) ** 2).sum(axis=1)
-        bent += np.einsum("ij,njk,ik->n", model.tip, vibration, model.tip)
-        share = _MODELLED**2 + _BEND**2 * np.minimum(bent, 1.0)
-        across = square[:, _FORCES].sum(axis=1)
-        axial, moment = _AXIAL**2 * across, share * square[:, _MOMENTS].sum(axis=1)
-        errors = np.column_stack([axial, *[share * across] * 2, *[moment] * 2])
-        spread[:, range(5), range(5)] += errors
+        slopes = np.column_stack([model.wrench, air, np.eye(len(_CHANNELS))])
+        covariance = self.covariance + self._renewed(model)
+        spread = slopes @ covariance @ slopes.T + model.correlation
         away = measured - self.state @ slopes.T
         solved = np.linalg.solve(spread, away[..., None])
-        gain = np.swapaxes(np.linalg.solve(spread, slopes @ self.covariance), 1, 2)
+        gain = np.swapaxes(np.linalg.solve(spread, slopes @ covariance), 1, 2)
         far = (away[:, None] @ solved)[:, 0, 0]
         size = 0.5 * np.linalg.slogdet(spread)[1]
         found = _student(far, _FREEDOM) - size
         return (
             self._replace(
                 state=self.state + (gain @ away[..., None])[..., 0],
-                covariance=self.covariance - gain @ slopes @ self.covariance,
+                covariance=covariance - gain @ slopes @ covariance,
                 weight=self.weight + found,
             ),
             found,
             _student(far / _ONSET**2, _FREEDOM_IN_CONTACT) - len(_CHANNELS) * np.log(_ONSET) - size,
         )
+
+    def _renewed(self, model: _Model) -> Array:
+        """Covariance (n, d, d) that the model errors gain in one frame."""
+        modes = model.wrench.shape[1]
+        state, vibration = self.state[:, :modes], self.covariance[:, :modes, :modes]
+        mean = state @ model.wrench.T
+        square = mean**2 + np.einsum("ij,njk,ik->ni", model.wrench, vibration, model.wrench)
+        bent = ((state @ model.tip.T) ** 2).sum(axis=1)
+        bent += np.einsum("ij,njk,ik->n", model.tip, vibration, model.tip)
+        share = _MODELLED**2 + _BEND**2 * np.minimum(bent, 1.0)
+        across = square[:, _FORCES].sum(axis=1)
+        axial, moment = _AXIAL**2 * across, share * square[:, _MOMENTS].sum(axis=1)
+        errors = np.column_stack([axial, *[share * across] * 2, *[moment] * 2])
+        number = np.arange(modes + 1, self.state.shape[1])
+        # At a release, in which they have no variance yet, model errors have their whole size.
+        new = self.covariance[:, number, number] == 0.0
+        gained = np.zeros_like(self.covariance)
+        gained[:, number, number] = np.where(new, 1.0, 1.0 - model.fading**2) * errors
+        return gained
 
 
 def _student(square: Array, freedom: float) -> Array:
@@ -506,13 +523,21 @@ def _student(square: Array, freedom: float) -> Array:
 
 def _touching(measured: Array, correlation: Array) -> Array:
     """Log likelihoods (n,) of frames in contact."""
-    n = len(_CHANNELS)
     change = np.diff(measured, axis=0, prepend=measured[:1])
-    square = (change * np.linalg.solve(correlation, change.T).T).sum(axis=1)
-    before = _AS_BEFORE**2 * np.append(square[:1], square[:-1]) / n
-    width = _CHANGE**2 + before
-    found = _student(square / width, _FREEDOM_IN_CONTACT) - 0.5 * n * np.log(width)
+    second = np.diff(change, axis=0, prepend=change[:1])
+    found = np.logaddexp(
+        np.log1p(-_STEADY) + _changed(change, correlation, _CHANGE),
+        np.log(_STEADY) + _changed(second, correlation, _CHANGE_OF_CHANGE),
+    )
     return np.asarray(found - 0.5 * np.linalg.slogdet(correlation)[1])
+
+
+def _changed(change: Array, correlation: Array, width: float) -> Array:
+    """Log likelihoods (n,) of changes (n, 5), about as large as before or as the given width."""
+    n = len(_CHANNELS)
+    square = (change * np.linalg.solve(correlation, change.T).T).sum(axis=1)
+    scale = width**2 + _AS_BEFORE**2 * np.append(square[:1], square[:-1]) / n
+    return _student(square / scale, _FREEDOM_IN_CONTACT) - 0.5 * n * np.log(scale)
 
 
 def contact_probability(

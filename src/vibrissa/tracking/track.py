@@ -63,6 +63,7 @@ from vibrissa.tracking.refine.taper import some_in_contact, tapered_as_it_bends
 from vibrissa.tracking.refine.tilt import Plane, plane_of, projected, unturned
 from vibrissa.tracking.space.curve import (
     HiddenPart,
+    all_merged,
     begun_together,
     merged,
     shown_by_one,
@@ -462,17 +463,13 @@ def track_whisker(
 ) -> Tracked:
     """Track one whisker, or one of a row, from traces of frames that belong together, by view."""
     report = progress or (lambda stage, done, total: None)
-    count = len(traces[0])
     traces = with_one_tip(cameras, traces)
     series = TraceSeries.of(traces)
     _check_views(cameras, series, name)
-    curves = []
-    for i, curve in enumerate(merged(cameras, zip(*traces, strict=True))):
-        curves.append(curve)
-        report(f"{name} in space", i + 1, count)
+    curves = all_merged(cameras, traces, partial(report, f"{name} in space"))
     points = np.array([curve.points for curve in curves])
     report(f"contact of {name}", 0, 2)
-    head = head or HeadPose.still(count)
+    head = head or HeadPose.still(len(points))
     on_head = head.seen_from(points)
     tips: Mask = np.all(series.ends[:, :, 1] > 0.5, axis=1)
     sparse = any(trace.sparse for view in traces for trace in view)
@@ -480,12 +477,11 @@ def track_whisker(
     astray = (_CROSSED if row and not sparse else _ASTRAY) * pixel
     rest = partial(_at_rest, options, name, tips, flat, sparse, astray)
     shape, whisker = rest(on_head)
-    plane = plane_of(on_head, shape, tips) if flat else Plane(None, np.zeros(count))
+    plane = plane_of(on_head, shape, tips) if flat else Plane(None, np.zeros(len(points)))
     if plane.head is not None:
         on_head = unturned(on_head, plane.head)
         shape, whisker = rest(on_head)
-    marked = row or sparse or options.whisker is not None
-    hook = None if marked else hook_of(shape, pixel)
+    hook = None if row or sparse or options.whisker is not None else hook_of(shape, pixel)
     if hook is not None:
         on_head = straightened(on_head, shape, whisker, base_pose(on_head, shape, whisker), hook)
         shape, whisker = rest(on_head, hook.share)

@@ -11,7 +11,7 @@ assumed to be in the laboratory's plane z = 0.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
 from itertools import islice, pairwise
 from typing import Any, NamedTuple
@@ -121,6 +121,19 @@ def merged(cameras: Sequence[Camera], frames: Iterable[Sequence[Trace]]) -> Iter
             for i, curve in zip(shown, fits, strict=True):
                 curves[i] = curve
         yield from curves
+
+
+def all_merged(
+    cameras: Sequence[Camera],
+    traces: Sequence[Sequence[Trace]],
+    progress: Callable[[int, int], None],
+) -> list[SpaceCurve]:
+    """Merge all frames of a whisker's traces by view, reporting each."""
+    curves = []
+    for curve in merged(cameras, zip(*traces, strict=True)):
+        curves.append(curve)
+        progress(len(curves), len(traces[0]))
+    return curves
 
 
 def begun_together(

@@ -148,6 +148,6 @@ def test_a_linear_sensor_is_calibrated_by_a_table_of_touches(tmp_path):
     assert "mm from the base of this whisker of 100 mm: are their unit" in fault
     points[:30] = points[29::-1]
     write("x,y,z,a,b,c", points)
-    with pytest.warns(UserWarning, match=r"explain little of the readings of a .*, b .*, c "):
+    with pytest.warns(UserWarning, match=r"of the readings of a .*, b .*, c "):
         done = CliRunner().invoke(app, again)
     assert "much noise of a, b, c" in done.output

@@ -176,7 +176,7 @@ def begun_together(
         one = one._replace(line=one.line[first:], sigma=one.sigma[first:], seen=one.seen[first:])
         pairs[i] = (one, pairs[i][1]) if view == 0 else (pairs[i][0], one)
     # Where one view shows more in some frames only, both begin elsewhere on the whisker in these.
-    sigma = max(0.5 * float(np.ptp(np.percentile(more[whole], [16.0, 84.0]))), 1.0)
+    sigma = max(0.5 * float(np.ptp(np.percentile(more[whole], [16.0, 84.0]))), _END)
     pairs = [tuple(trace._replace(begin_sigma=sigma) for trace in both) for both in pairs]
     return [list(view) for view in zip(*pairs, strict=True)]
 
@@ -215,7 +215,7 @@ def shown_by_one(
         lengths.append((curve.length, curve.length + more))
     known = np.isfinite(lengths).all(axis=1)
     shown = np.percentile(np.array(lengths)[known], _USUAL, axis=0) if known.any() else np.zeros(2)
-    apart = any(trace.begin_sigma > 1.0 for view in begun for trace in view)
+    apart = any(trace.begin_sigma > _END for view in begun for trace in view)
     return HiddenPart(float(shown[1] - shown[0]), float(shown[1]) if apart else 0.0)
 
 

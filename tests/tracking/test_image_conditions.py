@@ -97,6 +97,27 @@ def test_overexposed_ground_may_be_searched_for_bright_whiskers():
     assert np.isfinite(scene.still.factor).all()
 
 
+def test_halos_of_whiskers_do_not_join_a_peg_to_the_face():
+    """Side light makes one side of each whisker bright: what they sweep seems to be uneven."""
+    random = np.random.default_rng(0)
+    rows, columns = np.mgrid[:200, :300]
+    empty = np.where(columns < 50, 30.0, 170.0)
+    empty[(np.abs(rows - 60) < 10) & (columns > 85)] = 50.0
+    before = (columns > 50) & (columns < 250) & (empty > 100.0)
+    bases = np.array([[52.0, row] for row in (80.0, 95.0, 110.0, 125.0)])
+    frames = []
+    for _ in range(30):
+        picture = empty + random.normal(0.0, 4.0, empty.shape)
+        for (_, row), slope in zip(bases, random.uniform(-0.5, 0.3, len(bases)), strict=True):
+            away = (rows - row - slope * (columns - 50)) / np.hypot(1.0, slope) / 1.2
+            dark, halo = np.exp(-0.5 * away**2), np.exp(-0.5 * (away - 3.0) ** 2)
+            picture -= before * (80.0 * dark - 48.0 * halo)
+        frames.append(np.clip(picture, 0, 255).astype(np.uint8))
+    scene = Scene.of(frames).with_still(bases, frames)
+    peg = scene.without_still(frames[3])[55:65, 150:280]
+    assert peg.mean() == pytest.approx(170.0, abs=8.0)
+
+
 def test_bright_whiskers_are_traced_as_dark_ones(filmed):
     frames = filmed.frames[0][:2]
     negative = [np.asarray(255 - frame) for frame in frames]

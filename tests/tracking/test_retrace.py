@@ -133,6 +133,13 @@ def test_whiskers_whose_lines_are_as_likely_those_of_others_are_named(flat, monk
     assert remark.startswith("not sure which lines in front are those of whisker 0, whisker 1, wh")
 
 
+def test_lines_on_which_the_views_still_disagree_are_in_doubt(flat, monkeypatch):
+    monkeypatch.setattr(sys.modules["vibrissa.tracking.space.retrace"], "_MOSTLY", 1.1)
+    remark = flat.retraced()[1][1]
+    assert remark.startswith("not sure which lines in front are those of whisker 0, whisker 1, wh")
+    assert "the views still disagree in many frames" in remark
+
+
 def test_long_films_are_decided_in_blocks(flat, monkeypatch):
     monkeypatch.setattr(guided, "_BLOCK", FRAMES // 2)
     traces, _ = flat.retraced()

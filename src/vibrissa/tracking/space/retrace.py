@@ -27,6 +27,8 @@ _BASES, _TIPS, _FADING = 8.0, 0.1, 0.4
 # Share of the frames in which the views show one whisker, from which nothing is traced anew; and
 # change of a whisker's length from its usual one, as a share, up to which it is traced steadily.
 _AGREES, _STEADY = 0.9, 0.2
+# Share of the frames in which both views show a line, below which lines traced anew are in doubt.
+_MOSTLY = 0.6
 # Log likelihood by which a whisker's line is to be more probable than others in the median frame:
 # below zero, most frames by themselves show another one, and only motion and bend decide.
 _SURE = 0.0
@@ -90,7 +92,7 @@ def retraced(
     for v, camera in enumerate(cameras):
         both = [guide, v]
         rows = [_in_pairs(found[view], pairs[:, view]) for view in both]
-        before = _agreement([cameras[view] for view in both], rows)
+        before, _ = _agreement([cameras[view] for view in both], rows)
         if v == guide or before >= _AGREES:
             continue
         known = [_as_seen_by(row, pairs[:, v], len(found[v][0])) for row in rows[0]]
@@ -105,7 +107,8 @@ def retraced(
             mask=masks[v] if masks is not None else None,
             progress=None if progress is None else partial(progress, v),
         )
-        after = _agreement([cameras[view] for view in both], [rows[0], _in_pairs(new, pairs[:, v])])
+        rows[1] = _in_pairs(new, pairs[:, v])
+        after, of_seen = _agreement([cameras[view] for view in both], rows)
         if after > before:
             found[v] = new
             remarks.append(
@@ -113,13 +116,15 @@ def retraced(
                 f"{cameras[guide].name} shows them. Before, both views showed one whisker in "
                 f"{100.0 * before:.0f} % of the frames, now in {100.0 * after:.0f} %."
             )
-            seen = [any(len(trace.line) for trace in row) for row in new]
-            unsure = np.flatnonzero(seen & (margins < _SURE))
-            if unsure.size:
+            seen = np.array([any(len(trace.line) for trace in row) for row in new])
+            unsure = seen & (margins < _SURE) if of_seen >= _MOSTLY else seen
+            if unsure.any():
+                why = "most frames by themselves show other ones"
                 remarks.append(
                     f"not sure which lines in {camera.name} are those of "
-                    f"{', '.join(f'whisker {k}' for k in unsure)}: most frames by themselves "
-                    "show other ones. Compare traces and video (vibrissa correct)."
+                    f"{', '.join(f'whisker {k}' for k in np.flatnonzero(unsure))}: "
+                    f"{why if of_seen >= _MOSTLY else 'the views still disagree in many frames'}. "
+                    "Compare traces and video (vibrissa correct)."
                 )
     return found, remarks
 
@@ -144,15 +149,17 @@ def _as_seen_by(row: Sequence[Trace], frames: NDArray[np.int64], count: int) -> 
     return known
 
 
-def _agreement(cameras: Sequence[Camera], rows: Sequence[Sequence[Sequence[Trace]]]) -> float:
-    """Share of the frames, over all whiskers, in which two views show one whisker."""
+def _agreement(
+    cameras: Sequence[Camera], rows: Sequence[Sequence[Sequence[Trace]]]
+) -> tuple[float, float]:
+    """Share of all frames and whiskers in which two views show one; and of those seen by both."""
     pairs = [pair for both in zip(*rows, strict=True) for pair in zip(*both, strict=True)]
     seen = [pair for pair in pairs if all(len(trace.line) for trace in pair)]
     if not seen:
-        return 0.0
+        return 0.0, 0.0
     ends = np.array([[[t.line[0], t.line[-1]] for t in pair] for pair in seen])
     gaps: Array = base_gap(cameras, np.moveaxis(ends, 1, 0))
     length = np.array([min(trace.length for trace in pair) for pair in seen])
     whole = np.array([all(trace.tip_seen for trace in pair) for pair in seen])
     agree = (gaps[:, 0] < _BASES) & (gaps[:, 1] < np.where(whole, _TIPS, _FADING) * length)
-    return float(agree.sum() / len(pairs))
+    return float(agree.sum() / len(pairs)), float(agree.mean())

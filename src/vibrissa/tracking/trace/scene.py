@@ -43,6 +43,7 @@ _BESIDE = 10.0  # distance from a face up to which a point is taken to be on it,
 # Share of the light by which a thin line that never moves is darker: less where this many standard
 # deviations of the background's noise are less, but no less than the second number.
 _LINE, _FAINT, _NOISES = 0.06, 0.025, 8.0
+_USUAL = 0.5  # part of that by which it, or a body, is also seen in the usual image
 _MANY = 15  # number of frames from which it is clear what never moves
 # Extent of the smallest still line and half the width of the thinnest still body, pixels.
 _LONG, _THICK = 60, 5
@@ -135,10 +136,7 @@ class Scene:
             rank = max(1, int(_RANK * len(lit)))
             nth_largest(np.stack(lit), gains[gains > _UNLIT], rank, background)
             background -= np.median(background[::_SPARSE, ::_SPARSE] - usual)
-        still = _closed(_halved(frames[0] if background is None else background), thin + 2)
-        # Black ground, as that of negatives of overexposed images, divides as one grey value.
-        light = np.maximum(_doubled(blurred(still, _SOFT), frames[0].shape), np.float32(1.0))
-        ground, share = _ground(still)
+        light, ground, share = _lit(frames[0] if background is None else background, thin)
         usual = np.asarray(usual, dtype=np.float32)
         return cls(light, share * ground, background, usual, thin, ground, len(frames), mask)
 
@@ -239,10 +237,19 @@ class Scene:
             return self
         shown = np.maximum(self.background, 1.0)
         ground = _doubled(self.ground, shown.shape)
-        stands = np.abs(shown / ground - 1.0) > 1.0 - _LIT
         least = _NOISES * noise_level(shown) / float(np.median(self.light))
-        thin = self.light / shown - 1.0 > min(max(least, _FAINT), _LINE)
-        stands = ndimage.binary_dilation(stands | thin, iterations=_BLUR)
+        least = min(max(least, _FAINT), _LINE)
+
+        def things(image: Image, light: Image, ground: Image, share: float) -> NDArray[np.bool_]:
+            body = np.abs(image / _doubled(ground, image.shape) - 1.0) > share * (1.0 - _LIT)
+            return np.asarray(body | (light / image - 1.0 > share * least))
+
+        stands = things(shown, self.light, self.ground, 1.0)
+        # Whiskers in side light leave bright halos in the background, but not in the usual image.
+        some = [frame / np.float32(self.gain(frame)) for frame in frames[::2]]
+        usual = np.maximum(np.median(np.stack(some), axis=0), np.float32(1.0))
+        stands &= things(usual, *_lit(usual, self.thin)[:2], _USUAL)
+        stands = ndimage.binary_dilation(stands, iterations=_BLUR)
 
         def around(stands: NDArray[np.bool_]) -> Any:
             known = np.where(stands, 0.0, 1.0).astype(np.float32)
@@ -352,6 +359,17 @@ class Still:
         grey = np.where(self.opaque, gain * self.open, self.factor * flat[self.at])
         flat[self.at] = np.minimum(grey + 0.5, most).astype(frame.dtype)
         return out
+
+
+def _lit(image: Any, thin: int) -> tuple[Image, Image, np.float32]:
+    """Light of an image without what is thin and dark; open ground in half the size, and its share.
+
+    Below that share of the ground there are bodies.
+    """
+    still = _closed(_halved(image), thin + 2)
+    # Black ground, as that of negatives of overexposed images, divides as one grey value.
+    light = np.maximum(_doubled(blurred(still, _SOFT), image.shape), np.float32(1.0))
+    return light, *_ground(still)
 
 
 def _long(labels: Any) -> list[int]:

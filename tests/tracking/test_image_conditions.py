@@ -137,6 +137,20 @@ def test_views_together_decide_whether_whiskers_are_bright():
     assert is_bright(both, [base, base])
 
 
+def test_one_glint_next_to_several_bases_makes_their_whiskers_not_bright():
+    """It is sharper than any of the whiskers, and as near to their bases."""
+    x, y = np.arange(200.0), np.arange(120.0)[:, None]
+    bases = [(30.0, row) for row in (40.0, 48.0, 56.0, 64.0)]
+    picture = 120.0 - 40.0 * sum(
+        np.exp(-0.5 * ((y - row - (row - 52.0) * (x - 30.0) / 90.0) / 1.1) ** 2) for _, row in bases
+    ) * ((x > 30.0) & (x < 110.0))
+    picture += 100.0 * np.exp(-0.5 * ((y - 52.0) / 1.1) ** 2) * (x > 30.0)
+    noisy = picture + np.random.default_rng(0).normal(0.0, 2.0, picture.shape)
+    frame = np.clip(noisy, 0, 255).astype(np.uint8)
+    assert not is_bright([frame], [bases])
+    assert is_bright([frame], [[(30.0, 52.0)]])
+
+
 def test_views_together_say_where_the_whisker_begins(filmed):
     frames = [view[0] for view in filmed.frames]
     bases = find_start(filmed.cameras, [[frame] for frame in frames]).bases

@@ -245,6 +245,22 @@ def test_a_still_wire_before_the_face_draws_no_trace_away():
         assert last > 80.0
 
 
+def test_a_whisker_does_not_go_on_along_a_wire_that_begins_at_its_base():
+    """It crosses the wire at small angles; there its tip was followed to the wire's end."""
+    angles = 0.12 * np.sin(0.7 * np.arange(24.0))
+    y, x = np.mgrid[:320, :320]
+    wire = np.exp(-0.5 * ((y - 103.0 - 0.04 * (x - 60.0)) / 1.2) ** 2) * (x > 60)
+    frames = [
+        np.rint(tapered(angle, seed=i, size=320) * (1.0 - 0.25 * wire)).astype(np.uint8)
+        for i, angle in enumerate(angles)
+    ]
+    (row,) = trace_video(frames, [(60.0, 100.0)])
+    for trace, angle in zip(row, angles, strict=True):
+        away, _, last = shown_along(trace, angle)
+        assert away < 4.0
+        assert 70.0 < last < 118.0
+
+
 @pytest.mark.parametrize("turn", [0.01, 0.03])
 def test_a_wide_whisker_that_hardly_moves_is_not_divided_out(turn):
     """What it leaves of itself in the background had drawn traces aside by 0.5 to 0.9 pixels."""

@@ -42,6 +42,7 @@ from vibrissa.tracking.trace.trace import (
     NEAR,
     STEP,
     Trace,
+    TraceOptions,
     aligned,
     arc_lengths,
     between_whiskers,
@@ -57,6 +58,7 @@ _SHORT = 3.0  # cost of a line that is hardly seen
 # Share of a line that moves from which it may be a whisker, and cost of one that does not, such as
 # a wire, at a click where another one does that has such a share of its length.
 _MOVES, _STANDS, _COMPARABLE = 0.4, 3.0, 0.4
+_MOSTLY = 0.6  # share of the frames in which the line at a base moves if its whisker does
 # Turn, rad, and shift, pixels, of the whole row in a frame that cost as much as a lost whisker.
 _ROW_TURN, _ROW_SHIFT = 0.1, 5.0
 _UNLIKE = 3.0  # unlikeness above which a whisker's own line is in doubt
@@ -181,24 +183,11 @@ def _begun(
         for curve in find_curves(frame, scene, options, begins=clicked)
         if all(overlap(curve.line, other.line) < SAME for other in fixed.values())
     ]
-    apart = _distance_to_next(followers)[free]
-    price = np.array(
-        [
-            [_price(click, curve, half) for curve in every]
-            for click, half in zip(clicked, 0.5 * apart, strict=True)
-        ]
-    ).reshape(len(free), len(every))
-    moves = np.array([curve.moved > _MOVES for curve in every], dtype=bool)
-    length = np.array([curve.length for curve in every])
-    for row in price:
-        longest = length[moves & (row < 2.0 * LOST)].max(initial=0.0)
-        row[~moves & (_COMPARABLE * length < longest)] += _STANDS
-    rows, columns = optimize.linear_sum_assignment(np.minimum(price, 2.0 * LOST))
+    assigned = _at_clicks(clicked, every, _distance_to_next(followers)[free])
     lines = [one.line for one in every]
     starts = {
         free[i]: _up_to_a_crossing(even(lines[c][_passed(clicked[i], lines[c])[1] :]), lines)
-        for i, c in zip(rows, columns, strict=True)
-        if price[i, c] < 2.0 * LOST
+        for i, c in assigned
     }
     # A line may have met another one where that is not seen any more.
     onward = {k: prolonged(start, _POLYNOMIAL, _AHEAD) for k, start in starts.items()}
@@ -210,6 +199,35 @@ def _begun(
     found = _through_crossings(followers, starts, known, frame, noise, scene)
     found = {k: trace for k, trace in found.items() if followers[k].long_enough(trace)}
     return _without_clashes(found, fixed)
+
+
+def _at_clicks(clicked: Array, every: Sequence[Curve], apart: Array) -> list[tuple[int, int]]:
+    """Clicks and their curves, no two the same; a curve that stands still costs more."""
+    price = np.array(
+        [
+            [_price(click, curve, half) for curve in every]
+            for click, half in zip(clicked, 0.5 * apart, strict=True)
+        ]
+    ).reshape(len(clicked), len(every))
+    moves = np.array([curve.moved > _MOVES for curve in every], dtype=bool)
+    length = np.array([curve.length for curve in every])
+    for row in price:
+        longest = length[moves & (row < 2.0 * LOST)].max(initial=0.0)
+        row[~moves & (_COMPARABLE * length < longest)] += _STANDS
+    rows, columns = optimize.linear_sum_assignment(np.minimum(price, 2.0 * LOST))
+    pairs = zip(rows.tolist(), columns.tolist(), strict=True)
+    return [(i, c) for i, c in pairs if price[i, c] < 2.0 * LOST]
+
+
+def moving(frames: Sequence[Frame], scene: Scene, bases: Array, options: TraceOptions) -> Mask:
+    """Whether the whisker at each base (n, 2) moves: in most frames the line there does."""
+    apart = _spacing(bases)
+    count = np.zeros(len(bases))
+    for frame in frames:
+        every = find_curves(scene.without_still(frame), scene, options, begins=bases)
+        for i, c in _at_clicks(bases, every, apart):
+            count[i] += every[c].moved > _MOVES
+    return np.asarray(count > _MOSTLY * len(frames))
 
 
 def _through_crossings(
@@ -490,7 +508,11 @@ def from_click(click: Array, line: Array) -> float:
 
 def _distance_to_next(followers: Sequence[Follower]) -> Array:
     """Distance of each base from the nearest other one, pixels."""
-    bases = np.array([follower.base for follower in followers])
+    return _spacing(np.array([follower.base for follower in followers]))
+
+
+def _spacing(bases: Array) -> Array:
+    """Distance of each base from the nearest other one, pixels, at least two."""
     distance = np.linalg.norm(bases[:, None] - bases[None], axis=2)
     np.fill_diagonal(distance, np.inf)
     return np.asarray(np.maximum(distance.min(axis=1, initial=np.inf), 2.0))

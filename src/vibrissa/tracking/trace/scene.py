@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from vibrissa.deferred import ndimage
 from vibrissa.io import Frame
-from vibrissa.numerics import kernel
+from vibrissa.numerics import Mask, kernel
 from vibrissa.tracking.trace.ridge import middle, noise_level
 from vibrissa.tracking.trace.trace import EDGE, STILL, Bits, Trace, tangent
 
@@ -231,8 +231,13 @@ class Scene:
         """A frame without static objects, if these are known."""
         return frame if self.still is None else self.still.removed(frame, self.gain(frame))
 
-    def with_still(self, bases: Array, frames: Sequence[Frame]) -> Scene:
-        """Find static objects in these frames, except those at which whiskers begin (n, 2)."""
+    def with_still(
+        self, bases: Array, frames: Sequence[Frame], moving: Mask | None = None
+    ) -> Scene:
+        """Find static objects in these frames, except those at which whiskers begin (n, 2).
+
+        A static line at the base of a whisker that is known to move is none.
+        """
         if self.background is None or self.count < _MANY:
             return self
         shown = np.maximum(self.background, 1.0)
@@ -273,8 +278,8 @@ class Scene:
         # The face moves, with all that is attached to it, but not a line that only passes the base,
         # nor a body behind a base.
         row, column = (np.arange(n) for n in stands.shape)
-        lifted = np.zeros_like(stands)
-        for x, y in bases:
+        lifted, resting = np.zeros_like(stands), np.zeros(len(bases), dtype=bool)
+        for i, (x, y) in enumerate(bases):
             away = np.hypot.outer(row - y, column - x)
             at_base = np.isin(parts, np.unique(parts[(away < _AT_BASE) & stands]))
             if stands[away < _DEEP].mean() > _COVERED:
@@ -283,7 +288,8 @@ class Scene:
                 continue
             for k in np.unique(lines[(away < _AT_BASE) & across]):
                 if _begins(np.argwhere(lines == k)[:, ::-1] - [x, y]):
-                    across &= lines != k
+                    resting[i] = True
+                    across &= (lines != k) | (moving is not None and moving[i])
             other = (bodies > 0) & ~np.isin(bodies, np.unique(bodies[away < _AT_BASE]))
             stands &= ~at_base | across | other
         # Where whiskers cross or turn it is always dark too, but only over a short length.
@@ -298,10 +304,9 @@ class Scene:
         hidden = ndimage.binary_dilation(dark, iterations=_SEEN) | rim
         bits = STILL * hidden.astype(np.uint32)
         bits |= EDGE * stands.astype(np.uint32)
-        return replace(
-            self,
-            still=Still(at, factor, open_.ravel()[at], dark.ravel()[at], bool(lifted.any()), bits),
-        )
+        open_, dark = open_.ravel()[at], dark.ravel()[at]
+        still = Still(at, factor, open_, dark, bool(lifted.any()), bits, resting)
+        return replace(self, still=still)
 
     def _swept(self, frames: Sequence[Frame], lines: NDArray[Any]) -> NDArray[np.bool_]:
         """Pixels of lines that are only the trace of a whisker moving by less than its width.
@@ -349,6 +354,7 @@ class Still:
     opaque: NDArray[np.bool_]
     before_body: bool  # some whisker begins before one of these, which is grey
     bits: Bits
+    resting: Mask  # (n,) whether the whisker of each base may be one of them
 
     def removed(self, frame: Frame, gain: float) -> Frame:
         """A frame, of known brightness, without the static objects."""

@@ -291,15 +291,22 @@ def is_bright(
 
 
 def _seen(frame: Frame, bases: Sequence[ArrayLike] | None, options: TraceOptions) -> float:
-    """Clarity of the lines seen: their length over the standard deviation of points."""
+    """Clarity of lines seen, one for each base: length over the standard deviation of points."""
     if bases is None:
         curves = find_curves(frame, Scene.of([frame], options.scale), options)
         return max((curve.score for curve in curves), default=0.0)
     noise = noise_level(frame)
-    return sum(
-        max((t.clearness for t in start_at(base, options).from_base(frame, noise)), default=0.0)
-        for base in bases
-    )
+    lines = [
+        (trace.clearness, k, trace.line)
+        for k, base in enumerate(bases)
+        for trace in start_at(base, options).from_base(frame, noise)
+    ]
+    # One line, such as a glint next to all bases, is not that of several whiskers.
+    taken = dict[int, tuple[float, Array]]()
+    for clear, k, line in sorted(lines, key=lambda each: -each[0]):
+        if k not in taken and all(overlap(line, one) < _ALIKE for _, one in taken.values()):
+            taken[k] = clear, line
+    return sum(clear for clear, _ in taken.values())
 
 
 def find_start(

@@ -34,7 +34,7 @@ from vibrissa.numerics import Array, Mask, without_blas_threads
 from vibrissa.tracking.trace.curves import Curve, find_curves, find_whiskers
 from vibrissa.tracking.trace.follower import Follower, features_of, start_at
 from vibrissa.tracking.trace.identity import Seen, decided, settle_crossings
-from vibrissa.tracking.trace.row import CLICK, follow_row, from_click
+from vibrissa.tracking.trace.row import CLICK, follow_row, from_click, moving
 from vibrissa.tracking.trace.scene import Scene
 from vibrissa.tracking.trace.start import FRAMES, is_bright, negative
 from vibrissa.tracking.trace.steady import Steady
@@ -134,7 +134,7 @@ _BACK = 64  # largest number of frames before its own that a correction can chan
 _AGREES = 0.9  # share of a line along another one above which both are the same
 # Factor of the jump of a single whisker before grey fur, where its base is less certain.
 _FAINT = 2.4
-_LOOKED = 9  # number of frames after the first in which neighbours are searched
+_LOOKED = 9  # number of frames in which neighbours, and whether whiskers move, are searched
 _SPAN = 400  # number of frames at the beginning of a film from which those for its start are taken
 
 
@@ -176,11 +176,11 @@ class Surroundings:
     ) -> Surroundings:
         """Surroundings of whiskers that begin somewhere, (n, 2), by frames spread over a video."""
         sample = [negative(f) if bright else f for f in frames]
-        scene = Scene.of(sample, options.scale, mask).with_still(starts, sample)
+        scene = _scene(sample, starts, options, mask)
         steady = Steady.of(scene, sample)
         if steady is not None and steady.at.size:
             sample = [steady.moved_back(f)[0] for f in sample]
-            scene = Scene.of(sample, options.scale, mask).with_still(starts, sample)
+            scene = _scene(sample, starts, options, mask)
         return cls(bright, scene, steady, sample)
 
     def clear(self, frame: Frame) -> tuple[Frame, Shift]:
@@ -209,6 +209,17 @@ class Surroundings:
             ]
             if self.steady is not None:
                 row[:] = [t._replace(shift=s) for t, s in zip(row, shifts, strict=True)]
+
+
+def _scene(
+    frames: Sequence[Frame], starts: Array, options: TraceOptions, mask: Mask | None
+) -> Scene:
+    """Scene of whiskers that begin somewhere, (n, 2); those that move are none of its lines."""
+    scene = Scene.of(frames, options.scale, mask).with_still(starts, frames)
+    if scene.still is None or not scene.still.resting.any():
+        return scene
+    moves = moving(frames[:: max(len(frames) // _LOOKED, 1)], scene, starts, options)
+    return scene.with_still(starts, frames, moves) if moves.any() else scene
 
 
 @without_blas_threads

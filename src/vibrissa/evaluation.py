@@ -46,10 +46,7 @@ _QUANTILES = (0.5, 0.95, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class ErrorRow:
-    """Errors of some contacts in one quantity: median, 95 % quantile and largest, SI units.
-
-    Both measured, and predicted from the covariance; `contacts` is the number with an estimate.
-    """
+    """Measured and predicted errors in one quantity: median, 95 % quantile and largest."""
 
     quantity: str
     label: str
@@ -259,11 +256,7 @@ class TrackingScores:
 
 @dataclass(frozen=True, eq=False)
 class SignalRow:
-    """Errors of force and moment in a class of deflection angle.
-
-    Median and 95 % quantile (2,) of the magnitude of the error relative to that of the vector,
-    laboratory frame.
-    """
+    """Relative errors (2,) of force and moment in a class of deflection angle, laboratory frame."""
 
     label: str
     contacts: int

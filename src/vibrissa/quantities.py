@@ -206,10 +206,7 @@ _LARGER = {"µN": "mN", "mN": "N", "µN·m": "mN·m", "mN·m": "N·m"}
 
 
 def shown_unit(name: str, values: ArrayLike) -> tuple[float, str]:
-    """Factor from SI units, and the most readable unit for given values.
-
-    For forces and moments far larger than a rat's, it is larger than the display unit.
-    """
+    """Factor from SI units, and the most readable unit for given values."""
     known = quantity(name)
     factor, unit = known.display_factor, known.display_unit
     size = np.abs(np.asarray(values, dtype=np.float64))

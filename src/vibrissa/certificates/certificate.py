@@ -80,10 +80,7 @@ def enclose_conditions(
 
 @dataclass
 class Part:
-    """One part of the domain and the boxes that cover it: levels and indices, by unknown.
-
-    For an unknown that is fixed on a face, both bounds of the domain are equal.
-    """
+    """One part of the domain and the boxes that cover it: levels and indices, by unknown."""
 
     domain: Array
     certified: IntArray

@@ -224,11 +224,7 @@ def identity(data: xr.Dataset) -> str:
 
 
 def _domains_match(data: xr.Dataset) -> bool:
-    """Whether the rod is a straight cone, and the parts are those of the lemma.
-
-    These are the domain, its two ends and the face of the largest force. The equations do not apply
-    to a curved whisker whose file is marked as straight, nor to a rod of several pieces.
-    """
+    """Whether the rod is a straight cone, and the parts are those of the lemma."""
     rod = data["rod_coefficients"].values
     cone = len(rod) == 1 and not rod[0, :3].any() and not rod[0, 3, 2:].any()
     near = float(data["interior_domain"].values[0, 0])

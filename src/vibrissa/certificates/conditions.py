@@ -313,10 +313,7 @@ def report(z: Array, row: int, lane: int, unknowns: int, out: Array) -> None:
 
 @inlined_rigorous
 def relative_widths(state: Array, states: int, lane: int, out: Array) -> None:
-    """Sum over vectors of states of the change by each unknown, relative to the vector's size.
-
-    The vectors are the derivatives by the force, which change only as the rod turns.
-    """
+    """Sum over states' vectors of the change by each unknown, relative to the vector's size."""
     last = state.shape[1] - 1
     for a in range(out.size):
         out[a] = TINY

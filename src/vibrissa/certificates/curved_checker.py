@@ -101,10 +101,7 @@ def _constant(value: Array | float, number: int) -> Poly:
 
 
 def _function(axis: int, half: Array, derivatives: list[Array], beyond: Array) -> Poly:
-    """Taylor polynomial of a function of one unknown, from its derivatives in the middle.
-
-    ``beyond`` bounds the next derivative.
-    """
+    """Taylor polynomial of a function of one unknown, whose next derivative ``beyond`` bounds."""
     out = _constant(derivatives[0], half.size)
     power, each = 1.0 + 0.0 * half, np.eye(3, dtype=int)[axis]
     for k, value in enumerate(derivatives):

@@ -71,10 +71,7 @@ class ExactRod(NamedTuple):
 
 @dataclass
 class Equations:
-    """Variables in the order of their computation, from which a `Program` is built.
-
-    Each has a kind and products (sign, left, right).
-    """
+    """Variables, each with its kind and products, from which a `Program` is built in this order."""
 
     names: list[str] = field(default_factory=list)
     kinds: list[int] = field(default_factory=list)
@@ -96,10 +93,7 @@ class Equations:
         self.kinds += [GIVEN] * len(names)
 
     def differentiate(self, by: str, known: dict[str, str]) -> None:
-        """Add derivatives by an unknown of all variables that depend on it.
-
-        ``known`` names the derivatives of given variables.
-        """
+        """Add derivatives by an unknown of all variables that depend on it."""
         derivative = dict(known)
         fixed = {*KNOWN, "g", "g2", "c", "c1"}
         original = [n for n in self.names if n not in fixed and "_" not in n]

@@ -234,10 +234,7 @@ def _box_around(contact: Array, half: Array) -> Array:
 def _unique_box(
     system: _System, names: tuple[list[str], list[str]], free: IntArray, one: _Range, second: Array
 ) -> Array | None:
-    """Box (3, 2) with exactly one contact that has the first's signals; None if unproved.
-
-    ``names`` are all signals, and those that are compared; ``free`` are the unknowns that vary.
-    """
+    """Box (3, 2) with exactly one contact that has the first's signals; None if unproved."""
     everything, wanted = names
     gap, slope = _equations(wanted, one, system.at(_box_around(second, np.zeros(3))))
     by = slope.centre[:, free]

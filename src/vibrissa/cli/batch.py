@@ -111,10 +111,7 @@ def _one(
     again: bool,
     tell: Tell,
 ) -> tuple[vb.pipeline.TrialSummary | None, str, bool]:
-    """Reconstruct the object of one recording.
-
-    Return a summary (or None), the faults, and whether a contour was missing or outdated.
-    """
+    """Reconstruct one recording: summary (or None), faults, and whether a contour was due."""
     faults: list[str] = []
     found, tree, made = None, None, False
     with _noted(faults):

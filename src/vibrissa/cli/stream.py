@@ -284,10 +284,7 @@ def stream(
 
 @contextmanager
 def _without_long_collections() -> Iterator[Callable[[], None]]:
-    """Suspend garbage collection during loading, and exclude all loaded objects from it later.
-
-    Collection over all objects of the libraries takes longer than a sample may wait.
-    """
+    """Suspend garbage collection during loading: it takes longer than a sample may wait."""
 
     def settled() -> None:
         gc.freeze()

@@ -136,10 +136,7 @@ class Ended(KeyboardInterrupt):
 
 @contextmanager
 def ending_in_order() -> Iterator[None]:
-    """Context that raises `Ended` at a signal that would end the process, and then blocks others.
-
-    Signals that are ignored (``nohup``) or have other handlers are not affected.
-    """
+    """Raise `Ended` at a signal that would end the process, unless it is ignored or handled."""
     taken: dict[int, Any] = {}
 
     def end(number: int, frame: object) -> None:

@@ -322,10 +322,7 @@ def _excess(misses: Array) -> Array:
 
 
 def _softened(misses: Array) -> Array:
-    """Scale residuals (n, m) so that their squares are a robust misfit (smooth L1).
-
-    All residuals of a contact are scaled alike: the misfit does not depend on the frame.
-    """
+    """Scale residuals (n, m), those of a contact alike, so that their squares are smooth L1."""
     return np.asarray(misses * np.sqrt(2.0 / (1.0 + np.sqrt(1.0 + _excess(misses)))))
 
 

@@ -172,10 +172,7 @@ def prepare(
 
 
 def _plane(whisker: Whisker) -> tuple[Array, float | None]:
-    """Normal of the plane of a whisker, and the bearing of forces in it.
-
-    The normal is z, and there is no bearing, if the whisker is not planar.
-    """
+    """Normal of the plane of a whisker and bearing of forces in it; z and None if not planar."""
     line = whisker.centerline(101)
     normal = np.array([0.0, 0.0, 1.0])
     if not whisker.is_straight:
@@ -256,11 +253,7 @@ def gather_evidence(problem: Problem, names: tuple[str, ...], resolution: bool) 
 
 
 def _search_twins(problem: Problem, names: tuple[str, ...], own: Pairs, local: Local) -> Pairs:
-    """Search for twins farther from rest, from those of the samples and from contacts near folds.
-
-    Regions that seem to have none outside the cone are searched repeatedly. A contact at which
-    det ∂T/∂p has the rarer sign has a twin, though it may be in another region.
-    """
+    """Search for twins farther from rest, repeatedly in regions that seem to have none."""
     wide = problem.wide
     pool = concatenate([own, _twins_of(problem, names, wide.rows(local.near_folds))])
     without = _regions_without_witness(problem, pool, problem.regions)
@@ -525,10 +518,7 @@ def _local(problem: Problem, names: tuple[str, ...], samples: Samples) -> Local:
 
 
 def _distance_from_plane(points: Array, problem: Problem) -> Array:
-    """Distances (n,) of points from the whisker's plane.
-
-    Without BLAS, whose idle threads would compete with the kernels.
-    """
+    """Distances (n,) from the whisker's plane, without BLAS, whose idle threads would compete."""
     return np.asarray((points * problem.normal).sum(axis=1))
 
 

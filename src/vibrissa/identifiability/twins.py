@@ -93,11 +93,7 @@ class ContactSet(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """Contacts spread over Ω.
-
-    chart (n, 3): coordinates (η, ψ, ρ); the contacts; gradients (n, 6, 3): directions of the six
-    signals' gradients; volume (n,): share of the volume of contact points, up to a common factor.
-    """
+    """Pairs with equal triplets closest to contacts (n, 2, 3), by Newton's method."""
 
     chart: Array
     contacts: ContactSet
@@ -161,10 +157,7 @@ def sample(contact_map: ContactMap, chart: Array, domain: Domain) -> Samples:
 
 
 def spread(number: int, seed: int | None) -> Array:
-    """Low-discrepancy chart coordinates (n, 3), at least ``number`` of them: a power of two.
-
-    Without a seed the sequence is not scrambled.
-    """
+    """Low-discrepancy chart coordinates (n, 3), n a power of two; without a seed not scrambled."""
     rng = None if seed is None else np.random.default_rng(seed)
     sobol = stats.qmc.Sobol(3, scramble=seed is not None, seed=rng)
     unit = sobol.random_base2(max(1, int(np.ceil(np.log2(number)))))

@@ -529,10 +529,7 @@ def _evidence(
     verdict: AnyArray,
     certificate: Certificate | None,
 ) -> AnyArray:
-    """Evidence for each verdict, (triplets, regions).
-
-    A certificate covers all stable contacts outside a cone, and so every region and domain.
-    """
+    """Evidence for verdicts (triplets, regions); a certificate covers every region and domain."""
     words = {NOT_UNIQUE: "witness", EMPTY: ""}
     out = np.vectorize(lambda word: words.get(str(word), "no counterexample found"))(verdict)
     if certificate is None:

@@ -111,10 +111,7 @@ def _check_heaps(path: Path) -> None:
 
 
 def _items(file: h5py.File, faults: list[str]) -> Iterator[tuple[str, h5py.HLObject]]:
-    """Yield all objects of a file once, except soft links, which are appended to ``faults``.
-
-    ValueError is raised for external links and cycles.
-    """
+    """Yield all objects of a file once; soft links are faults, external links and cycles errors."""
     groups: list[tuple[str, h5py.Group]] = [("", file)]
     while groups:
         above, group = groups.pop()

@@ -146,10 +146,7 @@ def _failing(path: Path) -> Iterator[None]:
 
 
 def _finish(part: Path, path: Path) -> None:
-    """Flush the file to disk, which shows a lack of space, and set its permissions.
-
-    They are those of the file that it replaces, or else the default.
-    """
+    """Flush a file to disk, and give it the permissions of the one it replaces, or the default."""
     with part.open("r+b") as file:
         os.fsync(file.fileno())
     # A temporary file is readable by its owner only.

@@ -284,10 +284,7 @@ def _tapered(
     base: str | ArrayLike | None,
     properties: Properties,
 ) -> Whisker:
-    """Whisker with radii measured along it; by default the thicker end is the base.
-
-    Radii among the properties replace the measured ones, which then determine the base only.
-    """
+    """Whisker with radii measured along it, unless they are stated; the thicker end is the base."""
     known = np.isfinite(radii)
     replaced = any(properties.get(name) is not None for name in _STATED)
     faults = [f"{radii[i] * 1e6:g} µm at point {i + 1}" for i in np.flatnonzero(radii <= 0.0)]

@@ -145,13 +145,7 @@ def _widened(fit: FittedShape, together: float) -> FittedShape:
 
 
 def _moved_together(recording: xr.DataTree, estimates: xr.Dataset) -> Iterator[xr.Dataset]:
-    """Yield estimates displaced by the errors that all frames of a recording share.
-
-    A tracked contact moves with the trace, and a contact from sensor signals with the pose that
-    transforms it to the laboratory frame; an error of the pose rotates normals. Errors of the
-    inertia that was removed displace contacts and rotate normals. The errors are replaced by the
-    few independent combinations that account for nearly all of their variance.
-    """
+    """Yield estimates displaced by the few independent errors that all frames share."""
     root, found = Recording(recording).root, Group(estimates)
     point, normal = found["contact_point"], found["contact_normal"]
     inertia, count = found.get("contact_inertia"), root.data.sizes.get("error", 0)
@@ -490,10 +484,7 @@ def compare_contacts(
     whiskers: Sequence[Whisker] | None = None,
     seed: int = 0,
 ) -> xr.Dataset:
-    """Compare the contacts of a recording with the known object nearest to them, ``object``.
-
-    Distances are those of `vibrissa.contour.compare_with`.
-    """
+    """Compare contacts with the nearest known object, as `vibrissa.contour.compare_with` does."""
     estimates = estimates_in(recording)
     trial, contacts = Recording(recording), Group(estimates)
     known = trial.objects if objects is None else tuple(objects)

@@ -202,10 +202,7 @@ def _rigid(objects: Surface | Sequence[Surface]) -> list[Surface]:
 
 
 class NearObjects:
-    """Equilibria of one whisker near rigid objects that are shifted in the laboratory frame.
-
-    Shifts (3,) are in units of L.
-    """
+    """Equilibria of one whisker near rigid objects, shifted in the laboratory frame by (3,) L."""
 
     def __init__(
         self, whisker: Whisker, objects: Surface | Sequence[Surface], elements: int = ELEMENTS

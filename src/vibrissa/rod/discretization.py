@@ -224,10 +224,7 @@ def _nodes(whisker: Whisker, steps: int) -> Array:
 
 
 def _hinged(radius: Array, steep: Array) -> Array:
-    """Additional steps, over those of a rod without, where a rod is thinner than beyond.
-
-    A strong load turns such a hinge as far as it would turn the whole rod.
-    """
+    """Additional steps where a rod is thinner than beyond: a strong load turns such a hinge far."""
     beyond = np.maximum.accumulate(radius[::-1])[::-1]
     slack: Array = np.maximum((beyond / radius / _HINGE) ** 4 - 1.0, 0.0)
     if slack.any():

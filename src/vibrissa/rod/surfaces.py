@@ -221,10 +221,7 @@ class _Resting:
 
 
 class _Follower:
-    """Present placement and contact of the whisker, and its motion to the next placement.
-
-    Where there is no contact, a status states why: `Status.NO_CONTACT` if it was released.
-    """
+    """Present placement and contact of the whisker, and its motion to the next placement."""
 
     def __init__(self, whisker: Whisker, surfaces: Sequence[Surface], friction: float) -> None:
         self.discretization = discretize(whisker)

@@ -368,10 +368,7 @@ def _solve_leans(
 
 @kernel
 def solve_lanes(rod: Rod, weight: Weight, b: Array, h: Array, more: int) -> bool:
-    """Solve the contacts in the buffer ``b``, with their first ``more`` derivatives.
-
-    ``h``, of size ``WEIGHT_BUFFER``, receives the base values and derivatives.
-    """
+    """Solve the contacts in the buffer ``b``, with their first ``more`` derivatives, into ``h``."""
     enough = _SMALL if more == 0 else _NEAR
     error = _solve_leans(rod, weight, b, h, 1.0, enough)
     if not error < enough:  # increase the force from rest in steps

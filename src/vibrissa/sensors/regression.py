@@ -87,11 +87,7 @@ _RATIOS = np.logspace(-7, 1, 17)
 
 @dataclass(frozen=True, eq=False)
 class ThinPlate:
-    """Mean of a thin-plate Gaussian process of k quantities.
-
-    ``reach`` is the R of the kernel, at least the distance between any two ``points`` (n, 3);
-    ``noise`` (k,) is the fitted standard deviation of the noise.
-    """
+    """Mean of a thin-plate Gaussian process of k quantities, with fitted noise (k,)."""
 
     points: Array
     weights: Array

@@ -496,10 +496,7 @@ class _Touch:
         )
 
     def system(self, at: _State, metric: Array) -> tuple[Array, Array]:
-        """Gradient (n, m) and banded Hessian of half the cost, by contacts and bias.
-
-        An arc length at an end of its range is fixed if the gradient points out of the range.
-        """
+        """Gradient (n, m) and banded Hessian of half the cost, by contacts and bias."""
         n, k = at.bias.shape
         size = 3 + k
         point = self.turn @ at.touches.point_slopes

@@ -48,10 +48,7 @@ class Chain:
 
     @classmethod
     def of(cls, whisker: Whisker, density: tuple[float, float], segments: int) -> Chain:
-        """Chain of a whisker, with shorter segments where it is thin.
-
-        ``density`` is that at base and tip, kg/m³, linear in arc length in between.
-        """
+        """Chain of a whisker of a density, kg/m³, with shorter segments where it is thin."""
         nodes = _nodes(whisker, segments)
         h = np.diff(nodes)
         joints = nodes[:-1] + 0.5 * h

@@ -89,13 +89,7 @@ class Sample(NamedTuple):
 
 
 class Lines:
-    """Parser of lines; the first line that is not JSON is a header, and others may follow.
-
-    Of several choices of names, the first that a line has is used. ``raw`` names are those of a
-    sensor's channels, which must match exactly and have no units; channels Fx to Mz may also have
-    alternative names, such as ``wrench.force.x``. For a named whisker, its values are named
-    ``name.value``, and lines with only those of others are ignored.
-    """
+    """Parser of lines of CSV or JSON; of several choices of names, the first that a line has."""
 
     def __init__(self, *names: tuple[str, ...], raw: bool = False, whisker: str = "") -> None:
         self.names, self.raw = names, raw

@@ -496,11 +496,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Outcome:
-    """Numbers of cells in a run, and damaged parts of the store that were replaced.
-
-    Counted are cells computed now, failed ones among them, and existing ones: skipped, failed
-    earlier, or damaged and computed again.
-    """
+    """Numbers of cells computed, failed and existing in a run, and of damaged parts replaced."""
 
     done: int
     failed: int

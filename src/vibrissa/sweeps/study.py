@@ -49,11 +49,7 @@ _OF_WHISKER, _OF_CELL = 16, 4  # numbers stored for each whisker, including its 
 
 @dataclass(frozen=True)
 class Cell:
-    """One task for one whisker.
-
-    The seed is the same for the same whisker in all studies with the same seed; the identity is a
-    hash of whisker, task, settings and seed.
-    """
+    """One task for one whisker, with its seed, and a hash of all that determines it as identity."""
 
     task: str
     kind: str

@@ -209,10 +209,7 @@ class Page:
         self.work.put("mode", job)
 
     def redraw(self, dragging: bool = False) -> None:
-        """Draw the mode; a dragged object stays at the mouse.
-
-        All changes are sent together, as the browser redraws the scene after each message.
-        """
+        """Draw the mode, all in one message to the browser; a dragged object stays at the mouse."""
         now = time.monotonic()
         words = not dragging or now >= self._written + _READ
         with self.server.atomic():
@@ -256,10 +253,7 @@ class Page:
         show(self.linked, f'<i hidden data-link="{escape(urlencode(state))}"></i>')
 
     def restore(self, asked: Mapping[str, str]) -> None:
-        """Restore the state in the parameters of a link, as far as they are valid.
-
-        Parameters without a mode are for the current one.
-        """
+        """Restore the state in the parameters of a link, as far as they are valid."""
         if "mode" not in asked:
             if self.mode is not None:
                 self.mode.restore(asked)

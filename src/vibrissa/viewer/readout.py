@@ -36,10 +36,7 @@ def symbol(name: str) -> str:
 
 
 def number(name: str, value: float, digits: int = 4) -> str:
-    """Format an SI value in its most readable unit; a dash if it is missing.
-
-    Angles have two decimals, other numbers so many digits but at most four decimals.
-    """
+    """Format an SI value in its most readable unit; a dash if it is missing."""
     if not np.isfinite(value):
         return "–"
     factor, unit = shown_unit(name, value)
@@ -82,10 +79,7 @@ _BY_SUCCESS = {
 
 
 def sentence(status: Status, good: str | None = None) -> str:
-    """HTML of the status of a load or an estimate, coloured by success.
-
-    A valid status may be stated in other words.
-    """
+    """HTML of the status of a load or an estimate, coloured by success."""
     words = good if good and status.ok else status.explanation
     paper, ink = _BY_SUCCESS[bool(status.ok)]
     advice = f'<div style="margin-top:3px;opacity:.85">{plain(status.advice)}</div>'

@@ -94,10 +94,7 @@ def _render(client: viser.ClientHandle, fine: float) -> Picture:
 def movie(
     client: viser.ClientHandle, mode: TrialMode, fine: float, progress: Callable[[int, int], None]
 ) -> bytes:
-    """MP4 movie of a trial in the view of a browser, on white, without empty margins.
-
-    ``fine`` is the number of its pixels per pixel of the browser.
-    """
+    """MP4 movie of a trial in the view of a browser, on white, without empty margins."""
     import imageio.v3 as imageio
 
     mode.pause()

@@ -62,10 +62,7 @@ _TURNED = np.radians([106.51, -2.5211, -19.5401])
 
 
 def arc_length(row: ArrayLike, column: ArrayLike) -> Array:
-    """Length of whiskers (Towal et al. 2011).
-
-    S = −7.9312 column + 2.2224 row + 52.1110 mm.
-    """
+    """Length of whiskers: S = −7.9312 column + 2.2224 row + 52.1110 mm (Towal et al. 2011)."""
     row, column = _towal_numbers(row, column)
     return np.asarray(1e-3 * (-7.9312 * column + 2.2224 * row + 52.1110))
 
@@ -81,10 +78,7 @@ def curvature_coefficient(column: ArrayLike) -> Array:
 
 
 def curvature_bound(length: ArrayLike) -> Array:
-    """Largest coefficient A of real whiskers of a length (Quist & Hartmann 2012).
-
-    A ≤ 0.156 exp(−S / 15.6 mm) + 0.015 per mm.
-    """
+    """Largest A of a length: 0.156 exp(−S / 15.6 mm) + 0.015 per mm (Quist & Hartmann 2012)."""
     s = 1e3 * np.asarray(length, dtype=np.float64)
     return np.asarray(1e3 * (0.156 * np.exp(-s / 15.6) + 0.015))
 

@@ -145,10 +145,7 @@ def roll(angle: float) -> Array:
 
 
 def least_turn(direction: ArrayLike) -> Array:
-    """Rotation that takes e_x to a unit vector (3,) by the smallest angle.
-
-    For the opposite direction, where it is not unique, the rotation is about z.
-    """
+    """Rotation by the smallest angle that takes e_x to a unit vector (3,); about z if opposite."""
     x, y, z = np.asarray(direction, dtype=np.float64)
     rho2 = y * y + z * z
     if rho2 == 0.0:

@@ -107,10 +107,7 @@ class Profile:
         return self.coefficients.shape[2:]
 
     def __call__(self, s: ArrayLike, side: Side = "right") -> Array:
-        """Values at arc lengths `s` (...), m, as (..., *shape); NaN gives NaN.
-
-        At a knot `side` selects the interval; outside the knots the end ones are extrapolated.
-        """
+        """Values (..., *shape) at arc lengths `s`, m; at a knot `side` selects the interval."""
         s = np.asarray(s, dtype=np.float64)
         last = self.knots.size - 2
         interval = np.clip(np.searchsorted(self.knots, s, side=side) - 1, 0, last)

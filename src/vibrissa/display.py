@@ -104,8 +104,7 @@ def _picture(recording: xr.DataTree) -> str:
         ("base_position", REST, True, "its base"),
         ("contact_point", CONTACT, True, "contacts"),
     ):
-        values = trial.known(name, ("", "truth"))
-        if values is None:
+        if (values := trial.known(name, ("", "truth"))) is None:
             continue
         values = values if dots else thinned(values, MOST_CURVES)
         marks.append(Mark(values, colour, dots, 3.0 if dots else 0.7, label))

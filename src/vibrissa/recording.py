@@ -156,8 +156,7 @@ def ordered(name: str, variable: xr.Variable) -> NDArray[Any]:
     Missing booleans are False, a missing status is that of missing data, and infinite components of
     vectors count as missing.
     """
-    fault = _fault(name, variable, _SELECTED)
-    if fault:
+    if fault := _fault(name, variable, _SELECTED):
         raise ValueError(fault)
     wanted = _declared(name)
     called = {_ALSO_CALLED.get(str(dim), str(dim)): dim for dim in variable.dims}
@@ -220,8 +219,7 @@ class Group:
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         """Values in the declared order of dimensions; raise ValueError if they are missing."""
-        values = self.get(name)
-        if values is None:
+        if (values := self.get(name)) is None:
             here = f"the group {self.name} of the recording" if self.name else "the recording"
             got = ", ".join(sorted(map(str, self.data.data_vars))) or "no variables"
             raise ValueError(f"{here} lacks {name}; it has {got}")
@@ -334,8 +332,7 @@ class Recording:
 
     def __getitem__(self, name: str) -> Group:
         """Group by name; raise ValueError if it does not exist."""
-        group = self.find(name)
-        if group is None:
+        if (group := self.find(name)) is None:
             got = ", ".join(sorted(self.tree.children)) or "no groups"
             raise ValueError(f"the recording has no group {name} (it has {got})")
         return group
@@ -369,8 +366,7 @@ class Recording:
             Values in the declared order of dimensions; None if no group has any.
         """
         for group in filter(None, map(self.find, groups)):
-            values = group.known(name)
-            if values is not None:
+            if (values := group.known(name)) is not None:
                 return values
         return None
 
@@ -448,8 +444,7 @@ class Recording:
     @property
     def objects(self) -> tuple[Surface, ...]:
         """Objects of the recording in the laboratory frame; may be empty."""
-        objects = self.tree.children.get("objects")
-        if objects is None:
+        if (objects := self.tree.children.get("objects")) is None:
             return ()
         names = sorted(objects.children, key=_number)
         return tuple(object_from_dataset(objects.children[i].to_dataset()) for i in names)

@@ -125,8 +125,7 @@ def describe(codes: ArrayLike) -> Counter[str]:
     """
     numbers, counts = np.unique(np.asarray(codes), return_counts=True)
     known = {int(status) for status in Status}
-    unknown = [number for number in numbers.tolist() if number not in known]
-    if unknown:
+    if unknown := [number for number in numbers.tolist() if number not in known]:
         raise ValueError(f"{unknown} are not statuses; the statuses are {sorted(known)}.")
     return Counter(
         {

@@ -335,8 +335,7 @@ def _conditions_hold(data: xr.Dataset, part: str, bounds: Array, step: float) ->
     limit = q * q * p
     rise = q * q * dp - q * (inverse * inverse) * p * 2.0
     load = limit * limit * level
-    base = _integrate_to_base(s, load, beta, part == "fold", step)
-    if base is None:
+    if (base := _integrate_to_base(s, load, beta, part == "fold", step)) is None:
         return np.zeros(n, dtype=bool)
     (r, _, m, *_), (r_s, _, m_s, x_s, e_s), (r_f, _, m_f, x_f, e_f) = base
     if part == "fold":

@@ -156,8 +156,7 @@ def prove_witness(
         if not np.isfinite(move).all():
             return Witness(False, np.inf, 0.0, "the second contact could not be enclosed")
         second[free] -= move
-    box = _unique_box(system, (names, wanted), free, one, second)
-    if box is None:
+    if (box := _unique_box(system, (names, wanted), free, one, second)) is None:
         doubt = "no box around the second contact passes Krawczyk's test"
         return Witness(False, np.inf, 0.0, doubt)
     apart = one.at(slice(6, 9)) + -system.at(box).at(slice(6, 9))  # type: ignore[arg-type]

@@ -167,8 +167,7 @@ _WRITTEN, _EXTENDED = ("target", "csv", "events"), ("recording", "signals")
 def _spare_inputs(values: Mapping[str, Any]) -> None:
     """Raise ValueError if a result would replace a file that is read, also with --force."""
     for name in _WRITTEN:
-        path = values.get(name)
-        if path is None:
+        if (path := values.get(name)) is None:
             continue
         read = {
             other: [one for one in _listed(value) if isinstance(one, Path)]
@@ -198,8 +197,7 @@ def spare(path: Path, *read: Path) -> None:
 
 def free(files: Iterable[Path], force: bool) -> None:
     """Raise FileExistsError if files exist and must not be replaced."""
-    there = [str(file) for file in files if not force and file.exists()]
-    if there:
+    if there := [str(file) for file in files if not force and file.exists()]:
         more = f" and {len(there) - _NAMED} more" if len(there) > _NAMED else ""
         are = "is" if len(there) == 1 else "are"
         raise FileExistsError(

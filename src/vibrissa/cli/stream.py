@@ -171,8 +171,7 @@ class FollowOptions:
     def poses(self, name: str) -> vb.streaming.Poses:
         """Create the poses of the carrier on which a whisker is mounted."""
         mounts = _named(self.mount, "--mount")
-        mount = mounts.get(name, mounts.get(""))
-        if mount is None:
+        if (mount := mounts.get(name, mounts.get(""))) is None:
             return vb.streaming.Poses()
         values = numbers(mount, _MOUNT, "--mount")
         return vb.streaming.Poses(

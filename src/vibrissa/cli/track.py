@@ -425,8 +425,7 @@ class _Job:
                     f"trace {videos[view].name} anew", done, len(traces[view][0])
                 ),
             )
-            lost = _where_lost(traces)
-            if lost is not None:
+            if (lost := _where_lost(traces)) is not None:
                 self._show_doubt(videos, traces, [lost] * len(videos), _LOST, doubt)
             result = vb.tracking.track(
                 self.cameras,

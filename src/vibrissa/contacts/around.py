@@ -178,13 +178,11 @@ def _starts(
     near: NearObjects, place: Placement, measured: Array
 ) -> Iterator[tuple[Equilibrium, Array]]:
     """Equilibria and shifts from which a fit may begin, the likeliest first."""
-    found = near.under_wrench(place, measured)
-    if found is not None:
+    if (found := near.under_wrench(place, measured)) is not None:
         yield found
     # The resting whisker may be on the other side of an object that it was swept past.
     shift = near.reaching(place)
-    resting = near.from_outside(place, shift)
-    if resting is not None:
+    if (resting := near.from_outside(place, shift)) is not None:
         yield resting, shift
 
 
@@ -206,8 +204,7 @@ def _descended(
     for _ in range(_ROUNDS):
         slopes = np.empty((9, 3))
         for k, step in enumerate(_STEP * np.eye(3)):
-            moved = near.moved(place, shift + step, found)
-            if moved is None:
+            if (moved := near.moved(place, shift + step, found)) is None:
                 return None
             slopes[:, k] = (residual(moved, shift + step) - left) / _STEP
         normal = slopes.T @ slopes
@@ -215,8 +212,7 @@ def _descended(
             step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), slopes.T @ left)
             size = float(np.linalg.norm(step))
             step *= min(1.0, _LONGEST / max(size, 1e-300))
-            moved = near.moved(place, shift + step, found)
-            if moved is not None:
+            if (moved := near.moved(place, shift + step, found)) is not None:
                 after = residual(moved, shift + step)
                 if after @ after <= left @ left:
                     break
@@ -240,8 +236,7 @@ def _spread(
     size, axes = np.linalg.eigh(covariance)
     for step in (np.sqrt(3.0 * size) * axes).T:
         for way in (step, -step):
-            moved = near.moved(place, shift + way, found)
-            if moved is None:
+            if (moved := near.moved(place, shift + way, found)) is None:
                 return np.full((3, 3), np.nan)
             away = moved.first_contact()[1] - point
             out += np.outer(away, away) / 6.0

@@ -95,8 +95,7 @@ def _nodes(contact_map: ContactMap) -> ChosenContacts:
 
 
 def _grid(contact_map: ContactMap) -> ChosenContacts:
-    grid = contact_map.grid
-    if grid is None:
+    if (grid := contact_map.grid) is None:
         raise ValueError("the map has no grid: simulate it with grid=True")
     axes = [grid[name].to_numpy() for name in ("r", "theta", "phi")]
     reached = grid["status"].to_numpy() == int(Status.OK)

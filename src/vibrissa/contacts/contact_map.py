@@ -562,8 +562,7 @@ def _load(path: Path, grid: bool) -> ContactMap:
     kind = groups["/"].attrs.get("kind", "")
     if kind != _KIND:
         raise ValueError(f"{path} holds {kind or 'data of another kind'}, not a contact map")
-    missing = [name for name in ("whisker", "chart") if name not in groups]
-    if missing:
+    if missing := [name for name in ("whisker", "chart") if name not in groups]:
         raise ValueError(f"{path} lacks the group {' and '.join(missing)} of a contact map")
     solved = read_dataset(path, "grid") if grid and "grid" in groups else None
     with naming(path, "a contact map"):

@@ -352,8 +352,7 @@ class Estimator:
             The contact, all candidates, and the status.
         """
         d = self.contact_map.chart.discretization
-        nothing = self.nothing_in(measurement)
-        if nothing is not None:
+        if (nothing := self.nothing_in(measurement)) is not None:
             self.reset()
             return nowhere(nothing, math.nan, d)
         if self._search is None:

@@ -245,8 +245,7 @@ class JointEstimate:
 
         Gravity is the stated one, or ``gravity`` (3,), already reduced by the base's acceleration.
         """
-        stated = self._lab
-        if stated is None:
+        if (stated := self._lab) is None:
             return self
         lab = stated
         if gravity is not None:
@@ -416,12 +415,8 @@ class JointEstimate:
     def _as_sagged(
         self, joint: Joint, fits: Fits, covariance: Array, valid: AnyArray
     ) -> tuple[Array, AnyArray]:
-        """Covariances, or those of the same forces on the sagged weightless whisker if larger.
-
-        Light contacts have long, bent valleys, which are followed only without weight.
-        """
-        search = self._sagged_searches().noisy
-        if search is None:
+        """Covariances, or those of the same forces on the sagged weightless whisker if larger."""
+        if (search := self._sagged_searches().noisy) is None:
             return covariance, np.zeros_like(valid)
         rod = search.contact_map.chart.discretization
         signals = channels_of(solve_forces(rod, fits.contacts)[0])

@@ -77,10 +77,7 @@ _SAME = 1e-3  # contacts within this (over L, and ten times it relative to the f
 
 
 class Fitted(NamedTuple):
-    """Fits by row and candidate, padded with NaN.
-
-    Their number (n,), x (n, k, 4), (F, p) (n, k, 6), ∂(F, p)/∂x (n, k, 6, 4) and χ² (n, k).
-    """
+    """Fits by row and candidate: number (n,), x, (F, p), ∂(F, p)/∂x, χ² (n, k), padded with NaN."""
 
     number: IntArray
     contacts: Array
@@ -317,10 +314,7 @@ def _solve(
     limit: float,
     everywhere: bool = False,
 ) -> Fitted:
-    """Contacts that explain wrenches, or the one that comes nearest.
-
-    Fits start also elsewhere on the whisker if none explains the wrench, or if so requested.
-    """
+    """Contacts that explain wrenches, or the nearest one, started along the whisker if needed."""
     number, places = vanishing_moments(coarse, wrenches, PROXIMAL)
     row, place = np.nonzero(np.arange(places.shape[1]) < number[:, None])
     near = _promising(coarse, wrenches, weights, row, places[row, place])

@@ -177,8 +177,7 @@ def _scale_contacts(what: str, arrays: dict[str, Array], n: int, least: int) -> 
     if not size[1] > FLOOR * size[0]:
         raise ValueError(f"no {what}: all points are on a line, or the same")
     normal = kept["normals"] / length[usable][:, None] if "normals" in kept else None
-    spread = _covariance(what, kept, np.flatnonzero(usable), extent)
-    if spread is not None:
+    if (spread := _covariance(what, kept, np.flatnonzero(usable), extent)) is not None:
         variance = np.trace(spread[:, :3, :3], axis1=1, axis2=2) / 3.0
         if (sigma := extent * float(np.sqrt(np.median(variance)))) > max(_VAGUE, extent):
             warnings.warn(
@@ -532,8 +531,7 @@ _POINT_VARIABLES = ("surface_distance", "inlier", "chi_squared")
 
 def check_complete(dataset: xr.Dataset, kind: str, names: set[str]) -> None:
     """Raise a ValueError if variables of a stored shape are missing."""
-    missing = sorted((names | set(_POINT_VARIABLES)) - set(dataset.data_vars))
-    if missing:
+    if missing := sorted((names | set(_POINT_VARIABLES)) - set(dataset.data_vars)):
         raise ValueError(f"a fitted {kind} lacks {', '.join(missing)}")
 
 

@@ -403,8 +403,7 @@ def _pairs_in_plane(
     if problem.plane is None:
         return None
     plane = problem.plane
-    lost = deficient(problem.contact_map, names, plane.contacts.xi, span)
-    if lost is None:
+    if (lost := deficient(problem.contact_map, names, plane.contacts.xi, span)) is None:
         return None
     found, _, _ = _fibres(problem, names, lost, plane)
     return found.rows(found.apart >= problem.separation), lost

@@ -279,8 +279,7 @@ def load_corrections(path: str | PathLike[str]) -> dict[int, dict[tuple[int, int
         numbers.astype(int).tolist(), values[:, 3:], strict=True
     ):
         points.setdefault(view, {}).setdefault((frame, whisker), []).append(place)
-    short = [(v, *key) for v, each in points.items() for key, p in each.items() if len(p) < 2]
-    if short:
+    if short := [(v, *key) for v, each in points.items() for key, p in each.items() if len(p) < 2]:
         view, frame, whisker = short[0]
         raise ValueError(
             f"{path}: whisker {whisker} in frame {frame} of view {view} has one point; from base "
@@ -393,8 +392,7 @@ def load_clicks(path: str | PathLike[str]) -> Clicks:
         views = table.get("view")
         if not isinstance(views, list) or not all(isinstance(view, dict) for view in views):
             raise ValueError("it has no [[view]]; one for each view is needed")
-        size = table.get("pixel_size")
-        if size is not None:
+        if (size := table.get("pixel_size")) is not None:
             size = 1e-3 * float(number_array(size, "pixel_size"))
             if not 0.0 < size < np.inf:
                 raise ValueError(f"pixel_size is {1e3 * size:g}; it must be positive, mm")

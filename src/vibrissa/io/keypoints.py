@@ -165,8 +165,7 @@ def _header(path: Path, rows: Iterator[tuple[int, list[str]]]) -> dict[str, list
         header[cells[0]] = cells
         if cells[0] == "coords":
             break
-    missing = [name for name in ("scorer", "bodyparts", "coords") if name not in header]
-    if missing:
+    if missing := [name for name in ("scorer", "bodyparts", "coords") if name not in header]:
         raise ValueError(
             f"{path} is not a table of DeepLabCut, or cut short: its header rows are "
             f"{', '.join(header) or 'none'}{other}; it lacks {', '.join(missing)}. {_NEEDED}"
@@ -558,8 +557,7 @@ def read_calibration(path: str | PathLike[str]) -> list[dict[str, Any]]:
     for name, table in read_toml(path).items():
         if not isinstance(table, dict) or name == "metadata":
             continue
-        missing = [key for key in _CAMERA_NEEDED if key not in table]
-        if missing:
+        if missing := [key for key in _CAMERA_NEEDED if key not in table]:
             raise ValueError(f"{path}: [{name}] has no {', '.join(missing)}")
         with in_file(f"{path}: [{name}]"):
             cameras.append({"name": name} | table | _checked(table))

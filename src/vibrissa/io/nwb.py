@@ -105,8 +105,7 @@ def _found(file: h5py.File) -> tuple[dict[str, _Series], dict[tuple[str, str], _
     for name, group in groups.items():
         who = name.rpartition("/")[2]
         if _type(group) == _MANY:
-            series = _series(group)
-            if series is not None:
+            if (series := _series(group)) is not None:
                 space[who] = series
             for child in group.values():
                 if _type(child) == "PoseEstimation" and (series := _series(child)) is not None:

@@ -114,8 +114,7 @@ def check_units(tree: xr.DataTree) -> None:
     faults, unstated = [], set()
     for group in tree.subtree:
         for name, variable in group.to_dataset(inherit=False).variables.items():
-            quantity = QUANTITIES.get(str(name).removeprefix("unfiltered_"))
-            if quantity is None:
+            if (quantity := QUANTITIES.get(str(name).removeprefix("unfiltered_"))) is None:
                 continue
             if not variable.attrs.get("units"):
                 unstated |= {str(name)} if quantity.unit != "1" else set()

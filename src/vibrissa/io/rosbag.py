@@ -143,8 +143,7 @@ def _messages(
         messages = iter(reader.messages(connections=[c for c in fitting if c.topic == topic]))
         while True:
             with _readable(path):
-                following = next(messages, None)
-                if following is None:
+                if (following := next(messages, None)) is None:
                     return
                 connection, recorded, raw = following
                 message: Any = reader.deserialize(raw, connection.msgtype)

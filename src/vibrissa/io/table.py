@@ -304,8 +304,7 @@ def signal_columns(
     for name in names:
         here = [i for i, (which, _) in enumerate(known) if which == name]
         here.sort(key=lambda i: header[i] != name)
-        usable = [(i, factor) for i in here if (factor := known[i][1]) is not None]
-        if usable:
+        if usable := [(i, factor) for i in here if (factor := known[i][1]) is not None]:
             found[name] = usable[0]
         elif here:
             strange[name] = [header[i] for i in here]
@@ -366,8 +365,7 @@ def number_array(
 
 def check_keys(table: Mapping[str, Any], allowed: set[str], where: str) -> None:
     """Raise a ValueError if a table has an unknown key."""
-    unknown = sorted(set(table) - allowed)
-    if unknown:
+    if unknown := sorted(set(table) - allowed):
         raise ValueError(
             f"{where} has {', '.join(unknown)}; known are {', '.join(sorted(allowed))}"
         )

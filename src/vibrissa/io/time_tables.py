@@ -186,8 +186,7 @@ def save_signals(path: str | PathLike[str], signals: xr.Dataset) -> None:
     ValueError
         If the dataset has other dims or lacks a variable.
     """
-    missing = [name for name in ("time", "force", "moment") if name not in signals.variables]
-    if missing:
+    if missing := [name for name in ("time", "force", "moment") if name not in signals.variables]:
         raise ValueError(f"signals lack {', '.join(missing)}")
     wrench = [signals[name] for name in ("force", "moment")]
     for variable in wrench:
@@ -200,8 +199,7 @@ def save_signals(path: str | PathLike[str], signals: xr.Dataset) -> None:
 def _csv(path: Path) -> Array:
     """Columns (n, 7) of a CSV file."""
     rows = table_rows(read_text(path))
-    header = next(rows, None)
-    if header is None:
+    if (header := next(rows, None)) is None:
         raise ValueError(f"{path} is empty; a header {','.join(COLUMNS)} and rows are needed")
     names, later = header[1], list(rows)
     # Some programs write units in a separate line.
@@ -250,8 +248,7 @@ def _signal_places(path: Path, header: list[str]) -> tuple[list[int], Array]:
 def _netcdf(path: Path) -> Array:
     """Columns (n, 7) of a NetCDF file."""
     data = read_dataset(path)
-    missing = [name for name in COLUMNS if name not in data.variables]
-    if missing:
+    if missing := [name for name in COLUMNS if name not in data.variables]:
         got = ", ".join(str(name) for name in data.variables)
         raise ValueError(
             f"{path} is not a table of signals: it lacks {', '.join(missing)} (it has {got})"
@@ -268,8 +265,7 @@ def _in_si(path: Path, variable: xr.DataArray) -> Array:
     """Values of a variable by its attribute ``units``, if it has one."""
     kind = _KINDS[str(variable.name)[0]]
     unit = str(variable.attrs.get("units", ""))
-    factor = unit_factor(unit, kind)
-    if factor is None:
+    if (factor := unit_factor(unit, kind)) is None:
         raise ValueError(f"{path}: {variable.name} is in {unit}; {units_of(kind)} are known")
     return np.asarray(variable.values, dtype=np.float64) * factor
 
@@ -396,12 +392,10 @@ def _columns(
     needed: Sequence[str] = (),
 ) -> list[np.ndarray]:
     """Columns along the dimension of a table; missing ones are NaN."""
-    missing = [n for n in ("time", "x", "y", "z", *needed) if n not in data]
-    if missing:
+    if missing := [n for n in ("time", "x", "y", "z", *needed) if n not in data]:
         raise ValueError(f"{what} lack {', '.join(missing)}")
     there = [name for name in names if name in data]
-    faults = [name for name in there if getattr(data[name], "dims", (dim,)) != (dim,)]
-    if faults:
+    if faults := [name for name in there if getattr(data[name], "dims", (dim,)) != (dim,)]:
         raise ValueError(f"{', '.join(faults)} must have the one dim {dim}")
     columns = {name: np.asarray(data[name]) for name in there}
     nothing = np.full(len(columns[there[0]]), np.nan)

@@ -409,8 +409,7 @@ def read_tracks_table(path: str | PathLike[str]) -> RawTracks:
     points, sure = np.full((*shape, len(axes)), np.nan), np.full(shape, np.nan)
     for i, axis in enumerate(axes):
         points[(*place, i)] = numbers(axis)
-    confidence = numbers("confidence")
-    if confidence is not None:
+    if (confidence := numbers("confidence")) is not None:
         sure[place] = confidence
     return RawTracks.of(
         points,

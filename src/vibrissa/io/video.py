@@ -281,8 +281,7 @@ class Footage:
             if not self._shown < number <= self._shown + AHEAD:
                 self._jump(number)
             while self._shown < number:
-                frame = next(self._frames, None)
-                if frame is None:
+                if (frame := next(self._frames, None)) is None:
                     raise ValueError(f"{self._path} ends before frame {number}")
                 self._shown = self._number(frame)
                 self._last = self._grey(frame)
@@ -340,8 +339,7 @@ class FrameReader:
         if number < self._next:
             self._coming, self._next = read_video(self.path), 0
         while self._next <= number:
-            frame = next(self._coming, None)
-            if frame is None:
+            if (frame := next(self._coming, None)) is None:
                 # The next request must not continue with an exhausted decoder.
                 self._count, self._coming, self._next = self._next, read_video(self.path), 0
                 raise self._beyond(number)
@@ -392,8 +390,7 @@ def _of_videos(files: Sequence[Path], most: int) -> dict[str, list[Frame]]:
 def _of_images(files: Sequence[Path]) -> dict[str, list[Frame]]:
     numbered: dict[str, dict[int, Path]] = {}
     for path in files:
-        match = _NUMBERED.match(path.stem)
-        if match is None:
+        if (match := _NUMBERED.match(path.stem)) is None:
             raise ValueError(f"{path} has no number; names of images must be like top_01.png")
         name, number = match[1] or path.resolve().parent.name, int(match[2])
         if number in numbered.setdefault(name, {}):
@@ -401,8 +398,7 @@ def _of_images(files: Sequence[Path]) -> dict[str, list[Frame]]:
         numbered[name][number] = path
     moments = sorted(set().union(*numbered.values()))
     for name, images in numbered.items():
-        missing = [number for number in moments if number not in images]
-        if missing:
+        if missing := [number for number in moments if number not in images]:
             raise ValueError(
                 f"camera {name} has no image {missing[0]} ({len(missing)} are missing of "
                 f"{len(moments)}): images of one number belong together"

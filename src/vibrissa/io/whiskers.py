@@ -193,11 +193,9 @@ def _thickness(path: Path, header: list[str], coordinates: float) -> list[tuple[
     """Columns of radius or diameter, and the factor to a radius in m; at most one."""
     found = []
     for place, name in enumerate(header):
-        match = _THICKNESS.fullmatch(name)
-        if match is None:
+        if (match := _THICKNESS.fullmatch(name)) is None:
             continue
-        factor = unit_factor(match[2], "length")
-        if factor is None:
+        if (factor := unit_factor(match[2], "length")) is None:
             continue
         unit = factor if match[2].strip() else coordinates
         found.append((place, unit if match[1].lower() == "radius" else 0.5 * unit))

@@ -277,8 +277,7 @@ def _pool(process: int) -> ThreadPoolExecutor:
 
 def threads() -> int:
     """Return the number of cores that this process may use; ``VIBRISSA_THREADS`` overrides it."""
-    wanted = os.environ.get("VIBRISSA_THREADS")
-    if wanted:
+    if wanted := os.environ.get("VIBRISSA_THREADS"):
         if not wanted.strip().isdecimal() or int(wanted) == 0:
             raise ValueError(
                 f"the environment variable VIBRISSA_THREADS is {wanted!r}; a number of cores, 1 or "

@@ -260,8 +260,7 @@ def _leave(calls: list[tuple[Any, tuple[types.Type, ...]]]) -> bool:
     names = [_name(kernel) for kernel, _ in calls]
     if threads() < 2 or not _runs_python() or any(name is None for name in names):
         return False
-    helper = _start_helper(calls)
-    if helper is None:
+    if (helper := _start_helper(calls)) is None:
         return False
     atexit.register(_end, helper)
     for name, (_, signature) in zip(names, calls, strict=True):

@@ -360,8 +360,7 @@ def object_from_dataset(dataset: xr.Dataset) -> Surface:
     if kind not in _FIELDS:
         raise ValueError(f"the object is of kind {kind!r}; it must be one of {', '.join(_FIELDS)}")
     known, fields = _FIELDS[kind]
-    missing = sorted({name for _, name in _variables(fields)} - set(dataset.data_vars))
-    if missing:
+    if missing := sorted({name for _, name in _variables(fields)} - set(dataset.data_vars)):
         raise ValueError(f"a {kind} in a file lacks {', '.join(missing)}")
     restored: Surface = known(**{field: dataset[n].values for field, n in _variables(fields)})
     return restored

@@ -53,8 +53,7 @@ ESTIMATED = (
 def check_frames(recording: xr.DataTree) -> None:
     """Raise ValueError unless a recording has frames and whiskers."""
     root = recording.to_dataset(inherit=False)
-    missing = [name for name in ("time", "whisker") if name not in root.dims]
-    if missing:
+    if missing := [name for name in ("time", "whisker") if name not in root.dims]:
         got = ", ".join(str(name) for name in root.dims) or "none"
         raise ValueError(
             f"the recording lacks the dimensions {', '.join(missing)}; it has {got}: a tracked, "
@@ -115,8 +114,7 @@ def _position_faults(recording: Recording) -> list[str]:
     base = recording.root.known("base_position")
     groups = (recording.root, recording.find("truth"))
     lines = [group.known("centerline") for group in groups if group is not None]
-    line = next((line for line in lines if line is not None), None)
-    if line is None:
+    if (line := next((line for line in lines if line is not None), None)) is None:
         return []
     length = np.linalg.norm(np.diff(line, axis=2), axis=3).sum(axis=2)
     if "whiskers" in recording.tree.children:

@@ -84,8 +84,7 @@ def predictors(recording: xr.DataTree) -> xr.Dataset:
     )
     signals = base_signals(force, moment)
     columns |= {name: signals[name].values for name in ("FT", "FD", "MB", "MD")}
-    rotation = record.known("base_rotation", _GROUPS)
-    if rotation is not None:
+    if (rotation := record.known("base_rotation", _GROUPS)) is not None:
         angles = np.full(rotation.shape[:-1], np.nan)
         posed = np.isfinite(rotation).all(axis=(-2, -1))
         angles[posed] = angles_of(rotation[posed])

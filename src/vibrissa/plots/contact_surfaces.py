@@ -423,8 +423,7 @@ def _solid(figure: Figure | SubFigure, solid: xr.Dataset, plane: xr.Dataset) -> 
         raise ValueError(f"a solid needs a direction and its size; the triplet is {names}")
     size, across, along = _CIRCLES[turn]
     upward = next(n for n in names if n not in (turn, size))
-    lacking = [n for n in (*names, "error_distance") if n not in solid]
-    if lacking:
+    if lacking := [n for n in (*names, "error_distance") if n not in solid]:
         raise ValueError(f"the solid lacks {', '.join(lacking)}")
     dims = solid[size].dims
     rows = {n: solid[n].transpose(*dims).to_numpy().ravel() for n in (*names, "error_distance")}

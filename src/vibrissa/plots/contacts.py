@@ -310,8 +310,7 @@ def against(
     dots = axes.scatter(true, estimated, s=4.0, zorder=2, **look)
     axes.set(xlim=limits, ylim=limits, aspect="equal")
     axes.set(xlabel=f"{known_as} {axis_label(name)}", ylabel=f"estimated {axis_label(name)}")
-    outside = int(((estimated < limits[0]) | (estimated > limits[1])).sum())
-    if outside:
+    if outside := int(((estimated < limits[0]) | (estimated > limits[1])).sum()):
         _remark(axes, f"{outside} of {true.size} outside")
     return dots
 

@@ -382,8 +382,7 @@ def has_band(body: Body) -> bool:
 
 def lies_flat(body: Body, view: tuple[int, int], places: Array) -> bool:
     """Whether a surface faces the view, so that it has no section."""
-    normals = getattr(body, "outward_normals", None)
-    if normals is None:
+    if (normals := getattr(body, "outward_normals", None)) is None:
         return False
     toward = np.abs(normals(1e-3 * places)[:, 3 - sum(view)])
     return bool(np.nanmedian(toward) > _FACING)

@@ -86,8 +86,7 @@ def _of_many(
     _cone_axis(axes)
     _key(figure, verdict)
     among = f"on all {len(degrees)} whiskers"
-    held = np.flatnonzero((verdict == VERDICTS[0]).all(axis=0)).tolist()
-    if held:
+    if held := np.flatnonzero((verdict == VERDICTS[0]).all(axis=0)).tolist():
         shown = ", ".join(f"({triplet_label(names[i])})" for i in held)
         style.conclude(figure, f"Unique (no counterexample found) {among}: {shown}")
         return figure

@@ -111,8 +111,7 @@ def _check(verdicts: xr.Dataset) -> None:
             "the dataset has no verdict over triplet and region; that of vibrissa.uniqueness "
             "is needed"
         )
-    unknown = sorted(set(map(str, verdicts["verdict"].values.ravel())) - {*VERDICTS, EMPTY})
-    if unknown:
+    if unknown := sorted(set(map(str, verdicts["verdict"].values.ravel())) - {*VERDICTS, EMPTY}):
         raise ValueError(f"unknown verdicts {unknown}; allowed are {', '.join(VERDICTS)}")
 
 

@@ -434,13 +434,11 @@ def witness_pair(witness: xr.Dataset, *, width: style.Width = "double") -> Figur
 
 def _checked_pair(witness: xr.Dataset) -> tuple[str, ...]:
     needed = ("rest", "centerline", "contact_point", "force", "arc_length", *SIGNALS)
-    missing = [name for name in needed if name not in witness]
-    if missing:
+    if missing := [name for name in needed if name not in witness]:
         raise ValueError(f"the witness lacks {', '.join(missing)}")
     if witness.sizes.get("pair") != 2:
         raise ValueError(f"a witness is a pair of contacts; got {witness.sizes.get('pair', 0)}")
-    lacking = [name for name in needed if not np.isfinite(witness[name].values).all()]
-    if lacking:
+    if lacking := [name for name in needed if not np.isfinite(witness[name].values).all()]:
         raise ValueError(f"the witness has missing values in {', '.join(lacking)}")
     triplet = tuple(str(witness.attrs.get("triplet", "")).split())
     if len(triplet) < 1 or not set(triplet) <= set(SIGNALS):

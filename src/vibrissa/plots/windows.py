@@ -134,8 +134,7 @@ class Correction(_Window):
     def remove(self, x: float, y: float) -> None:
         """Remove the point that is nearest."""
         key = (self.frame, self.whisker)
-        points = self._points.get(key, [])
-        if points:
+        if points := self._points.get(key, []):
             nearest = int(np.argmin([np.hypot(x - a, y - b) for a, b in points]))
             self._change(key, points[:nearest] + points[nearest + 1 :])
 
@@ -269,8 +268,7 @@ def opened(make: Callable[[Figure], W], instead: str, size: tuple[float, float])
                 f"there is no screen for a window: {instead}, or run this where there is one"
             )
         # Matplotlib's own shortcuts for s, q, l and the arrows are disabled.
-        handler = getattr(manager, "key_press_handler_id", None)
-        if handler is not None:
+        if (handler := getattr(manager, "key_press_handler_id", None)) is not None:
             figure.canvas.mpl_disconnect(handler)
         window = make(figure)
         figure.canvas.mpl_connect("close_event", window.close)

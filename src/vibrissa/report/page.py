@@ -291,8 +291,7 @@ def _versions() -> list[tuple[str, str]]:
 
 
 def _date() -> datetime:
-    seconds = os.environ.get(_EPOCH)
-    if seconds is None:
+    if (seconds := os.environ.get(_EPOCH)) is None:
         return datetime.now(UTC)
     try:
         return datetime.fromtimestamp(int(seconds), UTC)

@@ -92,8 +92,7 @@ def _results(
     seed: int,
 ) -> str:
     """Main numbers of a trial: contacts, their error, the object's size and the misfit."""
-    estimates = groups["estimates"]
-    if estimates is None:
+    if (estimates := groups["estimates"]) is None:
         missing = "no contacts yet: `vibrissa estimate` adds them"
         found = [Tile("–", missing), Tile("–", "error of the contact point: no contacts yet")]
     else:
@@ -264,8 +263,7 @@ def _lacking(
         ("the result", found, also_found),
         ("the truth in this recording", truth, also_true),
     ):
-        absent = [name for name in (*names, *also) if name not in data.data_vars]
-        if absent:
+        if absent := [name for name in (*names, *also) if name not in data.data_vars]:
             text.append(f"{where} lacks {', '.join(absent)}")
     return paragraph(f"Errors cannot be computed: {'; '.join(text)}.", "note") if text else ""
 

@@ -195,8 +195,7 @@ def deflect_around(
 def _rigid(objects: Surface | Sequence[Surface]) -> list[Surface]:
     """Return the objects as a list; raise a ValueError if one is compliant."""
     solids = listed_objects(objects)
-    soft = [repr(solid) for solid in solids if np.isfinite(solid.stiffness)]
-    if soft:
+    if soft := [repr(solid) for solid in solids if np.isfinite(solid.stiffness)]:
         raise ValueError(f"several contacts are solved with rigid objects only; got {soft[0]}")
     return solids
 

@@ -263,8 +263,7 @@ def _with_weight(whisker: Resting, steps: int) -> Discretization:
     toward = np.round(gravity / size / _SPACING)
     toward *= np.exp(_SPACING * np.round(np.log(size) / _SPACING)) / np.linalg.norm(toward)
     x, y, z = toward.tolist()
-    near = _cached_lean(Resting(whisker.whisker, (x, y, z)), steps)
-    if near is not None:
+    if (near := _cached_lean(Resting(whisker.whisker, (x, y, z)), steps)) is not None:
         loaded = _rod_with_weight(whisker, steps, 1.0, near)
         solved = evaluated(loaded, _REST, leans=near[None], tangents=True)
         if _is_stable(loaded, solved):

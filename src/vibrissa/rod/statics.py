@@ -261,8 +261,7 @@ def _solve_peg(
 ) -> Solutions:
     """Solve contacts with pegs, from rest or continued from an earlier deflection."""
     pegs = _pegs_of(load, d.length)
-    start = load.start
-    if start is None:
+    if (start := load.start) is None:
         if load.side is not None:
             side = np.asarray(load.side).reshape(-1, 3)
         else:

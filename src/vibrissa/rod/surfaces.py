@@ -252,8 +252,7 @@ class _Follower:
         """Solve a whisker that was free at ``before``, or was not (None)."""
         ended = Status.NO_CONTACT
         if before is not None:
-            meeting = self._rest.first_meeting(before, now)
-            if meeting is None:
+            if (meeting := self._rest.first_meeting(before, now)) is None:
                 return ended
             for friction in (self._friction, 0.0):
                 found = self._enter(*meeting, now, friction)
@@ -263,8 +262,7 @@ class _Follower:
         for surface in np.argsort(gaps).tolist():
             if gaps[surface] >= 0.0:
                 break
-            outside = self._rest.outside(surface, now)
-            if outside is None:
+            if (outside := self._rest.outside(surface, now)) is None:
                 found = Status.NOT_CONVERGED
             else:
                 found = self._enter(surface, outside, now, now, 0.0)
@@ -320,8 +318,7 @@ class _Follower:
         """Continue with another contact of a whisker whose contact has ended, if there is one."""
         if not others:
             return None
-        other = self._other_touch(touch, here)
-        if other is None:
+        if (other := self._other_touch(touch, here)) is None:
             return None
         found = self._follow(other, here, now, friction, others - 1)
         return found if isinstance(found, Touch) else self._other_touch(touch, now)
@@ -370,8 +367,7 @@ class _Follower:
         """Solve a contact from an approximate one, starting at s or at its own arc length."""
         for guess in (s, contact[0]):
             start = self._solver.start(surface, place, np.r_[guess, contact[1:]])
-            found = self._solver.solve(start, place, 0.0)
-            if found is not None:
+            if (found := self._solver.solve(start, place, 0.0)) is not None:
                 return found
         return None
 

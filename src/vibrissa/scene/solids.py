@@ -73,11 +73,9 @@ def sample_contacts(
 ) -> Array:
     """Sample the contacts of a map as finely as a picture requires, as rows (l, m, n, k)."""
     names = ("contact_point", "arc_length", *SIGNALS)
-    missing = [name for name in names if name not in samples]
-    if missing:
+    if missing := [name for name in names if name not in samples]:
         raise ValueError(f"the map lacks {', '.join(missing)}")
-    absent = [dim for dim in _DIMS if dim not in samples["Fx"].dims]
-    if absent:
+    if absent := [dim for dim in _DIMS if dim not in samples["Fx"].dims]:
         raise ValueError(
             f"the map has no dimension {', '.join(absent)}; the chart of a map is needed, "
             "as of ContactMap.to_dataset()"

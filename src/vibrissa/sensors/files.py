@@ -294,8 +294,7 @@ class Stage:
         else:
             raise ValueError(f"file is {quoted(file)}; the name of a table is needed")
         known, values = read_numbers(path)
-        missing = [name for name in names if name not in known]
-        if missing:
+        if missing := [name for name in names if name not in known]:
             got = ", ".join(name for name in known if name)
             raise ValueError(f"{path} lacks {', '.join(missing)}; its columns are {got}")
         return values[:, [known.index(name) for name in names]]
@@ -342,8 +341,7 @@ class Stage:
                 if not shared:
                     raise ValueError("two tables of the shape have no coordinate in common")
                 found[name] = _read_off(other[shared[0]], other[name], found[shared[0]], shared[0])
-        lacking = [name for name in "xyz" if name not in found]
-        if lacking:
+        if lacking := [name for name in "xyz" if name not in found]:
             raise ValueError(f"the shape lacks {', '.join(lacking)}: name its columns")
         points = np.stack([found[name] for name in "xyz"], axis=1)
         apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > _AT_BASE

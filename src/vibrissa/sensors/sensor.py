@@ -408,8 +408,7 @@ def _checked_mixing(names: tuple[str, ...], mixing: Any, faults: list[str]) -> A
     """Mixing (k, 6) of channels; errors are appended to ``faults``."""
     array = numbers("mixing", 1.0 if mixing is None else mixing, COMPONENTS).copy()
     if array.ndim < 2:
-        unknown = [name for name in names if name not in COMPONENTS]
-        if unknown:
+        if unknown := [name for name in names if name not in COMPONENTS]:
             known = ", ".join(COMPONENTS)
             faults.append(f"channels {unknown} are not among {known}, so mixing (k, 6) is needed")
         rows = [[float(name == component) for component in COMPONENTS] for name in names]

@@ -172,8 +172,7 @@ def calibrate_suspension(
     known = np.isfinite(p).all(axis=1) & np.isfinite(y).all(axis=1)
     if known.sum() < FEWEST:
         raise ValueError(f"{known.sum()} touches are too few; {FEWEST} are needed")
-    idle = [n for n, size in zip(names, np.ptp(y[known], axis=0), strict=True) if size == 0.0]
-    if idle:
+    if idle := [n for n, size in zip(names, np.ptp(y[known], axis=0), strict=True) if size == 0.0]:
         raise ValueError(f"{', '.join(idle)} read the same at all touches")
     unknowns = _unknowns(whisker.length, base_sigma)
     outliers = np.zeros_like(known)

@@ -236,8 +236,7 @@ def measured(
             return signals_of(force, moment).take(which, axis=-1), dims, coords
         signals = base_signals(signals["force"], signals["moment"])
     found = _completed(signals, names)
-    missing = [name for name in names if name not in found]
-    if missing:
+    if missing := [name for name in names if name not in found]:
         raise ValueError(
             f"signals lack {', '.join(missing)}; they have {', '.join(map(str, signals)) or 'none'}"
         )

@@ -162,8 +162,7 @@ def _recording(
 def _pairs(whisker: Whiskers, motion: Motions) -> list[tuple[Whisker, Motion]]:
     """Pair whiskers with their motions, and check that these match."""
     if isinstance(whisker, Mapping) and isinstance(motion, Mapping):
-        missing = [name for name in whisker if name not in motion]
-        if missing:
+        if missing := [name for name in whisker if name not in motion]:
             raise ValueError(f"there is no motion of {', '.join(missing)}")
         motion = [motion[name] for name in whisker]
     whiskers = [whisker] if isinstance(whisker, Whisker) else _listed(whisker)
@@ -174,8 +173,7 @@ def _pairs(whisker: Whiskers, motion: Motions) -> list[tuple[Whisker, Motion]]:
             "whisker, and at least one whisker, is needed"
         )
     names = [one.name for one in whiskers]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
+    if twice := sorted({name for name in names if names.count(name) > 1}):
         raise ValueError(f"several whiskers are called {', '.join(twice)}; names must differ")
     first = motions[0]
     for name, other in zip(names, motions, strict=True):

@@ -131,8 +131,7 @@ class ContactStream:
         """
         for line in lines:
             try:
-                sample = self.lines(line)
-                if sample is None:
+                if (sample := self.lines(line)) is None:
                     continue
                 if not sample.names:
                     self._put(sample)

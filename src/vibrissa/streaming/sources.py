@@ -246,8 +246,7 @@ class ContactRecorder:
         likely = record.get("probabilities", np.full(len(points), 1.0 / max(len(points), 1)))
         names = ("lab_x", "lab_y", "lab_z") if self._follow else ("x", "y", "z")
         point = np.array([record[name] for name in names]) if "x" in record else None
-        stamp = record.get(STAMP)
-        if stamp is None:
+        if (stamp := record.get(STAMP)) is None:
             stamp = round(record["time"] * 1e9)
         frame, recorded = self._frame(record), record.get(RECORDED)
         try:

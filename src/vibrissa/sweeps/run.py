@@ -397,8 +397,7 @@ def _work(pipe: Connection) -> None:
 
 def _follow_parent() -> None:
     """End this process when the calling process has ended."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
+    if (parent := multiprocessing.parent_process()) is not None:
         wait([parent.sentinel])
         os._exit(1)
 

@@ -116,8 +116,7 @@ class Layout:
         path = folder / f"{task}.json"
         if not path.exists():
             return None
-        kept = _read_json(path)
-        if kept is None:
+        if (kept := _read_json(path)) is None:
             raise ValueError(
                 f"{path} is damaged: `vibrissa sweep` with the same study computes the task again"
             )
@@ -276,8 +275,7 @@ class Store:
     def _admitted(self, kept: dict[str, Any]) -> int:
         """Check that study and code match the store; return the index of the code."""
         own = _described(self.study)
-        differing = [name for name in own if kept.get(name) != own[name]]
-        if differing:
+        if differing := [name for name in own if kept.get(name) != own[name]]:
             raise ValueError(
                 f"{self.path} contains results of a study with other {' and '.join(differing)}: "
                 "give another store, or remove this one"
@@ -316,8 +314,7 @@ class Store:
 
     def write(self, cell: Cell, answer: Mapping[str, Any]) -> bool:
         """Write the result or the failure of a cell."""
-        failure = answer.get("failure") or self._kept(cell, answer)
-        if failure:
+        if failure := answer.get("failure") or self._kept(cell, answer):
             line = {
                 "task": cell.task,
                 "index": cell.index,
@@ -333,8 +330,7 @@ class Store:
     def _kept(self, cell: Cell, answer: Mapping[str, Any]) -> str:
         """Append a result; return the reason if it does not match the others, else empty."""
         result: xr.Dataset = answer["result"]
-        layout = self._layouts.get(cell.task)
-        if layout is None:
+        if (layout := self._layouts.get(cell.task)) is None:
             layout = Layout.of(result)
             content = {"variables": layout.variables, "coordinates": layout.coordinates}
             _write_json(self.path / f"{cell.task}.json", content)

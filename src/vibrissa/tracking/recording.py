@@ -535,10 +535,7 @@ def scale_sigma(whisker: Whisker, fur: float, more: float) -> float:
 
 
 def remarks_on_fur(one: Tracked, fur: float, name: str) -> list[str]:
-    """Report the common error of all forces due to fur over the base, of a stated length or none.
-
-    Without a stated radius there is no such error.
-    """
+    """Report the common error of all forces, if any, due to fur over the base."""
     if not np.isfinite(one.scale):
         return []
     error = (

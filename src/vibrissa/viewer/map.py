@@ -309,13 +309,11 @@ class MapMode(Mode):
 
     def pick(self, origin: Array, direction: Array) -> None:
         """Mark the contact that a ray, mm, meets first in any space."""
-        found = self._solids
-        if found is None:
+        if (found := self._solids) is None:
             return
         places = np.concatenate([found.seen(self._triangles, space) for space in _SPACES])
         rows = np.tile(self._triangles, (len(_SPACES), 1, 1))
-        row = picked(rows, places, origin, direction)
-        if row is not None:
+        if (row := picked(rows, places, origin, direction)) is not None:
             self.row = row
             self._mark()
 

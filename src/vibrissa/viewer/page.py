@@ -132,8 +132,7 @@ class Page:
         origin, direction = (
             np.asarray(of, dtype=np.float64) for of in (event.ray_origin, event.ray_direction)
         )
-        mode = self.mode
-        if mode is not None:
+        if (mode := self.mode) is not None:
             self.work.put("pick", lambda: mode.pick(origin, direction))
 
     def change(self, topic: str, transition: Transition, dragging: bool = False) -> None:
@@ -258,8 +257,7 @@ class Page:
             if self.mode is not None:
                 self.mode.restore(asked)
             return
-        mode = self.modes.get(asked["mode"])
-        if mode is None:
+        if (mode := self.modes.get(asked["mode"])) is None:
             return
         self.choose(mode.name)
         mode.restore(asked)

@@ -171,8 +171,7 @@ class SaveControls:
 
     def _picture(self, event: viser.GuiEvent[Any]) -> None:
         """Send a picture of the requesting browser's view, without the panel."""
-        client = event.client
-        if client is None:
+        if (client := event.client) is None:
             return
 
         def drawn() -> bytes:
@@ -204,8 +203,7 @@ class SaveControls:
             note.remove()
 
     def _send(self, event: viser.GuiEvent[Any], name: str, made: Callable[[], bytes]) -> None:
-        client = event.client
-        if client is None:
+        if (client := event.client) is None:
             return
         try:
             content = made()

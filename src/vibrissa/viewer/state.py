@@ -230,8 +230,7 @@ def words_of_shape(shape: Shape) -> str:
 
 def shape_in(word: str) -> Shape | None:
     """Parse a shape from a link's parameter; None if this fails."""
-    numbers = numbers_in(word, 4)
-    if numbers is None:
+    if (numbers := numbers_in(word, 4)) is None:
         return None
     length, turn, taper, modulus = numbers.tolist()
     return Shape(length / _MM, float(np.deg2rad(turn)), taper, modulus / _GPA)

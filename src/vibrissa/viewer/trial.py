@@ -100,8 +100,7 @@ def watched(recording: xr.DataTree) -> Watched:
     trial = Recording(recording)
     shape = (root.sizes["time"], root.sizes["whisker"])
     whiskers = tuple(trial.whiskers)
-    contacts = trial.known("contact_point", ("estimates", "", "truth"))
-    if contacts is None:
+    if (contacts := trial.known("contact_point", ("estimates", "", "truth"))) is None:
         contacts = np.full((*shape, 3), np.nan)
     in_contact = trial.known("in_contact", ("estimates", "", "truth"))
     touching: Mask = np.asarray(np.isfinite(contacts).all(axis=-1))
@@ -129,8 +128,7 @@ def watched(recording: xr.DataTree) -> Watched:
 
 def _lines(trial: Recording, whiskers: Sequence[Whisker]) -> Array:
     """Recorded centrelines, or else the resting whisker at the pose of its base."""
-    lines = trial.known("centerline", ("", "truth"))
-    if lines is not None:
+    if (lines := trial.known("centerline", ("", "truth"))) is not None:
         return lines
     place = trial.known("base_position", ("", "truth"))
     turn = trial.known("base_rotation", ("", "truth"))
@@ -320,10 +318,9 @@ def surroundings(trial: Watched, layers: Collection[str] = LAYERS) -> scene.Draw
     if "Objects" in layers:
         for i, thing in enumerate(trial.objects):
             out[f"object {i}"] = object_body(thing, 0.6 * size, mm(centre))
-    if "Fitted shape" in layers and trial.contour is not None:
-        body = fitted_body(trial.contour, near)
-        if body is not None:
-            out["fit"] = scene.Body(mm(body[0]), body[1], FIT, 0.4, "double")
+    fitted = trial.contour if "Fitted shape" in layers else None
+    if fitted is not None and (body := fitted_body(fitted, near)) is not None:
+        out["fit"] = scene.Body(mm(body[0]), body[1], FIT, 0.4, "double")
     return out
 
 

@@ -58,8 +58,7 @@ class WhiskerArray(Mapping[str, Whisker]):
     def __init__(self, whiskers: Iterable[Whisker]) -> None:
         found = sorted((_with_identity(w) for w in whiskers), key=lambda pair: pair[0].sort_key)
         names = [identity.name for identity, _ in found]
-        twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
+        if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"no array of whiskers: there are two of {', '.join(twice)}")
         if not found:
             raise ValueError("no array of whiskers: it is empty")
@@ -338,8 +337,7 @@ def whisker_array(
     columns, names = _several(columns), _several(names)
     if names is not None:
         identities = [Identity.of(name) for name in names]
-        away = [one.name for one in identities if one.side not in (None, *sides(side))]
-        if away:
+        if away := [one.name for one in identities if one.side not in (None, *sides(side))]:
             raise ValueError(f"{', '.join(away)} are not on the requested {side} side")
         if set(rows) != set("ABCDE") or set(columns) != set(range(7)):
             raise ValueError("names and rows or columns were both given; give one of them")

@@ -124,8 +124,7 @@ def whisker_fields(dataset: Stored) -> dict[str, Any]:
     needed |= {f"{name}_{part}" for name in ("curvature", "section") for part in _PROFILE}
     if not dataset.variables.keys().isdisjoint(_REDUNDANT):  # files of many whiskers omit them
         needed |= set(_REDUNDANT)
-    missing = sorted(needed - set(dataset.variables))
-    if missing:
+    if missing := sorted(needed - set(dataset.variables)):
         raise ValueError(f"this is not a dataset of a whisker: it lacks {', '.join(missing)}")
     value = {name: np.asarray(dataset.variables[name], dtype=np.float64) for name in needed}
     stiffness = float(value["base_bending_stiffness"]), float(value["base_twist_stiffness"])

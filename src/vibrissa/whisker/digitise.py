@@ -303,8 +303,7 @@ def _require_order(parameters: Array, noise: float) -> None:
 
 
 def _require_length(length: float, any_length: bool) -> None:
-    faults = length_faults(length, any_length)
-    if faults:
+    if faults := length_faults(length, any_length):
         raise ValueError("no whisker in these points: " + "; ".join(faults))
 
 

@@ -155,8 +155,7 @@ class Whisker:
                 faults.append(f"{what} does not reach from 0 to {self.length!r} m")
         if faults:
             raise ValueError("no whisker: " + "; ".join(faults))
-        stiffness = self.base_stiffness
-        if stiffness is not None:
+        if (stiffness := self.base_stiffness) is not None:
             object.__setattr__(self, "base_stiffness", tuple(float(value) for value in stiffness))
         if self.density is not None:
             object.__setattr__(self, "density", float(self.density))
@@ -269,8 +268,7 @@ class Whisker:
         -------
         Whisker
         """
-        faults = length_faults(length, properties.get("any_length"))
-        if faults:
+        if faults := length_faults(length, properties.get("any_length")):
             raise ValueError("no straight whisker: " + "; ".join(faults))
         properties.setdefault("name", "straight")
         return _assemble(length, constant(np.zeros(3), length), Pose(), properties)
@@ -302,8 +300,7 @@ class Whisker:
             got = type(curvature).__name__
             faults.append(f"curvature is of type {got}; a function of arc length is needed")
         breaks = properties.get("breaks", ())
-        faults = faults or _break_faults(breaks, length)
-        if faults:
+        if faults := faults or _break_faults(breaks, length):
             raise ValueError("no whisker from curvature: " + "; ".join(faults))
         joints = np.unique([0.0, *breaks, length])
         profile = approximate(array_function(curvature, (3,), "curvature"), joints)
@@ -671,8 +668,7 @@ def _assemble(
 ) -> Whisker:
     """Create a whisker from a shape, with radius and material from the keywords."""
     stated = properties.get("breaks", ())
-    faults = _break_faults(stated, length)
-    if faults:
+    if faults := _break_faults(stated, length):
         raise ValueError("no whisker: " + "; ".join(faults))
     section, holding, remarks = parse_properties(length, properties)
     breaks = _merge_breaks(stated, [*curvature.breaks(), *section.breaks()], length)

@@ -189,8 +189,7 @@ def _assumed_radius(length: float, section: Profile) -> str:
 def kept_notes(notes: Sequence[str], properties: Section | Holding) -> tuple[str, ...]:
     """Omit the notes on properties that are given anew."""
     about = []
-    stated = properties.keys() & _SECTION_KEYS - {"breaks"}
-    if stated:
+    if stated := properties.keys() & _SECTION_KEYS - {"breaks"}:
         about += ["radius of the tip", "the radius", "the tip"]
     if stated - {"tip_radius"}:
         about.append("radius")
@@ -209,8 +208,7 @@ def renewed_notes(notes: Sequence[str], length: float, section: Profile) -> tupl
 def radius_notes(length: float, section: Profile, stated: Section) -> tuple[str, ...]:
     """Notes on a radius that the user should read."""
     notes = []
-    rat = stated.get("rat")
-    if rat is not None:
+    if (rat := stated.get("rat")) is not None:
         notes.append(published_note(rat, length))
     if section(length, "left") > section(0.0) * (1.0 + 1e-9):
         notes.append("the tip is thicker than the base")

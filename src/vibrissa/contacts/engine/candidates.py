@@ -292,10 +292,7 @@ def _downhill(
     others: IntArray,
     row: int,
 ) -> bool:
-    """Whether χ² decreases on the path from a contact to one on the map that fits slightly better.
-
-    The path is straight in s and s f, about the moment, along which valleys of χ² extend.
-    """
+    """Whether χ² decreases on the path along a valley from a contact to a better one on the map."""
     b, k = np.zeros(BUFFER_SIZE), codes.shape[0]
     value, at, t = np.empty(6), np.zeros(4), np.zeros((6, 4))
     residual, jacobian, mine = np.empty(k), np.empty((k, 4)), x[row]

@@ -192,10 +192,7 @@ def among_allowed(
     status: IntArray,
     chi_squared: Array,
 ) -> tuple[Candidates, IntArray, Array]:
-    """Add contacts of the tip, and leave out candidates that a prior does not allow.
-
-    ``measured`` contains the measurements (n, k) and the target values of the channels.
-    """
+    """Add contacts of the tip, and leave out candidates that a prior does not allow."""
     if prior.tip:
         tips = tip_contacts(contact_map, readout, prior.tip)
         found, status, chi_squared = tips.allow(measured, found, status, chi_squared)
@@ -220,10 +217,7 @@ def among_allowed(
 
 
 def _renormalised(probability: Array) -> Array:
-    """Probabilities (..., k) of the remaining candidates; NaN if there are none.
-
-    If the probabilities of the remaining ones all vanish, they become equal.
-    """
+    """Probabilities (..., k) of the remaining candidates, NaN without any; equal if all vanish."""
     total = np.nansum(probability, axis=-1, keepdims=True)
     weight = np.where(total > 0.0, probability, probability + 1.0)
     with np.errstate(invalid="ignore"):

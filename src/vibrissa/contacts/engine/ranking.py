@@ -320,10 +320,7 @@ def _weighed(
     room: _Work,
     described: tuple[Array, Array, Array, Array],
 ) -> None:
-    """Fill χ² and the description of n candidates: weights, ∂(F, p)/∂ξ, residuals and slopes.
-
-    For the candidates before ``first``, ∂(F, p)/∂ξ is already there.
-    """
+    """Fill χ², weights, ∂(F, p)/∂ξ (known before ``first``), residuals and slopes of candidates."""
     target, measured, x, values, _, _ = row
     weights, third, residuals, jacobians = described
     k, residual, jacobian = how.codes.shape[0], room.residual, room.jacobian
@@ -544,11 +541,7 @@ def leave_rows(
     first: int,
     last: int,
 ) -> None:
-    """Lower the probability of first candidates by the posterior outside their regions.
-
-    For those that `judge_rows` found certain although more than their covariance may be probable.
-    Covariances may be widened.
-    """
+    """Lower the probability of first candidates by the posterior outside their regions."""
     of, how, out = task.of, task.how, in_memory(number, flat, valid)
     white = how.own[0, 0] > 0.0
     for row in range(first, last):

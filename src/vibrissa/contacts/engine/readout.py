@@ -175,11 +175,7 @@ class Named:
         return any(abs(values[i]) > above * sigma for i, sigma in self._noise)
 
     def excess(self, measurement: Measurement) -> Array:
-        """Measurement (n,) in standard deviations of a free whisker's noise; empty without noise.
-
-        A size with its direction gives two components; a size alone gives what noise does not
-        explain.
-        """
+        """Measurement (n,) in standard deviations of a free whisker's noise; empty without any."""
         out: list[float] = []
         for i, sigma in self._noise:
             if sigma > 0.0:

@@ -223,8 +223,7 @@ def estimate(
         if compliance_sigma:
             refuse_tip(prior, "an uncertain base is stated")
         rod = contact_map.whisker, contact_map.steps
-        base = soft_base(*rod, readout.channels, sensor, compliance_sigma)
-        if base is not None:
+        if (base := soft_base(*rod, readout.channels, sensor, compliance_sigma)) is not None:
             found, status, chi_squared = base.allow(flat, targets, found, status)
     else:
         found, chi_squared = Candidates.room(len(flat), 1), np.full(len(flat), np.nan)

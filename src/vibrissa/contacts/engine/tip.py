@@ -168,10 +168,7 @@ class TipContacts:
     def allow(
         self, measured: tuple[Array, Array], found: Candidates, status: IntArray, chi_squared: Array
     ) -> tuple[Candidates, IntArray, Array]:
-        """Candidates of measurements including the tip's, with statuses and first χ².
-
-        ``measured`` contains the measurements (n, k) and the target values of the channels.
-        """
+        """Candidates of measurements including the tip's, with statuses and first χ²."""
         rows = np.flatnonzero(np.isin(status, (*_SOLVED, *_UNSOLVED)))
         if not rows.size:
             return found, status, chi_squared

@@ -296,10 +296,7 @@ def _certain(inverse: Array, value: Array, target: Array) -> bool:
 
 @kernel
 def _moves_far(rod: Rod, b: Array, xi: Array, target: Array, step: Array) -> bool:
-    """Whether errors of the integration move a contact by 1 % of the length.
-
-    ``step`` is the change of (s, f₁, f₂) that moves it by 1 % in the direction least determined.
-    """
+    """Whether errors of the integration move a contact by 1 % of the length along ``step``."""
     value, tangents, four = np.empty(6), np.empty((6, 3)), np.empty((6, 4))
     residual, jacobian, moves = np.empty(3), np.empty((3, 3)), np.empty(3)
     set_all_lanes(b, xi[0], 0.0, xi[1], xi[2])
@@ -360,10 +357,7 @@ def invert_rows(
     first: int,
     last: int,
 ) -> None:
-    """Find all stable contacts that give three signals, by rising force, for some rows.
-
-    ``loose`` (n,) is set where the signals do not determine one of them.
-    """
+    """Find all stable contacts that give three signals; ``loose`` (n,) marks undetermined ones."""
     b = np.zeros(BUFFER_SIZE)
     room = seed_room()
     found, slopes, quality = room.found, room.inverses, room.quality
@@ -432,11 +426,7 @@ def polish_rows(
 
 @lru_cache(maxsize=64)
 def seeding_triplet(chart: StableSet, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Choose the three signals that determine contacts best over the chart.
-
-    The criterion is the median volume of the error ellipsoid, for the same relative error of forces
-    and moments.
-    """
+    """Choose the three signals with the smallest error ellipsoids, in the median over the chart."""
     values = chart.values[::2, ::4, 1::2].reshape(-1, 6)
     tangents = chart.tangents[::2, ::4, 1::2].reshape(-1, 6, 3)
     force, moment = values[:, :3], np.cross(values[:, 3:], values[:, :3])

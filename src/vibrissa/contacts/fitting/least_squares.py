@@ -118,10 +118,7 @@ def channel_equations(
 def contact_equations(
     rod: Charted, work: Array, near: bool, x: Array, value: Array, tangents: Array
 ) -> None:
-    """Fill (F, p) and ∂(F, p)/∂x (6, 4) of a contact; interpolated if ``near`` and on the map.
-
-    Otherwise the rod is integrated.
-    """
+    """Fill (F, p) and ∂(F, p)/∂x (6, 4) of a contact, interpolated on the map if ``near``."""
     if near and interpolate(rod.nodes, rod.fold, work, x, value, tangents, True):
         return
     set_all_lanes(work, x[0], x[1], x[2], x[3])
@@ -175,10 +172,7 @@ def _damped_step(
 def _next(
     x: Array, r: Array, j: Array, k: int, damping: float, least: float, free: bool, work: Array
 ) -> float:
-    """Fill row 6 of the work with x after a damped step; return its relative size, or -1.
-
-    The size is 0 if the step would gain nothing.
-    """
+    """Fill row 6 of the work with x after a damped step; return its relative size, or -1."""
     a, fixed, step, to = work[:4], work[4], work[5], work[6]
     for p in range(4):
         fixed[p] = 0.0

@@ -294,10 +294,7 @@ def _predictions(
     before: Array,
     root: Array,
 ) -> bool:
-    """Fill predictions in the whisker's frame by hypothesis: p, covariance P, and P^(-1/2).
-
-    False if rounding has made a covariance singular.
-    """
+    """Fill predictions in the whisker's frame: p, covariance P, and P^(-1/2); False if singular."""
     low, column = np.empty((3, 3)), np.empty(3)
     for i in range(len(mixture.weight)):
         away = mixture.mean[i, :3] - base
@@ -372,11 +369,7 @@ def _fits(
     weights: Array,
     fits: Fits,
 ) -> None:
-    """Move contacts to the minimum in Ω of χ² of measurement and prediction, and fill the rest.
-
-    Targets (n, k + 3) and weights (n, k + 3, k + 3) are those of the signals, which are filled,
-    and of p.
-    """
+    """Move contacts to the minimum in Ω of χ² of measurement and prediction, and fill the rest."""
     k = how.codes.shape[0]
     own, before, rest = np.empty((k, k)), fits.contacts.copy(), False
     for _ in range(passes):

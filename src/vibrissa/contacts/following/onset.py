@@ -159,10 +159,7 @@ class Beginning:
     def _whole(
         self, measurement: Measurement, located: Contact, reach: float
     ) -> tuple[Gaussians, IntArray]:
-        """Linear candidates of one sample, and the rows of those well within a window.
-
-        Noise moves these nearly linearly: mode and mean coincide.
-        """
+        """Nearly linear candidates of one sample, and the rows of those well within a window."""
         x, values = self.exact(located)
         slope = np.insert(
             solve_forces(self._chart.discretization, x, tangents=True)[1], 1, 0.0, axis=2
@@ -277,10 +274,7 @@ class Beginning:
     def _fitted(
         self, measurement: Measurement, x: Array, values: Array, stations: AnyArray, held: float
     ) -> Fits:
-        """Contacts in Ω of minimum χ² of a measurement and stations; infinite if there is none.
-
-        Arc lengths are those of the stations (n,), with the weight ``held``.
-        """
+        """Contacts in Ω of minimum χ² of a measurement and stations (n,), of weight ``held``."""
         chart, how, k = self._chart, self._readout.how, len(self._names)
         n = len(x)
         fits = Fits(
@@ -398,10 +392,7 @@ def _connected(near: AnyArray) -> IntArray:
 
 
 def _gaps_between(points: Array) -> Array:
-    """Covariances (n, 3, 3) by which samples of a curve or surface fill the gaps between them.
-
-    They extend half way to the nearest two others.
-    """
+    """Covariances (n, 3, 3) by which samples fill half of the gaps to their two nearest others."""
     if len(points) < 2:
         return np.zeros((len(points), 3, 3))
     apart = points[None] - points[:, None]

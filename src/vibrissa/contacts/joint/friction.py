@@ -212,11 +212,7 @@ class _Parts(NamedTuple):
 
 
 def _parts(nodes: _Nodes) -> _Parts:
-    """Divide the steps between nodes.
-
-    The log density is a cubic between nodes, which is exact for a normal density; other fields are
-    linear.
-    """
+    """Divide the steps between nodes; the log density is a cubic between these, the rest linear."""
     same = nodes.curve[1:] == nodes.curve[:-1]
     h = np.where(same, np.diff(nodes.s), np.nan)
     rise = np.diff(nodes.log) / h
@@ -398,10 +394,7 @@ def or_without(
 
 
 def _odds_of_all(ratio: Array, spread: Array, sigma: float) -> float:
-    """Odds that there is no friction in any of several measurements.
-
-    Their ratios (n,) have standard deviations ``spread`` (n,), which include the prior σ.
-    """
+    """Odds that there is no friction in any of several measurements of ratios (n,) ± ``spread``."""
     information = 1.0 / spread**2 - 1.0 / sigma**2
     known = information > 0.0
     variance = 1.0 / information[known]

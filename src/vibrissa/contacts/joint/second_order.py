@@ -131,11 +131,7 @@ def displace_rows(
     first: Array,
     known: AnyArray,
 ) -> None:
-    """Fill principal axes (n, u, u) in columns, and contacts (n, u, 4) displaced along them.
-
-    Fills also the displacements (n, u), the covariances (n, 3, 3) to first order, and whether the
-    unknowns are determined.
-    """
+    """Fill principal axes (n, u, u), contacts displaced along them, and first-order covariances."""
     free = how.free
     r, u, n = design.shape[1], axes.shape[1], free.shape[0]
     clean, across = np.empty((r, u)), np.empty(3)
@@ -215,10 +211,7 @@ def _bend(
     changes: Array,
     second: Array,
 ) -> float:
-    """Fill changes of derivatives along axes, and second derivatives; error of the channels.
-
-    ``changes`` (1 + u, q, n) begin with the derivatives themselves; ``second`` (q, u, u).
-    """
+    """Fill changes of derivatives along axes, and second derivatives (q, u, u); channels' error."""
     k, u = how.codes.shape[0], axes.shape[1]
     q, n = changes.shape[1], changes.shape[2]
     seen, other, turned, off = np.empty(k), np.empty(k), np.empty(k), np.empty(k)
@@ -311,10 +304,7 @@ def _fourth(root: Array, v: Array) -> float:
 
 @inlined
 def _moments(first: Array, linear: Array, points: Array, density: Array, out: Array) -> bool:
-    """Fill the covariance (3, 3) of a cloud (c, 3) with density (c,); whether it is usable.
-
-    Tails are relative to those of its linear part, whose covariance is ``first``.
-    """
+    """Fill the covariance (3, 3) of a cloud (c, 3) with density (c,); whether it is usable."""
     size, total, squares = density.shape[0], 0.0, 0.0
     for d in density:
         total += d
@@ -358,11 +348,7 @@ def cloud_rows(
     covariance: Array,
     valid: AnyArray,
 ) -> None:
-    """Fill covariances (n, 3, 3) of contact points from clouds, and whether they are valid.
-
-    ``contacts`` and ``displaced`` are values, derivatives and x; ``joint`` residuals and the
-    derivatives of these and of the points; ``principal`` axes and displacements along them.
-    """
+    """Fill covariances (n, 3, 3) of contact points from clouds, and whether they are valid."""
     k, n, u = how.codes.shape[0], how.free.shape[0], node.shape[1]
     number, all_r = node.shape[0], joint[0].shape[1]
     q = k + n  # with friction its angle is a row, so that those above the channels are square

@@ -70,10 +70,7 @@ class SensorNoise:
         errors: Array = _NONE,
         whisker: Whisker | None = None,
     ) -> SensorNoise:
-        """Read and check the noise of signals, and errors (n, 6, 7) that all measurements share.
-
-        If the whisker is stated, noise that is far too large or small for it is questioned.
-        """
+        """Read and check the noise of signals, and errors (n, 6, 7) that all measurements share."""
         out = cls._read(noise, names, errors)
         if whisker is not None:
             _question(out, names, whisker)
@@ -82,8 +79,7 @@ class SensorNoise:
     @classmethod
     def _read(cls, noise: Noise, names: tuple[str, ...], errors: Array) -> SensorNoise:
         if isinstance(noise, Mapping):
-            missing = [name for name in names if name not in noise]
-            if missing:
+            if missing := [name for name in names if name not in noise]:
                 raise ValueError(
                     f"noise lacks {', '.join(missing)}; it has {', '.join(noise) or 'none'}"
                 )

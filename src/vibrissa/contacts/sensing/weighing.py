@@ -221,10 +221,7 @@ def weigh_any(how: Weighing, value: Array, measured: Array, out: Array) -> bool:
 
 @inlined
 def sharpness(weights: Array) -> float:
-    """Logarithm of the noise's peak density for these weights, up to a common constant.
-
-    The noise of a direction decreases with the size of its vector, so that contacts differ.
-    """
+    """Logarithm of the noise's peak density for these weights, up to a common constant."""
     total = 0.0
     for i in range(weights.shape[0]):
         if abs(weights[i, i]) > 0.0:

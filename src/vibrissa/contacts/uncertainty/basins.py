@@ -130,10 +130,7 @@ def _root(parent: IntArray, i: int) -> int:
 def _basins(
     of: Searched, cells: IntArray, away: Array, n: int, order: IntArray, parent: IntArray
 ) -> None:
-    """Fill the order of cells by how far they miss, and the basin (its best cell) of each.
-
-    Cells that touch belong to one basin unless a sill separates them.
-    """
+    """Fill the order of cells by how far they miss, and the basin of each: sills separate these."""
     for i in range(n):
         place = i
         while place > 0 and away[order[place - 1]] > away[i]:

@@ -260,10 +260,7 @@ def _ends(x: Array, axes: Array, steps: Array, others: Array) -> None:
 
 @inlined
 def _displace(x: Array, model: Expansion, steps: Array, moved: Array) -> None:
-    """Fill contacts displaced along the bent axes (3, 4).
-
-    Steps that would leave the whisker are shortened.
-    """
+    """Fill contacts (3, 4) displaced along the bent axes, as far as these stay on the whisker."""
     axes, bends, bent_s = model.axes, model.bends, model.bent_s
     for i in range(3):
         for _ in range(_TRIALS):
@@ -281,11 +278,7 @@ def _displace(x: Array, model: Expansion, steps: Array, moved: Array) -> None:
 
 @inlined
 def _follow(rod: Charted, work: Array, near: bool, model: Expansion, slopes: int) -> bool:
-    """Fill (F, p) of the displaced contacts, and ∂(F, p)/∂x if ``slopes`` is 3 instead of 0.
-
-    They are interpolated if ``near`` and if all are on the map; else the rod is integrated. Return
-    whether they were interpolated.
-    """
+    """Fill (F, p), and ∂(F, p)/∂x, of displaced contacts; whether the map was interpolated."""
     moved, values, tangents = model.moved, model.values, model.tangents
     for i in range(3):
         near = near and interpolate(

@@ -169,10 +169,7 @@ def _one_way(
     nodes: Nodes,
     along: Array,
 ) -> tuple[int, bool]:
-    """Fill the nodes on one side of the start; return their number, and whether they end with Ω.
-
-    ``along`` is the direction at the start, where det ∂p/∂ξ is ``volume``.
-    """
+    """Fill the nodes on one side of the start; return their number, and whether they end with Ω."""
     places, misfits = nodes[0], nodes[1]
     b, value, t = np.zeros(BUFFER_SIZE), np.empty(6), np.zeros((6, 4))
     at, to, turned, gone = start.copy(), np.zeros(4), np.empty(3), np.empty(3)

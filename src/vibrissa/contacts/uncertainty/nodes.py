@@ -144,10 +144,7 @@ def _volumes(chart: StableSet) -> Array:
 
 @vectorised
 def nearest_of(of: Searched, mixing: Array, target: Array, out: IntArray) -> None:
-    """Fill the node of each part of the chart that is nearest to one measurement.
-
-    A block, which belongs to one part, is skipped if its bounds show that it is farther away.
-    """
+    """Fill the node of each part of the chart that is nearest to one measurement."""
     q, number, sizes = of.turns.shape[0], of.blocks.shape[0] - 1, np.zeros(2)
     fixed = np.zeros(q)
     wanted, scales, bounds = np.zeros(q), np.zeros((q, q)), np.zeros(number)
@@ -186,10 +183,7 @@ def nearest_of(of: Searched, mixing: Array, target: Array, out: IntArray) -> Non
 def _near_blocks(
     of: Searched, weights: Array, unit: Array, target: Array, most: float, blocks: IntArray
 ) -> tuple[int, int]:
-    """List the blocks that may contain nodes with a χ² of at most ``most``; count blocks and nodes.
-
-    Bounds on the channels of a block give bounds on each whitened residual.
-    """
+    """List the blocks with nodes of a χ² of at most ``most``, by bounds; count blocks and nodes."""
     q, number, nodes = of.turns.shape[0], 0, 0
     low, high = np.empty(q), np.empty(q)
     for n in range(blocks.shape[0]):

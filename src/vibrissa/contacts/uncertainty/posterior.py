@@ -250,10 +250,7 @@ def second_moment(points: Array, density: Array, total: float, covariance: Array
 
 @inlined
 def _reaches(far: Array, density: Array, centre: float, logs: Array) -> None:
-    """Make squared distances (rays, radii) monotonic; fill logs of the probability beyond.
-
-    ``logs`` (rays, 1 + radii) are for the centre and each node.
-    """
+    """Make squared distances (rays, radii) monotonic; fill ``logs`` of the probability beyond."""
     last = far.shape[1]
     for ray in range(far.shape[0]):
         left = _BEYOND[last] * density[ray, last - 1]
@@ -400,11 +397,7 @@ def _second_order(
 
 
 class JudgeRoom(NamedTuple):
-    """Working memory of `judge`.
-
-    A buffer of the rod's, slopes of residuals (k, 3) and of the point (3, 3), zeros (3,), the
-    expansion and the nodes.
-    """
+    """Working memory of `judge`: a rod's buffer, slopes, zeros, expansion and nodes."""
 
     buffer: Array
     j: Array

@@ -88,10 +88,7 @@ def continued(
     head: HeadPose,
     tapers: bool,
 ) -> tuple[RestShape, Length] | None:
-    """Continue a shape at rest as far as one of the views shows it; None if none shows more.
-
-    A whisker of which the other view shows a small share at most is not known in space.
-    """
+    """Continue a shape at rest as far as one view shows it; None if none shows more."""
     posed = _posed(shape, curves, cameras, traces, head)
     if posed is None or len(cameras) == 1:
         return None

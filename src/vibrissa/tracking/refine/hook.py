@@ -153,10 +153,7 @@ def straightened(
 def off_hook(
     cameras: Sequence[Camera], traces: TraceSeries, curves: Array, hook: Hook | None
 ) -> tuple[TraceSeries, TraceSeries]:
-    """Traces that do not show the whisker where a hook is, and those for its fit.
-
-    Curves (time, n, 3) are in the laboratory. The fit does not compare that part.
-    """
+    """Traces that do not show the whisker where a hook is, and those for its fit."""
     if hook is None:
         return traces, traces
     hooked = np.zeros(traces.seen.shape, dtype=bool)

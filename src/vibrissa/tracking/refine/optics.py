@@ -99,10 +99,7 @@ class Optics:
         return bool(self.before > _VISIBLE and explains and apart.max() > _CERTAIN)
 
     def as_stated(self) -> Optics:
-        """The stated cameras, with their uncertainty and their difference from these optics.
-
-        As both explain the views, it is not known better than by the prior how far they are apart.
-        """
+        """The stated cameras, with their uncertainty and their difference from these optics."""
         apart = self.values - self.stated
         apart /= max(1.0, float(np.linalg.norm(apart / self.prior)))
         return replace(

@@ -191,10 +191,7 @@ class Smoother:
         return np.asarray(step.T).reshape(len(pulls), count, n)
 
     def covariances(self) -> Array:
-        """Blocks (time, unknown, unknown) on the diagonal of the inverse.
-
-        Shared unknowns are taken as known: see `by_shared`.
-        """
+        """Blocks (time, unknown, unknown) on the diagonal of the inverse, shared unknowns known."""
         count, n, _ = self.diagonal.shape
         pairs = (count + 1) // 2
         size = 2 * n

@@ -96,10 +96,7 @@ class TraceSeries:
         return np.asarray(np.linalg.norm(np.diff(self.line, axis=2), axis=3).max(axis=2))
 
     def equations(self, view: int, pixels: Array, slopes: Array) -> tuple[Array, Array, Array]:
-        """Distances of points from the traces of a view, their derivatives, and their weights.
-
-        They are in standard deviations. The last two are distances of the ends along the trace.
-        """
+        """Distances of points, and of the ends, from a view's traces, derivatives, and weights."""
         count, n, _, unknowns = slopes.shape
         rows = np.zeros((count, n + 2, unknowns))
         misses, weights = np.zeros((2, count, n + 2))

@@ -120,11 +120,7 @@ def cheapest_ways(
     cost: Any,
     way: Any,
 ) -> int:
-    """Cheapest assignments by depth-first branch and bound; the bound is the last one kept.
-
-    Options (whisker, 1 + line) are costs of being lost and of lines, ``ranked`` the lines in their
-    order, −1 for being lost.
-    """
+    """Cheapest assignments by depth-first branch and bound; the bound is the last one kept."""
     n, most, count = len(order), len(cost), 0
     # The smallest cost of each whisker and all later ones.
     rest = np.zeros(n + 1)
@@ -304,10 +300,7 @@ def _moves(motion: Array, one: Ways, other: Ways) -> Array:
 
 @kernel
 def costs_of_moves(motion: Any, one: Any, other: Any, cost: Any) -> None:
-    """Cost of the row's motion, and of whiskers that move otherwise, get lost or are found.
-
-    The row moves as the median whisker does, and not at all if none is seen.
-    """
+    """Cost of the row's motion, and of whiskers that move otherwise, get lost or are found."""
     steps = np.empty(one.shape[1])
     for i in range(len(one)):
         for j in range(len(other)):
@@ -384,10 +377,7 @@ class _Meeting(NamedTuple):
 def settle_crossings(
     rows: Sequence[Sequence[Trace]], fixed: Sequence[set[int]], options: TraceOptions
 ) -> list[list[Trace]]:
-    """Traces of all whiskers of a view, with far ends as they are most probable over all frames.
-
-    Some whiskers are fixed in some frames.
-    """
+    """Traces of all whiskers of a view, with far ends as they are most probable over all frames."""
     found = [list(row) for row in rows]
     changed = set(range(len(found)))
     for _ in range(_PASSES):

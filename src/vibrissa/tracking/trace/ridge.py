@@ -151,10 +151,7 @@ def noise_level(frame: Any) -> float:
 
 @inlined
 def darkest_expected(profile: Any, gate: int, scale: float, sd: float, variance: float) -> Any:
-    """Depth, in standard deviations, and number of the most probable sample; depth 0 if none.
-
-    Far from the expected position only a darker sample counts.
-    """
+    """Depth, in standard deviations, and number of the most probable sample; depth 0 if none."""
     reach = gate + 5
     best, value, at = 0.0, 0.0, -1
     for j in range(5, 2 * gate + 6):
@@ -340,10 +337,7 @@ def measure_ends(
 
 @kernel
 def flanks(frame: Any, line: Any, distances: Any, bits: Any, which: int, out: Any) -> None:
-    """Grey values at distances from a curve, to its left (−dy, dx) and to its right.
-
-    NaN where there is clutter.
-    """
+    """Grey values at distances from a curve, left (−dy, dx) and right of it; NaN in clutter."""
     for k in range(line.shape[0]):
         nx, ny = normal(line, k)
         for i in range(distances.shape[0]):
@@ -388,10 +382,7 @@ def fitted(
     skipped: int = 0,
     held: float = 0.0,
 ) -> tuple[Array, Array, Array, Mask, Array, float]:
-    """Measure across a line and smooth it: line, amplitude, flank, seen, weight, and excess.
-
-    Points that are not seen are held at the line by a weight.
-    """
+    """Measure across a line and smooth it: line, amplitude, flank, seen, weight, and excess."""
     n, line = len(line), np.ascontiguousarray(line)
     points, amplitude, flank, support = np.empty((n, 2)), np.empty(n), np.empty(n), np.empty(n)
     measure(frame, line, gate, noise, options.scale, *clutter, points, amplitude, flank, support)

@@ -382,10 +382,7 @@ def _price(click: Array, curve: Curve, half: float) -> float:
 
 
 def _passed(click: Array, line: Array) -> tuple[float, int]:
-    """Distance of a click from a line, which may start with hairs before it, and the point.
-
-    The length of the line before it adds a little.
-    """
+    """Distance of a click from a line, which may start with hairs before it, and the point."""
     near = line[arc_lengths(line) < _HAIR]
     far = np.hypot(*(near - click).T) + _BEFORE * arc_lengths(near)
     at = int(np.argmin(far))

@@ -23,14 +23,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = [
-    "QUANTITIES",
-    "Quantity",
-    "attributes",
-    "axis_label",
-    "quantity",
-    "to_display",
-]
+__all__ = ["QUANTITIES", "Quantity", "attributes", "axis_label", "quantity", "to_display"]
 __dir__ = __all__.copy
 
 

@@ -52,11 +52,7 @@ def calibrate(
     `vibrissa calibrate touches.csv --whisker wire.nc --components My,Mz -o sensor.toml`
     """
     boards = {"--pattern": pattern, "--square": square, "--frames": frames}
-    touches = {
-        "--whisker": own.whisker,
-        "--components": components,
-        "--touch-sigma": touch_sigma,
-    }
+    touches = {"--whisker": own.whisker, "--components": components, "--touch-sigma": touch_sigma}
     kind = images[0].suffix if len(images) == 1 else ""
     if kind in (".toml", ".csv"):
         refuse(boards, f"only a checkerboard needs it, and {images[0]} describes touches")

@@ -22,9 +22,7 @@ from vibrissa.contacts.contacts import (
     friction_assumed as friction_assumed,
 )
 from vibrissa.contacts.engine.prior import Prior
-from vibrissa.contacts.engine.readout import (
-    searched_by_name as searched_by_name,
-)
+from vibrissa.contacts.engine.readout import searched_by_name as searched_by_name
 from vibrissa.contacts.engine.search import signals_at_nodes as signals_at_nodes
 from vibrissa.contacts.estimator import Estimator
 from vibrissa.contacts.fitting.inversion import (

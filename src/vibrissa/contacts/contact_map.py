@@ -495,11 +495,7 @@ def _dataset(whisker: Whisker, chart: StableSet) -> xr.Dataset:
     }
     for i, name in enumerate(("r", "theta", "phi")):
         data[name] = (dims, ball[..., i], attributes(name))
-    coords = {
-        **node_coordinates(chart),
-        "space": ["x", "y", "z"],
-        "unknown": ["s", "fy", "fz"],
-    }
+    coords = {**node_coordinates(chart), "space": ["x", "y", "z"], "unknown": ["s", "fy", "fz"]}
     out = xr.Dataset(data, coords=coords)
     return out.merge(base_signals(out.force, out.moment))
 

@@ -462,11 +462,7 @@ def _fit_deviation(
         )
         few = merge_neighbours(support._replace(variance=support.variance + noise), most)
         fit = FreeFit(
-            covariance=base.covariance,
-            base=base,
-            support=few,
-            amplitude=amplitude,
-            length=length,
+            covariance=base.covariance, base=base, support=few, amplitude=amplitude, length=length
         )
         mean, unsure = fit.deviation(there.foot)
         miss = np.abs(value - mean) / np.sqrt(variance + unsure**2)

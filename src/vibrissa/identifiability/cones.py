@@ -99,13 +99,7 @@ def _critical_cone(contact_map: ContactMap, triplet: str, samples: int) -> float
     cone = 0.0
     for seed in range(_ROUNDS):
         found = uniqueness(
-            contact_map,
-            [triplet],
-            ["all"],
-            cone=cone,
-            samples=samples,
-            resolution=False,
-            seed=seed,
+            contact_map, [triplet], ["all"], cone=cone, samples=samples, resolution=False, seed=seed
         )
         # Keep the cone below a right angle, at which it would be all of space.
         cone = min(max(cone, float(found["critical_cone"].squeeze())), 0.499 * np.pi)
@@ -144,12 +138,7 @@ def cone_bracket(
     low = 0.0
     for _ in range(_SEARCHES):  # the last search yields witnesses near the largest angle only
         found = uniqueness(
-            contact_map,
-            [TRIPLET],
-            ["all"],
-            cone=_NEARLY * low,
-            samples=samples,
-            resolution=False,
+            contact_map, [TRIPLET], ["all"], cone=_NEARLY * low, samples=samples, resolution=False
         )
         low = float(found["critical_cone"].squeeze())
     found = with_proved_witnesses(contact_map, found)

@@ -464,11 +464,7 @@ def _to_dataset(
 ) -> xr.Dataset:
     """Dataset of all verdicts and evidence."""
     data: dict[str, Any] = {
-        name: (
-            ("triplet", "region", *dims),
-            np.stack([a.variables[name] for a in results]),
-            about,
-        )
+        name: (("triplet", "region", *dims), np.stack([a.variables[name] for a in results]), about)
         for name, (dims, about) in _VARIABLES.items()
         if name in results[0].variables
     }

@@ -530,9 +530,7 @@ def read_anipose(path: str | PathLike[str]) -> RawTracks:
         frames=frames.astype(np.int64),
         extra={
             name: xr.Variable(
-                SPACE[:-1],
-                measured[what],
-                {"units": unit, "long_name": name.replace("_", " ")},
+                SPACE[:-1], measured[what], {"units": unit, "long_name": name.replace("_", " ")}
             )
             for name, (unit, what) in about.items()
         },

@@ -341,8 +341,7 @@ class ContactBag:
         level = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
         pose = types["geometry_msgs/msg/Pose"](place, level)
         return types[_UNCERTAIN](
-            header=header,
-            pose=types["geometry_msgs/msg/PoseWithCovariance"](pose, whole.ravel()),
+            header=header, pose=types["geometry_msgs/msg/PoseWithCovariance"](pose, whole.ravel())
         )
 
     def _cloud(self, header: Any, candidates: Array, values: Array) -> Any:

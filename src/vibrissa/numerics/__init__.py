@@ -58,15 +58,7 @@ if TYPE_CHECKING:
     from vibrissa.numerics.device import Translation as Translation, check_device as check_device
     from vibrissa.numerics.kernel_cache import compile_together as compile_together
 
-__all__ = [
-    "AnyArray",
-    "Array",
-    "IntArray",
-    "Vector",
-    "cholesky",
-    "copy",
-    "solve",
-]
+__all__ = ["AnyArray", "Array", "IntArray", "Vector", "cholesky", "copy", "solve"]
 __dir__ = __all__.copy
 
 __getattr__ = names_from(

@@ -432,11 +432,7 @@ def signal_slice(
         point = np.where(within_paper_bounds(contact_map.whisker, point)[..., None], point, np.nan)
     out = xr.Dataset(
         {
-            "contact_point": (
-                (*dims, "space"),
-                point,
-                attributes("contact_point_whisker"),
-            ),
+            "contact_point": ((*dims, "space"), point, attributes("contact_point_whisker")),
             "n_candidates": (dims, found.n_candidates, attributes("candidates")),
             "small_deflection": (
                 dims,

@@ -421,8 +421,5 @@ def _build_mesh(triangulation: Delaunay) -> Mesh:
     corners = triangulation.simplices.astype(np.int64)
     n = len(corners)
     centres, shares, flat = np.zeros((n, 3)), np.zeros((n, 4)), np.zeros(n, np.int64)
-    share_out(
-        n,
-        lambda first, last: measure(vertices, corners, centres, shares, flat, first, last),
-    )
+    share_out(n, lambda first, last: measure(vertices, corners, centres, shares, flat, first, last))
     return vertices, corners, triangulation.neighbors.astype(np.int64), centres, shares, flat

@@ -257,10 +257,7 @@ def with_network_errors(
         )
         if progress is not None:
             progress(len(errors), verdicts.sizes["triplet"])
-    about = {
-        "units": "m",
-        "long_name": "error of a network on contacts that it was not trained on",
-    }
+    about = {"units": "m", "long_name": "error of a network on contacts that it was not trained on"}
     return verdicts.assign_coords(quantile=list(QUANTILES)).assign(
         network_error=(("triplet", "region", "quantile"), errors, about)
     )

@@ -28,11 +28,7 @@ _ANGLES = ("base_azimuth", "base_elevation", "base_roll")
 _RATE = "_rate"
 
 # Names of the 16 columns that spike models use.
-PREDICTORS = (
-    *_COMPONENTS,
-    *_ANGLES[:2],
-    *(name + _RATE for name in (*_COMPONENTS, *_ANGLES[:2])),
-)
+PREDICTORS = (*_COMPONENTS, *_ANGLES[:2], *(name + _RATE for name in (*_COMPONENTS, *_ANGLES[:2])))
 # Columns that a single camera view cannot measure: they are zero up to rounding.
 _UNSEEN = ("Fz", "Mx", "My", "base_elevation")
 

@@ -435,11 +435,7 @@ def signal_frames(
 
 
 def _signal_frames(
-    course: Course,
-    signals: dict[str, Array],
-    samples: xr.Dataset,
-    centerline: ArrayLike,
-    rows: Any,
+    course: Course, signals: dict[str, Array], samples: xr.Dataset, centerline: ArrayLike, rows: Any
 ) -> Iterator[Picture]:
     first, last = int(rows[0]), int(rows[-1])
     time = to_display("time", course.time)

@@ -104,11 +104,7 @@ def intervals(time: Array, contact: Mask, known: Mask | None = None) -> Array:
 
 
 def _panel(
-    axes: Axes,
-    name: str,
-    signals: xr.Dataset,
-    truth: xr.Dataset | None,
-    contact: Mask | None,
+    axes: Axes, name: str, signals: xr.Dataset, truth: xr.Dataset | None, contact: Mask | None
 ) -> None:
     time = to_display("time", signals["time"])
     if name not in DIRECTIONS:
@@ -309,11 +305,7 @@ def _body(axes: Any, triangles: Array, colours: Array, line: Array, flat: float 
 
 
 def _pulled(
-    figure: Figure,
-    cell: style.Box,
-    nodes: Array,
-    line: Array,
-    view: tuple[float, float],
+    figure: Figure, cell: style.Box, nodes: Array, line: Array, view: tuple[float, float]
 ) -> None:
     """Draw an inset of the contacts that pull the whisker, with its own colours."""
     triangles = scene.solid_surface(nodes, False, scene.column("deflection"), scene.column("Fx"))

@@ -27,9 +27,5 @@ from vibrissa.report.space import (
     trial_in_space as trial_in_space,
 )
 
-__all__ = [
-    "document",
-    "in_space",
-    "reachable_space",
-]
+__all__ = ["document", "in_space", "reachable_space"]
 __dir__ = __all__.copy

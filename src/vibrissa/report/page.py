@@ -72,10 +72,7 @@ class Section(NamedTuple):
 
 
 def table(
-    rows: Iterable[Sequence[str]],
-    heading: Sequence[str] = (),
-    caption: str = "",
-    note: str = "",
+    rows: Iterable[Sequence[str]], heading: Sequence[str] = (), caption: str = "", note: str = ""
 ) -> str:
     """HTML of a table; the first column names the rows, and with a heading others are numbers."""
     kind = ' class="number"' if heading else ""

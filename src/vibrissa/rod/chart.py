@@ -476,14 +476,7 @@ def _add_values(b: Array, n: int, v: float, x: float, y: float, z: float) -> Non
 
 
 @inlined
-def _add_slopes(
-    b: Array,
-    n: int,
-    by_v: Vector,
-    by_x: Vector,
-    by_y: Vector,
-    by_z: Vector,
-) -> None:
+def _add_slopes(b: Array, n: int, by_v: Vector, by_x: Vector, by_y: Vector, by_z: Vector) -> None:
     """Add the corner in the buffer to the n sums of slopes, with the derivatives of the weights."""
     for q in range(n):
         v, x, y, z = b[q], b[_PADDED + q], b[2 * _PADDED + q], b[3 * _PADDED + q]

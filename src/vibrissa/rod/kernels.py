@@ -66,11 +66,7 @@ BUFFER_SIZE = LEAN + 3 * LANES
 @inlined
 def cross(a: Vector, b: Vector) -> Vector:
     """Vector product."""
-    return (
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    )
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 @inlined

@@ -33,14 +33,7 @@ from vibrissa.rod.continuation import POINT, follow
 from vibrissa.rod.discretization import Bendable, Rod, discretize
 from vibrissa.rod.integration import share_rows, solve_forces
 from vibrissa.rod.kernels import BUFFER_SIZE, LANES
-from vibrissa.rod.newton import (
-    ABOVE_FOLD,
-    TOLERANCE,
-    group_room,
-    newton_group,
-    stable,
-    start_from,
-)
+from vibrissa.rod.newton import ABOVE_FOLD, TOLERANCE, group_room, newton_group, stable, start_from
 from vibrissa.rod.search import MOST_SEEDS, compile_seeds, seed_room, seeds
 from vibrissa.rod.tree import SearchTree, search_tree
 from vibrissa.status import Status

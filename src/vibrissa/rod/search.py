@@ -50,12 +50,7 @@ _STACK = 256
 
 @inlined
 def _add_seed(
-    tree: SearchTree,
-    cell: int,
-    x: Array,
-    solved: int,
-    room: SeedRoom,
-    count: int,
+    tree: SearchTree, cell: int, x: Array, solved: int, room: SeedRoom, count: int
 ) -> int:
     """Add a seed unless a neighbour found the same; a solved one replaces an unsolved one."""
     found, inverses, quality, b, work = room.found, room.inverses, room.quality, room.b, room.work

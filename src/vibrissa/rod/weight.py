@@ -163,12 +163,7 @@ def _free_slope_rates(
 
 @inlined
 def _held_rates(
-    data: tuple[Array, Piece, Load, float, float],
-    stage: int,
-    left: float,
-    i: int,
-    x: Six,
-    y: Six,
+    data: tuple[Array, Piece, Load, float, float], stage: int, left: float, i: int, x: Six, y: Six
 ) -> tuple[Six, Six]:
     """Derivatives of (φ, q) and (g, μ) between contact and base."""
     b, piece, load, low, span = data
@@ -458,11 +453,7 @@ def evaluate_weighted(
             one, two = _shares(
                 h,
                 0,
-                (
-                    1.0 if axis == 0 else 0.0,
-                    1.0 if axis == 1 else 0.0,
-                    1.0 if axis == 2 else 0.0,
-                ),
+                (1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0),
             )
             for a in range(STATES):
                 at = _SLOPES + a * LANES

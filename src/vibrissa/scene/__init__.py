@@ -47,8 +47,5 @@ from vibrissa.scene.solids import (
     values_of as values_of,
 )
 
-__all__ = [
-    "Course",
-    "course_of",
-]
+__all__ = ["Course", "course_of"]
 __dir__ = __all__.copy

@@ -196,11 +196,7 @@ def answer(cell: Cell) -> dict[str, Any]:
     finally:
         for kept in _KEPT:
             kept.cache_clear()
-    return {
-        "result": result,
-        "whisker": described,
-        "seconds": time.process_time() - started,
-    }
+    return {"result": result, "whisker": described, "seconds": time.process_time() - started}
 
 
 # Parameters of a grid or a random population: default, factor to SI units, exclusive minimum.

@@ -11,12 +11,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from vibrissa.viewer.server import Served, Viewer, view, view_stream
 
-__all__ = [
-    "Served",
-    "Viewer",
-    "view",
-    "view_stream",
-]
+__all__ = ["Served", "Viewer", "view", "view_stream"]
 __dir__ = __all__.copy
 
 

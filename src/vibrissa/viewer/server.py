@@ -49,14 +49,7 @@ from vibrissa.viewer.bend import (
 )
 from vibrissa.viewer.locate import LocateMode, coloured, located, usual_sensor
 from vibrissa.viewer.map import MapMode
-from vibrissa.viewer.page import (
-    EXAGGERATION,
-    VIEWS,
-    Framing,
-    Mode,
-    Page,
-    whole,
-)
+from vibrissa.viewer.page import EXAGGERATION, VIEWS, Framing, Mode, Page, whole
 from vibrissa.viewer.readout import CLOUD, CONTACT, instructions, note, sentence, table
 from vibrissa.viewer.save import SaveControls, amended
 from vibrissa.viewer.stage import Stage, lit
@@ -137,12 +130,7 @@ class Viewer(Served):
 
 
 def view_stream(
-    whisker: Whisker,
-    address: str,
-    *,
-    name: str = "",
-    host: str = HOST,
-    port: int | None = None,
+    whisker: Whisker, address: str, *, name: str = "", host: str = HOST, port: int | None = None
 ) -> Served:
     """Serve a page that draws the results of a running stream as they arrive.
 
@@ -323,9 +311,7 @@ def rehearsal(page: Page) -> list[Callable[[], object]]:
 
 
 def _footage(
-    trial: Watched | None,
-    videos: Sequence[str | PathLike[str]],
-    opened: contextlib.ExitStack,
+    trial: Watched | None, videos: Sequence[str | PathLike[str]], opened: contextlib.ExitStack
 ) -> tuple[Footage, ...]:
     """Open the videos of a trial."""
     if not videos:

@@ -175,10 +175,7 @@ _WELD = 1e-6
 
 
 def glb(
-    triangles: Array,
-    colours: Bytes,
-    opacity: float | None = None,
-    side: Side = "double",
+    triangles: Array, colours: Bytes, opacity: float | None = None, side: Side = "double"
 ) -> bytes:
     """Write triangles with coloured corners as a GLB file."""
     # The brightness of each triangle is the same from both sides.

@@ -229,7 +229,7 @@ _SIDES: dict[str, Side] = {"l": "left", "left": "left", "r": "right", "right": "
 _PATTERN = re.compile(
     r"(?:(?P<before>left|right|l|r)[\s_-]*)?"
     r"(?:(?P<row>[a-e])[\s_-]*0*(?P<column>\d)|(?P<greek>" + "|".join((*GREEK, *_SPELLED)) + "))"
-    r"(?:[\s_-]*(?P<after>left|right|l|r))?",
+    r"(?:[\s_-]*(?P<after>left|right|l|r))?"
 )
 
 

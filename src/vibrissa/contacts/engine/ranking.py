@@ -30,12 +30,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vibrissa.contacts.contacts import MOST_CANDIDATES, Candidates, Room
-from vibrissa.contacts.engine.candidates import (
-    UNEXPLAINED,
-    explain_rows,
-    finite,
-    solve_rows,
-)
+from vibrissa.contacts.engine.candidates import UNEXPLAINED, explain_rows, finite, solve_rows
 from vibrissa.contacts.engine.task import (
     MOST_STARTS,
     Description,
@@ -53,12 +48,7 @@ from vibrissa.contacts.fitting.least_squares import channel_equations, same_cont
 from vibrissa.contacts.sensing.channels import Channels
 from vibrissa.contacts.sensing.noise import INDISTINCT
 from vibrissa.contacts.sensing.weighing import Weighing, sharpness, weigh_any, weighing_of
-from vibrissa.contacts.uncertainty.basins import (
-    BasinsRoom,
-    basins_room,
-    slacks,
-    starts_of_basins,
-)
+from vibrissa.contacts.uncertainty.basins import BasinsRoom, basins_room, slacks, starts_of_basins
 from vibrissa.contacts.uncertainty.flat_valleys import follow_valley
 from vibrissa.contacts.uncertainty.nodes import (
     PARTS,

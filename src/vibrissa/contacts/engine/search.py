@@ -26,13 +26,7 @@ from vibrissa.contacts.contacts import Candidates, Contacts, Room, candidates_wi
 from vibrissa.contacts.engine.candidates import UNEXPLAINED
 from vibrissa.contacts.engine.prior import Prior, among_allowed, refuse_tip
 from vibrissa.contacts.engine.ranking import compile_stages, estimate_rows
-from vibrissa.contacts.engine.readout import (
-    Bounds,
-    Measurement,
-    Mixed,
-    Named,
-    independent,
-)
+from vibrissa.contacts.engine.readout import Bounds, Measurement, Mixed, Named, independent
 from vibrissa.contacts.engine.task import Problem, task
 from vibrissa.contacts.fitting.inversion import polish
 from vibrissa.contacts.joint.joint_fit import soft_base

@@ -96,13 +96,7 @@ def ratio_slopes(x: Array, by: Array) -> float:
 
 @inlined
 def channel_equations(
-    x: Array,
-    v: Array,
-    t: Array,
-    codes: IntArray,
-    targets: Array,
-    residual: Array,
-    jacobian: Array,
+    x: Array, v: Array, t: Array, codes: IntArray, targets: Array, residual: Array, jacobian: Array
 ) -> None:
     """Fill channels of x and (F, p), or (F, p, μ), minus targets (k,); derivatives (k, 4) in x."""
     signal_equations(x[0], v, t, True, codes, residual, jacobian)

@@ -24,10 +24,7 @@ from numpy.typing import ArrayLike
 
 from vibrissa.contacts.fitting.least_squares import Fits, fit
 from vibrissa.contacts.joint.weighted_fit import Aim, fit_weighted
-from vibrissa.contacts.sensing.channels import (
-    FITTED,
-    wrenches_of,
-)
+from vibrissa.contacts.sensing.channels import FITTED, wrenches_of
 from vibrissa.deferred import transform
 from vibrissa.numerics import AnyArray, Array, relative, share_out
 from vibrissa.rod import (

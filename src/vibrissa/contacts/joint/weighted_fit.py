@@ -13,12 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vibrissa.contacts.fitting.least_squares import channel_equations, whiten
-from vibrissa.contacts.sensing.weighing import (
-    Weighing,
-    gradients,
-    whitened,
-    wrench_covariance,
-)
+from vibrissa.contacts.sensing.weighing import Weighing, gradients, whitened, wrench_covariance
 from vibrissa.numerics import Array, IntArray, copy, inlined, kernel, solve
 from vibrissa.rod import Rod, Weight, evaluate_weighted
 

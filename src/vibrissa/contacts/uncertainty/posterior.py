@@ -45,16 +45,7 @@ from vibrissa.contacts.uncertainty.expansion import (
     shorten_axes,
     without_friction,
 )
-from vibrissa.numerics import (
-    Array,
-    IntArray,
-    cholesky,
-    copy,
-    inlined,
-    kernel,
-    quick_exp,
-    solve,
-)
+from vibrissa.numerics import Array, IntArray, cholesky, copy, inlined, kernel, quick_exp, solve
 from vibrissa.rod import BUFFER_SIZE, Charted
 
 #: Posterior probability above which a candidate is unique.

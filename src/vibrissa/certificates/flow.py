@@ -40,10 +40,7 @@ _RADIUS, _SLOPE, _ONE, _TWIST = range(3, 7)
 
 @inlined_rigorous
 def recursion(program: Program, x: Array, rows: int, order: int) -> None:
-    """Compute Taylor coefficients of all variables: of states up to ``order``, else one less.
-
-    The coefficients of variable v are the rows from v·rows on.
-    """
+    """Compute Taylor coefficients, rows from v·rows: of states up to ``order``, else one less."""
     last = x.shape[1] - 1
     for k in range(order):
         for stage in (1, 2):

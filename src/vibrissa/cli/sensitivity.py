@@ -61,10 +61,7 @@ def sensitivity(
 
 
 def _contacts_of(path: Path, moment_noise: float) -> xr.Dataset:
-    """Contact points of a trial or, if unknown, its signals; NaN without contact.
-
-    As for estimates, there is a contact if M_B exceeds five standard deviations of its noise.
-    """
+    """Contact points of a trial or else its signals; NaN where M_B is within five deviations."""
     if kind_in(path) == RECORDING:
         recording = vb.load_recording(path).to_dataset(inherit=False)
         if "contact_point_whisker" in recording:

@@ -228,10 +228,7 @@ def _descended(
 def _spread(
     near: NearObjects, place: Placement, found: Equilibrium, shift: Array, covariance: Array
 ) -> Array:
-    """Second moment of the first contact about its estimate, to second order in the shift.
-
-    From six shifts of √3 standard deviations along the axes of the shift's covariance.
-    """
+    """Second moment of the first contact about its estimate, from shifts of √3 deviations."""
     out, point = _BETWEEN**2 * np.eye(3), found.first_contact()[1]
     size, axes = np.linalg.eigh(covariance)
     for step in (np.sqrt(3.0 * size) * axes).T:

@@ -98,7 +98,10 @@ def check_contacts(
     if unknown := sorted(contacts.keys() - ContactArrays.__annotations__.keys()):
         known = ", ".join(ContactArrays.__annotations__)
         raise TypeError(f"unknown property of contacts: {', '.join(unknown)}; {known} are known")
-    n = _number(what, points)
+    shape = np.shape(points)
+    if len(shape) != 2 or shape[1] != 3:
+        raise ValueError(f"no {what}: points have shape {shape}; (n, 3) is needed")
+    n = shape[0]
     given: dict[str, Any] = {"points": points, "whisker_radius": 0.0}
     given |= {name: values for name, values in contacts.items() if values is not None}
     allowed: dict[str, list[tuple[int, ...]]] = {
@@ -136,14 +139,6 @@ def check_variances(values: AnyArray) -> None:
     """Raise ValueError if eigenvalues (..., 3) of covariances, in ascending order, are negative."""
     if (values[..., 0] < -_SINGLE * np.abs(values).max(axis=-1)).any():
         raise ValueError("the covariance is invalid: a variance is negative")
-
-
-def _number(what: str, points: ArrayLike) -> int:
-    """Number of points; raise a ValueError if their shape is wrong."""
-    shape = np.shape(points)
-    if len(shape) != 2 or shape[1] != 3:
-        raise ValueError(f"no {what}: points have shape {shape}; (n, 3) is needed")
-    return int(shape[0])
 
 
 def _scale_contacts(what: str, arrays: dict[str, Array], n: int, least: int) -> Checked:

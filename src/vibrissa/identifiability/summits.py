@@ -257,10 +257,7 @@ class _Objective:
     # A pair that diverges has no signals, and so no merit.
     @np.errstate(divide="ignore", invalid="ignore")
     def at(self, xi: Array, signs: Array) -> _State:
-        """Pairs with equal triplets closest to contacts (n, 2, 3), for signs (n, 2) of regions.
-
-        They are found by Newton's method.
-        """
+        """Pairs with equal triplets closest to contacts (n, 2, 3), by Newton; signs of regions."""
         unit = self.units(xi)
         for step in range(_CORRECTIONS + 1):
             values, away, slope, by_point = self._equations(xi, unit)

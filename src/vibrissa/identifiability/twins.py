@@ -93,7 +93,11 @@ class ContactSet(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """Pairs with equal triplets closest to contacts (n, 2, 3), by Newton's method."""
+    """Contacts spread over Ω.
+
+    chart (n, 3): coordinates (η, ψ, ρ); the contacts; gradients (n, 6, 3): directions of the six
+    signals' gradients; volume (n,): share of the volume of contact points, up to a common factor.
+    """
 
     chart: Array
     contacts: ContactSet

@@ -298,25 +298,18 @@ def _repeated(rows: Array) -> NDArray[np.bool_]:
 def save_corrections(
     path: str | PathLike[str], corrections: Mapping[int, Mapping[tuple[int, int], ArrayLike]]
 ) -> None:
-    """Write corrected traces to a file for `load_corrections`.
-
-    ``corrections`` are points (n, 2) from base to tip, column and row, by view and then by frame
-    and whisker.
-    """
+    """Write corrected traces (n, 2), by view and (frame, whisker), for `load_corrections`."""
     rows: list[list[float]] = []
     for view, each in sorted(corrections.items()):
         for (frame, whisker), points in sorted(each.items()):
             array = np.asarray(points, dtype=np.float64)
+            which = f"whisker {whisker} in frame {frame} of view {view}"
             if array.ndim != 2 or array.shape[1:] != (2,) or len(array) < 2:
                 raise ValueError(
-                    f"whisker {whisker} in frame {frame} of view {view}: points of shape "
-                    f"{array.shape}; (n, 2), n ≥ 2, is needed"
+                    f"{which}: its points are {array.shape}; (n, 2), n ≥ 2, are needed"
                 )
             if not np.isfinite(array).all():
-                raise ValueError(
-                    f"whisker {whisker} in frame {frame} of view {view} has points that are not "
-                    "finite"
-                )
+                raise ValueError(f"{which} has points that are not finite")
             rows += [[view, frame, whisker, *place] for place in array.tolist()]
     write_table(path, CORRECTION_COLUMNS, rows)
 

@@ -325,6 +325,7 @@ def _block(name: str, data: Any) -> Array:
     return np.asarray(data, dtype=np.float64)
 
 
+_SCORES = (0.0, 1.0)  # the peaks of confidence maps can slightly exceed 1
 _OWN = {"tracks": ("track", "xy", "node", "frame"), "point_scores": ("track", "node", "frame")}
 
 
@@ -354,7 +355,7 @@ def read_sleap_analysis(path: str | PathLike[str]) -> RawTracks:
         software="SLEAP",
         whiskers=whiskers,
         image=points[:, :, None],
-        image_confidence=None if sure is None else _confidence(sure)[:, :, None],
+        image_confidence=None if sure is None else np.clip(sure, *_SCORES)[:, :, None],
         nodes=nodes,
         fps=None if fps is None else float(fps),
     )
@@ -394,7 +395,7 @@ def read_sleap_labels(path: str | PathLike[str]) -> RawTracks:
         software="SLEAP",
         whiskers=[track.name for track in labels.tracks] or _numbered(tracks),
         image=found[..., :2],
-        image_confidence=_confidence(found[..., 2]),
+        image_confidence=np.clip(found[..., 2], *_SCORES),
         nodes=list(labels.skeletons[0].node_names),
         views=stems if len(stems) > 1 else (),
         frames=np.arange(start, end),
@@ -424,11 +425,6 @@ def _ordered(array: h5py.Dataset, wanted: tuple[str, ...]) -> Array:
 
 def _numbered(count: int) -> list[str]:
     return [str(i) for i in range(count)] if count != 1 else ["whisker"]
-
-
-def _confidence(scores: Array) -> Array:
-    """Clip scores, peaks of confidence maps, which can slightly exceed 1, to confidences."""
-    return np.clip(scores, 0.0, 1.0)
 
 
 Frames = NDArray[np.int64]

@@ -135,10 +135,7 @@ def _items(file: h5py.File, faults: list[str]) -> Iterator[tuple[str, h5py.HLObj
 
 @lru_cache(maxsize=64)
 def _check(path: Path, size: int, version: tuple[int, ...]) -> list[str]:
-    """Raise ValueError for harmful files; ``version`` marks changes, as results are cached.
-
-    Return what NetCDF-4 files do not have.
-    """
+    """Check a file by `_check_items`; ``version`` marks changes, as results are cached."""
     _check_heaps(path)
     with h5py.File(path, "r") as file:
         return _check_items(file, size)

@@ -183,13 +183,14 @@ def _series(group: h5py.Group) -> _Series | None:
     if unit and unit not in (_PIXELS if flat else _LENGTHS):
         raise ValueError(f"{group.name} has positions in {unit}; pixels or a length is needed")
     frame = first.get("reference_frame")
+    stated = "" if frame is None else str(frame.asstr()[()])
     return _Series(
         nodes,
         np.stack(points, axis=1),
         np.stack(sure, axis=1),
         time,
         "" if flat else _LENGTHS.get(unit, ""),
-        _frame(frame),
+        "" if stated == "unknown" else stated,
     )
 
 
@@ -211,11 +212,6 @@ def _number(item: h5py.HLObject, attributes: Mapping[str, Any], name: str, usual
         return float(attributes.get(name, usual))
     except (TypeError, ValueError):
         raise ValueError(f"{item.name} has the {name} {attributes[name]!r}, not a number") from None
-
-
-def _frame(item: Any) -> str:
-    text = item.asstr()[()] if item is not None else ""
-    return "" if str(text) in ("", "unknown") else str(text)
 
 
 def series_time(series: h5py.Group) -> Array:

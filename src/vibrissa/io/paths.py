@@ -104,10 +104,7 @@ _PART = re.compile(rf"\..+{re.escape(_MARK)}[a-z0-9_]{{8}}(\.[^.]*)?")
 
 @contextmanager
 def replacing(path: str | PathLike[str]) -> Iterator[Path]:
-    """Context with a temporary path, which replaces the file at the end.
-
-    A link still leads to the file that is replaced.
-    """
+    """Context with a temporary path that replaces the file, also behind a link, at the end."""
     path = Path(path)
     path = check_writable(path.resolve() if path.is_symlink() else path)
     _remove_left(path.parent)

@@ -22,7 +22,7 @@ from contextlib import closing, contextmanager, suppress
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from types import TracebackType
+from types import SimpleNamespace, TracebackType
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -441,23 +441,15 @@ def _kept(path: Path) -> Iterator[None]:
         raise OSError(f"the bag {path} cannot be written: {fault}") from fault
 
 
-class _Rosbags:
+def _library() -> SimpleNamespace:
     """Parts of rosbags that are used here."""
-
-    def __init__(self) -> None:
+    try:
         from rosbags.highlevel import AnyReader
         from rosbags.rosbag2 import StoragePlugin, Writer
         from rosbags.typesys import Stores, get_typestore
-
-        self.reader = AnyReader
-        self.types: Any = get_typestore(Stores.ROS2_HUMBLE)
-        self.mcap = partial(Writer, version=_METADATA_VERSION, storage_plugin=StoragePlugin.MCAP)
-
-
-def _library() -> _Rosbags:
-    try:
-        return _Rosbags()
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
             "bags are read and written by rosbags: pip install 'vibrissa[ros]'"
         ) from error
+    mcap = partial(Writer, version=_METADATA_VERSION, storage_plugin=StoragePlugin.MCAP)
+    return SimpleNamespace(reader=AnyReader, types=get_typestore(Stores.ROS2_HUMBLE), mcap=mcap)

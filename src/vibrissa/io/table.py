@@ -72,14 +72,10 @@ def table_rows(text: str) -> Iterator[tuple[int, list[str]]]:
     if delimiter != "," and not any("." in cell and is_number(cell) for r in rows for cell in r):
         rows = [[with_point(cell) for cell in row] for row in rows]
     # Spreadsheets also write columns to the right that are empty in every row.
-    filled = max((len(row) - _empty_at_the_end(row) for row in rows), default=0)
+    filled = max((i for row in rows for i, cell in enumerate(row, start=1) if cell), default=0)
     for (line, _), row in zip(lines, rows, strict=True):
         if any(row):
             yield line, row[:filled]
-
-
-def _empty_at_the_end(row: Sequence[str]) -> int:
-    return next((i for i, cell in enumerate(reversed(row)) if cell), len(row))
 
 
 def delimiter_of(header: str) -> str:

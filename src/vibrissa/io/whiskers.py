@@ -49,6 +49,7 @@ from vibrissa.io.table import (
     LENGTHS,
     Table,
     few_faults,
+    in_file,
     is_number,
     read_rows,
     read_text,
@@ -193,12 +194,10 @@ def _thickness(path: Path, header: list[str], coordinates: float) -> list[tuple[
     """Columns of radius or diameter, and the factor to a radius in m; at most one."""
     found = []
     for place, name in enumerate(header):
-        if (match := _THICKNESS.fullmatch(name)) is None:
-            continue
-        if (factor := unit_factor(match[2], "length")) is None:
-            continue
-        unit = factor if match[2].strip() else coordinates
-        found.append((place, unit if match[1].lower() == "radius" else 0.5 * unit))
+        match = _THICKNESS.fullmatch(name)
+        if match and (factor := unit_factor(match[2], "length")) is not None:
+            unit = factor if match[2].strip() else coordinates
+            found.append((place, unit if match[1].lower() == "radius" else 0.5 * unit))
     if len(found) > 1:
         names = " and ".join(header[place] for place, _ in found)
         raise ValueError(f"{path} has {names}; one of them is needed, or none")
@@ -366,7 +365,8 @@ def load_array(
         tree = read_tree(path, WhiskerArray.kind, "an array of whiskers")
         with naming(path, "an array of whiskers"):
             return WhiskerArray.from_tree(separate_whiskers(tree))
-    return _array(path, whiskers_from_table(path))
+    with in_file(path):
+        return WhiskerArray(whiskers_from_table(path))
 
 
 def save_array(path: str | PathLike[str], array: WhiskerArray) -> None:
@@ -411,7 +411,8 @@ def _folder(path: Path, base: Any, noise: float | None) -> WhiskerArray:
         whiskers.append(whisker)
     if faults:
         raise ValueError(f"{path}: {few_faults(faults)}")
-    return _array(path, whiskers)
+    with in_file(path):
+        return WhiskerArray(whiskers)
 
 
 def _of_folder(path: Path) -> str:
@@ -421,13 +422,6 @@ def _of_folder(path: Path) -> str:
         return "is a Zarr folder, as NWB can be kept in; save it as HDF5, in one file .nwb"
     held = few_faults(names) if names else "nothing"
     return f"is a folder of {held}; one of centrelines, such as C2.csv, or a file is needed"
-
-
-def _array(path: Path, whiskers: Sequence[Whisker]) -> WhiskerArray:
-    try:
-        return WhiskerArray(whiskers)
-    except ValueError as fault:
-        raise ValueError(f"{path}: {fault}") from None
 
 
 # Largest entry of RᵀR − 1 that rounding in a table explains.

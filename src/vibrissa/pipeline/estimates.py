@@ -394,10 +394,7 @@ def _laboratory_covariance(
 def swept_recording(
     sensor: SuspendedWhisker, sweep: StageSweep, found: SweptContacts
 ) -> xr.DataTree:
-    """Recording of a sweep with a suspended whisker, with its contacts as estimates.
-
-    Time is the sample number. The recording includes the errors that all contacts share.
-    """
+    """Recording of a sweep with a suspended whisker, its contacts, and errors that they share."""
     pose, n, on = sensor.whisker.pose, len(found.points), found.in_contact
     held = {
         "in_contact": on,

@@ -76,10 +76,7 @@ class _Trial(NamedTuple):
 def without_inertia(
     own: Group, whisker: Whisker, dynamics: Dynamics | Literal["fitted"], noise: Array
 ) -> xr.Dataset:
-    """Signals of one whisker corrected for inertia and damping.
-
-    Density and damping ratio, given or fitted, are attributes of the result.
-    """
+    """Signals of one whisker without inertia and damping, which its attributes state."""
     trial, known = _trial(own, whisker, noise)
     course = trial.time, trial.wrench, trial.rotation, trial.position
     if dynamics == "fitted":

@@ -495,29 +495,18 @@ def _located(
         everywhere = _everywhere(rows, values)
         data[name] = ((dims[0], *dims[2:]), everywhere[:, 0], attributes(name))
         data[f"candidate_{short}"] = (dims, everywhere, attributes(name))
-    data["candidate_normal"] = (
-        ("time", "candidate", "space"),
-        _everywhere(rows, normals),
-        attributes("contact_normal") | _WHISKER,
+    wider = "covariance of contact point and normal by other errors"
+    by_wrench = "contact point and normal by force and moment"
+    pair, mixed = (("contact_component", n) for n in ("contact_component_", "component"))
+    more = (
+        ("normal", ("space",), normals, attributes("contact_normal") | _WHISKER),
+        ("tangent", ("space",), tangents, attributes("contact_tangent") | _WHISKER),
+        ("widening", pair, widening, {"units": "(m, 1)^2", "long_name": wider}),
+        ("gain", mixed, gain, {"units": "(m, 1)/(N, N m)", "long_name": by_wrench}),
     )
-    data["candidate_tangent"] = (
-        ("time", "candidate", "space"),
-        _everywhere(rows, tangents),
-        attributes("contact_tangent") | _WHISKER,
-    )
-    data["candidate_widening"] = (
-        ("time", "candidate", "contact_component", "contact_component_"),
-        _everywhere(rows, widening),
-        {
-            "units": "(m, 1)^2",
-            "long_name": "covariance of contact point and normal by other errors",
-        },
-    )
-    data["candidate_gain"] = (
-        ("time", "candidate", "contact_component", "component"),
-        _everywhere(rows, gain),
-        {"units": "(m, 1)/(N, N m)", "long_name": "contact point and normal by force and moment"},
-    )
+    for short, dims, values, attrs in more:
+        whole = _everywhere(rows, values)
+        data[f"candidate_{short}"] = (("time", "candidate", *dims), whole, attrs)
     if names == WRENCH or friction > 0.0:
         along, across = contact_forces[:, 0, 0], contact_forces[:, 0, 1:]
         angle = np.arctan2(along, np.linalg.norm(across, axis=-1))

@@ -20,7 +20,7 @@ from vibrissa.pipeline.events import EVENTS
 from vibrissa.quantities import attributes
 from vibrissa.recording import ONE_VIEW, Recording
 from vibrissa.signals import base_signals
-from vibrissa.status import Event, flag_attributes
+from vibrissa.status import Event, Status, flag_attributes
 from vibrissa.whisker import angles_of
 
 _COMPONENTS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
@@ -135,10 +135,8 @@ def _rate(values: Array, time: Array) -> Array:
 
 def _about(name: str) -> dict[str, object]:
     """Attributes of a column: unit, name and description."""
-    if name == "status":
-        return {**attributes(name), **flag_attributes()}
-    if name == "event":
-        return {**attributes(name), **flag_attributes(Event)}
+    if name in ("status", "event"):
+        return {**attributes(name), **flag_attributes(Event if name == "event" else Status)}
     plain = name.removesuffix(_RATE)
     if plain != name:
         known = attributes(plain)

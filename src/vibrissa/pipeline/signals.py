@@ -348,11 +348,7 @@ class Pose(NamedTuple):
 
 
 def paper_pose(recording: Recording, cutoff: float | None) -> list[Pose]:
-    """Pose of each whisker's base, low-pass filtered relative to the head.
-
-    The pose measured before the rod was fitted is used if there is one, otherwise that of the
-    recording.
-    """
+    """Pose of each base, filtered relative to the head; that before the rod's fit if known."""
     root = recording.root
     head = HeadPose.still(root.data.sizes["time"])
     if "head_position" in root and "head_rotation" in root:

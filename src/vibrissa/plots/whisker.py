@@ -303,12 +303,8 @@ def _bent_figure(drawn: _Drawn, limits: Array, width: style.Width) -> Figure:
     for number, j in enumerate((1, 2)):
         across = abreast * number
         left = _LEFT + across * (scale * span[0] + _BENT_GAP + _LEFT)
-        top = (
-            height
-            - _TOP
-            - _ROW * rows
-            - (0.0 if abreast else number * (tall[0] + _BENT_GAP + _BOTTOM))
-        )
+        above = 0.0 if abreast else number * (tall[0] + _BENT_GAP + _BOTTOM)
+        top = height - _TOP - _ROW * rows - above
         box = (left, top - tall[number], scale * span[0], tall[number])
         axes = _panel(figure, box, drawn, limits, j)
         axes.set_xlabel(axis_label("x"))

@@ -254,11 +254,7 @@ _EPOCH = "SOURCE_DATE_EPOCH"
 
 
 def provenance_section(command: Sequence[str], inputs: Sequence[Path], seed: int | None) -> Section:
-    """Section with the information needed to reproduce a page.
-
-    The date is that of the environment variable ``SOURCE_DATE_EPOCH``, seconds since 1970 in UTC,
-    if it is set; the same command then gives the same page.
-    """
+    """Section with what reproduces a page; ``SOURCE_DATE_EPOCH`` is its date, UTC, if set."""
     drawn = "none: no random numbers are used"
     if seed is not None:
         drawn = f"{seed}, for the predicted errors"

@@ -269,10 +269,7 @@ def contact_forces(discretization: Discretization, values: Array, arc: Array) ->
 def vanishing_moments(
     discretization: Discretization, wrenches: Array, least: float
 ) -> tuple[IntArray, Array]:
-    """Find the minima of the moment in the whisker for base wrenches (n, 6).
-
-    Returns their number (n,), and (s, n) at each, (n, MOST_PLACES, 4).
-    """
+    """Number (n,) of minima of the moment for wrenches (n, 6), and (s, n) (n, MOST_PLACES, 4)."""
     count = np.zeros(len(wrenches), np.int64)
     contacts = np.full((len(wrenches), MOST_PLACES, 4), np.nan)
     given = discretization.rod, np.ascontiguousarray(wrenches), least, count, contacts

@@ -112,8 +112,7 @@ def course_of(trial: xr.DataTree, whisker: int = 0) -> Course:
         nothing if each is None else each.whisker(whisker) for each in found
     )
     tracked = "measured" in trial.children
-    known = truth.known("contact_point_whisker")
-    known_as = "true"
+    known, known_as = truth.known("contact_point_whisker"), "true"
     if known is None and tracked:
         known, known_as = root.known("contact_point_whisker"), "tracked"
     estimated = estimates.known("contact_point_whisker")
@@ -125,10 +124,14 @@ def course_of(trial: xr.DataTree, whisker: int = 0) -> Course:
     if places is None:
         places, places_as = truth.known("contact_point"), "true"
     line = root.known("centerline")
-    order = (signals, estimates, root, truth)
+    traced = next((data["trace"] for data in (root, truth) if "trace" in data), None)
+    nowhere = np.zeros(root.data.sizes["time"], dtype=bool)
+    stated = (
+        each["in_contact"] for each in (signals, estimates, root, truth) if "in_contact" in each
+    )
     return Course(
         time=np.asarray(root.data["time"].values, dtype=np.float64),
-        touching=_in_contact(order, root.data.sizes["time"]),
+        touching=next(stated, nowhere),
         signals=_signals(signals),
         known=known,
         known_as=known_as,
@@ -136,7 +139,7 @@ def course_of(trial: xr.DataTree, whisker: int = 0) -> Course:
         places=places,
         places_as=places_as,
         centerline=truth.known("centerline") if line is None else line,
-        traces=_traces(root, truth),
+        traces=() if traced is None else tuple(np.swapaxes(traced, 0, 1)),
         position=root["base_position"],
         rotation=root["base_rotation"],
         frames=root.get("frame"),
@@ -151,26 +154,10 @@ def _signals(data: Group) -> dict[str, Array] | None:
     return known if len(known) == len(TRIPLET) else None
 
 
-def _in_contact(order: tuple[Group, ...], count: int) -> Mask:
-    """Whether there is contact (n,), from the first group that states it."""
-    for group in order:
-        if "in_contact" in group:
-            return group["in_contact"]
-    return np.zeros(count, dtype=bool)
-
-
 def _head(root: Group) -> tuple[Array, Array] | None:
     """Position and rotation of the head, if known."""
     position, rotation = (root.known(name) for name in ("head_position", "head_rotation"))
     return None if position is None or rotation is None else (position, rotation)
-
-
-def _traces(root: Group, truth: Group) -> tuple[Array, ...]:
-    """Traces in each view, tracked or else true."""
-    for data in (root, truth):
-        if "trace" in data:
-            return tuple(np.swapaxes(data["trace"], 0, 1))
-    return ()
 
 
 def deflection_angles(course: Course, centerline: ArrayLike) -> Array:

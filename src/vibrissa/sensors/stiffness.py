@@ -211,8 +211,7 @@ def fit_stiffness(
     if modulus_sigma < 0.0 or radius_sigma < 0.0 or np.isinf([modulus_sigma, radius_sigma]).all():
         raise ValueError(
             "loads determine E r⁴ only: modulus_sigma or radius_sigma must be finite, none "
-            "negative; "
-            f"got {modulus_sigma} and {radius_sigma}"
+            f"negative; got {modulus_sigma} and {radius_sigma}"
         )
     known = np.isfinite(y).all(axis=1) & np.isfinite(contacts).all(axis=1)
     blur = spread_of_points(point_sigma, contacts)[known]

@@ -484,10 +484,7 @@ def remarks_on_bases(
     scaled: bool,
     name: str,
 ) -> list[str]:
-    """Report views in which a whisker is seen from closer to its base than in the other view.
-
-    Whether its radius at the base is stated is given.
-    """
+    """Report views in which a whisker is seen from closer to its base than in the other view."""
     found = []
     for camera, before, after in zip(cameras, shown, used, strict=True):
         both = [(a.length, b.length) for a, b in zip(before, after, strict=True) if len(a.line)]

@@ -557,10 +557,7 @@ def leave_rows(
 
 
 def stages(of: Searched, how: Weighing, problem: Problem) -> tuple[list[Call], list[Call]]:
-    """Kernels for noisy measurements and the arguments of each, in two halves.
-
-    Each half takes about as long to compile as the other.
-    """
+    """Kernels for noisy measurements and their arguments, in halves that compile equally long."""
     channels = np.empty((0, how.codes.shape[0]))
     status, about = np.empty(0, np.int64), type_of_description()
     given = type_of_task(of, how, problem), channels, channels, *Room.of(0)

@@ -384,7 +384,10 @@ def fit_rows_within(
     weights: Array,
     fits: Fits,
 ) -> None:
-    """Fill ∂ξ/∂z (3, 3) of a fit's coordinates z, in units of their longest steps."""
+    """Fit contacts in Ω to rows of channels, of targets (n, k) and weights (n, k, k).
+
+    First in SIMD lanes, where most remain in Ω; those that leave it start anew, one by one.
+    """
     start, known, misfits = fits.contacts.copy(), np.zeros((0, 4)), np.zeros(0)
     room = fit_room(codes.shape[0])
     fit_rows(rod.rod, False, proximal, codes, targets, weights, fits, 0, len(targets))

@@ -51,10 +51,7 @@ _PLACE = 11  # codes of px, py and pz among the channels
 
 
 class Mixture(NamedTuple):
-    """Hypotheses: Gaussians over (p, v) in the laboratory, in L and L/s, with log weights.
-
-    Each moves by one of several laws, which differ in speed.
-    """
+    """Hypotheses: Gaussians over (p, v), in L and L/s, with log weights, and the law of each."""
 
     mean: Array
     spread: Array

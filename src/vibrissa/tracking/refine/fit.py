@@ -285,10 +285,7 @@ class Fitter:
         return whole, UncertainPeg(self.peg.at(state.peg), linear.smoother.shared_covariance)
 
     def touches(self, whisker: Whisker, pose: BasePose) -> tuple[Touches, Array]:
-        """Contacts of a whisker of approximate pose, laboratory frame, and misfits (time,).
-
-        Only frames in contact, and a few before and after, are fitted.
-        """
+        """Contacts, laboratory frame, and misfits (time,) of a whisker of approximate pose."""
         posed = np.isfinite(pose.rotation).all(axis=(1, 2))
         near = ndimage.binary_dilation(self.touching & posed, iterations=_MARGIN)
         near |= not near.any()
@@ -393,10 +390,7 @@ class Fitter:
         )
 
     def _nearest(self, frames: NDArray[np.intp]) -> tuple[Mask, Array]:
-        """Frames in which the whisker, as far as it is seen, is next to a known object.
-
-        And the arc lengths at which it is nearest, m.
-        """
+        """Frames in which the whisker, as seen, is next to a known object, and arc lengths, m."""
         things = self.objects if self.peg is None else [self.peg.expected]
         if not things:
             return np.zeros(len(frames), dtype=bool), np.zeros(len(frames))
@@ -561,10 +555,7 @@ def _tapered(whisker: Whisker, share: float, s: Array) -> Array:
 
 
 def _by_bend(problem: Problem, state: State, length: Length, spread: Array) -> Array:
-    """Shared changes (3, t, 15) of contacts beyond what all views show of the whisker.
-
-    Its shape at rest is extrapolated to there, and to where they may be by their covariance.
-    """
+    """Shared changes (3, t, 15) of contacts where the whisker's shape is extrapolated."""
     beyond = np.maximum(state.contact[:, 0] * problem.d.length - length.shown, 0.0)
     # The fourth power of a distance with an error is on average nearly this one's.
     farther = np.where(beyond > 0.0, 3.0 * np.trace(spread, axis1=1, axis2=2), 0.0)

@@ -147,10 +147,7 @@ class Optics:
 def rough_optics(
     cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]], distance: float | None = None
 ) -> Optics | None:
-    """Find the optics of orthographic cameras from traces of simultaneous frames.
-
-    The approximate distance of the lenses is in m; None if too few frames show a free whisker.
-    """
+    """Find the optics of orthographic cameras from simultaneous traces; None if few are free."""
     count = len(traces[0])
     rows = np.linspace(0, count - 1, min(_SAMPLE, count)).astype(int)
     some = [[view[i] for i in rows] for view in traces]
@@ -214,10 +211,7 @@ def estimated_optics(
     shape: RestShape,
     distance: float | None = None,
 ) -> Optics | None:
-    """Find the optics that explain a free whisker, as the stated cameras show it in space.
-
-    None if too few frames are free.
-    """
+    """Find the optics that explain a free whisker in space; None if too few frames are free."""
     known = np.isfinite(curves).all(axis=(1, 2))
     alike = np.nan_to_num(shape.deviation, nan=np.inf) < _ALIKE * shape.length
     fits = []

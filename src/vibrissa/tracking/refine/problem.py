@@ -128,10 +128,7 @@ class Smoother:
         return np.asarray((pull * values).sum(axis=1))
 
     def solved(self, damping: float | Array = 0.0) -> tuple[Array, Array]:
-        """Solve for the step (time, unknown), damped by a share (time,) of the diagonal.
-
-        And for that of the shared unknowns.
-        """
+        """Step (time, unknown), damped by a share (time,) of the diagonal, and the shared step."""
         pulls = np.concatenate([self.gradient[None], np.moveaxis(self.crossed, 2, 0)])
         if not self.crossed.any():
             return self.alone(pulls[:1], damping)[0], np.zeros(PEG_UNKNOWNS)

@@ -255,10 +255,7 @@ class Bent(NamedTuple):
         return wild
 
     def tangents(self, arcs: Array) -> tuple[Array, Array]:
-        """Tangents (t, 3) of whole rods at arc lengths (t,), and derivatives (t, 3, unknown).
-
-        The arc lengths are those of the contacts. Without contact the latter are zero.
-        """
+        """Tangents (t, 3) at contacts' arc lengths (t,), and derivatives (t, 3, unknown)."""
         ends = np.clip(arcs[:, None] * (_SAMPLES - 1) + [-1.0, 1.0], 0.0, _SAMPLES - 1.0)
         low = np.minimum(ends.astype(int), _SAMPLES - 2)
         share = (ends - low)[..., None]

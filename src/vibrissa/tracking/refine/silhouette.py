@@ -99,10 +99,7 @@ _CERTAIN = 2.0  # force over its standard deviation from which a contact off the
 def explains(
     seen: UncertainPeg, peg: UncertainPeg | None, misfit: Array, fit: RodFit, whisker: Whisker
 ) -> bool:
-    """Whether contacts are on a peg, where it is seen, and traces are explained as without it.
-
-    Misfits (time,) of the traces without it are given.
-    """
+    """Whether contacts are on a peg, where it is seen, and traces fit as well as without it."""
     if peg is None or seen.differs(peg.expected) > _ELSEWHERE:
         return False
     known = np.isfinite(fit.contact_point).all(axis=1)
@@ -314,10 +311,7 @@ def _largest_near(values: Array) -> Array:
 def peg_in_images(
     cameras: Sequence[Camera], sample: Sequence[Sequence[Frame]], touches: Touches
 ) -> UncertainPeg | None:
-    """Find the peg that a whisker touches in frames of two views, spread over the film.
-
-    None if no cylinder has an outline in both.
-    """
+    """Find the peg that is touched in frames of two views; None if no cylinder shows in both."""
     if len(touches.points) < _FEWEST or not all(np.isfinite(part).all() for part in touches):
         return None
     away = np.linalg.norm(touches.points - np.median(touches.points, axis=0), axis=1)

@@ -52,10 +52,7 @@ class Known(NamedTuple):
 def exchanged(
     cameras: Sequence[Camera], rows: Sequence[Row], known: Sequence[Known | None]
 ) -> list[list[list[Trace]]]:
-    """Traces of all whiskers, exchanged where in doubt, or lost.
-
-    A whisker without any reliable frame is in doubt in all frames, and keeps its traces.
-    """
+    """Traces of all whiskers, exchanged where in doubt, or lost; one always in doubt keeps them."""
     found = [[list(view) for view in row] for row in rows]
     looks = {k: _Look.of(k, known, cameras) for k, one in enumerate(known) if one is not None}
     count = len(rows[0][0])
@@ -125,10 +122,7 @@ def _offers(
     doubtful: Sequence[bool],
     lines: Sequence[Sequence[Sequence[_Line]]],
 ) -> dict[int, tuple[float, Pair]]:
-    """Pairs of lines that show the whisker, in frames where one does so far more clearly.
-
-    It has its rest shape, or else that of the rod which an object bends.
-    """
+    """Pairs of lines that clearly show the whisker, as it rests, or else as the rod is bent."""
     offers, left = dict[int, tuple[float, Pair]](), dict[int, list[tuple[Array, Pair]]]()
     for i in np.flatnonzero(doubtful).tolist():
         every = _pairs(cameras, look, lines[i], i)

@@ -249,10 +249,7 @@ def _shown(traces: Sequence[Trace], end: int) -> NDArray[np.intp]:
 def _passing(
     first: Camera, second: Camera, a: Sequence[Trace], b: Sequence[Trace], end: int
 ) -> Array:
-    """Distance (frame, offset), pixels, at which lines to one end pass; NaN if one is unseen.
-
-    Its sign is the side on which they pass.
-    """
+    """Signed distance (frame, offset), pixels, at which lines to one end pass; NaN if unseen."""
     ends = [
         np.array([t.line[end] if len(t.line) else (np.nan, np.nan) for t in row]) for row in (a, b)
     ]

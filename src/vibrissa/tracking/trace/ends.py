@@ -330,10 +330,7 @@ def prolonged(line: Array, used: int, ahead: int) -> Array:
 
 @cache
 def _onward(used: int, ahead: int) -> Array:
-    """Matrix (ahead, used) that extrapolates a parabola through some points to the next ones.
-
-    Two points are extrapolated by a straight line, one by itself.
-    """
+    """Matrix (ahead, used) that extrapolates a parabola, or of fewer points a line or constant."""
     t = np.arange(used + ahead) / max(used - 1, 1) - 0.5
     powers = np.vander(t, min(used, 3))
     return np.asarray(powers[used:] @ np.linalg.pinv(powers[:used]))

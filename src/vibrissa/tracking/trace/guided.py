@@ -188,10 +188,7 @@ def trace_guided(
 
 
 def _guides(cameras: tuple[Camera, Camera], row: Sequence[Trace]) -> list[_Guide | None]:
-    """Epipolar lines of a whisker in each frame, None where it is lost.
-
-    Where it fades before its tip it is continued to its usual length.
-    """
+    """Epipolar lines of a whisker, continued to its usual length, in each frame; None if lost."""
     whole = [len(trace.line) for trace in row if len(trace.line) and trace.tip_seen]
     usual = int(np.percentile(whole, _USUAL)) if whole else 0
     lines, ends = list[Array](), list[bool]()
@@ -489,10 +486,7 @@ def _over_all_frames(choices: Sequence[_Choice], margins: list[Array]) -> list[l
 
 
 def _margins(ways: Ways, cost: Array, place: Array, way: Sequence[int]) -> Array:
-    """Cost of giving each whisker another line than in a way, or none (whisker,).
-
-    NaN for lost whiskers, and for a way that is not among the cheapest ones.
-    """
+    """Cost (whisker,) of another line, or none, than in a way; NaN if lost or not a cheap way."""
     away = np.abs(place[ways] - place[list(way)]).max(axis=2)
     other = np.where(~(away <= 2.0 * _DISTINCT), cost[:, None], cost.max())
     own = cost[(ways == way).all(axis=1)]

@@ -184,10 +184,7 @@ class Surroundings:
         return cls(bright, scene, steady, sample)
 
     def clear(self, frame: Frame) -> tuple[Frame, Shift]:
-        """Dark whiskers of a frame without what never moves, and by how much it was shifted.
-
-        None are left where the lamp is off.
-        """
+        """Dark whiskers of a frame without what never moves, and its shift; none without light."""
         frame = negative(frame) if self.bright else frame
         shift = _STEADY
         if not self.scene.lit(frame):

@@ -299,7 +299,51 @@ class ContactMap:
 
     @cached_property
     def _samples(self) -> xr.Dataset:
-        return _dataset(self.whisker, self.chart)
+        whisker, chart, d = self.whisker, self.chart, self.chart.discretization
+        force = chart.values[..., :3] * d.force
+        point = chart.values[..., 3:] * d.length
+        moment = np.cross(point, force)
+        # Unknowns are s in L and f in EI/L²; in SI: m and N.
+        per_unknown = np.array([d.length, d.force, d.force])
+        space = (*_NODE, "space")
+        ball = spherical(point)
+        xi = with_normal_force(chart.contacts.reshape(-1, 3))
+        tangent = contact_tangents(d, xi).reshape(point.shape)
+        back = _label("tangent at contact points back")
+        data: dict[str, Any] = {
+            "arc_length": (_NODE, chart.contacts[..., 0] * d.length, attributes("arc_length")),
+            "contact_point": (space, point, attributes("contact_point_whisker")),
+            "force": (space, force, attributes("force")),
+            "moment": (space, moment, attributes("moment")),
+            "contact_point_derivative": (
+                (*space, "unknown"),
+                chart.tangents[..., 3:, :] * d.length / per_unknown,
+                _label("derivative of the contact point by (s, f_y, f_z)", "m / (m, N, N)"),
+            ),
+            "force_derivative": (
+                (*space, "unknown"),
+                chart.tangents[..., :3, :] * d.force / per_unknown,
+                _label("derivative of the base force by (s, f_y, f_z)", "N / (m, N, N)"),
+            ),
+            "fold_force": (
+                ("station", "bearing"),
+                np.exp(chart.fold.log_force[..., 0]) * d.force,
+                _label("force at which the whisker slips off", "N"),
+            ),
+            "small_deflection": (_NODE, within_cone(whisker, point), _label("within 2° of rest")),
+            "concave_backward": (_NODE, concave_backward(whisker, point), _label("CB, not CF")),
+            "large_deflection": (_NODE, tangent[..., 0] < 0.0, back),
+            "status": (
+                _NODE,
+                np.full(point.shape[:3], int(Status.OK)),
+                {**attributes("status"), **flag_attributes()},
+            ),
+        }
+        for i, name in enumerate(("r", "theta", "phi")):
+            data[name] = (_NODE, ball[..., i], attributes(name))
+        coords = {**node_coordinates(chart), "space": ["x", "y", "z"], "unknown": ["s", "fy", "fz"]}
+        out = xr.Dataset(data, coords=coords)
+        return out.merge(base_signals(out.force, out.moment))
 
     def to_dataset(self, domain: Domain = "reachable") -> xr.Dataset:
         """Return the contacts at the chart's nodes as a labelled dataset in SI units.
@@ -322,7 +366,7 @@ class ContactMap:
         data = self._samples
         if domain == "paper":
             inside = within_paper_bounds(self.whisker, data.contact_point.to_numpy())
-            kept = xr.DataArray(inside, dims=("station", "bearing", "load"))
+            kept = xr.DataArray(inside, dims=_NODE)
             floats = [name for name, v in data.data_vars.items() if v.dtype.kind == "f"]
             floats = [name for name in floats if "load" in data[name].dims]
             data = data.assign({name: data[name].where(kept) for name in floats})
@@ -336,7 +380,32 @@ class ContactMap:
         path : str or Path
             The file, ``.nc``; replaced if it exists.
         """
-        _save(self, Path(path))
+        chart = self.chart
+        raw = xr.Dataset(
+            {
+                "stations": ("station", chart.stations),
+                "bearings": ("bearing", chart.bearings),
+                "loads": ("load", chart.loads),
+                "bounds": ("bound", chart.fold.bounds),
+                "fold": (("station", "bearing", "derivative"), chart.fold.log_force),
+                "folded": (("station", "bearing"), chart.folded),
+                "contacts": ((*_NODE, "unknown"), chart.contacts),
+                "values": ((*_NODE, "value"), chart.values),
+                "tangents": ((*_NODE, "value", "unknown"), chart.tangents),
+                "frames": ((*_NODE, "unknown", "coordinate"), chart.frames),
+            },
+            attrs={"description": "non-dimensional: lengths over L, forces over EI/L²"},
+        )
+        for name, variable in raw.data_vars.items():
+            variable.attrs |= {"units": "1", "long_name": f"chart: {name}, non-dimensional"}
+        root = self.to_dataset()
+        root.attrs |= {"kind": _KIND, "steps": self.steps}
+        groups = {"/": root, "whisker": self.whisker.to_dataset(), "chart": raw}
+        if self.grid is not None:
+            groups["grid"] = self.grid
+        tree = xr.DataTree.from_dict(groups)
+        grid = [] if self.grid is None else list(map(str, self.grid.data_vars))
+        write_netcdf(Path(path), tree, {"/grid": dict.fromkeys(grid, COMPRESSED)})
 
     @classmethod
     def load(cls, path: str | Path, grid: bool = True) -> ContactMap:
@@ -354,7 +423,27 @@ class ContactMap:
         ContactMap
             The same map.
         """
-        return _load(Path(path), grid)
+        path = Path(path)
+        refuse_whisk(path)
+        what = recognise(path)
+        if what not in (Kind.NETCDF, Kind.UNKNOWN):
+            raise ValueError(
+                f"{path} is not a contact map, as `vibrissa map` writes it; it contains: {what}"
+            )
+        groups = read_groups(path, ("/", "whisker", "chart", "grid"), {"grid"})
+        kind = groups["/"].attrs.get("kind", "")
+        if kind != _KIND:
+            raise ValueError(f"{path} holds {kind or 'data of another kind'}, not a contact map")
+        if missing := [name for name in ("whisker", "chart") if name not in groups]:
+            raise ValueError(f"{path} lacks the group {' and '.join(missing)} of a contact map")
+        solved = read_dataset(path, "grid") if grid and "grid" in groups else None
+        with naming(path, "a contact map"):
+            whisker = Whisker.from_dataset(groups["whisker"])
+            steps = int(groups["/"].attrs["steps"])
+            chart = _chart(groups["chart"].variables, discretize(whisker, steps))
+            if solved is not None:  # files store a coordinate of the root only there
+                solved = solved.assign_coords(space=["x", "y", "z"])
+        return cls(whisker, chart, steps, solved)
 
     def __repr__(self) -> str:
         nodes = " × ".join(str(n) for n in self.chart.values.shape[:3])
@@ -446,63 +535,9 @@ def grid_dataset(
     return data.merge(base_signals(data.force, data.moment))
 
 
-def _dataset(whisker: Whisker, chart: StableSet) -> xr.Dataset:
-    d = chart.discretization
-    dims = ("station", "bearing", "load")
-    force = chart.values[..., :3] * d.force
-    point = chart.values[..., 3:] * d.length
-    moment = np.cross(point, force)
-    # Unknowns are s in L and f in EI/L²; in SI: m and N.
-    per_unknown = np.array([d.length, d.force, d.force])
-    space = (*dims, "space")
-    ball = spherical(point)
-    xi = with_normal_force(chart.contacts.reshape(-1, 3))
-    tangent = contact_tangents(d, xi).reshape(point.shape)
-    data: dict[str, Any] = {
-        "arc_length": (dims, chart.contacts[..., 0] * d.length, attributes("arc_length")),
-        "contact_point": (space, point, attributes("contact_point_whisker")),
-        "force": (space, force, attributes("force")),
-        "moment": (space, moment, attributes("moment")),
-        "contact_point_derivative": (
-            (*space, "unknown"),
-            chart.tangents[..., 3:, :] * d.length / per_unknown,
-            {
-                "units": "m / (m, N, N)",
-                "long_name": "derivative of the contact point by (s, f_y, f_z)",
-            },
-        ),
-        "force_derivative": (
-            (*space, "unknown"),
-            chart.tangents[..., :3, :] * d.force / per_unknown,
-            {
-                "units": "N / (m, N, N)",
-                "long_name": "derivative of the base force by (s, f_y, f_z)",
-            },
-        ),
-        "fold_force": (
-            ("station", "bearing"),
-            np.exp(chart.fold.log_force[..., 0]) * d.force,
-            {"units": "N", "long_name": "force at which the whisker slips off"},
-        ),
-        "small_deflection": (dims, within_cone(whisker, point), _label("within 2° of rest")),
-        "concave_backward": (dims, concave_backward(whisker, point), _label("CB, not CF")),
-        "large_deflection": (dims, tangent[..., 0] < 0.0, _label("tangent at contact points back")),
-        "status": (
-            dims,
-            np.full(point.shape[:3], int(Status.OK)),
-            {**attributes("status"), **flag_attributes()},
-        ),
-    }
-    for i, name in enumerate(("r", "theta", "phi")):
-        data[name] = (dims, ball[..., i], attributes(name))
-    coords = {**node_coordinates(chart), "space": ["x", "y", "z"], "unknown": ["s", "fy", "fz"]}
-    out = xr.Dataset(data, coords=coords)
-    return out.merge(base_signals(out.force, out.moment))
-
-
 def node_coordinates(chart: StableSet) -> dict[Hashable, xr.Variable]:
     """Label the axes along which the nodes of a chart are."""
-    angle = {"units": "rad", "long_name": "force's angle from d1 to d2"}
+    angle = _label("force's angle from d1 to d2", "rad")
     return {
         "station": xr.Variable(
             "station", chart.stations, _label("arc length of the contact over L")
@@ -512,62 +547,8 @@ def node_coordinates(chart: StableSet) -> dict[Hashable, xr.Variable]:
     }
 
 
-def _label(long_name: str) -> dict[str, str]:
-    return {"units": "1", "long_name": long_name}
-
-
-def _save(contact_map: ContactMap, path: Path) -> None:
-    """Write a map; a file that exists is replaced only when the new one is complete."""
-    chart = contact_map.chart
-    raw = xr.Dataset(
-        {
-            "stations": ("station", chart.stations),
-            "bearings": ("bearing", chart.bearings),
-            "loads": ("load", chart.loads),
-            "bounds": ("bound", chart.fold.bounds),
-            "fold": (("station", "bearing", "derivative"), chart.fold.log_force),
-            "folded": (("station", "bearing"), chart.folded),
-            "contacts": ((*_NODE, "unknown"), chart.contacts),
-            "values": ((*_NODE, "value"), chart.values),
-            "tangents": ((*_NODE, "value", "unknown"), chart.tangents),
-            "frames": ((*_NODE, "unknown", "coordinate"), chart.frames),
-        },
-        attrs={"description": "non-dimensional: lengths over L, forces over EI/L²"},
-    )
-    for name, variable in raw.data_vars.items():
-        variable.attrs |= {"units": "1", "long_name": f"chart: {name}, non-dimensional"}
-    root = contact_map.to_dataset()
-    root.attrs |= {"kind": _KIND, "steps": contact_map.steps}
-    groups = {"/": root, "whisker": contact_map.whisker.to_dataset(), "chart": raw}
-    if contact_map.grid is not None:
-        groups["grid"] = contact_map.grid
-    tree = xr.DataTree.from_dict(groups)
-    grid = [] if contact_map.grid is None else list(map(str, contact_map.grid.data_vars))
-    write_netcdf(path, tree, {"/grid": dict.fromkeys(grid, COMPRESSED)})
-
-
-def _load(path: Path, grid: bool) -> ContactMap:
-    """Read a map; raise a ValueError if the file is not one."""
-    refuse_whisk(path)
-    what = recognise(path)
-    if what not in (Kind.NETCDF, Kind.UNKNOWN):
-        raise ValueError(
-            f"{path} is not a contact map, as `vibrissa map` writes it; it contains: {what}"
-        )
-    groups = read_groups(path, ("/", "whisker", "chart", "grid"), {"grid"})
-    kind = groups["/"].attrs.get("kind", "")
-    if kind != _KIND:
-        raise ValueError(f"{path} holds {kind or 'data of another kind'}, not a contact map")
-    if missing := [name for name in ("whisker", "chart") if name not in groups]:
-        raise ValueError(f"{path} lacks the group {' and '.join(missing)} of a contact map")
-    solved = read_dataset(path, "grid") if grid and "grid" in groups else None
-    with naming(path, "a contact map"):
-        whisker = Whisker.from_dataset(groups["whisker"])
-        steps = int(groups["/"].attrs["steps"])
-        chart = _chart(groups["chart"].variables, discretize(whisker, steps))
-        if solved is not None:  # files store a coordinate of the root only there
-            solved = solved.assign_coords(space=["x", "y", "z"])
-    return ContactMap(whisker, chart, steps, solved)
+def _label(long_name: str, units: str = "1") -> dict[str, str]:
+    return {"units": units, "long_name": long_name}
 
 
 def _chart(raw: Mapping[str, AnyArray], discretization: Discretization) -> StableSet:

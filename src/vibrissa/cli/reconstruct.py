@@ -190,8 +190,7 @@ def _print_object(
         values = np.atleast_1d(value)
         for i, pair in enumerate(zip(values, np.atleast_1d(sigma), strict=True)):
             label = name if values.size == 1 else f"{name}, {'xyz'[i]}"
-            # Adding zero converts −0 to 0.
-            cells = [f"{round(factor * float(x), 4) + 0.0:.4f}{unit}" for x in pair]
+            cells = [f"{factor * float(x):z.4f}{unit}" for x in pair]
             rows.append([label, *cells, *(true.get(label, ["", ""]) if true else ())])
     if "tilt" in true:
         rows.append(["tilt", "", "", *true["tilt"]])

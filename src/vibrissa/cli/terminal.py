@@ -165,9 +165,7 @@ def shown(name: str, value: float, digits: int = 4) -> str:
 
 def fixed(name: str, value: float, decimals: int = 4) -> str:
     """Format an SI value in its display unit, with a fixed number of decimals."""
-    # Adding zero converts −0 to 0.
-    number = round(value * quantity(name).display_factor, decimals) + 0.0
-    return _with_unit(f"{number:.{decimals}f}", name)
+    return _with_unit(f"{value * quantity(name).display_factor:z.{decimals}f}", name)
 
 
 def _with_unit(number: str, name: str) -> str:

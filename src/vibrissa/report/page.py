@@ -242,8 +242,7 @@ def with_sigma(name: str, value: float, sigma: float) -> tuple[str, str]:
     if not np.isfinite(value * spread) or spread < _LEAST:
         return shown_value(name, value, 4), shown_value(name, sigma, 2)
     decimals = int(np.clip(1.0 - np.floor(np.log10(spread)), 0, 5))
-    # Adding zero turns −0 into 0.
-    numbers = (f"{round(x, decimals) + 0.0:.{decimals}f}" for x in (value * factor, spread))
+    numbers = (f"{x:z.{decimals}f}" for x in (value * factor, spread))
     end = f"{'' if unit in ('', '°') else ' '}{unit}"
     first, second = (f"{number.replace('-', '−')}{end}" for number in numbers)
     return first, second

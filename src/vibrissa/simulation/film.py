@@ -68,9 +68,11 @@ class Surroundings:
 
     @classmethod
     def of(
-        cls, camera: Camera, fur: float, cheek: float, wires: int, extent: float, seed: int
+        cls, camera: Camera, lines: Array, conditions: ImageConditions, seed: int
     ) -> Surroundings:
-        """Generate surroundings at random; ``extent`` is the length of whiskers, pixels."""
+        """Generate surroundings at random, sized as the longest whisker in the first frame."""
+        fur, cheek, ends = conditions.fur, conditions.cheek, camera.project(lines[0, :, [0, -1]])
+        extent = float(np.nanmax(np.linalg.norm(ends[1] - ends[0], axis=-1)))
         random = np.random.default_rng([seed, 11])
         width, height = camera.size
         texture = np.zeros((height, width), dtype=np.float32)
@@ -95,8 +97,8 @@ class Surroundings:
             ]
         sees = abs(float(camera.rays([0.5 * width, 0.5 * height])[1][1])) > 0.7
         far = random.uniform(*_BEHIND) * extent if cheek > 0.0 and sees else 0.0
-        lines = [_wire(width, height, random) for _ in range(int(wires))]
-        return cls(texture, hairs, lines, far, cheek)
+        wires = [_wire(width, height, random) for _ in range(int(conditions.wires))]
+        return cls(texture, hairs, wires, far, cheek)
 
     def furred(self, light: Image, middle: Array, share: Image) -> None:
         """Add the fur's texture to an image, scaled by the face's share of each pixel."""
@@ -333,7 +335,7 @@ def film_frames(
     width, height = camera.size
     scene = _scene(camera, objects, conditions, np.nanmean(lines, axis=(0, 1, 2)))
     total, covered = np.zeros_like(scene), np.zeros_like(scene)
-    around = _surroundings(camera, lines, conditions, seed)
+    around = Surroundings.of(camera, lines, conditions, seed)
     for wire in around.wires:
         cover(covered, wire[:, :2], wire[:, 2], np.ones(len(wire)), conditions.sigma, 1.0)
     scene += (conditions.dark - scene) * covered
@@ -401,15 +403,6 @@ def _expose_whisker(
             share = conditions.side_light * conditions.contrast / count
             cover(covered, lit, wide, shown, sigma, share)
             collect(covered, total, lit, reach, -1.0)
-
-
-def _surroundings(
-    camera: Camera, lines: Array, conditions: ImageConditions, seed: int
-) -> Surroundings:
-    """Fur, cheek and wires, with sizes relative to the longest whisker in the first frame."""
-    ends = camera.project(lines[0, :, [0, -1]])
-    extent = float(np.nanmax(np.linalg.norm(ends[1] - ends[0], axis=-1)))
-    return Surroundings.of(camera, conditions.fur, conditions.cheek, conditions.wires, extent, seed)
 
 
 def _to_the_left(line: Array) -> Array:

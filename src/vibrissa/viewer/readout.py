@@ -43,8 +43,7 @@ def number(name: str, value: float, digits: int = 4) -> str:
     shown = value * factor
     whole = np.floor(np.log10(abs(shown))) if shown else 0.0
     decimals = 2 if unit == "°" else int(np.clip(digits - 1 - whole, 0, 4))
-    # Adding zero turns −0 into 0.
-    text = f"{round(shown, decimals) + 0.0:.{decimals}f}".replace("-", "−")
+    text = f"{shown:z.{decimals}f}".replace("-", "−")
     return f"{text}{'' if unit in ('', '°') else ' '}{unit}"
 
 

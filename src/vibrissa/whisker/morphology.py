@@ -96,12 +96,8 @@ def base_point(row: ArrayLike, column: ArrayLike) -> Array:
         [np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], axis=-1
     )
     size = 1.0 / np.linalg.norm(direction / _RADII, axis=-1, keepdims=True)
-    return np.asarray(_CENTER + size * direction @ _cheek().T)
-
-
-def _cheek() -> Array:
-    """Rotation matrix from the ellipsoid's axes to the head's, R_z R_y R_x."""
-    return np.asarray(transform.Rotation.from_euler("ZYX", _TURNED).as_matrix())
+    to_head = transform.Rotation.from_euler("ZYX", _TURNED).as_matrix()
+    return np.asarray(_CENTER + size * direction @ to_head.T)
 
 
 def projection_angles(row: ArrayLike, column: ArrayLike) -> Array:

@@ -70,7 +70,10 @@ class SensorNoise:
         errors: Array = _NONE,
         whisker: Whisker | None = None,
     ) -> SensorNoise:
-        """Read and check the noise of signals, and errors (n, 6, 7) that all measurements share."""
+        """Read and check the noise of signals, and errors (n, 6, 7) that all measurements share.
+
+        If the whisker is stated, noise that is far too large or small for it is questioned.
+        """
         out = cls._read(noise, names, errors)
         if whisker is not None:
             _question(out, names, whisker)
@@ -79,7 +82,8 @@ class SensorNoise:
     @classmethod
     def _read(cls, noise: Noise, names: tuple[str, ...], errors: Array) -> SensorNoise:
         if isinstance(noise, Mapping):
-            if missing := [name for name in names if name not in noise]:
+            missing = [name for name in names if name not in noise]
+            if missing:
                 raise ValueError(
                     f"noise lacks {', '.join(missing)}; it has {', '.join(noise) or 'none'}"
                 )

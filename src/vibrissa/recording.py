@@ -419,7 +419,6 @@ class Recording:
             pairs = ", ".join(f"{a} has that of {b}" for a, b in zip(names, labels, strict=False))
             warnings.warn(
                 f"whiskers and shapes have different names and are matched in order: {pairs}",
-                UserWarning,
                 stacklevel=3,
             )
         return groups

@@ -179,7 +179,6 @@ def _scale_contacts(what: str, arrays: dict[str, Array], n: int, least: int) -> 
                 f"the median standard deviation of the contacts, {1e3 * sigma:.2g} mm, is larger "
                 f"than their extent, {1e3 * extent:.2g} mm: they hardly show a shape, or the "
                 "covariance is not in m²",
-                UserWarning,
                 stacklevel=4,
             )
     shared = kept["shared"] / np.repeat([extent, 1.0], 3) if "shared" in kept else None

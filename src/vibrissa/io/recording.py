@@ -125,7 +125,6 @@ def check_units(tree: xr.DataTree) -> None:
     if unstated:
         warnings.warn(
             f"the recording states no units of {', '.join(sorted(unstated))}; SI units are assumed",
-            UserWarning,
             stacklevel=3,
         )
 

@@ -460,7 +460,7 @@ def whiskers_from_table(path: Path) -> list[Whisker]:
             columns.faults.append(f"line {columns.lines[i]}: {fault}")
     columns.tell()
     for doubt in _doubted_poses(columns, whiskers):
-        warnings.warn(f"{path}: {doubt}", UserWarning, stacklevel=3)
+        warnings.warn(f"{path}: {doubt}", stacklevel=3)
     return whiskers
 
 

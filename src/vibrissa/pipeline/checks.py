@@ -86,14 +86,12 @@ def check_recording(recording: xr.DataTree) -> None:
         warnings.warn(
             f"the recording has frames {usual:.3g} s apart: its time has to be in seconds, and "
             "rates of change are wrong if it is in ms",
-            UserWarning,
             stacklevel=1,
         )
     if changed := edited(recording):
         warnings.warn(
             f"the recording was edited after its {changed[0]} had been computed: these, and all "
             "that depends on them, are out of date until `vibrissa reconstruct` has run",
-            UserWarning,
             stacklevel=1,
         )
 

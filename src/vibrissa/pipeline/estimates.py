@@ -228,7 +228,6 @@ def _whiskers(
         if others := _differences(one.whisker, own):
             warnings.warn(
                 f"the map's whisker differs from the recording's {own.name!r}: {others}",
-                UserWarning,
                 stacklevel=3,
             )
     return given

@@ -74,7 +74,7 @@ def predictors(recording: xr.DataTree) -> xr.Dataset:
         try:
             check_scale(force[:, k], moment[:, k], whisker)
         except ValueError as fault:
-            warnings.warn(f"{record.names[k]}: {fault}", UserWarning, stacklevel=2)
+            warnings.warn(f"{record.names[k]}: {fault}", stacklevel=2)
     columns = dict(
         zip(_COMPONENTS, np.moveaxis(np.concatenate([force, moment], -1), -1, 0), strict=True)
     )

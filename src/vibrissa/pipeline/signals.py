@@ -386,7 +386,6 @@ def paper_pose(recording: Recording, cutoff: float | None) -> list[Pose]:
         warnings.warn(
             f"frames are missing, up to {np.diff(time).max():.3g} s in a row: the base pose is "
             f"filtered in {count} pieces; those of a single frame are not filtered",
-            UserWarning,
             stacklevel=3,
         )
     return poses

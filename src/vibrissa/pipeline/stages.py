@@ -59,7 +59,7 @@ def without_faulty_stages(recording: xr.DataTree) -> xr.DataTree:
             try:
                 read(recording)
             except ValueError as fault:
-                warnings.warn(f"{fault}; until then it is ignored", UserWarning, stacklevel=2)
+                warnings.warn(f"{fault}; until then it is ignored", stacklevel=2)
                 recording = recording.drop_nodes(name)
     return recording
 

@@ -187,7 +187,6 @@ def _doubt_channels(names: Sequence[str], spread: Array, residual: Array) -> Non
             f"the loads explain only a part of the readings of {', '.join(loose)}: do the rows of "
             "both belong together, are there outliers or much noise, or do the channels read other "
             "components too?",
-            UserWarning,
             stacklevel=3,
         )
 

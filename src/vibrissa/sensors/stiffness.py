@@ -332,7 +332,6 @@ def _warn_of_units(factor: float) -> None:
         warnings.warn(
             f"the fitted stiffness is {factor:.3g} times the whisker's stated one: are the "
             "readings in N and N·m, and is the whisker's radius right?",
-            UserWarning,
             stacklevel=3,
         )
 

@@ -101,7 +101,6 @@ def _check_arms(force: Array, moment: Array) -> None:
         warnings.warn(
             f"all moments are those of forces {arm:.3g} m from the base or farther: force, N, "
             "comes before moment, N·m (1 N·mm is 1e-3 N·m)",
-            UserWarning,
             stacklevel=3,
         )
 

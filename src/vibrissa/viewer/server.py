@@ -432,7 +432,6 @@ def guarded(host: str, restore: Restore) -> Iterator[None]:
     if not used:
         warnings.warn(
             "with this version of viser, other web pages in this browser can talk to this one",
-            UserWarning,
             stacklevel=2,
         )
 

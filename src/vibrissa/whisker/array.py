@@ -369,7 +369,7 @@ def average_whisker(identity: Identity, **properties: Unpack[Properties]) -> Whi
         raise ValueError(f"{identity.name}: the equations reach to column 6, not {column}")
     notes = _range_notes(identity, length, coefficient)
     for note in notes:
-        warnings.warn(f"{identity.name}: {note}", UserWarning, stacklevel=3)
+        warnings.warn(f"{identity.name}: {note}", stacklevel=3)
     radii = dict(
         zip(("base_radius", "tip_radius"), published_radii(identity.name, length), strict=True)
     )

@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+import warnings
 from collections import defaultdict
 from typing import get_args, get_type_hints
 
@@ -17,6 +18,7 @@ import vibrissa as vb
 from vibrissa.cli import options
 from vibrissa.cli.app import VERBS, app
 from vibrissa.cli.reconstruct import ShapeOptions
+from vibrissa.cli.terminal import remark_once, warnings_as_notes
 from vibrissa.paper import METHODS
 from vibrissa.pipeline import Shape, Source
 from vibrissa.signals import REGIONS
@@ -165,6 +167,21 @@ def test_a_warning_is_a_note(tmp_path):
     )
     assert done.stderr.startswith("note: a force of 1 N causes the same reading")
     assert "Warning" not in done.stderr
+
+
+def test_notes_that_differ_only_in_numbers_are_printed_once(capsys):
+    """As for each of 62 whiskers; what they are about is part of them."""
+    with warnings.catch_warnings(), warnings_as_notes():
+        warnings.simplefilter("always")
+        for name, value in (("Fx", 3.0), ("Fx", 2e-9), ("MB", 4.0), ("Fx", 1.0)):
+            warnings.warn(f"the noise of {name} is {value} N", stacklevel=1)
+    remark_once(f"its tip would sag by {value:g} mm" for value in (0.7, 1e-5, 20.0))
+    assert capsys.readouterr().err.splitlines() == [
+        "note: the noise of Fx is 3.0 N",
+        "note: the noise of MB is 4.0 N",
+        "note: 2 more like this: the noise of Fx is 3.0 N",
+        "note: its tip would sag by 0.7 mm (2 more like this)",
+    ]
 
 
 @pytest.mark.parametrize(

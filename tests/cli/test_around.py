@@ -39,8 +39,16 @@ def test_a_table_is_estimated_around_a_wall(wall, tmp_path):
     data = {"force": (dims, wrench[:, :3]), "moment": (dims, wrench[:, 3:])}
     save_signals(tmp_path / "s.csv", xr.Dataset(data, {"time": [0.0, 1.0]}))
     known = ("--around", wall, "--position-sigma", 1)
+    # No candidates are written, so that those of others stay, and those of contacts replaced do not
+    (tmp_path / "c_candidates.csv").touch()
     result = run(tmp_path / "s.csv", *known, "-o", tmp_path / "c.csv")
     assert result.exit_code == 0, result.exception
+    assert (tmp_path / "c_candidates.csv").exists()
+    again = run(tmp_path / "s.csv", *known, "-o", tmp_path / "c.csv")
+    assert "c_candidates.csv are there already" in str(again.exception)
+    again = run(tmp_path / "s.csv", *known, "-o", tmp_path / "c.csv", "--force")
+    assert again.exit_code == 0, again.exception
+    assert not (tmp_path / "c_candidates.csv").exists()
     assert "whose position is known to 1 mm; no friction assumed" in " ".join(result.output.split())
     found = load_contacts(tmp_path / "c.csv")
     assert found["status"].values.tolist() == [vb.Status.NO_CONTACT, vb.Status.OK]

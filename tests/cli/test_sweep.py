@@ -64,6 +64,17 @@ def test_a_dry_run_counts_and_does_nothing(study, tmp_path):
     assert not (tmp_path / "s").exists()
 
 
+def test_a_dry_run_constructs_the_whiskers(tmp_path):
+    path = tmp_path / "study.toml"
+    text = "[[whiskers]]\nlength = {}\n[[tasks]]\nkind = 'map'\n"
+    path.write_text(text.format("[40, 0.04, 0.05, 0.06, 0.07]"))
+    result = RUN.invoke(app, ["sweep", str(path), "--dry-run"])
+    assert result.exit_code == 1
+    assert "5 cells" in result.output
+    assert "failed: length 0.04: ValueError: " in result.output
+    assert "and 1 more" in result.output
+
+
 def test_a_failed_cell_shows_in_the_exit_status(tmp_path):
     path = tmp_path / "study.toml"
     path.write_text("[[whiskers]]\nlength = [0.04, 40]\n[[tasks]]\nkind = 'map'\n")

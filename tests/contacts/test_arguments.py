@@ -149,6 +149,18 @@ def test_relative_errors_are_no_per_cent(contact_map, name):
         vb.sensors.Sensor(gain_error=5.0)
 
 
+def test_noise_of_unknown_signals_is_refused(contact_map, bent):
+    """Such as a component beside signals, whose noise would be ignored."""
+    sigma = {"Fx": 1e-6, "FT": 1e-6, "MB": 1e-8, "MD": 0.1}
+    assert contact_map.estimate({"Fx": 1e-6, "MB": 1e-8, "MD": 0.1}, noise=sigma).status is not None
+    for more in ("Fy", "mb", "fx"):
+        with pytest.raises(ValueError, match=f"'{more}' is unknown here; known are Fx, FT, FD, Mx"):
+            contact_map.estimate({"Fx": 1e-6, "MB": 1e-8, "MD": 0.1}, noise=sigma | {more: 1e-6})
+    components = dict.fromkeys(("Fx", "Fy", "Fz", "Mx", "My", "Mz", "MB"), 1e-6)
+    with pytest.raises(ValueError, match="'MB' is unknown here; known are Fx, Fy, Fz, Mx, My, Mz"):
+        vb.estimate_from_wrench(bent.whisker, bent.force, bent.moment, noise=components)
+
+
 def test_options_that_would_be_ignored_are_refused(bent, contact_map):
     signals = {"Fx": 1e-6, "MB": 1e-8, "MD": 0.1}
     with pytest.raises(ValueError, match="base_rotation is given without gravity"):

@@ -192,9 +192,18 @@ def test_shapes_and_forces_in_other_units_or_frames_are_not_two_contacts():
     for points in (1e3 * line, line + np.array([0.1, 0.2, 0.0])):
         with pytest.raises(ValueError, match=r"from the base of a whisker of 0\.04"):
             found(points=points)
-    with pytest.raises(ValueError, match="from the base to the tip"):
-        found(points=line[::-1])
+    assert not found(points=line[8:20]).second_contact
+    for points in (line[::-1], line[20:8:-1]):
+        with pytest.raises(ValueError, match="from the base to the tip"):
+            found(points=points)
     with pytest.raises(ValueError, match="centerline_sigma is 20 m"):
         found(sigma=20.0)
     with pytest.raises(ValueError, match="are these mN, µN"):
         found(scale=1e6)
+    # Light contacts in mN, most rows without any
+    near = vb.deflect(
+        whisker, vb.PointContact(whisker.position(28e-3) + np.array([0.0, 1e-3, 0.0]))
+    )
+    some = np.arange(9)[:, None] > 6
+    with pytest.warns(UserWarning, match="are these mN, µN"):
+        vb.second_contact(whisker, some * near.force * 1e3, some * near.moment * 1e3, noise=noise)

@@ -1,5 +1,7 @@
 """Estimates are as good as their noise says, whatever the signals and wherever they come from."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -214,10 +216,12 @@ def test_a_peg_is_found_from_a_recording_alone(quiet):
 
 @pytest.mark.parametrize(
     "shape",
-    ["free", *(pytest.param(shape, marks=pytest.mark.slow) for shape in ("plane", "sphere"))],
+    ["free", "plane", pytest.param("sphere", marks=pytest.mark.slow)],
 )
 def test_other_shapes_are_fitted_and_come_back_from_a_file(quiet, tmp_path, shape):
-    done = with_contour(quiet, shape)
+    said = pytest.warns(UserWarning, match=f"do not fit the shape '{shape}'")
+    with nullcontext() if shape == "free" else said:
+        done = with_contour(quiet, shape)
     save_recording(tmp_path / "t.nc", done)
     contour = load_recording(tmp_path / "t.nc")["contour"].to_dataset()
     fit = shape_from_dataset(contour)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import sys
-import warnings
 from collections.abc import Callable
-from typing import Annotated, TextIO
+from typing import Annotated
 
 import typer
 from rich.text import Text
@@ -30,7 +29,14 @@ from vibrissa.cli.signals import signals
 from vibrissa.cli.simulate import simulate
 from vibrissa.cli.stream import stream
 from vibrissa.cli.sweep import sweep
-from vibrissa.cli.terminal import errors, output, remark, repeat_lost_interrupts, spell_out
+from vibrissa.cli.terminal import (
+    errors,
+    output,
+    remark,
+    repeat_lost_interrupts,
+    spell_out,
+    warnings_as_notes,
+)
 from vibrissa.cli.track import track
 from vibrissa.cli.uniqueness import uniqueness
 from vibrissa.cli.view import view
@@ -94,26 +100,11 @@ def options(
 
 def main() -> None:
     """Run the command line; an error of the input gives one message and exit status 2."""
-    usual = warnings.showwarning
     spell_out()
     repeat_lost_interrupts()
-
-    def note(
-        message: Warning | str,
-        category: type[Warning],
-        filename: str,
-        lineno: int,
-        file: TextIO | None = None,
-        line: str | None = None,
-    ) -> None:
-        if category is UserWarning:
-            remark(f"note: {message}")
-        else:
-            usual(message, category, filename, lineno, file, line)
-
-    warnings.showwarning = note
     try:
-        app()
+        with warnings_as_notes():
+            app()
     except (ValueError, OSError, ModuleNotFoundError) as error:
         message = Text.assemble(("Error:", "bold red"), " ", str(error))
         errors.print(message, highlight=False, soft_wrap=True)

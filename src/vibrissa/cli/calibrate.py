@@ -12,7 +12,7 @@ from vibrissa.cli.inputs import WhiskerOptions
 from vibrissa.cli.options import check_new, refuse, with_options
 from vibrissa.cli.terminal import remark, say
 from vibrissa.io import unit_factor
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, Mask
 
 # Noise relative to the range of the readings above which the user is warned.
 _UNEXPLAINED = 0.05
@@ -101,8 +101,12 @@ def _linear(
         text = ", ".join(f"{one} {value:.4g} ± {error:.2g}" for one, value, error in fits)
         say(f"{name}: {text} per N or N·m; noise {found.sensor.noise[k]:.3g}")
     what = "unit, axes, origin and order of the touches"
-    _question_noise(found.sensor, readings, what)
-    ratio = np.divide(found.sensor.noise, quiet, out=np.zeros(len(channels)), where=quiet > 0.0)
+    # Channels that the touches do not explain are warned of already.
+    doubted = np.isin(channels, found.unexplained)
+    _question_noise(found.sensor, readings, what, ~doubted)
+    ratio = np.divide(
+        found.sensor.noise, quiet, out=np.zeros(len(channels)), where=(quiet > 0.0) & ~doubted
+    )
     if ratio.max() > _LOUD:
         names = ", ".join(np.array(channels)[ratio > _LOUD])
         say(
@@ -178,10 +182,13 @@ def _suspended(description: Path, target: Path, force: bool) -> None:
 
 
 def _question_noise(
-    sensor: vb.sensors.Sensor | vb.sensors.SuspendedWhisker, readings: Array, what: str
+    sensor: vb.sensors.Sensor | vb.sensors.SuspendedWhisker,
+    readings: Array,
+    what: str,
+    asked: Mask | bool = True,
 ) -> None:
     """Warn of channels with noise that is large compared with their readings."""
-    poor = sensor.noise > _UNEXPLAINED * np.ptp(readings, axis=0)
+    poor = (sensor.noise > _UNEXPLAINED * np.ptp(readings, axis=0)) & asked
     if poor.any():
         names = ", ".join(name for name, much in zip(sensor.channels, poor, strict=True) if much)
         say(f"  That is much noise of {names}: are {what} right?")

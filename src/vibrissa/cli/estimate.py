@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import vibrissa as vb
 from vibrissa.cli import inputs
 from vibrissa.cli.options import Method, free, numbers, refuse, spare, with_options
 from vibrissa.cli.signals import SourceOptions, described
-from vibrissa.cli.terminal import Tell, progress_bars, remark, shown
+from vibrissa.cli.terminal import Tell, progress_bars, remark, remark_once, shown
 from vibrissa.deferred import xr
 from vibrissa.numerics import Array
 
@@ -72,8 +73,8 @@ class GravityOptions:
         """Whisker with the stated density."""
         return whisker if self.density is None else whisker.with_properties(density=self.density)
 
-    def doubt(self, whisker: vb.Whisker) -> None:
-        """Say that the weight is neglected of a whisker that sags under it noticeably."""
+    def doubts(self, whisker: vb.Whisker) -> Iterator[str]:
+        """Yield that the weight is neglected of a whisker that sags under it noticeably."""
         if self.gravity is not None or whisker.density is None:
             return
         try:
@@ -83,8 +84,8 @@ class GravityOptions:
         else:
             sag = math.dist(below, whisker.position(whisker.length))
         if sag > _SAG:
-            remark(
-                f"note: the weight of the whisker is neglected; if it were level, its tip would "
+            yield (
+                "the weight of the whisker is neglected; if it were level, its tip would "
                 f"sag by {1e3 * sag:.2g} mm. If its base is tilted or accelerated after the sensor "
                 "was tared, contacts are wrong without --gravity"
             )
@@ -272,10 +273,13 @@ def estimate(
     swept = sensor is not None and vb.io.is_netcdf(sensor)
     both = (*vb.io.NETCDF, *vb.io.CSV)
     vb.io.check_writable(target, both if added or swept else vb.io.CSV)
+    # Candidates belong to the contacts of the table of the same name.
+    several = not (recorded or swept or known.around is not None)
+    stale = target.suffix.lower() in vb.io.CSV and target.exists()
     if added:
         inputs.free_beside(signals, [target], force)
     else:
-        written = target, _candidates_beside(target)
+        written = [target, _candidates_beside(target)] if several or stale else [target]
         for path in written:
             spare(path, signals)
         free(written, force)
@@ -306,6 +310,8 @@ def estimate(
         _from_lines(signals, target, how, weight, None)
     else:
         _from_table(signals, target, how, weight)
+    if stale and not several:
+        _candidates_beside(target).unlink(missing_ok=True)
 
 
 def _named_signals(table: Path, how: EstimateOptions) -> bool:
@@ -356,7 +362,7 @@ def _from_lines(
             )
         names = None if sensor is None else tuple(sensor.channels)
         inputs.print_notes(contact_map.whisker)
-        weight.doubt(contact_map.whisker)
+        remark_once(weight.doubts(contact_map.whisker))
         used = names or how.names or vb.signals.TRIPLET
         if sensor is None:
             _doubt_names(contact_map, used)
@@ -409,8 +415,7 @@ def _from_table(signals: Path, target: Path, how: EstimateOptions, weight: Gravi
     with vb.io.in_file(signals):
         vb.io.check_scale(*wrench, known)
     how.noise.doubt(known)
-    weight.doubt(known)
-    _doubt_axes(known, wrench, noise, weight)
+    remark_once(_doubts(known, wrench, noise, weight))
     with progress_bars() as tell:
         if not maps and not how.whole:
             remark(f"no map given; simulating that of {known!r}")
@@ -525,12 +530,18 @@ def _around(signals: Path, target: Path, how: EstimateOptions, known: AroundOpti
     inputs.print_written(target)
 
 
-def _doubt_axes(
-    whisker: vb.Whisker, wrench: tuple[Array, Array], noise: Array, weight: GravityOptions
-) -> None:
-    """Warn of apparently wrong axes of the sensor; not with gravity, whose effects are similar."""
-    if weight.gravity is None and (doubt := vb.pipeline.doubted_axes(whisker, *wrench, noise)):
-        remark(f"note: {doubt}")
+def _doubts(
+    whisker: vb.Whisker, wrench: tuple[Array, Array], noise: Array | None, weight: GravityOptions
+) -> Iterator[str]:
+    """Yield that the weight is neglected, or that the axes of a sensor with this noise seem wrong.
+
+    Axes are not questioned with gravity, whose effects are similar.
+    """
+    yield from weight.doubts(whisker)
+    if noise is None or weight.gravity is not None:
+        return
+    if doubt := vb.pipeline.doubted_axes(whisker, *wrench, noise):
+        yield doubt
 
 
 def _doubt_zero(
@@ -624,14 +635,15 @@ def estimated(
     whiskers = [one.whisker for one in maps] if maps else how.own.in_recording(tree)
     whiskers = [weight.of(one) for one in whiskers]
     inputs.print_notes(*whiskers)
+    doubts: list[str] = []
     for k, whisker in enumerate(whiskers):
         with vb.io.in_file(name):
             one = vb.recording.Group(signals).whisker(k)
             wrench = (one["force"], one["moment"])
             vb.io.check_scale(*wrench, whisker)
-        weight.doubt(whisker)
-        if source == "sensor":
-            _doubt_axes(whisker, wrench, how.noise.matrix(), weight)
+        sensed = how.noise.matrix() if source == "sensor" else None
+        doubts += _doubts(whisker, wrench, sensed, weight)
+    remark_once(doubts)
     by_default = how.using is None and how.method == "exact" and not how.friction_sigma
     whole = how.whole or (by_default and source == "rod")
     if not maps and not whole:

@@ -129,8 +129,12 @@ def stages(
     whiskers = how.known.in_recording(tree)
     yield (
         "contour",
-        vb.pipeline.with_contour(
-            tree, wanted.shape, whiskers=whiskers, objects=known, **wanted.keywords()
+        vb.pipeline.with_group(
+            tree,
+            "contour",
+            vb.pipeline.reconstruct(
+                tree, wanted.shape, whiskers=whiskers, objects=known, **wanted.keywords()
+            ),
         ),
     )
     tell(wanted.shape, 1, 1)

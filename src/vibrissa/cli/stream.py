@@ -20,7 +20,7 @@ import vibrissa as vb
 from vibrissa.cli import inputs
 from vibrissa.cli.estimate import GravityOptions
 from vibrissa.cli.options import numbers, refuse, with_options
-from vibrissa.cli.terminal import Ended, ending_in_order, remark
+from vibrissa.cli.terminal import Ended, ending_in_order, remark, remark_once
 
 if TYPE_CHECKING:
     import socket
@@ -143,7 +143,7 @@ class MeasurementOptions:
         if sensor is not None and self.tare:
             sensor = sensor.with_new_offset(self.tare)
         contact_map = self.contact_map(name)
-        self.weight.doubt(contact_map.whisker)
+        remark_once(self.weight.doubts(contact_map.whisker))
         return inputs.estimator_of(
             contact_map,
             sensor,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from vibrissa.cli.terminal import output, progress_bars, remark, say
 
 _SHOW = "show"
 _LISTED = 3  # largest number of failures listed
+_BUILT = 1000  # largest number of whiskers that a dry run constructs
 
 
 @with_options("the results, a Zarr folder; with `show`, a folder for the figures")
@@ -100,6 +102,7 @@ def _run(plan: vb.sweeps.Study, path: Path, **how: Any) -> None:
 
 
 def _cost(plan: vb.sweeps.Study, workers: int) -> None:
+    """Print the size of a study, and construct its whiskers, or a thousand of them."""
     say(
         f"{plan.size} cells: {len(plan.specimens)} whiskers, "
         f"{', '.join(f'{task} of {plan.count(task)}' for task in plan.tasks)}\n"
@@ -107,6 +110,9 @@ def _cost(plan: vb.sweeps.Study, workers: int) -> None:
         f"with {workers} worker{'s' if workers > 1 else ''} on idle cores\n"
         f"about {max(plan.bytes / 1e6, 1.0):.0f} MB"
     )
+    if faults := plan.faults(_BUILT):
+        _list(f"failed: {name}: {fault}" for name, fault in faults.items())
+        raise typer.Exit(1)
 
 
 def _show(store: Path | None, folder: Path, force: bool) -> None:
@@ -126,8 +132,17 @@ def _show(store: Path | None, folder: Path, force: bool) -> None:
 
 
 def _print_failures(faults: dict[str, str]) -> None:
-    for cell, text in list(faults.items())[:_LISTED]:
-        lines = text.strip().splitlines()
-        say(f"failed: {cell.rpartition('-')[0]} of {lines[0]}: {lines[-1]}")
-    if len(faults) > _LISTED:
-        say(f"and {len(faults) - _LISTED} more, in failures.jsonl of the store")
+    each = ((cell, text.strip().splitlines()) for cell, text in faults.items())
+    _list(
+        (f"failed: {cell.rpartition('-')[0]} of {of[0]}: {of[-1]}" for cell, of in each),
+        ", in failures.jsonl of the store",
+    )
+
+
+def _list(failures: Iterable[str], where: str = "") -> None:
+    """Print the first failures, and how many more there are."""
+    lines = list(failures)
+    for line in lines[:_LISTED]:
+        say(line)
+    if len(lines) > _LISTED:
+        say(f"and {len(lines) - _LISTED} more{where}")

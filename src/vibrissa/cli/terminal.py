@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import codecs
 import io
+import re
 import signal
 import sys
 import threading
+import warnings
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from textwrap import fill
-from typing import Any
+from typing import Any, TextIO
 
 from rich.console import Console
 from rich.text import Text
@@ -52,6 +55,53 @@ def say(line: str = "") -> None:
 def remark(line: str) -> None:
     """Print a remark that is not a result, such as an assumption or a default."""
     _print(errors, line)
+
+
+def remark_once(lines: Iterable[str]) -> None:
+    """Print notes of several whiskers; those that differ only in numbers once, with a count."""
+    alike: dict[str, list[str]] = {}
+    for line in lines:
+        alike.setdefault(_without_numbers(line), []).append(line)
+    for first, *others in alike.values():
+        remark(f"note: {first}" + f" ({len(others)} more like this)" * bool(others))
+
+
+@contextmanager
+def warnings_as_notes() -> Iterator[None]:
+    """Context that prints warnings as notes, those that differ only in numbers once."""
+    usual, counts = warnings.showwarning, Counter[str]()
+    first: dict[str, str] = {}
+
+    def note(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
+        if category is not UserWarning:
+            usual(message, category, filename, lineno, file, line)
+            return
+        text = str(message)
+        kind = _without_numbers(text)
+        counts[kind] += 1
+        if kind not in first:
+            first[kind] = text
+            remark(f"note: {text}")
+
+    warnings.showwarning = note
+    try:
+        yield
+    finally:
+        warnings.showwarning = usual
+        for kind, count in counts.items():
+            if count > 1:
+                remark(f"note: {count - 1} more like this: {first[kind]}")
+
+
+def _without_numbers(text: str) -> str:
+    return re.sub(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "#", text)
 
 
 def _print(console: Console, line: str) -> None:

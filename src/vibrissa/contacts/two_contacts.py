@@ -20,6 +20,7 @@ that errors of the pose do not count.
 
 from __future__ import annotations
 
+import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -52,10 +53,11 @@ _STEP, _ROUNDS = 1e-4, 10
 _LONGEST = 0.1
 # Residual of a meaningless model, such as a force that winds the whisker up.
 _LOST = 1e6
-# Median load, over EI/L² and EI/L, above which it is in other units; and largest distance of points
-# from the base, and of the last one if it is at the base, over the length.
-_LARGEST_LOAD, _STRETCHED, _AT_BASE = 1000.0, 1.1, 0.1
+# Median load, over EI/L² and EI/L, above which it may be, and is, in other units; and largest
+# distance of points from the base, over the length.
+_LARGE_LOAD, _LARGEST_LOAD, _STRETCHED = 10.0, 1000.0, 1.1
 _SOME = np.array([0.5, 0.0, 0.1, 0.0])
+_NEAREST = 201  # points of the undeformed whisker
 
 
 class Bent(NamedTuple):
@@ -239,7 +241,13 @@ def second_contact(
     Raises
     ------
     ValueError
-        If shapes do not fit, or a standard deviation is not positive.
+        If shapes do not fit, or a standard deviation is not positive, or loads or points are in
+        other units, or points go from the tip to the base.
+
+    Warns
+    -----
+    UserWarning
+        If force and moment are typically too large for the whisker, as in other units.
     """
     if not (0.0 <= friction <= LARGEST_FRICTION and 0.0 < false_alarms < 1.0):
         raise ValueError(
@@ -287,15 +295,20 @@ def second_contact(
 
 
 def _check_scale(whisker: Whisker, force: Array, moment: Array) -> None:
-    """Raise ValueError for force and moment far too large for this whisker, as in other units."""
+    """Question force and moment too large for this whisker; raise ValueError if far too large."""
     stiff, length = whisker.base_bending_stiffness, whisker.length
     sizes = np.linalg.norm([force * length**2, moment * length], axis=-1).reshape(2, -1) / stiff
-    known = sizes[:, np.isfinite(sizes).all(axis=0)]
-    if known.size and (typical := float(np.median(known, axis=1).min())) > _LARGEST_LOAD:
-        raise ValueError(
-            f"force and moment are typically {typical:.2g} times what is natural to this whisker, "
-            "EI/L² and EI/L: N and N·m are needed; are these mN, µN, mN·m or µN·m?"
-        )
+    known = sizes[:, np.isfinite(sizes).all(axis=0) & sizes.any(axis=0)]
+    typical = float(np.median(known, axis=1).min()) if known.size else 0.0
+    if typical <= _LARGE_LOAD:
+        return
+    text = (
+        f"force and moment are typically {typical:.2g} times what is natural to this whisker, "
+        "EI/L² and EI/L: N and N·m are needed; are these mN, µN, mN·m or µN·m?"
+    )
+    if typical > _LARGEST_LOAD:
+        raise ValueError(text)
+    warnings.warn(text, UserWarning, stacklevel=3)
 
 
 def _checked(
@@ -317,17 +330,21 @@ def _checked(
             f"centerline_sigma is {deviations.min():.3g} m on a whisker of {length:.3g} m: it has "
             "to be in m"
         )
-    reach = np.linalg.norm(points, axis=-1)
-    reach = reach[np.isfinite(reach).all(axis=-1)].reshape(-1, points.shape[-2])
-    if reach.size:
-        first, last, most = np.median([reach[:, 0], reach[:, -1], reach.max(axis=1)], axis=1)
+    lines = points.reshape(-1, *points.shape[-2:])
+    lines = lines[np.isfinite(lines).all(axis=(1, 2))]
+    if len(lines):
+        most = np.median(np.linalg.norm(lines, axis=2).max(axis=1))
         if most > _STRETCHED * length:
             raise ValueError(
                 f"the centerline reaches {most:.3g} m from the base of a whisker of {length:.3g} "
                 "m: points in the whisker frame, in m, are needed"
             )
-        if last < first and last < _AT_BASE * length:
-            raise ValueError("the centerline ends at the base; points go from the base to the tip")
+        # The nearest points of the undeformed whisker show the direction, wherever a line begins.
+        rest = whisker.centerline(_NEAREST)
+        ends = np.median(lines[:, [0, -1]], axis=0)
+        first, last = np.linalg.norm(rest - ends[:, None], axis=2).argmin(axis=1)
+        if last < first:
+            raise ValueError("points of the centerline go from the base to the tip; these go back")
     return points.reshape(-1, *points.shape[-2:]), deviations
 
 

@@ -152,10 +152,23 @@ def with_contour(
     -------
     xarray.DataTree
         Recording with the group.
+
+    Warns
+    -----
+    UserWarning
+        If the contacts do not fit the shape.
     """
     if "estimates" in due_stages(recording, "contour"):
         recording = with_estimates(recording, whiskers=options.get("whiskers"), progress=progress)
-    return with_group(recording, "contour", reconstruct(recording, *args, **options))
+    contour = reconstruct(recording, *args, **options)
+    if (misfit := float(contour.attrs["misfit"])) > AGREES:
+        warnings.warn(
+            f"the contacts do not fit the shape {contour.attrs['shape']!r} (χ² per degree of "
+            f"freedom {misfit:.3g}): the object has another one, or errors are larger than stated",
+            UserWarning,
+            stacklevel=2,
+        )
+    return with_group(recording, "contour", contour)
 
 
 _BEFORE = ("signals", "", "truth")  # groups searched for contacts, in this order

@@ -58,12 +58,15 @@ class MixingCalibration:
         Covariance of each channel's mixing of these p components and, last, its offset.
     residual : (k,) array
         Root mean square residual of each channel, in its unit.
+    unexplained : tuple of str
+        Channels of whose readings the loads explain only a part, as the warning states.
     """
 
     sensor: Sensor
     components: tuple[str, ...]
     covariance: Array
     residual: Array
+    unexplained: tuple[str, ...]
 
 
 def calibrate_mixing(
@@ -114,7 +117,7 @@ def calibrate_mixing(
     Warns
     -----
     UserWarning
-        If errors of the wrenches hide the noise.
+        If errors of the wrenches hide the noise, or loads explain only a part of the readings.
     """
     y, w = numbers("readings", readings, channels or ()), numbers("wrenches", wrenches, components)
     if y.ndim != 2 or w.shape != (len(y), 6):
@@ -167,28 +170,33 @@ def calibrate_mixing(
     residual = np.sqrt(((y[known] - design @ unknowns) ** 2).mean(axis=0))
     read = y[known]
     spread = np.where(np.ptp(read, axis=0) > 0.0, read.std(axis=0), 0.0)
-    _doubt_channels(names, spread, residual)
-    return MixingCalibration(sensor, tuple(components), covariance, residual)
+    loose = _doubt_channels(names, spread, residual)
+    return MixingCalibration(sensor, tuple(components), covariance, residual, loose)
 
 
-def _doubt_channels(names: Sequence[str], spread: Array, residual: Array) -> None:
-    """Warn of channels whose readings the loads hardly explain; raise if readings are constant."""
+def _doubt_channels(names: Sequence[str], spread: Array, residual: Array) -> tuple[str, ...]:
+    """Warn of channels whose readings the loads hardly explain; raise if readings are constant.
+
+    Return their names.
+    """
     if dead := [name for name, of in zip(names, spread, strict=True) if of == 0.0]:
         raise ValueError(
             f"{', '.join(dead)} always read the same: omit channels that are not connected"
         )
-    loose = [
-        f"{name} ({max(1.0 - (left / of) ** 2, 0.0):.0%})"
+    share = {
+        name: max(1.0 - (left / of) ** 2, 0.0)
         for name, of, left in zip(names, spread, residual, strict=True)
         if left > _UNEXPLAINED * of
-    ]
-    if loose:
+    }
+    if share:
+        loose = ", ".join(f"{name} ({part:.0%})" for name, part in share.items())
         warnings.warn(
-            f"the loads explain only a part of the readings of {', '.join(loose)}: do the rows of "
+            f"the loads explain only a part of the readings of {loose}: do the rows of "
             "both belong together, are there outliers or much noise, or do the channels read other "
             "components too?",
             stacklevel=3,
         )
+    return tuple(share)
 
 
 def _checked_errors(covariances: ArrayLike, wrenches: Array) -> Array:

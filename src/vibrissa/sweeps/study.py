@@ -115,6 +115,16 @@ class Study:
         each = sum(TASKS[kind].numbers(settings) for kind, settings in self.tasks.values())
         return 8 * len(self.specimens) * (each + _OF_WHISKER + _OF_CELL * len(self.tasks))
 
+    def faults(self, most: int) -> dict[str, str]:
+        """Whiskers that cannot be constructed, and why, of at most ``most`` tried ones."""
+        out = {}
+        for specimen in self.specimens[:: -(-len(self.specimens) // most)]:
+            try:
+                specimen.make()
+            except Exception as fault:
+                out[specimen.name] = f"{type(fault).__name__}: {fault}"
+        return out
+
 
 def read_study(text: str, folder: Path) -> Study:
     """Read a study.

@@ -82,6 +82,11 @@ class SensorNoise:
     @classmethod
     def _read(cls, noise: Noise, names: tuple[str, ...], errors: Array) -> SensorNoise:
         if isinstance(noise, Mapping):
+            known = SIGNALS if set(names) <= set(SIGNALS) else names
+            if unknown := [repr(name) for name in noise if name not in known]:
+                raise ValueError(
+                    f"noise of {', '.join(unknown)} is unknown here; known are {', '.join(known)}"
+                )
             missing = [name for name in names if name not in noise]
             if missing:
                 raise ValueError(

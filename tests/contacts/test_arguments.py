@@ -1,7 +1,10 @@
 """What users hand over: datasets of files, other units, swapped arguments."""
 
+import re
+
 import numpy as np
 import pytest
+import xarray as xr
 
 import vibrissa as vb
 
@@ -147,6 +150,27 @@ def test_relative_errors_are_no_per_cent(contact_map, name):
         contact_map.estimate(signals, noise=noise, **{name: 5.0})
     with pytest.raises(ValueError, match="it is a share: 5 % is"):
         vb.sensors.Sensor(gain_error=5.0)
+
+
+@pytest.mark.parametrize("unit", ["mN", "µN", "millinewton", "kilonewton * meter", "deg", "1/mm"])
+def test_labelled_arrays_in_other_units_are_refused(bent, unit):
+    """Their numbers would be used as if they were in SI units."""
+    force = xr.DataArray(bent.force, dims=("sample", "space"), attrs={"units": "N"})
+    assert (vb.base_signals(force, bent.moment).FT > 0.0).all()
+    with pytest.raises(ValueError, match=f"force is stated in {re.escape(unit)}; SI units"):
+        vb.base_signals(force.assign_attrs(units=unit), bent.moment)
+
+    # An array with a unit, as of packages for them
+    quantity = bent.moment.view(type("Quantity", (np.ndarray,), {"unit": unit}))
+    with pytest.raises(ValueError, match="moment is stated in"):
+        vb.base_signals(force, quantity)
+
+
+def test_a_covariance_that_is_not_symmetric_is_named_so(contact_map):
+    noise = np.diag([1e-12] * 3 + [4e-16] * 3)
+    noise[0, 1] = 1e-13
+    with pytest.raises(ValueError, match=r"a covariance is symmetric; the entries \(0, 1\) and"):
+        contact_map.estimate({"Fx": 1e-6, "MB": 1e-8, "MD": 0.1}, noise=noise)
 
 
 def test_noise_of_unknown_signals_is_refused(contact_map, bent):

@@ -34,6 +34,7 @@ def stages():
     n = 6
     rng = np.random.default_rng(1)
     values = {name: rng.normal(size=(n, 2, 3)) for name in ("force", "moment", "base_position")}
+    values["base_position"] *= 1e-3
     values["base_rotation"] = np.tile(np.eye(3), (n, 2, 1, 1))
     values |= {"in_contact": np.ones((n, 2), dtype=bool), "status": np.zeros((n, 2), dtype=np.int8)}
     held = {name: recorded(name, array) for name, array in values.items()}
@@ -79,6 +80,18 @@ def test_times_that_seem_to_be_in_milliseconds_are_noted(stages):
     with pytest.warns(UserWarning, match="frames 2 s apart: its time has to be in seconds"):
         check_recording(timed(2.0))
     check_recording(timed(2e-3))
+
+
+def test_bases_that_seem_to_move_in_millimetres_are_noted(stages):
+    data = stages["signals"].to_dataset()[["base_position"]]
+    data = xr.concat([data] * 3, "time").assign_coords(time=2e-3 * np.arange(18))
+    along = 2e-3 * np.sin(np.arange(18.0))[:, None, None] * np.ones(3)
+    moving = data.assign(base_position=data["base_position"] + along)
+    check_recording(xr.DataTree(moving))
+    with pytest.warns(
+        UserWarning, match=r"the base moves at [0-9.e+]+ m/s: is base_position in mm"
+    ):
+        check_recording(xr.DataTree(1e3 * moving))
 
 
 def test_what_no_group_can_hold_is_refused(stages):

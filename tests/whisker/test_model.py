@@ -379,6 +379,15 @@ def test_a_coefficient_per_millimetre_is_questioned():
             Whisker.parabola(35e-3, coefficient)
 
 
+def test_curves_sharper_than_a_rod_of_this_radius_are_questioned():
+    sharp = r"at 0 mm the radius of curvature is 0\.0025 of the whisker's radius"
+    with pytest.warns(UserWarning, match=sharp):
+        Whisker.parabola(0.04, 2e6)
+    with pytest.warns(UserWarning, match="which no rod has"):
+        Whisker.from_curvature(0.04, lambda s: np.stack([0 * s, 0 * s, 2e4 + 0 * s], -1))
+    Whisker.parabola(0.04, 1e3)
+
+
 def test_tip_thicker_than_base_is_noted():
     assert Whisker.straight(LENGTH, tip_radius=2e-4).notes == ("the tip is thicker than the base",)
 

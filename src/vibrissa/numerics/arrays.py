@@ -7,6 +7,7 @@ quantiles over contacts, each is weighted by the volume that it represents.
 from __future__ import annotations
 
 import os
+import re
 import reprlib
 import threading
 from collections.abc import Callable, Iterable, Sequence
@@ -29,6 +30,12 @@ AnyArray: TypeAlias = NDArray[Any]
 Vector: TypeAlias = tuple[float, float, float]
 #: A kernel and the arguments with which it will be called: values, or their types.
 Call: TypeAlias = tuple[Callable[..., Any], tuple[Any, ...]]
+
+# Units with a prefix, or degrees, whose numbers would be used as if they were in SI units
+_MULTIPLE = re.compile(
+    "([pnuµμmcdkMG]|pico|nano|micro|milli|centi|deci|kilo|mega|giga)"
+    "([mNs]|Pa|rad|meters?|metres?|newtons?|seconds?|pascals?|radians?)|°|deg|degrees?"
+)
 
 SKEW = 1e-5
 """Largest entry of RᵀR − 1 for a rotation R that was written with few digits."""
@@ -103,7 +110,7 @@ def numbers(name: str, value: object, order: Sequence[str] = ("x", "y", "z")) ->
 
     A ``space`` dimension is moved last. If columns, or labels of the last axis, have the names in
     ``order`` (such as Fx, Fy and Fz), they must be in this order, because arrays are indexed by
-    position.
+    position. A stated unit, of a labelled array or a quantity, must not be a multiple of SI units.
     """
     given: Any = value
     if isinstance(given, list | tuple) and any(isinstance(v, np.ma.MaskedArray) for v in given):
@@ -116,6 +123,10 @@ def numbers(name: str, value: object, order: Sequence[str] = ("x", "y", "z")) ->
             plain = np.empty(0, dtype=object)
         if plain.dtype.kind in "fiu":
             return plain.astype(np.float64, copy=False)
+    unit = getattr(given, "attrs", {}).get("units", getattr(given, "units", None))
+    unit = getattr(given, "unit", "") if unit is None else unit
+    if any(_MULTIPLE.fullmatch(part) for part in re.findall("[A-Za-zµμ°]+", str(unit))):
+        raise ValueError(f"{name} is stated in {unit}; SI units are needed (m, N, N·m, rad, s)")
     if "space" in getattr(given, "dims", ()):
         given = given.transpose(..., "space")
     labels = [str(label) for label in _last_labels(given)]

@@ -88,12 +88,30 @@ def check_recording(recording: xr.DataTree) -> None:
             "rates of change are wrong if it is in ms",
             stacklevel=1,
         )
+    elif fast := _unlikely_speed(root):
+        warnings.warn(
+            f"the base moves at {fast:.3g} m/s: is base_position in mm, where m is needed?",
+            UserWarning,
+            stacklevel=1,
+        )
     if changed := edited(recording):
         warnings.warn(
             f"the recording was edited after its {changed[0]} had been computed: these, and all "
             "that depends on them, are out of date until `vibrissa reconstruct` has run",
             stacklevel=1,
         )
+
+
+def _unlikely_speed(root: xr.Dataset) -> float:
+    """Speed that bases often exceed, m/s, if it is implausible; else 0."""
+    base = Group(root).known("base_position")
+    if base is None or len(base) < 2:
+        return 0.0
+    speed = np.linalg.norm(np.diff(base, axis=0), axis=2)
+    speed /= np.diff(np.asarray(root["time"].values, dtype=np.float64))[:, None]
+    known = speed[np.isfinite(speed)]
+    often = float(np.quantile(known, _OFTEN)) if known.size else 0.0
+    return often if often > _FASTEST else 0.0
 
 
 def _label_faults(root: xr.Dataset) -> list[str]:
@@ -214,6 +232,8 @@ def whisker_radii(estimates: xr.Dataset, whiskers: Sequence[Whisker]) -> Array:
     return radius
 
 
+# Speed of bases, m/s, that must not be exceeded in a tenth of the steps.
+_FASTEST, _OFTEN = 20.0, 0.9
 _SCALE = 10.0  # ratio of the lengths of centreline and whisker from which the unit is wrong
 MADE_FROM = "made_from"
 _POSE = ("base_position", "base_rotation", "pose_covariance")

@@ -521,7 +521,18 @@ class Whisker:
         return whisker._questioned(holding, stacklevel=3)
 
     def _questioned(self, stated: Container[str], stacklevel: int) -> Whisker:
-        """Return this whisker after a warning of properties that seem to be in other units."""
+        """Return this whisker after a warning of properties that seem to be in other units.
+
+        A radius of curvature below that of the section is impossible.
+        """
+        s = np.linspace(0.0, self.length, 101)
+        sharp = np.linalg.norm(self.curvature(s)[:, 1:], axis=1) * self.radius(s)
+        if sharp[at := int(sharp.argmax())] > 1.0:
+            warnings.warn(
+                f"at {1e3 * s[at]:.3g} mm the radius of curvature is {1.0 / sharp[at]:.2g} of the "
+                "whisker's radius, which no rod has: are curvature and radius in SI units?",
+                stacklevel=stacklevel,
+            )
         bending = self.base_bending_stiffness / self.length
         properties = self.youngs_modulus, self.poisson_ratio, self.base_stiffness
         for doubt in doubtful_units(stated, *properties, bending):

@@ -107,12 +107,17 @@ class SensorNoise:
                 "noise must be {signal: standard deviation} or a symmetric 6 × 6 covariance of "
                 f"(F, M); got {noise!r}"
             ) from error
-        if wrench.shape != (6, 6) or not np.allclose(
-            wrench, wrench.T, rtol=1e-9, atol=0.0, equal_nan=True
-        ):
+        if wrench.shape != (6, 6):
             raise ValueError(
                 "noise must be {signal: standard deviation} or a symmetric 6 × 6 covariance of "
                 f"(F, M); got shape {wrench.shape}"
+            )
+        apart = ~np.isclose(wrench, wrench.T, rtol=1e-9, atol=0.0, equal_nan=True)
+        if apart.any():
+            i, j = np.argwhere(apart)[0]
+            raise ValueError(
+                f"a covariance is symmetric; the entries ({i}, {j}) and ({j}, {i}) are "
+                f"{wrench[i, j]:g} and {wrench[j, i]:g}"
             )
         variances = np.diag(wrench)
         if not np.isfinite(wrench).all() or (variances < 0.0).any():

@@ -1,5 +1,7 @@
 """Arrays of whiskers on the command line: simulated, looked into, drawn."""
 
+import re
+
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -35,8 +37,9 @@ def test_simulated_looked_into_and_drawn(own, tmp_path):
     recording = load_recording(trial)
     assert recording.sizes["whisker"] == 4
     np.testing.assert_allclose(recording["head_position"].values[-1], [0, 14e-3, 0], atol=1e-12)
-    done("figures", trial, "-o", tmp_path, "--format", "png")
+    said = done("figures", trial, "-o", tmp_path, "--format", "png")
     assert (tmp_path / "array.png").stat().st_size > 10_000
+    assert re.search(r"of 4 whiskers, the one longest in contact is shown: [LR]C\d \(", said)
     told = done("info", trial)
     assert "4: LC2, LC3, RC2, RC3" in told
     assert "whiskers" in told

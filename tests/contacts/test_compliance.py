@@ -167,6 +167,13 @@ def test_a_gain_that_forgets_itself(gamma_map):
         vb.ContactFilter(locate, memory=0.0)
 
 
+def test_a_compliance_per_another_unit_is_refused(gamma_map):
+    signals = {"Fx": 1e-6, "FT": 1e-6, "MB": 1e-8, "MD": 0.1}
+    for using in ("Fx MB MD", "Fx FT MB MD"):
+        with pytest.raises(ValueError, match="is it per mN·m or µN·m"):
+            gamma_map.estimate(signals, using, NOISE, compliance_sigma=5e7)
+
+
 def test_a_base_that_hardly_gives_way_is_not_questioned(gamma_map):
     """It is stiffer than one that a user would state."""
     truth, wrenches = touched(gamma_map.whisker, [0.0], NOISE)

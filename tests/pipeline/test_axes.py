@@ -1,11 +1,13 @@
 """Axes of a sensor that are not those of the whisker are noticed by what contacts they give."""
 
+import re
+
 import numpy as np
 import pytest
 
 import vibrissa as vb
 from vibrissa.contacts import rubbing_misfits
-from vibrissa.pipeline import checks, doubted_axes
+from vibrissa.pipeline import checks, doubted_axes, doubted_noise
 from vibrissa.sensors import SensorFrame, component_noise
 
 NOISE = component_noise(1e-6, 2e-8)
@@ -69,3 +71,24 @@ def test_fits_are_never_worse_than_where_moments_vanish():
     fitted, seen = rubbing_misfits(*given, True), rubbing_misfits(*given, False)
     assert (fitted < 9.0).mean() >= (seen < 9.0).mean()
     assert (seen < 9.0).any()
+
+
+def test_noise_that_is_far_from_the_scatter_without_contact_is_doubted():
+    rng = np.random.default_rng(3)
+    size = np.repeat([1e-6, 2e-8], 3)
+    free = np.arange(400) % 100 < 70
+    # Contacts, and a drift, are not noise.
+    loads = np.where(free[:, None], np.linspace(0.0, 4.0, 400)[:, None], 80.0) * size
+    readings = loads + size * rng.normal(size=(400, 6))
+
+    def doubt(force=1.0, moment=1.0, rows=free, seen=readings):
+        return doubted_noise(seen, np.diag((np.repeat([force, moment], 3) * size) ** 2), rows)
+
+    assert not doubt()
+    assert not doubt(5.0, 0.2)
+    assert not doubt(rows=np.zeros(400, bool))
+    assert not doubt(seen=loads)
+    assert re.search(r"force by [12](\.\d)? µN, with noise of 1e\+03 µN", doubt(1e3))
+    assert "moment" not in doubt(1e3)
+    assert "with noise of 2e-05 µN·m" in doubt(moment=1e-3)
+    assert "successive readings" in doubt(moment=1e-4, rows=np.zeros(400, bool))

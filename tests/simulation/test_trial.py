@@ -234,6 +234,7 @@ class TestMotion:
             ({"duration": 0.0}, "duration is 0.0"),
             ({"rate": float("nan")}, "rate is nan"),
             ({"duration": 1e-3}, "fewer than two frames"),
+            ({"frequency": 8000.0}, "8000 whisks/s are more than"),
         ],
     )
     def test_faults(self, changes, message):

@@ -379,6 +379,13 @@ def test_a_coefficient_per_millimetre_is_questioned():
             Whisker.parabola(35e-3, coefficient)
 
 
+def test_radii_that_are_changed_to_other_units_are_refused():
+    whisker = Whisker.straight(0.04)
+    for radius, message in ((1e-7, "multiply by 1e3"), (0.1, "multiply by 1e-3")):
+        with pytest.raises(ValueError, match=message):
+            whisker.with_properties(base_radius=radius)
+
+
 def test_curves_sharper_than_a_rod_of_this_radius_are_questioned():
     sharp = r"at 0 mm the radius of curvature is 0\.0025 of the whisker's radius"
     with pytest.warns(UserWarning, match=sharp):

@@ -24,6 +24,7 @@ _XYZ = ("X", "Y", "Z")
 # Sag of the tip of a level whisker, m, above which neglecting it is mentioned: contact points are
 # wrong by several times as much. A rat's whisker sags by 0.2 mm.
 _SAG = 0.5e-3
+_WEAK = 1.5  # gravity, m/s², below which it is stated in another unit, or is not that of the earth
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,8 @@ class GravityOptions:
         if self.gravity is None:
             return None
         x, y, z = numbers(self.gravity, _XYZ, "--gravity")
+        if 0.0 < math.hypot(x, y, z) < _WEAK:
+            remark(f"note: gravity is {math.hypot(x, y, z):g} m/s²; on earth it is 9.81")
         tare: Any = self.tare_gravity
         if tare is not None:
             tare = tuple(numbers(tare, _XYZ, "--tare-gravity"))
@@ -547,15 +550,17 @@ def _doubts(
 def _doubt_zero(
     wrench: tuple[Array, Array], noise: Array, found: vb.pipeline.Frames, weight: GravityOptions
 ) -> None:
-    """Warn of signals that are not zero without contact, compared with their noise.
+    """Warn of signals that are not zero without contact, or scatter unlike their noise.
 
     Gravity changes them too, and is not warned of.
     """
     sigma = np.sqrt(np.diag(noise))
+    free = np.asarray(found["status"] == vb.Status.NOT_FELT)
+    readings = np.concatenate(wrench, axis=1)
+    if doubt := vb.pipeline.doubted_noise(readings, noise, free):
+        remark(f"note: {doubt}")
     if weight.gravity is not None or not sigma.all():
         return
-    free = found["status"] == vb.Status.NOT_FELT
-    readings = np.concatenate(wrench, axis=1)
     known = np.isfinite(readings).any(axis=0)
     zero = vb.streaming.Zero()
     for reading in (readings / sigma)[free][:, known]:
@@ -636,11 +641,13 @@ def estimated(
     whiskers = [weight.of(one) for one in whiskers]
     inputs.print_notes(*whiskers)
     doubts: list[str] = []
+    readings = []
     for k, whisker in enumerate(whiskers):
         with vb.io.in_file(name):
             one = vb.recording.Group(signals).whisker(k)
             wrench = (one["force"], one["moment"])
             vb.io.check_scale(*wrench, whisker)
+        readings.append(np.concatenate(wrench, axis=1))
         sensed = how.noise.matrix() if source == "sensor" else None
         doubts += _doubts(whisker, wrench, sensed, weight)
     remark_once(doubts)
@@ -661,6 +668,11 @@ def estimated(
         **({"contact_maps": maps} if maps else {"whiskers": whiskers}),
     )
     about = done["estimates"].attrs
+    if noisy and source == "sensor":
+        status = done["estimates"].to_dataset()["status"].transpose("whisker", "time")
+        free = np.asarray(status == vb.Status.NOT_FELT)
+        each = map(vb.pipeline.doubted_noise, readings, itertools.repeat(how.noise.matrix()), free)
+        remark_once(filter(None, each))
     noise = how.noise.described() if noisy else "noise as the recording states"
     noise += weight.described()
     used, friction = str(about["signals"]), float(about["friction"])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import vibrissa as vb
 from vibrissa.cli.inputs import map_of, recording_from
 from vibrissa.cli.options import Format, free, refuse, with_options
-from vibrissa.cli.terminal import Tell, progress_bars, say
+from vibrissa.cli.terminal import Tell, progress_bars, remark, say
 from vibrissa.deferred import xr
 
 Draw = Callable[[], Any]  # draws a figure when it is called
@@ -42,7 +42,13 @@ class TrialOptions:
         """Options for a trial, with the whisker longest in contact unless one is chosen."""
         if self.which is not None:
             return self
-        return replace(self, which=int(np.argmax(vb.report.contacts_by_whisker(trial))))
+        longest = int(np.argmax(vb.report.contacts_by_whisker(trial)))
+        if len(names := vb.recording.Recording(trial).names) > 1:
+            remark(
+                f"of {len(names)} whiskers, the one longest in contact is shown: {names[longest]} "
+                f"(--which {longest}; others by --which)"
+            )
+        return replace(self, which=longest)
 
     @property
     def whisker(self) -> int:

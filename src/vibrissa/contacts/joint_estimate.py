@@ -133,7 +133,7 @@ class JointEstimate:
                     "friction together with weight or an uncertain base needs at least "
                     f"{_SEPARATE} signals, such as Fx, FT, MB and MD; got {', '.join(names)}"
                 )
-        check_compliance(compliance_sigma, sensor)
+        check_compliance(compliance_sigma, sensor, whisker)
         self.whisker, self.contact_map, self.names = whisker, contact_map, names
         self.sensor, self.prior, self.gravity = sensor, prior, gravity
         self._how: dict[str, Any] = {

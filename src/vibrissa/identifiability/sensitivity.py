@@ -217,7 +217,8 @@ def best_triplet(
     chosen_names = [selection(triplet, exactly=3) for triplet in triplets]
     if not chosen_names:
         raise ValueError("at least one triplet is needed; got none")
-    sensor = SensorNoise.of(noise, tuple(dict.fromkeys(n for t in chosen_names for n in t)))
+    every = tuple(dict.fromkeys(n for t in chosen_names for n in t))
+    sensor = SensorNoise.of(noise, every, whisker=contact_map.whisker)
     chosen = chosen_contacts(contact_map, at)
     errors = np.stack(
         [_predicted_errors(contact_map, chosen, names, sensor) for names in chosen_names]

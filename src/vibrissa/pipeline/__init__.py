@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from vibrissa.pipeline.checks import (
         check_recording as check_recording,
         doubted_axes as doubted_axes,
+        doubted_noise as doubted_noise,
         edited as edited,
         whisker_radii as whisker_radii,
     )
@@ -87,7 +88,7 @@ __dir__ = __all__.copy
 __getattr__ = names_from(
     __name__,
     {
-        "checks": "check_recording doubted_axes edited whisker_radii",
+        "checks": "check_recording doubted_axes doubted_noise edited whisker_radii",
         "estimates": "Progress contact_events estimates_of in_laboratory swept_recording",
         "events": "EVENTS contact_columns with_events",
         "frames": "CHANGE Frames",

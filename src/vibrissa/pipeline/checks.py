@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from vibrissa.contacts import rubbing_misfits
 from vibrissa.deferred import xr
 from vibrissa.io import slow_steps
-from vibrissa.numerics import Array
+from vibrissa.numerics import Array, Mask
 from vibrissa.pipeline.frames import CHANGE
-from vibrissa.quantities import unit_fault
+from vibrissa.quantities import quantity, unit_fault
 from vibrissa.recording import VARIABLES, Group, Recording, faults_in, recorded
 from vibrissa.signals import base_signals
 from vibrissa.whisker import Whisker
@@ -284,6 +284,9 @@ def edited(recording: xr.DataTree) -> list[str]:
 
 # Smallest and largest number of contacts tested, chosen from those with the larger moments.
 _FEW, _MOST = 6, 24
+# Number of steps without contact that show the noise; ratio of their scatter to the stated noise
+# above which, or below whose inverse, this is doubted; and standard deviation over median size.
+_FREE, _DISTRUSTED, _TO_SIGMA, _ROOT_2 = 20, 10.0, 1.4826, 2.0**0.5
 # Model errors unrelated to the axes, such as those of stiffness, relative to force and moment.
 _MODEL = 0.05
 _EXPLAINED = 9.0  # largest χ² of an explained contact; a friction angle of 20° adds one to χ²
@@ -344,6 +347,45 @@ def doubted_axes(whisker: Whisker, force: Array, moment: Array, noise: Array) ->
         f"{100 * shares[simple]:.0f} % for example with {', '.join(columns)} as Fx, Fy, Fz, Mx, "
         "My, Mz: are force and moment along the axes of the whisker's frame, a right hand, and of "
         "the object on the whisker?"
+    )
+
+
+def doubted_noise(readings: Array, noise: Array, free: Mask) -> str:
+    """Describe noise that is far from the scatter of readings without contact.
+
+    ``readings`` (n, 6) are force and moment, ``noise`` (6, 6) is their covariance, SI units, and
+    ``free`` (n,) are the rows without contact. The text is empty if the noise is plausible. Noise
+    is too small if successive readings differ far more, which a drift does not cause, and too large
+    if all readings are far closer together, filtered or not. If hardly any row is free, as with
+    noise that is far too small, all count, which differ more as the whisker moves.
+    """
+    some = np.count_nonzero(free) > _FREE
+    rest = np.where(free[:, None] | (not some), readings, np.nan)
+    most = _DISTRUSTED if some else _DISTRUSTED**2
+    doubts = []
+    for name, part in (("force", slice(0, 3)), ("moment", slice(3, 6))):
+        stated, each = np.sqrt(np.diag(noise))[part], rest[:, part]
+        known = (np.isfinite(np.diff(each, axis=0)).sum(axis=0) >= _FREE) & (stated > 0.0)
+        if not known.any():
+            continue
+        each, stated = each[:, known], stated[known]
+        away = np.abs(each - np.nanmedian(each, axis=0)), np.abs(np.diff(each, axis=0)) / _ROOT_2
+        scatter, change = (_TO_SIGMA * np.nanmedian(one, axis=0) for one in away)
+        little, much = float(np.median(scatter / stated)), float(np.median(change / stated))
+        # Readings that never change are not those of a sensor.
+        if much > most or 0.0 < little < 1.0 / _DISTRUSTED:
+            about = quantity(name)
+            seen, asked = (
+                f"{about.display_factor * float(np.median(one)):.2g} {about.display_unit}"
+                for one in (change if much > most else scatter, stated)
+            )
+            doubts.append(f"{name} by {seen}, with noise of {asked}")
+    if not doubts:
+        return ""
+    return (
+        f"{'without contact readings' if some else 'successive readings'} scatter otherwise than "
+        f"by the noise, {'; '.join(doubts)}: which contacts are detected, and their covariances, "
+        "depend on the noise"
     )
 
 

@@ -204,6 +204,8 @@ def whisking(
     ]
     if not faults and round(duration * rate) < 2:
         faults.append(f"{duration} s at {rate} frames/s are fewer than two frames")
+    if not faults and 2.0 * frequency > rate:
+        faults.append(f"{frequency:g} whisks/s are more than {rate:g} frames/s can show")
     if row not in ROLL_PER_AZIMUTH:
         faults.append(f"row is {row!r}; one of {', '.join(ROLL_PER_AZIMUTH)} is needed")
     if not 0.3 <= protraction <= 0.7:

@@ -9,7 +9,7 @@ between the jumps and kinks found in them (`vibrissa.whisker.profile`).
 """
 
 from collections.abc import Callable, Container, Sequence
-from typing import TypedDict, cast
+from typing import TypedDict, Unpack, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -115,18 +115,6 @@ def parse_properties(
         section = radius_profile(length, **stated)
     except ValueError as fault:
         raise ValueError("no whisker: " + "; ".join([*faults, str(fault)])) from None
-    thickest = float(section(np.linspace(0.0, length, 101)).max())
-    if thickest > _STOUT * length:
-        faults.append(
-            f"the radius is up to {thickest:.4g} m at a length of {length:.4g} m, more than a "
-            "tenth of it: these look like millimetres given as metres; multiply by 1e-3"
-        )
-    elif thickest < _THIN * length:
-        faults.append(
-            f"the radius is at most {thickest:.4g} m at a length of {length:.4g} m, less than "
-            f"{_THIN:.0e} of it: these look like millimetres given as micrometres, or converted "
-            "once too often; multiply by 1e3"
-        )
     if faults:
         raise ValueError("no whisker: " + "; ".join(faults))
     return section, holding, radius_notes(length, section, stated)
@@ -301,7 +289,25 @@ def length_faults(length: float, any_length: bool | None = False) -> list[str]:
     return [f"{fault}. If a rod of this length is meant, say so: {CONFIRMATION}"]
 
 
-def radius_profile(
+def radius_profile(length: float, **stated: Unpack[Section]) -> Profile:
+    """Radius over arc length, from any of its specifications, of plausible size."""
+    section = _stated_profile(length, **stated)
+    thickest = float(section(np.linspace(0.0, length, 101)).max())
+    if thickest > _STOUT * length:
+        raise ValueError(
+            f"the radius is up to {thickest:.4g} m at a length of {length:.4g} m, more than a "
+            "tenth of it: these look like millimetres given as metres; multiply by 1e-3"
+        )
+    if thickest < _THIN * length:
+        raise ValueError(
+            f"the radius is at most {thickest:.4g} m at a length of {length:.4g} m, less than "
+            f"{_THIN:.0e} of it: these look like millimetres given as micrometres, or converted "
+            "once too often; multiply by 1e3"
+        )
+    return section
+
+
+def _stated_profile(
     length: float,
     base_radius: float | None = None,
     tip_radius: float | None = None,

@@ -49,6 +49,7 @@ HELD = 1e-5  # tolerance for a held arc length
 # Iterations in which the effects of shared unknowns, or the noise, are recomputed at the contact.
 _ROUNDS, _STEADY = 3, 2
 _CLOUD = 128
+_LOOSEST = 10.0  # turn of the base by EI/L, rad, above which its compliance is in other units
 _SOLVED = 1e-5  # χ² below which as many signals as unknowns are solved
 _MISFITS = (int(Status.NOT_FRICTIONLESS), int(Status.NOT_ONE_CONTACT))
 
@@ -284,11 +285,17 @@ def normal_cloud(dimension: int) -> Array:
     return np.asarray(points @ np.linalg.inv(root).T)
 
 
-def check_compliance(sigma: float, sensor: SensorNoise | None) -> None:
-    """Refuse what is not a standard deviation, or one without noise."""
+def check_compliance(sigma: float, sensor: SensorNoise | None, whisker: Whisker) -> None:
+    """Refuse what is not a standard deviation of the base of a whisker, or one without noise."""
     if not 0.0 <= sigma < np.inf:
         raise ValueError(
             f"compliance_sigma is a standard deviation, rad/(N·m), not negative; got {sigma!r}"
+        )
+    turn = sigma * whisker.base_bending_stiffness / whisker.length
+    if turn > _LOOSEST:
+        raise ValueError(
+            f"compliance_sigma is {sigma:.3g} rad/(N·m), a turn of {turn:.3g} rad by the moment "
+            "EI/L that bends this whisker: is it per mN·m or µN·m?"
         )
     if sigma > 0.0 and sensor is None:
         raise ValueError(
@@ -305,7 +312,7 @@ def soft_base(
     friction: bool = False,
 ) -> JointFit | None:
     """Fit with an uncertain compliance of the base, rad/(N·m); None if it is certain."""
-    check_compliance(sigma, sensor)
+    check_compliance(sigma, sensor, whisker)
     if sigma == 0.0:
         return None
     forward = Forward.of(whisker, None, sigma, steps=steps)

@@ -192,3 +192,28 @@ def test_noise_of_measured_radii_averages_out(count):
     found = worst(whisker, lambda s: np.zeros(3), whisker.radius, known, loads=2)
     # A tenth of what the noise itself does to the compliance ∝ r⁻⁴.
     assert found <= 0.1 * 4.0 * 0.01 / np.sqrt(count)
+
+
+@pytest.mark.parametrize(
+    ("at", "width", "turn", "twist"),
+    [
+        (0.0, 0.05, 1.0, 0.0),
+        (0.07, 0.016, 0.8, 0.6),
+        (0.19, 0.016, 1.6, -1.0),
+        (0.8, 0.03, 1.7, 0.0),
+    ],
+)
+def test_steps_are_shorter_where_a_whisker_turns_sharply(at, width, turn, twist):
+    """As in a hook; without a load it has its own shape."""
+    length = 0.04
+
+    def curvature(s):
+        bump = np.exp(-0.5 * ((s / length - at) / width) ** 2) / (2.5 * width * length)
+        return bump[..., None] * np.array([twist, 0.6 * turn, 0.8 * turn]) + [0.0, 10.0, 5.0]
+
+    whisker = vb.Whisker.from_curvature(length, curvature, base_radius=5e-5, tip_radius=5e-6)
+    s = np.array([0.35, 0.6, 0.95]) * length
+    faint = 1e-9 * whisker.base_bending_stiffness / length**2
+    bent = vb.deflect(whisker, vb.PointForce(s, components=np.tile([0.0, faint, 0.0], (3, 1))))
+    places = [whisker.position(one) for one in s]
+    np.testing.assert_allclose(bent.contact_point, places, atol=2e-6 * length)

@@ -19,6 +19,7 @@ from functools import lru_cache, singledispatch
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from vibrissa.numerics import Array
 
@@ -30,8 +31,10 @@ if TYPE_CHECKING:
 STEPS = 36
 #: Largest number of steps; more only adds rounding error.
 MOST_STEPS = 2**8 * STEPS
-# Largest turning of the resting whisker per step, rad; a helical whisker gets more steps for it.
-_TURN_PER_STEP = 0.08
+# Largest mean turning of the resting whisker per step, rad, and largest of a step where it turns
+# sharply, as in a hook; a helical whisker gets more steps for it.
+_TURN_PER_STEP, _SHARPEST = 0.08, 0.16
+_NEAR = 50  # half width of the surroundings of a sharp turn, of 2048 parts of the length
 _TAPER_EXPONENT = 0.4
 # Least number of steps, of STEPS, over which the radius falls by a factor e.
 _STEPS_PER_CHANGE = 6.0
@@ -195,10 +198,11 @@ def weight_beyond(rod: Rod, weight: float) -> Array:
 
 
 def _nodes(whisker: Whisker, steps: int) -> Array:
-    """Step boundaries in units of L, denser where the whisker is thin or turns."""
+    """Step boundaries in units of L, denser where the whisker is thin or turns sharply."""
     s = np.linspace(0.0, 1.0, 2049)
     middle = 0.5 * (s[1:] + s[:-1]) * whisker.length
     turning = np.linalg.norm(whisker.curvature(middle), axis=-1) * whisker.length
+    finer = steps / STEPS
     steps = max(steps, int(np.ceil(turning.mean() / _TURN_PER_STEP)))
     radius = whisker.radius(middle)
     density = (radius / whisker.base_radius) ** -_TAPER_EXPONENT
@@ -206,6 +210,11 @@ def _nodes(whisker: Whisker, steps: int) -> Array:
     ends = np.array([0.0, *(np.array(whisker.breaks) / whisker.length), 1.0])
     steep[np.searchsorted(middle, ends[1:-1] * whisker.length) - 1] = 0.0  # possible jumps
     hinged = _hinged(radius, np.append(steep, 0.0))
+    sharp = finer * turning / turning.size / _SHARPEST / steps
+    if (sharp > (usual := density / density.sum())).any():
+        # Steps next to a sharp turn, which it reaches into, must not be long either.
+        near = sliding_window_view(np.pad(sharp, _NEAR, "edge"), 2 * _NEAR + 1).max(axis=1)
+        hinged += np.maximum(near - usual, 0.0)
     cumulated = np.concatenate([[0.0], np.cumsum(density + density.sum() * hinged)])
     cumulated /= cumulated[-1]
     edges = np.interp(ends, s, cumulated)

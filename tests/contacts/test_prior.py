@@ -1,5 +1,7 @@
 """A prior leaves out candidates, and the status says what is left."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -70,12 +72,32 @@ def test_candidates_are_those_that_are_possible(gamma_map, bent, names, noise, p
     some = gamma_map.estimate(signals, names, noise, prior=prior)
     locate = vb.Estimator(gamma_map, names, noise, prior=prior)
     rows = np.stack([signals[name] for name in names.split()], axis=-1)
-    fewer = 0
+    fewer = displaced = 0
+    around = np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
+    around *= 3.0 / np.linalg.norm(around, axis=1, keepdims=True)
+    around = np.concatenate([around * share for share in (1.0, 2 / 3, 1 / 3, 1 / 6)])
     for i in range(len(rows)):
         n = whole.n_candidates[i]
         points, forces = whole.candidates.point[i, :n], whole.candidates.force[i, :n]
         good = reference(prior, gamma_map.whisker, points, forces)
         fewer += good.sum() < n
+        if noise is not None and n and not good.any() and some.n_candidates[i]:
+            # Noise has displaced a possible contact: the region is within three sigma.
+            size, axes = np.linalg.eigh(whole.candidates.covariance[i, :n])
+            near = points[:, None] + (around * np.sqrt(size)[:, None]) @ np.swapaxes(axes, 1, 2)
+            alike = np.broadcast_to(forces[:, None], near.shape)
+            good = np.array(
+                [
+                    reference(prior, gamma_map.whisker, *one).any()
+                    for one in zip(near, alike, strict=True)
+                ]
+            )
+            if prior.region != "ELD CF":  # which also depends on the force at each point
+                np.testing.assert_array_equal(
+                    some.candidates.point[i, : some.n_candidates[i]], points[good]
+                )
+            displaced += 1
+            continue
         assert some.n_candidates[i] == good.sum()
         np.testing.assert_array_equal(some.candidates.point[i, : good.sum()], points[good])
         assert np.isnan(some.candidates.point[i, good.sum() :]).all()
@@ -93,6 +115,7 @@ def test_candidates_are_those_that_are_possible(gamma_map, bent, names, noise, p
             assert one.status == some.status[i]
             np.testing.assert_allclose(one.candidates.point, points[good], atol=1e-8)
     assert 0 < fewer < len(rows)
+    assert displaced < len(rows) / 3
     kept = some.n_candidates > 0
     np.testing.assert_array_equal(some.point[kept], some.candidates.point[kept, 0])
     same = kept & (some.point == whole.point).all(axis=-1)
@@ -136,6 +159,27 @@ def misfit_of(force, point, signals, noise):
     """χ² of signals with independent noise."""
     at_contact = vb.base_signals(force, np.cross(point, force))
     return sum(((float(at_contact[n]) - signals[n]) / noise[n]) ** 2 for n in noise)
+
+
+@pytest.mark.parametrize("using", ["Fx MB MD", "Fx FT MB MD", "wrench"])
+def test_contacts_that_noise_displaces_beyond_the_region_have_an_answer(gamma_map, bent, using):
+    """They were drawn from the region, so that at most a few are three sigma away from it."""
+    inside = np.abs(np.linalg.norm(bent[2], axis=1) - 0.025) < 0.004
+    force, moment, points = (one[inside] for one in bent)
+    rng = np.random.default_rng(1)
+    sigma = np.sqrt(np.diag(NOISE))
+    wrench = np.concatenate([force, moment], axis=1) + sigma * rng.normal(size=(len(force), 6))
+    signals = vb.base_signals(wrench[:, :3], wrench[:, 3:])
+    if using == "wrench":
+        signals = {"force": wrench[:, :3], "moment": wrench[:, 3:]}
+    prior = vb.Prior({"r": (0.021, 0.029)})
+    found = gamma_map.estimate(signals, using, NOISE, prior=prior)
+    free = gamma_map.estimate(signals, using, NOISE)
+    assert (np.abs(np.linalg.norm(free.point, axis=1) - 0.025) > 0.004).sum() > 3
+    assert (found.status == Status.OUTSIDE_PRIOR).mean() < 0.02
+    away = found.point - points
+    near = np.einsum("ni,nij,nj->n", away, np.linalg.inv(found.covariance), away) < 7.815
+    assert near.mean() > 0.9
 
 
 @pytest.mark.slow

@@ -466,7 +466,7 @@ class Estimator:
             return nowhere(Status.OUTSIDE_MAP if beyond else Status.NOT_FRICTIONLESS, math.nan, d)
         if self.prior is not None:
             kept = np.flatnonzero(
-                possible_candidates(self.prior, self.contact_map.whisker, d, found)[0]
+                possible_candidates(self.prior, self.contact_map.whisker, d, found, near=False)[0]
             )
             if not kept.size:
                 return nowhere(Status.OUTSIDE_PRIOR, 0.0, d)

@@ -239,10 +239,16 @@ def _located(
         found = _candidates(solved)
         if prior is not None:
             allowed = possible_candidates(prior, whisker, d, found)
+            if sensor is not None:  # which are near is judged below, by their covariances
+                allowed |= ~allowed.any(axis=1, keepdims=True) & ~np.isnan(found.x[:, :, 0])
             found, solved = found.allowed_first(allowed), solved.allowed_first(allowed)
         if sensor is None:
             return found, np.zeros(which.size, np.bool_)
-        return _judged(coarse, d, solved, found, *given)
+        found, lost = _judged(coarse, d, solved, found, *given)
+        if prior is not None:
+            found = found.allowed_first(possible_candidates(prior, whisker, d, found))
+            found.probability[:] /= np.nansum(found.probability, axis=1, keepdims=True)
+        return found, lost
 
     found, lost = answers(np.arange(rows.size), False)
     doubtful = (found.probability[:, 0] > CERTAIN) & ~found.valid[:, 0] & ~lost

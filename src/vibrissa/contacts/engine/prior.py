@@ -7,6 +7,7 @@ need a larger force than the object can exert.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -24,6 +25,7 @@ from vibrissa.signals import REGIONS, concave_backward, in_region, spherical
 from vibrissa.status import Status
 from vibrissa.whisker import Whisker
 
+_REACHED = (0.5, 1.0, 2.0, 3.0)  # standard deviations at which a region is looked for
 _COORDINATES = ("r", "theta", "phi")
 _TURN = 2.0 * np.pi
 # Forces in units of EI/L² beyond which a limit leaves out either no contact or all: one at 3 % of
@@ -41,7 +43,8 @@ class Prior:
         Region of the contacts: one of "all", "ELD", "CF", "CB", "ELD CF" and "ELD CB" (concave
         backward and forward; excluding large deflections), or the least and the greatest value of
         some of ``r`` (m), ``theta`` and ``phi`` (rad) in the whisker's frame. A range of θ whose
-        least value is above the greatest passes through ±π.
+        least value is above the greatest passes through ±π. With noise, contacts from which the
+        region is within three standard deviations are the answer if none is in it.
     least_force, greatest_force : float
         Size of the contact force, N.
     tip : float
@@ -158,13 +161,34 @@ class Prior:
 
 
 def possible_candidates(
-    prior: Prior, whisker: Whisker, d: Discretization, found: Candidates
+    prior: Prior, whisker: Whisker, d: Discretization, found: Candidates, *, near: bool = True
 ) -> AnyArray:
-    """Which candidates (n, k) of a whisker are possible; padding is not."""
+    """Which candidates (n, k) of a whisker are possible; padding is not.
+
+    Noise may displace a possible contact beyond the prior's region. Where it leaves none, those
+    from which the region is within three standard deviations of the contact point count as
+    possible, unless ``near`` is false.
+    """
     there = np.arange(found.x.shape[1]) < found.number[:, None]
-    allowed, x = np.zeros_like(there), found.x[there]
-    points = found.values[there][:, 3:] * d.length
-    allowed[there] = prior.allows(whisker, points, x[:, 0] * d.length, x[:, 1:] * d.force)
+
+    def allowed_of(which: AnyArray, moved: Array | float = 0.0) -> AnyArray:
+        x, points = found.x[which], found.values[which][:, 3:] + moved
+        return prior.allows(whisker, points * d.length, x[:, 0] * d.length, x[:, 1:] * d.force)
+
+    allowed: AnyArray = np.zeros(there.shape, np.bool_)
+    allowed[there] = allowed_of(there)
+    known = np.isfinite(found.covariances).all(axis=(2, 3))
+    lost = there & known & ~allowed.any(axis=1, keepdims=True)
+    if not (near and lost.any()):
+        return allowed
+    size, axes = np.linalg.eigh(found.covariances[lost])
+    root = axes * np.sqrt(np.maximum(size, 0.0))[:, None, :]
+    reached = np.zeros(len(root), bool)
+    for direction in itertools.product((-1.0, 0.0, 1.0), repeat=3):
+        step = np.linalg.norm(direction)
+        for share in _REACHED if step > 0.0 else ():
+            reached |= allowed_of(lost, root @ (np.array(direction) * share / step))
+    allowed[lost] = reached
     return allowed
 
 

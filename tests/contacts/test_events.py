@@ -64,6 +64,24 @@ def test_onset_is_not_dated_without_free_samples_or_readings(silent):
     assert np.isnan(events.onset).all()
 
 
+@pytest.mark.parametrize("order", ["shuffled", "back", "still", "missing"])
+def test_onsets_of_rows_out_of_order_are_not_dated(order):
+    """Instead of an error, or of a date before the earlier rows."""
+    time = {
+        "shuffled": np.random.default_rng(1).permutation(TIME),
+        "back": TIME[::-1],
+        "still": 0.0 * TIME,
+        "missing": np.nan * TIME,
+    }[order]
+    events = ContactEvents(1.0)
+    for now, reading in zip(time, ramp(0.06, 300.0, 2), strict=True):
+        touching = bool(np.hypot(*reading[:2]) > 5.0)
+        events(now, touching, reading, None)
+    assert events.onset[1] >= 0.0 or np.isnan(events.onset[1])
+    if order != "shuffled":
+        assert np.isnan(events.onset[1])
+
+
 def test_events_in_order_are_where_contacts_began():
     readings = ramp(0.06, 300.0, 3)
     readings[50:] = 0.0

@@ -150,7 +150,8 @@ def test_rows_without_time_are_numbered(tmp_path):
 def test_time_that_does_not_rise_is_told(tmp_path):
     rows = "".join(f"{time},1e-6,0,0,1e-8,0,0\n" for time in (0, 1, 1, "", 2, 0))
     signals = load_signals(written(tmp_path, HEADER + "\n" + rows))
-    back, still = signals.attrs["notes"]
+    missing, back, still = signals.attrs["notes"]
+    assert "time is missing in 1 of 6 rows, first in row 4" in missing
     assert "goes back in 1 of 6 rows, first in row 6, from 2 to 0 s" in back
     assert "stands still in 1 of 6 rows, first in row 3" in still
 

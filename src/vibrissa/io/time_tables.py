@@ -119,10 +119,16 @@ def read_signals(path: Path) -> tuple[Array, Array, Array, list[str]]:
 
 
 def time_notes(time: Array) -> list[str]:
-    """Notes on times that do not increase, as in concatenated trials, and on implausible steps."""
+    """Notes on times that are missing or do not increase, and on implausible steps."""
     known = np.flatnonzero(np.isfinite(time))
     step = np.diff(time[known])
     notes = []
+    if known.size < time.size:
+        first = int(np.flatnonzero(~np.isfinite(time))[0])
+        notes.append(
+            f"time is missing in {time.size - known.size} of {time.size} rows, first in row "
+            f"{first + 1}; what depends on it, as onsets, is unknown there"
+        )
     for wrong, fault in ((step < 0.0, "goes back"), (step == 0.0, "stands still")):
         if wrong.any():
             first = int(np.flatnonzero(wrong)[0])

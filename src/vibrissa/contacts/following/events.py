@@ -143,6 +143,11 @@ class ContactEvents:
         if first:
             self.onset = time, math.nan
             self._datable = bool(self._times)
+        if self._times and not time > self._times[-1]:
+            # Rows in another order, or of another trial, do not show when the contact began.
+            self._times.clear()
+            self._readings.clear()
+            self._datable = False
         self._since += self._touching
         if self._since > 1 + _AFTER or not reading.size or not np.isfinite(reading).all():
             return

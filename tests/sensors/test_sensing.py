@@ -626,6 +626,17 @@ def test_a_sensor_that_hardly_reads_moments_is_doubted(name, tmp_path):
     assert described(np.linalg.inv(given)).mixing[0, 0] == pytest.approx(1.0 / 12.0)
 
 
+def test_a_sensor_far_from_the_whisker_is_doubted(tmp_path):
+    path = tmp_path / "sensor.toml"
+    for away in (0.02, 20.0):
+        path.write_text(f"noise = 1e-3\n[frame]\nposition = [{away}, 0.0, 0.0]")
+        if away < 1.0:
+            assert load_sensor(path).frame.position[0] == away
+            continue
+        with pytest.warns(UserWarning, match="position is 20 m from the base of the whisker: is"):
+            load_sensor(path)
+
+
 def test_a_mixing_keeps_saturation_and_resolution(rng):
     """Saturated rows would tilt the mix, and rounding is not counted as noise twice."""
     true = Sensor(("a",), [[0, 0, 0, 0, 1.0, 0]], noise=1e-3, resolution=0.02, largest=[1.0])

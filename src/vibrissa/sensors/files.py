@@ -48,6 +48,7 @@ from vibrissa.sensors.suspended import FEATURES, SuspendedWhisker
 from vibrissa.sensors.suspension import SuspensionCalibration
 from vibrissa.whisker import Whisker
 
+_FARTHEST = 1.0  # distance of a sensor from the base, m, above which it may be in mm
 _NUMBERS = ("noise", "bias", "drift", "resolution", "largest", "gain_error")
 _OTHERS = ("relative_noise", "mixing_error", "mixing_covariance")
 _TOP = {"channels", "mixing", "calibration", *_NUMBERS, *_OTHERS, "frame", "weight"}
@@ -103,6 +104,12 @@ def _described(table: dict[str, Any]) -> Sensor:
             "are the small ones; if so, name it calibration"
         )
     _check_lever(values.get("mixing"))
+    position = three_numbers(frame, "position", [0.0, 0.0, 0.0])
+    if (away := float(np.linalg.norm(position))) > _FARTHEST:
+        warnings.warn(
+            f"the sensor's position is {away:.4g} m from the base of the whisker: is it in mm?",
+            stacklevel=5,
+        )
     if "relative_noise" in table:
         values["relative_noise"] = one_number(table, "relative_noise", 0.0)
     reaction = frame.get("reaction", False)
@@ -112,7 +119,7 @@ def _described(table: dict[str, Any]) -> Sensor:
         **values,
         frame=SensorFrame(
             axes=_axes(frame.get("axes", ["x", "y", "z"])),
-            position=three_numbers(frame, "position", [0.0, 0.0, 0.0]),
+            position=position,
             reaction=reaction,
         ),
         mass=one_number(weight, "mass", 0.0),

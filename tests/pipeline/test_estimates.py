@@ -299,7 +299,9 @@ def test_a_peg_that_rubs_is_as_near_as_stated(friction):
     done = with_contour(felt)["contour"].to_dataset()
     assert (scores(done, peg) < 3.0).all()
     assert np.linalg.norm(done["axis_offset"]) < 0.05e-3
-    exact = with_contour(felt, lean=0.0)["contour"].to_dataset()
+    said = pytest.warns(UserWarning, match="do not fit the shape 'cylinder'")
+    with said if friction > 0.2 else nullcontext():
+        exact = with_contour(felt, lean=0.0)["contour"].to_dataset()
     assert (scores(exact, peg)[1] > 10.0) == (friction > 0.0)
     with pytest.raises(ValueError, match="lean"):
         with_contour(felt, lean=-0.1)

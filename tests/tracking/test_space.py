@@ -14,7 +14,8 @@ from vibrissa.tracking.recording import remarks_on_time
 from vibrissa.tracking.refine import continuation
 from vibrissa.tracking.space.curve import begun_together, merged, shown_by_one
 from vibrissa.tracking.space.exchange import Known, exchanged
-from vibrissa.tracking.space.frame_pairs import clear_offsets, repeated_frames, without_repeats
+from vibrissa.tracking.space.frame_pairs import clear_offsets, dropped_frames
+from vibrissa.tracking.space.frame_steps import repeated_frames, without_repeats
 from vibrissa.tracking.space.pose import base_pose, rolled_over
 from vibrissa.tracking.space.rest_shape import RestShape, whisker_at_rest
 from vibrissa.tracking.trace.start import base_gap
@@ -196,6 +197,34 @@ def test_errors_that_follow_the_motion_are_no_offset():
     (said,) = remarks_on_time(pair, rows, None)
     assert "do not determine their offset, and 0 is kept" in said
     assert remarks_on_time(pair, rows, 0) == []
+
+
+@pytest.mark.parametrize("view", [0, 1])
+@pytest.mark.parametrize("gap", [1, 2])
+def test_frames_that_one_camera_dropped_have_no_partner(view, gap):
+    """The whisker takes several steps at once in one view; ends that are hidden show nothing."""
+    generator, pair = np.random.default_rng(5), PAIRS["orthogonal"]
+    azimuth = 0.6 * np.sin(2.0 * np.pi * np.arange(70) / 70.0 - 1.2)
+    rows = [[traced(camera, curve(a), generator) for a in azimuth] for camera in pair]
+    rows = [[t._replace(tip_seen=False, base_seen=False) for t in row] for row in rows]
+    assert dropped_frames(pair, rows) == []
+    del rows[view][20 : 20 + gap], rows[1 - view][-gap:]
+    ((of, frame, count, certain),) = dropped_frames(pair, rows)
+    assert (of, frame, count, certain) == (view, 20, gap, True)
+    pairs = paired_frames(pair, rows, 0)
+    moments = pairs + gap * (pairs >= 20) * (np.arange(2) == view)
+    assert (moments[:, 0] == moments[:, 1]).all()
+    assert len(pairs) == 70 - 2 * gap
+    (remark,) = remarks_on_time(pair, rows, 0)
+    assert f"{pair[view].name} dropped {gap} frame" in remark
+    assert dropped_frames(pair[:1], rows[view : view + 1]) == []
+
+
+def test_what_lets_go_in_both_views_is_no_dropped_frame():
+    generator, pair = np.random.default_rng(6), PAIRS["orthogonal"]
+    azimuth = 0.6 * np.sin(2.0 * np.pi * np.delete(np.arange(70), 20) / 70.0 - 0.8)
+    rows = [[traced(camera, curve(a), generator) for a in azimuth] for camera in pair]
+    assert dropped_frames(pair, rows) == []
 
 
 def test_frames_that_repeat_the_one_before_are_left_out():

@@ -31,7 +31,7 @@ from vibrissa.tracking.refine.hook import Hook
 from vibrissa.tracking.refine.optics import Optics
 from vibrissa.tracking.refine.peg import UncertainPeg
 from vibrissa.tracking.refine.rods import TraceSeries
-from vibrissa.tracking.space.frame_pairs import NEAR, clear_offsets
+from vibrissa.tracking.space.frame_pairs import NEAR, clear_offsets, dropped_frames
 from vibrissa.tracking.space.pose import CUTOFF, BasePose, HeadPose
 from vibrissa.tracking.space.rest_shape import Length, RestShape
 from vibrissa.tracking.trace.start import base_gap
@@ -591,8 +591,24 @@ def remarks_on_plane(one: Tracked, name: str) -> list[str]:
 def remarks_on_time(
     cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]], offset: int | None
 ) -> list[str]:
-    """Report cameras that do not seem to be synchronous, and offsets that were found."""
+    """Report cameras that seem not to be synchronous, offsets found, and dropped frames."""
     found = []
+    for view, frame, count, certain in dropped_frames(cameras, traces, offset):
+        name, frames = cameras[view].name, f"{count} frame{'s' * (count > 1)}"
+        shown = (
+            f"before its frame {frame}: there the whisker takes {1 + count} of its steps at once "
+            "in this view only"
+        )
+        if certain:
+            found.append(
+                f"{name} dropped {frames} {shown}. Later frames are paired accordingly; record "
+                "without losses, as not all of them show."
+            )
+        else:
+            found.append(
+                f"not sure: {name} may have dropped {frames} {shown}. If so, the views are out of "
+                f"step by {count} from there on: compare the videos."
+            )
     for camera, row in zip(cameras[1:], traces[1:], strict=True):
         shifts, determined = clear_offsets(cameras[0], camera, traces[0], row, offset or 0)
         runs = [shift for shift, _ in groupby(shifts.tolist())]

@@ -70,7 +70,8 @@ from vibrissa.tracking.space.curve import (
     with_one_tip,
 )
 from vibrissa.tracking.space.exchange import Known, exchanged
-from vibrissa.tracking.space.frame_pairs import best_seen, paired_frames, without_repeats
+from vibrissa.tracking.space.frame_pairs import best_seen, paired_frames
+from vibrissa.tracking.space.frame_steps import without_repeats
 from vibrissa.tracking.space.pose import CUTOFF, BasePose, HeadPose, base_pose, rolled_over
 from vibrissa.tracking.space.rest_shape import (
     LEAST_SEEN,

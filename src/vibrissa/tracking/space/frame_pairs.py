@@ -2,17 +2,15 @@
 
 Two views of one point give lines of sight that meet. For frames of different times the lines to the
 whisker's base and tip pass each other at a distance; the offset between the videos is the one for
-which they pass nearest. Frames that a camera dropped change the offset from there on.
-
-Where a recorder repeated the frame before instead, a whisker stops for one frame and makes up for
-it in the next, which no whisker does.
+which they pass nearest. Frames that a camera dropped change the offset from there on, which steps
+of the whisker show too (`vibrissa.tracking.space.frame_steps`).
 """
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from itertools import pairwise
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +19,8 @@ from numpy.typing import NDArray
 
 from vibrissa.cameras import Camera, triangulate
 from vibrissa.numerics import Array
-from vibrissa.tracking.trace.trace import Trace, correlated, tangent
+from vibrissa.tracking.space.frame_steps import Dropped, steps_over_dropped
+from vibrissa.tracking.trace.trace import Trace, correlated
 
 Pairs = NDArray[np.int64]
 
@@ -36,12 +35,6 @@ _DROPPED = 10  # largest number of frames in a row that a camera drops unnoticed
 _KNOWN = 10  # number of frames that must show an end of the whisker
 _LOCATED = 0.3  # error with which an end is located in each frame by itself, pixels
 _POWERS = (1.0, 0.5, 0.0)  # of the weights of frames whose errors are alike, for paths to compare
-# Largest number of frames in a row that repeat one; smallest step of an even motion that includes
-# them, pixels; their own steps, as a share of that and at most, pixels; and the least of the step
-# before them, as a share of the even one.
-_RUN, _MOVES, _STOPS, _SAME, _EVENLY = 3, 0.35, 0.3, 0.25, 0.4
-_SEVERAL = 3  # number of such frames of a video from which the recorder repeats frames
-_ALONG = np.linspace(0.1, 0.9, 9)  # shares of a trace at which its step is measured
 NEAR = 3  # offsets that differ by so many frames are not distinguished when one is confirmed
 
 
@@ -58,7 +51,35 @@ def paired_frames(
     """Find the simultaneous frames (time, view) of two or more videos.
 
     Frame 0 of the first video is frame ``offset`` of the others. If it is None, it is found, and
-    dropped frames too, where they explain the views clearly better than none.
+    dropped frames too, where they explain the views clearly better than none. Frames that only one
+    camera dropped, as steps of the whisker show, have no partner.
+    """
+    pairs, gaps = _paired_by_offset(cameras, traces, offset)
+    if not len(pairs):
+        raise ValueError(f"no frames belong together: an offset of {offset} frames is too large")
+    # When each view's image of a pair was taken, in frames, with those that it dropped.
+    moments = np.tile(np.arange(len(pairs)), (len(cameras), 1))
+    for gap in gaps:
+        moments[gap.view, gap.frame :] += gap.missing if gap.certain else 0
+    common = reduce(np.intersect1d, moments)
+    at = [np.searchsorted(one, common) for one in moments]
+    return np.stack([pairs[rows, v] for v, rows in enumerate(at)], axis=1)
+
+
+def dropped_frames(
+    cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]], offset: int | None = 0
+) -> list[Dropped]:
+    """Frames that one of several cameras dropped, by its own numbers of frames."""
+    pairs, gaps = _paired_by_offset(cameras, traces, offset)
+    return [gap._replace(frame=int(pairs[gap.frame, gap.view])) for gap in gaps]
+
+
+def _paired_by_offset(
+    cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]], offset: int | None
+) -> tuple[Pairs, list[Dropped]]:
+    """Simultaneous frames (time, view) by the videos' offset, and what it leaves of dropped ones.
+
+    These are before rows of the pairs, not frames of the video.
     """
     columns = [np.arange(len(traces[0]))]
     for camera, row in zip(cameras[1:], traces[1:], strict=True):
@@ -73,67 +94,11 @@ def paired_frames(
     for k, row in enumerate(traces):
         usable &= (pairs[:, k] >= 0) & (pairs[:, k] < len(row))
         usable[1:] &= np.diff(pairs[:, k]) > 0
-    if not usable.any():
-        raise ValueError(f"no frames belong together: an offset of {offset} frames is too large")
-    return pairs[usable]
-
-
-def without_repeats(
-    cameras: Sequence[Camera], rows: Sequence[Sequence[Sequence[Trace]]]
-) -> tuple[list[list[list[Trace]]], list[str]]:
-    """Traces by whisker, view and frame without those of repeated frames, and remarks on these."""
-    kept, remarks = [[list(row) for row in one] for one in rows], []
-    for v, camera in enumerate(cameras):
-        stops = [repeated_frames(one[v]) for one in rows]
-        # A camera that repeats a frame stops all whiskers, of which some may be lost or rest.
-        most = len(stops) // 2
-        every = sorted(set[int]().union(*stops))
-        repeats = [i for i in every if sum(i in own for own in stops) > most]
-        if len(repeats) < _SEVERAL:
-            continue
-        for one in kept:
-            for i in repeats:
-                one[v][i] = Trace.lost()
-        listed = ", ".join(map(str, repeats[:5])) + ", …" * (len(repeats) > 5)
-        remarks.append(
-            f"{camera.name}: {len(repeats)} of {len(kept[0][v])} frames repeat the one before "
-            f"({listed}), as where frames were dropped or the frame rate was converted; whiskers "
-            "move on in the next. They are left out: record or convert every frame once."
-        )
-    return kept, remarks
-
-
-def repeated_frames(row: Sequence[Trace]) -> set[int]:
-    """Frames in which a moving whisker is where it was in the frame before."""
-    unseen = np.full(len(_ALONG), np.nan)
-    steps = np.array([unseen, *(_step(a, b) for a, b in pairwise(row))]).reshape(-1, len(_ALONG))
-    # Far parts of a whisker that touches move otherwise than their base.
-    return _stopped(steps) | _stopped(steps[:, : len(_ALONG) // 2 + 1])
-
-
-def _stopped(steps: Array) -> set[int]:
-    """Frames with no step (frame, point), from one frame to the next, in the midst of a motion."""
-    sizes, found = np.sqrt(np.mean(steps**2, axis=1)), set[int]()
-    for i in range(2, len(steps) - 1):
-        for after in range(i + 1, min(i + _RUN + 1, len(steps))):
-            usual = sizes[after] / (after - i + 1)
-            evenly = np.mean(steps[i - 1] * steps[after]) > _EVENLY * usual * sizes[after]
-            still = (sizes[i:after] < min(_STOPS * usual, _SAME)).all()
-            if usual > _MOVES and evenly and still:
-                found |= set(range(i, after))
-    return found
-
-
-def _step(before: Trace, after: Trace) -> Array:
-    """Distances, across a whisker, by which it moves from one frame to the next; NaN if unseen."""
-    n = min(len(before.line), len(after.line))
-    if n < len(_ALONG):
-        return np.full(len(_ALONG), np.nan)
-    at = np.rint(_ALONG * (n - 1)).astype(np.intp)
-    ahead = tangent(before.line)[at]
-    ahead /= np.maximum(np.hypot(*ahead.T), 1e-9)[:, None]
-    moved = after.line[at] - before.line[at]
-    return np.asarray(ahead[:, 0] * moved[:, 1] - ahead[:, 1] * moved[:, 0])
+    pairs = pairs[usable]
+    if (np.diff(pairs, axis=0) > 1).any():
+        return pairs, []
+    rows = [[row[i] for i in column] for row, column in zip(traces, pairs.T, strict=True)]
+    return pairs, steps_over_dropped(rows)
 
 
 def best_seen(traces: Sequence[Sequence[Sequence[Trace]]]) -> list[Sequence[Trace]]:

@@ -448,6 +448,21 @@ def test_dirt_on_the_sensor_does_not_hide_that_a_camera_shakes():
     assert found[:, 2:].max() < 0.05
 
 
+def test_bands_of_a_rolling_shutter_are_no_shaking():
+    """A lamp on alternating current: where a peg ends, it is brighter than at its sides."""
+    random, (y, x) = np.random.default_rng(4), np.mgrid[0:300, 0:240].astype(float)
+    frames = []
+    for i in range(30):
+        peg = 0.8 / (1.0 + np.exp((np.abs(x - 150.0 - 0.05 * y) - 14.0) / 0.6))
+        peg /= 1.0 + np.exp((80.0 - y) / 0.6)
+        whisker = 0.6 * np.exp(-((y - 60.0 - 2.0 * i - 0.2 * x) ** 2) / 3.0) * (x < 120.0)
+        lamp = 1.0 + 0.3 * np.sin(2.6 * i + 5.6 * y / 300.0)
+        grey = 170.0 * lamp * (1.0 - np.maximum(peg, whisker))
+        frames.append((grey + random.normal(0.0, 1.0, x.shape)).clip(0, 255).astype(np.uint8))
+    steady = Steady.of(Scene.of(frames).with_still(np.array([[0.0, 60.0]]), frames), frames)
+    assert steady is None or not any(any(steady.moved_back(f)[1][:2]) for f in frames)
+
+
 def test_a_camera_that_was_moved_may_have_been_calibrated_before_or_after(filmed, traced):
     """Half-way through the film it moves by a pixel: all is half a pixel off, and said to be."""
     half, moved = len(traced[0][0]) // 2, []

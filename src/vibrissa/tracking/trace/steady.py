@@ -2,9 +2,11 @@
 
 Static edges give the shift d of a frame I from their usual image M by least squares,
 
-    I(x + d) = a M(x) + b,
+    I(x + d) = a(y) M(x) + b,
 
-where a and b are changes of the light. What moves differently, such as a part of the face or a
+where a and b are changes of the light. As a rolling shutter exposes one row y after the other, a
+lamp on alternating current makes bands: a(y) is a constant and a wave of the height of the image.
+What moves differently, such as a part of the face or a
 passing whisker, is weighted down by its residuals in all frames. Blocks of the image, whose pixels
 have common errors, give the error of the shift by their disagreement.
 """
@@ -34,8 +36,8 @@ _ROUNDS, _STEPS = 3, 3  # numbers of rounds that change the usual image, and of 
 _RARE = 3.0  # standard deviations above which a pixel shows something else
 _FINE = 0.3  # standard deviation of grey values by rounding
 _FARTHEST = 6.0  # largest shift, pixels
-# Prior standard deviations of a shift, pixels, and of changes of the light.
-_PRIOR = np.diag([1.0, 1.0, 1.0, 1e-4])
+# Prior precisions of a shift, pixels, of changes of the light and its wave, and of a constant.
+_PRIOR = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 1e-4])
 # Standard deviation of shifts above which a camera shakes, pixels, and in units of their errors.
 _SHAKES, _CERTAIN = 0.05, 4.0
 _UNSEEN = 0.03  # standard deviation of the common shift of all blocks by compression, pixels
@@ -52,8 +54,8 @@ class Steady:
 
     at: NDArray[np.intp]  # (2, n): column and row of pixels, sorted by blocks
     blocks: NDArray[np.intp]  # (b,) first pixel of each block
-    slopes: Array  # (n, 4): change by the shift along columns and rows, the light, and one
-    soft: Array  # (n, 4): the same of a smoothed image, whose noise is another one
+    slopes: Array  # (n, 6): change by the shift along columns and rows, the light, and one
+    soft: Array  # (n, 6): the same of a smoothed image, whose noise is another one
     weight: Array  # (n,)
     trust: Array  # (2, 2): weight of a measured shift
     sigma: Array  # (2,): standard deviation of the remaining shift, pixels
@@ -70,7 +72,8 @@ class Steady:
         if len(blocks) < _FEWEST:
             return unknown
         ones = np.ones(len(at[0]))
-        soft = np.stack([*(-each[at[1], at[0]] for each in slopes), ones, ones], axis=1)
+        edges = [-each[at[1], at[0]] for each in slopes]
+        soft = np.stack([*edges, *[ones] * (len(_PRIOR) - len(edges))], axis=1)
         one = cls(at, blocks, soft, soft, ones, np.eye(2), np.zeros(2))
         shifts = np.zeros((len(frames), 2))
         one = one._with_usual(frames, shifts)
@@ -107,7 +110,7 @@ class Steady:
     @classmethod
     def unknown(cls) -> Steady:
         """For a view that does not show whether its camera shakes."""
-        none, empty = np.zeros(0, dtype=np.intp), np.zeros((0, 4))
+        none, empty = np.zeros(0, dtype=np.intp), np.zeros((0, len(_PRIOR)))
         left = np.full(2, np.nan)
         return cls(np.stack([none, none]), none, empty, empty, empty[:, 0], np.eye(2), left)
 
@@ -144,9 +147,9 @@ class Steady:
         pairs = list(zip(frames, shifts, strict=True))
         grey = np.array([[_at(frame, self.at, d + step) for step in steps] for frame, d in pairs])
         usual, right, left, below, above = np.median(grey, axis=0)
-        slopes = np.stack(
-            [0.5 * (left - right), 0.5 * (above - below), usual, np.ones_like(usual)], axis=1
-        )
+        phase = 2.0 * np.pi * self.at[1] / len(frames[0])
+        light = [usual, usual * np.cos(phase), usual * np.sin(phase), np.ones_like(usual)]
+        slopes = np.stack([0.5 * (left - right), 0.5 * (above - below), *light], axis=1)
         soft = np.concatenate([self.soft[:, :2], slopes[:, 2:]], axis=1)
         one = replace(self, slopes=slopes, soft=soft, weight=np.ones(len(usual)))
         # With shifts as they were until now: the first round prefers what moves least.
@@ -187,7 +190,7 @@ class Steady:
         return np.asarray(miss - light @ np.linalg.lstsq(light, miss)[0])
 
     def _equations(self, frame: Frame, shift: Array) -> tuple[Array, Array, Array]:
-        """Normal equations (4, 4), their right sides (block, 4), and residuals (n,)."""
+        """Normal equations (6, 6), their right sides (block, 6), and residuals (n,)."""
         miss = _at(frame, self.at, shift) - self.slopes[:, 2]
 
         def equations(weight: Array) -> tuple[Array, Array]:

@@ -3,6 +3,7 @@
 import pickle
 import sys
 from dataclasses import replace
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -579,6 +580,35 @@ def test_a_tip_that_is_not_seen_is_found_by_how_the_whisker_bends(filmed, traces
     assert "its tip is too faint" in recording.attrs["remarks"]
     squares = squared_errors(recording, filmed)
     assert np.nanmedian(squares) < 2.366 * 2.0**2
+
+
+def test_lengths_for_which_a_frame_has_no_pose_are_compared(filmed, traces, monkeypatch):
+    """All lengths are compared by the same frames, in contact with an object."""
+    module, calls = import_module("vibrissa.tracking.track"), []
+    usual = module._poses
+    bent = np.flatnonzero(filmed.truth["in_contact"].values[::2] > 0)
+
+    def poses(fitter, *rest):
+        found = usual(fitter, *rest)
+        calls.append(fitter)
+        for pose in found:
+            pose.azimuth[bent[3]] = np.nan if len(calls) % 2 == 0 else pose.azimuth[bent[3]]
+        return found
+
+    monkeypatch.setattr(module, "_poses", poses)
+    cut = []
+    for (row,) in traces:
+        ends = [int(0.94 * len(trace.line)) for trace in row[::2]]
+        cut.append(
+            [
+                t._replace(line=t.line[:n], sigma=t.sigma[:n], seen=t.seen[:n], tip_seen=False)
+                for t, n in zip(row[::2], ends, strict=True)
+            ]
+        )
+    recording = track(filmed.cameras, [[row] for row in cut], 500.0)
+    assert len(calls) > 6
+    true = Recording(filmed.recording).whisker().length
+    assert Recording(recording).whisker().length == pytest.approx(true, rel=0.05)
 
 
 @pytest.mark.parametrize("stated", [True, pytest.param(False, marks=pytest.mark.slow)])

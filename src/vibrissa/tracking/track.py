@@ -662,7 +662,13 @@ def _length(fitter: Fitter, shape: RestShape, options: TrackOptions) -> Length:
     def of(length: float) -> float:
         longer = lengthened(shape, length)
         whisker = whisker_at_rest(longer, **options.at_base)
-        return cost(whisker, _poses(fitter, longer, whisker, options)[1])
+        found = _poses(fitter, longer, whisker, options)[1]
+        # Where it has none, that for the longest is a start, too.
+        lost = ~np.isfinite(found.rotation).all(axis=(1, 2))
+        values = {name: array.copy() for name, array in vars(found).items()}
+        for name, array in values.items():
+            array[lost] = getattr(pose, name)[lost]
+        return cost(whisker, BasePose(**values))
 
     return likeliest_length(shape.length, of)
 

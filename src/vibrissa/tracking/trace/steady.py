@@ -45,6 +45,7 @@ _UNSEEN = 0.03  # standard deviation of the common shift of all blocks by compre
 # sensor is; required significance of that; and number of such blocks, and their share of all edges,
 # above which something else moves instead.
 _LESS, _KNOWN, _MOST, _DIRT = 0.5, 5.0, 2, 0.2
+_BANDS = 0.02  # relative amplitude of waves of brightness that shift what is seen of edges
 _PARTS = 8  # number of parts of a film whose means show slow motion
 
 
@@ -147,8 +148,8 @@ class Steady:
         pairs = list(zip(frames, shifts, strict=True))
         grey = np.array([[_at(frame, self.at, d + step) for step in steps] for frame, d in pairs])
         usual, right, left, below, above = np.median(grey, axis=0)
-        phase = 2.0 * np.pi * self.at[1] / len(frames[0])
-        light = [usual, usual * np.cos(phase), usual * np.sin(phase), np.ones_like(usual)]
+        wave = usual * _waves(len(frames[0]))[:, self.at[1]] * _banded(frames)
+        light = [usual, *wave, np.ones_like(usual)]
         slopes = np.stack([0.5 * (left - right), 0.5 * (above - below), *light], axis=1)
         soft = np.concatenate([self.soft[:, :2], slopes[:, 2:]], axis=1)
         one = replace(self, slopes=slopes, soft=soft, weight=np.ones(len(usual)))
@@ -226,6 +227,21 @@ class Steady:
             error += (inverse @ (right.T @ right + _PRIOR) @ inverse.T)[:2, :2] / len(frames)
         known = np.add.reduceat(self.weight * (self.slopes[:, :2] ** 2).sum(axis=1), self.blocks)
         return 0.5 * (error + error.T), float(known.sum() ** 2 / (known**2).sum())
+
+
+def _waves(rows: int) -> Array:
+    """Cosine and sine (2, rows) of a period over the height of an image."""
+    phase = 2.0 * np.pi * np.arange(rows) / rows
+    return np.stack([np.cos(phase), np.sin(phase)])
+
+
+def _banded(frames: Sequence[Frame]) -> bool:
+    """Whether the brightness of frames changes in bands, relative to the usual one of each row."""
+    rows = np.array([frame.mean(axis=1) for frame in frames])
+    rows /= np.maximum(rows.mean(axis=0), _FINE)
+    rows /= np.maximum(rows.mean(axis=1, keepdims=True), _FINE)
+    wave = 2.0 * _waves(rows.shape[1]) @ rows.T / rows.shape[1]
+    return bool(np.hypot(*wave.std(axis=1)) > _BANDS)
 
 
 def slow_motion(shifts: Array) -> Array:

@@ -137,7 +137,8 @@ def called_contact(whisker, trial, noise):
     wrench = np.concatenate([data.force.values, data.moment.values], axis=1)
     pose = (data.base_rotation.values, data.base_position.values)
     vibration = Vibration.of(whisker)
-    return vibration.in_contact(data.time.values, wrench, *pose, noise**2 * NOISE), wrench
+    course = data.time.values, wrench, *pose
+    return vibration.contact_probability(*course, noise**2 * NOISE) > 0.5, wrench
 
 
 def shares(name, whisker, trial, truth, lately, noise=1.0):

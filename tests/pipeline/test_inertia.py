@@ -8,6 +8,7 @@ import vibrissa as vb
 from vibrissa.contour import axis_offset
 from vibrissa.pipeline import (
     estimates_of,
+    predictors,
     reconstruct,
     signals_of,
     with_estimates,
@@ -157,3 +158,17 @@ def test_a_trial_without_inertia_has_none_to_remove():
     plain = measure(whisked(0.02, dynamics=None))
     with pytest.raises(ValueError, match="without inertia"):
         signals_of(plain, "sensor", dynamics=Dynamics())
+
+
+def test_the_probability_of_contact_accompanies_the_flag():
+    trial = measure(whisked(0.12), seed=1)
+    trial["force"][5] = np.nan
+    done = with_signals(trial, "sensor", dynamics=Dynamics())
+    found, table = done["signals"], predictors(done)
+    probability = found["contact_probability"].values[:, 0]
+    np.testing.assert_array_equal(table["contact_probability"].values[:, 0], probability)
+    known = np.isfinite(probability)
+    assert np.flatnonzero(~known).tolist() == [5]
+    flagged = found["in_contact"].values[:, 0].astype(bool)
+    assert 0 < flagged.sum() < flagged.size
+    np.testing.assert_array_equal(flagged[known], probability[known] > 0.5)

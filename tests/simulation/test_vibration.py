@@ -76,7 +76,7 @@ def test_contact_is_distinguished_from_inertia_with_a_wrong_mass(whisker, past_p
     time, wrench, rotation, position = measured(trial)
     dynamics = Dynamics(density=tuple(assumed * value for value in Dynamics().density))
     vibration = Vibration.of(whisker, dynamics)
-    found = vibration.in_contact(time, wrench, rotation, position, NOISE)
+    found = vibration.contact_probability(time, wrench, rotation, position, NOISE) > 0.5
     bare = np.hypot(wrench[:, 4], wrench[:, 5]) > 5.0 * 2e-8
     assert np.mean(bare[~touching]) > 0.3
     # A contact that begins or ends between two frames may be called either in both.
@@ -93,7 +93,7 @@ def test_quiet_and_constant_wrenches_are_free_and_in_contact(whisker):
     touching = time >= 0.06
     wrench[touching] += [2e-6, 8e-6, 0.0, 0.0, 0.0, 1.5e-7]
     still = np.broadcast_to(np.eye(3), (120, 3, 3)), np.zeros((120, 3))
-    found = Vibration.of(whisker).in_contact(time, wrench, *still, NOISE)
+    found = Vibration.of(whisker).contact_probability(time, wrench, *still, NOISE) > 0.5
     np.testing.assert_array_equal(found, touching)
 
 
@@ -179,7 +179,7 @@ def test_strong_vibration_of_a_slow_whisker_is_not_contact():
     dynamics = Dynamics(density=density, damping_ratio=0.103, step=2e-4)
     trial = measure(simulate(slow, motion, peg, dynamics=dynamics, nodes=9), 3e-6, 6e-8, seed=5)
     touching = trial["truth"].to_dataset().isel(whisker=0).in_contact.values.astype(bool)
-    found = Vibration.of(slow).in_contact(*measured(trial), 9.0 * NOISE)
+    found = Vibration.of(slow).contact_probability(*measured(trial), 9.0 * NOISE) > 0.5
     about = np.convolve(touching, np.ones(5), "same") > 0
     assert np.mean(found[~about]) < 0.1
     assert np.mean(found[touching]) > 0.7

@@ -84,7 +84,8 @@ def without_inertia(
             whisker, *course, noise, stiffness_sigma=_STIFFNESS_KNOWN_TO
         ).dynamics
     vibration = Vibration.of(whisker, dynamics)
-    trial = trial._replace(touching=vibration.in_contact(*course, noise))
+    probability = vibration.contact_probability(*course, noise)
+    trial = trial._replace(touching=probability > 0.5)
     removed = _removed(trial, dynamics, vibration)
     left = trial.wrench - removed.wrench
     left[~known] = np.nan
@@ -94,7 +95,11 @@ def without_inertia(
     values = {"force": left[:, :3], "moment": left[:, 3:], "in_contact": touching}
     values |= {"base_position": trial.position, "base_rotation": trial.rotation}
     of_wrench, of_change = _uncertainties(trial, removed, vibration)
-    more = {"wrench_covariance": trial.noise + of_wrench}
+    probability[~known] = np.nan
+    more = {
+        "contact_probability": probability,
+        "wrench_covariance": trial.noise + of_wrench,
+    }
     more |= dict(zip(CHANGE, (removed.change, of_change), strict=True))
     more |= dict(zip(INERTIA, removed.shared(), strict=True))
     about = {"density": dynamics.density, "damping_ratio": dynamics.damping_ratio}

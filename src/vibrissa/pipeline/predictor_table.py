@@ -51,9 +51,10 @@ def predictors(recording: xr.DataTree) -> xr.Dataset:
         Variables over (time, whisker), SI units, each with ``units``, ``long_name`` and
         ``description``: the six components of force and moment, the signals, the angles and
         position of the base, the rates of change of components and angles, the contact point in
-        the laboratory frame and its arc length, ``in_contact``, ``status``, ``confidence``,
-        ``event`` and ``onset_time`` with ``onset_sigma``. The attribute ``predictors`` lists the 16
-        predictors of spike models, or for a trial filmed by one camera the 8 that it measures.
+        the laboratory frame and its arc length, ``in_contact``, ``contact_probability``,
+        ``status``, ``confidence``, ``event`` and ``onset_time`` with ``onset_sigma``. The
+        attribute ``predictors`` lists the 16 predictors of spike models, or for a trial filmed by
+        one camera the 8 that it measures.
         Missing values are NaN.
 
     Raises
@@ -101,6 +102,7 @@ def predictors(recording: xr.DataTree) -> xr.Dataset:
     others = {
         "arc_length": arc,
         "in_contact": record.known("in_contact", _GROUPS),
+        "contact_probability": record.known("contact_probability", ("signals",)),
         "status": record.known("status", ("estimates", *_GROUPS)),
         "confidence": record.known("confidence", ("",)),
     }

@@ -92,8 +92,8 @@ def signals_of(
         noise: M_B above five standard deviations), ``status``, and, if known,
         ``wrench_covariance`` and the covariances of the pose. Attributes: ``source``, ``cutoff``
         and, for a sensor, ``noise``, the standard deviations of (F, M). Without inertia also
-        ``contact_force_change`` with its covariance: the true contact force minus that which the
-        signals give.
+        ``contact_probability``, above one half in contact, and ``contact_force_change`` with its
+        covariance: the true contact force minus that which the signals give.
 
     Raises
     ------

@@ -165,10 +165,10 @@ class Vibration:
             columns += [np.concatenate([g * part for g in gain]) for part in (wave.real, wave.imag)]
         return np.asarray(np.column_stack(columns), dtype=np.float64)
 
-    def in_contact(
+    def contact_probability(
         self, time: Array, wrench: Array, rotation: Array, position: Array, noise: Array
-    ) -> AnyArray:
-        """Detect the frames in which the whisker is in contact.
+    ) -> Array:
+        """Probability that the whisker is in contact (:mod:`vibrissa.simulation.vibration`).
 
         Parameters
         ----------
@@ -184,12 +184,12 @@ class Vibration:
         Returns
         -------
         (n,) array
-            True where contact has a probability above one half, given all frames
-            (:mod:`vibrissa.simulation.vibration`).
+            Probability of contact in each frame, given all frames. A frame counts as in contact if
+            it exceeds one half.
         """
         air = self.in_air(time, rotation, position)
         step = float(np.diff(time).mean())
-        return contact_probability(self, step, wrench - air, air, noise) > 0.5
+        return _contact_probability(self, step, wrench - air, air, noise)
 
 
 _LEAST_KNOWN = 0.3  # largest relative standard deviation of a quantity that counts as determined
@@ -274,7 +274,7 @@ def fit_dynamics(
     """
     dynamics = dynamics or Dynamics()
     first = Vibration.of(whisker, dynamics)
-    free = ~first.in_contact(time, wrench, rotation, position, noise)
+    free = first.contact_probability(time, wrench, rotation, position, noise) <= 0.5
     step = float(time[-1] - time[0]) / (len(time) - 1)
     starts, width = _windows(free, step, first)
     if not starts.size:
@@ -540,7 +540,7 @@ def _changed(change: Array, correlation: Array, width: float) -> Array:
     return _student(square / scale, _FREEDOM_IN_CONTACT) - 0.5 * n * np.log(scale)
 
 
-def contact_probability(
+def _contact_probability(
     vibration: Vibration, step: float, left: Array, air: Array, noise: Array
 ) -> Array:
     """Probability (n,) that a whisker is in contact in each frame, given all frames.

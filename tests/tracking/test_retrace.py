@@ -137,7 +137,7 @@ def test_lines_on_which_the_views_still_disagree_are_in_doubt(flat, monkeypatch)
     monkeypatch.setattr(sys.modules["vibrissa.tracking.space.retrace"], "_MOSTLY", 1.1)
     remark = flat.retraced()[1][1]
     assert remark.startswith("not sure which lines in front are those of whisker 0, whisker 1, wh")
-    assert "the views still disagree in many frames" in remark
+    assert "the views agree in few frames" in remark
 
 
 def test_long_films_are_decided_in_blocks(flat, monkeypatch):

@@ -27,8 +27,9 @@ _BASES, _TIPS, _FADING = 8.0, 0.1, 0.4
 # Share of the frames in which the views show one whisker, from which nothing is traced anew; and
 # change of a whisker's length from its usual one, as a share, up to which it is traced steadily.
 _AGREES, _STEADY = 0.9, 0.2
-# Share of the frames in which both views show a line, below which lines traced anew are in doubt.
-_MOSTLY = 0.6
+# Shares of all frames, and of those in which both views show a line, in which the views must agree;
+# else all lines that are traced anew are in doubt.
+_HALF, _MOSTLY = 0.5, 0.6
 # Log likelihood by which a whisker's line is to be more probable than others in the median frame:
 # below zero, most frames by themselves show another one, and only motion and bend decide.
 _SURE = 0.0
@@ -117,13 +118,14 @@ def retraced(
                 f"{100.0 * before:.0f} % of the frames, now in {100.0 * after:.0f} %."
             )
             seen = np.array([any(len(trace.line) for trace in row) for row in new])
-            unsure = seen & (margins < _SURE) if of_seen >= _MOSTLY else seen
+            agree = after >= _HALF and of_seen >= _MOSTLY
+            unsure = seen & (margins < _SURE) if agree else seen
             if unsure.any():
                 why = "most frames by themselves show other ones"
                 remarks.append(
                     f"not sure which lines in {camera.name} are those of "
                     f"{', '.join(f'whisker {k}' for k in np.flatnonzero(unsure))}: "
-                    f"{why if of_seen >= _MOSTLY else 'the views still disagree in many frames'}. "
+                    f"{why if agree else 'the views agree in few frames'}. "
                     "Compare traces and video (vibrissa correct)."
                 )
     return found, remarks

@@ -92,3 +92,11 @@ def test_noise_that_is_far_from_the_scatter_without_contact_is_doubted():
     assert "moment" not in doubt(1e3)
     assert "with noise of 2e-05 µN·m" in doubt(moment=1e-3)
     assert "successive readings" in doubt(moment=1e-4, rows=np.zeros(400, bool))
+
+
+def test_contacts_one_by_one_show_no_noise():
+    """Rows of a table of separate contacts differ as these do; none is free."""
+    rng = np.random.default_rng(5)
+    contacts = np.repeat([1e-6, 2e-8], 3) * 10.0 ** rng.uniform(1.5, 3.5, (300, 1))
+    contacts = contacts * rng.normal(size=(300, 6))
+    assert not doubted_noise(contacts, NOISE, np.zeros(300, bool))

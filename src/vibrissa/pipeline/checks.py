@@ -285,8 +285,10 @@ def edited(recording: xr.DataTree) -> list[str]:
 # Smallest and largest number of contacts tested, chosen from those with the larger moments.
 _FEW, _MOST = 6, 24
 # Number of steps without contact that show the noise; ratio of their scatter to the stated noise
-# above which, or below whose inverse, this is doubted; and standard deviation over median size.
-_FREE, _DISTRUSTED, _TO_SIGMA, _ROOT_2 = 20, 10.0, 1.4826, 2.0**0.5
+# above which, or below whose inverse, this is doubted; largest differences of successive readings,
+# over a quantile of the deviations of all, that may be noise; and standard deviation over median
+# size.
+_FREE, _DISTRUSTED, _GRADUAL, _RANGE, _TO_SIGMA, _ROOT_2 = 20, 10.0, 0.05, 0.95, 1.4826, 2.0**0.5
 # Model errors unrelated to the axes, such as those of stiffness, relative to force and moment.
 _MODEL = 0.05
 _EXPLAINED = 9.0  # largest χ² of an explained contact; a friction angle of 20° adds one to χ²
@@ -357,7 +359,8 @@ def doubted_noise(readings: Array, noise: Array, free: Mask) -> str:
     ``free`` (n,) are the rows without contact. The text is empty if the noise is plausible. Noise
     is too small if successive readings differ far more, which a drift does not cause, and too large
     if all readings are far closer together, filtered or not. If hardly any row is free, as with
-    noise that is far too small, all count, which differ more as the whisker moves.
+    noise that is far too small, all count, which differ more as the whisker moves; separate
+    contacts, which differ as much as any two, do not show noise.
     """
     some = np.count_nonzero(free) > _FREE
     rest = np.where(free[:, None] | (not some), readings, np.nan)
@@ -372,6 +375,8 @@ def doubted_noise(readings: Array, noise: Array, free: Mask) -> str:
         away = np.abs(each - np.nanmedian(each, axis=0)), np.abs(np.diff(each, axis=0)) / _ROOT_2
         scatter, change = (_TO_SIGMA * np.nanmedian(one, axis=0) for one in away)
         little, much = float(np.median(scatter / stated)), float(np.median(change / stated))
+        gradual = change < _GRADUAL * np.nanquantile(away[0], _RANGE, axis=0)
+        much *= some or bool(gradual.mean() > 0.5)
         # Readings that never change are not those of a sensor.
         if much > most or 0.0 < little < 1.0 / _DISTRUSTED:
             about = quantity(name)
@@ -383,9 +388,9 @@ def doubted_noise(readings: Array, noise: Array, free: Mask) -> str:
     if not doubts:
         return ""
     return (
-        f"{'without contact readings' if some else 'successive readings'} scatter otherwise than "
-        f"by the noise, {'; '.join(doubts)}: which contacts are detected, and their covariances, "
-        "depend on the noise"
+        f"{'readings without contact' if some else 'successive readings'} do not scatter as the "
+        f"noise states, but {'; '.join(doubts)}: which contacts are detected, and their "
+        "covariances, depend on the noise"
     )
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import xarray as xr
 from hypothesis import given, strategies as st
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
@@ -652,6 +653,18 @@ def test_a_mixing_keeps_saturation_and_resolution(rng):
     assert found.noise[0] < 3e-3
     plain = calibrate_mixing(readings, wrenches, components=("My",)).sensor
     assert plain.mixing[0, 4] < 0.95
+
+
+def test_channels_may_read_in_any_unit(rng):
+    """Mixing converts them; components themselves are in SI units."""
+    wrenches = rng.normal(size=(50, 6)) * ([1e-3] * 3 + [1e-5] * 3)
+    values = 1e3 * wrenches + rng.normal(size=(50, 6)) * 1e-6
+    readings = xr.DataArray(values, dims=("time", "channel"), attrs={"units": "mN, N·mm"})
+    found = calibrate_mixing(readings, wrenches, channels=[f"c{i}" for i in range(6)])
+    assert np.allclose(np.diag(found.sensor.mixing), 1e3, rtol=0.01)
+    assert np.isfinite(found.sensor.compensated(readings)).all()
+    with pytest.raises(ValueError, match="readings is stated in mN"):
+        Sensor().compensated(readings)
 
 
 def test_components_in_other_units_need_one_number(rng):

@@ -105,12 +105,15 @@ def _series(x: Array, first: float, ratios: tuple[int, ...]) -> Array:
     return total
 
 
-def numbers(name: str, value: object, order: Sequence[str] = ("x", "y", "z")) -> Array:
+def numbers(
+    name: str, value: object, order: Sequence[str] = ("x", "y", "z"), *, any_unit: bool = False
+) -> Array:
     """Convert a user's input to float64, with masked values as NaN, which means missing.
 
     A ``space`` dimension is moved last. If columns, or labels of the last axis, have the names in
     ``order`` (such as Fx, Fy and Fz), they must be in this order, because arrays are indexed by
-    position. A stated unit, of a labelled array or a quantity, must not be a multiple of SI units.
+    position. A stated unit, of a labelled array or a quantity, must not be a multiple of SI units,
+    except for readings of channels, which may have any unit.
     """
     given: Any = value
     if isinstance(given, list | tuple) and any(isinstance(v, np.ma.MaskedArray) for v in given):
@@ -125,7 +128,8 @@ def numbers(name: str, value: object, order: Sequence[str] = ("x", "y", "z")) ->
             return plain.astype(np.float64, copy=False)
     unit = getattr(given, "attrs", {}).get("units", getattr(given, "units", None))
     unit = getattr(given, "unit", "") if unit is None else unit
-    if any(_MULTIPLE.fullmatch(part) for part in re.findall("[A-Za-zµμ°]+", str(unit))):
+    parts = [] if any_unit else re.findall("[A-Za-zµμ°]+", str(unit))
+    if any(map(_MULTIPLE.fullmatch, parts)):
         raise ValueError(f"{name} is stated in {unit}; SI units are needed (m, N, N·m, rad, s)")
     if "space" in getattr(given, "dims", ()):
         given = given.transpose(..., "space")

@@ -119,7 +119,8 @@ def calibrate_mixing(
     UserWarning
         If errors of the wrenches hide the noise, or loads explain only a part of the readings.
     """
-    y, w = numbers("readings", readings, channels or ()), numbers("wrenches", wrenches, components)
+    y = numbers("readings", readings, channels or (), any_unit=True)
+    w = numbers("wrenches", wrenches, components)
     if y.ndim != 2 or w.shape != (len(y), 6):
         raise ValueError(
             f"readings (n, k) and wrenches (n, 6) are needed; got {y.shape} and {w.shape}"
@@ -146,7 +147,7 @@ def calibrate_mixing(
     errors = np.zeros((len(design), len(which) + 1, len(which) + 1))
     errors[:, :-1, :-1] = _checked_errors(wrench_covariances, w)[known][:, which][:, :, which]
     rounding = np.asarray(resolution) ** 2 / 12.0
-    floor = numbers("noise", noise, names)
+    floor = numbers("noise", noise, names, any_unit=True)
     if (floor < 0.0).any():
         raise ValueError(f"noise is {floor.tolist()}; it must not be negative")
     least = np.broadcast_to(floor**2 + rounding, y.shape[1:])
@@ -426,7 +427,7 @@ def calibrate_weight(
     UserWarning
         If residuals are more than five times the noise, or the mass is more than 5 kg.
     """
-    y = numbers("readings", readings)
+    y = numbers("readings", readings, any_unit=True)
     k = len(sensor.channels)
     if y.ndim != 2 or y.shape[1] != k:
         raise ValueError(f"readings are (n, {k}): {', '.join(sensor.channels)}; got {y.shape}")

@@ -193,7 +193,7 @@ class Sensor:
         array (k, k)
             Diagonal covariance, without drift and `common_errors`.
         """
-        relative = self.relative_noise * numbers("reading", reading, self.channels)
+        relative = self.relative_noise * numbers("reading", reading, self.channels, any_unit=True)
         variance = self.noise**2 + self.resolution**2 / 12.0 + relative**2
         return np.diag(variance)
 
@@ -291,7 +291,9 @@ class Sensor:
         array (..., k)
             Readings in the units of the channels; NaN if saturated.
         """
-        values = numbers("readings", readings, self.channels)
+        # Components themselves are in SI units.
+        any_unit = not (self.mixing == 1.0).any()
+        values = numbers("readings", readings, self.channels, any_unit=any_unit)
         if values.shape[-1:] != (len(self.channels),):
             raise ValueError(
                 f"readings of {', '.join(self.channels)} have a last axis of "

@@ -403,7 +403,8 @@ def follow_sweep(
     SweptContacts
         Contact points with covariance, and the surface normal there.
     """
-    y, base = numbers("readings", readings, sensor.channels), numbers("position", position)
+    y = numbers("readings", readings, sensor.channels, any_unit=True)
+    base = numbers("position", position)
     k = len(sensor.channels)
     turn = np.eye(3) if rotation is None else rotation_matrices("rotation", rotation)
     if y.ndim != 2 or y.shape[1] != k or base.shape != (len(y), 3) or turn.shape[-2:] != (3, 3):
@@ -412,7 +413,7 @@ def follow_sweep(
             f"got {y.shape}, {base.shape} and {turn.shape}"
         )
     turn = np.broadcast_to(turn, (len(y), 3, 3))
-    change = y - (y[0] if rest is None else numbers("rest", rest))
+    change = y - (y[0] if rest is None else numbers("rest", rest, any_unit=True))
     touching = np.any(np.abs(change) > _TOUCHED * sensor.uncertainty, axis=1)
     n = len(y)
     out = SweptContacts(

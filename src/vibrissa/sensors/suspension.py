@@ -160,13 +160,13 @@ def calibrate_suspension(
     ValueError
         If shapes do not match, or there are too few touches or no signal.
     """
-    p, y = numbers("points", points), numbers("readings", readings, channels or ())
+    p, y = numbers("points", points), numbers("readings", readings, channels or (), any_unit=True)
     if p.ndim != 2 or p.shape[1] != 3 or y.ndim != 2 or len(y) != len(p):
         raise ValueError(
             f"points (n, 3) and readings (n, k) are needed; got {p.shape} and {y.shape}"
         )
     names = channels or tuple(f"channel {i + 1}" for i in range(y.shape[1]))
-    zero = np.zeros(y.shape[1]) if rest is None else numbers("rest", rest)
+    zero = np.zeros(y.shape[1]) if rest is None else numbers("rest", rest, any_unit=True)
     if len(names) != y.shape[1] or zero.shape != (y.shape[1],):
         raise ValueError(f"{y.shape[1]} channels have names {names} and rest {zero.tolist()}")
     known = np.isfinite(p).all(axis=1) & np.isfinite(y).all(axis=1)

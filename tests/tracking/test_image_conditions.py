@@ -97,6 +97,19 @@ def test_overexposed_ground_may_be_searched_for_bright_whiskers():
     assert np.isfinite(scene.still.factor).all()
 
 
+def test_wires_are_removed_though_the_lamp_is_off_in_a_third_of_the_frames():
+    """Dark frames do not show that nothing stands there."""
+    random = np.random.default_rng(0)
+    empty = np.full((240, 320), 200.0)
+    empty[:, 100:104] = 120.0
+    frames = [empty + random.normal(0.0, 2.0, empty.shape) for _ in range(30)]
+    for frame in frames[:20:2]:
+        frame[:] = 0.0
+    taken = [frame.astype(np.uint8) for frame in frames]
+    scene = Scene.of(taken).with_still(np.array([[50.0, 120.0]]), taken)
+    assert scene.without_still(taken[3])[50:190, 100:104].mean() == pytest.approx(200.0, abs=3.0)
+
+
 def test_halos_of_whiskers_do_not_join_a_peg_to_the_face():
     """Side light makes one side of each whisker bright: what they sweep seems to be uneven."""
     random = np.random.default_rng(0)

@@ -251,8 +251,10 @@ class Scene:
 
         stands = things(shown, self.light, self.ground, 1.0)
         # Whiskers in side light leave bright halos in the background, but not in the usual image.
-        some = [frame / np.float32(self.gain(frame)) for frame in frames[::2]]
-        usual = np.maximum(np.median(np.stack(some), axis=0), np.float32(1.0))
+        some = [frame for frame in frames if self.lit(frame)][::2]
+        gains, usual = np.array(list(map(self.gain, some)), dtype=np.float32), np.empty_like(shown)
+        nth_largest(np.stack(some), gains, len(some) // 2 + 1, usual)
+        usual = np.maximum(usual, np.float32(1.0))
         stands &= things(usual, *_lit(usual, self.thin)[:2], _USUAL)
         stands = ndimage.binary_dilation(stands, iterations=_BLUR)
 

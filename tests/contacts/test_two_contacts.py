@@ -207,3 +207,18 @@ def test_shapes_and_forces_in_other_units_or_frames_are_not_two_contacts():
     some = np.arange(9)[:, None] > 6
     with pytest.warns(UserWarning, match="are these mN, µN"):
         vb.second_contact(whisker, some * near.force * 1e3, some * near.moment * 1e3, noise=noise)
+
+
+def test_large_forces_near_the_base_are_not_in_other_units():
+    """A peg at a twelfth of the length; warnings are errors."""
+    gamma = vb.samples.gamma()
+    arc = gamma.length / 12.0
+    size = np.array([0.0, gamma.base_bending_stiffness / arc**2, 0.0])
+    bent = vb.deflect(gamma, vb.PointForce(np.full(3, arc), components=[size] * 3))
+    assert np.linalg.norm(bent.moment, axis=-1).min() > (
+        10.0 * gamma.base_bending_stiffness / gamma.length
+    )
+    found = vb.second_contact(gamma, bent.force, bent.moment, noise=NOISE)
+    assert not found["second_contact"].any()
+    with pytest.warns(UserWarning, match="are these mN, µN"):
+        vb.second_contact(gamma, 30.0 * bent.force, 30.0 * bent.moment, noise=900.0 * NOISE)

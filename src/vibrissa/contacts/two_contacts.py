@@ -299,8 +299,10 @@ def _check_scale(whisker: Whisker, force: Array, moment: Array) -> None:
     stiff, length = whisker.base_bending_stiffness, whisker.length
     sizes = np.linalg.norm([force * length**2, moment * length], axis=-1).reshape(2, -1) / stiff
     known = sizes[:, np.isfinite(sizes).all(axis=0) & sizes.any(axis=0)]
-    typical = float(np.median(known, axis=1).min()) if known.size else 0.0
-    if typical <= _LARGE_LOAD:
+    of_force, of_moment = np.median(known, axis=1).tolist() if known.size else (0.0, 0.0)
+    typical = min(of_force, of_moment)
+    # Near the base both are large, but not the bend M²/(F EI) over the arm M/F.
+    if typical <= _LARGE_LOAD or of_moment**2 <= _LARGE_LOAD * of_force:
         return
     text = (
         f"force and moment are typically {typical:.2g} times what is natural to this whisker, "

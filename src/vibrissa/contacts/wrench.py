@@ -77,7 +77,10 @@ _SAME = 1e-3  # contacts within this (over L, and ten times it relative to the f
 
 
 class Fitted(NamedTuple):
-    """Fits by row and candidate: number (n,), x, (F, p), ∂(F, p)/∂x, χ² (n, k), padded with NaN."""
+    """Fits by row and candidate, padded with NaN.
+
+    Their number (n,), x (n, k, 4), (F, p) (n, k, 6), ∂(F, p)/∂x (n, k, 6, 4) and χ² (n, k).
+    """
 
     number: IntArray
     contacts: Array

@@ -253,7 +253,10 @@ def gather_evidence(problem: Problem, names: tuple[str, ...], resolution: bool) 
 
 
 def _search_twins(problem: Problem, names: tuple[str, ...], own: Pairs, local: Local) -> Pairs:
-    """Search for twins farther from rest, repeatedly in regions that seem to have none."""
+    """Search for twins farther from rest, repeatedly in regions that seem to have none.
+
+    A contact at which det ∂T/∂p has the rarer sign has a twin, perhaps in another region.
+    """
     wide = problem.wide
     pool = concatenate([own, _twins_of(problem, names, wide.rows(local.near_folds))])
     without = _regions_without_witness(problem, pool, problem.regions)

@@ -135,7 +135,10 @@ def _items(file: h5py.File, faults: list[str]) -> Iterator[tuple[str, h5py.HLObj
 
 @lru_cache(maxsize=64)
 def _check(path: Path, size: int, version: tuple[int, ...]) -> list[str]:
-    """Check a file by `_check_items`; ``version`` marks changes, as results are cached."""
+    """Raise ValueError for harmful files; list what NetCDF-4 files do not have.
+
+    ``version`` marks changes of the file, as results are cached.
+    """
     _check_heaps(path)
     with h5py.File(path, "r") as file:
         return _check_items(file, size)

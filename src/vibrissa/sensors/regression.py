@@ -87,7 +87,10 @@ _RATIOS = np.logspace(-7, 1, 17)
 
 @dataclass(frozen=True, eq=False)
 class ThinPlate:
-    """Mean of a thin-plate Gaussian process of k quantities, with fitted noise (k,)."""
+    """Mean of a thin-plate Gaussian process of k quantities, with fitted noise (k,).
+
+    ``reach`` is the R of the kernel, at least the distance between any two ``points`` (n, 3).
+    """
 
     points: Array
     weights: Array

@@ -89,7 +89,12 @@ class Sample(NamedTuple):
 
 
 class Lines:
-    """Parser of lines of CSV or JSON; of several choices of names, the first that a line has."""
+    """Parser of lines of CSV or JSON; of several choices of names, the first that a line has.
+
+    ``raw`` names are those of a sensor's channels, which must match exactly and have no units. For
+    a named ``whisker``, values are named ``name.value``, and lines with only those of others are
+    ignored.
+    """
 
     def __init__(self, *names: tuple[str, ...], raw: bool = False, whisker: str = "") -> None:
         self.names, self.raw = names, raw

@@ -160,7 +160,11 @@ class Answers:
 
 
 class NewestLines:
-    """Endless iterator over the lines of the newest datagram; earlier samples are dropped."""
+    """Endless iterator over the lines of the newest datagram.
+
+    Samples of earlier waiting datagrams are dropped and counted; headers, and the poses needed to
+    extrapolate the motion of the base, are kept.
+    """
 
     def __init__(self, opened: socket.socket, kind: Callable[[str], LineKind]) -> None:
         self.dropped = 0

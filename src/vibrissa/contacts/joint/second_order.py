@@ -131,7 +131,11 @@ def displace_rows(
     first: Array,
     known: AnyArray,
 ) -> None:
-    """Fill principal axes (n, u, u), contacts displaced along them, and first-order covariances."""
+    """Fill principal axes (n, u, u) in columns, and contacts (n, u, 4) displaced along them.
+
+    Fill also the displacements (n, u), the covariances (n, 3, 3) to first order, and whether the
+    unknowns are determined.
+    """
     free = how.free
     r, u, n = design.shape[1], axes.shape[1], free.shape[0]
     clean, across = np.empty((r, u)), np.empty(3)
@@ -348,7 +352,11 @@ def cloud_rows(
     covariance: Array,
     valid: AnyArray,
 ) -> None:
-    """Fill covariances (n, 3, 3) of contact points from clouds, and whether they are valid."""
+    """Fill covariances (n, 3, 3) of contact points from clouds, and whether they are valid.
+
+    ``contacts`` and ``displaced`` are values, derivatives and x; ``joint`` residuals and the
+    derivatives of these and of the points; ``principal`` axes and displacements along them.
+    """
     k, n, u = how.codes.shape[0], how.free.shape[0], node.shape[1]
     number, all_r = node.shape[0], joint[0].shape[1]
     q = k + n  # with friction its angle is a row, so that those above the channels are square

@@ -388,7 +388,11 @@ def _second_order(
 
 
 class JudgeRoom(NamedTuple):
-    """Working memory of `judge`: a rod's buffer, slopes, zeros, expansion and nodes."""
+    """Working memory of `judge`.
+
+    The rod's buffer, slopes of residuals (k, 3) and of the point (3, 3), zeros (3,), the expansion
+    and the nodes.
+    """
 
     buffer: Array
     j: Array

@@ -217,6 +217,7 @@ def test_frames_that_one_camera_dropped_have_no_partner(view, gap):
     assert len(pairs) == 70 - 2 * gap
     (remark,) = remarks_on_time(pair, rows, 0)
     assert f"{pair[view].name} dropped {gap} frame" in remark
+    assert (f"later ones are {gap} too early" in remark) == (view == 0)
     assert dropped_frames(pair[:1], rows[view : view + 1]) == []
 
 

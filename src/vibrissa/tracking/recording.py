@@ -600,9 +600,14 @@ def remarks_on_time(
             "in this view only"
         )
         if certain:
+            late = (
+                ""
+                if view
+                else f" Times count its frames, so that later ones are {count} too early."
+            )
             found.append(
                 f"{name} dropped {frames} {shown}. Later frames are paired accordingly; record "
-                "without losses, as not all of them show."
+                f"without losses, as not all of them show.{late}"
             )
         else:
             found.append(

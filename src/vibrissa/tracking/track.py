@@ -75,6 +75,7 @@ from vibrissa.tracking.space.frame_steps import without_repeats
 from vibrissa.tracking.space.pose import CUTOFF, BasePose, HeadPose, base_pose, rolled_over
 from vibrissa.tracking.space.rest_shape import (
     LEAST_SEEN,
+    Astray,
     Length,
     RestShape,
     known_rest,
@@ -86,6 +87,7 @@ from vibrissa.tracking.space.rest_shape import (
     unseen_part,
     whisker_at_rest,
 )
+from vibrissa.tracking.trace.blur import with_blur
 from vibrissa.tracking.trace.trace import Trace
 from vibrissa.whisker import Pose, Whisker
 
@@ -464,7 +466,7 @@ def track_whisker(
 ) -> Tracked:
     """Track one whisker, or one of a row, from traces of frames that belong together, by view."""
     report = progress or (lambda stage, done, total: None)
-    traces = with_one_tip(cameras, traces)
+    traces, blur = with_blur(with_one_tip(cameras, traces))
     series = TraceSeries.of(traces)
     _check_views(cameras, series, name)
     curves = all_merged(cameras, traces, partial(report, f"{name} in space"))
@@ -475,7 +477,7 @@ def track_whisker(
     tips: Mask = np.all(series.ends[:, :, 1] > 0.5, axis=1)
     sparse = any(trace.sparse for view in traces for trace in view)
     pixel, flat = _pixel_at(cameras, on_head), len(cameras) == 1
-    astray = (_CROSSED if row and not sparse else _ASTRAY) * pixel
+    astray = Astray((_CROSSED if row and not sparse else _ASTRAY) * pixel, blur * pixel)
     rest = partial(_at_rest, options, name, tips, flat, sparse, astray)
     shape, whisker = rest(on_head)
     plane = plane_of(on_head, shape, tips) if flat else Plane(None, np.zeros(len(points)))
@@ -575,8 +577,7 @@ def _bent(fitter: Fitter, begun: _Begun, options: TrackOptions) -> _Bent:
     if options.whisker is None and options.length is not None:
         length = unseen_part(shape, stated_length(shape, options.length, tapers))
     elif options.whisker is None and shape.whole:
-        steps = np.diff(fitter.curves[shape.free & tips], axis=1)
-        lengths = np.linalg.norm(steps, axis=2).sum(axis=1)
+        lengths = np.linalg.norm(np.diff(fitter.curves[shape.free & tips], axis=1), axis=2).sum(1)
         length = further or seen_length(lengths, fitter.traces.line, tapers)
     elif options.whisker is None:
         length = unseen_part(shape, _length(fitter, shape, options))
@@ -598,7 +599,7 @@ def _at_rest(
     tips: Mask,
     flat: bool,
     sparse: bool,
-    astray: float,
+    astray: Astray,
     curves: Array,
     hidden: float = 0.0,
 ) -> tuple[RestShape, Whisker]:
@@ -656,7 +657,11 @@ def _length(fitter: Fitter, shape: RestShape, options: TrackOptions) -> Length:
     if some is None:
         # Few bent frames do not show it, so that it is only known what is usual.
         touched = bool(fitter.touching.any())
-        return likeliest_length(shape.length, _alike) if touched else Length(shape.length, np.nan)
+        return (
+            likeliest_length(shape.length, lambda _: 0.0)
+            if touched
+            else Length(shape.length, np.nan)
+        )
     cost = some.costs(shape.length)
 
     def of(length: float) -> float:
@@ -671,10 +676,6 @@ def _length(fitter: Fitter, shape: RestShape, options: TrackOptions) -> Length:
         return cost(whisker, BasePose(**values))
 
     return likeliest_length(shape.length, of)
-
-
-def _alike(_: float) -> float:
-    return 0.0
 
 
 def _check_views(cameras: Sequence[Camera], series: TraceSeries, name: str) -> None:

@@ -122,11 +122,21 @@ class RestShape:
         return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
 
 
+class Astray(NamedTuple):
+    """Errors of curves besides noise, m: a bent whisker deviates by more than these."""
+
+    pose: float = 0.0  # that vary with the pose only
+    motion: Array | float = 0.0  # (time,) in each frame, by blur
+
+
+_EXACTLY = Astray()
+
+
 def rest_shape(
     curves: Array,
     least: float = 0.1,
     tips: Mask | None = None,
-    astray: float = 0.0,
+    astray: Astray = _EXACTLY,
     hidden: float = 0.0,
     *,
     fur: float = _FURRED,
@@ -141,9 +151,8 @@ def rest_shape(
         Smallest share of the frames that are free of contact.
     tips : array (time,), optional
         Whether the curve ends at the whisker's tip in each frame; by default in all.
-    astray : float
-        Errors of the curves that vary with the pose only, m: how much more than by noise a
-        whisker surely is bent.
+    astray : Astray
+        Errors of the curves besides noise.
     hidden : float
         Share of the curves at the base in which they are not on the whisker, and not compared.
     fur : float
@@ -217,11 +226,12 @@ def rest_shape(
     out = np.full(len(curves), np.nan)
     out[seen] = np.where(np.isfinite(deviation), deviation, np.nan)
     within = max(_limit(spread, white), _EXACT * length)
-    free = _free(out, within, float(np.hypot(within, astray)))
+    limits = np.hypot(np.full(len(out), within), astray.motion)
+    free = _free(out, limits, np.hypot(limits, astray.pose))
     return RestShape(points, free, out, noise, ends, ringing)
 
 
-def _free(deviation: Array, within: float, sure: float) -> Mask:
+def _free(deviation: Array, within: Array, sure: Array) -> Mask:
     """Frames that are free of contact, by their deviations (time,) and the limits of these.
 
     Some errors of curves vary with the pose of the whisker, and exceed the usual limit in some
@@ -232,8 +242,8 @@ def _free(deviation: Array, within: float, sure: float) -> Mask:
     touching = known >= sure
     for _ in range(2):
         for i in range(1, len(known)):
-            touching[i] |= touching[i - 1] and within <= known[i] < known[i - 1]
-        known, touching = known[::-1], touching[::-1]
+            touching[i] |= touching[i - 1] and within[i] <= known[i] < known[i - 1]
+        known, within, touching = known[::-1], within[::-1], touching[::-1]
     return np.asarray(np.isfinite(deviation) & ~touching)
 
 

@@ -121,8 +121,9 @@ def traced(
     line, along = line[first:last], along.part(slice(first, last))
     trusted = min(1.0, float(along.seen.sum() / max(along.open.sum(), 1)))
     base_seen = inside(frame, line[0])
-    skew = _skew(frame, line, options.scale, clutter)
-    return Trace(line, along.sigma, along.seen, trusted, base_seen, tip_seen, skew), from_face
+    skew, width = _profile(frame, line, options.scale, clutter)
+    trace = Trace(line, along.sigma, along.seen, trusted, base_seen, tip_seen, skew, width=width)
+    return trace, from_face
 
 
 def _beginning(
@@ -196,8 +197,10 @@ def _above_texture(
     return along._replace(amplitude=along.amplitude - usual, noise=noise), spread
 
 
-def _skew(frame: Frame, line: Array, scale: float, clutter: Clutter) -> float:
-    """Third cumulant of the darkness across a line's nearer half, pixels³; NaN if it is hidden.
+def _profile(frame: Frame, line: Array, scale: float, clutter: Clutter) -> tuple[float, float]:
+    """Third cumulant of the darkness across a line's nearer half, pixels³, and its width, pixels.
+
+    Both are NaN if it is hidden.
 
     Symmetric blur does not change it. With a Gaussian g of the profile's width and the distance u
     in units of it, the odd part of the profile is fitted by a slope of the background, a shift and
@@ -207,7 +210,7 @@ def _skew(frame: Frame, line: Array, scale: float, clutter: Clutter) -> float:
     sides = grey_flanks(frame, half, scale * _ACROSS, clutter)
     sides = sides[..., np.isfinite(sides).all(axis=(0, 1))]
     if not sides.shape[2]:
-        return np.nan
+        return np.nan, np.nan
     left, right = sides.mean(axis=2).T
     dark = 0.5 * (left[-1] + right[-1]) - 0.5 * (left + right)
     # Distances occur on both sides, the middle once.
@@ -219,7 +222,9 @@ def _skew(frame: Frame, line: Array, scale: float, clutter: Clutter) -> float:
     depth = float(count * dark @ g) / float(count @ g**2)
     basis = np.array([u, u * g, (u**3 - 3.0 * u) * g])
     odd = np.linalg.lstsq(basis.T, 0.5 * (right - left))[0]
-    return float(6.0 * odd[2] / depth * (width * scale) ** 3) if depth > 0.0 else np.nan
+    if not depth > 0.0:
+        return np.nan, np.nan
+    return float(6.0 * odd[2] / depth * (width * scale) ** 3), float(width * scale)
 
 
 def _with_base(frame: Frame, line: Array, before: float, clutter: Clutter) -> tuple[Array, bool]:

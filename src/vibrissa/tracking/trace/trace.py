@@ -95,6 +95,8 @@ class Trace(NamedTuple):
         shows whether it shakes.
     begin_sigma : float
         Standard deviation, along it, of where on the whisker it begins, pixels.
+    width : float
+        Standard deviation of its darkness across it, on its nearer half, pixels; NaN if unknown.
     """
 
     line: Array
@@ -107,6 +109,7 @@ class Trace(NamedTuple):
     sparse: bool = False
     shift: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     begin_sigma: float = 1.0
+    width: float = np.nan
 
     @classmethod
     def lost(cls) -> Trace:

@@ -144,6 +144,7 @@ class Estimator:
             friction=friction,
             compliance_sigma=compliance,
             stiffness_sigma=stiffness,
+            without_weight=self._sensor is not None and self._sensor.mass > 0.0,
         )
 
     @classmethod
@@ -174,7 +175,9 @@ class Estimator:
             Possible contacts.
         gravity : Gravity or (3,) array_like, optional
             Gravity that the whisker bends under, as of `Estimator`, for sensors whose channels
-            determine the six signals.
+            determine the six signals. The mass of a sensor includes the whisker's, as found by
+            `calibrate_weight` with the whisker mounted, unless `Gravity.tare` is stated: zeros,
+            if it is without the whisker.
 
         Returns
         -------

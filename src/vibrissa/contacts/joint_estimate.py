@@ -120,6 +120,7 @@ class JointEstimate:
         compliance_sigma: float = 0.0,
         stiffness_sigma: float = 0.0,
         same_friction: bool = False,
+        without_weight: bool = False,
     ) -> None:
         refuse_tip(prior, "friction, weight or an uncertain base is stated")
         if sensor is None and gravity is not None and gravity.uncertain:
@@ -141,6 +142,7 @@ class JointEstimate:
             "compliance_sigma": compliance_sigma,
             "stiffness_sigma": stiffness_sigma,
             "same_friction": same_friction,
+            "without_weight": without_weight,
         }
         self._lab, self._proposing = gravity, None if gravity is None else gravity.acceleration
         self._path: _Path | None = None
@@ -265,7 +267,8 @@ class JointEstimate:
             turn = np.linalg.norm(np.subtract(out._proposing, self._proposing))
             if turn < self._turn * np.linalg.norm(stated.acceleration):
                 out._proposing = self._proposing
-        out._lab = replace(stated, tare=weight.tare)
+        # The first pose is that of the tare, unless readings are without weight in every pose.
+        out._lab = stated if self._how["without_weight"] else replace(stated, tare=weight.tare)
         out._step, out._turn = self._step, self._turn
         out._path, out._searches = self._path, self._searches
         return out

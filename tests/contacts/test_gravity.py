@@ -275,6 +275,16 @@ def test_the_filter_follows_contacts_of_a_whisker_with_weight(nitinol, swung):
         size = away[gravity] @ np.linalg.solve(found.covariance, away[gravity])
         assert (size < 16.0) == (gravity is not None)
     assert np.linalg.norm(away[0, 0, -G]) < 0.1 * np.linalg.norm(away[None])
+    # A stiffer rod, whose signals are larger than the filter assumes.
+    stiff = 1.03
+    locate = vb.Estimator(
+        nitinol, ("Fx", "MB", "MD"), noise, gravity=(0, 0, -G), stiffness_sigma=stiff - 1.0
+    )
+    follow = vb.ContactFilter(locate, speed=1e-3)
+    for i, turn in enumerate(rotations):
+        found = follow(0.01 * i, stiff * values[i], turn)
+    away = found.point - held
+    assert away @ np.linalg.solve(found.covariance, away) < 16.0
     uncertain = vb.Gravity((0, 0, -G), direction_sigma=0.1)
     locate = vb.Estimator(nitinol, ("Fx", "MB", "MD"), noise, gravity=uncertain)
     with pytest.raises(ValueError, match="uncertain gravity"):

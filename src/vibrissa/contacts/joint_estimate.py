@@ -221,8 +221,12 @@ class JointEstimate:
 
     @property
     def uncertain(self) -> bool:
-        """Whether friction, or any parameter that measurements share, is uncertain."""
-        return bool(self.forward.errors or self._rubbing)
+        """Whether friction, the weight or the base is uncertain.
+
+        An uncertain stiffness is an error of gain, compared with which that of the sag is small.
+        """
+        weight = self.gravity is not None and self.gravity.uncertain
+        return bool(self._rubbing or self._how["compliance_sigma"]) or weight
 
     @property
     def sagged(self) -> ChartedWhisker:

@@ -275,20 +275,31 @@ def test_the_filter_follows_contacts_of_a_whisker_with_weight(nitinol, swung):
         size = away[gravity] @ np.linalg.solve(found.covariance, away[gravity])
         assert (size < 16.0) == (gravity is not None)
     assert np.linalg.norm(away[0, 0, -G]) < 0.1 * np.linalg.norm(away[None])
-    # A stiffer rod, whose signals are larger than the filter assumes.
-    stiff = 1.03
-    locate = vb.Estimator(
-        nitinol, ("Fx", "MB", "MD"), noise, gravity=(0, 0, -G), stiffness_sigma=stiff - 1.0
-    )
-    follow = vb.ContactFilter(locate, speed=1e-3)
-    for i, turn in enumerate(rotations):
-        found = follow(0.01 * i, stiff * values[i], turn)
-    away = found.point - held
-    assert away @ np.linalg.solve(found.covariance, away) < 16.0
     uncertain = vb.Gravity((0, 0, -G), direction_sigma=0.1)
     locate = vb.Estimator(nitinol, ("Fx", "MB", "MD"), noise, gravity=uncertain)
     with pytest.raises(ValueError, match="uncertain gravity"):
         vb.ContactFilter(locate)
+
+
+def test_the_filter_takes_an_uncertain_stiffness_if_the_sag_hardly_depends_on_it(nitinol, swung):
+    rotations, rows, points = swung
+    noise = covariance(nitinol.whisker)
+    shaken = rows + np.random.default_rng(4).normal(size=rows.shape) * np.sqrt(np.diag(noise))
+    six = vb.base_signals(shaken[:, :3], shaken[:, 3:])
+    softer = nitinol.whisker.with_properties(youngs_modulus=0.997 * RODS["nitinol"][3])
+    assumed = vb.ContactMap.simulate(softer, grid=False, cells=(8, 16, 8))
+
+    def filtered(sigma):
+        how = {"gravity": (0, 0, -G), "stiffness_sigma": sigma}
+        return vb.ContactFilter(vb.Estimator(assumed, ("Fx", "MB", "MD"), noise, **how), speed=1e-3)
+
+    follow = filtered(0.003)
+    for i, turn in enumerate(rotations):
+        found = follow(0.01 * i, [six[name][i] for name in ("Fx", "MB", "MD")], turn)
+    away = found.point - rotations[0] @ points[0]
+    assert away @ np.linalg.solve(found.covariance, away) < 11.3  # 99 %
+    with pytest.raises(ValueError, match="sag is then uncertain"):
+        filtered(0.02)
 
 
 def read_since(whisker, tare, pull, load):

@@ -248,7 +248,7 @@ class Estimator:
 
     @property
     def softened(self) -> bool:
-        """Whether friction, the weight or the base is uncertain."""
+        """Whether friction, the weight, the sag or the base is uncertain."""
         return self._base is not None or (self._joint is not None and self._joint.uncertain)
 
     @property

@@ -65,6 +65,7 @@ _NEAR_ARC, _NEAR_FORCE = (0.02, 0.05), (0.1, 0.3)
 # Displacement of the tip, over L, due to a turn of the base within which one resting shape proposes
 # contacts; and the least and the largest such turn, rad.
 _AS_BENT, _LEAST_TURN, _LARGEST_TURN = 0.01, 0.2, 1.0
+_SAME_SAG = 3e-4  # standard deviation of the tip's sag, over L, that a filter neglects
 
 
 class _Path(NamedTuple):
@@ -221,12 +222,14 @@ class JointEstimate:
 
     @property
     def uncertain(self) -> bool:
-        """Whether friction, the weight or the base is uncertain.
+        """Whether friction, the weight or the base is uncertain, or the stiffness and so the sag.
 
-        An uncertain stiffness is an error of gain, compared with which that of the sag is small.
+        A small uncertainty of the sag is neglected: an uncertain stiffness is an error of gain.
         """
         weight = self.gravity is not None and self.gravity.uncertain
-        return bool(self._rubbing or self._how["compliance_sigma"]) or weight
+        if self._rubbing or self._how["compliance_sigma"] or weight:
+            return True
+        return self.forward.weighted and self._how["stiffness_sigma"] * self._sag > _SAME_SAG
 
     @property
     def sagged(self) -> ChartedWhisker:
@@ -280,13 +283,16 @@ class JointEstimate:
     @cached_property
     def _turn(self) -> float:
         """Turn of the base, rad, up to which a resting shape proposes contacts."""
+        return float(np.clip(_AS_BENT / max(self._sag, 1e-300), _LEAST_TURN, _LARGEST_TURN))
+
+    @property
+    def _sag(self) -> float:
+        """Sag of the tip, over L, of a level cylinder; it is about half as large with a taper."""
         assert self._lab is not None
         assert self.whisker.density is not None
-        # Sag of the tip, over L, of a level cylinder; it is about half as large with a taper.
         load = self.whisker.density * float(np.linalg.norm(self._lab.acceleration))
         stiffness = self.whisker.youngs_modulus * self.whisker.base_radius**2
-        sag = 0.5 * load * self.whisker.length**3 / stiffness
-        return float(np.clip(_AS_BENT / max(sag, 1e-300), _LEAST_TURN, _LARGEST_TURN))
+        return 0.5 * load * self.whisker.length**3 / stiffness
 
     def untared(self, values: Array) -> Array:
         """Measurements (n, k), SI units, as if the sensor had been tared in this pose."""

@@ -186,7 +186,8 @@ class ContactFilter:
             raise ValueError(f"memory is a time, positive, s; got {memory!r}")
         if estimator.softened:
             raise ValueError(
-                "a filter does not support friction, compliance_sigma, or uncertain gravity"
+                "a filter does not support friction, compliance_sigma, uncertain gravity, or an "
+                "uncertain stiffness of a whisker whose sag is then uncertain by more than 0.0003 L"
             )
         refuse_tip(estimator.prior, "a filter takes contacts of the side")
         if not estimator.noisy:

@@ -1010,3 +1010,20 @@ def test_a_bag_may_hold_the_pose_of_what_carries_the_base(map_file, wrench, tmp_
 def test_what_cannot_be_is_said(options, message, map_file):
     with pytest.raises((ValueError, OSError), match=message):
         stream(*options, "--map", map_file)
+
+
+@pytest.mark.parametrize("repeats", [1, 4])
+def test_a_sensor_that_is_slower_than_its_lines_is_noticed(gamma_map, repeats):
+    whisker = gamma_map.whisker
+    touch = vb.deflect(whisker, vb.PointForce(0.7 * whisker.length, 2e-4, 0.3))
+    wrench = np.concatenate([touch.force, touch.moment])
+    noisy = wrench + NOISE * np.random.default_rng(0).normal(size=(160, 6))
+    sensor = Sensor(noise=NOISE)
+    running = ContactStream(Estimator.of_sensor(gamma_map, sensor, felt_above=5.0), COMPONENTS)
+    lines = [
+        json.dumps({"time": 0.001 * i} | dict(zip(COMPONENTS, noisy[i // repeats], strict=True)))
+        for i in range(160)
+    ]
+    assert all(record["status"] == "unique" for record in running.records(lines))
+    said = " ".join(advice(running))
+    assert ("120 of 160 samples with signals have exactly" in said) == (repeats > 1)

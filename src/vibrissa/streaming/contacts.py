@@ -110,7 +110,8 @@ class ContactStream:
         self._headers = 0
         self.poses = poses or Poses()
         self.laboratory = ""
-        self.slow, self.untimed, self.unused = 0, 0, False
+        self.slow, self.untimed, self.repeated, self.unused = 0, 0, 0, False
+        self._values: list[float] = []
 
     def records(self, lines: Iterable[str]) -> Iterator[dict[str, Any]]:
         """Convert lines to records, one per sample and one per unreadable line.
@@ -203,6 +204,7 @@ class ContactStream:
         self._headers = self.lines.headers
         self.slow += sample.time is not None and time > self._time + _SLOW > -math.inf
         self._time = max(self._time, time)
+        before, self._values = self._values, sample.values.tolist()
         rotation, position = self._pose(sample, time)
         sensor, gravity = self._estimator.sensor, None
         if sample.acceleration is not None:
@@ -251,6 +253,7 @@ class ContactStream:
             known |= followed_record(followed, rotation)
             place, spread, reliable = followed.point, followed.covariance, True
         status = known["status"]
+        self.repeated += before == self._values and status != "not_felt"
         excess = self._estimator.readout.excess(measurement) / self._offset.unsteadiness
         event = self._events(
             time,
@@ -432,6 +435,7 @@ _NEARLY_ALL = 0.9  # share of samples above which a wrong unit of time is suspec
 # Share of samples with signals that no contact explains, and their number, from which a general
 # error is suspected: noise alone leaves one in a thousand unexplained.
 _MANY, _SEVERAL = 0.2, 5
+_REPEATED = 100  # number of repeated readings of a contact, from which they are questioned
 _FAST = 0.02  # share of poses at an implausible speed above which their unit is questioned
 
 
@@ -471,6 +475,13 @@ def advice(stream: ContactStream) -> list[str]:
         )
     if stream.off_zero:
         out.append(OFF_ZERO)
+    if stream.repeated > max(_MANY * touching, _REPEATED):
+        out.append(
+            f"{stream.repeated} of {touching} samples with signals have exactly the readings of the one before. "
+            "Either the sensor is slower than the lines, and readings are older than their times "
+            "and poses state: send each reading once. Or its resolution is coarser than its noise, "
+            "and must be stated."
+        )
     if stream.slow > _NEARLY_ALL * max(total - 1, 1):
         out.append("Samples are a second or more apart: is their time in s?")
     if stream.poses.too_fast > _FAST * stream.poses.number > 0:

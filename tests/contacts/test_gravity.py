@@ -367,6 +367,27 @@ def test_a_base_that_accelerates_is_known_by_its_accelerometer(nitinol, kind):
         assert "accelerometer" in advice(running)[0]
 
 
+@pytest.mark.parametrize("drift", [0.0, 1.0])
+def test_the_weight_is_no_offset_of_a_base_that_turns(nitinol, drift):
+    """Not when the sensor is tared while the base turns, nor when its drift is followed."""
+    noise = np.sqrt(np.diag(covariance(nitinol.whisker)))
+    sensor = Sensor(noise=noise, drift=drift * noise).with_new_offset(20)
+    locate = vb.Estimator.of_sensor(nitinol, sensor, felt_above=5.0, gravity=(0.0, 0.0, -G))
+    turns = Rotation.from_rotvec(np.outer(0.005 * np.arange(200), [0.0, 1.0, 0.0]))
+    readings = read_at_rest(nitinol.whisker, Gravity((0.0, 0.0, -G)), turns.as_matrix(), 200)
+    running = ContactStream(locate, COMPONENTS, tare=20)
+    samples = [
+        (None, *np.split(reading, 2), dict(zip((*POSITION, *QUATERNION), pose, strict=True)))
+        for reading, pose in zip(
+            readings,
+            np.column_stack([np.zeros((200, 3)), turns.as_quat()[:, [3, 0, 1, 2]]]),
+            strict=True,
+        )
+    ]
+    found = [record["status"] for record in running.records(lines_of(samples))]
+    assert found == ["tare"] * 20 + ["not_felt"] * 180
+
+
 def test_a_stream_that_is_warm_counts_the_sensor_as_tared_in_its_first_pose(nitinol):
     whisker, upright = nitinol.whisker, Rotation.from_rotvec([0.0, 0.5 * np.pi, 0.0])
     pull = upright.inv().apply([0.0, 0.0, -G])

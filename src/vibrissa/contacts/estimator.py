@@ -341,6 +341,15 @@ class Estimator:
             values = self._joint.untared(values[None])[0]
         return self.readout.scaled(values)
 
+    def reading_at_rest(self, rotation: Array | None, gravity: Array | None) -> Array | float:
+        """Readings (k,) of a sensor due to the weight of the free whisker since the tare."""
+        if self._joint is None or self._sensor is None or rotation is None:
+            return 0.0
+        self._joint = self._joint.turned(rotation, gravity)
+        d = self._joint.d
+        scale = np.repeat([d.force, d.moment], 3)
+        return np.asarray(self._sensor.base_mixing @ (scale * self._joint.forward.shift))
+
     def locate(self, measurement: Measurement) -> Contact:
         """Locate one measurement.
 

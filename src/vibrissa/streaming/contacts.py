@@ -287,10 +287,11 @@ class ContactStream:
         return self.poses.at(time) or (rotation, position)
 
     def _compensated(self, values: Array, rotation: Array | None, gravity: Array | None) -> Array:
-        """Readings without the sensor's stated offset and the weight that it carries."""
+        """Readings without the sensor's stated offset and the weight of all that it carries."""
         sensor = self._estimator.sensor
         assert sensor is not None
-        return sensor.compensated(values, rotation, GRAVITY if gravity is None else gravity)
+        left = sensor.compensated(values, rotation, GRAVITY if gravity is None else gravity)
+        return left - self._estimator.reading_at_rest(rotation, gravity)
 
     @property
     def off_zero(self) -> bool:
@@ -477,10 +478,10 @@ def advice(stream: ContactStream) -> list[str]:
         out.append(OFF_ZERO)
     if stream.repeated > max(_MANY * touching, _REPEATED):
         out.append(
-            f"{stream.repeated} of {touching} samples with signals have exactly the readings of the one before. "
-            "Either the sensor is slower than the lines, and readings are older than their times "
-            "and poses state: send each reading once. Or its resolution is coarser than its noise, "
-            "and must be stated."
+            f"{stream.repeated} of {touching} samples with signals have exactly the readings of "
+            "the one before. Either the sensor is slower than the lines, and readings are older "
+            "than their times and poses state: send each reading once. Or its resolution is "
+            "coarser than its noise, and must be stated."
         )
     if stream.slow > _NEARLY_ALL * max(total - 1, 1):
         out.append("Samples are a second or more apart: is their time in s?")

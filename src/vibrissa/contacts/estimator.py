@@ -342,7 +342,20 @@ class Estimator:
         return self.readout.scaled(values)
 
     def reading_at_rest(self, rotation: Array | None, gravity: Array | None) -> Array | float:
-        """Readings (k,) of a sensor due to the weight of the free whisker since the tare."""
+        """Readings of a sensor due to the weight of the free whisker since the tare.
+
+        Parameters
+        ----------
+        rotation : array (3, 3) or None
+            Rotation of the base, from the whisker frame to that of gravity.
+        gravity : array (3,) or None
+            Gravity minus the acceleration of the base, m/s²; by default the one stated at first.
+
+        Returns
+        -------
+        array (k,) or float
+            The readings, in units of the sensor's channels; 0 without weight or rotation.
+        """
         if self._joint is None or self._sensor is None or rotation is None:
             return 0.0
         self._joint = self._joint.turned(rotation, gravity)

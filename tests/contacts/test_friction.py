@@ -72,6 +72,28 @@ def test_whether_one_object_has_friction_is_one_question(gamma_map, ratio, absen
         assert missed(found, truth) < 0.8 * missed(alone, truth)
 
 
+@pytest.mark.parametrize("using", ["Fx FT MB MD", "Fx FT FD Mx MB MD"])
+def test_light_contacts_with_friction_are_not_drawn_towards_the_tip(gamma_map, using):
+    """Signals hardly determine where they are, but most of the space within reach is there."""
+    rng = np.random.default_rng(7)
+    arc, bearing = 0.6 * gamma_map.whisker.length, rng.uniform(0.0, 2.0 * np.pi, COUNT)
+    force = rng.uniform(6e-6, 12e-6, COUNT)
+    along = 0.2 * np.cos(rng.uniform(0.0, 2.0 * np.pi, COUNT))
+    components = force * np.stack([along, np.cos(bearing), np.sin(bearing)])
+    bent = vb.deflect(
+        gamma_map.whisker, vb.PointForce(np.full(COUNT, arc), components=tuple(components))
+    )
+    noise = rng.normal(size=(COUNT, 6)) * np.sqrt(np.diag(NOISE))
+    light = vb.base_signals(bent.force + noise[:, :3], bent.moment + noise[:, 3:])
+    # Whether there is friction is decided by others, which are clear.
+    _, _, clear = rubbed(gamma_map, 0.3, count=20)
+    signals = {name: np.append(light[name], clear[name]) for name in light}
+    found = gamma_map.estimate(signals, using, NOISE, friction=0.3, same_friction=True)
+    away = np.linalg.norm(found.point[:COUNT] - bent.contact_point, axis=1)
+    predicted = np.sqrt(np.trace(found.covariance[:COUNT], axis1=1, axis2=2))
+    assert np.median(away) < 1.1 * np.median(predicted)
+
+
 def test_one_measurement_of_an_object_decides_by_itself(gamma_map):
     """Evidence that each of several contributes is bounded, which would widen its covariance."""
     _, _, signals = rubbed(gamma_map, 0.3, seed=4)

@@ -6,13 +6,16 @@ prior µ_x ~ N(0, σ²) as one more channel, three signals give as many equation
 The contacts that explain measured signals form a curve: one contact for each arc length s, since
 the force there has three components. The curve is short if four or more signals determine µ_x; for
 three it bends too much for an ellipsoid. So it is traced along the whisker, more finely where
-contacts are probable. At each s the force has, to first order, a covariance C_f. With a uniform
-prior of contact points and the stated one of ratios, the density of s is
+contacts are probable. At each s the force has, to first order, a covariance C_f. With the stated
+prior of ratios, and contacts distributed evenly along the whisker and over the distance y from its
+rest shape to which they bend it, the density of s is
 
-    exp(-χ²/2 - µ_x²/2σ²) |∂(p, µ_x)/∂(s, f)| √det C_f,
+    exp(-χ²/2 - µ_x²/2σ²) |∂(p, µ_x)/∂(s, f)| √det C_f / y,
 
-and the contact point is a mixture along the curve. Its second moment about the contact nearest to
-its mean, widened for tails as in :mod:`~vibrissa.contacts.uncertainty.posterior`, is the
+with y² increased by its variance. Contact points that are distributed evenly in space, without
+1/y, would be too near the tip if signals hardly determine s: most of the space that a moment can
+reach is there. The contact point is a mixture along the curve. Its second moment about the contact
+nearest to its mean, widened for tails as in :mod:`~vibrissa.contacts.uncertainty.posterior`, is the
 covariance. If the density has several peaks with valleys between them, these are separate
 candidates.
 
@@ -124,14 +127,14 @@ class _Curves:
         there = np.isfinite(log) & (np.abs(fits.contacts[:, 0] - x[:, 0]) < 10.0 * HELD)
         there &= np.isfinite(fits.misfits)
         log[~_upright(fits)] = -np.inf
-        x, moved = fits.contacts[there], joint.moved[there][..., 1:]
+        x, moved, values = fits.contacts[there], joint.moved[there][..., 1:], joint.values[there]
         spread = np.linalg.inv(information[there])
         across = moved @ spread @ np.swapaxes(moved, 1, 2)
+        away = (values - self.fitting.forward.values(x * [1.0, 0.0, 0.0, 0.0]))[:, 3:6]
+        log = log[there] - 0.5 * np.log((away**2).sum(axis=1) + np.trace(across, 0, 1, 2))
         turn = friction_angle_derivatives(x)[:, 1:]
         turned = np.einsum("ni,nij,nj->n", turn, spread[:, :3, :3], turn)
-        return _Nodes(
-            curve[there], x, joint.values[there], log[there], across, turned, joint.misfit[there]
-        )
+        return _Nodes(curve[there], x, values, log, across, turned, joint.misfit[there])
 
     def along(self, row: IntArray, x: Array, values: Array) -> _Nodes:
         """Trace curves through contacts x of rows, from station to station both ways."""

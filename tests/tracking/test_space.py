@@ -72,24 +72,6 @@ def test_views_begin_where_both_show_the_whisker(points):
     assert [len(trace.line) for trace in elsewhere[0]] == [len(trace.line) for trace in rows[0]]
 
 
-def test_frames_whose_base_something_covers_cut_no_view():
-    """A peg before the base in one view, in some frames: their shapes would begin farther out."""
-    cameras, covered = PAIRS["orthogonal"], [0, 1, 6]
-    rows = [[traced(camera, curve(0.1 * i)) for i in range(9)] for camera in cameras]
-    for view in (0, 1):
-        some = list(rows[view])
-        for i in covered:
-            t = some[i]
-            some[i] = Trace(t.line[25:], t.sigma[25:], t.seen[25:], t.confidence)
-        begun = begun_together(cameras, [some, rows[1]] if view == 0 else [rows[0], some])
-        assert [i for i, trace in enumerate(begun[view]) if not trace.base_seen] == covered
-        assert all(trace.base_seen for trace in begun[1 - view])
-        assert {trace.begin_sigma for both in begun for trace in both} == {1.0}
-        assert all(a.line is b.line for a, b in zip(rows[1 - view], begun[1 - view], strict=True))
-        shown = [np.isfinite(c.points).all() for c in merged(cameras, zip(*begun, strict=True))]
-        assert shown == [i not in covered for i in range(9)]
-
-
 def farther(trace):
     """The same 60 pixels to the right: it is another whisker."""
     return trace._replace(line=trace.line + np.array([60.0, 0.0]))

@@ -50,9 +50,6 @@ _BEYOND = 6.0  # distance of a tip from the end of a trace above which it is not
 # the whisker; share of it, and of twice that, left at most where they begin together; and shares of
 # a trace within which that is, if they also end together, and if not.
 _APART, _NEARER, _CUTS = 2.0, 0.4, (0.25, 0.08)
-# Share of a trace, and pixels, above which what one view shows more of it than usual, or less, is
-# because something covers the base in the other.
-_COVERED, _FAR = 0.06, 15.0
 # Number of frames by which the part is measured that only one view shows; share of the whisker, as
 # its inverse, whose direction that has; smallest length of its image, pixels; and percentile of
 # lengths that is the whisker's.
@@ -174,16 +171,8 @@ def begun_together(
             best[i] = gap.min(), view, int(np.argmin(gap))
     more = np.zeros(len(pairs))
     for i, (_, view, first) in best.items():
+        one = pairs[i][view]
         more[i] = STEP * first * (1 - 2 * view)
-    usual = float(np.median(more[whole]))
-    for i, (_, view, first) in best.items():
-        one, behind = pairs[i][view], int(more[i] > usual)
-        if abs(more[i] - usual) > max(_COVERED * len(one.line) * STEP, _FAR):
-            # Something covers the base in one view: where on the whisker that begins is unknown.
-            hidden, shown = pairs[i][behind]._replace(base_seen=False), pairs[i][1 - behind]
-            pairs[i] = (shown, hidden) if behind else (hidden, shown)
-            whole.remove(i)
-            continue
         one = one._replace(line=one.line[first:], sigma=one.sigma[first:], seen=one.seen[first:])
         pairs[i] = (one, pairs[i][1]) if view == 0 else (pairs[i][0], one)
     # Where one view shows more in some frames only, both begin elsewhere on the whisker in these.

@@ -399,7 +399,7 @@ def _without_tip(trace):
 def test_contacts_are_sure_somewhere():
     """Deviations by errors of traces that vary with the pose are not contacts."""
     um = 1e-6 * np.array([2, 3, 5, 40, 300, 900, 6, 8, 7, 9, 6, 3, np.nan, 2, 6, 60, 20, 5, 3, 2])
-    free = _free(um, 4e-6, 11e-6)
+    free = _free(um, *(np.full(len(um), limit) for limit in (4e-6, 11e-6)))
     # The frame before a contact, and those in which it ends, belong to it.
     touching = np.flatnonzero(~free & np.isfinite(um))
     assert touching.tolist() == [2, 3, 4, 5, 6, 14, 15, 16, 17]

@@ -232,7 +232,7 @@ def rest_shape(
 
 
 def _free(deviation: Array, within: Array, sure: Array) -> Mask:
-    """Frames that are free of contact, by their deviations (time,) and the limits of these.
+    """Frames that are free of contact, by their deviations (time,) and the limits of each.
 
     Some errors of curves vary with the pose of the whisker, and exceed the usual limit in some
     poses. Contacts that are not sure are therefore only the beginnings and ends of sure ones,

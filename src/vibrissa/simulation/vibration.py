@@ -30,13 +30,12 @@ the state and therefore explains larger wrenches. An error of mass or stiffness 
 frequencies by one factor and causes a growing error of phase; the factor is chosen by maximum
 likelihood over all frames, in steps of 10 %.
 
-In contact the change of the wrench from frame to frame has a heavy-tailed (Student) distribution,
-whose width is given by the noise and the previous change, or, less often, the change of that change
-has. A contact begins with a deviation from
-what the free whisker is predicted to do, which also has a Student distribution, wider than that of
-a free whisker. It must not be the change since the previous frame: where a vibration turns round,
-changes are small, and frames before an impact would count as contact. All likelihoods are those of
-(F, M_y, M_z).
+In contact the change of the wrench from frame to frame, or, less often, the change of that change,
+has a heavy-tailed (Student) distribution, whose width is given by the noise and the previous
+change. A contact begins with a deviation from what the free whisker is predicted to do, which also
+has a Student distribution, wider than that of a free whisker. It must not be the change since the
+previous frame: where a vibration turns round, changes are small, and frames before an impact would
+count as contact. All likelihoods are those of (F, M_y, M_z).
 """
 
 from __future__ import annotations

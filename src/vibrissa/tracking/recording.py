@@ -600,14 +600,10 @@ def remarks_on_time(
             "in this view only"
         )
         if certain:
-            late = (
-                ""
-                if view
-                else f" Times count its frames, so that later ones are {count} too early."
-            )
+            late = f" Times count its frames, so that later ones are {count} too early."
             found.append(
                 f"{name} dropped {frames} {shown}. Later frames are paired accordingly; record "
-                f"without losses, as not all of them show.{late}"
+                f"without losses, as not all of them show.{late * (view == 0)}"
             )
         else:
             found.append(

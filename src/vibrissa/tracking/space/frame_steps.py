@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from vibrissa.cameras import Camera
 from vibrissa.numerics import Array
-from vibrissa.tracking.trace.trace import Trace, tangent
+from vibrissa.tracking.trace.trace import Trace, normals
 
 # Largest number of frames in a row that repeat one; smallest step of an even motion that includes
 # them, pixels; their own steps, as a share of that and at most, pixels; and the least of the step
@@ -103,10 +103,8 @@ def _step(before: Trace, after: Trace) -> Array:
     if n < len(_ALONG):
         return np.full(len(_ALONG), np.nan)
     at = np.rint(_ALONG * (n - 1)).astype(np.intp)
-    ahead = tangent(before.line)[at]
-    ahead /= np.maximum(np.hypot(*ahead.T), 1e-9)[:, None]
     moved = after.line[at] - before.line[at]
-    return np.asarray(ahead[:, 0] * moved[:, 1] - ahead[:, 1] * moved[:, 0])
+    return np.asarray((moved * normals(before.line)[at]).sum(axis=1))
 
 
 class Dropped(NamedTuple):

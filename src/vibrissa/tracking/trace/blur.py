@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vibrissa.numerics import Array
-from vibrissa.tracking.trace.trace import Trace, tangent
+from vibrissa.tracking.trace.trace import Trace, normals
 
 # Width of the blur up to which traces are not affected, pixels; and excess of it whose square
 # is their error in pixels.
@@ -69,7 +69,5 @@ def _speed(before: Trace, here: Trace, after: Trace) -> Array:
     if len(others) == 1:
         others = [(others[0][0], 2.0 * others[0][1]), (here, -2.0 * others[0][1])]
     moved = sum((gap * one.line[:count] for one, gap in others), np.zeros((count, 2)))
-    ahead = tangent(here.line)[:count]
-    ahead /= np.maximum(np.hypot(*ahead.T), 1e-9)[:, None]
-    across = np.abs(ahead[:, 0] * moved[:, 1] - ahead[:, 1] * moved[:, 0])
+    across = np.abs((moved * normals(here.line)[:count]).sum(axis=1))
     return np.pad(across, (0, len(here.line) - count), mode="edge")

@@ -32,7 +32,7 @@ from vibrissa.tracking.trace.trace import (
     TraceOptions,
     distances,
     even,
-    tangent,
+    normals,
 )
 
 OUTSIDE = 12.0  # how far inside the face the base is searched, pixels
@@ -182,10 +182,8 @@ def _above_texture(
     if n < FEWEST:
         return along, sigma
     points, amplitude, flank, support = np.empty((n, 2)), np.empty(n), np.empty(n), np.empty(n)
-    ahead = tangent(part)
-    across = ahead[:, ::-1] * [-1.0, 1.0] / np.maximum(np.hypot(*ahead.T), 1e-9)[:, None]
     for away in (-_FLANKS[1], _FLANKS[1]):
-        other = np.ascontiguousarray(part + away * options.scale * across)
+        other = np.ascontiguousarray(part + away * options.scale * normals(part))
         measure(frame, other, 1, 1.0, options.scale, *clutter, points, amplitude, flank, support)
         amplitudes.append(amplitude[flank > 0.0])
     texture = np.concatenate(amplitudes)

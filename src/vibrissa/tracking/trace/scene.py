@@ -20,7 +20,7 @@ from vibrissa.deferred import ndimage
 from vibrissa.io import Frame
 from vibrissa.numerics import Mask, kernel
 from vibrissa.tracking.trace.ridge import middle, noise_level
-from vibrissa.tracking.trace.trace import EDGE, STILL, Bits, Trace, tangent
+from vibrissa.tracking.trace.trace import EDGE, STILL, Bits, Trace, normals
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -136,7 +136,9 @@ class Scene:
             rank = max(1, int(_RANK * len(lit)))
             nth_largest(np.stack(lit), gains[gains > _UNLIT], rank, background)
             background -= np.median(background[::_SPARSE, ::_SPARSE] - usual)
-        light, ground, share = _lit(frames[0] if background is None else background, thin)
+        light, ground, share = _light_and_ground(
+            frames[0] if background is None else background, thin
+        )
         usual = np.asarray(usual, dtype=np.float32)
         return cls(light, share * ground, background, usual, thin, ground, len(frames), mask)
 
@@ -197,8 +199,7 @@ class Scene:
         n = len(trace.line)
         if self._slopes is None or n < _FOLLOWS:
             return trace
-        normal = tangent(trace.line)[:, ::-1] * [-1.0, 1.0]
-        normal /= np.maximum(np.hypot(*normal.T), 1e-9)[:, None]
+        normal = normals(trace.line)
         away = np.arange(-_WITHIN, _WITHIN + 1)[:, None, None]
         near = np.rint(trace.line + away * normal).astype(np.intp)
         rows, columns = self._slopes.shape[1:]
@@ -255,7 +256,7 @@ class Scene:
         gains, usual = np.array(list(map(self.gain, some)), dtype=np.float32), np.empty_like(shown)
         nth_largest(np.stack(some), gains, len(some) // 2 + 1, usual)
         usual = np.maximum(usual, np.float32(1.0))
-        stands &= things(usual, *_lit(usual, self.thin)[:2], _USUAL)
+        stands &= things(usual, *_light_and_ground(usual, self.thin)[:2], _USUAL)
         stands = ndimage.binary_dilation(stands, iterations=_BLUR)
 
         def around(stands: NDArray[np.bool_]) -> Any:
@@ -369,7 +370,7 @@ class Still:
         return out
 
 
-def _lit(image: Any, thin: int) -> tuple[Image, Image, np.float32]:
+def _light_and_ground(image: Any, thin: int) -> tuple[Image, Image, np.float32]:
     """Light of an image without what is thin and dark; open ground in half the size, and its share.
 
     Below that share of the ground there are bodies.

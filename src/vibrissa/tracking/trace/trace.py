@@ -237,6 +237,12 @@ def tangent(line: Array) -> Array:
     return along
 
 
+def normals(line: Array) -> Array:
+    """Unit vectors (n, 2) to the left (−dy, dx) of a line at its points."""
+    left = tangent(line)[:, ::-1] * [-1.0, 1.0]
+    return np.asarray(left / np.maximum(np.hypot(*left.T), 1e-9)[:, None])
+
+
 def aligned(line: Array, other: Array, points: int = 30) -> float:
     """Cosine between the initial directions of two lines, over at most so many points."""
     i = min(points, len(line) - 1, len(other) - 1)

@@ -161,7 +161,7 @@ def moving(pair, count=120, late=0, dropped=()):
 @pytest.mark.parametrize("pair", PAIRS.values(), ids=PAIRS.keys())
 def test_the_offset_between_cameras_and_dropped_frames_are_found(pair):
     first, second, numbers = moving(pair, late=7, dropped=(60, 61))
-    pairs = paired_frames(pair, [first, second], None)
+    pairs = paired_frames(pair, [[first], [second]], None)
     moments = np.array(numbers)[pairs[:, 1]]
     wrong = pairs[:, 0] != moments
     assert len(pairs) > 100
@@ -178,9 +178,9 @@ def test_an_offset_is_found_of_views_that_show_the_whisker_along_itself(pair):
         for end, step in ((0, 1), (-1, -1)):
             ahead = trace.line[end + step] - trace.line[end]
             trace.line[end] += generator.normal(0.0, 4.0) * ahead / np.linalg.norm(ahead)
-    pairs = paired_frames(pair, [first, second], None)
+    pairs = paired_frames(pair, [[first], [second]], None)
     assert np.mean(pairs[:, 0] != np.array(numbers)[pairs[:, 1]]) < 0.05
-    (said,) = remarks_on_time(pair, [first, second], None)
+    (said,) = remarks_on_time(pair, [[first], [second]], None)
     assert "-7 frames" in said
     assert (clear_offsets(*pair, first, second, 0).shifts == -7).all()
     assert (clear_offsets(*pair, first, second, -7).shifts == -7).all()
@@ -192,11 +192,11 @@ def test_errors_that_follow_the_motion_are_no_offset():
     rows = [[t._replace(tip_seen=False) for t in row] for row in moving(pair)[:2]]
     for i, trace in enumerate(rows[1]):
         trace.line[0] += 3.0 * np.cos(2.0 * np.pi * i / 70.0 + 0.5)
-    pairs = paired_frames(pair, rows, None)
+    pairs = paired_frames(pair, [[row] for row in rows], None)
     assert (pairs[:, 0] == pairs[:, 1]).all()
-    (said,) = remarks_on_time(pair, rows, None)
+    (said,) = remarks_on_time(pair, [[row] for row in rows], None)
     assert "do not determine their offset, and 0 is kept" in said
-    assert remarks_on_time(pair, rows, 0) == []
+    assert remarks_on_time(pair, [[row] for row in rows], 0) == []
 
 
 @pytest.mark.parametrize("view", [0, 1])
@@ -207,25 +207,36 @@ def test_frames_that_one_camera_dropped_have_no_partner(view, gap):
     azimuth = 0.6 * np.sin(2.0 * np.pi * np.arange(70) / 70.0 - 1.2)
     rows = [[traced(camera, curve(a), generator) for a in azimuth] for camera in pair]
     rows = [[t._replace(tip_seen=False, base_seen=False) for t in row] for row in rows]
-    assert dropped_frames(pair, rows) == []
+    assert dropped_frames(pair, [[row] for row in rows]) == []
     del rows[view][20 : 20 + gap], rows[1 - view][-gap:]
-    ((of, frame, count, certain),) = dropped_frames(pair, rows)
+    ((of, frame, count, certain),) = dropped_frames(pair, [[row] for row in rows])
     assert (of, frame, count, certain) == (view, 20, gap, True)
-    pairs = paired_frames(pair, rows, 0)
+    pairs = paired_frames(pair, [[row] for row in rows], 0)
     moments = pairs + gap * (pairs >= 20) * (np.arange(2) == view)
     assert (moments[:, 0] == moments[:, 1]).all()
     assert len(pairs) == 70 - 2 * gap
-    (remark,) = remarks_on_time(pair, rows, 0)
+    (remark,) = remarks_on_time(pair, [[row] for row in rows], 0)
     assert f"{pair[view].name} dropped {gap} frame" in remark
     assert (f"later ones are {gap} too early" in remark) == (view == 0)
-    assert dropped_frames(pair[:1], rows[view : view + 1]) == []
+    assert dropped_frames(pair[:1], [rows[view : view + 1]]) == []
+
+
+def test_a_frame_is_dropped_for_all_whiskers_of_a_row():
+    """One whisker that takes two steps at once while the others do not is followed wrongly."""
+    generator, pair = np.random.default_rng(5), PAIRS["orthogonal"]
+    azimuth = 0.6 * np.sin(2.0 * np.pi * np.arange(70) / 70.0 - 1.2)
+    even = [[traced(camera, curve(a), generator) for a in azimuth] for camera in pair]
+    late = [even[0][:20] + even[0][21:], even[1][:-1]]
+    even = [row[:-1] for row in even]
+    assert len(dropped_frames(pair, [[a, a, b] for a, b in zip(late, even, strict=True)])) == 1
+    assert dropped_frames(pair, [[a, b, b] for a, b in zip(late, even, strict=True)]) == []
 
 
 def test_what_lets_go_in_both_views_is_no_dropped_frame():
     generator, pair = np.random.default_rng(6), PAIRS["orthogonal"]
     azimuth = 0.6 * np.sin(2.0 * np.pi * np.delete(np.arange(70), 20) / 70.0 - 0.8)
     rows = [[traced(camera, curve(a), generator) for a in azimuth] for camera in pair]
-    assert dropped_frames(pair, rows) == []
+    assert dropped_frames(pair, [[row] for row in rows]) == []
 
 
 def test_frames_that_repeat_the_one_before_are_left_out():
@@ -281,12 +292,12 @@ def test_ends_that_are_not_one_point_are_not_the_tip(faint, left):
 def test_a_given_offset_is_used():
     pair = PAIRS["orthogonal"]
     first, second, _ = moving(pair, count=20)
-    pairs = paired_frames(pair, [first, second], 3)
+    pairs = paired_frames(pair, [[first], [second]], 3)
     np.testing.assert_array_equal(pairs, np.stack([np.arange(17), np.arange(3, 20)], axis=1))
     with pytest.raises(ValueError, match="no frames belong together"):
-        paired_frames(pair, [first, second], 50)
-    assert not remarks_on_time(pair, [first, second], 50)
-    pairs = paired_frames(pair, [[first[0]] + [Trace.lost()] * 19, second], None)
+        paired_frames(pair, [[first], [second]], 50)
+    assert not remarks_on_time(pair, [[first], [second]], 50)
+    pairs = paired_frames(pair, [[[first[0]] + [Trace.lost()] * 19], [second]], None)
     assert (pairs[:, 0] == pairs[:, 1]).all()
 
 

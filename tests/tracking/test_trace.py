@@ -340,9 +340,14 @@ def test_a_trace_with_a_hook_is_in_doubt():
     assert not doubtful_frames([hooked, *[straight] * 30]).any()
 
 
-@pytest.mark.parametrize(("dash", "end"), [(8, 100.0), (40, 210.0)])
-def test_a_speck_far_behind_an_object_is_not_the_whisker(dash, end):
-    """What hides it for long may hide where it ends; a line behind that is its other part."""
+@pytest.mark.parametrize(
+    ("dash", "held", "end"), [(8, 0.0, 100.0), (40, 0.0, 210.0), (8, 0.02, 178.0)]
+)
+def test_a_speck_far_behind_an_object_is_not_the_whisker(dash, held, end):
+    """What hides it for long may hide where it ends; a line behind that is its other part.
+
+    If the line is known from another view, so is the speck if it is on it.
+    """
     frame = np.full((80, 260), 180.0)
     frame[40, 20:100] = frame[40, 170 : 170 + dash] = 60.0
     rng = np.random.default_rng(0)
@@ -350,7 +355,10 @@ def test_a_speck_far_behind_an_object_is_not_the_whisker(dash, end):
     bits = np.zeros(frame.shape, np.uint32)
     bits[:, 100:170] = 1
     guess = np.stack([np.arange(20.0, 230.0, 2.0), np.full(105, 40.0)], axis=1)
-    trace, _ = traced(frame.astype(np.uint8), 2.0, guess, TraceOptions(), clutter=Clutter(bits, 1))
+    clutter = Clutter(bits, 1)
+    trace, _ = traced(
+        frame.astype(np.uint8), 2.0, guess, TraceOptions(), clutter=clutter, held=held
+    )
     assert trace.line[-1, 0] == pytest.approx(end, abs=5.0)
 
 

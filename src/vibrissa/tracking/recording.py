@@ -31,7 +31,13 @@ from vibrissa.tracking.refine.hook import Hook
 from vibrissa.tracking.refine.optics import Optics
 from vibrissa.tracking.refine.peg import UncertainPeg
 from vibrissa.tracking.refine.rods import TraceSeries
-from vibrissa.tracking.space.frame_pairs import NEAR, clear_offsets, dropped_frames
+from vibrissa.tracking.space.frame_pairs import (
+    NEAR,
+    Traces,
+    best_seen,
+    clear_offsets,
+    dropped_frames,
+)
 from vibrissa.tracking.space.pose import CUTOFF, BasePose, HeadPose
 from vibrissa.tracking.space.rest_shape import Length, RestShape
 from vibrissa.tracking.trace.start import base_gap
@@ -588,11 +594,10 @@ def remarks_on_plane(one: Tracked, name: str) -> list[str]:
     ]
 
 
-def remarks_on_time(
-    cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]], offset: int | None
-) -> list[str]:
+def remarks_on_time(cameras: Sequence[Camera], traces: Traces, offset: int | None) -> list[str]:
     """Report cameras that seem not to be synchronous, offsets found, and dropped frames."""
     found = []
+    first, *others = best_seen(traces)
     for view, frame, count, certain in dropped_frames(cameras, traces, offset):
         name, frames = cameras[view].name, f"{count} frame{'s' * (count > 1)}"
         shown = (
@@ -610,8 +615,8 @@ def remarks_on_time(
                 f"not sure: {name} may have dropped {frames} {shown}. If so, the views are out of "
                 f"step by {count} from there on: compare the videos."
             )
-    for camera, row in zip(cameras[1:], traces[1:], strict=True):
-        shifts, determined = clear_offsets(cameras[0], camera, traces[0], row, offset or 0)
+    for camera, row in zip(cameras[1:], others, strict=True):
+        shifts, determined = clear_offsets(cameras[0], camera, first, row, offset or 0)
         runs = [shift for shift, _ in groupby(shifts.tolist())]
         listed, names = ", ".join(map(str, runs)), f"{cameras[0].name} and {camera.name}"
         if offset is None and determined:

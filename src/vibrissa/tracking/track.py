@@ -232,14 +232,14 @@ def track(
     if not (np.isfinite(rate) and rate > 0.0):
         raise ValueError(f"rate is {rate!r}; it must be positive, in frames per second")
     timed = best_seen(traces)
-    pairs = paired_frames(cameras, timed, options.offset)
+    pairs = paired_frames(cameras, traces, options.offset)
     if head is not None and len(cameras) == 1:
         raise ValueError("the head moves in space, which one view does not show: leave it out")
     optics, doubts = None, list[str]()
     if options.rough and len(cameras) > 1:
         optics, cameras, doubts = _corrected(cameras, timed, pairs, options.distance)
     moving = None if head is None else HeadPose.of(head, pairs[:, 0], rate)
-    found, remarks = list[Tracked](), doubts + remarks_on_time(cameras, timed, options.offset)
+    found, remarks = list[Tracked](), doubts + remarks_on_time(cameras, traces, options.offset)
     called = [f"whisker {k}" for k in range(count)] if names is None else list(names)
     timed_rows = [[[row[i] for i in pairs[:, v]] for row in view] for v, view in enumerate(traces)]
     rows = [list(row) for row in zip(*timed_rows, strict=True)]

@@ -242,7 +242,9 @@ class Bent(NamedTuple):
         )
         ahead = ahead.reshape(4, len(loaded), _SAMPLES, 3)
         rows = np.where(touching, np.cumsum(touching) - 1, -1)
-        with np.errstate(invalid="ignore"):  # rods without equilibrium, which are `wild`
+        with np.errstate(
+            invalid="ignore", over="ignore"
+        ):  # rods without equilibrium, which are `wild`
             turned = points[1 + rows] @ np.swapaxes(state.rotation, 1, 2)
             change = (ahead - points[1:]) / _STEP
         return cls(turned, rows, change, state.rotation)

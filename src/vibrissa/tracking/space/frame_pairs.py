@@ -24,6 +24,9 @@ from vibrissa.tracking.trace.trace import Trace, correlated
 
 Pairs = NDArray[np.int64]
 
+Traces = Sequence[Sequence[Sequence[Trace]]]
+"""Traces by view, whisker and frame."""
+
 _LARGEST = 30  # largest offset, frames
 _SHIFTS = np.arange(-_LARGEST, _LARGEST + 1)
 
@@ -45,9 +48,7 @@ class Offsets(NamedTuple):
     determined: bool
 
 
-def paired_frames(
-    cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]], offset: int | None = 0
-) -> Pairs:
+def paired_frames(cameras: Sequence[Camera], traces: Traces, offset: int | None = 0) -> Pairs:
     """Find the simultaneous frames (time, view) of two or more videos.
 
     Frame 0 of the first video is frame ``offset`` of the others. If it is None, it is found, and
@@ -67,7 +68,7 @@ def paired_frames(
 
 
 def dropped_frames(
-    cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]], offset: int | None = 0
+    cameras: Sequence[Camera], traces: Traces, offset: int | None = 0
 ) -> list[Dropped]:
     """Frames that one of several cameras dropped, by its own numbers of frames."""
     pairs, gaps = _paired_by_offset(cameras, traces, offset)
@@ -75,33 +76,37 @@ def dropped_frames(
 
 
 def _paired_by_offset(
-    cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]], offset: int | None
+    cameras: Sequence[Camera], traces: Traces, offset: int | None
 ) -> tuple[Pairs, list[Dropped]]:
     """Simultaneous frames (time, view) by the videos' offset, and what it leaves of dropped ones.
 
     These are before rows of the pairs, not frames of the video.
     """
-    columns = [np.arange(len(traces[0]))]
-    for camera, row in zip(cameras[1:], traces[1:], strict=True):
+    first, *others = best_seen(traces)
+    columns = [np.arange(len(first))]
+    for camera, row in zip(cameras[1:], others, strict=True):
         if offset is not None:
-            shift = np.full(len(traces[0]), offset)
+            shift = np.full(len(first), offset)
         else:
-            shift = clear_offsets(cameras[0], camera, traces[0], row).shifts
+            shift = clear_offsets(cameras[0], camera, first, row).shifts
         columns.append(columns[0] + shift)
     pairs = np.stack(columns, axis=1)
     # A frame that one camera dropped has no partner; of those that share one the first keeps it.
     usable = np.ones(len(pairs), dtype=bool)
-    for k, row in enumerate(traces):
+    for k, row in enumerate((first, *others)):
         usable &= (pairs[:, k] >= 0) & (pairs[:, k] < len(row))
         usable[1:] &= np.diff(pairs[:, k]) > 0
     pairs = pairs[usable]
     if (np.diff(pairs, axis=0) > 1).any():
         return pairs, []
-    rows = [[row[i] for i in column] for row, column in zip(traces, pairs.T, strict=True)]
-    return pairs, steps_over_dropped(rows)
+    views = [
+        [[row[i] for i in column] for row in view]
+        for view, column in zip(traces, pairs.T, strict=True)
+    ]
+    return pairs, steps_over_dropped(views)
 
 
-def best_seen(traces: Sequence[Sequence[Sequence[Trace]]]) -> list[Sequence[Trace]]:
+def best_seen(traces: Traces) -> list[Sequence[Trace]]:
     """Traces, by view, of the whisker that is lost least often."""
     seen = [[sum(len(trace.line) > 0 for trace in row) for row in view] for view in traces]
     best = int(np.argmax(np.min(seen, axis=0)))

@@ -116,26 +116,33 @@ class Dropped(NamedTuple):
     certain: bool
 
 
-def steps_over_dropped(rows: Sequence[Sequence[Trace]]) -> list[Dropped]:
-    """Find frames that one of the cameras dropped, by simultaneous traces of a whisker in each."""
-    steps = list[Array]()
-    if len(rows) < 2:
+def steps_over_dropped(views: Sequence[Sequence[Sequence[Trace]]]) -> list[Dropped]:
+    """Find frames that one of the cameras dropped, by simultaneous traces by view and whisker.
+
+    A camera drops them for all whiskers: most of those that move evenly in the other views show it.
+    """
+    if len(views) < 2:
         return []
-    for row in rows:
-        repeats = repeated_frames(row)
-        steps.append(_steps([Trace.lost() if i in repeats else t for i, t in enumerate(row)]))
+    steps = [[_without_repeated(row) for row in view] for view in views]
+    even = np.array([[_over(own, 0, _STEADY, _EVEN_SIZE, _EVEN_REST) for own in v] for v in steps])
     found = dict[tuple[int, int], Dropped]()
-    even = [_over(own, 0, _STEADY, _EVEN_SIZE, _EVEN_REST) for own in steps]
-    for view, own in enumerate(steps):
-        others = [one for v, one in enumerate(even) if v != view]
+    for view, rows in enumerate(steps):
+        others = np.delete(even, view, axis=0).min(axis=0)
         for missing in range(1, _GAP + 1):
-            jumps = _over(own, missing, _SHOWS, _SIZE, _REST)
-            for i in np.flatnonzero(np.all([jumps > 0, *(one > 0 for one in others)], axis=0)):
-                certain = min(jumps[i], *(one[i] for one in others)) > 1
-                new = Dropped(view, int(i), missing, bool(certain))
+            jumps = np.array([_over(own, missing, _SHOWS, _SIZE, _REST) for own in rows])
+            shown = np.minimum(jumps, others)
+            most = 2 * (shown > 0).sum(axis=0) > (others > 0).sum(axis=0)
+            for i in np.flatnonzero(most):
+                certain = bool(shown[:, i].max() > 1)
                 if certain or (view, int(i)) not in found:
-                    found[view, int(i)] = new
+                    found[view, int(i)] = Dropped(view, int(i), missing, certain)
     return sorted(found.values(), key=lambda gap: gap.frame)
+
+
+def _without_repeated(row: Sequence[Trace]) -> Array:
+    """Steps (frame, point) without those of repeated frames."""
+    repeats = repeated_frames(row)
+    return _steps([Trace.lost() if i in repeats else t for i, t in enumerate(row)])
 
 
 def _over(steps: Array, gap: int, least: float, size: float, rest: float) -> NDArray[np.int64]:

@@ -1,7 +1,7 @@
 """Rows of whiskers that lie on one another in a view: traced anew by another view.
 
 By one view alone it may be unknown which line is whose; the views then disagree about where
-whiskers begin and end. The view that shows the whiskers most steadily guides the others
+whiskers begin and end. The view in which they lie on one another least guides the others
 (`vibrissa.tracking.trace.guided`), if they agree better afterwards.
 """
 
@@ -16,17 +16,16 @@ from numpy.typing import ArrayLike, NDArray
 from vibrissa.cameras import Camera
 from vibrissa.io import Frame
 from vibrissa.numerics import Array, Mask
-from vibrissa.tracking.space.frame_pairs import best_seen, paired_frames
+from vibrissa.tracking.space.frame_pairs import Traces, paired_frames
 from vibrissa.tracking.trace.guided import Frames, trace_guided
 from vibrissa.tracking.trace.start import base_gap
-from vibrissa.tracking.trace.trace import Trace, TraceOptions
+from vibrissa.tracking.trace.trace import Trace, TraceOptions, overlap
 
 # Distance of bases of two views, pixels, and those of tips, as shares of the length, where both are
 # seen to end and where one may fade, up to which they may be those of one whisker.
 _BASES, _TIPS, _FADING = 8.0, 0.1, 0.4
-# Share of the frames in which the views show one whisker, from which nothing is traced anew; and
-# change of a whisker's length from its usual one, as a share, up to which it is traced steadily.
-_AGREES, _STEADY = 0.9, 0.2
+# Share of the frames in which the views show one whisker, from which nothing is traced anew.
+_AGREES = 0.9
 # Shares of all frames, and of those in which both views show a line, in which the views must agree;
 # else all lines that are traced anew are in doubt.
 _HALF, _MOSTLY = 0.5, 0.6
@@ -34,9 +33,6 @@ _HALF, _MOSTLY = 0.5, 0.6
 # below zero, most frames by themselves show another one, and only motion and bend decide.
 _SURE = 0.0
 _LARGEST = 20  # number of whiskers of a row up to which lines can be combined
-
-Traces = Sequence[Sequence[Sequence[Trace]]]
-"""Traces by view, whisker and frame."""
 
 
 def retraced(
@@ -52,7 +48,7 @@ def retraced(
     masks: Sequence[Mask | None] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[list[list[list[Trace]]], list[str]]:
-    """Trace a row anew in the views that contradict the steadiest one.
+    """Trace a row anew in the views that contradict the clearest one.
 
     Parameters
     ----------
@@ -88,8 +84,8 @@ def retraced(
     found, remarks = [[list(row) for row in view] for view in traces], list[str]()
     if len(cameras) < 2 or not 2 <= len(found[0]) <= _LARGEST:
         return found, remarks
-    guide = int(np.argmax([_steadiness(view) for view in found]))
-    pairs = paired_frames(cameras, best_seen(found), offset)
+    guide = int(np.argmin([_lies_on_others(view) for view in found]))
+    pairs = paired_frames(cameras, found, offset)
     for v, camera in enumerate(cameras):
         both = [guide, v]
         rows = [_in_pairs(found[view], pairs[:, view]) for view in both]
@@ -131,11 +127,16 @@ def retraced(
     return found, remarks
 
 
-def _steadiness(view: Sequence[Sequence[Trace]]) -> float:
-    """Share of the frames in which whiskers are as long as usual."""
-    lengths = np.array([[len(trace.line) for trace in row] for row in view], dtype=np.float64)
-    usual = np.array([np.median(row[row > 0]) if (row > 0).any() else np.inf for row in lengths])
-    return float((np.abs(lengths / usual[:, None] - 1.0) < _STEADY).mean())
+def _lies_on_others(view: Sequence[Sequence[Trace]]) -> float:
+    """Mean share of whiskers that lies on others, or is lost."""
+    shares = [
+        max((overlap(line, other) for other in others if other is not line), default=0.0)
+        if len(line)
+        else 1.0
+        for others in ([trace.line for trace in row] for row in zip(*view, strict=True))
+        for line in others
+    ]
+    return float(np.mean(shares))
 
 
 def _in_pairs(view: Sequence[Sequence[Trace]], frames: NDArray[np.int64]) -> list[list[Trace]]:

@@ -85,7 +85,8 @@ def traced(
 ) -> tuple[Trace, bool]:
     """Trace a whisker near a line, and find its ends; whether it begins at the face.
 
-    If points that are not seen are held at the line, the whisker begins where it does.
+    If points that are not seen are held at the line, the whisker begins where it does, and what is
+    seen of it behind something long belongs to it.
     """
     line = prolonged(even(line), _BENDING, _BEYOND)
     for gate in (3, 2):
@@ -112,7 +113,9 @@ def traced(
         bare, texture = _above_texture(frame, line, along, options, clutter)
         inward = bare.part(slice(None, None, -1))
         first = len(line) - _tip(inward, _EVEN, _CLEARER * texture)
-    last = _connected(along.seen[: _tip(along)])
+    last = _tip(along)
+    if not held:
+        last = _connected(along.seen[:last])
     if last - first < FEWEST or not along.seen[first:last].any():
         return Trace.lost(), False
     # An image without noise was smoothed, as by compression, which removes faint lines.

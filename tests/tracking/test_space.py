@@ -221,6 +221,21 @@ def test_frames_that_one_camera_dropped_have_no_partner(view, gap):
     assert dropped_frames(pair[:1], [rows[view : view + 1]]) == []
 
 
+def test_a_dropped_frame_is_not_sure_if_the_ends_contradict_it():
+    """From frame 20 on one view shows what is between them where it is a frame later."""
+    generator, pair = np.random.default_rng(5), PAIRS["orthogonal"]
+    azimuth = 0.6 * np.sin(2.0 * np.pi * np.arange(70) / 70.0 - 1.2)
+    rows = [[[traced(camera, curve(a), generator) for a in azimuth]] for camera in pair]
+    row = rows[1][0]
+    for i in range(20, 69):
+        line = np.concatenate([row[i].line[:1], row[i + 1].line[1:-1], row[i].line[-1:]])
+        row[i] = row[i + 1]._replace(line=line)
+    (gap,) = dropped_frames(pair, rows)
+    assert (gap.view, gap.frame, gap.certain) == (1, 20, False)
+    pairs = paired_frames(pair, rows, 0)
+    assert (pairs[:, 0] == pairs[:, 1]).all()
+
+
 def test_a_frame_is_dropped_for_all_whiskers_of_a_row():
     """One whisker that takes two steps at once while the others do not is followed wrongly."""
     generator, pair = np.random.default_rng(5), PAIRS["orthogonal"]

@@ -103,7 +103,23 @@ def _paired_by_offset(
         [[row[i] for i in column] for row in view]
         for view, column in zip(traces, pairs.T, strict=True)
     ]
-    return pairs, steps_over_dropped(views)
+    gaps = steps_over_dropped(views)
+    ends = best_seen(views)
+    return pairs, [
+        gap._replace(certain=gap.certain and _agrees(cameras, ends, gap)) for gap in gaps
+    ]
+
+
+def _agrees(cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]], gap: Dropped) -> bool:
+    """Whether the views agree as well about the ends if one of them dropped frames."""
+    gained, shift = 0.0, -gap.missing if gap.view else gap.missing
+    for v in [gap.view] if gap.view else range(1, len(cameras)):
+        ends = _passing_ends(cameras[0], cameras[v], traces[0], traces[v])
+        stay = [one[:, _LARGEST] for one in ends]
+        later = [one[gap.frame :, _LARGEST + shift] for one in ends]
+        changed = [np.r_[a[: gap.frame], b] for a, b in zip(stay, later, strict=True)]
+        gained += _gained(*(np.array([a - _medians(a) for a in x]) for x in (stay, changed)))
+    return gained >= 0.0
 
 
 def best_seen(traces: Traces) -> list[Sequence[Trace]]:

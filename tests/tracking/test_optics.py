@@ -133,7 +133,11 @@ def test_cameras_that_explain_the_views_are_not_known_worse_than_before():
     found = rough_optics(STATED, traces(still, [TOP, FRONT], 1e6))
     far = replace(found, values=found.stated + 3.0 * found.prior)
     more = (far.as_stated().covariance - found.covariance) / np.outer(found.prior, found.prior)
-    assert np.linalg.eigvalsh(more)[-1] == pytest.approx(1.0)
+    assert np.linalg.eigvalsh(more)[-1] == pytest.approx(len(found.prior))
+    near = replace(found, values=found.stated + 0.9 * found.prior)
+    assert near.as_stated().covariance - found.covariance == pytest.approx(
+        0.81 * np.outer(found.prior, found.prior)
+    )
 
 
 @pytest.mark.slow

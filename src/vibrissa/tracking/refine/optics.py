@@ -101,7 +101,9 @@ class Optics:
     def as_stated(self) -> Optics:
         """The stated cameras, with their uncertainty and their difference from these optics."""
         apart = self.values - self.stated
-        apart /= max(1.0, float(np.linalg.norm(apart / self.prior)))
+        # All together they are not known worse than before.
+        most = np.sqrt(len(apart))
+        apart /= max(1.0, float(np.linalg.norm(apart / self.prior)) / most)
         return replace(
             self,
             values=self.stated,

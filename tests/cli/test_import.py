@@ -243,6 +243,27 @@ def test_points_that_mislead_are_noticed(trial):
         join_views(labelled(one, "a", view="top"), labelled(other, "b", view="front"))
 
 
+def test_points_that_no_images_can_have_are_refused(trial):
+    image = np.stack([camera.project(trial[1]) for camera in CAMERAS], axis=2)
+
+    def refused(message, points=image, sure=0.9):
+        raw = RawTracks(
+            "test",
+            ["w"],
+            image=points,
+            image_confidence=np.full(points.shape[:-1], sure),
+            views=["top", "front"],
+            fps=1000.0,
+        )
+        with pytest.raises(ValueError, match=message):
+            tracker_traces(labelled(raw, "a.csv"), CAMERAS)
+
+    refused("confidence of 0.6 or more; the largest is 0.3", sure=0.3)
+    refused("up to 99; numbers from 0 to 1", sure=99.0)
+    refused("shares of the image", points=image / 400.0)
+    refused("top and front have the same points", points=image[:, :, [0, 0]])
+
+
 def test_a_whisker_may_end_beyond_its_last_point(trial):
     """Points without names end where the line does; of named ones the last is the tip."""
     image = np.stack([camera.project(trial[1]) for camera in CAMERAS], axis=2)

@@ -218,7 +218,7 @@ def _cameras(
     check_new(target, (".toml",), force)
     if vb.io.Kind.VIDEO not in map(vb.io.recognise, images):
         refuse({"--frames": frames}, "only videos need it, and these are images")
-    cameras, error = vb.cameras.calibrate(
+    cameras, error, point_sigma = vb.cameras.calibrate(
         vb.io.load_series(images, frames or _FRAMES), corners, 1e-3 * square
     )
     vb.cameras.save_cameras(target, cameras)
@@ -227,7 +227,10 @@ def _cameras(
             f"{camera.name}: {camera.size[0]} × {camera.size[1]} pixels, focal length "
             f"{camera.matrix[0, 0]:.1f} × {camera.matrix[1, 1]:.1f} pixels"
         )
-    say(f"reprojection error {error:.3f} pixels (root mean square)")
+    say(
+        f"reprojection error {error:.3f} pixels (root mean square); points among the boards are "
+        f"uncertain by {1e6 * point_sigma:.2g} µm due to it"
+    )
     if error > _POOR:
         say(
             "  This error is large: perhaps the images were not taken at the same times, are "

@@ -51,6 +51,8 @@ KIND = "vibrissa tracks"
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6}
 # Smallest and largest plausible extent of a whisker, m.
 SHORTEST, LONGEST = 0.5e-3, 1.0
+# Largest confidence that is read; peaks of confidence maps can exceed 1.
+SUREST = 2.0
 IMAGE = ("time", "whisker", "view", "node", "image_axis")
 SPACE = ("time", "whisker", "node", "space")
 
@@ -151,6 +153,12 @@ def _check_size(raw: RawTracks, path: Path) -> None:
     for name, missing in empty.items():
         if missing:
             raise ValueError(f"{path} contains no {name}")
+    for sure in (raw.image_confidence, raw.space_confidence):
+        if sure is not None and (most := np.nanmax(sure, initial=0.0)) > SUREST:
+            raise ValueError(
+                f"{path}: confidences are up to {most:.4g}; numbers from 0 to 1 are needed, not "
+                "percentages"
+            )
 
 
 def _without_zeros(points: Array, sure: Array | None) -> tuple[Array, Array]:

@@ -7,6 +7,7 @@ direction of the whisker, so that no whisker points towards a camera.
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,6 +36,7 @@ _TESTED = 20  # largest number of frames from which the error between points is 
 # gap is twice as wide; and the latter, in standard deviations of the points, due to their noise.
 _NARROWER, _OF_NOISE = 0.25, 3.0
 _STILLER = 3.0  # ratio by which a base moves more than a tip above which order is doubted
+_SHORTEST = 3.0  # extent below which points can not be those of a whisker, pixels
 _BASES = ("base", "root", "follicle")  # words that name the point at a whisker's base
 _ARC_POINTS = 12  # number of points on an arc that represents a measured curvature
 
@@ -67,6 +69,7 @@ def tracker_traces(
     elif "trace" in tracks:
         name = "trace_confidence" if "trace_confidence" in tracks else "confidence"
         points = _confident(tracks, "trace", name)
+        _check_images(points, [str(view) for view in tracks["view"].values])
         views = _views(points, tracks, cameras, pixel_size, notes)
     else:
         raise ValueError("the tracks hold neither a trace nor a centreline")
@@ -178,7 +181,13 @@ def _confident(tracks: xr.Dataset, name: str, confidence: str) -> Array:
     """Points (time, whisker[, view], node, axis), NaN where the tracker's confidence is low."""
     points = np.array(tracks[name].values, dtype=np.float64)
     if confidence in tracks:
-        points[tracks[confidence].values < _CONFIDENT] = np.nan
+        sure = tracks[confidence].values
+        points[sure < _CONFIDENT] = np.nan
+        if not np.isfinite(points).any() and np.isfinite(sure).any():
+            raise ValueError(
+                f"no point has a confidence of {_CONFIDENT:g} or more; the largest is "
+                f"{np.nanmax(sure):.2g}"
+            )
     return points
 
 
@@ -209,6 +218,23 @@ def _arcs(tracks: xr.Dataset, notes: list[str]) -> xr.Dataset:
     )
     kept = tracks.drop_dims("node")
     return kept.assign(trace=(tracks["trace"].dims, points)).assign_attrs(tracks.attrs)
+
+
+def _check_images(points: Array, views: Sequence[str]) -> None:
+    """Raise ValueError if points (time, whisker, view, node, 2) cannot be those of images."""
+    low, high = (np.where(np.isnan(points), end, points) for end in (np.inf, -np.inf))
+    longest = float((high.max(axis=3) - low.min(axis=3)).max(initial=-np.inf))
+    if 0.0 <= longest < _SHORTEST:
+        raise ValueError(
+            f"no whisker is longer than {longest:.2g} pixels: are its points in pixels, or in "
+            "shares of the image?"
+        )
+    for one, other in itertools.combinations(range(len(views)), 2):
+        if np.array_equal(points[:, :, one], points[:, :, other], equal_nan=True):
+            raise ValueError(
+                f"the views {views[one]} and {views[other]} have the same points: is a file given "
+                "twice?"
+            )
 
 
 def _views(

@@ -1,4 +1,4 @@
-"""Camera models, triangulation, and calibration.
+"""Camera models and triangulation.
 
 A camera maps points of the laboratory frame to the pixels of a view:
 
@@ -15,29 +15,18 @@ paper's top view sees from above.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from os import PathLike
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from vibrissa.deferred import transform, xr
 from vibrissa.io import in_file, read_calibration, write_calibration
 from vibrissa.numerics import Array, numbers, vectors
 from vibrissa.quantities import attributes
-
-__all__ = [
-    "PIXEL_SIZE",
-    "Camera",
-    "calibrate",
-    "load_cameras",
-    "orthogonal_views",
-    "save_cameras",
-    "triangulate",
-]
-__dir__ = __all__.copy
 
 PIXEL_SIZE = 58e-6
 """Size of a pixel of the paper's cameras in object space, m."""
@@ -489,154 +478,3 @@ def cameras_from_dataset(dataset: xr.Dataset) -> tuple[Camera, ...]:
         for row in views
     ]
     return tuple(Camera(**values) for values in known)
-
-
-Image = NDArray[np.uint8]
-Board = NDArray[np.float32]
-
-_FEWEST = 4  # smallest number of moments at which all cameras must see the board
-
-
-def calibrate(
-    images: Mapping[str, Sequence[Image]], corners: tuple[int, int], square: float
-) -> tuple[tuple[Camera, ...], float]:
-    """Calibrate cameras from simultaneous images of one checkerboard.
-
-    Parameters
-    ----------
-    images : mapping of str to sequence of array (height, width)
-        Grey images of each camera by name, moment by moment; not all need to show the board.
-    corners : tuple of int
-        Numbers of inner corners along the longer and the shorter side of the board.
-    square : float
-        Side of a square of the board, m.
-
-    Returns
-    -------
-    cameras : tuple of Camera
-        Cameras in the laboratory frame, which is that of the board at the first moment at which all
-        cameras see it: origin at its first inner corner, x along its rows, y along its columns.
-    error : float
-        Root mean square reprojection error of the corners, pixels.
-
-    Raises
-    ------
-    ModuleNotFoundError
-        If OpenCV is not installed.
-    ValueError
-        If the cameras have different numbers of images, or too few show the board.
-    """
-    counts = {name: len(series) for name, series in images.items()}
-    if len(counts) < 2 or len(set(counts.values())) != 1:
-        raise ValueError(f"images of the cameras: {counts}; two cameras, as many each, are needed")
-    for name, series in images.items():
-        sizes = {np.shape(image)[::-1] for image in series}
-        if len(sizes) > 1:
-            raise ValueError(f"images of camera {name} differ in size: {sorted(sizes)}")
-    board: Board = np.zeros((corners[0] * corners[1], 3), np.float32)
-    board[:, :2] = np.indices(corners).T.reshape(-1, 2) * square
-    seen = {
-        name: [_find_corners(np.asarray(image), corners) for image in series]
-        for name, series in images.items()
-    }
-    moments = range(next(iter(counts.values())))
-    shared = [i for i in moments if all(rows[i] is not None for rows in seen.values())]
-    if len(shared) < _FEWEST:
-        raise ValueError(
-            f"the board is seen by all cameras in {len(shared)} images; {_FEWEST} are needed, with "
-            "the board rotated and moved between them"
-        )
-    cameras = tuple(
-        _calibrate_one(name, rows, board, images[name][0].shape, shared[0])
-        for name, rows in seen.items()
-    )
-    cameras = _stereo_poses(cameras, seen, board, shared)
-    return cameras, _reprojection_error(cameras, seen, board, shared)
-
-
-def _find_corners(image: Image, corners: tuple[int, int]) -> Any:
-    """Pixels (n, 2) of the board's corners in an image, or None."""
-    cv2 = _opencv()
-    found, points = cv2.findChessboardCornersSB(image, corners)
-    return points.reshape(-1, 2) if found else None
-
-
-def _opencv() -> Any:
-    """Import OpenCV."""
-    try:
-        import cv2
-    except ImportError as error:
-        raise ModuleNotFoundError(
-            "calibrating needs OpenCV: pip install 'vibrissa[cameras]'"
-        ) from error
-    return cv2
-
-
-def _calibrate_one(
-    name: str, rows: Sequence[Any], board: Board, shape: tuple[int, ...], first: int
-) -> Camera:
-    """Calibrate one camera, in the frame of the board at the first shared moment."""
-    cv2 = _opencv()
-    usable = [i for i, points in enumerate(rows) if points is not None]
-    size = (shape[1], shape[0])
-    seen = [rows[i] for i in usable]
-    number = 2 * len(board) * len(usable)
-    # No more coefficients of the lens than the corners show (Bayesian information criterion):
-    # others would be arbitrary, and distort the parts of the image that the board never covered.
-    fixed = (cv2.CALIB_FIX_K1, cv2.CALIB_FIX_K2, cv2.CALIB_ZERO_TANGENT_DIST, cv2.CALIB_FIX_K3)
-    fits = []
-    for i, free in enumerate((0, 1, 2, 4, 5)):
-        fit = cv2.calibrateCamera(
-            [board] * len(usable), seen, size, None, None, flags=sum(fixed[i:])
-        )
-        fits.append((number * np.log(fit[0] ** 2) + free * np.log(number), i, fit))
-    _, matrix, distortion, turns, shifts = min(fits)[-1]
-    k = usable.index(first)
-    return Camera(
-        matrix=matrix,
-        rotation=cv2.Rodrigues(turns[k])[0],
-        translation=shifts[k].reshape(3),
-        distortion=distortion.reshape(-1)[:8],
-        size=size,
-        name=name,
-    )
-
-
-def _stereo_poses(
-    cameras: tuple[Camera, ...], seen: Mapping[str, Sequence[Any]], board: Board, shared: list[int]
-) -> tuple[Camera, ...]:
-    """Poses of all cameras relative to the first, from all shared moments rather than one."""
-    cv2 = _opencv()
-    main = cameras[0]
-    placed = [main]
-    for camera in cameras[1:]:
-        answer = cv2.stereoCalibrate(
-            [board] * len(shared),
-            [seen[main.name][i] for i in shared],
-            [seen[camera.name][i] for i in shared],
-            main.matrix,
-            main.distortion,
-            camera.matrix,
-            camera.distortion,
-            main.size,
-            flags=cv2.CALIB_FIX_INTRINSIC,
-        )
-        turn, shift = answer[5], answer[6].reshape(3)
-        rotation, translation = turn @ main.rotation, turn @ main.translation + shift
-        placed.append(replace(camera, rotation=rotation, translation=translation))
-    return tuple(placed)
-
-
-def _reprojection_error(
-    cameras: Sequence[Camera], seen: Mapping[str, Sequence[Any]], board: Board, shared: list[int]
-) -> float:
-    """Root mean square reprojection error of the triangulated corners."""
-    squares = []
-    for i in shared:
-        pixels = np.stack([seen[camera.name][i] for camera in cameras]).astype(np.float64)
-        points, _ = triangulate(cameras, pixels)
-        squares += [
-            ((camera.project(points) - row) ** 2).sum(axis=1)
-            for camera, row in zip(cameras, pixels, strict=True)
-        ]
-    return float(np.sqrt(np.mean(squares)))

@@ -172,6 +172,8 @@ def test_what_cannot_be_a_camera_says_why():
         orthogonal_views(pixel_size=0.0)
     with pytest.raises(ValueError, match="do not fit"):
         triangulate(PAIRS["orthogonal"][:1], np.zeros((2, 2)))
+    with pytest.raises(ValueError, match="do not fit"):
+        triangulate(PAIRS["orthogonal"], np.zeros((2, 3)))
     for sigma in (-1.0, 0.0):
         with pytest.raises(ValueError, match="sigma is a positive standard deviation"):
             triangulate(PAIRS["orthogonal"], np.zeros((2, 2)), sigma)

@@ -349,6 +349,18 @@ def test_standard_deviations_and_millimetres_are_not_taken_for_what_is_needed(jo
         fit_shape("cylinder", points, alike, known["whisker_radius"])
     with pytest.raises(ValueError, match="larger than the extent of the contacts"):
         fit_shape("cylinder", points, known["covariance"], 1e3 * known["whisker_radius"])
+    with pytest.raises(ValueError, match="times whisker_radius"):
+        fit_shape("cylinder", 1e3 * points, known["covariance"], known["whisker_radius"])
+
+
+def test_arguments_in_another_order_or_of_another_shape_are_named(joint_errors):
+    points, known = noisy("sphere", joint_errors, np.random.default_rng(4), 100)
+    with pytest.raises(ValueError, match=r"shape is array.*; it must be one of"):
+        fit_shape(points, "sphere")
+    fit = fit_shape("sphere", points, **known)
+    for method in (fit.signed_distance, fit.outward_normals, fit.distance_sigma):
+        with pytest.raises(ValueError, match=r"must have shape \(..., 3\)"):
+            method(points[:, :2])
 
 
 def test_a_stout_rod_may_touch_a_small_part_of_a_plane():

@@ -5,9 +5,10 @@ import pytest
 import xarray as xr
 from matplotlib.text import Text
 
+import vibrissa as vb
 from vibrissa.plots import sensitivity_panels, solid_slices, style
 from vibrissa.plots.sensitivity import derivative_label
-from vibrissa.quantities import axis_label
+from vibrissa.quantities import axis_label, quantity
 
 NAMES = ("Fx", "MB", "MD")
 
@@ -36,6 +37,18 @@ def derivatives():
         {**data, **flags, "sensitivity": (("contact", "coordinate", "signal"), jacobian)},
         {"coordinate": ["r", "theta", "phi"], "signal": list(NAMES)},
     )
+
+
+def test_the_title_has_the_numbers_of_the_table(gridded_map):
+    """They are those of the contacts that are drawn, which can be the paper's grid only."""
+    for at in (None, "grid"):
+        found = vb.sensitivity(gridded_map, at=at)
+        ratios = vb.sensitivity_findings(found)["small_over_large"].sel(coordinate="r")
+        title = next(t for t in texts(sensitivity_panels(found)) if t.startswith("Noise moves"))
+        for name in ("MB", "Fx"):
+            ratio = float(ratios.sel(signal=name, sorted_by=name))
+            assert f"{ratio:.0f} times ($\\partial r/\\partial {quantity(name).symbol}" in title
+        assert ("in the paper's grid" in title) == (at == "grid")
 
 
 @pytest.mark.parametrize("width", [pytest.param("single", marks=pytest.mark.slow), "double"])

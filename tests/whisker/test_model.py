@@ -181,6 +181,11 @@ def test_bad_curvature_functions():
         Whisker.from_curvature(LENGTH, lambda s: (0.0, 0.0, np.nan))
     with pytest.raises(ValueError, match="function of arc length"):
         Whisker.from_curvature(LENGTH, 5.0)
+    with pytest.raises(ValueError, match=r"length is of type function; .* of type float; a func"):
+        Whisker.from_curvature(wavy, LENGTH)
+    for length in ("0.04", [LENGTH], None, True):
+        with pytest.raises(ValueError, match="length is of type"):
+            Whisker.straight(length)
     with pytest.raises(ValueError, match=r"breaks \[0.05\]"):
         Whisker.from_curvature(LENGTH, lambda s: (0, 0, 1), breaks=[0.05])
 

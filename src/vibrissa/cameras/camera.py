@@ -316,7 +316,7 @@ def triangulate(
         If shapes do not match, or a single camera looks along the plane z = 0.
     """
     pixels = numbers("pixels", pixels)
-    if not cameras or pixels.ndim < 2 or pixels.shape[0] != len(cameras):
+    if not cameras or pixels.ndim < 2 or pixels.shape[:: pixels.ndim - 1] != (len(cameras), 2):
         raise ValueError(
             f"{len(cameras)} cameras and pixels of shape {pixels.shape} do not fit; "
             "(camera, ..., 2) is needed"

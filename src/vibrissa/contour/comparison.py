@@ -62,7 +62,7 @@ def compare_with(
         covariance were the only error.
     """
     if not hasattr(body, "signed_distance"):
-        raise ValueError(f"an object or a fitted shape is needed; got {body!r}")
+        raise ValueError(f"an object or a fitted shape is needed; got {type(body).__name__}")
     p = numbers("points", points)
     if p.ndim != len(dims) + 1 or p.shape[-1] != 3:
         raise ValueError(f"points have shape {p.shape}; {(*dims, 3)} is needed")

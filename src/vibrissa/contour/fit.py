@@ -149,8 +149,8 @@ def fit_shape(
         cylinder, 4 with a known axis), if a covariance is invalid, or if the points do not
         determine the shape, such as points on a line.
     """
-    if kind not in SHAPES:
-        raise ValueError(f"the shape is {kind!r}; it must be one of {', '.join(SHAPES)}")
+    if str(kind) not in SHAPES:
+        raise ValueError(f"the shape is {kind!r:.40}; it must be one of {', '.join(SHAPES)}")
     declared = SHAPES[kind]
     known = {"axis": axis, "outside": outside}
     for name, value in known.items():

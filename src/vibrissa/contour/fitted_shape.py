@@ -18,7 +18,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from vibrissa.deferred import special
-from vibrissa.numerics import AnyArray, Array, Mask, numbers
+from vibrissa.numerics import AnyArray, Array, Mask, numbers, vectors
 from vibrissa.quantities import QUANTITIES, attributes
 
 # Smallest standard deviation, over the points' extent, which replaces zero noise.
@@ -29,6 +29,7 @@ _ASTRAY, _FARTHEST = 100.0, 0.02
 # Median standard deviation of contacts, and radius of the whisker, m, above which they are in other
 # units if they exceed the extent of the contacts.
 _VAGUE, _STOUT = 2e-3, 5e-3
+_SLIM = 2e4  # extent of contacts over the whisker's radius above which points are in other units
 # Smallest variance of a combination, over that of the point or normal.
 _FINE = 1e-10
 # Largest negative eigenvalue of a covariance that is attributed to rounding, over the largest.
@@ -167,6 +168,11 @@ def _scale_contacts(what: str, arrays: dict[str, Array], n: int, least: int) -> 
         raise ValueError(
             f"no {what}: whisker_radius, {radius:.3g} m, is larger than the extent of the "
             f"contacts, {extent:.3g} m; both must be in m"
+        )
+    if extent > _SLIM * radius > 0.0:
+        raise ValueError(
+            f"no {what}: the contacts extend over {extent:.3g} m, {extent / radius:.2g} times "
+            "whisker_radius; both must be in m"
         )
     size = np.linalg.svd(centered, compute_uv=False)
     if not size[1] > FLOOR * size[0]:
@@ -340,7 +346,7 @@ class FittedShape(ABC):
         array (...)
             Distances, m; negative inside.
         """
-        return self._distance(numbers("points", points))
+        return self._distance(vectors("points", points))
 
     def outward_normals(self, points: ArrayLike) -> Array:
         """Compute outward normals of the surface at the points nearest to given points.
@@ -355,7 +361,7 @@ class FittedShape(ABC):
         array (..., 3)
             Unit vectors; NaN where undefined, as on the axis.
         """
-        normal = self._normals(numbers("points", points))
+        normal = self._normals(vectors("points", points))
         return np.where(normal.any(axis=-1, keepdims=True), normal, np.nan)
 
     def distance_sigma(self, points: ArrayLike) -> Array:
@@ -371,7 +377,7 @@ class FittedShape(ABC):
         array (...)
             Standard deviation due to the uncertainty of the parameters, m.
         """
-        return self._sigma(numbers("points", points))
+        return self._sigma(vectors("points", points))
 
     def _sigma(self, points: Array) -> Array:
         """Standard deviation of distances (...); see `distance_sigma`."""

@@ -109,6 +109,8 @@ def sensitivity(
     ):
         out = out.merge(_jacobian(name, matrix, chosen, rows, names, long_name))
     out.attrs |= {"triplet": " ".join(names), "method": "exact"}
+    if isinstance(at, str):
+        out.attrs["at"] = at
     if sensor is not None:
         force = chosen.values[:, :3] * d.force
         sigma = sensor.covariance(names, force, cross(point, force))

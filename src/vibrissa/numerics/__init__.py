@@ -25,6 +25,7 @@ from vibrissa.numerics.arrays import (
     relative as relative,
     rotation_matrices as rotation_matrices,
     share_out as share_out,
+    small_over_large as small_over_large,
     spherical as spherical,
     threads as threads,
     vectors as vectors,

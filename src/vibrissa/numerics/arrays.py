@@ -38,6 +38,7 @@ _MULTIPLE = re.compile(
 )
 
 SKEW = 1e-5
+_FIFTH = 0.2
 """Largest entry of RᵀR − 1 for a rotation R that was written with few digits."""
 
 
@@ -239,6 +240,17 @@ def weighted_quantile(values: AnyArray, weight: Array, shares: float | AnyArray 
     sorted_values, w = values[kept][order], weight[kept][order]
     middle = (np.cumsum(w) - 0.5 * w) / w.sum()
     return np.asarray(np.interp(shares, middle, sorted_values))
+
+
+def small_over_large(sizes: Array, signal: Array, weight: Array) -> float:
+    """Median size in the fifth of the smallest |signal| over that in the fifth of the largest."""
+    signal = np.abs(signal)
+    low, high = weighted_quantile(signal, weight, np.array([_FIFTH, 1.0 - _FIFTH]))
+    small, large = (
+        weighted_quantile(sizes, weight * part) for part in (signal <= low, signal >= high)
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return float(small / large)
 
 
 def without_blas_threads(function: Callable[P, R]) -> Callable[P, R]:

@@ -16,7 +16,7 @@ import xarray as xr
 
 from vibrissa.contacts import At, ContactMap, Noise, SensorNoise, ellipsoids, spherical_derivatives
 from vibrissa.identifiability import sensitivity
-from vibrissa.numerics import Array, contact_weights, weighted_quantile
+from vibrissa.numerics import Array, contact_weights, small_over_large, weighted_quantile
 from vibrissa.paper.lookup import STEP, Interpolation, LookupTable
 from vibrissa.signals import SIGNALS, measured, selection
 
@@ -116,7 +116,6 @@ def _wrench(contacts: xr.Dataset, dims: tuple[str, ...]) -> tuple[Array, Array]:
 
 #: Central share of a quantity's values that defines its range.
 RANGE = 0.99
-_FIFTH = 0.2
 
 
 def sensitivity_findings(data: xr.Dataset, region: xr.DataArray | None = None) -> xr.Dataset:
@@ -215,10 +214,10 @@ def _motion(size: Array, r: Array, phi: Array, weight: Array) -> Array:
 
 
 def _small_over_large(size: Array, signal: Array, weight: Array) -> Array:
-    """Medians for the fifth with the smallest |signal| over those for that with the largest."""
-    signal = np.abs(signal)
-    low, high = weighted_quantile(signal, weight, np.array([_FIFTH, 1.0 - _FIFTH]))
-    return _medians(size, weight * (signal <= low)) / _medians(size, weight * (signal >= high))
+    """Ratios (3, 3) of sizes (n, 3, 3) where the signal is small and where it is large."""
+    return np.array(
+        [[small_over_large(size[:, i, j], signal, weight) for j in range(3)] for i in range(3)]
+    )
 
 
 def _rank_correlations(size: Array, signal: Array, weight: Array) -> Array:

@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from vibrissa.numerics import Array, Mask, weighted_quantile
+from vibrissa.numerics import Array, Mask, small_over_large, weighted_quantile
 from vibrissa.plots import style
 from vibrissa.quantities import axis_label, quantity, to_display
 from vibrissa.scene import COORDINATES, DIRECTIONS, robust_limits
@@ -29,7 +29,6 @@ _BANDS = ((0, 4), (1, 3))
 _HEIGHTS = {"single": 104.0, "double": 125.0}
 # Signals that reach so many times their lowest tenth get an axis that is wider near zero.
 _SKEWED = 30.0
-_FIFTHS = np.array([0.2, 0.8])
 _LEAST = 0.01  # share of the contacts of a side that a station needs for its median to be drawn
 # Half width of a window, in distances of stations. Signals of the paper's grid are bunched, as its
 # radii are 2 mm apart: medians of narrower windows would zigzag.
@@ -44,6 +43,7 @@ class _Contacts:
     derivatives: dict[tuple[str, str], Array]
     weight: Array
     backward: Mask
+    in_grid: bool  # they are those of the paper's grid
 
 
 def derivative_label(coordinate: str, signal: str) -> str:
@@ -117,22 +117,18 @@ def sensitivity_panels(data: xr.Dataset, *, width: style.Width = "double") -> Fi
 
 
 def _finding(contacts: _Contacts) -> str:
-    """Describe the ratio of median slopes in the fifths of smallest and largest signals."""
-    kept, parts = contacts.weight > 0.0, []
+    """Describe the ratios of slopes where signals are small and where they are large."""
+    parts = []
     for name in (n for n in contacts.signals if n not in DIRECTIONS):
-        size = np.abs(contacts.signals[name][kept])
-        slope, weight = np.abs(contacts.derivatives["r", name][kept]), contacts.weight[kept]
-        low, high = weighted_quantile(size, weight, _FIFTHS)
-        medians = [
-            float(weighted_quantile(slope[part], weight[part]))
-            for part in (size <= low, size >= high)
-        ]
-        if min(medians) > 0.0:
+        slopes = np.abs(contacts.derivatives["r", name])
+        ratio = small_over_large(slopes, contacts.signals[name], contacts.weight)
+        if 0.0 < ratio < np.inf:
             symbol = rf"$\partial r/\partial {quantity(name).symbol}$"
-            parts.append(f"{medians[0] / medians[1]:.0f} times ({symbol})")
+            parts.append(f"{ratio:.0f} times ({symbol})")
     if not parts:
         return ""
-    return f"Noise moves light contacts {' and '.join(parts)} as far as strong ones"
+    where = " in the paper's grid" if contacts.in_grid else ""
+    return f"Noise moves light contacts{where} {' and '.join(parts)} as far as strong ones"
 
 
 def _contacts(data: xr.Dataset) -> _Contacts:
@@ -163,7 +159,11 @@ def _contacts(data: xr.Dataset) -> _Contacts:
     }
     signals = {n: to_display(n, row(data[n])) for n in names}
     return _Contacts(
-        signals, derivatives, row(weight), np.asarray(row(data["concave_backward"]), dtype=bool)
+        signals,
+        derivatives,
+        row(weight),
+        np.asarray(row(data["concave_backward"]), dtype=bool),
+        in_grid=data.attrs.get("at") == "grid",
     )
 
 

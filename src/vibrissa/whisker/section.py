@@ -268,6 +268,8 @@ def material_faults(
 
 def length_faults(length: float, any_length: bool | None = False) -> list[str]:
     """List the faults of a length."""
+    if np.ndim(length) or np.asarray(length).dtype.kind not in "fiu":
+        return [f"length is of type {type(length).__name__}; a number is needed, m"]
     if not (np.isfinite(length) and length > 0.0):
         return [f"length is {length!r} m; it must be positive"]
     if any_length or SHORTEST <= length <= LONGEST:

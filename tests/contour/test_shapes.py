@@ -353,6 +353,23 @@ def test_standard_deviations_and_millimetres_are_not_taken_for_what_is_needed(jo
         fit_shape("cylinder", 1e3 * points, known["covariance"], known["whisker_radius"])
 
 
+def test_no_cylinder_is_infinitely_large():
+    """Forces that are not the normals: the refined radius was kilometres, and 'all agreed'."""
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        angle = rng.uniform(-0.6, 0.6, 60)
+        points = 1.5e-3 * np.stack([np.cos(angle), np.sin(angle), rng.uniform(-2, 2, 60)], -1)
+        points += 1e-4 * rng.normal(size=points.shape)
+        covariance = np.tile(1e-8 * np.eye(3), (60, 1, 1))
+        normals = np.tile([1.0, 0.0, 0.0], (60, 1))
+        spread = np.tile(1e-5 * np.eye(3), (60, 1, 1))
+        # A candidate for the axis is along these normals, which is no reason for warnings either.
+        with pytest.raises(ValueError, match="none of finite size fits"):
+            fit_shape(
+                "cylinder", points, covariance, 5e-5, normals=normals, normal_covariance=spread
+            )
+
+
 def test_arguments_in_another_order_or_of_another_shape_are_named(joint_errors):
     points, known = noisy("sphere", joint_errors, np.random.default_rng(4), 100)
     with pytest.raises(ValueError, match=r"shape is array.*; it must be one of"):

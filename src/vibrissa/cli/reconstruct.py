@@ -257,8 +257,9 @@ def _judgement(fit: vb.contour.FittedShape, shapes: xr.Dataset | None) -> Iterat
     if fit.misfit > vb.pipeline.AGREES:
         yield (
             f"The contacts do not fit a {fit.kind}{_by(fit.misfit)}: the object has another "
-            "shape (--shape), or there is more than the noise, such as friction; sigma is as much "
-            "larger, but does not describe an object of another shape"
+            "shape (--shape), or there is more than the noise, such as friction, or base poses or "
+            "times that are not those of the signals; sigma is as much larger, but does not "
+            "describe an object of another shape"
         )
     if shapes is None or fit.kind not in shapes["shape"].values:
         return

@@ -240,6 +240,8 @@ def _fit(starts: Sequence[_SteppedShape], given: Checked) -> SimpleShape:
             used = narrow
             best = _fit_best([best], touches.rows(used))
     best = best.moved(_minimise(best, touches.rows(used), 1e-11).x)
+    if not abs(best.shape.size) < _LARGEST:
+        raise ValueError(_infinite(best))
     if not best.shape.size > 0.0:
         best = _with_positive_size(best, touches.rows(used))
     best = _SteppedShape.at(best.shape.arranged(), best.frame[0], best.count)
@@ -335,10 +337,18 @@ def _fit_best(starts: Sequence[_SteppedShape], touches: Touches) -> _SteppedShap
         if abs(moved.shape.size) < _LARGEST:
             found.append((moved.shape.size <= 0.0, float(solved.cost), moved))
     if not found:
-        raise ValueError(f"no {starts[0].shape.kind}: none of finite size fits the points")
+        raise ValueError(_infinite(starts[0]))
     # The size of a thin object may be fitted as negative; a positive one is preferred.
     *_, best = min(found, key=lambda each: each[:2])
     return best.moved(_minimise(best, touches).x)
+
+
+def _infinite(start: _SteppedShape) -> str:
+    """Message that only an infinitely large shape fits."""
+    return (
+        f"no {start.shape.kind}: none of finite size fits the points; the object may be a plane "
+        "there, or forces may not be normals (friction, inertia, their signs, poses)"
+    )
 
 
 def _uncertainty(best: _SteppedShape, touches: Touches) -> tuple[Array, float, Array, int]:

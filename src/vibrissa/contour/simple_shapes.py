@@ -234,14 +234,14 @@ class Cylinder(RoundShape):
         q = (touches.position - self.origin) @ frame.T
         normal = touches.normal @ frame.T
         n = len(q)
+        # A normal along the axis has no direction across it.
+        along = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), FLOOR)
         if not touches.joint:
-            normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-            return q - far * normal, np.broadcast_to(frame, (n, 2, 3))
+            return q - far * along, np.broadcast_to(frame, (n, 2, 3))
         by = np.zeros((n, 3, 6))
         by[:, :2, :3] = frame
         # A turned normal moves along the chord of an arc, whose radial component is half of that of
         # the arc's tangent.
-        along = normal / np.linalg.norm(normal, axis=1, keepdims=True)
         chord = np.eye(2) - 0.5 * along[:, :, None] * along[:, None, :]
         by[:, :2, 3:] = -far[..., None] * (chord @ frame)
         by[:, 2, 3:] = self.axis

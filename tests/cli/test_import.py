@@ -406,6 +406,19 @@ def test_the_frame_rate_is_asked_for_and_views_are_matched_by_name(trial, tmp_pa
         assert any("in order" in note for note in found.notes) == guessed
 
 
+def test_times_in_milliseconds_are_questioned(trial, tmp_path):
+    rows = [
+        f"{i},{k},{column:.3f},{row:.3f}"
+        for i, points in enumerate(CAMERAS[0].project(trial[1][:, 0]))
+        for k, (column, row) in enumerate(points)
+    ]
+    table = tmp_path / "film.csv"
+    table.write_text("\n".join(["time,node,column,row", *rows]))
+    out = tmp_path / "trial.nc"
+    said = run("import", table, "--pixel-size", "0.058", "--base-radius", "0.05", "-o", out)
+    assert "frames are 1 s apart: time has to be in seconds" in said
+
+
 def test_ends_and_curvature_make_an_arc():
     radius, angles = 300.0, np.linspace(0.2, 0.9, 12)
     circle = radius * np.stack([np.sin(angles), 1.0 - np.cos(angles)], axis=-1) + 50.0

@@ -463,6 +463,14 @@ def test_prior_uncertainty_decides_what_moves(wire, touched):
     assert both.stiffness == pytest.approx(1.1 * wire.base_bending_stiffness, rel=1e-6)
     with pytest.raises(ValueError, match="E r⁴ only"):
         fit_stiffness(*given, modulus_sigma=np.inf, radius_sigma=np.inf)
+    with pytest.raises(ValueError, match="modulus_sigma is 10; it is relative"):
+        fit_stiffness(*given, modulus_sigma=10.0)
+    with pytest.raises(ValueError, match="more than the whisker is long"):
+        fit_stiffness(*given, point_sigma=1.0)
+    with pytest.raises(ValueError, match="no reading with a contact point"):
+        fit_stiffness(wire, np.empty((0, 3)), np.empty((0, 6)), sensor)
+    with pytest.raises(TypeError, match=r"save_sensor\(path, sensor\) needs a Sensor"):
+        save_sensor(sensor, "sensor.toml")
 
 
 @pytest.mark.slow

@@ -126,6 +126,11 @@ def _tracks(
         found = parts[0]
     if found["time"].attrs.get("units") != "s":
         raise ValueError(f"{paths[0]} does not state the frame rate: give --rate")
+    if usual := vb.io.slow_steps(found["time"].values):
+        remark(
+            f"note: frames are {usual:.3g} s apart: time has to be in seconds (--rate: frames a "
+            "second), and forces and contacts are filtered wrongly if it is in ms"
+        )
     frames = found["frame"].values
     every = np.arange(frames.min(), frames.max() + 1)
     if len(every) > len(frames):

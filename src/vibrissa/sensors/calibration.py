@@ -350,7 +350,7 @@ def calibrate_on_contacts(
         If contacts are not possible, which are left out, or if errors of the points hide the noise.
     """
     bent = deflections_to(whisker, points)
-    sigma = spread_of_points(point_sigma, np.asarray(points, dtype=np.float64))
+    sigma = spread_of_points(point_sigma, np.asarray(points, dtype=np.float64), whisker.length)
     if sigma.any():
         slopes = wrench_slopes(bent) * sigma[:, None]
         options["wrench_covariances"] = slopes @ slopes.swapaxes(1, 2)

@@ -199,6 +199,8 @@ def save_sensor(path: str | PathLike[str], sensor: Sensor) -> None:
     sensor : Sensor
         Sensor to write.
     """
+    if not isinstance(sensor, Sensor):
+        raise TypeError(f"save_sensor(path, sensor) needs a Sensor; got {type(sensor).__name__}")
     lines = [f"channels = {json.dumps(sensor.channels, ensure_ascii=False)}"]
     lines.append(f"mixing = {_array(sensor.mixing)}")
     lines += [f"{name} = {_array(getattr(sensor, name))}" for name in _NUMBERS]

@@ -213,8 +213,13 @@ def fit_stiffness(
             "loads determine E r⁴ only: modulus_sigma or radius_sigma must be finite, none "
             f"negative; got {modulus_sigma} and {radius_sigma}"
         )
+    for name, sigma in (("modulus_sigma", modulus_sigma), ("radius_sigma", radius_sigma)):
+        if 1.0 < sigma < np.inf:
+            raise ValueError(f"{name} is {sigma:g}; it is relative, so that 0.1 is 10 %")
     known = np.isfinite(y).all(axis=1) & np.isfinite(contacts).all(axis=1)
-    blur = spread_of_points(point_sigma, contacts)[known]
+    if not known.any():
+        raise ValueError("no reading with a contact point is known")
+    blur = spread_of_points(point_sigma, contacts, whisker.length)[known]
     y, contacts = y[known], contacts[known]
     noise = np.sqrt(np.diag(sensor.covariance()))
     size = np.sqrt((y**2).mean(axis=0)) if len(y) else noise
@@ -312,7 +317,7 @@ def _check_determined(spread: Array, taper: bool, base: bool) -> None:
         )
 
 
-def spread_of_points(point_sigma: ArrayLike, contacts: Array) -> Array:
+def spread_of_points(point_sigma: ArrayLike, contacts: Array, length: float) -> Array:
     """Standard deviations (n, 3) of contact points; raise ValueError if they are not valid."""
     sigma = numbers("point_sigma", point_sigma)
     try:
@@ -323,6 +328,10 @@ def spread_of_points(point_sigma: ArrayLike, contacts: Array) -> Array:
         ) from fault
     if not (np.isfinite(spread) & (spread >= 0.0)).all():
         raise ValueError(f"point_sigma must be finite and not negative, m; got {sigma.tolist()}")
+    if (most := spread.max(initial=0.0)) > length:
+        raise ValueError(
+            f"point_sigma is {most:g} m, more than the whisker is long; are these millimetres?"
+        )
     return spread
 
 

@@ -1,6 +1,7 @@
 """What users hand over: datasets of files, other units, swapped arguments."""
 
 import re
+from functools import partial
 
 import numpy as np
 import pytest
@@ -65,7 +66,16 @@ def test_swapped_arguments_get_a_hint(bent, contact_map):
             vb.estimate_from_wrench(bent.whisker, force, moment)
         with pytest.raises(ValueError, match="force, N, comes before moment"):
             vb.second_contact(bent.whisker, force, moment, noise=1e-12 * np.eye(6))
-    for needs_a_map in (vb.uniqueness, vb.sensitivity, vb.Estimator):
+    certificates = vb.certificates
+    for needs_a_map in (
+        vb.uniqueness,
+        vb.sensitivity,
+        vb.Estimator,
+        partial(vb.best_triplet, noise=np.eye(6)),
+        certificates.certify,
+        certificates.smallest_cone,
+        partial(certificates.outlook, cone=0.1),
+    ):
         with pytest.raises(ValueError, match=r"ContactMap.simulate\(whisker\)"):
             needs_a_map(bent.whisker)
     sensor = vb.sensors.Sensor(("My", "Mz"), noise=2e-8)

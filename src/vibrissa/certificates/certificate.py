@@ -38,6 +38,7 @@ from vibrissa.certificates.conditions import (
 from vibrissa.certificates.domain import Bounds, bounds_of, is_planar, objection, room_within
 from vibrissa.certificates.equations import ExactRod, exact_rod
 from vibrissa.certificates.search import bounds, cover, volume
+from vibrissa.contacts import need_map
 from vibrissa.io import in_file, read_dataset, write_netcdf
 from vibrissa.numerics import Array, IntArray, share_out
 from vibrissa.signals import CONE
@@ -527,6 +528,7 @@ def certify(
     ValueError
         If the base is compliant, or the file is a certificate of another whisker or domain.
     """
+    need_map(contact_map)
     before = load_certificate(path) if path is not None and Path(path).exists() else None
     if before is None or not sum(len(part.certified) for part in before.parts.values()):
         if not 0.0 <= cone < 0.5 * np.pi:

@@ -33,6 +33,7 @@ import numpy as np
 
 from vibrissa.certificates.conditions import DEGREES, PLANAR, SPATIAL
 from vibrissa.certificates.equations import ExactRod, exact_rod
+from vibrissa.contacts import need_map
 from vibrissa.numerics import AnyArray, Array
 from vibrissa.rod import fold_forces, solve_forces, with_normal_force
 from vibrissa.signals import cone_angle
@@ -200,6 +201,7 @@ def outlook(contact_map: ContactMap, cone: float) -> Outlook:
     Outlook
         Whether a certificate can exist, and outside which cone.
     """
+    need_map(contact_map)
     straight = bool(contact_map.whisker.is_straight)
     room = float(np.sin(_REST if straight else cone))
     failing = _failing_shares(contact_map, room, (_COARSE, _DIRECTIONS, _LEVELS))
@@ -225,6 +227,7 @@ def smallest_cone(contact_map: ContactMap) -> float:
         Half angle about the resting whisker, rad; infinite if there is none, 0 for a straight
         whisker that needs none.
     """
+    need_map(contact_map)
     if contact_map.whisker.is_straight:
         return 0.0 if outlook(contact_map, 0.0).possible else np.inf
     rod = exact_rod(contact_map.whisker)

@@ -29,6 +29,7 @@ from vibrissa.certificates.conditions import DEGREES, Conditions, spatial_point_
 from vibrissa.certificates.domain import Bounds, is_planar
 from vibrissa.certificates.equations import ExactRod, exact_rod
 from vibrissa.certificates.search import bounds, cover
+from vibrissa.contacts import need_map
 from vibrissa.numerics import Array, IntArray
 
 if TYPE_CHECKING:
@@ -117,6 +118,7 @@ def prove_witness(
         Result for the pair, and the statement that could not be proved if there is one.
     """
     names = triplet.split() if isinstance(triplet, str) else list(triplet)
+    need_map(contact_map)
     d = contact_map.chart.discretization
     rod, whisker = exact_rod(contact_map.whisker), contact_map.whisker
     alpha = 1.0 - whisker.tip_radius / whisker.base_radius

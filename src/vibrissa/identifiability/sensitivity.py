@@ -31,6 +31,7 @@ from vibrissa.contacts import (
     contact_signal_derivatives,
     ellipsoids,
     large_deflection,
+    need_map,
     rms_error,
     spherical_derivatives,
     within_paper_bounds,
@@ -219,6 +220,7 @@ def best_triplet(
     chosen_names = [selection(triplet, exactly=3) for triplet in triplets]
     if not chosen_names:
         raise ValueError("at least one triplet is needed; got none")
+    need_map(contact_map)
     every = tuple(dict.fromkeys(n for t in chosen_names for n in t))
     sensor = SensorNoise.of(noise, every, whisker=contact_map.whisker)
     chosen = chosen_contacts(contact_map, at)

@@ -163,6 +163,7 @@ def test_the_verb_writes_cameras_that_see_the_same_points(files):
     done = run(*words, "-o", out)
     assert done.exit_code == 0, done.exception
     assert "reprojection error 0.0" in done.stdout
+    assert "mm from the first board's corner" in done.stdout
     cameras = load_cameras(out)
     assert error_of(cameras, PAIR) < 1e-3
 

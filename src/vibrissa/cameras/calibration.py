@@ -105,7 +105,8 @@ def calibrate(
         each = ", ".join(f"{name} in {sum(k == name for k, _ in seen)}" for name in images)
         raise ValueError(
             f"the board is seen by all cameras in {len(shared)} images (by {each}); {_FEWEST} are "
-            "needed, with the board rotated and moved between them"
+            "needed, with the board rotated and moved between them, and with as many inner corners "
+            f"as stated, {corners[0]} × {corners[1]} (one less than squares)"
         )
     lenses = {
         name: _Lens.of([seen[key] for key in seen if key[0] == name], board, series[0].shape)

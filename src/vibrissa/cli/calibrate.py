@@ -225,7 +225,8 @@ def _cameras(
     for camera in cameras:
         say(
             f"{camera.name}: {camera.size[0]} × {camera.size[1]} pixels, focal length "
-            f"{camera.matrix[0, 0]:.1f} × {camera.matrix[1, 1]:.1f} pixels"
+            f"{camera.matrix[0, 0]:.1f} × {camera.matrix[1, 1]:.1f} pixels, "
+            f"{1e3 * np.linalg.norm(camera.translation):.4g} mm from the first board's corner"
         )
     say(
         f"reprojection error {error:.3f} pixels (root mean square); points among the boards are "

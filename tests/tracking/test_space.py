@@ -289,21 +289,6 @@ def test_sudden_stops_and_starts_are_no_repeated_frames(steps):
     assert repeated_frames([traced(camera, curve(a)) for a in azimuth]) == set()
 
 
-@pytest.mark.parametrize(("faint", "left"), [(range(0, 20, 4), 20), (range(20), 0)])
-def test_ends_that_are_not_one_point_are_not_the_tip(faint, left):
-    """The second view shows the whisker only as far as its thin part, in some or all frames."""
-    from vibrissa.tracking.space.curve import with_one_tip
-
-    pair = PAIRS["orthogonal"]
-    rows = list(moving(pair, count=20)[:2])
-    for i in faint:
-        n = len(rows[1][i].line) - (30 if i != 7 else 0)
-        first = rows[1][i]
-        rows[1][i] = first._replace(line=first.line[:n], sigma=first.sigma[:n], seen=first.seen[:n])
-    found = with_one_tip(pair, rows)
-    assert [sum(t.tip_seen for t in view) for view in found] == [left, left]
-
-
 def test_a_given_offset_is_used():
     pair = PAIRS["orthogonal"]
     first, second, _ = moving(pair, count=20)

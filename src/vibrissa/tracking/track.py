@@ -67,7 +67,6 @@ from vibrissa.tracking.space.curve import (
     begun_together,
     merged,
     shown_by_one,
-    with_one_tip,
 )
 from vibrissa.tracking.space.exchange import Known, exchanged
 from vibrissa.tracking.space.frame_pairs import best_seen, paired_frames
@@ -466,7 +465,7 @@ def track_whisker(
 ) -> Tracked:
     """Track one whisker, or one of a row, from traces of frames that belong together, by view."""
     report = progress or (lambda stage, done, total: None)
-    traces, blur = with_blur(with_one_tip(cameras, traces))
+    traces, blur = with_blur(traces)
     series = TraceSeries.of(traces)
     _check_views(cameras, series, name)
     curves = all_merged(cameras, traces, partial(report, f"{name} in space"))

@@ -28,9 +28,7 @@ from vibrissa.tracking.trace.trace import STEP, Trace, arc_lengths, interpolated
 Array = NDArray[np.float64]
 
 NODES = 101  # number of points of a whisker in space, equally spaced
-# Distance of the ends of several views from one point from which they are not the tip, pixels, and
-# smallest number of frames that show it.
-_ENDS_APART, _FEW_ENDS = 8.0, 3
+_ENDS_APART = 8.0  # distance of tips from one point, pixels, above which views end apart
 _SAMPLES = 51  # number of points of the spline that are compared with the traces
 _CONTROLS = 14  # number of the spline's control points
 _ROUNDS = 5  # largest number of Gauss–Newton steps
@@ -444,23 +442,3 @@ def compare(pixels: Any, slopes: Any, lines: Any, rows: Any, found: Any) -> None
                         )
                 sums[f, 0] += (weight * gap) ** 2
                 sums[f, 1] += 1.0
-
-
-def with_one_tip(
-    cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]]
-) -> Sequence[Sequence[Trace]]:
-    """Traces of which none ends at the tip if most end apart in the views.
-
-    So it is where compression erases thin parts: the other ends agree by chance.
-    """
-    frames = [i for i, one in enumerate(zip(*traces, strict=True)) if _all_end(one)]
-    if len(cameras) == 1 or len(frames) < _FEW_ENDS:
-        return traces
-    apart = base_gap(cameras, np.array([[view[i].line[-1] for i in frames] for view in traces]))
-    if 2 * np.count_nonzero(apart > _ENDS_APART) <= len(frames):
-        return traces
-    return [[t._replace(tip_seen=False) for t in view] for view in traces]
-
-
-def _all_end(views: Sequence[Trace]) -> bool:
-    return all(len(trace.line) > 0 and trace.tip_seen for trace in views)

@@ -214,7 +214,6 @@ _LINEAR, _MOST_UNSURE = 0.04, 0.6
 # Force, over the usual one, from which its direction shows the normal; and standard deviation of
 # contacts along the whisker, over its length, by a taper that is only assumed.
 _STRONG, _UNSURE = 0.3, 0.03
-_CURVED = 0.05  # distance of points that show the curvature at a contact, as a share of the length
 
 
 @dataclass(frozen=True, eq=False)
@@ -565,23 +564,6 @@ def _by_bend(problem: Problem, state: State, length: Length, spread: Array) -> A
     return changes * length.astray(np.sqrt(beyond**2 + farther))[:, None]
 
 
-def _off_tangent(line: Array, share: Array, spread: Array) -> Array:
-    """Second moments (t, 3, 3) of how far contacts that slide along a bent line leave its tangent.
-
-    Covariances are those of points on the tangent. At the contact, lines bend as at rest.
-    """
-    n = line.shape[1]
-    step = max(1, round(_CURVED * n))
-    middle = np.clip(np.rint(share * (n - 1)).astype(int), step, n - 1 - step)
-    before, here, after = (line[np.arange(len(line)), middle + k * step] for k in (-1, 0, 1))
-    chord = after - before
-    square = (chord**2).sum(axis=1)
-    along = np.einsum("ti,tij,tj->t", chord, spread, chord) / square
-    aside = 4.0 * (after - 2.0 * here + before) / square[:, None] * (0.5 * along)[:, None]
-    # The mean of the fourth power of a normal number is three.
-    return np.asarray(3.0 * aside[:, :, None] * aside[:, None])
-
-
 def _answer(
     problem: Problem,
     state: State,
@@ -633,7 +615,6 @@ def _answer(
     wrench_spread += np.einsum("tki,tkj->tij", aside, aside)
     line = rods(d, state.contact, np.linspace(0.0, 1.0, nodes))
     line = np.einsum("tij,tnj->tni", state.rotation, line) + state.position[:, None]
-    spread += _off_tangent(line * d.length, state.contact[:, 0], spread)
     shared = np.concatenate([moved, framed], axis=1)
     shared[..., [0, 1, 2, *range(9, 15)]] *= none
     return RodFit(

@@ -281,6 +281,37 @@ def test_the_filter_follows_contacts_of_a_whisker_with_weight(nitinol, swung):
         vb.ContactFilter(locate)
 
 
+@pytest.mark.parametrize("angle", [0.0, 2.0])
+def test_the_filter_states_light_contacts_of_a_whisker_that_sags_in_any_pose(nitinol, angle):
+    """The sag of another pose is as large as the bending by a contact just detected."""
+    whisker, turn = nitinol.whisker, Rotation.from_rotvec([angle, 0.0, 0.0]).as_matrix()
+    pull = turn.T @ [0.0, 0.0, -G]
+    noise = covariance(whisker)
+    gravity = Gravity((0.0, 0.0, -G), tare=tuple(pull))
+    follow = vb.ContactFilter(vb.Estimator(nitinol, SIX, noise, felt_above=5.0, gravity=gravity))
+    rng, squares = np.random.default_rng(5), []
+    forces = np.linspace(0.01, 0.04, 4) * unit(whisker)
+    for arc, direction in zip(rng.uniform(0.4, 0.9, 30), rng.uniform(0, 6.28, 30), strict=True):
+        # Touches of one point of the whisker; the base follows it.
+        load = vb.PointForce(arc * whisker.length, forces, direction)
+        bent = vb.deflect(whisker, load, gravity=pull)
+        wrench = np.concatenate([bent.force, bent.moment], axis=1)
+        wrench += rng.normal(size=wrench.shape) * np.sqrt(np.diag(noise))
+        rows = np.stack([vb.base_signals(wrench[:, :3], wrench[:, 3:])[n] for n in SIX], axis=1)
+        follow.reset()
+        follow(0.0, np.zeros(6), turn, np.zeros(3))
+        for i, row in enumerate(rows):
+            base = turn @ (bent.contact_point[0] - bent.contact_point[i])
+            known = follow(0.01 + 0.01 * i, row, turn, base)
+            if known.probability > 0.99:
+                away = known.point - turn @ bent.contact_point[0]
+                squares.append(away @ np.linalg.solve(known.covariance, away))
+    assert len(squares) > 80
+    # The four samples of a contact share its first error.
+    assert np.mean(squares) < 5.0
+    assert np.mean(np.array(squares) < 7.81) > 0.85
+
+
 def test_the_filter_takes_an_uncertain_stiffness_if_the_sag_hardly_depends_on_it(nitinol, swung):
     rotations, rows, points = swung
     noise = covariance(nitinol.whisker)

@@ -25,7 +25,7 @@ from vibrissa.contacts.joint.joint_fit import JointFit, soft_base
 from vibrissa.contacts.joint_estimate import JointEstimate
 from vibrissa.contacts.sensing.channels import CHANNELS, channels_of
 from vibrissa.contacts.sensing.noise import by_stiffness, common_errors, sensor_noise
-from vibrissa.numerics import Array, numbers, rotation_matrices
+from vibrissa.numerics import Array, Vector, numbers, rotation_matrices
 from vibrissa.rod import PointContact, deflect
 from vibrissa.sensors import GRAVITY, Sensor
 from vibrissa.signals import selection
@@ -427,6 +427,28 @@ class Estimator:
         """
         assert self._joint is not None
         return self._again(contact_map=self._joint.sagged)
+
+    @property
+    def resting(self) -> Vector:
+        """Gravity under which that whisker rests in the last pose, whisker frame, m/s²."""
+        assert self._joint is not None
+        return self._joint.shape
+
+    def rests_nearly(self, before: Vector) -> bool:
+        """Return whether the whisker rests nearly as under another gravity.
+
+        Parameters
+        ----------
+        before : tuple of float
+            Gravity of another pose, whisker frame, m/s².
+
+        Returns
+        -------
+        bool
+            Whether the sagged shape is nearly the same.
+        """
+        assert self._joint is not None
+        return self._joint.nearly(self._joint.shape, before)
 
     def of_sagged(self, measurement: Measurement, sagged: Estimator) -> Measurement:
         """Return what the sagged whisker without weight would measure of the same contact point.

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,7 +33,7 @@ from vibrissa.contacts.uncertainty.posterior import THREE_SIGMA, ranked
 from vibrissa.contacts.uncertainty.valleys import LIKELY_FRICTION
 from vibrissa.contacts.wrench import PROXIMAL, by_probability, chosen, estimate_components
 from vibrissa.deferred import xr
-from vibrissa.numerics import AnyArray, Array, IntArray
+from vibrissa.numerics import AnyArray, Array, IntArray, Vector
 from vibrissa.rod import Discretization, Resting, solve_forces
 from vibrissa.signals import (
     SIGNALS,
@@ -65,6 +65,8 @@ _NEAR_ARC, _NEAR_FORCE = (0.02, 0.05), (0.1, 0.3)
 # Displacement of the tip, over L, due to a turn of the base within which one resting shape proposes
 # contacts; and the least and the largest such turn, rad.
 _AS_BENT, _LEAST_TURN, _LARGEST_TURN = 0.01, 0.2, 1.0
+_FINEST_TURN = 0.02  # spacing of directions, rad, below which resting shapes are not made anew
+_SHAPES = 8  # number of maps of sagged whiskers that are kept
 _SAME_SAG = 3e-4  # standard deviation of the tip's sag, over L, that a filter neglects
 
 
@@ -76,7 +78,7 @@ class _Path(NamedTuple):
 
     x: Array
     points: Array
-    shape: tuple[float, float, float] | None
+    shape: Vector | None
 
     def onward(self, found: Candidates) -> _Path | None:
         """Path on to the first candidate of a measurement; None if it is far from both contacts."""
@@ -100,7 +102,7 @@ class _Searches(NamedTuple):
     signals do not determine contacts.
     """
 
-    shape: tuple[float, float, float] | None
+    shape: Vector | None
     exact: list[Search]
     noisy: Search | None
 
@@ -152,7 +154,8 @@ class JointEstimate:
         self.d, whole = self.forward.d, names == WRENCH
         self.channels = Channels(WRENCH, WRENCH) if whole else Channels.of(names)
         self.scale = signal_scales(names, self.d.force, self.d.moment)
-        self._step = self.forward.direction_step(_least_noise(sensor, names, self.d))
+        self._least = _least_noise(sensor, names, self.d)
+        self._step = self.forward.direction_step(self._least)
         self._shift = _shifts(self.channels.names, self.forward.shift)
         least = PROXIMAL if whole or contact_map is None else contact_map.chart.proximal
         self._fit = JointFit(self.forward, self.channels, sensor, least, friction=whole)
@@ -235,8 +238,20 @@ class JointEstimate:
     def sagged(self) -> ChartedWhisker:
         """Map of a weightless whisker with the sagged shape, or nearly so."""
         assert self.contact_map is not None
-        assert self._proposing is not None
-        return self.contact_map.sagged(self._proposing)
+        return _sagged(self.contact_map, self.shape)
+
+    @property
+    def shape(self) -> Vector:
+        """Gravity of that shape, whisker frame, m/s²; noise hides the difference from this pose."""
+        assert self.gravity is not None
+        # A deviation δ of the tip, over L, is a force of 3 δ.
+        hidden = self._least / (3.0 * max(self._sag, 1e-300))
+        return self.gravity.nearly(1.0, min(max(2.0 * hidden, _FINEST_TURN), _LEAST_TURN))
+
+    def nearly(self, now: Vector, before: Vector) -> bool:
+        """Whether the resting shapes under two accelerations, m/s², are nearly the same."""
+        assert self._lab is not None
+        return math.dist(now, before) < self._turn * math.hypot(*self._lab.acceleration)
 
     def direction(self, rotation: Array) -> tuple[float, ...]:
         """Gravity of the laboratory frame in the frame of a base turned by (3, 3)."""
@@ -245,7 +260,7 @@ class JointEstimate:
         return self._lab.turned(rotation, self._step).acceleration
 
     @property
-    def laboratory_gravity(self) -> tuple[float, float, float] | None:
+    def laboratory_gravity(self) -> Vector | None:
         """Stated gravity in the frame that rotations of the base lead to."""
         return None if self._lab is None else self._lab.acceleration
 
@@ -270,10 +285,9 @@ class JointEstimate:
         # Contacts are proposed by resting shapes under gravity of the stated size, which are few.
         now = max(float(np.linalg.norm(weight.acceleration)), _WEIGHTLESS)
         out._proposing = weight.nearly(float(np.linalg.norm(stated.acceleration)) / now)
-        if self._proposing is not None and self._path is not None:
-            turn = np.linalg.norm(np.subtract(out._proposing, self._proposing))
-            if turn < self._turn * np.linalg.norm(stated.acceleration):
-                out._proposing = self._proposing
+        before = self._proposing if self._path is not None else None
+        if before is not None and self.nearly(out._proposing, before):
+            out._proposing = before
         # The first pose is that of the tare, unless readings are without weight in every pose.
         out._lab = stated if self._how["without_weight"] else replace(stated, tare=weight.tare)
         out._step, out._turn = self._step, self._turn
@@ -447,7 +461,9 @@ class JointEstimate:
     def _sagged_searches(self) -> _Searches:
         """Searches on the sagged whisker, kept as long as its shape proposes contacts."""
         if self._searches is None or self._searches.shape != self._proposing:
-            sagged, own, exact = self.sagged, None, []
+            assert self.contact_map is not None
+            assert self._proposing is not None
+            sagged, own, exact = _sagged(self.contact_map, self._proposing), None, []
             if sagged.determines(self.names):
                 near = dict(zip(self.names, (_NEAR * self.scale).tolist(), strict=True))
                 exact = [
@@ -458,6 +474,12 @@ class JointEstimate:
                     own = Search(sagged, Named(sagged, self.names, self.sensor))
             self._searches = _Searches(self._proposing, exact, own)
         return self._searches
+
+
+@lru_cache(maxsize=_SHAPES)
+def _sagged(contact_map: ChartedWhisker, gravity: Vector) -> ChartedWhisker:
+    """Map of a weightless whisker with the shape under this gravity, m/s²."""
+    return contact_map.sagged(gravity)
 
 
 def _least_noise(sensor: SensorNoise | None, names: tuple[str, ...], d: Discretization) -> float:

@@ -45,7 +45,7 @@ from vibrissa.contacts.following.units import Course, question_parameters
 from vibrissa.contacts.sensing.noise import explained
 from vibrissa.contacts.uncertainty.posterior import THREE_SIGMA
 from vibrissa.deferred import special
-from vibrissa.numerics import AnyArray, Array
+from vibrissa.numerics import AnyArray, Array, Vector
 from vibrissa.rod import charted_rod
 from vibrissa.status import Status
 
@@ -196,9 +196,12 @@ class ContactFilter:
             )
         # With weight, contacts are those of a weightless whisker with the sagged shape, for
         # measurements corrected by the effect of the weight.
+        self._shape: Vector | None = None
         self._weighted = estimator if estimator.weighted else None
-        estimator = estimator.sagged() if self._weighted else estimator
-        self.estimator = estimator
+        if self._weighted is None:
+            self._locate_by(estimator)
+        else:
+            self._sag()
         if speed is None:
             self._drift = Drift(_SPEEDS, _SHARES, persistence)
         else:
@@ -207,12 +210,29 @@ class ContactFilter:
         self._memory = memory
         self._pose = (pose_sigma / self._length) ** 2
         self._birth = math.log(birth)
-        self._beginning = Beginning(estimator)
-        how = estimator.readout.how
+        how = self.estimator.readout.how
         self._errors = len(how.errors)
         self._limit = explained(len(how.own))
         self._course = Course()
         self.reset()
+
+    def _locate_by(self, estimator: Estimator) -> None:
+        self.estimator, self._beginning = estimator, Beginning(estimator)
+
+    def _sag(self) -> None:
+        """Give the weightless whisker the shape of the whisker with weight in this pose.
+
+        A light contact is as near to the resting shape as the sag of another pose is. Hypotheses
+        of a contact that is held keep the shape as long as the base turns little.
+        """
+        assert self._weighted is not None
+        shape, before = self._weighted.resting, self._shape
+        if before is not None:
+            held = len(self._mixture.weight) > 0 and self._weighted.rests_nearly(before)
+            if held or shape == before:
+                return
+        self._shape = shape
+        self._locate_by(self._weighted.sagged())
 
     def __repr__(self) -> str:
         return f"<ContactFilter of {self.estimator!r}>"
@@ -250,6 +270,8 @@ class ContactFilter:
             measurement = self.estimator.measurement(signals, rotation, gravity)
         else:
             measurement = self._weighted.measurement(signals, rotation, gravity)
+            if self._weighted.nothing_in(measurement) is None:
+                self._sag()
             measurement = self._weighted.of_sagged(measurement, self.estimator)
         base = base / self._length
         if self._time is not None:

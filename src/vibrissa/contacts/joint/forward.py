@@ -133,20 +133,22 @@ class Gravity:
         x, y, z = near_direction(rotation.T @ self.acceleration, step).tolist()
         return replace(self, acceleration=(x, y, z), tare=self.tare or (x, y, z))
 
-    def nearly(self, share: float) -> tuple[float, float, float]:
+    def nearly(self, share: float, step: float = _SHAPES) -> tuple[float, float, float]:
         """A share of the acceleration, in the nearest of directions some degrees apart.
 
         Parameters
         ----------
         share : float
             Share of its size.
+        step : float
+            Angle between neighbouring directions, rad.
 
         Returns
         -------
         tuple of float
             Acceleration, m/s².
         """
-        x, y, z = near_direction(share * np.array(self.acceleration), _SHAPES).tolist()
+        x, y, z = near_direction(share * np.array(self.acceleration), step).tolist()
         return x, y, z
 
 

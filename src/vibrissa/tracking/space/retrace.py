@@ -26,12 +26,10 @@ from vibrissa.tracking.trace.trace import Trace, TraceOptions, overlap
 _BASES, _TIPS, _FADING = 8.0, 0.1, 0.4
 # Share of the frames in which the views show one whisker, from which nothing is traced anew.
 _AGREES = 0.9
-# Shares of all frames, and of those in which both views show a line, in which the views must agree;
-# else all lines that are traced anew are in doubt.
-_HALF, _MOSTLY = 0.5, 0.6
-# Log likelihood by which a whisker's line is to be more probable than others in the median frame:
-# below zero, most frames by themselves show another one, and only motion and bend decide.
-_SURE = 0.0
+# Log likelihood by which a whisker's line is to be more probable than others in the median frame,
+# for it to be sure: below zero, most frames by themselves show another one, and only motion and
+# bend decide; more is needed where the views do not agree about the whisker.
+_SURE, _CLEAR = 0.0, 4.0
 _LARGEST = 20  # number of whiskers of a row up to which lines can be combined
 
 
@@ -89,7 +87,7 @@ def retraced(
     for v, camera in enumerate(cameras):
         both = [guide, v]
         rows = [_in_pairs(found[view], pairs[:, view]) for view in both]
-        before, _ = _agreement([cameras[view] for view in both], rows)
+        before = _agreement([cameras[view] for view in both], rows).mean()
         if v == guide or before >= _AGREES:
             continue
         known = [_as_seen_by(row, pairs[:, v], len(found[v][0])) for row in rows[0]]
@@ -105,7 +103,8 @@ def retraced(
             progress=None if progress is None else partial(progress, v),
         )
         rows[1] = _in_pairs(new, pairs[:, v])
-        after, of_seen = _agreement([cameras[view] for view in both], rows)
+        agreement = _agreement([cameras[view] for view in both], rows)
+        after = agreement.mean()
         if after > before:
             found[v] = new
             remarks.append(
@@ -114,15 +113,12 @@ def retraced(
                 f"{100.0 * before:.0f} % of the frames, now in {100.0 * after:.0f} %."
             )
             seen = np.array([any(len(trace.line) for trace in row) for row in new])
-            agree = after >= _HALF and of_seen >= _MOSTLY
-            unsure = seen & (margins < _SURE) if agree else seen
+            unsure = seen & (margins < np.where(agreement < _AGREES, _CLEAR, _SURE))
             if unsure.any():
-                why = "most frames by themselves show other ones"
                 remarks.append(
                     f"not sure which lines in {camera.name} are those of "
-                    f"{', '.join(f'whisker {k}' for k in np.flatnonzero(unsure))}: "
-                    f"{why if agree else 'the views agree in few frames'}. "
-                    "Compare traces and video (vibrissa correct)."
+                    f"{', '.join(f'whisker {k}' for k in np.flatnonzero(unsure))}: others are "
+                    "about as probable. Compare traces and video (vibrissa correct)."
                 )
     return found, remarks
 
@@ -152,17 +148,18 @@ def _as_seen_by(row: Sequence[Trace], frames: NDArray[np.int64], count: int) -> 
     return known
 
 
-def _agreement(
-    cameras: Sequence[Camera], rows: Sequence[Sequence[Sequence[Trace]]]
-) -> tuple[float, float]:
-    """Share of all frames and whiskers in which two views show one; and of those seen by both."""
-    pairs = [pair for both in zip(*rows, strict=True) for pair in zip(*both, strict=True)]
-    seen = [pair for pair in pairs if all(len(trace.line) for trace in pair)]
-    if not seen:
-        return 0.0, 0.0
-    ends = np.array([[[t.line[0], t.line[-1]] for t in pair] for pair in seen])
-    gaps: Array = base_gap(cameras, np.moveaxis(ends, 1, 0))
-    length = np.array([min(trace.length for trace in pair) for pair in seen])
-    whole = np.array([all(trace.tip_seen for trace in pair) for pair in seen])
-    agree = (gaps[:, 0] < _BASES) & (gaps[:, 1] < np.where(whole, _TIPS, _FADING) * length)
-    return float(agree.sum() / len(pairs)), float(agree.mean())
+def _agreement(cameras: Sequence[Camera], rows: Sequence[Sequence[Sequence[Trace]]]) -> Array:
+    """Share of the frames (whisker,) in which two views show one whisker."""
+    shares = []
+    for row in zip(*rows, strict=True):
+        seen = [pair for pair in zip(*row, strict=True) if all(len(trace.line) for trace in pair)]
+        if not seen:
+            shares.append(0.0)
+            continue
+        ends = np.array([[[t.line[0], t.line[-1]] for t in pair] for pair in seen])
+        gaps: Array = base_gap(cameras, np.moveaxis(ends, 1, 0))
+        length = np.array([min(trace.length for trace in pair) for pair in seen])
+        whole = np.array([all(trace.tip_seen for trace in pair) for pair in seen])
+        agree = (gaps[:, 0] < _BASES) & (gaps[:, 1] < np.where(whole, _TIPS, _FADING) * length)
+        shares.append(float(agree.sum() / len(row[0])))
+    return np.array(shares)

@@ -13,7 +13,17 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import xarray as xr
-    from scipy import interpolate, linalg, ndimage, optimize, signal, spatial, special, stats
+    from scipy import (
+        interpolate,
+        linalg,
+        ndimage,
+        optimize,
+        signal,
+        sparse,
+        spatial,
+        special,
+        stats,
+    )
     from scipy.sparse import linalg as sparse_linalg
     from scipy.spatial import transform
 else:
@@ -31,8 +41,8 @@ else:
     interpolate, linalg, ndimage, optimize = (
         _Deferred(f"scipy.{name}") for name in ("interpolate", "linalg", "ndimage", "optimize")
     )
-    signal, spatial, special, stats = (
-        _Deferred(f"scipy.{name}") for name in ("signal", "spatial", "special", "stats")
+    signal, sparse, spatial, special, stats = (
+        _Deferred(f"scipy.{name}") for name in ("signal", "sparse", "spatial", "special", "stats")
     )
     sparse_linalg = _Deferred("scipy.sparse.linalg")
     transform = _Deferred("scipy.spatial.transform")
@@ -63,6 +73,7 @@ __all__ = [
     "ndimage",
     "optimize",
     "signal",
+    "sparse",
     "sparse_linalg",
     "spatial",
     "special",

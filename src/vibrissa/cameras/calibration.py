@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.cameras.camera import Camera, triangulate
-from vibrissa.deferred import optimize, transform
+from vibrissa.deferred import optimize, sparse, sparse_linalg, transform
 from vibrissa.numerics import Array, Mask
 
 Image = NDArray[np.uint8]
@@ -32,6 +32,8 @@ _FEWEST = 4  # smallest number of moments at which all cameras must see the boar
 _WINDOW, _WIDEST = 0.4, 15
 _EQUAL = 1e-3  # difference of mean agreements, up to 3, of orders of corners that are equally good
 _DRAWS = 20  # number of draws that show the errors of points
+# Relative changes at which the least squares, and the linear ones of each step, are solved.
+_CONVERGED, _SOLVED = 1e-12, {"atol": 1e-14, "btol": 1e-14, "maxiter": 3000}
 # Reprojection error, relative to the longer side of the image, of cameras that do not fit.
 _UNFIT = 0.005
 
@@ -283,23 +285,56 @@ class _Bundle:
         poses = x[at:].reshape(-1, 2, 3)
         return lenses, dict(zip(lenses, poses, strict=False)), poses[len(lenses) :]
 
-    def _misses(self, x: Array) -> Array:
-        """Differences of projected and seen corners, pixels, flat."""
+    def _compared(self, x: Array) -> tuple[Array, Any]:
+        """Differences of projected and seen corners, pixels, flat; sparse derivatives of them."""
         cv2 = _opencv()
         lenses, cameras, boards = self._split(x)
-        misses = []
-        for key, points in self.seen.items():
-            pose, k = cameras[key[0]], self.boards[key]
-            turn, shift = pose if k < 0 else cv2.composeRT(*boards[k], *pose)[:2]
-            lens = lenses[key[0]]
-            pixels = cv2.projectPoints(self.board, turn, shift, _matrix(lens), lens[4:])[0]
-            misses.append((pixels.reshape(-1, 2) - points).ravel())
-        return np.concatenate(misses)
+        lens_at = np.cumsum([0, *(lens.free.sum() for lens in self.lenses.values())])
+        pose_at = lens_at[-1] + 6 * np.arange(len(cameras) + len(boards))
+        order = {name: i for i, name in enumerate(self.lenses)}
+        misses, values, columns = [], [], []
+        for (name, moment), points in self.seen.items():
+            lens, free, i = lenses[name], self.lenses[name].free, order[name]
+            (turn, shift), by_camera = cameras[name], np.eye(6)
+            unknown, parts = [np.arange(*lens_at[i : i + 2]), pose_at[i] + np.arange(6)], []
+            if (k := self.boards[name, moment]) >= 0:
+                turn, shift, *by = cv2.composeRT(*boards[k], turn, shift)
+                by_camera = np.block([[by[2], by[3]], [by[6], by[7]]])
+                parts.append(np.block([[by[0], by[1]], [by[4], by[5]]]))
+                unknown.append(pose_at[len(cameras) + k] + np.arange(6))
+            pixels, slopes = cv2.projectPoints(self.board, turn, shift, _matrix(lens), lens[4:])
+            by_lens, by_pose = slopes[:, 6:15], slopes[:, :6]
+            if not free[1]:
+                by_lens[:, 0] += by_lens[:, 1]
+            misses.append((pixels.reshape(-1, 2) - points.astype(np.float64)).ravel())
+            values.append(
+                np.hstack([by_lens[:, free], *(by_pose @ p for p in (by_camera, *parts))])
+            )
+            columns.append(np.tile(np.concatenate(unknown), (len(slopes), 1)))
+        ends = np.cumsum([0, *(row.size for block in columns for row in block)])
+        flat = [np.concatenate([block.ravel() for block in each]) for each in (values, columns)]
+        return np.concatenate(misses), sparse.csr_matrix((*flat, ends), (len(ends) - 1, len(x)))
 
     @cached_property
     def solution(self) -> optimize.OptimizeResult:
         """Least squares."""
-        return optimize.least_squares(self._misses, self._start(), x_scale="jac", xtol=1e-10)
+
+        def misses(x: Array) -> Array:
+            return self._compared(x)[0]
+
+        def slopes(x: Array) -> Any:
+            return self._compared(x)[1]
+
+        return optimize.least_squares(
+            misses,
+            self._start(),
+            slopes,
+            x_scale="jac",
+            xtol=_CONVERGED,
+            ftol=_CONVERGED,
+            gtol=_CONVERGED,
+            tr_options={"regularize": False, **_SOLVED},
+        )
 
     @property
     def error(self) -> float:
@@ -323,11 +358,11 @@ class _Bundle:
 
     def point_sigma(self) -> float:
         """Root mean square error of points among the shared boards, m."""
-        x, jacobian = self.solution.x, self.solution.jac
-        scale = np.linalg.norm(jacobian, axis=0)
-        _, sizes, directions = np.linalg.svd(jacobian / scale, full_matrices=False)
-        noise = np.linalg.norm(self.solution.fun) / np.sqrt(max(len(jacobian) - len(x), 1))
-        steps = noise * directions.T / sizes / scale[:, None]
+        x, count = self.solution.x, len(self.solution.fun)
+        noise = np.linalg.norm(self.solution.fun) / np.sqrt(max(count - len(x), 1))
+        scale = sparse_linalg.norm(self.solution.jac, axis=0)
+        jacobian = self.solution.jac @ sparse.diags(1.0 / scale)
+        normal = sparse_linalg.splu((jacobian.T @ jacobian).tocsc())
         placed = self._split(x)[2]
         name = next(iter(self.lenses))
         others = [placed[self.boards[name, i]] for i in self.shared[1:]]
@@ -338,8 +373,9 @@ class _Bundle:
         true = np.concatenate([self.board, *moved])
         pixels = np.stack([camera.project(true) for camera in self.cameras(x)])
         squares = []
-        for draw in np.random.default_rng(0).normal(size=(_DRAWS, len(x))):
-            points = triangulate(self.cameras(x + steps @ draw), pixels)[0]
+        for draw in np.random.default_rng(0).normal(0.0, noise, (_DRAWS, count)):
+            step = normal.solve(jacobian.T @ draw) / scale
+            points = triangulate(self.cameras(x + step), pixels)[0]
             centred = points - points.mean(axis=0), true - true.mean(axis=0)
             squares.append(transform.Rotation.align_vectors(*centred)[1] ** 2 / len(true))
         return float(np.sqrt(np.mean(squares)))

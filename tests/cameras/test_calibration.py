@@ -113,6 +113,16 @@ def test_a_board_that_looks_the_same_after_a_rotation(images, quarters):
     assert error_of(cameras, (PAIR[0], Rolled())) < 2e-3
 
 
+def test_one_moment_that_does_not_fit_is_named(images):
+    """The second camera took it when the board was elsewhere."""
+    turn, shift = np.array([0.1, 0.2, -0.1]), np.array([-6e-3, -4e-3, 0.0])
+    series = {name: list(one) for name, one in images.items()}
+    series["left"][4] = painted(sights(PAIR[0]), turn, shift)
+    series["right"][4] = painted(sights(PAIR[1]), turn + 0.01, shift + 3e-4)
+    with pytest.warns(UserWarning, match=r"number 5 \(from 1\) of the images used has an error of"):
+        calibrate(series, CORNERS, SQUARE)
+
+
 def test_images_that_no_cameras_explain(images):
     """Those of a mirror, which had a reprojection error of NaN, and those of other moments."""
     left, right = images["left"], images["right"]

@@ -350,6 +350,21 @@ def test_points_in_space_and_one_view_of_a_plane(trial, tmp_path):
     assert np.median(np.abs(arcs)) < 3e-4
 
 
+def test_a_rod_longer_than_any_whisker_is_confirmed(trial, tmp_path):
+    """The option that the message advises was refused without a --whisker."""
+    noise = np.random.default_rng(2).normal(0.0, 5e-4, trial[1].shape)
+    raw = RawTracks("test", ["w"], space=50.0 * trial[1] + noise, unit="m", fps=1000.0)
+    save_tracks(tmp_path / "rod.nc", labelled(raw, "rod"))
+    how = ("import", tmp_path / "rod.nc", "--base-radius", 1, "-o", tmp_path / "a.nc")
+    with pytest.raises(ValueError, match="--any-length"):
+        run(*how)
+    assert "mm long, in contact in" in run(*how, "--any-length")
+    with pytest.raises(ValueError, match="and any other with --any-length"):
+        run(*how, "--length", 760, "--force")
+    text = run(*how, "--length", 760, "--any-length", "--fur", 20, "--force")
+    assert "20 ± 5 mm of its base are taken to be hidden by fur" in text
+
+
 @pytest.mark.slow
 def test_a_table_of_anipose_to_a_recording(trial, tmp_path):
     truth, line = trial

@@ -265,7 +265,7 @@ def test_bases_are_stated_by_whisker_or_by_view(capsys, by_whisker):
         (("--base-radius", "-1"), "--base-radius is -1"),
         (("--rat", "C2", "--base-radius", "0.1"), "--rat determines the radii"),
         (("--rat", "Z9"), "Z9"),
-        (("--any-length",), "needs a --whisker"),
+        (("--base-end", "last"), "--base-end needs a --whisker"),
         (("--base", "20,30", "--base", "20,192"), "outside of view 1, 192 × 192 pixels"),
     ],
 )

@@ -348,6 +348,20 @@ def test_covariances_of_frame_offset_and_weight_hold_what_the_misfit_shows(rng):
         assert 0.6 < np.mean(kind) < 1.5
 
 
+def test_loads_taken_for_readings_are_noticed(rng):
+    """The frame would be the inverse one, with equal residuals."""
+    frame = SensorFrame(("y", "-x", "z"), (0.01, 0.0, 0.0))
+    force = rng.normal(size=(12, 3))
+    arms = np.repeat([[0.05, 0.0, 0.0], [0.1, 0.0, 0.0]], 6, axis=0)
+    loads = np.concatenate([force, np.cross(arms, force)], axis=1)
+    noise = np.repeat([1e-2, 2e-4], 3)
+    readings = loads @ frame.from_base().T + noise * rng.normal(size=(12, 6))
+    stated = {"force_noise": noise[0], "moment_noise": noise[3]}
+    assert calibrate_frame(readings, loads, **stated).misfit < 2.0
+    with pytest.warns(UserWarning, match="are `readings` and `wrenches` exchanged"):
+        calibrate_frame(loads, readings, **stated)
+
+
 def test_loads_that_leave_the_frame_open_are_refused(rng):
     force = np.outer(rng.uniform(0.1, 1.0, 10), [0.0, 0.0, 1.0])
     loads = np.concatenate([force, np.zeros((10, 3))], axis=1)
@@ -698,6 +712,9 @@ def test_usual_mistakes_of_calibrations_are_said(wire, touched, rng):
         calibrate_weight(Sensor(noise=noise), readings, turn.transpose(0, 2, 1))
     with pytest.warns(UserWarning, match="carry 30 kg"):
         calibrate_weight(Sensor(noise=1e3 * noise), 1e3 * readings, turn)
+    in_mn = Sensor(mixing=1e3, noise=1e3 * noise)
+    with pytest.warns(UserWarning, match="are the readings and the sensor's noise in the same"):
+        calibrate_weight(in_mn, readings, turn)
     readings[0, 0] = 9.0  # saturated
     assert calibrate_weight(replace(heavy, mass=0.0), readings, turn).misfit < 2.0
     points, wrench = touched.contact_point, wrench_of(touched)

@@ -8,7 +8,11 @@ import pytest
 
 pytest.importorskip("viser", reason="viser is not installed", exc_type=ImportError)
 
+import vibrissa as vb
+from vibrissa.scene import Label
+from vibrissa.viewer.map import frame_drawing, overview, solids
 from vibrissa.viewer.page import PANEL, Framing, Shot, framed
+from vibrissa.viewer.state import charted
 
 FOV = np.deg2rad(75.0)
 
@@ -48,6 +52,28 @@ def test_the_centre_is_in_the_middle_of_what_is_free(width, height):
     ends = [on_screen(shot.centre + s * aside, position, look_at, width, height) for s in (-1, 1)]
     assert ends[0][0] >= -1e-6
     assert ends[1][0] <= free + 1e-6
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 720), (1280, 800), (1920, 1080)])
+def test_no_label_of_the_map_hides_another(width, height):
+    """A letter is 7 × 16 pixels."""
+    drawn = solids(charted(vb.samples.gamma()), cut=True)
+    middle, distance, way, tall = overview(drawn.length)
+    position, look_at = framed(Shot(middle, distance, np.array(way), tall), width, height, FOV)
+    boxes = {}
+    for mark in frame_drawing(drawn, 5.0).values():
+        if isinstance(mark, Label):
+            left, bottom = on_screen(mark.position, position, look_at, width, height)
+            boxes[mark.text] = np.array(
+                [[left, bottom - 16.0], [left + 7.0 * len(mark.text), bottom]]
+            )
+    assert len(boxes) > 8
+    free = width - PANEL * height
+    for text, box in boxes.items():
+        assert box[1, 0] < free, text
+        for other, second in boxes.items():
+            apart = (box[0] > second[1]).any() or (second[0] > box[1]).any()
+            assert apart or text == other, (text, other)
 
 
 def test_what_is_tall_is_above_the_panel_of_a_phone():

@@ -11,6 +11,7 @@ that the cameras keep their relative orientation from moment to moment.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -36,6 +37,8 @@ _DRAWS = 20  # number of draws that show the errors of points
 _CONVERGED, _SOLVED = 1e-12, {"atol": 1e-14, "btol": 1e-14, "maxiter": 3000}
 # Reprojection error, relative to the longer side of the image, of cameras that do not fit.
 _UNFIT = 0.005
+# Reprojection error of the images of one moment, relative to the median of all, that is doubted.
+_DOUBTED = 3.0
 
 
 class Calibration(NamedTuple):
@@ -85,6 +88,11 @@ def calibrate(
     ValueError
         If the cameras have different numbers of images, too few show the board, or no cameras
         explain the corners.
+
+    Warns
+    -----
+    UserWarning
+        If the images of one moment fit more than three times worse than those of most.
     """
     counts = {name: len(series) for name, series in images.items()}
     if len(counts) < 2 or len(set(counts.values())) != 1:
@@ -117,12 +125,19 @@ def calibrate(
     _align_orders(seen, lenses, board, corners, shared)
     fit = _Bundle(board, seen, lenses, tuple(shared))
     largest = max(max(image.shape) for series in images.values() for image in series)
+    doubt = fit.doubt()
     if not fit.error < _UNFIT * largest:
         raise ValueError(
             "no cameras explain the images of the board: their reprojection error is "
-            f"{fit.error:.2g} pixels. Were all images with the same number taken at the same "
-            "moment, with cameras that did not move? Images by way of a mirror must be mirrored "
-            "back"
+            f"{fit.error:.2g} pixels{doubt and f'; {doubt}'}. Were all images with the same number "
+            "taken at the same moment, with cameras that did not move? Images by way of a mirror "
+            "must be mirrored back"
+        )
+    if doubt:
+        warnings.warn(
+            f"{doubt}: did all cameras take it at the same moment, and was the board flat and at "
+            "rest? Otherwise leave it out",
+            stacklevel=2,
         )
     return Calibration(fit.cameras(fit.solution.x), fit.error, fit.point_sigma())
 
@@ -340,6 +355,21 @@ class _Bundle:
     def error(self) -> float:
         """Root mean square distance of corners from where they are seen, pixels."""
         return float(np.sqrt(2.0 * np.mean(self.solution.fun**2)))
+
+    def doubt(self) -> str:
+        """State which moment's images fit far worse than the others; "" if none do."""
+        misses = self.solution.fun.reshape(len(self.seen), len(self.board), 2)
+        squares = (misses**2).sum(axis=2).mean(axis=1)
+        moments = np.array([moment for _, moment in self.seen])
+        numbers = np.unique(moments)
+        errors = np.sqrt([squares[moments == number].mean() for number in numbers])
+        worst, usual = int(errors.argmax()), float(np.median(errors))
+        if errors[worst] < _DOUBTED * usual:
+            return ""
+        return (
+            f"number {numbers[worst] + 1} (from 1) of the images used has an error of "
+            f"{errors[worst]:.2g} pixels, the others {usual:.2g} (median)"
+        )
 
     def cameras(self, x: Array) -> tuple[Camera, ...]:
         """Cameras of the unknowns."""

@@ -38,6 +38,7 @@ def import_tracks(
     tip_radius: float | None = None,
     length: float | None = None,
     cutoff: float | None = None,
+    fur: float = 0.0,
     objects: Path | None = None,
     force: bool = False,
 ) -> None:
@@ -66,6 +67,7 @@ def import_tracks(
     how = vb.tracking.TrackOptions(
         cutoff=vb.tracking.usual_cutoff(per_second) if cutoff is None else cutoff or None,
         length=own.tracked_length(length),
+        fur=own.hidden(fur),
         **own.tracked(base_radius, tip_radius),
     )
     known: dict[str, Any] = {} if objects is None else {"objects": objects_from(objects)}

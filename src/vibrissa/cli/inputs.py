@@ -15,6 +15,7 @@ from vibrissa.deferred import xr
 
 RECORDING, MAP = "vibrissa recording", "vibrissa contact map"  # kinds of NetCDF files
 _LONGEST = 500.0  # longest whisker, mm
+_LONGEST_FUR = 20.0  # longest part of a whisker that fur hides, mm
 _THICKEST = 10.0  # radius of a whisker above which it may be in micrometres instead of mm, mm
 # Unit of each limit of a region on the command line.
 _UNITS = {"r": 1e-3, "theta": math.pi / 180.0, "phi": math.pi / 180.0}
@@ -82,20 +83,29 @@ class TrackedOptions(WhiskerOptions):
     """Options for a tracked whisker, whose shape is that in the frames unless a file is given."""
 
     def __post_init__(self) -> None:
-        if (self.any_length or self.base_end) and self.whisker is None:
-            raise ValueError("each of --any-length and --base-end needs a --whisker")
+        if self.base_end and self.whisker is None:
+            raise ValueError("--base-end needs a --whisker")
 
     def tracked_length(self, length: float | None) -> float | None:
         """Stated length of the whisker, m."""
         if length is None:
             return None
-        if not 0.0 < length <= _LONGEST:
+        if not 0.0 < length <= (math.inf if self.any_length else _LONGEST):
             raise ValueError(
-                f"--length is {length:g} mm; more than 0 to {_LONGEST:g} mm are allowed"
+                f"--length is {length:g} mm; more than 0 to {_LONGEST:g} mm are allowed, and any "
+                "other with --any-length"
             )
         if self.whisker is not None:
             refuse({"--length": length}, "the --whisker has a length")
         return 1e-3 * length
+
+    def hidden(self, fur: float) -> float:
+        """Length of the whisker's base that fur hides, m."""
+        if not 0.0 <= fur <= _LONGEST_FUR:
+            raise ValueError(f"--fur is {fur:g} mm; 0 to {_LONGEST_FUR:g} mm are allowed")
+        if self.whisker is not None:
+            refuse({"--fur": fur or None}, "the --whisker begins where it is seen: cut it there")
+        return 1e-3 * fur
 
     def tracked(self, base_radius: float | None, tip_radius: float | None) -> dict[str, Any]:
         """Keyword arguments of tracking: the whisker, if given, with the stated radii."""
@@ -111,6 +121,8 @@ class TrackedOptions(WhiskerOptions):
             refuse(stated, "--rat determines the radii")
             vb.Whisker.straight(0.03, rat=self.rat)  # rejects unknown names early
             properties["rat"] = self.rat
+        if self.any_length:
+            properties["any_length"] = True
         return {"properties": properties}
 
 

@@ -29,7 +29,6 @@ _VIEW = re.compile(r"\d+,\d+,\d+,\d+(:[a-z]+)*")  # part of the images of a vide
 _NEAREST, _FARTHEST = 0.03, 30.0  # smallest and largest distance of a lens, m
 _RATE = 1000.0
 
-_LONGEST_FUR = 20.0  # longest part of a whisker that fur hides, mm
 _HALF = 127  # grey value above which a pixel of a mask image is bright
 # Reason for showing a frame in which the whisker may have been lost.
 _LOST = "here a whisker is lost, has a hook, or differs much in length from the frame before"
@@ -329,17 +328,13 @@ def track(
         raise ValueError(
             f"--cutoff is {cutoff:g} Hz; it must be below half of {rate:g} frames/s, or 0 for none"
         )
-    if not fur <= _LONGEST_FUR:
-        raise ValueError(f"--fur is {fur:g} mm; 0 to {_LONGEST_FUR:g} mm are allowed")
-    if own.whisker is not None:
-        refuse({"--fur": fur or None}, "the --whisker begins where it is seen: cut it there")
     how = vb.tracking.TrackOptions(
         cutoff=vb.tracking.usual_cutoff(rate) if cutoff is None else cutoff or None,
         offset=None if filmed.offset == "auto" else int(filmed.offset),
         rough=filmed.cameras is None and filmed.distance != math.inf,
         distance=filmed.distance,
         length=own.tracked_length(length),
-        fur=1e-3 * fur,
+        fur=own.hidden(fur),
         **own.tracked(base_radius, tip_radius),
     )
     job = _Job(

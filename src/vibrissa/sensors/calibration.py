@@ -425,7 +425,8 @@ def calibrate_weight(
     Warns
     -----
     UserWarning
-        If residuals are more than five times the noise, or the mass is more than 5 kg.
+        If residuals are more than five times the noise or less than a hundredth of it, or the mass
+        is more than 5 kg.
     """
     y = numbers("readings", readings, any_unit=True)
     k = len(sensor.channels)
@@ -478,11 +479,12 @@ def calibrate_weight(
             stacklevel=2,
         )
     left = found.residuals.reshape(-1, k) * noise
-    warn_of_misfit(
-        misfit,
-        "that the rotations are those of the whisker's base (not of a flange), from the whisker "
-        "frame to the laboratory frame, and the sensor's axes and handedness",
-    )
+    if sensor.covariance().any():
+        warn_of_misfit(
+            misfit,
+            "that the rotations are those of the whisker's base (not of a flange), from the "
+            "whisker frame to the laboratory frame, and the sensor's axes and handedness",
+        )
     return WeightCalibration(calibrated, covariance, np.sqrt((left**2).mean(axis=0)), misfit)
 
 
@@ -547,7 +549,9 @@ def _tared(sensor: Sensor, y: Array, noise: Array) -> WeightCalibration:
     light = replace(sensor, mass=0.0, mass_moment=np.zeros(3))
     tared = light.with_new_offset(len(y), bias)
     misfit = float((left**2 / noise**2).sum() * len(y) / max(len(y) - 1, 1) / k)
-    warn_of_misfit(misfit, "that nothing was touched, and that the orientation stayed the same")
+    if sensor.covariance().any():
+        what = "that nothing was touched, and that the orientation stayed the same"
+        warn_of_misfit(misfit, what, stacklevel=4)
     return WeightCalibration(tared, covariance, left, misfit)
 
 

@@ -15,6 +15,7 @@ moments gives the origin. Finally, all six unknowns are fitted together.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -128,6 +129,8 @@ def _named_axes(names: Sequence[str]) -> Array:
 
 _ADVICE = "apply forces in at least two directions, at two points or more"
 _CLEARLY = 2.0  # smallest ratio of the residuals of the two signs of moments that decides
+# Ratio of the shares of moments along forces below which these are loads, and the others readings.
+_LOADS = 0.1
 _GAIN = 2.0  # largest ratio of measured forces to loads without an error of units or offset
 # Relative spreads of forces below which these are on one line, or in one plane.
 _ALONG, _FLAT = 1e-4, 1e-6
@@ -185,7 +188,8 @@ def calibrate_frame(
     Warns
     -----
     UserWarning
-        If residuals are more than five times the noise.
+        If residuals are more than five times the noise or less than a hundredth of it, or loads and
+        readings seem to be exchanged.
     """
     read, true = numbers("readings", readings), numbers("wrenches", wrenches)
     if read.ndim != 2 or read.shape[1:] != (6,) or read.shape != true.shape:
@@ -195,6 +199,7 @@ def calibrate_frame(
     known = np.isfinite(read).all(axis=1) & np.isfinite(true).all(axis=1)
     read, true = read[known], true[known]
     _check_units(read, true)
+    _check_order(read, true)
     force = _matched(read[:, :3], true[:, :3])
     options = [_placed(read, true, force, hand) for hand in (1, -1)]
     left = [option[1] for option in options]
@@ -248,6 +253,20 @@ def _check_units(read: Array, true: Array) -> None:
         raise ValueError(
             f"the measured forces are {gain:.3g} times the loads: readings are needed in N and "
             "N·m, without offset"
+        )
+
+
+def _check_order(read: Array, true: Array) -> None:
+    """Warn if the readings are those of exact forces at points, as only known loads are.
+
+    The moment of a force has no component along it, in any frame; noise adds one.
+    """
+    along = [np.linalg.norm((wrench[:, :3] * wrench[:, 3:]).sum(axis=1)) for wrench in (read, true)]
+    if along[0] < _LOADS * along[1]:
+        warnings.warn(
+            "the readings have smaller moments along their forces than the known loads, which have "
+            "no noise: are `readings` and `wrenches` exchanged?",
+            stacklevel=3,
         )
 
 

@@ -59,14 +59,22 @@ def _combination(direction: Array, names: Sequence[str]) -> str:
 
 
 _MANY = 5.0  # ratio of residuals to noise above which the user is warned
+# Ratios between which the noise seems stated in another unit; exact readings leave less.
+_FEW, _EXACT = 1e-2, 1e-4
 
 
-def warn_of_misfit(misfit: float, advice: str) -> None:
-    """Warn if residuals are far larger than the noise; ``misfit`` is χ² per degree of freedom."""
+def warn_of_misfit(misfit: float, advice: str, stacklevel: int = 3) -> None:
+    """Warn if residuals and noise differ in size; ``misfit`` is χ² per degree of freedom."""
+    if _EXACT**2 < misfit < _FEW**2:
+        warnings.warn(
+            f"the residuals are only {math.sqrt(misfit):.2g} times the noise: are the readings and "
+            "the sensor's noise in the same units?",
+            stacklevel=stacklevel,
+        )
     if misfit > _MANY**2:
         warnings.warn(
             f"the residuals are {math.sqrt(misfit):.0f} times the noise: check {advice}",
-            stacklevel=3,
+            stacklevel=stacklevel,
         )
 
 

@@ -694,6 +694,7 @@ def _check_views(cameras: Sequence[Camera], series: TraceSeries, name: str) -> N
     if gap > allowed:
         raise ValueError(
             f"the views do not show one whisker: where they see the base of {name}, their lines of "
-            f"sight pass each other by {gap:.0f} pixels (median). Give where it begins in each "
-            "view (--base), and check the order of the videos and the cameras' calibration."
+            f"sight pass each other by {gap:.0f} pixels (median). Check the order of the views, "
+            "the cameras' calibration, and that all are of the same whisker from its base on; of "
+            "videos, state where it begins in each (`vibrissa track --base`)"
         )

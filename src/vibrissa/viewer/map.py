@@ -179,10 +179,15 @@ def frame_drawing(solids: Solids, exaggeration: float) -> scene.Drawing:
         "0": centre + np.array([0.0, 0.0, solids.axis_height()]),
         least: bottom - np.array([0.85 * length, 0.0, 0.0]),
         "MD = 0°": bottom + edge + apart,
-        f"MB = {largest}": bottom - edge - 3.0 * apart,
+        f"MB = {largest}": bottom + np.array([0.55 * length, 0.0, 0.0]),
     }.items():
         out[f"axes {text}"] = scene.Label(at, text)
     return out
+
+
+def overview(length: float) -> tuple[Array, float, tuple[float, float, float], float]:
+    """Centre, distance, direction and height of the view of all four spaces; see `Page.look_at`."""
+    return np.array([1.0, 0.0, 0.0]) * length, 2.2 * length, (0.0, -0.95, 0.33), 1.6
 
 
 def _moved(body: scene.Body, by: Array) -> scene.Body:
@@ -263,9 +268,7 @@ class MapMode(Mode):
         """Show the controls, and point the cameras at all four spaces."""
         super().enter()
         self._drawn = None
-        length = float(to_display("length", self._page.bend.whisker.length))
-        middle = np.array([1.0, 0.0, 0.0]) * length
-        self._page.look_at(middle, 2.2 * length, (0.0, -0.95, 0.33), height=1.6)
+        self._page.look_at(*overview(float(to_display("length", self._page.bend.whisker.length))))
 
     def leave(self) -> None:
         """Hide the controls and the objects."""

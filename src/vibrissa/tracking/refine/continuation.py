@@ -128,7 +128,7 @@ def _too_short(posed: _Posed, view: int) -> str:
         f"the views show too little of one whisker to locate it: {shown} pixels (median), and what "
         f"{posed.cameras[view].name} shows goes on far beyond. Either another view follows "
         "something else, such as a whisker that was cut, or it hides most of it: look at the "
-        "traces, and give where it begins in each view (--base)"
+        "traces, and, of videos, state where it begins in each view (`vibrissa track --base`)"
     )
 
 

@@ -172,7 +172,22 @@ def test_what_cannot_be_written(tmp_path):
     again = load_tracks(tmp_path / "a.nc")
     assert again["trace_confidence"].dims == ("time", "whisker", "view", "node")
     with pytest.raises(ValueError, match="which states"):
-        load_tracks(tmp_path / "a.nc", fps=3.0)
+        load_tracks(tmp_path / "a.nc", unit="mm")
+
+
+def test_a_frame_rate_that_contradicts_the_times_is_refused(tmp_path):
+    """It was ignored: times of a file, or its own, were kept without a word."""
+    path = tmp_path / "points.csv"
+    path.write_text("time,x_mm,y_mm,z_mm\n" + "".join(f"{k / 1000},1,2,3\n" for k in range(5)))
+    for file in (path, tmp_path / "own.nc"):
+        tracks = load_tracks(file, fps=1000.0)
+        with pytest.raises(ValueError, match="states 1000 frames per second, but 500 is given"):
+            load_tracks(file, fps=500.0)
+        save_tracks(tmp_path / "own.nc", tracks)
+    save_tracks(tmp_path / "frames.nc", labelled(deep(image=IMAGE), "a.nc", unit="mm"))
+    found = load_tracks(tmp_path / "frames.nc", fps=3.0)
+    np.testing.assert_allclose(found["time"], found["frame"] / 3.0)
+    assert found["time"].attrs["units"] == "s"
 
 
 def test_somebody_elses_table(tmp_path):

@@ -106,10 +106,7 @@ def _tracks(
     """Read the tracks of all views, with every frame from the first to the last."""
     given: dict[str, Any] = {"fps": rate, "unit": unit}
     labels: Any = {name: value for name, value in given.items() if value is not None}
-    parts = []
-    for path in paths:
-        own = vb.io.recognise(path) in (vb.io.Kind.TRACKS, vb.io.Kind.RECORDING)
-        parts.append(vb.load_tracks(path, **({} if own else labels)))
+    parts = [vb.load_tracks(path, **labels) for path in paths]
     _check_frames(paths, [part["frame"].values for part in parts])
     if len(paths) > 1:
         if cameras is None and len(paths) > len(_VIEWS):

@@ -29,7 +29,14 @@ from vibrissa.io.nwb import read_nwb
 from vibrissa.io.paths import check_readable, without_part
 from vibrissa.io.table import read_text, signal_column, table_rows
 from vibrissa.io.time_tables import CONTOUR, MATLAB_PREDICTORS
-from vibrissa.io.tracks import Labels, RawTracks, labelled, load_own_tracks, read_tracks_table
+from vibrissa.io.tracks import (
+    Labels,
+    RawTracks,
+    labelled,
+    load_own_tracks,
+    read_tracks_table,
+    timed,
+)
 from vibrissa.io.whisk import MEASUREMENTS, WHISKERS, read_measurements, read_whiskers
 
 
@@ -208,9 +215,10 @@ def load_tracks(
     path = Path(path)
     kind = recognise(path) if kind is None else kind
     if kind in (Kind.TRACKS, Kind.RECORDING):
+        fps = labels.pop("fps", None)
         if labels:
             raise ValueError(f"{path} is a {kind}, which states {', '.join(labels)} itself")
-        return load_own_tracks(path)
+        return timed(load_own_tracks(path), path, fps)
     if kind not in READERS:
         raise ValueError(
             f"{path} does not contain tracks in a known format (it is: {kind}). Known are: "

@@ -51,6 +51,8 @@ KIND = "vibrissa tracks"
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6}
 # Smallest and largest plausible extent of a whisker, m.
 SHORTEST, LONGEST = 0.5e-3, 1.0
+# Relative difference of frame rates that are the same but for rounding.
+_ROUNDED = 5e-3
 # Largest confidence that is read; peaks of confidence maps can exceed 1.
 SUREST = 2.0
 IMAGE = ("time", "whisker", "view", "node", "image_axis")
@@ -218,11 +220,8 @@ def _clock(raw: RawTracks, path: Path, fps: float | None) -> dict[str, Any]:
     array = raw.image if raw.image is not None else raw.space
     assert array is not None
     frames = _counted_frames(raw.time, len(array)) if raw.frames is None else raw.frames
-    if fps is not None and not (np.isfinite(fps) and fps > 0.0):
-        raise ValueError(f"fps is {fps!r}; it must be positive")
-    if raw.fps is not None and fps is not None and abs(fps / raw.fps - 1.0) > 1e-3:
-        raise ValueError(f"{path} states {raw.fps:g} frames per second, but {fps:g} is given")
-    rate = raw.fps if raw.fps is not None else fps
+    stated = raw.fps or (None if raw.time is None else _rate_of(frames, raw.time))
+    rate = _agreed_rate(path, stated, fps)
     about = attributes("time")
     if raw.time is not None:
         time = np.asarray(raw.time, dtype=np.float64)
@@ -240,6 +239,33 @@ def _clock(raw: RawTracks, path: Path, fps: float | None) -> dict[str, Any]:
         "time": xr.Variable("time", time, about),
         "frame": xr.Variable("time", frames.astype(np.int64), number),
     }
+
+
+def _rate_of(frames: NDArray[np.integer[Any]], time: Array) -> float | None:
+    """Frames per second, of numbers of frames and their times, s."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rate = float(np.median(np.diff(frames) / np.diff(time))) if len(time) > 1 else np.nan
+    return rate if np.isfinite(rate) and rate > 0.0 else None
+
+
+def _agreed_rate(path: Path, stated: float | None, given: float | None) -> float | None:
+    """Frames per second stated by the file or given by the caller; the two must agree."""
+    if given is not None and not (np.isfinite(given) and given > 0.0):
+        raise ValueError(f"fps is {given!r}; it must be positive")
+    if stated is not None and given is not None and abs(given / stated - 1.0) > _ROUNDED:
+        raise ValueError(f"{path} states {stated:g} frames per second, but {given:g} is given")
+    return stated or given
+
+
+def timed(tracks: xr.Dataset, path: Path, fps: float | None) -> xr.Dataset:
+    """Tracks with times in seconds, if they or the caller state the frame rate."""
+    time = tracks["time"]
+    frames = tracks["frame"].values if "frame" in tracks.coords else np.arange(len(time))
+    in_seconds = time.attrs.get("units") == "s"
+    rate = _agreed_rate(path, _rate_of(frames, time.values) if in_seconds else None, fps)
+    if in_seconds or rate is None:
+        return tracks
+    return tracks.assign_coords(time=("time", frames / rate, attributes("time")))
 
 
 def _counted_frames(time: Array | None, count: int) -> NDArray[np.integer[Any]]:

@@ -343,6 +343,8 @@ def test_sleap_labels(tmp_path, rng, tracked):
         frames.append(sio.LabeledFrame(video=video, frame_idx=i + 2, instances=instances))
     labels = sio.Labels(frames, videos=[video], skeletons=[skeleton])
     labels.update()
+    if not tracked:  # Listed tracks that no instance has left no point.
+        labels.tracks.extend([sio.Track("C1"), sio.Track("C2")])
     path = tmp_path / "labels.slp"
     sio.save_slp(labels, str(path))
     tracks = load_tracks(path)

@@ -27,7 +27,13 @@ from vibrissa.contacts.fitting.least_squares import Fits
 from vibrissa.contacts.joint.forward import Forward, Gravity, finite
 from vibrissa.contacts.joint.friction import along_curves, check_ratio, or_without
 from vibrissa.contacts.joint.joint_fit import Joint, JointFit, check_compliance
-from vibrissa.contacts.sensing.channels import WRENCH, Channels, channels_of, friction_angle
+from vibrissa.contacts.sensing.channels import (
+    CHANNELS,
+    WRENCH,
+    Channels,
+    channels_of,
+    friction_angle,
+)
 from vibrissa.contacts.sensing.noise import Noise, SensorNoise, explained, sensor_noise
 from vibrissa.contacts.uncertainty.posterior import THREE_SIGMA, ranked
 from vibrissa.contacts.uncertainty.valleys import LIKELY_FRICTION
@@ -50,6 +56,8 @@ _EXACT = 1e-8  # tolerance for exact signals, in χ² of signals known to 1 %
 # Noise, in units of force and moment and in rad, within which the weightless whisker proposes
 # contacts for signals that it does not explain exactly.
 _NEAR = 0.01
+# Rounds of corrections of what it proposes; and the resolution in which proposals are the same.
+_CORRECTIONS, _ALIKE = 3, 1e-4
 _MOST = 8
 # Difference of arc lengths, over L, within which two contacts are the same.
 _SAME = 0.03
@@ -373,7 +381,35 @@ class JointEstimate:
         else:
             x, status = self._exact(values)
         row, place = np.nonzero(np.isfinite(x[..., 0]))
-        return row, x[row, place], status
+        starts = row, x[row, place]
+        if self.forward.weighted and names != WRENCH and self.contact_map is not None:
+            starts = self._corrected(targets, *starts)
+        return *starts, status
+
+    def _corrected(self, targets: Array, row: IntArray, x: Array) -> tuple[IntArray, Array]:
+        """Proposals x (m, 4) of rows, and what they become for corrected targets.
+
+        The sagged weightless whisker has other signals than that with weight, by a difference that
+        varies little along the map. Subtracted from the measured ones, as it is at a proposal, it
+        leads to contacts that a fit from that proposal does not reach.
+        """
+        rod = self.sagged.chart.discretization
+        index = [CHANNELS.index(name) for name in self.channels.names]
+        rows, starts = [row], [x]
+        for _ in range(_CORRECTIONS):
+            more = channels_of(self.forward.values(x)) - channels_of(solve_forces(rod, x)[0])
+            found, _ = self._exact(self.signals_of(targets[row] - more[:, index]))
+            each, place = np.nonzero(np.isfinite(found[..., 0]))
+            rows.append(row[each])
+            starts.append(found[each, place])
+            away = np.abs(found[..., 0] - x[:, :1])
+            known = np.isfinite(away).any(axis=1)
+            nearest = np.where(np.isfinite(away), away, np.inf).argmin(axis=1)[known]
+            row, x = row[known], found[known, nearest]
+        row, x = np.concatenate(rows), np.concatenate(starts)
+        alike = np.column_stack([row, (x / _ALIKE).round()])
+        kept = np.sort(np.unique(alike, axis=0, return_index=True)[1])
+        return row[kept], x[kept]
 
     def _exact(self, values: Array) -> tuple[Array, IntArray]:
         """Contacts (n, m, 4) of the sagged whisker for signals without noise, and statuses (n,)."""

@@ -388,12 +388,13 @@ def read_sleap_labels(path: str | PathLike[str]) -> RawTracks:
     for view, (first, values) in enumerate(parts):
         rows = slice(first - start, first - start + len(values))
         found[rows, : values.shape[1], view] = values
+    names = [track.name for track in labels.tracks]
     stems = [Path(str(video.filename)).stem for video in labels.videos]
     if len(set(stems)) < len(stems):
         stems = [f"view {i + 1}" for i in range(len(stems))]
     return RawTracks(
         software="SLEAP",
-        whiskers=[track.name for track in labels.tracks] or _numbered(tracks),
+        whiskers=names if len(names) == tracks else _numbered(tracks),
         image=found[..., :2],
         image_confidence=np.clip(found[..., 2], *_SCORES),
         nodes=list(labels.skeletons[0].node_names),
@@ -407,7 +408,9 @@ def _of_video(labels: sleap_io.Labels, video: sleap_io.Video) -> tuple[int, Arra
     numbers = [frame.frame_idx for frame in labels.labeled_frames if frame.video == video]
     if not numbers:
         return 0, np.full((0, 1, 1, 3), np.nan)
-    found = labels.numpy(video=video, untracked=not labels.tracks, return_confidence=True)
+    # Tracks may be listed although no instance has one.
+    tracked = any(one.track is not None for frame in labels.labeled_frames for one in frame)
+    found = labels.numpy(video=video, untracked=not tracked, return_confidence=True)
     # Depending on its version, sleap-io starts at frame 0 or at the first labelled frame.
     first = min(numbers) if len(found) == max(numbers) - min(numbers) + 1 else 0
     return first, found.astype(np.float64)

@@ -55,10 +55,10 @@ class Gravity:
 
     Attributes
     ----------
-    acceleration : tuple of float
+    acceleration : (3,) array_like
         Gravitational acceleration minus that of the base, whisker frame, m/s², such as
         ``(0, 0, -9.81)`` for a level whisker.
-    tare : tuple of float, optional
+    tare : (3,) array_like, optional
         Gravity, whisker frame, m/s², when the sensor was tared with the whisker at rest; by default
         as it is now. Zeros: a sensor that reads the weight.
     direction_sigma : float
@@ -80,9 +80,12 @@ class Gravity:
                 f"{self.direction_sigma!r}"
             )
         for name in ("acceleration", "tare"):
-            value = getattr(self, name)
-            if value is not None and np.shape(value) != (3,):
+            if (value := getattr(self, name)) is None:
+                continue
+            if np.shape(value) != (3,):
                 raise ValueError(f"{name} is (x, y, z) in m/s²; got {value!r}")
+            # An array cannot be the key of what is kept for each gravity.
+            object.__setattr__(self, name, tuple(map(float, value)))
 
     @property
     def uncertain(self) -> bool:

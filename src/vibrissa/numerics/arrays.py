@@ -38,8 +38,9 @@ _MULTIPLE = re.compile(
 )
 
 SKEW = 1e-5
-_FIFTH = 0.2
 """Largest entry of RᵀR − 1 for a rotation R that was written with few digits."""
+
+_FIFTH = 0.2  # share of contacts whose signal is small, and of those whose signal is large
 
 
 def contacts_in(touching: Mask, known: Mask | None = None) -> list[tuple[int, int]]:

@@ -236,6 +236,35 @@ def test_a_dropped_frame_is_not_sure_if_the_ends_contradict_it():
     assert (pairs[:, 0] == pairs[:, 1]).all()
 
 
+@pytest.mark.parametrize("pair", PAIRS.values(), ids=PAIRS.keys())
+def test_ends_that_hardly_move_do_not_contradict_a_dropped_frame(pair):
+    """The base moves by its noise only; no frame pairs are better than others by it."""
+    azimuth = 0.6 * np.sin(2.0 * np.pi * np.arange(70) / 70.0 - 1.2)
+    for seed in range(4):
+        generator = np.random.default_rng(seed)
+        rows = [[traced(camera, curve(a), generator) for a in azimuth] for camera in pair]
+        rows = [[t._replace(tip_seen=False) for t in row] for row in rows]
+        for trace in [*rows[0], *rows[1]]:
+            trace.line[0] += generator.normal(0.0, 0.5, 2)
+        del rows[0][20], rows[1][-1]
+        (gap,) = dropped_frames(pair, [[row] for row in rows])
+        assert gap == (0, 20, 1, True)
+
+
+def test_frames_that_one_camera_dropped_after_the_other_one():
+    """Later frames are simultaneous again, which contradicts neither gap."""
+    generator, pair = np.random.default_rng(1), PAIRS["any"]
+    azimuth = 0.6 * np.sin(2.0 * np.pi * np.arange(340) / 70.0 - 1.2)
+    rows = [[traced(camera, curve(a), generator) for a in azimuth] for camera in pair]
+    del rows[1][20], rows[0][120]
+    gaps = dropped_frames(pair, [[row] for row in rows])
+    assert gaps == [(1, 20, 1, True), (0, 120, 1, True)]
+    pairs = paired_frames(pair, [[row] for row in rows], 0)
+    moments = pairs + (pairs >= np.array([120, 20]))
+    assert (moments[:, 0] == moments[:, 1]).all()
+    assert len(pairs) == 338
+
+
 def test_a_frame_is_dropped_for_all_whiskers_of_a_row():
     """One whisker that takes two steps at once while the others do not is followed wrongly."""
     generator, pair = np.random.default_rng(5), PAIRS["orthogonal"]

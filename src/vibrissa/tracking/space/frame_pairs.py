@@ -103,23 +103,37 @@ def _paired_by_offset(
         [[row[i] for i in column] for row in view]
         for view, column in zip(traces, pairs.T, strict=True)
     ]
-    gaps = steps_over_dropped(views)
-    ends = best_seen(views)
-    return pairs, [
-        gap._replace(certain=gap.certain and _agrees(cameras, ends, gap)) for gap in gaps
-    ]
+    ends, gaps = best_seen(views), list[Dropped]()
+    found = steps_over_dropped(views)
+    for gap in found:
+        until = min((g.frame for g in found if g.certain and g.frame > gap.frame), default=None)
+        certain = gap.certain and _agree(cameras, ends, gap, gaps, until)
+        gaps.append(gap._replace(certain=certain))
+    return pairs, gaps
 
 
-def _agrees(cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]], gap: Dropped) -> bool:
-    """Whether the views agree as well about the ends if one of them dropped frames."""
-    gained, shift = 0.0, -gap.missing if gap.view else gap.missing
+def _agree(
+    cameras: Sequence[Camera],
+    traces: Sequence[Sequence[Trace]],
+    gap: Dropped,
+    before: Sequence[Dropped],
+    until: int | None,
+) -> bool:
+    """Whether the views do not contradict that one of them dropped frames, until the next gap."""
+    gained = 0.0
     for v in [gap.view] if gap.view else range(1, len(cameras)):
+        stay = np.full(len(traces[0]), _LARGEST)
+        for one in before:
+            if one.certain and one.view in (0, v):
+                stay[one.frame :] += -one.missing if one.view else one.missing
+        changed = stay.copy()
+        changed[gap.frame :] += -gap.missing if gap.view else gap.missing
         ends = _passing_ends(cameras[0], cameras[v], traces[0], traces[v])
-        stay = [one[:, _LARGEST] for one in ends]
-        later = [one[gap.frame :, _LARGEST + shift] for one in ends]
-        changed = [np.r_[a[: gap.frame], b] for a, b in zip(stay, later, strict=True)]
-        gained += _gained(*(np.array([a - _medians(a) for a in x]) for x in (stay, changed)))
-    return gained >= 0.0
+        paths = [np.clip(path, 0, 2 * _LARGEST)[:until] for path in (stay, changed)]
+        away = [[end[np.arange(len(path)), path] for end in ends] for path in paths]
+        gained += _gained(*(np.array([one - _medians(one) for one in each]) for each in away))
+    # Ends that hardly move, or are seen in few frames, agree better or worse by chance.
+    return gained > -_EVIDENCE
 
 
 def best_seen(traces: Traces) -> list[Sequence[Trace]]:

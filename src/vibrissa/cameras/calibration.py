@@ -122,9 +122,12 @@ def calibrate(
         name: _Lens.of([seen[key] for key in seen if key[0] == name], board, series[0].shape)
         for name, series in images.items()
     }
-    _align_orders(seen, lenses, board, corners, shared)
-    fit = _Bundle(board, seen, lenses, tuple(shared))
-    largest = max(max(image.shape) for series in images.values() for image in series)
+    largest = max(max(np.shape(image)) for series in images.values() for image in series)
+    aligned = _aligned(seen, lenses, board, corners, shared)
+    fit = _Bundle(board, aligned, lenses, tuple(shared))
+    if not fit.error < _UNFIT * largest:
+        # Poses of boards far away, which decide on orders, are ambiguous themselves.
+        fit = _Bundle(board, seen, lenses, tuple(shared))
     doubt = fit.doubt()
     if not fit.error < _UNFIT * largest:
         raise ValueError(
@@ -220,20 +223,21 @@ def _pose(board: Board, seen: Array, lens: _Lens) -> tuple[Array, Array]:
     return cv2.Rodrigues(turn)[0], shift.reshape(3)
 
 
-def _align_orders(
+def _aligned(
     seen: Seen,
     lenses: Mapping[str, _Lens],
     board: Board,
     corners: tuple[int, int],
     shared: Sequence[int],
-) -> None:
-    """Reorder the corners of boards such that cameras keep their relative orientation."""
+) -> Seen:
+    """Corners in orders such that cameras keep their relative orientation."""
     turns = 4 if corners[0] == corners[1] else 2
 
     def orders(points: Array) -> Iterator[Array]:
         grid = points.reshape(corners[1], corners[0], 2)
         return (np.rot90(grid, k * 4 // turns).reshape(-1, 2) for k in range(turns))
 
+    aligned = dict(seen)
     main, *others = lenses
     first = {i: _pose(board, seen[main, i], lenses[main])[0] for i in shared}
     for name in others:
@@ -249,7 +253,8 @@ def _align_orders(
         total = agreement.max(axis=2).mean(axis=1)
         best = agreement[(total > total.max() - _EQUAL).argmax()].argmax(axis=1)
         for i, order in zip(shared, best, strict=True):
-            seen[name, i] = np.ascontiguousarray(list(orders(seen[name, i]))[order])
+            aligned[name, i] = np.ascontiguousarray(list(orders(seen[name, i]))[order])
+    return aligned
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,8 @@
 """Rows of whiskers that lie on one another in a view: traced anew by another view.
 
 By one view alone it may be unknown which line is whose; the views then disagree about where
-whiskers begin and end. The view in which they lie on one another least guides the others
+whiskers begin and end. The view in which they lie on one another least, or the steadiest of those
+that are about as clear, guides the others
 (`vibrissa.tracking.trace.guided`), if they agree better afterwards.
 """
 
@@ -26,6 +27,9 @@ from vibrissa.tracking.trace.trace import Trace, TraceOptions, overlap
 _BASES, _TIPS, _FADING = 8.0, 0.1, 0.4
 # Share of the frames in which the views show one whisker, from which nothing is traced anew.
 _AGREES = 0.9
+# Difference of the shares of whiskers that lie on others up to which views are about as clear; and
+# change of a whisker's length from its usual one, as a share, up to which it is traced steadily.
+_ALIKE, _STEADY = 0.02, 0.2
 # Log likelihood by which a whisker's line is to be more probable than others in the median frame,
 # for it to be sure: below zero, most frames by themselves show another one, and only motion and
 # bend decide; more is needed where the views do not agree about the whisker.
@@ -82,7 +86,9 @@ def retraced(
     found, remarks = [[list(row) for row in view] for view in traces], list[str]()
     if len(cameras) < 2 or not 2 <= len(found[0]) <= _LARGEST:
         return found, remarks
-    guide = int(np.argmin([_lies_on_others(view) for view in found]))
+    shares = np.array([_lies_on_others(view) for view in found])
+    clear = np.flatnonzero(shares < shares.min() + _ALIKE)
+    guide = int(max(clear, key=lambda view: _steadiness(found[view])))
     pairs = paired_frames(cameras, found, offset)
     for v, camera in enumerate(cameras):
         both = [guide, v]
@@ -133,6 +139,13 @@ def _lies_on_others(view: Sequence[Sequence[Trace]]) -> float:
         for line in others
     ]
     return float(np.mean(shares))
+
+
+def _steadiness(view: Sequence[Sequence[Trace]]) -> float:
+    """Share of the frames in which whiskers are as long as usual."""
+    lengths = np.array([[len(trace.line) for trace in row] for row in view], dtype=np.float64)
+    usual = np.array([np.median(row[row > 0]) if (row > 0).any() else np.inf for row in lengths])
+    return float((np.abs(lengths / usual[:, None] - 1.0) < _STEADY).mean())
 
 
 def _in_pairs(view: Sequence[Sequence[Trace]], frames: NDArray[np.int64]) -> list[list[Trace]]:

@@ -353,6 +353,11 @@ def test_standard_deviations_and_millimetres_are_not_taken_for_what_is_needed(jo
         fit_shape("cylinder", 1e3 * points, known["covariance"], known["whisker_radius"])
 
 
+def test_a_whisker_may_be_sharp(joint_errors):
+    points, known = noisy("sphere", joint_errors, np.random.default_rng(4), 100)
+    assert fit_shape("sphere", points, known["covariance"], 1e-8).size > 0.0
+
+
 def test_no_cylinder_is_infinitely_large():
     """Forces that are not the normals: the refined radius was kilometres, and 'all agreed'."""
     for seed in range(3):

@@ -29,7 +29,9 @@ _ASTRAY, _FARTHEST = 100.0, 0.02
 # Median standard deviation of contacts, and radius of the whisker, m, above which they are in other
 # units if they exceed the extent of the contacts.
 _VAGUE, _STOUT = 2e-3, 5e-3
-_SLIM = 2e4  # extent of contacts over the whisker's radius above which points are in other units
+# Extent of contacts, m, and over the whisker's radius, above both of which they are in other units:
+# a whisker may have a sharp tip.
+_LONG, _SLIM = 1.0, 2e4
 # Smallest variance of a combination, over that of the point or normal.
 _FINE = 1e-10
 # Largest negative eigenvalue of a covariance that is attributed to rounding, over the largest.
@@ -169,7 +171,7 @@ def _scale_contacts(what: str, arrays: dict[str, Array], n: int, least: int) -> 
             f"no {what}: whisker_radius, {radius:.3g} m, is larger than the extent of the "
             f"contacts, {extent:.3g} m; both must be in m"
         )
-    if extent > _SLIM * radius > 0.0:
+    if extent > max(_LONG, _SLIM * radius) and radius > 0.0:
         raise ValueError(
             f"no {what}: the contacts extend over {extent:.3g} m, {extent / radius:.2g} times "
             "whisker_radius; both must be in m"

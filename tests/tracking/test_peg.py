@@ -7,13 +7,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, maximum_filter
+from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
 from vibrissa import Whisker
 from vibrissa.cameras import Camera, orthogonal_views
-from vibrissa.objects import Peg
+from vibrissa.objects import Box, Peg
 from vibrissa.recording import Recording
-from vibrissa.tracking import TrackOptions, track
+from vibrissa.simulation import Motion, simulate
+from vibrissa.tracking import TrackOptions, trace_video, track
 from vibrissa.tracking.refine.edge import OFFSETS, place_of_outline
 from vibrissa.tracking.refine.fit import RodFit, Touches
 from vibrissa.tracking.refine.peg import PEG_UNKNOWNS, UNITS, UncertainPeg
@@ -380,6 +382,23 @@ def test_contacts_are_fitted_on_a_peg_that_images_show(filmed, traced):
     for share in (50, 95):
         assert np.percentile(errors[1], share) < 0.7 * np.percentile(errors[0], share)
     assert np.abs(peg.signed_distance(points)).max() < 60e-6
+
+
+@pytest.mark.parametrize(("turned", "side"), [(45.0, 1e-3), (60.0, 1.4e-3)])
+def test_contacts_are_not_fitted_on_a_post_with_corners(make_filmed, turned, side):
+    """Its outlines are those of a round peg, but the whisker touches one of its edges."""
+    whisker, ahead = Whisker.parabola(length=10e-3, coefficient=15.0), np.linspace(-0.1, 0.95, 40)
+    motion = Motion(np.arange(40) / 1e3, ahead, 0.05 + 0.2 * ahead, 0.2 * ahead, np.zeros((40, 3)))
+    turn = Rotation.from_euler("z", turned, degrees=True).as_matrix()
+    post = Box([6e-3, 0.5e-3 + 0.7 * side, 0.0], [side, side, 20e-3], turn, edge_radius=5e-5)
+    filmed = make_filmed(simulate(whisker, motion, post))
+    traced = [trace_video(frames) for frames in filmed.frames]
+    found = [track(filmed.cameras, traced, 1000.0, sample=s) for s in (filmed.frames, ())]
+    for name in ("contact_point", "force"):
+        with_images, without = (one[name].values for one in found)
+        np.testing.assert_array_equal(with_images, without)
+    assert "bends otherwise than on it" in found[0].attrs["remarks"]
+    assert "touches a peg" not in found[0].attrs["remarks"]
 
 
 @pytest.mark.parametrize("count", [5, 12])

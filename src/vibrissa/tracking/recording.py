@@ -182,6 +182,7 @@ class Tracked:
     head: HeadPose  # its pose in these frames
     length: Length  # with a standard deviation of 0 where it is given
     peg: UncertainPeg | None = None  # that it touches, found in the images
+    unlike: UncertainPeg | None = None  # one that images show, but how it bends contradicts
     scale: float = np.nan  # standard deviation of the logarithm of all forces; see `scale_sigma`
     hook: Hook | None = None  # of its traces at the base
     turned: float = 0.0  # by how much its curvature shows that it leaves the only view's plane, rad
@@ -425,7 +426,14 @@ def remarks_on_unseen_contacts(one: Tracked, name: str) -> list[str]:
 
 
 def remarks_on_peg(one: Tracked, name: str) -> list[str]:
-    """Report the peg that was found in the images, as it would be stated."""
+    """Report the peg that was found in the images, as it would be stated, or why it is not used."""
+    if one.unlike is not None:
+        return [
+            f"{name} touches what looks like a round peg of {2e3 * one.unlike.expected.radius:.3f} "
+            "mm in both views, but bends otherwise than on it, and its contacts are not fitted on "
+            "it: it may not be round, may move, or the cameras may not be as stated. State what it "
+            "touches, if it is known (--objects)."
+        ]
     if one.peg is None:
         return []
     peg = one.peg.expected
@@ -644,3 +652,13 @@ def usual_gap(cameras: Sequence[Camera], series: TraceSeries) -> float:
     if not rows.any():
         return 0.0
     return float(np.median(base_gap(cameras, np.swapaxes(series.line[rows, :, 0], 0, 1))))
+
+
+def pixel_at(cameras: Sequence[Camera], curves: Array) -> float:
+    """Size of a pixel at a whisker, m, in the coarsest view."""
+    seen = curves[np.isfinite(curves).all(axis=(1, 2))]
+    if not len(seen):
+        return 0.0
+    base = np.median(seen[:, 0], axis=0)[None]
+    scales = [np.linalg.norm(c.project_with_slopes(base)[1], axis=-1).max() for c in cameras]
+    return float(1.0 / min(scales))

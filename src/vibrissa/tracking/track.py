@@ -26,6 +26,7 @@ from vibrissa.tracking.recording import (
     contacts_at,
     given_contacts,
     outside_video,
+    pixel_at,
     remarks_on,
     remarks_on_bases,
     remarks_on_following,
@@ -58,7 +59,7 @@ from vibrissa.tracking.refine.optics import (
 from vibrissa.tracking.refine.peg import UncertainPeg
 from vibrissa.tracking.refine.problem import FitOptions
 from vibrissa.tracking.refine.rods import TraceSeries, rolled
-from vibrissa.tracking.refine.silhouette import explains, on_peg, peg_in_images
+from vibrissa.tracking.refine.silhouette import bends_otherwise, explains, on_peg, peg_in_images
 from vibrissa.tracking.refine.taper import some_in_contact, tapered_as_it_bends
 from vibrissa.tracking.refine.tilt import Plane, plane_of, projected, unturned
 from vibrissa.tracking.space.curve import (
@@ -475,7 +476,7 @@ def track_whisker(
     on_head = head.seen_from(points)
     tips: Mask = np.all(series.ends[:, :, 1] > 0.5, axis=1)
     sparse = any(trace.sparse for view in traces for trace in view)
-    pixel, flat = _pixel_at(cameras, on_head), len(cameras) == 1
+    pixel, flat = pixel_at(cameras, on_head), len(cameras) == 1
     astray = Astray((_CROSSED if row and not sparse else _ASTRAY) * pixel, blur * pixel)
     rest = partial(_at_rest, options, name, tips, flat, sparse, astray)
     shape, whisker = rest(on_head)
@@ -527,6 +528,7 @@ def track_whisker(
         length=found.length,
         scale=scale_sigma(found.whisker, fur, more) if options.scaled else np.nan,
         peg=found.peg,
+        unlike=found.unlike,
         hook=hook,
         turned=plane.turned,
     )
@@ -552,6 +554,7 @@ class _Bent(NamedTuple):
     unfiltered: BasePose
     fit: RodFit
     peg: UncertainPeg | None  # that it touches, where that was unknown
+    unlike: UncertainPeg | None = None  # a peg that images show, but not how it bends
 
 
 def _on_peg(
@@ -563,9 +566,12 @@ def _on_peg(
     peg = peg_in_images(fitter.cameras, sample, touches)
     if peg is None:
         return None
-    found = _bent(replace(fitter, peg=peg), begun, options)
+    on = replace(fitter, peg=peg)
+    found = _bent(on, begun, options)
     if found.peg is None or not explains(peg, found.peg, misfit, found.fit, found.whisker):
         return None
+    if bends_otherwise(on.excess(found.whisker, found.pose)):
+        return _bent(fitter, begun, options)._replace(unlike=peg)
     return found._replace(fit=on_peg(found.peg, found.fit, found.whisker))
 
 
@@ -610,16 +616,6 @@ def _at_rest(
         return known_rest(curves, whisker, options.free), whisker
     shape = replace(rest_shape(curves, options.free, tips, astray, hidden), sparse=sparse)
     return shape, whisker_at_rest(shape, name, **options.at_base)
-
-
-def _pixel_at(cameras: Sequence[Camera], curves: Array) -> float:
-    """Size of a pixel at a whisker, m, in the coarsest view."""
-    seen = curves[np.isfinite(curves).all(axis=(1, 2))]
-    if not len(seen):
-        return 0.0
-    base = np.median(seen[:, 0], axis=0)[None]
-    scales = [np.linalg.norm(c.project_with_slopes(base)[1], axis=-1).max() for c in cameras]
-    return float(1.0 / min(scales))
 
 
 def _known_flat(curves: Array, whisker: Whisker, free: float) -> tuple[RestShape, Whisker]:

@@ -322,6 +322,17 @@ class Fitter:
             found[problem.frames] = np.where(linear.data.wild, np.inf, linear.data.misfit)
         return found
 
+    def excess(self, whisker: Whisker, pose: BasePose) -> Array:
+        """Costs (n,) of frames with contacts on the peg, over those with the same rod anywhere.
+
+        The traces are as uncertain as those show that are fitted without the peg.
+        """
+        problem, state, _ = self._problem(whisker, pose).trusted()
+        free, _, anywhere = replace(problem, peg=None, begun=state, variance=None).trusted()
+        _, on = replace(free, peg=problem.peg, begun=state).solved()
+        right = ~(anywhere.data.wild | on.data.wild) & problem.touching & problem.near
+        return on.costs[right] - anywhere.costs[right]
+
     def costs(
         self, shown: float, ends: tuple[float, float] = (1.0, 0.0)
     ) -> Callable[[Whisker, BasePose], float]:

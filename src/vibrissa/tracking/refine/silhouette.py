@@ -93,6 +93,9 @@ _ELSEWHERE = 250.0
 # Distance of contacts from the peg that they touch, m; and misfit of traces with it, over that
 # without it, from which they touch something else.
 _ON_PEG, _WORSE = 1e-4, 1.3
+# What it costs in a frame that its contact is on a peg, and tangent to it, is at most χ² of two
+# numbers if errors explain it: its median, and the standard deviation of the median of n, times √n.
+_USUAL_COST, _VARIES = 2.0 * np.log(2.0), 2.0
 _CERTAIN = 2.0  # force over its standard deviation from which a contact off the peg is one
 
 
@@ -111,6 +114,15 @@ def explains(
     )
     touches = np.mean(np.abs(gap) < _ON_PEG) >= _SEEN
     return bool(touches and after < _WORSE * max(before, free))
+
+
+def bends_otherwise(excess: Array) -> bool:
+    """Whether contacts on a peg cost too much in most frames; see `Fitter.excess`.
+
+    A post with corners, or an elliptic one, may look like a round peg in both views.
+    """
+    n = len(excess)
+    return n > 0 and bool(np.median(excess) > _USUAL_COST + _VARIES / np.sqrt(n))
 
 
 def on_peg(peg: UncertainPeg, fit: RodFit, whisker: Whisker) -> RodFit:

@@ -262,6 +262,8 @@ def test_points_that_no_images_can_have_are_refused(trial):
     refused("up to 99; numbers from 0 to 1", sure=99.0)
     refused("shares of the image", points=image / 400.0)
     refused("top and front have the same points", points=image[:, :, [0, 0]])
+    refused("two known points of a whisker; the most are 0", points=np.full_like(image, np.nan))
+    refused("two known points of a whisker; the most are 1", points=image[..., :1, :])
 
 
 def test_a_whisker_may_end_beyond_its_last_point(trial):

@@ -222,6 +222,9 @@ def _arcs(tracks: xr.Dataset, notes: list[str]) -> xr.Dataset:
 
 def _check_images(points: Array, views: Sequence[str]) -> None:
     """Raise ValueError if points (time, whisker, view, node, 2) cannot be those of images."""
+    most = int(np.isfinite(points).all(axis=4).sum(axis=3).max(initial=0))
+    if most < 2:
+        raise ValueError(f"no image has two known points of a whisker; the most are {most}")
     low, high = (np.where(np.isnan(points), end, points) for end in (np.inf, -np.inf))
     longest = float((high.max(axis=3) - low.min(axis=3)).max(initial=-np.inf))
     if 0.0 <= longest < _SHORTEST:

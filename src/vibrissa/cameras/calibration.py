@@ -37,6 +37,7 @@ _DRAWS = 20  # number of draws that show the errors of points
 _CONVERGED, _SOLVED = 1e-12, {"atol": 1e-14, "btol": 1e-14, "maxiter": 3000}
 # Reprojection error, relative to the longer side of the image, of cameras that do not fit.
 _UNFIT = 0.005
+_ATTEMPTS = 200  # largest number of steps; cameras that explain the corners take some thirty
 # Reprojection error of the images of one moment, relative to the median of all, that is doubted.
 _DOUBTED = 3.0
 
@@ -44,7 +45,7 @@ _DOUBTED = 3.0
 class Calibration(NamedTuple):
     """Cameras calibrated by a checkerboard.
 
-    Parameters
+    Attributes
     ----------
     cameras : tuple of Camera
         Cameras in the laboratory frame, which is that of the board at the first moment at which all
@@ -350,6 +351,7 @@ class _Bundle:
             self._start(),
             slopes,
             x_scale="jac",
+            max_nfev=_ATTEMPTS,
             xtol=_CONVERGED,
             ftol=_CONVERGED,
             gtol=_CONVERGED,

@@ -215,7 +215,9 @@ def fit_stiffness(
         )
     for name, sigma in (("modulus_sigma", modulus_sigma), ("radius_sigma", radius_sigma)):
         if 1.0 < sigma < np.inf:
-            raise ValueError(f"{name} is {sigma:g}; it is relative, so that 0.1 is 10 %; inf: unknown")
+            raise ValueError(
+                f"{name} is {sigma:g}; it is relative, so that 0.1 is 10 %; inf: unknown"
+            )
     known = np.isfinite(y).all(axis=1) & np.isfinite(contacts).all(axis=1)
     if not known.any():
         raise ValueError("no reading with a contact point is known")

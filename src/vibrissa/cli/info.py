@@ -191,11 +191,7 @@ def _recording(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
         thing += f", contacts {1e6 * found.distance:.1f} µm from it (median)"
     yield "object", f"{thing}{f'; known: {found.known}' if found.known else ''}"
     yield from _compared(path)
-    listed = list(_groups(path))
-    if whole:
-        yield from listed
-    else:
-        yield from (line for line in listed if line[0] == "note")
+    yield from _groups(path) if whole else _all_notes(path)
     # Estimates exist, but without contacts from which an object could be reconstructed.
     stuck = "estimates" in found.stages and not found.estimated
     follows = "report" if stuck or not missing else "reconstruct"
@@ -224,13 +220,14 @@ def _summarised(path: Path) -> xr.DataTree:
     # Bases are compared with the centreline, which shows a wrong unit of theirs.
     needed = ["in_contact", "status", "force", "moment", "centerline", *vb.pipeline.EVENTS]
     pose = ["time", "whisker", "base_position", "base_rotation"]
-    parts = {"/": vb.io.read_dataset(path, None, [*pose, *needed])}
-    for group in (*groups, *objects):
-        along = needed if group in ("truth", "signals", "estimates") else None
-        # Without all inputs, their checksums cannot be compared.
-        data = vb.io.read_dataset(path, group, along).drop_vars("made_from", errors="ignore")
-        parts[f"/{group}"] = data
-    return xr.DataTree.from_dict(parts)
+    parts: dict[str, list[str] | None] = {"/": [*pose, *needed]}
+    parts |= {name: None if name == "contour" else needed for name in groups}
+    parts |= dict.fromkeys(objects)
+    # Without all inputs, their checksums cannot be compared.
+    read = vb.io.read_parts(path, parts).items()
+    return xr.DataTree.from_dict(
+        {name: data.drop_vars("made_from", errors="ignore") for name, data in read}
+    )
 
 
 def _settings(path: Path) -> Iterator[tuple[str, str]]:
@@ -406,8 +403,7 @@ def _groups(path: Path, whole: bool = False) -> Iterator[tuple[str, str]]:
         if names:
             yield "/whiskers", f"{len(names)}: {', '.join(names)}"
             yield from _notes(file.groups["whiskers"])
-        for line in _text(file.attrs.get("remarks", "")).splitlines():
-            yield "note", line
+        yield from _remarks(file)
     yield from _follows(kind, path)
 
 
@@ -482,13 +478,26 @@ def _notes(group: Any) -> Iterator[tuple[str, str]]:
     if _text(group.attrs.get("kind", "")) != "vibrissa whisker":
         return
     texts = [_text(group.attrs["notes"])] if "notes" in group.attrs else []
-    if "notes" in group.variables:
-        texts += [_text(one) for one in group.variables["notes"][...]]
+    if "notes" in group:
+        texts += [_text(one) for one in group["notes"][...]]
     try:
         notes = [str(note) for text in texts for note in json.loads(text)]
     except (ValueError, TypeError):
         notes = texts
     yield from (("note", note) for note in dict.fromkeys(notes))
+
+
+def _remarks(file: Any) -> Iterator[tuple[str, str]]:
+    """List what tracking noted about a recording."""
+    yield from (("note", line) for line in _text(file.attrs.get("remarks", "")).splitlines())
+
+
+def _all_notes(path: Path) -> Iterator[tuple[str, str]]:
+    """List the notes about all whiskers, and about the recording as a whole."""
+    with vb.io.opened(path, "NetCDF-4", soft_links=False) as file:
+        for group in vb.io.all_groups(file):
+            yield from _notes(group)
+        yield from _remarks(file)
 
 
 def _text(value: Any) -> str:
@@ -501,11 +510,8 @@ def _compared(path: Path) -> Iterator[tuple[str, str]]:
         if "measured/contact_difference" not in file:
             return
     # Only the necessary variables are read, for speed.
-    names = {
-        None: ["arc_length"],
-        "measured": ["contact_difference", "contact_point", "arc_length"],
-    }
-    parts = {f"/{group or ''}": vb.io.read_dataset(path, group, of) for group, of in names.items()}
+    measured = ["contact_difference", "contact_point", "arc_length"]
+    parts = vb.io.read_parts(path, {"/": ["arc_length"], "measured": measured})
     recording = xr.DataTree.from_dict(parts)
     for k, name in enumerate(recording.coords["whisker"].values):
         for sentence in compared_contacts(recording, k):

@@ -28,6 +28,7 @@ from vibrissa.io.kinds import READERS as READERS, Kind, load_tracks, recognise
 from vibrissa.io.matlab import load_matlab
 from vibrissa.io.netcdf import (
     COMPRESSED as COMPRESSED,
+    all_groups as all_groups,
     is_netcdf as is_netcdf,
     kind_of as kind_of,
     naming as naming,
@@ -35,6 +36,7 @@ from vibrissa.io.netcdf import (
     opened as opened,
     read_dataset as read_dataset,
     read_groups as read_groups,
+    read_parts as read_parts,
     read_tree as read_tree,
     write_netcdf as write_netcdf,
 )

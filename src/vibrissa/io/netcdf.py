@@ -229,9 +229,20 @@ def read_dataset(
     path: str | PathLike[str], group: str | None = None, names: Sequence[str] | None = None
 ) -> xr.Dataset:
     """Read the dataset of one group, or only its variables ``names`` and their coordinates."""
+    return read_parts(path, {group or "/": names})[group or "/"]
+
+
+def read_parts(
+    path: str | PathLike[str], parts: Mapping[str, Sequence[str] | None]
+) -> dict[str, xr.Dataset]:
+    """Read groups, each with all variables (None) or only some and their coordinates."""
     with opened(path, "NetCDF-4", soft_links=False) as file:
-        data = _dataset(file[group or "/"], _names_by_address(file), names)
-    return data if names is None else data[[name for name in names if name in data]]
+        known = _names_by_address(file)
+        found = {group: _dataset(file[group], known, names) for group, names in parts.items()}
+    return {
+        group: data if parts[group] is None else data[[n for n in parts[group] or () if n in data]]
+        for group, data in found.items()
+    }
 
 
 class Group(NamedTuple):
@@ -266,20 +277,22 @@ def read_tree(path: str | PathLike[str], kind: str, what: str) -> xr.DataTree:
         if (found := _kind(file)) != kind:
             raise ValueError(f"{path} contains {found or 'data of another kind'}, not {what}")
         known = _names_by_address(file)
-        return xr.DataTree.from_dict({str(one.name): _dataset(one, known) for one in _groups(file)})
+        return xr.DataTree.from_dict(
+            {str(one.name): _dataset(one, known) for one in all_groups(file)}
+        )
 
 
-def _groups(group: h5py.Group) -> Iterator[h5py.Group]:
+def all_groups(group: h5py.Group) -> Iterator[h5py.Group]:
     """Yield the group itself and all groups below it, in the order of the file."""
     yield group
     for item in group.values():
         if isinstance(item, h5py.Group):
-            yield from _groups(item)
+            yield from all_groups(item)
 
 
 def _names_by_address(file: h5py.File) -> dict[int, str]:
     """Names of all variables by address; the library is slow to find the name for a reference."""
-    each = (item for group in _groups(file) for item in group.items())
+    each = (item for group in all_groups(file) for item in group.items())
     return {_address(item.id): name for name, item in each if isinstance(item, h5py.Dataset)}
 
 

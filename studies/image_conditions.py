@@ -66,7 +66,8 @@ def row(found: dict[str, Any]) -> list[str]:
         spread(found["claimed"], 1e6),
         few(found["over"]) if math.isfinite(found["over"]) else "–",
         f"{length:+.1f}".replace("-", "−"),
-        "; ".join(short(remark) for remark in found["remarks"]),
+        # That nothing is stated about fur is noted of all.
+        "; ".join(short(r) for r in found["remarks"] if "wrench_scale_sigma" not in r),
     ]
 
 

@@ -26,6 +26,7 @@ from vibrissa.simulation import (
     simulate,
     sweep_past,
     with_true_traces,
+    within_reach,
 )
 
 Array = NDArray[np.float64]
@@ -67,6 +68,10 @@ class Case:
         Frame of the trial for each frame of a view: ``shown(count, view)``.
     peg : float
         Its radius, as a share of the ordinary one.
+    kind : str
+        What the whisker touches, of `within_reach`.
+    friction : float
+        Between whisker and object.
     offset : int, optional
         Given to the tracking.
     """
@@ -86,6 +91,8 @@ class Case:
     change: Callable[[Frames, int], Frames] = lambda frames, view: frames
     shown: Callable[[int, int], NDArray[np.intp]] = lambda count, view: np.arange(count)
     peg: float = 1.0
+    kind: str = "peg"
+    friction: float = 0.0
     offset: int | None = 0
 
 
@@ -104,9 +111,11 @@ def filmed(case: Case, seed: int = 0) -> Filmed:
     thing = facing_peg(case.whisker)
     scale = case.whisker.length / 40e-3
     thing = facing_peg(case.whisker, radius=case.peg * scale * thing.radius)
+    if case.kind != "peg":
+        thing = within_reach(case.whisker, case.kind)
     motion = {"frequency": 1.0 / case.duration, **case.motion}
     sweep = sweep_past(case.whisker, thing, case.duration, case.rate, seed=seed, **motion)
-    trial = simulate(case.whisker, sweep, thing)
+    trial = simulate(case.whisker, sweep, thing, friction=case.friction)
     cameras = views(case, trial)
     trial = with_true_traces(trial, cameras)
     frames, shown = [], []
@@ -353,4 +362,7 @@ CASES = (
     Case("one frame out of step, offset not stated", "frames", shown=late(1, 1)),
     Case("one frame out of step, offset auto", "frames", shown=late(1, 1), offset=None),
     Case("γ whisker, 0.3 s", "ordinary", whisker=gamma(), duration=0.3, pixel=95e-6),
+    Case("γ whisker, friction 0.3", "object", gamma(), duration=0.3, pixel=95e-6, friction=0.3),
+    Case("sphere", "object", kind="sphere"),
+    Case("box", "object", kind="box"),
 )

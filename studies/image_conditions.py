@@ -67,7 +67,9 @@ def row(found: dict[str, Any]) -> list[str]:
         few(found["over"]) if math.isfinite(found["over"]) else "–",
         f"{length:+.1f}".replace("-", "−"),
         # That nothing is stated about fur is noted of all.
-        "; ".join(short(r) for r in found["remarks"] if "wrench_scale_sigma" not in r),
+        "; ".join(
+            dict.fromkeys(short(r) for r in found["remarks"] if "wrench_scale_sigma" not in r)
+        ),
     ]
 
 
@@ -88,6 +90,9 @@ def short(remark: str) -> str:
         ("nor is it bent", "noted: tip not seen"),
         ("does not show its base", "noted: base not seen"),
         ("its base is seen", "noted: views disagree"),
+        ("its shapes in the", "noted: free shapes differ"),
+        ("not sure where", "noted: contact not seen"),
+        ("was found (to within", "noted: offset found"),
     ):
         if words in remark:
             return about

@@ -28,6 +28,7 @@ from vibrissa.recording import coordinates, recorded, recording_tree
 from vibrissa.status import Status
 from vibrissa.tracking.refine.fit import RodFit
 from vibrissa.tracking.refine.hook import Hook
+from vibrissa.tracking.refine.inertia import Inertia
 from vibrissa.tracking.refine.optics import Optics
 from vibrissa.tracking.refine.peg import UncertainPeg
 from vibrissa.tracking.refine.rods import TraceSeries
@@ -185,6 +186,7 @@ class Tracked:
     unlike: UncertainPeg | None = None  # one that images show, but how it bends contradicts
     scale: float = np.nan  # standard deviation of the logarithm of all forces; see `scale_sigma`
     hook: Hook | None = None  # of its traces at the base
+    inertia: Inertia | None = None  # what its mass bends
     turned: float = 0.0  # by how much its curvature shows that it leaves the only view's plane, rad
     contacts: ContactPoints | None = None  # those that do not come from the rod
 
@@ -318,6 +320,9 @@ _BEYOND = 0.05  # share of the length beyond what is seen from which a contact i
 # Bending below which contacts are not detected, over the length, above which there is a remark.
 _COARSE = 2e-3
 _FEWEST = 8  # smallest number of frames to decide whether a whisker leaves the plane
+_LEAST = 3  # smallest number of frames that show the whisker in all views, with its base
+_FAR = 10.0  # distance between the bases of several views above which they differ, pixels
+_SHARE = 0.03  # the same as a share of the whisker's length
 
 
 def remarks_on_shaking(cameras: Sequence[Camera], traces: Sequence[Sequence[Trace]]) -> list[str]:
@@ -644,6 +649,29 @@ def remarks_on_time(cameras: Sequence[Camera], traces: Traces, offset: int | Non
                 "of other trackers, correct the numbers of the frames."
             )
     return found
+
+
+def check_views(cameras: Sequence[Camera], series: TraceSeries, name: str) -> None:
+    """Check that the views show one and the same whisker, from its base on."""
+    seen = np.isfinite(series.line[:, :, 0, 0])
+    whole = seen & (series.ends[:, :, 0] > 0.5)
+    if seen.all(axis=1).sum() >= _LEAST > whole.all(axis=1).sum():
+        rows = zip(cameras, seen.sum(axis=0), whole.sum(axis=0), strict=True)
+        listed = ", ".join(f"{c.name} in {base} of {all_} frames" for c, all_, base in rows)
+        raise ValueError(
+            f"the border of the image cuts off the base of {name}, which is shown by {listed}: "
+            "film it from its base on, or use a larger part of the image (--views)"
+        )
+    gap = usual_gap(cameras, series)
+    lengths = np.linalg.norm(np.diff(series.line, axis=2), axis=3).sum(axis=2)
+    allowed = max(_FAR, _SHARE * float(np.nanmax(lengths, initial=0.0)))
+    if gap > allowed:
+        raise ValueError(
+            f"the views do not show one whisker: where they see the base of {name}, their lines of "
+            f"sight pass each other by {gap:.0f} pixels (median). Check the order of the views, "
+            "the cameras' calibration, and that all are of the same whisker from its base on; of "
+            "videos, state where it begins in each (`vibrissa track --base`)"
+        )
 
 
 def usual_gap(cameras: Sequence[Camera], series: TraceSeries) -> float:

@@ -23,6 +23,7 @@ from vibrissa.objects import Surface
 from vibrissa.recording import ONE_VIEW
 from vibrissa.tracking.recording import (
     Tracked,
+    check_views,
     contacts_at,
     given_contacts,
     outside_video,
@@ -43,11 +44,11 @@ from vibrissa.tracking.recording import (
     scale_sigma,
     tracked_recording,
     unexplained_frames,
-    usual_gap,
 )
 from vibrissa.tracking.refine.continuation import continued
 from vibrissa.tracking.refine.fit import Fitter, RodFit
 from vibrissa.tracking.refine.hook import hook_of, off_hook, straightened
+from vibrissa.tracking.refine.inertia import inertia_of
 from vibrissa.tracking.refine.optics import (
     Optics,
     rough_optics,
@@ -61,7 +62,7 @@ from vibrissa.tracking.refine.problem import FitOptions
 from vibrissa.tracking.refine.rods import TraceSeries, rolled
 from vibrissa.tracking.refine.silhouette import bends_otherwise, explains, on_peg, peg_in_images
 from vibrissa.tracking.refine.taper import some_in_contact, tapered_as_it_bends
-from vibrissa.tracking.refine.tilt import Plane, plane_of, projected, unturned
+from vibrissa.tracking.refine.tilt import Plane, plane_of, projected, swung, unturned
 from vibrissa.tracking.space.curve import (
     HiddenPart,
     all_merged,
@@ -98,7 +99,6 @@ Progress = Callable[[str, int, int], None]
 _FLAT = 0.02
 # Standard deviation of a roll that is determined by bent shapes only, rad.
 _ANY_ROLL = np.radians(10.0)
-_FEWEST = 3  # smallest number of frames of a kind that are used
 # Misfit, absolute and relative to the usual one, below which the traces of a row are its whiskers'.
 _WELL, _WORSE = 1.0, 3.0
 # Misfit over the usual one above which frames of a row are left out, and share that must remain.
@@ -106,8 +106,6 @@ _MORE, _EXPLAINED = 2.0, 0.1
 # Errors of traces that vary with the pose only, pixels: by light, fur, lenses and what is behind;
 # and in a row, where they are next to crossings.
 _ASTRAY, _CROSSED = 0.1, 0.4
-_FAR = 10.0  # distance between the bases of several views above which they differ, pixels
-_SHARE = 0.03  # the same as a share of the whisker's length
 
 
 @dataclass(frozen=True)
@@ -311,6 +309,7 @@ def _remarks_on_one(
 ) -> list[str]:
     """Report what is to be known of one whisker; whether it touches stated objects is given."""
     remarks = remarks_on_fur(one, fur, name) + remarks_on_hook(one, name)
+    remarks += [one.inertia.remark(name)] if one.inertia else []
     remarks += remarks_on(cameras, one.traces, one.length, one.fit.misfit, name)
     # Known objects locate contacts that are not seen.
     if not stated and one.peg is None:
@@ -468,7 +467,7 @@ def track_whisker(
     report = progress or (lambda stage, done, total: None)
     traces, blur = with_blur(traces)
     series = TraceSeries.of(traces)
-    _check_views(cameras, series, name)
+    check_views(cameras, series, name)
     curves = all_merged(cameras, traces, partial(report, f"{name} in space"))
     points = np.array([curve.points for curve in curves])
     report(f"contact of {name}", 0, 2)
@@ -477,18 +476,35 @@ def track_whisker(
     tips: Mask = np.all(series.ends[:, :, 1] > 0.5, axis=1)
     sparse = any(trace.sparse for view in traces for trace in view)
     pixel, flat = pixel_at(cameras, on_head), len(cameras) == 1
-    astray = Astray((_CROSSED if row and not sparse else _ASTRAY) * pixel, blur * pixel)
-    rest = partial(_at_rest, options, name, tips, flat, sparse, astray)
-    shape, whisker = rest(on_head)
+    pose = (_CROSSED if row and not sparse else _ASTRAY) * pixel
+
+    def rest(
+        curves: Array, swings: Array | float, hidden: float = 0.0
+    ) -> tuple[RestShape, Whisker]:
+        astray = Astray(pose, np.hypot(blur * pixel, swings))
+        return _at_rest(options, name, tips, flat, sparse, astray, curves, hidden)
+
+    inertia = inertia_of(
+        points,
+        lambda curves, swings: rest(head.seen_from(curves), swings),
+        rate,
+        pixel,
+        options.scaled,
+    )
+    light, used, swings = points, series, np.zeros(len(points))
+    if inertia is not None:
+        light, swings = points - inertia.displacement, inertia.unsure
+        used, on_head = inertia.without(cameras, series, points), head.seen_from(light)
+    shape, whisker = rest(on_head, swings)
     plane = plane_of(on_head, shape, tips) if flat else Plane(None, np.zeros(len(points)))
     if plane.head is not None:
         on_head = unturned(on_head, plane.head)
-        shape, whisker = rest(on_head)
+        shape, whisker = rest(on_head, swings)
     hook = None if row or sparse or options.whisker is not None else hook_of(shape, pixel)
     if hook is not None:
         on_head = straightened(on_head, shape, whisker, base_pose(on_head, shape, whisker), hook)
-        shape, whisker = rest(on_head, hook.share)
-    series, used = off_hook(cameras, series, points, hook)
+        shape, whisker = rest(on_head, swings, hook.share)
+    used, fitted = off_hook(cameras, used, light, hook)
     if len(cameras) > 1:
         shape = replace(shape, free=shape.free & ~rolled_over(on_head, shape, whisker))
     report(f"contact of {name}", 1, 2)
@@ -501,35 +517,37 @@ def track_whisker(
     further = None
     if options.whisker is None:
         whisker = whisker_at_rest(shape, name, **options.at_base)
-        further = continued(shape, on_head, cameras, series, within, tapers)
+        further = continued(shape, on_head, cameras, used, within, tapers)
     if further is not None:
         shape = further[0]
         whisker = whisker_at_rest(shape, name, **options.at_base)
     if not shape.free.any():
         # Only the bent shapes determine the roll.
         smoothness = replace(smoothness, roll=max(smoothness.roll, _ANY_ROLL))
-    fitter = Fitter(cameras, used, touching, on_head, rate, smoothness, within, objects)
-    fitter = replace(fitter, unsure=plane.unsure, hook=hook)
+    fitter = Fitter(cameras, fitted, touching, on_head, rate, smoothness, within, objects)
+    fitter = replace(fitter, unsure=plane.unsure, hook=hook, inertia=inertia)
     begun = _Begun(shape, whisker, further and further[1], tips, tapers)
     found = _on_peg(fitter, begun, options, sample) if sample and not objects else None
     found = found or _bent(fitter, begun, options)
+    fit = found.fit if inertia is None else swung(found.fit, inertia, found.whisker.length)
     report(f"contact of {name}", 2, 2)
     return Tracked(
         whisker=found.whisker,
-        traces=series,
+        traces=replace(series, seen=used.seen),
         curves=points,
         covariance=np.array([curve.covariance for curve in curves]),
         shape=found.shape,
         pose=found.pose,
         unfiltered=found.unfiltered,
-        touching=touching & (found.fit.force != 0.0).any(axis=1),
-        fit=found.fit if plane.head is None else projected(found.fit, plane.head),
+        touching=touching & (fit.force != 0.0).any(axis=1),
+        fit=fit if plane.head is None else projected(fit, plane.head),
         head=head,
         length=found.length,
         scale=scale_sigma(found.whisker, fur, more) if options.scaled else np.nan,
         peg=found.peg,
         unlike=found.unlike,
         hook=hook,
+        inertia=inertia,
         turned=plane.turned,
     )
 
@@ -671,26 +689,3 @@ def _length(fitter: Fitter, shape: RestShape, options: TrackOptions) -> Length:
         return cost(whisker, BasePose(**values))
 
     return likeliest_length(shape.length, of)
-
-
-def _check_views(cameras: Sequence[Camera], series: TraceSeries, name: str) -> None:
-    """Check that the views show one and the same whisker, from its base on."""
-    seen = np.isfinite(series.line[:, :, 0, 0])
-    whole = seen & (series.ends[:, :, 0] > 0.5)
-    if seen.all(axis=1).sum() >= _FEWEST > whole.all(axis=1).sum():
-        rows = zip(cameras, seen.sum(axis=0), whole.sum(axis=0), strict=True)
-        listed = ", ".join(f"{c.name} in {base} of {all_} frames" for c, all_, base in rows)
-        raise ValueError(
-            f"the border of the image cuts off the base of {name}, which is shown by {listed}: "
-            "film it from its base on, or use a larger part of the image (--views)"
-        )
-    gap = usual_gap(cameras, series)
-    lengths = np.linalg.norm(np.diff(series.line, axis=2), axis=3).sum(axis=2)
-    allowed = max(_FAR, _SHARE * float(np.nanmax(lengths, initial=0.0)))
-    if gap > allowed:
-        raise ValueError(
-            f"the views do not show one whisker: where they see the base of {name}, their lines of "
-            f"sight pass each other by {gap:.0f} pixels (median). Check the order of the views, "
-            "the cameras' calibration, and that all are of the same whisker from its base on; of "
-            "videos, state where it begins in each (`vibrissa track --base`)"
-        )

@@ -40,6 +40,7 @@ from vibrissa.numerics import Array, Mask
 from vibrissa.objects import Surface
 from vibrissa.rod import discretize, solve_forces
 from vibrissa.tracking.refine.hook import Hook
+from vibrissa.tracking.refine.inertia import Inertia
 from vibrissa.tracking.refine.peg import UncertainPeg
 from vibrissa.tracking.refine.problem import NEARLY, FitOptions, Linear, Problem
 from vibrissa.tracking.refine.rods import (
@@ -268,6 +269,7 @@ class Fitter:
     # (time,) Standard deviation of the logarithm of the curvature that one view shows.
     unsure: Array | None = None
     hook: Hook | None = None  # at the base, which is not on the whisker
+    inertia: Inertia | None = None  # that traces and curves are without
 
     def fit(
         self, whisker: Whisker, pose: BasePose, nodes: int, length: Length | None = None
@@ -301,11 +303,12 @@ class Fitter:
         tangent = Bent.of(problem.d, state, problem.touching).tangents(state.contact[:, 0])[0]
         normal = force - (force * tangent).sum(axis=1, keepdims=True) * tangent
         turn, length = problem.head.rotation, whisker.length
-        at = np.einsum("tij,tj->ti", state.rotation, point) + state.position * length
+        point = np.einsum("tij,tj->ti", state.rotation, point) / length
+        at, _ = problem.put_in(point, state, np.arange(len(point)))
         along = np.sqrt(np.median(linear.smoother.covariances()[rows, 6, 6])) if rows.any() else 0.0
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
         found = Touches(
-            problem.head.put_in(at)[rows],
+            at[rows],
             np.einsum("tij,tj->ti", turn, normal)[rows],
             np.einsum("tij,tj->ti", turn, tangent)[rows],
             whisker.radius(state.contact[rows, 0] * length),
@@ -397,6 +400,7 @@ class Fitter:
             self.peg,
             near,
             begun,
+            inertia=self.inertia and self.inertia.rows(frames),
         )
 
     def _nearest(self, frames: NDArray[np.intp]) -> tuple[Mask, Array]:

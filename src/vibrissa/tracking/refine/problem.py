@@ -36,6 +36,7 @@ from vibrissa.deferred import linalg
 from vibrissa.numerics import Array, Mask
 from vibrissa.objects import Surface
 from vibrissa.rod import Discretization
+from vibrissa.tracking.refine.inertia import Inertia
 from vibrissa.tracking.refine.peg import PEG_UNKNOWNS, UncertainPeg
 from vibrissa.tracking.refine.rods import (
     FAR,
@@ -424,6 +425,7 @@ class Problem:
     held: Sequence[tuple[int, float]] = ()  # rows whose contact's arc length is held, and that
     fixed: bool = False  # whether the peg is as it is in the state that the fit begins with
     enough: float = _SETTLED  # expected decrease of the cost below which a step is the last
+    inertia: Inertia | None = None  # that traces are without
 
     def rows(self, rows: NDArray[np.intp], begun: State) -> Problem:
         """The problem restricted to some frames, which begins there."""
@@ -436,8 +438,21 @@ class Problem:
             start=self.start.rows(rows),
             head=self.head.rows(rows),
             begun=begun.rows(rows),
+            inertia=self.inertia and self.inertia.rows(rows),
             variance=self.variance and [each[rows] for each in self.variance],
         )
+
+    def put_in(self, points: Array, state: State, rows: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Contacts of some rows, relative to the base, in the laboratory, m, and turns of tangents.
+
+        Inertia moves them, and changes tangents (time, 3), in the frame of the head, by so much.
+        """
+        head, length = self.head.rows(rows), self.d.length
+        found = head.put_in((points + state.position) * length)
+        if self.inertia is None:
+            return found, np.zeros_like(found)
+        moved, slopes = self.inertia.rows(rows).at(state.contact[:, 0])
+        return found + moved, np.einsum("tji,tj->ti", head.rotation, slopes) / length
 
     def trusted(self, even: bool = False) -> tuple[Problem, State, Linear]:
         """The problem with traces weighted by their residuals, and its solution."""
@@ -600,8 +615,9 @@ class Problem:
         at = np.flatnonzero(self.touching & self.near & ~data.wild)
         part, turn = state.rows(at), self.head.rotation[at]
         points, slopes, _ = contact_slopes(self.d, part)
-        points = self.head.rows(at).put_in((points + part.position) * length)
+        points, tilt = self.put_in(points, part, at)
         tangent, turning = (values[at] for values in data.tangents)
+        tangent = tangent + tilt
         radius = self.whisker.radius(part.contact[:, 0] * length)
         nearer = tilted = None
         if self.peg is None:

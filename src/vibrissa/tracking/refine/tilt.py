@@ -21,6 +21,7 @@ import numpy as np
 from vibrissa.deferred import transform
 from vibrissa.numerics import Array, Mask
 from vibrissa.tracking.refine.fit import RodFit
+from vibrissa.tracking.refine.inertia import Inertia
 from vibrissa.tracking.space.pose import HeadPose, roll_like, seen_shapes, tangents
 from vibrissa.tracking.space.rest_shape import RestShape, differences, turned_change
 
@@ -134,4 +135,19 @@ def projected(fit: RodFit, plane: HeadPose) -> RodFit:
         pose_covariance=pose @ fit.pose_covariance @ np.swapaxes(pose, 1, 2),
         pose_wrench_covariance=pose @ fit.pose_wrench_covariance @ np.swapaxes(wrench, 1, 2),
         centerline=fit.centerline * level,
+    )
+
+
+def swung(fit: RodFit, inertia: Inertia, length: float) -> RodFit:
+    """The fit with contacts and shapes where inertia has them; loads are those of contact."""
+    nodes = np.linspace(0.0, 1.0, fit.centerline.shape[1])
+    moved = [inertia.at(np.full(len(fit.misfit), share))[0] for share in nodes]
+    aside, _ = inertia.at(fit.arc_length / length)
+    return replace(
+        fit,
+        contact_point=fit.contact_point + aside,
+        contact_point_whisker=fit.contact_point_whisker
+        + np.einsum("tji,tj->ti", fit.rotation, aside),
+        contact_covariance=fit.contact_covariance + inertia.spread(aside),
+        centerline=fit.centerline + np.stack(moved, axis=1),
     )

@@ -1,0 +1,99 @@
+"""Whiskers that their own mass bends, by traces that no film was made for."""
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+
+import vibrissa as vb
+from vibrissa.cameras import orthogonal_views
+from vibrissa.evaluation import distances_from_curves, refine_curves
+from vibrissa.objects import Peg
+from vibrissa.simulation import Dynamics, simulate, whisking
+from vibrissa.simulation.dynamics import resonances
+from vibrissa.tracking import TrackOptions, track
+from vibrissa.tracking.trace.trace import Trace
+
+RATE, FRAMES, DAMPING = 500.0, 90, 0.12
+WHISKER = vb.Whisker.parabola(
+    length=36e-3, coefficient=7.0, base_radius=90e-6, tip_radius=6e-6, youngs_modulus=3e9
+)
+POINTS, NOISE = 150, 0.02  # pixels
+AWAY = Peg(np.array([90e-3, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]), 1e-3)
+NEAR = Peg(np.array([20e-3, 8e-3, 0.0]), np.array([0.0, 0.0, 1.0]), 1e-3)
+OPTIONS = TrackOptions(properties={"base_radius": WHISKER.base_radius})
+
+
+def whisked(peg, dynamics):
+    """Track the traces of a whisker that whisks near a peg; the recording, and the truth."""
+    motion = whisking(
+        FRAMES / RATE, RATE, frequency=9.0, amplitude=np.radians(24.0), set_point=np.radians(5.0)
+    )
+    truth = simulate(WHISKER, motion, peg, dynamics=dynamics)["truth"].to_dataset()
+    lines = truth["centerline"].values[:, 0]
+    share = np.linspace(0.0, 1.0, POINTS)
+    lines = CubicSpline(np.linspace(0.0, 1.0, lines.shape[1]), lines, axis=1)(share)
+    middle = 0.5 * (lines.min(axis=(0, 1)) + lines.max(axis=(0, 1)))
+    views = orthogonal_views(90e-6, (500, 500), middle)
+    # Errors of traces change slowly along them.
+    waves = np.cos(np.pi * share * np.arange(6)[:, None])
+    draw, sigma = np.random.default_rng(3), np.full(POINTS, NOISE)
+    seen = np.ones(POINTS, dtype=bool)
+    traces = [
+        [
+            Trace(line + NOISE * (draw.normal(size=(2, 6)) @ waves).T, sigma, seen, 1.0)
+            for line in view.project(lines)
+        ]
+        for view in views
+    ]
+    found = track(views, [[one] for one in traces], RATE, OPTIONS)
+    return found, truth.isel(whisker=0)
+
+
+@pytest.fixture(scope="module")
+def in_air():
+    return whisked(AWAY, Dynamics(damping_ratio=DAMPING))
+
+
+def test_a_whisker_that_whisks_in_air_touches_nothing(in_air):
+    """Its inertia bends it by more than light contacts do."""
+    found, _ = in_air
+    root = found.to_dataset().isel(whisker=0)
+    assert not root["in_contact"].any()
+    assert np.nanmedian(root["trace_misfit"]) < 2.0
+    assert "its inertia bends it" in found.attrs["remarks"]
+
+
+def test_the_shape_of_a_whisker_in_air_is_that_which_is_seen(in_air):
+    found, truth = in_air
+    lines = found["centerline"].values[:, 0]
+    away = distances_from_curves(lines, refine_curves(truth["centerline"].values))
+    # The motion of the ends of the trial is not seen from both sides.
+    assert np.median(away[5:-5]) < 10e-6
+
+
+def test_mass_and_damping_of_a_whisker_are_those_of_its_motion(in_air):
+    found, _ = in_air
+    (remark,) = [line for line in found.attrs["remarks"].splitlines() if "its inertia" in line]
+    scale = float(remark.split("stiffness is ")[1].split()[0])
+    delay = 1e-3 * float(remark.split("its damping ")[1].split()[0])
+    whole = resonances(WHISKER, Dynamics(damping_ratio=DAMPING), 1)[0]
+    assert abs(scale - 1.0) < 0.25
+    assert abs(delay - 2.0 * DAMPING / (2.0 * np.pi * whole)) < 0.5e-3
+
+
+def test_contacts_of_a_whisker_with_mass_are_found():
+    found, truth = whisked(NEAR, Dynamics(damping_ratio=DAMPING))
+    root = found.to_dataset().isel(whisker=0)
+    touched, true = root["in_contact"].values > 0, truth["in_contact"].values > 0
+    assert true.sum() > 20
+    assert (touched == true).mean() > 0.93
+    both = touched & true
+    away = np.linalg.norm(root["contact_point"] - truth["contact_point"], axis=-1)[both]
+    assert np.median(away) < 0.2e-3
+
+
+def test_a_whisker_without_mass_is_not_bent_by_inertia():
+    found, truth = whisked(NEAR, None)
+    root = found.to_dataset().isel(whisker=0)
+    assert "inertia" not in found.attrs.get("remarks", "")
+    assert ((root["in_contact"] > 0) == (truth["in_contact"] > 0)).mean() > 0.97

@@ -1,14 +1,16 @@
 """Cameras that are known only roughly: what a free whisker shows of them, from exact traces."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from vibrissa.cameras import orthogonal_views, triangulate
 from vibrissa.tracking import Trace
-from vibrissa.tracking.refine.optics import rough_optics, stated_lenses
+from vibrissa.tracking.refine.fit import RodFit
+from vibrissa.tracking.refine.optics import Optics, rough_optics, stated_lenses, with_optics_unsure
 from vibrissa.tracking.space.frame_pairs import clear_offsets
 
 PIXEL = 150e-6
@@ -177,3 +179,65 @@ def test_an_offset_is_noted_in_a_short_film(late):
     seen = traces(lines, [TOP, FRONT], 1e6)
     assert (clear_offsets(*STATED, seen[0], seen[1][late:], 0).shifts == -late).all()
     assert not clear_offsets(*STATED, *seen, 0).shifts.any()
+
+
+def test_a_turn_that_traces_show_is_used_though_little_is_left_unexplained():
+    found = rough_optics(STATED, traces(sweep(), [TOP, turned(FRONT, np.radians(2.0))], 1e6))
+    assert found.before < 0.05
+    assert found.needed
+    assert np.degrees(np.linalg.norm(found.values[2:5])) == pytest.approx(2.0, abs=0.1)
+
+
+@pytest.mark.slow
+def test_optics_are_no_surer_than_errors_that_neighbouring_points_and_frames_share():
+    misses = []
+    for seed in range(5):
+        noise = np.random.default_rng(seed).normal(size=(2, *sweep().shape[:2], 2))
+        wrong = gaussian_filter(2.0 * noise, (0.0, 3.0, 8.0, 0.0))
+        views = [
+            [one._replace(line=one.line + error) for one, error in zip(*both, strict=True)]
+            for both in zip(traces(sweep(), [TOP, FRONT], 1e6), wrong, strict=True)
+        ]
+        found = rough_optics(STATED, views)
+        misses.append((found.values - found.stated) / found.sigma)
+    assert np.sqrt(np.mean(np.square(misses))) < 1.2
+
+
+@pytest.mark.parametrize(("error", "size"), [(2, 0.05), (3, 0.05), (4, 0.05), (5, 0.02)])
+def test_directions_and_loads_are_as_uncertain_as_the_cameras(error, size):
+    """A turn of the front view about one of its axes, and its scale."""
+    rotation = Rotation.from_rotvec([[0.1, 0.2, 0.3], [-0.4, 0.1, 0.9]]).as_matrix()
+    base = np.array([[1e-3, 2e-3, -1e-3], [0.0, 1e-3, 2e-3]])
+    tangent, load = rotation[:, :, 0], np.array([[1.0, -2.0, 0.5], [0.0, 1.0, 1.0]])
+    covariance = np.diag(np.where(np.arange(7) == error, size**2, 1e-20))
+    none = np.zeros(7)
+    found = Optics(STATED, STATED, none, covariance, none, none, 0.0, 0.0)
+    exact = {field.name: np.zeros((2, 1)) for field in fields(RodFit)}
+    exact |= {f"{name}_covariance": np.zeros((2, 6, 6)) for name in ("pose", "wrench")}
+    exact |= {"contact_covariance": np.zeros((2, 3, 3)), "shared": np.zeros((2, 0, 15))}
+    exact |= {"pose_wrench_covariance": np.zeros((2, 6, 6)), "rotation": rotation}
+    exact |= {"position": base, "contact_point": base + 5e-3 * tangent}
+    fit = with_optics_unsure(RodFit(**exact | {"force": load, "moment": 1e-3 * load}), found)
+    # Only the front shows z, and both views show x, of which half is by the front.
+    stretch = {
+        2: np.outer([0.0, 0.0, 1.0], [0.0, 1.0, 0.0]),
+        3: 0.5 * np.outer([1.0, 0.0, 0.0], [0.0, 1.0, 0.0]),
+        4: 0.5 * np.outer([1.0, 0.0, 0.0], [0.0, 0.0, 1.0]) - np.outer([0, 0, 1.0], [1.0, 0, 0]),
+        5: np.diag([0.5, 0.0, 1.0]),
+    }[error]
+    change = size * tangent @ stretch.T
+    along = (change * tangent).sum(axis=1, keepdims=True)
+    across = np.linalg.norm(change - along * tangent, axis=1)
+    turns = np.cross(fit.shared[:, error, 6:9], tangent)
+    np.testing.assert_allclose(np.linalg.norm(turns, axis=1), across, atol=0.1 * size)
+    np.testing.assert_allclose(
+        np.einsum("tii->t", fit.pose_covariance[:, :3, :3]),
+        (found.displacements(base) ** 2).sum(axis=(0, 2)),
+    )
+    seen = np.einsum("tij,tj->ti", rotation, load)
+    deformed = np.linalg.norm(0.5 * size * seen @ (stretch + stretch.T), axis=1)
+    spread = np.sqrt(np.einsum("tii->t", fit.wrench_covariance[:, :3, :3]))
+    np.testing.assert_allclose(spread, deformed, atol=0.1 * size)
+    np.testing.assert_allclose(
+        fit.wrench_covariance[:, 3:, 3:], 1e-6 * fit.wrench_covariance[:, :3, :3], rtol=1e-9
+    )

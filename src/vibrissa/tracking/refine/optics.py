@@ -46,9 +46,9 @@ _SAMPLE = 150  # largest number of frames from which the free ones are selected
 # Deviation from the rest shape up to which a frame may be free, as a share of the whisker's length:
 # wrong optics make free frames differ too, and what is bent is left out later.
 _ALIKE = 0.04
-# Visible misfit of the stated cameras, pixels; largest share of it that other optics may leave; and
-# standard deviations by which these must differ from the stated ones.
-_VISIBLE, _BETTER, _CERTAIN = 0.05, 0.6, 3.0
+# Visible misfit of cameras, pixels; largest share of it that other optics may leave, if that is
+# visible, too; and standard deviations by which these must differ from the stated ones.
+_VISIBLE, _BETTER, _CERTAIN = 0.05, 0.6, 2.0
 _EXPLAINED = (
     0.1  # distance of a rigid whisker from the traces below which nothing needs explaining, pixels
 )
@@ -62,6 +62,10 @@ _STEP = 1e-3  # step of differences by the optics, in their standard deviations
 _UNIT = 0.5
 # The same in units of what is left of them, and its smallest value, pixels.
 _COMMON, _SHARPEST = 5.0, 0.1
+# The same for covariances: errors of traces vary with the pose, and frames that are hardly bent may
+# be among the free ones.
+_SYSTEMATIC = 10.0
+_AROUND = 5e-3  # distance over which displacements by the cameras' errors are nearly linear, m
 _DECIDED = 3.0  # difference of log-likelihoods from which a mirrored view is on one side
 _SELECTIONS = 3  # number of rounds in which frames that are bent are left out
 _ODD = 3.0  # misfit of frames that are left out, in units of the usual one: they are bent
@@ -93,10 +97,10 @@ class Optics:
 
     @property
     def needed(self) -> bool:
-        """Whether only these optics, and not the stated ones, explain the views."""
+        """Whether these optics explain the views, and differ from the stated ones for certain."""
         apart = np.abs(self.values - self.stated) / self.sigma
-        explains = self.after < _BETTER * self.before
-        return bool(self.before > _VISIBLE and explains and apart.max() > _CERTAIN)
+        explains = self.after < max(_VISIBLE, _BETTER * self.before)
+        return bool(explains and apart.max() > _CERTAIN)
 
     def as_stated(self) -> Optics:
         """The stated cameras, with their uncertainty and their difference from these optics."""
@@ -236,7 +240,7 @@ def estimated_optics(
         fitted.cameras_at(fitted.q),
         fitted.stated,
         stated + fitted.q * size,
-        fitted.covariance * np.outer(size, size),
+        fitted.unsure * np.outer(size, size),
         stated,
         size,
         before.mean_miss,
@@ -313,6 +317,13 @@ class _Problem:
     def covariance(self) -> Array:
         """Covariance of the optics q."""
         return np.asarray(np.linalg.inv(self.normal()[0])[-len(self.q) :, -len(self.q) :])
+
+    @property
+    def unsure(self) -> Array:
+        """Covariance of the optics q, of which the traces state less than they seem to."""
+        stated, size = np.eye(len(self.q)), max(_SYSTEMATIC * self.mean_miss, _SHARPEST)
+        data = np.linalg.inv(self.covariance) - stated
+        return np.asarray(np.linalg.inv(data * (self.unit / size) ** 2 + stated))
 
     def sharper(self) -> _Problem:
         """The problem with traces weighted by their residuals."""
@@ -465,10 +476,32 @@ class _Problem:
 
 
 def with_optics_unsure(fit: RodFit, optics: Optics) -> RodFit:
-    """Add the uncertainty of the cameras to the covariances of points."""
+    """Add the uncertainty of the cameras to the covariances.
+
+    Points are displaced by a nearly linear map. It also turns the base, and how it deforms space
+    changes the wrench in the base's axes, relative to its size.
+    """
     moved = [optics.displacements(points) for points in (fit.contact_point, fit.position)]
-    contact, base = (np.einsum("vti,vtj->tij", points, points) for points in moved)
-    return _widened(fit, contact, base, np.moveaxis(np.concatenate(moved, axis=2), 0, 1))
+    contact, none = np.einsum("vti,vtj->tij", moved[0], moved[0]), np.zeros((3, 3))
+    middle = np.nanmedian(fit.position, axis=0)
+    ends = optics.displacements(middle + _AROUND * np.concatenate([np.eye(3), -np.eye(3)]))
+    map_ = np.swapaxes(ends[:, :3] - ends[:, 3:], 1, 2) / (2.0 * _AROUND)
+    back = np.swapaxes(map_, 1, 2)
+    tangent = fit.rotation[:, :, 0]
+    roll = 0.5 * (map_ - back)[:, [2, 0, 1], [1, 2, 0]] @ tangent.T
+    turn = np.cross(tangent, np.einsum("vij,tj->vti", map_, tangent)) + roll[..., None] * tangent
+    strain = np.einsum("tki,vkl,tlj->vtij", fit.rotation, 0.5 * (map_ + back), fit.rotation)
+    loads = np.concatenate(
+        [np.einsum("vtij,tj->vti", strain, load) for load in (fit.force, fit.moment)], axis=2
+    )
+    poses = np.concatenate([moved[1], turn], axis=2)
+    fit = _widened(fit, contact, none, np.moveaxis(np.concatenate([moved[0], poses], axis=2), 0, 1))
+    return replace(
+        fit,
+        pose_covariance=fit.pose_covariance + np.einsum("vti,vtj->tij", poses, poses),
+        wrench_covariance=fit.wrench_covariance + np.einsum("vti,vtj->tij", loads, loads),
+        pose_wrench_covariance=fit.pose_wrench_covariance + np.einsum("vti,vtj->tij", poses, loads),
+    )
 
 
 def with_depth_unsure(
@@ -499,10 +532,10 @@ def with_depth_unsure(
 
 
 def _widened(fit: RodFit, contact: Array, base: Array, shared: Array) -> RodFit:
-    """Add covariances (t, 3, 3) of contact and base, and errors (t, e, 6) that frames share."""
+    """Add covariances (t, 3, 3) of contact and base, and errors (t, e, ·) that frames share."""
     pose = fit.pose_covariance.copy()
     pose[:, :3, :3] += base
-    shared = np.pad(shared, ((0, 0), (0, 0), (0, 9)))
+    shared = np.pad(shared, ((0, 0), (0, 0), (0, fit.shared.shape[2] - shared.shape[2])))
     return replace(
         fit,
         contact_covariance=fit.contact_covariance + contact,

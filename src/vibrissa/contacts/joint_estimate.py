@@ -2,9 +2,10 @@
 
 The resting whisker sags under its weight. A weightless whisker with this resting shape proposes
 contacts: near the truth if gravity acts across the whisker, and within a few per cent of the length
-if it acts along it. They are then fitted to the signals with the full weight and all uncertain
-parameters (:mod:`~vibrissa.contacts.joint.joint_fit`). With unknown friction, curves of contacts
-are traced from there (:mod:`~vibrissa.contacts.joint.friction`).
+if it acts along it, except on nearly uniform whiskers, along which contacts are sought
+(:mod:`~vibrissa.contacts.joint.along_whisker`). They are then fitted to the signals with the full
+weight and all uncertain parameters (:mod:`~vibrissa.contacts.joint.joint_fit`). With unknown
+friction, curves of contacts are traced from there (:mod:`~vibrissa.contacts.joint.friction`).
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from vibrissa.contacts.engine.prior import Prior, possible_candidates, refuse_ti
 from vibrissa.contacts.engine.readout import Named
 from vibrissa.contacts.engine.search import Search, check_scale, estimate
 from vibrissa.contacts.fitting.least_squares import Fits
+from vibrissa.contacts.joint.along_whisker import evenly_weighted, leave_few_paths, sought_along
 from vibrissa.contacts.joint.forward import Forward, Gravity, finite
 from vibrissa.contacts.joint.friction import along_curves, check_ratio, or_without
 from vibrissa.contacts.joint.joint_fit import Joint, JointFit, check_compliance
@@ -383,8 +385,21 @@ class JointEstimate:
         row, place = np.nonzero(np.isfinite(x[..., 0]))
         starts = row, x[row, place]
         if self.forward.weighted and names != WRENCH and self.contact_map is not None:
-            starts = self._corrected(targets, *starts)
+            starts = self._farther(targets, *starts)
         return *starts, status
+
+    def _farther(self, targets: Array, row: IntArray, x: Array) -> tuple[IntArray, Array]:
+        """Proposals x (m, 4) of rows, and others that fits from these do not reach."""
+        along = leave_few_paths(self.channels.signals)
+        # With the moment and a direction the force at each arc length is known: there is one path.
+        if not (along and "MB" in self.channels.signals):
+            row, x = self._corrected(targets, row, x)
+        if not along or not row.size:
+            return row, x
+        evenly = evenly_weighted(self.forward, self.channels, self._fit.least)
+        flat = self.signals_of(targets) / self.scale
+        rows, sought = sought_along(evenly, flat, targets, row, x)
+        return np.append(row, rows), np.concatenate([x, sought])
 
     def _corrected(self, targets: Array, row: IntArray, x: Array) -> tuple[IntArray, Array]:
         """Proposals x (m, 4) of rows, and what they become for corrected targets.
@@ -494,13 +509,23 @@ class JointEstimate:
         larger = np.trace(own, axis1=1, axis2=2) > np.trace(covariance, axis1=1, axis2=2)
         return np.where(larger[:, None, None], own, covariance), valid & known & linear
 
+    def _determined(self, sagged: ChartedWhisker) -> bool:
+        """Whether the signals determine contacts, as they do on the sagged weightless whisker.
+
+        Weight does not twist a straight whisker, but that one twists.
+        """
+        names = self.names
+        if "Mx" in names and self.whisker.is_straight and self.whisker.base_stiffness is None:
+            names = tuple(name for name in names if name != "Mx")
+        return len(names) >= 3 and sagged.determines(names)
+
     def _sagged_searches(self) -> _Searches:
         """Searches on the sagged whisker, kept as long as its shape proposes contacts."""
         if self._searches is None or self._searches.shape != self._proposing:
             assert self.contact_map is not None
             assert self._proposing is not None
             sagged, own, exact = _sagged(self.contact_map, self._proposing), None, []
-            if sagged.determines(self.names):
+            if self._determined(sagged):
                 near = dict(zip(self.names, (_NEAR * self.scale).tolist(), strict=True))
                 exact = [
                     Search(sagged, Named(sagged, self.names, sensor))

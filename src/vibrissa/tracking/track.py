@@ -16,7 +16,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from vibrissa.cameras import Camera
-from vibrissa.deferred import transform
 from vibrissa.io import Frame
 from vibrissa.numerics import Array, Mask, without_blas_threads
 from vibrissa.objects import Surface
@@ -62,7 +61,13 @@ from vibrissa.tracking.refine.problem import FitOptions
 from vibrissa.tracking.refine.rods import TraceSeries, rolled
 from vibrissa.tracking.refine.silhouette import bends_otherwise, explains, on_peg, peg_in_images
 from vibrissa.tracking.refine.taper import some_in_contact, tapered_as_it_bends
-from vibrissa.tracking.refine.tilt import Plane, plane_of, projected, swung, unturned
+from vibrissa.tracking.refine.tilt import (
+    Plane,
+    known_flat,
+    plane_of,
+    projected,
+    unturned,
+)
 from vibrissa.tracking.space.curve import (
     HiddenPart,
     all_merged,
@@ -90,13 +95,11 @@ from vibrissa.tracking.space.rest_shape import (
 )
 from vibrissa.tracking.trace.blur import with_blur
 from vibrissa.tracking.trace.trace import Trace
-from vibrissa.whisker import Pose, Whisker
+from vibrissa.whisker import Whisker
 
 Progress = Callable[[str, int, int], None]
 """Function that is called with the name of a stage, and how much of how much is done."""
 
-# Largest distance of a known whisker from its plane for one view, as a share of its length.
-_FLAT = 0.02
 # Standard deviation of a roll that is determined by bent shapes only, rad.
 _ANY_ROLL = np.radians(10.0)
 # Misfit, absolute and relative to the usual one, below which the traces of a row are its whiskers'.
@@ -476,20 +479,10 @@ def track_whisker(
     tips: Mask = np.all(series.ends[:, :, 1] > 0.5, axis=1)
     sparse = any(trace.sparse for view in traces for trace in view)
     pixel, flat = pixel_at(cameras, on_head), len(cameras) == 1
-    pose = (_CROSSED if row and not sparse else _ASTRAY) * pixel
-
-    def rest(
-        curves: Array, swings: Array | float, hidden: float = 0.0
-    ) -> tuple[RestShape, Whisker]:
-        astray = Astray(pose, np.hypot(blur * pixel, swings))
-        return _at_rest(options, name, tips, flat, sparse, astray, curves, hidden)
-
+    astray = Astray((_CROSSED if row and not sparse else _ASTRAY) * pixel, blur * pixel)
+    rest = partial(_at_rest, options, name, tips, flat, sparse, astray)
     inertia = inertia_of(
-        points,
-        lambda curves, swings: rest(head.seen_from(curves), swings),
-        rate,
-        pixel,
-        options.scaled,
+        points, lambda c, s: rest(head.seen_from(c), s), rate, pixel, options.scaled
     )
     light, used, swings = points, series, np.zeros(len(points))
     if inertia is not None:
@@ -505,31 +498,18 @@ def track_whisker(
         on_head = straightened(on_head, shape, whisker, base_pose(on_head, shape, whisker), hook)
         shape, whisker = rest(on_head, swings, hook.share)
     used, fitted = off_hook(cameras, used, light, hook)
-    if len(cameras) > 1:
+    if not flat:
         shape = replace(shape, free=shape.free & ~rolled_over(on_head, shape, whisker))
     report(f"contact of {name}", 1, 2)
     touching = np.isfinite(points).all(axis=(1, 2)) & ~shape.free
-    sharpest = max(options.fit.sharpest, 1.0) if sparse else options.fit.sharpest
-    smoothness, within = replace(options.fit, sharpest=sharpest), plane.head or head
-    tapers = bool(options.properties.keys() & {"tip_radius", "radius"})
-    fur, more = options.fur, hidden.before(shape.length) * options.scaled
-    options = replace(options, fur=fur + more)
-    further = None
-    if options.whisker is None:
-        whisker = whisker_at_rest(shape, name, **options.at_base)
-        further = continued(shape, on_head, cameras, used, within, tapers)
-    if further is not None:
-        shape = further[0]
-        whisker = whisker_at_rest(shape, name, **options.at_base)
-    if not shape.free.any():
-        # Only the bent shapes determine the roll.
-        smoothness = replace(smoothness, roll=max(smoothness.roll, _ANY_ROLL))
-    fitter = Fitter(cameras, fitted, touching, on_head, rate, smoothness, within, objects)
+    fitter = Fitter(cameras, fitted, touching, on_head, rate, options.fit, head, objects)
     fitter = replace(fitter, unsure=plane.unsure, hook=hook, inertia=inertia)
-    begun = _Begun(shape, whisker, further and further[1], tips, tapers)
-    found = _on_peg(fitter, begun, options, sample) if sample and not objects else None
-    found = found or _bent(fitter, begun, options)
-    fit = found.fit if inertia is None else swung(found.fit, inertia, found.whisker.length)
+    if plane.head is not None:
+        fitter = replace(fitter, head=plane.head)
+    more = hidden.before(shape.length) * options.scaled
+    used_options = replace(options, fur=options.fur + more)
+    found = _found(fitter, shape, whisker, used, tips, sparse, used_options, sample)
+    fit = found.fit if inertia is None else found.fit.swung(inertia, found.whisker.length)
     report(f"contact of {name}", 2, 2)
     return Tracked(
         whisker=found.whisker,
@@ -543,13 +523,46 @@ def track_whisker(
         fit=fit if plane.head is None else projected(fit, plane.head),
         head=head,
         length=found.length,
-        scale=scale_sigma(found.whisker, fur, more) if options.scaled else np.nan,
+        scale=scale_sigma(found.whisker, options.fur, more) if options.scaled else np.nan,
         peg=found.peg,
         unlike=found.unlike,
         hook=hook,
         inertia=inertia,
         turned=plane.turned,
     )
+
+
+def _found(
+    fitter: Fitter,
+    shape: RestShape,
+    whisker: Whisker,
+    shown: TraceSeries,
+    tips: Mask,
+    sparse: bool,
+    options: TrackOptions,
+    sample: Sequence[Sequence[Frame]],
+) -> _Bent:
+    """Fit a whisker of a shape at rest, and the peg that it touches."""
+    tapers = bool(options.properties.keys() & {"tip_radius", "radius"})
+    further = None
+    if options.whisker is None:
+        whisker = whisker_at_rest(shape, whisker.name, **options.at_base)
+        further = continued(shape, fitter.curves, fitter.cameras, shown, fitter.head, tapers)
+    if further is not None:
+        shape = further[0]
+        whisker = whisker_at_rest(shape, whisker.name, **options.at_base)
+    smoothness = fitter.options
+    if sparse:
+        smoothness = replace(smoothness, sharpest=max(smoothness.sharpest, 1.0))
+    if not shape.free.any():
+        # Only the bent shapes determine the roll.
+        smoothness = replace(smoothness, roll=max(smoothness.roll, _ANY_ROLL))
+    fitter = replace(fitter, options=smoothness)
+    begun = _Begun(shape, whisker, further and further[1], tips, tapers)
+    found = None
+    if sample and not fitter.objects:
+        found = _on_peg(fitter, begun, options, sample)
+    return found or _bent(fitter, begun, options)
 
 
 class _Begun(NamedTuple):
@@ -624,31 +637,21 @@ def _at_rest(
     sparse: bool,
     astray: Astray,
     curves: Array,
+    swings: Array | float,
     hidden: float = 0.0,
 ) -> tuple[RestShape, Whisker]:
-    """Rest shape from the frames, without a share at the base, or of the known whisker."""
+    """Rest shape from the frames, without a share at the base, or of the known whisker.
+
+    ``swings`` are errors (time,) of the curves by what inertia bends.
+    """
+    astray = astray._replace(motion=np.hypot(astray.motion, swings))
     if options.whisker is not None:
         whisker = options.whisker.with_properties(name=name)
         if flat:
-            return _known_flat(curves, whisker, options.free)
+            return known_flat(curves, whisker, options.free)
         return known_rest(curves, whisker, options.free), whisker
     shape = replace(rest_shape(curves, options.free, tips, astray, hidden), sparse=sparse)
     return shape, whisker_at_rest(shape, name, **options.at_base)
-
-
-def _known_flat(curves: Array, whisker: Whisker, free: float) -> tuple[RestShape, Whisker]:
-    """Place a known whisker in the plane of a single view, on the side that fits."""
-    away = float(np.abs(whisker.centerline()[:, 2]).max())
-    if away > _FLAT * whisker.length:
-        raise ValueError(
-            f"the known whisker leaves its plane by {1e3 * away:.2f} mm; for one view "
-            f"{100.0 * _FLAT:g} % of its length, {1e3 * _FLAT * whisker.length:.2f} mm, are "
-            "allowed: film it from two sides, or leave --whisker out"
-        )
-    sides = [transform.Rotation.from_rotvec([turn, 0.0, 0.0]).as_matrix() for turn in (0.0, np.pi)]
-    laid = [replace(whisker, pose=Pose(turn, np.zeros(3))) for turn in sides]
-    shapes = [known_rest(curves, one, free) for one in laid]
-    return min(zip(shapes, laid, strict=True), key=lambda pair: pair[0].noise)
 
 
 def _poses(

@@ -242,6 +242,20 @@ class RodFit:
     centerline: Array  # (time, node, 3), laboratory
     misfit: Array  # (time,), root mean square distance from the traces in their deviations
 
+    def swung(self, inertia: Inertia, length: float) -> RodFit:
+        """The fit with contacts and shapes where inertia has them; loads are those of contact."""
+        nodes = np.linspace(0.0, 1.0, self.centerline.shape[1])
+        moved = [inertia.at(np.full(len(self.misfit), share))[0] for share in nodes]
+        aside, _ = inertia.at(self.arc_length / length)
+        turned = np.einsum("tji,tj->ti", self.rotation, aside)
+        return replace(
+            self,
+            contact_point=self.contact_point + aside,
+            contact_point_whisker=self.contact_point_whisker + turned,
+            contact_covariance=self.contact_covariance + inertia.spread(aside),
+            centerline=self.centerline + np.stack(moved, axis=1),
+        )
+
 
 class Touches(NamedTuple):
     """Contacts (n, 3), m, with unit normals of what is touched and unit tangents of the whisker."""

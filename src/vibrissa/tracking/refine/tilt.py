@@ -21,9 +21,14 @@ import numpy as np
 from vibrissa.deferred import transform
 from vibrissa.numerics import Array, Mask
 from vibrissa.tracking.refine.fit import RodFit
-from vibrissa.tracking.refine.inertia import Inertia
 from vibrissa.tracking.space.pose import HeadPose, roll_like, seen_shapes, tangents
-from vibrissa.tracking.space.rest_shape import RestShape, differences, turned_change
+from vibrissa.tracking.space.rest_shape import (
+    RestShape,
+    differences,
+    known_rest,
+    turned_change,
+)
+from vibrissa.whisker import Pose, Whisker
 
 # Share of the rest shape that a frame must show, and number of such frames from which turns follow.
 _SHOWN, _FEWEST = 0.85, 8
@@ -37,6 +42,8 @@ _RISES = -0.2
 # Standard deviation of the logarithm of the apparent curvature of a whisker in contact: least,
 # and as a share of how far it is from the usual one without contact.
 _UNSURE, _ASTRAY = 0.03, 0.3
+# Largest distance of a known whisker from its plane for one view, as a share of its length.
+_IN_PLANE = 0.02
 _FLAT = np.diag([1.0, 1.0, 1e-3])  # projection that leaves covariances regular
 
 
@@ -138,16 +145,17 @@ def projected(fit: RodFit, plane: HeadPose) -> RodFit:
     )
 
 
-def swung(fit: RodFit, inertia: Inertia, length: float) -> RodFit:
-    """The fit with contacts and shapes where inertia has them; loads are those of contact."""
-    nodes = np.linspace(0.0, 1.0, fit.centerline.shape[1])
-    moved = [inertia.at(np.full(len(fit.misfit), share))[0] for share in nodes]
-    aside, _ = inertia.at(fit.arc_length / length)
-    return replace(
-        fit,
-        contact_point=fit.contact_point + aside,
-        contact_point_whisker=fit.contact_point_whisker
-        + np.einsum("tji,tj->ti", fit.rotation, aside),
-        contact_covariance=fit.contact_covariance + inertia.spread(aside),
-        centerline=fit.centerline + np.stack(moved, axis=1),
-    )
+def known_flat(curves: Array, whisker: Whisker, free: float) -> tuple[RestShape, Whisker]:
+    """Place a known whisker in the plane of a single view, on the side that fits."""
+    away = float(np.abs(whisker.centerline()[:, 2]).max())
+    most = _IN_PLANE * whisker.length
+    if away > most:
+        raise ValueError(
+            f"the known whisker leaves its plane by {1e3 * away:.2f} mm; for one view "
+            f"{100.0 * _IN_PLANE:g} % of its length, {1e3 * most:.2f} mm, are "
+            "allowed: film it from two sides, or leave --whisker out"
+        )
+    sides = [transform.Rotation.from_rotvec([turn, 0.0, 0.0]).as_matrix() for turn in (0.0, np.pi)]
+    laid = [replace(whisker, pose=Pose(turn, np.zeros(3))) for turn in sides]
+    shapes = [known_rest(curves, one, free) for one in laid]
+    return min(zip(shapes, laid, strict=True), key=lambda pair: pair[0].noise)

@@ -123,28 +123,49 @@ def test_one_moment_that_does_not_fit_is_named(images):
         calibrate(series, CORNERS, SQUARE)
 
 
+def calibrated_by_corners(monkeypatch, views, turns, noise, generator):
+    """Calibration from noisy corners of boards with known rotations."""
+    from vibrissa.cameras import calibration
+
+    board = np.indices((*CORNERS, 1)).T.reshape(-1, 3) * SQUARE
+    seen, images = [], {"left": [], "right": []}
+    for turn in turns:
+        rotation = Rotation.from_rotvec(turn)
+        points = rotation.apply(board - board.mean(axis=0)) + generator.uniform(-2e-3, 2e-3, 3)
+        for view, series in zip(views, images.values(), strict=True):
+            series.append(np.full(SIZE[::-1], len(seen), np.uint8))
+            blur = generator.normal(0.0, noise, (len(points), 2))
+            seen.append(np.float32(view.project(points) + blur))
+    monkeypatch.setattr(calibration, "_find_corners", lambda image, _: seen[image[0, 0]])
+    return calibrate(images, CORNERS, SQUARE)
+
+
 @pytest.mark.slow
 def test_boards_seen_from_far_away(monkeypatch):
     """Their poses are ambiguous, and the orders of corners that these suggest are wrong."""
-    from vibrissa.cameras import calibration
-
     generator = np.random.default_rng(201)
     matrix = [[20000.0, 0.0, 199.5], [0.0, 20000.0, 149.5], [0.0, 0.0, 1.0]]
     views = [
         Camera(matrix, Rotation.from_rotvec([0.1 * k, 0.6 * k, 0.0]).as_matrix(), shift, size=SIZE)
         for k, shift in enumerate(([0.0, 0.0, 1.7], [0.001, 0.0, 1.785]))
     ]
-    board = np.indices((*CORNERS, 1)).T.reshape(-1, 3) * SQUARE
-    seen, images = [], {"left": [], "right": []}
-    for _ in range(10):
-        rotation = Rotation.from_rotvec(generator.uniform(-0.3, 0.3, 3))
-        points = rotation.apply(board - board.mean(axis=0)) + generator.uniform(-2e-3, 2e-3, 3)
-        for view, series in zip(views, images.values(), strict=True):
-            series.append(np.full(SIZE[::-1], len(seen), np.uint8))
-            noise = generator.normal(0.0, 0.2, (len(points), 2))
-            seen.append(np.float32(view.project(points) + noise))
-    monkeypatch.setattr(calibration, "_find_corners", lambda image, _: seen[image[0, 0]])
-    assert calibrate(images, CORNERS, SQUARE).error < 0.3
+    turns = (generator.uniform(-0.3, 0.3, 3) for _ in range(10))
+    assert calibrated_by_corners(monkeypatch, views, turns, 0.2, generator).error < 0.3
+
+
+def test_boards_parallel_to_a_camera_do_not_determine_it(monkeypatch):
+    """Reprojection errors are as small as ever; points were wrong by 4 % without a word."""
+    from vibrissa.cameras import calibration
+
+    generator = np.random.default_rng(3)
+    turns = [[0.0, 0.0, turn] for turn in generator.uniform(-0.6, 0.6, 10)]
+    with pytest.warns(UserWarning, match=r"hardly determine the cameras: .* board tilted"):
+        found = calibrated_by_corners(monkeypatch, PAIR, turns, 0.1, generator)
+    assert found.error < 0.2
+    assert found.point_sigma > 30e-6
+    monkeypatch.setattr(calibration._Bundle, "point_errors", lambda _: (np.inf, 8e-3))
+    with pytest.raises(ValueError, match=r"do not determine the cameras\. Take more"):
+        calibrated_by_corners(monkeypatch, PAIR, turns, 0.1, generator)
 
 
 def test_images_that_no_cameras_explain(images):

@@ -40,6 +40,9 @@ _UNFIT = 0.005
 _ATTEMPTS = 200  # largest number of steps; cameras that explain the corners take some thirty
 # Reprojection error of the images of one moment, relative to the median of all, that is doubted.
 _DOUBTED = 3.0
+# Error of points, over the extent of the boards, above which the images hardly determine cameras.
+_VAGUE = 0.005
+_TILT = "Take more images, with the board tilted by 20° and more, in various directions"
 
 
 class Calibration(NamedTuple):
@@ -87,13 +90,14 @@ def calibrate(
     ModuleNotFoundError
         If OpenCV is not installed.
     ValueError
-        If the cameras have different numbers of images, too few show the board, or no cameras
-        explain the corners.
+        If the cameras have different numbers of images, too few show the board, no cameras
+        explain the corners, or the boards are too much alike to determine them.
 
     Warns
     -----
     UserWarning
-        If the images of one moment fit more than three times worse than those of most.
+        If the images of one moment fit more than three times worse than those of most, or the
+        boards, hardly tilted or all alike, do not determine the cameras to 0.5 % of their extent.
     """
     counts = {name: len(series) for name, series in images.items()}
     if len(counts) < 2 or len(set(counts.values())) != 1:
@@ -135,7 +139,7 @@ def calibrate(
             "no cameras explain the images of the board: their reprojection error is "
             f"{fit.error:.2g} pixels{doubt and f'; {doubt}'}. Were all images with the same number "
             "taken at the same moment, with cameras that did not move? Images by way of a mirror "
-            "must be mirrored back"
+            f"must be mirrored back. {_TILT}"
         )
     if doubt:
         warnings.warn(
@@ -143,7 +147,16 @@ def calibrate(
             "rest? Otherwise leave it out",
             stacklevel=2,
         )
-    return Calibration(fit.cameras(fit.solution.x), fit.error, fit.point_sigma())
+    sigma, extent = fit.point_errors()
+    if not sigma < extent:
+        raise ValueError(f"the images do not determine the cameras. {_TILT}")
+    if sigma > _VAGUE * extent:
+        warnings.warn(
+            f"the images hardly determine the cameras: points have errors of {1e3 * sigma:.2g} mm "
+            f"(point_sigma) among boards that extend over {1e3 * extent:.2g} mm. {_TILT}",
+            stacklevel=2,
+        )
+    return Calibration(fit.cameras(fit.solution.x), fit.error, sigma)
 
 
 def _find_corners(image: Image, corners: tuple[int, int]) -> Any:
@@ -393,8 +406,8 @@ class _Bundle:
             for name, values in lenses.items()
         )
 
-    def point_sigma(self) -> float:
-        """Root mean square error of points among the shared boards, m."""
+    def point_errors(self) -> tuple[float, float]:
+        """Root mean square error of points among the shared boards, and their extent, m."""
         x, count = self.solution.x, len(self.solution.fun)
         noise = np.linalg.norm(self.solution.fun) / np.sqrt(max(count - len(x), 1))
         scale = sparse_linalg.norm(self.solution.jac, axis=0)
@@ -409,10 +422,13 @@ class _Bundle:
         ]
         true = np.concatenate([self.board, *moved])
         pixels = np.stack([camera.project(true) for camera in self.cameras(x)])
-        squares = []
+        centred = true - true.mean(axis=0)
+        extent, squares = float(np.sqrt((centred**2).sum(axis=1).mean())), []
         for draw in np.random.default_rng(0).normal(0.0, noise, (_DRAWS, count)):
             step = normal.solve(jacobian.T @ draw) / scale
             points = triangulate(self.cameras(x + step), pixels)[0]
-            centred = points - points.mean(axis=0), true - true.mean(axis=0)
-            squares.append(transform.Rotation.align_vectors(*centred)[1] ** 2 / len(true))
-        return float(np.sqrt(np.mean(squares)))
+            if not np.isfinite(points).all():  # behind one of the cameras
+                return np.inf, extent
+            misfit = transform.Rotation.align_vectors(points - points.mean(axis=0), centred)[1]
+            squares.append(misfit**2 / len(true))
+        return float(np.sqrt(np.mean(squares))), extent

@@ -261,6 +261,25 @@ def test_what_is_no_shape_is_refused(joint_errors):
         fit_shape("plane", points, outside=[0.0, 1.0])
 
 
+def test_covariances_and_units_that_cannot_be_meant():
+    """Asymmetric covariances and points in mm were accepted; zeros made points exact."""
+    generator = np.random.default_rng(2)
+    points = generator.normal(size=(20, 3))
+    points = 2e-3 * points / np.linalg.norm(points, axis=1)[:, None]
+    covariance = np.tile((2e-5) ** 2 * np.eye(3), (20, 1, 1))
+    lopsided, exact = covariance.copy(), covariance.copy()
+    lopsided[5, 0, 2] = 0.5 * covariance[5, 0, 0]
+    exact[7] = 0.0
+    with pytest.raises(ValueError, match="point 5 is invalid: it is not symmetric"):
+        fit_shape("sphere", points, lopsided)
+    with pytest.raises(ValueError, match="point 7 is invalid: it is zero"):
+        fit_shape("sphere", points, exact)
+    with pytest.raises(ValueError, match="point 5 is invalid: it is not symmetric"):
+        fit_shape("sphere", points, covariance, 0.0, points, normal_covariance=lopsided)
+    with pytest.warns(UserWarning, match=r"extend over .* are they in other units than m\?"):
+        fit_shape("sphere", 1e3 * points, 1e6 * covariance, 1e3 * 50e-6)
+
+
 @pytest.mark.slow
 def test_a_cylinder_of_few_points_does_not_end_in_another_one():
     """Whichever way its axis points in the frame of the points, its fit is as good as the truth."""

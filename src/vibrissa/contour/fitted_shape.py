@@ -26,14 +26,16 @@ FLOOR = 1e-7
 # Distance from the middle of the contacts, over the largest without the farthest contacts, above
 # which these are ignored; and how many they are at most, as a share.
 _ASTRAY, _FARTHEST = 100.0, 0.02
-# Median standard deviation of contacts, and radius of the whisker, m, above which they are in other
-# units if they exceed the extent of the contacts.
+# Median standard deviation of contacts, and radius of the whisker, m, above which they may be, and
+# above the extent of the contacts are, in other units.
 _VAGUE, _STOUT = 2e-3, 5e-3
-# Extent of contacts, m, and over the whisker's radius, above both of which they are in other units:
-# a whisker may have a sharp tip.
+# Extent of contacts, m, above which they may be, and extent over the whisker's radius, above both
+# of which they are in other units: a whisker may have a sharp tip.
 _LONG, _SLIM = 1.0, 2e4
 # Smallest variance of a combination, over that of the point or normal.
 _FINE = 1e-10
+# Largest asymmetry of a covariance that is attributed to rounding, over its largest element.
+_LOPSIDED = 1e-6
 # Largest negative eigenvalue of a covariance that is attributed to rounding, over the largest.
 _NEGATIVE = 1e-8
 _SINGLE = 1e-5  # the same for covariances of single precision, which are only drawn
@@ -176,6 +178,12 @@ def _scale_contacts(what: str, arrays: dict[str, Array], n: int, least: int) -> 
             f"no {what}: the contacts extend over {extent:.3g} m, {extent / radius:.2g} times "
             "whisker_radius; both must be in m"
         )
+    if extent > _LONG or radius > _STOUT:
+        warnings.warn(
+            f"the contacts extend over {extent:.3g} m, and whisker_radius is {radius:.3g} m: are "
+            "they in other units than m?",
+            stacklevel=4,
+        )
     size = np.linalg.svd(centered, compute_uv=False)
     if not size[1] > FLOOR * size[0]:
         raise ValueError(f"no {what}: all points are on a line, or the same")
@@ -206,11 +214,16 @@ def _covariance(
         turned = np.swapaxes(cross, 1, 2)
         out = np.block([[out, cross], [turned, kept["normal_covariance"]]])
     least, largest = np.linalg.eigvalsh(out)[:, [0, -1]].T
-    bad = np.flatnonzero(least < -_NEGATIVE * np.abs(largest))
-    if bad.size:
-        raise ValueError(
-            f"no {what}: the covariance of point {rows[bad[0]]} is invalid: a variance is negative"
-        )
+    skew = np.abs(out - np.swapaxes(out, 1, 2)).max(axis=(1, 2))
+    faults = {
+        "it is not symmetric": skew > _LOPSIDED * np.abs(out).max(axis=(1, 2)),
+        "a variance is negative": least < -_NEGATIVE * np.abs(largest),
+        "it is zero (without noise, leave it out)": ~out[:, :3, :3].any(axis=(1, 2)),
+    }
+    for fault, bad in faults.items():
+        if bad.any():
+            first = rows[np.argmax(bad)]
+            raise ValueError(f"no {what}: the covariance of point {first} is invalid: {fault}")
     return np.asarray(out)
 
 

@@ -69,7 +69,7 @@ def test_a_straight_tapered_whisker_is_located_by_fx_mb_md(theorem):
     assert "not finished" in stopped.summary()
     assert "interior 0.000 % (undecided: s 0.3 to 1, ℓ 0 to 1)" in stopped.summary()
     assert found.proved
-    assert "unique (proved)" in found.summary()
+    assert "unique (proved), for contacts from 0.3 L to the tip" in found.summary()
     assert repr(found) == f"<{found.summary()}>"
     assert found.share == 1.0
     assert set(found.parts) == {"interior", "proximal", "distal", "fold"}
@@ -181,6 +181,21 @@ def test_an_independent_check_confirms_boxes_and_no_others(theorem, tmp_path, mo
     assert not check_certificate(forged, 0).covers
 
 
+def test_what_cannot_be_checked_is_not_called_a_hole(theorem, tmp_path):
+    """The check of straight whiskers is for linear radii; others were called full of holes."""
+    for wrong in ({"parts": ["sides"]}, {"parts": []}, {"number": -1}):
+        with pytest.raises(ValueError, match=r"parts is|number of boxes is"):
+            check_certificate(theorem[0], **wrong)
+    bent = vb.Whisker.straight(30e-3, radius=lambda s: 60e-6 * (1.0 - 0.9 * (s / 30e-3) ** 1.1))
+    path = tmp_path / "certificate.nc"
+    assert certify(charted(bent), path=path).proved
+    with pytest.raises(ValueError, match="only those whose radius is linear can be verified"):
+        check_certificate(path)
+    shown = " ".join(CliRunner().invoke(app, ["info", str(path), "--all"]).output.split())
+    assert "checked no: " in shown
+    assert "do not fill" not in shown
+
+
 @pytest.mark.slow
 def test_an_independent_check_of_a_curved_whisker(curved, tmp_path, monkeypatch):
     path, certificate = tmp_path / "curved.nc", prepare_certificate(curved, np.deg2rad(2.0))
@@ -198,6 +213,11 @@ def test_an_independent_check_of_a_curved_whisker(curved, tmp_path, monkeypatch)
     assert not covers(np.delete(boxes, 5, axis=0))
     data = certificate.to_dataset()
     data.attrs["cone"] *= 0.99  # contacts that are left out are not within this one
+    write_forged(path, data)
+    assert not check_certificate(path, 0).covers
+    # Without a cone: the square of this room is that of one so large that all contacts are in it.
+    data = certificate.to_dataset()
+    data.attrs |= {"cone": -0.1, "room": -0.5}
     write_forged(path, data)
     assert not check_certificate(path, 0).covers
     monkeypatch.setattr(checker, "_ROUNDS", 1)

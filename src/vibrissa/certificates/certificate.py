@@ -179,8 +179,9 @@ class Certificate:
         if self.proved:
             number = sum(len(part.certified) for part in self.parts.values())
             return (
-                f"Certificate: (Fx, MB, MD) is unique (proved){where}, by {number} boxes found in "
-                f"{self.seconds:.0f} s."
+                f"Certificate: (Fx, MB, MD) is unique (proved){where}, for contacts from "
+                f"{self.parts['interior'].domain[0, 0]:.3g} L to the tip, by {number} boxes found "
+                f"in {self.seconds:.0f} s."
             )
         if self.refuted:
             return f"No certificate{where}: {self.refuted}."

@@ -181,8 +181,8 @@ def check_certificate(
     Raises
     ------
     ValueError
-        If the file is not a certificate, its numbers have been modified, or it belongs to another
-        whisker.
+        If the file is not a certificate, its numbers have been modified, it belongs to another
+        whisker, or the whisker is straight and its radius is not linear.
     """
     data = read_dataset(Path(path)).load()
     if data.attrs.get("kind") != "vibrissa certificate":
@@ -192,10 +192,21 @@ def check_certificate(
     if whisker is not None and not is_certificate_of(data, whisker):
         raise ValueError(f"{path} is a certificate of another whisker")
     straight = bool(data.attrs["straight"])
+    known = PARTS if straight else CURVED_PARTS
+    parts = known if parts is None else parts
+    if not parts or not set(parts) <= set(known):
+        raise ValueError(f"parts is {parts!r}; those of this certificate are {', '.join(known)}")
+    if number is not None and number < 0:
+        raise ValueError(f"the number of boxes is {number}; it must be 0 or more, or None for all")
+    rod = data["rod_coefficients"].values
+    if straight and not rod[:, :3].any() and (len(rod) > 1 or rod[:, 3, 2:].any()):
+        raise ValueError(
+            f"{path}: of straight whiskers only those whose radius is linear can be verified"
+        )
     rng = np.random.default_rng(seed)
     whole, tried, held = _domains_match(data) if straight else curved_domains_match(data), 0, 0
     conditions_hold = _conditions_hold if straight else curved_conditions_hold
-    for part in parts or (PARTS if straight else CURVED_PARTS):
+    for part in parts:
         boxes = data[f"{part}_certified"].values.astype(np.int64)
         domain = data[f"{part}_domain"].values
         whole &= covers(boxes)

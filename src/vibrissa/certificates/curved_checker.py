@@ -443,9 +443,9 @@ def domains_match(data: xr.Dataset) -> bool:
         if not np.array_equal(data[f"{part}_domain"].values, [reach, angle, level]):
             return False
     inner = edges[(edges > near) & (edges < 1.0)]
-    pieces = (
-        stations[-1] == 1.0 and (np.diff(stations) > 0.0).all() and np.isin(inner, stations).all()
-    )
+    rising = all((np.diff(one) > 0.0).all() for one in (stations, edges))
+    ends = edges[0] == 0.0 < near and edges[-1] == stations[-1] == 1.0
+    pieces = rising and ends and np.isin(inner, stations).all()
     slope, offset = np.moveaxis(data["rod_local"].values[..., 0], -1, 0)
     within = (
         np.abs([slope * e[:, None] + offset for e in (edges[:-1], edges[1:])]).max() < 1 + 1e-12
@@ -453,9 +453,12 @@ def domains_match(data: xr.Dataset) -> bool:
     kappa = float(
         np.hypot(*np.abs(data["rod_coefficients"].values[:, 1:3]).sum(axis=(2, 3)).T).max()
     )
+    # Only the square of `room` is compared, so that a negative one would allow any deflection.
+    acute = 0.0 < attrs["cone"] < 0.5 * np.pi and attrs["room"] > 0.0
     sine = float(np.sin(attrs["cone"]))
     k = 1.0 - kappa * sine - (kappa * np.pi * sine) ** 2 / 12.0
-    cone = kappa < np.pi and np.pi * sine < 1.0 and k > 0.0 and attrs["room"] <= np.sqrt(k) * sine
+    small = kappa < np.pi and np.pi * sine < 1.0 and k > 0.0
+    cone = acute and small and attrs["room"] <= np.sqrt(k) * sine
     return bool(circle and pieces and within and cone) and _direction_turns_once(data, angle)
 
 

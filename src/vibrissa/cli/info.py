@@ -429,7 +429,11 @@ def _certificate(path: Path, whole: bool) -> Iterator[tuple[str, str]]:
         yield name, f"{len(part.certified)} boxes certain, {len(part.undecided)} undecided"
     yield "identity", found.identity
     if whole:
-        checked = vb.certificates.check_certificate(path)
+        try:
+            checked = vb.certificates.check_certificate(path)
+        except ValueError as fault:
+            yield "checked", f"no: {fault}"
+            return
         yield (
             "checked",
             f"the boxes {'fill' if checked.covers else 'do not fill'} the domain; an independent "

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from vibrissa.cameras import Camera
 from vibrissa.numerics import Array, Mask
 from vibrissa.tracking.refine.rods import TraceSeries
+from vibrissa.tracking.space.pose import CUTOFF, base_pose
 from vibrissa.tracking.space.rest_shape import RestShape, motions
 from vibrissa.whisker import Whisker
 
@@ -30,6 +31,7 @@ _SPAN = 1e-3  # time to each side over which motion is fitted by a parabola, s
 _FEWEST = 12  # smallest number of frames
 # Share of the whisker that is compared, as fur and unseen tips are not, and number of its points.
 _FROM, _TO, _POINTS = 0.06, 0.85, 24
+_FAST = 2.0  # smallest number of frames in the period of the cut-off for poses that are filtered
 _ROUNDS, _SETTLED = 5, 0.03  # number of rounds, and relative change of the scale after the last one
 _REWEIGHTED = 20  # number of times that frames are weighted by what is left of them
 # Misses from which a frame hardly counts, as it is bent by contact, and errors of curves, pixels.
@@ -45,6 +47,7 @@ _LITTLE, _FAR_LESS, _USUAL, _SMALL = 0.1, 0.6, 0.9, 0.05
 # Standard deviation of displacements by inertia, over their size, and number of those up to which
 # a frame may be free.
 _UNSURE, _POSSIBLE = 0.15, 3.0
+_NONE = 1e-12  # displacement that is none, m
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +89,9 @@ class Inertia:
     def without(self, cameras: Sequence[Camera], traces: TraceSeries, curves: Array) -> TraceSeries:
         """Traces of the whisker as it would be without mass, as uncertain as that is."""
         line, sigma = traces.line.copy(), traces.sigma.copy()
+        # What moves a curve as a whole is no error of its shape.
+        moving = np.sqrt((self.displacement**2).sum(axis=2).mean(axis=1))
+        share = _UNSURE * np.minimum(self.size / np.maximum(moving, _NONE), 1.0)
         for view, camera in enumerate(cameras):
             shown = camera.project(curves)
             shift = shown - camera.project(curves - self.displacement)
@@ -94,7 +100,7 @@ class Inertia:
                 away = ((line[i, view][:, None] - shown[i]) ** 2).sum(axis=2)
                 moved = shift[i, away.argmin(axis=1)]
                 line[i, view] -= moved
-                sigma[i, view] = np.hypot(sigma[i, view], _UNSURE * np.linalg.norm(moved, axis=1))
+                sigma[i, view] = np.hypot(sigma[i, view], share[i] * np.linalg.norm(moved, axis=1))
         return replace(traces, line=line, sigma=sigma)
 
     def spread(self, displacement: Array) -> Array:
@@ -151,6 +157,7 @@ class _Swung:
 
     curves: Array  # (time, node, 3), m
     seen: Mask  # (time,)
+    whisker: Whisker
     by_mass: Array  # (time, node, 3): displacement for a scale of 1, m
     spacing: Array  # (time,) of the points, m
     rate: float
@@ -166,7 +173,7 @@ class _Swung:
         acceleration = _derivative(whole, rate, 2)
         by_mass = _bent(whole, acceleration, whisker)
         spacing = np.linalg.norm(np.diff(whole, axis=1), axis=2).mean(axis=1)
-        return cls(whole, seen, by_mass, spacing, rate, noise)
+        return cls(whole, seen, whisker, by_mass, spacing, rate, noise)
 
     def _on(self, shape: RestShape, displacement: Array) -> tuple[Array, Array]:
         """Rotations (time, 3, 3) to the frame of a shape, and deviations (time, node, 3) there.
@@ -191,10 +198,16 @@ class _Swung:
         spacing = np.array([shape.spacing])
         return np.asarray(_along(shape.points[None], spacing, self._arcs(shape))[0])
 
-    def _by_damping(self, rotation: Array, deviation: Array) -> Array:
-        """Displacements (time, node, 3) by damping for a time constant of one second, m."""
-        slopes = -_derivative(deviation, self.rate, 1)
-        return np.asarray(np.einsum("tji,tnj->tni", rotation, slopes))
+    def _by_damping(self, shape: RestShape, displacement: Array) -> Array:
+        """Displacements (time, node, 3) by damping for a time constant of one second, m.
+
+        They are those of a whisker that moves relative to its base, as it is posed without inertia.
+        """
+        pose = base_pose(self.curves - displacement, shape, self.whisker)
+        pose = pose.filtered(self.rate, CUTOFF if self.rate > _FAST * CUTOFF else None)
+        away = self.curves - pose.position[:, None]
+        slopes = -_derivative(np.einsum("tji,tnj->tni", pose.rotation, away), self.rate, 1)
+        return np.asarray(np.nan_to_num(np.einsum("tij,tnj->tni", pose.rotation, slopes)))
 
     def fitted(
         self,
@@ -206,7 +219,7 @@ class _Swung:
         """Scale of mass and time constant of damping with which most shapes are those at rest."""
         arcs = self._arcs(shape)
         rotation, deviation = self._on(shape, displacement)
-        damped = self._by_damping(rotation, deviation)
+        damped = self._by_damping(shape, displacement)
         columns = [self._turned(each, rotation, arcs) for each in (self.by_mass, damped)]
         rigid = _rigid(self._target(shape))
         left = [_without(each, rigid) for each in (_along(deviation, self.spacing, arcs), *columns)]
@@ -233,8 +246,8 @@ class _Swung:
     def inertia(self, numbers: tuple[float, float], shape: RestShape, before: Array) -> Inertia:
         """Displacements by inertia, on a shape at rest to which curves without those before fit."""
         scale, delay = numbers
-        rotation, deviation = self._on(shape, before)
-        moved = scale * self.by_mass + delay * self._by_damping(rotation, deviation)
+        rotation, _ = self._on(shape, before)
+        moved = scale * self.by_mass + delay * self._by_damping(shape, before)
         bent = _without(
             self._turned(moved, rotation, self._arcs(shape)), _rigid(self._target(shape))
         )

@@ -361,6 +361,19 @@ def test_the_filter_states_light_contacts_of_a_whisker_that_sags_in_any_pose(nit
     assert np.mean(np.array(squares) < 7.81) > 0.85
 
 
+def test_the_filter_states_why_a_complete_sample_of_a_heavy_whisker_has_no_contact(nitinol):
+    """A contact that explains a sample least badly may not exist for the weightless whisker."""
+    whisker, noise = nitinol.whisker, covariance(nitinol.whisker)
+    follow = vb.ContactFilter(vb.Estimator(nitinol, SIX, noise, felt_above=5.0, gravity=(0, 0, -G)))
+    wrenches = np.random.default_rng(8).normal(size=(40, 6)) * unit(whisker)
+    wrenches[:, 3:] *= whisker.length
+    rows = np.stack([vb.base_signals(wrenches[:, :3], wrenches[:, 3:])[n] for n in SIX], axis=1)
+    found = [follow(0.01 * i, row, np.eye(3)).status for i, row in enumerate(rows)]
+    assert vb.Status.MISSING not in found
+    assert {vb.Status.NOT_FRICTIONLESS, vb.Status.OUTSIDE_MAP} & set(found)
+    assert follow(1.0, np.full(6, np.nan), np.eye(3)).status == vb.Status.MISSING
+
+
 def test_the_filter_takes_an_uncertain_stiffness_if_the_sag_hardly_depends_on_it(nitinol, swung):
     rotations, rows, points = swung
     noise = covariance(nitinol.whisker)

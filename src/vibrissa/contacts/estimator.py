@@ -450,7 +450,9 @@ class Estimator:
         assert self._joint is not None
         return self._joint.nearly(self._joint.shape, before)
 
-    def of_sagged(self, measurement: Measurement, sagged: Estimator) -> Measurement:
+    def of_sagged(
+        self, measurement: Measurement, sagged: Estimator
+    ) -> tuple[Measurement, Status | None]:
         """Return what the sagged whisker without weight would measure of the same contact point.
 
         Parameters
@@ -464,13 +466,16 @@ class Estimator:
         -------
         Measurement
             The same with what noise adds to more than three signals; NaN where there is no contact.
+        Status or None
+            Reason why there is none.
         """
         assert self._joint is not None
-        if self.nothing_in(measurement) is not None:
+        nothing = self.nothing_in(measurement)
+        if nothing is not None:
             self.reset()
-            return measurement
+            return measurement, nothing
         names = self._joint.channels.names
-        found, _ = self._joint.following(measurement.measured[None] * self._joint.scale)
+        found, status = self._joint.following(measurement.measured[None] * self._joint.scale)
         d, target = self._joint.d, np.full(len(names), np.nan)
         if found.number[0]:
             there = PointContact(found.values[0, 0, 3:] * d.length)
@@ -480,7 +485,11 @@ class Estimator:
             weighted = self._joint.forward.values(found.x[:, 0])
             away = channels_of(values[None]) - channels_of(weighted)
             target = measurement.target + away[0, which]
-        return self.readout.scaled(self._joint.signals_of(target[None])[0])
+        if not np.isfinite(target).all():
+            reason = Status(int(status[0]))
+            # A contact that the sagged whisker without weight cannot have is beyond its map.
+            nothing = Status.OUTSIDE_MAP if reason in (Status.UNIQUE, Status.AMBIGUOUS) else reason
+        return self.readout.scaled(self._joint.signals_of(target[None])[0]), nothing
 
     def nothing_in(self, measurement: Measurement) -> Status | None:
         """Reason why a measurement needs no search: ``MISSING``, ``NOT_FELT``, ``DEGENERATE``.

@@ -266,13 +266,14 @@ class ContactFilter:
         if self._time is not None and not time > self._time:
             raise ValueError(f"times must increase; got {time} s after {self._time} s")
         self._course.question(time, base)
+        reason = None
         if self._weighted is None:
             measurement = self.estimator.measurement(signals, rotation, gravity)
         else:
             measurement = self._weighted.measurement(signals, rotation, gravity)
             if self._weighted.nothing_in(measurement) is None:
                 self._sag()
-            measurement = self._weighted.of_sagged(measurement, self.estimator)
+            measurement, reason = self._weighted.of_sagged(measurement, self.estimator)
         base = base / self._length
         if self._time is not None:
             self._predict(time - self._time)
@@ -286,6 +287,8 @@ class ContactFilter:
             self._mixture = room(0, self._errors)
             touching = nothing != Status.NOT_FELT or not np.isfinite(turn).all()
             self._free = None if touching else (time, turn, base)
+        elif reason is not None:
+            nothing = reason  # the sample is complete, but no contact explains it
         return self._known(nothing, None, turn, base)
 
     def _learned(
